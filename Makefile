@@ -1,0 +1,55 @@
+# make setup | demo | test | lint | format | types | bench | model
+PYTHON ?= python3
+TORCH ?= torch==2.13.0
+VENV := .venv
+BIN := $(VENV)/bin
+
+# With a sourced ROS 2 Jazzy its rclpy is used, else the wheels from PyPI.
+ifeq ($(ROS_DISTRO),jazzy)
+VENV_FLAGS := --system-site-packages
+EXTRAS := figures,tensorboard,test
+else
+EXTRAS := figures,ros,tensorboard,test
+endif
+
+.PHONY: setup demo test lint format types bench model
+.DEFAULT_GOAL := help
+
+.PHONY: help
+help:
+	@sed -n '1s/# //p' Makefile
+
+setup: $(VENV)/installed
+
+# torch by itself, so that what it names is what is installed.
+$(VENV)/installed: setup.py Makefile
+	$(PYTHON) -m venv $(VENV_FLAGS) $(VENV)
+	$(BIN)/pip install --quiet "setuptools>=64" "$(TORCH)"
+	$(BIN)/pip install --quiet --editable ".[$(EXTRAS)]"
+	touch $@
+
+demo: setup
+	$(BIN)/python demo/demo.py
+
+test: setup
+	$(BIN)/python -m pytest
+
+lint: setup
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+
+format: setup
+	$(BIN)/ruff check --fix .
+	$(BIN)/ruff format .
+
+types: setup
+	$(BIN)/mypy
+
+bench: setup
+	$(BIN)/pip install --quiet --editable ".[$(EXTRAS),bench]"
+	$(BIN)/python benchmark/benchmark.py
+
+# Trains the shipped model from nothing.
+model: setup
+	$(BIN)/ddqn-planner train dilemma --learning-rate 0.001 --seed 0 --out runs/dilemma
+	cp runs/dilemma/model.safetensors models/dilemma.safetensors

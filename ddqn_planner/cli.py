@@ -1,0 +1,190 @@
+"""``ddqn-planner``: planning and training from a shell, without ROS."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import signal
+import sys
+import threading
+import time
+from collections.abc import Sequence
+from dataclasses import fields
+from pathlib import Path
+
+import torch
+from tqdm import tqdm
+
+from ddqn_planner.grid import Cell, MapFile, MoveRule, read_map_file
+from ddqn_planner.planning import Plan, Planner, PlanStatus, shortest_distances
+from ddqn_planner.planning.evaluation import evaluate
+from ddqn_planner.planning.picture import PictureError, draw_text, save_picture
+from ddqn_planner.resources import find_resource
+from ddqn_planner.training.environment import Scenario
+from ddqn_planner.training.hyper_parameters import HyperParameters
+from ddqn_planner.training.run import TrainingRun
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command line; return the exit code: 0 done, 1 no path, 2 bad input."""
+    options = _parser().parse_args(arguments)
+    torch.set_num_threads(1)  # as fast as two for networks of this size, and the same every time
+    try:
+        return int(options.command(options))
+    except (OSError, ValueError, PictureError) as error:
+        print(f"ddqn-planner: {error}", file=sys.stderr)
+        return 2
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(prog="ddqn-planner", description=__doc__)
+    commands = parser.add_subparsers(required=True, metavar="plan|train")
+
+    plan = commands.add_parser("plan", help="plan a path on a map file")
+    _add_map_arguments(plan)
+    plan.add_argument("--model", default="dilemma", help="name or file (%(default)s)")
+    plan.add_argument(
+        "--move-rule", type=MoveRule, choices=list(MoveRule), help="the model's by default"
+    )
+    plan.add_argument("--json", action="store_true", help="print JSON in place of text")
+    plan.add_argument("--picture", type=Path, metavar="FILE", help="draw map, value and path")
+    plan.set_defaults(command=_plan)
+
+    train = commands.add_parser(
+        "train",
+        help="train a model on a map file",
+        description="Trains into a folder. The same command again goes on where it stopped.",
+        formatter_class=argparse.ArgumentDefaultsHelpFormatter,
+    )
+    _add_map_arguments(train)
+    train.add_argument("--out", type=Path, default=Path("runs/train"), help="folder of the run")
+    train.add_argument(
+        "--move-rule", type=MoveRule, choices=list(MoveRule), default=MoveRule.CORNER_CUTTING
+    )
+    train.add_argument("--seed", type=int, default=0)
+    for entry in fields(HyperParameters):
+        train.add_argument(
+            f"--{entry.name.replace('_', '-')}",
+            type=type(entry.default),
+            default=entry.default,
+            help=entry.metadata["source"],
+        )
+    train.set_defaults(command=_train)
+    return parser
+
+
+def _add_map_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("map", type=Path, help="ROS map YAML, MovingAI .map, or shipped map's name")
+    for name in ("start", "goal"):
+        parser.add_argument(
+            f"--{name}",
+            type=int,
+            nargs=2,
+            metavar=("X", "Y"),
+            help="by default the map file's",
+        )
+
+
+def _read_map(options: argparse.Namespace) -> tuple[MapFile, Cell, Cell]:
+    path: Path = options.map
+    if not path.exists() and path.name == str(path):
+        path = find_resource("maps", path.name if path.suffix else f"{path.name}.yaml")
+    map_file = read_map_file(path)
+    start = tuple(options.start) if options.start else map_file.start
+    goal = tuple(options.goal) if options.goal else map_file.goal
+    if start is None or goal is None:
+        raise ValueError(f"{path} names no start and goal; give --start X Y and --goal X Y")
+    return map_file, start, goal
+
+
+def _plan(options: argparse.Namespace) -> int:
+    map_file, start, goal = _read_map(options)
+    grid = map_file.grid()
+    planner = Planner.load(options.model)
+    began = time.perf_counter()
+    plan = planner.plan(grid, start, goal, options.move_rule)
+    seconds = time.perf_counter() - began
+    succeeded = plan.status is PlanStatus.SUCCEEDED
+    rule = options.move_rule or planner.metadata.move_rule
+    optimum = None
+    if succeeded:
+        optimum = float(shortest_distances(grid, goal, rule)[start[1], start[0]])
+    if options.json:
+        print(json.dumps(_as_dictionary(plan, optimum, rule, seconds)))
+    elif succeeded:
+        print(draw_text(grid, plan.cells))
+        print("path: " + " ".join(f"({x}, {y})" for x, y in plan.cells))
+        print(
+            f"length {plan.length:.2f} cells, optimum {optimum:.2f} under {rule.value}, "
+            f"planned in {seconds * 1e3:.1f} ms"
+        )
+    else:
+        print(f"no path from {start} to {goal}: {plan.status.value}", file=sys.stderr)
+    if options.picture:
+        value = planner.q_field(grid, goal, options.move_rule).value if succeeded else None
+        title = f"{plan.length:.2f} cells" if succeeded else plan.status.value
+        save_picture(options.picture, grid, plan.cells, value, title)
+    return 0 if succeeded else 1
+
+
+def _as_dictionary(
+    plan: Plan, optimum: float | None, rule: MoveRule, seconds: float
+) -> dict[str, object]:
+    return {
+        "status": plan.status.name,
+        "reason": plan.status.value,
+        "cells": plan.cells,
+        "length": plan.length,
+        "optimum": optimum,
+        "move_rule": rule.value,
+        "planning_seconds": seconds,
+    }
+
+
+def _train(options: argparse.Namespace) -> int:
+    map_file, start, goal = _read_map(options)
+    scenario = Scenario(map_file.grid(), start, goal)
+    values = {entry.name: getattr(options, entry.name) for entry in fields(HyperParameters)}
+    parameters = HyperParameters(**values)
+    run = TrainingRun(options.out, [scenario], options.move_rule, parameters, options.seed)
+    try:
+        _train_with_progress(run)
+    finally:
+        run.close()
+    if run.save_error:
+        raise OSError(run.save_error)
+    field = run.trainer.planner().q_field(scenario.grid, goal)
+    evaluation, plan = evaluate(field, scenario.grid, options.move_rule), field.rollout(start)
+    print(
+        f"{run.trainer.steps} steps, {run.trainer.episodes} episodes: the greedy walk solves "
+        f"{evaluation.solved} of {evaluation.starts} starts, mean length "
+        f"{evaluation.mean_ratio:.4f} of the optimum; from the start "
+        + (f"{plan.length:.2f} cells" if plan.cells else "it is trapped")
+    )
+    print(f"saved {run.model_path}")
+    return 0
+
+
+def _train_with_progress(run: TrainingRun) -> None:
+    trainer = run.trainer
+    interrupted = threading.Event()
+    # An exception could strike in the middle of a step; a flag is looked at between two.
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda *_: interrupted.set())
+    # disable=None: no bar where the output is no terminal.
+    with tqdm(total=trainer.parameters.steps, initial=trainer.steps, disable=None) as bar:
+        for finished in run.steps():
+            bar.update(trainer.steps - bar.n)
+            for episode in finished:
+                bar.set_postfix(
+                    {"episode": episode.number, "average reward": episode.average_reward},
+                    refresh=False,
+                )
+            if interrupted.is_set():
+                run.try_to_save()
+                print(f"stopped at step {trainer.steps}; the same command goes on from there")
+                break
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,78 @@
+"""The Q-networks. Each answers with the Q field of a map toward one goal."""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor, nn
+
+from ddqn_planner.grid import MOVES, Cell
+from ddqn_planner.model.observation import observation_background, observe
+
+
+class QNetwork(Protocol):
+    """What the planner asks of a network."""
+
+    def supports(self, shape: tuple[int, int]) -> bool:
+        """Say whether the network can plan on maps of shape (H, W)."""
+        ...
+
+    def q_values(self, occupancy: NDArray[np.bool_], goal: Cell) -> NDArray[np.float32]:
+        """Return Q(s, a) of every cell toward one goal: (8, H, W) float32."""
+        ...
+
+
+class PaperQNetwork(nn.Module):
+    """The paper's network (Fig. 3): one convolution, one fully connected layer.
+
+    A 3x3 convolution of stride 2, ReLU, and a fully connected layer with one output an action. The
+    paper gives neither the number of filters nor the padding. Ours is 1, because without it the
+    last row and column of an even-sized map are under no filter, and a robot there goes unseen.
+
+    Parameters
+    ----------
+    height, width : int
+        Size of the maps, cells; the paper's is 20 x 20. The network plans on no other size.
+    filters : int
+        Number of convolution filters.
+    """
+
+    def __init__(self, height: int, width: int, filters: int) -> None:
+        super().__init__()
+        self.shape = (height, width)
+        self.convolution = nn.Conv2d(1, filters, kernel_size=3, stride=2, padding=1)
+        features = filters * ((height + 1) // 2) * ((width + 1) // 2)
+        self.fully_connected = nn.Linear(features, len(MOVES))
+
+    def forward(self, observation_BHW: Tensor) -> Tensor:
+        """Return Q(s, a): (B, 8) for observations (B, H, W)."""
+        features = torch.relu(self.convolution(observation_BHW.unsqueeze(1)))
+        q_BA: Tensor = self.fully_connected(features.flatten(1))
+        return q_BA
+
+    def supports(self, shape: tuple[int, int]) -> bool:
+        """Say whether the network can plan on maps of shape (H, W)."""
+        return shape == self.shape
+
+    @torch.inference_mode()
+    def q_values(self, occupancy: NDArray[np.bool_], goal: Cell) -> NDArray[np.float32]:
+        """Evaluate the observation of a robot in each cell, in one batch.
+
+        Parameters
+        ----------
+        occupancy : (H, W) bool
+            Of the network's shape.
+        goal : (x, y)
+
+        Returns
+        -------
+        (8, H, W) float32
+        """
+        cells = np.arange(occupancy.size)
+        background = observation_background(occupancy, goal)
+        q_BA = self(torch.from_numpy(observe(background, cells, self.shape)))
+        q_AHW: NDArray[np.float32] = q_BA.T.reshape(len(MOVES), *self.shape).numpy()
+        return q_AHW

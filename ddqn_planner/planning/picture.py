@@ -1,0 +1,110 @@
+"""A plan to look at: as text, and as a picture of map, path and value field."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from numpy.typing import NDArray
+
+from ddqn_planner.grid import Cell, GridMap
+
+OBSTACLE_COLOUR = "#2b2d42"
+PATH_COLOUR = "#ff8c42"
+GOAL_COLOUR = "#d81159"
+VALUE_COLOURS = "YlGnBu"
+"""A map of light to dark that stays in order for colour-blind readers and in grey."""
+
+
+class PictureError(RuntimeError):
+    """A picture cannot be drawn; the message says what is missing."""
+
+
+def draw_text(grid: GridMap, cells: Sequence[Cell]) -> str:
+    """Return the map as text, y upwards: ``#`` occupied, ``.`` free, ``*`` path, ``S``, ``G``."""
+    letters = np.where(grid.occupancy, "#", ".")
+    for x, y in cells:
+        letters[y, x] = "*"
+    for letter, (x, y) in zip("SG", (*cells[:1], *cells[-1:]), strict=False):
+        letters[y, x] = letter
+    return "\n".join(" ".join(row) for row in letters[::-1])
+
+
+def save_picture(
+    path: str | Path,
+    grid: GridMap,
+    cells: Sequence[Cell],
+    value: NDArray[np.float32] | None,
+    title: str,
+    value_label: str = "value: max Q(s, a)",
+) -> None:
+    """Draw map, value field and path into a picture file.
+
+    Parameters
+    ----------
+    path : str or Path
+        Its ending (``.png``, ``.svg``, ``.pdf``) sets the format.
+    grid : GridMap
+    cells : sequence of (x, y)
+        The path; none draws the map alone.
+    value : (H, W) float32, or None
+        The value field, drawn where it is finite.
+    title, value_label : str
+
+    Raises
+    ------
+    PictureError
+        If matplotlib is not installed.
+    OSError, ValueError
+        If the file cannot be written, or matplotlib does not know its ending.
+    """
+    try:
+        import matplotlib
+
+        matplotlib.use("Agg")
+        import matplotlib.pyplot as plt
+    except ImportError as error:
+        raise PictureError(
+            f"pictures need matplotlib ({error}): pip install 'ddqn_planner[figures]'"
+        ) from None
+    figure, axes = plt.subplots(figsize=(7.2, 6.6), dpi=120, layout="constrained")
+    axes.set(facecolor="white", xlabel="x [cells]", ylabel="y [cells]", aspect="equal")
+    axes.set_title(title, loc="left", fontsize=12)
+    if value is not None:
+        finite = np.where(np.isfinite(value), value, np.nan)
+        image = axes.imshow(finite, origin="lower", cmap=VALUE_COLOURS, interpolation="nearest")
+        figure.colorbar(image, label=value_label, shrink=0.85)
+    _draw_obstacles(axes, grid)
+    if cells:
+        _draw_path(axes, cells)
+    figure.savefig(path)
+    plt.close(figure)
+
+
+def _draw_obstacles(axes: Any, grid: GridMap) -> None:
+    from matplotlib.colors import ListedColormap
+
+    occupied = np.where(grid.occupancy, 1.0, np.nan)
+    axes.imshow(
+        occupied, origin="lower", cmap=ListedColormap([OBSTACLE_COLOUR]), interpolation="nearest"
+    )
+    if max(grid.width, grid.height) <= 64:
+        axes.set_xticks(np.arange(-0.5, grid.width), minor=True)
+        axes.set_yticks(np.arange(-0.5, grid.height), minor=True)
+        axes.grid(which="minor", color="white", linewidth=0.8)
+        axes.tick_params(which="minor", length=0)
+
+
+def _draw_path(axes: Any, cells: Sequence[Cell]) -> None:
+    from matplotlib.patheffects import withStroke
+
+    x, y = np.transpose(cells)
+    outline = [withStroke(linewidth=5.5, foreground="white")]
+    axes.plot(x, y, color=PATH_COLOUR, linewidth=3, path_effects=outline, label="path")
+    ends = {"s": 110, "edgecolors": "white", "linewidths": 1.5, "zorder": 3}
+    axes.scatter(x[0], y[0], marker="o", color=PATH_COLOUR, label="start", **ends)
+    axes.scatter(x[-1], y[-1], marker="*", color=GOAL_COLOUR, label="goal", **{**ends, "s": 260})
+    axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.08), ncols=3, frameon=False)

@@ -1,0 +1,110 @@
+"""The planner: a network, a Q field a goal, and a walk a start."""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from pathlib import Path
+
+from ddqn_planner.grid import Cell, GridMap, MoveRule, connected_cells, legal_moves
+from ddqn_planner.model import ModelMetadata, QNetwork, load_model
+from ddqn_planner.planning.plan import Plan, PlanStatus
+from ddqn_planner.planning.q_field import QField
+
+MAX_FIELDS = 8
+"""How many Q fields a planner keeps, the last ones used."""
+
+
+class Planner:
+    """Plans paths with a trained Q-network, by greedy steps in its Q field.
+
+    Parameters
+    ----------
+    network : QNetwork
+    metadata : ModelMetadata
+        Its move rule is the default of `plan` and `q_field`.
+    """
+
+    def __init__(self, network: QNetwork, metadata: ModelMetadata) -> None:
+        self.network = network
+        self.metadata = metadata
+        self._fields: OrderedDict[tuple[str, Cell, MoveRule], QField] = OrderedDict()
+
+    @classmethod
+    def load(cls, model: str | Path) -> Planner:
+        """Load a shipped model by its name (``"dilemma"``), or a model file by its path.
+
+        Raises
+        ------
+        ModelFileError
+            If there is no such model, or its file cannot be used.
+        """
+        return cls(*load_model(model))
+
+    def q_field(self, grid: GridMap, goal: Cell, move_rule: MoveRule | None = None) -> QField:
+        """Return the Q field of a map toward a goal; asked again, it is looked up.
+
+        Parameters
+        ----------
+        grid : GridMap
+        goal : (x, y)
+            A free cell.
+        move_rule : MoveRule, optional
+            The rule that the model was trained for by default.
+
+        Raises
+        ------
+        ValueError
+            If the goal is not a free cell of the map, or the model cannot plan on this size.
+        """
+        if not grid.is_free(goal):
+            raise ValueError(f"the goal {goal} is not a free cell of the map; give another")
+        if not self.network.supports((grid.height, grid.width)):
+            raise ValueError(
+                f"the model was not trained for maps of {grid.width} x {grid.height} cells; "
+                "train one on such a map"
+            )
+        rule = move_rule or self.metadata.move_rule
+        key = (grid.fingerprint, goal, rule)
+        if key not in self._fields:
+            q = self.network.q_values(grid.occupancy, goal)
+            self._fields[key] = QField(goal, q, legal_moves(grid.occupancy, rule))
+        self._fields.move_to_end(key)
+        while len(self._fields) > MAX_FIELDS:
+            self._fields.popitem(last=False)
+        return self._fields[key]
+
+    def plan(
+        self, grid: GridMap, start: Cell, goal: Cell, move_rule: MoveRule | None = None
+    ) -> Plan:
+        """Plan a path.
+
+        Parameters
+        ----------
+        grid : GridMap
+        start, goal : (x, y)
+        move_rule : MoveRule, optional
+            The rule that the model was trained for by default.
+
+        Returns
+        -------
+        Plan
+            Every move of its path is legal under the rule, whatever the network says.
+        """
+        if not grid.contains(start):
+            return Plan(PlanStatus.START_OUTSIDE_MAP)
+        if not grid.contains(goal):
+            return Plan(PlanStatus.GOAL_OUTSIDE_MAP)
+        if not grid.is_free(start):
+            return Plan(PlanStatus.START_OCCUPIED)
+        if not grid.is_free(goal):
+            return Plan(PlanStatus.GOAL_OCCUPIED)
+        if not self.network.supports((grid.height, grid.width)):
+            return Plan(PlanStatus.MAP_SIZE_UNSUPPORTED)
+        plan = self.q_field(grid, goal, move_rule).rollout(start)
+        rule = move_rule or self.metadata.move_rule
+        if (
+            plan.status is PlanStatus.WALK_TRAPPED
+            and not connected_cells(grid.occupancy, goal, rule)[start[1], start[0]]
+        ):
+            return Plan(PlanStatus.NO_PATH)
+        return plan

@@ -1,0 +1,71 @@
+"""The Q field: Q(s, a) of every cell toward one goal, and the greedy walk in it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ddqn_planner.grid import MOVES, Cell
+from ddqn_planner.planning.plan import Plan, PlanStatus
+
+_STEPS: list[Cell] = [(int(dx), int(dy)) for dx, dy in MOVES]
+
+
+@dataclass(frozen=True, eq=False)
+class QField:
+    """Q(s, a) of every cell of one map toward one goal.
+
+    Parameters
+    ----------
+    goal : (x, y)
+        A free cell.
+    q : (8, H, W) float32
+        What the network says of each action in each cell.
+    legal : (8, H, W) bool
+        The legal moves: the robot knows its map, and takes no other.
+    """
+
+    goal: Cell
+    q: NDArray[np.float32]
+    legal: NDArray[np.bool_]
+
+    @cached_property
+    def value(self) -> NDArray[np.float32]:
+        """(H, W) float32: the greatest Q of a legal move; -inf where there is none.
+
+        Nothing is better than to be at the goal: it has the greatest value of the map.
+        """
+        value: NDArray[np.float32] = np.where(self.legal, self.q, -np.inf).max(axis=0)
+        value[self.goal[1], self.goal[0]] = value.max()
+        return value
+
+    @cached_property
+    def policy(self) -> NDArray[np.int8]:
+        """(H, W) int8: the legal action of the greatest Q in each cell; -1 where there is none."""
+        greedy = np.where(self.legal, self.q, -np.inf).argmax(axis=0)
+        return np.where(self.legal.any(axis=0), greedy, -1).astype(np.int8)
+
+    def rollout(self, start: Cell) -> Plan:
+        """Walk from a free cell to the goal by greedy steps alone.
+
+        The walk gives up on the first cell that it enters again: it would go round for ever.
+
+        Returns
+        -------
+        Plan
+            SUCCEEDED with every cell walked, or WALK_TRAPPED.
+        """
+        policy = self.policy
+        cell, cells = start, [start]
+        visited = {start}
+        while cell != self.goal:
+            action = int(policy[cell[1], cell[0]])
+            cell = (cell[0] + _STEPS[action][0], cell[1] + _STEPS[action][1])
+            if action < 0 or cell in visited:
+                return Plan(PlanStatus.WALK_TRAPPED)
+            visited.add(cell)
+            cells.append(cell)
+        return Plan(PlanStatus.SUCCEEDED, tuple(cells))

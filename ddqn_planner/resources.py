@@ -1,0 +1,51 @@
+"""Finds the maps and models that come with the package, however it was installed."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+PACKAGE = "ddqn_planner"
+
+
+def share_directories() -> Iterator[Path]:
+    """Yield the folders that may hold ``maps/`` and ``models/``, the likeliest first.
+
+    They are: the ament index (a colcon workspace that was sourced), ``share/ddqn_planner`` of this
+    Python environment (pip install), and the source tree (an editable install, or none).
+    """
+    try:
+        from ament_index_python.packages import get_package_share_directory
+
+        yield Path(get_package_share_directory(PACKAGE))
+    except (ImportError, LookupError, OSError):
+        pass  # no ROS here, or ROS from PyPI, which has no ament prefix
+    yield Path(sys.prefix) / "share" / PACKAGE
+    yield Path(__file__).resolve().parent.parent
+
+
+def find_resource(folder: str, name: str) -> Path:
+    """Return the path of a file that comes with the package.
+
+    Parameters
+    ----------
+    folder : str
+        ``"maps"`` or ``"models"``.
+    name : str
+        Name of the file, with its ending.
+
+    Raises
+    ------
+    FileNotFoundError
+        If no installed copy is found; the message names the folders that were looked in and the
+        files that are there.
+    """
+    looked_in = [share / folder for share in share_directories()]
+    for directory in looked_in:
+        if (directory / name).is_file():
+            return directory / name
+    known = sorted({path.name for directory in looked_in for path in directory.glob("*.*")})
+    raise FileNotFoundError(
+        f"no {name!r} in {', '.join(map(str, looked_in))}; there are: {', '.join(known) or 'none'}"
+    )

@@ -1,0 +1,8 @@
+"""The paper's contribution: environment, initialisation, reward, replay, Double DQN, trainer."""
+
+import gymnasium
+
+gymnasium.register(
+    id="ddqn_planner/Grid-v0",
+    entry_point="ddqn_planner.training.environment:GridEnvironment",
+)

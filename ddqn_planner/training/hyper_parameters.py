@@ -1,0 +1,50 @@
+"""Every number of the training, once: the nodes, the command line and the tests read it here."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, fields
+from typing import Any
+
+
+def _parameter(default: Any, source: str, low: float, high: float) -> Any:
+    return field(default=default, metadata={"source": source, "range": (low, high)})
+
+
+@dataclass(frozen=True)
+class HyperParameters:
+    """The paper's Table 1, and our choice where the paper is silent.
+
+    Improvement 1 (initialisation) is switched off by ``p_r = 0``, improvement 2 (reward) by
+    ``alpha = beta = 0``.
+
+    Raises
+    ------
+    ValueError
+        If a value lies outside its range.
+    """
+
+    learning_rate: float = _parameter(0.01, "Table 1: Adam's learning rate", 1e-6, 1.0)
+    batch_size: int = _parameter(32, "Table 1: transitions in a mini-batch", 1, 4096)
+    gamma: float = _parameter(0.95, "Table 1: discount γ", 0.0, 1.0)
+    obstacle_reward: float = _parameter(-10.0, "Table 1: reward of a collision", -1e3, 0.0)
+    goal_reward: float = _parameter(10.0, "Table 1: reward of the end", 0.0, 1e3)
+    p_r: float = _parameter(0.5, "section 4.1: probability of a random initial cell", 0.0, 1.0)
+    alpha: float = _parameter(0.6, "section 4.2: weight α of the progress to the end", 0.0, 10.0)
+    beta: float = _parameter(0.4, "section 4.2: weight β of the detour from the start", 0.0, 10.0)
+    steps: int = _parameter(50_000, "section 5.1: environment steps of goal i", 1, 10**9)
+    filters: int = _parameter(16, "ours: filters of the convolution", 1, 1024)
+    replay_capacity: int = _parameter(50_000, "ours: transitions in the replay buffer", 1, 10**7)
+    learning_starts: int = _parameter(500, "ours: environment steps before learning", 0, 10**6)
+    update_interval: int = _parameter(1, "ours: environment steps per update", 1, 10**4)
+    target_interval: int = _parameter(500, "ours: updates per target copy (N)", 1, 10**6)
+    epsilon_start: float = _parameter(1.0, "ours: ε at the first step", 0.0, 1.0)
+    epsilon_end: float = _parameter(0.1, "ours: ε after the decline", 0.0, 1.0)
+    epsilon_steps: int = _parameter(10_000, "ours: steps of ε's linear decline", 1, 10**9)
+    max_episode_steps: int = _parameter(200, "ours: steps that end an episode", 1, 10**6)
+    environments: int = _parameter(1, "ours: environments stepped at once", 1, 4096)
+
+    def __post_init__(self) -> None:
+        for entry in fields(self):
+            value, (low, high) = getattr(self, entry.name), entry.metadata["range"]
+            if not low <= value <= high:
+                raise ValueError(f"{entry.name} is {value}; it must lie in {low} to {high}")

@@ -1,0 +1,58 @@
+"""Experience replay: a ring of transitions, stored as cell numbers in place of observations."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+class Transitions(NamedTuple):
+    """B transitions as arrays. The map is named by the number of its scenario."""
+
+    scenario: NDArray[np.int64]
+    """(B,) number of the scenario."""
+    cell: NDArray[np.int64]
+    """(B,) the robot's cell before the move, y * W + x."""
+    action: NDArray[np.int64]
+    """(B,) 0..7."""
+    reward: NDArray[np.float32]
+    """(B,)"""
+    next_cell: NDArray[np.int64]
+    """(B,) the robot's cell after the move."""
+    discount: NDArray[np.float32]
+    """(B,) γ, or 0 where the move ended the episode; a truncated episode keeps γ."""
+
+
+class ReplayBuffer:
+    """The last `capacity` transitions.
+
+    Parameters
+    ----------
+    capacity : int
+    """
+
+    def __init__(self, capacity: int) -> None:
+        self.capacity = capacity
+        self.added = 0
+        self.transitions = Transitions._make(
+            np.zeros(capacity, np.float32 if name in ("reward", "discount") else np.int64)
+            for name in Transitions._fields
+        )
+
+    def __len__(self) -> int:
+        return min(self.added, self.capacity)
+
+    def add(self, transitions: Transitions) -> None:
+        """Add B transitions, B <= capacity; the oldest make room."""
+        count = len(transitions.cell)
+        places = (self.added + np.arange(count)) % self.capacity
+        for name in Transitions._fields:
+            getattr(self.transitions, name)[places] = getattr(transitions, name)
+        self.added += count
+
+    def sample(self, count: int, random: np.random.Generator) -> Transitions:
+        """Draw `count` transitions uniformly, with replacement."""
+        places = random.integers(len(self), size=count)
+        return Transitions._make(stored[places] for stored in self.transitions)

@@ -1,0 +1,61 @@
+from glob import glob
+
+from setuptools import find_packages, setup
+
+PACKAGE = "ddqn_planner"
+
+setup(
+    name=PACKAGE,
+    version="0.1.0",
+    description="Plans robot paths on grid maps with a Double DQN, as ROS 2 nodes",
+    long_description=open("README.md", encoding="utf-8").read(),
+    long_description_content_type="text/markdown",
+    license="Apache-2.0",
+    maintainer="ddqn_planner maintainers",
+    maintainer_email="maintainers@ddqn-planner.example",
+    packages=find_packages(include=[PACKAGE, f"{PACKAGE}.*"]),
+    package_data={PACKAGE: ["py.typed"]},
+    data_files=[
+        ("share/ament_index/resource_index/packages", [f"resource/{PACKAGE}"]),
+        (f"share/{PACKAGE}", ["package.xml"]),
+        (f"share/{PACKAGE}/maps", glob("maps/*")),
+        (f"share/{PACKAGE}/models", glob("models/*")),
+    ],
+    zip_safe=True,
+    python_requires=">=3.10",
+    install_requires=[
+        "gymnasium>=1.1",
+        "numpy>=1.26",
+        "Pillow>=10.0",
+        "PyYAML>=6.0",
+        "safetensors>=0.4",
+        "scipy>=1.11",
+        "torch>=2.1",
+        "tqdm>=4.60",
+    ],
+    extras_require={
+        "ros": ["ros-jazzy-rclpy[fastrtps]>=7.1.5,<8", "ros-jazzy-common-interfaces>=5.3,<6"],
+        "figures": ["matplotlib>=3.6"],
+        "tensorboard": ["tensorboard>=2.10"],
+        "bench": ["psutil>=5.9", "stable-baselines3>=2.6"],
+        "test": [
+            "colcon-core>=0.15",
+            "colcon-package-selection",
+            "colcon-ros>=0.4",
+            "hypothesis>=6.80",
+            "mypy>=1.10",
+            "pytest>=7.4",
+            "ruff>=0.9",
+            "types-PyYAML",
+            "types-tqdm",
+        ],
+    },
+    entry_points={
+        "console_scripts": [
+            "ddqn-planner = ddqn_planner.cli:main",
+            "map_server_node = ddqn_planner.nodes.map_server_node:main",
+            "planner_node = ddqn_planner.nodes.planner_node:main",
+            "trainer_node = ddqn_planner.nodes.trainer_node:main",
+        ],
+    },
+)

@@ -1,0 +1,95 @@
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import assume, given
+from hypothesis import strategies as st
+from strategies import occupancies
+
+from ddqn_planner.grid import GridMap
+
+origins = st.tuples(
+    st.floats(-100, 100), st.floats(-100, 100), st.floats(-2 * math.pi, 2 * math.pi)
+)
+
+
+@given(occupancies, st.floats(0.01, 10), origins, st.data())
+def test_the_centre_of_a_cell_lies_in_that_cell(
+    occupancy: np.ndarray,
+    resolution: float,
+    origin: tuple[float, float, float],
+    data: st.DataObject,
+) -> None:
+    grid = GridMap(occupancy, resolution, origin)
+    cell = (
+        data.draw(st.integers(0, grid.width - 1)),
+        data.draw(st.integers(0, grid.height - 1)),
+    )
+    assert grid.world_to_cell(*grid.cell_to_world(cell)) == cell
+
+
+def test_a_cell_owns_its_lower_edges_and_not_its_upper_ones() -> None:
+    grid = GridMap(np.zeros((4, 4)), resolution=0.5, origin=(-1.0, -1.0, 0.0))
+    assert grid.world_to_cell(-1.0, -1.0) == (0, 0)
+    assert grid.world_to_cell(-0.5, -0.75) == (1, 0)
+    assert not grid.contains(grid.world_to_cell(1.0, 0.0))
+    assert not grid.contains(grid.world_to_cell(math.nextafter(-1.0, -2.0), 0.0))
+
+
+def test_the_origin_turns_the_map_counter_clockwise() -> None:
+    grid = GridMap(np.zeros((2, 3)), resolution=1.0, origin=(10.0, 20.0, math.pi / 2))
+    assert grid.cell_to_world((2, 0)) == pytest.approx((9.5, 22.5))
+    assert grid.world_to_cell(9.5, 22.5) == (2, 0)
+
+
+@given(occupancies, occupancies)
+def test_equal_maps_and_no_others_have_equal_fingerprints(a: np.ndarray, b: np.ndarray) -> None:
+    assert GridMap(a).fingerprint == GridMap(a.copy(), 0.1).fingerprint
+    assume(not np.array_equal(a, b))
+    assert GridMap(a).fingerprint != GridMap(b).fingerprint
+
+
+def test_the_map_keeps_its_own_occupancy() -> None:
+    occupancy = np.zeros((2, 2), dtype=bool)
+    grid = GridMap(occupancy)
+    occupancy[0, 0] = True
+    assert grid.is_free((0, 0))
+    with pytest.raises(ValueError, match="read-only"):
+        grid.occupancy[0, 0] = True
+
+
+@pytest.mark.parametrize(
+    ("values", "threshold", "allow_unknown", "occupied"),
+    [
+        ([[0, 64, 65, 100, -1]], 65, False, [[0, 0, 1, 1, 1]]),
+        ([[0, 64, 65, 100, -1]], 65, True, [[0, 0, 1, 1, 0]]),
+        ([[0, 1, -1]], 1, True, [[0, 1, 0]]),
+    ],
+)
+def test_occupancy_values_are_cut_at_the_threshold(
+    values: list[list[int]], threshold: int, allow_unknown: bool, occupied: list[list[int]]
+) -> None:
+    grid = GridMap.from_occupancy_values(
+        np.array(values, dtype=np.int8),
+        occupied_threshold=threshold,
+        allow_unknown=allow_unknown,
+    )
+    np.testing.assert_array_equal(grid.occupancy, np.array(occupied, dtype=bool))
+
+
+@pytest.mark.parametrize(
+    ("arguments", "named"),
+    [
+        ((np.zeros((0, 3)),), "shape"),
+        ((np.zeros(3),), "shape"),
+        ((np.zeros((1, 1)), 0.0), "resolution"),
+        ((np.zeros((1, 1)), math.nan), "resolution"),
+        ((np.zeros((1, 1)), 1.0, (0.0, math.inf, 0.0)), "origin"),
+        ((np.zeros((1, 1)), 1.0, (0.0, 0.0)), "origin"),
+    ],
+)
+def test_a_malformed_map_is_refused_by_name(arguments: tuple, named: str) -> None:
+    with pytest.raises(ValueError, match=named):
+        GridMap(*arguments)

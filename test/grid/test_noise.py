@@ -1,0 +1,42 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from ddqn_planner.grid import GridMap, MoveRule, connected_cells, scatter_obstacles
+from ddqn_planner.planning import shortest_path
+from ddqn_planner.training.environment import Scenario
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_one_to_five_new_obstacles_lie_by_the_path_and_leave_a_way(
+    paper: Scenario, seed: int
+) -> None:
+    grid, rule = paper.grid, MoveRule.ROBOT_SAFE
+    path = shortest_path(grid, paper.start, paper.goal, rule)
+    noisy, rejected = scatter_obstacles(grid, path, rule, np.random.default_rng(seed))
+    new = np.argwhere(noisy.occupancy & ~grid.occupancy)
+    assert 1 <= len(new) <= 5
+    assert not (grid.occupancy & ~noisy.occupancy).any()
+    assert rejected >= 0
+    for y, x in new:
+        assert min(max(abs(x - px), abs(y - py)) for px, py in path) <= 1
+    start_x, start_y = paper.start
+    assert connected_cells(noisy.occupancy, paper.goal, rule)[start_y, start_x]
+
+
+def test_the_same_seed_scatters_the_same_obstacles(paper: Scenario) -> None:
+    path = shortest_path(paper.grid, paper.start, paper.goal, MoveRule.ROBOT_SAFE)
+    first, second = (
+        scatter_obstacles(paper.grid, path, MoveRule.ROBOT_SAFE, np.random.default_rng(7))[0]
+        for _ in range(2)
+    )
+    assert first.fingerprint == second.fingerprint
+
+
+def test_a_corridor_that_any_obstacle_closes_is_refused() -> None:
+    path = [(x, 0) for x in range(4)]
+    with pytest.raises(ValueError, match="left a path"):
+        scatter_obstacles(
+            GridMap(np.zeros((1, 4))), path, MoveRule.ROBOT_SAFE, np.random.default_rng(0)
+        )

@@ -1,0 +1,58 @@
+from __future__ import annotations
+
+import numpy as np
+import torch
+from hypothesis import given
+from strategies import grids_with_free_cell
+
+from ddqn_planner.grid import Cell, GridMap
+from ddqn_planner.model import PaperQNetwork
+from ddqn_planner.model.observation import (
+    FREE,
+    GOAL,
+    OBSTACLE,
+    ROBOT,
+    observation_background,
+    observe,
+)
+
+
+@given(grids_with_free_cell())
+def test_the_observation_shows_four_kinds_of_cell(grid_and_goal: tuple[GridMap, Cell]) -> None:
+    grid, goal = grid_and_goal
+    background = observation_background(grid.occupancy, goal)
+    for number, observation in enumerate(
+        observe(background, np.arange(grid.occupancy.size), grid.occupancy.shape)
+    ):
+        robot = (number % grid.width, number // grid.width)
+        for y in range(grid.height):
+            for x in range(grid.width):
+                kind = FREE if grid.is_free((x, y)) else OBSTACLE
+                kind = GOAL if (x, y) == goal else kind
+                assert observation[y, x] == (ROBOT if (x, y) == robot else kind)
+    assert len({FREE, GOAL, OBSTACLE, ROBOT}) == 4
+
+
+@given(grids_with_free_cell())
+def test_the_q_field_holds_the_networks_answer_in_each_cell(
+    grid_and_goal: tuple[GridMap, Cell],
+) -> None:
+    grid, goal = grid_and_goal
+    network = PaperQNetwork(grid.height, grid.width, filters=3)
+    q = network.q_values(grid.occupancy, goal)
+    assert q.shape == (8, grid.height, grid.width)
+    assert q.dtype == np.float32
+    background = observation_background(grid.occupancy, goal)
+    for x, y in grid.free_cells():
+        number = np.array([y * grid.width + x])
+        observation = torch.from_numpy(observe(background, number, grid.occupancy.shape))
+        with torch.inference_mode():
+            expected = network(observation)[0].numpy()
+        np.testing.assert_allclose(q[:, y, x], expected, atol=1e-5)
+
+
+def test_a_robot_in_the_last_row_and_column_is_seen() -> None:
+    network = PaperQNetwork(20, 20, filters=4)
+    q = network.q_values(np.zeros((20, 20), dtype=bool), (3, 3))
+    assert not np.allclose(q[:, 19, 19], q[:, 19, 18])
+    assert not np.allclose(q[:, 19, 19], q[:, 18, 19])

@@ -1,0 +1,125 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from strategies import grids_with_free_cell
+
+from ddqn_planner import GridMap, MoveRule, Planner, PlanStatus, QField
+from ddqn_planner.grid import LENGTHS, MOVES, Cell, legal_moves
+from ddqn_planner.model import ModelMetadata, PaperQNetwork
+from ddqn_planner.planning import shortest_distances
+from ddqn_planner.planning.evaluation import evaluate
+
+RULES = st.sampled_from(list(MoveRule))
+
+
+def perfect_field(grid: GridMap, goal: Cell, rule: MoveRule) -> QField:
+    """The field whose Q is minus the length of the shortest path through each move."""
+    distance = np.pad(shortest_distances(grid, goal, rule), 1, constant_values=np.inf)
+    height, width = grid.occupancy.shape
+    q = [
+        -length - distance[1 + dy : 1 + dy + height, 1 + dx : 1 + dx + width]
+        for (dx, dy), length in zip(MOVES, LENGTHS, strict=True)
+    ]
+    return QField(goal, np.array(q, dtype=np.float32), legal_moves(grid.occupancy, rule))
+
+
+def random_planner(height: int, width: int, seed: int) -> Planner:
+    torch.manual_seed(seed)
+    network = PaperQNetwork(height, width, filters=4).requires_grad_(False)
+    sizes = {"height": height, "width": width, "filters": 4}
+    return Planner(
+        network, ModelMetadata("paper", sizes, MoveRule.CORNER_CUTTING, 0.95, "", 0, seed, "")
+    )
+
+
+@given(grids_with_free_cell(), RULES)
+def test_a_perfect_field_walks_every_shortest_path(
+    grid_and_goal: tuple[GridMap, Cell], rule: MoveRule
+) -> None:
+    grid, goal = grid_and_goal
+    evaluation = evaluate(perfect_field(grid, goal, rule), grid, rule)
+    reachable = np.isfinite(shortest_distances(grid, goal, rule)).sum() - 1
+    assert evaluation.solved == evaluation.starts == reachable
+    if reachable:
+        assert evaluation.worst_ratio == pytest.approx(1.0)
+
+
+@given(grids_with_free_cell(), RULES, st.integers(0, 5), st.data())
+def test_whatever_the_network_says_each_move_of_a_path_is_legal(
+    grid_and_goal: tuple[GridMap, Cell], rule: MoveRule, seed: int, data: st.DataObject
+) -> None:
+    grid, goal = grid_and_goal
+    start = data.draw(st.sampled_from(grid.free_cells()))
+    plan = random_planner(grid.height, grid.width, seed).plan(grid, start, goal, rule)
+    optimum = shortest_distances(grid, goal, rule)[start[1], start[0]]
+    if plan.status is PlanStatus.SUCCEEDED:
+        assert (plan.cells[0], plan.cells[-1]) == (start, goal)
+        legal = legal_moves(grid.occupancy, rule)
+        for (x, y), (next_x, next_y) in zip(plan.cells, plan.cells[1:], strict=False):
+            (action,) = np.flatnonzero(((next_x - x, next_y - y) == MOVES).all(axis=1))
+            assert legal[action, y, x]
+        assert plan.length >= optimum - 1e-9
+    else:
+        assert plan.cells == ()
+        expected = PlanStatus.NO_PATH if np.isinf(optimum) else PlanStatus.WALK_TRAPPED
+        assert plan.status is expected
+
+
+def test_a_start_on_the_goal_is_a_path_of_one_cell() -> None:
+    plan = random_planner(3, 3, 0).plan(GridMap(np.zeros((3, 3))), (1, 1), (1, 1))
+    assert plan.status is PlanStatus.SUCCEEDED
+    assert plan.cells == ((1, 1),)
+    assert plan.length == 0
+
+
+@pytest.mark.parametrize(
+    ("start", "goal", "status"),
+    [
+        ((-1, 0), (2, 2), PlanStatus.START_OUTSIDE_MAP),
+        ((0, 0), (0, 3), PlanStatus.GOAL_OUTSIDE_MAP),
+        ((1, 1), (2, 2), PlanStatus.START_OCCUPIED),
+        ((0, 0), (1, 1), PlanStatus.GOAL_OCCUPIED),
+    ],
+)
+def test_a_request_off_the_free_cells_is_told_apart(
+    start: Cell, goal: Cell, status: PlanStatus
+) -> None:
+    occupancy = np.zeros((3, 3), dtype=bool)
+    occupancy[1, 1] = True
+    assert random_planner(3, 3, 0).plan(GridMap(occupancy), start, goal).status is status
+
+
+def test_a_map_of_another_size_is_refused() -> None:
+    grid = GridMap(np.zeros((4, 5)))
+    planner = random_planner(5, 4, 0)
+    assert planner.plan(grid, (0, 0), (1, 1)).status is PlanStatus.MAP_SIZE_UNSUPPORTED
+    with pytest.raises(ValueError, match="5 x 4"):
+        planner.q_field(grid, (1, 1))
+
+
+def test_a_field_is_computed_once_a_map_goal_and_rule() -> None:
+    planner, free = random_planner(3, 3, 0), GridMap(np.zeros((3, 3)))
+    field = planner.q_field(free, (1, 1))
+    assert planner.q_field(GridMap(np.zeros((3, 3))), (1, 1)) is field
+    assert planner.q_field(free, (1, 2)) is not field
+    assert planner.q_field(free, (1, 1), MoveRule.ROBOT_SAFE) is not field
+    other = np.zeros((3, 3))
+    other[0, 0] = 1
+    assert planner.q_field(GridMap(other), (1, 1)) is not field
+
+
+def test_the_goal_has_the_greatest_value() -> None:
+    field = random_planner(4, 4, 0).q_field(GridMap(np.zeros((4, 4))), (2, 1))
+    assert field.value[1, 2] == field.value.max()
+    assert field.value.shape == (4, 4)
+
+
+def test_the_shipped_model_finds_the_papers_path(paper) -> None:  # type: ignore[no-untyped-def]
+    planner = Planner.load("dilemma")
+    plan = planner.plan(paper.grid, paper.start, paper.goal)
+    assert plan.length == pytest.approx(6 + 12 * 2**0.5)
+    assert planner.metadata.map_fingerprint == paper.grid.fingerprint

@@ -1,0 +1,25 @@
+"""Random maps for the property tests."""
+
+from __future__ import annotations
+
+import numpy as np
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as numpy_st
+
+from ddqn_planner.grid import GridMap
+
+occupancies = numpy_st.arrays(
+    np.bool_,
+    numpy_st.array_shapes(min_dims=2, max_dims=2, min_side=1, max_side=9),
+    elements=st.sampled_from([False, False, True]),
+)
+
+
+@st.composite
+def grids_with_free_cell(draw: st.DrawFn) -> tuple[GridMap, tuple[int, int]]:
+    """A map and one of its free cells."""
+    occupancy = draw(occupancies)
+    y = draw(st.integers(0, occupancy.shape[0] - 1))
+    x = draw(st.integers(0, occupancy.shape[1] - 1))
+    occupancy[y, x] = False
+    return GridMap(occupancy), (x, y)

@@ -1,0 +1,159 @@
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+
+from ddqn_planner import MoveRule, PlanStatus
+from ddqn_planner.model import load_model
+from ddqn_planner.planning.evaluation import evaluate
+from ddqn_planner.training.environment import Scenario
+from ddqn_planner.training.hyper_parameters import HyperParameters
+from ddqn_planner.training.trainer import CheckpointError, Episode, Outcome, Trainer
+
+QUICK = HyperParameters(
+    learning_rate=0.003, filters=8, learning_starts=50, epsilon_steps=1500, target_interval=100
+)
+
+
+def make(scenario: Scenario, parameters: HyperParameters = QUICK, seed: int = 0) -> Trainer:
+    return Trainer([scenario], MoveRule.ROBOT_SAFE, parameters, seed)
+
+
+def train(trainer: Trainer, until: int) -> list[Episode]:
+    return [episode for finished in trainer.run(until) for episode in finished]
+
+
+def weights(trainer: Trainer) -> Iterator[torch.Tensor]:
+    return iter(trainer.network.state_dict().values())
+
+
+def same_weights(a: Trainer, b: Trainer) -> bool:
+    return all(torch.equal(x, y) for x, y in zip(weights(a), weights(b), strict=True))
+
+
+def test_training_learns_the_way_around_a_wall(small: Scenario) -> None:
+    trainer = make(small)
+    train(trainer, 3000)
+    field = trainer.planner().q_field(small.grid, small.goal)
+    evaluation = evaluate(field, small.grid, MoveRule.ROBOT_SAFE)
+    assert evaluation.solved == evaluation.starts
+    assert evaluation.mean_ratio < 1.1
+    assert field.rollout(small.start).status is PlanStatus.SUCCEEDED
+
+
+def test_the_value_of_the_last_moves_is_what_the_rewards_add_up_to(small: Scenario) -> None:
+    trainer = make(small)
+    train(trainer, 3000)
+    field = trainer.planner().q_field(small.grid, small.goal)
+    assert field.q[6, 1, 4] == pytest.approx(10.0, abs=0.6)  # onto the goal
+    assert field.q[0, 1, 4] == pytest.approx(-10.0, abs=0.6)  # off the map
+
+
+def test_one_seed_gives_one_network_and_another_seed_another(small: Scenario) -> None:
+    trainers = [make(small, seed=seed) for seed in (4, 4, 5)]
+    for trainer in trainers:
+        train(trainer, 400)
+    assert same_weights(trainers[0], trainers[1])
+    assert not same_weights(trainers[0], trainers[2])
+
+
+@pytest.mark.parametrize("environments", [1, 3])
+@pytest.mark.parametrize("first", [20, 301])
+def test_an_interrupted_training_goes_on_bit_for_bit(
+    small: Scenario, tmp_path: Path, environments: int, first: int
+) -> None:
+    parameters = replace(QUICK, environments=environments, replay_capacity=200, update_interval=2)
+    whole, interrupted = make(small, parameters), make(small, parameters)
+    episodes = train(whole, 600)
+    before = train(interrupted, first)
+    interrupted.save_checkpoint(tmp_path / "checkpoint")
+    resumed = Trainer.load_checkpoint(tmp_path / "checkpoint", [small])
+    assert before + train(resumed, 600) == episodes
+    assert same_weights(whole, resumed)
+    assert (whole.steps, whole.updates, whole.episodes, whole.epsilon) == (
+        resumed.steps,
+        resumed.updates,
+        resumed.episodes,
+        resumed.epsilon,
+    )
+
+
+def test_the_loop_can_be_left_after_any_step(small: Scenario) -> None:
+    whole, left = make(small), make(small)
+    train(whole, 200)
+    for _ in left.run(200):
+        if left.steps == 77:
+            break
+    train(left, 200)
+    assert same_weights(whole, left)
+
+
+@pytest.mark.parametrize(("environments", "interval"), [(1, 1), (3, 2), (3, 5), (4, 3)])
+def test_updates_keep_their_ratio_to_steps(
+    small: Scenario, environments: int, interval: int
+) -> None:
+    parameters = replace(
+        QUICK, environments=environments, update_interval=interval, learning_starts=0
+    )
+    trainer = make(small, parameters)
+    train(trainer, 240)
+    assert trainer.updates == trainer.steps // interval
+
+
+def test_episodes_tell_how_they_went(small: Scenario) -> None:
+    parameters = replace(QUICK, max_episode_steps=5)
+    episodes = train(make(small, parameters), 2000)
+    assert [episode.number for episode in episodes] == list(range(1, len(episodes) + 1))
+    assert {episode.outcome for episode in episodes} == set(Outcome)
+    for episode in episodes:
+        assert all(small.grid.is_free(cell) for cell in episode.cells)
+        assert episode.average_reward == episode.total_reward / episode.moves
+        collided = episode.outcome is Outcome.COLLIDED
+        assert episode.moves == len(episode.cells) - (0 if collided else 1)
+        assert (episode.cells[-1] == small.goal) == (episode.outcome is Outcome.REACHED_GOAL)
+        if episode.outcome is Outcome.OUT_OF_STEPS:
+            assert episode.moves == 5
+
+
+def test_a_saved_model_plans_as_the_trainer_does(small: Scenario, tmp_path: Path) -> None:
+    trainer = make(small)
+    train(trainer, 300)
+    trainer.save_model(tmp_path / "model.safetensors")
+    network, metadata = load_model(tmp_path / "model.safetensors")
+    assert metadata == trainer.metadata()
+    assert metadata.steps == 300
+    expected = trainer.planner().q_field(small.grid, small.goal).q
+    assert (network.q_values(small.grid.occupancy, small.goal) == expected).all()
+
+
+def test_a_checkpoint_of_another_problem_is_refused(
+    small: Scenario, paper: Scenario, tmp_path: Path
+) -> None:
+    make(small).save_checkpoint(tmp_path / "checkpoint")
+    with pytest.raises(CheckpointError, match="another map"):
+        Trainer.load_checkpoint(tmp_path / "checkpoint", [paper])
+
+
+@pytest.mark.parametrize("fraction", [0.0, 0.3, 0.9])
+def test_a_truncated_checkpoint_is_refused(
+    small: Scenario, tmp_path: Path, fraction: float
+) -> None:
+    path = tmp_path / "checkpoint"
+    make(small).save_checkpoint(path)
+    content = path.read_bytes()
+    path.write_bytes(content[: int(fraction * len(content))])
+    with pytest.raises(CheckpointError, match="no whole checkpoint"):
+        Trainer.load_checkpoint(path, [small])
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [("gamma", 1.5), ("batch_size", 0), ("learning_rate", float("nan")), ("p_r", -0.1)],
+)
+def test_a_parameter_out_of_range_is_named(name: str, value: float) -> None:
+    with pytest.raises(ValueError, match=f"{name} is {value}"):
+        HyperParameters(**{name: value})  # type: ignore[arg-type]
