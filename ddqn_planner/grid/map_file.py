@@ -1,9 +1,10 @@
-"""Map files: ROS map YAML with its image, read as Nav2's map_server does, and MovingAI ``.map``."""
+"""Map files: ROS maps (YAML and an image) are read and written, MovingAI maps are read."""
 
 from __future__ import annotations
 
-import io
-import math
+import os
+import re
+import reprlib
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -11,53 +12,54 @@ from typing import Any
 import numpy as np
 import yaml
 from numpy.typing import NDArray
-from PIL import Image, UnidentifiedImageError
+from PIL import Image
 
 from ddqn_planner.files import write_atomically
 from ddqn_planner.grid.grid_map import Cell, GridMap
 
-SCENARIO_KEY = "ddqn_planner"
-"""Key of a map YAML, unknown to map_server, under which start and goal stand."""
-
-MAX_YAML_BYTES = 2**20
 MAX_CELLS = 2**26
-"""A larger image is refused before it is decoded: 8192 x 8192 cells."""
+"""A larger map is refused before its cells are read."""
 
-OCCUPIED, FREE, UNKNOWN = 100, 0, -1
-MODES = ("trinary", "scale", "raw")
+MAX_YAML_BYTES = 2**16
+
+IMAGE_FORMATS = ("PPM", "PNG", "BMP", "JPEG")
 
 
 class MapFileError(ValueError):
-    """A map file cannot be read; the message names the file, the value and the remedy."""
+    """A map file cannot be read; the message says which value is wrong and what would be right."""
 
 
 class MapNotFoundError(MapFileError):
-    """There is no such map file."""
-
-
-class MapMetadataError(MapFileError):
-    """The YAML, or the header of a ``.map``, is wrong."""
+    """There is no such map file (result 1 of ``nav_msgs/LoadMap``)."""
 
 
 class MapDataError(MapFileError):
-    """The image, or the rows of a ``.map``, are wrong."""
+    """The image, or the rows of cells, cannot be read (result 2)."""
+
+
+class MapMetadataError(MapFileError):
+    """What the file says about the map is malformed (result 3)."""
 
 
 @dataclass(frozen=True, eq=False)
 class MapFile:
-    """What a map file says.
+    """What a map file holds.
 
     Parameters
     ----------
     values : (H, W) int8
-        Occupancy in percent, 0..100, or -1 where unknown; row y = 0 is the first row of
-        ``OccupancyGrid.data``: the bottom row of a ROS map's image, the top row of a ``.map``.
-    resolution : float
-        Metres a cell, > 0.
-    origin : (float, float, float)
-        See `GridMap`.
-    start, goal : (x, y) or None
-        The scenario that the file names, if it does.
+        Occupancy in percent, 0..100, or -1 where unknown. Row y = 0 is the bottom row of a ROS
+        map's image (the first row of ``OccupancyGrid.data``), but the first row of a MovingAI
+        file, so that the x and y of its scenario files hold. A read-only copy is kept.
+    resolution, origin
+        As for `GridMap`.
+    start, goal : (x, y), optional
+        Cells between which to plan.
+
+    Raises
+    ------
+    ValueError
+        If a value is out of its range, or the start or the goal lies outside the map.
     """
 
     values: NDArray[np.int8]
@@ -66,8 +68,23 @@ class MapFile:
     start: Cell | None = None
     goal: Cell | None = None
 
+    def __post_init__(self) -> None:
+        values = np.asarray(self.values)
+        checked = GridMap(values == 100, self.resolution, self.origin)
+        if values.min() < -1 or values.max() > 100:
+            raise ValueError(f"values span {values.min()}..{values.max()}; give -1..100")
+        for name, cell in (("start", self.start), ("goal", self.goal)):
+            if cell is not None and not checked.contains(cell):
+                size = f"{checked.width} x {checked.height}"
+                raise ValueError(f"{name} is {cell}; give a cell (x, y) of the map of {size} cells")
+        values = values.astype(np.int8)
+        values.flags.writeable = False
+        object.__setattr__(self, "values", values)
+        object.__setattr__(self, "resolution", checked.resolution)
+        object.__setattr__(self, "origin", checked.origin)
+
     def grid(self, occupied_threshold: int = 65, allow_unknown: bool = False) -> GridMap:
-        """Return the grid map; see `GridMap.from_occupancy_values`."""
+        """Return the grid map; the parameters are those of `GridMap.from_occupancy_values`."""
         return GridMap.from_occupancy_values(
             self.values, self.resolution, self.origin, occupied_threshold, allow_unknown
         )
@@ -76,214 +93,227 @@ class MapFile:
 def load_map(
     path: str | Path, occupied_threshold: int = 65, allow_unknown: bool = False
 ) -> GridMap:
-    """Read a map file as a grid map; see `read_map_file` and `GridMap.from_occupancy_values`."""
+    """Read the grid map of a map file: `read_map_file`, then `MapFile.grid`."""
     return read_map_file(path).grid(occupied_threshold, allow_unknown)
 
 
 def read_map_file(path: str | Path) -> MapFile:
-    """Read a map file.
+    """Read a ROS map (.yaml or .yml) or a map of the MovingAI benchmark (.map).
+
+    A ROS map is read as Nav2's map_server 1.3.7 and later reads it. Its YAML may also hold
+    ``ddqn_planner: {start: [x, y], goal: [x, y]}``, the cells of a scenario, which map_server
+    ignores.
 
     Parameters
     ----------
     path : str or Path
-        ``.yaml`` or ``.yml``: a ROS map, by the rules of nav2_map_server since 1.3.7; the image
-        in PGM, PNG or another format that Pillow knows. ``.map``: a MovingAI map; its row y = 0
-        is the first row of the file, as in the benchmark's scenarios.
+        A leading ``~`` stands for the home folder.
+
+    Raises
+    ------
+    MapNotFoundError
+        If there is no such file.
+    MapMetadataError
+        If the file is no map, or says something impossible of it.
+    MapDataError
+        If the cells of the map cannot be read.
+    """
+    path = Path(os.path.expanduser(path))
+    if not os.path.isfile(path):
+        raise MapNotFoundError(f"{path}: no such file; give the path of a .yaml or .map file")
+    if path.suffix.lower() not in (".yaml", ".yml", ".map"):
+        raise MapMetadataError(f"{path}: ends in {path.suffix!r}; give a .yaml, .yml or .map file")
+    try:
+        return _read_moving_ai(path) if path.suffix.lower() == ".map" else _read_ros(path)
+    except MapFileError:
+        raise
+    except ValueError as error:
+        raise MapMetadataError(f"{path}: {error}") from error
+
+
+def save_map(grid: GridMap | MapFile, path: str | Path) -> None:
+    """Write a ROS map that reads back equal: the YAML, and a PGM of the same name beside it.
+
+    The mode is trinary, or raw if a value is not one of -1, 0 and 100. Each file is replaced as a
+    whole, the image first.
+
+    Parameters
+    ----------
+    grid : GridMap or MapFile
+    path : str or Path
+        Of the YAML file; missing folders are made.
 
     Raises
     ------
     MapFileError
-        `MapNotFoundError`, `MapMetadataError` or `MapDataError`.
-    """
-    path = Path(path)
-    readers = {".yaml": _read_yaml, ".yml": _read_yaml, ".map": _read_moving_ai}
-    if path.suffix.lower() not in readers:
-        raise MapMetadataError(
-            f"{path}: the ending {path.suffix!r} is unknown; give a .yaml, .yml or .map file"
-        )
-    return readers[path.suffix.lower()](path)
-
-
-def save_map(map_file: MapFile | GridMap, path: str | Path) -> None:
-    """Write a ROS map: a YAML file, and beside it a PGM image of the same name.
-
-    Parameters
-    ----------
-    map_file : MapFile or GridMap
-    path : str or Path
-        Of the YAML file.
-
-    Raises
-    ------
+        If the path does not end in .yaml or .yml.
     OSError
-        If a file cannot be written; the old map is then untouched.
+        If a file cannot be written.
     """
-    path = Path(path)
-    if isinstance(map_file, GridMap):
-        values = np.where(map_file.occupancy, OCCUPIED, FREE).astype(np.int8)
-        map_file = MapFile(values, map_file.resolution, map_file.origin)
-    values = map_file.values
-    trinary = bool(np.isin(values, (FREE, OCCUPIED, UNKNOWN)).all())
-    grey = np.where(values < 0, 255, values)
-    if trinary:
-        grey = np.select([values == OCCUPIED, values == FREE], [0, 254], 205)
-    image = io.BytesIO()
-    Image.fromarray(grey[::-1].astype(np.uint8), mode="L").save(image, "PPM")
-    description: dict[str, Any] = {
-        "image": f"{path.stem}.pgm",
-        "mode": "trinary" if trinary else "raw",
-        "resolution": map_file.resolution,
-        "origin": list(map_file.origin),
+    path = Path(os.path.expanduser(path))
+    if path.suffix.lower() not in (".yaml", ".yml"):
+        raise MapFileError(f"{path}: ends in {path.suffix!r}; give a path that ends in .yaml")
+    if isinstance(grid, GridMap):
+        percent = np.where(grid.occupancy, 100, 0).astype(np.int8)
+        grid = MapFile(percent, grid.resolution, grid.origin)
+    values = grid.values
+    if np.isin(values, (-1, 0, 100)).all():
+        mode, grey = "trinary", np.select([values == 0, values == 100], [254, 0], 205)
+    else:
+        mode, grey = "raw", values
+    image = path.with_suffix(".pgm")
+    metadata: dict[str, Any] = {
+        "image": image.name,
+        "mode": mode,
+        "resolution": grid.resolution,
+        "origin": list(grid.origin),
         "negate": 0,
         "occupied_thresh": 0.65,
-        "free_thresh": 0.196,
+        "free_thresh": 0.196,  # grey 205 would be free at 0.25
     }
-    scenario = {"start": map_file.start, "goal": map_file.goal}
-    if named := {name: list(cell) for name, cell in scenario.items() if cell is not None}:
-        description[SCENARIO_KEY] = named
-    write_atomically(path.with_suffix(".pgm"), image.getvalue())
-    write_atomically(path, yaml.safe_dump(description, sort_keys=False).encode())
+    scenario = {"start": grid.start, "goal": grid.goal}
+    cells = {name: list(map(int, cell)) for name, cell in scenario.items() if cell is not None}
+    if cells:
+        metadata["ddqn_planner"] = cells
+    pixels = grey[::-1].astype(np.uint8).tobytes()  # row 0 is the bottom row; raw -1 becomes 255
+    write_atomically(image, b"P5\n%d %d\n255\n" % values.shape[::-1] + pixels)
+    text = yaml.safe_dump(metadata, sort_keys=False, allow_unicode=True, default_flow_style=None)
+    write_atomically(path, text.encode())
 
 
-def _read_text(path: Path, max_bytes: int) -> str:
+def _read_bytes(path: Path, limit: int, error_class: type[MapFileError]) -> bytes:
     try:
-        with path.open("rb") as file:
-            content = file.read(max_bytes + 1)
-        if len(content) > max_bytes:
-            raise MapMetadataError(f"{path}: is larger than {max_bytes} bytes; is it a map file?")
-        return content.decode()
-    except FileNotFoundError:
-        raise MapNotFoundError(f"{path}: there is no such file; check the path") from None
-    except (OSError, UnicodeDecodeError) as error:
-        raise MapMetadataError(f"{path}: cannot be read ({error}); give a text file") from None
-
-
-def _read_yaml(path: Path) -> MapFile:
-    try:
-        entries = yaml.safe_load(_read_text(path, MAX_YAML_BYTES))
-    except (yaml.YAMLError, RecursionError, ValueError) as error:
-        if isinstance(error, MapFileError):
-            raise
-        raise MapMetadataError(f"{path}: is no YAML ({error}); correct it") from None
-    if not isinstance(entries, dict):
-        raise MapMetadataError(f"{path}: holds {type(entries).__name__}, not keys and values")
-    yaml_keys = _Keys(path, entries)
-    mode = yaml_keys.get("mode", "trinary", lambda v: v in MODES, f"one of {', '.join(MODES)}")
-    resolution = yaml_keys.number("resolution", lambda v: v > 0, "metres a cell, above 0")
-    origin = yaml_keys.get("origin", None, _three_numbers, "three finite numbers x, y, yaw")
-    negate = yaml_keys.get("negate", None, lambda v: v in (0, 1), "0 or 1")
-    occupied = yaml_keys.number("occupied_thresh", lambda v: 0 <= v <= 1, "0 to 1")
-    free = yaml_keys.number("free_thresh", lambda v: 0 <= v <= occupied, "0 to occupied_thresh")
-    image = yaml_keys.get("image", None, lambda v: isinstance(v, str) and v, "the image's path")
-    grey, opaque = _read_image(path.parent / image)
-    values = _occupancy(grey, opaque, mode, bool(negate), occupied, free)[::-1].copy()
-    start, goal = _scenario(path, entries.get(SCENARIO_KEY), values.shape)
-    return MapFile(values, resolution, (origin[0], origin[1], origin[2]), start, goal)
-
-
-class _Keys:
-    """The keys of a map YAML, each checked when it is asked for."""
-
-    def __init__(self, path: Path, entries: dict[Any, Any]) -> None:
-        self.path = path
-        self.entries = entries
-
-    def get(self, key: str, default: Any, valid: Any, expected: str) -> Any:
-        value = self.entries.get(key, default)
-        if value is None:
-            raise MapMetadataError(f"{self.path}: has no {key!r}; add it: {expected}")
-        try:
-            correct = valid(value)
-        except TypeError:
-            correct = False
-        if not correct:
-            raise MapMetadataError(f"{self.path}: {key} is {value!r}; it must be {expected}")
-        return value
-
-    def number(self, key: str, valid: Any, expected: str) -> float:
-        return float(self.get(key, None, lambda v: _is_number(v) and valid(v), expected))
-
-
-def _is_number(value: object) -> bool:
-    return type(value) in (int, float) and math.isfinite(value)  # type: ignore[arg-type]
-
-
-def _three_numbers(value: object) -> bool:
-    return isinstance(value, list) and len(value) == 3 and all(map(_is_number, value))
-
-
-def _read_image(path: Path) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
-    """Return the grey values and where the image is opaque, (H, W) each, the top row first."""
-    try:
-        with Image.open(path) as image:
-            if image.width * image.height > MAX_CELLS:
-                raise MapDataError(
-                    f"{path}: has {image.width} x {image.height} pixels; at most {MAX_CELLS} in "
-                    "all are read: crop it, or make the resolution coarser"
-                )
-            alpha = "A" in image.getbands() or "transparency" in image.info
-            opaque = np.asarray(image.convert("RGBA"))[..., 3] == 255 if alpha else np.True_
-            grey = np.asarray(image.convert("L"))
-    except FileNotFoundError:
-        raise MapDataError(f"{path}: there is no such image; correct 'image' in the YAML") from None
-    except (OSError, UnidentifiedImageError, Image.DecompressionBombError, ValueError) as error:
-        if isinstance(error, MapFileError):
-            raise
-        raise MapDataError(f"{path}: is no whole image ({error}); save it again") from None
-    return grey, np.broadcast_to(opaque, grey.shape)
-
-
-def _occupancy(
-    grey: NDArray[np.uint8],
-    opaque: NDArray[np.bool_],
-    mode: str,
-    negate: bool,
-    occupied: float,
-    free: float,
-) -> NDArray[np.int8]:
-    """Return the occupancy of grey values by the rules of nav2_map_server."""
-    if mode == "raw":
-        return np.where(grey <= OCCUPIED, grey, UNKNOWN).astype(np.int8)
-    probability = grey / 255 if negate else 1 - grey / 255
-    values = np.full(grey.shape, UNKNOWN, dtype=np.int8)
-    if mode == "scale":
-        between = (probability > free) & (probability < occupied)
-        values[between] = np.rint((probability[between] - free) / (occupied - free) * 100)
-    values[probability >= occupied] = OCCUPIED
-    values[probability <= free] = FREE
-    values[~opaque] = UNKNOWN
-    return values
-
-
-def _scenario(path: Path, entry: object, shape: tuple[int, ...]) -> tuple[Cell | None, Cell | None]:
-    cells: list[Cell | None] = []
-    for name in ("start", "goal"):
-        cell = entry.get(name) if isinstance(entry, dict) else None
-        if cell is not None:
-            integers = isinstance(cell, list) and [type(value) for value in cell] == [int, int]
-            if not (integers and 0 <= cell[0] < shape[1] and 0 <= cell[1] < shape[0]):
-                raise MapMetadataError(
-                    f"{path}: {SCENARIO_KEY}: {name} is {cell!r}; it must be a cell [x, y] of the "
-                    f"{shape[1]} x {shape[0]} map"
-                )
-            cell = (cell[0], cell[1])
-        cells.append(cell)
-    return cells[0], cells[1]
+        with open(path, "rb") as file:
+            content = file.read(limit + 1)
+    except OSError as error:
+        raise error_class(f"{path}: cannot be read ({error.strerror}); check its rights") from error
+    if len(content) > limit:
+        raise error_class(f"{path}: longer than {limit} bytes; give a smaller file")
+    return content
 
 
 def _read_moving_ai(path: Path) -> MapFile:
-    lines = _read_text(path, MAX_CELLS + MAX_YAML_BYTES).splitlines()
+    # A row of one cell takes up to three bytes.
+    content = _read_bytes(path, 3 * MAX_CELLS, MapDataError)
+    pattern = rb"type octile\s+height (\d{1,8})\s+width (\d{1,8})\s+map[ \t]*\r?\n"
+    header = re.match(pattern, content)
+    if header is None:
+        raise ValueError(
+            f"begins with {content[:40]!r}; the first four lines must be"
+            " 'type octile', 'height H', 'width W' and 'map'"
+        )
+    height, width = int(header[1]), int(header[2])
+    if not 1 <= height * width <= MAX_CELLS:
+        raise ValueError(f"height is {height}, width is {width}; give 1 to {MAX_CELLS} cells")
+    rows = content[header.end() :].rstrip(b"\r\n").splitlines()
+    if len(rows) != height:
+        raise MapDataError(f"{path}: has {len(rows)} rows; give {height}, as its header says")
+    for y, row in enumerate(rows):
+        if len(row) != width:
+            raise MapDataError(
+                f"{path}: row {y} has {len(row)} characters; give {width}, as the header says"
+            )
+    cells = np.frombuffer(b"".join(rows), dtype=np.uint8).reshape(height, width)
+    free = np.isin(cells, np.frombuffer(b".GS", dtype=np.uint8))
+    return MapFile(np.where(free, np.int8(0), np.int8(100)))
+
+
+def _read_ros(path: Path) -> MapFile:
+    document = _parse_yaml(_read_bytes(path, MAX_YAML_BYTES, MapMetadataError))
+    name = document.get("image")
+    if not isinstance(name, str) or not name:
+        raise ValueError(f"image is {reprlib.repr(name)}; give the path of an image")
+    mode = str(document.get("mode", "trinary")).lower()
+    percent = _percent_of_grey(document, mode)
+    resolution = _number(document.get("resolution"), "resolution")
+    origin = document.get("origin")
+    if not isinstance(origin, list) or len(origin) != 3:
+        raise ValueError(f"origin is {reprlib.repr(origin)}; give three numbers [x, y, yaw]")
+    x, y, yaw = (_number(value, "origin") for value in origin)
+    scenario = document.get("ddqn_planner", {})
+    if not isinstance(scenario, dict) or not scenario.keys() <= {"start", "goal"}:
+        raise ValueError(f"ddqn_planner is {reprlib.repr(scenario)}; give {{start: , goal: }}")
+    start, goal = _cell(scenario, "start"), _cell(scenario, "goal")
+    values = _read_image(path.parent / name, percent, clear_is_unknown=mode != "raw")
+    return MapFile(values[::-1], resolution, (x, y, yaw), start, goal)
+
+
+def _parse_yaml(content: bytes) -> dict[str, Any]:
+    # As for map_server, a scalar is a text until its key says what it should be. BaseLoader knows
+    # no tags and no merge keys: nothing in the file can run, or grow, when it is read.
     try:
-        (_, kind), (_, height), (_, width) = (line.split() for line in lines[:3])
-        rows = lines[4 : 4 + int(height)]
-        if (kind, lines[3].strip()) != ("octile", "map") or int(height) < 1 or int(width) < 1:
-            raise ValueError(" / ".join(lines[:4]))
-    except (ValueError, IndexError) as error:
-        raise MapMetadataError(
-            f"{path}: its header is wrong ({error}); it must be the lines 'type octile', "
-            "'height H', 'width W' and 'map'"
-        ) from None
-    if len(rows) < int(height) or any(len(row) != int(width) for row in rows):
-        raise MapDataError(f"{path}: has not {height} rows of {width} characters; save it again")
-    free = np.isin(np.array([list(row) for row in rows]), list(".GS"))
-    return MapFile(np.where(free, FREE, OCCUPIED).astype(np.int8))
+        document = yaml.load(content, Loader=yaml.BaseLoader)
+    except (yaml.YAMLError, ValueError, OverflowError, RecursionError) as error:
+        raise ValueError(f"not a YAML file ({' '.join(str(error).split())})") from error
+    if not isinstance(document, dict):
+        raise ValueError("not a YAML mapping; give 'key: value' lines: image, resolution, ...")
+    return document
+
+
+def _number(value: object, key: str) -> float:
+    try:
+        return float(value if isinstance(value, str) else "")
+    except ValueError:
+        raise ValueError(f"{key} is {reprlib.repr(value)}; give a number") from None
+
+
+def _cell(scenario: dict[str, Any], key: str) -> Cell | None:
+    if key not in scenario:
+        return None
+    cell = scenario[key]
+    try:
+        x, y = map(int, cell if isinstance(cell, list) else ())
+    except (TypeError, ValueError):
+        raise ValueError(f"{key} is {reprlib.repr(cell)}; give two integers [x, y]") from None
+    return x, y
+
+
+def _percent_of_grey(document: dict[str, Any], mode: str) -> NDArray[np.int8]:
+    """Return (256,) int8: the occupancy of each grey value, by map_server's rules."""
+    free_thresh = _number(document.get("free_thresh"), "free_thresh")
+    occupied_thresh = _number(document.get("occupied_thresh"), "occupied_thresh")
+    if not 0 <= free_thresh <= occupied_thresh <= 1:
+        raise ValueError(
+            f"free_thresh is {free_thresh}, occupied_thresh is {occupied_thresh}; give"
+            " 0 <= free_thresh <= occupied_thresh <= 1"
+        )
+    negate = str(document.get("negate")).lower()
+    if negate not in ("0", "1", "false", "true", "no", "yes", "off", "on"):
+        raise ValueError(f"negate is {reprlib.repr(negate)}; give 0 or 1")
+    grey = np.arange(256)
+    if mode == "raw":
+        return np.where(grey <= 100, grey, -1).astype(np.int8)
+    if mode not in ("trinary", "scale"):
+        raise ValueError(f"mode is {reprlib.repr(mode)}; give trinary, scale or raw")
+    # map_server calculates in single precision, and a value may equal a threshold.
+    free, occupied = np.float32(free_thresh), np.float32(occupied_thresh)
+    p = grey.astype(np.float32) / np.float32(255)
+    if negate in ("0", "false", "no", "off"):
+        p = np.float32(1) - p
+    percent = np.full(256, -1.0)
+    if mode == "scale" and free < occupied:
+        percent = np.floor((p - free) / (occupied - free) * np.float32(100) + 0.5)
+    percent[p >= occupied] = 100
+    percent[p <= free] = 0
+    return percent.astype(np.int8)
+
+
+def _read_image(path: Path, percent: NDArray[np.int8], clear_is_unknown: bool) -> NDArray[np.int8]:
+    """Return (H, W) int8: the occupancy of each pixel; colours count by their Rec. 601 luma."""
+    if not os.path.isfile(path):
+        raise MapDataError(f"{path}: no such image; check 'image' in the YAML file")
+    try:
+        with Image.open(path, formats=IMAGE_FORMATS) as image:
+            if image.width * image.height > MAX_CELLS:
+                raise ValueError(f"{image.width} x {image.height} pixels")
+            sixteen_bits = image.mode.startswith("I")
+            grey = np.asarray(image) // 257 if sixteen_bits else np.asarray(image.convert("L"))
+            values: NDArray[np.int8] = percent[grey]
+            if clear_is_unknown and ("A" in image.getbands() or "transparency" in image.info):
+                values[np.asarray(image.convert("RGBA").getchannel("A")) < 255] = -1
+    except Exception as error:  # Pillow raises whatever broken bytes lead its decoders to
+        raise MapDataError(
+            f"{path}: not readable ({error}); give a {', '.join(IMAGE_FORMATS)} image of at most"
+            f" {MAX_CELLS} pixels"
+        ) from error
+    return values

@@ -7,16 +7,15 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-
 from numpy.typing import NDArray
 
 from ddqn_planner.grid import Cell, GridMap
 
-OBSTACLE_COLOUR = "#2b2d42"
-PATH_COLOUR = "#ff8c42"
-GOAL_COLOUR = "#d81159"
-VALUE_COLOURS = "YlGnBu"
-"""A map of light to dark that stays in order for colour-blind readers and in grey."""
+OBSTACLE_COLOUR = "#22223b"
+PATH_COLOUR = "#d1495b"
+VALUE_COLOURS = ("#f4f1de", "#cfe8dc", "#93cfc8", "#4fa3b5")
+"""From worst to best. Light to dark, so that their order is seen without colours too; the darkest
+is far from that of an obstacle."""
 
 
 class PictureError(RuntimeError):
@@ -66,6 +65,8 @@ def save_picture(
 
         matplotlib.use("Agg")
         import matplotlib.pyplot as plt
+        from matplotlib.colors import LinearSegmentedColormap
+        from matplotlib.ticker import MaxNLocator
     except ImportError as error:
         raise PictureError(
             f"pictures need matplotlib ({error}): pip install 'ddqn_planner[figures]'"
@@ -73,9 +74,12 @@ def save_picture(
     figure, axes = plt.subplots(figsize=(7.2, 6.6), dpi=120, layout="constrained")
     axes.set(facecolor="white", xlabel="x [cells]", ylabel="y [cells]", aspect="equal")
     axes.set_title(title, loc="left", fontsize=12)
+    for axis in (axes.xaxis, axes.yaxis):
+        axis.set_major_locator(MaxNLocator(integer=True))
     if value is not None:
         finite = np.where(np.isfinite(value), value, np.nan)
-        image = axes.imshow(finite, origin="lower", cmap=VALUE_COLOURS, interpolation="nearest")
+        colours = LinearSegmentedColormap.from_list("value", VALUE_COLOURS)
+        image = axes.imshow(finite, origin="lower", cmap=colours, interpolation="nearest")
         figure.colorbar(image, label=value_label, shrink=0.85)
     _draw_obstacles(axes, grid)
     if cells:
@@ -106,5 +110,5 @@ def _draw_path(axes: Any, cells: Sequence[Cell]) -> None:
     axes.plot(x, y, color=PATH_COLOUR, linewidth=3, path_effects=outline, label="path")
     ends = {"s": 110, "edgecolors": "white", "linewidths": 1.5, "zorder": 3}
     axes.scatter(x[0], y[0], marker="o", color=PATH_COLOUR, label="start", **ends)
-    axes.scatter(x[-1], y[-1], marker="*", color=GOAL_COLOUR, label="goal", **{**ends, "s": 260})
+    axes.scatter(x[-1], y[-1], marker="*", color=PATH_COLOUR, label="goal", **{**ends, "s": 300})
     axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.08), ncols=3, frameon=False)

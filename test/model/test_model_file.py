@@ -67,7 +67,7 @@ def test_a_pickle_is_not_run(tmp_path: Path) -> None:
 def save_as(path: Path, weights: PaperQNetwork, **changes: object) -> None:
     description = {**asdict(METADATA), **changes}
     content = safetensors.torch.save(
-        network.state_dict(), {"ddqn_planner": json.dumps(description)}
+        weights.state_dict(), {"ddqn_planner": json.dumps(description)}
     )
     path.write_bytes(content)
 

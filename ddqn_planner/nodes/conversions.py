@@ -1,0 +1,235 @@
+"""Between ROS messages and the core: grid maps, cells, paths and value fields.
+
+What comes in is checked as Nav2 checks it (nav2_util/validate_messages.hpp).
+"""
+
+from __future__ import annotations
+
+import array
+import math
+from collections.abc import Sequence
+from itertools import zip_longest
+
+import numpy as np
+from geometry_msgs.msg import Point, Pose, PoseStamped, Quaternion
+from nav_msgs.msg import OccupancyGrid, Path
+from numpy.typing import NDArray
+from std_msgs.msg import Header
+
+from ddqn_planner.grid import Cell, GridMap
+from ddqn_planner.planning import QField
+
+TOLERANCE = 1e-4
+"""How far the norm of a quaternion may be from 1."""
+
+MIN_RESOLUTION = 1e-6
+"""Metres a cell."""
+
+OCCUPIED = 100
+"""What an occupied cell is worth in an OccupancyGrid."""
+
+
+def grid_from_message(
+    message: OccupancyGrid, occupied_threshold: int = 65, allow_unknown: bool = False
+) -> GridMap:
+    """Make a grid map of a map message.
+
+    Parameters
+    ----------
+    message : nav_msgs/OccupancyGrid
+    occupied_threshold, allow_unknown
+        See `GridMap.from_occupancy_values`.
+
+    Raises
+    ------
+    ValueError
+        If the message is malformed, or its origin is rolled or pitched; the error names the value.
+    """
+    _check_map(message)
+    info = message.info
+    values = np.frombuffer(message.data, np.int8).reshape(info.height, info.width)
+    origin = (info.origin.position.x, info.origin.position.y, _yaw(info.origin.orientation))
+    return GridMap.from_occupancy_values(
+        values, info.resolution, origin, occupied_threshold, allow_unknown
+    )
+
+
+def occupancy_message(
+    values: NDArray[np.int8],
+    resolution: float,
+    origin: tuple[float, float, float],
+    header: Header,
+) -> OccupancyGrid:
+    """Make a map message.
+
+    Parameters
+    ----------
+    values : (H, W) int8
+        0..100, or -1 where unknown.
+    resolution, origin
+        As for `GridMap`.
+    header : std_msgs/Header
+    """
+    message = OccupancyGrid(header=header)
+    message.info.map_load_time = header.stamp
+    message.info.resolution = float(resolution)
+    message.info.height, message.info.width = (int(size) for size in values.shape)
+    message.info.origin.position.x = float(origin[0])
+    message.info.origin.position.y = float(origin[1])
+    message.info.origin.orientation = quaternion(origin[2])
+    message.data = array.array("b", values.astype(np.int8, copy=False).tobytes())
+    return message
+
+
+def value_message(field: QField, grid: GridMap, header: Header) -> OccupancyGrid:
+    """Make a map message of a value field: 0 the worst value, 100 the goal's, -1 where is none."""
+    value = field.value
+    known = np.isfinite(value) & ~grid.occupancy
+    percent = np.full(value.shape, -1, dtype=np.int8)
+    if known.any():
+        # In float64: the span of two float32 may overflow.
+        finite = value[known].astype(np.float64)
+        span = finite.max() - finite.min()
+        share = (finite - finite.min()) / span if span > 0 else np.ones_like(finite)
+        percent[known] = np.rint(100 * share).astype(np.int8)
+    return occupancy_message(percent, grid.resolution, grid.origin, header)
+
+
+def path_message(
+    cells: Sequence[Cell], grid: GridMap, header: Header, goal_orientation: Quaternion
+) -> Path:
+    """Make a path message of cells.
+
+    Parameters
+    ----------
+    cells : sequence of (x, y)
+        Neighbours, as in `Plan.cells`; none makes an empty path.
+    grid : GridMap
+    header : std_msgs/Header
+        Of the path and, the same object, of its poses.
+    goal_orientation : geometry_msgs/Quaternion
+        The last pose's. The others look to the next pose.
+    """
+    path = Path(header=header)
+    # The poses share what is equal: making messages is most of what an answer costs.
+    towards: dict[Cell, Quaternion] = {}
+    for cell, next_cell in zip_longest(cells, cells[1:]):
+        pose = PoseStamped(header=header)
+        pose.pose.position.x, pose.pose.position.y = grid.cell_to_world(cell)
+        if next_cell is None:
+            pose.pose.orientation = goal_orientation
+        else:
+            step = (next_cell[0] - cell[0], next_cell[1] - cell[1])
+            if step not in towards:
+                towards[step] = quaternion(grid.origin[2] + math.atan2(step[1], step[0]))
+            pose.pose.orientation = towards[step]
+        path.poses.append(pose)
+    return path
+
+
+def check_pose(name: str, header: Header, pose: Pose, frame: str = "") -> None:
+    """Check a pose.
+
+    Parameters
+    ----------
+    name : str
+        What the error calls it: ``"the goal"``.
+    header : std_msgs/Header
+    pose : geometry_msgs/Pose
+    frame : str
+        The map's frame, if it is known.
+
+    Raises
+    ------
+    ValueError
+        If the pose has no frame or another frame than `frame`, its position is not finite, or its
+        quaternion is not of norm 1.
+    """
+    if not header.frame_id or (frame and header.frame_id != frame):
+        expected = f"the map's is {frame!r}" if frame else "it needs the map's frame"
+        raise ValueError(
+            f"{name}'s frame is {header.frame_id!r}, {expected}; transform the pose to that frame "
+            "(in RViz: set Fixed Frame to it)"
+        )
+    _check_pose(name, pose)
+
+
+def cell_from_pose(name: str, header: Header, pose: Pose, grid: GridMap, frame: str) -> Cell:
+    """Return the cell of a pose; it may lie outside the map.
+
+    Parameters
+    ----------
+    name, header, pose, frame
+        See `check_pose`.
+    grid : GridMap
+
+    Raises
+    ------
+    ValueError
+        See `check_pose`; or if the pose is so far off that its cell has no number.
+    """
+    check_pose(name, header, pose, frame)
+    try:
+        return grid.world_to_cell(pose.position.x, pose.position.y)
+    except (OverflowError, ValueError):  # the floor of infinity, and of NaN
+        raise ValueError(
+            f"{name}'s position ({_numbers(pose.position)}) is too far from the map to have a "
+            "cell; give one on the map, in metres"
+        ) from None
+
+
+def quaternion(yaw: float) -> Quaternion:
+    """Return the rotation by `yaw` radians about z, counter-clockwise."""
+    rotation = Quaternion()
+    rotation.z = math.sin(yaw / 2)
+    rotation.w = math.cos(yaw / 2)
+    return rotation
+
+
+def _yaw(rotation: Quaternion) -> float:
+    return 2 * math.atan2(rotation.z, rotation.w)
+
+
+def _check_map(message: OccupancyGrid) -> None:
+    info = message.info
+    if not message.header.frame_id:
+        raise ValueError("the map's frame is ''; name one in header.frame_id")
+    if not (math.isfinite(info.resolution) and info.resolution > MIN_RESOLUTION):
+        raise ValueError(
+            f"the map's resolution is {info.resolution}; "
+            f"give metres a cell, finite and above {MIN_RESOLUTION}"
+        )
+    if info.width == 0 or info.height == 0:
+        raise ValueError(
+            f"the map has {info.width} x {info.height} cells; give at least one row and column"
+        )
+    if len(message.data) != info.width * info.height:
+        raise ValueError(
+            f"the map's data has {len(message.data)} values; "
+            f"its {info.width} x {info.height} cells need {info.width * info.height}"
+        )
+    _check_pose("the map's origin", info.origin)
+    if math.hypot(info.origin.orientation.x, info.origin.orientation.y) > TOLERANCE:
+        raise ValueError(
+            f"the map's origin is rolled or pitched ({_numbers(info.origin.orientation)}); "
+            "give a rotation about z alone"
+        )
+
+
+def _check_pose(name: str, pose: Pose) -> None:
+    position, rotation = pose.position, pose.orientation
+    if not all(map(math.isfinite, (position.x, position.y, position.z))):
+        raise ValueError(f"{name}'s position is ({_numbers(position)}); give finite numbers")
+    # A comparison that NaN fails.
+    norm = math.hypot(rotation.x, rotation.y, rotation.z, rotation.w)
+    if not abs(norm - 1) <= TOLERANCE:
+        raise ValueError(
+            f"{name}'s orientation is ({_numbers(rotation)}), a quaternion of norm {norm:.6g}; "
+            "give one of norm 1 (w = 1 and the rest 0 means no rotation)"
+        )
+
+
+def _numbers(message: Point | Quaternion) -> str:
+    return ", ".join(
+        f"{name} = {getattr(message, name):.6g}" for name in message.get_fields_and_field_types()
+    )

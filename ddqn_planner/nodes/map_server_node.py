@@ -1,0 +1,228 @@
+"""The map server node: serves a map file, and scatters the paper's static noise over it."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import numpy as np
+from nav_msgs.msg import OccupancyGrid
+from nav_msgs.srv import GetMap, LoadMap
+from numpy.typing import NDArray
+from rcl_interfaces.msg import IntegerRange, ParameterDescriptor
+from rclpy.exceptions import InvalidParameterValueException
+from rclpy.node import Node
+from std_msgs.msg import Header
+from std_srvs.srv import Trigger
+
+from ddqn_planner.grid import (
+    Cell,
+    GridMap,
+    MapFile,
+    MoveRule,
+    read_map_file,
+    scatter_obstacles,
+)
+from ddqn_planner.grid.map_file import MapDataError, MapMetadataError, MapNotFoundError
+from ddqn_planner.nodes.conversions import OCCUPIED, occupancy_message
+from ddqn_planner.nodes.runtime import LATCHED, spin_until_shutdown
+from ddqn_planner.planning import shortest_path
+from ddqn_planner.resources import PACKAGE, find_resource
+
+RESULTS: dict[type[Exception], int] = {
+    MapNotFoundError: LoadMap.Response.RESULT_MAP_DOES_NOT_EXIST,
+    MapDataError: LoadMap.Response.RESULT_INVALID_MAP_DATA,
+    MapMetadataError: LoadMap.Response.RESULT_INVALID_MAP_METADATA,
+}
+
+NO_MAP = "no map is loaded; call load_map first"
+
+
+class MapServerNode(Node):
+    """Serves one map, latched on a topic and as a service.
+
+    ``~/scatter_obstacles`` takes the loaded map, never one that already has new obstacles, so that
+    every call is a draw of its own; the parameter ``seed`` makes a sequence of calls repeatable.
+    A path is left under `MoveRule.ROBOT_SAFE`, and so under either rule; only on a map without
+    such a path it is left under `MoveRule.CORNER_CUTTING`.
+    """
+
+    def __init__(self) -> None:
+        super().__init__("map_server")
+        self._loaded: MapFile | None = None
+        self._served = OccupancyGrid()
+
+        yaml_filename = self._fixed_parameter(
+            "yaml_filename", "dilemma.yaml", "Path or URL of a map file, or name of a shipped one"
+        )
+        topic_name = self._fixed_parameter("topic_name", "map", "Topic of the map")
+        self._frame = self._fixed_parameter("frame_id", "map", "Frame of the map, not empty")
+        if not self._frame:
+            raise InvalidParameterValueException("frame_id", "", "name the map's frame")
+        self.declare_parameter(
+            "seed",
+            0,
+            ParameterDescriptor(
+                description="Seed of the new obstacles",
+                read_only=True,
+                integer_range=[IntegerRange(from_value=0, to_value=2**63 - 1, step=1)],
+            ),
+        )
+        self._random = np.random.default_rng(self.get_parameter("seed").value)
+
+        self._publisher = self.create_publisher(OccupancyGrid, topic_name, LATCHED)
+        self._load(yaml_filename)
+        self.create_service(GetMap, "~/map", self._on_get_map)
+        self.create_service(LoadMap, "~/load_map", self._on_load_map)
+        self.create_service(Trigger, "~/scatter_obstacles", self._on_scatter_obstacles)
+        self.create_service(Trigger, "~/restore_map", self._on_restore_map)
+
+    def _fixed_parameter(self, name: str, default: str, description: str) -> str:
+        descriptor = ParameterDescriptor(description=description, read_only=True)
+        value: str = self.declare_parameter(name, default, descriptor).value
+        return value
+
+    def _load(self, url: str) -> int:
+        """Load a map and serve it, or log why not; return the result code of LoadMap."""
+        try:
+            path = find_map(url)
+            self._loaded = read_map_file(path)
+        except Exception as error:
+            # Also what a broken file does to a library that reads it: the node must live on.
+            kept = "the map before it stays" if self._loaded else "no map is served"
+            self.get_logger().error(f"cannot load {url!r}, {kept}: {error}")
+            return int(RESULTS.get(type(error), LoadMap.Response.RESULT_UNDEFINED_FAILURE))
+        self._serve(self._loaded.values)
+        height, width = self._loaded.values.shape
+        self.get_logger().info(f"serving {path}, {width} x {height} cells")
+        return int(LoadMap.Response.RESULT_SUCCESS)
+
+    def _serve(self, values: NDArray[np.int8]) -> None:
+        assert self._loaded is not None
+        header = Header(stamp=self.get_clock().now().to_msg(), frame_id=self._frame)
+        self._served = occupancy_message(
+            values, self._loaded.resolution, self._loaded.origin, header
+        )
+        self._publisher.publish(self._served)
+
+    def _on_get_map(self, request: GetMap.Request, response: GetMap.Response) -> GetMap.Response:
+        if self._loaded is None:
+            self.get_logger().warning("asked for a map, but none is loaded: the answer is empty")
+        response.map = self._served
+        return response
+
+    def _on_load_map(
+        self, request: LoadMap.Request, response: LoadMap.Response
+    ) -> LoadMap.Response:
+        response.result = self._load(request.map_url)
+        if response.result == LoadMap.Response.RESULT_SUCCESS:
+            response.map = self._served
+        return response
+
+    def _on_scatter_obstacles(
+        self, request: Trigger.Request, response: Trigger.Response
+    ) -> Trigger.Response:
+        try:
+            response.message = self._scatter_obstacles()
+            response.success = True
+            self.get_logger().info(response.message)
+        except ValueError as error:
+            response.message = str(error)
+            self.get_logger().error(f"no obstacles were scattered: {error}")
+        return response
+
+    def _scatter_obstacles(self) -> str:
+        if self._loaded is None:
+            raise ValueError(NO_MAP)
+        grid, start, goal = self._loaded.grid(), self._loaded.start, self._loaded.goal
+        if start is None or goal is None:
+            raise ValueError(
+                "the map file names no start and goal, on whose path the obstacles would lie; add "
+                f"'{PACKAGE}: {{start: [x, y], goal: [x, y]}}' in cells to its YAML"
+            )
+        move_rule, path = known_path(grid, start, goal)
+        noisy, rejected = scatter_obstacles(grid, path, move_rule, self._random)
+        new = noisy.occupancy & ~grid.occupancy
+        self._serve(np.where(new, np.int8(OCCUPIED), self._loaded.values))
+        rows, columns = np.nonzero(new)
+        cells = [
+            "({:.3f}, {:.3f})".format(*grid.cell_to_world((x, y)))
+            for x, y in zip(columns.tolist(), rows.tolist(), strict=True)
+        ]
+        return f"{len(cells)} new obstacles at {', '.join(cells)} m; {rejected} draws thrown away"
+
+    def _on_restore_map(
+        self, request: Trigger.Request, response: Trigger.Response
+    ) -> Trigger.Response:
+        if self._loaded is None:
+            response.message = NO_MAP
+        else:
+            self._serve(self._loaded.values)
+            response.success, response.message = True, "the map is as it was loaded"
+        return response
+
+
+def find_map(url: str) -> Path:
+    """Return the file of a map that is given by path, URL or name.
+
+    Parameters
+    ----------
+    url : str
+        A path, a ``file://`` or ``package://`` URL, or the name of a map that comes with this
+        package. A file in the working directory goes before a shipped one.
+
+    Returns
+    -------
+    Path
+        It need not exist: whoever reads it will say so.
+
+    Raises
+    ------
+    MapNotFoundError
+        If there is no shipped map of that name, or no such package.
+    """
+    path = Path(url.removeprefix("file://"))
+    if url.startswith("package://"):
+        path = _package_path(url.removeprefix("package://"))
+    elif path.name == url and not path.exists():
+        try:
+            path = find_resource("maps", url)
+        except FileNotFoundError as error:
+            raise MapNotFoundError(f"{error}; give one of these or a path") from None
+    return path
+
+
+def _package_path(name: str) -> Path:
+    package, _, rest = name.partition("/")
+    try:
+        if package == PACKAGE:
+            return find_resource(str(Path(rest).parent), Path(rest).name)
+        from ament_index_python.packages import get_package_share_directory
+
+        return Path(get_package_share_directory(package)) / rest
+    except (ImportError, LookupError, OSError) as error:
+        raise MapNotFoundError(f"package://{name}: {error}; check it, or give a path") from None
+
+
+def known_path(grid: GridMap, start: Cell, goal: Cell) -> tuple[MoveRule, list[Cell]]:
+    """Return the shortest path and the safest rule under which there is one.
+
+    Raises
+    ------
+    ValueError
+        If there is none under either rule.
+    """
+    for move_rule in (MoveRule.ROBOT_SAFE, MoveRule.CORNER_CUTTING):
+        path = shortest_path(grid, start, goal, move_rule)
+        if path:
+            return move_rule, path
+    raise ValueError(f"no path leads from the start {start} to the goal {goal} of the map file")
+
+
+def main() -> int:
+    """Run the map server node until SIGINT or SIGTERM."""
+    return spin_until_shutdown(MapServerNode)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

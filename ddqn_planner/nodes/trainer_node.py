@@ -1,0 +1,362 @@
+"""The trainer node: trains a model on the map beside its executor, and replays episodes.
+
+The training thread makes no ROS call: what it has to tell it puts into a queue, which a timer
+publishes from. So nothing that must be saved depends on ROS still being there.
+"""
+
+from __future__ import annotations
+
+import queue
+import sys
+import threading
+from collections.abc import Iterator
+from dataclasses import fields
+from pathlib import Path as FilePath
+from typing import Any
+
+import torch
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped, Quaternion
+from nav_msgs.msg import OccupancyGrid, Path
+from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
+from rclpy.clock import Clock
+from rclpy.clock_type import ClockType
+from rclpy.exceptions import InvalidParameterValueException
+from rclpy.node import Node
+from rclpy.timer import Timer
+from std_msgs.msg import Float32, Header, String
+from std_srvs.srv import Trigger
+
+from ddqn_planner.grid import Cell, GridMap, MoveRule, read_map_file
+from ddqn_planner.nodes.conversions import (
+    cell_from_pose,
+    check_pose,
+    grid_from_message,
+    path_message,
+    quaternion,
+)
+from ddqn_planner.nodes.runtime import LATCHED, spin_until_shutdown
+from ddqn_planner.training.environment import Scenario
+from ddqn_planner.training.hyper_parameters import HyperParameters
+from ddqn_planner.training.run import TrainingRun, read_cells
+from ddqn_planner.training.trainer import Episode
+
+PUBLISH_PERIOD = 0.1
+"""Seconds between two looks into the training thread's queue."""
+
+
+class TrainerNode(Node):
+    """Trains on the last ``map`` from the last ``initialpose`` to the last ``goal_pose``.
+
+    With the parameter ``map_file`` it takes all three from a map file, until others are
+    published. A training keeps the map, start and end with which it was started. Its folder holds
+    a checkpoint: ``~/start`` goes on from there, also after a restart.
+    """
+
+    def __init__(self) -> None:
+        super().__init__("trainer")
+        self._grid: GridMap | None = None
+        self._frame = "map"
+        self._poses: dict[str, PoseStamped] = {}
+        self._run: TrainingRun | None = None
+        self._thread: threading.Thread | None = None
+        self._stop = threading.Event()
+        self._save = threading.Event()
+        self._events: queue.SimpleQueue[Episode | FilePath | Exception] = queue.SimpleQueue()
+        self._replay_timer: Timer | None = None
+        self._state, self._error = "idle", ""
+
+        self._declare_parameters()
+        self._episode_publisher = self.create_publisher(Path, "~/episode", 10)
+        self._reward_publisher = self.create_publisher(Float32, "~/average_reward", 100)
+        self._saved_publisher = self.create_publisher(String, "~/model_saved", LATCHED)
+        self._diagnostics_publisher = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
+        self._read_map_file()
+        self.create_subscription(OccupancyGrid, "map", self._on_map, LATCHED)
+        self.create_subscription(
+            PoseWithCovarianceStamped, "initialpose", self._on_initial_pose, 10
+        )
+        self.create_subscription(PoseStamped, "goal_pose", self._on_goal_pose, 10)
+        for name, callback in (
+            ("~/start", self._on_start),
+            ("~/stop", self._on_stop),
+            ("~/save", self._on_save),
+            ("~/replay", self._on_replay),
+        ):
+            self.create_service(Trigger, name, callback)
+        self._steady_clock = Clock(clock_type=ClockType.STEADY_TIME)
+        self.create_timer(PUBLISH_PERIOD, self._publish_events, clock=self._steady_clock)
+        self.create_timer(1.0, self._publish_diagnostics, clock=self._steady_clock)
+
+    # Parameters
+
+    def _declare_parameters(self) -> None:
+        def declare(name: str, default: object, description: str, **more: Any) -> None:
+            self.declare_parameter(
+                name, default, ParameterDescriptor(description=description, **more)
+            )
+
+        declare("output_folder", "runs/trainer", "Folder of the checkpoint, model and curves")
+        declare("map_file", "", "Map file with start and goal; '' to wait for topics")
+        declare("move_rule", "corner_cutting", f"One of {[rule.value for rule in MoveRule]}")
+        declare("seed", 0, "Seed of the training", **_integers(0, 2**31 - 1))
+        declare("occupied_threshold", 65, "Percent from which on", **_integers(1, 100))
+        declare("allow_unknown", False, "Whether unknown cells are free")
+        declare("episode_interval", 10, "Publish each n-th episode", **_integers(1, 10**6))
+        declare("replay_period", 0.05, "Seconds a step of ~/replay", **_floats(1e-3, 10.0))
+        for entry in fields(HyperParameters):
+            in_range = _integers if type(entry.default) is int else _floats
+            declare(
+                entry.name,
+                entry.default,
+                entry.metadata["source"],
+                **in_range(*entry.metadata["range"]),
+            )
+
+    def _value(self, name: str) -> Any:
+        return self.get_parameter(name).value
+
+    def _read_map_file(self) -> None:
+        name = self._value("map_file")
+        if not name:
+            return
+        try:
+            map_file = read_map_file(name)
+        except (ValueError, OSError) as error:
+            raise InvalidParameterValueException("map_file", name, str(error)) from None
+        self._grid = map_file.grid(self._value("occupied_threshold"), self._value("allow_unknown"))
+        for what, cell in (("start", map_file.start), ("goal", map_file.goal)):
+            if cell is not None:
+                pose = path_message([cell], self._grid, Header(frame_id=self._frame), quaternion(0))
+                self._poses[what] = pose.poses[0]
+
+    # What comes in
+
+    def _on_map(self, message: OccupancyGrid) -> None:
+        try:
+            self._grid = grid_from_message(
+                message, self._value("occupied_threshold"), self._value("allow_unknown")
+            )
+        except ValueError as error:
+            self._refuse(f"map refused: {error}")
+            return
+        self._frame = message.header.frame_id
+        self.get_logger().info(f"map of {self._grid.width} x {self._grid.height} cells")
+
+    def _on_initial_pose(self, message: PoseWithCovarianceStamped) -> None:
+        self._set_pose("start", PoseStamped(header=message.header, pose=message.pose.pose))
+
+    def _on_goal_pose(self, message: PoseStamped) -> None:
+        self._set_pose("goal", message)
+
+    def _set_pose(self, what: str, pose: PoseStamped) -> None:
+        try:
+            # A pose may come before the map: then it is held against the map at ~/start.
+            check_pose(f"the {what}", pose.header, pose.pose)
+            if self._grid is not None:
+                self.get_logger().info(f"the {what} is cell {self._cell(what, pose)}")
+        except ValueError as error:
+            self._refuse(f"{what} refused: {error}")
+        else:
+            self._poses[what] = pose
+
+    def _cell(self, what: str, pose: PoseStamped) -> Cell:
+        """Return the cell of a pose; ValueError if it is no free cell of the map."""
+        assert self._grid is not None
+        cell = cell_from_pose(f"the {what}", pose.header, pose.pose, self._grid, self._frame)
+        if not self._grid.is_free(cell):
+            raise ValueError(f"its cell {cell} is occupied or off the map; set it on a free cell")
+        return cell
+
+    def _refuse(self, reason: str) -> None:
+        self._error = reason
+        self.get_logger().error(reason)
+
+    # Services
+
+    def _on_start(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        if self._thread is not None and self._thread.is_alive():
+            return _answer(response, False, "training already; call ~/stop first")
+        try:
+            self._run = self._open_run()
+        except (ValueError, OSError) as error:
+            self._refuse(f"the training cannot start: {error}")
+            return _answer(response, False, str(error))
+        self._stop.clear()
+        self._save.clear()
+        self._state, self._error = "training", ""
+        trainer = self._run.trainer
+        last = trainer.parameters.steps
+        message = f"training in {self._run.folder} from step {trainer.steps} to {last}"
+        self._thread = threading.Thread(target=self._train, args=(self._run,), name="training")
+        self._thread.start()
+        return _answer(response, True, message)
+
+    def _open_run(self) -> TrainingRun:
+        if self._grid is None:
+            raise ValueError("no map was received yet; start a map server, or set map_file")
+        if self._poses.keys() < {"start", "goal"}:
+            raise ValueError(
+                "the start or the goal is unknown; publish initialpose and goal_pose, or set "
+                "map_file to a map with both"
+            )
+        return TrainingRun(
+            self._value("output_folder"),
+            [Scenario(self._grid, *(self._cell(w, self._poses[w]) for w in ("start", "goal")))],
+            MoveRule(self._value("move_rule")),
+            HyperParameters(**{e.name: self._value(e.name) for e in fields(HyperParameters)}),
+            self._value("seed"),
+        )
+
+    def _on_stop(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        self._stop_replay()
+        if self._thread is None or not self._thread.is_alive():
+            return _answer(response, True, "no training was running")
+        self._stop.set()
+        return _answer(response, True, "the training saves itself and stops; ~/start goes on")
+
+    def _on_save(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        if self._thread is None or not self._thread.is_alive():
+            return _answer(response, False, "no training is running; it was saved when it ended")
+        self._save.set()
+        return _answer(response, True, "saving after this step; ~/model_saved names the file")
+
+    def _on_replay(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        curves = FilePath(self._value("output_folder")) / "episodes.csv"
+        if self._grid is None:
+            return _answer(response, False, "no map was received yet; start a map server first")
+        try:
+            episodes = list(read_cells(curves, self._value("episode_interval")))
+        except (OSError, ValueError, KeyError) as error:
+            return _answer(response, False, f"no recorded episodes ({error}); call ~/start first")
+        if not episodes:
+            return _answer(response, False, f"{curves} holds no episode to replay yet; train on")
+        self._stop_replay()
+        frames = _growing(episodes)
+        self._replay_timer = self.create_timer(
+            self._value("replay_period"), lambda: self._replay_step(frames), clock=self._steady_clock
+        )
+        return _answer(response, True, f"replaying {len(episodes)} episodes on ~/episode")
+
+    # Training, in its own thread
+
+    def _train(self, run: TrainingRun) -> None:
+        try:
+            for finished in run.steps():
+                for episode in finished:
+                    self._events.put(episode)
+                stopping = self._stop.is_set()
+                if stopping or self._save.is_set():
+                    self._save.clear()
+                    run.try_to_save()
+                if run.saved_at == run.trainer.steps:
+                    self._note_save(run)
+                if stopping:
+                    return
+            self._note_save(run)
+        except Exception as error:  # whatever it is, the node must live on and say it
+            self._events.put(error)
+        finally:
+            run.close()
+
+    def _note_save(self, run: TrainingRun) -> None:
+        self._events.put(OSError(run.save_error) if run.save_error else run.model_path)
+
+    def _publish_events(self) -> None:
+        while not self._events.empty():
+            event = self._events.get()
+            if isinstance(event, Episode):
+                self._publish_episode(event)
+            elif isinstance(event, FilePath):
+                self._saved_publisher.publish(String(data=str(event.resolve())))
+            elif isinstance(event, OSError):
+                self._refuse(str(event))
+            else:
+                self._state = "failed"
+                self._refuse(f"the training failed: {event!r}; the last checkpoint is kept")
+        if self._state == "training" and self._thread and not self._thread.is_alive():
+            self._state = "stopped" if self._stop.is_set() else "finished"
+            self.get_logger().info(f"the training {self._state}")
+
+    def _publish_episode(self, episode: Episode) -> None:
+        self._reward_publisher.publish(Float32(data=episode.average_reward))
+        if episode.number % self._value("episode_interval") == 0 and self._replay_timer is None:
+            self._publish_cells(episode.cells)
+
+    def _publish_cells(self, cells: tuple[Cell, ...]) -> None:
+        # A training keeps its map when another one is published.
+        grid = self._run.trainer.scenarios[0].grid if self._run is not None else self._grid
+        if grid is not None:
+            stamp = self.get_clock().now().to_msg()
+            header = Header(stamp=stamp, frame_id=self._frame)
+            self._episode_publisher.publish(path_message(cells, grid, header, Quaternion(w=1.0)))
+
+    def _replay_step(self, frames: Iterator[tuple[Cell, ...]]) -> None:
+        frame = next(frames, None)
+        if frame is None:
+            self._stop_replay()
+        else:
+            self._publish_cells(frame)
+
+    def _stop_replay(self) -> None:
+        if self._replay_timer is not None:
+            self.destroy_timer(self._replay_timer)
+            self._replay_timer = None
+
+    def _publish_diagnostics(self) -> None:
+        status = DiagnosticStatus(name=f"{self.get_fully_qualified_name()}: training")
+        status.level = DiagnosticStatus.ERROR if self._error else DiagnosticStatus.OK
+        status.message = self._error or self._state
+        values = {"state": self._state}
+        for what, pose in self._poses.items():
+            position = pose.pose.position
+            values[what] = f"({position.x:.6g}, {position.y:.6g})"
+        if self._run is not None:
+            trainer = self._run.trainer
+            values |= {
+                "steps": f"{trainer.steps} of {trainer.parameters.steps}",
+                "episodes": str(trainer.episodes),
+                "epsilon": f"{trainer.epsilon:.3f}",
+                "folder": str(self._run.folder.resolve()),
+            }
+        status.values = [KeyValue(key=key, value=value) for key, value in values.items()]
+        message = DiagnosticArray(status=[status])
+        message.header.stamp = self.get_clock().now().to_msg()
+        self._diagnostics_publisher.publish(message)
+
+    def destroy_node(self) -> None:
+        """Let the training save itself and end, then destroy the node."""
+        self._stop.set()
+        if self._thread is not None:
+            self._thread.join()
+        super().destroy_node()
+
+
+def _answer(response: Trigger.Response, success: bool, message: str) -> Trigger.Response:
+    response.success, response.message = success, message
+    return response
+
+
+def _growing(episodes: list[tuple[Cell, ...]]) -> Iterator[tuple[Cell, ...]]:
+    """Yield each episode step by step: its first cell, its first two, and so on."""
+    for cells in episodes:
+        for count in range(1, len(cells) + 1):
+            yield cells[:count]
+
+
+def _integers(low: float, high: float) -> dict[str, Any]:
+    return {"integer_range": [IntegerRange(from_value=int(low), to_value=int(high), step=0)]}
+
+
+def _floats(low: float, high: float) -> dict[str, Any]:
+    return {"floating_point_range": [FloatingPointRange(from_value=low, to_value=high)]}
+
+
+def main() -> int:
+    """Run the trainer node until SIGINT or SIGTERM."""
+    torch.set_num_threads(1)  # as fast as two for this network, and leaves the executor a core
+    return spin_until_shutdown(TrainerNode)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,323 @@
+from __future__ import annotations
+
+import math
+import os
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import yaml
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as numpy_st
+from PIL import Image
+from strategies import occupancies
+
+from ddqn_planner.grid import GridMap, MapFile, load_map, read_map_file, save_map
+from ddqn_planner.grid.map_file import (
+    MapDataError,
+    MapFileError,
+    MapMetadataError,
+    MapNotFoundError,
+)
+
+VALID: dict[str, Any] = {
+    "image": "map.png",
+    "resolution": 0.05,
+    "origin": [1.0, -2.0, 0.5],
+    "negate": 0,
+    "occupied_thresh": 0.65,
+    "free_thresh": 0.25,
+}
+
+# A folder for each example costs nothing here: every example writes the same two files anew.
+same_folder = settings(suppress_health_check=[HealthCheck.function_scoped_fixture])
+
+
+def shapes() -> st.SearchStrategy[tuple[int, ...]]:
+    return numpy_st.array_shapes(min_dims=2, max_dims=2, min_side=1, max_side=7)
+
+
+def write(folder: Path, pixels: np.ndarray | Image.Image, /, **changes: Any) -> Path:
+    picture = pixels if isinstance(pixels, Image.Image) else Image.fromarray(pixels)
+    picture.save(folder / "map.png")
+    entries = {key: value for key, value in {**VALID, **changes}.items() if value is not None}
+    (folder / "map.yaml").write_text(yaml.safe_dump(entries))
+    return folder / "map.yaml"
+
+
+def occupancy_of(grey: int, mode: str, negate: bool, occupied: float, free: float) -> int:
+    """The rule of nav2_map_server for one opaque pixel, in its single precision."""
+    if mode == "raw":
+        return grey if grey <= 100 else -1
+    f = np.float32
+    p = f(grey) / f(255)
+    if not negate:
+        p = f(1) - p
+    if p <= f(free):
+        return 0
+    if p >= f(occupied):
+        return 100
+    if mode == "trinary":
+        return -1
+    return math.floor(float((p - f(free)) / (f(occupied) - f(free)) * f(100)) + 0.5)
+
+
+# Thresholds that a grey value equals are drawn often.
+thresholds = st.tuples(*2 * [st.integers(0, 255).map(lambda g: g / 255) | st.floats(0, 1)])
+
+
+@same_folder
+@given(
+    numpy_st.arrays(np.uint8, shapes()),
+    st.sampled_from(["trinary", "scale", "raw"]),
+    st.booleans(),
+    thresholds.map(sorted),
+)
+def test_each_mode_follows_map_servers_rule_and_row_0_is_the_bottom_one(
+    tmp_path: Path, image: np.ndarray, mode: str, negate: bool, thresholds: list[float]
+) -> None:
+    free, occupied = thresholds
+    path = write(
+        tmp_path, image, mode=mode, negate=int(negate), occupied_thresh=occupied, free_thresh=free
+    )
+    map_file = read_map_file(path)
+    expected = [
+        [occupancy_of(int(grey), mode, negate, occupied, free) for grey in row]
+        for row in image[::-1]
+    ]
+    np.testing.assert_array_equal(map_file.values, np.array(expected))
+    assert (map_file.resolution, map_file.origin) == (0.05, (1.0, -2.0, 0.5))
+
+
+@pytest.mark.parametrize(("free_thresh", "value"), [(0.196, -1), (0.25, 0)])
+def test_grey_205_is_unknown_only_below_its_threshold(
+    tmp_path: Path, free_thresh: float, value: int
+) -> None:
+    path = write(tmp_path, np.array([[205]], dtype=np.uint8), free_thresh=free_thresh)
+    assert read_map_file(path).values.item() == value
+
+
+def test_what_is_not_opaque_is_unknown(tmp_path: Path) -> None:
+    pixels = np.array([[[0, 0, 0, 255], [0, 0, 0, 254], [254, 254, 254, 0]]], dtype=np.uint8)
+    path = write(tmp_path, Image.fromarray(pixels))
+    assert read_map_file(path).values.tolist() == [[100, -1, -1]]
+
+
+def test_colours_are_read_as_grey(tmp_path: Path) -> None:
+    pixels = np.array([[[255, 255, 255], [10, 10, 10]]], dtype=np.uint8)
+    assert read_map_file(write(tmp_path, Image.fromarray(pixels))).values.tolist() == [[0, 100]]
+
+
+@same_folder
+@given(
+    numpy_st.arrays(np.int8, shapes(), elements=st.integers(-1, 100)),
+    st.floats(0.01, 10),
+    st.tuples(*3 * [st.floats(-100, 100)]),
+    st.data(),
+)
+def test_a_saved_map_comes_back_the_same(
+    tmp_path: Path,
+    values: np.ndarray,
+    resolution: float,
+    origin: tuple[float, float, float],
+    data: st.DataObject,
+) -> None:
+    cells = st.none() | st.tuples(
+        st.integers(0, values.shape[1] - 1), st.integers(0, values.shape[0] - 1)
+    )
+    start, goal = data.draw(cells), data.draw(cells)
+    save_map(MapFile(values, resolution, origin, start, goal), tmp_path / "saved.yaml")
+    read = read_map_file(tmp_path / "saved.yaml")
+    np.testing.assert_array_equal(read.values, values)
+    assert (read.resolution, read.origin, read.start, read.goal) == (
+        resolution,
+        origin,
+        start,
+        goal,
+    )
+
+
+@same_folder
+@given(occupancies)
+def test_a_saved_grid_comes_back_the_same(tmp_path: Path, occupancy: np.ndarray) -> None:
+    grid = GridMap(occupancy, 0.1, (1.0, 2.0, 0.3))
+    save_map(grid, tmp_path / "saved.yaml")
+    read = load_map(tmp_path / "saved.yaml")
+    assert (read.fingerprint, read.resolution, read.origin) == (
+        grid.fingerprint,
+        grid.resolution,
+        grid.origin,
+    )
+
+
+def test_a_moving_ai_map_keeps_the_benchmarks_rows_and_columns(tmp_path: Path) -> None:
+    path = tmp_path / "small.map"
+    path.write_text("type octile\nheight 2\nwidth 4\nmap\n.GS@\nTOW.\n")
+    grid = load_map(path)
+    assert grid.free_cells() == [(0, 0), (1, 0), (2, 0), (3, 1)]
+    assert grid.resolution == 1.0
+
+
+def test_the_papers_map_names_start_and_goal() -> None:
+    root = Path(__file__).resolve().parents[2]
+    map_file = read_map_file(root / "maps" / "dilemma.yaml")
+    assert (map_file.start, map_file.goal) == ((6, 6), (17, 19))
+
+
+@pytest.mark.parametrize(
+    ("changes", "named"),
+    [
+        ({"resolution": None}, "resolution is None"),
+        ({"resolution": 0}, "resolution is 0"),
+        ({"resolution": float("nan")}, r"resolution is \'\.nan\'"),
+        ({"resolution": "fine"}, "resolution is 'fine'"),
+        ({"resolution": True}, "resolution is 'true'"),
+        ({"origin": [0, 0]}, "origin is"),
+        ({"origin": [0, 0, float("inf")]}, "origin is"),
+        ({"origin": "here"}, "origin is 'here'"),
+        ({"negate": 2}, "negate is '2'"),
+        ({"occupied_thresh": 1.5}, r"occupied_thresh is 1\.5"),
+        ({"free_thresh": 0.7}, r"free_thresh is 0\.7"),
+        ({"mode": "quaternary"}, "mode is 'quaternary'"),
+        ({"mode": []}, r"mode is '\[\]'"),
+        ({"image": []}, r"image is \[\]"),
+        ({"ddqn_planner": {"start": [0, 9]}}, r"start is \(0, 9\)"),
+        ({"ddqn_planner": {"goal": [0.5, 0]}}, r"goal is \['0\.5', '0'\]"),
+        ({"ddqn_planner": {"goal": "there"}}, "goal is 'there'"),
+        ({"ddqn_planner": {"goal": "12"}}, "goal is '12'"),
+        ({"ddqn_planner": {"gaol": [0, 0]}}, "ddqn_planner is"),
+        ({"ddqn_planner": 5}, "ddqn_planner is '5'"),
+        ({"resolution": 10**400}, "resolution is inf"),
+    ],
+)
+def test_a_wrong_value_of_the_yaml_is_named(
+    tmp_path: Path, changes: dict[str, Any], named: str
+) -> None:
+    path = write(tmp_path, np.zeros((2, 2), dtype=np.uint8), **changes)
+    with pytest.raises(MapMetadataError, match=named):
+        read_map_file(path)
+
+
+@pytest.mark.parametrize(
+    "content", ["", "[1, 2", "a: &a [*a, *a]", "- 1", "\x00", "x" * 2**21, "[" * 5000]
+)
+def test_what_is_no_map_yaml_is_refused(tmp_path: Path, content: str) -> None:
+    path = tmp_path / "map.yaml"
+    path.write_text(content)
+    with pytest.raises(MapMetadataError, match=r"map\.yaml"):
+        read_map_file(path)
+
+
+def test_a_missing_file_is_told_from_a_broken_one(tmp_path: Path) -> None:
+    with pytest.raises(MapNotFoundError, match="no such file"):
+        read_map_file(tmp_path / "none.yaml")
+    (tmp_path / "folder.yaml").mkdir()
+    os.mkfifo(tmp_path / "pipe.yaml")
+    for name in ("folder.yaml", "pipe.yaml", "", "nul\0.yaml", "long" * 2000 + ".yaml"):
+        with pytest.raises(MapNotFoundError, match="no such file"):
+            read_map_file(tmp_path / name)
+    (tmp_path / "map.png").touch()
+    with pytest.raises(MapMetadataError, match=r"ends in '\.png'"):
+        read_map_file(tmp_path / "map.png")
+
+
+def test_a_missing_broken_or_huge_image_is_named(tmp_path: Path) -> None:
+    path = write(tmp_path, np.zeros((50, 50), dtype=np.uint8))
+    content = (tmp_path / "map.png").read_bytes()
+    for broken in (b"", b"no image", content[: len(content) // 2]):
+        (tmp_path / "map.png").write_bytes(broken)
+        with pytest.raises(MapDataError, match="not readable"):
+            read_map_file(path)
+    (tmp_path / "map.png").write_bytes(b"P5 100000 10000 255\n")
+    with pytest.raises(MapDataError, match=r"100000 x 10000|exceeds limit"):
+        read_map_file(path)
+    (tmp_path / "map.png").unlink()
+    with pytest.raises(MapDataError, match="no such image"):
+        read_map_file(path)
+
+
+@pytest.mark.parametrize(
+    ("content", "error"),
+    [
+        ("", MapMetadataError),
+        ("type octile\nheight x\nwidth 2\nmap\n..\n", MapMetadataError),
+        ("type octile\nheight 0\nwidth 2\nmap\n", MapMetadataError),
+        ("type quad\nheight 1\nwidth 2\nmap\n..\n", MapMetadataError),
+        ("type octile\nheight 2\nwidth 2\nmap\n..\n", MapDataError),
+        ("type octile\nheight 1\nwidth 2\nmap\n...\n", MapDataError),
+        ("type octile\nheight 1\nwidth 2\nmap\n..\n..\n", MapDataError),
+        ("type octile\nwidth 1\nheight 2\nmap\n.@\n", MapMetadataError),
+        ("type octile\nheight 99999999\nwidth 99999999\nmap\n..\n", MapMetadataError),
+    ],
+)
+def test_a_broken_moving_ai_map_is_refused(
+    tmp_path: Path, content: str, error: type[MapFileError]
+) -> None:
+    path = tmp_path / "broken.map"
+    path.write_text(content)
+    with pytest.raises(error, match=r"broken\.map"):
+        read_map_file(path)
+
+
+@pytest.mark.parametrize("resolution", ["5e-2", "'0.050'", "0.05"])
+def test_a_number_may_be_written_in_any_way_that_map_server_reads(
+    tmp_path: Path, resolution: str
+) -> None:
+    path = write(tmp_path, np.zeros((1, 1), dtype=np.uint8), mode="Trinary")
+    path.write_text(path.read_text().replace("resolution: 0.05", f"resolution: {resolution}"))
+    assert read_map_file(path).resolution == 0.05
+
+
+def test_a_wide_grey_value_counts_by_its_upper_byte(tmp_path: Path) -> None:
+    wide = np.array([[0, 100 * 257, 32768, 65535]], dtype=np.uint16)
+    path = write(tmp_path, Image.fromarray(wide), mode="raw")
+    assert read_map_file(path).values.tolist() == [[0, 100, -1, -1]]
+
+
+def test_nothing_in_a_yaml_grows_or_runs_when_it_is_read(tmp_path: Path) -> None:
+    path = write(tmp_path, np.zeros((1, 1), dtype=np.uint8))
+    merges = ["a0: &a0 {k: 1}"]
+    merges += [f"a{i}: &a{i} {{<<: [{', '.join([f'*a{i - 1}'] * 9)}]}}" for i in range(1, 12)]
+    tags = ["b: !!bool x", "t: !!timestamp x", "p: !!python/object/apply:os.abort []"]
+    path.write_text("\n".join([path.read_text(), *merges, *tags]))
+    assert read_map_file(path).values.tolist() == [[100]]
+
+
+@given(st.text() | st.sampled_from(['{a: "\\UFFFFFFFF"}', "%YAML 9.9\n---\na: b"]))
+@same_folder
+def test_a_yaml_of_any_text_is_refused_as_a_map(tmp_path: Path, text: str) -> None:
+    path = tmp_path / "any.yaml"
+    path.write_bytes(text.encode("utf-8", "surrogatepass"))
+    with pytest.raises(MapMetadataError, match=r"any\.yaml"):
+        read_map_file(path)
+
+
+@pytest.mark.parametrize("name", ["saved.pgm", "saved.map", "saved"])
+def test_a_map_is_saved_as_yaml_alone(tmp_path: Path, name: str) -> None:
+    with pytest.raises(MapFileError, match=r"\.yaml"):
+        save_map(GridMap(np.zeros((1, 1))), tmp_path / name)
+    assert not list(tmp_path.iterdir())
+
+
+def test_numbers_of_numpy_are_saved(tmp_path: Path) -> None:
+    cell = (np.int64(1), np.int64(0))
+    save_map(MapFile(np.zeros((1, 2)), np.float64(0.5), start=cell), tmp_path / "saved.yaml")
+    read = read_map_file(tmp_path / "saved.yaml")
+    assert (read.resolution, read.start) == (0.5, (1, 0))
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"values": np.zeros(3)},
+        {"values": np.full((2, 2), 101)},
+        {"resolution": 0.0},
+        {"origin": (0.0, math.nan, 0.0)},
+        {"goal": (2, 0)},
+    ],
+)
+def test_an_impossible_map_file_cannot_be_made(wrong: dict[str, Any]) -> None:
+    with pytest.raises(ValueError, match="give"):
+        MapFile(**{"values": np.zeros((2, 2)), **wrong})

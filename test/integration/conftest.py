@@ -1,0 +1,300 @@
+"""Real processes of the installed executables, and a client that talks to them over DDS."""
+
+from __future__ import annotations
+
+import importlib.util
+import itertools
+import os
+import re
+import signal
+import socket
+import subprocess
+import sysconfig
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import yaml
+
+TIMEOUT = 10.0
+"""Seconds that anything may take on a loaded machine."""
+
+STOP_TIMEOUT = 3.0
+"""Seconds in which a node ends after SIGINT or SIGTERM."""
+
+if importlib.util.find_spec("rclpy") is None:
+    collect_ignore_glob = ["test_*.py"]
+
+
+def claim_domain() -> tuple[int, socket.socket]:
+    """Return a domain id that no other test process of this machine has, and what holds it."""
+    for domain in range(1, 101):
+        claim = socket.socket()
+        try:
+            claim.bind(("127.0.0.1", 32768 + domain))
+        except OSError:
+            claim.close()
+        else:
+            return domain, claim
+    raise RuntimeError("all of the ROS domains 1 to 100 are claimed by other test processes")
+
+
+# Here, not in a fixture: it must stand before the test modules import rclpy and the messages.
+_domain, _claim = claim_domain()
+os.environ["ROS_DOMAIN_ID"] = str(_domain)
+os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
+os.environ["ROS_PYTHON_CHECK_FIELDS"] = "1"
+
+
+class NodeProcess:
+    """One executable in a process group of its own."""
+
+    def __init__(self, executable: str, arguments: list[str], log: Path) -> None:
+        self.log_path = log
+        with log.open("wb") as file:
+            self.process = subprocess.Popen(
+                [Path(sysconfig.get_path("scripts")) / executable, *arguments],
+                stdout=file,
+                stderr=subprocess.STDOUT,
+                start_new_session=True,
+            )
+
+    @property
+    def log(self) -> str:
+        return self.log_path.read_text(encoding="utf-8", errors="replace")
+
+    def wait_for_log(self, pattern: str) -> None:
+        deadline = time.monotonic() + TIMEOUT
+        while not re.search(pattern, self.log):
+            assert self.process.poll() is None, f"the node ended:\n{self.log}"
+            assert time.monotonic() < deadline, f"no {pattern!r} in the log:\n{self.log}"
+            time.sleep(0.02)
+
+    def stop(self, signal_number: int = signal.SIGINT) -> int:
+        """Send a signal to the process, and return its exit code."""
+        if self.process.poll() is None:
+            self.process.send_signal(signal_number)
+        try:
+            return self.process.wait(STOP_TIMEOUT)
+        except subprocess.TimeoutExpired:
+            os.killpg(self.process.pid, signal.SIGKILL)  # the group is its own
+            self.process.wait()
+            raise
+
+
+RunNode = Callable[..., Any]
+
+
+@pytest.fixture(scope="session")
+def run_node(tmp_path_factory: pytest.TempPathFactory) -> RunNode:
+    """Return a context manager that runs an executable, stops it by SIGINT and sees it exit with 0.
+
+    ``with run_node("planner_node", {"model": path}, ["map:=other"], namespace="/robot") as node``
+    """
+    logs = tmp_path_factory.mktemp("logs")
+    numbers = itertools.count()
+
+    @contextmanager
+    def run(
+        executable: str,
+        parameters: dict[str, Any] | None = None,
+        remaps: list[str] | None = None,
+        namespace: str = "",
+        exit_code: int = 0,
+    ) -> Iterator[NodeProcess]:
+        number = next(numbers)
+        arguments = ["--ros-args"]
+        if parameters:
+            # As a file: on the command line a YAML parser guesses the types of strings.
+            file = logs / f"{number}.yaml"
+            file.write_text(yaml.safe_dump({"/**": {"ros__parameters": parameters}}))
+            arguments += ["--params-file", str(file)]
+        for remap in [*(remaps or []), *([f"__ns:={namespace}"] if namespace else [])]:
+            arguments += ["-r", remap]
+        process = NodeProcess(executable, arguments, logs / f"{number}.{executable}.log")
+        try:
+            yield process
+        finally:
+            ended_with = process.stop()
+        assert ended_with == exit_code, process.log
+
+    return run
+
+
+class Recorder:
+    """The messages that a topic brought since the last `clear`."""
+
+    def __init__(self) -> None:
+        self._arrived = threading.Condition()
+        self._messages: list[Any] = []
+        self._since = 0
+
+    def add(self, message: Any) -> None:
+        with self._arrived:
+            self._messages.append(message)
+            self._arrived.notify_all()
+
+    def clear(self) -> None:
+        """Forget what came, and what is still on its way: what was stamped before now."""
+        with self._arrived:
+            self._messages.clear()
+            self._since = time.time_ns()
+
+    def wait(
+        self, predicate: Callable[[Any], bool] = lambda message: True, timeout: float = TIMEOUT
+    ) -> Any:
+        """Return the first message for which the predicate holds; there is a limit to the wait."""
+
+        def find() -> Any:
+            return next((m for m in self._messages if self._is_new(m) and predicate(m)), None)
+
+        with self._arrived:
+            found = self._arrived.wait_for(find, timeout)
+            assert found is not None, f"no such message; there came {self._messages[-3:]}"
+            return found
+
+    def _is_new(self, message: Any) -> bool:
+        stamp = message.header.stamp
+        return stamp.sec * 10**9 + stamp.nanosec >= self._since
+
+
+class Client:
+    """A node in a context of its own, spun in the background."""
+
+    def __init__(self, namespace: str) -> None:
+        import rclpy
+        from rclpy.executors import SingleThreadedExecutor
+
+        self.context = rclpy.Context()
+        self.context.init(args=[])
+        self.node = rclpy.create_node(
+            "client", namespace=namespace, context=self.context, start_parameter_services=False
+        )
+        self._executor = SingleThreadedExecutor(context=self.context)
+        self._executor.add_node(self.node)
+        self._thread = threading.Thread(target=self._spin, daemon=True)
+        self._thread.start()
+        self._clients: dict[str, Any] = {}
+        self._publishers: dict[str, Any] = {}
+
+    def _spin(self) -> None:
+        from rclpy.executors import ExternalShutdownException
+
+        with suppress(ExternalShutdownException):
+            self._executor.spin()
+
+    def close(self) -> None:
+        self._executor.shutdown()
+        self.context.try_shutdown()
+        self._thread.join()
+        self.node.destroy_node()
+
+    def call(self, service_type: Any, name: str, request: Any = None) -> Any:
+        """Wait for a service, call it, and return its response."""
+        if name not in self._clients:
+            self._clients[name] = self.node.create_client(service_type, name)
+        assert self._clients[name].wait_for_service(TIMEOUT), f"no service {name}"
+        answered = threading.Event()
+        future = self._clients[name].call_async(request or service_type.Request())
+        future.add_done_callback(lambda _: answered.set())
+        assert answered.wait(TIMEOUT), f"no answer from {name}"
+        return future.result()
+
+    def publish(self, topic: str, message: Any, qos: Any = 10, listeners: int = 1) -> None:
+        """Publish a message once so many listen."""
+        if topic not in self._publishers:
+            self._publishers[topic] = self.node.create_publisher(type(message), topic, qos)
+        deadline = time.monotonic() + TIMEOUT
+        while self._publishers[topic].get_subscription_count() < listeners:
+            assert time.monotonic() < deadline, f"nobody listens to {topic}"
+            time.sleep(0.01)
+        self._publishers[topic].publish(message)
+
+    def subscribe(self, message_type: Any, topic: str, qos: Any = 10) -> Recorder:
+        recorder = Recorder()
+        self.node.create_subscription(message_type, topic, recorder.add, qos)
+        return recorder
+
+    def set_parameters(self, node: str, **values: Any) -> list[Any]:
+        """Set parameters of a node one by one; return a SetParametersResult for each."""
+        from rcl_interfaces.srv import SetParameters
+        from rclpy.parameter import Parameter
+
+        messages = [Parameter(name, value=v).to_parameter_msg() for name, v in values.items()]
+        request = SetParameters.Request(parameters=messages)
+        results: list[Any] = self.call(SetParameters, f"{node}/set_parameters", request).results
+        return results
+
+    def get_parameter(self, node: str, name: str) -> Any:
+        from rcl_interfaces.srv import GetParameters
+        from rclpy.parameter import parameter_value_to_python
+
+        request = GetParameters.Request(names=[name])
+        response = self.call(GetParameters, f"{node}/get_parameters", request)
+        return parameter_value_to_python(response.values[0])
+
+
+@pytest.fixture(scope="module")
+def make_client() -> Iterator[Callable[[str], Client]]:
+    """Return a function that makes a client in a namespace; all end with the test module."""
+    clients: list[Client] = []
+
+    def make(namespace: str = "") -> Client:
+        clients.append(Client(namespace))
+        return clients[-1]
+
+    yield make
+    for client in clients:
+        client.close()
+
+
+SMALL_MAP = """
+......
+.##...
+..#.#.
+....#.
+.#....
+......
+"""
+"""Row 0 of the text is y = 0."""
+
+
+@pytest.fixture(scope="session")
+def small_values() -> np.ndarray:
+    """(6, 6) int8: occupancy of a map that a small model can learn in seconds."""
+    rows = [[100 if c == "#" else 0 for c in line] for line in SMALL_MAP.split()]
+    return np.array(rows, dtype=np.int8)
+
+
+@pytest.fixture(scope="session")
+def trained_model(tmp_path_factory: pytest.TempPathFactory, small_values: np.ndarray) -> Path:
+    """Train a model of the small map toward (5, 5) from anywhere, and return its file."""
+    from ddqn_planner.grid import GridMap, MoveRule
+    from ddqn_planner.training.environment import Scenario
+    from ddqn_planner.training.hyper_parameters import HyperParameters
+    from ddqn_planner.training.trainer import Trainer
+
+    grid = GridMap(small_values > 0)
+    parameters = HyperParameters(
+        learning_rate=3e-3,
+        p_r=1.0,
+        filters=16,
+        learning_starts=200,
+        update_interval=2,
+        target_interval=100,
+        epsilon_steps=2000,
+        max_episode_steps=40,
+    )
+    trainer = Trainer([Scenario(grid, (0, 0), (5, 5))], MoveRule.ROBOT_SAFE, parameters, seed=1)
+    for _ in trainer.run(3000):
+        pass
+    planner = trainer.planner()
+    assert all(planner.plan(grid, cell, (5, 5)).cells for cell in grid.free_cells())
+    path = tmp_path_factory.mktemp("models") / "small.safetensors"
+    trainer.save_model(path)
+    return path

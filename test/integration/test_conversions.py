@@ -1,0 +1,199 @@
+from __future__ import annotations
+
+import array
+import math
+
+import numpy as np
+import pytest
+from geometry_msgs.msg import Pose, Quaternion
+from nav_msgs.msg import OccupancyGrid
+from std_msgs.msg import Header
+
+from ddqn_planner.grid import MOVES, GridMap
+from ddqn_planner.nodes.conversions import (
+    cell_from_pose,
+    check_pose,
+    grid_from_message,
+    occupancy_message,
+    path_message,
+    quaternion,
+    value_message,
+)
+from ddqn_planner.planning import QField
+
+HEADER = Header(frame_id="map")
+
+
+def yaw_of(rotation: Quaternion) -> float:
+    return math.atan2(2 * rotation.w * rotation.z, 1 - 2 * rotation.z**2)
+
+
+def map_message(values: object = ((0, 100, -1), (64, 65, 0))) -> OccupancyGrid:
+    return occupancy_message(
+        np.array(values, dtype=np.int8), 0.5, (-1.0, 2.0, 0.3), Header(frame_id="map")
+    )
+
+
+def pose_at(x: float, y: float) -> Pose:
+    pose = Pose()
+    pose.position.x, pose.position.y = x, y
+    return pose
+
+
+def test_occupancy_values_survive_the_way_to_a_message_and_back() -> None:
+    message = map_message()
+    assert (message.info.width, message.info.height) == (3, 2)
+    assert message.data == array.array("b", [0, 100, -1, 64, 65, 0])
+    grid = grid_from_message(message)
+    assert grid.occupancy.tolist() == [[False, True, True], [False, True, False]]
+    assert grid.resolution == 0.5
+    assert grid.origin == pytest.approx((-1.0, 2.0, 0.3))
+
+
+def test_threshold_and_unknown_cells_are_as_asked_for() -> None:
+    grid = grid_from_message(map_message(), occupied_threshold=64, allow_unknown=True)
+    assert grid.occupancy.tolist() == [[False, True, False], [True, True, False]]
+
+
+@pytest.mark.parametrize("yaw", [0.0, 1.0, -1.0, 3.0, -3.0, math.pi])
+def test_yaw_of_an_origin_survives(yaw: float) -> None:
+    message = occupancy_message(np.zeros((1, 1), np.int8), 1.0, (0.0, 0.0, yaw), HEADER)
+    read = grid_from_message(message).origin[2]
+    assert (math.cos(read), math.sin(read)) == pytest.approx((math.cos(yaw), math.sin(yaw)))
+
+
+def test_a_quaternion_and_its_negative_are_one_rotation() -> None:
+    message = map_message()
+    rotation = message.info.origin.orientation
+    rotation.z, rotation.w = -rotation.z, -rotation.w
+    read = grid_from_message(message).origin[2]
+    assert (math.cos(read), math.sin(read)) == pytest.approx((math.cos(0.3), math.sin(0.3)))
+
+
+def set_nested(message: object, path: str, value: object) -> None:
+    *parents, name = path.split(".")
+    for parent in parents:
+        message = getattr(message, parent)
+    setattr(message, name, value)
+
+
+MALFORMED_MAPS = [
+    ("header.frame_id", "", "frame is ''"),
+    ("info.resolution", 0.0, "resolution is 0.0"),
+    ("info.resolution", math.nan, "resolution is nan"),
+    ("info.resolution", math.inf, "resolution is inf"),
+    ("info.resolution", -0.5, "resolution is -0.5"),
+    ("info.width", 0, "0 x 2 cells"),
+    ("info.height", 0, "3 x 0 cells"),
+    ("info.width", 4, "data has 6 values; its 4 x 2 cells need 8"),
+    ("data", array.array("b"), "data has 0 values; its 3 x 2 cells need 6"),
+    ("info.origin.position.x", math.nan, "position is .x = nan"),
+    ("info.origin.position.z", math.inf, "z = inf"),
+    ("info.origin.orientation", Quaternion(w=0.0), "quaternion of norm 0"),
+    ("info.origin.orientation", Quaternion(w=1.001), "quaternion of norm 1.001"),
+    ("info.origin.orientation", Quaternion(x=math.nan), "quaternion of norm nan"),
+    ("info.origin.orientation", Quaternion(x=math.sin(0.1), w=math.cos(0.1)), "rolled or pitched"),
+]
+
+
+@pytest.mark.parametrize(("field", "value", "reason"), MALFORMED_MAPS)
+def test_malformed_map_is_refused_by_the_name_of_its_value(
+    field: str, value: object, reason: str
+) -> None:
+    message = map_message()
+    set_nested(message, field, value)
+    with pytest.raises(ValueError, match=reason):
+        grid_from_message(message)
+
+
+def test_norm_within_the_tolerance_is_accepted() -> None:
+    check_pose("the goal", HEADER, Pose(orientation=Quaternion(w=1.00009)))
+
+
+@pytest.mark.parametrize(
+    ("field", "value", "reason"),
+    [
+        ("position.x", math.nan, r"the goal's position is \(x = nan"),
+        ("position.y", -math.inf, "y = -inf"),
+        ("orientation.w", 0.0, "quaternion of norm 0"),
+        ("orientation.w", 1e200, "quaternion of norm 1e[+]200"),
+        ("orientation.z", math.nan, "quaternion of norm nan"),
+        ("position.x", 1e308, "x = 1e[+]308.* too far"),
+    ],
+)
+def test_pose_without_a_cell_is_refused_by_the_name_of_its_value(
+    field: str, value: float, reason: str
+) -> None:
+    pose = Pose()
+    set_nested(pose, field, value)
+    grid = grid_from_message(map_message())
+    with pytest.raises(ValueError, match=reason):
+        cell_from_pose("the goal", HEADER, pose, grid, "map")
+
+
+@pytest.mark.parametrize("frame", ["", "odom"])
+def test_pose_in_another_frame_is_refused(frame: str) -> None:
+    with pytest.raises(ValueError, match=f"the start's frame is '{frame}', the map's is 'map'"):
+        check_pose("the start", Header(frame_id=frame), Pose(), "map")
+
+
+def test_frame_of_a_pose_is_free_but_not_empty_while_there_is_no_map() -> None:
+    check_pose("the start", Header(frame_id="odom"), Pose())
+    with pytest.raises(ValueError, match="frame is ''"):
+        check_pose("the start", Header(), Pose())
+
+
+def test_pose_off_the_map_has_a_cell_outside() -> None:
+    grid = GridMap(np.zeros((2, 2)), 0.5)
+    assert cell_from_pose("the goal", HEADER, pose_at(0.5, 0.99), grid, "map") == (1, 1)
+    assert cell_from_pose("the goal", HEADER, pose_at(-0.1, 1.0), grid, "map") == (-1, 2)
+
+
+@pytest.mark.parametrize("yaw", [0.0, 0.7, -2.0])
+def test_path_goes_through_cell_centres_and_looks_ahead(yaw: float) -> None:
+    grid = GridMap(np.zeros((9, 9)), 0.5, (-1.0, 2.0, yaw))
+    cells = [(4, 4)]
+    for dx, dy in MOVES.tolist():
+        cells.append((cells[-1][0] + dx, cells[-1][1] + dy))
+    goal_orientation = quaternion(1.5)
+    path = path_message(cells, grid, HEADER, goal_orientation)
+    assert all(pose.header is HEADER for pose in path.poses)
+    points = [(pose.pose.position.x, pose.pose.position.y) for pose in path.poses]
+    assert points == [grid.cell_to_world(cell) for cell in cells]
+    for pose, (x, y), (next_x, next_y) in zip(path.poses, points, points[1:], strict=False):
+        ahead = math.atan2(next_y - y, next_x - x)
+        looks = yaw_of(pose.pose.orientation)
+        assert math.cos(looks - ahead) == pytest.approx(1.0)
+    assert path.poses[-1].pose.orientation == goal_orientation
+
+
+def test_path_of_one_cell_has_the_orientation_of_the_goal() -> None:
+    path = path_message([(0, 0)], GridMap(np.zeros((1, 1))), HEADER, quaternion(-0.4))
+    assert [pose.pose.orientation for pose in path.poses] == [quaternion(-0.4)]
+
+
+def test_empty_path_keeps_its_frame() -> None:
+    path = path_message([], GridMap(np.zeros((1, 1))), HEADER, Quaternion())
+    assert (path.header.frame_id, path.poses) == ("map", [])
+
+
+def test_value_is_scaled_to_percent_and_unknown_where_there_is_none() -> None:
+    occupancy = np.array([[False, False, True, False]])
+    q = np.zeros((8, 1, 4), dtype=np.float32)
+    q[0, 0] = [-2.0, 4.0, 9.0, 9.0]
+    legal = np.zeros((8, 1, 4), dtype=np.bool_)
+    legal[0, 0, :2] = True
+    message = value_message(QField((1, 0), q, legal), GridMap(occupancy, 0.5), HEADER)
+    assert message.data.tolist() == [0, 100, -1, -1]
+    assert message.info.resolution == 0.5
+    assert message.header.frame_id == "map"
+
+
+@pytest.mark.parametrize("level", [0.0, 3e38, np.nan])
+def test_value_that_is_the_same_everywhere_makes_a_map(level: float) -> None:
+    q = np.full((8, 1, 2), level, dtype=np.float32)
+    q[0, 0, 0] = -level
+    message = value_message(
+        QField((1, 0), q, np.ones((8, 1, 2), dtype=np.bool_)), GridMap(np.zeros((1, 2))), HEADER
+    )
+    assert set(message.data) <= {-1, 100}

@@ -1,0 +1,269 @@
+from __future__ import annotations
+
+import re
+import signal
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from nav_msgs.msg import OccupancyGrid
+from nav_msgs.srv import GetMap, LoadMap
+from rcl_interfaces.srv import DescribeParameters
+from std_srvs.srv import Trigger
+
+from ddqn_planner.grid import MapFile, MoveRule, connected_cells, read_map_file, save_map
+from ddqn_planner.nodes.conversions import grid_from_message
+from ddqn_planner.nodes.runtime import LATCHED
+from ddqn_planner.resources import find_resource
+
+START, GOAL = (0, 0), (5, 5)
+NAMESPACE = "/maps"
+
+
+@pytest.fixture(scope="module")
+def map_file(tmp_path_factory: pytest.TempPathFactory, small_values: np.ndarray) -> Path:
+    path = tmp_path_factory.mktemp("maps") / "small.yaml"
+    save_map(MapFile(small_values, 0.25, (-1.0, 2.0, 0.5), START, GOAL), path)
+    return path
+
+
+@pytest.fixture(scope="module")
+def server(run_node: Any, map_file: Path) -> Iterator[Any]:
+    with run_node(
+        "map_server_node",
+        {"yaml_filename": str(map_file), "frame_id": "site", "topic_name": "plant", "seed": 3},
+        namespace=NAMESPACE,
+    ) as node:
+        yield node
+
+
+@pytest.fixture(scope="module")
+def client(server: Any, make_client: Callable[[str], Any]) -> Any:
+    return make_client(NAMESPACE)
+
+
+def get_map(client: Any) -> OccupancyGrid:
+    return client.call(GetMap, "map_server/map").map
+
+
+def load_map(client: Any, url: object) -> Any:
+    return client.call(LoadMap, "map_server/load_map", LoadMap.Request(map_url=str(url)))
+
+
+def values_of(message: OccupancyGrid) -> np.ndarray:
+    return np.array(message.data, dtype=np.int8).reshape(message.info.height, message.info.width)
+
+
+def test_service_and_topic_give_the_map_file(client: Any, small_values: np.ndarray) -> None:
+    # A subscriber that comes late: the node has published long ago.
+    published = client.subscribe(OccupancyGrid, "plant", LATCHED).wait()
+    assert published == get_map(client)
+    assert published.header.frame_id == "site"
+    assert (values_of(published) == small_values).all()
+    grid = grid_from_message(published)
+    assert grid.origin == pytest.approx((-1.0, 2.0, 0.5))
+    assert grid.resolution == 0.25
+
+
+def test_scatter_draws_on_the_loaded_map_and_restore_undoes_it(
+    client: Any, small_values: np.ndarray
+) -> None:
+    maps = client.subscribe(OccupancyGrid, "plant", LATCHED)
+    drawn = set()
+    for _ in range(4):
+        maps.clear()
+        response = client.call(Trigger, "map_server/scatter_obstacles")
+        assert response.success, response.message
+        message = maps.wait()
+        noisy = values_of(message)
+        new = (noisy != small_values).nonzero()
+        assert (small_values[new] == 0).all()
+        assert (noisy[new] == 100).all()
+        assert 1 <= len(new[0]) <= 5
+        grid = grid_from_message(message)
+        assert connected_cells(grid.occupancy, GOAL, MoveRule.ROBOT_SAFE)[START[1], START[0]]
+        named = re.findall(r"\((\S+), (\S+)\)", response.message)
+        assert {grid.world_to_cell(float(x), float(y)) for x, y in named} == {
+            (x, y) for y, x in zip(*new, strict=True)
+        }
+        assert re.search(r"\d+ draws thrown away", response.message)
+        drawn.add(noisy.tobytes())
+    assert len(drawn) > 1
+
+    maps.clear()
+    response = client.call(Trigger, "map_server/restore_map")
+    assert response.success
+    assert (values_of(maps.wait()) == small_values).all()
+    assert (values_of(get_map(client)) == small_values).all()
+
+
+def broken_maps(folder: Path) -> dict[str, tuple[str, int]]:
+    """Write map files that cannot be loaded; return the URL and the result code of each."""
+    good = folder / "good.yaml"
+    save_map(MapFile(np.zeros((3, 3), np.int8)), good)
+    text, image = good.read_text(), good.with_suffix(".pgm").read_bytes()
+    (folder / "truncated.pgm").write_bytes(image[:-4])
+    files = {
+        "no_yaml": "[1, 2",
+        "no_map": "- a list",
+        "no_resolution": text.replace("resolution", "resolutiom"),
+        "bad_resolution": re.sub(r"resolution: .*", "resolution: .nan", text),
+        "no_image": text.replace("good.pgm", "missing.pgm"),
+        "text_as_image": text.replace("good.pgm", "good.yaml"),
+        "truncated": text.replace("good.pgm", "truncated.pgm"),
+    }
+    for name, content in files.items():
+        (folder / f"{name}.yaml").write_text(content)
+    metadata = ("no_yaml", "no_map", "no_resolution", "bad_resolution")
+    codes = {
+        name: LoadMap.Response.RESULT_INVALID_MAP_METADATA
+        if name in metadata
+        else LoadMap.Response.RESULT_INVALID_MAP_DATA
+        for name in files
+    }
+    return {name: (str(folder / f"{name}.yaml"), code) for name, code in codes.items()} | {
+        "missing": (str(folder / "missing.yaml"), LoadMap.Response.RESULT_MAP_DOES_NOT_EXIST),
+        "unknown_name": ("unknown.yaml", LoadMap.Response.RESULT_MAP_DOES_NOT_EXIST),
+        "unknown_package": ("package://no/x.yaml", LoadMap.Response.RESULT_MAP_DOES_NOT_EXIST),
+        "empty": ("", LoadMap.Response.RESULT_INVALID_MAP_METADATA),
+        "folder": (str(folder), LoadMap.Response.RESULT_INVALID_MAP_METADATA),
+    }
+
+
+BROKEN_MAPS = [
+    "no_yaml", "no_map", "no_resolution", "bad_resolution", "no_image", "text_as_image",
+    "truncated", "missing", "unknown_name", "unknown_package", "empty", "folder",
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("name", BROKEN_MAPS)
+def test_failed_load_has_its_code_and_keeps_the_served_map(
+    client: Any, server: Any, small_values: np.ndarray, tmp_path: Path, name: str
+) -> None:
+    url, result = broken_maps(tmp_path)[name]
+    response = load_map(client, url)
+    assert response.result == result
+    assert len(response.map.data) == 0
+    server.wait_for_log(re.escape(f"cannot load {url!r}, the map before it stays"))
+    assert (values_of(get_map(client)) == small_values).all()
+
+
+def test_load_takes_a_path_a_url_and_a_shipped_name(
+    client: Any, map_file: Path, small_values: np.ndarray
+) -> None:
+    shipped = read_map_file(find_resource("maps", "dilemma.yaml")).values
+    maps = client.subscribe(OccupancyGrid, "plant", LATCHED)
+    for url, values in (
+        ("dilemma.yaml", shipped),
+        (map_file, small_values),
+        ("package://ddqn_planner/maps/dilemma.yaml", shipped),
+        (f"file://{map_file}", small_values),
+    ):
+        maps.clear()
+        response = load_map(client, url)
+        assert response.result == LoadMap.Response.RESULT_SUCCESS
+        assert response.map.header.frame_id == "site"
+        assert (values_of(response.map) == values).all()
+        assert (values_of(maps.wait()) == values).all()
+
+
+@pytest.mark.parametrize(
+    ("start", "goal", "reason"),
+    [
+        (None, None, "names no start and goal"),
+        ((0, 0), None, "names no start and goal"),
+        ((0, 0), (2, 0), "no path leads from the start"),
+        ((1, 0), (0, 0), "no path leads from the start"),
+    ],
+)
+def test_no_noise_without_a_path_from_start_to_goal(
+    client: Any, map_file: Path, tmp_path: Path, start: Any, goal: Any, reason: str
+) -> None:
+    values = np.array([[0, 100, 0], [0, 100, 0]], dtype=np.int8)
+    save_map(MapFile(values, start=start, goal=goal), tmp_path / "walled.yaml")
+    load_map(client, tmp_path / "walled.yaml")
+    response = client.call(Trigger, "map_server/scatter_obstacles")
+    assert not response.success
+    assert reason in response.message
+    assert (values_of(get_map(client)) == values).all()
+    assert load_map(client, map_file).result == LoadMap.Response.RESULT_SUCCESS
+
+
+def test_parameters_say_what_they_are(client: Any) -> None:
+    names = ["yaml_filename", "topic_name", "frame_id", "seed"]
+    request = DescribeParameters.Request(names=names)
+    response = client.call(DescribeParameters, "map_server/describe_parameters", request)
+    assert all(entry.description and entry.read_only for entry in response.descriptors)
+    (result,) = client.set_parameters("map_server", frame_id="other")
+    assert not result.successful
+    assert "read-only" in result.reason
+
+
+@pytest.mark.parametrize("content", [None, "[1, 2"])
+def test_without_a_map_at_the_start_the_node_lives_on(
+    run_node: Any,
+    make_client: Callable[[str], Any],
+    map_file: Path,
+    small_values: np.ndarray,
+    tmp_path: Path,
+    content: str | None,
+) -> None:
+    path = tmp_path / "map.yaml"
+    if content is not None:
+        path.write_text(content)
+    namespace = "/absent" if content is None else "/broken"
+    with run_node("map_server_node", {"yaml_filename": str(path)}, namespace=namespace) as node:
+        client = make_client(namespace)
+        assert len(get_map(client).data) == 0
+        node.wait_for_log(re.escape(f"cannot load {str(path)!r}, no map is served"))
+        node.wait_for_log("the answer is empty")
+        for name in ("scatter_obstacles", "restore_map"):
+            response = client.call(Trigger, f"map_server/{name}")
+            assert not response.success
+            assert "no map is loaded" in response.message
+        assert load_map(client, map_file).result == LoadMap.Response.RESULT_SUCCESS
+        assert (values_of(get_map(client)) == small_values).all()
+
+
+def test_serves_the_shipped_map_by_default_and_the_seed_repeats_the_noise(
+    run_node: Any, make_client: Callable[[str], Any]
+) -> None:
+    namespaces = ["/first", "/second"]
+    with (
+        run_node("map_server_node", namespace=namespaces[0]) as node,
+        run_node("map_server_node", namespace=namespaces[1]),
+    ):
+        drawn = []
+        for namespace in namespaces:
+            client = make_client(namespace)
+            message = client.subscribe(OccupancyGrid, "map", LATCHED).wait()
+            shipped = read_map_file(find_resource("maps", "dilemma.yaml")).values
+            assert (values_of(message) == shipped).all()
+            response = client.call(Trigger, "map_server/scatter_obstacles")
+            assert response.success
+            drawn.append(response.message)
+        assert drawn[0] == drawn[1]
+
+        began = time.monotonic()
+        assert node.stop(signal.SIGTERM) == 0
+        assert time.monotonic() - began < 3.0
+
+
+@pytest.mark.parametrize(
+    ("parameters", "reason"),
+    [
+        ({"frame_id": ""}, "name the map's frame"),
+        ({"topic_name": "a b"}, "topic name"),
+        ({"seed": -1}, "seed out of range"),
+    ],
+)
+def test_what_the_node_cannot_start_with_is_one_clear_line(
+    run_node: Any, parameters: dict[str, Any], reason: str
+) -> None:
+    with run_node("map_server_node", parameters, exit_code=1) as node:
+        node.process.wait(10)
+    assert re.search(f"cannot start: .*{reason}", node.log)
+    assert "Traceback" not in node.log
