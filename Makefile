@@ -29,7 +29,7 @@ $(VENV)/installed: setup.py Makefile
 	touch $@
 
 demo: setup
-	$(BIN)/python demo/demo.py
+	$(BIN)/python scripts/demo.py
 
 test: setup
 	$(BIN)/python -m pytest
@@ -47,7 +47,7 @@ types: setup
 
 bench: setup
 	$(BIN)/pip install --quiet --editable ".[$(EXTRAS),bench]"
-	$(BIN)/python benchmark/benchmark.py
+	$(BIN)/python scripts/benchmark.py
 
 # Trains the shipped model from nothing.
 model: setup

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from typing import Protocol
+from typing import Protocol, cast
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
+from torch.nn import functional
 
 from ddqn_planner.grid import MOVES, Cell
 from ddqn_planner.model.observation import observation_background, observe
@@ -49,8 +50,13 @@ class PaperQNetwork(nn.Module):
 
     def forward(self, observation_BHW: Tensor) -> Tensor:
         """Return Q(s, a): (B, 8) for observations (B, H, W)."""
-        features = torch.relu(self.convolution(observation_BHW.unsqueeze(1)))
-        q_BA: Tensor = self.fully_connected(features.flatten(1))
+        # The convolution as a matrix product: on maps this small that is the faster way.
+        patch_BKL = functional.unfold(observation_BHW.unsqueeze(1), 3, padding=1, stride=2)
+        weight_FK = self.convolution.weight.flatten(1)
+        weight_BFK = weight_FK.expand(len(patch_BKL), -1, -1)
+        bias_F1 = cast(Tensor, self.convolution.bias).unsqueeze(1)
+        feature_BFL = torch.baddbmm(bias_F1, weight_BFK, patch_BKL).relu()
+        q_BA: Tensor = self.fully_connected(feature_BFL.flatten(1))
         return q_BA
 
     def supports(self, shape: tuple[int, int]) -> bool:

@@ -34,7 +34,7 @@ from ddqn_planner.nodes.conversions import (
     value_message,
 )
 from ddqn_planner.nodes.runtime import LATCHED, spin_until_shutdown
-from ddqn_planner.planning import Plan, Planner, PlanStatus, QField
+from ddqn_planner.planning import Planner, PlanStatus, QField
 
 MOVE_RULES = {"": None, **{rule.value: rule for rule in MoveRule}}
 
@@ -76,7 +76,7 @@ class Outcome:
     status : str
         The name of a `PlanStatus`, or of one of the constants above: then there was no plan.
     reason : str
-        The sentence that a user reads.
+        Why there is no path, and what to do; empty if there is one.
     cells : tuple of (x, y)
         The path; empty unless the status is SUCCEEDED.
     field : QField, optional
@@ -96,6 +96,11 @@ class Outcome:
     def succeeded(self) -> bool:
         """Whether there is a path."""
         return self.status == PlanStatus.SUCCEEDED.name
+
+    @property
+    def sentence(self) -> str:
+        """What a user reads."""
+        return self.reason or f"a path of {path_length(self.cells):.2f} cells"
 
 
 class PlannerNode(Node):
@@ -307,7 +312,7 @@ class PlannerNode(Node):
             value = value_message(self._outcome.field, self._grid, path.header)
             self._value_publisher.publish(value)
         if self._outcome.succeeded:
-            self.get_logger().info(self._outcome.reason)
+            self.get_logger().info(self._outcome.sentence)
         if self._outcome.status == INVALID_GOAL:
             self._goal = None
 
@@ -352,13 +357,20 @@ class PlannerNode(Node):
         field_at_hand = time.perf_counter()
         plan = self._planner.plan(self._grid, start_cell, goal_cell, self._move_rule)
         ended = time.perf_counter()
+        reason = ""
+        if plan.status is not PlanStatus.SUCCEEDED:
+            reason = (
+                f"{plan.status.value} (start: {_place(start, start_cell)}; "
+                f"goal: {_place(goal, goal_cell)}; "
+                f"map: {self._grid.width} x {self._grid.height} cells); {REMEDIES[plan.status]}"
+            )
         return Outcome(
             plan.status.name,
-            _reason(plan, self._grid, _place(start, start_cell), _place(goal, goal_cell)),
+            reason,
             plan.cells,
             field,
-            1e3 * (field_at_hand - began),
-            1e3 * (ended - field_at_hand),
+            field_ms=1e3 * (field_at_hand - began),
+            walk_ms=1e3 * (ended - field_at_hand),
         )
 
     def _cell(self, status: str, name: str, stamped: PoseStamped, grid: GridMap) -> Cell:
@@ -391,10 +403,10 @@ class PlannerNode(Node):
         else:
             status.level = DiagnosticStatus.OK
         refused = [f"{what} refused: {reason}" for what, reason in self._refused.items()]
-        status.message = "; ".join([outcome.reason, *refused])
+        status.message = "; ".join([outcome.sentence, *refused])
         values = {
             "status": outcome.status,
-            "reason": outcome.reason,
+            "reason": outcome.sentence,
             "path length (cells)": f"{path_length(outcome.cells):.3f}",
             "field time (ms)": f"{outcome.field_ms:.3f}",
             "walk time (ms)": f"{outcome.walk_ms:.3f}",
@@ -418,15 +430,6 @@ class PlannerNode(Node):
                 "move rule": (self._move_rule or metadata.move_rule).value,
             }
         return description
-
-
-def _reason(plan: Plan, grid: GridMap, start: str, goal: str) -> str:
-    if plan.status is PlanStatus.SUCCEEDED:
-        return f"a path of {plan.length:.2f} cells, {plan.length * grid.resolution:.2f} m"
-    return (
-        f"{plan.status.value} (start: {start}; goal: {goal}; "
-        f"map: {grid.width} x {grid.height} cells); {REMEDIES[plan.status]}"
-    )
 
 
 def _place(stamped: PoseStamped, cell: Cell) -> str:

@@ -233,8 +233,9 @@ class TrainerNode(Node):
             return _answer(response, False, f"{curves} holds no episode to replay yet; train on")
         self._stop_replay()
         frames = _growing(episodes)
+        period = self._value("replay_period")
         self._replay_timer = self.create_timer(
-            self._value("replay_period"), lambda: self._replay_step(frames), clock=self._steady_clock
+            period, lambda: self._replay_step(frames), clock=self._steady_clock
         )
         return _answer(response, True, f"replaying {len(episodes)} episodes on ~/episode")
 

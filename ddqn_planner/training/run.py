@@ -7,13 +7,17 @@ import io
 from collections.abc import Iterator, Sequence
 from dataclasses import fields, replace
 from pathlib import Path
-from typing import Any
 
 from ddqn_planner.files import write_atomically
 from ddqn_planner.grid import Cell, MoveRule, path_length
 from ddqn_planner.training.environment import Scenario
 from ddqn_planner.training.hyper_parameters import HyperParameters
 from ddqn_planner.training.trainer import CheckpointError, Episode, Trainer
+
+try:
+    from torch.utils.tensorboard import SummaryWriter as TensorBoard
+except ImportError:  # an extra: the curves are in the CSV file all the same
+    TensorBoard = None  # type: ignore[assignment, misc]
 
 SAVE_INTERVAL = 5_000
 """Environment steps between two checkpoints."""
@@ -76,7 +80,10 @@ class TrainingRun:
         _cut_rows(self.curves_path, self.trainer.episodes)
         # Line-buffered: who reads the curves meanwhile, or after a crash, sees whole rows.
         self._curves = self.curves_path.open("a", buffering=1, newline="", encoding="utf-8")
-        self._board = _tensorboard(self.folder, self.trainer.steps)
+        steps = self.trainer.steps
+        self._board = None
+        if TensorBoard is not None:
+            self._board = TensorBoard(str(folder), purge_step=steps)
 
     @property
     def model_path(self) -> Path:
@@ -186,14 +193,6 @@ def _cut_rows(path: Path, episodes: int) -> None:
     kept = io.StringIO(newline="")
     csv.writer(kept).writerows([COLUMNS, *rows[:episodes]])
     write_atomically(path, kept.getvalue().encode())
-
-
-def _tensorboard(folder: Path, step: int) -> Any:
-    try:
-        from torch.utils.tensorboard import SummaryWriter
-    except ImportError:
-        return None
-    return SummaryWriter(str(folder), purge_step=step)
 
 
 def _check_same_training(

@@ -112,7 +112,9 @@ class Trainer:
             self.network = PaperQNetwork(height, width, parameters.filters)
         self._target = PaperQNetwork(height, width, parameters.filters).requires_grad_(False)
         self._target.load_state_dict(self.network.state_dict())
-        self._optimiser = torch.optim.Adam(self.network.parameters(), parameters.learning_rate)
+        self._optimiser = torch.optim.Adam(
+            self.network.parameters(), parameters.learning_rate, fused=True
+        )
         self._replay = ReplayBuffer(parameters.replay_capacity)
 
         self.environment.begin(np.ones(parameters.environments, dtype=np.bool_))

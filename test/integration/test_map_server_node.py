@@ -128,14 +128,15 @@ def broken_maps(folder: Path) -> dict[str, tuple[str, int]]:
         "missing": (str(folder / "missing.yaml"), LoadMap.Response.RESULT_MAP_DOES_NOT_EXIST),
         "unknown_name": ("unknown.yaml", LoadMap.Response.RESULT_MAP_DOES_NOT_EXIST),
         "unknown_package": ("package://no/x.yaml", LoadMap.Response.RESULT_MAP_DOES_NOT_EXIST),
-        "empty": ("", LoadMap.Response.RESULT_INVALID_MAP_METADATA),
-        "folder": (str(folder), LoadMap.Response.RESULT_INVALID_MAP_METADATA),
+        "empty": ("", LoadMap.Response.RESULT_MAP_DOES_NOT_EXIST),
+        "image": (str(good.with_suffix(".pgm")), LoadMap.Response.RESULT_INVALID_MAP_METADATA),
+        "folder": (str(folder), LoadMap.Response.RESULT_MAP_DOES_NOT_EXIST),
     }
 
 
 BROKEN_MAPS = [
     "no_yaml", "no_map", "no_resolution", "bad_resolution", "no_image", "text_as_image",
-    "truncated", "missing", "unknown_name", "unknown_package", "empty", "folder",
+    "truncated", "missing", "unknown_name", "unknown_package", "empty", "image", "folder",
 ]  # fmt: skip
 
 

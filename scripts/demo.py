@@ -7,10 +7,12 @@ as `ros2 topic pub` would. No process is left behind, also when this one is inte
 from __future__ import annotations
 
 import signal
+import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from typing import Any, TypeVar
 
 import numpy as np
@@ -19,22 +21,23 @@ from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped
 from nav_msgs.msg import OccupancyGrid, Path
 from nav_msgs.srv import GetPlan
-from processes import own_ros_domain, running
+from processes import claim_ros_domain, executable, running
+from rclpy.executors import ExternalShutdownException
 from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 
-from ddqn_planner.grid import Cell, GridMap, MoveRule, path_length, read_map_file
+from ddqn_planner.grid import Cell, GridMap, MoveRule, path_length
 from ddqn_planner.nodes.conversions import grid_from_message, quaternion
 from ddqn_planner.nodes.runtime import LATCHED
 from ddqn_planner.planning import shortest_distances
 from ddqn_planner.planning.picture import draw_text, save_picture
-from ddqn_planner.resources import find_resource
+from ddqn_planner.training.environment import Scenario, paper_scenario
 
-MAP = "dilemma.yaml"
 PICTURE = "demo.png"
 TIMEOUT = 60.0
 """Seconds to wait for any one answer."""
 
+Children = list[subprocess.Popen[bytes]]
 T = TypeVar("T")
 
 
@@ -58,7 +61,28 @@ class Client(Node):
         self.get_plan = self.create_client(GetPlan, "planner/get_plan")
 
 
-def wait_for(what: str, answer: Callable[[], T | None], children: list[Any]) -> T:
+@contextmanager
+def client() -> Iterator[Client]:
+    """Give a client in a ROS domain of its own, spun in the background."""
+    # Ctrl-C stays a KeyboardInterrupt.
+    with claim_ros_domain():
+        rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
+        node = Client()
+        thread = threading.Thread(target=_spin, args=(node,), daemon=True)
+        thread.start()
+        try:
+            yield node
+        finally:
+            rclpy.try_shutdown()
+            thread.join()
+
+
+def _spin(node: Node) -> None:
+    with suppress(ExternalShutdownException):
+        rclpy.spin(node)
+
+
+def wait_for(what: str, answer: Callable[[], T | None], children: Children) -> T:
     """Return the first answer that is true; give up when a node has died or time is out."""
     deadline = time.monotonic() + TIMEOUT
     while not (found := answer()):
@@ -79,43 +103,52 @@ def pose(grid: GridMap, cell: Cell) -> PoseStamped:
     return message
 
 
-def ask(client: Client, children: list[Any], began: float) -> None:
-    """Ask for the path, print it, and draw it."""
-    map_file = read_map_file(find_resource("maps", MAP))
-    start, goal = map_file.start, map_file.goal
-    assert start is not None
-    assert goal is not None
-    grid = grid_from_message(wait_for("map", lambda: client.heard.get("map"), children))
-    for publisher in (client.start, client.goal):
+def request_plan(node: Client, children: Children, scenario: Scenario) -> Path:
+    """Publish start and goal, and return the plan that comes back."""
+    message = wait_for("map", lambda: node.heard.get("map"), children)
+    grid = grid_from_message(message)
+    for publisher in (node.start, node.goal):
         wait_for("planner", publisher.get_subscription_count, children)
-    start_pose, goal_pose = pose(grid, start), pose(grid, goal)
-    initial_pose = PoseWithCovarianceStamped(header=start_pose.header)
-    initial_pose.pose.pose = start_pose.pose
-    client.start.publish(initial_pose)
-    client.goal.publish(goal_pose)
+    start = pose(grid, scenario.start)
+    initial_pose = PoseWithCovarianceStamped(header=start.header)
+    initial_pose.pose.pose = start.pose
+    node.start.publish(initial_pose)
+    node.goal.publish(pose(grid, scenario.goal))
 
     def plan_heard() -> Path | None:
-        plan = client.heard.get("plan")
+        plan = node.heard.get("plan")
         return plan if plan and plan.poses else None
 
-    plan = wait_for("plan", plan_heard, children)
-    first_plan_seconds = time.monotonic() - began
-    value = wait_for("value field", lambda: client.heard.get("planner/value"), children)
-    asked = time.perf_counter()
-    answer = client.get_plan.call_async(GetPlan.Request(start=start_pose, goal=goal_pose))
-    wait_for("answer of planner/get_plan", answer.done, children)
-    round_trip_ms = 1e3 * (time.perf_counter() - asked)
+    return wait_for("plan", plan_heard, children)
 
+
+def diagnosed(node: Client) -> dict[str, str] | None:
+    """Return what the planner said of a successful request in its last diagnostics."""
+    for status in getattr(node.heard.get("/diagnostics"), "status", ()):
+        values = {entry.key: entry.value for entry in status.values}
+        if values.get("status") == "SUCCEEDED":
+            return values
+    return None
+
+
+def show(node: Client, plan: Path, children: Children, seconds: float) -> None:
+    """Print the path and its times, and draw it."""
+    scenario = paper_scenario()
+    grid = grid_from_message(node.heard["map"])
     cells = [grid.world_to_cell(p.pose.position.x, p.pose.position.y) for p in plan.poses]
     rule = MoveRule.CORNER_CUTTING
-    optimum = shortest_distances(grid, goal, rule)[start[1], start[0]]
+    distances = shortest_distances(grid, scenario.goal, rule)
+    optimum = distances[scenario.start[1], scenario.start[0]]
+    times = wait_for("diagnostics", lambda: diagnosed(node), children)
     print(draw_text(grid, cells))
     print("path: " + " ".join(f"({x}, {y})" for x, y in cells))
     print(f"length {path_length(cells):.2f} cells, optimum {optimum:.2f} under {rule.value}")
     print(
-        f"first plan {first_plan_seconds:.1f} s after the nodes were started; "
-        f"asked again: {round_trip_ms:.1f} ms"
+        f"Q field computed in {float(times['field time (ms)']):.1f} ms, path walked in "
+        f"{float(times['walk time (ms)']):.2f} ms; first plan {seconds:.1f} s after the nodes "
+        "were started"
     )
+    value = wait_for("value field", lambda: node.heard.get("planner/value"), children)
     values = np.array(value.data, dtype=np.float32).reshape(grid.height, grid.width)
     values[values < 0] = np.nan
     title = f"Double DQN on the paper's map: {path_length(cells):.2f} cells"
@@ -126,19 +159,15 @@ def ask(client: Client, children: list[Any], began: float) -> None:
 def main() -> int:
     """Run the demo; return its exit code."""
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))
-    with own_ros_domain():
-        rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
-        client = Client()
-        spinning = threading.Thread(target=rclpy.spin, args=(client,), daemon=True)
-        spinning.start()
-        try:
-            began = time.monotonic()
-            map_server = running("map_server_node", "--ros-args", "-p", f"yaml_filename:={MAP}")
-            with map_server as server, running("planner_node") as planner:
-                ask(client, [server, planner], began)
-        finally:
-            rclpy.try_shutdown()
-            spinning.join(timeout=5)
+    with client() as node:
+        began = time.monotonic()
+        map_server = running(
+            executable("map_server_node"), "--ros-args", "-p", "yaml_filename:=dilemma.yaml"
+        )
+        with map_server as first, running(executable("planner_node")) as second:
+            children = [first, second]
+            plan = request_plan(node, children, paper_scenario())
+            show(node, plan, children, time.monotonic() - began)
     return 0
 
 

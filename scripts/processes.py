@@ -1,0 +1,62 @@
+"""Runs nodes as processes of their own, and talks to them: for demo, benchmark and tests."""
+
+from __future__ import annotations
+
+import os
+import signal
+import socket
+import subprocess
+import sysconfig
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+
+def claim_ros_domain() -> socket.socket:
+    """Set the environment to a ROS domain that nobody else here uses, kept to this machine.
+
+    Call it before rclpy is initialised.
+
+    Returns
+    -------
+    socket.socket
+        Holds the claim until it is closed.
+
+    Raises
+    ------
+    RuntimeError
+        If all domains from 1 to 100 are claimed.
+    """
+    for domain in range(1, 101):
+        claim = socket.socket()
+        try:
+            claim.bind(("127.0.0.1", 32768 + domain))
+        except OSError:
+            claim.close()
+        else:
+            os.environ["ROS_DOMAIN_ID"] = str(domain)
+            os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
+            return claim
+    raise RuntimeError("all ROS domains from 1 to 100 are in use; end a demo or a test first")
+
+
+def executable(name: str) -> str:
+    """Return the path of an installed executable of the package."""
+    return str(Path(sysconfig.get_path("scripts")) / name)
+
+
+@contextmanager
+def running(*command: str) -> Iterator[subprocess.Popen[bytes]]:
+    """Run a command; at the end stop it as Ctrl-C would."""
+    # A session of its own: Ctrl-C in the terminal reaches the parent alone, which then tidies up.
+    child = subprocess.Popen(command, start_new_session=True)
+    try:
+        yield child
+    finally:
+        child.send_signal(signal.SIGINT)
+        try:
+            child.wait(timeout=10)
+        except BaseException:
+            child.kill()
+            child.wait()
+            raise

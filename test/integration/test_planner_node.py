@@ -1,0 +1,651 @@
+from __future__ import annotations
+
+import array
+import math
+import re
+import shutil
+import signal
+import time
+from collections.abc import Callable, Iterator
+from itertools import pairwise
+from pathlib import Path as FilePath
+from typing import Any
+
+import numpy as np
+import pytest
+import safetensors.torch
+import torch
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped, Quaternion
+from nav_msgs.msg import OccupancyGrid, Path
+from nav_msgs.srv import GetPlan
+from rcl_interfaces.srv import DescribeParameters
+from std_msgs.msg import Header, String
+from std_srvs.srv import Trigger
+
+from ddqn_planner.grid import Cell, GridMap, MoveRule, legal_moves
+from ddqn_planner.model import ModelMetadata, PaperQNetwork, save_model
+from ddqn_planner.nodes.conversions import occupancy_message, quaternion
+from ddqn_planner.nodes.runtime import LATCHED
+
+START, GOAL = (0, 0), (5, 5)
+RESOLUTION, ORIGIN = 0.5, (-1.0, 2.0, 0.0)
+GOAL_YAW = 1.2
+
+
+class Robot:
+    """A planner node and what its user sees and does."""
+
+    def __init__(
+        self, client: Any, values: np.ndarray, model: FilePath, name: str = "/robot/planner"
+    ) -> None:
+        self.client = client
+        self.name = name
+        self.values = values
+        self.model = model
+        self.plans = client.subscribe(Path, "plan", LATCHED)
+        self.value = client.subscribe(OccupancyGrid, "planner/value", LATCHED)
+        self.diagnostics = client.subscribe(DiagnosticArray, "/diagnostics")
+        self.grid = self.grid_of(values)
+
+    @staticmethod
+    def grid_of(values: np.ndarray, origin: tuple[float, float, float] = ORIGIN) -> GridMap:
+        return GridMap.from_occupancy_values(values, RESOLUTION, origin)
+
+    def map_message(self) -> OccupancyGrid:
+        return occupancy_message(self.values, RESOLUTION, ORIGIN, Header(frame_id="map"))
+
+    def send_map(self, message: OccupancyGrid | None = None) -> None:
+        self.client.publish("map", message or self.map_message(), LATCHED)
+
+    def pose(self, cell: Cell, yaw: float = 0.0, grid: GridMap | None = None) -> PoseStamped:
+        stamped = PoseStamped(header=Header(frame_id="map"))
+        x, y = (grid or self.grid).cell_to_world(cell)
+        stamped.pose.position.x, stamped.pose.position.y = x + 0.05, y - 0.05
+        stamped.pose.orientation = quaternion(yaw)
+        return stamped
+
+    def send_start(self, stamped: PoseStamped) -> None:
+        message = PoseWithCovarianceStamped(header=stamped.header)
+        message.pose.pose = stamped.pose
+        self.client.publish("initialpose", message)
+
+    def send_goal(self, stamped: PoseStamped) -> None:
+        self.client.publish("goal_pose", stamped)
+
+    def get_plan(self, start: PoseStamped, goal: PoseStamped) -> Path:
+        request = GetPlan.Request(start=start, goal=goal)
+        return self.client.call(GetPlan, "planner/get_plan", request).plan
+
+    def wait_for_path(self, start: Cell, goal: Cell, grid: GridMap | None = None) -> Path:
+        """Wait for a plan between two cells, and check all that can be said of it."""
+        grid = grid or self.grid
+        ends = [grid.cell_to_world(start), grid.cell_to_world(goal)]
+
+        def joins_ends(path: Path) -> bool:
+            return len(path.poses) > 0 and np.allclose(
+                [points_of(path)[0], points_of(path)[-1]], ends, atol=1e-6
+            )
+
+        path: Path = self.plans.wait(joins_ends)
+        check_path(path, grid)
+        return path
+
+    def wait_for_reason(self, pattern: str) -> DiagnosticStatus:
+        """Wait until the diagnostics of this node say something."""
+
+        def says(message: DiagnosticArray) -> bool:
+            status = message.status[0]
+            return status.name == f"{self.name}: plan" and bool(re.search(pattern, status.message))
+
+        return self.diagnostics.wait(says).status[0]
+
+    def assert_works(self) -> None:
+        """See that a good request has its plan: the node lives, and has its map and model."""
+        path = self.get_plan(self.pose(START), self.pose(GOAL))
+        check_path(path, self.grid)
+        assert points_of(path)[0] == pytest.approx(self.grid.cell_to_world(START))
+
+    def clear(self) -> None:
+        for recorder in (self.plans, self.value, self.diagnostics):
+            recorder.clear()
+
+
+def points_of(path: Path) -> list[tuple[float, float]]:
+    return [(pose.pose.position.x, pose.pose.position.y) for pose in path.poses]
+
+
+def yaw_of(rotation: Quaternion) -> float:
+    return 2 * math.atan2(rotation.z, rotation.w)
+
+
+def check_path(path: Path, grid: GridMap, move_rule: MoveRule = MoveRule.ROBOT_SAFE) -> None:
+    """Check that a path makes legal moves from cell centre to cell centre and looks ahead."""
+    assert path.header.frame_id == "map"
+    assert all(pose.header == path.header for pose in path.poses)
+    points = points_of(path)
+    cells = [grid.world_to_cell(x, y) for x, y in points]
+    assert np.allclose([grid.cell_to_world(cell) for cell in cells], points, atol=1e-6)
+    legal = legal_moves(grid.occupancy, move_rule)
+    for index, (cell, next_cell) in enumerate(pairwise(cells)):
+        step = (next_cell[0] - cell[0], next_cell[1] - cell[1])
+        assert max(abs(step[0]), abs(step[1])) == 1
+        action = round(math.atan2(step[1], step[0]) / (math.pi / 4)) % 8
+        assert legal[action, cell[1], cell[0]]
+        turned = yaw_of(path.poses[index].pose.orientation) - grid.origin[2]
+        assert math.cos(turned - action * math.pi / 4) == pytest.approx(1.0)
+
+
+def values_of(status: DiagnosticStatus) -> dict[str, str]:
+    return {entry.key: entry.value for entry in status.values}
+
+
+@pytest.fixture(scope="module")
+def model(tmp_path_factory: pytest.TempPathFactory, trained_model: FilePath) -> FilePath:
+    """Return a copy that tests may overwrite, if they put it back."""
+    path = tmp_path_factory.mktemp("planner") / "model.safetensors"
+    shutil.copy(trained_model, path)
+    return path
+
+
+@pytest.fixture(scope="module")
+def planner(run_node: Any, model: FilePath) -> Iterator[Any]:
+    parameters = {"model": str(model), "follow_trainer": True}
+    with run_node("planner_node", parameters, namespace="/robot") as node:
+        yield node
+
+
+@pytest.fixture(scope="module")
+def running_robot(
+    planner: Any, make_client: Callable[[str], Any], small_values: np.ndarray, model: FilePath
+) -> Robot:
+    return Robot(make_client("/robot"), small_values, model)
+
+
+@pytest.fixture
+def robot(running_robot: Robot) -> Robot:
+    """Give the planner a map, a start and a goal, whatever the test before left."""
+    running_robot.clear()
+    running_robot.send_map()
+    running_robot.send_start(running_robot.pose(START))
+    running_robot.send_goal(running_robot.pose(GOAL, GOAL_YAW))
+    running_robot.wait_for_path(START, GOAL)
+    running_robot.wait_for_reason("^a path of [^;]*$")
+    running_robot.clear()
+    return running_robot
+
+
+# What it is for
+
+
+def test_goal_pose_is_answered_by_a_plan_a_value_and_diagnostics(robot: Robot) -> None:
+    robot.send_start(robot.pose((0, 3)))
+    robot.send_goal(robot.pose(GOAL, GOAL_YAW))
+    path = robot.wait_for_path((0, 3), GOAL)
+    assert yaw_of(path.poses[-1].pose.orientation) == pytest.approx(GOAL_YAW)
+
+    value = robot.value.wait()
+    assert value.header.frame_id == "map"
+    assert value.info.origin == robot.map_message().info.origin
+    percent = np.array(value.data).reshape(robot.values.shape)
+    assert ((percent == -1) == (robot.values > 0)).all()
+    assert percent[GOAL[1], GOAL[0]] == percent.max() == 100
+    assert percent[robot.values == 0].min() == 0
+
+    status = robot.wait_for_reason("^a path of ")
+    assert status.level == DiagnosticStatus.OK
+    values = values_of(status)
+    assert values["status"] == "SUCCEEDED"
+    steps = np.hypot(*np.diff(points_of(path), axis=0).T)
+    assert float(values["path length (cells)"]) == pytest.approx(steps.sum() / RESOLUTION, abs=1e-2)
+    assert float(values["walk time (ms)"]) > 0
+    assert values["model file"] == values["model"] == str(robot.model)
+    assert values["model move rule"] == values["move rule"] == "robot_safe"
+    assert values["model training steps"] == "3000"
+
+
+def test_diagnostics_come_though_nothing_changes(robot: Robot) -> None:
+    for _ in range(2):
+        robot.diagnostics.clear()
+        robot.wait_for_reason("^a path of ")
+
+
+def test_start_and_goal_in_one_cell_make_a_path_of_one_pose(robot: Robot) -> None:
+    path = robot.get_plan(robot.pose(GOAL), robot.pose(GOAL, GOAL_YAW))
+    assert points_of(path) == [robot.grid.cell_to_world(GOAL)]
+    assert yaw_of(path.poses[0].pose.orientation) == pytest.approx(GOAL_YAW)
+
+
+@pytest.mark.parametrize("yaw", [0.5, -2.5])
+def test_plans_on_a_map_with_a_rotated_origin(robot: Robot, yaw: float) -> None:
+    origin = (3.0, -7.0, yaw)
+    grid = robot.grid_of(robot.values, origin)
+    robot.send_map(occupancy_message(robot.values, RESOLUTION, origin, Header(frame_id="map")))
+    robot.send_start(robot.pose((5, 0), grid=grid))
+    robot.send_goal(robot.pose(GOAL, grid=grid))
+    robot.wait_for_path((5, 0), GOAL, grid)
+
+
+def test_get_plan_does_not_change_the_active_goal(robot: Robot) -> None:
+    path = robot.get_plan(robot.pose((2, 5)), robot.pose(GOAL, GOAL_YAW))
+    check_path(path, robot.grid)
+    assert points_of(path)[0] == pytest.approx(robot.grid.cell_to_world((2, 5)))
+    assert yaw_of(path.poses[-1].pose.orientation) == pytest.approx(GOAL_YAW)
+    assert path.header.stamp.sec > 0
+    robot.get_plan(robot.pose((0, 0)), robot.pose((0, 0)))
+    robot.send_start(robot.pose((3, 3)))
+    robot.wait_for_path((3, 3), GOAL)
+
+
+def test_get_plan_without_a_start_begins_at_the_known_one(robot: Robot) -> None:
+    path = robot.get_plan(PoseStamped(), robot.pose(GOAL))
+    assert points_of(path)[0] == pytest.approx(robot.grid.cell_to_world(START))
+
+
+def test_plans_again_when_the_start_changes(robot: Robot) -> None:
+    for cell in ((0, 5), (5, 0)):
+        robot.send_start(robot.pose(cell))
+        robot.wait_for_path(cell, GOAL)
+
+
+def test_plans_again_when_the_map_changes(robot: Robot) -> None:
+    grid = robot.grid_of(robot.values, (10.0, 0.0, 0.0))
+    robot.send_start(robot.pose(START, grid=grid))
+    robot.plans.wait(lambda path: not path.poses)
+    robot.wait_for_reason("the start lies outside the map")
+    robot.send_map(
+        occupancy_message(robot.values, RESOLUTION, (10.0, 0.0, 0.0), Header(frame_id="map"))
+    )
+    robot.wait_for_reason("the goal lies outside the map")
+    robot.clear()
+    robot.send_goal(robot.pose(GOAL, grid=grid))
+    robot.wait_for_path(START, GOAL, grid)
+
+
+def test_plans_again_when_threshold_or_unknown_cells_change(robot: Robot) -> None:
+    values = robot.values.copy()
+    values[GOAL[1], GOAL[0]] = 50
+    robot.send_map(occupancy_message(values, RESOLUTION, ORIGIN, Header(frame_id="map")))
+    robot.wait_for_path(START, GOAL)
+    robot.clear()
+    assert robot.client.set_parameters("planner", occupied_threshold=50)[0].successful
+    robot.plans.wait(lambda path: not path.poses)
+    robot.wait_for_reason("the goal is occupied")
+    assert robot.client.set_parameters("planner", occupied_threshold=65)[0].successful
+    robot.wait_for_path(START, GOAL)
+
+    values[GOAL[1], GOAL[0]] = -1
+    robot.clear()
+    robot.send_map(occupancy_message(values, RESOLUTION, ORIGIN, Header(frame_id="map")))
+    robot.wait_for_reason("the goal is occupied")
+    assert robot.client.set_parameters("planner", allow_unknown=True)[0].successful
+    robot.wait_for_path(START, GOAL)
+    assert robot.client.set_parameters("planner", allow_unknown=False)[0].successful
+
+
+def test_move_rule_is_changed_at_run_time(robot: Robot) -> None:
+    assert robot.client.set_parameters("planner", move_rule="corner_cutting")[0].successful
+    robot.plans.wait()
+    status = robot.wait_for_reason(".")
+    assert values_of(status)["move rule"] == "corner_cutting"
+    assert values_of(status)["model move rule"] == "robot_safe"
+    assert robot.client.set_parameters("planner", move_rule="")[0].successful
+
+
+def test_late_subscriber_has_the_last_plan_and_value(robot: Robot) -> None:
+    robot.plans = robot.client.subscribe(Path, "plan", LATCHED)
+    robot.wait_for_path(START, GOAL)
+    robot.client.subscribe(OccupancyGrid, "planner/value", LATCHED).wait()
+
+
+# Models
+
+
+def constant_model(path: FilePath, size: int, steps: int) -> None:
+    """Write a model that always goes to -x, or where it cannot, to +x: it turns round for ever."""
+    network = PaperQNetwork(size, size, 1)
+    with torch.no_grad():
+        network.fully_connected.weight.zero_()
+        network.fully_connected.bias.copy_(torch.tensor([1, 0, 0, 0, 2, 0, 0, 0]))
+    sizes = {"height": size, "width": size, "filters": 1}
+    metadata = ModelMetadata("paper", sizes, MoveRule.ROBOT_SAFE, 0.9, "", steps, 0, "")
+    save_model(path, network, metadata)
+
+
+def broken_model(path: FilePath, kind: str) -> None:
+    whole = path.read_bytes() if path.exists() else b""
+    if kind == "missing":
+        path.unlink(missing_ok=True)
+    elif kind == "truncated":
+        path.write_bytes(whole[: len(whole) // 2])
+    elif kind == "foreign":
+        path.write_bytes(safetensors.torch.save({"weight": torch.zeros(2)}))
+    elif kind == "text":
+        path.write_text("a model")
+
+
+BROKEN_MODELS = [
+    ("missing", "there is no model file"),
+    ("truncated", "cannot be read as safetensors"),
+    ("foreign", "no model of ddqn_planner"),
+    ("text", "cannot be read as safetensors"),
+]
+
+
+@pytest.fixture
+def whole_model(robot: Robot, trained_model: FilePath) -> Iterator[FilePath]:
+    """Put the whole model back after the test."""
+    yield robot.model
+    shutil.copy(trained_model, robot.model)
+    assert robot.client.set_parameters("planner", model=str(robot.model))[0].successful
+
+
+def test_reload_plans_again_with_what_the_file_holds_now(
+    robot: Robot, whole_model: FilePath, trained_model: FilePath
+) -> None:
+    constant_model(whole_model, 6, 7)
+    response = robot.client.call(Trigger, "planner/reload_model")
+    assert response.success, response.message
+    assert str(whole_model) in response.message
+    robot.plans.wait(lambda path: not path.poses)
+    status = robot.wait_for_reason("greedy steps do not find it.*cell \\(0, 0\\).*train the model")
+    assert status.level == DiagnosticStatus.WARN
+    assert values_of(status)["status"] == "WALK_TRAPPED"
+    assert values_of(status)["model training steps"] == "7"
+    shutil.copy(trained_model, whole_model)
+    assert robot.client.call(Trigger, "planner/reload_model").success
+    robot.wait_for_path(START, GOAL)
+
+
+@pytest.mark.parametrize(("kind", "reason"), BROKEN_MODELS)
+def test_failed_reload_keeps_the_model(
+    robot: Robot, whole_model: FilePath, kind: str, reason: str
+) -> None:
+    broken_model(whole_model, kind)
+    response = robot.client.call(Trigger, "planner/reload_model")
+    assert not response.success
+    assert reason in response.message
+    assert str(whole_model) in response.message
+    robot.assert_works()
+
+
+@pytest.mark.parametrize(("kind", "reason"), [*BROKEN_MODELS, ("no name", "no shipped model")])
+def test_parameter_model_refuses_a_bad_file(
+    robot: Robot, tmp_path: FilePath, kind: str, reason: str
+) -> None:
+    path = tmp_path / "other.safetensors"
+    constant_model(path, 6, 1)
+    broken_model(path, kind)
+    value = "no_such_model" if kind == "no name" else str(path)
+    (result,) = robot.client.set_parameters("planner", model=value)
+    assert not result.successful
+    assert reason in result.reason
+    assert robot.client.get_parameter("planner", "model") == str(robot.model)
+    robot.assert_works()
+
+
+def test_model_of_another_size_says_so(
+    robot: Robot, whole_model: FilePath, tmp_path: FilePath
+) -> None:
+    constant_model(tmp_path / "seven.safetensors", 7, 1)
+    path = str(tmp_path / "seven.safetensors")
+    assert robot.client.set_parameters("planner", model=path)[0].successful
+    robot.plans.wait(lambda plan: not plan.poses)
+    robot.wait_for_reason("not trained for maps of this size.*6 x 6 cells")
+
+
+def test_follows_the_trainer(robot: Robot, whole_model: FilePath, tmp_path: FilePath) -> None:
+    path = tmp_path / "saved.safetensors"
+    constant_model(path, 6, 11)
+    robot.client.publish("trainer/model_saved", String(data=str(path)), LATCHED)
+    status = robot.wait_for_reason("greedy steps do not find it")
+    assert values_of(status)["model training steps"] == "11"
+    assert robot.client.get_parameter("planner", "model") == str(path)
+
+    robot.clear()
+    robot.client.publish("trainer/model_saved", String(data="/no/such.safetensors"), LATCHED)
+    status = robot.wait_for_reason("trainer's model was refused: .*'/no/such.safetensors'")
+    assert values_of(status)["model training steps"] == "11"
+
+
+# Parameters
+
+
+def test_bad_parameters_are_refused_with_a_reason(robot: Robot) -> None:
+    for name, value, reason in (
+        ("move_rule", "diagonal", "move_rule is 'diagonal'"),
+        ("occupied_threshold", 0, "out of range"),
+        ("occupied_threshold", 101, "out of range"),
+        ("occupied_threshold", "many", "Wrong parameter type"),
+        ("follow_trainer", False, "read-only"),
+    ):
+        before = robot.client.get_parameter("planner", name)
+        (result,) = robot.client.set_parameters("planner", **{name: value})
+        assert not result.successful
+        assert reason in result.reason
+        assert robot.client.get_parameter("planner", name) == before
+    robot.assert_works()
+
+
+def test_parameters_say_what_they_are(robot: Robot) -> None:
+    names = ["model", "move_rule", "occupied_threshold", "allow_unknown", "follow_trainer"]
+    request = DescribeParameters.Request(names=names)
+    response = robot.client.call(DescribeParameters, "planner/describe_parameters", request)
+    assert [entry.name for entry in response.descriptors if entry.description] == names
+
+
+# Bad input. After each, a good request has its plan.
+
+
+def changed(message: Any, field: str, value: Any) -> Any:
+    target = message
+    *parents, name = field.split(".")
+    for parent in parents:
+        target = getattr(target, parent)
+    setattr(target, name, value)
+    return message
+
+
+BAD_POSES = [
+    ("pose.position.x", math.nan, "x = nan"),
+    ("pose.position.y", math.inf, "y = inf"),
+    ("pose.orientation", Quaternion(w=0.0), "quaternion of norm 0"),
+    ("pose.orientation", Quaternion(w=1.01), "quaternion of norm 1.01"),
+    ("pose.orientation", Quaternion(z=math.nan), "quaternion of norm nan"),
+    ("header.frame_id", "odom", "frame is 'odom', the map's is 'map'; transform"),
+]
+
+UNREACHED_POSES = [
+    ("pose.position.x", 50.0, r"lies outside the map .*\(50, .*\) m.*6 x 6 cells"),
+    ("pose.position.x", -1e300, r"lies outside the map .*\(-1e\+300, .*\) m"),
+    ("pose.position.x", 1e308, "x = 1e[+]308.*too far"),
+]
+
+
+@pytest.mark.parametrize(
+    ("field", "value", "reason"),
+    [
+        ("data", array.array("b", [0] * 35), "the map's data has 35 values.*need 36"),
+        ("info.width", 0, "the map has 0 x 6 cells"),
+        ("info.resolution", 0.0, "the map's resolution is 0.0"),
+        ("info.resolution", math.nan, "the map's resolution is nan"),
+        ("header.frame_id", "", "the map's frame is ''"),
+        ("info.origin.orientation", Quaternion(w=0.5), "quaternion of norm 0.5"),
+        ("info.origin.position.x", math.inf, "x = inf"),
+    ],
+)
+def test_malformed_map_is_refused_and_the_old_one_stays(
+    robot: Robot, planner: Any, field: str, value: Any, reason: str
+) -> None:
+    robot.send_map(changed(robot.map_message(), field, value))
+    status = robot.wait_for_reason(f"map refused: .*{reason}")
+    assert status.level == DiagnosticStatus.WARN
+    planner.wait_for_log(f"map refused: .*{reason}")
+    robot.assert_works()
+
+
+@pytest.mark.parametrize(
+    ("field", "value", "reason"), [*BAD_POSES, ("header.frame_id", "", "frame is ''")]
+)
+def test_malformed_start_is_refused_and_the_old_one_stays(
+    robot: Robot, planner: Any, field: str, value: Any, reason: str
+) -> None:
+    robot.send_start(changed(robot.pose((3, 3)), field, value))
+    robot.wait_for_reason(f"initialpose refused: the start's .*{reason}")
+    planner.wait_for_log(f"initialpose refused: the start's .*{reason}")
+    robot.assert_works()
+    robot.send_goal(robot.pose(GOAL))
+    robot.wait_for_path(START, GOAL)
+
+
+@pytest.mark.parametrize(
+    ("field", "value", "reason"), [*BAD_POSES, ("header.frame_id", "", "frame is ''")]
+)
+def test_malformed_goal_has_an_empty_plan_and_clears_the_active_goal(
+    robot: Robot, planner: Any, field: str, value: Any, reason: str
+) -> None:
+    robot.send_goal(changed(robot.pose(GOAL), field, value))
+    plan = robot.plans.wait(lambda path: not path.poses)
+    assert plan.header.frame_id == "map"
+    status = robot.wait_for_reason(f"the goal's .*{reason}")
+    assert (status.level, values_of(status)["status"]) == (DiagnosticStatus.WARN, "INVALID_GOAL")
+    planner.wait_for_log(f"no plan: the goal's .*{reason}")
+    robot.clear()
+    robot.send_start(robot.pose((3, 3)))
+    robot.assert_works()
+    with pytest.raises(AssertionError, match="no such message"):
+        robot.plans.wait(timeout=0.1)
+
+
+@pytest.mark.parametrize("name", ["start", "goal"])
+@pytest.mark.parametrize(("field", "value", "reason"), [*BAD_POSES, *UNREACHED_POSES])
+def test_bad_get_plan_has_an_empty_plan_and_a_reason(
+    robot: Robot, planner: Any, name: str, field: str, value: Any, reason: str
+) -> None:
+    poses = {"start": robot.pose(START), "goal": robot.pose(GOAL)}
+    changed(poses[name], field, value)
+    path = robot.get_plan(**poses)
+    assert (path.poses, path.header.frame_id) == ([], "map")
+    status = robot.wait_for_reason(f"the {name}.*{reason}")
+    assert values_of(status)["reason"] == status.message
+    planner.wait_for_log(f"no plan: the {name}.*{reason}")
+    robot.assert_works()
+
+
+@pytest.mark.parametrize(("field", "value", "reason"), UNREACHED_POSES[:2])
+@pytest.mark.parametrize("name", ["start", "goal"])
+def test_pose_outside_the_map_has_an_empty_plan(
+    robot: Robot, name: str, field: str, value: float, reason: str
+) -> None:
+    send = {"start": robot.send_start, "goal": robot.send_goal}[name]
+    send(changed(robot.pose(START), field, value))
+    assert robot.plans.wait(lambda path: not path.poses).header.frame_id == "map"
+    robot.wait_for_reason(f"the {name} {reason}")
+    robot.assert_works()
+
+
+@pytest.mark.parametrize("name", ["start", "goal"])
+def test_occupied_pose_has_an_empty_plan(robot: Robot, name: str) -> None:
+    send = {"start": robot.send_start, "goal": robot.send_goal}[name]
+    send(robot.pose((2, 1)))
+    assert robot.plans.wait(lambda path: not path.poses).header.frame_id == "map"
+    status = robot.wait_for_reason(rf"the {name} is occupied .*{name}: \(0.3, 2.7\) m in cell")
+    assert values_of(status)["status"] == f"{name.upper()}_OCCUPIED"
+    robot.assert_works()
+
+
+def test_unreachable_goal_has_an_empty_plan_until_the_map_opens(robot: Robot) -> None:
+    values = robot.values.copy()
+    values[4:, 4] = values[4, 4:] = 100
+    robot.send_map(occupancy_message(values, RESOLUTION, ORIGIN, Header(frame_id="map")))
+    robot.plans.wait(lambda path: not path.poses)
+    status = robot.wait_for_reason(r"no path leads from .*cell \(0, 0\).*cell \(5, 5\)")
+    assert values_of(status)["status"] == "NO_PATH"
+    robot.clear()
+    robot.send_map()
+    robot.wait_for_path(START, GOAL)
+
+
+# Processes of their own
+
+
+def test_says_what_it_waits_for_and_plans_once_it_is_there(
+    run_node: Any, make_client: Callable[[str], Any], small_values: np.ndarray, model: FilePath
+) -> None:
+    remaps = ["map:=plant", "plan:=route", "__node:=router"]
+    with run_node("planner_node", {"model": str(model)}, remaps) as node:
+        client = make_client("")
+        robot = Robot(client, small_values, model, "/router")
+        plans = client.subscribe(Path, "route", LATCHED)
+
+        def wait_for(reason: str) -> None:
+            robot.wait_for_reason(reason)
+            node.wait_for_log(reason)
+
+        client.publish("goal_pose", robot.pose(GOAL))
+        assert plans.wait().header.frame_id == "map"
+        wait_for("no map was received on /plant yet; start a map server")
+        malformed = changed(robot.map_message(), "info.resolution", 0.0)
+        client.publish("plant", malformed, LATCHED)
+        wait_for("map refused: the map's resolution is 0.0")
+
+        plans.clear()
+        client.publish("plant", robot.map_message(), LATCHED)
+        assert plans.wait().poses == []
+        wait_for("the start is unknown; set it on initialpose")
+        request = GetPlan.Request(goal=robot.pose(GOAL))
+        assert client.call(GetPlan, "router/get_plan", request).plan.poses == []
+
+        robot.send_start(robot.pose(START))
+        check_path(plans.wait(lambda path: path.poses), robot.grid)
+        resident_mib = (
+            int(
+                re.search(
+                    r"VmRSS:\s+(\d+) kB", FilePath(f"/proc/{node.process.pid}/status").read_text()
+                )[1]
+            )
+            / 1024
+        )
+        assert resident_mib < 500
+
+        began = time.monotonic()
+        assert node.stop(signal.SIGTERM) == 0
+        assert time.monotonic() - began < 3.0
+
+
+@pytest.mark.parametrize(("kind", "reason"), BROKEN_MODELS[:3])
+def test_without_a_model_at_the_start_the_node_lives_on(
+    run_node: Any,
+    make_client: Callable[[str], Any],
+    small_values: np.ndarray,
+    trained_model: FilePath,
+    tmp_path: FilePath,
+    kind: str,
+    reason: str,
+) -> None:
+    path = tmp_path / "model.safetensors"
+    shutil.copy(trained_model, path)
+    broken_model(path, kind)
+    namespace = f"/{kind}"
+    with run_node("planner_node", {"model": str(path)}, namespace=namespace) as node:
+        robot = Robot(make_client(namespace), small_values, path, f"{namespace}/planner")
+        node.wait_for_log(f"model refused: .*{reason}")
+        robot.send_map()
+        robot.send_start(robot.pose(START))
+        robot.send_goal(robot.pose(GOAL))
+        robot.plans.wait(lambda plan: not plan.poses)
+        status = robot.wait_for_reason(f"no model is loaded: .*{reason}")
+        assert status.level == DiagnosticStatus.ERROR
+        response = robot.client.call(Trigger, "planner/reload_model")
+        assert not response.success
+        assert reason in response.message
+        shutil.copy(trained_model, path)
+        assert robot.client.call(Trigger, "planner/reload_model").success
+        robot.wait_for_path(START, GOAL)
+
+
+def test_what_the_node_cannot_start_with_is_one_clear_line(run_node: Any) -> None:
+    with run_node("planner_node", {"move_rule": "diagonal"}, exit_code=1) as node:
+        node.process.wait(10)
+    assert re.search("cannot start: .*move_rule is 'diagonal'", node.log)
+    assert "Traceback" not in node.log

@@ -1,0 +1,112 @@
+from __future__ import annotations
+
+import json
+import os
+import re
+import signal
+import subprocess
+import sysconfig
+import time
+from pathlib import Path
+
+import pytest
+from PIL import Image
+
+from ddqn_planner.cli import main
+from ddqn_planner.grid import GridMap, MapFile, save_map
+from ddqn_planner.model import load_model
+from ddqn_planner.training.environment import Scenario
+
+
+@pytest.fixture
+def small_map(small: Scenario, tmp_path: Path) -> str:
+    """A map file of the small scenario."""
+    path = tmp_path / "small.yaml"
+    percent = small.grid.occupancy.astype("int8") * 100
+    save_map(MapFile(percent, start=small.start, goal=small.goal), path)
+    return str(path)
+
+
+def test_plan_prints_the_papers_path(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["plan", "dilemma"]) == 0
+    printed = capsys.readouterr().out
+    assert "length 22.97 cells, optimum 22.97 under corner_cutting" in printed
+    assert printed.count("*") == 17
+    assert printed.count("S") == printed.count("G") == 1
+
+
+def test_plan_writes_json_and_a_picture(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    assert main(["plan", "dilemma", "--json", "--picture", str(tmp_path / "plan.png")]) == 0
+    answer = json.loads(capsys.readouterr().out)
+    assert answer["status"] == "SUCCEEDED"
+    assert answer["cells"][0] == [6, 6]
+    assert answer["cells"][-1] == [17, 19]
+    assert answer["length"] == pytest.approx(answer["optimum"])
+    with Image.open(tmp_path / "plan.png") as picture:
+        assert len(set(picture.convert("RGB").resize((90, 80)).getdata())) > 100
+
+
+def test_plan_says_why_there_is_no_path(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["plan", "dilemma", "--start", "1", "19"]) == 1
+    assert "the start is occupied" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("arguments", "named"),
+    [
+        (["plan", "no_such_map.yaml"], "no_such_map.yaml"),
+        (["plan", "dilemma", "--model", "no_such_model"], "no_such_model"),
+        (["train", "dilemma", "--gamma", "2"], r"gamma is 2\.0"),
+        (["train", "dilemma", "--start", "1", "19"], r"start \(1, 19\)"),
+    ],
+)
+def test_bad_input_ends_with_2_and_its_name(
+    capsys: pytest.CaptureFixture[str], arguments: list[str], named: str
+) -> None:
+    assert main(arguments) == 2
+    error = capsys.readouterr().err
+    assert re.search(named, error)
+    assert "Traceback" not in error
+
+
+def test_a_map_without_start_and_goal_asks_for_them(
+    capsys: pytest.CaptureFixture[str], small: Scenario, tmp_path: Path
+) -> None:
+    save_map(GridMap(small.grid.occupancy), tmp_path / "bare.yaml")
+    assert main(["plan", str(tmp_path / "bare.yaml")]) == 2
+    assert "--start X Y" in capsys.readouterr().err
+
+
+def test_a_trained_model_plans(
+    capsys: pytest.CaptureFixture[str], small_map: str, tmp_path: Path
+) -> None:
+    train = ["train", small_map, "--out", str(tmp_path / "run"), "--steps", "3000"]
+    train += ["--learning-rate", "0.003", "--epsilon-steps", "1500", "--target-interval", "100"]
+    assert main(train) == 0
+    assert "of 16 starts" in capsys.readouterr().out
+    model = str(tmp_path / "run" / "model.safetensors")
+    assert main(["plan", small_map, "--model", model]) == 0
+    assert "length" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_an_interrupted_training_is_saved_and_goes_on(
+    small_map: str, tmp_path: Path, number: int
+) -> None:
+    executable = Path(sysconfig.get_path("scripts")) / "ddqn-planner"
+    command = [executable, "train", small_map, "--out", tmp_path / "run", "--filters", "4"]
+    curves = tmp_path / "run" / "episodes.csv"
+    child = subprocess.Popen([*command, "--steps", "1000000"], stdout=subprocess.PIPE, text=True)
+    deadline = time.monotonic() + 60
+    while not curves.exists() or curves.read_text().count("\n") < 50:
+        assert time.monotonic() < deadline
+        assert child.poll() is None
+        time.sleep(0.05)
+    os.kill(child.pid, number)
+    printed, _ = child.communicate(timeout=30)
+    assert child.returncode == 0
+    assert "the same command goes on from there" in printed
+    steps = load_model(tmp_path / "run" / "model.safetensors")[1].steps
+    assert steps > 0
+    subprocess.run([*command, "--steps", str(steps + 100)], check=True, capture_output=True)
+    assert load_model(tmp_path / "run" / "model.safetensors")[1].steps == steps + 100
