@@ -19,7 +19,7 @@ from ddqn_planner.grid import Cell, MapFile, MoveRule, read_map_file
 from ddqn_planner.planning import Plan, Planner, PlanStatus, shortest_distances
 from ddqn_planner.planning.evaluation import evaluate
 from ddqn_planner.planning.picture import PictureError, draw_text, save_picture
-from ddqn_planner.resources import find_resource
+from ddqn_planner.resources import find_map
 from ddqn_planner.training.environment import Scenario
 from ddqn_planner.training.hyper_parameters import HyperParameters
 from ddqn_planner.training.run import TrainingRun
@@ -74,7 +74,7 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def _add_map_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("map", type=Path, help="ROS map YAML, MovingAI .map, or shipped map's name")
+    parser.add_argument("map", help="ROS map YAML, MovingAI .map, or shipped map's name")
     for name in ("start", "goal"):
         parser.add_argument(
             f"--{name}",
@@ -86,14 +86,11 @@ def _add_map_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def _read_map(options: argparse.Namespace) -> tuple[MapFile, Cell, Cell]:
-    path: Path = options.map
-    if not path.exists() and path.name == str(path):
-        path = find_resource("maps", path.name if path.suffix else f"{path.name}.yaml")
-    map_file = read_map_file(path)
+    map_file = read_map_file(find_map(options.map))
     start = tuple(options.start) if options.start else map_file.start
     goal = tuple(options.goal) if options.goal else map_file.goal
     if start is None or goal is None:
-        raise ValueError(f"{path} names no start and goal; give --start X Y and --goal X Y")
+        raise ValueError(f"{options.map} names no start and goal; give --start X Y and --goal X Y")
     return map_file, start, goal
 
 

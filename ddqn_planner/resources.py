@@ -49,3 +49,44 @@ def find_resource(folder: str, name: str) -> Path:
     raise FileNotFoundError(
         f"no {name!r} in {', '.join(map(str, looked_in))}; there are: {', '.join(known) or 'none'}"
     )
+
+
+def find_map(name: str) -> Path:
+    """Return the file of a map that is given by path, URL or the name of a shipped one.
+
+    Parameters
+    ----------
+    name : str
+        A path, a ``file://`` or ``package://`` URL, or the name of a map that comes with this
+        package, with or without its ending. A file in the working directory goes first.
+
+    Returns
+    -------
+    Path
+        It need not exist: whoever reads it will say so.
+
+    Raises
+    ------
+    FileNotFoundError
+        If there is no shipped map of that name, or no such package.
+    """
+    path = Path(name.removeprefix("file://"))
+    if name.startswith("package://"):
+        return _package_path(name.removeprefix("package://"))
+    if path.name != name or path.exists():
+        return path
+    return find_resource("maps", name if path.suffix else f"{name}.yaml")
+
+
+def _package_path(name: str) -> Path:
+    package, _, rest = name.partition("/")
+    if package == PACKAGE:
+        return find_resource(str(Path(rest).parent), Path(rest).name)
+    try:
+        from ament_index_python.packages import get_package_share_directory
+
+        return Path(get_package_share_directory(package)) / rest
+    except (ImportError, LookupError, OSError) as error:
+        raise FileNotFoundError(
+            f"package://{name}: there is no such package ({error}); check it, or give a path"
+        ) from None

@@ -26,6 +26,11 @@ class MoveRule(str, Enum):
     CORNER_CUTTING = "corner_cutting"
     """A diagonal move needs no more than its target cell free (what the paper's 22.97 implies)."""
 
+    @classmethod
+    def _missing_(cls, value: object) -> MoveRule:
+        known = ", ".join(rule.value for rule in cls)
+        raise ValueError(f"the move rule {value!r} is unknown; give one of {known}")
+
 
 def legal_moves(occupancy: NDArray[np.bool_], move_rule: MoveRule) -> NDArray[np.bool_]:
     """Say for each cell which of the eight moves the robot may make from it.

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import sys
-from pathlib import Path
 
 import numpy as np
 from nav_msgs.msg import OccupancyGrid
@@ -27,9 +26,10 @@ from ddqn_planner.grid.map_file import MapDataError, MapMetadataError, MapNotFou
 from ddqn_planner.nodes.conversions import OCCUPIED, occupancy_message
 from ddqn_planner.nodes.runtime import LATCHED, spin_until_shutdown
 from ddqn_planner.planning import shortest_path
-from ddqn_planner.resources import PACKAGE, find_resource
+from ddqn_planner.resources import PACKAGE, find_map
 
 RESULTS: dict[type[Exception], int] = {
+    FileNotFoundError: LoadMap.Response.RESULT_MAP_DOES_NOT_EXIST,
     MapNotFoundError: LoadMap.Response.RESULT_MAP_DOES_NOT_EXIST,
     MapDataError: LoadMap.Response.RESULT_INVALID_MAP_DATA,
     MapMetadataError: LoadMap.Response.RESULT_INVALID_MAP_METADATA,
@@ -160,48 +160,6 @@ class MapServerNode(Node):
             self._serve(self._loaded.values)
             response.success, response.message = True, "the map is as it was loaded"
         return response
-
-
-def find_map(url: str) -> Path:
-    """Return the file of a map that is given by path, URL or name.
-
-    Parameters
-    ----------
-    url : str
-        A path, a ``file://`` or ``package://`` URL, or the name of a map that comes with this
-        package. A file in the working directory goes before a shipped one.
-
-    Returns
-    -------
-    Path
-        It need not exist: whoever reads it will say so.
-
-    Raises
-    ------
-    MapNotFoundError
-        If there is no shipped map of that name, or no such package.
-    """
-    path = Path(url.removeprefix("file://"))
-    if url.startswith("package://"):
-        path = _package_path(url.removeprefix("package://"))
-    elif path.name == url and not path.exists():
-        try:
-            path = find_resource("maps", url)
-        except FileNotFoundError as error:
-            raise MapNotFoundError(f"{error}; give one of these or a path") from None
-    return path
-
-
-def _package_path(name: str) -> Path:
-    package, _, rest = name.partition("/")
-    try:
-        if package == PACKAGE:
-            return find_resource(str(Path(rest).parent), Path(rest).name)
-        from ament_index_python.packages import get_package_share_directory
-
-        return Path(get_package_share_directory(package)) / rest
-    except (ImportError, LookupError, OSError) as error:
-        raise MapNotFoundError(f"package://{name}: {error}; check it, or give a path") from None
 
 
 def known_path(grid: GridMap, start: Cell, goal: Cell) -> tuple[MoveRule, list[Cell]]:

@@ -36,6 +36,7 @@ from ddqn_planner.nodes.conversions import (
     quaternion,
 )
 from ddqn_planner.nodes.runtime import LATCHED, spin_until_shutdown
+from ddqn_planner.resources import find_map
 from ddqn_planner.training.environment import Scenario
 from ddqn_planner.training.hyper_parameters import HyperParameters
 from ddqn_planner.training.run import TrainingRun, read_cells
@@ -97,7 +98,11 @@ class TrainerNode(Node):
             )
 
         declare("output_folder", "runs/trainer", "Folder of the checkpoint, model and curves")
-        declare("map_file", "", "Map file with start and goal; '' to wait for topics")
+        declare(
+            "map_file",
+            "",
+            "Map file with start and goal, or a shipped map's name; '' to wait for topics",
+        )
         declare("move_rule", "corner_cutting", f"One of {[rule.value for rule in MoveRule]}")
         declare("seed", 0, "Seed of the training", **_integers(0, 2**31 - 1))
         declare("occupied_threshold", 65, "Percent from which on", **_integers(1, 100))
@@ -121,7 +126,7 @@ class TrainerNode(Node):
         if not name:
             return
         try:
-            map_file = read_map_file(name)
+            map_file = read_map_file(find_map(name))
         except (ValueError, OSError) as error:
             raise InvalidParameterValueException("map_file", name, str(error)) from None
         self._grid = map_file.grid(self._value("occupied_threshold"), self._value("allow_unknown"))
