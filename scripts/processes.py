@@ -46,17 +46,44 @@ def executable(name: str) -> str:
 
 
 @contextmanager
-def running(*command: str) -> Iterator[subprocess.Popen[bytes]]:
-    """Run a command; at the end stop it as Ctrl-C would."""
-    # A session of its own: Ctrl-C in the terminal reaches the parent alone, which then tidies up.
-    child = subprocess.Popen(command, start_new_session=True)
+def _signals_held_back() -> Iterator[None]:
+    """Let SIGINT and SIGTERM come only after the block."""
+    held: list[int] = []
+    # Handlers, not a mask: a child would inherit the mask.
+    handlers = {
+        number: signal.signal(number, lambda number, _: held.append(number))
+        for number in (signal.SIGINT, signal.SIGTERM)
+    }
     try:
+        yield
+    finally:
+        for number, handler in handlers.items():
+            signal.signal(number, handler)
+        for number in held[:1]:
+            signal.raise_signal(number)
+
+
+@contextmanager
+def running(*command: str) -> Iterator[subprocess.Popen[bytes]]:
+    """Run a command; at the end stop it as Ctrl-C would. To be used in the main thread."""
+    child = None
+    try:
+        # A signal inside Popen would lose the child that it has just begun.
+        with _signals_held_back():
+            # A session of its own: Ctrl-C in the terminal reaches the parent alone, which then
+            # tidies up.
+            child = subprocess.Popen(command, start_new_session=True)
         yield child
     finally:
-        child.send_signal(signal.SIGINT)
-        try:
-            child.wait(timeout=10)
-        except BaseException:
-            child.kill()
-            child.wait()
-            raise
+        if child is not None:
+            _stop(child)
+
+
+def _stop(child: subprocess.Popen[bytes]) -> None:
+    child.send_signal(signal.SIGINT)
+    try:
+        child.wait(timeout=10)
+    except BaseException:
+        child.kill()
+        child.wait()
+        raise

@@ -55,7 +55,7 @@ class PaperQNetwork(nn.Module):
         weight_FK = self.convolution.weight.flatten(1)
         weight_BFK = weight_FK.expand(len(patch_BKL), -1, -1)
         bias_F1 = cast(Tensor, self.convolution.bias).unsqueeze(1)
-        feature_BFL = torch.baddbmm(bias_F1, weight_BFK, patch_BKL).relu()
+        feature_BFL = torch.baddbmm(bias_F1, weight_BFK, patch_BKL).relu_()
         q_BA: Tensor = self.fully_connected(feature_BFL.flatten(1))
         return q_BA
 

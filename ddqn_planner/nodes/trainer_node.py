@@ -6,10 +6,11 @@ publishes from. So nothing that must be saved depends on ROS still being there.
 
 from __future__ import annotations
 
+import itertools
 import queue
 import sys
 import threading
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import fields
 from pathlib import Path as FilePath
 from typing import Any
@@ -231,18 +232,19 @@ class TrainerNode(Node):
         if self._grid is None:
             return _answer(response, False, "no map was received yet; start a map server first")
         try:
-            episodes = list(read_cells(curves, self._value("episode_interval")))
+            episodes = read_cells(curves, self._value("episode_interval"))
+            first = next(episodes, None)
         except (OSError, ValueError, KeyError) as error:
             return _answer(response, False, f"no recorded episodes ({error}); call ~/start first")
-        if not episodes:
+        if first is None:
             return _answer(response, False, f"{curves} holds no episode to replay yet; train on")
         self._stop_replay()
-        frames = _growing(episodes)
+        frames = _growing(itertools.chain([first], episodes))
         period = self._value("replay_period")
         self._replay_timer = self.create_timer(
             period, lambda: self._replay_step(frames), clock=self._steady_clock
         )
-        return _answer(response, True, f"replaying {len(episodes)} episodes on ~/episode")
+        return _answer(response, True, "replaying the recorded episodes on ~/episode")
 
     # Training, in its own thread
 
@@ -298,7 +300,11 @@ class TrainerNode(Node):
             self._episode_publisher.publish(path_message(cells, grid, header, Quaternion(w=1.0)))
 
     def _replay_step(self, frames: Iterator[tuple[Cell, ...]]) -> None:
-        frame = next(frames, None)
+        try:
+            frame = next(frames, None)
+        except (OSError, ValueError, KeyError) as error:
+            self._refuse(f"the replay ends: episodes.csv cannot be read on ({error})")
+            frame = None
         if frame is None:
             self._stop_replay()
         else:
@@ -343,7 +349,7 @@ def _answer(response: Trigger.Response, success: bool, message: str) -> Trigger.
     return response
 
 
-def _growing(episodes: list[tuple[Cell, ...]]) -> Iterator[tuple[Cell, ...]]:
+def _growing(episodes: Iterable[tuple[Cell, ...]]) -> Iterator[tuple[Cell, ...]]:
     """Yield each episode step by step: its first cell, its first two, and so on."""
     for cells in episodes:
         for count in range(1, len(cells) + 1):
@@ -361,6 +367,7 @@ def _floats(low: float, high: float) -> dict[str, Any]:
 def main() -> int:
     """Run the trainer node until SIGINT or SIGTERM."""
     torch.set_num_threads(1)  # as fast as two for this network, and leaves the executor a core
+    torch.optim.Adam([torch.zeros(1)])  # the first one imports for a second: not in a service
     return spin_until_shutdown(TrainerNode)
 
 

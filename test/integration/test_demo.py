@@ -1,0 +1,120 @@
+"""The demo as `make demo` runs it, to its end and interrupted."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+import uuid
+from collections.abc import Iterator
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+from processes import running
+
+DEMO = Path(__file__).resolve().parents[2] / "scripts" / "demo.py"
+END_TIMEOUT = 90.0
+"""Seconds that the whole demo may take on a loaded machine."""
+
+STOP_TIMEOUT = 20.0
+"""Seconds in which it ends after a signal: each of two nodes is killed after 10."""
+
+MARK = "DDQN_PLANNER_TEST_DEMO"
+
+
+class Demo:
+    """A running demo, and the processes that came from it."""
+
+    def __init__(self, folder: Path) -> None:
+        # The demo's nodes are in sessions of their own; they inherit its environment.
+        mark = uuid.uuid4().hex
+        self._entry = f"{MARK}={mark}".encode()
+        self._output = folder / "output.txt"
+        with self._output.open("wb") as file:
+            self.process = subprocess.Popen(
+                [sys.executable, str(DEMO)],
+                cwd=folder,
+                env={**os.environ, MARK: mark},
+                stdout=file,
+                stderr=subprocess.STDOUT,
+                start_new_session=True,
+            )
+
+    @property
+    def output(self) -> str:
+        return self._output.read_text(encoding="utf-8", errors="replace")
+
+    def commands(self) -> dict[int, str]:
+        """Return the command lines of the demo's living processes, by process id."""
+        found = {}
+        for folder in Path("/proc").glob("[0-9]*"):
+            with suppress(OSError):  # it has ended, or is another user's
+                if self._entry in (folder / "environ").read_bytes().split(b"\0"):
+                    found[int(folder.name)] = (folder / "cmdline").read_text().replace("\0", " ")
+        return found
+
+    def wait_for_nodes(self) -> None:
+        deadline = time.monotonic() + END_TIMEOUT
+        nodes = ("map_server_node", "planner_node")
+        while not all(any(node in line for line in self.commands().values()) for node in nodes):
+            assert self.process.poll() is None, f"the demo ended:\n{self.output}"
+            assert time.monotonic() < deadline, f"no nodes:\n{self.output}"
+            time.sleep(0.01)
+
+
+@pytest.fixture
+def demo(tmp_path: Path) -> Iterator[Demo]:
+    """Run the demo in a temporary folder; nothing of it outlives the test."""
+    demo = Demo(tmp_path)
+    yield demo
+    for process in demo.commands():
+        with suppress(ProcessLookupError):
+            os.kill(process, signal.SIGKILL)
+    demo.process.wait()
+
+
+def test_demo_finds_the_shortest_path_and_draws_it(demo: Demo, tmp_path: Path) -> None:
+    assert demo.process.wait(END_TIMEOUT) == 0, demo.output
+    assert "length 22.97 cells, optimum 22.97" in demo.output
+    assert demo.commands() == {}
+
+    with Image.open(tmp_path / "demo.png") as picture:
+        pixels = np.asarray(picture.convert("RGB"))
+    assert min(pixels.shape[:2]) >= 400
+    # Occupied cells, the value field and the path: more than a few lines on a ground.
+    colours, counts = np.unique(pixels.reshape(-1, 3), axis=0, return_counts=True)
+    assert len(colours) > 100
+    assert counts.max() < 0.8 * counts.sum()
+
+
+@pytest.mark.parametrize(("signal_number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+def test_interrupted_demo_leaves_no_process_behind(
+    demo: Demo, signal_number: int, code: int
+) -> None:
+    demo.wait_for_nodes()
+    demo.process.send_signal(signal_number)
+    assert demo.process.wait(STOP_TIMEOUT) == code, demo.output
+    assert demo.commands() == {}
+
+
+def test_signal_while_a_node_is_started_does_not_lose_the_node(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    children = []
+
+    def start(*arguments: Any, **options: Any) -> subprocess.Popen[bytes]:
+        children.append(popen(*arguments, **options))
+        signal.raise_signal(signal.SIGINT)
+        return children[0]
+
+    popen = subprocess.Popen
+    monkeypatch.setattr(subprocess, "Popen", start)
+    with pytest.raises(KeyboardInterrupt), running("sleep", "60"):
+        pass
+    assert children[0].returncode == -signal.SIGINT
