@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import os
+import shutil
 from pathlib import Path
 
 import hypothesis
@@ -21,6 +22,16 @@ hypothesis.settings.register_profile("default", deadline=None, max_examples=50)
 hypothesis.settings.load_profile("default")
 
 ROOT = Path(__file__).resolve().parent.parent
+
+
+NOT_SOURCE = (".*", "__pycache__", "*.egg-info", "build", "dist", "install", "log", "runs")
+
+
+@pytest.fixture(scope="session")
+def source_copy(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Copy the source: a build leaves its folders beside it."""
+    copy = tmp_path_factory.mktemp("workspace") / "src" / "ddqn_planner"
+    return Path(shutil.copytree(ROOT, copy, ignore=shutil.ignore_patterns(*NOT_SOURCE)))
 
 
 @pytest.fixture(scope="session")

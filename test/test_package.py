@@ -50,24 +50,12 @@ def test_a_workspace_that_was_sourced_goes_first(
     assert find_resource("maps", "dilemma.yaml") == served
 
 
-def test_a_pip_install_brings_maps_and_models_along(tmp_path: Path) -> None:
+def test_a_pip_install_brings_maps_and_models_along(source_copy: Path, tmp_path: Path) -> None:
     environment = tmp_path / "environment"
     subprocess.run([sys.executable, "-m", "venv", "--without-pip", environment], check=True)
     python = environment / "bin" / "python"
     pip = [sys.executable, "-m", "pip", "--quiet"]
-    # A copy: the build would leave its folders in the source tree.
-    copy = tmp_path / "source"
-    files = subprocess.run(
-        ["git", "ls-files", "-z", "--cached", "--others", "--exclude-standard"],
-        cwd=ROOT,
-        check=True,
-        capture_output=True,
-        text=True,
-    )
-    for name in filter(None, files.stdout.split("\0")):
-        (copy / name).parent.mkdir(parents=True, exist_ok=True)
-        (copy / name).write_bytes((ROOT / name).read_bytes())
-    build = ["wheel", "--no-deps", "--no-build-isolation", "--wheel-dir", tmp_path, copy]
+    build = ["wheel", "--no-deps", "--no-build-isolation", "--wheel-dir", tmp_path, source_copy]
     subprocess.run([*pip, *build], check=True)
     (wheel,) = tmp_path.glob("*.whl")
     subprocess.run([*pip, "--python", python, "install", "--no-deps", wheel], check=True)

@@ -7,9 +7,7 @@ import itertools
 import os
 import re
 import signal
-import socket
 import subprocess
-import sysconfig
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -20,6 +18,7 @@ from typing import Any
 import numpy as np
 import pytest
 import yaml
+from processes import claim_ros_domain, executable
 
 TIMEOUT = 10.0
 """Seconds that anything may take on a loaded machine."""
@@ -31,34 +30,18 @@ if importlib.util.find_spec("rclpy") is None:
     collect_ignore_glob = ["test_*.py"]
 
 
-def claim_domain() -> tuple[int, socket.socket]:
-    """Return a domain id that no other test process of this machine has, and what holds it."""
-    for domain in range(1, 101):
-        claim = socket.socket()
-        try:
-            claim.bind(("127.0.0.1", 32768 + domain))
-        except OSError:
-            claim.close()
-        else:
-            return domain, claim
-    raise RuntimeError("all of the ROS domains 1 to 100 are claimed by other test processes")
-
-
 # Here, not in a fixture: it must stand before the test modules import rclpy and the messages.
-_domain, _claim = claim_domain()
-os.environ["ROS_DOMAIN_ID"] = str(_domain)
-os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
-os.environ["ROS_PYTHON_CHECK_FIELDS"] = "1"
+_claim = claim_ros_domain()
 
 
 class NodeProcess:
     """One executable in a process group of its own."""
 
-    def __init__(self, executable: str, arguments: list[str], log: Path) -> None:
+    def __init__(self, name: str, arguments: list[str], log: Path) -> None:
         self.log_path = log
         with log.open("wb") as file:
             self.process = subprocess.Popen(
-                [Path(sysconfig.get_path("scripts")) / executable, *arguments],
+                [executable(name), *arguments],
                 stdout=file,
                 stderr=subprocess.STDOUT,
                 start_new_session=True,
@@ -101,7 +84,7 @@ def run_node(tmp_path_factory: pytest.TempPathFactory) -> RunNode:
 
     @contextmanager
     def run(
-        executable: str,
+        name: str,
         parameters: dict[str, Any] | None = None,
         remaps: list[str] | None = None,
         namespace: str = "",
@@ -116,7 +99,7 @@ def run_node(tmp_path_factory: pytest.TempPathFactory) -> RunNode:
             arguments += ["--params-file", str(file)]
         for remap in [*(remaps or []), *([f"__ns:={namespace}"] if namespace else [])]:
             arguments += ["-r", remap]
-        process = NodeProcess(executable, arguments, logs / f"{number}.{executable}.log")
+        process = NodeProcess(name, arguments, logs / f"{number}.{name}.log")
         try:
             yield process
         finally:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import importlib.util
 import os
-import shutil
 import subprocess
 import sys
 import sysconfig
@@ -26,19 +25,15 @@ from ddqn_planner.nodes.runtime import LATCHED
 from ddqn_planner.training.environment import Scenario
 
 ROOT = Path(__file__).resolve().parents[2]
-NOT_SOURCE = (".*", "__pycache__", "*.egg-info", "build", "dist", "install", "log", "out", "runs")
 
 START_TIMEOUT = 30.0
 """Seconds in which a node of a loaded machine imports torch and speaks."""
 
 
 @pytest.fixture(scope="module")
-def install(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def install(source_copy: Path) -> Path:
     """Build a copy of the source in a workspace; return the workspace's install folder."""
-    workspace = tmp_path_factory.mktemp("workspace")
-    shutil.copytree(
-        ROOT, workspace / "src" / "ddqn_planner", ignore=shutil.ignore_patterns(*NOT_SOURCE)
-    )
+    workspace = source_copy.parents[1]
     colcon = Path(sysconfig.get_path("scripts")) / "colcon"
     built = subprocess.run(
         [colcon, "build", "--base-paths", "src", "--event-handlers", "console_direct+"],
