@@ -24,10 +24,13 @@ from ddqn_planner.training.environment import Scenario
 from ddqn_planner.training.hyper_parameters import HyperParameters
 from ddqn_planner.training.run import TrainingRun
 
+MOVE_RULES = [rule.value for rule in MoveRule]
+
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line; return the exit code: 0 done, 1 no path, 2 bad input."""
     options = _parser().parse_args(arguments)
+    options.move_rule = MoveRule(options.move_rule) if options.move_rule else None
     torch.set_num_threads(1)  # as fast as two for networks of this size, and the same every time
     try:
         return int(options.command(options))
@@ -43,9 +46,7 @@ def _parser() -> argparse.ArgumentParser:
     plan = commands.add_parser("plan", help="plan a path on a map file")
     _add_map_arguments(plan)
     plan.add_argument("--model", default="dilemma", help="name or file (%(default)s)")
-    plan.add_argument(
-        "--move-rule", type=MoveRule, choices=list(MoveRule), help="the model's by default"
-    )
+    plan.add_argument("--move-rule", choices=MOVE_RULES, help="the model's by default")
     plan.add_argument("--json", action="store_true", help="print JSON in place of text")
     plan.add_argument("--picture", type=Path, metavar="FILE", help="draw map, value and path")
     plan.set_defaults(command=_plan)
@@ -59,9 +60,9 @@ def _parser() -> argparse.ArgumentParser:
     _add_map_arguments(train)
     train.add_argument("--out", type=Path, default=Path("runs/train"), help="folder of the run")
     train.add_argument(
-        "--move-rule", type=MoveRule, choices=list(MoveRule), default=MoveRule.CORNER_CUTTING
+        "--move-rule", choices=MOVE_RULES, default="corner_cutting", help="of the robot"
     )
-    train.add_argument("--seed", type=int, default=0)
+    train.add_argument("--seed", type=int, default=0, help="of the training")
     for entry in fields(HyperParameters):
         train.add_argument(
             f"--{entry.name.replace('_', '-')}",

@@ -158,6 +158,8 @@ def show(node: Client, plan: Path, children: Children, seconds: float) -> None:
 
 def main() -> int:
     """Run the demo; return its exit code."""
+    # A shell starts what it runs in the background with SIGINT ignored, and so would the nodes be.
+    signal.signal(signal.SIGINT, signal.default_int_handler)
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))
     with client() as node:
         began = time.monotonic()

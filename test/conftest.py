@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import os
 import shutil
+import signal
 from pathlib import Path
 
 import hypothesis
@@ -16,6 +17,9 @@ import torch
 from ddqn_planner.grid import GridMap
 from ddqn_planner.training.environment import Scenario, paper_scenario
 
+# A shell starts what it runs in the background with SIGINT ignored; the processes that the tests
+# start would inherit that.
+signal.signal(signal.SIGINT, signal.default_int_handler)
 torch.set_num_threads(1)
 # A loaded machine is slow, not wrong.
 hypothesis.settings.register_profile("default", deadline=None, max_examples=50)

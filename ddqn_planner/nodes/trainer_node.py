@@ -106,7 +106,9 @@ class TrainerNode(Node):
         )
         declare("move_rule", "corner_cutting", f"One of {[rule.value for rule in MoveRule]}")
         declare("seed", 0, "Seed of the training", **_integers(0, 2**31 - 1))
-        declare("occupied_threshold", 65, "Percent from which on", **_integers(1, 100))
+        declare(
+            "occupied_threshold", 65, "Percent: from it on a cell is occupied", **_integers(1, 100)
+        )
         declare("allow_unknown", False, "Whether unknown cells are free")
         declare("episode_interval", 10, "Publish each n-th episode", **_integers(1, 10**6))
         declare("replay_period", 0.05, "Seconds a step of ~/replay", **_floats(1e-3, 10.0))
