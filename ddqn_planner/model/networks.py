@@ -50,14 +50,26 @@ class PaperQNetwork(nn.Module):
 
     def forward(self, observation_BHW: Tensor) -> Tensor:
         """Return Q(s, a): (B, 8) for observations (B, H, W)."""
-        # The convolution as a matrix product: on maps this small that is the faster way.
-        patch_BKL = functional.unfold(observation_BHW.unsqueeze(1), 3, padding=1, stride=2)
-        weight_FK = self.convolution.weight.flatten(1)
-        weight_BFK = weight_FK.expand(len(patch_BKL), -1, -1)
-        bias_F1 = cast(Tensor, self.convolution.bias).unsqueeze(1)
+        return self.q_of_patches(self.patches(observation_BHW))
+
+    @staticmethod
+    def patches(observation_BHW: Tensor) -> Tensor:
+        """Return what the filters see of observations: (B, 9, L), L places of 3x3 cells.
+
+        With its patches at hand the convolution is a matrix product, on maps this small the
+        faster way; and two networks can share them.
+        """
+        return functional.unfold(observation_BHW.unsqueeze(1), 3, padding=1, stride=2)
+
+    def q_of_patches(self, patch_BKL: Tensor) -> Tensor:
+        """Return Q(s, a): (B, 8) for the patches of observations (B, 9, L)."""
+        convolution, fully_connected = self.convolution, self.fully_connected
+        weight_BFK = convolution.weight.flatten(1).expand(len(patch_BKL), -1, -1)
+        bias_F1 = cast(Tensor, convolution.bias).unsqueeze(1)
         feature_BFL = torch.baddbmm(bias_F1, weight_BFK, patch_BKL).relu_()
-        q_BA: Tensor = self.fully_connected(feature_BFL.flatten(1))
-        return q_BA
+        return functional.linear(
+            feature_BFL.flatten(1), fully_connected.weight, fully_connected.bias
+        )
 
     def supports(self, shape: tuple[int, int]) -> bool:
         """Say whether the network can plan on maps of shape (H, W)."""

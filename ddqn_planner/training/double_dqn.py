@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import torch
-from torch import Tensor, nn
+from torch import Tensor
+from torch.nn import functional
 
 
 def double_dqn_target(
@@ -31,18 +34,27 @@ def double_dqn_target(
 
 
 def double_dqn_loss(
-    online: nn.Module,
-    target: nn.Module,
-    observation_BHW: Tensor,
+    online: Callable[[Tensor], Tensor],
+    target: Callable[[Tensor], Tensor],
+    state_B: Tensor,
     action_B: Tensor,
     reward_B: Tensor,
-    next_observation_BHW: Tensor,
+    next_state_B: Tensor,
     discount_B: Tensor,
 ) -> Tensor:
-    """Return the mean squared temporal-difference error of a batch, a scalar."""
+    """Return the mean squared temporal-difference error of a batch, a scalar.
+
+    Parameters
+    ----------
+    online, target : callable
+        From states (B, ...) to Q (B, 8) by θ and by θ⁻.
+    state_B, next_state_B : (B, ...)
+        What the callables take.
+    action_B : (B,) int64
+    reward_B, discount_B : (B,) float32
+        See `double_dqn_target`.
+    """
     with torch.no_grad():
-        y_B = double_dqn_target(
-            reward_B, discount_B, online(next_observation_BHW), target(next_observation_BHW)
-        )
-    q_B = online(observation_BHW).gather(1, action_B.unsqueeze(1)).squeeze(1)
-    return nn.functional.mse_loss(q_B, y_B)
+        y_B = double_dqn_target(reward_B, discount_B, online(next_state_B), target(next_state_B))
+    q_B = online(state_B).gather(1, action_B.unsqueeze(1)).squeeze(1)
+    return functional.mse_loss(q_B, y_B)

@@ -112,9 +112,8 @@ class Trainer:
             self.network = PaperQNetwork(height, width, parameters.filters)
         self._target = PaperQNetwork(height, width, parameters.filters).requires_grad_(False)
         self._target.load_state_dict(self.network.state_dict())
-        self._optimiser = torch.optim.Adam(
-            self.network.parameters(), parameters.learning_rate, fused=True
-        )
+        self._weights = tuple(self.network.parameters())
+        self._optimiser = torch.optim.Adam(self._weights, parameters.learning_rate, fused=True)
         self._replay = ReplayBuffer(parameters.replay_capacity)
 
         self.environment.begin(np.ones(parameters.environments, dtype=np.bool_))
@@ -171,19 +170,22 @@ class Trainer:
         """Make one Double DQN update on a batch from the replay buffer."""
         p = self.parameters
         batch = self._replay.sample(p.batch_size, self._sampling)
-        background = self.environment.background[batch.scenario]
-        shape = self.environment.shape
+        background = self.environment.background[np.tile(batch.scenario, 2)]
+        cells = np.concatenate([batch.cell, batch.next_cell])
+        observations = torch.from_numpy(observe(background, cells, self.environment.shape))
+        state, next_state = self.network.patches(observations).chunk(2)
         loss = double_dqn_loss(
-            self.network,
-            self._target,
-            torch.from_numpy(observe(background, batch.cell, shape)),
+            self.network.q_of_patches,
+            self._target.q_of_patches,
+            state,
             torch.from_numpy(batch.action),
             torch.from_numpy(batch.reward),
-            torch.from_numpy(observe(background, batch.next_cell, shape)),
+            next_state,
             torch.from_numpy(batch.discount),
         )
-        self._optimiser.zero_grad(set_to_none=True)
-        loss.backward()  # type: ignore[no-untyped-call]
+        gradients = torch.autograd.grad(loss, self._weights)
+        for weight, gradient in zip(self._weights, gradients, strict=True):
+            weight.grad = gradient
         self._optimiser.step()
         self.updates += 1
         if self.updates % p.target_interval == 0:

@@ -56,3 +56,10 @@ def test_a_robot_in_the_last_row_and_column_is_seen() -> None:
     q = network.q_values(np.zeros((20, 20), dtype=bool), (3, 3))
     assert not np.allclose(q[:, 19, 19], q[:, 19, 18])
     assert not np.allclose(q[:, 19, 19], q[:, 18, 19])
+
+
+def test_the_network_is_the_papers_convolution_relu_and_fully_connected_layer() -> None:
+    network = PaperQNetwork(7, 10, filters=5)
+    observations = torch.randn(6, 7, 10)
+    features = network.convolution(observations.unsqueeze(1)).relu().flatten(1)
+    torch.testing.assert_close(network(observations), network.fully_connected(features))
