@@ -20,7 +20,8 @@ class HyperParameters:
     Raises
     ------
     ValueError
-        If a value lies outside its range.
+        If a value lies outside its range, or a step of all environments outgrows the replay
+        buffer.
     """
 
     learning_rate: float = _parameter(0.01, "Table 1: Adam's learning rate", 1e-6, 1.0)
@@ -48,3 +49,8 @@ class HyperParameters:
             value, (low, high) = getattr(self, entry.name), entry.metadata["range"]
             if not low <= value <= high:
                 raise ValueError(f"{entry.name} is {value}; it must lie in {low} to {high}")
+        if self.environments > self.replay_capacity:
+            raise ValueError(
+                f"environments is {self.environments}; it must be at most replay_capacity, "
+                f"{self.replay_capacity}"
+            )

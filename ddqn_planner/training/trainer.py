@@ -183,6 +183,7 @@ class Trainer:
             next_state,
             torch.from_numpy(batch.discount),
         )
+        # Not backward(): nothing is accumulated, and so nothing must be zeroed.
         gradients = torch.autograd.grad(loss, self._weights)
         for weight, gradient in zip(self._weights, gradients, strict=True):
             weight.grad = gradient

@@ -20,11 +20,8 @@ import pytest
 import yaml
 from processes import claim_ros_domain, executable
 
-TIMEOUT = 10.0
-"""Seconds that anything may take on a loaded machine."""
-
-STOP_TIMEOUT = 3.0
-"""Seconds in which a node ends after SIGINT or SIGTERM."""
+TIMEOUT = 30.0
+"""Seconds that anything may take on a loaded machine; how long it does take, `make bench` says."""
 
 if importlib.util.find_spec("rclpy") is None:
     collect_ignore_glob = ["test_*.py"]
@@ -63,7 +60,7 @@ class NodeProcess:
         if self.process.poll() is None:
             self.process.send_signal(signal_number)
         try:
-            return self.process.wait(STOP_TIMEOUT)
+            return self.process.wait(TIMEOUT)
         except subprocess.TimeoutExpired:
             os.killpg(self.process.pid, signal.SIGKILL)  # the group is its own
             self.process.wait()
