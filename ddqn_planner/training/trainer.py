@@ -34,6 +34,9 @@ from ddqn_planner.training.replay_buffer import ReplayBuffer, Transitions
 
 CHECKPOINT_KEY = "ddqn_planner_checkpoint"
 
+FUSED = tuple(map(int, torch.__version__.split(".")[:2])) >= (2, 4)
+"""Adam in one call, which older versions have on GPUs alone."""
+
 
 class CheckpointError(ValueError):
     """A checkpoint cannot be resumed; the message says why and what to do."""
@@ -113,7 +116,7 @@ class Trainer:
         self._target = PaperQNetwork(height, width, parameters.filters).requires_grad_(False)
         self._target.load_state_dict(self.network.state_dict())
         self._weights = tuple(self.network.parameters())
-        self._optimiser = torch.optim.Adam(self._weights, parameters.learning_rate, fused=True)
+        self._optimiser = torch.optim.Adam(self._weights, parameters.learning_rate, fused=FUSED)
         self._replay = ReplayBuffer(parameters.replay_capacity)
 
         self.environment.begin(np.ones(parameters.environments, dtype=np.bool_))
