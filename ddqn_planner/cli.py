@@ -68,6 +68,7 @@ def _parser() -> argparse.ArgumentParser:
             f"--{entry.name.replace('_', '-')}",
             type=type(entry.default),
             default=entry.default,
+            choices=entry.metadata.get("choices"),
             help=entry.metadata["source"],
         )
     train.set_defaults(command=_train)

@@ -5,18 +5,22 @@ from ddqn_planner.model.model_file import (
     ModelMetadata,
     find_model,
     load_model,
+    new_network,
     package_version,
     save_model,
 )
 from ddqn_planner.model.networks import PaperQNetwork, QNetwork
+from ddqn_planner.model.propagation import PropagationQNetwork
 
 __all__ = [
     "ModelFileError",
     "ModelMetadata",
     "PaperQNetwork",
+    "PropagationQNetwork",
     "QNetwork",
     "find_model",
     "load_model",
+    "new_network",
     "package_version",
     "save_model",
 ]

@@ -6,7 +6,7 @@ import json
 from dataclasses import asdict, dataclass
 from importlib import metadata
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import safetensors.torch
 import torch
@@ -16,12 +16,19 @@ from torch import Tensor
 from ddqn_planner.files import write_atomically
 from ddqn_planner.grid import MoveRule
 from ddqn_planner.model.networks import PaperQNetwork
+from ddqn_planner.model.propagation import PropagationQNetwork
 from ddqn_planner.resources import PACKAGE, find_resource
 
 METADATA_KEY = "ddqn_planner"
 MODEL_SUFFIX = ".safetensors"
 MAX_SIZE = 4096
 """Largest network size (height, width, filters) that a model file may ask for."""
+
+
+AnyQNetwork = PaperQNetwork | PropagationQNetwork
+
+SIZES: Final = {"paper": ("height", "width", "filters"), "propagation": ("filters",)}
+"""The arguments of each kind of network."""
 
 
 class ModelFileError(ValueError):
@@ -35,9 +42,9 @@ class ModelMetadata:
     Parameters
     ----------
     network : str
-        Kind of network: ``"paper"``.
+        Kind of network: ``"paper"`` or ``"propagation"``.
     sizes : dict
-        The arguments of the network's class: height, width, filters.
+        The arguments of the network's class, see `SIZES`.
     move_rule : MoveRule
         The rule under which it was trained.
     gamma : float
@@ -89,7 +96,7 @@ def find_model(name: str | Path) -> Path:
         ) from None
 
 
-def save_model(path: str | Path, network: PaperQNetwork, description: ModelMetadata) -> None:
+def save_model(path: str | Path, network: AnyQNetwork, description: ModelMetadata) -> None:
     """Write a model file; the old file stays whole until the new one is.
 
     Raises
@@ -102,7 +109,7 @@ def save_model(path: str | Path, network: PaperQNetwork, description: ModelMetad
     write_atomically(Path(path), content)
 
 
-def load_model(name: str | Path) -> tuple[PaperQNetwork, ModelMetadata]:
+def load_model(name: str | Path) -> tuple[AnyQNetwork, ModelMetadata]:
     """Read a model file.
 
     Parameters
@@ -120,7 +127,7 @@ def load_model(name: str | Path) -> tuple[PaperQNetwork, ModelMetadata]:
     try:
         description = _parse(json.loads(text))
         with torch.device("meta"):
-            network = PaperQNetwork(**description.sizes)
+            network = new_network(description.network, description.sizes)
     except (TypeError, ValueError, KeyError, RecursionError) as error:
         raise ModelFileError(
             f"{path}: its metadata is wrong ({error}); train the model again"
@@ -133,6 +140,13 @@ def load_model(name: str | Path) -> tuple[PaperQNetwork, ModelMetadata]:
         raise ModelFileError(f"{path}: its weights are not all finite float32; train it again")
     network.load_state_dict(tensors, assign=True)
     return network.requires_grad_(False), description
+
+
+def new_network(kind: str, sizes: dict[str, int]) -> AnyQNetwork:
+    """Return a network with random weights; see `ModelMetadata` for the parameters."""
+    if kind == "propagation":
+        return PropagationQNetwork(**sizes)
+    return PaperQNetwork(**sizes)
 
 
 def _read(path: Path) -> tuple[dict[str, Tensor], str]:
@@ -153,10 +167,10 @@ def _read(path: Path) -> tuple[dict[str, Tensor], str]:
 
 
 def _parse(values: dict[str, Any]) -> ModelMetadata:
-    if values["network"] != "paper":
-        raise ValueError(f"network is {values['network']!r}; this version knows 'paper'")
+    if values["network"] not in SIZES:
+        raise ValueError(f"network is {values['network']!r}; this version knows {[*SIZES]}")
     sizes = values["sizes"]
-    for name in ("height", "width", "filters"):
+    for name in SIZES[values["network"]]:
         if type(sizes[name]) is not int or not 1 <= sizes[name] <= MAX_SIZE:
             raise ValueError(f"size {name} is {sizes[name]!r}; it must lie in 1 to {MAX_SIZE}")
     return ModelMetadata(**{**values, "move_rule": MoveRule(values["move_rule"])})

@@ -113,13 +113,12 @@ class TrainerNode(Node):
         declare("episode_interval", 10, "Publish each n-th episode", **_integers(1, 10**6))
         declare("replay_period", 0.05, "Seconds a step of ~/replay", **_floats(1e-3, 10.0))
         for entry in fields(HyperParameters):
+            source = entry.metadata["source"]
+            if "choices" in entry.metadata:
+                declare(entry.name, entry.default, f"{source}: one of {entry.metadata['choices']}")
+                continue
             in_range = _integers if type(entry.default) is int else _floats
-            declare(
-                entry.name,
-                entry.default,
-                entry.metadata["source"],
-                **in_range(*entry.metadata["range"]),
-            )
+            declare(entry.name, entry.default, source, **in_range(*entry.metadata["range"]))
 
     def _value(self, name: str) -> Any:
         return self.get_parameter(name).value

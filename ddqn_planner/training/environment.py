@@ -110,6 +110,7 @@ class GridVectorEnvironment(VectorEnv[Observations, NDArray[np.int64], Any]):
         if len(shapes) != 1:
             raise ValueError(f"the maps have the sizes {sorted(shapes)}; give maps of one size")
         (self.shape,) = shapes
+        self.scenarios = tuple(scenarios)
         self.num_envs = parameters.environments
         self.single_action_space = gymnasium.spaces.Discrete(len(MOVES))
         self.single_observation_space = observation_space(self.shape)
@@ -128,8 +129,13 @@ class GridVectorEnvironment(VectorEnv[Observations, NDArray[np.int64], Any]):
             [legal_moves(s.grid.occupancy, move_rule).reshape(len(MOVES), -1) for s in scenarios]
         )
         rewards = [free_cell_reward(self.shape, s.start, s.goal, parameters) for s in scenarios]
-        self._reward = np.stack([reward.reshape(len(MOVES), -1) for reward in rewards])
-        self._reward[~self._legal] = parameters.obstacle_reward
+        self.free_reward = np.stack([reward.reshape(len(MOVES), -1) for reward in rewards])
+        cells = np.arange(self.shape[0] * width)
+        reaches_goal = cells + self._offset[:, None] == self.goal[:, None, None]
+        self.free_reward[reaches_goal] = parameters.goal_reward
+        self._reward = np.where(
+            self._legal, self.free_reward, np.float32(parameters.obstacle_reward)
+        )
         free = [np.flatnonzero(~s.grid.occupancy) for s in scenarios]
         free = [cells[cells != goal] for cells, goal in zip(free, self.goal, strict=True)]
         self._free_count = np.array([len(cells) for cells in free])
@@ -173,7 +179,6 @@ class GridVectorEnvironment(VectorEnv[Observations, NDArray[np.int64], Any]):
         legal, reward = self._legal[lookup], self._reward[lookup]
         self.cell = np.where(legal, self.cell + self._offset[actions], self.cell)
         reached = self.cell == self.goal[self.scenario]
-        reward[reached] = self.parameters.goal_reward
         self.steps += 1
         terminated = reached | ~legal
         truncated = (self.steps >= self.parameters.max_episode_steps) & ~terminated

@@ -10,6 +10,10 @@ def _parameter(default: Any, source: str, low: float, high: float) -> Any:
     return field(default=default, metadata={"source": source, "range": (low, high)})
 
 
+def _choice(default: str, source: str, *others: str) -> Any:
+    return field(default=default, metadata={"source": source, "choices": (default, *others)})
+
+
 @dataclass(frozen=True)
 class HyperParameters:
     """The paper's Table 1, and our choice where the paper is silent.
@@ -20,10 +24,14 @@ class HyperParameters:
     Raises
     ------
     ValueError
-        If a value lies outside its range, or a step of all environments outgrows the replay
-        buffer.
+        If a value lies outside its range or is none of its choices, or a step of all environments
+        outgrows the replay buffer.
     """
 
+    network: str = _choice("paper", "ours: the Q-network, see model/networks.py", "propagation")
+    target: str = _choice(
+        "double_dqn", "ours: the target, see training/double_dqn.py", "dqn", "printed"
+    )
     learning_rate: float = _parameter(0.01, "Table 1: Adam's learning rate", 1e-6, 1.0)
     batch_size: int = _parameter(32, "Table 1: transitions in a mini-batch", 1, 4096)
     gamma: float = _parameter(0.95, "Table 1: discount γ", 0.0, 1.0)
@@ -46,7 +54,13 @@ class HyperParameters:
 
     def __post_init__(self) -> None:
         for entry in fields(self):
-            value, (low, high) = getattr(self, entry.name), entry.metadata["range"]
+            value = getattr(self, entry.name)
+            if "choices" in entry.metadata:
+                if value not in entry.metadata["choices"]:
+                    choices = ", ".join(entry.metadata["choices"])
+                    raise ValueError(f"{entry.name} is {value!r}; give one of {choices}")
+                continue
+            low, high = entry.metadata["range"]
             if not low <= value <= high:
                 raise ValueError(f"{entry.name} is {value}; it must lie in {low} to {high}")
         if self.environments > self.replay_capacity:

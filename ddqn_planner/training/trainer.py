@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import copy
 import json
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass
 from enum import Enum
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -15,21 +16,16 @@ import safetensors.torch
 import torch
 from numpy.typing import NDArray
 from safetensors import SafetensorError, safe_open
-from torch import Tensor
+from torch import Tensor, nn
 
 from ddqn_planner.files import write_atomically
 from ddqn_planner.grid import MOVES, Cell, MoveRule
-from ddqn_planner.model import (
-    ModelMetadata,
-    PaperQNetwork,
-    package_version,
-    save_model,
-)
-from ddqn_planner.model.observation import observe
+from ddqn_planner.model import ModelMetadata, new_network, package_version, save_model
 from ddqn_planner.planning import Planner
 from ddqn_planner.training.double_dqn import double_dqn_loss
 from ddqn_planner.training.environment import GridVectorEnvironment, Scenario
 from ddqn_planner.training.hyper_parameters import HyperParameters
+from ddqn_planner.training.learners import LEARNERS
 from ddqn_planner.training.replay_buffer import ReplayBuffer, Transitions
 
 CHECKPOINT_KEY = "ddqn_planner_checkpoint"
@@ -74,7 +70,7 @@ class Episode:
 
 
 class Trainer:
-    """Trains the paper's network by Double DQN.
+    """Trains a Q-network by Double DQN.
 
     The same scenarios, parameters and seed give the same network, bit for bit, also when the
     training was interrupted by `save_checkpoint` and `load_checkpoint`.
@@ -109,12 +105,12 @@ class Trainer:
         self.environment.np_random = np.random.default_rng(environment)
         self._exploration = np.random.default_rng(exploration)
         self._sampling = np.random.default_rng(replay)
-        height, width = self.environment.shape
+        self._learner = LEARNERS[parameters.network](self.environment, parameters)
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(int(weights.generate_state(1)[0]))
-            self.network = PaperQNetwork(height, width, parameters.filters)
-        self._target = PaperQNetwork(height, width, parameters.filters).requires_grad_(False)
-        self._target.load_state_dict(self.network.state_dict())
+            self.network = new_network(parameters.network, self._learner.sizes)
+        self._target = copy.deepcopy(self.network).requires_grad_(False)
+        self._learner.copy_target(self._target)
         self._weights = tuple(self.network.parameters())
         self._optimiser = torch.optim.Adam(self._weights, parameters.learning_rate, fused=FUSED)
         self._replay = ReplayBuffer(parameters.replay_capacity)
@@ -160,12 +156,15 @@ class Trainer:
 
     def _choose_actions(self) -> NDArray[np.int64]:
         """Draw ε-greedy actions, ε for each environment by itself."""
+        environment = self.environment
         count = self.parameters.environments
         actions = self._exploration.integers(len(MOVES), size=count)
         greedy = self._exploration.random(count) >= self.epsilon
         if greedy.any():
             with torch.inference_mode():
-                q_NA = self.network(torch.from_numpy(self.environment.observations()))
+                q_NA = self._q(self.network)(
+                    self._learner.states(environment.scenario, environment.cell)
+                )
             actions[greedy] = q_NA.argmax(dim=1).numpy()[greedy]
         return actions
 
@@ -173,13 +172,20 @@ class Trainer:
         """Make one Double DQN update on a batch from the replay buffer."""
         p = self.parameters
         batch = self._replay.sample(p.batch_size, self._sampling)
-        background = self.environment.background[np.tile(batch.scenario, 2)]
-        cells = np.concatenate([batch.cell, batch.next_cell])
-        observations = torch.from_numpy(observe(background, cells, self.environment.shape))
-        state, next_state = self.network.patches(observations).chunk(2)
+        states = self._learner.states(
+            np.tile(batch.scenario, 2), np.concatenate([batch.cell, batch.next_cell])
+        )
+        state, next_state = states.chunk(2)
+        online, target = self._q(self.network), self._q(self._target)
+        choose, judge = {
+            "double_dqn": (online, target),
+            "dqn": (target, target),
+            "printed": (online, online),
+        }[p.target]
         loss = double_dqn_loss(
-            self.network.q_of_patches,
-            self._target.q_of_patches,
+            online,
+            choose,
+            judge,
             state,
             torch.from_numpy(batch.action),
             torch.from_numpy(batch.reward),
@@ -194,6 +200,10 @@ class Trainer:
         self.updates += 1
         if self.updates % p.target_interval == 0:
             self._target.load_state_dict(self.network.state_dict())
+            self._learner.copy_target(self._target)
+
+    def _q(self, network: nn.Module) -> Callable[[Tensor], Tensor]:
+        return partial(self._learner.q, network)
 
     def _begin_again(
         self, ended: NDArray[np.bool_], terminated: NDArray[np.bool_]
@@ -237,10 +247,9 @@ class Trainer:
 
     def metadata(self) -> ModelMetadata:
         """Return what a model file says of the network as it is now."""
-        height, width = self.environment.shape
         return ModelMetadata(
-            network="paper",
-            sizes={"height": height, "width": width, "filters": self.parameters.filters},
+            network=self.parameters.network,
+            sizes=self._learner.sizes,
             move_rule=self.move_rule,
             gamma=self.parameters.gamma,
             map_fingerprint=self.scenarios[0].grid.fingerprint,
@@ -332,6 +341,7 @@ class Trainer:
         self.steps, self.updates, self.episodes, self._replay.added = description["counters"]
         self.network.load_state_dict(_unprefixed("network", tensors))
         self._target.load_state_dict(_unprefixed("target", tensors))
+        self._learner.copy_target(self._target)
         optimiser = self._optimiser.state_dict()
         count = len(optimiser["param_groups"][0]["params"]) if self.updates else 0
         optimiser["state"] = {

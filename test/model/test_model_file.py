@@ -11,7 +11,14 @@ import safetensors.torch
 import torch
 
 from ddqn_planner.grid import MoveRule
-from ddqn_planner.model import ModelFileError, ModelMetadata, PaperQNetwork, load_model, save_model
+from ddqn_planner.model import (
+    ModelFileError,
+    ModelMetadata,
+    PaperQNetwork,
+    PropagationQNetwork,
+    load_model,
+    save_model,
+)
 
 METADATA = ModelMetadata(
     network="paper",
@@ -91,6 +98,18 @@ def test_wrong_metadata_is_refused_by_name(
     save_as(path, network, **changes)
     with pytest.raises(ModelFileError, match=named):
         load_model(path)
+
+
+def test_a_propagation_network_comes_back_the_same(tmp_path: Path) -> None:
+    path, network = tmp_path / "model.safetensors", PropagationQNetwork(filters=3)
+    description = replace(METADATA, network="propagation", sizes={"filters": 3})
+    save_model(path, network, description)
+    loaded, read = load_model(path)
+    assert read == description
+    occupancy = np.zeros((3, 6), dtype=bool)
+    np.testing.assert_array_equal(
+        loaded.q_values(occupancy, (5, 2)), network.q_values(occupancy, (5, 2))
+    )
 
 
 def test_safetensors_of_another_program_are_refused(tmp_path: Path) -> None:

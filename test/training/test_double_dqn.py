@@ -7,12 +7,12 @@ from torch import nn
 from ddqn_planner.training.double_dqn import double_dqn_loss, double_dqn_target
 
 
-def test_the_online_network_chooses_and_the_target_network_values() -> None:
+def test_one_network_chooses_and_the_other_judges() -> None:
     target = double_dqn_target(
         reward_B=torch.tensor([1.0, -10.0]),
         discount_B=torch.tensor([0.9, 0.0]),
-        next_q_online_BA=torch.tensor([[0.0, 5.0, 1.0], [7.0, 0.0, 0.0]]),
-        next_q_target_BA=torch.tensor([[100.0, 2.0, 3.0], [50.0, 0.0, 0.0]]),
+        next_q_choose_BA=torch.tensor([[0.0, 5.0, 1.0], [7.0, 0.0, 0.0]]),
+        next_q_judge_BA=torch.tensor([[100.0, 2.0, 3.0], [50.0, 0.0, 0.0]]),
     )
     assert target.tolist() == pytest.approx([1.0 + 0.9 * 2.0, -10.0])
 
@@ -20,6 +20,7 @@ def test_the_online_network_chooses_and_the_target_network_values() -> None:
 def test_the_loss_moves_the_online_network_alone() -> None:
     online, target = nn.Linear(2, 3), nn.Linear(2, 3)
     loss = double_dqn_loss(
+        online,
         online,
         target,
         torch.ones(4, 2),

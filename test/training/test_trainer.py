@@ -45,6 +45,27 @@ def test_training_learns_the_way_around_a_wall(small: Scenario) -> None:
     assert field.rollout(small.start).status is PlanStatus.SUCCEEDED
 
 
+@pytest.mark.parametrize("target", ["dqn", "printed"])
+def test_the_other_targets_learn_the_small_map_too(small: Scenario, target: str) -> None:
+    trainer = make(small, replace(QUICK, target=target))
+    train(trainer, 3000)
+    assert trainer.planner().plan(small.grid, small.start, small.goal).cells
+
+
+@pytest.mark.parametrize("rule", MoveRule)
+def test_the_propagation_network_learns_what_a_move_does_for_maps_of_any_size(
+    small: Scenario, paper: Scenario, rule: MoveRule
+) -> None:
+    parameters = replace(QUICK, network="propagation", filters=32)
+    trainer = Trainer([paper], rule, parameters, seed=0)
+    train(trainer, 3000)
+    for scenario in (paper, small):
+        field = trainer.planner().q_field(scenario.grid, scenario.goal)
+        evaluation = evaluate(field, scenario.grid, rule)
+        assert evaluation.solved == evaluation.starts
+        assert evaluation.worst_ratio == pytest.approx(1.0)
+
+
 def test_the_value_of_the_last_moves_is_what_the_rewards_add_up_to(small: Scenario) -> None:
     trainer = make(small)
     train(trainer, 3000)
@@ -61,12 +82,20 @@ def test_one_seed_gives_one_network_and_another_seed_another(small: Scenario) ->
     assert not same_weights(trainers[0], trainers[2])
 
 
+@pytest.mark.parametrize("network", ["paper", "propagation"])
 @pytest.mark.parametrize("environments", [1, 3])
 @pytest.mark.parametrize("first", [20, 301])
 def test_an_interrupted_training_goes_on_bit_for_bit(
-    small: Scenario, tmp_path: Path, environments: int, first: int
+    small: Scenario, tmp_path: Path, environments: int, first: int, network: str
 ) -> None:
-    parameters = replace(QUICK, environments=environments, replay_capacity=200, update_interval=2)
+    parameters = replace(
+        QUICK,
+        environments=environments,
+        replay_capacity=200,
+        update_interval=2,
+        target_interval=30,
+        network=network,
+    )
     whole, interrupted = make(small, parameters), make(small, parameters)
     episodes = train(whole, 600)
     before = train(interrupted, first)
@@ -152,8 +181,14 @@ def test_a_truncated_checkpoint_is_refused(
 
 @pytest.mark.parametrize(
     ("name", "value"),
-    [("gamma", 1.5), ("batch_size", 0), ("learning_rate", float("nan")), ("p_r", -0.1)],
+    [
+        ("target", "sarsa"),
+        ("gamma", 1.5),
+        ("batch_size", 0),
+        ("learning_rate", float("nan")),
+        ("p_r", -0.1),
+    ],
 )
-def test_a_parameter_out_of_range_is_named(name: str, value: float) -> None:
-    with pytest.raises(ValueError, match=f"{name} is {value}"):
+def test_a_parameter_out_of_range_is_named(name: str, value: object) -> None:
+    with pytest.raises(ValueError, match=f"{name} is {value!r}"):
         HyperParameters(**{name: value})  # type: ignore[arg-type]

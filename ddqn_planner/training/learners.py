@@ -1,0 +1,124 @@
+"""What each Q-network sees of a robot's cell in training, and what it answers there."""
+
+from __future__ import annotations
+
+from typing import Final, Protocol
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor, nn
+
+from ddqn_planner.model import PaperQNetwork
+from ddqn_planner.model.observation import observe
+from ddqn_planner.model.propagation import neighbours, propagate, surroundings
+from ddqn_planner.training.environment import GridVectorEnvironment
+from ddqn_planner.training.hyper_parameters import HyperParameters
+
+
+class Learner(Protocol):
+    """What the trainer asks of a kind of network.
+
+    A state is what the network sees of a robot in a cell, a tensor (B, ...).
+    """
+
+    sizes: dict[str, int]
+    """The arguments of the network's class."""
+
+    def states(self, scenario: NDArray[np.int64], cell: NDArray[np.int64]) -> Tensor:
+        """Return the states of robots in `cell` (B,), y * W + x, on the maps `scenario` (B,)."""
+        ...
+
+    def q(self, network: nn.Module, state_B: Tensor) -> Tensor:
+        """Return Q(s, a): (B, 8)."""
+        ...
+
+    def copy_target(self, target: nn.Module) -> None:
+        """Take note of a new target network θ⁻."""
+        ...
+
+
+class PaperLearner:
+    """The paper's network sees the whole map with the robot in it, as patches of 3x3 cells.
+
+    Parameters
+    ----------
+    environment : GridVectorEnvironment
+    parameters : HyperParameters
+    """
+
+    def __init__(self, environment: GridVectorEnvironment, parameters: HyperParameters) -> None:
+        height, width = environment.shape
+        self.sizes = {"height": height, "width": width, "filters": parameters.filters}
+        self._environment = environment
+
+    def states(self, scenario: NDArray[np.int64], cell: NDArray[np.int64]) -> Tensor:
+        """Return the patches of the observations: (B, 9, L)."""
+        environment = self._environment
+        observations = observe(environment.background[scenario], cell, environment.shape)
+        return PaperQNetwork.patches(torch.from_numpy(observations))
+
+    def q(self, network: nn.Module, state_B: Tensor) -> Tensor:
+        """Return Q(s, a): (B, 8)."""
+        assert isinstance(network, PaperQNetwork)
+        return network.q_of_patches(state_B)
+
+    def copy_target(self, target: nn.Module) -> None:
+        """Do nothing: the observation does not depend on the target network."""
+
+
+class PropagationLearner:
+    """The propagation network sees the 3x3 cells around the robot, and what lies beyond them.
+
+    What lies beyond is r + γ V(s') of each move, V settled under the target network θ⁻. It stays
+    the same between two target copies, and no gradient goes through it: back-propagation through
+    the repetition diverges.
+
+    Parameters
+    ----------
+    environment : GridVectorEnvironment
+    parameters : HyperParameters
+    """
+
+    def __init__(self, environment: GridVectorEnvironment, parameters: HyperParameters) -> None:
+        self.sizes = {"filters": parameters.filters}
+        self._environment, self._parameters = environment, parameters
+        maps = [scenario.grid.occupancy for scenario in environment.scenarios]
+        self._surroundings_SC9 = np.stack([surroundings(occupancy) for occupancy in maps])
+        self._occupied_SC = np.stack([occupancy.ravel() for occupancy in maps])
+        self._neighbours_AC = neighbours(environment.shape)
+        self._return_SCA = np.zeros((*self._occupied_SC.shape, 8), dtype=np.float32)
+
+    def states(self, scenario: NDArray[np.int64], cell: NDArray[np.int64]) -> Tensor:
+        """Return the surroundings and r + γ V(s') of each action: (B, 9 + 8)."""
+        at = (scenario, cell)
+        seen_BF = np.concatenate([self._surroundings_SC9[at], self._return_SCA[at]], axis=1)
+        return torch.from_numpy(seen_BF)
+
+    def q(self, network: nn.Module, state_B: Tensor) -> Tensor:
+        """Return Q(s, a) = p (r + γ V(s')) + (1 - p) r_o: (B, 8)."""
+        p_BA: Tensor = network(state_B[:, :9])
+        collision = self._parameters.obstacle_reward
+        return collision + p_BA * (state_B[:, 9:] - collision)
+
+    def copy_target(self, target: nn.Module) -> None:
+        """Settle V on every map under the new target network."""
+        with torch.inference_mode():
+            success_SCA = target(torch.from_numpy(self._surroundings_SC9)).numpy()
+        return_SAC = propagate(
+            success_SCA.transpose(0, 2, 1),
+            self._environment.free_reward,
+            self._occupied_SC,
+            self._environment.goal,
+            self._neighbours_AC,
+            self._parameters.gamma,
+            self._parameters.obstacle_reward,
+        )
+        self._return_SCA = np.ascontiguousarray(return_SAC.transpose(0, 2, 1))
+
+
+LEARNERS: Final[dict[str, type[PaperLearner] | type[PropagationLearner]]] = {
+    "paper": PaperLearner,
+    "propagation": PropagationLearner,
+}
+"""By the hyper-parameter ``network``."""
