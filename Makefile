@@ -7,9 +7,9 @@ BIN := $(VENV)/bin
 # With a sourced ROS 2 Jazzy its rclpy is used, else the wheels from PyPI.
 ifeq ($(ROS_DISTRO),jazzy)
 VENV_FLAGS := --system-site-packages
-EXTRAS := figures,tensorboard,test
+EXTRAS := experiments,figures,tensorboard,test
 else
-EXTRAS := figures,ros,tensorboard,test
+EXTRAS := experiments,figures,ros,tensorboard,test
 endif
 
 .PHONY: setup demo test lint format types bench model

@@ -1,4 +1,4 @@
-"""``ddqn-planner``: planning and training from a shell, without ROS."""
+"""``ddqn-planner``: planning, training and experiments from a shell, without ROS."""
 
 from __future__ import annotations
 
@@ -15,6 +15,7 @@ from pathlib import Path
 import torch
 from tqdm import tqdm
 
+from ddqn_planner.experiments import EXPERIMENTS
 from ddqn_planner.grid import Cell, MapFile, MoveRule, read_map_file
 from ddqn_planner.planning import Plan, Planner, PlanStatus, shortest_distances
 from ddqn_planner.planning.evaluation import evaluate
@@ -30,7 +31,8 @@ MOVE_RULES = [rule.value for rule in MoveRule]
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line; return the exit code: 0 done, 1 no path, 2 bad input."""
     options = _parser().parse_args(arguments)
-    options.move_rule = MoveRule(options.move_rule) if options.move_rule else None
+    if name := getattr(options, "move_rule", None):
+        options.move_rule = MoveRule(name)
     torch.set_num_threads(1)  # as fast as two for networks of this size, and the same every time
     try:
         return int(options.command(options))
@@ -41,7 +43,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="ddqn-planner", description=__doc__)
-    commands = parser.add_subparsers(required=True, metavar="plan|train")
+    commands = parser.add_subparsers(required=True, metavar="plan|train|reproduce")
 
     plan = commands.add_parser("plan", help="plan a path on a map file")
     _add_map_arguments(plan)
@@ -72,6 +74,23 @@ def _parser() -> argparse.ArgumentParser:
             help=entry.metadata["source"],
         )
     train.set_defaults(command=_train)
+
+    reproduce = commands.add_parser(
+        "reproduce",
+        help="train and measure the paper's experiments",
+        description="Trains with many seeds, and writes tables, figures and a report. The same "
+        "command again goes on where it stopped.",
+        formatter_class=argparse.ArgumentDefaultsHelpFormatter,
+    )
+    reproduce.add_argument("--experiment", choices=[*EXPERIMENTS, "all"], default="all", help="one")
+    reproduce.add_argument("--seeds", type=int, default=5, metavar="N", help="trainings of a kind")
+    reproduce.add_argument(
+        "--out", type=Path, default=Path("runs/reproduce"), help="folder of trainings and report"
+    )
+    reproduce.add_argument(
+        "--quick", action="store_true", help="run everything, too briefly to learn anything"
+    )
+    reproduce.set_defaults(command=_reproduce)
     return parser
 
 
@@ -161,6 +180,23 @@ def _train(options: argparse.Namespace) -> int:
         + (f"{plan.length:.2f} cells" if plan.cells else "it is trapped")
     )
     print(f"saved {run.model_path}")
+    return 0
+
+
+def _reproduce(options: argparse.Namespace) -> int:
+    if options.seeds < 1:
+        raise ValueError(f"--seeds is {options.seeds}; give at least 1")
+    try:
+        from ddqn_planner.experiments.report import Settings
+        from ddqn_planner.experiments.reproduce import reproduce
+    except ImportError as error:
+        raise PictureError(
+            f"the experiments need another library ({error}): "
+            "pip install 'ddqn_planner[experiments]'"
+        ) from None
+    names = [*EXPERIMENTS] if options.experiment == "all" else [options.experiment]
+    print(reproduce(names, Settings(options.out, options.seeds, options.quick)))
+    print(f"saved {options.out / 'report.md'}")
     return 0
 
 

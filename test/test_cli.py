@@ -13,6 +13,7 @@ import pytest
 from PIL import Image
 
 from ddqn_planner.cli import main
+from ddqn_planner.experiments import EXPERIMENTS
 from ddqn_planner.grid import GridMap, MapFile, save_map
 from ddqn_planner.model import load_model
 from ddqn_planner.training.environment import Scenario
@@ -111,3 +112,28 @@ def test_an_interrupted_training_is_saved_and_goes_on(
     assert steps > 0
     subprocess.run([*command, "--steps", str(steps + 100)], check=True, capture_output=True)
     assert load_model(tmp_path / "run" / "model.safetensors")[1].steps == steps + 100
+
+
+def test_reproduce_runs_every_experiment_and_writes_its_report(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    command = ["reproduce", "--quick", "--seeds", "2", "--out", str(tmp_path)]
+    assert main(command) == 0
+    report = (tmp_path / "report.md").read_text()
+    assert report in capsys.readouterr().out
+    for name in EXPERIMENTS:
+        assert f"`ddqn-planner reproduce --experiment {name} --seeds 2 --quick`" in report
+    for picture in re.findall(r"!\[.*?\]\((.*?)\)", report):
+        with Image.open(tmp_path / picture) as image:
+            assert min(image.size) > 300
+            assert len(image.convert("RGB").getcolors(image.width * image.height)) > 20
+    assert "| best | 286 | 286 | 286 | 10 | 1.0000 | 1.0000 |" in report
+    trained = {path: path.stat().st_mtime_ns for path in tmp_path.rglob("evaluations.csv")}
+    assert len(trained) == 2 * (8 + 2 + 2)
+    assert main([*command[:4], "--experiment", "goal-2", *command[4:]]) == 0
+    assert trained == {path: path.stat().st_mtime_ns for path in trained}
+
+
+def test_reproduce_refuses_less_than_one_seed(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["reproduce", "--seeds", "0"]) == 2
+    assert "--seeds is 0; give at least 1" in capsys.readouterr().err

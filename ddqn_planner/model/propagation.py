@@ -77,7 +77,6 @@ class PropagationQNetwork(nn.Module):
         (return_AC,) = propagate(
             possible[None],
             length[None],
-            occupancy.reshape(1, -1),
             np.array([goal[1] * width + goal[0]]),
             neighbours((height, width)),
             gamma=1.0,
@@ -107,7 +106,6 @@ def neighbours(shape: tuple[int, int]) -> NDArray[np.int64]:
 def propagate(
     success_SAC: NDArray[np.float32],
     reward_SAC: NDArray[np.float32],
-    occupied_SC: NDArray[np.bool_],
     goal_S: NDArray[np.int64],
     neighbours_AC: NDArray[np.int64],
     gamma: float,
@@ -115,8 +113,8 @@ def propagate(
 ) -> NDArray[np.float32]:
     """Spread values from the goals until they settle, and return what each move leads to.
 
-    V(s) = max_a Q(s, a) with Q(s, a) = p (r + γ V(s')) + (1 - p) r_o; V(goal) = 0, and V = r_o in
-    occupied cells and outside.
+    V(s) = max_a Q(s, a) with Q(s, a) = p (r + γ V(s')) + (1 - p) r_o; V(goal) = 0, and V = r_o
+    outside the map. Nothing is said of occupied cells: that moves into them fail is for p to know.
 
     Parameters
     ----------
@@ -124,7 +122,6 @@ def propagate(
         p, 0..1.
     reward_SAC : (S, 8, C) float32
         r of a move that succeeds.
-    occupied_SC : (S, C) bool
     goal_S : (S,) int64
     neighbours_AC : (8, C) int64
         See `neighbours`.
@@ -139,12 +136,10 @@ def propagate(
         r + γ V(s'), the return of each move if it succeeds.
     """
     maps, _, cells = success_SAC.shape
-    # q = base + gain V(s'), which is r_o at obstacles and 0 at the goal, whatever lies beyond.
-    moving_S1C = ~occupied_SC[:, None]
-    moving_S1C[np.arange(maps), 0, goal_S] = False
-    gain_SAC = np.where(moving_S1C, np.float32(gamma) * success_SAC, np.float32(0.0))
+    gain_SAC = np.float32(gamma) * success_SAC
     base_SAC = success_SAC * reward_SAC + (1 - success_SAC) * np.float32(collision)
-    base_SAC = np.where(moving_S1C, base_SAC, np.float32(collision))
+    # The goal is worth 0, whatever lies beyond it.
+    gain_SAC[np.arange(maps), :, goal_S] = 0.0
     base_SAC[np.arange(maps), :, goal_S] = 0.0
     # From below, as if every move collided: values then rise along the front from the goal.
     value_SC = np.full((maps, cells + 1), collision, dtype=np.float32)

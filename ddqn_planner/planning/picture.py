@@ -81,14 +81,15 @@ def save_picture(
         colours = LinearSegmentedColormap.from_list("value", VALUE_COLOURS)
         image = axes.imshow(finite, origin="lower", cmap=colours, interpolation="nearest")
         figure.colorbar(image, label=value_label, shrink=0.85)
-    _draw_obstacles(axes, grid)
+    draw_obstacles(axes, grid)
     if cells:
         _draw_path(axes, cells)
     figure.savefig(path)
     plt.close(figure)
 
 
-def _draw_obstacles(axes: Any, grid: GridMap) -> None:
+def draw_obstacles(axes: Any, grid: GridMap) -> None:
+    """Draw the occupied cells of a map into matplotlib's axes, and lines between its cells."""
     from matplotlib.colors import ListedColormap
 
     occupied = np.where(grid.occupancy, 1.0, np.nan)

@@ -48,6 +48,15 @@ class QField:
         greedy = np.where(self.legal, self.q, -np.inf).argmax(axis=0)
         return np.where(self.legal.any(axis=0), greedy, -1).astype(np.int8)
 
+    def unmasked(self) -> QField:
+        """Return the field of a robot that does not know its map.
+
+        Its walk takes the action of the greatest Q of all, and is trapped where that is illegal.
+        """
+        greedy_1HW = self.q.argmax(axis=0, keepdims=True)
+        actions_A11 = np.arange(len(MOVES)).reshape(-1, 1, 1)
+        return QField(self.goal, self.q, self.legal & (actions_A11 == greedy_1HW))
+
     def rollout(self, start: Cell) -> Plan:
         """Walk from a free cell to the goal by greedy steps alone.
 

@@ -85,9 +85,8 @@ class PropagationLearner:
         self._environment, self._parameters = environment, parameters
         maps = [scenario.grid.occupancy for scenario in environment.scenarios]
         self._surroundings_SC9 = np.stack([surroundings(occupancy) for occupancy in maps])
-        self._occupied_SC = np.stack([occupancy.ravel() for occupancy in maps])
         self._neighbours_AC = neighbours(environment.shape)
-        self._return_SCA = np.zeros((*self._occupied_SC.shape, 8), dtype=np.float32)
+        self._return_SCA = np.zeros((*self._surroundings_SC9.shape[:2], 8), dtype=np.float32)
 
     def states(self, scenario: NDArray[np.int64], cell: NDArray[np.int64]) -> Tensor:
         """Return the surroundings and r + γ V(s') of each action: (B, 9 + 8)."""
@@ -108,7 +107,6 @@ class PropagationLearner:
         return_SAC = propagate(
             success_SCA.transpose(0, 2, 1),
             self._environment.free_reward,
-            self._occupied_SC,
             self._environment.goal,
             self._neighbours_AC,
             self._parameters.gamma,

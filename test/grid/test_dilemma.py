@@ -7,23 +7,11 @@ import math
 import numpy as np
 import pytest
 
+from ddqn_planner.experiments.profiles import START_DEAD_END
 from ddqn_planner.grid import MOVES, MoveRule, connected_cells, legal_moves
 from ddqn_planner.planning import shortest_distances
 from ddqn_planner.training.environment import Scenario
 
-START_DEAD_END = {
-    (6, 6),
-    (4, 6),
-    (4, 7),
-    (4, 8),
-    (5, 6),
-    (5, 7),
-    (5, 8),
-    (6, 7),
-    (6, 8),
-    (7, 6),
-    (7, 7),
-}
 DEAD_ENDS_ON_THE_WAY = [
     {(x, y) for x in range(14, 18) for y in (16, 17)},
     {(x, y) for x in range(16, 19) for y in range(9, 13)},

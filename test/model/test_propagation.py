@@ -23,7 +23,6 @@ def test_without_discount_a_perfect_success_spreads_the_length_of_the_shortest_p
     (return_AC,) = propagate(
         legal,
         length[None],
-        grid.occupancy.reshape(1, -1),
         goal_number,
         neighbours(grid.occupancy.shape),
         gamma=1.0,
@@ -45,7 +44,6 @@ def test_with_discount_a_value_is_what_the_rewards_on_the_way_add_up_to() -> Non
     (return_AC,) = propagate(
         success,
         reward,
-        np.zeros((1, 4), dtype=bool),
         np.array([3]),
         neighbours((1, 4)),
         gamma=0.9,

@@ -69,6 +69,16 @@ def test_whatever_the_network_says_each_move_of_a_path_is_legal(
         assert plan.status is expected
 
 
+def test_the_unmasked_walk_is_trapped_by_the_first_illegal_move_that_it_prefers() -> None:
+    grid = GridMap(np.array([[0, 0, 0], [0, 0, 0]]))
+    q = np.zeros((8, 2, 3), dtype=np.float32)
+    q[0] = 1.0  # +x
+    q[6, 0, 1] = 2.0  # off the map
+    field = QField((2, 0), q, legal_moves(grid.occupancy, MoveRule.ROBOT_SAFE))
+    assert field.rollout((0, 0)).cells == ((0, 0), (1, 0), (2, 0))
+    assert field.unmasked().rollout((0, 0)).status is PlanStatus.WALK_TRAPPED
+
+
 def test_a_start_on_the_goal_is_a_path_of_one_cell() -> None:
     plan = random_planner(3, 3, 0).plan(GridMap(np.zeros((3, 3))), (1, 1), (1, 1))
     assert plan.status is PlanStatus.SUCCEEDED

@@ -56,9 +56,11 @@ def test_the_other_targets_learn_the_small_map_too(small: Scenario, target: str)
 def test_the_propagation_network_learns_what_a_move_does_for_maps_of_any_size(
     small: Scenario, paper: Scenario, rule: MoveRule
 ) -> None:
-    parameters = replace(QUICK, network="propagation", filters=32)
+    parameters = HyperParameters(
+        network="propagation", learning_rate=0.001, batch_size=128, filters=64, target_interval=100
+    )
     trainer = Trainer([paper], rule, parameters, seed=0)
-    train(trainer, 3000)
+    train(trainer, 6000)
     for scenario in (paper, small):
         field = trainer.planner().q_field(scenario.grid, scenario.goal)
         evaluation = evaluate(field, scenario.grid, rule)

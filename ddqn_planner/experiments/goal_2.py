@@ -1,0 +1,115 @@
+"""Goal ii (section 5.2, Fig. 8): from every free cell to the given end."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import matplotlib.pyplot as plt
+import numpy as np
+from numpy.typing import NDArray
+
+from ddqn_planner.experiments import goal_1
+from ddqn_planner.experiments.figures import draw_border, draw_map, draw_share, save
+from ddqn_planner.experiments.profiles import MOVE_RULE, PROFILES, START_DEAD_END
+from ddqn_planner.experiments.report import Settings, mean, spread, table, worst
+from ddqn_planner.experiments.trainings import Training, write_csv
+from ddqn_planner.planning import Planner, shortest_distances
+from ddqn_planner.training.environment import Scenario, paper_scenario
+
+TITLE = "Goal ii: from every free cell"
+
+COLUMNS = (
+    "starts",
+    "solved",
+    "solved, any move",
+    "of the dilemma's 10",
+    "mean length / optimum",
+    "worst",
+)
+
+
+class Starts(NamedTuple):
+    """What became of the greedy walks from every free cell."""
+
+    ratio: NDArray[np.float64]
+    """(H, W) length over the optimum; NaN where the walk is trapped."""
+    unmasked: NDArray[np.bool_]
+    """(H, W) whether the walk by the greatest Q of all moves reaches the end."""
+
+
+def trainings(settings: Settings) -> list[Training]:
+    """Return the trainings of goal i: goal ii asks more of the same networks."""
+    return goal_1.trainings(settings)
+
+
+def free_starts(scenario: Scenario) -> NDArray[np.bool_]:
+    """Return the free cells besides start and end: (H, W) bool, the paper's 286."""
+    starts = ~scenario.grid.occupancy
+    for x, y in (scenario.start, scenario.goal):
+        starts[y, x] = False
+    return starts
+
+
+def walk_from_everywhere(planner: Planner, scenario: Scenario) -> Starts:
+    """Walk from every free cell besides the end."""
+    optimum = shortest_distances(scenario.grid, scenario.goal, MOVE_RULE)
+    field = planner.q_field(scenario.grid, scenario.goal)
+    any_move = field.unmasked()
+    ratio = np.full(optimum.shape, np.nan)
+    unmasked = np.zeros(optimum.shape, dtype=np.bool_)
+    for x, y in scenario.grid.free_cells():
+        if (x, y) == scenario.goal:
+            continue
+        plan = field.rollout((x, y))
+        if plan.cells:
+            ratio[y, x] = plan.length / optimum[y, x]
+        unmasked[y, x] = bool(any_move.rollout((x, y)).cells)
+    return Starts(ratio, unmasked)
+
+
+def report(settings: Settings) -> str:
+    """Write the table and the figure of goal ii, and return its Markdown."""
+    scenario = paper_scenario()
+    starts = free_starts(scenario)
+    x, y = np.transpose(sorted(START_DEAD_END - {scenario.start}))
+    rows, shares = [], {}
+    for profile in PROFILES:
+        walks = [
+            walk_from_everywhere(planner, scenario)
+            for planner in settings.planners(goal_1.name(profile))
+        ]
+        ratios = [walk.ratio[starts] for walk in walks]
+        rows.append(
+            [
+                profile,
+                int(starts.sum()),
+                spread([int(np.isfinite(ratio).sum()) for ratio in ratios]),
+                spread([int(walk.unmasked[starts].sum()) for walk in walks]),
+                spread([int(np.isfinite(walk.ratio[y, x]).sum()) for walk in walks]),
+                spread([mean(ratio) for ratio in ratios], 4),
+                spread([worst(ratio) for ratio in ratios], 4),
+            ]
+        )
+        solved = np.sum([np.isfinite(walk.ratio) for walk in walks], axis=0).astype(np.float64)
+        solved[scenario.grid.occupancy] = np.nan
+        shares[profile] = solved
+    write_csv(settings.out / "goal_2.csv", ["profile", *COLUMNS], rows)
+    _draw(settings, scenario, shares)
+    return f"{table(['profile', *COLUMNS], rows)}\n\n![Fig. 8: starts by outcome](goal_2.png)"
+
+
+def _draw(settings: Settings, scenario: Scenario, shares: dict[str, NDArray[np.float64]]) -> None:
+    figure, panels = plt.subplots(1, len(shares), figsize=(11, 5), layout="constrained")
+    for axes, (profile, share) in zip(panels, shares.items(), strict=True):
+        share[scenario.goal[::-1]] = np.nan
+        image = draw_share(axes, share, settings.seeds)
+        draw_map(axes, scenario, f"profile {profile}")
+        draw_border(axes, START_DEAD_END)
+    figure.colorbar(
+        image,
+        ax=panels,
+        label="seeds that solve the start",
+        ticks=range(settings.seeds + 1),
+        shrink=0.8,
+    )
+    save(figure, settings.out / "goal_2.png")

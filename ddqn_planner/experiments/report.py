@@ -1,0 +1,114 @@
+"""What the experiments' reports have in common: settings, tables, and spreads over seeds."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ddqn_planner.experiments.profiles import PROFILES
+from ddqn_planner.experiments.trainings import Training, TrainingEvaluation, read_evaluations
+from ddqn_planner.planning import Planner
+from ddqn_planner.training.environment import Scenario
+from ddqn_planner.training.hyper_parameters import HyperParameters
+
+
+@dataclass(frozen=True)
+class Settings:
+    """What the command line asks for.
+
+    Parameters
+    ----------
+    out : Path
+        Folder of the trainings, tables, figures and the report.
+    seeds : int
+        Trainings of each kind, with the seeds 0, 1, and so on; at least 1.
+    quick : bool
+        Train too briefly to learn anything, so that everything is run in little time.
+    """
+
+    out: Path
+    seeds: int
+    quick: bool = False
+
+    def profile(self, name: str) -> HyperParameters:
+        """Return the parameters of one of the `PROFILES`."""
+        return self.shorten(PROFILES[name])
+
+    def shorten(self, parameters: HyperParameters) -> HyperParameters:
+        """Return the parameters, with less steps where the settings say quick."""
+        return replace(parameters, steps=min(parameters.steps, 1_000 if self.quick else 10**9))
+
+    def trainings(
+        self,
+        name: str,
+        parameters: HyperParameters,
+        scenarios: Sequence[Scenario],
+        evaluation_interval: int = 250,
+    ) -> list[Training]:
+        """Return one training a seed."""
+        return [
+            Training(name, parameters, tuple(scenarios), seed, evaluation_interval)
+            for seed in range(self.seeds)
+        ]
+
+    def evaluations(self, name: str) -> list[list[TrainingEvaluation]]:
+        """Return the evaluations of the trainings of a name, a list a seed."""
+        return [read_evaluations(folder) for folder in self.folders(name)]
+
+    def planners(self, name: str, file: str = "model.safetensors") -> list[Planner]:
+        """Return the planners that the trainings of a name gave, one a seed."""
+        return [Planner.load(folder / file) for folder in self.folders(name)]
+
+    def curves(self, name: str) -> Iterator[Path]:
+        """Return the files with the episodes of the trainings of a name, one a seed."""
+        return (folder / "episodes.csv" for folder in self.folders(name))
+
+    def folders(self, name: str) -> list[Path]:
+        """Return the folders of the trainings of a name, one a seed."""
+        return [self.out / "trainings" / name / f"seed_{seed}" for seed in range(self.seeds)]
+
+
+def table(header: Sequence[str], rows: Sequence[Sequence[object]]) -> str:
+    """Return a Markdown table."""
+    lines = [header, ["---"] * len(header), *rows]
+    return "\n".join("| " + " | ".join(map(str, line)) + " |" for line in lines)
+
+
+def spread(values: Sequence[float], digits: int = 0) -> str:
+    """Return the median of the seeds, and their least and greatest: ``"3 (1 to 4)"``.
+
+    An infinite value is one that never came about; NaN is left out.
+    """
+    values = [value for value in values if not np.isnan(value)]
+    if not values:
+        return "none"
+    low, middle, high = (
+        "never" if np.isinf(v) else f"{v:,.{digits}f}"
+        for v in (min(values), float(np.median(values)), max(values))
+    )
+    return middle if low == high else f"{middle} ({low} to {high})"
+
+
+def mean(values: Sequence[float] | NDArray[np.float64]) -> float:
+    """Return the mean of those that are not NaN; NaN if there is none."""
+    finite = np.asarray(values)[~np.isnan(values)]
+    return float(finite.mean()) if finite.size else float("nan")
+
+
+def worst(values: Sequence[float] | NDArray[np.float64]) -> float:
+    """Return the greatest of those that are not NaN; NaN if there is none."""
+    finite = np.asarray(values)[~np.isnan(values)]
+    return float(finite.max()) if finite.size else float("nan")
+
+
+def first_kept(evaluations: Sequence[TrainingEvaluation], kept: Sequence[bool]) -> int | None:
+    """Return the index of the first evaluation from which on something holds to the end."""
+    assert len(kept) == len(evaluations)
+    holds = len(kept)
+    while holds and kept[holds - 1]:
+        holds -= 1
+    return holds if holds < len(kept) else None

@@ -1,0 +1,50 @@
+"""Trains and measures the experiments that are asked for, and writes their report."""
+
+from __future__ import annotations
+
+from typing import Final
+
+from ddqn_planner.experiments import EXPERIMENTS, ablation, goal_1, goal_2, goal_3, targets
+from ddqn_planner.experiments.report import Settings
+from ddqn_planner.experiments.trainings import in_parallel, train
+from ddqn_planner.files import write_atomically
+
+MODULES: Final = dict(zip(EXPERIMENTS, (goal_1, ablation, goal_2, goal_3, targets), strict=True))
+"""Each has a title, ``trainings(settings)``, and ``report(settings)`` for what they gave."""
+
+
+def reproduce(names: list[str], settings: Settings) -> str:
+    """Run experiments, and write ``report.md`` with tables (CSV too) and figures beside it.
+
+    Trainings that an earlier call finished in the same folder are not trained again.
+
+    Parameters
+    ----------
+    names : list of str
+        Of `EXPERIMENTS`.
+    settings : Settings
+
+    Returns
+    -------
+    str
+        The report, Markdown.
+    """
+    settings.out.mkdir(parents=True, exist_ok=True)
+    modules = {name: MODULES[name] for name in names}
+    # Experiments share trainings: by name and seed each is wanted once.
+    trainings = {
+        (training.name, training.seed): training
+        for module in modules.values()
+        for training in module.trainings(settings)
+    }
+    in_parallel(train, list(trainings.values()), settings.out)
+    quick = " --quick" if settings.quick else ""
+    sections = [
+        f"## {module.TITLE}\n\n"
+        f"`ddqn-planner reproduce --experiment {name} --seeds {settings.seeds}{quick}`\n\n"
+        f"{module.report(settings)}"
+        for name, module in modules.items()
+    ]
+    text = "\n\n".join(sections) + "\n"
+    write_atomically(settings.out / "report.md", text.encode())
+    return text

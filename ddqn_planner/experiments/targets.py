@@ -1,0 +1,80 @@
+"""What the printed target does: the paper's equation leaves θ⁻ out."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import matplotlib.pyplot as plt
+import numpy as np
+
+from ddqn_planner.experiments import goal_1
+from ddqn_planner.experiments.figures import Curve, draw_curves, save
+from ddqn_planner.experiments.goal_2 import free_starts, walk_from_everywhere
+from ddqn_planner.experiments.report import Settings, spread, table
+from ddqn_planner.experiments.trainings import Training, write_csv
+from ddqn_planner.training.environment import paper_scenario
+
+TITLE = "What the printed target does"
+
+TARGETS = {"double_dqn": "Double DQN", "dqn": "DQN", "printed": "printed"}
+
+COLUMNS = ("seeds solved from the start", "starts solved", "over-estimation, last 10 %", "worst")
+
+
+def name(target: str) -> str:
+    """Return the name of the trainings with a target; Double DQN's are those of goal i."""
+    return goal_1.name("paper") if target == "double_dqn" else f"paper/target_{target}"
+
+
+def trainings(settings: Settings) -> list[Training]:
+    """Return the trainings of the profile paper with each target."""
+    return [
+        training
+        for target in TARGETS
+        for training in settings.trainings(
+            name(target), replace(settings.profile("paper"), target=target), [paper_scenario()]
+        )
+    ]
+
+
+def report(settings: Settings) -> str:
+    """Write the table and the figure of the targets, and return its Markdown."""
+    scenario = paper_scenario()
+    starts = free_starts(scenario)
+    rows = []
+    for target, words in TARGETS.items():
+        runs = settings.evaluations(name(target))
+        walks = [walk_from_everywhere(p, scenario) for p in settings.planners(name(target))]
+        late = [[e.overestimation for e in run[-max(len(run) // 10, 1) :]] for run in runs]
+        rows.append(
+            [
+                words,
+                f"{sum(run[-1].solved for run in runs)} of {len(runs)}",
+                spread([int(np.isfinite(walk.ratio[starts]).sum()) for walk in walks]),
+                spread([float(np.mean(values)) for values in late], 2),
+                spread([max(e.overestimation for e in run) for run in runs], 2),
+            ]
+        )
+    write_csv(settings.out / "targets.csv", ["target", *COLUMNS], rows)
+    _draw(settings)
+    return f"{table(['target', *COLUMNS], rows)}\n\n![Over-estimation of Q](targets.png)"
+
+
+def _draw(settings: Settings) -> None:
+    figure, (left, right) = plt.subplots(1, 2, figsize=(13, 4), layout="constrained")
+    draw_curves(left, {w: _curve(settings, t, "overestimation") for t, w in TARGETS.items()}, "")
+    left.set(ylabel="mean of max Q - V*", yscale="symlog")
+    left.axhline(0, color="black", linewidth=0.8)
+    left.legend()
+    solved = {}
+    for target, words in TARGETS.items():
+        steps, values = _curve(settings, target, "solved")
+        solved[words] = (steps, values.mean(axis=0, keepdims=True))
+    draw_curves(right, solved, "share of seeds solved from the start")
+    save(figure, settings.out / "targets.png")
+
+
+def _curve(settings: Settings, target: str, column: str) -> Curve:
+    runs = settings.evaluations(name(target))
+    values = np.array([[getattr(e, column) for e in run] for run in runs], dtype=np.float64)
+    return np.array([e.step for e in runs[0]], dtype=np.float64), values

@@ -1,0 +1,224 @@
+"""Trainings that are evaluated as they go, many at once, each in a folder of its own."""
+
+from __future__ import annotations
+
+import csv
+import io
+import multiprocessing
+import os
+import time
+from collections.abc import Callable, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from dataclasses import asdict, astuple, dataclass
+from pathlib import Path
+from typing import TypeVar
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from tqdm import tqdm
+
+from ddqn_planner.experiments.profiles import MOVE_RULE
+from ddqn_planner.files import write_atomically
+from ddqn_planner.grid import MOVES, legal_moves
+from ddqn_planner.model.propagation import neighbours, propagate
+from ddqn_planner.planning import Planner
+from ddqn_planner.training.environment import GridVectorEnvironment, Scenario
+from ddqn_planner.training.hyper_parameters import HyperParameters
+from ddqn_planner.training.run import TrainingRun
+from ddqn_planner.training.trainer import Trainer
+
+Job = TypeVar("Job")
+
+
+@dataclass(frozen=True)
+class Training:
+    """One training of an experiment.
+
+    Parameters
+    ----------
+    name : str
+        Folder below the output folder; trainings that differ in more than the seed differ in it.
+    parameters : HyperParameters
+    scenarios : tuple of Scenario
+    seed : int
+    evaluation_interval : int
+        Environment steps between two evaluations.
+    """
+
+    name: str
+    parameters: HyperParameters
+    scenarios: tuple[Scenario, ...]
+    seed: int
+    evaluation_interval: int
+
+    def folder(self, out: Path) -> Path:
+        """Return the folder of this training."""
+        return out / "trainings" / self.name / f"seed_{self.seed}"
+
+
+@dataclass(frozen=True)
+class TrainingEvaluation:
+    """The greedy walks of a network in training, from the start of each of its scenarios."""
+
+    step: int
+    """Environment steps."""
+    updates: int
+    episodes: int
+    seconds: float
+    """Wall clock since the training began, evaluations included."""
+    solved: int
+    """Scenarios whose walk by legal moves reaches the end."""
+    solved_unmasked: int
+    """The same for the greatest Q of all moves, where an illegal one ends the walk."""
+    length: float
+    """Mean length of the solved ones, cells; NaN if there is none."""
+    overestimation: float
+    """Mean of max_a Q(s, a) - V*(s) over the free cells of the first scenario, V* the exact value
+    of the best policy; NaN for a network whose Q is not the return."""
+
+
+def in_parallel(job: Callable[[Job, Path], None], jobs: Sequence[Job], out: Path) -> None:
+    """Call ``job(each, out)`` in as many processes as there are cores.
+
+    Raises
+    ------
+    Exception
+        The first that a job raises; those not yet begun are then left undone.
+    """
+    spawn = multiprocessing.get_context("spawn")
+    with (
+        ProcessPoolExecutor(os.cpu_count(), spawn, torch.set_num_threads, (1,)) as pool,
+        # disable=None: no bar where the output is no terminal.
+        tqdm(total=len(jobs), unit="training", disable=None) as bar,
+    ):
+        futures = [pool.submit(job, each, out) for each in jobs]
+        try:
+            for future in as_completed(futures):
+                future.result()
+                bar.update()
+        except BaseException:
+            pool.shutdown(wait=False, cancel_futures=True)
+            raise
+
+
+def train(training: Training, out: Path) -> None:
+    """Train and evaluate, or go on where an interrupted training stopped.
+
+    The folder gets what `TrainingRun` writes, ``evaluations.csv``, and in ``kept.safetensors`` the
+    first of the networks that solved the most scenarios.
+
+    Raises
+    ------
+    CheckpointError
+        If the folder holds another training.
+    OSError
+        If the folder cannot be written.
+    """
+    folder = training.folder(out)
+    run = TrainingRun(folder, training.scenarios, MOVE_RULE, training.parameters, training.seed)
+    trainer = run.trainer
+    evaluations = [e for e in read_evaluations(folder) if e.step <= trainer.steps]
+    seconds = evaluations[-1].seconds if evaluations else 0.0
+    optimum = optimal_value(trainer.environment, training.parameters)
+    began = time.perf_counter() - seconds
+    for _ in run.steps():
+        if trainer.steps // training.evaluation_interval > len(evaluations):
+            best = max((evaluation.solved for evaluation in evaluations), default=-1)
+            evaluations.append(evaluate_training(trainer, optimum, time.perf_counter() - began))
+            _write_evaluations(folder, evaluations)
+            if evaluations[-1].solved > best:
+                trainer.save_model(folder / "kept.safetensors")
+    run.close()
+    if run.save_error:
+        raise OSError(run.save_error)
+
+
+def evaluate_training(
+    trainer: Trainer, optimum: NDArray[np.float32], seconds: float
+) -> TrainingEvaluation:
+    """Walk from the start of each scenario with the network as it is now.
+
+    Parameters
+    ----------
+    trainer : Trainer
+    optimum : (C,) float32
+        See `optimal_value`.
+    seconds : float
+        Since the training began.
+    """
+    planner = trainer.planner()
+    walks, unmasked = [], []
+    for scenario in trainer.scenarios:
+        field = planner.q_field(scenario.grid, scenario.goal)
+        walks.append(field.rollout(scenario.start))
+        unmasked.append(field.unmasked().rollout(scenario.start))
+    lengths = [walk.length for walk in walks if walk.cells]
+    return TrainingEvaluation(
+        step=trainer.steps,
+        updates=trainer.updates,
+        episodes=trainer.episodes,
+        seconds=round(seconds, 3),
+        solved=len(lengths),
+        solved_unmasked=sum(bool(walk.cells) for walk in unmasked),
+        length=float(np.mean(lengths)) if lengths else float("nan"),
+        overestimation=_overestimation(trainer, planner, optimum),
+    )
+
+
+def _overestimation(trainer: Trainer, planner: Planner, optimum: NDArray[np.float32]) -> float:
+    if trainer.parameters.network != "paper":
+        return float("nan")
+    scenario = trainer.scenarios[0]
+    q = planner.q_field(scenario.grid, scenario.goal).q
+    free = ~scenario.grid.occupancy
+    free[scenario.goal[1], scenario.goal[0]] = False
+    return float((q.max(axis=0) - optimum.reshape(free.shape))[free].mean())
+
+
+def optimal_value(
+    environment: GridVectorEnvironment, parameters: HyperParameters
+) -> NDArray[np.float32]:
+    """Return V* of the first scenario, exact by value iteration: (C,) float32."""
+    scenario = environment.scenarios[0]
+    legal = legal_moves(scenario.grid.occupancy, MOVE_RULE).reshape(1, len(MOVES), -1)
+    return_SAC = propagate(
+        legal.astype(np.float32),
+        environment.free_reward[:1],
+        environment.goal[:1],
+        neighbours(environment.shape),
+        parameters.gamma,
+        parameters.obstacle_reward,
+    )
+    q_SAC = np.where(legal, return_SAC, np.float32(parameters.obstacle_reward))
+    value_C: NDArray[np.float32] = q_SAC[0].max(axis=0)
+    return value_C
+
+
+def read_evaluations(folder: Path) -> list[TrainingEvaluation]:
+    """Read ``evaluations.csv`` of a training's folder; empty if there is none."""
+    path = folder / "evaluations.csv"
+    if not path.exists():
+        return []
+    whole = {"step", "updates", "episodes", "solved", "solved_unmasked"}
+    with path.open(newline="", encoding="utf-8") as file:
+        rows = list(csv.DictReader(file))
+    return [
+        TrainingEvaluation(**{k: int(v) if k in whole else float(v) for k, v in row.items()})  # type: ignore[arg-type]
+        for row in rows
+    ]
+
+
+def _write_evaluations(folder: Path, evaluations: Sequence[TrainingEvaluation]) -> None:
+    write_csv(
+        folder / "evaluations.csv",
+        [*asdict(evaluations[0])],
+        [astuple(evaluation) for evaluation in evaluations],
+    )
+
+
+def write_csv(path: Path, columns: Sequence[str], rows: Sequence[Sequence[object]]) -> None:
+    """Write a table; the file is never half written."""
+    text = io.StringIO(newline="")
+    csv.writer(text).writerows([columns, *rows])
+    write_atomically(path, text.getvalue().encode())

@@ -1,0 +1,82 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from strategies import grids_with_free_cell
+
+from ddqn_planner.experiments.goal_1 import a_star
+from ddqn_planner.experiments.goal_2 import free_starts, walk_from_everywhere
+from ddqn_planner.experiments.goal_3 import noisy_maps
+from ddqn_planner.experiments.profiles import MOVE_RULE, PROFILES, VARIANTS, variant
+from ddqn_planner.grid import Cell, GridMap, MoveRule, path_length
+from ddqn_planner.model import ModelMetadata, PropagationQNetwork
+from ddqn_planner.planning import Planner, shortest_distances, shortest_path
+from ddqn_planner.training.environment import Scenario
+
+
+@given(grids_with_free_cell(), st.sampled_from(MoveRule), st.data())
+def test_the_library_a_star_is_exact_under_both_rules(
+    grid_and_goal: tuple[GridMap, Cell], rule: MoveRule, data: st.DataObject
+) -> None:
+    grid, goal = grid_and_goal
+    start = data.draw(st.sampled_from(grid.free_cells()))
+    if start == goal:
+        return
+    cells = a_star(Scenario(grid, start, goal), rule)
+    optimum = shortest_distances(grid, goal, rule)[start[1], start[0]]
+    assert bool(cells) == np.isfinite(optimum)
+    if cells:
+        assert path_length(cells) == pytest.approx(optimum)
+
+
+def test_the_papers_map_has_286_starts(paper: Scenario) -> None:
+    assert free_starts(paper).sum() == 286
+
+
+def test_every_start_of_a_field_is_walked(paper: Scenario) -> None:
+    metadata = ModelMetadata("propagation", {"filters": 2}, MOVE_RULE, 0.95, "", 0, 0, "")
+    network = PropagationQNetwork(2).requires_grad_(False)
+    # Told that every move succeeds: its walks go straight to the goal, and are trapped by walls.
+    network.moves.bias.fill_(100.0)
+    walks = walk_from_everywhere(Planner(network, metadata), paper)
+    solved = np.isfinite(walks.ratio)
+    assert 0 < solved[free_starts(paper)].sum() < 286
+    assert not (walks.unmasked & ~solved).any()
+    assert np.nanmin(walks.ratio) >= 1.0 - 1e-9
+
+
+def test_noisy_maps_differ_and_keep_a_path(paper: Scenario) -> None:
+    maps = noisy_maps(12, 18, seed=3)
+    path = shortest_path(paper.grid, paper.start, paper.goal, MOVE_RULE)
+    scenarios = [*maps.training, *maps.test]
+    assert (len(maps.training), len(maps.test)) == (12, 18)
+    assert len({scenario.grid.fingerprint for scenario in scenarios}) == 30
+    for scenario in scenarios:
+        new = np.argwhere(scenario.grid.occupancy & ~paper.grid.occupancy)
+        assert 1 <= len(new) <= 5
+        for y, x in new:
+            assert min(max(abs(x - px), abs(y - py)) for px, py in path) <= 1
+        optimum = shortest_distances(scenario.grid, scenario.goal, MOVE_RULE)
+        assert np.isfinite(optimum[scenario.start[::-1]])
+
+
+def test_more_test_maps_leave_the_training_maps_as_they_are() -> None:
+    few, many = noisy_maps(5, 1), noisy_maps(5, 9)
+    fingerprints = [[s.grid.fingerprint for s in maps.training] for maps in (few, many)]
+    assert fingerprints[0] == fingerprints[1]
+
+
+@pytest.mark.parametrize("profile", PROFILES)
+def test_a_variant_switches_improvements_off(profile: str) -> None:
+    switched = {
+        name: (p.p_r > 0, p.alpha > 0 or p.beta > 0)
+        for name, p in ((name, variant(PROFILES[profile], name)) for name in VARIANTS)
+    }
+    assert switched == {
+        "plain": (False, False),
+        "initialisation": (True, False),
+        "reward": (False, True),
+        "both": (True, True),
+    }

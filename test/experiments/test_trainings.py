@@ -1,0 +1,125 @@
+from __future__ import annotations
+
+from dataclasses import asdict, replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from ddqn_planner.experiments.profiles import MOVE_RULE
+from ddqn_planner.experiments.report import first_kept, mean, spread, table, worst
+from ddqn_planner.experiments.taught import best_moves, cross_entropy, teach
+from ddqn_planner.experiments.trainings import (
+    Training,
+    TrainingEvaluation,
+    in_parallel,
+    optimal_value,
+    read_evaluations,
+    train,
+)
+from ddqn_planner.grid import LENGTHS, MOVES
+from ddqn_planner.planning import Planner, shortest_distances
+from ddqn_planner.training.environment import GridVectorEnvironment, Scenario
+from ddqn_planner.training.hyper_parameters import HyperParameters
+
+QUICK = HyperParameters(steps=900, filters=4, learning_starts=50, target_interval=100)
+
+
+def evaluation(step: int, solved: int) -> TrainingEvaluation:
+    return TrainingEvaluation(step, 0, 0, 0.0, solved, solved, 1.0, 0.0)
+
+
+def test_a_training_that_was_cut_off_ends_as_if_it_had_not_been(
+    small: Scenario, tmp_path: Path
+) -> None:
+    whole = Training("small", QUICK, (small,), seed=1, evaluation_interval=300)
+    train(whole, tmp_path / "whole")
+    train(replace(whole, parameters=replace(QUICK, steps=600)), tmp_path / "cut")
+    in_parallel(train, [whole], tmp_path / "cut")
+    runs = [read_evaluations(whole.folder(tmp_path / name)) for name in ("whole", "cut")]
+    assert [e.step for e in runs[0]] == [300, 600, 900]
+    for a, b in zip(*runs, strict=True):
+        np.testing.assert_equal(asdict(replace(a, seconds=0.0)), asdict(replace(b, seconds=0.0)))
+    models = [whole.folder(tmp_path / name) / "model.safetensors" for name in ("whole", "cut")]
+    assert models[0].read_bytes() == models[1].read_bytes()
+
+
+def test_what_a_job_raises_is_raised(small: Scenario, tmp_path: Path) -> None:
+    training = Training("small", QUICK, (small,), seed=1, evaluation_interval=300)
+    train(training, tmp_path)
+    other = replace(training, parameters=replace(QUICK, gamma=0.5))
+    with pytest.raises(ValueError, match=r"gamma 0\.95"):
+        in_parallel(train, [other], tmp_path)
+
+
+@pytest.mark.parametrize("alpha", [0.0, 0.6])
+def test_the_optimal_value_is_what_the_best_policy_earns(small: Scenario, alpha: float) -> None:
+    parameters = replace(QUICK, alpha=alpha)
+    environment = GridVectorEnvironment([small], MOVE_RULE, parameters)
+    value = optimal_value(environment, parameters)
+    # Bellman's equation, with what the environment itself does.
+    for x, y in small.grid.free_cells():
+        if (x, y) == small.goal:
+            continue
+        returns = []
+        for action in range(len(MOVES)):
+            environment.cell = np.array([y * 5 + x])
+            moved = environment.move(np.array([action]))
+            onward = 0.0 if moved.terminated[0] else parameters.gamma * value[moved.cell[0]]
+            returns.append(float(moved.reward[0] + onward))
+        assert value[y * 5 + x] == pytest.approx(max(returns), abs=0.02)
+
+
+def test_best_moves_begin_shortest_paths(small: Scenario) -> None:
+    best = best_moves(small).reshape(4, 5, 8)
+    distance = shortest_distances(small.grid, small.goal, MOVE_RULE)
+    assert not best[small.grid.occupancy].any()
+    assert not best[small.goal[::-1]].any()
+    for x, y in small.grid.free_cells():
+        for action in np.flatnonzero(best[y, x]):
+            dx, dy = MOVES[action]
+            assert distance[y, x] == pytest.approx(LENGTHS[action] + distance[y + dy, x + dx])
+
+
+def test_cross_entropy_is_zero_when_the_best_moves_have_all_the_weight() -> None:
+    q = torch.tensor([[50.0, 50.0, 0.0], [0.0, 0.0, 50.0]])
+    assert cross_entropy(q, torch.tensor([[1, 1, 0], [0, 0, 1]]).bool()) < 1e-6
+    even = cross_entropy(torch.zeros(1, 4), torch.tensor([[1, 0, 0, 0]]).bool())
+    assert even.item() == pytest.approx(np.log(4))
+
+
+def test_a_taught_network_walks_the_shortest_path(small: Scenario, tmp_path: Path) -> None:
+    training = Training("taught", QUICK, (small,), seed=0, evaluation_interval=300)
+    teach(training, tmp_path)
+    planner = Planner.load(training.folder(tmp_path) / "model.safetensors")
+    plan = planner.plan(small.grid, small.start, small.goal)
+    optimum = shortest_distances(small.grid, small.goal, MOVE_RULE)[small.start[::-1]]
+    assert plan.length == pytest.approx(optimum)
+
+
+def test_a_spread_is_the_median_and_the_range_and_what_never_came_about() -> None:
+    assert spread([3, 1, 2000]) == "3 (1 to 2,000)"
+    assert spread([2.5, 2.5], 1) == "2.5"
+    assert spread([500, np.inf, 700]) == "700 (500 to never)"
+    assert spread([np.nan, 4]) == "4"
+    assert spread([np.nan]) == "none"
+
+
+def test_mean_and_worst_leave_nan_out() -> None:
+    assert (mean([1.0, np.nan, 2.0]), worst([1.0, np.nan, 2.0])) == (1.5, 2.0)
+    assert np.isnan([mean([np.nan]), worst([])]).all()
+
+
+@pytest.mark.parametrize(
+    ("solved", "first"), [((0, 1, 0, 1, 1), 3), ((1, 1), 0), ((1, 0), None), ((), None)]
+)
+def test_what_is_solved_for_good_is_solved_to_the_end(
+    solved: tuple[int, ...], first: int | None
+) -> None:
+    run = [evaluation(step, value) for step, value in enumerate(solved)]
+    assert first_kept(run, [bool(e.solved) for e in run]) == first
+
+
+def test_a_table_is_markdown() -> None:
+    assert table(["a", "b"], [[1, "x"]]) == "| a | b |\n| --- | --- |\n| 1 | x |"
