@@ -164,12 +164,19 @@ def paper_scenario_of(map_file: Any) -> Scenario:
     return Scenario(read.grid(), read.start, read.goal)
 
 
+@pytest.mark.parametrize("network", ["paper", "propagation"])
 def test_a_planner_that_follows_the_trainer_plans_with_each_model_it_saves(
-    run_node: Any, make_client: Any, namespace: str, small_values: Any, tmp_path: FilePath
+    run_node: Any,
+    make_client: Any,
+    namespace: str,
+    small_values: Any,
+    tmp_path: FilePath,
+    network: str,
 ) -> None:
     client = make_client(namespace)
     trainer_parameters = {
         "steps": 6000,
+        "network": network,
         "learning_rate": 0.003,
         "p_r": 1.0,
         "update_interval": 2,
@@ -248,6 +255,18 @@ def test_a_folder_with_another_training_is_left_alone(
         with pytest.raises(AssertionError, match=r"gamma 0\.5 \(now 0\.95\)"):
             start_training(client)
     assert (tmp_path / "checkpoint.safetensors").read_bytes() == before
+
+
+def test_an_unknown_network_is_refused_with_those_that_there_are(
+    run_node: Any, make_client: Any, namespace: str, small_values: Any, tmp_path: FilePath
+) -> None:
+    client = make_client(namespace)
+    parameters = {"network": "perceptron", "output_folder": str(tmp_path / "run")}
+    with run_node("trainer_node", parameters, namespace=namespace):
+        set_up(client, small_values, stamped(0.5, 0.5), stamped(5.5, 5.5))
+        with pytest.raises(AssertionError, match="'perceptron'; give one of paper, propagation"):
+            start_training(client)
+    assert not (tmp_path / "run").exists()
 
 
 def test_a_map_file_that_cannot_be_read_ends_the_start_with_its_reason(run_node: Any) -> None:
