@@ -29,7 +29,10 @@ MOVE_RULES = [rule.value for rule in MoveRule]
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command line; return the exit code: 0 done, 1 no path, 2 bad input."""
+    """Run the command line; return the exit code.
+
+    0 done, 1 no path, 2 bad input, 130 interrupted.
+    """
     options = _parser().parse_args(arguments)
     if name := getattr(options, "move_rule", None):
         options.move_rule = MoveRule(name)
@@ -195,7 +198,12 @@ def _reproduce(options: argparse.Namespace) -> int:
             "pip install 'ddqn_planner[experiments]'"
         ) from None
     names = [*EXPERIMENTS] if options.experiment == "all" else [options.experiment]
-    print(reproduce(names, Settings(options.out, options.seeds, options.quick)))
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
+    try:
+        print(reproduce(names, Settings(options.out, options.seeds, options.quick)))
+    except KeyboardInterrupt:
+        print("interrupted; the same command goes on from the last checkpoints", file=sys.stderr)
+        return 130
     print(f"saved {options.out / 'report.md'}")
     return 0
 

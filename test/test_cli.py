@@ -134,6 +134,25 @@ def test_reproduce_runs_every_experiment_and_writes_its_report(
     assert trained == {path: path.stat().st_mtime_ns for path in trained}
 
 
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_interrupted_experiments_end_with_all_their_processes(tmp_path: Path, number: int) -> None:
+    executable = Path(sysconfig.get_path("scripts")) / "ddqn-planner"
+    command = [executable, "reproduce", "--experiment", "goal-1", "--out", tmp_path]
+    child = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
+    deadline = time.monotonic() + 60
+    while not (curves := [*tmp_path.rglob("evaluations.csv")]):
+        assert time.monotonic() < deadline
+        assert child.poll() is None
+        time.sleep(0.05)
+    os.kill(child.pid, number)
+    _, printed = child.communicate(timeout=30)  # to the end of what every process may print
+    assert child.returncode == 130
+    assert "the same command goes on" in printed
+    before = [path.read_bytes() for path in curves]
+    time.sleep(1.0)
+    assert before == [path.read_bytes() for path in curves]
+
+
 def test_reproduce_refuses_less_than_one_seed(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["reproduce", "--seeds", "0"]) == 2
     assert "--seeds is 0; give at least 1" in capsys.readouterr().err

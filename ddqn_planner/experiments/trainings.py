@@ -6,6 +6,7 @@ import csv
 import io
 import multiprocessing
 import os
+import signal
 import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
@@ -84,11 +85,11 @@ def in_parallel(job: Callable[[Job, Path], None], jobs: Sequence[Job], out: Path
     Raises
     ------
     Exception
-        The first that a job raises; those not yet begun are then left undone.
+        The first that a job raises. Those under way are then ended, and the others not begun.
     """
     spawn = multiprocessing.get_context("spawn")
     with (
-        ProcessPoolExecutor(os.cpu_count(), spawn, torch.set_num_threads, (1,)) as pool,
+        ProcessPoolExecutor(os.cpu_count(), spawn, _prepare_process) as pool,
         # disable=None: no bar where the output is no terminal.
         tqdm(total=len(jobs), unit="training", disable=None) as bar,
     ):
@@ -98,8 +99,15 @@ def in_parallel(job: Callable[[Job, Path], None], jobs: Sequence[Job], out: Path
                 future.result()
                 bar.update()
         except BaseException:
-            pool.shutdown(wait=False, cancel_futures=True)
+            for process in multiprocessing.active_children():
+                process.terminate()
             raise
+
+
+def _prepare_process() -> None:
+    torch.set_num_threads(1)
+    # Ctrl-C reaches every process of a shell's job; what then ends is up to the first one.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 
 def train(training: Training, out: Path) -> None:
