@@ -54,7 +54,8 @@ def _draw(settings: Settings) -> None:
         draw_curves(panels[1, column], solved, "share of seeds solved from the start")
         panels[0, column].set_title(f"profile {profile}", loc="left")
         panels[1, column].set_ylim(-0.05, 1.05)
-    panels[0, 0].legend(loc="lower right")
+    handles, labels = panels[0, 0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside lower center", ncols=len(VARIANTS))
     save(figure, settings.out / "ablation.png")
 
 

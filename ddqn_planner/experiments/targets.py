@@ -65,7 +65,7 @@ def _draw(settings: Settings) -> None:
     draw_curves(left, {w: _curve(settings, t, "overestimation") for t, w in TARGETS.items()}, "")
     left.set(ylabel="mean of max Q - V*", yscale="symlog")
     left.axhline(0, color="black", linewidth=0.8)
-    left.legend()
+    figure.legend(loc="outside lower center", ncols=len(TARGETS))
     solved = {}
     for target, words in TARGETS.items():
         steps, values = _curve(settings, target, "solved")

@@ -114,7 +114,7 @@ def train(training: Training, out: Path) -> None:
     """Train and evaluate, or go on where an interrupted training stopped.
 
     The folder gets what `TrainingRun` writes, ``evaluations.csv``, and in ``kept.safetensors`` the
-    first of the networks that solved the most scenarios.
+    last of the networks that solved the most scenarios.
 
     Raises
     ------
@@ -135,7 +135,7 @@ def train(training: Training, out: Path) -> None:
             best = max((evaluation.solved for evaluation in evaluations), default=-1)
             evaluations.append(evaluate_training(trainer, optimum, time.perf_counter() - began))
             _write_evaluations(folder, evaluations)
-            if evaluations[-1].solved > best:
+            if evaluations[-1].solved >= best:
                 trainer.save_model(folder / "kept.safetensors")
     run.close()
     if run.save_error:
