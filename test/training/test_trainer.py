@@ -41,7 +41,7 @@ def test_training_learns_the_way_around_a_wall(small: Scenario) -> None:
     field = trainer.planner().q_field(small.grid, small.goal)
     evaluation = evaluate(field, small.grid, MoveRule.ROBOT_SAFE)
     assert evaluation.solved == evaluation.starts
-    assert evaluation.mean_ratio < 1.1
+    assert evaluation.mean_ratio < 1.2
     assert field.rollout(small.start).status is PlanStatus.SUCCEEDED
 
 
