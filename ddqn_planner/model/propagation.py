@@ -12,6 +12,11 @@ from torch import Tensor, nn
 
 from ddqn_planner.grid import LENGTHS, MOVES, Cell
 
+SETTLED = 1e-3
+"""Values count as settled when none changes more than this in one repetition."""
+MAX_REPETITIONS = 1000
+"""Repetitions, and one for each cell of the map, after which spreading ends in any case."""
+
 
 class PropagationQNetwork(nn.Module):
     """A Q-network for maps of any size: Q(s, a) = p(s, a) (r + γ V(s')) + (1 - p(s, a)) r_o.
@@ -143,17 +148,14 @@ def propagate(
     base_SAC[np.arange(maps), :, goal_S] = 0.0
     # From below, as if every move collided: values then rise along the front from the goal.
     value_SC = np.full((maps, cells + 1), collision, dtype=np.float32)
-    settled = False
-    while not settled:
+    for _ in range(cells + MAX_REPETITIONS):
         q_SAC = value_SC.take(neighbours_AC, axis=1)
         q_SAC *= gain_SAC
         q_SAC += base_SAC
         new_SC = q_SAC.max(axis=1)
-        settled = bool(np.abs(new_SC - value_SC[:, :-1]).max() < SETTLED)
+        change = np.abs(new_SC - value_SC[:, :-1]).max()
         value_SC[:, :-1] = new_SC
+        if change < SETTLED:
+            break
     return_SAC: NDArray[np.float32] = reward_SAC + np.float32(gamma) * value_SC[:, neighbours_AC]
     return return_SAC
-
-
-SETTLED = 1e-3
-"""Greatest change of a value in one repetition from which on it counts as settled."""

@@ -27,6 +27,7 @@ from numpy.typing import NDArray
 
 from ddqn_planner.grid import MOVES, Cell, GridMap, MoveRule, legal_moves, read_map_file
 from ddqn_planner.model.observation import GOAL, OBSTACLE, ROBOT, observation_background, observe
+from ddqn_planner.model.propagation import neighbours
 from ddqn_planner.resources import find_resource
 from ddqn_planner.training.hyper_parameters import HyperParameters
 from ddqn_planner.training.initialisation import initial_cells
@@ -130,9 +131,9 @@ class GridVectorEnvironment(VectorEnv[Observations, NDArray[np.int64], Any]):
         )
         rewards = [free_cell_reward(self.shape, s.start, s.goal, parameters) for s in scenarios]
         self.free_reward = np.stack([reward.reshape(len(MOVES), -1) for reward in rewards])
-        cells = np.arange(self.shape[0] * width)
-        reaches_goal = cells + self._offset[:, None] == self.goal[:, None, None]
-        self.free_reward[reaches_goal] = parameters.goal_reward
+        self.free_reward[neighbours(self.shape) == self.goal[:, None, None]] = (
+            parameters.goal_reward
+        )
         self._reward = np.where(
             self._legal, self.free_reward, np.float32(parameters.obstacle_reward)
         )

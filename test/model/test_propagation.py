@@ -79,3 +79,11 @@ def test_a_field_has_one_q_an_action_and_cell_of_a_map_of_any_shape() -> None:
         assert q.shape == (8, *shape)
         assert q.dtype == np.float32
         assert np.isfinite(q).all()
+
+
+def test_values_that_never_settle_end_all_the_same() -> None:
+    success = np.full((1, 8, 4), np.nan, dtype=np.float32)
+    return_SAC = propagate(
+        success, success, np.array([3]), neighbours((2, 2)), gamma=1.0, collision=-1.0
+    )
+    assert return_SAC.shape == (1, 8, 4)

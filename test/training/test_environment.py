@@ -151,3 +151,11 @@ def test_a_scenario_needs_two_free_cells(
 def test_maps_of_two_sizes_are_refused(small: Scenario, paper: Scenario) -> None:
     with pytest.raises(ValueError, match="one size"):
         GridVectorEnvironment([small, paper], MoveRule.ROBOT_SAFE, PARAMETERS)
+
+
+def test_a_move_that_succeeds_is_rewarded_for_the_goal_only_beside_it(small: Scenario) -> None:
+    parameters = HyperParameters(alpha=0.0, beta=0.0)
+    environment = GridVectorEnvironment([small], MoveRule.ROBOT_SAFE, parameters)
+    rewarded = {(int(c) % 5, int(c) // 5) for _, c in np.argwhere(environment.free_reward[0])}
+    # The goal (4, 0) is at the end of its row: the first cells of the next one are far from it.
+    assert rewarded == {(3, 0), (3, 1), (4, 1)}
