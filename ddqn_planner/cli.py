@@ -91,7 +91,7 @@ def _parser() -> argparse.ArgumentParser:
         "--out", type=Path, default=Path("runs/reproduce"), help="folder of trainings and report"
     )
     reproduce.add_argument(
-        "--quick", action="store_true", help="run everything, too briefly to learn anything"
+        "--quick", action="store_true", help="run it too briefly to learn, into the folder quick"
     )
     reproduce.set_defaults(command=_reproduce)
     return parser
@@ -198,13 +198,14 @@ def _reproduce(options: argparse.Namespace) -> int:
             "pip install 'ddqn_planner[experiments]'"
         ) from None
     names = [*EXPERIMENTS] if options.experiment == "all" else [options.experiment]
+    out = options.out / "quick" if options.quick else options.out
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
-        print(reproduce(names, Settings(options.out, options.seeds, options.quick)))
+        print(reproduce(names, Settings(out, options.seeds, options.quick)))
     except KeyboardInterrupt:
         print("interrupted; the same command goes on from the last checkpoints", file=sys.stderr)
         return 130
-    print(f"saved {options.out / 'report.md'}")
+    print(f"saved {out / 'report.md'}")
     return 0
 
 

@@ -119,12 +119,13 @@ def test_reproduce_runs_every_experiment_and_writes_its_report(
 ) -> None:
     command = ["reproduce", "--quick", "--seeds", "2", "--out", str(tmp_path)]
     assert main(command) == 0
-    report = (tmp_path / "report.md").read_text()
+    folder = tmp_path / "quick"
+    report = (folder / "report.md").read_text()
     assert report in capsys.readouterr().out
     for name in EXPERIMENTS:
         assert f"`ddqn-planner reproduce --experiment {name} --seeds 2 --quick`" in report
     for picture in re.findall(r"!\[.*?\]\((.*?)\)", report):
-        with Image.open(tmp_path / picture) as image:
+        with Image.open(folder / picture) as image:
             assert min(image.size) > 300
             assert len(image.convert("RGB").getcolors(image.width * image.height)) > 20
     assert "| best | 286 |" in report
