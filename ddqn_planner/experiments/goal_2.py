@@ -6,6 +6,7 @@ from typing import NamedTuple
 
 import matplotlib.pyplot as plt
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
 from ddqn_planner.experiments import goal_1
@@ -13,8 +14,12 @@ from ddqn_planner.experiments.figures import draw_border, draw_map, draw_share, 
 from ddqn_planner.experiments.profiles import MOVE_RULE, PROFILES, START_DEAD_END
 from ddqn_planner.experiments.report import Settings, mean, spread, table, worst
 from ddqn_planner.experiments.trainings import Training, write_csv
+from ddqn_planner.grid import MOVES, legal_moves
+from ddqn_planner.model import PropagationQNetwork
 from ddqn_planner.planning import Planner, shortest_distances
-from ddqn_planner.training.environment import Scenario, paper_scenario
+from ddqn_planner.planning.q_field import QField
+from ddqn_planner.training.environment import GridVectorEnvironment, Scenario, paper_scenario
+from ddqn_planner.training.learners import PropagationLearner
 
 TITLE = "Goal ii: from every free cell"
 
@@ -50,10 +55,28 @@ def free_starts(scenario: Scenario) -> NDArray[np.bool_]:
     return starts
 
 
-def walk_from_everywhere(planner: Planner, scenario: Scenario) -> Starts:
+def planned_field(planner: Planner, scenario: Scenario) -> QField:
+    """Return the Q field that the planner walks in."""
+    return planner.q_field(scenario.grid, scenario.goal)
+
+
+def trained_field(planner: Planner, scenario: Scenario) -> QField:
+    """Return the Q field of a propagation network as the loss trained it: with reward and γ."""
+    parameters = PROFILES["best"]
+    environment = GridVectorEnvironment([scenario], MOVE_RULE, parameters)
+    learner = PropagationLearner(environment, parameters)
+    assert isinstance(planner.network, PropagationQNetwork)
+    learner.copy_target(planner.network)
+    cells = np.arange(scenario.grid.occupancy.size)
+    with torch.inference_mode():
+        q_CA = learner.q(planner.network, learner.states(np.zeros_like(cells), cells))
+    q_AHW = q_CA.T.reshape(len(MOVES), *scenario.grid.occupancy.shape).numpy()
+    return QField(scenario.goal, q_AHW, legal_moves(scenario.grid.occupancy, MOVE_RULE))
+
+
+def walk_from_everywhere(field: QField, scenario: Scenario) -> Starts:
     """Walk from every free cell besides the end."""
     optimum = shortest_distances(scenario.grid, scenario.goal, MOVE_RULE)
-    field = planner.q_field(scenario.grid, scenario.goal)
     any_move = field.unmasked()
     ratio = np.full(optimum.shape, np.nan)
     unmasked = np.zeros(optimum.shape, dtype=np.bool_)
@@ -70,39 +93,44 @@ def walk_from_everywhere(planner: Planner, scenario: Scenario) -> Starts:
 def report(settings: Settings) -> str:
     """Write the table and the figure of goal ii, and return its Markdown."""
     scenario = paper_scenario()
-    starts = free_starts(scenario)
-    x, y = np.transpose(sorted(START_DEAD_END - {scenario.start}))
-    rows, shares = [], {}
-    for profile in PROFILES:
-        walks = [
-            walk_from_everywhere(planner, scenario)
+    walks = {
+        label: [
+            walk_from_everywhere(field(planner, scenario), scenario)
             for planner in settings.planners(goal_1.name(profile))
         ]
-        ratios = [walk.ratio[starts] for walk in walks]
-        rows.append(
-            [
-                profile,
-                int(starts.sum()),
-                spread([int(np.isfinite(ratio).sum()) for ratio in ratios]),
-                spread([int(walk.unmasked[starts].sum()) for walk in walks]),
-                spread([int(np.isfinite(walk.ratio[y, x]).sum()) for walk in walks]),
-                spread([mean(ratio) for ratio in ratios], 4),
-                spread([worst(ratio) for ratio in ratios], 4),
-            ]
+        for label, profile, field in (
+            ("paper", "paper", planned_field),
+            ("best", "best", planned_field),
+            ("best, Q as trained", "best", trained_field),
         )
-        solved = np.sum([np.isfinite(walk.ratio) for walk in walks], axis=0).astype(np.float64)
-        solved[scenario.grid.occupancy] = np.nan
-        shares[profile] = solved
+    }
+    rows = [[label, *_row(of_seeds, scenario)] for label, of_seeds in walks.items()]
     write_csv(settings.out / "goal_2.csv", ["profile", *COLUMNS], rows)
-    _draw(settings, scenario, shares)
+    _draw(settings, scenario, {profile: walks[profile] for profile in PROFILES})
     return f"{table(['profile', *COLUMNS], rows)}\n\n![Fig. 8: starts by outcome](goal_2.png)"
 
 
-def _draw(settings: Settings, scenario: Scenario, shares: dict[str, NDArray[np.float64]]) -> None:
-    figure, panels = plt.subplots(1, len(shares), figsize=(11, 5), layout="constrained")
-    for axes, (profile, share) in zip(panels, shares.items(), strict=True):
-        share[scenario.goal[::-1]] = np.nan
-        image = draw_share(axes, share, settings.seeds)
+def _row(walks: list[Starts], scenario: Scenario) -> list[object]:
+    starts = free_starts(scenario)
+    x, y = np.transpose(sorted(START_DEAD_END - {scenario.start}))
+    ratios = [walk.ratio[starts] for walk in walks]
+    return [
+        int(starts.sum()),
+        spread([int(np.isfinite(ratio).sum()) for ratio in ratios]),
+        spread([int(walk.unmasked[starts].sum()) for walk in walks]),
+        spread([int(np.isfinite(walk.ratio[y, x]).sum()) for walk in walks]),
+        spread([mean(ratio) for ratio in ratios], 4),
+        spread([worst(ratio) for ratio in ratios], 4),
+    ]
+
+
+def _draw(settings: Settings, scenario: Scenario, walks: dict[str, list[Starts]]) -> None:
+    figure, panels = plt.subplots(1, len(walks), figsize=(11, 5), layout="constrained")
+    for axes, (profile, of_seeds) in zip(panels, walks.items(), strict=True):
+        solved = np.sum([np.isfinite(walk.ratio) for walk in of_seeds], axis=0)
+        free = ~scenario.grid.occupancy
+        free[scenario.goal[::-1]] = False
+        image = draw_share(axes, np.where(free, solved, np.nan), settings.seeds)
         draw_map(axes, scenario, f"profile {profile}")
         draw_border(axes, START_DEAD_END)
     figure.colorbar(

@@ -9,7 +9,7 @@ import numpy as np
 
 from ddqn_planner.experiments import goal_1
 from ddqn_planner.experiments.figures import Curve, draw_curves, save
-from ddqn_planner.experiments.goal_2 import free_starts, walk_from_everywhere
+from ddqn_planner.experiments.goal_2 import free_starts, planned_field, walk_from_everywhere
 from ddqn_planner.experiments.report import Settings, spread, table
 from ddqn_planner.experiments.trainings import Training, write_csv
 from ddqn_planner.training.environment import paper_scenario
@@ -44,7 +44,8 @@ def report(settings: Settings) -> str:
     rows = []
     for target, words in TARGETS.items():
         runs = settings.evaluations(name(target))
-        walks = [walk_from_everywhere(p, scenario) for p in settings.planners(name(target))]
+        fields = (planned_field(p, scenario) for p in settings.planners(name(target)))
+        walks = [walk_from_everywhere(field, scenario) for field in fields]
         late = [[e.overestimation for e in run[-max(len(run) // 10, 1) :]] for run in runs]
         rows.append(
             [

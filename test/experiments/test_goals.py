@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -7,7 +9,12 @@ from hypothesis import strategies as st
 from strategies import grids_with_free_cell
 
 from ddqn_planner.experiments.goal_1 import a_star
-from ddqn_planner.experiments.goal_2 import free_starts, walk_from_everywhere
+from ddqn_planner.experiments.goal_2 import (
+    free_starts,
+    planned_field,
+    trained_field,
+    walk_from_everywhere,
+)
 from ddqn_planner.experiments.goal_3 import noisy_maps
 from ddqn_planner.experiments.profiles import MOVE_RULE, PROFILES, VARIANTS, variant
 from ddqn_planner.grid import Cell, GridMap, MoveRule, path_length
@@ -40,11 +47,26 @@ def test_every_start_of_a_field_is_walked(paper: Scenario) -> None:
     network = PropagationQNetwork(2).requires_grad_(False)
     # Told that every move succeeds: its walks go straight to the goal, and are trapped by walls.
     network.moves.bias.fill_(100.0)
-    walks = walk_from_everywhere(Planner(network, metadata), paper)
+    planner = Planner(network, metadata)
+    walks = walk_from_everywhere(planned_field(planner, paper), paper)
     solved = np.isfinite(walks.ratio)
     assert 0 < solved[free_starts(paper)].sum() < 286
     assert not (walks.unmasked & ~solved).any()
     assert np.nanmin(walks.ratio) >= 1.0 - 1e-9
+
+
+def test_the_q_that_the_loss_trains_adds_up_the_papers_rewards(paper: Scenario) -> None:
+    metadata = ModelMetadata("propagation", {"filters": 2}, MOVE_RULE, 0.95, "", 0, 0, "")
+    network = PropagationQNetwork(2).requires_grad_(False)
+    network.moves.bias.fill_(100.0)
+    field = trained_field(Planner(network, metadata), paper)
+    goal_x, goal_y = paper.goal
+    assert field.q[0, goal_y, goal_x - 1] == pytest.approx(10.0, abs=1e-3)
+    # Two moves before the end: Section 4.2's reward of one, and the end's, discounted.
+    from_start = [math.dist((goal_x - k, goal_y), paper.start) for k in (1, 2)]
+    detour = from_start[0] - from_start[1] - 1.0
+    expected = 0.6 * 1.0 + 0.4 * detour + 0.95 * 10.0
+    assert field.q[0, goal_y, goal_x - 2] == pytest.approx(expected, abs=1e-3)
 
 
 def test_noisy_maps_differ_and_keep_a_path(paper: Scenario) -> None:
