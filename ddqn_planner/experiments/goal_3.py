@@ -85,7 +85,7 @@ def name(profile: str) -> str:
 def trainings(settings: Settings) -> list[Training]:
     """Return the trainings of both profiles on the training maps."""
     maps = _maps(settings).training
-    interval = 500 if settings.quick else 5_000
+    interval = 500 if settings.quick else 1_000
     return [
         *settings.trainings(name("paper"), settings.shorten(PAPER), maps, interval),
         *settings.trainings(name("best"), settings.profile("best"), maps, interval),
