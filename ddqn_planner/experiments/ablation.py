@@ -9,11 +9,9 @@ import numpy as np
 
 from ddqn_planner.experiments import goal_1
 from ddqn_planner.experiments.figures import Curve, draw_curves, save
-from ddqn_planner.experiments.profiles import MOVE_RULE, PROFILES, VARIANTS
+from ddqn_planner.experiments.profiles import PROFILES, VARIANTS
 from ddqn_planner.experiments.report import Settings, table
 from ddqn_planner.experiments.trainings import Training, write_csv
-from ddqn_planner.planning import shortest_distances
-from ddqn_planner.training.environment import paper_scenario
 
 TITLE = "Goal i: the ablation"
 
@@ -28,15 +26,11 @@ def trainings(settings: Settings) -> list[Training]:
 
 def report(settings: Settings) -> str:
     """Write the table and the curves of the ablation, and return its Markdown."""
-    scenario = paper_scenario()
-    optimum = float(
-        shortest_distances(scenario.grid, scenario.goal, MOVE_RULE)[scenario.start[::-1]]
-    )
     rows = []
     for profile in PROFILES:
         for of_variant in VARIANTS:
             evaluations = settings.evaluations(goal_1.name(profile, of_variant))
-            rows.append([profile, of_variant, *goal_1.convergence_row(evaluations, optimum)])
+            rows.append([profile, of_variant, *goal_1.convergence_row(evaluations)])
     header = ["profile", "variant", *goal_1.CONVERGENCE]
     write_csv(settings.out / "ablation.csv", header, rows)
     _draw(settings)

@@ -53,25 +53,21 @@ def trainings(settings: Settings, variants: Sequence[str] = ("both",)) -> list[T
     ]
 
 
-def convergence_row(
-    evaluations: Sequence[Sequence[TrainingEvaluation]], optimum: float
-) -> list[str]:
+def convergence_row(evaluations: Sequence[Sequence[TrainingEvaluation]]) -> list[str]:
     """Return the cells of a table: what the greedy path from the start became, over the seeds."""
+    scenario = paper_scenario()
+    optimum = shortest_distances(scenario.grid, scenario.goal, MOVE_RULE)[scenario.start[::-1]]
     ends = [run[-1] for run in evaluations]
     unmasked = sum(end.solved_unmasked for end in ends)
-    reached = [(run, first_kept(run, [bool(e.solved) for e in run])) for run in evaluations]
-    best = [
-        (run, first_kept(run, [bool(e.length <= optimum + 1e-6) for e in run]))
-        for run in evaluations
-    ]
-    lengths = [end.length for end in ends if end.solved]
+    reached = [first_kept(run, lambda e: e.solved == 1) for run in evaluations]
+    best = [first_kept(run, lambda e: e.length <= optimum + 1e-6) for run in evaluations]
     return [
         f"{sum(end.solved for end in ends)} ({unmasked}) of {len(ends)}",
-        spread([run[i].step if i is not None else np.inf for run, i in reached]),
-        spread([run[i].episodes if i is not None else np.inf for run, i in reached]),
-        spread([run[i].seconds if i is not None else np.inf for run, i in reached], 1),
-        spread([run[i].step if i is not None else np.inf for run, i in best]),
-        spread(lengths, 2),
+        spread([first.step if first else np.inf for first in reached]),
+        spread([first.episodes if first else np.inf for first in reached]),
+        spread([first.seconds if first else np.inf for first in reached], 1),
+        spread([first.step if first else np.inf for first in best]),
+        spread([end.length for end in ends if end.solved], 2),
     ]
 
 
@@ -88,12 +84,8 @@ CONVERGENCE = (
 def report(settings: Settings) -> str:
     """Write the table and the figure of goal i, and return its Markdown."""
     scenario = paper_scenario()
-    optimum = float(
-        shortest_distances(scenario.grid, scenario.goal, MOVE_RULE)[scenario.start[::-1]]
-    )
     rows = [
-        [profile, *convergence_row(settings.evaluations(name(profile)), optimum)]
-        for profile in PROFILES
+        [profile, *convergence_row(settings.evaluations(name(profile)))] for profile in PROFILES
     ]
     speeds = [[profile, *_speed(settings, profile)] for profile in PROFILES]
     paths, times = _paths(settings, scenario)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -105,10 +105,13 @@ def worst(values: Sequence[float] | NDArray[np.float64]) -> float:
     return float(finite.max()) if finite.size else float("nan")
 
 
-def first_kept(evaluations: Sequence[TrainingEvaluation], kept: Sequence[bool]) -> int | None:
-    """Return the index of the first evaluation from which on something holds to the end."""
-    assert len(kept) == len(evaluations)
-    holds = len(kept)
-    while holds and kept[holds - 1]:
-        holds -= 1
-    return holds if holds < len(kept) else None
+def first_kept(
+    evaluations: Sequence[TrainingEvaluation], holds: Callable[[TrainingEvaluation], bool]
+) -> TrainingEvaluation | None:
+    """Return the evaluation from which on something holds to the end, if there is one."""
+    first = None
+    for evaluation in reversed(evaluations):
+        if not holds(evaluation):
+            break
+        first = evaluation
+    return first

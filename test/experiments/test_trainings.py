@@ -118,7 +118,8 @@ def test_what_is_solved_for_good_is_solved_to_the_end(
     solved: tuple[int, ...], first: int | None
 ) -> None:
     run = [evaluation(step, value) for step, value in enumerate(solved)]
-    assert first_kept(run, [bool(e.solved) for e in run]) == first
+    kept = first_kept(run, lambda e: e.solved == 1)
+    assert (kept.step if kept else None) == first
 
 
 def test_a_table_is_markdown() -> None:
