@@ -10,8 +10,9 @@ import numpy as np
 from ddqn_planner.experiments import goal_1
 from ddqn_planner.experiments.figures import Curve, draw_curves, save
 from ddqn_planner.experiments.profiles import PROFILES, VARIANTS
-from ddqn_planner.experiments.report import Settings, table
-from ddqn_planner.experiments.trainings import Training, write_csv
+from ddqn_planner.experiments.report import Settings, share_curve, table
+from ddqn_planner.experiments.trainings import Training
+from ddqn_planner.files import write_csv
 
 TITLE = "Goal i: the ablation"
 
@@ -43,7 +44,7 @@ def _draw(settings: Settings) -> None:
     figure, panels = plt.subplots(2, len(PROFILES), figsize=(13, 7.5), layout="constrained")
     for column, profile in enumerate(PROFILES):
         rewards = {v: _reward_curve(settings, profile, v) for v in VARIANTS}
-        solved = {v: _solved_curve(settings, profile, v) for v in VARIANTS}
+        solved = {v: share_curve(settings.evaluations(goal_1.name(profile, v))) for v in VARIANTS}
         draw_curves(panels[0, column], rewards, "average reward a step of an episode")
         draw_curves(panels[1, column], solved, "share of seeds solved from the start")
         panels[0, column].set_title(f"profile {profile}", loc="left")
@@ -57,17 +58,11 @@ def _reward_curve(settings: Settings, profile: str, of_variant: str) -> Curve:
     """Return the mean over the episodes that ended in each interval, for each seed."""
     edges = np.linspace(0, settings.profile(profile).steps, BINS + 1)
     seeds = []
-    for path in settings.curves(goal_1.name(profile, of_variant)):
-        with path.open(newline="", encoding="utf-8") as file:
+    for folder in settings.folders(goal_1.name(profile, of_variant)):
+        with (folder / "episodes.csv").open(newline="", encoding="utf-8") as file:
             rows = [(int(r["step"]), float(r["average_reward"])) for r in csv.DictReader(file)]
         steps, rewards = np.array(rows, dtype=np.float64).reshape(-1, 2).T
         total, _ = np.histogram(steps, edges, weights=rewards)
         count, _ = np.histogram(steps, edges)
         seeds.append(np.where(count > 0, total / np.maximum(count, 1), np.nan))
     return (edges[:-1] + edges[1:]) / 2, np.array(seeds)
-
-
-def _solved_curve(settings: Settings, profile: str, of_variant: str) -> Curve:
-    runs = settings.evaluations(goal_1.name(profile, of_variant))
-    share = np.mean([[evaluation.solved for evaluation in run] for run in runs], axis=0)
-    return np.array([evaluation.step for evaluation in runs[0]], dtype=np.float64), share[None]

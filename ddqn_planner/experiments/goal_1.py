@@ -13,11 +13,12 @@ from pathfinding.core.grid import Grid
 from pathfinding.finder.a_star import AStarFinder
 
 from ddqn_planner.experiments.figures import draw_map, draw_walk, save
-from ddqn_planner.experiments.profiles import MOVE_RULE, PROFILES, variant
-from ddqn_planner.experiments.report import Settings, first_kept, spread, table
-from ddqn_planner.experiments.trainings import Training, TrainingEvaluation, write_csv
+from ddqn_planner.experiments.profiles import PROFILES, variant
+from ddqn_planner.experiments.report import Settings, first_kept, optimal_length, spread, table
+from ddqn_planner.experiments.trainings import Training, TrainingEvaluation
+from ddqn_planner.files import write_csv
 from ddqn_planner.grid import Cell, MoveRule, path_length
-from ddqn_planner.planning import Plan, Planner, shortest_distances
+from ddqn_planner.planning import Plan, Planner
 from ddqn_planner.training.environment import Scenario, paper_scenario
 
 TITLE = "Goal i: from the given start"
@@ -55,8 +56,7 @@ def trainings(settings: Settings, variants: Sequence[str] = ("both",)) -> list[T
 
 def convergence_row(evaluations: Sequence[Sequence[TrainingEvaluation]]) -> list[str]:
     """Return the cells of a table: what the greedy path from the start became, over the seeds."""
-    scenario = paper_scenario()
-    optimum = shortest_distances(scenario.grid, scenario.goal, MOVE_RULE)[scenario.start[::-1]]
+    optimum = optimal_length(paper_scenario())
     ends = [run[-1] for run in evaluations]
     unmasked = sum(end.solved_unmasked for end in ends)
     reached = [first_kept(run, lambda e: e.solved == 1) for run in evaluations]

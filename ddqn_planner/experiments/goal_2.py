@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import matplotlib.pyplot as plt
 import numpy as np
 import torch
@@ -13,10 +11,12 @@ from ddqn_planner.experiments import goal_1
 from ddqn_planner.experiments.figures import draw_border, draw_map, draw_share, save
 from ddqn_planner.experiments.profiles import MOVE_RULE, PROFILES, START_DEAD_END
 from ddqn_planner.experiments.report import Settings, mean, spread, table, worst
-from ddqn_planner.experiments.trainings import Training, write_csv
+from ddqn_planner.experiments.trainings import Training
+from ddqn_planner.files import write_csv
 from ddqn_planner.grid import MOVES, legal_moves
 from ddqn_planner.model import PropagationQNetwork
-from ddqn_planner.planning import Planner, shortest_distances
+from ddqn_planner.planning import Planner
+from ddqn_planner.planning.evaluation import length_ratios
 from ddqn_planner.planning.q_field import QField
 from ddqn_planner.training.environment import GridVectorEnvironment, Scenario, paper_scenario
 from ddqn_planner.training.learners import PropagationLearner
@@ -31,15 +31,6 @@ COLUMNS = (
     "mean length / optimum",
     "worst",
 )
-
-
-class Starts(NamedTuple):
-    """What became of the greedy walks from every free cell."""
-
-    ratio: NDArray[np.float64]
-    """(H, W) length over the optimum; NaN where the walk is trapped."""
-    unmasked: NDArray[np.bool_]
-    """(H, W) whether the walk by the greatest Q of all moves reaches the end."""
 
 
 def trainings(settings: Settings) -> list[Training]:
@@ -62,9 +53,8 @@ def planned_field(planner: Planner, scenario: Scenario) -> QField:
 
 def trained_field(planner: Planner, scenario: Scenario) -> QField:
     """Return the Q field of a propagation network as the loss trained it: with reward and γ."""
-    parameters = PROFILES["best"]
-    environment = GridVectorEnvironment([scenario], MOVE_RULE, parameters)
-    learner = PropagationLearner(environment, parameters)
+    environment = GridVectorEnvironment([scenario], MOVE_RULE, PROFILES["best"])
+    learner = PropagationLearner(environment)
     assert isinstance(planner.network, PropagationQNetwork)
     learner.copy_target(planner.network)
     cells = np.arange(scenario.grid.occupancy.size)
@@ -74,60 +64,50 @@ def trained_field(planner: Planner, scenario: Scenario) -> QField:
     return QField(scenario.goal, q_AHW, legal_moves(scenario.grid.occupancy, MOVE_RULE))
 
 
-def walk_from_everywhere(field: QField, scenario: Scenario) -> Starts:
-    """Walk from every free cell besides the end."""
-    optimum = shortest_distances(scenario.grid, scenario.goal, MOVE_RULE)
-    any_move = field.unmasked()
-    ratio = np.full(optimum.shape, np.nan)
-    unmasked = np.zeros(optimum.shape, dtype=np.bool_)
-    for x, y in scenario.grid.free_cells():
-        if (x, y) == scenario.goal:
-            continue
-        plan = field.rollout((x, y))
-        if plan.cells:
-            ratio[y, x] = plan.length / optimum[y, x]
-        unmasked[y, x] = bool(any_move.rollout((x, y)).cells)
-    return Starts(ratio, unmasked)
-
-
 def report(settings: Settings) -> str:
     """Write the table and the figure of goal ii, and return its Markdown."""
     scenario = paper_scenario()
-    walks = {
-        label: [
-            walk_from_everywhere(field(planner, scenario), scenario)
-            for planner in settings.planners(goal_1.name(profile))
-        ]
+    fields = {
+        label: [field(planner, scenario) for planner in settings.planners(goal_1.name(profile))]
         for label, profile, field in (
             ("paper", "paper", planned_field),
             ("best", "best", planned_field),
             ("best, Q as trained", "best", trained_field),
         )
     }
-    rows = [[label, *_row(of_seeds, scenario)] for label, of_seeds in walks.items()]
+    ratios = {
+        label: [length_ratios(field, scenario.grid, MOVE_RULE) for field in of_seeds]
+        for label, of_seeds in fields.items()
+    }
+    rows = [[label, *_row(fields[label], ratios[label], scenario)] for label in fields]
     write_csv(settings.out / "goal_2.csv", ["profile", *COLUMNS], rows)
-    _draw(settings, scenario, {profile: walks[profile] for profile in PROFILES})
+    _draw(settings, scenario, {profile: ratios[profile] for profile in PROFILES})
     return f"{table(['profile', *COLUMNS], rows)}\n\n![Fig. 8: starts by outcome](goal_2.png)"
 
 
-def _row(walks: list[Starts], scenario: Scenario) -> list[object]:
+def _row(
+    fields: list[QField], ratios: list[NDArray[np.float64]], scenario: Scenario
+) -> list[object]:
     starts = free_starts(scenario)
     x, y = np.transpose(sorted(START_DEAD_END - {scenario.start}))
-    ratios = [walk.ratio[starts] for walk in walks]
+    unmasked = [length_ratios(field.unmasked(), scenario.grid, MOVE_RULE) for field in fields]
+    lengths = [ratio[starts & np.isfinite(ratio)] for ratio in ratios]
     return [
         int(starts.sum()),
-        spread([int(np.isfinite(ratio).sum()) for ratio in ratios]),
-        spread([int(walk.unmasked[starts].sum()) for walk in walks]),
-        spread([int(np.isfinite(walk.ratio[y, x]).sum()) for walk in walks]),
-        spread([mean(ratio) for ratio in ratios], 4),
-        spread([worst(ratio) for ratio in ratios], 4),
+        spread([len(of_seed) for of_seed in lengths]),
+        spread([int(np.isfinite(ratio[starts]).sum()) for ratio in unmasked]),
+        spread([int(np.isfinite(ratio[y, x]).sum()) for ratio in ratios]),
+        spread([mean(of_seed) for of_seed in lengths], 4),
+        spread([worst(of_seed) for of_seed in lengths], 4),
     ]
 
 
-def _draw(settings: Settings, scenario: Scenario, walks: dict[str, list[Starts]]) -> None:
-    figure, panels = plt.subplots(1, len(walks), figsize=(11, 5), layout="constrained")
-    for axes, (profile, of_seeds) in zip(panels, walks.items(), strict=True):
-        solved = np.sum([np.isfinite(walk.ratio) for walk in of_seeds], axis=0)
+def _draw(
+    settings: Settings, scenario: Scenario, ratios: dict[str, list[NDArray[np.float64]]]
+) -> None:
+    figure, panels = plt.subplots(1, len(ratios), figsize=(11, 5), layout="constrained")
+    for axes, (profile, of_seeds) in zip(panels, ratios.items(), strict=True):
+        solved = np.sum([np.isfinite(ratio) for ratio in of_seeds], axis=0)
         free = ~scenario.grid.occupancy
         free[scenario.goal[::-1]] = False
         image = draw_share(axes, np.where(free, solved, np.nan), settings.seeds)

@@ -10,11 +10,17 @@ import numpy as np
 
 from ddqn_planner.experiments.figures import draw_map, draw_new_obstacles, draw_walk, save
 from ddqn_planner.experiments.profiles import MOVE_RULE, PROFILES
-from ddqn_planner.experiments.report import Settings, mean, spread, table, worst
+from ddqn_planner.experiments.report import Settings, mean, optimal_length, spread, table, worst
 from ddqn_planner.experiments.taught import teach
-from ddqn_planner.experiments.trainings import Training, in_parallel, write_csv
+from ddqn_planner.experiments.trainings import (
+    Training,
+    in_parallel,
+    solved,
+    walk_from_starts,
+)
+from ddqn_planner.files import write_csv
 from ddqn_planner.grid import scatter_obstacles
-from ddqn_planner.planning import Planner, shortest_distances, shortest_path
+from ddqn_planner.planning import Planner, shortest_path
 from ddqn_planner.training.environment import Scenario, paper_scenario
 
 TITLE = "Goal iii: noisy maps"
@@ -85,10 +91,9 @@ def name(profile: str) -> str:
 def trainings(settings: Settings) -> list[Training]:
     """Return the trainings of both profiles on the training maps."""
     maps = _maps(settings).training
-    interval = 500 if settings.quick else 1_000
     return [
-        *settings.trainings(name("paper"), settings.shorten(PAPER), maps, interval),
-        *settings.trainings(name("best"), settings.profile("best"), maps, interval),
+        *settings.trainings(name("paper"), settings.shorten(PAPER), maps, 1_000),
+        *settings.trainings(name("best"), settings.profile("best"), maps, 1_000),
     ]
 
 
@@ -102,8 +107,9 @@ def report(settings: Settings) -> str:
     """Write the table and the figure of goal iii, and return its Markdown."""
     maps = _maps(settings)
     in_parallel(teach, taught(settings), settings.out)
+    optimum = [optimal_length(scenario) for scenario in maps.test]
     rows = [
-        [label, *_row(settings.planners(trained, file), maps), *_cost(settings, trained)]
+        [label, *_row(settings.planners(trained, file), maps, optimum), *_cost(settings, trained)]
         for label, trained, file in (
             ("paper", name("paper"), "kept.safetensors"),
             ("paper, last network", name("paper"), "model.safetensors"),
@@ -125,16 +131,20 @@ def report(settings: Settings) -> str:
     )
 
 
-def _row(planners: list[Planner], maps: NoisyMaps) -> list[str]:
-    training = [ratios(planner, maps.training) for planner in planners]
-    test = [ratios(planner, maps.test) for planner in planners]
+def _row(planners: list[Planner], maps: NoisyMaps, optimum: list[float]) -> list[str]:
+    training = [walk_from_starts(planner, maps.training) for planner in planners]
+    test = [walk_from_starts(planner, maps.test) for planner in planners]
+    ratios = [
+        [walk.length / best for walk, best in zip(walks, optimum, strict=True) if walk.cells]
+        for walks, _ in test
+    ]
     return [
-        spread([int(np.isfinite(r).sum()) for r in training]),
-        spread([solved_by_any_move(planner, maps.training) for planner in planners]),
-        spread([int(np.isfinite(r).sum()) for r in test]),
-        spread([solved_by_any_move(planner, maps.test) for planner in planners]),
-        spread([mean(r) for r in test], 4),
-        spread([worst(r) for r in test], 4),
+        spread([solved(walks) for walks, _ in training]),
+        spread([solved(unmasked) for _, unmasked in training]),
+        spread([solved(walks) for walks, _ in test]),
+        spread([solved(unmasked) for _, unmasked in test]),
+        spread([mean(of_seed) for of_seed in ratios], 4),
+        spread([worst(of_seed) for of_seed in ratios], 4),
     ]
 
 
@@ -143,25 +153,6 @@ def _cost(settings: Settings, trained: str) -> list[str]:
     if not ends:
         return ["-", "-"]
     return [spread([end.step for end in ends]), spread([end.seconds for end in ends], 1)]
-
-
-def ratios(planner: Planner, scenarios: list[Scenario]) -> list[float]:
-    """Return the length over the optimum of each scenario; NaN where the walk is trapped."""
-    found = []
-    for scenario in scenarios:
-        plan = planner.plan(scenario.grid, scenario.start, scenario.goal)
-        best = shortest_distances(scenario.grid, scenario.goal, MOVE_RULE)[scenario.start[::-1]]
-        found.append(plan.length / float(best) if plan.cells else float("nan"))
-    return found
-
-
-def solved_by_any_move(planner: Planner, scenarios: list[Scenario]) -> int:
-    """Count the scenarios that the walk by the greatest Q of all moves solves."""
-    fields = (planner.q_field(scenario.grid, scenario.goal) for scenario in scenarios)
-    return sum(
-        bool(field.unmasked().rollout(scenario.start).cells)
-        for field, scenario in zip(fields, scenarios, strict=True)
-    )
 
 
 def _draw(settings: Settings, maps: NoisyMaps) -> None:

@@ -2,16 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ddqn_planner.experiments.profiles import PROFILES
-from ddqn_planner.experiments.trainings import Training, TrainingEvaluation, read_evaluations
-from ddqn_planner.planning import Planner
+from ddqn_planner.experiments.figures import Curve
+from ddqn_planner.experiments.profiles import MOVE_RULE, PROFILES
+from ddqn_planner.experiments.trainings import (
+    Training,
+    TrainingEvaluation,
+    read_evaluations,
+    training_folder,
+)
+from ddqn_planner.planning import Planner, shortest_distances
 from ddqn_planner.training.environment import Scenario
 from ddqn_planner.training.hyper_parameters import HyperParameters
 
@@ -63,13 +69,27 @@ class Settings:
         """Return the planners that the trainings of a name gave, one a seed."""
         return [Planner.load(folder / file) for folder in self.folders(name)]
 
-    def curves(self, name: str) -> Iterator[Path]:
-        """Return the files with the episodes of the trainings of a name, one a seed."""
-        return (folder / "episodes.csv" for folder in self.folders(name))
-
     def folders(self, name: str) -> list[Path]:
         """Return the folders of the trainings of a name, one a seed."""
-        return [self.out / "trainings" / name / f"seed_{seed}" for seed in range(self.seeds)]
+        return [training_folder(self.out, name, seed) for seed in range(self.seeds)]
+
+
+def optimal_length(scenario: Scenario) -> float:
+    """Return the length of the shortest path from start to goal, cells."""
+    distances = shortest_distances(scenario.grid, scenario.goal, MOVE_RULE)
+    return float(distances[scenario.start[::-1]])
+
+
+def evaluation_curve(runs: Sequence[Sequence[TrainingEvaluation]], column: str) -> Curve:
+    """Return a column of the evaluations of each seed."""
+    values = [[getattr(evaluation, column) for evaluation in run] for run in runs]
+    return np.array([e.step for e in runs[0]], dtype=np.float64), np.array(values, dtype=np.float64)
+
+
+def share_curve(runs: Sequence[Sequence[TrainingEvaluation]]) -> Curve:
+    """Return the share of the seeds that are solved from the start."""
+    steps, solved = evaluation_curve(runs, "solved")
+    return steps, solved.mean(axis=0, keepdims=True)
 
 
 def table(header: Sequence[str], rows: Sequence[Sequence[object]]) -> str:

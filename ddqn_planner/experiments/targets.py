@@ -8,10 +8,19 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 from ddqn_planner.experiments import goal_1
-from ddqn_planner.experiments.figures import Curve, draw_curves, save
-from ddqn_planner.experiments.goal_2 import free_starts, planned_field, walk_from_everywhere
-from ddqn_planner.experiments.report import Settings, spread, table
-from ddqn_planner.experiments.trainings import Training, write_csv
+from ddqn_planner.experiments.figures import draw_curves, save
+from ddqn_planner.experiments.goal_2 import free_starts, planned_field
+from ddqn_planner.experiments.profiles import MOVE_RULE
+from ddqn_planner.experiments.report import (
+    Settings,
+    evaluation_curve,
+    share_curve,
+    spread,
+    table,
+)
+from ddqn_planner.experiments.trainings import Training
+from ddqn_planner.files import write_csv
+from ddqn_planner.planning.evaluation import length_ratios
 from ddqn_planner.training.environment import paper_scenario
 
 TITLE = "What the printed target does"
@@ -44,14 +53,14 @@ def report(settings: Settings) -> str:
     rows = []
     for target, words in TARGETS.items():
         runs = settings.evaluations(name(target))
-        fields = (planned_field(p, scenario) for p in settings.planners(name(target)))
-        walks = [walk_from_everywhere(field, scenario) for field in fields]
+        fields = [planned_field(p, scenario) for p in settings.planners(name(target))]
+        ratios = [length_ratios(field, scenario.grid, MOVE_RULE)[starts] for field in fields]
         late = [[e.overestimation for e in run[-max(len(run) // 10, 1) :]] for run in runs]
         rows.append(
             [
                 words,
                 f"{sum(run[-1].solved for run in runs)} of {len(runs)}",
-                spread([int(np.isfinite(walk.ratio[starts]).sum()) for walk in walks]),
+                spread([int(np.isfinite(ratio).sum()) for ratio in ratios]),
                 spread([float(np.mean(values)) for values in late], 2),
                 spread([max(e.overestimation for e in run) for run in runs], 2),
             ]
@@ -63,19 +72,12 @@ def report(settings: Settings) -> str:
 
 def _draw(settings: Settings) -> None:
     figure, (left, right) = plt.subplots(1, 2, figsize=(13, 4), layout="constrained")
-    draw_curves(left, {w: _curve(settings, t, "overestimation") for t, w in TARGETS.items()}, "")
-    left.set(ylabel="mean of max Q - V*", yscale="symlog")
+    runs = {words: settings.evaluations(name(target)) for target, words in TARGETS.items()}
+    estimates = {words: evaluation_curve(r, "overestimation") for words, r in runs.items()}
+    draw_curves(left, estimates, "mean of max Q - V*")
+    left.set_yscale("symlog")
     left.axhline(0, color="black", linewidth=0.8)
     figure.legend(loc="outside lower center", ncols=len(TARGETS))
-    solved = {}
-    for target, words in TARGETS.items():
-        steps, values = _curve(settings, target, "solved")
-        solved[words] = (steps, values.mean(axis=0, keepdims=True))
-    draw_curves(right, solved, "share of seeds solved from the start")
+    shares = {words: share_curve(r) for words, r in runs.items()}
+    draw_curves(right, shares, "share of seeds solved from the start")
     save(figure, settings.out / "targets.png")
-
-
-def _curve(settings: Settings, target: str, column: str) -> Curve:
-    runs = settings.evaluations(name(target))
-    values = np.array([[getattr(e, column) for e in run] for run in runs], dtype=np.float64)
-    return np.array([e.step for e in runs[0]], dtype=np.float64), values

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import csv
-import io
 import multiprocessing
 import os
 import signal
 import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
-from dataclasses import asdict, astuple, dataclass
+from dataclasses import astuple, dataclass, fields
 from pathlib import Path
 from typing import TypeVar
 
@@ -20,10 +19,10 @@ from numpy.typing import NDArray
 from tqdm import tqdm
 
 from ddqn_planner.experiments.profiles import MOVE_RULE
-from ddqn_planner.files import write_atomically
+from ddqn_planner.files import write_csv
 from ddqn_planner.grid import MOVES, legal_moves
 from ddqn_planner.model.propagation import neighbours, propagate
-from ddqn_planner.planning import Planner
+from ddqn_planner.planning import Plan, Planner
 from ddqn_planner.training.environment import GridVectorEnvironment, Scenario
 from ddqn_planner.training.hyper_parameters import HyperParameters
 from ddqn_planner.training.run import TrainingRun
@@ -55,7 +54,12 @@ class Training:
 
     def folder(self, out: Path) -> Path:
         """Return the folder of this training."""
-        return out / "trainings" / self.name / f"seed_{self.seed}"
+        return training_folder(out, self.name, self.seed)
+
+
+def training_folder(out: Path, name: str, seed: int) -> Path:
+    """Return the folder of a training below the output folder."""
+    return out / "trainings" / name / f"seed_{seed}"
 
 
 @dataclass(frozen=True)
@@ -128,13 +132,14 @@ def train(training: Training, out: Path) -> None:
     trainer = run.trainer
     evaluations = [e for e in read_evaluations(folder) if e.step <= trainer.steps]
     seconds = evaluations[-1].seconds if evaluations else 0.0
-    optimum = optimal_value(trainer.environment, training.parameters)
+    optimum = optimal_value(trainer.environment)
     began = time.perf_counter() - seconds
     for _ in run.steps():
         if trainer.steps // training.evaluation_interval > len(evaluations):
             best = max((evaluation.solved for evaluation in evaluations), default=-1)
             evaluations.append(evaluate_training(trainer, optimum, time.perf_counter() - began))
-            _write_evaluations(folder, evaluations)
+            columns = [entry.name for entry in fields(TrainingEvaluation)]
+            write_csv(folder / "evaluations.csv", columns, map(astuple, evaluations))
             if evaluations[-1].solved >= best:
                 trainer.save_model(folder / "kept.safetensors")
     run.close()
@@ -156,11 +161,7 @@ def evaluate_training(
         Since the training began.
     """
     planner = trainer.planner()
-    walks, unmasked = [], []
-    for scenario in trainer.scenarios:
-        field = planner.q_field(scenario.grid, scenario.goal)
-        walks.append(field.rollout(scenario.start))
-        unmasked.append(field.unmasked().rollout(scenario.start))
+    walks, unmasked = walk_from_starts(planner, trainer.scenarios)
     lengths = [walk.length for walk in walks if walk.cells]
     return TrainingEvaluation(
         step=trainer.steps,
@@ -168,10 +169,27 @@ def evaluate_training(
         episodes=trainer.episodes,
         seconds=round(seconds, 3),
         solved=len(lengths),
-        solved_unmasked=sum(bool(walk.cells) for walk in unmasked),
+        solved_unmasked=solved(unmasked),
         length=float(np.mean(lengths)) if lengths else float("nan"),
         overestimation=_overestimation(trainer, planner, optimum),
     )
+
+
+def walk_from_starts(
+    planner: Planner, scenarios: Sequence[Scenario]
+) -> tuple[list[Plan], list[Plan]]:
+    """Walk from the start of each scenario by legal moves, and by the greatest Q of all moves."""
+    fields = [planner.q_field(scenario.grid, scenario.goal) for scenario in scenarios]
+    starts = [scenario.start for scenario in scenarios]
+    return (
+        [field.rollout(start) for field, start in zip(fields, starts, strict=True)],
+        [field.unmasked().rollout(start) for field, start in zip(fields, starts, strict=True)],
+    )
+
+
+def solved(walks: Sequence[Plan]) -> int:
+    """Count the walks that reach the end."""
+    return sum(bool(walk.cells) for walk in walks)
 
 
 def _overestimation(trainer: Trainer, planner: Planner, optimum: NDArray[np.float32]) -> float:
@@ -184,11 +202,9 @@ def _overestimation(trainer: Trainer, planner: Planner, optimum: NDArray[np.floa
     return float((q.max(axis=0) - optimum.reshape(free.shape))[free].mean())
 
 
-def optimal_value(
-    environment: GridVectorEnvironment, parameters: HyperParameters
-) -> NDArray[np.float32]:
+def optimal_value(environment: GridVectorEnvironment) -> NDArray[np.float32]:
     """Return V* of the first scenario, exact by value iteration: (C,) float32."""
-    scenario = environment.scenarios[0]
+    scenario, parameters = environment.scenarios[0], environment.parameters
     legal = legal_moves(scenario.grid.occupancy, MOVE_RULE).reshape(1, len(MOVES), -1)
     return_SAC = propagate(
         legal.astype(np.float32),
@@ -208,25 +224,10 @@ def read_evaluations(folder: Path) -> list[TrainingEvaluation]:
     path = folder / "evaluations.csv"
     if not path.exists():
         return []
-    whole = {"step", "updates", "episodes", "solved", "solved_unmasked"}
+    whole = {entry.name for entry in fields(TrainingEvaluation) if entry.type == "int"}
     with path.open(newline="", encoding="utf-8") as file:
         rows = list(csv.DictReader(file))
     return [
         TrainingEvaluation(**{k: int(v) if k in whole else float(v) for k, v in row.items()})  # type: ignore[arg-type]
         for row in rows
     ]
-
-
-def _write_evaluations(folder: Path, evaluations: Sequence[TrainingEvaluation]) -> None:
-    write_csv(
-        folder / "evaluations.csv",
-        [*asdict(evaluations[0])],
-        [astuple(evaluation) for evaluation in evaluations],
-    )
-
-
-def write_csv(path: Path, columns: Sequence[str], rows: Sequence[Sequence[object]]) -> None:
-    """Write a table; the file is never half written."""
-    text = io.StringIO(newline="")
-    csv.writer(text).writerows([columns, *rows])
-    write_atomically(path, text.getvalue().encode())

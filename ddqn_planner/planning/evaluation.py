@@ -5,10 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ddqn_planner.grid import GridMap, MoveRule
 from ddqn_planner.planning.oracle import shortest_distances
-from ddqn_planner.planning.plan import PlanStatus
 from ddqn_planner.planning.q_field import QField
 
 
@@ -32,8 +32,8 @@ class Evaluation:
     worst_ratio: float
 
 
-def evaluate(field: QField, grid: GridMap, move_rule: MoveRule) -> Evaluation:
-    """Walk from every free cell that a path joins to the field's goal.
+def length_ratios(field: QField, grid: GridMap, move_rule: MoveRule) -> NDArray[np.float64]:
+    """Return the length of the greedy walk from each cell over that of the shortest path.
 
     Parameters
     ----------
@@ -41,18 +41,29 @@ def evaluate(field: QField, grid: GridMap, move_rule: MoveRule) -> Evaluation:
         Of this map, under this rule.
     grid : GridMap
     move_rule : MoveRule
+
+    Returns
+    -------
+    (H, W) float64
+        At least 1; infinite where the walk is trapped, NaN at the goal and where no path leads to
+        it.
     """
     optimum = shortest_distances(grid, field.goal, move_rule)
-    starts = [
-        (x, y) for x, y in grid.free_cells() if np.isfinite(optimum[y, x]) and (x, y) != field.goal
-    ]
-    plans = ((field.rollout(start), optimum[start[1], start[0]]) for start in starts)
-    ratios = [
-        plan.length / float(best) for plan, best in plans if plan.status is PlanStatus.SUCCEEDED
-    ]
+    ratios = np.full(optimum.shape, np.nan)
+    for x, y in grid.free_cells():
+        if np.isfinite(optimum[y, x]) and (x, y) != field.goal:
+            plan = field.rollout((x, y))
+            ratios[y, x] = plan.length / optimum[y, x] if plan.cells else np.inf
+    return ratios
+
+
+def evaluate(field: QField, grid: GridMap, move_rule: MoveRule) -> Evaluation:
+    """Walk from every free cell that a path joins to the field's goal; see `length_ratios`."""
+    ratios = length_ratios(field, grid, move_rule)
+    solved = ratios[np.isfinite(ratios)]
     return Evaluation(
-        starts=len(starts),
-        solved=len(ratios),
-        mean_ratio=float(np.mean(ratios)) if ratios else float("nan"),
-        worst_ratio=max(ratios, default=float("nan")),
+        starts=int(np.count_nonzero(~np.isnan(ratios))),
+        solved=len(solved),
+        mean_ratio=float(solved.mean()) if len(solved) else float("nan"),
+        worst_ratio=float(solved.max()) if len(solved) else float("nan"),
     )

@@ -13,7 +13,6 @@ from ddqn_planner.model import PaperQNetwork
 from ddqn_planner.model.observation import observe
 from ddqn_planner.model.propagation import neighbours, propagate, surroundings
 from ddqn_planner.training.environment import GridVectorEnvironment
-from ddqn_planner.training.hyper_parameters import HyperParameters
 
 
 class Learner(Protocol):
@@ -44,12 +43,12 @@ class PaperLearner:
     Parameters
     ----------
     environment : GridVectorEnvironment
-    parameters : HyperParameters
     """
 
-    def __init__(self, environment: GridVectorEnvironment, parameters: HyperParameters) -> None:
+    def __init__(self, environment: GridVectorEnvironment) -> None:
         height, width = environment.shape
-        self.sizes = {"height": height, "width": width, "filters": parameters.filters}
+        filters = environment.parameters.filters
+        self.sizes = {"height": height, "width": width, "filters": filters}
         self._environment = environment
 
     def states(self, scenario: NDArray[np.int64], cell: NDArray[np.int64]) -> Tensor:
@@ -77,12 +76,11 @@ class PropagationLearner:
     Parameters
     ----------
     environment : GridVectorEnvironment
-    parameters : HyperParameters
     """
 
-    def __init__(self, environment: GridVectorEnvironment, parameters: HyperParameters) -> None:
-        self.sizes = {"filters": parameters.filters}
-        self._environment, self._parameters = environment, parameters
+    def __init__(self, environment: GridVectorEnvironment) -> None:
+        self.sizes = {"filters": environment.parameters.filters}
+        self._environment = environment
         maps = [scenario.grid.occupancy for scenario in environment.scenarios]
         self._surroundings_SC9 = np.stack([surroundings(occupancy) for occupancy in maps])
         self._neighbours_AC = neighbours(environment.shape)
@@ -97,20 +95,21 @@ class PropagationLearner:
     def q(self, network: nn.Module, state_B: Tensor) -> Tensor:
         """Return Q(s, a) = p (r + γ V(s')) + (1 - p) r_o: (B, 8)."""
         p_BA: Tensor = network(state_B[:, :9])
-        collision = self._parameters.obstacle_reward
+        collision = self._environment.parameters.obstacle_reward
         return collision + p_BA * (state_B[:, 9:] - collision)
 
     def copy_target(self, target: nn.Module) -> None:
         """Settle V on every map under the new target network."""
         with torch.inference_mode():
             success_SCA = target(torch.from_numpy(self._surroundings_SC9)).numpy()
+        environment = self._environment
         return_SAC = propagate(
             success_SCA.transpose(0, 2, 1),
-            self._environment.free_reward,
-            self._environment.goal,
+            environment.free_reward,
+            environment.goal,
             self._neighbours_AC,
-            self._parameters.gamma,
-            self._parameters.obstacle_reward,
+            environment.parameters.gamma,
+            environment.parameters.obstacle_reward,
         )
         self._return_SCA = np.ascontiguousarray(return_SAC.transpose(0, 2, 1))
 

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import csv
-import io
 from collections.abc import Iterator, Sequence
 from dataclasses import fields, replace
 from pathlib import Path
 
-from ddqn_planner.files import write_atomically
+from ddqn_planner.files import write_csv
 from ddqn_planner.grid import Cell, MoveRule, path_length
 from ddqn_planner.training.environment import Scenario
 from ddqn_planner.training.hyper_parameters import HyperParameters
@@ -190,9 +189,7 @@ def _cut_rows(path: Path, episodes: int) -> None:
     if path.exists():
         with path.open(newline="", encoding="utf-8") as file:
             rows = [r for r in list(csv.reader(file))[1:] if len(r) == len(COLUMNS)]
-    kept = io.StringIO(newline="")
-    csv.writer(kept).writerows([COLUMNS, *rows[:episodes]])
-    write_atomically(path, kept.getvalue().encode())
+    write_csv(path, COLUMNS, rows[:episodes])
 
 
 def _check_same_training(

@@ -105,7 +105,7 @@ class Trainer:
         self.environment.np_random = np.random.default_rng(environment)
         self._exploration = np.random.default_rng(exploration)
         self._sampling = np.random.default_rng(replay)
-        self._learner = LEARNERS[parameters.network](self.environment, parameters)
+        self._learner = LEARNERS[parameters.network](self.environment)
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(int(weights.generate_state(1)[0]))
             self.network = new_network(parameters.network, self._learner.sizes)

@@ -57,7 +57,7 @@ def test_what_a_job_raises_is_raised(small: Scenario, tmp_path: Path) -> None:
 def test_the_optimal_value_is_what_the_best_policy_earns(small: Scenario, alpha: float) -> None:
     parameters = replace(QUICK, alpha=alpha)
     environment = GridVectorEnvironment([small], MOVE_RULE, parameters)
-    value = optimal_value(environment, parameters)
+    value = optimal_value(environment)
     # Bellman's equation, with what the environment itself does.
     for x, y in small.grid.free_cells():
         if (x, y) == small.goal:
