@@ -23,3 +23,11 @@ def grids_with_free_cell(draw: st.DrawFn) -> tuple[GridMap, tuple[int, int]]:
     x = draw(st.integers(0, occupancy.shape[1] - 1))
     occupancy[y, x] = False
     return GridMap(occupancy), (x, y)
+
+
+@st.composite
+def priced_grids_with_free_cell(draw: st.DrawFn) -> tuple[GridMap, tuple[int, int]]:
+    """A map whose free cells have costs or are unknown, and one of its free cells."""
+    grid, cell = draw(grids_with_free_cell())
+    costs = numpy_st.arrays(np.int8, grid.occupancy.shape, elements=st.integers(-1, 99))
+    return GridMap(grid.occupancy, cost=draw(costs)), cell

@@ -1,6 +1,6 @@
 """What the robot moves on: the grid map, the eight moves, map files and the paper's noise."""
 
-from ddqn_planner.grid.grid_map import Cell, GridMap
+from ddqn_planner.grid.grid_map import MAX_PRICE, OCCUPIED, UNKNOWN, Cell, GridMap
 from ddqn_planner.grid.map_file import MapFile, MapFileError, load_map, read_map_file, save_map
 from ddqn_planner.grid.moves import (
     LENGTHS,
@@ -8,13 +8,18 @@ from ddqn_planner.grid.moves import (
     MoveRule,
     connected_cells,
     legal_moves,
+    move_costs,
+    path_cost,
     path_length,
 )
 from ddqn_planner.grid.noise import scatter_obstacles
 
 __all__ = [
     "LENGTHS",
+    "MAX_PRICE",
     "MOVES",
+    "OCCUPIED",
+    "UNKNOWN",
     "Cell",
     "GridMap",
     "MapFile",
@@ -23,6 +28,8 @@ __all__ = [
     "connected_cells",
     "legal_moves",
     "load_map",
+    "move_costs",
+    "path_cost",
     "path_length",
     "read_map_file",
     "save_map",

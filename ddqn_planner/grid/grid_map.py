@@ -14,6 +14,16 @@ from numpy.typing import ArrayLike, NDArray
 Cell: TypeAlias = tuple[int, int]
 """(x, y): x the column, y the row of ``occupancy[y, x]``."""
 
+OCCUPIED = 100
+"""The value of an occupied cell (``nav_msgs/OccupancyGrid``)."""
+
+UNKNOWN = -1
+"""The value of an unknown cell (``nav_msgs/OccupancyGrid``)."""
+
+MAX_PRICE = 5.0
+"""The price of a cell of value 100, and of an unknown one. NavFn spreads its costs alike, from 50
+for a free cell to 253 for the dearest one, and takes unknown cells, where allowed, as dearest."""
+
 
 @dataclass(frozen=True, eq=False)
 class GridMap:
@@ -29,17 +39,23 @@ class GridMap:
     origin : (float, float, float)
         Pose of the corner of cell (0, 0) in the map frame: x and y in metres, yaw in radians,
         counter-clockwise (the origin of ``nav_msgs/MapMetaData``).
+    cost : (H, W) int8, optional
+        What makes a free cell dear, as a value of ``nav_msgs/OccupancyGrid``: 0..99, or -1 where
+        it is unknown; see `price`. Values of occupied cells do not count. By default every free
+        cell is as good as any other. A read-only copy is kept.
 
     Raises
     ------
     ValueError
         If the occupancy is not a two-dimensional array with at least one cell, or the resolution
-        or the origin is not finite, or the resolution is not above 0.
+        or the origin is not finite, or the resolution is not above 0, or the costs have another
+        shape or a value outside -1..100.
     """
 
     occupancy: NDArray[np.bool_]
     resolution: float = 1.0
     origin: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    cost: NDArray[np.int8] | None = None
 
     def __post_init__(self) -> None:
         occupancy = np.array(self.occupancy, dtype=np.bool_)
@@ -54,6 +70,16 @@ class GridMap:
         object.__setattr__(self, "occupancy", occupancy)
         object.__setattr__(self, "resolution", float(self.resolution))
         object.__setattr__(self, "origin", origin)
+        if self.cost is not None:
+            cost = np.where(occupancy, 0, self.cost) if self.cost.shape == occupancy.shape else None
+            if cost is None or cost.min() < UNKNOWN or cost.max() > OCCUPIED:
+                raise ValueError(
+                    f"cost has shape {self.cost.shape} and values {self.cost.min()}.."
+                    f"{self.cost.max()}; give {occupancy.shape}, -1..100"
+                )
+            cost = cost.astype(np.int8)
+            cost.flags.writeable = False
+            object.__setattr__(self, "cost", cost)
 
     @classmethod
     def from_occupancy_values(
@@ -63,6 +89,7 @@ class GridMap:
         origin: tuple[float, float, float] = (0.0, 0.0, 0.0),
         occupied_threshold: int = 65,
         allow_unknown: bool = False,
+        priced: bool = False,
     ) -> GridMap:
         """Make a grid map of the values of a ``nav_msgs/OccupancyGrid``.
 
@@ -77,11 +104,13 @@ class GridMap:
             ``occupied_thresh``, in percent.
         allow_unknown : bool
             Whether unknown cells are free.
+        priced : bool
+            Whether free cells keep their values as costs; else they are all alike.
         """
         array = np.asarray(values, dtype=np.int16)
         unknown = array < 0
         occupied = (array >= occupied_threshold) | (unknown & (not allow_unknown))
-        return cls(occupied, resolution, origin)
+        return cls(occupied, resolution, origin, np.maximum(array, UNKNOWN) if priced else None)
 
     @property
     def height(self) -> int:
@@ -93,11 +122,21 @@ class GridMap:
         """Number of columns."""
         return int(self.occupancy.shape[1])
 
+    @property
+    def price(self) -> NDArray[np.float32]:
+        """(H, W) float32: what a cell of way costs in each cell, 1 to `MAX_PRICE`."""
+        if self.cost is None:
+            return np.ones(self.occupancy.shape, dtype=np.float32)
+        share = np.where(self.cost == UNKNOWN, 1.0, self.cost / 100)
+        return (1 + (MAX_PRICE - 1) * share).astype(np.float32)
+
     @cached_property
     def fingerprint(self) -> str:
-        """Hexadecimal digest of the size and the occupancy, the same for equal maps anywhere."""
+        """Hexadecimal digest of size, occupancy and costs, the same for equal maps anywhere."""
         digest = hashlib.sha256(f"{self.height}x{self.width}:".encode())
         digest.update(np.packbits(self.occupancy).tobytes())
+        if self.cost is not None:
+            digest.update(self.cost.tobytes())
         return digest.hexdigest()[:16]
 
     def contains(self, cell: Cell) -> bool:

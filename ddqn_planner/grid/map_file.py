@@ -83,18 +83,23 @@ class MapFile:
         object.__setattr__(self, "resolution", checked.resolution)
         object.__setattr__(self, "origin", checked.origin)
 
-    def grid(self, occupied_threshold: int = 65, allow_unknown: bool = False) -> GridMap:
+    def grid(
+        self, occupied_threshold: int = 65, allow_unknown: bool = False, priced: bool = False
+    ) -> GridMap:
         """Return the grid map; the parameters are those of `GridMap.from_occupancy_values`."""
         return GridMap.from_occupancy_values(
-            self.values, self.resolution, self.origin, occupied_threshold, allow_unknown
+            self.values, self.resolution, self.origin, occupied_threshold, allow_unknown, priced
         )
 
 
 def load_map(
-    path: str | Path, occupied_threshold: int = 65, allow_unknown: bool = False
+    path: str | Path,
+    occupied_threshold: int = 65,
+    allow_unknown: bool = False,
+    priced: bool = False,
 ) -> GridMap:
     """Read the grid map of a map file: `read_map_file`, then `MapFile.grid`."""
-    return read_map_file(path).grid(occupied_threshold, allow_unknown)
+    return read_map_file(path).grid(occupied_threshold, allow_unknown, priced)
 
 
 def read_map_file(path: str | Path) -> MapFile:
@@ -154,7 +159,8 @@ def save_map(grid: GridMap | MapFile, path: str | Path) -> None:
     if path.suffix.lower() not in (".yaml", ".yml"):
         raise MapFileError(f"{path}: ends in {path.suffix!r}; give a path that ends in .yaml")
     if isinstance(grid, GridMap):
-        percent = np.where(grid.occupancy, 100, 0).astype(np.int8)
+        cost = 0 if grid.cost is None else grid.cost
+        percent = np.where(grid.occupancy, 100, cost).astype(np.int8)
         grid = MapFile(percent, grid.resolution, grid.origin)
     values = grid.values
     if np.isin(values, (-1, 0, 100)).all():

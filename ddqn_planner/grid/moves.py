@@ -25,11 +25,23 @@ class MoveRule(str, Enum):
     """A diagonal move needs both side cells free (the rule of the MovingAI benchmark)."""
     CORNER_CUTTING = "corner_cutting"
     """A diagonal move needs no more than its target cell free (what the paper's 22.97 implies)."""
+    UNIT = "unit"
+    """As corner cutting, and every move counts 1 (the rule of the MPD data): for comparisons."""
 
     @classmethod
     def _missing_(cls, value: object) -> MoveRule:
         known = ", ".join(rule.value for rule in cls)
         raise ValueError(f"the move rule {value!r} is unknown; give one of {known}")
+
+    @property
+    def cuts_corners(self) -> bool:
+        """Whether a diagonal move may pass an occupied side cell."""
+        return self is not MoveRule.ROBOT_SAFE
+
+    @property
+    def lengths(self) -> NDArray[np.float64]:
+        """(8,) float64: what each action counts, in cells."""
+        return np.ones(len(MOVES)) if self is MoveRule.UNIT else LENGTHS
 
 
 def legal_moves(occupancy: NDArray[np.bool_], move_rule: MoveRule) -> NDArray[np.bool_]:
@@ -57,9 +69,34 @@ def legal_moves(occupancy: NDArray[np.bool_], move_rule: MoveRule) -> NDArray[np
     legal = np.empty((len(MOVES), height, width), dtype=np.bool_)
     for action, (dx, dy) in enumerate(MOVES.tolist()):
         legal[action] = free_at(0, 0) & free_at(dx, dy)
-        if move_rule is MoveRule.ROBOT_SAFE and dx and dy:
+        if dx and dy and not move_rule.cuts_corners:
             legal[action] &= free_at(dx, 0) & free_at(0, dy)
     return legal
+
+
+def move_costs(price: NDArray[np.float32], move_rule: MoveRule) -> NDArray[np.float64]:
+    """Return what each move costs: its length times the mean price of the two cells that it joins.
+
+    So a path costs the same in both directions.
+
+    Parameters
+    ----------
+    price : (H, W) float32
+        See `GridMap.price`.
+    move_rule : MoveRule
+
+    Returns
+    -------
+    (8, H, W) float64
+        ``[a, y, x]`` for action ``a`` from (x, y); without meaning where the move is illegal.
+    """
+    height, width = price.shape
+    padded = np.pad(price, 1, mode="edge").astype(np.float64)
+    onward = [
+        padded[1 + dy : 1 + dy + height, 1 + dx : 1 + dx + width] for dx, dy in MOVES.tolist()
+    ]
+    costs: NDArray[np.float64] = move_rule.lengths[:, None, None] * (price + np.stack(onward)) / 2
+    return costs
 
 
 def connected_cells(
@@ -81,7 +118,7 @@ def connected_cells(
         True at each free cell from which a path of legal moves leads to `cell`, itself included.
     """
     # Where a diagonal move needs both side cells free, two straight moves do the same.
-    diagonals = 2 if move_rule is MoveRule.CORNER_CUTTING else 1
+    diagonals = 2 if move_rule.cuts_corners else 1
     structure = scipy.ndimage.generate_binary_structure(2, diagonals)
     labels, _ = scipy.ndimage.label(~occupancy, structure)
     connected: NDArray[np.bool_] = labels == labels[cell[1], cell[0]]
@@ -98,3 +135,24 @@ def path_length(cells: Sequence[tuple[int, int]]) -> float:
     """
     steps = np.diff(np.asarray(cells, dtype=np.float64).reshape(-1, 2), axis=0)
     return float(np.hypot(steps[:, 0], steps[:, 1]).sum())
+
+
+def path_cost(
+    cells: Sequence[tuple[int, int]], price: NDArray[np.float32], move_rule: MoveRule
+) -> float:
+    """Return what a path costs: the sum of its moves' costs, see `move_costs`.
+
+    Parameters
+    ----------
+    cells : sequence of (x, y)
+        Each cell is a neighbour of the one before it.
+    price : (H, W) float32
+        See `GridMap.price`.
+    move_rule : MoveRule
+    """
+    x, y = np.asarray(cells, dtype=np.int64).reshape(-1, 2).T
+    lengths = np.hypot(np.diff(x), np.diff(y))
+    if move_rule is MoveRule.UNIT:
+        lengths = np.ones_like(lengths)
+    prices = price[y, x].astype(np.float64)
+    return float((lengths * (prices[1:] + prices[:-1]) / 2).sum())

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -64,7 +65,7 @@ def scatter_obstacles(
             x, y = near_path[index]
             occupancy[y, x] = True
         if connected_cells(occupancy, goal, move_rule)[start[1], start[0]]:
-            return GridMap(occupancy, grid.resolution, grid.origin), rejected
+            return replace(grid, occupancy=occupancy), rejected
     raise ValueError(
         f"none of {MAX_TRIES} draws of new obstacles left a path from {start} to {goal}"
     )

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ddqn_planner.grid import GridMap, MoveRule
+from ddqn_planner.grid import GridMap, MoveRule, path_cost
 from ddqn_planner.planning.oracle import shortest_distances
 from ddqn_planner.planning.q_field import QField
 
@@ -35,6 +35,8 @@ class Evaluation:
 def length_ratios(field: QField, grid: GridMap, move_rule: MoveRule) -> NDArray[np.float64]:
     """Return the length of the greedy walk from each cell over that of the shortest path.
 
+    On a map with costs these are the costs of the walk and of the cheapest path.
+
     Parameters
     ----------
     field : QField
@@ -49,11 +51,12 @@ def length_ratios(field: QField, grid: GridMap, move_rule: MoveRule) -> NDArray[
         it.
     """
     optimum = shortest_distances(grid, field.goal, move_rule)
-    ratios = np.full(optimum.shape, np.nan)
+    ratios, price = np.full(optimum.shape, np.nan), grid.price
     for x, y in grid.free_cells():
         if np.isfinite(optimum[y, x]) and (x, y) != field.goal:
             plan = field.rollout((x, y))
-            ratios[y, x] = plan.length / optimum[y, x] if plan.cells else np.inf
+            cost = path_cost(plan.cells, price, move_rule) if plan.cells else np.inf
+            ratios[y, x] = cost / optimum[y, x]
     return ratios
 
 

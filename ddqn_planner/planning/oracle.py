@@ -6,11 +6,13 @@ import numpy as np
 import scipy.sparse
 from numpy.typing import NDArray
 
-from ddqn_planner.grid import LENGTHS, MOVES, Cell, GridMap, MoveRule, legal_moves
+from ddqn_planner.grid import MOVES, Cell, GridMap, MoveRule, legal_moves, move_costs
 
 
 def shortest_distances(grid: GridMap, goal: Cell, move_rule: MoveRule) -> NDArray[np.float64]:
     """Return the length of the shortest path from every cell to the goal.
+
+    On a map with costs it is the least sum of length times price, see `move_costs`.
 
     Parameters
     ----------
@@ -51,4 +53,5 @@ def _graph(grid: GridMap, move_rule: MoveRule) -> scipy.sparse.csr_array:
     cell = y * grid.width + x
     next_cell = cell + MOVES[action, 1] * grid.width + MOVES[action, 0]
     size = grid.height * grid.width
-    return scipy.sparse.csr_array((LENGTHS[action], (cell, next_cell)), shape=(size, size))
+    cost = move_costs(grid.price, move_rule)[action, y, x]
+    return scipy.sparse.csr_array((cost, (cell, next_cell)), shape=(size, size))

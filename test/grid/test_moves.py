@@ -6,9 +6,20 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from strategies import grids_with_free_cell, occupancies
+from strategies import grids_with_free_cell, occupancies, priced_grids_with_free_cell
 
-from ddqn_planner.grid import LENGTHS, MOVES, GridMap, MoveRule, connected_cells, legal_moves
+from ddqn_planner.grid import (
+    LENGTHS,
+    MAX_PRICE,
+    MOVES,
+    GridMap,
+    MoveRule,
+    connected_cells,
+    legal_moves,
+    move_costs,
+    path_cost,
+    path_length,
+)
 from ddqn_planner.planning import shortest_distances
 
 RULES = st.sampled_from(list(MoveRule))
@@ -41,3 +52,26 @@ def test_connected_cells_are_those_at_finite_distance(
     grid, cell = grid_and_cell
     expected = np.isfinite(shortest_distances(grid, cell, rule))
     np.testing.assert_array_equal(connected_cells(grid.occupancy, cell, rule), expected)
+
+
+@given(priced_grids_with_free_cell(), RULES)
+def test_a_legal_move_costs_its_length_times_the_mean_price_and_the_same_in_return(
+    grid_and_cell: tuple[GridMap, tuple[int, int]], rule: MoveRule
+) -> None:
+    grid, _ = grid_and_cell
+    assert ((grid.price >= 1) & (grid.price <= MAX_PRICE)).all()
+    cost = move_costs(grid.price, rule)
+    for action, y, x in np.argwhere(legal_moves(grid.occupancy, rule)).tolist():
+        next_x, next_y = np.array([x, y]) + MOVES[action]
+        mean_price = (grid.price[y, x] + grid.price[next_y, next_x]) / 2
+        assert cost[action, y, x] == pytest.approx(rule.lengths[action] * mean_price)
+        assert cost[(action + 4) % 8, next_y, next_x] == cost[action, y, x]
+        move = [(x, y), (next_x, next_y)]
+        assert path_cost(move, grid.price, rule) == pytest.approx(cost[action, y, x])
+
+
+def test_without_costs_a_path_costs_its_length_or_under_the_unit_rule_its_moves() -> None:
+    path, price = [(0, 0), (1, 1), (2, 1), (3, 2)], GridMap(np.zeros((3, 4))).price
+    assert path_cost(path, price, MoveRule.ROBOT_SAFE) == pytest.approx(path_length(path))
+    assert path_cost(path, price, MoveRule.UNIT) == 3
+    assert path_cost(path[:1], price, MoveRule.UNIT) == 0

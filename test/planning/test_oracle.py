@@ -4,32 +4,32 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from strategies import grids_with_free_cell
+from strategies import priced_grids_with_free_cell
 
-from ddqn_planner.grid import LENGTHS, MOVES, GridMap, MoveRule, legal_moves, path_length
+from ddqn_planner.grid import MOVES, GridMap, MoveRule, legal_moves, move_costs, path_cost
 from ddqn_planner.planning import shortest_distances, shortest_path
 
 RULES = st.sampled_from(list(MoveRule))
 
 
-@given(grids_with_free_cell(), RULES)
+@given(priced_grids_with_free_cell(), RULES)
 def test_distances_meet_bellmans_equation(
     grid_and_goal: tuple[GridMap, tuple[int, int]], rule: MoveRule
 ) -> None:
     grid, goal = grid_and_goal
     distance = shortest_distances(grid, goal, rule)
-    legal = legal_moves(grid.occupancy, rule)
+    legal, cost = legal_moves(grid.occupancy, rule), move_costs(grid.price, rule)
     assert distance[goal[1], goal[0]] == 0
     assert np.isinf(distance[grid.occupancy]).all()
     for x, y in set(grid.free_cells()) - {goal}:
         by_move = [
-            LENGTHS[a] + distance[y + MOVES[a, 1], x + MOVES[a, 0]]
+            cost[a, y, x] + distance[y + MOVES[a, 1], x + MOVES[a, 0]]
             for a in np.flatnonzero(legal[:, y, x])
         ]
         assert distance[y, x] == pytest.approx(min(by_move, default=np.inf))
 
 
-@given(grids_with_free_cell(), RULES, st.data())
+@given(priced_grids_with_free_cell(), RULES, st.data())
 def test_the_path_is_as_long_as_the_distance_says(
     grid_and_goal: tuple[GridMap, tuple[int, int]], rule: MoveRule, data: st.DataObject
 ) -> None:
@@ -41,4 +41,4 @@ def test_the_path_is_as_long_as_the_distance_says(
         assert path == []
     else:
         assert (path[0], path[-1]) == (start, goal)
-        assert path_length(path) == pytest.approx(distance)
+        assert path_cost(path, grid.price, rule) == pytest.approx(distance)
