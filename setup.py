@@ -25,6 +25,7 @@ setup(
     python_requires=">=3.10",
     install_requires=[
         "gymnasium>=1.1",
+        "numba>=0.58",
         "numpy>=1.26",
         "Pillow>=10.0",
         "PyYAML>=6.0",

@@ -60,7 +60,7 @@ def measure_field(scenario: Scenario) -> bool:
     times = []
     for _ in range(FIELDS):
         began = time.perf_counter()
-        planner.network.q_values(scenario.grid.occupancy, scenario.goal)
+        planner.network.q_values(scenario.grid, scenario.goal, planner.metadata.move_rule)
         times.append(1e3 * (time.perf_counter() - began))
     return report("Q field of the 20x20 map, median", statistics.median(times), "ms", 20)
 

@@ -10,9 +10,10 @@ from ddqn_planner.model.model_file import (
     save_model,
 )
 from ddqn_planner.model.networks import PaperQNetwork, QNetwork
-from ddqn_planner.model.propagation import PropagationQNetwork
+from ddqn_planner.model.propagation import AnyMapQNetwork, PropagationQNetwork
 
 __all__ = [
+    "AnyMapQNetwork",
     "ModelFileError",
     "ModelMetadata",
     "PaperQNetwork",

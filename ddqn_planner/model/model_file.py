@@ -16,7 +16,7 @@ from torch import Tensor
 from ddqn_planner.files import write_atomically
 from ddqn_planner.grid import MoveRule
 from ddqn_planner.model.networks import PaperQNetwork
-from ddqn_planner.model.propagation import PropagationQNetwork
+from ddqn_planner.model.propagation import AnyMapQNetwork, PropagationQNetwork
 from ddqn_planner.resources import PACKAGE, find_resource
 
 METADATA_KEY = "ddqn_planner"
@@ -25,9 +25,13 @@ MAX_SIZE = 4096
 """Largest network size (height, width, filters) that a model file may ask for."""
 
 
-AnyQNetwork = PaperQNetwork | PropagationQNetwork
+AnyQNetwork = PaperQNetwork | PropagationQNetwork | AnyMapQNetwork
 
-SIZES: Final = {"paper": ("height", "width", "filters"), "propagation": ("filters",)}
+SIZES: Final = {
+    "paper": ("height", "width", "filters"),
+    "propagation": ("filters",),
+    "any_map": ("filters",),
+}
 """The arguments of each kind of network."""
 
 
@@ -42,7 +46,7 @@ class ModelMetadata:
     Parameters
     ----------
     network : str
-        Kind of network: ``"paper"`` or ``"propagation"``.
+        Kind of network: ``"paper"``, ``"propagation"`` or ``"any_map"``.
     sizes : dict
         The arguments of the network's class, see `SIZES`.
     move_rule : MoveRule
@@ -144,6 +148,8 @@ def load_model(name: str | Path) -> tuple[AnyQNetwork, ModelMetadata]:
 
 def new_network(kind: str, sizes: dict[str, int]) -> AnyQNetwork:
     """Return a network with random weights; see `ModelMetadata` for the parameters."""
+    if kind == "any_map":
+        return AnyMapQNetwork(**sizes)
     if kind == "propagation":
         return PropagationQNetwork(**sizes)
     return PaperQNetwork(**sizes)

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn import functional
 
-from ddqn_planner.grid import MOVES, Cell
+from ddqn_planner.grid import MOVES, Cell, GridMap, MoveRule
 from ddqn_planner.model.observation import observation_background, observe
 
 
@@ -21,7 +21,7 @@ class QNetwork(Protocol):
         """Say whether the network can plan on maps of shape (H, W)."""
         ...
 
-    def q_values(self, occupancy: NDArray[np.bool_], goal: Cell) -> NDArray[np.float32]:
+    def q_values(self, grid: GridMap, goal: Cell, move_rule: MoveRule) -> NDArray[np.float32]:
         """Return Q(s, a) of every cell toward one goal: (8, H, W) float32."""
         ...
 
@@ -76,21 +76,23 @@ class PaperQNetwork(nn.Module):
         return shape == self.shape
 
     @torch.inference_mode()
-    def q_values(self, occupancy: NDArray[np.bool_], goal: Cell) -> NDArray[np.float32]:
+    def q_values(self, grid: GridMap, goal: Cell, move_rule: MoveRule) -> NDArray[np.float32]:
         """Evaluate the observation of a robot in each cell, in one batch.
 
         Parameters
         ----------
-        occupancy : (H, W) bool
-            Of the network's shape.
+        grid : GridMap
+            Of the network's shape. Its costs do not count.
         goal : (x, y)
+        move_rule : MoveRule
+            Does not count: the network knows the rule of its training.
 
         Returns
         -------
         (8, H, W) float32
         """
-        cells = np.arange(occupancy.size)
-        background = observation_background(occupancy, goal)
+        cells = np.arange(grid.occupancy.size)
+        background = observation_background(grid.occupancy, goal)
         q_BA = self(torch.from_numpy(observe(background, cells, self.shape)))
         q_AHW: NDArray[np.float32] = q_BA.T.reshape(len(MOVES), *self.shape).numpy()
         return q_AHW

@@ -10,7 +10,13 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from ddqn_planner.grid import LENGTHS, MOVES, Cell
+from ddqn_planner.grid import MOVES, OCCUPIED, UNKNOWN, Cell, GridMap, MoveRule
+from ddqn_planner.model.front import spread
+
+FEATURES = 28
+"""Length of what `AnyMapQNetwork` sees of a cell."""
+BATCH = 2**16
+"""Surroundings that a network looks at in one go: all of a large map's would need gigabytes."""
 
 SETTLED = 1e-3
 """Values count as settled when none changes more than this in one repetition."""
@@ -51,14 +57,8 @@ class PropagationQNetwork(nn.Module):
         return True
 
     @torch.inference_mode()
-    def success(self, occupancy: NDArray[np.bool_]) -> NDArray[np.float32]:
-        """Return p(s, a) of each cell of a map: (8, C) float32."""
-        p_CA = self(torch.from_numpy(surroundings(occupancy)))
-        p_AC: NDArray[np.float32] = p_CA.T.contiguous().numpy()
-        return p_AC
-
-    def q_values(self, occupancy: NDArray[np.bool_], goal: Cell) -> NDArray[np.float32]:
-        """Return minus the length of the best path through each action, in cells.
+    def q_values(self, grid: GridMap, goal: Cell, move_rule: MoveRule) -> NDArray[np.float32]:
+        """Return minus the length of the shortest path through each action, in cells.
 
         Along a whole path the progress and detour terms of the paper's reward (section 4.2) add up
         to what its two ends make of them; what is left to choose is its length. So without
@@ -67,36 +67,156 @@ class PropagationQNetwork(nn.Module):
 
         Parameters
         ----------
-        occupancy : (H, W) bool
+        grid : GridMap
+            Its costs do not count.
         goal : (x, y)
+        move_rule : MoveRule
+            For the lengths of the moves; which of them succeed is learned.
 
         Returns
         -------
         (8, H, W) float32
-            Less than any path's, where no path is known.
+            -inf where no path is known.
         """
-        height, width = occupancy.shape
-        possible = (self.success(occupancy) > 0.5).astype(np.float32)
-        length = np.repeat(-LENGTHS[:, None], height * width, axis=1).astype(np.float32)
-        collision = np.float32(-2.0 * height * width)
-        (return_AC,) = propagate(
-            possible[None],
-            length[None],
-            np.array([goal[1] * width + goal[0]]),
-            neighbours((height, width)),
-            gamma=1.0,
-            collision=float(collision),
-        )
-        q_AC: NDArray[np.float32] = np.where(possible > 0, return_AC, collision)
-        return q_AC.reshape(len(MOVES), height, width)
+        kind, values_K9 = kinds_of_surroundings(grid.occupancy, None)
+        p_KA = self(torch.from_numpy((values_K9 == OCCUPIED).astype(np.float32))).numpy()
+        cost_KA = np.where(p_KA > 0.5, move_rule.lengths, np.inf).astype(np.float32)
+        return spread(kind, cost_KA, goal)
 
 
-def surroundings(occupancy: NDArray[np.bool_]) -> NDArray[np.float32]:
-    """Return the 3x3 cells around each cell, 1 where occupied or outside: (C, 9) float32."""
-    padded = np.pad(occupancy, 1, constant_values=True)
+class AnyMapQNetwork(nn.Module):
+    """A propagation network for both move rules and for cells of different prices.
+
+    As for `PropagationQNetwork`, Q(s, a) = p(s, a) (r(s, a) + γ V(s')) + (1 - p(s, a)) r_o. But it
+    learns the reward of a move too, r = -length times price(s, a), and sees the costs of the 3x3
+    cells around the robot beside the obstacles, which of them are unknown, and the move rule. That
+    a move costs its length at least is structure.
+
+    Parameters
+    ----------
+    filters : int
+        Number of convolution filters, and of units of the layer after it.
+    """
+
+    def __init__(self, filters: int) -> None:
+        super().__init__()
+        self.convolution = nn.Linear(FEATURES, filters)
+        self.hidden = nn.Linear(filters, filters)
+        self.moves = nn.Linear(filters, len(MOVES))
+        self.prices = nn.Linear(FEATURES, len(MOVES))
+        # A price below 1 has no gradient: it must begin above.
+        nn.init.ones_(self.prices.bias)
+
+    def forward(self, feature_BF: Tensor) -> tuple[Tensor, Tensor]:
+        """Return p(s, a) in 0..1 and the price of each move, at least 1: (B, 8) both.
+
+        Parameters
+        ----------
+        feature_BF : (B, 28) float32
+            See `features`.
+        """
+        hidden_BF = self.hidden(self.convolution(feature_BF).relu()).relu()
+        return self.moves(hidden_BF).sigmoid(), 1 + self.prices(feature_BF).relu()
+
+    def supports(self, shape: tuple[int, int]) -> bool:
+        """Say that the network can plan on maps of any shape (H, W)."""
+        return True
+
+    @torch.inference_mode()
+    def q_values(self, grid: GridMap, goal: Cell, move_rule: MoveRule) -> NDArray[np.float32]:
+        """Return minus the cost of the best path through each action: length times price.
+
+        There is no discount, and a move counts as possible where p > 1/2: so the greatest Q is the
+        cheapest path at any distance.
+
+        Parameters
+        ----------
+        grid : GridMap
+        goal : (x, y)
+        move_rule : MoveRule
+
+        Returns
+        -------
+        (8, H, W) float32
+            -inf where no path is known.
+        """
+        kind, values_K9 = kinds_of_surroundings(grid.occupancy, grid.cost)
+        cost_KA = np.empty((len(values_K9), len(MOVES)), dtype=np.float32)
+        for some in range(0, len(values_K9), BATCH):
+            these = slice(some, some + BATCH)
+            p_BA, price_BA = self(torch.from_numpy(features(values_K9[these], move_rule)))
+            cost_BA = move_rule.lengths * price_BA.numpy()
+            cost_KA[these] = np.where(p_BA.numpy() > 0.5, cost_BA, np.inf)
+        return spread(kind, cost_KA, goal)
+
+
+def surroundings(occupancy: NDArray[np.bool_], cost: NDArray[np.int8] | None) -> NDArray[np.int8]:
+    """Return the values of the 3x3 cells around each cell: (C, 9) int8.
+
+    Parameters
+    ----------
+    occupancy : (H, W) bool
+    cost : (H, W) int8, optional
+        -1..99, see `GridMap`; 0 by default.
+
+    Returns
+    -------
+    (C, 9) int8
+        The cost of a free cell, 100 of one that is occupied or outside the map.
+    """
+    values = np.where(occupancy, OCCUPIED, np.int8(0) if cost is None else cost).astype(np.int8)
+    padded = np.pad(values, 1, constant_values=OCCUPIED)
     windows = np.lib.stride_tricks.sliding_window_view(padded, (3, 3))
-    cells: NDArray[np.float32] = windows.reshape(-1, 9).astype(np.float32)
-    return cells
+    values_C9: NDArray[np.int8] = windows.reshape(-1, 9)
+    return values_C9
+
+
+def kinds_of_surroundings(
+    occupancy: NDArray[np.bool_], cost: NDArray[np.int8] | None
+) -> tuple[NDArray[np.int32], NDArray[np.int8]]:
+    """Sort the cells by their surroundings, so that a network need look at equal ones once.
+
+    Parameters
+    ----------
+    occupancy, cost
+        See `surroundings`.
+
+    Returns
+    -------
+    (H, W) int32
+        The kind of each cell, 0..K-1.
+    (K, 9) int8
+        The surroundings of each kind. Without costs these are all 512 that there can be.
+    """
+    seen_C9 = surroundings(occupancy, cost)
+    if cost is None:
+        kind = (seen_C9 == OCCUPIED) @ 2 ** np.arange(9, dtype=np.int32)
+        every_K9 = np.arange(2**9)[:, None] >> np.arange(9) & 1
+        return kind.reshape(occupancy.shape), (OCCUPIED * every_K9).astype(np.int8)
+    code = (seen_C9 - np.int8(UNKNOWN)) @ 128 ** np.arange(9, dtype=np.int64)
+    _, first, kind = np.unique(code, return_index=True, return_inverse=True)
+    return kind.reshape(occupancy.shape).astype(np.int32), seen_C9[first]
+
+
+def features(values_B9: NDArray[np.int8], move_rule: MoveRule) -> NDArray[np.float32]:
+    """Return what `AnyMapQNetwork` sees: (B, 28) float32.
+
+    Parameters
+    ----------
+    values_B9 : (B, 9) int8
+        See `surroundings`.
+    move_rule : MoveRule
+
+    Returns
+    -------
+    (B, 28) float32
+        9 cells each: whether it is occupied, its cost as 0..1, whether it is unknown; and whether
+        corners may be cut.
+    """
+    occupied, unknown = values_B9 == OCCUPIED, values_B9 == UNKNOWN
+    cost_B9 = np.where(occupied | unknown, 0, values_B9) / 100
+    rule_B1 = np.full((len(values_B9), 1), move_rule.cuts_corners)
+    return np.concatenate([occupied, cost_B9, unknown, rule_B1], axis=1, dtype=np.float32)
 
 
 def neighbours(shape: tuple[int, int]) -> NDArray[np.int64]:

@@ -207,9 +207,10 @@ class TrainerNode(Node):
                 "the start or the goal is unknown; publish initialpose and goal_pose, or set "
                 "map_file to a map with both"
             )
+        start, goal = (self._cell(which, self._poses[which]) for which in ("start", "goal"))
         return TrainingRun(
             self._value("output_folder"),
-            [Scenario(self._grid, *(self._cell(w, self._poses[w]) for w in ("start", "goal")))],
+            [Scenario(self._grid, start, goal)],
             MoveRule(self._value("move_rule")),
             HyperParameters(**{e.name: self._value(e.name) for e in fields(HyperParameters)}),
             self._value("seed"),

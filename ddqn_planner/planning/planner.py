@@ -11,7 +11,8 @@ from ddqn_planner.planning.plan import Plan, PlanStatus
 from ddqn_planner.planning.q_field import QField
 
 MAX_FIELDS = 8
-"""How many Q fields a planner keeps, the last ones used."""
+MAX_FIELD_BYTES = 2**29
+"""How many Q fields a planner keeps, the last ones used; one is kept whatever its size."""
 
 
 class Planner:
@@ -66,10 +67,13 @@ class Planner:
         rule = move_rule or self.metadata.move_rule
         key = (grid.fingerprint, goal, rule)
         if key not in self._fields:
-            q = self.network.q_values(grid.occupancy, goal)
+            q = self.network.q_values(grid, goal, rule)
             self._fields[key] = QField(goal, q, legal_moves(grid.occupancy, rule))
         self._fields.move_to_end(key)
-        while len(self._fields) > MAX_FIELDS:
+        while len(self._fields) > 1 and (
+            len(self._fields) > MAX_FIELDS
+            or sum(field.q.nbytes for field in self._fields.values()) > MAX_FIELD_BYTES
+        ):
             self._fields.popitem(last=False)
         return self._fields[key]
 
@@ -100,11 +104,16 @@ class Planner:
             return Plan(PlanStatus.GOAL_OCCUPIED)
         if not self.network.supports((grid.height, grid.width)):
             return Plan(PlanStatus.MAP_SIZE_UNSUPPORTED)
-        plan = self.q_field(grid, goal, move_rule).rollout(start)
         rule = move_rule or self.metadata.move_rule
-        if (
-            plan.status is PlanStatus.WALK_TRAPPED
-            and not connected_cells(grid.occupancy, goal, rule)[start[1], start[0]]
-        ):
+        known = (grid.fingerprint, goal, rule) in self._fields
+        # Where no path leads, there is no need to compute a field to say so.
+        if not known and not _joined(grid, start, goal, rule):
+            return Plan(PlanStatus.NO_PATH)
+        plan = self.q_field(grid, goal, rule).rollout(start)
+        if plan.status is PlanStatus.WALK_TRAPPED and not _joined(grid, start, goal, rule):
             return Plan(PlanStatus.NO_PATH)
         return plan
+
+
+def _joined(grid: GridMap, start: Cell, goal: Cell, move_rule: MoveRule) -> bool:
+    return bool(connected_cells(grid.occupancy, goal, move_rule)[start[1], start[0]])

@@ -23,7 +23,7 @@ class QField:
     goal : (x, y)
         A free cell.
     q : (8, H, W) float32
-        What the network says of each action in each cell.
+        What the network says of each action in each cell; -inf where it knows no way on.
     legal : (8, H, W) bool
         The legal moves: the robot knows its map, and takes no other.
     """
@@ -34,19 +34,21 @@ class QField:
 
     @cached_property
     def value(self) -> NDArray[np.float32]:
-        """(H, W) float32: the greatest Q of a legal move; -inf where there is none.
+        """(H, W) float32: the greatest Q of a legal move; -inf where none is known to lead on.
 
         Nothing is better than to be at the goal: it has the greatest value of the map.
         """
-        value: NDArray[np.float32] = np.where(self.legal, self.q, -np.inf).max(axis=0)
+        legal_q = np.where(self.legal, self.q, np.float32(-np.inf))
+        value: NDArray[np.float32] = legal_q.max(axis=0)
         value[self.goal[1], self.goal[0]] = value.max()
         return value
 
     @cached_property
     def policy(self) -> NDArray[np.int8]:
-        """(H, W) int8: the legal action of the greatest Q in each cell; -1 where there is none."""
-        greedy = np.where(self.legal, self.q, -np.inf).argmax(axis=0)
-        return np.where(self.legal.any(axis=0), greedy, -1).astype(np.int8)
+        """(H, W) int8: the legal action of the greatest Q in each cell; -1 where it is -inf."""
+        legal_q = np.where(self.legal, self.q, np.float32(-np.inf))
+        known = np.isfinite(legal_q).any(axis=0)
+        return np.where(known, legal_q.argmax(axis=0), -1).astype(np.int8)
 
     def unmasked(self) -> QField:
         """Return the field of a robot that does not know its map.

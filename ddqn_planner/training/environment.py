@@ -7,8 +7,9 @@ Action space
 Observation space
     ``Box(H, W) float32``: the matrix of `ddqn_planner.model.observation`.
 Rewards
-    ``goal_reward`` for reaching the end, ``obstacle_reward`` for an illegal move, which leaves the
-    robot where it is, and `free_cell_reward` for any other move.
+    ``obstacle_reward`` for an illegal move, which leaves the robot where it is. For any other move
+    the paper's: ``goal_reward`` for reaching the end, else `free_cell_reward`; or, if the parameter
+    ``reward`` is ``path_cost``, `path_cost_reward`.
 Episode end
     Terminated at the end or at an illegal move, truncated after ``max_episode_steps``.
 """
@@ -31,7 +32,7 @@ from ddqn_planner.model.propagation import neighbours
 from ddqn_planner.resources import find_resource
 from ddqn_planner.training.hyper_parameters import HyperParameters
 from ddqn_planner.training.initialisation import initial_cells
-from ddqn_planner.training.reward import free_cell_reward
+from ddqn_planner.training.reward import free_cell_reward, path_cost_reward
 
 
 @dataclass(frozen=True)
@@ -43,6 +44,8 @@ class Scenario:
     grid : GridMap
     start, goal : (x, y)
         Two different free cells.
+    move_rule : MoveRule, optional
+        The rule of its environment by default.
 
     Raises
     ------
@@ -53,6 +56,7 @@ class Scenario:
     grid: GridMap
     start: Cell
     goal: Cell
+    move_rule: MoveRule | None = None
 
     def __post_init__(self) -> None:
         for name, cell in (("start", self.start), ("goal", self.goal)):
@@ -60,6 +64,20 @@ class Scenario:
                 raise ValueError(f"the {name} {cell} is not a free cell of the map; give another")
         if self.start == self.goal:
             raise ValueError(f"start and goal are both {self.start}; give two different cells")
+
+
+def move_reward(
+    scenario: Scenario, move_rule: MoveRule, parameters: HyperParameters
+) -> NDArray[np.float32]:
+    """Return the reward of each move that is legal: (8, H, W) float32."""
+    grid = scenario.grid
+    if parameters.reward == "path_cost":
+        return path_cost_reward(grid, move_rule)
+    shape = (grid.height, grid.width)
+    reward = free_cell_reward(shape, scenario.start, scenario.goal, parameters)
+    to_goal = neighbours(shape) == scenario.goal[1] * grid.width + scenario.goal[0]
+    reward[to_goal.reshape(reward.shape)] = parameters.goal_reward
+    return reward
 
 
 class Moved(NamedTuple):
@@ -126,13 +144,18 @@ class GridVectorEnvironment(VectorEnv[Observations, NDArray[np.int64], Any]):
         self.background = np.stack(
             [observation_background(s.grid.occupancy, s.goal) for s in scenarios]
         )
+        self.move_rules = tuple(s.move_rule or move_rule for s in scenarios)
         self._legal = np.stack(
-            [legal_moves(s.grid.occupancy, move_rule).reshape(len(MOVES), -1) for s in scenarios]
+            [
+                legal_moves(s.grid.occupancy, rule).reshape(len(MOVES), -1)
+                for s, rule in zip(scenarios, self.move_rules, strict=True)
+            ]
         )
-        rewards = [free_cell_reward(self.shape, s.start, s.goal, parameters) for s in scenarios]
-        self.free_reward = np.stack([reward.reshape(len(MOVES), -1) for reward in rewards])
-        self.free_reward[neighbours(self.shape) == self.goal[:, None, None]] = (
-            parameters.goal_reward
+        self.free_reward = np.stack(
+            [
+                move_reward(s, rule, parameters).reshape(len(MOVES), -1)
+                for s, rule in zip(scenarios, self.move_rules, strict=True)
+            ]
         )
         self._reward = np.where(
             self._legal, self.free_reward, np.float32(parameters.obstacle_reward)
@@ -218,10 +241,9 @@ class GridEnvironment(gymnasium.Env[Observations, np.int64]):
         self.action_space = gymnasium.spaces.Discrete(len(MOVES))
         self.observation_space = observation_space(self.shape)
         self._background = observation_background(grid.occupancy, self.scenario.goal)
-        self._legal = legal_moves(grid.occupancy, move_rule)
-        self._reward = free_cell_reward(
-            self.shape, self.scenario.start, self.scenario.goal, self.parameters
-        )
+        rule = self.scenario.move_rule or move_rule
+        self._legal = legal_moves(grid.occupancy, rule)
+        self._reward = move_reward(self.scenario, rule, self.parameters)
         self.cell: Cell = self.scenario.start
         self.steps = 0
 
@@ -248,9 +270,9 @@ class GridEnvironment(gymnasium.Env[Observations, np.int64]):
         if not self._legal[action, y, x]:
             return self._observation(), self.parameters.obstacle_reward, True, False, {}
         self.cell = (x + int(MOVES[action, 0]), y + int(MOVES[action, 1]))
-        if self.cell == self.scenario.goal:
-            return self._observation(), self.parameters.goal_reward, True, False, {}
-        return self._observation(), float(self._reward[action, y, x]), False, out_of_steps, {}
+        reached = self.cell == self.scenario.goal
+        reward = float(self._reward[action, y, x])
+        return self._observation(), reward, reached, out_of_steps and not reached, {}
 
     def _observation(self) -> Observations:
         number = np.array([self.cell[1] * self.shape[1] + self.cell[0]])

@@ -28,10 +28,11 @@ class HyperParameters:
         outgrows the replay buffer.
     """
 
-    network: str = _choice("paper", "ours: the Q-network, see model/networks.py", "propagation")
+    network: str = _choice("paper", "ours: the Q-network, see model/", "propagation", "any_map")
     target: str = _choice(
         "double_dqn", "ours: the target, see training/double_dqn.py", "dqn", "printed"
     )
+    reward: str = _choice("paper", "ours: the reward, see training/reward.py", "path_cost")
     learning_rate: float = _parameter(0.01, "Table 1: Adam's learning rate", 1e-6, 1.0)
     batch_size: int = _parameter(32, "Table 1: transitions in a mini-batch", 1, 4096)
     gamma: float = _parameter(0.95, "Table 1: discount γ", 0.0, 1.0)
@@ -63,6 +64,8 @@ class HyperParameters:
             low, high = entry.metadata["range"]
             if not low <= value <= high:
                 raise ValueError(f"{entry.name} is {value}; it must lie in {low} to {high}")
+        if self.network == "any_map" and self.reward != "path_cost":
+            raise ValueError("the network any_map learns path costs; give the reward path_cost")
         if self.environments > self.replay_capacity:
             raise ValueError(
                 f"environments is {self.environments}; it must be at most replay_capacity, "

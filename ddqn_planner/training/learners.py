@@ -9,9 +9,16 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
+from ddqn_planner.grid import LENGTHS, OCCUPIED
 from ddqn_planner.model import PaperQNetwork
 from ddqn_planner.model.observation import observe
-from ddqn_planner.model.propagation import neighbours, propagate, surroundings
+from ddqn_planner.model.propagation import (
+    FEATURES,
+    features,
+    neighbours,
+    propagate,
+    surroundings,
+)
 from ddqn_planner.training.environment import GridVectorEnvironment
 
 
@@ -81,8 +88,10 @@ class PropagationLearner:
     def __init__(self, environment: GridVectorEnvironment) -> None:
         self.sizes = {"filters": environment.parameters.filters}
         self._environment = environment
-        maps = [scenario.grid.occupancy for scenario in environment.scenarios]
-        self._surroundings_SC9 = np.stack([surroundings(occupancy) for occupancy in maps])
+        seen_SC9 = [
+            surroundings(scenario.grid.occupancy, None) for scenario in environment.scenarios
+        ]
+        self._surroundings_SC9 = (np.stack(seen_SC9) == OCCUPIED).astype(np.float32)
         self._neighbours_AC = neighbours(environment.shape)
         self._return_SCA = np.zeros((*self._surroundings_SC9.shape[:2], 8), dtype=np.float32)
 
@@ -114,8 +123,67 @@ class PropagationLearner:
         self._return_SCA = np.ascontiguousarray(return_SAC.transpose(0, 2, 1))
 
 
-LEARNERS: Final[dict[str, type[PaperLearner] | type[PropagationLearner]]] = {
+class AnyMapLearner:
+    """The network for any map sees its features of the robot's cell, and the values beyond it.
+
+    As for `PropagationLearner`, but the network answers with the reward of each move as well. What
+    lies beyond is γ V(s').
+
+    Parameters
+    ----------
+    environment : GridVectorEnvironment
+    """
+
+    def __init__(self, environment: GridVectorEnvironment) -> None:
+        self.sizes = {"filters": environment.parameters.filters}
+        self._environment = environment
+        self._features_SCF = np.stack(
+            [
+                features(surroundings(s.grid.occupancy, s.grid.cost), rule)
+                for s, rule in zip(environment.scenarios, environment.move_rules, strict=True)
+            ]
+        )
+        self._lengths = torch.from_numpy(LENGTHS.astype(np.float32))
+        self._neighbours_AC = neighbours(environment.shape)
+        self._beyond_SCA = np.zeros((*self._features_SCF.shape[:2], 8), dtype=np.float32)
+
+    def states(self, scenario: NDArray[np.int64], cell: NDArray[np.int64]) -> Tensor:
+        """Return the features and γ V(s') of each action: (B, 28 + 8)."""
+        at = (scenario, cell)
+        seen_BF = np.concatenate([self._features_SCF[at], self._beyond_SCA[at]], axis=1)
+        return torch.from_numpy(seen_BF)
+
+    def q(self, network: nn.Module, state_B: Tensor) -> Tensor:
+        """Return Q(s, a) = p (r + γ V(s')) + (1 - p) r_o with r = -length times price: (B, 8)."""
+        p_BA, price_BA = network(state_B[:, :FEATURES])
+        collision = self._environment.parameters.obstacle_reward
+        q_BA: Tensor = collision + p_BA * (
+            state_B[:, FEATURES:] - self._lengths * price_BA - collision
+        )
+        return q_BA
+
+    def copy_target(self, target: nn.Module) -> None:
+        """Settle V on every map under the new target network."""
+        with torch.inference_mode():
+            p_SCA, price_SCA = target(torch.from_numpy(self._features_SCF))
+        parameters = self._environment.parameters
+        reward_SAC = -(self._lengths * price_SCA).numpy().transpose(0, 2, 1)
+        return_SAC = propagate(
+            p_SCA.numpy().transpose(0, 2, 1),
+            reward_SAC,
+            self._environment.goal,
+            self._neighbours_AC,
+            parameters.gamma,
+            parameters.obstacle_reward,
+        )
+        self._beyond_SCA = np.ascontiguousarray((return_SAC - reward_SAC).transpose(0, 2, 1))
+
+
+Learners = type[PaperLearner] | type[PropagationLearner] | type[AnyMapLearner]
+
+LEARNERS: Final[dict[str, Learners]] = {
     "paper": PaperLearner,
     "propagation": PropagationLearner,
+    "any_map": AnyMapLearner,
 }
 """By the hyper-parameter ``network``."""

@@ -1,11 +1,11 @@
-"""Improvement 2 of the paper (section 4.2): the reward of a free cell, from A*'s f = g + h."""
+"""Improvement 2 of the paper (section 4.2), the reward of a free cell, and path costs instead."""
 
 from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ddqn_planner.grid import LENGTHS, MOVES, Cell
+from ddqn_planner.grid import LENGTHS, MOVES, Cell, GridMap, MoveRule, move_costs
 from ddqn_planner.training.hyper_parameters import HyperParameters
 
 
@@ -44,3 +44,23 @@ def free_cell_reward(
     progress = -change_of_distance(goal)
     detour = change_of_distance(start) - LENGTHS[:, None, None]
     return (parameters.alpha * progress + parameters.beta * detour).astype(np.float32)
+
+
+def path_cost_reward(grid: GridMap, move_rule: MoveRule) -> NDArray[np.float32]:
+    """Reward each move by minus what it costs, so that the best return is the cheapest path.
+
+    Unlike the paper's reward it names neither start nor end, and so it is a matter of the cells
+    around the robot alone. The move onto the end costs as any other and earns nothing.
+
+    Parameters
+    ----------
+    grid : GridMap
+    move_rule : MoveRule
+
+    Returns
+    -------
+    (8, H, W) float32
+        See `ddqn_planner.grid.move_costs`.
+    """
+    reward: NDArray[np.float32] = -move_costs(grid.price, move_rule).astype(np.float32)
+    return reward

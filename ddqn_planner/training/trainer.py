@@ -22,6 +22,7 @@ from ddqn_planner.files import write_atomically
 from ddqn_planner.grid import MOVES, Cell, MoveRule
 from ddqn_planner.model import ModelMetadata, new_network, package_version, save_model
 from ddqn_planner.planning import Planner
+from ddqn_planner.training import ranks
 from ddqn_planner.training.double_dqn import double_dqn_loss
 from ddqn_planner.training.environment import GridVectorEnvironment, Scenario
 from ddqn_planner.training.hyper_parameters import HyperParameters
@@ -100,7 +101,9 @@ class Trainer:
         self.updates = 0
         self.episodes = 0
 
-        weights, environment, exploration, replay = np.random.SeedSequence(seed).spawn(4)
+        # The processes of a training share their first weights, and draw all else by themselves.
+        seeds = np.random.SeedSequence(seed).spawn(1 + 3 * ranks.world_size())
+        weights, (environment, exploration, replay) = seeds[0], seeds[1 + 3 * ranks.rank() :][:3]
         self.environment = GridVectorEnvironment(self.scenarios, move_rule, parameters)
         self.environment.np_random = np.random.default_rng(environment)
         self._exploration = np.random.default_rng(exploration)
@@ -193,7 +196,7 @@ class Trainer:
             torch.from_numpy(batch.discount),
         )
         # Not backward(): nothing is accumulated, and so nothing must be zeroed.
-        gradients = torch.autograd.grad(loss, self._weights)
+        gradients = ranks.average(torch.autograd.grad(loss, self._weights))
         for weight, gradient in zip(self._weights, gradients, strict=True):
             weight.grad = gradient
         self._optimiser.step()

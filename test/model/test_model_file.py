@@ -10,13 +10,13 @@ import pytest
 import safetensors.torch
 import torch
 
-from ddqn_planner.grid import MoveRule
+from ddqn_planner.grid import GridMap, MoveRule
 from ddqn_planner.model import (
     ModelFileError,
     ModelMetadata,
     PaperQNetwork,
-    PropagationQNetwork,
     load_model,
+    new_network,
     save_model,
 )
 
@@ -47,8 +47,8 @@ def model_path(tmp_path: Path, network: PaperQNetwork) -> Path:
 def test_a_saved_model_comes_back_the_same(model_path: Path, network: PaperQNetwork) -> None:
     loaded, metadata = load_model(model_path)
     assert metadata == METADATA
-    empty = np.zeros((4, 5), dtype=bool)
-    np.testing.assert_array_equal(loaded.q_values(empty, (1, 1)), network.q_values(empty, (1, 1)))
+    request = GridMap(np.zeros((4, 5))), (1, 1), MoveRule.ROBOT_SAFE
+    np.testing.assert_array_equal(loaded.q_values(*request), network.q_values(*request))
 
 
 @pytest.mark.parametrize("fraction", [0.0, 0.1, 0.5, 0.9, 0.999])
@@ -100,16 +100,15 @@ def test_wrong_metadata_is_refused_by_name(
         load_model(path)
 
 
-def test_a_propagation_network_comes_back_the_same(tmp_path: Path) -> None:
-    path, network = tmp_path / "model.safetensors", PropagationQNetwork(filters=3)
-    description = replace(METADATA, network="propagation", sizes={"filters": 3})
+@pytest.mark.parametrize("kind", ["propagation", "any_map"])
+def test_a_network_for_any_size_comes_back_the_same(tmp_path: Path, kind: str) -> None:
+    path, network = tmp_path / "model.safetensors", new_network(kind, {"filters": 3})
+    description = replace(METADATA, network=kind, sizes={"filters": 3})
     save_model(path, network, description)
     loaded, read = load_model(path)
     assert read == description
-    occupancy = np.zeros((3, 6), dtype=bool)
-    np.testing.assert_array_equal(
-        loaded.q_values(occupancy, (5, 2)), network.q_values(occupancy, (5, 2))
-    )
+    request = GridMap(np.zeros((3, 6))), (5, 2), MoveRule.CORNER_CUTTING
+    np.testing.assert_array_equal(loaded.q_values(*request), network.q_values(*request))
 
 
 def test_safetensors_of_another_program_are_refused(tmp_path: Path) -> None:

@@ -5,7 +5,7 @@ import torch
 from hypothesis import given
 from strategies import grids_with_free_cell
 
-from ddqn_planner.grid import Cell, GridMap
+from ddqn_planner.grid import Cell, GridMap, MoveRule
 from ddqn_planner.model import PaperQNetwork
 from ddqn_planner.model.observation import (
     FREE,
@@ -39,7 +39,7 @@ def test_the_q_field_holds_the_networks_answer_in_each_cell(
 ) -> None:
     grid, goal = grid_and_goal
     network = PaperQNetwork(grid.height, grid.width, filters=3)
-    q = network.q_values(grid.occupancy, goal)
+    q = network.q_values(grid, goal, MoveRule.ROBOT_SAFE)
     assert q.shape == (8, grid.height, grid.width)
     assert q.dtype == np.float32
     background = observation_background(grid.occupancy, goal)
@@ -53,7 +53,7 @@ def test_the_q_field_holds_the_networks_answer_in_each_cell(
 
 def test_a_robot_in_the_last_row_and_column_is_seen() -> None:
     network = PaperQNetwork(20, 20, filters=4)
-    q = network.q_values(np.zeros((20, 20), dtype=bool), (3, 3))
+    q = network.q_values(GridMap(np.zeros((20, 20))), (3, 3), MoveRule.ROBOT_SAFE)
     assert not np.allclose(q[:, 19, 19], q[:, 19, 18])
     assert not np.allclose(q[:, 19, 19], q[:, 18, 19])
 

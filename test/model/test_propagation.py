@@ -4,11 +4,17 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from strategies import grids_with_free_cell
+from strategies import grids_with_free_cell, priced_grids_with_free_cell
 
-from ddqn_planner.grid import LENGTHS, MOVES, Cell, GridMap, MoveRule, legal_moves
-from ddqn_planner.model import PropagationQNetwork
-from ddqn_planner.model.propagation import neighbours, propagate, surroundings
+from ddqn_planner.grid import MOVES, OCCUPIED, Cell, GridMap, MoveRule, legal_moves
+from ddqn_planner.model import AnyMapQNetwork, PropagationQNetwork
+from ddqn_planner.model.propagation import (
+    features,
+    kinds_of_surroundings,
+    neighbours,
+    propagate,
+    surroundings,
+)
 from ddqn_planner.planning import shortest_distances
 
 
@@ -18,7 +24,7 @@ def test_without_discount_a_perfect_success_spreads_the_length_of_the_shortest_p
 ) -> None:
     grid, goal = grid_and_goal
     legal = legal_moves(grid.occupancy, rule).reshape(1, 8, -1).astype(np.float32)
-    length = np.repeat(-LENGTHS[:, None], grid.occupancy.size, axis=1).astype(np.float32)
+    length = np.repeat(-rule.lengths[:, None], grid.occupancy.size, axis=1).astype(np.float32)
     goal_number = np.array([goal[1] * grid.width + goal[0]])
     (return_AC,) = propagate(
         legal,
@@ -59,26 +65,61 @@ def test_the_surroundings_are_the_3x3_cells_and_outside_is_occupied(
     grid_and_goal: tuple[GridMap, Cell],
 ) -> None:
     grid, _ = grid_and_goal
-    seen = surroundings(grid.occupancy).reshape(grid.height, grid.width, 3, 3)
+    seen = surroundings(grid.occupancy, None).reshape(grid.height, grid.width, 3, 3)
     next_cells = neighbours(grid.occupancy.shape).reshape(8, grid.height, grid.width)
     for y in range(grid.height):
         for x in range(grid.width):
             for action, (dx, dy) in enumerate(MOVES.tolist()):
                 neighbour = (x + dx, y + dy)
-                assert seen[y, x, 1 + dy, 1 + dx] == (not grid.is_free(neighbour))
+                assert seen[y, x, 1 + dy, 1 + dx] == (0 if grid.is_free(neighbour) else OCCUPIED)
                 inside = neighbour[1] * grid.width + neighbour[0]
                 expected = inside if grid.contains(neighbour) else grid.occupancy.size
                 assert next_cells[action, y, x] == expected
 
 
-def test_a_field_has_one_q_an_action_and_cell_of_a_map_of_any_shape() -> None:
-    network = PropagationQNetwork(filters=4)
+@given(priced_grids_with_free_cell())
+def test_cells_of_one_kind_have_the_same_surroundings(
+    grid_and_goal: tuple[GridMap, Cell],
+) -> None:
+    grid, _ = grid_and_goal
+    for cost in (None, grid.cost):
+        kind, values = kinds_of_surroundings(grid.occupancy, cost)
+        seen = surroundings(grid.occupancy, cost)
+        np.testing.assert_array_equal(values[kind.ravel()], seen)
+        assert len(np.unique(values, axis=0)) == len(values)
+
+
+def test_the_features_tell_obstacles_costs_unknown_cells_and_the_rule_apart() -> None:
+    values = np.array([[-1, 0, 50, 99, 100, 0, 0, 0, 0]], dtype=np.int8)
+    (seen,) = features(values, MoveRule.ROBOT_SAFE)
+    assert seen.dtype == np.float32
+    assert seen[:9].tolist() == [0, 0, 0, 0, 1, 0, 0, 0, 0]
+    assert seen[9:18] == pytest.approx([0, 0, 0.5, 0.99, 0, 0, 0, 0, 0])
+    assert seen[18:27].tolist() == [1, 0, 0, 0, 0, 0, 0, 0, 0]
+    assert seen[27] == 0
+    assert features(values, MoveRule.CORNER_CUTTING)[0, 27] == 1
+
+
+def test_many_kinds_of_surroundings_are_asked_in_batches(monkeypatch: pytest.MonkeyPatch) -> None:
+    cost = np.random.default_rng(0).integers(0, 99, (8, 9)).astype(np.int8)
+    grid, network = GridMap(np.zeros((8, 9)), cost=cost), AnyMapQNetwork(filters=4)
+    at_once = network.q_values(grid, (3, 3), MoveRule.ROBOT_SAFE)
+    monkeypatch.setattr("ddqn_planner.model.propagation.BATCH", 7)
+    in_batches = network.q_values(grid, (3, 3), MoveRule.ROBOT_SAFE)
+    np.testing.assert_allclose(in_batches, at_once, rtol=1e-5)
+
+
+@pytest.mark.parametrize("network_class", [PropagationQNetwork, AnyMapQNetwork])
+def test_a_field_has_one_q_an_action_and_cell_of_a_map_of_any_shape(
+    network_class: type[PropagationQNetwork] | type[AnyMapQNetwork],
+) -> None:
+    network = network_class(filters=4)
     for shape in ((1, 1), (3, 7), (9, 2)):
-        q = network.q_values(np.zeros(shape, dtype=bool), (0, 0))
+        q = network.q_values(GridMap(np.zeros(shape)), (0, 0), MoveRule.ROBOT_SAFE)
         assert network.supports(shape)
         assert q.shape == (8, *shape)
         assert q.dtype == np.float32
-        assert np.isfinite(q).all()
+        assert not np.isnan(q).any()
 
 
 def test_values_that_never_settle_end_all_the_same() -> None:

@@ -1,0 +1,78 @@
+"""The training of the model for any map: small maps of random cells, both rules, all prices."""
+
+from __future__ import annotations
+
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ddqn_planner.grid import UNKNOWN, GridMap, MoveRule
+from ddqn_planner.grid.generators import random_costs, random_requests
+from ddqn_planner.training.environment import Scenario
+from ddqn_planner.training.hyper_parameters import HyperParameters
+
+ANY_MAP: Final = HyperParameters(
+    network="any_map",
+    reward="path_cost",
+    obstacle_reward=-50.0,
+    goal_reward=0.0,
+    p_r=1.0,
+    filters=64,
+    learning_rate=0.003,
+    batch_size=512,
+    environments=64,
+    update_interval=64,
+    target_interval=100,
+    learning_starts=10_000,
+    replay_capacity=100_000,
+    epsilon_end=0.5,
+    epsilon_steps=100_000,
+    max_episode_steps=50,
+    steps=1_500_000,
+)
+"""What differs from the paper: every episode begins at a random free cell; a collision costs more
+than any walk on these maps; and the robot never stops to try what it holds for impossible."""
+
+MAPS: Final = 512
+SIDE: Final = 10
+"""Number of maps, and their side in cells."""
+
+RULES: Final = (MoveRule.ROBOT_SAFE, MoveRule.CORNER_CUTTING)
+
+
+def random_scenarios(seed: int, maps: int = MAPS) -> list[Scenario]:
+    """Draw maps to train on, the same for the same seed.
+
+    10 to 60 % of the cells are occupied, each by itself: of all the kinds of
+    `ddqn_planner.grid.generators` this is the only one that training sees, and the greater fills
+    are there for surroundings that are rare else. Half of the maps have each rule. A quarter has
+    no costs, a quarter random ones, a quarter the same cost everywhere, a quarter unknown cells.
+
+    Parameters
+    ----------
+    seed : int
+    maps : int
+
+    Returns
+    -------
+    list of Scenario
+        Start and goal are joined by a path.
+    """
+    random = np.random.default_rng(seed)
+    return [_random_scenario(RULES[number % 2], random) for number in range(maps)]
+
+
+def _random_scenario(rule: MoveRule, random: np.random.Generator) -> Scenario:
+    occupancy = random.random((SIDE, SIDE)) < random.uniform(0.1, 0.6)
+    constant = np.full((SIDE, SIDE), random.integers(100), dtype=np.int8)
+    unknown = np.where(random.random((SIDE, SIDE)) < 0.3, np.int8(UNKNOWN), np.int8(0))
+    costs: tuple[NDArray[np.int8] | None, ...] = (
+        None,
+        random_costs(occupancy, random),
+        constant,
+        unknown,
+    )
+    grid = GridMap(occupancy, cost=costs[random.integers(len(costs))])
+    ((start, goal),) = random_requests(occupancy, rule, 1, random)
+    return Scenario(grid, start, goal, rule)
