@@ -1,4 +1,4 @@
-# make setup | demo | test | lint | format | types | bench | model
+# make setup | demo | test | lint | format | types | bench | model | model-dilemma
 PYTHON ?= python3
 TORCH ?= torch==2.13.0
 VENV := .venv
@@ -12,7 +12,7 @@ else
 EXTRAS := experiments,figures,ros,tensorboard,test
 endif
 
-.PHONY: setup demo test lint format types bench model
+.PHONY: setup demo test lint format types bench model model-dilemma
 .DEFAULT_GOAL := help
 
 .PHONY: help
@@ -49,7 +49,11 @@ bench: setup
 	$(BIN)/pip install --quiet --editable ".[$(EXTRAS),bench]"
 	$(BIN)/python scripts/benchmark.py
 
-# Trains the shipped model from nothing.
+# These train the shipped models from nothing: the one for any map, and the paper's network.
 model: setup
+	$(BIN)/ddqn-planner train-any-map --seed 0 --out runs/any_map
+	cp runs/any_map/model.safetensors models/any_map.safetensors
+
+model-dilemma: setup
 	$(BIN)/ddqn-planner train dilemma --learning-rate 0.001 --seed 0 --out runs/dilemma
 	cp runs/dilemma/model.safetensors models/dilemma.safetensors

@@ -16,11 +16,23 @@ import torch
 from tqdm import tqdm
 
 from ddqn_planner.experiments import EXPERIMENTS
+from ddqn_planner.experiments.benchmark_maps import (
+    PRICES,
+    RequestSettings,
+    describe_files,
+    find_files,
+    generated_maps,
+    read_maps,
+)
+from ddqn_planner.experiments.generalisation import Walk, markdown, measure, summarise, write_report
 from ddqn_planner.grid import Cell, MapFile, MoveRule, read_map_file
+from ddqn_planner.grid.generators import KINDS
 from ddqn_planner.planning import Plan, Planner, PlanStatus, shortest_distances
 from ddqn_planner.planning.evaluation import evaluate
 from ddqn_planner.planning.picture import PictureError, draw_text, save_picture
 from ddqn_planner.resources import find_map
+from ddqn_planner.training import ranks
+from ddqn_planner.training.any_map import ANY_MAP, MAPS, random_scenarios
 from ddqn_planner.training.environment import Scenario
 from ddqn_planner.training.hyper_parameters import HyperParameters
 from ddqn_planner.training.run import TrainingRun
@@ -46,7 +58,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="ddqn-planner", description=__doc__)
-    commands = parser.add_subparsers(required=True, metavar="plan|train|reproduce")
+    commands = parser.add_subparsers(
+        required=True, metavar="plan|train|train-any-map|reproduce|evaluate"
+    )
 
     plan = commands.add_parser("plan", help="plan a path on a map file")
     _add_map_arguments(plan)
@@ -67,16 +81,22 @@ def _parser() -> argparse.ArgumentParser:
     train.add_argument(
         "--move-rule", choices=MOVE_RULES, default="corner_cutting", help="of the robot"
     )
-    train.add_argument("--seed", type=int, default=0, help="of the training")
-    for entry in fields(HyperParameters):
-        train.add_argument(
-            f"--{entry.name.replace('_', '-')}",
-            type=type(entry.default),
-            default=entry.default,
-            choices=entry.metadata.get("choices"),
-            help=entry.metadata["source"],
-        )
+    _add_training_arguments(train, HyperParameters())
     train.set_defaults(command=_train)
+
+    train_any_map = commands.add_parser(
+        "train-any-map",
+        help="train a model for any map on random maps",
+        description="Trains into a folder, on small random maps. The same command again goes on "
+        "where it stopped. Under torchrun all processes train one model, each on maps of its own.",
+        formatter_class=argparse.ArgumentDefaultsHelpFormatter,
+    )
+    train_any_map.add_argument(
+        "--out", type=Path, default=Path("runs/any_map"), help="folder of the run"
+    )
+    train_any_map.add_argument("--maps", type=int, default=MAPS, metavar="N", help="to train on")
+    _add_training_arguments(train_any_map, ANY_MAP)
+    train_any_map.set_defaults(command=_train_any_map)
 
     reproduce = commands.add_parser(
         "reproduce",
@@ -94,6 +114,34 @@ def _parser() -> argparse.ArgumentParser:
         "--quick", action="store_true", help="run it too briefly to learn, into the folder quick"
     )
     reproduce.set_defaults(command=_reproduce)
+
+    evaluate = commands.add_parser(
+        "evaluate",
+        help="measure a model on maps that it never saw",
+        description="Walks from random starts to random goals, and compares with the exact "
+        "optimum and with scipy's Dijkstra: on generated maps, or on those of benchmarks.",
+        formatter_class=argparse.ArgumentDefaultsHelpFormatter,
+    )
+    evaluate.add_argument("--model", default="any_map", help="name or file")
+    evaluate.add_argument(
+        "--move-rule", choices=MOVE_RULES, default="robot_safe", help="of the robot"
+    )
+    evaluate.add_argument(
+        "--data",
+        type=Path,
+        metavar="FOLDER",
+        help="of MovingAI .map and .scen, MPD .npz, ROS .yaml, in place of generated maps",
+    )
+    evaluate.add_argument("--kinds", nargs="+", choices=KINDS, default=[*KINDS], help="generated")
+    evaluate.add_argument(
+        "--sizes", nargs="+", type=int, default=[32, 64, 128, 256], help="sides, cells"
+    )
+    evaluate.add_argument("--maps", type=int, default=3, metavar="N", help="of a kind and size")
+    evaluate.add_argument("--requests", type=int, default=200, metavar="N", help="of a map")
+    evaluate.add_argument("--priced", choices=PRICES, default="none", help="costs of free cells")
+    evaluate.add_argument("--seed", type=int, default=0, help="of maps and requests")
+    evaluate.add_argument("--out", type=Path, metavar="FILE", help=".md or .csv, for the tables")
+    evaluate.set_defaults(command=_evaluate)
     return parser
 
 
@@ -107,6 +155,23 @@ def _add_map_arguments(parser: argparse.ArgumentParser) -> None:
             metavar=("X", "Y"),
             help="by default the map file's",
         )
+
+
+def _add_training_arguments(parser: argparse.ArgumentParser, parameters: HyperParameters) -> None:
+    parser.add_argument("--seed", type=int, default=0, help="of the training")
+    for entry in fields(HyperParameters):
+        parser.add_argument(
+            f"--{entry.name.replace('_', '-')}",
+            type=type(entry.default),
+            default=getattr(parameters, entry.name),
+            choices=entry.metadata.get("choices"),
+            help=entry.metadata["source"],
+        )
+
+
+def _hyper_parameters(options: argparse.Namespace) -> HyperParameters:
+    values = {entry.name: getattr(options, entry.name) for entry in fields(HyperParameters)}
+    return HyperParameters(**values)
 
 
 def _read_map(options: argparse.Namespace) -> tuple[MapFile, Cell, Cell]:
@@ -165,8 +230,7 @@ def _as_dictionary(
 def _train(options: argparse.Namespace) -> int:
     map_file, start, goal = _read_map(options)
     scenario = Scenario(map_file.grid(), start, goal)
-    values = {entry.name: getattr(options, entry.name) for entry in fields(HyperParameters)}
-    parameters = HyperParameters(**values)
+    parameters = _hyper_parameters(options)
     run = TrainingRun(options.out, [scenario], options.move_rule, parameters, options.seed)
     try:
         _train_with_progress(run)
@@ -183,6 +247,35 @@ def _train(options: argparse.Namespace) -> int:
         + (f"{plan.length:.2f} cells" if plan.cells else "it is trapped")
     )
     print(f"saved {run.model_path}")
+    return 0
+
+
+def _train_any_map(options: argparse.Namespace) -> int:
+    ranks.join()
+    try:
+        rank, processes = ranks.rank(), ranks.world_size()
+        if options.maps < processes:
+            raise ValueError(f"--maps is {options.maps}; give at least one a process: {processes}")
+        scenarios = random_scenarios(options.seed, options.maps)[rank::processes]
+        folder = options.out if rank == 0 else options.out / f"rank_{rank}"
+        parameters = _hyper_parameters(options)
+        run = TrainingRun(folder, scenarios, MoveRule.ROBOT_SAFE, parameters, options.seed)
+        try:
+            if ranks.greatest(run.trainer.steps) != -ranks.greatest(-run.trainer.steps):
+                raise ValueError(
+                    f"the processes were saved at different steps ({folder} at "
+                    f"{run.trainer.steps}); train into another folder"
+                )
+            _train_with_progress(run)
+        finally:
+            run.close()
+        if run.save_error:
+            raise OSError(run.save_error)
+        if rank == 0:
+            print(f"{run.trainer.steps} steps, {run.trainer.episodes} episodes")
+            print(f"saved {run.model_path}")
+    finally:
+        ranks.leave()
     return 0
 
 
@@ -209,14 +302,53 @@ def _reproduce(options: argparse.Namespace) -> int:
     return 0
 
 
+def _evaluate(options: argparse.Namespace) -> int:
+    if options.maps < 1:
+        raise ValueError(f"--maps is {options.maps}; give at least 1")
+    if options.out and options.out.suffix.lower() not in (".csv", ".md"):
+        raise ValueError(f"--out is {options.out}; give a file that ends in .csv or .md")
+    settings = RequestSettings(options.move_rule, options.requests, options.priced, options.seed)
+    planner = Planner.load(options.model)
+    maps = generated_maps(options.kinds, options.sizes, options.maps, settings)
+    if options.data:
+        files = find_files(options.data)
+        print(f"found in {options.data}: {describe_files(files)}", file=sys.stderr)
+        maps = read_maps(files, settings)
+    walks: list[Walk] = []
+    interrupted = False
+    try:
+        for walk in measure(planner, tqdm(maps, unit="map", disable=None), options.move_rule):
+            walks.append(walk)
+    except KeyboardInterrupt:
+        interrupted = True
+        print("interrupted; what follows is of the maps so far", file=sys.stderr)
+    if walks:
+        summaries = summarise(walks)
+        metadata = planner.metadata
+        text = markdown(
+            summaries,
+            walks,
+            f"Model {options.model} ({metadata.network}, {metadata.steps:,} steps, seed "
+            f"{metadata.seed}), move rule {options.move_rule.value}, costs {options.priced}, "
+            f"requests of seed {options.seed}.",
+        )
+        print(text, end="")
+        if options.out:
+            write_report(options.out, summaries, text)
+    elif not interrupted:
+        raise ValueError(f"{options.data}: none of its files has a request; see above")
+    return 130 if interrupted else 0
+
+
 def _train_with_progress(run: TrainingRun) -> None:
     trainer = run.trainer
     interrupted = threading.Event()
     # An exception could strike in the middle of a step; a flag is looked at between two.
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: interrupted.set())
-    # disable=None: no bar where the output is no terminal.
-    with tqdm(total=trainer.parameters.steps, initial=trainer.steps, disable=None) as bar:
+    # None: no bar where the output is no terminal.
+    quiet = True if ranks.rank() else None
+    with tqdm(total=trainer.parameters.steps, initial=trainer.steps, disable=quiet) as bar:
         for finished in run.steps():
             bar.update(trainer.steps - bar.n)
             for episode in finished:
@@ -224,7 +356,8 @@ def _train_with_progress(run: TrainingRun) -> None:
                     {"episode": episode.number, "average reward": episode.average_reward},
                     refresh=False,
                 )
-            if interrupted.is_set():
+            # All processes stop at the same step: none waits for another's gradients.
+            if ranks.greatest(interrupted.is_set()):
                 run.try_to_save()
                 print(f"stopped at step {trainer.steps}; the same command goes on from there")
                 break

@@ -2,4 +2,4 @@
 
 from typing import Final
 
-EXPERIMENTS: Final = ("goal-1", "ablation", "goal-2", "goal-3", "targets")
+EXPERIMENTS: Final = ("goal-1", "ablation", "goal-2", "goal-3", "targets", "any-map")

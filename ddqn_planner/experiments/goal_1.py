@@ -126,7 +126,7 @@ def _paths(
         paths[f"{profile}, median seed"] = plans[middle].cells
         milliseconds = spread([1e3 * s for s in seconds], 2)
         rows.append([profile, spread([n for n in lengths if np.isfinite(n)], 2), milliseconds])
-    for rule in MoveRule:
+    for rule in DIAGONALS:
         cells, s = _timed(lambda rule=rule: a_star(scenario, rule))  # type: ignore[misc]
         paths[f"A*, {rule.value}"] = cells
         rows.append([f"A*, {rule.value}", f"{path_length(cells):.2f}", f"{1e3 * s:.2f}"])

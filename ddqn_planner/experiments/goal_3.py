@@ -79,7 +79,8 @@ def noisy_maps(training: int, test: int, seed: int = NOISE_SEED) -> NoisyMaps:
     return NoisyMaps(drawn[:training], drawn[training:], rejected, repeated)
 
 
-def _maps(settings: Settings) -> NoisyMaps:
+def drawn_maps(settings: Settings) -> NoisyMaps:
+    """Return the noisy maps of the experiment."""
     return noisy_maps(4, 6) if settings.quick else noisy_maps(TRAINING_MAPS, TEST_MAPS)
 
 
@@ -90,7 +91,7 @@ def name(profile: str) -> str:
 
 def trainings(settings: Settings) -> list[Training]:
     """Return the trainings of both profiles on the training maps."""
-    maps = _maps(settings).training
+    maps = drawn_maps(settings).training
     return [
         *settings.trainings(name("paper"), settings.shorten(PAPER), maps, 1_000),
         *settings.trainings(name("best"), settings.profile("best"), maps, 1_000),
@@ -100,12 +101,12 @@ def trainings(settings: Settings) -> list[Training]:
 def taught(settings: Settings) -> list[Training]:
     """Return what the paper's network is taught, see `ddqn_planner.experiments.taught`."""
     parameters = settings.shorten(replace(PAPER, steps=TAUGHT_UPDATES))
-    return settings.trainings(TAUGHT, parameters, _maps(settings).training)
+    return settings.trainings(TAUGHT, parameters, drawn_maps(settings).training)
 
 
 def report(settings: Settings) -> str:
     """Write the table and the figure of goal iii, and return its Markdown."""
-    maps = _maps(settings)
+    maps = drawn_maps(settings)
     in_parallel(teach, taught(settings), settings.out)
     optimum = [optimal_length(scenario) for scenario in maps.test]
     rows = [

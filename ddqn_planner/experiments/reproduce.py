@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from typing import Final
 
-from ddqn_planner.experiments import EXPERIMENTS, ablation, goal_1, goal_2, goal_3, targets
+from ddqn_planner.experiments import EXPERIMENTS, ablation, any_map, goal_1, goal_2, goal_3, targets
 from ddqn_planner.experiments.report import Settings
 from ddqn_planner.experiments.trainings import in_parallel, train
 from ddqn_planner.files import write_atomically
 
-MODULES: Final = dict(zip(EXPERIMENTS, (goal_1, ablation, goal_2, goal_3, targets), strict=True))
+MODULES: Final = dict(
+    zip(EXPERIMENTS, (goal_1, ablation, goal_2, goal_3, targets, any_map), strict=True)
+)
 """Each has a title, ``trainings(settings)``, and ``report(settings)`` for what they gave."""
 
 

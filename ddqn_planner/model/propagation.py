@@ -188,14 +188,24 @@ def kinds_of_surroundings(
     (K, 9) int8
         The surroundings of each kind. Without costs these are all 512 that there can be.
     """
-    seen_C9 = surroundings(occupancy, cost)
+    base, digits, outside = 2, occupancy, 1
+    if cost is not None:
+        outside = OCCUPIED - UNKNOWN
+        base, digits = 128, np.where(occupancy, outside, cost.astype(np.int64) - UNKNOWN)
+    padded = np.pad(
+        digits.astype(np.int32 if cost is None else np.int64), 1, constant_values=outside
+    )
+    height, width = occupancy.shape
+    code = np.zeros(occupancy.shape, dtype=padded.dtype)
+    for place in range(9):
+        y, x = divmod(place, 3)
+        code += padded[y : y + height, x : x + width] * base**place
     if cost is None:
-        kind = (seen_C9 == OCCUPIED) @ 2 ** np.arange(9, dtype=np.int32)
-        every_K9 = np.arange(2**9)[:, None] >> np.arange(9) & 1
-        return kind.reshape(occupancy.shape), (OCCUPIED * every_K9).astype(np.int8)
-    code = (seen_C9 - np.int8(UNKNOWN)) @ 128 ** np.arange(9, dtype=np.int64)
-    _, first, kind = np.unique(code, return_index=True, return_inverse=True)
-    return kind.reshape(occupancy.shape).astype(np.int32), seen_C9[first]
+        every_K9 = np.arange(base**9)[:, None] // base ** np.arange(9) % base
+        return code, (every_K9 * OCCUPIED).astype(np.int8)
+    codes, kind = np.unique(code, return_inverse=True)
+    values_K9 = codes[:, None] // base ** np.arange(9) % base + UNKNOWN
+    return kind.reshape(code.shape).astype(np.int32), values_K9.astype(np.int8)
 
 
 def features(values_B9: NDArray[np.int8], move_rule: MoveRule) -> NDArray[np.float32]:

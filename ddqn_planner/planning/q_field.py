@@ -46,9 +46,13 @@ class QField:
     @cached_property
     def policy(self) -> NDArray[np.int8]:
         """(H, W) int8: the legal action of the greatest Q in each cell; -1 where it is -inf."""
-        legal_q = np.where(self.legal, self.q, np.float32(-np.inf))
-        known = np.isfinite(legal_q).any(axis=0)
-        return np.where(known, legal_q.argmax(axis=0), -1).astype(np.int8)
+        best = np.full(self.q.shape[1:], -np.inf, dtype=np.float32)
+        policy = np.full(self.q.shape[1:], -1, dtype=np.int8)
+        for action, (q, legal) in enumerate(zip(self.q, self.legal, strict=True)):
+            better = legal & (q > best)
+            np.copyto(best, q, where=better)
+            np.copyto(policy, action, where=better)
+        return policy
 
     def unmasked(self) -> QField:
         """Return the field of a robot that does not know its map.

@@ -29,7 +29,7 @@ ANY_MAP: Final = HyperParameters(
     epsilon_end=0.5,
     epsilon_steps=100_000,
     max_episode_steps=50,
-    steps=1_500_000,
+    steps=1_536_000,
 )
 """What differs from the paper: every episode begins at a random free cell; a collision costs more
 than any walk on these maps; and the robot never stops to try what it holds for impossible."""

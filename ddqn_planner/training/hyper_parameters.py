@@ -64,8 +64,6 @@ class HyperParameters:
             low, high = entry.metadata["range"]
             if not low <= value <= high:
                 raise ValueError(f"{entry.name} is {value}; it must lie in {low} to {high}")
-        if self.network == "any_map" and self.reward != "path_cost":
-            raise ValueError("the network any_map learns path costs; give the reward path_cost")
         if self.environments > self.replay_capacity:
             raise ValueError(
                 f"environments is {self.environments}; it must be at most replay_capacity, "

@@ -18,11 +18,13 @@ PARAMETERS = HyperParameters(max_episode_steps=12)
 
 @pytest.mark.parametrize("rule", MoveRule)
 @pytest.mark.parametrize("count", [1, 3])
+@pytest.mark.parametrize("reward", ["paper", "path_cost"])
 def test_the_batch_and_the_scalar_environment_agree_step_by_step(
-    paper: Scenario, rule: MoveRule, count: int
+    paper: Scenario, rule: MoveRule, count: int, reward: str
 ) -> None:
-    batch = GridVectorEnvironment([paper], rule, replace(PARAMETERS, environments=count))
-    scalars = [GridEnvironment(paper, rule, PARAMETERS) for _ in range(count)]
+    parameters = replace(PARAMETERS, reward=reward)
+    batch = GridVectorEnvironment([paper], rule, replace(parameters, environments=count))
+    scalars = [GridEnvironment(paper, rule, parameters) for _ in range(count)]
     random = np.random.default_rng(count)
     batch.reset(seed=1)
     for scalar in scalars:
@@ -94,6 +96,25 @@ def test_rewards_and_ends_of_one_episode_by_hand(small: Scenario) -> None:
     environment.cell = (4, 1)
     _, reward, terminated, _, _ = environment.step(np.int64(6))
     assert (reward, terminated) == (10.0, True)
+
+
+def test_path_costs_reward_a_move_by_minus_its_length_times_its_price(small: Scenario) -> None:
+    cost = np.zeros((4, 5), dtype=np.int8)
+    cost[1, 0] = 50
+    priced = replace(small, grid=replace(small.grid, cost=cost), move_rule=MoveRule.CORNER_CUTTING)
+    parameters = HyperParameters(p_r=0.0, reward="path_cost")
+    environment = GridEnvironment(priced, MoveRule.ROBOT_SAFE, parameters)
+    environment.reset(seed=0)
+    assert environment.step(np.int64(2))[1] == pytest.approx(-(1 + 3) / 2)
+    environment.cell = (1, 2)
+    # The rule of the scenario goes before that of the environment: a corner may be cut.
+    _, reward, terminated, _, _ = environment.step(np.int64(1))
+    assert (reward, terminated) == (pytest.approx(-(2**0.5)), False)
+    environment.cell = (4, 1)
+    _, reward, terminated, _, _ = environment.step(np.int64(6))
+    assert (reward, terminated) == (-1.0, True)
+    environment.reset()
+    assert environment.step(np.int64(4))[1] == parameters.obstacle_reward
 
 
 def test_without_alpha_and_beta_free_cells_earn_nothing(small: Scenario) -> None:

@@ -1,0 +1,197 @@
+"""The model for any map: the paper's goals with it unseen, and what each idea does for it."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any, Final
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from ddqn_planner.experiments import goal_3
+from ddqn_planner.experiments.profiles import MOVE_RULE
+from ddqn_planner.experiments.report import Settings, mean, spread, table
+from ddqn_planner.experiments.trainings import Training, solved, walk_from_starts
+from ddqn_planner.files import write_csv
+from ddqn_planner.grid import MAX_PRICE, MOVES, OCCUPIED, UNKNOWN, GridMap, MoveRule, legal_moves
+from ddqn_planner.grid.generators import generate_map, random_costs
+from ddqn_planner.model import AnyMapQNetwork
+from ddqn_planner.model.propagation import features
+from ddqn_planner.planning import Planner
+from ddqn_planner.planning.evaluation import evaluate
+from ddqn_planner.training.any_map import ANY_MAP, RULES, random_scenarios
+from ddqn_planner.training.environment import paper_scenario
+
+TITLE = "The model for any map"
+
+PAPERS_REWARD: Final = {"reward": "paper", "goal_reward": 10.0}
+VARIANTS: Final[dict[str, dict[str, Any]]] = {
+    "all": {},
+    "DQN's target": {"target": "dqn"},
+    "the printed target": {"target": "printed"},
+    "given initial cells (p_r = 0)": {"p_r": 0.0},
+    "the paper's reward": PAPERS_REWARD,
+    "plain reward (α = β = 0)": {**PAPERS_REWARD, "alpha": 0.0, "beta": 0.0},
+}
+"""What each changes in `ANY_MAP`."""
+
+STEPS: Final = (25_600, 256_000)
+"""Environment steps of the trainings of the ablation: a tenth of a minute, and a minute."""
+
+HELD_OUT: Final = ("maze", "rooms", "corridors", "dead_ends", "office")
+SIDE: Final = 48
+TIMES: Final = 50
+
+ABLATION = (
+    "variant",
+    "steps",
+    "moves judged wrongly, of 4,096",
+    "error of the price",
+    "starts solved, any move",
+    "mean length / optimum",
+    "mean cost / optimum, random costs",
+)
+
+
+def name(variant: str, steps: int) -> str:
+    """Return the name of the trainings of a variant."""
+    return f"any_map/{list(VARIANTS).index(variant)}/{steps}"
+
+
+def trainings(settings: Settings) -> list[Training]:
+    """Return the trainings of the ablation. Each seed has maps of its own."""
+    return [
+        Training(
+            name(variant, steps),
+            settings.shorten(replace(ANY_MAP, steps=steps, **changes)),
+            tuple(random_scenarios(seed)),
+            seed,
+            evaluation_interval=10**9,
+        )
+        for variant, changes in VARIANTS.items()
+        for steps in STEPS
+        for seed in range(settings.seeds)
+    ]
+
+
+def report(settings: Settings) -> str:
+    """Return the Markdown of both tables, and write them."""
+    header, row = zero_shot(settings)
+    write_csv(settings.out / "any_map_zero_shot.csv", header, [row])
+    rows = [
+        [variant, f"{steps:,}", *_row(settings.planners(name(variant, steps)))]
+        for variant in VARIANTS
+        for steps in STEPS
+    ]
+    write_csv(settings.out / "any_map_ablation.csv", ABLATION, rows)
+    return f"{table(header, [row])}\n\n{table(ABLATION, rows)}"
+
+
+def zero_shot(settings: Settings) -> tuple[list[str], list[str]]:
+    """Return a table of the paper's goals with the shipped model, which never saw their maps."""
+    shipped = Planner.load("any_map")
+    planner = Planner(shipped.network, replace(shipped.metadata, move_rule=MOVE_RULE))
+    scenario = paper_scenario()
+    field = planner.q_field(scenario.grid, scenario.goal)
+    # The given start, goal i, is one of the starts.
+    starts = evaluate(field, scenario.grid, MOVE_RULE)
+    any_move = evaluate(field.unmasked(), scenario.grid, MOVE_RULE)
+    maps = goal_3.drawn_maps(settings)
+    noisy = [walk_from_starts(planner, some) for some in (maps.training, maps.test)]
+    counts = [f"{solved(legal)} ({solved(free)}) of {len(legal)}" for legal, free in noisy]
+    seconds = []
+    for _ in range(TIMES):
+        began = time.perf_counter()
+        Planner(planner.network, planner.metadata).plan(
+            scenario.grid, scenario.start, scenario.goal
+        )
+        seconds.append(time.perf_counter() - began)
+    return [
+        "goal i, length",
+        "goal ii with the given start, solved (any move)",
+        "mean length / optimum",
+        "goal iii, first maps (any move)",
+        "goal iii, test maps (any move)",
+        "planning time, ms",
+    ], [
+        f"{field.rollout(scenario.start).length:.2f}",
+        f"{starts.solved} ({any_move.solved}) of {starts.starts}",
+        f"{starts.mean_ratio:.4f}",
+        *counts,
+        f"{1e3 * np.median(seconds):.2f}",
+    ]
+
+
+def _row(planners: Sequence[Planner]) -> list[str]:
+    judged = [_judgement(planner) for planner in planners]
+    lengths = [_walks(planner, priced=False) for planner in planners]
+    costs = [_walks(planner, priced=True) for planner in planners]
+    starts = lengths[0][1]
+    return [
+        spread([wrong for wrong, _ in judged]),
+        spread([error for _, error in judged], 4),
+        f"{spread([count for count, _, _ in lengths])} of {starts:,}",
+        spread([ratio for _, _, ratio in lengths], 4),
+        spread([ratio for _, _, ratio in costs], 4),
+    ]
+
+
+def _judgement(planner: Planner) -> tuple[int, float]:
+    """Return how many moves are judged wrongly, and the mean relative error of their prices.
+
+    All 256 surroundings of a free cell under both rules, for the prices each with random costs.
+    """
+    network = planner.network
+    assert isinstance(network, AnyMapQNetwork)
+    wrong, errors = 0, []
+    for rule in RULES:
+        seen_B9 = surroundings_of_a_free_cell()
+        legal_BA = np.stack([_legal(values, rule) for values in seen_B9])
+        with torch.inference_mode():
+            p_BA, _ = network(torch.from_numpy(features(seen_B9, rule)))
+            random = np.random.default_rng(0).integers(UNKNOWN, OCCUPIED, seen_B9.shape)
+            priced_B9 = np.where(seen_B9 == OCCUPIED, OCCUPIED, random).astype(np.int8)
+            _, price_BA = network(torch.from_numpy(features(priced_B9, rule)))
+        wrong += int(((p_BA.numpy() > 0.5) != legal_BA).sum())
+        true_BA = np.stack([_prices(values) for values in priced_B9])
+        errors.append(np.abs(price_BA.numpy() / true_BA - 1)[legal_BA])
+    return wrong, float(np.concatenate(errors).mean())
+
+
+def surroundings_of_a_free_cell() -> NDArray[np.int8]:
+    """Return every surroundings without costs that a free cell can have: (256, 9) int8."""
+    every = OCCUPIED * (np.arange(2**9)[:, None] >> np.arange(9) & 1)
+    free: NDArray[np.int8] = every[every[:, 4] == 0].astype(np.int8)
+    return free
+
+
+def _legal(values: NDArray[np.int8], rule: MoveRule) -> NDArray[np.bool_]:
+    legal: NDArray[np.bool_] = legal_moves(values.reshape(3, 3) == OCCUPIED, rule)[:, 1, 1]
+    return legal
+
+
+def _prices(values: NDArray[np.int8]) -> NDArray[np.float64]:
+    share = np.where(values == UNKNOWN, 1.0, values / 100).reshape(3, 3)
+    price = 1 + (MAX_PRICE - 1) * share
+    onward = price[1 + MOVES[:, 1], 1 + MOVES[:, 0]]
+    mean_price: NDArray[np.float64] = (price[1, 1] + onward) / 2
+    return mean_price
+
+
+def _walks(planner: Planner, priced: bool) -> tuple[int, int, float]:
+    """Walk from every free cell of a map of each kind: solved, starts, mean over the optimum."""
+    random = np.random.default_rng(0)
+    count, starts, ratios = 0, 0, []
+    for kind in HELD_OUT:
+        occupancy = generate_map(kind, (SIDE, SIDE), random)
+        grid = GridMap(occupancy, cost=random_costs(occupancy, random) if priced else None)
+        goal = grid.free_cells()[-1]
+        field = planner.q_field(grid, goal, MoveRule.ROBOT_SAFE).unmasked()
+        evaluation = evaluate(field, grid, MoveRule.ROBOT_SAFE)
+        count += evaluation.solved
+        starts += evaluation.starts
+        ratios.append(evaluation.mean_ratio)
+    return count, starts, mean(ratios)

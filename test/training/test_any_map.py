@@ -1,0 +1,128 @@
+from __future__ import annotations
+
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import safetensors.torch
+from hypothesis import given
+from hypothesis import strategies as st
+
+from ddqn_planner import GridMap, MoveRule, Planner
+from ddqn_planner.grid import UNKNOWN, Cell, connected_cells
+from ddqn_planner.grid.generators import generate_map, random_costs
+from ddqn_planner.planning.evaluation import Evaluation, evaluate
+from ddqn_planner.training.any_map import ANY_MAP, MAPS, RULES, random_scenarios
+from ddqn_planner.training.trainer import Trainer
+
+BRIEF = 128_000
+"""Environment steps that are enough to learn every move, though prices only roughly."""
+
+
+@pytest.fixture(scope="module")
+def planner() -> Planner:
+    trainer = Trainer(random_scenarios(seed=0), MoveRule.ROBOT_SAFE, ANY_MAP, seed=0)
+    for _ in trainer.run(BRIEF):
+        pass
+    return trainer.planner()
+
+
+def walks(planner: Planner, grid: GridMap, rule: MoveRule) -> Evaluation:
+    goal = grid.free_cells()[-1]
+    return evaluate(planner.q_field(grid, goal, rule).unmasked(), grid, rule)
+
+
+@pytest.mark.parametrize("rule", RULES)
+@pytest.mark.parametrize("kind", ["maze", "rooms", "corridors", "dead_ends", "office"])
+def test_small_random_maps_teach_the_moves_on_kinds_and_sizes_that_were_never_seen(
+    planner: Planner, kind: str, rule: MoveRule
+) -> None:
+    grid = GridMap(generate_map(kind, (40, 50), np.random.default_rng(1)))
+    evaluation = walks(planner, grid, rule)  # the network alone: nothing masks illegal moves
+    assert evaluation.solved == evaluation.starts > 100
+    assert evaluation.worst_ratio < 1.3
+
+
+@pytest.mark.parametrize("rule", RULES)
+def test_costs_and_unknown_cells_are_learned_with_them(planner: Planner, rule: MoveRule) -> None:
+    random = np.random.default_rng(2)
+    occupancy = generate_map("random_20", (30, 30), random)
+    cost = np.where(random.random((30, 30)) < 0.2, UNKNOWN, random_costs(occupancy, random))
+    priced = GridMap(occupancy, cost=cost.astype(np.int8))
+    evaluation = walks(planner, priced, rule)
+    assert evaluation.solved == evaluation.starts > 100
+    # A planner that does not see the prices takes the shortest way, which costs more.
+    goal = priced.free_cells()[-1]
+    blind = evaluate(planner.q_field(GridMap(occupancy), goal, rule), priced, rule)
+    assert evaluation.mean_ratio < (1 + blind.mean_ratio) / 2
+
+
+@given(st.integers(0, 1000))
+def test_the_maps_to_train_on_are_those_of_the_seed(seed: int) -> None:
+    scenarios, again = random_scenarios(seed, maps=8), random_scenarios(seed, maps=8)
+    for scenario, same in zip(scenarios, again, strict=True):
+        assert scenario.grid.fingerprint == same.grid.fingerprint
+        assert (scenario.start, scenario.goal) == (same.start, same.goal)
+        start: Cell = scenario.start
+        assert scenario.move_rule is not None
+        joined = connected_cells(scenario.grid.occupancy, scenario.goal, scenario.move_rule)
+        assert joined[start[1], start[0]]
+    assert {scenario.move_rule for scenario in scenarios} == set(RULES)
+    other = random_scenarios(seed + 1, maps=8)
+    assert scenarios[0].grid.fingerprint != other[0].grid.fingerprint
+
+
+def test_the_maps_to_train_on_have_costs_of_every_sort() -> None:
+    costs = [scenario.grid.cost for scenario in random_scenarios(seed=0)]
+    assert len(costs) == MAPS
+    assert any(cost is None for cost in costs)
+    assert any(cost is not None and (cost == UNKNOWN).any() for cost in costs)
+    assert any(cost is not None and len(np.unique(cost)) > 20 for cost in costs)
+
+
+def command(out: Path, *arguments: str) -> list[str]:
+    steps = ["--maps", "64", "--steps", "12800", "--learning-starts", "1000"]
+    return ["-m", "ddqn_planner.cli", "train-any-map", "--out", str(out), *steps, *arguments]
+
+
+def weights(folder: Path) -> dict[str, bytes]:
+    tensors = safetensors.torch.load_file(folder / "model.safetensors")
+    return {name: tensor.numpy().tobytes() for name, tensor in tensors.items()}
+
+
+def test_processes_train_one_model_on_maps_of_their_own_and_go_on_where_they_stopped(
+    tmp_path: Path,
+) -> None:
+    torchrun = ["-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2"]
+    two = tmp_path / "two"
+    subprocess.run([sys.executable, *torchrun, *command(two)], check=True)
+    assert weights(two) == weights(two / "rank_1")
+    first, second = (
+        Trainer.load_checkpoint(
+            folder / "checkpoint.safetensors", random_scenarios(0, maps=64)[rank::2]
+        )
+        for rank, folder in enumerate((two, two / "rank_1"))
+    )
+    assert not np.array_equal(first.environment.cell, second.environment.cell)
+    alone = tmp_path / "alone"
+    subprocess.run([sys.executable, *command(alone)], check=True)
+    assert weights(alone) != weights(two)
+
+    longer = ["--steps", "19200"]
+    subprocess.run([sys.executable, *torchrun, *command(two, *longer)], check=True)
+    subprocess.run([sys.executable, *torchrun, *command(tmp_path / "at_once", *longer)], check=True)
+    assert weights(two) == weights(tmp_path / "at_once") == weights(two / "rank_1")
+
+
+def test_one_seed_gives_one_model() -> None:
+    models = []
+    for _ in range(2):
+        parameters = replace(ANY_MAP, learning_starts=1_000)
+        trainer = Trainer(random_scenarios(3, maps=32), MoveRule.ROBOT_SAFE, parameters, seed=3)
+        for _ in trainer.run(6_400):
+            pass
+        models.append({k: v.numpy().tobytes() for k, v in trainer.network.state_dict().items()})
+    assert models[0] == models[1]
