@@ -39,6 +39,9 @@ from ddqn_planner.training.run import TrainingRun
 
 MOVE_RULES = [rule.value for rule in MoveRule]
 
+MAX_TEXT_WIDTH = 64
+"""Cells of the widest map that is printed as text: a cell takes two characters."""
+
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line; return the exit code.
@@ -64,7 +67,7 @@ def _parser() -> argparse.ArgumentParser:
 
     plan = commands.add_parser("plan", help="plan a path on a map file")
     _add_map_arguments(plan)
-    plan.add_argument("--model", default="dilemma", help="name or file (%(default)s)")
+    plan.add_argument("--model", default="any_map", help="name or file (%(default)s)")
     plan.add_argument("--move-rule", choices=MOVE_RULES, help="the model's by default")
     plan.add_argument("--json", action="store_true", help="print JSON in place of text")
     plan.add_argument("--picture", type=Path, metavar="FILE", help="draw map, value and path")
@@ -198,7 +201,8 @@ def _plan(options: argparse.Namespace) -> int:
     if options.json:
         print(json.dumps(_as_dictionary(plan, optimum, rule, seconds)))
     elif succeeded:
-        print(draw_text(grid, plan.cells))
+        if grid.width <= MAX_TEXT_WIDTH:
+            print(draw_text(grid, plan.cells))
         print("path: " + " ".join(f"({x}, {y})" for x, y in plan.cells))
         print(
             f"length {plan.length:.2f} cells, optimum {optimum:.2f} under {rule.value}, "

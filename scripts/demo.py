@@ -1,4 +1,4 @@
-"""Starts the map server and the planner, asks for a path over ROS, and shows it.
+"""Starts the map server and the planner, asks for a path over ROS, and shows it, on two maps.
 
 Both nodes are processes of their own, in a ROS domain of their own. Start and goal are published
 as `ros2 topic pub` would. No process is left behind, also when this one is interrupted.
@@ -12,7 +12,8 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
+from dataclasses import dataclass
 from typing import Any, TypeVar
 
 import numpy as np
@@ -26,14 +27,34 @@ from rclpy.executors import ExternalShutdownException
 from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 
-from ddqn_planner.grid import Cell, GridMap, MoveRule, path_length
+from ddqn_planner.grid import Cell, GridMap, MoveRule, path_length, read_map_file
 from ddqn_planner.nodes.conversions import grid_from_message, quaternion
 from ddqn_planner.nodes.runtime import LATCHED
 from ddqn_planner.planning import shortest_distances
 from ddqn_planner.planning.picture import draw_text, save_picture
-from ddqn_planner.training.environment import Scenario, paper_scenario
+from ddqn_planner.resources import find_map
+from ddqn_planner.training.environment import Scenario
 
-PICTURE = "demo.png"
+
+@dataclass(frozen=True)
+class Case:
+    """A map, and the shipped model that plans on it."""
+
+    map_name: str
+    model: str
+    move_rule: MoveRule
+    title: str
+    picture: str
+
+
+CASES = (
+    Case("dilemma", "dilemma", MoveRule.CORNER_CUTTING, "The paper's network", "demo.png"),
+    Case("office", "any_map", MoveRule.ROBOT_SAFE, "A map never seen", "demo_office.png"),
+)
+
+MAX_TEXT_WIDTH = 64
+"""Cells of the widest map that is printed as text."""
+
 TIMEOUT = 60.0
 """Seconds to wait for any one answer."""
 
@@ -131,18 +152,20 @@ def diagnosed(node: Client) -> dict[str, str] | None:
     return None
 
 
-def show(node: Client, plan: Path, children: Children, seconds: float) -> None:
+def show(node: Client, plan: Path, children: Children, case: Case, seconds: float) -> None:
     """Print the path and its times, and draw it."""
-    scenario = paper_scenario()
     grid = grid_from_message(node.heard["map"])
     cells = [grid.world_to_cell(p.pose.position.x, p.pose.position.y) for p in plan.poses]
-    rule = MoveRule.CORNER_CUTTING
-    distances = shortest_distances(grid, scenario.goal, rule)
-    optimum = distances[scenario.start[1], scenario.start[0]]
+    start, goal = cells[0], cells[-1]
+    optimum = shortest_distances(grid, goal, case.move_rule)[start[1], start[0]]
     times = wait_for("diagnostics", lambda: diagnosed(node), children)
-    print(draw_text(grid, cells))
-    print("path: " + " ".join(f"({x}, {y})" for x, y in cells))
-    print(f"length {path_length(cells):.2f} cells, optimum {optimum:.2f} under {rule.value}")
+    if grid.width <= MAX_TEXT_WIDTH:
+        print(draw_text(grid, cells))
+        print("path: " + " ".join(f"({x}, {y})" for x, y in cells))
+    else:
+        print(f"{grid.width} x {grid.height} cells, path of {len(cells)} from {start} to {goal}")
+    length = path_length(cells)
+    print(f"length {length:.2f} cells, optimum {optimum:.2f} under {case.move_rule.value}")
     print(
         f"Q field computed in {float(times['field time (ms)']):.1f} ms, path walked in "
         f"{float(times['walk time (ms)']):.2f} ms; first plan {seconds:.1f} s after the nodes "
@@ -151,9 +174,28 @@ def show(node: Client, plan: Path, children: Children, seconds: float) -> None:
     value = wait_for("value field", lambda: node.heard.get("planner/value"), children)
     values = np.array(value.data, dtype=np.float32).reshape(grid.height, grid.width)
     values[values < 0] = np.nan
-    title = f"Double DQN on the paper's map: {path_length(cells):.2f} cells"
-    save_picture(PICTURE, grid, cells, values, title, "value field, 100 at the goal")
-    print(f"picture: {PICTURE}")
+    title = f"{case.title}: {length:.2f} cells"
+    save_picture(case.picture, grid, cells, values, title, "value field, 100 at the goal")
+    print(f"picture: {case.picture}\n", flush=True)
+
+
+def run(node: Client, case: Case) -> None:
+    """Start both nodes, ask for a path, show it, and end them."""
+    map_file = read_map_file(find_map(case.map_name))
+    assert map_file.start is not None
+    assert map_file.goal is not None
+    scenario = Scenario(map_file.grid(), map_file.start, map_file.goal)
+    node.heard.clear()
+    began = time.monotonic()
+    map_server = ("map_server_node", f"yaml_filename:={case.map_name}.yaml")
+    planner = ("planner_node", f"model:={case.model}")
+    with ExitStack() as stack:
+        children = [
+            stack.enter_context(running(executable(name), "--ros-args", "-p", parameter))
+            for name, parameter in (map_server, planner)
+        ]
+        plan = request_plan(node, children, scenario)
+        show(node, plan, children, case, time.monotonic() - began)
 
 
 def main() -> int:
@@ -162,14 +204,8 @@ def main() -> int:
     signal.signal(signal.SIGINT, signal.default_int_handler)
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))
     with client() as node:
-        began = time.monotonic()
-        map_server = running(
-            executable("map_server_node"), "--ros-args", "-p", "yaml_filename:=dilemma.yaml"
-        )
-        with map_server as first, running(executable("planner_node")) as second:
-            children = [first, second]
-            plan = request_plan(node, children, paper_scenario())
-            show(node, plan, children, time.monotonic() - began)
+        for case in CASES:
+            run(node, case)
     return 0
 
 

@@ -71,7 +71,8 @@ def save_picture(
         raise PictureError(
             f"pictures need matplotlib ({error}): pip install 'ddqn_planner[figures]'"
         ) from None
-    figure, axes = plt.subplots(figsize=(7.2, 6.6), dpi=120, layout="constrained")
+    tall = min(max(grid.height / grid.width, 0.4), 1.0)
+    figure, axes = plt.subplots(figsize=(7.2, 1.5 + 5.1 * tall), dpi=120, layout="constrained")
     axes.set(facecolor="white", xlabel="x [cells]", ylabel="y [cells]", aspect="equal")
     axes.set_title(title, loc="left", fontsize=12)
     for axis in (axes.xaxis, axes.yaxis):
@@ -80,10 +81,11 @@ def save_picture(
         finite = np.where(np.isfinite(value), value, np.nan)
         colours = LinearSegmentedColormap.from_list("value", VALUE_COLOURS)
         image = axes.imshow(finite, origin="lower", cmap=colours, interpolation="nearest")
-        figure.colorbar(image, label=value_label, shrink=0.85)
+        figure.colorbar(image, label=value_label, shrink=0.85, aspect=20 * tall)
     draw_obstacles(axes, grid)
     if cells:
         _draw_path(axes, cells)
+        figure.legend(loc="outside lower center", ncols=3, frameon=False)
     figure.savefig(path)
     plt.close(figure)
 
@@ -112,4 +114,3 @@ def _draw_path(axes: Any, cells: Sequence[Cell]) -> None:
     ends = {"s": 110, "edgecolors": "white", "linewidths": 1.5, "zorder": 3}
     axes.scatter(x[0], y[0], marker="o", color=PATH_COLOUR, label="start", **ends)
     axes.scatter(x[-1], y[-1], marker="*", color=PATH_COLOUR, label="goal", **{**ends, "s": 300})
-    axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.08), ncols=3, frameon=False)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from collections import OrderedDict
 from pathlib import Path
 
@@ -18,6 +19,8 @@ MAX_FIELD_BYTES = 2**29
 class Planner:
     """Plans paths with a trained Q-network, by greedy steps in its Q field.
 
+    Several threads may use one planner.
+
     Parameters
     ----------
     network : QNetwork
@@ -29,10 +32,11 @@ class Planner:
         self.network = network
         self.metadata = metadata
         self._fields: OrderedDict[tuple[str, Cell, MoveRule], QField] = OrderedDict()
+        self._lock = threading.Lock()
 
     @classmethod
     def load(cls, model: str | Path) -> Planner:
-        """Load a shipped model by its name (``"dilemma"``), or a model file by its path.
+        """Load a shipped model by its name (``"any_map"``), or a model file by its path.
 
         Raises
         ------
@@ -64,18 +68,32 @@ class Planner:
                 f"the model was not trained for maps of {grid.width} x {grid.height} cells; "
                 "train one on such a map"
             )
-        rule = move_rule or self.metadata.move_rule
-        key = (grid.fingerprint, goal, rule)
-        if key not in self._fields:
+        field = self.known_field(grid, goal, move_rule)
+        if field is None:
+            rule = move_rule or self.metadata.move_rule
             q = self.network.q_values(grid, goal, rule)
-            self._fields[key] = QField(goal, q, legal_moves(grid.occupancy, rule))
-        self._fields.move_to_end(key)
-        while len(self._fields) > 1 and (
-            len(self._fields) > MAX_FIELDS
-            or sum(field.q.nbytes for field in self._fields.values()) > MAX_FIELD_BYTES
-        ):
-            self._fields.popitem(last=False)
-        return self._fields[key]
+            field = QField(goal, q, legal_moves(grid.occupancy, rule))
+            self._remember(grid, rule, field)
+        return field
+
+    def known_field(
+        self, grid: GridMap, goal: Cell, move_rule: MoveRule | None = None
+    ) -> QField | None:
+        """Return the Q field of a map toward a goal if it was computed lately, else None."""
+        key = (grid.fingerprint, goal, move_rule or self.metadata.move_rule)
+        with self._lock:
+            if key in self._fields:
+                self._fields.move_to_end(key)
+            return self._fields.get(key)
+
+    def _remember(self, grid: GridMap, rule: MoveRule, field: QField) -> None:
+        with self._lock:
+            self._fields[grid.fingerprint, field.goal, rule] = field
+            while len(self._fields) > 1 and (
+                len(self._fields) > MAX_FIELDS
+                or sum(known.q.nbytes for known in self._fields.values()) > MAX_FIELD_BYTES
+            ):
+                self._fields.popitem(last=False)
 
     def plan(
         self, grid: GridMap, start: Cell, goal: Cell, move_rule: MoveRule | None = None
@@ -105,7 +123,7 @@ class Planner:
         if not self.network.supports((grid.height, grid.width)):
             return Plan(PlanStatus.MAP_SIZE_UNSUPPORTED)
         rule = move_rule or self.metadata.move_rule
-        known = (grid.fingerprint, goal, rule) in self._fields
+        known = self.known_field(grid, goal, rule) is not None
         # Where no path leads, there is no need to compute a field to say so.
         if not known and not _joined(grid, start, goal, rule):
             return Plan(PlanStatus.NO_PATH)

@@ -79,18 +79,20 @@ def demo(tmp_path: Path) -> Iterator[Demo]:
     demo.process.wait()
 
 
-def test_demo_finds_the_shortest_path_and_draws_it(demo: Demo, tmp_path: Path) -> None:
+def test_demo_finds_the_shortest_paths_and_draws_them(demo: Demo, tmp_path: Path) -> None:
     assert demo.process.wait(END_TIMEOUT) == 0, demo.output
     assert "length 22.97 cells, optimum 22.97" in demo.output
+    assert "length 789.95 cells, optimum 789.95" in demo.output
     assert demo.commands() == {}
 
-    with Image.open(tmp_path / "demo.png") as picture:
-        pixels = np.asarray(picture.convert("RGB"))
-    assert min(pixels.shape[:2]) >= 400
-    # Occupied cells, the value field and the path: more than a few lines on a ground.
-    colours, counts = np.unique(pixels.reshape(-1, 3), axis=0, return_counts=True)
-    assert len(colours) > 100
-    assert counts.max() < 0.8 * counts.sum()
+    for name in ("demo.png", "demo_office.png"):
+        with Image.open(tmp_path / name) as picture:
+            pixels = np.asarray(picture.convert("RGB"))
+        assert min(pixels.shape[:2]) >= 400
+        # Occupied cells, the value field and the path: more than a few lines on a ground.
+        colours, counts = np.unique(pixels.reshape(-1, 3), axis=0, return_counts=True)
+        assert len(colours) > 100
+        assert counts.max() < 0.8 * counts.sum()
 
 
 @pytest.mark.parametrize(("signal_number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
