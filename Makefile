@@ -48,6 +48,7 @@ types: setup
 bench: setup
 	$(BIN)/pip install --quiet --editable ".[$(EXTRAS),bench]"
 	$(BIN)/python scripts/benchmark.py
+	$(BIN)/python scripts/benchmark_any_map.py $(MAP)
 
 # These train the shipped models from nothing: the one for any map, and the paper's network.
 model: setup

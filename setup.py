@@ -39,7 +39,7 @@ setup(
         "figures": ["matplotlib>=3.6"],
         "experiments": ["matplotlib>=3.6", "pathfinding>=1.0.9"],
         "tensorboard": ["tensorboard>=2.10"],
-        "bench": ["psutil>=5.9", "stable-baselines3>=2.6"],
+        "bench": ["psutil>=5.9", "pyastar2d>=1.1", "stable-baselines3>=2.6"],
         "test": [
             "colcon-core>=0.15",
             "colcon-package-selection",

@@ -30,7 +30,7 @@ INFLATION_RADIUS = 5.0
 """How far the cost of an obstacle reaches, cells."""
 
 GOALS = 10
-"""Goals that the requests of a map share: each needs a field and the exact distances."""
+"""Goals that the requests of a generated map share: each needs a field and exact distances."""
 
 FILES: Final = {
     ".map": "MovingAI maps",
@@ -146,7 +146,7 @@ def generated_maps(
                 name = f"{kind}-{size}-{number}"
                 random = settings.random(name)
                 occupancy = generate_map(kind, (size, size), random)
-                yield _with_random_requests(kind, name, occupancy, settings, random)
+                yield _with_random_requests(kind, name, occupancy, GOALS, settings, random)
 
 
 def find_files(folder: Path) -> list[Path]:
@@ -203,7 +203,8 @@ def read_maps(files: Sequence[Path], settings: RequestSettings) -> Iterator[Benc
                 random = settings.random(path.stem)
                 occupancy = read_map_file(path).grid().occupancy
                 name = f"ros {path.stem}"
-                yield _with_random_requests(name, str(path), occupancy, settings, random)
+                goals = settings.requests
+                yield _with_random_requests(name, str(path), occupancy, goals, settings, random)
         except (OSError, ValueError) as error:
             known = "" if str(path) in str(error) else f"{path}: "
             tqdm.write(f"skipped: {known}{error}", file=sys.stderr)
@@ -213,15 +214,17 @@ def _with_random_requests(
     set_name: str,
     name: str,
     occupancy: NDArray[np.bool_],
+    goals: int,
     settings: RequestSettings,
     random: np.random.Generator,
 ) -> BenchmarkMap:
     grid, rule = settings.grid(occupancy, random), settings.move_rule
-    goals = [goal for _, goal in random_requests(occupancy, rule, GOALS, random)]
     requests: list[tuple[Cell, Cell]] = []
-    for some, goal in zip(np.array_split(range(settings.requests), GOALS), goals, strict=True):
-        starts = _random_starts(occupancy, goal, rule, len(some), random)
-        requests += [(start, goal) for start in starts]
+    parts = np.array_split(range(settings.requests), goals)
+    drawn = random_requests(occupancy, rule, goals, random)
+    for some, (start, goal) in zip(parts, drawn, strict=True):
+        more = _random_starts(occupancy, goal, rule, max(0, len(some) - 1), random)
+        requests += [(cell, goal) for cell in [start, *more][: len(some)]]
     return BenchmarkMap(set_name, name, grid, requests)
 
 
@@ -246,7 +249,8 @@ def _moving_ai_map(path: Path, scenario: Path | None, settings: RequestSettings)
     occupancy = read_map_file(path).grid().occupancy
     set_name = f"movingai {path.stem}"
     if scenario is None:
-        return _with_random_requests(set_name, str(path), occupancy, settings, random)
+        goals = settings.requests
+        return _with_random_requests(set_name, str(path), occupancy, goals, settings, random)
     grid, rule = settings.grid(occupancy, random), settings.move_rule
     lines = sorted(_read_scenario(scenario, grid), key=lambda line: line[2])
     # One of each of as many equal parts as requests: short and long paths alike.

@@ -25,19 +25,19 @@ TOLERANCE = 1e-4
 MIN_RESOLUTION = 1e-6
 """Metres a cell."""
 
-OCCUPIED = 100
-"""What an occupied cell is worth in an OccupancyGrid."""
-
 
 def grid_from_message(
-    message: OccupancyGrid, occupied_threshold: int = 65, allow_unknown: bool = False
+    message: OccupancyGrid,
+    occupied_threshold: int = 65,
+    allow_unknown: bool = False,
+    priced: bool = False,
 ) -> GridMap:
     """Make a grid map of a map message.
 
     Parameters
     ----------
     message : nav_msgs/OccupancyGrid
-    occupied_threshold, allow_unknown
+    occupied_threshold, allow_unknown, priced
         See `GridMap.from_occupancy_values`.
 
     Raises
@@ -50,7 +50,7 @@ def grid_from_message(
     values = np.frombuffer(message.data, np.int8).reshape(info.height, info.width)
     origin = (info.origin.position.x, info.origin.position.y, _yaw(info.origin.orientation))
     return GridMap.from_occupancy_values(
-        values, info.resolution, origin, occupied_threshold, allow_unknown
+        values, info.resolution, origin, occupied_threshold, allow_unknown, priced
     )
 
 

@@ -15,6 +15,7 @@ from std_msgs.msg import Header
 from std_srvs.srv import Trigger
 
 from ddqn_planner.grid import (
+    OCCUPIED,
     Cell,
     GridMap,
     MapFile,
@@ -23,7 +24,7 @@ from ddqn_planner.grid import (
     scatter_obstacles,
 )
 from ddqn_planner.grid.map_file import MapDataError, MapMetadataError, MapNotFoundError
-from ddqn_planner.nodes.conversions import OCCUPIED, occupancy_message
+from ddqn_planner.nodes.conversions import occupancy_message
 from ddqn_planner.nodes.runtime import LATCHED, spin_until_shutdown
 from ddqn_planner.planning import shortest_path
 from ddqn_planner.resources import PACKAGE, find_map

@@ -2,25 +2,36 @@
 
 A request that cannot be answered is answered by an empty path in the map's frame; the log and
 `/diagnostics` say why.
+
+The field of a large map takes a second or more. A worker thread computes it; all else, and all that
+changes, stays in the executor's one thread, so that no lock is needed: a request that waits for its
+field is a coroutine. An executor of more threads would need locks, and answers slower.
 """
 
 from __future__ import annotations
 
-import sys
+import gc
+import os
 import time
+from collections.abc import Callable
+from concurrent import futures
 from dataclasses import dataclass
+from typing import Any, NoReturn
 
+import numpy as np
 import torch
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped
 from nav_msgs.msg import OccupancyGrid, Path
 from nav_msgs.srv import GetPlan
 from rcl_interfaces.msg import IntegerRange, ParameterDescriptor, SetParametersResult
+from rclpy.callback_groups import MutuallyExclusiveCallbackGroup, ReentrantCallbackGroup
 from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
 from rclpy.exceptions import InvalidParameterValueException
 from rclpy.node import Node
 from rclpy.parameter import Parameter
+from rclpy.task import Future
 from std_msgs.msg import Header, String
 from std_srvs.srv import Trigger
 
@@ -34,7 +45,7 @@ from ddqn_planner.nodes.conversions import (
     value_message,
 )
 from ddqn_planner.nodes.runtime import LATCHED, spin_until_shutdown
-from ddqn_planner.planning import Planner, PlanStatus, QField
+from ddqn_planner.planning import Planner, PlanStatus
 
 MOVE_RULES = {"": None, **{rule.value: rule for rule in MoveRule}}
 
@@ -79,8 +90,8 @@ class Outcome:
         Why there is no path, and what to do; empty if there is one.
     cells : tuple of (x, y)
         The path; empty unless the status is SUCCEEDED.
-    field : QField, optional
-        In which it was planned.
+    value : nav_msgs/OccupancyGrid, optional
+        The value field in which it was planned, without a header.
     field_ms, walk_ms : float
         How long it took to get the field, and to walk in it.
     """
@@ -88,7 +99,7 @@ class Outcome:
     status: str
     reason: str
     cells: tuple[Cell, ...] = ()
-    field: QField | None = None
+    value: OccupancyGrid | None = None
     field_ms: float = 0.0
     walk_ms: float = 0.0
 
@@ -109,7 +120,9 @@ class PlannerNode(Node):
     The active goal is planned for again whenever the map, the start, the model or a parameter
     changes; one that came too early is answered as soon as these are there. A malformed
     ``goal_pose`` clears it: the robot shall not go on to a goal that its user has replaced. A
-    malformed map, start or model is refused, and the one before it stays.
+    malformed map, start or model is refused, and the one before it stays. What comes while a field
+    is computed is planned with afterwards: the last plan is that of the latest goal, start, map and
+    model, and those between may be left out.
     """
 
     def __init__(self) -> None:
@@ -120,6 +133,7 @@ class PlannerNode(Node):
         self._goal: PoseStamped | None = None
         self._planner: Planner | None = None
         self._model_file = ""
+        self._worker = futures.ThreadPoolExecutor(1)
         self._refused: dict[str, str] = {}
         self._outcome = Outcome(NO_REQUEST, "no plan was asked for yet")
         self._reported = -DIAGNOSTICS_PERIOD
@@ -129,6 +143,12 @@ class PlannerNode(Node):
         self._plan_publisher = self.create_publisher(Path, "plan", LATCHED)
         self._value_publisher = self.create_publisher(OccupancyGrid, "~/value", LATCHED)
         self._diagnostics_publisher = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
+        # In a group of its own: triggers that come while it plans make it plan once more after
+        self._replan = self.create_guard_condition(
+            self._plan_for_active_goal, MutuallyExclusiveCallbackGroup()
+        )
+        # The worker triggers it: a future alone does not wake an executor in another thread.
+        self._wake = self.create_guard_condition(lambda: None)
         self._load_first_model()
         self._map_subscription = self.create_subscription(
             OccupancyGrid, "map", self._on_map, LATCHED
@@ -139,7 +159,10 @@ class PlannerNode(Node):
         self.create_subscription(PoseStamped, "goal_pose", self._on_goal_pose, 10)
         if self.get_parameter("follow_trainer").value:
             self.create_subscription(String, "trainer/model_saved", self._on_model_saved, LATCHED)
-        self.create_service(GetPlan, "~/get_plan", self._on_get_plan)
+        # Reentrant: a request that waits for its field does not keep out the others.
+        self.create_service(
+            GetPlan, "~/get_plan", self._on_get_plan, callback_group=ReentrantCallbackGroup()
+        )
         self.create_service(Trigger, "~/reload_model", self._on_reload_model)
         self.create_timer(LOOK_PERIOD, self._on_look, clock=Clock(clock_type=ClockType.STEADY_TIME))
 
@@ -148,7 +171,7 @@ class PlannerNode(Node):
     def _declare_parameters(self) -> None:
         self.declare_parameter(
             "model",
-            "dilemma",
+            "any_map",
             ParameterDescriptor(
                 description="Name of a shipped model, or path of a model file",
                 additional_constraints="a model that can be loaded; else the one before it stays",
@@ -176,6 +199,14 @@ class PlannerNode(Node):
             ParameterDescriptor(description="Whether unknown cells are free"),
         )
         self.declare_parameter(
+            "priced",
+            False,
+            ParameterDescriptor(
+                description="Whether a free cell is the dearer, the greater its value; an unknown "
+                "one that is free is the dearest. For models that learned prices: any_map"
+            ),
+        )
+        self.declare_parameter(
             "follow_trainer",
             False,
             ParameterDescriptor(
@@ -195,6 +226,7 @@ class PlannerNode(Node):
         self._move_rule = MOVE_RULES[self.get_parameter("move_rule").value]
         self._occupied_threshold: int = self.get_parameter("occupied_threshold").value
         self._allow_unknown: bool = self.get_parameter("allow_unknown").value
+        self._priced: bool = self.get_parameter("priced").value
 
     def _check_parameters(self, parameters: list[Parameter]) -> SetParametersResult:
         for parameter in parameters:
@@ -214,20 +246,22 @@ class PlannerNode(Node):
         self._read_parameters()
         if "model" in names:
             self._use_candidate()
-        if self._map is not None and names & {"occupied_threshold", "allow_unknown"}:
+        if self._map is not None and names & {"occupied_threshold", "allow_unknown", "priced"}:
             self._grid = self._grid_of(self._map)
-        self._plan_for_active_goal()
+        self._replan.trigger()
 
-    def _use_candidate(self) -> None:
+    def _use_candidate(self) -> futures.Future[None]:
+        """Plan with it from now on; return the future of its warming up."""
         self._planner, self._model_file = self._candidate
         self._accept("model")
         self.get_logger().info(f"planning with the model {self._model_file}")
+        return self._worker.submit(_warm_up, self._planner)
 
     def _load_first_model(self) -> None:
         """Load the model if that is possible; without one the node says what is wrong with it."""
         result = self._check_parameters([self.get_parameter("model")])
         if result.successful:
-            self._use_candidate()
+            self._use_candidate().result()
         else:
             self._refuse("model", f"{result.reason}; or set the parameter 'model'")
 
@@ -263,10 +297,12 @@ class PlannerNode(Node):
             f"map of {message.info.width} x {message.info.height} cells of "
             f"{message.info.resolution:.6g} m in frame {message.header.frame_id!r}"
         )
-        self._plan_for_active_goal()
+        self._replan.trigger()
 
     def _grid_of(self, message: OccupancyGrid) -> GridMap:
-        return grid_from_message(message, self._occupied_threshold, self._allow_unknown)
+        return grid_from_message(
+            message, self._occupied_threshold, self._allow_unknown, self._priced
+        )
 
     def _on_initial_pose(self, message: PoseWithCovarianceStamped) -> None:
         try:
@@ -276,17 +312,17 @@ class PlannerNode(Node):
             return
         self._accept("initialpose")
         self._start = PoseStamped(header=message.header, pose=message.pose.pose)
-        self._plan_for_active_goal()
+        self._replan.trigger()
 
     def _on_goal_pose(self, message: PoseStamped) -> None:
         self._goal = message
-        self._plan_for_active_goal()
+        self._replan.trigger()
 
-    def _on_get_plan(
+    async def _on_get_plan(
         self, request: GetPlan.Request, response: GetPlan.Response
     ) -> GetPlan.Response:
         start = request.start if request.start.header.frame_id else self._start
-        response.plan = self._answer(start, request.goal)
+        response.plan, _ = await self._answer(start, request.goal)
         return response
 
     def _frame(self) -> str:
@@ -303,40 +339,49 @@ class PlannerNode(Node):
 
     # Planning
 
-    def _plan_for_active_goal(self) -> None:
+    async def _plan_for_active_goal(self) -> None:
         if self._goal is None:
             return
-        path = self._answer(self._start, self._goal)
+        path, outcome = await self._answer(self._start, self._goal, for_value=True)
         self._plan_publisher.publish(path)
-        if self._grid is not None and self._outcome.field is not None:
-            value = value_message(self._outcome.field, self._grid, path.header)
-            self._value_publisher.publish(value)
-        if self._outcome.succeeded:
-            self.get_logger().info(self._outcome.sentence)
-        if self._outcome.status == INVALID_GOAL:
+        if outcome.value is not None:
+            outcome.value.header = path.header
+            outcome.value.info.map_load_time = path.header.stamp
+            self._value_publisher.publish(outcome.value)
+        if outcome.succeeded:
+            self.get_logger().info(outcome.sentence)
+        if outcome.status == INVALID_GOAL:
             self._goal = None
 
-    def _answer(self, start: PoseStamped | None, goal: PoseStamped) -> Path:
-        """Return the path, or an empty one and say in the log why; the diagnostics tell both."""
-        try:
-            self._outcome = self._plan(start, goal)
-        except RequestError as error:
-            self._outcome = Outcome(error.status, str(error))
-        self._changed = True
-        if not self._outcome.succeeded:
-            self.get_logger().warning(f"no plan: {self._outcome.reason}")
-        stamp = self.get_clock().now().to_msg()
-        header = Header(stamp=stamp, frame_id=self._frame() or goal.header.frame_id)
-        if self._grid is None:
-            return Path(header=header)
-        return path_message(self._outcome.cells, self._grid, header, goal.pose.orientation)
+    async def _answer(
+        self, start: PoseStamped | None, goal: PoseStamped, for_value: bool = False
+    ) -> tuple[Path, Outcome]:
+        """Return the path, or an empty one and say in the log why; the diagnostics tell both.
 
-    def _plan(self, start: PoseStamped | None, goal: PoseStamped) -> Outcome:
+        A path is planned with what is known when this begins, whatever comes while it waits.
+        """
+        grid, frame = self._grid, self._frame()
+        try:
+            outcome = await self._plan(start, goal, for_value)
+        except RequestError as error:
+            outcome = Outcome(error.status, str(error))
+        self._outcome = outcome
+        self._changed = True
+        if not outcome.succeeded:
+            self.get_logger().warning(f"no plan: {outcome.reason}")
+        stamp = self.get_clock().now().to_msg()
+        header = Header(stamp=stamp, frame_id=frame or goal.header.frame_id)
+        if grid is None:
+            return Path(header=header), outcome
+        return path_message(outcome.cells, grid, header, goal.pose.orientation), outcome
+
+    async def _plan(self, start: PoseStamped | None, goal: PoseStamped, for_value: bool) -> Outcome:
         try:
             check_pose("the goal", goal.header, goal.pose, self._frame())
         except ValueError as error:
             raise RequestError(INVALID_GOAL, str(error)) from None
-        if self._grid is None:
+        grid, planner = self._grid, self._planner
+        if grid is None:
             topic = self._map_subscription.topic_name
             refused = f" ({self._refused['map']})" if "map" in self._refused else ""
             raise RequestError(
@@ -348,27 +393,34 @@ class PlannerNode(Node):
                 "the start is unknown; set it on initialpose (in RViz: 2D Pose Estimate), or give "
                 "the request's start with its frame",
             )
-        if self._planner is None:
+        if planner is None:
             raise RequestError(NO_MODEL, f"no model is loaded: {self._refused['model']}")
-        start_cell = self._cell(INVALID_START, "the start", start, self._grid)
-        goal_cell = self._cell(INVALID_GOAL, "the goal", goal, self._grid)
+        start_cell = self._cell(INVALID_START, "the start", start, grid)
+        goal_cell = self._cell(INVALID_GOAL, "the goal", goal, grid)
+        rule = self._move_rule or planner.metadata.move_rule
         began = time.perf_counter()
-        field = self._field(self._planner, self._grid, goal_cell)
+        plan = None
+        if planner.needs_field(grid, start_cell, goal_cell, rule):
+            plan = await self._in_worker(planner.plan, grid, start_cell, goal_cell, rule)
         field_at_hand = time.perf_counter()
-        plan = self._planner.plan(self._grid, start_cell, goal_cell, self._move_rule)
+        if plan is None or plan.cells:  # all that is left is a look, or a walk in a known field
+            plan = planner.plan(grid, start_cell, goal_cell, rule)
         ended = time.perf_counter()
+        value, field = None, planner.known_field(grid, goal_cell, rule)
+        if for_value and field is not None:
+            value = await self._in_worker(value_message, field, grid, Header())
         reason = ""
         if plan.status is not PlanStatus.SUCCEEDED:
             reason = (
                 f"{plan.status.value} (start: {_place(start, start_cell)}; "
                 f"goal: {_place(goal, goal_cell)}; "
-                f"map: {self._grid.width} x {self._grid.height} cells); {REMEDIES[plan.status]}"
+                f"map: {grid.width} x {grid.height} cells); {REMEDIES[plan.status]}"
             )
         return Outcome(
             plan.status.name,
             reason,
             plan.cells,
-            field,
+            value,
             field_ms=1e3 * (field_at_hand - began),
             walk_ms=1e3 * (ended - field_at_hand),
         )
@@ -379,11 +431,19 @@ class PlannerNode(Node):
         except ValueError as error:
             raise RequestError(status, str(error)) from None
 
-    def _field(self, planner: Planner, grid: GridMap, goal: Cell) -> QField | None:
-        try:
-            return planner.q_field(grid, goal, self._move_rule)
-        except ValueError:
-            return None  # `Planner.plan` tells which of the reasons it is
+    def _in_worker(self, function: Callable[..., Any], *arguments: object) -> Future:
+        """Call a function in the worker thread; nothing else of the node is touched there."""
+        future = Future()
+
+        def work() -> None:
+            try:
+                future.set_result(function(*arguments))
+            except Exception as error:  # whatever it is, who waits must hear of it
+                future.set_exception(error)
+            self._wake.trigger()
+
+        self._worker.submit(work)
+        return future
 
     # Diagnostics
 
@@ -432,17 +492,27 @@ class PlannerNode(Node):
         return description
 
 
+def _warm_up(planner: Planner) -> None:
+    """Plan on a tiny map, for code that is compiled or loaded when it is first used."""
+    planner.plan(GridMap(np.zeros((2, 2), dtype=np.bool_)), (0, 0), (1, 1))
+
+
 def _place(stamped: PoseStamped, cell: Cell) -> str:
     position = stamped.pose.position
     return f"({position.x:.6g}, {position.y:.6g}) m in cell ({cell[0]:.6g}, {cell[1]:.6g})"
 
 
-def main() -> int:
+def main() -> NoReturn:
     """Run the planner node until SIGINT or SIGTERM."""
     # A network this small gains nothing from more threads, and a shared machine loses.
     torch.set_num_threads(1)
-    return spin_until_shutdown(PlannerNode)
+    # Garbage among what is imported is not worth 100 ms in which nobody is answered.
+    gc.freeze()
+    exit_code = spin_until_shutdown(PlannerNode)
+    # A field that is being computed cannot be stopped: Python would wait for the thread to end it,
+    # and if it did not, torch would abort the process.
+    os._exit(exit_code)
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    main()

@@ -86,6 +86,17 @@ class Planner:
                 self._fields.move_to_end(key)
             return self._fields.get(key)
 
+    def needs_field(
+        self, grid: GridMap, start: Cell, goal: Cell, move_rule: MoveRule | None = None
+    ) -> bool:
+        """Say whether `plan` takes its time: no field is known, and nothing rules a path out."""
+        return (
+            grid.is_free(start)
+            and grid.is_free(goal)
+            and self.network.supports((grid.height, grid.width))
+            and self.known_field(grid, goal, move_rule) is None
+        )
+
     def _remember(self, grid: GridMap, rule: MoveRule, field: QField) -> None:
         with self._lock:
             self._fields[grid.fingerprint, field.goal, rule] = field
@@ -112,6 +123,7 @@ class Planner:
         Plan
             Every move of its path is legal under the rule, whatever the network says.
         """
+        rule = move_rule or self.metadata.move_rule
         if not grid.contains(start):
             return Plan(PlanStatus.START_OUTSIDE_MAP)
         if not grid.contains(goal):
@@ -122,10 +134,8 @@ class Planner:
             return Plan(PlanStatus.GOAL_OCCUPIED)
         if not self.network.supports((grid.height, grid.width)):
             return Plan(PlanStatus.MAP_SIZE_UNSUPPORTED)
-        rule = move_rule or self.metadata.move_rule
-        known = self.known_field(grid, goal, rule) is not None
         # Where no path leads, there is no need to compute a field to say so.
-        if not known and not _joined(grid, start, goal, rule):
+        if self.needs_field(grid, start, goal, rule) and not _joined(grid, start, goal, rule):
             return Plan(PlanStatus.NO_PATH)
         plan = self.q_field(grid, goal, rule).rollout(start)
         if plan.status is PlanStatus.WALK_TRAPPED and not _joined(grid, start, goal, rule):

@@ -2,10 +2,13 @@ from __future__ import annotations
 
 import array
 import math
+import os
 import re
 import shutil
 import signal
+import threading
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from itertools import pairwise
 from pathlib import Path as FilePath
 from typing import Any
@@ -18,14 +21,16 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped, Quaternion
 from nav_msgs.msg import OccupancyGrid, Path
 from nav_msgs.srv import GetPlan
-from rcl_interfaces.srv import DescribeParameters
+from rcl_interfaces.srv import DescribeParameters, ListParameters
 from std_msgs.msg import Header, String
 from std_srvs.srv import Trigger
 
 from ddqn_planner.grid import Cell, GridMap, MoveRule, legal_moves
+from ddqn_planner.grid.generators import generate_map, random_requests
 from ddqn_planner.model import ModelMetadata, PaperQNetwork, save_model
 from ddqn_planner.nodes.conversions import occupancy_message, quaternion
 from ddqn_planner.nodes.runtime import LATCHED
+from ddqn_planner.planning import shortest_distances
 
 START, GOAL = (0, 0), (5, 5)
 RESOLUTION, ORIGIN = 0.5, (-1.0, 2.0, 0.0)
@@ -112,6 +117,10 @@ class Robot:
 
 def points_of(path: Path) -> list[tuple[float, float]]:
     return [(pose.pose.position.x, pose.pose.position.y) for pose in path.poses]
+
+
+def length_of(path: Path) -> float:
+    return sum(math.dist(*step) for step in pairwise(points_of(path)))
 
 
 def yaw_of(rotation: Quaternion) -> float:
@@ -427,7 +436,14 @@ def test_bad_parameters_are_refused_with_a_reason(robot: Robot) -> None:
 
 
 def test_parameters_say_what_they_are(robot: Robot) -> None:
-    names = ["model", "move_rule", "occupied_threshold", "allow_unknown", "follow_trainer"]
+    names = [
+        "model",
+        "move_rule",
+        "occupied_threshold",
+        "allow_unknown",
+        "priced",
+        "follow_trainer",
+    ]
     request = DescribeParameters.Request(names=names)
     response = robot.client.call(DescribeParameters, "planner/describe_parameters", request)
     assert [entry.name for entry in response.descriptors if entry.description] == names
@@ -563,6 +579,171 @@ def test_unreachable_goal_has_an_empty_plan_until_the_map_opens(robot: Robot) ->
     robot.clear()
     robot.send_map()
     robot.wait_for_path(START, GOAL)
+
+
+# The model for any map, which is there without a parameter
+
+
+def test_without_parameters_it_plans_on_maps_of_any_size_and_heeds_prices(
+    run_node: Any, make_client: Callable[[str], Any], model: FilePath
+) -> None:
+    client, random = make_client("/anywhere"), np.random.default_rng(0)
+    with run_node("planner_node", {}, namespace="/anywhere"):
+        for shape in ((30, 70), (150, 110)):
+            occupancy = generate_map("office", shape, random)
+            ((start, goal),) = random_requests(occupancy, MoveRule.ROBOT_SAFE, 1, random)
+            values = np.where(occupancy, 100, 0).astype(np.int8)
+            robot = Robot(client, values, model, "/anywhere/planner")
+            robot.send_map()
+            robot.send_start(robot.pose(start))
+            robot.send_goal(robot.pose(goal))
+            path = robot.wait_for_path(start, goal)
+            optimum = shortest_distances(robot.grid, goal, MoveRule.ROBOT_SAFE)[start[::-1]]
+            assert length_of(path) == pytest.approx(optimum * RESOLUTION)
+
+        # A wide corridor whose middle is dear: the straight way is short, the ones beside it cheap.
+        values = np.zeros((7, 20), dtype=np.int8)
+        values[2:5, 3:17] = 60
+        robot = Robot(client, values, model, "/anywhere/planner")
+        robot.send_map()
+        straight = robot.get_plan(robot.pose((0, 3)), robot.pose((19, 3)))
+        assert length_of(straight) == pytest.approx(19 * RESOLUTION)
+        assert client.set_parameters("planner", priced=True)[0].successful
+        around = robot.get_plan(robot.pose((0, 3)), robot.pose((19, 3)))
+        check_path(around, robot.grid)
+        cells = [robot.grid.world_to_cell(x, y) for x, y in points_of(around)]
+        assert not any(values[y, x] for x, y in cells)
+
+
+# While a field is computed
+
+
+GATE = """
+import os, time
+from ddqn_planner.model import PaperQNetwork
+
+compute = PaperQNetwork.q_values
+
+def q_values(*arguments):
+    while not os.path.exists({gate!r}):
+        print("a field waits", flush=True)
+        time.sleep(0.01)
+    return compute(*arguments)
+
+PaperQNetwork.q_values = q_values
+"""
+"""What a planner runs first (as its ``sitecustomize``): as slow as a test likes."""
+
+
+@pytest.fixture
+def gate(tmp_path: FilePath, monkeypatch: pytest.MonkeyPatch) -> FilePath:
+    """Return a file without which a planner that is started in the test computes no field."""
+    gate = tmp_path / "gate"
+    gate.touch()
+    (tmp_path / "sitecustomize.py").write_text(GATE.format(gate=str(gate)))
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path), prepend=os.pathsep)
+    return gate
+
+
+@contextmanager
+def robot_before(
+    gate: FilePath, run_node: Any, client: Any, values: np.ndarray, model: FilePath
+) -> Iterator[tuple[Robot, Any]]:
+    """Run a planner that knows the field toward START, its active goal; the gate closes then."""
+    namespace = client.node.get_namespace()
+    with run_node("planner_node", {"model": str(model)}, namespace=namespace) as node:
+        robot = Robot(client, values, model, f"{namespace}/planner")
+        robot.send_map()
+        robot.send_start(robot.pose(START))
+        robot.send_goal(robot.pose(START))
+        robot.wait_for_path(START, START)
+        gate.unlink()
+        yield robot, node
+
+
+def ask_for_plan(robot: Robot, node: Any) -> Any:
+    """Return the future of the plan from START to GOAL, once its field waits at the gate."""
+    client = robot.client.node.create_client(GetPlan, "planner/get_plan")
+    assert client.wait_for_service(30)
+    plan = client.call_async(GetPlan.Request(start=robot.pose(START), goal=robot.pose(GOAL)))
+    node.wait_for_log("a field waits")
+    return plan
+
+
+def test_all_else_is_answered_while_a_field_is_computed(
+    run_node: Any,
+    make_client: Callable[[str], Any],
+    small_values: np.ndarray,
+    model: FilePath,
+    gate: FilePath,
+) -> None:
+    client = make_client("/meanwhile")
+    with robot_before(gate, run_node, client, small_values, model) as (robot, node):
+        plan = ask_for_plan(robot, node)
+        assert len(robot.get_plan(robot.pose(START), robot.pose(START)).poses) == 1
+        outside = changed(robot.pose(START), "pose.position.x", 50.0)
+        assert robot.get_plan(outside, robot.pose((0, 5))).poses == []
+        assert client.get_parameter("planner", "model") == str(model)
+        names = client.call(ListParameters, "planner/list_parameters").result.names
+        request = DescribeParameters.Request(names=names)
+        assert client.call(DescribeParameters, "planner/describe_parameters", request).descriptors
+        assert client.set_parameters("planner", allow_unknown=True)[0].successful
+        assert not client.set_parameters("planner", model="no_model")[0].successful
+        assert client.call(Trigger, "planner/reload_model").success
+        assert not plan.done()
+
+        gate.touch()
+        answered = threading.Event()
+        plan.add_done_callback(lambda _: answered.set())
+        assert answered.wait(30)
+        check_path(plan.result().plan, robot.grid)
+        assert points_of(plan.result().plan)[-1] == pytest.approx(robot.grid.cell_to_world(GOAL))
+
+
+def test_what_comes_while_a_field_is_computed_has_the_last_plan(
+    run_node: Any,
+    make_client: Callable[[str], Any],
+    small_values: np.ndarray,
+    model: FilePath,
+    gate: FilePath,
+) -> None:
+    client = make_client("/superseded")
+    with robot_before(gate, run_node, client, small_values, model) as (robot, node):
+
+        def last_plan() -> Path:
+            robot.get_plan(robot.pose(START), robot.pose(START))  # what came before it is done
+            return client.subscribe(Path, "plan", LATCHED).wait()
+
+        robot.send_goal(robot.pose((0, 5)))
+        node.wait_for_log("a field waits")
+        robot.send_goal(robot.pose(GOAL))
+        robot.send_start(robot.pose((3, 3)))
+        gate.touch()
+        path = robot.wait_for_path((3, 3), GOAL)
+        assert points_of(last_plan()) == points_of(path)
+
+        gate.unlink()
+        robot.send_goal(robot.pose((5, 0)))
+        robot.send_goal(changed(robot.pose(GOAL), "header.frame_id", "odom"))
+        gate.touch()
+        node.wait_for_log("no plan: the goal's frame is 'odom'")
+        assert last_plan().poses == []
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_ends_the_node_while_a_field_is_computed(
+    run_node: Any,
+    make_client: Callable[[str], Any],
+    small_values: np.ndarray,
+    model: FilePath,
+    gate: FilePath,
+    number: signal.Signals,
+) -> None:
+    client = make_client(f"/{number.name.lower()}")
+    with robot_before(gate, run_node, client, small_values, model) as (robot, node):
+        ask_for_plan(robot, node)
+        assert node.stop(number) == 0
+        assert "Traceback" not in node.log
 
 
 # Processes of their own
