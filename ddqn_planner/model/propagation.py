@@ -15,8 +15,9 @@ from ddqn_planner.model.front import spread
 
 FEATURES = 28
 """Length of what `AnyMapQNetwork` sees of a cell."""
-BATCH = 2**16
-"""Surroundings that a network looks at in one go: all of a large map's would need gigabytes."""
+BATCH = 2**12
+"""Surroundings that a network looks at in one go: what it makes of them fits into a cache, where
+all those of a large map would need gigabytes."""
 
 SETTLED = 1e-3
 """Values count as settled when none changes more than this in one repetition."""

@@ -45,7 +45,7 @@ from ddqn_planner.nodes.conversions import (
     value_message,
 )
 from ddqn_planner.nodes.runtime import LATCHED, spin_until_shutdown
-from ddqn_planner.planning import Planner, PlanStatus
+from ddqn_planner.planning import Planner, PlanStatus, QField
 
 MOVE_RULES = {"": None, **{rule.value: rule for rule in MoveRule}}
 
@@ -78,6 +78,9 @@ class RequestError(ValueError):
         self.status = status
 
 
+Target = tuple[Planner, GridMap, Cell, MoveRule]
+
+
 @dataclass(frozen=True)
 class Outcome:
     """What became of a request.
@@ -90,8 +93,8 @@ class Outcome:
         Why there is no path, and what to do; empty if there is one.
     cells : tuple of (x, y)
         The path; empty unless the status is SUCCEEDED.
-    value : nav_msgs/OccupancyGrid, optional
-        The value field in which it was planned, without a header.
+    target : tuple, optional
+        Planner, map, goal and rule of the field in which it was planned, or would have been.
     field_ms, walk_ms : float
         How long it took to get the field, and to walk in it.
     """
@@ -99,7 +102,7 @@ class Outcome:
     status: str
     reason: str
     cells: tuple[Cell, ...] = ()
-    value: OccupancyGrid | None = None
+    target: Target | None = None
     field_ms: float = 0.0
     walk_ms: float = 0.0
 
@@ -134,6 +137,9 @@ class PlannerNode(Node):
         self._planner: Planner | None = None
         self._model_file = ""
         self._worker = futures.ThreadPoolExecutor(1)
+        # A value to look at does not wait for the fields of other requests.
+        self._value_worker = futures.ThreadPoolExecutor(1)
+        self._published_value: tuple[QField, GridMap] | None = None
         self._refused: dict[str, str] = {}
         self._outcome = Outcome(NO_REQUEST, "no plan was asked for yet")
         self._reported = -DIAGNOSTICS_PERIOD
@@ -316,6 +322,7 @@ class PlannerNode(Node):
 
     def _on_goal_pose(self, message: PoseStamped) -> None:
         self._goal = message
+        self._published_value = None
         self._replan.trigger()
 
     async def _on_get_plan(
@@ -342,27 +349,34 @@ class PlannerNode(Node):
     async def _plan_for_active_goal(self) -> None:
         if self._goal is None:
             return
-        path, outcome = await self._answer(self._start, self._goal, for_value=True)
+        path, outcome = await self._answer(self._start, self._goal)
         self._plan_publisher.publish(path)
-        if outcome.value is not None:
-            outcome.value.header = path.header
-            outcome.value.info.map_load_time = path.header.stamp
-            self._value_publisher.publish(outcome.value)
         if outcome.succeeded:
             self.get_logger().info(outcome.sentence)
         if outcome.status == INVALID_GOAL:
             self._goal = None
+        if outcome.target is not None:
+            await self._publish_value(outcome.target, path.header)
 
-    async def _answer(
-        self, start: PoseStamped | None, goal: PoseStamped, for_value: bool = False
-    ) -> tuple[Path, Outcome]:
+    async def _publish_value(self, target: Target, header: Header) -> None:
+        """Publish the value field, once a goal and again when it changes."""
+        planner, grid, goal, rule = target
+        field = planner.known_field(grid, goal, rule)
+        if field is None:
+            field = await self._in_worker(self._worker, planner.q_field, grid, goal, rule)
+        if self._published_value != (field, grid):
+            self._published_value = field, grid
+            value = await self._in_worker(self._value_worker, value_message, field, grid, header)
+            self._value_publisher.publish(value)
+
+    async def _answer(self, start: PoseStamped | None, goal: PoseStamped) -> tuple[Path, Outcome]:
         """Return the path, or an empty one and say in the log why; the diagnostics tell both.
 
         A path is planned with what is known when this begins, whatever comes while it waits.
         """
         grid, frame = self._grid, self._frame()
         try:
-            outcome = await self._plan(start, goal, for_value)
+            outcome = await self._plan(start, goal)
         except RequestError as error:
             outcome = Outcome(error.status, str(error))
         self._outcome = outcome
@@ -375,7 +389,7 @@ class PlannerNode(Node):
             return Path(header=header), outcome
         return path_message(outcome.cells, grid, header, goal.pose.orientation), outcome
 
-    async def _plan(self, start: PoseStamped | None, goal: PoseStamped, for_value: bool) -> Outcome:
+    async def _plan(self, start: PoseStamped | None, goal: PoseStamped) -> Outcome:
         try:
             check_pose("the goal", goal.header, goal.pose, self._frame())
         except ValueError as error:
@@ -401,14 +415,14 @@ class PlannerNode(Node):
         began = time.perf_counter()
         plan = None
         if planner.needs_field(grid, start_cell, goal_cell, rule):
-            plan = await self._in_worker(planner.plan, grid, start_cell, goal_cell, rule)
+            plan = await self._in_worker(
+                self._worker, planner.plan, grid, start_cell, goal_cell, rule
+            )
         field_at_hand = time.perf_counter()
         if plan is None or plan.cells:  # all that is left is a look, or a walk in a known field
             plan = planner.plan(grid, start_cell, goal_cell, rule)
         ended = time.perf_counter()
-        value, field = None, planner.known_field(grid, goal_cell, rule)
-        if for_value and field is not None:
-            value = await self._in_worker(value_message, field, grid, Header())
+        has_field = grid.is_free(goal_cell) and planner.network.supports((grid.height, grid.width))
         reason = ""
         if plan.status is not PlanStatus.SUCCEEDED:
             reason = (
@@ -420,7 +434,7 @@ class PlannerNode(Node):
             plan.status.name,
             reason,
             plan.cells,
-            value,
+            (planner, grid, goal_cell, rule) if has_field else None,
             field_ms=1e3 * (field_at_hand - began),
             walk_ms=1e3 * (ended - field_at_hand),
         )
@@ -431,8 +445,13 @@ class PlannerNode(Node):
         except ValueError as error:
             raise RequestError(status, str(error)) from None
 
-    def _in_worker(self, function: Callable[..., Any], *arguments: object) -> Future:
-        """Call a function in the worker thread; nothing else of the node is touched there."""
+    def _in_worker(
+        self,
+        worker: futures.ThreadPoolExecutor,
+        function: Callable[..., Any],
+        *arguments: object,
+    ) -> Future:
+        """Call a function in a worker thread; nothing else of the node is touched there."""
         future = Future()
 
         def work() -> None:
@@ -442,7 +461,7 @@ class PlannerNode(Node):
                 future.set_exception(error)
             self._wake.trigger()
 
-        self._worker.submit(work)
+        worker.submit(work)
         return future
 
     # Diagnostics
