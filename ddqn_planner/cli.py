@@ -62,10 +62,46 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="ddqn-planner", description=__doc__)
     commands = parser.add_subparsers(
-        required=True, metavar="plan|train|train-any-map|reproduce|evaluate"
+        required=True, metavar="plan|train|train-any-map|evaluate|reproduce"
     )
+    _add_plan(commands.add_parser("plan", help="plan a path on a map file"))
+    for name, add, words, description in (
+        (
+            "train",
+            _add_train,
+            "train a model on a map file",
+            "Trains into a folder. The same command again goes on where it stopped.",
+        ),
+        (
+            "train-any-map",
+            _add_train_any_map,
+            "train a model for any map on random maps",
+            "Trains into a folder, on small random maps. The same command again goes on where it "
+            "stopped. Under torchrun all processes train one model, each on maps of its own.",
+        ),
+        (
+            "evaluate",
+            _add_evaluate,
+            "measure a model on maps that it never saw",
+            "Walks from random starts to random goals, and compares with the exact optimum and "
+            "with scipy's Dijkstra: on generated maps, or on those of benchmarks.",
+        ),
+        (
+            "reproduce",
+            _add_reproduce,
+            "train and measure the paper's experiments",
+            "Trains with many seeds, and writes tables, figures and a report. The same command "
+            "again goes on where it stopped.",
+        ),
+    ):
+        defaults = argparse.ArgumentDefaultsHelpFormatter
+        add(
+            commands.add_parser(name, help=words, description=description, formatter_class=defaults)
+        )
+    return parser
 
-    plan = commands.add_parser("plan", help="plan a path on a map file")
+
+def _add_plan(plan: argparse.ArgumentParser) -> None:
     _add_map_arguments(plan)
     plan.add_argument("--model", default="any_map", help="name or file (%(default)s)")
     plan.add_argument("--move-rule", choices=MOVE_RULES, help="the model's by default")
@@ -73,12 +109,8 @@ def _parser() -> argparse.ArgumentParser:
     plan.add_argument("--picture", type=Path, metavar="FILE", help="draw map, value and path")
     plan.set_defaults(command=_plan)
 
-    train = commands.add_parser(
-        "train",
-        help="train a model on a map file",
-        description="Trains into a folder. The same command again goes on where it stopped.",
-        formatter_class=argparse.ArgumentDefaultsHelpFormatter,
-    )
+
+def _add_train(train: argparse.ArgumentParser) -> None:
     _add_map_arguments(train)
     train.add_argument("--out", type=Path, default=Path("runs/train"), help="folder of the run")
     train.add_argument(
@@ -87,65 +119,42 @@ def _parser() -> argparse.ArgumentParser:
     _add_training_arguments(train, HyperParameters())
     train.set_defaults(command=_train)
 
-    train_any_map = commands.add_parser(
-        "train-any-map",
-        help="train a model for any map on random maps",
-        description="Trains into a folder, on small random maps. The same command again goes on "
-        "where it stopped. Under torchrun all processes train one model, each on maps of its own.",
-        formatter_class=argparse.ArgumentDefaultsHelpFormatter,
-    )
-    train_any_map.add_argument(
-        "--out", type=Path, default=Path("runs/any_map"), help="folder of the run"
-    )
-    train_any_map.add_argument("--maps", type=int, default=MAPS, metavar="N", help="to train on")
-    _add_training_arguments(train_any_map, ANY_MAP)
-    train_any_map.set_defaults(command=_train_any_map)
 
-    reproduce = commands.add_parser(
-        "reproduce",
-        help="train and measure the paper's experiments",
-        description="Trains with many seeds, and writes tables, figures and a report. The same "
-        "command again goes on where it stopped.",
-        formatter_class=argparse.ArgumentDefaultsHelpFormatter,
-    )
-    reproduce.add_argument("--experiment", choices=[*EXPERIMENTS, "all"], default="all", help="one")
-    reproduce.add_argument("--seeds", type=int, default=5, metavar="N", help="trainings of a kind")
-    reproduce.add_argument(
-        "--out", type=Path, default=Path("runs/reproduce"), help="folder of trainings and report"
-    )
-    reproduce.add_argument(
-        "--quick", action="store_true", help="run it too briefly to learn, into the folder quick"
-    )
-    reproduce.set_defaults(command=_reproduce)
+def _add_train_any_map(train: argparse.ArgumentParser) -> None:
+    train.add_argument("--out", type=Path, default=Path("runs/any_map"), help="folder of the run")
+    train.add_argument("--maps", type=int, default=MAPS, metavar="N", help="to train on")
+    _add_training_arguments(train, ANY_MAP)
+    train.set_defaults(command=_train_any_map)
 
-    evaluate = commands.add_parser(
-        "evaluate",
-        help="measure a model on maps that it never saw",
-        description="Walks from random starts to random goals, and compares with the exact "
-        "optimum and with scipy's Dijkstra: on generated maps, or on those of benchmarks.",
-        formatter_class=argparse.ArgumentDefaultsHelpFormatter,
-    )
-    evaluate.add_argument("--model", default="any_map", help="name or file")
-    evaluate.add_argument(
-        "--move-rule", choices=MOVE_RULES, default="robot_safe", help="of the robot"
-    )
-    evaluate.add_argument(
+
+def _add_evaluate(evaluate: argparse.ArgumentParser) -> None:
+    add = evaluate.add_argument
+    add("--model", default="any_map", help="name or file")
+    add("--move-rule", choices=MOVE_RULES, default="robot_safe", help="of the robot")
+    add(
         "--data",
         type=Path,
         metavar="FOLDER",
         help="of MovingAI .map and .scen, MPD .npz, ROS .yaml, in place of generated maps",
     )
-    evaluate.add_argument("--kinds", nargs="+", choices=KINDS, default=[*KINDS], help="generated")
-    evaluate.add_argument(
-        "--sizes", nargs="+", type=int, default=[32, 64, 128, 256], help="sides, cells"
-    )
-    evaluate.add_argument("--maps", type=int, default=3, metavar="N", help="of a kind and size")
-    evaluate.add_argument("--requests", type=int, default=200, metavar="N", help="of a map")
-    evaluate.add_argument("--priced", choices=PRICES, default="none", help="costs of free cells")
-    evaluate.add_argument("--seed", type=int, default=0, help="of maps and requests")
-    evaluate.add_argument("--out", type=Path, metavar="FILE", help=".md or .csv, for the tables")
+    add("--kinds", nargs="+", choices=KINDS, default=[*KINDS], help="generated")
+    add("--sizes", nargs="+", type=int, default=[32, 64, 128, 256], help="sides, cells")
+    add("--maps", type=int, default=3, metavar="N", help="of a kind and size")
+    add("--requests", type=int, default=200, metavar="N", help="of a map")
+    add("--priced", choices=PRICES, default="none", help="costs of free cells")
+    add("--seed", type=int, default=0, help="of maps and requests")
+    add("--out", type=Path, metavar="FILE", help=".md or .csv, for the tables")
     evaluate.set_defaults(command=_evaluate)
-    return parser
+
+
+def _add_reproduce(reproduce: argparse.ArgumentParser) -> None:
+    add = reproduce.add_argument
+    add("--experiment", choices=[*EXPERIMENTS, "all"], default="all", help="one")
+    add("--seeds", type=int, default=5, metavar="N", help="trainings of a kind")
+    out = Path("runs/reproduce")
+    add("--out", type=Path, default=out, help="folder of trainings and report")
+    add("--quick", action="store_true", help="run it too briefly to learn, into the folder quick")
+    reproduce.set_defaults(command=_reproduce)
 
 
 def _add_map_arguments(parser: argparse.ArgumentParser) -> None:

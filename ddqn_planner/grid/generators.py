@@ -13,7 +13,7 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import minimum_spanning_tree
 
 from ddqn_planner.grid.grid_map import Cell
-from ddqn_planner.grid.moves import MoveRule
+from ddqn_planner.grid.moves import MoveRule, component_labels
 
 Occupancy: TypeAlias = NDArray[np.bool_]
 """(H, W) bool, True where a cell is occupied."""
@@ -284,13 +284,8 @@ def random_requests(
     ValueError
         If no two free cells are joined.
     """
-    # As in connected_cells: where a diagonal move needs both side cells free, two straight moves
-    # do the same.
-    diagonals = 2 if move_rule.cuts_corners else 1
-    structure = scipy.ndimage.generate_binary_structure(2, diagonals)
-    labels, _ = scipy.ndimage.label(~occupancy, structure)
     cells = np.flatnonzero(~occupancy)
-    label_of_cell = labels.ravel()[cells]
+    label_of_cell = component_labels(occupancy, move_rule).ravel()[cells]
     order = np.argsort(label_of_cell, kind="stable")
     cells, label_of_cell = cells[order], label_of_cell[order]
     sizes = np.bincount(label_of_cell)

@@ -117,12 +117,29 @@ def connected_cells(
     (H, W) bool
         True at each free cell from which a path of legal moves leads to `cell`, itself included.
     """
+    labels = component_labels(occupancy, move_rule)
+    connected: NDArray[np.bool_] = labels == labels[cell[1], cell[0]]
+    return connected
+
+
+def component_labels(occupancy: NDArray[np.bool_], move_rule: MoveRule) -> NDArray[np.int32]:
+    """Return which part of the map each cell belongs to: no path leads from one to another.
+
+    Parameters
+    ----------
+    occupancy : (H, W) bool
+    move_rule : MoveRule
+
+    Returns
+    -------
+    (H, W) int32
+        1 or more for the free cells, the same for all that paths join; 0 for the occupied ones.
+    """
     # Where a diagonal move needs both side cells free, two straight moves do the same.
     diagonals = 2 if move_rule.cuts_corners else 1
     structure = scipy.ndimage.generate_binary_structure(2, diagonals)
-    labels, _ = scipy.ndimage.label(~occupancy, structure)
-    connected: NDArray[np.bool_] = labels == labels[cell[1], cell[0]]
-    return connected
+    labels: NDArray[np.int32] = scipy.ndimage.label(~occupancy, structure)[0]
+    return labels
 
 
 def path_length(cells: Sequence[tuple[int, int]]) -> float:

@@ -12,13 +12,7 @@ from torch import Tensor, nn
 from ddqn_planner.grid import LENGTHS, OCCUPIED
 from ddqn_planner.model import PaperQNetwork
 from ddqn_planner.model.observation import observe
-from ddqn_planner.model.propagation import (
-    FEATURES,
-    features,
-    neighbours,
-    propagate,
-    surroundings,
-)
+from ddqn_planner.model.propagation import features, neighbours, propagate, surroundings
 from ddqn_planner.training.environment import GridVectorEnvironment
 
 
@@ -88,100 +82,77 @@ class PropagationLearner:
     def __init__(self, environment: GridVectorEnvironment) -> None:
         self.sizes = {"filters": environment.parameters.filters}
         self._environment = environment
-        seen_SC9 = [
-            surroundings(scenario.grid.occupancy, None) for scenario in environment.scenarios
-        ]
-        self._surroundings_SC9 = (np.stack(seen_SC9) == OCCUPIED).astype(np.float32)
+        self._seen_SCF = np.stack(self._see())
         self._neighbours_AC = neighbours(environment.shape)
-        self._return_SCA = np.zeros((*self._surroundings_SC9.shape[:2], 8), dtype=np.float32)
+        self._beyond_SCA = np.zeros((*self._seen_SCF.shape[:2], 8), dtype=np.float32)
+
+    def _see(self) -> list[NDArray[np.float32]]:
+        maps = [scenario.grid.occupancy for scenario in self._environment.scenarios]
+        return [(surroundings(map_, None) == OCCUPIED).astype(np.float32) for map_ in maps]
 
     def states(self, scenario: NDArray[np.int64], cell: NDArray[np.int64]) -> Tensor:
-        """Return the surroundings and r + γ V(s') of each action: (B, 9 + 8)."""
+        """Return what is seen of the cells, and what lies beyond each action: (B, F + 8)."""
         at = (scenario, cell)
-        seen_BF = np.concatenate([self._surroundings_SC9[at], self._return_SCA[at]], axis=1)
-        return torch.from_numpy(seen_BF)
+        return torch.from_numpy(np.concatenate([self._seen_SCF[at], self._beyond_SCA[at]], axis=1))
 
     def q(self, network: nn.Module, state_B: Tensor) -> Tensor:
         """Return Q(s, a) = p (r + γ V(s')) + (1 - p) r_o: (B, 8)."""
-        p_BA: Tensor = network(state_B[:, :9])
+        seen_BF, return_BA = state_B[:, :-8], state_B[:, -8:]
+        p_BA: Tensor = network(seen_BF)
         collision = self._environment.parameters.obstacle_reward
-        return collision + p_BA * (state_B[:, 9:] - collision)
+        return collision + p_BA * (return_BA - collision)
 
     def copy_target(self, target: nn.Module) -> None:
         """Settle V on every map under the new target network."""
         with torch.inference_mode():
-            success_SCA = target(torch.from_numpy(self._surroundings_SC9)).numpy()
-        environment = self._environment
+            p_SCA = target(torch.from_numpy(self._seen_SCF)).numpy()
+        self._settle(p_SCA, self._environment.free_reward)
+
+    def _settle(self, p_SCA: NDArray[np.float32], reward_SAC: NDArray[np.float32]) -> None:
+        """Let r + γ V(s') lie beyond."""
         return_SAC = propagate(
-            success_SCA.transpose(0, 2, 1),
-            environment.free_reward,
-            environment.goal,
+            p_SCA.transpose(0, 2, 1),
+            reward_SAC,
+            self._environment.goal,
             self._neighbours_AC,
-            environment.parameters.gamma,
-            environment.parameters.obstacle_reward,
+            self._environment.parameters.gamma,
+            self._environment.parameters.obstacle_reward,
         )
-        self._return_SCA = np.ascontiguousarray(return_SAC.transpose(0, 2, 1))
+        self._beyond_SCA = np.ascontiguousarray(return_SAC.transpose(0, 2, 1))
 
 
-class AnyMapLearner:
-    """The network for any map sees its features of the robot's cell, and the values beyond it.
+class AnyMapLearner(PropagationLearner):
+    """The network for any map answers with the reward of each move as well.
 
-    As for `PropagationLearner`, but the network answers with the reward of each move as well. What
-    lies beyond is γ V(s').
-
-    Parameters
-    ----------
-    environment : GridVectorEnvironment
+    So what lies beyond is γ V(s') alone.
     """
 
-    def __init__(self, environment: GridVectorEnvironment) -> None:
-        self.sizes = {"filters": environment.parameters.filters}
-        self._environment = environment
-        self._features_SCF = np.stack(
-            [
-                features(surroundings(s.grid.occupancy, s.grid.cost), rule)
-                for s, rule in zip(environment.scenarios, environment.move_rules, strict=True)
-            ]
-        )
-        self._lengths = torch.from_numpy(LENGTHS.astype(np.float32))
-        self._neighbours_AC = neighbours(environment.shape)
-        self._beyond_SCA = np.zeros((*self._features_SCF.shape[:2], 8), dtype=np.float32)
+    _lengths = torch.from_numpy(LENGTHS.astype(np.float32))
 
-    def states(self, scenario: NDArray[np.int64], cell: NDArray[np.int64]) -> Tensor:
-        """Return the features and γ V(s') of each action: (B, 28 + 8)."""
-        at = (scenario, cell)
-        seen_BF = np.concatenate([self._features_SCF[at], self._beyond_SCA[at]], axis=1)
-        return torch.from_numpy(seen_BF)
+    def _see(self) -> list[NDArray[np.float32]]:
+        environment = self._environment
+        return [
+            features(surroundings(scenario.grid.occupancy, scenario.grid.cost), rule)
+            for scenario, rule in zip(environment.scenarios, environment.move_rules, strict=True)
+        ]
 
     def q(self, network: nn.Module, state_B: Tensor) -> Tensor:
         """Return Q(s, a) = p (r + γ V(s')) + (1 - p) r_o with r = -length times price: (B, 8)."""
-        p_BA, price_BA = network(state_B[:, :FEATURES])
+        p_BA, price_BA = network(state_B[:, :-8])
         collision = self._environment.parameters.obstacle_reward
-        q_BA: Tensor = collision + p_BA * (
-            state_B[:, FEATURES:] - self._lengths * price_BA - collision
-        )
+        q_BA: Tensor = collision + p_BA * (state_B[:, -8:] - self._lengths * price_BA - collision)
         return q_BA
 
     def copy_target(self, target: nn.Module) -> None:
         """Settle V on every map under the new target network."""
         with torch.inference_mode():
-            p_SCA, price_SCA = target(torch.from_numpy(self._features_SCF))
-        parameters = self._environment.parameters
-        reward_SAC = -(self._lengths * price_SCA).numpy().transpose(0, 2, 1)
-        return_SAC = propagate(
-            p_SCA.numpy().transpose(0, 2, 1),
-            reward_SAC,
-            self._environment.goal,
-            self._neighbours_AC,
-            parameters.gamma,
-            parameters.obstacle_reward,
-        )
-        self._beyond_SCA = np.ascontiguousarray((return_SAC - reward_SAC).transpose(0, 2, 1))
+            p_SCA, price_SCA = target(torch.from_numpy(self._seen_SCF))
+            reward_SCA = -(self._lengths * price_SCA).numpy()
+        self._settle(p_SCA.numpy(), reward_SCA.transpose(0, 2, 1))
+        self._beyond_SCA -= reward_SCA
 
 
-Learners = type[PaperLearner] | type[PropagationLearner] | type[AnyMapLearner]
-
-LEARNERS: Final[dict[str, Learners]] = {
+LEARNERS: Final[dict[str, type[PaperLearner] | type[PropagationLearner]]] = {
     "paper": PaperLearner,
     "propagation": PropagationLearner,
     "any_map": AnyMapLearner,
