@@ -5,15 +5,17 @@ import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
-from strategies import grids_with_free_cell
+from strategies import grids_with_free_cell, priced_grids_with_free_cell
 
 from ddqn_planner import GridMap, MoveRule, Planner, PlanStatus, QField
 from ddqn_planner.grid import LENGTHS, MOVES, Cell, legal_moves
 from ddqn_planner.model import ModelMetadata, PaperQNetwork
 from ddqn_planner.planning import shortest_distances
 from ddqn_planner.planning.evaluation import evaluate
+from ddqn_planner.planning.planner import MAX_FIELDS
 
 RULES = st.sampled_from(list(MoveRule))
+ANY_MAP = Planner.load("any_map")
 
 
 def perfect_field(grid: GridMap, goal: Cell, rule: MoveRule) -> QField:
@@ -133,3 +135,69 @@ def test_the_shipped_model_finds_the_papers_path(paper) -> None:  # type: ignore
     plan = planner.plan(paper.grid, paper.start, paper.goal)
     assert plan.length == pytest.approx(6 + 12 * 2**0.5)
     assert planner.metadata.map_fingerprint == paper.grid.fingerprint
+
+
+@pytest.mark.parametrize("rule", MoveRule)
+def test_the_model_for_any_map_judges_every_move_in_all_surroundings_rightly(
+    rule: MoveRule,
+) -> None:
+    network = Planner.load("any_map").network
+    every = np.arange(2**9)[:, None] >> np.arange(9) & 1
+    for cells in every[every[:, 4] == 0].astype(bool):
+        grid = GridMap(cells.reshape(3, 3))
+        # A move counts as possible where it leads on: from the centre to each goal beside it.
+        legal = legal_moves(grid.occupancy, rule)[:, 1, 1]
+        for action, (dx, dy) in enumerate(MOVES.tolist()):
+            goal = (1 + dx, 1 + dy)
+            if legal[action]:
+                q = network.q_values(grid, goal, rule)[:, 1, 1]
+                assert q[action] == pytest.approx(-rule.lengths[action], abs=0.01)
+                assert not np.isfinite(q[~legal]).any()
+
+
+@given(grids_with_free_cell(), RULES)
+def test_the_model_for_any_map_solves_every_start_at_the_optimum(
+    grid_and_goal: tuple[GridMap, Cell], rule: MoveRule
+) -> None:
+    grid, goal = grid_and_goal
+    field = ANY_MAP.q_field(grid, goal, rule)
+    evaluation = evaluate(field.unmasked(), grid, rule)
+    assert evaluation.solved == evaluation.starts
+    if evaluation.starts:
+        assert evaluation.worst_ratio < 1.01
+
+
+@given(priced_grids_with_free_cell(), RULES)
+def test_the_model_for_any_map_heeds_prices(
+    grid_and_goal: tuple[GridMap, Cell], rule: MoveRule
+) -> None:
+    grid, goal = grid_and_goal
+    evaluation = evaluate(ANY_MAP.q_field(grid, goal, rule).unmasked(), grid, rule)
+    assert evaluation.solved == evaluation.starts
+    if evaluation.starts:
+        assert evaluation.worst_ratio < 1.02
+
+
+def test_where_no_path_leads_no_field_is_computed_to_say_so() -> None:
+    occupancy = np.zeros((3, 3), dtype=bool)
+    occupancy[:, 1] = True
+    grid, planner = GridMap(occupancy), random_planner(3, 3, 0)
+    assert planner.needs_field(grid, (0, 0), (2, 2))
+    assert planner.plan(grid, (0, 0), (2, 2)).status is PlanStatus.NO_PATH
+    assert planner.known_field(grid, (2, 2)) is None
+    planner.q_field(grid, (2, 2))
+    assert not planner.needs_field(grid, (0, 0), (2, 2))
+    assert planner.plan(grid, (0, 0), (2, 2)).status is PlanStatus.NO_PATH
+
+
+def test_the_fields_that_are_kept_are_bounded_in_number_and_memory(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    planner, grid = random_planner(3, 3, 0), GridMap(np.zeros((3, 3)))
+    for goal in grid.free_cells():
+        planner.q_field(grid, goal)
+    known = [goal for goal in grid.free_cells() if planner.known_field(grid, goal)]
+    assert known == grid.free_cells()[-MAX_FIELDS:]
+    monkeypatch.setattr("ddqn_planner.planning.planner.MAX_FIELD_BYTES", 1)
+    planner.q_field(GridMap(np.zeros((3, 3)), cost=np.ones((3, 3), np.int8)), (0, 0))
+    assert not any(planner.known_field(grid, goal) for goal in grid.free_cells())
