@@ -29,11 +29,20 @@ def small_map(small: Scenario, tmp_path: Path) -> str:
 
 
 def test_plan_prints_the_papers_path(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["plan", "dilemma"]) == 0
+    assert main(["plan", "dilemma", "--model", "dilemma"]) == 0
     printed = capsys.readouterr().out
     assert "length 22.97 cells, optimum 22.97 under corner_cutting" in printed
     assert printed.count("*") == 17
     assert printed.count("S") == printed.count("G") == 1
+
+
+def test_plan_takes_the_model_for_any_map_and_prints_no_wide_map(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    assert main(["plan", "office"]) == 0
+    printed = capsys.readouterr().out
+    assert "length 789.95 cells, optimum 789.95 under robot_safe" in printed
+    assert "#" not in printed
 
 
 def test_plan_writes_json_and_a_picture(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
