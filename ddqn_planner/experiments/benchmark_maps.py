@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from tqdm import tqdm
 
-from ddqn_planner.grid import Cell, GridMap, MoveRule, connected_cells, read_map_file
+from ddqn_planner.grid import UNKNOWN, Cell, GridMap, MoveRule, connected_cells, read_map_file
 from ddqn_planner.grid.generators import (
     generate_map,
     gradient_costs,
@@ -23,11 +23,14 @@ from ddqn_planner.grid.generators import (
     random_requests,
 )
 
-PRICES: Final = ("none", "random", "gradient", "inflated")
+PRICES: Final = ("none", "random", "gradient", "inflated", "unknown")
 """Which costs the free cells get."""
 
 INFLATION_RADIUS = 5.0
 """How far the cost of an obstacle reaches, cells."""
+
+UNKNOWN_SHARE = 0.2
+"""Of the free cells, where these are unknown."""
 
 GOALS = 10
 """Goals that the requests of a generated map share: each needs a field and exact distances."""
@@ -88,6 +91,9 @@ class RequestSettings:
             return GridMap(occupancy, cost=gradient_costs(occupancy, random))
         if self.priced == "inflated":
             return GridMap(occupancy, cost=inflated_costs(occupancy, INFLATION_RADIUS))
+        if self.priced == "unknown":
+            unknown = random.random(occupancy.shape) < UNKNOWN_SHARE
+            return GridMap(occupancy, cost=np.where(unknown, np.int8(UNKNOWN), np.int8(0)))
         return GridMap(occupancy)
 
 

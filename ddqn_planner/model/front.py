@@ -5,11 +5,24 @@ Dimensions: A = 8 actions, C = H * W cells (cell y * W + x), K kinds of cells.
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from typing import Any
+
 import numba
 import numpy as np
 from numpy.typing import NDArray
 
 from ddqn_planner.grid import MOVES, Cell
+
+
+def compiled(function: Callable[..., Any]) -> Callable[..., Any]:
+    """Compile a function on its first call, and keep the code for other processes if possible."""
+    try:
+        keeping: Callable[..., Any] = numba.njit(cache=True, nogil=True)(function)
+        return keeping
+    except RuntimeError:  # no folder that may be written: each process compiles it anew
+        forgetting: Callable[..., Any] = numba.njit(nogil=True)(function)
+        return forgetting
 
 
 def spread(
@@ -47,7 +60,7 @@ def spread(
     return q
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def _distances(kind, cost_KA, goal, offsets):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Return the least cost from each cell of a padded map to the goal: (C,) float64."""
     dearest = 1.0
@@ -98,7 +111,7 @@ def _distances(kind, cost_KA, goal, offsets):  # type: ignore[no-untyped-def]  #
     return distance
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def _q(kind, cost_KA, distance, moves):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Return Q of the cells inside a padded map: (8, H, W) float32."""
     height, width = kind.shape[0] - 2, kind.shape[1] - 2

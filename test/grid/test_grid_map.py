@@ -8,7 +8,7 @@ from hypothesis import assume, given
 from hypothesis import strategies as st
 from strategies import occupancies
 
-from ddqn_planner.grid import GridMap
+from ddqn_planner.grid import UNKNOWN, GridMap
 
 origins = st.tuples(
     st.floats(-100, 100), st.floats(-100, 100), st.floats(-2 * math.pi, 2 * math.pi)
@@ -88,8 +88,24 @@ def test_occupancy_values_are_cut_at_the_threshold(
         ((np.zeros((1, 1)), math.nan), "resolution"),
         ((np.zeros((1, 1)), 1.0, (0.0, math.inf, 0.0)), "origin"),
         ((np.zeros((1, 1)), 1.0, (0.0, 0.0)), "origin"),
+        ((np.zeros((1, 1)), 1.0, (0.0, 0.0, 0.0), np.zeros((1, 2))), "cost has shape"),
+        ((np.zeros((1, 1)), 1.0, (0.0, 0.0, 0.0), np.full((1, 1), -2)), "-2"),
+        ((np.zeros((1, 1)), 1.0, (0.0, 0.0, 0.0), np.full((1, 1), 101)), "101"),
     ],
 )
 def test_a_malformed_map_is_refused_by_name(arguments: tuple, named: str) -> None:
     with pytest.raises(ValueError, match=named):
         GridMap(*arguments)
+
+
+def test_priced_free_cells_keep_their_values_and_are_the_dearer_the_greater_these_are() -> None:
+    values = np.array([[0, 1, 64, 65, 100, -1, -7]], dtype=np.int8)
+    plain = GridMap.from_occupancy_values(values, allow_unknown=True)
+    assert plain.cost is None
+    assert (plain.price == 1).all()
+    priced = GridMap.from_occupancy_values(values, allow_unknown=True, priced=True)
+    assert priced.cost is not None
+    assert priced.cost.tolist() == [[0, 1, 64, 0, 0, UNKNOWN, UNKNOWN]]
+    assert priced.price[0, [0, 1, 2, 5, 6]] == pytest.approx([1, 1.04, 3.56, 5, 5])
+    assert priced.fingerprint != plain.fingerprint
+    assert priced.fingerprint == GridMap(priced.occupancy, cost=priced.cost).fingerprint

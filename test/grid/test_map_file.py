@@ -139,6 +139,13 @@ def test_a_saved_map_comes_back_the_same(
     )
 
 
+def test_a_saved_grid_keeps_its_costs(tmp_path: Path) -> None:
+    grid = GridMap(np.array([[0, 1, 0]]), cost=np.array([[7, 0, 64]], dtype=np.int8))
+    save_map(grid, tmp_path / "saved.yaml")
+    assert load_map(tmp_path / "saved.yaml", priced=True).fingerprint == grid.fingerprint
+    assert load_map(tmp_path / "saved.yaml").cost is None
+
+
 @same_folder
 @given(occupancies)
 def test_a_saved_grid_comes_back_the_same(tmp_path: Path, occupancy: np.ndarray) -> None:

@@ -8,7 +8,7 @@ from hypothesis.extra import numpy as numpy_st
 from strategies import priced_grids_with_free_cell
 
 from ddqn_planner.grid import MOVES, Cell, GridMap, MoveRule, legal_moves, move_costs
-from ddqn_planner.model.front import spread
+from ddqn_planner.model.front import compiled, spread
 from ddqn_planner.planning import shortest_distances
 
 KINDS = numpy_st.arrays(
@@ -66,3 +66,13 @@ def test_values_keep_their_sense_at_any_distance() -> None:
     free = ~occupancy
     free[500, 0] = False
     assert (np.sort(q[:, free], axis=0)[-1] > np.sort(q[:, free], axis=0)[-2] + 0.5).all()
+
+
+def test_where_no_folder_may_be_written_code_is_compiled_all_the_same(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def nowhere(*_: object) -> None:
+        raise RuntimeError("cannot cache function: no locator available")
+
+    monkeypatch.setattr("numba.core.dispatcher.Dispatcher.enable_caching", nowhere)
+    assert compiled(lambda x: x + 1)(1) == 2
