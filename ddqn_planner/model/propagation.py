@@ -90,8 +90,8 @@ class AnyMapQNetwork(nn.Module):
 
     As for `PropagationQNetwork`, Q(s, a) = p(s, a) (r(s, a) + γ V(s')) + (1 - p(s, a)) r_o. But it
     learns the reward of a move too, r = -length times price(s, a), and sees the costs of the 3x3
-    cells around the robot beside the obstacles, which of them are unknown, and the move rule. That
-    a move costs its length at least is structure.
+    cells around the robot beside the obstacles, which of them are unknown, and the move rule. The
+    price is one linear layer of what it sees. That a move costs its length at least is structure.
 
     Parameters
     ----------
