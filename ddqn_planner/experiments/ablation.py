@@ -10,7 +10,8 @@ import numpy as np
 from ddqn_planner.experiments import goal_1
 from ddqn_planner.experiments.figures import Curve, draw_curves, save
 from ddqn_planner.experiments.profiles import PROFILES, VARIANTS
-from ddqn_planner.experiments.report import Settings, share_curve, table
+from ddqn_planner.experiments.report import Settings, share_curve
+from ddqn_planner.experiments.tables import table
 from ddqn_planner.experiments.trainings import Training
 from ddqn_planner.files import write_csv
 

@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 
 from ddqn_planner.experiments import goal_3
 from ddqn_planner.experiments.profiles import MOVE_RULE
-from ddqn_planner.experiments.report import Settings, mean, spread, table
+from ddqn_planner.experiments.report import Settings, mean, spread
+from ddqn_planner.experiments.tables import table
 from ddqn_planner.experiments.trainings import Training, solved, walk_from_starts
 from ddqn_planner.files import write_csv
 from ddqn_planner.grid import MAX_PRICE, MOVES, OCCUPIED, UNKNOWN, GridMap, MoveRule, legal_moves

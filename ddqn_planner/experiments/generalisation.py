@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ddqn_planner.experiments.benchmark_maps import BenchmarkMap
+from ddqn_planner.experiments.tables import table
 from ddqn_planner.files import write_atomically, write_csv
 from ddqn_planner.grid import MOVES, Cell, GridMap, MoveRule, legal_moves, path_cost
 from ddqn_planner.planning import Planner, QField, shortest_distances
@@ -22,6 +23,21 @@ OPTIMAL = 1 + 1e-6
 
 AGREES = 1e-4
 """Relative; the files of benchmarks give six digits at least."""
+
+COLUMNS = (
+    "maps",
+    "requests",
+    "success",
+    "any move",
+    "optimal",
+    "mean",
+    "worst",
+    "illegal",
+    "field ms",
+    "Dijkstra ms",
+    "field/Dijkstra",
+    "path ms",
+)
 
 FIRST_GROUP_END = 16
 """Upper end of the first group of optima; each one after it reaches twice as far."""
@@ -264,9 +280,9 @@ def markdown(summaries: Sequence[Summary], walks: Sequence[Walk], description: s
             else []
         ),
         "",
-        *_table(["set", "size"], [*sets, ["all", "all", *_cells(total)]]),
+        table(["set", "size", *COLUMNS], [*sets, ["all", "all", *_cells(total)]]),
         "",
-        *_table(["optimum"], lengths),
+        table(["optimum", *COLUMNS], lengths),
     ]
     return "\n".join(lines) + "\n"
 
@@ -278,12 +294,6 @@ def write_report(path: Path, summaries: Sequence[Summary], text: str) -> None:
         write_csv(path, columns, [astuple(summary) for summary in summaries])
     else:
         write_atomically(path, text.encode())
-
-
-def _table(groups: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
-    header = [*groups, *COLUMNS]
-    lines = [header, ["---"] * len(header), *rows]
-    return ["| " + " | ".join(line) + " |" for line in lines]
 
 
 def _cells(summary: Summary) -> list[str]:

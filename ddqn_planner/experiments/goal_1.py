@@ -14,7 +14,8 @@ from pathfinding.finder.a_star import AStarFinder
 
 from ddqn_planner.experiments.figures import draw_map, draw_walk, save
 from ddqn_planner.experiments.profiles import PROFILES, variant
-from ddqn_planner.experiments.report import Settings, first_kept, optimal_length, spread, table
+from ddqn_planner.experiments.report import Settings, first_kept, optimal_length, spread
+from ddqn_planner.experiments.tables import table
 from ddqn_planner.experiments.trainings import Training, TrainingEvaluation
 from ddqn_planner.files import write_csv
 from ddqn_planner.grid import Cell, MoveRule, path_length

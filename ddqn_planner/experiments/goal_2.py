@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 from ddqn_planner.experiments import goal_1
 from ddqn_planner.experiments.figures import draw_border, draw_map, draw_share, save
 from ddqn_planner.experiments.profiles import MOVE_RULE, PROFILES, START_DEAD_END
-from ddqn_planner.experiments.report import Settings, mean, spread, table, worst
+from ddqn_planner.experiments.report import Settings, mean, spread, worst
+from ddqn_planner.experiments.tables import table
 from ddqn_planner.experiments.trainings import Training
 from ddqn_planner.files import write_csv
 from ddqn_planner.grid import MOVES, legal_moves

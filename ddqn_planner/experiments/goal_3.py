@@ -10,7 +10,8 @@ import numpy as np
 
 from ddqn_planner.experiments.figures import draw_map, draw_new_obstacles, draw_walk, save
 from ddqn_planner.experiments.profiles import MOVE_RULE, PROFILES
-from ddqn_planner.experiments.report import Settings, mean, optimal_length, spread, table, worst
+from ddqn_planner.experiments.report import Settings, mean, optimal_length, spread, worst
+from ddqn_planner.experiments.tables import table
 from ddqn_planner.experiments.taught import teach
 from ddqn_planner.experiments.trainings import (
     Training,

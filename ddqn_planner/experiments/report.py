@@ -92,12 +92,6 @@ def share_curve(runs: Sequence[Sequence[TrainingEvaluation]]) -> Curve:
     return steps, solved.mean(axis=0, keepdims=True)
 
 
-def table(header: Sequence[str], rows: Sequence[Sequence[object]]) -> str:
-    """Return a Markdown table."""
-    lines = [header, ["---"] * len(header), *rows]
-    return "\n".join("| " + " | ".join(map(str, line)) + " |" for line in lines)
-
-
 def spread(values: Sequence[float], digits: int = 0) -> str:
     """Return the median of the seeds, and their least and greatest: ``"3 (1 to 4)"``.
 

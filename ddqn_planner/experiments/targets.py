@@ -11,13 +11,8 @@ from ddqn_planner.experiments import goal_1
 from ddqn_planner.experiments.figures import draw_curves, save
 from ddqn_planner.experiments.goal_2 import free_starts, planned_field
 from ddqn_planner.experiments.profiles import MOVE_RULE
-from ddqn_planner.experiments.report import (
-    Settings,
-    evaluation_curve,
-    share_curve,
-    spread,
-    table,
-)
+from ddqn_planner.experiments.report import Settings, evaluation_curve, share_curve, spread
+from ddqn_planner.experiments.tables import table
 from ddqn_planner.experiments.trainings import Training
 from ddqn_planner.files import write_csv
 from ddqn_planner.planning.evaluation import length_ratios

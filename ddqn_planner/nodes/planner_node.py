@@ -149,7 +149,7 @@ class PlannerNode(Node):
         self._plan_publisher = self.create_publisher(Path, "plan", LATCHED)
         self._value_publisher = self.create_publisher(OccupancyGrid, "~/value", LATCHED)
         self._diagnostics_publisher = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
-        # In a group of its own: triggers that come while it plans make it plan once more after
+        # In a group of its own: triggers that come while it plans make it plan once more after.
         self._replan = self.create_guard_condition(
             self._plan_for_active_goal, MutuallyExclusiveCallbackGroup()
         )

@@ -8,7 +8,8 @@ import pytest
 import torch
 
 from ddqn_planner.experiments.profiles import MOVE_RULE
-from ddqn_planner.experiments.report import first_kept, mean, spread, table, worst
+from ddqn_planner.experiments.report import first_kept, mean, spread, worst
+from ddqn_planner.experiments.tables import table
 from ddqn_planner.experiments.taught import best_moves, cross_entropy, teach
 from ddqn_planner.experiments.trainings import (
     Training,
