@@ -18,7 +18,7 @@ from ddqn_planner.planning.evaluation import Evaluation, evaluate
 from ddqn_planner.training.any_map import ANY_MAP, MAPS, RULES, random_scenarios
 from ddqn_planner.training.trainer import Trainer
 
-BRIEF = 128_000
+BRIEF = 192_000
 """Environment steps that are enough to learn every move, though prices only roughly."""
 
 
