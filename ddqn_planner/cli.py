@@ -29,7 +29,7 @@ from ddqn_planner.grid import Cell, MapFile, MoveRule, read_map_file
 from ddqn_planner.grid.generators import KINDS
 from ddqn_planner.planning import Plan, Planner, PlanStatus, shortest_distances
 from ddqn_planner.planning.evaluation import evaluate
-from ddqn_planner.planning.picture import PictureError, draw_text, save_picture
+from ddqn_planner.planning.picture import MAX_TEXT_WIDTH, PictureError, draw_text, save_picture
 from ddqn_planner.resources import find_map
 from ddqn_planner.training import ranks
 from ddqn_planner.training.any_map import ANY_MAP, MAPS, random_scenarios
@@ -38,9 +38,6 @@ from ddqn_planner.training.hyper_parameters import HyperParameters
 from ddqn_planner.training.run import TrainingRun
 
 MOVE_RULES = [rule.value for rule in MoveRule]
-
-MAX_TEXT_WIDTH = 64
-"""Cells of the widest map that is printed as text: a cell takes two characters."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -21,18 +21,17 @@ import pyastar2d
 import torch
 from benchmark import call, report
 from nav_msgs.srv import GetPlan
-from pathfinding.core.diagonal_movement import DiagonalMovement
-from pathfinding.core.grid import Grid
-from pathfinding.finder.a_star import AStarFinder
 from processes import executable, running
 from rcl_interfaces.srv import GetParameters, ListParameters
 from std_srvs.srv import Trigger
 
 from ddqn_planner import GridMap, MoveRule, Planner, load_map
 from ddqn_planner.experiments.generalisation import compare_with_dijkstra
+from ddqn_planner.experiments.goal_1 import a_star
 from ddqn_planner.grid import Cell, save_map
 from ddqn_planner.grid.generators import KINDS, generate_map, random_requests
 from ddqn_planner.resources import find_map
+from ddqn_planner.training.environment import Scenario
 
 RULE = MoveRule.ROBOT_SAFE
 GOALS = 7
@@ -82,15 +81,12 @@ def compare_single_queries(side: int) -> None:
         return planner.plan(grid, start, goal, RULE)
 
     def pathfinding(start: Cell, goal: Cell) -> object:
-        matrix = Grid(matrix=(~grid.occupancy).astype(int).tolist())
-        finder = AStarFinder(diagonal_movement=DiagonalMovement.only_when_no_obstacle)
-        return finder.find_path(matrix.node(*start), matrix.node(*goal), matrix)
+        return a_star(Scenario(grid, start, goal), RULE)
 
     def pyastar(start: Cell, goal: Cell) -> object:
         return pyastar2d.astar_path(weights, start[::-1], goal[::-1], allow_diagonal=True)
 
     for _, goal in requests:
-        planner.q_field(grid, goal, RULE)
         _ = planner.q_field(grid, goal, RULE).policy
     planners: dict[str, Callable[[Cell, Cell], object]] = {
         "ours, new field": with_new_field,
@@ -161,11 +157,13 @@ def measure_node(node: demo.Client, map_file: str) -> list[bool]:
 def first_answer(node: demo.Client, asked: GetPlan.Request) -> float:
     """Ask the planner until it has its map; return how long its first plan took, milliseconds."""
     assert node.get_plan.wait_for_service(demo.TIMEOUT)
-    while True:
+
+    def answer() -> float:
         began = time.perf_counter()
-        if plan_of(node.get_plan, asked).poses:
-            return 1e3 * (time.perf_counter() - began)
-        time.sleep(0.05)
+        poses = plan_of(node.get_plan, asked).poses
+        return 1e3 * (time.perf_counter() - began) if poses else 0.0
+
+    return demo.wait_for("map", answer, [])
 
 
 def measure_large_map(node: demo.Client) -> list[bool]:

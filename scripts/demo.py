@@ -31,7 +31,7 @@ from ddqn_planner.grid import Cell, GridMap, MoveRule, path_length, read_map_fil
 from ddqn_planner.nodes.conversions import grid_from_message, quaternion
 from ddqn_planner.nodes.runtime import LATCHED
 from ddqn_planner.planning import shortest_distances
-from ddqn_planner.planning.picture import draw_text, save_picture
+from ddqn_planner.planning.picture import MAX_TEXT_WIDTH, draw_text, save_picture
 from ddqn_planner.resources import find_map
 from ddqn_planner.training.environment import Scenario
 
@@ -51,9 +51,6 @@ CASES = (
     Case("dilemma", "dilemma", MoveRule.CORNER_CUTTING, "The paper's network", "demo.png"),
     Case("office", "any_map", MoveRule.ROBOT_SAFE, "A map never seen", "demo_office.png"),
 )
-
-MAX_TEXT_WIDTH = 64
-"""Cells of the widest map that is printed as text."""
 
 TIMEOUT = 60.0
 """Seconds to wait for any one answer."""

@@ -5,10 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-import yaml
 from PIL import Image
 
-from ddqn_planner.grid import OCCUPIED, MapFile
+from ddqn_planner.grid import OCCUPIED, MapFile, save_map
 from ddqn_planner.grid.generators import generate_map
 
 SEED = 4
@@ -28,21 +27,14 @@ def office_map() -> MapFile:
 
 def main() -> None:
     """Write both files."""
-    map_file, folder = office_map(), Path(__file__).resolve().parent.parent / "maps"
-    grey = np.where(map_file.values == OCCUPIED, 0, 254).astype(np.uint8)
-    Image.fromarray(grey[::-1]).save(folder / "office.png", optimize=True)
-    metadata = {
-        "image": "office.png",
-        "mode": "trinary",
-        "resolution": map_file.resolution,
-        "origin": list(map_file.origin),
-        "negate": 0,
-        "occupied_thresh": 0.65,
-        "free_thresh": 0.196,
-        "ddqn_planner": {"start": list(START), "goal": list(GOAL)},
-    }
-    text = yaml.safe_dump(metadata, sort_keys=False, default_flow_style=None)
-    (folder / "office.yaml").write_text(text, encoding="utf-8")
+    yaml_file = Path(__file__).resolve().parent.parent / "maps" / "office.yaml"
+    save_map(office_map(), yaml_file)
+    # As PNG the image takes a hundredth of the place.
+    image = yaml_file.with_suffix(".pgm")
+    Image.open(image).save(image.with_suffix(".png"), optimize=True)
+    image.unlink()
+    text = yaml_file.read_text(encoding="utf-8").replace("office.pgm", "office.png")
+    yaml_file.write_text(text, encoding="utf-8")
 
 
 if __name__ == "__main__":

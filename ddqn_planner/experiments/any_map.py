@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any, Final
@@ -11,13 +10,13 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from ddqn_planner.experiments import goal_3
+from ddqn_planner.experiments import goal_1, goal_3
 from ddqn_planner.experiments.profiles import MOVE_RULE
 from ddqn_planner.experiments.report import Settings, mean, spread
 from ddqn_planner.experiments.tables import table
 from ddqn_planner.experiments.trainings import Training, solved, walk_from_starts
 from ddqn_planner.files import write_csv
-from ddqn_planner.grid import MAX_PRICE, MOVES, OCCUPIED, UNKNOWN, GridMap, MoveRule, legal_moves
+from ddqn_planner.grid import OCCUPIED, UNKNOWN, GridMap, MoveRule, legal_moves, move_costs
 from ddqn_planner.grid.generators import generate_map, random_costs
 from ddqn_planner.model import AnyMapQNetwork
 from ddqn_planner.model.propagation import features
@@ -44,7 +43,6 @@ STEPS: Final = (25_600, 256_000)
 
 HELD_OUT: Final = ("maze", "rooms", "corridors", "dead_ends", "office")
 SIDE: Final = 48
-TIMES: Final = 50
 
 ABLATION = (
     "variant",
@@ -103,13 +101,7 @@ def zero_shot(settings: Settings) -> tuple[list[str], list[str]]:
     maps = goal_3.drawn_maps(settings)
     noisy = [walk_from_starts(planner, some) for some in (maps.training, maps.test)]
     counts = [f"{solved(legal)} ({solved(free)}) of {len(legal)}" for legal, free in noisy]
-    seconds = []
-    for _ in range(TIMES):
-        began = time.perf_counter()
-        Planner(planner.network, planner.metadata).plan(
-            scenario.grid, scenario.start, scenario.goal
-        )
-        seconds.append(time.perf_counter() - began)
+    plan, seconds = goal_1.timed_plan(planner, scenario)
     return [
         "goal i, length",
         "goal ii with the given start, solved (any move)",
@@ -118,11 +110,11 @@ def zero_shot(settings: Settings) -> tuple[list[str], list[str]]:
         "goal iii, test maps (any move)",
         "planning time, ms",
     ], [
-        f"{field.rollout(scenario.start).length:.2f}",
+        f"{plan.length:.2f}",
         f"{starts.solved} ({any_move.solved}) of {starts.starts}",
         f"{starts.mean_ratio:.4f}",
         *counts,
-        f"{1e3 * np.median(seconds):.2f}",
+        f"{1e3 * seconds:.2f}",
     ]
 
 
@@ -148,38 +140,35 @@ def _judgement(planner: Planner) -> tuple[int, float]:
     network = planner.network
     assert isinstance(network, AnyMapQNetwork)
     wrong, errors = 0, []
+    seen_B9 = _surroundings_of_a_free_cell()
+    random = np.random.default_rng(0).integers(UNKNOWN, OCCUPIED, seen_B9.shape)
+    priced_B9 = np.where(seen_B9 == OCCUPIED, OCCUPIED, random).astype(np.int8)
     for rule in RULES:
-        seen_B9 = surroundings_of_a_free_cell()
-        legal_BA = np.stack([_legal(values, rule) for values in seen_B9])
+        truth = [_truth(values, rule) for values in priced_B9]
+        legal_BA, price_BA = map(np.stack, zip(*truth, strict=True))
         with torch.inference_mode():
             p_BA, _ = network(torch.from_numpy(features(seen_B9, rule)))
-            random = np.random.default_rng(0).integers(UNKNOWN, OCCUPIED, seen_B9.shape)
-            priced_B9 = np.where(seen_B9 == OCCUPIED, OCCUPIED, random).astype(np.int8)
-            _, price_BA = network(torch.from_numpy(features(priced_B9, rule)))
+            _, learned_BA = network(torch.from_numpy(features(priced_B9, rule)))
         wrong += int(((p_BA.numpy() > 0.5) != legal_BA).sum())
-        true_BA = np.stack([_prices(values) for values in priced_B9])
-        errors.append(np.abs(price_BA.numpy() / true_BA - 1)[legal_BA])
+        errors.append(np.abs(learned_BA.numpy() / price_BA - 1)[legal_BA])
     return wrong, float(np.concatenate(errors).mean())
 
 
-def surroundings_of_a_free_cell() -> NDArray[np.int8]:
+def _surroundings_of_a_free_cell() -> NDArray[np.int8]:
     """Return every surroundings without costs that a free cell can have: (256, 9) int8."""
     every = OCCUPIED * (np.arange(2**9)[:, None] >> np.arange(9) & 1)
     free: NDArray[np.int8] = every[every[:, 4] == 0].astype(np.int8)
     return free
 
 
-def _legal(values: NDArray[np.int8], rule: MoveRule) -> NDArray[np.bool_]:
-    legal: NDArray[np.bool_] = legal_moves(values.reshape(3, 3) == OCCUPIED, rule)[:, 1, 1]
-    return legal
-
-
-def _prices(values: NDArray[np.int8]) -> NDArray[np.float64]:
-    share = np.where(values == UNKNOWN, 1.0, values / 100).reshape(3, 3)
-    price = 1 + (MAX_PRICE - 1) * share
-    onward = price[1 + MOVES[:, 1], 1 + MOVES[:, 0]]
-    mean_price: NDArray[np.float64] = (price[1, 1] + onward) / 2
-    return mean_price
+def _truth(
+    values: NDArray[np.int8], rule: MoveRule
+) -> tuple[NDArray[np.bool_], NDArray[np.float64]]:
+    """Return which moves from the centre of 3x3 cells are legal, and their prices: (8,) both."""
+    cells = values.reshape(3, 3)
+    grid = GridMap(cells == OCCUPIED, cost=cells)
+    cost_AHW = move_costs(grid.price, rule)
+    return legal_moves(grid.occupancy, rule)[:, 1, 1], cost_AHW[:, 1, 1] / rule.lengths
 
 
 def _walks(planner: Planner, priced: bool) -> tuple[int, int, float]:

@@ -14,14 +14,16 @@ import numpy as np
 from numpy.typing import NDArray
 from tqdm import tqdm
 
-from ddqn_planner.grid import UNKNOWN, Cell, GridMap, MoveRule, connected_cells, read_map_file
+from ddqn_planner.grid import Cell, GridMap, MoveRule, connected_cells, read_map_file
 from ddqn_planner.grid.generators import (
     generate_map,
     gradient_costs,
     inflated_costs,
     random_costs,
     random_requests,
+    unknown_costs,
 )
+from ddqn_planner.grid.moves import component_labels
 
 PRICES: Final = ("none", "random", "gradient", "inflated", "unknown")
 """Which costs the free cells get."""
@@ -92,8 +94,7 @@ class RequestSettings:
         if self.priced == "inflated":
             return GridMap(occupancy, cost=inflated_costs(occupancy, INFLATION_RADIUS))
         if self.priced == "unknown":
-            unknown = random.random(occupancy.shape) < UNKNOWN_SHARE
-            return GridMap(occupancy, cost=np.where(unknown, np.int8(UNKNOWN), np.int8(0)))
+            return GridMap(occupancy, cost=unknown_costs(occupancy, UNKNOWN_SHARE, random))
         return GridMap(occupancy)
 
 
@@ -229,8 +230,10 @@ def _with_random_requests(
     parts = np.array_split(range(settings.requests), goals)
     drawn = random_requests(occupancy, rule, goals, random)
     for some, (start, goal) in zip(parts, drawn, strict=True):
-        more = _random_starts(occupancy, goal, rule, max(0, len(some) - 1), random)
-        requests += [(cell, goal) for cell in [start, *more][: len(some)]]
+        starts = [start][: len(some)]
+        if len(some) > 1:
+            starts += _random_starts(occupancy, goal, rule, len(some) - 1, random)
+        requests += [(cell, goal) for cell in starts]
     return BenchmarkMap(set_name, name, grid, requests)
 
 
@@ -263,8 +266,9 @@ def _moving_ai_map(path: Path, scenario: Path | None, settings: RequestSettings)
     count = min(settings.requests, len(lines))
     edges = np.arange(count + 1) * len(lines) // count
     lines = [lines[index] for index in random.integers(edges[:-1], edges[1:]).tolist()]
+    labels = component_labels(occupancy, rule)
     for start, goal, _ in lines:
-        if not connected_cells(occupancy, goal, rule)[start[1], start[0]]:
+        if labels[start[::-1]] != labels[goal[::-1]]:
             raise ValueError(f"{scenario}: no path leads from {start} to {goal}; check the files")
     known = rule is MoveRule.ROBOT_SAFE and grid.cost is None
     optima = np.array([optimum for _, _, optimum in lines]) if known else None

@@ -42,11 +42,6 @@ COLUMNS = (
 FIRST_GROUP_END = 16
 """Upper end of the first group of optima; each one after it reaches twice as far."""
 
-COLUMNS = (
-    *("maps", "requests", "success", "any move", "optimal", "mean", "worst", "illegal"),
-    *("field ms", "Dijkstra ms", "field/Dijkstra", "path ms"),
-)
-
 
 @dataclass(frozen=True)
 class Walk:

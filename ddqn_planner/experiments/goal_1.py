@@ -121,7 +121,7 @@ def _paths(
     rows = []
     for profile in PROFILES:
         planners = settings.planners(name(profile))
-        plans, seconds = zip(*(_timed_plan(planner, scenario) for planner in planners), strict=True)
+        plans, seconds = zip(*(timed_plan(planner, scenario) for planner in planners), strict=True)
         lengths = [plan.length if plan.cells else np.inf for plan in plans]
         middle = int(np.argsort(lengths)[len(lengths) // 2])
         paths[f"{profile}, median seed"] = plans[middle].cells
@@ -134,7 +134,9 @@ def _paths(
     return paths, (["planner", "length, cells", "planning time, ms"], rows)
 
 
-def _timed_plan(planner: Planner, scenario: Scenario) -> tuple[Plan, float]:
+def timed_plan(planner: Planner, scenario: Scenario) -> tuple[Plan, float]:
+    """Return a planner's plan, and the median of its times with a new field, seconds."""
+
     def plan() -> Plan:
         fresh = Planner(planner.network, planner.metadata)  # it remembers no Q field
         return fresh.plan(scenario.grid, scenario.start, scenario.goal)

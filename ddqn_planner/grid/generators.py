@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import minimum_spanning_tree
 
-from ddqn_planner.grid.grid_map import Cell
+from ddqn_planner.grid.grid_map import UNKNOWN, Cell
 from ddqn_planner.grid.moves import MoveRule, component_labels
 
 Occupancy: TypeAlias = NDArray[np.bool_]
@@ -324,6 +324,29 @@ def random_costs(occupancy: Occupancy, random: np.random.Generator) -> NDArray[n
     """
     costs = random.integers(0, 100, occupancy.shape, dtype=np.int8)
     costs[occupancy] = 0
+    return costs
+
+
+def unknown_costs(
+    occupancy: Occupancy, share: float, random: np.random.Generator
+) -> NDArray[np.int8]:
+    """Let each free cell be unknown with a probability, and cost nothing else.
+
+    Parameters
+    ----------
+    occupancy : (H, W) bool
+        True where a cell is occupied.
+    share : float
+        The probability, 0..1.
+    random : numpy.random.Generator
+
+    Returns
+    -------
+    (H, W) int8
+        `UNKNOWN` or 0 in a free cell, 0 in an occupied one.
+    """
+    unknown = random.random(occupancy.shape) < share
+    costs: NDArray[np.int8] = np.where(unknown & ~occupancy, np.int8(UNKNOWN), np.int8(0))
     return costs
 
 

@@ -168,8 +168,7 @@ def path_cost(
     move_rule : MoveRule
     """
     x, y = np.asarray(cells, dtype=np.int64).reshape(-1, 2).T
-    lengths = np.hypot(np.diff(x), np.diff(y))
-    if move_rule is MoveRule.UNIT:
-        lengths = np.ones_like(lengths)
+    # Actions 0 and 1: one straight, one diagonal.
+    lengths = move_rule.lengths[((np.diff(x) != 0) & (np.diff(y) != 0)).astype(np.int64)]
     prices = price[y, x].astype(np.float64)
     return float((lengths * (prices[1:] + prices[:-1]) / 2).sum())

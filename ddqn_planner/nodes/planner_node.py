@@ -79,6 +79,7 @@ class RequestError(ValueError):
 
 
 Target = tuple[Planner, GridMap, Cell, MoveRule]
+"""What a field is computed with: the planner, the map, the goal and the move rule."""
 
 
 @dataclass(frozen=True)
@@ -94,7 +95,7 @@ class Outcome:
     cells : tuple of (x, y)
         The path; empty unless the status is SUCCEEDED.
     target : tuple, optional
-        Planner, map, goal and rule of the field in which it was planned, or would have been.
+        Of the field in which it was planned, or would have been.
     field_ms, walk_ms : float
         How long it took to get the field, and to walk in it.
     """

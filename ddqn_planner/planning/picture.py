@@ -18,6 +18,10 @@ VALUE_COLOURS = ("#f4f1de", "#cfe8dc", "#93cfc8", "#4fa3b5")
 is far from that of an obstacle."""
 
 
+MAX_TEXT_WIDTH = 64
+"""Cells of the widest map that is worth printing as text: a cell takes two characters."""
+
+
 class PictureError(RuntimeError):
     """A picture cannot be drawn; the message says what is missing."""
 

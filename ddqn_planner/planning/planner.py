@@ -135,7 +135,8 @@ class Planner:
         if not self.network.supports((grid.height, grid.width)):
             return Plan(PlanStatus.MAP_SIZE_UNSUPPORTED)
         # Where no path leads, there is no need to compute a field to say so.
-        if self.needs_field(grid, start, goal, rule) and not _joined(grid, start, goal, rule):
+        known = self.known_field(grid, goal, rule) is not None
+        if not known and not _joined(grid, start, goal, rule):
             return Plan(PlanStatus.NO_PATH)
         plan = self.q_field(grid, goal, rule).rollout(start)
         if plan.status is PlanStatus.WALK_TRAPPED and not _joined(grid, start, goal, rule):

@@ -7,8 +7,8 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from ddqn_planner.grid import UNKNOWN, GridMap, MoveRule
-from ddqn_planner.grid.generators import random_costs, random_requests
+from ddqn_planner.grid import GridMap, MoveRule
+from ddqn_planner.grid.generators import random_costs, random_requests, unknown_costs
 from ddqn_planner.training.environment import Scenario
 from ddqn_planner.training.hyper_parameters import HyperParameters
 
@@ -66,7 +66,7 @@ def random_scenarios(seed: int, maps: int = MAPS) -> list[Scenario]:
 def _random_scenario(rule: MoveRule, random: np.random.Generator) -> Scenario:
     occupancy = random.random((SIDE, SIDE)) < random.uniform(0.1, 0.6)
     constant = np.full((SIDE, SIDE), random.integers(100), dtype=np.int8)
-    unknown = np.where(random.random((SIDE, SIDE)) < 0.3, np.int8(UNKNOWN), np.int8(0))
+    unknown = unknown_costs(occupancy, 0.3, random)
     costs: tuple[NDArray[np.int8] | None, ...] = (
         None,
         random_costs(occupancy, random),

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as numpy_st
 from strategies import occupancies
 
-from ddqn_planner.grid import MOVES, Cell, MoveRule, connected_cells, legal_moves
+from ddqn_planner.grid import MOVES, UNKNOWN, Cell, MoveRule, connected_cells, legal_moves
 from ddqn_planner.grid.generators import (
     KINDS,
     MINIMUM_SIDE,
@@ -20,6 +20,7 @@ from ddqn_planner.grid.generators import (
     inflated_costs,
     random_costs,
     random_requests,
+    unknown_costs,
 )
 
 RULES = st.sampled_from(list(MoveRule))
@@ -220,6 +221,16 @@ def test_costs_are_0_to_99_and_0_in_occupied_cells(
         assert costs.min() >= 0
         assert costs.max() <= 99
         assert not costs[occupancy].any()
+
+
+def test_a_share_of_the_free_cells_is_unknown_and_the_others_cost_nothing() -> None:
+    random = np.random.default_rng(0)
+    occupancy = random.random((200, 200)) < 0.3
+    costs = unknown_costs(occupancy, 0.2, random)
+    assert costs.dtype == np.int8
+    assert set(np.unique(costs)) == {UNKNOWN, 0}
+    assert not costs[occupancy].any()
+    assert (costs[~occupancy] == UNKNOWN).mean() == pytest.approx(0.2, abs=0.02)
 
 
 def test_random_costs_are_uniform() -> None:
