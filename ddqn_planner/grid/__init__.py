@@ -1,5 +1,6 @@
 """What the robot moves on: the grid map, the eight moves, map files and the paper's noise."""
 
+from ddqn_planner.grid.body import clearance, inflate
 from ddqn_planner.grid.grid_map import MAX_PRICE, OCCUPIED, UNKNOWN, Cell, GridMap
 from ddqn_planner.grid.map_file import MapFile, MapFileError, load_map, read_map_file, save_map
 from ddqn_planner.grid.moves import (
@@ -25,7 +26,9 @@ __all__ = [
     "MapFile",
     "MapFileError",
     "MoveRule",
+    "clearance",
     "connected_cells",
+    "inflate",
     "legal_moves",
     "load_map",
     "move_costs",

@@ -56,6 +56,7 @@ class GridMap:
     resolution: float = 1.0
     origin: tuple[float, float, float] = (0.0, 0.0, 0.0)
     cost: NDArray[np.int8] | None = None
+    obstacles: NDArray[np.bool_] | None = None
 
     def __post_init__(self) -> None:
         occupancy = np.array(self.occupancy, dtype=np.bool_)
@@ -80,6 +81,15 @@ class GridMap:
             cost = cost.astype(np.int8)
             cost.flags.writeable = False
             object.__setattr__(self, "cost", cost)
+        if self.obstacles is not None:
+            obstacles = np.array(self.obstacles, dtype=np.bool_)
+            if obstacles.shape != occupancy.shape or (obstacles & ~occupancy).any():
+                raise ValueError(
+                    f"obstacles have shape {obstacles.shape}, or lie on free cells; give "
+                    f"{occupancy.shape}, within the occupied cells"
+                )
+            obstacles.flags.writeable = False
+            object.__setattr__(self, "obstacles", obstacles)
 
     @classmethod
     def from_occupancy_values(
@@ -146,6 +156,11 @@ class GridMap:
     def is_free(self, cell: Cell) -> bool:
         """Say whether a cell lies inside the map and is not occupied."""
         return self.contains(cell) and not self.occupancy[cell[1], cell[0]]
+
+    def is_obstacle(self, cell: Cell) -> bool:
+        """Say whether a cell of the map is an obstacle, and not just too near to one."""
+        obstacles = self.occupancy if self.obstacles is None else self.obstacles
+        return bool(obstacles[cell[1], cell[0]])
 
     def free_cells(self) -> list[Cell]:
         """Return the free cells as (x, y), row by row from y = 0."""

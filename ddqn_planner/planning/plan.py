@@ -21,6 +21,15 @@ class PlanStatus(str, Enum):
     WALK_TRAPPED = "a path exists, but the model's greedy steps do not find it"
 
 
+class PlanMethod(str, Enum):
+    """How a path is found, or was."""
+
+    GREEDY = "greedy"
+    """By greedy steps in the Q field alone."""
+    GUIDED = "guided"
+    """By greedy steps, or where they are trapped by a search in the order of the Q field."""
+
+
 @dataclass(frozen=True)
 class Plan:
     """A path, or the reason why there is none.
@@ -29,11 +38,15 @@ class Plan:
     ----------
     status : PlanStatus
     cells : tuple of (x, y)
-        From start to goal, every move legal; empty unless the status is SUCCEEDED.
+        From start to goal, every move legal; empty unless the status is SUCCEEDED. The goal is
+        another than the one asked for where that is occupied and a tolerance was given.
+    method : PlanMethod
+        GUIDED if it was searched for because the greedy steps were trapped.
     """
 
     status: PlanStatus
     cells: tuple[Cell, ...] = ()
+    method: PlanMethod = PlanMethod.GREEDY
 
     @property
     def length(self) -> float:

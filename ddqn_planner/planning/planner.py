@@ -4,16 +4,42 @@ from __future__ import annotations
 
 import threading
 from collections import OrderedDict
+from dataclasses import dataclass, replace
 from pathlib import Path
 
-from ddqn_planner.grid import Cell, GridMap, MoveRule, connected_cells, legal_moves
-from ddqn_planner.model import ModelMetadata, QNetwork, load_model
-from ddqn_planner.planning.plan import Plan, PlanStatus
-from ddqn_planner.planning.q_field import QField
+import numpy as np
+from numpy.typing import NDArray
 
-MAX_FIELDS = 8
-MAX_FIELD_BYTES = 2**29
-"""How many Q fields a planner keeps, the last ones used; one is kept whatever its size."""
+from ddqn_planner.grid import Cell, GridMap, MoveRule, connected_cells, legal_moves
+from ddqn_planner.grid.moves import component_labels
+from ddqn_planner.model import ModelMetadata, QNetwork, load_model
+from ddqn_planner.planning.plan import Plan, PlanMethod, PlanStatus
+from ddqn_planner.planning.q_field import QField
+from ddqn_planner.planning.search import search
+
+CACHE_BYTES = 2**28
+"""Memory for the Q fields that a planner keeps, the last ones used. A field takes 45 bytes a cell;
+the last one is kept whatever its size."""
+
+
+@dataclass(frozen=True)
+class Route:
+    """What can be said of a path before there is a Q field.
+
+    Parameters
+    ----------
+    status : PlanStatus
+        SUCCEEDED if a path may follow, else why there is none.
+    leave : tuple of (x, y)
+        From the start to the first free cell: the start alone, where that is free. The cells
+        between are too near to an obstacle.
+    goal : (x, y)
+        A free cell: the goal, or the nearest that may stand for it.
+    """
+
+    status: PlanStatus
+    leave: tuple[Cell, ...] = ()
+    goal: Cell = (-1, -1)
 
 
 class Planner:
@@ -26,16 +52,21 @@ class Planner:
     network : QNetwork
     metadata : ModelMetadata
         Its move rule is the default of `plan` and `q_field`.
+    cache_bytes : int
+        Bound of the memory for the fields that it keeps; see `CACHE_BYTES`.
     """
 
-    def __init__(self, network: QNetwork, metadata: ModelMetadata) -> None:
+    def __init__(
+        self, network: QNetwork, metadata: ModelMetadata, cache_bytes: int = CACHE_BYTES
+    ) -> None:
         self.network = network
         self.metadata = metadata
+        self.cache_bytes = cache_bytes
         self._fields: OrderedDict[tuple[str, Cell, MoveRule], QField] = OrderedDict()
         self._lock = threading.Lock()
 
     @classmethod
-    def load(cls, model: str | Path) -> Planner:
+    def load(cls, model: str | Path, cache_bytes: int = CACHE_BYTES) -> Planner:
         """Load a shipped model by its name (``"any_map"``), or a model file by its path.
 
         Raises
@@ -43,7 +74,7 @@ class Planner:
         ModelFileError
             If there is no such model, or its file cannot be used.
         """
-        return cls(*load_model(model))
+        return cls(*load_model(model), cache_bytes)
 
     def q_field(self, grid: GridMap, goal: Cell, move_rule: MoveRule | None = None) -> QField:
         """Return the Q field of a map toward a goal; asked again, it is looked up.
@@ -86,30 +117,23 @@ class Planner:
                 self._fields.move_to_end(key)
             return self._fields.get(key)
 
-    def needs_field(
-        self, grid: GridMap, start: Cell, goal: Cell, move_rule: MoveRule | None = None
-    ) -> bool:
-        """Say whether `plan` takes its time: no field is known, and nothing rules a path out."""
-        return (
-            grid.is_free(start)
-            and grid.is_free(goal)
-            and self.network.supports((grid.height, grid.width))
-            and self.known_field(grid, goal, move_rule) is None
-        )
-
     def _remember(self, grid: GridMap, rule: MoveRule, field: QField) -> None:
         with self._lock:
             self._fields[grid.fingerprint, field.goal, rule] = field
-            while len(self._fields) > 1 and (
-                len(self._fields) > MAX_FIELDS
-                or sum(known.q.nbytes for known in self._fields.values()) > MAX_FIELD_BYTES
-            ):
-                self._fields.popitem(last=False)
+            size = sum(known.nbytes for known in self._fields.values())
+            while size > self.cache_bytes and len(self._fields) > 1:
+                size -= self._fields.popitem(last=False)[1].nbytes
 
     def plan(
-        self, grid: GridMap, start: Cell, goal: Cell, move_rule: MoveRule | None = None
+        self,
+        grid: GridMap,
+        start: Cell,
+        goal: Cell,
+        move_rule: MoveRule | None = None,
+        method: PlanMethod = PlanMethod.GREEDY,
+        tolerance: float = 0.0,
     ) -> Plan:
-        """Plan a path.
+        """Plan a path: `route`, `q_field`, and then `follow`.
 
         Parameters
         ----------
@@ -117,32 +141,108 @@ class Planner:
         start, goal : (x, y)
         move_rule : MoveRule, optional
             The rule that the model was trained for by default.
+        method : PlanMethod
+            Whether to search where the greedy steps are trapped.
+        tolerance : float
+            How far an occupied goal may move, in cells.
 
         Returns
         -------
         Plan
-            Every move of its path is legal under the rule, whatever the network says.
+            Every move of its path is legal under the rule, whatever the network says. The cells
+            are free, but for those by which a start leaves that is too near to an obstacle.
+        """
+        route = self.route(grid, start, goal, move_rule, tolerance)
+        if route.status is not PlanStatus.SUCCEEDED:
+            return Plan(route.status)
+        return self.follow(
+            route, grid, self.q_field(grid, route.goal, move_rule), method, move_rule
+        )
+
+    def route(
+        self,
+        grid: GridMap,
+        start: Cell,
+        goal: Cell,
+        move_rule: MoveRule | None = None,
+        tolerance: float = 0.0,
+    ) -> Route:
+        """Say where a path enters the free cells and where it ends, or why there is none.
+
+        The parameters are those of `plan`.
         """
         rule = move_rule or self.metadata.move_rule
         if not grid.contains(start):
-            return Plan(PlanStatus.START_OUTSIDE_MAP)
+            return Route(PlanStatus.START_OUTSIDE_MAP)
         if not grid.contains(goal):
-            return Plan(PlanStatus.GOAL_OUTSIDE_MAP)
-        if not grid.is_free(start):
-            return Plan(PlanStatus.START_OCCUPIED)
-        if not grid.is_free(goal):
-            return Plan(PlanStatus.GOAL_OCCUPIED)
+            return Route(PlanStatus.GOAL_OUTSIDE_MAP)
+        if grid.is_obstacle(start):
+            return Route(PlanStatus.START_OCCUPIED)
+        goals = np.array([goal]) if grid.is_free(goal) else _free_cells(grid, goal, tolerance)
+        if not len(goals):
+            return Route(PlanStatus.GOAL_OCCUPIED)
         if not self.network.supports((grid.height, grid.width)):
-            return Plan(PlanStatus.MAP_SIZE_UNSUPPORTED)
+            return Route(PlanStatus.MAP_SIZE_UNSUPPORTED)
+        if self.is_known(grid, start, goal, rule):
+            return Route(PlanStatus.SUCCEEDED, (start,), goal)
         # Where no path leads, there is no need to compute a field to say so.
-        known = self.known_field(grid, goal, rule) is not None
-        if not known and not _joined(grid, start, goal, rule):
-            return Plan(PlanStatus.NO_PATH)
-        plan = self.q_field(grid, goal, rule).rollout(start)
-        if plan.status is PlanStatus.WALK_TRAPPED and not _joined(grid, start, goal, rule):
-            return Plan(PlanStatus.NO_PATH)
-        return plan
+        labels = component_labels(grid.occupancy, rule)
+        labels_of_goals = labels[goals[:, 1], goals[:, 0]]
+        leave = _way_out(grid, start, np.isin(labels, labels_of_goals), rule)
+        if not leave:
+            free = grid.is_free(goal)
+            return Route(PlanStatus.NO_PATH if free else PlanStatus.GOAL_OCCUPIED)
+        label = labels[leave[-1][1], leave[-1][0]]
+        x, y = goals[np.argmax(labels_of_goals == label)].tolist()
+        return Route(PlanStatus.SUCCEEDED, leave, (x, y))
+
+    def is_known(
+        self, grid: GridMap, start: Cell, goal: Cell, move_rule: MoveRule | None = None
+    ) -> bool:
+        """Say whether a plan is no more than a walk in a field that was computed lately."""
+        return grid.is_free(start) and self.known_field(grid, goal, move_rule) is not None
+
+    def follow(
+        self,
+        route: Route,
+        grid: GridMap,
+        field: QField,
+        method: PlanMethod = PlanMethod.GREEDY,
+        move_rule: MoveRule | None = None,
+    ) -> Plan:
+        """Walk a route in the field of its goal; see `plan`."""
+        rule, entry = move_rule or self.metadata.move_rule, route.leave[-1]
+        plan = field.rollout(entry)
+        if plan.status is PlanStatus.WALK_TRAPPED:
+            joined = connected_cells(grid.occupancy, field.goal, rule)
+            if not joined[entry[1], entry[0]]:
+                return Plan(PlanStatus.NO_PATH)
+            if method is PlanMethod.GUIDED:
+                end = np.zeros(grid.occupancy.shape, dtype=np.bool_)
+                end[field.goal[1], field.goal[0]] = True
+                cells = search(entry, end, field.legal, grid.price, rule, field.value)
+                plan = Plan(PlanStatus.SUCCEEDED, cells, method)
+        return replace(plan, cells=route.leave[:-1] + plan.cells) if plan.cells else plan
 
 
-def _joined(grid: GridMap, start: Cell, goal: Cell, move_rule: MoveRule) -> bool:
-    return bool(connected_cells(grid.occupancy, goal, move_rule)[start[1], start[0]])
+def _free_cells(grid: GridMap, goal: Cell, tolerance: float) -> NDArray[np.int64]:
+    """Return the free cells within a distance of a cell, the nearest first: (N, 2) int64."""
+    reach = int(min(tolerance, max(grid.height, grid.width)))
+    left, bottom = max(goal[0] - reach, 0), max(goal[1] - reach, 0)
+    near = ~grid.occupancy[bottom : goal[1] + reach + 1, left : goal[0] + reach + 1]
+    cells: NDArray[np.int64] = np.argwhere(near)[:, ::-1] + (left, bottom)
+    distance = np.hypot(*(cells - goal).T)
+    order = np.argsort(distance, kind="stable")
+    return cells[order[: np.count_nonzero(distance <= tolerance)]]
+
+
+def _way_out(
+    grid: GridMap, start: Cell, ends: NDArray[np.bool_], rule: MoveRule
+) -> tuple[Cell, ...]:
+    """Return the shortest way from a cell, by cells too near to an obstacle, to one of some."""
+    if grid.is_free(start):
+        return (start,) if ends[start[1], start[0]] else ()
+    assert grid.obstacles is not None
+    closed = ~ends & (grid.obstacles | ~grid.occupancy)
+    plain = np.ones(ends.shape, dtype=np.float32)
+    return search(start, ends, legal_moves(closed, rule), plain, rule)

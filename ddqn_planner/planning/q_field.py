@@ -54,6 +54,11 @@ class QField:
             np.copyto(policy, action, where=better)
         return policy
 
+    @property
+    def nbytes(self) -> int:
+        """Memory of the field with its value and policy, bytes."""
+        return int(self.q.nbytes + self.legal.nbytes + 5 * self.q[0].size)
+
     def unmasked(self) -> QField:
         """Return the field of a robot that does not know its map.
 

@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+from itertools import pairwise
+
 import numpy as np
 import pytest
 import torch
@@ -7,12 +9,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 from strategies import grids_with_free_cell, priced_grids_with_free_cell
 
-from ddqn_planner import GridMap, MoveRule, Planner, PlanStatus, QField
-from ddqn_planner.grid import LENGTHS, MOVES, Cell, legal_moves
+from ddqn_planner import GridMap, MoveRule, PlanMethod, Planner, PlanStatus, QField, inflate
+from ddqn_planner.grid import LENGTHS, MOVES, Cell, connected_cells, legal_moves
 from ddqn_planner.model import ModelMetadata, PaperQNetwork
 from ddqn_planner.planning import shortest_distances
 from ddqn_planner.planning.evaluation import evaluate
-from ddqn_planner.planning.planner import MAX_FIELDS
 
 RULES = st.sampled_from(list(MoveRule))
 ANY_MAP = Planner.load("any_map")
@@ -182,22 +183,131 @@ def test_where_no_path_leads_no_field_is_computed_to_say_so() -> None:
     occupancy = np.zeros((3, 3), dtype=bool)
     occupancy[:, 1] = True
     grid, planner = GridMap(occupancy), random_planner(3, 3, 0)
-    assert planner.needs_field(grid, (0, 0), (2, 2))
+    assert not planner.is_known(grid, (0, 0), (2, 2))
     assert planner.plan(grid, (0, 0), (2, 2)).status is PlanStatus.NO_PATH
     assert planner.known_field(grid, (2, 2)) is None
     planner.q_field(grid, (2, 2))
-    assert not planner.needs_field(grid, (0, 0), (2, 2))
+    assert planner.is_known(grid, (0, 0), (2, 2))
     assert planner.plan(grid, (0, 0), (2, 2)).status is PlanStatus.NO_PATH
 
 
-def test_the_fields_that_are_kept_are_bounded_in_number_and_memory(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_the_memory_for_fields_is_bounded_and_the_last_ones_are_kept() -> None:
     planner, grid = random_planner(3, 3, 0), GridMap(np.zeros((3, 3)))
+    field = planner.q_field(grid, (0, 0))
+    assert field.nbytes == field.q.nbytes + field.legal.nbytes + field.value.nbytes + (
+        field.policy.nbytes
+    )
+    planner.cache_bytes = 4 * field.nbytes
     for goal in grid.free_cells():
         planner.q_field(grid, goal)
     known = [goal for goal in grid.free_cells() if planner.known_field(grid, goal)]
-    assert known == grid.free_cells()[-MAX_FIELDS:]
-    monkeypatch.setattr("ddqn_planner.planning.planner.MAX_FIELD_BYTES", 1)
+    assert known == grid.free_cells()[-4:]
+    planner.cache_bytes = 1
     planner.q_field(GridMap(np.zeros((3, 3)), cost=np.ones((3, 3), np.int8)), (0, 0))
     assert not any(planner.known_field(grid, goal) for goal in grid.free_cells())
+
+
+# A search where the walk fails
+
+
+def check_legal(cells: tuple[Cell, ...], occupancy: np.ndarray, rule: MoveRule) -> None:
+    legal = legal_moves(occupancy, rule)
+    for (x, y), (next_x, next_y) in pairwise(cells):
+        assert legal[MOVES.tolist().index([next_x - x, next_y - y]), y, x]
+
+
+@given(grids_with_free_cell(), RULES, st.integers(0, 5), st.data())
+def test_with_a_bad_model_every_solvable_request_is_searched_for_or_walked(
+    grid_and_goal: tuple[GridMap, Cell], rule: MoveRule, seed: int, data: st.DataObject
+) -> None:
+    grid, goal = grid_and_goal
+    start = data.draw(st.sampled_from(grid.free_cells()))
+    planner = random_planner(grid.height, grid.width, seed)
+    greedy = planner.plan(grid, start, goal, rule)
+    guided = planner.plan(grid, start, goal, rule, PlanMethod.GUIDED)
+    assert greedy.method is PlanMethod.GREEDY
+    if greedy.status is PlanStatus.WALK_TRAPPED:
+        assert guided.status is PlanStatus.SUCCEEDED
+        assert guided.method is PlanMethod.GUIDED
+        assert (guided.cells[0], guided.cells[-1]) == (start, goal)
+        check_legal(guided.cells, grid.occupancy, rule)
+    else:
+        assert guided == greedy
+
+
+def test_whatever_is_wrong_with_the_values_the_search_finds_a_path() -> None:
+    grid = GridMap(np.zeros((6, 6)))
+    for bias in (np.nan, np.inf, -np.inf, 1e38):
+        planner = random_planner(6, 6, 0)
+        planner.network.fully_connected.bias.fill_(bias)  # type: ignore[attr-defined]
+        plan = planner.plan(grid, (0, 0), (5, 3), method=PlanMethod.GUIDED)
+        check_legal(plan.cells, grid.occupancy, MoveRule.CORNER_CUTTING)
+        assert plan.cells[-1] == (5, 3)
+
+
+# A robot with a body
+
+
+@given(grids_with_free_cell(), RULES, st.sampled_from([1.1, 1.5, 2.1]), st.data())
+def test_a_start_too_near_to_an_obstacle_leaves_by_the_shortest_way(
+    grid_and_cell: tuple[GridMap, Cell], rule: MoveRule, radius: float, data: st.DataObject
+) -> None:
+    plain, start = grid_and_cell
+    grid = inflate(plain, radius)
+    goal = data.draw(st.sampled_from(plain.free_cells()))
+    plan = ANY_MAP.plan(grid, start, goal, rule)
+    if not grid.is_free(goal):
+        assert plan.status is PlanStatus.GOAL_OCCUPIED
+        return
+    reached = connected_cells(grid.occupancy, goal, rule)
+    through = plain.occupancy | (~grid.occupancy & ~reached)
+    way = shortest_distances(GridMap(through), start, rule) if not through[start[::-1]] else None
+    if way is None or not np.isfinite(way[reached]).any():
+        assert plan.status is PlanStatus.NO_PATH
+        return
+    assert (plan.cells[0], plan.cells[-1]) == (start, goal)
+    check_legal(plan.cells, plain.occupancy, rule)
+    free = [grid.is_free(cell) for cell in plan.cells]
+    leave = plan.cells[: free.index(True) + 1]
+    assert all(free[len(leave) :])
+    lengths = sum(
+        rule.lengths[MOVES.tolist().index([b[0] - a[0], b[1] - a[1]])] for a, b in pairwise(leave)
+    )
+    assert lengths == pytest.approx(way[reached].min())
+
+
+def test_a_start_on_an_obstacle_cannot_leave() -> None:
+    occupancy = np.zeros((5, 5), dtype=bool)
+    occupancy[2, 2] = True
+    grid = inflate(GridMap(occupancy), 1.1)
+    assert ANY_MAP.plan(grid, (2, 2), (0, 0)).status is PlanStatus.START_OCCUPIED
+    assert ANY_MAP.plan(grid, (2, 1), (0, 0)).status is PlanStatus.SUCCEEDED
+
+
+@given(grids_with_free_cell(), RULES, st.floats(0, 6), st.data())
+def test_an_occupied_goal_moves_to_the_nearest_reachable_free_cell_within_the_tolerance(
+    grid_and_start: tuple[GridMap, Cell], rule: MoveRule, tolerance: float, data: st.DataObject
+) -> None:
+    grid, start = grid_and_start
+    goal = data.draw(
+        st.tuples(st.integers(0, grid.width - 1), st.integers(0, grid.height - 1)), label="goal"
+    )
+    plan = ANY_MAP.plan(grid, start, goal, rule, tolerance=tolerance)
+    if grid.is_free(goal):
+        assert plan == ANY_MAP.plan(grid, start, goal, rule)
+        return
+    rows, columns = np.nonzero(connected_cells(grid.occupancy, start, rule))
+    nearest = np.hypot(columns - goal[0], rows - goal[1]).min()
+    if nearest <= tolerance:
+        assert plan.cells[0] == start
+        assert np.hypot(*np.subtract(plan.cells[-1], goal)) == pytest.approx(nearest)
+        check_legal(plan.cells, grid.occupancy, rule)
+    else:
+        assert plan.status is PlanStatus.GOAL_OCCUPIED
+
+
+def test_a_tolerance_larger_than_the_map_is_no_harm() -> None:
+    occupancy = np.zeros((3, 4), dtype=bool)
+    occupancy[0, 0] = True
+    plan = ANY_MAP.plan(GridMap(occupancy), (3, 2), (0, 0), tolerance=1e300)
+    assert plan.cells[-1] in {(1, 0), (0, 1)}

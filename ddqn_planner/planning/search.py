@@ -1,0 +1,85 @@
+"""Best-first search, compiled: guided by a value field, or to the nearest of some cells."""
+
+from __future__ import annotations
+
+import heapq
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ddqn_planner.grid import MOVES, Cell, MoveRule
+from ddqn_planner.model.front import compiled
+
+
+def search(
+    start: Cell,
+    ends: NDArray[np.bool_],
+    legal: NDArray[np.bool_],
+    price: NDArray[np.float32],
+    move_rule: MoveRule,
+    value: NDArray[np.float32] | None = None,
+) -> tuple[Cell, ...]:
+    """Return a path from a cell to one of some others, empty if there is none.
+
+    Cells are visited in the order of the path's cost so far minus V(s), the whole path's cost if
+    V says what is left of it (A* of Hart, Nilsson and Raphael 1968, with V as its heuristic). So a
+    good field leads straight to the end; with any other, as each cell is visited once at most, an
+    end is found if a path leads to one.
+
+    Parameters
+    ----------
+    start : (x, y)
+    ends : (H, W) bool
+    legal : (8, H, W) bool
+        The moves that may be made.
+    price : (H, W) float32
+        See `GridMap.price`.
+    move_rule : MoveRule
+        Says what a move counts.
+    value : (H, W) float32, optional
+        V(s); by default 0: the path is the cheapest, to the end that is nearest.
+    """
+    if value is None:
+        value = np.zeros(ends.shape, dtype=np.float32)
+    entered_by, end = _search(start, ends, legal, price, move_rule.lengths, value, MOVES)
+    if end < 0:
+        return ()
+    width = ends.shape[1]
+    cells = [(end % width, end // width)]
+    while cells[-1] != start:
+        x, y = cells[-1]
+        dx, dy = MOVES[entered_by[y, x]].tolist()
+        cells.append((x - dx, y - dy))
+    return tuple(reversed(cells))
+
+
+@compiled
+def _search(start, ends, legal, price, lengths, value, moves):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Return the action by which each cell was entered, (H, W) int8, and the end's number or -1."""
+    width = ends.shape[1]
+    entered_by = np.full(ends.shape, -1, dtype=np.int8)
+    visited = np.zeros(ends.shape, dtype=np.bool_)
+    # Of a move: its order, the cost of the path with it, the cell it leads to, the action.
+    waiting = [(0.0, 0.0, start[1] * width + start[0], -1)]
+    while len(waiting) > 0:
+        _, cost, cell, entered = heapq.heappop(waiting)
+        y, x = cell // width, cell % width
+        if visited[y, x]:
+            continue
+        visited[y, x] = True
+        entered_by[y, x] = entered
+        if ends[y, x]:
+            return entered_by, cell
+        for action in range(moves.shape[0]):
+            if not legal[action, y, x]:
+                continue
+            next_x, next_y = x + moves[action, 0], y + moves[action, 1]
+            if visited[next_y, next_x]:
+                continue
+            mean_price = (np.float64(price[y, x]) + price[next_y, next_x]) / 2
+            through = cost + lengths[action] * mean_price
+            order = through - value[next_y, next_x]
+            if np.isnan(order):
+                order = np.inf
+            heapq.heappush(waiting, (order, through, next_y * width + next_x, action))
+    return entered_by, -1

@@ -1,0 +1,91 @@
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from strategies import occupancies
+
+from ddqn_planner.grid import UNKNOWN, GridMap, MoveRule, clearance, inflate
+from ddqn_planner.grid.moves import component_labels
+
+RESOLUTION = 0.05
+
+
+def distances_by_definition(obstacles: np.ndarray) -> np.ndarray:
+    """Look at every pair of a cell and an obstacle."""
+    points = np.argwhere(obstacles)
+    distance = np.full(obstacles.shape, math.inf)
+    for y, x in np.ndindex(obstacles.shape):
+        for row, column in points:
+            distance[y, x] = min(distance[y, x], math.dist((y, x), (row, column)))
+    return distance
+
+
+@given(occupancies, st.sampled_from([0.0, 0.03, 0.05, 0.1, 0.12, 0.2, 1.0]))
+def test_cells_nearer_to_an_obstacle_than_the_radius_are_occupied(
+    occupancy: np.ndarray, radius: float
+) -> None:
+    distance = distances_by_definition(occupancy)
+    assert clearance(occupancy) == pytest.approx(distance)
+    # A message brings the resolution in single precision.
+    grid = inflate(GridMap(occupancy, float(np.float32(RESOLUTION))), radius)
+    near = np.round(distance * RESOLUTION, 6) < radius
+    assert (grid.occupancy == (occupancy | near)).all()
+    for y, x in np.ndindex(occupancy.shape):
+        assert grid.is_obstacle((x, y)) == occupancy[y, x]
+
+
+@given(occupancies, st.floats(0.01, 1.0), st.data())
+def test_clearance_costs_fall_with_the_distance_and_close_nothing(
+    occupancy: np.ndarray, weight: float, data: st.DataObject
+) -> None:
+    values = data.draw(st.sampled_from([UNKNOWN, 0, 40]))
+    plain = GridMap(occupancy, RESOLUTION, cost=np.full(occupancy.shape, values, dtype=np.int8))
+    grid = inflate(plain, 0.07, weight)
+    assert (grid.occupancy == inflate(plain, 0.07).occupancy).all()
+    labels = [component_labels(g.occupancy, MoveRule.ROBOT_SAFE) for g in (grid, plain)]
+    assert (labels[0] > 0).sum() <= (labels[1] > 0).sum()
+    free, distance = ~grid.occupancy, clearance(occupancy)
+    price = grid.price[free][np.argsort(distance[free])]
+    assert (np.diff(price) <= 0).all()
+    assert (price >= plain.price[free]).all()
+
+
+def test_the_cost_halves_where_the_docstring_says() -> None:
+    occupancy = np.zeros((1, 20), dtype=bool)
+    occupancy[0, 0] = True
+    cost = inflate(GridMap(occupancy, 0.1), 0.1, 1.0).cost
+    assert cost is not None
+    assert cost[0, 1] == 99
+    assert cost[0, 4] == pytest.approx(49.5, abs=0.5)  # 0.3 m beyond the body
+
+
+def test_without_a_body_the_map_is_the_same() -> None:
+    grid = GridMap(np.zeros((2, 2)))
+    assert inflate(grid, 0.0) is grid
+
+
+@pytest.mark.parametrize(
+    ("radius", "weight", "named"),
+    [
+        (-0.1, 0.0, "robot_radius is -0.1"),
+        (math.nan, 0.0, "robot_radius is nan"),
+        (math.inf, 0.0, "robot_radius is inf"),
+        (0.0, -0.1, "clearance_weight is -0.1"),
+        (0.0, 1.1, "clearance_weight is 1.1"),
+        (0.0, math.nan, "clearance_weight is nan"),
+    ],
+)
+def test_what_is_out_of_range_is_named(radius: float, weight: float, named: str) -> None:
+    with pytest.raises(ValueError, match=named):
+        inflate(GridMap(np.zeros((2, 2))), radius, weight)
+
+
+def test_obstacles_must_be_occupied() -> None:
+    with pytest.raises(ValueError, match="within the occupied cells"):
+        GridMap(np.zeros((2, 2)), obstacles=np.eye(2, dtype=bool))
+    with pytest.raises(ValueError, match=r"shape \(3, 3\)"):
+        GridMap(np.ones((2, 2)), obstacles=np.eye(3, dtype=bool))

@@ -1,0 +1,54 @@
+from __future__ import annotations
+
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as numpy_st
+from strategies import priced_grids_with_free_cell
+
+from ddqn_planner.grid import MOVES, Cell, GridMap, MoveRule, legal_moves, path_cost
+from ddqn_planner.planning import shortest_distances
+from ddqn_planner.planning.search import search
+
+ANY_VALUE = st.floats(width=32, allow_nan=True, allow_infinity=True)
+
+
+@given(priced_grids_with_free_cell(), st.sampled_from(list(MoveRule)), st.data())
+def test_finds_a_legal_path_wherever_there_is_one_whatever_the_values(
+    grid_and_goal: tuple[GridMap, Cell], rule: MoveRule, data: st.DataObject
+) -> None:
+    grid, goal = grid_and_goal
+    start = data.draw(st.sampled_from(grid.free_cells()))
+    value = data.draw(numpy_st.arrays(np.float32, grid.occupancy.shape, elements=ANY_VALUE))
+    end = np.zeros(grid.occupancy.shape, dtype=bool)
+    end[goal[1], goal[0]] = True
+    legal = legal_moves(grid.occupancy, rule)
+    distances = shortest_distances(grid, goal, rule)
+
+    cells = search(start, end, legal, grid.price, rule, value)
+    assert (cells != ()) == np.isfinite(distances[start[1], start[0]])
+    if cells:
+        assert (cells[0], cells[-1]) == (start, goal)
+        assert len(set(cells)) == len(cells)
+        for (x, y), (next_x, next_y) in pairwise(cells):
+            assert legal[MOVES.tolist().index([next_x - x, next_y - y]), y, x]
+
+    cheapest = distances[start[1], start[0]]
+    for known in (None, -distances.astype(np.float32)):  # nothing is known, or all is
+        cells = search(start, end, legal, grid.price, rule, known)
+        if cells:
+            assert path_cost(cells, grid.price, rule) == pytest.approx(cheapest)
+
+
+def test_goes_to_the_nearest_of_several_ends() -> None:
+    grid = GridMap(np.zeros((1, 9)))
+    ends = np.zeros((1, 9), dtype=bool)
+    ends[0, [0, 8]] = True
+    rule = MoveRule.ROBOT_SAFE
+    legal = legal_moves(grid.occupancy, rule)
+    assert search((3, 0), ends, legal, grid.price, rule)[-1] == (0, 0)
+    assert search((5, 0), ends, legal, grid.price, rule)[-1] == (8, 0)
+    assert search((8, 0), ends, legal, grid.price, rule) == ((8, 0),)
