@@ -1,4 +1,4 @@
-# make setup | demo | test | lint | format | types | bench | model | model-dilemma
+# make setup | demo | test | lint | format | types | bench | load | soak | faults | model | model-dilemma
 PYTHON ?= python3
 TORCH ?= torch==2.13.0
 VENV := .venv
@@ -7,12 +7,12 @@ BIN := $(VENV)/bin
 # With a sourced ROS 2 Jazzy its rclpy is used, else the wheels from PyPI.
 ifeq ($(ROS_DISTRO),jazzy)
 VENV_FLAGS := --system-site-packages
-EXTRAS := experiments,figures,tensorboard,test
+EXTRAS := experiments,figures,tensorboard,test,watch
 else
-EXTRAS := experiments,figures,ros,tensorboard,test
+EXTRAS := experiments,figures,ros,tensorboard,test,watch
 endif
 
-.PHONY: setup demo test lint format types bench model model-dilemma
+.PHONY: setup demo test lint format types bench load soak faults model model-dilemma
 .DEFAULT_GOAL := help
 
 .PHONY: help
@@ -49,6 +49,16 @@ bench: setup
 	$(BIN)/pip install --quiet --editable ".[$(EXTRAS),bench]"
 	$(BIN)/python scripts/benchmark.py
 	$(BIN)/python scripts/benchmark_any_map.py $(MAP)
+
+# REQUESTS and MINUTES are those of the scripts by default.
+load: setup
+	$(BIN)/python scripts/load.py $(REQUESTS)
+
+soak: setup
+	$(BIN)/python scripts/soak.py $(MINUTES)
+
+faults: setup
+	$(BIN)/python scripts/faults.py $(KILLS)
 
 # These train the shipped models from nothing: the one for any map, and the paper's network.
 model: setup

@@ -20,6 +20,7 @@ setup(
         (f"share/{PACKAGE}", ["package.xml"]),
         (f"share/{PACKAGE}/maps", glob("maps/*")),
         (f"share/{PACKAGE}/models", glob("models/*")),
+        (f"share/{PACKAGE}/rviz", glob("rviz/*")),
     ],
     zip_safe=True,
     python_requires=">=3.10",
@@ -39,6 +40,7 @@ setup(
         "figures": ["matplotlib>=3.6"],
         "experiments": ["matplotlib>=3.6", "pathfinding>=1.0.9"],
         "tensorboard": ["tensorboard>=2.10"],
+        "watch": ["rerun-sdk>=0.39"],
         "bench": ["psutil>=5.9", "pyastar2d>=1.1", "stable-baselines3>=2.6"],
         "test": [
             "colcon-core>=0.15",

@@ -28,6 +28,7 @@ from ddqn_planner.experiments.generalisation import Walk, markdown, measure, sum
 from ddqn_planner.grid import Cell, MapFile, MoveRule, read_map_file
 from ddqn_planner.grid.generators import KINDS
 from ddqn_planner.planning import Plan, Planner, PlanStatus, shortest_distances
+from ddqn_planner.planning.animation import save_animation
 from ddqn_planner.planning.evaluation import evaluate
 from ddqn_planner.planning.picture import MAX_TEXT_WIDTH, PictureError, draw_text, save_picture
 from ddqn_planner.resources import find_map
@@ -59,7 +60,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="ddqn-planner", description=__doc__)
     commands = parser.add_subparsers(
-        required=True, metavar="plan|train|train-any-map|evaluate|reproduce"
+        required=True, metavar="plan|train|train-any-map|evaluate|reproduce|watch"
     )
     _add_plan(commands.add_parser("plan", help="plan a path on a map file"))
     for name, add, words, description in (
@@ -90,6 +91,13 @@ def _parser() -> argparse.ArgumentParser:
             "Trains with many seeds, and writes tables, figures and a report. The same command "
             "again goes on where it stopped.",
         ),
+        (
+            "watch",
+            _add_watch,
+            "show live what the ROS nodes publish",
+            "Opens rerun's viewer: map, value field, plan, and a training's episodes and reward. "
+            "It shows what comes after it was started, and the last map, value and plan.",
+        ),
     ):
         defaults = argparse.ArgumentDefaultsHelpFormatter
         add(
@@ -104,6 +112,9 @@ def _add_plan(plan: argparse.ArgumentParser) -> None:
     plan.add_argument("--move-rule", choices=MOVE_RULES, help="the model's by default")
     plan.add_argument("--json", action="store_true", help="print JSON in place of text")
     plan.add_argument("--picture", type=Path, metavar="FILE", help="draw map, value and path")
+    plan.add_argument(
+        "--animate", type=Path, metavar="FILE", help="draw how value and path grow, a .gif"
+    )
     plan.set_defaults(command=_plan)
 
 
@@ -154,6 +165,16 @@ def _add_reproduce(reproduce: argparse.ArgumentParser) -> None:
     reproduce.set_defaults(command=_reproduce)
 
 
+def _add_watch(watch: argparse.ArgumentParser) -> None:
+    add = watch.add_argument
+    add("--save", type=Path, metavar="FILE", help="write a recording (.rrd), open no viewer")
+    add("--planner", default="planner", metavar="NODE", help="name of the planner node")
+    add("--trainer", default="trainer", metavar="NODE", help="name of the trainer node")
+    # rclpy finds them in sys.argv.
+    add("--ros-args", nargs="...", default=argparse.SUPPRESS, help="as of any ROS node")
+    watch.set_defaults(command=_watch)
+
+
 def _add_map_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("map", help="ROS map YAML, MovingAI .map, or shipped map's name")
     for name in ("start", "goal"):
@@ -193,6 +214,8 @@ def _read_map(options: argparse.Namespace) -> tuple[MapFile, Cell, Cell]:
 
 
 def _plan(options: argparse.Namespace) -> int:
+    if options.animate and options.animate.suffix.lower() != ".gif":
+        raise ValueError(f"--animate is {options.animate}; give a file that ends in .gif")
     map_file, start, goal = _read_map(options)
     grid = map_file.grid()
     planner = Planner.load(options.model)
@@ -220,6 +243,10 @@ def _plan(options: argparse.Namespace) -> int:
         value = planner.q_field(grid, goal, options.move_rule).value if succeeded else None
         title = f"{plan.length:.2f} cells" if succeeded else plan.status.value
         save_picture(options.picture, grid, plan.cells, value, title)
+    if options.animate:
+        has_field = grid.is_free(goal) and planner.network.supports((grid.height, grid.width))
+        value = planner.q_field(grid, goal, options.move_rule).value if has_field else None
+        save_animation(options.animate, grid, start, goal, value, plan.cells)
     return 0 if succeeded else 1
 
 
@@ -310,6 +337,18 @@ def _reproduce(options: argparse.Namespace) -> int:
         return 130
     print(f"saved {out / 'report.md'}")
     return 0
+
+
+def _watch(options: argparse.Namespace) -> int:
+    try:
+        from ddqn_planner.nodes.watch import watch
+    except ImportError as error:
+        extra = "watch" if (error.name or "").startswith("rerun") else "ros"
+        raise PictureError(
+            f"watch needs another library ({error}): pip install 'ddqn_planner[{extra}]'"
+            + (", or source ROS 2 Jazzy" if extra == "ros" else "")
+        ) from None
+    return watch(options.planner, options.trainer, options.save)
 
 
 def _evaluate(options: argparse.Namespace) -> int:

@@ -57,6 +57,32 @@ def test_plan_writes_json_and_a_picture(capsys: pytest.CaptureFixture[str], tmp_
         assert len(colours) > 100
 
 
+def test_plan_writes_an_animation(tmp_path: Path) -> None:
+    assert main(["plan", "office", "--animate", str(tmp_path / "plan.gif")]) == 0
+    assert (tmp_path / "plan.gif").stat().st_size < 2**21
+    with Image.open(tmp_path / "plan.gif") as animation:
+        assert 60 < animation.n_frames <= 81
+
+
+@pytest.mark.parametrize(
+    ("start", "goal", "spreads"), [("1", "6", True), ("6", "1", False), ("99", "6", True)]
+)
+def test_an_animation_without_a_path_shows_the_field_if_there_is_one(
+    tmp_path: Path, start: str, goal: str, spreads: bool
+) -> None:
+    ends = ["--start", start, "19", "--goal", goal, "19"]
+    assert main(["plan", "dilemma", *ends, "--animate", str(tmp_path / "plan.GIF")]) == 1
+    with Image.open(tmp_path / "plan.GIF") as animation:
+        assert (animation.n_frames > 1) == spreads
+
+
+def test_an_animation_that_is_no_gif_is_refused_before_planning(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    assert main(["plan", "no_such_map", "--animate", "plan.mp4"]) == 2
+    assert "--animate is plan.mp4; give a file that ends in .gif" in capsys.readouterr().err
+
+
 def test_plan_says_why_there_is_no_path(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["plan", "dilemma", "--start", "1", "19"]) == 1
     assert "the start is occupied" in capsys.readouterr().err

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from std_msgs.msg import Header
 
 from ddqn_planner.grid import Cell, GridMap
+from ddqn_planner.grid.map_file import MAX_CELLS
 from ddqn_planner.planning import QField
 
 TOLERANCE = 1e-4
@@ -24,6 +25,9 @@ TOLERANCE = 1e-4
 
 MIN_RESOLUTION = 1e-6
 """Metres a cell."""
+
+ROUNDING = 1e-6
+"""A tolerance and a resolution come as float32: 0.1 m shall reach 2 cells of 0.05 m."""
 
 
 def grid_from_message(
@@ -103,7 +107,7 @@ def path_message(
     Parameters
     ----------
     cells : sequence of (x, y)
-        Neighbours, as in `Plan.cells`; none makes an empty path.
+        Those of a plan, simplified or not; none makes an empty path.
     grid : GridMap
     header : std_msgs/Header
         Of the path and, the same object, of its poses.
@@ -178,6 +182,19 @@ def cell_from_pose(name: str, header: Header, pose: Pose, grid: GridMap, frame: 
         ) from None
 
 
+def check_tolerance(tolerance: float) -> float:
+    """Return the tolerance of a request, metres, so that its last cell counts.
+
+    Raises
+    ------
+    ValueError
+        If it is not finite and 0 or more.
+    """
+    if not 0 <= tolerance < math.inf:
+        raise ValueError(f"the tolerance is {tolerance}; give metres, finite and 0 or more")
+    return tolerance * (1 + ROUNDING)
+
+
 def quaternion(yaw: float) -> Quaternion:
     """Return the rotation by `yaw` radians about z, counter-clockwise."""
     rotation = Quaternion()
@@ -202,6 +219,11 @@ def _check_map(message: OccupancyGrid) -> None:
     if info.width == 0 or info.height == 0:
         raise ValueError(
             f"the map has {info.width} x {info.height} cells; give at least one row and column"
+        )
+    if info.width * info.height > MAX_CELLS:
+        raise ValueError(
+            f"the map has {info.width} x {info.height} cells; give at most {MAX_CELLS}, or a "
+            "coarser resolution"
         )
     if len(message.data) != info.width * info.height:
         raise ValueError(

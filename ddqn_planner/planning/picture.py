@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from PIL import ImageColor
 
 from ddqn_planner.grid import Cell, GridMap
 
@@ -17,6 +18,8 @@ VALUE_COLOURS = ("#f4f1de", "#cfe8dc", "#93cfc8", "#4fa3b5")
 """From worst to best. Light to dark, so that their order is seen without colours too; the darkest
 is far from that of an obstacle."""
 
+MAX_RULED_SIDE = 64
+"""Cells of the longest side of a map that is drawn with lines between its cells."""
 
 MAX_TEXT_WIDTH = 64
 """Cells of the widest map that is worth printing as text: a cell takes two characters."""
@@ -24,6 +27,15 @@ MAX_TEXT_WIDTH = 64
 
 class PictureError(RuntimeError):
     """A picture cannot be drawn; the message says what is missing."""
+
+
+def value_ramp(levels: int) -> NDArray[np.uint8]:
+    """Return (levels, 3) uint8: red, green and blue from the worst value to the best."""
+    colours = np.array([ImageColor.getrgb(colour) for colour in VALUE_COLOURS])
+    places, shades = np.linspace(0, 1, len(colours)), np.linspace(0, 1, levels)
+    ramp = np.stack([np.interp(shades, places, channel) for channel in colours.T], axis=1)
+    rounded: NDArray[np.uint8] = np.rint(ramp).astype(np.uint8)
+    return rounded
 
 
 def draw_text(grid: GridMap, cells: Sequence[Cell]) -> str:
@@ -102,7 +114,7 @@ def draw_obstacles(axes: Any, grid: GridMap) -> None:
     axes.imshow(
         occupied, origin="lower", cmap=ListedColormap([OBSTACLE_COLOUR]), interpolation="nearest"
     )
-    if max(grid.width, grid.height) <= 64:
+    if max(grid.width, grid.height) <= MAX_RULED_SIDE:
         axes.set_xticks(np.arange(-0.5, grid.width), minor=True)
         axes.set_yticks(np.arange(-0.5, grid.height), minor=True)
         axes.grid(which="minor", color="white", linewidth=0.8)

@@ -172,20 +172,13 @@ class Planner:
         The parameters are those of `plan`.
         """
         rule = move_rule or self.metadata.move_rule
-        if not grid.contains(start):
-            return Route(PlanStatus.START_OUTSIDE_MAP)
-        if not grid.contains(goal):
-            return Route(PlanStatus.GOAL_OUTSIDE_MAP)
-        if grid.is_obstacle(start):
-            return Route(PlanStatus.START_OCCUPIED)
-        goals = np.array([goal]) if grid.is_free(goal) else _free_cells(grid, goal, tolerance)
-        if not len(goals):
-            return Route(PlanStatus.GOAL_OCCUPIED)
-        if not self.network.supports((grid.height, grid.width)):
-            return Route(PlanStatus.MAP_SIZE_UNSUPPORTED)
-        if self.is_known(grid, start, goal, rule):
+        ruled_out = self._ruled_out(grid, start, goal, tolerance)
+        if ruled_out:
+            return Route(ruled_out)
+        if self._is_known(grid, start, goal, rule):
             return Route(PlanStatus.SUCCEEDED, (start,), goal)
         # Where no path leads, there is no need to compute a field to say so.
+        goals = np.array([goal]) if grid.is_free(goal) else _free_cells(grid, goal, tolerance)
         labels = component_labels(grid.occupancy, rule)
         labels_of_goals = labels[goals[:, 1], goals[:, 0]]
         leave = _way_out(grid, start, np.isin(labels, labels_of_goals), rule)
@@ -196,11 +189,36 @@ class Planner:
         x, y = goals[np.argmax(labels_of_goals == label)].tolist()
         return Route(PlanStatus.SUCCEEDED, leave, (x, y))
 
-    def is_known(
-        self, grid: GridMap, start: Cell, goal: Cell, move_rule: MoveRule | None = None
+    def is_quick(
+        self,
+        grid: GridMap,
+        start: Cell,
+        goal: Cell,
+        move_rule: MoveRule | None = None,
+        tolerance: float = 0.0,
     ) -> bool:
-        """Say whether a plan is no more than a walk in a field that was computed lately."""
-        return grid.is_free(start) and self.known_field(grid, goal, move_rule) is not None
+        """Say whether a look rules a path out, or it is a walk in a field that is known."""
+        return self._ruled_out(grid, start, goal, tolerance) is not None or self._is_known(
+            grid, start, goal, move_rule
+        )
+
+    def _ruled_out(
+        self, grid: GridMap, start: Cell, goal: Cell, tolerance: float
+    ) -> PlanStatus | None:
+        if not grid.contains(start):
+            return PlanStatus.START_OUTSIDE_MAP
+        if not grid.contains(goal):
+            return PlanStatus.GOAL_OUTSIDE_MAP
+        if grid.is_obstacle(start):
+            return PlanStatus.START_OCCUPIED
+        if not grid.is_free(goal) and tolerance < 1:
+            return PlanStatus.GOAL_OCCUPIED
+        if not self.network.supports((grid.height, grid.width)):
+            return PlanStatus.MAP_SIZE_UNSUPPORTED
+        return None
+
+    def _is_known(self, grid: GridMap, start: Cell, goal: Cell, rule: MoveRule | None) -> bool:
+        return grid.is_free(start) and self.known_field(grid, goal, rule) is not None
 
     def follow(
         self,

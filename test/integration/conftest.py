@@ -6,6 +6,7 @@ import importlib.util
 import itertools
 import os
 import re
+import shutil
 import signal
 import subprocess
 import threading
@@ -54,6 +55,10 @@ class NodeProcess:
             assert self.process.poll() is None, f"the node ended:\n{self.log}"
             assert time.monotonic() < deadline, f"no {pattern!r} in the log:\n{self.log}"
             time.sleep(0.02)
+
+    def wait_for_end(self) -> int:
+        """Return the exit code of a process that ends by itself."""
+        return self.process.wait(TIMEOUT)
 
     def stop(self, signal_number: int = signal.SIGINT) -> int:
         """Send a signal to the process, and return its exit code."""
@@ -114,13 +119,15 @@ class Recorder:
         self._messages: list[Any] = []
         self._since = 0
 
-    def add(self, message: Any) -> None:
+    def add(self, message: Any, info: dict[str, Any]) -> None:
+        """Note a message that was published after the last `clear`."""
         with self._arrived:
-            self._messages.append(message)
-            self._arrived.notify_all()
+            if info["source_timestamp"] >= self._since:
+                self._messages.append(message)
+                self._arrived.notify_all()
 
     def clear(self) -> None:
-        """Forget what came, and what is still on its way: what was stamped before now."""
+        """Forget what came, and what is still on its way."""
         with self._arrived:
             self._messages.clear()
             self._since = time.time_ns()
@@ -131,16 +138,17 @@ class Recorder:
         """Return the first message for which the predicate holds; there is a limit to the wait."""
 
         def find() -> Any:
-            return next((m for m in self._messages if self._is_new(m) and predicate(m)), None)
+            return next((message for message in self._messages if predicate(message)), None)
 
         with self._arrived:
             found = self._arrived.wait_for(find, timeout)
             assert found is not None, f"no such message; there came {self._messages[-3:]}"
             return found
 
-    def _is_new(self, message: Any) -> bool:
-        stamp = message.header.stamp
-        return stamp.sec * 10**9 + stamp.nanosec >= self._since
+    def messages(self) -> list[Any]:
+        """Return what came since the last `clear`, in order."""
+        with self._arrived:
+            return [*self._messages]
 
 
 class Client:
@@ -278,3 +286,34 @@ def trained_model(tmp_path_factory: pytest.TempPathFactory, small_values: np.nda
     path = tmp_path_factory.mktemp("models") / "small.safetensors"
     trainer.save_model(path)
     return path
+
+
+@pytest.fixture(scope="module")
+def model(tmp_path_factory: pytest.TempPathFactory, trained_model: Path) -> Path:
+    """Return a copy that tests may overwrite, if they put it back."""
+    path = tmp_path_factory.mktemp("planner") / "model.safetensors"
+    shutil.copy(trained_model, path)
+    return path
+
+
+@pytest.fixture(scope="module")
+def planner(run_node: RunNode, model: Path) -> Iterator[Any]:
+    parameters = {"model": str(model), "follow_trainer": True}
+    with run_node("planner_node", parameters, namespace="/robot") as node:
+        yield node
+
+
+@pytest.fixture(scope="module")
+def running_robot(
+    planner: Any, make_client: Callable[[str], Any], small_values: np.ndarray, model: Path
+) -> Any:
+    from integration.robot import Robot
+
+    return Robot(make_client("/robot"), small_values, model)
+
+
+@pytest.fixture
+def robot(running_robot: Any) -> Any:
+    """Give the planner a map, a start and a goal, whatever the test before left."""
+    running_robot.begin()
+    return running_robot

@@ -13,6 +13,7 @@ from ddqn_planner.grid import MOVES, GridMap
 from ddqn_planner.nodes.conversions import (
     cell_from_pose,
     check_pose,
+    check_tolerance,
     grid_from_message,
     occupancy_message,
     path_message,
@@ -197,3 +198,15 @@ def test_value_that_is_the_same_everywhere_makes_a_map(level: float) -> None:
         QField((1, 0), q, np.ones((8, 1, 2), dtype=np.bool_)), GridMap(np.zeros((1, 2))), HEADER
     )
     assert set(message.data) <= {-1, 100}
+
+
+def test_a_tolerance_reaches_the_cells_that_its_metres_name() -> None:
+    # As messages bring them, in single precision: the tolerance is less than two cells.
+    tolerance, resolution = float(np.float32(0.7)), float(np.float32(0.35))
+    for metres in (tolerance, float(np.float32(0.1))):
+        assert check_tolerance(metres) >= metres
+    assert check_tolerance(tolerance) / resolution >= 2
+    assert check_tolerance(0.0) == 0.0
+    for bad in (-1e-9, math.nan, math.inf):
+        with pytest.raises(ValueError, match=f"the tolerance is {bad}; give metres"):
+            check_tolerance(bad)

@@ -9,7 +9,6 @@ import signal
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from itertools import pairwise
 from pathlib import Path as FilePath
 from typing import Any
 
@@ -17,171 +16,34 @@ import numpy as np
 import pytest
 import safetensors.torch
 import torch
-from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
-from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped, Quaternion
+from diagnostic_msgs.msg import DiagnosticStatus
+from geometry_msgs.msg import PoseStamped, Quaternion
+from integration.robot import (
+    GOAL,
+    GOAL_YAW,
+    ORIGIN,
+    RESOLUTION,
+    START,
+    Robot,
+    changed,
+    check_path,
+    constant_model,
+    length_of,
+    points_of,
+    values_of,
+    yaw_of,
+)
 from nav_msgs.msg import OccupancyGrid, Path
 from nav_msgs.srv import GetPlan
 from rcl_interfaces.srv import DescribeParameters, ListParameters
 from std_msgs.msg import Header, String
 from std_srvs.srv import Trigger
 
-from ddqn_planner.grid import Cell, GridMap, MoveRule, legal_moves
+from ddqn_planner.grid import MoveRule
 from ddqn_planner.grid.generators import generate_map, random_requests
-from ddqn_planner.model import ModelMetadata, PaperQNetwork, save_model
-from ddqn_planner.nodes.conversions import occupancy_message, quaternion
+from ddqn_planner.nodes.conversions import occupancy_message
 from ddqn_planner.nodes.runtime import LATCHED
 from ddqn_planner.planning import shortest_distances
-
-START, GOAL = (0, 0), (5, 5)
-RESOLUTION, ORIGIN = 0.5, (-1.0, 2.0, 0.0)
-GOAL_YAW = 1.2
-
-
-class Robot:
-    """A planner node and what its user sees and does."""
-
-    def __init__(
-        self, client: Any, values: np.ndarray, model: FilePath, name: str = "/robot/planner"
-    ) -> None:
-        self.client = client
-        self.name = name
-        self.values = values
-        self.model = model
-        self.plans = client.subscribe(Path, "plan", LATCHED)
-        self.value = client.subscribe(OccupancyGrid, "planner/value", LATCHED)
-        self.diagnostics = client.subscribe(DiagnosticArray, "/diagnostics")
-        self.grid = self.grid_of(values)
-
-    @staticmethod
-    def grid_of(values: np.ndarray, origin: tuple[float, float, float] = ORIGIN) -> GridMap:
-        return GridMap.from_occupancy_values(values, RESOLUTION, origin)
-
-    def map_message(self) -> OccupancyGrid:
-        return occupancy_message(self.values, RESOLUTION, ORIGIN, Header(frame_id="map"))
-
-    def send_map(self, message: OccupancyGrid | None = None) -> None:
-        self.client.publish("map", message or self.map_message(), LATCHED)
-
-    def pose(self, cell: Cell, yaw: float = 0.0, grid: GridMap | None = None) -> PoseStamped:
-        stamped = PoseStamped(header=Header(frame_id="map"))
-        x, y = (grid or self.grid).cell_to_world(cell)
-        stamped.pose.position.x, stamped.pose.position.y = x + 0.05, y - 0.05
-        stamped.pose.orientation = quaternion(yaw)
-        return stamped
-
-    def send_start(self, stamped: PoseStamped) -> None:
-        message = PoseWithCovarianceStamped(header=stamped.header)
-        message.pose.pose = stamped.pose
-        self.client.publish("initialpose", message)
-
-    def send_goal(self, stamped: PoseStamped) -> None:
-        self.client.publish("goal_pose", stamped)
-
-    def get_plan(self, start: PoseStamped, goal: PoseStamped) -> Path:
-        request = GetPlan.Request(start=start, goal=goal)
-        return self.client.call(GetPlan, "planner/get_plan", request).plan
-
-    def wait_for_path(self, start: Cell, goal: Cell, grid: GridMap | None = None) -> Path:
-        """Wait for a plan between two cells, and check all that can be said of it."""
-        grid = grid or self.grid
-        ends = [grid.cell_to_world(start), grid.cell_to_world(goal)]
-
-        def joins_ends(path: Path) -> bool:
-            return len(path.poses) > 0 and np.allclose(
-                [points_of(path)[0], points_of(path)[-1]], ends, atol=1e-6
-            )
-
-        path: Path = self.plans.wait(joins_ends)
-        check_path(path, grid)
-        return path
-
-    def wait_for_reason(self, pattern: str) -> DiagnosticStatus:
-        """Wait until the diagnostics of this node say something."""
-
-        def says(message: DiagnosticArray) -> bool:
-            status = message.status[0]
-            return status.name == f"{self.name}: plan" and bool(re.search(pattern, status.message))
-
-        return self.diagnostics.wait(says).status[0]
-
-    def assert_works(self) -> None:
-        """See that a good request has its plan: the node lives, and has its map and model."""
-        path = self.get_plan(self.pose(START), self.pose(GOAL))
-        check_path(path, self.grid)
-        assert points_of(path)[0] == pytest.approx(self.grid.cell_to_world(START))
-
-    def clear(self) -> None:
-        for recorder in (self.plans, self.value, self.diagnostics):
-            recorder.clear()
-
-
-def points_of(path: Path) -> list[tuple[float, float]]:
-    return [(pose.pose.position.x, pose.pose.position.y) for pose in path.poses]
-
-
-def length_of(path: Path) -> float:
-    return sum(math.dist(*step) for step in pairwise(points_of(path)))
-
-
-def yaw_of(rotation: Quaternion) -> float:
-    return 2 * math.atan2(rotation.z, rotation.w)
-
-
-def check_path(path: Path, grid: GridMap, move_rule: MoveRule = MoveRule.ROBOT_SAFE) -> None:
-    """Check that a path makes legal moves from cell centre to cell centre and looks ahead."""
-    assert path.header.frame_id == "map"
-    assert all(pose.header == path.header for pose in path.poses)
-    points = points_of(path)
-    cells = [grid.world_to_cell(x, y) for x, y in points]
-    assert np.allclose([grid.cell_to_world(cell) for cell in cells], points, atol=1e-6)
-    legal = legal_moves(grid.occupancy, move_rule)
-    for index, (cell, next_cell) in enumerate(pairwise(cells)):
-        step = (next_cell[0] - cell[0], next_cell[1] - cell[1])
-        assert max(abs(step[0]), abs(step[1])) == 1
-        action = round(math.atan2(step[1], step[0]) / (math.pi / 4)) % 8
-        assert legal[action, cell[1], cell[0]]
-        turned = yaw_of(path.poses[index].pose.orientation) - grid.origin[2]
-        assert math.cos(turned - action * math.pi / 4) == pytest.approx(1.0)
-
-
-def values_of(status: DiagnosticStatus) -> dict[str, str]:
-    return {entry.key: entry.value for entry in status.values}
-
-
-@pytest.fixture(scope="module")
-def model(tmp_path_factory: pytest.TempPathFactory, trained_model: FilePath) -> FilePath:
-    """Return a copy that tests may overwrite, if they put it back."""
-    path = tmp_path_factory.mktemp("planner") / "model.safetensors"
-    shutil.copy(trained_model, path)
-    return path
-
-
-@pytest.fixture(scope="module")
-def planner(run_node: Any, model: FilePath) -> Iterator[Any]:
-    parameters = {"model": str(model), "follow_trainer": True}
-    with run_node("planner_node", parameters, namespace="/robot") as node:
-        yield node
-
-
-@pytest.fixture(scope="module")
-def running_robot(
-    planner: Any, make_client: Callable[[str], Any], small_values: np.ndarray, model: FilePath
-) -> Robot:
-    return Robot(make_client("/robot"), small_values, model)
-
-
-@pytest.fixture
-def robot(running_robot: Robot) -> Robot:
-    """Give the planner a map, a start and a goal, whatever the test before left."""
-    running_robot.clear()
-    running_robot.send_map()
-    running_robot.send_start(running_robot.pose(START))
-    running_robot.send_goal(running_robot.pose(GOAL, GOAL_YAW))
-    running_robot.wait_for_path(START, GOAL)
-    running_robot.wait_for_reason("^a path of [^;]*$")
-    running_robot.clear()
-    return running_robot
-
 
 # What it is for
 
@@ -239,7 +101,6 @@ def test_get_plan_does_not_change_the_active_goal(robot: Robot) -> None:
     check_path(path, robot.grid)
     assert points_of(path)[0] == pytest.approx(robot.grid.cell_to_world((2, 5)))
     assert yaw_of(path.poses[-1].pose.orientation) == pytest.approx(GOAL_YAW)
-    assert path.header.stamp.sec > 0
     robot.get_plan(robot.pose((0, 0)), robot.pose((0, 0)))
     robot.send_start(robot.pose((3, 3)))
     robot.wait_for_path((3, 3), GOAL)
@@ -307,17 +168,6 @@ def test_late_subscriber_has_the_last_plan_and_value(robot: Robot) -> None:
 
 
 # Models
-
-
-def constant_model(path: FilePath, size: int, steps: int) -> None:
-    """Write a model that always goes to -x, or where it cannot, to +x: it turns round for ever."""
-    network = PaperQNetwork(size, size, 1)
-    with torch.no_grad():
-        network.fully_connected.weight.zero_()
-        network.fully_connected.bias.copy_(torch.tensor([1, 0, 0, 0, 2, 0, 0, 0]))
-    sizes = {"height": size, "width": size, "filters": 1}
-    metadata = ModelMetadata("paper", sizes, MoveRule.ROBOT_SAFE, 0.9, "", steps, 0, "")
-    save_model(path, network, metadata)
 
 
 def broken_model(path: FilePath, kind: str) -> None:
@@ -435,30 +285,7 @@ def test_bad_parameters_are_refused_with_a_reason(robot: Robot) -> None:
     robot.assert_works()
 
 
-def test_parameters_say_what_they_are(robot: Robot) -> None:
-    names = [
-        "model",
-        "move_rule",
-        "occupied_threshold",
-        "allow_unknown",
-        "priced",
-        "follow_trainer",
-    ]
-    request = DescribeParameters.Request(names=names)
-    response = robot.client.call(DescribeParameters, "planner/describe_parameters", request)
-    assert [entry.name for entry in response.descriptors if entry.description] == names
-
-
 # Bad input. After each, a good request has its plan.
-
-
-def changed(message: Any, field: str, value: Any) -> Any:
-    target = message
-    *parents, name = field.split(".")
-    for parent in parents:
-        target = getattr(target, parent)
-    setattr(target, name, value)
-    return message
 
 
 BAD_POSES = [
@@ -772,7 +599,7 @@ def test_says_what_it_waits_for_and_plans_once_it_is_there(
         plans.clear()
         client.publish("plant", robot.map_message(), LATCHED)
         assert plans.wait().poses == []
-        wait_for("the start is unknown; set it on initialpose")
+        wait_for("the start is unknown; set it on /initialpose")
         request = GetPlan.Request(goal=robot.pose(GOAL))
         assert client.call(GetPlan, "router/get_plan", request).plan.poses == []
 

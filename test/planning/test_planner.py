@@ -183,11 +183,11 @@ def test_where_no_path_leads_no_field_is_computed_to_say_so() -> None:
     occupancy = np.zeros((3, 3), dtype=bool)
     occupancy[:, 1] = True
     grid, planner = GridMap(occupancy), random_planner(3, 3, 0)
-    assert not planner.is_known(grid, (0, 0), (2, 2))
+    assert not planner.is_quick(grid, (0, 0), (2, 2))
     assert planner.plan(grid, (0, 0), (2, 2)).status is PlanStatus.NO_PATH
     assert planner.known_field(grid, (2, 2)) is None
     planner.q_field(grid, (2, 2))
-    assert planner.is_known(grid, (0, 0), (2, 2))
+    assert planner.is_quick(grid, (0, 0), (2, 2))
     assert planner.plan(grid, (0, 0), (2, 2)).status is PlanStatus.NO_PATH
 
 

@@ -1,0 +1,90 @@
+"""The planner node's parameters: names, defaults, ranges, and what a user reads of them."""
+
+from __future__ import annotations
+
+from typing import Final
+
+from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
+from rclpy.node import Node
+
+from ddqn_planner.grid import MoveRule
+from ddqn_planner.planning import PlanMethod
+from ddqn_planner.planning.planner import CACHE_BYTES
+
+CHOICES: Final = {
+    "move_rule": ["", *(rule.value for rule in MoveRule)],
+    "mode": [method.value for method in PlanMethod],
+    "path_simplification": ["none", "line_of_sight"],
+    "start_source": ["initialpose", "odometry", "tf"],
+}
+"""The values of the parameters that have but a few."""
+
+
+def declare_parameters(node: Node) -> None:
+    """Declare all parameters of the planner node, each with what may be set."""
+
+    def declare(name: str, default: object, description: str, **more: object) -> None:
+        if name in CHOICES:
+            more["additional_constraints"] = f"one of {CHOICES[name]}"
+        node.declare_parameter(name, default, ParameterDescriptor(description=description, **more))
+
+    declare(
+        "model",
+        "any_map",
+        "Name of a shipped model, or path of a model file",
+        additional_constraints="a model that can be loaded; else the one before it stays",
+    )
+    declare("move_rule", "", "Which diagonal moves are legal; '' for the rule of the model")
+    declare(
+        "occupied_threshold",
+        65,
+        "A cell of this value or more is occupied, percent",
+        integer_range=[IntegerRange(from_value=1, to_value=100, step=1)],
+    )
+    declare("allow_unknown", False, "Whether unknown cells are free")
+    declare(
+        "priced",
+        False,
+        "Whether a free cell is the dearer, the greater its value; an unknown one that is free is "
+        "the dearest. For models that learned prices: any_map",
+    )
+    declare(
+        "robot_radius",
+        0.0,
+        "Cells nearer than this to an obstacle are occupied, metres",
+        floating_point_range=[FloatingPointRange(from_value=0.0, to_value=100.0)],
+    )
+    declare(
+        "clearance_weight",
+        0.0,
+        "How much dearer cells near to an obstacle are: 0 for not at all. For models that learned "
+        "prices: any_map",
+        floating_point_range=[FloatingPointRange(from_value=0.0, to_value=1.0)],
+    )
+    declare(
+        "tolerance",
+        0.0,
+        "How far an occupied goal_pose may move to a reachable free cell, metres",
+        floating_point_range=[FloatingPointRange(from_value=0.0, to_value=1000.0)],
+    )
+    declare("mode", "greedy", "Whether to search where the greedy steps are trapped: guided")
+    declare("path_simplification", "none", "Whether straight parts of a path have two poses only")
+    declare("start_source", "initialpose", "Where the robot is: a topic, odom, or a transform")
+    declare(
+        "robot_frame",
+        "base_link",
+        "Frame of the robot, for the start_source tf",
+        additional_constraints="not empty",
+    )
+    declare(
+        "field_cache_bytes",
+        CACHE_BYTES,
+        "Memory for Q fields that are kept; the last one is kept whatever its size, bytes",
+        integer_range=[IntegerRange(from_value=0, to_value=2**40, step=1)],
+    )
+    declare(
+        "follow_trainer",
+        False,
+        "Whether to load each model that trainer/model_saved names",
+        read_only=True,
+    )

@@ -1,0 +1,398 @@
+"""A robot with a body, that is somewhere, and wants more than greedy steps."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from itertools import pairwise
+from pathlib import Path as FilePath
+from typing import Any
+
+import numpy as np
+import pytest
+from diagnostic_msgs.msg import DiagnosticStatus
+from geometry_msgs.msg import PoseStamped, TransformStamped
+from integration.robot import (
+    GOAL_YAW,
+    Robot,
+    check_path,
+    constant_model,
+    length_of,
+    points_of,
+    values_of,
+    yaw_of,
+)
+from nav_msgs.msg import Odometry, Path
+from nav_msgs.srv import GetPlan
+from rcl_interfaces.msg import SetParametersResult
+from rcl_interfaces.srv import SetParametersAtomically
+from rclpy.parameter import Parameter
+from std_msgs.msg import Header
+from visualization_msgs.msg import Marker, MarkerArray
+
+from ddqn_planner.grid import Cell, MoveRule, clearance, inflate
+from ddqn_planner.nodes.conversions import occupancy_message
+from ddqn_planner.nodes.runtime import LATCHED
+from ddqn_planner.planning import shortest_distances
+from ddqn_planner.planning.simplification import touched_cells
+
+RULE = MoveRule.ROBOT_SAFE
+RESOLUTION = 0.5
+
+
+@pytest.fixture(scope="module")
+def hall() -> np.ndarray:
+    """(15, 20) int8: a hall with a wall across, open at its upper end."""
+    values = np.zeros((15, 20), dtype=np.int8)
+    values[:9, 10] = 100
+    return values
+
+
+@pytest.fixture(scope="module")
+def hall_robot(
+    run_node: Any, make_client: Callable[[str], Any], hall: np.ndarray, model: FilePath
+) -> Iterator[Robot]:
+    client = make_client("/hall")
+    with run_node("planner_node", {}, namespace="/hall"):
+        yield Robot(client, hall, model, "/hall/planner")
+
+
+@contextmanager
+def parameters_of(robot: Robot, **values: Any) -> Iterator[None]:
+    """Set parameters for a while."""
+    before = {name: robot.client.get_parameter("planner", name) for name in values}
+    assert all(result.successful for result in robot.client.set_parameters("planner", **values))
+    try:
+        yield
+    finally:
+        robot.client.set_parameters("planner", **before)
+
+
+@pytest.fixture
+def robot(hall_robot: Robot) -> Robot:
+    hall_robot.clear()
+    hall_robot.send_map()
+    wait_for_map(hall_robot)
+    return hall_robot
+
+
+def wait_for_map(robot: Robot) -> None:
+    """Wait until the planner has the map that was sent: services do not wait for topics."""
+    ask(robot, lambda: robot.get_plan(robot.pose((0, 0)), robot.pose((0, 0))).poses)
+
+
+def ask(robot: Robot, question: Callable[[], Any]) -> Any:
+    for _ in range(200):
+        answer = question()
+        if answer:
+            return answer
+    raise AssertionError(f"no answer: {robot.wait_for_reason('.').message}")
+
+
+def cells_of(robot: Robot, path: Path) -> list[Cell]:
+    return [robot.grid.world_to_cell(x, y) for x, y in points_of(path)]
+
+
+# A body
+
+
+@pytest.mark.parametrize("radius", [0.6, 1.2])
+def test_paths_keep_the_robots_radius_from_obstacles_and_are_as_short_as_that_lets_them(
+    robot: Robot, hall: np.ndarray, radius: float
+) -> None:
+    inflated = inflate(robot.grid, radius)
+    with parameters_of(robot, robot_radius=radius):
+        path = robot.get_plan(robot.pose((0, 0)), robot.pose((19, 0)))
+        check_path(path, inflated)
+        optimum = shortest_distances(inflated, (19, 0), RULE)[0, 0]
+        assert length_of(path) == pytest.approx(optimum * RESOLUTION)
+        metres = clearance(hall > 0) * RESOLUTION
+        assert min(metres[y, x] for x, y in cells_of(robot, path)) >= radius
+    path = robot.get_plan(robot.pose((0, 0)), robot.pose((19, 0)))
+    assert length_of(path) < optimum * RESOLUTION
+
+
+def test_a_start_beside_an_obstacle_leaves_and_one_on_it_does_not(robot: Robot) -> None:
+    inflated = inflate(robot.grid, 1.2)
+    with parameters_of(robot, robot_radius=1.2):
+        cells = cells_of(robot, robot.get_plan(robot.pose((9, 4)), robot.pose((0, 0))))
+        assert cells[:2] == [(9, 4), (8, 4)]
+        free = [inflated.is_free(cell) for cell in cells]
+        assert free == sorted(free)
+        assert robot.get_plan(robot.pose((10, 4)), robot.pose((0, 0))).poses == []
+        robot.wait_for_reason("the start is occupied")
+
+
+def test_costs_near_obstacles_keep_the_path_away_from_them(robot: Robot, hall: np.ndarray) -> None:
+    def mean_distance(path: Path) -> float:
+        metres = clearance(hall > 0) * RESOLUTION
+        return float(np.mean([metres[y, x] for x, y in cells_of(robot, path)]))
+
+    asked = robot.pose((9, 0)), robot.pose((11, 0))
+    plain = robot.get_plan(*asked)
+    with parameters_of(robot, clearance_weight=1.0):
+        careful = robot.get_plan(*asked)
+    check_path(careful, robot.grid)
+    assert mean_distance(careful) > 1.3 * mean_distance(plain)
+    assert length_of(plain) <= length_of(careful) < 1.5 * length_of(plain)
+
+
+def test_an_occupied_goal_moves_within_the_tolerance_of_the_request(robot: Robot) -> None:
+    def get_plan(tolerance: float) -> Path:
+        goal = robot.pose((10, 2), GOAL_YAW)
+        request = GetPlan.Request(start=robot.pose((0, 2)), goal=goal, tolerance=tolerance)
+        return robot.client.call(GetPlan, "planner/get_plan", request).plan
+
+    assert get_plan(0.0).poses == []
+    status = robot.wait_for_reason("the goal is occupied.*greater tolerance")
+    assert values_of(status)["status"] == "GOAL_OCCUPIED"
+    path = get_plan(0.5)
+    assert cells_of(robot, path)[-1] == (9, 2)
+    assert yaw_of(path.poses[-1].pose.orientation) == pytest.approx(GOAL_YAW)
+    robot.wait_for_reason("a path of .*; the goal is occupied and moved 0.5 m")
+    with parameters_of(robot, robot_radius=0.9):
+        assert get_plan(0.9).poses == []
+        assert cells_of(robot, get_plan(1.0))[-1] == (8, 2)
+    for tolerance in (-0.1, math.nan, math.inf):
+        assert get_plan(tolerance).poses == []
+        status = robot.wait_for_reason(f"the tolerance is {tolerance:.1f}")
+        assert values_of(status)["status"] == "INVALID_TOLERANCE"
+        robot.clear()
+    with parameters_of(robot, robot_radius=0.9):
+        assert robot.get_plan(robot.pose((0, 2)), robot.pose((9, 2))).poses == []
+        robot.wait_for_reason("the goal is occupied .*nearer to an obstacle than robot_radius, 0.9")
+
+
+def test_an_occupied_goal_pose_moves_within_the_parameter(robot: Robot) -> None:
+    robot.send_start(robot.pose((0, 2)))
+    with parameters_of(robot, tolerance=0.6):
+        robot.send_goal(robot.pose((10, 2)))
+        robot.wait_for_path((0, 2), (9, 2))
+        robot.value.wait(lambda value: value.data[2 * 20 + 9] == 100)
+
+
+def test_simplified_paths_have_fewer_poses_and_no_illegal_segment(robot: Robot) -> None:
+    asked = robot.pose((1, 1)), robot.pose((18, 3), GOAL_YAW)
+    whole = robot.get_plan(*asked)
+    with parameters_of(robot, path_simplification="line_of_sight", robot_radius=0.6):
+        path = robot.get_plan(*asked)
+    cells = cells_of(robot, path)
+    assert (cells[0], cells[-1]) == ((1, 1), (18, 3))
+    assert len(cells) < len(whole.poses) / 3
+    occupancy = inflate(robot.grid, 0.6).occupancy
+    for index, (first, last) in enumerate(pairwise(cells)):
+        for x, y in touched_cells(first, last, RULE).tolist():
+            assert not occupancy[y, x]
+        towards = math.atan2(last[1] - first[1], last[0] - first[0])
+        assert yaw_of(path.poses[index].pose.orientation) == pytest.approx(towards)
+    assert yaw_of(path.poses[-1].pose.orientation) == pytest.approx(GOAL_YAW)
+
+
+# Searching
+
+
+def test_a_bad_model_plans_in_guided_mode_and_says_that_it_searched(
+    run_node: Any,
+    make_client: Callable[[str], Any],
+    small_values: np.ndarray,
+    tmp_path: FilePath,
+) -> None:
+    path = tmp_path / "bad.safetensors"
+    constant_model(path, 6, 1)
+    grid = Robot.grid_of(small_values)
+    with run_node("planner_node", {"model": str(path)}, namespace="/bad") as node:
+        robot = Robot(make_client("/bad"), small_values, path, "/bad/planner")
+        robot.send_map()
+        wait_for_map(robot)
+        assert robot.get_plan(robot.pose((0, 0)), robot.pose((5, 5))).poses == []
+        robot.wait_for_reason("greedy steps do not find it.*or set mode to 'guided'")
+        with parameters_of(robot, mode="guided"):
+            for goal in grid.free_cells()[::3]:
+                distances = shortest_distances(grid, goal, RULE)
+                for start in grid.free_cells():
+                    plan = robot.get_plan(robot.pose(start), robot.pose(goal))
+                    assert bool(plan.poses) == bool(np.isfinite(distances[start[::-1]]))
+                    check_path(plan, grid)
+            robot.get_plan(robot.pose((0, 0)), robot.pose((5, 5)))
+            status = robot.wait_for_reason("searched for in the order of the Q field")
+            assert values_of(status)["method"] == "guided"
+            assert status.level == DiagnosticStatus.OK
+            node.wait_for_log("a path of .* searched for in the order of the Q field")
+            # Of the two moves that the model knows one leads there.
+            robot.get_plan(robot.pose((2, 0)), robot.pose((0, 0)))
+            status = robot.wait_for_reason("a path of 2.00 cells, by greedy steps")
+            assert values_of(status)["method"] == "greedy"
+
+
+# Where the robot is
+
+
+def odometry(robot: Robot, cell: Cell, frame: str = "map") -> Odometry:
+    message = Odometry(header=Header(frame_id=frame), child_frame_id="base_link")
+    message.pose.pose = robot.pose(cell).pose
+    return message
+
+
+def test_the_start_comes_from_odometry(robot: Robot) -> None:
+    robot.send_goal(robot.pose((19, 14)))
+    with parameters_of(robot, start_source="odometry"):
+        robot.wait_for_reason("start is unknown; nothing came on /hall/odom in the map's frame")
+        robot.client.publish("odom", odometry(robot, (2, 2)))
+        robot.wait_for_path((2, 2), (19, 14))
+        robot.clear()
+        # It goes on moving; the next plan begins where it is then.
+        robot.client.publish("odom", odometry(robot, (3, 2)))
+        robot.client.publish("odom", odometry(robot, (4, 2), frame="odom"))
+        status = robot.wait_for_reason("odom refused: the start's frame is 'odom', the map's is")
+        assert status.level == DiagnosticStatus.WARN
+        assert robot.plans.messages() == []
+        robot.client.publish("odom", odometry(robot, (3, 2)))
+        robot.wait_for_reason("^a path of [^;]*$")
+        robot.send_goal(robot.pose((0, 14)))
+        robot.wait_for_path((3, 2), (0, 14))
+    robot.wait_for_reason("start is unknown; set it on /hall/initialpose")
+    robot.send_start(robot.pose((5, 5)))
+    robot.wait_for_path((5, 5), (0, 14))
+
+
+def test_without_tf2_it_says_so_and_the_other_sources_work(robot: Robot, run_node: Any) -> None:
+    (result,) = robot.client.set_parameters("planner", start_source="tf")
+    assert not result.successful
+    assert "needs tf2_ros, and that is not installed: apt install" in result.reason
+    robot.send_start(robot.pose((5, 5)))
+    robot.send_goal(robot.pose((6, 6)))
+    robot.wait_for_path((5, 5), (6, 6))
+    with run_node("planner_node", {"start_source": "tf"}, exit_code=1) as node:
+        node.wait_for_end()
+    assert "cannot start: " in node.log
+    assert "tf2_ros" in node.log
+    assert "Traceback" not in node.log
+
+
+TF2_ROS = """
+from geometry_msgs.msg import TransformStamped
+
+class TransformException(Exception):
+    pass
+
+class Buffer:
+    def __init__(self):
+        self.transforms = {}
+
+    def lookup_transform(self, target_frame, source_frame, time):
+        if (target_frame, source_frame) not in self.transforms:
+            raise TransformException(f'"{source_frame}" does not exist')
+        return self.transforms[target_frame, source_frame]
+
+class TransformListener:
+    def __init__(self, buffer, node):
+        def hear(transform):
+            buffer.transforms[transform.header.frame_id, transform.child_frame_id] = transform
+
+        self.node = node
+        self.subscription = node.create_subscription(TransformStamped, "tf", hear, 10)
+
+    def unregister(self):
+        self.node.destroy_subscription(self.subscription)
+"""
+"""As much of tf2_ros as the node uses, which is no package of PyPI: one transform, no tree."""
+
+
+def test_the_start_comes_from_tf(
+    run_node: Any,
+    make_client: Callable[[str], Any],
+    hall: np.ndarray,
+    model: FilePath,
+    tmp_path: FilePath,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    (tmp_path / "tf2_ros.py").write_text(TF2_ROS)
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path), prepend=":")
+    client = make_client("/transformed")
+    with run_node("planner_node", {"start_source": "tf"}, namespace="/transformed"):
+        robot = Robot(client, hall, model, "/transformed/planner")
+        robot.send_map()
+        robot.send_goal(robot.pose((19, 14)))
+        robot.wait_for_reason("no transform leads from 'base_link' to 'map' .*publish one, or set")
+        transform = TransformStamped(header=Header(frame_id="map"), child_frame_id="base_link")
+        x, y = robot.grid.cell_to_world((4, 7))
+        transform.transform.translation.x, transform.transform.translation.y = x, y
+        client.publish("tf", transform)
+        ask(robot, lambda: robot.get_plan(PoseStamped(), robot.pose((0, 0))).poses)
+        robot.send_goal(robot.pose((19, 13)))
+        robot.wait_for_path((4, 7), (19, 13))
+        assert client.set_parameters("planner", start_source="initialpose")[0].successful
+        robot.send_start(robot.pose((5, 5)))
+        robot.wait_for_path((5, 5), (19, 13))
+
+
+# Parameters that come together
+
+
+def test_parameters_that_come_together_are_set_together_or_not_at_all(robot: Robot) -> None:
+    def set_together(**values: Any) -> SetParametersResult:
+        messages = [
+            Parameter(name, value=value).to_parameter_msg() for name, value in values.items()
+        ]
+        request = SetParametersAtomically.Request(parameters=messages)
+        name = "planner/set_parameters_atomically"
+        return robot.client.call(SetParametersAtomically, name, request).result
+
+    good = {"robot_radius": 0.4, "mode": "guided", "occupied_threshold": 50}
+    before = {name: robot.client.get_parameter("planner", name) for name in good}
+    for bad, reason in (
+        ({"clearance_weight": 1.5}, "out of range"),
+        ({"move_rule": "diagonal"}, "move_rule is 'diagonal'; it is one of"),
+        ({"model": "no_such_model"}, "there is no shipped model 'no_such_model'"),
+        ({"start_source": "gps"}, "start_source is 'gps'; it is one of"),
+        ({"robot_frame": ""}, "robot_frame is ''; name"),
+        ({"tolerance": math.nan}, "out of range"),
+        ({"follow_trainer": True}, "read-only"),
+        ({"no_such": 1}, "undeclared"),
+    ):
+        for together in ({**good, **bad}, {**bad, **good}):
+            result = set_together(**together)
+            assert not result.successful
+            assert reason in result.reason
+            for name, value in before.items():
+                assert robot.client.get_parameter("planner", name) == value
+    assert set_together(**good).successful
+    assert robot.client.get_parameter("planner", "robot_radius") == 0.4
+    assert set_together(**before).successful
+
+
+# What is to be looked at
+
+
+def test_the_plan_and_the_value_carry_the_stamp_of_their_map(robot: Robot) -> None:
+    for seconds in (5, 9):
+        message = robot.map_message()
+        message.header.stamp.sec = seconds
+        robot.send_map(message)
+        robot.send_start(robot.pose((0, 0)))
+        robot.send_goal(robot.pose((3, 3)))
+        robot.plans.wait(lambda plan, s=seconds: plan.poses and plan.header.stamp.sec == s)
+        robot.value.wait(lambda value, s=seconds: value.header.stamp.sec == s)
+        plan = robot.get_plan(robot.pose((1, 0)), robot.pose((3, 3)))
+        assert plan.header.stamp.sec == seconds
+
+
+def test_the_policy_is_drawn_for_who_looks(robot: Robot, hall: np.ndarray) -> None:
+    robot.send_start(robot.pose((0, 0)))
+    robot.send_goal(robot.pose((19, 14)))
+    robot.wait_for_path((0, 0), (19, 14))
+    policies = robot.client.subscribe(MarkerArray, "planner/policy", LATCHED)
+
+    def arrows(message: MarkerArray) -> int:
+        (marker,) = message.markers
+        return len(marker.points) // 6 if marker.action == Marker.ADD else 0
+
+    free = int((hall == 0).sum())
+    message = policies.wait(lambda m: arrows(m) == free - 1)
+    assert message.markers[0].header.frame_id == "map"
+    policies.clear()
+    values = hall.copy()
+    values[13:, 0] = 100
+    robot.send_map(occupancy_message(values, RESOLUTION, (-1.0, 2.0, 0.0), Header(frame_id="map")))
+    policies.wait(lambda m: arrows(m) == free - 3)
