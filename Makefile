@@ -1,4 +1,4 @@
-# make setup | demo | test | lint | format | types | bench | load | soak | faults | model | model-dilemma
+# make setup | demo | test | lint | format | types | bench | body | faults | fuzz | load | soak | model | model-dilemma
 PYTHON ?= python3
 TORCH ?= torch==2.13.0
 VENV := .venv
@@ -12,7 +12,7 @@ else
 EXTRAS := experiments,figures,ros,tensorboard,test,watch
 endif
 
-.PHONY: setup demo test lint format types bench load soak faults model model-dilemma
+.PHONY: setup demo test lint format types bench body faults fuzz load soak model model-dilemma
 .DEFAULT_GOAL := help
 
 .PHONY: help
@@ -50,15 +50,25 @@ bench: setup
 	$(BIN)/python scripts/benchmark.py
 	$(BIN)/python scripts/benchmark_any_map.py $(MAP)
 
-# REQUESTS and MINUTES are those of the scripts by default.
+# What a robot's body costs, on MAP (the office by default) and with RADIUS, metres.
+body: setup
+	$(BIN)/python scripts/body.py $(MAP) $(RADIUS)
+
+# 50 kills, 1,000 inputs of each kind, 10,000 requests, 20 minutes; KILLS, REQUESTS, MINUTES change it.
+faults: setup
+	$(BIN)/python scripts/faults.py $(KILLS)
+
+fuzz: setup
+	$(BIN)/python -m pytest --hypothesis-profile=fuzz -k "any or fuzz or bad or broken" \
+		test/grid/test_map_file.py test/grid/test_map_file_fuzz.py test/model \
+		test/training/test_run.py test/training/test_trainer.py test/integration/test_map_server_node.py \
+		test/integration/test_planner_fuzz.py test/integration/test_trainer_node.py
+
 load: setup
 	$(BIN)/python scripts/load.py $(REQUESTS)
 
 soak: setup
 	$(BIN)/python scripts/soak.py $(MINUTES)
-
-faults: setup
-	$(BIN)/python scripts/faults.py $(KILLS)
 
 # These train the shipped models from nothing: the one for any map, and the paper's network.
 model: setup

@@ -1,4 +1,4 @@
-"""Writing files so that a crash leaves the old one or the new one, never a half."""
+"""Writing files so that a crash or a full disk leaves no half of anything."""
 
 from __future__ import annotations
 
@@ -7,11 +7,14 @@ import io
 import os
 import tempfile
 from collections.abc import Iterable, Sequence
+from contextlib import suppress
 from pathlib import Path
 
 
 def write_atomically(path: Path, content: bytes) -> None:
     """Write a file beside its place and rename it there; missing folders are made.
+
+    A process that is killed meanwhile leaves a temporary file, see `remove_temporaries`.
 
     Raises
     ------
@@ -31,8 +34,65 @@ def write_atomically(path: Path, content: bytes) -> None:
         os.chmod(temporary, 0o666 & ~umask)
         os.replace(temporary, path)
     except BaseException:
-        os.unlink(temporary)
+        with suppress(OSError):  # the first error is the one to tell
+            os.unlink(temporary)
         raise
+
+
+def remove_temporaries(path: Path) -> None:
+    """Remove what killed processes left of writing a file; its name must have no wildcards.
+
+    Raises
+    ------
+    OSError
+        If one cannot be removed.
+    """
+    for temporary in path.parent.glob(f".{path.name}.*"):
+        temporary.unlink(missing_ok=True)
+
+
+class Appender:
+    """Appends records to a file, each whole before the next one begins.
+
+    When the disk is full, the file may end with a part of a record; the rest of it is kept, and
+    written before the next record.
+
+    Parameters
+    ----------
+    path : Path
+
+    Raises
+    ------
+    OSError
+        If the file cannot be opened.
+    """
+
+    def __init__(self, path: Path) -> None:
+        # Unbuffered: who reads the file meanwhile, or after a crash, sees every record.
+        self._file = path.open("ab", buffering=0)
+        self._rest = b""
+
+    def append(self, record: bytes) -> None:
+        """Append a record.
+
+        Raises
+        ------
+        OSError
+            If it cannot be written whole. It is then written by the next call that can write, or
+            left out if the one before it is not yet whole.
+        """
+        self.flush()
+        self._rest = record
+        self.flush()
+
+    def flush(self) -> None:
+        """Write what is left of the last record; see `append` for errors."""
+        while self._rest:
+            self._rest = self._rest[self._file.write(self._rest) :]
+
+    def close(self) -> None:
+        """Close the file."""
+        self._file.close()
 
 
 def write_csv(path: Path, columns: Sequence[str], rows: Iterable[Sequence[object]]) -> None:

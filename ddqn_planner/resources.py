@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 from collections.abc import Iterator
 from pathlib import Path
@@ -43,7 +44,7 @@ def find_resource(folder: str, name: str) -> Path:
     """
     looked_in = [share / folder for share in share_directories()]
     for directory in looked_in:
-        if (directory / name).is_file():
+        if os.path.isfile(directory / name):
             return directory / name
     known = sorted({path.name for directory in looked_in for path in directory.glob("*.*")})
     raise FileNotFoundError(
@@ -68,25 +69,29 @@ def find_map(name: str) -> Path:
     Raises
     ------
     FileNotFoundError
-        If there is no shipped map of that name, or no such package.
+        If there is no shipped map of that name, or no such package, or a URL leads out of it.
     """
     path = Path(name.removeprefix("file://"))
     if name.startswith("package://"):
         return _package_path(name.removeprefix("package://"))
-    if path.name != name or path.exists():
+    if path.name != name or os.path.exists(path):
         return path
     return find_resource("maps", name if path.suffix else f"{name}.yaml")
 
 
 def _package_path(name: str) -> Path:
     package, _, rest = name.partition("/")
+    if rest.startswith("/") or ".." in Path(rest).parts:
+        raise FileNotFoundError(
+            f"{'package://' + name!r} leads out of its package; give a path in it, or a plain path"
+        )
     if package == PACKAGE:
         return find_resource(str(Path(rest).parent), Path(rest).name)
     try:
         from ament_index_python.packages import get_package_share_directory
 
         return Path(get_package_share_directory(package)) / rest
-    except (ImportError, LookupError, OSError) as error:
+    except (ImportError, LookupError, OSError, ValueError) as error:
         raise FileNotFoundError(
-            f"package://{name}: there is no such package ({error}); check it, or give a path"
+            f"{'package://' + name!r}: there is no such package ({error}); give another, or a path"
         ) from None

@@ -3,6 +3,8 @@ from __future__ import annotations
 import os
 import shutil
 import signal
+import tempfile
+from collections.abc import Iterator
 from pathlib import Path
 
 import hypothesis
@@ -29,7 +31,24 @@ hypothesis.settings.load_profile("default")
 ROOT = Path(__file__).resolve().parent.parent
 
 
+NOBODY = 65534
+
 NOT_SOURCE = (".*", "__pycache__", "*.egg-info", "build", "dist", "install", "log", "runs")
+
+
+@pytest.fixture
+def plain_folder() -> Iterator[Path]:
+    """A folder of a user who is not root, and may not read everything, for the time of a test."""
+    folder = Path(tempfile.mkdtemp())
+    user = os.geteuid()
+    if user == 0:
+        folder.chmod(0o777)
+        os.seteuid(NOBODY)
+    try:
+        yield folder
+    finally:
+        os.seteuid(user)
+        shutil.rmtree(folder)
 
 
 @pytest.fixture(scope="session")

@@ -24,6 +24,11 @@ MAX_YAML_BYTES = 2**16
 
 IMAGE_FORMATS = ("PPM", "PNG", "BMP", "JPEG")
 
+_shortener = reprlib.Repr()
+# Lists that aliases nest may be of any size when they are written out.
+_shortener.maxlevel = 2
+_short = _shortener.repr
+
 
 class MapFileError(ValueError):
     """A map file cannot be read; the message says which value is wrong and what would be right."""
@@ -107,7 +112,8 @@ def read_map_file(path: str | Path) -> MapFile:
 
     A ROS map is read as Nav2's map_server 1.3.7 and later reads it. Its YAML may also hold
     ``ddqn_planner: {start: [x, y], goal: [x, y]}``, the cells of a scenario, which map_server
-    ignores.
+    ignores. Unlike there, the image must lie in the folder of the YAML file or below it, so that a
+    map from elsewhere cannot name any file of this machine.
 
     Parameters
     ----------
@@ -123,9 +129,14 @@ def read_map_file(path: str | Path) -> MapFile:
     MapDataError
         If the cells of the map cannot be read.
     """
-    path = Path(os.path.expanduser(path))
+    try:
+        path = Path(os.path.expanduser(path))
+    except ValueError:  # the name of a user that cannot be one
+        path = Path(path)
     if not os.path.isfile(path):
-        raise MapNotFoundError(f"{path}: no such file; give the path of a .yaml or .map file")
+        raise MapNotFoundError(
+            f"{str(path)!r}: no such file; give the path of a .yaml or .map file"
+        )
     if path.suffix.lower() not in (".yaml", ".yml", ".map"):
         raise MapMetadataError(f"{path}: ends in {path.suffix!r}; give a .yaml, .yml or .map file")
     try:
@@ -211,37 +222,54 @@ def _read_moving_ai(path: Path) -> MapFile:
     height, width = int(header[1]), int(header[2])
     if not 1 <= height * width <= MAX_CELLS:
         raise ValueError(f"height is {height}, width is {width}; give 1 to {MAX_CELLS} cells")
-    rows = content[header.end() :].rstrip(b"\r\n").splitlines()
-    if len(rows) != height:
-        raise MapDataError(f"{path}: has {len(rows)} rows; give {height}, as its header says")
-    for y, row in enumerate(rows):
-        if len(row) != width:
-            raise MapDataError(
-                f"{path}: row {y} has {len(row)} characters; give {width}, as the header says"
-            )
-    cells = np.frombuffer(b"".join(rows), dtype=np.uint8).reshape(height, width)
+    rows = content[header.end() :].replace(b"\r\n", b"\n").rstrip(b"\n") + b"\n"
+    count = rows.count(b"\n")
+    if count != height:
+        raise MapDataError(f"{path}: has {count} rows; give {height}, as its header says")
+    cells = np.frombuffer(rows, dtype=np.uint8)
+    lengths = np.diff(np.flatnonzero(cells == ord("\n")), prepend=-1) - 1
+    wrong = np.flatnonzero(lengths != width)
+    if wrong.size:
+        raise MapDataError(
+            f"{path}: row {wrong[0]} has {lengths[wrong[0]]} characters; give {width}, as the"
+            " header says"
+        )
+    cells = cells.reshape(height, width + 1)[:, :-1]
     free = np.isin(cells, np.frombuffer(b".GS", dtype=np.uint8))
     return MapFile(np.where(free, np.int8(0), np.int8(100)))
 
 
 def _read_ros(path: Path) -> MapFile:
     document = _parse_yaml(_read_bytes(path, MAX_YAML_BYTES, MapMetadataError))
-    name = document.get("image")
-    if not isinstance(name, str) or not name:
-        raise ValueError(f"image is {reprlib.repr(name)}; give the path of an image")
-    mode = str(document.get("mode", "trinary")).lower()
+    image = _image_path(path, document.get("image"))
+    mode = _text(document, "mode", "trinary")
     percent = _percent_of_grey(document, mode)
     resolution = _number(document.get("resolution"), "resolution")
     origin = document.get("origin")
     if not isinstance(origin, list) or len(origin) != 3:
-        raise ValueError(f"origin is {reprlib.repr(origin)}; give three numbers [x, y, yaw]")
+        raise ValueError(f"origin is {_short(origin)}; give three numbers [x, y, yaw]")
     x, y, yaw = (_number(value, "origin") for value in origin)
     scenario = document.get("ddqn_planner", {})
     if not isinstance(scenario, dict) or not scenario.keys() <= {"start", "goal"}:
-        raise ValueError(f"ddqn_planner is {reprlib.repr(scenario)}; give {{start: , goal: }}")
+        raise ValueError(f"ddqn_planner is {_short(scenario)}; give {{start: , goal: }}")
     start, goal = _cell(scenario, "start"), _cell(scenario, "goal")
-    values = _read_image(path.parent / name, percent, clear_is_unknown=mode != "raw")
+    values = _read_image(image, percent, clear_is_unknown=mode != "raw")
     return MapFile(values[::-1], resolution, (x, y, yaw), start, goal)
+
+
+def _image_path(path: Path, name: object) -> Path:
+    if not isinstance(name, str) or not name:
+        raise ValueError(f"image is {_short(name)}; give the path of an image")
+    image = path.parent / name
+    if not os.path.isfile(image):
+        raise MapDataError(f"{str(image)!r}: no such image; check 'image' in the YAML file")
+    # Of a YAML that is a link itself, as in a linked colcon workspace, both folders may hold it.
+    folders = path.parent.resolve(), path.resolve().parent
+    if not any(image.resolve().is_relative_to(folder) for folder in folders):
+        raise ValueError(
+            f"image is {name!r}, outside of the folder of the YAML file; put it beside the YAML"
+        )
+    return image
 
 
 def _parse_yaml(content: bytes) -> dict[str, Any]:
@@ -256,11 +284,18 @@ def _parse_yaml(content: bytes) -> dict[str, Any]:
     return document
 
 
+def _text(document: dict[str, Any], key: str, default: str | None = None) -> str:
+    value = document.get(key, default)
+    if not isinstance(value, str):
+        raise ValueError(f"{key} is {_short(value)}; give a single value")
+    return value.lower()
+
+
 def _number(value: object, key: str) -> float:
     try:
         return float(value if isinstance(value, str) else "")
     except ValueError:
-        raise ValueError(f"{key} is {reprlib.repr(value)}; give a number") from None
+        raise ValueError(f"{key} is {_short(value)}; give a number") from None
 
 
 def _cell(scenario: dict[str, Any], key: str) -> Cell | None:
@@ -270,7 +305,7 @@ def _cell(scenario: dict[str, Any], key: str) -> Cell | None:
     try:
         x, y = map(int, cell if isinstance(cell, list) else ())
     except (TypeError, ValueError):
-        raise ValueError(f"{key} is {reprlib.repr(cell)}; give two integers [x, y]") from None
+        raise ValueError(f"{key} is {_short(cell)}; give two integers [x, y]") from None
     return x, y
 
 
@@ -283,14 +318,14 @@ def _percent_of_grey(document: dict[str, Any], mode: str) -> NDArray[np.int8]:
             f"free_thresh is {free_thresh}, occupied_thresh is {occupied_thresh}; give"
             " 0 <= free_thresh <= occupied_thresh <= 1"
         )
-    negate = str(document.get("negate")).lower()
+    negate = _text(document, "negate")
     if negate not in ("0", "1", "false", "true", "no", "yes", "off", "on"):
-        raise ValueError(f"negate is {reprlib.repr(negate)}; give 0 or 1")
+        raise ValueError(f"negate is {_short(negate)}; give 0 or 1")
     grey = np.arange(256)
     if mode == "raw":
         return np.where(grey <= 100, grey, -1).astype(np.int8)
     if mode not in ("trinary", "scale"):
-        raise ValueError(f"mode is {reprlib.repr(mode)}; give trinary, scale or raw")
+        raise ValueError(f"mode is {_short(mode)}; give trinary, scale or raw")
     # map_server calculates in single precision, and a value may equal a threshold.
     free, occupied = np.float32(free_thresh), np.float32(occupied_thresh)
     p = grey.astype(np.float32) / np.float32(255)
@@ -306,8 +341,6 @@ def _percent_of_grey(document: dict[str, Any], mode: str) -> NDArray[np.int8]:
 
 def _read_image(path: Path, percent: NDArray[np.int8], clear_is_unknown: bool) -> NDArray[np.int8]:
     """Return (H, W) int8: the occupancy of each pixel; colours count by their Rec. 601 luma."""
-    if not os.path.isfile(path):
-        raise MapDataError(f"{path}: no such image; check 'image' in the YAML file")
     try:
         with Image.open(path, formats=IMAGE_FORMATS) as image:
             if image.width * image.height > MAX_CELLS:
@@ -319,7 +352,7 @@ def _read_image(path: Path, percent: NDArray[np.int8], clear_is_unknown: bool) -
                 values[np.asarray(image.convert("RGBA").getchannel("A")) < 255] = -1
     except Exception as error:  # Pillow raises whatever broken bytes lead its decoders to
         raise MapDataError(
-            f"{path}: not readable ({error}); give a {', '.join(IMAGE_FORMATS)} image of at most"
-            f" {MAX_CELLS} pixels"
+            f"{str(path)!r}: not readable ({error}); give a {', '.join(IMAGE_FORMATS)} image of at"
+            f" most {MAX_CELLS} pixels"
         ) from error
     return values

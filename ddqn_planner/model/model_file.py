@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import json
+import os
+import reprlib
 from dataclasses import asdict, dataclass
 from importlib import metadata
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 import safetensors.torch
 import torch
 from safetensors import SafetensorError, safe_open
-from torch import Tensor
 
 from ddqn_planner.files import write_atomically
 from ddqn_planner.grid import MoveRule
@@ -24,6 +25,9 @@ MODEL_SUFFIX = ".safetensors"
 MAX_SIZE = 4096
 """Largest network size (height, width, filters) that a model file may ask for."""
 
+MAX_FILE_BYTES = 2**28
+"""A larger file is refused before it is read."""
+
 
 AnyQNetwork = PaperQNetwork | PropagationQNetwork | AnyMapQNetwork
 
@@ -33,6 +37,18 @@ SIZES: Final = {
     "any_map": ("filters",),
 }
 """The arguments of each kind of network."""
+
+FIELD_TYPES: Final[dict[str, tuple[type, ...]]] = {
+    "network": (str,),
+    "sizes": (dict,),
+    "move_rule": (str,),
+    "gamma": (float, int),
+    "map_fingerprint": (str,),
+    "steps": (int,),
+    "seed": (int,),
+    "package_version": (str,),
+}
+"""What JSON makes of each entry of `ModelMetadata`."""
 
 
 class ModelFileError(ValueError):
@@ -88,7 +104,7 @@ def find_model(name: str | Path) -> Path:
         If there is neither such a file nor such a shipped model.
     """
     if Path(name).suffix == MODEL_SUFFIX or Path(name).name != str(name):
-        if Path(name).is_file():
+        if os.path.isfile(name):
             return Path(name)
         raise ModelFileError(f"there is no model file {str(name)!r}; check the path")
     try:
@@ -127,23 +143,16 @@ def load_model(name: str | Path) -> tuple[AnyQNetwork, ModelMetadata]:
         If the file is missing, truncated, not safetensors, or not a model of this package.
     """
     path = find_model(name)
-    tensors, text = _read(path)
     try:
-        description = _parse(json.loads(text))
-        with torch.device("meta"):
-            network = new_network(description.network, description.sizes)
-    except (TypeError, ValueError, KeyError, RecursionError) as error:
+        with path.open("rb"):  # safetensors says of a file that it may not read that there is none
+            return _load(path)
+    except OSError as error:
+        raise ModelFileError(f"{path}: cannot be read ({error}); check its rights") from None
+    except SafetensorError as error:
         raise ModelFileError(
-            f"{path}: its metadata is wrong ({error}); train the model again"
+            f"{path}: cannot be read as safetensors ({error}); it is truncated or of another "
+            "kind: save or copy it again"
         ) from None
-    expected = {key: tuple(tensor.shape) for key, tensor in network.state_dict().items()}
-    found = {key: tuple(tensor.shape) for key, tensor in tensors.items()}
-    if expected != found:
-        raise ModelFileError(f"{path}: holds tensors {found}, not {expected}; train it again")
-    if not all(t.dtype == torch.float32 and bool(t.isfinite().all()) for t in tensors.values()):
-        raise ModelFileError(f"{path}: its weights are not all finite float32; train it again")
-    network.load_state_dict(tensors, assign=True)
-    return network.requires_grad_(False), description
 
 
 def new_network(kind: str, sizes: dict[str, int]) -> AnyQNetwork:
@@ -155,28 +164,59 @@ def new_network(kind: str, sizes: dict[str, int]) -> AnyQNetwork:
     return PaperQNetwork(**sizes)
 
 
-def _read(path: Path) -> tuple[dict[str, Tensor], str]:
-    try:
-        with safe_open(path, framework="pt") as file:
-            text = (file.metadata() or {}).get(METADATA_KEY)
-            if text is None:
-                raise ModelFileError(
-                    f"{path}: is safetensors, but no model of {PACKAGE} (it has no metadata "
-                    f"{METADATA_KEY!r}); give a file that ddqn-planner or trainer_node saved"
-                )
-            return {key: file.get_tensor(key) for key in file.keys()}, text  # noqa: SIM118
-    except (SafetensorError, OSError) as error:
-        raise ModelFileError(
-            f"{path}: cannot be read as safetensors ({error}); it is truncated or of another "
-            "kind: save or copy it again"
-        ) from None
+def _load(path: Path) -> tuple[AnyQNetwork, ModelMetadata]:
+    size = os.path.getsize(path)
+    if size > MAX_FILE_BYTES:
+        raise ModelFileError(f"{path}: has {size} bytes; give a model of at most {MAX_FILE_BYTES}")
+    with safe_open(path, framework="pt") as file:
+        text = (file.metadata() or {}).get(METADATA_KEY)
+        if text is None:
+            raise ModelFileError(
+                f"{path}: is safetensors, but no model of {PACKAGE} (it has no metadata "
+                f"{METADATA_KEY!r}); give a file that ddqn-planner or trainer_node saved"
+            )
+        try:
+            description = _parse(json.loads(text))
+            with torch.device("meta"):
+                network = new_network(description.network, description.sizes)
+        except (ValueError, RecursionError) as error:
+            raise ModelFileError(
+                f"{path}: its metadata is wrong ({error}); train the model again"
+            ) from None
+        weights = network.state_dict()
+        expected = {key: ("F32", [*tensor.shape]) for key, tensor in weights.items()}
+        slices = {key: file.get_slice(key) for key in file.keys()}  # noqa: SIM118
+        found = {key: (part.get_dtype(), part.get_shape()) for key, part in slices.items()}
+        if expected != found:
+            raise ModelFileError(
+                f"{path}: holds tensors {reprlib.repr(found)}, not {expected}; train it again"
+            )
+        # Copies: the tensors of an open file change, or end the process, when the file does.
+        tensors = {key: file.get_tensor(key).clone() for key in found}
+    if not all(bool(tensor.isfinite().all()) for tensor in tensors.values()):
+        raise ModelFileError(f"{path}: its weights are not all finite; train it again")
+    network.load_state_dict(tensors, assign=True)
+    return network.requires_grad_(False), description
 
 
-def _parse(values: dict[str, Any]) -> ModelMetadata:
-    if values["network"] not in SIZES:
-        raise ValueError(f"network is {values['network']!r}; this version knows {[*SIZES]}")
-    sizes = values["sizes"]
-    for name in SIZES[values["network"]]:
-        if type(sizes[name]) is not int or not 1 <= sizes[name] <= MAX_SIZE:
-            raise ValueError(f"size {name} is {sizes[name]!r}; it must lie in 1 to {MAX_SIZE}")
+def _parse(values: object) -> ModelMetadata:
+    if not isinstance(values, dict):
+        raise ValueError(f"it is {reprlib.repr(values)}; it must be a JSON object")
+    wrong = sorted(values.keys() ^ FIELD_TYPES.keys())
+    if wrong:
+        raise ValueError(f"it lacks, or should not have, {reprlib.repr(wrong)}")
+    for key, types in FIELD_TYPES.items():
+        if type(values[key]) not in types:
+            names = " or ".join(known.__name__ for known in types)
+            raise ValueError(f"{key} is {reprlib.repr(values[key])}; it must be {names}")
+    network, sizes = values["network"], values["sizes"]
+    if network not in SIZES:
+        raise ValueError(f"network is {reprlib.repr(network)}; this version knows {[*SIZES]}")
+    if sizes.keys() != set(SIZES[network]):
+        raise ValueError(f"sizes is {reprlib.repr(sizes)}; it must have {[*SIZES[network]]}")
+    for name, size in sizes.items():
+        if type(size) is not int or not 1 <= size <= MAX_SIZE:
+            raise ValueError(f"size {name} is {reprlib.repr(size)}; it must lie in 1 to {MAX_SIZE}")
+    if not 0 <= values["gamma"] <= 1:
+        raise ValueError(f"gamma is {values['gamma']}; it must lie in 0 to 1")
     return ModelMetadata(**{**values, "move_rule": MoveRule(values["move_rule"])})

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from ddqn_planner.grid import MOVES, OCCUPIED, UNKNOWN, Cell, GridMap, MoveRule
+from ddqn_planner.grid.grid_map import MAX_PRICE
 from ddqn_planner.model.front import spread
 
 FEATURES = 28
@@ -18,6 +19,10 @@ FEATURES = 28
 BATCH = 2**12
 """Surroundings that a network looks at in one go: what it makes of them fits into a cache, where
 all those of a large map would need gigabytes."""
+
+MAX_LEARNED_PRICE = 20 * MAX_PRICE
+"""Greatest price of a move that `AnyMapQNetwork` is believed: far beyond every true one. Time and
+memory of `spread` grow with the dearest move, and weights gone wild may ask for any price."""
 
 SETTLED = 1e-3
 """Values count as settled when none changes more than this in one repetition."""
@@ -128,7 +133,8 @@ class AnyMapQNetwork(nn.Module):
         """Return minus the cost of the best path through each action: length times price.
 
         There is no discount, and a move counts as possible where p > 1/2: so the greatest Q is the
-        cheapest path at any distance.
+        cheapest path at any distance. Prices above `MAX_LEARNED_PRICE` count as that; a move whose
+        p or price is NaN is not possible.
 
         Parameters
         ----------
@@ -146,8 +152,10 @@ class AnyMapQNetwork(nn.Module):
         for some in range(0, len(values_K9), BATCH):
             these = slice(some, some + BATCH)
             p_BA, price_BA = self(torch.from_numpy(features(values_K9[these], move_rule)))
-            cost_BA = move_rule.lengths * price_BA.numpy()
-            cost_KA[these] = np.where(p_BA.numpy() > 0.5, cost_BA, np.inf)
+            # A price may have overflowed, to infinity or NaN; a p that is NaN fails the comparison.
+            possible_BA = (p_BA > 0.5) & ~price_BA.isnan()
+            cost_BA = move_rule.lengths * price_BA.clamp(max=MAX_LEARNED_PRICE).numpy()
+            cost_KA[these] = np.where(possible_BA.numpy(), cost_BA, np.inf)
         return spread(kind, cost_KA, goal)
 
 

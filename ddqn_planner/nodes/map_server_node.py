@@ -10,7 +10,6 @@ from nav_msgs.srv import GetMap, LoadMap
 from numpy.typing import NDArray
 from rcl_interfaces.msg import IntegerRange, ParameterDescriptor
 from rclpy.exceptions import InvalidParameterValueException
-from rclpy.node import Node
 from std_msgs.msg import Header
 from std_srvs.srv import Trigger
 
@@ -24,8 +23,8 @@ from ddqn_planner.grid import (
     scatter_obstacles,
 )
 from ddqn_planner.grid.map_file import MapDataError, MapMetadataError, MapNotFoundError
-from ddqn_planner.nodes.conversions import occupancy_message
-from ddqn_planner.nodes.runtime import LATCHED, spin_until_shutdown
+from ddqn_planner.nodes.conversions import MIN_RESOLUTION, occupancy_message
+from ddqn_planner.nodes.runtime import LATCHED, BaseNode, spin_until_shutdown
 from ddqn_planner.planning import shortest_path
 from ddqn_planner.resources import PACKAGE, find_map
 
@@ -39,7 +38,7 @@ RESULTS: dict[type[Exception], int] = {
 NO_MAP = "no map is loaded; call load_map first"
 
 
-class MapServerNode(Node):
+class MapServerNode(BaseNode):
     """Serves one map, latched on a topic and as a service.
 
     ``~/scatter_obstacles`` takes the loaded map, never one that already has new obstacles, so that
@@ -87,14 +86,20 @@ class MapServerNode(Node):
         """Load a map and serve it, or log why not; return the result code of LoadMap."""
         try:
             path = find_map(url)
-            self._loaded = read_map_file(path)
+            loaded = read_map_file(path)
+            if not MIN_RESOLUTION < loaded.resolution < np.finfo(np.float32).max:
+                raise MapMetadataError(
+                    f"{path}: resolution is {loaded.resolution}; a map message needs more than "
+                    f"{MIN_RESOLUTION}, and no more than a float32 holds"
+                )
         except Exception as error:
             # Also what a broken file does to a library that reads it: the node must live on.
             kept = "the map before it stays" if self._loaded else "no map is served"
             self.get_logger().error(f"cannot load {url!r}, {kept}: {error}")
             return int(RESULTS.get(type(error), LoadMap.Response.RESULT_UNDEFINED_FAILURE))
-        self._serve(self._loaded.values)
-        height, width = self._loaded.values.shape
+        self._loaded = loaded
+        self._serve(loaded.values)
+        height, width = loaded.values.shape
         self.get_logger().info(f"serving {path}, {width} x {height} cells")
         return int(LoadMap.Response.RESULT_SUCCESS)
 

@@ -29,7 +29,6 @@ from rclpy.callback_groups import MutuallyExclusiveCallbackGroup, ReentrantCallb
 from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
 from rclpy.exceptions import InvalidParameterValueException
-from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.subscription import Subscription
 from rclpy.task import Future
@@ -49,7 +48,7 @@ from ddqn_planner.nodes.conversions import (
 )
 from ddqn_planner.nodes.markers import policy_message
 from ddqn_planner.nodes.planner_parameters import CHOICES, declare_parameters
-from ddqn_planner.nodes.runtime import LATCHED, spin_until_shutdown
+from ddqn_planner.nodes.runtime import LATCHED, BaseNode, spin_until_shutdown
 from ddqn_planner.nodes.transforms import TransformError, TransformSource
 from ddqn_planner.planning import Plan, PlanMethod, Planner, PlanStatus, QField, Route, simplify
 
@@ -173,7 +172,7 @@ class Outcome:
         return self.status == PlanStatus.SUCCEEDED.name
 
 
-class PlannerNode(Node):
+class PlannerNode(BaseNode):
     """Plans from where the robot is to the active goal, the last ``goal_pose``.
 
     The active goal is planned for again whenever the map, the ``initialpose``, the model or a

@@ -1,14 +1,17 @@
-"""What the three nodes share: the quality of service of lasting topics, and how a node ends."""
+"""What the nodes share: lasting topics, parameters of any kind, and how a node ends."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 
 import rclpy
+from rcl_interfaces.msg import SetParametersResult
+from rcl_interfaces.srv import SetParameters, SetParametersAtomically
 from rclpy.exceptions import NameValidationException, ParameterException
 from rclpy.executors import ExternalShutdownException
 from rclpy.logging import get_logger
 from rclpy.node import Node
+from rclpy.parameter_service import ParameterService
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.utilities import ok, try_shutdown
 
@@ -18,6 +21,47 @@ LATCHED = QoSProfile(
     durability=DurabilityPolicy.TRANSIENT_LOCAL,
 )
 """The last message reaches also those who come later: maps, plans, saved models."""
+
+
+class BaseNode(Node):
+    """A node that no request to set parameters ends.
+
+    Parameters
+    ----------
+    name : str
+    """
+
+    def __init__(self, name: str) -> None:
+        super().__init__(name, start_parameter_services=False)
+        self._parameter_services = _CheckedParameterService(self)
+
+
+class _CheckedParameterService(ParameterService):
+    """Refuses a value of an unknown type, which ends rclpy's own, and a parameter without a name.
+
+    rclpy takes the empty name for declared.
+    """
+
+    def _set_parameters_callback(
+        self, request: SetParameters.Request, response: SetParameters.Response
+    ) -> SetParameters.Response:
+        for parameter in request.parameters:
+            one = SetParametersAtomically.Request(parameters=[parameter])
+            answer = SetParametersAtomically.Response()
+            response.results.append(self._set_parameters_atomically_callback(one, answer).result)
+        return response
+
+    def _set_parameters_atomically_callback(
+        self, request: SetParametersAtomically.Request, response: SetParametersAtomically.Response
+    ) -> SetParametersAtomically.Response:
+        reason = "a parameter has no name; give one"
+        try:
+            if all(parameter.name for parameter in request.parameters):
+                return super()._set_parameters_atomically_callback(request, response)
+        except ValueError as error:
+            reason = f"{error}; give one of rcl_interfaces/msg/ParameterType"
+        response.result = SetParametersResult(successful=False, reason=reason)
+        return response
 
 
 def spin_until_shutdown(make_node: Callable[[], Node]) -> int:

@@ -19,11 +19,16 @@ import torch
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped, Quaternion
 from nav_msgs.msg import OccupancyGrid, Path
-from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
+from rcl_interfaces.msg import (
+    FloatingPointRange,
+    IntegerRange,
+    ParameterDescriptor,
+    SetParametersResult,
+)
 from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
-from rclpy.exceptions import InvalidParameterValueException
-from rclpy.node import Node
+from rclpy.exceptions import InvalidParameterValueException, ParameterException
+from rclpy.parameter import Parameter
 from rclpy.timer import Timer
 from std_msgs.msg import Float32, Header, String
 from std_srvs.srv import Trigger
@@ -36,7 +41,7 @@ from ddqn_planner.nodes.conversions import (
     path_message,
     quaternion,
 )
-from ddqn_planner.nodes.runtime import LATCHED, spin_until_shutdown
+from ddqn_planner.nodes.runtime import LATCHED, BaseNode, spin_until_shutdown
 from ddqn_planner.resources import find_map
 from ddqn_planner.training.environment import Scenario
 from ddqn_planner.training.hyper_parameters import HyperParameters
@@ -46,8 +51,10 @@ from ddqn_planner.training.trainer import Episode
 PUBLISH_PERIOD = 0.1
 """Seconds between two looks into the training thread's queue."""
 
+MOVE_RULES = [rule.value for rule in MoveRule]
 
-class TrainerNode(Node):
+
+class TrainerNode(BaseNode):
     """Trains on the last ``map`` from the last ``initialpose`` to the last ``goal_pose``.
 
     With the parameter ``map_file`` it takes all three from a map file, until others are
@@ -67,6 +74,7 @@ class TrainerNode(Node):
         self._events: queue.SimpleQueue[Episode | FilePath | Exception] = queue.SimpleQueue()
         self._replay_timer: Timer | None = None
         self._state, self._error = "idle", ""
+        self._save_fails = False
 
         self._declare_parameters()
         self._episode_publisher = self.create_publisher(Path, "~/episode", 10)
@@ -98,13 +106,24 @@ class TrainerNode(Node):
                 name, default, ParameterDescriptor(description=description, **more)
             )
 
-        declare("output_folder", "runs/trainer", "Folder of the checkpoint, model and curves")
+        declare(
+            "output_folder",
+            "runs/trainer",
+            "Folder of the checkpoint, model and curves; used by the next ~/start",
+            additional_constraints="not empty",
+        )
         declare(
             "map_file",
             "",
             "Map file with start and goal, or a shipped map's name; '' to wait for topics",
+            read_only=True,
         )
-        declare("move_rule", "corner_cutting", f"One of {[rule.value for rule in MoveRule]}")
+        declare(
+            "move_rule",
+            "corner_cutting",
+            "Which diagonal moves are legal; used by the next ~/start",
+            additional_constraints=f"one of {MOVE_RULES}",
+        )
         declare("seed", 0, "Seed of the training", **_integers(0, 2**31 - 1))
         declare(
             "occupied_threshold", 65, "Percent: from it on a cell is occupied", **_integers(1, 100)
@@ -115,13 +134,39 @@ class TrainerNode(Node):
         for entry in fields(HyperParameters):
             source = entry.metadata["source"]
             if "choices" in entry.metadata:
-                declare(entry.name, entry.default, f"{source}: one of {entry.metadata['choices']}")
+                constraint = f"one of {list(entry.metadata['choices'])}"
+                declare(entry.name, entry.default, source, additional_constraints=constraint)
                 continue
             in_range = _integers if type(entry.default) is int else _floats
             declare(entry.name, entry.default, source, **in_range(*entry.metadata["range"]))
+        result = self._check_parameters([])
+        if not result.successful:
+            raise ParameterException("a parameter is invalid", result.reason)
+        self.add_on_set_parameters_callback(self._check_parameters)
 
     def _value(self, name: str) -> Any:
         return self.get_parameter(name).value
+
+    def _hyper_parameters(self, **new: Any) -> HyperParameters:
+        """Return those of the parameters, with new values; ValueError if they are invalid."""
+        names = [entry.name for entry in fields(HyperParameters)]
+        return HyperParameters(**{n: new[n] if n in new else self._value(n) for n in names})
+
+    def _check_parameters(self, parameters: list[Parameter]) -> SetParametersResult:
+        """Check what the parameters would be together: one may limit another."""
+        new = {parameter.name: parameter.value for parameter in parameters}
+        move_rule = new.get("move_rule", self._value("move_rule"))
+        reason = ""
+        if new.get("output_folder", self._value("output_folder")) == "":
+            reason = "output_folder is ''; name a folder"
+        elif move_rule not in MOVE_RULES:
+            reason = f"move_rule is {move_rule!r}; give one of {MOVE_RULES}"
+        else:
+            try:
+                self._hyper_parameters(**new)
+            except ValueError as error:
+                reason = str(error)
+        return SetParametersResult(successful=not reason, reason=reason)
 
     def _read_map_file(self) -> None:
         name = self._value("map_file")
@@ -146,6 +191,9 @@ class TrainerNode(Node):
             )
         except ValueError as error:
             self._refuse(f"map refused: {error}")
+            return
+        except MemoryError as error:
+            self._refuse(f"map refused: {error}; give a smaller one")
             return
         self._frame = message.header.frame_id
         self.get_logger().info(f"map of {self._grid.width} x {self._grid.height} cells")
@@ -186,11 +234,13 @@ class TrainerNode(Node):
             return _answer(response, False, "training already; call ~/stop first")
         try:
             self._run = self._open_run()
-        except (ValueError, OSError) as error:
-            self._refuse(f"the training cannot start: {error}")
-            return _answer(response, False, str(error))
+        except Exception as error:  # whatever it is, the node must live on and say it
+            reason = _with_remedy(error)
+            self._refuse(f"the training cannot start: {reason}")
+            return _answer(response, False, reason)
         self._stop.clear()
         self._save.clear()
+        self._save_fails = False
         self._state, self._error = "training", ""
         trainer = self._run.trainer
         last = trainer.parameters.steps
@@ -209,10 +259,10 @@ class TrainerNode(Node):
             )
         start, goal = (self._cell(which, self._poses[which]) for which in ("start", "goal"))
         return TrainingRun(
-            self._value("output_folder"),
+            FilePath(self._value("output_folder")).absolute(),
             [Scenario(self._grid, start, goal)],
             MoveRule(self._value("move_rule")),
-            HyperParameters(**{e.name: self._value(e.name) for e in fields(HyperParameters)}),
+            self._hyper_parameters(),
             self._value("seed"),
         )
 
@@ -227,7 +277,7 @@ class TrainerNode(Node):
         if self._thread is None or not self._thread.is_alive():
             return _answer(response, False, "no training is running; it was saved when it ended")
         self._save.set()
-        return _answer(response, True, "saving after this step; ~/model_saved names the file")
+        return _answer(response, True, "saving after this step; ~/model_saved or an error follows")
 
     def _on_replay(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         curves = FilePath(self._value("output_folder")) / "episodes.csv"
@@ -236,7 +286,7 @@ class TrainerNode(Node):
         try:
             episodes = read_cells(curves, self._value("episode_interval"))
             first = next(episodes, None)
-        except (OSError, ValueError, KeyError) as error:
+        except OSError as error:
             return _answer(response, False, f"no recorded episodes ({error}); call ~/start first")
         if first is None:
             return _answer(response, False, f"{curves} holds no episode to replay yet; train on")
@@ -270,7 +320,8 @@ class TrainerNode(Node):
             run.close()
 
     def _note_save(self, run: TrainingRun) -> None:
-        self._events.put(OSError(run.save_error) if run.save_error else run.model_path)
+        if not run.save_error:
+            self._events.put(run.model_path)
 
     def _publish_events(self) -> None:
         while not self._events.empty():
@@ -278,15 +329,26 @@ class TrainerNode(Node):
             if isinstance(event, Episode):
                 self._publish_episode(event)
             elif isinstance(event, FilePath):
-                self._saved_publisher.publish(String(data=str(event.resolve())))
-            elif isinstance(event, OSError):
-                self._refuse(str(event))
+                self._saved_publisher.publish(String(data=str(event)))
             else:
                 self._state = "failed"
-                self._refuse(f"the training failed: {event!r}; the last checkpoint is kept")
+                self._refuse(f"the training failed: {event!r}; ~/start goes on from its checkpoint")
+        self._say_whether_saving_works()
         if self._state == "training" and self._thread and not self._thread.is_alive():
             self._state = "stopped" if self._stop.is_set() else "finished"
             self.get_logger().info(f"the training {self._state}")
+
+    def _save_error(self) -> str:
+        return self._run.save_error if self._run is not None else ""
+
+    def _say_whether_saving_works(self) -> None:
+        """Log it when that changes, not at each try."""
+        error = self._save_error()
+        if error and not self._save_fails:
+            self.get_logger().error(error)
+        if self._save_fails and not error:
+            self.get_logger().info("the training is saved again")
+        self._save_fails = bool(error)
 
     def _publish_episode(self, episode: Episode) -> None:
         self._reward_publisher.publish(Float32(data=episode.average_reward))
@@ -304,7 +366,7 @@ class TrainerNode(Node):
     def _replay_step(self, frames: Iterator[tuple[Cell, ...]]) -> None:
         try:
             frame = next(frames, None)
-        except (OSError, ValueError, KeyError) as error:
+        except OSError as error:
             self._refuse(f"the replay ends: episodes.csv cannot be read on ({error})")
             frame = None
         if frame is None:
@@ -319,8 +381,9 @@ class TrainerNode(Node):
 
     def _publish_diagnostics(self) -> None:
         status = DiagnosticStatus(name=f"{self.get_fully_qualified_name()}: training")
-        status.level = DiagnosticStatus.ERROR if self._error else DiagnosticStatus.OK
-        status.message = self._error or self._state
+        error = self._save_error() or self._error
+        status.level = DiagnosticStatus.ERROR if error else DiagnosticStatus.OK
+        status.message = error or self._state
         values = {"state": self._state}
         for what, pose in self._poses.items():
             position = pose.pose.position
@@ -331,7 +394,7 @@ class TrainerNode(Node):
                 "steps": f"{trainer.steps} of {trainer.parameters.steps}",
                 "episodes": str(trainer.episodes),
                 "epsilon": f"{trainer.epsilon:.3f}",
-                "folder": str(self._run.folder.resolve()),
+                "folder": str(self._run.folder),
             }
         status.values = [KeyValue(key=key, value=value) for key, value in values.items()]
         message = DiagnosticArray(status=[status])
@@ -343,7 +406,16 @@ class TrainerNode(Node):
         self._stop.set()
         if self._thread is not None:
             self._thread.join()
+        self._say_whether_saving_works()
         super().destroy_node()
+
+
+def _with_remedy(error: Exception) -> str:
+    if isinstance(error, OSError):
+        return f"{error}; set output_folder to a folder that can be written"
+    if isinstance(error, ValueError):
+        return str(error)
+    return f"{error!r}; take a smaller map, or smaller filters, environments or replay_capacity"
 
 
 def _answer(response: Trigger.Response, success: bool, message: str) -> Trigger.Response:

@@ -2,21 +2,32 @@
 
 from __future__ import annotations
 
-import csv
+import io
+import re
+import time
 from collections.abc import Iterator, Sequence
 from dataclasses import fields, replace
 from pathlib import Path
+from typing import Any
 
-from ddqn_planner.files import write_csv
+from ddqn_planner.files import Appender, remove_temporaries, write_atomically
 from ddqn_planner.grid import Cell, MoveRule, path_length
 from ddqn_planner.training.environment import Scenario
 from ddqn_planner.training.hyper_parameters import HyperParameters
 from ddqn_planner.training.trainer import CheckpointError, Episode, Trainer
 
+# Not torch's SummaryWriter: its thread ends for good at the first error, a full disk's too.
 try:
-    from torch.utils.tensorboard import SummaryWriter as TensorBoard
+    from tensorboard.compat.proto.event_pb2 import (  # type: ignore[import-untyped]
+        Event,
+        SessionLog,
+    )
+    from tensorboard.compat.proto.summary_pb2 import Summary  # type: ignore[import-untyped]
+    from tensorboard.summary.writer.record_writer import (  # type: ignore[import-untyped]
+        RecordWriter,
+    )
 except ImportError:  # an extra: the curves are in the CSV file all the same
-    TensorBoard = None  # type: ignore[assignment, misc]
+    Event = None
 
 SAVE_INTERVAL = 5_000
 """Environment steps between two checkpoints."""
@@ -32,6 +43,9 @@ COLUMNS = (
     "average_reward",
     "cells",
 )
+
+ROW = re.compile(rb"(\d{1,18})(?:,[^,]*){7},(\d{1,9}:\d{1,9}(?: \d{1,9}:\d{1,9})*)\r\n")
+"""A whole row: the episode's number, and its cells."""
 
 
 class TrainingRun:
@@ -76,13 +90,13 @@ class TrainingRun:
             self.trainer = Trainer(scenarios, move_rule, parameters, seed)
         self.saved_at = self.trainer.steps
         self.save_error = ""
+        for path in (self.model_path, self.checkpoint_path, self.curves_path):
+            remove_temporaries(path)
         _cut_rows(self.curves_path, self.trainer.episodes)
-        # Line-buffered: who reads the curves meanwhile, or after a crash, sees whole rows.
-        self._curves = self.curves_path.open("a", buffering=1, newline="", encoding="utf-8")
-        steps = self.trainer.steps
-        self._board = None
-        if TensorBoard is not None:
-            self._board = TensorBoard(str(folder), purge_step=steps)
+        self._curves = Appender(self.curves_path)
+        self._board = Appender(self._board_path()) if Event is not None else None
+        if self._board is not None:
+            self._board.append(_first_events(self.trainer.steps))
 
     @property
     def model_path(self) -> Path:
@@ -99,10 +113,15 @@ class TrainingRun:
         """Where the rows of the episodes are."""
         return self.folder / "episodes.csv"
 
+    def _board_path(self) -> Path:
+        # TensorBoard reads a folder's files in the order of their names: here of their times.
+        return self.folder / f"events.out.tfevents.{time.time_ns()}.ddqn_planner"
+
     def steps(self) -> Iterator[list[Episode]]:
         """Train until ``parameters.steps``, and save every `SAVE_INTERVAL` steps and at the end.
 
-        Where that fails the training goes on, and `save_error` says why.
+        Where that fails, or the curves cannot be written, the training goes on, and `save_error`
+        says why until a save succeeds. Episodes that end meanwhile may lack in the curves.
 
         Yields
         ------
@@ -124,16 +143,22 @@ class TrainingRun:
             self.save_error = ""
         except OSError as error:
             self.saved_at = self.trainer.steps
-            self.save_error = (
-                f"cannot save to {self.folder} ({error}); make room or set its mode: the training "
-                f"goes on and tries again every {SAVE_INTERVAL} steps"
-            )
+            self._fail(error)
+
+    def _fail(self, error: OSError) -> None:
+        # Not its file name: that of a temporary file says nothing.
+        self.save_error = (
+            f"cannot save to {self.folder} ({error.strerror or error}); make room or set its mode: "
+            f"the training goes on and tries again every {SAVE_INTERVAL} steps"
+        )
 
     def _note(self, episode: Episode) -> None:
-        csv.writer(self._curves).writerow(_row(episode))
-        if self._board is not None:
-            self._board.add_scalar("average_reward", episode.average_reward, episode.step)
-            self._board.add_scalar("episode_moves", episode.moves, episode.step)
+        try:
+            self._curves.append(_row(episode))
+            if self._board is not None:
+                self._board.append(_events(episode))
+        except OSError as error:
+            self._fail(error)
 
     def save(self) -> None:
         """Write the model and the checkpoint.
@@ -141,10 +166,17 @@ class TrainingRun:
         Raises
         ------
         OSError
-            If one cannot be written; the last good ones are then still there.
+            If one cannot be written; the last good ones are then still there. Or if the curves
+            cannot be written.
         """
+        # A kill between the two leaves a model that is newer than the checkpoint. Each is whole: a
+        # planner takes the model, and a training goes on from the checkpoint and saves its model
+        # over that one. Neither reads the other's file.
         self.trainer.save_model(self.model_path)
         self.trainer.save_checkpoint(self.checkpoint_path)
+        self._curves.flush()
+        if self._board is not None:
+            self._board.flush()
         self.saved_at = self.trainer.steps
 
     def close(self) -> None:
@@ -157,20 +189,22 @@ class TrainingRun:
 def read_cells(curves_path: str | Path, every: int) -> Iterator[tuple[Cell, ...]]:
     """Yield the cells of each `every`-th episode of a run's ``episodes.csv``.
 
+    What is no whole row is passed over.
+
     Raises
     ------
     OSError
         If the file cannot be read.
     """
-    with Path(curves_path).open(newline="", encoding="utf-8") as file:
-        for row in csv.DictReader(file):
-            if int(row["episode"]) % every == 0:
-                x_y = (cell.split(":") for cell in row["cells"].split())
+    with Path(curves_path).open("rb") as file:
+        for row in map(ROW.fullmatch, file):
+            if row and int(row[1]) % every == 0:
+                x_y = (cell.split(b":") for cell in row[2].split())
                 yield tuple((int(x), int(y)) for x, y in x_y)
 
 
-def _row(episode: Episode) -> tuple[object, ...]:
-    return (
+def _row(episode: Episode) -> bytes:
+    values = (
         episode.number,
         episode.step,
         episode.scenario,
@@ -181,15 +215,43 @@ def _row(episode: Episode) -> tuple[object, ...]:
         round(episode.average_reward, 6),
         " ".join(f"{x}:{y}" for x, y in episode.cells),
     )
+    return _line(values)
+
+
+def _line(values: Sequence[object]) -> bytes:
+    return (",".join(map(str, values)) + "\r\n").encode()
 
 
 def _cut_rows(path: Path, episodes: int) -> None:
     """Keep the header and the rows of the first episodes: those that the checkpoint knows."""
-    rows = []
+    lines = [_line(COLUMNS)]
     if path.exists():
-        with path.open(newline="", encoding="utf-8") as file:
-            rows = [r for r in list(csv.reader(file))[1:] if len(r) == len(COLUMNS)]
-    write_csv(path, COLUMNS, rows[:episodes])
+        with path.open("rb") as file:
+            rows = map(ROW.fullmatch, file)
+            lines += [row[0] for row in rows if row and int(row[1]) <= episodes]
+    write_atomically(path, b"".join(lines))
+
+
+def _first_events(step: int) -> bytes:
+    """Return what a file of TensorBoard begins with: what others hold from this step on is void."""
+    return _records(
+        Event(wall_time=time.time(), step=step, file_version="brain.Event:2"),
+        Event(wall_time=time.time(), step=step, session_log=SessionLog(status=SessionLog.START)),
+    )
+
+
+def _events(episode: Episode) -> bytes:
+    values = {"average_reward": episode.average_reward, "episode_moves": episode.moves}
+    summary = Summary(value=[Summary.Value(tag=t, simple_value=v) for t, v in values.items()])
+    return _records(Event(wall_time=time.time(), step=episode.step, summary=summary))
+
+
+def _records(*events: Any) -> bytes:
+    content = io.BytesIO()
+    writer = RecordWriter(content)
+    for event in events:
+        writer.write(event.SerializeToString())
+    return content.getvalue()
 
 
 def _check_same_training(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import hashlib
 import json
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass
@@ -15,7 +16,7 @@ import numpy as np
 import safetensors.torch
 import torch
 from numpy.typing import NDArray
-from safetensors import SafetensorError, safe_open
+from safetensors import safe_open
 from torch import Tensor, nn
 
 from ddqn_planner.files import write_atomically
@@ -30,6 +31,7 @@ from ddqn_planner.training.learners import LEARNERS
 from ddqn_planner.training.replay_buffer import ReplayBuffer, Transitions
 
 CHECKPOINT_KEY = "ddqn_planner_checkpoint"
+DIGEST_KEY = "sha256"
 
 FUSED = tuple(map(int, torch.__version__.split(".")[:2])) >= (2, 4)
 """Adam in one call, which older versions have on GPUs alone."""
@@ -298,10 +300,10 @@ class Trainer:
             "walked": self._walked,
             "generators": [generator.bit_generator.state for generator in self._generators()],
         }
-        content = safetensors.torch.save(
-            {name: tensor.contiguous() for name, tensor in tensors.items()},
-            {CHECKPOINT_KEY: json.dumps(description)},
-        )
+        tensors = {name: tensor.contiguous() for name, tensor in tensors.items()}
+        text = json.dumps(description)
+        metadata = {CHECKPOINT_KEY: text, DIGEST_KEY: _digest(text, tensors)}
+        content = safetensors.torch.save(tensors, metadata)
         write_atomically(Path(path), content)
 
     @classmethod
@@ -321,8 +323,13 @@ class Trainer:
         """
         try:
             with safe_open(path, framework="pt") as file:
-                description = json.loads((file.metadata() or {})[CHECKPOINT_KEY])
+                metadata = file.metadata() or {}
                 tensors = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118
+            text = metadata[CHECKPOINT_KEY]
+            digest = _digest(text, tensors)
+            if metadata.get(DIGEST_KEY, digest) != digest:  # older ones have none
+                raise ValueError("its digest is another")
+            description = json.loads(text)
             if description["scenarios"] != _fingerprints(scenarios):
                 raise CheckpointError(
                     f"{path}: was made with another map, start or goal; give that one, or train "
@@ -334,10 +341,11 @@ class Trainer:
             trainer._restore(description, tensors)
         except CheckpointError:
             raise
-        except (SafetensorError, OSError, LookupError, TypeError, ValueError, RuntimeError) as e:
+        except Exception as error:  # whatever a broken file does to those who read it
             raise CheckpointError(
-                f"{path}: is no whole checkpoint ({e}); train into another folder"
-            ) from e
+                f"{path}: is no whole checkpoint ({error!r}); remove it to train anew, or train "
+                "into another folder"
+            ) from error
         return trainer
 
     def _restore(self, description: dict[str, Any], tensors: dict[str, Tensor]) -> None:
@@ -367,6 +375,14 @@ class Trainer:
 
 def _fingerprints(scenarios: Sequence[Scenario]) -> list[list[object]]:
     return [[s.grid.fingerprint, list(s.start), list(s.goal)] for s in scenarios]
+
+
+def _digest(text: str, tensors: dict[str, Tensor]) -> str:
+    digest = hashlib.sha256(text.encode())
+    for name in sorted(tensors):
+        digest.update(name.encode())
+        digest.update(tensors[name].numpy().tobytes())
+    return digest.hexdigest()
 
 
 def _prefixed(prefix: str, tensors: dict[str, Tensor]) -> dict[str, Tensor]:

@@ -188,7 +188,7 @@ def test_the_papers_map_names_start_and_goal() -> None:
         ({"occupied_thresh": 1.5}, r"occupied_thresh is 1\.5"),
         ({"free_thresh": 0.7}, r"free_thresh is 0\.7"),
         ({"mode": "quaternary"}, "mode is 'quaternary'"),
-        ({"mode": []}, r"mode is '\[\]'"),
+        ({"mode": []}, r"mode is \[\]"),
         ({"image": []}, r"image is \[\]"),
         ({"ddqn_planner": {"start": [0, 9]}}, r"start is \(0, 9\)"),
         ({"ddqn_planner": {"goal": [0.5, 0]}}, r"goal is \['0\.5', '0'\]"),

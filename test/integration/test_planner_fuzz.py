@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-import array
 import itertools
-import math
 from typing import Any
 
 import numpy as np
 import pytest
-from geometry_msgs.msg import Point, Pose, PoseStamped, PoseWithCovarianceStamped, Quaternion
+from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from integration.messages import NUMBERS_32, STAMPED_POSES, TEXTS, maps, some_parameters
 from integration.robot import GOAL, START, Robot, check_path, points_of
 from nav_msgs.msg import OccupancyGrid, Odometry
 from nav_msgs.srv import GetPlan
@@ -23,50 +22,16 @@ from rcl_interfaces.srv import (
     SetParametersAtomically,
 )
 from rclpy.parameter import Parameter
-from std_msgs.msg import Header, String
+from std_msgs.msg import String
 from std_srvs.srv import Trigger
 
 from ddqn_planner.nodes.conversions import check_tolerance, grid_from_message
-from ddqn_planner.nodes.planner_parameters import CHOICES
 from ddqn_planner.nodes.runtime import LATCHED
 
 NUMBERS = itertools.count(1)
 """Stamps of maps, to tell one from another."""
 
 fuzz = settings(suppress_health_check=[HealthCheck.function_scoped_fixture])
-
-FLOATS = st.one_of(
-    st.floats(),
-    st.floats(-10, 10),
-    st.sampled_from([math.nan, math.inf, -math.inf, 1e300, -1e300, 5e-324, 1e38]),
-)
-FLOATS_32 = st.one_of(st.floats(width=32), st.floats(-2, 2, width=32))
-# A message's string ends at its first NUL.
-TEXTS = st.text(st.characters(exclude_categories=["Cs"], exclude_characters="\0"), max_size=30)
-FRAMES = st.one_of(st.sampled_from(["map", "map", "map", "", "odom", "/map", "ma" * 500]), TEXTS)
-HEADERS = st.builds(lambda frame: Header(frame_id=frame), FRAMES)
-POINTS = st.builds(lambda x, y, z: Point(x=x, y=y, z=z), FLOATS, FLOATS, FLOATS)
-QUATERNIONS = st.one_of(
-    st.builds(lambda yaw: Quaternion(z=math.sin(yaw), w=math.cos(yaw)), st.floats(-7, 7)),
-    st.builds(lambda x, y, z, w: Quaternion(x=x, y=y, z=z, w=w), FLOATS, FLOATS, FLOATS, FLOATS),
-)
-POSES = st.builds(lambda p, q: Pose(position=p, orientation=q), POINTS, QUATERNIONS)
-STAMPED = st.builds(lambda header, pose: PoseStamped(header=header, pose=pose), HEADERS, POSES)
-
-
-@st.composite
-def maps(draw: st.DrawFn) -> OccupancyGrid:
-    """A map that may be whole: of any values, turned, or malformed in one way or more."""
-    message = OccupancyGrid(header=draw(HEADERS))
-    width, height = draw(st.integers(0, 7)), draw(st.integers(0, 7))
-    message.info.width, message.info.height = width, height
-    message.info.resolution = draw(st.one_of(st.just(0.5), FLOATS_32))
-    message.info.origin = draw(POSES)
-    values = draw(st.lists(st.integers(-128, 127), min_size=width * height, max_size=50))
-    message.data = array.array("b", values[: draw(st.sampled_from([width * height, None]))])
-    if draw(st.booleans()):
-        message.info.width = draw(st.sampled_from([1, 2**16, 2**31, 2**32 - 1]))
-    return message
 
 
 @pytest.fixture
@@ -101,7 +66,7 @@ def test_any_map_is_taken_or_refused(unharmed: Robot, message: OccupancyGrid) ->
 
 
 @fuzz
-@given(start=STAMPED, goal=STAMPED, tolerance=FLOATS_32)
+@given(start=STAMPED_POSES, goal=STAMPED_POSES, tolerance=NUMBERS_32)
 def test_any_request_is_answered(
     unharmed: Robot, start: PoseStamped, goal: PoseStamped, tolerance: float
 ) -> None:
@@ -119,7 +84,7 @@ def test_any_request_is_answered(
 
 
 @fuzz
-@given(message=STAMPED, topic=st.sampled_from(["initialpose", "goal_pose", "odom"]))
+@given(message=STAMPED_POSES, topic=st.sampled_from(["initialpose", "goal_pose", "odom"]))
 def test_any_pose_is_taken_or_refused(unharmed: Robot, message: PoseStamped, topic: str) -> None:
     robot = unharmed
     pose_message: Any = message
@@ -149,7 +114,7 @@ def test_any_name_of_a_model_is_loaded_or_refused(unharmed: Robot, name: str) ->
     robot.assert_works()
 
 
-NAMES = (
+NAMES = [
     "model",
     "move_rule",
     "occupied_threshold",
@@ -165,57 +130,39 @@ NAMES = (
     "field_cache_bytes",
     "follow_trainer",
     "use_sim_time",
-)
-VALUES = st.one_of(
-    st.booleans(),
-    st.integers(-(2**63), 2**63 - 1),
-    st.sampled_from([0, 1, 50, 100, 101, 0.0, 0.1, 1.0, 1.0000001, 5.0, 1e9]),
-    FLOATS,
-    TEXTS,
-    st.sampled_from([choice for choices in CHOICES.values() for choice in choices]),
-    st.lists(st.integers(0, 9), min_size=1, max_size=3),
-    st.lists(TEXTS, min_size=1, max_size=3),
-)
-PARAMETERS = st.dictionaries(st.one_of(st.sampled_from(NAMES), TEXTS), VALUES, max_size=4)
+]
 
 
 @fuzz
-@given(values=PARAMETERS, together=st.booleans())
+@given(parameters=some_parameters(NAMES), together=st.booleans())
 def test_any_parameters_are_set_or_refused_with_a_reason(
-    unharmed: Robot, values: dict[str, Any], together: bool
+    unharmed: Robot, parameters: list[Any], together: bool
 ) -> None:
     robot = unharmed
 
-    def read() -> list[Any]:
+    def read() -> dict[str, Any]:
         request = GetParameters.Request(names=NAMES)
-        return list(robot.client.call(GetParameters, "planner/get_parameters", request).values)
+        values = robot.client.call(GetParameters, "planner/get_parameters", request).values
+        return dict(zip(NAMES, values, strict=True))
 
-    before = read()
-    messages = [Parameter(name, value=value).to_parameter_msg() for name, value in values.items()]
+    expected = read()
     if together:
-        name, request = "set_parameters_atomically", SetParametersAtomically.Request()
-        request.parameters = messages
-        results = [robot.client.call(SetParametersAtomically, f"planner/{name}", request).result]
+        request = SetParametersAtomically.Request(parameters=parameters)
+        name = "planner/set_parameters_atomically"
+        one = robot.client.call(SetParametersAtomically, name, request).result
+        results = [one] * len(parameters)
     else:
-        request = SetParameters.Request(parameters=messages)
+        request = SetParameters.Request(parameters=parameters)
         results = robot.client.call(SetParameters, "planner/set_parameters", request).results
-        assert len(results) == len(values)
     assert all(result.successful or result.reason for result in results)
-    expected = dict(zip(NAMES, before, strict=True))
-    for message, result in zip(messages, results * (len(messages) if together else 1), strict=True):
+    for parameter, result in zip(parameters, results, strict=True):
         if result.successful:
-            expected[message.name] = message.value
-    for now, then in zip(read(), (expected[name] for name in NAMES), strict=True):
-        assert now == then
-    restore = [Parameter(name, value=value) for name, value in DEFAULTS.items()]
-    request = SetParameters.Request(
-        parameters=[
-            *(parameter.to_parameter_msg() for parameter in restore),
-            Parameter("model", value=str(robot.model)).to_parameter_msg(),
-        ]
-    )
-    results = robot.client.call(SetParameters, "planner/set_parameters", request).results
-    assert all(result.successful for result in results)
+            # Of its fields the one that its type names counts.
+            whole = Parameter.from_parameter_msg(parameter).to_parameter_msg()
+            expected[parameter.name] = whole.value
+    assert read() == expected
+    defaults = {**DEFAULTS, "model": str(robot.model)}
+    assert all(result.successful for result in robot.client.set_parameters("planner", **defaults))
     robot.assert_works()
 
 

@@ -1,18 +1,34 @@
 from __future__ import annotations
 
+import csv
 import itertools
 import queue
 import re
+import resource
 import signal
 import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import fields
 from pathlib import Path as FilePath
 from typing import Any
 
 import pytest
 from diagnostic_msgs.msg import DiagnosticArray
-from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped
+from geometry_msgs.msg import Pose, PoseStamped, PoseWithCovarianceStamped
+from hypothesis import given
+from integration.messages import HEADERS, POSES, maps, some_parameters
 from nav_msgs.msg import OccupancyGrid, Path
 from nav_msgs.srv import GetPlan
+from rcl_interfaces.msg import Parameter as ParameterMessage
+from rcl_interfaces.msg import ParameterType, ParameterValue
+from rcl_interfaces.srv import (
+    DescribeParameters,
+    ListParameters,
+    SetParameters,
+    SetParametersAtomically,
+)
+from rclpy.parameter import Parameter
 from std_msgs.msg import Float32, Header, String
 from std_srvs.srv import Trigger
 
@@ -257,16 +273,22 @@ def test_a_folder_with_another_training_is_left_alone(
     assert (tmp_path / "checkpoint.safetensors").read_bytes() == before
 
 
-def test_an_unknown_network_is_refused_with_those_that_there_are(
-    run_node: Any, make_client: Any, namespace: str, small_values: Any, tmp_path: FilePath
+@pytest.mark.parametrize(
+    ("parameters", "reason"),
+    [
+        ({"network": "perceptron"}, "network is 'perceptron'; give one of paper, propagation"),
+        ({"move_rule": "diagonal"}, "move_rule is 'diagonal'; give one of .*robot_safe"),
+        ({"output_folder": ""}, "output_folder is ''; name a folder"),
+        ({"environments": 8, "replay_capacity": 4}, "environments is 8; .* at most .* 4"),
+    ],
+)
+def test_a_node_does_not_start_with_an_invalid_parameter(
+    run_node: Any, namespace: str, parameters: dict[str, Any], reason: str
 ) -> None:
-    client = make_client(namespace)
-    parameters = {"network": "perceptron", "output_folder": str(tmp_path / "run")}
-    with run_node("trainer_node", parameters, namespace=namespace):
-        set_up(client, small_values, stamped(0.5, 0.5), stamped(5.5, 5.5))
-        with pytest.raises(AssertionError, match="'perceptron'; give one of paper, propagation"):
-            start_training(client)
-    assert not (tmp_path / "run").exists()
+    with run_node("trainer_node", parameters, namespace=namespace, exit_code=1) as node:
+        assert node.process.wait(TIMEOUT) == 1
+    assert re.search(reason, node.log)
+    assert "Traceback" not in node.log
 
 
 def test_a_map_file_that_cannot_be_read_ends_the_start_with_its_reason(run_node: Any) -> None:
@@ -275,3 +297,239 @@ def test_a_map_file_that_cannot_be_read_ends_the_start_with_its_reason(run_node:
         run_node("trainer_node", {"map_file": "no_such_map.yaml"}) as node,
     ):
         assert node.process.wait(TIMEOUT) == 1
+
+
+def set_atomically(client: Any, *parameters: Any) -> Any:
+    request = SetParametersAtomically.Request(parameters=list(parameters))
+    return client.call(SetParametersAtomically, "trainer/set_parameters_atomically", request).result
+
+
+def message_of(name: str, value: Any) -> Any:
+    return Parameter(name, value=value).to_parameter_msg()
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "reason"),
+    [
+        ("move_rule", "diagonal", "give one of .*robot_safe"),
+        ("network", "perceptron", "give one of paper"),
+        ("target", "", "give one of double_dqn"),
+        ("reward", "gold", "give one of paper"),
+        ("output_folder", "", "name a folder"),
+        ("map_file", "office", "read-only"),
+        ("gamma", 1.0 + 1e-7, "must lie in 0.0 to 1.0"),
+        ("gamma", float("nan"), "out of range"),
+        ("seed", -1, "out of range"),
+        ("seed", 1.0, "type"),
+        ("environments", 4000, "at most replay_capacity, 3000"),
+        ("", 1, "no name"),
+        ("colour", 1, "undeclared"),
+    ],
+)
+def test_an_invalid_value_is_refused_with_its_reason_and_nothing_is_half_set(
+    training: Any, name: str, value: Any, reason: str
+) -> None:
+    client, _, _ = training
+    good = [message_of("replay_capacity", 3000), message_of("epsilon_end", 0.2)]
+    assert set_atomically(client, *good).successful
+    for order in (1, -1):
+        others = [message_of("epsilon_end", 0.3), message_of(name, value)]
+        result = set_atomically(client, *others[::order])
+        assert not result.successful
+        assert re.search(reason, result.reason), result.reason
+        assert client.get_parameter("trainer", "epsilon_end") == 0.2
+    (result,) = client.call(
+        SetParameters,
+        "trainer/set_parameters",
+        SetParameters.Request(parameters=[message_of(name, value)]),
+    ).results
+    assert not result.successful
+
+
+def test_values_that_limit_one_another_can_be_set_together(training: Any) -> None:
+    client, _, _ = training
+    both = message_of("environments", 4096), message_of("replay_capacity", 4096)
+    assert set_atomically(client, *both).successful
+    both = message_of("replay_capacity", 50_000), message_of("environments", 1)
+    assert set_atomically(client, *both).successful
+
+
+def test_a_value_of_an_unknown_type_is_refused(training: Any) -> None:
+    client, _, _ = training
+    strange = ParameterMessage(name="seed", value=ParameterValue(type=77))
+    assert "ParameterType" in set_atomically(client, strange).reason
+    request = SetParameters.Request(parameters=[strange, message_of("seed", 7)])
+    results = client.call(SetParameters, "trainer/set_parameters", request).results
+    assert [result.successful for result in results] == [False, True]
+    assert client.get_parameter("trainer", "seed") == 7
+
+
+def test_each_parameter_says_what_may_be_set(training: Any) -> None:
+    client, _, _ = training
+    names = client.call(ListParameters, "trainer/list_parameters").result.names
+    own = [name for name in names if name not in ("use_sim_time", "start_type_description_service")]
+    request = DescribeParameters.Request(names=own)
+    descriptors = client.call(DescribeParameters, "trainer/describe_parameters", request)
+    assert {entry.name for entry in fields(HyperParameters)} <= set(own)
+    for descriptor in descriptors.descriptors:
+        assert descriptor.description
+        limited = (
+            descriptor.integer_range
+            or descriptor.floating_point_range
+            or descriptor.additional_constraints
+        )
+        unlimited = descriptor.type == ParameterType.PARAMETER_BOOL or descriptor.read_only
+        assert bool(limited) != unlimited, descriptor.name
+
+
+@contextmanager
+def full_disk(process: Any, folder: FilePath) -> Iterator[None]:
+    """Let the writes of a running process fail in their middle, as on a full disk."""
+    limits = resource.prlimit(process.pid, resource.RLIMIT_FSIZE)
+    size = (folder / "model.safetensors").stat().st_size - 10
+    resource.prlimit(process.pid, resource.RLIMIT_FSIZE, (size, limits[1]))
+    yield
+    resource.prlimit(process.pid, resource.RLIMIT_FSIZE, limits)
+
+
+@contextmanager
+def no_folder(_: Any, folder: FilePath) -> Iterator[None]:
+    """Put a dangling link in a folder's place, into which nobody can write, not even root."""
+    moved = folder.with_name("moved")
+    folder.rename(moved)
+    folder.symlink_to("nowhere/else")
+    yield
+    folder.unlink()
+    moved.rename(folder)
+
+
+@pytest.mark.parametrize("fault", [full_disk, no_folder])
+def test_a_fault_of_the_disk_is_said_once_and_the_training_goes_on(
+    run_node: Any,
+    make_client: Any,
+    namespace: str,
+    small_values: Any,
+    tmp_path: FilePath,
+    fault: Any,
+) -> None:
+    client, folder = make_client(namespace), tmp_path / "run"
+    parameters = {**ENDLESS, "output_folder": str(folder), "move_rule": "robot_safe"}
+    with run_node("trainer_node", parameters, namespace=namespace) as node:
+        saved = Listener(client, String, "trainer/model_saved", LATCHED)
+        diagnostics = Listener(client, DiagnosticArray, "/diagnostics")
+        set_up(client, small_values, stamped(0.5, 0.5), stamped(5.5, 5.5))
+        start_training(client)
+        client.call(Trigger, "trainer/save")
+        saved.next()
+        model, checkpoint = folder / "model.safetensors", folder / "checkpoint.safetensors"
+        wait_until(checkpoint.exists)
+        with fault(node.process, folder):
+            client.call(Trigger, "trainer/save")
+            failing = wait_for_state(diagnostics, namespace, message=f"cannot save to {folder} (")
+            kept = folder if folder.exists() else folder.with_name("moved")
+            before = [(kept / path.name).read_bytes() for path in (model, checkpoint)]
+            for _ in range(3):
+                client.call(Trigger, "trainer/save")
+                after = wait_for_state(diagnostics, namespace, message="make room")
+            assert int(after["steps"].split()[0]) > int(failing["steps"].split()[0])
+            assert after["state"] == "training"
+            assert [(kept / path.name).read_bytes() for path in (model, checkpoint)] == before
+        client.call(Trigger, "trainer/save")
+        wait_for_state(diagnostics, namespace, state="training", message="training")
+        assert load_model(saved.next().data)[1].steps > 0
+        size = (folder / "episodes.csv").stat().st_size
+        wait_until(lambda: (folder / "episodes.csv").stat().st_size > size)
+        assert node.stop() == 0
+    assert node.log.count("cannot save") == 1
+    assert node.log.count("saved again") == 1
+    assert "Traceback" not in node.log
+    scenario = Scenario(GridMap(small_values > 0), (0, 0), (5, 5))
+    episodes = Trainer.load_checkpoint(checkpoint, [scenario]).episodes
+    with (folder / "episodes.csv").open(newline="") as file:
+        numbers = [int(row["episode"]) for row in csv.DictReader(file)]
+    assert numbers == sorted(set(numbers))
+    assert numbers[-1] == episodes
+    assert list(folder.glob(".*")) == []
+
+
+def wait_until(condition: Callable[[], bool]) -> None:
+    deadline = time.monotonic() + TIMEOUT
+    while not condition():
+        assert time.monotonic() < deadline
+        time.sleep(0.02)
+
+
+def test_a_last_save_that_fails_is_said_when_the_node_ends(
+    run_node: Any, make_client: Any, namespace: str, small_values: Any, tmp_path: FilePath
+) -> None:
+    client, folder = make_client(namespace), tmp_path / "run"
+    parameters = {**ENDLESS, "output_folder": str(folder)}
+    with run_node("trainer_node", parameters, namespace=namespace) as node:
+        set_up(client, small_values, stamped(0.5, 0.5), stamped(5.5, 5.5))
+        start_training(client)
+        with no_folder(node.process, folder):
+            assert node.stop() == 0
+    assert node.log.count("cannot save") == 1
+
+
+def test_what_cannot_be_started_or_replayed_is_answered_with_the_remedy(
+    run_node: Any, make_client: Any, namespace: str, small_values: Any, tmp_path: FilePath
+) -> None:
+    client = make_client(namespace)
+    broken = tmp_path / "broken"
+    broken.mkdir()
+    (broken / "checkpoint.safetensors").write_bytes(b"no checkpoint")
+    (broken / "episodes.csv").write_bytes(b"\0\xff,'\n" * 1000)
+    (tmp_path / "file").touch()
+    with run_node("trainer_node", {"output_folder": str(broken)}, namespace=namespace) as node:
+        set_up(client, small_values, stamped(0.5, 0.5), stamped(5.5, 5.5))
+        with pytest.raises(AssertionError, match="remove it to train anew"):
+            start_training(client)
+        assert "no episode" in client.call(Trigger, "trainer/replay").message
+        for folder in (tmp_path / "file", tmp_path / ("x" * 300)):
+            client.set_parameters("trainer", output_folder=str(folder))
+            answer = client.call(Trigger, "trainer/start")
+            assert not answer.success
+            assert "set output_folder to a folder that can be written" in answer.message
+            assert "call ~/start first" in client.call(Trigger, "trainer/replay").message
+        # Less memory than the replay buffer needs.
+        limits = resource.prlimit(node.process.pid, resource.RLIMIT_AS)
+        used = int(FilePath(f"/proc/{node.process.pid}/statm").read_text().split()[0]) * 4096
+        client.set_parameters("trainer", output_folder=str(tmp_path), replay_capacity=10**7)
+        resource.prlimit(node.process.pid, resource.RLIMIT_AS, (used + 10**8, limits[1]))
+        answer = client.call(Trigger, "trainer/start")
+        assert not answer.success
+        assert "smaller filters, environments or replay_capacity" in answer.message
+        client.set_parameters("trainer", replay_capacity=1000)
+        assert client.call(Trigger, "trainer/start").success
+
+
+def test_nothing_that_comes_in_ends_the_node(
+    run_node: Any, make_client: Any, namespace: str, small_values: Any, tmp_path: FilePath
+) -> None:
+    client = make_client(namespace)
+    parameters = {**ENDLESS, "output_folder": str(tmp_path / "run")}
+    with run_node("trainer_node", parameters, namespace=namespace) as node:
+        names = client.call(ListParameters, "trainer/list_parameters").result.names
+        set_up(client, small_values, stamped(0.5, 0.5), stamped(5.5, 5.5))
+        start_training(client)
+
+        @given(maps(), POSES, HEADERS, some_parameters(names))
+        def fuzz(grid: Any, pose: Pose, header: Header, some: list[Any]) -> None:
+            client.publish("map", grid, LATCHED)
+            initial_pose = PoseWithCovarianceStamped(header=header)
+            initial_pose.pose.pose = pose
+            client.publish("initialpose", initial_pose)
+            client.publish("goal_pose", PoseStamped(header=header, pose=pose))
+            request = SetParameters.Request(parameters=some)
+            results = client.call(SetParameters, "trainer/set_parameters", request).results
+            assert len(results) == len(some)
+            result = set_atomically(client, *some)
+            assert all(one.successful or one.reason for one in [*results, result])
+            assert client.call(Trigger, "trainer/save").success
+
+        fuzz()
+        client.call(Trigger, "trainer/stop")
+        client.call(Trigger, "trainer/replay")
+        client.call(Trigger, "trainer/start")
+    assert "Traceback" not in node.log

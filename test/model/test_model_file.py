@@ -1,16 +1,26 @@
 from __future__ import annotations
 
 import json
+import os
 import pickle
+import random
+import subprocess
+import sys
+from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import asdict, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 import safetensors.torch
 import torch
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from strategies import priced_grids_with_free_cell
 
-from ddqn_planner.grid import GridMap, MoveRule
+from ddqn_planner.grid import Cell, GridMap, MoveRule
 from ddqn_planner.model import (
     ModelFileError,
     ModelMetadata,
@@ -19,6 +29,7 @@ from ddqn_planner.model import (
     new_network,
     save_model,
 )
+from ddqn_planner.model.propagation import MAX_LEARNED_PRICE
 
 METADATA = ModelMetadata(
     network="paper",
@@ -30,6 +41,9 @@ METADATA = ModelMetadata(
     seed=3,
     package_version="0.1.0",
 )
+
+# Every example writes the same file anew.
+same_folder = settings(suppress_health_check=[HealthCheck.function_scoped_fixture])
 
 
 @pytest.fixture
@@ -51,12 +65,38 @@ def test_a_saved_model_comes_back_the_same(model_path: Path, network: PaperQNetw
     np.testing.assert_array_equal(loaded.q_values(*request), network.q_values(*request))
 
 
-@pytest.mark.parametrize("fraction", [0.0, 0.1, 0.5, 0.9, 0.999])
-def test_a_truncated_file_is_refused(model_path: Path, fraction: float) -> None:
+def test_a_file_that_is_truncated_anywhere_is_refused(model_path: Path) -> None:
     content = model_path.read_bytes()
-    model_path.write_bytes(content[: int(len(content) * fraction)])
-    with pytest.raises(ModelFileError, match="truncated"):
-        load_model(model_path)
+    for length in np.linspace(0, len(content) - 1, 50).astype(int):
+        model_path.write_bytes(content[:length])
+        with pytest.raises(ModelFileError, match="truncated"):
+            load_model(model_path)
+
+
+def test_a_file_with_one_wrong_byte_is_a_model_or_refused(model_path: Path) -> None:
+    content = model_path.read_bytes()
+    chance = random.Random(0)
+    header = 8 + int.from_bytes(content[:8], "little")
+    refused = 0
+    places = [*range(8), *(chance.randrange(header) for _ in range(200))]
+    for place in [*places, *(chance.randrange(header, len(content)) for _ in range(50))]:
+        changed = bytearray(content)
+        changed[place] ^= chance.randrange(1, 256)
+        model_path.write_bytes(changed)
+        try:
+            network, _ = load_model(model_path)
+        except ModelFileError:
+            refused += 1
+        else:
+            assert all(tensor.isfinite().all() for tensor in network.state_dict().values())
+    assert refused > 100
+
+
+def test_a_loaded_model_does_not_change_with_its_file(model_path: Path) -> None:
+    loaded, _ = load_model(model_path)
+    before = {key: tensor.clone() for key, tensor in loaded.state_dict().items()}
+    model_path.write_bytes(bytes(model_path.stat().st_size))
+    assert all(torch.equal(before[key], tensor) for key, tensor in loaded.state_dict().items())
 
 
 def test_a_pickle_is_not_run(tmp_path: Path) -> None:
@@ -89,6 +129,15 @@ def save_as(path: Path, weights: PaperQNetwork, **changes: object) -> None:
         ({"sizes": {"height": 4, "width": 5}}, "filters"),
         ({"sizes": {"height": 6, "width": 5, "filters": 2}}, "holds tensors"),
         ({"extra": 1}, "extra"),
+        ({"sizes": {"height": 4, "width": 5, "filters": True}}, "filters is True"),
+        ({"sizes": {"height": 4, "width": 5, "filters": 2, "depth": 1}}, "depth"),
+        ({"sizes": []}, r"sizes is \[\]; it must be dict"),
+        ({"network": ["paper"]}, r"network is \['paper'\]"),
+        ({"gamma": "high"}, "gamma is 'high'; it must be float or int"),
+        ({"gamma": float("nan")}, "gamma is nan"),
+        ({"gamma": 1.5}, r"gamma is 1\.5"),
+        ({"steps": 1.5}, r"steps is 1\.5"),
+        ({"map_fingerprint": None}, "map_fingerprint is None"),
     ],
 )
 def test_wrong_metadata_is_refused_by_name(
@@ -118,16 +167,199 @@ def test_safetensors_of_another_program_are_refused(tmp_path: Path) -> None:
         load_model(path)
 
 
-def test_weights_that_are_not_finite_are_refused(tmp_path: Path, network: PaperQNetwork) -> None:
-    with torch.no_grad():
-        network.fully_connected.bias[0] = torch.nan
+@pytest.mark.parametrize("key", list(asdict(METADATA)))
+def test_metadata_without_a_key_is_refused(
+    tmp_path: Path, network: PaperQNetwork, key: str
+) -> None:
+    description = asdict(METADATA)
+    del description[key]
     path = tmp_path / "model.safetensors"
-    save_model(path, network, METADATA)
-    with pytest.raises(ModelFileError, match="finite"):
+    text = json.dumps(description)
+    path.write_bytes(safetensors.torch.save(network.state_dict(), {"ddqn_planner": text}))
+    with pytest.raises(ModelFileError, match=rf"metadata is wrong .*{key}"):
         load_model(path)
 
 
-@pytest.mark.parametrize("name", ["no_such_model", "no/such.safetensors", "/etc/passwd"])
+JSON_VALUES = st.recursive(
+    st.none() | st.booleans() | st.integers() | st.floats() | st.text(),
+    lambda values: st.lists(values) | st.dictionaries(st.text(), values),
+    max_leaves=8,
+)
+
+
+@same_folder
+@given(
+    st.dictionaries(st.sampled_from([*asdict(METADATA)]) | st.text(), JSON_VALUES, min_size=1)
+    | st.fixed_dictionaries(
+        {"sizes": st.dictionaries(st.sampled_from(["height", "width", "filters"]), JSON_VALUES)}
+    )
+)
+def test_metadata_of_any_json_is_a_models_or_refused(
+    tmp_path: Path, changes: dict[str, Any]
+) -> None:
+    path = tmp_path / "model.safetensors"
+    save_as(path, PaperQNetwork(4, 5, filters=2), **changes)
+    try:
+        _, read = load_model(path)
+    except ModelFileError:
+        return
+    assert json.loads(json.dumps(asdict(read))) == {**asdict(METADATA), **changes}
+
+
+@pytest.mark.parametrize("text", ["", "null", "[1, 2", "[" * 10**5, "7", "{}", "1" * 5000])
+def test_metadata_that_is_no_object_is_refused(tmp_path: Path, text: str) -> None:
+    path = tmp_path / "model.safetensors"
+    path.write_bytes(safetensors.torch.save({"x": torch.zeros(1)}, {"ddqn_planner": text}))
+    with pytest.raises(ModelFileError, match="metadata is wrong"):
+        load_model(path)
+
+
+Tensors = dict[str, torch.Tensor]
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda tensors: tensors.update(more=torch.zeros(1)),
+        lambda tensors: tensors.pop("convolution.bias"),
+        lambda tensors: tensors.update({"convolution.bias": torch.zeros(3)}),
+        lambda tensors: tensors.update({"convolution.bias": torch.zeros(1, 2)}),
+        lambda tensors: tensors.update({"convolution.bias": torch.zeros(2, dtype=torch.float64)}),
+        lambda tensors: tensors.update({"convolution.bias": torch.zeros(2, dtype=torch.float16)}),
+        lambda tensors: tensors.update({"convolution.bias": torch.zeros(2, dtype=torch.int32)}),
+        lambda tensors: tensors.clear(),
+    ],
+)
+def test_tensors_of_another_network_are_refused(
+    tmp_path: Path, network: PaperQNetwork, change: Callable[[Tensors], object]
+) -> None:
+    path = tmp_path / "model.safetensors"
+    tensors = dict(network.state_dict())
+    change(tensors)
+    text = json.dumps(asdict(METADATA))
+    path.write_bytes(safetensors.torch.save(tensors, {"ddqn_planner": text}))
+    with pytest.raises(ModelFileError, match="holds tensors"):
+        load_model(path)
+
+
+@pytest.mark.parametrize("weight", [torch.nan, torch.inf, -torch.inf])
+def test_weights_that_are_not_finite_are_refused(
+    tmp_path: Path, network: PaperQNetwork, weight: float
+) -> None:
+    with torch.no_grad():
+        network.fully_connected.bias[0] = weight
+    path = tmp_path / "model.safetensors"
+    save_model(path, network, METADATA)
+    with pytest.raises(ModelFileError, match="not all finite"):
+        load_model(path)
+
+
+@same_folder
+@given(
+    priced_grids_with_free_cell(),
+    st.sampled_from(["any_map", "propagation"]),
+    st.sampled_from(MoveRule),
+    st.integers(0, 2**32 - 1),
+    st.floats(-30, 38),
+)
+def test_whatever_finite_weights_say_each_q_is_a_length_or_no_way(
+    tmp_path: Path,
+    grid_and_goal: tuple[GridMap, Cell],
+    kind: str,
+    rule: MoveRule,
+    seed: int,
+    exponent: float,
+) -> None:
+    path, network = tmp_path / "model.safetensors", new_network(kind, {"filters": 3})
+    generator = torch.Generator().manual_seed(seed)
+    for weights in network.requires_grad_(False).parameters():
+        normal = torch.randn(weights.shape, generator=generator, dtype=torch.float64)
+        weights.copy_((normal * 10**exponent).clamp(-3e38, 3e38))
+    save_model(path, network, replace(METADATA, network=kind, sizes={"filters": 3}))
+    grid, goal = grid_and_goal
+    loaded, _ = load_model(path)
+    q = loaded.q_values(grid, goal, rule)
+    longest = 2 * MAX_LEARNED_PRICE * grid.occupancy.size
+    assert (np.isneginf(q) | ((q <= -1) & (q >= -longest))).all()
+
+
+@same_folder
+@given(st.binary(max_size=300) | st.binary(max_size=300).map(lambda b: bytes([len(b)]) + b))
+def test_any_bytes_are_refused(tmp_path: Path, content: bytes) -> None:
+    path = tmp_path / "model.safetensors"
+    path.write_bytes(content)
+    with pytest.raises(ModelFileError, match="truncated or of another kind"):
+        load_model(path)
+
+
+def huge_files(folder: Path) -> list[Path]:
+    """Files that claim, or are, 10 GB; they take no room."""
+    sizes = {"height": 4096, "width": 4096, "filters": 4096}
+    text = json.dumps({**asdict(METADATA), "sizes": sizes})
+    tensors = {"x": {"dtype": "F32", "shape": [5 * 2**29], "data_offsets": [0, 10 * 2**30]}}
+    header = json.dumps({"__metadata__": {"ddqn_planner": text}, **tensors}).encode()
+    begins = {
+        "claim": (10 * 2**30).to_bytes(8, "little"),
+        "sparse": (10 * 2**30).to_bytes(8, "little"),
+        "tensor": len(header).to_bytes(8, "little") + header,
+        "zeros": b"",
+    }
+    for name, begin in begins.items():
+        with (folder / f"{name}.safetensors").open("wb") as file:
+            file.write(begin)
+            if name != "claim":
+                file.truncate(len(begin) + 10 * 2**30)
+    return sorted(folder.glob("*.safetensors"))
+
+
+MEASURE = """
+import resource, sys
+from ddqn_planner.model import ModelFileError, load_model
+load_model("any_map")
+before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+for name in sys.argv[1:]:
+    try:
+        load_model(name)
+        sys.exit(f"{name} was loaded")
+    except ModelFileError:
+        pass
+print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before)
+"""
+"""Prints by how many KiB the greatest memory grew."""
+
+
+def test_a_file_that_claims_gigabytes_takes_no_memory(tmp_path: Path) -> None:
+    command = [sys.executable, "-c", MEASURE, *map(str, huge_files(tmp_path))]
+    grown = subprocess.run(command, check=True, capture_output=True, text=True).stdout
+    assert int(grown) < 20_000
+
+
+def test_what_is_no_regular_file_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "folder.safetensors").mkdir()
+    os.mkfifo(tmp_path / "pipe.safetensors")
+    (tmp_path / "zero.safetensors").symlink_to("/dev/zero")
+    (tmp_path / "loop.safetensors").symlink_to(tmp_path / "loop.safetensors")
+    for name in ("folder", "pipe", "zero", "loop", "nul\0", "lone\ud800", "long" * 2000):
+        with pytest.raises(ModelFileError, match="there is no model file"):
+            load_model(tmp_path / f"{name}.safetensors")
+
+
+def test_an_unreadable_file_is_refused(plain_folder: Path, network: PaperQNetwork) -> None:
+    path = plain_folder / "model.safetensors"
+    save_model(path, network, METADATA)
+    path.chmod(0)
+    with pytest.raises(ModelFileError, match=r"[Pp]ermission denied"):
+        load_model(path)
+
+
+@given(st.text() | st.sampled_from(["..", ".", "/", "~", "any_map\0", "../any_map", "any_map/"]))
+def test_a_model_of_any_name_is_shipped_or_refused(name: str) -> None:
+    with suppress(ModelFileError):
+        load_model(name)
+        assert name in ("any_map", "dilemma")
+
+
+@pytest.mark.parametrize("name", ["no_such_model", "no/such.safetensors", "/etc/passwd", "x" * 999])
 def test_a_missing_or_foreign_file_is_named(name: str) -> None:
     with pytest.raises(ModelFileError, match=name):
         load_model(name)

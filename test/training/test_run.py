@@ -1,14 +1,18 @@
 from __future__ import annotations
 
 import csv
+import resource
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
 import torch
+from hypothesis import given
+from hypothesis import strategies as st
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from ddqn_planner import MoveRule
+from ddqn_planner.model import load_model
 from ddqn_planner.training.environment import Scenario
 from ddqn_planner.training.hyper_parameters import HyperParameters
 from ddqn_planner.training.run import TrainingRun, read_cells
@@ -90,3 +94,129 @@ def test_tensorboard_gets_the_curves_where_it_is_installed(small: Scenario, tmp_
     events = EventAccumulator(str(tmp_path))
     events.Reload()
     assert len(events.Scalars("average_reward")) == len(episodes)
+
+
+def test_a_training_goes_on_while_the_disk_is_full_and_saves_when_it_no_longer_is(
+    small: Scenario, tmp_path: Path
+) -> None:
+    run = open_run(tmp_path, small, steps=10**6)
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    steps, errors, episodes = run.steps(), set(), 0
+
+    def train(until: int) -> None:
+        nonlocal episodes
+        while run.trainer.steps < until:
+            episodes += len(next(steps))
+            errors.add(run.save_error)
+
+    train(100)
+    run.try_to_save()
+    saved = run.checkpoint_path.read_bytes()
+    assert errors == {""}
+    size = run.curves_path.stat().st_size
+    # Full in the middle of a row.
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size + 10, limits[1]))
+    try:
+        train(300)
+        run.try_to_save()
+        train(400)
+        content = run.curves_path.read_bytes()
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    (error,) = errors - {""}
+    assert error == run.save_error
+    assert "too large" in error
+    assert str(tmp_path) in error
+    assert "make room" in error
+    assert run.checkpoint_path.read_bytes() == saved
+    assert len(content) == size + 10
+
+    run.try_to_save()
+    assert run.save_error == ""
+    before = episodes
+    train(600)
+    run.try_to_save()
+    run.close()
+    numbers = [int(row["episode"]) for row in rows(tmp_path)]
+    assert numbers == sorted(set(numbers))
+    assert set(range(before + 1, episodes + 1)) <= set(numbers)
+    assert len(list(read_cells(run.curves_path, every=1))) == len(numbers) < episodes
+    events = EventAccumulator(str(tmp_path))
+    events.Reload()
+    assert events.Scalars("average_reward")[-1].step == int(rows(tmp_path)[-1]["step"])
+
+    resumed = open_run(tmp_path, small, steps=10**6)
+    resumed.close()
+    assert resumed.trainer.steps == 600
+    assert [int(row["episode"]) for row in rows(tmp_path)] == numbers
+
+
+@pytest.mark.parametrize("put_there", [Path.touch, lambda path: path.symlink_to("nowhere/else")])
+def test_a_folder_that_is_gone_keeps_no_training_from_going_on(
+    small: Scenario, tmp_path: Path, put_there: object
+) -> None:
+    run = open_run(tmp_path / "run", small, steps=10**6)
+    steps = run.steps()
+    next(steps)
+    run.try_to_save()
+    (tmp_path / "run").rename(tmp_path / "moved")
+    put_there(tmp_path / "run")  # type: ignore[operator]
+    for _ in range(100):
+        next(steps)
+    run.try_to_save()
+    assert str(tmp_path / "run") in run.save_error
+    (tmp_path / "run").unlink()
+    (tmp_path / "moved").rename(tmp_path / "run")
+    run.try_to_save()
+    assert run.save_error == ""
+    run.close()
+    resumed = open_run(tmp_path / "run", small, steps=10**6)
+    resumed.close()
+    assert resumed.trainer.steps == 101
+
+
+def test_a_run_removes_what_killed_ones_left_in_its_folder(small: Scenario, tmp_path: Path) -> None:
+    for name in ("model.safetensors", "checkpoint.safetensors", "episodes.csv"):
+        for number in range(50):
+            (tmp_path / f".{name}.{number:08}").write_bytes(b"half")
+    (tmp_path / ".hidden").touch()
+    open_run(tmp_path, small).close()
+    assert [path.name for path in tmp_path.glob(".*")] == [".hidden"]
+
+
+def test_a_model_newer_than_the_checkpoint_does_no_harm(small: Scenario, tmp_path: Path) -> None:
+    killed = open_run(tmp_path, small)
+    for _ in killed.steps():
+        if killed.trainer.steps == 150:
+            killed.save()
+        if killed.trainer.steps == 220:  # killed between the two files of a save
+            killed.trainer.save_model(killed.model_path)
+            break
+    killed.close()
+    assert load_model(killed.model_path)[1].steps == 220
+    resumed = open_run(tmp_path, small)
+    assert resumed.trainer.steps == 150
+    finish(resumed)
+    assert load_model(resumed.model_path)[1].steps == 400
+
+
+WHOLE = b"1,9,0,reached_goal,2,2.0,1.5,0.75,0:0 1:0 2:0\r\n"
+
+
+@given(st.lists(st.binary() | st.sampled_from([WHOLE, WHOLE[:-9], WHOLE.replace(b"1:0", b"1:")])))
+def test_of_a_broken_file_whole_rows_alone_are_read(
+    tmp_path_factory: pytest.TempPathFactory, lines: list[bytes]
+) -> None:
+    path = tmp_path_factory.mktemp("broken") / "episodes.csv"
+    path.write_bytes(b"\n".join([*lines, b""]) + WHOLE)
+    cells = list(read_cells(path, every=1))
+    assert cells[-1] == ((0, 0), (1, 0), (2, 0))
+
+
+def test_an_episode_of_any_length_can_be_read_and_cut(small: Scenario, tmp_path: Path) -> None:
+    path = tmp_path / "episodes.csv"
+    cells = b" ".join([b"0:0"] * 10**5)
+    path.write_bytes(b"1,9,0,out_of_steps,2,2.0,1.5,0.75," + cells + b"\r\n")
+    assert [len(walked) for walked in read_cells(path, every=1)] == [10**5]
+    open_run(tmp_path, small).close()
+    assert rows(tmp_path) == []

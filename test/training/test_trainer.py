@@ -4,6 +4,7 @@ from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 
@@ -195,3 +196,21 @@ def test_a_truncated_checkpoint_is_refused(
 def test_a_parameter_out_of_range_is_named(name: str, value: object) -> None:
     with pytest.raises(ValueError, match=f"{name} is {value!r}"):
         HyperParameters(**{name: value})  # type: ignore[arg-type]
+
+
+def test_a_checkpoint_with_another_bit_is_refused_with_the_remedy(
+    small: Scenario, tmp_path: Path
+) -> None:
+    path = tmp_path / "checkpoint"
+    trainer = make(small, replace(QUICK, replay_capacity=100))
+    train(trainer, 100)
+    trainer.save_checkpoint(path)
+    content = path.read_bytes()
+    random = np.random.default_rng(0)
+    header = 8 + int.from_bytes(content[:8], "little")
+    for position in [*random.integers(header, size=50), *random.integers(len(content), size=50)]:
+        broken = bytearray(content)
+        broken[position] ^= 1 << random.integers(8)
+        path.write_bytes(broken)
+        with pytest.raises(CheckpointError, match="remove it to train anew, or train into another"):
+            Trainer.load_checkpoint(path, [small])

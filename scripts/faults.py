@@ -1,0 +1,408 @@
+"""Kills each node in turn while it works, starts it again, and checks that nothing is broken.
+
+The planner is killed while it plans, the map server while it publishes, the trainer while it saves:
+by SIGKILL, each time at a random moment. `make faults` kills 50 times; an argument gives another
+number.
+"""
+
+from __future__ import annotations
+
+import array
+import random
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack
+from dataclasses import astuple, dataclass, fields
+from itertools import cycle, islice, pairwise
+from pathlib import Path
+from typing import Any, TypeVar
+
+import demo
+import numpy as np
+from geometry_msgs.msg import PoseWithCovarianceStamped
+from nav_msgs.msg import OccupancyGrid
+from nav_msgs.srv import GetPlan, LoadMap
+from processes import executable, running
+from rcl_interfaces.srv import GetParameters, SetParameters
+from rclpy.parameter import Parameter
+from std_srvs.srv import Trigger
+
+from ddqn_planner.grid import (
+    MOVES,
+    OCCUPIED,
+    Cell,
+    GridMap,
+    MapFile,
+    MoveRule,
+    legal_moves,
+    read_map_file,
+    save_map,
+)
+from ddqn_planner.grid.generators import generate_map, random_requests
+from ddqn_planner.model import load_model
+from ddqn_planner.resources import find_map
+from ddqn_planner.training.environment import Scenario
+from ddqn_planner.training.trainer import Trainer
+
+KILLS = 50
+SIDE = 1000
+"""Cells: a map so large that its fields are killed in."""
+
+GOALS = 6
+"""Fields that the planner is asked for at once: a second's work."""
+
+RULE = MoveRule.ROBOT_SAFE
+"""That of the shipped model for any map."""
+
+TRY_TIME = 1.0
+"""Seconds until a question is asked again: it may have gone to the node that was killed."""
+
+START_TIME = 20.0
+"""The same for ~/start, which a second question would find started."""
+
+LAST_WAIT = 0.5
+"""Seconds that a client waits after a kill until it gives up."""
+
+T = TypeVar("T")
+
+
+@dataclass
+class Tally:
+    """What became of the kills of one node: a row of the table."""
+
+    node: str
+    killed_while: str
+    kills: int = 0
+    in_a_save: int = 0
+    restarts: int = 0
+    answers: int = 0
+    time_outs: int = 0
+    wrong_paths: int = 0
+    temporaries: int = 0
+
+    @property
+    def right(self) -> bool:
+        """Whether every restart worked, and nothing wrong came or stayed."""
+        return self.restarts == self.kills and not self.wrong_paths and not self.temporaries
+
+
+class Killed:
+    """An executable of the package that is killed and started again."""
+
+    def __init__(self, name: str, *arguments: str) -> None:
+        self._command = (executable(name), "--ros-args", "--log-level", "fatal", *arguments)
+        self._stack = ExitStack()
+        self._child: subprocess.Popen[bytes] | None = None
+        self.start()
+
+    def start(self) -> None:
+        """Start it."""
+        self._child = self._stack.enter_context(running(*self._command))
+
+    def kill(self) -> None:
+        """End it as a power cut would."""
+        assert self._child is not None
+        self._child.kill()
+        self._child.wait()
+        self._child = None
+
+    def check(self) -> None:
+        """Raise if it ended by itself."""
+        if self._child is not None and self._child.poll() is not None:
+            raise RuntimeError(f"{self._command[0]} ended with {self._child.returncode}")
+
+    def stop(self) -> None:
+        """End it as Ctrl-C would."""
+        self._stack.close()
+
+
+class Faults:
+    """The nodes, and what a client sees of them.
+
+    Parameters
+    ----------
+    client : demo.Client
+    folder : Path
+        An empty one.
+    """
+
+    def __init__(self, client: demo.Client, folder: Path) -> None:
+        self.client = client
+        self._draw, self._random = random.Random(0), np.random.default_rng(0)
+        self.map_path, self.training_folder = folder / "map.yaml", folder / "training"
+        occupancy = generate_map("office", (SIDE, SIDE), self._random)
+        ((start, goal),) = random_requests(occupancy, RULE, 1, self._random)
+        values = np.where(occupancy, np.int8(100), np.int8(0))
+        save_map(MapFile(values, start=start, goal=goal), self.map_path)
+        self.values, self.grid = values, GridMap(occupancy)
+        self._legal = legal_moves(occupancy, RULE)
+        self._moves: list[list[int]] = MOVES.tolist()
+        self._watched = start, goal
+        trained = read_map_file(find_map("dilemma"))
+        assert trained.start is not None
+        assert trained.goal is not None
+        self._scenario = Scenario(trained.grid(), trained.start, trained.goal)
+        self.tallies = {
+            self.kill_planner: Tally("planner_node", "planning"),
+            self.kill_map_server: Tally("map_server_node", "publishing"),
+            self.kill_trainer: Tally("trainer_node", "saving"),
+        }
+        self._services: dict[str, Any] = {}
+
+    def __enter__(self) -> Faults:
+        apart = ("-r", "__ns:=/training")
+        output = f"output_folder:={self.training_folder}"
+        trained = ("map_file:=dilemma", "steps:=1000000000", output)
+        parameters = [word for parameter in trained for word in ("-p", parameter)]
+        with ExitStack() as stack:
+
+            def started(name: str, *arguments: str) -> Killed:
+                node = Killed(name, *arguments)
+                stack.callback(node.stop)
+                return node
+
+            self.map_server = started("map_server_node", "-p", f"yaml_filename:={self.map_path}")
+            self.planner = started("planner_node")
+            self.trainer = started("trainer_node", *apart, *parameters)
+            self.follower = started("planner_node", *apart, "-p", "follow_trainer:=true")
+            self._stack = stack.pop_all()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._stack.close()
+
+    # Asking
+
+    def service(self, service_type: Any, name: str) -> Any:
+        """Return a client of a service, always the same one."""
+        if name not in self._services:
+            self._services[name] = self.client.create_client(service_type, name)
+        return self._services[name]
+
+    def ask(
+        self,
+        service: Any,
+        request: Any,
+        accept: Callable[[Any], T | None] = lambda answer: answer,
+        try_time: float = TRY_TIME,
+    ) -> T:
+        """Ask until an answer is accepted; return what `accept` returned."""
+        deadline = time.monotonic() + demo.TIMEOUT
+        service.wait_for_service(demo.TIMEOUT)
+        while time.monotonic() < deadline:
+            for node in (self.map_server, self.planner, self.trainer, self.follower):
+                node.check()
+            future = service.call_async(request)
+            until = time.monotonic() + try_time
+            while not future.done() and time.monotonic() < until:
+                time.sleep(0.005)
+            if future.done():
+                if accepted := accept(future.result()):
+                    return accepted
+                time.sleep(0.05)
+            service.remove_pending_request(future)
+        raise TimeoutError(f"no answer from {service.srv_name} within {demo.TIMEOUT:.0f} s")
+
+    def trigger(self, name: str, try_time: float = TRY_TIME) -> str:
+        """Call a Trigger service until it succeeds; return its message."""
+        service = self.service(Trigger, name)
+        return self.ask(service, Trigger.Request(), lambda a: a.success and a.message, try_time)
+
+    def parameter(self, node: str, name: str) -> Any:
+        """Return a parameter's value message."""
+        service = self.service(GetParameters, f"{node}/get_parameters")
+        return self.ask(service, GetParameters.Request(names=[name]), lambda a: a.values[0])
+
+    def request(self, start: Cell, goal: Cell) -> GetPlan.Request:
+        """Return a request for a plan between two cells."""
+        return GetPlan.Request(start=demo.pose(self.grid, start), goal=demo.pose(self.grid, goal))
+
+    def is_right(self, plan: Any, start: Cell, goal: Cell) -> bool:
+        """Say whether a plan leads from the start to the goal by legal moves on the map.
+
+        A plan of a map with new obstacles must be right on the map without them too.
+        """
+        positions = [entry.pose.position for entry in plan.poses]
+        cells = [self.grid.world_to_cell(position.x, position.y) for position in positions]
+        moves = [([x - a, y - b], a, b) for (a, b), (x, y) in pairwise(cells)]
+        ends = cells[:1] == [start] and cells[-1:] == [goal]
+        return ends and all(
+            move in self._moves and bool(self._legal[self._moves.index(move), y, x])
+            for move, x, y in moves
+        )
+
+    def is_whole(self, message: OccupancyGrid) -> bool:
+        """Say whether a map is the loaded one with at most five obstacles more."""
+        values = np.frombuffer(message.data, np.int8).reshape(self.values.shape)
+        new = values != self.values
+        return bool((values[new] == OCCUPIED).all()) and int(new.sum()) <= 5
+
+    # Killing
+
+    def begin(self) -> None:
+        """Wait until all nodes work, and start the training."""
+        self.ask(self.client.get_plan, self.request(*self._watched), lambda a: a.plan.poses)
+        self.trigger("/training/trainer/start", START_TIME)
+        self.parameter("/training/planner", "model")
+
+    def count(self, tally: Tally, service: Any, futures: Sequence[Any]) -> list[Any]:
+        """Count the answers that came before a kill, and the time-outs; return the answers."""
+        answers = [future.result() for future in futures if future.done()]
+        tally.answers += len(answers)
+        tally.time_outs += len(futures) - len(answers)
+        for future in futures:
+            service.remove_pending_request(future)
+        return answers
+
+    def kill_planner(self, tally: Tally) -> None:
+        """Kill the planner while it plans toward goals that it does not know."""
+        get_plan = self.client.get_plan
+        asked = random_requests(self.grid.occupancy, RULE, GOALS, self._random)
+        futures = [get_plan.call_async(self.request(*cells)) for cells in asked]
+        time.sleep(self._draw.uniform(0.0, 1.0))
+        self.planner.kill()
+        time.sleep(LAST_WAIT)
+        for cells, future in zip(asked, futures, strict=True):
+            for answer in self.count(tally, get_plan, [future]):
+                tally.wrong_paths += not self.is_right(answer.plan, *cells)
+        self.planner.start()
+        plan = self.ask(
+            get_plan, self.request(*asked[0]), lambda a: a.plan if a.plan.poses else None
+        )
+        tally.wrong_paths += not self.is_right(plan, *asked[0])
+        tally.restarts += 1
+
+    def kill_map_server(self, tally: Tally) -> None:
+        """Kill the map server while it loads, scatters over and restores its map."""
+        self.plan_for_active_goal()
+        load = LoadMap.Request(map_url=str(self.map_path))
+        calls = [
+            *[(self.service(Trigger, "map_server/restore_map"), Trigger.Request())] * 20,
+            *[(self.service(LoadMap, "map_server/load_map"), load)] * 4,
+            (self.service(Trigger, "map_server/scatter_obstacles"), Trigger.Request()),
+        ]
+        self._draw.shuffle(calls)
+        futures = [(service, service.call_async(request)) for service, request in calls]
+        time.sleep(self._draw.uniform(0.0, 2.0))
+        self.map_server.kill()
+        time.sleep(LAST_WAIT)
+        for service, future in futures:
+            self.count(tally, service, [future])
+        # When that is answered, the plans of the last maps are out.
+        self.ask(self.client.get_plan, self.request(*self._watched), lambda a: a.plan.poses)
+        whole = self.is_whole(self.client.heard["map"])
+        for topic in ("map", "plan"):
+            del self.client.heard[topic]
+        self.map_server.start()
+        served = demo.wait_for("map", lambda: self.client.heard.get("map"), [])
+        plan = demo.wait_for("plan", lambda: self.client.heard.get("plan"), [])
+        tally.wrong_paths += not self.is_right(plan, *self._watched)
+        tally.restarts += whole and served.data == array.array("b", self.values.tobytes())
+
+    def plan_for_active_goal(self) -> None:
+        """Give the planner a start and an active goal until it plans: it may be a new one."""
+        start, goal = (demo.pose(self.grid, cell) for cell in self._watched)
+        initial_pose = PoseWithCovarianceStamped(header=start.header)
+        initial_pose.pose.pose = start.pose
+        self.client.heard.pop("plan", None)
+
+        def planned() -> bool:
+            self.client.start.publish(initial_pose)
+            self.client.goal.publish(goal)
+            time.sleep(0.2)
+            return "plan" in self.client.heard and bool(self.client.heard["plan"].poses)
+
+        demo.wait_for("plan", planned, [])
+
+    def kill_trainer(self, tally: Tally) -> None:
+        """Kill the trainer while it saves after each step, soon after a save was seen to begin."""
+        save = self.service(Trigger, "/training/trainer/save")
+        until = time.monotonic() + self._draw.uniform(0.2, 1.2)
+        futures = []
+        while time.monotonic() < until:
+            futures.append(save.call_async(Trigger.Request()))
+            time.sleep(0.002)
+        while not self.temporaries() and time.monotonic() < until + LAST_WAIT:
+            pass
+        time.sleep(self._draw.uniform(0.0, 0.002))
+        self.trainer.kill()
+        tally.in_a_save += bool(self.temporaries())
+        time.sleep(LAST_WAIT)
+        self.count(tally, save, futures)
+        steps = self.saved_steps()
+        self.trainer.start()
+        self.parameter("/training/trainer", "seed")
+        message = self.trigger("/training/trainer/start", START_TIME)
+        self.follow()
+        tally.temporaries = len(self.temporaries())
+        tally.restarts += f"from step {steps} " in message
+
+    def temporaries(self) -> list[Path]:
+        """Return what the killed trainers left of their saves."""
+        return [*self.training_folder.glob(".*")]
+
+    def saved_steps(self) -> int:
+        """Load the model and the checkpoint, where there are any; return the checkpoint's steps."""
+        model = self.training_folder / "model.safetensors"
+        checkpoint = self.training_folder / "checkpoint.safetensors"
+        if model.exists():
+            load_model(model)
+        if not checkpoint.exists():
+            return 0
+        return Trainer.load_checkpoint(checkpoint, [self._scenario]).steps
+
+    def follow(self) -> None:
+        """Wait until the planner that follows the trainer has loaded a model of its."""
+        other = Parameter("model", value="any_map").to_parameter_msg()
+        set_parameters = self.service(SetParameters, "/training/planner/set_parameters")
+        request = SetParameters.Request(parameters=[other])
+        self.ask(set_parameters, request, lambda a: a.results[0].successful)
+        self.trigger("/training/trainer/save")
+        saved = str(self.training_folder / "model.safetensors")
+        demo.wait_for(
+            "model",
+            lambda: self.parameter("/training/planner", "model").string_value == saved,
+            [],
+        )
+
+
+def show(tallies: Sequence[Tally]) -> None:
+    """Print the table."""
+    names = [field.name for field in fields(Tally)]
+    rows = [names, *([str(value) for value in astuple(tally)] for tally in tallies)]
+    rows[0] = [name.replace("_", " ") for name in names]
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    for row in rows:
+        print("  ".join(text.ljust(width) for text, width in zip(row, widths, strict=True)))
+
+
+def main(arguments: Sequence[str]) -> int:
+    """Kill so many times, and print what became of it; return 1 if anything is wrong."""
+    # A shell starts what it runs in the background with SIGINT ignored, and so would the nodes be.
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))
+    kills = int(arguments[0]) if arguments else KILLS
+    with (
+        demo.client() as client,
+        tempfile.TemporaryDirectory() as folder,
+        Faults(client, Path(folder)) as faults,
+    ):
+        faults.begin()
+        try:
+            for kill, tally in islice(cycle(faults.tallies.items()), kills):
+                tally.kills += 1
+                kill(tally)
+        finally:
+            show([*faults.tallies.values()])
+    return int(not all(tally.right for tally in faults.tallies.values()))
+
+
+if __name__ == "__main__":
+    try:
+        sys.exit(main(sys.argv[1:]))
+    except KeyboardInterrupt:
+        sys.exit(130)

@@ -1,0 +1,405 @@
+"""Asks one planner node from many processes while its map changes, and checks every answer.
+
+Part one: processes ask `get_plan` on three maps that take turns. The stamp of a plan says on which
+map it was planned, so each answer is checked against that map: both ends, and that every move is
+legal; or that there is no path where it is empty. Part two: goals come at 200 Hz; the plans have
+to follow in their order, and the last one has to be the last goal's.
+"""
+
+from __future__ import annotations
+
+import itertools
+import multiprocessing
+import signal
+import sys
+import threading
+import time
+from collections import Counter
+from collections.abc import Sequence
+from contextlib import suppress
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import rclpy
+from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped
+from nav_msgs.msg import OccupancyGrid
+from nav_msgs.msg import Path as PathMessage
+from nav_msgs.srv import GetPlan
+from numpy.typing import NDArray
+from processes import claim_ros_domain, executable, running
+from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rclpy.qos import DurabilityPolicy, QoSProfile
+from std_msgs.msg import Header
+
+from ddqn_planner.grid import MOVES, Cell, GridMap, MapFile, MoveRule, legal_moves, read_map_file
+from ddqn_planner.grid.generators import generate_map, random_requests
+from ddqn_planner.grid.moves import component_labels
+from ddqn_planner.nodes.conversions import occupancy_message, quaternion
+from ddqn_planner.nodes.runtime import LATCHED
+from ddqn_planner.resources import find_map
+
+RULE = MoveRule.ROBOT_SAFE
+"""The rule of the planner's default model."""
+
+TIMEOUT = 60.0
+"""Seconds after which an answer counts as lost."""
+
+SERVICE_QUALITY = QoSProfile(depth=1000)
+"""With Fast DDS each client of a service hears the answers to all. In the usual queue of ten
+its own is overwritten if the process has to wait for its turn: one in a thousand was lost."""
+
+REQUESTS, CLIENTS, CHANGES = 10_000, 8, 50
+WARM_UP = 0.3
+"""Share of the requests in which the planner comes to keep as many fields as it may."""
+
+GOALS_A_MAP = 40
+GOALS, GOALS_PERIOD = 2000, 0.005
+ACTIONS = {(dx, dy): action for action, (dx, dy) in enumerate(MOVES.tolist())}
+
+
+class Terrain:
+    """A map, and what it takes to check a plan on it."""
+
+    def __init__(self, map_file: MapFile) -> None:
+        # A message holds the resolution in single precision.
+        resolution = float(np.float32(map_file.resolution))
+        self.values = map_file.values
+        self.grid = MapFile(map_file.values, resolution, map_file.origin).grid()
+
+    @cached_property
+    def legal(self) -> NDArray[np.bool_]:
+        """(8, H, W) bool: which moves are legal."""
+        return legal_moves(self.grid.occupancy, RULE)
+
+    @cached_property
+    def labels(self) -> NDArray[np.int32]:
+        """(H, W) int32: which part of the map each cell belongs to."""
+        return component_labels(self.grid.occupancy, RULE)
+
+    def message(self, number: int) -> OccupancyGrid:
+        """Return the map message, stamped with a number of seconds."""
+        header = Header(frame_id="map")
+        header.stamp.sec = number
+        return occupancy_message(self.values, self.grid.resolution, self.grid.origin, header)
+
+    def fault(self, request: GetPlan.Request, plan: PathMessage) -> str:
+        """Say what is wrong with an answer; "" if nothing is."""
+        start, goal = (cell_of(self.grid, pose) for pose in (request.start, request.goal))
+        possible = (
+            self.grid.is_free(start)
+            and self.grid.is_free(goal)
+            and self.labels[start[1], start[0]] == self.labels[goal[1], goal[0]]
+        )
+        cells = [cell_of(self.grid, pose) for pose in plan.poses]
+        if not cells:
+            return f"no path from {start} to {goal}, where there is one" if possible else ""
+        if (cells[0], cells[-1]) != (start, goal):
+            return f"a path from {cells[0]} to {cells[-1]}, asked was {start} to {goal}"
+        for (x, y), (next_x, next_y) in itertools.pairwise(cells):
+            action = ACTIONS.get((next_x - x, next_y - y))
+            if action is None or not self.grid.contains((x, y)) or not self.legal[action, y, x]:
+                return f"an illegal move from {(x, y)} to {(next_x, next_y)}"
+        return ""
+
+
+def terrains() -> list[Terrain]:
+    """Return the three maps; they are the same in each process."""
+    rooms = generate_map("rooms", (200, 200), np.random.default_rng(0))
+    generated = MapFile(np.where(rooms, 100, 0), 0.05)
+    return [
+        Terrain(read_map_file(find_map("dilemma"))),
+        Terrain(generated),
+        Terrain(read_map_file(find_map("office"))),
+    ]
+
+
+def cell_of(grid: GridMap, pose: PoseStamped) -> Cell:
+    """Return the cell of a pose."""
+    return grid.world_to_cell(pose.pose.position.x, pose.pose.position.y)
+
+
+def pose_of(grid: GridMap, cell: Cell) -> PoseStamped:
+    """Return the pose of a cell's centre."""
+    message = PoseStamped(header=Header(frame_id="map"))
+    message.pose.position.x, message.pose.position.y = grid.cell_to_world(cell)
+    message.pose.orientation = quaternion(0.0)
+    return message
+
+
+def request_of(grid: GridMap, start: Cell, goal: Cell) -> GetPlan.Request:
+    """Return a request for a plan between two cells."""
+    return GetPlan.Request(start=pose_of(grid, start), goal=pose_of(grid, goal))
+
+
+def resident(process: int) -> float:
+    """Return the resident memory of a process, MB."""
+    status = Path(f"/proc/{process}/status").read_text(encoding="utf-8")
+    return int(status.split("VmRSS:")[1].split()[0]) / 1e3
+
+
+class Client:
+    """A node in a context of its own, spun in the background."""
+
+    def __init__(self) -> None:
+        self._context = rclpy.Context()
+        self._context.init(args=[])
+        self.node = rclpy.create_node("load", context=self._context, start_parameter_services=False)
+        self._executor = SingleThreadedExecutor(context=self._context)
+        self._executor.add_node(self.node)
+        self._thread = threading.Thread(target=self._spin, daemon=True)
+        self._thread.start()
+        self._clients: dict[str, Any] = {}
+
+    def __enter__(self) -> Client:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._executor.shutdown()
+        self._context.try_shutdown()
+        self._thread.join()
+        self.node.destroy_node()
+
+    def _spin(self) -> None:
+        with suppress(ExternalShutdownException):
+            self._executor.spin()
+
+    def call(self, service_type: Any, name: str, request: Any = None) -> Any:
+        """Return a service's answer, or None if it is lost."""
+        if name not in self._clients:
+            self._clients[name] = self.node.create_client(
+                service_type, name, qos_profile=SERVICE_QUALITY
+            )
+            self._clients[name].wait_for_service(TIMEOUT)
+        answered = threading.Event()
+        future = self._clients[name].call_async(request or service_type.Request())
+        future.add_done_callback(lambda _: answered.set())
+        return future.result() if answered.wait(TIMEOUT) else None
+
+    def get_plan(self, request: GetPlan.Request) -> PathMessage | None:
+        """Return the planner's answer, or None if it is lost."""
+        answer = self.call(GetPlan, "planner/get_plan", request)
+        return answer and answer.plan
+
+
+@dataclass
+class Result:
+    """What became of requests.
+
+    Parameters
+    ----------
+    counts : Counter
+        "answered", "lost", "wrong", "paths" and "empty" answers.
+    milliseconds : list of float
+        How long each answer took.
+    faults : list of str
+        What is wrong with the wrong answers.
+    """
+
+    counts: Counter[str] = field(default_factory=Counter)
+    milliseconds: list[float] = field(default_factory=list)
+    faults: list[str] = field(default_factory=list)
+
+
+def ask(seed: int, count: int, ready: Any, done: Any, results: Any) -> None:
+    """Ask for plans, check each, and put a `Result` into a queue: the work of one process."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # it ends with its parent
+    random, maps, result = np.random.default_rng(seed), terrains(), Result()
+    goals = [
+        [goal for _, goal in random_requests(m.grid.occupancy, RULE, GOALS_A_MAP, random)]
+        for m in maps
+    ]
+    starts = [m.grid.free_cells() for m in maps]
+    with Client() as client:
+        current = 0
+        # Unmeasured: it waits for the planner's services to be found.
+        client.get_plan(GetPlan.Request())
+        ready.wait(TIMEOUT)
+        for _ in range(count):
+            start = starts[current][random.integers(len(starts[current]))]
+            goal = goals[current][random.integers(GOALS_A_MAP)]
+            request = request_of(maps[current].grid, start, goal)
+            began = time.perf_counter()
+            plan = client.get_plan(request)
+            took = 1e3 * (time.perf_counter() - began)
+            with done.get_lock():
+                done.value += 1
+            if plan is None:
+                result.counts["lost"] += 1
+                result.faults.append(f"no answer to {start} to {goal} of map {current}")
+                continue
+            result.milliseconds.append(took)
+            result.counts["answered"] += 1
+            result.counts["paths" if plan.poses else "empty"] += 1
+            current = plan.header.stamp.sec % len(maps)
+            fault = maps[current].fault(request, plan)
+            if fault:
+                result.counts["wrong"] += 1
+                result.faults.append(f"on map {plan.header.stamp.sec}: {fault}")
+    results.put(result)
+
+
+def wait_for_map(client: Client, number: int) -> None:
+    """Wait until the planner answers on the map of a number.
+
+    Raises
+    ------
+    TimeoutError
+        If it does not in time.
+    """
+    deadline = time.monotonic() + TIMEOUT
+    while (plan := client.get_plan(GetPlan.Request())) is None or plan.header.stamp.sec != number:
+        if time.monotonic() > deadline:
+            raise TimeoutError(f"no plan on map {number} within {TIMEOUT:.0f} s; last: {plan}")
+        time.sleep(0.05)
+
+
+def load_requests(planner: int, requests: int, clients: int) -> bool:
+    """Ask a running planner from several processes under changing maps; print a table.
+
+    Parameters
+    ----------
+    planner : int
+        Process of the planner node, which has no map of anybody else.
+    requests, clients : int
+        How many requests in all, from how many processes.
+
+    Returns
+    -------
+    bool
+        Whether nothing was lost or wrong.
+    """
+    context = multiprocessing.get_context("spawn")
+    maps = [terrain.message for terrain in terrains()]
+    ready, done, results = context.Barrier(clients + 1), context.Value("i"), context.Queue()
+    shares = [len(range(seed, requests, clients)) for seed in range(clients)]
+    processes = [
+        context.Process(target=ask, args=(seed, share, ready, done, results), daemon=True)
+        for seed, share in enumerate(shares)
+    ]
+    with Client() as client:
+        publisher = client.node.create_publisher(OccupancyGrid, "map", LATCHED)
+        number = len(maps)
+        publisher.publish(maps[0](number))
+        wait_for_map(client, number)
+        for process in processes:
+            process.start()
+        ready.wait(TIMEOUT)
+        began, first_memory = time.monotonic(), 0.0
+        while done.value < requests and any(process.is_alive() for process in processes):
+            if done.value >= (number - 2) * requests / CHANGES:
+                number += 1
+                publisher.publish(maps[number % len(maps)](number))
+            if not first_memory and done.value >= WARM_UP * requests:
+                first_memory = resident(planner)
+            time.sleep(0.005)
+        seconds = time.monotonic() - began
+        last_memory = resident(planner)
+    total = Result()
+    for _ in processes:
+        result = results.get(timeout=TIMEOUT)  # fails if a process did
+        total.counts += result.counts
+        total.milliseconds += result.milliseconds
+        total.faults += result.faults
+    for process in processes:
+        process.join()
+    for fault in total.faults[:10]:
+        print(fault)
+    median, slow = np.percentile(total.milliseconds, (50, 99))
+    print(
+        f"GetPlan: {requests} requests of {clients} processes in {seconds:.0f} s, "
+        f"{number - len(maps)} changes of the map\n"
+        f"  answered {total.counts['answered']}, lost {total.counts['lost']}, "
+        f"wrong {total.counts['wrong']}\n"
+        f"  paths {total.counts['paths']}, empty answers {total.counts['empty']}\n"
+        f"  latency median {median:.1f} ms, 99 % {slow:.1f} ms\n"
+        f"  planner's resident memory {first_memory:.0f} MB after {WARM_UP:.0%} of them, "
+        f"{last_memory:.0f} MB at the end: {last_memory / first_memory - 1:+.1%}",
+        flush=True,
+    )
+    return total.counts["answered"] == requests and not total.counts["wrong"]
+
+
+def load_goals(goals: int) -> bool:
+    """Send goals at 200 Hz to a running planner; print what became of them.
+
+    Returns
+    -------
+    bool
+        Whether the plans came in the order of the goals, and the last is the last goal's.
+    """
+    terrain = terrains()[2]
+    grid, random = terrain.grid, np.random.default_rng(0)
+    (start, _), *_ = random_requests(grid.occupancy, RULE, 1, random)
+    rows, columns = np.nonzero(terrain.labels == terrain.labels[start[1], start[0]])
+    chosen = random.permutation(len(rows))[:goals]
+    cells = list(zip(columns[chosen].tolist(), rows[chosen].tolist(), strict=True))
+    numbers = {cell: number for number, cell in enumerate(cells)}
+    heard: list[int] = []
+
+    def hear(plan: PathMessage) -> None:
+        heard.append(numbers.get(cell_of(grid, plan.poses[-1]), -1) if plan.poses else -1)
+
+    with Client() as client:
+        map_publisher = client.node.create_publisher(OccupancyGrid, "map", LATCHED)
+        start_publisher = client.node.create_publisher(PoseWithCovarianceStamped, "initialpose", 10)
+        goal_publisher = client.node.create_publisher(PoseStamped, "goal_pose", 10)
+        number = 2**20
+        map_publisher.publish(terrain.message(number))
+        wait_for_map(client, number)
+        wait_for_listeners(start_publisher, goal_publisher)
+        pose = pose_of(grid, start)
+        known = PoseWithCovarianceStamped(header=pose.header)
+        known.pose.pose = pose.pose
+        start_publisher.publish(known)
+        from_known_start = GetPlan.Request(goal=pose)
+        while not getattr(client.get_plan(from_known_start), "poses", None):
+            time.sleep(0.01)
+        everything = QoSProfile(depth=goals, durability=DurabilityPolicy.VOLATILE)
+        plans = client.node.create_subscription(PathMessage, "plan", hear, everything)
+        while client.node.count_publishers("plan") < 1:
+            time.sleep(0.01)
+        began = time.monotonic()
+        for sent, cell in enumerate(cells):
+            time.sleep(max(0.0, began + sent * GOALS_PERIOD - time.monotonic()))
+            goal_publisher.publish(pose_of(grid, cell))
+        seconds = time.monotonic() - began
+        deadline = time.monotonic() + TIMEOUT
+        while goals - 1 not in heard and time.monotonic() < deadline:
+            time.sleep(0.01)
+        # A plan for an older goal would come now.
+        time.sleep(2)
+        client.node.destroy_subscription(plans)
+    late = sum(later < earlier for earlier, later in itertools.pairwise(heard))
+    right = bool(heard) and heard[-1] == goals - 1 and not late
+    print(
+        f"goal_pose: {goals} goals in {seconds:.1f} s, {len(heard)} plans published, "
+        f"{late} late; the last is {'' if right else 'not '}the last goal's",
+        flush=True,
+    )
+    return right
+
+
+def wait_for_listeners(*publishers: Any) -> None:
+    """Wait until somebody hears each publisher."""
+    while not all(publisher.get_subscription_count() for publisher in publishers):
+        time.sleep(0.01)
+
+
+def main(arguments: Sequence[str]) -> int:
+    """Load a planner node with requests and with goals; return 1 if anything is lost or wrong."""
+    requests = int(arguments[0]) if arguments else REQUESTS
+    with (
+        claim_ros_domain(),
+        running(executable("planner_node"), "--ros-args", "--log-level", "error") as planner,
+    ):
+        fine = [load_requests(planner.pid, requests, CLIENTS), load_goals(GOALS)]
+    return int(not all(fine))
+
+
+if __name__ == "__main__":
+    # So that the nodes end with it.
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))
+    sys.exit(main(sys.argv[1:]))

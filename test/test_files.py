@@ -1,0 +1,82 @@
+from __future__ import annotations
+
+import os
+import resource
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+
+from ddqn_planner.files import Appender, remove_temporaries, write_atomically
+
+
+@contextmanager
+def files_no_longer_than(size: int) -> Iterator[None]:
+    """Let a write fail in its middle, for any user, as on a full disk."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, hard))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+
+
+def test_a_write_that_fails_leaves_the_old_file_and_nothing_else(tmp_path: Path) -> None:
+    path = tmp_path / "file"
+    write_atomically(path, b"old")
+    with files_no_longer_than(1000), pytest.raises(OSError, match="too large"):
+        write_atomically(path, b"n" * 2000)
+    assert path.read_bytes() == b"old"
+    assert list(tmp_path.iterdir()) == [path]
+
+
+WRITE_FOR_EVER = """
+import sys
+from pathlib import Path
+from ddqn_planner.files import write_atomically
+
+while True:
+    write_atomically(Path(sys.argv[1]), b"whole" * 100_000)
+    print(flush=True)
+"""
+
+
+def test_a_kill_leaves_a_whole_file_and_a_temporary_that_can_be_removed(tmp_path: Path) -> None:
+    path = tmp_path / "file"
+    left = 0
+    while not left:
+        command = [sys.executable, "-c", WRITE_FOR_EVER, str(path)]
+        with subprocess.Popen(command, stdout=subprocess.PIPE) as writer:
+            assert writer.stdout is not None
+            for _ in range(5):
+                writer.stdout.readline()
+            writer.send_signal(signal.SIGKILL)
+        assert path.read_bytes() == b"whole" * 100_000
+        left = len(list(tmp_path.iterdir())) - 1
+    (tmp_path / ".another").touch()
+    remove_temporaries(path)
+    assert sorted(tmp_path.iterdir()) == [tmp_path / ".another", path]
+
+
+def test_a_new_file_has_the_mode_of_any_other(tmp_path: Path) -> None:
+    write_atomically(tmp_path / "atomic", b"")
+    (tmp_path / "other").touch()
+    assert os.stat(tmp_path / "atomic").st_mode == os.stat(tmp_path / "other").st_mode
+
+
+def test_records_stay_whole_when_the_disk_is_full_and_then_is_not(tmp_path: Path) -> None:
+    path = tmp_path / "records"
+    records = Appender(path)
+    records.append(b"first\n")
+    with files_no_longer_than(10):
+        for record in (b"second\n", b"third\n"):
+            with pytest.raises(OSError, match="too large"):
+                records.append(record)
+        assert path.read_bytes() == b"first\nseco"
+    records.append(b"fourth\n")
+    records.close()
+    assert path.read_bytes() == b"first\nsecond\nfourth\n"
