@@ -9,7 +9,7 @@ import sys
 import threading
 import time
 from collections.abc import Sequence
-from dataclasses import fields
+from dataclasses import fields, replace
 from pathlib import Path
 
 import torch
@@ -25,9 +25,9 @@ from ddqn_planner.experiments.benchmark_maps import (
     read_maps,
 )
 from ddqn_planner.experiments.generalisation import Walk, markdown, measure, summarise, write_report
-from ddqn_planner.grid import Cell, MapFile, MoveRule, read_map_file
+from ddqn_planner.grid import Cell, GridMap, MapFile, MoveRule, inflate, read_map_file
 from ddqn_planner.grid.generators import KINDS
-from ddqn_planner.planning import Plan, Planner, PlanStatus, shortest_distances
+from ddqn_planner.planning import Plan, PlanMethod, Planner, shortest_distances
 from ddqn_planner.planning.animation import save_animation
 from ddqn_planner.planning.evaluation import evaluate
 from ddqn_planner.planning.picture import MAX_TEXT_WIDTH, PictureError, draw_text, save_picture
@@ -110,6 +110,18 @@ def _add_plan(plan: argparse.ArgumentParser) -> None:
     _add_map_arguments(plan)
     plan.add_argument("--model", default="any_map", help="name or file (%(default)s)")
     plan.add_argument("--move-rule", choices=MOVE_RULES, help="the model's by default")
+    plan.add_argument(
+        "--mode",
+        choices=[method.value for method in PlanMethod],
+        default="greedy",
+        help="guided: search where the greedy steps are trapped",
+    )
+    for name, words in (
+        ("robot-radius", "metres that the path keeps from obstacles"),
+        ("clearance-weight", "0 to 1: how much dearer cells near to obstacles are"),
+        ("tolerance", "metres that an occupied goal may move"),
+    ):
+        plan.add_argument(f"--{name}", type=float, default=0.0, metavar="X", help=words)
     plan.add_argument("--json", action="store_true", help="print JSON in place of text")
     plan.add_argument("--picture", type=Path, metavar="FILE", help="draw map, value and path")
     plan.add_argument(
@@ -217,37 +229,49 @@ def _plan(options: argparse.Namespace) -> int:
     if options.animate and options.animate.suffix.lower() != ".gif":
         raise ValueError(f"--animate is {options.animate}; give a file that ends in .gif")
     map_file, start, goal = _read_map(options)
-    grid = map_file.grid()
+    grid = inflate(map_file.grid(), options.robot_radius, options.clearance_weight)
     planner = Planner.load(options.model)
+    method, tolerance = PlanMethod(options.mode), options.tolerance / grid.resolution
     began = time.perf_counter()
-    plan = planner.plan(grid, start, goal, options.move_rule)
+    plan = planner.plan(grid, start, goal, options.move_rule, method, tolerance)
     seconds = time.perf_counter() - began
-    succeeded = plan.status is PlanStatus.SUCCEEDED
     rule = options.move_rule or planner.metadata.move_rule
+    if plan.cells:
+        goal = plan.cells[-1]  # another where the goal is occupied and a tolerance was given
+    _print_plan(options, grid, plan, rule, seconds)
+    field = None
+    if grid.is_free(goal) and planner.network.supports((grid.height, grid.width)):
+        field = planner.q_field(grid, goal, rule)
+    if options.picture:
+        title = f"{plan.length:.2f} cells" if plan.cells else plan.status.value
+        value = field.value if field and plan.cells else None
+        save_picture(options.picture, grid, plan.cells, value, title)
+    if options.animate:
+        value = field.value if field else None
+        save_animation(options.animate, grid, start, goal, value, plan.cells)
+    return 0 if plan.cells else 1
+
+
+def _print_plan(
+    options: argparse.Namespace, grid: GridMap, plan: Plan, rule: MoveRule, seconds: float
+) -> None:
     optimum = None
-    if succeeded:
-        optimum = float(shortest_distances(grid, goal, rule)[start[1], start[0]])
+    if plan.cells and grid.is_free(plan.cells[0]):
+        by_length = replace(grid, cost=None)
+        optimum = float(shortest_distances(by_length, plan.cells[-1], rule)[plan.cells[0][::-1]])
     if options.json:
         print(json.dumps(_as_dictionary(plan, optimum, rule, seconds)))
-    elif succeeded:
+    elif plan.cells:
         if grid.width <= MAX_TEXT_WIDTH:
             print(draw_text(grid, plan.cells))
         print("path: " + " ".join(f"({x}, {y})" for x, y in plan.cells))
         print(
-            f"length {plan.length:.2f} cells, optimum {optimum:.2f} under {rule.value}, "
-            f"planned in {seconds * 1e3:.1f} ms"
+            f"length {plan.length:.2f} cells, "
+            + (f"optimum {optimum:.2f} under {rule.value}, " if optimum is not None else "")
+            + f"{plan.method.value}, planned in {seconds * 1e3:.1f} ms"
         )
     else:
-        print(f"no path from {start} to {goal}: {plan.status.value}", file=sys.stderr)
-    if options.picture:
-        value = planner.q_field(grid, goal, options.move_rule).value if succeeded else None
-        title = f"{plan.length:.2f} cells" if succeeded else plan.status.value
-        save_picture(options.picture, grid, plan.cells, value, title)
-    if options.animate:
-        has_field = grid.is_free(goal) and planner.network.supports((grid.height, grid.width))
-        value = planner.q_field(grid, goal, options.move_rule).value if has_field else None
-        save_animation(options.animate, grid, start, goal, value, plan.cells)
-    return 0 if succeeded else 1
+        print(f"no path: {plan.status.value}", file=sys.stderr)
 
 
 def _as_dictionary(
@@ -257,6 +281,7 @@ def _as_dictionary(
         "status": plan.status.name,
         "reason": plan.status.value,
         "cells": plan.cells,
+        "method": plan.method.value,
         "length": plan.length,
         "optimum": optimum,
         "move_rule": rule.value,

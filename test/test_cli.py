@@ -8,7 +8,9 @@ import subprocess
 import sysconfig
 import time
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pytest
 from PIL import Image
 
@@ -55,6 +57,45 @@ def test_plan_writes_json_and_a_picture(capsys: pytest.CaptureFixture[str], tmp_
     with Image.open(tmp_path / "plan.png") as picture:
         colours = picture.convert("RGB").getcolors(picture.width * picture.height)
         assert len(colours) > 100
+
+
+def test_plan_heeds_the_robots_body(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    values = np.zeros((11, 11), dtype=np.int8)
+    values[:7, 5] = 100
+    path = str(tmp_path / "wall.yaml")
+    save_map(MapFile(values, resolution=0.1, start=(0, 0), goal=(10, 0)), path)
+
+    def plan(*arguments: str) -> dict[str, Any]:
+        assert main(["plan", path, "--json", *arguments]) == 0
+        answer: dict[str, Any] = json.loads(capsys.readouterr().out)
+        return answer
+
+    point, body = plan(), plan("--robot-radius", "0.3")
+    assert point["length"] < body["length"] == pytest.approx(body["optimum"])
+    assert body["method"] == "greedy"
+    beside = ["--start", "4", "0", "--goal", "6", "0"]
+    assert plan("--clearance-weight", "1", *beside)["length"] > plan(*beside)["length"]
+    near = plan("--robot-radius", "0.3", "--start", "4", "3")
+    assert near["cells"][0] == [4, 3]
+    assert near["optimum"] is None
+    moved = plan("--robot-radius", "0.3", "--goal", "6", "3", "--tolerance", "0.2")
+    assert moved["cells"][-1] == [8, 3]
+    for bad, named in (
+        (["--robot-radius", "-1"], "robot_radius is -1.0"),
+        (["--clearance-weight", "2"], "clearance_weight is 2.0"),
+        (["--tolerance", "nan"], "tolerance is nan"),
+    ):
+        assert main(["plan", path, *bad]) == 2
+        assert named in capsys.readouterr().err
+
+
+def test_plan_searches_in_guided_mode(capsys: pytest.CaptureFixture[str]) -> None:
+    request = ["plan", "dilemma", "--model", "dilemma", "--goal", "0", "0"]
+    assert main(request) == 1
+    assert "greedy steps do not find it" in capsys.readouterr().err
+    assert main([*request, "--mode", "guided"]) == 0
+    assert "cells, optimum" in (printed := capsys.readouterr().out)
+    assert ", guided, planned in" in printed
 
 
 def test_plan_writes_an_animation(tmp_path: Path) -> None:

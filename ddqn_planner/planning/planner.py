@@ -151,6 +151,11 @@ class Planner:
         Plan
             Every move of its path is legal under the rule, whatever the network says. The cells
             are free, but for those by which a start leaves that is too near to an obstacle.
+
+        Raises
+        ------
+        ValueError
+            If the tolerance is negative or NaN.
         """
         route = self.route(grid, start, goal, move_rule, tolerance)
         if route.status is not PlanStatus.SUCCEEDED:
@@ -205,6 +210,8 @@ class Planner:
     def _ruled_out(
         self, grid: GridMap, start: Cell, goal: Cell, tolerance: float
     ) -> PlanStatus | None:
+        if not tolerance >= 0:
+            raise ValueError(f"the tolerance is {tolerance}; give 0 or more")
         if not grid.contains(start):
             return PlanStatus.START_OUTSIDE_MAP
         if not grid.contains(goal):
