@@ -75,24 +75,34 @@ def spin_until_shutdown(make_node: Callable[[], Node]) -> int:
     Returns
     -------
     int
-        Exit code: 0, or 1 if a parameter or a name was given that the node cannot start with.
+        Exit code: 0, or 1 if the node cannot start with the parameters, names or environment.
     """
     node = None
     try:
         rclpy.init()
+    except Exception as error:
+        # As of an unknown ROS argument, a domain that is no number, keys that are missing.
+        return _cannot_start(error)
+    try:
         node = make_node()
         rclpy.spin(node)
     except (KeyboardInterrupt, ExternalShutdownException):
         pass
     except (NameValidationException, ParameterException) as error:
-        get_logger("ddqn_planner").fatal(f"cannot start: {error}")
-        return 1
-    except Exception:
+        return _cannot_start(error)
+    except Exception as error:
         # A callback that was at work when the signal came fails at its next ROS call.
         if ok():
+            if node is None and isinstance(error, RuntimeError):  # what ROS itself raises
+                return _cannot_start(error)
             raise
     finally:
         if node is not None:
             node.destroy_node()
         try_shutdown()
     return 0
+
+
+def _cannot_start(error: Exception) -> int:
+    get_logger("ddqn_planner").fatal(f"cannot start: {error}")
+    return 1

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import os
 import re
+import subprocess
 from collections.abc import Callable
 from typing import Any
 
 import pytest
+from processes import executable
 from rcl_interfaces.msg import Parameter as ParameterMessage
 from rcl_interfaces.msg import ParameterValue
 from rcl_interfaces.srv import (
@@ -58,3 +61,32 @@ def test_no_request_for_parameters_ends_a_node(
         names = call(ListParameters, "list_parameters").result.names
         assert len(call(GetParameters, "get_parameters", names=names).values) == len(names) > 3
         assert "Traceback" not in node.log
+
+
+@pytest.mark.parametrize(
+    ("arguments", "environment", "reason"),
+    [
+        (["-p", "model"], {}, "model"),
+        (["--params-file", "/no/such.yaml"], {}, "such.yaml"),
+        ([], {"ROS_DOMAIN_ID": "abc"}, "ROS_DOMAIN_ID"),
+        (
+            ["--enclave", "/nobody"],
+            {
+                "ROS_SECURITY_ENABLE": "true",
+                "ROS_SECURITY_STRATEGY": "Enforce",
+                "ROS_SECURITY_KEYSTORE": "/no/such/keystore",
+            },
+            "SECURITY|security|keystore|enclave",
+        ),
+    ],
+)
+def test_what_ros_cannot_start_with_is_said_and_ends_with_1(
+    arguments: list[str], environment: dict[str, str], reason: str
+) -> None:
+    command = [executable("map_server_node"), "--ros-args", *arguments]
+    ended = subprocess.run(
+        command, env={**os.environ, **environment}, capture_output=True, text=True, timeout=60
+    )
+    assert ended.returncode == 1
+    assert re.search(f"cannot start: .*({reason})", ended.stdout + ended.stderr)
+    assert "Traceback" not in ended.stderr
