@@ -270,7 +270,7 @@ class PlannerNode(BaseNode):
             for parameter in parameters:
                 self._check_parameter(parameter.name, parameter.value)
         except (ValueError, OSError, RuntimeError, MemoryError) as error:
-            return SetParametersResult(successful=False, reason=str(error))
+            return SetParametersResult(successful=False, reason=str(error) or repr(error))
         return SetParametersResult(successful=True)
 
     def _check_parameter(self, name: str, value: Any) -> None:
@@ -327,12 +327,8 @@ class PlannerNode(BaseNode):
     # What comes in
 
     def _on_map(self, message: OccupancyGrid) -> None:
-        try:
-            self._use_map(message)
-        except (ValueError, MemoryError) as error:
-            self._refuse("map", str(error) or "no memory is left for it; give a smaller map")
+        if not self._use_map(message):
             return
-        self._accept("map")
         self._map = message
         self.get_logger().info(
             f"map of {message.info.width} x {message.info.height} cells of "
@@ -340,14 +336,20 @@ class PlannerNode(BaseNode):
         )
         self._replan.trigger()
 
-    def _use_map(self, message: OccupancyGrid) -> None:
-        """Plan on it from now on, with the robot's body if that has a size."""
-        grid = grid_from_message(message, *self._map_arguments)
+    def _use_map(self, message: OccupancyGrid) -> bool:
+        """Plan on it from now on, with the robot's body if that has a size; or refuse it."""
+        try:
+            grid = grid_from_message(message, *self._map_arguments)
+        except (ValueError, MemoryError) as error:
+            self._refuse("map", str(error) or "no memory is left for it; give a smaller one")
+            return False
+        self._accept("map")
         if any(self._body):
             self._grid = self._in_worker(self._quick_worker, inflate, grid, *self._body)
         else:
             self._grid = Future()
             self._grid.set_result(grid)
+        return True
 
     def _listen_for_start(self) -> None:
         """Listen to what `start_source` says, and forget what another one said."""
@@ -431,14 +433,18 @@ class PlannerNode(BaseNode):
     # Planning
 
     async def _plan_for_active_goal(self) -> None:
-        if self._goal is None:
+        goal = self._goal
+        if goal is None:
             return
-        path, outcome = await self._answer(None, self._goal, self._tolerance)
+        path, outcome = await self._answer(None, goal, self._tolerance)
         self._plan_publisher.publish(path)
-        if outcome.status == INVALID_GOAL:
+        if outcome.status == INVALID_GOAL and self._goal is goal:
             self._goal = None
         if outcome.problem is not None and outcome.solution.goal is not None:
-            await self._publish_value(outcome.problem, outcome.solution.goal, path.header)
+            try:
+                await self._publish_value(outcome.problem, outcome.solution.goal, path.header)
+            except MemoryError:
+                self.get_logger().error("no memory is left to show the value; give a smaller map")
 
     async def _publish_value(self, problem: Problem, goal: Cell, header: Header) -> None:
         """Publish the value field, once a goal and again when it changes."""
