@@ -54,7 +54,7 @@ class Measured:
 def main(arguments: Sequence[str]) -> int:
     """Print a row for each weight; return 1 if a request was not solved."""
     path = str(arguments[0] if arguments else find_map("office"))
-    radius = float(arguments[1]) if len(arguments) > 1 else 0.22
+    radius = float(arguments[1]) if len(arguments) > 1 else 0.15
     grid = load_map(path)
     inflated = inflate(grid, radius)
     requests = random_requests(inflated.occupancy, RULE, REQUESTS, np.random.default_rng(0))

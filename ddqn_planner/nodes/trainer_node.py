@@ -220,7 +220,9 @@ class TrainerNode(BaseNode):
         assert self._grid is not None
         cell = cell_from_pose(f"the {what}", pose.header, pose.pose, self._grid, self._frame)
         if not self._grid.is_free(cell):
-            raise ValueError(f"its cell {cell} is occupied or off the map; set it on a free cell")
+            raise ValueError(
+                f"the {what}'s cell {cell} is occupied or off the map; set it on a free cell"
+            )
         return cell
 
     def _refuse(self, reason: str) -> None:
