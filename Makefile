@@ -59,10 +59,9 @@ faults: setup
 	$(BIN)/python scripts/faults.py $(KILLS)
 
 fuzz: setup
-	$(BIN)/python -m pytest --hypothesis-profile=fuzz -k "any or fuzz or bad or broken" \
-		test/grid/test_map_file.py test/grid/test_map_file_fuzz.py test/model \
-		test/training/test_run.py test/training/test_trainer.py test/integration/test_map_server_node.py \
-		test/integration/test_planner_fuzz.py test/integration/test_trainer_node.py
+	$(BIN)/python -m pytest --hypothesis-profile=fuzz --hypothesis-show-statistics -m hypothesis \
+		test/grid/test_map_file.py test/grid/test_map_file_fuzz.py test/model/test_model_file.py \
+		test/training/test_run.py test/integration
 
 load: setup
 	$(BIN)/python scripts/load.py $(REQUESTS)

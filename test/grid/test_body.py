@@ -54,13 +54,13 @@ def test_clearance_costs_fall_with_the_distance_and_close_nothing(
     assert (price >= plain.price[free]).all()
 
 
-def test_the_cost_falls_to_a_quarter_where_the_docstring_says() -> None:
+def test_the_cost_falls_to_an_eighth_where_the_docstring_says() -> None:
     occupancy = np.zeros((1, 20), dtype=bool)
     occupancy[0, 0] = True
     cost = inflate(GridMap(occupancy, 0.1), 0.1, 1.0).cost
     assert cost is not None
     assert cost[0, 1] == 99
-    assert cost[0, 8] == 25  # 0.7 m beyond the body
+    assert cost[0, 11] == 12  # 1 m beyond the body
 
 
 def test_without_a_body_the_map_is_the_same() -> None:

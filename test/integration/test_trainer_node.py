@@ -504,6 +504,7 @@ def test_what_cannot_be_started_or_replayed_is_answered_with_the_remedy(
         assert client.call(Trigger, "trainer/start").success
 
 
+@pytest.mark.hypothesis
 def test_nothing_that_comes_in_ends_the_node(
     run_node: Any, make_client: Any, namespace: str, small_values: Any, tmp_path: FilePath
 ) -> None:
