@@ -52,21 +52,22 @@ class Planner:
     network : QNetwork
     metadata : ModelMetadata
         Its move rule is the default of `plan` and `q_field`.
+
+    Attributes
+    ----------
     cache_bytes : int
-        Bound of the memory for the fields that it keeps; see `CACHE_BYTES`.
+        Bound of the memory for the fields that it keeps; `CACHE_BYTES` until it is set.
     """
 
-    def __init__(
-        self, network: QNetwork, metadata: ModelMetadata, cache_bytes: int = CACHE_BYTES
-    ) -> None:
+    def __init__(self, network: QNetwork, metadata: ModelMetadata) -> None:
         self.network = network
         self.metadata = metadata
-        self.cache_bytes = cache_bytes
+        self.cache_bytes = CACHE_BYTES
         self._fields: OrderedDict[tuple[str, Cell, MoveRule], QField] = OrderedDict()
         self._lock = threading.Lock()
 
     @classmethod
-    def load(cls, model: str | Path, cache_bytes: int = CACHE_BYTES) -> Planner:
+    def load(cls, model: str | Path) -> Planner:
         """Load a shipped model by its name (``"any_map"``), or a model file by its path.
 
         Raises
@@ -74,7 +75,7 @@ class Planner:
         ModelFileError
             If there is no such model, or its file cannot be used.
         """
-        return cls(*load_model(model), cache_bytes)
+        return cls(*load_model(model))
 
     def q_field(self, grid: GridMap, goal: Cell, move_rule: MoveRule | None = None) -> QField:
         """Return the Q field of a map toward a goal; asked again, it is looked up.
@@ -160,9 +161,8 @@ class Planner:
         route = self.route(grid, start, goal, move_rule, tolerance)
         if route.status is not PlanStatus.SUCCEEDED:
             return Plan(route.status)
-        return self.follow(
-            route, grid, self.q_field(grid, route.goal, move_rule), method, move_rule
-        )
+        field = self.q_field(grid, route.goal, move_rule)
+        return self.follow(route, grid, field, method, move_rule)
 
     def route(
         self,
