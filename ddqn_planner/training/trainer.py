@@ -326,8 +326,7 @@ class Trainer:
                 metadata = file.metadata() or {}
                 tensors = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118
             text = metadata[CHECKPOINT_KEY]
-            digest = _digest(text, tensors)
-            if metadata.get(DIGEST_KEY, digest) != digest:  # older ones have none
+            if metadata[DIGEST_KEY] != _digest(text, tensors):
                 raise ValueError("its digest is another")
             description = json.loads(text)
             if description["scenarios"] != _fingerprints(scenarios):
