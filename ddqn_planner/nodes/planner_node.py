@@ -200,6 +200,7 @@ class PlannerNode(BaseNode):
         self._published_policy: QField | None = None
         self._refused: dict[str, str] = {}
         self._outcome = Outcome(NO_REQUEST, "no plan was asked for yet")
+        self._to_be_logged: list[str] = []
         self._reported = -DIAGNOSTICS_PERIOD
         self._changed = True
 
@@ -488,9 +489,10 @@ class PlannerNode(BaseNode):
         self._outcome = outcome
         self._changed = True
         if not outcome.succeeded or outcome.problem is None:
+            self._log_paths()
             self.get_logger().warning(f"no plan: {outcome.sentence}")
             return Path(header=header), outcome
-        self.get_logger().info(outcome.sentence)
+        self._to_be_logged.append(outcome.sentence)
         cells, grid = outcome.solution.cells, outcome.problem.grid
         return path_message(cells, grid, header, goal.pose.orientation), outcome
 
@@ -578,7 +580,14 @@ class PlannerNode(BaseNode):
 
     # Diagnostics
 
+    def _log_paths(self) -> None:
+        for sentence in self._to_be_logged:
+            self.get_logger().info(sentence)
+        self._to_be_logged.clear()
+
     def _on_look(self) -> None:
+        # To log takes as long as to plan: an answer does not wait for it.
+        self._log_paths()
         if self._changed or time.monotonic() - self._reported >= DIAGNOSTICS_PERIOD:
             self._changed = False
             self._reported = time.monotonic()

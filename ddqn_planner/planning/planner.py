@@ -17,9 +17,9 @@ from ddqn_planner.planning.plan import Plan, PlanMethod, PlanStatus
 from ddqn_planner.planning.q_field import QField
 from ddqn_planner.planning.search import search
 
-CACHE_BYTES = 2**28
-"""Memory for the Q fields that a planner keeps, the last ones used. A field takes 45 bytes a cell;
-the last one is kept whatever its size."""
+CACHE_BYTES = 2**29
+"""Memory for the Q fields that a planner keeps, the last ones used: two of 2000 x 2000 cells, at 45
+bytes a cell. The last one is kept whatever its size."""
 
 
 @dataclass(frozen=True)

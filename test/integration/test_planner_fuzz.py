@@ -178,7 +178,7 @@ DEFAULTS: dict[str, Any] = {
     "path_simplification": "none",
     "start_source": "initialpose",
     "robot_frame": "base_link",
-    "field_cache_bytes": 2**28,
+    "field_cache_bytes": 2**29,
     "use_sim_time": False,
 }
 
