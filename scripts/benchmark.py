@@ -15,6 +15,7 @@ import demo
 import gymnasium
 import psutil
 import torch
+from client import pose
 from nav_msgs.srv import GetPlan
 from processes import executable, running
 from stable_baselines3 import DQN
@@ -159,7 +160,7 @@ def measure_planner(node: demo.Client, scenario: Scenario) -> list[bool]:
     with map_server as first, running(executable("planner_node")) as planner:
         plan = demo.request_plan(node, [first, planner], scenario)
         seconds = time.monotonic() - began
-        start, goal = demo.pose(scenario.grid, scenario.start), plan.poses[-1]
+        start, goal = pose(scenario.grid, scenario.start), plan.poses[-1]
         request = GetPlan.Request(start=start, goal=goal)
         request.start.pose.position = plan.poses[0].pose.position
         bare = node.create_client(GetPlan, "bare/get_plan")

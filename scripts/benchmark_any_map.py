@@ -20,6 +20,7 @@ import numpy as np
 import pyastar2d
 import torch
 from benchmark import call, report
+from client import plan_request
 from nav_msgs.srv import GetPlan
 from processes import executable, running
 from rcl_interfaces.srv import GetParameters, ListParameters
@@ -103,11 +104,6 @@ def compare_single_queries(side: int) -> None:
         print(f"one query at {side}x{side}, {name}: median {statistics.median(times):.2f} ms")
 
 
-def request(grid: GridMap, start: Cell, goal: Cell) -> GetPlan.Request:
-    """Return a request for a plan between two cells."""
-    return GetPlan.Request(start=demo.pose(grid, start), goal=demo.pose(grid, goal))
-
-
 def plan_of(client: Any, asked: GetPlan.Request) -> Any:
     """Return the plan of a service's answer."""
     future = client.call_async(asked)
@@ -120,7 +116,7 @@ def measure_node(node: demo.Client, map_file: str) -> list[bool]:
     grid = load_map(map_file)
     random = np.random.default_rng(0)
     requests = [
-        request(grid, *cells) for cells in random_requests(grid.occupancy, RULE, GOALS, random)
+        plan_request(grid, *cells) for cells in random_requests(grid.occupancy, RULE, GOALS, random)
     ]
     parameter = f"yaml_filename:={Path(map_file).resolve()}"
     first, ratios = [], []
@@ -171,8 +167,10 @@ def measure_large_map(node: demo.Client) -> list[bool]:
     random = np.random.default_rng(0)
     grid = GridMap(generate_map("office", (LARGE, LARGE), random))
     cells = random_requests(grid.occupancy, RULE, GOALS + 1, random)
-    new = [request(grid, *both) for both in cells[1:]]
-    known = request(grid, cells[0][0], cells[0][0])  # of one pose: a long path takes its own time
+    new = [plan_request(grid, *both) for both in cells[1:]]
+    known = plan_request(
+        grid, cells[0][0], cells[0][0]
+    )  # of one pose: a long path takes its own time
     services = {
         "get_parameters": (
             node.create_client(GetParameters, "planner/get_parameters"),

@@ -14,7 +14,7 @@ import demo
 import numpy as np
 import scipy.ndimage
 import scipy.sparse
-from nav_msgs.srv import GetPlan
+from client import plan_request
 from numpy.typing import NDArray
 from processes import executable, running
 
@@ -164,7 +164,7 @@ def greatest_distance(
 
 def plan(node: demo.Client, grid: GridMap, start: Cell, goal: Cell) -> list[Cell]:
     """Return the cells of a path, none if there is none."""
-    request = GetPlan.Request(start=demo.pose(grid, start), goal=demo.pose(grid, goal))
+    request = plan_request(grid, start, goal)
     future = node.get_plan.call_async(request)
     demo.wait_for("answer", future.done, [])
     poses = future.result().plan.poses

@@ -18,6 +18,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 import rclpy
+from client import pose
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped
 from nav_msgs.msg import OccupancyGrid, Path
@@ -27,8 +28,8 @@ from rclpy.executors import ExternalShutdownException
 from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 
-from ddqn_planner.grid import Cell, GridMap, MoveRule, path_length, read_map_file
-from ddqn_planner.nodes.conversions import grid_from_message, quaternion
+from ddqn_planner.grid import MoveRule, path_length, read_map_file
+from ddqn_planner.nodes.conversions import grid_from_message
 from ddqn_planner.nodes.runtime import LATCHED
 from ddqn_planner.planning import shortest_distances
 from ddqn_planner.planning.picture import MAX_TEXT_WIDTH, draw_text, save_picture
@@ -110,15 +111,6 @@ def wait_for(what: str, answer: Callable[[], T | None], children: Children) -> T
             raise TimeoutError(f"no {what} within {TIMEOUT:.0f} s")
         time.sleep(0.002)
     return found
-
-
-def pose(grid: GridMap, cell: Cell) -> PoseStamped:
-    """Return the pose of a cell's centre in the map frame."""
-    message = PoseStamped()
-    message.header.frame_id = "map"
-    message.pose.position.x, message.pose.position.y = grid.cell_to_world(cell)
-    message.pose.orientation = quaternion(0.0)
-    return message
 
 
 def request_plan(node: Client, children: Children, scenario: Scenario) -> Path:

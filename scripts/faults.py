@@ -17,13 +17,15 @@ import time
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from dataclasses import astuple, dataclass, fields
-from itertools import cycle, islice, pairwise
+from itertools import cycle, islice
 from pathlib import Path
 from typing import Any, TypeVar
 
 import demo
 import numpy as np
+from client import plan_request, pose
 from geometry_msgs.msg import PoseWithCovarianceStamped
+from load import RULE, Terrain
 from nav_msgs.msg import OccupancyGrid
 from nav_msgs.srv import GetPlan, LoadMap
 from processes import executable, running
@@ -32,13 +34,9 @@ from rclpy.parameter import Parameter
 from std_srvs.srv import Trigger
 
 from ddqn_planner.grid import (
-    MOVES,
     OCCUPIED,
     Cell,
-    GridMap,
     MapFile,
-    MoveRule,
-    legal_moves,
     read_map_file,
     save_map,
 )
@@ -54,9 +52,6 @@ SIDE = 1000
 
 GOALS = 6
 """Fields that the planner is asked for at once: a second's work."""
-
-RULE = MoveRule.ROBOT_SAFE
-"""That of the shipped model for any map."""
 
 TRY_TIME = 1.0
 """Seconds until a question is asked again: it may have gone to the node that was killed."""
@@ -138,9 +133,7 @@ class Faults:
         ((start, goal),) = random_requests(occupancy, RULE, 1, self._random)
         values = np.where(occupancy, np.int8(100), np.int8(0))
         save_map(MapFile(values, start=start, goal=goal), self.map_path)
-        self.values, self.grid = values, GridMap(occupancy)
-        self._legal = legal_moves(occupancy, RULE)
-        self._moves: list[list[int]] = MOVES.tolist()
+        self._terrain = Terrain(read_map_file(self.map_path))
         self._watched = start, goal
         trained = read_map_file(find_map("dilemma"))
         assert trained.start is not None
@@ -219,26 +212,19 @@ class Faults:
 
     def request(self, start: Cell, goal: Cell) -> GetPlan.Request:
         """Return a request for a plan between two cells."""
-        return GetPlan.Request(start=demo.pose(self.grid, start), goal=demo.pose(self.grid, goal))
+        return plan_request(self._terrain.grid, start, goal)
 
     def is_right(self, plan: Any, start: Cell, goal: Cell) -> bool:
         """Say whether a plan leads from the start to the goal by legal moves on the map.
 
         A plan of a map with new obstacles must be right on the map without them too.
         """
-        positions = [entry.pose.position for entry in plan.poses]
-        cells = [self.grid.world_to_cell(position.x, position.y) for position in positions]
-        moves = [([x - a, y - b], a, b) for (a, b), (x, y) in pairwise(cells)]
-        ends = cells[:1] == [start] and cells[-1:] == [goal]
-        return ends and all(
-            move in self._moves and bool(self._legal[self._moves.index(move), y, x])
-            for move, x, y in moves
-        )
+        return bool(plan.poses) and not self._terrain.fault(self.request(start, goal), plan)
 
     def is_whole(self, message: OccupancyGrid) -> bool:
         """Say whether a map is the loaded one with at most five obstacles more."""
-        values = np.frombuffer(message.data, np.int8).reshape(self.values.shape)
-        new = values != self.values
+        values = np.frombuffer(message.data, np.int8).reshape(self._terrain.values.shape)
+        new = values != self._terrain.values
         return bool((values[new] == OCCUPIED).all()) and int(new.sum()) <= 5
 
     # Killing
@@ -261,7 +247,7 @@ class Faults:
     def kill_planner(self, tally: Tally) -> None:
         """Kill the planner while it plans toward goals that it does not know."""
         get_plan = self.client.get_plan
-        asked = random_requests(self.grid.occupancy, RULE, GOALS, self._random)
+        asked = random_requests(self._terrain.grid.occupancy, RULE, GOALS, self._random)
         futures = [get_plan.call_async(self.request(*cells)) for cells in asked]
         time.sleep(self._draw.uniform(0.0, 1.0))
         self.planner.kill()
@@ -301,11 +287,11 @@ class Faults:
         served = demo.wait_for("map", lambda: self.client.heard.get("map"), [])
         plan = demo.wait_for("plan", lambda: self.client.heard.get("plan"), [])
         tally.wrong_paths += not self.is_right(plan, *self._watched)
-        tally.restarts += whole and served.data == array.array("b", self.values.tobytes())
+        tally.restarts += whole and served.data == array.array("b", self._terrain.values.tobytes())
 
     def plan_for_active_goal(self) -> None:
         """Give the planner a start and an active goal until it plans: it may be a new one."""
-        start, goal = (demo.pose(self.grid, cell) for cell in self._watched)
+        start, goal = (pose(self._terrain.grid, cell) for cell in self._watched)
         initial_pose = PoseWithCovarianceStamped(header=start.header)
         initial_pose.pose.pose = start.pose
         self.client.heard.pop("plan", None)

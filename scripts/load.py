@@ -16,28 +16,26 @@ import threading
 import time
 from collections import Counter
 from collections.abc import Sequence
-from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import rclpy
+from client import BackgroundNode, plan_request, pose
 from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped
 from nav_msgs.msg import OccupancyGrid
 from nav_msgs.msg import Path as PathMessage
 from nav_msgs.srv import GetPlan
 from numpy.typing import NDArray
 from processes import claim_ros_domain, executable, running
-from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.qos import DurabilityPolicy, QoSProfile
 from std_msgs.msg import Header
 
 from ddqn_planner.grid import MOVES, Cell, GridMap, MapFile, MoveRule, legal_moves, read_map_file
 from ddqn_planner.grid.generators import generate_map, random_requests
 from ddqn_planner.grid.moves import component_labels
-from ddqn_planner.nodes.conversions import occupancy_message, quaternion
+from ddqn_planner.nodes.conversions import occupancy_message
 from ddqn_planner.nodes.runtime import LATCHED
 from ddqn_planner.resources import find_map
 
@@ -121,50 +119,24 @@ def cell_of(grid: GridMap, pose: PoseStamped) -> Cell:
     return grid.world_to_cell(pose.pose.position.x, pose.pose.position.y)
 
 
-def pose_of(grid: GridMap, cell: Cell) -> PoseStamped:
-    """Return the pose of a cell's centre."""
-    message = PoseStamped(header=Header(frame_id="map"))
-    message.pose.position.x, message.pose.position.y = grid.cell_to_world(cell)
-    message.pose.orientation = quaternion(0.0)
-    return message
-
-
-def request_of(grid: GridMap, start: Cell, goal: Cell) -> GetPlan.Request:
-    """Return a request for a plan between two cells."""
-    return GetPlan.Request(start=pose_of(grid, start), goal=pose_of(grid, goal))
-
-
 def resident(process: int) -> float:
     """Return the resident memory of a process, MB."""
     status = Path(f"/proc/{process}/status").read_text(encoding="utf-8")
     return int(status.split("VmRSS:")[1].split()[0]) / 1e3
 
 
-class Client:
-    """A node in a context of its own, spun in the background."""
+class Client(BackgroundNode):
+    """Asks, and notes what is lost."""
 
     def __init__(self) -> None:
-        self._context = rclpy.Context()
-        self._context.init(args=[])
-        self.node = rclpy.create_node("load", context=self._context, start_parameter_services=False)
-        self._executor = SingleThreadedExecutor(context=self._context)
-        self._executor.add_node(self.node)
-        self._thread = threading.Thread(target=self._spin, daemon=True)
-        self._thread.start()
+        super().__init__("load")
         self._clients: dict[str, Any] = {}
 
     def __enter__(self) -> Client:
         return self
 
     def __exit__(self, *_: object) -> None:
-        self._executor.shutdown()
-        self._context.try_shutdown()
-        self._thread.join()
-        self.node.destroy_node()
-
-    def _spin(self) -> None:
-        with suppress(ExternalShutdownException):
-            self._executor.spin()
+        self.close()
 
     def call(self, service_type: Any, name: str, request: Any = None) -> Any:
         """Return a service's answer, or None if it is lost."""
@@ -220,7 +192,7 @@ def ask(seed: int, count: int, ready: Any, done: Any, results: Any) -> None:
         for _ in range(count):
             start = starts[current][random.integers(len(starts[current]))]
             goal = goals[current][random.integers(GOALS_A_MAP)]
-            request = request_of(maps[current].grid, start, goal)
+            request = plan_request(maps[current].grid, start, goal)
             began = time.perf_counter()
             plan = client.get_plan(request)
             took = 1e3 * (time.perf_counter() - began)
@@ -350,11 +322,11 @@ def load_goals(goals: int) -> bool:
         map_publisher.publish(terrain.message(number))
         wait_for_map(client, number)
         wait_for_listeners(start_publisher, goal_publisher)
-        pose = pose_of(grid, start)
-        known = PoseWithCovarianceStamped(header=pose.header)
-        known.pose.pose = pose.pose
+        from_start = pose(grid, start)
+        known = PoseWithCovarianceStamped(header=from_start.header)
+        known.pose.pose = from_start.pose
         start_publisher.publish(known)
-        from_known_start = GetPlan.Request(goal=pose)
+        from_known_start = GetPlan.Request(goal=from_start)
         while not getattr(client.get_plan(from_known_start), "poses", None):
             time.sleep(0.01)
         everything = QoSProfile(depth=goals, durability=DurabilityPolicy.VOLATILE)
@@ -364,7 +336,7 @@ def load_goals(goals: int) -> bool:
         began = time.monotonic()
         for sent, cell in enumerate(cells):
             time.sleep(max(0.0, began + sent * GOALS_PERIOD - time.monotonic()))
-            goal_publisher.publish(pose_of(grid, cell))
+            goal_publisher.publish(pose(grid, cell))
         seconds = time.monotonic() - began
         deadline = time.monotonic() + TIMEOUT
         while goals - 1 not in heard and time.monotonic() < deadline:

@@ -19,13 +19,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from client import plan_request, pose
 from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped
 from load import (
     RULE,
     TIMEOUT,
     Client,
-    pose_of,
-    request_of,
     resident,
     terrains,
     wait_for_listeners,
@@ -74,7 +73,7 @@ class Work:
             save_map(MapFile(terrain.values, grid.resolution, grid.origin, free[0], free[1]), path)
         grid = self._terrains[-1].grid
         cells = random_requests(grid.occupancy, RULE, STEADY_FIELDS, self._random)
-        self._steady = [request_of(grid, *both) for both in cells]
+        self._steady = [plan_request(grid, *both) for both in cells]
         self._bad_map = folder / "bad.yaml"
         self._bad_map.write_text("image: [", encoding="utf-8")
         node = client.node
@@ -122,7 +121,7 @@ class Work:
         terrain = self._terrains[self._random.integers(len(self._terrains))]
         height, width = terrain.values.shape
         cell = int(self._random.integers(width)), int(self._random.integers(height))
-        return pose_of(terrain.grid, cell)
+        return pose(terrain.grid, cell)
 
     def load_map(self) -> None:
         """Load one of the maps."""

@@ -8,7 +8,7 @@ import numpy as np
 from nav_msgs.msg import OccupancyGrid
 from nav_msgs.srv import GetMap, LoadMap
 from numpy.typing import NDArray
-from rcl_interfaces.msg import IntegerRange, ParameterDescriptor
+from rcl_interfaces.msg import ParameterDescriptor
 from rclpy.exceptions import InvalidParameterValueException
 from std_msgs.msg import Header
 from std_srvs.srv import Trigger
@@ -24,7 +24,7 @@ from ddqn_planner.grid import (
 )
 from ddqn_planner.grid.map_file import MapDataError, MapMetadataError, MapNotFoundError
 from ddqn_planner.nodes.conversions import MIN_RESOLUTION, occupancy_message
-from ddqn_planner.nodes.runtime import LATCHED, BaseNode, spin_until_shutdown
+from ddqn_planner.nodes.runtime import LATCHED, BaseNode, integer_range, spin_until_shutdown
 from ddqn_planner.planning import shortest_path
 from ddqn_planner.resources import PACKAGE, find_map
 
@@ -65,7 +65,7 @@ class MapServerNode(BaseNode):
             ParameterDescriptor(
                 description="Seed of the new obstacles",
                 read_only=True,
-                integer_range=[IntegerRange(from_value=0, to_value=2**63 - 1, step=1)],
+                **integer_range(0, 2**63 - 1),
             ),
         )
         self._random = np.random.default_rng(self.get_parameter("seed").value)

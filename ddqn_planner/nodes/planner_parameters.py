@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from typing import Final
 
-from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
+from rcl_interfaces.msg import ParameterDescriptor
 from rclpy.node import Node
 
 from ddqn_planner.grid import MoveRule
+from ddqn_planner.nodes.runtime import floating_point_range, integer_range
 from ddqn_planner.planning import PlanMethod
 from ddqn_planner.planning.planner import CACHE_BYTES
 
@@ -39,7 +40,7 @@ def declare_parameters(node: Node) -> None:
         "occupied_threshold",
         65,
         "A cell of this value or more is occupied, percent",
-        integer_range=[IntegerRange(from_value=1, to_value=100, step=1)],
+        **integer_range(1, 100),
     )
     declare("allow_unknown", False, "Whether unknown cells are free")
     declare(
@@ -52,20 +53,20 @@ def declare_parameters(node: Node) -> None:
         "robot_radius",
         0.0,
         "Cells nearer than this to an obstacle are occupied, metres",
-        floating_point_range=[FloatingPointRange(from_value=0.0, to_value=100.0)],
+        **floating_point_range(0.0, 100.0),
     )
     declare(
         "clearance_weight",
         0.0,
         "How much dearer cells near to an obstacle are: 0 for not at all. For models that learned "
         "prices: any_map",
-        floating_point_range=[FloatingPointRange(from_value=0.0, to_value=1.0)],
+        **floating_point_range(0.0, 1.0),
     )
     declare(
         "tolerance",
         0.0,
         "How far an occupied goal_pose may move to a reachable free cell, metres",
-        floating_point_range=[FloatingPointRange(from_value=0.0, to_value=1000.0)],
+        **floating_point_range(0.0, 1000.0),
     )
     declare("mode", "greedy", "Whether to search where the greedy steps are trapped: guided")
     declare("path_simplification", "none", "Whether straight parts of a path have two poses only")
@@ -80,7 +81,7 @@ def declare_parameters(node: Node) -> None:
         "field_cache_bytes",
         CACHE_BYTES,
         "Memory for Q fields that are kept; the last one is kept whatever its size, bytes",
-        integer_range=[IntegerRange(from_value=0, to_value=2**40, step=1)],
+        **integer_range(0, 2**40),
     )
     declare(
         "follow_trainer",

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 import rclpy
-from rcl_interfaces.msg import SetParametersResult
+from rcl_interfaces.msg import FloatingPointRange, IntegerRange, SetParametersResult
 from rcl_interfaces.srv import SetParameters, SetParametersAtomically
 from rclpy.exceptions import NameValidationException, ParameterException
 from rclpy.executors import ExternalShutdownException
@@ -62,6 +63,16 @@ class _CheckedParameterService(ParameterService):
             reason = f"{error}; give one of rcl_interfaces/msg/ParameterType"
         response.result = SetParametersResult(successful=False, reason=reason)
         return response
+
+
+def integer_range(low: float, high: float) -> dict[str, Any]:
+    """Return what a parameter's descriptor says of an integer from `low` to `high`."""
+    return {"integer_range": [IntegerRange(from_value=int(low), to_value=int(high), step=0)]}
+
+
+def floating_point_range(low: float, high: float) -> dict[str, Any]:
+    """Return what a parameter's descriptor says of a double from `low` to `high`."""
+    return {"floating_point_range": [FloatingPointRange(from_value=low, to_value=high)]}
 
 
 def spin_until_shutdown(make_node: Callable[[], Node]) -> int:

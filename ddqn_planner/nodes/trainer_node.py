@@ -19,12 +19,7 @@ import torch
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped, Quaternion
 from nav_msgs.msg import OccupancyGrid, Path
-from rcl_interfaces.msg import (
-    FloatingPointRange,
-    IntegerRange,
-    ParameterDescriptor,
-    SetParametersResult,
-)
+from rcl_interfaces.msg import ParameterDescriptor, SetParametersResult
 from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
 from rclpy.exceptions import InvalidParameterValueException, ParameterException
@@ -41,7 +36,13 @@ from ddqn_planner.nodes.conversions import (
     path_message,
     quaternion,
 )
-from ddqn_planner.nodes.runtime import LATCHED, BaseNode, spin_until_shutdown
+from ddqn_planner.nodes.runtime import (
+    LATCHED,
+    BaseNode,
+    floating_point_range,
+    integer_range,
+    spin_until_shutdown,
+)
 from ddqn_planner.resources import find_map
 from ddqn_planner.training.environment import Scenario
 from ddqn_planner.training.hyper_parameters import HyperParameters
@@ -124,20 +125,25 @@ class TrainerNode(BaseNode):
             "Which diagonal moves are legal; used by the next ~/start",
             additional_constraints=f"one of {MOVE_RULES}",
         )
-        declare("seed", 0, "Seed of the training", **_integers(0, 2**31 - 1))
+        declare("seed", 0, "Seed of the training", **integer_range(0, 2**31 - 1))
         declare(
-            "occupied_threshold", 65, "Percent: from it on a cell is occupied", **_integers(1, 100)
+            "occupied_threshold",
+            65,
+            "Percent: from it on a cell is occupied",
+            **integer_range(1, 100),
         )
         declare("allow_unknown", False, "Whether unknown cells are free")
-        declare("episode_interval", 10, "Publish each n-th episode", **_integers(1, 10**6))
-        declare("replay_period", 0.05, "Seconds a step of ~/replay", **_floats(1e-3, 10.0))
+        declare("episode_interval", 10, "Publish each n-th episode", **integer_range(1, 10**6))
+        declare(
+            "replay_period", 0.05, "Seconds a step of ~/replay", **floating_point_range(1e-3, 10.0)
+        )
         for entry in fields(HyperParameters):
             source = entry.metadata["source"]
             if "choices" in entry.metadata:
                 constraint = f"one of {list(entry.metadata['choices'])}"
                 declare(entry.name, entry.default, source, additional_constraints=constraint)
                 continue
-            in_range = _integers if type(entry.default) is int else _floats
+            in_range = integer_range if type(entry.default) is int else floating_point_range
             declare(entry.name, entry.default, source, **in_range(*entry.metadata["range"]))
         result = self._check_parameters([])
         if not result.successful:
@@ -430,14 +436,6 @@ def _growing(episodes: Iterable[tuple[Cell, ...]]) -> Iterator[tuple[Cell, ...]]
     for cells in episodes:
         for count in range(1, len(cells) + 1):
             yield cells[:count]
-
-
-def _integers(low: float, high: float) -> dict[str, Any]:
-    return {"integer_range": [IntegerRange(from_value=int(low), to_value=int(high), step=0)]}
-
-
-def _floats(low: float, high: float) -> dict[str, Any]:
-    return {"floating_point_range": [FloatingPointRange(from_value=low, to_value=high)]}
 
 
 def main() -> int:

@@ -60,10 +60,10 @@ class WatchNode(Node):
             self.create_subscription(message_type, topic, callback, quality)
 
     def _on_map(self, message: OccupancyGrid) -> None:
-        values = self._read("map", message)
-        if values is None:
+        grid, values = self._read("map", message)
+        if grid is None:
             return
-        self._grid = grid_from_message(message)
+        self._grid = grid
         shades = 255 - 2 * values.clip(0, 100).astype(np.int16)
         shades[values < 0] = UNKNOWN_GREY
         self._draw_image(MAP, shades.astype(np.uint8))
@@ -72,8 +72,8 @@ class WatchNode(Node):
             self._draw_path(entity)
 
     def _on_value(self, message: OccupancyGrid) -> None:
-        values = self._read("value field", message)
-        if values is not None:
+        grid, values = self._read("value field", message)
+        if grid is not None:
             self._value = values
             self._draw_value()
 
@@ -84,14 +84,14 @@ class WatchNode(Node):
     def _on_reward(self, message: Float32) -> None:
         self._recording.log(REWARD, rr.Scalars(message.data))
 
-    def _read(self, what: str, message: OccupancyGrid) -> NDArray[np.int8] | None:
-        """Return (H, W) int8 values, or None, and say why, if the message is malformed."""
+    def _read(self, what: str, message: OccupancyGrid) -> tuple[GridMap | None, NDArray[np.int8]]:
+        """Return the map and (H, W) int8 values; or no map, and say why, if it is malformed."""
         try:
             grid = grid_from_message(message)
         except ValueError as error:
             self.get_logger().warning(f"the {what} is not drawn: {error}")
-            return None
-        return np.frombuffer(message.data, np.int8).reshape(grid.height, grid.width)
+            return None, np.empty((0, 0), np.int8)
+        return grid, np.frombuffer(message.data, np.int8).reshape(grid.height, grid.width)
 
     def _draw_image(self, entity: str, colours: NDArray[np.uint8]) -> None:
         self._recording.log(entity, rr.Image(colours[::-1], draw_order=LAYERS.index(entity)))

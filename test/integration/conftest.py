@@ -12,7 +12,7 @@ import subprocess
 import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -155,32 +155,13 @@ class Client:
     """A node in a context of its own, spun in the background."""
 
     def __init__(self, namespace: str) -> None:
-        import rclpy
-        from rclpy.executors import SingleThreadedExecutor
+        from client import BackgroundNode
 
-        self.context = rclpy.Context()
-        self.context.init(args=[])
-        self.node = rclpy.create_node(
-            "client", namespace=namespace, context=self.context, start_parameter_services=False
-        )
-        self._executor = SingleThreadedExecutor(context=self.context)
-        self._executor.add_node(self.node)
-        self._thread = threading.Thread(target=self._spin, daemon=True)
-        self._thread.start()
+        self._background = BackgroundNode("client", namespace)
+        self.node = self._background.node
+        self.close = self._background.close
         self._clients: dict[str, Any] = {}
         self._publishers: dict[str, Any] = {}
-
-    def _spin(self) -> None:
-        from rclpy.executors import ExternalShutdownException
-
-        with suppress(ExternalShutdownException):
-            self._executor.spin()
-
-    def close(self) -> None:
-        self._executor.shutdown()
-        self.context.try_shutdown()
-        self._thread.join()
-        self.node.destroy_node()
 
     def call(self, service_type: Any, name: str, request: Any = None) -> Any:
         """Wait for a service, call it, and return its response."""

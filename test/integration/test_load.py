@@ -8,7 +8,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from load import Client, Terrain, load_goals, load_requests, pose_of, request_of
+from client import plan_request, pose
+from load import Client, Terrain, load_goals, load_requests
 from nav_msgs.msg import Path as PathMessage
 from soak import Work, growth, soak
 
@@ -45,8 +46,8 @@ def test_the_check_of_an_answer_finds_each_fault(
 ) -> None:
     values = np.array([[0, 100, 0], [0, 0, 100], [0, 100, 0]], dtype=np.int8)
     terrain = Terrain(MapFile(values, 0.1, (1.0, 2.0, 0.3)))
-    plan = PathMessage(poses=[pose_of(terrain.grid, cell) for cell in path])
-    found = terrain.fault(request_of(terrain.grid, start, goal), plan)
+    plan = PathMessage(poses=[pose(terrain.grid, cell) for cell in path])
+    found = terrain.fault(plan_request(terrain.grid, start, goal), plan)
     assert fault in found
     assert bool(fault) == bool(found)
 
