@@ -50,7 +50,8 @@ from ddqn_planner.nodes.markers import policy_message
 from ddqn_planner.nodes.planner_parameters import CHOICES, declare_parameters
 from ddqn_planner.nodes.runtime import LATCHED, BaseNode, spin_until_shutdown
 from ddqn_planner.nodes.transforms import TransformError, TransformSource
-from ddqn_planner.planning import Plan, PlanMethod, Planner, PlanStatus, QField, Route, simplify
+from ddqn_planner.planning import Plan, PlanMethod, Planner, PlanStatus, QField
+from ddqn_planner.planning.problem import Problem, Solution, solve
 
 DIAGNOSTICS_PERIOD = 1.0
 """Seconds between two diagnostics when nothing changes."""
@@ -82,68 +83,7 @@ class RequestError(ValueError):
         self.status = status
 
 
-@dataclass(frozen=True)
-class Problem:
-    """What a path is planned with: the state of the node when the request came.
-
-    Parameters
-    ----------
-    planner : Planner
-    grid : GridMap
-    start, goal : (x, y)
-    move_rule : MoveRule
-    method : PlanMethod
-    tolerance : float
-        In cells.
-    simplified : bool
-    """
-
-    planner: Planner
-    grid: GridMap
-    start: Cell
-    goal: Cell
-    move_rule: MoveRule
-    method: PlanMethod
-    tolerance: float
-    simplified: bool
-
-
-@dataclass(frozen=True)
-class Solution:
-    """What became of a problem.
-
-    Parameters
-    ----------
-    plan : Plan
-    goal : (x, y), optional
-        Where the path ends, or would: there is a field toward it.
-    cells : tuple of (x, y)
-        The path, simplified if asked for.
-    field_ms, walk_ms : float
-        How long it took to get the field, and to walk in it.
-    """
-
-    plan: Plan
-    goal: Cell | None = None
-    cells: tuple[Cell, ...] = ()
-    field_ms: float = 0.0
-    walk_ms: float = 0.0
-
-
-def solve(problem: Problem) -> Solution:
-    """Plan a path, in any thread."""
-    planner, grid, rule = problem.planner, problem.grid, problem.move_rule
-    began = time.perf_counter()
-    route: Route = planner.route(grid, problem.start, problem.goal, rule, problem.tolerance)
-    if route.status is not PlanStatus.SUCCEEDED:
-        return Solution(Plan(route.status), field_ms=1e3 * (time.perf_counter() - began))
-    field = planner.q_field(grid, route.goal, rule)
-    field_at_hand = time.perf_counter()
-    plan = planner.follow(route, grid, field, problem.method, rule)
-    cells = simplify(plan.cells, grid, rule) if problem.simplified else plan.cells
-    ended = time.perf_counter()
-    times = 1e3 * (field_at_hand - began), 1e3 * (ended - field_at_hand)
-    return Solution(plan, route.goal, cells, *times)
+NO_SOLUTION = Solution(Plan(PlanStatus.NO_PATH))
 
 
 @dataclass(frozen=True)
@@ -164,7 +104,7 @@ class Outcome:
     status: str
     sentence: str
     problem: Problem | None = None
-    solution: Solution = Solution(Plan(PlanStatus.NO_PATH))
+    solution: Solution = NO_SOLUTION
 
     @property
     def succeeded(self) -> bool:
