@@ -36,9 +36,9 @@ class BackgroundNode:
 
     def close(self) -> None:
         """Stop spinning, and destroy the node."""
-        self._executor.shutdown()
         self._context.try_shutdown()
         self._thread.join()
+        self._executor.shutdown()
         self.node.destroy_node()
 
     def _spin(self) -> None:
