@@ -25,7 +25,8 @@ from ddqn_planner.experiments.benchmark_maps import (
     read_maps,
 )
 from ddqn_planner.experiments.generalisation import Walk, markdown, measure, summarise, write_report
-from ddqn_planner.grid import Cell, GridMap, MapFile, MoveRule, inflate, read_map_file
+from ddqn_planner.experiments.profiles import HIDDEN_UNITS
+from ddqn_planner.grid import Cell, GridMap, MapFile, MoveRule, Noise, inflate, read_map_file
 from ddqn_planner.grid.generators import KINDS
 from ddqn_planner.planning import Plan, PlanMethod, Planner, shortest_distances
 from ddqn_planner.planning.animation import save_animation
@@ -173,6 +174,10 @@ def _add_reproduce(reproduce: argparse.ArgumentParser) -> None:
     add("--seeds", type=int, default=5, metavar="N", help="trainings of a kind")
     out = Path("runs/reproduce")
     add("--out", type=Path, default=out, help="folder of trainings and report")
+    choices = [noise.value for noise in Noise]
+    add("--noise", nargs="+", choices=choices, default=choices, help="of goal iii")
+    units = [*HIDDEN_UNITS]
+    add("--hidden-units", nargs="+", type=int, default=units, metavar="N", help="of goal iii")
     add("--quick", action="store_true", help="run it too briefly to learn, into the folder quick")
     reproduce.set_defaults(command=_reproduce)
 
@@ -354,9 +359,12 @@ def _reproduce(options: argparse.Namespace) -> int:
         ) from None
     names = [*EXPERIMENTS] if options.experiment == "all" else [options.experiment]
     out = options.out / "quick" if options.quick else options.out
+    noise = tuple(map(Noise, dict.fromkeys(options.noise)))
+    hidden_units = tuple(dict.fromkeys(options.hidden_units))
+    settings = Settings(out, options.seeds, options.quick, noise, hidden_units)
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
-        print(reproduce(names, Settings(out, options.seeds, options.quick)))
+        print(reproduce(names, settings))
     except KeyboardInterrupt:
         print("interrupted; the same command goes on from the last checkpoints", file=sys.stderr)
         return 130

@@ -193,13 +193,15 @@ def test_an_interrupted_training_is_saved_and_goes_on(
 def test_reproduce_runs_every_experiment_and_writes_its_report(
     capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
-    command = ["reproduce", "--quick", "--seeds", "2", "--out", str(tmp_path)]
+    reading = ["--noise", "on_path", "--hidden-units", "0"]
+    command = ["reproduce", "--quick", "--seeds", "2", "--out", str(tmp_path), *reading]
     assert main(command) == 0
     folder = tmp_path / "quick"
     report = (folder / "report.md").read_text()
     assert report in capsys.readouterr().out
     for name in EXPERIMENTS:
-        assert f"`ddqn-planner reproduce --experiment {name} --seeds 2 --quick`" in report
+        options = f"--experiment {name} --seeds 2 {' '.join(reading)} --quick"
+        assert f"`ddqn-planner reproduce {options}`" in report
     for picture in re.findall(r"!\[.*?\]\((.*?)\)", report):
         with Image.open(folder / picture) as image:
             assert min(image.size) > 300
@@ -233,3 +235,24 @@ def test_interrupted_experiments_end_with_all_their_processes(tmp_path: Path, nu
 def test_reproduce_refuses_less_than_one_seed(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["reproduce", "--seeds", "0"]) == 2
     assert "--seeds is 0; give at least 1" in capsys.readouterr().err
+
+
+def test_reproduce_may_be_asked_for_one_reading_of_goal_3(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    command = ["reproduce", "--quick", "--seeds", "1", "--out", str(tmp_path)]
+    assert main([*command, "--experiment", "goal-3", "--hidden-units", "3"]) == 0
+    report = capsys.readouterr().out
+    options = "--seeds 1 --hidden-units 3 --quick"
+    assert f"`ddqn-planner reproduce --experiment goal-3 {options}`" in report
+    for noise in ("on_path", "near_path"):
+        assert f"| {noise} | paper, 3 hidden units |" in report
+    assert "| paper |" not in report
+
+
+def test_reproduce_refuses_a_hidden_layer_that_cannot_be(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    command = ["reproduce", "--experiment", "goal-3", "--hidden-units", "-1"]
+    assert main([*command, "--out", str(tmp_path)]) == 2
+    assert "hidden_units is -1" in capsys.readouterr().err

@@ -98,22 +98,25 @@ def zero_shot(settings: Settings) -> tuple[list[str], list[str]]:
     # The given start, goal i, is one of the starts.
     starts = evaluate(field, scenario.grid, MOVE_RULE)
     any_move = evaluate(field.unmasked(), scenario.grid, MOVE_RULE)
-    maps = goal_3.drawn_maps(settings)
-    noisy = [walk_from_starts(planner, some) for some in (maps.training, maps.test)]
-    counts = [f"{solved(legal)} ({solved(free)}) of {len(legal)}" for legal, free in noisy]
+    noisy = {}
+    for noise in settings.noise:
+        maps = goal_3.drawn_maps(settings, noise)
+        for which, some in (("first", maps.training), ("test", maps.test)):
+            legal, unmasked = walk_from_starts(planner, some)
+            counts = f"{solved(legal)} ({solved(unmasked)}) of {len(legal)}"
+            noisy[f"goal iii, {noise.value}, {which} maps (any move)"] = counts
     plan, seconds = goal_1.timed_plan(planner, scenario)
     return [
         "goal i, length",
         "goal ii with the given start, solved (any move)",
         "mean length / optimum",
-        "goal iii, first maps (any move)",
-        "goal iii, test maps (any move)",
+        *noisy,
         "planning time, ms",
     ], [
         f"{plan.length:.2f}",
         f"{starts.solved} ({any_move.solved}) of {starts.starts}",
         f"{starts.mean_ratio:.4f}",
-        *counts,
+        *noisy.values(),
         f"{1e3 * seconds:.2f}",
     ]
 

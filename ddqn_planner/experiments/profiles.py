@@ -11,6 +11,9 @@ from ddqn_planner.training.hyper_parameters import HyperParameters
 MOVE_RULE: Final = MoveRule.CORNER_CUTTING
 """The rule under which the paper's 22.97 is the shortest path (docs/dilemma_map.md)."""
 
+HIDDEN_UNITS: Final = (0, 128)
+"""Sizes of the hidden layer with which goal iii tries the paper's network; 0 for none."""
+
 START_DEAD_END: Final[frozenset[Cell]] = frozenset(
     {(6, 6), (4, 6), (4, 7), (4, 8), (5, 6), (5, 7), (5, 8), (6, 7), (6, 8), (7, 6), (7, 7)}
 )

@@ -10,13 +10,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ddqn_planner.experiments.figures import Curve
-from ddqn_planner.experiments.profiles import MOVE_RULE, PROFILES
+from ddqn_planner.experiments.profiles import HIDDEN_UNITS, MOVE_RULE, PROFILES
 from ddqn_planner.experiments.trainings import (
     Training,
     TrainingEvaluation,
     read_evaluations,
     training_folder,
 )
+from ddqn_planner.grid import Noise
 from ddqn_planner.planning import Planner, shortest_distances
 from ddqn_planner.training.environment import Scenario
 from ddqn_planner.training.hyper_parameters import HyperParameters
@@ -34,11 +35,25 @@ class Settings:
         Trainings of each kind, with the seeds 0, 1, and so on; at least 1.
     quick : bool
         Train too briefly to learn anything, so that everything is run in little time.
+    noise : tuple of Noise
+    hidden_units : tuple of int
+        The readings of goal iii, each noise with each hidden layer of the paper's network.
     """
 
     out: Path
     seeds: int
     quick: bool = False
+    noise: tuple[Noise, ...] = tuple(Noise)
+    hidden_units: tuple[int, ...] = HIDDEN_UNITS
+
+    def options(self) -> str:
+        """Return the options of the command line that give these settings, except the folder."""
+        options = [f"--seeds {self.seeds}"]
+        if self.noise != tuple(Noise):
+            options.append(f"--noise {' '.join(noise.value for noise in self.noise)}")
+        if self.hidden_units != HIDDEN_UNITS:
+            options.append(f"--hidden-units {' '.join(map(str, self.hidden_units))}")
+        return " ".join([*options, *(["--quick"] if self.quick else [])])
 
     def profile(self, name: str) -> HyperParameters:
         """Return the parameters of one of the `PROFILES`."""

@@ -40,10 +40,9 @@ def reproduce(names: list[str], settings: Settings) -> str:
         for training in module.trainings(settings)
     }
     in_parallel(train, list(trainings.values()), settings.out)
-    quick = " --quick" if settings.quick else ""
     sections = [
         f"## {module.TITLE}\n\n"
-        f"`ddqn-planner reproduce --experiment {name} --seeds {settings.seeds}{quick}`\n\n"
+        f"`ddqn-planner reproduce --experiment {name} {settings.options()}`\n\n"
         f"{module.report(settings)}"
         for name, module in modules.items()
     ]

@@ -13,7 +13,7 @@ from ddqn_planner.grid.moves import (
     path_cost,
     path_length,
 )
-from ddqn_planner.grid.noise import scatter_obstacles
+from ddqn_planner.grid.noise import Noise, scatter_obstacles
 
 __all__ = [
     "LENGTHS",
@@ -26,6 +26,7 @@ __all__ = [
     "MapFile",
     "MapFileError",
     "MoveRule",
+    "Noise",
     "clearance",
     "connected_cells",
     "inflate",

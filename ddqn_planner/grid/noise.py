@@ -1,9 +1,10 @@
-"""The paper's static noise (section 4.3): new obstacles on or next to a known path."""
+"""The paper's static noise (section 4.3): new obstacles on a known path, or also next to it."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from enum import Enum
 
 import numpy as np
 
@@ -16,10 +17,28 @@ MAX_NEW_OBSTACLES = 5
 MAX_TRIES = 1000
 
 
+class Noise(str, Enum):
+    """Which free cells new obstacles may occupy: two readings of section 5.3."""
+
+    ON_PATH = "on_path"
+    """Those of the path ("free positions that make up the optimal path")."""
+    NEAR_PATH = "near_path"
+    """Those of the path and their eight neighbours."""
+
+    @property
+    def reach(self) -> int:
+        """How far from the path a new obstacle may lie, in cells along x and y."""
+        return 0 if self is Noise.ON_PATH else 1
+
+
 def scatter_obstacles(
-    grid: GridMap, path: Sequence[Cell], move_rule: MoveRule, random: np.random.Generator
+    grid: GridMap,
+    path: Sequence[Cell],
+    move_rule: MoveRule,
+    random: np.random.Generator,
+    noise: Noise = Noise.NEAR_PATH,
 ) -> tuple[GridMap, int]:
-    """Occupy 1 to 5 free cells on or next to a path, so that a path is still left.
+    """Occupy 1 to 5 free cells on a path, or also next to it, so that a path is still left.
 
     The paper (goal iii) does so to the path of goal i. Draws that close every way from the first
     to the last cell of the path are thrown away and counted.
@@ -32,6 +51,7 @@ def scatter_obstacles(
     move_rule : MoveRule
         The rule under which a path must be left.
     random : numpy.random.Generator
+    noise : Noise
 
     Returns
     -------
@@ -43,26 +63,27 @@ def scatter_obstacles(
     Raises
     ------
     ValueError
-        If the path has no free cell on or next to it besides its ends, or no draw of 1,000 left
-        a path.
+        If there is no cell to occupy except the path's ends, or no draw of 1,000 left a path.
     """
     start, goal = path[0], path[-1]
-    near_path = sorted(
+    offsets = range(-noise.reach, noise.reach + 1)
+    candidates = sorted(
         {
             (x + dx, y + dy)
             for x, y in path
-            for dx in (-1, 0, 1)
-            for dy in (-1, 0, 1)
+            for dx in offsets
+            for dy in offsets
             if (x + dx, y + dy) not in (start, goal) and grid.is_free((x + dx, y + dy))
         }
     )
-    if not near_path:
-        raise ValueError(f"no free cell lies on or next to the path from {start} to {goal}")
+    if not candidates:
+        where = "on" if noise is Noise.ON_PATH else "on or next to"
+        raise ValueError(f"no free cell lies {where} the path from {start} to {goal}")
     for rejected in range(MAX_TRIES):
-        count = min(int(random.integers(1, MAX_NEW_OBSTACLES + 1)), len(near_path))
+        count = min(int(random.integers(1, MAX_NEW_OBSTACLES + 1)), len(candidates))
         occupancy = grid.occupancy.copy()
-        for index in random.choice(len(near_path), size=count, replace=False):
-            x, y = near_path[index]
+        for index in random.choice(len(candidates), size=count, replace=False):
+            x, y = candidates[index]
             occupancy[y, x] = True
         if connected_cells(occupancy, goal, move_rule)[start[1], start[0]]:
             return replace(grid, occupancy=occupancy), rejected

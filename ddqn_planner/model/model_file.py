@@ -23,7 +23,7 @@ from ddqn_planner.resources import PACKAGE, find_resource
 METADATA_KEY = "ddqn_planner"
 MODEL_SUFFIX = ".safetensors"
 MAX_SIZE = 4096
-"""Largest network size (height, width, filters) that a model file may ask for."""
+"""Largest network size (height, width, filters, hidden units) that a model file may ask for."""
 
 MAX_FILE_BYTES = 2**28
 """A larger file is refused before it is read."""
@@ -32,7 +32,7 @@ MAX_FILE_BYTES = 2**28
 AnyQNetwork = PaperQNetwork | PropagationQNetwork | AnyMapQNetwork
 
 SIZES: Final = {
-    "paper": ("height", "width", "filters"),
+    "paper": ("height", "width", "filters", "hidden_units"),
     "propagation": ("filters",),
     "any_map": ("filters",),
 }
@@ -212,11 +212,16 @@ def _parse(values: object) -> ModelMetadata:
     network, sizes = values["network"], values["sizes"]
     if network not in SIZES:
         raise ValueError(f"network is {reprlib.repr(network)}; this version knows {[*SIZES]}")
+    if network == "paper":  # files of version 0.1.0 do not name it: their networks have none
+        sizes = {**sizes, "hidden_units": sizes.get("hidden_units", 0)}
     if sizes.keys() != set(SIZES[network]):
         raise ValueError(f"sizes is {reprlib.repr(sizes)}; it must have {[*SIZES[network]]}")
     for name, size in sizes.items():
-        if type(size) is not int or not 1 <= size <= MAX_SIZE:
-            raise ValueError(f"size {name} is {reprlib.repr(size)}; it must lie in 1 to {MAX_SIZE}")
+        least = 0 if name == "hidden_units" else 1
+        if type(size) is not int or not least <= size <= MAX_SIZE:
+            raise ValueError(
+                f"size {name} is {reprlib.repr(size)}; it must lie in {least} to {MAX_SIZE}"
+            )
     if not 0 <= values["gamma"] <= 1:
         raise ValueError(f"gamma is {values['gamma']}; it must lie in 0 to 1")
-    return ModelMetadata(**{**values, "move_rule": MoveRule(values["move_rule"])})
+    return ModelMetadata(**{**values, "sizes": sizes, "move_rule": MoveRule(values["move_rule"])})

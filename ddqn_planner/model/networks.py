@@ -29,9 +29,12 @@ class QNetwork(Protocol):
 class PaperQNetwork(nn.Module):
     """The paper's network (Fig. 3): one convolution, one fully connected layer.
 
-    A 3x3 convolution of stride 2, ReLU, and a fully connected layer with one output an action. The
-    paper gives neither the number of filters nor the padding. Ours is 1, because without it the
+    A 3x3 convolution of stride 2, ReLU, and a fully connected layer with one output per action.
+    The paper gives neither the number of filters nor the padding. Ours is 1, because without it the
     last row and column of an even-sized map are under no filter, and a robot there goes unseen.
+
+    The paper's text ("one hidden layer is followed by ReLU") can also be read as a second, fully
+    connected hidden layer between the two: `hidden_units` has its size.
 
     Parameters
     ----------
@@ -39,14 +42,17 @@ class PaperQNetwork(nn.Module):
         Size of the maps, cells; the paper's is 20 x 20. The network plans on no other size.
     filters : int
         Number of convolution filters.
+    hidden_units : int
+        Size of a fully connected hidden layer with ReLU after the convolution; 0 for none.
     """
 
-    def __init__(self, height: int, width: int, filters: int) -> None:
+    def __init__(self, height: int, width: int, filters: int, hidden_units: int = 0) -> None:
         super().__init__()
         self.shape = (height, width)
         self.convolution = nn.Conv2d(1, filters, kernel_size=3, stride=2, padding=1)
         features = filters * ((height + 1) // 2) * ((width + 1) // 2)
-        self.fully_connected = nn.Linear(features, len(MOVES))
+        self.hidden = nn.Linear(features, hidden_units) if hidden_units else None
+        self.fully_connected = nn.Linear(hidden_units or features, len(MOVES))
 
     def forward(self, observation_BHW: Tensor) -> Tensor:
         """Return Q(s, a): (B, 8) for observations (B, H, W)."""
@@ -63,13 +69,14 @@ class PaperQNetwork(nn.Module):
 
     def q_of_patches(self, patch_BKL: Tensor) -> Tensor:
         """Return Q(s, a): (B, 8) for the patches of observations (B, 9, L)."""
-        convolution, fully_connected = self.convolution, self.fully_connected
+        convolution, hidden, fully_connected = self.convolution, self.hidden, self.fully_connected
         weight_BFK = convolution.weight.flatten(1).expand(len(patch_BKL), -1, -1)
         bias_F1 = cast(Tensor, convolution.bias).unsqueeze(1)
         feature_BFL = torch.baddbmm(bias_F1, weight_BFK, patch_BKL).relu_()
-        return functional.linear(
-            feature_BFL.flatten(1), fully_connected.weight, fully_connected.bias
-        )
+        feature_BF = feature_BFL.flatten(1)
+        if hidden is not None:
+            feature_BF = functional.linear(feature_BF, hidden.weight, hidden.bias).relu_()
+        return functional.linear(feature_BF, fully_connected.weight, fully_connected.bias)
 
     def supports(self, shape: tuple[int, int]) -> bool:
         """Say whether the network can plan on maps of shape (H, W)."""

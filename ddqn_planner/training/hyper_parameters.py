@@ -43,6 +43,9 @@ class HyperParameters:
     beta: float = _parameter(0.4, "section 4.2: weight β of the detour from the start", 0.0, 10.0)
     steps: int = _parameter(50_000, "section 5.1: environment steps of goal i", 1, 10**9)
     filters: int = _parameter(16, "ours: filters of the convolution", 1, 1024)
+    hidden_units: int = _parameter(
+        0, "ours: units of a hidden layer after the convolution; 0 for none", 0, 4096
+    )
     replay_capacity: int = _parameter(50_000, "ours: transitions in the replay buffer", 1, 10**7)
     learning_starts: int = _parameter(500, "ours: environment steps before learning", 0, 10**6)
     update_interval: int = _parameter(1, "ours: environment steps per update", 1, 10**4)

@@ -48,8 +48,13 @@ class PaperLearner:
 
     def __init__(self, environment: GridVectorEnvironment) -> None:
         height, width = environment.shape
-        filters = environment.parameters.filters
-        self.sizes = {"height": height, "width": width, "filters": filters}
+        parameters = environment.parameters
+        self.sizes = {
+            "height": height,
+            "width": width,
+            "filters": parameters.filters,
+            "hidden_units": parameters.hidden_units,
+        }
         self._environment = environment
 
     def states(self, scenario: NDArray[np.int64], cell: NDArray[np.int64]) -> Tensor:

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import itertools
 import math
 
 import numpy as np
@@ -14,9 +15,9 @@ from ddqn_planner.experiments.goal_2 import (
     planned_field,
     trained_field,
 )
-from ddqn_planner.experiments.goal_3 import noisy_maps
+from ddqn_planner.experiments.goal_3 import fixed_walk, noisy_maps
 from ddqn_planner.experiments.profiles import MOVE_RULE, PROFILES, VARIANTS, variant
-from ddqn_planner.grid import Cell, GridMap, MoveRule, path_length
+from ddqn_planner.grid import MOVES, Cell, GridMap, MoveRule, Noise, legal_moves, path_length
 from ddqn_planner.model import ModelMetadata, PropagationQNetwork
 from ddqn_planner.planning import Planner, shortest_distances, shortest_path
 from ddqn_planner.planning.evaluation import length_ratios
@@ -71,8 +72,9 @@ def test_the_q_that_the_loss_trains_adds_up_the_papers_rewards(paper: Scenario) 
     assert field.q[0, goal_y, goal_x - 2] == pytest.approx(expected, abs=1e-3)
 
 
-def test_noisy_maps_differ_and_keep_a_path(paper: Scenario) -> None:
-    maps = noisy_maps(12, 18, seed=3)
+@pytest.mark.parametrize("noise", Noise)
+def test_noisy_maps_differ_and_keep_a_path(paper: Scenario, noise: Noise) -> None:
+    maps = noisy_maps(12, 18, noise, seed=3)
     path = shortest_path(paper.grid, paper.start, paper.goal, MOVE_RULE)
     scenarios = [*maps.training, *maps.test]
     assert (len(maps.training), len(maps.test)) == (12, 18)
@@ -81,15 +83,29 @@ def test_noisy_maps_differ_and_keep_a_path(paper: Scenario) -> None:
         new = np.argwhere(scenario.grid.occupancy & ~paper.grid.occupancy)
         assert 1 <= len(new) <= 5
         for y, x in new:
-            assert min(max(abs(x - px), abs(y - py)) for px, py in path) <= 1
+            distance = min(max(abs(x - px), abs(y - py)) for px, py in path)
+            assert distance <= (0 if noise is Noise.ON_PATH else 1)
         optimum = shortest_distances(scenario.grid, scenario.goal, MOVE_RULE)
         assert np.isfinite(optimum[scenario.start[::-1]])
 
 
 def test_more_test_maps_leave_the_training_maps_as_they_are() -> None:
-    few, many = noisy_maps(5, 1), noisy_maps(5, 9)
+    few, many = (noisy_maps(5, count, Noise.ON_PATH) for count in (1, 9))
     fingerprints = [[s.grid.fingerprint for s in maps.training] for maps in (few, many)]
     assert fingerprints[0] == fingerprints[1]
+
+
+def test_a_fixed_walk_is_legal_on_the_papers_map_and_avoids_what_it_can(paper: Scenario) -> None:
+    maps = noisy_maps(30, 30, Noise.ON_PATH)
+    walk = fixed_walk(maps.training)
+    legal = legal_moves(paper.grid.occupancy, MOVE_RULE)
+    assert (walk[0], walk[-1]) == (paper.start, paper.goal)
+    for (x, y), (next_x, next_y) in itertools.pairwise(walk):
+        action = MOVES.tolist().index([next_x - x, next_y - y])
+        assert legal[action, y, x]
+    # Every inner cell of the path can be avoided at once: the walk is free in every such map.
+    assert all(s.grid.is_free(cell) for s in (*maps.training, *maps.test) for cell in walk)
+    assert path_length(walk) == pytest.approx(31.56, abs=0.005)
 
 
 @pytest.mark.parametrize("profile", PROFILES)

@@ -33,7 +33,7 @@ from ddqn_planner.model.propagation import MAX_LEARNED_PRICE
 
 METADATA = ModelMetadata(
     network="paper",
-    sizes={"height": 4, "width": 5, "filters": 2},
+    sizes={"height": 4, "width": 5, "filters": 2, "hidden_units": 0},
     move_rule=MoveRule.ROBOT_SAFE,
     gamma=0.95,
     map_fingerprint="0123456789abcdef",
@@ -61,6 +61,27 @@ def model_path(tmp_path: Path, network: PaperQNetwork) -> Path:
 def test_a_saved_model_comes_back_the_same(model_path: Path, network: PaperQNetwork) -> None:
     loaded, metadata = load_model(model_path)
     assert metadata == METADATA
+    request = GridMap(np.zeros((4, 5))), (1, 1), MoveRule.ROBOT_SAFE
+    np.testing.assert_array_equal(loaded.q_values(*request), network.q_values(*request))
+
+
+def test_a_model_file_that_names_no_hidden_units_has_none(
+    tmp_path: Path, network: PaperQNetwork
+) -> None:
+    path = tmp_path / "old.safetensors"
+    save_model(path, network, replace(METADATA, sizes={"height": 4, "width": 5, "filters": 2}))
+    loaded, metadata = load_model(path)
+    assert metadata == METADATA
+    request = GridMap(np.zeros((4, 5))), (1, 1), MoveRule.ROBOT_SAFE
+    np.testing.assert_array_equal(loaded.q_values(*request), network.q_values(*request))
+
+
+def test_a_network_with_a_hidden_layer_comes_back_the_same(tmp_path: Path) -> None:
+    sizes = {**METADATA.sizes, "hidden_units": 3}
+    network = PaperQNetwork(**sizes)
+    save_model(tmp_path / "hidden.safetensors", network, replace(METADATA, sizes=sizes))
+    loaded, metadata = load_model(tmp_path / "hidden.safetensors")
+    assert metadata.sizes == sizes
     request = GridMap(np.zeros((4, 5))), (1, 1), MoveRule.ROBOT_SAFE
     np.testing.assert_array_equal(loaded.q_values(*request), network.q_values(*request))
 
@@ -127,6 +148,8 @@ def save_as(path: Path, weights: PaperQNetwork, **changes: object) -> None:
         ({"sizes": {"height": 4, "width": 5, "filters": 10**9}}, "filters is 1000000000"),
         ({"sizes": {"height": 4, "width": 5, "filters": "2"}}, "filters is '2'"),
         ({"sizes": {"height": 4, "width": 5}}, "filters"),
+        ({"sizes": {**METADATA.sizes, "hidden_units": -1}}, "hidden_units is -1"),
+        ({"sizes": {**METADATA.sizes, "hidden_units": 3}}, "holds tensors"),
         ({"sizes": {"height": 6, "width": 5, "filters": 2}}, "holds tensors"),
         ({"extra": 1}, "extra"),
         ({"sizes": {"height": 4, "width": 5, "filters": True}}, "filters is True"),

@@ -63,3 +63,12 @@ def test_the_network_is_the_papers_convolution_relu_and_fully_connected_layer() 
     observations = torch.randn(6, 7, 10)
     features = network.convolution(observations.unsqueeze(1)).relu().flatten(1)
     torch.testing.assert_close(network(observations), network.fully_connected(features))
+
+
+def test_a_hidden_layer_with_relu_lies_between_the_two() -> None:
+    network = PaperQNetwork(7, 10, filters=5, hidden_units=6)
+    assert network.hidden is not None
+    observations = torch.randn(6, 7, 10)
+    features = network.convolution(observations.unsqueeze(1)).relu().flatten(1)
+    hidden = network.hidden(features).relu()
+    torch.testing.assert_close(network(observations), network.fully_connected(hidden))
