@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from ddqn_planner import MoveRule, PlanStatus
+from ddqn_planner import GridMap, MoveRule, PlanStatus
 from ddqn_planner.model import load_model
 from ddqn_planner.planning.evaluation import evaluate
 from ddqn_planner.training.environment import Scenario
@@ -134,6 +134,45 @@ def test_updates_keep_their_ratio_to_steps(
     trainer = make(small, parameters)
     train(trainer, 240)
     assert trainer.updates == trainer.steps // interval
+
+
+def test_learning_starts_after_as_many_steps_as_asked_for(small: Scenario) -> None:
+    trainer = make(small, replace(QUICK, learning_starts=5))
+    train(trainer, 5)
+    assert trainer.updates == 0
+    train(trainer, 6)
+    assert trainer.updates == 1
+
+
+def test_epsilon_falls_linearly_and_then_stays(small: Scenario) -> None:
+    trainer = make(small, HyperParameters(epsilon_start=0.8, epsilon_end=0.2, epsilon_steps=100))
+    epsilons = []
+    for trainer.steps in (0, 25, 100, 101, 1000):
+        epsilons.append(trainer.epsilon)
+    assert epsilons == pytest.approx([0.8, 0.65, 0.2, 0.2, 0.2])
+
+
+def test_after_a_truncated_move_the_target_still_bootstraps(small: Scenario) -> None:
+    # Episodes of one move each: it collides, or the episode is out of steps.
+    trainer = make(small, replace(QUICK, max_episode_steps=1, p_r=0.0))
+    outcomes = [episode.outcome for episode in train(trainer, 40)]
+    assert {*outcomes} == {Outcome.COLLIDED, Outcome.OUT_OF_STEPS}
+    stored = trainer._replay.transitions.discount[:40]
+    expected = [0.0 if outcome is Outcome.COLLIDED else 0.95 for outcome in outcomes]
+    assert stored.tolist() == pytest.approx(expected)
+
+
+def test_an_episode_that_was_interrupted_before_its_last_step_ends_with_that(
+    tmp_path: Path,
+) -> None:
+    nothing_to_hit = Scenario(GridMap(np.zeros((21, 21))), start=(10, 10), goal=(0, 0))
+    trainer = make(nothing_to_hit, replace(QUICK, max_episode_steps=5, p_r=0.0))
+    assert train(trainer, 4) == []
+    trainer.save_checkpoint(tmp_path / "checkpoint")
+    resumed = Trainer.load_checkpoint(tmp_path / "checkpoint", [nothing_to_hit])
+    (episode,) = train(resumed, 5)
+    assert (episode.outcome, episode.moves) == (Outcome.OUT_OF_STEPS, 5)
+    assert len(episode.cells) == 6
 
 
 def test_episodes_tell_how_they_went(small: Scenario) -> None:
