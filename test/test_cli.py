@@ -83,10 +83,35 @@ def test_plan_heeds_the_robots_body(capsys: pytest.CaptureFixture[str], tmp_path
     for bad, named in (
         (["--robot-radius", "-1"], "robot_radius is -1.0"),
         (["--clearance-weight", "2"], "clearance_weight is 2.0"),
-        (["--tolerance", "nan"], "tolerance is nan"),
+        (["--tolerance", "nan"], "--tolerance is nan; give metres"),
+        (["--tolerance", "-1"], "--tolerance is -1.0; give metres"),
     ):
         assert main(["plan", path, *bad]) == 2
         assert named in capsys.readouterr().err
+
+
+def test_plan_reads_a_maps_values_as_the_node_does(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    values = np.zeros((5, 5), dtype=np.int8)
+    values[:3, 1] = 60  # free below the usual threshold, and then dear
+    values[:4, 3] = -1
+    path = str(tmp_path / "values.yaml")
+    save_map(MapFile(values), path)
+
+    def crossed(start: str, goal: str, *arguments: str) -> int:
+        """The row in which the path goes through the column between start and goal in row 2."""
+        main(["plan", path, "--json", "--start", start, "2", "--goal", goal, "2", *arguments])
+        rows: dict[int, int] = dict(json.loads(capsys.readouterr().out)["cells"])
+        return rows[int(start) + 1]
+
+    assert crossed("0", "2") == 2
+    assert crossed("0", "2", "--occupied-threshold", "61") == 2
+    assert crossed("0", "2", "--occupied-threshold", "60") == 3
+    assert crossed("0", "2", "--priced") == 3
+    assert crossed("2", "4") == 4
+    assert crossed("2", "4", "--allow-unknown") == 2
+    assert crossed("2", "4", "--allow-unknown", "--priced") == 4
 
 
 def test_plan_searches_in_guided_mode(capsys: pytest.CaptureFixture[str]) -> None:
