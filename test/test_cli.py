@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sysconfig
 import time
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +19,10 @@ from ddqn_planner.cli import main
 from ddqn_planner.experiments import EXPERIMENTS
 from ddqn_planner.grid import GridMap, MapFile, save_map
 from ddqn_planner.model import load_model
+from ddqn_planner.training.any_map import ANY_MAP, random_scenarios
 from ddqn_planner.training.environment import Scenario
+from ddqn_planner.training.hyper_parameters import HyperParameters
+from ddqn_planner.training.trainer import Trainer
 
 
 @pytest.fixture
@@ -74,12 +78,20 @@ def test_plan_heeds_the_robots_body(capsys: pytest.CaptureFixture[str], tmp_path
     assert point["length"] < body["length"] == pytest.approx(body["optimum"])
     assert body["method"] == "greedy"
     beside = ["--start", "4", "0", "--goal", "6", "0"]
-    assert plan("--clearance-weight", "1", *beside)["length"] > plan(*beside)["length"]
+    near_wall, clear = plan(*beside), plan("--clearance-weight", "1", *beside)
+    assert clear["length"] > near_wall["length"]
+    assert clear["optimum"] == near_wall["optimum"]  # both are lengths
     near = plan("--robot-radius", "0.3", "--start", "4", "3")
     assert near["cells"][0] == [4, 3]
     assert near["optimum"] is None
     moved = plan("--robot-radius", "0.3", "--goal", "6", "3", "--tolerance", "0.2")
     assert moved["cells"][-1] == [8, 3]
+    picture = tmp_path / "moved.gif"
+    plan(
+        "--robot-radius", "0.3", "--goal", "6", "3", "--tolerance", "0.2", "--animate", str(picture)
+    )
+    with Image.open(picture) as animation:
+        assert animation.n_frames > 1  # there is a field toward the goal that stands for it
     for bad, named in (
         (["--robot-radius", "-1"], "robot_radius is -1.0"),
         (["--clearance-weight", "2"], "clearance_weight is 2.0"),
@@ -190,6 +202,38 @@ def test_a_trained_model_plans(
     model = str(tmp_path / "run" / "model.safetensors")
     assert main(["plan", small_map, "--model", model]) == 0
     assert "length" in capsys.readouterr().out
+
+
+def test_every_hyper_parameter_and_the_seed_can_be_given(
+    small: Scenario, small_map: str, tmp_path: Path
+) -> None:
+    given: dict[str, Any] = {}
+    for entry in fields(HyperParameters):
+        if "choices" in entry.metadata:
+            given[entry.name] = entry.metadata["choices"][1]
+        else:
+            low, default = entry.metadata["range"][0], entry.default
+            other = default + 1 if default == low else (low + default) / 2
+            given[entry.name] = type(default)(other)
+    given["steps"] = 4
+    arguments = [f"--{name.replace('_', '-')}={value}" for name, value in given.items()]
+    out = str(tmp_path / "run")
+    assert main(["train", small_map, "--out", out, "--seed", "5", *arguments]) == 0
+    trainer = Trainer.load_checkpoint(tmp_path / "run" / "checkpoint.safetensors", [small])
+    assert trainer.parameters == HyperParameters(**given)
+    assert all(
+        getattr(trainer.parameters, entry.name) != entry.default
+        for entry in fields(HyperParameters)
+    )
+    assert trainer.seed == load_model(tmp_path / "run" / "model.safetensors")[1].seed == 5
+
+
+def test_the_model_for_any_map_is_trained_with_parameters_of_its_own(tmp_path: Path) -> None:
+    command = ["train-any-map", "--out", str(tmp_path), "--maps", "3", "--seed", "4"]
+    assert main([*command, "--steps", "128"]) == 0
+    scenarios = random_scenarios(seed=4, maps=3)
+    trainer = Trainer.load_checkpoint(tmp_path / "checkpoint.safetensors", scenarios)
+    assert (trainer.parameters, trainer.seed) == (replace(ANY_MAP, steps=128), 4)
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])

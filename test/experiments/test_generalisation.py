@@ -196,6 +196,11 @@ def test_an_optimum_lies_in_its_group_and_groups_double(optimum: float) -> None:
     assert (low, high) == (0, 16) or (high == 2 * low and math.log2(low / 16).is_integer())
 
 
+def test_a_walk_is_optimal_within_a_millionth() -> None:
+    walks = [replace(walk_of_optimum(10.0), ratio=ratio) for ratio in (1.0, 1.0000009, 1.00001)]
+    assert summarise(walks)[-1].optimal == 2
+
+
 def test_groups_of_optima_are_in_order() -> None:
     walks = [walk_of_optimum(optimum) for optimum in (70.0, 16.0, 3.0, 31.9, 15.9)]
     groups = [(group.optimum, group.requests) for group in summarise(walks)]
@@ -429,6 +434,16 @@ def test_evaluate_prints_and_writes_its_tables(
     for column in ("requests", "success", "illegal"):
         sums = [sum(int(row[column]) for row in part) for part in (rows[:4], by_optimum, rows[-1:])]
         assert sums[0] == sums[1] == sums[2]
+
+
+def test_evaluate_gives_free_cells_the_costs_asked_for(tmp_path: Path, model: str) -> None:
+    means = {}
+    for priced in ("none", "random"):
+        out = tmp_path / f"{priced}.csv"
+        command = ["evaluate", "--model", model, "--kinds", "random_10", "--sizes", "16"]
+        assert main([*command, "--priced", priced, "--out", str(out)]) == 0
+        means[priced] = float(list(csv.DictReader(out.read_text().splitlines()))[-1]["mean"])
+    assert means["random"] > 1.1 * means["none"]  # this model does not see them
 
 
 def test_evaluate_says_which_sets_it_found(

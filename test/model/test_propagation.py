@@ -145,6 +145,21 @@ def test_a_value_is_settled_when_it_no_longer_changes() -> None:
     assert [return_AC[0, 0], return_AC[4, 1]] == pytest.approx([-10.0, -10.0], abs=0.01)
 
 
+def test_values_spread_as_far_as_a_map_reaches() -> None:
+    cells = 2500
+    success, reward = np.zeros((2, 1, 8, cells), dtype=np.float32)
+    success[0, 0], reward[:] = 1.0, -1.0
+    (return_AC,) = propagate(
+        success,
+        reward,
+        np.array([cells - 1]),
+        neighbours((1, cells)),
+        gamma=1.0,
+        collision=-10_000.0,
+    )
+    assert return_AC[0, 0] == 1 - cells
+
+
 def told(network: AnyMapQNetwork | PropagationQNetwork, success: float, price: float = 1.0) -> None:
     """Have a network say one p and one price of every move, whatever it sees."""
     network.requires_grad_(False)

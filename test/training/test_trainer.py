@@ -152,6 +152,47 @@ def test_epsilon_falls_linearly_and_then_stays(small: Scenario) -> None:
     assert epsilons == pytest.approx([0.8, 0.65, 0.2, 0.2, 0.2])
 
 
+def test_without_epsilon_the_robot_walks_by_the_network_alone(small: Scenario) -> None:
+    parameters = replace(QUICK, learning_starts=10**6, max_episode_steps=9, p_r=0.0)
+    walks = []
+    for epsilon in (0.0, 1.0):
+        parameters = replace(parameters, epsilon_start=epsilon, epsilon_end=epsilon)
+        walks.append({episode.cells for episode in train(make(small, parameters), 200)})
+    assert len(walks[0]) == 1  # the network does not change
+    assert len(walks[1]) > 5
+
+
+def test_the_target_is_copied_after_as_many_updates_as_asked_for(small: Scenario) -> None:
+    trainer = make(small, replace(QUICK, learning_starts=0, target_interval=3))
+    for _ in trainer.run(8):
+        target = trainer._target.state_dict().values()
+        same = all(torch.equal(x, y) for x, y in zip(weights(trainer), target, strict=True))
+        assert same == (trainer.updates % 3 == 0)
+    assert trainer.updates == 8
+
+
+def test_an_episode_adds_up_its_own_rewards_alone(small: Scenario) -> None:
+    parameters = replace(QUICK, alpha=0.0, beta=0.0, max_episode_steps=5)
+    totals = {
+        (episode.outcome, episode.total_reward) for episode in train(make(small, parameters), 2000)
+    }
+    assert totals == {
+        (Outcome.REACHED_GOAL, 10.0),
+        (Outcome.COLLIDED, -10.0),
+        (Outcome.OUT_OF_STEPS, 0.0),
+    }
+
+
+def test_a_model_says_what_it_was_trained_with(small: Scenario) -> None:
+    other = replace(small, grid=GridMap(np.zeros((4, 5))))
+    trainer = Trainer([small, other], MoveRule.UNIT, replace(QUICK, gamma=0.8), seed=3)
+    train(trainer, 2)
+    metadata = trainer.metadata()
+    assert (metadata.network, metadata.gamma, metadata.move_rule) == ("paper", 0.8, MoveRule.UNIT)
+    assert (metadata.seed, metadata.steps) == (3, 2)
+    assert metadata.map_fingerprint == small.grid.fingerprint != other.grid.fingerprint
+
+
 def test_after_a_truncated_move_the_target_still_bootstraps(small: Scenario) -> None:
     # Episodes of one move each: it collides, or the episode is out of steps.
     trainer = make(small, replace(QUICK, max_episode_steps=1, p_r=0.0))
