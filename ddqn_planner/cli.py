@@ -125,7 +125,7 @@ def _add_plan(plan: argparse.ArgumentParser) -> None:
     )
     for name, words in (
         ("allow-unknown", "take unknown cells as free"),
-        ("priced", "take a free cell as the dearer, the greater its value; an unknown as dearest"),
+        ("priced", "let a free cell cost more, the greater its value; an unknown one costs most"),
     ):
         plan.add_argument(f"--{name}", action="store_true", help=words)
     for name, words in (
@@ -241,7 +241,7 @@ def _plan(options: argparse.Namespace) -> int:
     if options.animate and options.animate.suffix.lower() != ".gif":
         raise ValueError(f"--animate is {options.animate}; give a file that ends in .gif")
     if not options.tolerance >= 0:
-        raise ValueError(f"--tolerance is {options.tolerance}; give metres, 0 or more")
+        raise ValueError(f"--tolerance is {options.tolerance:g}; give metres, 0 or more")
     map_file, start, goal = _read_map(options)
     grid = map_file.grid(options.occupied_threshold, options.allow_unknown, options.priced)
     grid = inflate(grid, options.robot_radius, options.clearance_weight)
