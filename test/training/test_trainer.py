@@ -231,6 +231,17 @@ def test_episodes_tell_how_they_went(small: Scenario) -> None:
             assert episode.moves == 5
 
 
+def test_an_episode_names_its_map_and_the_step_at_which_it_ended(small: Scenario) -> None:
+    upside_down = replace(small, grid=GridMap(small.grid.occupancy[::-1]))
+    scenarios = [small, upside_down]
+    trainer = Trainer(scenarios, MoveRule.ROBOT_SAFE, QUICK, seed=0)
+    steps = 0
+    for episode in train(trainer, 500):
+        steps += episode.moves
+        assert episode.step == steps
+        assert all(scenarios[episode.scenario].grid.is_free(cell) for cell in episode.cells)
+
+
 def test_a_saved_model_plans_as_the_trainer_does(small: Scenario, tmp_path: Path) -> None:
     trainer = make(small)
     train(trainer, 300)
@@ -247,8 +258,9 @@ def test_a_checkpoint_of_another_problem_is_refused(
     small: Scenario, paper: Scenario, tmp_path: Path
 ) -> None:
     make(small).save_checkpoint(tmp_path / "checkpoint")
-    with pytest.raises(CheckpointError, match="another map"):
-        Trainer.load_checkpoint(tmp_path / "checkpoint", [paper])
+    for other in (paper, replace(small, start=(0, 1)), replace(small, goal=(4, 1))):
+        with pytest.raises(CheckpointError, match="another map, start or goal"):
+            Trainer.load_checkpoint(tmp_path / "checkpoint", [other])
 
 
 @pytest.mark.parametrize("fraction", [0.0, 0.3, 0.9])

@@ -25,10 +25,10 @@ Q = Callable[[Scenario, Cell], Tensor]
 STEPS = 60
 
 
-def about_to_update(scenario: Scenario, parameters: HyperParameters) -> Trainer:
+def about_to_update(scenarios: list[Scenario], parameters: HyperParameters) -> Trainer:
     """A trainer that has seen some steps; its two networks differ, it made no update yet."""
     parameters = replace(parameters, learning_starts=10**6, environments=5, max_episode_steps=7)
-    trainer = Trainer([scenario], MoveRule.CORNER_CUTTING, parameters, seed=1)
+    trainer = Trainer(scenarios, MoveRule.CORNER_CUTTING, parameters, seed=1)
     for _ in trainer.run(STEPS):
         pass
     torch.manual_seed(0)
@@ -78,7 +78,8 @@ def check_update(trainer: Trainer, loss: Tensor, before: list[Tensor], tolerance
 def test_an_update_of_the_papers_network_is_that_of_the_equations(
     small: Scenario, target: str
 ) -> None:
-    trainer = about_to_update(small, HyperParameters(target=target, filters=4))
+    scenarios = [small, replace(small, grid=GridMap(small.grid.occupancy[::-1]))]
+    trainer = about_to_update(scenarios, HyperParameters(target=target, filters=4))
     network = copy.deepcopy(trainer.network)
     assert isinstance(network, PaperQNetwork)
 
@@ -96,6 +97,7 @@ def test_an_update_of_the_papers_network_is_that_of_the_equations(
     choose = target_q if target == "dqn" else online
     judge = online if target == "printed" else target_q
     batch = next_batch(trainer)
+    assert {0, 1} == set(batch.scenario)
     assert {0.0, np.float32(0.95)} == set(batch.discount)
     loss = mean_squared_error(trainer, batch, online, choose, judge)
     check_update(trainer, loss, list(network.parameters()), tolerance=1e-4)
@@ -104,19 +106,25 @@ def test_an_update_of_the_papers_network_is_that_of_the_equations(
 def test_an_update_of_the_network_for_any_map_counts_each_reward_once(small: Scenario) -> None:
     # Q(s, a) = p (r + γ V(s')) + (1 - p) r_o, r = -length * price, V = max Q under θ⁻.
     cost = np.arange(20, dtype=np.int8).reshape(4, 5)
-    priced = replace(small, grid=GridMap(small.grid.occupancy, cost=cost))
+    walls = small.grid.occupancy
+    scenarios = [
+        replace(small, grid=GridMap(walls, cost=cost)),
+        Scenario(GridMap(walls[::-1]), (4, 3), (0, 1), MoveRule.ROBOT_SAFE),
+    ]
     parameters = HyperParameters(
         network="any_map", reward="path_cost", gamma=0.5, obstacle_reward=-20.0, filters=4
     )
-    trainer = about_to_update(priced, parameters)
+    trainer = about_to_update(scenarios, parameters)
     network, judge_network = copy.deepcopy(trainer.network), copy.deepcopy(trainer._target)
     assert isinstance(network, AnyMapQNetwork)
-    values = surroundings(priced.grid.occupancy, priced.grid.cost)
-    seen = torch.from_numpy(features(values, MoveRule.CORNER_CUTTING))
     lengths = torch.from_numpy(LENGTHS.astype(np.float32))
 
-    def q_all(network: nn.Module, value: dict[Cell, float]) -> dict[Cell, Tensor]:
-        p, price = network(seen)
+    def q_of(
+        network: nn.Module, scenario: Scenario, value: dict[Cell, float]
+    ) -> dict[Cell, Tensor]:
+        seen = surroundings(scenario.grid.occupancy, scenario.grid.cost)
+        rule = scenario.move_rule or MoveRule.CORNER_CUTTING
+        p, price = network(torch.from_numpy(features(seen, rule)))
         answers = {}
         for number in range(20):
             x, y = number % 5, number // 5
@@ -125,18 +133,23 @@ def test_an_update_of_the_network_for_any_map_counts_each_reward_once(small: Sce
             answers[x, y] = p[number] * success + (1 - p[number]) * -20.0
         return answers
 
-    value = {(x, y): -20.0 for x in range(5) for y in range(4)}
-    with torch.no_grad():
-        for _ in range(40):  # γ^40 is 1e-12
-            value = {cell: float(q.max()) for cell, q in q_all(judge_network, value).items()}
-            value[priced.goal] = 0.0
-        judge = q_all(judge_network, value)
-    online = q_all(network, value)
+    online, judge = {}, {}
+    for scenario in scenarios:
+        value = {(x, y): -20.0 for x in range(5) for y in range(4)}
+        with torch.no_grad():
+            for _ in range(40):  # γ^40 is 1e-12
+                q = q_of(judge_network, scenario, value)
+                value = {cell: float(q_A.max()) for cell, q_A in q.items()}
+                value[scenario.goal] = 0.0
+            judge[scenario] = q_of(judge_network, scenario, value)
+        online[scenario] = q_of(network, scenario, value)
+    batch = next_batch(trainer)
+    assert {0, 1} == set(batch.scenario)
     loss = mean_squared_error(
         trainer,
-        next_batch(trainer),
-        lambda _, c: online[c],
-        lambda _, c: online[c],
-        lambda _, c: judge[c],
+        batch,
+        online=lambda s, cell: online[s][cell],
+        choose=lambda s, cell: online[s][cell],
+        judge=lambda s, cell: judge[s][cell],
     )
     check_update(trainer, loss, list(network.parameters()), tolerance=2e-3)
