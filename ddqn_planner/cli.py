@@ -117,6 +117,18 @@ def _add_plan(plan: argparse.ArgumentParser) -> None:
         default="greedy",
         help="guided: search where the greedy steps are trapped",
     )
+    plan.add_argument(
+        "--occupied-threshold",
+        type=int,
+        default=65,
+        metavar="N",
+        help="percent: a cell of this value or more is occupied (%(default)s)",
+    )
+    for name, words in (
+        ("allow-unknown", "take unknown cells as free"),
+        ("priced", "let a free cell cost more, the greater its value; an unknown one costs most"),
+    ):
+        plan.add_argument(f"--{name}", action="store_true", help=words)
     for name, words in (
         ("robot-radius", "metres that the path keeps from obstacles"),
         ("clearance-weight", "0 to 1: how much dearer cells near to obstacles are"),
@@ -233,8 +245,11 @@ def _read_map(options: argparse.Namespace) -> tuple[MapFile, Cell, Cell]:
 def _plan(options: argparse.Namespace) -> int:
     if options.animate and options.animate.suffix.lower() != ".gif":
         raise ValueError(f"--animate is {options.animate}; give a file that ends in .gif")
+    if not options.tolerance >= 0:
+        raise ValueError(f"--tolerance is {options.tolerance:g}; give metres, 0 or more")
     map_file, start, goal = _read_map(options)
-    grid = inflate(map_file.grid(), options.robot_radius, options.clearance_weight)
+    grid = map_file.grid(options.occupied_threshold, options.allow_unknown, options.priced)
+    grid = inflate(grid, options.robot_radius, options.clearance_weight)
     planner = Planner.load(options.model)
     method, tolerance = PlanMethod(options.mode), options.tolerance / grid.resolution
     began = time.perf_counter()

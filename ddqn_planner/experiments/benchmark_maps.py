@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import math
 import sys
 import zipfile
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from decimal import Decimal, InvalidOperation
 from pathlib import Path
 from typing import Final
 
@@ -114,6 +116,8 @@ class BenchmarkMap:
     optima : (N,) float64, optional
         Length of the shortest path of each request in cells, where the benchmark gives it under
         the move rule in question.
+    precision : float
+        How far a right optimum may be off because the benchmark rounds it, cells.
     """
 
     set_name: str
@@ -121,6 +125,7 @@ class BenchmarkMap:
     grid: GridMap
     requests: list[tuple[Cell, Cell]]
     optima: NDArray[np.float64] | None = None
+    precision: float = 0.0
 
     @property
     def size(self) -> str:
@@ -261,46 +266,67 @@ def _moving_ai_map(path: Path, scenario: Path | None, settings: RequestSettings)
         goals = settings.requests
         return _with_random_requests(set_name, str(path), occupancy, goals, settings, random)
     grid, rule = settings.grid(occupancy, random), settings.move_rule
-    lines = sorted(_read_scenario(scenario, grid), key=lambda line: line[2])
+    lines, precision = _read_scenario(scenario, grid, rule)
+    lines.sort(key=lambda line: line[2])
     # One of each of as many equal parts as requests: short and long paths alike.
     count = min(settings.requests, len(lines))
     edges = np.arange(count + 1) * len(lines) // count
     lines = [lines[index] for index in random.integers(edges[:-1], edges[1:]).tolist()]
-    labels = component_labels(occupancy, rule)
-    for start, goal, _ in lines:
-        if labels[start[::-1]] != labels[goal[::-1]]:
-            raise ValueError(f"{scenario}: no path leads from {start} to {goal}; check the files")
     known = rule is MoveRule.ROBOT_SAFE and grid.cost is None
     optima = np.array([optimum for _, _, optimum in lines]) if known else None
     requests = [(start, goal) for start, goal, _ in lines]
-    return BenchmarkMap(set_name, str(path), grid, requests, optima)
+    return BenchmarkMap(set_name, str(path), grid, requests, optima, precision)
 
 
-def _read_scenario(path: Path, grid: GridMap) -> list[tuple[Cell, Cell, float]]:
-    """Return start, goal and optimal length of each line of a MovingAI scenario file."""
-    requests = []
+def _read_scenario(
+    path: Path, grid: GridMap, move_rule: MoveRule
+) -> tuple[list[tuple[Cell, Cell, float]], float]:
+    """Return start, goal and optimum of each good line of a MovingAI scenario file.
+
+    Say on stderr which lines are bad. And return how far an optimum may be off because it is
+    rounded: half a unit of the last of the decimals that the file gives.
+    """
+    labels = component_labels(grid.occupancy, move_rule)
+    requests, bad, decimals = [], [], 0
     for number, line in enumerate(path.read_text(errors="replace").splitlines(), start=1):
         if (number == 1 and line.startswith("version")) or not line.strip():
             continue
         try:
-            *_, width, height, x, y, goal_x, goal_y, optimum = line.split()
-            shape = int(height), int(width)
-            start, goal = (int(x), int(y)), (int(goal_x), int(goal_y))
-            request = start, goal, float(optimum)
-        except ValueError:
-            raise ValueError(
-                f"{path}: line {number} is {line!r}; give bucket, map, width, height, start x and "
-                "y, goal x and y, optimal length"
-            ) from None
-        if shape != grid.occupancy.shape or not grid.is_free(start) or not grid.is_free(goal):
-            raise ValueError(
-                f"{path}: line {number} goes from {start} to {goal} on {width} x {height} cells; "
-                f"give free cells of its map of {grid.width} x {grid.height} cells"
-            )
-        requests.append(request)
+            start, goal, optimum = _parse_line(line, grid)
+            if labels[start[::-1]] != labels[goal[::-1]]:
+                raise ValueError(f"asks for a path from {start} to {goal}; none joins them")
+        except ValueError as error:
+            bad.append(f"{path}: line {number} {error}")
+            continue
+        requests.append((start, goal, float(optimum)))
+        decimals = max(decimals, -int(optimum.as_tuple().exponent))
     if not requests:
-        raise ValueError(f"{path}: has no requests; give a scenario file with some")
-    return requests
+        raise ValueError(bad[0] if bad else f"{path}: has no requests; give a file with some")
+    if bad:
+        more = f" (and {len(bad) - 1} more lines)" if bad[1:] else ""
+        tqdm.write(f"skipped: {bad[0]}{more}", file=sys.stderr)
+    return requests, 0.5 * 10.0**-decimals
+
+
+def _parse_line(line: str, grid: GridMap) -> tuple[Cell, Cell, Decimal]:
+    try:
+        *_, width, height, x, y, goal_x, goal_y, optimum = line.split()
+        shape = int(height), int(width)
+        start, goal = (int(x), int(y)), (int(goal_x), int(goal_y))
+        length = Decimal(optimum)
+        if not math.isfinite(length):
+            raise ValueError
+    except (ValueError, InvalidOperation):
+        raise ValueError(
+            f"is {line!r}; give bucket, map, width, height, start x and y, goal x and y, optimal "
+            "length"
+        ) from None
+    if shape != grid.occupancy.shape or not grid.is_free(start) or not grid.is_free(goal):
+        raise ValueError(
+            f"goes from {start} to {goal} on {width} x {height} cells; give free cells of its map "
+            f"of {grid.width} x {grid.height} cells"
+        )
+    return start, goal, length
 
 
 def _mpd_maps(path: Path, settings: RequestSettings) -> Iterator[BenchmarkMap]:
@@ -327,8 +353,7 @@ def _mpd_maps(path: Path, settings: RequestSettings) -> Iterator[BenchmarkMap]:
         goal = int(goal_x), int(goal_y)
         if occupancy[goal[1], goal[0]]:
             raise ValueError(f"{path}: goal {goal} of map {number} is occupied; give a free cell")
-        count = max(2, settings.requests // 100)
-        starts = _random_starts(occupancy, goal, settings.move_rule, count, random)
+        starts = _random_starts(occupancy, goal, settings.move_rule, settings.requests, random)
         yield BenchmarkMap(
             f"mpd {path.stem}",
             str(number),

@@ -1,4 +1,4 @@
-"""Model files: safetensors with JSON metadata. Nothing is ever unpickled."""
+"""Model files: safetensors with JSON metadata. Nothing in them is unpickled."""
 
 from __future__ import annotations
 

@@ -33,7 +33,9 @@ class HyperParameters:
         "double_dqn", "ours: the target, see training/double_dqn.py", "dqn", "printed"
     )
     reward: str = _choice("paper", "ours: the reward, see training/reward.py", "path_cost")
-    learning_rate: float = _parameter(0.01, "Table 1: Adam's learning rate", 1e-6, 1.0)
+    learning_rate: float = _parameter(
+        0.01, "section on the network: Adam's learning rate", 1e-6, 1.0
+    )
     batch_size: int = _parameter(32, "Table 1: transitions in a mini-batch", 1, 4096)
     gamma: float = _parameter(0.95, "Table 1: discount γ", 0.0, 1.0)
     obstacle_reward: float = _parameter(-10.0, "Table 1: reward of a collision", -1e3, 0.0)

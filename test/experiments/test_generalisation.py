@@ -186,7 +186,7 @@ def test_steps_through_walls_over_corners_and_of_two_cells_are_illegal() -> None
 
 
 def walk_of_optimum(optimum: float) -> Walk:
-    return Walk("set", "map", "9x9", optimum, math.nan, 1.0, True, 0, 1.0, 1.0, 1.0)
+    return Walk("set", "map", "9x9", optimum, None, 1.0, True, 0, 1.0, 1.0, 1.0)
 
 
 @given(st.floats(0, 1e6))
@@ -194,6 +194,11 @@ def test_an_optimum_lies_in_its_group_and_groups_double(optimum: float) -> None:
     low, high = map(int, walk_of_optimum(optimum).length_group.split("-"))
     assert low <= optimum < high
     assert (low, high) == (0, 16) or (high == 2 * low and math.log2(low / 16).is_integer())
+
+
+def test_a_walk_is_optimal_within_a_millionth() -> None:
+    walks = [replace(walk_of_optimum(10.0), ratio=ratio) for ratio in (1.0, 1.0000009, 1.00001)]
+    assert summarise(walks)[-1].optimal == 2
 
 
 def test_groups_of_optima_are_in_order() -> None:
@@ -254,6 +259,43 @@ def test_a_wrong_optimum_of_a_file_is_told() -> None:
     assert "the oracle agrees with 1/2" in markdown(summarise(walks), walks, "")
 
 
+def test_a_bad_line_of_a_scenario_file_is_told_and_the_others_are_used(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    good = ["0 c.map 3 3 0 0 1 0 1", "0 c.map 3 3 0 0 0 2 2"]
+    write_moving_ai(tmp_path, "c", CORNER, [good[0], "0 c.map 3 3 0 0 2 0 2", good[1]])
+    (read,) = read_maps(find_files(tmp_path), SAFE)
+    assert read.requests == [((0, 0), (1, 0)), ((0, 0), (0, 2))]
+    (line,) = capsys.readouterr().err.splitlines()
+    assert re.search(r"skipped: .*c\.scen: line 3 goes from \(0, 0\) to \(2, 0\).*cells$", line)
+    write_moving_ai(tmp_path, "c", CORNER, ["broken", good[0], "broken too", "0 c.map 1"])
+    (read,) = read_maps(find_files(tmp_path), SAFE)
+    assert read.requests == [((0, 0), (1, 0))]
+    (line,) = capsys.readouterr().err.splitlines()
+    assert re.search(r"line 2 is 'broken'; give .* \(and 2 more lines\)$", line)
+
+
+@pytest.mark.parametrize(
+    ("optima", "agree"),
+    [
+        (("1.41", "2.83", "2"), 3),  # two decimals, as the longest
+        (("1.40", "2.82", "2"), 1),
+        (("1.41", "2.83000000", "2"), 1),
+        (("1", "3", "2"), 3),  # whole cells
+        (("2", "2", "3"), 0),
+        (("1.41421356", "2.82842712", "2.00000000"), 3),
+    ],
+)
+def test_a_rounded_optimum_agrees_within_what_its_file_gives(
+    tmp_path: Path, optima: tuple[str, ...], agree: int
+) -> None:
+    goals = ("1 1", "2 2", "0 2")
+    lines = [f"0 c.map 3 3 0 0 {goal} {o}" for goal, o in zip(goals, optima, strict=True)]
+    write_moving_ai(tmp_path, "c", ["...", "...", "..."], lines)
+    walks = walk(PerfectNetwork(), *read_maps(find_files(tmp_path), SAFE))
+    assert f"the oracle agrees with {agree}/3." in markdown(summarise(walks), walks, "")
+
+
 def test_a_sample_of_a_scenario_file_has_short_and_long_paths_alike(tmp_path: Path) -> None:
     lines = [f"0 long.map 100 1 0 0 {x} 0 {x}" for x in range(99, 0, -1)]
     write_moving_ai(tmp_path, "long", ["." * 100], lines)
@@ -297,7 +339,7 @@ def test_mpd_maps_keep_their_goal_and_give_the_optimum_under_their_rule(
 ) -> None:
     path = tmp_path_factory.mktemp("mpd") / "m.npz"
     occupancies = write_mpd(path)
-    read = list(read_maps([path], RequestSettings(rule, 400, "none", seed)))
+    read = list(read_maps([path], RequestSettings(rule, 4, "none", seed)))
     for benchmark_map, occupancy in zip(read, occupancies, strict=True):
         np.testing.assert_array_equal(benchmark_map.grid.occupancy, occupancy)
         assert len(benchmark_map.requests) == 4
@@ -322,7 +364,8 @@ def test_mpd_maps_keep_their_goal_and_give_the_optimum_under_their_rule(
         ("c.scen", "version 1\n0 c.map 3 3 0 0 2 0 2", r"line 2 .*\(2, 0\) .*give free cells"),
         ("c.scen", "0 c.map 9 9 0 0 1 0 1", r"on 9 x 9 cells; .* of 3 x 3 cells"),
         ("c.scen", "version 1", r"c\.scen: has no requests"),
-        ("cut.scen", "0 cut.map 3 1 0 0 2 0 2", r"cut\.scen: no path leads from \(0, 0\)"),
+        ("c.scen", "0 c.map 3 3 0 0 1 0 nan", r"line 1 is .* nan'; give"),
+        ("cut.scen", "0 cut.map 3 1 0 0 2 0 2", r"cut\.scen: line 1 .* from \(0, 0\) to \(2, 0\)"),
     ],
 )
 def test_a_file_that_cannot_be_used_is_named_and_the_others_go_on(
@@ -393,6 +436,16 @@ def test_evaluate_prints_and_writes_its_tables(
         assert sums[0] == sums[1] == sums[2]
 
 
+def test_evaluate_gives_free_cells_the_costs_asked_for(tmp_path: Path, model: str) -> None:
+    means = {}
+    for priced in ("none", "random"):
+        out = tmp_path / f"{priced}.csv"
+        command = ["evaluate", "--model", model, "--kinds", "random_10", "--sizes", "16"]
+        assert main([*command, "--priced", priced, "--out", str(out)]) == 0
+        means[priced] = float(list(csv.DictReader(out.read_text().splitlines()))[-1]["mean"])
+    assert means["random"] > 1.1 * means["none"]  # this model does not see them
+
+
 def test_evaluate_says_which_sets_it_found(
     capsys: pytest.CaptureFixture[str], tmp_path: Path, model: str
 ) -> None:
@@ -407,7 +460,7 @@ def test_evaluate_says_which_sets_it_found(
     assert "1 MovingAI maps, 1 MovingAI scenario files, 1 MPD files" in error
     assert "skipped" not in error
     assert "| movingai c | 3x3 | 1 | 1 | 1/1 |" in printed
-    assert "| mpd m | 7x6 | 3 | 6 |" in printed
+    assert "| mpd m | 7x6 | 3 | 600 |" in printed
 
 
 @pytest.mark.parametrize(

@@ -9,7 +9,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from strategies import grids_with_free_cell
 
-from ddqn_planner.experiments.goal_1 import DIAGONALS, a_star
+from ddqn_planner.experiments import any_map
+from ddqn_planner.experiments.goal_1 import DIAGONALS, a_star, convergence_row
 from ddqn_planner.experiments.goal_2 import (
     free_starts,
     planned_field,
@@ -17,8 +18,9 @@ from ddqn_planner.experiments.goal_2 import (
 )
 from ddqn_planner.experiments.goal_3 import fixed_walk, noisy_maps
 from ddqn_planner.experiments.profiles import MOVE_RULE, PROFILES, VARIANTS, variant
+from ddqn_planner.experiments.trainings import TrainingEvaluation
 from ddqn_planner.grid import MOVES, Cell, GridMap, MoveRule, Noise, legal_moves, path_length
-from ddqn_planner.model import ModelMetadata, PropagationQNetwork
+from ddqn_planner.model import AnyMapQNetwork, ModelMetadata, PropagationQNetwork
 from ddqn_planner.planning import Planner, shortest_distances, shortest_path
 from ddqn_planner.planning.evaluation import length_ratios
 from ddqn_planner.training.environment import Scenario
@@ -41,6 +43,34 @@ def test_the_library_a_star_is_exact_under_both_rules(
 
 def test_the_papers_map_has_286_starts(paper: Scenario) -> None:
     assert free_starts(paper).sum() == 286
+
+
+def test_a_row_tells_from_when_on_a_path_is_found_and_is_the_shortest() -> None:
+    shortest, longer = 22.970562748, 24.142135624
+    lengths = [np.nan, longer, shortest, longer, shortest]
+    run = [
+        TrainingEvaluation(100 * n, n, 2 * n, 0.5 * n, int(n > 0), 0, length, 0.0)
+        for n, length in enumerate(lengths)
+    ]
+    never = [TrainingEvaluation(0, 0, 0, 0.0, 0, 0, np.nan, 0.0)]
+    assert convergence_row([run]) == ["1 (0) of 1", "100", "2", "0.5", "400", "22.97"]
+    both = convergence_row([run, never])
+    assert (both[0], both[-1]) == ("1 (0) of 2", "22.97")
+    assert "never" in both[1]
+
+
+@pytest.mark.parametrize(("possible", "wrong"), [(True, False), (False, True)])
+def test_moves_are_judged_wrongly_that_are_legal_and_not_believed_or_the_other_way_round(
+    possible: bool, wrong: bool
+) -> None:
+    network = AnyMapQNetwork(filters=2).requires_grad_(False)
+    network.moves.bias.fill_(100.0 if possible else -100.0)
+    metadata = ModelMetadata("any_map", {"filters": 2}, MOVE_RULE, 0.95, "", 0, 0, "")
+    judged, _ = any_map._judgement(Planner(network, metadata))
+    # A straight move is legal in half of the 256 surroundings of a free cell. A diagonal one too
+    # if corners may be cut, else in an eighth.
+    legal = 4 * (128 + 128 + 128 + 32)
+    assert judged == (legal if wrong else 4096 - legal)
 
 
 def test_every_start_of_a_field_is_walked(paper: Scenario) -> None:

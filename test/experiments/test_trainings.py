@@ -14,15 +14,18 @@ from ddqn_planner.experiments.taught import best_moves, cross_entropy, teach
 from ddqn_planner.experiments.trainings import (
     Training,
     TrainingEvaluation,
+    evaluate_training,
     in_parallel,
     optimal_value,
     read_evaluations,
     train,
 )
 from ddqn_planner.grid import LENGTHS, MOVES
+from ddqn_planner.model import load_model
 from ddqn_planner.planning import Planner, shortest_distances
 from ddqn_planner.training.environment import GridVectorEnvironment, Scenario
 from ddqn_planner.training.hyper_parameters import HyperParameters
+from ddqn_planner.training.trainer import Trainer
 
 QUICK = HyperParameters(steps=900, filters=4, learning_starts=50, target_interval=100)
 
@@ -42,8 +45,32 @@ def test_a_training_that_was_cut_off_ends_as_if_it_had_not_been(
     assert [e.step for e in runs[0]] == [300, 600, 900]
     for a, b in zip(*runs, strict=True):
         np.testing.assert_equal(asdict(replace(a, seconds=0.0)), asdict(replace(b, seconds=0.0)))
+    seconds = [e.seconds for e in runs[1]]
+    assert seconds == sorted(seconds)
     models = [whole.folder(tmp_path / name) / "model.safetensors" for name in ("whole", "cut")]
     assert models[0].read_bytes() == models[1].read_bytes()
+
+
+def test_the_last_of_the_networks_that_solve_the_most_is_kept(
+    small: Scenario, tmp_path: Path
+) -> None:
+    training = Training("small", QUICK, (small,), seed=1, evaluation_interval=50)
+    train(training, tmp_path)
+    folder = training.folder(tmp_path)
+    solved = [e.solved for e in read_evaluations(folder)]
+    assert solved.count(1) > 1
+    last = max(number for number, count in enumerate(solved) if count == 1)
+    assert load_model(folder / "kept.safetensors")[1].steps == 50 * (last + 1)
+
+
+def test_the_over_estimation_is_that_of_the_free_cells_but_the_goal(small: Scenario) -> None:
+    trainer = Trainer([small], MOVE_RULE, QUICK, seed=0)
+    optimum = np.full(20, -2.0, dtype=np.float32)
+    found = evaluate_training(trainer, optimum, seconds=1.0)
+    value = trainer.planner().q_field(small.grid, small.goal).q.max(axis=0)
+    cells = [cell for cell in small.grid.free_cells() if cell != small.goal]
+    expected = np.mean([value[y, x] + 2.0 for x, y in cells])
+    assert found.overestimation == pytest.approx(expected, rel=1e-5)
 
 
 def test_what_a_job_raises_is_raised(small: Scenario, tmp_path: Path) -> None:
@@ -93,7 +120,11 @@ def test_cross_entropy_is_zero_when_the_best_moves_have_all_the_weight() -> None
 def test_a_taught_network_walks_the_shortest_path(small: Scenario, tmp_path: Path) -> None:
     training = Training("taught", QUICK, (small,), seed=0, evaluation_interval=300)
     teach(training, tmp_path)
-    planner = Planner.load(training.folder(tmp_path) / "model.safetensors")
+    path = training.folder(tmp_path) / "model.safetensors"
+    written = path.stat().st_mtime_ns
+    teach(training, tmp_path)
+    assert path.stat().st_mtime_ns == written
+    planner = Planner.load(path)
     plan = planner.plan(small.grid, small.start, small.goal)
     optimum = shortest_distances(small.grid, small.goal, MOVE_RULE)[small.start[::-1]]
     assert plan.length == pytest.approx(optimum)

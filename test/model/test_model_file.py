@@ -61,6 +61,7 @@ def model_path(tmp_path: Path, network: PaperQNetwork) -> Path:
 def test_a_saved_model_comes_back_the_same(model_path: Path, network: PaperQNetwork) -> None:
     loaded, metadata = load_model(model_path)
     assert metadata == METADATA
+    assert not any(weight.requires_grad for weight in loaded.parameters())
     request = GridMap(np.zeros((4, 5))), (1, 1), MoveRule.ROBOT_SAFE
     np.testing.assert_array_equal(loaded.q_values(*request), network.q_values(*request))
 
@@ -147,6 +148,7 @@ def save_as(path: Path, weights: PaperQNetwork, **changes: object) -> None:
         ({"move_rule": "flying"}, "flying"),
         ({"sizes": {"height": 4, "width": 5, "filters": 10**9}}, "filters is 1000000000"),
         ({"sizes": {"height": 4, "width": 5, "filters": "2"}}, "filters is '2'"),
+        ({"sizes": {"height": 4, "width": 5, "filters": 0}}, "filters is 0"),
         ({"sizes": {"height": 4, "width": 5}}, "filters"),
         ({"sizes": {**METADATA.sizes, "hidden_units": -1}}, "hidden_units is -1"),
         ({"sizes": {**METADATA.sizes, "hidden_units": 3}}, "holds tensors"),

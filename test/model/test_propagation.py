@@ -1,14 +1,18 @@
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import pytest
+import torch
 from hypothesis import given
 from hypothesis import strategies as st
 from strategies import grids_with_free_cell, priced_grids_with_free_cell
 
 from ddqn_planner.grid import MOVES, OCCUPIED, Cell, GridMap, MoveRule, legal_moves
-from ddqn_planner.model import AnyMapQNetwork, PropagationQNetwork
+from ddqn_planner.model import AnyMapQNetwork, PropagationQNetwork, propagation
 from ddqn_planner.model.propagation import (
+    MAX_LEARNED_PRICE,
     features,
     kinds_of_surroundings,
     neighbours,
@@ -128,3 +132,84 @@ def test_values_that_never_settle_end_all_the_same() -> None:
         success, success, np.array([3]), neighbours((2, 2)), gamma=1.0, collision=-1.0
     )
     assert return_SAC.shape == (1, 8, 4)
+
+
+def test_a_value_is_settled_when_it_no_longer_changes() -> None:
+    # Two cells with a move to and fro and no way to the goal: V = r + γ V, and so r / (1 - γ).
+    success, reward = np.zeros((2, 1, 8, 3), dtype=np.float32)
+    success[0, 0, 0] = success[0, 4, 1] = 1.0
+    reward[:] = -1.0
+    (return_AC,) = propagate(
+        success, reward, np.array([2]), neighbours((1, 3)), gamma=0.9, collision=-20.0
+    )
+    assert [return_AC[0, 0], return_AC[4, 1]] == pytest.approx([-10.0, -10.0], abs=0.01)
+
+
+def test_values_spread_as_far_as_a_map_reaches() -> None:
+    cells = 2500
+    success, reward = np.zeros((2, 1, 8, cells), dtype=np.float32)
+    success[0, 0], reward[:] = 1.0, -1.0
+    (return_AC,) = propagate(
+        success,
+        reward,
+        np.array([cells - 1]),
+        neighbours((1, cells)),
+        gamma=1.0,
+        collision=-10_000.0,
+    )
+    assert return_AC[0, 0] == 1 - cells
+
+
+def told(network: AnyMapQNetwork | PropagationQNetwork, success: float, price: float = 1.0) -> None:
+    """Have a network say one p and one price of every move, whatever it sees."""
+    network.requires_grad_(False)
+    network.moves.weight.zero_()
+    network.moves.bias.fill_(math.log(success / (1 - success)))
+    if isinstance(network, AnyMapQNetwork):
+        network.prices.weight.zero_()
+        network.prices.bias.fill_(price - 1)
+
+
+@pytest.mark.parametrize("network_class", [PropagationQNetwork, AnyMapQNetwork])
+def test_a_move_is_possible_where_it_succeeds_more_often_than_not(
+    network_class: type[PropagationQNetwork] | type[AnyMapQNetwork],
+) -> None:
+    for success, possible in ((0.55, True), (0.45, False)):
+        network = network_class(filters=4)
+        told(network, success)
+        q = network.q_values(GridMap(np.zeros((1, 2))), (1, 0), MoveRule.ROBOT_SAFE)
+        assert q[0, 0, 0] == (-1.0 if possible else -np.inf)
+
+
+def test_a_price_beyond_belief_counts_as_the_greatest() -> None:
+    network = AnyMapQNetwork(filters=4)
+    grid = GridMap(np.zeros((1, 2)))
+    for price, believed in ((MAX_LEARNED_PRICE - 1, MAX_LEARNED_PRICE - 1), (1e4, 100.0)):
+        told(network, 0.9, price)
+        assert network.q_values(grid, (1, 0), MoveRule.ROBOT_SAFE)[0, 0, 0] == -believed
+
+
+def test_a_move_whose_price_is_nan_is_not_possible(monkeypatch: pytest.MonkeyPatch) -> None:
+    def checked(
+        kind: np.ndarray, cost_KA: np.ndarray, goal: Cell
+    ) -> np.ndarray:  # with NaN the front would never end
+        assert not np.isnan(cost_KA).any()
+        return spread(kind, cost_KA, goal)
+
+    spread = propagation.spread
+    monkeypatch.setattr(propagation, "spread", checked)
+    network = AnyMapQNetwork(filters=4)
+    told(network, 0.9)
+    network.prices.bias[0] = torch.nan
+    q = network.q_values(GridMap(np.zeros((2, 2))), (1, 0), MoveRule.ROBOT_SAFE)
+    assert q[0, 0, 0] == -np.inf
+    assert q[2, 0, 0] == pytest.approx(-1 - 2**0.5)  # up, and then down to the right
+
+
+def test_every_price_begins_where_it_has_a_gradient() -> None:
+    torch.manual_seed(0)
+    network = AnyMapQNetwork(filters=4)
+    _, price_BA = network(torch.zeros(1, 28))
+    price_BA.sum().backward()
+    assert network.prices.bias.grad is not None
+    assert network.prices.bias.grad.tolist() == [1.0] * 8

@@ -76,8 +76,20 @@ def test_the_maps_to_train_on_are_those_of_the_seed(seed: int) -> None:
 
 
 def test_the_maps_to_train_on_have_costs_of_every_sort() -> None:
-    costs = [scenario.grid.cost for scenario in random_scenarios(seed=0)]
+    grids = [scenario.grid for scenario in random_scenarios(seed=0)]
+    costs = [grid.cost for grid in grids]
     assert len(costs) == MAPS
+    filled = [grid.occupancy.mean() for grid in grids]
+    assert min(filled) < 0.15
+    assert max(filled) > 0.55
+    alike = [
+        int(grid.cost[~grid.occupancy].max())
+        for grid in grids
+        if grid.cost is not None and len(np.unique(grid.cost[~grid.occupancy])) == 1
+    ]
+    assert len(alike) > MAPS / 8
+    assert min(alike) < 10
+    assert max(alike) > 90
     assert any(cost is None for cost in costs)
     assert any(cost is not None and (cost == UNKNOWN).any() for cost in costs)
     assert any(cost is not None and len(np.unique(cost)) > 20 for cost in costs)

@@ -12,6 +12,7 @@ from ddqn_planner.grid import GridMap, MoveRule
 from ddqn_planner.model.observation import ROBOT
 from ddqn_planner.training.environment import GridEnvironment, GridVectorEnvironment, Scenario
 from ddqn_planner.training.hyper_parameters import HyperParameters
+from ddqn_planner.training.initialisation import initial_cells
 
 PARAMETERS = HyperParameters(max_episode_steps=12)
 
@@ -180,3 +181,14 @@ def test_a_move_that_succeeds_is_rewarded_for_the_goal_only_beside_it(small: Sce
     rewarded = {(int(c) % 5, int(c) // 5) for _, c in np.argwhere(environment.free_reward[0])}
     # The goal (4, 0) is at the end of its row: the first cells of the next one are far from it.
     assert rewarded == {(3, 0), (3, 1), (4, 1)}
+
+
+def test_an_episode_begins_in_each_free_cell_of_its_map_alike() -> None:
+    # Of the first map two cells are free; what pads its row does not count.
+    free = np.array([[1, 2, -1], [3, 4, 5]]).repeat(3000, axis=0)
+    count = np.array([2, 3]).repeat(3000)
+    start = np.zeros(6000, dtype=np.int64)
+    cells = initial_cells(start, free, count, 1.0, np.random.default_rng(0))
+    drawn, times = np.unique(cells, return_counts=True)
+    assert drawn.tolist() == [1, 2, 3, 4, 5]
+    assert times == pytest.approx([1500, 1500, 1000, 1000, 1000], rel=0.15)

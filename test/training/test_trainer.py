@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from ddqn_planner import MoveRule, PlanStatus
+from ddqn_planner import GridMap, MoveRule, PlanStatus
 from ddqn_planner.model import load_model
 from ddqn_planner.planning.evaluation import evaluate
 from ddqn_planner.training.environment import Scenario
@@ -136,6 +136,86 @@ def test_updates_keep_their_ratio_to_steps(
     assert trainer.updates == trainer.steps // interval
 
 
+def test_learning_starts_after_as_many_steps_as_asked_for(small: Scenario) -> None:
+    trainer = make(small, replace(QUICK, learning_starts=5))
+    train(trainer, 5)
+    assert trainer.updates == 0
+    train(trainer, 6)
+    assert trainer.updates == 1
+
+
+def test_epsilon_falls_linearly_and_then_stays(small: Scenario) -> None:
+    trainer = make(small, HyperParameters(epsilon_start=0.8, epsilon_end=0.2, epsilon_steps=100))
+    epsilons = []
+    for trainer.steps in (0, 25, 100, 101, 1000):
+        epsilons.append(trainer.epsilon)
+    assert epsilons == pytest.approx([0.8, 0.65, 0.2, 0.2, 0.2])
+
+
+def test_without_epsilon_the_robot_walks_by_the_network_alone(small: Scenario) -> None:
+    parameters = replace(QUICK, learning_starts=10**6, max_episode_steps=9, p_r=0.0)
+    walks = []
+    for epsilon in (0.0, 1.0):
+        parameters = replace(parameters, epsilon_start=epsilon, epsilon_end=epsilon)
+        walks.append({episode.cells for episode in train(make(small, parameters), 200)})
+    assert len(walks[0]) == 1  # the network does not change
+    assert len(walks[1]) > 5
+
+
+def test_the_target_is_copied_after_as_many_updates_as_asked_for(small: Scenario) -> None:
+    trainer = make(small, replace(QUICK, learning_starts=0, target_interval=3))
+    for _ in trainer.run(8):
+        target = trainer._target.state_dict().values()
+        same = all(torch.equal(x, y) for x, y in zip(weights(trainer), target, strict=True))
+        assert same == (trainer.updates % 3 == 0)
+    assert trainer.updates == 8
+
+
+def test_an_episode_adds_up_its_own_rewards_alone(small: Scenario) -> None:
+    parameters = replace(QUICK, alpha=0.0, beta=0.0, max_episode_steps=5)
+    totals = {
+        (episode.outcome, episode.total_reward) for episode in train(make(small, parameters), 2000)
+    }
+    assert totals == {
+        (Outcome.REACHED_GOAL, 10.0),
+        (Outcome.COLLIDED, -10.0),
+        (Outcome.OUT_OF_STEPS, 0.0),
+    }
+
+
+def test_a_model_says_what_it_was_trained_with(small: Scenario) -> None:
+    other = replace(small, grid=GridMap(np.zeros((4, 5))))
+    trainer = Trainer([small, other], MoveRule.UNIT, replace(QUICK, gamma=0.8), seed=3)
+    train(trainer, 2)
+    metadata = trainer.metadata()
+    assert (metadata.network, metadata.gamma, metadata.move_rule) == ("paper", 0.8, MoveRule.UNIT)
+    assert (metadata.seed, metadata.steps) == (3, 2)
+    assert metadata.map_fingerprint == small.grid.fingerprint != other.grid.fingerprint
+
+
+def test_after_a_truncated_move_the_target_still_bootstraps(small: Scenario) -> None:
+    # Episodes of one move each: it collides, or the episode is out of steps.
+    trainer = make(small, replace(QUICK, max_episode_steps=1, p_r=0.0))
+    outcomes = [episode.outcome for episode in train(trainer, 40)]
+    assert {*outcomes} == {Outcome.COLLIDED, Outcome.OUT_OF_STEPS}
+    stored = trainer._replay.transitions.discount[:40]
+    expected = [0.0 if outcome is Outcome.COLLIDED else 0.95 for outcome in outcomes]
+    assert stored.tolist() == pytest.approx(expected)
+
+
+def test_an_episode_that_was_interrupted_before_its_last_step_ends_with_that(
+    tmp_path: Path,
+) -> None:
+    nothing_to_hit = Scenario(GridMap(np.zeros((21, 21))), start=(10, 10), goal=(0, 0))
+    trainer = make(nothing_to_hit, replace(QUICK, max_episode_steps=5, p_r=0.0))
+    assert train(trainer, 4) == []
+    trainer.save_checkpoint(tmp_path / "checkpoint")
+    resumed = Trainer.load_checkpoint(tmp_path / "checkpoint", [nothing_to_hit])
+    (episode,) = train(resumed, 5)
+    assert (episode.outcome, episode.moves) == (Outcome.OUT_OF_STEPS, 5)
+    assert len(episode.cells) == 6
+
+
 def test_episodes_tell_how_they_went(small: Scenario) -> None:
     parameters = replace(QUICK, max_episode_steps=5)
     episodes = train(make(small, parameters), 2000)
@@ -149,6 +229,17 @@ def test_episodes_tell_how_they_went(small: Scenario) -> None:
         assert (episode.cells[-1] == small.goal) == (episode.outcome is Outcome.REACHED_GOAL)
         if episode.outcome is Outcome.OUT_OF_STEPS:
             assert episode.moves == 5
+
+
+def test_an_episode_names_its_map_and_the_step_at_which_it_ended(small: Scenario) -> None:
+    upside_down = replace(small, grid=GridMap(small.grid.occupancy[::-1]))
+    scenarios = [small, upside_down]
+    trainer = Trainer(scenarios, MoveRule.ROBOT_SAFE, QUICK, seed=0)
+    steps = 0
+    for episode in train(trainer, 500):
+        steps += episode.moves
+        assert episode.step == steps
+        assert all(scenarios[episode.scenario].grid.is_free(cell) for cell in episode.cells)
 
 
 def test_a_saved_model_plans_as_the_trainer_does(small: Scenario, tmp_path: Path) -> None:
@@ -167,8 +258,9 @@ def test_a_checkpoint_of_another_problem_is_refused(
     small: Scenario, paper: Scenario, tmp_path: Path
 ) -> None:
     make(small).save_checkpoint(tmp_path / "checkpoint")
-    with pytest.raises(CheckpointError, match="another map"):
-        Trainer.load_checkpoint(tmp_path / "checkpoint", [paper])
+    for other in (paper, replace(small, start=(0, 1)), replace(small, goal=(4, 1))):
+        with pytest.raises(CheckpointError, match="another map, start or goal"):
+            Trainer.load_checkpoint(tmp_path / "checkpoint", [other])
 
 
 @pytest.mark.parametrize("fraction", [0.0, 0.3, 0.9])

@@ -1,0 +1,155 @@
+"""One update of each learner, beside the same written down from the equations."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor, nn
+
+from ddqn_planner.grid import LENGTHS, MOVES, Cell, GridMap, MoveRule
+from ddqn_planner.model import AnyMapQNetwork, PaperQNetwork
+from ddqn_planner.model.propagation import features, surroundings
+from ddqn_planner.training.environment import Scenario
+from ddqn_planner.training.hyper_parameters import HyperParameters
+from ddqn_planner.training.replay_buffer import Transitions
+from ddqn_planner.training.trainer import Trainer
+
+Q = Callable[[Scenario, Cell], Tensor]
+"""Q(s, a) of all actions, (8,), for the robot in a cell of a scenario's map."""
+
+STEPS = 60
+
+
+def about_to_update(scenarios: list[Scenario], parameters: HyperParameters) -> Trainer:
+    """A trainer that has seen some steps; its two networks differ, it made no update yet."""
+    parameters = replace(parameters, learning_starts=10**6, environments=5, max_episode_steps=7)
+    trainer = Trainer(scenarios, MoveRule.CORNER_CUTTING, parameters, seed=1)
+    for _ in trainer.run(STEPS):
+        pass
+    torch.manual_seed(0)
+    for weight in trainer._target.parameters():
+        weight.add_(0.3 * torch.randn_like(weight))
+    trainer._learner.copy_target(trainer._target)
+    return trainer
+
+
+def next_batch(trainer: Trainer) -> Transitions:
+    """The transitions that the next update will draw."""
+    random = copy.deepcopy(trainer._sampling)
+    return trainer._replay.sample(trainer.parameters.batch_size, random)
+
+
+def mean_squared_error(
+    trainer: Trainer, batch: Transitions, online: Q, choose: Q, judge: Q
+) -> Tensor:
+    """Mean of (r + γ Q(s', argmax_a Q(s', a; choose); judge) - Q(s, a; online))², γ 0 at an end."""
+    width = trainer.environment.shape[1]
+    errors = []
+    for number, cell, action, reward, next_cell, discount in zip(*batch, strict=True):
+        scenario = trainer.scenarios[number]
+        state, next_state = ((int(c) % width, int(c) // width) for c in (cell, next_cell))
+        with torch.no_grad():
+            best = choose(scenario, next_state).argmax()
+            y = reward + discount * judge(scenario, next_state)[best]
+        errors.append((y - online(scenario, state)[action]) ** 2)
+    return torch.stack(errors).mean()
+
+
+def check_update(trainer: Trainer, loss: Tensor, before: list[Tensor], tolerance: float) -> None:
+    """Check gradients, and weights after Adam's first step: w - rate * g / (|g| + ε)."""
+    expected = torch.autograd.grad(loss, before)
+    trainer._update()
+    assert trainer.updates == 1
+    rate = trainer.parameters.learning_rate
+    scale = max(float(gradient.abs().max()) for gradient in expected)
+    for weight, gradient, old in zip(trainer.network.parameters(), expected, before, strict=True):
+        assert weight.grad is not None
+        torch.testing.assert_close(weight.grad, gradient, rtol=tolerance, atol=tolerance * scale)
+        step = rate * weight.grad / (weight.grad.abs() + 1e-8)
+        torch.testing.assert_close(weight.detach(), (old - step).detach())
+
+
+@pytest.mark.parametrize("target", ["double_dqn", "dqn", "printed"])
+def test_an_update_of_the_papers_network_is_that_of_the_equations(
+    small: Scenario, target: str
+) -> None:
+    scenarios = [small, replace(small, grid=GridMap(small.grid.occupancy[::-1]))]
+    trainer = about_to_update(scenarios, HyperParameters(target=target, filters=4))
+    network = copy.deepcopy(trainer.network)
+    assert isinstance(network, PaperQNetwork)
+
+    def q_of(network: nn.Module) -> Q:
+        def q(scenario: Scenario, cell: Cell) -> Tensor:
+            observation = torch.where(torch.tensor(scenario.grid.occupancy), -0.1, 0.0)
+            observation[scenario.goal[::-1]] = 1.0
+            observation[cell[::-1]] = 3.0
+            answer: Tensor = network(observation[None])[0]
+            return answer
+
+        return q
+
+    online, target_q = q_of(network), q_of(copy.deepcopy(trainer._target))
+    choose = target_q if target == "dqn" else online
+    judge = online if target == "printed" else target_q
+    batch = next_batch(trainer)
+    assert {0, 1} == set(batch.scenario)
+    assert {0.0, np.float32(0.95)} == set(batch.discount)
+    loss = mean_squared_error(trainer, batch, online, choose, judge)
+    check_update(trainer, loss, list(network.parameters()), tolerance=1e-4)
+
+
+def test_an_update_of_the_network_for_any_map_counts_each_reward_once(small: Scenario) -> None:
+    # Q(s, a) = p (r + γ V(s')) + (1 - p) r_o, r = -length * price, V = max Q under θ⁻.
+    cost = np.arange(20, dtype=np.int8).reshape(4, 5)
+    walls = small.grid.occupancy
+    scenarios = [
+        replace(small, grid=GridMap(walls, cost=cost)),
+        Scenario(GridMap(walls[::-1]), (4, 3), (0, 1), MoveRule.ROBOT_SAFE),
+    ]
+    parameters = HyperParameters(
+        network="any_map", reward="path_cost", gamma=0.5, obstacle_reward=-20.0, filters=4
+    )
+    trainer = about_to_update(scenarios, parameters)
+    network, judge_network = copy.deepcopy(trainer.network), copy.deepcopy(trainer._target)
+    assert isinstance(network, AnyMapQNetwork)
+    lengths = torch.from_numpy(LENGTHS.astype(np.float32))
+
+    def q_of(
+        network: nn.Module, scenario: Scenario, value: dict[Cell, float]
+    ) -> dict[Cell, Tensor]:
+        seen = surroundings(scenario.grid.occupancy, scenario.grid.cost)
+        rule = scenario.move_rule or MoveRule.CORNER_CUTTING
+        p, price = network(torch.from_numpy(features(seen, rule)))
+        answers = {}
+        for number in range(20):
+            x, y = number % 5, number // 5
+            onward = torch.tensor([value.get((x + dx, y + dy), -20.0) for dx, dy in MOVES.tolist()])
+            success = -lengths * price[number] + 0.5 * onward
+            answers[x, y] = p[number] * success + (1 - p[number]) * -20.0
+        return answers
+
+    online, judge = {}, {}
+    for scenario in scenarios:
+        value = {(x, y): -20.0 for x in range(5) for y in range(4)}
+        with torch.no_grad():
+            for _ in range(40):  # γ^40 is 1e-12
+                q = q_of(judge_network, scenario, value)
+                value = {cell: float(q_A.max()) for cell, q_A in q.items()}
+                value[scenario.goal] = 0.0
+            judge[scenario] = q_of(judge_network, scenario, value)
+        online[scenario] = q_of(network, scenario, value)
+    batch = next_batch(trainer)
+    assert {0, 1} == set(batch.scenario)
+    loss = mean_squared_error(
+        trainer,
+        batch,
+        online=lambda s, cell: online[s][cell],
+        choose=lambda s, cell: online[s][cell],
+        judge=lambda s, cell: judge[s][cell],
+    )
+    check_update(trainer, loss, list(network.parameters()), tolerance=2e-3)
