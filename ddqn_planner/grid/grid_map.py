@@ -78,9 +78,9 @@ class GridMap:
         if self.cost is not None:
             if np.shape(self.cost) != occupancy.shape:
                 raise ValueError(f"cost has shape {np.shape(self.cost)}; give {occupancy.shape}")
-            cost = np.where(occupancy, 0, self.cost)
-            cost = whole_numbers("costs of free cells", cost, UNKNOWN, OCCUPIED - 1)
-            cost = cost.astype(np.int8)
+            free, cost = ~occupancy, np.zeros(occupancy.shape, dtype=np.int8)
+            of_free = np.asarray(self.cost)[free]
+            cost[free] = whole_numbers("costs of free cells", of_free, UNKNOWN, OCCUPIED - 1)
             cost.flags.writeable = False
             object.__setattr__(self, "cost", cost)
         if self.obstacles is not None:

@@ -54,6 +54,12 @@ def test_clearance_costs_fall_with_the_distance_and_close_nothing(
     assert (price >= plain.price[free]).all()
 
 
+def test_a_radius_of_whole_cells_leaves_the_cell_at_that_distance_free() -> None:
+    # As a message brings it the resolution is less: two cells are 0.69999999 m.
+    grid = GridMap(np.array([[1, 0, 0, 0]]), float(np.float32(0.35)))
+    assert inflate(grid, 0.7).occupancy.tolist() == [[True, True, False, False]]
+
+
 def test_the_cost_falls_to_an_eighth_where_the_docstring_says() -> None:
     occupancy = np.zeros((1, 20), dtype=bool)
     occupancy[0, 0] = True
