@@ -114,7 +114,10 @@ def load_map(
 def read_map_file(path: str | Path) -> MapFile:
     """Read a ROS map (.yaml or .yml) or a map of the MovingAI benchmark (.map).
 
-    A ROS map is read as Nav2's map_server 1.3.7 and later reads it. Its YAML may also hold
+    A ROS map is read as Nav2's map_server 1.3.7 and later reads it. Images that Pillow
+    reads otherwise than map_server's GraphicsMagick are refused: colours of 16 bits, PPM and PGM
+    of other greatest values than 255 (or 65535, for grey), BMP of 16 or 32 bits without an alpha
+    channel, and PNG with a transparent colour besides a palette's. Its YAML may also hold
     ``ddqn_planner: {start: [x, y], goal: [x, y]}``, the cells of a scenario, which map_server
     ignores. Unlike there, the image must lie in the folder of the YAML file or below it, so that a
     map from elsewhere cannot name any file of this machine.

@@ -592,7 +592,8 @@ def _describe(problem: Problem, solution: Solution) -> str:
         sentence += ", searched for in the order of the Q field: the greedy steps were trapped"
     if solution.goal is not None and solution.goal != problem.goal:
         moved = float(np.hypot(*np.subtract(solution.goal, problem.goal)))
-        sentence += f"; the goal is occupied and moved {moved * problem.grid.resolution:.3g} m"
+        why = "cut off" if problem.grid.is_free(problem.goal) else "occupied"
+        sentence += f"; the goal is {why} and moved {moved * problem.grid.resolution:.3g} m"
     return sentence
 
 
