@@ -11,9 +11,8 @@ from PIL import Image
 
 IMAGE_FORMATS = ("PPM", "PNG", "BMP", "JPEG")
 
-RAW_MODES = {"1", "1;I", "L", "L;2", "L;4", "I;16B", "LA", "P", "P;1", "P;2", "P;4"} | {
-    "RGB", "RGBA", "BGR", "BGRA", "CMYK;I"
-}  # fmt: skip
+RAW_MODES = {"1", "1;I", "L", "L;2", "L;4", "LA", "I;16B", "P", "P;1", "P;2", "P;4"}
+RAW_MODES |= {"RGB", "RGBA", "BGR", "BGRA", "CMYK;I"}
 """Of how files store pixels (Pillow's names), those that are read as map_server does. In others
 Pillow drops bits, or map_server takes the fourth byte of a pixel as its opacity."""
 
@@ -63,7 +62,8 @@ def _grey(image: Image.Image) -> NDArray[np.uint8]:
         return (np.asarray(image) // 257).astype(np.uint8)
     if image.mode in ("1", "L", "LA"):
         return np.asarray(image.convert("L"))
-    red, green, blue = np.moveaxis(np.asarray(image.convert("RGB"), dtype=np.int32), 2, 0)
+    colours = image.convert("RGBA" if image.mode == "P" else "RGB")
+    red, green, blue = np.moveaxis(np.asarray(colours, dtype=np.int32), 2, 0)[:3]
     luma = (257 * (299 * red + 587 * green + 114 * blue) + 500) // 1000  # 0..65535, rounded
     grey: NDArray[np.uint8] = (luma // 257).astype(np.uint8)
     return grey

@@ -26,8 +26,15 @@ def shortest_distances(grid: GridMap, goal: Cell, move_rule: MoveRule | str) -> 
     -------
     (H, W) float64
         In cells; infinite where no path leads to the goal.
+
+    Raises
+    ------
+    ValueError
+        If the goal is no cell of the map, or there is no such move rule.
     """
     goal_x, goal_y = as_cell(goal, "the goal")
+    if not grid.contains(goal):
+        raise ValueError(f"the goal {goal} lies outside the map of {grid.width} x {grid.height}")
     graph = _graph(grid, move_rule)
     # A path may be walked back: every legal move is legal in reverse.
     distances = scipy.sparse.csgraph.dijkstra(graph, indices=goal_y * grid.width + goal_x)

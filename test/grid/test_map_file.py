@@ -131,6 +131,15 @@ def test_grey_205_is_unknown_only_below_its_threshold(
     assert read_map_file(path).values.item() == value
 
 
+def test_clear_colours_of_a_palette_are_unknown(tmp_path: Path) -> None:
+    image = Image.fromarray(np.array([[0, 1, 2]], dtype=np.uint8), "P")
+    image.putpalette([0, 0, 0, 0, 0, 0, 254, 254, 254])
+    image.save(tmp_path / "map.png", transparency=bytes([255, 254, 255]))
+    path = write(tmp_path, Image.open(tmp_path / "map.png"))
+    assert "transparency" in Image.open(tmp_path / "map.png").info
+    assert read_map_file(path).values.tolist() == [[100, -1, 0]]
+
+
 def test_what_is_not_opaque_is_unknown(tmp_path: Path) -> None:
     pixels = np.array([[[0, 0, 0, 255], [0, 0, 0, 254], [254, 254, 254, 0]]], dtype=np.uint8)
     path = write(tmp_path, Image.fromarray(pixels))

@@ -42,6 +42,9 @@ def test_any_pair_of_whole_numbers_is_a_goal() -> None:
             shortest_distances(grid, wrong, "unit")  # type: ignore[arg-type]
         with pytest.raises(ValueError, match="the start is "):
             shortest_path(grid, wrong, (0, 0), "unit")  # type: ignore[arg-type]
+    for outside in ((3, 0), (0, 2), (-1, 0)):
+        with pytest.raises(ValueError, match="outside the map of 3 x 2"):
+            shortest_distances(grid, outside, "unit")
 
 
 def test_columns_of_the_graph_are_in_order_and_short_numbers() -> None:
