@@ -82,9 +82,17 @@ class QField:
         -------
         Plan
             SUCCEEDED with every cell walked, or WALK_TRAPPED.
+
+        Raises
+        ------
+        ValueError
+            If the start is no cell of the map.
         """
         policy = self.policy
         cell = as_cell(start, "the start")
+        height, width = policy.shape
+        if not (0 <= cell[0] < width and 0 <= cell[1] < height):
+            raise ValueError(f"the start {cell} lies outside the map of {width} x {height} cells")
         cells, visited = [cell], {cell}
         while cell != self.goal:
             action = int(policy[cell[1], cell[0]])

@@ -298,6 +298,14 @@ def test_any_pair_of_whole_numbers_is_a_start_and_a_goal() -> None:
                 function(grid, wrong)  # type: ignore[operator]
 
 
+def test_a_walk_from_outside_the_map_is_refused() -> None:
+    field = ANY_MAP.q_field(GridMap(np.zeros((4, 6))), (5, 3))
+    for start in ((6, 0), (0, 4), (-1, 0), (0, -1)):
+        with pytest.raises(ValueError, match=r"outside the map of 6 x 4 cells"):
+            field.rollout(start)
+    assert field.rollout((5, 0)).cells
+
+
 def test_a_plan_knows_its_rule_and_counts_by_it() -> None:
     grid = GridMap(np.zeros((4, 6)))
     for rule, length in ((MoveRule.UNIT, 5), (MoveRule.ROBOT_SAFE, 2 + 3 * 2**0.5)):
