@@ -72,15 +72,15 @@ def touched_cells(first: Cell, last: Cell, move_rule: MoveRule | str) -> NDArray
     ----------
     first, last : (x, y)
     move_rule : MoveRule
-        Unless it cuts corners, cells that the segment touches at a corner count too.
+        Unless it cuts corners, cells that the segment touches at a corner count too. Some come
+        more than once.
     """
     passed, _ = _passed_cells(first, last)
     if MoveRule(move_rule).cuts_corners:
         return passed
-    before, after = passed[:-1], passed[1:]
-    at_corner = (before != after).all(axis=1)
-    corners = [np.stack([before[:, 0], after[:, 1]], 1), np.stack([after[:, 0], before[:, 1]], 1)]
-    return np.concatenate([passed, *(cells[at_corner] for cells in corners)])
+    # From one to the next at a corner it touches two more, else these are the same two again.
+    (x, y), (next_x, next_y) = passed[:-1].T, passed[1:].T
+    return np.concatenate([passed, np.stack([x, next_y], 1), np.stack([next_x, y], 1)])
 
 
 def segment_cost(

@@ -220,7 +220,9 @@ def test_colours_are_read_as_grey(tmp_path: Path) -> None:
 
 @same_folder
 @given(
-    numpy_st.arrays(np.int8, shapes(), elements=st.integers(-1, 100)),
+    st.sampled_from([st.integers(-1, 100), st.sampled_from([-1, 0, 100])]).flatmap(
+        lambda elements: numpy_st.arrays(np.int8, shapes(), elements=elements)
+    ),
     st.floats(0.01, 10),
     st.tuples(*3 * [st.floats(-100, 100)]),
     st.data(),
