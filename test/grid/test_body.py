@@ -69,6 +69,13 @@ def test_the_cost_falls_to_an_eighth_where_the_docstring_says() -> None:
     assert cost[0, 11] == 12  # 1 m beyond the body
 
 
+def test_a_robot_without_a_body_may_keep_clear_too() -> None:
+    grid = inflate(GridMap(np.array([[1, 0, 0]])), 0.0, 1.0)
+    assert grid.cost is not None
+    assert grid.cost[0, 1] > grid.cost[0, 2] > 0
+    assert grid.occupancy.tolist() == [[True, False, False]]
+
+
 def test_without_a_body_the_map_is_the_same() -> None:
     grid = GridMap(np.zeros((2, 2)))
     assert inflate(grid, 0.0) is grid

@@ -17,6 +17,7 @@ from strategies import occupancies, priced_grids_with_free_cell
 
 from ddqn_planner.grid import UNKNOWN, Cell, GridMap, MapFile, load_map, read_map_file, save_map
 from ddqn_planner.grid.map_file import (
+    MAX_YAML_BYTES,
     MapDataError,
     MapFileError,
     MapMetadataError,
@@ -416,6 +417,16 @@ def test_a_yaml_of_any_text_is_refused_as_a_map(tmp_path: Path, text: str) -> No
     path = tmp_path / "any.yaml"
     path.write_bytes(text.encode("utf-8", "surrogatepass"))
     with pytest.raises(MapMetadataError, match=r"any\.yaml"):
+        read_map_file(path)
+
+
+def test_a_yaml_may_have_so_many_bytes_and_no_more(tmp_path: Path) -> None:
+    path = write(tmp_path, np.zeros((1, 1), dtype=np.uint8))
+    text = path.read_text() + "#"
+    path.write_text(text.ljust(MAX_YAML_BYTES, "-"))
+    assert read_map_file(path).values.tolist() == [[100]]
+    path.write_text(text.ljust(MAX_YAML_BYTES + 1, "-"))
+    with pytest.raises(MapMetadataError, match=f"longer than {MAX_YAML_BYTES} bytes"):
         read_map_file(path)
 
 
