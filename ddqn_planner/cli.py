@@ -132,7 +132,7 @@ def _add_plan(plan: argparse.ArgumentParser) -> None:
     for name, words in (
         ("robot-radius", "metres that the path keeps from obstacles"),
         ("clearance-weight", "0 to 1: how much dearer cells near to obstacles are"),
-        ("tolerance", "metres that an occupied goal may move"),
+        ("tolerance", "metres that a goal may move that is occupied or cut off"),
     ):
         plan.add_argument(f"--{name}", type=float, default=0.0, metavar="X", help=words)
     plan.add_argument("--json", action="store_true", help="print JSON in place of text")
@@ -257,7 +257,7 @@ def _plan(options: argparse.Namespace) -> int:
     seconds = time.perf_counter() - began
     rule = options.move_rule or planner.metadata.move_rule
     if plan.cells:
-        goal = plan.cells[-1]  # another where the goal is occupied and a tolerance was given
+        goal = plan.cells[-1]  # another where it moved within the tolerance
     _print_plan(options, grid, plan, rule, seconds)
     field = None
     if grid.is_free(goal) and planner.network.supports((grid.height, grid.width)):

@@ -45,6 +45,21 @@ def test_plan_prints_the_papers_path(capsys: pytest.CaptureFixture[str]) -> None
     assert printed.count("S") == printed.count("G") == 1
 
 
+def test_plan_counts_by_its_rule(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["plan", "dilemma", "--move-rule", "unit"]) == 0
+    assert "length 18.00 cells, optimum 18.00 under unit" in capsys.readouterr().out
+
+
+def test_plan_reaches_the_cells_that_the_metres_of_its_tolerance_name(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    values = np.zeros((1, 9), dtype=np.int8)
+    values[0, 6:] = 100
+    save_map(MapFile(values, 0.05, start=(0, 0), goal=(8, 0)), tmp_path / "wall.yaml")
+    assert main(["plan", str(tmp_path / "wall.yaml"), "--json", "--tolerance", "0.15"]) == 0
+    assert json.loads(capsys.readouterr().out)["cells"][-1] == [5, 0]
+
+
 def test_plan_takes_the_model_for_any_map_and_prints_no_wide_map(
     capsys: pytest.CaptureFixture[str],
 ) -> None:

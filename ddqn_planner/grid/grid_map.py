@@ -6,13 +6,12 @@ import hashlib
 import math
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-Cell: TypeAlias = tuple[int, int]
-"""(x, y): x the column, y the row of ``occupancy[y, x]``."""
+from ddqn_planner.grid.arguments import Cell as Cell
+from ddqn_planner.grid.arguments import as_cell, whole_numbers
 
 OCCUPIED = 100
 """The value of an occupied cell (``nav_msgs/OccupancyGrid``)."""
@@ -39,17 +38,22 @@ class GridMap:
     origin : (float, float, float)
         Pose of the corner of cell (0, 0) in the map frame: x and y in metres, yaw in radians,
         counter-clockwise (the origin of ``nav_msgs/MapMetaData``).
-    cost : (H, W) int8, optional
+    cost : (H, W) int8, or any array or list of such numbers, optional
         What makes a free cell dear, as a value of ``nav_msgs/OccupancyGrid``: 0..99, or -1 where
-        it is unknown; see `price`. Values of occupied cells do not count. By default every free
-        cell is as good as any other. A read-only copy is kept.
+        it is unknown; see `price`. Values of occupied cells do not count, and become 0. By default
+        every free cell is as good as any other. A read-only copy is kept.
+    obstacles : (H, W) bool, optional
+        Which of the occupied cells are obstacles; the others are only too near to one for the
+        robot's body, so that a start there may leave. By default all are obstacles. `inflate`
+        makes such a map. A read-only copy is kept.
 
     Raises
     ------
     ValueError
         If the occupancy is not a two-dimensional array with at least one cell, or the resolution
         or the origin is not finite, or the resolution is not above 0, or the costs have another
-        shape or a value outside -1..100.
+        shape or a free cell's is not one of -1..99, or the obstacles have another shape or lie on
+        free cells.
     """
 
     occupancy: NDArray[np.bool_]
@@ -72,13 +76,11 @@ class GridMap:
         object.__setattr__(self, "resolution", float(self.resolution))
         object.__setattr__(self, "origin", origin)
         if self.cost is not None:
-            cost = np.where(occupancy, 0, self.cost) if self.cost.shape == occupancy.shape else None
-            if cost is None or cost.min() < UNKNOWN or cost.max() > OCCUPIED:
-                raise ValueError(
-                    f"cost has shape {self.cost.shape} and values {self.cost.min()}.."
-                    f"{self.cost.max()}; give {occupancy.shape}, -1..100"
-                )
-            cost = cost.astype(np.int8)
+            if np.shape(self.cost) != occupancy.shape:
+                raise ValueError(f"cost has shape {np.shape(self.cost)}; give {occupancy.shape}")
+            free, cost = ~occupancy, np.zeros(occupancy.shape, dtype=np.int8)
+            of_free = np.asarray(self.cost)[free]
+            cost[free] = whole_numbers("costs of free cells", of_free, UNKNOWN, OCCUPIED - 1)
             cost.flags.writeable = False
             object.__setattr__(self, "cost", cost)
         if self.obstacles is not None:
@@ -105,8 +107,9 @@ class GridMap:
 
         Parameters
         ----------
-        values : (H, W) int8
-            Occupancy in percent, 0..100, or -1 where unknown.
+        values : (H, W) int8, or any array or list of such integers
+            Occupancy in percent, 0..100, or -1 where unknown. As in a message any value below 0 is
+            unknown, and any above 100 is occupied.
         resolution, origin
             As for `GridMap`.
         occupied_threshold : int
@@ -116,8 +119,19 @@ class GridMap:
             Whether unknown cells are free.
         priced : bool
             Whether free cells keep their values as costs; else they are all alike.
+
+        Raises
+        ------
+        ValueError
+            If the values are not integers of int8, the threshold is outside 1..100, or for what
+            `GridMap` refuses.
         """
-        array = np.asarray(values, dtype=np.int16)
+        if not 1 <= occupied_threshold <= OCCUPIED:
+            raise ValueError(f"occupied_threshold is {occupied_threshold}; give 1 to {OCCUPIED}")
+        array = whole_numbers("occupancy values", values, -128, 127)
+        if array.dtype.kind == "f":  # which may be shares, 1.0 for occupied
+            raise ValueError(f"occupancy values are of type {array.dtype}; give integers, percent")
+        array = array.astype(np.int8, copy=False)
         unknown = array < 0
         occupied = (array >= occupied_threshold) | (unknown & (not allow_unknown))
         return cls(occupied, resolution, origin, np.maximum(array, UNKNOWN) if priced else None)
@@ -132,7 +146,7 @@ class GridMap:
         """Number of columns."""
         return int(self.occupancy.shape[1])
 
-    @property
+    @cached_property
     def price(self) -> NDArray[np.float32]:
         """(H, W) float32: what a cell of way costs in each cell, 1 to `MAX_PRICE`."""
         if self.cost is None:
@@ -151,16 +165,19 @@ class GridMap:
 
     def contains(self, cell: Cell) -> bool:
         """Say whether a cell lies inside the map."""
-        return 0 <= cell[0] < self.width and 0 <= cell[1] < self.height
+        x, y = as_cell(cell)
+        return 0 <= x < self.width and 0 <= y < self.height
 
     def is_free(self, cell: Cell) -> bool:
         """Say whether a cell lies inside the map and is not occupied."""
-        return self.contains(cell) and not self.occupancy[cell[1], cell[0]]
+        x, y = as_cell(cell)
+        return self.contains((x, y)) and not self.occupancy[y, x]
 
     def is_obstacle(self, cell: Cell) -> bool:
         """Say whether a cell of the map is an obstacle, and not just too near to one."""
+        x, y = as_cell(cell)
         obstacles = self.occupancy if self.obstacles is None else self.obstacles
-        return bool(obstacles[cell[1], cell[0]])
+        return bool(obstacles[y, x])
 
     def free_cells(self) -> list[Cell]:
         """Return the free cells as (x, y), row by row from y = 0."""

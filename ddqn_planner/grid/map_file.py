@@ -12,17 +12,20 @@ from typing import Any
 import numpy as np
 import yaml
 from numpy.typing import NDArray
-from PIL import Image
 
 from ddqn_planner.files import write_atomically
-from ddqn_planner.grid.grid_map import Cell, GridMap
+from ddqn_planner.grid.arguments import Cell, as_cell, whole_numbers
+from ddqn_planner.grid.grid_map import OCCUPIED, UNKNOWN, GridMap
+from ddqn_planner.grid.map_image import IMAGE_FORMATS, read_grey
 
 MAX_CELLS = 2**26
 """A larger map is refused before its cells are read."""
 
 MAX_YAML_BYTES = 2**16
 
-IMAGE_FORMATS = ("PPM", "PNG", "BMP", "JPEG")
+POSITIVE = ("0", "n", "no", "false", "off")
+NEGATIVE = ("1", "y", "yes", "true", "on")
+"""Values of ``negate``: whether dark pixels are occupied, or light ones."""
 
 _shortener = reprlib.Repr()
 # Lists that aliases nest may be of any size when they are written out.
@@ -74,14 +77,15 @@ class MapFile:
     goal: Cell | None = None
 
     def __post_init__(self) -> None:
-        values = np.asarray(self.values)
-        checked = GridMap(values == 100, self.resolution, self.origin)
-        if values.min() < -1 or values.max() > 100:
-            raise ValueError(f"values span {values.min()}..{values.max()}; give -1..100")
-        for name, cell in (("start", self.start), ("goal", self.goal)):
-            if cell is not None and not checked.contains(cell):
+        values = whole_numbers("values", self.values, UNKNOWN, OCCUPIED)
+        checked = GridMap(values == OCCUPIED, self.resolution, self.origin)
+        for name in ("start", "goal"):
+            if (cell := getattr(self, name)) is None:
+                continue
+            if not checked.contains(cell := as_cell(cell, name)):
                 size = f"{checked.width} x {checked.height}"
                 raise ValueError(f"{name} is {cell}; give a cell (x, y) of the map of {size} cells")
+            object.__setattr__(self, name, cell)
         values = values.astype(np.int8)
         values.flags.writeable = False
         object.__setattr__(self, "values", values)
@@ -110,7 +114,10 @@ def load_map(
 def read_map_file(path: str | Path) -> MapFile:
     """Read a ROS map (.yaml or .yml) or a map of the MovingAI benchmark (.map).
 
-    A ROS map is read as Nav2's map_server 1.3.7 and later reads it. Its YAML may also hold
+    A ROS map is read as Nav2's map_server 1.3.7 and later reads it. Images that Pillow
+    reads otherwise than map_server's GraphicsMagick are refused: colours of 16 bits, PPM and PGM
+    of other greatest values than 255 (or 65535, for grey), BMP of 16 or 32 bits without an alpha
+    channel, and PNG with a transparent colour besides a palette's. Its YAML may also hold
     ``ddqn_planner: {start: [x, y], goal: [x, y]}``, the cells of a scenario, which map_server
     ignores. Unlike there, the image must lie in the folder of the YAML file or below it, so that a
     map from elsewhere cannot name any file of this machine.
@@ -148,10 +155,15 @@ def read_map_file(path: str | Path) -> MapFile:
 
 
 def save_map(grid: GridMap | MapFile, path: str | Path) -> None:
-    """Write a ROS map that reads back equal: the YAML, and a PGM of the same name beside it.
+    """Write a ROS map: the YAML, and a PGM of the same name beside it.
 
     The mode is trinary, or raw if a value is not one of -1, 0 and 100. Each file is replaced as a
     whole, the image first.
+
+    A `MapFile` reads back equal. So does a `GridMap` without costs by ``load_map(path)``, and one
+    with costs by ``load_map(path, occupied_threshold=100, allow_unknown=True, priced=True)``: else
+    `load_map` takes costs of 65 or more and unknown cells as occupied. `GridMap.obstacles` is not
+    written.
 
     Parameters
     ----------
@@ -189,7 +201,7 @@ def save_map(grid: GridMap | MapFile, path: str | Path) -> None:
         "free_thresh": 0.196,  # grey 205 would be free at 0.25
     }
     scenario = {"start": grid.start, "goal": grid.goal}
-    cells = {name: list(map(int, cell)) for name, cell in scenario.items() if cell is not None}
+    cells = {name: list(cell) for name, cell in scenario.items() if cell is not None}
     if cells:
         metadata["ddqn_planner"] = cells
     pixels = grey[::-1].astype(np.uint8).tobytes()  # row 0 is the bottom row; raw -1 becomes 255
@@ -319,7 +331,7 @@ def _percent_of_grey(document: dict[str, Any], mode: str) -> NDArray[np.int8]:
             " 0 <= free_thresh <= occupied_thresh <= 1"
         )
     negate = _text(document, "negate")
-    if negate not in ("0", "1", "false", "true", "no", "yes", "off", "on"):
+    if negate not in (*POSITIVE, *NEGATIVE):
         raise ValueError(f"negate is {_short(negate)}; give 0 or 1")
     grey = np.arange(256)
     if mode == "raw":
@@ -329,30 +341,28 @@ def _percent_of_grey(document: dict[str, Any], mode: str) -> NDArray[np.int8]:
     # map_server calculates in single precision, and a value may equal a threshold.
     free, occupied = np.float32(free_thresh), np.float32(occupied_thresh)
     p = grey.astype(np.float32) / np.float32(255)
-    if negate in ("0", "false", "no", "off"):
+    if negate in POSITIVE:
         p = np.float32(1) - p
     percent = np.full(256, -1.0)
     if mode == "scale" and free < occupied:
-        percent = np.floor((p - free) / (occupied - free) * np.float32(100) + 0.5)
+        # Their difference alone is that of two doubles.
+        scaled = (p - free) / np.float32(occupied_thresh - free_thresh) * np.float32(100)
+        percent = np.floor(scaled) + (scaled - np.floor(scaled) >= 0.5)
     percent[p >= occupied] = 100
     percent[p <= free] = 0
     return percent.astype(np.int8)
 
 
 def _read_image(path: Path, percent: NDArray[np.int8], clear_is_unknown: bool) -> NDArray[np.int8]:
-    """Return (H, W) int8: the occupancy of each pixel; colours count by their Rec. 601 luma."""
+    """Return (H, W) int8: the occupancy of each pixel."""
     try:
-        with Image.open(path, formats=IMAGE_FORMATS) as image:
-            if image.width * image.height > MAX_CELLS:
-                raise ValueError(f"{image.width} x {image.height} pixels")
-            sixteen_bits = image.mode.startswith("I")
-            grey = np.asarray(image) // 257 if sixteen_bits else np.asarray(image.convert("L"))
-            values: NDArray[np.int8] = percent[grey]
-            if clear_is_unknown and ("A" in image.getbands() or "transparency" in image.info):
-                values[np.asarray(image.convert("RGBA").getchannel("A")) < 255] = -1
+        grey, clear = read_grey(path, MAX_CELLS)
     except Exception as error:  # Pillow raises whatever broken bytes lead its decoders to
         raise MapDataError(
             f"{str(path)!r}: not readable ({error}); give a {', '.join(IMAGE_FORMATS)} image of at"
             f" most {MAX_CELLS} pixels"
         ) from error
+    values: NDArray[np.int8] = percent[grey]
+    if clear_is_unknown:
+        values[clear] = UNKNOWN
     return values

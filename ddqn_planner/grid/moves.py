@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from enum import Enum
 
 import numpy as np
 import scipy.ndimage
 from numpy.typing import NDArray
+
+from ddqn_planner.grid.arguments import Cell, Choice, as_cell
 
 MOVES: NDArray[np.int64] = np.array(
     [(1, 0), (1, 1), (0, 1), (-1, 1), (-1, 0), (-1, -1), (0, -1), (1, -1)], dtype=np.int64
@@ -18,7 +19,7 @@ LENGTHS: NDArray[np.float64] = np.hypot(MOVES[:, 0], MOVES[:, 1])
 """(8,) float64: the length of each action in cells, 1 or sqrt(2)."""
 
 
-class MoveRule(str, Enum):
+class MoveRule(Choice):
     """Which diagonal moves are legal; a move into an occupied cell or off the map never is."""
 
     ROBOT_SAFE = "robot_safe"
@@ -27,11 +28,6 @@ class MoveRule(str, Enum):
     """A diagonal move needs no more than its target cell free (what the paper's 22.97 implies)."""
     UNIT = "unit"
     """As corner cutting, and every move counts 1 (the rule of the MPD data): for comparisons."""
-
-    @classmethod
-    def _missing_(cls, value: object) -> MoveRule:
-        known = ", ".join(rule.value for rule in cls)
-        raise ValueError(f"the move rule {value!r} is unknown; give one of {known}")
 
     @property
     def cuts_corners(self) -> bool:
@@ -44,7 +40,7 @@ class MoveRule(str, Enum):
         return np.ones(len(MOVES)) if self is MoveRule.UNIT else LENGTHS
 
 
-def legal_moves(occupancy: NDArray[np.bool_], move_rule: MoveRule) -> NDArray[np.bool_]:
+def legal_moves(occupancy: NDArray[np.bool_], move_rule: MoveRule | str) -> NDArray[np.bool_]:
     """Say for each cell which of the eight moves the robot may make from it.
 
     Parameters
@@ -59,6 +55,7 @@ def legal_moves(occupancy: NDArray[np.bool_], move_rule: MoveRule) -> NDArray[np
         ``[a, y, x]`` is True if action ``a`` leads from the free cell (x, y) to a free cell of the
         map and the rule allows it.
     """
+    rule = MoveRule(move_rule)
     height, width = occupancy.shape
     free = np.zeros((height + 2, width + 2), dtype=np.bool_)
     free[1:-1, 1:-1] = ~occupancy
@@ -69,12 +66,12 @@ def legal_moves(occupancy: NDArray[np.bool_], move_rule: MoveRule) -> NDArray[np
     legal = np.empty((len(MOVES), height, width), dtype=np.bool_)
     for action, (dx, dy) in enumerate(MOVES.tolist()):
         legal[action] = free_at(0, 0) & free_at(dx, dy)
-        if dx and dy and not move_rule.cuts_corners:
+        if dx and dy and not rule.cuts_corners:
             legal[action] &= free_at(dx, 0) & free_at(0, dy)
     return legal
 
 
-def move_costs(price: NDArray[np.float32], move_rule: MoveRule) -> NDArray[np.float64]:
+def move_costs(price: NDArray[np.float32], move_rule: MoveRule | str) -> NDArray[np.float64]:
     """Return what each move costs: its length times the mean price of the two cells that it joins.
 
     So a path costs the same in both directions.
@@ -95,12 +92,13 @@ def move_costs(price: NDArray[np.float32], move_rule: MoveRule) -> NDArray[np.fl
     onward = [
         padded[1 + dy : 1 + dy + height, 1 + dx : 1 + dx + width] for dx, dy in MOVES.tolist()
     ]
-    costs: NDArray[np.float64] = move_rule.lengths[:, None, None] * (price + np.stack(onward)) / 2
+    lengths = MoveRule(move_rule).lengths[:, None, None]
+    costs: NDArray[np.float64] = lengths * (price + np.stack(onward)) / 2
     return costs
 
 
 def connected_cells(
-    occupancy: NDArray[np.bool_], cell: tuple[int, int], move_rule: MoveRule
+    occupancy: NDArray[np.bool_], cell: Cell, move_rule: MoveRule | str
 ) -> NDArray[np.bool_]:
     """Return the cells that a path joins to a free cell.
 
@@ -117,12 +115,13 @@ def connected_cells(
     (H, W) bool
         True at each free cell from which a path of legal moves leads to `cell`, itself included.
     """
+    x, y = as_cell(cell)
     labels = component_labels(occupancy, move_rule)
-    connected: NDArray[np.bool_] = labels == labels[cell[1], cell[0]]
+    connected: NDArray[np.bool_] = labels == labels[y, x]
     return connected
 
 
-def component_labels(occupancy: NDArray[np.bool_], move_rule: MoveRule) -> NDArray[np.int32]:
+def component_labels(occupancy: NDArray[np.bool_], move_rule: MoveRule | str) -> NDArray[np.int32]:
     """Return which part of the map each cell belongs to: no path leads from one to another.
 
     Parameters
@@ -136,26 +135,29 @@ def component_labels(occupancy: NDArray[np.bool_], move_rule: MoveRule) -> NDArr
         1 or more for the free cells, the same for all that paths join; 0 for the occupied ones.
     """
     # Where a diagonal move needs both side cells free, two straight moves do the same.
-    diagonals = 2 if move_rule.cuts_corners else 1
+    diagonals = 2 if MoveRule(move_rule).cuts_corners else 1
     structure = scipy.ndimage.generate_binary_structure(2, diagonals)
     labels: NDArray[np.int32] = scipy.ndimage.label(~occupancy, structure)[0]
     return labels
 
 
-def path_length(cells: Sequence[tuple[int, int]]) -> float:
-    """Return the length of a path in cells: 1 for a straight move, sqrt(2) for a diagonal one.
+def path_length(cells: Sequence[Cell], move_rule: MoveRule | str = MoveRule.ROBOT_SAFE) -> float:
+    """Return the length of a path in cells.
+
+    A straight move counts 1 and a diagonal one sqrt(2), but under `MoveRule.UNIT` each counts 1.
 
     Parameters
     ----------
     cells : sequence of (x, y)
-        Each cell is a neighbour of the one before it.
+        Those of a plan, or some of them, joined by straight segments.
+    move_rule : MoveRule
     """
-    steps = np.diff(np.asarray(cells, dtype=np.float64).reshape(-1, 2), axis=0)
-    return float(np.hypot(steps[:, 0], steps[:, 1]).sum())
+    x, y = np.asarray(cells, dtype=np.int64).reshape(-1, 2).T
+    return float(segment_lengths(np.diff(x), np.diff(y), move_rule).sum())
 
 
 def path_cost(
-    cells: Sequence[tuple[int, int]], price: NDArray[np.float32], move_rule: MoveRule
+    cells: Sequence[Cell], price: NDArray[np.float32], move_rule: MoveRule | str
 ) -> float:
     """Return what a path costs: the sum of its moves' costs, see `move_costs`.
 
@@ -168,7 +170,28 @@ def path_cost(
     move_rule : MoveRule
     """
     x, y = np.asarray(cells, dtype=np.int64).reshape(-1, 2).T
-    # Actions 0 and 1: one straight, one diagonal.
-    lengths = move_rule.lengths[((np.diff(x) != 0) & (np.diff(y) != 0)).astype(np.int64)]
+    lengths = segment_lengths(np.diff(x), np.diff(y), move_rule)
     prices = price[y, x].astype(np.float64)
     return float((lengths * (prices[1:] + prices[:-1]) / 2).sum())
+
+
+def segment_lengths(
+    dx: NDArray[np.int64], dy: NDArray[np.int64], move_rule: MoveRule | str
+) -> NDArray[np.float64]:
+    """Return what straight segments count: their lengths, or under `MoveRule.UNIT` their moves.
+
+    Parameters
+    ----------
+    dx, dy : (N,) int64
+        From the first to the last cell of each segment.
+    move_rule : MoveRule
+
+    Returns
+    -------
+    (N,) float64
+        In cells.
+    """
+    if MoveRule(move_rule) is MoveRule.UNIT:
+        return np.maximum(np.abs(dx), np.abs(dy)).astype(np.float64)
+    lengths: NDArray[np.float64] = np.hypot(dx, dy)
+    return lengths

@@ -26,9 +26,6 @@ TOLERANCE = 1e-4
 MIN_RESOLUTION = 1e-6
 """Metres a cell."""
 
-ROUNDING = 1e-6
-"""A tolerance and a resolution come as float32: 0.1 m shall reach 2 cells of 0.05 m."""
-
 
 def grid_from_message(
     message: OccupancyGrid,
@@ -183,7 +180,7 @@ def cell_from_pose(name: str, header: Header, pose: Pose, grid: GridMap, frame: 
 
 
 def check_tolerance(tolerance: float) -> float:
-    """Return the tolerance of a request, metres, so that its last cell counts.
+    """Return the tolerance of a request, metres.
 
     Raises
     ------
@@ -192,7 +189,7 @@ def check_tolerance(tolerance: float) -> float:
     """
     if not 0 <= tolerance < math.inf:
         raise ValueError(f"the tolerance is {tolerance}; give metres, finite and 0 or more")
-    return tolerance * (1 + ROUNDING)
+    return tolerance
 
 
 def quaternion(yaw: float) -> Quaternion:

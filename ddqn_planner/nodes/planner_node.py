@@ -553,7 +553,7 @@ class PlannerNode(BaseNode):
             "status": outcome.status,
             "reason": outcome.sentence,
             "method": solution.plan.method.value,
-            "path length (cells)": f"{path_length(solution.cells):.3f}",
+            "path length (cells)": f"{path_length(solution.cells, solution.plan.move_rule):.3f}",
             "field time (ms)": f"{solution.field_ms:.3f}",
             "walk time (ms)": f"{solution.walk_ms:.3f}",
             **self._describe_model(),
@@ -585,14 +585,15 @@ def _warm_up(planner: Planner) -> None:
 
 def _describe(problem: Problem, solution: Solution) -> str:
     """Return how there is a path."""
-    sentence = f"a path of {path_length(solution.cells):.2f} cells"
+    sentence = f"a path of {path_length(solution.cells, problem.move_rule):.2f} cells"
     if solution.plan.method is PlanMethod.GREEDY:
         sentence += ", by greedy steps"
     else:
         sentence += ", searched for in the order of the Q field: the greedy steps were trapped"
     if solution.goal is not None and solution.goal != problem.goal:
         moved = float(np.hypot(*np.subtract(solution.goal, problem.goal)))
-        sentence += f"; the goal is occupied and moved {moved * problem.grid.resolution:.3g} m"
+        why = "cut off" if problem.grid.is_free(problem.goal) else "occupied"
+        sentence += f"; the goal is {why} and moved {moved * problem.grid.resolution:.3g} m"
     return sentence
 
 

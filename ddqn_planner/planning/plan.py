@@ -5,7 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from enum import Enum
 
-from ddqn_planner.grid import Cell, path_length
+from ddqn_planner.grid import Cell, MoveRule, path_length
+from ddqn_planner.grid.arguments import Choice
 
 
 class PlanStatus(str, Enum):
@@ -21,7 +22,7 @@ class PlanStatus(str, Enum):
     WALK_TRAPPED = "a path exists, but the model's greedy steps do not find it"
 
 
-class PlanMethod(str, Enum):
+class PlanMethod(Choice):
     """How a path is found, or was."""
 
     GREEDY = "greedy"
@@ -39,16 +40,22 @@ class Plan:
     status : PlanStatus
     cells : tuple of (x, y)
         From start to goal, every move legal; empty unless the status is SUCCEEDED. The goal is
-        another than the one asked for where that is occupied and a tolerance was given.
+        another than the one asked for where that is occupied or cut off and a tolerance was given.
     method : PlanMethod
         GUIDED if it was searched for because the greedy steps were trapped.
+    move_rule : MoveRule
+        The rule under which the moves are legal.
+    cost : float, optional
+        What the path costs, see `path_cost`: on a map with costs, if a planner made the plan.
     """
 
     status: PlanStatus
     cells: tuple[Cell, ...] = ()
     method: PlanMethod = PlanMethod.GREEDY
+    move_rule: MoveRule = MoveRule.ROBOT_SAFE
+    cost: float | None = None
 
     @property
     def length(self) -> float:
-        """Length in cells: 1 for a straight move, sqrt(2) for a diagonal one."""
-        return path_length(self.cells)
+        """Length in cells under the plan's rule, see `path_length`."""
+        return path_length(self.cells, self.move_rule)

@@ -10,7 +10,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from ddqn_planner.grid import Cell, GridMap, MoveRule, connected_cells, legal_moves
+from ddqn_planner.grid import Cell, GridMap, MoveRule, connected_cells, legal_moves, path_cost
+from ddqn_planner.grid.arguments import as_cell
 from ddqn_planner.grid.moves import component_labels
 from ddqn_planner.model import ModelMetadata, QNetwork, load_model
 from ddqn_planner.planning.plan import Plan, PlanMethod, PlanStatus
@@ -20,6 +21,10 @@ from ddqn_planner.planning.search import search
 CACHE_BYTES = 2**29
 """Memory for the Q fields that a planner keeps, the last ones used: two of 2000 x 2000 cells, at 45
 bytes a cell. The last one is kept whatever its size."""
+
+ROUNDING = 1e-6
+"""A tolerance and a resolution have errors of float32, or of a division: 0.15 m of cells of 0.05 m
+shall reach 3 cells, not 2.9999999."""
 
 
 @dataclass(frozen=True)
@@ -34,7 +39,7 @@ class Route:
         From the start to the first free cell: the start alone, where that is free. The cells
         between are too near to an obstacle.
     goal : (x, y)
-        A free cell: the goal, or the nearest that may stand for it.
+        A free cell: the goal, or the nearest that may stand for it and can be reached.
     """
 
     status: PlanStatus
@@ -77,7 +82,7 @@ class Planner:
         """
         return cls(*load_model(model))
 
-    def q_field(self, grid: GridMap, goal: Cell, move_rule: MoveRule | None = None) -> QField:
+    def q_field(self, grid: GridMap, goal: Cell, move_rule: MoveRule | str | None = None) -> QField:
         """Return the Q field of a map toward a goal; asked again, it is looked up.
 
         Parameters
@@ -93,6 +98,7 @@ class Planner:
         ValueError
             If the goal is not a free cell of the map, or the model cannot plan on this size.
         """
+        goal, rule = as_cell(goal, "the goal"), self._rule(move_rule)
         if not grid.is_free(goal):
             raise ValueError(f"the goal {goal} is not a free cell of the map; give another")
         if not self.network.supports((grid.height, grid.width)):
@@ -100,27 +106,29 @@ class Planner:
                 f"the model was not trained for maps of {grid.width} x {grid.height} cells; "
                 "train one on such a map"
             )
-        field = self.known_field(grid, goal, move_rule)
+        field = self.known_field(grid, goal, rule)
         if field is None:
-            rule = move_rule or self.metadata.move_rule
             q = self.network.q_values(grid, goal, rule)
-            field = QField(goal, q, legal_moves(grid.occupancy, rule))
-            self._remember(grid, rule, field)
+            field = QField(goal, q, legal_moves(grid.occupancy, rule), rule)
+            self._remember(grid, field)
         return field
 
     def known_field(
-        self, grid: GridMap, goal: Cell, move_rule: MoveRule | None = None
+        self, grid: GridMap, goal: Cell, move_rule: MoveRule | str | None = None
     ) -> QField | None:
         """Return the Q field of a map toward a goal if it was computed lately, else None."""
-        key = (grid.fingerprint, goal, move_rule or self.metadata.move_rule)
+        key = (grid.fingerprint, as_cell(goal, "the goal"), self._rule(move_rule))
         with self._lock:
             if key in self._fields:
                 self._fields.move_to_end(key)
             return self._fields.get(key)
 
-    def _remember(self, grid: GridMap, rule: MoveRule, field: QField) -> None:
+    def _rule(self, move_rule: MoveRule | str | None) -> MoveRule:
+        return self.metadata.move_rule if move_rule is None else MoveRule(move_rule)
+
+    def _remember(self, grid: GridMap, field: QField) -> None:
         with self._lock:
-            self._fields[grid.fingerprint, field.goal, rule] = field
+            self._fields[grid.fingerprint, field.goal, field.move_rule] = field
             size = sum(known.nbytes for known in self._fields.values())
             while size > self.cache_bytes and len(self._fields) > 1:
                 size -= self._fields.popitem(last=False)[1].nbytes
@@ -130,8 +138,8 @@ class Planner:
         grid: GridMap,
         start: Cell,
         goal: Cell,
-        move_rule: MoveRule | None = None,
-        method: PlanMethod = PlanMethod.GREEDY,
+        move_rule: MoveRule | str | None = None,
+        method: PlanMethod | str = PlanMethod.GREEDY,
         tolerance: float = 0.0,
     ) -> Plan:
         """Plan a path: `route`, `q_field`, and then `follow`.
@@ -145,7 +153,8 @@ class Planner:
         method : PlanMethod
             Whether to search where the greedy steps are trapped.
         tolerance : float
-            How far an occupied goal may move, in cells.
+            How far a goal that is occupied or cut off may move, in cells: to the nearest free cell
+            that a path reaches.
 
         Returns
         -------
@@ -156,11 +165,13 @@ class Planner:
         Raises
         ------
         ValueError
-            If the tolerance is negative or NaN.
+            If the tolerance is negative or NaN, the start or the goal is no pair of whole numbers,
+            or there is no such move rule or method.
         """
+        method, move_rule = PlanMethod(method), self._rule(move_rule)
         route = self.route(grid, start, goal, move_rule, tolerance)
         if route.status is not PlanStatus.SUCCEEDED:
-            return Plan(route.status)
+            return Plan(route.status, move_rule=move_rule)
         field = self.q_field(grid, route.goal, move_rule)
         return self.follow(route, grid, field, method, move_rule)
 
@@ -169,42 +180,46 @@ class Planner:
         grid: GridMap,
         start: Cell,
         goal: Cell,
-        move_rule: MoveRule | None = None,
+        move_rule: MoveRule | str | None = None,
         tolerance: float = 0.0,
     ) -> Route:
         """Say where a path enters the free cells and where it ends, or why there is none.
 
         The parameters are those of `plan`.
         """
-        rule = move_rule or self.metadata.move_rule
+        start, goal = as_cell(start, "the start"), as_cell(goal, "the goal")
+        rule = self._rule(move_rule)
         ruled_out = self._ruled_out(grid, start, goal, tolerance)
         if ruled_out:
             return Route(ruled_out)
-        if self._is_known(grid, start, goal, rule):
+        if self._is_a_walk(grid, start, goal, rule, tolerance):
             return Route(PlanStatus.SUCCEEDED, (start,), goal)
         # Where no path leads, there is no need to compute a field to say so.
-        goals = np.array([goal]) if grid.is_free(goal) else _free_cells(grid, goal, tolerance)
         labels = component_labels(grid.occupancy, rule)
-        labels_of_goals = labels[goals[:, 1], goals[:, 0]]
-        leave = _way_out(grid, start, np.isin(labels, labels_of_goals), rule)
-        if not leave:
-            free = grid.is_free(goal)
-            return Route(PlanStatus.NO_PATH if free else PlanStatus.GOAL_OCCUPIED)
-        label = labels[leave[-1][1], leave[-1][0]]
-        x, y = goals[np.argmax(labels_of_goals == label)].tolist()
-        return Route(PlanStatus.SUCCEEDED, leave, (x, y))
+        goals = [np.array([goal])] if grid.is_free(goal) else []
+        if _reach(tolerance) >= 1:
+            goals.append(_free_cells(grid, goal, _reach(tolerance)))
+        for candidates in goals:
+            labels_of_goals = labels[candidates[:, 1], candidates[:, 0]]
+            leave = _way_out(grid, start, np.isin(labels, labels_of_goals), rule)
+            if leave:
+                label = labels[leave[-1][1], leave[-1][0]]
+                x, y = candidates[np.argmax(labels_of_goals == label)].tolist()
+                return Route(PlanStatus.SUCCEEDED, leave, (x, y))
+        return Route(PlanStatus.NO_PATH if grid.is_free(goal) else PlanStatus.GOAL_OCCUPIED)
 
     def is_quick(
         self,
         grid: GridMap,
         start: Cell,
         goal: Cell,
-        move_rule: MoveRule | None = None,
+        move_rule: MoveRule | str | None = None,
         tolerance: float = 0.0,
     ) -> bool:
         """Say whether a look rules a path out, or it is a walk in a field that is known."""
-        return self._ruled_out(grid, start, goal, tolerance) is not None or self._is_known(
-            grid, start, goal, move_rule
+        start, goal = as_cell(start, "the start"), as_cell(goal, "the goal")
+        return self._ruled_out(grid, start, goal, tolerance) is not None or self._is_a_walk(
+            grid, start, goal, self._rule(move_rule), tolerance
         )
 
     def _ruled_out(
@@ -218,36 +233,50 @@ class Planner:
             return PlanStatus.GOAL_OUTSIDE_MAP
         if grid.is_obstacle(start):
             return PlanStatus.START_OCCUPIED
-        if not grid.is_free(goal) and tolerance < 1:
+        if not grid.is_free(goal) and _reach(tolerance) < 1:
             return PlanStatus.GOAL_OCCUPIED
         if not self.network.supports((grid.height, grid.width)):
             return PlanStatus.MAP_SIZE_UNSUPPORTED
         return None
 
-    def _is_known(self, grid: GridMap, start: Cell, goal: Cell, rule: MoveRule | None) -> bool:
-        return grid.is_free(start) and self.known_field(grid, goal, rule) is not None
+    def _is_a_walk(
+        self, grid: GridMap, start: Cell, goal: Cell, rule: MoveRule, tolerance: float
+    ) -> bool:
+        field = self.known_field(grid, goal, rule) if grid.is_free(start) else None
+        if field is None:
+            return False
+        # A goal that may move need not where a walk arrives.
+        return _reach(tolerance) < 1 or field.rollout(start).status is PlanStatus.SUCCEEDED
 
     def follow(
         self,
         route: Route,
         grid: GridMap,
         field: QField,
-        method: PlanMethod = PlanMethod.GREEDY,
-        move_rule: MoveRule | None = None,
+        method: PlanMethod | str = PlanMethod.GREEDY,
+        move_rule: MoveRule | str | None = None,
     ) -> Plan:
         """Walk a route in the field of its goal; see `plan`."""
-        rule, entry = move_rule or self.metadata.move_rule, route.leave[-1]
+        method, rule, entry = PlanMethod(method), self._rule(move_rule), route.leave[-1]
         plan = field.rollout(entry)
         if plan.status is PlanStatus.WALK_TRAPPED:
             joined = connected_cells(grid.occupancy, field.goal, rule)
             if not joined[entry[1], entry[0]]:
-                return Plan(PlanStatus.NO_PATH)
+                return Plan(PlanStatus.NO_PATH, move_rule=rule)
             if method is PlanMethod.GUIDED:
                 end = np.zeros(grid.occupancy.shape, dtype=np.bool_)
                 end[field.goal[1], field.goal[0]] = True
                 cells = search(entry, end, field.legal, grid.price, rule, field.value)
                 plan = Plan(PlanStatus.SUCCEEDED, cells, method)
-        return replace(plan, cells=route.leave[:-1] + plan.cells) if plan.cells else plan
+        if not plan.cells:
+            return replace(plan, move_rule=rule)
+        cells = route.leave[:-1] + plan.cells
+        cost = None if grid.cost is None else path_cost(cells, grid.price, rule)
+        return replace(plan, cells=cells, move_rule=rule, cost=cost)
+
+
+def _reach(tolerance: float) -> float:
+    return tolerance * (1 + ROUNDING)
 
 
 def _free_cells(grid: GridMap, goal: Cell, tolerance: float) -> NDArray[np.int64]:

@@ -8,7 +8,8 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from ddqn_planner.grid import MOVES, Cell
+from ddqn_planner.grid import MOVES, Cell, MoveRule
+from ddqn_planner.grid.arguments import as_cell
 from ddqn_planner.planning.plan import Plan, PlanStatus
 
 _STEPS: list[Cell] = [(int(dx), int(dy)) for dx, dy in MOVES]
@@ -26,11 +27,14 @@ class QField:
         What the network says of each action in each cell; -inf where it knows no way on.
     legal : (8, H, W) bool
         The legal moves: the robot knows its map, and takes no other.
+    move_rule : MoveRule
+        The rule that made them so.
     """
 
     goal: Cell
     q: NDArray[np.float32]
     legal: NDArray[np.bool_]
+    move_rule: MoveRule = MoveRule.ROBOT_SAFE
 
     @cached_property
     def value(self) -> NDArray[np.float32]:
@@ -66,7 +70,8 @@ class QField:
         """
         greedy_1HW = self.q.argmax(axis=0, keepdims=True)
         actions_A11 = np.arange(len(MOVES)).reshape(-1, 1, 1)
-        return QField(self.goal, self.q, self.legal & (actions_A11 == greedy_1HW))
+        legal = self.legal & (actions_A11 == greedy_1HW)
+        return QField(self.goal, self.q, legal, self.move_rule)
 
     def rollout(self, start: Cell) -> Plan:
         """Walk from a free cell to the goal by greedy steps alone.
@@ -77,15 +82,23 @@ class QField:
         -------
         Plan
             SUCCEEDED with every cell walked, or WALK_TRAPPED.
+
+        Raises
+        ------
+        ValueError
+            If the start is no cell of the map.
         """
         policy = self.policy
-        cell, cells = start, [start]
-        visited = {start}
+        cell = as_cell(start, "the start")
+        height, width = policy.shape
+        if not (0 <= cell[0] < width and 0 <= cell[1] < height):
+            raise ValueError(f"the start {cell} lies outside the map of {width} x {height} cells")
+        cells, visited = [cell], {cell}
         while cell != self.goal:
             action = int(policy[cell[1], cell[0]])
             cell = (cell[0] + _STEPS[action][0], cell[1] + _STEPS[action][1])
             if action < 0 or cell in visited:
-                return Plan(PlanStatus.WALK_TRAPPED)
+                return Plan(PlanStatus.WALK_TRAPPED, move_rule=self.move_rule)
             visited.add(cell)
             cells.append(cell)
-        return Plan(PlanStatus.SUCCEEDED, tuple(cells))
+        return Plan(PlanStatus.SUCCEEDED, tuple(cells), move_rule=self.move_rule)

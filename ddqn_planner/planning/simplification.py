@@ -8,9 +8,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ddqn_planner.grid import Cell, GridMap, MoveRule, path_cost
+from ddqn_planner.grid.arguments import as_cell
+from ddqn_planner.grid.moves import segment_lengths
+
+ROUNDING = 1e-9
+"""Of a sum of costs: a segment may cost so much more than what it replaces, as a share."""
 
 
-def simplify(cells: Sequence[Cell], grid: GridMap, move_rule: MoveRule) -> tuple[Cell, ...]:
+def simplify(cells: Sequence[Cell], grid: GridMap, move_rule: MoveRule | str) -> tuple[Cell, ...]:
     """Return some of a path's cells, so that straight segments between them are legal.
 
     A segment is legal if all cells that it passes through are free; under
@@ -29,20 +34,25 @@ def simplify(cells: Sequence[Cell], grid: GridMap, move_rule: MoveRule) -> tuple
     -------
     tuple of (x, y)
         The first and the last cell among them.
+
+    Raises
+    ------
+    ValueError
+        If a cell is no pair of whole numbers, or there is no such move rule.
     """
-    price = grid.price
+    rule, price = MoveRule(move_rule), grid.price
+    path = [as_cell(cell) for cell in cells]
 
     def joins(first: int, last: int) -> bool:
         if last - first == 1:  # a move of the path itself
             return True
-        touched = touched_cells(cells[first], cells[last], move_rule)
+        touched = touched_cells(path[first], path[last], rule)
         if grid.occupancy[touched[:, 1], touched[:, 0]].any():
             return False
-        length = float(np.hypot(*np.subtract(cells[last], cells[first])))
-        cost = length * float(price[touched[:, 1], touched[:, 0]].mean())
-        return cost <= path_cost(cells[first : last + 1], price, move_rule) + 1e-6
+        cost = segment_cost(path[first], path[last], price, rule)
+        return cost <= (1 + ROUNDING) * path_cost(path[first : last + 1], price, rule)
 
-    kept, last = [0] if cells else [], len(cells) - 1
+    kept, last = [0] if path else [], len(path) - 1
     while kept and kept[-1] < last:
         first, step, reached = kept[-1], 1, kept[-1] + 1
         while reached < last and joins(first, min(reached + step, last)):
@@ -52,39 +62,60 @@ def simplify(cells: Sequence[Cell], grid: GridMap, move_rule: MoveRule) -> tuple
             if reached + step <= last and joins(first, reached + step):
                 reached += step
         kept.append(reached)
-    return tuple(cells[index] for index in kept)
+    return tuple(path[index] for index in kept)
 
 
-def touched_cells(first: Cell, last: Cell, move_rule: MoveRule) -> NDArray[np.int64]:
+def touched_cells(first: Cell, last: Cell, move_rule: MoveRule | str) -> NDArray[np.int64]:
     """Return the cells that the segment between two cells' centres passes through: (N, 2) int64.
 
     Parameters
     ----------
     first, last : (x, y)
     move_rule : MoveRule
-        Unless it cuts corners, cells that the segment touches at a corner count too.
+        Unless it cuts corners, cells that the segment touches at a corner count too. Some come
+        more than once.
     """
-    dx, dy = last[0] - first[0], last[1] - first[1]
-    if abs(dy) > abs(dx):
-        swapped = touched_cells(first[::-1], last[::-1], move_rule)
-        return swapped[:, ::-1]
-    if dx == 0:
-        return np.array([first], dtype=np.int64)
-    sign = 1 if dx > 0 else -1
-    column = np.arange(abs(dx) + 1)
-    # In units of 1 / (2 |dx|) of a cell, so that all is whole: where the segment enters and leaves
-    # each column, above the first cell's centre.
-    enters = np.maximum(2 * column - 1, 0) * dy
-    leaves = np.minimum(2 * column + 1, 2 * abs(dx)) * dy
-    low, high = np.minimum(enters, leaves), np.maximum(enters, leaves)
-    unit = 2 * abs(dx)
-    if move_rule.cuts_corners:
-        lowest, highest = (low + abs(dx)) // unit, -((abs(dx) - high) // unit)
-    else:
-        lowest, highest = -((abs(dx) - low) // unit), (high + abs(dx)) // unit
-    cells = [
-        (first[0] + sign * x, first[1] + y)
-        for x, from_y, to_y in zip(column.tolist(), lowest.tolist(), highest.tolist(), strict=True)
-        for y in range(from_y, to_y + 1)
-    ]
-    return np.array(cells, dtype=np.int64)
+    passed, _ = _passed_cells(first, last)
+    if MoveRule(move_rule).cuts_corners:
+        return passed
+    # From one to the next at a corner it touches two more, else these are the same two again.
+    (x, y), (next_x, next_y) = passed[:-1].T, passed[1:].T
+    return np.concatenate([passed, np.stack([x, next_y], 1), np.stack([next_x, y], 1)])
+
+
+def segment_cost(
+    first: Cell, last: Cell, price: NDArray[np.float32], move_rule: MoveRule | str
+) -> float:
+    """Return what the segment between two cells' centres costs, as `path_cost` for a path.
+
+    Each cell's price counts for the share of the segment that lies within the cell: so does a
+    move's, half of which lies in each of its two cells.
+
+    Parameters
+    ----------
+    first, last : (x, y)
+    price : (H, W) float32
+        See `GridMap.price`.
+    move_rule : MoveRule
+    """
+    passed, share = _passed_cells(first, last)
+    vector = np.subtract(last, first)
+    length = segment_lengths(vector[:1], vector[1:], move_rule).item()
+    return length * float(share @ price[passed[:, 1], passed[:, 0]].astype(np.float64))
+
+
+def _passed_cells(first: Cell, last: Cell) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    """Return the cells that a segment passes through, in order, and the share within each.
+
+    They are (N, 2) int64 and (N,) float64.
+    """
+    vector = np.subtract(last, first)
+    width, height = np.maximum(np.abs(vector), 1).tolist()
+    # Where the segment crosses edges of cells, of 0..unit from its first to its last point, so
+    # that all is whole.
+    unit = 2 * width * height
+    columns, rows = (np.arange(1, 2 * abs(side), 2) for side in vector.tolist())
+    crossings = np.unique(np.concatenate([[0, unit], height * columns, width * rows]))
+    middle = crossings[:-1] + crossings[1:]  # twice that of each part
+    cells = np.asarray(first) + (middle[:, None] * vector + unit) // (2 * unit)
+    return cells, np.diff(crossings) / unit

@@ -54,6 +54,12 @@ def test_clearance_costs_fall_with_the_distance_and_close_nothing(
     assert (price >= plain.price[free]).all()
 
 
+def test_a_radius_of_whole_cells_leaves_the_cell_at_that_distance_free() -> None:
+    # As a message brings it the resolution is less: two cells are 0.69999999 m.
+    grid = GridMap(np.array([[1, 0, 0, 0]]), float(np.float32(0.35)))
+    assert inflate(grid, 0.7).occupancy.tolist() == [[True, True, False, False]]
+
+
 def test_the_cost_falls_to_an_eighth_where_the_docstring_says() -> None:
     occupancy = np.zeros((1, 20), dtype=bool)
     occupancy[0, 0] = True
@@ -61,6 +67,13 @@ def test_the_cost_falls_to_an_eighth_where_the_docstring_says() -> None:
     assert cost is not None
     assert cost[0, 1] == 99
     assert cost[0, 11] == 12  # 1 m beyond the body
+
+
+def test_a_robot_without_a_body_may_keep_clear_too() -> None:
+    grid = inflate(GridMap(np.array([[1, 0, 0]])), 0.0, 1.0)
+    assert grid.cost is not None
+    assert grid.cost[0, 1] > grid.cost[0, 2] > 0
+    assert grid.occupancy.tolist() == [[True, False, False]]
 
 
 def test_without_a_body_the_map_is_the_same() -> None:

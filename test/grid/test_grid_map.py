@@ -1,6 +1,9 @@
 from __future__ import annotations
 
+import json
 import math
+from fractions import Fraction
+from typing import Any
 
 import numpy as np
 import pytest
@@ -9,6 +12,7 @@ from hypothesis import strategies as st
 from strategies import occupancies
 
 from ddqn_planner.grid import UNKNOWN, GridMap
+from ddqn_planner.grid.arguments import as_cell
 
 origins = st.tuples(
     st.floats(-100, 100), st.floats(-100, 100), st.floats(-2 * math.pi, 2 * math.pi)
@@ -90,7 +94,12 @@ def test_occupancy_values_are_cut_at_the_threshold(
         ((np.zeros((1, 1)), 1.0, (0.0, 0.0)), "origin"),
         ((np.zeros((1, 1)), 1.0, (0.0, 0.0, 0.0), np.zeros((1, 2))), "cost has shape"),
         ((np.zeros((1, 1)), 1.0, (0.0, 0.0, 0.0), np.full((1, 1), -2)), "-2"),
-        ((np.zeros((1, 1)), 1.0, (0.0, 0.0, 0.0), np.full((1, 1), 101)), "101"),
+        ((np.zeros((1, 1)), 1.0, (0.0, 0.0, 0.0), np.full((1, 1), 100)), "hold 100; .*-1..99"),
+        ((np.zeros((1, 1)), 1.0, (0.0, 0.0, 0.0), [[0.7]]), r"hold 0\.7"),
+        ((np.zeros((1, 1)), 1.0, (0.0, 0.0, 0.0), [[math.nan]]), "hold nan"),
+        ((np.zeros((1, 1)), 1.0, (0.0, 0.0, 0.0), [["dear"]]), "are of type <U"),
+        ((np.zeros((1, 1)), 1.0, (0.0, 0.0, 0.0), 7), r"cost has shape \(\)"),
+        ((np.zeros((1, 1)), 1.0, (0.0, 0.0, 0.0), [7]), r"cost has shape \(1,\)"),
     ],
 )
 def test_a_malformed_map_is_refused_by_name(arguments: tuple, named: str) -> None:
@@ -109,3 +118,82 @@ def test_priced_free_cells_keep_their_values_and_are_the_dearer_the_greater_thes
     assert priced.price[0, [0, 1, 2, 5, 6]] == pytest.approx([1, 1.04, 3.56, 5, 5])
     assert priced.fingerprint != plain.fingerprint
     assert priced.fingerprint == GridMap(priced.occupancy, cost=priced.cost).fingerprint
+
+
+def test_costs_may_be_lists_or_arrays_of_any_numbers_and_those_of_occupied_cells_do_not_count() -> (
+    None
+):
+    for cost in ([[99, 100], [-1, 7]], np.array([[99.0, np.nan], [-1.0, 7.0]])):
+        grid = GridMap([[0, 1], [0, 0]], cost=cost)  # type: ignore[arg-type]
+        assert grid.cost is not None
+        assert grid.cost.dtype == np.int8
+        assert grid.cost.tolist() == [[99, 0], [-1, 7]]
+
+
+@pytest.mark.parametrize(
+    ("values", "threshold", "named"),
+    [
+        ([[0, 65536]], 65, "hold 65536"),
+        ([[0, 128]], 65, "hold 128"),
+        ([[0, -129]], 65, "hold -129"),
+        ([[0.0, 0.4]], 65, r"hold 0\.4"),
+        ([[0.0, 1.0]], 65, "of type float64; give integers, percent"),
+        ([[True, False]], 65, "of type bool"),
+        ([[0, 1], [0]], 65, "no array"),
+        ([[0, 1]], 0, "occupied_threshold is 0; give 1 to 100"),
+        ([[0, 1]], 101, "occupied_threshold is 101"),
+        ([[0, 1]], 200, "occupied_threshold is 200"),
+        ([[0, 1]], math.nan, "occupied_threshold is nan"),
+    ],
+)
+def test_occupancy_values_that_are_none_are_named(values: Any, threshold: Any, named: str) -> None:
+    with pytest.raises(ValueError, match=named):
+        GridMap.from_occupancy_values(values, occupied_threshold=threshold)
+
+
+def test_all_values_of_a_message_have_a_meaning() -> None:
+    grid = GridMap.from_occupancy_values([[-128, 127, 99, 100]], 1.0, occupied_threshold=100)
+    assert grid.occupancy.tolist() == [[True, True, False, True]]
+
+
+@pytest.mark.parametrize(
+    "cell",
+    [(2, 1), [2, 1], np.array([2, 1]), (np.int64(2), np.uint8(1)), (2.0, 1), (Fraction(2), True)],
+)
+def test_a_cell_is_any_pair_of_whole_numbers(cell: Any) -> None:
+    assert json.dumps(as_cell(cell)) == "[2, 1]"
+    occupancy = np.zeros((2, 3), dtype=bool)
+    grid = GridMap(occupancy)
+    assert grid.contains(cell)
+    assert grid.is_free(cell)
+    assert not grid.is_obstacle(cell)
+    occupancy[1, 2] = True
+    grid = GridMap(occupancy)
+    assert not grid.is_free(cell)
+    assert grid.is_obstacle(cell)
+
+
+@pytest.mark.parametrize(
+    "cell",
+    [
+        *[(0, 0, 0), (0,), (), 0, None, "00", "ab", (0.5, 0), (0, math.nan), (math.inf, 0), {0, 1}],
+        *[((0,), (0,)), ("0", "0"), np.zeros((2, 2)), {"x": 0, "y": 1}, (0, None)],
+    ],
+)
+def test_what_is_no_cell_is_named(cell: Any) -> None:
+    with pytest.raises(ValueError, match=r"(?s)the goal is .*; give two whole numbers \(x, y\)"):
+        as_cell(cell, "the goal")
+    with pytest.raises(ValueError, match="the cell is"):
+        GridMap(np.zeros((2, 2))).contains(cell)
+
+
+def test_a_cell_on_the_edges_of_the_map_is_told_from_one_beyond() -> None:
+    grid = GridMap(np.zeros((2, 3)))
+    assert grid.contains((0, 0))
+    assert grid.contains((2, 1))
+    assert not any(map(grid.contains, [(-1, 0), (0, -1), (3, 0), (0, 2)]))
+
+
+def test_only_obstacles_within_the_occupied_cells_are_such() -> None:
+    grid = GridMap([[1, 1, 0]], obstacles=np.array([[1, 0, 0]]))  # type: ignore[arg-type]
+    assert [grid.is_obstacle((x, 0)) for x in range(3)] == [True, False, False]

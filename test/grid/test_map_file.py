@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import math
 import os
+import struct
 from pathlib import Path
 from typing import Any
 
@@ -12,10 +13,11 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as numpy_st
 from PIL import Image
-from strategies import occupancies
+from strategies import occupancies, priced_grids_with_free_cell
 
-from ddqn_planner.grid import GridMap, MapFile, load_map, read_map_file, save_map
+from ddqn_planner.grid import UNKNOWN, Cell, GridMap, MapFile, load_map, read_map_file, save_map
 from ddqn_planner.grid.map_file import (
+    MAX_YAML_BYTES,
     MapDataError,
     MapFileError,
     MapMetadataError,
@@ -61,7 +63,7 @@ def occupancy_of(grey: int, mode: str, negate: bool, occupied: float, free: floa
         return 100
     if mode == "trinary":
         return -1
-    return math.floor(float((p - f(free)) / (f(occupied) - f(free)) * f(100)) + 0.5)
+    return math.floor(float((p - f(free)) / f(occupied - free) * f(100)) + 0.5)
 
 
 # Thresholds that a grey value equals are drawn often.
@@ -91,6 +93,37 @@ def test_each_mode_follows_map_servers_rule_and_row_0_is_the_bottom_one(
     assert (map_file.resolution, map_file.origin) == (0.05, (1.0, -2.0, 0.5))
 
 
+# What map_server's arithmetic gave when it was run, negated.
+@pytest.mark.parametrize(
+    ("mode", "grey", "free", "occupied", "value"),
+    [
+        ("trinary", 128, 0.1, 128 / 255, 100),  # a value that equals a threshold
+        ("trinary", 127, 0.1, 128 / 255, -1),
+        ("trinary", 26, 26 / 255, 0.9, 0),
+        ("trinary", 27, 26 / 255, 0.9, -1),
+        ("scale", 51, 0.0, 0.4, 50),
+        ("scale", 204, 0.17, 0.89, 87),  # the difference of two doubles
+        ("scale", 102, 0.33, 0.41, 87),  # the difference of two doubles
+        ("scale", 102, 0.33, 0.89, 12),  # the difference of two doubles
+    ],
+)
+def test_a_threshold_is_compared_in_single_precision(
+    tmp_path: Path, mode: str, grey: int, free: float, occupied: float, value: int
+) -> None:
+    pixel = np.array([[grey]], dtype=np.uint8)
+    path = write(tmp_path, pixel, mode=mode, negate=1, free_thresh=free, occupied_thresh=occupied)
+    assert read_map_file(path).values.item() == value
+
+
+@pytest.mark.parametrize(
+    ("word", "negated"), [("y", True), ("Y", True), ("on", True), ("n", False)]
+)
+def test_negate_is_any_yes_or_no_of_yaml(tmp_path: Path, word: str, negated: bool) -> None:
+    path = write(tmp_path, np.array([[0]], dtype=np.uint8))
+    path.write_text(path.read_text().replace("negate: 0", f"negate: {word}"))
+    assert read_map_file(path).values.item() == (0 if negated else 100)
+
+
 @pytest.mark.parametrize(("free_thresh", "value"), [(0.196, -1), (0.25, 0)])
 def test_grey_205_is_unknown_only_below_its_threshold(
     tmp_path: Path, free_thresh: float, value: int
@@ -99,10 +132,86 @@ def test_grey_205_is_unknown_only_below_its_threshold(
     assert read_map_file(path).values.item() == value
 
 
+def test_clear_colours_of_a_palette_are_unknown(tmp_path: Path) -> None:
+    image = Image.fromarray(np.array([[0, 1, 2]], dtype=np.uint8), "P")
+    image.putpalette([0, 0, 0, 0, 0, 0, 254, 254, 254])
+    image.save(tmp_path / "map.png", transparency=bytes([255, 254, 255]))
+    path = write(tmp_path, Image.open(tmp_path / "map.png"))
+    assert "transparency" in Image.open(tmp_path / "map.png").info
+    assert read_map_file(path).values.tolist() == [[100, -1, 0]]
+
+
 def test_what_is_not_opaque_is_unknown(tmp_path: Path) -> None:
     pixels = np.array([[[0, 0, 0, 255], [0, 0, 0, 254], [254, 254, 254, 0]]], dtype=np.uint8)
     path = write(tmp_path, Image.fromarray(pixels))
     assert read_map_file(path).values.tolist() == [[100, -1, -1]]
+
+
+# The greys that map_server's GraphicsMagick makes of them.
+COLOURS = {(13, 71, 98): 56, (11, 0, 12): 4, (13, 26, 25): 22, (5, 18, 17): 14, (72, 111, 67): 94}
+
+
+@pytest.mark.parametrize("mode", ["RGB", "P", "RGBA"])
+def test_luma_is_rounded_to_16_bits_and_cut_to_8(tmp_path: Path, mode: str) -> None:
+    pixels = np.array([list(COLOURS)], dtype=np.uint8)
+    image = Image.fromarray(pixels)
+    if mode == "P":
+        image = Image.fromarray(np.arange(len(COLOURS), dtype=np.uint8)[None], "P")
+        image.putpalette(pixels.ravel().tolist())
+    path = write(tmp_path, image.convert(mode), mode="raw")
+    assert read_map_file(path).values.tolist() == [list(COLOURS.values())]
+
+
+def bitmap_of_32_bits(compression: int) -> bytes:
+    """Return a BMP of one black pixel whose fourth byte is 0."""
+    masks = struct.pack("<III", 0xFF0000, 0xFF00, 0xFF) if compression else b""
+    header = struct.pack("<IiiHHIIiiII", 40, 1, 1, 1, 32, compression, 4, 0, 0, 0, 0) + masks
+    start = 14 + len(header)
+    return b"BM" + struct.pack("<IHHI", start + 4, 0, 0, start) + header + bytes(4)
+
+
+def pixels_after(head: bytes, dtype: str) -> bytes:
+    return head + np.array([1, 2, 3], dtype=dtype).tobytes()
+
+
+def png(folder: Path, pixels: np.ndarray, **options: Any) -> bytes:
+    Image.fromarray(pixels).save(folder / "pixels.png", **options)
+    return (folder / "pixels.png").read_bytes()
+
+
+def test_what_map_server_would_read_otherwise_is_refused(tmp_path: Path) -> None:
+    path = write(tmp_path, np.zeros((1, 1), dtype=np.uint8))
+    wide = np.array([[256, 257, 511]], dtype=np.uint16)
+    refused = {
+        "stored as raw": [bitmap_of_32_bits(0), bitmap_of_32_bits(3)],
+        "stored as ppm": [
+            pixels_after(b"P5 3 1 100\n", ">u1"),
+            pixels_after(b"P5 3 1 1000\n", ">u2"),
+            pixels_after(b"P6 1 1 65535\n", ">u2"),
+            b"P2 3 1 100\n1 2 3",
+        ],
+        "transparent": [
+            png(tmp_path, wide, transparency=257),
+            png(tmp_path, wide.astype(np.uint8), transparency=1),
+        ],
+    }
+    for reason, contents in refused.items():
+        for content in contents:
+            (tmp_path / "map.png").write_bytes(content)
+            with pytest.raises(MapDataError, match=reason):
+                read_map_file(path)
+    accepted = [
+        pixels_after(b"P5 3 1 255\n", ">u1"),
+        pixels_after(b"P5 3 1 65535\n", ">u2"),
+        pixels_after(b"P6 1 1 255\n", ">u1"),
+        b"P2 3 1 255\n1 2 3",
+        b"P2 3 1 65535\n1 2 3",
+        b"P1 3 1\n1 1 1",
+        png(tmp_path, wide),
+    ]
+    for content in accepted:
+        (tmp_path / "map.png").write_bytes(content)
+        assert set(read_map_file(path).values.ravel().tolist()) == {100}
 
 
 def test_colours_are_read_as_grey(tmp_path: Path) -> None:
@@ -112,7 +221,9 @@ def test_colours_are_read_as_grey(tmp_path: Path) -> None:
 
 @same_folder
 @given(
-    numpy_st.arrays(np.int8, shapes(), elements=st.integers(-1, 100)),
+    st.sampled_from([st.integers(-1, 100), st.sampled_from([-1, 0, 100])]).flatmap(
+        lambda elements: numpy_st.arrays(np.int8, shapes(), elements=elements)
+    ),
     st.floats(0.01, 10),
     st.tuples(*3 * [st.floats(-100, 100)]),
     st.data(),
@@ -139,11 +250,19 @@ def test_a_saved_map_comes_back_the_same(
     )
 
 
-def test_a_saved_grid_keeps_its_costs(tmp_path: Path) -> None:
-    grid = GridMap(np.array([[0, 1, 0]]), cost=np.array([[7, 0, 64]], dtype=np.int8))
-    save_map(grid, tmp_path / "saved.yaml")
-    assert load_map(tmp_path / "saved.yaml", priced=True).fingerprint == grid.fingerprint
-    assert load_map(tmp_path / "saved.yaml").cost is None
+@same_folder
+@given(priced_grids_with_free_cell())
+def test_a_saved_grid_keeps_its_costs_where_they_are_asked_for(
+    tmp_path: Path, grid_and_cell: tuple[GridMap, Cell]
+) -> None:
+    grid, _ = grid_and_cell
+    path = tmp_path / "saved.yaml"
+    save_map(grid, path)
+    read = load_map(path, occupied_threshold=100, allow_unknown=True, priced=True)
+    assert read.fingerprint == grid.fingerprint
+    assert grid.cost is not None
+    closed = (grid.cost >= 65) | (grid.cost == UNKNOWN)
+    np.testing.assert_array_equal(load_map(path).occupancy, grid.occupancy | closed)
 
 
 @same_folder
@@ -278,9 +397,9 @@ def test_a_number_may_be_written_in_any_way_that_map_server_reads(
 
 
 def test_a_wide_grey_value_counts_by_its_upper_byte(tmp_path: Path) -> None:
-    wide = np.array([[0, 100 * 257, 32768, 65535]], dtype=np.uint16)
+    wide = np.array([[0, 256, 257, 513, 100 * 257, 100 * 257 + 256, 65535]], dtype=np.uint16)
     path = write(tmp_path, Image.fromarray(wide), mode="raw")
-    assert read_map_file(path).values.tolist() == [[0, 100, -1, -1]]
+    assert read_map_file(path).values.tolist() == [[0, 0, 1, 1, 100, 100, -1]]
 
 
 def test_nothing_in_a_yaml_grows_or_runs_when_it_is_read(tmp_path: Path) -> None:
@@ -301,6 +420,16 @@ def test_a_yaml_of_any_text_is_refused_as_a_map(tmp_path: Path, text: str) -> No
         read_map_file(path)
 
 
+def test_a_yaml_may_have_so_many_bytes_and_no_more(tmp_path: Path) -> None:
+    path = write(tmp_path, np.zeros((1, 1), dtype=np.uint8))
+    text = path.read_text() + "#"
+    path.write_text(text.ljust(MAX_YAML_BYTES, "-"))
+    assert read_map_file(path).values.tolist() == [[100]]
+    path.write_text(text.ljust(MAX_YAML_BYTES + 1, "-"))
+    with pytest.raises(MapMetadataError, match=f"longer than {MAX_YAML_BYTES} bytes"):
+        read_map_file(path)
+
+
 @pytest.mark.parametrize("name", ["saved.pgm", "saved.map", "saved"])
 def test_a_map_is_saved_as_yaml_alone(tmp_path: Path, name: str) -> None:
     with pytest.raises(MapFileError, match=r"\.yaml"):
@@ -309,8 +438,9 @@ def test_a_map_is_saved_as_yaml_alone(tmp_path: Path, name: str) -> None:
 
 
 def test_numbers_of_numpy_are_saved(tmp_path: Path) -> None:
-    cell = (np.int64(1), np.int64(0))
-    save_map(MapFile(np.zeros((1, 2)), np.float64(0.5), start=cell), tmp_path / "saved.yaml")
+    map_file = MapFile([[0, 0]], np.float64(0.5), start=np.array([1, 0]))  # type: ignore[arg-type]
+    assert repr(map_file.start) == "(1, 0)"
+    save_map(map_file, tmp_path / "saved.yaml")
     read = read_map_file(tmp_path / "saved.yaml")
     assert (read.resolution, read.start) == (0.5, (1, 0))
 
@@ -320,9 +450,13 @@ def test_numbers_of_numpy_are_saved(tmp_path: Path) -> None:
     [
         {"values": np.zeros(3)},
         {"values": np.full((2, 2), 101)},
+        {"values": np.full((2, 2), -2)},
+        {"values": np.full((2, 2), 0.5)},
         {"resolution": 0.0},
         {"origin": (0.0, math.nan, 0.0)},
         {"goal": (2, 0)},
+        {"goal": (0.5, 0)},
+        {"start": (0, 0, 0)},
     ],
 )
 def test_an_impossible_map_file_cannot_be_made(wrong: dict[str, Any]) -> None:

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 
 import numpy as np
 import pytest
@@ -20,7 +21,7 @@ from ddqn_planner.grid import (
     path_cost,
     path_length,
 )
-from ddqn_planner.planning import shortest_distances
+from ddqn_planner.planning import shortest_distances, shortest_path, simplify
 
 RULES = st.sampled_from(list(MoveRule))
 
@@ -68,6 +69,39 @@ def test_a_legal_move_costs_its_length_times_the_mean_price_and_the_same_in_retu
         assert cost[(action + 4) % 8, next_y, next_x] == cost[action, y, x]
         move = [(x, y), (next_x, next_y)]
         assert path_cost(move, grid.price, rule) == pytest.approx(cost[action, y, x])
+
+
+@pytest.mark.parametrize("rule", MoveRule)
+def test_a_rule_is_given_as_a_member_or_as_its_value(rule: MoveRule) -> None:
+    occupancy = np.array([[0, 1, 0], [0, 0, 0], [0, 1, 1]], dtype=bool)
+    price, cells = np.arange(1, 10, dtype=np.float32).reshape(3, 3), [(0, 0), (1, 1), (2, 1)]
+    by_rule: list[Callable[[MoveRule | str], object]] = [
+        lambda rule: legal_moves(occupancy, rule).tolist(),
+        lambda rule: move_costs(price, rule).tolist(),
+        lambda rule: connected_cells(occupancy, (2, 0), rule).tolist(),
+        lambda rule: path_length(cells, rule),
+        lambda rule: path_cost(cells, price, rule),
+        lambda rule: shortest_distances(GridMap(occupancy), (0, 0), rule).tolist(),
+        lambda rule: shortest_path(GridMap(occupancy), (0, 0), (2, 1), rule),
+        lambda rule: simplify(cells, GridMap(occupancy), rule),
+    ]
+    for function in by_rule:
+        assert function(rule.value) == function(rule)
+        for wrong in ("nope", "", "ROBOT_SAFE", None):
+            with pytest.raises(
+                ValueError, match=f"{wrong!r} is unknown; give one of robot_safe, corner_c.*, unit"
+            ):
+                function(wrong)  # type: ignore[arg-type]
+
+
+def test_a_length_counts_moves_under_the_unit_rule_and_along_straight_segments() -> None:
+    for cells in ([(0, 0), (1, 1), (2, 2), (3, 2)], [(0, 0), (2, 2), (3, 2)]):
+        assert path_length(cells) == pytest.approx(2 * 2**0.5 + 1)
+        assert path_length(cells, MoveRule.CORNER_CUTTING) == pytest.approx(2 * 2**0.5 + 1)
+        assert path_length(cells, MoveRule.UNIT) == 3
+    assert path_length([(0, 0), (-5, 3)], "unit") == 5
+    assert path_length([(0, 0), (1, -4)], "unit") == 4
+    assert path_length([], "unit") == path_length([(1, 1)]) == 0
 
 
 def test_without_costs_a_path_costs_its_length_or_under_the_unit_rule_its_moves() -> None:

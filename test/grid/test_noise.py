@@ -29,6 +29,16 @@ def test_one_to_five_new_obstacles_lie_by_the_path_and_leave_a_way(
     assert connected_cells(noisy.occupancy, paper.goal, rule)[start_y, start_x]
 
 
+def test_as_many_as_the_paper_says_and_no_fewer_are_drawn(paper: Scenario) -> None:
+    path = shortest_path(paper.grid, paper.start, paper.goal, MoveRule.ROBOT_SAFE)
+    occupied, counts = np.count_nonzero(paper.grid.occupancy), set()
+    for seed in range(60):
+        random = np.random.default_rng(seed)
+        noisy, _ = scatter_obstacles(paper.grid, path, MoveRule.ROBOT_SAFE, random)
+        counts.add(np.count_nonzero(noisy.occupancy) - occupied)
+    assert counts == {1, 2, 3, 4, 5}
+
+
 def test_the_same_seed_scatters_the_same_obstacles(paper: Scenario) -> None:
     path = shortest_path(paper.grid, paper.start, paper.goal, MoveRule.ROBOT_SAFE)
     first, second = (

@@ -138,6 +138,22 @@ def test_costs_near_obstacles_keep_the_path_away_from_them(robot: Robot, hall: n
     assert length_of(plain) <= length_of(careful) < 1.5 * length_of(plain)
 
 
+def test_a_goal_that_is_cut_off_moves_within_the_tolerance_of_the_request(
+    robot: Robot, hall: np.ndarray
+) -> None:
+    closed = hall.copy()
+    closed[:, 10] = 100
+    robot.send_map(occupancy_message(closed, RESOLUTION, robot.grid.origin, Header(frame_id="map")))
+    ask(robot, lambda: not robot.get_plan(robot.pose((0, 0)), robot.pose((19, 0))).poses)
+    for tolerance, last in ((1.4, []), (1.5, [(9, 2)])):
+        request = GetPlan.Request(
+            start=robot.pose((0, 2)), goal=robot.pose((12, 2)), tolerance=tolerance
+        )
+        path = robot.client.call(GetPlan, "planner/get_plan", request).plan
+        assert cells_of(robot, path)[-1:] == last
+    robot.wait_for_reason("a path of .*; the goal is cut off and moved 1.5 m")
+
+
 def test_an_occupied_goal_moves_within_the_tolerance_of_the_request(robot: Robot) -> None:
     def get_plan(tolerance: float) -> Path:
         goal = robot.pose((10, 2), GOAL_YAW)

@@ -8,6 +8,7 @@ from strategies import priced_grids_with_free_cell
 
 from ddqn_planner.grid import MOVES, GridMap, MoveRule, legal_moves, move_costs, path_cost
 from ddqn_planner.planning import shortest_distances, shortest_path
+from ddqn_planner.planning.oracle import _graph
 
 RULES = st.sampled_from(list(MoveRule))
 
@@ -27,6 +28,32 @@ def test_distances_meet_bellmans_equation(
             for a in np.flatnonzero(legal[:, y, x])
         ]
         assert distance[y, x] == pytest.approx(min(by_move, default=np.inf))
+
+
+def test_any_pair_of_whole_numbers_is_a_goal() -> None:
+    grid = GridMap(np.zeros((2, 3)))
+    expected = shortest_distances(grid, (2, 1), MoveRule.UNIT)
+    for goal in ([2, 1], np.array([2, 1]), (2.0, np.int8(1))):
+        assert (shortest_distances(grid, goal, "unit") == expected).all()  # type: ignore[arg-type]
+        path = shortest_path(grid, np.array([0, 0]), goal, "unit")  # type: ignore[arg-type]
+        assert repr(path) == repr(shortest_path(grid, (0, 0), (2, 1), "unit"))
+    for wrong in ((0.5, 0), (0, 0, 0), None):
+        with pytest.raises(ValueError, match="the goal is "):
+            shortest_distances(grid, wrong, "unit")  # type: ignore[arg-type]
+        with pytest.raises(ValueError, match="the start is "):
+            shortest_path(grid, wrong, (0, 0), "unit")  # type: ignore[arg-type]
+    for outside in ((3, 0), (0, 2), (-1, 0)):
+        with pytest.raises(ValueError, match="outside the map of 3 x 2"):
+            shortest_distances(grid, outside, "unit")
+
+
+def test_columns_of_the_graph_are_in_order_and_short_numbers() -> None:
+    graph = _graph(GridMap(np.zeros((7, 5))), MoveRule.ROBOT_SAFE)
+    assert graph.indices.dtype == graph.indptr.dtype == np.int32
+    graph.has_sorted_indices = graph.has_canonical_format = False
+    sorted_graph = graph.sorted_indices()
+    assert (sorted_graph.indices == graph.indices).all()
+    assert (sorted_graph.data == graph.data).all()
 
 
 @given(priced_grids_with_free_cell(), RULES, st.data())

@@ -1,19 +1,25 @@
 from __future__ import annotations
 
+import json
+import time
+from collections.abc import Callable
+from dataclasses import replace
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
-from strategies import grids_with_free_cell, priced_grids_with_free_cell
+from strategies import grids_in_parts, grids_with_free_cell, priced_grids_with_free_cell
 
 from ddqn_planner import GridMap, MoveRule, PlanMethod, Planner, PlanStatus, QField, inflate
-from ddqn_planner.grid import LENGTHS, MOVES, Cell, connected_cells, legal_moves
+from ddqn_planner.grid import LENGTHS, MOVES, Cell, connected_cells, legal_moves, path_cost
 from ddqn_planner.model import ModelMetadata, PaperQNetwork
 from ddqn_planner.planning import shortest_distances
 from ddqn_planner.planning.evaluation import evaluate
+from ddqn_planner.planning.problem import Problem, solve
 
 RULES = st.sampled_from(list(MoveRule))
 ANY_MAP = Planner.load("any_map")
@@ -206,8 +212,152 @@ def test_the_memory_for_fields_is_bounded_and_the_last_ones_are_kept() -> None:
     known = [goal for goal in grid.free_cells() if planner.known_field(grid, goal)]
     assert known == grid.free_cells()[-4:]
     planner.cache_bytes = 1
-    planner.q_field(GridMap(np.zeros((3, 3)), cost=np.ones((3, 3), np.int8)), (0, 0))
+    last = GridMap(np.zeros((3, 3)), cost=np.ones((3, 3), np.int8))
+    planner.q_field(last, (0, 0))
+    assert planner.known_field(last, (0, 0)) is not None  # whatever its size
     assert not any(planner.known_field(grid, goal) for goal in grid.free_cells())
+
+
+def test_of_the_fields_those_are_kept_that_were_asked_for_last() -> None:
+    planner, grid = random_planner(3, 3, 0), GridMap(np.zeros((3, 3)))
+    first, second, third = grid.free_cells()[:3]
+    planner.cache_bytes = 2 * planner.q_field(grid, first).nbytes
+    planner.q_field(grid, second)
+    planner.q_field(grid, first)
+    planner.q_field(grid, third)
+    assert [bool(planner.known_field(grid, goal)) for goal in (first, second, third)] == [1, 0, 1]
+
+
+# What users give
+
+
+def test_choices_are_members_or_their_values_and_else_refused_with_a_list() -> None:
+    planner, grid = random_planner(3, 3, 1), GridMap(np.zeros((3, 3)))
+    start, goal = (0, 0), (2, 2)
+    planner.q_field(grid, goal)
+    route = planner.route(grid, start, goal)
+    by_rule: list[Callable[[Any], object]] = [
+        lambda rule: planner.plan(grid, start, goal, rule),
+        lambda rule: planner.q_field(grid, goal, rule),
+        lambda rule: planner.known_field(grid, goal, rule),
+        lambda rule: planner.route(grid, start, goal, rule),
+        lambda rule: planner.is_quick(grid, start, goal, rule),
+        lambda rule: planner.follow(route, grid, planner.q_field(grid, goal), move_rule=rule),
+    ]
+    for function in by_rule:
+        for rule in MoveRule:
+            assert function(rule.value) == function(rule)
+        with pytest.raises(ValueError, match="'nope' is unknown; give one of robot_safe, "):
+            function("nope")
+    by_method: list[Callable[[Any], object]] = [
+        lambda method: planner.plan(grid, start, goal, method=method),
+        lambda method: planner.plan(grid, start, (9, 9), method=method),
+        lambda method: planner.follow(route, grid, planner.q_field(grid, goal), method),
+    ]
+    for function in by_method:
+        for method in PlanMethod:
+            assert function(method.value) == function(method)
+        with pytest.raises(ValueError, match="'nope' is unknown; give one of greedy, guided"):
+            function("nope")
+
+
+def test_a_method_given_by_its_value_is_used() -> None:
+    grid = GridMap(np.zeros((6, 6)))
+    statuses = set()
+    for seed in range(10):
+        planner = random_planner(6, 6, seed)
+        greedy = planner.plan(grid, (0, 0), (5, 3))
+        guided = planner.plan(grid, (0, 0), (5, 3), method="guided")
+        assert guided.cells
+        assert (guided.method is PlanMethod.GUIDED) == (not greedy.cells)
+        statuses.add(greedy.status)
+    assert PlanStatus.WALK_TRAPPED in statuses
+
+
+def test_any_pair_of_whole_numbers_is_a_start_and_a_goal() -> None:
+    grid = GridMap(np.zeros((3, 4)))
+    planner = Planner(ANY_MAP.network, ANY_MAP.metadata)
+    for start, goal in (
+        ([0, 0], [3, 1]),
+        (np.array([0, 0]), np.array([3, 1])),
+        ((np.int64(0), np.int64(0)), (3.0, 1.0)),
+    ):
+        plan = planner.plan(grid, start, goal)  # type: ignore[arg-type]
+        assert json.loads(json.dumps(plan.cells))[-1] == [3, 1]
+        assert planner.is_quick(grid, start, goal)  # type: ignore[arg-type]
+        field = planner.q_field(grid, goal)  # type: ignore[arg-type]
+        assert field is planner.q_field(grid, (3, 1))
+        assert json.dumps(field.rollout(start).cells) == json.dumps(plan.cells)  # type: ignore[arg-type]
+        route = planner.route(grid, start, goal)  # type: ignore[arg-type]
+        assert json.dumps([route.leave, route.goal]) == "[[[0, 0]], [3, 1]]"
+    for wrong in ((0.5, 0), (0, 0, 0), "00", None, (0, np.nan)):
+        for arguments, name in (((wrong, (0, 0)), "start"), (((0, 0), wrong), "goal")):
+            for function in (planner.plan, planner.route, planner.is_quick):
+                with pytest.raises(ValueError, match=f"the {name} is .*; give two whole numbers"):
+                    function(grid, *arguments)  # type: ignore[operator]
+        for function in (planner.q_field, planner.known_field):
+            with pytest.raises(ValueError, match="the goal is "):
+                function(grid, wrong)  # type: ignore[operator]
+
+
+def test_a_walk_from_outside_the_map_is_refused() -> None:
+    field = ANY_MAP.q_field(GridMap(np.zeros((4, 6))), (5, 3))
+    for start in ((6, 0), (0, 4), (-1, 0), (0, -1)):
+        with pytest.raises(ValueError, match=r"outside the map of 6 x 4 cells"):
+            field.rollout(start)
+    assert field.rollout((5, 0)).cells
+
+
+def test_a_plan_knows_its_rule_and_counts_by_it() -> None:
+    grid = GridMap(np.zeros((4, 6)))
+    for rule, length in ((MoveRule.UNIT, 5), (MoveRule.ROBOT_SAFE, 2 + 3 * 2**0.5)):
+        field = ANY_MAP.q_field(grid, (5, 3), rule)
+        for plan in (
+            ANY_MAP.plan(grid, (0, 0), (5, 3), rule),
+            field.rollout((0, 0)),
+            field.unmasked().rollout((0, 0)),
+        ):
+            assert plan.move_rule is rule
+            assert plan.length == pytest.approx(length)
+            assert plan.cost is None
+    for goal in ((9, 9), (5, 3)):  # whatever becomes of it
+        trapped = random_planner(4, 6, 0).plan(grid, (0, 0), goal, "unit")
+        assert trapped.move_rule is MoveRule.UNIT
+
+
+@given(priced_grids_with_free_cell(), RULES, st.data())
+def test_on_a_map_with_costs_a_plan_knows_what_it_costs(
+    grid_and_goal: tuple[GridMap, Cell], rule: MoveRule, data: st.DataObject
+) -> None:
+    grid, goal = grid_and_goal
+    start = data.draw(st.sampled_from(grid.free_cells()))
+    plan = ANY_MAP.plan(grid, start, goal, rule)
+    assert (plan.cost is None) == (not plan.cells)
+    if plan.cost is not None:
+        assert plan.cost == path_cost(plan.cells, grid.price, rule)
+
+
+def test_a_solution_tells_how_long_field_and_walk_took() -> None:
+    class SlowNetwork:
+        def __getattr__(self, name: str) -> Any:
+            return getattr(ANY_MAP.network, name)
+
+        def q_values(self, *arguments: Any) -> Any:
+            time.sleep(0.05)
+            return ANY_MAP.network.q_values(*arguments)
+
+    planner, rule = Planner(SlowNetwork(), ANY_MAP.metadata), MoveRule.UNIT  # type: ignore[arg-type]
+    ANY_MAP.plan(GridMap(np.zeros((2, 2))), (0, 0), (1, 1))
+    problem = Problem(
+        planner, GridMap(np.zeros((5, 5))), (0, 0), (4, 2), rule, PlanMethod.GREEDY, 0.0, True
+    )
+    solution = solve(problem)
+    assert solution.field_ms >= 50
+    assert solution.walk_ms > 0
+    assert solution.goal == (4, 2)
+    failed = solve(replace(problem, goal=(9, 9)))
+    assert failed.plan.status is PlanStatus.GOAL_OUTSIDE_MAP
+    assert failed.goal is None
 
 
 # A search where the walk fails
@@ -281,26 +431,65 @@ def test_a_start_on_an_obstacle_cannot_leave() -> None:
     assert ANY_MAP.plan(grid, (2, 1), (0, 0)).status is PlanStatus.SUCCEEDED
 
 
-@given(grids_with_free_cell(), RULES, st.floats(0, 6), st.data())
-def test_an_occupied_goal_moves_to_the_nearest_reachable_free_cell_within_the_tolerance(
-    grid_and_start: tuple[GridMap, Cell], rule: MoveRule, tolerance: float, data: st.DataObject
+# Distances between cells are drawn as often as what lies between.
+TOLERANCES = st.floats(0, 6) | st.integers(0, 36).map(np.sqrt)
+
+
+@settings(max_examples=400)
+@given(grids_in_parts(), RULES, TOLERANCES, st.booleans(), st.data())
+def test_a_goal_moves_to_the_nearest_reachable_free_cell_within_the_tolerance(
+    grid_and_start: tuple[GridMap, Cell],
+    rule: MoveRule,
+    tolerance: float,
+    field_is_known: bool,
+    data: st.DataObject,
 ) -> None:
     grid, start = grid_and_start
     goal = data.draw(
         st.tuples(st.integers(0, grid.width - 1), st.integers(0, grid.height - 1)), label="goal"
     )
-    plan = ANY_MAP.plan(grid, start, goal, rule, tolerance=tolerance)
-    if grid.is_free(goal):
-        assert plan == ANY_MAP.plan(grid, start, goal, rule)
-        return
+    planner = Planner(ANY_MAP.network, ANY_MAP.metadata)
+    if field_is_known and grid.is_free(goal):
+        planner.q_field(grid, goal, rule)
+    quick = planner.is_quick(grid, start, goal, rule, tolerance)
+    route = planner.route(grid, start, goal, rule, tolerance)
+    plan = planner.plan(grid, start, goal, rule, tolerance=tolerance)
     rows, columns = np.nonzero(connected_cells(grid.occupancy, start, rule))
     nearest = np.hypot(columns - goal[0], rows - goal[1]).min()
     if nearest <= tolerance:
         assert plan.cells[0] == start
+        assert plan.cells[-1] == route.goal
         assert np.hypot(*np.subtract(plan.cells[-1], goal)) == pytest.approx(nearest)
         check_legal(plan.cells, grid.occupancy, rule)
+        assert quick == (nearest == 0 and field_is_known)
+    elif grid.is_free(goal):
+        assert plan.status is PlanStatus.NO_PATH
+        assert quick == (field_is_known and tolerance < 1)
     else:
         assert plan.status is PlanStatus.GOAL_OCCUPIED
+        assert quick == (tolerance < 1)
+
+
+@pytest.mark.parametrize(
+    ("tolerance", "cells"),
+    [(0.15 / 0.05, 3), (float(np.float32(0.7)) / float(np.float32(0.35)), 2), (2.99, 2), (1.0, 1)],
+)
+def test_a_tolerance_reaches_the_cells_that_its_metres_name(tolerance: float, cells: int) -> None:
+    for distance in range(1, 5):
+        occupancy = np.zeros((1, 9), dtype=bool)
+        occupancy[0, 9 - distance :] = True
+        plan = ANY_MAP.plan(GridMap(occupancy), (0, 0), (8, 0), tolerance=tolerance)
+        assert (plan.status is PlanStatus.SUCCEEDED) == (distance <= cells)
+
+
+def test_a_start_too_near_to_an_obstacle_finds_a_goal_that_is_cut_off() -> None:
+    occupancy = np.zeros((5, 12), dtype=bool)
+    occupancy[:, 8] = occupancy[2, 0] = True
+    grid = inflate(GridMap(occupancy), 1.1)
+    plan = ANY_MAP.plan(grid, (1, 2), (11, 2), tolerance=5.0)
+    assert (plan.cells[0], plan.cells[-1]) == ((1, 2), (6, 2))
+    assert ANY_MAP.plan(grid, (1, 2), (11, 2), tolerance=4.9).status is PlanStatus.NO_PATH
+    assert ANY_MAP.plan(grid, (1, 2), (5, 2), tolerance=5.0).cells[-1] == (5, 2)
 
 
 def test_a_tolerance_larger_than_the_map_is_no_harm() -> None:

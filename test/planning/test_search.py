@@ -43,6 +43,27 @@ def test_finds_a_legal_path_wherever_there_is_one_whatever_the_values(
             assert path_cost(cells, grid.price, rule) == pytest.approx(cheapest)
 
 
+def test_follows_the_values_even_on_a_detour() -> None:
+    grid, rule = GridMap(np.zeros((3, 5))), MoveRule.ROBOT_SAFE
+    detour = [(0, 0), (0, 1), (0, 2), (1, 2), (2, 2), (3, 2), (4, 2), (4, 1), (4, 0)]
+    value, end = np.zeros((3, 5), np.float32), np.zeros((3, 5), dtype=bool)
+    end[0, 4] = True
+    for x, y in detour:
+        value[y, x] = 100
+    legal = legal_moves(grid.occupancy, rule)
+    assert set(search((0, 0), end, legal, grid.price, rule, value)) <= set(detour)
+    assert len(search((0, 0), end, legal, grid.price, rule)) == 5
+
+
+def test_a_move_costs_the_mean_price_of_its_two_cells() -> None:
+    # From a dear start it is cheaper to leave by the straight move, though it ends a bit dearer.
+    grid = GridMap(np.array([[0, 0, 1], [1, 0, 0]]), cost=np.array([[99, 3, 0], [0, 0, 0]]))
+    rule, end = MoveRule.CORNER_CUTTING, np.zeros((2, 3), dtype=bool)
+    end[1, 2] = True
+    legal = legal_moves(grid.occupancy, rule)
+    assert search((0, 0), end, legal, grid.price, rule) == ((0, 0), (1, 0), (2, 1))
+
+
 def test_goes_to_the_nearest_of_several_ends() -> None:
     grid = GridMap(np.zeros((1, 9)))
     ends = np.zeros((1, 9), dtype=bool)

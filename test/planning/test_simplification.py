@@ -1,16 +1,18 @@
 from __future__ import annotations
 
 import math
+from fractions import Fraction
 from itertools import pairwise
 
 import numpy as np
-from hypothesis import given
+import pytest
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from strategies import grids_with_free_cell, priced_grids_with_free_cell
 
-from ddqn_planner.grid import Cell, GridMap, MoveRule, path_length
+from ddqn_planner.grid import Cell, GridMap, MoveRule, path_cost, path_length
 from ddqn_planner.planning import shortest_path, simplify
-from ddqn_planner.planning.simplification import touched_cells
+from ddqn_planner.planning.simplification import segment_cost, touched_cells
 
 RULES = st.sampled_from(list(MoveRule))
 CELLS = st.tuples(st.integers(-12, 12), st.integers(-12, 12))
@@ -57,22 +59,100 @@ def test_a_simplified_path_has_fewer_cells_no_illegal_segment_and_is_no_longer(
             assert not grid.occupancy[y, x]
 
 
-@given(priced_grids_with_free_cell(), st.data())
-def test_no_segment_is_dearer_than_what_it_replaces(
+def share_within(cell: Cell, first: Cell, last: Cell) -> Fraction:
+    """Return the share of a segment that lies within a cell, exactly: the cell clips it."""
+    enters, leaves = Fraction(0), Fraction(1)
+    for centre, begin, end in zip(cell, first, last, strict=True):
+        edges = [Fraction(2 * (centre - begin) + side, 2) for side in (-1, 1)]
+        if begin == end:
+            if not edges[0] < 0 < edges[1]:
+                return Fraction(0)
+            continue
+        times = sorted(edge / (end - begin) for edge in edges)
+        enters, leaves = max(enters, times[0]), min(leaves, times[1])
+    return max(leaves - enters, Fraction(0))
+
+
+def exact_cost(first: Cell, last: Cell, price: np.ndarray, rule: MoveRule) -> float:
+    vector = np.subtract(last, first)
+    length = np.abs(vector).max() if rule is MoveRule.UNIT else math.hypot(*vector)
+    columns, rows = (range(min(ends), max(ends) + 1) for ends in zip(first, last, strict=True))
+    cells = [(x, y) for x in columns for y in rows]
+    shares = [share_within(cell, first, last) for cell in cells]
+    assert sum(shares) == 1 or first == last
+    prices = [Fraction(float(price[y, x])) for x, y in cells]
+    return float(length * float(sum(a * b for a, b in zip(shares, prices, strict=True))))
+
+
+@given(priced_grids_with_free_cell(), RULES, st.data())
+def test_each_cell_counts_by_the_length_of_the_segment_within_it(
+    grid_and_cell: tuple[GridMap, Cell], rule: MoveRule, data: st.DataObject
+) -> None:
+    grid, first = grid_and_cell
+    last = data.draw(
+        st.tuples(st.integers(0, grid.width - 1), st.integers(0, grid.height - 1)), label="last"
+    )
+    exact = exact_cost(first, last, grid.price, rule)
+    assert segment_cost(first, last, grid.price, rule) == pytest.approx(exact)
+    if max(abs(last[0] - first[0]), abs(last[1] - first[1])) == 1:
+        assert path_cost([first, last], grid.price, rule) == pytest.approx(exact)
+
+
+def check_costs(grid: GridMap, cells: list[Cell], rule: MoveRule) -> None:
+    for first, last in pairwise(simplify(cells, grid, rule)):
+        part = cells[cells.index(first) : cells.index(last) + 1]
+        replaced = sum(exact_cost(a, b, grid.price, rule) for a, b in pairwise(part))
+        assert exact_cost(first, last, grid.price, rule) <= replaced * (1 + 1e-8)
+
+
+@settings(max_examples=200)
+@given(priced_grids_with_free_cell(), RULES, st.data())
+def test_no_segment_costs_more_than_what_it_replaces(
+    grid_and_goal: tuple[GridMap, Cell], rule: MoveRule, data: st.DataObject
+) -> None:
+    grid, goal = grid_and_goal
+    cells = shortest_path(grid, data.draw(st.sampled_from(grid.free_cells())), goal, rule)
+    check_costs(grid, cells, rule)
+
+
+def test_a_segment_through_little_of_what_is_dear_is_weighed_by_it() -> None:
+    cost = np.array([[0, 99, 0, 99], [50, 50, 50, 50]])
+    grid, cells = GridMap(np.zeros((2, 4)), cost=cost), [(0, 0), (1, 1), (2, 0), (3, 1)]
+    for rule in MoveRule:
+        check_costs(grid, cells, rule)
+        assert len(simplify(cells, grid, rule)) == 4
+    # The two cells that it passes through cost as much as those of the path.
+    grid = GridMap(np.zeros((2, 3)), cost=np.array([[10, 20, 30], [0, 0, 30]]))
+    assert simplify([(0, 0), (1, 0), (2, 0), (2, 1)], grid, "robot_safe")[0] == (0, 0)
+
+
+def test_under_the_unit_rule_diagonals_are_joined_and_no_segment_counts_more() -> None:
+    grid = GridMap(np.zeros((9, 12)))
+    cells = [(x, x) for x in range(9)]
+    assert simplify(cells, grid, MoveRule.UNIT) == ((0, 0), (8, 8))
+    cells += [(9, 8), (10, 8), (11, 8)]
+    simple = simplify(cells, grid, MoveRule.UNIT)
+    assert len(simple) <= 3
+    assert path_length(simple, MoveRule.UNIT) == path_length(cells, MoveRule.UNIT) == 11
+
+
+@given(grids_with_free_cell(), st.data())
+def test_under_the_unit_rule_a_shortest_path_keeps_its_length(
     grid_and_goal: tuple[GridMap, Cell], data: st.DataObject
 ) -> None:
     grid, goal = grid_and_goal
-    rule = MoveRule.ROBOT_SAFE
-    cells = shortest_path(grid, data.draw(st.sampled_from(grid.free_cells())), goal, rule)
-    simple = simplify(cells, grid, rule)
-    price = grid.price
-    for first, last in pairwise(simple):
-        part = cells[cells.index(first) : cells.index(last) + 1]
-        touched = touched_cells(first, last, rule)
-        dearness = price[touched[:, 1], touched[:, 0]].mean()
-        steps = pairwise(part)
-        cost = sum(math.dist(a, b) * (price[a[::-1]] + price[b[::-1]]) / 2 for a, b in steps)
-        assert len(part) == 2 or dearness * math.dist(first, last) <= cost + 1e-5
+    start = data.draw(st.sampled_from(grid.free_cells()))
+    cells = shortest_path(grid, start, goal, MoveRule.UNIT)
+    simple = simplify(cells, grid, MoveRule.UNIT)
+    assert path_length(simple, "unit") <= path_length(cells, "unit") == max(len(cells) - 1, 0)
+
+
+def test_any_pairs_of_whole_numbers_are_cells_and_come_back_as_python_ints() -> None:
+    grid = GridMap(np.zeros((3, 5)))
+    cells = np.array([(0, 0), (1, 0), (2, 0), (3, 1), (4, 2)])
+    assert repr(simplify(cells, grid, "unit")) == repr(simplify(cells.tolist(), grid, "unit"))
+    with pytest.raises(ValueError, match=r"the cell is \(0\.5, 0\)"):
+        simplify([(0.5, 0)], grid, "unit")  # type: ignore[list-item]
 
 
 def test_a_straight_way_has_two_cells_and_an_open_map_too() -> None:

@@ -1,0 +1,63 @@
+"""What users give, checked in one place: choices, whole numbers, cells."""
+
+from __future__ import annotations
+
+from enum import Enum
+from typing import Any, TypeAlias
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+Cell: TypeAlias = tuple[int, int]
+"""(x, y): x the column, y the row of ``occupancy[y, x]``."""
+
+
+class Choice(str, Enum):
+    """Choices that are given as members or as their values: ``MoveRule("unit")`` takes both."""
+
+    @classmethod
+    def _missing_(cls, value: object) -> Choice:
+        known = ", ".join(member.value for member in cls)
+        raise ValueError(f"{cls.__name__} {value!r} is unknown; give one of {known}")
+
+
+def as_cell(cell: Any, name: str = "the cell") -> Cell:
+    """Return a pair of whole numbers of any type (a list, an array, ...) as Python ints.
+
+    Raises
+    ------
+    ValueError
+        If it is anything else; the error calls it `name`.
+    """
+    try:
+        if len(cell) == 2:
+            x, y = int(cell[0]), int(cell[1])
+            if (x, y) == (cell[0], cell[1]):
+                return x, y
+    except (TypeError, ValueError, OverflowError, LookupError):
+        pass
+    raise ValueError(f"{name} is {cell!r}; give two whole numbers (x, y)")
+
+
+def whole_numbers(name: str, values: ArrayLike, lowest: int, highest: int) -> NDArray[Any]:
+    """Return an array of whole numbers within bounds, of whatever dtype.
+
+    Raises
+    ------
+    ValueError
+        If it holds anything else; the error calls it `name`, and names the first wrong value.
+    """
+    try:
+        array = np.asarray(values)
+    except ValueError as error:  # rows of different lengths
+        raise ValueError(f"{name} are no array ({error}); give rows of one length") from None
+    if array.dtype.kind not in "iuf":
+        raise ValueError(f"{name} are of type {array.dtype}; give {lowest}..{highest}")
+    # Comparisons that NaN fails.
+    right = (array >= lowest) & (array <= highest)
+    if array.dtype.kind == "f":
+        right &= array == np.floor(array)
+    if not right.all():
+        wrong = array[~right].flat[0]
+        raise ValueError(f"{name} hold {wrong}; give whole numbers {lowest}..{highest}")
+    return array
