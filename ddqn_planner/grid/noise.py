@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from enum import Enum
 
 import numpy as np
 
-from ddqn_planner.grid.grid_map import Cell, GridMap
+from ddqn_planner.grid.arguments import Cell, Choice
+from ddqn_planner.grid.grid_map import GridMap
 from ddqn_planner.grid.moves import MoveRule, connected_cells
 
 MAX_NEW_OBSTACLES = 5
@@ -17,7 +17,7 @@ MAX_NEW_OBSTACLES = 5
 MAX_TRIES = 1000
 
 
-class Noise(str, Enum):
+class Noise(Choice):
     """Which free cells new obstacles may occupy: two readings of section 5.3."""
 
     ON_PATH = "on_path"
