@@ -16,6 +16,7 @@ from ddqn_planner.files import Appender, lock, remove_temporaries, write_atomica
 from ddqn_planner.grid import Cell, MoveRule, path_length
 from ddqn_planner.training.environment import Scenario
 from ddqn_planner.training.hyper_parameters import HyperParameters
+from ddqn_planner.training.memory import check_memory
 from ddqn_planner.training.trainer import CheckpointError, Episode, Trainer
 
 # Not torch's SummaryWriter: its thread ends for good at the first error, a full disk's too.
@@ -86,6 +87,8 @@ class TrainingRun:
         If the folder holds a checkpoint that cannot be read, or of another training.
     FolderError
         If the folder holds what no training wrote, or another process trains in it.
+    MemoryShortageError
+        If the training cannot fit into the memory; see ``memory``, bytes.
     OSError
         If the folder cannot be written.
     """
@@ -99,6 +102,7 @@ class TrainingRun:
         seed: int,
     ) -> None:
         self.folder = Path(folder)
+        self.memory = check_memory(scenarios, parameters)
         self._lock = _claim(self.folder)
         try:
             self._open(scenarios, move_rule, parameters, seed)
