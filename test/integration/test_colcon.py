@@ -31,6 +31,8 @@ START_TIMEOUT = 120.0
 """Seconds in which a node of a loaded machine imports torch and speaks."""
 
 
+PYTHONPATH = os.pathsep.join([str(ROOT / "scripts"), sysconfig.get_path("purelib")])
+
 COLCON = shutil.which("colcon", path=os.pathsep.join([sysconfig.get_path("scripts"), os.defpath]))
 
 pytestmark = pytest.mark.skipif(COLCON is None, reason="colcon is not installed")
@@ -90,6 +92,20 @@ def test_sourced_workspace_goes_before_what_pip_installed(install: Path) -> None
     editable = importlib.util.find_spec("ddqn_planner")
     assert editable is not None
     assert found.stdout.strip() != editable.origin
+
+
+def test_tests_that_colcon_runs_find_the_executables(install: Path, tmp_path: Path) -> None:
+    # A Python into which pip has not installed the package, as that of ROS is.
+    subprocess.run([sys.executable, "-m", "venv", "--without-pip", tmp_path], check=True)
+    look = "import processes; print(processes.executable('planner_node'))"
+    found = subprocess.run(
+        sourced(install, "env", f"PYTHONPATH={PYTHONPATH}", tmp_path / "bin/python", "-c", look),
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    expected = install / "ddqn_planner" / "lib" / "ddqn_planner" / "planner_node"
+    assert Path(found.stdout.strip()) == expected
 
 
 def test_linked_workspace_finds_maps_and_models(source_copy: Path, tmp_path: Path) -> None:

@@ -24,7 +24,7 @@ from ddqn_planner.nodes.conversions import grid_from_message, occupancy_message,
 from ddqn_planner.nodes.runtime import LATCHED
 from ddqn_planner.planning.picture import value_ramp
 
-pytest.importorskip("rerun")
+pytest.importorskip("rerun", reason="rerun, of the extra watch, is missing")
 from rerun.chunk import RrdReader
 
 from ddqn_planner.nodes.watch import EPISODE, MAP, PLAN, PORT, REWARD, UNKNOWN_GREY, VALUE

@@ -37,7 +37,7 @@ def finish(run: TrainingRun) -> list[Episode]:
 
 def board_scalars(folder: Path) -> list[Any]:
     """What TensorBoard shows of the average reward, where it is installed."""
-    pytest.importorskip("tensorboard", reason="tensorboard, an extra, is not installed")
+    pytest.importorskip("tensorboard", reason="tensorboard, an extra, is missing")
     from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
     events = EventAccumulator(str(folder))
