@@ -193,6 +193,7 @@ def test_an_interrupted_training_is_saved_and_goes_on(
 def test_reproduce_runs_every_experiment_and_writes_its_report(
     capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
+    pytest.importorskip("pathfinding", reason="pathfinding, of the extra experiments, is missing")
     command = ["reproduce", "--quick", "--seeds", "2", "--out", str(tmp_path)]
     assert main(command) == 0
     folder = tmp_path / "quick"
@@ -214,6 +215,7 @@ def test_reproduce_runs_every_experiment_and_writes_its_report(
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_interrupted_experiments_end_with_all_their_processes(tmp_path: Path, number: int) -> None:
     executable = Path(sysconfig.get_path("scripts")) / "ddqn-planner"
+    pytest.importorskip("pathfinding", reason="pathfinding, of the extra experiments, is missing")
     command = [executable, "reproduce", "--experiment", "goal-1", "--out", tmp_path]
     child = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
     deadline = time.monotonic() + 60

@@ -215,6 +215,17 @@ def test_a_save_that_failed_is_tried_again_at_the_next_interval_and_not_before(
     run.close()
 
 
+def test_the_last_step_is_saved_once(
+    small: Scenario, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(run_module, "SAVE_INTERVAL", 100)
+    run = open_run(tmp_path, small)
+    saved_at = [run.saved_at for _ in run.steps()]
+    run.close()
+    assert sorted(set(saved_at)) == [0, 100, 200, 300]
+    assert run.saved_at == run.trainer.steps == 400
+
+
 def test_tensorboard_gets_the_curves_where_it_is_installed(small: Scenario, tmp_path: Path) -> None:
     episodes = finish(open_run(tmp_path, small))
     assert len(board_scalars(tmp_path)) == len(episodes)
