@@ -1,4 +1,5 @@
 from glob import glob
+from pathlib import Path
 
 from setuptools import find_packages, setup
 
@@ -8,13 +9,15 @@ setup(
     name=PACKAGE,
     version="0.1.0",
     description="Plans robot paths on grid maps with a Double DQN, as ROS 2 nodes",
-    long_description=open("README.md", encoding="utf-8").read(),
+    # `colcon build --symlink-install` runs a link to this file in a folder without a README.
+    long_description=(Path(__file__).resolve().parent / "README.md").read_text(encoding="utf-8"),
     long_description_content_type="text/markdown",
     license="Apache-2.0",
     maintainer="ddqn_planner maintainers",
     maintainer_email="maintainers@ddqn-planner.example",
     packages=find_packages(include=[PACKAGE, f"{PACKAGE}.*"]),
-    package_data={PACKAGE: ["py.typed"]},
+    # Links in the source tree, files in what is built of it.
+    package_data={PACKAGE: ["py.typed", "maps/*", "models/*"]},
     data_files=[
         ("share/ament_index/resource_index/packages", [f"resource/{PACKAGE}"]),
         (f"share/{PACKAGE}", ["package.xml"]),
@@ -22,7 +25,7 @@ setup(
         (f"share/{PACKAGE}/models", glob("models/*")),
         (f"share/{PACKAGE}/rviz", glob("rviz/*")),
     ],
-    zip_safe=True,
+    zip_safe=False,
     python_requires=">=3.10",
     install_requires=[
         "gymnasium>=1.1",

@@ -37,6 +37,7 @@ from ddqn_planner.training import ranks
 from ddqn_planner.training.any_map import ANY_MAP, MAPS, random_scenarios
 from ddqn_planner.training.environment import Scenario
 from ddqn_planner.training.hyper_parameters import HyperParameters
+from ddqn_planner.training.memory import megabytes
 from ddqn_planner.training.run import TrainingRun
 
 MOVE_RULES = [rule.value for rule in MoveRule]
@@ -439,6 +440,8 @@ def _evaluate(options: argparse.Namespace) -> int:
 
 def _train_with_progress(run: TrainingRun) -> None:
     trainer = run.trainer
+    if ranks.rank() == 0:
+        print(f"training in {run.folder}, with about {megabytes(run.memory)} of memory")
     interrupted = threading.Event()
     # An exception could strike in the middle of a step; a flag is looked at between two.
     for number in (signal.SIGINT, signal.SIGTERM):

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import csv
+import fcntl
 import io
 import os
 import tempfile
 from collections.abc import Iterable, Sequence
 from contextlib import suppress
 from pathlib import Path
+from typing import BinaryIO
 
 
 def write_atomically(path: Path, content: bytes) -> None:
@@ -49,6 +51,27 @@ def remove_temporaries(path: Path) -> None:
     """
     for temporary in path.parent.glob(f".{path.name}.*"):
         temporary.unlink(missing_ok=True)
+
+
+def lock(path: Path) -> BinaryIO:
+    """Lock a file, which is made if need be, until the returned file is closed.
+
+    The end of the process, a kill too, closes it. The file itself stays.
+
+    Raises
+    ------
+    BlockingIOError
+        If it is locked already.
+    OSError
+        If it cannot be opened.
+    """
+    file = path.open("ab")
+    try:
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BaseException:
+        file.close()
+        raise
+    return file
 
 
 class Appender:

@@ -1,29 +1,17 @@
-"""Finds the maps and models that come with the package, however it was installed."""
+"""Finds the maps and models that come with the package, however it was installed.
+
+They are data of the package, so they lie beside its code. In the source tree ``maps`` and
+``models`` beside the code are links to the folders at the top. ``share/ddqn_planner`` of an
+installed package holds copies for the tools of ROS, which nothing here reads.
+"""
 
 from __future__ import annotations
 
 import os
-import sys
-from collections.abc import Iterator
+from importlib.resources import files
 from pathlib import Path
 
 PACKAGE = "ddqn_planner"
-
-
-def share_directories() -> Iterator[Path]:
-    """Yield the folders that may hold ``maps/`` and ``models/``, the likeliest first.
-
-    They are: the ament index (a colcon workspace that was sourced), ``share/ddqn_planner`` of this
-    Python environment (pip install), and the source tree (an editable install, or none).
-    """
-    try:
-        from ament_index_python.packages import get_package_share_directory
-
-        yield Path(get_package_share_directory(PACKAGE))
-    except (ImportError, LookupError, OSError):
-        pass  # no ROS here, or ROS from PyPI, which has no ament prefix
-    yield Path(sys.prefix) / "share" / PACKAGE
-    yield Path(__file__).resolve().parent.parent
 
 
 def find_resource(folder: str, name: str) -> Path:
@@ -39,17 +27,13 @@ def find_resource(folder: str, name: str) -> Path:
     Raises
     ------
     FileNotFoundError
-        If no installed copy is found; the message names the folders that were looked in and the
-        files that are there.
+        If there is none; the message names the folder and the files that are there.
     """
-    looked_in = [share / folder for share in share_directories()]
-    for directory in looked_in:
-        if os.path.isfile(directory / name):
-            return directory / name
-    known = sorted({path.name for directory in looked_in for path in directory.glob("*.*")})
-    raise FileNotFoundError(
-        f"no {name!r} in {', '.join(map(str, looked_in))}; there are: {', '.join(known) or 'none'}"
-    )
+    directory = Path(str(files(PACKAGE))) / folder
+    if os.path.isfile(directory / name):
+        return directory / name
+    known = ", ".join(sorted(path.name for path in directory.glob("*.*")))
+    raise FileNotFoundError(f"no {name!r} in {directory}; there are: {known or 'none'}")
 
 
 def find_map(name: str) -> Path:
@@ -59,7 +43,8 @@ def find_map(name: str) -> Path:
     ----------
     name : str
         A path, a ``file://`` or ``package://`` URL, or the name of a map that comes with this
-        package, with or without its ending. A file in the working directory goes first.
+        package, with or without its ending. A file of that very name in the working directory
+        goes first; a folder does not.
 
     Returns
     -------
@@ -74,7 +59,7 @@ def find_map(name: str) -> Path:
     path = Path(name.removeprefix("file://"))
     if name.startswith("package://"):
         return _package_path(name.removeprefix("package://"))
-    if path.name != name or os.path.exists(path):
+    if path.name != name or os.path.isfile(path):
         return path
     return find_resource("maps", name if path.suffix else f"{name}.yaml")
 

@@ -41,8 +41,13 @@ def claim_ros_domain() -> socket.socket:
 
 
 def executable(name: str) -> str:
-    """Return the path of an installed executable of the package."""
-    return str(Path(sysconfig.get_path("scripts")) / name)
+    """Return the path of an executable of the package: pip's, else that of a colcon workspace."""
+    installed = Path(sysconfig.get_path("scripts")) / name
+    if not installed.exists():
+        from ament_index_python.packages import get_package_prefix
+
+        installed = Path(get_package_prefix("ddqn_planner")) / "lib" / "ddqn_planner" / name
+    return str(installed)
 
 
 @contextmanager

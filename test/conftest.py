@@ -55,7 +55,8 @@ def plain_folder() -> Iterator[Path]:
 def source_copy(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Copy the source: a build leaves its folders beside it."""
     copy = tmp_path_factory.mktemp("workspace") / "src" / "ddqn_planner"
-    return Path(shutil.copytree(ROOT, copy, ignore=shutil.ignore_patterns(*NOT_SOURCE)))
+    ignore = shutil.ignore_patterns(*NOT_SOURCE)
+    return Path(shutil.copytree(ROOT, copy, symlinks=True, ignore=ignore))
 
 
 @pytest.fixture(scope="session")

@@ -278,6 +278,7 @@ def test_an_interrupted_training_is_saved_and_goes_on(
 def test_reproduce_runs_every_experiment_and_writes_its_report(
     capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
+    pytest.importorskip("pathfinding", reason="pathfinding, of the extra experiments, is missing")
     reading = ["--noise", "on_path", "--hidden-units", "0"]
     command = ["reproduce", "--quick", "--seeds", "2", "--out", str(tmp_path), *reading]
     assert main(command) == 0
@@ -301,6 +302,7 @@ def test_reproduce_runs_every_experiment_and_writes_its_report(
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_interrupted_experiments_end_with_all_their_processes(tmp_path: Path, number: int) -> None:
     executable = Path(sysconfig.get_path("scripts")) / "ddqn-planner"
+    pytest.importorskip("pathfinding", reason="pathfinding, of the extra experiments, is missing")
     command = [executable, "reproduce", "--experiment", "goal-1", "--out", tmp_path]
     child = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
     deadline = time.monotonic() + PATIENCE
@@ -323,6 +325,7 @@ def test_reproduce_refuses_less_than_one_seed(capsys: pytest.CaptureFixture[str]
 def test_reproduce_may_be_asked_for_one_reading_of_goal_3(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
+    pytest.importorskip("pathfinding", reason="pathfinding, of the extra experiments, is missing")
     command = ["reproduce", "--quick", "--seeds", "1", "--out", str(tmp_path)]
     assert main([*command, "--experiment", "goal-3", "--hidden-units", "3"]) == 0
     report = capsys.readouterr().out
@@ -336,6 +339,7 @@ def test_reproduce_may_be_asked_for_one_reading_of_goal_3(
 def test_reproduce_refuses_a_hidden_layer_that_cannot_be(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
+    pytest.importorskip("pathfinding", reason="pathfinding, of the extra experiments, is missing")
     command = ["reproduce", "--experiment", "goal-3", "--hidden-units", "-1"]
     assert main([*command, "--out", str(tmp_path)]) == 2
     assert "hidden_units is -1" in capsys.readouterr().err

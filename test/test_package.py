@@ -34,54 +34,90 @@ def test_the_core_works_without_ros() -> None:
 
 
 def test_the_source_tree_holds_maps_and_models() -> None:
-    assert find_resource("maps", "dilemma.yaml") == ROOT / "maps" / "dilemma.yaml"
+    found = find_resource("maps", "dilemma.yaml")
+    assert found.resolve() == ROOT / "maps" / "dilemma.yaml"
     assert find_resource("models", "dilemma.safetensors").is_file()
 
 
-def test_a_workspace_that_was_sourced_goes_first(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+def test_a_missing_resource_is_named_with_those_that_are_there() -> None:
+    with pytest.raises(FileNotFoundError, match=r"'nowhere\.yaml'.*dilemma\.yaml, office"):
+        find_resource("maps", "nowhere.yaml")
+
+
+@pytest.fixture(scope="module")
+def wheel(source_copy: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """What pip builds of the source."""
+    folder = tmp_path_factory.mktemp("wheel")
+    build = ["wheel", "--no-deps", "--no-build-isolation", "--wheel-dir", folder, source_copy]
+    subprocess.run([*PIP, *build], check=True)
+    (path,) = folder.glob("*.whl")
+    return path
+
+
+PIP = [sys.executable, "-m", "pip", "--quiet"]
+
+
+# --user and Debian's Python install beside another share folder than the interpreter's, as the
+# last two do.
+@pytest.mark.parametrize("option", [None, "--target", "--prefix"])
+def test_maps_and_models_come_along_wherever_pip_installs(
+    wheel: Path, tmp_path: Path, option: str | None
 ) -> None:
-    marker = tmp_path / "share/ament_index/resource_index/packages/ddqn_planner"
-    served = tmp_path / "share/ddqn_planner/maps/dilemma.yaml"
-    for path in (marker, served):
-        path.parent.mkdir(parents=True)
-        path.touch()
-    monkeypatch.setenv("AMENT_PREFIX_PATH", str(tmp_path))
-    assert find_resource("maps", "dilemma.yaml") == served
-
-
-def test_a_pip_install_brings_maps_and_models_along(source_copy: Path, tmp_path: Path) -> None:
     environment = tmp_path / "environment"
     subprocess.run([sys.executable, "-m", "venv", "--without-pip", environment], check=True)
-    python = environment / "bin" / "python"
-    pip = [sys.executable, "-m", "pip", "--quiet"]
-    build = ["wheel", "--no-deps", "--no-build-isolation", "--wheel-dir", tmp_path, source_copy]
-    subprocess.run([*pip, *build], check=True)
-    (wheel,) = tmp_path.glob("*.whl")
-    subprocess.run([*pip, "--python", python, "install", "--no-deps", wheel], check=True)
+    python, folder = environment / "bin" / "python", environment
+    into: list[str | Path] = []
+    if option:
+        folder = tmp_path / "elsewhere"
+        into = [option, folder]
+    subprocess.run([*PIP, "--python", python, "install", "--no-deps", *into, wheel], check=True)
+    (package,) = folder.glob("**/ddqn_planner/__init__.py")
     code = (
-        "import ddqn_planner; from ddqn_planner.resources import find_resource\n"
-        "print(ddqn_planner.__file__, find_resource('maps', 'dilemma.yaml'),"
-        " find_resource('models', 'dilemma.safetensors'))"
+        "import ddqn_planner; from ddqn_planner.resources import find_map\n"
+        "from ddqn_planner.model import find_model\n"
+        "print(ddqn_planner.__file__, find_map('dilemma'), find_model('dilemma'))"
     )
     # The libraries of this environment; its editable install of the package is not among them.
-    variables = {**os.environ, "PYTHONPATH": sysconfig.get_path("purelib")}
+    path = [str(package.parents[1]), sysconfig.get_path("purelib")]
     printed = subprocess.run(
         [python, "-c", code],
-        env=variables,
+        env={**os.environ, "PYTHONPATH": os.pathsep.join(path)},
         cwd=tmp_path,
         check=True,
         capture_output=True,
         text=True,
     )
-    assert all(path.startswith(str(environment)) for path in printed.stdout.split())
+    assert all(Path(path).is_relative_to(folder) for path in printed.stdout.split())
+    for name in ("maps", "models"):
+        shipped = {path.name: path.read_bytes() for path in (ROOT / name).iterdir()}
+        for copy in (package.parent / name, package_share(folder) / name):
+            assert {path.name: path.read_bytes() for path in copy.iterdir()} == shipped
+
+
+def package_share(prefix: Path) -> Path:
+    """The folder in which the tools of ROS look."""
+    (marker,) = prefix.glob("**/resource_index/packages/ddqn_planner")
+    return marker.parents[3] / "ddqn_planner"
+
+
+def test_a_file_hides_a_shipped_map_but_a_folder_does_not(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    shipped = find_map("dilemma")
+    (tmp_path / "dilemma").mkdir()
+    (tmp_path / "dilemma.yaml").mkdir()
+    assert find_map("dilemma") == find_map("dilemma.yaml") == shipped
+    (tmp_path / "office.yaml").touch()
+    assert find_map("office.yaml") == Path("office.yaml")
+    assert find_map("office").is_relative_to(shipped.parent)
 
 
 @pytest.mark.parametrize(
     "name", ["dilemma", "dilemma.yaml", "package://ddqn_planner/maps/dilemma.yaml"]
 )
 def test_a_shipped_map_is_found_by_name(name: str) -> None:
-    assert find_map(name) == ROOT / "maps" / "dilemma.yaml"
+    assert find_map(name).resolve() == ROOT / "maps" / "dilemma.yaml"
 
 
 def test_a_path_is_left_as_it_is() -> None:

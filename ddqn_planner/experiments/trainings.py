@@ -122,14 +122,23 @@ def train(training: Training, out: Path) -> None:
 
     Raises
     ------
-    CheckpointError
-        If the folder holds another training.
+    CheckpointError, FolderError
+        If the folder holds another training or what no training wrote, or is in use.
     OSError
         If the folder cannot be written.
     """
     folder = training.folder(out)
     run = TrainingRun(folder, training.scenarios, MOVE_RULE, training.parameters, training.seed)
-    trainer = run.trainer
+    try:
+        _train(training, run)
+    finally:
+        run.close()
+    if run.save_error:
+        raise OSError(run.save_error)
+
+
+def _train(training: Training, run: TrainingRun) -> None:
+    folder, trainer = run.folder, run.trainer
     evaluations = [e for e in read_evaluations(folder) if e.step <= trainer.steps]
     seconds = evaluations[-1].seconds if evaluations else 0.0
     optimum = optimal_value(trainer.environment)
@@ -142,9 +151,6 @@ def train(training: Training, out: Path) -> None:
             write_csv(folder / "evaluations.csv", columns, map(astuple, evaluations))
             if evaluations[-1].solved >= best:
                 trainer.save_model(folder / "kept.safetensors")
-    run.close()
-    if run.save_error:
-        raise OSError(run.save_error)
 
 
 def evaluate_training(

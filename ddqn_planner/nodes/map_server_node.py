@@ -10,6 +10,7 @@ from nav_msgs.srv import GetMap, LoadMap
 from numpy.typing import NDArray
 from rcl_interfaces.msg import ParameterDescriptor
 from rclpy.exceptions import InvalidParameterValueException
+from rclpy.node import Node
 from std_msgs.msg import Header
 from std_srvs.srv import Trigger
 
@@ -38,6 +39,23 @@ RESULTS: dict[type[Exception], int] = {
 NO_MAP = "no map is loaded; call load_map first"
 
 
+def declare_parameters(node: Node) -> None:
+    """Declare all parameters of the map server node; none can be set while it runs."""
+    for name, default, description, limits in (
+        (
+            "yaml_filename",
+            "dilemma.yaml",
+            "Path or URL of a map file, or name of a shipped one",
+            {},
+        ),
+        ("topic_name", "map", "Topic of the map", {}),
+        ("frame_id", "map", "Frame of the map, not empty", {}),
+        ("seed", 0, "Seed of the new obstacles", integer_range(0, 2**63 - 1)),
+    ):
+        descriptor = ParameterDescriptor(description=description, read_only=True, **limits)
+        node.declare_parameter(name, default, descriptor)
+
+
 class MapServerNode(BaseNode):
     """Serves one map, latched on a topic and as a service.
 
@@ -52,23 +70,14 @@ class MapServerNode(BaseNode):
         self._loaded: MapFile | None = None
         self._served = OccupancyGrid()
 
-        yaml_filename = self._fixed_parameter(
-            "yaml_filename", "dilemma.yaml", "Path or URL of a map file, or name of a shipped one"
+        declare_parameters(self)
+        yaml_filename, topic_name, self._frame, seed = (
+            self.get_parameter(name).value
+            for name in ("yaml_filename", "topic_name", "frame_id", "seed")
         )
-        topic_name = self._fixed_parameter("topic_name", "map", "Topic of the map")
-        self._frame = self._fixed_parameter("frame_id", "map", "Frame of the map, not empty")
         if not self._frame:
             raise InvalidParameterValueException("frame_id", "", "name the map's frame")
-        self.declare_parameter(
-            "seed",
-            0,
-            ParameterDescriptor(
-                description="Seed of the new obstacles",
-                read_only=True,
-                **integer_range(0, 2**63 - 1),
-            ),
-        )
-        self._random = np.random.default_rng(self.get_parameter("seed").value)
+        self._random = np.random.default_rng(seed)
 
         self._publisher = self.create_publisher(OccupancyGrid, topic_name, LATCHED)
         self._load(yaml_filename)
@@ -76,11 +85,6 @@ class MapServerNode(BaseNode):
         self.create_service(LoadMap, "~/load_map", self._on_load_map)
         self.create_service(Trigger, "~/scatter_obstacles", self._on_scatter_obstacles)
         self.create_service(Trigger, "~/restore_map", self._on_restore_map)
-
-    def _fixed_parameter(self, name: str, default: str, description: str) -> str:
-        descriptor = ParameterDescriptor(description=description, read_only=True)
-        value: str = self.declare_parameter(name, default, descriptor).value
-        return value
 
     def _load(self, url: str) -> int:
         """Load a map and serve it, or log why not; return the result code of LoadMap."""
@@ -185,7 +189,7 @@ def known_path(grid: GridMap, start: Cell, goal: Cell) -> tuple[MoveRule, list[C
 
 def main() -> int:
     """Run the map server node until SIGINT or SIGTERM."""
-    return spin_until_shutdown(MapServerNode)
+    return spin_until_shutdown(MapServerNode, declare_parameters)
 
 
 if __name__ == "__main__":

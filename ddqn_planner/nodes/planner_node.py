@@ -618,7 +618,7 @@ def main() -> NoReturn:
     torch.set_num_threads(1)
     # Garbage among what is imported is not worth 100 ms in which nobody is answered.
     gc.freeze()
-    exit_code = spin_until_shutdown(PlannerNode)
+    exit_code = spin_until_shutdown(PlannerNode, declare_parameters)
     # A field that is being computed cannot be stopped: Python would wait for the thread to end it,
     # and if it did not, torch would abort the process.
     os._exit(exit_code)

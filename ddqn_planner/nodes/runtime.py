@@ -1,17 +1,27 @@
-"""What the nodes share: lasting topics, parameters of any kind, and how a node ends."""
+"""What the nodes share: lasting topics, parameters of any kind, ``--help``, how a node ends."""
 
 from __future__ import annotations
 
+import json
+import sys
 from collections.abc import Callable
+from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import rclpy
-from rcl_interfaces.msg import FloatingPointRange, IntegerRange, SetParametersResult
+from rcl_interfaces.msg import (
+    FloatingPointRange,
+    IntegerRange,
+    ParameterDescriptor,
+    SetParametersResult,
+)
 from rcl_interfaces.srv import SetParameters, SetParametersAtomically
 from rclpy.exceptions import NameValidationException, ParameterException
 from rclpy.executors import ExternalShutdownException
 from rclpy.logging import get_logger
 from rclpy.node import Node
+from rclpy.parameter import Parameter
 from rclpy.parameter_service import ParameterService
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.utilities import ok, try_shutdown
@@ -75,19 +85,68 @@ def floating_point_range(low: float, high: float) -> dict[str, Any]:
     return {"floating_point_range": [FloatingPointRange(from_value=low, to_value=high)]}
 
 
-def spin_until_shutdown(make_node: Callable[[], Node]) -> int:
-    """Run one node until SIGINT or SIGTERM.
+HELP = """\
+usage: {program} [--ros-args [-p PARAMETER:=VALUE] [--params-file FILE] [-r NAME:=NEW_NAME] ...]
+
+{summary}
+
+Parameters are set at the start by -p or in a file, and those that are not read-only also while the
+node runs, by `ros2 param set NODE PARAMETER VALUE`:
+"""
+
+
+def help_text(program: str, summary: str, declare_parameters: Callable[[Any], None]) -> str:
+    """Return what ``--help`` prints. No node is made for it.
+
+    Parameters
+    ----------
+    program : str
+        Name of the executable.
+    summary : str
+        What the node does, a sentence.
+    declare_parameters : callable
+        Declares the parameters of the node that it is given, by `rclpy.node.Node.declare_parameter`
+        alone.
+    """
+    parts = [HELP.format(program=program, summary=summary)]
+
+    def describe(name: str, default: object, descriptor: ParameterDescriptor) -> None:
+        kind = Parameter.Type.from_parameter_value(default).name.lower()
+        value = repr(default) if isinstance(default, str) else json.dumps(default)
+        limits = [f"{r.from_value:g} to {r.to_value:g}" for r in descriptor.floating_point_range]
+        limits += [f"{r.from_value} to {r.to_value}" for r in descriptor.integer_range]
+        limits += [descriptor.additional_constraints] if descriptor.additional_constraints else []
+        limits += ["read-only"] if descriptor.read_only else []
+        parts.append(
+            f"  {name}: {'; '.join([f'{kind}, default {value}', *limits])}\n"
+            f"      {descriptor.description}"
+        )
+
+    declare_parameters(SimpleNamespace(declare_parameter=describe))
+    return "\n".join(parts)
+
+
+def spin_until_shutdown(
+    make_node: Callable[[], Node], declare_parameters: Callable[[Any], None] | None = None
+) -> int:
+    """Run one node until SIGINT or SIGTERM, or print its parameters if it is asked for help.
 
     Parameters
     ----------
     make_node : callable
         The node's class.
+    declare_parameters : callable, optional
+        See `help_text`; without it ``--help`` is not looked for.
 
     Returns
     -------
     int
         Exit code: 0, or 1 if the node cannot start with the parameters, names or environment.
     """
+    if declare_parameters and {"-h", "--help"} & {*sys.argv[1:]}:
+        summary = (make_node.__doc__ or "").partition("\n")[0].replace("``", "")
+        print(help_text(Path(sys.argv[0]).name, summary, declare_parameters), flush=True)
+        return 0
     node = None
     try:
         rclpy.init()

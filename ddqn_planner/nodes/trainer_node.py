@@ -11,19 +11,17 @@ import queue
 import sys
 import threading
 from collections.abc import Iterable, Iterator
-from dataclasses import fields
+from functools import partial
 from pathlib import Path as FilePath
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped, Quaternion
 from nav_msgs.msg import OccupancyGrid, Path
-from rcl_interfaces.msg import ParameterDescriptor, SetParametersResult
 from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
 from rclpy.exceptions import InvalidParameterValueException, ParameterException
-from rclpy.parameter import Parameter
 from rclpy.timer import Timer
 from std_msgs.msg import Float32, Header, String
 from std_srvs.srv import Trigger
@@ -36,23 +34,43 @@ from ddqn_planner.nodes.conversions import (
     path_message,
     quaternion,
 )
-from ddqn_planner.nodes.runtime import (
-    LATCHED,
-    BaseNode,
-    floating_point_range,
-    integer_range,
-    spin_until_shutdown,
+from ddqn_planner.nodes.runtime import LATCHED, BaseNode, spin_until_shutdown
+from ddqn_planner.nodes.trainer_parameters import (
+    check_parameters,
+    declare_parameters,
+    hyper_parameters,
 )
 from ddqn_planner.resources import find_map
 from ddqn_planner.training.environment import Scenario
-from ddqn_planner.training.hyper_parameters import HyperParameters
+from ddqn_planner.training.memory import REMEDY as MEMORY_REMEDY
+from ddqn_planner.training.memory import megabytes
 from ddqn_planner.training.run import TrainingRun, read_cells
 from ddqn_planner.training.trainer import Episode
 
 PUBLISH_PERIOD = 0.1
 """Seconds between two looks into the training thread's queue."""
 
-MOVE_RULES = [rule.value for rule in MoveRule]
+
+class MapInFrame(NamedTuple):
+    """A map, and the frame in which its origin is."""
+
+    grid: GridMap
+    frame: str
+
+
+class Walked(NamedTuple):
+    """An episode that ended, and the map of its training: the node's may be another by then."""
+
+    episode: Episode
+    place: MapInFrame
+
+
+class Saved(NamedTuple):
+    """The files that were saved, and the environment step."""
+
+    model: FilePath
+    checkpoint: FilePath
+    step: int
 
 
 class TrainerNode(BaseNode):
@@ -65,19 +83,23 @@ class TrainerNode(BaseNode):
 
     def __init__(self) -> None:
         super().__init__("trainer")
-        self._grid: GridMap | None = None
-        self._frame = "map"
+        self._map: MapInFrame | None = None
         self._poses: dict[str, PoseStamped] = {}
         self._run: TrainingRun | None = None
+        self._run_frame = ""
         self._thread: threading.Thread | None = None
         self._stop = threading.Event()
         self._save = threading.Event()
-        self._events: queue.SimpleQueue[Episode | FilePath | Exception] = queue.SimpleQueue()
+        self._events: queue.SimpleQueue[Walked | Saved | Exception] = queue.SimpleQueue()
         self._replay_timer: Timer | None = None
         self._state, self._error = "idle", ""
         self._save_fails = False
 
-        self._declare_parameters()
+        declare_parameters(self)
+        result = check_parameters(self, [])
+        if not result.successful:
+            raise ParameterException("a parameter is invalid", result.reason)
+        self.add_on_set_parameters_callback(partial(check_parameters, self))
         self._episode_publisher = self.create_publisher(Path, "~/episode", 10)
         self._reward_publisher = self.create_publisher(Float32, "~/average_reward", 100)
         self._saved_publisher = self.create_publisher(String, "~/model_saved", LATCHED)
@@ -99,80 +121,8 @@ class TrainerNode(BaseNode):
         self.create_timer(PUBLISH_PERIOD, self._publish_events, clock=self._steady_clock)
         self.create_timer(1.0, self._publish_diagnostics, clock=self._steady_clock)
 
-    # Parameters
-
-    def _declare_parameters(self) -> None:
-        def declare(name: str, default: object, description: str, **more: Any) -> None:
-            self.declare_parameter(
-                name, default, ParameterDescriptor(description=description, **more)
-            )
-
-        declare(
-            "output_folder",
-            "runs/trainer",
-            "Folder of the checkpoint, model and curves; used by the next ~/start",
-            additional_constraints="not empty",
-        )
-        declare(
-            "map_file",
-            "",
-            "Map file with start and goal, or a shipped map's name; '' to wait for topics",
-            read_only=True,
-        )
-        declare(
-            "move_rule",
-            "corner_cutting",
-            "Which diagonal moves are legal; used by the next ~/start",
-            additional_constraints=f"one of {MOVE_RULES}",
-        )
-        declare("seed", 0, "Seed of the training", **integer_range(0, 2**31 - 1))
-        declare(
-            "occupied_threshold",
-            65,
-            "Percent: from it on a cell is occupied",
-            **integer_range(1, 100),
-        )
-        declare("allow_unknown", False, "Whether unknown cells are free")
-        declare("episode_interval", 10, "Publish each n-th episode", **integer_range(1, 10**6))
-        declare(
-            "replay_period", 0.05, "Seconds a step of ~/replay", **floating_point_range(1e-3, 10.0)
-        )
-        for entry in fields(HyperParameters):
-            source = entry.metadata["source"]
-            if "choices" in entry.metadata:
-                constraint = f"one of {list(entry.metadata['choices'])}"
-                declare(entry.name, entry.default, source, additional_constraints=constraint)
-                continue
-            in_range = integer_range if type(entry.default) is int else floating_point_range
-            declare(entry.name, entry.default, source, **in_range(*entry.metadata["range"]))
-        result = self._check_parameters([])
-        if not result.successful:
-            raise ParameterException("a parameter is invalid", result.reason)
-        self.add_on_set_parameters_callback(self._check_parameters)
-
     def _value(self, name: str) -> Any:
         return self.get_parameter(name).value
-
-    def _hyper_parameters(self, **new: Any) -> HyperParameters:
-        """Return those of the parameters, with new values; ValueError if they are invalid."""
-        names = [entry.name for entry in fields(HyperParameters)]
-        return HyperParameters(**{n: new[n] if n in new else self._value(n) for n in names})
-
-    def _check_parameters(self, parameters: list[Parameter]) -> SetParametersResult:
-        """Check what the parameters would be together: one may limit another."""
-        new = {parameter.name: parameter.value for parameter in parameters}
-        move_rule = new.get("move_rule", self._value("move_rule"))
-        reason = ""
-        if new.get("output_folder", self._value("output_folder")) == "":
-            reason = "output_folder is ''; name a folder"
-        elif move_rule not in MOVE_RULES:
-            reason = f"move_rule is {move_rule!r}; give one of {MOVE_RULES}"
-        else:
-            try:
-                self._hyper_parameters(**new)
-            except ValueError as error:
-                reason = str(error)
-        return SetParametersResult(successful=not reason, reason=reason)
 
     def _read_map_file(self) -> None:
         name = self._value("map_file")
@@ -182,17 +132,18 @@ class TrainerNode(BaseNode):
             map_file = read_map_file(find_map(name))
         except (ValueError, OSError) as error:
             raise InvalidParameterValueException("map_file", name, str(error)) from None
-        self._grid = map_file.grid(self._value("occupied_threshold"), self._value("allow_unknown"))
+        grid = map_file.grid(self._value("occupied_threshold"), self._value("allow_unknown"))
+        self._map = MapInFrame(grid, "map")
         for what, cell in (("start", map_file.start), ("goal", map_file.goal)):
             if cell is not None:
-                pose = path_message([cell], self._grid, Header(frame_id=self._frame), quaternion(0))
-                self._poses[what] = pose.poses[0]
+                header = Header(frame_id=self._map.frame)
+                self._poses[what] = path_message([cell], grid, header, quaternion(0)).poses[0]
 
     # What comes in
 
     def _on_map(self, message: OccupancyGrid) -> None:
         try:
-            self._grid = grid_from_message(
+            grid = grid_from_message(
                 message, self._value("occupied_threshold"), self._value("allow_unknown")
             )
         except ValueError as error:
@@ -201,8 +152,8 @@ class TrainerNode(BaseNode):
         except MemoryError as error:
             self._refuse(f"map refused: {error}; give a smaller one")
             return
-        self._frame = message.header.frame_id
-        self.get_logger().info(f"map of {self._grid.width} x {self._grid.height} cells")
+        self._map = MapInFrame(grid, message.header.frame_id)
+        self.get_logger().info(f"map of {grid.width} x {grid.height} cells")
 
     def _on_initial_pose(self, message: PoseWithCovarianceStamped) -> None:
         self._set_pose("start", PoseStamped(header=message.header, pose=message.pose.pose))
@@ -214,18 +165,18 @@ class TrainerNode(BaseNode):
         try:
             # A pose may come before the map: then it is held against the map at ~/start.
             check_pose(f"the {what}", pose.header, pose.pose)
-            if self._grid is not None:
-                self.get_logger().info(f"the {what} is cell {self._cell(what, pose)}")
+            if self._map is not None:
+                cell = self._cell(what, pose, self._map)
+                self.get_logger().info(f"the {what} is cell {cell}")
         except ValueError as error:
             self._refuse(f"{what} refused: {error}")
         else:
             self._poses[what] = pose
 
-    def _cell(self, what: str, pose: PoseStamped) -> Cell:
+    def _cell(self, what: str, pose: PoseStamped, place: MapInFrame) -> Cell:
         """Return the cell of a pose; ValueError if it is no free cell of the map."""
-        assert self._grid is not None
-        cell = cell_from_pose(f"the {what}", pose.header, pose.pose, self._grid, self._frame)
-        if not self._grid.is_free(cell):
+        cell = cell_from_pose(f"the {what}", pose.header, pose.pose, place.grid, place.frame)
+        if not place.grid.is_free(cell):
             raise ValueError(
                 f"the {what}'s cell {cell} is occupied or off the map; set it on a free cell"
             )
@@ -241,7 +192,7 @@ class TrainerNode(BaseNode):
         if self._thread is not None and self._thread.is_alive():
             return _answer(response, False, "training already; call ~/stop first")
         try:
-            self._run = self._open_run()
+            place, run = self._open_run()
         except Exception as error:  # whatever it is, the node must live on and say it
             reason = _with_remedy(error)
             self._refuse(f"the training cannot start: {reason}")
@@ -250,36 +201,46 @@ class TrainerNode(BaseNode):
         self._save.clear()
         self._save_fails = False
         self._state, self._error = "training", ""
-        trainer = self._run.trainer
-        last = trainer.parameters.steps
-        message = f"training in {self._run.folder} from step {trainer.steps} to {last}"
-        self._thread = threading.Thread(target=self._train, args=(self._run,), name="training")
+        self._run, self._run_frame = run, place.frame
+        last = run.trainer.parameters.steps
+        message = (
+            f"training in {run.folder} from step {run.trainer.steps} to {last}, "
+            f"with about {megabytes(run.memory)} of memory"
+        )
+        self.get_logger().info(message)
+        self._thread = threading.Thread(target=self._train, args=(run, place), name="training")
         self._thread.start()
         return _answer(response, True, message)
 
-    def _open_run(self) -> TrainingRun:
-        if self._grid is None:
+    def _open_run(self) -> tuple[MapInFrame, TrainingRun]:
+        if self._map is None:
             raise ValueError("no map was received yet; start a map server, or set map_file")
         if self._poses.keys() < {"start", "goal"}:
             raise ValueError(
                 "the start or the goal is unknown; publish initialpose and goal_pose, or set "
                 "map_file to a map with both"
             )
-        start, goal = (self._cell(which, self._poses[which]) for which in ("start", "goal"))
-        return TrainingRun(
-            FilePath(self._value("output_folder")).absolute(),
-            [Scenario(self._grid, start, goal)],
+        start, goal = (
+            self._cell(which, self._poses[which], self._map) for which in ("start", "goal")
+        )
+        return self._map, TrainingRun(
+            self._folder(),
+            [Scenario(self._map.grid, start, goal)],
             MoveRule(self._value("move_rule")),
-            self._hyper_parameters(),
+            hyper_parameters(self),
             self._value("seed"),
         )
 
+    def _folder(self) -> FilePath:
+        return FilePath(self._value("output_folder")).absolute()
+
     def _on_stop(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        self._stop_replay()
+        replay = "; the replay was stopped" if self._stop_replay() else ""
         if self._thread is None or not self._thread.is_alive():
-            return _answer(response, True, "no training was running")
+            return _answer(response, True, f"no training was running{replay}")
         self._stop.set()
-        return _answer(response, True, "the training saves itself and stops; ~/start goes on")
+        message = f"the training saves itself and stops, and ~/start goes on with it{replay}"
+        return _answer(response, True, message)
 
     def _on_save(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         if self._thread is None or not self._thread.is_alive():
@@ -288,8 +249,11 @@ class TrainerNode(BaseNode):
         return _answer(response, True, "saving after this step; ~/model_saved or an error follows")
 
     def _on_replay(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        curves = FilePath(self._value("output_folder")) / "episodes.csv"
-        if self._grid is None:
+        curves = self._folder() / "episodes.csv"
+        place = self._map
+        if self._run is not None and self._run.folder == self._folder():
+            place = MapInFrame(self._run.trainer.scenarios[0].grid, self._run_frame)
+        if place is None:
             return _answer(response, False, "no map was received yet; start a map server first")
         try:
             episodes = read_cells(curves, self._value("episode_interval"))
@@ -302,17 +266,17 @@ class TrainerNode(BaseNode):
         frames = _growing(itertools.chain([first], episodes))
         period = self._value("replay_period")
         self._replay_timer = self.create_timer(
-            period, lambda: self._replay_step(frames), clock=self._steady_clock
+            period, lambda: self._replay_step(frames, place), clock=self._steady_clock
         )
         return _answer(response, True, "replaying the recorded episodes on ~/episode")
 
     # Training, in its own thread
 
-    def _train(self, run: TrainingRun) -> None:
+    def _train(self, run: TrainingRun, place: MapInFrame) -> None:
         try:
             for finished in run.steps():
                 for episode in finished:
-                    self._events.put(episode)
+                    self._events.put(Walked(episode, place))
                 stopping = self._stop.is_set()
                 if stopping or self._save.is_set():
                     self._save.clear()
@@ -329,15 +293,16 @@ class TrainerNode(BaseNode):
 
     def _note_save(self, run: TrainingRun) -> None:
         if not run.save_error:
-            self._events.put(run.model_path)
+            self._events.put(Saved(run.model_path, run.checkpoint_path, run.trainer.steps))
 
     def _publish_events(self) -> None:
         while not self._events.empty():
             event = self._events.get()
-            if isinstance(event, Episode):
+            if isinstance(event, Walked):
                 self._publish_episode(event)
-            elif isinstance(event, FilePath):
-                self._saved_publisher.publish(String(data=str(event)))
+            elif isinstance(event, Saved):
+                self.get_logger().info(f"step {event.step} is saved in {event.checkpoint}")
+                self._saved_publisher.publish(String(data=str(event.model)))
             else:
                 self._state = "failed"
                 self._refuse(f"the training failed: {event!r}; ~/start goes on from its checkpoint")
@@ -358,20 +323,17 @@ class TrainerNode(BaseNode):
             self.get_logger().info("the training is saved again")
         self._save_fails = bool(error)
 
-    def _publish_episode(self, episode: Episode) -> None:
+    def _publish_episode(self, walked: Walked) -> None:
+        episode = walked.episode
         self._reward_publisher.publish(Float32(data=episode.average_reward))
         if episode.number % self._value("episode_interval") == 0 and self._replay_timer is None:
-            self._publish_cells(episode.cells)
+            self._publish_cells(episode.cells, walked.place)
 
-    def _publish_cells(self, cells: tuple[Cell, ...]) -> None:
-        # A training keeps its map when another one is published.
-        grid = self._run.trainer.scenarios[0].grid if self._run is not None else self._grid
-        if grid is not None:
-            stamp = self.get_clock().now().to_msg()
-            header = Header(stamp=stamp, frame_id=self._frame)
-            self._episode_publisher.publish(path_message(cells, grid, header, Quaternion(w=1.0)))
+    def _publish_cells(self, cells: tuple[Cell, ...], place: MapInFrame) -> None:
+        header = Header(stamp=self.get_clock().now().to_msg(), frame_id=place.frame)
+        self._episode_publisher.publish(path_message(cells, place.grid, header, Quaternion(w=1.0)))
 
-    def _replay_step(self, frames: Iterator[tuple[Cell, ...]]) -> None:
+    def _replay_step(self, frames: Iterator[tuple[Cell, ...]], place: MapInFrame) -> None:
         try:
             frame = next(frames, None)
         except OSError as error:
@@ -380,12 +342,14 @@ class TrainerNode(BaseNode):
         if frame is None:
             self._stop_replay()
         else:
-            self._publish_cells(frame)
+            self._publish_cells(frame, place)
 
-    def _stop_replay(self) -> None:
-        if self._replay_timer is not None:
-            self.destroy_timer(self._replay_timer)
-            self._replay_timer = None
+    def _stop_replay(self) -> bool:
+        """Stop a replay; say whether there was one."""
+        timer, self._replay_timer = self._replay_timer, None
+        if timer is not None:
+            self.destroy_timer(timer)
+        return timer is not None
 
     def _publish_diagnostics(self) -> None:
         status = DiagnosticStatus(name=f"{self.get_fully_qualified_name()}: training")
@@ -423,7 +387,7 @@ def _with_remedy(error: Exception) -> str:
         return f"{error}; set output_folder to a folder that can be written"
     if isinstance(error, ValueError):
         return str(error)
-    return f"{error!r}; take a smaller map, or smaller filters, environments or replay_capacity"
+    return f"{error!r}; {MEMORY_REMEDY}"
 
 
 def _answer(response: Trigger.Response, success: bool, message: str) -> Trigger.Response:
@@ -442,7 +406,7 @@ def main() -> int:
     """Run the trainer node until SIGINT or SIGTERM."""
     torch.set_num_threads(1)  # as fast as two for this network, and leaves the executor a core
     torch.optim.Adam([torch.zeros(1)])  # the first one imports for a second: not in a service
-    return spin_until_shutdown(TrainerNode)
+    return spin_until_shutdown(TrainerNode, declare_parameters)
 
 
 if __name__ == "__main__":

@@ -6,6 +6,10 @@ origin; y points up.
 
 from __future__ import annotations
 
+import os
+import socket
+import subprocess
+from contextlib import suppress
 from pathlib import Path as FilePath
 
 import numpy as np
@@ -16,6 +20,7 @@ from nav_msgs.msg import OccupancyGrid, Path
 from numpy.typing import NDArray
 from PIL import ImageColor
 from rclpy.node import Node
+from rclpy.utilities import try_shutdown
 from std_msgs.msg import Float32
 
 from ddqn_planner.grid import GridMap
@@ -32,6 +37,12 @@ RADII = {PLAN: rr.Radius.ui_points(4), EPISODE: rr.Radius.ui_points(2)}
 """In points of the screen, to be seen on any map; the plan is seen below an episode like it."""
 
 UNKNOWN_GREY = 160
+
+PORT = 9876
+"""On which rerun's viewer listens."""
+
+LOOK_PERIOD = 1.0
+"""Seconds between two looks whether the viewer is there."""
 
 
 class WatchNode(Node):
@@ -132,6 +143,33 @@ def cell_coordinates(grid: GridMap, positions: NDArray[np.float64]) -> NDArray[n
     return cells
 
 
+def open_viewer() -> subprocess.Popen[bytes] | None:
+    """Start rerun's viewer, unless one listens already; it stays when this process ends."""
+    with socket.socket() as connection:
+        if connection.connect_ex(("127.0.0.1", PORT)) == 0:
+            return None
+    command = [str(FilePath(rerun_cli.__file__).with_name("rerun")), "--port", str(PORT)]
+    # As rerun.spawn does it, which does not say whether the viewer lives.
+    environment = {**os.environ, "RERUN_APP_ONLY": "true"}
+    viewer = subprocess.Popen(command, env=environment, start_new_session=True)
+    # Most that fail do so at once; to one that is gone rerun tries to connect for ten seconds.
+    with suppress(subprocess.TimeoutExpired):
+        viewer.wait(LOOK_PERIOD)
+    look_at(viewer)
+    return viewer
+
+
+def look_at(viewer: subprocess.Popen[bytes]) -> None:
+    """End the node with its viewer: OSError if that has failed."""
+    if viewer.poll():
+        raise OSError(
+            f"rerun's viewer ended with {viewer.returncode}, see above; it needs a display: start "
+            "this on a desktop, or write a recording by --save FILE"
+        )
+    if viewer.returncode == 0:
+        try_shutdown()
+
+
 def watch(planner: str, trainer: str, file: FilePath | None) -> int:
     """Show what the nodes publish until SIGINT or SIGTERM.
 
@@ -166,16 +204,18 @@ def watch(planner: str, trainer: str, file: FilePath | None) -> int:
         # Only now: a signal that came before rclpy took it would leave half a file.
         try:
             if file is None:
-                viewer = FilePath(rerun_cli.__file__).with_name("rerun")
-                rr.spawn(
-                    executable_path=str(viewer), default_blueprint=blueprint, recording=recording
-                )
+                viewer = open_viewer()
+                recording.connect_grpc(default_blueprint=blueprint)
             else:
+                viewer = None
                 file.parent.mkdir(parents=True, exist_ok=True)
                 recording.save(file, default_blueprint=blueprint)
         except RuntimeError as error:
             raise OSError(f"rerun cannot show it: {error}; give another --save FILE") from None
-        return WatchNode(planner, trainer, recording)
+        node = WatchNode(planner, trainer, recording)
+        if viewer is not None:
+            node.create_timer(LOOK_PERIOD, lambda: look_at(viewer))
+        return node
 
     try:
         return spin_until_shutdown(make_node)

@@ -3,17 +3,20 @@
 from __future__ import annotations
 
 import io
+import os
 import re
+import reprlib
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import fields, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
-from ddqn_planner.files import Appender, remove_temporaries, write_atomically
+from ddqn_planner.files import Appender, lock, remove_temporaries, write_atomically
 from ddqn_planner.grid import Cell, MoveRule, path_length
 from ddqn_planner.training.environment import Scenario
 from ddqn_planner.training.hyper_parameters import HyperParameters
+from ddqn_planner.training.memory import check_memory
 from ddqn_planner.training.trainer import CheckpointError, Episode, Trainer
 
 # Not torch's SummaryWriter: its thread ends for good at the first error, a full disk's too.
@@ -48,11 +51,25 @@ ROW = re.compile(rb"(\d{1,18})(?:,[^,]*){7},(\d{1,9}:\d{1,9}(?: \d{1,9}:\d{1,9})
 """A whole row: the episode's number, and its cells."""
 
 
+RANK_FOLDER = re.compile(r"rank_\d+")
+"""The folders of the other processes of a training, see `ddqn_planner.training.ranks`."""
+
+LOCK, CHECKPOINT = "training.lock", "checkpoint.safetensors"
+"""Either file says that a folder is a training's. The lock is there from the start, so that a
+training that was killed before its first checkpoint can begin again."""
+
+
+class FolderError(ValueError):
+    """A folder holds what no training wrote, or another process trains in it."""
+
+
 class TrainingRun:
     """Trains into a folder, and goes on there when the folder holds a checkpoint.
 
-    The folder gets ``model.safetensors``, ``checkpoint.safetensors``, ``episodes.csv`` (one row an
-    episode, its cells as ``x:y``), and TensorBoard's curves where ``tensorboard`` is installed.
+    The folder gets ``model.safetensors``, ``checkpoint.safetensors``, ``episodes.csv`` (one row per
+    episode, its cells as ``x:y``), TensorBoard's curves where ``tensorboard`` is installed, and
+    ``training.lock``, which keeps other processes out until `close` or the end of the process. It
+    must be new, empty, or a training's.
 
     Parameters
     ----------
@@ -68,6 +85,10 @@ class TrainingRun:
     ------
     CheckpointError
         If the folder holds a checkpoint that cannot be read, or of another training.
+    FolderError
+        If the folder holds what no training wrote, or another process trains in it.
+    MemoryShortageError
+        If the training cannot fit into the memory; see ``memory``, bytes.
     OSError
         If the folder cannot be written.
     """
@@ -81,7 +102,21 @@ class TrainingRun:
         seed: int,
     ) -> None:
         self.folder = Path(folder)
-        self.folder.mkdir(parents=True, exist_ok=True)
+        self.memory = check_memory(scenarios, parameters)
+        self._lock = _claim(self.folder)
+        try:
+            self._open(scenarios, move_rule, parameters, seed)
+        except BaseException:
+            self._lock.close()
+            raise
+
+    def _open(
+        self,
+        scenarios: Sequence[Scenario],
+        move_rule: MoveRule,
+        parameters: HyperParameters,
+        seed: int,
+    ) -> None:
         if self.checkpoint_path.exists():
             self.trainer = Trainer.load_checkpoint(self.checkpoint_path, scenarios)
             _check_same_training(self.trainer, move_rule, parameters, seed, self.folder)
@@ -106,7 +141,7 @@ class TrainingRun:
     @property
     def checkpoint_path(self) -> Path:
         """Where `save` writes the checkpoint."""
-        return self.folder / "checkpoint.safetensors"
+        return self.folder / CHECKPOINT
 
     @property
     def curves_path(self) -> Path:
@@ -131,7 +166,8 @@ class TrainingRun:
         for finished in self.trainer.run(self.trainer.parameters.steps):
             for episode in finished:
                 self._note(episode)
-            if self.trainer.steps // SAVE_INTERVAL != self.saved_at // SAVE_INTERVAL:
+            due = self.trainer.steps // SAVE_INTERVAL != self.saved_at // SAVE_INTERVAL
+            if due and self.trainer.steps < self.trainer.parameters.steps:
                 self.try_to_save()
             yield finished
         self.try_to_save()
@@ -180,10 +216,11 @@ class TrainingRun:
         self.saved_at = self.trainer.steps
 
     def close(self) -> None:
-        """Close the curves. `save` first."""
+        """Close the curves, and let others into the folder. `save` first."""
         self._curves.close()
         if self._board is not None:
             self._board.close()
+        self._lock.close()
 
 
 def read_cells(curves_path: str | Path, every: int) -> Iterator[tuple[Cell, ...]]:
@@ -201,6 +238,24 @@ def read_cells(curves_path: str | Path, every: int) -> Iterator[tuple[Cell, ...]
             if row and int(row[1]) % every == 0:
                 x_y = (cell.split(b":") for cell in row[2].split())
                 yield tuple((int(x), int(y)) for x, y in x_y)
+
+
+def _claim(folder: Path) -> BinaryIO:
+    """Make a folder a training's, and keep others out until what is returned is closed."""
+    folder.mkdir(parents=True, exist_ok=True)
+    known = any(os.path.isfile(folder / name) for name in (LOCK, CHECKPOINT))
+    # The other processes of a training may have made their folders before this one's.
+    others = sorted(path.name for path in folder.iterdir() if not RANK_FOLDER.fullmatch(path.name))
+    if others and not known:
+        raise FolderError(
+            f"{folder} holds {reprlib.repr(others)} but no training; give a new or empty folder"
+        )
+    try:
+        return lock(folder / LOCK)
+    except BlockingIOError:
+        raise FolderError(
+            f"another process trains in {folder}; wait for its end, stop it, or give another folder"
+        ) from None
 
 
 def _row(episode: Episode) -> bytes:

@@ -28,10 +28,14 @@ from ddqn_planner.training.double_dqn import double_dqn_loss
 from ddqn_planner.training.environment import GridVectorEnvironment, Scenario
 from ddqn_planner.training.hyper_parameters import HyperParameters
 from ddqn_planner.training.learners import LEARNERS
+from ddqn_planner.training.memory import MemoryShortageError, check_memory
 from ddqn_planner.training.replay_buffer import ReplayBuffer, Transitions
 
 CHECKPOINT_KEY = "ddqn_planner_checkpoint"
 DIGEST_KEY = "sha256"
+
+DTYPES = {torch.float32: "F32", torch.float64: "F64", torch.int64: "I64"}
+"""As safetensors names them."""
 
 FUSED = tuple(map(int, torch.__version__.split(".")[:2])) >= (2, 4)
 """Adam in one call, which older versions have on GPUs alone."""
@@ -275,10 +279,27 @@ class Trainer:
         OSError
             If the file cannot be written; the one before it is then untouched.
         """
+        tensors = self._tensors(self._optimiser.state_dict()["state"])
+        description = {
+            "seed": self.seed,
+            "move_rule": self.move_rule,
+            "parameters": asdict(self.parameters),
+            "scenarios": _fingerprints(self.scenarios),
+            "counters": [self.steps, self.updates, self.episodes, self._replay.added],
+            "walked": self._walked,
+            "generators": [generator.bit_generator.state for generator in self._generators()],
+        }
+        text = json.dumps(description)
+        metadata = {CHECKPOINT_KEY: text, DIGEST_KEY: _digest(text, tensors)}
+        content = safetensors.torch.save(tensors, metadata)
+        write_atomically(Path(path), content)
+
+    def _tensors(self, optimiser: dict[int, dict[str, Tensor]]) -> dict[str, Tensor]:
+        """Return all that a checkpoint holds, with a given state of the optimiser."""
         environment = self.environment
         tensors = _prefixed("network", self.network.state_dict())
         tensors |= _prefixed("target", self._target.state_dict())
-        for index, state in self._optimiser.state_dict()["state"].items():
+        for index, state in optimiser.items():
             tensors |= _prefixed(f"optimiser.{index}", state)
         stored = Transitions._make(
             values[: len(self._replay)] for values in self._replay.transitions
@@ -291,20 +312,16 @@ class Trainer:
             "total_reward": self._total_reward,
         }
         tensors |= {name: torch.from_numpy(values) for name, values in arrays.items()}
-        description = {
-            "seed": self.seed,
-            "move_rule": self.move_rule,
-            "parameters": asdict(self.parameters),
-            "scenarios": _fingerprints(self.scenarios),
-            "counters": [self.steps, self.updates, self.episodes, self._replay.added],
-            "walked": self._walked,
-            "generators": [generator.bit_generator.state for generator in self._generators()],
+        return {name: tensor.contiguous() for name, tensor in tensors.items()}
+
+    def _layout(self) -> dict[str, tuple[str, list[int]]]:
+        """Return the type and shape of each tensor of a checkpoint with the counters as now."""
+        state = {
+            index: {"step": torch.zeros(()), "exp_avg": weight, "exp_avg_sq": weight}
+            for index, weight in enumerate(self._weights if self.updates else ())
         }
-        tensors = {name: tensor.contiguous() for name, tensor in tensors.items()}
-        text = json.dumps(description)
-        metadata = {CHECKPOINT_KEY: text, DIGEST_KEY: _digest(text, tensors)}
-        content = safetensors.torch.save(tensors, metadata)
-        write_atomically(Path(path), content)
+        tensors = self._tensors(state)
+        return {name: (DTYPES[t.dtype], [*t.shape]) for name, t in tensors.items()}
 
     @classmethod
     def load_checkpoint(cls, path: str | Path, scenarios: Sequence[Scenario]) -> Trainer:
@@ -320,25 +337,34 @@ class Trainer:
         ------
         CheckpointError
             If the file is missing, broken or no checkpoint, or was made with other scenarios.
+        MemoryShortageError
+            If its training cannot fit into the memory.
         """
         try:
             with safe_open(path, framework="pt") as file:
                 metadata = file.metadata() or {}
-                tensors = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118
-            text = metadata[CHECKPOINT_KEY]
+                text = metadata[CHECKPOINT_KEY]
+                description = json.loads(text)
+                if description["scenarios"] != _fingerprints(scenarios):
+                    raise CheckpointError(
+                        f"{path}: was made with another map, start or goal; give that one, or "
+                        "train into another folder"
+                    )
+                parameters = HyperParameters(**description["parameters"])
+                check_memory(scenarios, parameters)
+                rule = MoveRule(description["move_rule"])
+                trainer = cls(scenarios, rule, parameters, description["seed"])
+                trainer._count(description)
+                slices = {key: file.get_slice(key) for key in file.keys()}  # noqa: SIM118
+                found = {key: (part.get_dtype(), part.get_shape()) for key, part in slices.items()}
+                # Before one is read: a small file may claim, and hold as holes, any size.
+                if found != trainer._layout():
+                    raise ValueError("its tensors have other names, types or shapes")
+                tensors = {key: file.get_tensor(key) for key in found}
             if metadata[DIGEST_KEY] != _digest(text, tensors):
                 raise ValueError("its digest is another")
-            description = json.loads(text)
-            if description["scenarios"] != _fingerprints(scenarios):
-                raise CheckpointError(
-                    f"{path}: was made with another map, start or goal; give that one, or train "
-                    "into another folder"
-                )
-            parameters = HyperParameters(**description["parameters"])
-            rule = MoveRule(description["move_rule"])
-            trainer = cls(scenarios, rule, parameters, description["seed"])
             trainer._restore(description, tensors)
-        except CheckpointError:
+        except (CheckpointError, MemoryShortageError):
             raise
         except Exception as error:  # whatever a broken file does to those who read it
             raise CheckpointError(
@@ -347,8 +373,10 @@ class Trainer:
             ) from error
         return trainer
 
-    def _restore(self, description: dict[str, Any], tensors: dict[str, Tensor]) -> None:
+    def _count(self, description: dict[str, Any]) -> None:
         self.steps, self.updates, self.episodes, self._replay.added = description["counters"]
+
+    def _restore(self, description: dict[str, Any], tensors: dict[str, Tensor]) -> None:
         self.network.load_state_dict(_unprefixed("network", tensors))
         self._target.load_state_dict(_unprefixed("target", tensors))
         self._learner.copy_target(self._target)
@@ -380,7 +408,7 @@ def _digest(text: str, tensors: dict[str, Tensor]) -> str:
     digest = hashlib.sha256(text.encode())
     for name in sorted(tensors):
         digest.update(name.encode())
-        digest.update(tensors[name].numpy().tobytes())
+        digest.update(tensors[name].numpy().ravel().data)
     return digest.hexdigest()
 
 

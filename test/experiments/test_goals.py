@@ -9,6 +9,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from strategies import grids_with_free_cell
 
+pytest.importorskip("pathfinding", reason="pathfinding, of the extra experiments, is missing")
+
 from ddqn_planner.experiments import any_map
 from ddqn_planner.experiments.goal_1 import DIAGONALS, a_star, convergence_row
 from ddqn_planner.experiments.goal_2 import (

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.util
 import os
+import shutil
 import subprocess
 import sys
 import sysconfig
@@ -26,17 +27,27 @@ from ddqn_planner.training.environment import Scenario
 
 ROOT = Path(__file__).resolve().parents[2]
 
-START_TIMEOUT = 30.0
+START_TIMEOUT = 120.0
 """Seconds in which a node of a loaded machine imports torch and speaks."""
+
+
+PYTHONPATH = os.pathsep.join([str(ROOT / "scripts"), sysconfig.get_path("purelib")])
+
+COLCON = shutil.which("colcon", path=os.pathsep.join([sysconfig.get_path("scripts"), os.defpath]))
+
+pytestmark = pytest.mark.skipif(COLCON is None, reason="colcon is not installed")
 
 
 @pytest.fixture(scope="module")
 def install(source_copy: Path) -> Path:
     """Build a copy of the source in a workspace; return the workspace's install folder."""
-    workspace = source_copy.parents[1]
-    colcon = Path(sysconfig.get_path("scripts")) / "colcon"
+    return build(source_copy.parents[1])
+
+
+def build(workspace: Path, *options: str) -> Path:
+    command = [str(COLCON), "build", "--base-paths", "src", "--event-handlers", "console_direct+"]
     built = subprocess.run(
-        [colcon, "build", "--base-paths", "src", "--event-handlers", "console_direct+"],
+        [*command, *options],
         cwd=workspace,
         # A home of its own: the user's defaults may ask for another layout.
         env={**os.environ, "COLCON_HOME": str(workspace / "home")},
@@ -83,6 +94,41 @@ def test_sourced_workspace_goes_before_what_pip_installed(install: Path) -> None
     assert found.stdout.strip() != editable.origin
 
 
+def test_tests_that_colcon_runs_find_the_executables(install: Path, tmp_path: Path) -> None:
+    # A Python into which pip has not installed the package, as that of ROS is.
+    subprocess.run([sys.executable, "-m", "venv", "--without-pip", tmp_path], check=True)
+    look = "import processes; print(processes.executable('planner_node'))"
+    found = subprocess.run(
+        sourced(install, "env", f"PYTHONPATH={PYTHONPATH}", tmp_path / "bin/python", "-c", look),
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    expected = install / "ddqn_planner" / "lib" / "ddqn_planner" / "planner_node"
+    assert Path(found.stdout.strip()) == expected
+
+
+def test_linked_workspace_finds_maps_and_models(source_copy: Path, tmp_path: Path) -> None:
+    (tmp_path / "src").symlink_to(source_copy.parent)
+    install = build(tmp_path, "--symlink-install")
+    look = (
+        "from ddqn_planner.resources import find_map; from ddqn_planner.model import find_model\n"
+        "print(find_map('dilemma').resolve(), find_model('any_map').resolve())"
+    )
+    found = subprocess.run(
+        sourced(install, sys.executable, "-c", look),
+        cwd=tmp_path,
+        # Else the tests' own source may come first.
+        env={key: value for key, value in os.environ.items() if key != "PYTHONPATH"},
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    names = ("maps/dilemma.yaml", "models/any_map.safetensors")
+    shipped = [str(source_copy / name) for name in names]
+    assert found.stdout.split() == shipped
+
+
 def test_nodes_of_the_workspace_plan_with_its_model_on_its_map(
     install: Path,
     make_client: Callable[[], Any],
@@ -124,7 +170,7 @@ def test_nodes_of_the_workspace_plan_with_its_model_on_its_map(
     assert path_length(cells) == pytest.approx(14 + 8 * 2**0.5)
     assert (map_server.returncode, planner.returncode) == (0, 0)
 
-    share = install / "ddqn_planner" / "share" / "ddqn_planner"
+    (package,) = (install / "ddqn_planner" / "lib").glob("python*/site-packages/ddqn_planner")
     values = {entry.key: entry.value for entry in diagnosis.values}
-    assert values["model file"] == str(share / "models" / "any_map.safetensors")
-    assert f"serving {share / 'maps' / 'dilemma.yaml'}" in capfd.readouterr().err
+    assert values["model file"] == str(package / "models" / "any_map.safetensors")
+    assert f"serving {package / 'maps' / 'dilemma.yaml'}" in capfd.readouterr().err

@@ -23,8 +23,16 @@ from rcl_interfaces.srv import (
 )
 from std_srvs.srv import Trigger
 
-from ddqn_planner.grid import MapFile, MoveRule, connected_cells, read_map_file, save_map
+from ddqn_planner.grid import (
+    MapFile,
+    MoveRule,
+    connected_cells,
+    read_map_file,
+    save_map,
+    scatter_obstacles,
+)
 from ddqn_planner.nodes.conversions import grid_from_message
+from ddqn_planner.nodes.map_server_node import known_path
 from ddqn_planner.nodes.runtime import LATCHED
 from ddqn_planner.resources import find_resource
 
@@ -359,6 +367,24 @@ def test_serves_the_shipped_map_by_default_and_the_seed_repeats_the_noise(
         assert node.stop(signal.SIGTERM) == 0
 
 
+def test_the_seed_chooses_the_obstacles(
+    run_node: Any, make_client: Callable[[str], Any], map_file: Path
+) -> None:
+    read = read_map_file(map_file)
+    move_rule, path = known_path(read.grid(), START, GOAL)
+    drawn = {}
+    for seed in (0, 11, 12):
+        noisy, _ = scatter_obstacles(read.grid(), path, move_rule, np.random.default_rng(seed))
+        drawn[seed] = noisy.occupancy
+    assert not (drawn[0] == drawn[11]).all()
+    for seed in (11, 12):
+        namespace, parameters = f"/seed_{seed}", {"yaml_filename": str(map_file), "seed": seed}
+        with run_node("map_server_node", parameters, namespace=namespace):
+            other = make_client(namespace)
+            assert other.call(Trigger, "map_server/scatter_obstacles").success
+            assert ((values_of(get_map(other)) == 100) == drawn[seed]).all()
+
+
 @pytest.mark.parametrize(
     ("parameters", "reason"),
     [
@@ -371,6 +397,6 @@ def test_what_the_node_cannot_start_with_is_one_clear_line(
     run_node: Any, parameters: dict[str, Any], reason: str
 ) -> None:
     with run_node("map_server_node", parameters, exit_code=1) as node:
-        node.process.wait(10)
+        node.wait_for_end()
     assert re.search(f"cannot start: .*{reason}", node.log)
     assert "Traceback" not in node.log

@@ -6,6 +6,7 @@ import os
 import re
 import subprocess
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -21,6 +22,7 @@ from rcl_interfaces.srv import (
     SetParametersAtomically,
 )
 
+DOCS = (Path(__file__).resolve().parents[2] / "docs" / "nodes.md").read_text(encoding="utf-8")
 NAMES = ["", "no_such", "a.b", "/", "ü" * 300]
 
 
@@ -63,6 +65,41 @@ def test_no_request_for_parameters_ends_a_node(
         assert "Traceback" not in node.log
 
 
+ROW = re.compile(r"\| `(\w+)` \| (\w+) \| `(.*?)` \|(.*?)\|")
+
+
+@pytest.mark.parametrize("option", ["--help", "-h"])
+@pytest.mark.parametrize("name", ["map_server", "planner", "trainer"])
+def test_help_says_of_each_parameter_what_the_docs_say_and_starts_no_node(
+    name: str, option: str, tmp_path: Path
+) -> None:
+    # With such a domain, such parameters and in such a folder no node starts.
+    environment = {**os.environ, "ROS_DOMAIN_ID": "abc"}
+    arguments = [option, "--ros-args", "-p", "model:=no_such", "-p", "map_file:=no_such"]
+    helped = subprocess.run(
+        [executable(f"{name}_node"), *arguments],
+        env=environment,
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        timeout=600,
+    )
+    assert helped.returncode == 0, helped.stderr
+    assert helped.stderr == ""
+    assert list(tmp_path.iterdir()) == []
+    assert f"usage: {name}_node" in helped.stdout
+    (section,) = (part for part in DOCS.split("\n## ") if part.startswith(f"{name}_node"))
+    documented = {}
+    for parameter, kind, default, limits in map(re.Match[str].groups, ROW.finditer(section)):
+        value = default or "''"
+        documented[parameter] = "; ".join(
+            filter(None, [f"{kind}, default {value}", limits.strip()])
+        )
+    printed = re.findall(r"^  (\w+): (.*)\n      (\S.*)", helped.stdout, re.MULTILINE)
+    assert {parameter: rest for parameter, rest, _ in printed} == documented
+    assert len(printed) == len(documented) > 3
+
+
 @pytest.mark.parametrize(
     ("arguments", "environment", "reason"),
     [
@@ -85,7 +122,7 @@ def test_what_ros_cannot_start_with_is_said_and_ends_with_1(
 ) -> None:
     command = [executable("map_server_node"), "--ros-args", *arguments]
     ended = subprocess.run(
-        command, env={**os.environ, **environment}, capture_output=True, text=True, timeout=60
+        command, env={**os.environ, **environment}, capture_output=True, text=True, timeout=600
     )
     assert ended.returncode == 1
     assert re.search(f"cannot start: .*({reason})", ended.stdout + ended.stderr)

@@ -9,8 +9,6 @@ from typing import Any
 import pytest
 import yaml
 
-from ddqn_planner.resources import find_resource
-
 ROOT = Path(__file__).resolve().parents[2]
 MESSAGES = {
     "rviz_default_plugins/Map": "nav_msgs/OccupancyGrid",
@@ -23,7 +21,7 @@ MESSAGES = {
 
 @pytest.fixture(scope="module")
 def manager() -> dict[str, Any]:
-    path = find_resource("rviz", "ddqn_planner.rviz")
+    path = ROOT / "rviz" / "ddqn_planner.rviz"
     manager: dict[str, Any] = yaml.safe_load(path.read_text())["Visualization Manager"]
     return manager
 

@@ -29,6 +29,7 @@ from rcl_interfaces.srv import (
     SetParametersAtomically,
 )
 from rclpy.parameter import Parameter
+from rclpy.time import Time
 from std_msgs.msg import Float32, Header, String
 from std_srvs.srv import Trigger
 
@@ -38,9 +39,10 @@ from ddqn_planner.nodes.conversions import occupancy_message, quaternion
 from ddqn_planner.nodes.runtime import LATCHED
 from ddqn_planner.training.environment import Scenario
 from ddqn_planner.training.hyper_parameters import HyperParameters
+from ddqn_planner.training.run import TrainingRun
 from ddqn_planner.training.trainer import Trainer
 
-TIMEOUT = 20.0
+TIMEOUT = 120.0
 ENDLESS = {"steps": 10**9, "filters": 4, "learning_starts": 100}
 
 
@@ -68,12 +70,17 @@ def stamped(x: float, y: float, frame: str = "map") -> PoseStamped:
     return message
 
 
+def publish_map(client: Any, values: Any, resolution: float = 1.0, frame: str = "map") -> None:
+    header = Header(frame_id=frame)
+    message = occupancy_message(values, resolution, (0.0, 0.0, 0.0), header)
+    client.publish("map", message, LATCHED)
+
+
 def set_up(
     client: Any, values: Any, start: PoseStamped, goal: PoseStamped, listeners: int = 1
 ) -> None:
     """Publish the map, the start and the goal to so many nodes."""
-    header = Header(frame_id="map")
-    client.publish("map", occupancy_message(values, 1.0, (0.0, 0.0, 0.0), header), LATCHED)
+    publish_map(client, values)
     initial_pose = PoseWithCovarianceStamped(header=start.header)
     initial_pose.pose.pose = start.pose
     client.publish("initialpose", initial_pose, listeners=listeners)
@@ -148,6 +155,110 @@ def test_a_training_can_be_watched_saved_stopped_resumed_and_replayed(
         lengths = []
         while len(lengths) < 3 or lengths[-3:-1] != [1, 2]:
             lengths.append(len(episodes.next().poses))
+
+
+def test_episodes_are_drawn_on_the_map_of_their_own_training(
+    run_node: Any, make_client: Any, namespace: str, small_values: Any, tmp_path: FilePath
+) -> None:
+    client = make_client(namespace)
+    parameters = {**ENDLESS, "output_folder": str(tmp_path / "run"), "replay_period": 0.001}
+    with run_node("trainer_node", parameters, namespace=namespace) as node:
+        episodes = Listener(client, Path, "trainer/episode")
+        set_up(client, small_values, stamped(0.5, 0.5), stamped(5.5, 5.5))
+        start_training(client)
+
+        def next_episode() -> tuple[str, set[float]]:
+            """Return the frame, and the places within a cell of all poses."""
+            episode = episodes.next()
+            coordinates = [(p.pose.position.x, p.pose.position.y) for p in episode.poses]
+            return episode.header.frame_id, {round(c % 1.0, 3) for xy in coordinates for c in xy}
+
+        assert next_episode() == ("map", {0.5})
+        publish_map(client, small_values, 0.25, "site")
+        node.wait_for_log("6 x 6 cells(.|\n)*6 x 6 cells")
+        for _ in range(20):
+            assert next_episode() == ("map", {0.5})
+        client.call(Trigger, "trainer/stop")
+        node.wait_for_log("the training stopped")
+        assert client.call(Trigger, "trainer/replay").success
+        for _ in range(20):
+            assert next_episode() == ("map", {0.5})
+        # Of a training that this process has not seen: the last map is the best guess.
+        (tmp_path / "run").rename(tmp_path / "earlier")
+        client.set_parameters("trainer", output_folder=str(tmp_path / "earlier"))
+        assert client.call(Trigger, "trainer/replay").success
+        while next_episode()[0] != "site":
+            pass
+
+
+def test_a_replay_is_not_mixed_with_the_training_and_stop_says_what_it_stopped(
+    run_node: Any, make_client: Any, namespace: str, small_values: Any, tmp_path: FilePath
+) -> None:
+    client = make_client(namespace)
+    parameters = {**ENDLESS, "output_folder": str(tmp_path / "run"), "episode_interval": 1}
+    with run_node("trainer_node", parameters, namespace=namespace) as node:
+
+        def stop() -> str:
+            answer = client.call(Trigger, "trainer/stop")
+            assert answer.success
+            return str(answer.message)
+
+        episodes = Listener(client, Path, "trainer/episode")
+        diagnostics = Listener(client, DiagnosticArray, "/diagnostics")
+        assert stop() == "no training was running"
+        set_up(client, small_values, stamped(0.5, 0.5), stamped(5.5, 5.5))
+        start_training(client)
+        episodes.next()
+        assert client.call(Trigger, "trainer/replay").success
+        answered = time.time_ns()
+        while Time.from_msg((first := episodes.next()).header.stamp).nanoseconds <= answered:
+            pass  # what the training published before
+        count = int(wait_for_state(diagnostics, namespace, state="training")["episodes"])
+        lengths = [len(first.poses), *(len(episodes.next().poses) for _ in range(40))]
+        while int(wait_for_state(diagnostics, namespace)["episodes"]) < count + 20:
+            pass
+        lengths += [len(episodes.next().poses) for _ in range(20)]
+        assert all(b in (1, a + 1) for a, b in itertools.pairwise(lengths)), lengths
+
+        assert "; the replay was stopped" in stop()
+        node.wait_for_log("the training stopped")
+        assert client.call(Trigger, "trainer/replay").success
+        assert stop() == "no training was running; the replay was stopped"
+        assert stop() == "no training was running"
+
+
+def test_the_log_says_when_a_training_begins_and_what_is_saved(
+    run_node: Any, make_client: Any, namespace: str, small_values: Any, tmp_path: FilePath
+) -> None:
+    client = make_client(namespace)
+    parameters = {"steps": 300, "filters": 4, "output_folder": str(tmp_path / "run")}
+    with run_node("trainer_node", parameters, namespace=namespace) as node:
+        set_up(client, small_values, stamped(0.5, 0.5), stamped(5.5, 5.5))
+        start_training(client)
+        node.wait_for_log(f"training in {tmp_path}/run from step 0 to 300")
+        node.wait_for_log(f"step 300 is saved in {tmp_path}/run/checkpoint.safetensors")
+        node.wait_for_log("the training finished")
+    assert node.log.count("is saved in") == 1
+
+
+def test_a_folder_of_something_else_or_in_use_is_refused_and_left_as_it_is(
+    run_node: Any, make_client: Any, namespace: str, small_values: Any, tmp_path: FilePath
+) -> None:
+    client = make_client(namespace)
+    for name in ("episodes.csv", "model.safetensors"):
+        (tmp_path / name).write_text("mine")
+    used = tmp_path.with_name("used")
+    scenario = Scenario(GridMap(small_values > 0), (0, 0), (5, 5))
+    other = TrainingRun(used, [scenario], MoveRule.ROBOT_SAFE, HyperParameters(), seed=0)
+    with run_node("trainer_node", {"output_folder": str(tmp_path)}, namespace=namespace):
+        set_up(client, small_values, stamped(0.5, 0.5), stamped(5.5, 5.5))
+        with pytest.raises(AssertionError, match="no training; give a new or empty folder"):
+            start_training(client)
+        client.set_parameters("trainer", output_folder=str(used))
+        assert "another process trains" in client.call(Trigger, "trainer/start").message
+    other.close()
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["episodes.csv", "model.safetensors"]
+    assert all(path.read_text() == "mine" for path in tmp_path.iterdir())
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
@@ -495,11 +606,12 @@ def test_what_cannot_be_started_or_replayed_is_answered_with_the_remedy(
         # Less memory than the replay buffer needs.
         limits = resource.prlimit(node.process.pid, resource.RLIMIT_AS)
         used = int(FilePath(f"/proc/{node.process.pid}/statm").read_text().split()[0]) * 4096
-        client.set_parameters("trainer", output_folder=str(tmp_path), replay_capacity=10**7)
+        client.set_parameters("trainer", output_folder=str(tmp_path / "run"))
+        client.set_parameters("trainer", replay_capacity=10**7)
         resource.prlimit(node.process.pid, resource.RLIMIT_AS, (used + 10**8, limits[1]))
         answer = client.call(Trigger, "trainer/start")
         assert not answer.success
-        assert "smaller filters, environments or replay_capacity" in answer.message
+        assert "smaller filters, batch_size, environments or replay_capacity" in answer.message
         client.set_parameters("trainer", replay_capacity=1000)
         assert client.call(Trigger, "trainer/start").success
 

@@ -1,6 +1,8 @@
 from __future__ import annotations
 
+import os
 import signal
+import socket
 import subprocess
 import sys
 import time
@@ -22,12 +24,13 @@ from ddqn_planner.nodes.conversions import grid_from_message, occupancy_message,
 from ddqn_planner.nodes.runtime import LATCHED
 from ddqn_planner.planning.picture import value_ramp
 
-pytest.importorskip("rerun")
+pytest.importorskip("rerun", reason="rerun, of the extra watch, is missing")
 from rerun.chunk import RrdReader
 
-from ddqn_planner.nodes.watch import EPISODE, MAP, PLAN, REWARD, UNKNOWN_GREY, VALUE
+from ddqn_planner.nodes.watch import EPISODE, MAP, PLAN, PORT, REWARD, UNKNOWN_GREY, VALUE
 
-TIMEOUT = 30.0
+DISPLAYS = ("DISPLAY", "WAYLAND_DISPLAY", "WAYLAND_SOCKET")
+TIMEOUT = 300.0
 HEADER = Header(frame_id="map")
 ORIGIN = (-1.0, 2.0, 0.7)
 PLAN_CELLS = [(0, 0), (1, 1), (1, 2)]
@@ -131,6 +134,28 @@ def test_a_recording_holds_what_the_nodes_published(
         [0, 35]
     ].tolist()
     assert found[REWARD]["scalars"] == [[0.25], [-0.5]]
+
+
+@pytest.mark.parametrize("display", [{}, {"DISPLAY": ":4242"}])
+def test_without_a_display_it_ends_with_the_remedy(
+    tmp_path: FilePath, display: dict[str, str]
+) -> None:
+    with socket.socket() as connection:
+        if connection.connect_ex(("127.0.0.1", PORT)) == 0:
+            pytest.skip("a viewer listens already, and watch uses it")
+    without = {k: v for k, v in os.environ.items() if k not in DISPLAYS}
+    ended = subprocess.run(
+        [executable("ddqn-planner"), "watch"],
+        env={**without, **display},
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        timeout=TIMEOUT,
+    )
+    assert ended.returncode == 2, ended.stderr
+    assert "ddqn-planner: rerun's viewer ended with 1" in ended.stderr
+    assert "--save FILE" in ended.stderr
+    assert "Traceback" not in ended.stderr
 
 
 @pytest.mark.parametrize(

@@ -2,20 +2,23 @@ from __future__ import annotations
 
 import csv
 import resource
+import subprocess
+import sys
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
-from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from ddqn_planner import MoveRule
 from ddqn_planner.model import load_model
+from ddqn_planner.training import run as run_module
 from ddqn_planner.training.environment import Scenario
 from ddqn_planner.training.hyper_parameters import HyperParameters
-from ddqn_planner.training.run import TrainingRun, read_cells
+from ddqn_planner.training.run import FolderError, TrainingRun, read_cells
 from ddqn_planner.training.trainer import CheckpointError, Episode
 
 PARAMETERS = HyperParameters(steps=400, filters=4, learning_starts=50)
@@ -30,6 +33,16 @@ def finish(run: TrainingRun) -> list[Episode]:
     episodes = [episode for finished in run.steps() for episode in finished]
     run.close()
     return episodes
+
+
+def board_scalars(folder: Path) -> list[Any]:
+    """What TensorBoard shows of the average reward, where it is installed."""
+    pytest.importorskip("tensorboard", reason="tensorboard, an extra, is missing")
+    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+    events = EventAccumulator(str(folder))
+    events.Reload()
+    return list(events.Scalars("average_reward"))
 
 
 def rows(folder: Path) -> list[dict[str, str]]:
@@ -89,11 +102,133 @@ def test_other_parameters_do_not_overwrite_a_run(
     assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == before
 
 
+@pytest.mark.parametrize(
+    "name",
+    ["episodes.csv", "model.safetensors", ".episodes.csv.swp", "notes.txt", "sub/thesis.tex"],
+)
+def test_a_folder_of_something_else_is_refused_and_left_as_it_is(
+    small: Scenario, tmp_path: Path, name: str
+) -> None:
+    path = tmp_path / name
+    path.parent.mkdir(exist_ok=True)
+    path.write_text("mine")
+    with pytest.raises(FolderError, match="no training; give a new or empty folder") as error:
+        open_run(tmp_path, small)
+    assert name.split("/")[0] in str(error.value)
+    assert [entry for entry in tmp_path.rglob("*") if entry.is_file()] == [path]
+    assert path.read_text() == "mine"
+
+
+def test_the_folders_of_other_ranks_do_not_keep_the_first_one_out(
+    small: Scenario, tmp_path: Path
+) -> None:
+    open_run(tmp_path / "rank_1", small).close()
+    open_run(tmp_path, small).close()
+
+
+def test_a_training_that_was_killed_before_its_first_checkpoint_can_begin_again(
+    small: Scenario, tmp_path: Path
+) -> None:
+    killed = open_run(tmp_path, small)
+    next(killed.steps())
+    killed.close()
+    assert not killed.checkpoint_path.exists()
+    finish(open_run(tmp_path, small))
+    assert rows(tmp_path)
+
+
+def test_a_checkpoint_of_a_version_without_locks_goes_on(small: Scenario, tmp_path: Path) -> None:
+    finish(open_run(tmp_path, small))
+    (tmp_path / "training.lock").unlink()
+    resumed = open_run(tmp_path, small)
+    resumed.close()
+    assert resumed.trainer.steps == 400
+
+
+def test_no_other_run_gets_into_a_folder_until_the_first_one_ends(
+    small: Scenario, tmp_path: Path
+) -> None:
+    first = open_run(tmp_path, small)
+    steps = first.steps()
+    for _ in range(100):
+        next(steps)
+    before = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
+    with pytest.raises(FolderError, match=f"another process trains in {tmp_path}"):
+        open_run(tmp_path, small)
+    assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == before
+    first.close()
+    open_run(tmp_path, small).close()
+
+
+def test_a_run_that_cannot_be_opened_leaves_its_folder_unlocked(
+    small: Scenario, tmp_path: Path
+) -> None:
+    finish(open_run(tmp_path, small))
+    with pytest.raises(CheckpointError) as refused:  # whose frames keep the failed run alive
+        open_run(tmp_path, small, gamma=0.9)
+    open_run(tmp_path, small).close()
+    assert refused
+
+
+LOCK_FOR_EVER = """
+import sys
+from pathlib import Path
+from ddqn_planner.files import lock
+
+file = lock(Path(sys.argv[1]))
+print(flush=True)
+sys.stdin.read()
+"""
+
+
+def test_a_process_locks_a_folder_until_it_is_killed(small: Scenario, tmp_path: Path) -> None:
+    command = [sys.executable, "-c", LOCK_FOR_EVER, str(tmp_path / "training.lock")]
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as other:
+        assert other.stdout is not None
+        other.stdout.readline()
+        with pytest.raises(FolderError, match="another process"):
+            open_run(tmp_path, small)
+        other.kill()
+        other.wait()
+    open_run(tmp_path, small).close()
+
+
+def test_a_save_that_failed_is_tried_again_at_the_next_interval_and_not_before(
+    small: Scenario, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(run_module, "SAVE_INTERVAL", 100)
+    run = open_run(tmp_path / "run", small, steps=10**6)
+    steps = run.steps()
+    (tmp_path / "run").rename(tmp_path / "moved")
+    (tmp_path / "run").touch()
+    while run.trainer.steps < 100:
+        next(steps)
+    assert run.save_error
+    (tmp_path / "run").unlink()
+    (tmp_path / "moved").rename(tmp_path / "run")
+    while run.trainer.steps < 199:
+        next(steps)
+        assert not run.checkpoint_path.exists()
+    next(steps)
+    assert run.checkpoint_path.exists()
+    assert run.save_error == ""
+    run.close()
+
+
+def test_the_last_step_is_saved_once(
+    small: Scenario, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(run_module, "SAVE_INTERVAL", 100)
+    run = open_run(tmp_path, small)
+    saved_at = [run.saved_at for _ in run.steps()]
+    run.close()
+    assert sorted(set(saved_at)) == [0, 100, 200, 300]
+    assert run.saved_at == run.trainer.steps == 400
+
+
 def test_tensorboard_gets_the_curves_where_it_is_installed(small: Scenario, tmp_path: Path) -> None:
     episodes = finish(open_run(tmp_path, small))
-    events = EventAccumulator(str(tmp_path))
-    events.Reload()
-    assert len(events.Scalars("average_reward")) == len(episodes)
+    assert len(board_scalars(tmp_path)) == len(episodes)
 
 
 def test_a_training_goes_on_while_the_disk_is_full_and_saves_when_it_no_longer_is(
@@ -141,14 +276,13 @@ def test_a_training_goes_on_while_the_disk_is_full_and_saves_when_it_no_longer_i
     assert numbers == sorted(set(numbers))
     assert set(range(before + 1, episodes + 1)) <= set(numbers)
     assert len(list(read_cells(run.curves_path, every=1))) == len(numbers) < episodes
-    events = EventAccumulator(str(tmp_path))
-    events.Reload()
-    assert events.Scalars("average_reward")[-1].step == int(rows(tmp_path)[-1]["step"])
+    last_step = int(rows(tmp_path)[-1]["step"])
 
     resumed = open_run(tmp_path, small, steps=10**6)
     resumed.close()
     assert resumed.trainer.steps == 600
     assert [int(row["episode"]) for row in rows(tmp_path)] == numbers
+    assert board_scalars(tmp_path)[-1].step == last_step
 
 
 @pytest.mark.parametrize("put_there", [Path.touch, lambda path: path.symlink_to("nowhere/else")])
@@ -176,6 +310,7 @@ def test_a_folder_that_is_gone_keeps_no_training_from_going_on(
 
 
 def test_a_run_removes_what_killed_ones_left_in_its_folder(small: Scenario, tmp_path: Path) -> None:
+    open_run(tmp_path, small).close()
     for name in ("model.safetensors", "checkpoint.safetensors", "episodes.csv"):
         for number in range(50):
             (tmp_path / f".{name}.{number:08}").write_bytes(b"half")
@@ -214,6 +349,7 @@ def test_of_a_broken_file_whole_rows_alone_are_read(
 
 
 def test_an_episode_of_any_length_can_be_read_and_cut(small: Scenario, tmp_path: Path) -> None:
+    open_run(tmp_path, small).close()
     path = tmp_path / "episodes.csv"
     cells = b" ".join([b"0:0"] * 10**5)
     path.write_bytes(b"1,9,0,out_of_steps,2,2.0,1.5,0.75," + cells + b"\r\n")
