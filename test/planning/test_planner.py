@@ -89,6 +89,13 @@ def test_the_unmasked_walk_is_trapped_by_the_first_illegal_move_that_it_prefers(
     field = QField((2, 0), q, legal_moves(grid.occupancy, MoveRule.ROBOT_SAFE))
     assert field.rollout((0, 0)).cells == ((0, 0), (1, 0), (2, 0))
     assert field.unmasked().rollout((0, 0)).status is PlanStatus.WALK_TRAPPED
+    assert field.value.max() == 1  # what is illegal does not count
+
+
+def test_of_equal_moves_the_first_is_taken() -> None:
+    legal = legal_moves(np.zeros((3, 3), dtype=bool), MoveRule.ROBOT_SAFE)
+    field = QField((2, 2), np.zeros((8, 3, 3), dtype=np.float32), legal)
+    assert (field.policy == legal.argmax(axis=0)).all()
 
 
 def test_a_start_on_the_goal_is_a_path_of_one_cell() -> None:

@@ -55,6 +55,15 @@ def test_follows_the_values_even_on_a_detour() -> None:
     assert len(search((0, 0), end, legal, grid.price, rule)) == 5
 
 
+def test_visits_cells_without_a_value_last() -> None:
+    grid, rule = GridMap(np.array([[0, 0, 0], [0, 1, 0], [0, 0, 0]])), MoveRule.ROBOT_SAFE
+    value, end = np.zeros((3, 3), np.float32), np.zeros((3, 3), dtype=bool)
+    end[0, 2] = True
+    value[0, 1] = np.nan
+    legal = legal_moves(grid.occupancy, rule)
+    assert (1, 0) not in search((0, 0), end, legal, grid.price, rule, value)
+
+
 def test_a_move_costs_the_mean_price_of_its_two_cells() -> None:
     # From a dear start it is cheaper to leave by the straight move, though it ends a bit dearer.
     grid = GridMap(np.array([[0, 0, 1], [1, 0, 0]]), cost=np.array([[99, 3, 0], [0, 0, 0]]))

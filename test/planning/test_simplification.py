@@ -155,6 +155,15 @@ def test_any_pairs_of_whole_numbers_are_cells_and_come_back_as_python_ints() -> 
         simplify([(0.5, 0)], grid, "unit")  # type: ignore[list-item]
 
 
+def test_a_segment_reaches_to_the_corner_of_a_corridor_of_any_length() -> None:
+    for length in range(2, 20):
+        occupancy = np.ones((4, length + 1), dtype=bool)
+        occupancy[0] = occupancy[:, length] = False
+        cells = [(x, 0) for x in range(length + 1)] + [(length, y) for y in range(1, 4)]
+        expected = ((0, 0), (length, 0), (length, 3))
+        assert simplify(cells, GridMap(occupancy), MoveRule.ROBOT_SAFE) == expected
+
+
 def test_a_straight_way_has_two_cells_and_an_open_map_too() -> None:
     grid, rule = GridMap(np.zeros((40, 90))), MoveRule.ROBOT_SAFE
     assert simplify([(x, 3) for x in range(90)], grid, rule) == ((0, 3), (89, 3))
