@@ -243,11 +243,18 @@ class Planner:
             if not joined[entry[1], entry[0]]:
                 return Plan(PlanStatus.NO_PATH)
             if method is PlanMethod.GUIDED:
-                end = np.zeros(grid.occupancy.shape, dtype=np.bool_)
-                end[field.goal[1], field.goal[0]] = True
-                cells = search(entry, end, field.legal, grid.price, rule, field.value)
-                plan = Plan(PlanStatus.SUCCEEDED, cells, method)
+                return self.search(route, grid, field, rule)
         return replace(plan, cells=route.leave[:-1] + plan.cells) if plan.cells else plan
+
+    def search(
+        self, route: Route, grid: GridMap, field: QField, move_rule: MoveRule | None = None
+    ) -> Plan:
+        """Search a route in the order of its field's values, where greedy steps are trapped."""
+        rule, entry = move_rule or self.metadata.move_rule, route.leave[-1]
+        end = np.zeros(grid.occupancy.shape, dtype=np.bool_)
+        end[field.goal[1], field.goal[0]] = True
+        cells = search(entry, end, field.legal, grid.price, rule, field.value)
+        return Plan(PlanStatus.SUCCEEDED, route.leave[:-1] + cells, PlanMethod.GUIDED)
 
 
 def _free_cells(grid: GridMap, goal: Cell, tolerance: float) -> NDArray[np.int64]:

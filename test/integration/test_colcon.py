@@ -26,7 +26,7 @@ from ddqn_planner.training.environment import Scenario
 
 ROOT = Path(__file__).resolve().parents[2]
 
-START_TIMEOUT = 30.0
+START_TIMEOUT = 120.0
 """Seconds in which a node of a loaded machine imports torch and speaks."""
 
 

@@ -40,7 +40,7 @@ from ddqn_planner.training.environment import Scenario
 from ddqn_planner.training.hyper_parameters import HyperParameters
 from ddqn_planner.training.trainer import Trainer
 
-TIMEOUT = 20.0
+TIMEOUT = 120.0
 ENDLESS = {"steps": 10**9, "filters": 4, "learning_starts": 100}
 
 

@@ -27,7 +27,7 @@ from rerun.chunk import RrdReader
 
 from ddqn_planner.nodes.watch import EPISODE, MAP, PLAN, REWARD, UNKNOWN_GREY, VALUE
 
-TIMEOUT = 30.0
+TIMEOUT = 120.0
 HEADER = Header(frame_id="map")
 ORIGIN = (-1.0, 2.0, 0.7)
 PLAN_CELLS = [(0, 0), (1, 1), (1, 2)]
