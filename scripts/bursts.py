@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 from client import SERVICE_QUALITY, BackgroundNode, plan_request
+from geometry_msgs.msg import PoseStamped
 from nav_msgs.msg import OccupancyGrid
 from nav_msgs.srv import GetPlan
 from std_msgs.msg import Header
@@ -23,7 +24,8 @@ TIMEOUT = 120.0
 """Seconds after which the missing answers of a burst count as lost."""
 
 SIZES, COUNTS, BURSTS = (20, 400, 2000), (20, 50, 200), 30
-GOALS = 3
+GOALS = 2
+"""As many as the fields of the greatest map that the planner keeps."""
 REACH = 30
 """Cells from a start to its goal along an axis, at most: the answers are short, so that they come
 as fast as they can."""
@@ -114,9 +116,7 @@ def load_bursts(
             publisher = one.node.create_publisher(OccupancyGrid, "map", LATCHED)
             publisher.publish(message)
             # Until it plans on this map, and so that it knows the fields: these are not measured.
-            while not all(
-                answer_is_right(grid, reachable, *pair) for pair in ask_all(one, grid, goals)
-            ):
+            while not all(is_right(grid, reachable, *pair) for pair in ask_all(one, grid, goals)):
                 pass
             for count in counts:
                 for clients in (1, count):
@@ -132,22 +132,21 @@ def ask_all(
     return [(request, one.burst([request])[0]) for request in requests]
 
 
-def answer_is_right(
+def is_right(
     grid: GridMap, reachable: dict[Cell, Any], request: GetPlan.Request, answer: Any
 ) -> bool:
-    """Say whether there is an answer, with a path from start to goal if and only if there is one."""
-    start, goal = (
-        grid.world_to_cell(pose.pose.position.x, pose.pose.position.y)
-        for pose in (request.start, request.goal)
-    )
+    """Say whether it is a path from start to goal, or empty because there is none."""
     if answer is None:
         return False
+    start, goal = cell_of(grid, request.start), cell_of(grid, request.goal)
     poses = answer.plan.poses
-    ends = [
-        grid.world_to_cell(pose.pose.position.x, pose.pose.position.y)
-        for pose in poses[:1] + poses[-1:]
-    ]
+    ends = [cell_of(grid, pose) for pose in poses[:1] + poses[-1:]]
     return ends == ([start, goal] if reachable[goal][start[1], start[0]] else [])
+
+
+def cell_of(grid: GridMap, pose: PoseStamped) -> Cell:
+    """Return the cell of a pose."""
+    return grid.world_to_cell(pose.pose.position.x, pose.pose.position.y)
 
 
 def load_burst(
@@ -161,8 +160,7 @@ def load_burst(
             answers = asking.burst(requests)
             answered += sum(answer is not None for answer in answers)
             right += sum(
-                answer_is_right(grid, reachable, *pair)
-                for pair in zip(requests, answers, strict=True)
+                is_right(grid, reachable, *pair) for pair in zip(requests, answers, strict=True)
             )
     print(
         f"bursts: {grid.width} x {grid.height} cells, {bursts} of {count} requests, "

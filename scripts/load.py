@@ -24,7 +24,7 @@ from typing import Any
 
 import numpy as np
 from builtin_interfaces.msg import Time
-from bursts import load_bursts
+from bursts import cell_of, load_bursts
 from client import SERVICE_QUALITY, BackgroundNode, plan_request, pose
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped
@@ -36,7 +36,7 @@ from processes import claim_ros_domain, executable, running
 from rclpy.qos import DurabilityPolicy, QoSProfile
 from std_msgs.msg import Header
 
-from ddqn_planner.grid import MOVES, Cell, GridMap, MapFile, MoveRule, legal_moves, read_map_file
+from ddqn_planner.grid import MOVES, MapFile, MoveRule, legal_moves, read_map_file
 from ddqn_planner.grid.generators import generate_map, random_requests
 from ddqn_planner.grid.moves import component_labels
 from ddqn_planner.nodes.conversions import occupancy_message
@@ -113,11 +113,6 @@ def terrains() -> list[Terrain]:
         Terrain(generated),
         Terrain(read_map_file(find_map("office"))),
     ]
-
-
-def cell_of(grid: GridMap, pose: PoseStamped) -> Cell:
-    """Return the cell of a pose."""
-    return grid.world_to_cell(pose.pose.position.x, pose.pose.position.y)
 
 
 def resident(process: int) -> float:

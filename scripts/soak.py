@@ -23,7 +23,6 @@ from client import plan_request, pose
 from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped
 from load import (
     RULE,
-    TIMEOUT,
     Client,
     resident,
     terrains,
@@ -107,7 +106,6 @@ class Work:
         request = LoadMap.Request(map_url=str(self._maps[-1]))
         loaded = self._client.call(LoadMap, "map_server/load_map", request)
         self._client.wait_for_map(loaded.map.header.stamp)
-            time.sleep(PAUSE)
         for steady in self._steady:
             self._call(GetPlan, "planner/get_plan", steady)
 
