@@ -23,7 +23,7 @@ from ddqn_planner.planning import shortest_distances
 TIMEOUT = 120.0
 """Seconds after which the missing answers of a burst count as lost."""
 
-SIZES, COUNTS, BURSTS = (20, 400, 2000), (20, 50, 200), 30
+SIZES, COUNTS, CLIENTS, BURSTS = (20, 400, 2000), (20, 50, 200), (1, 20), 30
 GOALS = 2
 """As many as the fields of the greatest map that the planner keeps."""
 REACH = 30
@@ -119,7 +119,7 @@ def load_bursts(
             while not all(is_right(grid, reachable, *pair) for pair in ask_all(one, grid, goals)):
                 pass
             for count in counts:
-                for clients in (1, count):
+                for clients in CLIENTS:
                     fine &= load_burst(grid, reachable, clients, count, bursts)
     return fine
 
