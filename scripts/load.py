@@ -47,7 +47,7 @@ from ddqn_planner.resources import find_map
 RULE = MoveRule.ROBOT_SAFE
 """The rule of the planner's default model."""
 
-TIMEOUT = 60.0
+TIMEOUT = 240.0
 """Seconds after which an answer counts as lost."""
 
 REQUESTS, CLIENTS, CHANGES = 10_000, 8, 50
