@@ -9,10 +9,15 @@ import rclpy
 from geometry_msgs.msg import PoseStamped
 from nav_msgs.srv import GetPlan
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rclpy.qos import QoSProfile
 from std_msgs.msg import Header
 
 from ddqn_planner.grid import Cell, GridMap
 from ddqn_planner.nodes.conversions import quaternion
+
+SERVICE_QUALITY = QoSProfile(depth=1000)
+"""Of a client that asks much. With Fast DDS each client of a service hears the answers to all, and
+one that is slow to read them loses its own from the usual queue of ten."""
 
 
 class BackgroundNode:

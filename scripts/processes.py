@@ -11,6 +11,9 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+STOP_TIMEOUT = 120.0
+"""Seconds that a process may take to end on a loaded machine."""
+
 
 def claim_ros_domain() -> socket.socket:
     """Set the environment to a ROS domain that nobody else here uses, kept to this machine.
@@ -87,7 +90,7 @@ def running(*command: str) -> Iterator[subprocess.Popen[bytes]]:
 def _stop(child: subprocess.Popen[bytes]) -> None:
     child.send_signal(signal.SIGINT)
     try:
-        child.wait(timeout=10)
+        child.wait(timeout=STOP_TIMEOUT)
     except BaseException:
         child.kill()
         child.wait()

@@ -23,7 +23,6 @@ from client import plan_request, pose
 from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped
 from load import (
     RULE,
-    TIMEOUT,
     Client,
     resident,
     terrains,
@@ -106,11 +105,7 @@ class Work:
         self.reload_model()  # it forgets all fields
         request = LoadMap.Request(map_url=str(self._maps[-1]))
         loaded = self._client.call(LoadMap, "map_server/load_map", request)
-        deadline = time.monotonic() + TIMEOUT
-        while self._client.get_plan(self._steady[0]).header.stamp != loaded.map.header.stamp:
-            if time.monotonic() > deadline:
-                raise TimeoutError(f"the planner has no new map after {TIMEOUT:.0f} s")
-            time.sleep(PAUSE)
+        self._client.wait_for_map(loaded.map.header.stamp)
         for steady in self._steady:
             self._call(GetPlan, "planner/get_plan", steady)
 

@@ -96,6 +96,12 @@ def value_message(field: QField, grid: GridMap, header: Header) -> OccupancyGrid
     return occupancy_message(percent, grid.resolution, grid.origin, header)
 
 
+def unknown_value_message(grid: GridMap, header: Header) -> OccupancyGrid:
+    """Make a message that says of no cell of a map what its value is."""
+    unknown = np.full(grid.occupancy.shape, -1, dtype=np.int8)
+    return occupancy_message(unknown, grid.resolution, grid.origin, header)
+
+
 def path_message(
     cells: Sequence[Cell], grid: GridMap, header: Header, goal_orientation: Quaternion
 ) -> Path:

@@ -78,6 +78,11 @@ def policy_message(field: QField, grid: GridMap, header: Header) -> MarkerArray:
     return MarkerArray(markers=[marker])
 
 
+def no_policy_message(header: Header) -> MarkerArray:
+    """Make a message that deletes the arrows of the last `policy_message`."""
+    return MarkerArray(markers=[Marker(header=header, ns="policy", id=0, action=Marker.DELETE)])
+
+
 def _point(x: float, y: float) -> Point:
     # Faster than Point(x=x, y=y).
     point = Point()

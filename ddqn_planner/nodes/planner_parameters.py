@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from typing import Final
+from dataclasses import dataclass
+from typing import Any, Final
 
 from rcl_interfaces.msg import ParameterDescriptor
 from rclpy.node import Node
 
 from ddqn_planner.grid import MoveRule
 from ddqn_planner.nodes.runtime import floating_point_range, integer_range
+from ddqn_planner.nodes.transforms import TransformSource
 from ddqn_planner.planning import PlanMethod
 from ddqn_planner.planning.planner import CACHE_BYTES
 
@@ -65,7 +67,7 @@ def declare_parameters(node: Node) -> None:
     declare(
         "tolerance",
         0.0,
-        "How far an occupied goal_pose may move to a reachable free cell, metres",
+        "How far a goal_pose that is occupied or cut off may move to a reachable free cell, metres",
         **floating_point_range(0.0, 1000.0),
     )
     declare("mode", "greedy", "Whether to search where the greedy steps are trapped: guided")
@@ -76,6 +78,12 @@ def declare_parameters(node: Node) -> None:
         "base_link",
         "Frame of the robot, for the start_source tf",
         additional_constraints="not empty",
+    )
+    declare(
+        "transform_tolerance",
+        0.3,
+        "How old a transform may be, for the start_source tf, seconds",
+        **floating_point_range(0.0, 1000.0),
     )
     declare(
         "field_cache_bytes",
@@ -89,3 +97,75 @@ def declare_parameters(node: Node) -> None:
         "Whether to load each model that trainer/model_saved names",
         read_only=True,
     )
+
+
+@dataclass(frozen=True)
+class Settings:
+    """The values of the parameters, except those of the model.
+
+    Parameters
+    ----------
+    move_rule : MoveRule, optional
+        The model's own by default.
+    map_arguments : tuple
+        ``occupied_threshold``, ``allow_unknown``, ``priced``: of `grid_from_message`.
+    body : tuple of float
+        ``robot_radius``, ``clearance_weight``: of `inflate`.
+    tolerance : float
+    method : PlanMethod
+    simplified : bool
+    start_source : str
+    robot_frame : str
+    transform_tolerance : float
+    cache_bytes : int
+    """
+
+    move_rule: MoveRule | None
+    map_arguments: tuple[int, bool, bool]
+    body: tuple[float, float]
+    tolerance: float
+    method: PlanMethod
+    simplified: bool
+    start_source: str
+    robot_frame: str
+    transform_tolerance: float
+    cache_bytes: int
+
+
+def read_parameters(node: Node) -> Settings:
+    """Return the values of the parameters."""
+
+    def value(name: str) -> Any:
+        return node.get_parameter(name).value
+
+    return Settings(
+        move_rule=MoveRule(value("move_rule")) if value("move_rule") else None,
+        map_arguments=(value("occupied_threshold"), value("allow_unknown"), value("priced")),
+        # A range lets a value pass that is above it by a millionth.
+        body=(value("robot_radius"), min(value("clearance_weight"), 1.0)),
+        tolerance=value("tolerance"),
+        method=PlanMethod(value("mode")),
+        simplified=value("path_simplification") == "line_of_sight",
+        start_source=value("start_source"),
+        robot_frame=value("robot_frame"),
+        transform_tolerance=value("transform_tolerance"),
+        cache_bytes=value("field_cache_bytes"),
+    )
+
+
+def check_parameter(name: str, value: Any) -> None:
+    """Check what neither a parameter's type nor its range says.
+
+    Raises
+    ------
+    ValueError
+        If it is not one of the choices, or empty.
+    RuntimeError
+        If it needs what is not installed.
+    """
+    if name in CHOICES and value not in CHOICES[name]:
+        raise ValueError(f"{name} is {value!r}; it is one of {CHOICES[name]}")
+    if name == "start_source" and value == "tf":
+        TransformSource.check()
+    if name == "robot_frame" and not value:
+        raise ValueError("robot_frame is ''; name the robot's frame, as base_link")

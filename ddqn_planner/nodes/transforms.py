@@ -10,7 +10,7 @@ from rclpy.time import Time
 
 
 class TransformError(RuntimeError):
-    """The transform is not known; the message says why and what to do."""
+    """The transform is not known, or too old; the message says why and what to do."""
 
 
 class TransformSource:
@@ -30,6 +30,7 @@ class TransformSource:
         import tf2_ros
 
         self._tf2_ros = tf2_ros
+        self._clock = node.get_clock()
         self._buffer = tf2_ros.Buffer()
         self._listener = tf2_ros.TransformListener(self._buffer, node)
 
@@ -43,8 +44,8 @@ class TransformSource:
                 "'odometry'"
             )
 
-    def pose(self, robot_frame: str, map_frame: str) -> PoseStamped:
-        """Return where a frame is in the map's frame now.
+    def pose(self, robot_frame: str, map_frame: str, tolerance: float) -> PoseStamped:
+        """Return where a frame is in the map's frame now, or at most `tolerance` seconds ago.
 
         Raises
         ------
@@ -55,9 +56,18 @@ class TransformSource:
             transform = self._buffer.lookup_transform(map_frame, robot_frame, Time())
         except self._tf2_ros.TransformException as error:
             raise TransformError(
-                f"the start is unknown: no transform leads from {robot_frame!r} to {map_frame!r} "
+                f"no transform leads from {robot_frame!r} to {map_frame!r} "
                 f"({error}); publish one, or set robot_frame or start_source"
             ) from None
+        stamp = Time.from_msg(transform.header.stamp)
+        age = (self._clock.now() - stamp).nanoseconds / 1e9
+        # Static transforms alone have the stamp 0, and hold for ever.
+        if stamp.nanoseconds and age > tolerance:
+            raise TransformError(
+                f"the transform from {robot_frame!r} to {map_frame!r} is {age:.3g} s old, more "
+                f"than transform_tolerance, {tolerance:g} s; publish it more often, or set "
+                "transform_tolerance or start_source"
+            )
         pose = PoseStamped(header=transform.header)
         position, translation = pose.pose.position, transform.transform.translation
         position.x, position.y, position.z = translation.x, translation.y, translation.z

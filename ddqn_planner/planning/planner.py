@@ -264,19 +264,32 @@ class Planner:
             if not joined[entry[1], entry[0]]:
                 return Plan(PlanStatus.NO_PATH, move_rule=rule)
             if method is PlanMethod.GUIDED:
-                end = np.zeros(grid.occupancy.shape, dtype=np.bool_)
-                end[field.goal[1], field.goal[0]] = True
-                cells = search(entry, end, field.legal, grid.price, rule, field.value)
-                plan = Plan(PlanStatus.SUCCEEDED, cells, method)
-        if not plan.cells:
-            return replace(plan, move_rule=rule)
-        cells = route.leave[:-1] + plan.cells
-        cost = None if grid.cost is None else path_cost(cells, grid.price, rule)
-        return replace(plan, cells=cells, move_rule=rule, cost=cost)
+                return self.search(route, grid, field, rule)
+        return _on_route(route, plan, grid, rule)
+
+    def search(
+        self, route: Route, grid: GridMap, field: QField, move_rule: MoveRule | str | None = None
+    ) -> Plan:
+        """Search a route in the order of its field's values, where greedy steps are trapped."""
+        rule, entry = self._rule(move_rule), route.leave[-1]
+        end = np.zeros(grid.occupancy.shape, dtype=np.bool_)
+        end[field.goal[1], field.goal[0]] = True
+        cells = search(entry, end, field.legal, grid.price, rule, field.value)
+        plan = Plan(PlanStatus.SUCCEEDED, cells, PlanMethod.GUIDED)
+        return _on_route(route, plan, grid, rule)
 
 
 def _reach(tolerance: float) -> float:
     return tolerance * (1 + ROUNDING)
+
+
+def _on_route(route: Route, plan: Plan, grid: GridMap, rule: MoveRule) -> Plan:
+    """Let a plan from where a route enters the free cells begin at the route's start."""
+    if not plan.cells:
+        return replace(plan, move_rule=rule)
+    cells = route.leave[:-1] + plan.cells
+    cost = None if grid.cost is None else path_cost(cells, grid.price, rule)
+    return replace(plan, cells=cells, move_rule=rule, cost=cost)
 
 
 def _free_cells(grid: GridMap, goal: Cell, tolerance: float) -> NDArray[np.int64]:

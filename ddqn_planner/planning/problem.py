@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from ddqn_planner.grid import Cell, GridMap, MoveRule
 from ddqn_planner.planning.plan import Plan, PlanMethod, PlanStatus
-from ddqn_planner.planning.planner import Planner
+from ddqn_planner.planning.planner import Planner, Route
+from ddqn_planner.planning.q_field import QField
 from ddqn_planner.planning.simplification import simplify
 
 
@@ -51,6 +52,9 @@ class Solution:
         The path, simplified if asked for.
     field_ms, walk_ms : float
         How long it took to get the field, and to walk in it.
+    route : Route, optional
+    field : QField, optional
+        Both, unless there is no path for a reason that needs no field.
     """
 
     plan: Plan
@@ -58,6 +62,8 @@ class Solution:
     cells: tuple[Cell, ...] = ()
     field_ms: float = 0.0
     walk_ms: float = 0.0
+    route: Route | None = None
+    field: QField | None = None
 
 
 def solve(problem: Problem) -> Solution:
@@ -70,7 +76,31 @@ def solve(problem: Problem) -> Solution:
     field = planner.q_field(grid, route.goal, rule)
     field_at_hand = time.perf_counter()
     plan = planner.follow(route, grid, field, problem.method, rule)
-    cells = simplify(plan.cells, grid, rule) if problem.simplified else plan.cells
+    cells = _shown_cells(problem, plan)
     ended = time.perf_counter()
     times = 1e3 * (field_at_hand - began), 1e3 * (ended - field_at_hand)
-    return Solution(plan, route.goal, cells, *times)
+    return Solution(plan, route.goal, cells, *times, route, field)
+
+
+def search_on(problem: Problem, trapped: Solution) -> Solution:
+    """Search where the greedy steps of a solution were trapped, in any thread.
+
+    Parameters
+    ----------
+    problem : Problem
+    trapped : Solution
+        Its plan's status is WALK_TRAPPED. Its route and its field are used again.
+    """
+    assert trapped.route is not None
+    assert trapped.field is not None
+    began = time.perf_counter()
+    plan = problem.planner.search(trapped.route, problem.grid, trapped.field, problem.move_rule)
+    cells = _shown_cells(problem, plan)
+    walk_ms = trapped.walk_ms + 1e3 * (time.perf_counter() - began)
+    return replace(trapped, plan=plan, cells=cells, walk_ms=walk_ms)
+
+
+def _shown_cells(problem: Problem, plan: Plan) -> tuple[Cell, ...]:
+    if not problem.simplified:
+        return plan.cells
+    return simplify(plan.cells, problem.grid, problem.move_rule)

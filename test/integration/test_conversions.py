@@ -190,14 +190,24 @@ def test_value_is_scaled_to_percent_and_unknown_where_there_is_none() -> None:
     assert message.header.frame_id == "map"
 
 
-@pytest.mark.parametrize("level", [0.0, 3e38, np.nan])
-def test_value_that_is_the_same_everywhere_makes_a_map(level: float) -> None:
-    q = np.full((8, 1, 2), level, dtype=np.float32)
-    q[0, 0, 0] = -level
-    message = value_message(
-        QField((1, 0), q, np.ones((8, 1, 2), dtype=np.bool_)), GridMap(np.zeros((1, 2))), HEADER
-    )
-    assert set(message.data) <= {-1, 100}
+def test_value_is_rounded_to_the_nearest_percent() -> None:
+    q = np.zeros((8, 1, 4), dtype=np.float32)
+    q[:, 0] = [0.0, 1.004, 1.996, 3.0]
+    field = QField((3, 0), q, np.ones(q.shape, dtype=np.bool_))
+    message = value_message(field, GridMap(np.zeros((1, 4))), HEADER)
+    assert message.data.tolist() == [0, 33, 67, 100]
+
+
+@pytest.mark.parametrize(
+    ("worst", "best", "percent"),
+    [(0.0, 0.0, [100, 100]), (-3e38, 3e38, [0, 100]), (np.nan, np.nan, [-1, -1])],
+)
+def test_value_of_any_span_makes_a_map(worst: float, best: float, percent: list[int]) -> None:
+    q = np.full((8, 1, 2), best, dtype=np.float32)
+    q[:, 0, 0] = worst
+    field = QField((1, 0), q, np.ones(q.shape, dtype=np.bool_))
+    message = value_message(field, GridMap(np.zeros((1, 2))), HEADER)
+    assert message.data.tolist() == percent
 
 
 def test_a_tolerance_is_a_finite_number_of_metres() -> None:

@@ -19,10 +19,10 @@ from PIL import Image
 from processes import running
 
 DEMO = Path(__file__).resolve().parents[2] / "scripts" / "demo.py"
-END_TIMEOUT = 90.0
+END_TIMEOUT = 240.0
 """Seconds that the whole demo may take on a loaded machine."""
 
-STOP_TIMEOUT = 20.0
+STOP_TIMEOUT = 120.0
 """Seconds in which it ends after a signal: each of two nodes is killed after 10."""
 
 MARK = "DDQN_PLANNER_TEST_DEMO"

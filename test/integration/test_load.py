@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from bursts import load_bursts
 from client import plan_request, pose
 from load import Client, Terrain, load_goals, load_requests
 from nav_msgs.msg import Path as PathMessage
@@ -22,6 +23,7 @@ def test_every_answer_is_right_while_the_map_changes_and_goals_are_planned_in_or
     with run_node("planner_node") as node:
         assert load_requests(node.process.pid, requests=200, clients=4), capfd.readouterr().out
         assert load_goals(200), capfd.readouterr().out
+        assert load_bursts((20, 50), (20,), 2), capfd.readouterr().out
     assert "Traceback" not in node.log
 
 

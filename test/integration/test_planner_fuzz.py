@@ -127,6 +127,7 @@ NAMES = [
     "path_simplification",
     "start_source",
     "robot_frame",
+    "transform_tolerance",
     "field_cache_bytes",
     "follow_trainer",
     "use_sim_time",
@@ -178,6 +179,7 @@ DEFAULTS: dict[str, Any] = {
     "path_simplification": "none",
     "start_source": "initialpose",
     "robot_frame": "base_link",
+    "transform_tolerance": 0.3,
     "field_cache_bytes": 2**29,
     "use_sim_time": False,
 }

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from itertools import pairwise
@@ -12,7 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 from diagnostic_msgs.msg import DiagnosticStatus
-from geometry_msgs.msg import PoseStamped, TransformStamped
+from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped, TransformStamped
 from integration.robot import (
     GOAL_YAW,
     Robot,
@@ -27,6 +28,7 @@ from nav_msgs.msg import Odometry, Path
 from nav_msgs.srv import GetPlan
 from rcl_interfaces.msg import SetParametersResult
 from rcl_interfaces.srv import SetParametersAtomically
+from rclpy.duration import Duration
 from rclpy.parameter import Parameter
 from std_msgs.msg import Header
 from visualization_msgs.msg import Marker, MarkerArray
@@ -315,7 +317,109 @@ class TransformListener:
 """As much of tf2_ros as the node uses, which is no package of PyPI: one transform, no tree."""
 
 
-def test_the_start_comes_from_tf(
+@pytest.fixture
+def transformed(
+    run_node: Any,
+    make_client: Callable[[str], Any],
+    hall: np.ndarray,
+    model: FilePath,
+    tmp_path: FilePath,
+    monkeypatch: pytest.MonkeyPatch,
+) -> Iterator[Robot]:
+    """Run a planner that asks TF where it is, with a map."""
+    (tmp_path / "tf2_ros.py").write_text(TF2_ROS)
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path), prepend=":")
+    client = make_client("/transformed")
+    with run_node("planner_node", {"start_source": "tf"}, namespace="/transformed"):
+        robot = Robot(client, hall, model, "/transformed/planner")
+        robot.send_map()
+        robot.wait_for_map(robot.map_message())
+        yield robot
+
+
+def transform(robot: Robot, cell: Cell, age: float | None = None) -> TransformStamped:
+    """Return where the robot was so many seconds ago; None for a static transform."""
+    message = TransformStamped(header=Header(frame_id="map"), child_frame_id="base_link")
+    if age is not None:
+        message.header.stamp = (
+            robot.client.node.get_clock().now() - Duration(seconds=age)
+        ).to_msg()
+    position = message.transform.translation
+    position.x, position.y = robot.grid.cell_to_world(cell)
+    return message
+
+
+def test_a_goal_waits_for_the_first_transform(transformed: Robot) -> None:
+    robot, client = transformed, transformed.client
+    robot.send_goal(robot.pose((19, 14)))
+    robot.wait_for_reason("no transform leads from 'base_link' to 'map' .*publish one, or set")
+    assert robot.plans.wait().poses == []
+    client.publish("tf", transform(robot, (4, 7)))
+    robot.wait_for_path((4, 7), (19, 14))
+    assert robot.get_plan(PoseStamped(), robot.pose((0, 0))).poses
+    assert client.set_parameters("planner", start_source="initialpose")[0].successful
+    robot.send_start(robot.pose((5, 5)))
+    robot.wait_for_path((5, 5), (19, 14))
+
+
+def test_an_old_transform_is_no_start(transformed: Robot) -> None:
+    robot, client = transformed, transformed.client
+    client.publish("tf", transform(robot, (4, 7), age=6.0))
+    robot.send_goal(robot.pose((19, 14)))
+    status = robot.wait_for_reason(
+        r"the transform from 'base_link' to 'map' is ([6-9]|\d\d)[.\d]* s old, more than "
+        "transform_tolerance, 0.3 s; publish"
+    )
+    assert values_of(status)["status"] == "NO_START"
+    assert all(not plan.poses for plan in robot.plans.messages())
+    assert client.set_parameters("planner", transform_tolerance=500.0)[0].successful
+    robot.wait_for_path((4, 7), (19, 14))
+
+
+def test_a_new_listener_to_transforms_has_no_empty_plan(transformed: Robot) -> None:
+    robot, client = transformed, transformed.client
+    values = {"start_source": "initialpose", "transform_tolerance": 100.0}
+    assert all(result.successful for result in client.set_parameters("planner", **values))
+    robot.send_start(robot.pose((5, 5)))
+    robot.send_goal(robot.pose((19, 14)))
+    robot.wait_for_path((5, 5), (19, 14))
+    robot.plans.clear()
+    timer = client.node.create_timer(
+        0.05, lambda: client.publish("tf", transform(robot, (4, 7), age=0.0), listeners=0)
+    )
+    try:
+        assert client.set_parameters("planner", start_source="tf")[0].successful
+        robot.wait_for_path((4, 7), (19, 14))
+    finally:
+        client.node.destroy_timer(timer)
+    assert all(plan.poses for plan in robot.plans.messages())
+
+
+# Parameters that come together
+
+
+def test_what_was_refused_of_one_source_is_forgotten_with_it(robot: Robot) -> None:
+    robot.send_start(robot.pose((0, 0)))
+    robot.send_goal(robot.pose((3, 3)))
+    robot.client.publish(
+        "initialpose", PoseWithCovarianceStamped(header=Header(frame_id="nowhere"))
+    )
+    robot.wait_for_reason("initialpose refused")
+    robot.clear()
+    with parameters_of(robot, start_source="odometry"):
+        robot.wait_for_reason("^((?!initialpose refused).)*$")
+        robot.client.publish("odom", odometry(robot, (4, 2), frame="odom"))
+        robot.wait_for_reason("odom refused")
+        robot.clear()
+    robot.wait_for_reason("^((?!odom refused).)*$")
+
+
+def test_a_weight_that_its_range_lets_pass_is_one_that_plans(robot: Robot) -> None:
+    with parameters_of(robot, clearance_weight=1.0000005):
+        assert robot.get_plan(robot.pose((0, 0)), robot.pose((3, 3))).poses
+
+
+def test_the_bound_of_the_kept_fields_holds_from_the_start(
     run_node: Any,
     make_client: Callable[[str], Any],
     hall: np.ndarray,
@@ -323,27 +427,29 @@ def test_the_start_comes_from_tf(
     tmp_path: FilePath,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    (tmp_path / "tf2_ros.py").write_text(TF2_ROS)
+    (tmp_path / "sitecustomize.py").write_text(COUNT)
     monkeypatch.setenv("PYTHONPATH", str(tmp_path), prepend=":")
-    client = make_client("/transformed")
-    with run_node("planner_node", {"start_source": "tf"}, namespace="/transformed"):
-        robot = Robot(client, hall, model, "/transformed/planner")
+    client = make_client("/bounded")
+    with run_node("planner_node", {"field_cache_bytes": 0}, namespace="/bounded") as node:
+        robot = Robot(client, hall, model, "/bounded/planner")
         robot.send_map()
-        robot.send_goal(robot.pose((19, 14)))
-        robot.wait_for_reason("no transform leads from 'base_link' to 'map' .*publish one, or set")
-        transform = TransformStamped(header=Header(frame_id="map"), child_frame_id="base_link")
-        x, y = robot.grid.cell_to_world((4, 7))
-        transform.transform.translation.x, transform.transform.translation.y = x, y
-        client.publish("tf", transform)
-        ask(robot, lambda: robot.get_plan(PoseStamped(), robot.pose((0, 0))).poses)
-        robot.send_goal(robot.pose((19, 13)))
-        robot.wait_for_path((4, 7), (19, 13))
-        assert client.set_parameters("planner", start_source="initialpose")[0].successful
-        robot.send_start(robot.pose((5, 5)))
-        robot.wait_for_path((5, 5), (19, 13))
+        robot.wait_for_map(robot.map_message())
+        for goal in ((3, 3), (4, 4), (3, 3)):
+            assert robot.get_plan(robot.pose((0, 0)), robot.pose(goal)).poses
+        node.wait_for_log(r"(?s)(field of 20.*){3}")
 
 
-# Parameters that come together
+COUNT = """
+from ddqn_planner.model import AnyMapQNetwork
+
+compute = AnyMapQNetwork.q_values
+
+def q_values(network, grid, *arguments):
+    print("field of", grid.width, flush=True)
+    return compute(network, grid, *arguments)
+
+AnyMapQNetwork.q_values = q_values
+"""
 
 
 def test_parameters_that_come_together_are_set_together_or_not_at_all(robot: Robot) -> None:
@@ -381,17 +487,139 @@ def test_parameters_that_come_together_are_set_together_or_not_at_all(robot: Rob
 # What is to be looked at
 
 
-def test_the_plan_and_the_value_carry_the_stamp_of_their_map(robot: Robot) -> None:
+def test_plan_and_value_are_stamped_when_answered_and_the_diagnostics_name_the_map(
+    robot: Robot,
+) -> None:
+    def is_new(message: Any) -> bool:
+        stamp = message.header.stamp
+        return bool(began <= stamp.sec + stamp.nanosec / 1e9 <= time.time())
+
     for seconds in (5, 9):
         message = robot.map_message()
         message.header.stamp.sec = seconds
         robot.send_map(message)
+        robot.wait_for_map(message)
+        robot.clear()
+        began = time.time()
         robot.send_start(robot.pose((0, 0)))
         robot.send_goal(robot.pose((3, 3)))
-        robot.plans.wait(lambda plan, s=seconds: plan.poses and plan.header.stamp.sec == s)
-        robot.value.wait(lambda value, s=seconds: value.header.stamp.sec == s)
-        plan = robot.get_plan(robot.pose((1, 0)), robot.pose((3, 3)))
-        assert plan.header.stamp.sec == seconds
+        assert is_new(robot.wait_for_path((0, 0), (3, 3)))
+        assert is_new(robot.value.wait())
+        assert is_new(robot.get_plan(robot.pose((1, 0)), robot.pose((3, 3))))
+        values = values_of(robot.wait_for_reason("^a path of "))
+        assert values["planned on the map of (s)"] == f"{seconds}.000000000"
+        assert values["map"] == "20 x 15 cells of 0.5 m in frame 'map'"
+
+
+def test_the_value_is_published_once_a_goal(robot: Robot) -> None:
+    first, second = 6 * 20 + 3, 7 * 20 + 4
+    robot.send_start(robot.pose((0, 0)))
+    robot.send_goal(robot.pose((3, 6)))
+    robot.wait_for_path((0, 0), (3, 6))
+    robot.send_start(robot.pose((1, 0)))
+    robot.wait_for_path((1, 0), (3, 6))
+    robot.send_goal(robot.pose((4, 7)))
+    robot.value.wait(lambda value: value.data[second] == 100)
+    assert sum(value.data[first] == 100 for value in robot.value.messages()) == 1
+
+
+def test_nothing_is_shown_of_a_goal_without_a_field(robot: Robot) -> None:
+    policies = robot.client.subscribe(MarkerArray, "planner/policy", LATCHED)
+    robot.send_start(robot.pose((0, 0)))
+    robot.send_goal(robot.pose((3, 3)))
+    robot.value.wait(lambda value: value.data[3 * 20 + 3] == 100)
+    policies.wait(lambda message: message.markers[0].action == Marker.ADD)
+    robot.clear()
+    policies.clear()
+    robot.send_goal(robot.pose((10, 2)))
+    assert robot.plans.wait().poses == []
+    value = robot.value.wait()
+    assert (set(value.data), value.info.width, value.header.frame_id) == ({-1}, 20, "map")
+    assert policies.wait().markers[0].action == Marker.DELETE
+    robot.clear()
+    policies.clear()
+    robot.send_goal(robot.pose((3, 3)))
+    robot.value.wait(lambda value: value.data[3 * 20 + 3] == 100)
+    policies.wait(lambda message: message.markers[0].action == Marker.ADD)
+
+
+@pytest.mark.parametrize("name", ["value", "policy"])
+def test_what_cannot_be_shown_does_not_end_the_node(
+    name: str,
+    run_node: Any,
+    make_client: Callable[[str], Any],
+    hall: np.ndarray,
+    model: FilePath,
+    tmp_path: FilePath,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    (tmp_path / "sitecustomize.py").write_text(
+        "import ddqn_planner.nodes.conversions as value\n"
+        "import ddqn_planner.nodes.markers as policy\n"
+        f"{name}.{name}_message = lambda *_: [][0]\n"
+    )
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path), prepend=":")
+    client = make_client(f"/no_{name}")
+    client.subscribe(MarkerArray, "planner/policy", LATCHED)
+    with run_node("planner_node", {}, namespace=f"/no_{name}") as node:
+        robot = Robot(client, hall, model, f"/no_{name}/planner")
+        robot.send_map()
+        robot.send_start(robot.pose((0, 0)))
+        robot.send_goal(robot.pose((3, 3)))
+        robot.wait_for_path((0, 0), (3, 3))
+        node.wait_for_log(f"the {name} cannot be shown .IndexError")
+        assert robot.get_plan(robot.pose((0, 0)), robot.pose((4, 4))).poses
+
+
+# What the log says
+
+
+def test_the_log_says_once_what_stays_the_same(
+    run_node: Any, make_client: Callable[[str], Any], hall: np.ndarray, model: FilePath
+) -> None:
+    client = make_client("/quiet")
+    with run_node("planner_node", {}, namespace="/quiet") as node:
+        robot = Robot(client, hall, model, "/quiet/planner")
+
+        def send_maps(frame: str, first: int) -> None:
+            """Send three maps, one after the other is planned on."""
+            for seconds in range(first, first + 3):
+                message = robot.map_message()
+                message.header.frame_id, message.header.stamp.sec = frame, seconds
+                robot.send_map(message)
+                robot.wait_for_map(message)
+
+        def set_goal_again() -> None:
+            for radius in (0.1, 0.2, 0.3):
+                robot.plans.clear()
+                assert client.set_parameters("planner", robot_radius=radius)[0].successful
+                robot.plans.wait()
+
+        send_maps("map", 1)
+        robot.send_start(robot.pose((0, 0)))
+        robot.send_goal(robot.pose((3, 3)))
+        robot.wait_for_path((0, 0), (3, 3))
+        set_goal_again()
+        send_maps("map", 4)
+        robot.send_goal(robot.pose((10, 2)))
+        robot.wait_for_reason("the goal is occupied")
+        set_goal_again()
+        for frame in ("nowhere", "nowhere", "nowhere", "elsewhere"):
+            pose = robot.pose((0, 0))
+            pose.header.frame_id = frame
+            robot.send_start(pose)
+        node.wait_for_log("the start's frame is 'elsewhere'")
+        send_maps("upstairs", 7)
+        node.wait_for_log("no plan: the goal's frame")
+        for line in (
+            r"map of 20 x 15 cells of 0.5 m in frame 'map'",
+            r"map of 20 x 15 cells of 0.5 m in frame 'upstairs'",
+            "a path of ",
+            "no plan: the goal is occupied",
+            "no plan: the goal's frame",
+            "initialpose refused: the start's frame is 'nowhere'",
+        ):
+            assert node.log.count(line) == 1, node.log
 
 
 def test_the_policy_is_drawn_for_who_looks(robot: Robot, hall: np.ndarray) -> None:

@@ -1,0 +1,31 @@
+"""Requests that come at once: each is answered."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+from bursts import BurstClients, burst_requests
+from nav_msgs.srv import GetMap
+
+
+@pytest.mark.parametrize("clients", [1, 20])
+@pytest.mark.parametrize("count", [20, 200])
+def test_each_request_of_a_burst_has_its_plan(robot: Any, clients: int, count: int) -> None:
+    with BurstClients(clients, name="/robot/planner/get_plan") as asking:
+        requests = burst_requests(robot.grid, [(5, 5)], count)
+        answers = asking.burst(requests)
+    assert len(answers) == count
+    assert all(answer is not None and answer.plan.poses for answer in answers)
+
+
+def test_each_request_of_a_burst_has_its_map(
+    run_node: Callable[..., Any],
+) -> None:
+    with (
+        run_node("map_server_node", {}, namespace="/burst"),
+        BurstClients(1, GetMap, "/burst/map_server/map") as asking,
+    ):
+        answers = asking.burst([GetMap.Request()] * 200)
+    assert all(answer is not None and answer.map.info.width == 20 for answer in answers)

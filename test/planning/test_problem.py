@@ -1,0 +1,43 @@
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from ddqn_planner.grid import GridMap, MoveRule
+from ddqn_planner.model import ModelMetadata, PaperQNetwork
+from ddqn_planner.planning import PlanMethod, Planner, PlanStatus
+from ddqn_planner.planning.problem import Problem, search_on, solve
+
+
+def turning_planner() -> Planner:
+    """Return one that goes to -x, or where it cannot, to +x: its greedy steps are trapped."""
+    network = PaperQNetwork(6, 6, 1)
+    with torch.no_grad():
+        network.fully_connected.weight.zero_()
+        network.fully_connected.bias.copy_(torch.tensor([1, 0, 0, 0, 2, 0, 0, 0]))
+    sizes = {"height": 6, "width": 6, "filters": 1}
+    return Planner(network, ModelMetadata("paper", sizes, MoveRule.ROBOT_SAFE, 0.9, "", 1, 0, ""))
+
+
+@pytest.mark.parametrize("simplified", [False, True])
+def test_a_search_goes_on_from_what_the_trapped_steps_found(
+    simplified: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    grid, rule = GridMap(np.zeros((6, 6))), MoveRule.ROBOT_SAFE
+    guided = Problem(
+        turning_planner(), grid, (0, 0), (5, 5), rule, PlanMethod.GUIDED, 0.0, simplified
+    )
+    trapped = solve(replace(guided, method=PlanMethod.GREEDY))
+    assert trapped.plan.status is PlanStatus.WALK_TRAPPED
+    whole = solve(guided)
+    for name in ("route", "q_field", "known_field", "follow"):
+        monkeypatch.delattr(Planner, name)
+    found = search_on(guided, trapped)
+    assert (found.plan, found.cells, found.goal) == (whole.plan, whole.cells, whole.goal)
+    assert found.plan.method is PlanMethod.GUIDED
+    assert found.field_ms == trapped.field_ms
+    assert found.walk_ms > trapped.walk_ms
+    assert len(found.cells) == (2 if simplified else 6)
