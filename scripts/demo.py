@@ -153,7 +153,7 @@ def show(node: Client, plan: Path, children: Children, case: Case, seconds: floa
         print("path: " + " ".join(f"({x}, {y})" for x, y in cells))
     else:
         print(f"{grid.width} x {grid.height} cells, path of {len(cells)} from {start} to {goal}")
-    length = path_length(cells)
+    length = path_length(cells, case.move_rule)
     print(f"length {length:.2f} cells, optimum {optimum:.2f} under {case.move_rule.value}")
     print(
         f"Q field computed in {float(times['field time (ms)']):.1f} ms, path walked in "

@@ -190,7 +190,8 @@ class TrainingRun:
 
     def _note(self, episode: Episode) -> None:
         try:
-            self._curves.append(_row(episode))
+            rule = self.trainer.environment.move_rules[episode.scenario]
+            self._curves.append(_row(episode, rule))
             if self._board is not None:
                 self._board.append(_events(episode))
         except OSError as error:
@@ -258,14 +259,14 @@ def _claim(folder: Path) -> BinaryIO:
         ) from None
 
 
-def _row(episode: Episode) -> bytes:
+def _row(episode: Episode, move_rule: MoveRule) -> bytes:
     values = (
         episode.number,
         episode.step,
         episode.scenario,
         episode.outcome.value,
         episode.moves,
-        round(path_length(episode.cells), 4),
+        round(path_length(episode.cells, move_rule), 4),
         round(episode.total_reward, 6),
         round(episode.average_reward, 6),
         " ".join(f"{x}:{y}" for x, y in episode.cells),

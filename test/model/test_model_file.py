@@ -133,7 +133,7 @@ def test_a_pickle_is_not_run(tmp_path: Path) -> None:
     assert not (tmp_path / "exploded").exists()
 
 
-def save_as(path: Path, weights: PaperQNetwork, **changes: object) -> None:
+def save_as(path: Path, weights: PaperQNetwork, /, **changes: object) -> None:
     description = {**asdict(METADATA), **changes}
     content = safetensors.torch.save(
         weights.state_dict(), {"ddqn_planner": json.dumps(description)}

@@ -5,6 +5,7 @@ import resource
 import subprocess
 import sys
 from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +15,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ddqn_planner import MoveRule
+from ddqn_planner.grid import path_length
 from ddqn_planner.model import load_model
 from ddqn_planner.training import run as run_module
 from ddqn_planner.training.environment import Scenario
@@ -58,6 +60,17 @@ def test_each_episode_is_a_row_of_the_curves(small: Scenario, tmp_path: Path) ->
     )
     recorded = list(read_cells(tmp_path / "episodes.csv", every=3))
     assert recorded == [episode.cells for episode in episodes if episode.number % 3 == 0]
+
+
+@pytest.mark.parametrize("rule", MoveRule)
+def test_the_curves_hold_lengths_under_the_rule_of_the_scenario(
+    small: Scenario, tmp_path: Path, rule: MoveRule
+) -> None:
+    episodes = finish(open_run(tmp_path, replace(small, move_rule=rule)))
+    assert any(x != u and y != v for e in episodes for (x, y), (u, v) in pairwise(e.cells))
+    assert [float(row["length"]) for row in rows(tmp_path)] == pytest.approx(
+        [path_length(episode.cells, rule) for episode in episodes], abs=1e-4
+    )
 
 
 def test_a_run_goes_on_from_its_checkpoint_and_loses_no_row(
