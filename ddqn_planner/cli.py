@@ -17,7 +17,7 @@ from tqdm import tqdm
 
 from ddqn_planner.experiments import EXPERIMENTS
 from ddqn_planner.experiments.benchmark_maps import (
-    PRICES,
+    COSTS,
     RequestSettings,
     describe_files,
     find_files,
@@ -116,7 +116,7 @@ def _add_plan(plan: argparse.ArgumentParser) -> None:
         "--mode",
         choices=[method.value for method in PlanMethod],
         default="greedy",
-        help="guided: search where the greedy steps are trapped",
+        help="astar_fallback: search where the greedy steps are trapped",
     )
     plan.add_argument(
         "--occupied-threshold",
@@ -127,7 +127,10 @@ def _add_plan(plan: argparse.ArgumentParser) -> None:
     )
     for name, words in (
         ("allow-unknown", "take unknown cells as free"),
-        ("priced", "let a free cell cost more, the greater its value; an unknown one costs most"),
+        (
+            "use-map-costs",
+            "let a free cell cost more, the greater its value; an unknown one costs most",
+        ),
     ):
         plan.add_argument(f"--{name}", action="store_true", help=words)
     for name, words in (
@@ -175,7 +178,7 @@ def _add_evaluate(evaluate: argparse.ArgumentParser) -> None:
     add("--sizes", nargs="+", type=int, default=[32, 64, 128, 256], help="sides, cells")
     add("--maps", type=int, default=3, metavar="N", help="of a kind and size")
     add("--requests", type=int, default=200, metavar="N", help="of a map")
-    add("--priced", choices=PRICES, default="none", help="costs of free cells")
+    add("--costs", choices=COSTS, default="none", help="costs of free cells")
     add("--seed", type=int, default=0, help="of maps and requests")
     add("--out", type=Path, metavar="FILE", help=".md or .csv, for the tables")
     evaluate.set_defaults(command=_evaluate)
@@ -249,7 +252,7 @@ def _plan(options: argparse.Namespace) -> int:
     if not options.tolerance >= 0:
         raise ValueError(f"--tolerance is {options.tolerance:g}; give metres, 0 or more")
     map_file, start, goal = _read_map(options)
-    grid = map_file.grid(options.occupied_threshold, options.allow_unknown, options.priced)
+    grid = map_file.grid(options.occupied_threshold, options.allow_unknown, options.use_map_costs)
     grid = inflate(grid, options.robot_radius, options.clearance_weight)
     planner = Planner.load(options.model)
     method, tolerance = PlanMethod(options.mode), options.tolerance / grid.resolution
@@ -405,7 +408,9 @@ def _evaluate(options: argparse.Namespace) -> int:
         raise ValueError(f"--maps is {options.maps}; give at least 1")
     if options.out and options.out.suffix.lower() not in (".csv", ".md"):
         raise ValueError(f"--out is {options.out}; give a file that ends in .csv or .md")
-    settings = RequestSettings(options.move_rule, options.requests, options.priced, options.seed)
+    settings = RequestSettings(
+        options.move_rule, options.requests, options.costs, options.seed
+    )
     planner = Planner.load(options.model)
     maps = generated_maps(options.kinds, options.sizes, options.maps, settings)
     if options.data:
@@ -427,7 +432,7 @@ def _evaluate(options: argparse.Namespace) -> int:
             summaries,
             walks,
             f"Model {options.model} ({metadata.network}, {metadata.steps:,} steps, seed "
-            f"{metadata.seed}), move rule {options.move_rule.value}, costs {options.priced}, "
+            f"{metadata.seed}), move rule {options.move_rule.value}, costs {options.costs}, "
             f"requests of seed {options.seed}.",
         )
         print(text, end="")

@@ -157,7 +157,7 @@ def show(node: Client, plan: Path, children: Children, case: Case, seconds: floa
     print(f"length {length:.2f} cells, optimum {optimum:.2f} under {case.move_rule.value}")
     print(
         f"Q field computed in {float(times['field time (ms)']):.1f} ms, path walked in "
-        f"{float(times['walk time (ms)']):.2f} ms; first plan {seconds:.1f} s after the nodes "
+        f"{float(times['rollout time (ms)']):.2f} ms; first plan {seconds:.1f} s after the nodes "
         "were started"
     )
     value = wait_for("value field", lambda: node.heard.get("planner/value"), children)

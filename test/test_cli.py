@@ -136,19 +136,19 @@ def test_plan_reads_a_maps_values_as_the_node_does(
     assert crossed("0", "2") == 2
     assert crossed("0", "2", "--occupied-threshold", "61") == 2
     assert crossed("0", "2", "--occupied-threshold", "60") == 3
-    assert crossed("0", "2", "--priced") == 3
+    assert crossed("0", "2", "--use-map-costs") == 3
     assert crossed("2", "4") == 4
     assert crossed("2", "4", "--allow-unknown") == 2
-    assert crossed("2", "4", "--allow-unknown", "--priced") == 4
+    assert crossed("2", "4", "--allow-unknown", "--use-map-costs") == 4
 
 
-def test_plan_searches_in_guided_mode(capsys: pytest.CaptureFixture[str]) -> None:
+def test_plan_searches_in_fallback_mode(capsys: pytest.CaptureFixture[str]) -> None:
     request = ["plan", "dilemma", "--model", "dilemma", "--goal", "0", "0"]
     assert main(request) == 1
     assert "greedy steps do not find it" in capsys.readouterr().err
-    assert main([*request, "--mode", "guided"]) == 0
+    assert main([*request, "--mode", "astar_fallback"]) == 0
     assert "cells, optimum" in (printed := capsys.readouterr().out)
-    assert ", guided, planned in" in printed
+    assert ", astar_fallback, planned in" in printed
 
 
 def test_plan_writes_an_animation(tmp_path: Path) -> None:

@@ -48,7 +48,7 @@ ABLATION = (
     "variant",
     "steps",
     "moves judged wrongly, of 4,096",
-    "error of the price",
+    "error of the cost multiplier",
     "starts solved, any move",
     "mean length / optimum",
     "mean cost / optimum, random costs",
@@ -123,8 +123,8 @@ def zero_shot(settings: Settings) -> tuple[list[str], list[str]]:
 
 def _row(planners: Sequence[Planner]) -> list[str]:
     judged = [_judgement(planner) for planner in planners]
-    lengths = [_walks(planner, priced=False) for planner in planners]
-    costs = [_walks(planner, priced=True) for planner in planners]
+    lengths = [_walks(planner, with_costs=False) for planner in planners]
+    costs = [_walks(planner, with_costs=True) for planner in planners]
     starts = lengths[0][1]
     return [
         spread([wrong for wrong, _ in judged]),
@@ -136,24 +136,24 @@ def _row(planners: Sequence[Planner]) -> list[str]:
 
 
 def _judgement(planner: Planner) -> tuple[int, float]:
-    """Return how many moves are judged wrongly, and the mean relative error of their prices.
+    """Count the wrongly judged moves, and return the mean relative error of their costs.
 
-    All 256 surroundings of a free cell under both rules, for the prices each with random costs.
+    All 256 neighbourhoods of a free cell under both rules; for the costs, each with random costs.
     """
     network = planner.network
     assert isinstance(network, AnyMapQNetwork)
     wrong, errors = 0, []
     seen_B9 = _surroundings_of_a_free_cell()
     random = np.random.default_rng(0).integers(UNKNOWN, OCCUPIED, seen_B9.shape)
-    priced_B9 = np.where(seen_B9 == OCCUPIED, OCCUPIED, random).astype(np.int8)
+    costs_B9 = np.where(seen_B9 == OCCUPIED, OCCUPIED, random).astype(np.int8)
     for rule in RULES:
-        truth = [_truth(values, rule) for values in priced_B9]
-        legal_BA, price_BA = map(np.stack, zip(*truth, strict=True))
+        truth = [_truth(values, rule) for values in costs_B9]
+        legal_BA, multiplier_BA = map(np.stack, zip(*truth, strict=True))
         with torch.inference_mode():
             p_BA, _ = network(torch.from_numpy(features(seen_B9, rule)))
-            _, learned_BA = network(torch.from_numpy(features(priced_B9, rule)))
+            _, learned_BA = network(torch.from_numpy(features(costs_B9, rule)))
         wrong += int(((p_BA.numpy() > 0.5) != legal_BA).sum())
-        errors.append(np.abs(learned_BA.numpy() / price_BA - 1)[legal_BA])
+        errors.append(np.abs(learned_BA.numpy() / multiplier_BA - 1)[legal_BA])
     return wrong, float(np.concatenate(errors).mean())
 
 
@@ -167,20 +167,20 @@ def _surroundings_of_a_free_cell() -> NDArray[np.int8]:
 def _truth(
     values: NDArray[np.int8], rule: MoveRule
 ) -> tuple[NDArray[np.bool_], NDArray[np.float64]]:
-    """Return which moves from the centre of 3x3 cells are legal, and their prices: (8,) both."""
+    """Return legal moves from the centre of 3x3 cells, and their cost multipliers: (8,) both."""
     cells = values.reshape(3, 3)
     grid = GridMap(cells == OCCUPIED, cost=cells)
-    cost_AHW = move_costs(grid.price, rule)
+    cost_AHW = move_costs(grid.cost_multiplier, rule)
     return legal_moves(grid.occupancy, rule)[:, 1, 1], cost_AHW[:, 1, 1] / rule.lengths
 
 
-def _walks(planner: Planner, priced: bool) -> tuple[int, int, float]:
+def _walks(planner: Planner, with_costs: bool) -> tuple[int, int, float]:
     """Walk from every free cell of a map of each kind: solved, starts, mean over the optimum."""
     random = np.random.default_rng(0)
     count, starts, ratios = 0, 0, []
     for kind in HELD_OUT:
         occupancy = generate_map(kind, (SIDE, SIDE), random)
-        grid = GridMap(occupancy, cost=random_costs(occupancy, random) if priced else None)
+        grid = GridMap(occupancy, cost=random_costs(occupancy, random) if with_costs else None)
         goal = grid.free_cells()[-1]
         field = planner.q_field(grid, goal, MoveRule.ROBOT_SAFE).unmasked()
         evaluation = evaluate(field, grid, MoveRule.ROBOT_SAFE)

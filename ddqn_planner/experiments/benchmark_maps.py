@@ -27,7 +27,7 @@ from ddqn_planner.grid.generators import (
 )
 from ddqn_planner.grid.moves import component_labels
 
-PRICES: Final = ("none", "random", "gradient", "inflated", "unknown")
+COSTS: Final = ("none", "random", "gradient", "inflated", "unknown")
 """Which costs the free cells get."""
 
 INFLATION_RADIUS = 5.0
@@ -59,8 +59,8 @@ class RequestSettings:
         The rule under which a path must exist.
     requests : int
         How many a map, at least 1.
-    priced : str
-        Of `PRICES`.
+    costs : str
+        Of `COSTS`.
     seed : int
         At least 0.
 
@@ -72,14 +72,14 @@ class RequestSettings:
 
     move_rule: MoveRule
     requests: int = 200
-    priced: str = "none"
+    costs: str = "none"
     seed: int = 0
 
     def __post_init__(self) -> None:
         if self.requests < 1:
             raise ValueError(f"requests is {self.requests}; give at least 1")
-        if self.priced not in PRICES:
-            raise ValueError(f"priced is {self.priced!r}; give one of {', '.join(PRICES)}")
+        if self.costs not in COSTS:
+            raise ValueError(f"costs is {self.costs!r}; give one of {', '.join(COSTS)}")
         if self.seed < 0:
             raise ValueError(f"seed is {self.seed}; give at least 0")
 
@@ -89,13 +89,13 @@ class RequestSettings:
 
     def grid(self, occupancy: NDArray[np.bool_], random: np.random.Generator) -> GridMap:
         """Return the grid map with its costs."""
-        if self.priced == "random":
+        if self.costs == "random":
             return GridMap(occupancy, cost=random_costs(occupancy, random))
-        if self.priced == "gradient":
+        if self.costs == "gradient":
             return GridMap(occupancy, cost=gradient_costs(occupancy, random))
-        if self.priced == "inflated":
+        if self.costs == "inflated":
             return GridMap(occupancy, cost=inflated_costs(occupancy, INFLATION_RADIUS))
-        if self.priced == "unknown":
+        if self.costs == "unknown":
             return GridMap(occupancy, cost=unknown_costs(occupancy, UNKNOWN_SHARE, random))
         return GridMap(occupancy)
 
@@ -345,7 +345,7 @@ def _mpd_maps(path: Path, settings: RequestSettings) -> Iterator[BenchmarkMap]:
             f"{path}: cannot be read ({error}); give the test maps, their goals and minus the "
             "number of moves in the arrays arr_8, arr_9 and arr_11"
         ) from error
-    known = settings.move_rule is MoveRule.UNIT and settings.priced == "none"
+    known = settings.move_rule is MoveRule.UNIT and settings.costs == "none"
     for number in range(len(free)):
         random = settings.random(f"{path.stem}-{number}")
         occupancy = free[number] == 0

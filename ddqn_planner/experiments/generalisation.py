@@ -156,7 +156,7 @@ def measure(planner: Planner, maps: Iterable[BenchmarkMap], move_rule: MoveRule)
                 cells = field.rollout(start).cells
                 path_ms = 1e3 * (time.perf_counter() - began)
                 arrived = cells[:1] == (start,) and cells[-1:] == (goal,)
-                cost = path_cost(cells, grid.price, move_rule) if arrived else math.inf
+                cost = path_cost(cells, grid.cost_multiplier, move_rule) if arrived else math.inf
                 optimum = float(optima[start[1], start[0]])
                 agrees = math.isclose(
                     given_optimum, optimum, rel_tol=AGREES, abs_tol=benchmark_map.precision

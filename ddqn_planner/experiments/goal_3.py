@@ -229,7 +229,7 @@ def _on_map(walk: tuple[Cell, ...], scenario: Scenario) -> Plan:
     """Return the plan that a walk is on a map: trapped where a cell of it is occupied."""
     if all(map(scenario.grid.is_free, walk)):
         return Plan(PlanStatus.SUCCEEDED, walk)
-    return Plan(PlanStatus.WALK_TRAPPED)
+    return Plan(PlanStatus.ROLLOUT_TRAPPED)
 
 
 def _measured(planners: Sequence[Planner], maps: NoisyMaps) -> list[str]:

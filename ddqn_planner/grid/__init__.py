@@ -1,7 +1,7 @@
 """What the robot moves on: the grid map, the eight moves, map files and the paper's noise."""
 
 from ddqn_planner.grid.body import clearance, inflate
-from ddqn_planner.grid.grid_map import MAX_PRICE, OCCUPIED, UNKNOWN, Cell, GridMap
+from ddqn_planner.grid.grid_map import MAX_COST_MULTIPLIER, OCCUPIED, UNKNOWN, Cell, GridMap
 from ddqn_planner.grid.map_file import MapFile, MapFileError, load_map, read_map_file, save_map
 from ddqn_planner.grid.moves import (
     LENGTHS,
@@ -17,7 +17,7 @@ from ddqn_planner.grid.noise import Noise, scatter_obstacles
 
 __all__ = [
     "LENGTHS",
-    "MAX_PRICE",
+    "MAX_COST_MULTIPLIER",
     "MOVES",
     "OCCUPIED",
     "UNKNOWN",

@@ -19,9 +19,11 @@ OCCUPIED = 100
 UNKNOWN = -1
 """The value of an unknown cell (``nav_msgs/OccupancyGrid``)."""
 
-MAX_PRICE = 5.0
-"""The price of a cell of value 100, and of an unknown one. NavFn spreads its costs alike, from 50
-for a free cell to 253 for the dearest one, and takes unknown cells, where allowed, as dearest."""
+MAX_COST_MULTIPLIER = 5.0
+"""The cost multiplier of a cell of value 100, and of an unknown one.
+
+NavFn's costs have the same range: 50 for a free cell, 253 at most, and for unknown cells if these
+are allowed."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,9 +41,9 @@ class GridMap:
         Pose of the corner of cell (0, 0) in the map frame: x and y in metres, yaw in radians,
         counter-clockwise (the origin of ``nav_msgs/MapMetaData``).
     cost : (H, W) int8, or any array or list of such numbers, optional
-        What makes a free cell dear, as a value of ``nav_msgs/OccupancyGrid``: 0..99, or -1 where
-        it is unknown; see `price`. Values of occupied cells do not count, and become 0. By default
-        every free cell is as good as any other. A read-only copy is kept.
+        Cost of each free cell, a value of ``nav_msgs/OccupancyGrid``: 0..99, or -1 for an unknown
+        cell; see `cost_multiplier`. Values of occupied cells are ignored and become 0. By default
+        all free cells cost the same. A read-only copy is kept.
     obstacles : (H, W) bool, optional
         Which of the occupied cells are obstacles; the others are only too near to one for the
         robot's body, so that a start there may leave. By default all are obstacles. `inflate`
@@ -101,7 +103,7 @@ class GridMap:
         origin: tuple[float, float, float] = (0.0, 0.0, 0.0),
         occupied_threshold: int = 65,
         allow_unknown: bool = False,
-        priced: bool = False,
+        use_map_costs: bool = False,
     ) -> GridMap:
         """Make a grid map of the values of a ``nav_msgs/OccupancyGrid``.
 
@@ -117,7 +119,7 @@ class GridMap:
             ``occupied_thresh``, in percent.
         allow_unknown : bool
             Whether unknown cells are free.
-        priced : bool
+        use_map_costs : bool
             Whether free cells keep their values as costs; else they are all alike.
 
         Raises
@@ -134,7 +136,9 @@ class GridMap:
         array = array.astype(np.int8, copy=False)
         unknown = array < 0
         occupied = (array >= occupied_threshold) | (unknown & (not allow_unknown))
-        return cls(occupied, resolution, origin, np.maximum(array, UNKNOWN) if priced else None)
+        return cls(
+            occupied, resolution, origin, np.maximum(array, UNKNOWN) if use_map_costs else None
+        )
 
     @property
     def height(self) -> int:
@@ -147,12 +151,12 @@ class GridMap:
         return int(self.occupancy.shape[1])
 
     @cached_property
-    def price(self) -> NDArray[np.float32]:
-        """(H, W) float32: what a cell of way costs in each cell, 1 to `MAX_PRICE`."""
+    def cost_multiplier(self) -> NDArray[np.float32]:
+        """(H, W) float32: what a cell of way costs in each cell, 1 to `MAX_COST_MULTIPLIER`."""
         if self.cost is None:
             return np.ones(self.occupancy.shape, dtype=np.float32)
         share = np.where(self.cost == UNKNOWN, 1.0, self.cost / 100)
-        return (1 + (MAX_PRICE - 1) * share).astype(np.float32)
+        return (1 + (MAX_COST_MULTIPLIER - 1) * share).astype(np.float32)
 
     @cached_property
     def fingerprint(self) -> str:

@@ -93,11 +93,16 @@ class MapFile:
         object.__setattr__(self, "origin", checked.origin)
 
     def grid(
-        self, occupied_threshold: int = 65, allow_unknown: bool = False, priced: bool = False
+        self, occupied_threshold: int = 65, allow_unknown: bool = False, use_map_costs: bool = False
     ) -> GridMap:
         """Return the grid map; the parameters are those of `GridMap.from_occupancy_values`."""
         return GridMap.from_occupancy_values(
-            self.values, self.resolution, self.origin, occupied_threshold, allow_unknown, priced
+            self.values,
+            self.resolution,
+            self.origin,
+            occupied_threshold,
+            allow_unknown,
+            use_map_costs,
         )
 
 
@@ -105,10 +110,10 @@ def load_map(
     path: str | Path,
     occupied_threshold: int = 65,
     allow_unknown: bool = False,
-    priced: bool = False,
+    use_map_costs: bool = False,
 ) -> GridMap:
     """Read the grid map of a map file: `read_map_file`, then `MapFile.grid`."""
-    return read_map_file(path).grid(occupied_threshold, allow_unknown, priced)
+    return read_map_file(path).grid(occupied_threshold, allow_unknown, use_map_costs)
 
 
 def read_map_file(path: str | Path) -> MapFile:
@@ -161,9 +166,9 @@ def save_map(grid: GridMap | MapFile, path: str | Path) -> None:
     whole, the image first.
 
     A `MapFile` reads back equal. So does a `GridMap` without costs by ``load_map(path)``, and one
-    with costs by ``load_map(path, occupied_threshold=100, allow_unknown=True, priced=True)``: else
-    `load_map` takes costs of 65 or more and unknown cells as occupied. `GridMap.obstacles` is not
-    written.
+    with costs by ``load_map(path, occupied_threshold=100, allow_unknown=True,
+    use_map_costs=True)``: else `load_map` takes costs of 65 or more and unknown cells as
+    occupied. `GridMap.obstacles` is not written.
 
     Parameters
     ----------

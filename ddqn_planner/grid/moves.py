@@ -71,15 +71,15 @@ def legal_moves(occupancy: NDArray[np.bool_], move_rule: MoveRule | str) -> NDAr
     return legal
 
 
-def move_costs(price: NDArray[np.float32], move_rule: MoveRule | str) -> NDArray[np.float64]:
-    """Return what each move costs: its length times the mean price of the two cells that it joins.
+def move_costs(multiplier: NDArray[np.float32], move_rule: MoveRule | str) -> NDArray[np.float64]:
+    """Return the cost of each move: its length times the mean cost multiplier of its two cells.
 
     So a path costs the same in both directions.
 
     Parameters
     ----------
-    price : (H, W) float32
-        See `GridMap.price`.
+    multiplier : (H, W) float32
+        See `GridMap.cost_multiplier`.
     move_rule : MoveRule
 
     Returns
@@ -87,13 +87,13 @@ def move_costs(price: NDArray[np.float32], move_rule: MoveRule | str) -> NDArray
     (8, H, W) float64
         ``[a, y, x]`` for action ``a`` from (x, y); without meaning where the move is illegal.
     """
-    height, width = price.shape
-    padded = np.pad(price, 1, mode="edge").astype(np.float64)
+    height, width = multiplier.shape
+    padded = np.pad(multiplier, 1, mode="edge").astype(np.float64)
     onward = [
         padded[1 + dy : 1 + dy + height, 1 + dx : 1 + dx + width] for dx, dy in MOVES.tolist()
     ]
     lengths = MoveRule(move_rule).lengths[:, None, None]
-    costs: NDArray[np.float64] = lengths * (price + np.stack(onward)) / 2
+    costs: NDArray[np.float64] = lengths * (multiplier + np.stack(onward)) / 2
     return costs
 
 
@@ -157,7 +157,7 @@ def path_length(cells: Sequence[Cell], move_rule: MoveRule | str = MoveRule.ROBO
 
 
 def path_cost(
-    cells: Sequence[Cell], price: NDArray[np.float32], move_rule: MoveRule | str
+    cells: Sequence[Cell], multiplier: NDArray[np.float32], move_rule: MoveRule | str
 ) -> float:
     """Return what a path costs: the sum of its moves' costs, see `move_costs`.
 
@@ -165,14 +165,14 @@ def path_cost(
     ----------
     cells : sequence of (x, y)
         Each cell is a neighbour of the one before it.
-    price : (H, W) float32
-        See `GridMap.price`.
+    multiplier : (H, W) float32
+        See `GridMap.cost_multiplier`.
     move_rule : MoveRule
     """
     x, y = np.asarray(cells, dtype=np.int64).reshape(-1, 2).T
     lengths = segment_lengths(np.diff(x), np.diff(y), move_rule)
-    prices = price[y, x].astype(np.float64)
-    return float((lengths * (prices[1:] + prices[:-1]) / 2).sum())
+    multipliers = multiplier[y, x].astype(np.float64)
+    return float((lengths * (multipliers[1:] + multipliers[:-1]) / 2).sum())
 
 
 def segment_lengths(

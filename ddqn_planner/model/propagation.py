@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from ddqn_planner.grid import MOVES, OCCUPIED, UNKNOWN, Cell, GridMap, MoveRule
-from ddqn_planner.grid.grid_map import MAX_PRICE
+from ddqn_planner.grid.grid_map import MAX_COST_MULTIPLIER
 from ddqn_planner.model.front import spread
 
 FEATURES = 28
@@ -20,9 +20,10 @@ BATCH = 2**12
 """Surroundings that a network looks at in one go: what it makes of them fits into a cache, where
 all those of a large map would need gigabytes."""
 
-MAX_LEARNED_PRICE = 20 * MAX_PRICE
-"""Greatest price of a move that `AnyMapQNetwork` is believed: far beyond every true one. Time and
-memory of `spread` grow with the dearest move, and weights gone wild may ask for any price."""
+MAX_LEARNED_MULTIPLIER = 20 * MAX_COST_MULTIPLIER
+"""Upper bound on predicted cost multipliers, far above every true one.
+
+Time and memory of `spread` grow with the highest cost, and a broken model may predict any."""
 
 SETTLED = 1e-3
 """Values count as settled when none changes more than this in one repetition."""
@@ -91,12 +92,13 @@ class PropagationQNetwork(nn.Module):
 
 
 class AnyMapQNetwork(nn.Module):
-    """A propagation network for both move rules and for cells of different prices.
+    """A propagation network for both move rules and for cells of different cost multipliers.
 
     As for `PropagationQNetwork`, Q(s, a) = p(s, a) (r(s, a) + γ V(s')) + (1 - p(s, a)) r_o. But it
-    learns the reward of a move too, r = -length times price(s, a), and sees the costs of the 3x3
+    learns the reward of a move too, r = -length times m(s, a), and sees the costs of the 3x3
     cells around the robot beside the obstacles, which of them are unknown, and the move rule. The
-    price is one linear layer of what it sees. That a move costs its length at least is structure.
+    cost multiplier is one linear layer of what it sees. That a move costs at least its length is
+    given.
 
     Parameters
     ----------
@@ -110,11 +112,11 @@ class AnyMapQNetwork(nn.Module):
         self.hidden = nn.Linear(filters, filters)
         self.moves = nn.Linear(filters, len(MOVES))
         self.prices = nn.Linear(FEATURES, len(MOVES))
-        # A price below 1 has no gradient: it must begin above.
+        # A cost multiplier below 1 has no gradient: it must begin above.
         nn.init.ones_(self.prices.bias)
 
     def forward(self, feature_BF: Tensor) -> tuple[Tensor, Tensor]:
-        """Return p(s, a) in 0..1 and the price of each move, at least 1: (B, 8) both.
+        """Return p(s, a) in 0..1 and the cost multiplier of each move, at least 1: (B, 8) both.
 
         Parameters
         ----------
@@ -130,11 +132,11 @@ class AnyMapQNetwork(nn.Module):
 
     @torch.inference_mode()
     def q_values(self, grid: GridMap, goal: Cell, move_rule: MoveRule) -> NDArray[np.float32]:
-        """Return minus the cost of the best path through each action: length times price.
+        """Return minus the cost of the best path through each action: length times cost multiplier.
 
         There is no discount, and a move counts as possible where p > 1/2: so the greatest Q is the
-        cheapest path at any distance. Prices above `MAX_LEARNED_PRICE` count as that; a move whose
-        p or price is NaN is not possible.
+        cheapest path at any distance. Cost multipliers are clamped to `MAX_LEARNED_MULTIPLIER`. A
+        move whose p or cost multiplier is NaN is not possible.
 
         Parameters
         ----------
@@ -151,10 +153,10 @@ class AnyMapQNetwork(nn.Module):
         cost_KA = np.empty((len(values_K9), len(MOVES)), dtype=np.float32)
         for some in range(0, len(values_K9), BATCH):
             these = slice(some, some + BATCH)
-            p_BA, price_BA = self(torch.from_numpy(features(values_K9[these], move_rule)))
-            # A price may have overflowed, to infinity or NaN; a p that is NaN fails the comparison.
-            possible_BA = (p_BA > 0.5) & ~price_BA.isnan()
-            cost_BA = move_rule.lengths * price_BA.clamp(max=MAX_LEARNED_PRICE).numpy()
+            p_BA, multiplier_BA = self(torch.from_numpy(features(values_K9[these], move_rule)))
+            # A multiplier may overflow to infinity or NaN; a p that is NaN fails the comparison.
+            possible_BA = (p_BA > 0.5) & ~multiplier_BA.isnan()
+            cost_BA = move_rule.lengths * multiplier_BA.clamp(max=MAX_LEARNED_MULTIPLIER).numpy()
             cost_KA[these] = np.where(possible_BA.numpy(), cost_BA, np.inf)
         return spread(kind, cost_KA, goal)
 

@@ -31,14 +31,14 @@ def grid_from_message(
     message: OccupancyGrid,
     occupied_threshold: int = 65,
     allow_unknown: bool = False,
-    priced: bool = False,
+    use_map_costs: bool = False,
 ) -> GridMap:
     """Make a grid map of a map message.
 
     Parameters
     ----------
     message : nav_msgs/OccupancyGrid
-    occupied_threshold, allow_unknown, priced
+    occupied_threshold, allow_unknown, use_map_costs
         See `GridMap.from_occupancy_values`.
 
     Raises
@@ -51,7 +51,7 @@ def grid_from_message(
     values = np.frombuffer(message.data, np.int8).reshape(info.height, info.width)
     origin = (info.origin.position.x, info.origin.position.y, _yaw(info.origin.orientation))
     return GridMap.from_occupancy_values(
-        values, info.resolution, origin, occupied_threshold, allow_unknown, priced
+        values, info.resolution, origin, occupied_threshold, allow_unknown, use_map_costs
     )
 
 

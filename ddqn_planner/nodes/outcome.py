@@ -22,7 +22,7 @@ REMEDIES = {
     PlanStatus.GOAL_OCCUPIED: "set the goal on a free cell, or a greater tolerance",
     PlanStatus.MAP_SIZE_UNSUPPORTED: "set the parameter 'model' to one trained for this size",
     PlanStatus.NO_PATH: "set the goal where free cells lead to, or a greater tolerance",
-    PlanStatus.WALK_TRAPPED: "train the model longer, or on this map; or set mode to 'guided'",
+    PlanStatus.ROLLOUT_TRAPPED: "train the model longer, or set mode to 'astar_fallback'",
 }
 
 NO_SOLUTION = Solution(Plan(PlanStatus.NO_PATH))

@@ -375,7 +375,7 @@ class PlannerNode(BaseNode):
             grid, problem.start, problem.goal, problem.move_rule, problem.tolerance
         ):
             solution = solve(replace(problem, method=PlanMethod.GREEDY))
-            trapped = solution.plan.status is PlanStatus.WALK_TRAPPED
+            trapped = solution.plan.status is PlanStatus.ROLLOUT_TRAPPED
             if not trapped or problem.method is PlanMethod.GREEDY:
                 return solution
             searched: Solution = await self._worker.call(search_on, problem, solution)

@@ -46,10 +46,10 @@ def declare_parameters(node: Node) -> None:
     )
     declare("allow_unknown", False, "Whether unknown cells are free")
     declare(
-        "priced",
+        "use_map_costs",
         False,
         "Whether a free cell is the dearer, the greater its value; an unknown one that is free is "
-        "the dearest. For models that learned prices: any_map",
+        "the dearest. For models that learned cost multipliers: any_map",
     )
     declare(
         "robot_radius",
@@ -61,7 +61,7 @@ def declare_parameters(node: Node) -> None:
         "clearance_weight",
         0.0,
         "How much dearer cells near to an obstacle are: 0 for not at all. For models that learned "
-        "prices: any_map",
+        "cost multipliers: any_map",
         **floating_point_range(0.0, 1.0),
     )
     declare(
@@ -70,7 +70,9 @@ def declare_parameters(node: Node) -> None:
         "How far a goal_pose that is occupied or cut off may move to a reachable free cell, metres",
         **floating_point_range(0.0, 1000.0),
     )
-    declare("mode", "greedy", "Whether to search where the greedy steps are trapped: guided")
+    declare(
+        "mode", "greedy", "Whether to search where the greedy steps are trapped: astar_fallback"
+    )
     declare("path_simplification", "none", "Whether straight parts of a path have two poses only")
     declare("start_source", "initialpose", "Where the robot is: a topic, odom, or a transform")
     declare(
@@ -108,7 +110,7 @@ class Settings:
     move_rule : MoveRule, optional
         The model's own by default.
     map_arguments : tuple
-        ``occupied_threshold``, ``allow_unknown``, ``priced``: of `grid_from_message`.
+        ``occupied_threshold``, ``allow_unknown``, ``use_map_costs``: of `grid_from_message`.
     body : tuple of float
         ``robot_radius``, ``clearance_weight``: of `inflate`.
     tolerance : float
@@ -140,7 +142,7 @@ def read_parameters(node: Node) -> Settings:
 
     return Settings(
         move_rule=MoveRule(value("move_rule")) if value("move_rule") else None,
-        map_arguments=(value("occupied_threshold"), value("allow_unknown"), value("priced")),
+        map_arguments=(value("occupied_threshold"), value("allow_unknown"), value("use_map_costs")),
         # A range lets a value pass that is above it by a millionth.
         body=(value("robot_radius"), min(value("clearance_weight"), 1.0)),
         tolerance=value("tolerance"),

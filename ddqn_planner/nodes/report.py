@@ -114,7 +114,7 @@ class Report:
             "method": solution.plan.method.value,
             "path length (cells)": f"{path_length(solution.cells, solution.plan.move_rule):.3f}",
             "field time (ms)": f"{solution.field_ms:.3f}",
-            "walk time (ms)": f"{solution.walk_ms:.3f}",
+            "rollout time (ms)": f"{solution.rollout_ms:.3f}",
             "planned on the map of (s)": outcome.map_stamp,
             **more,
             **{f"refused {what}": reason for what, reason in self.refused.items()},

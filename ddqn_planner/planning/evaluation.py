@@ -51,11 +51,11 @@ def length_ratios(field: QField, grid: GridMap, move_rule: MoveRule) -> NDArray[
         it.
     """
     optimum = shortest_distances(grid, field.goal, move_rule)
-    ratios, price = np.full(optimum.shape, np.nan), grid.price
+    ratios, multiplier = np.full(optimum.shape, np.nan), grid.cost_multiplier
     for x, y in grid.free_cells():
         if np.isfinite(optimum[y, x]) and (x, y) != field.goal:
             plan = field.rollout((x, y))
-            cost = path_cost(plan.cells, price, move_rule) if plan.cells else np.inf
+            cost = path_cost(plan.cells, multiplier, move_rule) if plan.cells else np.inf
             ratios[y, x] = cost / optimum[y, x]
     return ratios
 

@@ -13,7 +13,7 @@ from ddqn_planner.grid.arguments import as_cell
 def shortest_distances(grid: GridMap, goal: Cell, move_rule: MoveRule | str) -> NDArray[np.float64]:
     """Return the length of the shortest path from every cell to the goal.
 
-    On a map with costs it is the least sum of length times price, see `move_costs`.
+    On a map with costs it is the least sum of length times cost multiplier, see `move_costs`.
 
     Parameters
     ----------
@@ -71,8 +71,8 @@ def _graph(grid: GridMap, move_rule: MoveRule | str) -> scipy.sparse.csr_array:
     next_cell = cell + step[actions].astype(np.int32)[place]
     cost = MoveRule(move_rule).lengths[actions][place]
     if grid.cost is not None:
-        price = grid.price.ravel().astype(np.float64)
-        cost *= (price[cell] + price[next_cell]) / 2
+        multiplier = grid.cost_multiplier.ravel().astype(np.float64)
+        cost *= (multiplier[cell] + multiplier[next_cell]) / 2
     row_end = np.cumsum(np.count_nonzero(legal_NA, axis=1), dtype=np.int32)
     row_start = np.concatenate([np.zeros(1, dtype=np.int32), row_end])
     return scipy.sparse.csr_array((cost, next_cell, row_start), shape=(legal_NA.shape[0],) * 2)

@@ -19,7 +19,7 @@ class PlanStatus(str, Enum):
     GOAL_OCCUPIED = "the goal is occupied"
     MAP_SIZE_UNSUPPORTED = "the model was not trained for maps of this size"
     NO_PATH = "no path leads from the start to the goal"
-    WALK_TRAPPED = "a path exists, but the model's greedy steps do not find it"
+    ROLLOUT_TRAPPED = "a path exists, but the model's greedy steps do not find it"
 
 
 class PlanMethod(Choice):
@@ -27,7 +27,7 @@ class PlanMethod(Choice):
 
     GREEDY = "greedy"
     """By greedy steps in the Q field alone."""
-    GUIDED = "guided"
+    ASTAR_FALLBACK = "astar_fallback"
     """By greedy steps, or where they are trapped by a search in the order of the Q field."""
 
 

@@ -259,11 +259,11 @@ class Planner:
         """Walk a route in the field of its goal; see `plan`."""
         method, rule, entry = PlanMethod(method), self._rule(move_rule), route.leave[-1]
         plan = field.rollout(entry)
-        if plan.status is PlanStatus.WALK_TRAPPED:
+        if plan.status is PlanStatus.ROLLOUT_TRAPPED:
             joined = connected_cells(grid.occupancy, field.goal, rule)
             if not joined[entry[1], entry[0]]:
                 return Plan(PlanStatus.NO_PATH, move_rule=rule)
-            if method is PlanMethod.GUIDED:
+            if method is PlanMethod.ASTAR_FALLBACK:
                 return self.search(route, grid, field, rule)
         return _on_route(route, plan, grid, rule)
 
@@ -274,8 +274,8 @@ class Planner:
         rule, entry = self._rule(move_rule), route.leave[-1]
         end = np.zeros(grid.occupancy.shape, dtype=np.bool_)
         end[field.goal[1], field.goal[0]] = True
-        cells = search(entry, end, field.legal, grid.price, rule, field.value)
-        plan = Plan(PlanStatus.SUCCEEDED, cells, PlanMethod.GUIDED)
+        cells = search(entry, end, field.legal, grid.cost_multiplier, rule, field.value)
+        plan = Plan(PlanStatus.SUCCEEDED, cells, PlanMethod.ASTAR_FALLBACK)
         return _on_route(route, plan, grid, rule)
 
 
@@ -288,7 +288,7 @@ def _on_route(route: Route, plan: Plan, grid: GridMap, rule: MoveRule) -> Plan:
     if not plan.cells:
         return replace(plan, move_rule=rule)
     cells = route.leave[:-1] + plan.cells
-    cost = None if grid.cost is None else path_cost(cells, grid.price, rule)
+    cost = None if grid.cost is None else path_cost(cells, grid.cost_multiplier, rule)
     return replace(plan, cells=cells, move_rule=rule, cost=cost)
 
 

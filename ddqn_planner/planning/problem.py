@@ -50,7 +50,7 @@ class Solution:
         Where the path ends, or would: there is a field toward it.
     cells : tuple of (x, y)
         The path, simplified if asked for.
-    field_ms, walk_ms : float
+    field_ms, rollout_ms : float
         How long it took to get the field, and to walk in it.
     route : Route, optional
     field : QField, optional
@@ -61,7 +61,7 @@ class Solution:
     goal: Cell | None = None
     cells: tuple[Cell, ...] = ()
     field_ms: float = 0.0
-    walk_ms: float = 0.0
+    rollout_ms: float = 0.0
     route: Route | None = None
     field: QField | None = None
 
@@ -89,15 +89,15 @@ def search_on(problem: Problem, trapped: Solution) -> Solution:
     ----------
     problem : Problem
     trapped : Solution
-        Its plan's status is WALK_TRAPPED. Its route and its field are used again.
+        Its plan's status is ROLLOUT_TRAPPED. Its route and its field are used again.
     """
     assert trapped.route is not None
     assert trapped.field is not None
     began = time.perf_counter()
     plan = problem.planner.search(trapped.route, problem.grid, trapped.field, problem.move_rule)
     cells = _shown_cells(problem, plan)
-    walk_ms = trapped.walk_ms + 1e3 * (time.perf_counter() - began)
-    return replace(trapped, plan=plan, cells=cells, walk_ms=walk_ms)
+    rollout_ms = trapped.rollout_ms + 1e3 * (time.perf_counter() - began)
+    return replace(trapped, plan=plan, cells=cells, rollout_ms=rollout_ms)
 
 
 def _shown_cells(problem: Problem, plan: Plan) -> tuple[Cell, ...]:

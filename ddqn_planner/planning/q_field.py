@@ -81,7 +81,7 @@ class QField:
         Returns
         -------
         Plan
-            SUCCEEDED with every cell walked, or WALK_TRAPPED.
+            SUCCEEDED with every cell walked, or ROLLOUT_TRAPPED.
 
         Raises
         ------
@@ -98,7 +98,7 @@ class QField:
             action = int(policy[cell[1], cell[0]])
             cell = (cell[0] + _STEPS[action][0], cell[1] + _STEPS[action][1])
             if action < 0 or cell in visited:
-                return Plan(PlanStatus.WALK_TRAPPED, move_rule=self.move_rule)
+                return Plan(PlanStatus.ROLLOUT_TRAPPED, move_rule=self.move_rule)
             visited.add(cell)
             cells.append(cell)
         return Plan(PlanStatus.SUCCEEDED, tuple(cells), move_rule=self.move_rule)

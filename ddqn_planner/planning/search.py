@@ -1,4 +1,4 @@
-"""Best-first search, compiled: guided by a value field, or to the nearest of some cells."""
+"""Best-first search, compiled: astar_fallback by a value field, or to the nearest of some cells."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ def search(
     start: Cell,
     ends: NDArray[np.bool_],
     legal: NDArray[np.bool_],
-    price: NDArray[np.float32],
+    multiplier: NDArray[np.float32],
     move_rule: MoveRule,
     value: NDArray[np.float32] | None = None,
 ) -> tuple[Cell, ...]:
@@ -32,8 +32,8 @@ def search(
     ends : (H, W) bool
     legal : (8, H, W) bool
         The moves that may be made.
-    price : (H, W) float32
-        See `GridMap.price`.
+    multiplier : (H, W) float32
+        See `GridMap.cost_multiplier`.
     move_rule : MoveRule
         Says what a move counts.
     value : (H, W) float32, optional
@@ -41,7 +41,7 @@ def search(
     """
     if value is None:
         value = np.zeros(ends.shape, dtype=np.float32)
-    entered_by, end = _search(start, ends, legal, price, move_rule.lengths, value, MOVES)
+    entered_by, end = _search(start, ends, legal, multiplier, move_rule.lengths, value, MOVES)
     if end < 0:
         return ()
     width = ends.shape[1]
@@ -54,7 +54,7 @@ def search(
 
 
 @compiled
-def _search(start, ends, legal, price, lengths, value, moves):  # type: ignore[no-untyped-def]  # pragma: no cover
+def _search(start, ends, legal, multiplier, lengths, value, moves):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Return the action by which each cell was entered, (H, W) int8, and the end's number or -1."""
     width = ends.shape[1]
     entered_by = np.full(ends.shape, -1, dtype=np.int8)
@@ -76,8 +76,8 @@ def _search(start, ends, legal, price, lengths, value, moves):  # type: ignore[n
             next_x, next_y = x + moves[action, 0], y + moves[action, 1]
             if visited[next_y, next_x]:
                 continue
-            mean_price = (np.float64(price[y, x]) + price[next_y, next_x]) / 2
-            through = cost + lengths[action] * mean_price
+            mean_multiplier = (np.float64(multiplier[y, x]) + multiplier[next_y, next_x]) / 2
+            through = cost + lengths[action] * mean_multiplier
             order = through - value[next_y, next_x]
             if np.isnan(order):
                 order = np.inf

@@ -40,7 +40,7 @@ def simplify(cells: Sequence[Cell], grid: GridMap, move_rule: MoveRule | str) ->
     ValueError
         If a cell is no pair of whole numbers, or there is no such move rule.
     """
-    rule, price = MoveRule(move_rule), grid.price
+    rule, multiplier = MoveRule(move_rule), grid.cost_multiplier
     path = [as_cell(cell) for cell in cells]
 
     def joins(first: int, last: int) -> bool:
@@ -49,8 +49,8 @@ def simplify(cells: Sequence[Cell], grid: GridMap, move_rule: MoveRule | str) ->
         touched = touched_cells(path[first], path[last], rule)
         if grid.occupancy[touched[:, 1], touched[:, 0]].any():
             return False
-        cost = segment_cost(path[first], path[last], price, rule)
-        return cost <= (1 + ROUNDING) * path_cost(path[first : last + 1], price, rule)
+        cost = segment_cost(path[first], path[last], multiplier, rule)
+        return cost <= (1 + ROUNDING) * path_cost(path[first : last + 1], multiplier, rule)
 
     kept, last = [0] if path else [], len(path) - 1
     while kept and kept[-1] < last:
@@ -84,24 +84,24 @@ def touched_cells(first: Cell, last: Cell, move_rule: MoveRule | str) -> NDArray
 
 
 def segment_cost(
-    first: Cell, last: Cell, price: NDArray[np.float32], move_rule: MoveRule | str
+    first: Cell, last: Cell, multiplier: NDArray[np.float32], move_rule: MoveRule | str
 ) -> float:
     """Return what the segment between two cells' centres costs, as `path_cost` for a path.
 
-    Each cell's price counts for the share of the segment that lies within the cell: so does a
-    move's, half of which lies in each of its two cells.
+    Each cell's cost multiplier is weighted by the share of the segment within that cell, as half of
+    a move lies in each of its two cells.
 
     Parameters
     ----------
     first, last : (x, y)
-    price : (H, W) float32
-        See `GridMap.price`.
+    multiplier : (H, W) float32
+        See `GridMap.cost_multiplier`.
     move_rule : MoveRule
     """
     passed, share = _passed_cells(first, last)
     vector = np.subtract(last, first)
     length = segment_lengths(vector[:1], vector[1:], move_rule).item()
-    return length * float(share @ price[passed[:, 1], passed[:, 0]].astype(np.float64))
+    return length * float(share @ multiplier[passed[:, 1], passed[:, 0]].astype(np.float64))
 
 
 def _passed_cells(first: Cell, last: Cell) -> tuple[NDArray[np.int64], NDArray[np.float64]]:

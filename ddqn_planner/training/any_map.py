@@ -1,4 +1,4 @@
-"""The training of the model for any map: small maps of random cells, both rules, all prices."""
+"""The training of the model for any map: small random maps, both rules, all costs."""
 
 from __future__ import annotations
 

@@ -142,17 +142,19 @@ class AnyMapLearner(PropagationLearner):
         ]
 
     def q(self, network: nn.Module, state_B: Tensor) -> Tensor:
-        """Return Q(s, a) = p (r + γ V(s')) + (1 - p) r_o with r = -length times price: (B, 8)."""
-        p_BA, price_BA = network(state_B[:, :-8])
+        """Return Q(s, a) = p (r + γ V(s')) + (1 - p) r_o with r = -length * multiplier: (B, 8)."""
+        p_BA, multiplier_BA = network(state_B[:, :-8])
         collision = self._environment.parameters.obstacle_reward
-        q_BA: Tensor = collision + p_BA * (state_B[:, -8:] - self._lengths * price_BA - collision)
+        q_BA: Tensor = collision + p_BA * (
+            state_B[:, -8:] - self._lengths * multiplier_BA - collision
+        )
         return q_BA
 
     def copy_target(self, target: nn.Module) -> None:
         """Settle V on every map under the new target network."""
         with torch.inference_mode():
-            p_SCA, price_SCA = target(torch.from_numpy(self._seen_SCF))
-            reward_SCA = -(self._lengths * price_SCA).numpy()
+            p_SCA, multiplier_SCA = target(torch.from_numpy(self._seen_SCF))
+            reward_SCA = -(self._lengths * multiplier_SCA).numpy()
         self._settle(p_SCA.numpy(), reward_SCA.transpose(0, 2, 1))
         self._beyond_SCA -= reward_SCA
 

@@ -62,5 +62,5 @@ def path_cost_reward(grid: GridMap, move_rule: MoveRule) -> NDArray[np.float32]:
     (8, H, W) float32
         See `ddqn_planner.grid.move_costs`.
     """
-    reward: NDArray[np.float32] = -move_costs(grid.price, move_rule).astype(np.float32)
+    reward: NDArray[np.float32] = -move_costs(grid.cost_multiplier, move_rule).astype(np.float32)
     return reward

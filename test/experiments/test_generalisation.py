@@ -18,8 +18,8 @@ from ddqn_planner import cli
 from ddqn_planner.cli import main
 from ddqn_planner.experiments import generalisation
 from ddqn_planner.experiments.benchmark_maps import (
+    COSTS,
     GOALS,
-    PRICES,
     BenchmarkMap,
     RequestSettings,
     describe_files,
@@ -70,7 +70,7 @@ class PerfectNetwork:
         distance = np.pad(shortest_distances(grid, goal, move_rule), 1, constant_values=np.inf)
         height, width = grid.occupancy.shape
         onward = [distance[1 + dy : 1 + dy + height, 1 + dx : 1 + dx + width] for dx, dy in MOVES]
-        q = -move_costs(grid.price, move_rule) - np.array(onward)
+        q = -move_costs(grid.cost_multiplier, move_rule) - np.array(onward)
         return np.where(legal_moves(grid.occupancy, move_rule), q, self.bonus).astype(np.float32)
 
 
@@ -124,11 +124,11 @@ CORNER = ["..@", "...", "..."]
 """From (1, 0) to (2, 1) the diagonal move cuts a corner."""
 
 
-@given(RULES, st.sampled_from(PRICES), st.sampled_from([*KINDS]), st.integers(0, 99))
+@given(RULES, st.sampled_from(COSTS), st.sampled_from([*KINDS]), st.integers(0, 99))
 def test_a_perfect_network_solves_every_request_at_the_least_cost(
-    rule: MoveRule, priced: str, kind: str, seed: int
+    rule: MoveRule, costs: str, kind: str, seed: int
 ) -> None:
-    settings = RequestSettings(rule, 7, priced, seed)
+    settings = RequestSettings(rule, 7, costs, seed)
     walks = walk(PerfectNetwork(), *generated_maps([kind], [9], 2, settings), rule=rule)
     *groups, total = summarise(walks)
     assert without_times(groups[0]) == replace(without_times(total), set_name=kind, size="9x9")
@@ -166,13 +166,13 @@ def test_a_network_that_prefers_illegal_moves_is_found_out_without_the_mask() ->
     assert (total.success, total.any_move, total.illegal) == (1, 0, 0)
 
 
-def test_prices_count_in_the_ratio() -> None:
+def test_costs_count_in_the_ratio() -> None:
     cost = np.array([[0, 99, 0], [0, 0, 0]], dtype=np.int8)
     grid = GridMap(np.zeros((2, 3)), cost=cost)
     straight = StubbornNetwork([[0, 0, 0], [0, 0, 0]])
-    (priced,) = walk(straight, BenchmarkMap("priced", "0", grid, [((0, 0), (2, 0))]))
-    assert priced.optimum == pytest.approx(2 * 2**0.5)
-    assert priced.ratio == pytest.approx((1 + 4.96) / (2 * 2**0.5))
+    (costs,) = walk(straight, BenchmarkMap("costs", "0", grid, [((0, 0), (2, 0))]))
+    assert costs.optimum == pytest.approx(2 * 2**0.5)
+    assert costs.ratio == pytest.approx((1 + 4.96) / (2 * 2**0.5))
 
 
 def test_steps_through_walls_over_corners_and_of_two_cells_are_illegal() -> None:
@@ -196,7 +196,7 @@ def test_an_optimum_lies_in_its_group_and_groups_double(optimum: float) -> None:
     assert (low, high) == (0, 16) or (high == 2 * low and math.log2(low / 16).is_integer())
 
 
-def test_a_walk_is_optimal_within_a_millionth() -> None:
+def test_a_rollout_is_optimal_within_a_millionth() -> None:
     walks = [replace(walk_of_optimum(10.0), ratio=ratio) for ratio in (1.0, 1.0000009, 1.00001)]
     assert summarise(walks)[-1].optimal == 2
 
@@ -219,12 +219,12 @@ def test_a_path_joins_start_and_goal_of_each_drawn_request_and_few_goals_are_dra
         assert connected_cells(drawn.grid.occupancy, goal, rule)[start[1], start[0]]
 
 
-@pytest.mark.parametrize("priced", PRICES)
-def test_the_same_seed_draws_the_same_whichever_other_maps_there_are(priced: str) -> None:
+@pytest.mark.parametrize("costs", COSTS)
+def test_the_same_seed_draws_the_same_whichever_other_maps_there_are(costs: str) -> None:
     def drawn(kinds: list[str], seed: int) -> tuple[str, list[tuple[Cell, Cell]]]:
-        settings = RequestSettings(MoveRule.ROBOT_SAFE, 30, priced, seed)
+        settings = RequestSettings(MoveRule.ROBOT_SAFE, 30, costs, seed)
         last = list(generated_maps(kinds, [20], 2, settings))[-1]
-        assert (last.grid.cost is None) == (priced == "none")
+        assert (last.grid.cost is None) == (costs == "none")
         return last.grid.fingerprint, last.requests
 
     assert drawn(["rooms"], 1) == drawn(["maze", "rooms"], 1)
@@ -248,7 +248,7 @@ def test_the_optima_of_a_scenario_file_hold_under_the_robot_safe_rule(tmp_path: 
     assert [walk.ratio for walk in walks] == pytest.approx([1.0, 1.0])
     for settings in (
         RequestSettings(MoveRule.CORNER_CUTTING),
-        RequestSettings(MoveRule.ROBOT_SAFE, priced="random"),
+        RequestSettings(MoveRule.ROBOT_SAFE, costs="random"),
     ):
         (read,) = read_maps(find_files(tmp_path), settings)
         assert read.optima is None
@@ -438,11 +438,11 @@ def test_evaluate_prints_and_writes_its_tables(
 
 def test_evaluate_gives_free_cells_the_costs_asked_for(tmp_path: Path, model: str) -> None:
     means = {}
-    for priced in ("none", "random"):
-        out = tmp_path / f"{priced}.csv"
+    for costs in ("none", "random"):
+        out = tmp_path / f"{costs}.csv"
         command = ["evaluate", "--model", model, "--kinds", "random_10", "--sizes", "16"]
-        assert main([*command, "--priced", priced, "--out", str(out)]) == 0
-        means[priced] = float(list(csv.DictReader(out.read_text().splitlines()))[-1]["mean"])
+        assert main([*command, "--costs", costs, "--out", str(out)]) == 0
+        means[costs] = float(list(csv.DictReader(out.read_text().splitlines()))[-1]["mean"])
     assert means["random"] > 1.1 * means["none"]  # this model does not see them
 
 

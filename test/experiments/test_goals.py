@@ -127,7 +127,7 @@ def test_more_test_maps_leave_the_training_maps_as_they_are() -> None:
     assert fingerprints[0] == fingerprints[1]
 
 
-def test_a_fixed_walk_is_legal_on_the_papers_map_and_avoids_what_it_can(paper: Scenario) -> None:
+def test_a_fixed_rollout_is_legal_on_the_papers_map_and_avoids_what_it_can(paper: Scenario) -> None:
     maps = noisy_maps(30, 30, Noise.ON_PATH)
     walk = fixed_walk(maps.training)
     legal = legal_moves(paper.grid.occupancy, MOVE_RULE)

@@ -49,9 +49,9 @@ def test_clearance_costs_fall_with_the_distance_and_close_nothing(
     labels = [component_labels(g.occupancy, MoveRule.ROBOT_SAFE) for g in (grid, plain)]
     assert (labels[0] > 0).sum() <= (labels[1] > 0).sum()
     free, distance = ~grid.occupancy, clearance(occupancy)
-    price = grid.price[free][np.argsort(distance[free])]
-    assert (np.diff(price) <= 0).all()
-    assert (price >= plain.price[free]).all()
+    multiplier = grid.cost_multiplier[free][np.argsort(distance[free])]
+    assert (np.diff(multiplier) <= 0).all()
+    assert (multiplier >= plain.cost_multiplier[free]).all()
 
 
 def test_a_radius_of_whole_cells_leaves_the_cell_at_that_distance_free() -> None:

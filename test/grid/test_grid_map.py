@@ -107,17 +107,20 @@ def test_a_malformed_map_is_refused_by_name(arguments: tuple, named: str) -> Non
         GridMap(*arguments)
 
 
-def test_priced_free_cells_keep_their_values_and_are_the_dearer_the_greater_these_are() -> None:
+def test_free_cells_with_costs_keep_their_values_and_are_the_dearer_the_greater_these_are() -> None:
     values = np.array([[0, 1, 64, 65, 100, -1, -7]], dtype=np.int8)
     plain = GridMap.from_occupancy_values(values, allow_unknown=True)
     assert plain.cost is None
-    assert (plain.price == 1).all()
-    priced = GridMap.from_occupancy_values(values, allow_unknown=True, priced=True)
-    assert priced.cost is not None
-    assert priced.cost.tolist() == [[0, 1, 64, 0, 0, UNKNOWN, UNKNOWN]]
-    assert priced.price[0, [0, 1, 2, 5, 6]] == pytest.approx([1, 1.04, 3.56, 5, 5])
-    assert priced.fingerprint != plain.fingerprint
-    assert priced.fingerprint == GridMap(priced.occupancy, cost=priced.cost).fingerprint
+    assert (plain.cost_multiplier == 1).all()
+    use_map_costs = GridMap.from_occupancy_values(values, allow_unknown=True, use_map_costs=True)
+    assert use_map_costs.cost is not None
+    assert use_map_costs.cost.tolist() == [[0, 1, 64, 0, 0, UNKNOWN, UNKNOWN]]
+    assert use_map_costs.cost_multiplier[0, [0, 1, 2, 5, 6]] == pytest.approx([1, 1.04, 3.56, 5, 5])
+    assert use_map_costs.fingerprint != plain.fingerprint
+    assert (
+        use_map_costs.fingerprint
+        == GridMap(use_map_costs.occupancy, cost=use_map_costs.cost).fingerprint
+    )
 
 
 def test_costs_may_be_lists_or_arrays_of_any_numbers_and_those_of_occupied_cells_do_not_count() -> (

@@ -13,7 +13,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as numpy_st
 from PIL import Image
-from strategies import occupancies, priced_grids_with_free_cell
+from strategies import grids_with_costs, occupancies
 
 from ddqn_planner.grid import UNKNOWN, Cell, GridMap, MapFile, load_map, read_map_file, save_map
 from ddqn_planner.grid.map_file import (
@@ -251,14 +251,14 @@ def test_a_saved_map_comes_back_the_same(
 
 
 @same_folder
-@given(priced_grids_with_free_cell())
+@given(grids_with_costs())
 def test_a_saved_grid_keeps_its_costs_where_they_are_asked_for(
     tmp_path: Path, grid_and_cell: tuple[GridMap, Cell]
 ) -> None:
     grid, _ = grid_and_cell
     path = tmp_path / "saved.yaml"
     save_map(grid, path)
-    read = load_map(path, occupied_threshold=100, allow_unknown=True, priced=True)
+    read = load_map(path, occupied_threshold=100, allow_unknown=True, use_map_costs=True)
     assert read.fingerprint == grid.fingerprint
     assert grid.cost is not None
     closed = (grid.cost >= 65) | (grid.cost == UNKNOWN)

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as numpy_st
-from strategies import priced_grids_with_free_cell
+from strategies import grids_with_costs
 
 from ddqn_planner.grid import MOVES, Cell, GridMap, MoveRule, legal_moves, move_costs
 from ddqn_planner.model.front import compiled, spread
@@ -21,13 +21,13 @@ COSTS = numpy_st.arrays(
 )
 
 
-@given(priced_grids_with_free_cell(), st.sampled_from(MoveRule))
+@given(grids_with_costs(), st.sampled_from(MoveRule))
 def test_with_true_costs_the_greatest_q_is_minus_the_exact_cost_of_the_cheapest_path(
     grid_and_goal: tuple[GridMap, Cell], rule: MoveRule
 ) -> None:
     grid, goal = grid_and_goal
     legal = legal_moves(grid.occupancy, rule)
-    cost = np.where(legal, move_costs(grid.price, rule), np.inf).astype(np.float32)
+    cost = np.where(legal, move_costs(grid.cost_multiplier, rule), np.inf).astype(np.float32)
     kind = np.arange(grid.occupancy.size, dtype=np.int32).reshape(grid.occupancy.shape)
     q = spread(kind, cost.reshape(8, -1).T, goal)
     optimum = shortest_distances(grid, goal, rule)

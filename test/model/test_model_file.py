@@ -18,7 +18,7 @@ import safetensors.torch
 import torch
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from strategies import priced_grids_with_free_cell
+from strategies import grids_with_costs
 
 from ddqn_planner.grid import Cell, GridMap, MoveRule
 from ddqn_planner.model import (
@@ -29,7 +29,7 @@ from ddqn_planner.model import (
     new_network,
     save_model,
 )
-from ddqn_planner.model.propagation import MAX_LEARNED_PRICE
+from ddqn_planner.model.propagation import MAX_LEARNED_MULTIPLIER
 
 METADATA = ModelMetadata(
     network="paper",
@@ -281,7 +281,7 @@ def test_weights_that_are_not_finite_are_refused(
 
 @same_folder
 @given(
-    priced_grids_with_free_cell(),
+    grids_with_costs(),
     st.sampled_from(["any_map", "propagation"]),
     st.sampled_from(MoveRule),
     st.integers(0, 2**32 - 1),
@@ -304,7 +304,7 @@ def test_whatever_finite_weights_say_each_q_is_a_length_or_no_way(
     grid, goal = grid_and_goal
     loaded, _ = load_model(path)
     q = loaded.q_values(grid, goal, rule)
-    longest = 2 * MAX_LEARNED_PRICE * grid.occupancy.size
+    longest = 2 * MAX_LEARNED_MULTIPLIER * grid.occupancy.size
     assert (np.isneginf(q) | ((q <= -1) & (q >= -longest))).all()
 
 

@@ -7,12 +7,12 @@ import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
-from strategies import grids_with_free_cell, priced_grids_with_free_cell
+from strategies import grids_with_costs, grids_with_free_cell
 
 from ddqn_planner.grid import MOVES, OCCUPIED, Cell, GridMap, MoveRule, legal_moves
 from ddqn_planner.model import AnyMapQNetwork, PropagationQNetwork, propagation
 from ddqn_planner.model.propagation import (
-    MAX_LEARNED_PRICE,
+    MAX_LEARNED_MULTIPLIER,
     features,
     kinds_of_surroundings,
     neighbours,
@@ -81,7 +81,7 @@ def test_the_surroundings_are_the_3x3_cells_and_outside_is_occupied(
                 assert next_cells[action, y, x] == expected
 
 
-@given(priced_grids_with_free_cell())
+@given(grids_with_costs())
 def test_cells_of_one_kind_have_the_same_surroundings(
     grid_and_goal: tuple[GridMap, Cell],
 ) -> None:
@@ -160,14 +160,16 @@ def test_values_spread_as_far_as_a_map_reaches() -> None:
     assert return_AC[0, 0] == 1 - cells
 
 
-def told(network: AnyMapQNetwork | PropagationQNetwork, success: float, price: float = 1.0) -> None:
-    """Have a network say one p and one price of every move, whatever it sees."""
+def told(
+    network: AnyMapQNetwork | PropagationQNetwork, success: float, multiplier: float = 1.0
+) -> None:
+    """Have a network say one p and one cost multiplier of every move, whatever it sees."""
     network.requires_grad_(False)
     network.moves.weight.zero_()
     network.moves.bias.fill_(math.log(success / (1 - success)))
     if isinstance(network, AnyMapQNetwork):
         network.prices.weight.zero_()
-        network.prices.bias.fill_(price - 1)
+        network.prices.bias.fill_(multiplier - 1)
 
 
 @pytest.mark.parametrize("network_class", [PropagationQNetwork, AnyMapQNetwork])
@@ -181,15 +183,18 @@ def test_a_move_is_possible_where_it_succeeds_more_often_than_not(
         assert q[0, 0, 0] == (-1.0 if possible else -np.inf)
 
 
-def test_a_price_beyond_belief_counts_as_the_greatest() -> None:
+def test_a_cost_beyond_belief_counts_as_the_greatest() -> None:
     network = AnyMapQNetwork(filters=4)
     grid = GridMap(np.zeros((1, 2)))
-    for price, believed in ((MAX_LEARNED_PRICE - 1, MAX_LEARNED_PRICE - 1), (1e4, 100.0)):
-        told(network, 0.9, price)
+    for multiplier, believed in (
+        (MAX_LEARNED_MULTIPLIER - 1, MAX_LEARNED_MULTIPLIER - 1),
+        (1e4, 100.0),
+    ):
+        told(network, 0.9, multiplier)
         assert network.q_values(grid, (1, 0), MoveRule.ROBOT_SAFE)[0, 0, 0] == -believed
 
 
-def test_a_move_whose_price_is_nan_is_not_possible(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_move_whose_cost_is_nan_is_not_possible(monkeypatch: pytest.MonkeyPatch) -> None:
     def checked(
         kind: np.ndarray, cost_KA: np.ndarray, goal: Cell
     ) -> np.ndarray:  # with NaN the front would never end
@@ -206,10 +211,10 @@ def test_a_move_whose_price_is_nan_is_not_possible(monkeypatch: pytest.MonkeyPat
     assert q[2, 0, 0] == pytest.approx(-1 - 2**0.5)  # up, and then down to the right
 
 
-def test_every_price_begins_where_it_has_a_gradient() -> None:
+def test_every_cost_begins_where_it_has_a_gradient() -> None:
     torch.manual_seed(0)
     network = AnyMapQNetwork(filters=4)
-    _, price_BA = network(torch.zeros(1, 28))
-    price_BA.sum().backward()
+    _, multiplier_BA = network(torch.zeros(1, 28))
+    multiplier_BA.sum().backward()
     assert network.prices.bias.grad is not None
     assert network.prices.bias.grad.tolist() == [1.0] * 8

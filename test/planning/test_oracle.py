@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from strategies import priced_grids_with_free_cell
+from strategies import grids_with_costs
 
 from ddqn_planner.grid import MOVES, GridMap, MoveRule, legal_moves, move_costs, path_cost
 from ddqn_planner.planning import shortest_distances, shortest_path
@@ -13,13 +13,13 @@ from ddqn_planner.planning.oracle import _graph
 RULES = st.sampled_from(list(MoveRule))
 
 
-@given(priced_grids_with_free_cell(), RULES)
+@given(grids_with_costs(), RULES)
 def test_distances_meet_bellmans_equation(
     grid_and_goal: tuple[GridMap, tuple[int, int]], rule: MoveRule
 ) -> None:
     grid, goal = grid_and_goal
     distance = shortest_distances(grid, goal, rule)
-    legal, cost = legal_moves(grid.occupancy, rule), move_costs(grid.price, rule)
+    legal, cost = legal_moves(grid.occupancy, rule), move_costs(grid.cost_multiplier, rule)
     assert distance[goal[1], goal[0]] == 0
     assert np.isinf(distance[grid.occupancy]).all()
     for x, y in set(grid.free_cells()) - {goal}:
@@ -56,7 +56,7 @@ def test_columns_of_the_graph_are_in_order_and_short_numbers() -> None:
     assert (sorted_graph.data == graph.data).all()
 
 
-@given(priced_grids_with_free_cell(), RULES, st.data())
+@given(grids_with_costs(), RULES, st.data())
 def test_the_path_is_as_long_as_the_distance_says(
     grid_and_goal: tuple[GridMap, tuple[int, int]], rule: MoveRule, data: st.DataObject
 ) -> None:
@@ -68,4 +68,4 @@ def test_the_path_is_as_long_as_the_distance_says(
         assert path == []
     else:
         assert (path[0], path[-1]) == (start, goal)
-        assert path_cost(path, grid.price, rule) == pytest.approx(distance)
+        assert path_cost(path, grid.cost_multiplier, rule) == pytest.approx(distance)

@@ -12,7 +12,7 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from strategies import grids_in_parts, grids_with_free_cell, priced_grids_with_free_cell
+from strategies import grids_in_parts, grids_with_costs, grids_with_free_cell
 
 from ddqn_planner import GridMap, MoveRule, PlanMethod, Planner, PlanStatus, QField, inflate
 from ddqn_planner.grid import LENGTHS, MOVES, Cell, connected_cells, legal_moves, path_cost
@@ -77,18 +77,18 @@ def test_whatever_the_network_says_each_move_of_a_path_is_legal(
         assert plan.length >= optimum - 1e-9
     else:
         assert plan.cells == ()
-        expected = PlanStatus.NO_PATH if np.isinf(optimum) else PlanStatus.WALK_TRAPPED
+        expected = PlanStatus.NO_PATH if np.isinf(optimum) else PlanStatus.ROLLOUT_TRAPPED
         assert plan.status is expected
 
 
-def test_the_unmasked_walk_is_trapped_by_the_first_illegal_move_that_it_prefers() -> None:
+def test_the_unmasked_rollout_is_trapped_by_the_first_illegal_move_that_it_prefers() -> None:
     grid = GridMap(np.array([[0, 0, 0], [0, 0, 0]]))
     q = np.zeros((8, 2, 3), dtype=np.float32)
     q[0] = 1.0  # +x
     q[6, 0, 1] = 2.0  # off the map
     field = QField((2, 0), q, legal_moves(grid.occupancy, MoveRule.ROBOT_SAFE))
     assert field.rollout((0, 0)).cells == ((0, 0), (1, 0), (2, 0))
-    assert field.unmasked().rollout((0, 0)).status is PlanStatus.WALK_TRAPPED
+    assert field.unmasked().rollout((0, 0)).status is PlanStatus.ROLLOUT_TRAPPED
     assert field.value.max() == 1  # what is illegal does not count
 
 
@@ -184,8 +184,8 @@ def test_the_model_for_any_map_solves_every_start_at_the_optimum(
         assert evaluation.worst_ratio < 1.01
 
 
-@given(priced_grids_with_free_cell(), RULES)
-def test_the_model_for_any_map_heeds_prices(
+@given(grids_with_costs(), RULES)
+def test_the_model_for_any_map_heeds_costs(
     grid_and_goal: tuple[GridMap, Cell], rule: MoveRule
 ) -> None:
     grid, goal = grid_and_goal
@@ -264,7 +264,9 @@ def test_choices_are_members_or_their_values_and_else_refused_with_a_list() -> N
     for function in by_method:
         for method in PlanMethod:
             assert function(method.value) == function(method)
-        with pytest.raises(ValueError, match="'nope' is unknown; give one of greedy, guided"):
+        with pytest.raises(
+            ValueError, match="'nope' is unknown; give one of greedy, astar_fallback"
+        ):
             function("nope")
 
 
@@ -274,11 +276,11 @@ def test_a_method_given_by_its_value_is_used() -> None:
     for seed in range(10):
         planner = random_planner(6, 6, seed)
         greedy = planner.plan(grid, (0, 0), (5, 3))
-        guided = planner.plan(grid, (0, 0), (5, 3), method="guided")
+        guided = planner.plan(grid, (0, 0), (5, 3), method="astar_fallback")
         assert guided.cells
-        assert (guided.method is PlanMethod.GUIDED) == (not greedy.cells)
+        assert (guided.method is PlanMethod.ASTAR_FALLBACK) == (not greedy.cells)
         statuses.add(greedy.status)
-    assert PlanStatus.WALK_TRAPPED in statuses
+    assert PlanStatus.ROLLOUT_TRAPPED in statuses
 
 
 def test_any_pair_of_whole_numbers_is_a_start_and_a_goal() -> None:
@@ -307,7 +309,7 @@ def test_any_pair_of_whole_numbers_is_a_start_and_a_goal() -> None:
                 function(grid, wrong)  # type: ignore[operator]
 
 
-def test_a_walk_from_outside_the_map_is_refused() -> None:
+def test_a_rollout_from_outside_the_map_is_refused() -> None:
     field = ANY_MAP.q_field(GridMap(np.zeros((4, 6))), (5, 3))
     for start in ((6, 0), (0, 4), (-1, 0), (0, -1)):
         with pytest.raises(ValueError, match=r"outside the map of 6 x 4 cells"):
@@ -332,7 +334,7 @@ def test_a_plan_knows_its_rule_and_counts_by_it() -> None:
         assert trapped.move_rule is MoveRule.UNIT
 
 
-@given(priced_grids_with_free_cell(), RULES, st.data())
+@given(grids_with_costs(), RULES, st.data())
 def test_on_a_map_with_costs_a_plan_knows_what_it_costs(
     grid_and_goal: tuple[GridMap, Cell], rule: MoveRule, data: st.DataObject
 ) -> None:
@@ -341,10 +343,10 @@ def test_on_a_map_with_costs_a_plan_knows_what_it_costs(
     plan = ANY_MAP.plan(grid, start, goal, rule)
     assert (plan.cost is None) == (not plan.cells)
     if plan.cost is not None:
-        assert plan.cost == path_cost(plan.cells, grid.price, rule)
+        assert plan.cost == path_cost(plan.cells, grid.cost_multiplier, rule)
 
 
-def test_a_solution_tells_how_long_field_and_walk_took() -> None:
+def test_a_solution_tells_how_long_field_and_rollout_took() -> None:
     class SlowNetwork:
         def __getattr__(self, name: str) -> Any:
             return getattr(ANY_MAP.network, name)
@@ -360,7 +362,7 @@ def test_a_solution_tells_how_long_field_and_walk_took() -> None:
     )
     solution = solve(problem)
     assert solution.field_ms >= 50
-    assert solution.walk_ms > 0
+    assert solution.rollout_ms > 0
     assert solution.goal == (4, 2)
     failed = solve(replace(problem, goal=(9, 9)))
     assert failed.plan.status is PlanStatus.GOAL_OUTSIDE_MAP
@@ -378,11 +380,11 @@ def test_with_a_bad_model_every_solvable_request_is_searched_for_or_walked(
     start = data.draw(st.sampled_from(grid.free_cells()))
     planner = random_planner(grid.height, grid.width, seed)
     greedy = planner.plan(grid, start, goal, rule)
-    guided = planner.plan(grid, start, goal, rule, PlanMethod.GUIDED)
+    guided = planner.plan(grid, start, goal, rule, PlanMethod.ASTAR_FALLBACK)
     assert greedy.method is PlanMethod.GREEDY
-    if greedy.status is PlanStatus.WALK_TRAPPED:
+    if greedy.status is PlanStatus.ROLLOUT_TRAPPED:
         assert guided.status is PlanStatus.SUCCEEDED
-        assert guided.method is PlanMethod.GUIDED
+        assert guided.method is PlanMethod.ASTAR_FALLBACK
         assert (guided.cells[0], guided.cells[-1]) == (start, goal)
         check_legal(guided.cells, grid.occupancy, rule)
     else:
@@ -394,7 +396,7 @@ def test_whatever_is_wrong_with_the_values_the_search_finds_a_path() -> None:
     for bias in (np.nan, np.inf, -np.inf, 1e38):
         planner = random_planner(6, 6, 0)
         planner.network.fully_connected.bias.fill_(bias)  # type: ignore[attr-defined]
-        plan = planner.plan(grid, (0, 0), (5, 3), method=PlanMethod.GUIDED)
+        plan = planner.plan(grid, (0, 0), (5, 3), method=PlanMethod.ASTAR_FALLBACK)
         check_legal(plan.cells, grid.occupancy, MoveRule.CORNER_CUTTING)
         assert plan.cells[-1] == (5, 3)
 

@@ -28,16 +28,16 @@ def test_a_search_goes_on_from_what_the_trapped_steps_found(
 ) -> None:
     grid, rule = GridMap(np.zeros((6, 6))), MoveRule.ROBOT_SAFE
     guided = Problem(
-        turning_planner(), grid, (0, 0), (5, 5), rule, PlanMethod.GUIDED, 0.0, simplified
+        turning_planner(), grid, (0, 0), (5, 5), rule, PlanMethod.ASTAR_FALLBACK, 0.0, simplified
     )
     trapped = solve(replace(guided, method=PlanMethod.GREEDY))
-    assert trapped.plan.status is PlanStatus.WALK_TRAPPED
+    assert trapped.plan.status is PlanStatus.ROLLOUT_TRAPPED
     whole = solve(guided)
     for name in ("route", "q_field", "known_field", "follow"):
         monkeypatch.delattr(Planner, name)
     found = search_on(guided, trapped)
     assert (found.plan, found.cells, found.goal) == (whole.plan, whole.cells, whole.goal)
-    assert found.plan.method is PlanMethod.GUIDED
+    assert found.plan.method is PlanMethod.ASTAR_FALLBACK
     assert found.field_ms == trapped.field_ms
-    assert found.walk_ms > trapped.walk_ms
+    assert found.rollout_ms > trapped.rollout_ms
     assert len(found.cells) == (2 if simplified else 6)

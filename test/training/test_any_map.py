@@ -19,7 +19,7 @@ from ddqn_planner.training.any_map import ANY_MAP, MAPS, RULES, random_scenarios
 from ddqn_planner.training.trainer import Trainer
 
 BRIEF = 192_000
-"""Environment steps that are enough to learn every move, though prices only roughly."""
+"""Environment steps that are enough to learn every move, though cost multipliers only roughly."""
 
 
 @pytest.fixture(scope="module")
@@ -51,12 +51,12 @@ def test_costs_and_unknown_cells_are_learned_with_them(planner: Planner, rule: M
     random = np.random.default_rng(2)
     occupancy = generate_map("random_20", (30, 30), random)
     cost = np.where(random.random((30, 30)) < 0.2, UNKNOWN, random_costs(occupancy, random))
-    priced = GridMap(occupancy, cost=cost.astype(np.int8))
-    evaluation = walks(planner, priced, rule)
+    use_map_costs = GridMap(occupancy, cost=cost.astype(np.int8))
+    evaluation = walks(planner, use_map_costs, rule)
     assert evaluation.solved == evaluation.starts > 100
-    # A planner that does not see the prices takes the shortest way, which costs more.
-    goal = priced.free_cells()[-1]
-    blind = evaluate(planner.q_field(GridMap(occupancy), goal, rule), priced, rule)
+    # A planner that does not see the cost multipliers takes the shortest way, which costs more.
+    goal = use_map_costs.free_cells()[-1]
+    blind = evaluate(planner.q_field(GridMap(occupancy), goal, rule), use_map_costs, rule)
     assert evaluation.mean_ratio < (1 + blind.mean_ratio) / 2
 
 

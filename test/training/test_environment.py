@@ -99,12 +99,14 @@ def test_rewards_and_ends_of_one_episode_by_hand(small: Scenario) -> None:
     assert (reward, terminated) == (10.0, True)
 
 
-def test_path_costs_reward_a_move_by_minus_its_length_times_its_price(small: Scenario) -> None:
+def test_path_costs_reward_a_move_by_minus_its_length_times_its_cost(small: Scenario) -> None:
     cost = np.zeros((4, 5), dtype=np.int8)
     cost[1, 0] = 50
-    priced = replace(small, grid=replace(small.grid, cost=cost), move_rule=MoveRule.CORNER_CUTTING)
+    use_map_costs = replace(
+        small, grid=replace(small.grid, cost=cost), move_rule=MoveRule.CORNER_CUTTING
+    )
     parameters = HyperParameters(p_r=0.0, reward="path_cost")
-    environment = GridEnvironment(priced, MoveRule.ROBOT_SAFE, parameters)
+    environment = GridEnvironment(use_map_costs, MoveRule.ROBOT_SAFE, parameters)
     environment.reset(seed=0)
     assert environment.step(np.int64(2))[1] == pytest.approx(-(1 + 3) / 2)
     environment.cell = (1, 2)

@@ -104,7 +104,7 @@ def test_an_update_of_the_papers_network_is_that_of_the_equations(
 
 
 def test_an_update_of_the_network_for_any_map_counts_each_reward_once(small: Scenario) -> None:
-    # Q(s, a) = p (r + γ V(s')) + (1 - p) r_o, r = -length * price, V = max Q under θ⁻.
+    # Q(s, a) = p (r + γ V(s')) + (1 - p) r_o, r = -length * cost multiplier, V = max Q under θ⁻.
     cost = np.arange(20, dtype=np.int8).reshape(4, 5)
     walls = small.grid.occupancy
     scenarios = [
@@ -124,12 +124,12 @@ def test_an_update_of_the_network_for_any_map_counts_each_reward_once(small: Sce
     ) -> dict[Cell, Tensor]:
         seen = surroundings(scenario.grid.occupancy, scenario.grid.cost)
         rule = scenario.move_rule or MoveRule.CORNER_CUTTING
-        p, price = network(torch.from_numpy(features(seen, rule)))
+        p, multiplier = network(torch.from_numpy(features(seen, rule)))
         answers = {}
         for number in range(20):
             x, y = number % 5, number // 5
             onward = torch.tensor([value.get((x + dx, y + dy), -20.0) for dx, dy in MOVES.tolist()])
-            success = -lengths * price[number] + 0.5 * onward
+            success = -lengths * multiplier[number] + 0.5 * onward
             answers[x, y] = p[number] * success + (1 - p[number]) * -20.0
         return answers
 
