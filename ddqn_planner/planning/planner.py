@@ -14,11 +14,10 @@ from numpy.typing import NDArray
 
 from ddqn_planner.grid import Cell, GridMap, MoveRule, legal_moves, path_cost
 from ddqn_planner.grid.arguments import as_cell
-from ddqn_planner.grid.moves import component_labels
 from ddqn_planner.model import ModelMetadata, QNetwork, load_model
 from ddqn_planner.planning.plan import Plan, PlanMethod, PlanRequest, PlanStatus
 from ddqn_planner.planning.q_field import QField
-from ddqn_planner.planning.search import search
+from ddqn_planner.planning.search import reachable_cells, search
 from ddqn_planner.planning.simplification import simplify
 
 CACHE_BYTES = 2**29
@@ -243,21 +242,27 @@ def _reach(request: PlanRequest) -> float:
 def _way_out_and_end(request: PlanRequest) -> tuple[tuple[Cell, ...], Cell]:
     """Return the way from the start to the first free cell, and where the path can end.
 
-    The way is the start alone where that is free, and empty where no path leads to the goal or to
-    a cell within the tolerance. Connected cells say so: no field is computed for it.
+    The way is the start alone where that is free. It is empty where no path leads to the goal, nor
+    to a cell within the tolerance: connected cells say so, without a field.
     """
-    grid, goal, rule = request.grid, request.goal, request.move_rule
-    labels = component_labels(grid.occupancy, rule)
+    grid, start, goal, rule = request.grid, request.start, request.goal, request.move_rule
     goals = [np.array([goal])] if grid.is_free(goal) else []
     if _reach(request) >= 1:
         goals.append(_free_cells(grid, goal, _reach(request)))
-    for candidates in goals:
-        labels_of_goals = labels[candidates[:, 1], candidates[:, 0]]
-        way_out = _way_out(grid, request.start, np.isin(labels, labels_of_goals), rule)
+    for ends in goals:
+        way_out: tuple[Cell, ...] = (start,)
+        if not grid.is_free(start):
+            # The robot is too near to an obstacle: the shortest way through such cells.
+            assert grid.obstacles is not None
+            joined = reachable_cells(grid.occupancy, ends, rule)
+            legal = legal_moves(~joined & (grid.obstacles | ~grid.occupancy), rule)
+            way_out = search(start, joined, legal, np.ones(joined.shape, np.float32), rule)
         if way_out:
-            label = labels[way_out[-1][1], way_out[-1][0]]
-            x, y = candidates[np.argmax(labels_of_goals == label)].tolist()
-            return way_out, (x, y)
+            joined = reachable_cells(grid.occupancy, np.array(way_out[-1:]), rule)
+            can_end = joined[ends[:, 1], ends[:, 0]]
+            if can_end.any():
+                x, y = ends[np.argmax(can_end)].tolist()
+                return way_out, (x, y)
     return (), goal
 
 
@@ -270,15 +275,3 @@ def _free_cells(grid: GridMap, goal: Cell, tolerance: float) -> NDArray[np.int64
     distance = np.hypot(*(cells - goal).T)
     order = np.argsort(distance, kind="stable")
     return cells[order[: np.count_nonzero(distance <= tolerance)]]
-
-
-def _way_out(
-    grid: GridMap, start: Cell, ends: NDArray[np.bool_], rule: MoveRule
-) -> tuple[Cell, ...]:
-    """Return the shortest way from a cell to one of some, by cells too near to an obstacle."""
-    if grid.is_free(start):
-        return (start,) if ends[start[1], start[0]] else ()
-    assert grid.obstacles is not None
-    closed = ~ends & (grid.obstacles | ~grid.occupancy)
-    same_cost = np.ones(ends.shape, dtype=np.float32)
-    return search(start, ends, legal_moves(closed, rule), same_cost, rule)
