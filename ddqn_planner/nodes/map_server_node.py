@@ -21,11 +21,11 @@ from ddqn_planner.grid import (
     MoveRule,
     read_map_file,
     scatter_obstacles,
+    shortest_path,
 )
 from ddqn_planner.grid.map_file import MapDataError, MapMetadataError, MapNotFoundError
 from ddqn_planner.nodes.conversions import MIN_RESOLUTION, occupancy_message
 from ddqn_planner.nodes.runtime import LATCHED, BaseNode, declare, spin_until_shutdown
-from ddqn_planner.planning import shortest_path
 from ddqn_planner.resources import PACKAGE, find_map
 
 RESULTS: dict[type[Exception], int] = {
