@@ -41,7 +41,12 @@ NO_MAP = "no map is loaded; call load_map first"
 def declare_parameters(node: Node) -> None:
     """Declare all parameters of the map server node; none can be set while it runs."""
     for name, default, description, limits in (
-        ("yaml_filename", "dilemma.yaml", "Path or URL of a map file, or a shipped map's name", None),
+        (
+            "yaml_filename",
+            "dilemma.yaml",
+            "Path or URL of a map file, or a shipped map's name",
+            None,
+        ),
         ("topic_name", "map", "Topic of the map", None),
         ("frame_id", "map", "Frame of the map, not empty", None),
         ("seed", 0, "Seed of the new obstacles", (0, 2**63 - 1)),

@@ -101,9 +101,7 @@ class PlannerNode(BaseNode):
         # What takes less time than a field does not wait for the fields of other requests.
         self._quick_worker = Worker(self)
         # While it loads, DDS discovers, and the node says what else is missing.
-        self._first_planner = self._worker.call(
-            load_and_warm_up, self.get_parameter("model").value
-        )
+        self._first_planner = self._worker.call(load_and_warm_up, self.get_parameter("model").value)
         self._model_is_due = True
         self._display = FieldDisplay(self, self._quick_worker)
         self._report = Report(self)

@@ -34,6 +34,9 @@ REMEDIES = {
 }
 
 
+NO_PLAN = Plan(PlanStatus.NO_PATH)
+
+
 class RequestError(ValueError):
     """There is no request for the planner; the message says why and what to do."""
 
@@ -64,7 +67,7 @@ class Outcome:
     reason: str
     planner: Planner | None = None
     request: PlanRequest | None = None
-    plan: Plan = Plan(PlanStatus.NO_PATH)
+    plan: Plan = NO_PLAN
     map_stamp: str = ""
 
 

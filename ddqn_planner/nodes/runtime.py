@@ -1,4 +1,4 @@
-"""What the nodes share: latched topics, parameters, a worker thread, ``--help``, how a node ends."""
+"""What the nodes share: latched topics, parameters, worker threads, ``--help``, the shutdown."""
 
 from __future__ import annotations
 

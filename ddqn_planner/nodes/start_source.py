@@ -97,15 +97,13 @@ class StartSource:
             )
         return self._pose
 
-    def _transformed_pose(
-        self, map_frame: str, robot_frame: str, tolerance: float
-    ) -> PoseStamped:
+    def _transformed_pose(self, map_frame: str, robot_frame: str, tolerance: float) -> PoseStamped:
         try:
             transform = self._buffer.lookup_transform(map_frame, robot_frame, Time())
         except self._tf2_ros.TransformException as error:
             raise StartUnknownError(
-                f"the start is unknown: no transform leads from {robot_frame!r} to {map_frame!r} ({error}); "
-                "publish one, or set robot_frame or start_source"
+                f"the start is unknown: no transform leads from {robot_frame!r} to {map_frame!r} "
+                f"({error}); publish one, or set robot_frame or start_source"
             ) from None
         stamp = Time.from_msg(transform.header.stamp)
         age = (self._node.get_clock().now() - stamp).nanoseconds / 1e9

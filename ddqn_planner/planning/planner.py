@@ -166,7 +166,7 @@ class Planner:
             yield Plan(status, move_rule=rule)
             return
         field_time, rollout_time = _Stopwatch(), _Stopwatch()
-        way_out = (request.start,)
+        way_out: tuple[Cell, ...] = (request.start,)
         with field_time:
             field = self.known_field(grid, goal, rule) if grid.is_free(request.start) else None
         with rollout_time:

@@ -13,7 +13,16 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from strategies import grids_in_parts, grids_with_costs, grids_with_free_cell
 
-from ddqn_planner import GridMap, MoveRule, PlanMethod, Planner, PlanStatus, QField, inflate, simplify
+from ddqn_planner import (
+    GridMap,
+    MoveRule,
+    PlanMethod,
+    Planner,
+    PlanStatus,
+    QField,
+    inflate,
+    simplify,
+)
 from ddqn_planner.grid import LENGTHS, MOVES, Cell, connected_cells, legal_moves, path_cost
 from ddqn_planner.model import ModelMetadata, PaperQNetwork
 from ddqn_planner.planning import PlanRequest, shortest_distances

@@ -9,7 +9,15 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as numpy_st
 from strategies import grids_with_costs
 
-from ddqn_planner.grid import MOVES, Cell, GridMap, MoveRule, connected_cells, legal_moves, path_cost
+from ddqn_planner.grid import (
+    MOVES,
+    Cell,
+    GridMap,
+    MoveRule,
+    connected_cells,
+    legal_moves,
+    path_cost,
+)
 from ddqn_planner.planning import shortest_distances
 from ddqn_planner.planning.search import reachable_cells, search
 
@@ -61,7 +69,7 @@ def test_visits_cells_without_a_value_last() -> None:
 
 
 def test_a_move_costs_the_mean_cost_of_its_two_cells() -> None:
-    # From a start of high cost the straight move is cheaper, though it ends in a cell of higher cost.
+    # From a start of high cost the straight move is cheaper, though its end costs more.
     grid = GridMap(np.array([[0, 0, 1], [1, 0, 0]]), cost=np.array([[99, 3, 0], [0, 0, 0]]))
     rule = MoveRule.CORNER_CUTTING
     legal = legal_moves(grid.occupancy, rule)
