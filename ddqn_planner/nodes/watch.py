@@ -47,11 +47,7 @@ LOOK_PERIOD = 1.0
 class WatchNode(Node):
     """Draws the last map, value field, plan and episode, and the curve of the average reward.
 
-    Parameters
-    ----------
-    planner, trainer : str
-        Names of the nodes; relative names are in this node's namespace.
-    recording : rerun.RecordingStream
+    The names of the planner node and the trainer node are relative to this node's namespace.
     """
 
     def __init__(self, planner: str, trainer: str, recording: rr.RecordingStream) -> None:
@@ -68,9 +64,9 @@ class WatchNode(Node):
         subscribe(Float32, f"{trainer}/average_reward", self._on_reward, 100)
 
     def _on_map(self, message: OccupancyGrid) -> None:
-        if (grid := self._read("map", message)) is None:
+        if (read := self._read("map", message)) is None:
             return
-        self._grid, values = grid, _values(message)
+        self._grid, values = read
         shades = 255 - 2 * values.clip(0, 100).astype(np.int16)
         shades[values < 0] = UNKNOWN_GREY
         self._draw_image(MAP, shades.astype(np.uint8))
@@ -79,8 +75,8 @@ class WatchNode(Node):
             self._draw_path(entity)
 
     def _on_value(self, message: OccupancyGrid) -> None:
-        if self._read("value field", message) is not None:
-            self._value = _values(message)
+        if (read := self._read("value field", message)) is not None:
+            self._value = read[1]
             self._draw_value()
 
     def _on_path(self, entity: str, message: Path) -> None:
@@ -90,13 +86,14 @@ class WatchNode(Node):
     def _on_reward(self, message: Float32) -> None:
         self._recording.log(REWARD, rr.Scalars(message.data))
 
-    def _read(self, what: str, message: OccupancyGrid) -> GridMap | None:
-        """Return the map; None if it is malformed, and log why."""
+    def _read(self, what: str, message: OccupancyGrid) -> tuple[GridMap, NDArray[np.int8]] | None:
+        """Return the map and its (H, W) values; None if it is malformed, and log why."""
         try:
-            return grid_from_message(message)
+            grid = grid_from_message(message)
         except ValueError as error:
             self.get_logger().warning(f"the {what} is not drawn: {error}")
             return None
+        return grid, np.frombuffer(message.data, np.int8).reshape(grid.occupancy.shape)
 
     def _draw_image(self, entity: str, colours: NDArray[np.uint8]) -> None:
         self._recording.log(entity, rr.Image(colours[::-1], draw_order=LAYERS.index(entity)))
@@ -119,7 +116,7 @@ class WatchNode(Node):
         x, y, yaw = self._grid.origin
         points = [pose.pose.position for pose in self._paths[entity].poses]
         # Complex numbers as points: to turn is to multiply.
-        metres = np.array([complex(p.x - x, p.y - y) for p in points], dtype=np.complex128)
+        metres = np.array([complex(p.x - x, p.y - y) for p in points])
         cells = metres * np.exp(-1j * yaw) / self._grid.resolution
         strip = np.stack([cells.real, self._grid.height - cells.imag], axis=1)
         colour, radius = LINES[entity]
@@ -130,10 +127,6 @@ class WatchNode(Node):
             draw_order=LAYERS.index(entity),
         )
         self._recording.log(entity, lines)
-
-
-def _values(message: OccupancyGrid) -> NDArray[np.int8]:
-    return np.frombuffer(message.data, np.int8).reshape(message.info.height, message.info.width)
 
 
 def open_viewer() -> subprocess.Popen[bytes] | None:
