@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ddqn_planner.grid.arguments import Cell, Choice, as_cell
+from ddqn_planner.grid.labels import label_cells
 
 MOVES: NDArray[np.int64] = np.array(
     [(1, 0), (1, 1), (0, 1), (-1, 1), (-1, 0), (-1, -1), (0, -1), (1, -1)], dtype=np.int64
@@ -148,13 +149,9 @@ def component_labels(occupancy: NDArray[np.bool_], move_rule: MoveRule | str) ->
     (H, W) int32
         1 or more for the free cells, the same for all that paths join; 0 for the occupied ones.
     """
-    import scipy.ndimage  # slow to import, and not needed to load or serve a map
-
     # Where a diagonal move needs both side cells free, two straight moves do the same.
-    diagonals = 2 if MoveRule(move_rule).cuts_corners else 1
-    structure = scipy.ndimage.generate_binary_structure(2, diagonals)
-    labels: NDArray[np.int32] = scipy.ndimage.label(~occupancy, structure)[0]
-    return labels
+    moves = MOVES[4:] if MoveRule(move_rule).cuts_corners else MOVES[4::2]
+    return label_cells(~occupancy, moves)
 
 
 def path_length(cells: Sequence[Cell], move_rule: MoveRule | str = MoveRule.ROBOT_SAFE) -> float:
