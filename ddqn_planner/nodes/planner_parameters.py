@@ -21,6 +21,9 @@ CHOICES: Final = {
 }
 """The values of the parameters that have only a few."""
 
+CHECKED: Final = [*CHOICES, "robot_frame"]
+"""The parameters of `check_parameter`."""
+
 PARAMETERS: Final[list[tuple[str, object, str, dict[str, Any]]]] = [
     (
         "model",
