@@ -20,8 +20,6 @@ from nav_msgs.msg import OccupancyGrid, Odometry, Path
 from nav_msgs.srv import GetPlan
 from rcl_interfaces.msg import SetParametersResult
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup, ReentrantCallbackGroup
-from rclpy.clock import Clock, ClockType
-from rclpy.exceptions import InvalidParameterValueException
 from rclpy.parameter import Parameter
 from rclpy.task import Future
 from std_msgs.msg import Header, String
@@ -38,9 +36,9 @@ from ddqn_planner.nodes.conversions import (
 from ddqn_planner.nodes.field_display import FieldDisplay
 from ddqn_planner.nodes.model_loading import load, load_and_warm_up
 from ddqn_planner.nodes.planner_parameters import (
-    CHECKED,
     Settings,
     check_parameter,
+    check_parameters_of,
     declare_parameters,
 )
 from ddqn_planner.nodes.report import (
@@ -60,16 +58,13 @@ from ddqn_planner.nodes.report import (
     reason_of,
     seconds,
 )
-from ddqn_planner.nodes.runtime import LATCHED, BaseNode, Worker, spin_until_shutdown
+from ddqn_planner.nodes.runtime import LATCHED, STEADY, BaseNode, Worker, spin_until_shutdown
 from ddqn_planner.nodes.start_source import StartSource, StartUnknownError
 from ddqn_planner.planning import Planner, PlanRequest
 from ddqn_planner.planning.planner import last_step
 
 LOOK_PERIOD = 0.1
 """Seconds between two looks whether something changed: an answer does not wait for diagnostics."""
-
-M_MMAP_THRESHOLD = -3
-"""The number of an option of glibc's mallopt(3)."""
 
 
 class PlannerNode(BaseNode):
@@ -90,10 +85,7 @@ class PlannerNode(BaseNode):
         self._planner: Planner | None = None
         self._model_file = ""
         declare_parameters(self)
-        for parameter in self.get_parameters(CHECKED):
-            result = self._check_parameters([parameter])
-            if not result.successful:
-                raise InvalidParameterValueException(parameter.name, parameter.value, result.reason)
+        check_parameters_of(self)
         self._settings = Settings.of(self)
 
         self._worker = Worker(self)
@@ -127,8 +119,7 @@ class PlannerNode(BaseNode):
             GetPlan, "~/get_plan", self._on_get_plan, callback_group=ReentrantCallbackGroup()
         )
         self.create_service(Trigger, "~/reload_model", self._on_reload_model)
-        steady = Clock(clock_type=ClockType.STEADY_TIME)
-        self.create_timer(LOOK_PERIOD, self._on_look, clock=steady)
+        self.create_timer(LOOK_PERIOD, self._on_look, clock=STEADY)
         self.add_on_set_parameters_callback(self._check_parameters)
         self.add_post_set_parameters_callback(self._apply_parameters)
         self._replan.trigger()
@@ -401,7 +392,7 @@ def main() -> NoReturn:
     """Run the planner node until SIGINT or SIGTERM."""
     # glibc returns large arrays at once: after 120 fields the process has 185 MB instead of 245.
     with suppress(AttributeError):  # another C library
-        ctypes.CDLL(None).mallopt(M_MMAP_THRESHOLD, 2**20)
+        ctypes.CDLL(None).mallopt(-3, 2**20)  # M_MMAP_THRESHOLD
     exit_code = spin_until_shutdown(PlannerNode, declare_parameters)
     # A field that is being computed cannot be stopped, and Python would wait for its thread.
     os._exit(exit_code)

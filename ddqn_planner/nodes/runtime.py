@@ -18,6 +18,8 @@ from rcl_interfaces.msg import (
     SetParametersResult,
 )
 from rcl_interfaces.srv import SetParameters, SetParametersAtomically
+from rclpy.clock import Clock
+from rclpy.clock_type import ClockType
 from rclpy.exceptions import NameValidationException, ParameterException
 from rclpy.executors import ExternalShutdownException
 from rclpy.logging import get_logger
@@ -35,6 +37,9 @@ LATCHED = QoSProfile(
     durability=DurabilityPolicy.TRANSIENT_LOCAL,
 )
 """Late subscribers receive the last message too: for maps, plans, saved models."""
+
+STEADY = Clock(clock_type=ClockType.STEADY_TIME)
+"""For timers that must not depend on simulated time."""
 
 SERVICE_QUALITY = QoSProfile(depth=5000)
 """For each service, except ROS's parameter services, whose queue is 1,000.
