@@ -16,15 +16,15 @@ import torch
 from tqdm import tqdm
 
 from ddqn_planner.experiments import EXPERIMENTS
-from ddqn_planner.experiments.benchmark_maps import (
-    COSTS,
-    RequestSettings,
-    describe_files,
-    find_files,
-    generated_maps,
-    read_maps,
+from ddqn_planner.benchmarks.map_files import describe_files, find_files, read_maps
+from ddqn_planner.benchmarks.maps import COSTS, RequestSettings, generated_maps
+from ddqn_planner.benchmarks.generalisation import (
+    Rollout,
+    markdown,
+    measure,
+    summarise,
+    write_report,
 )
-from ddqn_planner.experiments.generalisation import Walk, markdown, measure, summarise, write_report
 from ddqn_planner.experiments.profiles import HIDDEN_UNITS
 from ddqn_planner.grid import Cell, GridMap, MapFile, MoveRule, Noise, inflate, read_map_file
 from ddqn_planner.grid.generators import KINDS
@@ -369,7 +369,7 @@ def _reproduce(options: argparse.Namespace) -> int:
     if options.seeds < 1:
         raise ValueError(f"--seeds is {options.seeds}; give at least 1")
     try:
-        from ddqn_planner.experiments.report import Settings
+        from ddqn_planner.experiments.settings import Settings
         from ddqn_planner.experiments.reproduce import reproduce
     except ImportError as error:
         raise PictureError(
@@ -408,16 +408,14 @@ def _evaluate(options: argparse.Namespace) -> int:
         raise ValueError(f"--maps is {options.maps}; give at least 1")
     if options.out and options.out.suffix.lower() not in (".csv", ".md"):
         raise ValueError(f"--out is {options.out}; give a file that ends in .csv or .md")
-    settings = RequestSettings(
-        options.move_rule, options.requests, options.costs, options.seed
-    )
+    settings = RequestSettings(options.move_rule, options.requests, options.costs, options.seed)
     planner = Planner.load(options.model)
     maps = generated_maps(options.kinds, options.sizes, options.maps, settings)
     if options.data:
         files = find_files(options.data)
         print(f"found in {options.data}: {describe_files(files)}", file=sys.stderr)
         maps = read_maps(files, settings)
-    walks: list[Walk] = []
+    walks: list[Rollout] = []
     interrupted = False
     try:
         for walk in measure(planner, tqdm(maps, unit="map", disable=None), options.move_rule):

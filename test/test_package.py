@@ -12,7 +12,7 @@ import pytest
 from ddqn_planner.resources import find_map, find_resource
 
 ROOT = Path(__file__).resolve().parent.parent
-ROOMS = ["grid", "model", "planning", "training", "experiments", "nodes"]
+ROOMS = ["grid", "model", "planning", "training", "benchmarks", "experiments", "nodes"]
 
 
 @pytest.mark.parametrize("room", ROOMS)

@@ -21,7 +21,7 @@ START_DEAD_END: Final[frozenset[Cell]] = frozenset(
 
 PROFILES: Final[dict[str, HyperParameters]] = {
     "paper": HyperParameters(),
-    "best": HyperParameters(
+    "propagation": HyperParameters(
         network="propagation",
         filters=64,
         learning_rate=0.001,
@@ -30,8 +30,8 @@ PROFILES: Final[dict[str, HyperParameters]] = {
         steps=15_000,
     ),
 }
-"""``paper``: its network, observation and Table 1, our choice where it is silent. ``best``: the
-same rewards and restarts, with another network and fewer steps."""
+"""``paper``: its network, observation and Table 1, our choice where it is silent. ``propagation``:
+the same rewards and initialisation, with another network and fewer steps."""
 
 VARIANTS: Final[dict[str, dict[str, float]]] = {
     "plain": {"p_r": 0.0, "alpha": 0.0, "beta": 0.0},
