@@ -15,9 +15,7 @@ from pathlib import Path
 import torch
 from tqdm import tqdm
 
-from ddqn_planner.experiments import EXPERIMENTS
-from ddqn_planner.benchmarks.map_files import describe_files, find_files, read_maps
-from ddqn_planner.benchmarks.maps import COSTS, RequestSettings, generated_maps
+from ddqn_planner.benchmarks.evaluation import evaluate
 from ddqn_planner.benchmarks.generalisation import (
     Rollout,
     markdown,
@@ -25,13 +23,15 @@ from ddqn_planner.benchmarks.generalisation import (
     summarise,
     write_report,
 )
+from ddqn_planner.benchmarks.map_files import describe_files, find_files, read_maps
+from ddqn_planner.benchmarks.maps import COSTS, RequestSettings, generated_maps
+from ddqn_planner.experiments import EXPERIMENTS
 from ddqn_planner.experiments.profiles import HIDDEN_UNITS
 from ddqn_planner.grid import Cell, GridMap, MapFile, MoveRule, Noise, inflate, read_map_file
 from ddqn_planner.grid.generators import KINDS
+from ddqn_planner.pictures.animation import save_animation
+from ddqn_planner.pictures.picture import MAX_TEXT_WIDTH, PictureError, draw_text, save_picture
 from ddqn_planner.planning import Plan, PlanMethod, Planner, shortest_distances
-from ddqn_planner.planning.animation import save_animation
-from ddqn_planner.planning.evaluation import evaluate
-from ddqn_planner.planning.picture import MAX_TEXT_WIDTH, PictureError, draw_text, save_picture
 from ddqn_planner.resources import find_map
 from ddqn_planner.training import ranks
 from ddqn_planner.training.any_map import ANY_MAP, MAPS, random_scenarios
@@ -369,8 +369,8 @@ def _reproduce(options: argparse.Namespace) -> int:
     if options.seeds < 1:
         raise ValueError(f"--seeds is {options.seeds}; give at least 1")
     try:
-        from ddqn_planner.experiments.settings import Settings
         from ddqn_planner.experiments.reproduce import reproduce
+        from ddqn_planner.experiments.settings import Settings
     except ImportError as error:
         raise PictureError(
             f"the experiments need another library ({error}): "

@@ -27,7 +27,6 @@ from ddqn_planner.grid.generators import generate_map, random_costs
 from ddqn_planner.model import AnyMapQNetwork
 from ddqn_planner.model.propagation import features
 from ddqn_planner.planning import Planner
-from ddqn_planner.planning.evaluation import evaluate
 from ddqn_planner.training.any_map import ANY_MAP, RULES, random_scenarios
 from ddqn_planner.training.environment import paper_scenario
 

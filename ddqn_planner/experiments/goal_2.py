@@ -16,7 +16,6 @@ from ddqn_planner.experiments.trainings import Training
 from ddqn_planner.grid import MOVES, legal_moves
 from ddqn_planner.model import PropagationQNetwork
 from ddqn_planner.planning import Planner
-from ddqn_planner.planning.evaluation import length_ratios
 from ddqn_planner.planning.q_field import QField
 from ddqn_planner.training.environment import GridVectorEnvironment, Scenario, paper_scenario
 from ddqn_planner.training.learners import PropagationLearner

@@ -7,13 +7,13 @@ from dataclasses import replace
 import matplotlib.pyplot as plt
 import numpy as np
 
+from ddqn_planner.benchmarks.evaluation import length_ratios
 from ddqn_planner.benchmarks.tables import write_table
 from ddqn_planner.experiments.figures import draw_curves, evaluation_curve, save_figure, share_curve
 from ddqn_planner.experiments.goal_2 import free_starts
 from ddqn_planner.experiments.profiles import MOVE_RULE, PROFILES
 from ddqn_planner.experiments.settings import Settings, median_and_range
 from ddqn_planner.experiments.trainings import Training
-from ddqn_planner.planning.evaluation import length_ratios
 from ddqn_planner.training.environment import paper_scenario
 
 TITLE = "What the printed target does"

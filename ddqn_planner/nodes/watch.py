@@ -26,7 +26,7 @@ from std_msgs.msg import Float32
 from ddqn_planner.grid import GridMap
 from ddqn_planner.nodes.conversions import grid_from_message
 from ddqn_planner.nodes.runtime import LATCHED, spin_until_shutdown
-from ddqn_planner.planning.picture import PATH_COLOUR, value_ramp
+from ddqn_planner.pictures.colours import PATH_COLOUR, value_ramp
 
 MAP, VALUE, PLAN, EPISODE, REWARD = "map/map", "map/value", "map/plan", "map/episode", "reward"
 LAYERS = (MAP, VALUE, PLAN, EPISODE)

@@ -11,6 +11,7 @@ from strategies import grids_with_free_cell
 
 pytest.importorskip("matplotlib", reason="matplotlib, of the extra experiments, is missing")
 
+from ddqn_planner.benchmarks.evaluation import length_ratios
 from ddqn_planner.experiments import any_map
 from ddqn_planner.experiments.goal_1 import a_star, convergence_row
 from ddqn_planner.experiments.goal_2 import free_starts, trained_field
@@ -20,7 +21,6 @@ from ddqn_planner.experiments.trainings import TrainingEvaluation
 from ddqn_planner.grid import MOVES, Cell, GridMap, MoveRule, Noise, legal_moves, path_length
 from ddqn_planner.model import AnyMapQNetwork, ModelMetadata, PropagationQNetwork
 from ddqn_planner.planning import Planner, shortest_distances, shortest_path
-from ddqn_planner.planning.evaluation import length_ratios
 from ddqn_planner.training.environment import Scenario
 
 
