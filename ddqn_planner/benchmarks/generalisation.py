@@ -211,9 +211,9 @@ def _summary(set_name: str, size: str, optimum: str, rollouts: Sequence[Rollout]
     )
 
 
-def markdown(summaries: Sequence[Summary], rollouts: Sequence[Rollout], description: str) -> str:
+def markdown(rollouts: Sequence[Rollout], description: str) -> str:
     """Return the report: what was measured, a table by set and size, and one by optimum."""
-    cells = [(s, [cell(s) for cell in COLUMNS.values()]) for s in summaries]
+    cells = [(s, [cell(s) for cell in COLUMNS.values()]) for s in summarise(rollouts)]
     sets = [[s.set_name, s.size, *row] for s, row in cells if s.optimum == "all"]
     lengths = [[s.optimum, *row] for s, row in cells if s.optimum != "all"]
     text = (
@@ -228,10 +228,10 @@ def markdown(summaries: Sequence[Summary], rollouts: Sequence[Rollout], descript
     return f"{text}\n{table(by_set, sets)}\n\n{table(by_length, lengths)}\n"
 
 
-def write_report(path: Path, summaries: Sequence[Summary], text: str) -> None:
-    """Write the report as Markdown, or its summaries as CSV if the path ends in ``.csv``."""
+def write_report(path: Path, rollouts: Sequence[Rollout], text: str) -> None:
+    """Write the report's text, or its summaries as CSV if the path ends in ``.csv``."""
     if path.suffix.lower() == ".csv":
         columns = [field.name for field in fields(Summary)]
-        write_csv(path, columns, [astuple(summary) for summary in summaries])
+        write_csv(path, columns, map(astuple, summarise(rollouts)))
     else:
         write_atomically(path, text.encode())

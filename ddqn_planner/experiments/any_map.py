@@ -9,6 +9,7 @@ from typing import Any, Final
 import numpy as np
 import torch
 
+from ddqn_planner.benchmarks.evaluation import evaluate
 from ddqn_planner.benchmarks.tables import write_table
 from ddqn_planner.experiments import goal_1, goal_3
 from ddqn_planner.experiments.profiles import MOVE_RULE

@@ -7,6 +7,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from ddqn_planner.benchmarks.evaluation import length_ratios
 from ddqn_planner.benchmarks.tables import write_table
 from ddqn_planner.experiments import goal_1
 from ddqn_planner.experiments.figures import draw_border, draw_map, draw_share, save_figure

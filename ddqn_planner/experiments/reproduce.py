@@ -4,14 +4,19 @@ from __future__ import annotations
 
 from typing import Final
 
-from ddqn_planner.experiments import EXPERIMENTS, ablation, any_map, goal_1, goal_2, goal_3, targets
+from ddqn_planner.experiments import ablation, any_map, goal_1, goal_2, goal_3, targets
 from ddqn_planner.experiments.settings import Settings
 from ddqn_planner.experiments.trainings import in_parallel, train
 from ddqn_planner.files import write_atomically
 
-MODULES: Final = dict(
-    zip(EXPERIMENTS, (goal_1, ablation, goal_2, goal_3, targets, any_map), strict=True)
-)
+EXPERIMENTS: Final = {
+    "goal-1": goal_1,
+    "ablation": ablation,
+    "goal-2": goal_2,
+    "goal-3": goal_3,
+    "targets": targets,
+    "any-map": any_map,
+}
 """Each has a title, ``trainings(settings)``, and ``report(settings)`` for their results."""
 
 
@@ -22,7 +27,7 @@ def reproduce(names: list[str], settings: Settings) -> str:
     Markdown.
     """
     settings.out.mkdir(parents=True, exist_ok=True)
-    modules = {name: MODULES[name] for name in names}
+    modules = {name: EXPERIMENTS[name] for name in names}
     # Experiments share trainings: each folder is trained once.
     trainings = {
         training.folder: training

@@ -247,7 +247,7 @@ def test_the_optima_of_a_scenario_file_hold_under_the_robot_safe_rule(tmp_path: 
     (read,) = read_maps(find_files(tmp_path), SAFE)
     assert read.requests == [((1, 0), (2, 1)), ((0, 0), (2, 2))]
     rollouts = rollouts_of(PerfectNetwork(), read)
-    assert "the oracle agrees with 2/2" in markdown(summarise(rollouts), rollouts, "")
+    assert "the oracle agrees with 2/2" in markdown(rollouts, "")
     assert [rollout.ratio for rollout in rollouts] == pytest.approx([1.0, 1.0])
     for settings in (
         RequestSettings(MoveRule.CORNER_CUTTING),
@@ -261,7 +261,7 @@ def test_a_wrong_optimum_of_a_file_is_told() -> None:
     rollouts = rollouts_of(
         PerfectNetwork(), free_map(((0, 0), (2, 0)), ((0, 0), (1, 1)), optima=[2.0, 2.0])
     )
-    assert "the oracle agrees with 1/2" in markdown(summarise(rollouts), rollouts, "")
+    assert "the oracle agrees with 1/2" in markdown(rollouts, "")
 
 
 def test_a_bad_line_of_a_scenario_file_is_told_and_the_others_are_used(
@@ -298,7 +298,7 @@ def test_a_rounded_optimum_agrees_within_what_its_file_gives(
     lines = [f"0 c.map 3 3 0 0 {goal} {o}" for goal, o in zip(goals, optima, strict=True)]
     write_moving_ai(tmp_path, "c", ["...", "...", "..."], lines)
     rollouts = rollouts_of(PerfectNetwork(), *read_maps(find_files(tmp_path), SAFE))
-    assert f"the oracle agrees with {agree}/3." in markdown(summarise(rollouts), rollouts, "")
+    assert f"the oracle agrees with {agree}/3." in markdown(rollouts, "")
 
 
 def test_a_sample_of_a_scenario_file_has_short_and_long_paths_alike(tmp_path: Path) -> None:
@@ -353,7 +353,7 @@ def test_mpd_maps_keep_their_goal_and_give_the_optimum_under_their_rule(
             assert connected_cells(occupancy, goal, rule)[start[1], start[0]]
         assert (benchmark_map.optima is not None) == (rule is MoveRule.UNIT)
     rollouts = rollouts_of(PerfectNetwork(), *read, rule=rule)
-    agrees = "the oracle agrees with 12/12" in markdown(summarise(rollouts), rollouts, "")
+    agrees = "the oracle agrees with 12/12" in markdown(rollouts, "")
     assert agrees == (rule is MoveRule.UNIT)
     assert all(rollout.ratio == pytest.approx(1.0) for rollout in rollouts)
 
