@@ -7,7 +7,6 @@ from dataclasses import replace
 from typing import Any, Final
 
 import numpy as np
-import torch
 
 from ddqn_planner.benchmarks.evaluation import evaluate
 from ddqn_planner.benchmarks.tables import write_table
@@ -26,7 +25,7 @@ from ddqn_planner.grid import (
 )
 from ddqn_planner.grid.generators import generate_map, random_costs
 from ddqn_planner.model import AnyMapQNetwork
-from ddqn_planner.model.propagation import features
+from ddqn_planner.model.observation import patch_features
 from ddqn_planner.planning import Planner
 from ddqn_planner.training.any_map import ANY_MAP, RULES, random_scenarios
 from ddqn_planner.training.environment import paper_scenario
@@ -154,11 +153,10 @@ def move_errors(planner: Planner) -> tuple[int, float]:
     for rule in RULES:
         legal_BA = legal_moves(grid.occupancy, rule)[:, 1::3, 1::3].reshape(8, -1).T
         cost_BA = move_costs(grid.cost_multiplier, rule)[:, 1::3, 1::3].reshape(8, -1).T
-        with torch.inference_mode():
-            p_BA, _ = network(torch.from_numpy(features(patch_B9, rule)))
-            _, learned_BA = network(torch.from_numpy(features(costs_B9, rule)))
-        wrong += int(((p_BA.numpy() > 0.5) != legal_BA).sum())
-        errors.append(np.abs(learned_BA.numpy() / (cost_BA / rule.lengths) - 1)[legal_BA])
+        p_BA = network.success(patch_features(patch_B9, rule))
+        learned_BA = network.multiplier(patch_features(costs_B9, rule))
+        wrong += int(((p_BA > 0.5) != legal_BA).sum())
+        errors.append(np.abs(learned_BA / (cost_BA / rule.lengths) - 1)[legal_BA])
     return wrong, float(np.concatenate(errors).mean())
 
 
