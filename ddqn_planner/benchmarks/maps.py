@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ddqn_planner.grid import Cell, GridMap, MoveRule, connected_cells
+from ddqn_planner.grid.arguments import Occupancy
 from ddqn_planner.grid.generators import (
-    Occupancy,
     generate_map,
     gradient_costs,
     inflated_costs,

@@ -194,6 +194,6 @@ def read_evaluations(folder: Path) -> list[TrainingEvaluation]:
     }
     with path.open(newline="", encoding="utf-8") as file:
         return [
-            TrainingEvaluation(**{name: types[name](value) for name, value in row.items()})
+            TrainingEvaluation(**{k: types[k](v) for k, v in row.items()})  # type: ignore[arg-type]
             for row in csv.DictReader(file)
         ]

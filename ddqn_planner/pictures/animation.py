@@ -92,11 +92,9 @@ def save_animation(
         frames.append(_frame(field, line[:count], start_pixel, goal_pixel))
         durations.append(FRAME_MS)
     durations[-1] = LAST_FRAME_MS
-    content = io.BytesIO()
-    frames[0].save(
-        content, "GIF", save_all=True, append_images=frames[1:], duration=durations, loop=0
-    )
-    write_atomically(Path(path), content.getvalue())
+    file, first, *others = io.BytesIO(), *frames
+    first.save(file, "GIF", save_all=True, append_images=others, duration=durations, loop=0)
+    write_atomically(Path(path), file.getvalue())
 
 
 def _spreading(grid: GridMap, value: NDArray[np.float32] | None) -> Iterator[NDArray[np.uint8]]:
@@ -121,10 +119,9 @@ def _field_image(colours: NDArray[np.uint8], scale: float) -> Image.Image:
     image = Image.fromarray(COLOURS[colours[::-1]]).resize((width, height), Image.Resampling.BOX)
     if max(colours.shape) <= MAX_SIDE_WITH_LINES:
         draw, step = ImageDraw.Draw(image), int(scale)
-        for x in range(0, width, step):
-            draw.rectangle((x, 0, x + FINE - 1, height), "white")
-        for y in range(0, height, step):
-            draw.rectangle((0, y, width, y + FINE - 1), "white")
+        for place in range(0, max(width, height), step):
+            draw.rectangle((place, 0, place + FINE - 1, height), "white")
+            draw.rectangle((0, place, width, place + FINE - 1), "white")
     return image
 
 
