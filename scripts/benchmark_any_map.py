@@ -21,13 +21,13 @@ import pyastar2d
 import torch
 from benchmark import call, report
 from client import plan_request
-from ddqn_planner.experiments.generalisation import compare_with_dijkstra
 from nav_msgs.srv import GetPlan
 from processes import executable, running
 from rcl_interfaces.srv import GetParameters, ListParameters
 from std_srvs.srv import Trigger
 
 from ddqn_planner import GridMap, MoveRule, Planner, load_map
+from ddqn_planner.benchmarks.generalisation import compare_with_dijkstra
 from ddqn_planner.experiments.goal_1 import a_star
 from ddqn_planner.grid import Cell, save_map
 from ddqn_planner.grid.generators import KINDS, generate_map, random_requests

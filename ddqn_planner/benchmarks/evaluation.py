@@ -29,18 +29,10 @@ def length_ratios(field: QField, grid: GridMap, move_rule: MoveRule) -> NDArray[
 
     On a map with costs these are the costs of the rollout and of the cheapest path.
 
-    Parameters
-    ----------
-    field : QField
-        Of this map, under this rule.
-    grid : GridMap
-    move_rule : MoveRule
-
     Returns
     -------
     (H, W) float64
-        At least 1; infinite if the rollout is trapped, NaN at the goal and where no path leads to
-        it.
+        At least 1; infinite if the rollout is trapped, NaN at the goal and in cells without a path.
     """
     optimum = shortest_distances(grid, field.goal, move_rule)
     ratios, multiplier = np.full(optimum.shape, np.nan), grid.cost_multiplier

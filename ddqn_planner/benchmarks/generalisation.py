@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import astuple, dataclass, fields
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
 from itertools import groupby
 from pathlib import Path
-from typing import Final
+from typing import Any, Final, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -60,45 +60,24 @@ class Rollout:
         return f"{upper // 2 if doublings else 0}-{upper}"
 
 
-@dataclass(frozen=True)
-class Summary:
-    """The rollouts of a group: of a set and size, of a range of optima, or all.
+Summary: TypeAlias = dict[str, Any]
+"""A row of a table, see `_summary`."""
 
-    ``success``, ``unmasked`` and ``optimal`` count requests that are solved, solved without action
-    masking, and solved at the least cost. ``mean`` and ``worst`` are ratios to the optimum of the
-    solved requests, NaN if there are none. Times are medians.
-    """
-
-    set_name: str
-    size: str
-    optimum: str
-    maps: int
-    requests: int
-    success: int
-    unmasked: int
-    optimal: int
-    mean: float
-    worst: float
-    illegal: int
-    field_ms: float
-    dijkstra_ms: float
-    path_ms: float
-
-
-COLUMNS: Final[dict[str, Callable[[Summary], str]]] = {
-    "maps": lambda s: str(s.maps),
-    "requests": lambda s: str(s.requests),
-    "success": lambda s: f"{s.success}/{s.requests}",
-    "without action masking": lambda s: f"{s.unmasked}/{s.requests}",
-    "optimal": lambda s: f"{s.optimal}/{s.requests}",
-    "mean": lambda s: f"{s.mean:.4f}",
-    "worst": lambda s: f"{s.worst:.4f}",
-    "illegal": lambda s: str(s.illegal),
-    "field ms": lambda s: f"{s.field_ms:.2f}",
-    "Dijkstra ms": lambda s: f"{s.dijkstra_ms:.2f}",
-    "field/Dijkstra": lambda s: f"{s.field_ms / s.dijkstra_ms:.2f}",
-    "path ms": lambda s: f"{s.path_ms:.3f}",
+COLUMNS: Final = {
+    "maps": "{maps}",
+    "requests": "{requests}",
+    "success": "{success}/{requests}",
+    "without action masking": "{unmasked}/{requests}",
+    "optimal": "{optimal}/{requests}",
+    "mean": "{mean:.4f}",
+    "worst": "{worst:.4f}",
+    "illegal": "{illegal}",
+    "field ms": "{field_ms:.2f}",
+    "Dijkstra ms": "{dijkstra_ms:.2f}",
+    "field/Dijkstra": "{field_per_dijkstra:.2f}",
+    "path ms": "{path_ms:.3f}",
 }
+"""The columns of the Markdown tables, from a `Summary`."""
 
 
 def measure(
@@ -191,31 +170,35 @@ def summarise(rollouts: Sequence[Rollout]) -> list[Summary]:
 
 
 def _summary(set_name: str, size: str, optimum: str, rollouts: Sequence[Rollout]) -> Summary:
+    """Return one row: counts of requests, ratios of the solved ones (NaN if none), median times."""
     ratios = np.array([rollout.ratio for rollout in rollouts])
     solved = ratios[np.isfinite(ratios)]
-    return Summary(
-        set_name,
-        size,
-        optimum,
-        maps=len({(rollout.set_name, rollout.size, rollout.map_name) for rollout in rollouts}),
-        requests=len(rollouts),
-        success=len(solved),
-        unmasked=sum(rollout.unmasked for rollout in rollouts),
-        optimal=int(np.count_nonzero(ratios <= OPTIMAL)),
-        mean=float(solved.mean()) if len(solved) else math.nan,
-        worst=float(solved.max()) if len(solved) else math.nan,
-        illegal=sum(rollout.illegal for rollout in rollouts),
-        field_ms=float(np.median([rollout.field_ms for rollout in rollouts])),
-        dijkstra_ms=float(np.median([rollout.dijkstra_ms for rollout in rollouts])),
-        path_ms=float(np.median([rollout.path_ms for rollout in rollouts])),
-    )
+    field_ms = float(np.median([rollout.field_ms for rollout in rollouts]))
+    dijkstra_ms = float(np.median([rollout.dijkstra_ms for rollout in rollouts]))
+    return {
+        "set_name": set_name,
+        "size": size,
+        "optimum": optimum,
+        "maps": len({(rollout.set_name, rollout.size, rollout.map_name) for rollout in rollouts}),
+        "requests": len(rollouts),
+        "success": len(solved),
+        "unmasked": sum(rollout.unmasked for rollout in rollouts),
+        "optimal": int(np.count_nonzero(ratios <= OPTIMAL)),
+        "mean": float(solved.mean()) if len(solved) else math.nan,
+        "worst": float(solved.max()) if len(solved) else math.nan,
+        "illegal": sum(rollout.illegal for rollout in rollouts),
+        "field_ms": field_ms,
+        "dijkstra_ms": dijkstra_ms,
+        "field_per_dijkstra": field_ms / dijkstra_ms,
+        "path_ms": float(np.median([rollout.path_ms for rollout in rollouts])),
+    }
 
 
 def markdown(rollouts: Sequence[Rollout], description: str) -> str:
     """Return the report: what was measured, a table by set and size, and one by optimum."""
-    cells = [(s, [cell(s) for cell in COLUMNS.values()]) for s in summarise(rollouts)]
-    sets = [[s.set_name, s.size, *row] for s, row in cells if s.optimum == "all"]
-    lengths = [[s.optimum, *row] for s, row in cells if s.optimum != "all"]
+    cells = [(s, [column.format(**s) for column in COLUMNS.values()]) for s in summarise(rollouts)]
+    sets = [[s["set_name"], s["size"], *row] for s, row in cells if s["optimum"] == "all"]
+    lengths = [[s["optimum"], *row] for s, row in cells if s["optimum"] != "all"]
     text = (
         f"{description}\n\n"
         "Every request has a path. Without action masking: solved too by a rollout that may choose "
@@ -231,7 +214,7 @@ def markdown(rollouts: Sequence[Rollout], description: str) -> str:
 def write_report(path: Path, rollouts: Sequence[Rollout], text: str) -> None:
     """Write the report's text, or its summaries as CSV if the path ends in ``.csv``."""
     if path.suffix.lower() == ".csv":
-        columns = [field.name for field in fields(Summary)]
-        write_csv(path, columns, map(astuple, summarise(rollouts)))
+        summaries = summarise(rollouts)
+        write_csv(path, [*summaries[0]], [[*summary.values()] for summary in summaries])
     else:
         write_atomically(path, text.encode())

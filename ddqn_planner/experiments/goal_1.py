@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 
 import matplotlib.pyplot as plt
 import numpy as np
 
 from ddqn_planner.benchmarks.tables import table, write_table
 from ddqn_planner.experiments.figures import draw_map, draw_path, save_figure
-from ddqn_planner.experiments.profiles import PROFILES, variant
+from ddqn_planner.experiments.profiles import PROFILES, VARIANTS
 from ddqn_planner.experiments.settings import Settings, first_kept, median_and_range, optimal_length
 from ddqn_planner.experiments.trainings import Training, TrainingEvaluation
 from ddqn_planner.grid import Cell, MoveRule, legal_moves, path_length
@@ -40,7 +41,7 @@ def trainings(settings: Settings, variants: Sequence[str] = ("both",)) -> list[T
         for profile, parameters in PROFILES.items()
         for name in variants
         for training in settings.trainings(
-            f"{profile}/{name}", variant(parameters, name), [paper_scenario()]
+            f"{profile}/{name}", replace(parameters, **VARIANTS[name]), [paper_scenario()]
         )
     ]
 
@@ -145,7 +146,7 @@ def a_star(scenario: Scenario, move_rule: MoveRule) -> Sequence[Cell]:
     dx, dy = np.abs(x - goal_x), np.abs(y - goal_y)
     octile = np.maximum(dx, dy) + (move_rule.lengths[1] - 1) * np.minimum(dx, dy)
     value, legal = -octile.astype(np.float32), legal_moves(grid.occupancy, move_rule)
-    return search(scenario.start, octile == 0, legal, grid.cost_multiplier, move_rule, value)
+    return search(scenario.start, scenario.goal, legal, grid.cost_multiplier, move_rule, value)
 
 
 def _draw(settings: Settings, scenario: Scenario, paths: dict[str, Sequence[Cell]]) -> str:

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-from typing import Final
+from typing import Any, Final
 
 from ddqn_planner.grid import Cell, MoveRule
 from ddqn_planner.training.hyper_parameters import HyperParameters
@@ -33,15 +32,10 @@ PROFILES: Final[dict[str, HyperParameters]] = {
 """``paper``: its network, observation and Table 1, our choice where it is silent. ``propagation``:
 the same rewards and initialisation, with another network and fewer steps."""
 
-VARIANTS: Final[dict[str, dict[str, float]]] = {
+VARIANTS: Final[dict[str, dict[str, Any]]] = {
     "plain": {"p_r": 0.0, "alpha": 0.0, "beta": 0.0},
     "initialisation": {"alpha": 0.0, "beta": 0.0},
     "reward": {"p_r": 0.0},
     "both": {},
 }
 """Plain Double DQN, each improvement alone, and both: what each sets."""
-
-
-def variant(parameters: HyperParameters, name: str) -> HyperParameters:
-    """Return the parameters of one of the `VARIANTS`."""
-    return replace(parameters, **VARIANTS[name])  # type: ignore[arg-type]

@@ -18,7 +18,12 @@ from ddqn_planner.training.environment import paper_scenario
 
 TITLE = "What the printed target does"
 
-TARGETS = {"double_dqn": "Double DQN", "dqn": "DQN", "printed": "printed"}
+TARGETS = {
+    "double_dqn": ("Double DQN", "paper/both"),
+    "dqn": ("DQN", "paper/target_dqn"),
+    "printed": ("printed", "paper/target_printed"),
+}
+"""Label and name of the trainings with each target; Double DQN's are those of goal i."""
 
 COLUMNS = (
     "target",
@@ -29,18 +34,13 @@ COLUMNS = (
 )
 
 
-def name(target: str) -> str:
-    """Return the name of the trainings with a target; Double DQN's are those of goal i."""
-    return "paper/both" if target == "double_dqn" else f"paper/target_{target}"
-
-
 def trainings(settings: Settings) -> list[Training]:
     """Return the trainings of the profile paper with each target."""
     return [
         training
-        for target in TARGETS
+        for target, (_, name) in TARGETS.items()
         for training in settings.trainings(
-            name(target), replace(PROFILES["paper"], target=target), [paper_scenario()]
+            name, replace(PROFILES["paper"], target=target), [paper_scenario()]
         )
     ]
 
@@ -50,9 +50,9 @@ def report(settings: Settings) -> str:
     scenario = paper_scenario()
     starts = free_starts(scenario)
     rows = []
-    for target, label in TARGETS.items():
-        runs = settings.evaluations(name(target))
-        fields = [p.q_field(scenario.grid, scenario.goal) for p in settings.planners(name(target))]
+    for label, name in TARGETS.values():
+        runs = settings.evaluations(name)
+        fields = [p.q_field(scenario.grid, scenario.goal) for p in settings.planners(name)]
         ratios = [length_ratios(field, scenario.grid, MOVE_RULE)[starts] for field in fields]
         late = [[e.overestimation for e in run[-max(len(run) // 10, 1) :]] for run in runs]
         rows.append(
@@ -69,7 +69,7 @@ def report(settings: Settings) -> str:
 
 def _draw(settings: Settings) -> str:
     figure, (left, right) = plt.subplots(1, 2, figsize=(13, 4), layout="constrained")
-    runs = {label: settings.evaluations(name(target)) for target, label in TARGETS.items()}
+    runs = {label: settings.evaluations(name) for label, name in TARGETS.values()}
     estimates = {label: evaluation_curve(r, "overestimation") for label, r in runs.items()}
     draw_curves(left, estimates, "mean of max Q - V*")
     left.set_yscale("symlog")

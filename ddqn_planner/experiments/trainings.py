@@ -64,10 +64,7 @@ class TrainingEvaluation:
 def in_parallel(job: Callable[[Training], None], trainings: Sequence[Training]) -> None:
     """Call ``job(training)`` for each training, in one process per core.
 
-    Raises
-    ------
-    Exception
-        The first that a job raises. Running jobs are then terminated, and no others start.
+    The first exception of a job is raised: running jobs are terminated, and no others start.
     """
     spawn = multiprocessing.get_context("spawn")
     with (
@@ -96,14 +93,7 @@ def train(training: Training) -> None:
     """Train and evaluate, or resume an interrupted training.
 
     The folder gets what `TrainingRun` writes, ``evaluations.csv``, and in ``kept.safetensors`` the
-    last of the networks that solved the most scenarios.
-
-    Raises
-    ------
-    CheckpointError, FolderError
-        If the folder holds another training or other files, or is in use.
-    OSError
-        If the folder cannot be written.
+    last of the networks that solved the most scenarios. Errors are those of `TrainingRun`.
     """
     folder = training.folder
     with closing(

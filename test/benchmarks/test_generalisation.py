@@ -89,7 +89,11 @@ def rollouts_of(
 
 
 def without_times(summary: Summary) -> Summary:
-    return replace(summary, field_ms=0.0, dijkstra_ms=0.0, path_ms=0.0)
+    return {
+        key: value
+        for key, value in summary.items()
+        if "ms" not in key and key != "field_per_dijkstra"
+    }
 
 
 def free_map(*requests: tuple[Cell, Cell], optima: list[float] | None = None) -> BenchmarkMap:
@@ -130,12 +134,12 @@ def test_a_perfect_network_solves_every_request_at_the_least_cost(
     settings = RequestSettings(rule, 7, costs, seed)
     rollouts = rollouts_of(PerfectNetwork(), *generated_maps([kind], [9], 2, settings), rule=rule)
     *groups, total = summarise(rollouts)
-    assert without_times(groups[0]) == replace(without_times(total), set_name=kind, size="9x9")
-    assert (total.maps, total.requests, total.illegal) == (2, 14, 0)
-    assert total.success == total.unmasked == total.optimal == 14
-    assert total.mean == pytest.approx(1.0)
-    assert total.worst == pytest.approx(1.0)
-    assert sum(group.requests for group in groups[1:]) == 14
+    assert without_times(groups[0]) == {**without_times(total), "set_name": kind, "size": "9x9"}
+    assert (total["maps"], total["requests"], total["illegal"]) == (2, 14, 0)
+    assert total["success"] == total["unmasked"] == total["optimal"] == 14
+    assert total["mean"] == pytest.approx(1.0)
+    assert total["worst"] == pytest.approx(1.0)
+    assert sum(group["requests"] for group in groups[1:]) == 14
 
 
 def test_a_detour_counts_as_solved_but_not_optimal_and_a_loop_as_not_solved() -> None:
@@ -144,27 +148,27 @@ def test_a_detour_counts_as_solved_but_not_optimal_and_a_loop_as_not_solved() ->
     rollouts = rollouts_of(network, free_map(((0, 0), (2, 0)), ((1, 0), (1, 1)), ((0, 0), (1, 0))))
     assert sorted(rollout.ratio for rollout in rollouts) == [2.0, 3.0, math.inf]
     total = summarise(rollouts)[-1]
-    assert (total.requests, total.success, total.optimal) == (3, 2, 0)
-    assert (total.mean, total.worst) == (2.5, 3.0)
+    assert (total["requests"], total["success"], total["optimal"]) == (3, 2, 0)
+    assert (total["mean"], total["worst"]) == (2.5, 3.0)
 
 
 def test_a_group_in_which_nothing_is_solved_has_no_mean() -> None:
     total = summarise(
         rollouts_of(StubbornNetwork([[4, 4, 4], [4, 4, 4]]), free_map(((0, 0), (2, 0))))
     )[-1]
-    assert (total.success, total.unmasked, total.optimal) == (0, 0, 0)
-    assert math.isnan(total.mean)
-    assert math.isnan(total.worst)
+    assert (total["success"], total["unmasked"], total["optimal"]) == (0, 0, 0)
+    assert math.isnan(total["mean"])
+    assert math.isnan(total["worst"])
 
 
 def test_a_start_on_its_goal_is_solved_at_the_least_cost() -> None:
     total = summarise(rollouts_of(PerfectNetwork(), free_map(((1, 1), (1, 1)))))[-1]
-    assert (total.success, total.optimal, total.worst) == (1, 1, 1.0)
+    assert (total["success"], total["optimal"], total["worst"]) == (1, 1, 1.0)
 
 
 def test_a_network_that_prefers_illegal_moves_is_found_out_without_the_mask() -> None:
     total = summarise(rollouts_of(PerfectNetwork(bonus=1.0), free_map(((0, 0), (2, 0)))))[-1]
-    assert (total.success, total.unmasked, total.illegal) == (1, 0, 0)
+    assert (total["success"], total["unmasked"], total["illegal"]) == (1, 0, 0)
 
 
 def test_costs_count_in_the_ratio() -> None:
@@ -201,12 +205,12 @@ def test_a_rollout_is_optimal_within_a_millionth() -> None:
     rollouts = [
         replace(rollout_of_optimum(10.0), ratio=ratio) for ratio in (1.0, 1.0000009, 1.00001)
     ]
-    assert summarise(rollouts)[-1].optimal == 2
+    assert summarise(rollouts)[-1]["optimal"] == 2
 
 
 def test_groups_of_optima_are_in_order() -> None:
     rollouts = [rollout_of_optimum(optimum) for optimum in (70.0, 16.0, 3.0, 31.9, 15.9)]
-    groups = [(group.optimum, group.requests) for group in summarise(rollouts)]
+    groups = [(group["optimum"], group["requests"]) for group in summarise(rollouts)]
     assert groups == [("all", 5), ("0-16", 2), ("16-32", 2), ("64-128", 1), ("all", 5)]
 
 

@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import itertools
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -17,7 +18,7 @@ from ddqn_planner.experiments import any_map
 from ddqn_planner.experiments.goal_1 import a_star, convergence_row
 from ddqn_planner.experiments.goal_2 import free_starts, trained_field
 from ddqn_planner.experiments.goal_3 import fixed_path, noisy_maps
-from ddqn_planner.experiments.profiles import MOVE_RULE, PROFILES, VARIANTS, variant
+from ddqn_planner.experiments.profiles import MOVE_RULE, PROFILES, VARIANTS
 from ddqn_planner.experiments.trainings import TrainingEvaluation
 from ddqn_planner.grid import MOVES, Cell, GridMap, MoveRule, Noise, legal_moves, path_length
 from ddqn_planner.model import ModelMetadata
@@ -141,7 +142,9 @@ def test_a_fixed_rollout_is_legal_on_the_papers_map_and_avoids_what_it_can(paper
 def test_a_variant_switches_improvements_off(profile: str) -> None:
     switched = {
         name: (p.p_r > 0, p.alpha > 0 or p.beta > 0)
-        for name, p in ((name, variant(PROFILES[profile], name)) for name in VARIANTS)
+        for name, p in (
+            (name, replace(PROFILES[profile], **changes)) for name, changes in VARIANTS.items()
+        )
     }
     assert switched == {
         "plain": (False, False),
