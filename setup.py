@@ -41,7 +41,7 @@ setup(
     extras_require={
         "ros": ["ros-jazzy-rclpy[fastrtps]>=7.1.5,<8", "ros-jazzy-common-interfaces>=5.3,<6"],
         "figures": ["matplotlib>=3.6"],
-        "experiments": ["matplotlib>=3.6", "pathfinding>=1.0.9"],
+        "experiments": ["matplotlib>=3.6"],
         "tensorboard": ["tensorboard>=2.10"],
         "watch": ["rerun-sdk>=0.39"],
         "bench": ["psutil>=5.9", "pyastar2d>=1.1", "stable-baselines3>=2.6"],

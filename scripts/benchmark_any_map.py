@@ -81,7 +81,7 @@ def compare_single_queries(side: int) -> None:
     def with_known_field(start: Cell, goal: Cell) -> object:
         return planner.plan(grid, start, goal, RULE)
 
-    def pathfinding(start: Cell, goal: Cell) -> object:
+    def own_a_star(start: Cell, goal: Cell) -> object:
         return a_star(Scenario(grid, start, goal), RULE)
 
     def pyastar(start: Cell, goal: Cell) -> object:
@@ -92,7 +92,7 @@ def compare_single_queries(side: int) -> None:
     planners: dict[str, Callable[[Cell, Cell], object]] = {
         "ours, new field": with_new_field,
         "ours, known field": with_known_field,
-        "pathfinding A*, its grid made anew": pathfinding,
+        "our A*": own_a_star,
         "pyastar2d A* (cuts corners, a diagonal counts 1)": pyastar,
     }
     for name, plan in planners.items():
