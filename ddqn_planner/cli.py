@@ -33,7 +33,6 @@ from ddqn_planner.planning.animation import save_animation
 from ddqn_planner.planning.evaluation import evaluate
 from ddqn_planner.planning.picture import MAX_TEXT_WIDTH, PictureError, draw_text, save_picture
 from ddqn_planner.resources import find_map
-from ddqn_planner.training import ranks
 from ddqn_planner.training.any_map import ANY_MAP, MAPS, random_scenarios
 from ddqn_planner.training.environment import Scenario
 from ddqn_planner.training.hyper_parameters import HyperParameters
@@ -77,7 +76,7 @@ def _parser() -> argparse.ArgumentParser:
             _add_train_any_map,
             "train a model for any map on random maps",
             "Trains into a folder, on small random maps. The same command again goes on where it "
-            "stopped. Under torchrun all processes train one model, each on maps of its own.",
+            "stopped.",
         ),
         (
             "evaluate",
@@ -337,31 +336,19 @@ def _train(options: argparse.Namespace) -> int:
 
 
 def _train_any_map(options: argparse.Namespace) -> int:
-    ranks.join()
+    if options.maps < 1:
+        raise ValueError(f"--maps is {options.maps}; give at least 1")
+    scenarios = random_scenarios(options.seed, options.maps)
+    parameters = _hyper_parameters(options)
+    run = TrainingRun(options.out, scenarios, MoveRule.ROBOT_SAFE, parameters, options.seed)
     try:
-        rank, processes = ranks.rank(), ranks.world_size()
-        if options.maps < processes:
-            raise ValueError(f"--maps is {options.maps}; give at least one a process: {processes}")
-        scenarios = random_scenarios(options.seed, options.maps)[rank::processes]
-        folder = options.out if rank == 0 else options.out / f"rank_{rank}"
-        parameters = _hyper_parameters(options)
-        run = TrainingRun(folder, scenarios, MoveRule.ROBOT_SAFE, parameters, options.seed)
-        try:
-            if ranks.greatest(run.trainer.steps) != -ranks.greatest(-run.trainer.steps):
-                raise ValueError(
-                    f"the processes were saved at different steps ({folder} at "
-                    f"{run.trainer.steps}); train into another folder"
-                )
-            _train_with_progress(run)
-        finally:
-            run.close()
-        if run.save_error:
-            raise OSError(run.save_error)
-        if rank == 0:
-            print(f"{run.trainer.steps} steps, {run.trainer.episodes} episodes")
-            print(f"saved {run.model_path}")
+        _train_with_progress(run)
     finally:
-        ranks.leave()
+        run.close()
+    if run.save_error:
+        raise OSError(run.save_error)
+    print(f"{run.trainer.steps} steps, {run.trainer.episodes} episodes")
+    print(f"saved {run.model_path}")
     return 0
 
 
@@ -408,9 +395,7 @@ def _evaluate(options: argparse.Namespace) -> int:
         raise ValueError(f"--maps is {options.maps}; give at least 1")
     if options.out and options.out.suffix.lower() not in (".csv", ".md"):
         raise ValueError(f"--out is {options.out}; give a file that ends in .csv or .md")
-    settings = RequestSettings(
-        options.move_rule, options.requests, options.costs, options.seed
-    )
+    settings = RequestSettings(options.move_rule, options.requests, options.costs, options.seed)
     planner = Planner.load(options.model)
     maps = generated_maps(options.kinds, options.sizes, options.maps, settings)
     if options.data:
@@ -445,15 +430,13 @@ def _evaluate(options: argparse.Namespace) -> int:
 
 def _train_with_progress(run: TrainingRun) -> None:
     trainer = run.trainer
-    if ranks.rank() == 0:
-        print(f"training in {run.folder}, with about {megabytes(run.memory)} of memory")
+    print(f"training in {run.folder}, with about {megabytes(run.memory)} of memory")
     interrupted = threading.Event()
     # An exception could strike in the middle of a step; a flag is looked at between two.
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: interrupted.set())
     # None: no bar where the output is no terminal.
-    quiet = True if ranks.rank() else None
-    with tqdm(total=trainer.parameters.steps, initial=trainer.steps, disable=quiet) as bar:
+    with tqdm(total=trainer.parameters.steps, initial=trainer.steps, disable=None) as bar:
         for finished in run.steps():
             bar.update(trainer.steps - bar.n)
             for episode in finished:
@@ -461,8 +444,7 @@ def _train_with_progress(run: TrainingRun) -> None:
                     {"episode": episode.number, "average reward": episode.average_reward},
                     refresh=False,
                 )
-            # All processes stop at the same step: none waits for another's gradients.
-            if ranks.greatest(interrupted.is_set()):
+            if interrupted.is_set():
                 run.try_to_save()
                 print(f"stopped at step {trainer.steps}; the same command goes on from there")
                 break
