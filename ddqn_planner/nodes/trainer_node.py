@@ -42,10 +42,10 @@ from ddqn_planner.nodes.trainer_parameters import (
 )
 from ddqn_planner.resources import find_map
 from ddqn_planner.training.environment import Scenario
+from ddqn_planner.training.episodes import Episode, read_cells
 from ddqn_planner.training.memory import REMEDY as MEMORY_REMEDY
 from ddqn_planner.training.memory import megabytes
-from ddqn_planner.training.run import TrainingRun, read_cells
-from ddqn_planner.training.trainer import Episode
+from ddqn_planner.training.run import TrainingRun
 
 PUBLISH_PERIOD = 0.1
 """Seconds between two looks into the training thread's queue."""

@@ -1,54 +1,24 @@
-"""A training run: a trainer with a folder for its curves, its checkpoint and its model."""
+"""A training run: a trainer with a folder for its episodes, its checkpoint and its model."""
 
 from __future__ import annotations
 
-import io
-import re
 import reprlib
-import time
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, closing
 from dataclasses import asdict, replace
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import BinaryIO
 
-from ddqn_planner.files import Appender, lock, remove_temporaries, write_atomically
-from ddqn_planner.grid import Cell, MoveRule, path_length
+from ddqn_planner.files import lock, remove_temporaries
+from ddqn_planner.grid import MoveRule
 from ddqn_planner.training.environment import Scenario
+from ddqn_planner.training.episodes import Episode, EpisodeLog
 from ddqn_planner.training.hyper_parameters import HyperParameters
 from ddqn_planner.training.memory import check_memory
-from ddqn_planner.training.trainer import CheckpointError, Episode, Trainer
-
-# Not torch's SummaryWriter: its thread ends at the first error, for example of a full disk.
-try:
-    from tensorboard.compat.proto.event_pb2 import (  # type: ignore[import-untyped]
-        Event,
-        SessionLog,
-    )
-    from tensorboard.compat.proto.summary_pb2 import Summary  # type: ignore[import-untyped]
-    from tensorboard.summary.writer.record_writer import (  # type: ignore[import-untyped]
-        RecordWriter,
-    )
-except ImportError:  # an extra: the CSV file has the curves too
-    Event = None
+from ddqn_planner.training.trainer import CheckpointError, Trainer
 
 SAVE_INTERVAL = 5_000
 """Environment steps between two checkpoints."""
-
-COLUMNS = (
-    "episode",
-    "step",
-    "scenario",
-    "outcome",
-    "moves",
-    "length",
-    "total_reward",
-    "average_reward",
-    "cells",
-)
-
-ROW = re.compile(rb"(\d{1,18})(?:,[^,]*){7},(\d{1,9}:\d{1,9}(?: \d{1,9}:\d{1,9})*)\r\n")
-"""A complete row: the number of the episode, and its cells."""
 
 LOCK, CHECKPOINT = "training.lock", "checkpoint.safetensors"
 """A folder with one of these files belongs to a training. The lock file is there from the start, so
@@ -62,8 +32,7 @@ class FolderError(ValueError):
 class TrainingRun:
     """Trains into a folder, or continues there when the folder holds a checkpoint.
 
-    The run writes ``model.safetensors``, ``checkpoint.safetensors``, ``episodes.csv`` (one row per
-    episode, its cells as ``x:y``), TensorBoard's curves where ``tensorboard`` is installed, and
+    The run writes ``model.safetensors``, ``checkpoint.safetensors``, the files of `EpisodeLog`, and
     ``training.lock``, which keeps other processes out until `close` or the end of the process. The
     folder must be new or empty, or belong to a training.
 
@@ -103,7 +72,7 @@ class TrainingRun:
         self.curves_path = self.folder / "episodes.csv"
         self.memory = check_memory(scenarios, parameters)
         self.save_error = ""
-        with ExitStack() as stack:  # closes what is open, the lock too, if the rest fails
+        with ExitStack() as stack:  # unlocks the folder if the rest fails
             stack.enter_context(_claim(self.folder))
             if self.checkpoint_path.exists():
                 self.trainer = Trainer.load_checkpoint(self.checkpoint_path, scenarios)
@@ -112,32 +81,29 @@ class TrainingRun:
             else:
                 self.trainer = Trainer(scenarios, move_rule, parameters, seed)
             self.saved_at = self.trainer.steps
-            for path in (self.model_path, self.checkpoint_path, self.curves_path):
+            for path in (self.model_path, self.checkpoint_path):
                 remove_temporaries(path)
-            _cut_rows(self.curves_path, self.trainer.episodes)
-            self._curves = stack.enter_context(closing(Appender(self.curves_path)))
-            self._board: Appender | None = None
-            if Event is not None:
-                # TensorBoard reads the files of a folder in the order of their names.
-                name = f"events.out.tfevents.{time.time_ns()}.ddqn_planner"
-                self._board = stack.enter_context(closing(Appender(self.folder / name)))
-                self._board.append(_first_events(self.trainer.steps))
+            log = EpisodeLog(self.curves_path, self.trainer.episodes, self.trainer.steps)
+            self._log = stack.enter_context(closing(log))
             self._open_files = stack.pop_all()
 
     def steps(self) -> Iterator[list[Episode]]:
         """Train until ``parameters.steps``; save every `SAVE_INTERVAL` steps and at the end.
 
-        If a save fails, or the curves cannot be written, the training continues, and `save_error`
-        says why until a save succeeds. Episodes that end meanwhile may be missing in the curves.
+        If a save fails, or the episodes cannot be written, the training continues, and `save_error`
+        says why until a save succeeds. Episodes that end meanwhile may be missing in the log.
 
         Yields
         ------
         list of Episode
-            The episodes that ended with this step, often none; they are in the curves.
+            The episodes that ended with this step, often none; they are in the log.
         """
         for finished in self.trainer.run(self.trainer.parameters.steps):
             for episode in finished:
-                self._record(episode)
+                try:
+                    self._log.append(episode, self.trainer.environment.move_rules[episode.scenario])
+                except OSError as error:
+                    self._fail(error)
             due = self.trainer.steps // SAVE_INTERVAL != self.saved_at // SAVE_INTERVAL
             if due and self.trainer.steps < self.trainer.parameters.steps:
                 self.try_to_save()
@@ -160,52 +126,24 @@ class TrainingRun:
             f"there: the training continues and tries again every {SAVE_INTERVAL} steps"
         )
 
-    def _record(self, episode: Episode) -> None:
-        try:
-            rule = self.trainer.environment.move_rules[episode.scenario]
-            self._curves.append(_row(episode, rule))
-            if self._board is not None:
-                self._board.append(_events(episode))
-        except OSError as error:
-            self._fail(error)
-
     def save(self) -> None:
         """Write the model and the checkpoint.
 
         Raises
         ------
         OSError
-            If the curves or one of the two cannot be written; the last good files then stay.
+            If one of the two or the log cannot be written; the last good files then stay.
         """
         # A kill between the two leaves a model that is newer than the checkpoint. Both are
         # complete, and nothing needs them to be of the same step: the next save replaces the model.
         self.trainer.save_model(self.model_path)
         self.trainer.save_checkpoint(self.checkpoint_path)
-        self._curves.flush()
-        if self._board is not None:
-            self._board.flush()
+        self._log.flush()
         self.saved_at = self.trainer.steps
 
     def close(self) -> None:
-        """Close the curves and unlock the folder. `save` first."""
+        """Close the files and unlock the folder. `save` first."""
         self._open_files.close()
-
-
-def read_cells(curves_path: str | Path, every: int) -> Iterator[tuple[Cell, ...]]:
-    """Yield the cells of each `every`-th episode of a run's ``episodes.csv``.
-
-    Rows that are not complete are skipped.
-
-    Raises
-    ------
-    OSError
-        If the file cannot be read.
-    """
-    with Path(curves_path).open("rb") as file:
-        for row in map(ROW.fullmatch, file):
-            if row and int(row[1]) % every == 0:
-                x_y = (cell.split(b":") for cell in row[2].split())
-                yield tuple((int(x), int(y)) for x, y in x_y)
 
 
 def _claim(folder: Path) -> BinaryIO:
@@ -222,57 +160,6 @@ def _claim(folder: Path) -> BinaryIO:
         raise FolderError(
             f"another process trains in {folder}; wait for its end, stop it, or give another folder"
         ) from None
-
-
-def _row(episode: Episode, move_rule: MoveRule) -> bytes:
-    values = (
-        episode.number,
-        episode.step,
-        episode.scenario,
-        episode.outcome.value,
-        episode.moves,
-        round(path_length(episode.cells, move_rule), 4),
-        round(episode.total_reward, 6),
-        round(episode.average_reward, 6),
-        " ".join(f"{x}:{y}" for x, y in episode.cells),
-    )
-    return _line(values)
-
-
-def _line(values: Sequence[object]) -> bytes:
-    return (",".join(map(str, values)) + "\r\n").encode()
-
-
-def _cut_rows(path: Path, episodes: int) -> None:
-    """Keep the header and the rows of the first `episodes`, which the checkpoint includes."""
-    lines = [_line(COLUMNS)]
-    if path.exists():
-        with path.open("rb") as file:
-            rows = map(ROW.fullmatch, file)
-            lines += [row[0] for row in rows if row and int(row[1]) <= episodes]
-    write_atomically(path, b"".join(lines))
-
-
-def _first_events(step: int) -> bytes:
-    """Return the start of a TensorBoard file: it replaces other files' events from `step` on."""
-    return _records(
-        Event(wall_time=time.time(), step=step, file_version="brain.Event:2"),
-        Event(wall_time=time.time(), step=step, session_log=SessionLog(status=SessionLog.START)),
-    )
-
-
-def _events(episode: Episode) -> bytes:
-    values = {"average_reward": episode.average_reward, "episode_moves": episode.moves}
-    summary = Summary(value=[Summary.Value(tag=t, simple_value=v) for t, v in values.items()])
-    return _records(Event(wall_time=time.time(), step=episode.step, summary=summary))
-
-
-def _records(*events: Any) -> bytes:
-    content = io.BytesIO()
-    writer = RecordWriter(content)
-    for event in events:
-        writer.write(event.SerializeToString())
-    return content.getvalue()
 
 
 def _check_same_training(

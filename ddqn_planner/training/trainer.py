@@ -6,8 +6,7 @@ import copy
 import hashlib
 import json
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import asdict, dataclass
-from enum import Enum
+from dataclasses import asdict
 from functools import partial
 from pathlib import Path
 
@@ -19,11 +18,12 @@ from safetensors import safe_open
 from torch import Tensor, nn
 
 from ddqn_planner.files import write_atomically
-from ddqn_planner.grid import MOVES, Cell, MoveRule
+from ddqn_planner.grid import MOVES, MoveRule
 from ddqn_planner.model import ModelMetadata, new_network, package_version, save_model
 from ddqn_planner.planning import Planner
 from ddqn_planner.training.double_dqn import double_dqn_loss
 from ddqn_planner.training.environment import GridVectorEnvironment, Scenario
+from ddqn_planner.training.episodes import Episode, EpisodeEnd
 from ddqn_planner.training.hyper_parameters import HyperParameters
 from ddqn_planner.training.learners import LEARNERS
 from ddqn_planner.training.memory import MemoryShortageError, check_memory
@@ -41,37 +41,6 @@ FUSED = tuple(map(int, torch.__version__.split(".")[:2])) >= (2, 4)
 
 class CheckpointError(ValueError):
     """A checkpoint cannot be resumed; the message says why and what to do."""
-
-
-class EpisodeEnd(str, Enum):
-    """How an episode ended."""
-
-    REACHED_GOAL = "reached_goal"
-    COLLIDED = "collided"
-    OUT_OF_STEPS = "out_of_steps"
-
-
-@dataclass(frozen=True)
-class Episode:
-    """An episode that has ended (the paper's round)."""
-
-    number: int
-    """1 for the first."""
-    step: int
-    """Environment steps of the training when it ended."""
-    scenario: int
-    """Number of its scenario."""
-    outcome: EpisodeEnd
-    cells: tuple[Cell, ...]
-    """The visited cells in order, with the initial one."""
-    moves: int
-    """Moves made, with an illegal last one."""
-    total_reward: float
-
-    @property
-    def average_reward(self) -> float:
-        """Reward per step, the paper's curve (Fig. 6)."""
-        return self.total_reward / self.moves
 
 
 class Trainer:

@@ -12,8 +12,9 @@ from ddqn_planner import GridMap, MoveRule, PlanStatus
 from ddqn_planner.model import load_model
 from ddqn_planner.planning.evaluation import evaluate
 from ddqn_planner.training.environment import Scenario
+from ddqn_planner.training.episodes import Episode, EpisodeEnd
 from ddqn_planner.training.hyper_parameters import HyperParameters
-from ddqn_planner.training.trainer import CheckpointError, Episode, EpisodeEnd, Trainer
+from ddqn_planner.training.trainer import CheckpointError, Trainer
 
 QUICK = HyperParameters(
     learning_rate=0.003, filters=8, learning_starts=50, epsilon_steps=1500, target_interval=100
