@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ddqn_planner.grid import GridMap, MoveRule, path_cost
-from ddqn_planner.planning.oracle import shortest_distances
+from ddqn_planner.grid.shortest_paths import shortest_distances
 from ddqn_planner.planning.q_field import QField
 
 

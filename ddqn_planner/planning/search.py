@@ -1,4 +1,4 @@
-"""Best-first search, compiled: astar_fallback by a value field, or to the nearest of some cells."""
+"""Best-first search and flood fill, compiled: A* with a value field, Dijkstra, connected cells."""
 
 from __future__ import annotations
 
@@ -13,44 +13,88 @@ from ddqn_planner.model.front import compiled
 
 def search(
     start: Cell,
-    ends: NDArray[np.bool_],
+    end: Cell | NDArray[np.bool_],
     legal: NDArray[np.bool_],
     multiplier: NDArray[np.float32],
     move_rule: MoveRule,
     value: NDArray[np.float32] | None = None,
 ) -> tuple[Cell, ...]:
-    """Return a path from a cell to one of some others, empty if there is none.
+    """Return a path from one cell to another, or to one of several; empty if there is none.
 
-    Cells are visited in the order of the path's cost so far minus V(s), the whole path's cost if
-    V says what is left of it (A* of Hart, Nilsson and Raphael 1968, with V as its heuristic). So a
-    good field leads straight to the end; with any other, as each cell is visited once at most, an
-    end is found if a path leads to one.
+    Cells are visited in the order of the path's cost so far minus V(s): A* (Hart, Nilsson and
+    Raphael 1968) with -V as its heuristic. A good field leads straight to the end. With any
+    field, each cell is visited at most once, so an end is found if a path leads to one.
 
     Parameters
     ----------
     start : (x, y)
-    ends : (H, W) bool
+    end : (x, y), or (H, W) bool
+        The end, or a mask of several.
     legal : (8, H, W) bool
         The moves that may be made.
     multiplier : (H, W) float32
         See `GridMap.cost_multiplier`.
     move_rule : MoveRule
-        Says what a move counts.
+        Gives the length of a move.
     value : (H, W) float32, optional
-        V(s); by default 0: the path is the cheapest, to the end that is nearest.
+        V(s); by default 0, which gives the cheapest path to the nearest end (Dijkstra).
     """
+    if not isinstance(end, np.ndarray):
+        (x, y), end = end, np.zeros(multiplier.shape, dtype=np.bool_)
+        end[y, x] = True
     if value is None:
-        value = np.zeros(ends.shape, dtype=np.float32)
-    entered_by, end = _search(start, ends, legal, multiplier, move_rule.lengths, value, MOVES)
-    if end < 0:
+        value = np.zeros_like(multiplier)
+    entered_by, found = _search(start, end, legal, multiplier, move_rule.lengths, value, MOVES)
+    if found < 0:
         return ()
-    width = ends.shape[1]
-    cells = [(end % width, end // width)]
+    width = multiplier.shape[1]
+    cells = [(found % width, found // width)]
     while cells[-1] != start:
         x, y = cells[-1]
         dx, dy = MOVES[entered_by[y, x]].tolist()
         cells.append((x - dx, y - dy))
     return tuple(reversed(cells))
+
+
+def reachable_cells(
+    occupancy: NDArray[np.bool_], cells: NDArray[np.int64], move_rule: MoveRule
+) -> NDArray[np.bool_]:
+    """Return the free cells that paths join to at least one of some free cells: (H, W) bool.
+
+    Parameters
+    ----------
+    occupancy : (H, W) bool
+    cells : (N, 2) int64
+        Free cells, (x, y) each.
+    move_rule : MoveRule
+    """
+    # Where a diagonal move needs both side cells free, two straight moves do the same.
+    moves = MOVES if move_rule.cuts_corners else MOVES[::2]
+    closed, row = np.pad(occupancy, 1, constant_values=True), occupancy.shape[1] + 2
+    _flood(closed.ravel(), (cells + 1) @ (1, row), moves @ (1, row))
+    reached: NDArray[np.bool_] = closed[1:-1, 1:-1] & ~occupancy
+    return reached
+
+
+@compiled
+def _flood(closed, cells, offsets):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Close the open cells that moves reach from some open cells of a padded map."""
+    waiting = np.empty(closed.size, dtype=np.int64)
+    count = 0
+    for cell in cells:
+        if not closed[cell]:
+            closed[cell] = True
+            waiting[count] = cell
+            count += 1
+    while count > 0:
+        count -= 1
+        cell = waiting[count]
+        for offset in offsets:
+            following = cell + offset
+            if not closed[following]:
+                closed[following] = True
+                waiting[count] = following
+                count += 1
 
 
 @compiled
@@ -59,7 +103,7 @@ def _search(start, ends, legal, multiplier, lengths, value, moves):  # type: ign
     width = ends.shape[1]
     entered_by = np.full(ends.shape, -1, dtype=np.int8)
     visited = np.zeros(ends.shape, dtype=np.bool_)
-    # Of a move: its order, the cost of the path with it, the cell it leads to, the action.
+    # Of each move: its order, the cost of the path with it, the cell it leads to, the action.
     waiting = [(0.0, 0.0, start[1] * width + start[0], -1)]
     while len(waiting) > 0:
         _, cost, cell, entered = heapq.heappop(waiting)

@@ -5,12 +5,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from ddqn_planner.planning.oracle import shortest_path
 from PIL import Image, ImageColor
 
 from ddqn_planner.grid import GridMap, MoveRule
 from ddqn_planner.planning import shortest_distances
 from ddqn_planner.planning.animation import FRAMES, LAST_FRAME_MS, MIN_SIDE, save_animation
-from ddqn_planner.planning.oracle import shortest_path
 from ddqn_planner.planning.picture import OBSTACLE_COLOUR, PATH_COLOUR
 from ddqn_planner.training.environment import Scenario
 
