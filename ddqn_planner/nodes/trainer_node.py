@@ -1,8 +1,8 @@
 """The trainer node: trains a model on the map in a thread, and replays episodes.
 
 The training thread makes no ROS call: it puts functions into a queue, and a timer calls them. So
-checkpoints are saved even after ROS has shut down. torch takes seconds to import: a thread imports
-it while the node already answers, and the first ``~/start`` waits for it.
+checkpoints are saved even after ROS has shut down. Another thread imports torch while the node
+already answers; the first ``~/start`` waits for it.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ import itertools
 import queue
 import sys
 import threading
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from contextlib import suppress
 from functools import partial
 from pathlib import Path as FilePath
@@ -48,9 +48,6 @@ if TYPE_CHECKING:
     from ddqn_planner.training.episodes import Episode
     from ddqn_planner.training.run import TrainingRun
 
-EVENT_PERIOD = 0.1
-"""Seconds between two looks into the queue of the training thread."""
-
 
 class MapInFrame(NamedTuple):
     """A map, and the frame of its origin."""
@@ -78,8 +75,7 @@ class TrainerNode(BaseNode):
         self._save = threading.Event()
         self._events: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()
         self._replay_timer: Timer | None = None
-        self._state, self._error = "idle", ""
-        self._save_fails = False
+        self._state, self._error, self._save_error = "idle", "", ""
 
         declare_parameters(self)
         result = check_parameters(self, [])
@@ -92,9 +88,7 @@ class TrainerNode(BaseNode):
         self._diagnostics_publisher = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
         self._read_map_file()
         self.create_subscription(OccupancyGrid, "map", self._on_map, LATCHED)
-        self.create_subscription(
-            PoseWithCovarianceStamped, "initialpose", self._on_initial_pose, 10
-        )
+        self.create_subscription(PoseWithCovarianceStamped, "initialpose", self._on_start_pose, 10)
         self.create_subscription(PoseStamped, "goal_pose", partial(self._set_pose, "goal"), 10)
         for name, handler in (
             ("start", self._on_start),
@@ -104,7 +98,7 @@ class TrainerNode(BaseNode):
         ):
             self.create_service(Trigger, f"~/{name}", partial(_answer, handler))
         self._steady_clock = Clock(clock_type=ClockType.STEADY_TIME)
-        self.create_timer(EVENT_PERIOD, self._on_events, clock=self._steady_clock)
+        self.create_timer(0.1, self._on_events, clock=self._steady_clock)
         self.create_timer(1.0, self._publish_diagnostics, clock=self._steady_clock)
         threading.Thread(target=import_training, name="import").start()
 
@@ -140,7 +134,7 @@ class TrainerNode(BaseNode):
         self._map = MapInFrame(grid, message.header.frame_id)
         self.get_logger().info(f"map of {grid.width} x {grid.height} cells")
 
-    def _on_initial_pose(self, message: PoseWithCovarianceStamped) -> None:
+    def _on_start_pose(self, message: PoseWithCovarianceStamped) -> None:
         self._set_pose("start", PoseStamped(header=message.header, pose=message.pose.pose))
 
     def _set_pose(self, which: str, pose: PoseStamped) -> None:
@@ -168,7 +162,7 @@ class TrainerNode(BaseNode):
         self._error = reason
         self.get_logger().error(reason)
 
-    # The services answer whether they succeed, and a message
+    # Services: each returns whether it succeeds, and a message
 
     def _is_training(self) -> bool:
         return self._thread is not None and self._thread.is_alive()
@@ -177,49 +171,41 @@ class TrainerNode(BaseNode):
         if self._is_training():
             return False, "training already; call ~/stop first"
         try:
-            place, run, memory = self._open_run()
+            place, run = self._open_run()
         except Exception as error:  # the node must survive any error
             reason = _with_remedy(error)
             self._refuse(f"the training cannot start: {reason}")
             return False, reason
         self._stop.clear()
         self._save.clear()
-        self._save_fails = False
-        self._state, self._error = "training", ""
+        self._state, self._error, self._save_error = "training", "", ""
         self._run, self._run_map = run, place
-        message = (
-            f"training in {run.folder} from step {run.trainer.steps} to "
-            f"{run.trainer.parameters.steps}, with about {memory} of memory"
-        )
-        self.get_logger().info(message)
+        self.get_logger().info(run.description)
         self._thread = threading.Thread(target=self._train, args=(run, place), name="training")
         self._thread.start()
-        return True, message
+        return True, run.description
 
-    def _open_run(self) -> tuple[MapInFrame, TrainingRun, str]:
-        if self._map is None:
+    def _open_run(self) -> tuple[MapInFrame, TrainingRun]:
+        place = self._map
+        if place is None:
             raise ValueError("no map was received yet; start a map server, or set map_file")
         if self._poses.keys() < {"start", "goal"}:
             raise ValueError(
                 "the start or the goal is unknown; publish initialpose and goal_pose, or set "
                 "map_file to a map with both"
             )
-        start, goal = (
-            self._cell(which, self._poses[which], self._map) for which in ("start", "goal")
-        )
+        start, goal = (self._cell(name, self._poses[name], place) for name in ("start", "goal"))
         # Waits for the thread that imports them.
         from ddqn_planner.training.environment import Scenario
-        from ddqn_planner.training.memory import megabytes
         from ddqn_planner.training.run import TrainingRun
 
-        run = TrainingRun(
+        return place, TrainingRun(
             self._folder(),
-            [Scenario(self._map.grid, start, goal)],
+            [Scenario(place.grid, start, goal)],
             MoveRule(self._value("move_rule")),
             hyper_parameters(self),
             self._value("seed"),
         )
-        return self._map, run, megabytes(run.memory)
 
     def _folder(self) -> FilePath:
         return FilePath(self._value("output_folder")).absolute()
@@ -285,17 +271,13 @@ class TrainerNode(BaseNode):
         self._state = "failed"
         self._refuse(f"the training failed: {error!r}; ~/start continues from its checkpoint")
 
-    def _save_error(self) -> str:
-        return self._run.save_error if self._run is not None else ""
-
     def _log_change_of_saving(self) -> None:
         """Log when saving begins to fail or works again, not at each try."""
-        error = self._save_error()
-        if error and not self._save_fails:
-            self.get_logger().error(error)
-        if self._save_fails and not error:
+        before, self._save_error = self._save_error, self._run.save_error if self._run else ""
+        if self._save_error and not before:
+            self.get_logger().error(self._save_error)
+        if before and not self._save_error:
             self.get_logger().info("the training is saved again")
-        self._save_fails = bool(error)
 
     def _publish_cells(self, cells: tuple[Cell, ...], place: MapInFrame) -> None:
         header = Header(stamp=self.get_clock().now().to_msg(), frame_id=place.frame)
@@ -303,7 +285,7 @@ class TrainerNode(BaseNode):
 
     def _publish_diagnostics(self) -> None:
         status = DiagnosticStatus(name=f"{self.get_fully_qualified_name()}: training")
-        error = self._save_error() or self._error
+        error = self._save_error or self._error
         status.level = DiagnosticStatus.ERROR if error else DiagnosticStatus.OK
         status.message = error or self._state
         values = {"state": self._state}
@@ -341,7 +323,12 @@ class TrainerNode(BaseNode):
         if first is None:
             return False, f"{file} holds no episode to replay yet; train on"
         self._stop_replay()
-        frames = _growing(itertools.chain([first], episodes))
+        # Each episode step by step: its first cell, its first two, and so on.
+        frames = (
+            cells[: count + 1]
+            for cells in itertools.chain([first], episodes)
+            for count in range(len(cells))
+        )
         self._replay_timer = self.create_timer(
             self._value("replay_period"),
             partial(self._replay_step, frames, place),
@@ -403,13 +390,6 @@ def _answer(
 ) -> Trigger.Response:
     response.success, response.message = handler()
     return response
-
-
-def _growing(episodes: Iterable[tuple[Cell, ...]]) -> Iterator[tuple[Cell, ...]]:
-    """Yield each episode step by step: its first cell, its first two, and so on."""
-    for cells in episodes:
-        for count in range(1, len(cells) + 1):
-            yield cells[:count]
 
 
 def main() -> int:

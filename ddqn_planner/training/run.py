@@ -14,7 +14,7 @@ from ddqn_planner.grid import MoveRule
 from ddqn_planner.training.environment import Scenario
 from ddqn_planner.training.episodes import Episode, EpisodeLog
 from ddqn_planner.training.hyper_parameters import HyperParameters
-from ddqn_planner.training.memory import check_memory
+from ddqn_planner.training.memory import check_memory, megabytes
 from ddqn_planner.training.trainer import CheckpointError, Trainer
 
 SAVE_INTERVAL = 5_000
@@ -86,6 +86,10 @@ class TrainingRun:
             log = EpisodeLog(self.curves_path, self.trainer.episodes, self.trainer.steps)
             self._log = stack.enter_context(closing(log))
             self._open_files = stack.pop_all()
+        self.description = (
+            f"training in {self.folder} from step {self.trainer.steps} to {parameters.steps}, "
+            f"with about {megabytes(self.memory)} of memory"
+        )
 
     def steps(self) -> Iterator[list[Episode]]:
         """Train until ``parameters.steps``; save every `SAVE_INTERVAL` steps and at the end.
