@@ -2,25 +2,19 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import asdict
 from pathlib import Path
 from typing import Final
 
-import torch
-
-from ddqn_planner.model import new_network
-from ddqn_planner.model.model_file import SIZES
+from ddqn_planner.model import NETWORKS, PropagationQNetwork
 from ddqn_planner.training.environment import Scenario
 from ddqn_planner.training.hyper_parameters import HyperParameters
 
 REMEDY: Final = (
     "take a smaller map, or smaller filters, batch_size, environments or replay_capacity"
 )
-
-FEATURES: Final = {"propagation": 9, "any_map": 28}
-"""Float32 inputs per cell of the networks that see a 3x3 patch."""
 
 
 class MemoryShortageError(ValueError):
@@ -52,20 +46,19 @@ def megabytes(count: int) -> str:
 def training_bytes(scenarios: Sequence[Scenario], parameters: HyperParameters) -> int:
     """Return about how many bytes a training takes at its peak, in addition to the program.
 
-    It counts the arrays that exist at the same time in the environment, the learner, an update and
+    It counts the arrays that exist at the same time in the environment, the encoder, an update and
     a save; `test/training/test_memory.py` compares it with measured processes.
     """
     grid, p = scenarios[0].grid, parameters
     cells, maps = grid.width * grid.height, len(scenarios)
-    known = {**asdict(p), "height": grid.height, "width": grid.width}
-    with torch.device("meta"):
-        network = new_network(p.network, {name: known[name] for name in SIZES[p.network]})
-    weights = sum(weight.numel() for weight in network.parameters())
+    network = NETWORKS[p.network]
+    shapes = network.shapes(p.network_sizes((grid.height, grid.width)))
+    weights = sum(map(math.prod, shapes.values()))
 
     # Per cell of each map: legal moves, two tables of rewards, free cells, the background. Then,
     # for one map at a time: distances, neighbours and moves, float64 and int64.
     tables = maps * cells * (8 + 2 * 8 * 4 + 8 + 4) + cells * 8 * 8 * 4
-    if p.network == "paper":
+    if not issubclass(network, PropagationQNetwork):
         patches = (grid.height + 1) // 2 * ((grid.width + 1) // 2)
         # Update: observations and 3x3 patches of states and next states; then features, their
         # gradient, and its inputs. Step: the same of one state per environment, without gradient.
@@ -74,7 +67,7 @@ def training_bytes(scenarios: Sequence[Scenario], parameters: HyperParameters) -
         batch = 4 * max(update, step)
     else:
         # Per cell of each map: features, and two layers or the six arrays of the propagation.
-        batch = maps * cells * 4 * (FEATURES[p.network] + max(2 * p.filters, 6 * 8))
+        batch = maps * cells * 4 * (network.features + max(2 * p.filters, 6 * 8))
     # Two networks, the gradient and Adam's two means stay, with 40 bytes per transition. A save
     # makes two copies of all these except the gradient.
     replay = 40 * p.replay_capacity
