@@ -107,7 +107,25 @@ def load_map(
     allow_unknown: bool = False,
     use_map_costs: bool = False,
 ) -> GridMap:
-    """Read a map file into a grid map: `read_map_file`, then `MapFile.grid`."""
+    """Read a grid map from a ROS map (.yaml) or a MovingAI map (.map), see `read_map_file`.
+
+    Parameters
+    ----------
+    path : str or Path
+    occupied_threshold : int
+        A cell of this value or more is occupied, 1..100 percent.
+    allow_unknown : bool
+        Whether unknown cells are free.
+    use_map_costs : bool
+        Whether free cells keep their values as costs; otherwise all cost the same.
+
+    Raises
+    ------
+    MapFileError
+        If the file cannot be read; the message names the wrong value.
+    ValueError
+        If the threshold is outside 1..100.
+    """
     return read_map_file(path).grid(occupied_threshold, allow_unknown, use_map_costs)
 
 

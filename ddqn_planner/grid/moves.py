@@ -65,6 +65,19 @@ def legal_moves(occupancy: Occupancy, move_rule: MoveRule | str) -> NDArray[np.b
     return legal
 
 
+def neighbours(shape: tuple[int, int]) -> NDArray[np.int64]:
+    """Return the cell that each action leads to, for maps of shape (H, W).
+
+    Returns
+    -------
+    (8, H * W) int64
+        Cell numbers y * W + x; H * W for any cell outside the map.
+    """
+    cells = shape[0] * shape[1]
+    padded = np.pad(np.arange(cells).reshape(shape), 1, constant_values=cells)
+    return np.stack([_shifted(padded, dx, dy).ravel() for dx, dy in MOVES.tolist()])
+
+
 def move_costs(multiplier: NDArray[np.float32], move_rule: MoveRule | str) -> NDArray[np.float64]:
     """Return the cost of each move: its length times the mean cost multiplier of its two cells.
 
