@@ -27,10 +27,7 @@ class Choice(str, Enum):
 def as_cell(cell: Any, name: str = "the cell") -> Cell:
     """Return a pair of whole numbers of any type (a list, an array, ...) as Python ints.
 
-    Raises
-    ------
-    ValueError
-        If it is anything else. The message uses `name`.
+    The message of the ValueError for anything else uses `name`.
     """
     try:
         if len(cell) == 2:
@@ -45,10 +42,7 @@ def as_cell(cell: Any, name: str = "the cell") -> Cell:
 def whole_numbers(name: str, values: ArrayLike, lowest: int, highest: int) -> NDArray[Any]:
     """Return an array of whole numbers from `lowest` to `highest`; its dtype stays as it is.
 
-    Raises
-    ------
-    ValueError
-        If it holds anything else. The message uses `name` and shows the first wrong value.
+    The message of the ValueError for anything else uses `name` and shows the first wrong value.
     """
     try:
         array = np.asarray(values)

@@ -228,11 +228,6 @@ def generate_map(kind: str, shape: tuple[int, int], random: np.random.Generator)
     shape : (int, int)
         Height and width in cells, each at least `MINIMUM_SIDE`.
     random : numpy.random.Generator
-
-    Raises
-    ------
-    ValueError
-        If the kind is unknown or a side is too short.
     """
     if kind not in KINDS:
         raise ValueError(f"the kind {kind!r} is unknown; give one of {', '.join(KINDS)}")
@@ -247,12 +242,8 @@ def random_requests(
     """Draw `count` pairs of start and goal: different free cells that a path joins.
 
     The start is uniform over the free cells that have a legal move, the goal is uniform over the
-    other cells that the robot can reach from there. Pairs may repeat.
-
-    Raises
-    ------
-    ValueError
-        If no path joins two free cells.
+    other cells that the robot can reach from there. Pairs may repeat. A map where no path joins two
+    free cells is a ValueError.
     """
     cells = np.flatnonzero(~occupancy)
     label_of_cell = component_labels(occupancy, move_rule).ravel()[cells]
@@ -293,15 +284,10 @@ def gradient_costs(occupancy: Occupancy, random: np.random.Generator) -> NDArray
 
 
 def inflated_costs(occupancy: Occupancy, radius: float) -> NDArray[np.int8]:
-    """Return (H, W) costs that fall exponentially with the distance from obstacles.
+    """Return (H, W) costs that fall exponentially with the distance from obstacles, as in costmaps.
 
-    As in a costmap: ``99 ** (1 - (d - 1) / radius)`` at a distance of d cells between centres, so
+    They are ``99 ** (1 - (d - 1) / radius)`` at a distance of d cells between centres, so
     99 next to an obstacle, and 0 beyond `radius` cells.
-
-    Raises
-    ------
-    ValueError
-        If the radius is not finite or not above 0.
     """
     if not 0 < radius < np.inf:
         raise ValueError(f"radius is {radius}; give cells, finite and > 0")

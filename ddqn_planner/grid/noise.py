@@ -42,12 +42,7 @@ def scatter_obstacles(
     GridMap
         The map with the new obstacles.
     int
-        How many draws were rejected because they left no path.
-
-    Raises
-    ------
-    ValueError
-        If there is no cell to occupy except the ends, or if 1,000 draws in a row are rejected.
+        How many draws were rejected because they left no path: 1,000 in a row are a ValueError.
     """
     start, goal = path[0], path[-1]
     reach = 0 if noise is Noise.ON_PATH else 1

@@ -21,11 +21,6 @@ def shortest_distances(grid: GridMap, goal: Cell, move_rule: MoveRule | str) -> 
     -------
     (H, W) float64
         Infinite where no path leads to the goal.
-
-    Raises
-    ------
-    ValueError
-        If the goal is no cell of the map, or there is no such move rule.
     """
     distances: NDArray[np.float64] = _dijkstra(grid, goal, move_rule)[0]
     return distances.reshape(grid.height, grid.width)

@@ -2,10 +2,13 @@ from __future__ import annotations
 
 import csv
 import itertools
+import os
 import queue
 import re
 import resource
 import signal
+import subprocess
+import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -183,7 +186,7 @@ def test_episodes_are_drawn_on_the_map_of_their_own_training(
         assert client.call(Trigger, "trainer/replay").success
         for _ in range(20):
             assert next_episode() == ("map", {0.5})
-        # Of a training that this process has not seen: the last map is the best guess.
+        # This process has not seen that training: the last map is the best guess.
         (tmp_path / "run").rename(tmp_path / "earlier")
         client.set_parameters("trainer", output_folder=str(tmp_path / "earlier"))
         assert client.call(Trigger, "trainer/replay").success
@@ -227,7 +230,7 @@ def test_a_replay_is_not_mixed_with_the_training_and_stop_says_what_it_stopped(
         assert stop() == "no training was running"
 
 
-def test_the_log_says_when_a_training_begins_and_what_is_saved(
+def test_the_log_says_when_a_training_starts_and_what_is_saved(
     run_node: Any, make_client: Any, namespace: str, small_values: Any, tmp_path: FilePath
 ) -> None:
     client = make_client(namespace)
@@ -262,7 +265,7 @@ def test_a_folder_of_something_else_or_in_use_is_refused_and_left_as_it_is(
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_a_signal_saves_a_checkpoint_from_which_a_new_process_goes_on(
+def test_a_signal_saves_a_checkpoint_that_a_new_process_continues(
     run_node: Any, make_client: Any, namespace: str, tmp_path: FilePath, number: int
 ) -> None:
     client = make_client(namespace)
@@ -338,7 +341,7 @@ def test_a_planner_that_follows_the_trainer_plans_with_each_model_it_saves(
         ("map", OccupancyGrid(header=Header(frame_id="map")), "resolution"),
     ],
 )
-def test_bad_input_is_refused_by_name_and_the_training_goes_on(
+def test_bad_input_is_refused_by_name_and_the_training_continues(
     training: Any, topic: str, message: Any, named: str
 ) -> None:
     client, diagnostics, namespace = training
@@ -515,7 +518,7 @@ def no_folder(_: Any, folder: FilePath) -> Iterator[None]:
 
 
 @pytest.mark.parametrize("fault", [full_disk, no_folder])
-def test_a_fault_of_the_disk_is_said_once_and_the_training_goes_on(
+def test_a_disk_error_is_logged_once_and_the_training_continues(
     run_node: Any,
     make_client: Any,
     namespace: str,
@@ -570,7 +573,7 @@ def wait_until(condition: Callable[[], bool]) -> None:
         time.sleep(0.02)
 
 
-def test_a_last_save_that_fails_is_said_when_the_node_ends(
+def test_a_last_save_that_fails_is_logged_when_the_node_ends(
     run_node: Any, make_client: Any, namespace: str, small_values: Any, tmp_path: FilePath
 ) -> None:
     client, folder = make_client(namespace), tmp_path / "run"
@@ -614,6 +617,30 @@ def test_what_cannot_be_started_or_replayed_is_answered_with_the_remedy(
         assert "smaller filters, batch_size, environments or replay_capacity" in answer.message
         client.set_parameters("trainer", replay_capacity=1000)
         assert client.call(Trigger, "trainer/start").success
+
+
+def test_the_module_of_the_node_imports_no_torch() -> None:
+    loaded = "import sys, ddqn_planner.nodes.trainer_node; sys.exit('torch' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", loaded]).returncode == 0
+
+
+def test_without_torch_a_start_is_refused_and_the_node_lives(
+    run_node: Any,
+    make_client: Any,
+    namespace: str,
+    tmp_path: FilePath,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    (tmp_path / "torch.py").write_text("raise ModuleNotFoundError(\"No module named 'torch'\")")
+    monkeypatch.setenv("PYTHONPATH", f"{tmp_path}:{os.environ.get('PYTHONPATH', '')}")
+    client = make_client(namespace)
+    parameters = {"map_file": "dilemma", "output_folder": str(tmp_path / "run")}
+    with run_node("trainer_node", parameters, namespace=namespace) as node:
+        answer = client.call(Trigger, "trainer/start")
+        assert not answer.success
+        assert "needs another library (No module named 'torch')" in answer.message
+        assert "call ~/start first" in client.call(Trigger, "trainer/replay").message
+    assert "Traceback" not in node.log
 
 
 @pytest.mark.hypothesis
