@@ -1,4 +1,4 @@
-"""A bare rclpy service that returns a ready path: what planner/get_plan is measured against."""
+"""A bare rclpy service that returns a ready path: what planner/get_plan is compared with."""
 
 import sys
 

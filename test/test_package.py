@@ -59,6 +59,8 @@ PIP = [sys.executable, "-m", "pip", "--quiet"]
 
 # --user and Debian's Python install beside another share folder than the interpreter's, as the
 # last two do.
+@pytest.mark.xdist_group("wheel")
+@pytest.mark.slow
 @pytest.mark.parametrize("option", [None, "--target", "--prefix"])
 def test_maps_and_models_come_along_wherever_pip_installs(
     wheel: Path, tmp_path: Path, option: str | None
