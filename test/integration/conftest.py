@@ -9,6 +9,7 @@ import re
 import shutil
 import signal
 import subprocess
+import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
@@ -74,6 +75,33 @@ class NodeProcess:
 RunNode = Callable[..., Any]
 
 
+def parameter_arguments(parameters: dict[str, Any] | None, file: Path) -> list[str]:
+    """Return the ROS arguments that set parameters, which are written to a file."""
+    if not parameters:
+        return []
+    # As a file: on the command line a YAML parser guesses the types of strings.
+    file.write_text(yaml.safe_dump({"/**": {"ros__parameters": parameters}}))
+    return ["--params-file", str(file)]
+
+
+@pytest.fixture
+def log_of_refused_start(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> Callable[[Callable[[], int], dict[str, Any]], str]:
+    """Return a function that sees a node refuse to start with parameters, and returns its log.
+
+    The node is in this process: to start one that imports torch takes seconds.
+    """
+
+    def start(main: Callable[[], int], parameters: dict[str, Any]) -> str:
+        arguments = parameter_arguments(parameters, tmp_path / "parameters.yaml")
+        monkeypatch.setattr(sys, "argv", ["node", "--ros-args", *arguments])
+        assert main() == 1
+        return capfd.readouterr().err
+
+    return start
+
+
 @pytest.fixture(scope="session")
 def run_node(tmp_path_factory: pytest.TempPathFactory) -> RunNode:
     """Return a context manager that runs an executable, stops it by SIGINT and sees it exit with 0.
@@ -92,12 +120,7 @@ def run_node(tmp_path_factory: pytest.TempPathFactory) -> RunNode:
         exit_code: int = 0,
     ) -> Iterator[NodeProcess]:
         number = next(numbers)
-        arguments = ["--ros-args"]
-        if parameters:
-            # As a file: on the command line a YAML parser guesses the types of strings.
-            file = logs / f"{number}.yaml"
-            file.write_text(yaml.safe_dump({"/**": {"ros__parameters": parameters}}))
-            arguments += ["--params-file", str(file)]
+        arguments = ["--ros-args", *parameter_arguments(parameters, logs / f"{number}.yaml")]
         for remap in [*(remaps or []), *([f"__ns:={namespace}"] if namespace else [])]:
             arguments += ["-r", remap]
         process = NodeProcess(name, arguments, logs / f"{number}.{name}.log")
