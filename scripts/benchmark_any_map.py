@@ -57,8 +57,8 @@ def measure_fields(side: int) -> bool:
         grid = GridMap(generate_map(kind, (side, side), random))
         goals = [goal for _, goal in random_requests(grid.occupancy, RULE, GOALS, random)]
         compare_with_dijkstra(planner, grid, goals[0], RULE)  # compiled code is loaded
-        both = [compare_with_dijkstra(planner, grid, goal, RULE) for goal in goals]
-        field, dijkstra = (statistics.median(row[column] for row in both) for column in (1, 3))
+        both = [compare_with_dijkstra(planner, grid, goal, RULE)[1::2] for goal in goals]
+        field, dijkstra = (statistics.median(times) for times in zip(*both, strict=True))
         ratios[kind] = field / dijkstra
         print(f"{side}x{side} {kind}: field {field:.1f} ms, Dijkstra {dijkstra:.1f} ms")
     worst = max(ratios, key=lambda kind: ratios[kind])

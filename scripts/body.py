@@ -153,7 +153,7 @@ def greatest_distance(
 
     length = share * integrals(np.ones_like(metres))
     greatest = metres[~grid.occupancy].max()
-    return min(c - integrals(c - metres) / length for c in greatest * BOUND_FACTORS)
+    return float(min(c - integrals(c - metres) / length for c in greatest * BOUND_FACTORS))
 
 
 if __name__ == "__main__":

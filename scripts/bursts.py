@@ -64,7 +64,8 @@ def burst_requests(
     grid: GridMap, goals: Sequence[Cell], count: int, seed: int = 0
 ) -> list[GetPlan.Request]:
     """Return requests from random free cells within `REACH` of the goals, which take turns."""
-    random, requests = np.random.default_rng(seed), []
+    random = np.random.default_rng(seed)
+    requests: list[GetPlan.Request] = []
     for goal in itertools.cycle(goals):
         if len(requests) == count:
             return requests

@@ -8,7 +8,7 @@ from collections import deque
 from collections.abc import Callable, Iterable
 from contextlib import suppress
 from subprocess import Popen
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 import rclpy
@@ -19,6 +19,7 @@ from nav_msgs.msg import OccupancyGrid, Path
 from nav_msgs.srv import GetPlan
 from numpy.typing import NDArray
 from rcl_interfaces.srv import GetParameters, SetParameters
+from rclpy.context import Context
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.parameter import Parameter, parameter_value_to_python
 from rclpy.qos import QoSProfile
@@ -27,6 +28,9 @@ from std_msgs.msg import Header
 from ddqn_planner.grid import Cell, GridMap
 from ddqn_planner.nodes.conversions import occupancy_message, quaternion
 from ddqn_planner.nodes.report import seconds
+
+if TYPE_CHECKING:
+    from typing_extensions import Self
 
 TIMEOUT = 120.0
 """Seconds that anything may take on a loaded machine."""
@@ -121,7 +125,7 @@ class Client:
     """
 
     def __init__(self, namespace: str = "", name: str = "client") -> None:
-        self._context = rclpy.Context()
+        self._context = Context()
         self._context.init(args=[])
         self.node = rclpy.create_node(
             name, namespace=namespace, context=self._context, start_parameter_services=False
@@ -133,7 +137,7 @@ class Client:
         self._services: dict[str, Any] = {}
         self._publishers: dict[str, Any] = {}
 
-    def __enter__(self) -> Client:
+    def __enter__(self) -> Self:
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -187,7 +191,8 @@ class Client:
     ) -> Recorder:
         """Return what a topic brings from now on."""
         recorder = Recorder(keep)
-        self.node.create_subscription(message_type, topic, recorder.add, qos)
+        add: Any = recorder.add  # rclpy takes callbacks of two arguments, and does not say so
+        self.node.create_subscription(message_type, topic, add, qos)
         return recorder
 
     def get_plan(self, start: PoseStamped, goal: PoseStamped) -> Path:

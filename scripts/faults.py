@@ -15,6 +15,7 @@ import time
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from dataclasses import astuple, dataclass, fields
+from functools import partial
 from itertools import cycle, islice
 from pathlib import Path
 from typing import Any, TypeVar
@@ -82,7 +83,7 @@ class Killed:
     """A node that is killed and started again."""
 
     def __init__(self, name: str, *arguments: str, **parameters: object) -> None:
-        self._run = lambda: running_node(name, "--log-level", "fatal", *arguments, **parameters)
+        self._run = partial(running_node, name, "--log-level", "fatal", *arguments, **parameters)
         self._stack = ExitStack()
         self.child: subprocess.Popen[bytes] | None = None
         self.start()
@@ -209,7 +210,8 @@ class Faults:
     def trigger(self, name: str, try_time: float = TRY_TIME) -> str:
         """Call a Trigger service until it succeeds; return its message."""
         service = self.service(Trigger, name)
-        return self.ask(service, Trigger.Request(), lambda a: a.success and a.message, try_time)
+        answer = self.ask(service, Trigger.Request(), lambda a: a if a.success else None, try_time)
+        return str(answer.message)
 
     def parameter(self, node: str, name: str) -> Any:
         """Return a parameter's value message."""

@@ -139,7 +139,11 @@ def make_client() -> Iterator[Callable[[str], Any]]:
     from client import Client
 
     with ExitStack() as clients:
-        yield lambda namespace="": clients.enter_context(Client(namespace))
+
+        def make(namespace: str = "") -> Client:
+            return clients.enter_context(Client(namespace))
+
+        yield make
 
 
 SMALL_MAP = """
