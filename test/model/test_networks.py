@@ -12,6 +12,7 @@ from ddqn_planner.grid import Cell, GridMap, MoveRule, legal_moves
 from ddqn_planner.model import NETWORKS, load_model, networks
 from ddqn_planner.model.networks import MAX_LEARNED_MULTIPLIER, AnyMapQNetwork, PropagationQNetwork
 from ddqn_planner.model.observation import observation_background, observe, patch_features, patches
+from ddqn_planner.model.wavefront import propagate_values
 from ddqn_planner.training.encoders import ENCODERS
 from ddqn_planner.training.networks import AnyMapModule, PaperModule, PropagationModule
 
@@ -194,7 +195,6 @@ def test_a_move_whose_cost_or_p_is_nan_is_not_possible(
         assert not np.isnan(cost_PA).any()  # with NaN the propagation would never end
         return propagate_values(patch_id, cost_PA, goal)
 
-    propagate_values = networks.propagate_values
     monkeypatch.setattr(networks, "propagate_values", checked)
     network = answering("any_map", 0.9)
     network.tensors[tensor][0] = np.nan
