@@ -36,6 +36,7 @@ NOBODY = 65534
 NOT_SOURCE = (".*", "__pycache__", "*.egg-info", "build", "dist", "install", "log", "runs")
 
 
+@pytest.hookimpl(tryfirst=True)  # before pytest-xdist reads the groups
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Put the slow tests last, each on any worker; keep the others of a file on one worker."""
     for item in items:
