@@ -408,9 +408,7 @@ def _evaluate(options: argparse.Namespace) -> int:
         raise ValueError(f"--maps is {options.maps}; give at least 1")
     if options.out and options.out.suffix.lower() not in (".csv", ".md"):
         raise ValueError(f"--out is {options.out}; give a file that ends in .csv or .md")
-    settings = RequestSettings(
-        options.move_rule, options.requests, options.costs, options.seed
-    )
+    settings = RequestSettings(options.move_rule, options.requests, options.costs, options.seed)
     planner = Planner.load(options.model)
     maps = generated_maps(options.kinds, options.sizes, options.maps, settings)
     if options.data:

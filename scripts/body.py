@@ -31,22 +31,12 @@ BOUND_FACTORS = np.array([1.01, 1.1, 1.3, 1.6, 2.5, 5.0])
 
 @dataclass(frozen=True)
 class Measured:
-    """What came of the requests.
-
-    Parameters
-    ----------
-    least, mean : float
-        Distance to the nearest obstacle, of all poses of all paths, metres.
-    edge : float
-        The least distance from a pose to the edge of an occupied cell, metres.
-    ratio : (N,) float64
-        Length over the optimum; infinite without a path.
-    """
+    """The distances from all poses of all paths to obstacles, metres, and the lengths."""
 
     least: float
     mean: float
-    edge: float
-    ratio: NDArray[np.float64]
+    edge: float  # the least distance to the edge of an occupied cell
+    ratio: NDArray[np.float64]  # (N,) lengths over the optimum; infinite without a path
 
 
 def main(arguments: Sequence[str]) -> int:

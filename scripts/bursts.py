@@ -23,14 +23,7 @@ REACH = 30
 
 
 class BurstClients(Client):
-    """Clients of one service in one process.
-
-    Parameters
-    ----------
-    clients : int
-    service_type : type
-    service : str
-    """
+    """Clients of one service in one process."""
 
     def __init__(
         self, clients: int, service_type: Any = GetPlan, service: str = "planner/get_plan"
@@ -78,13 +71,7 @@ def burst_requests(
 def load_bursts(
     sizes: Sequence[int] = SIZES, counts: Sequence[int] = COUNTS, bursts: int = BURSTS
 ) -> bool:
-    """Send bursts to a running planner from one client and from many; print the answers.
-
-    Returns
-    -------
-    bool
-        Whether every request was answered, and each answer is right.
-    """
+    """Send bursts to a running planner; return whether each request has its right answer."""
     fine = True
     for size in sizes:
         fixture = generated_map("rooms", size, resolution=0.5)

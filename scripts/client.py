@@ -50,12 +50,7 @@ def wait_for(
 ) -> T:
     """Return the first answer that is true.
 
-    Raises
-    ------
-    RuntimeError
-        If one of the children has ended.
-    TimeoutError
-        If there is none in time.
+    RuntimeError says that one of the children has ended, TimeoutError that time is up.
     """
     deadline = time.monotonic() + timeout
     while not (found := answer()):
@@ -69,13 +64,7 @@ def wait_for(
 
 
 class Recorder:
-    """The messages that a topic brought since the last `clear`.
-
-    Parameters
-    ----------
-    keep : int, optional
-        How many of the last ones; all by default.
-    """
+    """The messages that a topic brought since the last `clear`: all, or the last `keep`."""
 
     def __init__(self, keep: int | None = None) -> None:
         self._arrived = threading.Condition()
@@ -117,12 +106,7 @@ class Recorder:
 
 
 class Client:
-    """A node in a context of its own, spun in the background.
-
-    Parameters
-    ----------
-    namespace, name : str
-    """
+    """A node in a context of its own, spun in the background."""
 
     def __init__(self, namespace: str = "", name: str = "client") -> None:
         self._context = Context()
@@ -160,17 +144,21 @@ class Client:
             self._services[name] = self.node.create_client(
                 service_type, name, qos_profile=SERVICE_QUALITY
             )
-        wait_for(f"service {name}", self._services[name].service_is_ready)
+        # It looks four times per second only: a service that is called at the very moment when it
+        # is found may not know its client yet, and the answer is lost.
+        if not self._services[name].wait_for_service(TIMEOUT):
+            raise TimeoutError(f"no service {name} within {TIMEOUT:.0f} s")
         return self._services[name]
 
     def call(
         self, service_type: Any, name: str, request: Any = None, timeout: float = TIMEOUT
     ) -> Any:
         """Wait for a service, call it, and return its response; or raise TimeoutError."""
-        answered = threading.Event()
-        future = self.service(service_type, name).call_async(request or service_type.Request())
+        answered, service = threading.Event(), self.service(service_type, name)
+        future = service.call_async(request or service_type.Request())
         future.add_done_callback(lambda _: answered.set())
         if not answered.wait(timeout):
+            service.remove_pending_request(future)
             raise TimeoutError(f"no answer from {name} within {timeout:.0f} s")
         return future.result()
 

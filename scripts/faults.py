@@ -13,7 +13,7 @@ import subprocess
 import tempfile
 import time
 from collections.abc import Callable, Sequence
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from dataclasses import astuple, dataclass, fields
 from functools import partial
 from itertools import cycle, islice
@@ -56,6 +56,7 @@ START_TIME = 20.0
 LAST_WAIT = 0.5
 """Seconds that a client waits after a kill until it gives up."""
 
+GET_PLAN = "planner/get_plan"
 T = TypeVar("T")
 
 
@@ -82,9 +83,9 @@ class Tally:
 class Killed:
     """A node that is killed and started again."""
 
-    def __init__(self, name: str, *arguments: str, **parameters: object) -> None:
+    def __init__(self, stack: ExitStack, name: str, *arguments: str, **parameters: object) -> None:
         self._run = partial(running_node, name, "--log-level", "fatal", *arguments, **parameters)
-        self._stack = ExitStack()
+        self._stack = stack
         self.child: subprocess.Popen[bytes] | None = None
         self.start()
 
@@ -99,22 +100,11 @@ class Killed:
         self.child.wait()
         self.child = None
 
-    def stop(self) -> None:
-        """End it as Ctrl-C would."""
-        self._stack.close()
-
 
 class Faults:
-    """The nodes, and what a client sees of them.
+    """The nodes, which end with a stack, and what a client sees of them."""
 
-    Parameters
-    ----------
-    client : Client
-    folder : Path
-        An empty one.
-    """
-
-    def __init__(self, client: Client, folder: Path) -> None:
+    def __init__(self, client: Client, folder: Path, stack: ExitStack) -> None:
         self.client = client
         self.maps = client.subscribe(OccupancyGrid, "map", LATCHED, keep=1)
         self.plans = client.subscribe(PathMessage, "plan", LATCHED, keep=1)
@@ -132,32 +122,18 @@ class Faults:
             self.kill_map_server: Tally("map_server_node", "publishing"),
             self.kill_trainer: Tally("trainer_node", "saving"),
         }
-        self._services: dict[str, Any] = {}
-
-    def __enter__(self) -> Faults:
         apart = ("-r", "__ns:=/training")
-        with ExitStack() as stack:
-
-            def started(name: str, *arguments: str, **parameters: object) -> Killed:
-                node = Killed(name, *arguments, **parameters)
-                stack.callback(node.stop)
-                return node
-
-            self.map_server = started("map_server_node", yaml_filename=self.map_path)
-            self.planner = started("planner_node")
-            self.trainer = started(
-                "trainer_node",
-                *apart,
-                map_file="dilemma",
-                steps=1_000_000_000,
-                output_folder=self.training_folder,
-            )
-            self.follower = started("planner_node", *apart, follow_trainer=True)
-            self._stack = stack.pop_all()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._stack.close()
+        self.map_server = Killed(stack, "map_server_node", yaml_filename=self.map_path)
+        self.planner = Killed(stack, "planner_node")
+        self.trainer = Killed(
+            stack,
+            "trainer_node",
+            *apart,
+            map_file="dilemma",
+            steps=1_000_000_000,
+            output_folder=self.training_folder,
+        )
+        self.follower = Killed(stack, "planner_node", *apart, follow_trainer=True)
 
     @property
     def children(self) -> list[subprocess.Popen[bytes]]:
@@ -167,56 +143,42 @@ class Faults:
 
     # Asking
 
-    def service(self, service_type: Any, name: str) -> Any:
-        """Return a client of a service, always the same one."""
-        if name not in self._services:
-            self._services[name] = self.client.node.create_client(service_type, name)
-        return self._services[name]
-
     def ask(
         self,
-        service: Any,
-        request: Any,
+        service_type: Any,
+        name: str,
+        request: Any = None,
         accept: Callable[[Any], T | None] = lambda answer: answer,
         try_time: float = TRY_TIME,
     ) -> T:
         """Ask until an answer is accepted; return what `accept` returned."""
 
         def answer() -> T | None:
-            future = service.call_async(request)
-            until = time.monotonic() + try_time
-            while not future.done() and time.monotonic() < until:
-                time.sleep(0.005)
-            if future.done() and (accepted := accept(future.result())):
-                return accepted
-            service.remove_pending_request(future)
+            with suppress(TimeoutError):
+                accepted = accept(self.client.call(service_type, name, request, try_time))
+                if accepted:
+                    return accepted
             time.sleep(0.05)
             return None
 
-        wait_for(f"service {service.srv_name}", service.service_is_ready)
-        return wait_for(f"answer from {service.srv_name}", answer, self.children)
+        return wait_for(f"answer from {name}", answer, self.children)
 
     def ask_for_plan(self, start: Cell, goal: Cell) -> PathMessage:
         """Ask for a plan until there is one."""
-        return self.ask(
-            self.get_plan, self.request(start, goal), lambda a: a.plan if a.plan.poses else None
-        )
-
-    @property
-    def get_plan(self) -> Any:
-        """The planner's service."""
-        return self.service(GetPlan, "planner/get_plan")
+        request = self.request(start, goal)
+        return self.ask(GetPlan, GET_PLAN, request, lambda a: a.plan if a.plan.poses else None)
 
     def trigger(self, name: str, try_time: float = TRY_TIME) -> str:
         """Call a Trigger service until it succeeds; return its message."""
-        service = self.service(Trigger, name)
-        answer = self.ask(service, Trigger.Request(), lambda a: a if a.success else None, try_time)
+        answer = self.ask(
+            Trigger, name, accept=lambda a: a if a.success else None, try_time=try_time
+        )
         return str(answer.message)
 
     def parameter(self, node: str, name: str) -> Any:
         """Return a parameter's value message."""
-        service = self.service(GetParameters, f"{node}/get_parameters")
-        return self.ask(service, GetParameters.Request(names=[name]), lambda a: a.values[0])
+        request = GetParameters.Request(names=[name])
+        return self.ask(GetParameters, f"{node}/get_parameters", request, lambda a: a.values[0])
 
     def request(self, start: Cell, goal: Cell) -> GetPlan.Request:
         """Return a request for a plan between two cells."""
@@ -254,7 +216,7 @@ class Faults:
 
     def kill_planner(self, tally: Tally) -> None:
         """Kill the planner while it plans toward goals that it does not know."""
-        get_plan = self.get_plan
+        get_plan = self.client.service(GetPlan, GET_PLAN)
         asked = random_requests(self._map.grid.occupancy, RULE, GOALS, self._random)
         futures = [get_plan.call_async(self.request(*cells)) for cells in asked]
         time.sleep(self._draw.uniform(0.0, 1.0))
@@ -273,9 +235,9 @@ class Faults:
         self.plan_for_active_goal()
         load = LoadMap.Request(map_url=str(self.map_path))
         calls = [
-            *[(self.service(Trigger, "map_server/restore_map"), Trigger.Request())] * 20,
-            *[(self.service(LoadMap, "map_server/load_map"), load)] * 4,
-            (self.service(Trigger, "map_server/scatter_obstacles"), Trigger.Request()),
+            *[(self.client.service(Trigger, "map_server/restore_map"), Trigger.Request())] * 20,
+            *[(self.client.service(LoadMap, "map_server/load_map"), load)] * 4,
+            (self.client.service(Trigger, "map_server/scatter_obstacles"), Trigger.Request()),
         ]
         self._draw.shuffle(calls)
         futures = [(service, service.call_async(request)) for service, request in calls]
@@ -309,7 +271,7 @@ class Faults:
 
     def kill_trainer(self, tally: Tally) -> None:
         """Kill the trainer while it saves after each step, soon after a save was seen to begin."""
-        save = self.service(Trigger, "/training/trainer/save")
+        save = self.client.service(Trigger, "/training/trainer/save")
         until = time.monotonic() + self._draw.uniform(0.2, 1.2)
         futures = []
         while time.monotonic() < until:
@@ -347,9 +309,9 @@ class Faults:
     def follow(self) -> None:
         """Wait until the planner that follows the trainer has loaded a model of its."""
         other = Parameter("model", value="any_map").to_parameter_msg()
-        set_parameters = self.service(SetParameters, "/training/planner/set_parameters")
         request = SetParameters.Request(parameters=[other])
-        self.ask(set_parameters, request, lambda a: a.results[0].successful)
+        name = "/training/planner/set_parameters"
+        self.ask(SetParameters, name, request, lambda a: a.results[0].successful)
         self.trigger("/training/trainer/save")
         saved = str(self.training_folder / "model.safetensors")
         wait_for(
@@ -374,8 +336,9 @@ def main(arguments: Sequence[str]) -> int:
         claim_ros_domain(),
         Client() as client,
         tempfile.TemporaryDirectory() as folder,
-        Faults(client, Path(folder)) as faults,
+        ExitStack() as stack,
     ):
+        faults = Faults(client, Path(folder), stack)
         faults.begin()
         try:
             for kill, tally in islice(cycle(faults.tallies.items()), kills):

@@ -51,17 +51,7 @@ GOALS, GOALS_PERIOD = 2000, 0.005
 
 @dataclass
 class Result:
-    """What became of requests.
-
-    Parameters
-    ----------
-    counts : Counter
-        "answered", "lost", "wrong", "paths" and "empty" answers.
-    milliseconds : list of float
-        How long each answer took.
-    errors : list of str
-        What is wrong with the wrong answers.
-    """
+    """What became of requests: how many, how long each took, and what is wrong."""
 
     counts: Counter[str] = field(default_factory=Counter)
     milliseconds: list[float] = field(default_factory=list)
@@ -70,23 +60,13 @@ class Result:
 
 @dataclass
 class Shared:
-    """What the processes tell each other.
+    """What the processes tell each other."""
 
-    Parameters
-    ----------
-    ready : Barrier
-    done, confirmed, published : Value
-        How many requests were answered or lost; the number of the last map that the planner is
-        known to have, and of the last that was published.
-    results : Queue
-        Of a `Result` per process.
-    """
-
-    ready: Any
-    done: Any
-    confirmed: Any
-    published: Any
-    results: Any
+    ready: Any  # a barrier
+    done: Any  # how many requests were answered or lost
+    confirmed: Any  # the number of the last map that the planner is known to have
+    published: Any  # the number of the last map that was published
+    results: Any  # a queue of a `Result` per process
 
 
 def ask(seed: int, count: int, shared: Shared) -> None:
@@ -132,17 +112,7 @@ def ask(seed: int, count: int, shared: Shared) -> None:
 def load_requests(planner: int, requests: int, clients: int) -> bool:
     """Ask a running planner from several processes under changing maps; print a table.
 
-    Parameters
-    ----------
-    planner : int
-        Process of the planner node, which has no map of anybody else.
-    requests, clients : int
-        How many requests in all, from how many processes.
-
-    Returns
-    -------
-    bool
-        Whether nothing was lost or wrong.
+    The planner, given by its process, has no other map yet. Return whether all is answered right.
     """
     context = multiprocessing.get_context("spawn")
     maps = three_maps()
@@ -209,10 +179,7 @@ def load_requests(planner: int, requests: int, clients: int) -> bool:
 def load_goals(goals: int) -> bool:
     """Send goals at 200 Hz to a running planner; print what became of them.
 
-    Returns
-    -------
-    bool
-        Whether the plans came in the order of the goals, and the last is the last goal's.
+    Return whether the plans came in the order of the goals, and the last is the last goal's.
     """
     office = three_maps()[2]
     grid, random = office.grid, np.random.default_rng(0)

@@ -23,12 +23,7 @@ ACTIONS = {(dx, dy): action for action, (dx, dy) in enumerate(MOVES.tolist())}
 
 
 class MapFixture:
-    """A map, its message, and the check of an answer.
-
-    Parameters
-    ----------
-    map_file : MapFile
-    """
+    """A map, its message, and the check of an answer."""
 
     def __init__(self, map_file: MapFile) -> None:
         # A message holds the resolution in single precision.

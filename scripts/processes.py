@@ -20,17 +20,8 @@ STOP_TIMEOUT = 120.0
 def claim_ros_domain() -> socket.socket:
     """Set the environment to a ROS domain that nobody else here uses, kept to this machine.
 
-    Call it before rclpy is initialised.
-
-    Returns
-    -------
-    socket.socket
-        Holds the claim until it is closed.
-
-    Raises
-    ------
-    RuntimeError
-        If all domains from 1 to 100 are claimed.
+    Call it before rclpy is initialised. The socket that is returned holds the claim until it is
+    closed; no two processes can hold the same.
     """
     for domain in range(1, 101):
         claim = socket.socket()

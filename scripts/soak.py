@@ -43,14 +43,7 @@ Samples = dict[str, list[float]]
 
 
 class Work:
-    """One piece of work per call, drawn at random.
-
-    Parameters
-    ----------
-    client : Client
-    folder : Path
-        Where maps may be written.
-    """
+    """One piece of work per call, drawn at random; it writes its maps into a folder."""
 
     def __init__(self, client: Client, folder: Path) -> None:
         self._client = client
@@ -158,13 +151,7 @@ class Work:
 
 
 def soak(children: dict[str, Popen[bytes]], work: Work, minutes: float) -> Samples:
-    """Work for some minutes; return the resident memory of each node, MB, as time went by.
-
-    Raises
-    ------
-    RuntimeError
-        If a node ends.
-    """
+    """Work for some minutes; return the resident memory of each node, MB, as time went by."""
     samples: Samples = {name: [] for name in children}
     began = time.monotonic()
     while time.monotonic() < began + 60 * minutes:
