@@ -9,6 +9,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from ddqn_planner.benchmarks.evaluation import evaluate
 from ddqn_planner.experiments import goal_1, goal_3
 from ddqn_planner.experiments.profiles import MOVE_RULE
 from ddqn_planner.experiments.report import Settings, mean, spread
@@ -19,7 +20,6 @@ from ddqn_planner.grid import OCCUPIED, UNKNOWN, GridMap, MoveRule, legal_moves,
 from ddqn_planner.grid.generators import generate_map, random_costs
 from ddqn_planner.model import AnyMapQNetwork
 from ddqn_planner.planning import Planner
-from ddqn_planner.planning.evaluation import evaluate
 from ddqn_planner.training.any_map import ANY_MAP, RULES, random_scenarios
 from ddqn_planner.training.environment import paper_scenario
 
