@@ -15,6 +15,7 @@ from pathlib import Path
 import torch
 from tqdm import tqdm
 
+from ddqn_planner.benchmarks.evaluation import evaluate
 from ddqn_planner.experiments import EXPERIMENTS
 from ddqn_planner.experiments.benchmark_maps import (
     COSTS,
@@ -28,10 +29,9 @@ from ddqn_planner.experiments.generalisation import Walk, markdown, measure, sum
 from ddqn_planner.experiments.profiles import HIDDEN_UNITS
 from ddqn_planner.grid import Cell, GridMap, MapFile, MoveRule, Noise, inflate, read_map_file
 from ddqn_planner.grid.generators import KINDS
+from ddqn_planner.pictures.animation import save_animation
+from ddqn_planner.pictures.picture import MAX_TEXT_WIDTH, PictureError, draw_text, save_picture
 from ddqn_planner.planning import Plan, PlanMethod, Planner, shortest_distances
-from ddqn_planner.planning.animation import save_animation
-from ddqn_planner.planning.evaluation import evaluate
-from ddqn_planner.planning.picture import MAX_TEXT_WIDTH, PictureError, draw_text, save_picture
 from ddqn_planner.resources import find_map
 from ddqn_planner.training import ranks
 from ddqn_planner.training.any_map import ANY_MAP, MAPS, random_scenarios

@@ -80,3 +80,10 @@ def test_records_stay_whole_when_the_disk_is_full_and_then_is_not(tmp_path: Path
     records.append(b"fourth\n")
     records.close()
     assert path.read_bytes() == b"first\nsecond\nfourth\n"
+
+
+def test_only_the_temporaries_of_that_very_file_are_removed(tmp_path: Path) -> None:
+    (tmp_path / ".file_1.0").touch()
+    (tmp_path / ".file_[1].0").touch()
+    remove_temporaries(tmp_path / "file_[1]")
+    assert list(tmp_path.iterdir()) == [tmp_path / ".file_1.0"]

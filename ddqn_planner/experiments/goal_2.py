@@ -7,6 +7,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from ddqn_planner.benchmarks.evaluation import length_ratios
 from ddqn_planner.experiments import goal_1
 from ddqn_planner.experiments.figures import draw_border, draw_map, draw_share, save
 from ddqn_planner.experiments.profiles import MOVE_RULE, PROFILES, START_DEAD_END
@@ -16,7 +17,6 @@ from ddqn_planner.experiments.trainings import Training
 from ddqn_planner.files import write_csv
 from ddqn_planner.grid import MOVES, legal_moves
 from ddqn_planner.planning import Planner
-from ddqn_planner.planning.evaluation import length_ratios
 from ddqn_planner.planning.q_field import QField
 from ddqn_planner.training.encoders import PropagationEncoder
 from ddqn_planner.training.environment import GridVectorEnvironment, Scenario, paper_scenario

@@ -7,6 +7,7 @@ from dataclasses import replace
 import matplotlib.pyplot as plt
 import numpy as np
 
+from ddqn_planner.benchmarks.evaluation import length_ratios
 from ddqn_planner.experiments import goal_1
 from ddqn_planner.experiments.figures import draw_curves, save
 from ddqn_planner.experiments.goal_2 import free_starts, planned_field
@@ -15,7 +16,6 @@ from ddqn_planner.experiments.report import Settings, evaluation_curve, share_cu
 from ddqn_planner.experiments.tables import table
 from ddqn_planner.experiments.trainings import Training
 from ddqn_planner.files import write_csv
-from ddqn_planner.planning.evaluation import length_ratios
 from ddqn_planner.training.environment import paper_scenario
 
 TITLE = "What the printed target does"

@@ -1,6 +1,6 @@
 """From a map, a start and a goal to a path: the Q field, the planner, and the exact oracle."""
 
-from ddqn_planner.planning.oracle import shortest_distances, shortest_path
+from ddqn_planner.grid.shortest_paths import shortest_distances, shortest_path
 from ddqn_planner.planning.plan import Plan, PlanMethod, PlanStatus
 from ddqn_planner.planning.planner import Planner, Route
 from ddqn_planner.planning.q_field import QField

@@ -68,7 +68,7 @@ def training_bytes(scenarios: Sequence[Scenario], parameters: HyperParameters) -
         batch = 4 * max(update, step)
     else:
         # Per cell of each map: what is seen, and two layers or then six arrays of the propagation.
-        batch = maps * cells * 4 * (network.features + max(2 * p.filters, 6 * 8))
+        batch = maps * cells * 4 * (network.inputs + max(2 * p.filters, 6 * 8))
     # Both networks, the gradient and Adam's two means stay. A save copies all of them except the
     # gradient twice, and the replay buffer, 40 bytes per transition, too.
     kept = 5 * 4 * weights + 40 * p.replay_capacity

@@ -12,6 +12,7 @@ from strategies import grids_with_free_cell
 
 pytest.importorskip("pathfinding", reason="pathfinding, of the extra experiments, is missing")
 
+from ddqn_planner.benchmarks.evaluation import length_ratios
 from ddqn_planner.experiments import any_map
 from ddqn_planner.experiments.goal_1 import DIAGONALS, a_star, convergence_row
 from ddqn_planner.experiments.goal_2 import (
@@ -25,7 +26,6 @@ from ddqn_planner.experiments.trainings import TrainingEvaluation
 from ddqn_planner.grid import MOVES, Cell, GridMap, MoveRule, Noise, legal_moves, path_length
 from ddqn_planner.model import ModelMetadata
 from ddqn_planner.planning import Planner, shortest_distances, shortest_path
-from ddqn_planner.planning.evaluation import length_ratios
 from ddqn_planner.training.environment import Scenario
 
 

@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+import hashlib
+import itertools
 import math
 from collections import Counter
 
@@ -86,6 +88,34 @@ def test_the_same_seed_makes_the_same_map_and_another_seed_another(
     first, second, other = (make(kind, shape, seed) for seed in (7, 7, 8))
     np.testing.assert_array_equal(first, second)
     assert (first != other).any()
+
+
+# Documented figures depend on these maps.
+FINGERPRINTS = {
+    "random_10": "cd0c0d47b98ee7c0",
+    "random_20": "422626fd67739974",
+    "random_30": "a63a032a81e2484e",
+    "random_40": "d84da09b0da208f9",
+    "maze": "71e15000efa68d3d",
+    "rooms": "cb7bfa124b24f79a",
+    "corridors": "c5cc018fbc745584",
+    "dead_ends": "3793acc08acffc06",
+    "office": "cab1d5e9e55bf5e5",
+}
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_seed_makes_the_same_map_requests_and_costs_in_every_version(kind: str) -> None:
+    digest = hashlib.sha256()
+    for shape, seed in itertools.product([(5, 7), (9, 200), (64, 64), (150, 131)], range(5)):
+        random = np.random.default_rng(seed)
+        occupancy = generate_map(kind, shape, random)
+        digest.update(np.packbits(occupancy).tobytes())
+        digest.update(random_costs(occupancy, random).tobytes())
+        digest.update(unknown_costs(occupancy, 0.3, random).tobytes())
+        for rule in MoveRule:
+            digest.update(repr(random_requests(occupancy, rule, 20, random)).encode())
+    assert digest.hexdigest()[:16] == FINGERPRINTS[kind]
 
 
 @pytest.mark.parametrize("percent", [10, 20, 30, 40])

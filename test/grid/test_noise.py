@@ -5,8 +5,14 @@ import itertools
 import numpy as np
 import pytest
 
-from ddqn_planner.grid import GridMap, MoveRule, Noise, connected_cells, scatter_obstacles
-from ddqn_planner.planning import shortest_path
+from ddqn_planner.grid import (
+    GridMap,
+    MoveRule,
+    Noise,
+    connected_cells,
+    scatter_obstacles,
+    shortest_path,
+)
 from ddqn_planner.training.environment import Scenario
 
 

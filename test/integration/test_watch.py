@@ -22,7 +22,7 @@ from std_msgs.msg import Float32, Header
 from ddqn_planner.cli import main
 from ddqn_planner.nodes.conversions import grid_from_message, occupancy_message, path_message
 from ddqn_planner.nodes.runtime import LATCHED
-from ddqn_planner.planning.picture import value_ramp
+from ddqn_planner.pictures.colours import value_ramp
 
 pytest.importorskip("rerun", reason="rerun, of the extra watch, is missing")
 from rerun.chunk import RrdReader

@@ -15,10 +15,10 @@ from networks import random_network
 from strategies import grids_in_parts, grids_with_costs, grids_with_free_cell
 
 from ddqn_planner import GridMap, MoveRule, PlanMethod, Planner, PlanStatus, QField, inflate
+from ddqn_planner.benchmarks.evaluation import evaluate
 from ddqn_planner.grid import LENGTHS, MOVES, Cell, connected_cells, legal_moves, path_cost
 from ddqn_planner.model import ModelMetadata
 from ddqn_planner.planning import shortest_distances
-from ddqn_planner.planning.evaluation import evaluate
 from ddqn_planner.planning.problem import Problem, solve
 
 RULES = st.sampled_from(list(MoveRule))

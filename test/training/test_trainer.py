@@ -9,8 +9,8 @@ import pytest
 import torch
 
 from ddqn_planner import GridMap, MoveRule, PlanStatus
+from ddqn_planner.benchmarks.evaluation import evaluate
 from ddqn_planner.model import load_model
-from ddqn_planner.planning.evaluation import evaluate
 from ddqn_planner.training.environment import Scenario
 from ddqn_planner.training.hyper_parameters import HyperParameters
 from ddqn_planner.training.trainer import CheckpointError, Episode, Outcome, Trainer

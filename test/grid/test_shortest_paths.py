@@ -6,9 +6,17 @@ from hypothesis import given
 from hypothesis import strategies as st
 from strategies import grids_with_costs
 
-from ddqn_planner.grid import MOVES, GridMap, MoveRule, legal_moves, move_costs, path_cost
-from ddqn_planner.planning import shortest_distances, shortest_path
-from ddqn_planner.planning.oracle import _graph
+from ddqn_planner.grid import (
+    MOVES,
+    GridMap,
+    MoveRule,
+    legal_moves,
+    move_costs,
+    path_cost,
+    shortest_distances,
+    shortest_path,
+)
+from ddqn_planner.grid.shortest_paths import _graph
 
 RULES = st.sampled_from(list(MoveRule))
 
