@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import os
 import sys
 from collections.abc import Sequence
 from importlib import import_module
@@ -40,6 +41,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
     0 done, 1 no path, 2 bad input or a missing library, 130 interrupted.
     """
+    # NumPy is not yet imported. For small products one thread is as fast as several, and on a busy
+    # machine several are ten times as slow.
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     arguments = sys.argv[1:] if arguments is None else arguments
     parser = argparse.ArgumentParser(prog="ddqn-planner", description=__doc__.replace("`", ""))
     commands = parser.add_subparsers(required=True, metavar="|".join(COMMANDS))

@@ -25,7 +25,6 @@ from ddqn_planner.grid import (
 )
 from ddqn_planner.grid.generators import generate_map, random_costs
 from ddqn_planner.model import AnyMapQNetwork
-from ddqn_planner.model.observation import patch_features
 from ddqn_planner.planning import Planner
 from ddqn_planner.training.any_map import ANY_MAP, RULES, random_scenarios
 from ddqn_planner.training.environment import paper_scenario
@@ -153,8 +152,8 @@ def move_errors(planner: Planner) -> tuple[int, float]:
     for rule in RULES:
         legal_BA = legal_moves(grid.occupancy, rule)[:, 1::3, 1::3].reshape(8, -1).T
         cost_BA = move_costs(grid.cost_multiplier, rule)[:, 1::3, 1::3].reshape(8, -1).T
-        p_BA = network.success(patch_features(patch_B9, rule))
-        learned_BA = network.multiplier(patch_features(costs_B9, rule))
+        p_BA = network.success(network.features(patch_B9, rule))
+        learned_BA = network.multiplier(network.features(costs_B9, rule))
         wrong += int(((p_BA > 0.5) != legal_BA).sum())
         errors.append(np.abs(learned_BA / (cost_BA / rule.lengths) - 1)[legal_BA])
     return wrong, float(np.concatenate(errors).mean())
