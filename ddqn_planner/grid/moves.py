@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ddqn_planner.grid.arguments import Cell, Choice, Occupancy, as_cell
+from ddqn_planner.grid.labels import label_cells
 
 MOVES: NDArray[np.int64] = np.array(
     [(1, 0), (1, 1), (0, 1), (-1, 1), (-1, 0), (-1, -1), (0, -1), (1, -1)], dtype=np.int64
@@ -107,13 +108,9 @@ def component_labels(occupancy: Occupancy, move_rule: MoveRule | str) -> NDArray
 
     Two free cells have the same label, 1 or more, if a path joins them. Occupied cells have 0.
     """
-    import scipy.ndimage
-
     # If a diagonal move needs both side cells free, two straight moves can replace it.
-    diagonals = 2 if MoveRule(move_rule).cuts_corners else 1
-    structure = scipy.ndimage.generate_binary_structure(2, diagonals)
-    labels: NDArray[np.int32] = scipy.ndimage.label(~occupancy, structure)[0]
-    return labels
+    moves = MOVES[4:] if MoveRule(move_rule).cuts_corners else MOVES[4::2]
+    return label_cells(~occupancy, moves)
 
 
 def connected_cells(

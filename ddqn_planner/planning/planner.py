@@ -14,10 +14,11 @@ from numpy.typing import NDArray
 
 from ddqn_planner.grid import Cell, GridMap, MoveRule, legal_moves, path_cost
 from ddqn_planner.grid.arguments import as_cell
+from ddqn_planner.grid.moves import component_labels
 from ddqn_planner.model import ModelMetadata, QNetwork, load_model
 from ddqn_planner.planning.plan import Plan, PlanMethod, PlanRequest, PlanStatus
 from ddqn_planner.planning.q_field import QField
-from ddqn_planner.planning.search import reachable_cells, search
+from ddqn_planner.planning.search import search
 from ddqn_planner.planning.simplification import simplify
 
 CACHE_BYTES = 2**29
@@ -246,23 +247,23 @@ def _way_out_and_end(request: PlanRequest) -> tuple[tuple[Cell, ...], Cell]:
     to a cell within the tolerance: connected cells say so, without a field.
     """
     grid, start, goal, rule = request.grid, request.start, request.goal, request.move_rule
+    labels = component_labels(grid.occupancy, rule)
     goals = [np.array([goal])] if grid.is_free(goal) else []
     if _reach(request) >= 1:
         goals.append(_free_cells(grid, goal, _reach(request)))
     for ends in goals:
+        labels_of_ends = labels[ends[:, 1], ends[:, 0]]
+        joined = np.isin(labels, labels_of_ends)
         way_out: tuple[Cell, ...] = (start,)
         if not grid.is_free(start):
             # The robot is too near to an obstacle: the shortest way through such cells.
             assert grid.obstacles is not None
-            joined = reachable_cells(grid.occupancy, ends, rule)
             legal = legal_moves(~joined & (grid.obstacles | ~grid.occupancy), rule)
             way_out = search(start, joined, legal, np.ones(joined.shape, np.float32), rule)
-        if way_out:
-            joined = reachable_cells(grid.occupancy, np.array(way_out[-1:]), rule)
-            can_end = joined[ends[:, 1], ends[:, 0]]
-            if can_end.any():
-                x, y = ends[np.argmax(can_end)].tolist()
-                return way_out, (x, y)
+        if way_out and joined[way_out[-1][1], way_out[-1][0]]:
+            label = labels[way_out[-1][1], way_out[-1][0]]
+            x, y = ends[np.argmax(labels_of_ends == label)].tolist()
+            return way_out, (x, y)
     return (), goal
 
 

@@ -1,4 +1,4 @@
-"""Best-first search and flood fill, compiled: A* with a value field, Dijkstra, connected cells."""
+"""Best-first search, compiled: A* with a value field, or Dijkstra to the nearest of some cells."""
 
 from __future__ import annotations
 
@@ -54,47 +54,6 @@ def search(
         dx, dy = MOVES[entered_by[y, x]].tolist()
         cells.append((x - dx, y - dy))
     return tuple(reversed(cells))
-
-
-def reachable_cells(
-    occupancy: NDArray[np.bool_], cells: NDArray[np.int64], move_rule: MoveRule
-) -> NDArray[np.bool_]:
-    """Return the free cells that paths join to at least one of some free cells: (H, W) bool.
-
-    Parameters
-    ----------
-    occupancy : (H, W) bool
-    cells : (N, 2) int64
-        Free cells, (x, y) each.
-    move_rule : MoveRule
-    """
-    # Where a diagonal move needs both side cells free, two straight moves do the same.
-    moves = MOVES if move_rule.cuts_corners else MOVES[::2]
-    closed, row = np.pad(occupancy, 1, constant_values=True), occupancy.shape[1] + 2
-    _flood(closed.ravel(), (cells + 1) @ (1, row), moves @ (1, row))
-    reached: NDArray[np.bool_] = closed[1:-1, 1:-1] & ~occupancy
-    return reached
-
-
-@compiled
-def _flood(closed, cells, offsets):  # type: ignore[no-untyped-def]  # pragma: no cover
-    """Close the open cells that moves reach from some open cells of a padded map."""
-    waiting = np.empty(closed.size, dtype=np.int64)
-    count = 0
-    for cell in cells:
-        if not closed[cell]:
-            closed[cell] = True
-            waiting[count] = cell
-            count += 1
-    while count > 0:
-        count -= 1
-        cell = waiting[count]
-        for offset in offsets:
-            following = cell + offset
-            if not closed[following]:
-                closed[following] = True
-                waiting[count] = following
-                count += 1
 
 
 @compiled

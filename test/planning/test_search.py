@@ -14,12 +14,11 @@ from ddqn_planner.grid import (
     Cell,
     GridMap,
     MoveRule,
-    connected_cells,
     legal_moves,
     path_cost,
 )
 from ddqn_planner.planning import shortest_distances
-from ddqn_planner.planning.search import reachable_cells, search
+from ddqn_planner.planning.search import search
 
 ANY_VALUE = st.floats(width=32, allow_nan=True, allow_infinity=True)
 
@@ -85,14 +84,3 @@ def test_goes_to_the_nearest_of_several_ends() -> None:
     assert search((3, 0), ends, legal, grid.cost_multiplier, rule)[-1] == (0, 0)
     assert search((5, 0), ends, legal, grid.cost_multiplier, rule)[-1] == (8, 0)
     assert search((8, 0), ends, legal, grid.cost_multiplier, rule) == ((8, 0),)
-
-
-@given(grids_with_costs(), st.sampled_from(list(MoveRule)), st.data())
-def test_the_reachable_cells_are_those_that_a_path_joins_to_one_of_the_cells(
-    grid_and_goal: tuple[GridMap, Cell], rule: MoveRule, data: st.DataObject
-) -> None:
-    grid, _ = grid_and_goal
-    cells = data.draw(st.lists(st.sampled_from(grid.free_cells()), min_size=1))
-    joined = [connected_cells(grid.occupancy, cell, rule) for cell in cells]
-    reached = reachable_cells(grid.occupancy, np.array(cells), rule)
-    assert (reached == np.any(joined, axis=0)).all()
