@@ -248,7 +248,7 @@ class TrainerNode(BaseNode):
         finally:
             run.close()
 
-    # What the training thread told
+    # Events of the training thread
 
     def _on_events(self) -> None:
         while not self._events.empty():
