@@ -110,17 +110,8 @@ def test_an_interrupted_training_continues_bit_for_bit(
     resumed = Trainer.load_checkpoint(tmp_path / "checkpoint", [small])
     assert before + train(resumed, 600) == episodes
     assert same_weights(uninterrupted, resumed)
-    assert (
-        uninterrupted.steps,
-        uninterrupted.updates,
-        uninterrupted.episodes,
-        uninterrupted.epsilon,
-    ) == (
-        resumed.steps,
-        resumed.updates,
-        resumed.episodes,
-        resumed.epsilon,
-    )
+    for name in ("steps", "updates", "episodes", "epsilon"):
+        assert getattr(uninterrupted, name) == getattr(resumed, name)
 
 
 def test_the_loop_can_be_left_after_any_step(small: Scenario) -> None:
@@ -277,10 +268,8 @@ def test_the_format_of_a_checkpoint_stays(small: Scenario, tmp_path: Path) -> No
     train(trainer, 60)
     trainer.save_checkpoint(tmp_path / "checkpoint")
     with safe_open(tmp_path / "checkpoint", framework="np") as file:
-        metadata, shapes = (
-            file.metadata(),
-            {key: file.get_slice(key).get_shape() for key in file.keys()},
-        )  # noqa: SIM118
+        metadata = file.metadata()
+        shapes = {key: file.get_slice(key).get_shape() for key in file.keys()}  # noqa: SIM118
     description = json.loads(metadata["ddqn_planner_checkpoint"])
     assert {*metadata} == {"ddqn_planner_checkpoint", "sha256"}
     assert [*description] == [
