@@ -19,7 +19,7 @@ from pathlib import Path as FilePath
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
-from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped, Quaternion
+from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped
 from nav_msgs.msg import OccupancyGrid, Path
 from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
@@ -117,8 +117,8 @@ class TrainerNode(BaseNode):
         self._map = MapInFrame(grid, "map")
         for which, cell in (("start", map_file.start), ("goal", map_file.goal)):
             if cell is not None:
-                header = Header(frame_id=self._map.frame)
-                self._poses[which] = path_message([cell], grid, header, quaternion(0)).poses[0]
+                path = path_message([cell], grid, Header(frame_id="map"), quaternion(0))
+                self._poses[which] = path.poses[0]
 
     # Map, start and goal
 
@@ -248,7 +248,7 @@ class TrainerNode(BaseNode):
         finally:
             run.close()
 
-    # What the training thread told
+    # Events of the training thread
 
     def _on_events(self) -> None:
         while not self._events.empty():
@@ -281,7 +281,7 @@ class TrainerNode(BaseNode):
 
     def _publish_cells(self, cells: tuple[Cell, ...], place: MapInFrame) -> None:
         header = Header(stamp=self.get_clock().now().to_msg(), frame_id=place.frame)
-        self._episode_publisher.publish(path_message(cells, place.grid, header, Quaternion(w=1.0)))
+        self._episode_publisher.publish(path_message(cells, place.grid, header, quaternion(0)))
 
     def _publish_diagnostics(self) -> None:
         status = DiagnosticStatus(name=f"{self.get_fully_qualified_name()}: training")
@@ -364,10 +364,9 @@ class TrainerNode(BaseNode):
 
 
 def import_training() -> None:
-    """Import torch and what trains with it, and let torch use one thread."""
+    """Import torch and the trainer, and let torch use one thread."""
     with suppress(ImportError):  # without torch, ~/start says what is missing
-        import torch
-
+        torch = importlib.import_module("torch")
         importlib.import_module("ddqn_planner.training.run")
         torch.set_num_threads(1)  # as fast as two for these networks, and leaves ROS a core
         torch.optim.Adam([torch.zeros(1)])  # the first optimiser imports for a second

@@ -5,7 +5,7 @@ from __future__ import annotations
 import io
 import re
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import ExitStack, closing
 from dataclasses import dataclass
 from enum import Enum
@@ -28,17 +28,7 @@ try:
 except ImportError:  # an extra: the CSV file has the curves too
     Event = None
 
-COLUMNS = (
-    "episode",
-    "step",
-    "scenario",
-    "outcome",
-    "moves",
-    "length",
-    "total_reward",
-    "average_reward",
-    "cells",
-)
+HEADER = b"episode,step,scenario,outcome,moves,length,total_reward,average_reward,cells\r\n"
 
 ROW = re.compile(rb"(\d{1,18})(?:,[^,]*){7},(\d{1,9}:\d{1,9}(?: \d{1,9}:\d{1,9})*)\r\n")
 """A complete row: the number of the episode, and its cells."""
@@ -139,27 +129,16 @@ def read_cells(path: str | Path, every: int) -> Iterator[tuple[Cell, ...]]:
 
 
 def _row(episode: Episode, move_rule: MoveRule) -> bytes:
-    values = (
-        episode.number,
-        episode.step,
-        episode.scenario,
-        episode.outcome.value,
-        episode.moves,
-        round(path_length(episode.cells, move_rule), 4),
-        round(episode.total_reward, 6),
-        round(episode.average_reward, 6),
-        " ".join(f"{x}:{y}" for x, y in episode.cells),
-    )
-    return _line(values)
-
-
-def _line(values: Sequence[object]) -> bytes:
-    return (",".join(map(str, values)) + "\r\n").encode()
+    e, length = episode, round(path_length(episode.cells, move_rule), 4)
+    rewards = f"{round(e.total_reward, 6)},{round(e.average_reward, 6)}"
+    cells = " ".join(f"{x}:{y}" for x, y in e.cells)
+    start = f"{e.number},{e.step},{e.scenario},{e.outcome.value},{e.moves},{length}"
+    return f"{start},{rewards},{cells}\r\n".encode()
 
 
 def _cut_rows(path: Path, episodes: int) -> None:
     """Keep the header and the rows of the first `episodes`."""
-    lines = [_line(COLUMNS)]
+    lines = [HEADER]
     if path.exists():
         with path.open("rb") as file:
             rows = map(ROW.fullmatch, file)

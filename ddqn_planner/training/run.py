@@ -39,12 +39,8 @@ class TrainingRun:
     Parameters
     ----------
     folder : str or Path
-    scenarios : sequence of Scenario
-    move_rule : MoveRule
-    parameters : HyperParameters
-        Those of the checkpoint, if there is one; only ``steps`` may differ.
-    seed : int
-        That of the checkpoint, if there is one.
+    scenarios, move_rule, parameters, seed
+        See `Trainer`. A checkpoint must have the same, except ``steps``.
 
     Raises
     ------

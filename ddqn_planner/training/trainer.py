@@ -242,7 +242,7 @@ class Trainer:
         OSError
             If the file cannot be written; the one before it then stays as it is.
         """
-        description = {
+        description = {  # with the names of 0.1, whose checkpoints load too
             "seed": self.seed,
             "move_rule": self.move_rule,
             "parameters": asdict(self.parameters),

@@ -77,8 +77,8 @@ def test_the_curves_hold_lengths_under_the_rule_of_the_scenario(
 def test_a_run_continues_from_its_checkpoint_and_loses_no_row(
     small: Scenario, tmp_path: Path
 ) -> None:
-    whole = open_run(tmp_path / "whole", small)
-    finish(whole)
+    uninterrupted = open_run(tmp_path / "uninterrupted", small)
+    finish(uninterrupted)
     first = open_run(tmp_path / "cut", small)
     for _ in first.steps():
         if first.trainer.steps == 150:
@@ -89,9 +89,9 @@ def test_a_run_continues_from_its_checkpoint_and_loses_no_row(
     second = open_run(tmp_path / "cut", small)
     assert second.trainer.steps == 150
     finish(second)
-    assert rows(tmp_path / "cut") == rows(tmp_path / "whole")
+    assert rows(tmp_path / "cut") == rows(tmp_path / "uninterrupted")
     for a, b in zip(
-        whole.trainer.network.parameters(), second.trainer.network.parameters(), strict=True
+        uninterrupted.trainer.network.parameters(), second.trainer.network.parameters(), strict=True
     ):
         assert torch.equal(a, b)
 

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import json
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -7,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from safetensors import safe_open
 
 from ddqn_planner import GridMap, MoveRule, PlanStatus
 from ddqn_planner.benchmarks.evaluation import evaluate
@@ -14,6 +16,7 @@ from ddqn_planner.model import load_model
 from ddqn_planner.training.environment import Scenario
 from ddqn_planner.training.episodes import Episode, EpisodeEnd
 from ddqn_planner.training.hyper_parameters import HyperParameters
+from ddqn_planner.training.replay_buffer import Transitions
 from ddqn_planner.training.trainer import CheckpointError, Trainer
 
 QUICK = HyperParameters(
@@ -101,29 +104,25 @@ def test_an_interrupted_training_continues_bit_for_bit(
         target_interval=30,
         network=network,
     )
-    whole, interrupted = make(small, parameters), make(small, parameters)
-    episodes = train(whole, 600)
+    uninterrupted, interrupted = make(small, parameters), make(small, parameters)
+    episodes = train(uninterrupted, 600)
     before = train(interrupted, first)
     interrupted.save_checkpoint(tmp_path / "checkpoint")
     resumed = Trainer.load_checkpoint(tmp_path / "checkpoint", [small])
     assert before + train(resumed, 600) == episodes
-    assert same_weights(whole, resumed)
-    assert (whole.steps, whole.updates, whole.episodes, whole.epsilon) == (
-        resumed.steps,
-        resumed.updates,
-        resumed.episodes,
-        resumed.epsilon,
-    )
+    assert same_weights(uninterrupted, resumed)
+    for name in ("steps", "updates", "episodes", "epsilon"):
+        assert getattr(uninterrupted, name) == getattr(resumed, name)
 
 
 def test_the_loop_can_be_left_after_any_step(small: Scenario) -> None:
-    whole, left = make(small), make(small)
-    train(whole, 200)
+    uninterrupted, left = make(small), make(small)
+    train(uninterrupted, 200)
     for _ in left.run(200):
         if left.steps == 77:
             break
     train(left, 200)
-    assert same_weights(whole, left)
+    assert same_weights(uninterrupted, left)
 
 
 @pytest.mark.parametrize(("environments", "interval"), [(1, 1), (3, 2), (3, 5), (4, 3)])
@@ -185,7 +184,7 @@ def test_an_episode_adds_up_its_own_rewards_alone(small: Scenario) -> None:
     }
 
 
-def test_the_metadata_of_a_model_tell_how_it_was_trained(small: Scenario) -> None:
+def test_the_metadata_of_a_model_say_how_it_was_trained(small: Scenario) -> None:
     other = replace(small, grid=GridMap(np.zeros((4, 5))))
     trainer = Trainer([small, other], MoveRule.UNIT, replace(QUICK, gamma=0.8), seed=3)
     train(trainer, 2)
@@ -218,7 +217,7 @@ def test_an_episode_that_was_interrupted_before_its_last_step_ends_with_that(
     assert len(episode.cells) == 6
 
 
-def test_episodes_tell_how_they_went(small: Scenario) -> None:
+def test_episodes_say_how_they_ended(small: Scenario) -> None:
     parameters = replace(QUICK, max_episode_steps=5)
     episodes = train(make(small, parameters), 2000)
     assert [episode.number for episode in episodes] == list(range(1, len(episodes) + 1))
@@ -263,6 +262,42 @@ def test_a_checkpoint_of_another_problem_is_refused(
     for other in (paper, replace(small, start=(0, 1)), replace(small, goal=(4, 1))):
         with pytest.raises(CheckpointError, match="another map, start or goal"):
             Trainer.load_checkpoint(tmp_path / "checkpoint", [other])
+
+
+def test_the_format_of_a_checkpoint_stays(small: Scenario, tmp_path: Path) -> None:
+    trainer = make(small, replace(QUICK, replay_capacity=100))
+    train(trainer, 60)
+    trainer.save_checkpoint(tmp_path / "checkpoint")
+    with safe_open(tmp_path / "checkpoint", framework="np") as file:
+        metadata = file.metadata()
+        shapes = {key: file.get_slice(key).get_shape() for key in file.keys()}  # noqa: SIM118
+    description = json.loads(metadata["ddqn_planner_checkpoint"])
+    assert {*metadata} == {"ddqn_planner_checkpoint", "sha256"}
+    assert [*description] == [
+        "seed",
+        "move_rule",
+        "parameters",
+        "scenarios",
+        "counters",
+        "walked",
+        "generators",
+    ]
+    replay = {f"replay.{name}": [60] for name in Transitions._fields}
+    environment = {f"environment.{name}": [1] for name in ("scenario", "cell", "steps")}
+    network = {name: [*tensor.shape] for name, tensor in trainer.network.state_dict().items()}
+    assert shapes == {
+        **replay,
+        **environment,
+        "total_reward": [1],
+        **{f"network.{name}": shape for name, shape in network.items()},
+        **{f"target.{name}": shape for name, shape in network.items()},
+        **{f"optimiser.{number}.step": [] for number in range(len(network))},
+        **{
+            f"optimiser.{number}.{moment}": shape
+            for number, shape in enumerate(network.values())
+            for moment in ("exp_avg", "exp_avg_sq")
+        },
+    }
 
 
 @pytest.mark.parametrize("fraction", [0.0, 0.3, 0.9])
