@@ -1,6 +1,7 @@
 """A simulated robot: it drives along `plan` and publishes `odom` in the map's frame."""
 
 import math
+from contextlib import suppress
 
 import rclpy
 from nav_msgs.msg import Odometry, Path
@@ -54,4 +55,5 @@ class Robot(Node):
 
 if __name__ == "__main__":
     rclpy.init()
-    rclpy.spin(Robot())
+    with suppress(KeyboardInterrupt):
+        rclpy.spin(Robot())
