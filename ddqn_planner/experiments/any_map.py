@@ -7,7 +7,6 @@ from dataclasses import replace
 from typing import Any, Final
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from ddqn_planner.experiments import goal_1, goal_3
@@ -19,7 +18,7 @@ from ddqn_planner.files import write_csv
 from ddqn_planner.grid import OCCUPIED, UNKNOWN, GridMap, MoveRule, legal_moves, move_costs
 from ddqn_planner.grid.generators import generate_map, random_costs
 from ddqn_planner.model import AnyMapQNetwork
-from ddqn_planner.model.propagation import features
+from ddqn_planner.model.observation import patch_features
 from ddqn_planner.planning import Planner
 from ddqn_planner.planning.evaluation import evaluate
 from ddqn_planner.training.any_map import ANY_MAP, RULES, random_scenarios
@@ -149,11 +148,10 @@ def _judgement(planner: Planner) -> tuple[int, float]:
     for rule in RULES:
         truth = [_truth(values, rule) for values in costs_B9]
         legal_BA, multiplier_BA = map(np.stack, zip(*truth, strict=True))
-        with torch.inference_mode():
-            p_BA, _ = network(torch.from_numpy(features(seen_B9, rule)))
-            _, learned_BA = network(torch.from_numpy(features(costs_B9, rule)))
-        wrong += int(((p_BA.numpy() > 0.5) != legal_BA).sum())
-        errors.append(np.abs(learned_BA.numpy() / multiplier_BA - 1)[legal_BA])
+        p_BA = network.success(patch_features(seen_B9, rule))
+        learned_BA = network.multiplier(patch_features(costs_B9, rule))
+        wrong += int(((p_BA > 0.5) != legal_BA).sum())
+        errors.append(np.abs(learned_BA / multiplier_BA - 1)[legal_BA])
     return wrong, float(np.concatenate(errors).mean())
 
 

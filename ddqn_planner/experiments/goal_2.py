@@ -15,12 +15,12 @@ from ddqn_planner.experiments.tables import table
 from ddqn_planner.experiments.trainings import Training
 from ddqn_planner.files import write_csv
 from ddqn_planner.grid import MOVES, legal_moves
-from ddqn_planner.model import PropagationQNetwork
 from ddqn_planner.planning import Planner
 from ddqn_planner.planning.evaluation import length_ratios
 from ddqn_planner.planning.q_field import QField
+from ddqn_planner.training.encoders import PropagationEncoder
 from ddqn_planner.training.environment import GridVectorEnvironment, Scenario, paper_scenario
-from ddqn_planner.training.learners import PropagationLearner
+from ddqn_planner.training.networks import PropagationModule
 
 TITLE = "Goal ii: from every free cell"
 
@@ -55,12 +55,12 @@ def planned_field(planner: Planner, scenario: Scenario) -> QField:
 def trained_field(planner: Planner, scenario: Scenario) -> QField:
     """Return the Q field of a propagation network as the loss trained it: with reward and γ."""
     environment = GridVectorEnvironment([scenario], MOVE_RULE, PROFILES["best"])
-    learner = PropagationLearner(environment)
-    assert isinstance(planner.network, PropagationQNetwork)
-    learner.copy_target(planner.network)
+    encoder = PropagationEncoder(environment)
+    module = PropagationModule.from_numpy(planner.network)
+    encoder.update_target(module)
     cells = np.arange(scenario.grid.occupancy.size)
     with torch.inference_mode():
-        q_CA = learner.q(planner.network, learner.states(np.zeros_like(cells), cells))
+        q_CA = encoder.q(module, encoder.states(np.zeros_like(cells), cells))
     q_AHW = q_CA.T.reshape(len(MOVES), *scenario.grid.occupancy.shape).numpy()
     return QField(scenario.goal, q_AHW, legal_moves(scenario.grid.occupancy, MOVE_RULE))
 

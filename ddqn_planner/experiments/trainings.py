@@ -20,13 +20,13 @@ from tqdm import tqdm
 
 from ddqn_planner.experiments.profiles import MOVE_RULE
 from ddqn_planner.files import write_csv
-from ddqn_planner.grid import MOVES, legal_moves
-from ddqn_planner.model.propagation import neighbours, propagate
+from ddqn_planner.grid import MOVES, legal_moves, neighbours
 from ddqn_planner.planning import Plan, Planner
 from ddqn_planner.training.environment import GridVectorEnvironment, Scenario
 from ddqn_planner.training.hyper_parameters import HyperParameters
 from ddqn_planner.training.run import TrainingRun
 from ddqn_planner.training.trainer import Trainer
+from ddqn_planner.training.value_iteration import value_iteration
 
 Job = TypeVar("Job")
 
@@ -212,7 +212,7 @@ def optimal_value(environment: GridVectorEnvironment) -> NDArray[np.float32]:
     """Return V* of the first scenario, exact by value iteration: (C,) float32."""
     scenario, parameters = environment.scenarios[0], environment.parameters
     legal = legal_moves(scenario.grid.occupancy, MOVE_RULE).reshape(1, len(MOVES), -1)
-    return_SAC = propagate(
+    return_SAC = value_iteration(
         legal.astype(np.float32),
         environment.free_reward[:1],
         environment.goal[:1],

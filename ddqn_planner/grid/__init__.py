@@ -10,6 +10,7 @@ from ddqn_planner.grid.moves import (
     connected_cells,
     legal_moves,
     move_costs,
+    neighbours,
     path_cost,
     path_length,
 )
@@ -33,6 +34,7 @@ __all__ = [
     "legal_moves",
     "load_map",
     "move_costs",
+    "neighbours",
     "path_cost",
     "path_length",
     "read_map_file",

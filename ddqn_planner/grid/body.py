@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-import scipy.ndimage
 from numpy.typing import NDArray
 
 from ddqn_planner.grid.grid_map import OCCUPIED, UNKNOWN, GridMap
@@ -35,6 +34,8 @@ def clearance(obstacles: NDArray[np.bool_]) -> NDArray[np.float64]:
     """
     if not obstacles.any():
         return np.full(obstacles.shape, np.inf)
+    import scipy.ndimage  # slow to import, and not needed to load or serve a map
+
     distance: NDArray[np.float64] = scipy.ndimage.distance_transform_edt(~obstacles)
     return distance
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-import scipy.ndimage
 from numpy.typing import NDArray
 
 from ddqn_planner.grid.arguments import Cell, Choice, as_cell
@@ -71,6 +70,21 @@ def legal_moves(occupancy: NDArray[np.bool_], move_rule: MoveRule | str) -> NDAr
     return legal
 
 
+def neighbours(shape: tuple[int, int]) -> NDArray[np.int64]:
+    """Return the cell that each action leads to, for maps of shape (H, W).
+
+    Returns
+    -------
+    (8, H * W) int64
+        Cell numbers y * W + x; H * W for any cell outside the map.
+    """
+    height, width = shape
+    y, x = np.divmod(np.arange(height * width), width)
+    next_x, next_y = x + MOVES[:, :1], y + MOVES[:, 1:]
+    inside = (next_x >= 0) & (next_x < width) & (next_y >= 0) & (next_y < height)
+    return np.where(inside, next_y * width + next_x, height * width)
+
+
 def move_costs(multiplier: NDArray[np.float32], move_rule: MoveRule | str) -> NDArray[np.float64]:
     """Return the cost of each move: its length times the mean cost multiplier of its two cells.
 
@@ -134,6 +148,8 @@ def component_labels(occupancy: NDArray[np.bool_], move_rule: MoveRule | str) ->
     (H, W) int32
         1 or more for the free cells, the same for all that paths join; 0 for the occupied ones.
     """
+    import scipy.ndimage  # slow to import, and not needed to load or serve a map
+
     # Where a diagonal move needs both side cells free, two straight moves do the same.
     diagonals = 2 if MoveRule(move_rule).cuts_corners else 1
     structure = scipy.ndimage.generate_binary_structure(2, diagonals)

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
-import scipy.sparse
 from numpy.typing import NDArray
 
 from ddqn_planner.grid import MOVES, Cell, GridMap, MoveRule, legal_moves
 from ddqn_planner.grid.arguments import as_cell
+
+if TYPE_CHECKING:
+    import scipy.sparse
 
 
 def shortest_distances(grid: GridMap, goal: Cell, move_rule: MoveRule | str) -> NDArray[np.float64]:
@@ -32,6 +36,8 @@ def shortest_distances(grid: GridMap, goal: Cell, move_rule: MoveRule | str) -> 
     ValueError
         If the goal is no cell of the map, or there is no such move rule.
     """
+    import scipy.sparse.csgraph
+
     goal_x, goal_y = as_cell(goal, "the goal")
     if not grid.contains(goal):
         raise ValueError(f"the goal {goal} lies outside the map of {grid.width} x {grid.height}")
@@ -44,6 +50,8 @@ def shortest_distances(grid: GridMap, goal: Cell, move_rule: MoveRule | str) -> 
 
 def shortest_path(grid: GridMap, start: Cell, goal: Cell, move_rule: MoveRule | str) -> list[Cell]:
     """Return the cells of one shortest path, both ends included; empty if there is none."""
+    import scipy.sparse.csgraph
+
     start, goal = as_cell(start, "the start"), as_cell(goal, "the goal")
     _, previous = scipy.sparse.csgraph.dijkstra(
         _graph(grid, move_rule),
@@ -63,6 +71,8 @@ def _graph(grid: GridMap, move_rule: MoveRule | str) -> scipy.sparse.csr_array:
 
     Built row by row as scipy keeps it: to sort a list of edges would take longer.
     """
+    import scipy.sparse
+
     step = MOVES[:, 1] * grid.width + MOVES[:, 0]
     actions = np.argsort(step)  # so that the columns of a row are in order
     legal_NA = legal_moves(grid.occupancy, move_rule)[actions].reshape(len(MOVES), -1).T

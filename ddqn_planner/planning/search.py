@@ -7,8 +7,8 @@ import heapq
 import numpy as np
 from numpy.typing import NDArray
 
+from ddqn_planner.compiled import compiled
 from ddqn_planner.grid import MOVES, Cell, MoveRule
-from ddqn_planner.model.front import compiled
 
 
 def search(

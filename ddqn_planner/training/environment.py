@@ -26,9 +26,16 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
-from ddqn_planner.grid import MOVES, Cell, GridMap, MoveRule, legal_moves, read_map_file
+from ddqn_planner.grid import (
+    MOVES,
+    Cell,
+    GridMap,
+    MoveRule,
+    legal_moves,
+    neighbours,
+    read_map_file,
+)
 from ddqn_planner.model.observation import GOAL, OBSTACLE, ROBOT, observation_background, observe
-from ddqn_planner.model.propagation import neighbours
 from ddqn_planner.resources import find_resource
 from ddqn_planner.training.hyper_parameters import HyperParameters
 from ddqn_planner.training.initialisation import initial_cells

@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, fields
+from dataclasses import asdict, dataclass, field, fields
 from typing import Any
+
+from ddqn_planner.model import NETWORKS
 
 
 def _parameter(default: Any, source: str, low: float, high: float) -> Any:
     return field(default=default, metadata={"source": source, "range": (low, high)})
 
 
-def _choice(default: str, source: str, *others: str) -> Any:
-    return field(default=default, metadata={"source": source, "choices": (default, *others)})
+def _choice(*choices: str, source: str) -> Any:
+    return field(default=choices[0], metadata={"source": source, "choices": choices})
 
 
 @dataclass(frozen=True)
@@ -28,11 +30,11 @@ class HyperParameters:
         outgrows the replay buffer.
     """
 
-    network: str = _choice("paper", "ours: the Q-network, see model/", "propagation", "any_map")
+    network: str = _choice(*NETWORKS, source="ours: the Q-network, see model/")
     target: str = _choice(
-        "double_dqn", "ours: the target, see training/double_dqn.py", "dqn", "printed"
+        "double_dqn", "dqn", "printed", source="ours: the target, see training/double_dqn.py"
     )
-    reward: str = _choice("paper", "ours: the reward, see training/reward.py", "path_cost")
+    reward: str = _choice("paper", "path_cost", source="ours: the reward, see training/reward.py")
     learning_rate: float = _parameter(
         0.01, "section on the network: Adam's learning rate", 1e-6, 1.0
     )
@@ -74,3 +76,8 @@ class HyperParameters:
                 f"environments is {self.environments}; it must be at most replay_capacity, "
                 f"{self.replay_capacity}"
             )
+
+    def network_sizes(self, shape: tuple[int, int]) -> dict[str, int]:
+        """Return the sizes of the network for maps of shape (H, W)."""
+        known = {**asdict(self), "height": shape[0], "width": shape[1]}
+        return {name: known[name] for name in NETWORKS[self.network].size_names}

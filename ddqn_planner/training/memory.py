@@ -2,25 +2,19 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import asdict
 from pathlib import Path
 from typing import Final
 
-import torch
-
-from ddqn_planner.model import new_network
-from ddqn_planner.model.model_file import SIZES
+from ddqn_planner.model import NETWORKS, PropagationQNetwork
 from ddqn_planner.training.environment import Scenario
 from ddqn_planner.training.hyper_parameters import HyperParameters
 
 REMEDY: Final = (
     "take a smaller map, or smaller filters, batch_size, environments or replay_capacity"
 )
-
-FEATURES: Final = {"propagation": 9, "any_map": 28}
-"""What a network that looks at one cell's surroundings sees of them, float32 each."""
 
 
 class MemoryShortageError(ValueError):
@@ -53,20 +47,19 @@ def training_bytes(scenarios: Sequence[Scenario], parameters: HyperParameters) -
     """Return about how much memory a training takes at its peak, beside the program itself.
 
     The numbers count the float32 and int64 arrays that are alive at once in the environment, the
-    learner, an update and a save; `test/training/test_memory.py` holds them against processes.
+    encoder, an update and a save; `test/training/test_memory.py` holds them against processes.
     """
     grid, p = scenarios[0].grid, parameters
     cells, maps = grid.width * grid.height, len(scenarios)
-    known = {**asdict(p), "height": grid.height, "width": grid.width}
-    with torch.device("meta"):
-        network = new_network(p.network, {name: known[name] for name in SIZES[p.network]})
-    weights = sum(weight.numel() for weight in network.parameters())
+    network = NETWORKS[p.network]
+    shapes = network.shapes(p.network_sizes((grid.height, grid.width)))
+    weights = sum(map(math.prod, shapes.values()))
 
     # Per cell of each map: legal moves, two tables of rewards, free cells, what lies in the cells.
     tables = maps * cells * (8 + 2 * 8 * 4 + 8 + 4)
     # Made on the way: distances, neighbours and moves, float64 and int64, of one map at a time.
     tables += cells * 8 * 8 * 4
-    if p.network == "paper":
+    if not issubclass(network, PropagationQNetwork):
         patches = (grid.height + 1) // 2 * ((grid.width + 1) // 2)
         # An update: observations and their 3x3 patches of states and next states, then features,
         # their gradient, and what it is made of. A step: the same of one state per environment.
@@ -75,7 +68,7 @@ def training_bytes(scenarios: Sequence[Scenario], parameters: HyperParameters) -
         batch = 4 * max(update, step)
     else:
         # Per cell of each map: what is seen, and two layers or then six arrays of the propagation.
-        batch = maps * cells * 4 * (FEATURES[p.network] + max(2 * p.filters, 6 * 8))
+        batch = maps * cells * 4 * (network.features + max(2 * p.filters, 6 * 8))
     # Both networks, the gradient and Adam's two means stay. A save copies all of them except the
     # gradient twice, and the replay buffer, 40 bytes per transition, too.
     kept = 5 * 4 * weights + 40 * p.replay_capacity

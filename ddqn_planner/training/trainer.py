@@ -17,18 +17,19 @@ import safetensors.torch
 import torch
 from numpy.typing import NDArray
 from safetensors import safe_open
-from torch import Tensor, nn
+from torch import Tensor
 
 from ddqn_planner.files import write_atomically
 from ddqn_planner.grid import MOVES, Cell, MoveRule
-from ddqn_planner.model import ModelMetadata, new_network, package_version, save_model
+from ddqn_planner.model import ModelMetadata, package_version, save_model
 from ddqn_planner.planning import Planner
 from ddqn_planner.training import ranks
 from ddqn_planner.training.double_dqn import double_dqn_loss
+from ddqn_planner.training.encoders import ENCODERS
 from ddqn_planner.training.environment import GridVectorEnvironment, Scenario
 from ddqn_planner.training.hyper_parameters import HyperParameters
-from ddqn_planner.training.learners import LEARNERS
 from ddqn_planner.training.memory import MemoryShortageError, check_memory
+from ddqn_planner.training.networks import TrainableNetwork
 from ddqn_planner.training.replay_buffer import ReplayBuffer, Transitions
 
 CHECKPOINT_KEY = "ddqn_planner_checkpoint"
@@ -114,12 +115,13 @@ class Trainer:
         self.environment.np_random = np.random.default_rng(environment)
         self._exploration = np.random.default_rng(exploration)
         self._sampling = np.random.default_rng(replay)
-        self._learner = LEARNERS[parameters.network](self.environment)
+        self._encoder = ENCODERS[parameters.network](self.environment)
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(int(weights.generate_state(1)[0]))
-            self.network = new_network(parameters.network, self._learner.sizes)
+            sizes = parameters.network_sizes(self.environment.shape)
+            self.network = self._encoder.module_class(**sizes)
         self._target = copy.deepcopy(self.network).requires_grad_(False)
-        self._learner.copy_target(self._target)
+        self._encoder.update_target(self._target)
         self._weights = tuple(self.network.parameters())
         self._optimiser = torch.optim.Adam(self._weights, parameters.learning_rate, fused=FUSED)
         self._replay = ReplayBuffer(parameters.replay_capacity)
@@ -172,7 +174,7 @@ class Trainer:
         if greedy.any():
             with torch.inference_mode():
                 q_NA = self._q(self.network)(
-                    self._learner.states(environment.scenario, environment.cell)
+                    self._encoder.states(environment.scenario, environment.cell)
                 )
             actions[greedy] = q_NA.argmax(dim=1).numpy()[greedy]
         return actions
@@ -181,20 +183,20 @@ class Trainer:
         """Make one Double DQN update on a batch from the replay buffer."""
         p = self.parameters
         batch = self._replay.sample(p.batch_size, self._sampling)
-        states = self._learner.states(
+        states = self._encoder.states(
             np.tile(batch.scenario, 2), np.concatenate([batch.cell, batch.next_cell])
         )
         state, next_state = states.chunk(2)
         online, target = self._q(self.network), self._q(self._target)
-        choose, judge = {
+        selection, evaluation = {
             "double_dqn": (online, target),
             "dqn": (target, target),
             "printed": (online, online),
         }[p.target]
         loss = double_dqn_loss(
             online,
-            choose,
-            judge,
+            selection,
+            evaluation,
             state,
             torch.from_numpy(batch.action),
             torch.from_numpy(batch.reward),
@@ -209,10 +211,10 @@ class Trainer:
         self.updates += 1
         if self.updates % p.target_interval == 0:
             self._target.load_state_dict(self.network.state_dict())
-            self._learner.copy_target(self._target)
+            self._encoder.update_target(self._target)
 
-    def _q(self, network: nn.Module) -> Callable[[Tensor], Tensor]:
-        return partial(self._learner.q, network)
+    def _q(self, network: TrainableNetwork) -> Callable[[Tensor], Tensor]:
+        return partial(self._encoder.q, network)
 
     def _begin_again(
         self, ended: NDArray[np.bool_], terminated: NDArray[np.bool_]
@@ -251,14 +253,13 @@ class Trainer:
 
     def planner(self) -> Planner:
         """Return a planner with a copy of the network as it is now."""
-        network = copy.deepcopy(self.network).requires_grad_(False)
-        return Planner(network, self.metadata())
+        return Planner(self.network.to_numpy(), self.metadata())
 
     def metadata(self) -> ModelMetadata:
         """Return what a model file says of the network as it is now."""
         return ModelMetadata(
             network=self.parameters.network,
-            sizes=self._learner.sizes,
+            sizes=self.network.sizes,
             move_rule=self.move_rule,
             gamma=self.parameters.gamma,
             map_fingerprint=self.scenarios[0].grid.fingerprint,
@@ -269,7 +270,7 @@ class Trainer:
 
     def save_model(self, path: str | Path) -> None:
         """Write the network as it is now to a model file; see `save_model` for errors."""
-        save_model(path, self.network, self.metadata())
+        save_model(path, self.network.to_numpy(), self.metadata())
 
     def save_checkpoint(self, path: str | Path) -> None:
         """Write all that `load_checkpoint` needs to go on as if nothing had happened.
@@ -379,7 +380,7 @@ class Trainer:
     def _restore(self, description: dict[str, Any], tensors: dict[str, Tensor]) -> None:
         self.network.load_state_dict(_unprefixed("network", tensors))
         self._target.load_state_dict(_unprefixed("target", tensors))
-        self._learner.copy_target(self._target)
+        self._encoder.update_target(self._target)
         optimiser = self._optimiser.state_dict()
         count = len(optimiser["param_groups"][0]["params"]) if self.updates else 0
         optimiser["state"] = {

@@ -10,9 +10,9 @@ from typing import Any
 
 import numpy as np
 import pytest
-import torch
 from hypothesis import given
 from hypothesis import strategies as st
+from networks import random_network
 
 from ddqn_planner import cli
 from ddqn_planner.cli import main
@@ -46,7 +46,7 @@ from ddqn_planner.grid import (
     save_map,
 )
 from ddqn_planner.grid.generators import KINDS
-from ddqn_planner.model import ModelMetadata, PropagationQNetwork
+from ddqn_planner.model import ModelMetadata
 from ddqn_planner.model.model_file import save_model
 from ddqn_planner.planning import Planner, shortest_distances
 
@@ -405,9 +405,9 @@ def test_mpd_goals_on_obstacles_are_refused(
 @pytest.fixture
 def model(tmp_path: Path) -> str:
     """A network that takes every move as possible: the mask makes it solve what is convex."""
-    network = PropagationQNetwork(filters=4)
-    torch.nn.init.zeros_(network.moves.weight)
-    torch.nn.init.ones_(network.moves.bias)
+    network = random_network("propagation", filters=4)
+    network.tensors["moves.weight"].fill(0)
+    network.tensors["moves.bias"].fill(1)
     save_model(tmp_path / "model.safetensors", network, METADATA)
     return str(tmp_path / "model.safetensors")
 

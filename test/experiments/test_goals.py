@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from networks import random_network
 from strategies import grids_with_free_cell
 
 pytest.importorskip("pathfinding", reason="pathfinding, of the extra experiments, is missing")
@@ -22,7 +23,7 @@ from ddqn_planner.experiments.goal_3 import fixed_walk, noisy_maps
 from ddqn_planner.experiments.profiles import MOVE_RULE, PROFILES, VARIANTS, variant
 from ddqn_planner.experiments.trainings import TrainingEvaluation
 from ddqn_planner.grid import MOVES, Cell, GridMap, MoveRule, Noise, legal_moves, path_length
-from ddqn_planner.model import AnyMapQNetwork, ModelMetadata, PropagationQNetwork
+from ddqn_planner.model import ModelMetadata
 from ddqn_planner.planning import Planner, shortest_distances, shortest_path
 from ddqn_planner.planning.evaluation import length_ratios
 from ddqn_planner.training.environment import Scenario
@@ -65,8 +66,8 @@ def test_a_row_tells_from_when_on_a_path_is_found_and_is_the_shortest() -> None:
 def test_moves_are_judged_wrongly_that_are_legal_and_not_believed_or_the_other_way_round(
     possible: bool, wrong: bool
 ) -> None:
-    network = AnyMapQNetwork(filters=2).requires_grad_(False)
-    network.moves.bias.fill_(100.0 if possible else -100.0)
+    network = random_network("any_map", filters=2)
+    network.tensors["moves.bias"].fill(100.0 if possible else -100.0)
     metadata = ModelMetadata("any_map", {"filters": 2}, MOVE_RULE, 0.95, "", 0, 0, "")
     judged, _ = any_map._judgement(Planner(network, metadata))
     # A straight move is legal in half of the 256 surroundings of a free cell. A diagonal one too
@@ -77,9 +78,9 @@ def test_moves_are_judged_wrongly_that_are_legal_and_not_believed_or_the_other_w
 
 def test_every_start_of_a_field_is_walked(paper: Scenario) -> None:
     metadata = ModelMetadata("propagation", {"filters": 2}, MOVE_RULE, 0.95, "", 0, 0, "")
-    network = PropagationQNetwork(2).requires_grad_(False)
+    network = random_network("propagation", filters=2)
     # Told that every move succeeds: its walks go straight to the goal, and are trapped by walls.
-    network.moves.bias.fill_(100.0)
+    network.tensors["moves.bias"].fill(100.0)
     planner = Planner(network, metadata)
     field = planned_field(planner, paper)
     ratios = length_ratios(field, paper.grid, MOVE_RULE)
@@ -92,8 +93,8 @@ def test_every_start_of_a_field_is_walked(paper: Scenario) -> None:
 
 def test_the_q_that_the_loss_trains_adds_up_the_papers_rewards(paper: Scenario) -> None:
     metadata = ModelMetadata("propagation", {"filters": 2}, MOVE_RULE, 0.95, "", 0, 0, "")
-    network = PropagationQNetwork(2).requires_grad_(False)
-    network.moves.bias.fill_(100.0)
+    network = random_network("propagation", filters=2)
+    network.tensors["moves.bias"].fill(100.0)
     field = trained_field(Planner(network, metadata), paper)
     goal_x, goal_y = paper.goal
     assert field.q[0, goal_y, goal_x - 1] == pytest.approx(10.0, abs=1e-3)

@@ -10,15 +10,15 @@ from typing import Any
 
 import numpy as np
 import pytest
-import torch
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped, Quaternion
 from nav_msgs.msg import OccupancyGrid, Path
 from nav_msgs.srv import GetPlan
+from networks import turning_network
 from std_msgs.msg import Header
 
 from ddqn_planner.grid import Cell, GridMap, MoveRule, legal_moves
-from ddqn_planner.model import ModelMetadata, PaperQNetwork, save_model
+from ddqn_planner.model import ModelMetadata, save_model
 from ddqn_planner.nodes.conversions import occupancy_message, quaternion
 from ddqn_planner.nodes.runtime import LATCHED
 
@@ -173,10 +173,6 @@ def changed(message: Any, field: str, value: Any) -> Any:
 
 def constant_model(path: FilePath, size: int, steps: int) -> None:
     """Write a model that always goes to -x, or where it cannot, to +x: it turns round for ever."""
-    network = PaperQNetwork(size, size, 1)
-    with torch.no_grad():
-        network.fully_connected.weight.zero_()
-        network.fully_connected.bias.copy_(torch.tensor([1, 0, 0, 0, 2, 0, 0, 0]))
-    sizes = {"height": size, "width": size, "filters": 1}
-    metadata = ModelMetadata("paper", sizes, MoveRule.ROBOT_SAFE, 0.9, "", steps, 0, "")
+    network = turning_network(size)
+    metadata = ModelMetadata("paper", network.sizes, MoveRule.ROBOT_SAFE, 0.9, "", steps, 0, "")
     save_model(path, network, metadata)

@@ -9,14 +9,14 @@ from typing import Any
 
 import numpy as np
 import pytest
-import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from networks import random_network
 from strategies import grids_in_parts, grids_with_costs, grids_with_free_cell
 
 from ddqn_planner import GridMap, MoveRule, PlanMethod, Planner, PlanStatus, QField, inflate
 from ddqn_planner.grid import LENGTHS, MOVES, Cell, connected_cells, legal_moves, path_cost
-from ddqn_planner.model import ModelMetadata, PaperQNetwork
+from ddqn_planner.model import ModelMetadata
 from ddqn_planner.planning import shortest_distances
 from ddqn_planner.planning.evaluation import evaluate
 from ddqn_planner.planning.problem import Problem, solve
@@ -37,9 +37,8 @@ def perfect_field(grid: GridMap, goal: Cell, rule: MoveRule) -> QField:
 
 
 def random_planner(height: int, width: int, seed: int) -> Planner:
-    torch.manual_seed(seed)
-    network = PaperQNetwork(height, width, filters=4).requires_grad_(False)
-    sizes = {"height": height, "width": width, "filters": 4}
+    sizes = {"height": height, "width": width, "filters": 4, "hidden_units": 0}
+    network = random_network("paper", seed, **sizes)
     return Planner(
         network, ModelMetadata("paper", sizes, MoveRule.CORNER_CUTTING, 0.95, "", 0, seed, "")
     )
@@ -395,7 +394,7 @@ def test_whatever_is_wrong_with_the_values_the_search_finds_a_path() -> None:
     grid = GridMap(np.zeros((6, 6)))
     for bias in (np.nan, np.inf, -np.inf, 1e38):
         planner = random_planner(6, 6, 0)
-        planner.network.fully_connected.bias.fill_(bias)  # type: ignore[attr-defined]
+        planner.network.tensors["fully_connected.bias"].fill(bias)
         plan = planner.plan(grid, (0, 0), (5, 3), method=PlanMethod.ASTAR_FALLBACK)
         check_legal(plan.cells, grid.occupancy, MoveRule.CORNER_CUTTING)
         assert plan.cells[-1] == (5, 3)

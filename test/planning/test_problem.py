@@ -4,22 +4,19 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-import torch
+from networks import turning_network
 
 from ddqn_planner.grid import GridMap, MoveRule
-from ddqn_planner.model import ModelMetadata, PaperQNetwork
+from ddqn_planner.model import ModelMetadata
 from ddqn_planner.planning import PlanMethod, Planner, PlanStatus
 from ddqn_planner.planning.problem import Problem, search_on, solve
 
 
 def turning_planner() -> Planner:
     """Return one that goes to -x, or where it cannot, to +x: its greedy steps are trapped."""
-    network = PaperQNetwork(6, 6, 1)
-    with torch.no_grad():
-        network.fully_connected.weight.zero_()
-        network.fully_connected.bias.copy_(torch.tensor([1, 0, 0, 0, 2, 0, 0, 0]))
-    sizes = {"height": 6, "width": 6, "filters": 1}
-    return Planner(network, ModelMetadata("paper", sizes, MoveRule.ROBOT_SAFE, 0.9, "", 1, 0, ""))
+    network = turning_network(6)
+    metadata = ModelMetadata("paper", network.sizes, MoveRule.ROBOT_SAFE, 0.9, "", 1, 0, "")
+    return Planner(network, metadata)
 
 
 @pytest.mark.parametrize("simplified", [False, True])
