@@ -89,8 +89,7 @@ class PlannerNode(BaseNode):
         self._settings = Settings.of(self)
 
         self._worker = Worker(self)
-        # What takes milliseconds must not wait for the fields of other requests: one of 2000 x 2000
-        # cells takes more than a second.
+        # What takes milliseconds must not wait for fields: 2000 x 2000 cells take over a second.
         self._quick_worker = Worker(self)
         # While it loads, DDS discovers, and the node says what else is missing.
         self._first_planner = self._worker.call(load_and_warm_up, self.get_parameter("model").value)
@@ -318,8 +317,8 @@ class PlannerNode(BaseNode):
         header = Header(stamp=self.get_clock().now().to_msg(), frame_id=frame)
         if outcome.request is None:
             return Path(header=header), outcome
-        cells, grid = outcome.plan.cells, outcome.request.grid
-        return path_message(cells, grid, header, goal.pose.orientation), outcome
+        grid, rotation = outcome.request.grid, goal.pose.orientation
+        return path_message(outcome.plan.cells, grid, header, rotation), outcome
 
     async def _plan(
         self, start: PoseStamped | None, goal: PoseStamped, tolerance: float
@@ -393,9 +392,8 @@ def main() -> NoReturn:
     # glibc returns large arrays at once: after 120 fields the process has 185 MB instead of 245.
     with suppress(AttributeError):  # another C library
         ctypes.CDLL(None).mallopt(-3, 2**20)  # M_MMAP_THRESHOLD
-    exit_code = spin_until_shutdown(PlannerNode, declare_parameters)
     # A field that is being computed cannot be stopped, and Python would wait for its thread.
-    os._exit(exit_code)
+    os._exit(spin_until_shutdown(PlannerNode, declare_parameters))
 
 
 if __name__ == "__main__":

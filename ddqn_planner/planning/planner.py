@@ -65,15 +65,9 @@ class Planner:
         return cls(*load_model(model))
 
     def q_field(self, grid: GridMap, goal: Cell, move_rule: MoveRule | str | None = None) -> QField:
-        """Return the Q field of a map toward a goal, computed or from the cache.
+        """Return the Q field of a map toward a goal, a free cell, computed or from the cache.
 
-        Parameters
-        ----------
-        grid : GridMap
-        goal : (x, y)
-            A free cell.
-        move_rule : MoveRule, optional
-            By default the rule that the model was trained for.
+        The move rule is by default the one that the model was trained for.
 
         Raises
         ------
