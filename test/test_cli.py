@@ -252,6 +252,7 @@ def test_the_model_for_any_map_is_trained_with_parameters_of_its_own(tmp_path: P
     assert (trainer.parameters, trainer.seed) == (replace(ANY_MAP, steps=128), 4)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_an_interrupted_training_is_saved_and_goes_on(
     small_map: str, tmp_path: Path, number: int
@@ -275,6 +276,7 @@ def test_an_interrupted_training_is_saved_and_goes_on(
     assert load_model(tmp_path / "run" / "model.safetensors")[1].steps == steps + 100
 
 
+@pytest.mark.slow
 def test_reproduce_runs_every_experiment_and_writes_its_report(
     capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
@@ -299,6 +301,7 @@ def test_reproduce_runs_every_experiment_and_writes_its_report(
     assert trained == {path: path.stat().st_mtime_ns for path in trained}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_interrupted_experiments_end_with_all_their_processes(tmp_path: Path, number: int) -> None:
     executable = Path(sysconfig.get_path("scripts")) / "ddqn-planner"
@@ -322,6 +325,7 @@ def test_reproduce_refuses_less_than_one_seed(capsys: pytest.CaptureFixture[str]
     assert "--seeds is 0; give at least 1" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_reproduce_may_be_asked_for_one_reading_of_goal_3(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -19,7 +19,6 @@ from ddqn_planner.files import write_csv
 from ddqn_planner.grid import OCCUPIED, UNKNOWN, GridMap, MoveRule, legal_moves, move_costs
 from ddqn_planner.grid.generators import generate_map, random_costs
 from ddqn_planner.model import AnyMapQNetwork
-from ddqn_planner.model.observation import patch_features
 from ddqn_planner.planning import Planner
 from ddqn_planner.training.any_map import ANY_MAP, RULES, random_scenarios
 from ddqn_planner.training.environment import paper_scenario
@@ -148,8 +147,8 @@ def _judgement(planner: Planner) -> tuple[int, float]:
     for rule in RULES:
         truth = [_truth(values, rule) for values in costs_B9]
         legal_BA, multiplier_BA = map(np.stack, zip(*truth, strict=True))
-        p_BA = network.success(patch_features(seen_B9, rule))
-        learned_BA = network.multiplier(patch_features(costs_B9, rule))
+        p_BA = network.success(network.features(seen_B9, rule))
+        learned_BA = network.multiplier(network.features(costs_B9, rule))
         wrong += int(((p_BA > 0.5) != legal_BA).sum())
         errors.append(np.abs(learned_BA / multiplier_BA - 1)[legal_BA])
     return wrong, float(np.concatenate(errors).mean())

@@ -1,4 +1,4 @@
-"""Connected parts of a map, compiled. scipy has the same, and takes 0.2 s to import."""
+"""Connected components of a map, compiled: scipy has them too, and takes 0.2 s to import."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from ddqn_planner.compiled import compiled
 
 
 def label_cells(free: NDArray[np.bool_], moves: NDArray[np.int64]) -> NDArray[np.int32]:
-    """Label the connected parts of the free cells from 1, in the order of their first cells.
+    """Label the connected components of the free cells from 1, in the order of their first cells.
 
     Parameters
     ----------
@@ -31,7 +31,7 @@ def label_cells(free: NDArray[np.bool_], moves: NDArray[np.int64]) -> NDArray[np
 @compiled
 def _labels(free, offsets):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Return the label of each cell of a padded map: (C,) int32, by union-find."""
-    parent = np.arange(free.size, dtype=np.int32)  # of the same part, and never after the cell
+    parent = np.arange(free.size, dtype=np.int32)  # in its component, never after the cell
     for cell in range(free.size):
         if not free[cell]:
             continue

@@ -84,7 +84,8 @@ def save_picture(
         finite = np.where(np.isfinite(value), value, np.nan)
         colours = LinearSegmentedColormap.from_list("value", VALUE_COLOURS)
         image = axes.imshow(finite, origin="lower", cmap=colours, interpolation="nearest")
-        figure.colorbar(image, label=value_label, shrink=0.85, aspect=20 * tall)
+        bar = axes.inset_axes((1.02, 0, 0.035, 1))  # as high as the map
+        figure.colorbar(image, bar, label=value_label)
     draw_obstacles(axes, grid)
     if cells:
         _draw_path(axes, cells)

@@ -67,7 +67,7 @@ def training_bytes(scenarios: Sequence[Scenario], parameters: HyperParameters) -
         batch = 4 * max(update, step)
     else:
         # Per cell of each map: features, and two layers or the six arrays of the propagation.
-        batch = maps * cells * 4 * (network.features + max(2 * p.filters, 6 * 8))
+        batch = maps * cells * 4 * (network.inputs + max(2 * p.filters, 6 * 8))
     # Two networks, the gradient and Adam's two means stay, with 40 bytes per transition. A save
     # makes two copies of all these except the gradient.
     replay = 40 * p.replay_capacity

@@ -34,6 +34,7 @@ def evaluation(step: int, solved: int) -> TrainingEvaluation:
     return TrainingEvaluation(step, 0, 0, 0.0, solved, solved, 1.0, 0.0)
 
 
+@pytest.mark.slow
 def test_a_training_that_was_cut_off_ends_as_if_it_had_not_been(
     small: Scenario, tmp_path: Path
 ) -> None:
@@ -73,6 +74,7 @@ def test_the_over_estimation_is_that_of_the_free_cells_but_the_goal(small: Scena
     assert found.overestimation == pytest.approx(expected, rel=1e-5)
 
 
+@pytest.mark.slow
 def test_what_a_job_raises_is_raised(small: Scenario, tmp_path: Path) -> None:
     training = Training("small", QUICK, (small,), seed=1, evaluation_interval=300)
     train(training, tmp_path)

@@ -38,6 +38,7 @@ from std_srvs.srv import Trigger
 
 from ddqn_planner.grid import MOVES, GridMap, MoveRule, legal_moves, read_map_file
 from ddqn_planner.model import load_model
+from ddqn_planner.nodes import trainer_node
 from ddqn_planner.nodes.conversions import occupancy_message, quaternion
 from ddqn_planner.nodes.runtime import LATCHED
 from ddqn_planner.training.environment import Scenario
@@ -354,18 +355,27 @@ def test_bad_input_is_refused_by_name_and_the_training_continues(
 
 
 @pytest.fixture(scope="module")
-def training(
+def trainer(
     run_node: Any, make_client: Any, small_values: Any, tmp_path_factory: pytest.TempPathFactory
 ) -> Any:
-    """A trainer that trains, and its diagnostics."""
+    """A trainer that can train, and its diagnostics."""
     namespace = "/training"
     client = make_client(namespace)
     folder = tmp_path_factory.mktemp("training")
     with run_node("trainer_node", {**ENDLESS, "output_folder": str(folder)}, namespace=namespace):
         diagnostics = Listener(client, DiagnosticArray, "/diagnostics")
         set_up(client, small_values, stamped(0.5, 0.5), stamped(5.5, 5.5))
-        start_training(client)
         yield client, diagnostics, namespace
+
+
+@pytest.fixture
+def training(trainer: Any) -> Any:
+    """A trainer that trains during the test, but not beside the tests after it."""
+    client, diagnostics, namespace = trainer
+    start_training(client)
+    yield trainer
+    client.call(Trigger, "trainer/stop")
+    wait_for_state(diagnostics, namespace, state="stopped")
 
 
 def test_a_folder_with_another_training_is_left_alone(
@@ -397,12 +407,11 @@ def test_a_folder_with_another_training_is_left_alone(
     ],
 )
 def test_a_node_does_not_start_with_an_invalid_parameter(
-    run_node: Any, namespace: str, parameters: dict[str, Any], reason: str
+    log_of_refused_start: Any, parameters: dict[str, Any], reason: str
 ) -> None:
-    with run_node("trainer_node", parameters, namespace=namespace, exit_code=1) as node:
-        assert node.process.wait(TIMEOUT) == 1
-    assert re.search(reason, node.log)
-    assert "Traceback" not in node.log
+    log = log_of_refused_start(trainer_node.main, parameters)
+    assert re.search(reason, log)
+    assert "Traceback" not in log
 
 
 def test_a_map_file_that_cannot_be_read_ends_the_start_with_its_reason(run_node: Any) -> None:
@@ -441,9 +450,9 @@ def message_of(name: str, value: Any) -> Any:
     ],
 )
 def test_an_invalid_value_is_refused_with_its_reason_and_nothing_is_half_set(
-    training: Any, name: str, value: Any, reason: str
+    trainer: Any, name: str, value: Any, reason: str
 ) -> None:
-    client, _, _ = training
+    client, _, _ = trainer
     good = [message_of("replay_capacity", 3000), message_of("epsilon_end", 0.2)]
     assert set_atomically(client, *good).successful
     for order in (1, -1):
@@ -460,16 +469,16 @@ def test_an_invalid_value_is_refused_with_its_reason_and_nothing_is_half_set(
     assert not result.successful
 
 
-def test_values_that_limit_one_another_can_be_set_together(training: Any) -> None:
-    client, _, _ = training
+def test_values_that_limit_one_another_can_be_set_together(trainer: Any) -> None:
+    client, _, _ = trainer
     both = message_of("environments", 4096), message_of("replay_capacity", 4096)
     assert set_atomically(client, *both).successful
     both = message_of("replay_capacity", 50_000), message_of("environments", 1)
     assert set_atomically(client, *both).successful
 
 
-def test_a_value_of_an_unknown_type_is_refused(training: Any) -> None:
-    client, _, _ = training
+def test_a_value_of_an_unknown_type_is_refused(trainer: Any) -> None:
+    client, _, _ = trainer
     strange = ParameterMessage(name="seed", value=ParameterValue(type=77))
     assert "ParameterType" in set_atomically(client, strange).reason
     request = SetParameters.Request(parameters=[strange, message_of("seed", 7)])
@@ -478,8 +487,8 @@ def test_a_value_of_an_unknown_type_is_refused(training: Any) -> None:
     assert client.get_parameter("trainer", "seed") == 7
 
 
-def test_each_parameter_says_what_may_be_set(training: Any) -> None:
-    client, _, _ = training
+def test_each_parameter_says_what_may_be_set(trainer: Any) -> None:
+    client, _, _ = trainer
     names = client.call(ListParameters, "trainer/list_parameters").result.names
     own = [name for name in names if name not in ("use_sim_time", "start_type_description_service")]
     request = DescribeParameters.Request(names=own)

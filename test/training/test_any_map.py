@@ -35,6 +35,8 @@ def evaluation_of(planner: Planner, grid: GridMap, rule: MoveRule) -> Evaluation
     return evaluate(planner.q_field(grid, goal, rule).unmasked(), grid, rule)
 
 
+@pytest.mark.slow
+@pytest.mark.xdist_group("any_map")
 @pytest.mark.parametrize("rule", RULES)
 @pytest.mark.parametrize("kind", ["maze", "rooms", "corridors", "dead_ends", "office"])
 def test_training_on_small_random_maps_learns_the_moves_on_other_types_and_sizes_of_maps(
@@ -46,6 +48,8 @@ def test_training_on_small_random_maps_learns_the_moves_on_other_types_and_sizes
     assert evaluation.worst_ratio < 1.3
 
 
+@pytest.mark.slow
+@pytest.mark.xdist_group("any_map")
 @pytest.mark.parametrize("rule", RULES)
 def test_costs_and_unknown_cells_are_learned_with_them(planner: Planner, rule: MoveRule) -> None:
     random = np.random.default_rng(2)

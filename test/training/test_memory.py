@@ -53,6 +53,7 @@ print(peak() - before)
 """The memory that a training takes beyond a small one of its kind."""
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("side", "maps", "more"),
     [

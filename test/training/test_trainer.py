@@ -57,6 +57,7 @@ def test_the_other_targets_learn_the_small_map_too(small: Scenario, target: str)
     assert trainer.planner().plan(small.grid, small.start, small.goal).cells
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("rule", MoveRule)
 def test_the_propagation_network_learns_what_a_move_does_for_maps_of_any_size(
     small: Scenario, paper: Scenario, rule: MoveRule
