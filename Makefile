@@ -1,4 +1,4 @@
-# make setup | demo | test | test-fast | lint | format | types | bench | body | faults | fuzz | load | soak | model | model-dilemma
+# make setup | demo | test | test-fast | docs | lint | format | types | bench | body | faults | fuzz | load | soak | model | model-dilemma
 PYTHON ?= python3
 TORCH ?= torch==2.13.0
 VENV := .venv
@@ -12,7 +12,7 @@ else
 EXTRAS := experiments,figures,ros,tensorboard,test,watch
 endif
 
-.PHONY: setup demo test test-fast lint format types bench body faults fuzz load soak model model-dilemma
+.PHONY: setup demo test test-fast docs lint format types bench body faults fuzz load soak model model-dilemma
 .DEFAULT_GOAL := help
 
 .PHONY: help
@@ -40,6 +40,11 @@ test: setup
 # No ROS and nothing slow: for every save.
 test-fast: setup
 	$(PYTEST) --ignore test/integration -m "not slow"
+
+# The site, in docs/_build/html; a warning is an error.
+docs: setup
+	$(BIN)/pip install --quiet --editable ".[$(EXTRAS),docs]"
+	$(BIN)/python -m sphinx --quiet --fail-on-warning --keep-going --fresh-env docs docs/_build/html
 
 lint: setup
 	$(BIN)/ruff check .

@@ -24,7 +24,7 @@ from rcl_interfaces.srv import GetParameters, ListParameters
 from std_srvs.srv import Trigger
 
 from ddqn_planner import GridMap, MoveRule, Planner, load_map
-from ddqn_planner.experiments.generalisation import compare_with_dijkstra
+from ddqn_planner.benchmarks.generalisation import compare_with_dijkstra
 from ddqn_planner.experiments.goal_1 import a_star
 from ddqn_planner.grid import Cell, save_map
 from ddqn_planner.grid.generators import KINDS, generate_map, random_requests
@@ -78,7 +78,7 @@ def compare_single_queries(side: int) -> None:
     def with_known_field(start: Cell, goal: Cell) -> object:
         return planner.plan(grid, start, goal, RULE)
 
-    def pathfinding(start: Cell, goal: Cell) -> object:
+    def own_a_star(start: Cell, goal: Cell) -> object:
         return a_star(Scenario(grid, start, goal), RULE)
 
     def pyastar(start: Cell, goal: Cell) -> object:
@@ -89,7 +89,7 @@ def compare_single_queries(side: int) -> None:
     planners: dict[str, Callable[[Cell, Cell], object]] = {
         "ours, new field": with_new_field,
         "ours, known field": with_known_field,
-        "pathfinding A*, its grid made anew": pathfinding,
+        "our A*": own_a_star,
         "pyastar2d A* (cuts corners, a diagonal counts 1)": pyastar,
     }
     for name, plan in planners.items():

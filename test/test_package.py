@@ -12,7 +12,17 @@ import pytest
 from ddqn_planner.resources import find_map, find_resource
 
 ROOT = Path(__file__).resolve().parent.parent
-ROOMS = ["grid", "model", "planning", "training", "experiments", "nodes"]
+ROOMS = [
+    "grid",
+    "model",
+    "planning",
+    "pictures",
+    "training",
+    "benchmarks",
+    "experiments",
+    "nodes",
+    "commands",
+]
 
 
 @pytest.mark.parametrize("room", ROOMS)
@@ -29,7 +39,10 @@ def test_imports_run_downwards(room: str) -> None:
 
 
 def test_the_core_works_without_ros() -> None:
-    code = "import sys; sys.modules['rclpy'] = None; import ddqn_planner, ddqn_planner.cli"
+    code = (
+        "import sys; sys.modules['rclpy'] = None; import ddqn_planner, ddqn_planner.cli\n"
+        "from ddqn_planner.commands import evaluate, plan, train_any_map"
+    )
     subprocess.run([sys.executable, "-c", code], check=True)
 
 

@@ -1,4 +1,4 @@
-"""Compares the greedy rollouts of a Q field, one from each free cell, with the exact optimum."""
+"""How good a Q field is: its greedy rollout from every free cell, against the exact optimum."""
 
 from __future__ import annotations
 
@@ -13,34 +13,26 @@ from ddqn_planner.planning import QField
 
 @dataclass(frozen=True)
 class Evaluation:
-    """The greedy rollouts of one Q field.
-
-    Parameters
-    ----------
-    starts : int
-        Free cells, without the goal, from which a path exists.
-    solved : int
-        How many of their rollouts reach the goal.
-    mean_ratio, worst_ratio : float
-        Cost of these rollouts over the optimum, at least 1; NaN if none reaches the goal.
-    """
+    """The greedy rollouts of one Q field."""
 
     starts: int
+    """Free cells, except the goal, from which a path exists."""
     solved: int
+    """The starts whose rollout reaches the goal."""
     mean_ratio: float
     worst_ratio: float
+    """Length of the solved rollouts over the optimum, at least 1; NaN if none is solved."""
 
 
 def length_ratios(field: QField, grid: GridMap, move_rule: MoveRule) -> NDArray[np.float64]:
-    """Return the cost of the rollout from each cell over that of the cheapest path.
+    """Return the length of the greedy rollout from each cell over that of the shortest path.
 
-    On a map without costs, these are lengths. Field and map belong together, under this rule.
+    On a map with costs these are the costs of the rollout and of the cheapest path.
 
     Returns
     -------
     (H, W) float64
-        At least 1; infinite where the rollout is trapped; NaN at the goal and where no path leads
-        to it.
+        At least 1; infinite if the rollout is trapped, NaN at the goal and in cells without a path.
     """
     optimum = shortest_distances(grid, field.goal, move_rule)
     ratios, multiplier = np.full(optimum.shape, np.nan), grid.cost_multiplier
@@ -53,7 +45,7 @@ def length_ratios(field: QField, grid: GridMap, move_rule: MoveRule) -> NDArray[
 
 
 def evaluate(field: QField, grid: GridMap, move_rule: MoveRule) -> Evaluation:
-    """Make a rollout from every free cell that a path joins to the goal; see `length_ratios`."""
+    """Summarise `length_ratios` of a field."""
     ratios = length_ratios(field, grid, move_rule)
     solved = ratios[np.isfinite(ratios)]
     return Evaluation(

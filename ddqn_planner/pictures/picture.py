@@ -21,7 +21,7 @@ MAX_TEXT_WIDTH = 64
 """Cells of the widest map that is worth printing as text: a cell takes two characters."""
 
 
-class PictureError(RuntimeError):
+class PictureError(ImportError):
     """A picture cannot be drawn; the message says what is missing."""
 
 

@@ -37,9 +37,7 @@ def test_action_k_points_at_k_times_45_degrees() -> None:
 
 
 @given(occupancies, RULES)
-def test_legal_moves_are_those_of_the_rule_cell_by_cell(
-    occupancy: np.ndarray, rule: MoveRule
-) -> None:
+def test_legal_moves_follow_the_rule_in_each_cell(occupancy: np.ndarray, rule: MoveRule) -> None:
     grid, legal = GridMap(occupancy), legal_moves(occupancy, rule)
     for y in range(grid.height):
         for x in range(grid.width):
@@ -61,7 +59,7 @@ def test_neighbours_are_numbered_row_by_row_and_outside_comes_last(shape: tuple[
 
 
 @given(grids_with_free_cell(), RULES)
-def test_connected_cells_are_those_at_finite_distance(
+def test_connected_cells_have_a_finite_distance(
     grid_and_cell: tuple[GridMap, tuple[int, int]], rule: MoveRule
 ) -> None:
     grid, cell = grid_and_cell

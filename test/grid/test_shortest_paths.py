@@ -55,7 +55,7 @@ def test_any_pair_of_whole_numbers_is_a_goal() -> None:
             shortest_distances(grid, outside, "unit")
 
 
-def test_columns_of_the_graph_are_in_order_and_short_numbers() -> None:
+def test_columns_of_the_graph_are_sorted_and_int32() -> None:
     graph = _graph(GridMap(np.zeros((7, 5))), MoveRule.ROBOT_SAFE)
     assert graph.indices.dtype == graph.indptr.dtype == np.int32
     graph.has_sorted_indices = graph.has_canonical_format = False
