@@ -43,7 +43,7 @@ setup(
     extras_require={
         "ros": ["ros-jazzy-rclpy[fastrtps]>=7.1.5,<8", "ros-jazzy-common-interfaces>=5.3,<6"],
         "figures": ["matplotlib>=3.6"],
-        "experiments": ["matplotlib>=3.6", "pathfinding>=1.0.9"],
+        "experiments": ["matplotlib>=3.6"],
         "tensorboard": ["tensorboard>=2.10"],
         "watch": ["rerun-sdk>=0.39"],
         "docs": ["furo", "myst-parser>=3.0", "sphinx>=7.3"],
@@ -55,6 +55,7 @@ setup(
             "hypothesis>=6.80",
             "mypy>=1.10",
             "pytest>=7.4",
+            "pytest-xdist>=3.5",
             "ruff>=0.9",
             "types-PyYAML",
             "types-tqdm",

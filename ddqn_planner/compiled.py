@@ -4,7 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import cache, wraps
+from threading import Lock
 from typing import Any
+
+_importing = Lock()
 
 
 def compiled(function: Callable[..., Any]) -> Callable[..., Any]:
@@ -12,8 +15,7 @@ def compiled(function: Callable[..., Any]) -> Callable[..., Any]:
 
     @cache
     def dispatcher() -> Callable[..., Any]:
-        import numba
-
+        numba = _import_numba()
         try:
             with_cache: Callable[..., Any] = numba.njit(cache=True, nogil=True)(function)
             return with_cache
@@ -26,3 +28,22 @@ def compiled(function: Callable[..., Any]) -> Callable[..., Any]:
         return dispatcher()(*arguments)
 
     return call
+
+
+def _import_numba() -> Any:
+    """Import numba without scipy.linalg, which takes 0.2 s and no function here needs.
+
+    numba imports it to check for a BLAS, and checks again when it compiles a function that needs
+    one: the first check can be left out.
+    """
+    import numba
+    from numba.np import linalg
+
+    with _importing:
+        check = linalg.ensure_blas
+        linalg.ensure_blas = lambda: None
+        try:
+            from numba.np import arraymath  # noqa: F401
+        finally:
+            linalg.ensure_blas = check
+    return numba

@@ -11,7 +11,7 @@ sys.path.insert(0, str(DOCS.parent))
 
 project = "ddqn_planner"
 author = "ddqn_planner maintainers"
-copyright = "ddqn_planner maintainers, Apache-2.0"  # noqa: A001
+copyright = "ddqn_planner maintainers, Apache-2.0"
 release = ElementTree.parse(DOCS.parent / "package.xml").findtext("version")
 
 extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "sphinx.ext.viewcode"]

@@ -1,4 +1,7 @@
-"""What the robot moves on: the grid map, the eight moves, map files and the paper's noise."""
+"""What the robot moves on: the grid map, the eight moves, shortest paths, map files and noise.
+
+`import ddqn_planner.grid` loads no SciPy: what needs it imports it at its first call.
+"""
 
 from ddqn_planner.grid.body import clearance, inflate
 from ddqn_planner.grid.grid_map import MAX_COST_MULTIPLIER, OCCUPIED, UNKNOWN, Cell, GridMap
@@ -15,6 +18,7 @@ from ddqn_planner.grid.moves import (
     path_length,
 )
 from ddqn_planner.grid.noise import Noise, scatter_obstacles
+from ddqn_planner.grid.shortest_paths import shortest_distances, shortest_path
 
 __all__ = [
     "LENGTHS",
@@ -40,4 +44,6 @@ __all__ = [
     "read_map_file",
     "save_map",
     "scatter_obstacles",
+    "shortest_distances",
+    "shortest_path",
 ]

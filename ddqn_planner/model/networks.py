@@ -15,13 +15,16 @@ from typing import ClassVar, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from ddqn_planner.grid import MAX_COST_MULTIPLIER, MOVES, OCCUPIED, Cell, GridMap, MoveRule
-from ddqn_planner.model.observation import (
-    ROBOT,
-    observation_background,
-    patch_features,
-    unique_patches,
+from ddqn_planner.grid import (
+    MAX_COST_MULTIPLIER,
+    MOVES,
+    OCCUPIED,
+    UNKNOWN,
+    Cell,
+    GridMap,
+    MoveRule,
 )
+from ddqn_planner.model.observation import ROBOT, observation_background, unique_patches
 from ddqn_planner.model.wavefront import propagate_values
 
 Array: TypeAlias = NDArray[np.float32]
@@ -67,7 +70,19 @@ class QNetwork(ABC):
 
     @abstractmethod
     def q_values(self, grid: GridMap, goal: Cell, move_rule: MoveRule) -> Array:
-        """Return Q(s, a) of every cell toward one goal: (8, H, W) float32."""
+        """Return Q(s, a) of every cell toward one goal.
+
+        Parameters
+        ----------
+        grid : GridMap
+            Of a shape that the network supports.
+        goal : (x, y)
+        move_rule : MoveRule
+
+        Returns
+        -------
+        (8, H, W) float32
+        """
 
     def _layer(self, name: str, input_BI: Array) -> Array:
         """Return the output of a fully connected layer: (B, O)."""
@@ -92,10 +107,6 @@ class PaperQNetwork(QNetwork):
     name = "paper"
     size_names = ("height", "width", "filters", "hidden_units")
 
-    def __init__(self, sizes: Mapping[str, int], tensors: Mapping[str, Array]) -> None:
-        super().__init__(sizes, tensors)
-        self.shape = (sizes["height"], sizes["width"])
-
     @classmethod
     def shapes(cls, sizes: Mapping[str, int]) -> dict[str, tuple[int, ...]]:
         """Return the shape of each tensor."""
@@ -107,7 +118,7 @@ class PaperQNetwork(QNetwork):
 
     def supports(self, shape: tuple[int, int]) -> bool:
         """Say whether maps of shape (H, W) have the network's size."""
-        return shape == self.shape
+        return shape == (self.sizes["height"], self.sizes["width"])
 
     def q_values(self, grid: GridMap, goal: Cell, move_rule: MoveRule) -> Array:
         """Evaluate the observation of a robot in each cell.
@@ -115,23 +126,14 @@ class PaperQNetwork(QNetwork):
         The robot changes at most 2 x 2 outputs of the convolution. So these alone are evaluated
         again for each cell, one row of the map at once, and all else once for the map.
 
-        Parameters
-        ----------
-        grid : GridMap
-            Of the network's shape. Its costs are not used.
-        goal : (x, y)
-        move_rule : MoveRule
-            Not used: the network knows the rule of its training.
-
-        Returns
-        -------
-        (8, H, W) float32
+        The costs of the map are not used, nor is the move rule: the network knows that of its
+        training.
         """
         # In double precision: differences of large sums stay exact enough, and do not overflow.
         tensors = {name: tensor.astype(np.float64) for name, tensor in self.tensors.items()}
         first, *last = ["hidden", "fully_connected"][not self.sizes["hidden_units"] :]
         kernel_33F = np.moveaxis(tensors["convolution.weight"][:, 0], 0, 2)
-        background = observation_background(grid.occupancy, goal).reshape(self.shape)
+        background = observation_background(grid.occupancy, goal).reshape(grid.occupancy.shape)
         windows = np.lib.stride_tricks.sliding_window_view(np.pad(background, 1), (3, 3))[::2, ::2]
         input_RLF = np.tensordot(windows, kernel_33F, 2) + tensors["convolution.bias"]
         feature_RLF = np.maximum(input_RLF, 0)
@@ -139,7 +141,7 @@ class PaperQNetwork(QNetwork):
         weight_UFRL = tensors[f"{first}.weight"].reshape(-1, filters, rows, columns)
         weight_RLFU = np.ascontiguousarray(weight_UFRL.transpose(2, 3, 1, 0))
         without_robot_U = np.tensordot(feature_RLF, weight_RLFU, 3) + tensors[f"{first}.bias"]
-        height, width = self.shape
+        height, width = grid.occupancy.shape
         q = np.empty((len(MOVES), height, width), dtype=np.float32)
         for y in range(height):
             output_WU = np.tile(without_robot_U, (width, 1))
@@ -172,52 +174,63 @@ class PropagationQNetwork(QNetwork):
 
     name = "propagation"
     size_names = ("filters",)
-    features: ClassVar[int] = 9
-    """Length of the network's input for one cell."""
+    inputs: ClassVar[int] = 9
+    """Number of features."""
+    uses_costs: ClassVar[bool] = False
+    """Whether the costs of the cells are among the features."""
 
     @classmethod
     def shapes(cls, sizes: Mapping[str, int]) -> dict[str, tuple[int, ...]]:
         """Return the shape of each tensor."""
         filters = sizes["filters"]
         layers = {
-            "convolution": (filters, cls.features),
+            "convolution": (filters, cls.inputs),
             "hidden": (filters, filters),
             "moves": (len(MOVES), filters),
         }
         return _with_biases(layers)
 
+    @staticmethod
+    def features(patch_B9: NDArray[np.int8], move_rule: MoveRule) -> Array:
+        """Return which cells of patches are occupied: (B, 9), see `patches`."""
+        occupied: NDArray[np.bool_] = patch_B9 == OCCUPIED
+        return occupied.astype(np.float32)
+
     def success(self, feature_BI: Array) -> Array:
-        """Return p(s, a) in 0..1: (B, 8), for the features of patches (B, I)."""
+        """Return p(s, a) in 0..1: (B, 8), given features (B, I)."""
         hidden_BF = np.maximum(self._layer("convolution", feature_BI), 0)
         hidden_BF = np.maximum(self._layer("hidden", hidden_BF), 0)
         # The sigmoid function, without overflow.
         p_BA: Array = 0.5 + 0.5 * np.tanh(0.5 * self._layer("moves", hidden_BF))
         return p_BA
 
+    def multiplier(self, feature_BI: Array) -> Array:
+        """Return the cost multiplier of each move, here 1: (B, 8), given features (B, I)."""
+        return np.ones((len(feature_BI), len(MOVES)), dtype=np.float32)
+
     def q_values(self, grid: GridMap, goal: Cell, move_rule: MoveRule) -> Array:
-        """Return minus the length of the shortest path through each action, in cells.
+        """Return minus the cost of the best path through each action: length times cost multiplier.
 
-        Along a whole path, the progress and detour terms of the paper's reward (section 4.2) add up
-        to a constant of its two ends; only the length differs between paths. So without discount,
-        and with a move taken as possible where p > 1/2, the greatest Q is the shortest path, at
-        any distance.
-
-        Parameters
-        ----------
-        grid : GridMap
-            Its costs are not used.
-        goal : (x, y)
-        move_rule : MoveRule
-            For the lengths of the moves; which of them succeed is learned.
+        There is no discount, and a move counts as possible where p > 1/2: so the greatest Q is the
+        cheapest path at any distance. (Along a whole path, the progress and detour terms of the
+        paper's reward, section 4.2, add up to a constant of its two ends.) Cost multipliers are
+        clamped to `MAX_LEARNED_MULTIPLIER`. A move with NaN as its p or cost multiplier is not
+        possible.
 
         Returns
         -------
         (8, H, W) float32
             -inf where no path is known.
         """
-        patch_id, patch_P9 = unique_patches(grid.occupancy, None)
-        p_PA = self.success((patch_P9 == OCCUPIED).astype(np.float32))
-        cost_PA = np.where(p_PA > 0.5, move_rule.lengths, np.inf).astype(np.float32)
+        patch_id, patch_P9 = unique_patches(grid.occupancy, grid.cost if self.uses_costs else None)
+        cost_PA = np.empty((len(patch_P9), len(MOVES)), dtype=np.float32)
+        for begin in range(0, len(patch_P9), BATCH):
+            batch = slice(begin, begin + BATCH)
+            feature_BI = self.features(patch_P9[batch], move_rule)
+            multiplier_BA = np.minimum(self.multiplier(feature_BI), MAX_LEARNED_MULTIPLIER)
+            # Comparisons with NaN are false, and NumPy's minimum and maximum keep it.
+            possible_BA = (self.success(feature_BI) > 0.5) & (multiplier_BA >= 1)
+            cost_PA[batch] = np.where(possible_BA, move_rule.lengths * multiplier_BA, np.inf)
         return propagate_values(patch_id, cost_PA, goal)
 
 
@@ -231,46 +244,30 @@ class AnyMapQNetwork(PropagationQNetwork):
     """
 
     name = "any_map"
-    features = 28
+    inputs = 28
+    uses_costs = True
 
     @classmethod
     def shapes(cls, sizes: Mapping[str, int]) -> dict[str, tuple[int, ...]]:
         """Return the shape of each tensor."""
-        return super().shapes(sizes) | _with_biases({"prices": (len(MOVES), cls.features)})
+        return super().shapes(sizes) | _with_biases({"prices": (len(MOVES), cls.inputs)})
+
+    @staticmethod
+    def features(patch_B9: NDArray[np.int8], move_rule: MoveRule) -> Array:
+        """Return the features of patches, see `patches`: (B, 28).
+
+        For each of the 9 cells whether it is occupied, its cost as 0..1, and whether it is unknown;
+        then whether the rule allows to cut corners.
+        """
+        occupied, unknown = patch_B9 == OCCUPIED, patch_B9 == UNKNOWN
+        cost_B9 = np.where(occupied | unknown, 0, patch_B9) / 100
+        rule_B1 = np.full((len(patch_B9), 1), move_rule.cuts_corners)
+        return np.concatenate([occupied, cost_B9, unknown, rule_B1], axis=1, dtype=np.float32)
 
     def multiplier(self, feature_BI: Array) -> Array:
-        """Return the cost multiplier of each move, at least 1: (B, 8), see `patch_features`."""
+        """Return the cost multiplier of each move, at least 1: (B, 8), given features (B, 28)."""
         multiplier_BA: Array = 1 + np.maximum(self._layer("prices", feature_BI), 0)
         return multiplier_BA
-
-    def q_values(self, grid: GridMap, goal: Cell, move_rule: MoveRule) -> Array:
-        """Return minus the cost of the best path through each action: length times cost multiplier.
-
-        There is no discount, and a move counts as possible where p > 1/2: so the greatest Q is the
-        cheapest path at any distance. Cost multipliers are clamped to `MAX_LEARNED_MULTIPLIER`. A
-        move with NaN as its p or cost multiplier is not possible.
-
-        Parameters
-        ----------
-        grid : GridMap
-        goal : (x, y)
-        move_rule : MoveRule
-
-        Returns
-        -------
-        (8, H, W) float32
-            -inf where no path is known.
-        """
-        patch_id, patch_P9 = unique_patches(grid.occupancy, grid.cost)
-        cost_PA = np.empty((len(patch_P9), len(MOVES)), dtype=np.float32)
-        for begin in range(0, len(patch_P9), BATCH):
-            batch = slice(begin, begin + BATCH)
-            feature_BI = patch_features(patch_P9[batch], move_rule)
-            multiplier_BA = np.minimum(self.multiplier(feature_BI), MAX_LEARNED_MULTIPLIER)
-            # Comparisons with NaN are false, and NumPy's minimum and maximum keep it.
-            possible_BA = (self.success(feature_BI) > 0.5) & (multiplier_BA >= 1)
-            cost_PA[batch] = np.where(possible_BA, move_rule.lengths * multiplier_BA, np.inf)
-        return propagate_values(patch_id, cost_PA, goal)
 
 
 def _with_biases(weights: Mapping[str, tuple[int, ...]]) -> dict[str, tuple[int, ...]]:

@@ -10,7 +10,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from ddqn_planner.grid import OCCUPIED, UNKNOWN, Cell, MoveRule
+from ddqn_planner.grid import OCCUPIED, UNKNOWN, Cell
 
 # The paper (section 4) uses four values and does not give them. With ours the robot stands out.
 # With a smaller value for the robot, the many obstacles outweigh it and training is less stable.
@@ -118,24 +118,3 @@ def unique_patches(
     codes, patch_id = np.unique(code, return_inverse=True)
     patch_P9 = codes[:, None] // base ** np.arange(9) % base + UNKNOWN
     return patch_id.reshape(code.shape).astype(np.int32), patch_P9.astype(np.int8)
-
-
-def patch_features(patch_B9: NDArray[np.int8], move_rule: MoveRule) -> NDArray[np.float32]:
-    """Return the features of patches that `AnyMapQNetwork` observes.
-
-    Parameters
-    ----------
-    patch_B9 : (B, 9) int8
-        See `patches`.
-    move_rule : MoveRule
-
-    Returns
-    -------
-    (B, 28) float32
-        For each of the 9 cells whether it is occupied, its cost as 0..1, and whether it is unknown;
-        then whether the rule allows to cut corners.
-    """
-    occupied, unknown = patch_B9 == OCCUPIED, patch_B9 == UNKNOWN
-    cost_B9 = np.where(occupied | unknown, 0, patch_B9) / 100
-    rule_B1 = np.full((len(patch_B9), 1), move_rule.cuts_corners)
-    return np.concatenate([occupied, cost_B9, unknown, rule_B1], axis=1, dtype=np.float32)

@@ -13,12 +13,11 @@ from visualization_msgs.msg import MarkerArray
 from ddqn_planner.grid import GridMap
 from ddqn_planner.nodes.conversions import unknown_value_message, value_message
 from ddqn_planner.nodes.markers import no_policy_message, policy_message
-from ddqn_planner.nodes.runtime import LATCHED
-from ddqn_planner.nodes.worker import Worker
+from ddqn_planner.nodes.runtime import LATCHED, Worker
 from ddqn_planner.planning import QField
 
 LOOK_PERIOD = 0.1
-"""Seconds between two looks whether somebody wants the policy."""
+"""Seconds between two looks whether somebody subscribes to the policy."""
 
 
 class FieldDisplay:
@@ -28,7 +27,7 @@ class FieldDisplay:
     ----------
     node : Node
     worker : Worker
-        Draws both.
+        Computes both messages.
     """
 
     def __init__(self, node: Node, worker: Worker) -> None:
@@ -48,14 +47,14 @@ class FieldDisplay:
         self._shows_again = True
 
     async def show(self, field: QField, grid: GridMap, header: Header) -> None:
-        """Publish a field's value if it is another than that shown."""
+        """Publish a field's value unless it is shown already."""
         if self._shows_again or self._shown is None or self._shown[:2] != (field, grid):
             value = await self._worker.call(value_message, field, grid, header)
             self._value_publisher.publish(value)
             self._shown, self._shows_again = (field, grid, header), False
 
     def clear(self, now: Header) -> None:
-        """Publish that no value is known, and no policy: those shown were of another goal."""
+        """Publish an unknown value and no policy: those that are shown are of another goal."""
         if self._shown is None:
             return
         _, grid, header = self._shown
@@ -67,7 +66,7 @@ class FieldDisplay:
             self._policy_publisher.publish(no_policy_message(header))
 
     async def _show_policy(self) -> None:
-        """Publish the policy of the field whose value was published, if somebody looks."""
+        """Publish the policy of the field that is shown, if somebody subscribes to it."""
         shown = self._shown
         if shown is None or not self._policy_publisher.get_subscription_count():
             return

@@ -1,4 +1,4 @@
-"""The paper's contribution: environment, initialisation, reward, replay, Double DQN, trainer."""
+"""The paper's contribution: environment, exploring starts, reward, replay, Double DQN, trainer."""
 
 import gymnasium
 

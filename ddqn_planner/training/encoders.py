@@ -13,8 +13,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ddqn_planner.grid import LENGTHS, MOVES, OCCUPIED, GridMap, MoveRule, neighbours
-from ddqn_planner.model.observation import observe, patch_features, patches
+from ddqn_planner.grid import LENGTHS, MOVES, neighbours
+from ddqn_planner.model.observation import observe, patches
 from ddqn_planner.training.environment import GridVectorEnvironment
 from ddqn_planner.training.networks import (
     AnyMapModule,
@@ -75,19 +75,20 @@ class PropagationEncoder(Encoder):
     through the iteration diverges.
     """
 
-    module_class = PropagationModule
+    module_class: ClassVar[type[PropagationModule]] = PropagationModule
 
     def __init__(self, environment: GridVectorEnvironment) -> None:
         super().__init__(environment)
-        rules = environment.move_rules
+        network = self.module_class.numpy_class
         grids = (scenario.grid for scenario in environment.scenarios)
-        self._feature_SCI = np.stack([*map(self._features, grids, rules)])
+        self._feature_SCI = np.stack(
+            [
+                network.features(patches(grid.occupancy, grid.cost), rule)
+                for grid, rule in zip(grids, environment.move_rules, strict=True)
+            ]
+        )
         self._return_SCA = np.zeros((*self._feature_SCI.shape[:2], len(MOVES)), dtype=np.float32)
         self._neighbours_AC = neighbours(environment.shape)
-
-    def _features(self, grid: GridMap, move_rule: MoveRule) -> NDArray[np.float32]:
-        occupied: NDArray[np.bool_] = patches(grid.occupancy, None) == OCCUPIED
-        return occupied.astype(np.float32)
 
     def states(self, scenario: NDArray[np.int64], cell: NDArray[np.int64]) -> Tensor:
         """Return the features of the cells' patches, and the return of each move: (B, I + 8)."""
@@ -133,9 +134,6 @@ class AnyMapEncoder(PropagationEncoder):
 
     module_class = AnyMapModule
     _lengths = torch.from_numpy(LENGTHS.astype(np.float32))
-
-    def _features(self, grid: GridMap, move_rule: MoveRule) -> NDArray[np.float32]:
-        return patch_features(patches(grid.occupancy, grid.cost), move_rule)
 
     def q(self, module: TrainableNetwork, state_B: Tensor) -> Tensor:
         """Return Q(s, a) = p (r + γ V(s')) + (1 - p) r_o with r = -length * multiplier: (B, 8)."""

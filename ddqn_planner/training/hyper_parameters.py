@@ -1,4 +1,4 @@
-"""Every number of the training, once: the nodes, the command line and the tests read it here."""
+"""All hyper-parameters of training, defined once for the nodes, the command line and the tests."""
 
 from __future__ import annotations
 
@@ -18,16 +18,16 @@ def _choice(*choices: str, source: str) -> Any:
 
 @dataclass(frozen=True)
 class HyperParameters:
-    """The paper's Table 1, and our choice where the paper is silent.
+    """The values of the paper's Table 1, and our values where the paper gives none.
 
-    Improvement 1 (initialisation) is switched off by ``p_r = 0``, improvement 2 (reward) by
-    ``alpha = beta = 0``.
+    ``p_r = 0`` switches off improvement 1 (initialisation), ``alpha = beta = 0`` improvement 2
+    (reward).
 
     Raises
     ------
     ValueError
-        If a value lies outside its range or is none of its choices, or a step of all environments
-        outgrows the replay buffer.
+        If a value is outside its range or not one of its choices, or the replay buffer cannot hold
+        one step of all environments.
     """
 
     network: str = _choice(*NETWORKS, source="ours: the Q-network, see model/")

@@ -93,7 +93,7 @@ class PropagationModule(TrainableNetwork):
 
     def __init__(self, filters: int) -> None:
         super().__init__(filters=filters)
-        self.convolution = nn.Linear(self.numpy_class.features, filters)
+        self.convolution = nn.Linear(self.numpy_class.inputs, filters)
         self.hidden = nn.Linear(filters, filters)
         self.moves = nn.Linear(filters, len(MOVES))
 
@@ -111,7 +111,7 @@ class AnyMapModule(PropagationModule):
 
     def __init__(self, filters: int) -> None:
         super().__init__(filters)
-        self.prices = nn.Linear(self.numpy_class.features, len(MOVES))
+        self.prices = nn.Linear(self.numpy_class.inputs, len(MOVES))
         # A cost multiplier below 1 has no gradient: it must begin above.
         nn.init.ones_(self.prices.bias)
 

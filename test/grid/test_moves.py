@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from itertools import product
 
 import numpy as np
 import pytest
@@ -18,10 +19,13 @@ from ddqn_planner.grid import (
     connected_cells,
     legal_moves,
     move_costs,
+    neighbours,
     path_cost,
     path_length,
+    shortest_distances,
+    shortest_path,
 )
-from ddqn_planner.planning import shortest_distances, shortest_path, simplify
+from ddqn_planner.planning import simplify
 
 RULES = st.sampled_from(list(MoveRule))
 
@@ -33,9 +37,7 @@ def test_action_k_points_at_k_times_45_degrees() -> None:
 
 
 @given(occupancies, RULES)
-def test_legal_moves_are_those_of_the_rule_cell_by_cell(
-    occupancy: np.ndarray, rule: MoveRule
-) -> None:
+def test_legal_moves_follow_the_rule_in_each_cell(occupancy: np.ndarray, rule: MoveRule) -> None:
     grid, legal = GridMap(occupancy), legal_moves(occupancy, rule)
     for y in range(grid.height):
         for x in range(grid.width):
@@ -46,8 +48,18 @@ def test_legal_moves_are_those_of_the_rule_cell_by_cell(
                 assert legal[action, y, x] == expected
 
 
+@pytest.mark.parametrize("shape", [(1, 1), (1, 4), (3, 5)])
+def test_neighbours_are_numbered_row_by_row_and_outside_comes_last(shape: tuple[int, int]) -> None:
+    found, (height, width) = neighbours(shape), shape
+    assert (found.shape, found.dtype) == ((8, height * width), np.int64)
+    for (y, x), (action, (dx, dy)) in product(np.ndindex(shape), enumerate(MOVES.tolist())):
+        inside = 0 <= x + dx < width and 0 <= y + dy < height
+        expected = (y + dy) * width + x + dx if inside else height * width
+        assert found[action, y * width + x] == expected
+
+
 @given(grids_with_free_cell(), RULES)
-def test_connected_cells_are_those_at_finite_distance(
+def test_connected_cells_have_a_finite_distance(
     grid_and_cell: tuple[GridMap, tuple[int, int]], rule: MoveRule
 ) -> None:
     grid, cell = grid_and_cell

@@ -18,6 +18,8 @@ import pytest
 from PIL import Image
 from processes import running
 
+pytestmark = pytest.mark.slow
+
 DEMO = Path(__file__).resolve().parents[2] / "scripts" / "demo.py"
 END_TIMEOUT = 240.0
 """Seconds that the whole demo may take on a loaded machine."""

@@ -11,7 +11,8 @@ from strategies import grids_with_costs, grids_with_free_cell
 from ddqn_planner.grid import Cell, GridMap, MoveRule, legal_moves
 from ddqn_planner.model import NETWORKS, load_model, networks
 from ddqn_planner.model.networks import MAX_LEARNED_MULTIPLIER, AnyMapQNetwork, PropagationQNetwork
-from ddqn_planner.model.observation import observation_background, observe, patch_features, patches
+from ddqn_planner.model.observation import observation_background, observe, patches
+from ddqn_planner.model.wavefront import propagate_values
 from ddqn_planner.training.encoders import ENCODERS
 from ddqn_planner.training.networks import AnyMapModule, PaperModule, PropagationModule
 
@@ -63,7 +64,7 @@ def test_the_propagation_networks_answer_on_each_patch_as_their_modules(
     grid_and_goal: tuple[GridMap, Cell], rule: MoveRule, seed: int
 ) -> None:
     grid, _ = grid_and_goal
-    features = patch_features(patches(grid.occupancy, grid.cost), rule)
+    features = AnyMapQNetwork.features(patches(grid.occupancy, grid.cost), rule)
     any_map = random_network("any_map", seed, filters=5)
     propagation = random_network("propagation", seed, filters=5)
     assert isinstance(any_map, AnyMapQNetwork)
@@ -96,7 +97,7 @@ def test_the_shipped_models_answer_as_their_modules(paper) -> None:  # type: ign
     assert isinstance(any_map, AnyMapQNetwork)
     module = AnyMapModule.from_numpy(any_map)
     random = np.random.default_rng(0)
-    features = patch_features(
+    features = AnyMapQNetwork.features(
         random.integers(-1, 101, (2000, 9)).astype(np.int8), MoveRule.ROBOT_SAFE
     )
     with torch.inference_mode():
@@ -194,7 +195,6 @@ def test_a_move_whose_cost_or_p_is_nan_is_not_possible(
         assert not np.isnan(cost_PA).any()  # with NaN the propagation would never end
         return propagate_values(patch_id, cost_PA, goal)
 
-    propagate_values = networks.propagate_values
     monkeypatch.setattr(networks, "propagate_values", checked)
     network = answering("any_map", 0.9)
     network.tensors[tensor][0] = np.nan
@@ -208,7 +208,7 @@ def test_the_network_for_any_map_tells_legal_moves() -> None:
     assert isinstance(network, AnyMapQNetwork)
     occupancy = np.random.default_rng(0).random((30, 30)) < 0.3
     for rule in (MoveRule.ROBOT_SAFE, MoveRule.CORNER_CUTTING):
-        p = network.success(patch_features(patches(occupancy, None), rule))
+        p = network.success(AnyMapQNetwork.features(patches(occupancy, None), rule))
         free = ~occupancy.ravel()
         legal = legal_moves(occupancy, rule).reshape(8, -1).T
         np.testing.assert_array_equal(p[free] > 0.5, legal[free])

@@ -6,6 +6,7 @@ from hypothesis import given
 from strategies import grids_with_costs, grids_with_free_cell
 
 from ddqn_planner.grid import MOVES, OCCUPIED, Cell, GridMap, MoveRule, neighbours
+from ddqn_planner.model import AnyMapQNetwork
 from ddqn_planner.model.observation import (
     FREE,
     GOAL,
@@ -13,7 +14,6 @@ from ddqn_planner.model.observation import (
     ROBOT,
     observation_background,
     observe,
-    patch_features,
     patches,
     unique_patches,
 )
@@ -65,10 +65,10 @@ def test_cells_with_one_patch_id_have_the_same_patch(
 
 def test_the_features_tell_obstacles_costs_unknown_cells_and_the_rule_apart() -> None:
     patch = np.array([[-1, 0, 50, 99, 100, 0, 0, 0, 0]], dtype=np.int8)
-    (features,) = patch_features(patch, MoveRule.ROBOT_SAFE)
+    (features,) = AnyMapQNetwork.features(patch, MoveRule.ROBOT_SAFE)
     assert features.dtype == np.float32
     assert features[:9].tolist() == [0, 0, 0, 0, 1, 0, 0, 0, 0]
     assert features[9:18] == pytest.approx([0, 0, 0.5, 0.99, 0, 0, 0, 0, 0])
     assert features[18:27].tolist() == [1, 0, 0, 0, 0, 0, 0, 0, 0]
     assert features[27] == 0
-    assert patch_features(patch, MoveRule.CORNER_CUTTING)[0, 27] == 1
+    assert AnyMapQNetwork.features(patch, MoveRule.CORNER_CUTTING)[0, 27] == 1

@@ -12,7 +12,8 @@ import torch
 from torch import Tensor, nn
 
 from ddqn_planner.grid import LENGTHS, MOVES, Cell, GridMap, MoveRule
-from ddqn_planner.model.observation import patch_features, patches
+from ddqn_planner.model import AnyMapQNetwork
+from ddqn_planner.model.observation import patches
 from ddqn_planner.training.environment import Scenario
 from ddqn_planner.training.hyper_parameters import HyperParameters
 from ddqn_planner.training.networks import AnyMapModule, PaperModule
@@ -124,7 +125,7 @@ def test_an_update_of_the_network_for_any_map_counts_each_reward_once(small: Sce
     ) -> dict[Cell, Tensor]:
         seen = patches(scenario.grid.occupancy, scenario.grid.cost)
         rule = scenario.move_rule or MoveRule.CORNER_CUTTING
-        features = torch.from_numpy(patch_features(seen, rule))
+        features = torch.from_numpy(AnyMapQNetwork.features(seen, rule))
         p, multiplier = network.success(features), network.multiplier(features)
         answers = {}
         for number in range(20):

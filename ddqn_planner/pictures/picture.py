@@ -1,4 +1,4 @@
-"""A plan to look at: as text, and as a picture of map, path and value field."""
+"""A plan as text, and as a picture of map, value field and path."""
 
 from __future__ import annotations
 
@@ -8,34 +8,21 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from PIL import ImageColor
 
 from ddqn_planner.grid import Cell, GridMap
-
-OBSTACLE_COLOUR = "#22223b"
-PATH_COLOUR = "#d1495b"
-VALUE_COLOURS = ("#f4f1de", "#cfe8dc", "#93cfc8", "#4fa3b5")
-"""From worst to best. Light to dark, so that their order is seen without colours too; the darkest
-is far from that of an obstacle."""
-
-MAX_RULED_SIDE = 64
-"""Cells of the longest side of a map that is drawn with lines between its cells."""
+from ddqn_planner.pictures.colours import (
+    MAX_SIDE_WITH_LINES,
+    OBSTACLE_COLOUR,
+    PATH_COLOUR,
+    VALUE_COLOURS,
+)
 
 MAX_TEXT_WIDTH = 64
 """Cells of the widest map that is worth printing as text: a cell takes two characters."""
 
 
-class PictureError(RuntimeError):
+class PictureError(ImportError):
     """A picture cannot be drawn; the message says what is missing."""
-
-
-def value_ramp(levels: int) -> NDArray[np.uint8]:
-    """Return (levels, 3) uint8: red, green and blue from the worst value to the best."""
-    colours = np.array([ImageColor.getrgb(colour) for colour in VALUE_COLOURS])
-    places, shades = np.linspace(0, 1, len(colours)), np.linspace(0, 1, levels)
-    ramp = np.stack([np.interp(shades, places, channel) for channel in colours.T], axis=1)
-    rounded: NDArray[np.uint8] = np.rint(ramp).astype(np.uint8)
-    return rounded
 
 
 def draw_text(grid: GridMap, cells: Sequence[Cell]) -> str:
@@ -64,8 +51,8 @@ def save_picture(
         Its ending (``.png``, ``.svg``, ``.pdf``) sets the format.
     grid : GridMap
     cells : sequence of (x, y)
-        The path; none draws the map alone.
-    value : (H, W) float32, or None
+        The path; if it is empty, none is drawn.
+    value : (H, W) float32, optional
         The value field, drawn where it is finite.
     title, value_label : str
 
@@ -97,7 +84,8 @@ def save_picture(
         finite = np.where(np.isfinite(value), value, np.nan)
         colours = LinearSegmentedColormap.from_list("value", VALUE_COLOURS)
         image = axes.imshow(finite, origin="lower", cmap=colours, interpolation="nearest")
-        figure.colorbar(image, label=value_label, shrink=0.85, aspect=20 * tall)
+        bar = axes.inset_axes((1.02, 0, 0.035, 1))  # as high as the map
+        figure.colorbar(image, bar, label=value_label)
     draw_obstacles(axes, grid)
     if cells:
         _draw_path(axes, cells)
@@ -107,14 +95,13 @@ def save_picture(
 
 
 def draw_obstacles(axes: Any, grid: GridMap) -> None:
-    """Draw the occupied cells of a map into matplotlib's axes, and lines between its cells."""
+    """Draw the occupied cells of a map into matplotlib axes, and lines between its cells."""
     from matplotlib.colors import ListedColormap
 
     occupied = np.where(grid.occupancy, 1.0, np.nan)
-    axes.imshow(
-        occupied, origin="lower", cmap=ListedColormap([OBSTACLE_COLOUR]), interpolation="nearest"
-    )
-    if max(grid.width, grid.height) <= MAX_RULED_SIDE:
+    colours = ListedColormap([OBSTACLE_COLOUR])
+    axes.imshow(occupied, origin="lower", cmap=colours, interpolation="nearest")
+    if max(grid.width, grid.height) <= MAX_SIDE_WITH_LINES:
         axes.set_xticks(np.arange(-0.5, grid.width), minor=True)
         axes.set_yticks(np.arange(-0.5, grid.height), minor=True)
         axes.grid(which="minor", color="white", linewidth=0.8)
@@ -127,6 +114,6 @@ def _draw_path(axes: Any, cells: Sequence[Cell]) -> None:
     x, y = np.transpose(cells)
     outline = [withStroke(linewidth=5.5, foreground="white")]
     axes.plot(x, y, color=PATH_COLOUR, linewidth=3, path_effects=outline, label="path")
-    ends = {"s": 110, "edgecolors": "white", "linewidths": 1.5, "zorder": 3}
-    axes.scatter(x[0], y[0], marker="o", color=PATH_COLOUR, label="start", **ends)
-    axes.scatter(x[-1], y[-1], marker="*", color=PATH_COLOUR, label="goal", **{**ends, "s": 300})
+    for label, end, marker, size in (("start", 0, "o", 110), ("goal", -1, "*", 300)):
+        ends = {"marker": marker, "s": size, "edgecolors": "white", "linewidths": 1.5, "zorder": 3}
+        axes.scatter(x[end], y[end], color=PATH_COLOUR, label=label, **ends)

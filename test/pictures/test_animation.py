@@ -7,11 +7,15 @@ import numpy as np
 import pytest
 from PIL import Image, ImageColor
 
-from ddqn_planner.grid import GridMap, MoveRule
-from ddqn_planner.planning import shortest_distances
-from ddqn_planner.planning.animation import FRAMES, LAST_FRAME_MS, MIN_SIDE, save_animation
-from ddqn_planner.planning.oracle import shortest_path
-from ddqn_planner.planning.picture import OBSTACLE_COLOUR, PATH_COLOUR
+from ddqn_planner.grid import GridMap, MoveRule, shortest_distances, shortest_path
+from ddqn_planner.pictures.animation import (
+    FIELD_MS,
+    FRAMES,
+    LAST_FRAME_MS,
+    MIN_SIDE,
+    save_animation,
+)
+from ddqn_planner.pictures.colours import OBSTACLE_COLOUR, PATH_COLOUR
 from ddqn_planner.training.environment import Scenario
 
 
@@ -43,6 +47,7 @@ def test_cells_appear_in_the_order_of_their_value_and_then_the_path_grows(
     save_animation(tmp_path / "new" / "plan.gif", grid, start, goal, value, cells)
     frames, durations = frames_of(tmp_path / "new" / "plan.gif")
     assert durations[-1] == LAST_FRAME_MS
+    assert sum(shown >= FIELD_MS for shown in durations) == 2  # the complete field, the path
     side = frames[0].shape[1] // grid.width
     assert frames[0].shape == (side * grid.height, side * grid.width, 3)
     corners = [frame[::-1][side // 8 :: side, side // 8 :: side] for frame in frames]

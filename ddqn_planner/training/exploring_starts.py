@@ -1,4 +1,7 @@
-"""Improvement 1 of the paper (section 4.1): where an episode begins, from RRT's random sampling."""
+"""Improvement 1 of the paper (section 4.1, "initialisation"): exploring starts.
+
+An episode starts at a random free cell with probability p_r, as RRT samples its cells.
+"""
 
 from __future__ import annotations
 
@@ -13,23 +16,25 @@ def initial_cells(
     p_r: float,
     random: np.random.Generator,
 ) -> NDArray[np.int64]:
-    """Draw the cells in which N episodes begin: with probability p_r at random, else the start.
+    """Draw the cells in which N episodes start.
 
     Parameters
     ----------
     start_N : (N,) int64
-        The given starts.
+        The given start of each episode.
     free_cells_NF : (N, F) int64
-        The free cells besides the end of each one's map; the first `free_count_N` count.
+        The free cells of each episode's map, except the goal. Only the first `free_count_N` of a
+        row are used; the rest is padding.
     free_count_N : (N,) int64
     p_r : float
-        Probability of a random free cell, 0..1. The paper's is 0.5; 0 switches the idea off.
+        Probability of a random free cell, 0..1; 0.5 in the paper. With 0 every episode starts at
+        the given start.
     random : numpy.random.Generator
 
     Returns
     -------
     (N,) int64
-        Cell numbers of the same numbering as the arguments'.
+        Cell numbers, counted as in the arguments.
     """
     at_random_N = random.random(len(start_N)) < p_r
     random_cell_N = free_cells_NF[np.arange(len(start_N)), random.integers(free_count_N)]

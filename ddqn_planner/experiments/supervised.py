@@ -1,13 +1,11 @@
-"""What the paper's network can hold: it is taught the best moves, in place of learning them.
+"""What the paper's network can represent: supervised with the best moves, not by Double DQN.
 
-This is a yardstick and no planner: the exact oracle tells the network how every shortest path from
-every cell of every training map begins. What it misses even then lies in its architecture rather
-than in how it learns.
+This is a yardstick and not a planner: the exact oracle gives the first moves of all shortest paths
+from every cell of every training map. What the network fails to learn even then is a limit of its
+architecture, not of how it learns.
 """
 
 from __future__ import annotations
-
-from pathlib import Path
 
 import numpy as np
 import torch
@@ -26,12 +24,12 @@ BATCH_SIZE = 128
 LEARNING_RATE = 0.003
 
 
-def teach(training: Training, out: Path) -> None:
-    """Teach the network of a training by cross-entropy, for as many updates as it has steps.
+def train_supervised(training: Training) -> None:
+    """Train a training's network by cross-entropy, for as many updates as it has steps.
 
-    Writes ``model.safetensors``; where it is there already, nothing is done.
+    Writes ``model.safetensors``; does nothing if that exists.
     """
-    path = training.folder(out) / "model.safetensors"
+    path = training.folder / "model.safetensors"
     if path.exists():
         return
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -46,11 +44,9 @@ def teach(training: Training, out: Path) -> None:
     for _ in range(steps):
         drawn = random.integers(len(cell), size=BATCH_SIZE)
         background = environment.background[scenario[drawn]]
-        q_BA = trainer.network(
-            torch.from_numpy(observe(background, cell[drawn], environment.shape))
-        )
+        observation = observe(background, cell[drawn], environment.shape)
         best_BA = torch.from_numpy(best_SCA[scenario[drawn], cell[drawn]])
-        loss = cross_entropy(q_BA, best_BA)
+        loss = cross_entropy(trainer.network(torch.from_numpy(observation)), best_BA)
         optimiser.zero_grad()
         torch.autograd.backward(loss)
         optimiser.step()

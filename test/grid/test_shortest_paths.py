@@ -6,9 +6,17 @@ from hypothesis import given
 from hypothesis import strategies as st
 from strategies import grids_with_costs
 
-from ddqn_planner.grid import MOVES, GridMap, MoveRule, legal_moves, move_costs, path_cost
-from ddqn_planner.planning import shortest_distances, shortest_path
-from ddqn_planner.planning.oracle import _graph
+from ddqn_planner.grid import (
+    MOVES,
+    GridMap,
+    MoveRule,
+    legal_moves,
+    move_costs,
+    path_cost,
+    shortest_distances,
+    shortest_path,
+)
+from ddqn_planner.grid.shortest_paths import _graph
 
 RULES = st.sampled_from(list(MoveRule))
 
@@ -47,7 +55,7 @@ def test_any_pair_of_whole_numbers_is_a_goal() -> None:
             shortest_distances(grid, outside, "unit")
 
 
-def test_columns_of_the_graph_are_in_order_and_short_numbers() -> None:
+def test_columns_of_the_graph_are_sorted_and_int32() -> None:
     graph = _graph(GridMap(np.zeros((7, 5))), MoveRule.ROBOT_SAFE)
     assert graph.indices.dtype == graph.indptr.dtype == np.int32
     graph.has_sorted_indices = graph.has_canonical_format = False

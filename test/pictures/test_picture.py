@@ -7,7 +7,8 @@ import pytest
 from PIL import Image
 
 from ddqn_planner.grid import GridMap
-from ddqn_planner.planning.picture import VALUE_COLOURS, draw_text, save_picture, value_ramp
+from ddqn_planner.pictures import draw_text, save_picture
+from ddqn_planner.pictures.colours import VALUE_COLOURS, value_ramp
 
 
 def test_a_map_as_text_has_its_first_row_below() -> None:

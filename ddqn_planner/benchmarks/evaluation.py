@@ -1,4 +1,4 @@
-"""How good a Q field is: its greedy walk from every free cell, beside the exact optimum."""
+"""How good a Q field is: its greedy rollout from every free cell, against the exact optimum."""
 
 from __future__ import annotations
 
@@ -7,48 +7,32 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ddqn_planner.grid import GridMap, MoveRule, path_cost
-from ddqn_planner.planning.oracle import shortest_distances
-from ddqn_planner.planning.q_field import QField
+from ddqn_planner.grid import GridMap, MoveRule, path_cost, shortest_distances
+from ddqn_planner.planning import QField
 
 
 @dataclass(frozen=True)
 class Evaluation:
-    """The greedy walks of one Q field.
-
-    Parameters
-    ----------
-    starts : int
-        Free cells, besides the goal, from which a path exists.
-    solved : int
-        How many of them the greedy walk solves.
-    mean_ratio, worst_ratio : float
-        Length over the optimum of the solved ones, at least 1; NaN if none is solved.
-    """
+    """The greedy rollouts of one Q field."""
 
     starts: int
+    """Free cells, except the goal, from which a path exists."""
     solved: int
+    """The starts whose rollout reaches the goal."""
     mean_ratio: float
     worst_ratio: float
+    """Length of the solved rollouts over the optimum, at least 1; NaN if none is solved."""
 
 
 def length_ratios(field: QField, grid: GridMap, move_rule: MoveRule) -> NDArray[np.float64]:
-    """Return the length of the greedy walk from each cell over that of the shortest path.
+    """Return the length of the greedy rollout from each cell over that of the shortest path.
 
-    On a map with costs these are the costs of the walk and of the cheapest path.
-
-    Parameters
-    ----------
-    field : QField
-        Of this map, under this rule.
-    grid : GridMap
-    move_rule : MoveRule
+    On a map with costs these are the costs of the rollout and of the cheapest path.
 
     Returns
     -------
     (H, W) float64
-        At least 1; infinite where the walk is trapped, NaN at the goal and where no path leads to
-        it.
+        At least 1; infinite if the rollout is trapped, NaN at the goal and in cells without a path.
     """
     optimum = shortest_distances(grid, field.goal, move_rule)
     ratios, multiplier = np.full(optimum.shape, np.nan), grid.cost_multiplier
@@ -61,7 +45,7 @@ def length_ratios(field: QField, grid: GridMap, move_rule: MoveRule) -> NDArray[
 
 
 def evaluate(field: QField, grid: GridMap, move_rule: MoveRule) -> Evaluation:
-    """Walk from every free cell that a path joins to the field's goal; see `length_ratios`."""
+    """Summarise `length_ratios` of a field."""
     ratios = length_ratios(field, grid, move_rule)
     solved = ratios[np.isfinite(ratios)]
     return Evaluation(

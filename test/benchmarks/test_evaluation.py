@@ -3,9 +3,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from ddqn_planner.benchmarks.evaluation import Evaluation, evaluate, length_ratios
 from ddqn_planner.grid import GridMap, MoveRule, legal_moves
 from ddqn_planner.planning import QField
-from ddqn_planner.planning.evaluation import Evaluation, evaluate, length_ratios
 
 RULE = MoveRule.ROBOT_SAFE
 GRID = GridMap(np.array([[0, 0, 0, 1, 0], [0, 0, 0, 1, 0]]))
@@ -19,7 +19,7 @@ def field_of(actions: list[list[int]]) -> QField:
     return QField((2, 0), q, legal_moves(GRID.occupancy, RULE))
 
 
-def test_a_detour_counts_by_its_length_and_a_trapped_rollout_not_at_all() -> None:
+def test_a_detour_counts_with_its_length_and_a_trapped_rollout_is_left_out() -> None:
     # (0, 1) goes by (0, 0), (1, 1) and (2, 1) go to each other; nothing joins (4, 0) to the goal.
     field = field_of([[0, 0, 0, 0, 0], [6, 0, 4, 0, 0]])
     detour = 3 / (1 + 2**0.5)

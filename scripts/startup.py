@@ -1,0 +1,108 @@
+"""Measures how soon the executables are of use: `make bench`. Each figure stands beside its bar."""
+
+from __future__ import annotations
+
+import os
+import statistics
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Sequence
+from functools import partial
+
+from client import Client, initial_pose, pose
+from demo import start_and_goal
+from map_fixture import MapFixture
+from nav_msgs.msg import OccupancyGrid, Path
+from processes import claim_ros_domain, executable, memory, run_script, running_node
+
+from ddqn_planner.grid import read_map_file
+from ddqn_planner.nodes.runtime import LATCHED
+from ddqn_planner.resources import find_map
+
+STARTS = 10
+NO_BAR = float("inf")
+UNITS = ("s wall", "s CPU", "MB")
+
+Usage = tuple[float, float, float]
+"""Wall time and CPU time, seconds; resident memory, MB."""
+
+
+def node_usage(process: int, began: float) -> Usage:
+    """Return what a running process has taken since it began."""
+    with open(f"/proc/{process}/stat", encoding="utf-8") as file:
+        user, system = file.read().rsplit(")", 1)[1].split()[11:13]
+    ticks = int(user) + int(system)
+    return time.monotonic() - began, ticks / os.sysconf("SC_CLK_TCK"), memory(process)
+
+
+def start_planner(client: Client, dilemma: MapFixture) -> Usage:
+    """Start the planner node; return what it takes until its first plan."""
+    start, goal = (pose(dilemma.grid, cell) for cell in start_and_goal("dilemma"))
+    plans = client.subscribe(Path, "plan", LATCHED)
+    began = time.monotonic()
+    with running_node("planner_node", "--log-level", "error") as planner:
+        client.publish("initialpose", initial_pose(start))
+        client.publish("goal_pose", goal)
+        plans.wait(lambda plan: plan.poses)
+        return node_usage(planner.pid, began)
+
+
+def start_map_server(client: Client) -> Usage:
+    """Start the map server; return what it takes until its first map is received."""
+    maps = client.subscribe(OccupancyGrid, "map", LATCHED)
+    maps.clear()
+    began = time.monotonic()
+    with running_node("map_server_node", "--log-level", "error") as map_server:
+        maps.wait()
+        return node_usage(map_server.pid, began)
+
+
+def run_command(*command: str) -> Usage:
+    """Return what a command takes from start to end."""
+    began = time.monotonic()
+    child = subprocess.Popen(command, stdout=subprocess.DEVNULL)
+    _, status, used = os.wait4(child.pid, 0)
+    child.returncode = os.waitstatus_to_exitcode(status)
+    assert child.returncode == 0, f"{command} ended with {child.returncode}"
+    return time.monotonic() - began, used.ru_utime + used.ru_stime, used.ru_maxrss / 1e3
+
+
+def show(name: str, start: Callable[[], Usage], bars: Usage) -> bool:
+    """Print the medians of some starts beside their bars; return whether all are met."""
+    medians = [
+        statistics.median(column) for column in zip(*(start() for _ in range(STARTS)), strict=True)
+    ]
+    words = [
+        f"{value:7.2f} {unit}" + (f" (at most {bar:g})" if bar < NO_BAR else "")
+        for value, unit, bar in zip(medians, UNITS, bars, strict=True)
+    ]
+    fine = all(value <= bar for value, bar in zip(medians, bars, strict=True))
+    print(f"{name:34} {', '.join(words)}  {'ok' if fine else 'MISSED'}", flush=True)
+    return fine
+
+
+def main(_: Sequence[str]) -> int:
+    """Print the table; return 1 if a bar is missed."""
+    dilemma = MapFixture(read_map_file(find_map("dilemma")))
+    program, no_bar = executable("ddqn-planner"), NO_BAR
+    importing = partial(run_command, sys.executable, "-c", "import ddqn_planner")
+    with claim_ros_domain(), Client() as client:
+        server, planner = partial(start_map_server, client), partial(start_planner, client, dilemma)
+        fine = [show("map_server_node to its first map", server, (0.8, no_bar, 90))]
+        client.publish("map", dilemma.message(), LATCHED, listeners=0)
+        fine.append(show("planner_node to its first plan", planner, (1.5, 0.9, 210)))
+    fine += [
+        show("import ddqn_planner", importing, (no_bar, 0.3, no_bar)),
+        show(
+            "ddqn-planner plan dilemma",
+            partial(run_command, program, "plan", "dilemma"),
+            (1.2, no_bar, no_bar),
+        ),
+        show("ddqn-planner --help", partial(run_command, program, "--help"), (0.3, no_bar, no_bar)),
+    ]
+    return int(not all(fine))
+
+
+if __name__ == "__main__":
+    run_script(main)
