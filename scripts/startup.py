@@ -8,6 +8,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from functools import partial
 
 from client import Client, initial_pose, pose
@@ -60,12 +61,18 @@ def start_map_server(client: Client) -> Usage:
 
 def run_command(*command: str) -> Usage:
     """Return what a command takes from start to end."""
-    began = time.monotonic()
+    began, peak, ended = time.monotonic(), 0.0, 0
     child = subprocess.Popen(command, stdout=subprocess.DEVNULL)
-    _, status, used = os.wait4(child.pid, 0)
+    while not ended:
+        # Not ru_maxrss: that begins with the memory of this process.
+        with suppress(IndexError, OSError):
+            peak = memory(child.pid, "VmHWM")
+        time.sleep(0.002)
+        ended, status, used = os.wait4(child.pid, os.WNOHANG)
+    seconds = time.monotonic() - began
     child.returncode = os.waitstatus_to_exitcode(status)
     assert child.returncode == 0, f"{command} ended with {child.returncode}"
-    return time.monotonic() - began, used.ru_utime + used.ru_stime, used.ru_maxrss / 1e3
+    return seconds, used.ru_utime + used.ru_stime, peak
 
 
 def show(name: str, start: Callable[[], Usage], bars: Usage) -> bool:

@@ -24,7 +24,7 @@ from ddqn_planner.training.environment import Scenario, paper_scenario
 signal.signal(signal.SIGINT, signal.default_int_handler)
 torch.set_num_threads(1)
 # A loaded machine is slow, not wrong.
-hypothesis.settings.register_profile("default", deadline=None, max_examples=50)
+hypothesis.settings.register_profile("default", deadline=None, max_examples=25)
 hypothesis.settings.register_profile("fuzz", deadline=None, max_examples=1000)
 hypothesis.settings.load_profile("default")
 
