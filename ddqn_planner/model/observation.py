@@ -77,9 +77,8 @@ def patches(occupancy: NDArray[np.bool_], cost: NDArray[np.int8] | None) -> NDAr
     """
     values = np.where(occupancy, OCCUPIED, np.int8(0) if cost is None else cost).astype(np.int8)
     padded = np.pad(values, 1, constant_values=OCCUPIED)
-    patch_C9: NDArray[np.int8] = np.lib.stride_tricks.sliding_window_view(padded, (3, 3)).reshape(
-        -1, 9
-    )
+    windows = np.lib.stride_tricks.sliding_window_view(padded, (3, 3))
+    patch_C9: NDArray[np.int8] = windows.reshape(-1, 9)
     return patch_C9
 
 

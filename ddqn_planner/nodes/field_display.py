@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from nav_msgs.msg import OccupancyGrid
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
-from rclpy.clock import Clock
-from rclpy.clock_type import ClockType
 from rclpy.node import Node
 from std_msgs.msg import Header
 from visualization_msgs.msg import MarkerArray
@@ -13,7 +11,7 @@ from visualization_msgs.msg import MarkerArray
 from ddqn_planner.grid import GridMap
 from ddqn_planner.nodes.conversions import unknown_value_message, value_message
 from ddqn_planner.nodes.markers import no_policy_message, policy_message
-from ddqn_planner.nodes.runtime import LATCHED, Worker
+from ddqn_planner.nodes.runtime import LATCHED, STEADY, Worker
 from ddqn_planner.planning import QField
 
 LOOK_PERIOD = 0.1
@@ -38,9 +36,8 @@ class FieldDisplay:
         self._published_policy: QField | None = None
         self._value_publisher = node.create_publisher(OccupancyGrid, "~/value", LATCHED)
         self._policy_publisher = node.create_publisher(MarkerArray, "~/policy", LATCHED)
-        steady = Clock(clock_type=ClockType.STEADY_TIME)
         group = MutuallyExclusiveCallbackGroup()
-        node.create_timer(LOOK_PERIOD, self._show_policy, group, clock=steady)
+        node.create_timer(LOOK_PERIOD, self._show_policy, group, clock=STEADY)
 
     def show_again(self) -> None:
         """Publish the next field even if it is shown already."""

@@ -11,27 +11,21 @@ large map. A request that waits for a worker is a coroutine.
 from __future__ import annotations
 
 import ctypes
-import gc
 import os
 from contextlib import suppress
-from typing import Any, NoReturn
+from typing import NoReturn
 
-import numpy as np
 from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped
 from nav_msgs.msg import OccupancyGrid, Odometry, Path
 from nav_msgs.srv import GetPlan
 from rcl_interfaces.msg import SetParametersResult
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup, ReentrantCallbackGroup
-from rclpy.clock import Clock
-from rclpy.clock_type import ClockType
-from rclpy.exceptions import InvalidParameterValueException
 from rclpy.parameter import Parameter
 from rclpy.task import Future
 from std_msgs.msg import Header, String
 from std_srvs.srv import Trigger
 
 from ddqn_planner.grid import Cell, GridMap, inflate
-from ddqn_planner.model import find_model
 from ddqn_planner.nodes.conversions import (
     cell_from_pose,
     check_pose,
@@ -40,10 +34,11 @@ from ddqn_planner.nodes.conversions import (
     path_message,
 )
 from ddqn_planner.nodes.field_display import FieldDisplay
+from ddqn_planner.nodes.model_loading import load, load_and_warm_up
 from ddqn_planner.nodes.planner_parameters import (
-    CHOICES,
     Settings,
     check_parameter,
+    check_parameters_of,
     declare_parameters,
 )
 from ddqn_planner.nodes.report import (
@@ -57,20 +52,19 @@ from ddqn_planner.nodes.report import (
     Outcome,
     Report,
     RequestError,
+    checked,
     describe_map,
+    describe_model,
     reason_of,
     seconds,
 )
-from ddqn_planner.nodes.runtime import LATCHED, BaseNode, Worker, spin_until_shutdown
+from ddqn_planner.nodes.runtime import LATCHED, STEADY, BaseNode, Worker, spin_until_shutdown
 from ddqn_planner.nodes.start_source import StartSource, StartUnknownError
 from ddqn_planner.planning import Planner, PlanRequest
 from ddqn_planner.planning.planner import last_step
 
 LOOK_PERIOD = 0.1
 """Seconds between two looks whether something changed: an answer does not wait for diagnostics."""
-
-M_MMAP_THRESHOLD = -3
-"""The number of an option of glibc's mallopt(3)."""
 
 
 class PlannerNode(BaseNode):
@@ -91,14 +85,12 @@ class PlannerNode(BaseNode):
         self._planner: Planner | None = None
         self._model_file = ""
         declare_parameters(self)
-        for parameter in self.get_parameters([*CHOICES, "robot_frame"]):
-            result = self._check_parameters([parameter])
-            if not result.successful:
-                raise InvalidParameterValueException(parameter.name, parameter.value, result.reason)
+        check_parameters_of(self)
         self._settings = Settings.of(self)
 
         self._worker = Worker(self)
-        # What takes less time than a field does not wait for the fields of other requests.
+        # What takes milliseconds must not wait for the fields of other requests: one of 2000 x 2000
+        # cells takes more than a second.
         self._quick_worker = Worker(self)
         # While it loads, DDS discovers, and the node says what else is missing.
         self._first_planner = self._worker.call(load_and_warm_up, self.get_parameter("model").value)
@@ -116,10 +108,9 @@ class PlannerNode(BaseNode):
             self._plan_for_active_goal, MutuallyExclusiveCallbackGroup()
         )
         self._start = StartSource(self, self._settings.start_source, self._on_start)
-        self._map_subscription = self.create_subscription(
-            OccupancyGrid, "map", self._on_map, LATCHED
-        )
-        self.get_logger().info(f"waiting for a map on {self._map_subscription.topic_name}")
+        maps = self.create_subscription(OccupancyGrid, "map", self._on_map, LATCHED)
+        self._map_topic = maps.topic_name
+        self.get_logger().info(f"waiting for a map on {self._map_topic}")
         self.create_subscription(PoseStamped, "goal_pose", self._on_goal_pose, 10)
         if self.get_parameter("follow_trainer").value:
             self.create_subscription(String, "trainer/model_saved", self._on_model_saved, LATCHED)
@@ -128,8 +119,7 @@ class PlannerNode(BaseNode):
             GetPlan, "~/get_plan", self._on_get_plan, callback_group=ReentrantCallbackGroup()
         )
         self.create_service(Trigger, "~/reload_model", self._on_reload_model)
-        steady = Clock(clock_type=ClockType.STEADY_TIME)
-        self.create_timer(LOOK_PERIOD, self._on_look, clock=steady)
+        self.create_timer(LOOK_PERIOD, self._on_look, clock=STEADY)
         self.add_on_set_parameters_callback(self._check_parameters)
         self.add_post_set_parameters_callback(self._apply_parameters)
         self._replan.trigger()
@@ -169,14 +159,13 @@ class PlannerNode(BaseNode):
             return
         try:
             loaded = await self._first_planner
-        except Exception as error:
-            reason = f"{str(error) or repr(error)}; or set the parameter 'model'"
-            if self._model_is_due:
-                self._report.refuse("model", reason)
-        else:
             if self._model_is_due:
                 self._use_planner(*loaded)
-        self._model_is_due = False
+        except Exception as error:
+            if self._model_is_due:
+                self._model_is_due = False
+                reason = f"{str(error) or repr(error)}; or set the parameter 'model'"
+                self._report.refuse("model", reason)
 
     def _use_planner(self, planner: Planner, model_file: str) -> None:
         """Plan with it from now on."""
@@ -269,8 +258,7 @@ class PlannerNode(BaseNode):
     def _missing_map(self) -> str:
         refused = self._report.refused.get("map")
         because = f" ({refused})" if refused else ""
-        topic = self._map_subscription.topic_name
-        return f"no map was received on {topic} yet{because}; start a map server"
+        return f"no map was received on {self._map_topic} yet{because}; start a map server"
 
     # Planning
 
@@ -336,7 +324,7 @@ class PlannerNode(BaseNode):
     async def _plan(
         self, start: PoseStamped | None, goal: PoseStamped, tolerance: float
     ) -> Outcome:
-        _checked(INVALID_GOAL, check_pose, "the goal", goal.header, goal.pose, self._frame())
+        checked(INVALID_GOAL, check_pose, "the goal", goal.header, goal.pose, self._frame())
         map_message, next_grid, settings = self._map, self._grid, self._settings
         if map_message is None or next_grid is None:
             raise RequestError(NO_MAP, self._missing_map())
@@ -351,12 +339,12 @@ class PlannerNode(BaseNode):
 
         def cell(status: str, name: str, stamped: PoseStamped) -> Cell:
             pose = stamped.header, stamped.pose
-            found: Cell = _checked(status, cell_from_pose, name, *pose, grid, frame)
+            found: Cell = checked(status, cell_from_pose, name, *pose, grid, frame)
             return found
 
         request = PlanRequest(
             grid,
-            tolerance=_checked(INVALID_TOLERANCE, check_tolerance, tolerance) / grid.resolution,
+            tolerance=checked(INVALID_TOLERANCE, check_tolerance, tolerance) / grid.resolution,
             start=cell(INVALID_START, "the start", start),
             goal=cell(INVALID_GOAL, "the goal", goal),
             move_rule=settings.move_rule or planner.metadata.move_rule,
@@ -374,6 +362,7 @@ class PlannerNode(BaseNode):
     # Diagnostics
 
     def _on_look(self) -> None:
+        self._report.log_paths()
         looked, self._next_look = self._next_look, Future()
         looked.set_result(None)
         if self._waits_for_start and self._start.name == "tf":
@@ -390,56 +379,20 @@ class PlannerNode(BaseNode):
     def _describe(self) -> dict[str, str]:
         description = {"model": self.get_parameter("model").value}
         if self._planner is not None:
-            metadata = self._planner.metadata
-            description |= {
-                "model file": self._model_file,
-                "model move rule": metadata.move_rule.value,
-                "model sizes": ", ".join(f"{key} {n}" for key, n in metadata.sizes.items()),
-                "model training steps": str(metadata.steps),
-                "move rule": (self._settings.move_rule or metadata.move_rule).value,
-            }
+            rule = self._settings.move_rule or self._planner.metadata.move_rule
+            description |= {"model file": self._model_file, "move rule": rule.value}
+            description |= describe_model(self._planner.metadata)
         if self._map is not None:
             description["map"] = describe_map(self._map)
             description["map stamp (s)"] = seconds(self._map.header.stamp)
         return description
 
 
-def _checked(status: str, function: Any, *arguments: Any) -> Any:
-    """Call a function; its ValueError becomes a `RequestError` with this status."""
-    try:
-        return function(*arguments)
-    except ValueError as error:
-        raise RequestError(status, str(error)) from None
-
-
-def load(model: str) -> tuple[Planner, str]:
-    """Return the planner of a model, and the model's file."""
-    path = find_model(model)
-    return Planner.load(path), str(path)
-
-
-def load_and_warm_up(model: str) -> tuple[Planner, str]:
-    """Load a model, and the libraries and compiled functions that the first plan needs.
-
-    The garbage collector leaves out what is there then: it would take 100 ms per collection.
-    """
-    planner, path = load(model)
-    sizes = planner.metadata.sizes
-    shape = sizes.get("height", 3), sizes.get("width", 3)
-    # The start is too near to an obstacle, so that a search takes it out.
-    occupancy = np.zeros(shape, dtype=np.bool_)
-    occupancy[0, 0] = True
-    grid = GridMap(occupancy, obstacles=np.zeros(shape, dtype=np.bool_))
-    planner.plan(grid, (0, 0), (shape[1] - 1, shape[0] - 1))
-    gc.freeze()
-    return planner, path
-
-
 def main() -> NoReturn:
     """Run the planner node until SIGINT or SIGTERM."""
-    # glibc returns large arrays at once. Else it keeps what fields leave behind, a tenth more.
+    # glibc returns large arrays at once: after 120 fields the process has 185 MB instead of 245.
     with suppress(AttributeError):  # another C library
-        ctypes.CDLL(None).mallopt(M_MMAP_THRESHOLD, 2**20)
+        ctypes.CDLL(None).mallopt(-3, 2**20)  # M_MMAP_THRESHOLD
     exit_code = spin_until_shutdown(PlannerNode, declare_parameters)
     # A field that is being computed cannot be stopped, and Python would wait for its thread.
     os._exit(exit_code)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any, Final
 
+from rclpy.exceptions import InvalidParameterValueException
 from rclpy.node import Node
 
 from ddqn_planner.grid import MoveRule
@@ -163,3 +164,14 @@ def check_parameter(name: str, value: Any) -> None:
         check_tf()
     if name == "robot_frame" and not value:
         raise ValueError("robot_frame is ''; name the robot's frame, as base_link")
+
+
+def check_parameters_of(node: Node) -> None:
+    """Check the parameters with which a node starts; InvalidParameterValueException ends it."""
+    for parameter in node.get_parameters([*CHOICES, "robot_frame"]):
+        try:
+            check_parameter(parameter.name, parameter.value)
+        except (ValueError, RuntimeError) as error:
+            raise InvalidParameterValueException(
+                parameter.name, parameter.value, str(error)
+            ) from None

@@ -18,7 +18,8 @@ from rcl_interfaces.msg import (
     SetParametersResult,
 )
 from rcl_interfaces.srv import SetParameters, SetParametersAtomically
-from rclpy.callback_groups import CallbackGroup
+from rclpy.clock import Clock
+from rclpy.clock_type import ClockType
 from rclpy.exceptions import NameValidationException, ParameterException
 from rclpy.executors import ExternalShutdownException
 from rclpy.logging import get_logger
@@ -36,6 +37,9 @@ LATCHED = QoSProfile(
     durability=DurabilityPolicy.TRANSIENT_LOCAL,
 )
 """Late subscribers receive the last message too: for maps, plans, saved models."""
+
+STEADY = Clock(clock_type=ClockType.STEADY_TIME)
+"""For timers that must not depend on simulated time."""
 
 SERVICE_QUALITY = QoSProfile(depth=5000)
 """For each service, except ROS's parameter services, whose queue is 1,000.
@@ -57,19 +61,9 @@ class BaseNode(Node):
         super().__init__(name, start_parameter_services=False)
         self._parameter_services = _CheckedParameterService(self)
 
-    def create_service(
-        self,
-        srv_type: Any,
-        srv_name: str,
-        callback: Callable[..., Any],
-        *,
-        qos_profile: QoSProfile = SERVICE_QUALITY,
-        callback_group: CallbackGroup | None = None,
-    ) -> Service:
+    def create_service(self, *arguments: Any, **options: Any) -> Service:
         """Create a service with the queue of `SERVICE_QUALITY`."""
-        return super().create_service(
-            srv_type, srv_name, callback, qos_profile=qos_profile, callback_group=callback_group
-        )
+        return super().create_service(*arguments, **{"qos_profile": SERVICE_QUALITY, **options})
 
 
 class _CheckedParameterService(ParameterService):
@@ -141,16 +135,7 @@ def declare(
 ) -> None:
     """Declare a parameter with what a user reads of it.
 
-    Parameters
-    ----------
-    node : Node
-    name, default, description
-    limits : (float, float), optional
-        The range of a number; ROS checks it.
-    choices : sequence of str
-        The values of a string. The node must check them, and what `constraint` says.
-    constraint : str
-    read_only : bool
+    ROS checks the limits of a number. The node must check choices, and what the constraint says.
     """
     constraint = f"one of {list(choices)}" if choices else constraint
     descriptor = ParameterDescriptor(
@@ -179,14 +164,7 @@ the node runs, with `ros2 param set NODE PARAMETER VALUE`:
 def help_text(program: str, summary: str, declare_parameters: Callable[[Any], None]) -> str:
     """Return what ``--help`` prints, without a node.
 
-    Parameters
-    ----------
-    program : str
-        Name of the executable.
-    summary : str
-        What the node does, one sentence.
-    declare_parameters : callable
-        Declares the node's parameters, and calls nothing else of the node that it is given.
+    `declare_parameters` may call nothing of its node except `declare_parameter`.
     """
     parts = [HELP.format(program=program, summary=summary)]
 
@@ -211,17 +189,8 @@ def spin_until_shutdown(
 ) -> int:
     """Run one node until SIGINT or SIGTERM, or print its parameters if the user asks for help.
 
-    Parameters
-    ----------
-    make_node : callable
-        The node's class.
-    declare_parameters : callable, optional
-        See `help_text`; without it there is no ``--help``.
-
-    Returns
-    -------
-    int
-        Exit code: 0, or 1 if the node cannot start with its parameters, names or environment.
+    Returns the exit code: 0, or 1 if the node cannot start with its parameters, names or
+    environment. Without `declare_parameters` (see `help_text`) there is no ``--help``.
     """
     if declare_parameters and {"-h", "--help"} & {*sys.argv[1:]}:
         summary = (make_node.__doc__ or "").partition("\n")[0].replace("``", "")
