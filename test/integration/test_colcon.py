@@ -144,6 +144,10 @@ def test_nodes_of_the_workspace_plan_with_its_model_on_its_map(
             *sourced(install, install / "ddqn_planner" / "lib" / "ddqn_planner" / name, *arguments)
         )
 
+    def names_model(message: DiagnosticArray) -> bool:
+        """The node speaks before it has loaded its model."""
+        return any(entry.key == "model file" for entry in message.status[0].values)
+
     client = make_client()
     diagnostics = client.subscribe(DiagnosticArray, "/diagnostics")
     maps = client.subscribe(OccupancyGrid, "map", LATCHED)
@@ -153,7 +157,7 @@ def test_nodes_of_the_workspace_plan_with_its_model_on_its_map(
         node("planner_node") as planner,
     ):
         grid = grid_from_message(maps.wait(timeout=START_TIMEOUT))
-        diagnosis = diagnostics.wait(timeout=START_TIMEOUT).status[0]
+        diagnosis = diagnostics.wait(names_model, timeout=START_TIMEOUT).status[0]
 
         client.publish("initialpose", initial_pose(pose(grid, paper.start)))
         client.publish("goal_pose", pose(grid, paper.goal))
