@@ -22,6 +22,7 @@ COMMANDS: Final = {
 INSTALL: Final = {
     "matplotlib": "pip install 'ddqn_planner[experiments]'",
     "nav_msgs": "source ROS 2 Jazzy, or pip install 'ddqn_planner[ros]'",
+    "rclpy": "source ROS 2 Jazzy, or pip install 'ddqn_planner[ros]'",
     "rerun": "pip install 'ddqn_planner[watch]'",
     "torch": "pip install torch",
 }
@@ -58,7 +59,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         options = parser.parse_args(arguments)
         return int(options.run(options))
     except (OSError, ValueError, ImportError) as error:
-        hint = INSTALL.get(getattr(error, "name", None) or "")
+        library = (getattr(error, "name", None) or "").partition(".")[0]
+        hint = INSTALL.get(library)
         print(f"ddqn-planner: {error}" + (f"; {hint}" if hint else ""), file=sys.stderr)
         return 2
 

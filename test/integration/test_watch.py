@@ -162,7 +162,7 @@ def test_without_a_display_it_exits_and_says_what_to_do(
     ("missing", "remedy"),
     [
         ("rerun", "pip install 'ddqn_planner[watch]'"),
-        ("rclpy.node", "pip install 'ddqn_planner[ros]', or source ROS 2 Jazzy"),
+        ("rclpy.node", "source ROS 2 Jazzy, or pip install 'ddqn_planner[ros]'"),
     ],
 )
 def test_a_missing_library_is_named_with_the_way_to_install_it(
