@@ -633,21 +633,24 @@ def test_the_module_of_the_node_imports_no_torch() -> None:
     assert subprocess.run([sys.executable, "-c", loaded]).returncode == 0
 
 
-def test_without_torch_a_start_is_refused_and_the_node_lives(
+@pytest.mark.parametrize("library", ["torch", "gymnasium"])
+def test_without_its_libraries_a_start_is_refused_and_the_node_lives(
+    library: str,
     run_node: Any,
     make_client: Any,
     namespace: str,
     tmp_path: FilePath,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    (tmp_path / "torch.py").write_text("raise ModuleNotFoundError(\"No module named 'torch'\")")
+    missing = f"No module named '{library}'"
+    (tmp_path / f"{library}.py").write_text(f'raise ModuleNotFoundError("{missing}")')
     monkeypatch.setenv("PYTHONPATH", f"{tmp_path}:{os.environ.get('PYTHONPATH', '')}")
     client = make_client(namespace)
     parameters = {"map_file": "dilemma", "output_folder": str(tmp_path / "run")}
     with run_node("trainer_node", parameters, namespace=namespace) as node:
         answer = client.call(Trigger, "trainer/start")
         assert not answer.success
-        assert "needs another library (No module named 'torch')" in answer.message
+        assert f"needs another library ({missing})" in answer.message
         assert "call ~/start first" in client.call(Trigger, "trainer/replay").message
     assert "Traceback" not in node.log
 
