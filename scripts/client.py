@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import queue
 import threading
 import time
 from collections import deque
@@ -19,6 +20,7 @@ from nav_msgs.msg import OccupancyGrid, Path
 from nav_msgs.srv import GetPlan
 from numpy.typing import NDArray
 from rcl_interfaces.srv import GetParameters, SetParameters
+from rclpy._rclpy_pybind11 import RCLError
 from rclpy.context import Context
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.parameter import Parameter, parameter_value_to_python
@@ -119,6 +121,7 @@ class Client:
         self._thread = threading.Thread(target=self._spin, daemon=True)
         self._thread.start()
         self._services: dict[str, Any] = {}
+        self._answered: set[str] = set()
         self._publishers: dict[str, Any] = {}
 
     def __enter__(self) -> Self:
@@ -135,8 +138,11 @@ class Client:
         self.node.destroy_node()
 
     def _spin(self) -> None:
-        with suppress(ExternalShutdownException):
+        try:
             self._executor.spin()
+        except (ExternalShutdownException, RCLError):  # by `close`
+            if self._context.ok():
+                raise
 
     def service(self, service_type: Any, name: str) -> Any:
         """Return rclpy's client of a service, always the same one, once the service is there."""
@@ -153,14 +159,24 @@ class Client:
     def call(
         self, service_type: Any, name: str, request: Any = None, timeout: float = TIMEOUT
     ) -> Any:
-        """Wait for a service, call it, and return its response; or raise TimeoutError."""
-        answered, service = threading.Event(), self.service(service_type, name)
-        future = service.call_async(request or service_type.Request())
-        future.add_done_callback(lambda _: answered.set())
-        if not answered.wait(timeout):
+        """Wait for a service, call it, and return its response; or raise TimeoutError.
+
+        The middleware drops the answer to a client that the node has not discovered yet, which a
+        busy machine delays. So the first call of a service asks again; the first answer counts.
+        """
+        service, answers = self.service(service_type, name), queue.SimpleQueue[Any]()
+        waits = [timeout] if name in self._answered else [timeout / 4, 3 * timeout / 4]
+        futures = []
+        for wait in waits:
+            futures.append(service.call_async(request or service_type.Request()))
+            futures[-1].add_done_callback(answers.put)
+            with suppress(queue.Empty):
+                answer = answers.get(timeout=wait)
+                self._answered.add(name)
+                return answer.result()
+        for future in futures:
             service.remove_pending_request(future)
-            raise TimeoutError(f"no answer from {name} within {timeout:.0f} s")
-        return future.result()
+        raise TimeoutError(f"no answer from {name} within {timeout:.0f} s")
 
     def publisher(self, message_type: Any, topic: str, qos: Any = 10, listeners: int = 1) -> Any:
         """Return a publisher, always the same one per topic, once so many listen."""
