@@ -1,4 +1,4 @@
-# make setup | demo | test | lint | format | types | bench | body | faults | fuzz | load | soak | model | model-dilemma
+# make setup | demo | test | test-fast | docs | lint | format | types | bench | body | faults | fuzz | load | soak | model | model-dilemma
 PYTHON ?= python3
 TORCH ?= torch==2.13.0
 VENV := .venv
@@ -12,7 +12,7 @@ else
 EXTRAS := experiments,figures,ros,tensorboard,test,watch
 endif
 
-.PHONY: setup demo test lint format types bench body faults fuzz load soak model model-dilemma
+.PHONY: setup demo test test-fast docs lint format types bench body faults fuzz load soak model model-dilemma
 .DEFAULT_GOAL := help
 
 .PHONY: help
@@ -31,8 +31,20 @@ $(VENV)/installed: setup.py Makefile
 demo: setup
 	$(BIN)/python scripts/demo.py
 
+# One process per core; each has its nodes in a ROS domain of its own.
+PYTEST := $(BIN)/python -m pytest --numprocesses auto --maxprocesses 4 --dist loadgroup --no-loadscope-reorder
+
 test: setup
-	$(BIN)/python -m pytest
+	$(PYTEST)
+
+# No ROS and nothing slow: for every save.
+test-fast: setup
+	$(PYTEST) --ignore test/integration -m "not slow"
+
+# The site, in docs/_build/html; a warning is an error.
+docs: setup
+	$(BIN)/pip install --quiet --editable ".[$(EXTRAS),docs]"
+	$(BIN)/python -m sphinx --quiet --fail-on-warning --keep-going --fresh-env docs docs/_build/html
 
 lint: setup
 	$(BIN)/ruff check .
@@ -47,6 +59,7 @@ types: setup
 
 bench: setup
 	$(BIN)/pip install --quiet --editable ".[$(EXTRAS),bench]"
+	$(BIN)/python scripts/startup.py
 	$(BIN)/python scripts/benchmark.py
 	$(BIN)/python scripts/benchmark_any_map.py $(MAP)
 

@@ -1,22 +1,24 @@
 from glob import glob
 from pathlib import Path
+from xml.etree import ElementTree
 
 from setuptools import find_packages, setup
 
 PACKAGE = "ddqn_planner"
+# `colcon build --symlink-install` runs a link to this file, in a folder without the others.
+ROOT = Path(__file__).resolve().parent
 
 setup(
     name=PACKAGE,
-    version="0.1.0",
+    version=ElementTree.parse(ROOT / "package.xml").findtext("version"),
     description="Plans robot paths on grid maps with a Double DQN, as ROS 2 nodes",
-    # `colcon build --symlink-install` runs a link to this file in a folder without a README.
-    long_description=(Path(__file__).resolve().parent / "README.md").read_text(encoding="utf-8"),
+    long_description=(ROOT / "README.md").read_text(encoding="utf-8"),
     long_description_content_type="text/markdown",
     license="Apache-2.0",
     maintainer="ddqn_planner maintainers",
     maintainer_email="maintainers@ddqn-planner.example",
     packages=find_packages(include=[PACKAGE, f"{PACKAGE}.*"]),
-    # Links in the source tree, files in what is built of it.
+    # Links in the source tree, files in what is built from it.
     package_data={PACKAGE: ["py.typed", "maps/*", "models/*"]},
     data_files=[
         ("share/ament_index/resource_index/packages", [f"resource/{PACKAGE}"]),
@@ -41,9 +43,10 @@ setup(
     extras_require={
         "ros": ["ros-jazzy-rclpy[fastrtps]>=7.1.5,<8", "ros-jazzy-common-interfaces>=5.3,<6"],
         "figures": ["matplotlib>=3.6"],
-        "experiments": ["matplotlib>=3.6", "pathfinding>=1.0.9"],
+        "experiments": ["matplotlib>=3.6"],
         "tensorboard": ["tensorboard>=2.10"],
         "watch": ["rerun-sdk>=0.39"],
+        "docs": ["furo", "myst-parser>=3.0", "sphinx>=7.3"],
         "bench": ["psutil>=5.9", "pyastar2d>=1.1", "stable-baselines3>=2.6"],
         "test": [
             "colcon-core>=0.15",
@@ -52,6 +55,7 @@ setup(
             "hypothesis>=6.80",
             "mypy>=1.10",
             "pytest>=7.4",
+            "pytest-xdist>=3.5",
             "ruff>=0.9",
             "types-PyYAML",
             "types-tqdm",

@@ -1,7 +1,13 @@
 """Plans robot paths on grid maps with a Double DQN."""
 
-from ddqn_planner.grid import GridMap, MoveRule, inflate, load_map
-from ddqn_planner.planning import Plan, PlanMethod, Planner, PlanStatus, QField, simplify
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from ddqn_planner.grid import GridMap, MoveRule, inflate, load_map
+    from ddqn_planner.planning import Plan, PlanMethod, Planner, PlanStatus, QField, simplify
 
 __all__ = [
     "GridMap",
@@ -15,3 +21,17 @@ __all__ = [
     "load_map",
     "simplify",
 ]
+
+
+def __getattr__(name: str) -> Any:
+    """Import a public name at its first use, so that a program loads only what it uses."""
+    if name not in __all__:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    of_grid = name in ("GridMap", "MoveRule", "inflate", "load_map")
+    value = getattr(import_module(f"{__name__}.{'grid' if of_grid else 'planning'}"), name)
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted([*globals(), *__all__])

@@ -1,12 +1,13 @@
-"""Writing files so that a crash or a full disk leaves no half of anything."""
+"""Writes files so that a crash or a full disk never leaves half a file or half a record."""
 
 from __future__ import annotations
 
 import csv
 import fcntl
+import glob
 import io
 import os
-import tempfile
+import secrets
 from collections.abc import Iterable, Sequence
 from contextlib import suppress
 from pathlib import Path
@@ -14,49 +15,45 @@ from typing import BinaryIO
 
 
 def write_atomically(path: Path, content: bytes) -> None:
-    """Write a file beside its place and rename it there; missing folders are made.
+    """Write a temporary file beside `path` and rename it; missing folders are made.
 
-    A process that is killed meanwhile leaves a temporary file, see `remove_temporaries`.
+    If the process is killed meanwhile, the temporary file remains: see `remove_temporaries`.
 
     Raises
     ------
     OSError
-        If it cannot be written; what stood at `path` is then untouched.
+        If the file cannot be written; an old file at `path` is then unchanged.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
-    descriptor, temporary = tempfile.mkstemp(prefix=f".{path.name}.", dir=path.parent)
+    temporary = path.with_name(f".{path.name}.{secrets.token_hex(8)}")
     try:
-        with os.fdopen(descriptor, "wb") as file:
+        with temporary.open("xb") as file:
             file.write(content)
             file.flush()
             os.fsync(file.fileno())
-        # mkstemp makes a private file; a saved one has the mode of any other new file.
-        umask = os.umask(0)
-        os.umask(umask)
-        os.chmod(temporary, 0o666 & ~umask)
-        os.replace(temporary, path)
+        temporary.replace(path)
     except BaseException:
-        with suppress(OSError):  # the first error is the one to tell
-            os.unlink(temporary)
+        with suppress(OSError):  # report the first error
+            temporary.unlink()
         raise
 
 
 def remove_temporaries(path: Path) -> None:
-    """Remove what killed processes left of writing a file; its name must have no wildcards.
+    """Remove the temporary files that killed processes left beside `path`.
 
     Raises
     ------
     OSError
         If one cannot be removed.
     """
-    for temporary in path.parent.glob(f".{path.name}.*"):
+    for temporary in path.parent.glob(f".{glob.escape(path.name)}.*"):
         temporary.unlink(missing_ok=True)
 
 
 def lock(path: Path) -> BinaryIO:
-    """Lock a file, which is made if need be, until the returned file is closed.
+    """Lock a file until the returned file is closed; a missing file is made, and stays.
 
-    The end of the process, a kill too, closes it. The file itself stays.
+    When the process ends, or is killed, the system closes the file.
 
     Raises
     ------
@@ -75,14 +72,10 @@ def lock(path: Path) -> BinaryIO:
 
 
 class Appender:
-    """Appends records to a file, each whole before the next one begins.
+    """Appends records to a file, each of them complete before the next one begins.
 
-    When the disk is full, the file may end with a part of a record; the rest of it is kept, and
-    written before the next record.
-
-    Parameters
-    ----------
-    path : Path
+    When the disk is full, the file may end with a part of a record. The rest is kept and written
+    before the next record.
 
     Raises
     ------
@@ -91,7 +84,7 @@ class Appender:
     """
 
     def __init__(self, path: Path) -> None:
-        # Unbuffered: who reads the file meanwhile, or after a crash, sees every record.
+        # Unbuffered: readers see every record, also after a crash.
         self._file = path.open("ab", buffering=0)
         self._rest = b""
 
@@ -101,15 +94,15 @@ class Appender:
         Raises
         ------
         OSError
-            If it cannot be written whole. It is then written by the next call that can write, or
-            left out if the one before it is not yet whole.
+            If it cannot be written completely. The next call that can write then writes the rest
+            of it, or leaves it out if the record before it is still incomplete.
         """
         self.flush()
         self._rest = record
         self.flush()
 
     def flush(self) -> None:
-        """Write what is left of the last record; see `append` for errors."""
+        """Write the rest of the last record; see `append` for errors."""
         while self._rest:
             self._rest = self._rest[self._file.write(self._rest) :]
 
@@ -119,7 +112,7 @@ class Appender:
 
 
 def write_csv(path: Path, columns: Sequence[str], rows: Iterable[Sequence[object]]) -> None:
-    """Write a table under its header; see `write_atomically` for errors."""
+    """Write a table with a header row; see `write_atomically` for errors."""
     text = io.StringIO(newline="")
     csv.writer(text).writerows([columns, *rows])
     write_atomically(path, text.getvalue().encode())

@@ -1,14 +1,12 @@
-"""Finds the maps and models that come with the package, however it was installed.
+"""Finds the maps and models that come with the package.
 
-They are data of the package, so they lie beside its code. In the source tree ``maps`` and
-``models`` beside the code are links to the folders at the top. ``share/ddqn_planner`` of an
-installed package holds copies for the tools of ROS, which nothing here reads.
+They lie beside its code, however it was installed; in the source tree ``maps`` and ``models`` there
+are links to the folders at the top. The copies in ``share/ddqn_planner`` are only for ROS tools.
 """
 
 from __future__ import annotations
 
 import os
-from importlib.resources import files
 from pathlib import Path
 
 PACKAGE = "ddqn_planner"
@@ -29,7 +27,7 @@ def find_resource(folder: str, name: str) -> Path:
     FileNotFoundError
         If there is none; the message names the folder and the files that are there.
     """
-    directory = Path(str(files(PACKAGE))) / folder
+    directory = Path(__file__).parent / folder
     if os.path.isfile(directory / name):
         return directory / name
     known = ", ".join(sorted(path.name for path in directory.glob("*.*")))
@@ -37,24 +35,24 @@ def find_resource(folder: str, name: str) -> Path:
 
 
 def find_map(name: str) -> Path:
-    """Return the file of a map that is given by path, URL or the name of a shipped one.
+    """Return the file of a map, given its path, its URL or the name of a shipped map.
 
     Parameters
     ----------
     name : str
         A path, a ``file://`` or ``package://`` URL, or the name of a map that comes with this
-        package, with or without its ending. A file of that very name in the working directory
-        goes first; a folder does not.
+        package, with or without its ending. A file of the same name in the working directory has
+        priority.
 
     Returns
     -------
     Path
-        It need not exist: whoever reads it will say so.
+        It may be missing, unless it is a shipped map: whoever reads it reports that.
 
     Raises
     ------
     FileNotFoundError
-        If there is no shipped map of that name, or no such package, or a URL leads out of it.
+        If there is no shipped map of that name, no such package, or if a URL leads out of it.
     """
     path = Path(name.removeprefix("file://"))
     if name.startswith("package://"):

@@ -1,4 +1,4 @@
-"""A bare rclpy service that returns a ready path: what planner/get_plan is measured against."""
+"""A bare rclpy service that returns a ready path: what planner/get_plan is compared with."""
 
 import sys
 
@@ -8,6 +8,7 @@ from nav_msgs.msg import Path
 from nav_msgs.srv import GetPlan
 from rclpy.executors import ExternalShutdownException
 from rclpy.node import Node
+from rclpy.utilities import try_shutdown
 
 
 def main() -> None:
@@ -24,7 +25,7 @@ def main() -> None:
     try:
         rclpy.spin(node)
     except (KeyboardInterrupt, ExternalShutdownException):
-        rclpy.try_shutdown()
+        try_shutdown()
 
 
 if __name__ == "__main__":

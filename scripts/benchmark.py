@@ -8,23 +8,23 @@ import sys
 import tempfile
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import Any
 
-import demo
 import gymnasium
-import psutil
 import torch
-from client import pose
+from client import TIMEOUT, Client, initial_pose, plan_request, pose, wait_for
+from nav_msgs.msg import Path as PathMessage
 from nav_msgs.srv import GetPlan
-from processes import executable, running
+from processes import claim_ros_domain, memory, run_script, running, running_node
 from stable_baselines3 import DQN
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from std_srvs.srv import Trigger
 from torch import nn
 
 from ddqn_planner import MoveRule, Planner
-from ddqn_planner.resources import find_resource
+from ddqn_planner.nodes.runtime import LATCHED
 from ddqn_planner.training.environment import GridEnvironment, Scenario, paper_scenario
 from ddqn_planner.training.hyper_parameters import HyperParameters
 from ddqn_planner.training.trainer import Trainer
@@ -35,14 +35,14 @@ STEPS = 3_000
 ROUNDS = 5
 
 
-def main() -> int:
+def main(_: Sequence[str]) -> int:
     """Print each figure beside its bound; return 1 if one is missed."""
     torch.set_num_threads(1)
     scenario = paper_scenario()
-    missed = [measure_field(scenario), *measure_training(scenario)]
-    with demo.client() as node:
-        missed += measure_planner(node, scenario)
-        missed += measure_trainer(node)
+    missed = [measure_field(scenario), measure_training(scenario)]
+    with claim_ros_domain(), Client() as client:
+        missed += measure_planner(client, scenario)
+        missed += measure_trainer(client)
     return int(any(missed))
 
 
@@ -104,7 +104,7 @@ def stable_baselines(scenario: Scenario, p: HyperParameters) -> DQN:
     )
 
 
-def measure_training(scenario: Scenario) -> list[bool]:
+def measure_training(scenario: Scenario) -> bool:
     """Compare our steps/s with Stable-Baselines3's: one update of 32 transitions a step."""
     # ε at its last value for both from the start: a random action costs no forward pass.
     p = HyperParameters(epsilon_start=HyperParameters().epsilon_end)
@@ -123,16 +123,16 @@ def measure_training(scenario: Scenario) -> list[bool]:
     train_theirs()
     ratios, rates = [], []
     for _ in range(ROUNDS):
-        our_rate, their_rate = steps_a_second(train_ours), steps_a_second(train_theirs)
+        our_rate, their_rate = steps_per_second(train_ours), steps_per_second(train_theirs)
         ratios.append(our_rate / their_rate)
         rates.append((our_rate, their_rate))
     our_rate, their_rate = (statistics.median(rate) for rate in zip(*rates, strict=True))
     figure = f"training: {our_rate:.0f} steps/s; Stable-Baselines3 {their_rate:.0f}; ratio"
-    return [report(figure, statistics.median(ratios), "x", 1.5, at_most=False)]
+    return report(figure, statistics.median(ratios), "x", 1.5, at_most=False)
 
 
-def steps_a_second(train: Callable[[], None]) -> float:
-    """Return the environment steps a second of a function that makes `STEPS`."""
+def steps_per_second(train: Callable[[], None]) -> float:
+    """Return the environment steps per second of a function that makes `STEPS`."""
     began = time.perf_counter()
     train()
     return STEPS / (time.perf_counter() - began)
@@ -143,76 +143,80 @@ def count_weights(network: nn.Module) -> int:
     return sum(parameter.numel() for parameter in network.parameters())
 
 
-def call(client: Any, request: Any) -> float:
-    """Call a service; return how long its answer took, milliseconds."""
+def timed(service: Any, request: Any) -> tuple[float, Any]:
+    """Call a service; return how long its answer took, milliseconds, and the answer."""
     answered = threading.Event()
     began = time.perf_counter()
-    future = client.call_async(request)
+    future = service.call_async(request)
     future.add_done_callback(lambda _: answered.set())
-    assert answered.wait(demo.TIMEOUT), f"no answer from {client.srv_name}"
-    return 1e3 * (time.perf_counter() - began)
+    assert answered.wait(TIMEOUT), f"no answer from {service.srv_name}"
+    return 1e3 * (time.perf_counter() - began), future.result()
 
 
-def measure_planner(node: demo.Client, scenario: Scenario) -> list[bool]:
+def compare_with_bare_service(
+    client: Client, request: Any, poses: int, calls: int
+) -> tuple[float, float]:
+    """Return the median times of the planner and of a bare service that answers as much, ms."""
+    script = Path(__file__).with_name("bare_service.py")
+    with running(sys.executable, str(script), str(poses)):
+        ours = client.service(GetPlan, "planner/get_plan")
+        bare = client.service(GetPlan, "bare/get_plan")
+        timed(bare, request)
+        pairs = [(timed(ours, request)[0], timed(bare, request)[0]) for _ in range(calls)]
+    ours_ms, bare_ms = (statistics.median(times) for times in zip(*pairs, strict=True))
+    return ours_ms, bare_ms
+
+
+def measure_planner(client: Client, scenario: Scenario) -> list[bool]:
     """Measure the planner node: its first plan, its round trips, its memory."""
+    plans = client.subscribe(PathMessage, "plan", LATCHED)
     began = time.monotonic()
-    map_server = running(executable("map_server_node"))
-    with map_server as first, running(executable("planner_node")) as planner:
-        plan = demo.request_plan(node, [first, planner], scenario)
+    with running_node("map_server_node") as first, running_node("planner_node") as planner:
+        client.publish("initialpose", initial_pose(pose(scenario.grid, scenario.start)))
+        client.publish("goal_pose", pose(scenario.grid, scenario.goal))
+        plan = wait_for("plan", lambda: plans.find(lambda plan: plan.poses), [first, planner])
         seconds = time.monotonic() - began
-        start, goal = pose(scenario.grid, scenario.start), plan.poses[-1]
-        request = GetPlan.Request(start=start, goal=goal)
-        request.start.pose.position = plan.poses[0].pose.position
-        bare = node.create_client(GetPlan, "bare/get_plan")
-        script = __file__.replace("benchmark.py", "bare_service.py")
-        with running(sys.executable, script, str(len(plan.poses))):
-            assert bare.wait_for_service(demo.TIMEOUT)
-            ours, theirs = [], []
-            for _ in range(CALLS):
-                ours.append(call(node.get_plan, request))
-                theirs.append(call(bare, request))
-        memory = psutil.Process(planner.pid).memory_info().rss / 1e6
-    ours_ms, theirs_ms = statistics.median(ours), statistics.median(theirs)
-    figure = f"GetPlan, known field: {ours_ms:.2f} ms; bare service {theirs_ms:.2f} ms; ratio"
+        request = plan_request(scenario.grid, scenario.start, scenario.goal)
+        ours, bare = compare_with_bare_service(client, request, len(plan.poses), CALLS)
+        resident = memory(planner.pid)
+    figure = f"GetPlan, known field: {ours:.2f} ms; bare service {bare:.2f} ms; ratio"
     return [
         report("process start to first plan", seconds, "s", 6),
-        report(figure, ours_ms / theirs_ms, "x", 1.5),
-        report("planner node, resident memory", memory, "MB", 500),
+        report(figure, ours / bare, "x", 1.5),
+        report("planner node, resident memory", resident, "MB", 500),
     ]
 
 
-def measure_trainer(node: demo.Client) -> list[bool]:
+def measure_trainer(client: Client) -> list[bool]:
     """Measure the trainer node while it trains: its services, and how soon a signal ends it."""
     missed: list[bool] = []
     slowest: dict[str, float] = {}
-    clients = {
-        name: node.create_client(Trigger, f"trainer/{name}")
-        for name in ("start", "save", "replay", "stop")
-    }
+
+    def call(name: str, times: int = 1) -> float:
+        service = client.service(Trigger, f"trainer/{name}")
+        return max(timed(service, Trigger.Request())[0] for _ in range(times))
+
     for number in (signal.SIGINT, signal.SIGTERM):
-        with tempfile.TemporaryDirectory() as folder:
-            map_file = find_resource("maps", "dilemma.yaml")
-            parameters = (f"output_folder:={folder}", f"map_file:={map_file}", "steps:=1000000")
-            arguments = [word for parameter in parameters for word in ("-p", parameter)]
-            with running(executable("trainer_node"), "--ros-args", *arguments) as trainer:
-                assert clients["start"].wait_for_service(demo.TIMEOUT)
-                # A service is found before its node spins: the first answer says that it does.
-                waited = call(clients["stop"], Trigger.Request())
-                print(f"trainer: first answer of the node, while it comes up: {waited:.0f} ms")
-                first = call(clients["start"], Trigger.Request())
-                slowest["start"] = max(slowest.get("start", 0.0), first)
-                time.sleep(10)  # thousands of steps: a checkpoint and curves of some size
-                for name in ("start", "save", "replay", "stop"):
-                    times = [call(clients[name], Trigger.Request()) for _ in range(50)]
-                    slowest[name] = max(slowest.get(name, 0.0), *times)
-                for _ in range(20):  # until the training that was stopped has saved itself
-                    call(clients["start"], Trigger.Request())
-                    time.sleep(0.1)
-                began = time.monotonic()
-                trainer.send_signal(number)
-                exit_code = trainer.wait()
-                seconds = time.monotonic() - began
-            assert exit_code == 0, f"{number.name} ended the trainer with {exit_code}"
+        with (
+            tempfile.TemporaryDirectory() as folder,
+            running_node(
+                "trainer_node", output_folder=folder, map_file="dilemma", steps=1_000_000
+            ) as trainer,
+        ):
+            # A service is found before its node spins: the first answer says that it does.
+            print(f"trainer: first answer of the node, while it starts: {call('stop'):.0f} ms")
+            slowest["start"] = max(slowest.get("start", 0.0), call("start"))
+            time.sleep(10)  # thousands of steps: a checkpoint and curves of some size
+            for name in ("start", "save", "replay", "stop"):
+                slowest[name] = max(slowest.get(name, 0.0), call(name, 50))
+            for _ in range(20):  # until the training that was stopped has saved itself
+                call("start")
+                time.sleep(0.1)
+            began = time.monotonic()
+            trainer.send_signal(number)
+            exit_code = trainer.wait()
+            seconds = time.monotonic() - began
+        assert exit_code == 0, f"{number.name} ended the trainer with {exit_code}"
         missed.append(report(f"trainer: {number.name} to exit", seconds, "s", 3))
     missed += [
         report(f"trainer: ~/{name} while it trains, slowest of 100", ms, "ms", 100)
@@ -222,4 +226,4 @@ def measure_trainer(node: demo.Client) -> list[bool]:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    run_script(main)

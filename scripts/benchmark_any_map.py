@@ -8,26 +8,23 @@ from __future__ import annotations
 
 import gc
 import statistics
-import sys
 import tempfile
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
 
-import demo
 import numpy as np
 import pyastar2d
 import torch
-from benchmark import call, report
-from client import plan_request
+from benchmark import compare_with_bare_service, report, timed
+from client import Client, plan_request, wait_for
 from nav_msgs.srv import GetPlan
-from processes import executable, running
+from processes import claim_ros_domain, memory, run_script, running_node
 from rcl_interfaces.srv import GetParameters, ListParameters
 from std_srvs.srv import Trigger
 
 from ddqn_planner import GridMap, MoveRule, Planner, load_map
-from ddqn_planner.experiments.generalisation import compare_with_dijkstra
+from ddqn_planner.benchmarks.generalisation import compare_with_dijkstra
 from ddqn_planner.experiments.goal_1 import a_star
 from ddqn_planner.grid import Cell, save_map
 from ddqn_planner.grid.generators import KINDS, generate_map, random_requests
@@ -46,9 +43,9 @@ def main(arguments: Sequence[str]) -> int:
     gc.freeze()  # else this process pauses to look for garbage among what it has imported
     missed = [measure_fields(256), measure_fields(1024)]
     compare_single_queries(256)
-    with demo.client() as node:
-        missed += measure_node(node, str(arguments[0] if arguments else find_map("office")))
-        missed += measure_large_map(node)
+    with claim_ros_domain(), Client() as client:
+        missed += measure_node(client, Path(arguments[0] if arguments else find_map("office")))
+        missed += measure_large_map(client)
     return int(any(missed))
 
 
@@ -60,8 +57,8 @@ def measure_fields(side: int) -> bool:
         grid = GridMap(generate_map(kind, (side, side), random))
         goals = [goal for _, goal in random_requests(grid.occupancy, RULE, GOALS, random)]
         compare_with_dijkstra(planner, grid, goals[0], RULE)  # compiled code is loaded
-        both = [compare_with_dijkstra(planner, grid, goal, RULE) for goal in goals]
-        field, dijkstra = (statistics.median(row[column] for row in both) for column in (1, 3))
+        both = [compare_with_dijkstra(planner, grid, goal, RULE)[1::2] for goal in goals]
+        field, dijkstra = (statistics.median(times) for times in zip(*both, strict=True))
         ratios[kind] = field / dijkstra
         print(f"{side}x{side} {kind}: field {field:.1f} ms, Dijkstra {dijkstra:.1f} ms")
     worst = max(ratios, key=lambda kind: ratios[kind])
@@ -81,7 +78,7 @@ def compare_single_queries(side: int) -> None:
     def with_known_field(start: Cell, goal: Cell) -> object:
         return planner.plan(grid, start, goal, RULE)
 
-    def pathfinding(start: Cell, goal: Cell) -> object:
+    def own_a_star(start: Cell, goal: Cell) -> object:
         return a_star(Scenario(grid, start, goal), RULE)
 
     def pyastar(start: Cell, goal: Cell) -> object:
@@ -92,7 +89,7 @@ def compare_single_queries(side: int) -> None:
     planners: dict[str, Callable[[Cell, Cell], object]] = {
         "ours, new field": with_new_field,
         "ours, known field": with_known_field,
-        "pathfinding A*, its grid made anew": pathfinding,
+        "our A*": own_a_star,
         "pyastar2d A* (cuts corners, a diagonal counts 1)": pyastar,
     }
     for name, plan in planners.items():
@@ -104,110 +101,82 @@ def compare_single_queries(side: int) -> None:
         print(f"one query at {side}x{side}, {name}: median {statistics.median(times):.2f} ms")
 
 
-def plan_of(client: Any, asked: GetPlan.Request) -> Any:
-    """Return the plan of a service's answer."""
-    future = client.call_async(asked)
-    demo.wait_for("plan", future.done, [])
-    return future.result().plan
+def first_answer(client: Client, request: GetPlan.Request) -> tuple[float, int]:
+    """Ask the planner until it has its map; return its first plan's milliseconds and poses."""
+    service = client.service(GetPlan, "planner/get_plan")
+
+    def answer() -> tuple[float, int] | None:
+        took, response = timed(service, request)
+        return (took, len(response.plan.poses)) if response.plan.poses else None
+
+    return wait_for("plan", answer)
 
 
-def measure_node(node: demo.Client, map_file: str) -> list[bool]:
+def measure_node(client: Client, map_file: Path) -> list[bool]:
     """Measure the first and the later answers of the planner node on a real-size map."""
     grid = load_map(map_file)
-    random = np.random.default_rng(0)
-    requests = [
-        plan_request(grid, *cells) for cells in random_requests(grid.occupancy, RULE, GOALS, random)
-    ]
-    parameter = f"yaml_filename:={Path(map_file).resolve()}"
+    pairs = random_requests(grid.occupancy, RULE, GOALS, np.random.default_rng(0))
+    requests = [plan_request(grid, *cells) for cells in pairs]
     first, ratios = [], []
-    bare = node.create_client(GetPlan, "bare/get_plan")
-    map_server = running(executable("map_server_node"), "--ros-args", "-p", parameter)
-    with map_server, running(executable("planner_node")):
-        first.append(first_answer(node, requests[0]))
-        script = __file__.replace("benchmark_any_map.py", "bare_service.py")
-        for asked in requests[1:]:
-            first.append(call(node.get_plan, asked))
-            poses = len(plan_of(node.get_plan, asked).poses)
-            with running(sys.executable, script, str(poses)):
-                assert bare.wait_for_service(demo.TIMEOUT)
-                call(bare, asked)
-                pairs = [(call(node.get_plan, asked), call(bare, asked)) for _ in range(CALLS)]
-            ours, theirs = (statistics.median(times) for times in zip(*pairs, strict=True))
-            ratios.append(ours / theirs)
+    server = running_node("map_server_node", yaml_filename=map_file.resolve())
+    with server, running_node("planner_node"):
+        first.append(first_answer(client, requests[0])[0])
+        for request in requests[1:]:
+            took, poses = first_answer(client, request)
+            first.append(took)
+            ours, bare = compare_with_bare_service(client, request, poses, CALLS)
+            ratios.append(ours / bare)
             print(
-                f"GetPlan of {poses} poses: first {first[-1]:.1f} ms, then {ours:.2f} ms; bare "
-                f"service {theirs:.2f} ms"
+                f"GetPlan of {poses} poses: first {took:.1f} ms, then {ours:.2f} ms; bare "
+                f"service {bare:.2f} ms"
             )
-    name = f"{Path(map_file).stem}, {grid.width}x{grid.height}"
+    name = f"{map_file.stem}, {grid.width}x{grid.height}"
+    figure = f"{name}: GetPlan to a new goal, first ever {first[0]:.1f} ms, slowest"
     return [
-        report(
-            f"{name}: GetPlan to a new goal, first ever {first[0]:.1f} ms, slowest",
-            max(first),
-            "ms",
-            100,
-        ),
+        report(figure, max(first), "ms", 100),
         report(f"{name}: GetPlan again / bare service, worst", max(ratios), "x", 1.5),
     ]
 
 
-def first_answer(node: demo.Client, asked: GetPlan.Request) -> float:
-    """Ask the planner until it has its map; return how long its first plan took, milliseconds."""
-    assert node.get_plan.wait_for_service(demo.TIMEOUT)
-
-    def answer() -> float:
-        began = time.perf_counter()
-        poses = plan_of(node.get_plan, asked).poses
-        return 1e3 * (time.perf_counter() - began) if poses else 0.0
-
-    return demo.wait_for("map", answer, [])
-
-
-def measure_large_map(node: demo.Client) -> list[bool]:
+def measure_large_map(client: Client) -> list[bool]:
     """Measure memory, and what other services take while a large field is computed."""
     random = np.random.default_rng(0)
     grid = GridMap(generate_map("office", (LARGE, LARGE), random))
     cells = random_requests(grid.occupancy, RULE, GOALS + 1, random)
     new = [plan_request(grid, *both) for both in cells[1:]]
-    known = plan_request(
-        grid, cells[0][0], cells[0][0]
-    )  # of one pose: a long path takes its own time
-    services = {
-        "get_parameters": (
-            node.create_client(GetParameters, "planner/get_parameters"),
-            GetParameters.Request(names=["model"]),
-        ),
-        "list_parameters": (
-            node.create_client(ListParameters, "planner/list_parameters"),
-            ListParameters.Request(),
-        ),
-        "get_plan with a known field": (node.get_plan, known),
-        "reload_model": (node.create_client(Trigger, "planner/reload_model"), Trigger.Request()),
+    # Of one pose: a long path takes its own time.
+    known = plan_request(grid, cells[0][0], cells[0][0])
+    parameters = GetParameters.Request(names=["model"])
+    questions = {
+        "get_parameters": (GetParameters, "planner/get_parameters", parameters),
+        "list_parameters": (ListParameters, "planner/list_parameters", ListParameters.Request()),
+        "get_plan with a known field": (GetPlan, "planner/get_plan", known),
+        "reload_model": (Trigger, "planner/reload_model", Trigger.Request()),
     }
     missed, waited = [], []
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder, "large.yaml")
         save_map(grid, path)
-        parameter = f"yaml_filename:={path}"
-        map_server = running(executable("map_server_node"), "--ros-args", "-p", parameter)
-        with map_server, running(executable("planner_node")) as planner:
-            first_answer(node, known)
-            for name, (client, question) in services.items():
-                times = []
-                for asked in new:
-                    plan_of(node.get_plan, known)
+        server = running_node("map_server_node", yaml_filename=path)
+        with server, running_node("planner_node") as planner:
+            first_answer(client, known)
+            get_plan = client.service(GetPlan, "planner/get_plan")
+            for name, (service_type, service_name, question) in questions.items():
+                service, times = client.service(service_type, service_name), []
+                for request in new:
+                    timed(get_plan, known)
                     began = time.perf_counter()
-                    plan = node.get_plan.call_async(asked)
+                    plan = get_plan.call_async(request)
                     while not plan.done():
-                        times.append(call(client, question))
+                        times.append(timed(service, question)[0])
                     waited.append(1e3 * (time.perf_counter() - began))
                 figure = f"{LARGE}x{LARGE}, field under way: {name}, slowest of {len(times)}"
                 missed.append(report(figure, max(times), "ms", 100))
-            memory = Path(f"/proc/{planner.pid}/status").read_text(encoding="utf-8")
+            peak = memory(planner.pid, "VmHWM")
     print(f"{LARGE}x{LARGE}: GetPlan with a new field, median {statistics.median(waited):.0f} ms")
-    peak = int(memory.split("VmHWM:")[1].split()[0]) / 1e3
     missed.append(report(f"{LARGE}x{LARGE}: planner node, greatest memory", peak, "MB", 2000))
     return missed
 
 
 if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]))
+    run_script(main)

@@ -5,18 +5,16 @@ With the path of a ROS map, and the robot's radius in metres. The requests go to
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-import demo
 import numpy as np
 import scipy.ndimage
 import scipy.sparse
-from client import plan_request
+from client import Client, cells_of, pose, wait_for
 from numpy.typing import NDArray
-from processes import executable, running
+from processes import claim_ros_domain, run_script, running_node
 
 from ddqn_planner import GridMap, MoveRule, inflate, load_map
 from ddqn_planner.grid import MOVES, Cell, clearance, legal_moves, move_costs, path_length
@@ -33,22 +31,12 @@ BOUND_FACTORS = np.array([1.01, 1.1, 1.3, 1.6, 2.5, 5.0])
 
 @dataclass(frozen=True)
 class Measured:
-    """What came of the requests.
-
-    Parameters
-    ----------
-    least, mean : float
-        Distance to the nearest obstacle, of all poses of all paths, metres.
-    edge : float
-        The least distance from a pose to the edge of an occupied cell, metres.
-    ratio : (N,) float64
-        Length over the optimum; infinite without a path.
-    """
+    """The distances from all poses of all paths to obstacles, metres, and the lengths."""
 
     least: float
     mean: float
-    edge: float
-    ratio: NDArray[np.float64]
+    edge: float  # the least distance to the edge of an occupied cell
+    ratio: NDArray[np.float64]  # (N,) lengths over the optimum; infinite without a path
 
 
 def main(arguments: Sequence[str]) -> int:
@@ -89,25 +77,21 @@ def measure(
 ) -> Measured:
     """Ask a planner node for all paths."""
     metres, edges = metres_of(grid), edge_distances(grid)
-    map_server = ("--log-level", "error", "-p", f"yaml_filename:={Path(path).resolve()}")
-    planner = (
-        "--log-level",
-        "error",
-        "-p",
-        f"robot_radius:={radius}",
-        "-p",
-        f"clearance_weight:={weight}",
-    )
+    quiet = ("--log-level", "error")
     distances, edge, ratios = [], [], []
     with (
-        demo.client() as node,
-        running(executable("map_server_node"), "--ros-args", *map_server) as server,
-        running(executable("planner_node"), "--ros-args", *planner) as asked,
+        claim_ros_domain(),
+        Client() as client,
+        running_node("map_server_node", *quiet, yaml_filename=Path(path).resolve()),
+        running_node("planner_node", *quiet, robot_radius=radius, clearance_weight=weight),
     ):
-        demo.wait_for("planner", node.get_plan.service_is_ready, [server, asked])
-        demo.wait_for("map", lambda: plan(node, grid, *requests[0]), [server, asked])
+
+        def plan(start: Cell, goal: Cell) -> list[Cell]:
+            return cells_of(grid, client.get_plan(pose(grid, start), pose(grid, goal)))
+
+        wait_for("map", lambda: plan(*requests[0]))
         for (start, goal), optimum in zip(requests, optima, strict=True):
-            cells = plan(node, grid, start, goal)
+            cells = plan(start, goal)
             distances += [metres[y, x] for x, y in cells]
             edge += [edges[y, x] for x, y in cells]
             ratios.append(path_length(cells) / optimum if cells else np.inf)
@@ -159,17 +143,8 @@ def greatest_distance(
 
     length = share * integrals(np.ones_like(metres))
     greatest = metres[~grid.occupancy].max()
-    return min(c - integrals(c - metres) / length for c in greatest * BOUND_FACTORS)
-
-
-def plan(node: demo.Client, grid: GridMap, start: Cell, goal: Cell) -> list[Cell]:
-    """Return the cells of a path, none if there is none."""
-    request = plan_request(grid, start, goal)
-    future = node.get_plan.call_async(request)
-    demo.wait_for("answer", future.done, [])
-    poses = future.result().plan.poses
-    return [grid.world_to_cell(p.pose.position.x, p.pose.position.y) for p in poses]
+    return float(min(c - integrals(c - metres) / length for c in greatest * BOUND_FACTORS))
 
 
 if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]))
+    run_script(main)

@@ -1,35 +1,117 @@
-"""A client of the nodes: spun in the background, and what it asks."""
+"""A client of the nodes, and the messages that scripts and tests exchange with them."""
 
 from __future__ import annotations
 
+import queue
 import threading
+import time
+from collections import deque
+from collections.abc import Callable, Iterable
 from contextlib import suppress
+from subprocess import Popen
+from typing import TYPE_CHECKING, Any, TypeVar
 
+import numpy as np
 import rclpy
-from geometry_msgs.msg import PoseStamped
+from builtin_interfaces.msg import Time
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped
+from nav_msgs.msg import OccupancyGrid, Path
 from nav_msgs.srv import GetPlan
+from numpy.typing import NDArray
+from rcl_interfaces.srv import GetParameters, SetParameters
+from rclpy._rclpy_pybind11 import RCLError
+from rclpy.context import Context
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rclpy.parameter import Parameter, parameter_value_to_python
 from rclpy.qos import QoSProfile
 from std_msgs.msg import Header
 
 from ddqn_planner.grid import Cell, GridMap
-from ddqn_planner.nodes.conversions import quaternion
+from ddqn_planner.nodes.conversions import occupancy_message, quaternion
+from ddqn_planner.nodes.report import seconds
+
+if TYPE_CHECKING:
+    from typing_extensions import Self
+
+TIMEOUT = 120.0
+"""Seconds that anything may take on a loaded machine."""
 
 SERVICE_QUALITY = QoSProfile(depth=1000)
-"""Of a client that asks much. With Fast DDS each client of a service hears the answers to all, and
-one that is slow to read them loses its own from the usual queue of ten."""
+"""With Fast DDS each client of a service hears the answers to all clients. One that is slow to read
+them loses its own from the usual queue of ten."""
+
+T = TypeVar("T")
 
 
-class BackgroundNode:
-    """A node in a context of its own, spun in the background.
+def wait_for(
+    what: str,
+    answer: Callable[[], T | None],
+    children: Iterable[Popen[bytes]] = (),
+    timeout: float = TIMEOUT,
+) -> T:
+    """Return the first answer that is true.
 
-    Parameters
-    ----------
-    name, namespace : str
+    RuntimeError says that one of the children has ended, TimeoutError that time is up.
     """
+    deadline = time.monotonic() + timeout
+    while not (found := answer()):
+        for child in children:
+            if child.poll() is not None:
+                raise RuntimeError(f"{child.args!r} ended during the wait for: {what}")
+        if time.monotonic() > deadline:
+            raise TimeoutError(f"no {what} within {timeout:.0f} s")
+        time.sleep(0.002)
+    return found
 
-    def __init__(self, name: str, namespace: str = "") -> None:
-        self._context = rclpy.Context()
+
+class Recorder:
+    """The messages that a topic brought since the last `clear`: all, or the last `keep`."""
+
+    def __init__(self, keep: int | None = None) -> None:
+        self._arrived = threading.Condition()
+        self._messages: deque[Any] = deque(maxlen=keep)
+        self._since = 0
+
+    def add(self, message: Any, info: dict[str, Any]) -> None:
+        """Note a message that was published after the last `clear`."""
+        with self._arrived:
+            if info["source_timestamp"] >= self._since:
+                self._messages.append(message)
+                self._arrived.notify_all()
+
+    def clear(self) -> None:
+        """Forget what came, and what is still on its way."""
+        with self._arrived:
+            self._messages.clear()
+            self._since = time.time_ns()
+
+    def find(self, predicate: Callable[[Any], Any] = lambda message: True) -> Any:
+        """Return the first message for which the predicate holds, or None."""
+        with self._arrived:
+            return next((message for message in self._messages if predicate(message)), None)
+
+    def wait(
+        self, predicate: Callable[[Any], Any] = lambda message: True, timeout: float = TIMEOUT
+    ) -> Any:
+        """Return the first message for which the predicate holds, or raise TimeoutError."""
+        with self._arrived:
+            found = self._arrived.wait_for(lambda: self.find(predicate), timeout)
+            if found is None:
+                raise TimeoutError(f"no such message; there came {[*self._messages][-3:]}")
+            return found
+
+    def messages(self) -> list[Any]:
+        """Return what came since the last `clear`, in order."""
+        with self._arrived:
+            return [*self._messages]
+
+
+class Client:
+    """A node in a context of its own, spun in the background."""
+
+    def __init__(self, namespace: str = "", name: str = "client") -> None:
+        self._context = Context()
         self._context.init(args=[])
         self.node = rclpy.create_node(
             name, namespace=namespace, context=self._context, start_parameter_services=False
@@ -38,6 +120,15 @@ class BackgroundNode:
         self._executor.add_node(self.node)
         self._thread = threading.Thread(target=self._spin, daemon=True)
         self._thread.start()
+        self._services: dict[str, Any] = {}
+        self._answered: set[str] = set()
+        self._publishers: dict[str, Any] = {}
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
 
     def close(self) -> None:
         """Stop spinning, and destroy the node."""
@@ -47,18 +138,134 @@ class BackgroundNode:
         self.node.destroy_node()
 
     def _spin(self) -> None:
-        with suppress(ExternalShutdownException):
+        try:
             self._executor.spin()
+        except (ExternalShutdownException, RCLError):  # by `close`
+            if self._context.ok():
+                raise
+
+    def service(self, service_type: Any, name: str) -> Any:
+        """Return rclpy's client of a service, always the same one, once the service is there."""
+        if name not in self._services:
+            self._services[name] = self.node.create_client(
+                service_type, name, qos_profile=SERVICE_QUALITY
+            )
+        # It looks four times per second only: a service that is called at the very moment when it
+        # is found may not know its client yet, and the answer is lost.
+        if not self._services[name].wait_for_service(TIMEOUT):
+            raise TimeoutError(f"no service {name} within {TIMEOUT:.0f} s")
+        return self._services[name]
+
+    def call(
+        self, service_type: Any, name: str, request: Any = None, timeout: float = TIMEOUT
+    ) -> Any:
+        """Wait for a service, call it, and return its response; or raise TimeoutError.
+
+        The middleware drops the answer to a client that the node has not discovered yet, which a
+        busy machine delays. So the first call of a service asks again; the first answer counts.
+        """
+        service, answers = self.service(service_type, name), queue.SimpleQueue[Any]()
+        waits = [timeout] if name in self._answered else [timeout / 4, 3 * timeout / 4]
+        futures = []
+        for wait in waits:
+            futures.append(service.call_async(request or service_type.Request()))
+            futures[-1].add_done_callback(answers.put)
+            with suppress(queue.Empty):
+                answer = answers.get(timeout=wait)
+                self._answered.add(name)
+                return answer.result()
+        for future in futures:
+            service.remove_pending_request(future)
+        raise TimeoutError(f"no answer from {name} within {timeout:.0f} s")
+
+    def publisher(self, message_type: Any, topic: str, qos: Any = 10, listeners: int = 1) -> Any:
+        """Return a publisher, always the same one per topic, once so many listen."""
+        if topic not in self._publishers:
+            self._publishers[topic] = self.node.create_publisher(message_type, topic, qos)
+        publisher = self._publishers[topic]
+        wait_for(f"listener to {topic}", lambda: publisher.get_subscription_count() >= listeners)
+        return publisher
+
+    def publish(self, topic: str, message: Any, qos: Any = 10, listeners: int = 1) -> None:
+        """Publish a message once so many listen."""
+        self.publisher(type(message), topic, qos, listeners).publish(message)
+
+    def subscribe(
+        self, message_type: Any, topic: str, qos: Any = 10, keep: int | None = None
+    ) -> Recorder:
+        """Return what a topic brings from now on."""
+        recorder = Recorder(keep)
+        add: Any = recorder.add  # rclpy takes callbacks of two arguments, and does not say so
+        self.node.create_subscription(message_type, topic, add, qos)
+        return recorder
+
+    def get_plan(self, start: PoseStamped, goal: PoseStamped) -> Path:
+        """Return the planner's answer."""
+        request = GetPlan.Request(start=start, goal=goal)
+        return self.call(GetPlan, "planner/get_plan", request).plan
+
+    def set_parameters(self, node: str, **values: Any) -> list[Any]:
+        """Set parameters of a node one by one; return a SetParametersResult for each."""
+        messages = [Parameter(name, value=v).to_parameter_msg() for name, v in values.items()]
+        request = SetParameters.Request(parameters=messages)
+        results: list[Any] = self.call(SetParameters, f"{node}/set_parameters", request).results
+        return results
+
+    def get_parameter(self, node: str, name: str) -> Any:
+        """Return a parameter's value."""
+        request = GetParameters.Request(names=[name])
+        response = self.call(GetParameters, f"{node}/get_parameters", request)
+        return parameter_value_to_python(response.values[0])
 
 
-def pose(grid: GridMap, cell: Cell) -> PoseStamped:
-    """Return the pose of a cell's centre in the map frame."""
+def pose(grid: GridMap, cell: Cell, yaw: float = 0.0, offset: float = 0.0) -> PoseStamped:
+    """Return the pose of a cell's centre in the map frame, or one that is `offset` m beside it."""
     message = PoseStamped(header=Header(frame_id="map"))
-    message.pose.position.x, message.pose.position.y = grid.cell_to_world(cell)
-    message.pose.orientation = quaternion(0.0)
+    x, y = grid.cell_to_world(cell)
+    message.pose.position.x, message.pose.position.y = x + offset, y - offset
+    message.pose.orientation = quaternion(yaw)
+    return message
+
+
+def initial_pose(start: PoseStamped) -> PoseWithCovarianceStamped:
+    """Return a pose as `initialpose` takes it."""
+    message = PoseWithCovarianceStamped(header=start.header)
+    message.pose.pose = start.pose
     return message
 
 
 def plan_request(grid: GridMap, start: Cell, goal: Cell) -> GetPlan.Request:
     """Return a request for a plan between two cells."""
     return GetPlan.Request(start=pose(grid, start), goal=pose(grid, goal))
+
+
+def cell_of(grid: GridMap, stamped: PoseStamped) -> Cell:
+    """Return the cell of a pose."""
+    return grid.world_to_cell(stamped.pose.position.x, stamped.pose.position.y)
+
+
+def cells_of(grid: GridMap, path: Path) -> list[Cell]:
+    """Return the cells of a path, none if there is none."""
+    return [cell_of(grid, stamped) for stamped in path.poses]
+
+
+def map_message(values: NDArray[np.int8], grid: GridMap, stamp: int = 0) -> OccupancyGrid:
+    """Return the message of a map in the map frame, stamped with a number of seconds."""
+    header = Header(frame_id="map", stamp=Time(sec=stamp))
+    return occupancy_message(values, grid.resolution, grid.origin, header)
+
+
+def values_of(status: DiagnosticStatus) -> dict[str, str]:
+    """Return the values of a diagnostic status."""
+    return {entry.key: entry.value for entry in status.values}
+
+
+def wait_for_map(diagnostics: Recorder, stamp: Time, node: str = "/planner") -> None:
+    """Wait until the diagnostics of a planner name the stamp of its map."""
+
+    def has_map(message: DiagnosticArray) -> bool:
+        status = message.status[0]
+        found = values_of(status).get("map stamp (s)")
+        return status.name == f"{node}: plan" and found == seconds(stamp)
+
+    diagnostics.wait(has_map)

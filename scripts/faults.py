@@ -9,39 +9,33 @@ from __future__ import annotations
 
 import array
 import random
-import signal
 import subprocess
-import sys
 import tempfile
 import time
 from collections.abc import Callable, Sequence
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from dataclasses import astuple, dataclass, fields
+from functools import partial
 from itertools import cycle, islice
 from pathlib import Path
 from typing import Any, TypeVar
 
-import demo
 import numpy as np
-from client import plan_request, pose
-from geometry_msgs.msg import PoseWithCovarianceStamped
-from load import RULE, Terrain
+from client import Client, initial_pose, plan_request, pose, wait_for
+from demo import start_and_goal
+from map_fixture import RULE, MapFixture
 from nav_msgs.msg import OccupancyGrid
+from nav_msgs.msg import Path as PathMessage
 from nav_msgs.srv import GetPlan, LoadMap
-from processes import executable, running
+from processes import claim_ros_domain, run_script, running_node
 from rcl_interfaces.srv import GetParameters, SetParameters
 from rclpy.parameter import Parameter
 from std_srvs.srv import Trigger
 
-from ddqn_planner.grid import (
-    OCCUPIED,
-    Cell,
-    MapFile,
-    read_map_file,
-    save_map,
-)
+from ddqn_planner.grid import OCCUPIED, Cell, MapFile, load_map, read_map_file, save_map
 from ddqn_planner.grid.generators import generate_map, random_requests
 from ddqn_planner.model import load_model
+from ddqn_planner.nodes.runtime import LATCHED
 from ddqn_planner.resources import find_map
 from ddqn_planner.training.environment import Scenario
 from ddqn_planner.training.trainer import Trainer
@@ -62,6 +56,7 @@ START_TIME = 20.0
 LAST_WAIT = 0.5
 """Seconds that a client waits after a kill until it gives up."""
 
+GET_PLAN = "planner/get_plan"
 T = TypeVar("T")
 
 
@@ -86,152 +81,127 @@ class Tally:
 
 
 class Killed:
-    """An executable of the package that is killed and started again."""
+    """A node that is killed and started again."""
 
-    def __init__(self, name: str, *arguments: str) -> None:
-        self._command = (executable(name), "--ros-args", "--log-level", "fatal", *arguments)
-        self._stack = ExitStack()
-        self._child: subprocess.Popen[bytes] | None = None
+    def __init__(self, stack: ExitStack, name: str, *arguments: str, **parameters: object) -> None:
+        self._run = partial(running_node, name, "--log-level", "fatal", *arguments, **parameters)
+        self._stack = stack
+        self.child: subprocess.Popen[bytes] | None = None
         self.start()
 
     def start(self) -> None:
         """Start it."""
-        self._child = self._stack.enter_context(running(*self._command))
+        self.child = self._stack.enter_context(self._run())
 
     def kill(self) -> None:
         """End it as a power cut would."""
-        assert self._child is not None
-        self._child.kill()
-        self._child.wait()
-        self._child = None
-
-    def check(self) -> None:
-        """Raise if it ended by itself."""
-        if self._child is not None and self._child.poll() is not None:
-            raise RuntimeError(f"{self._command[0]} ended with {self._child.returncode}")
-
-    def stop(self) -> None:
-        """End it as Ctrl-C would."""
-        self._stack.close()
+        assert self.child is not None
+        self.child.kill()
+        self.child.wait()
+        self.child = None
 
 
 class Faults:
-    """The nodes, and what a client sees of them.
+    """The nodes, which end with a stack, and what a client sees of them."""
 
-    Parameters
-    ----------
-    client : demo.Client
-    folder : Path
-        An empty one.
-    """
-
-    def __init__(self, client: demo.Client, folder: Path) -> None:
+    def __init__(self, client: Client, folder: Path, stack: ExitStack) -> None:
         self.client = client
+        self.maps = client.subscribe(OccupancyGrid, "map", LATCHED, keep=1)
+        self.plans = client.subscribe(PathMessage, "plan", LATCHED, keep=1)
         self._draw, self._random = random.Random(0), np.random.default_rng(0)
         self.map_path, self.training_folder = folder / "map.yaml", folder / "training"
         occupancy = generate_map("office", (SIDE, SIDE), self._random)
-        ((start, goal),) = random_requests(occupancy, RULE, 1, self._random)
+        (self._watched,) = random_requests(occupancy, RULE, 1, self._random)
         values = np.where(occupancy, np.int8(100), np.int8(0))
+        start, goal = self._watched
         save_map(MapFile(values, start=start, goal=goal), self.map_path)
-        self._terrain = Terrain(read_map_file(self.map_path))
-        self._watched = start, goal
-        trained = read_map_file(find_map("dilemma"))
-        assert trained.start is not None
-        assert trained.goal is not None
-        self._scenario = Scenario(trained.grid(), trained.start, trained.goal)
+        self._map = MapFixture(read_map_file(self.map_path))
+        self._scenario = Scenario(load_map(find_map("dilemma")), *start_and_goal("dilemma"))
         self.tallies = {
             self.kill_planner: Tally("planner_node", "planning"),
             self.kill_map_server: Tally("map_server_node", "publishing"),
             self.kill_trainer: Tally("trainer_node", "saving"),
         }
-        self._services: dict[str, Any] = {}
-
-    def __enter__(self) -> Faults:
         apart = ("-r", "__ns:=/training")
-        output = f"output_folder:={self.training_folder}"
-        trained = ("map_file:=dilemma", "steps:=1000000000", output)
-        parameters = [word for parameter in trained for word in ("-p", parameter)]
-        with ExitStack() as stack:
+        self.map_server = Killed(stack, "map_server_node", yaml_filename=self.map_path)
+        self.planner = Killed(stack, "planner_node")
+        self.trainer = Killed(
+            stack,
+            "trainer_node",
+            *apart,
+            map_file="dilemma",
+            steps=1_000_000_000,
+            output_folder=self.training_folder,
+        )
+        self.follower = Killed(stack, "planner_node", *apart, follow_trainer=True)
 
-            def started(name: str, *arguments: str) -> Killed:
-                node = Killed(name, *arguments)
-                stack.callback(node.stop)
-                return node
-
-            self.map_server = started("map_server_node", "-p", f"yaml_filename:={self.map_path}")
-            self.planner = started("planner_node")
-            self.trainer = started("trainer_node", *apart, *parameters)
-            self.follower = started("planner_node", *apart, "-p", "follow_trainer:=true")
-            self._stack = stack.pop_all()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._stack.close()
+    @property
+    def children(self) -> list[subprocess.Popen[bytes]]:
+        """The processes that have to live."""
+        nodes = (self.map_server, self.planner, self.trainer, self.follower)
+        return [node.child for node in nodes if node.child]
 
     # Asking
 
-    def service(self, service_type: Any, name: str) -> Any:
-        """Return a client of a service, always the same one."""
-        if name not in self._services:
-            self._services[name] = self.client.create_client(service_type, name)
-        return self._services[name]
-
     def ask(
         self,
-        service: Any,
-        request: Any,
+        service_type: Any,
+        name: str,
+        request: Any = None,
         accept: Callable[[Any], T | None] = lambda answer: answer,
         try_time: float = TRY_TIME,
     ) -> T:
         """Ask until an answer is accepted; return what `accept` returned."""
-        deadline = time.monotonic() + demo.TIMEOUT
-        service.wait_for_service(demo.TIMEOUT)
-        while time.monotonic() < deadline:
-            for node in (self.map_server, self.planner, self.trainer, self.follower):
-                node.check()
-            future = service.call_async(request)
-            until = time.monotonic() + try_time
-            while not future.done() and time.monotonic() < until:
-                time.sleep(0.005)
-            if future.done():
-                if accepted := accept(future.result()):
+
+        def answer() -> T | None:
+            with suppress(TimeoutError):
+                accepted = accept(self.client.call(service_type, name, request, try_time))
+                if accepted:
                     return accepted
-                time.sleep(0.05)
-            service.remove_pending_request(future)
-        raise TimeoutError(f"no answer from {service.srv_name} within {demo.TIMEOUT:.0f} s")
+            time.sleep(0.05)
+            return None
+
+        return wait_for(f"answer from {name}", answer, self.children)
+
+    def ask_for_plan(self, start: Cell, goal: Cell) -> PathMessage:
+        """Ask for a plan until there is one."""
+        request = self.request(start, goal)
+        return self.ask(GetPlan, GET_PLAN, request, lambda a: a.plan if a.plan.poses else None)
 
     def trigger(self, name: str, try_time: float = TRY_TIME) -> str:
         """Call a Trigger service until it succeeds; return its message."""
-        service = self.service(Trigger, name)
-        return self.ask(service, Trigger.Request(), lambda a: a.success and a.message, try_time)
+        answer = self.ask(
+            Trigger, name, accept=lambda a: a if a.success else None, try_time=try_time
+        )
+        return str(answer.message)
 
     def parameter(self, node: str, name: str) -> Any:
         """Return a parameter's value message."""
-        service = self.service(GetParameters, f"{node}/get_parameters")
-        return self.ask(service, GetParameters.Request(names=[name]), lambda a: a.values[0])
+        request = GetParameters.Request(names=[name])
+        return self.ask(GetParameters, f"{node}/get_parameters", request, lambda a: a.values[0])
 
     def request(self, start: Cell, goal: Cell) -> GetPlan.Request:
         """Return a request for a plan between two cells."""
-        return plan_request(self._terrain.grid, start, goal)
+        return plan_request(self._map.grid, start, goal)
 
     def is_right(self, plan: Any, start: Cell, goal: Cell) -> bool:
         """Say whether a plan leads from the start to the goal by legal moves on the map.
 
         A plan of a map with new obstacles must be right on the map without them too.
         """
-        return bool(plan.poses) and not self._terrain.fault(self.request(start, goal), plan)
+        return bool(plan.poses) and not self._map.error(self.request(start, goal), plan)
 
     def is_whole(self, message: OccupancyGrid) -> bool:
         """Say whether a map is the loaded one with at most five obstacles more."""
-        values = np.frombuffer(message.data, np.int8).reshape(self._terrain.values.shape)
-        new = values != self._terrain.values
+        values = np.frombuffer(message.data, np.int8).reshape(self._map.values.shape)
+        new = values != self._map.values
         return bool((values[new] == OCCUPIED).all()) and int(new.sum()) <= 5
 
     # Killing
 
     def begin(self) -> None:
         """Wait until all nodes work, and start the training."""
-        self.ask(self.client.get_plan, self.request(*self._watched), lambda a: a.plan.poses)
+        self.ask_for_plan(*self._watched)
         self.trigger("/training/trainer/start", START_TIME)
         self.parameter("/training/planner", "model")
 
@@ -246,8 +216,8 @@ class Faults:
 
     def kill_planner(self, tally: Tally) -> None:
         """Kill the planner while it plans toward goals that it does not know."""
-        get_plan = self.client.get_plan
-        asked = random_requests(self._terrain.grid.occupancy, RULE, GOALS, self._random)
+        get_plan = self.client.service(GetPlan, GET_PLAN)
+        asked = random_requests(self._map.grid.occupancy, RULE, GOALS, self._random)
         futures = [get_plan.call_async(self.request(*cells)) for cells in asked]
         time.sleep(self._draw.uniform(0.0, 1.0))
         self.planner.kill()
@@ -256,9 +226,7 @@ class Faults:
             for answer in self.count(tally, get_plan, [future]):
                 tally.wrong_paths += not self.is_right(answer.plan, *cells)
         self.planner.start()
-        plan = self.ask(
-            get_plan, self.request(*asked[0]), lambda a: a.plan if a.plan.poses else None
-        )
+        plan = self.ask_for_plan(*asked[0])
         tally.wrong_paths += not self.is_right(plan, *asked[0])
         tally.restarts += 1
 
@@ -267,9 +235,9 @@ class Faults:
         self.plan_for_active_goal()
         load = LoadMap.Request(map_url=str(self.map_path))
         calls = [
-            *[(self.service(Trigger, "map_server/restore_map"), Trigger.Request())] * 20,
-            *[(self.service(LoadMap, "map_server/load_map"), load)] * 4,
-            (self.service(Trigger, "map_server/scatter_obstacles"), Trigger.Request()),
+            *[(self.client.service(Trigger, "map_server/restore_map"), Trigger.Request())] * 20,
+            *[(self.client.service(LoadMap, "map_server/load_map"), load)] * 4,
+            (self.client.service(Trigger, "map_server/scatter_obstacles"), Trigger.Request()),
         ]
         self._draw.shuffle(calls)
         futures = [(service, service.call_async(request)) for service, request in calls]
@@ -279,34 +247,31 @@ class Faults:
         for service, future in futures:
             self.count(tally, service, [future])
         # When that is answered, the plans of the last maps are out.
-        self.ask(self.client.get_plan, self.request(*self._watched), lambda a: a.plan.poses)
-        whole = self.is_whole(self.client.heard["map"])
-        for topic in ("map", "plan"):
-            del self.client.heard[topic]
+        self.ask_for_plan(*self._watched)
+        whole = self.is_whole(self.maps.wait())
+        self.maps.clear()
+        self.plans.clear()
         self.map_server.start()
-        served = demo.wait_for("map", lambda: self.client.heard.get("map"), [])
-        plan = demo.wait_for("plan", lambda: self.client.heard.get("plan"), [])
+        served, plan = self.maps.wait(), self.plans.wait()
         tally.wrong_paths += not self.is_right(plan, *self._watched)
-        tally.restarts += whole and served.data == array.array("b", self._terrain.values.tobytes())
+        tally.restarts += whole and served.data == array.array("b", self._map.values.tobytes())
 
     def plan_for_active_goal(self) -> None:
         """Give the planner a start and an active goal until it plans: it may be a new one."""
-        start, goal = (pose(self._terrain.grid, cell) for cell in self._watched)
-        initial_pose = PoseWithCovarianceStamped(header=start.header)
-        initial_pose.pose.pose = start.pose
-        self.client.heard.pop("plan", None)
+        start, goal = (pose(self._map.grid, cell) for cell in self._watched)
+        self.plans.clear()
 
         def planned() -> bool:
-            self.client.start.publish(initial_pose)
-            self.client.goal.publish(goal)
+            self.client.publish("initialpose", initial_pose(start))
+            self.client.publish("goal_pose", goal)
             time.sleep(0.2)
-            return "plan" in self.client.heard and bool(self.client.heard["plan"].poses)
+            return self.plans.find(lambda plan: plan.poses) is not None
 
-        demo.wait_for("plan", planned, [])
+        wait_for("plan", planned)
 
     def kill_trainer(self, tally: Tally) -> None:
         """Kill the trainer while it saves after each step, soon after a save was seen to begin."""
-        save = self.service(Trigger, "/training/trainer/save")
+        save = self.client.service(Trigger, "/training/trainer/save")
         until = time.monotonic() + self._draw.uniform(0.2, 1.2)
         futures = []
         while time.monotonic() < until:
@@ -344,15 +309,13 @@ class Faults:
     def follow(self) -> None:
         """Wait until the planner that follows the trainer has loaded a model of its."""
         other = Parameter("model", value="any_map").to_parameter_msg()
-        set_parameters = self.service(SetParameters, "/training/planner/set_parameters")
         request = SetParameters.Request(parameters=[other])
-        self.ask(set_parameters, request, lambda a: a.results[0].successful)
+        name = "/training/planner/set_parameters"
+        self.ask(SetParameters, name, request, lambda a: a.results[0].successful)
         self.trigger("/training/trainer/save")
         saved = str(self.training_folder / "model.safetensors")
-        demo.wait_for(
-            "model",
-            lambda: self.parameter("/training/planner", "model").string_value == saved,
-            [],
+        wait_for(
+            "model", lambda: self.parameter("/training/planner", "model").string_value == saved
         )
 
 
@@ -368,15 +331,14 @@ def show(tallies: Sequence[Tally]) -> None:
 
 def main(arguments: Sequence[str]) -> int:
     """Kill so many times, and print what became of it; return 1 if anything is wrong."""
-    # A shell starts what it runs in the background with SIGINT ignored, and so would the nodes be.
-    signal.signal(signal.SIGINT, signal.default_int_handler)
-    signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))
     kills = int(arguments[0]) if arguments else KILLS
     with (
-        demo.client() as client,
+        claim_ros_domain(),
+        Client() as client,
         tempfile.TemporaryDirectory() as folder,
-        Faults(client, Path(folder)) as faults,
+        ExitStack() as stack,
     ):
+        faults = Faults(client, Path(folder), stack)
         faults.begin()
         try:
             for kill, tally in islice(cycle(faults.tallies.items()), kills):
@@ -388,7 +350,4 @@ def main(arguments: Sequence[str]) -> int:
 
 
 if __name__ == "__main__":
-    try:
-        sys.exit(main(sys.argv[1:]))
-    except KeyboardInterrupt:
-        sys.exit(130)
+    run_script(main)

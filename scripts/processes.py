@@ -1,4 +1,4 @@
-"""Runs nodes as processes of their own, and talks to them: for demo, benchmark and tests."""
+"""Runs nodes as processes of their own, for scripts and tests."""
 
 from __future__ import annotations
 
@@ -6,10 +6,12 @@ import os
 import signal
 import socket
 import subprocess
+import sys
 import sysconfig
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
+from typing import NoReturn
 
 STOP_TIMEOUT = 120.0
 """Seconds that a process may take to end on a loaded machine."""
@@ -18,17 +20,8 @@ STOP_TIMEOUT = 120.0
 def claim_ros_domain() -> socket.socket:
     """Set the environment to a ROS domain that nobody else here uses, kept to this machine.
 
-    Call it before rclpy is initialised.
-
-    Returns
-    -------
-    socket.socket
-        Holds the claim until it is closed.
-
-    Raises
-    ------
-    RuntimeError
-        If all domains from 1 to 100 are claimed.
+    Call it before rclpy is initialised. The socket that is returned holds the claim until it is
+    closed; no two processes can hold the same.
     """
     for domain in range(1, 101):
         claim = socket.socket()
@@ -67,8 +60,8 @@ def _signals_held_back() -> Iterator[None]:
     finally:
         for number, handler in handlers.items():
             signal.signal(number, handler)
-        for number in held[:1]:
-            signal.raise_signal(number)
+        if held:
+            signal.raise_signal(held[0])
 
 
 @contextmanager
@@ -95,3 +88,28 @@ def _stop(child: subprocess.Popen[bytes]) -> None:
         child.kill()
         child.wait()
         raise
+
+
+def running_node(
+    name: str, *arguments: str, **parameters: object
+) -> AbstractContextManager[subprocess.Popen[bytes]]:
+    """Run a node of the package with ROS arguments and parameters."""
+    given = [word for key, value in parameters.items() for word in ("-p", f"{key}:={value}")]
+    return running(executable(name), "--ros-args", *arguments, *given)
+
+
+def memory(process: int, kind: str = "VmRSS") -> float:
+    """Return the resident memory of a process, MB; its greatest so far as ``VmHWM``."""
+    status = Path(f"/proc/{process}/status").read_text(encoding="utf-8")
+    return int(status.split(f"{kind}:")[1].split()[0]) / 1e3
+
+
+def run_script(main: Callable[[Sequence[str]], int]) -> NoReturn:
+    """Exit with what `main` returns for the arguments; when a signal ends it, so do its nodes."""
+    # A shell starts what it runs in the background with SIGINT ignored, and so would the nodes be.
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))
+    try:
+        sys.exit(main(sys.argv[1:]))
+    except KeyboardInterrupt:
+        sys.exit(130)

@@ -40,7 +40,7 @@ def grids_in_parts(draw: st.DrawFn) -> tuple[GridMap, tuple[int, int]]:
 
 
 @st.composite
-def priced_grids_with_free_cell(draw: st.DrawFn) -> tuple[GridMap, tuple[int, int]]:
+def grids_with_costs(draw: st.DrawFn) -> tuple[GridMap, tuple[int, int]]:
     """A map whose free cells have costs or are unknown, and one of its free cells."""
     grid, cell = draw(grids_with_free_cell())
     costs = numpy_st.arrays(np.int8, grid.occupancy.shape, elements=st.integers(-1, 99))

@@ -5,6 +5,7 @@ import os
 import re
 import signal
 import subprocess
+import sys
 import sysconfig
 import time
 from dataclasses import fields, replace
@@ -16,7 +17,6 @@ import pytest
 from PIL import Image
 
 from ddqn_planner.cli import main
-from ddqn_planner.experiments import EXPERIMENTS
 from ddqn_planner.grid import GridMap, MapFile, save_map
 from ddqn_planner.model import load_model
 from ddqn_planner.training.any_map import ANY_MAP, random_scenarios
@@ -122,7 +122,7 @@ def test_plan_reads_a_maps_values_as_the_node_does(
     capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
     values = np.zeros((5, 5), dtype=np.int8)
-    values[:3, 1] = 60  # free below the usual threshold, and then dear
+    values[:3, 1] = 60  # free below the usual threshold, and then expensive
     values[:4, 3] = -1
     path = str(tmp_path / "values.yaml")
     save_map(MapFile(values), path)
@@ -136,19 +136,19 @@ def test_plan_reads_a_maps_values_as_the_node_does(
     assert crossed("0", "2") == 2
     assert crossed("0", "2", "--occupied-threshold", "61") == 2
     assert crossed("0", "2", "--occupied-threshold", "60") == 3
-    assert crossed("0", "2", "--priced") == 3
+    assert crossed("0", "2", "--use-map-costs") == 3
     assert crossed("2", "4") == 4
     assert crossed("2", "4", "--allow-unknown") == 2
-    assert crossed("2", "4", "--allow-unknown", "--priced") == 4
+    assert crossed("2", "4", "--allow-unknown", "--use-map-costs") == 4
 
 
-def test_plan_searches_in_guided_mode(capsys: pytest.CaptureFixture[str]) -> None:
+def test_plan_searches_in_fallback_mode(capsys: pytest.CaptureFixture[str]) -> None:
     request = ["plan", "dilemma", "--model", "dilemma", "--goal", "0", "0"]
     assert main(request) == 1
     assert "greedy steps do not find it" in capsys.readouterr().err
-    assert main([*request, "--mode", "guided"]) == 0
+    assert main([*request, "--mode", "astar_fallback"]) == 0
     assert "cells, optimum" in (printed := capsys.readouterr().out)
-    assert ", guided, planned in" in printed
+    assert ", astar_fallback, planned in" in printed
 
 
 def test_plan_writes_an_animation(tmp_path: Path) -> None:
@@ -175,6 +175,43 @@ def test_an_animation_that_is_no_gif_is_refused_before_planning(
 ) -> None:
     assert main(["plan", "no_such_map", "--animate", "plan.mp4"]) == 2
     assert "--animate is plan.mp4; give a file that ends in .gif" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("arguments", "unused"),
+    [
+        (["--help"], ("numpy", "ddqn_planner.grid")),
+        (["plan", "dilemma"], ("torch", "matplotlib", "ddqn_planner.training", "tqdm")),
+    ],
+)
+def test_a_command_imports_only_what_it_needs(
+    arguments: list[str], unused: tuple[str, ...]
+) -> None:
+    code = f"""if True:
+        import sys
+        from ddqn_planner.cli import main
+        try:
+            main({arguments})
+        except SystemExit:
+            pass
+        print(sorted(set({unused}) & set(sys.modules)), file=sys.stderr)
+    """
+    command = [sys.executable, "-c", code]
+    done = subprocess.run(command, check=True, capture_output=True, text=True)
+    assert done.stderr == "[]\n"
+    assert done.stdout
+
+
+def test_a_missing_library_is_named_with_how_to_get_it(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "rerun", None)
+    monkeypatch.delitem(sys.modules, "ddqn_planner.commands.watch", raising=False)
+    monkeypatch.delitem(sys.modules, "ddqn_planner.nodes.watch", raising=False)
+    assert main(["watch"]) == 2
+    error = capsys.readouterr().err
+    assert "rerun" in error
+    assert "pip install 'ddqn_planner[watch]'" in error
 
 
 def test_plan_says_why_there_is_no_path(capsys: pytest.CaptureFixture[str]) -> None:
@@ -252,8 +289,9 @@ def test_the_model_for_any_map_is_trained_with_parameters_of_its_own(tmp_path: P
     assert (trainer.parameters, trainer.seed) == (replace(ANY_MAP, steps=128), 4)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_an_interrupted_training_is_saved_and_goes_on(
+def test_an_interrupted_training_is_saved_and_resumed(
     small_map: str, tmp_path: Path, number: int
 ) -> None:
     executable = Path(sysconfig.get_path("scripts")) / "ddqn-planner"
@@ -268,17 +306,20 @@ def test_an_interrupted_training_is_saved_and_goes_on(
     os.kill(child.pid, number)
     printed, _ = child.communicate(timeout=PATIENCE)
     assert child.returncode == 0
-    assert "the same command goes on from there" in printed
+    assert "run the same command to resume" in printed
     steps = load_model(tmp_path / "run" / "model.safetensors")[1].steps
     assert steps > 0
     subprocess.run([*command, "--steps", str(steps + 100)], check=True, capture_output=True)
     assert load_model(tmp_path / "run" / "model.safetensors")[1].steps == steps + 100
 
 
+@pytest.mark.slow
 def test_reproduce_runs_every_experiment_and_writes_its_report(
     capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
-    pytest.importorskip("pathfinding", reason="pathfinding, of the extra experiments, is missing")
+    pytest.importorskip("matplotlib", reason="matplotlib, of the extra experiments, is missing")
+    from ddqn_planner.experiments.reproduce import EXPERIMENTS
+
     reading = ["--noise", "on_path", "--hidden-units", "0"]
     command = ["reproduce", "--quick", "--seeds", "2", "--out", str(tmp_path), *reading]
     assert main(command) == 0
@@ -292,17 +333,18 @@ def test_reproduce_runs_every_experiment_and_writes_its_report(
         with Image.open(folder / picture) as image:
             assert min(image.size) > 300
             assert len(image.convert("RGB").getcolors(image.width * image.height)) > 20
-    assert "| best | 286 |" in report
+    assert "| propagation | 286 |" in report
     trained = {path: path.stat().st_mtime_ns for path in tmp_path.rglob("evaluations.csv")}
     assert len(trained) == 2 * (8 + 2 + 2)
     assert main([*command[:4], "--experiment", "goal-2", *command[4:]]) == 0
     assert trained == {path: path.stat().st_mtime_ns for path in trained}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_interrupted_experiments_end_with_all_their_processes(tmp_path: Path, number: int) -> None:
     executable = Path(sysconfig.get_path("scripts")) / "ddqn-planner"
-    pytest.importorskip("pathfinding", reason="pathfinding, of the extra experiments, is missing")
+    pytest.importorskip("matplotlib", reason="matplotlib, of the extra experiments, is missing")
     command = [executable, "reproduce", "--experiment", "goal-1", "--out", tmp_path]
     child = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
     deadline = time.monotonic() + PATIENCE
@@ -314,7 +356,7 @@ def test_interrupted_experiments_end_with_all_their_processes(tmp_path: Path, nu
     # To the end of what every process may print: so all of them have ended.
     _, printed = child.communicate(timeout=PATIENCE)
     assert child.returncode == 130
-    assert "the same command goes on" in printed
+    assert "run the same command to resume" in printed
 
 
 def test_reproduce_refuses_less_than_one_seed(capsys: pytest.CaptureFixture[str]) -> None:
@@ -322,10 +364,11 @@ def test_reproduce_refuses_less_than_one_seed(capsys: pytest.CaptureFixture[str]
     assert "--seeds is 0; give at least 1" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_reproduce_may_be_asked_for_one_reading_of_goal_3(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    pytest.importorskip("pathfinding", reason="pathfinding, of the extra experiments, is missing")
+    pytest.importorskip("matplotlib", reason="matplotlib, of the extra experiments, is missing")
     command = ["reproduce", "--quick", "--seeds", "1", "--out", str(tmp_path)]
     assert main([*command, "--experiment", "goal-3", "--hidden-units", "3"]) == 0
     report = capsys.readouterr().out
@@ -339,7 +382,7 @@ def test_reproduce_may_be_asked_for_one_reading_of_goal_3(
 def test_reproduce_refuses_a_hidden_layer_that_cannot_be(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    pytest.importorskip("pathfinding", reason="pathfinding, of the extra experiments, is missing")
+    pytest.importorskip("matplotlib", reason="matplotlib, of the extra experiments, is missing")
     command = ["reproduce", "--experiment", "goal-3", "--hidden-units", "-1"]
     assert main([*command, "--out", str(tmp_path)]) == 2
     assert "hidden_units is -1" in capsys.readouterr().err

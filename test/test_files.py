@@ -45,7 +45,7 @@ while True:
 """
 
 
-def test_a_kill_leaves_a_whole_file_and_a_temporary_that_can_be_removed(tmp_path: Path) -> None:
+def test_a_kill_leaves_a_complete_file_and_a_temporary_that_can_be_removed(tmp_path: Path) -> None:
     path = tmp_path / "file"
     left = 0
     while not left:
@@ -68,7 +68,7 @@ def test_a_new_file_has_the_mode_of_any_other(tmp_path: Path) -> None:
     assert os.stat(tmp_path / "atomic").st_mode == os.stat(tmp_path / "other").st_mode
 
 
-def test_records_stay_whole_when_the_disk_is_full_and_then_is_not(tmp_path: Path) -> None:
+def test_records_stay_complete_while_the_disk_is_full_for_a_time(tmp_path: Path) -> None:
     path = tmp_path / "records"
     records = Appender(path)
     records.append(b"first\n")
@@ -80,3 +80,10 @@ def test_records_stay_whole_when_the_disk_is_full_and_then_is_not(tmp_path: Path
     records.append(b"fourth\n")
     records.close()
     assert path.read_bytes() == b"first\nsecond\nfourth\n"
+
+
+def test_only_the_temporaries_of_that_file_are_removed(tmp_path: Path) -> None:
+    (tmp_path / ".file_1.0").touch()
+    (tmp_path / ".file_[1].0").touch()
+    remove_temporaries(tmp_path / "file_[1]")
+    assert list(tmp_path.iterdir()) == [tmp_path / ".file_1.0"]

@@ -12,7 +12,17 @@ import pytest
 from ddqn_planner.resources import find_map, find_resource
 
 ROOT = Path(__file__).resolve().parent.parent
-ROOMS = ["grid", "model", "planning", "training", "experiments", "nodes"]
+ROOMS = [
+    "grid",
+    "model",
+    "planning",
+    "pictures",
+    "training",
+    "benchmarks",
+    "experiments",
+    "nodes",
+    "commands",
+]
 
 
 @pytest.mark.parametrize("room", ROOMS)
@@ -29,7 +39,10 @@ def test_imports_run_downwards(room: str) -> None:
 
 
 def test_the_core_works_without_ros() -> None:
-    code = "import sys; sys.modules['rclpy'] = None; import ddqn_planner, ddqn_planner.cli"
+    code = (
+        "import sys; sys.modules['rclpy'] = None; import ddqn_planner, ddqn_planner.cli\n"
+        "from ddqn_planner.commands import evaluate, plan, train_any_map"
+    )
     subprocess.run([sys.executable, "-c", code], check=True)
 
 
@@ -59,6 +72,8 @@ PIP = [sys.executable, "-m", "pip", "--quiet"]
 
 # --user and Debian's Python install beside another share folder than the interpreter's, as the
 # last two do.
+@pytest.mark.xdist_group("wheel")
+@pytest.mark.slow
 @pytest.mark.parametrize("option", [None, "--target", "--prefix"])
 def test_maps_and_models_come_along_wherever_pip_installs(
     wheel: Path, tmp_path: Path, option: str | None
@@ -92,6 +107,35 @@ def test_maps_and_models_come_along_wherever_pip_installs(
         shipped = {path.name: path.read_bytes() for path in (ROOT / name).iterdir()}
         for copy in (package.parent / name, package_share(folder) / name):
             assert {path.name: path.read_bytes() for path in copy.iterdir()} == shipped
+
+
+@pytest.mark.slow
+@pytest.mark.xdist_group("wheel")
+def test_the_command_of_the_wheel_plans_in_another_folder(wheel: Path, tmp_path: Path) -> None:
+    environment, elsewhere = tmp_path / "environment", tmp_path / "elsewhere"
+    elsewhere.mkdir()
+    subprocess.run([sys.executable, "-m", "venv", "--without-pip", environment], check=True)
+    python = environment / "bin" / "python"
+    subprocess.run([*PIP, "--python", python, "install", "--no-deps", wheel], check=True)
+    (site,) = environment.glob("lib/*/site-packages")
+    # The libraries of this environment come after what was installed.
+    (site / "libraries.pth").write_text(sysconfig.get_path("purelib"))
+    without = {key: value for key, value in os.environ.items() if key != "PYTHONPATH"}
+
+    def run(name: str, *arguments: str) -> str:
+        return subprocess.run(
+            [environment / "bin" / name, *arguments],
+            env=without,
+            cwd=elsewhere,
+            check=True,
+            capture_output=True,
+            text=True,
+        ).stdout
+
+    assert "under corner_cutting" in run("ddqn-planner", "plan", "dilemma", "--model", "dilemma")
+    assert "length 789.95 cells" in run("ddqn-planner", "plan", "office")
+    for name in ("map_server_node", "planner_node", "trainer_node"):
+        assert (environment / "bin" / name).is_file()
 
 
 def package_share(prefix: Path) -> Path:

@@ -7,13 +7,12 @@ import csv
 import matplotlib.pyplot as plt
 import numpy as np
 
+from ddqn_planner.benchmarks.tables import write_table
 from ddqn_planner.experiments import goal_1
-from ddqn_planner.experiments.figures import Curve, draw_curves, save
+from ddqn_planner.experiments.figures import Curve, draw_curves, save_figure, share_curve
 from ddqn_planner.experiments.profiles import PROFILES, VARIANTS
-from ddqn_planner.experiments.report import Settings, share_curve
-from ddqn_planner.experiments.tables import table
+from ddqn_planner.experiments.settings import Settings
 from ddqn_planner.experiments.trainings import Training
-from ddqn_planner.files import write_csv
 
 TITLE = "Goal i: the ablation"
 
@@ -28,42 +27,41 @@ def trainings(settings: Settings) -> list[Training]:
 
 def report(settings: Settings) -> str:
     """Write the table and the curves of the ablation, and return its Markdown."""
-    rows = []
-    for profile in PROFILES:
-        for of_variant in VARIANTS:
-            evaluations = settings.evaluations(goal_1.name(profile, of_variant))
-            rows.append([profile, of_variant, *goal_1.convergence_row(evaluations)])
+    rows = [
+        [profile, variant, *goal_1.convergence_row(settings.evaluations(f"{profile}/{variant}"))]
+        for profile in PROFILES
+        for variant in VARIANTS
+    ]
     header = ["profile", "variant", *goal_1.CONVERGENCE]
-    write_csv(settings.out / "ablation.csv", header, rows)
-    _draw(settings)
-    return (
-        f"{table(header, rows)}\n\n![Fig. 6: average reward a step, and solved seeds](ablation.png)"
-    )
+    return f"{write_table(settings.out / 'ablation.csv', header, rows)}\n\n{_draw(settings)}"
 
 
-def _draw(settings: Settings) -> None:
+def _draw(settings: Settings) -> str:
     figure, panels = plt.subplots(2, len(PROFILES), figsize=(13, 7.5), layout="constrained")
     for column, profile in enumerate(PROFILES):
-        rewards = {v: _reward_curve(settings, profile, v) for v in VARIANTS}
-        solved = {v: share_curve(settings.evaluations(goal_1.name(profile, v))) for v in VARIANTS}
-        draw_curves(panels[0, column], rewards, "average reward a step of an episode")
+        names = {variant: f"{profile}/{variant}" for variant in VARIANTS}
+        steps = settings.shorten(PROFILES[profile]).steps
+        rewards = {v: _reward_curve(settings, name, steps) for v, name in names.items()}
+        solved = {v: share_curve(settings.evaluations(name)) for v, name in names.items()}
+        draw_curves(panels[0, column], rewards, "average reward per step of an episode")
         draw_curves(panels[1, column], solved, "share of seeds solved from the start")
         panels[0, column].set_title(f"profile {profile}", loc="left")
         panels[1, column].set_ylim(-0.05, 1.05)
     handles, labels = panels[0, 0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside lower center", ncols=len(VARIANTS))
-    save(figure, settings.out / "ablation.png")
+    caption = "Fig. 6: average reward per step, and solved seeds"
+    return save_figure(figure, settings.out / "ablation.png", caption)
 
 
-def _reward_curve(settings: Settings, profile: str, of_variant: str) -> Curve:
+def _reward_curve(settings: Settings, name: str, steps: int) -> Curve:
     """Return the mean over the episodes that ended in each interval, for each seed."""
-    edges = np.linspace(0, settings.profile(profile).steps, BINS + 1)
+    edges = np.linspace(0, steps, BINS + 1)
     seeds = []
-    for folder in settings.folders(goal_1.name(profile, of_variant)):
+    for folder in settings.folders(name):
         with (folder / "episodes.csv").open(newline="", encoding="utf-8") as file:
             rows = [(int(r["step"]), float(r["average_reward"])) for r in csv.DictReader(file)]
-        steps, rewards = np.array(rows, dtype=np.float64).reshape(-1, 2).T
-        total, _ = np.histogram(steps, edges, weights=rewards)
-        count, _ = np.histogram(steps, edges)
+        step, reward = np.array(rows, dtype=np.float64).reshape(-1, 2).T
+        total, _ = np.histogram(step, edges, weights=reward)
+        count, _ = np.histogram(step, edges)
         seeds.append(np.where(count > 0, total / np.maximum(count, 1), np.nan))
     return (edges[:-1] + edges[1:]) / 2, np.array(seeds)

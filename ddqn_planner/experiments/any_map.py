@@ -1,4 +1,4 @@
-"""The model for any map: the paper's goals with it unseen, and what each idea does for it."""
+"""The model for any map: the paper's goals on their unseen map, and what each idea contributes."""
 
 from __future__ import annotations
 
@@ -7,21 +7,25 @@ from dataclasses import replace
 from typing import Any, Final
 
 import numpy as np
-import torch
-from numpy.typing import NDArray
 
+from ddqn_planner.benchmarks.evaluation import evaluate
+from ddqn_planner.benchmarks.tables import write_table
 from ddqn_planner.experiments import goal_1, goal_3
 from ddqn_planner.experiments.profiles import MOVE_RULE
-from ddqn_planner.experiments.report import Settings, mean, spread
-from ddqn_planner.experiments.tables import table
-from ddqn_planner.experiments.trainings import Training, solved, walk_from_starts
-from ddqn_planner.files import write_csv
-from ddqn_planner.grid import OCCUPIED, UNKNOWN, GridMap, MoveRule, legal_moves, move_costs
+from ddqn_planner.experiments.settings import Settings, median_and_range
+from ddqn_planner.experiments.trainings import Training, rollouts, solved
+from ddqn_planner.grid import (
+    OCCUPIED,
+    UNKNOWN,
+    GridMap,
+    MoveRule,
+    legal_moves,
+    move_costs,
+    path_length,
+)
 from ddqn_planner.grid.generators import generate_map, random_costs
 from ddqn_planner.model import AnyMapQNetwork
-from ddqn_planner.model.propagation import features
 from ddqn_planner.planning import Planner
-from ddqn_planner.planning.evaluation import evaluate
 from ddqn_planner.training.any_map import ANY_MAP, RULES, random_scenarios
 from ddqn_planner.training.environment import paper_scenario
 
@@ -36,7 +40,7 @@ VARIANTS: Final[dict[str, dict[str, Any]]] = {
     "the paper's reward": PAPERS_REWARD,
     "plain reward (α = β = 0)": {**PAPERS_REWARD, "alpha": 0.0, "beta": 0.0},
 }
-"""What each changes in `ANY_MAP`."""
+"""The changes to `ANY_MAP` of each variant."""
 
 STEPS: Final = (25_600, 256_000)
 """Environment steps of the trainings of the ablation: a tenth of a minute, and a minute."""
@@ -47,9 +51,9 @@ SIDE: Final = 48
 ABLATION = (
     "variant",
     "steps",
-    "moves judged wrongly, of 4,096",
-    "error of the price",
-    "starts solved, any move",
+    "moves classified wrongly, of 4,096",
+    "error of the cost multiplier",
+    "starts solved, without action masking",
     "mean length / optimum",
     "mean cost / optimum, random costs",
 )
@@ -64,7 +68,7 @@ def trainings(settings: Settings) -> list[Training]:
     """Return the trainings of the ablation. Each seed has maps of its own."""
     return [
         Training(
-            name(variant, steps),
+            folder,
             settings.shorten(replace(ANY_MAP, steps=steps, **changes)),
             tuple(random_scenarios(seed)),
             seed,
@@ -72,119 +76,102 @@ def trainings(settings: Settings) -> list[Training]:
         )
         for variant, changes in VARIANTS.items()
         for steps in STEPS
-        for seed in range(settings.seeds)
+        for seed, folder in enumerate(settings.folders(name(variant, steps)))
     ]
 
 
 def report(settings: Settings) -> str:
-    """Return the Markdown of both tables, and write them."""
-    header, row = zero_shot(settings)
-    write_csv(settings.out / "any_map_zero_shot.csv", header, [row])
+    """Write both tables, and return their Markdown."""
+    zero_shot = _zero_shot(settings)
     rows = [
         [variant, f"{steps:,}", *_row(settings.planners(name(variant, steps)))]
         for variant in VARIANTS
         for steps in STEPS
     ]
-    write_csv(settings.out / "any_map_ablation.csv", ABLATION, rows)
-    return f"{table(header, [row])}\n\n{table(ABLATION, rows)}"
+    path = settings.out / "any_map_zero_shot.csv"
+    first = write_table(path, [*zero_shot], [[*zero_shot.values()]])
+    return f"{first}\n\n{write_table(settings.out / 'any_map_ablation.csv', ABLATION, rows)}"
 
 
-def zero_shot(settings: Settings) -> tuple[list[str], list[str]]:
-    """Return a table of the paper's goals with the shipped model, which never saw their maps."""
+def _zero_shot(settings: Settings) -> dict[str, str]:
+    """Return the results of the shipped model on the paper's goals, whose maps it never saw."""
     shipped = Planner.load("any_map")
     planner = Planner(shipped.network, replace(shipped.metadata, move_rule=MOVE_RULE))
     scenario = paper_scenario()
+    cells, seconds = goal_1.timed_plan(planner, scenario)
     field = planner.q_field(scenario.grid, scenario.goal)
     # The given start, goal i, is one of the starts.
     starts = evaluate(field, scenario.grid, MOVE_RULE)
-    any_move = evaluate(field.unmasked(), scenario.grid, MOVE_RULE)
-    noisy = {}
+    unmasked = evaluate(field.unmasked(), scenario.grid, MOVE_RULE)
+    row = {
+        "goal i, length": f"{path_length(cells):.2f}",
+        "goal ii with the given start, solved (without action masking)": (
+            f"{starts.solved} ({unmasked.solved}) of {starts.starts}"
+        ),
+        "mean length / optimum": f"{starts.mean_ratio:.4f}",
+    }
     for noise in settings.noise:
         maps = goal_3.drawn_maps(settings, noise)
-        for which, some in (("first", maps.training), ("test", maps.test)):
-            legal, unmasked = walk_from_starts(planner, some)
-            counts = f"{solved(legal)} ({solved(unmasked)}) of {len(legal)}"
-            noisy[f"goal iii, {noise.value}, {which} maps (any move)"] = counts
-    plan, seconds = goal_1.timed_plan(planner, scenario)
-    return [
-        "goal i, length",
-        "goal ii with the given start, solved (any move)",
-        "mean length / optimum",
-        *noisy,
-        "planning time, ms",
-    ], [
-        f"{plan.length:.2f}",
-        f"{starts.solved} ({any_move.solved}) of {starts.starts}",
-        f"{starts.mean_ratio:.4f}",
-        *noisy.values(),
-        f"{1e3 * seconds:.2f}",
-    ]
+        for label, scenarios in (("first", maps.training), ("test", maps.test)):
+            plans, unmasked_plans = rollouts(planner, scenarios)
+            row[f"goal iii, {noise.value}, {label} maps (without action masking)"] = (
+                f"{solved(plans)} ({solved(unmasked_plans)}) of {len(plans)}"
+            )
+    return row | {"planning time, ms": f"{1e3 * seconds:.2f}"}
 
 
 def _row(planners: Sequence[Planner]) -> list[str]:
-    judged = [_judgement(planner) for planner in planners]
-    lengths = [_walks(planner, priced=False) for planner in planners]
-    costs = [_walks(planner, priced=True) for planner in planners]
+    errors = [move_errors(planner) for planner in planners]
+    lengths = [_held_out_rollouts(planner, with_costs=False) for planner in planners]
+    costs = [_held_out_rollouts(planner, with_costs=True) for planner in planners]
     starts = lengths[0][1]
     return [
-        spread([wrong for wrong, _ in judged]),
-        spread([error for _, error in judged], 4),
-        f"{spread([count for count, _, _ in lengths])} of {starts:,}",
-        spread([ratio for _, _, ratio in lengths], 4),
-        spread([ratio for _, _, ratio in costs], 4),
+        median_and_range([wrong for wrong, _ in errors]),
+        median_and_range([error for _, error in errors], 4),
+        f"{median_and_range([count for count, _, _ in lengths])} of {starts:,}",
+        median_and_range([ratio for _, _, ratio in lengths], 4),
+        median_and_range([ratio for _, _, ratio in costs], 4),
     ]
 
 
-def _judgement(planner: Planner) -> tuple[int, float]:
-    """Return how many moves are judged wrongly, and the mean relative error of their prices.
+def move_errors(planner: Planner) -> tuple[int, float]:
+    """Count the moves classified wrongly, and return the mean relative error of their costs.
 
-    All 256 surroundings of a free cell under both rules, for the prices each with random costs.
+    All 256 3x3 patches with a free centre under both rules; for the costs, each with random costs.
     """
     network = planner.network
     assert isinstance(network, AnyMapQNetwork)
     wrong, errors = 0, []
-    seen_B9 = _surroundings_of_a_free_cell()
-    random = np.random.default_rng(0).integers(UNKNOWN, OCCUPIED, seen_B9.shape)
-    priced_B9 = np.where(seen_B9 == OCCUPIED, OCCUPIED, random).astype(np.int8)
+    patches = OCCUPIED * (np.arange(2**9)[:, None] >> np.arange(9) & 1)
+    patch_B9 = patches[patches[:, 4] == 0].astype(np.int8)
+    random = np.random.default_rng(0).integers(UNKNOWN, OCCUPIED, patch_B9.shape)
+    costs_B9 = np.where(patch_B9 == OCCUPIED, OCCUPIED, random).astype(np.int8)
+    # One map of all patches: a centre's neighbours all lie in its own patch.
+    cells = costs_B9.reshape(16, 16, 3, 3).swapaxes(1, 2).reshape(48, 48)
+    grid = GridMap(cells == OCCUPIED, cost=cells)
     for rule in RULES:
-        truth = [_truth(values, rule) for values in priced_B9]
-        legal_BA, price_BA = map(np.stack, zip(*truth, strict=True))
-        with torch.inference_mode():
-            p_BA, _ = network(torch.from_numpy(features(seen_B9, rule)))
-            _, learned_BA = network(torch.from_numpy(features(priced_B9, rule)))
-        wrong += int(((p_BA.numpy() > 0.5) != legal_BA).sum())
-        errors.append(np.abs(learned_BA.numpy() / price_BA - 1)[legal_BA])
+        legal_BA = legal_moves(grid.occupancy, rule)[:, 1::3, 1::3].reshape(8, -1).T
+        cost_BA = move_costs(grid.cost_multiplier, rule)[:, 1::3, 1::3].reshape(8, -1).T
+        p_BA = network.success(network.features(patch_B9, rule))
+        learned_BA = network.multiplier(network.features(costs_B9, rule))
+        wrong += int(((p_BA > 0.5) != legal_BA).sum())
+        errors.append(np.abs(learned_BA / (cost_BA / rule.lengths) - 1)[legal_BA])
     return wrong, float(np.concatenate(errors).mean())
 
 
-def _surroundings_of_a_free_cell() -> NDArray[np.int8]:
-    """Return every surroundings without costs that a free cell can have: (256, 9) int8."""
-    every = OCCUPIED * (np.arange(2**9)[:, None] >> np.arange(9) & 1)
-    free: NDArray[np.int8] = every[every[:, 4] == 0].astype(np.int8)
-    return free
+def _held_out_rollouts(planner: Planner, with_costs: bool) -> tuple[int, int, float]:
+    """Return solved starts, all starts and mean ratio of rollouts without action masking.
 
-
-def _truth(
-    values: NDArray[np.int8], rule: MoveRule
-) -> tuple[NDArray[np.bool_], NDArray[np.float64]]:
-    """Return which moves from the centre of 3x3 cells are legal, and their prices: (8,) both."""
-    cells = values.reshape(3, 3)
-    grid = GridMap(cells == OCCUPIED, cost=cells)
-    cost_AHW = move_costs(grid.price, rule)
-    return legal_moves(grid.occupancy, rule)[:, 1, 1], cost_AHW[:, 1, 1] / rule.lengths
-
-
-def _walks(planner: Planner, priced: bool) -> tuple[int, int, float]:
-    """Walk from every free cell of a map of each kind: solved, starts, mean over the optimum."""
+    The starts are all free cells of one map of each held-out kind.
+    """
     random = np.random.default_rng(0)
     count, starts, ratios = 0, 0, []
     for kind in HELD_OUT:
         occupancy = generate_map(kind, (SIDE, SIDE), random)
-        grid = GridMap(occupancy, cost=random_costs(occupancy, random) if priced else None)
-        goal = grid.free_cells()[-1]
-        field = planner.q_field(grid, goal, MoveRule.ROBOT_SAFE).unmasked()
+        grid = GridMap(occupancy, cost=random_costs(occupancy, random) if with_costs else None)
+        field = planner.q_field(grid, grid.free_cells()[-1], MoveRule.ROBOT_SAFE).unmasked()
         evaluation = evaluate(field, grid, MoveRule.ROBOT_SAFE)
         count += evaluation.solved
         starts += evaluation.starts
         ratios.append(evaluation.mean_ratio)
-    return count, starts, mean(ratios)
+    return count, starts, float(np.nanmean(ratios))

@@ -1,79 +1,31 @@
-"""Goal i (section 5.1, Fig. 7): from the given start to the given end, beside A*."""
+"""Goal i (section 5.1, Fig. 7): from the given start to the given end, compared with A*."""
 
 from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
-from typing import TypeVar
+from dataclasses import replace
 
 import matplotlib.pyplot as plt
 import numpy as np
-from pathfinding.core.diagonal_movement import DiagonalMovement
-from pathfinding.core.grid import Grid
-from pathfinding.finder.a_star import AStarFinder
 
-from ddqn_planner.experiments.figures import draw_map, draw_walk, save
-from ddqn_planner.experiments.profiles import PROFILES, variant
-from ddqn_planner.experiments.report import Settings, first_kept, optimal_length, spread
-from ddqn_planner.experiments.tables import table
+from ddqn_planner.benchmarks.tables import table, write_table
+from ddqn_planner.experiments.figures import draw_map, draw_path, save_figure
+from ddqn_planner.experiments.profiles import PROFILES, VARIANTS
+from ddqn_planner.experiments.settings import Settings, first_kept, median_and_range, optimal_length
 from ddqn_planner.experiments.trainings import Training, TrainingEvaluation
-from ddqn_planner.files import write_csv
-from ddqn_planner.grid import Cell, MoveRule, path_length
-from ddqn_planner.planning import Plan, Planner
+from ddqn_planner.grid import Cell, MoveRule, legal_moves, path_length
+from ddqn_planner.planning import Planner
+from ddqn_planner.planning.search import search
 from ddqn_planner.training.environment import Scenario, paper_scenario
 
 TITLE = "Goal i: from the given start"
 
-Result = TypeVar("Result")
-
-DIAGONALS = {
-    MoveRule.CORNER_CUTTING: DiagonalMovement.always,
-    MoveRule.ROBOT_SAFE: DiagonalMovement.only_when_no_obstacle,
-}
-"""The move rules in the words of the library ``pathfinding``."""
-
 TIMES = 50
 """How often each planner is timed."""
 
-
-def name(profile: str, of_variant: str = "both") -> str:
-    """Return the name of the trainings of a profile on the paper's map."""
-    return f"{profile}/{of_variant}"
-
-
-def trainings(settings: Settings, variants: Sequence[str] = ("both",)) -> list[Training]:
-    """Return the trainings of both profiles on the paper's map."""
-    return [
-        training
-        for profile in PROFILES
-        for of_variant in variants
-        for training in settings.trainings(
-            name(profile, of_variant),
-            variant(settings.profile(profile), of_variant),
-            [paper_scenario()],
-        )
-    ]
-
-
-def convergence_row(evaluations: Sequence[Sequence[TrainingEvaluation]]) -> list[str]:
-    """Return the cells of a table: what the greedy path from the start became, over the seeds."""
-    optimum = optimal_length(paper_scenario())
-    ends = [run[-1] for run in evaluations]
-    unmasked = sum(end.solved_unmasked for end in ends)
-    reached = [first_kept(run, lambda e: e.solved == 1) for run in evaluations]
-    best = [first_kept(run, lambda e: e.length <= optimum + 1e-6) for run in evaluations]
-    return [
-        f"{sum(end.solved for end in ends)} ({unmasked}) of {len(ends)}",
-        spread([first.step if first else np.inf for first in reached]),
-        spread([first.episodes if first else np.inf for first in reached]),
-        spread([first.seconds if first else np.inf for first in reached], 1),
-        spread([first.step if first else np.inf for first in best]),
-        spread([end.length for end in ends if end.solved], 2),
-    ]
-
-
 CONVERGENCE = (
-    "seeds solved at the end (any move)",
+    "seeds solved at the end (without action masking)",
     "steps until solved for good",
     "episodes",
     "seconds",
@@ -82,90 +34,125 @@ CONVERGENCE = (
 )
 
 
-def report(settings: Settings) -> str:
-    """Write the table and the figure of goal i, and return its Markdown."""
-    scenario = paper_scenario()
-    rows = [
-        [profile, *convergence_row(settings.evaluations(name(profile)))] for profile in PROFILES
+def trainings(settings: Settings, variants: Sequence[str] = ("both",)) -> list[Training]:
+    """Return the trainings of both profiles on the paper's map, by the name "profile/variant"."""
+    return [
+        training
+        for profile, parameters in PROFILES.items()
+        for name in variants
+        for training in settings.trainings(
+            f"{profile}/{name}", replace(parameters, **VARIANTS[name]), [paper_scenario()]
+        )
     ]
-    speeds = [[profile, *_speed(settings, profile)] for profile in PROFILES]
-    paths, times = _paths(settings, scenario)
-    write_csv(settings.out / "goal_1.csv", ["profile", *CONVERGENCE], rows)
-    write_csv(settings.out / "goal_1_planning.csv", *times)
-    _draw(settings, scenario, paths)
+
+
+def convergence_row(runs: Sequence[Sequence[TrainingEvaluation]]) -> list[str]:
+    """Return the cells of `CONVERGENCE` for the evaluations of each seed."""
+    optimum = optimal_length(paper_scenario())
+    ends = [run[-1] for run in runs]
+    reached = [first_kept(run, lambda e: e.solved == 1) for run in runs]
+    shortest = [first_kept(run, lambda e: e.length <= optimum + 1e-6) for run in runs]
+
+    def column(first: Sequence[TrainingEvaluation | None], name: str, digits: int = 0) -> str:
+        return median_and_range([getattr(e, name) if e else np.inf for e in first], digits)
+
+    unmasked = sum(end.solved_unmasked for end in ends)
+    return [
+        f"{sum(end.solved for end in ends)} ({unmasked}) of {len(ends)}",
+        column(reached, "step"),
+        column(reached, "episodes"),
+        column(reached, "seconds", 1),
+        column(shortest, "step"),
+        median_and_range([end.length for end in ends if end.solved], 2),
+    ]
+
+
+def report(settings: Settings) -> str:
+    """Write the tables and the figure of goal i, and return its Markdown."""
+    runs = {profile: settings.evaluations(f"{profile}/both") for profile in PROFILES}
+    convergence = [[profile, *convergence_row(runs[profile])] for profile in PROFILES]
+    speeds = [[profile, *_speeds(profile, runs[profile])] for profile in PROFILES]
+    scenario = paper_scenario()
+    paths, times = _paths_and_times(settings, scenario)
     return "\n\n".join(
         [
-            table(["profile", *CONVERGENCE], rows),
+            write_table(settings.out / "goal_1.csv", ["profile", *CONVERGENCE], convergence),
             table(["profile", "steps/s", "updates/s", "replay ratio"], speeds),
-            table(*times),
-            "![Fig. 7: the paths of goal i](goal_1.png)",
+            write_table(
+                settings.out / "goal_1_planning.csv",
+                ["planner", "length, cells", "planning time, ms"],
+                times,
+            ),
+            _draw(settings, scenario, paths),
         ]
     )
 
 
-def _speed(settings: Settings, profile: str) -> list[str]:
-    ends = [run[-1] for run in settings.evaluations(name(profile))]
-    batch = settings.profile(profile).batch_size
+def _speeds(profile: str, runs: Sequence[Sequence[TrainingEvaluation]]) -> list[str]:
+    ends, batch = [run[-1] for run in runs], PROFILES[profile].batch_size
     return [
-        spread([end.step / end.seconds for end in ends]),
-        spread([end.updates / end.seconds for end in ends]),
-        spread([batch * end.updates / end.step for end in ends], 1),
+        median_and_range([end.step / end.seconds for end in ends]),
+        median_and_range([end.updates / end.seconds for end in ends]),
+        median_and_range([batch * end.updates / end.step for end in ends], 1),
     ]
 
 
-def _paths(
+def _paths_and_times(
     settings: Settings, scenario: Scenario
-) -> tuple[dict[str, Sequence[Cell]], tuple[list[str], list[list[str]]]]:
-    """Return the path of each planner, and a table of lengths and planning times."""
+) -> tuple[dict[str, Sequence[Cell]], list[list[str]]]:
+    """Return the path of each planner, and a row of length and planning time for each."""
     paths: dict[str, Sequence[Cell]] = {}
     rows = []
     for profile in PROFILES:
-        planners = settings.planners(name(profile))
-        plans, seconds = zip(*(timed_plan(planner, scenario) for planner in planners), strict=True)
-        lengths = [plan.length if plan.cells else np.inf for plan in plans]
-        middle = int(np.argsort(lengths)[len(lengths) // 2])
-        paths[f"{profile}, median seed"] = plans[middle].cells
-        milliseconds = spread([1e3 * s for s in seconds], 2)
-        rows.append([profile, spread([n for n in lengths if np.isfinite(n)], 2), milliseconds])
-    for rule in DIAGONALS:
+        plans, seconds = zip(
+            *(timed_plan(planner, scenario) for planner in settings.planners(f"{profile}/both")),
+            strict=True,
+        )
+        lengths = [path_length(cells) if cells else np.inf for cells in plans]
+        paths[f"{profile}, median seed"] = plans[int(np.argsort(lengths)[len(lengths) // 2])]
+        length = median_and_range([n for n in lengths if np.isfinite(n)], 2)
+        rows.append([profile, length, median_and_range([1e3 * s for s in seconds], 2)])
+    for rule in (MoveRule.CORNER_CUTTING, MoveRule.ROBOT_SAFE):
         cells, s = _timed(lambda rule=rule: a_star(scenario, rule))  # type: ignore[misc]
         paths[f"A*, {rule.value}"] = cells
         rows.append([f"A*, {rule.value}", f"{path_length(cells):.2f}", f"{1e3 * s:.2f}"])
-    return paths, (["planner", "length, cells", "planning time, ms"], rows)
+    return paths, rows
 
 
-def timed_plan(planner: Planner, scenario: Scenario) -> tuple[Plan, float]:
-    """Return a planner's plan, and the median of its times with a new field, seconds."""
+def timed_plan(planner: Planner, scenario: Scenario) -> tuple[Sequence[Cell], float]:
+    """Return a planner's path, and the median of its times with a new field, seconds."""
 
-    def plan() -> Plan:
-        fresh = Planner(planner.network, planner.metadata)  # it remembers no Q field
-        return fresh.plan(scenario.grid, scenario.start, scenario.goal)
+    def plan() -> Sequence[Cell]:
+        fresh = Planner(planner.network, planner.metadata)  # it has no Q field yet
+        return fresh.plan(scenario.grid, scenario.start, scenario.goal).cells
 
     return _timed(plan)
 
 
-def _timed(function: Callable[[], Result]) -> tuple[Result, float]:
-    """Return what a function returns, and the median of its times, seconds."""
+def _timed(plan: Callable[[], Sequence[Cell]]) -> tuple[Sequence[Cell], float]:
+    """Return a path, and the median of the times that it took, seconds."""
     seconds = []
     for _ in range(TIMES):
         began = time.perf_counter()
-        result = function()
+        cells = plan()
         seconds.append(time.perf_counter() - began)
-    return result, float(np.median(seconds))
+    return cells, float(np.median(seconds))
 
 
-def a_star(scenario: Scenario, move_rule: MoveRule) -> list[Cell]:
-    """Return the path of the library ``pathfinding``'s A*."""
-    grid = Grid(matrix=(~scenario.grid.occupancy).astype(int).tolist())
-    finder = AStarFinder(diagonal_movement=DIAGONALS[move_rule])
-    nodes, _ = finder.find_path(grid.node(*scenario.start), grid.node(*scenario.goal), grid)
-    return [(node.x, node.y) for node in nodes]
+def a_star(scenario: Scenario, move_rule: MoveRule) -> Sequence[Cell]:
+    """Return a shortest path by A* with the octile distance to the goal as its heuristic."""
+    grid, (goal_x, goal_y) = scenario.grid, scenario.goal
+    y, x = np.indices(grid.occupancy.shape)
+    dx, dy = np.abs(x - goal_x), np.abs(y - goal_y)
+    octile = np.maximum(dx, dy) + (move_rule.lengths[1] - 1) * np.minimum(dx, dy)
+    value, legal = -octile.astype(np.float32), legal_moves(grid.occupancy, move_rule)
+    return search(scenario.start, scenario.goal, legal, grid.cost_multiplier, move_rule, value)
 
 
-def _draw(settings: Settings, scenario: Scenario, paths: dict[str, Sequence[Cell]]) -> None:
+def _draw(settings: Settings, scenario: Scenario, paths: dict[str, Sequence[Cell]]) -> str:
     figure, panels = plt.subplots(1, len(paths), figsize=(15, 4.2), layout="constrained")
     for number, (axes, (planner, cells)) in enumerate(zip(panels, paths.items(), strict=True)):
         length = f"{path_length(cells):.2f} cells" if cells else "trapped"
         draw_map(axes, scenario, f"{planner}: {length}")
-        draw_walk(axes, cells, number, planner)
-    save(figure, settings.out / "goal_1.png")
+        draw_path(axes, cells, number, planner)
+    return save_figure(figure, settings.out / "goal_1.png", "Fig. 7: the paths of goal i")

@@ -7,27 +7,27 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from ddqn_planner.benchmarks.evaluation import length_ratios
+from ddqn_planner.benchmarks.tables import write_table
 from ddqn_planner.experiments import goal_1
-from ddqn_planner.experiments.figures import draw_border, draw_map, draw_share, save
+from ddqn_planner.experiments.figures import draw_border, draw_map, draw_share, save_figure
 from ddqn_planner.experiments.profiles import MOVE_RULE, PROFILES, START_DEAD_END
-from ddqn_planner.experiments.report import Settings, mean, spread, worst
-from ddqn_planner.experiments.tables import table
+from ddqn_planner.experiments.settings import Settings, mean_and_worst, median_and_range
 from ddqn_planner.experiments.trainings import Training
-from ddqn_planner.files import write_csv
 from ddqn_planner.grid import MOVES, legal_moves
-from ddqn_planner.model import PropagationQNetwork
 from ddqn_planner.planning import Planner
-from ddqn_planner.planning.evaluation import length_ratios
 from ddqn_planner.planning.q_field import QField
+from ddqn_planner.training.encoders import PropagationEncoder
 from ddqn_planner.training.environment import GridVectorEnvironment, Scenario, paper_scenario
-from ddqn_planner.training.learners import PropagationLearner
+from ddqn_planner.training.networks import PropagationModule
 
 TITLE = "Goal ii: from every free cell"
 
 COLUMNS = (
+    "profile",
     "starts",
     "solved",
-    "solved, any move",
+    "solved without action masking",
     "of the dilemma's 10",
     "mean length / optimum",
     "worst",
@@ -40,27 +40,21 @@ def trainings(settings: Settings) -> list[Training]:
 
 
 def free_starts(scenario: Scenario) -> NDArray[np.bool_]:
-    """Return the free cells besides start and end: (H, W) bool, the paper's 286."""
+    """Return the free cells except start and end: (H, W) bool, the paper's 286."""
     starts = ~scenario.grid.occupancy
     for x, y in (scenario.start, scenario.goal):
         starts[y, x] = False
     return starts
 
 
-def planned_field(planner: Planner, scenario: Scenario) -> QField:
-    """Return the Q field that the planner walks in."""
-    return planner.q_field(scenario.grid, scenario.goal)
-
-
 def trained_field(planner: Planner, scenario: Scenario) -> QField:
     """Return the Q field of a propagation network as the loss trained it: with reward and γ."""
-    environment = GridVectorEnvironment([scenario], MOVE_RULE, PROFILES["best"])
-    learner = PropagationLearner(environment)
-    assert isinstance(planner.network, PropagationQNetwork)
-    learner.copy_target(planner.network)
+    environment = GridVectorEnvironment([scenario], MOVE_RULE, PROFILES["propagation"])
+    encoder, module = PropagationEncoder(environment), PropagationModule.from_numpy(planner.network)
+    encoder.update_target(module)
     cells = np.arange(scenario.grid.occupancy.size)
     with torch.inference_mode():
-        q_CA = learner.q(planner.network, learner.states(np.zeros_like(cells), cells))
+        q_CA = encoder.q(module, encoder.states(np.zeros_like(cells), cells))
     q_AHW = q_CA.T.reshape(len(MOVES), *scenario.grid.occupancy.shape).numpy()
     return QField(scenario.goal, q_AHW, legal_moves(scenario.grid.occupancy, MOVE_RULE))
 
@@ -68,22 +62,21 @@ def trained_field(planner: Planner, scenario: Scenario) -> QField:
 def report(settings: Settings) -> str:
     """Write the table and the figure of goal ii, and return its Markdown."""
     scenario = paper_scenario()
+    planners = {profile: settings.planners(f"{profile}/both") for profile in PROFILES}
     fields = {
-        label: [field(planner, scenario) for planner in settings.planners(goal_1.name(profile))]
-        for label, profile, field in (
-            ("paper", "paper", planned_field),
-            ("best", "best", planned_field),
-            ("best, Q as trained", "best", trained_field),
-        )
+        profile: [planner.q_field(scenario.grid, scenario.goal) for planner in of_seeds]
+        for profile, of_seeds in planners.items()
     }
+    fields["propagation, Q as trained"] = [
+        trained_field(planner, scenario) for planner in planners["propagation"]
+    ]
     ratios = {
         label: [length_ratios(field, scenario.grid, MOVE_RULE) for field in of_seeds]
         for label, of_seeds in fields.items()
     }
     rows = [[label, *_row(fields[label], ratios[label], scenario)] for label in fields]
-    write_csv(settings.out / "goal_2.csv", ["profile", *COLUMNS], rows)
-    _draw(settings, scenario, {profile: ratios[profile] for profile in PROFILES})
-    return f"{table(['profile', *COLUMNS], rows)}\n\n![Fig. 8: starts by outcome](goal_2.png)"
+    table = write_table(settings.out / "goal_2.csv", COLUMNS, rows)
+    return f"{table}\n\n{_draw(settings, scenario, ratios)}"
 
 
 def _row(
@@ -95,30 +88,24 @@ def _row(
     lengths = [ratio[starts & np.isfinite(ratio)] for ratio in ratios]
     return [
         int(starts.sum()),
-        spread([len(of_seed) for of_seed in lengths]),
-        spread([int(np.isfinite(ratio[starts]).sum()) for ratio in unmasked]),
-        spread([int(np.isfinite(ratio[y, x]).sum()) for ratio in ratios]),
-        spread([mean(of_seed) for of_seed in lengths], 4),
-        spread([worst(of_seed) for of_seed in lengths], 4),
+        median_and_range([len(of_seed) for of_seed in lengths]),
+        median_and_range([int(np.isfinite(ratio[starts]).sum()) for ratio in unmasked]),
+        median_and_range([int(np.isfinite(ratio[y, x]).sum()) for ratio in ratios]),
+        *mean_and_worst(lengths),
     ]
 
 
 def _draw(
     settings: Settings, scenario: Scenario, ratios: dict[str, list[NDArray[np.float64]]]
-) -> None:
-    figure, panels = plt.subplots(1, len(ratios), figsize=(11, 5), layout="constrained")
-    for axes, (profile, of_seeds) in zip(panels, ratios.items(), strict=True):
-        solved = np.sum([np.isfinite(ratio) for ratio in of_seeds], axis=0)
-        free = ~scenario.grid.occupancy
-        free[scenario.goal[::-1]] = False
+) -> str:
+    figure, panels = plt.subplots(1, len(PROFILES), figsize=(11, 5), layout="constrained")
+    free = ~scenario.grid.occupancy
+    free[scenario.goal[::-1]] = False
+    for axes, profile in zip(panels, PROFILES, strict=True):
+        solved = np.sum([np.isfinite(ratio) for ratio in ratios[profile]], axis=0)
         image = draw_share(axes, np.where(free, solved, np.nan), settings.seeds)
         draw_map(axes, scenario, f"profile {profile}")
         draw_border(axes, START_DEAD_END)
-    figure.colorbar(
-        image,
-        ax=panels,
-        label="seeds that solve the start",
-        ticks=range(settings.seeds + 1),
-        shrink=0.8,
-    )
-    save(figure, settings.out / "goal_2.png")
+    label, ticks = "seeds that solve the start", range(settings.seeds + 1)
+    figure.colorbar(image, ax=panels, label=label, ticks=ticks, shrink=0.8)
+    return save_figure(figure, settings.out / "goal_2.png", "Fig. 8: starts by outcome")

@@ -8,26 +8,24 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from itertools import product
 from typing import Any, Final, NamedTuple
 
 import matplotlib.pyplot as plt
 import numpy as np
 
-from ddqn_planner.experiments.figures import draw_map, draw_new_obstacles, draw_walk, save
+from ddqn_planner.benchmarks.tables import write_table
+from ddqn_planner.experiments.figures import draw_map, draw_new_obstacles, draw_path, save_figure
 from ddqn_planner.experiments.profiles import MOVE_RULE, PROFILES
-from ddqn_planner.experiments.report import Settings, mean, optimal_length, spread, worst
-from ddqn_planner.experiments.tables import table
-from ddqn_planner.experiments.taught import teach
-from ddqn_planner.experiments.trainings import (
-    Training,
-    in_parallel,
-    solved,
-    walk_from_starts,
+from ddqn_planner.experiments.settings import (
+    Settings,
+    mean_and_worst,
+    median_and_range,
+    optimal_length,
 )
-from ddqn_planner.files import write_csv
+from ddqn_planner.experiments.supervised import train_supervised
+from ddqn_planner.experiments.trainings import Training, in_parallel, rollouts, solved
 from ddqn_planner.grid import Cell, Noise, legal_moves, scatter_obstacles
-from ddqn_planner.planning import Plan, Planner, PlanStatus, shortest_path
+from ddqn_planner.planning import Plan, PlanStatus, shortest_path
 from ddqn_planner.planning.search import search
 from ddqn_planner.training.environment import Scenario, paper_scenario
 from ddqn_planner.training.hyper_parameters import HyperParameters
@@ -39,44 +37,38 @@ PAPER: Final = replace(PROFILES["paper"], steps=120_000, replay_capacity=120_000
 """The profile paper for many maps: the steps are the paper's, memory and filters ours."""
 NOISE_SEED = 0
 EVALUATION_INTERVAL = 1_000
-
-TAUGHT_UPDATES = 10_000
+SUPERVISED_UPDATES = 10_000
 
 COLUMNS = (
     "new obstacles",
-    "walks",
+    "planner",
     "training maps solved",
-    "training, any move",
+    "training, without action masking",
     "test maps solved",
-    "test, any move",
+    "test, without action masking",
     "mean length / optimum, test",
     "worst",
-    "distinct walks, test",
+    "distinct paths, test",
     "steps",
     "seconds",
 )
 
 
 class NoisyMaps(NamedTuple):
-    """Maps with new obstacles on or next to the path of goal i, no two of them alike."""
+    """Different maps with new obstacles on or next to the path of goal i."""
 
     training: list[Scenario]
     test: list[Scenario]
     rejected: int
-    """Draws thrown away because they closed every way."""
+    """Draws rejected because they closed every path."""
     repeated: int
-    """Draws thrown away because that map was there already."""
+    """Draws rejected because they repeated a map."""
 
 
 def noisy_maps(training: int, test: int, noise: Noise, seed: int = NOISE_SEED) -> NoisyMaps:
-    """Draw distinct noisy maps around the shortest path of goal i.
+    """Draw different noisy maps around the shortest path of goal i.
 
-    Parameters
-    ----------
-    training, test : int
-        How many of each; the training maps do not depend on the number of test maps.
-    noise : Noise
-    seed : int
+    The training maps do not depend on the number of test maps.
     """
     scenario = paper_scenario()
     path = shortest_path(scenario.grid, scenario.start, scenario.goal, MOVE_RULE)
@@ -84,8 +76,8 @@ def noisy_maps(training: int, test: int, noise: Noise, seed: int = NOISE_SEED) -
     scenarios: dict[str, Scenario] = {}
     rejected = repeated = 0
     while len(scenarios) < training + test:
-        grid, thrown_away = scatter_obstacles(scenario.grid, path, MOVE_RULE, random, noise)
-        rejected += thrown_away
+        grid, closed = scatter_obstacles(scenario.grid, path, MOVE_RULE, random, noise)
+        rejected += closed
         repeated += grid.fingerprint in scenarios
         scenarios.setdefault(grid.fingerprint, replace(scenario, grid=grid))
     drawn = list(scenarios.values())
@@ -98,198 +90,154 @@ def drawn_maps(settings: Settings, noise: Noise) -> NoisyMaps:
     return noisy_maps(*counts, noise)
 
 
-def readings(settings: Settings) -> dict[str, tuple[Noise, HyperParameters]]:
-    """Return the readings of the paper that are asked for, by the names of their trainings."""
-    return {
-        f"paper/{noise.value}/hidden_{units}": (noise, replace(PAPER, hidden_units=units))
-        for noise, units in product(settings.noise, settings.hidden_units)
+def networks(settings: Settings) -> dict[str, tuple[str, HyperParameters]]:
+    """Return the folder and the parameters of each network, by its label in the table."""
+    papers = {
+        f"paper, {units} hidden units" if units else "paper": (
+            f"paper/hidden_{units}",
+            replace(PAPER, hidden_units=units),
+        )
+        for units in settings.hidden_units
     }
-
-
-def best_name(noise: Noise) -> str:
-    """Return the name of the trainings of the profile best on the noisy maps."""
-    return f"best/{noise.value}"
-
-
-def taught_name(name: str) -> str:
-    """Return the name under which the network of a reading is taught."""
-    return f"{name}/taught"
+    return papers | {"propagation": ("propagation", PROFILES["propagation"])}
 
 
 def trainings(settings: Settings) -> list[Training]:
-    """Return the trainings on the training maps: each reading, and the profile best."""
-    wanted = readings(settings) | {
-        best_name(noise): (noise, PROFILES["best"]) for noise in settings.noise
-    }
+    """Return the trainings of each network on the training maps of each noise."""
+    maps = {noise: drawn_maps(settings, noise).training for noise in settings.noise}
     return [
         training
-        for name, (noise, parameters) in wanted.items()
+        for noise in settings.noise
+        for folder, parameters in networks(settings).values()
         for training in settings.trainings(
-            name,
-            settings.shorten(parameters),
-            drawn_maps(settings, noise).training,
-            EVALUATION_INTERVAL,
+            f"{noise.value}/{folder}", parameters, maps[noise], EVALUATION_INTERVAL
         )
     ]
 
 
-def taught(settings: Settings) -> list[Training]:
-    """Return what the networks are taught, see `ddqn_planner.experiments.taught`.
+def supervised_trainings(settings: Settings) -> list[Training]:
+    """Return the trainings for `train_supervised`: the paper's networks on maps near the path.
 
-    Only near the path: obstacles on it alone can be avoided by one fixed walk.
+    Obstacles on the path alone can be avoided by one fixed path.
     """
+    if Noise.NEAR_PATH not in settings.noise:
+        return []
+    maps = drawn_maps(settings, Noise.NEAR_PATH).training
     return [
         training
-        for name, (noise, parameters) in readings(settings).items()
-        if noise is Noise.NEAR_PATH
+        for folder, parameters in networks(settings).values()
+        if parameters.network == "paper"
         for training in settings.trainings(
-            taught_name(name),
-            settings.shorten(replace(parameters, steps=TAUGHT_UPDATES)),
-            drawn_maps(settings, noise).training,
+            f"near_path/{folder}/supervised", replace(parameters, steps=SUPERVISED_UPDATES), maps
         )
     ]
 
 
-def fixed_walk(maps: Sequence[Scenario]) -> tuple[Cell, ...]:
-    """Return a walk from start to end that is free in many of the maps at once.
+def fixed_path(maps: Sequence[Scenario]) -> tuple[Cell, ...]:
+    """Return a path from start to end that is free in many of the maps at once.
 
-    It looks at no map when it is walked, so what it solves is no achievement: a network must solve
-    more, or walk less far. It is the cheapest path of the paper's map where a cell costs 1, and 1
-    more for each of the maps in which it is a new obstacle.
-
-    Parameters
-    ----------
-    maps : sequence of Scenario
-        Noisy maps, see `noisy_maps`.
-
-    Returns
-    -------
-    tuple of (x, y)
+    It does not depend on the map at hand, so a network must solve more maps, or find shorter
+    paths, to show that it sees the map. It is the cheapest path of the paper's map if a cell costs
+    1, and 1 more for each of the maps in which it is a new obstacle.
     """
     paper = paper_scenario()
     occupied = sum(scenario.grid.occupancy.astype(np.float32) for scenario in maps)
-    end = np.zeros(paper.grid.occupancy.shape, dtype=np.bool_)
-    end[paper.goal[1], paper.goal[0]] = True
     legal = legal_moves(paper.grid.occupancy, MOVE_RULE)
-    return search(paper.start, end, legal, np.float32(1) + occupied, MOVE_RULE)
+    return search(paper.start, paper.goal, legal, np.float32(1) + occupied, MOVE_RULE)
 
 
 def report(settings: Settings) -> str:
     """Write the table and the figure of goal iii, and return its Markdown."""
-    in_parallel(teach, taught(settings), settings.out)
+    in_parallel(train_supervised, supervised_trainings(settings))
     rows, drawn = [], []
     for noise in settings.noise:
         maps = drawn_maps(settings, noise)
         rows += [[noise.value, *row] for row in _rows(settings, maps, noise)]
         drawn.append(
             f"{noise.value}: {len(maps.training)} training and {len(maps.test)} test maps, all "
-            f"different; {maps.rejected} draws were thrown away because they closed every way, "
+            f"different; {maps.rejected} draws were rejected because they closed every path, "
             f"{maps.repeated} because they repeated a map."
         )
-    write_csv(settings.out / "goal_3.csv", COLUMNS, rows)
-    _draw(settings)
-    figure = "![Fig. 9: the first three test maps of each reading](goal_3.png)"
-    return "\n\n".join([*drawn, table(COLUMNS, rows), figure])
+    table = write_table(settings.out / "goal_3.csv", COLUMNS, rows)
+    return "\n\n".join([*drawn, table, _draw(settings)])
 
 
 def _rows(settings: Settings, maps: NoisyMaps, noise: Noise) -> list[list[str]]:
-    best, rows = best_name(noise), []
-    for name, (of_noise, parameters) in readings(settings).items():
-        if of_noise is noise:
-            network = _network(parameters.hidden_units)
-            rows += [
-                (network, name, "kept.safetensors"),
-                (f"{network}, last network", name, "model.safetensors"),
-            ]
+    rows = []
+    for label, (folder, parameters) in networks(settings).items():
+        name = f"{noise.value}/{folder}"
+        models = [(label, name, "kept.safetensors")]
+        if parameters.network == "paper":
+            models.append((f"{label}, last network", name, "model.safetensors"))
             if noise is Noise.NEAR_PATH:
-                label = f"{network}, taught the best moves"
-                rows.append((label, taught_name(name), "model.safetensors"))
-    rows.append(("best", best, "kept.safetensors"))
-    walk = fixed_walk(maps.training)
-    walks = [[_on_map(walk, scenario) for scenario in some] for some in (maps.training, maps.test)]
-    return [
-        *(
-            [label, *_measured(settings.planners(name, file), maps), *_cost(settings, name)]
-            for label, name, file in rows
-        ),
-        [
-            "one fixed walk",
-            *_columns([(walks[0], walks[0])], [(walks[1], walks[1])], maps),
-            "-",
-            "-",
-        ],
-    ]
+                models.append((f"{label}, supervised", f"{name}/supervised", "model.safetensors"))
+        for model, trained, file in models:
+            planners = settings.planners(trained, file)
+            training, test = (
+                [rollouts(planner, some) for planner in planners]
+                for some in (maps.training, maps.test)
+            )
+            ends = [run[-1] for run in settings.evaluations(trained) if run]
+            cost = [
+                median_and_range([end.step for end in ends]),
+                median_and_range([end.seconds for end in ends], 1),
+            ]
+            rows.append([model, *_columns(training, test, maps), *(cost if ends else ["-", "-"])])
+    path = fixed_path(maps.training)
+    training, test = (
+        [([_on_map(path, scenario) for scenario in some],) * 2]
+        for some in (maps.training, maps.test)
+    )
+    return [*rows, ["one fixed path", *_columns(training, test, maps), "-", "-"]]
 
 
-def _network(hidden_units: int) -> str:
-    return f"paper, {hidden_units} hidden units" if hidden_units else "paper"
+def _on_map(path: tuple[Cell, ...], scenario: Scenario) -> Plan:
+    """Return the path as a plan on a map: trapped if a cell of it is occupied."""
+    if all(map(scenario.grid.is_free, path)):
+        return Plan(PlanStatus.SUCCEEDED, path)
+    return Plan(PlanStatus.ROLLOUT_TRAPPED)
 
 
-def _on_map(walk: tuple[Cell, ...], scenario: Scenario) -> Plan:
-    """Return the plan that a walk is on a map: trapped where a cell of it is occupied."""
-    if all(map(scenario.grid.is_free, walk)):
-        return Plan(PlanStatus.SUCCEEDED, walk)
-    return Plan(PlanStatus.WALK_TRAPPED)
+Rollouts = tuple[list[Plan], list[Plan]]
+"""With and without action masking: one plan per map."""
 
 
-def _measured(planners: Sequence[Planner], maps: NoisyMaps) -> list[str]:
-    training = [walk_from_starts(planner, maps.training) for planner in planners]
-    test = [walk_from_starts(planner, maps.test) for planner in planners]
-    return _columns(training, test, maps)
-
-
-Walks = tuple[list[Plan], list[Plan]]
-"""By legal moves, and by the greatest Q of all moves: a walk per map."""
-
-
-def _columns(training: Sequence[Walks], test: Sequence[Walks], maps: NoisyMaps) -> list[str]:
-    """Return the cells of the table for the walks of each seed."""
+def _columns(training: Sequence[Rollouts], test: Sequence[Rollouts], maps: NoisyMaps) -> list[str]:
+    """Return the cells of the table for the rollouts of each seed."""
     optimum = [optimal_length(scenario) for scenario in maps.test]
     ratios = [
-        [walk.length / least for walk, least in zip(walks, optimum, strict=True) if walk.cells]
-        for walks, _ in test
+        [plan.length / least for plan, least in zip(plans, optimum, strict=True) if plan.cells]
+        for plans, _ in test
     ]
     return [
-        spread([solved(walks) for walks, _ in training]),
-        spread([solved(unmasked) for _, unmasked in training]),
-        spread([solved(walks) for walks, _ in test]),
-        spread([solved(unmasked) for _, unmasked in test]),
-        spread([mean(of_seed) for of_seed in ratios], 4),
-        spread([worst(of_seed) for of_seed in ratios], 4),
-        spread([len({walk.cells for walk in walks if walk.cells}) for walks, _ in test]),
+        median_and_range([solved(plans) for plans, _ in training]),
+        median_and_range([solved(unmasked) for _, unmasked in training]),
+        median_and_range([solved(plans) for plans, _ in test]),
+        median_and_range([solved(unmasked) for _, unmasked in test]),
+        *mean_and_worst(ratios),
+        median_and_range([len({plan.cells for plan in plans if plan.cells}) for plans, _ in test]),
     ]
 
 
-def _cost(settings: Settings, trained: str) -> list[str]:
-    ends = [run[-1] for run in settings.evaluations(trained) if run]
-    if not ends:
-        return ["-", "-"]
-    return [spread([end.step for end in ends]), spread([end.seconds for end in ends], 1)]
-
-
-def _draw(settings: Settings) -> None:
-    rows = len(settings.noise)
+def _draw(settings: Settings) -> str:
+    size = (12, 4.2 * len(settings.noise))
     figure, panels = plt.subplots(
-        rows, 3, figsize=(12, 4.2 * rows), layout="constrained", squeeze=False
+        len(settings.noise), 3, figsize=size, layout="constrained", squeeze=False
     )
     legend: dict[str, Any] = {}
     for noise, row in zip(settings.noise, panels, strict=True):
         planners = {
-            _network(parameters.hidden_units): name
-            for name, (of_noise, parameters) in readings(settings).items()
-            if of_noise is noise
-        } | {"best": best_name(noise)}
-        loaded = {
-            label: settings.planners(name, "kept.safetensors")[0]
-            for label, name in planners.items()
+            label: settings.planners(f"{noise.value}/{folder}", "kept.safetensors")[0]
+            for label, (folder, _) in networks(settings).items()
         }
         for axes, scenario in zip(row, drawn_maps(settings, noise).test, strict=False):
             draw_map(axes, scenario, noise.value)
             draw_new_obstacles(axes, scenario.grid, paper_scenario().grid)
-            for number, (label, planner) in enumerate(loaded.items()):
+            for number, (label, planner) in enumerate(planners.items()):
                 plan = planner.plan(scenario.grid, scenario.start, scenario.goal)
-                draw_walk(axes, plan.cells, number, label)
+                draw_path(axes, plan.cells, number, label)
             handles, labels = axes.get_legend_handles_labels()
             legend |= dict(zip(labels, handles, strict=True))
     figure.legend([*legend.values()], [*legend], loc="outside lower center", ncols=len(legend))
-    save(figure, settings.out / "goal_3.png")
+    caption = "Fig. 9: the first three test maps of each reading"
+    return save_figure(figure, settings.out / "goal_3.png", caption)

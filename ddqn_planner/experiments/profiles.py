@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-from typing import Final
+from typing import Any, Final
 
 from ddqn_planner.grid import Cell, MoveRule
 from ddqn_planner.training.hyper_parameters import HyperParameters
@@ -21,7 +20,7 @@ START_DEAD_END: Final[frozenset[Cell]] = frozenset(
 
 PROFILES: Final[dict[str, HyperParameters]] = {
     "paper": HyperParameters(),
-    "best": HyperParameters(
+    "propagation": HyperParameters(
         network="propagation",
         filters=64,
         learning_rate=0.001,
@@ -30,18 +29,13 @@ PROFILES: Final[dict[str, HyperParameters]] = {
         steps=15_000,
     ),
 }
-"""``paper``: its network, observation and Table 1, our choice where it is silent. ``best``: the
-same rewards and restarts, with another network and fewer steps."""
+"""``paper``: its network, observation and Table 1, our choice where it is silent. ``propagation``:
+the same rewards and initialisation, with another network and fewer steps."""
 
-VARIANTS: Final[dict[str, dict[str, float]]] = {
+VARIANTS: Final[dict[str, dict[str, Any]]] = {
     "plain": {"p_r": 0.0, "alpha": 0.0, "beta": 0.0},
     "initialisation": {"alpha": 0.0, "beta": 0.0},
     "reward": {"p_r": 0.0},
     "both": {},
 }
 """Plain Double DQN, each improvement alone, and both: what each sets."""
-
-
-def variant(parameters: HyperParameters, name: str) -> HyperParameters:
-    """Return the parameters of one of the `VARIANTS`."""
-    return replace(parameters, **VARIANTS[name])  # type: ignore[arg-type]

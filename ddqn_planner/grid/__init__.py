@@ -1,7 +1,10 @@
-"""What the robot moves on: the grid map, the eight moves, map files and the paper's noise."""
+"""What the robot moves on: the grid map, the eight moves, shortest paths, map files and noise.
+
+`import ddqn_planner.grid` loads no SciPy: what needs it imports it at its first call.
+"""
 
 from ddqn_planner.grid.body import clearance, inflate
-from ddqn_planner.grid.grid_map import MAX_PRICE, OCCUPIED, UNKNOWN, Cell, GridMap
+from ddqn_planner.grid.grid_map import MAX_COST_MULTIPLIER, OCCUPIED, UNKNOWN, Cell, GridMap
 from ddqn_planner.grid.map_file import MapFile, MapFileError, load_map, read_map_file, save_map
 from ddqn_planner.grid.moves import (
     LENGTHS,
@@ -10,14 +13,16 @@ from ddqn_planner.grid.moves import (
     connected_cells,
     legal_moves,
     move_costs,
+    neighbours,
     path_cost,
     path_length,
 )
 from ddqn_planner.grid.noise import Noise, scatter_obstacles
+from ddqn_planner.grid.shortest_paths import shortest_distances, shortest_path
 
 __all__ = [
     "LENGTHS",
-    "MAX_PRICE",
+    "MAX_COST_MULTIPLIER",
     "MOVES",
     "OCCUPIED",
     "UNKNOWN",
@@ -33,9 +38,12 @@ __all__ = [
     "legal_moves",
     "load_map",
     "move_costs",
+    "neighbours",
     "path_cost",
     "path_length",
     "read_map_file",
     "save_map",
     "scatter_obstacles",
+    "shortest_distances",
+    "shortest_path",
 ]

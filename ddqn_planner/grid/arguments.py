@@ -1,4 +1,4 @@
-"""What users give, checked in one place: choices, whole numbers, cells."""
+"""Checks of what users pass in: choices, whole numbers, cells."""
 
 from __future__ import annotations
 
@@ -9,11 +9,14 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 Cell: TypeAlias = tuple[int, int]
-"""(x, y): x the column, y the row of ``occupancy[y, x]``."""
+"""(x, y): x is the column, y is the row of ``occupancy[y, x]``."""
+
+Occupancy: TypeAlias = NDArray[np.bool_]
+"""(H, W) bool: True where a cell is occupied."""
 
 
 class Choice(str, Enum):
-    """Choices that are given as members or as their values: ``MoveRule("unit")`` takes both."""
+    """An enum whose members can be given by value: ``MoveRule("unit")``."""
 
     @classmethod
     def _missing_(cls, value: object) -> Choice:
@@ -24,10 +27,7 @@ class Choice(str, Enum):
 def as_cell(cell: Any, name: str = "the cell") -> Cell:
     """Return a pair of whole numbers of any type (a list, an array, ...) as Python ints.
 
-    Raises
-    ------
-    ValueError
-        If it is anything else; the error calls it `name`.
+    The message of the ValueError for anything else uses `name`.
     """
     try:
         if len(cell) == 2:
@@ -40,12 +40,9 @@ def as_cell(cell: Any, name: str = "the cell") -> Cell:
 
 
 def whole_numbers(name: str, values: ArrayLike, lowest: int, highest: int) -> NDArray[Any]:
-    """Return an array of whole numbers within bounds, of whatever dtype.
+    """Return an array of whole numbers from `lowest` to `highest`; its dtype stays as it is.
 
-    Raises
-    ------
-    ValueError
-        If it holds anything else; the error calls it `name`, and names the first wrong value.
+    The message of the ValueError for anything else uses `name` and shows the first wrong value.
     """
     try:
         array = np.asarray(values)
@@ -53,11 +50,10 @@ def whole_numbers(name: str, values: ArrayLike, lowest: int, highest: int) -> ND
         raise ValueError(f"{name} are no array ({error}); give rows of one length") from None
     if array.dtype.kind not in "iuf":
         raise ValueError(f"{name} are of type {array.dtype}; give {lowest}..{highest}")
-    # Comparisons that NaN fails.
-    right = (array >= lowest) & (array <= highest)
+    valid = (array >= lowest) & (array <= highest)  # False for NaN
     if array.dtype.kind == "f":
-        right &= array == np.floor(array)
-    if not right.all():
-        wrong = array[~right].flat[0]
+        valid &= array == np.floor(array)
+    if not valid.all():
+        wrong = array[~valid].flat[0]
         raise ValueError(f"{name} hold {wrong}; give whole numbers {lowest}..{highest}")
     return array

@@ -1,32 +1,28 @@
-"""The robot's body: how far its centre keeps from obstacles, and how far it would rather keep."""
+"""The robot's body: which cells are too near to an obstacle, and which are better avoided."""
 
 from __future__ import annotations
 
 from dataclasses import replace
 
 import numpy as np
-import scipy.ndimage
 from numpy.typing import NDArray
 
+from ddqn_planner.grid.arguments import Occupancy
 from ddqn_planner.grid.grid_map import OCCUPIED, UNKNOWN, GridMap
 
 CLEARANCE_SCALE = 1.0
-"""Metres beyond the body over which the cost of being near to an obstacle falls to an eighth.
+"""Metres beyond the body over which the cost near an obstacle falls to an eighth.
 
-It falls as 1 / (1 + distance / scale)^3. Of linear, exponential and inverse costs that make paths
-at most 1.10 times as long on each of eight maps of this package, none brought noticeably greater
-distances; see docs/reliability.md."""
+It falls as 1 / (1 + distance / scale)^3. Linear and exponential costs were compared with it, each
+with paths at most 1.10 times as long on eight maps of this package; none kept clearly greater
+distances. See docs/reliability.md."""
 
 ROUNDING = 1e-6
-"""A resolution comes as float32: 0.2 m of 0.05 m cells shall be 4 cells, not 3.9999999."""
+"""A message has the resolution as float32: 0.2 m must be 4 cells of 0.05 m, not 3.9999999."""
 
 
-def clearance(obstacles: NDArray[np.bool_]) -> NDArray[np.float64]:
+def clearance(obstacles: Occupancy) -> NDArray[np.float64]:
     """Return the distance from each cell to the nearest obstacle, between their centres.
-
-    Parameters
-    ----------
-    obstacles : (H, W) bool
 
     Returns
     -------
@@ -35,26 +31,27 @@ def clearance(obstacles: NDArray[np.bool_]) -> NDArray[np.float64]:
     """
     if not obstacles.any():
         return np.full(obstacles.shape, np.inf)
+    import scipy.ndimage
+
     distance: NDArray[np.float64] = scipy.ndimage.distance_transform_edt(~obstacles)
     return distance
 
 
 def inflate(grid: GridMap, robot_radius: float, clearance_weight: float = 0.0) -> GridMap:
-    """Return the map of a robot with a body: cells too near to an obstacle are occupied.
+    """Return the map for a robot with a body: cells too near to an obstacle become occupied.
 
-    Distances are those between the centres of cells (as in Nav2's inflation layer). Every occupied
-    cell counts as an obstacle, an unknown one where it is not allowed too.
+    Distances are measured between the centres of cells, as in Nav2's inflation layer.
 
     Parameters
     ----------
     grid : GridMap
         Its occupied cells become the obstacles of the new map.
     robot_radius : float
-        Metres, finite and >= 0: cells nearer than that to an obstacle become occupied.
+        In metres, finite and >= 0: cells nearer than this to an obstacle become occupied.
     clearance_weight : float
-        0..1: the cost of a free cell next to an obstacle, as a share of the greatest one. It falls
-        with the distance, see `CLEARANCE_SCALE`. Where a cell has a cost already, the greater one
-        counts. No path is lost because of it: costs close no cell.
+        0..1: cost of a free cell next to an obstacle, as a share of the greatest cost. It falls
+        with the distance, see `CLEARANCE_SCALE`. Where a cell already has a cost, the greater one
+        counts. Costs never make a path impossible.
 
     Raises
     ------

@@ -1,36 +1,35 @@
-"""Random maps of many kinds and sizes, requests on them, and costs of their cells."""
+"""Random maps of nine kinds and any size, requests on them, and costs of their cells.
+
+The documented figures depend on these maps: the same seed must always give the same ones.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
-from typing import Final, TypeAlias
+from typing import Any, Final
 
 import numpy as np
-import scipy.ndimage
 from numpy.typing import NDArray
-from scipy.sparse import coo_matrix
-from scipy.sparse.csgraph import minimum_spanning_tree
 
-from ddqn_planner.grid.grid_map import UNKNOWN, Cell
+from ddqn_planner.grid.arguments import Cell, Occupancy
+from ddqn_planner.grid.body import clearance
+from ddqn_planner.grid.grid_map import UNKNOWN
 from ddqn_planner.grid.moves import MoveRule, component_labels
-
-Occupancy: TypeAlias = NDArray[np.bool_]
-"""(H, W) bool, True where a cell is occupied."""
 
 MINIMUM_SIDE = 5
 """The shortest side of a map: a maze of two corridors between its walls."""
 
 SHORTEST_STEP = 3
-"""From one wall of a room to the next, in cells: a room is at least two cells wide."""
+"""Cells from one wall of a room to the next: a room is at least two cells wide."""
 
 EXTRA_LINKS = 0.15
-"""Share of the links between neighbours that are opened whether they are in the tree or not."""
+"""Share of the links outside the spanning tree that are opened too."""
 
 
 def _independent(share: float, shape: tuple[int, int], random: np.random.Generator) -> Occupancy:
     """Occupy each cell with the same probability."""
-    while True:  # a small map may come out without two free cells side by side
+    while True:  # a small map may have no two free cells side by side
         occupancy = random.random(shape) < share
         if not (occupancy[:, 1:] | occupancy[:, :-1]).all():
             return occupancy
@@ -47,7 +46,7 @@ def _maze(shape: tuple[int, int], random: np.random.Generator) -> Occupancy:
 
 
 def _rooms(shape: tuple[int, int], random: np.random.Generator) -> Occupancy:
-    """Divide the map into rooms by walls one cell thick, with doors that reach every room."""
+    """Divide the map into rooms by walls one cell thick, with doors so that all are connected."""
     longest = int(random.integers(SHORTEST_STEP, np.clip(min(shape) // 3, SHORTEST_STEP, 15) + 1))
     y, x = (_wall_lines(0, side - 1, longest, random) for side in shape)
     occupancy = np.zeros(shape, dtype=np.bool_)
@@ -63,25 +62,20 @@ def _rooms(shape: tuple[int, int], random: np.random.Generator) -> Occupancy:
 
 def _corridors(shape: tuple[int, int], random: np.random.Generator) -> Occupancy:
     """Dig L-shaped corridors, one to three cells wide, between random points of a solid block."""
-    # One point in each part of the map: links between neighbours only keep it from being hollowed.
+    # One point in each part of the map, and links only between neighbours, keep most of it solid.
     spacing = int(random.integers(5, 11))
     rows, columns = (max(2, (side - 2) // spacing) for side in shape)
-    y_edges, x_edges = (
-        np.linspace(1, side - 1, parts + 1).astype(np.int64)
-        for side, parts in zip(shape, (rows, columns), strict=True)
-    )
+    y_edges = np.linspace(1, shape[0] - 1, rows + 1).astype(np.int64)
+    x_edges = np.linspace(1, shape[1] - 1, columns + 1).astype(np.int64)
     y = random.integers(y_edges[:-1, None], y_edges[1:, None], (rows, columns))
     x = random.integers(x_edges[:-1], x_edges[1:], (rows, columns))
     row, column, next_row, next_column = _links(rows, columns, EXTRA_LINKS, random)
-    ends = np.stack(
-        [y[row, column], x[row, column], y[next_row, next_column], x[next_row, next_column]], axis=1
-    )
-    widths = random.integers(1, 4, len(ends))
-    turns = random.random(len(ends)) < 0.5
+    widths = random.integers(1, 4, len(row))
+    turns = random.random(len(row)) < 0.5
+    first, second = (row, column), (next_row, next_column)
+    links = np.stack([y[first], x[first], y[second], x[second], widths, turns], axis=1)
     occupancy = np.ones(shape, dtype=np.bool_)
-    for (y0, x0, y1, x1), width, turn in zip(
-        ends.tolist(), widths.tolist(), turns.tolist(), strict=True
-    ):
+    for y0, x0, y1, x1, width, turn in links.tolist():
         corner_y, corner_x = (y0, x1) if turn else (y1, x0)
         occupancy[min(y0, y1) : max(y0, y1) + width, corner_x : corner_x + width] = False
         occupancy[corner_y : corner_y + width, min(x0, x1) : max(x0, x1) + width] = False
@@ -93,10 +87,10 @@ def _dead_ends(shape: tuple[int, int], random: np.random.Generator) -> Occupancy
     """Scatter U-shaped walls, each open to one of the four sides, in free space."""
     occupancy = np.zeros(shape, dtype=np.bool_)
     longest = int(np.clip(min(shape) // 3, 3, 25))
-    tries = 1 + shape[0] * shape[1] // 25
-    sides = random.integers(3, longest + 1, (tries, 2)).tolist()
-    for sides_of_bay, turns in zip(sides, random.integers(0, 4, tries).tolist(), strict=True):
-        bay = np.ones(sides_of_bay, dtype=np.bool_)
+    tries = 1 + occupancy.size // 25
+    sizes = random.integers(3, longest + 1, (tries, 2)).tolist()
+    for size, turns in zip(sizes, random.integers(0, 4, tries).tolist(), strict=True):
+        bay = np.ones(size, dtype=np.bool_)
         bay[1:-1, 1:] = False
         _stamp(occupancy, np.rot90(bay, turns), random)
     return occupancy
@@ -108,7 +102,7 @@ def _office(shape: tuple[int, int], random: np.random.Generator) -> Occupancy:
     height, width = shape if along_x else shape[::-1]
     count = max(1, round(height / random.integers(14, 25)))
     corridors = _corridor_spans(height, count, random)
-    # More than one corridor needs another across them, or they would not be joined.
+    # Two or more corridors need another corridor across them, or they would not be connected.
     cross_count = max(int(count > 1), round(width / random.integers(30, 61)))
     cross_corridors = _corridor_spans(width, cross_count, random)
     corridor = np.zeros((height, width), dtype=np.bool_)
@@ -131,10 +125,9 @@ def _office(shape: tuple[int, int], random: np.random.Generator) -> Occupancy:
                 occupancy[above + 1 : below, left + 1 : right] = False
                 occupancy[above + 1 : below, x] = True
                 _open_doors(occupancy.T, np.full(len(x) - 1, door), x[:-1], x[1:], random)
-    tries = height * width // 25
-    for desk in random.integers(1, 4, (tries, 2)).tolist():
+    for desk in random.integers(1, 4, (occupancy.size // 25, 2)).tolist():
         _stamp(occupancy, np.ones(desk, dtype=np.bool_), random)
-    occupancy &= ~corridor  # a desk stands in a room
+    occupancy &= ~corridor  # desks stand in rooms only
     return occupancy if along_x else np.ascontiguousarray(occupancy.T)
 
 
@@ -143,22 +136,23 @@ def _links(
 ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
     """Link the nodes of a lattice by a random spanning tree and a share of all other links.
 
-    Returns the row and the column of the one end of each link, then of the other, which lies below
-    or to the right of it.
+    Returns the row and column of one end of each link, then those of the other end, which lies
+    below it or to its right.
     """
+    from scipy.sparse import coo_matrix
+    from scipy.sparse.csgraph import minimum_spanning_tree
+
     node = np.arange(rows * columns, dtype=np.int64).reshape(rows, columns)
     first = np.concatenate([node[:, :-1].ravel(), node[:-1].ravel()])
     second = np.concatenate([node[:, 1:].ravel(), node[1:].ravel()])
-    # In random order, the number of a link serves as its weight, and tells which are in the tree.
+    # The links are in random order: the number of a link is its weight and tells it in the tree.
     order = random.permutation(len(first))
     first, second = first[order], second[order]
-    numbers = np.arange(1, len(first) + 1)  # a weight of 0 would be no link
+    numbers = np.arange(1, len(first) + 1)  # scipy reads a weight of 0 as no link
     tree = minimum_spanning_tree(coo_matrix((numbers, (first, second)), (node.size, node.size)))
     linked = random.random(len(first)) < extra
     linked[tree.data.astype(np.int64) - 1] = True
-    row, column = np.divmod(first[linked], columns)
-    next_row, next_column = np.divmod(second[linked], columns)
-    return row, column, next_row, next_column
+    return *np.divmod(first[linked], columns), *np.divmod(second[linked], columns)
 
 
 def _wall_lines(
@@ -171,11 +165,7 @@ def _wall_lines(
 
 
 def _open_doors(
-    occupancy: Occupancy,
-    columns: NDArray[np.int64],
-    tops: NDArray[np.int64],
-    bottoms: NDArray[np.int64],
-    random: np.random.Generator,
+    occupancy: Occupancy, columns: Any, tops: Any, bottoms: Any, random: np.random.Generator
 ) -> None:
     """Open a door of one or two cells in walls along columns, between their top and bottom rows."""
     first = random.integers(tops + 1, bottoms)
@@ -186,7 +176,7 @@ def _open_doors(
 def _stamp(occupancy: Occupancy, pattern: Occupancy, random: np.random.Generator) -> None:
     """Occupy the cells of a pattern at a random place, if all cells in and around it are free.
 
-    The ring of free cells around the pattern keeps joined what was joined before.
+    The ring of free cells around the pattern keeps connected what was connected before.
     """
     height, width = pattern.shape
     top = int(random.integers(1, occupancy.shape[0] - height))
@@ -196,7 +186,7 @@ def _stamp(occupancy: Occupancy, pattern: Occupancy, random: np.random.Generator
 
 
 def _corridor_spans(side: int, count: int, random: np.random.Generator) -> list[tuple[int, int]]:
-    """Return the first cell of each of the corridors and the cell after its last."""
+    """Return the first cell of each corridor and the cell after its last."""
     spans = []
     for index in range(count):
         width = int(random.integers(2, min(4, side - 2) + 1))
@@ -208,7 +198,7 @@ def _corridor_spans(side: int, count: int, random: np.random.Generator) -> list[
 
 
 def _between(spans: list[tuple[int, int]], side: int) -> list[tuple[int, int]]:
-    """Return the first and the last cell of what corridors leave of a side of the map."""
+    """Return the first and last cell of each part of a side that lies between corridors."""
     firsts = [0, *(end for _, end in spans)]
     lasts = [*(first - 1 for first, _ in spans), side - 1]
     return list(zip(firsts, lasts, strict=True))
@@ -225,11 +215,11 @@ KINDS: Final[dict[str, Callable[[tuple[int, int], np.random.Generator], Occupanc
     "dead_ends": _dead_ends,
     "office": _office,
 }
-"""The function that makes each kind of map. All but random_* are wholly connected."""
+"""The function that makes each kind of map. All free cells are connected, except in random_*."""
 
 
 def generate_map(kind: str, shape: tuple[int, int], random: np.random.Generator) -> Occupancy:
-    """Make a random map on which at least two free cells are joined.
+    """Make a random map in which a path joins at least two free cells.
 
     Parameters
     ----------
@@ -238,16 +228,6 @@ def generate_map(kind: str, shape: tuple[int, int], random: np.random.Generator)
     shape : (int, int)
         Height and width in cells, each at least `MINIMUM_SIDE`.
     random : numpy.random.Generator
-
-    Returns
-    -------
-    (H, W) bool
-        True where a cell is occupied.
-
-    Raises
-    ------
-    ValueError
-        If the kind is unknown or a side is too short.
     """
     if kind not in KINDS:
         raise ValueError(f"the kind {kind!r} is unknown; give one of {', '.join(KINDS)}")
@@ -259,30 +239,11 @@ def generate_map(kind: str, shape: tuple[int, int], random: np.random.Generator)
 def random_requests(
     occupancy: Occupancy, move_rule: MoveRule, count: int, random: np.random.Generator
 ) -> list[tuple[Cell, Cell]]:
-    """Draw pairs of different free cells that a path joins.
+    """Draw `count` pairs of start and goal: different free cells that a path joins.
 
-    The start is uniform over the free cells from which the robot can go anywhere, the goal over
-    the other cells that it can reach. Pairs may repeat.
-
-    Parameters
-    ----------
-    occupancy : (H, W) bool
-        True where a cell is occupied.
-    move_rule : MoveRule
-        The rule under which the path is legal.
-    count : int
-        How many pairs, >= 0.
-    random : numpy.random.Generator
-
-    Returns
-    -------
-    list of ((x, y), (x, y))
-        Start and goal of each request.
-
-    Raises
-    ------
-    ValueError
-        If no two free cells are joined.
+    The start is uniform over the free cells that have a legal move, the goal is uniform over the
+    other cells that the robot can reach from there. Pairs may repeat. A map where no path joins two
+    free cells is a ValueError.
     """
     cells = np.flatnonzero(~occupancy)
     label_of_cell = component_labels(occupancy, move_rule).ravel()[cells]
@@ -295,112 +256,45 @@ def random_requests(
         raise ValueError("no two free cells of the map are joined; give a map with a path")
     starts = random.choice(candidates, count)
     first, size = first_of_label[label_of_cell[starts]], sizes[label_of_cell[starts]]
-    # One to size - 1 cells further round its component: any cell of it but the start.
+    # The goal is 1 to size - 1 cells further in the list of the component, which is a ring.
     goals = first + (starts - first + random.integers(1, size)) % size
-    start_y, start_x = np.divmod(cells[starts], occupancy.shape[1])
-    goal_y, goal_x = np.divmod(cells[goals], occupancy.shape[1])
-    return list(
-        zip(
-            zip(start_x.tolist(), start_y.tolist(), strict=True),
-            zip(goal_x.tolist(), goal_y.tolist(), strict=True),
-            strict=True,
-        )
-    )
+    y, x = np.divmod(cells[np.stack([starts, goals], axis=1)], occupancy.shape[1])
+    return [((sx, sy), (gx, gy)) for (sx, gx), (sy, gy) in zip(x.tolist(), y.tolist(), strict=True)]
 
 
 def random_costs(occupancy: Occupancy, random: np.random.Generator) -> NDArray[np.int8]:
-    """Draw the cost of each free cell by itself, uniformly.
-
-    Parameters
-    ----------
-    occupancy : (H, W) bool
-        True where a cell is occupied.
-    random : numpy.random.Generator
-
-    Returns
-    -------
-    (H, W) int8
-        0..99 in a free cell, 0 in an occupied one.
-    """
-    costs = random.integers(0, 100, occupancy.shape, dtype=np.int8)
-    costs[occupancy] = 0
-    return costs
+    """Draw (H, W) costs of free cells, each independent and uniform in 0..99."""
+    return _in_free_cells(occupancy, random.integers(0, 100, occupancy.shape, dtype=np.int8))
 
 
 def unknown_costs(
     occupancy: Occupancy, share: float, random: np.random.Generator
 ) -> NDArray[np.int8]:
-    """Let each free cell be unknown with a probability, and cost nothing else.
-
-    Parameters
-    ----------
-    occupancy : (H, W) bool
-        True where a cell is occupied.
-    share : float
-        The probability, 0..1.
-    random : numpy.random.Generator
-
-    Returns
-    -------
-    (H, W) int8
-        `UNKNOWN` or 0 in a free cell, 0 in an occupied one.
-    """
-    unknown = random.random(occupancy.shape) < share
-    costs: NDArray[np.int8] = np.where(unknown & ~occupancy, np.int8(UNKNOWN), np.int8(0))
-    return costs
+    """Draw (H, W) costs: each free cell is `UNKNOWN` with probability `share`, otherwise 0."""
+    return _in_free_cells(occupancy, np.where(random.random(occupancy.shape) < share, UNKNOWN, 0))
 
 
 def gradient_costs(occupancy: Occupancy, random: np.random.Generator) -> NDArray[np.int8]:
-    """Let the costs rise evenly over the map in a random direction, from 0 to 99.
-
-    Parameters
-    ----------
-    occupancy : (H, W) bool
-        True where a cell is occupied.
-    random : numpy.random.Generator
-
-    Returns
-    -------
-    (H, W) int8
-        0..99 in a free cell, 0 in an occupied one.
-    """
+    """Return (H, W) costs that rise linearly over the map in a random direction, from 0 to 99."""
     angle = random.uniform(0, 2 * np.pi)
     y, x = np.ogrid[: occupancy.shape[0], : occupancy.shape[1]]
-    way = np.cos(angle) * x + np.sin(angle) * y
-    way -= way.min()
-    costs: NDArray[np.int8] = np.rint(99 * way / max(way.max(), 1e-9)).astype(np.int8)
-    costs[occupancy] = 0
-    return costs
+    distance = np.cos(angle) * x + np.sin(angle) * y
+    distance -= distance.min()
+    return _in_free_cells(occupancy, np.rint(99 * distance / max(distance.max(), 1e-9)))
 
 
 def inflated_costs(occupancy: Occupancy, radius: float) -> NDArray[np.int8]:
-    """Let the costs fall exponentially with the distance from obstacles, as a costmap does.
+    """Return (H, W) costs that fall exponentially with the distance from obstacles, as in costmaps.
 
-    At a distance of d cells, centre to centre, the cost is ``99 ** (1 - (d - 1) / radius)``: 99
-    beside an obstacle.
-
-    Parameters
-    ----------
-    occupancy : (H, W) bool
-        True where a cell is occupied.
-    radius : float
-        Distance in cells beyond which the cost is 0, > 0 and finite.
-
-    Returns
-    -------
-    (H, W) int8
-        0..99 in a free cell, 0 in an occupied one.
-
-    Raises
-    ------
-    ValueError
-        If the radius is not finite or not above 0.
+    They are ``99 ** (1 - (d - 1) / radius)`` at a distance of d cells between centres, so
+    99 next to an obstacle, and 0 beyond `radius` cells.
     """
     if not 0 < radius < np.inf:
         raise ValueError(f"radius is {radius}; give cells, finite and > 0")
-    costs = np.zeros(occupancy.shape, dtype=np.int8)
-    if occupancy.any():  # without an obstacle, the distances would mean nothing
-        distances = scipy.ndimage.distance_transform_edt(~occupancy)
-        near = (distances > 0) & (distances <= radius)
-        costs[near] = np.rint(99 ** (1 - (distances[near] - 1) / radius))
-    return costs
+    distance = np.maximum(clearance(occupancy), 1)  # occupied cells do not matter
+    costs = np.where(distance <= radius, np.rint(99 ** (1 - (distance - 1) / radius)), 0)
+    return _in_free_cells(occupancy, costs)
+
+
+def _in_free_cells(occupancy: Occupancy, costs: NDArray[Any]) -> NDArray[np.int8]:
+    return np.where(occupancy, 0, costs).astype(np.int8)

@@ -1,4 +1,4 @@
-"""The grid map: which cells are occupied, and where they lie in the world."""
+"""The grid map: which cells are occupied, what free cells cost, and where the map lies."""
 
 from __future__ import annotations
 
@@ -6,83 +6,80 @@ import hashlib
 import math
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ddqn_planner.grid.arguments import Cell as Cell
-from ddqn_planner.grid.arguments import as_cell, whole_numbers
+from ddqn_planner.grid.arguments import Occupancy, as_cell, whole_numbers
 
 OCCUPIED = 100
-"""The value of an occupied cell (``nav_msgs/OccupancyGrid``)."""
+"""The value of an occupied cell in ``nav_msgs/OccupancyGrid``."""
 
 UNKNOWN = -1
-"""The value of an unknown cell (``nav_msgs/OccupancyGrid``)."""
+"""The value of an unknown cell in ``nav_msgs/OccupancyGrid``."""
 
-MAX_PRICE = 5.0
-"""The price of a cell of value 100, and of an unknown one. NavFn spreads its costs alike, from 50
-for a free cell to 253 for the dearest one, and takes unknown cells, where allowed, as dearest."""
+MAX_COST_MULTIPLIER = 5.0
+"""The cost multiplier of a cell of value 100, and of an unknown cell.
+
+The costs of Nav2's NavFn planner have the same range: 50 for a free cell and at most 253."""
 
 
 @dataclass(frozen=True, eq=False)
 class GridMap:
-    """A map of free and occupied cells.
+    """A map of free and occupied cells. It keeps read-only copies of the arrays.
 
     Parameters
     ----------
     occupancy : (H, W) bool
-        True where a cell is occupied. Row y = 0 is the first row of ``OccupancyGrid.data``. A
-        read-only copy is kept.
+        True where a cell is occupied. Row y = 0 is the first row of ``OccupancyGrid.data``.
     resolution : float
-        Side of a cell, metres, > 0.
+        Side of a cell in metres, > 0.
     origin : (float, float, float)
-        Pose of the corner of cell (0, 0) in the map frame: x and y in metres, yaw in radians,
-        counter-clockwise (the origin of ``nav_msgs/MapMetaData``).
-    cost : (H, W) int8, or any array or list of such numbers, optional
-        What makes a free cell dear, as a value of ``nav_msgs/OccupancyGrid``: 0..99, or -1 where
-        it is unknown; see `price`. Values of occupied cells do not count, and become 0. By default
-        every free cell is as good as any other. A read-only copy is kept.
+        Pose of the corner of cell (0, 0) in the map frame, as in ``nav_msgs/MapMetaData``: x and y
+        in metres, and yaw in radians, counter-clockwise.
+    cost : (H, W) array of whole numbers, optional
+        Cost of each free cell: 0..99, or -1 for an unknown cell; see `cost_multiplier`. Values of
+        occupied cells are ignored and become 0. By default all free cells cost the same.
     obstacles : (H, W) bool, optional
-        Which of the occupied cells are obstacles; the others are only too near to one for the
-        robot's body, so that a start there may leave. By default all are obstacles. `inflate`
-        makes such a map. A read-only copy is kept.
+        Which occupied cells are obstacles. The others are only too near to an obstacle for the
+        robot's body, and a robot that starts there may leave; `inflate` makes such maps. By default
+        all occupied cells are obstacles.
 
     Raises
     ------
     ValueError
-        If the occupancy is not a two-dimensional array with at least one cell, or the resolution
-        or the origin is not finite, or the resolution is not above 0, or the costs have another
-        shape or a free cell's is not one of -1..99, or the obstacles have another shape or lie on
-        free cells.
+        If a shape, a number or a cost is wrong, or if an obstacle lies on a free cell.
     """
 
-    occupancy: NDArray[np.bool_]
+    occupancy: Occupancy
     resolution: float = 1.0
     origin: tuple[float, float, float] = (0.0, 0.0, 0.0)
     cost: NDArray[np.int8] | None = None
-    obstacles: NDArray[np.bool_] | None = None
+    obstacles: Occupancy | None = None
 
     def __post_init__(self) -> None:
         occupancy = np.array(self.occupancy, dtype=np.bool_)
         if occupancy.ndim != 2 or occupancy.size == 0:
             raise ValueError(f"occupancy has shape {occupancy.shape}; give (H, W) with H, W >= 1")
         if not (math.isfinite(self.resolution) and self.resolution > 0):
-            raise ValueError(f"resolution is {self.resolution}; give metres a cell, finite and > 0")
+            raise ValueError(
+                f"resolution is {self.resolution}; give metres per cell, finite and > 0"
+            )
         origin = tuple(float(value) for value in self.origin)
         if len(origin) != 3 or not all(map(math.isfinite, origin)):
             raise ValueError(f"origin is {self.origin}; give three finite numbers x, y, yaw")
-        occupancy.flags.writeable = False
-        object.__setattr__(self, "occupancy", occupancy)
-        object.__setattr__(self, "resolution", float(self.resolution))
-        object.__setattr__(self, "origin", origin)
+        self._set("occupancy", occupancy)
+        self._set("resolution", float(self.resolution))
+        self._set("origin", origin)
         if self.cost is not None:
             if np.shape(self.cost) != occupancy.shape:
                 raise ValueError(f"cost has shape {np.shape(self.cost)}; give {occupancy.shape}")
             free, cost = ~occupancy, np.zeros(occupancy.shape, dtype=np.int8)
             of_free = np.asarray(self.cost)[free]
             cost[free] = whole_numbers("costs of free cells", of_free, UNKNOWN, OCCUPIED - 1)
-            cost.flags.writeable = False
-            object.__setattr__(self, "cost", cost)
+            self._set("cost", cost)
         if self.obstacles is not None:
             obstacles = np.array(self.obstacles, dtype=np.bool_)
             if obstacles.shape != occupancy.shape or (obstacles & ~occupancy).any():
@@ -90,8 +87,12 @@ class GridMap:
                     f"obstacles have shape {obstacles.shape}, or lie on free cells; give "
                     f"{occupancy.shape}, within the occupied cells"
                 )
-            obstacles.flags.writeable = False
-            object.__setattr__(self, "obstacles", obstacles)
+            self._set("obstacles", obstacles)
+
+    def _set(self, name: str, value: Any) -> None:
+        if isinstance(value, np.ndarray):
+            value.flags.writeable = False
+        object.__setattr__(self, name, value)  # the dataclass is frozen
 
     @classmethod
     def from_occupancy_values(
@@ -101,40 +102,37 @@ class GridMap:
         origin: tuple[float, float, float] = (0.0, 0.0, 0.0),
         occupied_threshold: int = 65,
         allow_unknown: bool = False,
-        priced: bool = False,
+        use_map_costs: bool = False,
     ) -> GridMap:
-        """Make a grid map of the values of a ``nav_msgs/OccupancyGrid``.
+        """Make a grid map from the values of a ``nav_msgs/OccupancyGrid``.
 
         Parameters
         ----------
-        values : (H, W) int8, or any array or list of such integers
-            Occupancy in percent, 0..100, or -1 where unknown. As in a message any value below 0 is
-            unknown, and any above 100 is occupied.
+        values : (H, W) array of integers -128..127
+            Occupancy in percent. Any value below 0 is unknown, any above 100 is occupied.
         resolution, origin
             As for `GridMap`.
         occupied_threshold : int
-            A cell of this value or more is occupied, 1..100. The default is map_server's usual
-            ``occupied_thresh``, in percent.
+            A cell of this value or more is occupied, 1..100. The default is the usual
+            ``occupied_thresh`` of map_server, in percent.
         allow_unknown : bool
             Whether unknown cells are free.
-        priced : bool
-            Whether free cells keep their values as costs; else they are all alike.
+        use_map_costs : bool
+            Whether free cells keep their values as costs; otherwise all cost the same.
 
         Raises
         ------
         ValueError
-            If the values are not integers of int8, the threshold is outside 1..100, or for what
-            `GridMap` refuses.
+            If the values, the threshold or the arguments of `GridMap` are wrong.
         """
         if not 1 <= occupied_threshold <= OCCUPIED:
             raise ValueError(f"occupied_threshold is {occupied_threshold}; give 1 to {OCCUPIED}")
         array = whole_numbers("occupancy values", values, -128, 127)
-        if array.dtype.kind == "f":  # which may be shares, 1.0 for occupied
+        if array.dtype.kind == "f":  # these may be probabilities, 1.0 for occupied
             raise ValueError(f"occupancy values are of type {array.dtype}; give integers, percent")
-        array = array.astype(np.int8, copy=False)
-        unknown = array < 0
-        occupied = (array >= occupied_threshold) | (unknown & (not allow_unknown))
-        return cls(occupied, resolution, origin, np.maximum(array, UNKNOWN) if priced else None)
+        array = np.maximum(array.astype(np.int8, copy=False), UNKNOWN)
+        occupied = (array >= occupied_threshold) | ((array == UNKNOWN) & (not allow_unknown))
+        return cls(occupied, resolution, origin, array if use_map_costs else None)
 
     @property
     def height(self) -> int:
@@ -147,16 +145,20 @@ class GridMap:
         return int(self.occupancy.shape[1])
 
     @cached_property
-    def price(self) -> NDArray[np.float32]:
-        """(H, W) float32: what a cell of way costs in each cell, 1 to `MAX_PRICE`."""
+    def cost_multiplier(self) -> NDArray[np.float32]:
+        """(H, W) float32: cost of a path in each cell per cell of its length.
+
+        It grows linearly from 1 for cost 0 to `MAX_COST_MULTIPLIER` for cost 100; it is 1
+        everywhere on a map without costs. See `move_costs`.
+        """
         if self.cost is None:
             return np.ones(self.occupancy.shape, dtype=np.float32)
         share = np.where(self.cost == UNKNOWN, 1.0, self.cost / 100)
-        return (1 + (MAX_PRICE - 1) * share).astype(np.float32)
+        return (1 + (MAX_COST_MULTIPLIER - 1) * share).astype(np.float32)
 
     @cached_property
     def fingerprint(self) -> str:
-        """Hexadecimal digest of size, occupancy and costs, the same for equal maps anywhere."""
+        """Hexadecimal digest of size, occupancy and costs; equal maps have the same digest."""
         digest = hashlib.sha256(f"{self.height}x{self.width}:".encode())
         digest.update(np.packbits(self.occupancy).tobytes())
         if self.cost is not None:
@@ -164,17 +166,17 @@ class GridMap:
         return digest.hexdigest()[:16]
 
     def contains(self, cell: Cell) -> bool:
-        """Say whether a cell lies inside the map."""
+        """Return whether a cell lies inside the map."""
         x, y = as_cell(cell)
         return 0 <= x < self.width and 0 <= y < self.height
 
     def is_free(self, cell: Cell) -> bool:
-        """Say whether a cell lies inside the map and is not occupied."""
+        """Return whether a cell lies inside the map and is not occupied."""
         x, y = as_cell(cell)
         return self.contains((x, y)) and not self.occupancy[y, x]
 
     def is_obstacle(self, cell: Cell) -> bool:
-        """Say whether a cell of the map is an obstacle, and not just too near to one."""
+        """Return whether a cell of the map is an obstacle, and not just too near to one."""
         x, y = as_cell(cell)
         obstacles = self.occupancy if self.obstacles is None else self.obstacles
         return bool(obstacles[y, x])
@@ -185,15 +187,10 @@ class GridMap:
         return list(zip(columns.tolist(), rows.tolist(), strict=True))
 
     def world_to_cell(self, x: float, y: float) -> Cell:
-        """Return the cell of a point of the map frame.
+        """Return the cell of a point of the map frame; x and y are finite, in metres.
 
-        The lower edges of a cell belong to it, the upper ones to the next (Nav2's costmap). The
-        cell may lie outside the map: see `contains`.
-
-        Parameters
-        ----------
-        x, y : float
-            Metres in the map frame, finite.
+        The lower edges of a cell belong to it, as in Nav2's costmap. The cell may lie outside the
+        map: see `contains`.
         """
         origin_x, origin_y, yaw = self.origin
         dx, dy = x - origin_x, y - origin_y
@@ -202,7 +199,7 @@ class GridMap:
         return math.floor(along_x / self.resolution), math.floor(along_y / self.resolution)
 
     def cell_to_world(self, cell: Cell) -> tuple[float, float]:
-        """Return the centre of a cell in the map frame, metres."""
+        """Return the centre of a cell in the map frame, in metres."""
         origin_x, origin_y, yaw = self.origin
         along_x = (cell[0] + 0.5) * self.resolution
         along_y = (cell[1] + 0.5) * self.resolution

@@ -23,18 +23,19 @@ MAX_CELLS = 2**26
 
 MAX_YAML_BYTES = 2**16
 
-POSITIVE = ("0", "n", "no", "false", "off")
-NEGATIVE = ("1", "y", "yes", "true", "on")
-"""Values of ``negate``: whether dark pixels are occupied, or light ones."""
+NEGATE = {
+    **dict.fromkeys(("0", "n", "no", "false", "off"), False),
+    **dict.fromkeys(("1", "y", "yes", "true", "on"), True),
+}
+"""Values of ``negate``: whether light pixels are occupied instead of dark ones."""
 
 _shortener = reprlib.Repr()
-# Lists that aliases nest may be of any size when they are written out.
-_shortener.maxlevel = 2
+_shortener.maxlevel = 2  # YAML aliases can nest lists that are huge when they are printed
 _short = _shortener.repr
 
 
 class MapFileError(ValueError):
-    """A map file cannot be read; the message says which value is wrong and what would be right."""
+    """A map file cannot be read; the message names the wrong value and what would be right."""
 
 
 class MapNotFoundError(MapFileError):
@@ -46,19 +47,19 @@ class MapDataError(MapFileError):
 
 
 class MapMetadataError(MapFileError):
-    """What the file says about the map is malformed (result 3)."""
+    """The description of the map is malformed (result 3)."""
 
 
 @dataclass(frozen=True, eq=False)
 class MapFile:
-    """What a map file holds.
+    """The content of a map file.
 
     Parameters
     ----------
     values : (H, W) int8
-        Occupancy in percent, 0..100, or -1 where unknown. Row y = 0 is the bottom row of a ROS
-        map's image (the first row of ``OccupancyGrid.data``), but the first row of a MovingAI
-        file, so that the x and y of its scenario files hold. A read-only copy is kept.
+        Occupancy in percent, 0..100, or -1 where unknown; a read-only copy is kept. Row y = 0 is
+        the bottom row of a ROS map's image, but the first row of a MovingAI file, so that x and y
+        of its scenario files are valid.
     resolution, origin
         As for `GridMap`.
     start, goal : (x, y), optional
@@ -93,34 +94,53 @@ class MapFile:
         object.__setattr__(self, "origin", checked.origin)
 
     def grid(
-        self, occupied_threshold: int = 65, allow_unknown: bool = False, priced: bool = False
+        self, occupied_threshold: int = 65, allow_unknown: bool = False, use_map_costs: bool = False
     ) -> GridMap:
         """Return the grid map; the parameters are those of `GridMap.from_occupancy_values`."""
-        return GridMap.from_occupancy_values(
-            self.values, self.resolution, self.origin, occupied_threshold, allow_unknown, priced
-        )
+        options = (occupied_threshold, allow_unknown, use_map_costs)
+        return GridMap.from_occupancy_values(self.values, self.resolution, self.origin, *options)
 
 
 def load_map(
     path: str | Path,
     occupied_threshold: int = 65,
     allow_unknown: bool = False,
-    priced: bool = False,
+    use_map_costs: bool = False,
 ) -> GridMap:
-    """Read the grid map of a map file: `read_map_file`, then `MapFile.grid`."""
-    return read_map_file(path).grid(occupied_threshold, allow_unknown, priced)
+    """Read a grid map from a ROS map (.yaml) or a MovingAI map (.map), see `read_map_file`.
+
+    Parameters
+    ----------
+    path : str or Path
+    occupied_threshold : int
+        A cell of this value or more is occupied, 1..100 percent.
+    allow_unknown : bool
+        Whether unknown cells are free.
+    use_map_costs : bool
+        Whether free cells keep their values as costs; otherwise all cost the same.
+
+    Raises
+    ------
+    MapFileError
+        If the file cannot be read; the message names the wrong value.
+    ValueError
+        If the threshold is outside 1..100.
+    """
+    return read_map_file(path).grid(occupied_threshold, allow_unknown, use_map_costs)
 
 
 def read_map_file(path: str | Path) -> MapFile:
     """Read a ROS map (.yaml or .yml) or a map of the MovingAI benchmark (.map).
 
-    A ROS map is read as Nav2's map_server 1.3.7 and later reads it. Images that Pillow
-    reads otherwise than map_server's GraphicsMagick are refused: colours of 16 bits, PPM and PGM
-    of other greatest values than 255 (or 65535, for grey), BMP of 16 or 32 bits without an alpha
-    channel, and PNG with a transparent colour besides a palette's. Its YAML may also hold
-    ``ddqn_planner: {start: [x, y], goal: [x, y]}``, the cells of a scenario, which map_server
-    ignores. Unlike there, the image must lie in the folder of the YAML file or below it, so that a
-    map from elsewhere cannot name any file of this machine.
+    A ROS map is read as Nav2's map_server 1.3.7 and later reads it, with these differences:
+
+    - Images that Pillow reads differently from map_server are refused: colours of 16 bits, PPM and
+      PGM whose greatest value is not 255 (or 65535 for grey), BMP of 16 or 32 bits without an alpha
+      channel, and PNG with a transparent colour outside a palette.
+    - The image must lie in the folder of the YAML file or below it, so that a map from elsewhere
+      cannot name any file of this machine.
+    - The YAML may hold ``ddqn_planner: {start: [x, y], goal: [x, y]}``, the cells of a scenario,
+      which map_server ignores.
 
     Parameters
     ----------
@@ -132,13 +152,13 @@ def read_map_file(path: str | Path) -> MapFile:
     MapNotFoundError
         If there is no such file.
     MapMetadataError
-        If the file is no map, or says something impossible of it.
+        If the file is no map, or its description is wrong.
     MapDataError
         If the cells of the map cannot be read.
     """
     try:
         path = Path(os.path.expanduser(path))
-    except ValueError:  # the name of a user that cannot be one
+    except ValueError:  # "~" with a user name that is impossible
         path = Path(path)
     if not os.path.isfile(path):
         raise MapNotFoundError(
@@ -157,19 +177,15 @@ def read_map_file(path: str | Path) -> MapFile:
 def save_map(grid: GridMap | MapFile, path: str | Path) -> None:
     """Write a ROS map: the YAML, and a PGM of the same name beside it.
 
-    The mode is trinary, or raw if a value is not one of -1, 0 and 100. Each file is replaced as a
-    whole, the image first.
-
     A `MapFile` reads back equal. So does a `GridMap` without costs by ``load_map(path)``, and one
-    with costs by ``load_map(path, occupied_threshold=100, allow_unknown=True, priced=True)``: else
-    `load_map` takes costs of 65 or more and unknown cells as occupied. `GridMap.obstacles` is not
-    written.
+    with costs by ``load_map(path, occupied_threshold=100, allow_unknown=True,
+    use_map_costs=True)``. `GridMap.obstacles` is not written.
 
     Parameters
     ----------
     grid : GridMap or MapFile
     path : str or Path
-        Of the YAML file; missing folders are made.
+        The YAML file; missing folders are made.
 
     Raises
     ------
@@ -201,10 +217,9 @@ def save_map(grid: GridMap | MapFile, path: str | Path) -> None:
         "free_thresh": 0.196,  # grey 205 would be free at 0.25
     }
     scenario = {"start": grid.start, "goal": grid.goal}
-    cells = {name: list(cell) for name, cell in scenario.items() if cell is not None}
-    if cells:
+    if cells := {name: list(cell) for name, cell in scenario.items() if cell is not None}:
         metadata["ddqn_planner"] = cells
-    pixels = grey[::-1].astype(np.uint8).tobytes()  # row 0 is the bottom row; raw -1 becomes 255
+    pixels = grey[::-1].astype(np.uint8).tobytes()  # the top row comes first; raw -1 becomes 255
     write_atomically(image, b"P5\n%d %d\n255\n" % values.shape[::-1] + pixels)
     text = yaml.safe_dump(metadata, sort_keys=False, allow_unicode=True, default_flow_style=None)
     write_atomically(path, text.encode())
@@ -222,7 +237,7 @@ def _read_bytes(path: Path, limit: int, error_class: type[MapFileError]) -> byte
 
 
 def _read_moving_ai(path: Path) -> MapFile:
-    # A row of one cell takes up to three bytes.
+    # A row of one cell takes up to three bytes: the cell, \r and \n.
     content = _read_bytes(path, 3 * MAX_CELLS, MapDataError)
     pattern = rb"type octile\s+height (\d{1,8})\s+width (\d{1,8})\s+map[ \t]*\r?\n"
     header = re.match(pattern, content)
@@ -240,11 +255,10 @@ def _read_moving_ai(path: Path) -> MapFile:
         raise MapDataError(f"{path}: has {count} rows; give {height}, as its header says")
     cells = np.frombuffer(rows, dtype=np.uint8)
     lengths = np.diff(np.flatnonzero(cells == ord("\n")), prepend=-1) - 1
-    wrong = np.flatnonzero(lengths != width)
-    if wrong.size:
+    if (lengths != width).any():
+        row = int(np.argmax(lengths != width))
         raise MapDataError(
-            f"{path}: row {wrong[0]} has {lengths[wrong[0]]} characters; give {width}, as the"
-            " header says"
+            f"{path}: row {row} has {lengths[row]} characters; give {width}, as the header says"
         )
     cells = cells.reshape(height, width + 1)[:, :-1]
     free = np.isin(cells, np.frombuffer(b".GS", dtype=np.uint8))
@@ -264,9 +278,18 @@ def _read_ros(path: Path) -> MapFile:
     scenario = document.get("ddqn_planner", {})
     if not isinstance(scenario, dict) or not scenario.keys() <= {"start", "goal"}:
         raise ValueError(f"ddqn_planner is {_short(scenario)}; give {{start: , goal: }}")
-    start, goal = _cell(scenario, "start"), _cell(scenario, "goal")
-    values = _read_image(image, percent, clear_is_unknown=mode != "raw")
-    return MapFile(values[::-1], resolution, (x, y, yaw), start, goal)
+    cells = {name: _cell(cell, name) for name, cell in scenario.items()}
+    try:
+        grey, clear = read_grey(image, MAX_CELLS)
+    except Exception as error:  # Pillow's decoders raise many exceptions on broken bytes
+        raise MapDataError(
+            f"{str(image)!r}: not readable ({error}); give a {', '.join(IMAGE_FORMATS)} image of at"
+            f" most {MAX_CELLS} pixels"
+        ) from error
+    values: NDArray[np.int8] = percent[grey]
+    if mode != "raw":
+        values[clear] = UNKNOWN
+    return MapFile(values[::-1], resolution, (x, y, yaw), **cells)
 
 
 def _image_path(path: Path, name: object) -> Path:
@@ -275,7 +298,7 @@ def _image_path(path: Path, name: object) -> Path:
     image = path.parent / name
     if not os.path.isfile(image):
         raise MapDataError(f"{str(image)!r}: no such image; check 'image' in the YAML file")
-    # Of a YAML that is a link itself, as in a linked colcon workspace, both folders may hold it.
+    # In a linked colcon workspace the YAML file is itself a link: allow the folder of either.
     folders = path.parent.resolve(), path.resolve().parent
     if not any(image.resolve().is_relative_to(folder) for folder in folders):
         raise ValueError(
@@ -285,8 +308,8 @@ def _image_path(path: Path, name: object) -> Path:
 
 
 def _parse_yaml(content: bytes) -> dict[str, Any]:
-    # As for map_server, a scalar is a text until its key says what it should be. BaseLoader knows
-    # no tags and no merge keys: nothing in the file can run, or grow, when it is read.
+    # BaseLoader returns each scalar as text and knows no tags and no merge keys: nothing in the
+    # file can run, or grow, when it is read. map_server converts scalars by their key too.
     try:
         document = yaml.load(content, Loader=yaml.BaseLoader)
     except (yaml.YAMLError, ValueError, OverflowError, RecursionError) as error:
@@ -310,14 +333,11 @@ def _number(value: object, key: str) -> float:
         raise ValueError(f"{key} is {_short(value)}; give a number") from None
 
 
-def _cell(scenario: dict[str, Any], key: str) -> Cell | None:
-    if key not in scenario:
-        return None
-    cell = scenario[key]
+def _cell(value: object, key: str) -> Cell:
     try:
-        x, y = map(int, cell if isinstance(cell, list) else ())
+        x, y = map(int, value if isinstance(value, list) else ())
     except (TypeError, ValueError):
-        raise ValueError(f"{key} is {_short(cell)}; give two integers [x, y]") from None
+        raise ValueError(f"{key} is {_short(value)}; give two integers [x, y]") from None
     return x, y
 
 
@@ -330,39 +350,24 @@ def _percent_of_grey(document: dict[str, Any], mode: str) -> NDArray[np.int8]:
             f"free_thresh is {free_thresh}, occupied_thresh is {occupied_thresh}; give"
             " 0 <= free_thresh <= occupied_thresh <= 1"
         )
-    negate = _text(document, "negate")
-    if negate not in (*POSITIVE, *NEGATIVE):
-        raise ValueError(f"negate is {_short(negate)}; give 0 or 1")
+    negate = NEGATE.get(_text(document, "negate"))
+    if negate is None:
+        raise ValueError(f"negate is {_short(document['negate'])}; give 0 or 1")
     grey = np.arange(256)
     if mode == "raw":
         return np.where(grey <= 100, grey, -1).astype(np.int8)
     if mode not in ("trinary", "scale"):
         raise ValueError(f"mode is {_short(mode)}; give trinary, scale or raw")
-    # map_server calculates in single precision, and a value may equal a threshold.
+    # map_server computes in single precision, and a grey value may equal a threshold.
     free, occupied = np.float32(free_thresh), np.float32(occupied_thresh)
     p = grey.astype(np.float32) / np.float32(255)
-    if negate in POSITIVE:
+    if not negate:
         p = np.float32(1) - p
     percent = np.full(256, -1.0)
     if mode == "scale" and free < occupied:
-        # Their difference alone is that of two doubles.
+        # map_server subtracts the thresholds in double precision.
         scaled = (p - free) / np.float32(occupied_thresh - free_thresh) * np.float32(100)
         percent = np.floor(scaled) + (scaled - np.floor(scaled) >= 0.5)
     percent[p >= occupied] = 100
     percent[p <= free] = 0
     return percent.astype(np.int8)
-
-
-def _read_image(path: Path, percent: NDArray[np.int8], clear_is_unknown: bool) -> NDArray[np.int8]:
-    """Return (H, W) int8: the occupancy of each pixel."""
-    try:
-        grey, clear = read_grey(path, MAX_CELLS)
-    except Exception as error:  # Pillow raises whatever broken bytes lead its decoders to
-        raise MapDataError(
-            f"{str(path)!r}: not readable ({error}); give a {', '.join(IMAGE_FORMATS)} image of at"
-            f" most {MAX_CELLS} pixels"
-        ) from error
-    values: NDArray[np.int8] = percent[grey]
-    if clear_is_unknown:
-        values[clear] = UNKNOWN
-    return values

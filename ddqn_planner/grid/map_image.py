@@ -1,4 +1,4 @@
-"""Images of maps, read as map_server reads them: with GraphicsMagick, of 16 bits a channel."""
+"""Images of maps, read as map_server's GraphicsMagick reads them (with 16 bits per channel)."""
 
 from __future__ import annotations
 
@@ -13,41 +13,41 @@ IMAGE_FORMATS = ("PPM", "PNG", "BMP", "JPEG")
 
 RAW_MODES = {"1", "1;I", "L", "L;2", "L;4", "LA", "I;16B", "P", "P;1", "P;2", "P;4"}
 RAW_MODES |= {"RGB", "RGBA", "BGR", "BGRA", "CMYK;I"}
-"""Of how files store pixels (Pillow's names), those that are read as map_server does. In others
+"""Pillow's names of the pixel layouts in files that it reads as map_server does. In other layouts
 Pillow drops bits, or map_server takes the fourth byte of a pixel as its opacity."""
 
 
 def read_grey(path: Path, max_pixels: int) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
-    """Read an image of grey values; colours count by their Rec. 601 luma.
+    """Read an image as grey values; colours are converted to their Rec. 601 luma.
 
     Returns
     -------
     (H, W) uint8
-        From the top row on.
+        Grey values; the first row is the top row.
     (H, W) bool
         Which pixels are not opaque.
 
     Raises
     ------
     ValueError
-        If the image has more pixels, or would be read otherwise than by map_server.
+        If the image has more pixels, or if map_server would read it differently.
     Exception
-        Whatever broken bytes lead Pillow's decoders to.
+        Pillow's decoders may raise any other exception on broken bytes.
     """
     with Image.open(path, formats=IMAGE_FORMATS) as image:
         if image.width * image.height > max_pixels:
             raise ValueError(f"{image.width} x {image.height} pixels")
-        _refuse_other_depths(image)
+        _check_layout(image)
         grey = _grey(image)
         if "A" not in image.getbands() and "transparency" not in image.info:
             return grey, np.zeros(grey.shape, dtype=np.bool_)
         return grey, np.asarray(image.convert("RGBA").getchannel("A")) < 255
 
 
-def _refuse_other_depths(image: Any) -> None:
+def _check_layout(image: Any) -> None:
     codec, *_, arguments = image.tile[0]
     raw_mode, *rest = [arguments] if isinstance(arguments, str) else arguments
-    # Of numbers as text, or of another range than that of their bytes, the greatest is the last.
+    # The last argument of a PPM is its greatest value, unless that is the greatest of its bytes.
     scaled = codec.startswith("ppm") and rest not in ([], [255])
     if image.mode == "I" and rest == [65535]:
         scaled = False

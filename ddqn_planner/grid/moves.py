@@ -1,33 +1,34 @@
-"""The eight moves of the robot, numbered once, and the two rules for the diagonal ones."""
+"""The eight moves of the robot, the rules for diagonal moves, and what moves and paths cost."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
-import scipy.ndimage
 from numpy.typing import NDArray
 
-from ddqn_planner.grid.arguments import Cell, Choice, as_cell
+from ddqn_planner.grid.arguments import Cell, Choice, Occupancy, as_cell
+from ddqn_planner.grid.labels import label_cells
 
 MOVES: NDArray[np.int64] = np.array(
     [(1, 0), (1, 1), (0, 1), (-1, 1), (-1, 0), (-1, -1), (0, -1), (1, -1)], dtype=np.int64
 )
-"""(8, 2) int64: (dx, dy) of each action, counter-clockwise from +x; action k points at k * pi/4."""
+"""(8, 2) int64: (dx, dy) of each action, counter-clockwise; action k points at k * pi / 4."""
 
 LENGTHS: NDArray[np.float64] = np.hypot(MOVES[:, 0], MOVES[:, 1])
 """(8,) float64: the length of each action in cells, 1 or sqrt(2)."""
 
 
 class MoveRule(Choice):
-    """Which diagonal moves are legal; a move into an occupied cell or off the map never is."""
+    """Which diagonal moves are legal. A move to an occupied cell or off the map never is."""
 
     ROBOT_SAFE = "robot_safe"
     """A diagonal move needs both side cells free (the rule of the MovingAI benchmark)."""
     CORNER_CUTTING = "corner_cutting"
-    """A diagonal move needs no more than its target cell free (what the paper's 22.97 implies)."""
+    """A diagonal move needs only its target cell free (the paper's length 22.97 implies it)."""
     UNIT = "unit"
-    """As corner cutting, and every move counts 1 (the rule of the MPD data): for comparisons."""
+    """As corner cutting, but every move has length 1 (the rule of the MPD data)."""
 
     @property
     def cuts_corners(self) -> bool:
@@ -36,18 +37,18 @@ class MoveRule(Choice):
 
     @property
     def lengths(self) -> NDArray[np.float64]:
-        """(8,) float64: what each action counts, in cells."""
+        """(8,) float64: the length of each action in cells under this rule."""
         return np.ones(len(MOVES)) if self is MoveRule.UNIT else LENGTHS
 
 
-def legal_moves(occupancy: NDArray[np.bool_], move_rule: MoveRule | str) -> NDArray[np.bool_]:
-    """Say for each cell which of the eight moves the robot may make from it.
+def _shifted(padded: NDArray[Any], dx: int, dy: int) -> NDArray[Any]:
+    """Return the value of each cell's neighbour at (dx, dy), from an array with a border of 1."""
+    height, width = padded.shape
+    return padded[1 + dy : height - 1 + dy, 1 + dx : width - 1 + dx]
 
-    Parameters
-    ----------
-    occupancy : (H, W) bool
-        True where a cell is occupied.
-    move_rule : MoveRule
+
+def legal_moves(occupancy: Occupancy, move_rule: MoveRule | str) -> NDArray[np.bool_]:
+    """Return which of the eight moves are legal in each cell.
 
     Returns
     -------
@@ -56,141 +57,95 @@ def legal_moves(occupancy: NDArray[np.bool_], move_rule: MoveRule | str) -> NDAr
         map and the rule allows it.
     """
     rule = MoveRule(move_rule)
-    height, width = occupancy.shape
-    free = np.zeros((height + 2, width + 2), dtype=np.bool_)
-    free[1:-1, 1:-1] = ~occupancy
-
-    def free_at(dx: int, dy: int) -> NDArray[np.bool_]:
-        return free[1 + dy : 1 + dy + height, 1 + dx : 1 + dx + width]
-
-    legal = np.empty((len(MOVES), height, width), dtype=np.bool_)
+    free = np.pad(~occupancy, 1)
+    legal = np.empty((len(MOVES), *occupancy.shape), dtype=np.bool_)
     for action, (dx, dy) in enumerate(MOVES.tolist()):
-        legal[action] = free_at(0, 0) & free_at(dx, dy)
+        legal[action] = _shifted(free, 0, 0) & _shifted(free, dx, dy)
         if dx and dy and not rule.cuts_corners:
-            legal[action] &= free_at(dx, 0) & free_at(0, dy)
+            legal[action] &= _shifted(free, dx, 0) & _shifted(free, 0, dy)
     return legal
 
 
-def move_costs(price: NDArray[np.float32], move_rule: MoveRule | str) -> NDArray[np.float64]:
-    """Return what each move costs: its length times the mean price of the two cells that it joins.
+def neighbours(shape: tuple[int, int]) -> NDArray[np.int64]:
+    """Return the cell that each action leads to, for maps of shape (H, W).
+
+    Returns
+    -------
+    (8, H * W) int64
+        Cell numbers y * W + x; H * W for any cell outside the map.
+    """
+    cells = shape[0] * shape[1]
+    padded = np.pad(np.arange(cells).reshape(shape), 1, constant_values=cells)
+    return np.stack([_shifted(padded, dx, dy).ravel() for dx, dy in MOVES.tolist()])
+
+
+def move_costs(multiplier: NDArray[np.float32], move_rule: MoveRule | str) -> NDArray[np.float64]:
+    """Return the cost of each move: its length times the mean cost multiplier of its two cells.
 
     So a path costs the same in both directions.
 
     Parameters
     ----------
-    price : (H, W) float32
-        See `GridMap.price`.
+    multiplier : (H, W) float32
+        See `GridMap.cost_multiplier`.
     move_rule : MoveRule
 
     Returns
     -------
     (8, H, W) float64
-        ``[a, y, x]`` for action ``a`` from (x, y); without meaning where the move is illegal.
+        ``[a, y, x]`` for action ``a`` from (x, y); it has no meaning where the move is illegal.
     """
-    height, width = price.shape
-    padded = np.pad(price, 1, mode="edge").astype(np.float64)
-    onward = [
-        padded[1 + dy : 1 + dy + height, 1 + dx : 1 + dx + width] for dx, dy in MOVES.tolist()
-    ]
-    lengths = MoveRule(move_rule).lengths[:, None, None]
-    costs: NDArray[np.float64] = lengths * (price + np.stack(onward)) / 2
+    padded = np.pad(multiplier, 1, mode="edge").astype(np.float64)
+    target = np.stack([_shifted(padded, dx, dy) for dx, dy in MOVES.tolist()])
+    costs: NDArray[np.float64] = (
+        MoveRule(move_rule).lengths[:, None, None] * (multiplier + target) / 2
+    )
     return costs
 
 
-def connected_cells(
-    occupancy: NDArray[np.bool_], cell: Cell, move_rule: MoveRule | str
-) -> NDArray[np.bool_]:
-    """Return the cells that a path joins to a free cell.
+def component_labels(occupancy: Occupancy, move_rule: MoveRule | str) -> NDArray[np.int32]:
+    """Return the connected component of each cell, (H, W) int32.
 
-    Parameters
-    ----------
-    occupancy : (H, W) bool
-        True where a cell is occupied.
-    cell : (x, y)
-        A free cell.
-    move_rule : MoveRule
-
-    Returns
-    -------
-    (H, W) bool
-        True at each free cell from which a path of legal moves leads to `cell`, itself included.
+    Two free cells have the same label, 1 or more, if a path joins them. Occupied cells have 0.
     """
+    # If a diagonal move needs both side cells free, two straight moves can replace it.
+    moves = MOVES[4:] if MoveRule(move_rule).cuts_corners else MOVES[4::2]
+    return label_cells(~occupancy, moves)
+
+
+def connected_cells(
+    occupancy: Occupancy, cell: Cell, move_rule: MoveRule | str
+) -> NDArray[np.bool_]:
+    """Return (H, W) bool: True at the free cell `cell` and where a path leads to it."""
     x, y = as_cell(cell)
     labels = component_labels(occupancy, move_rule)
     connected: NDArray[np.bool_] = labels == labels[y, x]
     return connected
 
 
-def component_labels(occupancy: NDArray[np.bool_], move_rule: MoveRule | str) -> NDArray[np.int32]:
-    """Return which part of the map each cell belongs to: no path leads from one to another.
-
-    Parameters
-    ----------
-    occupancy : (H, W) bool
-    move_rule : MoveRule
-
-    Returns
-    -------
-    (H, W) int32
-        1 or more for the free cells, the same for all that paths join; 0 for the occupied ones.
-    """
-    # Where a diagonal move needs both side cells free, two straight moves do the same.
-    diagonals = 2 if MoveRule(move_rule).cuts_corners else 1
-    structure = scipy.ndimage.generate_binary_structure(2, diagonals)
-    labels: NDArray[np.int32] = scipy.ndimage.label(~occupancy, structure)[0]
-    return labels
-
-
 def path_length(cells: Sequence[Cell], move_rule: MoveRule | str = MoveRule.ROBOT_SAFE) -> float:
     """Return the length of a path in cells.
 
-    A straight move counts 1 and a diagonal one sqrt(2), but under `MoveRule.UNIT` each counts 1.
-
-    Parameters
-    ----------
-    cells : sequence of (x, y)
-        Those of a plan, or some of them, joined by straight segments.
-    move_rule : MoveRule
+    The cells are those of a plan, or some of them, joined by straight segments.
     """
     x, y = np.asarray(cells, dtype=np.int64).reshape(-1, 2).T
     return float(segment_lengths(np.diff(x), np.diff(y), move_rule).sum())
 
 
 def path_cost(
-    cells: Sequence[Cell], price: NDArray[np.float32], move_rule: MoveRule | str
+    cells: Sequence[Cell], multiplier: NDArray[np.float32], move_rule: MoveRule | str
 ) -> float:
-    """Return what a path costs: the sum of its moves' costs, see `move_costs`.
-
-    Parameters
-    ----------
-    cells : sequence of (x, y)
-        Each cell is a neighbour of the one before it.
-    price : (H, W) float32
-        See `GridMap.price`.
-    move_rule : MoveRule
-    """
+    """Return the cost of a path of neighbouring cells: the sum of its moves, see `move_costs`."""
     x, y = np.asarray(cells, dtype=np.int64).reshape(-1, 2).T
     lengths = segment_lengths(np.diff(x), np.diff(y), move_rule)
-    prices = price[y, x].astype(np.float64)
-    return float((lengths * (prices[1:] + prices[:-1]) / 2).sum())
+    multipliers = multiplier[y, x].astype(np.float64)
+    return float((lengths * (multipliers[1:] + multipliers[:-1]) / 2).sum())
 
 
 def segment_lengths(
     dx: NDArray[np.int64], dy: NDArray[np.int64], move_rule: MoveRule | str
 ) -> NDArray[np.float64]:
-    """Return what straight segments count: their lengths, or under `MoveRule.UNIT` their moves.
-
-    Parameters
-    ----------
-    dx, dy : (N,) int64
-        From the first to the last cell of each segment.
-    move_rule : MoveRule
-
-    Returns
-    -------
-    (N,) float64
-        In cells.
-    """
+    """Return the length of each straight segment (dx, dy); under `MoveRule.UNIT`, its moves."""
     if MoveRule(move_rule) is MoveRule.UNIT:
         return np.maximum(np.abs(dx), np.abs(dy)).astype(np.float64)
     lengths: NDArray[np.float64] = np.hypot(dx, dy)

@@ -25,11 +25,6 @@ class Noise(Choice):
     NEAR_PATH = "near_path"
     """Those of the path and their eight neighbours."""
 
-    @property
-    def reach(self) -> int:
-        """How far from the path a new obstacle may lie, in cells along x and y."""
-        return 0 if self is Noise.ON_PATH else 1
-
 
 def scatter_obstacles(
     grid: GridMap,
@@ -38,44 +33,22 @@ def scatter_obstacles(
     random: np.random.Generator,
     noise: Noise = Noise.NEAR_PATH,
 ) -> tuple[GridMap, int]:
-    """Occupy 1 to 5 free cells on a path, or also next to it, so that a path is still left.
+    """Occupy 1 to 5 free cells on or near a path, so that its ends stay free and connected.
 
-    The paper (goal iii) does so to the path of goal i. Draws that close every way from the first
-    to the last cell of the path are thrown away and counted.
-
-    Parameters
-    ----------
-    grid : GridMap
-    path : sequence of (x, y)
-        A path on the map; its first and last cell stay free.
-    move_rule : MoveRule
-        The rule under which a path must be left.
-    random : numpy.random.Generator
-    noise : Noise
+    The paper (goal iii) does this to the path of goal i.
 
     Returns
     -------
     GridMap
         The map with the new obstacles.
     int
-        How many draws were thrown away.
-
-    Raises
-    ------
-    ValueError
-        If there is no cell to occupy except the path's ends, or no draw of 1,000 left a path.
+        How many draws were rejected because they left no path: 1,000 in a row are a ValueError.
     """
     start, goal = path[0], path[-1]
-    offsets = range(-noise.reach, noise.reach + 1)
-    candidates = sorted(
-        {
-            (x + dx, y + dy)
-            for x, y in path
-            for dx in offsets
-            for dy in offsets
-            if (x + dx, y + dy) not in (start, goal) and grid.is_free((x + dx, y + dy))
-        }
-    )
+    reach = 0 if noise is Noise.ON_PATH else 1
+    offsets = range(-reach, reach + 1)
+    near = {(x + dx, y + dy) for x, y in path for dx in offsets for dy in offsets}
+    candidates = sorted(cell for cell in near - {start, goal} if grid.is_free(cell))
     if not candidates:
         where = "on" if noise is Noise.ON_PATH else "on or next to"
         raise ValueError(f"no free cell lies {where} the path from {start} to {goal}")

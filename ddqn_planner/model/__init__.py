@@ -1,18 +1,23 @@
-"""Q-networks, what they observe, and the model file."""
+"""Q-networks evaluated by NumPy, what they observe, and the model file."""
 
 from ddqn_planner.model.model_file import (
+    NETWORKS,
     ModelFileError,
     ModelMetadata,
     find_model,
     load_model,
-    new_network,
     package_version,
     save_model,
 )
-from ddqn_planner.model.networks import PaperQNetwork, QNetwork
-from ddqn_planner.model.propagation import AnyMapQNetwork, PropagationQNetwork
+from ddqn_planner.model.networks import (
+    AnyMapQNetwork,
+    PaperQNetwork,
+    PropagationQNetwork,
+    QNetwork,
+)
 
 __all__ = [
+    "NETWORKS",
     "AnyMapQNetwork",
     "ModelFileError",
     "ModelMetadata",
@@ -21,7 +26,6 @@ __all__ = [
     "QNetwork",
     "find_model",
     "load_model",
-    "new_network",
     "package_version",
     "save_model",
 ]

@@ -6,18 +6,21 @@ import json
 import os
 import reprlib
 from dataclasses import asdict, dataclass
-from importlib import metadata
 from pathlib import Path
 from typing import Final
 
-import safetensors.torch
-import torch
+import numpy as np
+import safetensors.numpy
 from safetensors import SafetensorError, safe_open
 
 from ddqn_planner.files import write_atomically
 from ddqn_planner.grid import MoveRule
-from ddqn_planner.model.networks import PaperQNetwork
-from ddqn_planner.model.propagation import AnyMapQNetwork, PropagationQNetwork
+from ddqn_planner.model.networks import (
+    AnyMapQNetwork,
+    PaperQNetwork,
+    PropagationQNetwork,
+    QNetwork,
+)
 from ddqn_planner.resources import PACKAGE, find_resource
 
 METADATA_KEY = "ddqn_planner"
@@ -28,15 +31,10 @@ MAX_SIZE = 4096
 MAX_FILE_BYTES = 2**28
 """A larger file is refused before it is read."""
 
-
-AnyQNetwork = PaperQNetwork | PropagationQNetwork | AnyMapQNetwork
-
-SIZES: Final = {
-    "paper": ("height", "width", "filters", "hidden_units"),
-    "propagation": ("filters",),
-    "any_map": ("filters",),
+NETWORKS: Final[dict[str, type[QNetwork]]] = {
+    network.name: network for network in (PaperQNetwork, PropagationQNetwork, AnyMapQNetwork)
 }
-"""The arguments of each kind of network."""
+"""By their names in model files and hyper-parameters."""
 
 FIELD_TYPES: Final[dict[str, tuple[type, ...]]] = {
     "network": (str,),
@@ -48,7 +46,7 @@ FIELD_TYPES: Final[dict[str, tuple[type, ...]]] = {
     "seed": (int,),
     "package_version": (str,),
 }
-"""What JSON makes of each entry of `ModelMetadata`."""
+"""The type of each entry of `ModelMetadata` in JSON."""
 
 
 class ModelFileError(ValueError):
@@ -57,14 +55,14 @@ class ModelFileError(ValueError):
 
 @dataclass(frozen=True)
 class ModelMetadata:
-    """What a model file says of its network.
+    """The description of a network in its model file.
 
     Parameters
     ----------
     network : str
-        Kind of network: ``"paper"``, ``"propagation"`` or ``"any_map"``.
+        A name in `NETWORKS`.
     sizes : dict
-        The arguments of the network's class, see `SIZES`.
+        A value for each of the network's `size_names`.
     move_rule : MoveRule
         The rule under which it was trained.
     gamma : float
@@ -89,6 +87,8 @@ class ModelMetadata:
 
 def package_version() -> str:
     """Return the version of the installed package, or "unknown" in a bare source tree."""
+    from importlib import metadata  # slow to import, and planning does not need it
+
     try:
         return metadata.version(PACKAGE)
     except metadata.PackageNotFoundError:
@@ -116,20 +116,19 @@ def find_model(name: str | Path) -> Path:
         ) from None
 
 
-def save_model(path: str | Path, network: AnyQNetwork, description: ModelMetadata) -> None:
-    """Write a model file; the old file stays whole until the new one is.
+def save_model(path: str | Path, network: QNetwork, description: ModelMetadata) -> None:
+    """Write a model file; the old file stays complete until the new one is.
 
     Raises
     ------
     OSError
         If the file cannot be written.
     """
-    tensors = {name: tensor.contiguous() for name, tensor in network.state_dict().items()}
-    content = safetensors.torch.save(tensors, {METADATA_KEY: json.dumps(asdict(description))})
-    write_atomically(Path(path), content)
+    text = json.dumps(asdict(description))
+    write_atomically(Path(path), safetensors.numpy.save(network.tensors, {METADATA_KEY: text}))
 
 
-def load_model(name: str | Path) -> tuple[AnyQNetwork, ModelMetadata]:
+def load_model(name: str | Path) -> tuple[QNetwork, ModelMetadata]:
     """Read a model file.
 
     Parameters
@@ -144,7 +143,7 @@ def load_model(name: str | Path) -> tuple[AnyQNetwork, ModelMetadata]:
     """
     path = find_model(name)
     try:
-        with path.open("rb"):  # safetensors says of a file that it may not read that there is none
+        with path.open("rb"):  # safetensors reports an unreadable file as missing
             return _load(path)
     except OSError as error:
         raise ModelFileError(f"{path}: cannot be read ({error}); check its rights") from None
@@ -155,20 +154,11 @@ def load_model(name: str | Path) -> tuple[AnyQNetwork, ModelMetadata]:
         ) from None
 
 
-def new_network(kind: str, sizes: dict[str, int]) -> AnyQNetwork:
-    """Return a network with random weights; see `ModelMetadata` for the parameters."""
-    if kind == "any_map":
-        return AnyMapQNetwork(**sizes)
-    if kind == "propagation":
-        return PropagationQNetwork(**sizes)
-    return PaperQNetwork(**sizes)
-
-
-def _load(path: Path) -> tuple[AnyQNetwork, ModelMetadata]:
+def _load(path: Path) -> tuple[QNetwork, ModelMetadata]:
     size = os.path.getsize(path)
     if size > MAX_FILE_BYTES:
         raise ModelFileError(f"{path}: has {size} bytes; give a model of at most {MAX_FILE_BYTES}")
-    with safe_open(path, framework="pt") as file:
+    with safe_open(path, framework="np") as file:
         text = (file.metadata() or {}).get(METADATA_KEY)
         if text is None:
             raise ModelFileError(
@@ -177,26 +167,23 @@ def _load(path: Path) -> tuple[AnyQNetwork, ModelMetadata]:
             )
         try:
             description = _parse(json.loads(text))
-            with torch.device("meta"):
-                network = new_network(description.network, description.sizes)
         except (ValueError, RecursionError) as error:
             raise ModelFileError(
                 f"{path}: its metadata is wrong ({error}); train the model again"
             ) from None
-        weights = network.state_dict()
-        expected = {key: ("F32", [*tensor.shape]) for key, tensor in weights.items()}
+        network_class, sizes = NETWORKS[description.network], description.sizes
+        shapes = network_class.shapes(sizes)
+        expected = {key: ("F32", [*shape]) for key, shape in shapes.items()}
         slices = {key: file.get_slice(key) for key in file.keys()}  # noqa: SIM118
         found = {key: (part.get_dtype(), part.get_shape()) for key, part in slices.items()}
         if expected != found:
             raise ModelFileError(
                 f"{path}: holds tensors {reprlib.repr(found)}, not {expected}; train it again"
             )
-        # Copies: the tensors of an open file change, or end the process, when the file does.
-        tensors = {key: file.get_tensor(key).clone() for key in found}
-    if not all(bool(tensor.isfinite().all()) for tensor in tensors.values()):
+        tensors = {key: file.get_tensor(key) for key in found}
+    if not all(np.isfinite(tensor).all() for tensor in tensors.values()):
         raise ModelFileError(f"{path}: its weights are not all finite; train it again")
-    network.load_state_dict(tensors, assign=True)
-    return network.requires_grad_(False), description
+    return network_class(sizes, tensors), description
 
 
 def _parse(values: object) -> ModelMetadata:
@@ -210,12 +197,13 @@ def _parse(values: object) -> ModelMetadata:
             names = " or ".join(known.__name__ for known in types)
             raise ValueError(f"{key} is {reprlib.repr(values[key])}; it must be {names}")
     network, sizes = values["network"], values["sizes"]
-    if network not in SIZES:
-        raise ValueError(f"network is {reprlib.repr(network)}; this version knows {[*SIZES]}")
-    if network == "paper":  # files of version 0.1.0 do not name it: their networks have none
+    if network not in NETWORKS:
+        raise ValueError(f"network is {reprlib.repr(network)}; this version knows {[*NETWORKS]}")
+    if network == "paper":  # missing in files of version 0.1.0, whose networks have none
         sizes = {**sizes, "hidden_units": sizes.get("hidden_units", 0)}
-    if sizes.keys() != set(SIZES[network]):
-        raise ValueError(f"sizes is {reprlib.repr(sizes)}; it must have {[*SIZES[network]]}")
+    size_names = NETWORKS[network].size_names
+    if sizes.keys() != set(size_names):
+        raise ValueError(f"sizes is {reprlib.repr(sizes)}; it must have {[*size_names]}")
     for name, size in sizes.items():
         least = 0 if name == "hidden_units" else 1
         if type(size) is not int or not least <= size <= MAX_SIZE:

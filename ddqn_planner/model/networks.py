@@ -1,105 +1,279 @@
-"""The Q-networks. Each answers with the Q field of a map toward one goal."""
+"""The Q-networks as the planner uses them: trained tensors, evaluated by NumPy.
+
+Their torch modules, which training needs, are in `ddqn_planner.training.networks`.
+Dimensions: A = 8 actions, B = a batch, I = inputs of a layer, P = unique patches, F = filters,
+R x L = rows and columns of the convolution's output, U = outputs of the layer after it, X = columns
+of a map.
+"""
 
 from __future__ import annotations
 
-from typing import Protocol, cast
+from abc import ABC, abstractmethod
+from collections.abc import Mapping
+from typing import ClassVar, TypeAlias
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
-from torch import Tensor, nn
-from torch.nn import functional
 
-from ddqn_planner.grid import MOVES, Cell, GridMap, MoveRule
-from ddqn_planner.model.observation import observation_background, observe
+from ddqn_planner.grid import (
+    MAX_COST_MULTIPLIER,
+    MOVES,
+    OCCUPIED,
+    UNKNOWN,
+    Cell,
+    GridMap,
+    MoveRule,
+)
+from ddqn_planner.model.observation import ROBOT, observation_background, unique_patches
+from ddqn_planner.model.wavefront import propagate_values
+
+Array: TypeAlias = NDArray[np.float32]
+
+BATCH = 2**12
+"""Patches per evaluation of a network. The layers' outputs then fit into a cache; those of all
+patches of a large map would need gigabytes."""
+
+MAX_LEARNED_MULTIPLIER = 20 * MAX_COST_MULTIPLIER
+"""Upper bound on predicted cost multipliers, far above every true one.
+
+Time and memory of `propagate_values` grow with the highest cost, and a broken model may predict
+any."""
 
 
-class QNetwork(Protocol):
-    """What the planner asks of a network."""
-
-    def supports(self, shape: tuple[int, int]) -> bool:
-        """Say whether the network can plan on maps of shape (H, W)."""
-        ...
-
-    def q_values(self, grid: GridMap, goal: Cell, move_rule: MoveRule) -> NDArray[np.float32]:
-        """Return Q(s, a) of every cell toward one goal: (8, H, W) float32."""
-        ...
-
-
-class PaperQNetwork(nn.Module):
-    """The paper's network (Fig. 3): one convolution, one fully connected layer.
-
-    A 3x3 convolution of stride 2, ReLU, and a fully connected layer with one output per action.
-    The paper gives neither the number of filters nor the padding. Ours is 1, because without it the
-    last row and column of an even-sized map are under no filter, and a robot there goes unseen.
-
-    The paper's text ("one hidden layer is followed by ReLU") can also be read as a second, fully
-    connected hidden layer between the two: `hidden_units` has its size.
+class QNetwork(ABC):
+    """A trained Q-network. It computes the Q field of a map toward one goal.
 
     Parameters
     ----------
-    height, width : int
-        Size of the maps, cells; the paper's is 20 x 20. The network plans on no other size.
-    filters : int
-        Number of convolution filters.
-    hidden_units : int
-        Size of a fully connected hidden layer with ReLU after the convolution; 0 for none.
+    sizes : mapping of str to int
+        A value for each of `size_names`.
+    tensors : mapping of str to (...) float32
+        Of the names and shapes that `shapes` returns.
     """
 
-    def __init__(self, height: int, width: int, filters: int, hidden_units: int = 0) -> None:
-        super().__init__()
-        self.shape = (height, width)
-        self.convolution = nn.Conv2d(1, filters, kernel_size=3, stride=2, padding=1)
-        features = filters * ((height + 1) // 2) * ((width + 1) // 2)
-        self.hidden = nn.Linear(features, hidden_units) if hidden_units else None
-        self.fully_connected = nn.Linear(hidden_units or features, len(MOVES))
+    name: ClassVar[str]
+    """The network's name in model files and hyper-parameters."""
+    size_names: ClassVar[tuple[str, ...]]
 
-    def forward(self, observation_BHW: Tensor) -> Tensor:
-        """Return Q(s, a): (B, 8) for observations (B, H, W)."""
-        return self.q_of_patches(self.patches(observation_BHW))
+    def __init__(self, sizes: Mapping[str, int], tensors: Mapping[str, Array]) -> None:
+        self.sizes = dict(sizes)
+        self.tensors = dict(tensors)
 
-    @staticmethod
-    def patches(observation_BHW: Tensor) -> Tensor:
-        """Return what the filters see of observations: (B, 9, L), L places of 3x3 cells.
-
-        With its patches at hand the convolution is a matrix product, on maps this small the
-        faster way; and two networks can share them.
-        """
-        return functional.unfold(observation_BHW.unsqueeze(1), 3, padding=1, stride=2)
-
-    def q_of_patches(self, patch_BKL: Tensor) -> Tensor:
-        """Return Q(s, a): (B, 8) for the patches of observations (B, 9, L)."""
-        convolution, hidden, fully_connected = self.convolution, self.hidden, self.fully_connected
-        weight_BFK = convolution.weight.flatten(1).expand(len(patch_BKL), -1, -1)
-        bias_F1 = cast(Tensor, convolution.bias).unsqueeze(1)
-        feature_BFL = torch.baddbmm(bias_F1, weight_BFK, patch_BKL).relu_()
-        feature_BF = feature_BFL.flatten(1)
-        if hidden is not None:
-            feature_BF = functional.linear(feature_BF, hidden.weight, hidden.bias).relu_()
-        return functional.linear(feature_BF, fully_connected.weight, fully_connected.bias)
+    @classmethod
+    @abstractmethod
+    def shapes(cls, sizes: Mapping[str, int]) -> dict[str, tuple[int, ...]]:
+        """Return the shape of each tensor."""
 
     def supports(self, shape: tuple[int, int]) -> bool:
         """Say whether the network can plan on maps of shape (H, W)."""
-        return shape == self.shape
+        return True
 
-    @torch.inference_mode()
-    def q_values(self, grid: GridMap, goal: Cell, move_rule: MoveRule) -> NDArray[np.float32]:
-        """Evaluate the observation of a robot in each cell, in one batch.
+    @abstractmethod
+    def q_values(self, grid: GridMap, goal: Cell, move_rule: MoveRule) -> Array:
+        """Return Q(s, a) of every cell toward one goal.
 
         Parameters
         ----------
         grid : GridMap
-            Of the network's shape. Its costs do not count.
+            Of a shape that the network supports.
         goal : (x, y)
         move_rule : MoveRule
-            Does not count: the network knows the rule of its training.
 
         Returns
         -------
         (8, H, W) float32
         """
-        cells = np.arange(grid.occupancy.size)
-        background = observation_background(grid.occupancy, goal)
-        q_BA = self(torch.from_numpy(observe(background, cells, self.shape)))
-        q_AHW: NDArray[np.float32] = q_BA.T.reshape(len(MOVES), *self.shape).numpy()
-        return q_AHW
+
+    def _layer(self, name: str, input_BI: Array) -> Array:
+        """Return the output of a fully connected layer: (B, O)."""
+        with np.errstate(over="ignore", invalid="ignore"):  # a broken model may overflow
+            output_BO: Array = input_BI @ self.tensors[f"{name}.weight"].T
+            output_BO += self.tensors[f"{name}.bias"]
+        return output_BO
+
+
+class PaperQNetwork(QNetwork):
+    """The paper's network (Fig. 3): one convolution, one fully connected layer.
+
+    A 3x3 convolution of stride 2, ReLU, and a fully connected layer with one output per action.
+    The paper gives neither the number of filters nor the padding. Our padding is 1: without it, no
+    filter covers the last row and column of a map of even size, and a robot there is invisible.
+
+    The paper's text ("one hidden layer is followed by ReLU") can also mean a second, fully
+    connected hidden layer between the two: `hidden_units` is its size, 0 for none. The network
+    plans on maps of its own height and width only; the paper's maps are 20 x 20 cells.
+    """
+
+    name = "paper"
+    size_names = ("height", "width", "filters", "hidden_units")
+
+    @classmethod
+    def shapes(cls, sizes: Mapping[str, int]) -> dict[str, tuple[int, ...]]:
+        """Return the shape of each tensor."""
+        height, width, filters, units = (sizes[name] for name in cls.size_names)
+        features = filters * ((height + 1) // 2) * ((width + 1) // 2)
+        layers = {"hidden": (units, features)} if units else {}
+        layers["fully_connected"] = (len(MOVES), units or features)
+        return _with_biases({"convolution": (filters, 1, 3, 3), **layers})
+
+    def supports(self, shape: tuple[int, int]) -> bool:
+        """Say whether maps of shape (H, W) have the network's size."""
+        return shape == (self.sizes["height"], self.sizes["width"])
+
+    def q_values(self, grid: GridMap, goal: Cell, move_rule: MoveRule) -> Array:
+        """Evaluate the observation of a robot in each cell.
+
+        The robot changes at most 2 x 2 outputs of the convolution. So these alone are evaluated
+        again for each cell, one row of the map at once, and all else once for the map.
+
+        The costs of the map are not used, nor is the move rule: the network knows that of its
+        training.
+        """
+        # In double precision: differences of large sums stay exact enough, and do not overflow.
+        tensors = {name: tensor.astype(np.float64) for name, tensor in self.tensors.items()}
+        first, *last = ["hidden", "fully_connected"][not self.sizes["hidden_units"] :]
+        kernel_33F = np.moveaxis(tensors["convolution.weight"][:, 0], 0, 2)
+        background = observation_background(grid.occupancy, goal).reshape(grid.occupancy.shape)
+        windows = np.lib.stride_tricks.sliding_window_view(np.pad(background, 1), (3, 3))[::2, ::2]
+        input_RLF = np.tensordot(windows, kernel_33F, 2) + tensors["convolution.bias"]
+        feature_RLF = np.maximum(input_RLF, 0)
+        rows, columns, filters = feature_RLF.shape
+        weight_UFRL = tensors[f"{first}.weight"].reshape(-1, filters, rows, columns)
+        weight_RLFU = np.ascontiguousarray(weight_UFRL.transpose(2, 3, 1, 0))
+        without_robot_U = np.tensordot(feature_RLF, weight_RLFU, 3) + tensors[f"{first}.bias"]
+        height, width = grid.occupancy.shape
+        q = np.empty((len(MOVES), height, width), dtype=np.float32)
+        for y in range(height):
+            output_WU = np.tile(without_robot_U, (width, 1))
+            for row in {y // 2, (y + 1) // 2} - {rows}:
+                for shift in (0, 1):  # to the outputs at x // 2, and of odd x at (x + 1) // 2
+                    x = np.arange(shift, width - shift, 1 + shift)
+                    at = row, (x + shift) // 2
+                    kernel_XF = kernel_33F[y + 1 - 2 * row, x + 1 - 2 * at[1]]
+                    robot_X1 = (ROBOT - background[y, x])[:, None]
+                    change_XF = np.maximum(input_RLF[at] + robot_X1 * kernel_XF, 0)
+                    change_XF -= feature_RLF[at]
+                    output_WU[x] += (change_XF[:, None] @ weight_RLFU[at])[:, 0]
+            for name in last:
+                output_WU = np.maximum(output_WU, 0) @ tensors[f"{name}.weight"].T
+                output_WU += tensors[f"{name}.bias"]
+            with np.errstate(over="ignore"):
+                q[:, y] = output_WU.T
+        return q
+
+
+class PropagationQNetwork(QNetwork):
+    """A Q-network for maps of any size: Q(s, a) = p(s, a) (r + γ V(s')) + (1 - p(s, a)) r_o.
+
+    Learned is p(s, a), the probability that a move succeeds, from the 3x3 patch around the robot: a
+    3x3 convolution and two 1x1 layers. The rest is given: the cell that a successful move leads to,
+    its reward r, the reward r_o of a collision, and that V(s) is the greatest Q(s, a), propagated
+    from the goal. Related networks are the value iteration networks (VIN, Tamar et al. 2016), which
+    learn their reward too, and VProp (Nardelli et al. 2019), which learns how values propagate.
+    """
+
+    name = "propagation"
+    size_names = ("filters",)
+    inputs: ClassVar[int] = 9
+    """Number of features."""
+    uses_costs: ClassVar[bool] = False
+    """Whether the costs of the cells are among the features."""
+
+    @classmethod
+    def shapes(cls, sizes: Mapping[str, int]) -> dict[str, tuple[int, ...]]:
+        """Return the shape of each tensor."""
+        filters = sizes["filters"]
+        layers = {
+            "convolution": (filters, cls.inputs),
+            "hidden": (filters, filters),
+            "moves": (len(MOVES), filters),
+        }
+        return _with_biases(layers)
+
+    @staticmethod
+    def features(patch_B9: NDArray[np.int8], move_rule: MoveRule) -> Array:
+        """Return which cells of patches are occupied: (B, 9), see `patches`."""
+        occupied: NDArray[np.bool_] = patch_B9 == OCCUPIED
+        return occupied.astype(np.float32)
+
+    def success(self, feature_BI: Array) -> Array:
+        """Return p(s, a) in 0..1: (B, 8), given features (B, I)."""
+        hidden_BF = np.maximum(self._layer("convolution", feature_BI), 0)
+        hidden_BF = np.maximum(self._layer("hidden", hidden_BF), 0)
+        # The sigmoid function, without overflow.
+        p_BA: Array = 0.5 + 0.5 * np.tanh(0.5 * self._layer("moves", hidden_BF))
+        return p_BA
+
+    def multiplier(self, feature_BI: Array) -> Array:
+        """Return the cost multiplier of each move, here 1: (B, 8), given features (B, I)."""
+        return np.ones((len(feature_BI), len(MOVES)), dtype=np.float32)
+
+    def q_values(self, grid: GridMap, goal: Cell, move_rule: MoveRule) -> Array:
+        """Return minus the cost of the best path through each action: length times cost multiplier.
+
+        There is no discount, and a move counts as possible where p > 1/2: so the greatest Q is the
+        cheapest path at any distance. (Along a whole path, the progress and detour terms of the
+        paper's reward, section 4.2, add up to a constant of its two ends.) Cost multipliers are
+        clamped to `MAX_LEARNED_MULTIPLIER`. A move with NaN as its p or cost multiplier is not
+        possible.
+
+        Returns
+        -------
+        (8, H, W) float32
+            -inf where no path is known.
+        """
+        patch_id, patch_P9 = unique_patches(grid.occupancy, grid.cost if self.uses_costs else None)
+        cost_PA = np.empty((len(patch_P9), len(MOVES)), dtype=np.float32)
+        for begin in range(0, len(patch_P9), BATCH):
+            batch = slice(begin, begin + BATCH)
+            feature_BI = self.features(patch_P9[batch], move_rule)
+            multiplier_BA = np.minimum(self.multiplier(feature_BI), MAX_LEARNED_MULTIPLIER)
+            # Comparisons with NaN are false, and NumPy's minimum and maximum keep it.
+            possible_BA = (self.success(feature_BI) > 0.5) & (multiplier_BA >= 1)
+            cost_PA[batch] = np.where(possible_BA, move_rule.lengths * multiplier_BA, np.inf)
+        return propagate_values(patch_id, cost_PA, goal)
+
+
+class AnyMapQNetwork(PropagationQNetwork):
+    """A propagation network for both move rules and for cells with different cost multipliers.
+
+    It learns the reward of a move too, r(s, a) = -length times m(s, a). Its input is more than the
+    obstacles of the patch: the costs of its cells, which of them are unknown, and the move rule.
+    The cost multiplier m is one linear layer of this input. That a move costs at least its length
+    is given.
+    """
+
+    name = "any_map"
+    inputs = 28
+    uses_costs = True
+
+    @classmethod
+    def shapes(cls, sizes: Mapping[str, int]) -> dict[str, tuple[int, ...]]:
+        """Return the shape of each tensor."""
+        return super().shapes(sizes) | _with_biases({"prices": (len(MOVES), cls.inputs)})
+
+    @staticmethod
+    def features(patch_B9: NDArray[np.int8], move_rule: MoveRule) -> Array:
+        """Return the features of patches, see `patches`: (B, 28).
+
+        For each of the 9 cells whether it is occupied, its cost as 0..1, and whether it is unknown;
+        then whether the rule allows to cut corners.
+        """
+        occupied, unknown = patch_B9 == OCCUPIED, patch_B9 == UNKNOWN
+        cost_B9 = np.where(occupied | unknown, 0, patch_B9) / 100
+        rule_B1 = np.full((len(patch_B9), 1), move_rule.cuts_corners)
+        return np.concatenate([occupied, cost_B9, unknown, rule_B1], axis=1, dtype=np.float32)
+
+    def multiplier(self, feature_BI: Array) -> Array:
+        """Return the cost multiplier of each move, at least 1: (B, 8), given features (B, 28)."""
+        multiplier_BA: Array = 1 + np.maximum(self._layer("prices", feature_BI), 0)
+        return multiplier_BA
+
+
+def _with_biases(weights: Mapping[str, tuple[int, ...]]) -> dict[str, tuple[int, ...]]:
+    """Return the shapes of layers' weights and biases, given those of the weights."""
+    return {
+        f"{layer}.{part}": shape if part == "weight" else shape[:1]
+        for layer, shape in weights.items()
+        for part in ("weight", "bias")
+    }

@@ -1,6 +1,6 @@
-"""Between ROS messages and the core: grid maps, cells, paths and value fields.
+"""Conversions between ROS messages and grid maps, cells, paths and value fields.
 
-What comes in is checked as Nav2 checks it (nav2_util/validate_messages.hpp).
+Messages are checked as Nav2 checks them (nav2_util/validate_messages.hpp).
 """
 
 from __future__ import annotations
@@ -9,6 +9,7 @@ import array
 import math
 from collections.abc import Sequence
 from itertools import zip_longest
+from typing import TYPE_CHECKING
 
 import numpy as np
 from geometry_msgs.msg import Point, Pose, PoseStamped, Quaternion
@@ -18,28 +19,24 @@ from std_msgs.msg import Header
 
 from ddqn_planner.grid import Cell, GridMap
 from ddqn_planner.grid.map_file import MAX_CELLS
-from ddqn_planner.planning import QField
+
+if TYPE_CHECKING:
+    from ddqn_planner.planning import QField
 
 TOLERANCE = 1e-4
 """How far the norm of a quaternion may be from 1."""
 
 MIN_RESOLUTION = 1e-6
-"""Metres a cell."""
+"""Metres per cell."""
 
 
 def grid_from_message(
     message: OccupancyGrid,
     occupied_threshold: int = 65,
     allow_unknown: bool = False,
-    priced: bool = False,
+    use_map_costs: bool = False,
 ) -> GridMap:
-    """Make a grid map of a map message.
-
-    Parameters
-    ----------
-    message : nav_msgs/OccupancyGrid
-    occupied_threshold, allow_unknown, priced
-        See `GridMap.from_occupancy_values`.
+    """Make a grid map of a map message; see `GridMap.from_occupancy_values`.
 
     Raises
     ------
@@ -51,7 +48,7 @@ def grid_from_message(
     values = np.frombuffer(message.data, np.int8).reshape(info.height, info.width)
     origin = (info.origin.position.x, info.origin.position.y, _yaw(info.origin.orientation))
     return GridMap.from_occupancy_values(
-        values, info.resolution, origin, occupied_threshold, allow_unknown, priced
+        values, info.resolution, origin, occupied_threshold, allow_unknown, use_map_costs
     )
 
 
@@ -61,16 +58,7 @@ def occupancy_message(
     origin: tuple[float, float, float],
     header: Header,
 ) -> OccupancyGrid:
-    """Make a map message.
-
-    Parameters
-    ----------
-    values : (H, W) int8
-        0..100, or -1 where unknown.
-    resolution, origin
-        As for `GridMap`.
-    header : std_msgs/Header
-    """
+    """Make a map message of values 0..100, or -1 where unknown; see `GridMap` for the rest."""
     message = OccupancyGrid(header=header)
     message.info.map_load_time = header.stamp
     message.info.resolution = float(resolution)
@@ -83,7 +71,7 @@ def occupancy_message(
 
 
 def value_message(field: QField, grid: GridMap, header: Header) -> OccupancyGrid:
-    """Make a map message of a value field: 0 the worst value, 100 the goal's, -1 where is none."""
+    """Make a map message of a value field: 0 the lowest value, 100 the goal's, -1 for no value."""
     value = field.value
     known = np.isfinite(value) & ~grid.occupancy
     percent = np.full(value.shape, -1, dtype=np.int8)
@@ -97,7 +85,7 @@ def value_message(field: QField, grid: GridMap, header: Header) -> OccupancyGrid
 
 
 def unknown_value_message(grid: GridMap, header: Header) -> OccupancyGrid:
-    """Make a message that says of no cell of a map what its value is."""
+    """Make a map message of a value field that is -1 everywhere."""
     unknown = np.full(grid.occupancy.shape, -1, dtype=np.int8)
     return occupancy_message(unknown, grid.resolution, grid.origin, header)
 
@@ -105,20 +93,13 @@ def unknown_value_message(grid: GridMap, header: Header) -> OccupancyGrid:
 def path_message(
     cells: Sequence[Cell], grid: GridMap, header: Header, goal_orientation: Quaternion
 ) -> Path:
-    """Make a path message of cells.
+    """Make a path message of cells, which may be none.
 
-    Parameters
-    ----------
-    cells : sequence of (x, y)
-        Those of a plan, simplified or not; none makes an empty path.
-    grid : GridMap
-    header : std_msgs/Header
-        Of the path and, the same object, of its poses.
-    goal_orientation : geometry_msgs/Quaternion
-        The last pose's. The others look to the next pose.
+    Each pose faces the next one, and the last has the goal's orientation. All have the same header
+    object.
     """
     path = Path(header=header)
-    # The poses share what is equal: making messages is most of what an answer costs.
+    # Poses in the same direction share a quaternion: most of an answer's time is making messages.
     towards: dict[Cell, Quaternion] = {}
     for cell, next_cell in zip_longest(cells, cells[1:]):
         pose = PoseStamped(header=header)
@@ -135,22 +116,13 @@ def path_message(
 
 
 def check_pose(name: str, header: Header, pose: Pose, frame: str = "") -> None:
-    """Check a pose.
-
-    Parameters
-    ----------
-    name : str
-        What the error calls it: ``"the goal"``.
-    header : std_msgs/Header
-    pose : geometry_msgs/Pose
-    frame : str
-        The map's frame, if it is known.
+    """Check a pose, which the error calls by its name, as ``"the goal"``.
 
     Raises
     ------
     ValueError
-        If the pose has no frame or another frame than `frame`, its position is not finite, or its
-        quaternion is not of norm 1.
+        If the pose has no frame or another one than the map's `frame`, if that is known; if its
+        position is not finite, or its quaternion is not of norm 1.
     """
     if not header.frame_id or (frame and header.frame_id != frame):
         expected = f"the map's is {frame!r}" if frame else "it needs the map's frame"
@@ -164,16 +136,10 @@ def check_pose(name: str, header: Header, pose: Pose, frame: str = "") -> None:
 def cell_from_pose(name: str, header: Header, pose: Pose, grid: GridMap, frame: str) -> Cell:
     """Return the cell of a pose; it may lie outside the map.
 
-    Parameters
-    ----------
-    name, header, pose, frame
-        See `check_pose`.
-    grid : GridMap
-
     Raises
     ------
     ValueError
-        See `check_pose`; or if the pose is so far off that its cell has no number.
+        See `check_pose`; or if the pose is so far away that its cell has no number.
     """
     check_pose(name, header, pose, frame)
     try:
@@ -186,13 +152,7 @@ def cell_from_pose(name: str, header: Header, pose: Pose, grid: GridMap, frame: 
 
 
 def check_tolerance(tolerance: float) -> float:
-    """Return the tolerance of a request, metres.
-
-    Raises
-    ------
-    ValueError
-        If it is not finite and 0 or more.
-    """
+    """Return a tolerance in metres; ValueError if it is not finite and 0 or more."""
     if not 0 <= tolerance < math.inf:
         raise ValueError(f"the tolerance is {tolerance}; give metres, finite and 0 or more")
     return tolerance
@@ -217,7 +177,7 @@ def _check_map(message: OccupancyGrid) -> None:
     if not (math.isfinite(info.resolution) and info.resolution > MIN_RESOLUTION):
         raise ValueError(
             f"the map's resolution is {info.resolution}; "
-            f"give metres a cell, finite and above {MIN_RESOLUTION}"
+            f"give metres per cell, finite and above {MIN_RESOLUTION}"
         )
     if info.width == 0 or info.height == 0:
         raise ValueError(

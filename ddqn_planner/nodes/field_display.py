@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from nav_msgs.msg import OccupancyGrid
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
-from rclpy.clock import Clock
-from rclpy.clock_type import ClockType
 from rclpy.node import Node
 from std_msgs.msg import Header
 from visualization_msgs.msg import MarkerArray
@@ -13,12 +11,11 @@ from visualization_msgs.msg import MarkerArray
 from ddqn_planner.grid import GridMap
 from ddqn_planner.nodes.conversions import unknown_value_message, value_message
 from ddqn_planner.nodes.markers import no_policy_message, policy_message
-from ddqn_planner.nodes.runtime import LATCHED
-from ddqn_planner.nodes.worker import Worker
+from ddqn_planner.nodes.runtime import LATCHED, STEADY, Worker
 from ddqn_planner.planning import QField
 
 LOOK_PERIOD = 0.1
-"""Seconds between two looks whether somebody wants the policy."""
+"""Seconds between two looks whether somebody subscribes to the policy."""
 
 
 class FieldDisplay:
@@ -28,7 +25,7 @@ class FieldDisplay:
     ----------
     node : Node
     worker : Worker
-        Draws both.
+        Computes both messages.
     """
 
     def __init__(self, node: Node, worker: Worker) -> None:
@@ -39,23 +36,22 @@ class FieldDisplay:
         self._published_policy: QField | None = None
         self._value_publisher = node.create_publisher(OccupancyGrid, "~/value", LATCHED)
         self._policy_publisher = node.create_publisher(MarkerArray, "~/policy", LATCHED)
-        steady = Clock(clock_type=ClockType.STEADY_TIME)
         group = MutuallyExclusiveCallbackGroup()
-        node.create_timer(LOOK_PERIOD, self._show_policy, group, clock=steady)
+        node.create_timer(LOOK_PERIOD, self._show_policy, group, clock=STEADY)
 
     def show_again(self) -> None:
         """Publish the next field even if it is shown already."""
         self._shows_again = True
 
     async def show(self, field: QField, grid: GridMap, header: Header) -> None:
-        """Publish a field's value if it is another than that shown."""
+        """Publish a field's value unless it is shown already."""
         if self._shows_again or self._shown is None or self._shown[:2] != (field, grid):
             value = await self._worker.call(value_message, field, grid, header)
             self._value_publisher.publish(value)
             self._shown, self._shows_again = (field, grid, header), False
 
     def clear(self, now: Header) -> None:
-        """Publish that no value is known, and no policy: those shown were of another goal."""
+        """Publish an unknown value and no policy: those that are shown are of another goal."""
         if self._shown is None:
             return
         _, grid, header = self._shown
@@ -67,7 +63,7 @@ class FieldDisplay:
             self._policy_publisher.publish(no_policy_message(header))
 
     async def _show_policy(self) -> None:
-        """Publish the policy of the field whose value was published, if somebody looks."""
+        """Publish the policy of the field that is shown, if somebody subscribes to it."""
         shown = self._shown
         if shown is None or not self._policy_publisher.get_subscription_count():
             return

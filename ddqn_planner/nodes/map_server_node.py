@@ -1,4 +1,4 @@
-"""The map server node: serves a map file, and scatters the paper's static noise over it."""
+"""The map server node: serves a map file, and adds the paper's static noise to it."""
 
 from __future__ import annotations
 
@@ -8,7 +8,6 @@ import numpy as np
 from nav_msgs.msg import OccupancyGrid
 from nav_msgs.srv import GetMap, LoadMap
 from numpy.typing import NDArray
-from rcl_interfaces.msg import ParameterDescriptor
 from rclpy.exceptions import InvalidParameterValueException
 from rclpy.node import Node
 from std_msgs.msg import Header
@@ -22,11 +21,11 @@ from ddqn_planner.grid import (
     MoveRule,
     read_map_file,
     scatter_obstacles,
+    shortest_path,
 )
 from ddqn_planner.grid.map_file import MapDataError, MapMetadataError, MapNotFoundError
 from ddqn_planner.nodes.conversions import MIN_RESOLUTION, occupancy_message
-from ddqn_planner.nodes.runtime import LATCHED, BaseNode, integer_range, spin_until_shutdown
-from ddqn_planner.planning import shortest_path
+from ddqn_planner.nodes.runtime import LATCHED, BaseNode, declare, spin_until_shutdown
 from ddqn_planner.resources import PACKAGE, find_map
 
 RESULTS: dict[type[Exception], int] = {
@@ -45,24 +44,23 @@ def declare_parameters(node: Node) -> None:
         (
             "yaml_filename",
             "dilemma.yaml",
-            "Path or URL of a map file, or name of a shipped one",
-            {},
+            "Path or URL of a map file, or a shipped map's name",
+            None,
         ),
-        ("topic_name", "map", "Topic of the map", {}),
-        ("frame_id", "map", "Frame of the map, not empty", {}),
-        ("seed", 0, "Seed of the new obstacles", integer_range(0, 2**63 - 1)),
+        ("topic_name", "map", "Topic of the map", None),
+        ("frame_id", "map", "Frame of the map, not empty", None),
+        ("seed", 0, "Seed of the new obstacles", (0, 2**63 - 1)),
     ):
-        descriptor = ParameterDescriptor(description=description, read_only=True, **limits)
-        node.declare_parameter(name, default, descriptor)
+        declare(node, name, default, description, limits, read_only=True)
 
 
 class MapServerNode(BaseNode):
     """Serves one map, latched on a topic and as a service.
 
-    ``~/scatter_obstacles`` takes the loaded map, never one that already has new obstacles, so that
-    every call is a draw of its own; the parameter ``seed`` makes a sequence of calls repeatable.
-    A path is left under `MoveRule.ROBOT_SAFE`, and so under either rule; only on a map without
-    such a path it is left under `MoveRule.CORNER_CUTTING`.
+    ``~/scatter_obstacles`` always adds to the loaded map, so that each call is an independent draw;
+    the parameter ``seed`` makes a sequence of calls repeatable. A path remains under
+    `MoveRule.ROBOT_SAFE`, and so under any rule; under `MoveRule.CORNER_CUTTING` on a map that has
+    only such a path.
     """
 
     def __init__(self) -> None:
@@ -97,7 +95,7 @@ class MapServerNode(BaseNode):
                     f"{MIN_RESOLUTION}, and no more than a float32 holds"
                 )
         except Exception as error:
-            # Also what a broken file does to a library that reads it: the node must live on.
+            # A broken file may raise anything in a library that reads it: the node must survive.
             kept = "the map before it stays" if self._loaded else "no map is served"
             self.get_logger().error(f"cannot load {url!r}, {kept}: {error}")
             return int(RESULTS.get(type(error), LoadMap.Response.RESULT_UNDEFINED_FAILURE))
@@ -173,7 +171,7 @@ class MapServerNode(BaseNode):
 
 
 def known_path(grid: GridMap, start: Cell, goal: Cell) -> tuple[MoveRule, list[Cell]]:
-    """Return the shortest path and the safest rule under which there is one.
+    """Return the shortest path, and the safest rule under which there is one.
 
     Raises
     ------

@@ -1,20 +1,117 @@
-"""What the planner node says of itself: its log and `/diagnostics`."""
+"""What the planner node says: what became of a request, its log, and `/diagnostics`."""
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
 
 from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from geometry_msgs.msg import PoseStamped
 from nav_msgs.msg import OccupancyGrid
 from rclpy.node import Node
 
-from ddqn_planner.grid import path_length
-from ddqn_planner.nodes.outcome import NO_REQUEST, Outcome
+from ddqn_planner.grid import Cell
+from ddqn_planner.model import ModelMetadata
+from ddqn_planner.planning import Plan, PlanMethod, Planner, PlanRequest, PlanStatus
 
 PERIOD = 1.0
 """Seconds between two diagnostics when nothing changes."""
+
+NO_REQUEST, NO_MAP, NO_START, NO_MODEL = "NO_REQUEST", "NO_MAP", "NO_START", "NO_MODEL"
+INVALID_START, INVALID_GOAL = "INVALID_START", "INVALID_GOAL"
+INVALID_TOLERANCE, FAILED = "INVALID_TOLERANCE", "FAILED"
+
+REMEDIES = {
+    PlanStatus.START_OUTSIDE_MAP: "set the start on the map",
+    PlanStatus.GOAL_OUTSIDE_MAP: "set the goal on the map",
+    PlanStatus.START_OCCUPIED: "set the start on a free cell",
+    PlanStatus.GOAL_OCCUPIED: "set the goal on a free cell, or a greater tolerance",
+    PlanStatus.MAP_SIZE_UNSUPPORTED: "set the parameter 'model' to one trained for this size",
+    PlanStatus.NO_PATH: "set the goal where free cells lead to, or a greater tolerance",
+    PlanStatus.ROLLOUT_TRAPPED: "train the model longer, or set mode to 'astar_fallback'",
+}
+
+
+NO_PLAN = Plan(PlanStatus.NO_PATH)
+
+
+class RequestError(ValueError):
+    """There is no request for the planner; the message says why and what to do."""
+
+    def __init__(self, status: str, reason: str) -> None:
+        super().__init__(reason)
+        self.status = status
+
+
+def checked(status: str, function: Any, *arguments: Any) -> Any:
+    """Call a function; its ValueError becomes a `RequestError` with this status."""
+    try:
+        return function(*arguments)
+    except ValueError as error:
+        raise RequestError(status, str(error)) from None
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What became of a request.
+
+    Parameters
+    ----------
+    status : str
+        The name of a `PlanStatus`, or one of the constants above if there is no plan.
+    reason : str
+        What a user reads: how the path was found, or why there is none and what to do.
+    planner : Planner, optional
+    request : PlanRequest, optional
+    plan : Plan
+        What the planner was asked and answered; without cells if there was no request.
+    map_stamp : str
+        The stamp of the map of the request, seconds; empty without a map.
+    """
+
+    status: str
+    reason: str
+    planner: Planner | None = None
+    request: PlanRequest | None = None
+    plan: Plan = NO_PLAN
+    map_stamp: str = ""
+
+
+def reason_of(
+    request: PlanRequest, plan: Plan, start: PoseStamped, goal: PoseStamped, robot_radius: float
+) -> str:
+    """Say how a path was found, or why there is none and what to do.
+
+    `start` and `goal` are the poses of the request, and `robot_radius` inflated its map.
+    """
+    grid = request.grid
+    if plan.status is not PlanStatus.SUCCEEDED:
+        reason = (
+            f"{plan.status.value} (start: {_place(start, request.start)}; "
+            f"goal: {_place(goal, request.goal)}; map: {grid.width} x {grid.height} cells)"
+        )
+        if plan.status is PlanStatus.GOAL_OCCUPIED and not grid.is_obstacle(request.goal):
+            reason += f", nearer to an obstacle than robot_radius, {robot_radius:g} m"
+        return f"{reason}; {REMEDIES[plan.status]}"
+    reason = f"a path of {plan.length:.2f} cells, " + (
+        "by greedy steps"
+        if plan.method is PlanMethod.GREEDY
+        else "searched for in the order of the Q field: the greedy steps were trapped"
+    )
+    if plan.cells[-1] != request.goal:
+        metres = math.dist(plan.cells[-1], request.goal) * grid.resolution
+        why = "is cut off" if grid.is_free(request.goal) else "is occupied"
+        reason += f"; the goal {why} and moved {metres:.3g} m"
+    return reason
+
+
+def _place(stamped: PoseStamped, cell: Cell) -> str:
+    position = stamped.pose.position
+    return f"({position.x:.6g}, {position.y:.6g}) m in cell ({cell[0]:.6g}, {cell[1]:.6g})"
 
 
 class Report:
@@ -27,14 +124,12 @@ class Report:
     Attributes
     ----------
     refused : dict of str to str
-        The reason why each thing was refused that was not accepted since.
-    outcome : Outcome
-        Of the last request.
+        What was refused and not accepted since, and why.
     """
 
     def __init__(self, node: Node) -> None:
         self.refused: dict[str, str] = {}
-        self.outcome = Outcome(NO_REQUEST, "no plan was asked for yet")
+        self._outcome = Outcome(NO_REQUEST, "no plan was asked for yet")
         self._node = node
         self._publisher = node.create_publisher(DiagnosticArray, "/diagnostics", 10)
         self._to_be_logged: list[str] = []
@@ -42,11 +137,11 @@ class Report:
         self._changed = True
 
     def change(self) -> None:
-        """Publish with the next look: something of the node changed."""
+        """Publish soon: something about the node changed."""
         self._changed = True
 
     def refuse(self, what: str, reason: str) -> None:
-        """Log that something was refused, unless that was the last one said of it."""
+        """Log that something was refused, unless the last log of it said the same."""
         repeated = self.refused.get(what) == reason
         self.refused[what] = reason
         self._changed = True
@@ -59,22 +154,22 @@ class Report:
             self._changed = True
 
     def note(self, outcome: Outcome) -> None:
-        """Note the last outcome."""
-        self.outcome = outcome
+        """Store the last outcome for the diagnostics."""
+        self._outcome = outcome
         self._changed = True
 
     def log(self, outcome: Outcome) -> None:
-        """Log a failure at once, and a path with the next look: that takes as long as to plan."""
-        if outcome.succeeded:
-            self._to_be_logged.append(outcome.sentence)
+        """Log a failure at once, and a path after its answer, which comes 1.2 times as fast."""
+        if outcome.plan.cells:
+            self._to_be_logged.append(outcome.reason)
         else:
             self.log_paths()
-            self._node.get_logger().warning(f"no plan: {outcome.sentence}")
+            self._node.get_logger().warning(f"no plan: {outcome.reason}")
 
     def log_paths(self) -> None:
-        """Log the paths that were found since the last time."""
-        for sentence in self._to_be_logged:
-            self._node.get_logger().info(sentence)
+        """Log the paths that were found since the last call."""
+        for reason in self._to_be_logged:
+            self._node.get_logger().info(reason)
         self._to_be_logged.clear()
 
     @property
@@ -83,38 +178,29 @@ class Report:
         return self._changed or time.monotonic() - self._reported >= PERIOD
 
     def publish(self, fatal: bool, missing: str, more: Mapping[str, str]) -> None:
-        """Publish the diagnostics.
+        """Publish the diagnostics, with what is missing and more values.
 
-        Parameters
-        ----------
-        fatal : bool
-            Whether nothing can be planned until its user does something.
-        missing : str
-            What else is missing; empty for nothing.
-        more : mapping of str to str
-            Further values.
+        It is fatal if the node cannot plan until its user does something.
         """
         self._changed = False
         self._reported = time.monotonic()
-        outcome, solution = self.outcome, self.outcome.solution
+        outcome, plan = self._outcome, self._outcome.plan
         problems = [f"{what} refused: {reason}" for what, reason in self.refused.items()]
-        if missing and missing != outcome.sentence:
+        if missing and missing != outcome.reason:
             problems.append(missing)
+        good = not problems and (plan.cells or outcome.status == NO_REQUEST)
         status = DiagnosticStatus(name=f"{self._node.get_fully_qualified_name()}: plan")
+        status.level = DiagnosticStatus.OK if good else DiagnosticStatus.WARN
         if fatal:
             status.level = DiagnosticStatus.ERROR
-        elif problems or not (outcome.succeeded or outcome.status == NO_REQUEST):
-            status.level = DiagnosticStatus.WARN
-        else:
-            status.level = DiagnosticStatus.OK
-        status.message = "; ".join([outcome.sentence, *problems])
+        status.message = "; ".join([outcome.reason, *problems])
         values = {
             "status": outcome.status,
-            "reason": outcome.sentence,
-            "method": solution.plan.method.value,
-            "path length (cells)": f"{path_length(solution.cells, solution.plan.move_rule):.3f}",
-            "field time (ms)": f"{solution.field_ms:.3f}",
-            "walk time (ms)": f"{solution.walk_ms:.3f}",
+            "reason": outcome.reason,
+            "method": plan.method.value,
+            "path length (cells)": f"{plan.length:.3f}",
+            "field time (ms)": f"{plan.field_ms:.3f}",
+            "rollout time (ms)": f"{plan.rollout_ms:.3f}",
             "planned on the map of (s)": outcome.map_stamp,
             **more,
             **{f"refused {what}": reason for what, reason in self.refused.items()},
@@ -123,6 +209,15 @@ class Report:
         message = DiagnosticArray(status=[status])
         message.header.stamp = self._node.get_clock().now().to_msg()
         self._publisher.publish(message)
+
+
+def describe_model(metadata: ModelMetadata) -> dict[str, str]:
+    """Return what the diagnostics say of a model."""
+    return {
+        "model move rule": metadata.move_rule.value,
+        "model sizes": ", ".join(f"{key} {size}" for key, size in metadata.sizes.items()),
+        "model training steps": str(metadata.steps),
+    }
 
 
 def describe_map(message: OccupancyGrid) -> str:

@@ -1,10 +1,11 @@
-"""What the nodes share: lasting topics, parameters of any kind, ``--help``, how a node ends."""
+"""What the nodes share: latched topics, parameters, worker threads, ``--help``, the shutdown."""
 
 from __future__ import annotations
 
 import json
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -17,7 +18,8 @@ from rcl_interfaces.msg import (
     SetParametersResult,
 )
 from rcl_interfaces.srv import SetParameters, SetParametersAtomically
-from rclpy.callback_groups import CallbackGroup
+from rclpy.clock import Clock
+from rclpy.clock_type import ClockType
 from rclpy.exceptions import NameValidationException, ParameterException
 from rclpy.executors import ExternalShutdownException
 from rclpy.logging import get_logger
@@ -26,6 +28,7 @@ from rclpy.parameter import Parameter
 from rclpy.parameter_service import ParameterService
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.service import Service
+from rclpy.task import Future
 from rclpy.utilities import ok, try_shutdown
 
 LATCHED = QoSProfile(
@@ -33,18 +36,21 @@ LATCHED = QoSProfile(
     reliability=ReliabilityPolicy.RELIABLE,
     durability=DurabilityPolicy.TRANSIENT_LOCAL,
 )
-"""The last message reaches also those who come later: maps, plans, saved models."""
+"""Late subscribers receive the last message too: for maps, plans, saved models."""
+
+STEADY = Clock(clock_type=ClockType.STEADY_TIME)
+"""For timers that must not depend on simulated time."""
 
 SERVICE_QUALITY = QoSProfile(depth=5000)
-"""Of each service, except ROS's parameter services, whose queue is 1,000.
+"""For each service, except ROS's parameter services, whose queue is 1,000.
 
-Requests that come at once wait in it. The middleware drops what does not fit, unseen by the node:
-ROS's usual queue of ten lost half of 20 requests. Fast DDS keeps 5,000 messages by default.
+The middleware drops requests that do not fit into the queue, and the node cannot see it: ROS's
+default queue of ten lost half of 20 requests. Fast DDS keeps 5,000 messages by default.
 """
 
 
 class BaseNode(Node):
-    """A node that no request to set parameters ends, and whose services lose no request of a burst.
+    """Node whose parameter services survive malformed requests, and whose services lose no request.
 
     Parameters
     ----------
@@ -55,23 +61,9 @@ class BaseNode(Node):
         super().__init__(name, start_parameter_services=False)
         self._parameter_services = _CheckedParameterService(self)
 
-    def create_service(
-        self,
-        srv_type: Any,
-        srv_name: str,
-        callback: Callable[..., Any],
-        *,
-        qos_profile: QoSProfile = SERVICE_QUALITY,
-        callback_group: CallbackGroup | None = None,
-    ) -> Service:
+    def create_service(self, *arguments: Any, **options: Any) -> Service:
         """Create a service with the queue of `SERVICE_QUALITY`."""
-        return super().create_service(
-            srv_type,
-            srv_name,
-            callback,
-            qos_profile=qos_profile,
-            callback_group=callback_group,
-        )
+        return super().create_service(*arguments, **{"qos_profile": SERVICE_QUALITY, **options})
 
 
 class _CheckedParameterService(ParameterService):
@@ -102,14 +94,61 @@ class _CheckedParameterService(ParameterService):
         return response
 
 
-def integer_range(low: float, high: float) -> dict[str, Any]:
-    """Return what a parameter's descriptor says of an integer from `low` to `high`."""
-    return {"integer_range": [IntegerRange(from_value=int(low), to_value=int(high), step=0)]}
+class Worker:
+    """Calls functions one after the other in a thread, and wakes the node's executor after each.
+
+    Parameters
+    ----------
+    node : Node
+        The thread touches nothing else of it.
+    """
+
+    def __init__(self, node: Node) -> None:
+        self._thread = ThreadPoolExecutor(1)
+        # A future alone does not wake an executor in another thread.
+        self._wake = node.create_guard_condition(lambda: None)
+
+    def call(self, function: Callable[..., Any], *arguments: object) -> Future:
+        """Return the future of a call; it has the exception if the function raises one."""
+        future = Future()
+
+        def work() -> None:
+            try:
+                future.set_result(function(*arguments))
+            except Exception as error:
+                future.set_exception(error)
+            self._wake.trigger()
+
+        self._thread.submit(work)
+        return future
 
 
-def floating_point_range(low: float, high: float) -> dict[str, Any]:
-    """Return what a parameter's descriptor says of a double from `low` to `high`."""
-    return {"floating_point_range": [FloatingPointRange(from_value=low, to_value=high)]}
+def declare(
+    node: Node,
+    name: str,
+    default: object,
+    description: str,
+    limits: tuple[float, float] | None = None,
+    choices: Sequence[str] = (),
+    constraint: str = "",
+    read_only: bool = False,
+) -> None:
+    """Declare a parameter with what a user reads of it.
+
+    ROS checks the limits of a number. The node must check choices, and what the constraint says.
+    """
+    constraint = f"one of {list(choices)}" if choices else constraint
+    descriptor = ParameterDescriptor(
+        description=description, additional_constraints=constraint, read_only=read_only
+    )
+    if limits and isinstance(default, int):
+        low, high = map(int, limits)
+        descriptor.integer_range = [IntegerRange(from_value=low, to_value=high, step=0)]
+    elif limits:
+        descriptor.floating_point_range = [
+            FloatingPointRange(from_value=float(limits[0]), to_value=float(limits[1]))
+        ]
+    node.declare_parameter(name, default, descriptor)
 
 
 HELP = """\
@@ -117,23 +156,15 @@ usage: {program} [--ros-args [-p PARAMETER:=VALUE] [--params-file FILE] [-r NAME
 
 {summary}
 
-Parameters are set at the start by -p or in a file, and those that are not read-only also while the
-node runs, by `ros2 param set NODE PARAMETER VALUE`:
+Set parameters at the start with -p or in a file. Those that are not read-only can also be set while
+the node runs, with `ros2 param set NODE PARAMETER VALUE`:
 """
 
 
 def help_text(program: str, summary: str, declare_parameters: Callable[[Any], None]) -> str:
-    """Return what ``--help`` prints. No node is made for it.
+    """Return what ``--help`` prints, without a node.
 
-    Parameters
-    ----------
-    program : str
-        Name of the executable.
-    summary : str
-        What the node does, a sentence.
-    declare_parameters : callable
-        Declares the parameters of the node that it is given, by `rclpy.node.Node.declare_parameter`
-        alone.
+    `declare_parameters` may call nothing of its node except `declare_parameter`.
     """
     parts = [HELP.format(program=program, summary=summary)]
 
@@ -156,30 +187,20 @@ def help_text(program: str, summary: str, declare_parameters: Callable[[Any], No
 def spin_until_shutdown(
     make_node: Callable[[], Node], declare_parameters: Callable[[Any], None] | None = None
 ) -> int:
-    """Run one node until SIGINT or SIGTERM, or print its parameters if it is asked for help.
+    """Run one node until SIGINT or SIGTERM, or print its parameters if the user asks for help.
 
-    Parameters
-    ----------
-    make_node : callable
-        The node's class.
-    declare_parameters : callable, optional
-        See `help_text`; without it ``--help`` is not looked for.
-
-    Returns
-    -------
-    int
-        Exit code: 0, or 1 if the node cannot start with the parameters, names or environment.
+    Returns the exit code: 0, or 1 if the node cannot start with its parameters, names or
+    environment. Without `declare_parameters` (see `help_text`) there is no ``--help``.
     """
     if declare_parameters and {"-h", "--help"} & {*sys.argv[1:]}:
         summary = (make_node.__doc__ or "").partition("\n")[0].replace("``", "")
         print(help_text(Path(sys.argv[0]).name, summary, declare_parameters), flush=True)
         return 0
-    node = None
     try:
         rclpy.init()
-    except Exception as error:
-        # As of an unknown ROS argument, a domain that is no number, keys that are missing.
+    except Exception as error:  # an unknown ROS argument, a domain that is no number, no keys
         return _cannot_start(error)
+    node = None
     try:
         node = make_node()
         rclpy.spin(node)
@@ -188,7 +209,7 @@ def spin_until_shutdown(
     except (NameValidationException, ParameterException) as error:
         return _cannot_start(error)
     except Exception as error:
-        # A callback that was at work when the signal came fails at its next ROS call.
+        # A callback that runs when the signal comes fails at its next ROS call.
         if ok():
             if node is None and isinstance(error, RuntimeError):  # what ROS itself raises
                 return _cannot_start(error)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 import time
 from collections.abc import Callable
 from typing import Any
@@ -9,18 +10,27 @@ from typing import Any
 from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped
 from nav_msgs.msg import Odometry
 from rclpy.node import Node
+from rclpy.time import Time
 
 from ddqn_planner.nodes.conversions import check_pose
-from ddqn_planner.nodes.transforms import TransformSource
 
 TOPICS = {"initialpose": PoseWithCovarianceStamped, "odom": Odometry}
 
 PATIENCE = 1.0
-"""Seconds in which a source that speaks all the time is heard, once somebody listens to it."""
+"""Seconds within which the first message of `odom` or TF is expected after the node subscribes."""
 
 
 class StartUnknownError(RuntimeError):
     """The start is not known; the message says why and what to do."""
+
+
+def check_tf() -> None:
+    """Raise a RuntimeError with the remedy if tf2_ros is not installed; PyPI does not have it."""
+    if importlib.util.find_spec("tf2_ros") is None:
+        raise RuntimeError(
+            "start_source is 'tf', which needs tf2_ros, and that is not installed: "
+            "apt install ros-jazzy-tf2-ros-py, or set start_source to 'initialpose' or 'odometry'"
+        )
 
 
 class StartSource:
@@ -30,23 +40,29 @@ class StartSource:
     ----------
     node : Node
     name : str
-        A value of the parameter ``start_source``.
-    hear : callable
-        What to call with each message, if the source is a topic.
+        A value of the parameter ``start_source``; for ``tf`` see `check_tf`.
+    on_message : callable
+        Called with each message, if the source is a topic.
     """
 
-    def __init__(self, node: Node, name: str, hear: Callable[[Any], None]) -> None:
+    def __init__(self, node: Node, name: str, on_message: Callable[[Any], None]) -> None:
         self.name = name
         self.topic = "odom" if name == "odometry" else name
         self._node = node
-        self._begun = time.monotonic()
+        self._began = time.monotonic()
         self._pose: PoseStamped | None = None
-        self._transforms = TransformSource(node) if name == "tf" else None
-        if self._transforms is None:
-            self._subscription = node.create_subscription(TOPICS[self.topic], self.topic, hear, 10)
+        if name == "tf":
+            import tf2_ros
+
+            self._tf2_ros = tf2_ros
+            self._buffer = tf2_ros.Buffer()
+            self._listener = tf2_ros.TransformListener(self._buffer, node)
+        else:
+            message_type = TOPICS[self.topic]
+            self._subscription = node.create_subscription(message_type, self.topic, on_message, 10)
 
     def take(self, message: PoseWithCovarianceStamped | Odometry, map_frame: str) -> bool:
-        """Note a pose, and say whether the active goal is to be planned for from it.
+        """Store a pose, and say whether to plan for the active goal from it.
 
         Raises
         ------
@@ -54,7 +70,7 @@ class StartSource:
             If it is malformed or in another frame; the pose before it stays.
         """
         check_pose("the start", message.header, message.pose.pose, map_frame)
-        # Odometry comes all the time; a plan that waited for it is due, others hold on.
+        # Odometry comes all the time: it only triggers a plan that waits for the first pose.
         due = self._pose is None or self.name == "initialpose"
         self._pose = PoseStamped(header=message.header, pose=message.pose.pose)
         return due
@@ -67,11 +83,8 @@ class StartSource:
         StartUnknownError
             If there is none.
         """
-        if self._transforms is not None:
-            try:
-                return self._transforms.pose(robot_frame, map_frame, tolerance)
-            except RuntimeError as error:
-                raise StartUnknownError(f"the start is unknown: {error}") from None
+        if self.name == "tf":
+            return self._transformed_pose(map_frame, robot_frame, tolerance)
         if self._pose is None:
             topic = self._subscription.topic_name
             remedy = {
@@ -84,14 +97,37 @@ class StartSource:
             )
         return self._pose
 
+    def _transformed_pose(self, map_frame: str, robot_frame: str, tolerance: float) -> PoseStamped:
+        try:
+            transform = self._buffer.lookup_transform(map_frame, robot_frame, Time())
+        except self._tf2_ros.TransformException as error:
+            raise StartUnknownError(
+                f"the start is unknown: no transform leads from {robot_frame!r} to {map_frame!r} "
+                f"({error}); publish one, or set robot_frame or start_source"
+            ) from None
+        stamp = Time.from_msg(transform.header.stamp)
+        age = (self._node.get_clock().now() - stamp).nanoseconds / 1e9
+        # Static transforms have the stamp 0, and are never too old.
+        if stamp.nanoseconds and age > tolerance:
+            raise StartUnknownError(
+                f"the start is unknown: the transform from {robot_frame!r} to {map_frame!r} is "
+                f"{age:.3g} s old, more than transform_tolerance, {tolerance:g} s; publish it more "
+                "often, or set transform_tolerance or start_source"
+            )
+        pose = PoseStamped(header=transform.header)
+        position, translation = pose.pose.position, transform.transform.translation
+        position.x, position.y, position.z = translation.x, translation.y, translation.z
+        pose.pose.orientation = transform.transform.rotation
+        return pose
+
     @property
-    def is_settling(self) -> bool:
-        """Whether a pose may come any moment, as it was begun to listen for one just now."""
-        return self.name != "initialpose" and time.monotonic() - self._begun < PATIENCE
+    def may_come(self) -> bool:
+        """Whether the first pose is still expected, as the node has subscribed just now."""
+        return self.name != "initialpose" and time.monotonic() - self._began < PATIENCE
 
     def close(self) -> None:
         """Stop listening."""
-        if self._transforms is not None:
-            self._transforms.close()
+        if self.name == "tf":
+            self._listener.unregister()
         else:
             self._node.destroy_subscription(self._subscription)

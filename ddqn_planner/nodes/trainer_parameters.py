@@ -1,4 +1,4 @@
-"""The trainer node's parameters: names, defaults, ranges, and how one may limit another."""
+"""The trainer node's parameters: names, defaults, ranges, and what a user reads of them."""
 
 from __future__ import annotations
 
@@ -6,72 +6,68 @@ from collections.abc import Sequence
 from dataclasses import fields
 from typing import Any, Final
 
-from rcl_interfaces.msg import ParameterDescriptor, SetParametersResult
+from rcl_interfaces.msg import SetParametersResult
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 
 from ddqn_planner.grid import MoveRule
-from ddqn_planner.nodes.runtime import floating_point_range, integer_range
+from ddqn_planner.nodes.runtime import declare
 from ddqn_planner.training.hyper_parameters import HyperParameters
 
 MOVE_RULES: Final = [rule.value for rule in MoveRule]
 
-
-def declare_parameters(node: Node) -> None:
-    """Declare all parameters of the trainer node, each with what may be set."""
-
-    def declare(name: str, default: object, description: str, **more: Any) -> None:
-        node.declare_parameter(name, default, ParameterDescriptor(description=description, **more))
-
-    declare(
+NODE_PARAMETERS: Final[list[tuple[str, object, str, dict[str, Any]]]] = [
+    (
         "output_folder",
         "runs/trainer",
         "Folder of the checkpoint, model and curves; used by the next ~/start",
-        additional_constraints="not empty",
-    )
-    declare(
+        {"constraint": "not empty"},
+    ),
+    (
         "map_file",
         "",
         "Map file with start and goal, or a shipped map's name; '' to wait for topics",
-        read_only=True,
-    )
-    declare(
+        {"read_only": True},
+    ),
+    (
         "move_rule",
         "corner_cutting",
         "Which diagonal moves are legal; used by the next ~/start",
-        additional_constraints=f"one of {MOVE_RULES}",
-    )
-    declare("seed", 0, "Seed of the training", **integer_range(0, 2**31 - 1))
-    declare(
+        {"choices": MOVE_RULES},
+    ),
+    ("seed", 0, "Seed of the training", {"limits": (0, 2**31 - 1)}),
+    (
         "occupied_threshold",
         65,
-        "Percent: from it on a cell is occupied",
-        **integer_range(1, 100),
-    )
-    declare("allow_unknown", False, "Whether unknown cells are free")
-    declare("episode_interval", 10, "Publish each n-th episode", **integer_range(1, 10**6))
-    declare(
-        "replay_period", 0.05, "Seconds per step of ~/replay", **floating_point_range(1e-3, 10.0)
-    )
+        "A cell of this value or more is occupied, percent",
+        {"limits": (1, 100)},
+    ),
+    ("allow_unknown", False, "Whether unknown cells are free", {}),
+    ("episode_interval", 10, "Publish each n-th episode", {"limits": (1, 10**6)}),
+    ("replay_period", 0.05, "Seconds per step of ~/replay", {"limits": (1e-3, 10.0)}),
+]
+"""Name, default, description and limits; the hyper-parameters follow them."""
+
+
+def declare_parameters(node: Node) -> None:
+    """Declare all parameters of the trainer node."""
+    for name, default, description, limits in NODE_PARAMETERS:
+        declare(node, name, default, description, **limits)
     for entry in fields(HyperParameters):
-        source = entry.metadata["source"]
-        if "choices" in entry.metadata:
-            constraint = f"one of {list(entry.metadata['choices'])}"
-            declare(entry.name, entry.default, source, additional_constraints=constraint)
-            continue
-        in_range = integer_range if type(entry.default) is int else floating_point_range
-        declare(entry.name, entry.default, source, **in_range(*entry.metadata["range"]))
+        allowed = entry.metadata
+        limits = {"choices": allowed.get("choices", ()), "limits": allowed.get("range")}
+        declare(node, entry.name, entry.default, allowed["source"], **limits)
 
 
 def hyper_parameters(node: Node, **new: Any) -> HyperParameters:
-    """Return those of the parameters, with new values; ValueError if they are invalid."""
+    """Return the hyper-parameters with `new` values; ValueError if they are invalid."""
     names = [entry.name for entry in fields(HyperParameters)]
     values = {name: new[name] if name in new else node.get_parameter(name).value for name in names}
     return HyperParameters(**values)
 
 
 def check_parameters(node: Node, parameters: Sequence[Parameter]) -> SetParametersResult:
-    """Check what the parameters would be together with new values: one may limit another."""
+    """Check all parameters together, with new values, since some limit others."""
     new = {parameter.name: parameter.value for parameter in parameters}
     output_folder, move_rule = (
         new.get(name, node.get_parameter(name).value) for name in ("output_folder", "move_rule")

@@ -1,7 +1,7 @@
-"""A live picture without RViz: what the nodes publish, in rerun.
+"""A live picture without RViz: draws in rerun what the nodes publish.
 
-Everything is drawn in cells of the map, so that images and lines fit for every resolution and
-origin; y points up.
+Everything is drawn in cells of the map, with y upwards, so that images and lines fit together for
+every resolution and origin.
 """
 
 from __future__ import annotations
@@ -26,33 +26,28 @@ from std_msgs.msg import Float32
 from ddqn_planner.grid import GridMap
 from ddqn_planner.nodes.conversions import grid_from_message
 from ddqn_planner.nodes.runtime import LATCHED, spin_until_shutdown
-from ddqn_planner.planning.picture import PATH_COLOUR, value_ramp
+from ddqn_planner.pictures.colours import EPISODE_COLOUR, PATH_COLOUR, value_ramp
 
 MAP, VALUE, PLAN, EPISODE, REWARD = "map/map", "map/value", "map/plan", "map/episode", "reward"
 LAYERS = (MAP, VALUE, PLAN, EPISODE)
 """From bottom to top."""
 
-COLOURS = {PLAN: ImageColor.getrgb(PATH_COLOUR), EPISODE: ImageColor.getrgb("#edae49")}
-RADII = {PLAN: rr.Radius.ui_points(4), EPISODE: rr.Radius.ui_points(2)}
-"""In points of the screen, to be seen on any map; the plan is seen below an episode like it."""
+LINES = {PLAN: (PATH_COLOUR, 4), EPISODE: (EPISODE_COLOUR, 2)}
+"""Colour, and radius in points of the screen: a plan shows on both sides of an equal episode."""
 
 UNKNOWN_GREY = 160
 
 PORT = 9876
-"""On which rerun's viewer listens."""
+"""The viewer of rerun listens here."""
 
 LOOK_PERIOD = 1.0
-"""Seconds between two looks whether the viewer is there."""
+"""Seconds between two checks that the viewer still runs."""
 
 
 class WatchNode(Node):
     """Draws the last map, value field, plan and episode, and the curve of the average reward.
 
-    Parameters
-    ----------
-    planner, trainer : str
-        Names of the nodes; relative ones are of this node's namespace.
-    recording : rerun.RecordingStream
+    The names of the planner node and the trainer node are relative to this node's namespace.
     """
 
     def __init__(self, planner: str, trainer: str, recording: rr.RecordingStream) -> None:
@@ -61,20 +56,17 @@ class WatchNode(Node):
         self._grid: GridMap | None = None
         self._value: NDArray[np.int8] | None = None
         self._paths: dict[str, Path] = {}
-        for message_type, topic, callback, quality in (
-            (OccupancyGrid, "map", self._on_map, LATCHED),
-            (OccupancyGrid, f"{planner}/value", self._on_value, LATCHED),
-            (Path, "plan", lambda path: self._on_path(PLAN, path), LATCHED),
-            (Path, f"{trainer}/episode", lambda path: self._on_path(EPISODE, path), 10),
-            (Float32, f"{trainer}/average_reward", self._on_reward, 100),
-        ):
-            self.create_subscription(message_type, topic, callback, quality)
+        subscribe = self.create_subscription
+        subscribe(OccupancyGrid, "map", self._on_map, LATCHED)
+        subscribe(OccupancyGrid, f"{planner}/value", self._on_value, LATCHED)
+        subscribe(Path, "plan", lambda path: self._on_path(PLAN, path), LATCHED)
+        subscribe(Path, f"{trainer}/episode", lambda path: self._on_path(EPISODE, path), 10)
+        subscribe(Float32, f"{trainer}/average_reward", self._on_reward, 100)
 
     def _on_map(self, message: OccupancyGrid) -> None:
-        grid, values = self._read("map", message)
-        if grid is None:
+        if (read := self._read("map", message)) is None:
             return
-        self._grid = grid
+        self._grid, values = read
         shades = 255 - 2 * values.clip(0, 100).astype(np.int16)
         shades[values < 0] = UNKNOWN_GREY
         self._draw_image(MAP, shades.astype(np.uint8))
@@ -83,9 +75,8 @@ class WatchNode(Node):
             self._draw_path(entity)
 
     def _on_value(self, message: OccupancyGrid) -> None:
-        grid, values = self._read("value field", message)
-        if grid is not None:
-            self._value = values
+        if (read := self._read("value field", message)) is not None:
+            self._value = read[1]
             self._draw_value()
 
     def _on_path(self, entity: str, message: Path) -> None:
@@ -95,14 +86,14 @@ class WatchNode(Node):
     def _on_reward(self, message: Float32) -> None:
         self._recording.log(REWARD, rr.Scalars(message.data))
 
-    def _read(self, what: str, message: OccupancyGrid) -> tuple[GridMap | None, NDArray[np.int8]]:
-        """Return the map and (H, W) int8 values; or no map, and say why, if it is malformed."""
+    def _read(self, what: str, message: OccupancyGrid) -> tuple[GridMap, NDArray[np.int8]] | None:
+        """Return the map and its (H, W) values; None if it is malformed, and log why."""
         try:
             grid = grid_from_message(message)
         except ValueError as error:
             self.get_logger().warning(f"the {what} is not drawn: {error}")
-            return None, np.empty((0, 0), np.int8)
-        return grid, np.frombuffer(message.data, np.int8).reshape(grid.height, grid.width)
+            return None
+        return grid, np.frombuffer(message.data, np.int8).reshape(grid.occupancy.shape)
 
     def _draw_image(self, entity: str, colours: NDArray[np.uint8]) -> None:
         self._recording.log(entity, rr.Image(colours[::-1], draw_order=LAYERS.index(entity)))
@@ -111,56 +102,51 @@ class WatchNode(Node):
         if self._grid is None or self._value is None:
             return
         if self._value.shape != self._grid.occupancy.shape:
-            # It is the last map's; the new map's is being computed.
+            # The field belongs to the last map; the new map's field is still being computed.
             self._recording.log(VALUE, rr.Clear(recursive=False))
             return
-        colours = np.zeros((*self._value.shape, 4), np.uint8)
-        known = self._value >= 0
-        colours[known, :3] = value_ramp(101)[self._value[known].clip(max=100)]
-        colours[known, 3] = 255
-        self._draw_image(VALUE, colours)
+        # Cells without a value, -1, take the last colour, which is transparent.
+        ramp = np.pad(value_ramp(101), ((0, 1), (0, 1)), constant_values=255)
+        ramp[-1] = 0
+        self._draw_image(VALUE, ramp[self._value.clip(-1, 100)])
 
     def _draw_path(self, entity: str) -> None:
         if self._grid is None:
             return
-        positions = [pose.pose.position for pose in self._paths[entity].poses]
-        points = cell_coordinates(self._grid, np.array([(p.x, p.y) for p in positions]))
-        points[:, 1] = self._grid.height - points[:, 1]
-        strips = rr.LineStrips2D(
-            [points] if positions else [],
-            radii=RADII[entity],
-            colors=COLOURS[entity],
+        x, y, yaw = self._grid.origin
+        points = [pose.pose.position for pose in self._paths[entity].poses]
+        # Complex numbers as points: to turn is to multiply.
+        metres = np.array([complex(p.x - x, p.y - y) for p in points])
+        cells = metres * np.exp(-1j * yaw) / self._grid.resolution
+        strip = np.stack([cells.real, self._grid.height - cells.imag], axis=1)
+        colour, radius = LINES[entity]
+        lines = rr.LineStrips2D(
+            [strip] if points else [],
+            radii=rr.Radius.ui_points(radius),
+            colors=ImageColor.getrgb(colour),
             draw_order=LAYERS.index(entity),
         )
-        self._recording.log(entity, strips)
-
-
-def cell_coordinates(grid: GridMap, positions: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return (N, 2) places in cells of (N, 2) positions in metres; 0.5 is a cell's centre."""
-    x, y, yaw = grid.origin
-    turn = np.array([[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]])
-    cells: NDArray[np.float64] = (positions.reshape(-1, 2) - (x, y)) @ turn / grid.resolution
-    return cells
+        self._recording.log(entity, lines)
 
 
 def open_viewer() -> subprocess.Popen[bytes] | None:
-    """Start rerun's viewer, unless one listens already; it stays when this process ends."""
+    """Start rerun's viewer, unless one listens already; it keeps running after this process."""
     with socket.socket() as connection:
         if connection.connect_ex(("127.0.0.1", PORT)) == 0:
             return None
     command = [str(FilePath(rerun_cli.__file__).with_name("rerun")), "--port", str(PORT)]
-    # As rerun.spawn does it, which does not say whether the viewer lives.
+    # As rerun.spawn does it, but that does not tell whether the viewer runs.
     environment = {**os.environ, "RERUN_APP_ONLY": "true"}
     viewer = subprocess.Popen(command, env=environment, start_new_session=True)
-    # Most that fail do so at once; to one that is gone rerun tries to connect for ten seconds.
+    # A viewer that fails mostly fails at once, and connecting to none would take ten seconds.
     with suppress(subprocess.TimeoutExpired):
         viewer.wait(LOOK_PERIOD)
-    look_at(viewer)
+    check_viewer(viewer)
     return viewer
 
 
-def look_at(viewer: subprocess.Popen[bytes]) -> None:
-    """End the node with its viewer: OSError if that has failed."""
+def check_viewer(viewer: subprocess.Popen[bytes]) -> None:
+    """Stop the node if the viewer was closed; raise OSError if it has failed."""
     if viewer.poll():
         raise OSError(
             f"rerun's viewer ended with {viewer.returncode}, see above; it needs a display: start "
@@ -171,19 +157,9 @@ def look_at(viewer: subprocess.Popen[bytes]) -> None:
 
 
 def watch(planner: str, trainer: str, file: FilePath | None) -> int:
-    """Show what the nodes publish until SIGINT or SIGTERM.
+    """Show what the nodes publish until SIGINT or SIGTERM; return the exit code.
 
-    Parameters
-    ----------
-    planner, trainer : str
-        Names of the nodes.
-    file : Path, optional
-        Where to write a recording; without one the viewer is opened.
-
-    Returns
-    -------
-    int
-        Exit code, see `spin_until_shutdown`.
+    Without a file for a recording, a viewer is opened. See `WatchNode` for the names.
 
     Raises
     ------
@@ -194,27 +170,27 @@ def watch(planner: str, trainer: str, file: FilePath | None) -> int:
     blueprint = rrb.Blueprint(
         rrb.Vertical(
             rrb.Spatial2DView(origin="map", name="Map, value field, plan, episode"),
-            rrb.TimeSeriesView(origin=REWARD, name="Average reward of a step"),
+            rrb.TimeSeriesView(origin=REWARD, name="Average reward per step"),
             row_shares=[3, 1],
         ),
         collapse_panels=True,
     )
 
     def make_node() -> WatchNode:
-        # Only now: a signal that came before rclpy took it would leave half a file.
+        # Opened here: a signal before rclpy handles signals would leave half a file.
+        viewer = None
         try:
             if file is None:
                 viewer = open_viewer()
                 recording.connect_grpc(default_blueprint=blueprint)
             else:
-                viewer = None
                 file.parent.mkdir(parents=True, exist_ok=True)
                 recording.save(file, default_blueprint=blueprint)
         except RuntimeError as error:
             raise OSError(f"rerun cannot show it: {error}; give another --save FILE") from None
         node = WatchNode(planner, trainer, recording)
         if viewer is not None:
-            node.create_timer(LOOK_PERIOD, lambda: look_at(viewer))
+            node.create_timer(LOOK_PERIOD, lambda: check_viewer(viewer))
         return node
 
     try:

@@ -1,18 +1,18 @@
-"""From a map, a start and a goal to a path: the Q field, the planner, and the exact oracle."""
+"""From a map, a start and a goal to a path: the Q field, and the planner."""
 
-from ddqn_planner.planning.oracle import shortest_distances, shortest_path
-from ddqn_planner.planning.plan import Plan, PlanMethod, PlanStatus
-from ddqn_planner.planning.planner import Planner, Route
+from ddqn_planner.grid.shortest_paths import shortest_distances, shortest_path
+from ddqn_planner.planning.plan import Plan, PlanMethod, PlanRequest, PlanStatus
+from ddqn_planner.planning.planner import Planner
 from ddqn_planner.planning.q_field import QField
 from ddqn_planner.planning.simplification import simplify
 
 __all__ = [
     "Plan",
     "PlanMethod",
+    "PlanRequest",
     "PlanStatus",
     "Planner",
     "QField",
-    "Route",
     "shortest_distances",
     "shortest_path",
     "simplify",

@@ -1,4 +1,4 @@
-"""The Q field: Q(s, a) of every cell toward one goal, and the greedy walk in it."""
+"""The Q field: Q(s, a) of every cell toward one goal, and greedy rollouts in it."""
 
 from __future__ import annotations
 
@@ -24,11 +24,11 @@ class QField:
     goal : (x, y)
         A free cell.
     q : (8, H, W) float32
-        What the network says of each action in each cell; -inf where it knows no way on.
+        The network's value of each action in each cell; -inf where no way to the goal is known.
     legal : (8, H, W) bool
-        The legal moves: the robot knows its map, and takes no other.
+        The legal moves. The robot knows its map and takes no other.
     move_rule : MoveRule
-        The rule that made them so.
+        The rule by which they are legal.
     """
 
     goal: Cell
@@ -38,10 +38,7 @@ class QField:
 
     @cached_property
     def value(self) -> NDArray[np.float32]:
-        """(H, W) float32: the greatest Q of a legal move; -inf where none is known to lead on.
-
-        Nothing is better than to be at the goal: it has the greatest value of the map.
-        """
+        """(H, W) float32: the greatest Q of a legal move, and at the goal the greatest of all."""
         legal_q = np.where(self.legal, self.q, np.float32(-np.inf))
         value: NDArray[np.float32] = legal_q.max(axis=0)
         value[self.goal[1], self.goal[0]] = value.max()
@@ -49,7 +46,7 @@ class QField:
 
     @cached_property
     def policy(self) -> NDArray[np.int8]:
-        """(H, W) int8: the legal action of the greatest Q in each cell; -1 where it is -inf."""
+        """(H, W) int8: the legal action of the greatest Q; -1 where that is -inf."""
         best = np.full(self.q.shape[1:], -np.inf, dtype=np.float32)
         policy = np.full(self.q.shape[1:], -1, dtype=np.int8)
         for action, (q, legal) in enumerate(zip(self.q, self.legal, strict=True)):
@@ -64,24 +61,16 @@ class QField:
         return int(self.q.nbytes + self.legal.nbytes + 5 * self.q[0].size)
 
     def unmasked(self) -> QField:
-        """Return the field of a robot that does not know its map.
-
-        Its walk takes the action of the greatest Q of all, and is trapped where that is illegal.
-        """
+        """Return the field without action masking: a rollout is trapped by an illegal move."""
         greedy_1HW = self.q.argmax(axis=0, keepdims=True)
         actions_A11 = np.arange(len(MOVES)).reshape(-1, 1, 1)
         legal = self.legal & (actions_A11 == greedy_1HW)
         return QField(self.goal, self.q, legal, self.move_rule)
 
     def rollout(self, start: Cell) -> Plan:
-        """Walk from a free cell to the goal by greedy steps alone.
+        """Take greedy steps from a free cell until the goal, and return the path.
 
-        The walk gives up on the first cell that it enters again: it would go round for ever.
-
-        Returns
-        -------
-        Plan
-            SUCCEEDED with every cell walked, or WALK_TRAPPED.
+        The plan is ROLLOUT_TRAPPED as soon as a cell is entered again: the steps would repeat.
 
         Raises
         ------
@@ -98,7 +87,7 @@ class QField:
             action = int(policy[cell[1], cell[0]])
             cell = (cell[0] + _STEPS[action][0], cell[1] + _STEPS[action][1])
             if action < 0 or cell in visited:
-                return Plan(PlanStatus.WALK_TRAPPED, move_rule=self.move_rule)
+                return Plan(PlanStatus.ROLLOUT_TRAPPED, move_rule=self.move_rule)
             visited.add(cell)
             cells.append(cell)
         return Plan(PlanStatus.SUCCEEDED, tuple(cells), move_rule=self.move_rule)

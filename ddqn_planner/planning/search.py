@@ -1,4 +1,4 @@
-"""Best-first search, compiled: guided by a value field, or to the nearest of some cells."""
+"""Best-first search, compiled: A* with a value field, or Dijkstra to the nearest of some cells."""
 
 from __future__ import annotations
 
@@ -7,45 +7,48 @@ import heapq
 import numpy as np
 from numpy.typing import NDArray
 
+from ddqn_planner.compiled import compiled
 from ddqn_planner.grid import MOVES, Cell, MoveRule
-from ddqn_planner.model.front import compiled
 
 
 def search(
     start: Cell,
-    ends: NDArray[np.bool_],
+    end: Cell | NDArray[np.bool_],
     legal: NDArray[np.bool_],
-    price: NDArray[np.float32],
+    multiplier: NDArray[np.float32],
     move_rule: MoveRule,
     value: NDArray[np.float32] | None = None,
 ) -> tuple[Cell, ...]:
-    """Return a path from a cell to one of some others, empty if there is none.
+    """Return a path from one cell to another, or to one of several; empty if there is none.
 
-    Cells are visited in the order of the path's cost so far minus V(s), the whole path's cost if
-    V says what is left of it (A* of Hart, Nilsson and Raphael 1968, with V as its heuristic). So a
-    good field leads straight to the end; with any other, as each cell is visited once at most, an
-    end is found if a path leads to one.
+    Cells are visited in the order of the path's cost so far minus V(s): A* (Hart, Nilsson and
+    Raphael 1968) with -V as its heuristic. A good field leads straight to the end. With any
+    field, each cell is visited at most once, so an end is found if a path leads to one.
 
     Parameters
     ----------
     start : (x, y)
-    ends : (H, W) bool
+    end : (x, y), or (H, W) bool
+        The end, or a mask of several.
     legal : (8, H, W) bool
         The moves that may be made.
-    price : (H, W) float32
-        See `GridMap.price`.
+    multiplier : (H, W) float32
+        See `GridMap.cost_multiplier`.
     move_rule : MoveRule
-        Says what a move counts.
+        Gives the length of a move.
     value : (H, W) float32, optional
-        V(s); by default 0: the path is the cheapest, to the end that is nearest.
+        V(s); by default 0, which gives the cheapest path to the nearest end (Dijkstra).
     """
+    if not isinstance(end, np.ndarray):
+        (x, y), end = end, np.zeros(multiplier.shape, dtype=np.bool_)
+        end[y, x] = True
     if value is None:
-        value = np.zeros(ends.shape, dtype=np.float32)
-    entered_by, end = _search(start, ends, legal, price, move_rule.lengths, value, MOVES)
-    if end < 0:
+        value = np.zeros_like(multiplier)
+    entered_by, found = _search(start, end, legal, multiplier, move_rule.lengths, value, MOVES)
+    if found < 0:
         return ()
-    width = ends.shape[1]
-    cells = [(end % width, end // width)]
+    width = multiplier.shape[1]
+    cells = [(found % width, found // width)]
     while cells[-1] != start:
         x, y = cells[-1]
         dx, dy = MOVES[entered_by[y, x]].tolist()
@@ -54,12 +57,12 @@ def search(
 
 
 @compiled
-def _search(start, ends, legal, price, lengths, value, moves):  # type: ignore[no-untyped-def]  # pragma: no cover
+def _search(start, ends, legal, multiplier, lengths, value, moves):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Return the action by which each cell was entered, (H, W) int8, and the end's number or -1."""
     width = ends.shape[1]
     entered_by = np.full(ends.shape, -1, dtype=np.int8)
     visited = np.zeros(ends.shape, dtype=np.bool_)
-    # Of a move: its order, the cost of the path with it, the cell it leads to, the action.
+    # Of each move: its order, the cost of the path with it, the cell it leads to, the action.
     waiting = [(0.0, 0.0, start[1] * width + start[0], -1)]
     while len(waiting) > 0:
         _, cost, cell, entered = heapq.heappop(waiting)
@@ -76,8 +79,8 @@ def _search(start, ends, legal, price, lengths, value, moves):  # type: ignore[n
             next_x, next_y = x + moves[action, 0], y + moves[action, 1]
             if visited[next_y, next_x]:
                 continue
-            mean_price = (np.float64(price[y, x]) + price[next_y, next_x]) / 2
-            through = cost + lengths[action] * mean_price
+            mean_multiplier = (np.float64(multiplier[y, x]) + multiplier[next_y, next_x]) / 2
+            through = cost + lengths[action] * mean_multiplier
             order = through - value[next_y, next_x]
             if np.isnan(order):
                 order = np.inf

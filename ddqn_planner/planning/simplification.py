@@ -1,4 +1,4 @@
-"""Path simplification: fewer poses, joined by straight segments with nothing in their way."""
+"""Path simplification: fewer poses, joined by straight segments through free cells."""
 
 from __future__ import annotations
 
@@ -12,16 +12,16 @@ from ddqn_planner.grid.arguments import as_cell
 from ddqn_planner.grid.moves import segment_lengths
 
 ROUNDING = 1e-9
-"""Of a sum of costs: a segment may cost so much more than what it replaces, as a share."""
+"""Relative error of a sum of costs: a segment may cost this much more than what it replaces."""
 
 
 def simplify(cells: Sequence[Cell], grid: GridMap, move_rule: MoveRule | str) -> tuple[Cell, ...]:
-    """Return some of a path's cells, so that straight segments between them are legal.
+    """Return some of a path's cells, the first and the last included, joined by legal segments.
 
-    A segment is legal if all cells that it passes through are free; under
-    `MoveRule.ROBOT_SAFE` also those that it touches at a corner. One that costs more than the part
-    of the path that it would replace is not taken, so that the path keeps its distance from what
-    is dear. Each segment is as long as a doubling and halving of its length finds it.
+    A segment is legal if all cells that it passes through are free; under `MoveRule.ROBOT_SAFE`
+    also those that it touches at a corner. It must not cost more than the part of the path that it
+    replaces, so that the path keeps away from cells of high cost. The length of each segment is
+    found by doubling and halving.
 
     Parameters
     ----------
@@ -30,17 +30,12 @@ def simplify(cells: Sequence[Cell], grid: GridMap, move_rule: MoveRule | str) ->
     grid : GridMap
     move_rule : MoveRule
 
-    Returns
-    -------
-    tuple of (x, y)
-        The first and the last cell among them.
-
     Raises
     ------
     ValueError
         If a cell is no pair of whole numbers, or there is no such move rule.
     """
-    rule, price = MoveRule(move_rule), grid.price
+    rule, multiplier = MoveRule(move_rule), grid.cost_multiplier
     path = [as_cell(cell) for cell in cells]
 
     def joins(first: int, last: int) -> bool:
@@ -49,8 +44,8 @@ def simplify(cells: Sequence[Cell], grid: GridMap, move_rule: MoveRule | str) ->
         touched = touched_cells(path[first], path[last], rule)
         if grid.occupancy[touched[:, 1], touched[:, 0]].any():
             return False
-        cost = segment_cost(path[first], path[last], price, rule)
-        return cost <= (1 + ROUNDING) * path_cost(path[first : last + 1], price, rule)
+        cost = segment_cost(path[first], path[last], multiplier, rule)
+        return cost <= (1 + ROUNDING) * path_cost(path[first : last + 1], multiplier, rule)
 
     kept, last = [0] if path else [], len(path) - 1
     while kept and kept[-1] < last:
@@ -66,56 +61,42 @@ def simplify(cells: Sequence[Cell], grid: GridMap, move_rule: MoveRule | str) ->
 
 
 def touched_cells(first: Cell, last: Cell, move_rule: MoveRule | str) -> NDArray[np.int64]:
-    """Return the cells that the segment between two cells' centres passes through: (N, 2) int64.
+    """Return the cells that a segment between two cells' centres passes through: (N, 2) int64.
 
-    Parameters
-    ----------
-    first, last : (x, y)
-    move_rule : MoveRule
-        Unless it cuts corners, cells that the segment touches at a corner count too. Some come
-        more than once.
+    Unless the rule cuts corners, cells that it touches at a corner count too. Some cells are
+    repeated.
     """
     passed, _ = _passed_cells(first, last)
     if MoveRule(move_rule).cuts_corners:
         return passed
-    # From one to the next at a corner it touches two more, else these are the same two again.
+    # Between two cells that share only a corner, two more are touched; else the same two again.
     (x, y), (next_x, next_y) = passed[:-1].T, passed[1:].T
     return np.concatenate([passed, np.stack([x, next_y], 1), np.stack([next_x, y], 1)])
 
 
 def segment_cost(
-    first: Cell, last: Cell, price: NDArray[np.float32], move_rule: MoveRule | str
+    first: Cell, last: Cell, multiplier: NDArray[np.float32], move_rule: MoveRule | str
 ) -> float:
     """Return what the segment between two cells' centres costs, as `path_cost` for a path.
 
-    Each cell's price counts for the share of the segment that lies within the cell: so does a
-    move's, half of which lies in each of its two cells.
-
-    Parameters
-    ----------
-    first, last : (x, y)
-    price : (H, W) float32
-        See `GridMap.price`.
-    move_rule : MoveRule
+    Each cell's cost multiplier is weighted by the share of the segment within that cell, as half of
+    a move lies in each of its two cells.
     """
     passed, share = _passed_cells(first, last)
     vector = np.subtract(last, first)
     length = segment_lengths(vector[:1], vector[1:], move_rule).item()
-    return length * float(share @ price[passed[:, 1], passed[:, 0]].astype(np.float64))
+    return length * float(share @ multiplier[passed[:, 1], passed[:, 0]].astype(np.float64))
 
 
 def _passed_cells(first: Cell, last: Cell) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Return the cells that a segment passes through, in order, and the share within each.
-
-    They are (N, 2) int64 and (N,) float64.
-    """
+    """Return the cells of a segment in order, (N, 2), and the share within each, (N,) float64."""
     vector = np.subtract(last, first)
     width, height = np.maximum(np.abs(vector), 1).tolist()
-    # Where the segment crosses edges of cells, of 0..unit from its first to its last point, so
-    # that all is whole.
+    # Positions on the segment count from 0 at its first point to `unit` at its last one: then all
+    # crossings of edges of cells are whole numbers.
     unit = 2 * width * height
     columns, rows = (np.arange(1, 2 * abs(side), 2) for side in vector.tolist())
     crossings = np.unique(np.concatenate([[0, unit], height * columns, width * rows]))
-    middle = crossings[:-1] + crossings[1:]  # twice that of each part
+    middle = crossings[:-1] + crossings[1:]  # twice the middle of each part
     cells = np.asarray(first) + (middle[:, None] * vector + unit) // (2 * unit)
     return cells, np.diff(crossings) / unit

@@ -1,8 +1,11 @@
-"""The paper's contribution: environment, initialisation, reward, replay, Double DQN, trainer."""
+"""The paper's contribution: environment, exploring starts, reward, replay, Double DQN, trainer."""
 
-import gymnasium
+from contextlib import suppress
 
-gymnasium.register(
-    id="ddqn_planner/Grid-v0",
-    entry_point="ddqn_planner.training.environment:GridEnvironment",
-)
+with suppress(ImportError):  # the trainer node must start without it, and say that it is missing
+    import gymnasium
+
+    gymnasium.register(
+        id="ddqn_planner/Grid-v0",
+        entry_point="ddqn_planner.training.environment:GridEnvironment",
+    )

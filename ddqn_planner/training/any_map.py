@@ -1,11 +1,10 @@
-"""The training of the model for any map: small maps of random cells, both rules, all prices."""
+"""The training of the model for any map: small random maps, both move rules, all costs."""
 
 from __future__ import annotations
 
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ddqn_planner.grid import GridMap, MoveRule
 from ddqn_planner.grid.generators import random_costs, random_requests, unknown_costs
@@ -31,23 +30,25 @@ ANY_MAP: Final = HyperParameters(
     max_episode_steps=50,
     steps=1_536_000,
 )
-"""What differs from the paper: every episode begins at a random free cell; a collision costs more
-than any walk on these maps; and the robot never stops to try what it holds for impossible."""
+"""Differences from the paper: every episode starts at a random free cell; a collision costs more
+than any rollout on these maps; and the agent keeps exploring moves it believes impossible."""
 
 MAPS: Final = 512
+"""Number of maps."""
+
 SIDE: Final = 10
-"""Number of maps, and their side in cells."""
+"""Width and height of each map in cells."""
 
 RULES: Final = (MoveRule.ROBOT_SAFE, MoveRule.CORNER_CUTTING)
 
 
 def random_scenarios(seed: int, maps: int = MAPS) -> list[Scenario]:
-    """Draw maps to train on, the same for the same seed.
+    """Draw the maps to train on. The same seed gives the same maps.
 
-    10 to 60 % of the cells are occupied, each by itself: of all the kinds of
-    `ddqn_planner.grid.generators` this is the only one that training sees, and the greater fills
-    are there for surroundings that are rare else. Half of the maps have each rule. A quarter has
-    no costs, a quarter random ones, a quarter the same cost everywhere, a quarter unknown cells.
+    10 to 60 % of the cells are occupied, each independently: of the map types in
+    `ddqn_planner.grid.generators`, training uses only this one. The high fill rates show 3x3
+    patches that are rare otherwise. Each move rule has half of the maps. A quarter of the maps has
+    no costs, a quarter random costs, a quarter one constant cost, a quarter unknown cells.
 
     Parameters
     ----------
@@ -57,7 +58,7 @@ def random_scenarios(seed: int, maps: int = MAPS) -> list[Scenario]:
     Returns
     -------
     list of Scenario
-        Start and goal are joined by a path.
+        A path connects each start with its goal.
     """
     random = np.random.default_rng(seed)
     return [_random_scenario(RULES[number % 2], random) for number in range(maps)]
@@ -65,14 +66,10 @@ def random_scenarios(seed: int, maps: int = MAPS) -> list[Scenario]:
 
 def _random_scenario(rule: MoveRule, random: np.random.Generator) -> Scenario:
     occupancy = random.random((SIDE, SIDE)) < random.uniform(0.1, 0.6)
+    # All four are drawn each time: the draws belong to what one seed gives.
     constant = np.full((SIDE, SIDE), random.integers(100), dtype=np.int8)
     unknown = unknown_costs(occupancy, 0.3, random)
-    costs: tuple[NDArray[np.int8] | None, ...] = (
-        None,
-        random_costs(occupancy, random),
-        constant,
-        unknown,
-    )
+    costs = (None, random_costs(occupancy, random), constant, unknown)
     grid = GridMap(occupancy, cost=costs[random.integers(len(costs))])
     ((start, goal),) = random_requests(occupancy, rule, 1, random)
     return Scenario(grid, start, goal, rule)

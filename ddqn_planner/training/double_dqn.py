@@ -10,34 +10,34 @@ from torch.nn import functional
 
 
 def double_dqn_target(
-    reward_B: Tensor, discount_B: Tensor, next_q_choose_BA: Tensor, next_q_judge_BA: Tensor
+    reward_B: Tensor, discount_B: Tensor, next_q_selection_BA: Tensor, next_q_evaluation_BA: Tensor
 ) -> Tensor:
-    """Return r + γ Q(s', argmax_a Q(s', a; choose); judge).
+    """Return r + γ Q(s', argmax_a Q(s', a; selection); evaluation).
 
-    One network chooses the next action, one judges it. Double DQN (van Hasselt et al. 2016,
-    equation 4) lets the online network θ choose and the target network θ⁻ judge. In DQN (Mnih et
-    al. 2015) θ⁻ does both, in the paper's target as it is printed, without θ⁻, θ does both.
+    The selection network selects the next action, the evaluation network gives its value. In Double
+    DQN (van Hasselt et al. 2016, equation 4) these are the online network θ and the target network
+    θ⁻. In DQN (Mnih et al. 2015) both are θ⁻. In the paper's target as printed both are θ.
 
     Parameters
     ----------
     reward_B : (B,) float32
     discount_B : (B,) float32
         γ, or 0 after a terminal transition.
-    next_q_choose_BA, next_q_judge_BA : (B, 8) float32
-        Q of the next state by the network that chooses, and by the one that judges.
+    next_q_selection_BA, next_q_evaluation_BA : (B, 8) float32
+        Q of the next state by the two networks.
 
     Returns
     -------
     (B,) float32
     """
-    greedy_B1 = next_q_choose_BA.argmax(dim=1, keepdim=True)
-    return reward_B + discount_B * next_q_judge_BA.gather(1, greedy_B1).squeeze(1)
+    greedy_B1 = next_q_selection_BA.argmax(dim=1, keepdim=True)
+    return reward_B + discount_B * next_q_evaluation_BA.gather(1, greedy_B1).squeeze(1)
 
 
 def double_dqn_loss(
     online: Callable[[Tensor], Tensor],
-    choose: Callable[[Tensor], Tensor],
-    judge: Callable[[Tensor], Tensor],
+    selection: Callable[[Tensor], Tensor],
+    evaluation: Callable[[Tensor], Tensor],
     state_B: Tensor,
     action_B: Tensor,
     reward_B: Tensor,
@@ -48,7 +48,7 @@ def double_dqn_loss(
 
     Parameters
     ----------
-    online, choose, judge : callable
+    online, selection, evaluation : callable
         From states (B, ...) to Q (B, 8): by θ, which learns, and by the two networks of
         `double_dqn_target`.
     state_B, next_state_B : (B, ...)
@@ -58,6 +58,8 @@ def double_dqn_loss(
         See `double_dqn_target`.
     """
     with torch.no_grad():
-        y_B = double_dqn_target(reward_B, discount_B, choose(next_state_B), judge(next_state_B))
+        y_B = double_dqn_target(
+            reward_B, discount_B, selection(next_state_B), evaluation(next_state_B)
+        )
     q_B = online(state_B).gather(1, action_B.unsqueeze(1)).squeeze(1)
     return functional.mse_loss(q_B, y_B)

@@ -1,38 +1,40 @@
-"""Every number of the training, once: the nodes, the command line and the tests read it here."""
+"""All hyper-parameters of training, defined once for the nodes, the command line and the tests."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, fields
+from dataclasses import asdict, dataclass, field, fields
 from typing import Any
+
+from ddqn_planner.model import NETWORKS
 
 
 def _parameter(default: Any, source: str, low: float, high: float) -> Any:
     return field(default=default, metadata={"source": source, "range": (low, high)})
 
 
-def _choice(default: str, source: str, *others: str) -> Any:
-    return field(default=default, metadata={"source": source, "choices": (default, *others)})
+def _choice(*choices: str, source: str) -> Any:
+    return field(default=choices[0], metadata={"source": source, "choices": choices})
 
 
 @dataclass(frozen=True)
 class HyperParameters:
-    """The paper's Table 1, and our choice where the paper is silent.
+    """The values of the paper's Table 1, and our values where the paper gives none.
 
-    Improvement 1 (initialisation) is switched off by ``p_r = 0``, improvement 2 (reward) by
-    ``alpha = beta = 0``.
+    ``p_r = 0`` switches off improvement 1 (initialisation), ``alpha = beta = 0`` improvement 2
+    (reward).
 
     Raises
     ------
     ValueError
-        If a value lies outside its range or is none of its choices, or a step of all environments
-        outgrows the replay buffer.
+        If a value is outside its range or not one of its choices, or the replay buffer cannot hold
+        one step of all environments.
     """
 
-    network: str = _choice("paper", "ours: the Q-network, see model/", "propagation", "any_map")
+    network: str = _choice(*NETWORKS, source="ours: the Q-network, see model/")
     target: str = _choice(
-        "double_dqn", "ours: the target, see training/double_dqn.py", "dqn", "printed"
+        "double_dqn", "dqn", "printed", source="ours: the target, see training/double_dqn.py"
     )
-    reward: str = _choice("paper", "ours: the reward, see training/reward.py", "path_cost")
+    reward: str = _choice("paper", "path_cost", source="ours: the reward, see training/reward.py")
     learning_rate: float = _parameter(
         0.01, "section on the network: Adam's learning rate", 1e-6, 1.0
     )
@@ -74,3 +76,8 @@ class HyperParameters:
                 f"environments is {self.environments}; it must be at most replay_capacity, "
                 f"{self.replay_capacity}"
             )
+
+    def network_sizes(self, shape: tuple[int, int]) -> dict[str, int]:
+        """Return the sizes of the network for maps of shape (H, W)."""
+        known = {**asdict(self), "height": shape[0], "width": shape[1]}
+        return {name: known[name] for name in NETWORKS[self.network].size_names}

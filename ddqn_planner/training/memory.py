@@ -1,17 +1,14 @@
-"""How much memory a training takes, and how much there is."""
+"""How much memory a training takes, and how much is available."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import asdict
 from pathlib import Path
 from typing import Final
 
-import torch
-
-from ddqn_planner.model import new_network
-from ddqn_planner.model.model_file import SIZES
+from ddqn_planner.model import NETWORKS, PropagationQNetwork
 from ddqn_planner.training.environment import Scenario
 from ddqn_planner.training.hyper_parameters import HyperParameters
 
@@ -19,21 +16,18 @@ REMEDY: Final = (
     "take a smaller map, or smaller filters, batch_size, environments or replay_capacity"
 )
 
-FEATURES: Final = {"propagation": 9, "any_map": 28}
-"""What a network that looks at one cell's surroundings sees of them, float32 each."""
-
 
 class MemoryShortageError(ValueError):
-    """A training cannot fit into the memory that is available."""
+    """A training does not fit into the available memory."""
 
 
 def check_memory(scenarios: Sequence[Scenario], parameters: HyperParameters) -> int:
-    """Return what a training takes, bytes; see `training_bytes`.
+    """Return `training_bytes`.
 
     Raises
     ------
     MemoryShortageError
-        If that is more than what is available.
+        If less is available.
     """
     needed, available = training_bytes(scenarios, parameters), available_bytes()
     if needed > available:
@@ -50,45 +44,44 @@ def megabytes(count: int) -> str:
 
 
 def training_bytes(scenarios: Sequence[Scenario], parameters: HyperParameters) -> int:
-    """Return about how much memory a training takes at its peak, beside the program itself.
+    """Return about how many bytes a training takes at its peak, in addition to the program.
 
-    The numbers count the float32 and int64 arrays that are alive at once in the environment, the
-    learner, an update and a save; `test/training/test_memory.py` holds them against processes.
+    It counts the arrays that exist at the same time in the environment, the encoder, an update and
+    a save; `test/training/test_memory.py` compares it with measured processes.
     """
     grid, p = scenarios[0].grid, parameters
     cells, maps = grid.width * grid.height, len(scenarios)
-    known = {**asdict(p), "height": grid.height, "width": grid.width}
-    with torch.device("meta"):
-        network = new_network(p.network, {name: known[name] for name in SIZES[p.network]})
-    weights = sum(weight.numel() for weight in network.parameters())
+    network = NETWORKS[p.network]
+    shapes = network.shapes(p.network_sizes((grid.height, grid.width)))
+    weights = sum(map(math.prod, shapes.values()))
 
-    # Per cell of each map: legal moves, two tables of rewards, free cells, what lies in the cells.
-    tables = maps * cells * (8 + 2 * 8 * 4 + 8 + 4)
-    # Made on the way: distances, neighbours and moves, float64 and int64, of one map at a time.
-    tables += cells * 8 * 8 * 4
-    if p.network == "paper":
+    # Per cell of each map: legal moves, two tables of rewards, free cells, the background. Then,
+    # for one map at a time: distances, neighbours and moves, float64 and int64.
+    tables = maps * cells * (8 + 2 * 8 * 4 + 8 + 4) + cells * 8 * 8 * 4
+    if not issubclass(network, PropagationQNetwork):
         patches = (grid.height + 1) // 2 * ((grid.width + 1) // 2)
-        # An update: observations and their 3x3 patches of states and next states, then features,
-        # their gradient, and what it is made of. A step: the same of one state per environment.
+        # Update: observations and 3x3 patches of states and next states; then features, their
+        # gradient, and its inputs. Step: the same of one state per environment, without gradient.
         update = p.batch_size * (4 * cells + 18 * patches + 3 * p.filters * patches)
         step = p.environments * (2 * cells + 9 * patches + p.filters * patches)
         batch = 4 * max(update, step)
     else:
-        # Per cell of each map: what is seen, and two layers or then six arrays of the propagation.
-        batch = maps * cells * 4 * (FEATURES[p.network] + max(2 * p.filters, 6 * 8))
-    # Both networks, the gradient and Adam's two means stay. A save copies all of them except the
-    # gradient twice, and the replay buffer, 40 bytes per transition, too.
-    kept = 5 * 4 * weights + 40 * p.replay_capacity
-    saved = 2 * (4 * 4 * weights + 40 * p.replay_capacity)
+        # Per cell of each map: features, and two layers or the six arrays of the propagation.
+        batch = maps * cells * 4 * (network.inputs + max(2 * p.filters, 6 * 8))
+    # Two networks, the gradient and Adam's two means stay, with 40 bytes per transition. A save
+    # makes two copies of all these except the gradient.
+    replay = 40 * p.replay_capacity
+    kept = 5 * 4 * weights + replay
+    saved = 2 * (4 * 4 * weights + replay)
     return tables + kept + max(batch, saved)
 
 
 def available_bytes() -> int:
-    """Return the memory that a process may still take, as Linux says; without it, 2^63 - 1."""
+    """Return the memory that a process may still take: what Linux says, elsewhere 2^63 - 1."""
     available = 2**63 - 1
     with suppress(OSError, KeyError, ValueError):
         available = _numbers("/proc/meminfo")["MemAvailable:"] * 1024
-    # The limit of a container; what it caches of files it can give back.
+    # The limit of a container. Its file cache does not count, since Linux can free it.
     with suppress(OSError, KeyError, ValueError):
         limit = int(Path("/sys/fs/cgroup/memory.max").read_text())
         available = min(available, limit - _numbers("/sys/fs/cgroup/memory.stat")["anon"])
@@ -96,6 +89,6 @@ def available_bytes() -> int:
 
 
 def _numbers(path: str) -> dict[str, int]:
-    """Return what a file of the kernel says: a name and a number on each line."""
+    """Return the numbers in a file of the kernel that has a name and a number in each line."""
     lines = map(str.split, Path(path).read_text().splitlines())
     return {name: int(number) for name, number, *_ in lines}

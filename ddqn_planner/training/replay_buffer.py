@@ -1,4 +1,4 @@
-"""Experience replay: a ring of transitions, stored as cell numbers in place of observations."""
+"""Experience replay: a ring buffer of transitions, with cell numbers instead of observations."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 
 class Transitions(NamedTuple):
-    """B transitions as arrays. The map is named by the number of its scenario."""
+    """B transitions as arrays."""
 
     scenario: NDArray[np.int64]
     """(B,) number of the scenario."""
@@ -22,7 +22,7 @@ class Transitions(NamedTuple):
     next_cell: NDArray[np.int64]
     """(B,) the robot's cell after the move."""
     discount: NDArray[np.float32]
-    """(B,) γ, or 0 where the move ended the episode; a truncated episode keeps γ."""
+    """(B,) γ, or 0 where the move terminated the episode; a truncated episode keeps γ."""
 
 
 class ReplayBuffer:
@@ -45,14 +45,14 @@ class ReplayBuffer:
         return min(self.added, self.capacity)
 
     def add(self, transitions: Transitions) -> None:
-        """Add B transitions, B <= capacity; the oldest make room."""
+        """Add B transitions, B <= capacity; they replace the oldest ones."""
         count = len(transitions.cell)
-        places = (self.added + np.arange(count)) % self.capacity
+        indices = (self.added + np.arange(count)) % self.capacity
         for name in Transitions._fields:
-            getattr(self.transitions, name)[places] = getattr(transitions, name)
+            getattr(self.transitions, name)[indices] = getattr(transitions, name)
         self.added += count
 
     def sample(self, count: int, random: np.random.Generator) -> Transitions:
         """Draw `count` transitions uniformly, with replacement."""
-        places = random.integers(len(self), size=count)
-        return Transitions._make(stored[places] for stored in self.transitions)
+        indices = random.integers(len(self), size=count)
+        return Transitions._make(stored[indices] for stored in self.transitions)

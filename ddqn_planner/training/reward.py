@@ -1,4 +1,4 @@
-"""Improvement 2 of the paper (section 4.2), the reward of a free cell, and path costs instead."""
+"""The reward of a legal move: improvement 2 of the paper (section 4.2), or minus its cost."""
 
 from __future__ import annotations
 
@@ -12,25 +12,25 @@ from ddqn_planner.training.hyper_parameters import HyperParameters
 def free_cell_reward(
     shape: tuple[int, int], start: Cell, goal: Cell, parameters: HyperParameters
 ) -> NDArray[np.float32]:
-    """Reward each move by its progress to the end and its detour from the start.
+    """Reward each move for its progress toward the goal, and punish a detour from the start.
 
     R_t = α (d_re(t-1) - d_re(t)) + β (d_rs(t) - d_rs(t-1) - d(t, t-1)), with d_re and d_rs the
-    Euclidean distances of the robot to the end and to the start, and d(t, t-1) the move's length.
-    The start is the given one, also in episodes that begin elsewhere: so the reward depends on
-    nothing that the robot does not observe.
+    Euclidean distances of the robot to the end (the goal) and to the start, and d(t, t-1) the
+    length of the move. The start is always the given one, also in an episode that starts elsewhere:
+    so the reward depends only on what the robot observes.
 
     Parameters
     ----------
     shape : (H, W)
     start, goal : (x, y)
     parameters : HyperParameters
-        For α and β. Zero for both is the plain DDQN: no reward on free cells.
+        For α and β. With α = β = 0, as in plain DDQN, free cells have no reward.
 
     Returns
     -------
     (8, H, W) float32
-        ``[a, y, x]`` is the reward of action ``a`` from (x, y); only moves onto a free cell that
-        is not the end earn it.
+        ``[a, y, x]`` is the reward of action ``a`` in (x, y). It holds only for moves onto a free
+        cell other than the goal.
     """
     height, width = shape
     y, x = np.mgrid[0:height, 0:width]
@@ -47,10 +47,10 @@ def free_cell_reward(
 
 
 def path_cost_reward(grid: GridMap, move_rule: MoveRule) -> NDArray[np.float32]:
-    """Reward each move by minus what it costs, so that the best return is the cheapest path.
+    """Reward each move by minus its cost, so that the best return is the cheapest path.
 
-    Unlike the paper's reward it names neither start nor end, and so it is a matter of the cells
-    around the robot alone. The move onto the end costs as any other and earns nothing.
+    Unlike the paper's reward it depends on neither start nor goal, only on the cells around the
+    robot. The move onto the goal has the same reward as any other.
 
     Parameters
     ----------
@@ -62,5 +62,5 @@ def path_cost_reward(grid: GridMap, move_rule: MoveRule) -> NDArray[np.float32]:
     (8, H, W) float32
         See `ddqn_planner.grid.move_costs`.
     """
-    reward: NDArray[np.float32] = -move_costs(grid.price, move_rule).astype(np.float32)
+    reward: NDArray[np.float32] = -move_costs(grid.cost_multiplier, move_rule).astype(np.float32)
     return reward

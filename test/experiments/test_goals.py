@@ -2,34 +2,32 @@ from __future__ import annotations
 
 import itertools
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from networks import random_network
 from strategies import grids_with_free_cell
 
-pytest.importorskip("pathfinding", reason="pathfinding, of the extra experiments, is missing")
+pytest.importorskip("matplotlib", reason="matplotlib, of the extra experiments, is missing")
 
+from ddqn_planner.benchmarks.evaluation import length_ratios
 from ddqn_planner.experiments import any_map
-from ddqn_planner.experiments.goal_1 import DIAGONALS, a_star, convergence_row
-from ddqn_planner.experiments.goal_2 import (
-    free_starts,
-    planned_field,
-    trained_field,
-)
-from ddqn_planner.experiments.goal_3 import fixed_walk, noisy_maps
-from ddqn_planner.experiments.profiles import MOVE_RULE, PROFILES, VARIANTS, variant
+from ddqn_planner.experiments.goal_1 import a_star, convergence_row
+from ddqn_planner.experiments.goal_2 import free_starts, trained_field
+from ddqn_planner.experiments.goal_3 import fixed_path, noisy_maps
+from ddqn_planner.experiments.profiles import MOVE_RULE, PROFILES, VARIANTS
 from ddqn_planner.experiments.trainings import TrainingEvaluation
 from ddqn_planner.grid import MOVES, Cell, GridMap, MoveRule, Noise, legal_moves, path_length
-from ddqn_planner.model import AnyMapQNetwork, ModelMetadata, PropagationQNetwork
+from ddqn_planner.model import ModelMetadata
 from ddqn_planner.planning import Planner, shortest_distances, shortest_path
-from ddqn_planner.planning.evaluation import length_ratios
 from ddqn_planner.training.environment import Scenario
 
 
-@given(grids_with_free_cell(), st.sampled_from([*DIAGONALS]), st.data())
-def test_the_library_a_star_is_exact_under_both_rules(
+@given(grids_with_free_cell(), st.sampled_from(list(MoveRule)), st.data())
+def test_a_star_is_exact_under_every_rule(
     grid_and_goal: tuple[GridMap, Cell], rule: MoveRule, data: st.DataObject
 ) -> None:
     grid, goal = grid_and_goal
@@ -40,7 +38,7 @@ def test_the_library_a_star_is_exact_under_both_rules(
     optimum = shortest_distances(grid, goal, rule)[start[1], start[0]]
     assert bool(cells) == np.isfinite(optimum)
     if cells:
-        assert path_length(cells) == pytest.approx(optimum)
+        assert path_length(cells, rule) == pytest.approx(optimum)
 
 
 def test_the_papers_map_has_286_starts(paper: Scenario) -> None:
@@ -62,26 +60,26 @@ def test_a_row_tells_from_when_on_a_path_is_found_and_is_the_shortest() -> None:
 
 
 @pytest.mark.parametrize(("possible", "wrong"), [(True, False), (False, True)])
-def test_moves_are_judged_wrongly_that_are_legal_and_not_believed_or_the_other_way_round(
+def test_moves_count_as_wrong_that_are_legal_and_predicted_to_fail_or_the_other_way_round(
     possible: bool, wrong: bool
 ) -> None:
-    network = AnyMapQNetwork(filters=2).requires_grad_(False)
-    network.moves.bias.fill_(100.0 if possible else -100.0)
+    network = random_network("any_map", filters=2)
+    network.tensors["moves.bias"].fill(100.0 if possible else -100.0)
     metadata = ModelMetadata("any_map", {"filters": 2}, MOVE_RULE, 0.95, "", 0, 0, "")
-    judged, _ = any_map._judgement(Planner(network, metadata))
-    # A straight move is legal in half of the 256 surroundings of a free cell. A diagonal one too
+    found, _ = any_map.move_errors(Planner(network, metadata))
+    # A straight move is legal in half of the 256 patches with a free centre. A diagonal one too
     # if corners may be cut, else in an eighth.
     legal = 4 * (128 + 128 + 128 + 32)
-    assert judged == (legal if wrong else 4096 - legal)
+    assert found == (legal if wrong else 4096 - legal)
 
 
-def test_every_start_of_a_field_is_walked(paper: Scenario) -> None:
+def test_a_rollout_is_made_from_every_start_of_a_field(paper: Scenario) -> None:
     metadata = ModelMetadata("propagation", {"filters": 2}, MOVE_RULE, 0.95, "", 0, 0, "")
-    network = PropagationQNetwork(2).requires_grad_(False)
-    # Told that every move succeeds: its walks go straight to the goal, and are trapped by walls.
-    network.moves.bias.fill_(100.0)
+    network = random_network("propagation", filters=2)
+    # Told that every move succeeds: its rollouts go straight to the goal, and are trapped by walls.
+    network.tensors["moves.bias"].fill(100.0)
     planner = Planner(network, metadata)
-    field = planned_field(planner, paper)
+    field = planner.q_field(paper.grid, paper.goal)
     ratios = length_ratios(field, paper.grid, MOVE_RULE)
     unmasked = length_ratios(field.unmasked(), paper.grid, MOVE_RULE)
     solved = np.isfinite(ratios)
@@ -92,8 +90,8 @@ def test_every_start_of_a_field_is_walked(paper: Scenario) -> None:
 
 def test_the_q_that_the_loss_trains_adds_up_the_papers_rewards(paper: Scenario) -> None:
     metadata = ModelMetadata("propagation", {"filters": 2}, MOVE_RULE, 0.95, "", 0, 0, "")
-    network = PropagationQNetwork(2).requires_grad_(False)
-    network.moves.bias.fill_(100.0)
+    network = random_network("propagation", filters=2)
+    network.tensors["moves.bias"].fill(100.0)
     field = trained_field(Planner(network, metadata), paper)
     goal_x, goal_y = paper.goal
     assert field.q[0, goal_y, goal_x - 1] == pytest.approx(10.0, abs=1e-3)
@@ -127,24 +125,26 @@ def test_more_test_maps_leave_the_training_maps_as_they_are() -> None:
     assert fingerprints[0] == fingerprints[1]
 
 
-def test_a_fixed_walk_is_legal_on_the_papers_map_and_avoids_what_it_can(paper: Scenario) -> None:
+def test_a_fixed_rollout_is_legal_on_the_papers_map_and_avoids_what_it_can(paper: Scenario) -> None:
     maps = noisy_maps(30, 30, Noise.ON_PATH)
-    walk = fixed_walk(maps.training)
+    path = fixed_path(maps.training)
     legal = legal_moves(paper.grid.occupancy, MOVE_RULE)
-    assert (walk[0], walk[-1]) == (paper.start, paper.goal)
-    for (x, y), (next_x, next_y) in itertools.pairwise(walk):
+    assert (path[0], path[-1]) == (paper.start, paper.goal)
+    for (x, y), (next_x, next_y) in itertools.pairwise(path):
         action = MOVES.tolist().index([next_x - x, next_y - y])
         assert legal[action, y, x]
-    # Every inner cell of the path can be avoided at once: the walk is free in every such map.
-    assert all(s.grid.is_free(cell) for s in (*maps.training, *maps.test) for cell in walk)
-    assert path_length(walk) == pytest.approx(31.56, abs=0.005)
+    # Every inner cell of the path can be avoided at once: the path is free in every such map.
+    assert all(s.grid.is_free(cell) for s in (*maps.training, *maps.test) for cell in path)
+    assert path_length(path) == pytest.approx(31.56, abs=0.005)
 
 
 @pytest.mark.parametrize("profile", PROFILES)
 def test_a_variant_switches_improvements_off(profile: str) -> None:
     switched = {
         name: (p.p_r > 0, p.alpha > 0 or p.beta > 0)
-        for name, p in ((name, variant(PROFILES[profile], name)) for name in VARIANTS)
+        for name, p in (
+            (name, replace(PROFILES[profile], **changes)) for name, changes in VARIANTS.items()
+        )
     }
     assert switched == {
         "plain": (False, False),

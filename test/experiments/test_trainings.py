@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 import torch
 
+from ddqn_planner.benchmarks.tables import table, write_table
 from ddqn_planner.experiments.profiles import MOVE_RULE
-from ddqn_planner.experiments.report import first_kept, mean, spread, worst
-from ddqn_planner.experiments.tables import table
-from ddqn_planner.experiments.taught import best_moves, cross_entropy, teach
+from ddqn_planner.experiments.settings import first_kept, mean_and_worst, median_and_range
+from ddqn_planner.experiments.supervised import best_moves, cross_entropy, train_supervised
 from ddqn_planner.experiments.trainings import (
     Training,
     TrainingEvaluation,
@@ -34,33 +34,33 @@ def evaluation(step: int, solved: int) -> TrainingEvaluation:
     return TrainingEvaluation(step, 0, 0, 0.0, solved, solved, 1.0, 0.0)
 
 
+@pytest.mark.slow
 def test_a_training_that_was_cut_off_ends_as_if_it_had_not_been(
     small: Scenario, tmp_path: Path
 ) -> None:
-    whole = Training("small", QUICK, (small,), seed=1, evaluation_interval=300)
-    train(whole, tmp_path / "whole")
-    train(replace(whole, parameters=replace(QUICK, steps=600)), tmp_path / "cut")
-    in_parallel(train, [whole], tmp_path / "cut")
-    runs = [read_evaluations(whole.folder(tmp_path / name)) for name in ("whole", "cut")]
+    folders = [tmp_path / name for name in ("whole", "cut")]
+    whole, cut = (Training(folder, QUICK, (small,), 1, 300) for folder in folders)
+    train(whole)
+    train(replace(cut, parameters=replace(QUICK, steps=600)))
+    in_parallel(train, [cut])
+    runs = [read_evaluations(folder) for folder in folders]
     assert [e.step for e in runs[0]] == [300, 600, 900]
     for a, b in zip(*runs, strict=True):
         np.testing.assert_equal(asdict(replace(a, seconds=0.0)), asdict(replace(b, seconds=0.0)))
     seconds = [e.seconds for e in runs[1]]
     assert seconds == sorted(seconds)
-    models = [whole.folder(tmp_path / name) / "model.safetensors" for name in ("whole", "cut")]
+    models = [folder / "model.safetensors" for folder in folders]
     assert models[0].read_bytes() == models[1].read_bytes()
 
 
 def test_the_last_of_the_networks_that_solve_the_most_is_kept(
     small: Scenario, tmp_path: Path
 ) -> None:
-    training = Training("small", QUICK, (small,), seed=1, evaluation_interval=50)
-    train(training, tmp_path)
-    folder = training.folder(tmp_path)
-    solved = [e.solved for e in read_evaluations(folder)]
+    train(Training(tmp_path, QUICK, (small,), seed=1, evaluation_interval=50))
+    solved = [e.solved for e in read_evaluations(tmp_path)]
     assert solved.count(1) > 1
     last = max(number for number, count in enumerate(solved) if count == 1)
-    assert load_model(folder / "kept.safetensors")[1].steps == 50 * (last + 1)
+    assert load_model(tmp_path / "kept.safetensors")[1].steps == 50 * (last + 1)
 
 
 def test_the_over_estimation_is_that_of_the_free_cells_but_the_goal(small: Scenario) -> None:
@@ -73,12 +73,13 @@ def test_the_over_estimation_is_that_of_the_free_cells_but_the_goal(small: Scena
     assert found.overestimation == pytest.approx(expected, rel=1e-5)
 
 
+@pytest.mark.slow
 def test_what_a_job_raises_is_raised(small: Scenario, tmp_path: Path) -> None:
-    training = Training("small", QUICK, (small,), seed=1, evaluation_interval=300)
-    train(training, tmp_path)
+    training = Training(tmp_path, QUICK, (small,), seed=1, evaluation_interval=300)
+    train(training)
     other = replace(training, parameters=replace(QUICK, gamma=0.5))
     with pytest.raises(ValueError, match=r"gamma 0\.95"):
-        in_parallel(train, [other], tmp_path)
+        in_parallel(train, [other])
 
 
 @pytest.mark.parametrize("alpha", [0.0, 0.6])
@@ -117,12 +118,12 @@ def test_cross_entropy_is_zero_when_the_best_moves_have_all_the_weight() -> None
     assert even.item() == pytest.approx(np.log(4))
 
 
-def test_a_taught_network_walks_the_shortest_path(small: Scenario, tmp_path: Path) -> None:
-    training = Training("taught", QUICK, (small,), seed=0, evaluation_interval=300)
-    teach(training, tmp_path)
-    path = training.folder(tmp_path) / "model.safetensors"
+def test_a_supervised_network_finds_the_shortest_path(small: Scenario, tmp_path: Path) -> None:
+    training = Training(tmp_path, QUICK, (small,), seed=0, evaluation_interval=300)
+    train_supervised(training)
+    path = tmp_path / "model.safetensors"
     written = path.stat().st_mtime_ns
-    teach(training, tmp_path)
+    train_supervised(training)
     assert path.stat().st_mtime_ns == written
     planner = Planner.load(path)
     plan = planner.plan(small.grid, small.start, small.goal)
@@ -130,17 +131,20 @@ def test_a_taught_network_walks_the_shortest_path(small: Scenario, tmp_path: Pat
     assert plan.length == pytest.approx(optimum)
 
 
-def test_a_spread_is_the_median_and_the_range_and_what_never_came_about() -> None:
-    assert spread([3, 1, 2000]) == "3 (1 to 2,000)"
-    assert spread([2.5, 2.5], 1) == "2.5"
-    assert spread([500, np.inf, 700]) == "700 (500 to never)"
-    assert spread([np.nan, 4]) == "4"
-    assert spread([np.nan]) == "none"
+def test_median_and_range_say_never_for_infinity_and_leave_nan_out() -> None:
+    assert median_and_range([3, 1, 2000]) == "3 (1 to 2,000)"
+    assert median_and_range([2.5, 2.5], 1) == "2.5"
+    assert median_and_range([500, np.inf, 700]) == "700 (500 to never)"
+    assert median_and_range([np.nan, 4]) == "4"
+    assert median_and_range([np.nan]) == "none"
 
 
-def test_mean_and_worst_leave_nan_out() -> None:
-    assert (mean([1.0, np.nan, 2.0]), worst([1.0, np.nan, 2.0])) == (1.5, 2.0)
-    assert np.isnan([mean([np.nan]), worst([])]).all()
+def test_mean_and_worst_leave_out_seeds_without_ratios() -> None:
+    assert mean_and_worst([[1.0, 2.0], [], [3.0]]) == [
+        "2.2500 (1.5000 to 3.0000)",
+        "2.5000 (2.0000 to 3.0000)",
+    ]
+    assert mean_and_worst([[]]) == ["none", "none"]
 
 
 @pytest.mark.parametrize(
@@ -154,5 +158,8 @@ def test_what_is_solved_for_good_is_solved_to_the_end(
     assert (kept.step if kept else None) == first
 
 
-def test_a_table_is_markdown() -> None:
-    assert table(["a", "b"], [[1, "x"]]) == "| a | b |\n| --- | --- |\n| 1 | x |"
+def test_a_table_is_markdown_and_csv(tmp_path: Path) -> None:
+    expected = "| a | b |\n| --- | --- |\n| 1 | x |"
+    assert table(["a", "b"], [[1, "x"]]) == expected
+    assert write_table(tmp_path / "table.csv", ["a", "b"], [[1, "x"]]) == expected
+    assert (tmp_path / "table.csv").read_text() == "a,b\n1,x\n"

@@ -30,7 +30,7 @@ def test_cells_nearer_to_an_obstacle_than_the_radius_are_occupied(
 ) -> None:
     distance = distances_by_definition(occupancy)
     assert clearance(occupancy) == pytest.approx(distance)
-    # A message brings the resolution in single precision.
+    # A message has the resolution in single precision.
     grid = inflate(GridMap(occupancy, float(np.float32(RESOLUTION))), radius)
     near = np.round(distance * RESOLUTION, 6) < radius
     assert (grid.occupancy == (occupancy | near)).all()
@@ -39,7 +39,7 @@ def test_cells_nearer_to_an_obstacle_than_the_radius_are_occupied(
 
 
 @given(occupancies, st.floats(0.01, 1.0), st.data())
-def test_clearance_costs_fall_with_the_distance_and_close_nothing(
+def test_clearance_costs_fall_with_the_distance_and_occupy_no_cell(
     occupancy: np.ndarray, weight: float, data: st.DataObject
 ) -> None:
     values = data.draw(st.sampled_from([UNKNOWN, 0, 40]))
@@ -49,13 +49,13 @@ def test_clearance_costs_fall_with_the_distance_and_close_nothing(
     labels = [component_labels(g.occupancy, MoveRule.ROBOT_SAFE) for g in (grid, plain)]
     assert (labels[0] > 0).sum() <= (labels[1] > 0).sum()
     free, distance = ~grid.occupancy, clearance(occupancy)
-    price = grid.price[free][np.argsort(distance[free])]
-    assert (np.diff(price) <= 0).all()
-    assert (price >= plain.price[free]).all()
+    multiplier = grid.cost_multiplier[free][np.argsort(distance[free])]
+    assert (np.diff(multiplier) <= 0).all()
+    assert (multiplier >= plain.cost_multiplier[free]).all()
 
 
 def test_a_radius_of_whole_cells_leaves_the_cell_at_that_distance_free() -> None:
-    # As a message brings it the resolution is less: two cells are 0.69999999 m.
+    # In a message's single precision, two cells are 0.69999999 m.
     grid = GridMap(np.array([[1, 0, 0, 0]]), float(np.float32(0.35)))
     assert inflate(grid, 0.7).occupancy.tolist() == [[True, True, False, False]]
 
@@ -69,7 +69,7 @@ def test_the_cost_falls_to_an_eighth_where_the_docstring_says() -> None:
     assert cost[0, 11] == 12  # 1 m beyond the body
 
 
-def test_a_robot_without_a_body_may_keep_clear_too() -> None:
+def test_a_robot_without_a_body_can_avoid_obstacles_too() -> None:
     grid = inflate(GridMap(np.array([[1, 0, 0]])), 0.0, 1.0)
     assert grid.cost is not None
     assert grid.cost[0, 1] > grid.cost[0, 2] > 0
@@ -92,7 +92,7 @@ def test_without_a_body_the_map_is_the_same() -> None:
         (0.0, math.nan, "clearance_weight is nan"),
     ],
 )
-def test_what_is_out_of_range_is_named(radius: float, weight: float, named: str) -> None:
+def test_a_value_out_of_range_is_named(radius: float, weight: float, named: str) -> None:
     with pytest.raises(ValueError, match=named):
         inflate(GridMap(np.zeros((2, 2))), radius, weight)
 

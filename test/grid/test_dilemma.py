@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 from ddqn_planner.experiments.profiles import START_DEAD_END
-from ddqn_planner.grid import MOVES, MoveRule, connected_cells, legal_moves
-from ddqn_planner.planning import shortest_distances
+from ddqn_planner.grid import MOVES, MoveRule, connected_cells, legal_moves, shortest_distances
 from ddqn_planner.training.environment import Scenario
 
 DEAD_ENDS_ON_THE_WAY = [

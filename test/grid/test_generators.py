@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+import hashlib
+import itertools
 import math
 from collections import Counter
 
@@ -33,7 +35,7 @@ def make(kind: str, shape: tuple[int, int], seed: int) -> np.ndarray:
 
 
 def greedy_arrives(legal: np.ndarray, cell: Cell, goal: Cell) -> bool:
-    """Say whether the legal move that ends nearest the goal leads there without turning away."""
+    """Return whether moves to the cell nearest to the goal always get nearer, and arrive."""
     while cell != goal:
         moves = MOVES[legal[:, cell[1], cell[0]]].tolist()
         nearest = min(
@@ -70,7 +72,7 @@ def test_straight_moves_join_all_free_cells_of_the_built_kinds(
 
 @pytest.mark.parametrize("kind", ["maze", "rooms", "corridors", "office"])
 @given(shape=SHAPES, seed=SEEDS)
-def test_a_wall_surrounds_the_built_kinds_but_dead_ends(
+def test_a_wall_surrounds_the_built_kinds_except_dead_ends(
     kind: str, shape: tuple[int, int], seed: int
 ) -> None:
     occupancy = make(kind, shape, seed)
@@ -86,6 +88,34 @@ def test_the_same_seed_makes_the_same_map_and_another_seed_another(
     first, second, other = (make(kind, shape, seed) for seed in (7, 7, 8))
     np.testing.assert_array_equal(first, second)
     assert (first != other).any()
+
+
+# Documented figures depend on these maps.
+FINGERPRINTS = {
+    "random_10": "cd0c0d47b98ee7c0",
+    "random_20": "422626fd67739974",
+    "random_30": "a63a032a81e2484e",
+    "random_40": "d84da09b0da208f9",
+    "maze": "71e15000efa68d3d",
+    "rooms": "cb7bfa124b24f79a",
+    "corridors": "c5cc018fbc745584",
+    "dead_ends": "3793acc08acffc06",
+    "office": "cab1d5e9e55bf5e5",
+}
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_seed_makes_the_same_map_requests_and_costs_in_every_version(kind: str) -> None:
+    digest = hashlib.sha256()
+    for shape, seed in itertools.product([(5, 7), (9, 200), (64, 64), (150, 131)], range(5)):
+        random = np.random.default_rng(seed)
+        occupancy = generate_map(kind, shape, random)
+        digest.update(np.packbits(occupancy).tobytes())
+        digest.update(random_costs(occupancy, random).tobytes())
+        digest.update(unknown_costs(occupancy, 0.3, random).tobytes())
+        for rule in MoveRule:
+            digest.update(repr(random_requests(occupancy, rule, 20, random)).encode())
+    assert digest.hexdigest()[:16] == FINGERPRINTS[kind]
 
 
 @pytest.mark.parametrize("percent", [10, 20, 30, 40])
@@ -122,8 +152,8 @@ def test_rooms_have_straight_walls_with_one_door_of_one_or_two_cells() -> None:
 
 
 @pytest.mark.parametrize("kind", ["rooms", "corridors"])
-def test_a_map_of_rooms_or_corridors_has_more_than_one_way(kind: str) -> None:
-    # A round way cuts off the occupied cells within from the outer wall.
+def test_a_map_of_rooms_or_corridors_has_loops(kind: str) -> None:
+    # A loop separates the occupied cells inside it from the outer wall.
     _, islands = scipy.ndimage.label(make(kind, (100, 120), 0), np.ones((3, 3)))
     assert islands > 5
 
@@ -176,7 +206,7 @@ def test_a_side_that_is_too_short_is_refused(shape: tuple[int, int]) -> None:
 
 
 @given(occupancies, RULES, SEEDS)
-def test_a_path_joins_the_start_and_the_goal_of_each_request(
+def test_a_path_joins_start_and_goal_of_each_request(
     occupancy: np.ndarray, rule: MoveRule, seed: int
 ) -> None:
     random = np.random.default_rng(seed)
@@ -191,8 +221,8 @@ def test_a_path_joins_the_start_and_the_goal_of_each_request(
         assert connected_cells(occupancy, start, rule)[goal[1], goal[0]]
 
 
-def test_requests_are_uniform_over_the_cells_with_company() -> None:
-    # Three joined cells, a lone one and two joined ones; corner cutting joins the first four.
+def test_requests_are_uniform_over_the_cells_that_have_a_move() -> None:
+    # Three connected cells, one alone, two connected ones; corner cutting connects the first four.
     occupancy = np.array(
         [[0, 0, 0, 1, 1, 1], [1, 1, 1, 0, 1, 1], [1, 1, 1, 1, 1, 0], [1] * 5 + [0]]
     )

@@ -107,22 +107,23 @@ def test_a_malformed_map_is_refused_by_name(arguments: tuple, named: str) -> Non
         GridMap(*arguments)
 
 
-def test_priced_free_cells_keep_their_values_and_are_the_dearer_the_greater_these_are() -> None:
+def test_free_cells_keep_their_values_as_costs_and_greater_values_cost_more() -> None:
     values = np.array([[0, 1, 64, 65, 100, -1, -7]], dtype=np.int8)
     plain = GridMap.from_occupancy_values(values, allow_unknown=True)
     assert plain.cost is None
-    assert (plain.price == 1).all()
-    priced = GridMap.from_occupancy_values(values, allow_unknown=True, priced=True)
-    assert priced.cost is not None
-    assert priced.cost.tolist() == [[0, 1, 64, 0, 0, UNKNOWN, UNKNOWN]]
-    assert priced.price[0, [0, 1, 2, 5, 6]] == pytest.approx([1, 1.04, 3.56, 5, 5])
-    assert priced.fingerprint != plain.fingerprint
-    assert priced.fingerprint == GridMap(priced.occupancy, cost=priced.cost).fingerprint
+    assert (plain.cost_multiplier == 1).all()
+    use_map_costs = GridMap.from_occupancy_values(values, allow_unknown=True, use_map_costs=True)
+    assert use_map_costs.cost is not None
+    assert use_map_costs.cost.tolist() == [[0, 1, 64, 0, 0, UNKNOWN, UNKNOWN]]
+    assert use_map_costs.cost_multiplier[0, [0, 1, 2, 5, 6]] == pytest.approx([1, 1.04, 3.56, 5, 5])
+    assert use_map_costs.fingerprint != plain.fingerprint
+    assert (
+        use_map_costs.fingerprint
+        == GridMap(use_map_costs.occupancy, cost=use_map_costs.cost).fingerprint
+    )
 
 
-def test_costs_may_be_lists_or_arrays_of_any_numbers_and_those_of_occupied_cells_do_not_count() -> (
-    None
-):
+def test_costs_may_be_lists_or_arrays_and_those_of_occupied_cells_are_ignored() -> None:
     for cost in ([[99, 100], [-1, 7]], np.array([[99.0, np.nan], [-1.0, 7.0]])):
         grid = GridMap([[0, 1], [0, 0]], cost=cost)  # type: ignore[arg-type]
         assert grid.cost is not None
@@ -146,7 +147,7 @@ def test_costs_may_be_lists_or_arrays_of_any_numbers_and_those_of_occupied_cells
         ([[0, 1]], math.nan, "occupied_threshold is nan"),
     ],
 )
-def test_occupancy_values_that_are_none_are_named(values: Any, threshold: Any, named: str) -> None:
+def test_a_wrong_occupancy_value_is_named(values: Any, threshold: Any, named: str) -> None:
     with pytest.raises(ValueError, match=named):
         GridMap.from_occupancy_values(values, occupied_threshold=threshold)
 
@@ -180,20 +181,20 @@ def test_a_cell_is_any_pair_of_whole_numbers(cell: Any) -> None:
         *[((0,), (0,)), ("0", "0"), np.zeros((2, 2)), {"x": 0, "y": 1}, (0, None)],
     ],
 )
-def test_what_is_no_cell_is_named(cell: Any) -> None:
+def test_a_wrong_cell_is_named(cell: Any) -> None:
     with pytest.raises(ValueError, match=r"(?s)the goal is .*; give two whole numbers \(x, y\)"):
         as_cell(cell, "the goal")
     with pytest.raises(ValueError, match="the cell is"):
         GridMap(np.zeros((2, 2))).contains(cell)
 
 
-def test_a_cell_on_the_edges_of_the_map_is_told_from_one_beyond() -> None:
+def test_cells_on_the_edges_are_inside_and_those_beyond_are_not() -> None:
     grid = GridMap(np.zeros((2, 3)))
     assert grid.contains((0, 0))
     assert grid.contains((2, 1))
     assert not any(map(grid.contains, [(-1, 0), (0, -1), (3, 0), (0, 2)]))
 
 
-def test_only_obstacles_within_the_occupied_cells_are_such() -> None:
+def test_only_some_occupied_cells_may_be_obstacles() -> None:
     grid = GridMap([[1, 1, 0]], obstacles=np.array([[1, 0, 0]]))  # type: ignore[arg-type]
     assert [grid.is_obstacle((x, 0)) for x in range(3)] == [True, False, False]

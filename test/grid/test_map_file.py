@@ -13,7 +13,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as numpy_st
 from PIL import Image
-from strategies import occupancies, priced_grids_with_free_cell
+from strategies import grids_with_costs, occupancies
 
 from ddqn_planner.grid import UNKNOWN, Cell, GridMap, MapFile, load_map, read_map_file, save_map
 from ddqn_planner.grid.map_file import (
@@ -33,7 +33,7 @@ VALID: dict[str, Any] = {
     "free_thresh": 0.25,
 }
 
-# A folder for each example costs nothing here: every example writes the same two files anew.
+# The examples can share a folder: each writes the same two files again.
 same_folder = settings(suppress_health_check=[HealthCheck.function_scoped_fixture])
 
 
@@ -66,7 +66,7 @@ def occupancy_of(grey: int, mode: str, negate: bool, occupied: float, free: floa
     return math.floor(float((p - f(free)) / f(occupied - free) * f(100)) + 0.5)
 
 
-# Thresholds that a grey value equals are drawn often.
+# Often exactly a grey value.
 thresholds = st.tuples(*2 * [st.integers(0, 255).map(lambda g: g / 255) | st.floats(0, 1)])
 
 
@@ -93,7 +93,7 @@ def test_each_mode_follows_map_servers_rule_and_row_0_is_the_bottom_one(
     assert (map_file.resolution, map_file.origin) == (0.05, (1.0, -2.0, 0.5))
 
 
-# What map_server's arithmetic gave when it was run, negated.
+# The results of running map_server's arithmetic, with negate: 1.
 @pytest.mark.parametrize(
     ("mode", "grey", "free", "occupied", "value"),
     [
@@ -147,7 +147,7 @@ def test_what_is_not_opaque_is_unknown(tmp_path: Path) -> None:
     assert read_map_file(path).values.tolist() == [[100, -1, -1]]
 
 
-# The greys that map_server's GraphicsMagick makes of them.
+# The grey value that map_server's GraphicsMagick gives for each colour.
 COLOURS = {(13, 71, 98): 56, (11, 0, 12): 4, (13, 26, 25): 22, (5, 18, 17): 14, (72, 111, 67): 94}
 
 
@@ -179,7 +179,7 @@ def png(folder: Path, pixels: np.ndarray, **options: Any) -> bytes:
     return (folder / "pixels.png").read_bytes()
 
 
-def test_what_map_server_would_read_otherwise_is_refused(tmp_path: Path) -> None:
+def test_an_image_that_map_server_reads_differently_is_refused(tmp_path: Path) -> None:
     path = write(tmp_path, np.zeros((1, 1), dtype=np.uint8))
     wide = np.array([[256, 257, 511]], dtype=np.uint16)
     refused = {
@@ -251,14 +251,14 @@ def test_a_saved_map_comes_back_the_same(
 
 
 @same_folder
-@given(priced_grids_with_free_cell())
-def test_a_saved_grid_keeps_its_costs_where_they_are_asked_for(
+@given(grids_with_costs())
+def test_a_saved_grid_keeps_its_costs_if_they_are_asked_for(
     tmp_path: Path, grid_and_cell: tuple[GridMap, Cell]
 ) -> None:
     grid, _ = grid_and_cell
     path = tmp_path / "saved.yaml"
     save_map(grid, path)
-    read = load_map(path, occupied_threshold=100, allow_unknown=True, priced=True)
+    read = load_map(path, occupied_threshold=100, allow_unknown=True, use_map_costs=True)
     assert read.fingerprint == grid.fingerprint
     assert grid.cost is not None
     closed = (grid.cost >= 65) | (grid.cost == UNKNOWN)
@@ -336,7 +336,7 @@ def test_what_is_no_map_yaml_is_refused(tmp_path: Path, content: str) -> None:
         read_map_file(path)
 
 
-def test_a_missing_file_is_told_from_a_broken_one(tmp_path: Path) -> None:
+def test_a_missing_file_and_a_broken_one_have_different_errors(tmp_path: Path) -> None:
     with pytest.raises(MapNotFoundError, match="no such file"):
         read_map_file(tmp_path / "none.yaml")
     (tmp_path / "folder.yaml").mkdir()
@@ -420,7 +420,7 @@ def test_a_yaml_of_any_text_is_refused_as_a_map(tmp_path: Path, text: str) -> No
         read_map_file(path)
 
 
-def test_a_yaml_may_have_so_many_bytes_and_no_more(tmp_path: Path) -> None:
+def test_a_yaml_has_a_greatest_size(tmp_path: Path) -> None:
     path = write(tmp_path, np.zeros((1, 1), dtype=np.uint8))
     text = path.read_text() + "#"
     path.write_text(text.ljust(MAX_YAML_BYTES, "-"))

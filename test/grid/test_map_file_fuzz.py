@@ -1,4 +1,4 @@
-"""Map files that are bad in every way: refused by name, and neither hang nor grow."""
+"""Broken and hostile map files are refused with their name, in little time and memory."""
 
 from __future__ import annotations
 
@@ -39,13 +39,13 @@ VALID: dict[str, Any] = {
     "ddqn_planner": {"start": [0, 0], "goal": [1, 1]},
 }
 
-# Every example writes the same files anew.
+# The examples can share a folder: each writes the same files again.
 same_folder = settings(suppress_health_check=[HealthCheck.function_scoped_fixture])
 
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
-    """A folder with a good map, and beside it what no map file may reach."""
+    """A folder with a good map, and beside it a file that no map file may reach."""
     folder = tmp_path / "maps"
     for parent in (folder, tmp_path):
         save_map(GridMap(np.zeros((3, 3))), parent / "good.yaml")
@@ -131,7 +131,7 @@ def laughs(key: str) -> str:
 
 
 def bombs(folder: Path) -> list[Path]:
-    """Small files that would take gigabytes, were they not refused."""
+    """Small files that would take gigabytes if they were read."""
     images = {
         "header.pgm": b"P5 100000 10000 255\n",
         "plain.pgm": b"P2 100000 10000 255\n0 0",
@@ -167,10 +167,10 @@ for name in sys.argv[2:]:
         assert len(str(error)) < 2000, name
 print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before)
 """
-"""Prints by how many KiB the greatest memory grew."""
+"""Prints how many KiB the peak memory has grown."""
 
 
-def test_a_file_that_would_be_gigabytes_is_refused_before_it_is(folder: Path) -> None:
+def test_a_file_that_grows_to_gigabytes_is_refused_before_it_is_read(folder: Path) -> None:
     names = [str(path) for path in (folder / "good.yaml", *bombs(folder))]
     command = [sys.executable, "-c", MEASURE, *names]
     grown = subprocess.run(command, check=True, capture_output=True, text=True).stdout
@@ -200,7 +200,7 @@ YAML_VALUES = st.recursive(
 
 @same_folder
 @given(st.dictionaries(st.sampled_from([*VALID]), YAML_VALUES, min_size=1))
-def test_any_value_in_any_key_is_a_maps_or_refused(folder: Path, changes: dict[str, Any]) -> None:
+def test_any_value_of_any_key_is_read_or_refused(folder: Path, changes: dict[str, Any]) -> None:
     path = write_yaml(folder, **changes)
     with suppress(MapFileError):
         map_file = read_map_file(path)
@@ -211,9 +211,7 @@ def test_any_value_in_any_key_is_a_maps_or_refused(folder: Path, changes: dict[s
 
 @same_folder
 @given(st.dictionaries(st.sampled_from(["start", "goal"]), YAML_VALUES, min_size=1))
-def test_any_value_of_a_scenario_is_a_cell_or_refused(
-    folder: Path, scenario: dict[str, Any]
-) -> None:
+def test_any_value_of_a_scenario_is_read_or_refused(folder: Path, scenario: dict[str, Any]) -> None:
     path = write_yaml(folder, ddqn_planner=scenario)
     with suppress(MapFileError):
         map_file = read_map_file(path)
@@ -245,7 +243,7 @@ GOOD_MAP = b"type octile\nheight 2\nwidth 3\nmap\n.@.\n..@\n"
 
 @same_folder
 @given(st.binary() | edited(GOOD_YAML), st.binary() | edited(GOOD_PGM) | edited(png_of(3, 3)))
-def test_a_map_of_any_bytes_is_a_map_or_refused(folder: Path, text: bytes, image: bytes) -> None:
+def test_a_ros_map_of_any_bytes_is_read_or_refused(folder: Path, text: bytes, image: bytes) -> None:
     (folder / "any.image").write_bytes(image)
     (folder / "any.yaml").write_bytes(text)
     (folder / "image.yaml").write_bytes(GOOD_YAML)
@@ -256,14 +254,16 @@ def test_a_map_of_any_bytes_is_a_map_or_refused(folder: Path, text: bytes, image
 
 @same_folder
 @given(st.binary() | edited(GOOD_MAP))
-def test_a_moving_ai_map_of_any_bytes_is_a_map_or_refused(folder: Path, content: bytes) -> None:
+def test_a_moving_ai_map_of_any_bytes_is_read_or_refused(folder: Path, content: bytes) -> None:
     (folder / "any.map").write_bytes(content)
     with suppress(MapFileError):
         assert read_map_file(folder / "any.map").values.size > 0
 
 
 @pytest.mark.parametrize("suffix", [".png", ".bmp", ".jpg", ".ppm"])
-def test_an_image_that_is_cut_off_anywhere_is_refused_or_whole(folder: Path, suffix: str) -> None:
+def test_an_image_that_is_cut_off_anywhere_is_complete_or_refused(
+    folder: Path, suffix: str
+) -> None:
     Image.fromarray(np.zeros((9, 9), dtype=np.uint8)).save(folder / f"whole{suffix}")
     content = (folder / f"whole{suffix}").read_bytes()
     path = write_yaml(folder, image=f"cut{suffix}", mode="raw")
@@ -284,7 +284,9 @@ TAGS = [
 
 
 @pytest.mark.parametrize("tag", TAGS)
-def test_a_tag_makes_nothing(folder: Path, monkeypatch: pytest.MonkeyPatch, tag: str) -> None:
+def test_a_yaml_tag_creates_no_object(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, tag: str
+) -> None:
     monkeypatch.chdir(folder)
     others = {name: value for name, value in VALID.items() if name != "resolution"}
     (folder / "map.yaml").write_text(f"{yaml.safe_dump(others)}resolution: {tag}\n")

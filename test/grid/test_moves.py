@@ -2,26 +2,30 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from itertools import product
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from strategies import grids_with_free_cell, occupancies, priced_grids_with_free_cell
+from strategies import grids_with_costs, grids_with_free_cell, occupancies
 
 from ddqn_planner.grid import (
     LENGTHS,
-    MAX_PRICE,
+    MAX_COST_MULTIPLIER,
     MOVES,
     GridMap,
     MoveRule,
     connected_cells,
     legal_moves,
     move_costs,
+    neighbours,
     path_cost,
     path_length,
+    shortest_distances,
+    shortest_path,
 )
-from ddqn_planner.planning import shortest_distances, shortest_path, simplify
+from ddqn_planner.planning import simplify
 
 RULES = st.sampled_from(list(MoveRule))
 
@@ -33,9 +37,7 @@ def test_action_k_points_at_k_times_45_degrees() -> None:
 
 
 @given(occupancies, RULES)
-def test_legal_moves_are_those_of_the_rule_cell_by_cell(
-    occupancy: np.ndarray, rule: MoveRule
-) -> None:
+def test_legal_moves_follow_the_rule_in_each_cell(occupancy: np.ndarray, rule: MoveRule) -> None:
     grid, legal = GridMap(occupancy), legal_moves(occupancy, rule)
     for y in range(grid.height):
         for x in range(grid.width):
@@ -46,8 +48,18 @@ def test_legal_moves_are_those_of_the_rule_cell_by_cell(
                 assert legal[action, y, x] == expected
 
 
+@pytest.mark.parametrize("shape", [(1, 1), (1, 4), (3, 5)])
+def test_neighbours_are_numbered_row_by_row_and_outside_comes_last(shape: tuple[int, int]) -> None:
+    found, (height, width) = neighbours(shape), shape
+    assert (found.shape, found.dtype) == ((8, height * width), np.int64)
+    for (y, x), (action, (dx, dy)) in product(np.ndindex(shape), enumerate(MOVES.tolist())):
+        inside = 0 <= x + dx < width and 0 <= y + dy < height
+        expected = (y + dy) * width + x + dx if inside else height * width
+        assert found[action, y * width + x] == expected
+
+
 @given(grids_with_free_cell(), RULES)
-def test_connected_cells_are_those_at_finite_distance(
+def test_connected_cells_have_a_finite_distance(
     grid_and_cell: tuple[GridMap, tuple[int, int]], rule: MoveRule
 ) -> None:
     grid, cell = grid_and_cell
@@ -55,32 +67,32 @@ def test_connected_cells_are_those_at_finite_distance(
     np.testing.assert_array_equal(connected_cells(grid.occupancy, cell, rule), expected)
 
 
-@given(priced_grids_with_free_cell(), RULES)
-def test_a_legal_move_costs_its_length_times_the_mean_price_and_the_same_in_return(
+@given(grids_with_costs(), RULES)
+def test_a_legal_move_costs_its_length_times_the_mean_cost_and_the_same_in_return(
     grid_and_cell: tuple[GridMap, tuple[int, int]], rule: MoveRule
 ) -> None:
     grid, _ = grid_and_cell
-    assert ((grid.price >= 1) & (grid.price <= MAX_PRICE)).all()
-    cost = move_costs(grid.price, rule)
+    assert ((grid.cost_multiplier >= 1) & (grid.cost_multiplier <= MAX_COST_MULTIPLIER)).all()
+    cost = move_costs(grid.cost_multiplier, rule)
     for action, y, x in np.argwhere(legal_moves(grid.occupancy, rule)).tolist():
         next_x, next_y = np.array([x, y]) + MOVES[action]
-        mean_price = (grid.price[y, x] + grid.price[next_y, next_x]) / 2
-        assert cost[action, y, x] == pytest.approx(rule.lengths[action] * mean_price)
+        mean_multiplier = (grid.cost_multiplier[y, x] + grid.cost_multiplier[next_y, next_x]) / 2
+        assert cost[action, y, x] == pytest.approx(rule.lengths[action] * mean_multiplier)
         assert cost[(action + 4) % 8, next_y, next_x] == cost[action, y, x]
         move = [(x, y), (next_x, next_y)]
-        assert path_cost(move, grid.price, rule) == pytest.approx(cost[action, y, x])
+        assert path_cost(move, grid.cost_multiplier, rule) == pytest.approx(cost[action, y, x])
 
 
 @pytest.mark.parametrize("rule", MoveRule)
 def test_a_rule_is_given_as_a_member_or_as_its_value(rule: MoveRule) -> None:
     occupancy = np.array([[0, 1, 0], [0, 0, 0], [0, 1, 1]], dtype=bool)
-    price, cells = np.arange(1, 10, dtype=np.float32).reshape(3, 3), [(0, 0), (1, 1), (2, 1)]
+    multiplier, cells = np.arange(1, 10, dtype=np.float32).reshape(3, 3), [(0, 0), (1, 1), (2, 1)]
     by_rule: list[Callable[[MoveRule | str], object]] = [
         lambda rule: legal_moves(occupancy, rule).tolist(),
-        lambda rule: move_costs(price, rule).tolist(),
+        lambda rule: move_costs(multiplier, rule).tolist(),
         lambda rule: connected_cells(occupancy, (2, 0), rule).tolist(),
         lambda rule: path_length(cells, rule),
-        lambda rule: path_cost(cells, price, rule),
+        lambda rule: path_cost(cells, multiplier, rule),
         lambda rule: shortest_distances(GridMap(occupancy), (0, 0), rule).tolist(),
         lambda rule: shortest_path(GridMap(occupancy), (0, 0), (2, 1), rule),
         lambda rule: simplify(cells, GridMap(occupancy), rule),
@@ -105,7 +117,7 @@ def test_a_length_counts_moves_under_the_unit_rule_and_along_straight_segments()
 
 
 def test_without_costs_a_path_costs_its_length_or_under_the_unit_rule_its_moves() -> None:
-    path, price = [(0, 0), (1, 1), (2, 1), (3, 2)], GridMap(np.zeros((3, 4))).price
-    assert path_cost(path, price, MoveRule.ROBOT_SAFE) == pytest.approx(path_length(path))
-    assert path_cost(path, price, MoveRule.UNIT) == 3
-    assert path_cost(path[:1], price, MoveRule.UNIT) == 0
+    path, multiplier = [(0, 0), (1, 1), (2, 1), (3, 2)], GridMap(np.zeros((3, 4))).cost_multiplier
+    assert path_cost(path, multiplier, MoveRule.ROBOT_SAFE) == pytest.approx(path_length(path))
+    assert path_cost(path, multiplier, MoveRule.UNIT) == 3
+    assert path_cost(path[:1], multiplier, MoveRule.UNIT) == 0

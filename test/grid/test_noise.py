@@ -5,14 +5,20 @@ import itertools
 import numpy as np
 import pytest
 
-from ddqn_planner.grid import GridMap, MoveRule, Noise, connected_cells, scatter_obstacles
-from ddqn_planner.planning import shortest_path
+from ddqn_planner.grid import (
+    GridMap,
+    MoveRule,
+    Noise,
+    connected_cells,
+    scatter_obstacles,
+    shortest_path,
+)
 from ddqn_planner.training.environment import Scenario
 
 
 @pytest.mark.parametrize("noise", Noise)
 @pytest.mark.parametrize("seed", range(20))
-def test_one_to_five_new_obstacles_lie_by_the_path_and_leave_a_way(
+def test_one_to_five_new_obstacles_lie_near_the_path_and_leave_a_path(
     paper: Scenario, noise: Noise, seed: int
 ) -> None:
     grid, rule = paper.grid, MoveRule.CORNER_CUTTING
@@ -29,7 +35,7 @@ def test_one_to_five_new_obstacles_lie_by_the_path_and_leave_a_way(
     assert connected_cells(noisy.occupancy, paper.goal, rule)[start_y, start_x]
 
 
-def test_as_many_as_the_paper_says_and_no_fewer_are_drawn(paper: Scenario) -> None:
+def test_all_counts_of_the_paper_are_drawn(paper: Scenario) -> None:
     path = shortest_path(paper.grid, paper.start, paper.goal, MoveRule.ROBOT_SAFE)
     occupied, counts = np.count_nonzero(paper.grid.occupancy), set()
     for seed in range(60):

@@ -1,4 +1,4 @@
-"""Real processes of the installed executables, and a client that talks to them over DDS."""
+"""Real processes of the installed executables, and clients that talk to them over DDS."""
 
 from __future__ import annotations
 
@@ -9,10 +9,10 @@ import re
 import shutil
 import signal
 import subprocess
-import threading
+import sys
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -75,6 +75,33 @@ class NodeProcess:
 RunNode = Callable[..., Any]
 
 
+def parameter_arguments(parameters: dict[str, Any] | None, file: Path) -> list[str]:
+    """Return the ROS arguments that set parameters, which are written to a file."""
+    if not parameters:
+        return []
+    # As a file: on the command line a YAML parser guesses the types of strings.
+    file.write_text(yaml.safe_dump({"/**": {"ros__parameters": parameters}}))
+    return ["--params-file", str(file)]
+
+
+@pytest.fixture
+def log_of_refused_start(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> Callable[[Callable[[], int], dict[str, Any]], str]:
+    """Return a function that sees a node refuse to start with parameters, and returns its log.
+
+    The node is in this process: to start one that imports torch takes seconds.
+    """
+
+    def start(main: Callable[[], int], parameters: dict[str, Any]) -> str:
+        arguments = parameter_arguments(parameters, tmp_path / "parameters.yaml")
+        monkeypatch.setattr(sys, "argv", ["node", "--ros-args", *arguments])
+        assert main() == 1
+        return capfd.readouterr().err
+
+    return start
+
+
 @pytest.fixture(scope="session")
 def run_node(tmp_path_factory: pytest.TempPathFactory) -> RunNode:
     """Return a context manager that runs an executable, stops it by SIGINT and sees it exit with 0.
@@ -93,12 +120,7 @@ def run_node(tmp_path_factory: pytest.TempPathFactory) -> RunNode:
         exit_code: int = 0,
     ) -> Iterator[NodeProcess]:
         number = next(numbers)
-        arguments = ["--ros-args"]
-        if parameters:
-            # As a file: on the command line a YAML parser guesses the types of strings.
-            file = logs / f"{number}.yaml"
-            file.write_text(yaml.safe_dump({"/**": {"ros__parameters": parameters}}))
-            arguments += ["--params-file", str(file)]
+        arguments = ["--ros-args", *parameter_arguments(parameters, logs / f"{number}.yaml")]
         for remap in [*(remaps or []), *([f"__ns:={namespace}"] if namespace else [])]:
             arguments += ["-r", remap]
         process = NodeProcess(name, arguments, logs / f"{number}.{name}.log")
@@ -111,115 +133,17 @@ def run_node(tmp_path_factory: pytest.TempPathFactory) -> RunNode:
     return run
 
 
-class Recorder:
-    """The messages that a topic brought since the last `clear`."""
-
-    def __init__(self) -> None:
-        self._arrived = threading.Condition()
-        self._messages: list[Any] = []
-        self._since = 0
-
-    def add(self, message: Any, info: dict[str, Any]) -> None:
-        """Note a message that was published after the last `clear`."""
-        with self._arrived:
-            if info["source_timestamp"] >= self._since:
-                self._messages.append(message)
-                self._arrived.notify_all()
-
-    def clear(self) -> None:
-        """Forget what came, and what is still on its way."""
-        with self._arrived:
-            self._messages.clear()
-            self._since = time.time_ns()
-
-    def wait(
-        self, predicate: Callable[[Any], bool] = lambda message: True, timeout: float = TIMEOUT
-    ) -> Any:
-        """Return the first message for which the predicate holds; there is a limit to the wait."""
-
-        def find() -> Any:
-            return next((message for message in self._messages if predicate(message)), None)
-
-        with self._arrived:
-            found = self._arrived.wait_for(find, timeout)
-            assert found is not None, f"no such message; there came {self._messages[-3:]}"
-            return found
-
-    def messages(self) -> list[Any]:
-        """Return what came since the last `clear`, in order."""
-        with self._arrived:
-            return [*self._messages]
-
-
-class Client:
-    """A node in a context of its own, spun in the background."""
-
-    def __init__(self, namespace: str) -> None:
-        from client import BackgroundNode
-
-        self._background = BackgroundNode("client", namespace)
-        self.node = self._background.node
-        self.close = self._background.close
-        self._clients: dict[str, Any] = {}
-        self._publishers: dict[str, Any] = {}
-
-    def call(self, service_type: Any, name: str, request: Any = None) -> Any:
-        """Wait for a service, call it, and return its response."""
-        if name not in self._clients:
-            self._clients[name] = self.node.create_client(service_type, name)
-        assert self._clients[name].wait_for_service(TIMEOUT), f"no service {name}"
-        answered = threading.Event()
-        future = self._clients[name].call_async(request or service_type.Request())
-        future.add_done_callback(lambda _: answered.set())
-        assert answered.wait(TIMEOUT), f"no answer from {name}"
-        return future.result()
-
-    def publish(self, topic: str, message: Any, qos: Any = 10, listeners: int = 1) -> None:
-        """Publish a message once so many listen."""
-        if topic not in self._publishers:
-            self._publishers[topic] = self.node.create_publisher(type(message), topic, qos)
-        deadline = time.monotonic() + TIMEOUT
-        while self._publishers[topic].get_subscription_count() < listeners:
-            assert time.monotonic() < deadline, f"nobody listens to {topic}"
-            time.sleep(0.01)
-        self._publishers[topic].publish(message)
-
-    def subscribe(self, message_type: Any, topic: str, qos: Any = 10) -> Recorder:
-        recorder = Recorder()
-        self.node.create_subscription(message_type, topic, recorder.add, qos)
-        return recorder
-
-    def set_parameters(self, node: str, **values: Any) -> list[Any]:
-        """Set parameters of a node one by one; return a SetParametersResult for each."""
-        from rcl_interfaces.srv import SetParameters
-        from rclpy.parameter import Parameter
-
-        messages = [Parameter(name, value=v).to_parameter_msg() for name, v in values.items()]
-        request = SetParameters.Request(parameters=messages)
-        results: list[Any] = self.call(SetParameters, f"{node}/set_parameters", request).results
-        return results
-
-    def get_parameter(self, node: str, name: str) -> Any:
-        from rcl_interfaces.srv import GetParameters
-        from rclpy.parameter import parameter_value_to_python
-
-        request = GetParameters.Request(names=[name])
-        response = self.call(GetParameters, f"{node}/get_parameters", request)
-        return parameter_value_to_python(response.values[0])
-
-
 @pytest.fixture(scope="module")
-def make_client() -> Iterator[Callable[[str], Client]]:
+def make_client() -> Iterator[Callable[[str], Any]]:
     """Return a function that makes a client in a namespace; all end with the test module."""
-    clients: list[Client] = []
+    from client import Client
 
-    def make(namespace: str = "") -> Client:
-        clients.append(Client(namespace))
-        return clients[-1]
+    with ExitStack() as clients:
 
-    yield make
-    for client in clients:
-        client.close()
+        def make(namespace: str = "") -> Client:
+            return clients.enter_context(Client(namespace))
+
+        yield make
 
 
 SMALL_MAP = """

@@ -10,29 +10,28 @@ from typing import Any
 
 import numpy as np
 import pytest
-import torch
+from client import TIMEOUT as TIMEOUT  # this and values_of are used by the tests of the planner
+from client import Client, initial_pose, map_message, pose, wait_for_map
+from client import values_of as values_of
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
-from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped, Quaternion
+from geometry_msgs.msg import PoseStamped, Quaternion
 from nav_msgs.msg import OccupancyGrid, Path
-from nav_msgs.srv import GetPlan
-from std_msgs.msg import Header
+from networks import turning_network
 
 from ddqn_planner.grid import Cell, GridMap, MoveRule, legal_moves
-from ddqn_planner.model import ModelMetadata, PaperQNetwork, save_model
-from ddqn_planner.nodes.conversions import occupancy_message, quaternion
+from ddqn_planner.model import ModelMetadata, save_model
 from ddqn_planner.nodes.runtime import LATCHED
 
 START, GOAL = (0, 0), (5, 5)
 RESOLUTION, ORIGIN = 0.5, (-1.0, 2.0, 0.0)
 GOAL_YAW = 1.2
-TIMEOUT = 120.0
 
 
 class Robot:
     """A planner node and what its user sees and does."""
 
     def __init__(
-        self, client: Any, values: np.ndarray, model: FilePath, name: str = "/robot/planner"
+        self, client: Client, values: np.ndarray, model: FilePath, name: str = "/robot/planner"
     ) -> None:
         self.client = client
         self.name = name
@@ -48,29 +47,23 @@ class Robot:
         return GridMap.from_occupancy_values(values, RESOLUTION, origin)
 
     def map_message(self) -> OccupancyGrid:
-        return occupancy_message(self.values, RESOLUTION, ORIGIN, Header(frame_id="map"))
+        return map_message(self.values, self.grid)
 
     def send_map(self, message: OccupancyGrid | None = None) -> None:
         self.client.publish("map", message or self.map_message(), LATCHED)
 
     def pose(self, cell: Cell, yaw: float = 0.0, grid: GridMap | None = None) -> PoseStamped:
-        stamped = PoseStamped(header=Header(frame_id="map"))
-        x, y = (grid or self.grid).cell_to_world(cell)
-        stamped.pose.position.x, stamped.pose.position.y = x + 0.05, y - 0.05
-        stamped.pose.orientation = quaternion(yaw)
-        return stamped
+        """Return a pose in a cell, a little beside its centre."""
+        return pose(grid or self.grid, cell, yaw, offset=0.05)
 
     def send_start(self, stamped: PoseStamped) -> None:
-        message = PoseWithCovarianceStamped(header=stamped.header)
-        message.pose.pose = stamped.pose
-        self.client.publish("initialpose", message)
+        self.client.publish("initialpose", initial_pose(stamped))
 
     def send_goal(self, stamped: PoseStamped) -> None:
         self.client.publish("goal_pose", stamped)
 
     def get_plan(self, start: PoseStamped, goal: PoseStamped) -> Path:
-        request = GetPlan.Request(start=start, goal=goal)
-        return self.client.call(GetPlan, "planner/get_plan", request).plan
+        return self.client.get_plan(start, goal)
 
     def wait_for_path(self, start: Cell, goal: Cell, grid: GridMap | None = None) -> Path:
         """Wait for a plan between two cells, and check all that can be said of it."""
@@ -103,16 +96,7 @@ class Robot:
 
     def wait_for_map(self, message: OccupancyGrid) -> None:
         """Wait until the planner has a map: its diagnostics name its stamp."""
-        stamp = f"{message.header.stamp.sec}.{message.header.stamp.nanosec:09d}"
-
-        def has_map(found: DiagnosticArray) -> bool:
-            status = found.status[0]
-            return (
-                status.name == f"{self.name}: plan"
-                and values_of(status).get("map stamp (s)") == stamp
-            )
-
-        self.diagnostics.wait(has_map)
+        wait_for_map(self.diagnostics, message.header.stamp, self.name)
 
     def begin(self) -> None:
         """Send a map, a start and a goal, and wait for the path."""
@@ -158,10 +142,6 @@ def check_path(path: Path, grid: GridMap, move_rule: MoveRule = MoveRule.ROBOT_S
         assert math.cos(turned - action * math.pi / 4) == pytest.approx(1.0)
 
 
-def values_of(status: DiagnosticStatus) -> dict[str, str]:
-    return {entry.key: entry.value for entry in status.values}
-
-
 def changed(message: Any, field: str, value: Any) -> Any:
     target = message
     *parents, name = field.split(".")
@@ -173,10 +153,6 @@ def changed(message: Any, field: str, value: Any) -> Any:
 
 def constant_model(path: FilePath, size: int, steps: int) -> None:
     """Write a model that always goes to -x, or where it cannot, to +x: it turns round for ever."""
-    network = PaperQNetwork(size, size, 1)
-    with torch.no_grad():
-        network.fully_connected.weight.zero_()
-        network.fully_connected.bias.copy_(torch.tensor([1, 0, 0, 0, 2, 0, 0, 0]))
-    sizes = {"height": size, "width": size, "filters": 1}
-    metadata = ModelMetadata("paper", sizes, MoveRule.ROBOT_SAFE, 0.9, "", steps, 0, "")
+    network = turning_network(size)
+    metadata = ModelMetadata("paper", network.sizes, MoveRule.ROBOT_SAFE, 0.9, "", steps, 0, "")
     save_model(path, network, metadata)

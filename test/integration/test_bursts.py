@@ -9,11 +9,13 @@ import pytest
 from bursts import BurstClients, burst_requests
 from nav_msgs.srv import GetMap
 
+pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("bursts")]
+
 
 @pytest.mark.parametrize("clients", [1, 20])
 @pytest.mark.parametrize("count", [20, 200])
 def test_each_request_of_a_burst_has_its_plan(robot: Any, clients: int, count: int) -> None:
-    with BurstClients(clients, name="/robot/planner/get_plan") as asking:
+    with BurstClients(clients, service="/robot/planner/get_plan") as asking:
         requests = burst_requests(robot.grid, [(5, 5)], count)
         answers = asking.burst(requests)
     assert len(answers) == count

@@ -14,14 +14,14 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from client import cells_of, initial_pose, pose
 from diagnostic_msgs.msg import DiagnosticArray
-from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped
 from nav_msgs.msg import OccupancyGrid
 from nav_msgs.msg import Path as PathMessage
 from processes import running
 
-from ddqn_planner.grid import Cell, path_length
-from ddqn_planner.nodes.conversions import grid_from_message, quaternion
+from ddqn_planner.grid import path_length
+from ddqn_planner.nodes.conversions import grid_from_message
 from ddqn_planner.nodes.runtime import LATCHED
 from ddqn_planner.training.environment import Scenario
 
@@ -35,7 +35,11 @@ PYTHONPATH = os.pathsep.join([str(ROOT / "scripts"), sysconfig.get_path("purelib
 
 COLCON = shutil.which("colcon", path=os.pathsep.join([sysconfig.get_path("scripts"), os.defpath]))
 
-pytestmark = pytest.mark.skipif(COLCON is None, reason="colcon is not installed")
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.xdist_group("colcon"),
+    pytest.mark.skipif(COLCON is None, reason="colcon is not installed"),
+]
 
 
 @pytest.fixture(scope="module")
@@ -140,6 +144,10 @@ def test_nodes_of_the_workspace_plan_with_its_model_on_its_map(
             *sourced(install, install / "ddqn_planner" / "lib" / "ddqn_planner" / name, *arguments)
         )
 
+    def names_model(message: DiagnosticArray) -> bool:
+        """The node speaks before it has loaded its model."""
+        return any(entry.key == "model file" for entry in message.status[0].values)
+
     client = make_client()
     diagnostics = client.subscribe(DiagnosticArray, "/diagnostics")
     maps = client.subscribe(OccupancyGrid, "map", LATCHED)
@@ -149,22 +157,13 @@ def test_nodes_of_the_workspace_plan_with_its_model_on_its_map(
         node("planner_node") as planner,
     ):
         grid = grid_from_message(maps.wait(timeout=START_TIMEOUT))
-        diagnosis = diagnostics.wait(timeout=START_TIMEOUT).status[0]
+        diagnosis = diagnostics.wait(names_model, timeout=START_TIMEOUT).status[0]
 
-        def pose(cell: Cell) -> PoseStamped:
-            message = PoseStamped()
-            message.header.frame_id = "map"
-            message.pose.position.x, message.pose.position.y = grid.cell_to_world(cell)
-            message.pose.orientation = quaternion(0.0)
-            return message
-
-        start = PoseWithCovarianceStamped(header=pose(paper.start).header)
-        start.pose.pose = pose(paper.start).pose
-        client.publish("initialpose", start)
-        client.publish("goal_pose", pose(paper.goal))
+        client.publish("initialpose", initial_pose(pose(grid, paper.start)))
+        client.publish("goal_pose", pose(grid, paper.goal))
         plan = plans.wait(lambda message: message.poses)
 
-    cells = [grid.world_to_cell(p.pose.position.x, p.pose.position.y) for p in plan.poses]
+    cells = cells_of(grid, plan)
     assert (cells[0], cells[-1]) == (paper.start, paper.goal)
     # The optimum of the default model's rule, which does not cut corners.
     assert path_length(cells) == pytest.approx(14 + 8 * 2**0.5)

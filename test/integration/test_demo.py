@@ -18,6 +18,8 @@ import pytest
 from PIL import Image
 from processes import running
 
+pytestmark = pytest.mark.slow
+
 DEMO = Path(__file__).resolve().parents[2] / "scripts" / "demo.py"
 END_TIMEOUT = 240.0
 """Seconds that the whole demo may take on a loaded machine."""
@@ -117,6 +119,11 @@ def test_signal_while_a_node_is_started_does_not_lose_the_node(
 
     popen = subprocess.Popen
     monkeypatch.setattr(subprocess, "Popen", start)
-    with pytest.raises(KeyboardInterrupt), running("sleep", "60"):
-        pass
+    # A shell starts what it runs in the background with SIGINT ignored.
+    handler = signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        with pytest.raises(KeyboardInterrupt), running("sleep", "60"):
+            pass
+    finally:
+        signal.signal(signal.SIGINT, handler)
     assert children[0].returncode == -signal.SIGINT

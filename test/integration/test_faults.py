@@ -7,6 +7,10 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
+pytestmark = pytest.mark.slow
+
 FAULTS = Path(__file__).resolve().parents[2] / "scripts" / "faults.py"
 TIMEOUT = 180.0
 """Seconds that it may take on a loaded machine."""

@@ -9,14 +9,16 @@ from typing import Any
 import numpy as np
 import pytest
 from bursts import load_bursts
-from client import plan_request, pose
-from load import Client, Terrain, load_goals, load_requests
+from client import Client, plan_request, pose
+from load import load_goals, load_requests
+from map_fixture import MapFixture
 from nav_msgs.msg import Path as PathMessage
 from soak import Work, growth, soak
 
 from ddqn_planner.grid import Cell, MapFile
 
 
+@pytest.mark.slow
 def test_every_answer_is_right_while_the_map_changes_and_goals_are_planned_in_order(
     run_node: Callable[..., Any], capfd: pytest.CaptureFixture[str]
 ) -> None:
@@ -28,7 +30,7 @@ def test_every_answer_is_right_while_the_map_changes_and_goals_are_planned_in_or
 
 
 @pytest.mark.parametrize(
-    ("start", "goal", "path", "fault"),
+    ("start", "goal", "path", "error"),
     [
         ((0, 0), (1, 1), [(0, 0), (0, 1), (1, 1)], ""),
         ((0, 0), (0, 0), [(0, 0)], ""),
@@ -43,17 +45,18 @@ def test_every_answer_is_right_while_the_map_changes_and_goals_are_planned_in_or
         ((0, 0), (0, 1), [(0, 0), (-1, 0), (0, 1)], "illegal move"),
     ],
 )
-def test_the_check_of_an_answer_finds_each_fault(
-    start: Cell, goal: Cell, path: list[Cell], fault: str
+def test_the_check_of_an_answer_finds_each_error(
+    start: Cell, goal: Cell, path: list[Cell], error: str
 ) -> None:
     values = np.array([[0, 100, 0], [0, 0, 100], [0, 100, 0]], dtype=np.int8)
-    terrain = Terrain(MapFile(values, 0.1, (1.0, 2.0, 0.3)))
-    plan = PathMessage(poses=[pose(terrain.grid, cell) for cell in path])
-    found = terrain.fault(plan_request(terrain.grid, start, goal), plan)
-    assert fault in found
-    assert bool(fault) == bool(found)
+    fixture = MapFixture(MapFile(values, 0.1, (1.0, 2.0, 0.3)))
+    plan = PathMessage(poses=[pose(fixture.grid, cell) for cell in path])
+    found = fixture.error(plan_request(fixture.grid, start, goal), plan)
+    assert error in found
+    assert bool(error) == bool(found)
 
 
+@pytest.mark.slow
 def test_mixed_work_with_bad_input_is_answered_and_sampled(
     run_node: Callable[..., Any], tmp_path: Path
 ) -> None:

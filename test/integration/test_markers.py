@@ -6,9 +6,9 @@ from rclpy.serialization import serialize_message
 from std_msgs.msg import Header
 from visualization_msgs.msg import Marker
 
-from ddqn_planner.grid import MOVES, Cell, GridMap, MoveRule, legal_moves
+from ddqn_planner.grid import MOVES, Cell, GridMap, MoveRule, legal_moves, shortest_distances
 from ddqn_planner.nodes.markers import MAX_ARROWS, policy_message
-from ddqn_planner.planning import QField, shortest_distances
+from ddqn_planner.planning import QField
 
 HEADER = Header(frame_id="map")
 
@@ -33,7 +33,7 @@ def arrows_of(marker: Marker) -> np.ndarray:
 
 
 @pytest.mark.parametrize("origin", [(0.0, 0.0, 0.0), (-1.0, 2.0, 0.7), (3.0, 0.0, -2.5)])
-def test_each_free_cell_but_the_goal_has_its_greedy_arrow(
+def test_each_free_cell_except_the_goal_has_its_greedy_arrow(
     small_values: np.ndarray, origin: tuple[float, float, float]
 ) -> None:
     grid = GridMap.from_occupancy_values(small_values, 0.5, origin)

@@ -69,7 +69,7 @@ def test_goal_pose_is_answered_by_a_plan_a_value_and_diagnostics(robot: Robot) -
     assert values["status"] == "SUCCEEDED"
     steps = np.hypot(*np.diff(points_of(path), axis=0).T)
     assert float(values["path length (cells)"]) == pytest.approx(steps.sum() / RESOLUTION, abs=1e-2)
-    assert float(values["walk time (ms)"]) > 0
+    assert float(values["rollout time (ms)"]) > 0
     assert values["model file"] == values["model"] == str(robot.model)
     assert values["model move rule"] == values["move rule"] == "robot_safe"
     assert values["model training steps"] == "3000"
@@ -209,7 +209,7 @@ def test_reload_plans_again_with_what_the_file_holds_now(
     robot.plans.wait(lambda path: not path.poses)
     status = robot.wait_for_reason("greedy steps do not find it.*cell \\(0, 0\\).*train the model")
     assert status.level == DiagnosticStatus.WARN
-    assert values_of(status)["status"] == "WALK_TRAPPED"
+    assert values_of(status)["status"] == "ROLLOUT_TRAPPED"
     assert values_of(status)["model training steps"] == "7"
     shutil.copy(trained_model, whole_model)
     assert robot.client.call(Trigger, "planner/reload_model").success
@@ -426,7 +426,7 @@ def test_goal_waits_while_the_map_is_in_another_frame(robot: Robot) -> None:
 # The model for any map, which is there without a parameter
 
 
-def test_without_parameters_it_plans_on_maps_of_any_size_and_heeds_prices(
+def test_without_parameters_it_plans_on_maps_of_any_size_and_heeds_costs(
     run_node: Any, make_client: Callable[[str], Any], model: FilePath
 ) -> None:
     client, random = make_client("/anywhere"), np.random.default_rng(0)
@@ -450,7 +450,7 @@ def test_without_parameters_it_plans_on_maps_of_any_size_and_heeds_prices(
         robot.send_map()
         straight = robot.get_plan(robot.pose((0, 3)), robot.pose((19, 3)))
         assert length_of(straight) == pytest.approx(19 * RESOLUTION)
-        assert client.set_parameters("planner", priced=True)[0].successful
+        assert client.set_parameters("planner", use_map_costs=True)[0].successful
         around = robot.get_plan(robot.pose((0, 3)), robot.pose((19, 3)))
         check_path(around, robot.grid)
         cells = [robot.grid.world_to_cell(x, y) for x, y in points_of(around)]
@@ -594,7 +594,7 @@ def test_all_else_is_answered_while_a_path_is_searched_for(
         robot.send_map()
         robot.wait_for_map(robot.map_message())
         assert robot.get_plan(robot.pose(START), robot.pose(GOAL)).poses == []
-        assert client.set_parameters("planner", mode="guided")[0].successful
+        assert client.set_parameters("planner", mode="astar_fallback")[0].successful
         gate.unlink()
         plans = client.node.create_client(GetPlan, "planner/get_plan")
         assert plans.wait_for_service(TIMEOUT)

@@ -210,7 +210,7 @@ def test_simplified_paths_have_fewer_poses_and_no_illegal_segment(robot: Robot) 
 # Searching
 
 
-def test_a_bad_model_plans_in_guided_mode_and_says_that_it_searched(
+def test_a_bad_model_plans_in_fallback_mode_and_says_that_it_searched(
     run_node: Any,
     make_client: Callable[[str], Any],
     small_values: np.ndarray,
@@ -224,8 +224,8 @@ def test_a_bad_model_plans_in_guided_mode_and_says_that_it_searched(
         robot.send_map()
         wait_for_map(robot)
         assert robot.get_plan(robot.pose((0, 0)), robot.pose((5, 5))).poses == []
-        robot.wait_for_reason("greedy steps do not find it.*or set mode to 'guided'")
-        with parameters_of(robot, mode="guided"):
+        robot.wait_for_reason("greedy steps do not find it.*or set mode to 'astar_fallback'")
+        with parameters_of(robot, mode="astar_fallback"):
             for goal in grid.free_cells()[::3]:
                 distances = shortest_distances(grid, goal, RULE)
                 for start in grid.free_cells():
@@ -234,7 +234,7 @@ def test_a_bad_model_plans_in_guided_mode_and_says_that_it_searched(
                     check_path(plan, grid)
             robot.get_plan(robot.pose((0, 0)), robot.pose((5, 5)))
             status = robot.wait_for_reason("searched for in the order of the Q field")
-            assert values_of(status)["method"] == "guided"
+            assert values_of(status)["method"] == "astar_fallback"
             assert status.level == DiagnosticStatus.OK
             node.wait_for_log("a path of .* searched for in the order of the Q field")
             # Of the two moves that the model knows one leads there.
@@ -461,7 +461,7 @@ def test_parameters_that_come_together_are_set_together_or_not_at_all(robot: Rob
         name = "planner/set_parameters_atomically"
         return robot.client.call(SetParametersAtomically, name, request).result
 
-    good = {"robot_radius": 0.4, "mode": "guided", "occupied_threshold": 50}
+    good = {"robot_radius": 0.4, "mode": "astar_fallback", "occupied_threshold": 50}
     before = {name: robot.client.get_parameter("planner", name) for name in good}
     for bad, reason in (
         ({"clearance_weight": 1.5}, "out of range"),

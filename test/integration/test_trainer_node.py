@@ -2,10 +2,13 @@ from __future__ import annotations
 
 import csv
 import itertools
+import os
 import queue
 import re
 import resource
 import signal
+import subprocess
+import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -35,6 +38,7 @@ from std_srvs.srv import Trigger
 
 from ddqn_planner.grid import MOVES, GridMap, MoveRule, legal_moves, read_map_file
 from ddqn_planner.model import load_model
+from ddqn_planner.nodes import trainer_node
 from ddqn_planner.nodes.conversions import occupancy_message, quaternion
 from ddqn_planner.nodes.runtime import LATCHED
 from ddqn_planner.training.environment import Scenario
@@ -183,7 +187,7 @@ def test_episodes_are_drawn_on_the_map_of_their_own_training(
         assert client.call(Trigger, "trainer/replay").success
         for _ in range(20):
             assert next_episode() == ("map", {0.5})
-        # Of a training that this process has not seen: the last map is the best guess.
+        # This process has not seen that training: the last map is the best guess.
         (tmp_path / "run").rename(tmp_path / "earlier")
         client.set_parameters("trainer", output_folder=str(tmp_path / "earlier"))
         assert client.call(Trigger, "trainer/replay").success
@@ -227,7 +231,7 @@ def test_a_replay_is_not_mixed_with_the_training_and_stop_says_what_it_stopped(
         assert stop() == "no training was running"
 
 
-def test_the_log_says_when_a_training_begins_and_what_is_saved(
+def test_the_log_says_when_a_training_starts_and_what_is_saved(
     run_node: Any, make_client: Any, namespace: str, small_values: Any, tmp_path: FilePath
 ) -> None:
     client = make_client(namespace)
@@ -262,7 +266,7 @@ def test_a_folder_of_something_else_or_in_use_is_refused_and_left_as_it_is(
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_a_signal_saves_a_checkpoint_from_which_a_new_process_goes_on(
+def test_a_signal_saves_a_checkpoint_that_a_new_process_continues(
     run_node: Any, make_client: Any, namespace: str, tmp_path: FilePath, number: int
 ) -> None:
     client = make_client(namespace)
@@ -338,7 +342,7 @@ def test_a_planner_that_follows_the_trainer_plans_with_each_model_it_saves(
         ("map", OccupancyGrid(header=Header(frame_id="map")), "resolution"),
     ],
 )
-def test_bad_input_is_refused_by_name_and_the_training_goes_on(
+def test_bad_input_is_refused_by_name_and_the_training_continues(
     training: Any, topic: str, message: Any, named: str
 ) -> None:
     client, diagnostics, namespace = training
@@ -351,18 +355,27 @@ def test_bad_input_is_refused_by_name_and_the_training_goes_on(
 
 
 @pytest.fixture(scope="module")
-def training(
+def trainer(
     run_node: Any, make_client: Any, small_values: Any, tmp_path_factory: pytest.TempPathFactory
 ) -> Any:
-    """A trainer that trains, and its diagnostics."""
+    """A trainer that can train, and its diagnostics."""
     namespace = "/training"
     client = make_client(namespace)
     folder = tmp_path_factory.mktemp("training")
     with run_node("trainer_node", {**ENDLESS, "output_folder": str(folder)}, namespace=namespace):
         diagnostics = Listener(client, DiagnosticArray, "/diagnostics")
         set_up(client, small_values, stamped(0.5, 0.5), stamped(5.5, 5.5))
-        start_training(client)
         yield client, diagnostics, namespace
+
+
+@pytest.fixture
+def training(trainer: Any) -> Any:
+    """A trainer that trains during the test, but not beside the tests after it."""
+    client, diagnostics, namespace = trainer
+    start_training(client)
+    yield trainer
+    client.call(Trigger, "trainer/stop")
+    wait_for_state(diagnostics, namespace, state="stopped")
 
 
 def test_a_folder_with_another_training_is_left_alone(
@@ -394,12 +407,11 @@ def test_a_folder_with_another_training_is_left_alone(
     ],
 )
 def test_a_node_does_not_start_with_an_invalid_parameter(
-    run_node: Any, namespace: str, parameters: dict[str, Any], reason: str
+    log_of_refused_start: Any, parameters: dict[str, Any], reason: str
 ) -> None:
-    with run_node("trainer_node", parameters, namespace=namespace, exit_code=1) as node:
-        assert node.process.wait(TIMEOUT) == 1
-    assert re.search(reason, node.log)
-    assert "Traceback" not in node.log
+    log = log_of_refused_start(trainer_node.main, parameters)
+    assert re.search(reason, log)
+    assert "Traceback" not in log
 
 
 def test_a_map_file_that_cannot_be_read_ends_the_start_with_its_reason(run_node: Any) -> None:
@@ -438,9 +450,9 @@ def message_of(name: str, value: Any) -> Any:
     ],
 )
 def test_an_invalid_value_is_refused_with_its_reason_and_nothing_is_half_set(
-    training: Any, name: str, value: Any, reason: str
+    trainer: Any, name: str, value: Any, reason: str
 ) -> None:
-    client, _, _ = training
+    client, _, _ = trainer
     good = [message_of("replay_capacity", 3000), message_of("epsilon_end", 0.2)]
     assert set_atomically(client, *good).successful
     for order in (1, -1):
@@ -457,16 +469,16 @@ def test_an_invalid_value_is_refused_with_its_reason_and_nothing_is_half_set(
     assert not result.successful
 
 
-def test_values_that_limit_one_another_can_be_set_together(training: Any) -> None:
-    client, _, _ = training
+def test_values_that_limit_one_another_can_be_set_together(trainer: Any) -> None:
+    client, _, _ = trainer
     both = message_of("environments", 4096), message_of("replay_capacity", 4096)
     assert set_atomically(client, *both).successful
     both = message_of("replay_capacity", 50_000), message_of("environments", 1)
     assert set_atomically(client, *both).successful
 
 
-def test_a_value_of_an_unknown_type_is_refused(training: Any) -> None:
-    client, _, _ = training
+def test_a_value_of_an_unknown_type_is_refused(trainer: Any) -> None:
+    client, _, _ = trainer
     strange = ParameterMessage(name="seed", value=ParameterValue(type=77))
     assert "ParameterType" in set_atomically(client, strange).reason
     request = SetParameters.Request(parameters=[strange, message_of("seed", 7)])
@@ -475,8 +487,8 @@ def test_a_value_of_an_unknown_type_is_refused(training: Any) -> None:
     assert client.get_parameter("trainer", "seed") == 7
 
 
-def test_each_parameter_says_what_may_be_set(training: Any) -> None:
-    client, _, _ = training
+def test_each_parameter_says_what_may_be_set(trainer: Any) -> None:
+    client, _, _ = trainer
     names = client.call(ListParameters, "trainer/list_parameters").result.names
     own = [name for name in names if name not in ("use_sim_time", "start_type_description_service")]
     request = DescribeParameters.Request(names=own)
@@ -515,7 +527,7 @@ def no_folder(_: Any, folder: FilePath) -> Iterator[None]:
 
 
 @pytest.mark.parametrize("fault", [full_disk, no_folder])
-def test_a_fault_of_the_disk_is_said_once_and_the_training_goes_on(
+def test_a_disk_error_is_logged_once_and_the_training_continues(
     run_node: Any,
     make_client: Any,
     namespace: str,
@@ -570,7 +582,7 @@ def wait_until(condition: Callable[[], bool]) -> None:
         time.sleep(0.02)
 
 
-def test_a_last_save_that_fails_is_said_when_the_node_ends(
+def test_a_last_save_that_fails_is_logged_when_the_node_ends(
     run_node: Any, make_client: Any, namespace: str, small_values: Any, tmp_path: FilePath
 ) -> None:
     client, folder = make_client(namespace), tmp_path / "run"
@@ -614,6 +626,33 @@ def test_what_cannot_be_started_or_replayed_is_answered_with_the_remedy(
         assert "smaller filters, batch_size, environments or replay_capacity" in answer.message
         client.set_parameters("trainer", replay_capacity=1000)
         assert client.call(Trigger, "trainer/start").success
+
+
+def test_the_module_of_the_node_imports_no_torch() -> None:
+    loaded = "import sys, ddqn_planner.nodes.trainer_node; sys.exit('torch' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", loaded]).returncode == 0
+
+
+@pytest.mark.parametrize("library", ["torch", "gymnasium"])
+def test_without_its_libraries_a_start_is_refused_and_the_node_lives(
+    library: str,
+    run_node: Any,
+    make_client: Any,
+    namespace: str,
+    tmp_path: FilePath,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    missing = f"No module named '{library}'"
+    (tmp_path / f"{library}.py").write_text(f'raise ModuleNotFoundError("{missing}")')
+    monkeypatch.setenv("PYTHONPATH", f"{tmp_path}:{os.environ.get('PYTHONPATH', '')}")
+    client = make_client(namespace)
+    parameters = {"map_file": "dilemma", "output_folder": str(tmp_path / "run")}
+    with run_node("trainer_node", parameters, namespace=namespace) as node:
+        answer = client.call(Trigger, "trainer/start")
+        assert not answer.success
+        assert f"needs another library ({missing})" in answer.message
+        assert "call ~/start first" in client.call(Trigger, "trainer/replay").message
+    assert "Traceback" not in node.log
 
 
 @pytest.mark.hypothesis

@@ -22,7 +22,7 @@ from std_msgs.msg import Float32, Header
 from ddqn_planner.cli import main
 from ddqn_planner.nodes.conversions import grid_from_message, occupancy_message, path_message
 from ddqn_planner.nodes.runtime import LATCHED
-from ddqn_planner.planning.picture import value_ramp
+from ddqn_planner.pictures.colours import value_ramp
 
 pytest.importorskip("rerun", reason="rerun, of the extra watch, is missing")
 from rerun.chunk import RrdReader
@@ -137,7 +137,7 @@ def test_a_recording_holds_what_the_nodes_published(
 
 
 @pytest.mark.parametrize("display", [{}, {"DISPLAY": ":4242"}])
-def test_without_a_display_it_ends_with_the_remedy(
+def test_without_a_display_it_exits_and_says_what_to_do(
     tmp_path: FilePath, display: dict[str, str]
 ) -> None:
     with socket.socket() as connection:
@@ -162,10 +162,10 @@ def test_without_a_display_it_ends_with_the_remedy(
     ("missing", "remedy"),
     [
         ("rerun", "pip install 'ddqn_planner[watch]'"),
-        ("rclpy.node", "pip install 'ddqn_planner[ros]', or source ROS 2 Jazzy"),
+        ("rclpy.node", "source ROS 2 Jazzy, or pip install 'ddqn_planner[ros]'"),
     ],
 )
-def test_a_missing_library_is_named_with_its_remedy(
+def test_a_missing_library_is_named_with_the_way_to_install_it(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], missing: str, remedy: str
 ) -> None:
     monkeypatch.delitem(sys.modules, "ddqn_planner.nodes.watch")

@@ -14,22 +14,21 @@ from typing import Any
 
 import numpy as np
 import pytest
-import safetensors.torch
-import torch
+import safetensors.numpy
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from strategies import priced_grids_with_free_cell
+from networks import random_network
+from strategies import grids_with_costs
 
 from ddqn_planner.grid import Cell, GridMap, MoveRule
 from ddqn_planner.model import (
     ModelFileError,
     ModelMetadata,
-    PaperQNetwork,
+    QNetwork,
     load_model,
-    new_network,
     save_model,
 )
-from ddqn_planner.model.propagation import MAX_LEARNED_PRICE
+from ddqn_planner.model.networks import MAX_LEARNED_MULTIPLIER
 
 METADATA = ModelMetadata(
     network="paper",
@@ -47,27 +46,26 @@ same_folder = settings(suppress_health_check=[HealthCheck.function_scoped_fixtur
 
 
 @pytest.fixture
-def network() -> PaperQNetwork:
-    return PaperQNetwork(4, 5, filters=2)
+def network() -> QNetwork:
+    return random_network("paper", **METADATA.sizes)
 
 
 @pytest.fixture
-def model_path(tmp_path: Path, network: PaperQNetwork) -> Path:
+def model_path(tmp_path: Path, network: QNetwork) -> Path:
     path = tmp_path / "model.safetensors"
     save_model(path, network, METADATA)
     return path
 
 
-def test_a_saved_model_comes_back_the_same(model_path: Path, network: PaperQNetwork) -> None:
+def test_a_saved_model_comes_back_the_same(model_path: Path, network: QNetwork) -> None:
     loaded, metadata = load_model(model_path)
     assert metadata == METADATA
-    assert not any(weight.requires_grad for weight in loaded.parameters())
     request = GridMap(np.zeros((4, 5))), (1, 1), MoveRule.ROBOT_SAFE
     np.testing.assert_array_equal(loaded.q_values(*request), network.q_values(*request))
 
 
 def test_a_model_file_that_names_no_hidden_units_has_none(
-    tmp_path: Path, network: PaperQNetwork
+    tmp_path: Path, network: QNetwork
 ) -> None:
     path = tmp_path / "old.safetensors"
     save_model(path, network, replace(METADATA, sizes={"height": 4, "width": 5, "filters": 2}))
@@ -79,7 +77,7 @@ def test_a_model_file_that_names_no_hidden_units_has_none(
 
 def test_a_network_with_a_hidden_layer_comes_back_the_same(tmp_path: Path) -> None:
     sizes = {**METADATA.sizes, "hidden_units": 3}
-    network = PaperQNetwork(**sizes)
+    network = random_network("paper", **sizes)
     save_model(tmp_path / "hidden.safetensors", network, replace(METADATA, sizes=sizes))
     loaded, metadata = load_model(tmp_path / "hidden.safetensors")
     assert metadata.sizes == sizes
@@ -110,15 +108,15 @@ def test_a_file_with_one_wrong_byte_is_a_model_or_refused(model_path: Path) -> N
         except ModelFileError:
             refused += 1
         else:
-            assert all(tensor.isfinite().all() for tensor in network.state_dict().values())
+            assert all(np.isfinite(tensor).all() for tensor in network.tensors.values())
     assert refused > 100
 
 
 def test_a_loaded_model_does_not_change_with_its_file(model_path: Path) -> None:
     loaded, _ = load_model(model_path)
-    before = {key: tensor.clone() for key, tensor in loaded.state_dict().items()}
+    before = {key: tensor.copy() for key, tensor in loaded.tensors.items()}
     model_path.write_bytes(bytes(model_path.stat().st_size))
-    assert all(torch.equal(before[key], tensor) for key, tensor in loaded.state_dict().items())
+    assert all((before[key] == tensor).all() for key, tensor in loaded.tensors.items())
 
 
 def test_a_pickle_is_not_run(tmp_path: Path) -> None:
@@ -133,11 +131,9 @@ def test_a_pickle_is_not_run(tmp_path: Path) -> None:
     assert not (tmp_path / "exploded").exists()
 
 
-def save_as(path: Path, weights: PaperQNetwork, /, **changes: object) -> None:
+def save_as(path: Path, weights: QNetwork, /, **changes: object) -> None:
     description = {**asdict(METADATA), **changes}
-    content = safetensors.torch.save(
-        weights.state_dict(), {"ddqn_planner": json.dumps(description)}
-    )
+    content = safetensors.numpy.save(weights.tensors, {"ddqn_planner": json.dumps(description)})
     path.write_bytes(content)
 
 
@@ -166,7 +162,7 @@ def save_as(path: Path, weights: PaperQNetwork, /, **changes: object) -> None:
     ],
 )
 def test_wrong_metadata_is_refused_by_name(
-    tmp_path: Path, network: PaperQNetwork, changes: dict[str, object], named: str
+    tmp_path: Path, network: QNetwork, changes: dict[str, object], named: str
 ) -> None:
     path = tmp_path / "model.safetensors"
     save_as(path, network, **changes)
@@ -176,7 +172,7 @@ def test_wrong_metadata_is_refused_by_name(
 
 @pytest.mark.parametrize("kind", ["propagation", "any_map"])
 def test_a_network_for_any_size_comes_back_the_same(tmp_path: Path, kind: str) -> None:
-    path, network = tmp_path / "model.safetensors", new_network(kind, {"filters": 3})
+    path, network = tmp_path / "model.safetensors", random_network(kind, filters=3)
     description = replace(METADATA, network=kind, sizes={"filters": 3})
     save_model(path, network, description)
     loaded, read = load_model(path)
@@ -187,20 +183,18 @@ def test_a_network_for_any_size_comes_back_the_same(tmp_path: Path, kind: str) -
 
 def test_safetensors_of_another_program_are_refused(tmp_path: Path) -> None:
     path = tmp_path / "model.safetensors"
-    path.write_bytes(safetensors.torch.save({"weight": torch.zeros(2)}))
+    path.write_bytes(safetensors.numpy.save({"weight": np.zeros(2)}))
     with pytest.raises(ModelFileError, match="no model of ddqn_planner"):
         load_model(path)
 
 
 @pytest.mark.parametrize("key", list(asdict(METADATA)))
-def test_metadata_without_a_key_is_refused(
-    tmp_path: Path, network: PaperQNetwork, key: str
-) -> None:
+def test_metadata_without_a_key_is_refused(tmp_path: Path, network: QNetwork, key: str) -> None:
     description = asdict(METADATA)
     del description[key]
     path = tmp_path / "model.safetensors"
     text = json.dumps(description)
-    path.write_bytes(safetensors.torch.save(network.state_dict(), {"ddqn_planner": text}))
+    path.write_bytes(safetensors.numpy.save(network.tensors, {"ddqn_planner": text}))
     with pytest.raises(ModelFileError, match=rf"metadata is wrong .*{key}"):
         load_model(path)
 
@@ -223,7 +217,7 @@ def test_metadata_of_any_json_is_a_models_or_refused(
     tmp_path: Path, changes: dict[str, Any]
 ) -> None:
     path = tmp_path / "model.safetensors"
-    save_as(path, PaperQNetwork(4, 5, filters=2), **changes)
+    save_as(path, random_network("paper", **METADATA.sizes), **changes)
     try:
         _, read = load_model(path)
     except ModelFileError:
@@ -234,45 +228,44 @@ def test_metadata_of_any_json_is_a_models_or_refused(
 @pytest.mark.parametrize("text", ["", "null", "[1, 2", "[" * 10**5, "7", "{}", "1" * 5000])
 def test_metadata_that_is_no_object_is_refused(tmp_path: Path, text: str) -> None:
     path = tmp_path / "model.safetensors"
-    path.write_bytes(safetensors.torch.save({"x": torch.zeros(1)}, {"ddqn_planner": text}))
+    path.write_bytes(safetensors.numpy.save({"x": np.zeros(1)}, {"ddqn_planner": text}))
     with pytest.raises(ModelFileError, match="metadata is wrong"):
         load_model(path)
 
 
-Tensors = dict[str, torch.Tensor]
+Tensors = dict[str, np.ndarray]
 
 
 @pytest.mark.parametrize(
     "change",
     [
-        lambda tensors: tensors.update(more=torch.zeros(1)),
+        lambda tensors: tensors.update(more=np.zeros(1, np.float32)),
         lambda tensors: tensors.pop("convolution.bias"),
-        lambda tensors: tensors.update({"convolution.bias": torch.zeros(3)}),
-        lambda tensors: tensors.update({"convolution.bias": torch.zeros(1, 2)}),
-        lambda tensors: tensors.update({"convolution.bias": torch.zeros(2, dtype=torch.float64)}),
-        lambda tensors: tensors.update({"convolution.bias": torch.zeros(2, dtype=torch.float16)}),
-        lambda tensors: tensors.update({"convolution.bias": torch.zeros(2, dtype=torch.int32)}),
+        lambda tensors: tensors.update({"convolution.bias": np.zeros(3, np.float32)}),
+        lambda tensors: tensors.update({"convolution.bias": np.zeros((1, 2), np.float32)}),
+        lambda tensors: tensors.update({"convolution.bias": np.zeros(2, dtype=np.float64)}),
+        lambda tensors: tensors.update({"convolution.bias": np.zeros(2, dtype=np.float16)}),
+        lambda tensors: tensors.update({"convolution.bias": np.zeros(2, dtype=np.int32)}),
         lambda tensors: tensors.clear(),
     ],
 )
 def test_tensors_of_another_network_are_refused(
-    tmp_path: Path, network: PaperQNetwork, change: Callable[[Tensors], object]
+    tmp_path: Path, network: QNetwork, change: Callable[[Tensors], object]
 ) -> None:
     path = tmp_path / "model.safetensors"
-    tensors = dict(network.state_dict())
+    tensors = dict(network.tensors)
     change(tensors)
     text = json.dumps(asdict(METADATA))
-    path.write_bytes(safetensors.torch.save(tensors, {"ddqn_planner": text}))
+    path.write_bytes(safetensors.numpy.save(tensors, {"ddqn_planner": text}))
     with pytest.raises(ModelFileError, match="holds tensors"):
         load_model(path)
 
 
-@pytest.mark.parametrize("weight", [torch.nan, torch.inf, -torch.inf])
+@pytest.mark.parametrize("weight", [np.nan, np.inf, -np.inf])
 def test_weights_that_are_not_finite_are_refused(
-    tmp_path: Path, network: PaperQNetwork, weight: float
+    tmp_path: Path, network: QNetwork, weight: float
 ) -> None:
-    with torch.no_grad():
-        network.fully_connected.bias[0] = weight
+    network.tensors["fully_connected.bias"][0] = weight
     path = tmp_path / "model.safetensors"
     save_model(path, network, METADATA)
     with pytest.raises(ModelFileError, match="not all finite"):
@@ -281,7 +274,7 @@ def test_weights_that_are_not_finite_are_refused(
 
 @same_folder
 @given(
-    priced_grids_with_free_cell(),
+    grids_with_costs(),
     st.sampled_from(["any_map", "propagation"]),
     st.sampled_from(MoveRule),
     st.integers(0, 2**32 - 1),
@@ -295,16 +288,15 @@ def test_whatever_finite_weights_say_each_q_is_a_length_or_no_way(
     seed: int,
     exponent: float,
 ) -> None:
-    path, network = tmp_path / "model.safetensors", new_network(kind, {"filters": 3})
-    generator = torch.Generator().manual_seed(seed)
-    for weights in network.requires_grad_(False).parameters():
-        normal = torch.randn(weights.shape, generator=generator, dtype=torch.float64)
-        weights.copy_((normal * 10**exponent).clamp(-3e38, 3e38))
+    path, network = tmp_path / "model.safetensors", random_network(kind, filters=3)
+    generator = np.random.default_rng(seed)
+    for weights in network.tensors.values():
+        weights[:] = np.clip(generator.normal(size=weights.shape) * 10**exponent, -3e38, 3e38)
     save_model(path, network, replace(METADATA, network=kind, sizes={"filters": 3}))
     grid, goal = grid_and_goal
     loaded, _ = load_model(path)
     q = loaded.q_values(grid, goal, rule)
-    longest = 2 * MAX_LEARNED_PRICE * grid.occupancy.size
+    longest = 2 * MAX_LEARNED_MULTIPLIER * grid.occupancy.size
     assert (np.isneginf(q) | ((q <= -1) & (q >= -longest))).all()
 
 
@@ -369,7 +361,7 @@ def test_what_is_no_regular_file_is_refused(tmp_path: Path) -> None:
             load_model(tmp_path / f"{name}.safetensors")
 
 
-def test_an_unreadable_file_is_refused(plain_folder: Path, network: PaperQNetwork) -> None:
+def test_an_unreadable_file_is_refused(plain_folder: Path, network: QNetwork) -> None:
     path = plain_folder / "model.safetensors"
     save_model(path, network, METADATA)
     path.chmod(0)
@@ -391,7 +383,7 @@ def test_a_missing_or_foreign_file_is_named(name: str) -> None:
 
 
 def test_a_model_that_cannot_be_written_leaves_the_old_one(
-    model_path: Path, network: PaperQNetwork, monkeypatch: pytest.MonkeyPatch
+    model_path: Path, network: QNetwork, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     before = model_path.read_bytes()
 

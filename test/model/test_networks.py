@@ -1,74 +1,222 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 import torch
 from hypothesis import given
-from strategies import grids_with_free_cell
+from hypothesis import strategies as st
+from networks import random_network
+from strategies import grids_with_costs, grids_with_free_cell
 
-from ddqn_planner.grid import Cell, GridMap, MoveRule
-from ddqn_planner.model import PaperQNetwork
-from ddqn_planner.model.observation import (
-    FREE,
-    GOAL,
-    OBSTACLE,
-    ROBOT,
-    observation_background,
-    observe,
-)
+from ddqn_planner.grid import Cell, GridMap, MoveRule, legal_moves
+from ddqn_planner.model import NETWORKS, load_model, networks
+from ddqn_planner.model.networks import MAX_LEARNED_MULTIPLIER, AnyMapQNetwork, PropagationQNetwork
+from ddqn_planner.model.observation import observation_background, observe, patches
+from ddqn_planner.model.wavefront import propagate_values
+from ddqn_planner.training.encoders import ENCODERS
+from ddqn_planner.training.networks import AnyMapModule, PaperModule, PropagationModule
 
-
-@given(grids_with_free_cell())
-def test_the_observation_shows_four_kinds_of_cell(grid_and_goal: tuple[GridMap, Cell]) -> None:
-    grid, goal = grid_and_goal
-    background = observation_background(grid.occupancy, goal)
-    for number, observation in enumerate(
-        observe(background, np.arange(grid.occupancy.size), grid.occupancy.shape)
-    ):
-        robot = (number % grid.width, number // grid.width)
-        for y in range(grid.height):
-            for x in range(grid.width):
-                kind = FREE if grid.is_free((x, y)) else OBSTACLE
-                kind = GOAL if (x, y) == goal else kind
-                assert observation[y, x] == (ROBOT if (x, y) == robot else kind)
-    assert len({FREE, GOAL, OBSTACLE, ROBOT}) == 4
+SIZES = {
+    "paper": {"height": 5, "width": 8, "filters": 3, "hidden_units": 6},
+    "propagation": {"filters": 3},
+    "any_map": {"filters": 3},
+}
 
 
-@given(grids_with_free_cell())
-def test_the_q_field_holds_the_networks_answer_in_each_cell(
-    grid_and_goal: tuple[GridMap, Cell],
+# The same as the torch modules
+
+
+@pytest.mark.parametrize("name", NETWORKS)
+def test_a_module_has_the_tensors_of_its_network(name: str) -> None:
+    module = ENCODERS[name].module_class(**SIZES[name])
+    assert {key: tuple(t.shape) for key, t in module.state_dict().items()} == NETWORKS[name].shapes(
+        SIZES[name]
+    )
+    network = module.to_numpy()
+    assert type(network) is NETWORKS[name]
+    again = type(module).from_numpy(network)
+    assert all(map(torch.equal, again.state_dict().values(), module.state_dict().values()))
+    for tensor in module.parameters():
+        tensor.data.zero_()
+    assert any(tensor.any() for tensor in network.tensors.values())
+
+
+@given(grids_with_free_cell(), st.sampled_from([0, 1, 6]), st.integers(0, 99))
+def test_the_papers_network_answers_in_each_cell_as_its_module(
+    grid_and_goal: tuple[GridMap, Cell], hidden_units: int, seed: int
 ) -> None:
     grid, goal = grid_and_goal
-    network = PaperQNetwork(grid.height, grid.width, filters=3)
+    sizes = {"height": grid.height, "width": grid.width, "filters": 3, "hidden_units": hidden_units}
+    network = random_network("paper", seed, **sizes)
     q = network.q_values(grid, goal, MoveRule.ROBOT_SAFE)
     assert q.shape == (8, grid.height, grid.width)
     assert q.dtype == np.float32
     background = observation_background(grid.occupancy, goal)
-    for x, y in grid.free_cells():
-        number = np.array([y * grid.width + x])
-        observation = torch.from_numpy(observe(background, number, grid.occupancy.shape))
-        with torch.inference_mode():
-            expected = network(observation)[0].numpy()
-        np.testing.assert_allclose(q[:, y, x], expected, atol=1e-5)
+    cells = np.arange(grid.occupancy.size)
+    observations = torch.from_numpy(observe(background, cells, grid.occupancy.shape))
+    with torch.inference_mode():
+        expected = PaperModule.from_numpy(network)(observations).T.reshape(q.shape)
+    np.testing.assert_allclose(q, expected.numpy(), rtol=1e-5, atol=1e-5)
+
+
+@given(grids_with_costs(), st.sampled_from(MoveRule), st.integers(0, 99))
+def test_the_propagation_networks_answer_on_each_patch_as_their_modules(
+    grid_and_goal: tuple[GridMap, Cell], rule: MoveRule, seed: int
+) -> None:
+    grid, _ = grid_and_goal
+    features = AnyMapQNetwork.features(patches(grid.occupancy, grid.cost), rule)
+    any_map = random_network("any_map", seed, filters=5)
+    propagation = random_network("propagation", seed, filters=5)
+    assert isinstance(any_map, AnyMapQNetwork)
+    assert isinstance(propagation, PropagationQNetwork)
+    module = AnyMapModule.from_numpy(any_map)
+    with torch.inference_mode():
+        for answer, expected in (
+            (any_map.success(features), module.success(torch.from_numpy(features))),
+            (any_map.multiplier(features), module.multiplier(torch.from_numpy(features))),
+            (
+                propagation.success(features[:, :9]),
+                PropagationModule.from_numpy(propagation).success(
+                    torch.from_numpy(features[:, :9])
+                ),
+            ),
+        ):
+            np.testing.assert_allclose(answer, expected.numpy(), rtol=1e-5, atol=1e-5)
+
+
+def test_the_shipped_models_answer_as_their_modules(paper) -> None:  # type: ignore[no-untyped-def]
+    network, _ = load_model("dilemma")
+    q = network.q_values(paper.grid, paper.goal, MoveRule.CORNER_CUTTING)
+    background = observation_background(paper.grid.occupancy, paper.goal)
+    observations = observe(background, np.arange(400), (20, 20))
+    with torch.inference_mode():
+        expected = PaperModule.from_numpy(network)(torch.from_numpy(observations))
+    np.testing.assert_allclose(q.reshape(8, -1).T, expected.numpy(), rtol=1e-5, atol=1e-5)
+
+    any_map, _ = load_model("any_map")
+    assert isinstance(any_map, AnyMapQNetwork)
+    module = AnyMapModule.from_numpy(any_map)
+    random = np.random.default_rng(0)
+    features = AnyMapQNetwork.features(
+        random.integers(-1, 101, (2000, 9)).astype(np.int8), MoveRule.ROBOT_SAFE
+    )
+    with torch.inference_mode():
+        p = module.success(torch.from_numpy(features)).numpy()
+        multiplier = module.multiplier(torch.from_numpy(features)).numpy()
+    np.testing.assert_allclose(any_map.success(features), p, rtol=1e-5, atol=1e-5)
+    np.testing.assert_allclose(any_map.multiplier(features), multiplier, rtol=1e-5, atol=1e-5)
+
+
+# The paper's network
 
 
 def test_a_robot_in_the_last_row_and_column_is_seen() -> None:
-    network = PaperQNetwork(20, 20, filters=4)
+    network = random_network("paper", height=20, width=20, filters=4, hidden_units=0)
     q = network.q_values(GridMap(np.zeros((20, 20))), (3, 3), MoveRule.ROBOT_SAFE)
     assert not np.allclose(q[:, 19, 19], q[:, 19, 18])
     assert not np.allclose(q[:, 19, 19], q[:, 18, 19])
 
 
 def test_the_network_is_the_papers_convolution_relu_and_fully_connected_layer() -> None:
-    network = PaperQNetwork(7, 10, filters=5)
+    module = PaperModule(7, 10, filters=5)
     observations = torch.randn(6, 7, 10)
-    features = network.convolution(observations.unsqueeze(1)).relu().flatten(1)
-    torch.testing.assert_close(network(observations), network.fully_connected(features))
+    features = module.convolution(observations.unsqueeze(1)).relu().flatten(1)
+    torch.testing.assert_close(module(observations), module.fully_connected(features))
 
 
 def test_a_hidden_layer_with_relu_lies_between_the_two() -> None:
-    network = PaperQNetwork(7, 10, filters=5, hidden_units=6)
-    assert network.hidden is not None
+    module = PaperModule(7, 10, filters=5, hidden_units=6)
+    assert module.hidden is not None
     observations = torch.randn(6, 7, 10)
-    features = network.convolution(observations.unsqueeze(1)).relu().flatten(1)
-    hidden = network.hidden(features).relu()
-    torch.testing.assert_close(network(observations), network.fully_connected(hidden))
+    features = module.convolution(observations.unsqueeze(1)).relu().flatten(1)
+    hidden = module.hidden(features).relu()
+    torch.testing.assert_close(module(observations), module.fully_connected(hidden))
+
+
+# The networks for maps of any size
+
+
+def answering(name: str, success: float, multiplier: float = 1.0) -> PropagationQNetwork:
+    """A network that answers with one p and one cost multiplier for every move and patch."""
+    network = random_network(name, filters=4)
+    assert isinstance(network, PropagationQNetwork)
+    network.tensors["moves.weight"].fill(0)
+    network.tensors["moves.bias"].fill(np.log(success / (1 - success)))
+    if name == "any_map":
+        network.tensors["prices.weight"].fill(0)
+        network.tensors["prices.bias"].fill(multiplier - 1)
+    return network
+
+
+def test_many_unique_patches_are_evaluated_in_batches(monkeypatch: pytest.MonkeyPatch) -> None:
+    cost = np.random.default_rng(0).integers(0, 99, (8, 9)).astype(np.int8)
+    grid, network = GridMap(np.zeros((8, 9)), cost=cost), random_network("any_map", filters=4)
+    at_once = network.q_values(grid, (3, 3), MoveRule.ROBOT_SAFE)
+    assert np.isfinite(at_once).any()
+    monkeypatch.setattr(networks, "BATCH", 7)
+    in_batches = network.q_values(grid, (3, 3), MoveRule.ROBOT_SAFE)
+    np.testing.assert_allclose(in_batches, at_once, rtol=1e-5)
+
+
+@pytest.mark.parametrize("name", ["propagation", "any_map"])
+def test_a_field_has_one_q_per_action_and_cell_of_a_map_of_any_shape(name: str) -> None:
+    network = random_network(name, filters=4)
+    for shape in ((1, 1), (3, 7), (9, 2)):
+        q = network.q_values(GridMap(np.zeros(shape)), (0, 0), MoveRule.ROBOT_SAFE)
+        assert network.supports(shape)
+        assert q.shape == (8, *shape)
+        assert q.dtype == np.float32
+        assert not np.isnan(q).any()
+
+
+@pytest.mark.parametrize("name", ["propagation", "any_map"])
+def test_a_move_is_possible_where_it_succeeds_more_often_than_not(name: str) -> None:
+    for success, possible in ((0.55, True), (0.45, False)):
+        network = answering(name, success)
+        q = network.q_values(GridMap(np.zeros((1, 2))), (1, 0), MoveRule.ROBOT_SAFE)
+        assert q[0, 0, 0] == (-1.0 if possible else -np.inf)
+
+
+def test_a_cost_above_the_upper_bound_counts_as_the_bound() -> None:
+    grid = GridMap(np.zeros((1, 2)))
+    for multiplier, used in (
+        (MAX_LEARNED_MULTIPLIER - 1, MAX_LEARNED_MULTIPLIER - 1),
+        (1e4, 100.0),
+    ):
+        network = answering("any_map", 0.9, multiplier)
+        assert network.q_values(grid, (1, 0), MoveRule.ROBOT_SAFE)[0, 0, 0] == -used
+
+
+@pytest.mark.parametrize("tensor", ["prices.bias", "moves.bias"])
+def test_a_move_whose_cost_or_p_is_nan_is_not_possible(
+    monkeypatch: pytest.MonkeyPatch, tensor: str
+) -> None:
+    def checked(patch_id: np.ndarray, cost_PA: np.ndarray, goal: Cell) -> np.ndarray:
+        assert not np.isnan(cost_PA).any()  # with NaN the propagation would never end
+        return propagate_values(patch_id, cost_PA, goal)
+
+    monkeypatch.setattr(networks, "propagate_values", checked)
+    network = answering("any_map", 0.9)
+    network.tensors[tensor][0] = np.nan
+    q = network.q_values(GridMap(np.zeros((2, 2))), (1, 0), MoveRule.ROBOT_SAFE)
+    assert q[0, 0, 0] == -np.inf
+    assert q[2, 0, 0] == pytest.approx(-1 - 2**0.5)  # up, and then down to the right
+
+
+def test_the_network_for_any_map_tells_legal_moves() -> None:
+    network, _ = load_model("any_map")
+    assert isinstance(network, AnyMapQNetwork)
+    occupancy = np.random.default_rng(0).random((30, 30)) < 0.3
+    for rule in (MoveRule.ROBOT_SAFE, MoveRule.CORNER_CUTTING):
+        p = network.success(AnyMapQNetwork.features(patches(occupancy, None), rule))
+        free = ~occupancy.ravel()
+        legal = legal_moves(occupancy, rule).reshape(8, -1).T
+        np.testing.assert_array_equal(p[free] > 0.5, legal[free])
+
+
+def test_every_cost_begins_where_it_has_a_gradient() -> None:
+    torch.manual_seed(0)
+    module = AnyMapModule(filters=4)
+    module.multiplier(torch.zeros(1, 28)).sum().backward()
+    assert module.prices.bias.grad is not None
+    assert module.prices.bias.grad.tolist() == [1.0] * 8

@@ -3,23 +3,30 @@ from __future__ import annotations
 import json
 import time
 from collections.abc import Callable
-from dataclasses import replace
 from itertools import pairwise
 from typing import Any
 
 import numpy as np
 import pytest
-import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from strategies import grids_in_parts, grids_with_free_cell, priced_grids_with_free_cell
+from networks import random_network
+from strategies import grids_in_parts, grids_with_costs, grids_with_free_cell
 
-from ddqn_planner import GridMap, MoveRule, PlanMethod, Planner, PlanStatus, QField, inflate
+from ddqn_planner import (
+    GridMap,
+    MoveRule,
+    PlanMethod,
+    Planner,
+    PlanStatus,
+    QField,
+    inflate,
+    simplify,
+)
+from ddqn_planner.benchmarks.evaluation import evaluate
 from ddqn_planner.grid import LENGTHS, MOVES, Cell, connected_cells, legal_moves, path_cost
-from ddqn_planner.model import ModelMetadata, PaperQNetwork
-from ddqn_planner.planning import shortest_distances
-from ddqn_planner.planning.evaluation import evaluate
-from ddqn_planner.planning.problem import Problem, solve
+from ddqn_planner.model import ModelMetadata
+from ddqn_planner.planning import PlanRequest, shortest_distances
 
 RULES = st.sampled_from(list(MoveRule))
 ANY_MAP = Planner.load("any_map")
@@ -37,12 +44,16 @@ def perfect_field(grid: GridMap, goal: Cell, rule: MoveRule) -> QField:
 
 
 def random_planner(height: int, width: int, seed: int) -> Planner:
-    torch.manual_seed(seed)
-    network = PaperQNetwork(height, width, filters=4).requires_grad_(False)
-    sizes = {"height": height, "width": width, "filters": 4}
+    sizes = {"height": height, "width": width, "filters": 4, "hidden_units": 0}
+    network = random_network("paper", seed, **sizes)
     return Planner(
         network, ModelMetadata("paper", sizes, MoveRule.CORNER_CUTTING, 0.95, "", 0, seed, "")
     )
+
+
+def is_answered_at_once(planner: Planner, *request: Any, **more: Any) -> bool:
+    """Whether no step of a request is slow: no field is computed, and nothing is searched for."""
+    return next(planner.steps(PlanRequest(*request, **more))) is not None
 
 
 def check_legal(cells: tuple[Cell, ...], occupancy: np.ndarray, rule: MoveRule) -> None:
@@ -52,7 +63,7 @@ def check_legal(cells: tuple[Cell, ...], occupancy: np.ndarray, rule: MoveRule) 
 
 
 @given(grids_with_free_cell(), RULES)
-def test_a_perfect_field_walks_every_shortest_path(
+def test_rollouts_of_a_perfect_field_are_shortest_paths(
     grid_and_goal: tuple[GridMap, Cell], rule: MoveRule
 ) -> None:
     grid, goal = grid_and_goal
@@ -77,18 +88,18 @@ def test_whatever_the_network_says_each_move_of_a_path_is_legal(
         assert plan.length >= optimum - 1e-9
     else:
         assert plan.cells == ()
-        expected = PlanStatus.NO_PATH if np.isinf(optimum) else PlanStatus.WALK_TRAPPED
+        expected = PlanStatus.NO_PATH if np.isinf(optimum) else PlanStatus.ROLLOUT_TRAPPED
         assert plan.status is expected
 
 
-def test_the_unmasked_walk_is_trapped_by_the_first_illegal_move_that_it_prefers() -> None:
+def test_the_unmasked_rollout_is_trapped_by_the_first_illegal_move_that_it_prefers() -> None:
     grid = GridMap(np.array([[0, 0, 0], [0, 0, 0]]))
     q = np.zeros((8, 2, 3), dtype=np.float32)
     q[0] = 1.0  # +x
     q[6, 0, 1] = 2.0  # off the map
     field = QField((2, 0), q, legal_moves(grid.occupancy, MoveRule.ROBOT_SAFE))
     assert field.rollout((0, 0)).cells == ((0, 0), (1, 0), (2, 0))
-    assert field.unmasked().rollout((0, 0)).status is PlanStatus.WALK_TRAPPED
+    assert field.unmasked().rollout((0, 0)).status is PlanStatus.ROLLOUT_TRAPPED
     assert field.value.max() == 1  # what is illegal does not count
 
 
@@ -130,7 +141,7 @@ def test_a_map_of_another_size_is_refused() -> None:
         planner.q_field(grid, (1, 1))
 
 
-def test_a_field_is_computed_once_a_map_goal_and_rule() -> None:
+def test_a_field_is_computed_once_per_map_goal_and_rule() -> None:
     planner, free = random_planner(3, 3, 0), GridMap(np.zeros((3, 3)))
     field = planner.q_field(free, (1, 1))
     assert planner.q_field(GridMap(np.zeros((3, 3))), (1, 1)) is field
@@ -155,7 +166,7 @@ def test_the_shipped_model_finds_the_papers_path(paper) -> None:  # type: ignore
 
 
 @pytest.mark.parametrize("rule", MoveRule)
-def test_the_model_for_any_map_judges_every_move_in_all_surroundings_rightly(
+def test_the_model_for_any_map_judges_every_move_in_every_patch_rightly(
     rule: MoveRule,
 ) -> None:
     network = Planner.load("any_map").network
@@ -184,8 +195,8 @@ def test_the_model_for_any_map_solves_every_start_at_the_optimum(
         assert evaluation.worst_ratio < 1.01
 
 
-@given(priced_grids_with_free_cell(), RULES)
-def test_the_model_for_any_map_heeds_prices(
+@given(grids_with_costs(), RULES)
+def test_the_model_for_any_map_heeds_costs(
     grid_and_goal: tuple[GridMap, Cell], rule: MoveRule
 ) -> None:
     grid, goal = grid_and_goal
@@ -199,11 +210,13 @@ def test_where_no_path_leads_no_field_is_computed_to_say_so() -> None:
     occupancy = np.zeros((3, 3), dtype=bool)
     occupancy[:, 1] = True
     grid, planner = GridMap(occupancy), random_planner(3, 3, 0)
-    assert not planner.is_quick(grid, (0, 0), (2, 2))
+    rule = planner.metadata.move_rule
+    assert not is_answered_at_once(planner, grid, (0, 0), (2, 2), rule)
     assert planner.plan(grid, (0, 0), (2, 2)).status is PlanStatus.NO_PATH
     assert planner.known_field(grid, (2, 2)) is None
     planner.q_field(grid, (2, 2))
-    assert planner.is_quick(grid, (0, 0), (2, 2))
+    for method in PlanMethod:
+        assert is_answered_at_once(planner, grid, (0, 0), (2, 2), rule, method)
     assert planner.plan(grid, (0, 0), (2, 2)).status is PlanStatus.NO_PATH
 
 
@@ -241,15 +254,10 @@ def test_of_the_fields_those_are_kept_that_were_asked_for_last() -> None:
 def test_choices_are_members_or_their_values_and_else_refused_with_a_list() -> None:
     planner, grid = random_planner(3, 3, 1), GridMap(np.zeros((3, 3)))
     start, goal = (0, 0), (2, 2)
-    planner.q_field(grid, goal)
-    route = planner.route(grid, start, goal)
     by_rule: list[Callable[[Any], object]] = [
         lambda rule: planner.plan(grid, start, goal, rule),
         lambda rule: planner.q_field(grid, goal, rule),
         lambda rule: planner.known_field(grid, goal, rule),
-        lambda rule: planner.route(grid, start, goal, rule),
-        lambda rule: planner.is_quick(grid, start, goal, rule),
-        lambda rule: planner.follow(route, grid, planner.q_field(grid, goal), move_rule=rule),
     ]
     for function in by_rule:
         for rule in MoveRule:
@@ -259,12 +267,13 @@ def test_choices_are_members_or_their_values_and_else_refused_with_a_list() -> N
     by_method: list[Callable[[Any], object]] = [
         lambda method: planner.plan(grid, start, goal, method=method),
         lambda method: planner.plan(grid, start, (9, 9), method=method),
-        lambda method: planner.follow(route, grid, planner.q_field(grid, goal), method),
     ]
     for function in by_method:
         for method in PlanMethod:
             assert function(method.value) == function(method)
-        with pytest.raises(ValueError, match="'nope' is unknown; give one of greedy, guided"):
+        with pytest.raises(
+            ValueError, match="'nope' is unknown; give one of greedy, astar_fallback"
+        ):
             function("nope")
 
 
@@ -274,11 +283,11 @@ def test_a_method_given_by_its_value_is_used() -> None:
     for seed in range(10):
         planner = random_planner(6, 6, seed)
         greedy = planner.plan(grid, (0, 0), (5, 3))
-        guided = planner.plan(grid, (0, 0), (5, 3), method="guided")
+        guided = planner.plan(grid, (0, 0), (5, 3), method="astar_fallback")
         assert guided.cells
-        assert (guided.method is PlanMethod.GUIDED) == (not greedy.cells)
+        assert (guided.method is PlanMethod.ASTAR_FALLBACK) == (not greedy.cells)
         statuses.add(greedy.status)
-    assert PlanStatus.WALK_TRAPPED in statuses
+    assert PlanStatus.ROLLOUT_TRAPPED in statuses
 
 
 def test_any_pair_of_whole_numbers_is_a_start_and_a_goal() -> None:
@@ -291,23 +300,20 @@ def test_any_pair_of_whole_numbers_is_a_start_and_a_goal() -> None:
     ):
         plan = planner.plan(grid, start, goal)  # type: ignore[arg-type]
         assert json.loads(json.dumps(plan.cells))[-1] == [3, 1]
-        assert planner.is_quick(grid, start, goal)  # type: ignore[arg-type]
         field = planner.q_field(grid, goal)  # type: ignore[arg-type]
         assert field is planner.q_field(grid, (3, 1))
         assert json.dumps(field.rollout(start).cells) == json.dumps(plan.cells)  # type: ignore[arg-type]
-        route = planner.route(grid, start, goal)  # type: ignore[arg-type]
-        assert json.dumps([route.leave, route.goal]) == "[[[0, 0]], [3, 1]]"
+        assert json.dumps([plan.cells[0], plan.goal]) == "[[0, 0], [3, 1]]"
     for wrong in ((0.5, 0), (0, 0, 0), "00", None, (0, np.nan)):
         for arguments, name in (((wrong, (0, 0)), "start"), (((0, 0), wrong), "goal")):
-            for function in (planner.plan, planner.route, planner.is_quick):
-                with pytest.raises(ValueError, match=f"the {name} is .*; give two whole numbers"):
-                    function(grid, *arguments)  # type: ignore[operator]
+            with pytest.raises(ValueError, match=f"the {name} is .*; give two whole numbers"):
+                planner.plan(grid, *arguments)  # type: ignore[arg-type]
         for function in (planner.q_field, planner.known_field):
             with pytest.raises(ValueError, match="the goal is "):
                 function(grid, wrong)  # type: ignore[operator]
 
 
-def test_a_walk_from_outside_the_map_is_refused() -> None:
+def test_a_rollout_from_outside_the_map_is_refused() -> None:
     field = ANY_MAP.q_field(GridMap(np.zeros((4, 6))), (5, 3))
     for start in ((6, 0), (0, 4), (-1, 0), (0, -1)):
         with pytest.raises(ValueError, match=r"outside the map of 6 x 4 cells"):
@@ -332,7 +338,7 @@ def test_a_plan_knows_its_rule_and_counts_by_it() -> None:
         assert trapped.move_rule is MoveRule.UNIT
 
 
-@given(priced_grids_with_free_cell(), RULES, st.data())
+@given(grids_with_costs(), RULES, st.data())
 def test_on_a_map_with_costs_a_plan_knows_what_it_costs(
     grid_and_goal: tuple[GridMap, Cell], rule: MoveRule, data: st.DataObject
 ) -> None:
@@ -341,10 +347,10 @@ def test_on_a_map_with_costs_a_plan_knows_what_it_costs(
     plan = ANY_MAP.plan(grid, start, goal, rule)
     assert (plan.cost is None) == (not plan.cells)
     if plan.cost is not None:
-        assert plan.cost == path_cost(plan.cells, grid.price, rule)
+        assert plan.cost == path_cost(plan.cells, grid.cost_multiplier, rule)
 
 
-def test_a_solution_tells_how_long_field_and_walk_took() -> None:
+def test_a_plan_tells_how_long_field_and_rollout_took() -> None:
     class SlowNetwork:
         def __getattr__(self, name: str) -> Any:
             return getattr(ANY_MAP.network, name)
@@ -353,36 +359,45 @@ def test_a_solution_tells_how_long_field_and_walk_took() -> None:
             time.sleep(0.05)
             return ANY_MAP.network.q_values(*arguments)
 
-    planner, rule = Planner(SlowNetwork(), ANY_MAP.metadata), MoveRule.UNIT  # type: ignore[arg-type]
+    planner, grid = Planner(SlowNetwork(), ANY_MAP.metadata), GridMap(np.zeros((5, 5)))  # type: ignore[arg-type]
     ANY_MAP.plan(GridMap(np.zeros((2, 2))), (0, 0), (1, 1))
-    problem = Problem(
-        planner, GridMap(np.zeros((5, 5))), (0, 0), (4, 2), rule, PlanMethod.GREEDY, 0.0, True
-    )
-    solution = solve(problem)
-    assert solution.field_ms >= 50
-    assert solution.walk_ms > 0
-    assert solution.goal == (4, 2)
-    failed = solve(replace(problem, goal=(9, 9)))
-    assert failed.plan.status is PlanStatus.GOAL_OUTSIDE_MAP
+    plan = planner.plan(grid, (0, 0), (4, 2), MoveRule.UNIT, simplified=True)
+    assert plan.field_ms >= 50
+    assert plan.rollout_ms > 0
+    assert plan.goal == (4, 2)
+    again = planner.plan(grid, (0, 0), (4, 2), MoveRule.UNIT, simplified=True)
+    assert again == plan
+    assert again.field_ms < 50
+    failed = planner.plan(grid, (0, 0), (9, 9), MoveRule.UNIT)
+    assert failed.status is PlanStatus.GOAL_OUTSIDE_MAP
     assert failed.goal is None
 
 
-# A search where the walk fails
+def test_a_plan_is_simplified_if_asked_for_and_costs_what_the_whole_path_costs() -> None:
+    grid = GridMap(np.zeros((5, 9)), cost=np.ones((5, 9), np.int8))
+    whole = ANY_MAP.plan(grid, (0, 0), (8, 4))
+    simple = ANY_MAP.plan(grid, (0, 0), (8, 4), simplified=True)
+    assert simple.cells == simplify(whole.cells, grid, MoveRule.ROBOT_SAFE)
+    assert len(simple.cells) < len(whole.cells)
+    assert simple.cost == whole.cost
+
+
+# A search where the rollout is trapped
 
 
 @given(grids_with_free_cell(), RULES, st.integers(0, 5), st.data())
-def test_with_a_bad_model_every_solvable_request_is_searched_for_or_walked(
+def test_with_a_bad_model_every_solvable_request_is_searched_for_or_rolled_out(
     grid_and_goal: tuple[GridMap, Cell], rule: MoveRule, seed: int, data: st.DataObject
 ) -> None:
     grid, goal = grid_and_goal
     start = data.draw(st.sampled_from(grid.free_cells()))
     planner = random_planner(grid.height, grid.width, seed)
     greedy = planner.plan(grid, start, goal, rule)
-    guided = planner.plan(grid, start, goal, rule, PlanMethod.GUIDED)
+    guided = planner.plan(grid, start, goal, rule, PlanMethod.ASTAR_FALLBACK)
     assert greedy.method is PlanMethod.GREEDY
-    if greedy.status is PlanStatus.WALK_TRAPPED:
+    if greedy.status is PlanStatus.ROLLOUT_TRAPPED:
         assert guided.status is PlanStatus.SUCCEEDED
-        assert guided.method is PlanMethod.GUIDED
+        assert guided.method is PlanMethod.ASTAR_FALLBACK
         assert (guided.cells[0], guided.cells[-1]) == (start, goal)
         check_legal(guided.cells, grid.occupancy, rule)
     else:
@@ -393,8 +408,8 @@ def test_whatever_is_wrong_with_the_values_the_search_finds_a_path() -> None:
     grid = GridMap(np.zeros((6, 6)))
     for bias in (np.nan, np.inf, -np.inf, 1e38):
         planner = random_planner(6, 6, 0)
-        planner.network.fully_connected.bias.fill_(bias)  # type: ignore[attr-defined]
-        plan = planner.plan(grid, (0, 0), (5, 3), method=PlanMethod.GUIDED)
+        planner.network.tensors["fully_connected.bias"].fill(bias)
+        plan = planner.plan(grid, (0, 0), (5, 3), method=PlanMethod.ASTAR_FALLBACK)
         check_legal(plan.cells, grid.occupancy, MoveRule.CORNER_CUTTING)
         assert plan.cells[-1] == (5, 3)
 
@@ -458,14 +473,13 @@ def test_a_goal_moves_to_the_nearest_reachable_free_cell_within_the_tolerance(
     planner = Planner(ANY_MAP.network, ANY_MAP.metadata)
     if field_is_known and grid.is_free(goal):
         planner.q_field(grid, goal, rule)
-    quick = planner.is_quick(grid, start, goal, rule, tolerance)
-    route = planner.route(grid, start, goal, rule, tolerance)
+    quick = is_answered_at_once(planner, grid, start, goal, rule, tolerance=tolerance)
     plan = planner.plan(grid, start, goal, rule, tolerance=tolerance)
     rows, columns = np.nonzero(connected_cells(grid.occupancy, start, rule))
     nearest = np.hypot(columns - goal[0], rows - goal[1]).min()
     if nearest <= tolerance:
         assert plan.cells[0] == start
-        assert plan.cells[-1] == route.goal
+        assert plan.cells[-1] == plan.goal
         assert np.hypot(*np.subtract(plan.cells[-1], goal)) == pytest.approx(nearest)
         check_legal(plan.cells, grid.occupancy, rule)
         assert quick == (nearest == 0 and field_is_known)

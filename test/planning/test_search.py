@@ -7,28 +7,33 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as numpy_st
-from strategies import priced_grids_with_free_cell
+from strategies import grids_with_costs
 
-from ddqn_planner.grid import MOVES, Cell, GridMap, MoveRule, legal_moves, path_cost
+from ddqn_planner.grid import (
+    MOVES,
+    Cell,
+    GridMap,
+    MoveRule,
+    legal_moves,
+    path_cost,
+)
 from ddqn_planner.planning import shortest_distances
 from ddqn_planner.planning.search import search
 
 ANY_VALUE = st.floats(width=32, allow_nan=True, allow_infinity=True)
 
 
-@given(priced_grids_with_free_cell(), st.sampled_from(list(MoveRule)), st.data())
+@given(grids_with_costs(), st.sampled_from(list(MoveRule)), st.data())
 def test_finds_a_legal_path_wherever_there_is_one_whatever_the_values(
     grid_and_goal: tuple[GridMap, Cell], rule: MoveRule, data: st.DataObject
 ) -> None:
     grid, goal = grid_and_goal
     start = data.draw(st.sampled_from(grid.free_cells()))
     value = data.draw(numpy_st.arrays(np.float32, grid.occupancy.shape, elements=ANY_VALUE))
-    end = np.zeros(grid.occupancy.shape, dtype=bool)
-    end[goal[1], goal[0]] = True
     legal = legal_moves(grid.occupancy, rule)
     distances = shortest_distances(grid, goal, rule)
 
-    cells = search(start, end, legal, grid.price, rule, value)
+    cells = search(start, goal, legal, grid.cost_multiplier, rule, value)
     assert (cells != ()) == np.isfinite(distances[start[1], start[0]])
     if cells:
         assert (cells[0], cells[-1]) == (start, goal)
@@ -38,39 +43,36 @@ def test_finds_a_legal_path_wherever_there_is_one_whatever_the_values(
 
     cheapest = distances[start[1], start[0]]
     for known in (None, -distances.astype(np.float32)):  # nothing is known, or all is
-        cells = search(start, end, legal, grid.price, rule, known)
+        cells = search(start, goal, legal, grid.cost_multiplier, rule, known)
         if cells:
-            assert path_cost(cells, grid.price, rule) == pytest.approx(cheapest)
+            assert path_cost(cells, grid.cost_multiplier, rule) == pytest.approx(cheapest)
 
 
 def test_follows_the_values_even_on_a_detour() -> None:
     grid, rule = GridMap(np.zeros((3, 5))), MoveRule.ROBOT_SAFE
     detour = [(0, 0), (0, 1), (0, 2), (1, 2), (2, 2), (3, 2), (4, 2), (4, 1), (4, 0)]
-    value, end = np.zeros((3, 5), np.float32), np.zeros((3, 5), dtype=bool)
-    end[0, 4] = True
+    value = np.zeros((3, 5), np.float32)
     for x, y in detour:
         value[y, x] = 100
     legal = legal_moves(grid.occupancy, rule)
-    assert set(search((0, 0), end, legal, grid.price, rule, value)) <= set(detour)
-    assert len(search((0, 0), end, legal, grid.price, rule)) == 5
+    assert set(search((0, 0), (4, 0), legal, grid.cost_multiplier, rule, value)) <= set(detour)
+    assert len(search((0, 0), (4, 0), legal, grid.cost_multiplier, rule)) == 5
 
 
 def test_visits_cells_without_a_value_last() -> None:
     grid, rule = GridMap(np.array([[0, 0, 0], [0, 1, 0], [0, 0, 0]])), MoveRule.ROBOT_SAFE
-    value, end = np.zeros((3, 3), np.float32), np.zeros((3, 3), dtype=bool)
-    end[0, 2] = True
+    value = np.zeros((3, 3), np.float32)
     value[0, 1] = np.nan
     legal = legal_moves(grid.occupancy, rule)
-    assert (1, 0) not in search((0, 0), end, legal, grid.price, rule, value)
+    assert (1, 0) not in search((0, 0), (2, 0), legal, grid.cost_multiplier, rule, value)
 
 
-def test_a_move_costs_the_mean_price_of_its_two_cells() -> None:
-    # From a dear start it is cheaper to leave by the straight move, though it ends a bit dearer.
+def test_a_move_costs_the_mean_cost_of_its_two_cells() -> None:
+    # From a start of high cost the straight move is cheaper, though its end costs more.
     grid = GridMap(np.array([[0, 0, 1], [1, 0, 0]]), cost=np.array([[99, 3, 0], [0, 0, 0]]))
-    rule, end = MoveRule.CORNER_CUTTING, np.zeros((2, 3), dtype=bool)
-    end[1, 2] = True
+    rule = MoveRule.CORNER_CUTTING
     legal = legal_moves(grid.occupancy, rule)
-    assert search((0, 0), end, legal, grid.price, rule) == ((0, 0), (1, 0), (2, 1))
+    assert search((0, 0), (2, 1), legal, grid.cost_multiplier, rule) == ((0, 0), (1, 0), (2, 1))
 
 
 def test_goes_to_the_nearest_of_several_ends() -> None:
@@ -79,6 +81,6 @@ def test_goes_to_the_nearest_of_several_ends() -> None:
     ends[0, [0, 8]] = True
     rule = MoveRule.ROBOT_SAFE
     legal = legal_moves(grid.occupancy, rule)
-    assert search((3, 0), ends, legal, grid.price, rule)[-1] == (0, 0)
-    assert search((5, 0), ends, legal, grid.price, rule)[-1] == (8, 0)
-    assert search((8, 0), ends, legal, grid.price, rule) == ((8, 0),)
+    assert search((3, 0), ends, legal, grid.cost_multiplier, rule)[-1] == (0, 0)
+    assert search((5, 0), ends, legal, grid.cost_multiplier, rule)[-1] == (8, 0)
+    assert search((8, 0), ends, legal, grid.cost_multiplier, rule) == ((8, 0),)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from strategies import grids_with_free_cell, priced_grids_with_free_cell
+from strategies import grids_with_costs, grids_with_free_cell
 
 from ddqn_planner.grid import Cell, GridMap, MoveRule, path_cost, path_length
 from ddqn_planner.planning import shortest_path, simplify
@@ -73,18 +73,18 @@ def share_within(cell: Cell, first: Cell, last: Cell) -> Fraction:
     return max(leaves - enters, Fraction(0))
 
 
-def exact_cost(first: Cell, last: Cell, price: np.ndarray, rule: MoveRule) -> float:
+def exact_cost(first: Cell, last: Cell, multiplier: np.ndarray, rule: MoveRule) -> float:
     vector = np.subtract(last, first)
     length = np.abs(vector).max() if rule is MoveRule.UNIT else math.hypot(*vector)
     columns, rows = (range(min(ends), max(ends) + 1) for ends in zip(first, last, strict=True))
     cells = [(x, y) for x in columns for y in rows]
     shares = [share_within(cell, first, last) for cell in cells]
     assert sum(shares) == 1 or first == last
-    prices = [Fraction(float(price[y, x])) for x, y in cells]
-    return float(length * float(sum(a * b for a, b in zip(shares, prices, strict=True))))
+    multipliers = [Fraction(float(multiplier[y, x])) for x, y in cells]
+    return float(length * float(sum(a * b for a, b in zip(shares, multipliers, strict=True))))
 
 
-@given(priced_grids_with_free_cell(), RULES, st.data())
+@given(grids_with_costs(), RULES, st.data())
 def test_each_cell_counts_by_the_length_of_the_segment_within_it(
     grid_and_cell: tuple[GridMap, Cell], rule: MoveRule, data: st.DataObject
 ) -> None:
@@ -92,21 +92,21 @@ def test_each_cell_counts_by_the_length_of_the_segment_within_it(
     last = data.draw(
         st.tuples(st.integers(0, grid.width - 1), st.integers(0, grid.height - 1)), label="last"
     )
-    exact = exact_cost(first, last, grid.price, rule)
-    assert segment_cost(first, last, grid.price, rule) == pytest.approx(exact)
+    exact = exact_cost(first, last, grid.cost_multiplier, rule)
+    assert segment_cost(first, last, grid.cost_multiplier, rule) == pytest.approx(exact)
     if max(abs(last[0] - first[0]), abs(last[1] - first[1])) == 1:
-        assert path_cost([first, last], grid.price, rule) == pytest.approx(exact)
+        assert path_cost([first, last], grid.cost_multiplier, rule) == pytest.approx(exact)
 
 
 def check_costs(grid: GridMap, cells: list[Cell], rule: MoveRule) -> None:
     for first, last in pairwise(simplify(cells, grid, rule)):
         part = cells[cells.index(first) : cells.index(last) + 1]
-        replaced = sum(exact_cost(a, b, grid.price, rule) for a, b in pairwise(part))
-        assert exact_cost(first, last, grid.price, rule) <= replaced * (1 + 1e-8)
+        replaced = sum(exact_cost(a, b, grid.cost_multiplier, rule) for a, b in pairwise(part))
+        assert exact_cost(first, last, grid.cost_multiplier, rule) <= replaced * (1 + 1e-8)
 
 
 @settings(max_examples=200)
-@given(priced_grids_with_free_cell(), RULES, st.data())
+@given(grids_with_costs(), RULES, st.data())
 def test_no_segment_costs_more_than_what_it_replaces(
     grid_and_goal: tuple[GridMap, Cell], rule: MoveRule, data: st.DataObject
 ) -> None:

@@ -12,14 +12,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ddqn_planner import GridMap, MoveRule, Planner
+from ddqn_planner.benchmarks.evaluation import Evaluation, evaluate
 from ddqn_planner.grid import UNKNOWN, Cell, connected_cells
 from ddqn_planner.grid.generators import generate_map, random_costs
-from ddqn_planner.planning.evaluation import Evaluation, evaluate
 from ddqn_planner.training.any_map import ANY_MAP, MAPS, RULES, random_scenarios
 from ddqn_planner.training.trainer import Trainer
 
 BRIEF = 192_000
-"""Environment steps that are enough to learn every move, though prices only roughly."""
+"""Environment steps that are enough to learn every move, and the cost multipliers roughly."""
 
 
 @pytest.fixture(scope="module")
@@ -30,33 +30,37 @@ def planner() -> Planner:
     return trainer.planner()
 
 
-def walks(planner: Planner, grid: GridMap, rule: MoveRule) -> Evaluation:
+def evaluation_of(planner: Planner, grid: GridMap, rule: MoveRule) -> Evaluation:
     goal = grid.free_cells()[-1]
     return evaluate(planner.q_field(grid, goal, rule).unmasked(), grid, rule)
 
 
+@pytest.mark.slow
+@pytest.mark.xdist_group("any_map")
 @pytest.mark.parametrize("rule", RULES)
 @pytest.mark.parametrize("kind", ["maze", "rooms", "corridors", "dead_ends", "office"])
-def test_small_random_maps_teach_the_moves_on_kinds_and_sizes_that_were_never_seen(
+def test_training_on_small_random_maps_learns_the_moves_on_other_types_and_sizes_of_maps(
     planner: Planner, kind: str, rule: MoveRule
 ) -> None:
     grid = GridMap(generate_map(kind, (40, 50), np.random.default_rng(1)))
-    evaluation = walks(planner, grid, rule)  # the network alone: nothing masks illegal moves
+    evaluation = evaluation_of(planner, grid, rule)  # without action masking
     assert evaluation.solved == evaluation.starts > 100
     assert evaluation.worst_ratio < 1.3
 
 
+@pytest.mark.slow
+@pytest.mark.xdist_group("any_map")
 @pytest.mark.parametrize("rule", RULES)
 def test_costs_and_unknown_cells_are_learned_with_them(planner: Planner, rule: MoveRule) -> None:
     random = np.random.default_rng(2)
     occupancy = generate_map("random_20", (30, 30), random)
     cost = np.where(random.random((30, 30)) < 0.2, UNKNOWN, random_costs(occupancy, random))
-    priced = GridMap(occupancy, cost=cost.astype(np.int8))
-    evaluation = walks(planner, priced, rule)
+    with_costs = GridMap(occupancy, cost=cost.astype(np.int8))
+    evaluation = evaluation_of(planner, with_costs, rule)
     assert evaluation.solved == evaluation.starts > 100
-    # A planner that does not see the prices takes the shortest way, which costs more.
-    goal = priced.free_cells()[-1]
-    blind = evaluate(planner.q_field(GridMap(occupancy), goal, rule), priced, rule)
+    # A planner that does not see the costs takes the shortest path, which costs more.
+    goal = with_costs.free_cells()[-1]
+    blind = evaluate(planner.q_field(GridMap(occupancy), goal, rule), with_costs, rule)
     assert evaluation.mean_ratio < (1 + blind.mean_ratio) / 2
 
 
@@ -105,28 +109,15 @@ def weights(folder: Path) -> dict[str, bytes]:
     return {name: tensor.numpy().tobytes() for name, tensor in tensors.items()}
 
 
-def test_processes_train_one_model_on_maps_of_their_own_and_go_on_where_they_stopped(
-    tmp_path: Path,
-) -> None:
-    torchrun = ["-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2"]
-    two = tmp_path / "two"
-    subprocess.run([sys.executable, *torchrun, *command(two)], check=True)
-    assert weights(two) == weights(two / "rank_1")
-    first, second = (
-        Trainer.load_checkpoint(
-            folder / "checkpoint.safetensors", random_scenarios(0, maps=64)[rank::2]
-        )
-        for rank, folder in enumerate((two, two / "rank_1"))
-    )
-    assert not np.array_equal(first.environment.cell, second.environment.cell)
-    alone = tmp_path / "alone"
-    subprocess.run([sys.executable, *command(alone)], check=True)
-    assert weights(alone) != weights(two)
-
+def test_the_command_continues_where_it_stopped_and_gives_the_same_model(tmp_path: Path) -> None:
     longer = ["--steps", "19200"]
-    subprocess.run([sys.executable, *torchrun, *command(two, *longer)], check=True)
-    subprocess.run([sys.executable, *torchrun, *command(tmp_path / "at_once", *longer)], check=True)
-    assert weights(two) == weights(tmp_path / "at_once") == weights(two / "rank_1")
+    for arguments in (
+        command(tmp_path / "cut"),
+        command(tmp_path / "cut", *longer),
+        command(tmp_path / "at_once", *longer),
+    ):
+        subprocess.run([sys.executable, *arguments], check=True)
+    assert weights(tmp_path / "cut") == weights(tmp_path / "at_once")
 
 
 def test_one_seed_gives_one_model() -> None:

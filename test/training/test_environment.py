@@ -2,66 +2,98 @@ from __future__ import annotations
 
 import warnings
 from dataclasses import replace
+from math import dist, hypot
 
 import gymnasium
 import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
 
-from ddqn_planner.grid import GridMap, MoveRule
-from ddqn_planner.model.observation import ROBOT
+from ddqn_planner.grid import MOVES, Cell, GridMap, MoveRule
+from ddqn_planner.model.observation import ROBOT, observation_background
 from ddqn_planner.training.environment import GridEnvironment, GridVectorEnvironment, Scenario
+from ddqn_planner.training.exploring_starts import initial_cells
 from ddqn_planner.training.hyper_parameters import HyperParameters
-from ddqn_planner.training.initialisation import initial_cells
 
 PARAMETERS = HyperParameters(max_episode_steps=12)
+
+
+def set_cell(environment: GridEnvironment, cell: Cell) -> None:
+    environment.vector.cell[0] = cell[1] * environment.vector.shape[1] + cell[0]
+
+
+def step_by_hand(
+    scenario: Scenario, rule: MoveRule, parameters: HyperParameters, cell: Cell, action: int
+) -> tuple[Cell, float, bool]:
+    """What one move gives: the next cell, the reward, and whether the episode terminates."""
+    (x, y), (dx, dy) = cell, MOVES[action].tolist()
+    after = (x + dx, y + dy)
+    sides = [(x + dx, y), (x, y + dy)]
+    free = [scenario.grid.is_free(entered) for entered in (after, *sides)]
+    if not (all(free) if rule is MoveRule.ROBOT_SAFE else free[0]):
+        return cell, parameters.obstacle_reward, True
+    if parameters.reward == "path_cost":
+        length = 1.0 if rule is MoveRule.UNIT else hypot(dx, dy)
+        return after, -length, after == scenario.goal
+    if after == scenario.goal:
+        return after, parameters.goal_reward, True
+    d_re, d_re_before = dist(after, scenario.goal), dist(cell, scenario.goal)
+    d_rs, d_rs_before = dist(after, scenario.start), dist(cell, scenario.start)
+    progress, detour = d_re_before - d_re, d_rs - d_rs_before - hypot(dx, dy)
+    return after, parameters.alpha * progress + parameters.beta * detour, False
 
 
 @pytest.mark.parametrize("rule", MoveRule)
 @pytest.mark.parametrize("count", [1, 3])
 @pytest.mark.parametrize("reward", ["paper", "path_cost"])
-def test_the_batch_and_the_scalar_environment_agree_step_by_step(
+def test_the_batch_agrees_with_one_robot_moved_by_hand(
     paper: Scenario, rule: MoveRule, count: int, reward: str
 ) -> None:
-    parameters = replace(PARAMETERS, reward=reward)
-    batch = GridVectorEnvironment([paper], rule, replace(parameters, environments=count))
-    scalars = [GridEnvironment(paper, rule, parameters) for _ in range(count)]
+    parameters = replace(PARAMETERS, reward=reward, environments=count)
+    batch = GridVectorEnvironment([paper], rule, parameters)
     random = np.random.default_rng(count)
     batch.reset(seed=1)
-    for scalar in scalars:
-        scalar.reset(seed=0)
-    fresh = np.ones(count, dtype=bool)
+    background = observation_background(paper.grid.occupancy, paper.goal)
+    steps = [0] * count
     for _ in range(3_000):
-        for index in np.flatnonzero(fresh):  # where an episode begins is drawn, the rest is not
-            scalars[index].cell = (int(batch.cell[index] % 20), int(batch.cell[index] // 20))
-            scalars[index].steps = 0
+        cells = [(int(cell) % 20, int(cell) // 20) for cell in batch.cell]
         actions = random.integers(8, size=count)
         observations, rewards, terminated, truncated, _ = batch.step(actions)
-        for index, scalar in enumerate(scalars):
-            observation, *outcome, _ = scalar.step(actions[index])
-            np.testing.assert_array_equal(observations[index], observation)
-            assert outcome == [rewards[index], terminated[index], truncated[index]]
-        fresh = terminated | truncated
-        if fresh.any():
-            batch.reset(options={"reset_mask": fresh})
+        for i, cell in enumerate(cells):
+            after, reward_by_hand, ended = step_by_hand(paper, rule, parameters, cell, actions[i])
+            steps[i] += 1
+            observation = background.reshape(20, 20).copy()
+            observation[after[1], after[0]] = ROBOT
+            np.testing.assert_array_equal(observations[i], observation)
+            assert rewards[i] == pytest.approx(reward_by_hand, abs=1e-6)
+            assert terminated[i] == ended
+            assert truncated[i] == (steps[i] == 12 and not ended)
+            steps[i] *= not (terminated[i] or truncated[i])
+        batch.reset(options={"reset_mask": terminated | truncated})
 
 
-def test_one_seed_begins_the_same_episodes_in_both(paper: Scenario) -> None:
+def test_the_scalar_environment_is_a_batch_of_one(paper: Scenario) -> None:
     batch = GridVectorEnvironment([paper], MoveRule.ROBOT_SAFE, PARAMETERS)
-    scalar = GridEnvironment(paper, MoveRule.ROBOT_SAFE, PARAMETERS)
-    observations, _ = batch.reset(seed=5)
-    batch.np_random.bit_generator.state = scalar_state = np.random.default_rng(
-        9
-    ).bit_generator.state
-    scalar.np_random = np.random.default_rng()
-    scalar.np_random.bit_generator.state = scalar_state
+    # How many environments a batch has does not matter here.
+    parameters = replace(PARAMETERS, environments=7)
+    scalar = GridEnvironment(paper, MoveRule.ROBOT_SAFE, parameters)
+    random = np.random.default_rng(0)
     starts = 0
-    for _ in range(200):
-        observations, _ = batch.reset()
-        observation, _ = scalar.reset()
-        # The scalar environment draws no scenario; with one scenario the draw takes no randomness.
+    for seed in (5, *[None] * 199):
+        observations, _ = batch.reset(seed=seed)
+        observation, info = scalar.reset(seed=seed)
+        starts += scalar.vector.cell[0] == batch.start[0]
         np.testing.assert_array_equal(observations[0], observation)
-        starts += scalar.cell == paper.start
+        assert info == {}
+        ended = False
+        while not ended:
+            action = random.integers(8)
+            observations, *expected, _ = batch.step(np.array([action]))
+            observation, *found, info = scalar.step(action)
+            np.testing.assert_array_equal(observations[0], observation)
+            assert found == [values[0] for values in expected]
+            assert [type(value) for value in found] == [float, bool, bool]
+            ended = found[1] or found[2]
     assert 60 < starts < 140
 
 
@@ -94,24 +126,26 @@ def test_rewards_and_ends_of_one_episode_by_hand(small: Scenario) -> None:
     assert reward == pytest.approx(0.6 * (17**0.5 - 4) + 0.4 * (0 - 1 - 1), abs=1e-6)
     _, reward, terminated, _, _ = environment.step(np.int64(4))
     assert (reward, terminated) == (-10.0, True)
-    environment.cell = (4, 1)
+    set_cell(environment, (4, 1))
     _, reward, terminated, _, _ = environment.step(np.int64(6))
     assert (reward, terminated) == (10.0, True)
 
 
-def test_path_costs_reward_a_move_by_minus_its_length_times_its_price(small: Scenario) -> None:
+def test_path_costs_reward_a_move_by_minus_its_length_times_its_cost(small: Scenario) -> None:
     cost = np.zeros((4, 5), dtype=np.int8)
     cost[1, 0] = 50
-    priced = replace(small, grid=replace(small.grid, cost=cost), move_rule=MoveRule.CORNER_CUTTING)
+    with_costs = replace(
+        small, grid=replace(small.grid, cost=cost), move_rule=MoveRule.CORNER_CUTTING
+    )
     parameters = HyperParameters(p_r=0.0, reward="path_cost")
-    environment = GridEnvironment(priced, MoveRule.ROBOT_SAFE, parameters)
+    environment = GridEnvironment(with_costs, MoveRule.ROBOT_SAFE, parameters)
     environment.reset(seed=0)
     assert environment.step(np.int64(2))[1] == pytest.approx(-(1 + 3) / 2)
-    environment.cell = (1, 2)
-    # The rule of the scenario goes before that of the environment: a corner may be cut.
+    set_cell(environment, (1, 2))
+    # The rule of the scenario overrides that of the environment: a corner may be cut.
     _, reward, terminated, _, _ = environment.step(np.int64(1))
     assert (reward, terminated) == (pytest.approx(-(2**0.5)), False)
-    environment.cell = (4, 1)
+    set_cell(environment, (4, 1))
     _, reward, terminated, _, _ = environment.step(np.int64(6))
     assert (reward, terminated) == (-1.0, True)
     environment.reset()
@@ -127,7 +161,7 @@ def test_without_alpha_and_beta_free_cells_earn_nothing(small: Scenario) -> None
 
 
 @pytest.mark.parametrize(("p_r", "expected"), [(0.0, 0.0), (0.5, 0.5), (1.0, 1.0)])
-def test_episodes_begin_at_random_free_cells_with_probability_p_r(
+def test_episodes_start_at_random_free_cells_with_probability_p_r(
     paper: Scenario, p_r: float, expected: float
 ) -> None:
     parameters = HyperParameters(environments=4000, p_r=p_r)
@@ -183,8 +217,8 @@ def test_a_move_that_succeeds_is_rewarded_for_the_goal_only_beside_it(small: Sce
     assert rewarded == {(3, 0), (3, 1), (4, 1)}
 
 
-def test_an_episode_begins_in_each_free_cell_of_its_map_alike() -> None:
-    # Of the first map two cells are free; what pads its row does not count.
+def test_an_episode_starts_in_each_free_cell_of_its_map_equally_often() -> None:
+    # The first map has two free cells; the padding of its row is never drawn.
     free = np.array([[1, 2, -1], [3, 4, 5]]).repeat(3000, axis=0)
     count = np.array([2, 3]).repeat(3000)
     start = np.zeros(6000, dtype=np.int64)

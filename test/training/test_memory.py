@@ -53,6 +53,7 @@ print(peak() - before)
 """The memory that a training takes beyond a small one of its kind."""
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("side", "maps", "more"),
     [
@@ -60,16 +61,16 @@ print(peak() - before)
         (20, 400, {"network": "propagation"}),
     ],
 )
-def test_a_training_takes_what_was_said(
+def test_the_estimate_is_near_to_the_measured_memory(
     tmp_path: Path, side: int, maps: int, more: dict[str, object]
 ) -> None:
     parameters = HyperParameters(**{"learning_starts": 0, **more})  # type: ignore[arg-type]
     scenario = Scenario(GridMap(np.zeros((side, side), bool)), (0, 0), (side - 1, side - 1))
-    said = training_bytes([scenario] * maps, parameters)
+    estimate = training_bytes([scenario] * maps, parameters)
     arguments = [str(side), str(maps), json.dumps(asdict(parameters)), str(tmp_path / "x")]
     command = [sys.executable, "-c", TRAIN, *arguments]
     measured = int(subprocess.run(command, check=True, capture_output=True, text=True).stdout)
-    assert 0.7 * measured <= said <= 1.5 * measured, (said, measured)
+    assert 0.7 * measured <= estimate <= 1.5 * measured, (estimate, measured)
 
 
 def test_a_training_that_cannot_fit_is_refused_with_both_numbers(tmp_path: Path) -> None:
@@ -81,15 +82,15 @@ def test_a_training_that_cannot_fit_is_refused_with_both_numbers(tmp_path: Path)
     assert not (tmp_path / "run").exists()
 
 
-def test_what_fits_is_what_is_available(small: Scenario) -> None:
+def test_a_training_that_fits_is_accepted(small: Scenario) -> None:
     assert 0 < available_bytes() < os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
     assert check_memory([small], HyperParameters()) == training_bytes([small], HyperParameters())
 
 
-def test_each_parameter_that_takes_memory_counts(small: Scenario) -> None:
-    # A small buffer: else saving it takes more than all that the others can change.
+def test_each_parameter_that_takes_memory_raises_the_estimate(small: Scenario) -> None:
+    # A small buffer: saving a large one takes more than all that the others can change.
     least = HyperParameters(replay_capacity=4096)
-    said = training_bytes([small], least)
+    estimate = training_bytes([small], least)
     for more in (
         replace(least, filters=64),
         replace(least, hidden_units=1024),
@@ -97,8 +98,8 @@ def test_each_parameter_that_takes_memory_counts(small: Scenario) -> None:
         replace(least, environments=4096),
         replace(least, replay_capacity=100_000),
     ):
-        assert training_bytes([small], more) > said
-    assert training_bytes([small] * 1000, least) > said
+        assert training_bytes([small], more) > estimate
+    assert training_bytes([small] * 1000, least) > estimate
 
 
 def test_a_checkpoint_of_holes_is_refused_before_it_is_read(

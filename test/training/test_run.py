@@ -19,9 +19,10 @@ from ddqn_planner.grid import path_length
 from ddqn_planner.model import load_model
 from ddqn_planner.training import run as run_module
 from ddqn_planner.training.environment import Scenario
+from ddqn_planner.training.episodes import Episode, read_cells
 from ddqn_planner.training.hyper_parameters import HyperParameters
-from ddqn_planner.training.run import FolderError, TrainingRun, read_cells
-from ddqn_planner.training.trainer import CheckpointError, Episode
+from ddqn_planner.training.run import FolderError, TrainingRun
+from ddqn_planner.training.trainer import CheckpointError
 
 PARAMETERS = HyperParameters(steps=400, filters=4, learning_starts=50)
 
@@ -73,11 +74,11 @@ def test_the_curves_hold_lengths_under_the_rule_of_the_scenario(
     )
 
 
-def test_a_run_goes_on_from_its_checkpoint_and_loses_no_row(
+def test_a_run_continues_from_its_checkpoint_and_loses_no_row(
     small: Scenario, tmp_path: Path
 ) -> None:
-    whole = open_run(tmp_path / "whole", small)
-    finish(whole)
+    uninterrupted = open_run(tmp_path / "uninterrupted", small)
+    finish(uninterrupted)
     first = open_run(tmp_path / "cut", small)
     for _ in first.steps():
         if first.trainer.steps == 150:
@@ -88,9 +89,9 @@ def test_a_run_goes_on_from_its_checkpoint_and_loses_no_row(
     second = open_run(tmp_path / "cut", small)
     assert second.trainer.steps == 150
     finish(second)
-    assert rows(tmp_path / "cut") == rows(tmp_path / "whole")
+    assert rows(tmp_path / "cut") == rows(tmp_path / "uninterrupted")
     for a, b in zip(
-        whole.trainer.network.parameters(), second.trainer.network.parameters(), strict=True
+        uninterrupted.trainer.network.parameters(), second.trainer.network.parameters(), strict=True
     ):
         assert torch.equal(a, b)
 
@@ -132,14 +133,7 @@ def test_a_folder_of_something_else_is_refused_and_left_as_it_is(
     assert path.read_text() == "mine"
 
 
-def test_the_folders_of_other_ranks_do_not_keep_the_first_one_out(
-    small: Scenario, tmp_path: Path
-) -> None:
-    open_run(tmp_path / "rank_1", small).close()
-    open_run(tmp_path, small).close()
-
-
-def test_a_training_that_was_killed_before_its_first_checkpoint_can_begin_again(
+def test_a_training_that_was_killed_before_its_first_checkpoint_can_start_again(
     small: Scenario, tmp_path: Path
 ) -> None:
     killed = open_run(tmp_path, small)
@@ -150,7 +144,9 @@ def test_a_training_that_was_killed_before_its_first_checkpoint_can_begin_again(
     assert rows(tmp_path)
 
 
-def test_a_checkpoint_of_a_version_without_locks_goes_on(small: Scenario, tmp_path: Path) -> None:
+def test_a_run_continues_a_checkpoint_of_a_version_without_locks(
+    small: Scenario, tmp_path: Path
+) -> None:
     finish(open_run(tmp_path, small))
     (tmp_path / "training.lock").unlink()
     resumed = open_run(tmp_path, small)
@@ -244,7 +240,7 @@ def test_tensorboard_gets_the_curves_where_it_is_installed(small: Scenario, tmp_
     assert len(board_scalars(tmp_path)) == len(episodes)
 
 
-def test_a_training_goes_on_while_the_disk_is_full_and_saves_when_it_no_longer_is(
+def test_a_training_continues_while_the_disk_is_full_and_saves_when_it_no_longer_is(
     small: Scenario, tmp_path: Path
 ) -> None:
     run = open_run(tmp_path, small, steps=10**6)
@@ -348,15 +344,15 @@ def test_a_model_newer_than_the_checkpoint_does_no_harm(small: Scenario, tmp_pat
     assert load_model(resumed.model_path)[1].steps == 400
 
 
-WHOLE = b"1,9,0,reached_goal,2,2.0,1.5,0.75,0:0 1:0 2:0\r\n"
+GOOD = b"1,9,0,reached_goal,2,2.0,1.5,0.75,0:0 1:0 2:0\r\n"
 
 
-@given(st.lists(st.binary() | st.sampled_from([WHOLE, WHOLE[:-9], WHOLE.replace(b"1:0", b"1:")])))
-def test_of_a_broken_file_whole_rows_alone_are_read(
+@given(st.lists(st.binary() | st.sampled_from([GOOD, GOOD[:-9], GOOD.replace(b"1:0", b"1:")])))
+def test_only_the_complete_rows_of_a_broken_file_are_read(
     tmp_path_factory: pytest.TempPathFactory, lines: list[bytes]
 ) -> None:
     path = tmp_path_factory.mktemp("broken") / "episodes.csv"
-    path.write_bytes(b"\n".join([*lines, b""]) + WHOLE)
+    path.write_bytes(b"\n".join([*lines, b""]) + GOOD)
     cells = list(read_cells(path, every=1))
     assert cells[-1] == ((0, 0), (1, 0), (2, 0))
 
@@ -366,6 +362,6 @@ def test_an_episode_of_any_length_can_be_read_and_cut(small: Scenario, tmp_path:
     path = tmp_path / "episodes.csv"
     cells = b" ".join([b"0:0"] * 10**5)
     path.write_bytes(b"1,9,0,out_of_steps,2,2.0,1.5,0.75," + cells + b"\r\n")
-    assert [len(walked) for walked in read_cells(path, every=1)] == [10**5]
+    assert [len(cells) for cells in read_cells(path, every=1)] == [10**5]
     open_run(tmp_path, small).close()
     assert rows(tmp_path) == []

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import json
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -7,13 +8,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from safetensors import safe_open
 
 from ddqn_planner import GridMap, MoveRule, PlanStatus
+from ddqn_planner.benchmarks.evaluation import evaluate
 from ddqn_planner.model import load_model
-from ddqn_planner.planning.evaluation import evaluate
 from ddqn_planner.training.environment import Scenario
+from ddqn_planner.training.episodes import Episode, EpisodeEnd
 from ddqn_planner.training.hyper_parameters import HyperParameters
-from ddqn_planner.training.trainer import CheckpointError, Episode, Outcome, Trainer
+from ddqn_planner.training.replay_buffer import Transitions
+from ddqn_planner.training.trainer import CheckpointError, Trainer
 
 QUICK = HyperParameters(
     learning_rate=0.003, filters=8, learning_starts=50, epsilon_steps=1500, target_interval=100
@@ -36,7 +40,7 @@ def same_weights(a: Trainer, b: Trainer) -> bool:
     return all(torch.equal(x, y) for x, y in zip(weights(a), weights(b), strict=True))
 
 
-def test_training_learns_the_way_around_a_wall(small: Scenario) -> None:
+def test_training_learns_the_path_around_a_wall(small: Scenario) -> None:
     trainer = make(small)
     train(trainer, 3000)
     field = trainer.planner().q_field(small.grid, small.goal)
@@ -53,6 +57,7 @@ def test_the_other_targets_learn_the_small_map_too(small: Scenario, target: str)
     assert trainer.planner().plan(small.grid, small.start, small.goal).cells
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("rule", MoveRule)
 def test_the_propagation_network_learns_what_a_move_does_for_maps_of_any_size(
     small: Scenario, paper: Scenario, rule: MoveRule
@@ -88,7 +93,7 @@ def test_one_seed_gives_one_network_and_another_seed_another(small: Scenario) ->
 @pytest.mark.parametrize("network", ["paper", "propagation"])
 @pytest.mark.parametrize("environments", [1, 3])
 @pytest.mark.parametrize("first", [20, 301])
-def test_an_interrupted_training_goes_on_bit_for_bit(
+def test_an_interrupted_training_continues_bit_for_bit(
     small: Scenario, tmp_path: Path, environments: int, first: int, network: str
 ) -> None:
     parameters = replace(
@@ -99,29 +104,25 @@ def test_an_interrupted_training_goes_on_bit_for_bit(
         target_interval=30,
         network=network,
     )
-    whole, interrupted = make(small, parameters), make(small, parameters)
-    episodes = train(whole, 600)
+    uninterrupted, interrupted = make(small, parameters), make(small, parameters)
+    episodes = train(uninterrupted, 600)
     before = train(interrupted, first)
     interrupted.save_checkpoint(tmp_path / "checkpoint")
     resumed = Trainer.load_checkpoint(tmp_path / "checkpoint", [small])
     assert before + train(resumed, 600) == episodes
-    assert same_weights(whole, resumed)
-    assert (whole.steps, whole.updates, whole.episodes, whole.epsilon) == (
-        resumed.steps,
-        resumed.updates,
-        resumed.episodes,
-        resumed.epsilon,
-    )
+    assert same_weights(uninterrupted, resumed)
+    for name in ("steps", "updates", "episodes", "epsilon"):
+        assert getattr(uninterrupted, name) == getattr(resumed, name)
 
 
 def test_the_loop_can_be_left_after_any_step(small: Scenario) -> None:
-    whole, left = make(small), make(small)
-    train(whole, 200)
+    uninterrupted, left = make(small), make(small)
+    train(uninterrupted, 200)
     for _ in left.run(200):
         if left.steps == 77:
             break
     train(left, 200)
-    assert same_weights(whole, left)
+    assert same_weights(uninterrupted, left)
 
 
 @pytest.mark.parametrize(("environments", "interval"), [(1, 1), (3, 2), (3, 5), (4, 3)])
@@ -152,14 +153,14 @@ def test_epsilon_falls_linearly_and_then_stays(small: Scenario) -> None:
     assert epsilons == pytest.approx([0.8, 0.65, 0.2, 0.2, 0.2])
 
 
-def test_without_epsilon_the_robot_walks_by_the_network_alone(small: Scenario) -> None:
+def test_without_epsilon_the_robot_follows_the_network_alone(small: Scenario) -> None:
     parameters = replace(QUICK, learning_starts=10**6, max_episode_steps=9, p_r=0.0)
-    walks = []
+    rollouts = []
     for epsilon in (0.0, 1.0):
         parameters = replace(parameters, epsilon_start=epsilon, epsilon_end=epsilon)
-        walks.append({episode.cells for episode in train(make(small, parameters), 200)})
-    assert len(walks[0]) == 1  # the network does not change
-    assert len(walks[1]) > 5
+        rollouts.append({episode.cells for episode in train(make(small, parameters), 200)})
+    assert len(rollouts[0]) == 1  # the network does not change
+    assert len(rollouts[1]) > 5
 
 
 def test_the_target_is_copied_after_as_many_updates_as_asked_for(small: Scenario) -> None:
@@ -177,13 +178,13 @@ def test_an_episode_adds_up_its_own_rewards_alone(small: Scenario) -> None:
         (episode.outcome, episode.total_reward) for episode in train(make(small, parameters), 2000)
     }
     assert totals == {
-        (Outcome.REACHED_GOAL, 10.0),
-        (Outcome.COLLIDED, -10.0),
-        (Outcome.OUT_OF_STEPS, 0.0),
+        (EpisodeEnd.REACHED_GOAL, 10.0),
+        (EpisodeEnd.COLLIDED, -10.0),
+        (EpisodeEnd.OUT_OF_STEPS, 0.0),
     }
 
 
-def test_a_model_says_what_it_was_trained_with(small: Scenario) -> None:
+def test_the_metadata_of_a_model_say_how_it_was_trained(small: Scenario) -> None:
     other = replace(small, grid=GridMap(np.zeros((4, 5))))
     trainer = Trainer([small, other], MoveRule.UNIT, replace(QUICK, gamma=0.8), seed=3)
     train(trainer, 2)
@@ -197,9 +198,9 @@ def test_after_a_truncated_move_the_target_still_bootstraps(small: Scenario) -> 
     # Episodes of one move each: it collides, or the episode is out of steps.
     trainer = make(small, replace(QUICK, max_episode_steps=1, p_r=0.0))
     outcomes = [episode.outcome for episode in train(trainer, 40)]
-    assert {*outcomes} == {Outcome.COLLIDED, Outcome.OUT_OF_STEPS}
+    assert {*outcomes} == {EpisodeEnd.COLLIDED, EpisodeEnd.OUT_OF_STEPS}
     stored = trainer._replay.transitions.discount[:40]
-    expected = [0.0 if outcome is Outcome.COLLIDED else 0.95 for outcome in outcomes]
+    expected = [0.0 if outcome is EpisodeEnd.COLLIDED else 0.95 for outcome in outcomes]
     assert stored.tolist() == pytest.approx(expected)
 
 
@@ -212,22 +213,22 @@ def test_an_episode_that_was_interrupted_before_its_last_step_ends_with_that(
     trainer.save_checkpoint(tmp_path / "checkpoint")
     resumed = Trainer.load_checkpoint(tmp_path / "checkpoint", [nothing_to_hit])
     (episode,) = train(resumed, 5)
-    assert (episode.outcome, episode.moves) == (Outcome.OUT_OF_STEPS, 5)
+    assert (episode.outcome, episode.moves) == (EpisodeEnd.OUT_OF_STEPS, 5)
     assert len(episode.cells) == 6
 
 
-def test_episodes_tell_how_they_went(small: Scenario) -> None:
+def test_episodes_say_how_they_ended(small: Scenario) -> None:
     parameters = replace(QUICK, max_episode_steps=5)
     episodes = train(make(small, parameters), 2000)
     assert [episode.number for episode in episodes] == list(range(1, len(episodes) + 1))
-    assert {episode.outcome for episode in episodes} == set(Outcome)
+    assert {episode.outcome for episode in episodes} == set(EpisodeEnd)
     for episode in episodes:
         assert all(small.grid.is_free(cell) for cell in episode.cells)
         assert episode.average_reward == episode.total_reward / episode.moves
-        collided = episode.outcome is Outcome.COLLIDED
+        collided = episode.outcome is EpisodeEnd.COLLIDED
         assert episode.moves == len(episode.cells) - (0 if collided else 1)
-        assert (episode.cells[-1] == small.goal) == (episode.outcome is Outcome.REACHED_GOAL)
-        if episode.outcome is Outcome.OUT_OF_STEPS:
+        assert (episode.cells[-1] == small.goal) == (episode.outcome is EpisodeEnd.REACHED_GOAL)
+        if episode.outcome is EpisodeEnd.OUT_OF_STEPS:
             assert episode.moves == 5
 
 
@@ -263,6 +264,42 @@ def test_a_checkpoint_of_another_problem_is_refused(
             Trainer.load_checkpoint(tmp_path / "checkpoint", [other])
 
 
+def test_the_format_of_a_checkpoint_stays(small: Scenario, tmp_path: Path) -> None:
+    trainer = make(small, replace(QUICK, replay_capacity=100))
+    train(trainer, 60)
+    trainer.save_checkpoint(tmp_path / "checkpoint")
+    with safe_open(tmp_path / "checkpoint", framework="np") as file:
+        metadata = file.metadata()
+        shapes = {key: file.get_slice(key).get_shape() for key in file.keys()}  # noqa: SIM118
+    description = json.loads(metadata["ddqn_planner_checkpoint"])
+    assert {*metadata} == {"ddqn_planner_checkpoint", "sha256"}
+    assert [*description] == [
+        "seed",
+        "move_rule",
+        "parameters",
+        "scenarios",
+        "counters",
+        "walked",
+        "generators",
+    ]
+    replay = {f"replay.{name}": [60] for name in Transitions._fields}
+    environment = {f"environment.{name}": [1] for name in ("scenario", "cell", "steps")}
+    network = {name: [*tensor.shape] for name, tensor in trainer.network.state_dict().items()}
+    assert shapes == {
+        **replay,
+        **environment,
+        "total_reward": [1],
+        **{f"network.{name}": shape for name, shape in network.items()},
+        **{f"target.{name}": shape for name, shape in network.items()},
+        **{f"optimiser.{number}.step": [] for number in range(len(network))},
+        **{
+            f"optimiser.{number}.{moment}": shape
+            for number, shape in enumerate(network.values())
+            for moment in ("exp_avg", "exp_avg_sq")
+        },
+    }
+
+
 @pytest.mark.parametrize("fraction", [0.0, 0.3, 0.9])
 def test_a_truncated_checkpoint_is_refused(
     small: Scenario, tmp_path: Path, fraction: float
@@ -271,7 +308,7 @@ def test_a_truncated_checkpoint_is_refused(
     make(small).save_checkpoint(path)
     content = path.read_bytes()
     path.write_bytes(content[: int(fraction * len(content))])
-    with pytest.raises(CheckpointError, match="no whole checkpoint"):
+    with pytest.raises(CheckpointError, match="no complete checkpoint"):
         Trainer.load_checkpoint(path, [small])
 
 

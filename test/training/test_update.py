@@ -1,4 +1,4 @@
-"""One update of each learner, beside the same written down from the equations."""
+"""One update of each network, compared with the same written down from the equations."""
 
 from __future__ import annotations
 
@@ -12,10 +12,11 @@ import torch
 from torch import Tensor, nn
 
 from ddqn_planner.grid import LENGTHS, MOVES, Cell, GridMap, MoveRule
-from ddqn_planner.model import AnyMapQNetwork, PaperQNetwork
-from ddqn_planner.model.propagation import features, surroundings
+from ddqn_planner.model import AnyMapQNetwork
+from ddqn_planner.model.observation import patches
 from ddqn_planner.training.environment import Scenario
 from ddqn_planner.training.hyper_parameters import HyperParameters
+from ddqn_planner.training.networks import AnyMapModule, PaperModule
 from ddqn_planner.training.replay_buffer import Transitions
 from ddqn_planner.training.trainer import Trainer
 
@@ -34,7 +35,7 @@ def about_to_update(scenarios: list[Scenario], parameters: HyperParameters) -> T
     torch.manual_seed(0)
     for weight in trainer._target.parameters():
         weight.add_(0.3 * torch.randn_like(weight))
-    trainer._learner.copy_target(trainer._target)
+    trainer._encoder.update_target(trainer._target)
     return trainer
 
 
@@ -45,17 +46,17 @@ def next_batch(trainer: Trainer) -> Transitions:
 
 
 def mean_squared_error(
-    trainer: Trainer, batch: Transitions, online: Q, choose: Q, judge: Q
+    trainer: Trainer, batch: Transitions, online: Q, selection: Q, evaluation: Q
 ) -> Tensor:
-    """Mean of (r + γ Q(s', argmax_a Q(s', a; choose); judge) - Q(s, a; online))², γ 0 at an end."""
+    """Mean of (y - Q(s, a; online))², y of `double_dqn_target`, and γ = 0 at an end."""
     width = trainer.environment.shape[1]
     errors = []
     for number, cell, action, reward, next_cell, discount in zip(*batch, strict=True):
         scenario = trainer.scenarios[number]
         state, next_state = ((int(c) % width, int(c) // width) for c in (cell, next_cell))
         with torch.no_grad():
-            best = choose(scenario, next_state).argmax()
-            y = reward + discount * judge(scenario, next_state)[best]
+            best = selection(scenario, next_state).argmax()
+            y = reward + discount * evaluation(scenario, next_state)[best]
         errors.append((y - online(scenario, state)[action]) ** 2)
     return torch.stack(errors).mean()
 
@@ -81,7 +82,7 @@ def test_an_update_of_the_papers_network_is_that_of_the_equations(
     scenarios = [small, replace(small, grid=GridMap(small.grid.occupancy[::-1]))]
     trainer = about_to_update(scenarios, HyperParameters(target=target, filters=4))
     network = copy.deepcopy(trainer.network)
-    assert isinstance(network, PaperQNetwork)
+    assert isinstance(network, PaperModule)
 
     def q_of(network: nn.Module) -> Q:
         def q(scenario: Scenario, cell: Cell) -> Tensor:
@@ -94,17 +95,17 @@ def test_an_update_of_the_papers_network_is_that_of_the_equations(
         return q
 
     online, target_q = q_of(network), q_of(copy.deepcopy(trainer._target))
-    choose = target_q if target == "dqn" else online
-    judge = online if target == "printed" else target_q
+    selection = target_q if target == "dqn" else online
+    evaluation = online if target == "printed" else target_q
     batch = next_batch(trainer)
     assert {0, 1} == set(batch.scenario)
     assert {0.0, np.float32(0.95)} == set(batch.discount)
-    loss = mean_squared_error(trainer, batch, online, choose, judge)
+    loss = mean_squared_error(trainer, batch, online, selection, evaluation)
     check_update(trainer, loss, list(network.parameters()), tolerance=1e-4)
 
 
 def test_an_update_of_the_network_for_any_map_counts_each_reward_once(small: Scenario) -> None:
-    # Q(s, a) = p (r + γ V(s')) + (1 - p) r_o, r = -length * price, V = max Q under θ⁻.
+    # Q(s, a) = p (r + γ V(s')) + (1 - p) r_o, r = -length * cost multiplier, V = max Q under θ⁻.
     cost = np.arange(20, dtype=np.int8).reshape(4, 5)
     walls = small.grid.occupancy
     scenarios = [
@@ -115,33 +116,34 @@ def test_an_update_of_the_network_for_any_map_counts_each_reward_once(small: Sce
         network="any_map", reward="path_cost", gamma=0.5, obstacle_reward=-20.0, filters=4
     )
     trainer = about_to_update(scenarios, parameters)
-    network, judge_network = copy.deepcopy(trainer.network), copy.deepcopy(trainer._target)
-    assert isinstance(network, AnyMapQNetwork)
+    network, target_network = copy.deepcopy(trainer.network), copy.deepcopy(trainer._target)
+    assert isinstance(network, AnyMapModule)
     lengths = torch.from_numpy(LENGTHS.astype(np.float32))
 
     def q_of(
-        network: nn.Module, scenario: Scenario, value: dict[Cell, float]
+        network: AnyMapModule, scenario: Scenario, value: dict[Cell, float]
     ) -> dict[Cell, Tensor]:
-        seen = surroundings(scenario.grid.occupancy, scenario.grid.cost)
+        seen = patches(scenario.grid.occupancy, scenario.grid.cost)
         rule = scenario.move_rule or MoveRule.CORNER_CUTTING
-        p, price = network(torch.from_numpy(features(seen, rule)))
+        features = torch.from_numpy(AnyMapQNetwork.features(seen, rule))
+        p, multiplier = network.success(features), network.multiplier(features)
         answers = {}
         for number in range(20):
             x, y = number % 5, number // 5
             onward = torch.tensor([value.get((x + dx, y + dy), -20.0) for dx, dy in MOVES.tolist()])
-            success = -lengths * price[number] + 0.5 * onward
+            success = -lengths * multiplier[number] + 0.5 * onward
             answers[x, y] = p[number] * success + (1 - p[number]) * -20.0
         return answers
 
-    online, judge = {}, {}
+    online, evaluation = {}, {}
     for scenario in scenarios:
         value = {(x, y): -20.0 for x in range(5) for y in range(4)}
         with torch.no_grad():
             for _ in range(40):  # γ^40 is 1e-12
-                q = q_of(judge_network, scenario, value)
+                q = q_of(target_network, scenario, value)
                 value = {cell: float(q_A.max()) for cell, q_A in q.items()}
                 value[scenario.goal] = 0.0
-            judge[scenario] = q_of(judge_network, scenario, value)
+            evaluation[scenario] = q_of(target_network, scenario, value)
         online[scenario] = q_of(network, scenario, value)
     batch = next_batch(trainer)
     assert {0, 1} == set(batch.scenario)
@@ -149,7 +151,7 @@ def test_an_update_of_the_network_for_any_map_counts_each_reward_once(small: Sce
         trainer,
         batch,
         online=lambda s, cell: online[s][cell],
-        choose=lambda s, cell: online[s][cell],
-        judge=lambda s, cell: judge[s][cell],
+        selection=lambda s, cell: online[s][cell],
+        evaluation=lambda s, cell: evaluation[s][cell],
     )
     check_update(trainer, loss, list(network.parameters()), tolerance=2e-3)

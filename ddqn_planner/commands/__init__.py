@@ -1,0 +1,1 @@
+"""The commands of ``ddqn-planner``: each module has ``add_options`` and ``run``."""

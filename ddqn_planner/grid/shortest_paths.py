@@ -1,0 +1,73 @@
+"""Exact shortest paths by Dijkstra's algorithm in scipy: the reference for plans."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ddqn_planner.grid.arguments import Cell, as_cell
+from ddqn_planner.grid.grid_map import GridMap
+from ddqn_planner.grid.moves import MOVES, MoveRule, legal_moves
+
+
+def shortest_distances(grid: GridMap, goal: Cell, move_rule: MoveRule | str) -> NDArray[np.float64]:
+    """Return the cost of the cheapest path from every cell to the goal, see `path_cost`.
+
+    Without costs on the map, that is the length of the shortest path in cells.
+
+    Returns
+    -------
+    (H, W) float64
+        Infinite where no path leads to the goal.
+    """
+    distances: NDArray[np.float64] = _dijkstra(grid, goal, move_rule)[0]
+    return distances.reshape(grid.height, grid.width)
+
+
+def shortest_path(grid: GridMap, start: Cell, goal: Cell, move_rule: MoveRule | str) -> list[Cell]:
+    """Return the cells of one cheapest path, from start to goal; empty if there is none."""
+    start, goal = as_cell(start, "the start"), as_cell(goal, "the goal")
+    _, previous = _dijkstra(grid, goal, move_rule)
+    cells, number = [start], start[1] * grid.width + start[0]
+    while previous[number] >= 0:
+        number = int(previous[number])
+        cells.append((number % grid.width, number // grid.width))
+    return cells if cells[-1] == goal else []
+
+
+def _dijkstra(grid: GridMap, goal: Cell, move_rule: MoveRule | str) -> Any:
+    """Return each cell's distance from the goal, and the next cell on its path to the goal.
+
+    The search runs from the goal: every move is legal, and costs the same, in both directions.
+    """
+    from scipy.sparse.csgraph import dijkstra
+
+    x, y = as_cell(goal, "the goal")
+    if not grid.contains((x, y)):
+        raise ValueError(f"the goal {goal} lies outside the map of {grid.width} x {grid.height}")
+    graph = _graph(grid, move_rule)
+    return dijkstra(graph, indices=y * grid.width + x, return_predecessors=True)
+
+
+def _graph(grid: GridMap, move_rule: MoveRule | str) -> Any:
+    """Return the cost of each legal move, from cell number y * width + x to another.
+
+    The rows of the sparse matrix are built in scipy's own order: sorting edges would take longer.
+    """
+    from scipy.sparse import csr_array
+
+    step = MOVES[:, 1] * grid.width + MOVES[:, 0]
+    actions = np.argsort(step)  # puts the columns of each row in order
+    legal_NA = legal_moves(grid.occupancy, move_rule)[actions].reshape(len(MOVES), -1).T
+    edge = np.flatnonzero(legal_NA)
+    cell, place = np.divmod(edge.astype(np.int32), np.int32(len(MOVES)))
+    next_cell = cell + step[actions].astype(np.int32)[place]
+    cost = MoveRule(move_rule).lengths[actions][place]
+    if grid.cost is not None:
+        multiplier = grid.cost_multiplier.ravel().astype(np.float64)
+        cost *= (multiplier[cell] + multiplier[next_cell]) / 2
+    row_end = np.cumsum(np.count_nonzero(legal_NA, axis=1), dtype=np.int32)
+    row_start = np.concatenate([np.zeros(1, dtype=np.int32), row_end])
+    return csr_array((cost, next_cell, row_start), shape=(legal_NA.shape[0],) * 2)

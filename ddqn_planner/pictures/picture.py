@@ -1,0 +1,119 @@
+"""A plan as text, and as a picture of map, value field and path."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ddqn_planner.grid import Cell, GridMap
+from ddqn_planner.pictures.colours import (
+    MAX_SIDE_WITH_LINES,
+    OBSTACLE_COLOUR,
+    PATH_COLOUR,
+    VALUE_COLOURS,
+)
+
+MAX_TEXT_WIDTH = 64
+"""Cells of the widest map that is worth printing as text: a cell takes two characters."""
+
+
+class PictureError(ImportError):
+    """A picture cannot be drawn; the message says what is missing."""
+
+
+def draw_text(grid: GridMap, cells: Sequence[Cell]) -> str:
+    """Return the map as text, y upwards: ``#`` occupied, ``.`` free, ``*`` path, ``S``, ``G``."""
+    letters = np.where(grid.occupancy, "#", ".")
+    for x, y in cells:
+        letters[y, x] = "*"
+    for letter, (x, y) in zip("SG", (*cells[:1], *cells[-1:]), strict=False):
+        letters[y, x] = letter
+    return "\n".join(" ".join(row) for row in letters[::-1])
+
+
+def save_picture(
+    path: str | Path,
+    grid: GridMap,
+    cells: Sequence[Cell],
+    value: NDArray[np.float32] | None,
+    title: str,
+    value_label: str = "value: max Q(s, a)",
+) -> None:
+    """Draw map, value field and path into a picture file.
+
+    Parameters
+    ----------
+    path : str or Path
+        Its ending (``.png``, ``.svg``, ``.pdf``) sets the format.
+    grid : GridMap
+    cells : sequence of (x, y)
+        The path; if it is empty, none is drawn.
+    value : (H, W) float32, optional
+        The value field, drawn where it is finite.
+    title, value_label : str
+
+    Raises
+    ------
+    PictureError
+        If matplotlib is not installed.
+    OSError, ValueError
+        If the file cannot be written, or matplotlib does not know its ending.
+    """
+    try:
+        import matplotlib
+
+        matplotlib.use("Agg")
+        import matplotlib.pyplot as plt
+        from matplotlib.colors import LinearSegmentedColormap
+        from matplotlib.ticker import MaxNLocator
+    except ImportError as error:
+        raise PictureError(
+            f"pictures need matplotlib ({error}): pip install 'ddqn_planner[figures]'"
+        ) from None
+    tall = min(max(grid.height / grid.width, 0.4), 1.0)
+    figure, axes = plt.subplots(figsize=(7.2, 1.5 + 5.1 * tall), dpi=120, layout="constrained")
+    axes.set(facecolor="white", xlabel="x [cells]", ylabel="y [cells]", aspect="equal")
+    axes.set_title(title, loc="left", fontsize=12)
+    for axis in (axes.xaxis, axes.yaxis):
+        axis.set_major_locator(MaxNLocator(integer=True))
+    if value is not None:
+        finite = np.where(np.isfinite(value), value, np.nan)
+        colours = LinearSegmentedColormap.from_list("value", VALUE_COLOURS)
+        image = axes.imshow(finite, origin="lower", cmap=colours, interpolation="nearest")
+        bar = axes.inset_axes((1.02, 0, 0.035, 1))  # as high as the map
+        figure.colorbar(image, bar, label=value_label)
+    draw_obstacles(axes, grid)
+    if cells:
+        _draw_path(axes, cells)
+        figure.legend(loc="outside lower center", ncols=3, frameon=False)
+    figure.savefig(path)
+    plt.close(figure)
+
+
+def draw_obstacles(axes: Any, grid: GridMap) -> None:
+    """Draw the occupied cells of a map into matplotlib axes, and lines between its cells."""
+    from matplotlib.colors import ListedColormap
+
+    occupied = np.where(grid.occupancy, 1.0, np.nan)
+    colours = ListedColormap([OBSTACLE_COLOUR])
+    axes.imshow(occupied, origin="lower", cmap=colours, interpolation="nearest")
+    if max(grid.width, grid.height) <= MAX_SIDE_WITH_LINES:
+        axes.set_xticks(np.arange(-0.5, grid.width), minor=True)
+        axes.set_yticks(np.arange(-0.5, grid.height), minor=True)
+        axes.grid(which="minor", color="white", linewidth=0.8)
+        axes.tick_params(which="minor", length=0)
+
+
+def _draw_path(axes: Any, cells: Sequence[Cell]) -> None:
+    from matplotlib.patheffects import withStroke
+
+    x, y = np.transpose(cells)
+    outline = [withStroke(linewidth=5.5, foreground="white")]
+    axes.plot(x, y, color=PATH_COLOUR, linewidth=3, path_effects=outline, label="path")
+    for label, end, marker, size in (("start", 0, "o", 110), ("goal", -1, "*", 300)):
+        ends = {"marker": marker, "s": size, "edgecolors": "white", "linewidths": 1.5, "zorder": 3}
+        axes.scatter(x[end], y[end], color=PATH_COLOUR, label=label, **ends)

@@ -1,0 +1,46 @@
+"""The site of these pages: `make docs` writes it to docs/_build/html."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+from xml.etree import ElementTree
+
+DOCS = Path(__file__).resolve().parent
+sys.path.insert(0, str(DOCS.parent))
+
+project = "ddqn_planner"
+author = "ddqn_planner maintainers"
+copyright = "ddqn_planner maintainers, Apache-2.0"
+release = ElementTree.parse(DOCS.parent / "package.xml").findtext("version")
+
+extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "sphinx.ext.viewcode"]
+exclude_patterns = ["_build"]
+html_theme = "furo"
+html_title = f"ddqn_planner {release}"
+html_static_path = ["_static"]
+html_css_files = ["site.css"]
+pygments_style = "friendly"
+pygments_dark_style = "native"
+
+myst_heading_anchors = 3
+myst_enable_extensions = ["colon_fence"]
+nitpicky = False
+napoleon_google_docstring = False
+autodoc_member_order = "bysource"
+autodoc_typehints = "none"
+default_role = "code"
+
+
+def write_command_line() -> None:
+    """Write what `ddqn-planner COMMAND --help` prints, which the page command_line.md includes."""
+    folder = DOCS / "_build" / "help"
+    folder.mkdir(parents=True, exist_ok=True)
+    environment = {**os.environ, "COLUMNS": "88", "PYTHONPATH": str(DOCS.parent)}
+    for name in ("plan", "train", "train-any-map", "evaluate", "reproduce"):
+        command = [sys.executable, "-m", "ddqn_planner.cli", name, "--help"]
+        text = subprocess.run(command, env=environment, stdout=subprocess.PIPE, check=True).stdout
+        (folder / f"{name}.txt").write_bytes(text)
+
+
+write_command_line()

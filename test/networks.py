@@ -1,0 +1,23 @@
+"""Networks with chosen weights, without a training."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ddqn_planner.model import NETWORKS, QNetwork
+
+
+def random_network(name: str, seed: int = 0, scale: float = 0.5, **sizes: int) -> QNetwork:
+    """A network with weights from a normal distribution."""
+    random = np.random.default_rng(seed)
+    shapes = NETWORKS[name].shapes(sizes)
+    tensors = {key: random.normal(0, scale, shape) for key, shape in shapes.items()}
+    return NETWORKS[name](sizes, {key: t.astype(np.float32) for key, t in tensors.items()})
+
+
+def turning_network(size: int) -> QNetwork:
+    """A network that always goes to -x, or where it cannot, to +x: it turns round for ever."""
+    network = random_network("paper", height=size, width=size, filters=1, hidden_units=0)
+    network.tensors["fully_connected.weight"][:] = 0
+    network.tensors["fully_connected.bias"][:] = [1, 0, 0, 0, 2, 0, 0, 0]
+    return network

@@ -1,0 +1,76 @@
+"""Which libraries a program loads: a planner must start fast, and on robots without torch."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+
+import pytest
+
+PLAN = """
+import numpy as np
+from ddqn_planner import GridMap, Planner, load_map
+from ddqn_planner.resources import find_map
+
+planner = Planner.load("any_map")
+costs = np.arange(36).reshape(6, 6)
+for grid in (load_map(find_map("dilemma")), GridMap(np.zeros((6, 6), dtype=bool), cost=costs)):
+    assert planner.plan(grid, grid.free_cells()[0], grid.free_cells()[-1]).cells
+assert Planner.load("dilemma").plan(load_map(find_map("dilemma")), (1, 1), (10, 12)).status
+"""
+
+
+def loaded(code: str) -> set[str]:
+    """Return the top-level packages that a new process has loaded after some code."""
+    code += "\nimport sys; print(*{name.partition('.')[0] for name in sys.modules})"
+    command = [sys.executable, "-c", code]
+    printed = subprocess.run(command, check=True, capture_output=True, text=True).stdout
+    return set(printed.split())
+
+
+@pytest.mark.parametrize(
+    "code",
+    [
+        "import ddqn_planner",
+        "import ddqn_planner.grid",
+        "import ddqn_planner.model",
+        "import ddqn_planner.planning",
+        "from ddqn_planner import GridMap, Planner, load_map",
+        "from ddqn_planner import Planner; Planner.load('any_map')",
+    ],
+)
+def test_no_import_of_the_core_loads_a_large_library(code: str) -> None:
+    assert not loaded(code) & {"torch", "numba", "scipy", "matplotlib", "gymnasium", "rclpy"}
+
+
+def test_the_package_itself_loads_nothing() -> None:
+    assert "numpy" not in loaded("import ddqn_planner")
+
+
+def test_a_plan_needs_numba_alone() -> None:
+    packages = loaded(PLAN)
+    assert "numba" in packages
+    assert not packages & {"torch", "matplotlib", "gymnasium", "rclpy"}
+    # numba reads scipy's version, which is light.
+    code = PLAN + "\nimport sys\nassert not {'scipy.ndimage', 'scipy.linalg'} & sys.modules.keys()"
+    loaded(code)
+
+
+def test_where_torch_is_missing_a_plan_is_made() -> None:
+    loaded("import sys; sys.modules['torch'] = None\n" + PLAN)
+
+
+def test_the_public_names_are_known_before_they_are_loaded() -> None:
+    code = """
+import ddqn_planner
+assert set(ddqn_planner.__all__) <= set(dir(ddqn_planner))
+from ddqn_planner import *
+assert GridMap is ddqn_planner.GridMap and Planner is ddqn_planner.Planner
+try:
+    ddqn_planner.Plannner
+except AttributeError as error:
+    assert "Plannner" in str(error)
+else:
+    raise AssertionError
+"""
+    assert "torch" not in loaded(code)
