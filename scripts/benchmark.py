@@ -205,6 +205,9 @@ def measure_trainer(client: Client) -> list[bool]:
         ):
             # A service is found before its node spins: the first answer says that it does.
             print(f"trainer: first answer of the node, while it starts: {call('stop'):.0f} ms")
+            print(f"trainer: first ~/start, once torch is imported: {call('start'):.0f} ms")
+            call("stop")
+            time.sleep(1)  # until it has saved itself
             slowest["start"] = max(slowest.get("start", 0.0), call("start"))
             time.sleep(10)  # thousands of steps: a checkpoint and curves of some size
             for name in ("start", "save", "replay", "stop"):

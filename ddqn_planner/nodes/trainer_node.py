@@ -2,7 +2,7 @@
 
 The training thread makes no ROS call: it puts functions into a queue, and a timer calls them. So
 checkpoints are saved even after ROS has shut down. Another thread imports torch while the node
-already answers; the first ``~/start`` waits for it.
+already answers; ``~/start`` waits for it, and the other services do not.
 """
 
 from __future__ import annotations
@@ -15,12 +15,14 @@ import threading
 from collections.abc import Callable, Iterator
 from contextlib import suppress
 from functools import partial
+from inspect import isawaitable
 from pathlib import Path as FilePath
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped
 from nav_msgs.msg import OccupancyGrid, Path
+from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
 from rclpy.exceptions import InvalidParameterValueException, ParameterException
@@ -36,7 +38,7 @@ from ddqn_planner.nodes.conversions import (
     path_message,
     quaternion,
 )
-from ddqn_planner.nodes.runtime import LATCHED, BaseNode, spin_until_shutdown
+from ddqn_planner.nodes.runtime import LATCHED, BaseNode, Worker, spin_until_shutdown
 from ddqn_planner.nodes.trainer_parameters import (
     check_parameters,
     declare_parameters,
@@ -90,17 +92,14 @@ class TrainerNode(BaseNode):
         self.create_subscription(OccupancyGrid, "map", self._on_map, LATCHED)
         self.create_subscription(PoseWithCovarianceStamped, "initialpose", self._on_start_pose, 10)
         self.create_subscription(PoseStamped, "goal_pose", partial(self._set_pose, "goal"), 10)
-        for name, handler in (
-            ("start", self._on_start),
-            ("stop", self._on_stop),
-            ("save", self._on_save),
-            ("replay", self._on_replay),
-        ):
-            self.create_service(Trigger, f"~/{name}", partial(_answer, handler))
+        group = ReentrantCallbackGroup()  # the others are answered while ~/start waits
+        for name in ("start", "stop", "save", "replay"):
+            handler = partial(_answer, getattr(self, f"_on_{name}"))
+            self.create_service(Trigger, f"~/{name}", handler, callback_group=group)
         self._steady_clock = Clock(clock_type=ClockType.STEADY_TIME)
         self.create_timer(0.1, self._on_events, clock=self._steady_clock)
         self.create_timer(1.0, self._publish_diagnostics, clock=self._steady_clock)
-        threading.Thread(target=import_training, name="import").start()
+        self._imported = Worker(self).call(import_training)
 
     def _value(self, name: str) -> Any:
         return self.get_parameter(name).value
@@ -167,7 +166,8 @@ class TrainerNode(BaseNode):
     def _is_training(self) -> bool:
         return self._thread is not None and self._thread.is_alive()
 
-    def _on_start(self) -> tuple[bool, str]:
+    async def _on_start(self) -> tuple[bool, str]:
+        await self._imported
         if self._is_training():
             return False, "training already; call ~/stop first"
         try:
@@ -195,7 +195,6 @@ class TrainerNode(BaseNode):
                 "map_file to a map with both"
             )
         start, goal = (self._cell(name, self._poses[name], place) for name in ("start", "goal"))
-        # Waits for the thread that imports them.
         from ddqn_planner.training.environment import Scenario
         from ddqn_planner.training.run import TrainingRun
 
@@ -384,10 +383,11 @@ def _with_remedy(error: Exception) -> str:
     return f"{error!r}; {REMEDY}"
 
 
-def _answer(
-    handler: Callable[[], tuple[bool, str]], _: Trigger.Request, response: Trigger.Response
+async def _answer(
+    handler: Callable[[], Any], _: Trigger.Request, response: Trigger.Response
 ) -> Trigger.Response:
-    response.success, response.message = handler()
+    answer = handler()
+    response.success, response.message = await answer if isawaitable(answer) else answer
     return response
 
 
