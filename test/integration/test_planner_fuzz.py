@@ -100,9 +100,13 @@ def test_any_pose_is_taken_or_refused(unharmed: Robot, message: PoseStamped, top
     assert robot.client.set_parameters("planner", start_source="initialpose")[0].successful
 
 
+SHIPPED = ("any_map", "dilemma")
+"""Hypothesis takes texts from the code too."""
+
+
 @fuzz
-@given(name=TEXTS)
-def test_any_name_of_a_model_is_loaded_or_refused(unharmed: Robot, name: str) -> None:
+@given(name=TEXTS.filter(lambda name: name not in SHIPPED))
+def test_any_name_of_no_model_is_refused(unharmed: Robot, name: str) -> None:
     robot = unharmed
     before = robot.client.get_parameter("planner", "model")
     robot.client.publish("trainer/model_saved", String(data=name), LATCHED)
