@@ -17,9 +17,16 @@ from numpy.typing import NDArray
 from processes import claim_ros_domain, run_script, running_node
 
 from ddqn_planner import GridMap, MoveRule, inflate, load_map
-from ddqn_planner.grid import MOVES, Cell, clearance, legal_moves, move_costs, path_length
+from ddqn_planner.grid import (
+    MOVES,
+    Cell,
+    clearance,
+    legal_moves,
+    move_costs,
+    path_length,
+    shortest_distances,
+)
 from ddqn_planner.grid.generators import random_requests
-from ddqn_planner.planning import shortest_distances
 from ddqn_planner.resources import find_map
 
 RULE = MoveRule.ROBOT_SAFE

@@ -16,8 +16,16 @@ from numpy.typing import NDArray
 from ddqn_planner.benchmarks.maps import BenchmarkMap
 from ddqn_planner.benchmarks.tables import table
 from ddqn_planner.files import write_atomically, write_csv
-from ddqn_planner.grid import MOVES, Cell, GridMap, MoveRule, legal_moves, path_cost
-from ddqn_planner.planning import Planner, QField, shortest_distances
+from ddqn_planner.grid import (
+    MOVES,
+    Cell,
+    GridMap,
+    MoveRule,
+    legal_moves,
+    path_cost,
+    shortest_distances,
+)
+from ddqn_planner.planning import Planner, QField
 
 OPTIMAL = 1 + 1e-6
 """A rollout of at most this ratio to the optimum counts as optimal."""

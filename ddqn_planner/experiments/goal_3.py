@@ -24,8 +24,8 @@ from ddqn_planner.experiments.settings import (
 )
 from ddqn_planner.experiments.supervised import train_supervised
 from ddqn_planner.experiments.trainings import Training, in_parallel, rollouts, solved
-from ddqn_planner.grid import Cell, Noise, legal_moves, scatter_obstacles
-from ddqn_planner.planning import Plan, PlanStatus, shortest_path
+from ddqn_planner.grid import Cell, Noise, legal_moves, scatter_obstacles, shortest_path
+from ddqn_planner.planning import Plan, PlanStatus
 from ddqn_planner.planning.search import search
 from ddqn_planner.training.environment import Scenario, paper_scenario
 from ddqn_planner.training.hyper_parameters import HyperParameters

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from ddqn_planner.experiments.profiles import HIDDEN_UNITS, MOVE_RULE
 from ddqn_planner.experiments.trainings import Training, TrainingEvaluation, read_evaluations
-from ddqn_planner.grid import Noise
-from ddqn_planner.planning import Planner, shortest_distances
+from ddqn_planner.grid import Noise, shortest_distances
+from ddqn_planner.planning import Planner
 from ddqn_planner.training.environment import Scenario
 from ddqn_planner.training.hyper_parameters import HyperParameters
 

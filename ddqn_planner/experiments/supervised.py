@@ -14,9 +14,8 @@ from torch import Tensor
 
 from ddqn_planner.experiments.profiles import MOVE_RULE
 from ddqn_planner.experiments.trainings import Training
-from ddqn_planner.grid import LENGTHS, legal_moves, neighbours
+from ddqn_planner.grid import LENGTHS, legal_moves, neighbours, shortest_distances
 from ddqn_planner.model.observation import observe
-from ddqn_planner.planning import shortest_distances
 from ddqn_planner.training.environment import Scenario
 from ddqn_planner.training.trainer import Trainer
 

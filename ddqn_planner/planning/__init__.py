@@ -1,6 +1,5 @@
 """From a map, a start and a goal to a path: the Q field, and the planner."""
 
-from ddqn_planner.grid.shortest_paths import shortest_distances, shortest_path
 from ddqn_planner.planning.plan import Plan, PlanMethod, PlanRequest, PlanStatus
 from ddqn_planner.planning.planner import Planner
 from ddqn_planner.planning.q_field import QField
@@ -13,7 +12,5 @@ __all__ = [
     "PlanStatus",
     "Planner",
     "QField",
-    "shortest_distances",
-    "shortest_path",
     "simplify",
 ]

@@ -41,11 +41,12 @@ from ddqn_planner.grid import (
     legal_moves,
     move_costs,
     save_map,
+    shortest_distances,
 )
 from ddqn_planner.grid.generators import KINDS
 from ddqn_planner.model import ModelMetadata
 from ddqn_planner.model.model_file import save_model
-from ddqn_planner.planning import Planner, shortest_distances
+from ddqn_planner.planning import Planner
 
 RULES = st.sampled_from(list(MoveRule))
 SAFE = RequestSettings(MoveRule.ROBOT_SAFE)

@@ -20,9 +20,19 @@ from ddqn_planner.experiments.goal_2 import free_starts, trained_field
 from ddqn_planner.experiments.goal_3 import fixed_path, noisy_maps
 from ddqn_planner.experiments.profiles import MOVE_RULE, PROFILES, VARIANTS
 from ddqn_planner.experiments.trainings import TrainingEvaluation
-from ddqn_planner.grid import MOVES, Cell, GridMap, MoveRule, Noise, legal_moves, path_length
+from ddqn_planner.grid import (
+    MOVES,
+    Cell,
+    GridMap,
+    MoveRule,
+    Noise,
+    legal_moves,
+    path_length,
+    shortest_distances,
+    shortest_path,
+)
 from ddqn_planner.model import ModelMetadata
-from ddqn_planner.planning import Planner, shortest_distances, shortest_path
+from ddqn_planner.planning import Planner
 from ddqn_planner.training.environment import Scenario
 
 

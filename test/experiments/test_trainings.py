@@ -20,9 +20,9 @@ from ddqn_planner.experiments.trainings import (
     read_evaluations,
     train,
 )
-from ddqn_planner.grid import LENGTHS, MOVES
+from ddqn_planner.grid import LENGTHS, MOVES, shortest_distances
 from ddqn_planner.model import load_model
-from ddqn_planner.planning import Planner, shortest_distances
+from ddqn_planner.planning import Planner
 from ddqn_planner.training.environment import GridVectorEnvironment, Scenario
 from ddqn_planner.training.hyper_parameters import HyperParameters
 from ddqn_planner.training.trainer import Trainer

@@ -40,11 +40,10 @@ from rcl_interfaces.srv import DescribeParameters, ListParameters
 from std_msgs.msg import Header, String
 from std_srvs.srv import Trigger
 
-from ddqn_planner.grid import MoveRule
+from ddqn_planner.grid import MoveRule, shortest_distances
 from ddqn_planner.grid.generators import generate_map, random_requests
 from ddqn_planner.nodes.conversions import occupancy_message
 from ddqn_planner.nodes.runtime import LATCHED
-from ddqn_planner.planning import shortest_distances
 
 # What it is for
 

@@ -33,10 +33,9 @@ from rclpy.parameter import Parameter
 from std_msgs.msg import Header
 from visualization_msgs.msg import Marker, MarkerArray
 
-from ddqn_planner.grid import Cell, MoveRule, clearance, inflate
+from ddqn_planner.grid import Cell, MoveRule, clearance, inflate, shortest_distances
 from ddqn_planner.nodes.conversions import occupancy_message
 from ddqn_planner.nodes.runtime import LATCHED
-from ddqn_planner.planning import shortest_distances
 from ddqn_planner.planning.simplification import touched_cells
 
 RULE = MoveRule.ROBOT_SAFE

@@ -8,9 +8,16 @@ from hypothesis.extra import numpy as numpy_st
 from strategies import grids_with_costs
 
 from ddqn_planner.compiled import compiled
-from ddqn_planner.grid import MOVES, Cell, GridMap, MoveRule, legal_moves, move_costs
+from ddqn_planner.grid import (
+    MOVES,
+    Cell,
+    GridMap,
+    MoveRule,
+    legal_moves,
+    move_costs,
+    shortest_distances,
+)
 from ddqn_planner.model.wavefront import propagate_values
-from ddqn_planner.planning import shortest_distances
 
 PATCH_IDS = numpy_st.arrays(
     np.int32,

@@ -24,9 +24,17 @@ from ddqn_planner import (
     simplify,
 )
 from ddqn_planner.benchmarks.evaluation import evaluate
-from ddqn_planner.grid import LENGTHS, MOVES, Cell, connected_cells, legal_moves, path_cost
+from ddqn_planner.grid import (
+    LENGTHS,
+    MOVES,
+    Cell,
+    connected_cells,
+    legal_moves,
+    path_cost,
+    shortest_distances,
+)
 from ddqn_planner.model import ModelMetadata
-from ddqn_planner.planning import PlanRequest, shortest_distances
+from ddqn_planner.planning import PlanRequest
 
 RULES = st.sampled_from(list(MoveRule))
 ANY_MAP = Planner.load("any_map")

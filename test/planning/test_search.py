@@ -16,8 +16,8 @@ from ddqn_planner.grid import (
     MoveRule,
     legal_moves,
     path_cost,
+    shortest_distances,
 )
-from ddqn_planner.planning import shortest_distances
 from ddqn_planner.planning.search import search
 
 ANY_VALUE = st.floats(width=32, allow_nan=True, allow_infinity=True)

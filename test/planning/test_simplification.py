@@ -10,8 +10,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from strategies import grids_with_costs, grids_with_free_cell
 
-from ddqn_planner.grid import Cell, GridMap, MoveRule, path_cost, path_length
-from ddqn_planner.planning import shortest_path, simplify
+from ddqn_planner.grid import Cell, GridMap, MoveRule, path_cost, path_length, shortest_path
+from ddqn_planner.planning import simplify
 from ddqn_planner.planning.simplification import segment_cost, touched_cells
 
 RULES = st.sampled_from(list(MoveRule))

@@ -6,8 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from strategies import grids_with_free_cell
 
-from ddqn_planner.grid import Cell, GridMap, MoveRule, legal_moves, neighbours
-from ddqn_planner.planning import shortest_distances
+from ddqn_planner.grid import Cell, GridMap, MoveRule, legal_moves, neighbours, shortest_distances
 from ddqn_planner.training.value_iteration import value_iteration
 
 
