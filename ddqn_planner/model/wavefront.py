@@ -204,7 +204,9 @@ def grow(
 
 
 @compiled_now
-def grow_whole(distance: Distances, opened: Cells, costs: MoveCosts) -> None:
+def grow_whole(
+    distance: Distances, state: States, opened: Cells, costs: MoveCosts
+) -> None:
     """Give each cell that a path joins to the goal its distance: Dijkstra's algorithm.
 
     `grow` would do the same in twice the time. No move costs less than 1, the width of a bucket: a
@@ -212,7 +214,7 @@ def grow_whole(distance: Distances, opened: Cells, costs: MoveCosts) -> None:
 
     Parameters
     ----------
-    distance : (C,) float64
+    distance, state : (C,) float64, (C,) uint8
         Changed in place.
     opened : (N,) int32
         The open cells.
@@ -243,9 +245,10 @@ def grow_whole(distance: Distances, opened: Cells, costs: MoveCosts) -> None:
                 waiting -= 1
             else:
                 break
-            here = distance[cell]
-            if int(here) != front:
+            if state[cell] != OPEN:
                 continue
+            state[cell] = CLOSED
+            here = distance[cell]
             better = 0
             for action in range(8):
                 previous = cell - offsets[action]
@@ -261,8 +264,9 @@ def grow_whole(distance: Distances, opened: Cells, costs: MoveCosts) -> None:
                 previous = cell - offsets[action]
                 new, known = int(through[action]), distance[previous]
                 distance[previous] = through[action]
-                if known > 0 and int(known) == new:
+                if state[previous] == OPEN and int(known) == new:
                     continue
+                state[previous] = OPEN
                 slot_of_new = new % ring
                 if count[slot_of_new] == capacity:
                     wider = np.empty((ring, 2 * capacity), np.int32)
@@ -460,8 +464,8 @@ def propagate_values(
     padded = np.pad(patch_id, 1, constant_values=outside)
     table_PA = np.pad(cost_PA, ((0, 1), (0, 0)), constant_values=np.inf)
     costs = costs_by_patch(padded.ravel(), table_PA, padded.shape[1])
-    distance, _, opened = new_field(padded.size, (goal[1] + 1) * costs.width + goal[0] + 1)
-    grow_whole(distance, opened, costs)
+    distance, state, opened = new_field(padded.size, (goal[1] + 1) * costs.width + goal[0] + 1)
+    grow_whole(distance, state, opened, costs)
     return q_of(distance, costs)
 
 
