@@ -14,11 +14,11 @@ import tempfile
 import time
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack, suppress
-from dataclasses import astuple, dataclass, fields
+from dataclasses import dataclass
 from functools import partial
 from itertools import cycle, islice
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 from client import Client, initial_pose, plan_request, pose, wait_for
@@ -32,8 +32,9 @@ from rcl_interfaces.srv import GetParameters, SetParameters
 from rclpy.parameter import Parameter
 from std_srvs.srv import Trigger
 
-from ddqn_planner.grid import OCCUPIED, Cell, MapFile, load_map, read_map_file, save_map
+from ddqn_planner.grid import OCCUPIED, Cell, MapFile, load_map, save_map
 from ddqn_planner.grid.generators import generate_map, random_requests
+from ddqn_planner.grid.noise import MAX_NEW_OBSTACLES
 from ddqn_planner.model import load_model
 from ddqn_planner.nodes.runtime import LATCHED
 from ddqn_planner.resources import find_map
@@ -57,7 +58,6 @@ LAST_WAIT = 0.5
 """Seconds that a client waits after a kill until it gives up."""
 
 GET_PLAN = "planner/get_plan"
-T = TypeVar("T")
 
 
 @dataclass
@@ -112,10 +112,9 @@ class Faults:
         self.map_path, self.training_folder = folder / "map.yaml", folder / "training"
         occupancy = generate_map("office", (SIDE, SIDE), self._random)
         (self._watched,) = random_requests(occupancy, RULE, 1, self._random)
-        values = np.where(occupancy, np.int8(100), np.int8(0))
-        start, goal = self._watched
-        save_map(MapFile(values, start=start, goal=goal), self.map_path)
-        self._map = MapFixture(read_map_file(self.map_path))
+        map_file = MapFile(OCCUPIED * occupancy, 1.0, (0.0, 0.0, 0.0), *self._watched)
+        save_map(map_file, self.map_path)
+        self._map = MapFixture(map_file)
         self._scenario = Scenario(load_map(find_map("dilemma")), *start_and_goal("dilemma"))
         self.tallies = {
             self.kill_planner: Tally("planner_node", "planning"),
@@ -148,16 +147,16 @@ class Faults:
         service_type: Any,
         name: str,
         request: Any = None,
-        accept: Callable[[Any], T | None] = lambda answer: answer,
+        accept: Callable[[Any], Any] = bool,
         try_time: float = TRY_TIME,
-    ) -> T:
-        """Ask until an answer is accepted; return what `accept` returned."""
+    ) -> Any:
+        """Ask until an answer is accepted; return it."""
 
-        def answer() -> T | None:
+        def answer() -> Any:
             with suppress(TimeoutError):
-                accepted = accept(self.client.call(service_type, name, request, try_time))
-                if accepted:
-                    return accepted
+                found = self.client.call(service_type, name, request, try_time)
+                if accept(found):
+                    return found
             time.sleep(0.05)
             return None
 
@@ -165,37 +164,32 @@ class Faults:
 
     def ask_for_plan(self, start: Cell, goal: Cell) -> PathMessage:
         """Ask for a plan until there is one."""
-        request = self.request(start, goal)
-        return self.ask(GetPlan, GET_PLAN, request, lambda a: a.plan if a.plan.poses else None)
+        request = plan_request(self._map.grid, start, goal)
+        return self.ask(GetPlan, GET_PLAN, request, lambda answer: answer.plan.poses).plan
 
     def trigger(self, name: str, try_time: float = TRY_TIME) -> str:
         """Call a Trigger service until it succeeds; return its message."""
-        answer = self.ask(
-            Trigger, name, accept=lambda a: a if a.success else None, try_time=try_time
-        )
+        answer = self.ask(Trigger, name, None, lambda answer: answer.success, try_time)
         return str(answer.message)
 
     def parameter(self, node: str, name: str) -> Any:
         """Return a parameter's value message."""
         request = GetParameters.Request(names=[name])
-        return self.ask(GetParameters, f"{node}/get_parameters", request, lambda a: a.values[0])
-
-    def request(self, start: Cell, goal: Cell) -> GetPlan.Request:
-        """Return a request for a plan between two cells."""
-        return plan_request(self._map.grid, start, goal)
+        return self.ask(GetParameters, f"{node}/get_parameters", request).values[0]
 
     def is_right(self, plan: Any, start: Cell, goal: Cell) -> bool:
         """Say whether a plan leads from the start to the goal by legal moves on the map.
 
         A plan of a map with new obstacles must be right on the map without them too.
         """
-        return bool(plan.poses) and not self._map.error(self.request(start, goal), plan)
+        request = plan_request(self._map.grid, start, goal)
+        return bool(plan.poses) and not self._map.error(request, plan)
 
     def is_whole(self, message: OccupancyGrid) -> bool:
         """Say whether a map is the loaded one with at most five obstacles more."""
         values = np.frombuffer(message.data, np.int8).reshape(self._map.values.shape)
-        new = values != self._map.values
-        return bool((values[new] == OCCUPIED).all()) and int(new.sum()) <= 5
+        new = values[values != self._map.values]
+        return bool((new == OCCUPIED).all()) and len(new) <= MAX_NEW_OBSTACLES
 
     # Killing
 
@@ -217,8 +211,9 @@ class Faults:
     def kill_planner(self, tally: Tally) -> None:
         """Kill the planner while it plans toward goals that it does not know."""
         get_plan = self.client.service(GetPlan, GET_PLAN)
-        asked = random_requests(self._map.grid.occupancy, RULE, GOALS, self._random)
-        futures = [get_plan.call_async(self.request(*cells)) for cells in asked]
+        grid = self._map.grid
+        asked = random_requests(grid.occupancy, RULE, GOALS, self._random)
+        futures = [get_plan.call_async(plan_request(grid, *cells)) for cells in asked]
         time.sleep(self._draw.uniform(0.0, 1.0))
         self.planner.kill()
         time.sleep(LAST_WAIT)
@@ -311,19 +306,17 @@ class Faults:
         other = Parameter("model", value="any_map").to_parameter_msg()
         request = SetParameters.Request(parameters=[other])
         name = "/training/planner/set_parameters"
-        self.ask(SetParameters, name, request, lambda a: a.results[0].successful)
+        self.ask(SetParameters, name, request, lambda answer: answer.results[0].successful)
         self.trigger("/training/trainer/save")
         saved = str(self.training_folder / "model.safetensors")
-        wait_for(
-            "model", lambda: self.parameter("/training/planner", "model").string_value == saved
-        )
+        model = partial(self.parameter, "/training/planner", "model")
+        wait_for("model", lambda: model().string_value == saved)
 
 
 def show(tallies: Sequence[Tally]) -> None:
     """Print the table."""
-    names = [field.name for field in fields(Tally)]
-    rows = [names, *([str(value) for value in astuple(tally)] for tally in tallies)]
-    rows[0] = [name.replace("_", " ") for name in names]
+    names = [name.replace("_", " ") for name in vars(tallies[0])]
+    rows = [names, *([str(value) for value in vars(tally).values()] for tally in tallies)]
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     for row in rows:
         print("  ".join(text.ljust(width) for text, width in zip(row, widths, strict=True)))

@@ -109,8 +109,7 @@ def component_labels(occupancy: Occupancy, move_rule: MoveRule | str) -> NDArray
     Two free cells have the same label, 1 or more, if a path joins them. Occupied cells have 0.
     """
     # If a diagonal move needs both side cells free, two straight moves can replace it.
-    moves = MOVES[4:] if MoveRule(move_rule).cuts_corners else MOVES[4::2]
-    return label_cells(~occupancy, moves)
+    return label_cells(occupancy, corners=MoveRule(move_rule).cuts_corners)
 
 
 def connected_cells(
