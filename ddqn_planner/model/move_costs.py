@@ -36,18 +36,18 @@ OCCUPIED_PATCH = 512
 class MoveCosts(NamedTuple):
     """The cost of each move of each cell, on a map with a border of one cell.
 
-    It is ``table_PA[patch_C[cell], action]``; with terms, that is only the length of the move, and
+    It is ``table[patch[cell], action]``; with terms, that is only the length of the move, and
     is multiplied by ``1 + max(0, sum of terms)``, at most `MAX_MULTIPLIER`.
 
     Parameters
     ----------
-    patch_C : (C,) uint16 or int32
+    patch : (C,) uint16 or int32
         The number of each cell's patch.
-    table_PA : (P, 8) float32
+    table : (P, 8) float32
         At least 1; infinite where a move is not possible.
-    value_C : (C,) uint8, optional
+    value : (C,) uint8, optional
         The value of each cell, for the terms.
-    terms_NLA : (9, 102, 8) float32, optional
+    terms : (9, 102, 8) float32, optional
         What each value of each cell of a patch adds.
     width : int
         Columns of the padded map.
@@ -57,10 +57,10 @@ class MoveCosts(NamedTuple):
         No straight and no diagonal move costs less.
     """
 
-    patch_C: NDArray[Any]
-    table_PA: Array
-    value_C: NDArray[np.uint8] | None
-    terms_NLA: Array | None
+    patch: NDArray[Any]
+    table: Array
+    value: NDArray[np.uint8] | None
+    terms: Array | None
     width: int
     highest: float
     straight: float

@@ -222,7 +222,7 @@ class PropagationQNetwork(QNetwork):
     def tables(self) -> dict[MoveRule, Array]:
         """What the network says of each patch without costs, by rule: (513, 8) float32 each.
 
-        See `MoveCosts.table_PA`. The network of a copy of the tensors: they do not change.
+        See `MoveCosts.table`. The network of a copy of the tensors: they do not change.
         """
         every_P9 = every_patch()
         tables = {}
@@ -338,12 +338,12 @@ class AnyMapQNetwork(PropagationQNetwork):
         if not self.certificate.proved:
             return None
         lengths_A = move_rule.lengths.astype(np.float32)
-        table_PA = np.where(np.isfinite(costs.table_PA), lengths_A, np.float32(np.inf))
+        table_PA = np.where(np.isfinite(costs.table), lengths_A, np.float32(np.inf))
         terms_9LA = self.terms(move_rule)
         greatest = 1 + max(0.0, float(terms_9LA.max(axis=1).sum(axis=0).max()))
         highest = min(greatest, MAX_MULTIPLIER) * float(lengths_A.max())
         return costs._replace(
-            table_PA=table_PA, value_C=cell_values(grid), terms_NLA=terms_9LA, highest=highest
+            table=table_PA, value=cell_values(grid), terms=terms_9LA, highest=highest
         )
 
 

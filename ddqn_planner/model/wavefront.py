@@ -62,30 +62,30 @@ def patch_numbers(occupancy: NDArray[np.bool_]) -> NDArray[np.uint16]:
     for y in range(height):
         for x in range(width):
             padded[y + 1, x + 1] = occupancy[y, x]
-    patch = np.full((height + 2, width + 2), OCCUPIED_PATCH, np.uint16)
+    numbers = np.full((height + 2, width + 2), OCCUPIED_PATCH, np.uint16)
     for y in range(1, height + 1):
-        below, here, above, out = padded[y - 1], padded[y], padded[y + 1], patch[y]
+        below, here, above, out = padded[y - 1], padded[y], padded[y + 1], numbers[y]
         for x in range(1, width + 1):
             bits = below[x - 1] + 2 * below[x] + 4 * below[x + 1] + 8 * here[x - 1]
             bits += 32 * here[x + 1] + 64 * above[x - 1] + 128 * above[x] + 256 * above[x + 1]
             out[x] = OCCUPIED_PATCH if here[x] else bits
-    return patch.ravel()
+    return numbers.ravel()
 
 
 @compiled_now
 def cost_of(
-    patch_C: Any, table_PA: Any, value_C: Any, terms_NLA: Any, width: int, cell: int, action: int
+    patch: Any, table: Any, value: Any, terms: Any, width: int, cell: int, action: int
 ) -> Any:
     """Return the cost of a move, float32; infinite if it is not possible. See `MoveCosts`."""
-    cost = table_PA[patch_C[cell], action]
-    if terms_NLA is None:
+    cost = table[patch[cell], action]
+    if terms is None:
         return cost
     if cost == np.inf:
         return cost
     total = np.float32(0)
     for place in range(9):
-        value = value_C[cell + (place // 3 - 1) * width + place % 3 - 1]
-        total += terms_NLA[place, value, action]
+        known = value[cell + (place // 3 - 1) * width + place % 3 - 1]
+        total += terms[place, known, action]
     multiplier = np.float32(1) + max(total, np.float32(0))
     return cost * min(multiplier, np.float32(MAX_MULTIPLIER))
 
@@ -106,8 +106,8 @@ def grow(
     costs: MoveCosts,
     start: int,
     limit: int,
-) -> Cells:
-    """Close cells in the order of A* until a start is closed; return the cells that stay open.
+) -> tuple[Cells, bool]:
+    """Close cells in the order of A* until the distance of a start is known.
 
     All cells that tie with those of the start's best path are closed too. So a rollout does not
     depend on what was asked before.
@@ -122,8 +122,15 @@ def grow(
     start : int
     limit : int
         How many cells may be visited before it gives up.
+
+    Returns
+    -------
+    (M,) int32
+        The cells that stay open.
+    bool
+        Whether all was visited that the start needs.
     """
-    patch_C, table_PA, value_C, terms_NLA, width = costs[:5]
+    patch, table, value, terms, width = costs[:5]
     offsets = MOVE_Y * width + MOVE_X
     # Lower bounds, whatever the rounding.
     straight = costs.straight * (1 - 1e-7)
@@ -142,13 +149,16 @@ def grow(
     count = np.zeros(ring, np.int64)
     through = np.empty(8)
     taken, waiting, front, visited = 0, 0, 0, 0
-    while visited <= limit:
+    done = False
+    while visited <= limit and not done:
         if waiting == 0:
             if taken == opened.size:
-                break
+                done = True
+                continue
             front = max(front, int(order[sorted_opened[taken]]))
-        if state[start] == CLOSED and distance[start] * (1 + 1e-6) * BUCKETS < front:
-            break
+        done = state[start] == CLOSED and distance[start] * (1 + 1e-6) * BUCKETS < front
+        if done:
+            continue
         slot = front % ring
         used = 0
         while True:
@@ -169,7 +179,7 @@ def grow(
             for action in range(8):
                 previous = cell - offsets[action]
                 through[action] = distance[cell] + cost_of(
-                    patch_C, table_PA, value_C, terms_NLA, width, previous, action
+                    patch, table, value, terms, width, previous, action
                 )
                 known = distance[previous]
                 is_better = (through[action] < known) | (
@@ -200,13 +210,11 @@ def grow(
                 waiting += 1
         count[slot] = 0
         front += 1
-    return _still_open(state, opened[sorted_opened[taken:]], bucket, count)
+    return _still_open(state, opened[sorted_opened[taken:]], bucket, count), done
 
 
 @compiled_now
-def grow_whole(
-    distance: Distances, state: States, opened: Cells, costs: MoveCosts
-) -> None:
+def grow_whole(distance: Distances, state: States, opened: Cells, costs: MoveCosts) -> None:
     """Give each cell that a path joins to the goal its distance: Dijkstra's algorithm.
 
     `grow` would do the same in twice the time. No move costs less than 1, the width of a bucket: a
@@ -220,8 +228,8 @@ def grow_whole(
         The open cells.
     costs : MoveCosts
     """
-    patch_C, table_PA, value_C, terms_NLA, width = costs[:5]
-    patch_C, table_PA, value_C, terms_NLA, width = costs[:5]
+    patch, table, value, terms, width = costs[:5]
+    patch, table, value, terms, width = costs[:5]
     offsets = MOVE_Y * width + MOVE_X
     opened = opened[np.argsort(distance[opened])]
     ring = int(costs.highest) + 2
@@ -253,7 +261,7 @@ def grow_whole(
             for action in range(8):
                 previous = cell - offsets[action]
                 through[action] = here + cost_of(
-                    patch_C, table_PA, value_C, terms_NLA, width, previous, action
+                    patch, table, value, terms, width, previous, action
                 )
                 known = distance[previous]
                 is_better = (through[action] < known) | ((known == 0) & (through[action] < np.inf))
@@ -322,8 +330,8 @@ def take_back(
     bool
         Whether the limit was kept; if not, the field is of no more use.
     """
-    patch_C, table_PA, value_C, terms_NLA, width = costs[:5]
-    patch_C, table_PA, value_C, terms_NLA, width = costs[:5]
+    patch, table, value, terms, width = costs[:5]
+    patch, table, value, terms, width = costs[:5]
     offsets = MOVE_Y * width + MOVE_X
     # In the order of the old distances: what supports a cell is judged before it.
     waiting = [(np.float64(0), np.int64(0)) for _ in range(0)]
@@ -340,8 +348,7 @@ def take_back(
             after = cell + offsets[action]
             if distance[after] > 0 and not state[after] & MARKED:
                 supported |= (
-                    distance[after]
-                    + cost_of(patch_C, table_PA, value_C, terms_NLA, width, cell, action)
+                    distance[after] + cost_of(patch, table, value, terms, width, cell, action)
                     <= known
                 )
         if supported:
@@ -352,11 +359,12 @@ def take_back(
             return changed[:0], False
         for action in range(8):
             before = cell - offsets[action]
-            if distance[before] >= known + cost_of(
-                patch_C, table_PA, value_C, terms_NLA, width, before, action
+            if (
+                distance[before]
+                >= known + cost_of(patch, table, value, terms, width, before, action)
+                and not state[before] & MARKED
             ):
-                if not state[before] & MARKED:
-                    heapq.heappush(waiting, (distance[before], np.int64(before)))
+                heapq.heappush(waiting, (distance[before], np.int64(before)))
     for cell in lost:
         distance[cell], state[cell] = 0.0, UNREACHED
     for cell in changed:
@@ -370,8 +378,7 @@ def take_back(
             if distance[after] > 0:
                 best = min(
                     best,
-                    distance[after]
-                    + cost_of(patch_C, table_PA, value_C, terms_NLA, width, cell, action),
+                    distance[after] + cost_of(patch, table, value, terms, width, cell, action),
                 )
         if best < np.inf and (distance[cell] == 0 or best < distance[cell]):
             distance[cell], state[cell] = best, OPEN
@@ -382,13 +389,13 @@ def take_back(
 
 @compiled_now
 def next_action(
-    distance: Any, patch_C: Any, table_PA: Any, value_C: Any, terms_NLA: Any, width: int, cell: int
+    distance: Any, patch: Any, table: Any, value: Any, terms: Any, width: int, cell: int
 ) -> int:
     """Return the greedy action of a closed cell, the lowest of those that tie; -1 without one."""
     for action in range(8):
         after = distance[cell + MOVE_Y[action] * width + MOVE_X[action]]
         if after > 0:
-            cost = cost_of(patch_C, table_PA, value_C, terms_NLA, width, cell, action)
+            cost = cost_of(patch, table, value, terms, width, cell, action)
             if after + cost <= distance[cell] * SAME:
                 return action
     return -1
@@ -397,7 +404,7 @@ def next_action(
 @compiled_now
 def roll_out(distance: Distances, costs: MoveCosts, start: int) -> Cells:
     """Return the greedy steps from a closed start to the goal, with both cells: (N,) int32."""
-    patch_C, table_PA, value_C, terms_NLA, width = costs[:5]
+    patch, table, value, terms, width = costs[:5]
     cells = np.empty(64, np.int32)
     cell, number = start, 0
     while True:
@@ -405,7 +412,7 @@ def roll_out(distance: Distances, costs: MoveCosts, start: int) -> Cells:
             cells = np.concatenate((cells, np.empty(number, np.int32)))
         cells[number] = cell
         number += 1
-        action = next_action(distance, patch_C, table_PA, value_C, terms_NLA, width, cell)
+        action = next_action(distance, patch, table, value, terms, width, cell)
         if distance[cell] == AT_GOAL or action < 0:
             return cells[:number].copy()
         cell += MOVE_Y[action] * width + MOVE_X[action]
@@ -414,19 +421,19 @@ def roll_out(distance: Distances, costs: MoveCosts, start: int) -> Cells:
 @compiled_now
 def policy_of(distance: Distances, costs: MoveCosts) -> NDArray[np.int8]:
     """Return the greedy action of each cell of a whole field, -1 without one: (H, W) int8."""
-    patch_C, table_PA, value_C, terms_NLA, width = costs[:5]
+    patch, table, value, terms, width = costs[:5]
     policy = np.full((distance.size // width - 2, width - 2), -1, np.int8)
     for y in range(policy.shape[0]):
         for x in range(policy.shape[1]):
             cell = (y + 1) * width + x + 1
-            policy[y, x] = next_action(distance, patch_C, table_PA, value_C, terms_NLA, width, cell)
+            policy[y, x] = next_action(distance, patch, table, value, terms, width, cell)
     return policy
 
 
 @compiled_now
 def q_of(distance: Distances, costs: MoveCosts) -> NDArray[np.float32]:
     """Return minus the cost of the best path through each action: (8, H, W) float32."""
-    patch_C, table_PA, value_C, terms_NLA, width = costs[:5]
+    patch, table, value, terms, width = costs[:5]
     q = np.full((8, distance.size // width - 2, width - 2), -np.inf, np.float32)
     for action in range(8):
         for y in range(q.shape[1]):
@@ -434,7 +441,7 @@ def q_of(distance: Distances, costs: MoveCosts) -> NDArray[np.float32]:
                 cell = (y + 1) * width + x + 1
                 after = distance[cell + MOVE_Y[action] * width + MOVE_X[action]]
                 if after > 0:
-                    cost = cost_of(patch_C, table_PA, value_C, terms_NLA, width, cell, action)
+                    cost = cost_of(patch, table, value, terms, width, cell, action)
                     q[action, y, x] = -(cost + after)
     return q
 

@@ -49,7 +49,7 @@ class DistanceField(QField):
         self.is_whole = False
         # After a repair the distance of a closed cell may be too great, until `reach` is called.
         self.closed_is_final = True
-        cells, goal = self.costs.patch_C.size, self._number(self.goal)
+        cells, goal = self.costs.patch.size, self._number(self.goal)
         self.arrays: FieldArrays = self.wavefront.new_field(cells, goal)
 
     def _number(self, cell: Cell) -> int:
@@ -65,14 +65,14 @@ class DistanceField(QField):
     def _reach(self, start: Cell, limit: int | None = None) -> bool:
         """Compute the field as far as a start needs it; return whether its distance is known."""
         distance, state, opened = self.arrays
-        number, closed = self._number(start), self.wavefront.CLOSED
+        number, closed, done = self._number(start), self.wavefront.CLOSED, True
         if not self.is_whole and not (self.closed_is_final and state[number] == closed):
             limit = distance.size if limit is None else limit
-            opened = self.wavefront.grow(distance, state, opened, self.costs, number, limit)
+            opened, done = self.wavefront.grow(distance, state, opened, self.costs, number, limit)
             self.arrays = distance, state, opened
             self.is_whole = not opened.size
             self.closed_is_final |= self.is_whole
-        return bool(state[number] == closed)
+        return bool((done or self.is_whole) and state[number] == closed)
 
     def rollout_if_known(self, start: Cell) -> Plan | None:
         """Return the rollout from a start if no more of the field is needed, else None."""

@@ -6,7 +6,8 @@ import threading
 import time
 from collections import OrderedDict
 from collections.abc import Iterator
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from dataclasses import field as dataclass_field
 from pathlib import Path
 
 import numpy as np
@@ -14,10 +15,12 @@ from numpy.typing import NDArray
 
 from ddqn_planner.grid import Cell, GridMap, MoveRule, legal_moves, path_cost
 from ddqn_planner.grid.arguments import as_cell
-from ddqn_planner.grid.moves import component_labels
 from ddqn_planner.model import ModelMetadata, QNetwork, load_model
+from ddqn_planner.model.move_costs import MoveCosts
+from ddqn_planner.planning.distance_field import DistanceField
 from ddqn_planner.planning.plan import Plan, PlanMethod, PlanRequest, PlanStatus
 from ddqn_planner.planning.q_field import QField
+from ddqn_planner.planning.repair import repaired, shift_between
 from ddqn_planner.planning.search import search
 from ddqn_planner.planning.simplification import simplify
 
@@ -43,12 +46,12 @@ class _KnownMap:
     grid: GridMap
     move_rule: MoveRule
     costs: MoveCosts | None
-    fields: OrderedDict[Cell, QField] = field(default_factory=OrderedDict)
+    fields: OrderedDict[Cell, QField] = dataclass_field(default_factory=OrderedDict)
 
     @property
     def nbytes(self) -> int:
         """Memory of the fields and the costs, bytes."""
-        of_costs = self.costs.patch_C.nbytes if self.costs else 0
+        of_costs = self.costs.patch.nbytes if self.costs else 0
         return of_costs + sum(field.nbytes for field in self.fields.values())
 
 
@@ -106,11 +109,7 @@ class Planner:
                 "train one on such a map"
             )
         with self._lock:
-            known = self._known_map(grid, rule)
-            if known is None:
-                costs = self.network.move_costs(grid, rule)
-                known = _KnownMap(grid, rule, costs)
-                self._maps.append(known)
+            known = self._map(grid, rule)
             field = known.fields.get(goal)
         if field is None:
             if known.costs is None:
@@ -141,6 +140,14 @@ class Planner:
                 known.grid = grid  # which may lie elsewhere
                 return known
         return None
+
+    def _map(self, grid: GridMap, rule: MoveRule) -> _KnownMap:
+        """Return what is known of an equal map, or what the network says of a new one."""
+        known = self._known_map(grid, rule)
+        if known is None:
+            known = _KnownMap(grid, rule, self.network.move_costs(grid, rule))
+            self._maps.append(known)
+        return known
 
     def _repaired(self, known: _KnownMap, goal: Cell) -> QField | None:
         """Return the field of a map that a field of an older one becomes, if there is one."""
@@ -240,11 +247,13 @@ class Planner:
             yield None
         if plan is None and grid.is_free(start) and grid.is_free(goal):
             with field_time:
-                field, plan = self._grown(request)
-        if field is None or plan is None or not plan.cells:
-            if plan is None or plan.status is not PlanStatus.NO_PATH or _reach(request) >= 1:
+                field, plan = self._visit_some(request)
+        if plan is None or not plan.cells:
             with field_time:
-                way_out, end = _way_out_and_end(request)
+                if plan and plan.status is PlanStatus.NO_PATH and _reach(request) < 1:
+                    way_out, end = (), goal
+                else:
+                    way_out, end = _way_out_and_end(request)
                 if way_out and (field is None or field.goal != end):
                     field, plan = self.q_field(grid, end, rule), None
             if field is None or not way_out:
@@ -253,6 +262,36 @@ class Planner:
                 return
             with rollout_time:
                 plan = plan or field.rollout(way_out[-1])
+            if not plan.cells and request.method is PlanMethod.ASTAR_FALLBACK:
+                yield None
+                costs = grid.cost_multiplier
+                with rollout_time:
+                    cells = search(way_out[-1], end, field.legal, costs, rule, field.value)
+                plan = Plan(PlanStatus.SUCCEEDED, cells, PlanMethod.ASTAR_FALLBACK)
+        cells, cost = plan.cells, None
+        with rollout_time:
+            if cells:
+                cells = way_out[:-1] + cells
+                cost = None if grid.cost is None else path_cost(cells, grid.cost_multiplier, rule)
+                cells = simplify(cells, grid, rule) if request.simplified else cells
+        plan = replace(plan, cells=cells, move_rule=rule, cost=cost, goal=field.goal)
+        yield replace(plan, field_ms=field_time.ms, rollout_ms=rollout_time.ms)
+
+    def _visit_some(self, request: PlanRequest) -> tuple[QField | None, Plan | None]:
+        """Return the field of the goal and the plan from it, if these take few visits of cells.
+
+        So most requests need no connected components.
+        """
+        grid, rule = request.grid, request.move_rule
+        with self._lock:
+            known = self._map(grid, rule)
+        if known.costs is None:
+            return None, None
+        field = self.q_field(grid, request.goal, rule)
+        assert isinstance(field, DistanceField)
+        plan = field.rollout(request.start, int(UNLABELLED_SHARE * grid.occupancy.size))
+        return field, None if plan.status is PlanStatus.ROLLOUT_TRAPPED else plan
+
     def _refusal(self, request: PlanRequest) -> PlanStatus | None:
         """Return why there is no path, where one look at start and goal says so."""
         grid = request.grid
@@ -300,7 +339,7 @@ def _way_out_and_end(request: PlanRequest) -> tuple[tuple[Cell, ...], Cell]:
     to a cell within the tolerance: connected cells say so, without a field.
     """
     grid, start, goal, rule = request.grid, request.start, request.goal, request.move_rule
-    labels = component_labels(grid.occupancy, rule)
+    labels = grid.labels(rule)
     goals = [np.array([goal])] if grid.is_free(goal) else []
     if _reach(request) >= 1:
         goals.append(_free_cells(grid, goal, _reach(request)))

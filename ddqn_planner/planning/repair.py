@@ -60,7 +60,7 @@ def repaired(
     if changed is None:
         return None
     arrays = field.hand_over()
-    if shift != (0, 0) or field.costs.patch_C.size != costs.patch_C.size:
+    if shift != (0, 0) or field.costs.patch.size != costs.patch.size:
         arrays = _moved(arrays, field.grid, grid, shift)
     distance, state, opened = arrays
     new = DistanceField(goal, grid, costs, field.move_rule)

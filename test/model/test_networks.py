@@ -10,7 +10,8 @@ from strategies import grids_with_costs, grids_with_free_cell
 
 from ddqn_planner.grid import Cell, GridMap, MoveRule, legal_moves
 from ddqn_planner.model import NETWORKS, load_model, networks
-from ddqn_planner.model.networks import MAX_LEARNED_MULTIPLIER, AnyMapQNetwork, PropagationQNetwork
+from ddqn_planner.model.move_costs import MAX_MULTIPLIER
+from ddqn_planner.model.networks import AnyMapQNetwork, PropagationQNetwork
 from ddqn_planner.model.observation import observation_background, observe, patches
 from ddqn_planner.model.wavefront import propagate_values
 from ddqn_planner.training.encoders import ENCODERS
@@ -180,7 +181,7 @@ def test_a_move_is_possible_where_it_succeeds_more_often_than_not(name: str) -> 
 def test_a_cost_above_the_upper_bound_counts_as_the_bound() -> None:
     grid = GridMap(np.zeros((1, 2)))
     for multiplier, used in (
-        (MAX_LEARNED_MULTIPLIER - 1, MAX_LEARNED_MULTIPLIER - 1),
+        (MAX_MULTIPLIER - 1, MAX_MULTIPLIER - 1),
         (1e4, 100.0),
     ):
         network = answering("any_map", 0.9, multiplier)
