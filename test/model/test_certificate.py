@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import math
 from itertools import product
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,6 +12,7 @@ from hypothesis.extra import numpy as numpy_st
 from networks import random_network
 from strategies import grids_with_costs
 
+from ddqn_planner.cli import main
 from ddqn_planner.grid import (
     MAX_COST_MULTIPLIER,
     MOVES,
@@ -33,6 +35,8 @@ from ddqn_planner.model.certificate import (
     certify,
 )
 from ddqn_planner.planning import Planner
+
+GUARANTEES = Path(__file__).resolve().parents[2] / "docs" / "guarantees.md"
 
 PATCHES = np.array(list(product([0, OCCUPIED], repeat=9)), dtype=np.int8)
 PATCHES = PATCHES[PATCHES[:, 4] == 0]
@@ -295,3 +299,24 @@ def test_the_papers_network_has_no_certificate() -> None:
     network, metadata = load_model("dilemma")
     assert type(network) is NETWORKS["paper"]
     assert certificate_of(network, metadata.move_rule) is None
+
+
+# What a user reads
+
+
+def test_certify_prints_the_proof_that_the_documentation_shows(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    assert main(["certify", "any_map"]) == 0
+    printed = capsys.readouterr().out
+    assert printed.startswith("proved: all 4,096 decisions, ")
+    assert printed in GUARANTEES.read_text(encoding="utf-8")
+
+
+def test_certify_says_that_nothing_can_be_proved_about_the_papers_network(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    assert main(["certify", "dilemma"]) == 1
+    assert capsys.readouterr().out == (
+        "nothing can be proved: the moves depend on the whole map, not on 3x3 patches\n"
+    )
