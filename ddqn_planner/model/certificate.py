@@ -2,10 +2,10 @@
 
 The network sees a 3x3 patch. Which of its cells are occupied gives 256 patterns with a free centre;
 the free cells may have any cost or be unknown. For all of these at once, each ReLU is enclosed by
-two lines, so that each logit is enclosed by two linear functions of the costs, whose extreme values
-are known exactly (CROWN, Zhang et al. 2018, "Efficient neural network robustness certification with
-general activation functions"). In the first layer that has bounds of this kind, both lines have one
-slope, so that one product gives both bounds (Fast-Lin, Weng et al. 2018).
+two lines. So each logit is enclosed by two linear functions of the costs, whose extreme values are
+known exactly (CROWN, Zhang et al. 2018, "Efficient neural network robustness certification with
+general activation functions"). For the bounds of the hidden layer, both lines have one slope, so
+that one product gives both bounds (Fast-Lin, Weng et al. 2018).
 
 Dimensions: P = 256 patterns, A = 8 actions, F = filters, I = inputs, C = 18 inputs for costs and
 unknown cells (0 for a network that uses no costs).
