@@ -182,6 +182,7 @@ def test_an_animation_that_is_no_gif_is_refused_before_planning(
     [
         (["--help"], ("numpy", "ddqn_planner.grid")),
         (["plan", "dilemma"], ("torch", "matplotlib", "ddqn_planner.training", "tqdm")),
+        (["certify"], ("torch", "numba", "scipy", "ddqn_planner.planning")),
     ],
 )
 def test_a_command_imports_only_what_it_needs(

@@ -2,10 +2,10 @@
 
 The network sees a 3x3 patch. Which of its cells are occupied gives 256 patterns with a free centre;
 the free cells may have any cost or be unknown. For all of these at once, each ReLU is enclosed by
-two lines, so that each logit is enclosed by two linear functions of the costs, whose extreme values
-are known exactly (CROWN, Zhang et al. 2018, "Efficient neural network robustness certification with
-general activation functions"). In the first layer that has bounds of this kind, both lines have one
-slope, so that one product gives both bounds (Fast-Lin, Weng et al. 2018).
+two lines. So each logit is enclosed by two linear functions of the costs, whose extreme values are
+known exactly (CROWN, Zhang et al. 2018, "Efficient neural network robustness certification with
+general activation functions"). For the bounds of the hidden layer, both lines have one slope, so
+that one product gives both bounds (Fast-Lin, Weng et al. 2018).
 
 Dimensions: P = 256 patterns, A = 8 actions, F = filters, I = inputs, C = 18 inputs for costs and
 unknown cells (0 for a network that uses no costs).
@@ -37,6 +37,9 @@ CENTRE = 4
 
 COSTS = slice(9, 27)
 """The features for costs and unknown cells; see `AnyMapQNetwork.features`."""
+
+NO_CERTIFICATE = "nothing can be proved: the moves depend on the whole map, not on 3x3 patches"
+"""Said of a network that `certificate_of` gives none, such as the paper's."""
 
 MAX_FILTERS = 256
 """For more, the proof would take seconds, and it is not tried."""
@@ -146,19 +149,17 @@ def certify(
 
 
 @lru_cache(maxsize=1)
-def describe(network: QNetwork, move_rule: MoveRule) -> str:
-    """Say what is proved about a network that was trained under a move rule.
+def certificate_of(network: QNetwork, move_rule: MoveRule) -> Certificate | None:
+    """Return the certificate of a loaded network; None if its moves depend on the whole map.
 
-    The last answer is kept: a network does not change after it was loaded.
+    The last one is kept. A network that does not observe the move rule is certified for the one of
+    its training.
     """
-    from ddqn_planner.model.networks import PropagationQNetwork  # it imports this module
+    from ddqn_planner.model.networks import PropagationQNetwork  # may import this module
 
     if not isinstance(network, PropagationQNetwork):
-        return "nothing can be proved: its moves depend on the whole map, not on 3x3 patches"
-    if network.uses_costs:
-        return str(certify(network))
-    # It does not observe the move rule, and learns that of its training.
-    return f"{certify(network, [move_rule])}; move rule {move_rule.value}"
+        return None
+    return certify(network) if network.uses_costs else certify(network, [move_rule])
 
 
 def _legal_moves(patch_P9: NDArray[np.int8], move_rule: MoveRule) -> NDArray[np.bool_]:

@@ -380,7 +380,7 @@ class PlannerNode(BaseNode):
         if self._planner is not None:
             rule = self._settings.move_rule or self._planner.metadata.move_rule
             description |= {"model file": self._model_file, "move rule": rule.value}
-            description |= describe_model(self._planner.metadata)
+            description |= describe_model(self._planner)
         if self._map is not None:
             description["map"] = describe_map(self._map)
             description["map stamp (s)"] = seconds(self._map.header.stamp)

@@ -15,7 +15,7 @@ from nav_msgs.msg import OccupancyGrid
 from rclpy.node import Node
 
 from ddqn_planner.grid import Cell
-from ddqn_planner.model import ModelMetadata
+from ddqn_planner.model.certificate import NO_CERTIFICATE, certificate_of
 from ddqn_planner.planning import Plan, PlanMethod, Planner, PlanRequest, PlanStatus
 
 PERIOD = 1.0
@@ -211,12 +211,15 @@ class Report:
         self._publisher.publish(message)
 
 
-def describe_model(metadata: ModelMetadata) -> dict[str, str]:
-    """Return what the diagnostics say of a model."""
+def describe_model(planner: Planner) -> dict[str, str]:
+    """Return what the diagnostics say of a planner's model."""
+    metadata = planner.metadata
+    certificate = certificate_of(planner.network, metadata.move_rule)
     return {
         "model move rule": metadata.move_rule.value,
         "model sizes": ", ".join(f"{key} {size}" for key, size in metadata.sizes.items()),
         "model training steps": str(metadata.steps),
+        "model certificate": str(certificate or NO_CERTIFICATE),
     }
 
 
