@@ -12,7 +12,7 @@ Function = TypeVar("Function", bound=Callable[..., Any])
 _importing = Lock()
 
 
-def compiled(function: Function) -> Function:
+def compiled(function: Callable[..., Any]) -> Callable[..., Any]:
     """Compile a function at its first call. It calls no other compiled function."""
 
     @cache
@@ -23,7 +23,7 @@ def compiled(function: Function) -> Function:
     def call(*arguments: Any) -> Any:
         return dispatcher()(*arguments)
 
-    return call  # type: ignore[return-value]
+    return call
 
 
 def compiled_now(function: Function) -> Function:

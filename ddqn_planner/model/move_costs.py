@@ -85,7 +85,8 @@ def every_patch() -> NDArray[np.int8]:
 def legal_in_every_patch(move_rule: MoveRule) -> NDArray[np.bool_]:
     """Return which moves are legal in the middle of each patch: (512, 8) bool."""
     rows = every_patch().reshape(-1, 3) == OCCUPIED  # the patches, one above the other
-    return legal_moves(rows, move_rule)[:, 1::3, 1].T
+    legal: NDArray[np.bool_] = legal_moves(rows, move_rule)[:, 1::3, 1].T
+    return legal
 
 
 def cell_values(grid: GridMap) -> NDArray[np.uint8]:

@@ -229,7 +229,6 @@ def grow_whole(distance: Distances, state: States, opened: Cells, costs: MoveCos
     costs : MoveCosts
     """
     patch, table, value, terms, width = costs[:5]
-    patch, table, value, terms, width = costs[:5]
     offsets = MOVE_Y * width + MOVE_X
     opened = opened[np.argsort(distance[opened])]
     ring = int(costs.highest) + 2
@@ -292,7 +291,7 @@ def _still_open(
     state: States, opened: Cells, bucket: NDArray[np.int32], count: NDArray[np.int64]
 ) -> Cells:
     """Return each open cell of those given and of the buckets once."""
-    found = np.empty(opened.size + count.sum(), np.int32)
+    found: Cells = np.empty(opened.size + count.sum(), np.int32)
     number = 0
     for slot in range(-1, count.size):
         cells = opened if slot < 0 else bucket[slot, : count[slot]]
@@ -303,7 +302,8 @@ def _still_open(
                 number += 1
     for cell in found[:number]:
         state[cell] = OPEN
-    return found[:number].copy()
+    still_open: Cells = found[:number].copy()
+    return still_open
 
 
 @compiled_now
@@ -330,7 +330,6 @@ def take_back(
     bool
         Whether the limit was kept; if not, the field is of no more use.
     """
-    patch, table, value, terms, width = costs[:5]
     patch, table, value, terms, width = costs[:5]
     offsets = MOVE_Y * width + MOVE_X
     # In the order of the old distances: what supports a cell is judged before it.
@@ -405,7 +404,7 @@ def next_action(
 def roll_out(distance: Distances, costs: MoveCosts, start: int) -> Cells:
     """Return the greedy steps from a closed start to the goal, with both cells: (N,) int32."""
     patch, table, value, terms, width = costs[:5]
-    cells = np.empty(64, np.int32)
+    cells: Cells = np.empty(64, np.int32)
     cell, number = start, 0
     while True:
         if number == cells.size:
@@ -414,7 +413,8 @@ def roll_out(distance: Distances, costs: MoveCosts, start: int) -> Cells:
         number += 1
         action = next_action(distance, patch, table, value, terms, width, cell)
         if distance[cell] == AT_GOAL or action < 0:
-            return cells[:number].copy()
+            path: Cells = cells[:number].copy()
+            return path
         cell += MOVE_Y[action] * width + MOVE_X[action]
 
 

@@ -131,7 +131,7 @@ class DistanceField(QField):
         return legal_moves(self.grid.occupancy, self.move_rule)
 
     @cached_property
-    def value(self) -> NDArray[np.float32]:  # type: ignore[override]
+    def value(self) -> NDArray[np.float32]:
         """(H, W) float32: the greatest Q of a legal move, and at the goal the greatest of all."""
         with self.lock:
             distance = self._whole().reshape(-1, self.costs.width)[1:-1, 1:-1]
@@ -141,7 +141,7 @@ class DistanceField(QField):
         return value
 
     @cached_property
-    def policy(self) -> NDArray[np.int8]:  # type: ignore[override]
+    def policy(self) -> NDArray[np.int8]:
         """(H, W) int8: the action of a rollout in each cell; -1 without one."""
         with self.lock:
             return self.wavefront.policy_of(self._whole(), self.costs)

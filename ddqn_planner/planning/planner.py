@@ -268,6 +268,7 @@ class Planner:
                 with rollout_time:
                     cells = search(way_out[-1], end, field.legal, costs, rule, field.value)
                 plan = Plan(PlanStatus.SUCCEEDED, cells, PlanMethod.ASTAR_FALLBACK)
+        assert field is not None
         cells, cost = plan.cells, None
         with rollout_time:
             if cells:

@@ -60,7 +60,7 @@ def repaired(
     if changed is None:
         return None
     arrays = field.hand_over()
-    if shift != (0, 0) or field.costs.patch.size != costs.patch.size:
+    if shift != (0, 0) or field.grid.occupancy.shape != grid.occupancy.shape:
         arrays = _moved(arrays, field.grid, grid, shift)
     distance, state, opened = arrays
     new = DistanceField(goal, grid, costs, field.move_rule)
@@ -97,7 +97,7 @@ def _changed_cells(old: GridMap, new: GridMap, shift: Cell) -> NDArray[np.int32]
     number = np.flatnonzero(differs)
     y, x = np.divmod(number, max(right - left, 1))
     cells = [(y + bottom + 1) * width + x + left + 1]
-    if (old.width, old.height) != (new.width, new.height) or shift != (0, 0):
+    if shift != (0, 0) or old.occupancy.shape != new.occupancy.shape:
         # What lay beyond the border of one map is inside the other.
         for row in (bottom, top + 1):
             cells.append(row * width + np.arange(left, right + 2))

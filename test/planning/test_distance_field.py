@@ -1,7 +1,6 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -87,11 +86,10 @@ def test_a_request_without_a_path_does_not_visit_the_whole_map() -> None:
 
 
 @pytest.fixture(autouse=True)
-def any_share(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+def any_share(monkeypatch: pytest.MonkeyPatch) -> None:
     """Repair the small maps of these tests, however much of them changes."""
     monkeypatch.setattr(repair, "CHANGED_SHARE", 1.0)
     monkeypatch.setattr(repair, "REPAIRED_SHARE", 1.0)
-    yield
 
 
 @st.composite
@@ -106,7 +104,6 @@ def changed_maps(draw: st.DrawFn, grid: GridMap) -> GridMap:
         cost = None if grid.cost is None else random.integers(-1, 100, patch.shape)
         return grid.with_patch(patch, x, y, cost)
     left, right, below, above = (draw(st.integers(-2, 3)) for _ in range(4))
-    left, right = max(left, 1 - grid.width - min(right, 0)), right
     if grid.width + left + right < 1 or grid.height + below + above < 1:
         left = right = below = above = 1
 
@@ -171,7 +168,8 @@ def test_a_changed_map_uses_what_is_known_of_the_one_before() -> None:
     x, y = before.cells[3]
     changed = grid.with_patch(np.ones((1, 1)), x, y)
     older, costs = planner.q_field(grid, goal), NETWORK.move_costs(changed, MoveRule.ROBOT_SAFE)
-    assert isinstance(older, DistanceField) and costs is not None
+    assert isinstance(older, DistanceField)
+    assert costs is not None
     known = np.count_nonzero(older.arrays[0])
     field = repair.repaired(older, goal, changed, costs, (0, 0))
     assert field is not None
@@ -221,7 +219,7 @@ def test_threads_share_a_planner_while_the_map_changes(kind: str) -> None:
         x, y = random.integers(0, 58, 2).tolist()
         maps.append(maps[-1].with_patch(random.random((2, 2)) < 0.5, x, y))
     expected = {
-        (number, *request): Planner(NETWORK, METADATA).plan(changed, *request)
+        (number, request): Planner(NETWORK, METADATA).plan(changed, *request)
         for number, changed in enumerate(maps)
         for request in requests
     }
@@ -232,7 +230,7 @@ def test_threads_share_a_planner_while_the_map_changes(kind: str) -> None:
         for _ in range(100):
             number = int(order.integers(len(maps)))
             request = requests[int(order.integers(len(requests)))]
-            if planner.plan(maps[number], *request) != expected[number, *request]:
+            if planner.plan(maps[number], *request) != expected[number, request]:
                 wrong.append((number, request))
 
     threads = [threading.Thread(target=ask, args=(seed,)) for seed in range(4)]
