@@ -22,7 +22,6 @@ from typing import Any
 
 import numpy as np
 from client import Client, initial_pose, plan_request, pose, wait_for
-from demo import start_and_goal
 from map_fixture import RULE, MapFixture
 from nav_msgs.msg import OccupancyGrid
 from nav_msgs.msg import Path as PathMessage
@@ -32,13 +31,12 @@ from rcl_interfaces.srv import GetParameters, SetParameters
 from rclpy.parameter import Parameter
 from std_srvs.srv import Trigger
 
-from ddqn_planner.grid import OCCUPIED, Cell, MapFile, load_map, save_map
+from ddqn_planner.grid import OCCUPIED, Cell, MapFile, save_map
 from ddqn_planner.grid.generators import generate_map, random_requests
 from ddqn_planner.grid.noise import MAX_NEW_OBSTACLES
 from ddqn_planner.model import load_model
 from ddqn_planner.nodes.runtime import LATCHED
-from ddqn_planner.resources import find_map
-from ddqn_planner.training.environment import Scenario
+from ddqn_planner.training.environment import paper_scenario
 from ddqn_planner.training.trainer import Trainer
 
 KILLS = 50
@@ -115,7 +113,6 @@ class Faults:
         map_file = MapFile(OCCUPIED * occupancy, 1.0, (0.0, 0.0, 0.0), *self._watched)
         save_map(map_file, self.map_path)
         self._map = MapFixture(map_file)
-        self._scenario = Scenario(load_map(find_map("dilemma")), *start_and_goal("dilemma"))
         self.tallies = {
             self.kill_planner: Tally("planner_node", "planning"),
             self.kill_map_server: Tally("map_server_node", "publishing"),
@@ -199,27 +196,27 @@ class Faults:
         self.trigger("/training/trainer/start", START_TIME)
         self.parameter("/training/planner", "model")
 
-    def count(self, tally: Tally, service: Any, futures: Sequence[Any]) -> list[Any]:
-        """Count the answers that came before a kill, and the time-outs; return the answers."""
-        answers = [future.result() for future in futures if future.done()]
-        tally.answers += len(answers)
-        tally.time_outs += len(futures) - len(answers)
-        for future in futures:
+    def kill(self, node: Killed, tally: Tally, calls: Sequence[tuple[Any, Any]]) -> list[Any]:
+        """Kill a node under calls, which are pairs of a service and a future.
+
+        Count the answers that came before, and the time-outs; return the answers, or None.
+        """
+        node.kill()
+        time.sleep(LAST_WAIT)
+        for service, future in calls:
+            tally.answers += future.done()
+            tally.time_outs += not future.done()
             service.remove_pending_request(future)
-        return answers
+        return [future.result() for _, future in calls]
 
     def kill_planner(self, tally: Tally) -> None:
         """Kill the planner while it plans toward goals that it does not know."""
-        get_plan = self.client.service(GetPlan, GET_PLAN)
-        grid = self._map.grid
+        get_plan, grid = self.client.service(GetPlan, GET_PLAN), self._map.grid
         asked = random_requests(grid.occupancy, RULE, GOALS, self._random)
-        futures = [get_plan.call_async(plan_request(grid, *cells)) for cells in asked]
+        calls = [(get_plan, get_plan.call_async(plan_request(grid, *cells))) for cells in asked]
         time.sleep(self._draw.uniform(0.0, 1.0))
-        self.planner.kill()
-        time.sleep(LAST_WAIT)
-        for cells, future in zip(asked, futures, strict=True):
-            for answer in self.count(tally, get_plan, [future]):
-                tally.wrong_paths += not self.is_right(answer.plan, *cells)
+        for cells, answer in zip(asked, self.kill(self.planner, tally, calls), strict=True):
+            tally.wrong_paths += answer is not None and not self.is_right(answer.plan, *cells)
         self.planner.start()
         plan = self.ask_for_plan(*asked[0])
         tally.wrong_paths += not self.is_right(plan, *asked[0])
@@ -229,18 +226,15 @@ class Faults:
         """Kill the map server while it loads, scatters over and restores its map."""
         self.plan_for_active_goal()
         load = LoadMap.Request(map_url=str(self.map_path))
-        calls = [
+        requests = [
             *[(self.client.service(Trigger, "map_server/restore_map"), Trigger.Request())] * 20,
             *[(self.client.service(LoadMap, "map_server/load_map"), load)] * 4,
             (self.client.service(Trigger, "map_server/scatter_obstacles"), Trigger.Request()),
         ]
-        self._draw.shuffle(calls)
-        futures = [(service, service.call_async(request)) for service, request in calls]
+        self._draw.shuffle(requests)
+        calls = [(service, service.call_async(request)) for service, request in requests]
         time.sleep(self._draw.uniform(0.0, 2.0))
-        self.map_server.kill()
-        time.sleep(LAST_WAIT)
-        for service, future in futures:
-            self.count(tally, service, [future])
+        self.kill(self.map_server, tally, calls)
         # When that is answered, the plans of the last maps are out.
         self.ask_for_plan(*self._watched)
         whole = self.is_whole(self.maps.wait())
@@ -268,17 +262,15 @@ class Faults:
         """Kill the trainer while it saves after each step, soon after a save was seen to begin."""
         save = self.client.service(Trigger, "/training/trainer/save")
         until = time.monotonic() + self._draw.uniform(0.2, 1.2)
-        futures = []
+        calls = []
         while time.monotonic() < until:
-            futures.append(save.call_async(Trigger.Request()))
+            calls.append((save, save.call_async(Trigger.Request())))
             time.sleep(0.002)
         while not self.temporaries() and time.monotonic() < until + LAST_WAIT:
             pass
         time.sleep(self._draw.uniform(0.0, 0.002))
-        self.trainer.kill()
+        self.kill(self.trainer, tally, calls)
         tally.in_a_save += bool(self.temporaries())
-        time.sleep(LAST_WAIT)
-        self.count(tally, save, futures)
         steps = self.saved_steps()
         self.trainer.start()
         self.parameter("/training/trainer", "seed")
@@ -299,7 +291,7 @@ class Faults:
             load_model(model)
         if not checkpoint.exists():
             return 0
-        return Trainer.load_checkpoint(checkpoint, [self._scenario]).steps
+        return Trainer.load_checkpoint(checkpoint, [paper_scenario()]).steps
 
     def follow(self) -> None:
         """Wait until the planner that follows the trainer has loaded a model of its."""

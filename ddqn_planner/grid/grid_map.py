@@ -190,10 +190,9 @@ class GridMap:
 
     @cached_property
     def cost_multiplier(self) -> NDArray[np.float32]:
-        """(H, W) float32: cost of a path in each cell per cell of its length.
+        """(H, W) float32: cost of a path in each cell per cell of its length, see `move_costs`.
 
-        It grows linearly from 1 for cost 0 to `MAX_COST_MULTIPLIER` for cost 100; it is 1
-        everywhere on a map without costs. See `move_costs`.
+        It grows linearly from 1 for cost 0, or without costs, to `MAX_COST_MULTIPLIER`.
         """
         if self.cost is None:
             return np.ones(self.occupancy.shape, dtype=np.float32)

@@ -9,18 +9,10 @@ from ddqn_planner.compiled import compiled
 
 
 def label_cells(occupancy: NDArray[np.bool_], corners: bool) -> NDArray[np.int32]:
-    """Label the connected components of the free cells from 1, in the order of their first cells.
+    """Return (H, W) int32: the connected component of each free cell, 0 in occupied cells.
 
-    Parameters
-    ----------
-    occupancy : (H, W) bool
-    corners : bool
-        Whether two cells that share only a corner are connected.
-
-    Returns
-    -------
-    (H, W) int32
-        0 for the occupied cells.
+    They are numbered from 1, in the order of their first cells. `corners` says whether two cells
+    that share only a corner are connected.
     """
     # One layout, and a fresh array: numba compiles again for every other, and for read-only ones.
     free = np.logical_not(occupancy, order="C")
