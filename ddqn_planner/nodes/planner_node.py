@@ -33,7 +33,7 @@ from ddqn_planner.nodes.conversions import (
     grid_from_message,
     path_message,
 )
-from ddqn_planner.nodes.field_display import FieldDisplay
+from ddqn_planner.nodes.field_display import FieldDisplay, Shown
 from ddqn_planner.nodes.model_loading import load, load_and_warm_up
 from ddqn_planner.nodes.planner_parameters import (
     Settings,
@@ -89,12 +89,12 @@ class PlannerNode(BaseNode):
         self._settings = Settings.of(self)
 
         self._worker = Worker(self)
-        # What takes milliseconds must not wait for fields: 2000 x 2000 cells take over a second.
+        # Maps must not wait for fields: 2000 x 2000 cells take over a second.
         self._quick_worker = Worker(self)
         # While it loads, DDS discovers, and the node says what else is missing.
         self._first_planner = self._worker.call(load_and_warm_up, self.get_parameter("model").value)
         self._model_is_due = True
-        self._display = FieldDisplay(self, self._quick_worker)
+        self._display = FieldDisplay(self)
         self._report = Report(self)
         self._logged: tuple[PoseStamped, object] | None = None
         self._logged_map = ""
@@ -282,20 +282,13 @@ class PlannerNode(BaseNode):
         if self._logged != logged:
             self._logged = logged
             self._report.log(outcome)
-        try:
-            await self._show_field(outcome, path.header)
-        except Exception as error:  # as when no memory is left: the node must survive
-            self.get_logger().error(f"the value cannot be shown ({error!r}); give a smaller map")
-
-    async def _show_field(self, outcome: Outcome, header: Header) -> None:
-        request, goal, planner = outcome.request, outcome.plan.goal, outcome.planner
-        if request is None or goal is None or planner is None:
-            self._display.clear(header)
-            return
-        field = planner.known_field(request.grid, goal, request.move_rule)
-        if field is None:
-            field = await self._worker.call(planner.q_field, request.grid, goal, request.move_rule)
-        await self._display.show(field, request.grid, header)
+        request, field_goal = outcome.request, outcome.plan.goal
+        if request is None or field_goal is None or outcome.planner is None:
+            self._display.clear(path.header)
+        else:
+            rule = request.move_rule
+            shown = Shown(outcome.planner, request.grid, field_goal, rule, path.header)
+            self._display.show(shown)
 
     async def _answer(
         self, start: PoseStamped | None, goal: PoseStamped, tolerance: float
@@ -389,9 +382,11 @@ class PlannerNode(BaseNode):
 
 def main() -> NoReturn:
     """Run the planner node until SIGINT or SIGTERM."""
-    # glibc returns large arrays at once: after 120 fields the process has 185 MB instead of 245.
+    # glibc reuses the memory of arrays up to 16 MB, because new pages would cost small fields a
+    # third of their time. It returns larger arrays at once, so that the memory does not grow.
     with suppress(AttributeError):  # another C library
-        ctypes.CDLL(None).mallopt(-3, 2**20)  # M_MMAP_THRESHOLD
+        for option in (-1, -3):  # M_TRIM_THRESHOLD, M_MMAP_THRESHOLD
+            ctypes.CDLL(None).mallopt(option, 2**24)
     # A field that is being computed cannot be stopped, and Python would wait for its thread.
     os._exit(spin_until_shutdown(PlannerNode, declare_parameters))
 

@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from client import initial_pose, map_message, pose
 from diagnostic_msgs.msg import DiagnosticStatus
 from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped, TransformStamped
 from integration.robot import (
@@ -24,7 +25,7 @@ from integration.robot import (
     values_of,
     yaw_of,
 )
-from nav_msgs.msg import Odometry, Path
+from nav_msgs.msg import OccupancyGrid, Odometry, Path
 from nav_msgs.srv import GetPlan
 from rcl_interfaces.msg import SetParametersResult
 from rcl_interfaces.srv import SetParametersAtomically
@@ -515,6 +516,7 @@ def test_the_value_is_published_once_a_goal(robot: Robot) -> None:
     robot.send_start(robot.pose((0, 0)))
     robot.send_goal(robot.pose((3, 6)))
     robot.wait_for_path((0, 0), (3, 6))
+    robot.value.wait(lambda value: value.data[first] == 100)
     robot.send_start(robot.pose((1, 0)))
     robot.wait_for_path((1, 0), (3, 6))
     robot.send_goal(robot.pose((4, 7)))
@@ -540,6 +542,38 @@ def test_nothing_is_shown_of_a_goal_without_a_field(robot: Robot) -> None:
     robot.send_goal(robot.pose((3, 3)))
     robot.value.wait(lambda value: value.data[3 * 20 + 3] == 100)
     policies.wait(lambda message: message.markers[0].action == Marker.ADD)
+
+
+def test_nothing_is_computed_for_a_topic_without_subscribers(
+    run_node: Any,
+    make_client: Callable[[str], Any],
+    hall: np.ndarray,
+    tmp_path: FilePath,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    (tmp_path / "sitecustomize.py").write_text(
+        "import ddqn_planner.nodes.conversions as conversions\n"
+        "make = conversions.value_message\n"
+        "def value_message(field, *others):\n"
+        "    print('value of', field.goal, flush=True)\n"
+        "    return make(field, *others)\n"
+        "conversions.value_message = value_message\n"
+    )
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path), prepend=":")
+    client, grid = make_client("/unseen"), Robot.grid_of(hall)
+    with run_node("planner_node", {}, namespace="/unseen") as node:
+        plans = client.subscribe(Path, "plan", LATCHED)
+        client.publish("map", map_message(hall, grid), LATCHED)
+        client.publish("initialpose", initial_pose(pose(grid, (0, 0))))
+        for goal in ((3, 3), (4, 4)):
+            plans.clear()
+            client.publish("goal_pose", pose(grid, goal))
+            plans.wait(lambda path: path.poses)
+            time.sleep(0.3)
+        assert "value of" not in node.log
+        value = client.subscribe(OccupancyGrid, "planner/value", LATCHED).wait()
+        assert value.data[4 * 20 + 4] == 100
+        assert node.log.count("value of") == 1
 
 
 @pytest.mark.parametrize("name", ["value", "policy"])
