@@ -43,15 +43,17 @@ def grid_from_message(
     Raises
     ------
     ValueError
-        If the message is malformed, or its origin is rolled or pitched; the error names the value.
+        If the message is malformed, its origin is rolled or pitched, or no memory is left for it.
     """
     _check_map(message)
     info = message.info
     values = np.frombuffer(message.data, np.int8).reshape(info.height, info.width)
     origin = (info.origin.position.x, info.origin.position.y, _yaw(info.origin.orientation))
-    return GridMap.from_occupancy_values(
-        values, info.resolution, origin, occupied_threshold, allow_unknown, use_map_costs
-    )
+    rules = occupied_threshold, allow_unknown, use_map_costs
+    try:
+        return GridMap.from_occupancy_values(values, info.resolution, origin, *rules)
+    except MemoryError:
+        raise ValueError("no memory is left for the map; give a smaller one") from None
 
 
 def occupancy_message(

@@ -465,9 +465,9 @@ def test_parameters_that_come_together_are_set_together_or_not_at_all(robot: Rob
     before = {name: robot.client.get_parameter("planner", name) for name in good}
     for bad, reason in (
         ({"clearance_weight": 1.5}, "out of range"),
-        ({"move_rule": "diagonal"}, "move_rule is 'diagonal'; it is one of"),
+        ({"move_rule": "diagonal"}, "move_rule is 'diagonal'; give one of ''"),
         ({"model": "no_such_model"}, "there is no shipped model 'no_such_model'"),
-        ({"start_source": "gps"}, "start_source is 'gps'; it is one of"),
+        ({"start_source": "gps"}, "start_source is 'gps'; give one of"),
         ({"robot_frame": ""}, "robot_frame is ''; name"),
         ({"tolerance": math.nan}, "out of range"),
         ({"follow_trainer": True}, "read-only"),
