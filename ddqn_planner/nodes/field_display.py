@@ -24,23 +24,24 @@ LOOK_PERIOD = 0.1
 
 
 class Shown(NamedTuple):
-    """A Q field, perhaps not computed yet; without a goal, none. All messages have the header."""
+    """A Q field, perhaps not computed yet, or none without a planner; and its messages' header."""
 
-    planner: Planner
+    planner: Planner | None
     grid: GridMap
-    goal: Cell | None
+    goal: Cell
     move_rule: MoveRule
     header: Header
 
 
 @dataclass
 class Layer:
-    """A topic that shows the field, the function that makes its messages, and what it shows."""
+    """A topic, the function that makes its messages, and whether the last one shows a field."""
 
     name: str
     publisher: Publisher
     message: Callable[..., Any]
-    shown: Shown | None = None
+    is_due: bool = False
+    has_field: bool = False
 
 
 class FieldDisplay:
@@ -70,22 +71,25 @@ class FieldDisplay:
         """Show a field from now on."""
         if self._shows_again or self._shown is None or self._shown[:-1] != shown[:-1]:
             self._shown, self._shows_again = shown, False
+            for layer in self._layers:
+                layer.is_due = True
 
     def clear(self, now: Header) -> None:
         """Show no field: the one that is shown is of another goal."""
-        if self._shown is not None and self._shown.goal is not None:
+        if self._shown is not None:
             header = Header(stamp=now.stamp, frame_id=self._shown.header.frame_id)
-            self._shown = self._shown._replace(goal=None, header=header)
+            self.show(self._shown._replace(planner=None, header=header))
 
     async def _on_look(self) -> None:
         for layer in self._layers:
             shown = self._shown
-            if shown is None or shown is layer.shown:
+            if shown is None or not layer.is_due:
                 continue
-            # The last message is latched, so it is replaced even if nobody subscribes now.
-            if not (layer.publisher.get_subscription_count() if shown.goal else layer.shown):
+            has_field = shown.planner is not None
+            # A field that is latched is cleared even if nobody subscribes now.
+            if not (layer.publisher.get_subscription_count() if has_field else layer.has_field):
                 continue
-            layer.shown = shown
+            layer.is_due, layer.has_field = False, has_field
             try:
                 layer.publisher.publish(await self._worker.call(_message, layer, shown))
             except Exception as error:  # as when no memory is left: the node must survive
@@ -94,5 +98,6 @@ class FieldDisplay:
 
 
 def _message(layer: Layer, shown: Shown) -> Any:
-    field = shown.goal and shown.planner.q_field(shown.grid, shown.goal, shown.move_rule)
-    return layer.message(field, shown.grid, shown.header)
+    planner, grid, goal, move_rule, header = shown
+    field = planner and planner.q_field(grid, goal, move_rule)
+    return layer.message(field, grid, header)

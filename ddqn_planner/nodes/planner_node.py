@@ -46,7 +46,7 @@ from ddqn_planner.nodes.report import (
     seconds,
 )
 from ddqn_planner.nodes.runtime import LATCHED, STEADY, BaseNode, Worker, spin_until_shutdown
-from ddqn_planner.nodes.start_source import StartSource, StartUnknownError, check_tf
+from ddqn_planner.nodes.start_source import StartSource, check_tf
 from ddqn_planner.planning import PlanMethod, Planner, PlanRequest
 from ddqn_planner.planning.planner import last_step
 
@@ -224,9 +224,9 @@ class PlannerNode(BaseNode):
         while True:
             try:
                 return self._start_pose(frame)
-            except StartUnknownError as error:
+            except RequestError:
                 if not self._start.may_come:
-                    raise RequestError("NO_START", str(error)) from None
+                    raise
             await self._next_look
 
     def _on_goal_pose(self, message: PoseStamped) -> None:
@@ -346,7 +346,7 @@ class PlannerNode(BaseNode):
         looked, self._next_look = self._next_look, Future()
         looked.set_result(None)
         if self._waits_for_start and self._start.name == "tf":
-            with suppress(StartUnknownError):
+            with suppress(RequestError):
                 self._start_pose(self._frame())
                 self._waits_for_start = False
                 self._replan.trigger()

@@ -123,30 +123,29 @@ class Report:
         self._node = node
         self._publisher = node.create_publisher(DiagnosticArray, "/diagnostics", 10)
         self._to_be_logged: list[str] = []
-        self._reported = -PERIOD
-        self._changed = True
+        self._due = 0.0
 
     def change(self) -> None:
         """Publish soon: something about the node changed."""
-        self._changed = True
+        self._due = 0.0
 
     def refuse(self, what: str, reason: str) -> None:
         """Log that something was refused, unless the last log of it said the same."""
         repeated = self.refused.get(what) == reason
         self.refused[what] = reason
-        self._changed = True
+        self.change()
         if not repeated:
             self._node.get_logger().error(f"{what} refused: {reason}")
 
     def accept(self, what: str) -> None:
         """Forget that something was refused."""
         if self.refused.pop(what, None):
-            self._changed = True
+            self.change()
 
     def note(self, outcome: Outcome) -> None:
         """Store the last outcome for the diagnostics."""
         self._outcome = outcome
-        self._changed = True
+        self.change()
 
     def log(self, outcome: Outcome) -> None:
         """Log a failure at once, and a path after its answer, which comes 1.2 times as fast."""
@@ -165,15 +164,14 @@ class Report:
     @property
     def is_due(self) -> bool:
         """Whether to publish: something changed, or `PERIOD` has passed."""
-        return self._changed or time.monotonic() - self._reported >= PERIOD
+        return time.monotonic() >= self._due
 
     def publish(self, fatal: bool, missing: str, more: Mapping[str, str]) -> None:
         """Publish the diagnostics, with what is missing and more values.
 
         It is fatal if the node cannot plan until its user does something.
         """
-        self._changed = False
-        self._reported = time.monotonic()
+        self._due = time.monotonic() + PERIOD
         outcome, plan = self._outcome, self._outcome.plan
         problems = [f"{what} refused: {reason}" for what, reason in self.refused.items()]
         if missing and missing != outcome.reason:

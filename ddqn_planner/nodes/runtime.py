@@ -63,19 +63,25 @@ class Declared(NamedTuple):
     allowed: tuple[float, float] | list[str] | str = ""
     read_only: bool = False
 
+    @property
+    def limits(self) -> str:
+        """Which values are allowed, in words."""
+        if isinstance(self.allowed, tuple):
+            form = "{} to {}" if isinstance(self.default, int) else "{:g} to {:g}"
+            return form.format(*self.allowed)
+        return self.allowed if isinstance(self.allowed, str) else f"one of {self.allowed}"
+
     def descriptor(self) -> ParameterDescriptor:
         """Return what ROS stores of it, and checks: a number's type and range."""
         descriptor = ParameterDescriptor(description=self.description, read_only=self.read_only)
-        if isinstance(self.allowed, tuple):
-            low, high = map(type(self.default), self.allowed)
-            if isinstance(self.default, int):
-                descriptor.integer_range = [IntegerRange(from_value=low, to_value=high)]
-            else:
-                limits = FloatingPointRange(from_value=low, to_value=high)
-                descriptor.floating_point_range = [limits]
+        if not isinstance(self.allowed, tuple):
+            descriptor.additional_constraints = self.limits
+            return descriptor
+        low, high = map(type(self.default), self.allowed)
+        if isinstance(self.default, int):
+            descriptor.integer_range = [IntegerRange(from_value=low, to_value=high)]
         else:
-            words = self.allowed if isinstance(self.allowed, str) else f"one of {self.allowed}"
-            descriptor.additional_constraints = words
+            descriptor.floating_point_range = [FloatingPointRange(from_value=low, to_value=high)]
         return descriptor
 
     def check(self, name: str, value: Any) -> None:
@@ -229,20 +235,14 @@ the node runs, with `ros2 param set NODE PARAMETER VALUE`:
 
 def help_text(program: str, summary: str, parameters: Parameters) -> str:
     """Return what ``--help`` prints."""
-    parts = [HELP.format(program=program, summary=summary)]
+    lines = [HELP.format(program=program, summary=summary)]
     for name, declared in parameters.items():
-        default, descriptor = declared.default, declared.descriptor()
+        default = declared.default
         kind = Parameter.Type.from_parameter_value(default).name.lower()
         value = repr(default) if isinstance(default, str) else json.dumps(default)
-        limits = [f"{r.from_value:g} to {r.to_value:g}" for r in descriptor.floating_point_range]
-        limits += [f"{r.from_value} to {r.to_value}" for r in descriptor.integer_range]
-        limits += filter(None, [descriptor.additional_constraints])
-        limits += ["read-only"] * declared.read_only
-        parts.append(
-            f"  {name}: {'; '.join([f'{kind}, default {value}', *limits])}\n"
-            f"      {declared.description}"
-        )
-    return "\n".join(parts)
+        words = f"{kind}, default {value}", declared.limits, "read-only" * declared.read_only
+        lines += [f"  {name}: {'; '.join(filter(None, words))}", f"      {declared.description}"]
+    return "\n".join(lines)
 
 
 def spin_until_shutdown(make_node: Callable[[], Node], parameters: Parameters | None = None) -> int:

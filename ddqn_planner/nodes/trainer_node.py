@@ -44,6 +44,9 @@ if TYPE_CHECKING:
     from ddqn_planner.training.run import TrainingRun
 
 
+MAP_PARAMETERS = ("occupied_threshold", "allow_unknown")
+
+
 class MapInFrame(NamedTuple):
     """A map, and the frame of its origin."""
 
@@ -78,8 +81,9 @@ class TrainerNode(BaseNode):
         self._diagnostics_publisher = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
         self._read_map_file()
         self.create_subscription(OccupancyGrid, "map", self._on_map, LATCHED)
-        self.create_subscription(PoseWithCovarianceStamped, "initialpose", self._on_start_pose, 10)
-        self.create_subscription(PoseStamped, "goal_pose", partial(self._set_pose, "goal"), 10)
+        on_start, on_goal = (partial(self._on_pose, which) for which in ("start", "goal"))
+        self.create_subscription(PoseWithCovarianceStamped, "initialpose", on_start, 10)
+        self.create_subscription(PoseStamped, "goal_pose", on_goal, 10)
         group = ReentrantCallbackGroup()  # the others are answered while ~/start waits
         for name in ("start", "stop", "save", "replay"):
             self.create_trigger(f"~/{name}", getattr(self, f"_on_{name}"), callback_group=group)
@@ -93,8 +97,8 @@ class TrainerNode(BaseNode):
         self._hyper_parameters(new)
 
     def _hyper_parameters(self, new: dict[str, Any]) -> HyperParameters:
-        names = HYPER_PARAMETERS
-        return HyperParameters(**{n: new[n] if n in new else self.value(n) for n in names})
+        values = {**vars(self.settings()), **new}
+        return HyperParameters(**{name: values[name] for name in HYPER_PARAMETERS})
 
     def _read_map_file(self) -> None:
         name = self.value("map_file")
@@ -104,7 +108,7 @@ class TrainerNode(BaseNode):
             map_file = read_map_file(find_map(name))
         except (ValueError, OSError) as error:
             raise InvalidParameterValueException("map_file", name, str(error)) from None
-        grid = map_file.grid(self.value("occupied_threshold"), self.value("allow_unknown"))
+        grid = map_file.grid(*map(self.value, MAP_PARAMETERS))
         self._map = MapInFrame(grid, "map")
         for which, cell in (("start", map_file.start), ("goal", map_file.goal)):
             if cell is not None:
@@ -115,29 +119,25 @@ class TrainerNode(BaseNode):
 
     def _on_map(self, message: OccupancyGrid) -> None:
         try:
-            grid = grid_from_message(
-                message, self.value("occupied_threshold"), self.value("allow_unknown")
-            )
+            grid = grid_from_message(message, *map(self.value, MAP_PARAMETERS))
         except ValueError as error:
             self._refuse(f"map refused: {error}")
             return
         self._map = MapInFrame(grid, message.header.frame_id)
         self.get_logger().info(f"map of {grid.width} x {grid.height} cells")
 
-    def _on_start_pose(self, message: PoseWithCovarianceStamped) -> None:
-        self._set_pose("start", PoseStamped(header=message.header, pose=message.pose.pose))
-
-    def _set_pose(self, which: str, pose: PoseStamped) -> None:
+    def _on_pose(self, which: str, message: PoseStamped | PoseWithCovarianceStamped) -> None:
+        pose = getattr(message.pose, "pose", message.pose)
         try:
             # A pose may come before the map: ~/start then checks its cell.
-            check_pose(f"the {which}", pose.header, pose.pose)
+            check_pose(f"the {which}", message.header, pose)
+            stamped = PoseStamped(header=message.header, pose=pose)
             if self._map is not None:
-                cell = self._cell(which, pose, self._map)
+                cell = self._cell(which, stamped, self._map)
                 self.get_logger().info(f"the {which} is cell {cell}")
+            self._poses[which] = stamped
         except ValueError as error:
             self._refuse(f"{which} refused: {error}")
-        else:
-            self._poses[which] = pose
 
     def _cell(self, which: str, pose: PoseStamped, place: MapInFrame) -> Cell:
         """Return the cell of a pose; ValueError if it is not a free cell of the map."""
