@@ -13,7 +13,8 @@ from typing import Any
 import numpy as np
 import pytest
 from client import initial_pose, map_message, pose
-from diagnostic_msgs.msg import DiagnosticStatus
+from client import wait_for_map as wait_for_stamp
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped, TransformStamped
 from integration.robot import (
     GOAL_YAW,
@@ -544,36 +545,51 @@ def test_nothing_is_shown_of_a_goal_without_a_field(robot: Robot) -> None:
     policies.wait(lambda message: message.markers[0].action == Marker.ADD)
 
 
-def test_nothing_is_computed_for_a_topic_without_subscribers(
+TOLD = """
+import ddqn_planner.grid as grid
+import ddqn_planner.nodes.conversions as conversions
+
+def told(words, function):
+    def say_and_call(*arguments):
+        print(words, flush=True)
+        return function(*arguments)
+
+    return say_and_call
+
+grid.inflate = told("a map is inflated", grid.inflate)
+conversions.value_message = told("a value is shown", conversions.value_message)
+"""
+
+
+def test_what_nobody_asks_for_is_not_computed(
     run_node: Any,
     make_client: Callable[[str], Any],
     hall: np.ndarray,
     tmp_path: FilePath,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    (tmp_path / "sitecustomize.py").write_text(
-        "import ddqn_planner.nodes.conversions as conversions\n"
-        "make = conversions.value_message\n"
-        "def value_message(field, *others):\n"
-        "    print('value of', field.goal, flush=True)\n"
-        "    return make(field, *others)\n"
-        "conversions.value_message = value_message\n"
-    )
+    (tmp_path / "sitecustomize.py").write_text(TOLD)
     monkeypatch.setenv("PYTHONPATH", str(tmp_path), prepend=":")
     client, grid = make_client("/unseen"), Robot.grid_of(hall)
     with run_node("planner_node", {}, namespace="/unseen") as node:
+        diagnostics = client.subscribe(DiagnosticArray, "/diagnostics")
         plans = client.subscribe(Path, "plan", LATCHED)
-        client.publish("map", map_message(hall, grid), LATCHED)
+        for seconds in (1, 2):
+            message = map_message(hall, grid, seconds)
+            client.publish("map", message, LATCHED)
+            wait_for_stamp(diagnostics, message.header.stamp, "/unseen/planner")
+        assert "a map is inflated" not in node.log
         client.publish("initialpose", initial_pose(pose(grid, (0, 0))))
         for goal in ((3, 3), (4, 4)):
             plans.clear()
             client.publish("goal_pose", pose(grid, goal))
             plans.wait(lambda path: path.poses)
             time.sleep(0.3)
-        assert "value of" not in node.log
+        assert node.log.count("a map is inflated") == 1
+        assert "a value is shown" not in node.log
         value = client.subscribe(OccupancyGrid, "planner/value", LATCHED).wait()
         assert value.data[4 * 20 + 4] == 100
-        assert node.log.count("value of") == 1
+        assert node.log.count("a value is shown") == 1
 
 
 @pytest.mark.parametrize("name", ["value", "policy"])
