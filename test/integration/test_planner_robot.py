@@ -441,15 +441,15 @@ def test_the_bound_of_the_kept_fields_holds_from_the_start(
 
 
 COUNT = """
-from ddqn_planner.model import AnyMapQNetwork
+from ddqn_planner.planning.distance_field import DistanceField
 
-compute = AnyMapQNetwork.q_values
+begin = DistanceField.__init__
 
-def q_values(network, grid, *arguments):
+def counted(field, goal, grid, *arguments):
     print("field of", grid.width, flush=True)
-    return compute(network, grid, *arguments)
+    begin(field, goal, grid, *arguments)
 
-AnyMapQNetwork.q_values = q_values
+DistanceField.__init__ = counted
 """
 
 
