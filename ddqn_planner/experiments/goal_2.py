@@ -50,11 +50,11 @@ def free_starts(scenario: Scenario) -> NDArray[np.bool_]:
 def trained_field(planner: Planner, scenario: Scenario) -> QField:
     """Return the Q field of a propagation network as the loss trained it: with reward and γ."""
     environment = GridVectorEnvironment([scenario], MOVE_RULE, PROFILES["propagation"])
-    encoder, module = PropagationEncoder(environment), PropagationModule.from_numpy(planner.network)
-    encoder.update_target(module)
+    module = PropagationModule.from_numpy(planner.network)
     cells = np.arange(scenario.grid.occupancy.size)
+    states = PropagationEncoder(environment, module).states(np.zeros_like(cells), cells)
     with torch.inference_mode():
-        q_CA = encoder.q(module, encoder.states(np.zeros_like(cells), cells))
+        q_CA = module(states)
     q_AHW = q_CA.T.reshape(len(MOVES), *scenario.grid.occupancy.shape).numpy()
     return QField(scenario.goal, q_AHW, legal_moves(scenario.grid.occupancy, MOVE_RULE))
 

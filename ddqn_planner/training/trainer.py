@@ -5,9 +5,8 @@ from __future__ import annotations
 import copy
 import hashlib
 import json
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict
-from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -22,12 +21,12 @@ from ddqn_planner.grid import MOVES, MoveRule
 from ddqn_planner.model import ModelMetadata, package_version, save_model
 from ddqn_planner.planning import Planner
 from ddqn_planner.training.double_dqn import double_dqn_loss
-from ddqn_planner.training.encoders import ENCODERS
+from ddqn_planner.training.encoders import ObservationEncoder, PropagationEncoder
 from ddqn_planner.training.environment import GridVectorEnvironment, Scenario
 from ddqn_planner.training.episodes import Episode, EpisodeEnd
 from ddqn_planner.training.hyper_parameters import HyperParameters
 from ddqn_planner.training.memory import MemoryShortageError, check_memory
-from ddqn_planner.training.networks import TrainableNetwork
+from ddqn_planner.training.networks import MODULES, PropagationModule
 from ddqn_planner.training.replay_buffer import ReplayBuffer, Transitions
 
 CHECKPOINT_KEY = "ddqn_planner_checkpoint"
@@ -80,13 +79,16 @@ class Trainer:
         self.environment.np_random = np.random.default_rng(environment)
         self._exploration = np.random.default_rng(exploration)
         self._sampling = np.random.default_rng(replay)
-        self._encoder = ENCODERS[parameters.network](self.environment)
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(int(weights.generate_state(1)[0]))
             sizes = parameters.network_sizes(self.environment.shape)
-            self.network = self._encoder.module_class(**sizes)
+            self.network = MODULES[parameters.network](**sizes)
         self._target = copy.deepcopy(self.network).requires_grad_(False)
-        self._encoder.update_target(self._target)
+        self.encoder = (
+            PropagationEncoder(self.environment, self._target)
+            if isinstance(self._target, PropagationModule)
+            else ObservationEncoder(self.environment)
+        )
         self._weights = tuple(self.network.parameters())
         self._optimiser = torch.optim.Adam(self._weights, parameters.learning_rate, fused=FUSED)
         self._replay = ReplayBuffer(parameters.replay_capacity)
@@ -115,32 +117,29 @@ class Trainer:
         while self.steps < until:
             scenario, cell = self.environment.scenario.copy(), self.environment.cell
             actions = self._choose_actions()
-            result = self.environment.move(actions)
-            discount = np.where(result.terminated, 0.0, p.gamma).astype(np.float32)
-            self._replay.add(
-                Transitions(scenario, cell, actions, result.reward, result.cell, discount)
-            )
+            reward, terminated, truncated = self.environment.move(actions)
+            next_cell = self.environment.cell
+            discount = np.where(terminated, 0.0, p.gamma).astype(np.float32)
+            self._replay.add(Transitions(scenario, cell, actions, reward, next_cell, discount))
             before, self.steps = self.steps, self.steps + p.environments
             if self.steps > p.learning_starts:
                 for _ in range(self.steps // p.update_interval - before // p.update_interval):
                     self._update()
-            self._total_reward += result.reward
-            for visited, entered in zip(self._visited, result.cell.tolist(), strict=True):
+            self._total_reward += reward
+            for visited, entered in zip(self._visited, next_cell.tolist(), strict=True):
                 visited.append(entered)
-            ended = result.terminated | result.truncated
-            yield self._end_episodes(ended, result.terminated) if ended.any() else []
+            ended = terminated | truncated
+            yield self._end_episodes(ended, terminated) if ended.any() else []
 
     def _choose_actions(self) -> NDArray[np.int64]:
         """Draw ε-greedy actions, independently for each environment."""
-        environment = self.environment
         count = self.parameters.environments
         actions = self._exploration.integers(len(MOVES), size=count)
         greedy = self._exploration.random(count) >= self.epsilon
         if greedy.any():
+            states = self.encoder.states(self.environment.scenario, self.environment.cell)
             with torch.inference_mode():
-                q_NA = self._q(self.network)(
-                    self._encoder.states(environment.scenario, environment.cell)
-                )
+                q_NA = self.network(states)
             actions[greedy] = q_NA.argmax(dim=1).numpy()[greedy]
         return actions
 
@@ -148,20 +147,14 @@ class Trainer:
         """Make one Double DQN update with a batch from the replay buffer."""
         p = self.parameters
         batch = self._replay.sample(p.batch_size, self._sampling)
-        states = self._encoder.states(
+        states = self.encoder.states(
             np.tile(batch.scenario, 2), np.concatenate([batch.cell, batch.next_cell])
         )
         state, next_state = states.chunk(2)
-        online, target = self._q(self.network), self._q(self._target)
-        selection, evaluation = {
-            "double_dqn": (online, target),
-            "dqn": (target, target),
-            "printed": (online, online),
-        }[p.target]
         loss = double_dqn_loss(
-            online,
-            selection,
-            evaluation,
+            self.network,
+            self._target,
+            p.target,
             state,
             torch.from_numpy(batch.action),
             torch.from_numpy(batch.reward),
@@ -176,10 +169,7 @@ class Trainer:
         self.updates += 1
         if self.updates % p.target_interval == 0:
             self._target.load_state_dict(self.network.state_dict())
-            self._encoder.update_target(self._target)
-
-    def _q(self, network: TrainableNetwork) -> Callable[[Tensor], Tensor]:
-        return partial(self._encoder.q, network)
+            self.encoder.update_target(self._target)
 
     def _end_episodes(
         self, ended: NDArray[np.bool_], terminated: NDArray[np.bool_]
@@ -302,7 +292,7 @@ class Trainer:
                 raise ValueError("its digest is another")
             for key, tensor in tensors.items():
                 tensor.copy_(saved[key])
-            trainer._encoder.update_target(trainer._target)
+            trainer.encoder.update_target(trainer._target)
             trainer._visited = description["walked"]
             for generator, state in zip(
                 trainer._generators(), description["generators"], strict=True
