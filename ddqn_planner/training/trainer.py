@@ -175,41 +175,36 @@ class Trainer:
         self, ended: NDArray[np.bool_], terminated: NDArray[np.bool_]
     ) -> list[Episode]:
         """Return the ended episodes, and start new ones in their environments."""
-        indices = np.flatnonzero(ended).tolist()
-        episodes = [self._end_episode(index, bool(terminated[index])) for index in indices]
+        episodes = []
+        width = self.environment.shape[1]
+        for index in np.flatnonzero(ended).tolist():
+            cells, scenario = self._visited[index], int(self.environment.scenario[index])
+            moves, outcome = len(cells) - 1, EpisodeEnd.OUT_OF_STEPS
+            if terminated[index] and cells[-1] == self.environment.goal[scenario]:
+                outcome = EpisodeEnd.REACHED_GOAL
+            elif terminated[index]:
+                outcome, cells = EpisodeEnd.COLLIDED, cells[:-1]
+            self.episodes += 1
+            episodes.append(
+                Episode(
+                    number=self.episodes,
+                    step=self.steps,
+                    scenario=scenario,
+                    outcome=outcome,
+                    cells=tuple((cell % width, cell // width) for cell in cells),
+                    moves=moves,
+                    total_reward=float(self._total_reward[index]),
+                )
+            )
         self.environment.reset_where(ended)
-        for index in indices:
+        for index in np.flatnonzero(ended).tolist():
             self._visited[index] = [int(self.environment.cell[index])]
         self._total_reward[ended] = 0.0
         return episodes
 
-    def _end_episode(self, index: int, terminated: bool) -> Episode:
-        self.episodes += 1
-        visited, scenario = self._visited[index], int(self.environment.scenario[index])
-        cells, width = visited, self.environment.shape[1]
-        if not terminated:
-            outcome = EpisodeEnd.OUT_OF_STEPS
-        elif visited[-1] == self.environment.goal[scenario]:
-            outcome = EpisodeEnd.REACHED_GOAL
-        else:
-            outcome, cells = EpisodeEnd.COLLIDED, visited[:-1]
-        return Episode(
-            number=self.episodes,
-            step=self.steps,
-            scenario=scenario,
-            outcome=outcome,
-            cells=tuple((cell % width, cell // width) for cell in cells),
-            moves=len(visited) - 1,
-            total_reward=float(self._total_reward[index]),
-        )
-
     def planner(self) -> Planner:
         """Return a planner with a copy of the network as it is now."""
-        return Planner(self.network.to_numpy(), self.metadata())
-
-    def metadata(self) -> ModelMetadata:
-        """Return the metadata of a model file with the network as it is now."""
-        return ModelMetadata(
+        metadata = ModelMetadata(
             network=self.parameters.network,
             sizes=self.network.sizes,
             move_rule=self.move_rule,
@@ -219,10 +214,12 @@ class Trainer:
             seed=self.seed,
             package_version=package_version(),
         )
+        return Planner(self.network.to_numpy(), metadata)
 
     def save_model(self, path: str | Path) -> None:
         """Write the network as it is now to a model file; see `save_model` for errors."""
-        save_model(path, self.network.to_numpy(), self.metadata())
+        planner = self.planner()
+        save_model(path, planner.network, planner.metadata)
 
     def save_checkpoint(self, path: str | Path) -> None:
         """Write all that `load_checkpoint` needs to continue as if nothing had happened.
@@ -294,9 +291,8 @@ class Trainer:
                 tensor.copy_(saved[key])
             trainer.encoder.update_target(trainer._target)
             trainer._visited = description["walked"]
-            for generator, state in zip(
-                trainer._generators(), description["generators"], strict=True
-            ):
+            states = description["generators"]
+            for generator, state in zip(trainer._generators(), states, strict=True):
                 generator.bit_generator.state = state
         except (CheckpointError, MemoryShortageError):
             raise
@@ -310,19 +306,16 @@ class Trainer:
     def _tensors(self) -> dict[str, Tensor]:
         """Return the tensors of a checkpoint. They share the trainer's memory."""
         environment, stored = self.environment, len(self._replay)
-        arrays = {
-            f"replay.{name}": values[:stored]
-            for name, values in self._replay.transitions._asdict().items()
+        replay = self._replay.transitions._asdict()
+        groups = {
+            "network": self.network.state_dict(),
+            "target": self._target.state_dict(),
+            "replay": {name: torch.from_numpy(values[:stored]) for name, values in replay.items()},
+            "environment": {
+                name: torch.from_numpy(getattr(environment, name))
+                for name in ("scenario", "cell", "steps")
+            },
         }
-        arrays |= {
-            "environment.scenario": environment.scenario,
-            "environment.cell": environment.cell,
-            "environment.steps": environment.steps,
-            "total_reward": self._total_reward,
-        }
-        tensors = {name: torch.from_numpy(values) for name, values in arrays.items()}
-        tensors |= _prefixed("network", self.network.state_dict())
-        tensors |= _prefixed("target", self._target.state_dict())
         # Adam makes its state at the first update.
         for index, weight in enumerate(self._weights if self.updates else ()):
             state = self._optimiser.state[weight]
@@ -330,8 +323,12 @@ class Trainer:
                 state["step"] = torch.zeros(())
                 state["exp_avg"] = torch.zeros_like(weight)
                 state["exp_avg_sq"] = torch.zeros_like(weight)
-            tensors |= _prefixed(f"optimiser.{index}", state)
-        return tensors
+            groups[f"optimiser.{index}"] = state
+        return {"total_reward": torch.from_numpy(self._total_reward)} | {
+            f"{group}.{name}": tensor
+            for group, tensors in groups.items()
+            for name, tensor in tensors.items()
+        }
 
     def _generators(self) -> tuple[np.random.Generator, ...]:
         return self.environment.np_random, self._exploration, self._sampling
@@ -347,7 +344,3 @@ def _digest(text: str, tensors: dict[str, Tensor]) -> str:
         digest.update(name.encode())
         digest.update(tensors[name].numpy().ravel().data)
     return digest.hexdigest()
-
-
-def _prefixed(prefix: str, tensors: dict[str, Tensor]) -> dict[str, Tensor]:
-    return {f"{prefix}.{name}": tensor for name, tensor in tensors.items()}
