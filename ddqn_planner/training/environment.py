@@ -35,26 +35,13 @@ Observations = NDArray[np.float32]
 
 @dataclass(frozen=True)
 class Scenario:
-    """One path planning problem.
-
-    Parameters
-    ----------
-    grid : GridMap
-    start, goal : (x, y)
-        Two different free cells.
-    move_rule : MoveRule, optional
-        By default the rule of its environment.
-
-    Raises
-    ------
-    ValueError
-        If the start or the goal is occupied or outside the map, or both are the same cell.
-    """
+    """One path planning problem; a ValueError unless start and goal are two free cells."""
 
     grid: GridMap
     start: Cell
     goal: Cell
     move_rule: MoveRule | None = None
+    """By default the rule of its environment."""
 
     def __post_init__(self) -> None:
         for name, cell in (("start", self.start), ("goal", self.goal)):
@@ -84,6 +71,7 @@ class GridVectorEnvironment(VectorEnv[Observations, NDArray[np.int64], Any]):
     scenarios : sequence of Scenario
         Maps of one size; each episode draws one of them.
     move_rule : MoveRule
+        Of the scenarios that have none.
     parameters : HyperParameters
         For N (``environments``), the rewards, p_r and ``max_episode_steps``.
     """
@@ -180,16 +168,9 @@ class GridVectorEnvironment(VectorEnv[Observations, NDArray[np.int64], Any]):
 
 
 class GridEnvironment(gymnasium.Env[Observations, np.int64]):
-    """One robot on one grid map: a `GridVectorEnvironment` with N = 1.
+    """One robot on one grid map, by default the paper's: a `GridVectorEnvironment` with N = 1.
 
     ``gymnasium.make("ddqn_planner.training:ddqn_planner/Grid-v0")`` gives the paper's map.
-
-    Parameters
-    ----------
-    scenario : Scenario, optional
-        By default the paper's map, start and goal.
-    move_rule : MoveRule
-    parameters : HyperParameters
     """
 
     metadata = {"render_modes": []}  # noqa: RUF012

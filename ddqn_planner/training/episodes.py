@@ -39,14 +39,12 @@ class EpisodeEnd(str, Enum):
 
 @dataclass(frozen=True)
 class Episode:
-    """An episode that has ended (the paper's round)."""
+    """An episode that has ended (the paper's round), the first one with number 1."""
 
     number: int
-    """1 for the first."""
     step: int
     """Environment steps of the training when it ended."""
     scenario: int
-    """Number of its scenario."""
     outcome: EpisodeEnd
     cells: tuple[Cell, ...]
     """The visited cells in order, with the initial one."""
@@ -63,17 +61,9 @@ class Episode:
 class EpisodeLog:
     """Appends episodes to ``episodes.csv``, and to TensorBoard's curves where it is installed.
 
-    Parameters
-    ----------
-    path : Path
-        The CSV file: one row per episode, its cells as ``x:y``. TensorBoard's file is beside it.
-    episodes, step : int
-        The training continues from there: later rows and events of an earlier process are dropped.
-
-    Raises
-    ------
-    OSError
-        If a file cannot be written.
+    The CSV file at `path` has one row per episode, its cells as ``x:y``; TensorBoard's file is
+    beside it. The training continues from `episodes` and `step`: later rows and events of an
+    earlier process are dropped. An OSError if a file cannot be written.
     """
 
     def __init__(self, path: Path, episodes: int, step: int) -> None:
@@ -107,9 +97,7 @@ class EpisodeLog:
 
 
 def read_cells(path: str | Path, every: int) -> Iterator[tuple[Cell, ...]]:
-    """Yield the cells of each `every`-th episode of an ``episodes.csv``.
-
-    Rows that are not complete are skipped.
+    """Yield the cells of each `every`-th episode of an ``episodes.csv`` in its complete rows.
 
     Raises
     ------

@@ -22,16 +22,10 @@ Module = TypeVar("Module", bound="TrainableNetwork")
 
 
 class TrainableNetwork(nn.Module):
-    """A Q-network that torch can train: from states (B, ...) to Q(s, a), (B, 8).
-
-    Parameters
-    ----------
-    **sizes : int
-        A value for each of the `size_names` of `numpy_class`.
-    """
+    """A Q-network that torch can train: from states (B, ...) to Q(s, a), (B, 8)."""
 
     numpy_class: ClassVar[type[QNetwork]]
-    """The same network for planning."""
+    """The same network for planning, whose `size_names` a module takes as arguments."""
 
     def __init__(self, **sizes: int) -> None:
         super().__init__()

@@ -44,19 +44,10 @@ class CheckpointError(ValueError):
 
 
 class Trainer:
-    """Trains a Q-network by Double DQN.
+    """Trains a Q-network by Double DQN in a `GridVectorEnvironment`; the seed is at least 0.
 
     The same scenarios, parameters and seed give the same network, bit for bit, also when
     `save_checkpoint` and `load_checkpoint` interrupt the training.
-
-    Parameters
-    ----------
-    scenarios : sequence of Scenario
-        Maps of one size; each episode draws one of them.
-    move_rule : MoveRule
-    parameters : HyperParameters
-    seed : int
-        At least 0.
     """
 
     def __init__(
@@ -107,11 +98,8 @@ class Trainer:
     def run(self, until: int) -> Iterator[list[Episode]]:
         """Train until the trainer has made `until` environment steps in all.
 
-        Yields
-        ------
-        list of Episode
-            The episodes that ended with this step, often none. Between two steps the caller may
-            save the trainer or leave the loop.
+        Yield the episodes that ended with each step, often none. Between two steps the caller may
+        save the trainer or leave the loop.
         """
         p = self.parameters
         while self.steps < until:
@@ -245,13 +233,7 @@ class Trainer:
 
     @classmethod
     def load_checkpoint(cls, path: str | Path, scenarios: Sequence[Scenario]) -> Trainer:
-        """Return the trainer that `save_checkpoint` wrote.
-
-        Parameters
-        ----------
-        path : str or Path
-        scenarios : sequence of Scenario
-            The same as those of the saved trainer; a checkpoint holds no maps.
+        """Return the trainer that `save_checkpoint` wrote; a checkpoint holds no scenarios.
 
         Raises
         ------
