@@ -91,13 +91,7 @@ COLUMNS: Final = {
 def measure(
     planner: Planner, maps: Iterable[BenchmarkMap], move_rule: MoveRule
 ) -> Iterator[Rollout]:
-    """Make a rollout for every request of every map.
-
-    Raises
-    ------
-    ValueError
-        If the model cannot plan on a map of such a size.
-    """
+    """Make a rollout for every request of every map; a ValueError if the model has another size."""
     warm = False
     for benchmark_map in maps:
         grid, given = benchmark_map.grid, benchmark_map.optima

@@ -118,10 +118,8 @@ def with_random_requests(
     parts = np.array_split(range(settings.requests), goals)
     drawn = random_requests(occupancy, rule, goals, random)
     for part, (start, goal) in zip(parts, drawn, strict=True):
-        starts = [start][: len(part)]
-        if len(part) > 1:
-            starts += random_starts(occupancy, goal, rule, len(part) - 1, random)
-        requests += [(cell, goal) for cell in starts]
+        more = random_starts(occupancy, goal, rule, max(len(part) - 1, 0), random)
+        requests += [(cell, goal) for cell in [start, *more][: len(part)]]
     return BenchmarkMap(set_name, name, grid, requests)
 
 

@@ -36,14 +36,12 @@ CONVERGENCE = (
 
 def trainings(settings: Settings, variants: Sequence[str] = ("both",)) -> list[Training]:
     """Return the trainings of both profiles on the paper's map, by the name "profile/variant"."""
-    return [
-        training
+    parameters_of = {
+        f"{profile}/{name}": replace(parameters, **VARIANTS[name])
         for profile, parameters in PROFILES.items()
         for name in variants
-        for training in settings.trainings(
-            f"{profile}/{name}", replace(parameters, **VARIANTS[name]), [paper_scenario()]
-        )
-    ]
+    }
+    return settings.trainings(parameters_of, [paper_scenario()])
 
 
 def convergence_row(runs: Sequence[Sequence[TrainingEvaluation]]) -> list[str]:

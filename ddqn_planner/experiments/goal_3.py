@@ -104,13 +104,13 @@ def networks(settings: Settings) -> dict[str, tuple[str, HyperParameters]]:
 
 def trainings(settings: Settings) -> list[Training]:
     """Return the trainings of each network on the training maps of each noise."""
-    maps = {noise: drawn_maps(settings, noise).training for noise in settings.noise}
     return [
         training
         for noise in settings.noise
-        for folder, parameters in networks(settings).values()
         for training in settings.trainings(
-            f"{noise.value}/{folder}", parameters, maps[noise], EVALUATION_INTERVAL
+            {f"{noise.value}/{folder}": p for folder, p in networks(settings).values()},
+            drawn_maps(settings, noise).training,
+            EVALUATION_INTERVAL,
         )
     ]
 
@@ -122,15 +122,12 @@ def supervised_trainings(settings: Settings) -> list[Training]:
     """
     if Noise.NEAR_PATH not in settings.noise:
         return []
-    maps = drawn_maps(settings, Noise.NEAR_PATH).training
-    return [
-        training
+    parameters_of = {
+        f"near_path/{folder}/supervised": replace(parameters, steps=SUPERVISED_UPDATES)
         for folder, parameters in networks(settings).values()
         if parameters.network == "paper"
-        for training in settings.trainings(
-            f"near_path/{folder}/supervised", replace(parameters, steps=SUPERVISED_UPDATES), maps
-        )
-    ]
+    }
+    return settings.trainings(parameters_of, drawn_maps(settings, Noise.NEAR_PATH).training)
 
 
 def fixed_path(maps: Sequence[Scenario]) -> tuple[Cell, ...]:

@@ -36,13 +36,9 @@ COLUMNS = (
 
 def trainings(settings: Settings) -> list[Training]:
     """Return the trainings of the profile paper with each target."""
-    return [
-        training
-        for target, (_, name) in TARGETS.items()
-        for training in settings.trainings(
-            name, replace(PROFILES["paper"], target=target), [paper_scenario()]
-        )
-    ]
+    paper = PROFILES["paper"]
+    parameters_of = {name: replace(paper, target=target) for target, (_, name) in TARGETS.items()}
+    return settings.trainings(parameters_of, [paper_scenario()])
 
 
 def report(settings: Settings) -> str:

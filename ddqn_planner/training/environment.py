@@ -103,10 +103,10 @@ class GridVectorEnvironment(VectorEnv[Observations, NDArray[np.int64], Any]):
         reward = [move_reward(s.grid, s.start, s.goal, rule, parameters) for s, rule in with_rules]
         background = [observation_background(s.grid.occupancy, s.goal) for s in self.scenarios]
         self.background = np.stack(background)
+        self.legal = np.stack(legal).reshape(tables)
         self.free_reward = np.stack(reward).reshape(tables)
-        self._legal = np.stack(legal).reshape(tables)
         collision = np.float32(parameters.obstacle_reward)
-        self._reward = np.where(self._legal, self.free_reward, collision)
+        self._reward = np.where(self.legal, self.free_reward, collision)
         self._offset = MOVES[:, 1] * width + MOVES[:, 0]
 
         self.start = np.array([s.start[1] * width + s.start[0] for s in self.scenarios])
@@ -155,7 +155,7 @@ class GridVectorEnvironment(VectorEnv[Observations, NDArray[np.int64], Any]):
     ) -> tuple[NDArray[np.float32], NDArray[np.bool_], NDArray[np.bool_]]:
         """Move as `step` does: return reward, terminated and truncated, but no observations."""
         lookup = (self.scenario, actions, self.cell)
-        legal, reward = self._legal[lookup], self._reward[lookup]
+        legal, reward = self.legal[lookup], self._reward[lookup]
         self.cell = np.where(legal, self.cell + self._offset[actions], self.cell)
         self.steps += 1
         terminated = ~legal | (self.cell == self.goal[self.scenario])

@@ -102,12 +102,19 @@ class TrainingRun:
         self.try_to_save()
 
     def try_to_save(self) -> None:
-        """Save. If that fails, `save_error` says why, and the last good files stay."""
+        """Write the model and the checkpoint.
+
+        If that fails, `save_error` says why, and the last good files stay.
+        """
+        self.saved_at = self.trainer.steps
         try:
-            self.save()
+            # A kill between the two leaves a model that is newer than the checkpoint. Both are
+            # complete, and nothing needs them to be of the same step.
+            self.trainer.save_model(self.model_path)
+            self.trainer.save_checkpoint(self.checkpoint_path)
+            self._log.flush()
             self.save_error = ""
         except OSError as error:
-            self.saved_at = self.trainer.steps
             self._fail(error)
 
     def _fail(self, error: OSError) -> None:
@@ -117,23 +124,8 @@ class TrainingRun:
             f"there: the training continues and tries again every {SAVE_INTERVAL} steps"
         )
 
-    def save(self) -> None:
-        """Write the model and the checkpoint.
-
-        Raises
-        ------
-        OSError
-            If one of the two or the log cannot be written; the last good files then stay.
-        """
-        # A kill between the two leaves a model that is newer than the checkpoint. Both are
-        # complete, and nothing needs them to be of the same step: the next save replaces the model.
-        self.trainer.save_model(self.model_path)
-        self.trainer.save_checkpoint(self.checkpoint_path)
-        self._log.flush()
-        self.saved_at = self.trainer.steps
-
     def close(self) -> None:
-        """Close the files and unlock the folder. `save` first."""
+        """Close the files and unlock the folder. `try_to_save` first."""
         self._open_files.close()
 
 
