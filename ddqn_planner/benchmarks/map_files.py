@@ -34,13 +34,7 @@ FILES: Final = {
 
 
 def find_files(folder: Path) -> list[Path]:
-    """Return the benchmark files of a folder and its subfolders.
-
-    Raises
-    ------
-    ValueError
-        If there is no such folder, or no map in it.
-    """
+    """Return the benchmark files of a folder and its subfolders; a ValueError without a map."""
     files = sorted(
         path for path in folder.rglob("*") if path.suffix.lower() in FILES and path.is_file()
     )

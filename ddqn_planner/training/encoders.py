@@ -45,26 +45,27 @@ class PropagationEncoder(ObservationEncoder):
     def __init__(self, environment: GridVectorEnvironment, target: PropagationModule) -> None:
         super().__init__(environment)
         with_rules = zip(environment.scenarios, environment.move_rules, strict=True)
-        feature_SCI = np.stack(
+        self._feature_SCI = np.stack(
             [
                 target.numpy_class.features(patches(s.grid.occupancy, s.grid.cost), rule)
                 for s, rule in with_rules
             ]
         )
-        self._state_SCX = np.pad(feature_SCI, ((0, 0), (0, 0), (0, len(MOVES) + 1)))
-        self._state_SCX[..., -1] = environment.parameters.obstacle_reward
+        maps, cells, _ = self._feature_SCI.shape
+        self._return_SCX = np.empty((maps, cells, len(MOVES) + 1), dtype=np.float32)
         self.update_target(target)
 
     def states(self, scenario: NDArray[np.int64], cell: NDArray[np.int64]) -> Tensor:
         """Return the states of robots in `cell` (B,) on the maps `scenario` (B,): (B, I + 9)."""
-        return torch.from_numpy(self._state_SCX[scenario, cell])
+        at = (scenario, cell)
+        state_BX = np.concatenate([self._feature_SCI[at], self._return_SCX[at]], axis=1)
+        return torch.from_numpy(state_BX)
 
     def update_target(self, target: TrainableNetwork) -> None:
         """Settle V on every map under the new target network."""
         assert isinstance(target, PropagationModule)
-        environment, returns = self._environment, slice(target.numpy_class.inputs, -1)
+        environment, feature_SCI = self._environment, torch.from_numpy(self._feature_SCI)
         with torch.inference_mode():
-            feature_SCI = torch.from_numpy(self._state_SCX)[..., : returns.start].contiguous()
             p_SAC = target.success(feature_SCI).numpy().transpose(0, 2, 1)
             cost_SAC = target.cost(feature_SCI).numpy().transpose(0, 2, 1)
         return_SAC = value_iteration(
@@ -75,4 +76,6 @@ class PropagationEncoder(ObservationEncoder):
             environment.parameters.gamma,
             environment.parameters.obstacle_reward,
         )
-        self._state_SCX[..., returns] = (return_SAC + cost_SAC).transpose(0, 2, 1)
+        return_SAC += cost_SAC
+        self._return_SCX[..., :-1] = return_SAC.transpose(0, 2, 1)
+        self._return_SCX[..., -1] = environment.parameters.obstacle_reward

@@ -99,12 +99,14 @@ class GridVectorEnvironment(VectorEnv[Observations, NDArray[np.int64], Any]):
         width = self.shape[1]
         tables = (len(self.scenarios), len(MOVES), -1)
         with_rules = list(zip(self.scenarios, self.move_rules, strict=True))
-        legal = [legal_moves(s.grid.occupancy, rule) for s, rule in with_rules]
-        reward = [move_reward(s.grid, s.start, s.goal, rule, parameters) for s, rule in with_rules]
-        background = [observation_background(s.grid.occupancy, s.goal) for s in self.scenarios]
-        self.background = np.stack(background)
-        self.legal = np.stack(legal).reshape(tables)
-        self.free_reward = np.stack(reward).reshape(tables)
+        self.background = np.stack(
+            [observation_background(s.grid.occupancy, s.goal) for s in self.scenarios]
+        )
+        self.legal = np.stack([legal_moves(s.grid.occupancy, r) for s, r in with_rules])
+        self.legal = self.legal.reshape(tables)
+        self.free_reward = np.stack(
+            [move_reward(s.grid, s.start, s.goal, r, parameters) for s, r in with_rules]
+        ).reshape(tables)
         collision = np.float32(parameters.obstacle_reward)
         self._reward = np.where(self.legal, self.free_reward, collision)
         self._offset = MOVES[:, 1] * width + MOVES[:, 0]

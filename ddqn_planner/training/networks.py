@@ -93,7 +93,7 @@ class PropagationModule(TrainableNetwork):
     def forward(self, state_BX: Tensor) -> Tensor:
         """Return Q(s, a) = p (r + γ V(s')) + (1 - p) r_o: (B, 8), see `PropagationEncoder`."""
         inputs = self.numpy_class.inputs
-        # Contiguous, since how a layer rounds depends on the layout.
+        # Contiguous as in `update_target`, since how a layer rounds depends on the layout.
         feature_BI, collision_B1 = state_BX[:, :inputs].contiguous(), state_BX[:, -1:]
         gain_BA = state_BX[:, inputs:-1] - self.cost(feature_BI) - collision_B1
         return collision_B1 + self.success(feature_BI) * gain_BA
@@ -106,7 +106,7 @@ class PropagationModule(TrainableNetwork):
 
     def cost(self, feature_BI: Tensor) -> Tensor:
         """Return the learned cost of each move: (B, 8); 0 where the reward is given."""
-        return feature_BI.new_zeros(*feature_BI.shape[:-1], len(MOVES))
+        return torch.zeros(1).expand(*feature_BI.shape[:-1], len(MOVES))
 
 
 class AnyMapModule(PropagationModule):
