@@ -41,16 +41,15 @@ GOALS = 10
 
 @dataclass(frozen=True)
 class RequestSettings:
-    """How requests are drawn; a value out of its range raises a ValueError."""
+    """How requests are drawn: so many per map, each with a path under the move rule.
+
+    The costs are a key of `COSTS`. A value out of its range raises a ValueError.
+    """
 
     move_rule: MoveRule
-    """The rule under which a path must exist."""
     requests: int = 200
-    """Requests per map, at least 1."""
     costs: str = "none"
-    """A key of `COSTS`."""
     seed: int = 0
-    """At least 0."""
 
     def __post_init__(self) -> None:
         if self.requests < 1:
