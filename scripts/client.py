@@ -172,7 +172,7 @@ class Client:
             return answered.wait(1.0)
 
         wait_for(f"discovery by {node}", asked)
-        self.node.destroy_client(probe)
+        self._executor.create_task(self.node.destroy_client, probe)  # its thread may hold it
 
     def call(
         self, service_type: Any, name: str, request: Any = None, timeout: float = TIMEOUT

@@ -366,17 +366,26 @@ def test_a_planner_that_follows_the_trainer_plans_with_each_model_it_saves(
         move_rule="robot_safe",
         seed=1,
     )
+    saved = tmp_path / "model.safetensors"
     request = GetPlan.Request(start=stamped(0.5, 0.5), goal=stamped(5.5, 5.5))
     with run_node("planner_node", {"follow_trainer": True}, namespace=NAMESPACE):
         plans = client.subscribe(Path, "plan", LATCHED)
         set_up(node, client, small_values, listeners=2)
-        plans.wait(lambda plan: plan.poses)  # with the model before
-        client.call(GetPlan, "planner/get_plan", request)
-        plans.clear()
         start_training(client)
+        asked = [time.time_ns()]
+
+        def has_its_model() -> bool:
+            time.sleep(0.05)
+            asked.append(time.time_ns())
+            return bool(client.get_parameter("planner", "model") == str(saved))
+
+        wait_for("its model", has_its_model)
+
+        def is_with_its_model(plan: Path) -> bool:
+            return Time.from_msg(plan.header.stamp).nanoseconds > asked[-2]
+
         # The planner plans for the active goal again with each model, until one is good enough.
-        plans.wait(lambda plan: plan.poses)
-        assert client.get_parameter("planner", "model") == str(tmp_path / "model.safetensors")
+        plans.wait(lambda plan: plan.poses and is_with_its_model(plan))
         wait_for("plan", lambda: client.call(GetPlan, "planner/get_plan", request).plan.poses)
 
 
