@@ -38,11 +38,19 @@ NOT_SOURCE = (".*", "__pycache__", "*.egg-info", "build", "dist", "install", "lo
 
 @pytest.hookimpl(tryfirst=True)  # before pytest-xdist reads the groups
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Put the slow tests last, each on any worker; keep the others of a file on one worker."""
+    """Put the slow tests last, each on any worker; keep the others of a file on one worker.
+
+    The longest of the slow ones come first, so that the workers end at the same time.
+    """
     for item in items:
         if not (item.get_closest_marker("slow") or item.get_closest_marker("xdist_group")):
             item.add_marker(pytest.mark.xdist_group(item.path.stem))
-    items.sort(key=lambda item: item.get_closest_marker("slow") is not None)
+
+    def order(item: pytest.Item) -> tuple[bool, int]:
+        slow = item.get_closest_marker("slow")
+        return slow is not None, -slow.kwargs.get("seconds", 0) if slow else 0
+
+    items.sort(key=order)
 
 
 @pytest.fixture
