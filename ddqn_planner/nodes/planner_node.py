@@ -26,6 +26,7 @@ from rclpy.task import Future
 from std_msgs.msg import Header, String
 
 from ddqn_planner.grid import Cell, GridMap, MoveRule, inflate
+from ddqn_planner.grid.body import inflate_changed
 from ddqn_planner.model.certificate import NO_CERTIFICATE, certificate_of
 from ddqn_planner.nodes.conversions import (
     cell_from_pose,
@@ -72,6 +73,7 @@ class PlannerNode(BaseNode):
         super().__init__("planner", PARAMETERS)
         self._map: OccupancyGrid | None = None
         self._inflated: Future | None = None
+        self._last_inflation: tuple[tuple[float, float], GridMap, GridMap] | None = None
         self._goal: PoseStamped | None = None
         self._planner: Planner | None = None
         self._model_file = ""
@@ -204,8 +206,19 @@ class PlannerNode(BaseNode):
         if self._inflated is None:
             radius, weight = map(self.value, BODY_PARAMETERS)
             # ROS accepts a value that is above the range by a millionth.
-            self._inflated = self._map_worker.call(inflate, self._grid, radius, min(weight, 1.0))
+            body = radius, min(weight, 1.0)
+            self._inflated = self._map_worker.call(self._inflate, self._grid, body)
         return self._inflated
+
+    def _inflate(self, grid: GridMap, body: tuple[float, float]) -> GridMap:
+        """Inflate a map, near its changed cells only if it is like the last one."""
+        last = self._last_inflation
+        if last is None or last[0] != body:
+            inflated = inflate(grid, *body)
+        else:
+            inflated = inflate_changed(grid, *last[1:], *body)
+        self._last_inflation = body, grid, inflated
+        return inflated
 
     def _on_start(self, message: PoseWithCovarianceStamped | Odometry) -> None:
         try:
