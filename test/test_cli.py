@@ -181,7 +181,9 @@ def test_an_animation_that_is_no_gif_is_refused_before_planning(
     ("arguments", "unused"),
     [
         (["--help"], ("numpy", "ddqn_planner.grid")),
+        (["watch", "--help"], ("numpy", "rclpy", "rerun")),
         (["plan", "dilemma"], ("torch", "matplotlib", "ddqn_planner.training", "tqdm")),
+        (["certify"], ("torch", "numba", "scipy", "ddqn_planner.planning")),
     ],
 )
 def test_a_command_imports_only_what_it_needs(

@@ -22,12 +22,9 @@ ROUNDING = 1e-6
 
 
 def clearance(obstacles: Occupancy) -> NDArray[np.float64]:
-    """Return the distance from each cell to the nearest obstacle, between their centres.
+    """Return (H, W) float64: the distance from each cell to the nearest obstacle, in cells.
 
-    Returns
-    -------
-    (H, W) float64
-        In cells; 0 on an obstacle, infinite if there is none.
+    It is that between the centres: 0 on an obstacle, infinite if there is none.
     """
     if not obstacles.any():
         return np.full(obstacles.shape, np.inf)

@@ -71,6 +71,7 @@ def test_goal_pose_is_answered_by_a_plan_a_value_and_diagnostics(robot: Robot) -
     assert values["model file"] == values["model"] == str(robot.model)
     assert values["model move rule"] == values["move rule"] == "robot_safe"
     assert values["model training steps"] == "3000"
+    assert values["model certificate"].startswith("nothing can be proved: ")
 
 
 def test_diagnostics_come_though_nothing_changes(robot: Robot) -> None:

@@ -12,7 +12,9 @@ from typing import Any
 
 import numpy as np
 import pytest
-from diagnostic_msgs.msg import DiagnosticStatus
+from client import initial_pose, map_message, pose
+from client import wait_for_map as wait_for_stamp
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped, TransformStamped
 from integration.robot import (
     GOAL_YAW,
@@ -24,7 +26,7 @@ from integration.robot import (
     values_of,
     yaw_of,
 )
-from nav_msgs.msg import Odometry, Path
+from nav_msgs.msg import OccupancyGrid, Odometry, Path
 from nav_msgs.srv import GetPlan
 from rcl_interfaces.msg import SetParametersResult
 from rcl_interfaces.srv import SetParametersAtomically
@@ -433,15 +435,15 @@ def test_the_bound_of_the_kept_fields_holds_from_the_start(
 
 
 COUNT = """
-from ddqn_planner.model import AnyMapQNetwork
+from ddqn_planner.planning.distance_field import DistanceField
 
-compute = AnyMapQNetwork.q_values
+begin = DistanceField.__init__
 
-def q_values(network, grid, *arguments):
+def counted(field, goal, grid, *arguments):
     print("field of", grid.width, flush=True)
-    return compute(network, grid, *arguments)
+    begin(field, goal, grid, *arguments)
 
-AnyMapQNetwork.q_values = q_values
+DistanceField.__init__ = counted
 """
 
 
@@ -458,9 +460,9 @@ def test_parameters_that_come_together_are_set_together_or_not_at_all(robot: Rob
     before = {name: robot.client.get_parameter("planner", name) for name in good}
     for bad, reason in (
         ({"clearance_weight": 1.5}, "out of range"),
-        ({"move_rule": "diagonal"}, "move_rule is 'diagonal'; it is one of"),
+        ({"move_rule": "diagonal"}, "move_rule is 'diagonal'; give one of ''"),
         ({"model": "no_such_model"}, "there is no shipped model 'no_such_model'"),
-        ({"start_source": "gps"}, "start_source is 'gps'; it is one of"),
+        ({"start_source": "gps"}, "start_source is 'gps'; give one of"),
         ({"robot_frame": ""}, "robot_frame is ''; name"),
         ({"tolerance": math.nan}, "out of range"),
         ({"follow_trainer": True}, "read-only"),
@@ -510,6 +512,7 @@ def test_the_value_is_published_once_a_goal(robot: Robot) -> None:
     robot.send_start(robot.pose((0, 0)))
     robot.send_goal(robot.pose((3, 6)))
     robot.wait_for_path((0, 0), (3, 6))
+    robot.value.wait(lambda value: value.data[first] == 100)
     robot.send_start(robot.pose((1, 0)))
     robot.wait_for_path((1, 0), (3, 6))
     robot.send_goal(robot.pose((4, 7)))
@@ -535,6 +538,53 @@ def test_nothing_is_shown_of_a_goal_without_a_field(robot: Robot) -> None:
     robot.send_goal(robot.pose((3, 3)))
     robot.value.wait(lambda value: value.data[3 * 20 + 3] == 100)
     policies.wait(lambda message: message.markers[0].action == Marker.ADD)
+
+
+TOLD = """
+import ddqn_planner.grid as grid
+import ddqn_planner.nodes.conversions as conversions
+
+def told(words, function):
+    def say_and_call(*arguments):
+        print(words, flush=True)
+        return function(*arguments)
+
+    return say_and_call
+
+grid.inflate = told("a map is inflated", grid.inflate)
+conversions.value_message = told("a value is shown", conversions.value_message)
+"""
+
+
+def test_what_nobody_asks_for_is_not_computed(
+    run_node: Any,
+    make_client: Callable[[str], Any],
+    hall: np.ndarray,
+    tmp_path: FilePath,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    (tmp_path / "sitecustomize.py").write_text(TOLD)
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path), prepend=":")
+    client, grid = make_client("/unseen"), Robot.grid_of(hall)
+    with run_node("planner_node", {}, namespace="/unseen") as node:
+        diagnostics = client.subscribe(DiagnosticArray, "/diagnostics")
+        plans = client.subscribe(Path, "plan", LATCHED)
+        for seconds in (1, 2):
+            message = map_message(hall, grid, seconds)
+            client.publish("map", message, LATCHED)
+            wait_for_stamp(diagnostics, message.header.stamp, "/unseen/planner")
+        assert "a map is inflated" not in node.log
+        client.publish("initialpose", initial_pose(pose(grid, (0, 0))))
+        for goal in ((3, 3), (4, 4)):
+            plans.clear()
+            client.publish("goal_pose", pose(grid, goal))
+            plans.wait(lambda path: path.poses)
+            time.sleep(0.3)
+        assert node.log.count("a map is inflated") == 1
+        assert "a value is shown" not in node.log
+        value = client.subscribe(OccupancyGrid, "planner/value", LATCHED).wait()
+        assert value.data[4 * 20 + 4] == 100
+        assert node.log.count("a value is shown") == 1
 
 
 @pytest.mark.parametrize("name", ["value", "policy"])
