@@ -27,7 +27,7 @@ from ddqn_planner.planning.simplification import simplify
 CACHE_BYTES = 2**29
 """Memory for the Q fields that a planner keeps: 14 of 2000 x 2000 cells, at 9 bytes per cell."""
 
-UNLABELLED_SHARE = 1 / 8
+UNLABELLED_SHARE = 1 / 2
 """Share of the map's cells that a request may visit before the connected cells are looked at. A
 request without a path would visit all that its goal is connected to."""
 
@@ -291,7 +291,11 @@ class Planner:
         field = self.q_field(grid, request.goal, rule)
         assert isinstance(field, DistanceField)
         plan = field.rollout(request.start, int(UNLABELLED_SHARE * grid.occupancy.size))
-        return field, None if plan.status is PlanStatus.ROLLOUT_TRAPPED else plan
+        if plan.status is PlanStatus.ROLLOUT_TRAPPED:
+            labels = grid.labels(rule)
+            joined = labels[request.start[::-1]] == labels[request.goal[::-1]]
+            plan = field.rollout(request.start) if joined else Plan(PlanStatus.NO_PATH)
+        return field, plan
 
     def _refusal(self, request: PlanRequest) -> PlanStatus | None:
         """Return why there is no path, where one look at start and goal says so."""

@@ -73,13 +73,13 @@ def test_a_request_visits_few_cells_of_a_large_map() -> None:
 
 def test_a_request_without_a_path_does_not_visit_the_whole_map() -> None:
     occupancy = np.zeros((200, 200))
-    occupancy[:, 100] = 1
+    occupancy[:, 10] = 1
     grid, planner = GridMap(occupancy), Planner(NETWORK, METADATA)
     assert planner.plan(grid, (0, 0), (199, 199)).status is PlanStatus.NO_PATH
     field = planner.known_field(grid, (199, 199))
     assert isinstance(field, DistanceField)
     assert not field.is_whole
-    assert np.count_nonzero(field.arrays[0]) < 0.3 * occupancy.size
+    assert np.count_nonzero(field.arrays[0]) < 0.6 * occupancy.size
 
 
 # Repair
