@@ -32,7 +32,7 @@ demo: setup
 	$(BIN)/python scripts/demo.py
 
 # One process per core; each has its nodes in a ROS domain of its own.
-PYTEST := $(BIN)/python -m pytest --numprocesses auto --maxprocesses 4 --dist loadgroup --no-loadscope-reorder
+PYTEST := $(BIN)/python -m pytest --numprocesses auto --maxprocesses 4 --dist loadfile --no-loadscope-reorder
 
 test: setup
 	$(PYTEST)

@@ -33,6 +33,8 @@ class BurstClients(Client):
             self.node.create_client(service_type, service, qos_profile=SERVICE_QUALITY)
             for _ in range(clients)
         ]
+        # Made after them: the node knows them all when it knows this one.
+        self.service(service_type, service)
         for client in self._clients:
             client.wait_for_service(TIMEOUT)
 

@@ -155,11 +155,11 @@ def certificate_of(network: QNetwork, move_rule: MoveRule) -> Certificate | None
     The last one is kept. A network that does not observe the move rule is certified for the one of
     its training.
     """
-    from ddqn_planner.model.networks import PropagationQNetwork  # may import this module
+    from ddqn_planner.model.networks import AnyMapQNetwork, PropagationQNetwork  # import this
 
-    if not isinstance(network, PropagationQNetwork):
-        return None
-    return certify(network) if network.uses_costs else certify(network, [move_rule])
+    if isinstance(network, AnyMapQNetwork):
+        return network.certificate
+    return certify(network, [move_rule]) if isinstance(network, PropagationQNetwork) else None
 
 
 def _legal_moves(patch_P9: NDArray[np.int8], move_rule: MoveRule) -> NDArray[np.bool_]:

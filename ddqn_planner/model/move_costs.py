@@ -32,6 +32,8 @@ Time and memory of a field grow with the highest cost, and a broken model may pr
 OCCUPIED_PATCH = 512
 """The patch of all occupied cells, and of those outside the map: no move leads out of them."""
 
+NO_PATCHES = np.empty(0, dtype=np.uint16)
+
 
 class MoveCosts(NamedTuple):
     """The cost of each move of each cell, on a map with a border of one cell.
@@ -42,7 +44,8 @@ class MoveCosts(NamedTuple):
     Parameters
     ----------
     patch : (C,) uint16 or int32
-        The number of each cell's patch.
+        The number of each cell's patch; None where the table is of moves into cells, see
+        `wavefront.costs_into_cells`.
     table : (P, 8) float32
         At least 1; infinite where a move is not possible.
     value : (C,) uint8, optional
@@ -57,10 +60,10 @@ class MoveCosts(NamedTuple):
         No straight and no diagonal move costs less.
     """
 
-    patch: NDArray[Any]
+    patch: Any
     table: Array
-    value: NDArray[np.uint8] | None
-    terms: Array | None
+    value: Any
+    terms: Any
     width: int
     highest: float
     straight: float

@@ -27,6 +27,8 @@ from ddqn_planner.grid import (
 from ddqn_planner.model.certificate import Certificate, certify
 from ddqn_planner.model.move_costs import (
     MAX_MULTIPLIER,
+    NO_PATCHES,
+    OCCUPIED_PATCH,
     VALUES,
     MoveCosts,
     cell_values,
@@ -218,28 +220,35 @@ class PropagationQNetwork(QNetwork):
         """Return the cost multiplier of each move, here 1: (B, 8), given features (B, I)."""
         return np.ones((len(feature_BI), len(MOVES)), dtype=np.float32)
 
-    @cached_property
-    def tables(self) -> dict[MoveRule, Array]:
-        """What the network says of each patch without costs, by rule: (513, 8) float32 each.
-
-        See `MoveCosts.table`. The network of a copy of the tensors: they do not change.
-        """
-        every_P9 = every_patch()
-        tables = {}
-        for rule in MoveRule:
-            table_PA = self._costs_of(every_P9, rule)
-            table_PA[every_P9[:, 4] == OCCUPIED] = np.inf
-            tables[rule] = np.pad(table_PA, ((0, 1), (0, 0)), constant_values=np.inf)
-        return tables
-
     def move_costs(self, grid: GridMap, move_rule: MoveRule) -> MoveCosts | None:
         """Return the costs of a map's moves if the possible ones are exactly the legal ones."""
-        from ddqn_planner.model.wavefront import patch_numbers
+        from ddqn_planner.model.compiled_costs import patch_numbers
 
-        table_PA = self.tables[move_rule]
-        if not np.array_equal(np.isfinite(table_PA[:-1]), legal_in_every_patch(move_rule)):
+        with_costs = self.uses_costs and grid.cost is not None
+        if (move_rule, with_costs) not in self._costs_by_rule:
+            self._costs_by_rule[move_rule, with_costs] = self._costs(move_rule, with_costs)
+        costs = self._costs_by_rule[move_rule, with_costs]
+        if costs is None:
             return None
-        return costs_by_patch(patch_numbers(grid.occupancy), table_PA, grid.width + 2)
+        value = cell_values(grid) if with_costs else None
+        return costs._replace(
+            patch=patch_numbers(grid.occupancy), value=value, width=grid.width + 2
+        )
+
+    @cached_property
+    def _costs_by_rule(self) -> dict[tuple[MoveRule, bool], MoveCosts | None]:
+        """What holds for all maps, so that it is computed once."""
+        return {}
+
+    def _costs(self, move_rule: MoveRule, with_costs: bool) -> MoveCosts | None:
+        """Return the costs of moves without what depends on the map."""
+        patch_P9 = every_patch()
+        table_PA = self._costs_of(patch_P9, move_rule)
+        table_PA[patch_P9[:, 4] == OCCUPIED] = np.inf
+        if not np.array_equal(np.isfinite(table_PA), legal_in_every_patch(move_rule)):
+            return None
+        table_PA = np.pad(table_PA, ((0, 1), (0, 0)), constant_values=np.inf)
+        return costs_by_patch(NO_PATCHES, table_PA, 0)
 
     def q_values(self, grid: GridMap, goal: Cell, move_rule: MoveRule) -> Array:
         """Return minus the cost of the best path through each action: length times cost multiplier.
@@ -330,20 +339,18 @@ class AnyMapQNetwork(PropagationQNetwork):
         terms_9LA[4] += bias_A + weight_AI[:, 27] * move_rule.cuts_corners
         return terms_9LA
 
-    def move_costs(self, grid: GridMap, move_rule: MoveRule) -> MoveCosts | None:
-        """Return the costs of a map's moves if the possible ones are exactly the legal ones."""
-        costs = super().move_costs(grid, move_rule)
-        if costs is None or grid.cost is None:
-            return costs
+    def _costs(self, move_rule: MoveRule, with_costs: bool) -> MoveCosts | None:
+        """Return the costs of moves without what depends on the map."""
+        if not with_costs:
+            return super()._costs(move_rule, with_costs)
         if not self.certificate.proved:
             return None
-        lengths_A = move_rule.lengths.astype(np.float32)
-        table_PA = np.where(np.isfinite(costs.table), lengths_A, np.float32(np.inf))
-        terms_9LA = self.terms(move_rule)
+        table_PA = np.full((OCCUPIED_PATCH + 1, len(MOVES)), np.inf, dtype=np.float32)
+        np.copyto(table_PA[:-1], move_rule.lengths, where=legal_in_every_patch(move_rule))
+        costs, terms_9LA = costs_by_patch(NO_PATCHES, table_PA, 0), self.terms(move_rule)
         greatest = 1 + max(0.0, float(terms_9LA.max(axis=1).sum(axis=0).max()))
-        highest = min(greatest, MAX_MULTIPLIER) * float(lengths_A.max())
         return costs._replace(
-            table=table_PA, value=cell_values(grid), terms=terms_9LA, highest=highest
+            terms=terms_9LA, highest=costs.highest * min(greatest, MAX_MULTIPLIER)
         )
 
 

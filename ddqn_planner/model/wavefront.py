@@ -2,8 +2,7 @@
 
 A field is spread from its goal in the order of A*, so that a request visits the cells that its
 start needs and no others (resumable reverse A*, Silver 2005). Buckets hold the cells of about the
-same order (Dial 1969). When the map changes, what no longer holds is taken back, and what the
-change offers is spread anew (Ramalingam and Reps 1996).
+same order (Dial 1969). `ddqn_planner.planning.invalidation` prepares a field for another map.
 
 Cells are numbers of a padded map, see `MoveCosts`. Of each cell there is the distance to the goal,
 the least cost of a path, and its state. The functions compare distances in float64: float32 would
@@ -12,15 +11,15 @@ lose the order of neighbours above some 10^6.
 
 from __future__ import annotations
 
-import heapq
 from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ddqn_planner.compiled import compiled_now
-from ddqn_planner.grid import MOVES, Cell
-from ddqn_planner.model.move_costs import MAX_MULTIPLIER, OCCUPIED_PATCH, MoveCosts, costs_by_patch
+from ddqn_planner.grid import Cell
+from ddqn_planner.model.compiled_costs import MOVE_X, MOVE_Y, cost_into, cost_of
+from ddqn_planner.model.move_costs import MoveCosts, costs_by_patch
 
 Distances = NDArray[np.float64]
 States = NDArray[np.uint8]
@@ -47,47 +46,6 @@ FIRST: NDArray[np.int8] = np.array(
     [0] + [(bits & -bits).bit_length() - 1 for bits in range(1, 256)], np.int8
 )
 """The lowest bit of a byte that is set."""
-
-MOVE_X, MOVE_Y = MOVES.T.copy()
-
-
-@compiled_now
-def patch_numbers(occupancy: NDArray[np.bool_]) -> NDArray[np.uint16]:
-    """Return the patch of each cell, with a border: (C,) uint16.
-
-    Bit 3 y + x is set where the patch's cell (x, y) is occupied; see `OCCUPIED_PATCH`.
-    """
-    height, width = occupancy.shape
-    padded = np.ones((height + 2, width + 2), np.uint16)
-    for y in range(height):
-        for x in range(width):
-            padded[y + 1, x + 1] = occupancy[y, x]
-    numbers = np.full((height + 2, width + 2), OCCUPIED_PATCH, np.uint16)
-    for y in range(1, height + 1):
-        below, here, above, out = padded[y - 1], padded[y], padded[y + 1], numbers[y]
-        for x in range(1, width + 1):
-            bits = below[x - 1] + 2 * below[x] + 4 * below[x + 1] + 8 * here[x - 1]
-            bits += 32 * here[x + 1] + 64 * above[x - 1] + 128 * above[x] + 256 * above[x + 1]
-            out[x] = OCCUPIED_PATCH if here[x] else bits
-    return numbers.ravel()
-
-
-@compiled_now
-def cost_of(
-    patch: Any, table: Any, value: Any, terms: Any, width: int, cell: int, action: int
-) -> Any:
-    """Return the cost of a move, float32; infinite if it is not possible. See `MoveCosts`."""
-    cost = table[patch[cell], action]
-    if terms is None:
-        return cost
-    if cost == np.inf:
-        return cost
-    total = np.float32(0)
-    for place in range(9):
-        known = value[cell + (place // 3 - 1) * width + place % 3 - 1]
-        total += terms[place, known, action]
-    multiplier = np.float32(1) + max(total, np.float32(0))
-    return cost * min(multiplier, np.float32(MAX_MULTIPLIER))
 
 
 @compiled_now
@@ -259,8 +217,8 @@ def grow_whole(distance: Distances, state: States, opened: Cells, costs: MoveCos
             better = 0
             for action in range(8):
                 previous = cell - offsets[action]
-                through[action] = here + cost_of(
-                    patch, table, value, terms, width, previous, action
+                through[action] = here + cost_into(
+                    patch, table, value, terms, width, cell, previous, action
                 )
                 known = distance[previous]
                 is_better = (through[action] < known) | ((known == 0) & (through[action] < np.inf))
@@ -304,86 +262,6 @@ def _still_open(
         state[cell] = OPEN
     still_open: Cells = found[:number].copy()
     return still_open
-
-
-@compiled_now
-def take_back(
-    distance: Distances, state: States, costs: MoveCosts, changed: Cells, limit: int
-) -> tuple[Cells, bool]:
-    """Take back what changed moves no longer support, and open what they offer.
-
-    Parameters
-    ----------
-    distance, state : (C,) float64, (C,) uint8
-        Changed in place.
-    costs : MoveCosts
-        After the change.
-    changed : (N,) int32
-        All cells whose own moves changed; more do no harm.
-    limit : int
-        How many cells may be taken back.
-
-    Returns
-    -------
-    (M,) int32
-        The cells that it opened.
-    bool
-        Whether the limit was kept; if not, the field is of no more use.
-    """
-    patch, table, value, terms, width = costs[:5]
-    offsets = MOVE_Y * width + MOVE_X
-    # In the order of the old distances: what supports a cell is judged before it.
-    waiting = [(np.float64(0), np.int64(0)) for _ in range(0)]
-    for cell in changed:
-        if distance[cell] > AT_GOAL:
-            heapq.heappush(waiting, (distance[cell], np.int64(cell)))
-    lost = [np.int64(0) for _ in range(0)]
-    while len(waiting) > 0:
-        known, cell = heapq.heappop(waiting)
-        if state[cell] & MARKED:
-            continue
-        supported = False
-        for action in range(8):
-            after = cell + offsets[action]
-            if distance[after] > 0 and not state[after] & MARKED:
-                supported |= (
-                    distance[after] + cost_of(patch, table, value, terms, width, cell, action)
-                    <= known
-                )
-        if supported:
-            continue
-        state[cell] |= MARKED
-        lost.append(cell)
-        if len(lost) > limit:
-            return changed[:0], False
-        for action in range(8):
-            before = cell - offsets[action]
-            if (
-                distance[before]
-                >= known + cost_of(patch, table, value, terms, width, before, action)
-                and not state[before] & MARKED
-            ):
-                heapq.heappush(waiting, (distance[before], np.int64(before)))
-    for cell in lost:
-        distance[cell], state[cell] = 0.0, UNREACHED
-    for cell in changed:
-        lost.append(np.int64(cell))
-    opened = np.empty(len(lost), np.int32)
-    number = 0
-    for cell in lost:
-        best = np.inf
-        for action in range(8):
-            after = cell + offsets[action]
-            if distance[after] > 0:
-                best = min(
-                    best,
-                    distance[after] + cost_of(patch, table, value, terms, width, cell, action),
-                )
-        if best < np.inf and (distance[cell] == 0 or best < distance[cell]):
-            distance[cell], state[cell] = best, OPEN
-            opened[number] = cell
-            number += 1
-    return opened[:number].copy(), True
 
 
 @compiled_now

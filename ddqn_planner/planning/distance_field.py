@@ -37,9 +37,9 @@ class DistanceField(QField):
     """
 
     def __init__(self, goal: Cell, grid: GridMap, costs: MoveCosts, move_rule: MoveRule) -> None:
-        from ddqn_planner.model import wavefront
+        from ddqn_planner.model import compiled_costs, wavefront
 
-        self.wavefront = wavefront
+        self.wavefront, self._compiled_costs = wavefront, compiled_costs
         self.goal, self.grid, self.costs, self.move_rule = goal, grid, costs, move_rule
         self.lock = threading.RLock()
         self._forget()
@@ -114,7 +114,11 @@ class DistanceField(QField):
         """Return the distance of every cell of the padded map, 0 where there is none: (C,)."""
         if not self.is_whole:
             distance, state, opened = self.arrays
-            self.wavefront.grow_whole(distance, state, opened, self.costs)
+            costs = self.costs
+            if costs.terms is not None:
+                into = self._compiled_costs.costs_into_cells(costs)
+                costs = costs._replace(patch=None, table=into, value=None, terms=None)
+            self.wavefront.grow_whole(distance, state, opened, costs)
             self.arrays = distance, state, opened[:0]
             self.is_whole = self.closed_is_final = True
         return self.arrays[0]

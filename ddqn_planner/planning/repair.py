@@ -56,6 +56,8 @@ def repaired(
     shift : (dx, dy)
         See `shift_between`.
     """
+    from ddqn_planner.planning.invalidation import take_back
+
     changed = _changed_cells(field.grid, grid, shift)
     if changed is None:
         return None
@@ -65,7 +67,7 @@ def repaired(
     distance, state, opened = arrays
     new = DistanceField(goal, grid, costs, field.move_rule)
     limit = max(1000, int(REPAIRED_SHARE * np.count_nonzero(state)))
-    reopened, kept = new.wavefront.take_back(distance, state, costs, changed, limit)
+    reopened, kept = take_back(distance, state, costs, changed, limit)
     if not kept:
         return None
     new.arrays = distance, state, np.concatenate([opened, reopened])
