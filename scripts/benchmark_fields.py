@@ -10,7 +10,6 @@ from __future__ import annotations
 import gc
 import math
 import statistics
-import sys
 import time
 from collections.abc import Callable, Sequence
 from functools import partial
@@ -80,6 +79,11 @@ def take_turns(*prepared: Prepared, rounds: int = ROUNDS) -> tuple[list[float], 
     return [statistics.median(of_call) for of_call in times], answers
 
 
+def ready(call: Callable[[], Any]) -> Prepared:
+    """Return the preparation of a call that needs none."""
+    return lambda: call
+
+
 def medians(times: Sequence[Sequence[float]]) -> list[float]:
     """Return the median of each column."""
     return [statistics.median(column) for column in zip(*times, strict=True)]
@@ -102,7 +106,7 @@ def measure_requests(side: int) -> list[bool]:
             nano = partial(nano_astar.astar, of_nano, *ends)
             pyastar = partial(pyastar2d.astar_path, weights, *ends, allow_diagonal=True)
             took, (plan, (_, length), _) = take_turns(
-                partial(ours, start, goal), lambda call=nano: call, lambda call=pyastar: call
+                partial(ours, start, goal), ready(nano), ready(pyastar)
             )
             assert math.isclose(plan.length, length, rel_tol=1e-6), (plan.length, length)
             times.append(took)
@@ -127,7 +131,7 @@ def measure_known_goals(side: int) -> list[bool]:
             planner, grid = new_planner(), GridMap(occupancy)
             after_a_move = planner.plan(grid, start, goal, RULE).cells[1]
             call = partial(planner.plan, grid, after_a_move, goal, RULE)
-            (took,), (plan,) = take_turns(lambda call=call: call)
+            (took,), (plan,) = take_turns(ready(call))
             times.append((took, len(plan.cells)))
         took, cells = medians(times)
         figure = f"{side}x{side} {kind}: known goal, path of {cells:.0f} cells"
@@ -164,7 +168,8 @@ def wall(occupancy: Occupancy, path: Sequence[Cell], at: int, opens: bool) -> Ch
     (x0, y0), (x, y), (x1, y1) = path[at - 2], path[at], path[at + 2]
     along_x = abs(y1 - y0) > abs(x1 - x0)
     x, y = (max(x - WALL // 2, 0), y) if along_x else (x, max(y - WALL // 2, 0))
-    box = (slice(y, y + 1), slice(x, x + WALL)) if along_x else (slice(y, y + WALL), slice(x, x + 1))
+    height, width = (1, WALL) if along_x else (WALL, 1)
+    box = slice(y, y + height), slice(x, x + width)
     if not opens:
         return Change(occupancy, np.ones_like(occupancy[box]), x, y)
     closed = occupancy.copy()
@@ -212,7 +217,8 @@ def draw_changes(
     map_kind: str, side: int, change_kind: str, count: int
 ) -> list[tuple[Change, Cell, Cell]]:
     """Draw changes that leave start and goal free, each with its start and goal."""
-    random, drawn = np.random.default_rng(0), []
+    drawn: list[tuple[Change, Cell, Cell]] = []
+    random = np.random.default_rng(0)
     occupancy = generate_map(map_kind, (side, side), random)
     while len(drawn) < count:
         ((start, goal),) = random_requests(occupancy, RULE, 1, random)
@@ -232,7 +238,9 @@ def measure_replans(side: int) -> list[bool]:
     for kind in REQUEST_KINDS:
         times = []
         for drawn in draw_changes(kind, side, "cells near the robot", 5):
-            took, (ours, theirs) = take_turns(partial(replan, *drawn), partial(plan_by_q_values, *drawn))
+            took, (ours, theirs) = take_turns(
+                partial(replan, *drawn), partial(plan_by_q_values, *drawn)
+            )
             assert math.isclose(ours.length, theirs.length, rel_tol=1e-6), drawn[1:]
             times.append(took)
         our_ms, q_ms = medians(times)
@@ -246,18 +254,25 @@ def measure_worst_replans(side: int) -> list[bool]:
     """Compare replans with a new field on the changed map, which must give the same path."""
     missed = []
     for change_kind in CHANGE_KINDS:
-        ratios = []
+        ratios: list[tuple[float, str, float, float]] = []
         for map_kind in REQUEST_KINDS:
             count = CHANGES // len(REQUEST_KINDS)
             for drawn in draw_changes(map_kind, side, change_kind, count):
                 took, (ours, fresh) = take_turns(partial(replan, *drawn), partial(new_plan, *drawn))
                 assert ours.cells == fresh.cells, drawn[1:]
-                ratios.append((took[0] / took[1], map_kind, *took))
+                ratios.append((took[0] / took[1], map_kind, took[0], took[1]))
         typical, (worst, kind, ms, fresh_ms) = statistics.median(r[0] for r in ratios), max(ratios)
         print(f"worst: {kind}, {ms:.1f} ms; new field {fresh_ms:.1f} ms")
         figure = f"{side}x{side}, {change_kind}: replan / new, median {typical:.3f}; worst"
         missed.append(report(figure, worst, "x", 2.0))
     return missed
+
+
+def whole_field(grid: GridMap, goal: Cell) -> QField:
+    """Return a field whose value was asked for in every cell."""
+    field = new_planner().q_field(grid, goal, RULE)
+    _ = field.value
+    return field
 
 
 def measure_whole_fields(side: int, costs: bool, bound: float) -> bool:
@@ -268,28 +283,26 @@ def measure_whole_fields(side: int, costs: bool, bound: float) -> bool:
         occupancy = generate_map(kind, (side, side), random)
         cost = random_costs(occupancy, random) if costs else None
 
-        def grid(occupancy: Occupancy = occupancy, cost: Any = cost) -> GridMap:
-            return GridMap(occupancy, cost=cost)
+        def value(goal: Cell, occupancy: Occupancy, cost: Any) -> Callable[[], QField]:
+            return partial(whole_field, GridMap(occupancy, cost=cost), goal)
 
-        def value(grid: GridMap, goal: Cell) -> QField:
-            field = new_planner().q_field(grid, goal, RULE)
-            _ = field.value
-            return field
+        def distances(goal: Cell, occupancy: Occupancy, cost: Any) -> Callable[[], Any]:
+            return partial(shortest_distances, GridMap(occupancy, cost=cost), goal, RULE)
 
         for _, goal in random_requests(occupancy, RULE, ROUNDS, random):
             took, (field, _) = take_turns(
-                lambda goal=goal: partial(value, grid(), goal),
-                lambda goal=goal: partial(shortest_distances, grid(), goal, RULE),
+                partial(value, goal, occupancy, cost),
+                partial(distances, goal, occupancy, cost),
                 rounds=ROUNDS if side < 1000 else 1,
             )
             times.append(took)
             nbytes = max(nbytes, field.nbytes)
         ours, dijkstra = medians(times)
         ratios[kind] = ours / dijkstra
-        print(f"{side}x{side} {kind}, costs {costs}: field {ours:.1f} ms, Dijkstra {dijkstra:.1f} ms")
+        name = f"{side}x{side}{', random costs' if costs else ''}"
+        print(f"{name}, {kind}: field {ours:.1f} ms, Dijkstra {dijkstra:.1f} ms", flush=True)
     per_cell = nbytes / side**2
     worst = max(ratios, key=lambda kind: ratios[kind])
-    name = f"{side}x{side}{', random costs' if costs else ''}"
     missed = side > 32 and report(f"{name}: bytes per cell of a field", per_cell, "B", 10)
     figure = f"{name}: field / Dijkstra, worst kind ({worst})"
     return report(figure, 100 * ratios[worst], "%", bound) or missed
