@@ -42,24 +42,24 @@ class DistanceField(QField):
         self.wavefront, self._compiled_costs = wavefront, compiled_costs
         self.goal, self.grid, self.costs, self.move_rule = goal, grid, costs, move_rule
         self.lock = threading.RLock()
-        self._forget()
-
-    def _forget(self) -> None:
-        """Begin anew, at the goal."""
         self.is_whole = False
-        # After a repair the distance of a closed cell may be too great, until `reach` is called.
+        # After a repair the distance of a closed cell may be too great, until `_reach` is called.
         self.closed_is_final = True
-        cells, goal = self.costs.patch.size, self._number(self.goal)
-        self.arrays: FieldArrays = self.wavefront.new_field(cells, goal)
+
+    @cached_property
+    def arrays(self) -> FieldArrays:
+        """What is known, at first the goal alone."""
+        return self.wavefront.new_field(self.costs.patch.size, self._number(self.goal))
 
     def _number(self, cell: Cell) -> int:
         return (cell[1] + 1) * self.costs.width + cell[0] + 1
 
     def hand_over(self) -> FieldArrays:
-        """Return the distances, states and open cells, and begin anew."""
+        """Return what is known, and begin anew."""
         with self.lock:
             arrays = self.arrays
-            self._forget()
+            del self.arrays
+            self.is_whole, self.closed_is_final = False, True
             return arrays
 
     def _reach(self, start: Cell, limit: int | None = None) -> bool:
