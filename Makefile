@@ -61,6 +61,7 @@ bench: setup
 	$(BIN)/pip install --quiet --editable ".[$(EXTRAS),bench]"
 	$(BIN)/python scripts/startup.py
 	$(BIN)/python scripts/benchmark.py
+	$(BIN)/python scripts/benchmark_fields.py
 	$(BIN)/python scripts/benchmark_any_map.py $(MAP)
 
 # What a robot's body costs, on MAP (the office by default) and with RADIUS, metres.
