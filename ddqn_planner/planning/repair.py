@@ -12,8 +12,12 @@ from ddqn_planner.grid import Cell, GridMap
 from ddqn_planner.model.move_costs import MoveCosts
 from ddqn_planner.planning.distance_field import DistanceField, FieldArrays
 
-REPAIRED_SHARE = 0.2
-"""Share of the known cells that a repair may take back: with more, a new field is cheaper."""
+REPAIRED_SHARE = 0.02
+"""Share of the known cells that a repair may take back: with more, a new field for the one start is
+often cheaper, and the repair that gives up costs more than that. See docs/benchmarks.md."""
+
+MIN_REPAIRED = 300
+"""Cells that a repair may take back in any case."""
 
 CHANGED_SHARE = 0.02
 """Share of the map's cells that may have changed: with more, a new field is cheaper."""
@@ -66,7 +70,7 @@ def repaired(
         arrays = _moved(arrays, field.grid, grid, shift)
     distance, state, opened = arrays
     new = DistanceField(goal, grid, costs, field.move_rule)
-    limit = max(1000, int(REPAIRED_SHARE * np.count_nonzero(state)))
+    limit = max(MIN_REPAIRED, int(REPAIRED_SHARE * np.count_nonzero(state)))
     reopened, kept = take_back(distance, state, costs, changed, limit)
     if not kept:
         return None
