@@ -152,5 +152,6 @@ class DistanceField(QField):
 
     @property
     def nbytes(self) -> int:
-        """Memory of the distances, bytes: at most 10 per cell."""
-        return sum(array.nbytes for array in self.arrays)
+        """Memory of what is known, bytes: about 9 per cell; more once `q` and so on were made."""
+        made = (self.__dict__.get(name) for name in ("q", "legal", "value", "policy"))
+        return sum(array.nbytes for array in (*self.arrays, *made) if array is not None)
