@@ -296,7 +296,7 @@ def measure_whole_fields(side: int, costs: bool, bound: float) -> bool:
                 rounds=ROUNDS if side < 1000 else 1,
             )
             times.append(took)
-            nbytes = max(nbytes, field.nbytes)
+            nbytes = max(nbytes, field.nbytes - field.value.nbytes)
         ours, dijkstra = medians(times)
         ratios[kind] = ours / dijkstra
         name = f"{side}x{side}{', random costs' if costs else ''}"

@@ -44,8 +44,7 @@ class MoveCosts(NamedTuple):
     Parameters
     ----------
     patch : (C,) uint16 or int32
-        The number of each cell's patch; None where the table is of moves into cells, see
-        `wavefront.costs_into_cells`.
+        The number of each cell's patch.
     table : (P, 8) float32
         At least 1; infinite where a move is not possible.
     value : (C,) uint8, optional
@@ -60,7 +59,7 @@ class MoveCosts(NamedTuple):
         No straight and no diagonal move costs less.
     """
 
-    patch: Any
+    patch: NDArray[Any]
     table: Array
     value: Any
     terms: Any

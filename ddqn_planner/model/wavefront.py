@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from ddqn_planner.compiled import compiled_now
 from ddqn_planner.grid import Cell
-from ddqn_planner.model.compiled_costs import MOVE_X, MOVE_Y, cost_into, cost_of
+from ddqn_planner.model.compiled_costs import MOVE_X, MOVE_Y, cost_of
 from ddqn_planner.model.move_costs import MoveCosts, costs_by_patch
 
 Distances = NDArray[np.float64]
@@ -233,8 +233,8 @@ def _grow_whole(distance: Distances, state: States, opened: Cells, costs: MoveCo
             better = 0
             for action in range(8):
                 previous = cell - offsets[action]
-                through[action] = here + cost_into(
-                    patch, table, value, terms, width, cell, previous, action
+                through[action] = here + cost_of(
+                    patch, table, value, terms, width, previous, action
                 )
                 known = distance[previous]
                 is_better = (through[action] < known) | ((known == 0) & (through[action] < np.inf))

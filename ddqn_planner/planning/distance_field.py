@@ -37,9 +37,9 @@ class DistanceField(QField):
     """
 
     def __init__(self, goal: Cell, grid: GridMap, costs: MoveCosts, move_rule: MoveRule) -> None:
-        from ddqn_planner.model import compiled_costs, wavefront
+        from ddqn_planner.model import wavefront
 
-        self.wavefront, self._compiled_costs = wavefront, compiled_costs
+        self.wavefront = wavefront
         self.goal, self.grid, self.costs, self.move_rule = goal, grid, costs, move_rule
         self.lock = threading.RLock()
         self.is_whole = False
@@ -114,11 +114,7 @@ class DistanceField(QField):
         """Return the distance of every cell of the padded map, 0 where there is none: (C,)."""
         if not self.is_whole:
             distance, state, opened = self.arrays
-            costs = self.costs
-            if costs.terms is not None:
-                into = self._compiled_costs.costs_into_cells(costs)
-                costs = costs._replace(patch=None, table=into, value=None, terms=None)
-            self.wavefront.grow_whole(distance, state, opened, costs)
+            self.wavefront.grow_whole(distance, state, opened, self.costs)
             self.arrays = distance, state, opened[:0]
             self.is_whole = self.closed_is_final = True
         return self.arrays[0]
@@ -139,7 +135,8 @@ class DistanceField(QField):
         """(H, W) float32: the greatest Q of a legal move, and at the goal the greatest of all."""
         with self.lock:
             distance = self._whole().reshape(-1, self.costs.width)[1:-1, 1:-1]
-            value = np.where(distance > 0, -distance, -np.inf).astype(np.float32)
+            value = np.negative(distance, dtype=np.float32, casting="same_kind")
+            value[value == 0] = -np.inf
         value[self.goal[1], self.goal[0]] = -np.inf
         value[self.goal[1], self.goal[0]] = value.max()
         return value
