@@ -73,6 +73,23 @@ def inflate(grid: GridMap, robot_radius: float, clearance_weight: float = 0.0) -
     return replace(grid, occupancy=occupancy, cost=cost, obstacles=grid.occupancy)
 
 
+class Inflation:
+    """Inflates maps as they come: of a map like the last one, only what is near changed cells."""
+
+    def __init__(self) -> None:
+        self._last: tuple[tuple[float, float], GridMap, GridMap] | None = None
+
+    def __call__(self, grid: GridMap, *body: float) -> GridMap:
+        """Return what `inflate` returns; `body` is the radius and the weight."""
+        radius, weight = body
+        if self._last is None or self._last[0] != body:
+            inflated = inflate(grid, radius, weight)
+        else:
+            inflated = inflate_changed(grid, *self._last[1:], radius, weight)
+        self._last = (radius, weight), grid, inflated
+        return inflated
+
+
 def inflate_changed(
     grid: GridMap,
     before: GridMap,

@@ -15,6 +15,7 @@ import numpy as np
 from geometry_msgs.msg import Point, Pose, PoseStamped, Quaternion
 from nav_msgs.msg import OccupancyGrid, Path
 from numpy.typing import NDArray
+from rclpy.serialization import serialize_message
 from std_msgs.msg import Header
 
 from ddqn_planner.grid import Cell, GridMap
@@ -111,6 +112,33 @@ def path_message(
             pose.orientation = towards[step]
         path.poses.append(stamped)
     return path
+
+
+def serialized_path(
+    cells: Sequence[Cell], grid: GridMap, header: Header, goal_orientation: Quaternion
+) -> bytes:
+    """Return what `path_message` returns in the form in which it is sent, which publishers take.
+
+    It saves nearly all of an answer's time: rclpy converts a message pose by pose. The form is CDR
+    (OMG DDS-XTypes, plain CDR, little-endian): numbers are aligned to their size, so that a pose
+    has the same bytes before its seven numbers each time, except for the first one.
+    """
+    start = serialize_message(Path(header=header))[4:-4] + len(cells).to_bytes(4, "little")
+    start += bytes(-len(start) % 4)
+    stamp = serialize_message(header)[4:]
+    first, others = (stamp + bytes(-(at + len(stamp)) % 8) for at in (len(start), 0))
+    pose = np.dtype([("header", f"V{len(others)}"), ("numbers", "<f8", 7)])
+    poses = np.zeros(len(cells), dtype=pose)
+    if len(cells):
+        poses["header"] = np.void(others)
+        x, y = np.array(cells, dtype=np.float64).T
+        yaw = grid.origin[2] + np.arctan2(np.diff(y), np.diff(x))
+        numbers = poses["numbers"]
+        numbers[:, 0], numbers[:, 1] = grid.cell_to_world((x, y))
+        numbers[:-1, 5], numbers[:-1, 6] = np.sin(yaw / 2), np.cos(yaw / 2)
+        last = goal_orientation
+        numbers[-1, 3:] = last.x, last.y, last.z, last.w
+    return b"\0\1\0\0" + start + (first + poses.tobytes()[len(others) :] if len(cells) else b"")
 
 
 def _copy(message: Message) -> Message:

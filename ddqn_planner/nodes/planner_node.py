@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import ctypes
 import os
+from collections.abc import Callable
 from contextlib import suppress
 from types import SimpleNamespace
 from typing import Any, NoReturn
@@ -25,8 +26,8 @@ from rclpy.parameter import Parameter
 from rclpy.task import Future
 from std_msgs.msg import Header, String
 
-from ddqn_planner.grid import Cell, GridMap, MoveRule, inflate
-from ddqn_planner.grid.body import inflate_changed
+from ddqn_planner.grid import Cell, GridMap, MoveRule
+from ddqn_planner.grid.body import Inflation
 from ddqn_planner.model.certificate import NO_CERTIFICATE, certificate_of
 from ddqn_planner.nodes.conversions import (
     cell_from_pose,
@@ -34,6 +35,7 @@ from ddqn_planner.nodes.conversions import (
     check_tolerance,
     grid_from_message,
     path_message,
+    serialized_path,
 )
 from ddqn_planner.nodes.field_display import FieldDisplay, Shown
 from ddqn_planner.nodes.model_loading import load, load_and_warm_up
@@ -73,7 +75,7 @@ class PlannerNode(BaseNode):
         super().__init__("planner", PARAMETERS)
         self._map: OccupancyGrid | None = None
         self._inflated: Future | None = None
-        self._last_inflation: tuple[tuple[float, float], GridMap, GridMap] | None = None
+        self._inflate = Inflation()
         self._goal: PoseStamped | None = None
         self._planner: Planner | None = None
         self._model_file = ""
@@ -207,18 +209,8 @@ class PlannerNode(BaseNode):
             radius, weight = map(self.value, BODY_PARAMETERS)
             # ROS accepts a value that is above the range by a millionth.
             body = radius, min(weight, 1.0)
-            self._inflated = self._map_worker.call(self._inflate, self._grid, body)
+            self._inflated = self._map_worker.call(self._inflate, self._grid, *body)
         return self._inflated
-
-    def _inflate(self, grid: GridMap, body: tuple[float, float]) -> GridMap:
-        """Inflate a map, near its changed cells only if it is like the last one."""
-        last = self._last_inflation
-        if last is None or last[0] != body:
-            inflated = inflate(grid, *body)
-        else:
-            inflated = inflate_changed(grid, *last[1:], *body)
-        self._last_inflation = body, grid, inflated
-        return inflated
 
     def _on_start(self, message: PoseWithCovarianceStamped | Odometry) -> None:
         try:
@@ -262,7 +254,8 @@ class PlannerNode(BaseNode):
         self, request: GetPlan.Request, response: GetPlan.Response
     ) -> GetPlan.Response:
         start = request.start if request.start.header.frame_id else None
-        response.plan, outcome = await self._answer(start, request.goal, request.tolerance)
+        header, outcome = await self._answer(start, request.goal, request.tolerance)
+        response.plan = _path(path_message, outcome, header, request.goal)
         self._report.log(outcome)
         return response
 
@@ -271,8 +264,8 @@ class PlannerNode(BaseNode):
         goal = self._goal
         if goal is None:
             return
-        path, outcome = await self._answer(None, goal, self._settings.tolerance)
-        self._plan_publisher.publish(path)
+        header, outcome = await self._answer(None, goal, self._settings.tolerance)
+        self._plan_publisher.publish(_path(serialized_path, outcome, header, goal))
         self._waits_for_start = outcome.status == "NO_START"
         # The places and lengths in the reason may differ.
         logged = goal, (outcome.status, outcome.plan.method)
@@ -281,16 +274,16 @@ class PlannerNode(BaseNode):
             self._report.log(outcome)
         request, field_goal = outcome.request, outcome.plan.goal
         if request is None or field_goal is None or outcome.planner is None:
-            self._display.clear(path.header)
+            self._display.clear(header)
         else:
             rule = request.move_rule
-            shown = Shown(outcome.planner, request.grid, field_goal, rule, path.header)
+            shown = Shown(outcome.planner, request.grid, field_goal, rule, header)
             self._display.show(shown)
 
     async def _answer(
         self, start: PoseStamped | None, goal: PoseStamped, tolerance: float
-    ) -> tuple[Path, Outcome]:
-        """Return the path, or an empty one, and what became of the request.
+    ) -> tuple[Header, Outcome]:
+        """Return the path's header, and what became of the request.
 
         A path is planned with the map, model and parameters that are there when this begins,
         whatever changes while it waits. Its stamp is the time of the answer.
@@ -304,11 +297,7 @@ class PlannerNode(BaseNode):
             remedy = "give a smaller map, or another model"
             outcome = Outcome("FAILED", f"the planning failed ({error!r}); {remedy}")
         self._report.note(outcome)
-        header = Header(stamp=self.get_clock().now().to_msg(), frame_id=frame)
-        if outcome.request is None:
-            return Path(header=header), outcome
-        grid, rotation = outcome.request.grid, goal.pose.orientation
-        return path_message(outcome.plan.cells, grid, header, rotation), outcome
+        return Header(stamp=self.get_clock().now().to_msg(), frame_id=frame), outcome
 
     async def _plan(
         self, start: PoseStamped | None, goal: PoseStamped, tolerance: float
@@ -386,6 +375,13 @@ class PlannerNode(BaseNode):
             description["map"] = describe_map(self._map)
             description["map stamp (s)"] = seconds(self._map.header.stamp)
         return description
+
+
+def _path(make: Callable[..., Any], outcome: Outcome, header: Header, goal: PoseStamped) -> Any:
+    """Return the path of an outcome, or an empty one, made by a function of `conversions`."""
+    if outcome.request is None:
+        return Path(header=header)
+    return make(outcome.plan.cells, outcome.request.grid, header, goal.pose.orientation)
 
 
 def main() -> NoReturn:

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from strategies import occupancies
 
 from ddqn_planner.grid import UNKNOWN, GridMap, MoveRule, clearance, inflate
-from ddqn_planner.grid.body import inflate_changed
+from ddqn_planner.grid.body import Inflation, inflate_changed
 from ddqn_planner.grid.moves import component_labels
 
 RESOLUTION = 0.05
@@ -135,3 +135,11 @@ def test_a_map_of_another_size_is_inflated_whole() -> None:
     before, grid = GridMap(np.eye(9)), GridMap(np.eye(12))
     found = inflate_changed(grid, before, inflate(before, 1.5), 1.5)
     assert found.same_cells(inflate(grid, 1.5))
+
+
+def test_maps_that_come_one_after_another_are_inflated_for_the_body_of_now() -> None:
+    inflation, random = Inflation(), np.random.default_rng(0)
+    grid = GridMap(random.random((30, 30)) < 0.05, 0.5)
+    for body in ((0.6, 0.0), (0.6, 0.0), (1.1, 0.5), (1.1, 0.5), (0.0, 0.0), (0.6, 0.0)):
+        grid = grid.with_patch(random.random((2, 2)) < 0.5, 4, 5)
+        assert inflation(grid, *body).same_cells(inflate(grid, *body))
