@@ -541,8 +541,8 @@ def test_nothing_is_shown_of_a_goal_without_a_field(robot: Robot) -> None:
 
 
 TOLD = """
-import ddqn_planner.grid as grid
 import ddqn_planner.nodes.conversions as conversions
+from ddqn_planner.grid.body import Inflation
 
 def told(words, function):
     def say_and_call(*arguments):
@@ -551,7 +551,7 @@ def told(words, function):
 
     return say_and_call
 
-grid.inflate = told("a map is inflated", grid.inflate)
+Inflation.__call__ = told("a map is inflated", Inflation.__call__)
 conversions.value_message = told("a value is shown", conversions.value_message)
 """
 
