@@ -129,9 +129,9 @@ class Planner:
         with self._lock:
             known = self._known_map(grid, rule)
             field = known.fields.get(goal) if known else None
-        if known and field:
-            self._remember(known, field)
-        return field
+            if known and field:
+                self._use(known, field)
+            return field
 
     def _known_map(self, grid: GridMap, rule: MoveRule) -> _KnownMap | None:
         """Return what is known of an equal map."""
@@ -151,28 +151,26 @@ class Planner:
 
     def _repaired(self, known: _KnownMap, goal: Cell) -> QField | None:
         """Return the field of a map that a field of an older one becomes, if there is one."""
-        with self._lock:
-            for older in reversed(self._maps):
-                if older is known or older.move_rule is not known.move_rule:
-                    continue
-                shift = shift_between(older.grid, known.grid)
-                if shift is None:
-                    continue
-                field = older.fields.pop((goal[0] - shift[0], goal[1] - shift[1]), None)
-                if isinstance(field, DistanceField):
-                    break
-            else:
-                return None
         assert known.costs is not None
-        return repaired(field, goal, known.grid, known.costs, shift)
+        with self._lock:
+            olders = [other for other in reversed(self._maps) if other is not known]
+        for older in olders:
+            shift = shift_between(older.grid, known.grid)
+            if shift is None or older.move_rule is not known.move_rule:
+                continue
+            old_goal = goal[0] - shift[0], goal[1] - shift[1]
+            field = older.fields.get(old_goal)
+            if isinstance(field, DistanceField):
+                new = repaired(field, goal, known.grid, known.costs, shift)
+                if new:  # it has the older one's memory
+                    older.fields.pop(old_goal, None)
+                return new
+        return None
 
     def _remember(self, known: _KnownMap, field: QField) -> None:
-        """Keep a field and its map as those that were used last, and forget the oldest ones."""
+        """Keep a field, and forget the oldest ones beyond the bound."""
         with self._lock:
-            known.fields[field.goal] = field
-            known.fields.move_to_end(field.goal)
-            self._maps = [other for other in self._maps if other is not known and other.fields]
-            self._maps.append(known)
+            self._use(known, field)
             size = sum(other.nbytes for other in self._maps)
             while size > self.cache_bytes and (len(self._maps) > 1 or len(known.fields) > 1):
                 oldest = self._maps[0]
@@ -182,6 +180,13 @@ class Planner:
                     size += oldest.nbytes
                 else:
                     del self._maps[0]
+
+    def _use(self, known: _KnownMap, field: QField) -> None:
+        """Put a map and its field where those lie that were used last."""
+        known.fields[field.goal] = field
+        known.fields.move_to_end(field.goal)
+        self._maps = [other for other in self._maps if other is not known and other.fields]
+        self._maps.append(known)
 
     def _rule(self, move_rule: MoveRule | str | None) -> MoveRule:
         return self.metadata.move_rule if move_rule is None else MoveRule(move_rule)

@@ -189,6 +189,15 @@ def test_with_too_many_changes_a_field_is_computed_anew(monkeypatch: pytest.Monk
     assert repair.repaired(older, goal, other, costs, (0, 0)) is None
 
 
+def test_the_fields_of_another_map_are_kept(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.undo()
+    first, second = (GridMap(np.random.default_rng(n).random((60, 60)) < 0.2) for n in (0, 1))
+    goal = next(cell for cell in first.free_cells() if second.is_free(cell))
+    planner = Planner(NETWORK, METADATA)
+    fields = [planner.q_field(grid, goal) for grid in (first, second, first, second)]
+    assert fields[:2] == fields[2:]
+
+
 @pytest.mark.parametrize(
     ("resolution", "origin", "shift"),
     [
