@@ -163,7 +163,8 @@ class Planner:
             if isinstance(field, DistanceField):
                 new = repaired(field, goal, known.grid, known.costs, shift)
                 if new:  # it has the older one's memory
-                    older.fields.pop(old_goal, None)
+                    with self._lock:
+                        older.fields.pop(old_goal, None)
                 return new
         return None
 

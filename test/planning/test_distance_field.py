@@ -1,6 +1,6 @@
 from __future__ import annotations
 
-import threading
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import numpy as np
@@ -232,19 +232,15 @@ def test_threads_share_a_planner_while_the_map_changes(kind: str) -> None:
         for number, changed in enumerate(maps)
         for request in requests
     }
-    planner, wrong = Planner(NETWORK, METADATA), []
+    planner = Planner(NETWORK, METADATA)
 
-    def ask(seed: int) -> None:
-        order = np.random.default_rng(seed)
+    def count_wrong(seed: int) -> int:
+        order, wrong = np.random.default_rng(seed), 0
         for _ in range(100):
             number = int(order.integers(len(maps)))
             request = requests[int(order.integers(len(requests)))]
-            if planner.plan(maps[number], *request) != expected[number, request]:
-                wrong.append((number, request))
+            wrong += planner.plan(maps[number], *request) != expected[number, request]
+        return wrong
 
-    threads = [threading.Thread(target=ask, args=(seed,)) for seed in range(4)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
-    assert not wrong
+    with ThreadPoolExecutor(4) as threads:
+        assert list(threads.map(count_wrong, range(4))) == [0, 0, 0, 0]
