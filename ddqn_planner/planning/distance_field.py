@@ -149,6 +149,6 @@ class DistanceField(QField):
 
     @property
     def nbytes(self) -> int:
-        """Memory of what is known, bytes: about 9 per cell; more once `q` and so on were made."""
+        """Memory, bytes: 9 per cell, and more once `q` and so on were made."""
         made = (self.__dict__.get(name) for name in ("q", "legal", "value", "policy"))
-        return sum(array.nbytes for array in (*self.arrays, *made) if array is not None)
+        return 9 * self.costs.patch.size + sum(a.nbytes for a in made if a is not None)
