@@ -151,4 +151,5 @@ class DistanceField(QField):
     def nbytes(self) -> int:
         """Memory, bytes: 9 per cell, and more once `q` and so on were made."""
         made = (self.__dict__.get(name) for name in ("q", "legal", "value", "policy"))
-        return 9 * self.costs.patch.size + sum(a.nbytes for a in made if a is not None)
+        cells = int(self.costs.patch.size)
+        return 9 * cells + sum(int(array.nbytes) for array in made if array is not None)
