@@ -32,7 +32,7 @@ demo: setup
 	$(BIN)/python scripts/demo.py
 
 # One process per core; each has its nodes in a ROS domain of its own.
-PYTEST := $(BIN)/python -m pytest --numprocesses auto --maxprocesses 4 --dist loadgroup --no-loadscope-reorder
+PYTEST := $(BIN)/python -m pytest --numprocesses auto --maxprocesses 4 --dist loadfile --no-loadscope-reorder
 
 test: setup
 	$(PYTEST)
@@ -61,6 +61,7 @@ bench: setup
 	$(BIN)/pip install --quiet --editable ".[$(EXTRAS),bench]"
 	$(BIN)/python scripts/startup.py
 	$(BIN)/python scripts/benchmark.py
+	$(BIN)/python scripts/benchmark_fields.py
 	$(BIN)/python scripts/benchmark_any_map.py $(MAP)
 
 # What a robot's body costs, on MAP (the office by default) and with RADIUS, metres.

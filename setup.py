@@ -47,7 +47,7 @@ setup(
         "tensorboard": ["tensorboard>=2.10"],
         "watch": ["rerun-sdk>=0.39"],
         "docs": ["furo", "myst-parser>=3.0", "sphinx>=7.3"],
-        "bench": ["psutil>=5.9", "pyastar2d>=1.1", "stable-baselines3>=2.6"],
+        "bench": ["nano-astar>=0.1.2", "psutil>=5.9", "pyastar2d>=1.1", "stable-baselines3>=2.6"],
         "test": [
             "colcon-core>=0.15",
             "colcon-package-selection",

@@ -14,6 +14,7 @@ COMMANDS: Final = {
     "train": "train a model on a map file",
     "train-any-map": "train a model for any map on random maps",
     "evaluate": "measure a model on maps that it never saw",
+    "certify": "prove which moves a model takes for possible",
     "reproduce": "train and measure the paper's experiments",
     "watch": "show live what the ROS nodes publish",
 }
@@ -40,7 +41,7 @@ class HelpFormatter(argparse.HelpFormatter):
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line; return the exit code.
 
-    0 done, 1 no path, 2 bad input or a missing library, 130 interrupted.
+    0 done, 1 no path or no proof, 2 bad input or a missing library, 130 interrupted.
     """
     # NumPy is not yet imported. For small products one thread is as fast as several, and on a busy
     # machine several are ten times as slow.

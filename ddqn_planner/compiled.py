@@ -5,29 +5,40 @@ from __future__ import annotations
 from collections.abc import Callable
 from functools import cache, wraps
 from threading import Lock
-from typing import Any
+from typing import Any, TypeVar
+
+Function = TypeVar("Function", bound=Callable[..., Any])
 
 _importing = Lock()
 
 
 def compiled(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Compile a function at its first call, and keep the code for other processes if possible."""
+    """Compile a function at its first call. It calls no other compiled function."""
 
     @cache
     def dispatcher() -> Callable[..., Any]:
-        numba = _import_numba()
-        try:
-            with_cache: Callable[..., Any] = numba.njit(cache=True, nogil=True)(function)
-            return with_cache
-        except RuntimeError:  # no folder is writable: each process compiles again
-            without_cache: Callable[..., Any] = numba.njit(nogil=True)(function)
-            return without_cache
+        return compiled_now(function)
 
     @wraps(function)
     def call(*arguments: Any) -> Any:
         return dispatcher()(*arguments)
 
     return call
+
+
+def compiled_now(function: Function) -> Function:
+    """Import numba, and compile a function for its first call, also by other compiled functions.
+
+    The code is kept for other processes where a folder is writable. For modules that are imported
+    when they are needed.
+    """
+    numba = _import_numba()
+    try:
+        with_cache: Function = numba.njit(cache=True, nogil=True)(function)
+        return with_cache
+    except RuntimeError:  # no folder is writable: each process compiles again
+        without_cache: Function = numba.njit(nogil=True)(function)
+        return without_cache
 
 
 def _import_numba() -> Any:

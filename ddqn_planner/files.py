@@ -17,12 +17,8 @@ from typing import BinaryIO
 def write_atomically(path: Path, content: bytes) -> None:
     """Write a temporary file beside `path` and rename it; missing folders are made.
 
-    If the process is killed meanwhile, the temporary file remains: see `remove_temporaries`.
-
-    Raises
-    ------
-    OSError
-        If the file cannot be written; an old file at `path` is then unchanged.
+    After an OSError, an old file at `path` is unchanged. If the process is killed meanwhile, the
+    temporary file remains: see `remove_temporaries`.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_name(f".{path.name}.{secrets.token_hex(8)}")
@@ -39,28 +35,15 @@ def write_atomically(path: Path, content: bytes) -> None:
 
 
 def remove_temporaries(path: Path) -> None:
-    """Remove the temporary files that killed processes left beside `path`.
-
-    Raises
-    ------
-    OSError
-        If one cannot be removed.
-    """
+    """Remove the temporary files that killed processes left beside `path`."""
     for temporary in path.parent.glob(f".{glob.escape(path.name)}.*"):
         temporary.unlink(missing_ok=True)
 
 
 def lock(path: Path) -> BinaryIO:
-    """Lock a file until the returned file is closed; a missing file is made, and stays.
+    """Lock a file until the returned file is closed; BlockingIOError if it is locked already.
 
-    When the process ends, or is killed, the system closes the file.
-
-    Raises
-    ------
-    BlockingIOError
-        If it is locked already.
-    OSError
-        If it cannot be opened.
+    A missing file is made, and stays. The system closes the file when the process ends.
     """
     file = path.open("ab")
     try:
@@ -76,11 +59,6 @@ class Appender:
 
     When the disk is full, the file may end with a part of a record. The rest is kept and written
     before the next record.
-
-    Raises
-    ------
-    OSError
-        If the file cannot be opened.
     """
 
     def __init__(self, path: Path) -> None:
@@ -91,11 +69,8 @@ class Appender:
     def append(self, record: bytes) -> None:
         """Append a record.
 
-        Raises
-        ------
-        OSError
-            If it cannot be written completely. The next call that can write then writes the rest
-            of it, or leaves it out if the record before it is still incomplete.
+        After an OSError, the next call that can write writes the rest of it first, or leaves it out
+        if the record before it is still incomplete.
         """
         self.flush()
         self._rest = record

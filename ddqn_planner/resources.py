@@ -13,19 +13,9 @@ PACKAGE = "ddqn_planner"
 
 
 def find_resource(folder: str, name: str) -> Path:
-    """Return the path of a file that comes with the package.
+    """Return the path of a file of the folder ``"maps"`` or ``"models"``.
 
-    Parameters
-    ----------
-    folder : str
-        ``"maps"`` or ``"models"``.
-    name : str
-        Name of the file, with its ending.
-
-    Raises
-    ------
-    FileNotFoundError
-        If there is none; the message names the folder and the files that are there.
+    The FileNotFoundError for a wrong name, with its ending, names the files that are there.
     """
     directory = Path(__file__).parent / folder
     if os.path.isfile(directory / name):

@@ -1,4 +1,4 @@
-"""Measures the model for any map on large maps: fields, single queries, the node.
+"""Measures the planner node with the model for any map, on large and on changing maps.
 
 Part of `make bench`. Without arguments it measures on the package's own maps; with the path of a
 ROS map, as of turtlebot3, the node plans on that one.
@@ -10,95 +10,52 @@ import gc
 import statistics
 import tempfile
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 
 import numpy as np
-import pyastar2d
-import torch
 from benchmark import compare_with_bare_service, report, timed
-from client import Client, plan_request, wait_for
+from client import Client, initial_pose, map_message, plan_request, pose, wait_for
+from nav_msgs.msg import OccupancyGrid
+from nav_msgs.msg import Path as PathMessage
 from nav_msgs.srv import GetPlan
 from processes import claim_ros_domain, memory, run_script, running_node
 from rcl_interfaces.srv import GetParameters, ListParameters
+from startup import node_usage
 from std_srvs.srv import Trigger
 
 from ddqn_planner import GridMap, MoveRule, Planner, load_map
-from ddqn_planner.benchmarks.generalisation import compare_with_dijkstra
-from ddqn_planner.experiments.goal_1 import a_star
 from ddqn_planner.grid import Cell, save_map
-from ddqn_planner.grid.generators import KINDS, generate_map, random_requests
+from ddqn_planner.grid.generators import generate_map, random_requests
+from ddqn_planner.grid.grid_map import OCCUPIED
+from ddqn_planner.nodes.runtime import LATCHED
 from ddqn_planner.resources import find_map
-from ddqn_planner.training.environment import Scenario
 
 RULE = MoveRule.ROBOT_SAFE
 GOALS = 7
 CALLS = 200
 LARGE = 2000
+CHANGING = 1024
+RATE = 5
+"""Maps per second."""
 
 
 def main(arguments: Sequence[str]) -> int:
     """Print each figure beside its bound; return 1 if one is missed."""
-    torch.set_num_threads(1)
     gc.freeze()  # else this process pauses to look for garbage among what it has imported
-    missed = [measure_fields(256), measure_fields(1024)]
-    compare_single_queries(256)
-    with claim_ros_domain(), Client() as client:
-        missed += measure_node(client, Path(arguments[0] if arguments else find_map("office")))
-        missed += measure_large_map(client)
+    map_file = Path(arguments[0] if arguments else find_map("office"))
+    missed = []
+    with claim_ros_domain():
+        for measure in (
+            partial(measure_node, map_file=map_file),
+            measure_large_map,
+            measure_new_maps,
+            measure_changing_map,
+        ):
+            with Client() as client:  # else its last map would reach the next node
+                missed += measure(client)
     return int(any(missed))
-
-
-def measure_fields(side: int) -> bool:
-    """Compare the time of a field with that of scipy's Dijkstra, graph included, on each kind."""
-    planner, ratios = Planner.load("any_map"), {}
-    for kind in KINDS:
-        random = np.random.default_rng(0)
-        grid = GridMap(generate_map(kind, (side, side), random))
-        goals = [goal for _, goal in random_requests(grid.occupancy, RULE, GOALS, random)]
-        compare_with_dijkstra(planner, grid, goals[0], RULE)  # compiled code is loaded
-        both = [compare_with_dijkstra(planner, grid, goal, RULE)[1::2] for goal in goals]
-        field, dijkstra = (statistics.median(times) for times in zip(*both, strict=True))
-        ratios[kind] = field / dijkstra
-        print(f"{side}x{side} {kind}: field {field:.1f} ms, Dijkstra {dijkstra:.1f} ms")
-    worst = max(ratios, key=lambda kind: ratios[kind])
-    return report(f"field / Dijkstra at {side}x{side}, worst kind ({worst})", ratios[worst], "x", 1)
-
-
-def compare_single_queries(side: int) -> None:
-    """Print what one path costs that is asked for once; A* in C++ is not to be beaten."""
-    planner, random = Planner.load("any_map"), np.random.default_rng(0)
-    grid = GridMap(generate_map("random_20", (side, side), random))
-    weights = np.where(grid.occupancy, np.inf, 1).astype(np.float32)
-    requests = random_requests(grid.occupancy, RULE, GOALS, random)
-
-    def with_new_field(start: Cell, goal: Cell) -> object:
-        return Planner(planner.network, planner.metadata).plan(grid, start, goal, RULE)
-
-    def with_known_field(start: Cell, goal: Cell) -> object:
-        return planner.plan(grid, start, goal, RULE)
-
-    def own_a_star(start: Cell, goal: Cell) -> object:
-        return a_star(Scenario(grid, start, goal), RULE)
-
-    def pyastar(start: Cell, goal: Cell) -> object:
-        return pyastar2d.astar_path(weights, start[::-1], goal[::-1], allow_diagonal=True)
-
-    for _, goal in requests:
-        _ = planner.q_field(grid, goal, RULE).policy
-    planners: dict[str, Callable[[Cell, Cell], object]] = {
-        "ours, new field": with_new_field,
-        "ours, known field": with_known_field,
-        "our A*": own_a_star,
-        "pyastar2d A* (cuts corners, a diagonal counts 1)": pyastar,
-    }
-    for name, plan in planners.items():
-        times = []
-        for start, goal in requests:
-            began = time.perf_counter()
-            plan(start, goal)
-            times.append(1e3 * (time.perf_counter() - began))
-        print(f"one query at {side}x{side}, {name}: median {statistics.median(times):.2f} ms")
 
 
 def first_answer(client: Client, request: GetPlan.Request) -> tuple[float, int]:
@@ -177,6 +134,75 @@ def measure_large_map(client: Client) -> list[bool]:
     print(f"{LARGE}x{LARGE}: GetPlan with a new field, median {statistics.median(waited):.0f} ms")
     missed.append(report(f"{LARGE}x{LARGE}: planner node, greatest memory", peak, "MB", 2000))
     return missed
+
+
+def office(side: int) -> tuple[GridMap, Cell, Cell]:
+    """Return a generated office, with a start and a goal that a path joins."""
+    random = np.random.default_rng(0)
+    grid = GridMap(generate_map("office", (side, side), random))
+    ((start, goal),) = random_requests(grid.occupancy, RULE, 1, random)
+    return grid, start, goal
+
+
+def message_of(grid: GridMap) -> OccupancyGrid:
+    """Return the message of a map."""
+    return map_message(OCCUPIED * grid.occupancy.astype(np.int8), grid)
+
+
+def publish_request(client: Client, grid: GridMap, start: Cell, goal: Cell) -> None:
+    """Publish the start and the goal."""
+    client.publish("initialpose", initial_pose(pose(grid, start)))
+    client.publish("goal_pose", pose(grid, goal))
+
+
+def measure_new_maps(client: Client) -> list[bool]:
+    """Measure how soon a new large map brings a path to the active goal."""
+    plans, times = client.subscribe(PathMessage, "plan", LATCHED), []
+    small = message_of(GridMap(np.zeros((5, 5), dtype=np.bool_)))
+    first, *_ = office(LARGE)
+    with running_node("planner_node"):
+        for turns in range(4):
+            grid = GridMap(np.rot90(first.occupancy, turns))
+            client.publish("map", small, LATCHED)
+            random = np.random.default_rng(turns)
+            ((start, goal),) = random_requests(grid.occupancy, RULE, 1, random)
+            publish_request(client, grid, start, goal)
+            time.sleep(2)  # until the node has answered that these lie outside the small map
+            message = message_of(grid)
+            plans.clear()
+            began = time.monotonic()
+            client.publish("map", message, LATCHED)
+            plans.wait(lambda plan: plan.poses)
+            times.append(time.monotonic() - began)
+    print(f"{LARGE}x{LARGE}: new map to path, first of the node {times[0]:.2f} s")
+    seconds = statistics.median(times[1:])
+    return [report(f"{LARGE}x{LARGE}: new map to path, median", seconds, "s", 0.3)]
+
+
+def measure_changing_map(client: Client) -> list[bool]:
+    """Measure the planner's share of a core while its map changes in a few cells, 5 Hz."""
+    plans = client.subscribe(PathMessage, "plan", LATCHED)
+    grid, start, goal = office(CHANGING)
+    local, random, messages = Planner.load("any_map"), np.random.default_rng(0), [message_of(grid)]
+    path = local.plan(grid, start, goal, RULE).cells
+    while len(messages) < 12 * RATE:
+        x, y = random.choice(path[3:-3])
+        changed = grid.with_patch(~grid.occupancy[y : y + 2, x : x + 2], x, y)
+        if local.plan(changed, start, goal, RULE).cells:
+            messages.append(message_of(changed))
+    with running_node("planner_node") as planner:
+        publish_request(client, grid, start, goal)
+        for number, message in enumerate(messages):
+            if number == 2 * RATE:  # the node is warm
+                plans.clear()
+                began = time.monotonic()
+                _, cpu_before, _ = node_usage(planner.pid, began)
+            client.publish("map", message, LATCHED)
+            time.sleep(1 / RATE)
+        wall, cpu, _ = node_usage(planner.pid, began)
+    print(f"{CHANGING}x{CHANGING}: {len(plans.messages())} plans in {wall:.1f} s")
+    figure = f"{CHANGING}x{CHANGING}: a few cells change, 5 Hz: share of a core"
+    return [report(figure, 100 * (cpu - cpu_before) / wall, "%", 10)]
 
 
 if __name__ == "__main__":

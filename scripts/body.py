@@ -1,10 +1,11 @@
 """Measures what a robot's body costs: distances to obstacles, and lengths beside the optimum.
 
-With the path of a ROS map, and the robot's radius in metres. The requests go to a running node.
+With the path of a ROS map, and the robot's radius in metres.
 """
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,11 +13,9 @@ from pathlib import Path
 import numpy as np
 import scipy.ndimage
 import scipy.sparse
-from client import Client, cells_of, pose, wait_for
 from numpy.typing import NDArray
-from processes import claim_ros_domain, run_script, running_node
 
-from ddqn_planner import GridMap, MoveRule, inflate, load_map
+from ddqn_planner import GridMap, MoveRule, Planner, inflate, load_map
 from ddqn_planner.grid import (
     MOVES,
     Cell,
@@ -51,11 +50,15 @@ def main(arguments: Sequence[str]) -> int:
     path = str(arguments[0] if arguments else find_map("office"))
     radius = float(arguments[1]) if len(arguments) > 1 else 0.15
     grid = load_map(path)
-    inflated = inflate(grid, radius)
+    inflated, metres = inflate(grid, radius), clearance(grid.occupancy) * grid.resolution
     requests = random_requests(inflated.occupancy, RULE, REQUESTS, np.random.default_rng(0))
     optima = [shortest_distances(inflated, goal, RULE)[start[::-1]] for start, goal in requests]
     print(f"{Path(path).stem}: {len(requests)} requests, robot_radius {radius} m")
-    measured = {weight: measure(path, grid, radius, weight, requests, optima) for weight in WEIGHTS}
+    planner, measured = Planner.load("any_map"), {}
+    for weight in WEIGHTS:
+        body = inflate(grid, radius, weight)
+        paths = [planner.plan(body, start, goal, RULE).cells for start, goal in requests]
+        measured[weight] = measure(paths, optima, metres, edge_distances(grid))
     plain = measured[0.0]
     for weight, of_paths in measured.items():
         print(
@@ -66,7 +69,7 @@ def main(arguments: Sequence[str]) -> int:
             f"{of_paths.mean / plain.mean:.2f} of without; between it and the body "
             f"{(of_paths.mean - radius) / (plain.mean - radius):.2f} of without"
         )
-    bound = greatest_distance(inflated, metres_of(grid), requests, MAX_RATIO)
+    bound = greatest_distance(inflated, metres, requests, MAX_RATIO)
     print(
         f"no paths of {MAX_RATIO} times the least total length have a mean distance above "
         f"{bound:.3f} m, {bound / plain.mean:.2f} of without"
@@ -75,40 +78,19 @@ def main(arguments: Sequence[str]) -> int:
 
 
 def measure(
-    path: str,
-    grid: GridMap,
-    radius: float,
-    weight: float,
-    requests: Sequence[tuple[Cell, Cell]],
+    paths: Sequence[Sequence[Cell]],
     optima: Sequence[float],
+    metres: NDArray[np.float64],
+    edges: NDArray[np.float64],
 ) -> Measured:
-    """Ask a planner node for all paths."""
-    metres, edges = metres_of(grid), edge_distances(grid)
-    quiet = ("--log-level", "error")
-    distances, edge, ratios = [], [], []
-    with (
-        claim_ros_domain(),
-        Client() as client,
-        running_node("map_server_node", *quiet, yaml_filename=Path(path).resolve()),
-        running_node("planner_node", *quiet, robot_radius=radius, clearance_weight=weight),
-    ):
-
-        def plan(start: Cell, goal: Cell) -> list[Cell]:
-            return cells_of(grid, client.get_plan(pose(grid, start), pose(grid, goal)))
-
-        wait_for("map", lambda: plan(*requests[0]))
-        for (start, goal), optimum in zip(requests, optima, strict=True):
-            cells = plan(start, goal)
-            distances += [metres[y, x] for x, y in cells]
-            edge += [edges[y, x] for x, y in cells]
-            ratios.append(path_length(cells) / optimum if cells else np.inf)
-    return Measured(min(distances), float(np.mean(distances)), min(edge), np.array(ratios))
-
-
-def metres_of(grid: GridMap) -> NDArray[np.float64]:
-    """Return the distance from each cell to the nearest obstacle, metres."""
-    distance: NDArray[np.float64] = clearance(grid.occupancy) * grid.resolution
-    return distance
+    """Measure all paths; empty ones are requests that were not solved."""
+    ratios = [
+        path_length(cells) / optimum if cells else np.inf
+        for cells, optimum in zip(paths, optima, strict=True)
+    ]
+    x, y = np.transpose([cell for cells in paths for cell in cells])
+    distances = metres[y, x]
+    return Measured(distances.min(), distances.mean(), edges[y, x].min(), np.array(ratios))
 
 
 def edge_distances(grid: GridMap) -> NDArray[np.float64]:
@@ -154,4 +136,4 @@ def greatest_distance(
 
 
 if __name__ == "__main__":
-    run_script(main)
+    sys.exit(main(sys.argv[1:]))

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import itertools
-import threading
 from collections.abc import Sequence
+from contextlib import suppress
 from typing import Any
 
 import numpy as np
-from client import SERVICE_QUALITY, TIMEOUT, Client, plan_request
+from client import SERVICE_QUALITY, TIMEOUT, Client, plan_request, wait_for
 from map_fixture import MapFixture, generated_map
 from nav_msgs.srv import GetPlan
 
@@ -33,23 +33,19 @@ class BurstClients(Client):
             self.node.create_client(service_type, service, qos_profile=SERVICE_QUALITY)
             for _ in range(clients)
         ]
+        # Made after them: the node knows them all when it knows this one.
+        self.service(service_type, service)
         for client in self._clients:
             client.wait_for_service(TIMEOUT)
 
     def burst(self, requests: Sequence[Any]) -> list[Any]:
         """Send all requests, the clients in turn; return the answers, None where it is lost."""
-        answered = threading.Semaphore(0)
-        pending = []
-        for client, request in zip(itertools.cycle(self._clients), requests, strict=False):
-            future = client.call_async(request)
-            future.add_done_callback(lambda _: answered.release())
-            pending.append((client, future))
-        for _ in pending:
-            if not answered.acquire(timeout=TIMEOUT):
-                break
+        asked = zip(itertools.cycle(self._clients), requests, strict=False)
+        pending = [(client, client.call_async(request)) for client, request in asked]
+        with suppress(TimeoutError):
+            wait_for("answers", lambda: all(future.done() for _, future in pending))
         for client, future in pending:
-            if not future.done():
-                client.remove_pending_request(future)
+            client.remove_pending_request(future)
         return [future.result() for _, future in pending]
 
 

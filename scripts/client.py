@@ -7,7 +7,6 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable, Iterable
-from contextlib import suppress
 from subprocess import Popen
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -121,7 +120,6 @@ class Client:
         self._thread = threading.Thread(target=self._spin, daemon=True)
         self._thread.start()
         self._services: dict[str, Any] = {}
-        self._answered: set[str] = set()
         self._publishers: dict[str, Any] = {}
 
     def __enter__(self) -> Self:
@@ -145,38 +143,49 @@ class Client:
                 raise
 
     def service(self, service_type: Any, name: str) -> Any:
-        """Return rclpy's client of a service, always the same one, once the service is there."""
+        """Return rclpy's client of a service, always the same one, once node and client are ready.
+
+        The middleware drops the answer to a client that the node has not discovered yet, which a
+        busy machine delays.
+        """
+        service = self._services.get(name) or self.node.create_client(
+            service_type, name, qos_profile=SERVICE_QUALITY
+        )
+        wait_for(f"service {name}", service.service_is_ready)
         if name not in self._services:
-            self._services[name] = self.node.create_client(
-                service_type, name, qos_profile=SERVICE_QUALITY
-            )
-        # It looks four times per second only: a service that is called at the very moment when it
-        # is found may not know its client yet, and the answer is lost.
-        if not self._services[name].wait_for_service(TIMEOUT):
-            raise TimeoutError(f"no service {name} within {TIMEOUT:.0f} s")
-        return self._services[name]
+            self.wait_for_discovery(name.rpartition("/")[0])
+            self._services[name] = service
+        return service
+
+    def wait_for_discovery(self, node: str) -> None:
+        """Wait until a node has discovered all that this client has created so far.
+
+        It discovers in the order of creation. So it knows all the rest when it answers a client
+        that is new, and whose question changes nothing: it may be asked again.
+        """
+        probe = self.node.create_client(GetParameters, f"{node}/get_parameters")
+        wait_for(f"parameters of {node}", probe.service_is_ready)
+        answered = threading.Event()
+
+        def asked() -> bool:
+            probe.call_async(GetParameters.Request()).add_done_callback(lambda _: answered.set())
+            return answered.wait(1.0)
+
+        wait_for(f"discovery by {node}", asked)
+        self._executor.create_task(self.node.destroy_client, probe)  # its thread may hold it
 
     def call(
         self, service_type: Any, name: str, request: Any = None, timeout: float = TIMEOUT
     ) -> Any:
-        """Wait for a service, call it, and return its response; or raise TimeoutError.
-
-        The middleware drops the answer to a client that the node has not discovered yet, which a
-        busy machine delays. So the first call of a service asks again; the first answer counts.
-        """
+        """Wait for a service, call it, and return its response; or raise TimeoutError."""
         service, answers = self.service(service_type, name), queue.SimpleQueue[Any]()
-        waits = [timeout] if name in self._answered else [timeout / 4, 3 * timeout / 4]
-        futures = []
-        for wait in waits:
-            futures.append(service.call_async(request or service_type.Request()))
-            futures[-1].add_done_callback(answers.put)
-            with suppress(queue.Empty):
-                answer = answers.get(timeout=wait)
-                self._answered.add(name)
-                return answer.result()
-        for future in futures:
+        future = service.call_async(request or service_type.Request())
+        future.add_done_callback(answers.put)
+        try:
+            return answers.get(timeout=timeout).result()
+        except queue.Empty:
             service.remove_pending_request(future)
-        raise TimeoutError(f"no answer from {name} within {timeout:.0f} s")
+            raise TimeoutError(f"no answer from {name} within {timeout:.0f} s") from None
 
     def publisher(self, message_type: Any, topic: str, qos: Any = 10, listeners: int = 1) -> Any:
         """Return a publisher, always the same one per topic, once so many listen."""

@@ -14,15 +14,14 @@ import tempfile
 import time
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack, suppress
-from dataclasses import astuple, dataclass, fields
+from dataclasses import dataclass
 from functools import partial
 from itertools import cycle, islice
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 from client import Client, initial_pose, plan_request, pose, wait_for
-from demo import start_and_goal
 from map_fixture import RULE, MapFixture
 from nav_msgs.msg import OccupancyGrid
 from nav_msgs.msg import Path as PathMessage
@@ -32,12 +31,12 @@ from rcl_interfaces.srv import GetParameters, SetParameters
 from rclpy.parameter import Parameter
 from std_srvs.srv import Trigger
 
-from ddqn_planner.grid import OCCUPIED, Cell, MapFile, load_map, read_map_file, save_map
+from ddqn_planner.grid import OCCUPIED, Cell, MapFile, save_map
 from ddqn_planner.grid.generators import generate_map, random_requests
+from ddqn_planner.grid.noise import MAX_NEW_OBSTACLES
 from ddqn_planner.model import load_model
 from ddqn_planner.nodes.runtime import LATCHED
-from ddqn_planner.resources import find_map
-from ddqn_planner.training.environment import Scenario
+from ddqn_planner.training.environment import paper_scenario
 from ddqn_planner.training.trainer import Trainer
 
 KILLS = 50
@@ -57,7 +56,6 @@ LAST_WAIT = 0.5
 """Seconds that a client waits after a kill until it gives up."""
 
 GET_PLAN = "planner/get_plan"
-T = TypeVar("T")
 
 
 @dataclass
@@ -112,11 +110,9 @@ class Faults:
         self.map_path, self.training_folder = folder / "map.yaml", folder / "training"
         occupancy = generate_map("office", (SIDE, SIDE), self._random)
         (self._watched,) = random_requests(occupancy, RULE, 1, self._random)
-        values = np.where(occupancy, np.int8(100), np.int8(0))
-        start, goal = self._watched
-        save_map(MapFile(values, start=start, goal=goal), self.map_path)
-        self._map = MapFixture(read_map_file(self.map_path))
-        self._scenario = Scenario(load_map(find_map("dilemma")), *start_and_goal("dilemma"))
+        map_file = MapFile(OCCUPIED * occupancy, 1.0, (0.0, 0.0, 0.0), *self._watched)
+        save_map(map_file, self.map_path)
+        self._map = MapFixture(map_file)
         self.tallies = {
             self.kill_planner: Tally("planner_node", "planning"),
             self.kill_map_server: Tally("map_server_node", "publishing"),
@@ -148,16 +144,16 @@ class Faults:
         service_type: Any,
         name: str,
         request: Any = None,
-        accept: Callable[[Any], T | None] = lambda answer: answer,
+        accept: Callable[[Any], Any] = bool,
         try_time: float = TRY_TIME,
-    ) -> T:
-        """Ask until an answer is accepted; return what `accept` returned."""
+    ) -> Any:
+        """Ask until an answer is accepted; return it."""
 
-        def answer() -> T | None:
+        def answer() -> Any:
             with suppress(TimeoutError):
-                accepted = accept(self.client.call(service_type, name, request, try_time))
-                if accepted:
-                    return accepted
+                found = self.client.call(service_type, name, request, try_time)
+                if accept(found):
+                    return found
             time.sleep(0.05)
             return None
 
@@ -165,37 +161,32 @@ class Faults:
 
     def ask_for_plan(self, start: Cell, goal: Cell) -> PathMessage:
         """Ask for a plan until there is one."""
-        request = self.request(start, goal)
-        return self.ask(GetPlan, GET_PLAN, request, lambda a: a.plan if a.plan.poses else None)
+        request = plan_request(self._map.grid, start, goal)
+        return self.ask(GetPlan, GET_PLAN, request, lambda answer: answer.plan.poses).plan
 
     def trigger(self, name: str, try_time: float = TRY_TIME) -> str:
         """Call a Trigger service until it succeeds; return its message."""
-        answer = self.ask(
-            Trigger, name, accept=lambda a: a if a.success else None, try_time=try_time
-        )
+        answer = self.ask(Trigger, name, None, lambda answer: answer.success, try_time)
         return str(answer.message)
 
     def parameter(self, node: str, name: str) -> Any:
         """Return a parameter's value message."""
         request = GetParameters.Request(names=[name])
-        return self.ask(GetParameters, f"{node}/get_parameters", request, lambda a: a.values[0])
-
-    def request(self, start: Cell, goal: Cell) -> GetPlan.Request:
-        """Return a request for a plan between two cells."""
-        return plan_request(self._map.grid, start, goal)
+        return self.ask(GetParameters, f"{node}/get_parameters", request).values[0]
 
     def is_right(self, plan: Any, start: Cell, goal: Cell) -> bool:
         """Say whether a plan leads from the start to the goal by legal moves on the map.
 
         A plan of a map with new obstacles must be right on the map without them too.
         """
-        return bool(plan.poses) and not self._map.error(self.request(start, goal), plan)
+        request = plan_request(self._map.grid, start, goal)
+        return bool(plan.poses) and not self._map.error(request, plan)
 
     def is_whole(self, message: OccupancyGrid) -> bool:
         """Say whether a map is the loaded one with at most five obstacles more."""
         values = np.frombuffer(message.data, np.int8).reshape(self._map.values.shape)
-        new = values != self._map.values
-        return bool((values[new] == OCCUPIED).all()) and int(new.sum()) <= 5
+        new = values[values != self._map.values]
+        return bool((new == OCCUPIED).all()) and len(new) <= MAX_NEW_OBSTACLES
 
     # Killing
 
@@ -205,26 +196,27 @@ class Faults:
         self.trigger("/training/trainer/start", START_TIME)
         self.parameter("/training/planner", "model")
 
-    def count(self, tally: Tally, service: Any, futures: Sequence[Any]) -> list[Any]:
-        """Count the answers that came before a kill, and the time-outs; return the answers."""
-        answers = [future.result() for future in futures if future.done()]
-        tally.answers += len(answers)
-        tally.time_outs += len(futures) - len(answers)
-        for future in futures:
+    def kill(self, node: Killed, tally: Tally, calls: Sequence[tuple[Any, Any]]) -> list[Any]:
+        """Kill a node under calls, which are pairs of a service and a future.
+
+        Count the answers that came before, and the time-outs; return the answers, or None.
+        """
+        node.kill()
+        time.sleep(LAST_WAIT)
+        for service, future in calls:
+            tally.answers += future.done()
+            tally.time_outs += not future.done()
             service.remove_pending_request(future)
-        return answers
+        return [future.result() for _, future in calls]
 
     def kill_planner(self, tally: Tally) -> None:
         """Kill the planner while it plans toward goals that it does not know."""
-        get_plan = self.client.service(GetPlan, GET_PLAN)
-        asked = random_requests(self._map.grid.occupancy, RULE, GOALS, self._random)
-        futures = [get_plan.call_async(self.request(*cells)) for cells in asked]
+        get_plan, grid = self.client.service(GetPlan, GET_PLAN), self._map.grid
+        asked = random_requests(grid.occupancy, RULE, GOALS, self._random)
+        calls = [(get_plan, get_plan.call_async(plan_request(grid, *cells))) for cells in asked]
         time.sleep(self._draw.uniform(0.0, 1.0))
-        self.planner.kill()
-        time.sleep(LAST_WAIT)
-        for cells, future in zip(asked, futures, strict=True):
-            for answer in self.count(tally, get_plan, [future]):
-                tally.wrong_paths += not self.is_right(answer.plan, *cells)
+        for cells, answer in zip(asked, self.kill(self.planner, tally, calls), strict=True):
+            tally.wrong_paths += answer is not None and not self.is_right(answer.plan, *cells)
         self.planner.start()
         plan = self.ask_for_plan(*asked[0])
         tally.wrong_paths += not self.is_right(plan, *asked[0])
@@ -234,18 +226,15 @@ class Faults:
         """Kill the map server while it loads, scatters over and restores its map."""
         self.plan_for_active_goal()
         load = LoadMap.Request(map_url=str(self.map_path))
-        calls = [
+        requests = [
             *[(self.client.service(Trigger, "map_server/restore_map"), Trigger.Request())] * 20,
             *[(self.client.service(LoadMap, "map_server/load_map"), load)] * 4,
             (self.client.service(Trigger, "map_server/scatter_obstacles"), Trigger.Request()),
         ]
-        self._draw.shuffle(calls)
-        futures = [(service, service.call_async(request)) for service, request in calls]
+        self._draw.shuffle(requests)
+        calls = [(service, service.call_async(request)) for service, request in requests]
         time.sleep(self._draw.uniform(0.0, 2.0))
-        self.map_server.kill()
-        time.sleep(LAST_WAIT)
-        for service, future in futures:
-            self.count(tally, service, [future])
+        self.kill(self.map_server, tally, calls)
         # When that is answered, the plans of the last maps are out.
         self.ask_for_plan(*self._watched)
         whole = self.is_whole(self.maps.wait())
@@ -273,17 +262,15 @@ class Faults:
         """Kill the trainer while it saves after each step, soon after a save was seen to begin."""
         save = self.client.service(Trigger, "/training/trainer/save")
         until = time.monotonic() + self._draw.uniform(0.2, 1.2)
-        futures = []
+        calls = []
         while time.monotonic() < until:
-            futures.append(save.call_async(Trigger.Request()))
+            calls.append((save, save.call_async(Trigger.Request())))
             time.sleep(0.002)
         while not self.temporaries() and time.monotonic() < until + LAST_WAIT:
             pass
         time.sleep(self._draw.uniform(0.0, 0.002))
-        self.trainer.kill()
+        self.kill(self.trainer, tally, calls)
         tally.in_a_save += bool(self.temporaries())
-        time.sleep(LAST_WAIT)
-        self.count(tally, save, futures)
         steps = self.saved_steps()
         self.trainer.start()
         self.parameter("/training/trainer", "seed")
@@ -304,26 +291,24 @@ class Faults:
             load_model(model)
         if not checkpoint.exists():
             return 0
-        return Trainer.load_checkpoint(checkpoint, [self._scenario]).steps
+        return Trainer.load_checkpoint(checkpoint, [paper_scenario()]).steps
 
     def follow(self) -> None:
         """Wait until the planner that follows the trainer has loaded a model of its."""
         other = Parameter("model", value="any_map").to_parameter_msg()
         request = SetParameters.Request(parameters=[other])
         name = "/training/planner/set_parameters"
-        self.ask(SetParameters, name, request, lambda a: a.results[0].successful)
+        self.ask(SetParameters, name, request, lambda answer: answer.results[0].successful)
         self.trigger("/training/trainer/save")
         saved = str(self.training_folder / "model.safetensors")
-        wait_for(
-            "model", lambda: self.parameter("/training/planner", "model").string_value == saved
-        )
+        model = partial(self.parameter, "/training/planner", "model")
+        wait_for("model", lambda: model().string_value == saved)
 
 
 def show(tallies: Sequence[Tally]) -> None:
     """Print the table."""
-    names = [field.name for field in fields(Tally)]
-    rows = [names, *([str(value) for value in astuple(tally)] for tally in tallies)]
-    rows[0] = [name.replace("_", " ") for name in names]
+    names = [name.replace("_", " ") for name in vars(tallies[0])]
+    rows = [names, *([str(value) for value in vars(tally).values()] for tally in tallies)]
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     for row in rows:
         print("  ".join(text.ljust(width) for text, width in zip(row, widths, strict=True)))

@@ -12,9 +12,8 @@ import itertools
 import multiprocessing
 import signal
 import time
-from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -38,6 +37,7 @@ from nav_msgs.srv import GetPlan
 from processes import claim_ros_domain, memory, run_script, running_node
 from rclpy.qos import DurabilityPolicy, QoSProfile
 
+from ddqn_planner.grid import connected_cells
 from ddqn_planner.grid.generators import random_requests
 from ddqn_planner.nodes.runtime import LATCHED
 
@@ -50,15 +50,6 @@ GOALS, GOALS_PERIOD = 2000, 0.005
 
 
 @dataclass
-class Result:
-    """What became of requests: how many, how long each took, and what is wrong."""
-
-    counts: Counter[str] = field(default_factory=Counter)
-    milliseconds: list[float] = field(default_factory=list)
-    errors: list[str] = field(default_factory=list)
-
-
-@dataclass
 class Shared:
     """What the processes tell each other."""
 
@@ -66,13 +57,20 @@ class Shared:
     done: Any  # how many requests were answered or lost
     confirmed: Any  # the number of the last map that the planner is known to have
     published: Any  # the number of the last map that was published
-    results: Any  # a queue of a `Result` per process
+    results: Any  # a queue of what `ask` puts into it per process
 
 
 def ask(seed: int, count: int, shared: Shared) -> None:
-    """Ask for plans, check each, and put a `Result` into the queue: the work of one process."""
+    """Ask for plans and check each answer: the work of one process.
+
+    It puts into the queue how long each answer took in milliseconds, how many were empty, and what
+    is wrong with requests that were lost or answered wrong.
+    """
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # it ends with its parent
-    random, maps, result = np.random.default_rng(seed), three_maps(), Result()
+    random, maps = np.random.default_rng(seed), three_maps()
+    milliseconds: list[float] = []
+    errors: list[str] = []
+    empty = 0
     goals = [
         [goal for _, goal in random_requests(m.grid.occupancy, RULE, GOALS_PER_MAP, random)]
         for m in maps
@@ -91,22 +89,17 @@ def ask(seed: int, count: int, shared: Shared) -> None:
             try:
                 plan = client.call(GetPlan, "planner/get_plan", request).plan
             except TimeoutError as error:
-                result.counts["lost"] += 1
-                result.errors.append(f"{start} to {goal} on map {current}: {error}")
-                continue
-            finally:
-                took = 1e3 * (time.perf_counter() - began)
-                with shared.done.get_lock():
-                    shared.done.value += 1
-            result.milliseconds.append(took)
-            result.counts["answered"] += 1
-            result.counts["paths" if plan.poses else "empty"] += 1
-            possible = {n % len(maps) for n in range(first, shared.published.value + 1)}
-            errors = [maps[number].error(request, plan) for number in possible]
-            if all(errors):
-                result.counts["wrong"] += 1
-                result.errors.append(f"on map {first} or later: {errors[0]}")
-    shared.results.put(result)
+                errors.append(f"{start} to {goal} on map {current}: {error}")
+            else:
+                milliseconds.append(1e3 * (time.perf_counter() - began))
+                empty += not plan.poses
+                possible = {n % len(maps) for n in range(first, shared.published.value + 1)}
+                wrong = [maps[number].error(request, plan) for number in possible]
+                if all(wrong):
+                    errors.append(f"on map {first} or later: {wrong[0]}")
+            with shared.done.get_lock():
+                shared.done.value += 1
+    shared.results.put((milliseconds, empty, errors))
 
 
 def load_requests(planner: int, requests: int, clients: int) -> bool:
@@ -151,29 +144,27 @@ def load_requests(planner: int, requests: int, clients: int) -> bool:
             time.sleep(0.005)
         seconds = time.monotonic() - began
         last_memory = memory(planner)
-    total = Result()
-    for _ in processes:
-        result = shared.results.get(timeout=TIMEOUT)  # fails if a process did
-        total.counts += result.counts
-        total.milliseconds += result.milliseconds
-        total.errors += result.errors
+    # It fails if a process did.
+    results = [shared.results.get(timeout=TIMEOUT) for _ in processes]
     for process in processes:
         process.join()
-    for error in total.errors[:10]:
+    times, empty, errors = zip(*results, strict=True)
+    milliseconds, wrong_or_lost = np.concatenate(times), list(itertools.chain(*errors))
+    for error in wrong_or_lost[:10]:
         print(error)
-    median, slow = np.percentile(total.milliseconds, (50, 99))
+    lost = requests - len(milliseconds)
+    median, slow = np.percentile(milliseconds, (50, 99))
     print(
         f"GetPlan: {requests} requests of {clients} processes in {seconds:.0f} s, "
         f"{number - len(maps)} changes of the map\n"
-        f"  answered {total.counts['answered']}, lost {total.counts['lost']}, "
-        f"wrong {total.counts['wrong']}\n"
-        f"  paths {total.counts['paths']}, empty answers {total.counts['empty']}\n"
+        f"  answered {len(milliseconds)}, lost {lost}, wrong {len(wrong_or_lost) - lost}\n"
+        f"  paths {len(milliseconds) - sum(empty)}, empty answers {sum(empty)}\n"
         f"  latency median {median:.1f} ms, 99 % {slow:.1f} ms\n"
         f"  planner's resident memory {first_memory:.0f} MB after {WARM_UP:.0%} of them, "
         f"{last_memory:.0f} MB at the end: {last_memory / first_memory - 1:+.1%}",
         flush=True,
     )
-    return total.counts["answered"] == requests and not total.counts["wrong"]
+    return not wrong_or_lost
 
 
 def load_goals(goals: int) -> bool:
@@ -184,7 +175,7 @@ def load_goals(goals: int) -> bool:
     office = three_maps()[2]
     grid, random = office.grid, np.random.default_rng(0)
     ((start, _),) = random_requests(grid.occupancy, RULE, 1, random)
-    rows, columns = np.nonzero(office.labels == office.labels[start[1], start[0]])
+    rows, columns = np.nonzero(connected_cells(grid.occupancy, start, RULE))
     chosen = random.permutation(len(rows))[:goals]
     cells = list(zip(columns[chosen].tolist(), rows[chosen].tolist(), strict=True))
     numbers = {cell: number for number, cell in enumerate(cells)}

@@ -22,7 +22,7 @@ def office_map() -> MapFile:
     """Return an office building of 28.8 m x 19.2 m in cells of 0.05 m."""
     plan = generate_map("office", COARSE, np.random.default_rng(SEED))
     occupancy = np.kron(plan, np.ones((SCALE, SCALE), dtype=np.bool_))
-    return MapFile(np.where(occupancy, np.int8(OCCUPIED), np.int8(0)), 0.05, start=START, goal=GOAL)
+    return MapFile(OCCUPIED * occupancy, 0.05, start=START, goal=GOAL)
 
 
 def main() -> None:

@@ -2,18 +2,15 @@
 
 from __future__ import annotations
 
-from functools import cached_property
 from itertools import pairwise
 
 import numpy as np
 from client import cell_of, cells_of, map_message
 from nav_msgs.msg import OccupancyGrid, Path
 from nav_msgs.srv import GetPlan
-from numpy.typing import NDArray
 
 from ddqn_planner.grid import MOVES, MapFile, MoveRule, legal_moves, read_map_file
 from ddqn_planner.grid.generators import generate_map
-from ddqn_planner.grid.moves import component_labels
 from ddqn_planner.resources import find_map
 
 RULE = MoveRule.ROBOT_SAFE
@@ -30,16 +27,7 @@ class MapFixture:
         resolution = float(np.float32(map_file.resolution))
         self.values = map_file.values
         self.grid = MapFile(map_file.values, resolution, map_file.origin).grid()
-
-    @cached_property
-    def legal(self) -> NDArray[np.bool_]:
-        """(8, H, W) bool: which moves are legal."""
-        return legal_moves(self.grid.occupancy, RULE)
-
-    @cached_property
-    def labels(self) -> NDArray[np.int32]:
-        """(H, W) int32: which part of the map each cell belongs to."""
-        return component_labels(self.grid.occupancy, RULE)
+        self._legal = legal_moves(self.grid.occupancy, RULE)
 
     def message(self, stamp: int = 0) -> OccupancyGrid:
         """Return the map message, stamped with a number of seconds."""
@@ -48,11 +36,9 @@ class MapFixture:
     def error(self, request: GetPlan.Request, plan: Path) -> str:
         """Say what is wrong with an answer; "" if nothing is."""
         start, goal = (cell_of(self.grid, pose) for pose in (request.start, request.goal))
-        possible = (
-            self.grid.is_free(start)
-            and self.grid.is_free(goal)
-            and self.labels[start[1], start[0]] == self.labels[goal[1], goal[0]]
-        )
+        labels = self.grid.labels(RULE)
+        both_free = self.grid.is_free(start) and self.grid.is_free(goal)
+        possible = both_free and labels[start[::-1]] == labels[goal[::-1]]
         cells = cells_of(self.grid, plan)
         if not cells:
             return f"no path from {start} to {goal}, where there is one" if possible else ""
@@ -60,7 +46,7 @@ class MapFixture:
             return f"a path from {cells[0]} to {cells[-1]}, asked was {start} to {goal}"
         for (x, y), (next_x, next_y) in pairwise(cells):
             action = ACTIONS.get((next_x - x, next_y - y))
-            if action is None or not self.grid.contains((x, y)) or not self.legal[action, y, x]:
+            if action is None or not self.grid.contains((x, y)) or not self._legal[action, y, x]:
                 return f"an illegal move from {(x, y)} to {(next_x, next_y)}"
         return ""
 
@@ -68,7 +54,7 @@ class MapFixture:
 def generated_map(kind: str, side: int, resolution: float = 0.05) -> MapFixture:
     """Return a square map of a kind, always the same one."""
     occupancy = generate_map(kind, (side, side), np.random.default_rng(0))
-    return MapFixture(MapFile(np.where(occupancy, np.int8(100), np.int8(0)), resolution))
+    return MapFixture(MapFile(100 * occupancy, resolution))
 
 
 def three_maps() -> list[MapFixture]:

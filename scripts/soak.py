@@ -7,11 +7,12 @@ the last tenth of what is left may lie no more than 5 % above that of its first 
 from __future__ import annotations
 
 import math
+import random
 import statistics
 import tempfile
 import time
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
 from subprocess import Popen
@@ -39,6 +40,12 @@ MAX_GROWTH = 0.05
 STEADY_FIELDS = 8
 """Fields that are computed before each sample."""
 
+SHARES = {
+    **dict.fromkeys(("map", "noise", "model", "parameters", "bad input"), 1),
+    **{"start": 3, "goal": 5, "plan": 8},
+}
+"""How often each kind of work is drawn."""
+
 Samples = dict[str, list[float]]
 
 
@@ -48,7 +55,7 @@ class Work:
     def __init__(self, client: Client, folder: Path) -> None:
         self._client = client
         self._diagnostics = client.subscribe(DiagnosticArray, "/diagnostics", keep=1)
-        self._random = np.random.default_rng(0)
+        self._draw = random.Random(0)
         self._maps = three_maps()
         self._paths = [folder / f"{number}.yaml" for number in range(len(self._maps))]
         for path, fixture in zip(self._paths, self._maps, strict=True):
@@ -56,83 +63,52 @@ class Work:
             start, goal, *_ = grid.free_cells()
             save_map(MapFile(fixture.values, grid.resolution, grid.origin, start, goal), path)
         grid = self._maps[-1].grid
-        cells = random_requests(grid.occupancy, RULE, STEADY_FIELDS, self._random)
+        cells = random_requests(grid.occupancy, RULE, STEADY_FIELDS, np.random.default_rng(0))
         self._steady = [plan_request(grid, *both) for both in cells]
         self._bad_map = folder / "bad.yaml"
         self._bad_map.write_text("image: [", encoding="utf-8")
         self.lost = 0
         self.done: Counter[str] = Counter()
-        self._kinds: list[Callable[[], object]] = [
-            self.load_map,
-            self.scatter_and_restore,
-            self.reload_model,
-            self.set_parameters,
-            self.bad_input,
-            *3 * [self.start],
-            *5 * [self.goal],
-            *8 * [self.get_plan],
-        ]
 
     def __call__(self) -> None:
         """Do one piece of work; count it as lost if it has no answer."""
-        kind = self._kinds[self._random.integers(len(self._kinds))]
-        self.done[kind.__name__] += 1
+        (kind,) = self._draw.choices([*SHARES], [*SHARES.values()])
+        self.done[kind] += 1
         self.lost += 1
         with suppress(TimeoutError):
-            kind()
+            self._do(kind)
             self.lost -= 1
+
+    def _do(self, kind: str) -> None:
+        client, draw = self._client, self._draw
+        match kind:
+            case "map":
+                self._load(draw.choice(self._paths))
+            case "noise":
+                name = draw.choice(("scatter_obstacles", "restore_map"))
+                client.call(Trigger, f"map_server/{name}")
+            case "model":
+                client.call(Trigger, "planner/reload_model")
+            case "parameters":
+                rule, threshold = draw.choice([*MoveRule]).value, draw.randint(1, 100)
+                client.set_parameters("planner", move_rule=rule, occupied_threshold=threshold)
+            case "bad input":
+                self.bad_input()
+            case "start":
+                client.publish("initialpose", initial_pose(self._pose()))
+            case "goal":
+                client.publish("goal_pose", self._pose())
+            case "plan":
+                client.get_plan(self._pose(), self._pose())
 
     def settle(self) -> None:
         """Bring the nodes to the same state: the memory depends on the fields that are kept."""
         self._client.set_parameters("planner", move_rule="", occupied_threshold=65)
-        self.reload_model()  # it forgets all fields
+        self._do("model")  # loaded again, it forgets all fields
         loaded = self._load(self._paths[-1])
         wait_for_map(self._diagnostics, loaded.map.header.stamp)
         for steady in self._steady:
             self._client.call(GetPlan, "planner/get_plan", steady)
-
-    def _load(self, path: Path) -> Any:
-        request = LoadMap.Request(map_url=str(path))
-        return self._client.call(LoadMap, "map_server/load_map", request)
-
-    def _pose(self) -> PoseStamped:
-        fixture = self._maps[self._random.integers(len(self._maps))]
-        height, width = fixture.values.shape
-        cell = int(self._random.integers(width)), int(self._random.integers(height))
-        return pose(fixture.grid, cell)
-
-    def load_map(self) -> None:
-        """Load one of the maps."""
-        self._load(self._paths[self._random.integers(len(self._paths))])
-
-    def scatter_and_restore(self) -> None:
-        """Scatter obstacles over the map, or take them away."""
-        name = self._random.choice(["scatter_obstacles", "restore_map"])
-        self._client.call(Trigger, f"map_server/{name}")
-
-    def reload_model(self) -> None:
-        """Load the model again."""
-        self._client.call(Trigger, "planner/reload_model")
-
-    def set_parameters(self) -> None:
-        """Set the planner's move rule and threshold."""
-        self._client.set_parameters(
-            "planner",
-            move_rule=str(self._random.choice([rule.value for rule in MoveRule])),
-            occupied_threshold=int(self._random.integers(1, 101)),
-        )
-
-    def start(self) -> None:
-        """Publish a start."""
-        self._client.publish("initialpose", initial_pose(self._pose()))
-
-    def goal(self) -> None:
-        """Publish a goal."""
-        self._client.publish("goal_pose", self._pose())
-
-    def get_plan(self) -> None:
-        """Ask for a plan."""
-        self._client.get_plan(self._pose(), self._pose())
 
     def bad_input(self) -> None:
         """Give each input once as it must not be."""
@@ -148,6 +124,14 @@ class Work:
         self._client.set_parameters(
             "planner", move_rule="flying", occupied_threshold=0, model="no_such_model"
         )
+
+    def _load(self, path: Path) -> Any:
+        request = LoadMap.Request(map_url=str(path))
+        return self._client.call(LoadMap, "map_server/load_map", request)
+
+    def _pose(self) -> PoseStamped:
+        grid = self._draw.choice(self._maps).grid
+        return pose(grid, (self._draw.randrange(grid.width), self._draw.randrange(grid.height)))
 
 
 def soak(children: dict[str, Popen[bytes]], work: Work, minutes: float) -> Samples:

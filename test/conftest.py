@@ -6,6 +6,7 @@ import signal
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import hypothesis
 import numpy as np
@@ -36,13 +37,31 @@ NOBODY = 65534
 NOT_SOURCE = (".*", "__pycache__", "*.egg-info", "build", "dist", "install", "log", "runs")
 
 
-@pytest.hookimpl(tryfirst=True)  # before pytest-xdist reads the groups
+ANY_WORKER = {"test_cli.py", "test_demo.py", "test_load.py", "test_memory.py", "test_trainer.py"}
+"""Files whose tests take long and share nothing; the tests of another file share a worker."""
+
+
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Put the slow tests last, each on any worker; keep the others of a file on one worker."""
-    for item in items:
-        if not (item.get_closest_marker("slow") or item.get_closest_marker("xdist_group")):
-            item.add_marker(pytest.mark.xdist_group(item.path.stem))
-    items.sort(key=lambda item: item.get_closest_marker("slow") is not None)
+    """Put the slow tests last, the longest of them first: so the workers end at the same time."""
+
+    def order(item: pytest.Item) -> tuple[bool, int]:
+        slow = item.get_closest_marker("slow")
+        return slow is not None, -slow.kwargs.get("seconds", 0) if slow else 0
+
+    items.sort(key=order)
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
+    """Give the tests of a file to one worker, where they share nodes and models."""
+    from xdist.scheduler import LoadScopeScheduling
+
+    class Scheduling(LoadScopeScheduling):
+        def _split_scope(self, nodeid: str) -> str:
+            file = nodeid.partition("::")[0]
+            return nodeid if Path(file).name in ANY_WORKER else file
+
+    return Scheduling(config, log)
 
 
 @pytest.fixture

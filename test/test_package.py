@@ -72,7 +72,6 @@ PIP = [sys.executable, "-m", "pip", "--quiet"]
 
 # --user and Debian's Python install beside another share folder than the interpreter's, as the
 # last two do.
-@pytest.mark.xdist_group("wheel")
 @pytest.mark.slow
 @pytest.mark.parametrize("option", [None, "--target", "--prefix"])
 def test_maps_and_models_come_along_wherever_pip_installs(
@@ -110,7 +109,6 @@ def test_maps_and_models_come_along_wherever_pip_installs(
 
 
 @pytest.mark.slow
-@pytest.mark.xdist_group("wheel")
 def test_the_command_of_the_wheel_plans_in_another_folder(wheel: Path, tmp_path: Path) -> None:
     environment, elsewhere = tmp_path / "environment", tmp_path / "elsewhere"
     elsewhere.mkdir()

@@ -13,26 +13,21 @@ from ddqn_planner.planning import QField
 
 @dataclass(frozen=True)
 class Evaluation:
-    """The greedy rollouts of one Q field."""
+    """The greedy rollouts of one Q field, from all cells with a path to the goal."""
 
     starts: int
-    """Free cells, except the goal, from which a path exists."""
     solved: int
     """The starts whose rollout reaches the goal."""
     mean_ratio: float
     worst_ratio: float
-    """Length of the solved rollouts over the optimum, at least 1; NaN if none is solved."""
+    """Of the solved rollouts, see `length_ratios`; NaN if none is solved."""
 
 
 def length_ratios(field: QField, grid: GridMap, move_rule: MoveRule) -> NDArray[np.float64]:
-    """Return the length of the greedy rollout from each cell over that of the shortest path.
+    """Return the cost of the greedy rollout from each cell over that of the best path: (H, W).
 
-    On a map with costs these are the costs of the rollout and of the cheapest path.
-
-    Returns
-    -------
-    (H, W) float64
-        At least 1; infinite if the rollout is trapped, NaN at the goal and in cells without a path.
+    Without costs on the map these are lengths. The ratio is infinite if the rollout is trapped, NaN
+    at the goal and in cells without a path.
     """
     optimum = shortest_distances(grid, field.goal, move_rule)
     ratios, multiplier = np.full(optimum.shape, np.nan), grid.cost_multiplier

@@ -7,6 +7,7 @@ import time
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import groupby
+from operator import itemgetter
 from pathlib import Path
 from typing import Any, Final, TypeAlias
 
@@ -91,23 +92,14 @@ COLUMNS: Final = {
 def measure(
     planner: Planner, maps: Iterable[BenchmarkMap], move_rule: MoveRule
 ) -> Iterator[Rollout]:
-    """Make a rollout for every request of every map.
-
-    Raises
-    ------
-    ValueError
-        If the model cannot plan on a map of such a size.
-    """
+    """Make a rollout for every request of every map; a ValueError if the model has another size."""
     warm = False
     for benchmark_map in maps:
-        grid, given = benchmark_map.grid, benchmark_map.optima
+        grid, requests, given = benchmark_map.grid, benchmark_map.requests, benchmark_map.optima
         legal = legal_moves(grid.occupancy, move_rule)
-        if given is None:
-            given = np.full(len(benchmark_map.requests), np.nan)
-        cases = sorted(
-            zip(benchmark_map.requests, given.tolist(), strict=True), key=lambda case: case[0][1]
-        )
-        for goal, of_goal in groupby(cases, key=lambda case: case[0][1]):
+        optima_given = [math.nan] * len(requests) if given is None else given.tolist()
+        cases = [(goal, start, o) for (start, goal), o in zip(requests, optima_given, strict=True)]
+        for goal, of_goal in groupby(sorted(cases, key=itemgetter(0)), key=itemgetter(0)):
             if not warm:  # the first field of a process also loads compiled code
                 compare_with_dijkstra(planner, grid, goal, move_rule)
                 warm = True
@@ -115,7 +107,7 @@ def measure(
                 planner, grid, goal, move_rule
             )
             unmasked = field.unmasked()
-            for (start, _), given_optimum in of_goal:
+            for _, start, given_optimum in of_goal:
                 began = time.perf_counter()
                 cells = field.rollout(start).cells
                 path_ms = 1e3 * (time.perf_counter() - began)

@@ -34,13 +34,7 @@ FILES: Final = {
 
 
 def find_files(folder: Path) -> list[Path]:
-    """Return the benchmark files of a folder and its subfolders.
-
-    Raises
-    ------
-    ValueError
-        If there is no such folder, or no map in it.
-    """
+    """Return the benchmark files of a folder and its subfolders; a ValueError without a map."""
     files = sorted(
         path for path in folder.rglob("*") if path.suffix.lower() in FILES and path.is_file()
     )
@@ -71,28 +65,22 @@ def read_maps(files: Sequence[Path], settings: RequestSettings) -> Iterator[Benc
         try:
             match path.suffix.lower():
                 case ".map":
-                    if scenario := scenarios.get(path.stem):
-                        yield _with_scenario(path, scenario, settings)
-                    else:
-                        yield _without_requests("movingai", path, settings)
+                    yield _map("movingai", path, scenarios.get(path.stem), settings)
+                case ".yaml" | ".yml":
+                    yield _map("ros", path, None, settings)
                 case ".npz":
                     yield from _mpd_maps(path, settings)
-                case ".yaml" | ".yml":
-                    yield _without_requests("ros", path, settings)
         except (OSError, ValueError) as error:
             known = "" if str(path) in str(error) else f"{path}: "
             tqdm.write(f"skipped: {known}{error}", file=sys.stderr)
 
 
-def _without_requests(set_name: str, path: Path, settings: RequestSettings) -> BenchmarkMap:
-    """Read a map whose benchmark gives no requests; each random request has its own goal."""
+def _map(kind: str, path: Path, scenario: Path | None, settings: RequestSettings) -> BenchmarkMap:
+    """Read a map, with requests of its scenario file, or random ones with a goal each."""
     occupancy, random = read_map_file(path).grid().occupancy, settings.random(path.stem)
-    name, goals = f"{set_name} {path.stem}", settings.requests
-    return with_random_requests(name, str(path), occupancy, goals, settings, random)
-
-
-def _with_scenario(path: Path, scenario: Path, settings: RequestSettings) -> BenchmarkMap:
-    occupancy, random = read_map_file(path).grid().occupancy, settings.random(path.stem)
+    name, goals = f"{kind} {path.stem}", settings.requests
+    if scenario is None:
+        return with_random_requests(name, str(path), occupancy, goals, settings, random)
     grid, rule = settings.grid(occupancy, random), settings.move_rule
     lines, precision = _read_scenario(scenario, grid, rule)
     lines.sort(key=lambda line: line[2])
@@ -103,7 +91,7 @@ def _with_scenario(path: Path, scenario: Path, settings: RequestSettings) -> Ben
     known = rule is MoveRule.ROBOT_SAFE and grid.cost is None
     optima = np.array([optimum for _, _, optimum in lines]) if known else None
     requests = [(start, goal) for start, goal, _ in lines]
-    return BenchmarkMap(f"movingai {path.stem}", str(path), grid, requests, optima, precision)
+    return BenchmarkMap(name, str(path), grid, requests, optima, precision)
 
 
 def _read_scenario(

@@ -41,16 +41,15 @@ GOALS = 10
 
 @dataclass(frozen=True)
 class RequestSettings:
-    """How requests are drawn; a value out of its range raises a ValueError."""
+    """How requests are drawn: so many per map, each with a path under the move rule.
+
+    The costs are a key of `COSTS`. A value out of its range raises a ValueError.
+    """
 
     move_rule: MoveRule
-    """The rule under which a path must exist."""
     requests: int = 200
-    """Requests per map, at least 1."""
     costs: str = "none"
-    """A key of `COSTS`."""
     seed: int = 0
-    """At least 0."""
 
     def __post_init__(self) -> None:
         if self.requests < 1:
@@ -118,10 +117,8 @@ def with_random_requests(
     parts = np.array_split(range(settings.requests), goals)
     drawn = random_requests(occupancy, rule, goals, random)
     for part, (start, goal) in zip(parts, drawn, strict=True):
-        starts = [start][: len(part)]
-        if len(part) > 1:
-            starts += random_starts(occupancy, goal, rule, len(part) - 1, random)
-        requests += [(cell, goal) for cell in starts]
+        more = random_starts(occupancy, goal, rule, max(len(part) - 1, 0), random)
+        requests += [(cell, goal) for cell in [start, *more][: len(part)]]
     return BenchmarkMap(set_name, name, grid, requests)
 
 

@@ -18,7 +18,6 @@ from ddqn_planner.commands.options import add_map_options, add_move_rule, read_m
 from ddqn_planner.grid import MoveRule
 from ddqn_planner.training.environment import Scenario
 from ddqn_planner.training.hyper_parameters import HyperParameters
-from ddqn_planner.training.memory import megabytes
 from ddqn_planner.training.run import TrainingRun
 
 
@@ -69,7 +68,7 @@ def run_training(
     parameters = HyperParameters(**values)
     with closing(TrainingRun(options.out, scenarios, move_rule, parameters, options.seed)) as run:
         trainer = run.trainer
-        print(f"training in {run.folder}, with about {megabytes(run.memory)} of memory")
+        print(run.description)
         interrupted = threading.Event()
         # An exception could interrupt a step; a flag is read between two steps.
         for number in (signal.SIGINT, signal.SIGTERM):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import partial
 
 import matplotlib.pyplot as plt
 import numpy as np
@@ -36,14 +37,12 @@ CONVERGENCE = (
 
 def trainings(settings: Settings, variants: Sequence[str] = ("both",)) -> list[Training]:
     """Return the trainings of both profiles on the paper's map, by the name "profile/variant"."""
-    return [
-        training
+    parameters_of = {
+        f"{profile}/{name}": replace(parameters, **VARIANTS[name])
         for profile, parameters in PROFILES.items()
         for name in variants
-        for training in settings.trainings(
-            f"{profile}/{name}", replace(parameters, **VARIANTS[name]), [paper_scenario()]
-        )
-    ]
+    }
+    return settings.trainings(parameters_of, [paper_scenario()])
 
 
 def convergence_row(runs: Sequence[Sequence[TrainingEvaluation]]) -> list[str]:
@@ -113,7 +112,7 @@ def _paths_and_times(
         length = median_and_range([n for n in lengths if np.isfinite(n)], 2)
         rows.append([profile, length, median_and_range([1e3 * s for s in seconds], 2)])
     for rule in (MoveRule.CORNER_CUTTING, MoveRule.ROBOT_SAFE):
-        cells, s = _timed(lambda rule=rule: a_star(scenario, rule))  # type: ignore[misc]
+        cells, s = _timed(partial(a_star, scenario, rule))
         paths[f"A*, {rule.value}"] = cells
         rows.append([f"A*, {rule.value}", f"{path_length(cells):.2f}", f"{1e3 * s:.2f}"])
     return paths, rows
@@ -121,12 +120,9 @@ def _paths_and_times(
 
 def timed_plan(planner: Planner, scenario: Scenario) -> tuple[Sequence[Cell], float]:
     """Return a planner's path, and the median of its times with a new field, seconds."""
-
-    def plan() -> Sequence[Cell]:
-        fresh = Planner(planner.network, planner.metadata)  # it has no Q field yet
-        return fresh.plan(scenario.grid, scenario.start, scenario.goal).cells
-
-    return _timed(plan)
+    request = scenario.grid, scenario.start, scenario.goal
+    # A new planner has no Q field yet.
+    return _timed(lambda: Planner(planner.network, planner.metadata).plan(*request).cells)
 
 
 def _timed(plan: Callable[[], Sequence[Cell]]) -> tuple[Sequence[Cell], float]:

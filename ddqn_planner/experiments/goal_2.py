@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from typing import Any
+
 import matplotlib.pyplot as plt
 import numpy as np
 import torch
@@ -47,14 +50,19 @@ def free_starts(scenario: Scenario) -> NDArray[np.bool_]:
     return starts
 
 
+def count_solved(ratios: Sequence[NDArray[np.float64]], starts: Any) -> str:
+    """Return how many of the starts, an index into `length_ratios`, each seed solves."""
+    return median_and_range([int(np.isfinite(ratio[starts]).sum()) for ratio in ratios])
+
+
 def trained_field(planner: Planner, scenario: Scenario) -> QField:
     """Return the Q field of a propagation network as the loss trained it: with reward and γ."""
     environment = GridVectorEnvironment([scenario], MOVE_RULE, PROFILES["propagation"])
-    encoder, module = PropagationEncoder(environment), PropagationModule.from_numpy(planner.network)
-    encoder.update_target(module)
+    module = PropagationModule.from_numpy(planner.network)
     cells = np.arange(scenario.grid.occupancy.size)
+    states = PropagationEncoder(environment, module).states(np.zeros_like(cells), cells)
     with torch.inference_mode():
-        q_CA = encoder.q(module, encoder.states(np.zeros_like(cells), cells))
+        q_CA = module(states)
     q_AHW = q_CA.T.reshape(len(MOVES), *scenario.grid.occupancy.shape).numpy()
     return QField(scenario.goal, q_AHW, legal_moves(scenario.grid.occupancy, MOVE_RULE))
 
@@ -85,13 +93,12 @@ def _row(
     starts = free_starts(scenario)
     x, y = np.transpose(sorted(START_DEAD_END - {scenario.start}))
     unmasked = [length_ratios(field.unmasked(), scenario.grid, MOVE_RULE) for field in fields]
-    lengths = [ratio[starts & np.isfinite(ratio)] for ratio in ratios]
     return [
         int(starts.sum()),
-        median_and_range([len(of_seed) for of_seed in lengths]),
-        median_and_range([int(np.isfinite(ratio[starts]).sum()) for ratio in unmasked]),
-        median_and_range([int(np.isfinite(ratio[y, x]).sum()) for ratio in ratios]),
-        *mean_and_worst(lengths),
+        count_solved(ratios, starts),
+        count_solved(unmasked, starts),
+        count_solved(ratios, (y, x)),
+        *mean_and_worst([ratio[starts & np.isfinite(ratio)] for ratio in ratios]),
     ]
 
 

@@ -104,13 +104,13 @@ def networks(settings: Settings) -> dict[str, tuple[str, HyperParameters]]:
 
 def trainings(settings: Settings) -> list[Training]:
     """Return the trainings of each network on the training maps of each noise."""
-    maps = {noise: drawn_maps(settings, noise).training for noise in settings.noise}
     return [
         training
         for noise in settings.noise
-        for folder, parameters in networks(settings).values()
         for training in settings.trainings(
-            f"{noise.value}/{folder}", parameters, maps[noise], EVALUATION_INTERVAL
+            {f"{noise.value}/{folder}": p for folder, p in networks(settings).values()},
+            drawn_maps(settings, noise).training,
+            EVALUATION_INTERVAL,
         )
     ]
 
@@ -122,15 +122,12 @@ def supervised_trainings(settings: Settings) -> list[Training]:
     """
     if Noise.NEAR_PATH not in settings.noise:
         return []
-    maps = drawn_maps(settings, Noise.NEAR_PATH).training
-    return [
-        training
+    parameters_of = {
+        f"near_path/{folder}/supervised": replace(parameters, steps=SUPERVISED_UPDATES)
         for folder, parameters in networks(settings).values()
         if parameters.network == "paper"
-        for training in settings.trainings(
-            f"near_path/{folder}/supervised", replace(parameters, steps=SUPERVISED_UPDATES), maps
-        )
-    ]
+    }
+    return settings.trainings(parameters_of, drawn_maps(settings, Noise.NEAR_PATH).training)
 
 
 def fixed_path(maps: Sequence[Scenario]) -> tuple[Cell, ...]:
@@ -163,7 +160,7 @@ def report(settings: Settings) -> str:
 
 
 def _rows(settings: Settings, maps: NoisyMaps, noise: Noise) -> list[list[str]]:
-    rows = []
+    rows, scenarios = [], [*maps.training, *maps.test]
     for label, (folder, parameters) in networks(settings).items():
         name = f"{noise.value}/{folder}"
         models = [(label, name, "kept.safetensors")]
@@ -172,23 +169,16 @@ def _rows(settings: Settings, maps: NoisyMaps, noise: Noise) -> list[list[str]]:
             if noise is Noise.NEAR_PATH:
                 models.append((f"{label}, supervised", f"{name}/supervised", "model.safetensors"))
         for model, trained, file in models:
-            planners = settings.planners(trained, file)
-            training, test = (
-                [rollouts(planner, some) for planner in planners]
-                for some in (maps.training, maps.test)
-            )
+            plans = [rollouts(planner, scenarios) for planner in settings.planners(trained, file)]
             ends = [run[-1] for run in settings.evaluations(trained) if run]
             cost = [
                 median_and_range([end.step for end in ends]),
                 median_and_range([end.seconds for end in ends], 1),
             ]
-            rows.append([model, *_columns(training, test, maps), *(cost if ends else ["-", "-"])])
+            rows.append([model, *_columns(plans, maps), *(cost if ends else ["-", "-"])])
     path = fixed_path(maps.training)
-    training, test = (
-        [([_on_map(path, scenario) for scenario in some],) * 2]
-        for some in (maps.training, maps.test)
-    )
-    return [*rows, ["one fixed path", *_columns(training, test, maps), "-", "-"]]
+    on_maps = [_on_map(path, scenario) for scenario in scenarios]
+    return [*rows, ["one fixed path", *_columns([(on_maps, on_maps)], maps), "-", "-"]]
 
 
 def _on_map(path: tuple[Cell, ...], scenario: Scenario) -> Plan:
@@ -198,24 +188,22 @@ def _on_map(path: tuple[Cell, ...], scenario: Scenario) -> Plan:
     return Plan(PlanStatus.ROLLOUT_TRAPPED)
 
 
-Rollouts = tuple[list[Plan], list[Plan]]
-"""With and without action masking: one plan per map."""
-
-
-def _columns(training: Sequence[Rollouts], test: Sequence[Rollouts], maps: NoisyMaps) -> list[str]:
-    """Return the cells of the table for the rollouts of each seed."""
+def _columns(of_seeds: Sequence[tuple[list[Plan], list[Plan]]], maps: NoisyMaps) -> list[str]:
+    """Return the cells of the table: the plans of each seed on all maps, see `rollouts`."""
+    training, test = slice(len(maps.training)), slice(len(maps.training), None)
     optimum = [optimal_length(scenario) for scenario in maps.test]
     ratios = [
-        [plan.length / least for plan, least in zip(plans, optimum, strict=True) if plan.cells]
-        for plans, _ in test
+        [p.length / least for p, least in zip(plans[test], optimum, strict=True) if p.cells]
+        for plans, _ in of_seeds
     ]
     return [
-        median_and_range([solved(plans) for plans, _ in training]),
-        median_and_range([solved(unmasked) for _, unmasked in training]),
-        median_and_range([solved(plans) for plans, _ in test]),
-        median_and_range([solved(unmasked) for _, unmasked in test]),
+        *(
+            median_and_range([solved(plans[masking][part]) for plans in of_seeds])
+            for part in (training, test)
+            for masking in (0, 1)
+        ),
         *mean_and_worst(ratios),
-        median_and_range([len({plan.cells for plan in plans if plan.cells}) for plans, _ in test]),
+        median_and_range([len({p.cells for p in plans[test] if p.cells}) for plans, _ in of_seeds]),
     ]
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -50,15 +50,14 @@ class Settings:
 
     def trainings(
         self,
-        name: str,
-        parameters: HyperParameters,
+        parameters_of: Mapping[str, HyperParameters],
         scenarios: Sequence[Scenario],
         evaluation_interval: int = 250,
     ) -> list[Training]:
-        """Return one training per seed, shortened if the settings say quick."""
-        parameters = self.shorten(parameters)
+        """Return one training per name and seed, shortened if the settings say quick."""
         return [
-            Training(folder, parameters, tuple(scenarios), seed, evaluation_interval)
+            Training(folder, self.shorten(parameters), tuple(scenarios), seed, evaluation_interval)
+            for name, parameters in parameters_of.items()
             for seed, folder in enumerate(self.folders(name))
         ]
 

@@ -15,7 +15,6 @@ from torch import Tensor
 from ddqn_planner.experiments.profiles import MOVE_RULE
 from ddqn_planner.experiments.trainings import Training
 from ddqn_planner.grid import LENGTHS, legal_moves, neighbours, shortest_distances
-from ddqn_planner.model.observation import observe
 from ddqn_planner.training.environment import Scenario
 from ddqn_planner.training.trainer import Trainer
 
@@ -33,7 +32,6 @@ def train_supervised(training: Training) -> None:
         return
     path.parent.mkdir(parents=True, exist_ok=True)
     trainer = Trainer(training.scenarios, MOVE_RULE, training.parameters, training.seed)
-    environment = trainer.environment
     best_SCA = np.stack([best_moves(scenario) for scenario in training.scenarios])
     scenario, cell = np.nonzero(best_SCA.any(axis=2))
     random = np.random.default_rng(training.seed)
@@ -42,10 +40,9 @@ def train_supervised(training: Training) -> None:
     decay = torch.optim.lr_scheduler.LinearLR(optimiser, 1.0, 0.05, steps)
     for _ in range(steps):
         drawn = random.integers(len(cell), size=BATCH_SIZE)
-        background = environment.background[scenario[drawn]]
-        observation = observe(background, cell[drawn], environment.shape)
+        states = trainer.encoder.states(scenario[drawn], cell[drawn])
         best_BA = torch.from_numpy(best_SCA[scenario[drawn], cell[drawn]])
-        loss = cross_entropy(trainer.network(torch.from_numpy(observation)), best_BA)
+        loss = cross_entropy(trainer.network(states), best_BA)
         optimiser.zero_grad()
         torch.autograd.backward(loss)
         optimiser.step()

@@ -10,7 +10,7 @@ import numpy as np
 from ddqn_planner.benchmarks.evaluation import length_ratios
 from ddqn_planner.benchmarks.tables import write_table
 from ddqn_planner.experiments.figures import draw_curves, evaluation_curve, save_figure, share_curve
-from ddqn_planner.experiments.goal_2 import free_starts
+from ddqn_planner.experiments.goal_2 import count_solved, free_starts
 from ddqn_planner.experiments.profiles import MOVE_RULE, PROFILES
 from ddqn_planner.experiments.settings import Settings, median_and_range
 from ddqn_planner.experiments.trainings import Training
@@ -36,13 +36,9 @@ COLUMNS = (
 
 def trainings(settings: Settings) -> list[Training]:
     """Return the trainings of the profile paper with each target."""
-    return [
-        training
-        for target, (_, name) in TARGETS.items()
-        for training in settings.trainings(
-            name, replace(PROFILES["paper"], target=target), [paper_scenario()]
-        )
-    ]
+    paper = PROFILES["paper"]
+    parameters_of = {name: replace(paper, target=target) for target, (_, name) in TARGETS.items()}
+    return settings.trainings(parameters_of, [paper_scenario()])
 
 
 def report(settings: Settings) -> str:
@@ -53,13 +49,13 @@ def report(settings: Settings) -> str:
     for label, name in TARGETS.values():
         runs = settings.evaluations(name)
         fields = [p.q_field(scenario.grid, scenario.goal) for p in settings.planners(name)]
-        ratios = [length_ratios(field, scenario.grid, MOVE_RULE)[starts] for field in fields]
+        ratios = [length_ratios(field, scenario.grid, MOVE_RULE) for field in fields]
         late = [[e.overestimation for e in run[-max(len(run) // 10, 1) :]] for run in runs]
         rows.append(
             [
                 label,
                 f"{sum(run[-1].solved for run in runs)} of {len(runs)}",
-                median_and_range([int(np.isfinite(ratio).sum()) for ratio in ratios]),
+                count_solved(ratios, starts),
                 median_and_range([float(np.mean(values)) for values in late], 2),
                 median_and_range([max(e.overestimation for e in run) for run in runs], 2),
             ]

@@ -20,7 +20,7 @@ from tqdm import tqdm
 
 from ddqn_planner.experiments.profiles import MOVE_RULE
 from ddqn_planner.files import write_csv
-from ddqn_planner.grid import MOVES, legal_moves, neighbours
+from ddqn_planner.grid import neighbours
 from ddqn_planner.planning import Plan, Planner
 from ddqn_planner.training.environment import GridVectorEnvironment, Scenario
 from ddqn_planner.training.hyper_parameters import HyperParameters
@@ -144,11 +144,10 @@ def evaluate_training(
 
 def rollouts(planner: Planner, scenarios: Sequence[Scenario]) -> tuple[list[Plan], list[Plan]]:
     """Return the rollout from the start of each scenario, with and without action masking."""
-    fields = [planner.q_field(scenario.grid, scenario.goal) for scenario in scenarios]
-    starts = [scenario.start for scenario in scenarios]
+    fields = [(planner.q_field(s.grid, s.goal), s.start) for s in scenarios]
     return (
-        [field.rollout(start) for field, start in zip(fields, starts, strict=True)],
-        [field.unmasked().rollout(start) for field, start in zip(fields, starts, strict=True)],
+        [field.rollout(start) for field, start in fields],
+        [field.unmasked().rollout(start) for field, start in fields],
     )
 
 
@@ -159,9 +158,8 @@ def solved(plans: Sequence[Plan]) -> int:
 
 def optimal_value(environment: GridVectorEnvironment) -> NDArray[np.float32]:
     """Return V* of the first scenario, exact by value iteration: (C,) float32."""
-    scenario, parameters = environment.scenarios[0], environment.parameters
-    legal = legal_moves(scenario.grid.occupancy, MOVE_RULE).reshape(1, len(MOVES), -1)
-    return_SAC = value_iteration(
+    legal, parameters = environment.legal[:1], environment.parameters
+    (return_AC,) = value_iteration(
         legal.astype(np.float32),
         environment.free_reward[:1],
         environment.goal[:1],
@@ -169,8 +167,8 @@ def optimal_value(environment: GridVectorEnvironment) -> NDArray[np.float32]:
         parameters.gamma,
         parameters.obstacle_reward,
     )
-    q_SAC = np.where(legal, return_SAC, np.float32(parameters.obstacle_reward))
-    value_C: NDArray[np.float32] = q_SAC[0].max(axis=0)
+    value_C: NDArray[np.float32]
+    value_C = np.where(legal[0], return_AC, np.float32(parameters.obstacle_reward)).max(axis=0)
     return value_C
 
 

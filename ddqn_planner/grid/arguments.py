@@ -50,10 +50,9 @@ def whole_numbers(name: str, values: ArrayLike, lowest: int, highest: int) -> ND
         raise ValueError(f"{name} are no array ({error}); give rows of one length") from None
     if array.dtype.kind not in "iuf":
         raise ValueError(f"{name} are of type {array.dtype}; give {lowest}..{highest}")
-    valid = (array >= lowest) & (array <= highest)  # False for NaN
-    if array.dtype.kind == "f":
-        valid &= array == np.floor(array)
-    if not valid.all():
-        wrong = array[~valid].flat[0]
-        raise ValueError(f"{name} hold {wrong}; give whole numbers {lowest}..{highest}")
-    return array
+    whole = array.dtype.kind != "f" or (array == np.floor(array)).all()  # False for NaN
+    if whole and (array.size == 0 or lowest <= array.min() <= array.max() <= highest):
+        return array
+    valid = (array >= lowest) & (array <= highest) & (array == np.floor(array))
+    wrong = array[~valid].flat[0]
+    raise ValueError(f"{name} hold {wrong}; give whole numbers {lowest}..{highest}")

@@ -22,12 +22,9 @@ ROUNDING = 1e-6
 
 
 def clearance(obstacles: Occupancy) -> NDArray[np.float64]:
-    """Return the distance from each cell to the nearest obstacle, between their centres.
+    """Return (H, W) float64: the distance from each cell to the nearest obstacle, in cells.
 
-    Returns
-    -------
-    (H, W) float64
-        In cells; 0 on an obstacle, infinite if there is none.
+    It is that between the centres: 0 on an obstacle, infinite if there is none.
     """
     if not obstacles.any():
         return np.full(obstacles.shape, np.inf)
@@ -74,3 +71,78 @@ def inflate(grid: GridMap, robot_radius: float, clearance_weight: float = 0.0) -
         if grid.cost is not None:
             cost = np.where(grid.cost == UNKNOWN, UNKNOWN, np.maximum(cost, grid.cost))
     return replace(grid, occupancy=occupancy, cost=cost, obstacles=grid.occupancy)
+
+
+class Inflation:
+    """Inflates maps as they come: of a map like the last one, only what is near changed cells."""
+
+    def __init__(self) -> None:
+        self._last: tuple[tuple[float, float], GridMap, GridMap] | None = None
+
+    def __call__(self, grid: GridMap, *body: float) -> GridMap:
+        """Return what `inflate` returns; `body` is the radius and the weight."""
+        radius, weight = body
+        if self._last is None or self._last[0] != body:
+            inflated = inflate(grid, radius, weight)
+        else:
+            inflated = inflate_changed(grid, *self._last[1:], radius, weight)
+        self._last = (radius, weight), grid, inflated
+        return inflated
+
+
+def inflate_changed(
+    grid: GridMap,
+    before: GridMap,
+    inflated: GridMap,
+    robot_radius: float,
+    clearance_weight: float = 0.0,
+) -> GridMap:
+    """Return what `inflate` returns, computed only near the cells that differ from another map.
+
+    Parameters
+    ----------
+    grid : GridMap
+    before, inflated : GridMap
+        The other map, and what `inflate` made of it with the same radius and weight.
+    robot_radius, clearance_weight : float
+        As for `inflate`.
+    """
+    shape = grid.occupancy.shape
+    same_kind = before.occupancy.shape == shape and before.resolution == grid.resolution
+    if not same_kind or (before.cost is None) != (grid.cost is None) or inflated is before:
+        return inflate(grid, robot_radius, clearance_weight)
+    differs = before.occupancy != grid.occupancy
+    if before.cost is not None and grid.cost is not None:
+        differs |= before.cost != grid.cost
+    # Farther away than this, an obstacle has no effect: the cost that it adds is rounded to 0.
+    reach = robot_radius
+    if clearance_weight > 0:
+        greatest = 2 * (OCCUPIED - 1) * clearance_weight
+        reach += max(np.cbrt(greatest) - 1, 0) * CLEARANCE_SCALE
+    cells = int(reach / grid.resolution) + 2
+    occupancy, cost = inflated.occupancy, inflated.cost
+    if differs.any():
+        spans = [np.flatnonzero(differs.any(axis=axis))[[0, -1]] + (0, 1) for axis in (1, 0)]
+        box, window = (
+            tuple(
+                slice(max(first - margin, 0), min(last + margin, size))
+                for (first, last), size in zip(spans, shape, strict=True)
+            )
+            for margin in (cells, 2 * cells)
+        )
+        part = GridMap(grid.occupancy[window], grid.resolution, cost=_part(grid.cost, window))
+        part = inflate(part, robot_radius, clearance_weight)
+        within = tuple(
+            slice(inner.start - outer.start, inner.stop - outer.start)
+            for inner, outer in zip(box, window, strict=True)
+        )
+        occupancy = occupancy.copy()
+        occupancy[box] = part.occupancy[within]
+        if cost is not None and part.cost is not None:
+            cost = cost.copy()
+            cost[box] = part.cost[within]
+    return replace(grid, occupancy=occupancy, cost=cost, obstacles=grid.occupancy)
+
+
+def _part(cost: NDArray[np.int8] | None, box: tuple[slice, ...]) -> NDArray[np.int8] | None:
+    return None if cost is None else cost[box]

@@ -190,8 +190,7 @@ def _corridor_spans(side: int, count: int, random: np.random.Generator) -> list[
     spans = []
     for index in range(count):
         width = int(random.integers(2, min(4, side - 2) + 1))
-        centre = (index + 0.5) * side / count
-        first = round(centre - width / 2) + int(random.integers(-1, 2))
+        first = round((index + 0.5) * side / count - width / 2) + int(random.integers(-1, 2))
         first = min(max(first, 1), side - 1 - width)
         spans.append((first, first + width))
     return spans
@@ -219,15 +218,9 @@ KINDS: Final[dict[str, Callable[[tuple[int, int], np.random.Generator], Occupanc
 
 
 def generate_map(kind: str, shape: tuple[int, int], random: np.random.Generator) -> Occupancy:
-    """Make a random map in which a path joins at least two free cells.
+    """Make a random map, of a kind in `KINDS`, in which a path joins at least two free cells.
 
-    Parameters
-    ----------
-    kind : str
-        A key of `KINDS`.
-    shape : (int, int)
-        Height and width in cells, each at least `MINIMUM_SIDE`.
-    random : numpy.random.Generator
+    Its shape is (H, W) in cells, each at least `MINIMUM_SIDE`.
     """
     if kind not in KINDS:
         raise ValueError(f"the kind {kind!r} is unknown; give one of {', '.join(KINDS)}")
@@ -286,8 +279,7 @@ def gradient_costs(occupancy: Occupancy, random: np.random.Generator) -> NDArray
 def inflated_costs(occupancy: Occupancy, radius: float) -> NDArray[np.int8]:
     """Return (H, W) costs that fall exponentially with the distance from obstacles, as in costmaps.
 
-    They are ``99 ** (1 - (d - 1) / radius)`` at a distance of d cells between centres, so
-    99 next to an obstacle, and 0 beyond `radius` cells.
+    They are ``99 ** (1 - (d - 1) / radius)`` at a distance of d cells, and 0 beyond `radius` cells.
     """
     if not 0 < radius < np.inf:
         raise ValueError(f"radius is {radius}; give cells, finite and > 0")

@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ddqn_planner.grid.arguments import Cell as Cell
 from ddqn_planner.grid.arguments import Occupancy, as_cell, whole_numbers
+from ddqn_planner.grid.moves import MoveRule, component_labels
 
 OCCUPIED = 100
 """The value of an occupied cell in ``nav_msgs/OccupancyGrid``."""
@@ -24,6 +25,9 @@ MAX_COST_MULTIPLIER = 5.0
 """The cost multiplier of a cell of value 100, and of an unknown cell.
 
 The costs of Nav2's NavFn planner have the same range: 50 for a free cell and at most 253."""
+
+_MULTIPLIERS = np.linspace(1, MAX_COST_MULTIPLIER, OCCUPIED + 1, dtype=np.float32)
+"""(101,) float32: the multiplier of each cost, 0 to 100."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,9 +64,7 @@ class GridMap:
     obstacles: Occupancy | None = None
 
     def __post_init__(self) -> None:
-        occupancy = np.array(self.occupancy, dtype=np.bool_)
-        if occupancy.ndim != 2 or occupancy.size == 0:
-            raise ValueError(f"occupancy has shape {occupancy.shape}; give (H, W) with H, W >= 1")
+        occupancy = _occupancy(self.occupancy)
         if not (math.isfinite(self.resolution) and self.resolution > 0):
             raise ValueError(
                 f"resolution is {self.resolution}; give metres per cell, finite and > 0"
@@ -74,14 +76,9 @@ class GridMap:
         self._set("resolution", float(self.resolution))
         self._set("origin", origin)
         if self.cost is not None:
-            if np.shape(self.cost) != occupancy.shape:
-                raise ValueError(f"cost has shape {np.shape(self.cost)}; give {occupancy.shape}")
-            free, cost = ~occupancy, np.zeros(occupancy.shape, dtype=np.int8)
-            of_free = np.asarray(self.cost)[free]
-            cost[free] = whole_numbers("costs of free cells", of_free, UNKNOWN, OCCUPIED - 1)
-            self._set("cost", cost)
+            self._set("cost", _costs(self.cost, occupancy))
         if self.obstacles is not None:
-            obstacles = np.array(self.obstacles, dtype=np.bool_)
+            obstacles = np.array(self.obstacles, dtype=np.bool_, order="C")
             if obstacles.shape != occupancy.shape or (obstacles & ~occupancy).any():
                 raise ValueError(
                     f"obstacles have shape {obstacles.shape}, or lie on free cells; give "
@@ -130,9 +127,56 @@ class GridMap:
         array = whole_numbers("occupancy values", values, -128, 127)
         if array.dtype.kind == "f":  # these may be probabilities, 1.0 for occupied
             raise ValueError(f"occupancy values are of type {array.dtype}; give integers, percent")
-        array = np.maximum(array.astype(np.int8, copy=False), UNKNOWN)
-        occupied = (array >= occupied_threshold) | ((array == UNKNOWN) & (not allow_unknown))
-        return cls(occupied, resolution, origin, array if use_map_costs else None)
+        array = array.astype(np.int8, copy=False)
+        occupied = array >= occupied_threshold
+        if not allow_unknown:
+            occupied |= array < 0
+        cost = np.maximum(array, UNKNOWN) if use_map_costs else None
+        return cls(occupied, resolution, origin, cost)
+
+    def with_patch(
+        self, occupancy: ArrayLike, x: int, y: int, cost: ArrayLike | None = None
+    ) -> GridMap:
+        """Return the same map with other cells from (x, y) on; this map stays as it is.
+
+        On a map that `inflate` made, occupied cells of the patch are obstacles, and the cells
+        around them are not inflated: better patch the map of the obstacles, and inflate it again.
+
+        Parameters
+        ----------
+        occupancy : (h, w) bool
+            The new cells: True where occupied. All of them lie inside the map.
+        x, y : int
+            The cell of ``occupancy[0, 0]``.
+        cost : (h, w) array of whole numbers, optional
+            Costs of the new free cells, as for `GridMap`. By default free cells keep their costs,
+            and those that were occupied cost 0. On a map without costs, the other cells cost 0.
+
+        Raises
+        ------
+        ValueError
+            If the patch is empty or not inside the map, or its costs are wrong.
+        """
+        patch = _occupancy(occupancy)
+        left, bottom = as_cell((x, y), "the first cell of the patch")
+        height, width = patch.shape
+        if not (0 <= left <= self.width - width and 0 <= bottom <= self.height - height):
+            raise ValueError(
+                f"a patch of {width} x {height} cells from {(left, bottom)} is not inside the map "
+                f"of {self.width} x {self.height}; cut it to the map"
+            )
+        box = slice(bottom, bottom + height), slice(left, left + width)
+        costs = self.cost
+        if costs is not None or cost is not None:
+            costs = np.zeros(self.occupancy.shape, dtype=np.int8) if costs is None else costs
+            costs = _replaced(costs, box, _costs(costs[box] if cost is None else cost, patch))
+        patched = object.__new__(GridMap)  # the cells outside the patch need no check
+        patched._set("occupancy", _replaced(self.occupancy, box, patch))
+        patched._set("resolution", self.resolution)
+        patched._set("origin", self.origin)
+        patched._set("cost", costs)
+        patched._set("obstacles", _replaced(self.obstacles, box, patch))
+        return patched
 
     @property
     def height(self) -> int:
@@ -146,15 +190,27 @@ class GridMap:
 
     @cached_property
     def cost_multiplier(self) -> NDArray[np.float32]:
-        """(H, W) float32: cost of a path in each cell per cell of its length.
+        """(H, W) float32: cost of a path in each cell per cell of its length, see `move_costs`.
 
-        It grows linearly from 1 for cost 0 to `MAX_COST_MULTIPLIER` for cost 100; it is 1
-        everywhere on a map without costs. See `move_costs`.
+        It grows linearly from 1 for cost 0, or without costs, to `MAX_COST_MULTIPLIER`.
         """
         if self.cost is None:
             return np.ones(self.occupancy.shape, dtype=np.float32)
-        share = np.where(self.cost == UNKNOWN, 1.0, self.cost / 100)
-        return (1 + (MAX_COST_MULTIPLIER - 1) * share).astype(np.float32)
+        return _MULTIPLIERS.take(self.cost, mode="wrap")  # -1 finds the last one
+
+    def labels(self, move_rule: MoveRule | str) -> NDArray[np.int32]:
+        """Return the connected component of each cell, see `component_labels`.
+
+        The map computes them once per kind of move rule, and remembers them: 4 bytes per cell.
+        """
+        rule = MoveRule(move_rule)
+        if rule.cuts_corners not in self._labels:
+            self._labels[rule.cuts_corners] = component_labels(self.occupancy, rule)
+        return self._labels[rule.cuts_corners]
+
+    @cached_property
+    def _labels(self) -> dict[bool, NDArray[np.int32]]:
+        return {}
 
     @cached_property
     def fingerprint(self) -> str:
@@ -164,6 +220,15 @@ class GridMap:
         if self.cost is not None:
             digest.update(self.cost.tobytes())
         return digest.hexdigest()[:16]
+
+    def same_cells(self, other: GridMap) -> bool:
+        """Return whether the occupancy and the costs of two maps are equal, wherever they lie."""
+        if self is other:
+            return True
+        same = np.array_equal(self.occupancy, other.occupancy)
+        if not same or self.cost is None or other.cost is None:
+            return same and self.cost is other.cost
+        return np.array_equal(self.cost, other.cost)
 
     def contains(self, cell: Cell) -> bool:
         """Return whether a cell lies inside the map."""
@@ -207,3 +272,32 @@ class GridMap:
             origin_x + math.cos(yaw) * along_x - math.sin(yaw) * along_y,
             origin_y + math.sin(yaw) * along_x + math.cos(yaw) * along_y,
         )
+
+
+def _occupancy(cells: ArrayLike) -> Occupancy:
+    """Return a copy in C order, checked."""
+    occupancy = np.array(cells, dtype=np.bool_, order="C")
+    if occupancy.ndim != 2 or occupancy.size == 0:
+        raise ValueError(f"occupancy has shape {occupancy.shape}; give (H, W) with H, W >= 1")
+    return occupancy
+
+
+def _costs(cost: ArrayLike, occupancy: Occupancy) -> NDArray[np.int8]:
+    """Return a copy with 0 in occupied cells, checked."""
+    if np.shape(cost) != occupancy.shape:
+        raise ValueError(f"cost has shape {np.shape(cost)}; give {occupancy.shape}")
+    of_free = np.array(cost, order="C")
+    if of_free.dtype.kind in "iu":
+        of_free *= ~occupancy  # fifty times as fast as the assignment below
+    else:  # NaN times 0 is NaN
+        of_free[occupancy] = 0
+    whole_numbers("costs of free cells", of_free, UNKNOWN, OCCUPIED - 1)
+    return of_free.astype(np.int8, copy=False)
+
+
+def _replaced(array: NDArray[Any] | None, box: tuple[slice, slice], values: NDArray[Any]) -> Any:
+    """Return a copy with other values in a box."""
+    if array is not None:
+        array = array.copy()
+        array[box] = values
+    return array

@@ -107,24 +107,10 @@ def load_map(
     allow_unknown: bool = False,
     use_map_costs: bool = False,
 ) -> GridMap:
-    """Read a grid map from a ROS map (.yaml) or a MovingAI map (.map), see `read_map_file`.
+    """Read a grid map from a ROS map (.yaml) or a MovingAI map (.map).
 
-    Parameters
-    ----------
-    path : str or Path
-    occupied_threshold : int
-        A cell of this value or more is occupied, 1..100 percent.
-    allow_unknown : bool
-        Whether unknown cells are free.
-    use_map_costs : bool
-        Whether free cells keep their values as costs; otherwise all cost the same.
-
-    Raises
-    ------
-    MapFileError
-        If the file cannot be read; the message names the wrong value.
-    ValueError
-        If the threshold is outside 1..100.
+    See `read_map_file` for the path and the errors, and `GridMap.from_occupancy_values` for the
+    other parameters.
     """
     return read_map_file(path).grid(occupied_threshold, allow_unknown, use_map_costs)
 
@@ -260,8 +246,7 @@ def _read_moving_ai(path: Path) -> MapFile:
         raise MapDataError(
             f"{path}: row {row} has {lengths[row]} characters; give {width}, as the header says"
         )
-    cells = cells.reshape(height, width + 1)[:, :-1]
-    free = np.isin(cells, np.frombuffer(b".GS", dtype=np.uint8))
+    free = np.isin(cells.reshape(height, width + 1)[:, :-1], list(b".GS"))
     return MapFile(np.where(free, np.int8(0), np.int8(100)))
 
 
@@ -271,14 +256,11 @@ def _read_ros(path: Path) -> MapFile:
     mode = _text(document, "mode", "trinary")
     percent = _percent_of_grey(document, mode)
     resolution = _number(document.get("resolution"), "resolution")
-    origin = document.get("origin")
-    if not isinstance(origin, list) or len(origin) != 3:
-        raise ValueError(f"origin is {_short(origin)}; give three numbers [x, y, yaw]")
-    x, y, yaw = (_number(value, "origin") for value in origin)
+    x, y, yaw = _numbers(document.get("origin"), "origin", "[x, y, yaw]")
     scenario = document.get("ddqn_planner", {})
     if not isinstance(scenario, dict) or not scenario.keys() <= {"start", "goal"}:
         raise ValueError(f"ddqn_planner is {_short(scenario)}; give {{start: , goal: }}")
-    cells = {name: _cell(cell, name) for name, cell in scenario.items()}
+    cells: Any = {name: _numbers(cell, name, "[x, y]") for name, cell in scenario.items()}
     try:
         grey, clear = read_grey(image, MAX_CELLS)
     except Exception as error:  # Pillow's decoders raise many exceptions on broken bytes
@@ -326,19 +308,17 @@ def _text(document: dict[str, Any], key: str, default: str | None = None) -> str
     return value.lower()
 
 
-def _number(value: object, key: str) -> float:
+def _number(value: Any, key: str) -> float:
     try:
-        return float(value if isinstance(value, str) else "")
-    except ValueError:
+        return float(value)
+    except (TypeError, ValueError):
         raise ValueError(f"{key} is {_short(value)}; give a number") from None
 
 
-def _cell(value: object, key: str) -> Cell:
-    try:
-        x, y = map(int, value if isinstance(value, list) else ())
-    except (TypeError, ValueError):
-        raise ValueError(f"{key} is {_short(value)}; give two integers [x, y]") from None
-    return x, y
+def _numbers(value: Any, key: str, names: str) -> list[float]:
+    if not isinstance(value, list) or len(value) != names.count(",") + 1:
+        raise ValueError(f"{key} is {_short(value)}; give numbers {names}")
+    return [_number(number, key) for number in value]
 
 
 def _percent_of_grey(document: dict[str, Any], mode: str) -> NDArray[np.int8]:

@@ -18,21 +18,11 @@ Pillow drops bits, or map_server takes the fourth byte of a pixel as its opacity
 
 
 def read_grey(path: Path, max_pixels: int) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
-    """Read an image as grey values; colours are converted to their Rec. 601 luma.
+    """Return the grey values of an image, top row first, and which pixels are not opaque.
 
-    Returns
-    -------
-    (H, W) uint8
-        Grey values; the first row is the top row.
-    (H, W) bool
-        Which pixels are not opaque.
-
-    Raises
-    ------
-    ValueError
-        If the image has more pixels, or if map_server would read it differently.
-    Exception
-        Pillow's decoders may raise any other exception on broken bytes.
+    Colours are converted to their Rec. 601 luma. An image that has more pixels, or that map_server
+    would read differently, is a ValueError; Pillow's decoders may raise any other exception on
+    broken bytes.
     """
     with Image.open(path, formats=IMAGE_FORMATS) as image:
         if image.width * image.height > max_pixels:

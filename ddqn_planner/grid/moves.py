@@ -48,13 +48,10 @@ def _shifted(padded: NDArray[Any], dx: int, dy: int) -> NDArray[Any]:
 
 
 def legal_moves(occupancy: Occupancy, move_rule: MoveRule | str) -> NDArray[np.bool_]:
-    """Return which of the eight moves are legal in each cell.
+    """Return (8, H, W) bool: which of the eight moves are legal in each cell.
 
-    Returns
-    -------
-    (8, H, W) bool
-        ``[a, y, x]`` is True if action ``a`` leads from the free cell (x, y) to a free cell of the
-        map and the rule allows it.
+    ``[a, y, x]`` is True if action ``a`` leads from the free cell (x, y) to a free cell of the map
+    and the rule allows it.
     """
     rule = MoveRule(move_rule)
     free = np.pad(~occupancy, 1)
@@ -67,12 +64,9 @@ def legal_moves(occupancy: Occupancy, move_rule: MoveRule | str) -> NDArray[np.b
 
 
 def neighbours(shape: tuple[int, int]) -> NDArray[np.int64]:
-    """Return the cell that each action leads to, for maps of shape (H, W).
+    """Return (8, H * W) int64: the cell number y * W + x that each action leads to from each cell.
 
-    Returns
-    -------
-    (8, H * W) int64
-        Cell numbers y * W + x; H * W for any cell outside the map.
+    The number is H * W for all cells outside the map.
     """
     cells = shape[0] * shape[1]
     padded = np.pad(np.arange(cells).reshape(shape), 1, constant_values=cells)
@@ -80,20 +74,10 @@ def neighbours(shape: tuple[int, int]) -> NDArray[np.int64]:
 
 
 def move_costs(multiplier: NDArray[np.float32], move_rule: MoveRule | str) -> NDArray[np.float64]:
-    """Return the cost of each move: its length times the mean cost multiplier of its two cells.
+    """Return (8, H, W) float64: the cost of action ``a`` from (x, y) in ``[a, y, x]``.
 
-    So a path costs the same in both directions.
-
-    Parameters
-    ----------
-    multiplier : (H, W) float32
-        See `GridMap.cost_multiplier`.
-    move_rule : MoveRule
-
-    Returns
-    -------
-    (8, H, W) float64
-        ``[a, y, x]`` for action ``a`` from (x, y); it has no meaning where the move is illegal.
+    It is the length of the move times the mean of `GridMap.cost_multiplier` in its two cells, so a
+    path costs the same in both directions. It has no meaning where the move is illegal.
     """
     padded = np.pad(multiplier, 1, mode="edge").astype(np.float64)
     target = np.stack([_shifted(padded, dx, dy) for dx, dy in MOVES.tolist()])
@@ -109,8 +93,7 @@ def component_labels(occupancy: Occupancy, move_rule: MoveRule | str) -> NDArray
     Two free cells have the same label, 1 or more, if a path joins them. Occupied cells have 0.
     """
     # If a diagonal move needs both side cells free, two straight moves can replace it.
-    moves = MOVES[4:] if MoveRule(move_rule).cuts_corners else MOVES[4::2]
-    return label_cells(~occupancy, moves)
+    return label_cells(occupancy, corners=MoveRule(move_rule).cuts_corners)
 
 
 def connected_cells(
@@ -124,10 +107,7 @@ def connected_cells(
 
 
 def path_length(cells: Sequence[Cell], move_rule: MoveRule | str = MoveRule.ROBOT_SAFE) -> float:
-    """Return the length of a path in cells.
-
-    The cells are those of a plan, or some of them, joined by straight segments.
-    """
+    """Return the length in cells of a path of straight segments between the given cells."""
     x, y = np.asarray(cells, dtype=np.int64).reshape(-1, 2).T
     return float(segment_lengths(np.diff(x), np.diff(y), move_rule).sum())
 

@@ -37,16 +37,11 @@ def scatter_obstacles(
 
     The paper (goal iii) does this to the path of goal i.
 
-    Returns
-    -------
-    GridMap
-        The map with the new obstacles.
-    int
-        How many draws were rejected because they left no path: 1,000 in a row are a ValueError.
+    Returns the new map, and how many draws were rejected because they left no path: 1,000 in a row
+    are a ValueError.
     """
     start, goal = path[0], path[-1]
-    reach = 0 if noise is Noise.ON_PATH else 1
-    offsets = range(-reach, reach + 1)
+    offsets = (0,) if noise is Noise.ON_PATH else (-1, 0, 1)
     near = {(x + dx, y + dy) for x, y in path for dx in offsets for dy in offsets}
     candidates = sorted(cell for cell in near - {start, goal} if grid.is_free(cell))
     if not candidates:

@@ -13,14 +13,10 @@ from ddqn_planner.grid.moves import MOVES, MoveRule, legal_moves
 
 
 def shortest_distances(grid: GridMap, goal: Cell, move_rule: MoveRule | str) -> NDArray[np.float64]:
-    """Return the cost of the cheapest path from every cell to the goal, see `path_cost`.
+    """Return (H, W) float64: the cost of the cheapest path from each cell to the goal.
 
-    Without costs on the map, that is the length of the shortest path in cells.
-
-    Returns
-    -------
-    (H, W) float64
-        Infinite where no path leads to the goal.
+    See `path_cost`; it is the length of the shortest path on a map without costs, and infinite
+    where no path leads to the goal.
     """
     distances: NDArray[np.float64] = _dijkstra(grid, goal, move_rule)[0]
     return distances.reshape(grid.height, grid.width)

@@ -10,13 +10,13 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
+from functools import cached_property
 from typing import ClassVar, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ddqn_planner.grid import (
-    MAX_COST_MULTIPLIER,
     MOVES,
     OCCUPIED,
     UNKNOWN,
@@ -24,20 +24,25 @@ from ddqn_planner.grid import (
     GridMap,
     MoveRule,
 )
+from ddqn_planner.model.certificate import Certificate, certify
+from ddqn_planner.model.move_costs import (
+    MAX_MULTIPLIER,
+    NO_PATCHES,
+    OCCUPIED_PATCH,
+    VALUES,
+    MoveCosts,
+    cell_values,
+    costs_by_patch,
+    every_patch,
+    legal_in_every_patch,
+)
 from ddqn_planner.model.observation import ROBOT, observation_background, unique_patches
-from ddqn_planner.model.wavefront import propagate_values
 
 Array: TypeAlias = NDArray[np.float32]
 
 BATCH = 2**12
 """Patches per evaluation of a network. The layers' outputs then fit into a cache; those of all
 patches of a large map would need gigabytes."""
-
-MAX_LEARNED_MULTIPLIER = 20 * MAX_COST_MULTIPLIER
-"""Upper bound on predicted cost multipliers, far above every true one.
-
-Time and memory of `propagate_values` grow with the highest cost, and a broken model may predict
-any."""
 
 
 class QNetwork(ABC):
@@ -67,6 +72,13 @@ class QNetwork(ABC):
     def supports(self, shape: tuple[int, int]) -> bool:
         """Say whether the network can plan on maps of shape (H, W)."""
         return True
+
+    def move_costs(self, grid: GridMap, move_rule: MoveRule) -> MoveCosts | None:
+        """Return the costs of a map's moves if the possible ones are exactly the legal ones.
+
+        None if the network knows no costs, or if it is not certain that it judges all moves right.
+        """
+        return None
 
     @abstractmethod
     def q_values(self, grid: GridMap, goal: Cell, move_rule: MoveRule) -> Array:
@@ -208,13 +220,43 @@ class PropagationQNetwork(QNetwork):
         """Return the cost multiplier of each move, here 1: (B, 8), given features (B, I)."""
         return np.ones((len(feature_BI), len(MOVES)), dtype=np.float32)
 
+    def move_costs(self, grid: GridMap, move_rule: MoveRule) -> MoveCosts | None:
+        """Return the costs of a map's moves if the possible ones are exactly the legal ones."""
+        from ddqn_planner.model.compiled_costs import patch_numbers
+
+        with_costs = self.uses_costs and grid.cost is not None
+        if (move_rule, with_costs) not in self._costs_by_rule:
+            self._costs_by_rule[move_rule, with_costs] = self._costs(move_rule, with_costs)
+        costs = self._costs_by_rule[move_rule, with_costs]
+        if costs is None:
+            return None
+        value = cell_values(grid) if with_costs else None
+        return costs._replace(
+            patch=patch_numbers(grid.occupancy), value=value, width=grid.width + 2
+        )
+
+    @cached_property
+    def _costs_by_rule(self) -> dict[tuple[MoveRule, bool], MoveCosts | None]:
+        """What holds for all maps, so that it is computed once."""
+        return {}
+
+    def _costs(self, move_rule: MoveRule, with_costs: bool) -> MoveCosts | None:
+        """Return the costs of moves without what depends on the map."""
+        patch_P9 = every_patch()
+        table_PA = self._costs_of(patch_P9, move_rule)
+        table_PA[patch_P9[:, 4] == OCCUPIED] = np.inf
+        if not np.array_equal(np.isfinite(table_PA), legal_in_every_patch(move_rule)):
+            return None
+        table_PA = np.pad(table_PA, ((0, 1), (0, 0)), constant_values=np.inf)
+        return costs_by_patch(NO_PATCHES, table_PA, 0)
+
     def q_values(self, grid: GridMap, goal: Cell, move_rule: MoveRule) -> Array:
         """Return minus the cost of the best path through each action: length times cost multiplier.
 
         There is no discount, and a move counts as possible where p > 1/2: so the greatest Q is the
         cheapest path at any distance. (Along a whole path, the progress and detour terms of the
         paper's reward, section 4.2, add up to a constant of its two ends.) Cost multipliers are
-        clamped to `MAX_LEARNED_MULTIPLIER`. A move with NaN as its p or cost multiplier is not
+        clamped to `MAX_MULTIPLIER`. A move with NaN as its p or cost multiplier is not
         possible.
 
         Returns
@@ -222,16 +264,22 @@ class PropagationQNetwork(QNetwork):
         (8, H, W) float32
             -inf where no path is known.
         """
+        from ddqn_planner.model.wavefront import propagate_values
+
         patch_id, patch_P9 = unique_patches(grid.occupancy, grid.cost if self.uses_costs else None)
+        return propagate_values(patch_id, self._costs_of(patch_P9, move_rule), goal)
+
+    def _costs_of(self, patch_P9: NDArray[np.int8], move_rule: MoveRule) -> Array:
+        """Return the cost of each move in each patch, infinite if not possible: (P, 8) float32."""
         cost_PA = np.empty((len(patch_P9), len(MOVES)), dtype=np.float32)
         for begin in range(0, len(patch_P9), BATCH):
             batch = slice(begin, begin + BATCH)
             feature_BI = self.features(patch_P9[batch], move_rule)
-            multiplier_BA = np.minimum(self.multiplier(feature_BI), MAX_LEARNED_MULTIPLIER)
+            multiplier_BA = np.minimum(self.multiplier(feature_BI), MAX_MULTIPLIER)
             # Comparisons with NaN are false, and NumPy's minimum and maximum keep it.
             possible_BA = (self.success(feature_BI) > 0.5) & (multiplier_BA >= 1)
             cost_PA[batch] = np.where(possible_BA, move_rule.lengths * multiplier_BA, np.inf)
-        return propagate_values(patch_id, cost_PA, goal)
+        return cost_PA
 
 
 class AnyMapQNetwork(PropagationQNetwork):
@@ -268,6 +316,42 @@ class AnyMapQNetwork(PropagationQNetwork):
         """Return the cost multiplier of each move, at least 1: (B, 8), given features (B, 28)."""
         multiplier_BA: Array = 1 + np.maximum(self._layer("prices", feature_BI), 0)
         return multiplier_BA
+
+    @cached_property
+    def certificate(self) -> Certificate:
+        """What is proved of its judgement of moves, whatever the costs."""
+        return certify(self)
+
+    def terms(self, move_rule: MoveRule) -> Array:
+        """Return what each value of each cell of a patch adds to the cost multiplier.
+
+        The layer is linear, so its output is a sum over the cells; see `MoveCosts`.
+
+        Returns
+        -------
+        (9, 102, 8) float32
+        """
+        weight_AI, bias_A = self.tensors["prices.weight"], self.tensors["prices.bias"]
+        occupied_9A, cost_9A, unknown_9A = weight_AI[:, :27].T.reshape(3, 9, -1)
+        terms_9LA = np.empty((9, VALUES, len(MOVES)), dtype=np.float32)
+        terms_9LA[:, 0], terms_9LA[:, -1] = unknown_9A, occupied_9A
+        terms_9LA[:, 1:-1] = (np.arange(OCCUPIED) / 100)[:, None] * cost_9A[:, None]
+        terms_9LA[4] += bias_A + weight_AI[:, 27] * move_rule.cuts_corners
+        return terms_9LA
+
+    def _costs(self, move_rule: MoveRule, with_costs: bool) -> MoveCosts | None:
+        """Return the costs of moves without what depends on the map."""
+        if not with_costs:
+            return super()._costs(move_rule, with_costs)
+        if not self.certificate.proved:
+            return None
+        table_PA = np.full((OCCUPIED_PATCH + 1, len(MOVES)), np.inf, dtype=np.float32)
+        np.copyto(table_PA[:-1], move_rule.lengths, where=legal_in_every_patch(move_rule))
+        costs, terms_9LA = costs_by_patch(NO_PATCHES, table_PA, 0), self.terms(move_rule)
+        greatest = 1 + max(0.0, float(terms_9LA.max(axis=1).sum(axis=0).max()))
+        return costs._replace(
+            terms=terms_9LA, highest=costs.highest * min(greatest, MAX_MULTIPLIER)
+        )
 
 
 def _with_biases(weights: Mapping[str, tuple[int, ...]]) -> dict[str, tuple[int, ...]]:

@@ -1,15 +1,351 @@
-"""Propagation of values from the goal: Dijkstra's algorithm with a bucket queue, compiled.
+"""How values spread from the goal over a map, in compiled code. numba is imported with it.
 
-Dimensions: A = 8 actions, P = unique patches, C = cells of the padded map.
+A field is spread from its goal in the order of A*, so that a request visits the cells that its
+start needs and no others (resumable reverse A*, Silver 2005). Buckets hold the cells of about the
+same order (Dial 1969). `ddqn_planner.planning.invalidation` prepares a field for another map.
+
+Cells are numbers of a padded map, see `MoveCosts`. Of each cell there is the distance to the goal,
+the least cost of a path, and its state. The functions compare distances in float64: float32 would
+lose the order of neighbours above some 10^6.
 """
 
 from __future__ import annotations
 
+from typing import Any, Final
+
 import numpy as np
 from numpy.typing import NDArray
 
-from ddqn_planner.compiled import compiled
-from ddqn_planner.grid import MOVES, Cell
+from ddqn_planner.compiled import compiled_now
+from ddqn_planner.grid import Cell
+from ddqn_planner.model.compiled_costs import MOVE_X, MOVE_Y, cost_of
+from ddqn_planner.model.move_costs import MoveCosts, costs_by_patch
+
+Distances = NDArray[np.float64]
+States = NDArray[np.uint8]
+Cells = NDArray[np.int32]
+
+UNREACHED: Final = 0
+OPEN: Final = 1
+CLOSED: Final = 2
+MARKED: Final = 4
+"""States of cells. The distance of an open cell may fall; that of a closed one is the least. Until
+a cell is reached its distance is 0: then pages of memory that no request needs are never touched.
+"""
+
+AT_GOAL: Final = 5e-324
+"""The distance of the goal: not 0, and as good as 0 in every sum."""
+
+BUCKETS: Final = 2
+"""Per unit of cost. More buckets mean fewer visits of cells that the start does not need."""
+
+SAME: Final = 1 + 1e-12
+"""Paths whose costs differ by a smaller factor cost the same: sums of floats are rounded."""
+
+FIRST: NDArray[np.int8] = np.array(
+    [0] + [(bits & -bits).bit_length() - 1 for bits in range(1, 256)], np.int8
+)
+"""The lowest bit of a byte that is set."""
+
+
+@compiled_now
+def _octile(dx: int, dy: int, straight: float, diagonal: float) -> float:
+    """Return the least cost of moves over (dx, dy), given that of a straight and a diagonal one."""
+    dx, dy = abs(dx), abs(dy)
+    both = min(dx, dy)
+    return straight * (max(dx, dy) - both) + diagonal * both
+
+
+def grow(
+    distance: Distances,
+    state: States,
+    opened: Cells,
+    costs: MoveCosts,
+    start: int,
+    limit: int,
+) -> tuple[Cells, bool]:
+    """Close cells in the order of A* until the distance of a start is known.
+
+    All cells that tie with those of the start's best path are closed too. So a rollout does not
+    depend on what was asked before.
+
+    Parameters
+    ----------
+    distance, state : (C,) float64, (C,) uint8
+        Changed in place.
+    opened : (N,) int32
+        The open cells.
+    costs : MoveCosts
+    start : int
+    limit : int
+        How many cells may be visited before it gives up.
+
+    Returns
+    -------
+    (M,) int32
+        The cells that stay open.
+    bool
+        Whether all was visited that the start needs.
+    """
+    # Lower bounds, whatever the rounding.
+    straight, diagonal = costs.straight * (1 - 1e-7), costs.diagonal * (1 - 1e-7)
+    start_y, start_x = divmod(start, costs.width)
+    dx = np.abs(opened % costs.width - start_x)
+    dy = np.abs(opened // costs.width - start_y)
+    remaining = straight * np.abs(dx - dy) + diagonal * np.minimum(dx, dy)
+    order = ((distance[opened] + remaining) * BUCKETS).astype(np.int64)
+    first = np.argsort(order)
+    bounds = straight, diagonal
+    return _grow(distance, state, opened[first], order[first], costs, start, bounds, limit)
+
+
+@compiled_now
+def _grow(
+    distance: Distances,
+    state: States,
+    opened: Cells,
+    order: NDArray[np.int64],
+    costs: MoveCosts,
+    start: int,
+    bounds: tuple[float, float],
+    limit: int,
+) -> tuple[Cells, bool]:
+    """Do the work of `grow`, with the open cells in their order."""
+    patch, table, value, terms, width = costs[:5]
+    offsets = MOVE_Y * width + MOVE_X
+    start_y, start_x = start // width, start % width
+    straight, diagonal = bounds
+    ring = int((costs.highest + diagonal) * BUCKETS) + 3
+    capacity = 256
+    bucket = np.empty((ring, capacity), np.int32)
+    count = np.zeros(ring, np.int64)
+    through = np.empty(8)
+    taken, waiting, front, visited = 0, 0, 0, 0
+    done = False
+    while visited <= limit and not done:
+        if waiting == 0:
+            if taken == opened.size:
+                done = True
+                continue
+            front = max(front, order[taken])
+        done = state[start] == CLOSED and distance[start] * (1 + 1e-6) * BUCKETS < front
+        if done:
+            continue
+        slot = front % ring
+        used = 0
+        while True:
+            if taken < opened.size and order[taken] <= front:
+                cell = opened[taken]
+                taken += 1
+            elif used < count[slot]:
+                cell = bucket[slot, used]
+                used += 1
+                waiting -= 1
+            else:
+                break
+            if state[cell] != OPEN:
+                continue
+            state[cell] = CLOSED
+            visited += 1
+            better = 0
+            for action in range(8):
+                previous = cell - offsets[action]
+                through[action] = distance[cell] + cost_of(
+                    patch, table, value, terms, width, previous, action
+                )
+                known = distance[previous]
+                is_better = (through[action] < known) | (
+                    (known == 0.0) & (through[action] < np.inf)
+                )
+                better |= int(is_better) << action
+            y = cell // width
+            x = cell - y * width
+            while better:
+                action = FIRST[better]
+                better &= better - 1
+                previous = cell - offsets[action]
+                dx, dy = x - MOVE_X[action] - start_x, y - MOVE_Y[action] - start_y
+                remaining = _octile(dx, dy, straight, diagonal)
+                new = max(int((through[action] + remaining) * BUCKETS), front)
+                old = max(int((distance[previous] + remaining) * BUCKETS), front)
+                distance[previous] = through[action]
+                if state[previous] == OPEN and old == new:
+                    continue
+                state[previous] = OPEN
+                slot_of_new = new % ring
+                if count[slot_of_new] == capacity:
+                    bucket, capacity = _wider(bucket), 2 * capacity
+                bucket[slot_of_new, count[slot_of_new]] = previous
+                count[slot_of_new] += 1
+                waiting += 1
+        count[slot] = 0
+        front += 1
+    return _still_open(state, opened[taken:], bucket, count), done
+
+
+def grow_whole(distance: Distances, state: States, opened: Cells, costs: MoveCosts) -> None:
+    """Give each cell that a path joins to the goal its distance: Dijkstra's algorithm.
+
+    `grow` would do the same in twice the time. No move costs less than 1, the width of a bucket: a
+    cell cannot change its own bucket.
+
+    Parameters
+    ----------
+    distance, state : (C,) float64, (C,) uint8
+        Changed in place.
+    opened : (N,) int32
+        The open cells.
+    costs : MoveCosts
+    """
+    _grow_whole(distance, state, opened[np.argsort(distance[opened])], costs)
+
+
+@compiled_now
+def _grow_whole(distance: Distances, state: States, opened: Cells, costs: MoveCosts) -> None:
+    """Do the work of `grow_whole`, with the open cells in the order of their distances."""
+    patch, table, value, terms, width = costs[:5]
+    offsets = MOVE_Y * width + MOVE_X
+    ring = int(costs.highest) + 2
+    capacity = 1024
+    bucket = np.empty((ring, capacity), np.int32)
+    count = np.zeros(ring, np.int64)
+    through = np.empty(8)
+    taken, waiting, front = 0, 0, 0
+    while waiting > 0 or taken < opened.size:
+        if waiting == 0:
+            front = int(distance[opened[taken]])
+        slot = front % ring
+        used = 0
+        while True:
+            if taken < opened.size and int(distance[opened[taken]]) <= front:
+                cell = opened[taken]
+                taken += 1
+            elif used < count[slot]:
+                cell = bucket[slot, used]
+                used += 1
+                waiting -= 1
+            else:
+                break
+            if state[cell] != OPEN:
+                continue
+            state[cell] = CLOSED
+            here = distance[cell]
+            better = 0
+            for action in range(8):
+                previous = cell - offsets[action]
+                through[action] = here + cost_of(
+                    patch, table, value, terms, width, previous, action
+                )
+                known = distance[previous]
+                is_better = (through[action] < known) | ((known == 0) & (through[action] < np.inf))
+                better |= int(is_better) << action
+            while better:
+                action = FIRST[better]
+                better &= better - 1
+                previous = cell - offsets[action]
+                new, known = int(through[action]), distance[previous]
+                distance[previous] = through[action]
+                if state[previous] == OPEN and int(known) == new:
+                    continue
+                state[previous] = OPEN
+                slot_of_new = new % ring
+                if count[slot_of_new] == capacity:
+                    bucket, capacity = _wider(bucket), 2 * capacity
+                bucket[slot_of_new, count[slot_of_new]] = previous
+                count[slot_of_new] += 1
+                waiting += 1
+        count[slot] = 0
+        front += 1
+
+
+@compiled_now
+def _wider(bucket: NDArray[np.int32]) -> NDArray[np.int32]:
+    """Return buckets of twice the capacity with the same cells."""
+    wider = np.empty((bucket.shape[0], 2 * bucket.shape[1]), np.int32)
+    for slot in range(bucket.shape[0]):  # numba compiles it in a third of the time of a slice
+        for number in range(bucket.shape[1]):
+            wider[slot, number] = bucket[slot, number]
+    return wider
+
+
+@compiled_now
+def _still_open(
+    state: States, opened: Cells, bucket: NDArray[np.int32], count: NDArray[np.int64]
+) -> Cells:
+    """Return each open cell of those given and of the buckets once."""
+    found: Cells = np.empty(opened.size + count.sum(), np.int32)
+    number = 0
+    for slot in range(-1, count.size):
+        cells = opened if slot < 0 else bucket[slot, : count[slot]]
+        for cell in cells:
+            if state[cell] == OPEN:
+                state[cell] = OPEN | MARKED
+                found[number] = cell
+                number += 1
+    for cell in found[:number]:
+        state[cell] = OPEN
+    still_open: Cells = found[:number].copy()
+    return still_open
+
+
+@compiled_now
+def next_action(
+    distance: Any, patch: Any, table: Any, value: Any, terms: Any, width: int, cell: int
+) -> int:
+    """Return the greedy action of a closed cell, the lowest of those that tie; -1 without one."""
+    for action in range(8):
+        after = distance[cell + MOVE_Y[action] * width + MOVE_X[action]]
+        if after > 0:
+            cost = cost_of(patch, table, value, terms, width, cell, action)
+            if after + cost <= distance[cell] * SAME:
+                return action
+    return -1
+
+
+@compiled_now
+def roll_out(distance: Distances, costs: MoveCosts, start: int) -> Cells:
+    """Return the greedy steps from a closed start to the goal, with both cells: (N,) int32."""
+    patch, table, value, terms, width = costs[:5]
+    cells: Cells = np.empty(64, np.int32)
+    cell, number = start, 0
+    while True:
+        if number == cells.size:
+            cells = np.concatenate((cells, np.empty(number, np.int32)))
+        cells[number] = cell
+        number += 1
+        action = next_action(distance, patch, table, value, terms, width, cell)
+        if distance[cell] == AT_GOAL or action < 0:
+            path: Cells = cells[:number].copy()
+            return path
+        cell += MOVE_Y[action] * width + MOVE_X[action]
+
+
+@compiled_now
+def policy_of(distance: Distances, costs: MoveCosts) -> NDArray[np.int8]:
+    """Return the greedy action of each cell of a whole field, -1 without one: (H, W) int8."""
+    patch, table, value, terms, width = costs[:5]
+    policy = np.full((distance.size // width - 2, width - 2), -1, np.int8)
+    for y in range(policy.shape[0]):
+        for x in range(policy.shape[1]):
+            cell = (y + 1) * width + x + 1
+            policy[y, x] = next_action(distance, patch, table, value, terms, width, cell)
+    return policy
+
+
+@compiled_now
+def q_of(distance: Distances, costs: MoveCosts) -> NDArray[np.float32]:
+    """Return minus the cost of the best path through each action: (8, H, W) float32."""
+    patch, table, value, terms, width = costs[:5]
+    q = np.full((8, distance.size // width - 2, width - 2), -np.inf, np.float32)
+    for action in range(8):
+        for y in range(q.shape[1]):
+            for x in range(q.shape[2]):
+                cell = (y + 1) * width + x + 1
+                after = distance[cell + MOVE_Y[action] * width + MOVE_X[action]]
+                if after > 0:
+                    cost = cost_of(patch, table, value, terms, width, cell, action)
+                    q[action, y, x] = -(cost + after)
+    return q
 
 
 def propagate_values(
@@ -17,9 +353,7 @@ def propagate_values(
 ) -> NDArray[np.float32]:
     """Return the greatest Q that satisfies Q(s, a) = -cost(s, a) + max_a' Q(s', a'), 0 at the goal.
 
-    Value iteration without discount converges to it. The cells are visited in the order of their
-    distance to the goal, bucket by bucket (Dial 1969). Each bucket has the width 1, and no move
-    costs less than 1. So a cell cannot change its own bucket, and each cell is visited once.
+    Value iteration without discount converges to it.
 
     Parameters
     ----------
@@ -35,77 +369,17 @@ def propagate_values(
         -inf where a move is not possible or no path leads from it to the goal. Summed in double
         precision, rounded once.
     """
-    width = patch_id.shape[1]
     outside = len(cost_PA)
     padded = np.pad(patch_id, 1, constant_values=outside)
-    cost_PA = np.concatenate([cost_PA, np.full((1, len(MOVES)), np.inf, dtype=np.float32)])
-    offsets = MOVES[:, 1] * (width + 2) + MOVES[:, 0]
-    goal_number = (goal[1] + 1) * (width + 2) + goal[0] + 1
-    distance = _distances(padded.ravel(), cost_PA, goal_number, offsets)
-    q: NDArray[np.float32] = _q(padded, cost_PA, distance.reshape(padded.shape), MOVES)
-    return q
+    table_PA = np.pad(cost_PA, ((0, 1), (0, 0)), constant_values=np.inf)
+    costs = costs_by_patch(padded.ravel(), table_PA, padded.shape[1])
+    distance, state, opened = new_field(padded.size, (goal[1] + 1) * costs.width + goal[0] + 1)
+    grow_whole(distance, state, opened, costs)
+    return q_of(distance, costs)
 
 
-@compiled
-def _distances(patch_id, cost_PA, goal, offsets):  # type: ignore[no-untyped-def]  # pragma: no cover
-    """Return the least cost from each cell of a padded map to the goal: (C,) float64."""
-    highest = 1.0
-    for patch in range(cost_PA.shape[0]):
-        for action in range(cost_PA.shape[1]):
-            if highest < cost_PA[patch, action] < np.inf:
-                highest = cost_PA[patch, action]
-    # A ring of buckets. Each is a doubly linked list of cells, so that a cell that gets a shorter
-    # path leaves its old bucket in constant time.
-    buckets = int(highest) + 2
-    head = np.full(buckets, -1, dtype=np.int32)
-    after = np.full(patch_id.size, -1, dtype=np.int32)
-    before = np.full(patch_id.size, -1, dtype=np.int32)
-    distance = np.full(patch_id.size, np.inf)
-    distance[goal] = 0.0
-    head[0] = goal
-    queued, current = 1, 0
-    while queued > 0:
-        bucket = current % buckets
-        while head[bucket] >= 0:
-            cell = head[bucket]
-            head[bucket] = after[cell]
-            if after[cell] >= 0:
-                before[after[cell]] = -1
-            queued -= 1
-            for action in range(offsets.size):
-                previous = cell - offsets[action]
-                through = distance[cell] + cost_PA[patch_id[previous], action]
-                if through >= distance[previous]:
-                    continue
-                if distance[previous] < np.inf:
-                    if before[previous] >= 0:
-                        after[before[previous]] = after[previous]
-                    else:
-                        head[int(distance[previous]) % buckets] = after[previous]
-                    if after[previous] >= 0:
-                        before[after[previous]] = before[previous]
-                else:
-                    queued += 1
-                distance[previous] = through
-                new = int(through) % buckets
-                before[previous] = -1
-                after[previous] = head[new]
-                if head[new] >= 0:
-                    before[head[new]] = previous
-                head[new] = previous
-        current += 1
-    return distance
-
-
-@compiled
-def _q(patch_id, cost_PA, distance, moves):  # type: ignore[no-untyped-def]  # pragma: no cover
-    """Return Q of the cells inside a padded map: (8, H, W) float32."""
-    height, width = patch_id.shape[0] - 2, patch_id.shape[1] - 2
-    q = np.empty((moves.shape[0], height, width), dtype=np.float32)
-    for action in range(moves.shape[0]):
-        dx, dy = moves[action]
-        for y in range(height):
-            for x in range(width):
-                cost = cost_PA[patch_id[y + 1, x + 1], action]
-                q[action, y, x] = -(cost + distance[y + 1 + dy, x + 1 + dx])
-    return q
+def new_field(cells: int, goal: int) -> tuple[Distances, States, Cells]:
+    """Return the distances, states and open cells of a field that is still to grow."""
+    distance, state = np.zeros(cells), np.zeros(cells, dtype=np.uint8)
+    distance[goal], state[goal] = AT_GOAL, OPEN
+    return distance, state, np.array([goal], dtype=np.int32)

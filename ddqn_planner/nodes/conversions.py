@@ -9,12 +9,13 @@ import array
 import math
 from collections.abc import Sequence
 from itertools import zip_longest
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 from geometry_msgs.msg import Point, Pose, PoseStamped, Quaternion
 from nav_msgs.msg import OccupancyGrid, Path
 from numpy.typing import NDArray
+from rclpy.serialization import serialize_message
 from std_msgs.msg import Header
 
 from ddqn_planner.grid import Cell, GridMap
@@ -22,6 +23,8 @@ from ddqn_planner.grid.map_file import MAX_CELLS
 
 if TYPE_CHECKING:
     from ddqn_planner.planning import QField
+
+Message = TypeVar("Message", Point, Pose, PoseStamped)
 
 TOLERANCE = 1e-4
 """How far the norm of a quaternion may be from 1."""
@@ -41,15 +44,17 @@ def grid_from_message(
     Raises
     ------
     ValueError
-        If the message is malformed, or its origin is rolled or pitched; the error names the value.
+        If the message is malformed, its origin is rolled or pitched, or no memory is left for it.
     """
     _check_map(message)
     info = message.info
     values = np.frombuffer(message.data, np.int8).reshape(info.height, info.width)
     origin = (info.origin.position.x, info.origin.position.y, _yaw(info.origin.orientation))
-    return GridMap.from_occupancy_values(
-        values, info.resolution, origin, occupied_threshold, allow_unknown, use_map_costs
-    )
+    rules = occupied_threshold, allow_unknown, use_map_costs
+    try:
+        return GridMap.from_occupancy_values(values, info.resolution, origin, *rules)
+    except MemoryError:
+        raise ValueError("no memory is left for the map; give a smaller one") from None
 
 
 def occupancy_message(
@@ -70,24 +75,16 @@ def occupancy_message(
     return message
 
 
-def value_message(field: QField, grid: GridMap, header: Header) -> OccupancyGrid:
+def value_message(field: QField | None, grid: GridMap, header: Header) -> OccupancyGrid:
     """Make a map message of a value field: 0 the lowest value, 100 the goal's, -1 for no value."""
-    value = field.value
-    known = np.isfinite(value) & ~grid.occupancy
-    percent = np.full(value.shape, -1, dtype=np.int8)
-    if known.any():
-        # In float64: the span of two float32 may overflow.
-        finite = value[known].astype(np.float64)
-        span = finite.max() - finite.min()
-        share = (finite - finite.min()) / span if span > 0 else np.ones_like(finite)
-        percent[known] = np.rint(100 * share).astype(np.int8)
+    percent = np.full(grid.occupancy.shape, -1, dtype=np.int8)
+    if field is not None:
+        known = np.isfinite(field.value) & ~grid.occupancy
+        values = field.value[known]
+        if values.size:
+            shares = np.interp(values, (values.min(), values.max()), (0, 100))
+            percent[known] = np.rint(shares)
     return occupancy_message(percent, grid.resolution, grid.origin, header)
-
-
-def unknown_value_message(grid: GridMap, header: Header) -> OccupancyGrid:
-    """Make a map message of a value field that is -1 everywhere."""
-    unknown = np.full(grid.occupancy.shape, -1, dtype=np.int8)
-    return occupancy_message(unknown, grid.resolution, grid.origin, header)
 
 
 def path_message(
@@ -98,21 +95,58 @@ def path_message(
     Each pose faces the next one, and the last has the goal's orientation. All have the same header
     object.
     """
-    path = Path(header=header)
+    path, blank = Path(header=header), PoseStamped(header=header)
     # Poses in the same direction share a quaternion: most of an answer's time is making messages.
     towards: dict[Cell, Quaternion] = {}
     for cell, next_cell in zip_longest(cells, cells[1:]):
-        pose = PoseStamped(header=header)
-        pose.pose.position.x, pose.pose.position.y = grid.cell_to_world(cell)
+        stamped = _copy(blank)
+        stamped.pose = pose = _copy(blank.pose)
+        pose.position = point = _copy(blank.pose.position)
+        point.x, point.y = grid.cell_to_world(cell)
         if next_cell is None:
-            pose.pose.orientation = goal_orientation
+            pose.orientation = goal_orientation
         else:
             step = (next_cell[0] - cell[0], next_cell[1] - cell[1])
             if step not in towards:
                 towards[step] = quaternion(grid.origin[2] + math.atan2(step[1], step[0]))
-            pose.pose.orientation = towards[step]
-        path.poses.append(pose)
+            pose.orientation = towards[step]
+        path.poses.append(stamped)
     return path
+
+
+def serialized_path(
+    cells: Sequence[Cell], grid: GridMap, header: Header, goal_orientation: Quaternion
+) -> bytes:
+    """Return what `path_message` returns in the form in which it is sent, which publishers take.
+
+    It saves nearly all of an answer's time: rclpy converts a message pose by pose. The form is CDR
+    (OMG DDS-XTypes, plain CDR, little-endian): numbers are aligned to their size, so that a pose
+    has the same bytes before its seven numbers each time, except for the first one.
+    """
+    start = serialize_message(Path(header=header))[4:-4] + len(cells).to_bytes(4, "little")
+    start += bytes(-len(start) % 4)
+    stamp = serialize_message(header)[4:]
+    first, others = (stamp + bytes(-(at + len(stamp)) % 8) for at in (len(start), 0))
+    pose = np.dtype([("header", f"V{len(others)}"), ("numbers", "<f8", 7)])
+    poses = np.zeros(len(cells), dtype=pose)
+    if len(cells):
+        poses["header"] = np.void(others)
+        x, y = np.array(cells, dtype=np.float64).T
+        yaw = grid.origin[2] + np.arctan2(np.diff(y), np.diff(x))
+        numbers = poses["numbers"]
+        numbers[:, 0], numbers[:, 1] = grid.cell_to_world((x, y))
+        numbers[:-1, 5], numbers[:-1, 6] = np.sin(yaw / 2), np.cos(yaw / 2)
+        last = goal_orientation
+        numbers[-1, 3:] = last.x, last.y, last.z, last.w
+    return b"\0\1\0\0" + start + (first + poses.tobytes()[len(others) :] if len(cells) else b"")
+
+
+def _copy(message: Message) -> Message:
+    """Return a message with the same parts, in a third of the time of `copy.copy`."""
+    copied: Message = object.__new__(type(message))
+    for slot in message.__slots__:
+        setattr(copied, slot, getattr(message, slot))
+    return copied
 
 
 def check_pose(name: str, header: Header, pose: Pose, frame: str = "") -> None:

@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 import sys
+from typing import Final
 
 import numpy as np
 from nav_msgs.msg import OccupancyGrid
 from nav_msgs.srv import GetMap, LoadMap
 from numpy.typing import NDArray
-from rclpy.exceptions import InvalidParameterValueException
-from rclpy.node import Node
 from std_msgs.msg import Header
-from std_srvs.srv import Trigger
 
 from ddqn_planner.grid import (
     OCCUPIED,
@@ -25,7 +23,7 @@ from ddqn_planner.grid import (
 )
 from ddqn_planner.grid.map_file import MapDataError, MapMetadataError, MapNotFoundError
 from ddqn_planner.nodes.conversions import MIN_RESOLUTION, occupancy_message
-from ddqn_planner.nodes.runtime import LATCHED, BaseNode, declare, spin_until_shutdown
+from ddqn_planner.nodes.runtime import LATCHED, BaseNode, Declared, spin_until_shutdown
 from ddqn_planner.resources import PACKAGE, find_map
 
 RESULTS: dict[type[Exception], int] = {
@@ -38,20 +36,14 @@ RESULTS: dict[type[Exception], int] = {
 NO_MAP = "no map is loaded; call load_map first"
 
 
-def declare_parameters(node: Node) -> None:
-    """Declare all parameters of the map server node; none can be set while it runs."""
-    for name, default, description, limits in (
-        (
-            "yaml_filename",
-            "dilemma.yaml",
-            "Path or URL of a map file, or a shipped map's name",
-            None,
-        ),
-        ("topic_name", "map", "Topic of the map", None),
-        ("frame_id", "map", "Frame of the map, not empty", None),
-        ("seed", 0, "Seed of the new obstacles", (0, 2**63 - 1)),
-    ):
-        declare(node, name, default, description, limits, read_only=True)
+PARAMETERS: Final = {
+    "yaml_filename": Declared(
+        "dilemma.yaml", "Path or URL of a map file, or a shipped map's name", read_only=True
+    ),
+    "topic_name": Declared("map", "Topic of the map", read_only=True),
+    "frame_id": Declared("map", "The map's frame", "not empty", read_only=True),
+    "seed": Declared(0, "Seed of the new obstacles", (0, 2**63 - 1), read_only=True),
+}
 
 
 class MapServerNode(BaseNode):
@@ -64,25 +56,17 @@ class MapServerNode(BaseNode):
     """
 
     def __init__(self) -> None:
-        super().__init__("map_server")
+        super().__init__("map_server", PARAMETERS)
         self._loaded: MapFile | None = None
         self._served = OccupancyGrid()
 
-        declare_parameters(self)
-        yaml_filename, topic_name, self._frame, seed = (
-            self.get_parameter(name).value
-            for name in ("yaml_filename", "topic_name", "frame_id", "seed")
-        )
-        if not self._frame:
-            raise InvalidParameterValueException("frame_id", "", "name the map's frame")
-        self._random = np.random.default_rng(seed)
-
-        self._publisher = self.create_publisher(OccupancyGrid, topic_name, LATCHED)
-        self._load(yaml_filename)
+        self._random = np.random.default_rng(self.value("seed"))
+        self._publisher = self.create_publisher(OccupancyGrid, self.value("topic_name"), LATCHED)
+        self._load(self.value("yaml_filename"))
         self.create_service(GetMap, "~/map", self._on_get_map)
         self.create_service(LoadMap, "~/load_map", self._on_load_map)
-        self.create_service(Trigger, "~/scatter_obstacles", self._on_scatter_obstacles)
-        self.create_service(Trigger, "~/restore_map", self._on_restore_map)
+        self.create_trigger("~/scatter_obstacles", self._on_scatter_obstacles)
+        self.create_trigger("~/restore_map", self._on_restore_map)
 
     def _load(self, url: str) -> int:
         """Load a map and serve it, or log why not; return the result code of LoadMap."""
@@ -107,7 +91,7 @@ class MapServerNode(BaseNode):
 
     def _serve(self, values: NDArray[np.int8]) -> None:
         assert self._loaded is not None
-        header = Header(stamp=self.get_clock().now().to_msg(), frame_id=self._frame)
+        header = Header(stamp=self.get_clock().now().to_msg(), frame_id=self.value("frame_id"))
         self._served = occupancy_message(
             values, self._loaded.resolution, self._loaded.origin, header
         )
@@ -127,17 +111,14 @@ class MapServerNode(BaseNode):
             response.map = self._served
         return response
 
-    def _on_scatter_obstacles(
-        self, request: Trigger.Request, response: Trigger.Response
-    ) -> Trigger.Response:
+    def _on_scatter_obstacles(self) -> tuple[bool, str]:
         try:
-            response.message = self._scatter_obstacles()
-            response.success = True
-            self.get_logger().info(response.message)
+            message = self._scatter_obstacles()
         except ValueError as error:
-            response.message = str(error)
             self.get_logger().error(f"no obstacles were scattered: {error}")
-        return response
+            return False, str(error)
+        self.get_logger().info(message)
+        return True, message
 
     def _scatter_obstacles(self) -> str:
         if self._loaded is None:
@@ -159,15 +140,11 @@ class MapServerNode(BaseNode):
         ]
         return f"{len(cells)} new obstacles at {', '.join(cells)} m; {rejected} draws thrown away"
 
-    def _on_restore_map(
-        self, request: Trigger.Request, response: Trigger.Response
-    ) -> Trigger.Response:
+    def _on_restore_map(self) -> tuple[bool, str]:
         if self._loaded is None:
-            response.message = NO_MAP
-        else:
-            self._serve(self._loaded.values)
-            response.success, response.message = True, "the map is as it was loaded"
-        return response
+            return False, NO_MAP
+        self._serve(self._loaded.values)
+        return True, "the map is as it was loaded"
 
 
 def known_path(grid: GridMap, start: Cell, goal: Cell) -> tuple[MoveRule, list[Cell]]:
@@ -187,7 +164,7 @@ def known_path(grid: GridMap, start: Cell, goal: Cell) -> tuple[MoveRule, list[C
 
 def main() -> int:
     """Run the map server node until SIGINT or SIGTERM."""
-    return spin_until_shutdown(MapServerNode, declare_parameters)
+    return spin_until_shutdown(MapServerNode, PARAMETERS)
 
 
 if __name__ == "__main__":

@@ -29,7 +29,7 @@ ARROW = np.array([-0.35, 0.35, 0.1 + 0.175j, 0.1 - 0.175j])
 DIRECTIONS = np.exp(1j * np.arctan2(MOVES[:, 1], MOVES[:, 0]))
 
 
-def policy_message(field: QField, grid: GridMap, header: Header) -> MarkerArray:
+def policy_message(field: QField | None, grid: GridMap, header: Header) -> MarkerArray:
     """Make a message with an arrow for the greedy action in each cell.
 
     The goal and cells of policy -1 have none. If there are more than `MAX_ARROWS`, the message has
@@ -40,21 +40,21 @@ def policy_message(field: QField, grid: GridMap, header: Header) -> MarkerArray:
     visualization_msgs/MarkerArray
         One list of lines, which replaces the last one; without any arrow, it deletes the last one.
     """
-    policy = field.policy.copy()
-    policy[field.goal[1], field.goal[0]] = -1
+    policy = np.full(grid.occupancy.shape, -1)
+    if field is not None:
+        policy[:] = field.policy
+        policy[field.goal[1], field.goal[0]] = -1
     step = next(
         k for k in itertools.count(1) if np.count_nonzero(policy[::k, ::k] >= 0) <= MAX_ARROWS
     )
-    rows, columns = np.nonzero(policy[::step, ::step] >= 0)
-    if not rows.size:
-        return no_policy_message(header)
-    rows, columns = rows * step, columns * step
+    rows, columns = step * np.array(np.nonzero(policy[::step, ::step] >= 0))
     centres = columns + 0.5 + 1j * (rows + 0.5)
     arrows = centres[:, None] + step * ARROW * DIRECTIONS[policy[rows, columns], None]
     origin_x, origin_y, yaw = grid.origin
     arrows = complex(origin_x, origin_y) + grid.resolution * np.exp(1j * yaw) * arrows
 
     marker = Marker(header=header, ns="policy", type=Marker.LINE_LIST, color=COLOUR)
+    marker.action = Marker.ADD if rows.size else Marker.DELETE
     marker.pose.position.z = HEIGHT
     marker.pose.orientation.w = 1.0
     marker.scale.x = LINE_WIDTH * step * grid.resolution
@@ -63,11 +63,6 @@ def policy_message(field: QField, grid: GridMap, header: Header) -> MarkerArray:
     for tail, tip, left, right in zip(corners, corners, corners, corners, strict=True):
         marker.points.extend((tail, tip, tip, left, tip, right))
     return MarkerArray(markers=[marker])
-
-
-def no_policy_message(header: Header) -> MarkerArray:
-    """Make a message that deletes the arrows of the last `policy_message`."""
-    return MarkerArray(markers=[Marker(header=header, ns="policy", action=Marker.DELETE)])
 
 
 def _point(x: float, y: float) -> Point:

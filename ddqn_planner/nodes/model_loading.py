@@ -18,17 +18,14 @@ def load(model: str) -> tuple[Planner, str]:
 
 
 def load_and_warm_up(model: str) -> tuple[Planner, str]:
-    """Load a model, and the libraries and compiled functions that the first plan needs.
+    """Load a model, and the libraries and compiled functions that most plans need.
 
     The garbage collector leaves out what is there then: a collection would stop the node for 45 ms.
     """
     planner, path = load(model)
     sizes = planner.metadata.sizes
     shape = sizes.get("height", 3), sizes.get("width", 3)
-    # The start is too near to an obstacle, so that a search takes it out.
-    occupancy = np.zeros(shape, dtype=np.bool_)
-    occupancy[0, 0] = True
-    grid = GridMap(occupancy, obstacles=np.zeros(shape, dtype=np.bool_))
+    grid = GridMap(np.zeros(shape, dtype=np.bool_))
     planner.plan(grid, (0, 0), (shape[1] - 1, shape[0] - 1))
     gc.freeze()
     return planner, path

@@ -12,8 +12,10 @@ from __future__ import annotations
 
 import ctypes
 import os
+from collections.abc import Callable
 from contextlib import suppress
-from typing import NoReturn
+from types import SimpleNamespace
+from typing import Any, NoReturn
 
 from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped
 from nav_msgs.msg import OccupancyGrid, Odometry, Path
@@ -23,45 +25,37 @@ from rclpy.callback_groups import MutuallyExclusiveCallbackGroup, ReentrantCallb
 from rclpy.parameter import Parameter
 from rclpy.task import Future
 from std_msgs.msg import Header, String
-from std_srvs.srv import Trigger
 
-from ddqn_planner.grid import Cell, GridMap, inflate
+from ddqn_planner.grid import Cell, GridMap, MoveRule
+from ddqn_planner.grid.body import Inflation
+from ddqn_planner.model.certificate import NO_CERTIFICATE, certificate_of
 from ddqn_planner.nodes.conversions import (
     cell_from_pose,
     check_pose,
     check_tolerance,
     grid_from_message,
     path_message,
+    serialized_path,
 )
-from ddqn_planner.nodes.field_display import FieldDisplay
+from ddqn_planner.nodes.field_display import FieldDisplay, Shown
 from ddqn_planner.nodes.model_loading import load, load_and_warm_up
-from ddqn_planner.nodes.planner_parameters import (
-    Settings,
-    check_parameter,
-    check_parameters_of,
-    declare_parameters,
-)
+from ddqn_planner.nodes.planner_parameters import PARAMETERS
 from ddqn_planner.nodes.report import (
-    FAILED,
-    INVALID_GOAL,
-    INVALID_START,
-    INVALID_TOLERANCE,
-    NO_MAP,
-    NO_MODEL,
-    NO_START,
     Outcome,
     Report,
     RequestError,
     checked,
     describe_map,
-    describe_model,
     reason_of,
     seconds,
 )
 from ddqn_planner.nodes.runtime import LATCHED, STEADY, BaseNode, Worker, spin_until_shutdown
-from ddqn_planner.nodes.start_source import StartSource, StartUnknownError
-from ddqn_planner.planning import Planner, PlanRequest
+from ddqn_planner.nodes.start_source import StartSource, check_tf
+from ddqn_planner.planning import PlanMethod, Planner, PlanRequest
 from ddqn_planner.planning.planner import last_step
+
+MAP_PARAMETERS = ("occupied_threshold", "allow_unknown", "use_map_costs")
+BODY_PARAMETERS = ("robot_radius", "clearance_weight")
 
 LOOK_PERIOD = 0.1
 """Seconds between two looks whether something changed: an answer does not wait for diagnostics."""
@@ -78,23 +72,21 @@ class PlannerNode(BaseNode):
     """
 
     def __init__(self) -> None:
-        super().__init__("planner")
+        super().__init__("planner", PARAMETERS)
         self._map: OccupancyGrid | None = None
-        self._grid: Future | None = None
+        self._inflated: Future | None = None
+        self._inflate = Inflation()
         self._goal: PoseStamped | None = None
         self._planner: Planner | None = None
         self._model_file = ""
-        declare_parameters(self)
-        check_parameters_of(self)
-        self._settings = Settings.of(self)
-
+        self._settings = self.settings()
         self._worker = Worker(self)
-        # What takes milliseconds must not wait for fields: 2000 x 2000 cells take over a second.
-        self._quick_worker = Worker(self)
+        # Maps must not wait for fields: 2000 x 2000 cells take over a second.
+        self._map_worker = Worker(self)
         # While it loads, DDS discovers, and the node says what else is missing.
-        self._first_planner = self._worker.call(load_and_warm_up, self.get_parameter("model").value)
+        self._first_planner = self._worker.call(load_and_warm_up, self._settings.model)
         self._model_is_due = True
-        self._display = FieldDisplay(self, self._quick_worker)
+        self._display = FieldDisplay(self)
         self._report = Report(self)
         self._logged: tuple[PoseStamped, object] | None = None
         self._logged_map = ""
@@ -111,44 +103,40 @@ class PlannerNode(BaseNode):
         self._map_topic = maps.topic_name
         self.get_logger().info(f"waiting for a map on {self._map_topic}")
         self.create_subscription(PoseStamped, "goal_pose", self._on_goal_pose, 10)
-        if self.get_parameter("follow_trainer").value:
+        if self._settings.follow_trainer:
             self.create_subscription(String, "trainer/model_saved", self._on_model_saved, LATCHED)
         # Reentrant: a request that waits for its field does not keep out the others.
         self.create_service(
             GetPlan, "~/get_plan", self._on_get_plan, callback_group=ReentrantCallbackGroup()
         )
-        self.create_service(Trigger, "~/reload_model", self._on_reload_model)
+        self.create_trigger("~/reload_model", self._on_reload_model)
         self.create_timer(LOOK_PERIOD, self._on_look, clock=STEADY)
-        self.add_on_set_parameters_callback(self._check_parameters)
         self.add_post_set_parameters_callback(self._apply_parameters)
         self._replan.trigger()
 
     # Parameters and the model
 
-    def _check_parameters(self, parameters: list[Parameter]) -> SetParametersResult:
-        try:
-            for parameter in parameters:
-                check_parameter(parameter.name, parameter.value)
-                if parameter.name == "model":
-                    self._candidate = load(parameter.value)
-        except (ValueError, OSError, RuntimeError, MemoryError) as error:
-            return SetParametersResult(successful=False, reason=str(error) or repr(error))
-        return SetParametersResult(successful=True)
+    def check_parameters(self, new: dict[str, Any]) -> None:
+        """Check new values as `BaseNode` does, whether TF can be used, and load a new model."""
+        super().check_parameters(new)
+        if new.get("start_source") == "tf":
+            check_tf()
+        if "model" in new and hasattr(self, "_settings"):  # a worker loads the first one
+            self._candidate = load(new["model"])
 
     def _apply_parameters(self, parameters: list[Parameter]) -> None:
-        before, self._settings = self._settings, Settings.of(self)
-        settings = self._settings
-        if any(parameter.name == "model" for parameter in parameters):
+        settings = self._settings = self.settings()
+        changed = {parameter.name for parameter in parameters}
+        if "model" in changed:
             self._use_planner(*self._candidate)
         if self._planner is not None:
-            self._planner.cache_bytes = settings.cache_bytes
-        if settings.start_source != before.start_source:
+            self._planner.cache_bytes = settings.field_cache_bytes
+        if settings.start_source != self._start.name:
             # What the other source said, and what was refused of it, no longer counts.
             self._start.close()
             self._report.accept(self._start.topic)
             self._start = StartSource(self, settings.start_source, self._on_start)
-        map_settings = settings.map_arguments, settings.body
-        if self._map is not None and map_settings != (before.map_arguments, before.body):
+        if self._map is not None and changed.intersection(MAP_PARAMETERS + BODY_PARAMETERS):
             self._use_map(self._map)
         self._replan.trigger()
 
@@ -169,7 +157,7 @@ class PlannerNode(BaseNode):
     def _use_planner(self, planner: Planner, model_file: str) -> None:
         """Plan with it from now on."""
         self._planner, self._model_file, self._model_is_due = planner, model_file, False
-        planner.cache_bytes = self._settings.cache_bytes
+        planner.cache_bytes = self._settings.field_cache_bytes
         self._report.accept("model")
         self._report.change()
         self.get_logger().info(f"planning with the model {model_file}")
@@ -182,15 +170,11 @@ class PlannerNode(BaseNode):
         if not result.successful:
             self._report.refuse("model", f"the trainer's model was refused: {result.reason}")
 
-    def _on_reload_model(
-        self, request: Trigger.Request, response: Trigger.Response
-    ) -> Trigger.Response:
-        result = self._set_model(self.get_parameter("model").value)
-        response.success = result.successful
-        response.message = result.reason or f"loaded {self._model_file}"
+    def _on_reload_model(self) -> tuple[bool, str]:
+        result = self._set_model(self._settings.model)
         if not result.successful:
             self.get_logger().error(f"the model was not loaded again: {result.reason}")
-        return response
+        return result.successful, result.reason or f"loaded {self._model_file}"
 
     # Map, start and goal
 
@@ -209,19 +193,24 @@ class PlannerNode(BaseNode):
         self._replan.trigger()
 
     def _use_map(self, message: OccupancyGrid) -> bool:
-        """Plan on it from now on, with the robot's body if that has a size; or refuse it."""
+        """Plan on it from now on, or refuse it."""
         try:
-            grid = grid_from_message(message, *self._settings.map_arguments)
-        except (ValueError, MemoryError) as error:
-            self._report.refuse("map", str(error) or "no memory is left for it; give a smaller one")
+            self._grid = grid_from_message(message, *map(self.value, MAP_PARAMETERS))
+        except ValueError as error:
+            self._report.refuse("map", str(error))
             return False
         self._report.accept("map")
-        if any(self._settings.body):
-            self._grid = self._quick_worker.call(inflate, grid, *self._settings.body)
-        else:
-            self._grid = Future()
-            self._grid.set_result(grid)
+        self._inflated = None
         return True
+
+    def _inflated_map(self) -> Future:
+        """Return the map for the robot's body, which is computed for the first request."""
+        if self._inflated is None:
+            radius, weight = map(self.value, BODY_PARAMETERS)
+            # ROS accepts a value that is above the range by a millionth.
+            body = radius, min(weight, 1.0)
+            self._inflated = self._map_worker.call(self._inflate, self._grid, *body)
+        return self._inflated
 
     def _on_start(self, message: PoseWithCovarianceStamped | Odometry) -> None:
         try:
@@ -241,9 +230,9 @@ class PlannerNode(BaseNode):
         while True:
             try:
                 return self._start_pose(frame)
-            except StartUnknownError as error:
+            except RequestError:
                 if not self._start.may_come:
-                    raise RequestError(NO_START, str(error)) from None
+                    raise
             await self._next_look
 
     def _on_goal_pose(self, message: PoseStamped) -> None:
@@ -265,7 +254,8 @@ class PlannerNode(BaseNode):
         self, request: GetPlan.Request, response: GetPlan.Response
     ) -> GetPlan.Response:
         start = request.start if request.start.header.frame_id else None
-        response.plan, outcome = await self._answer(start, request.goal, request.tolerance)
+        header, outcome = await self._answer(start, request.goal, request.tolerance)
+        response.plan = _path(path_message, outcome, header, request.goal)
         self._report.log(outcome)
         return response
 
@@ -274,33 +264,26 @@ class PlannerNode(BaseNode):
         goal = self._goal
         if goal is None:
             return
-        path, outcome = await self._answer(None, goal, self._settings.tolerance)
-        self._plan_publisher.publish(path)
-        self._waits_for_start = outcome.status == NO_START
+        header, outcome = await self._answer(None, goal, self._settings.tolerance)
+        self._plan_publisher.publish(_path(serialized_path, outcome, header, goal))
+        self._waits_for_start = outcome.status == "NO_START"
         # The places and lengths in the reason may differ.
         logged = goal, (outcome.status, outcome.plan.method)
         if self._logged != logged:
             self._logged = logged
             self._report.log(outcome)
-        try:
-            await self._show_field(outcome, path.header)
-        except Exception as error:  # as when no memory is left: the node must survive
-            self.get_logger().error(f"the value cannot be shown ({error!r}); give a smaller map")
-
-    async def _show_field(self, outcome: Outcome, header: Header) -> None:
-        request, goal, planner = outcome.request, outcome.plan.goal, outcome.planner
-        if request is None or goal is None or planner is None:
+        request, field_goal = outcome.request, outcome.plan.goal
+        if request is None or field_goal is None or outcome.planner is None:
             self._display.clear(header)
-            return
-        field = planner.known_field(request.grid, goal, request.move_rule)
-        if field is None:
-            field = await self._worker.call(planner.q_field, request.grid, goal, request.move_rule)
-        await self._display.show(field, request.grid, header)
+        else:
+            rule = request.move_rule
+            shown = Shown(outcome.planner, request.grid, field_goal, rule, header)
+            self._display.show(shown)
 
     async def _answer(
         self, start: PoseStamped | None, goal: PoseStamped, tolerance: float
-    ) -> tuple[Path, Outcome]:
-        """Return the path, or an empty one, and what became of the request.
+    ) -> tuple[Header, Outcome]:
+        """Return the path's header, and what became of the request.
 
         A path is planned with the map, model and parameters that are there when this begins,
         whatever changes while it waits. Its stamp is the time of the answer.
@@ -312,29 +295,26 @@ class PlannerNode(BaseNode):
             outcome = Outcome(error.status, str(error))
         except Exception as error:  # as when no memory is left: the node must survive
             remedy = "give a smaller map, or another model"
-            outcome = Outcome(FAILED, f"the planning failed ({error!r}); {remedy}")
+            outcome = Outcome("FAILED", f"the planning failed ({error!r}); {remedy}")
         self._report.note(outcome)
-        header = Header(stamp=self.get_clock().now().to_msg(), frame_id=frame)
-        if outcome.request is None:
-            return Path(header=header), outcome
-        grid, rotation = outcome.request.grid, goal.pose.orientation
-        return path_message(outcome.plan.cells, grid, header, rotation), outcome
+        return Header(stamp=self.get_clock().now().to_msg(), frame_id=frame), outcome
 
     async def _plan(
         self, start: PoseStamped | None, goal: PoseStamped, tolerance: float
     ) -> Outcome:
-        checked(INVALID_GOAL, check_pose, "the goal", goal.header, goal.pose, self._frame())
-        map_message, next_grid, settings = self._map, self._grid, self._settings
-        if map_message is None or next_grid is None:
-            raise RequestError(NO_MAP, self._missing_map())
+        checked("INVALID_GOAL", check_pose, "the goal", goal.header, goal.pose, self._frame())
+        map_message, settings = self._map, self._settings
+        if map_message is None:
+            raise RequestError("NO_MAP", self._missing_map())
+        inflated = self._inflated_map()
         await self._first_model()
         planner = self._planner
         if planner is None:
-            raise RequestError(NO_MODEL, f"no model is loaded: {self._report.refused['model']}")
+            raise RequestError("NO_MODEL", f"no model is loaded: {self._report.refused['model']}")
         frame = map_message.header.frame_id
         if start is None:
             start = await self._known_start(frame)
-        grid: GridMap = await next_grid
+        grid: GridMap = await inflated
 
         def cell(status: str, name: str, stamped: PoseStamped) -> Cell:
             pose = stamped.header, stamped.pose
@@ -343,20 +323,24 @@ class PlannerNode(BaseNode):
 
         request = PlanRequest(
             grid,
-            tolerance=checked(INVALID_TOLERANCE, check_tolerance, tolerance) / grid.resolution,
-            start=cell(INVALID_START, "the start", start),
-            goal=cell(INVALID_GOAL, "the goal", goal),
-            move_rule=settings.move_rule or planner.metadata.move_rule,
-            method=settings.method,
-            simplified=settings.simplified,
+            tolerance=checked("INVALID_TOLERANCE", check_tolerance, tolerance) / grid.resolution,
+            start=cell("INVALID_START", "the start", start),
+            goal=cell("INVALID_GOAL", "the goal", goal),
+            move_rule=self._move_rule(settings, planner),
+            method=PlanMethod(settings.mode),
+            simplified=settings.path_simplification == "line_of_sight",
         )
         steps = planner.steps(request)
         plan = next(steps)
         if plan is None:  # a slow step follows
             plan = await self._worker.call(last_step, steps)
-        reason = reason_of(request, plan, start, goal, settings.body[0])
+        reason = reason_of(request, plan, start, goal, settings.robot_radius)
         stamp = seconds(map_message.header.stamp)
         return Outcome(plan.status.name, reason, planner, request, plan, stamp)
+
+    @staticmethod
+    def _move_rule(settings: SimpleNamespace, planner: Planner) -> MoveRule:
+        return MoveRule(settings.move_rule or planner.metadata.move_rule)
 
     # Diagnostics
 
@@ -365,7 +349,7 @@ class PlannerNode(BaseNode):
         looked, self._next_look = self._next_look, Future()
         looked.set_result(None)
         if self._waits_for_start and self._start.name == "tf":
-            with suppress(StartUnknownError):
+            with suppress(RequestError):
                 self._start_pose(self._frame())
                 self._waits_for_start = False
                 self._replan.trigger()
@@ -376,24 +360,39 @@ class PlannerNode(BaseNode):
             self._report.publish(fatal, "; ".join(missing), self._describe())
 
     def _describe(self) -> dict[str, str]:
-        description = {"model": self.get_parameter("model").value}
+        description = {"model": self._settings.model}
         if self._planner is not None:
-            rule = self._settings.move_rule or self._planner.metadata.move_rule
+            rule = self._move_rule(self._settings, self._planner)
             description |= {"model file": self._model_file, "move rule": rule.value}
-            description |= describe_model(self._planner.metadata)
+            metadata = self._planner.metadata
+            description["model move rule"] = metadata.move_rule.value
+            sizes = metadata.sizes.items()
+            description["model sizes"] = ", ".join(f"{key} {size}" for key, size in sizes)
+            description["model training steps"] = str(metadata.steps)
+            certificate = certificate_of(self._planner.network, metadata.move_rule)
+            description["model certificate"] = str(certificate or NO_CERTIFICATE)
         if self._map is not None:
             description["map"] = describe_map(self._map)
             description["map stamp (s)"] = seconds(self._map.header.stamp)
         return description
 
 
+def _path(make: Callable[..., Any], outcome: Outcome, header: Header, goal: PoseStamped) -> Any:
+    """Return the path of an outcome, or an empty one, made by a function of `conversions`."""
+    if outcome.request is None:
+        return Path(header=header)
+    return make(outcome.plan.cells, outcome.request.grid, header, goal.pose.orientation)
+
+
 def main() -> NoReturn:
     """Run the planner node until SIGINT or SIGTERM."""
-    # glibc returns large arrays at once: after 120 fields the process has 185 MB instead of 245.
+    # glibc reuses the memory of arrays up to 16 MB, because new pages would cost small fields a
+    # third of their time. It returns larger arrays at once, so that the memory does not grow.
     with suppress(AttributeError):  # another C library
-        ctypes.CDLL(None).mallopt(-3, 2**20)  # M_MMAP_THRESHOLD
+        for option in (-1, -3):  # M_TRIM_THRESHOLD, M_MMAP_THRESHOLD
+            ctypes.CDLL(None).mallopt(option, 2**24)
     # A field that is being computed cannot be stopped, and Python would wait for its thread.
-    os._exit(spin_until_shutdown(PlannerNode, declare_parameters))
+    os._exit(spin_until_shutdown(PlannerNode, PARAMETERS))
 
 
 if __name__ == "__main__":

@@ -9,21 +9,16 @@ from dataclasses import dataclass
 from typing import Any
 
 from builtin_interfaces.msg import Time
-from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import PoseStamped
 from nav_msgs.msg import OccupancyGrid
-from rclpy.node import Node
 
 from ddqn_planner.grid import Cell
-from ddqn_planner.model import ModelMetadata
+from ddqn_planner.nodes.runtime import BaseNode
 from ddqn_planner.planning import Plan, PlanMethod, Planner, PlanRequest, PlanStatus
 
 PERIOD = 1.0
 """Seconds between two diagnostics when nothing changes."""
-
-NO_REQUEST, NO_MAP, NO_START, NO_MODEL = "NO_REQUEST", "NO_MAP", "NO_START", "NO_MODEL"
-INVALID_START, INVALID_GOAL = "INVALID_START", "INVALID_GOAL"
-INVALID_TOLERANCE, FAILED = "INVALID_TOLERANCE", "FAILED"
 
 REMEDIES = {
     PlanStatus.START_OUTSIDE_MAP: "set the start on the map",
@@ -34,7 +29,6 @@ REMEDIES = {
     PlanStatus.NO_PATH: "set the goal where free cells lead to, or a greater tolerance",
     PlanStatus.ROLLOUT_TRAPPED: "train the model longer, or set mode to 'astar_fallback'",
 }
-
 
 NO_PLAN = Plan(PlanStatus.NO_PATH)
 
@@ -57,18 +51,14 @@ def checked(status: str, function: Any, *arguments: Any) -> Any:
 
 @dataclass(frozen=True)
 class Outcome:
-    """What became of a request.
+    """What became of a request; without a planner and a `PlanRequest` if it is not well-formed.
 
     Parameters
     ----------
     status : str
-        The name of a `PlanStatus`, or one of the constants above if there is no plan.
+        The name of a `PlanStatus`, or that of a `RequestError`.
     reason : str
         What a user reads: how the path was found, or why there is none and what to do.
-    planner : Planner, optional
-    request : PlanRequest, optional
-    plan : Plan
-        What the planner was asked and answered; without cells if there was no request.
     map_stamp : str
         The stamp of the map of the request, seconds; empty without a map.
     """
@@ -119,7 +109,7 @@ class Report:
 
     Parameters
     ----------
-    node : Node
+    node : BaseNode
 
     Attributes
     ----------
@@ -127,36 +117,35 @@ class Report:
         What was refused and not accepted since, and why.
     """
 
-    def __init__(self, node: Node) -> None:
+    def __init__(self, node: BaseNode) -> None:
         self.refused: dict[str, str] = {}
-        self._outcome = Outcome(NO_REQUEST, "no plan was asked for yet")
+        self._outcome = Outcome("NO_REQUEST", "no plan was asked for yet")
         self._node = node
         self._publisher = node.create_publisher(DiagnosticArray, "/diagnostics", 10)
         self._to_be_logged: list[str] = []
-        self._reported = -PERIOD
-        self._changed = True
+        self._due = 0.0
 
     def change(self) -> None:
         """Publish soon: something about the node changed."""
-        self._changed = True
+        self._due = 0.0
 
     def refuse(self, what: str, reason: str) -> None:
         """Log that something was refused, unless the last log of it said the same."""
         repeated = self.refused.get(what) == reason
         self.refused[what] = reason
-        self._changed = True
+        self.change()
         if not repeated:
             self._node.get_logger().error(f"{what} refused: {reason}")
 
     def accept(self, what: str) -> None:
         """Forget that something was refused."""
         if self.refused.pop(what, None):
-            self._changed = True
+            self.change()
 
     def note(self, outcome: Outcome) -> None:
         """Store the last outcome for the diagnostics."""
         self._outcome = outcome
-        self._changed = True
+        self.change()
 
     def log(self, outcome: Outcome) -> None:
         """Log a failure at once, and a path after its answer, which comes 1.2 times as fast."""
@@ -175,25 +164,22 @@ class Report:
     @property
     def is_due(self) -> bool:
         """Whether to publish: something changed, or `PERIOD` has passed."""
-        return self._changed or time.monotonic() - self._reported >= PERIOD
+        return time.monotonic() >= self._due
 
     def publish(self, fatal: bool, missing: str, more: Mapping[str, str]) -> None:
         """Publish the diagnostics, with what is missing and more values.
 
         It is fatal if the node cannot plan until its user does something.
         """
-        self._changed = False
-        self._reported = time.monotonic()
+        self._due = time.monotonic() + PERIOD
         outcome, plan = self._outcome, self._outcome.plan
         problems = [f"{what} refused: {reason}" for what, reason in self.refused.items()]
         if missing and missing != outcome.reason:
             problems.append(missing)
-        good = not problems and (plan.cells or outcome.status == NO_REQUEST)
-        status = DiagnosticStatus(name=f"{self._node.get_fully_qualified_name()}: plan")
-        status.level = DiagnosticStatus.OK if good else DiagnosticStatus.WARN
+        good = not problems and (plan.cells or outcome.status == "NO_REQUEST")
+        level = DiagnosticStatus.OK if good else DiagnosticStatus.WARN
         if fatal:
-            status.level = DiagnosticStatus.ERROR
-        status.message = "; ".join([outcome.reason, *problems])
+            level = DiagnosticStatus.ERROR
         values = {
             "status": outcome.status,
             "reason": outcome.reason,
@@ -205,19 +191,8 @@ class Report:
             **more,
             **{f"refused {what}": reason for what, reason in self.refused.items()},
         }
-        status.values = [KeyValue(key=key, value=value) for key, value in values.items()]
-        message = DiagnosticArray(status=[status])
-        message.header.stamp = self._node.get_clock().now().to_msg()
-        self._publisher.publish(message)
-
-
-def describe_model(metadata: ModelMetadata) -> dict[str, str]:
-    """Return what the diagnostics say of a model."""
-    return {
-        "model move rule": metadata.move_rule.value,
-        "model sizes": ", ".join(f"{key} {size}" for key, size in metadata.sizes.items()),
-        "model training steps": str(metadata.steps),
-    }
+        message = "; ".join([outcome.reason, *problems])
+        self._publisher.publish(self._node.diagnostics("plan", level, message, values))
 
 
 def describe_map(message: OccupancyGrid) -> str:

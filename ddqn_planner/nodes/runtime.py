@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import json
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
+from inspect import isawaitable
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, NamedTuple
 
 import rclpy
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rcl_interfaces.msg import (
     FloatingPointRange,
     IntegerRange,
@@ -30,6 +32,7 @@ from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.service import Service
 from rclpy.task import Future
 from rclpy.utilities import ok, try_shutdown
+from std_srvs.srv import Trigger
 
 LATCHED = QoSProfile(
     depth=1,
@@ -49,21 +52,118 @@ default queue of ten lost half of 20 requests. Fast DDS keeps 5,000 messages by 
 """
 
 
-class BaseNode(Node):
-    """Node whose parameter services survive malformed requests, and whose services lose no request.
+class Declared(NamedTuple):
+    """What a user reads of a parameter.
 
-    Parameters
-    ----------
-    name : str
+    A number has a range; a text may have a list of choices, or words that say what it must be.
     """
 
-    def __init__(self, name: str) -> None:
+    default: Any
+    description: str
+    allowed: tuple[float, float] | list[str] | str = ""
+    read_only: bool = False
+
+    @property
+    def limits(self) -> str:
+        """Which values are allowed, in words."""
+        if isinstance(self.allowed, tuple):
+            form = "{} to {}" if isinstance(self.default, int) else "{:g} to {:g}"
+            return form.format(*self.allowed)
+        return self.allowed if isinstance(self.allowed, str) else f"one of {self.allowed}"
+
+    def descriptor(self) -> ParameterDescriptor:
+        """Return what ROS stores of it, and checks: a number's type and range."""
+        descriptor = ParameterDescriptor(description=self.description, read_only=self.read_only)
+        if not isinstance(self.allowed, tuple):
+            descriptor.additional_constraints = self.limits
+            return descriptor
+        low, high = map(type(self.default), self.allowed)
+        if isinstance(self.default, int):
+            descriptor.integer_range = [IntegerRange(from_value=low, to_value=high)]
+        else:
+            descriptor.floating_point_range = [FloatingPointRange(from_value=low, to_value=high)]
+        return descriptor
+
+    def check(self, name: str, value: Any) -> None:
+        """Check what ROS does not; ValueError if it is not one of the choices, or empty."""
+        if isinstance(self.allowed, list) and value not in self.allowed:
+            choices = ", ".join(choice or "''" for choice in self.allowed)
+            raise ValueError(f"{name} is {value!r}; give one of {choices}")
+        if self.allowed == "not empty" and not value:
+            raise ValueError(
+                f"{name} is ''; name {self.description[0].lower()}{self.description[1:]}"
+            )
+
+
+Parameters = Mapping[str, Declared]
+
+
+class BaseNode(Node):
+    """Node with checked parameters, whose services lose no request and survive malformed ones.
+
+    Raises
+    ------
+    ParameterException
+        If the node was started with invalid parameters.
+    """
+
+    def __init__(self, name: str, parameters: Parameters) -> None:
         super().__init__(name, start_parameter_services=False)
+        self._declared = parameters
+        for parameter, declared in parameters.items():
+            self.declare_parameter(parameter, declared.default, declared.descriptor())
+        result = self._check(self.get_parameters([*parameters]))
+        if not result.successful:
+            raise ParameterException("a parameter is invalid", result.reason)
+        self.add_on_set_parameters_callback(self._check)
         self._parameter_services = _CheckedParameterService(self)
+
+    def _check(self, parameters: list[Parameter]) -> SetParametersResult:
+        try:
+            self.check_parameters({parameter.name: parameter.value for parameter in parameters})
+        except (ValueError, OSError, RuntimeError, MemoryError) as error:
+            return SetParametersResult(successful=False, reason=str(error) or repr(error))
+        return SetParametersResult(successful=True)
+
+    def check_parameters(self, new: dict[str, Any]) -> None:
+        """Check new values beyond their types and ranges; an error refuses them all."""
+        for name, value in new.items():
+            if name in self._declared:
+                self._declared[name].check(name, value)
+
+    def value(self, name: str) -> Any:
+        """Return the value of a parameter."""
+        return self.get_parameter(name).value
+
+    def settings(self) -> SimpleNamespace:
+        """Return the values that all parameters have now."""
+        return SimpleNamespace(**{name: self.value(name) for name in self._declared})
 
     def create_service(self, *arguments: Any, **options: Any) -> Service:
         """Create a service with the queue of `SERVICE_QUALITY`."""
         return super().create_service(*arguments, **{"qos_profile": SERVICE_QUALITY, **options})
+
+    def create_trigger(self, name: str, handler: Callable[[], Any], **options: Any) -> None:
+        """Create a service; its handler returns whether it succeeds and a message, or awaits."""
+
+        async def answer(_: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+            result = handler()
+            success_and_message = await result if isawaitable(result) else result
+            response.success, response.message = success_and_message
+            return response
+
+        self.create_service(Trigger, name, answer, **options)
+
+    def diagnostics(
+        self, what: str, level: bytes, message: str, values: Mapping[str, str]
+    ) -> DiagnosticArray:
+        """Return a message for `/diagnostics` with one status."""
+        status = DiagnosticStatus(name=f"{self.get_fully_qualified_name()}: {what}")
+        status.level, status.message = level, message
+        status.values = [KeyValue(key=key, value=value) for key, value in values.items()]
+        array = DiagnosticArray(status=[status])
+        array.header.stamp = self.get_clock().now().to_msg()
+        return array
 
 
 class _CheckedParameterService(ParameterService):
@@ -123,34 +223,6 @@ class Worker:
         return future
 
 
-def declare(
-    node: Node,
-    name: str,
-    default: object,
-    description: str,
-    limits: tuple[float, float] | None = None,
-    choices: Sequence[str] = (),
-    constraint: str = "",
-    read_only: bool = False,
-) -> None:
-    """Declare a parameter with what a user reads of it.
-
-    ROS checks the limits of a number. The node must check choices, and what the constraint says.
-    """
-    constraint = f"one of {list(choices)}" if choices else constraint
-    descriptor = ParameterDescriptor(
-        description=description, additional_constraints=constraint, read_only=read_only
-    )
-    if limits and isinstance(default, int):
-        low, high = map(int, limits)
-        descriptor.integer_range = [IntegerRange(from_value=low, to_value=high, step=0)]
-    elif limits:
-        descriptor.floating_point_range = [
-            FloatingPointRange(from_value=float(limits[0]), to_value=float(limits[1]))
-        ]
-    node.declare_parameter(name, default, descriptor)
-
-
 HELP = """\
 usage: {program} [--ros-args [-p PARAMETER:=VALUE] [--params-file FILE] [-r NAME:=NEW_NAME] ...]
 
@@ -161,40 +233,27 @@ the node runs, with `ros2 param set NODE PARAMETER VALUE`:
 """
 
 
-def help_text(program: str, summary: str, declare_parameters: Callable[[Any], None]) -> str:
-    """Return what ``--help`` prints, without a node.
-
-    `declare_parameters` may call nothing of its node except `declare_parameter`.
-    """
-    parts = [HELP.format(program=program, summary=summary)]
-
-    def describe(name: str, default: object, descriptor: ParameterDescriptor) -> None:
+def help_text(program: str, summary: str, parameters: Parameters) -> str:
+    """Return what ``--help`` prints."""
+    lines = [HELP.format(program=program, summary=summary)]
+    for name, declared in parameters.items():
+        default = declared.default
         kind = Parameter.Type.from_parameter_value(default).name.lower()
         value = repr(default) if isinstance(default, str) else json.dumps(default)
-        limits = [f"{r.from_value:g} to {r.to_value:g}" for r in descriptor.floating_point_range]
-        limits += [f"{r.from_value} to {r.to_value}" for r in descriptor.integer_range]
-        limits += [descriptor.additional_constraints] if descriptor.additional_constraints else []
-        limits += ["read-only"] if descriptor.read_only else []
-        parts.append(
-            f"  {name}: {'; '.join([f'{kind}, default {value}', *limits])}\n"
-            f"      {descriptor.description}"
-        )
-
-    declare_parameters(SimpleNamespace(declare_parameter=describe))
-    return "\n".join(parts)
+        words = f"{kind}, default {value}", declared.limits, "read-only" * declared.read_only
+        lines += [f"  {name}: {'; '.join(filter(None, words))}", f"      {declared.description}"]
+    return "\n".join(lines)
 
 
-def spin_until_shutdown(
-    make_node: Callable[[], Node], declare_parameters: Callable[[Any], None] | None = None
-) -> int:
+def spin_until_shutdown(make_node: Callable[[], Node], parameters: Parameters | None = None) -> int:
     """Run one node until SIGINT or SIGTERM, or print its parameters if the user asks for help.
 
     Returns the exit code: 0, or 1 if the node cannot start with its parameters, names or
-    environment. Without `declare_parameters` (see `help_text`) there is no ``--help``.
+    environment. Without `parameters` there is no ``--help``.
     """
-    if declare_parameters and {"-h", "--help"} & {*sys.argv[1:]}:
+    if parameters and {"-h", "--help"} & {*sys.argv[1:]}:
         summary = (make_node.__doc__ or "").partition("\n")[0].replace("``", "")
-        print(help_text(Path(sys.argv[0]).name, summary, declare_parameters), flush=True)
+        print(help_text(Path(sys.argv[0]).name, summary, parameters), flush=True)
         return 0
     try:
         rclpy.init()

@@ -13,15 +13,10 @@ from rclpy.node import Node
 from rclpy.time import Time
 
 from ddqn_planner.nodes.conversions import check_pose
-
-TOPICS = {"initialpose": PoseWithCovarianceStamped, "odom": Odometry}
+from ddqn_planner.nodes.report import RequestError
 
 PATIENCE = 1.0
 """Seconds within which the first message of `odom` or TF is expected after the node subscribes."""
-
-
-class StartUnknownError(RuntimeError):
-    """The start is not known; the message says why and what to do."""
 
 
 def check_tf() -> None:
@@ -58,7 +53,7 @@ class StartSource:
             self._buffer = tf2_ros.Buffer()
             self._listener = tf2_ros.TransformListener(self._buffer, node)
         else:
-            message_type = TOPICS[self.topic]
+            message_type = Odometry if self.topic == "odom" else PoseWithCovarianceStamped
             self._subscription = node.create_subscription(message_type, self.topic, on_message, 10)
 
     def take(self, message: PoseWithCovarianceStamped | Odometry, map_frame: str) -> bool:
@@ -80,20 +75,20 @@ class StartSource:
 
         Raises
         ------
-        StartUnknownError
-            If there is none.
+        RequestError
+            If there is none: NO_START.
         """
         if self.name == "tf":
             return self._transformed_pose(map_frame, robot_frame, tolerance)
         if self._pose is None:
             topic = self._subscription.topic_name
-            remedy = {
-                "initialpose": f"set it on {topic} (in RViz: 2D Pose Estimate)",
-                "odom": f"nothing came on {topic} in the map's frame",
-            }[self.topic]
-            raise StartUnknownError(
+            remedy = f"nothing came on {topic} in the map's frame"
+            if self.name == "initialpose":
+                remedy = f"set it on {topic} (in RViz: 2D Pose Estimate)"
+            raise RequestError(
+                "NO_START",
                 f"the start is unknown; {remedy}; or set start_source, or give the request's start "
-                "its frame"
+                "its frame",
             )
         return self._pose
 
@@ -101,18 +96,20 @@ class StartSource:
         try:
             transform = self._buffer.lookup_transform(map_frame, robot_frame, Time())
         except self._tf2_ros.TransformException as error:
-            raise StartUnknownError(
+            raise RequestError(
+                "NO_START",
                 f"the start is unknown: no transform leads from {robot_frame!r} to {map_frame!r} "
-                f"({error}); publish one, or set robot_frame or start_source"
+                f"({error}); publish one, or set robot_frame or start_source",
             ) from None
         stamp = Time.from_msg(transform.header.stamp)
         age = (self._node.get_clock().now() - stamp).nanoseconds / 1e9
         # Static transforms have the stamp 0, and are never too old.
         if stamp.nanoseconds and age > tolerance:
-            raise StartUnknownError(
+            raise RequestError(
+                "NO_START",
                 f"the start is unknown: the transform from {robot_frame!r} to {map_frame!r} is "
                 f"{age:.3g} s old, more than transform_tolerance, {tolerance:g} s; publish it more "
-                "often, or set transform_tolerance or start_source"
+                "often, or set transform_tolerance or start_source",
             )
         pose = PoseStamped(header=transform.header)
         position, translation = pose.pose.position, transform.transform.translation

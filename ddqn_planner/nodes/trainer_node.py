@@ -15,20 +15,16 @@ import threading
 from collections.abc import Callable, Iterator
 from contextlib import suppress
 from functools import partial
-from inspect import isawaitable
 from pathlib import Path as FilePath
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped
 from nav_msgs.msg import OccupancyGrid, Path
 from rclpy.callback_groups import ReentrantCallbackGroup
-from rclpy.clock import Clock
-from rclpy.clock_type import ClockType
-from rclpy.exceptions import InvalidParameterValueException, ParameterException
+from rclpy.exceptions import InvalidParameterValueException
 from rclpy.timer import Timer
 from std_msgs.msg import Float32, Header, String
-from std_srvs.srv import Trigger
 
 from ddqn_planner.grid import Cell, GridMap, MoveRule, read_map_file
 from ddqn_planner.nodes.conversions import (
@@ -38,17 +34,17 @@ from ddqn_planner.nodes.conversions import (
     path_message,
     quaternion,
 )
-from ddqn_planner.nodes.runtime import LATCHED, BaseNode, Worker, spin_until_shutdown
-from ddqn_planner.nodes.trainer_parameters import (
-    check_parameters,
-    declare_parameters,
-    hyper_parameters,
-)
+from ddqn_planner.nodes.runtime import LATCHED, STEADY, BaseNode, Worker, spin_until_shutdown
+from ddqn_planner.nodes.trainer_parameters import HYPER_PARAMETERS, PARAMETERS
 from ddqn_planner.resources import find_map
+from ddqn_planner.training.hyper_parameters import HyperParameters
 
 if TYPE_CHECKING:
     from ddqn_planner.training.episodes import Episode
     from ddqn_planner.training.run import TrainingRun
+
+
+MAP_PARAMETERS = ("occupied_threshold", "allow_unknown")
 
 
 class MapInFrame(NamedTuple):
@@ -67,7 +63,7 @@ class TrainerNode(BaseNode):
     """
 
     def __init__(self) -> None:
-        super().__init__("trainer")
+        super().__init__("trainer", PARAMETERS)
         self._map: MapInFrame | None = None
         self._poses: dict[str, PoseStamped] = {}
         self._run: TrainingRun | None = None
@@ -79,40 +75,40 @@ class TrainerNode(BaseNode):
         self._replay_timer: Timer | None = None
         self._state, self._error, self._save_error = "idle", "", ""
 
-        declare_parameters(self)
-        result = check_parameters(self, [])
-        if not result.successful:
-            raise ParameterException("a parameter is invalid", result.reason)
-        self.add_on_set_parameters_callback(partial(check_parameters, self))
         self._episode_publisher = self.create_publisher(Path, "~/episode", 10)
         self._reward_publisher = self.create_publisher(Float32, "~/average_reward", 100)
         self._saved_publisher = self.create_publisher(String, "~/model_saved", LATCHED)
         self._diagnostics_publisher = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
         self._read_map_file()
         self.create_subscription(OccupancyGrid, "map", self._on_map, LATCHED)
-        self.create_subscription(PoseWithCovarianceStamped, "initialpose", self._on_start_pose, 10)
-        self.create_subscription(PoseStamped, "goal_pose", partial(self._set_pose, "goal"), 10)
+        on_start, on_goal = (partial(self._on_pose, which) for which in ("start", "goal"))
+        self.create_subscription(PoseWithCovarianceStamped, "initialpose", on_start, 10)
+        self.create_subscription(PoseStamped, "goal_pose", on_goal, 10)
         group = ReentrantCallbackGroup()  # the others are answered while ~/start waits
         for name in ("start", "stop", "save", "replay"):
-            handler = partial(_answer, getattr(self, f"_on_{name}"))
-            self.create_service(Trigger, f"~/{name}", handler, callback_group=group)
-        self._steady_clock = Clock(clock_type=ClockType.STEADY_TIME)
-        self.create_timer(0.1, self._on_events, clock=self._steady_clock)
-        self.create_timer(1.0, self._publish_diagnostics, clock=self._steady_clock)
+            self.create_trigger(f"~/{name}", getattr(self, f"_on_{name}"), callback_group=group)
+        self.create_timer(0.1, self._on_events, clock=STEADY)
+        self.create_timer(1.0, self._publish_diagnostics, clock=STEADY)
         self._imported = Worker(self).call(import_training)
 
-    def _value(self, name: str) -> Any:
-        return self.get_parameter(name).value
+    def check_parameters(self, new: dict[str, Any]) -> None:
+        """Check new values as `BaseNode` does, and hyper-parameters together: some limit others."""
+        super().check_parameters(new)
+        self._hyper_parameters(new)
+
+    def _hyper_parameters(self, new: dict[str, Any]) -> HyperParameters:
+        values = {**vars(self.settings()), **new}
+        return HyperParameters(**{name: values[name] for name in HYPER_PARAMETERS})
 
     def _read_map_file(self) -> None:
-        name = self._value("map_file")
+        name = self.value("map_file")
         if not name:
             return
         try:
             map_file = read_map_file(find_map(name))
         except (ValueError, OSError) as error:
             raise InvalidParameterValueException("map_file", name, str(error)) from None
-        grid = map_file.grid(self._value("occupied_threshold"), self._value("allow_unknown"))
+        grid = map_file.grid(*map(self.value, MAP_PARAMETERS))
         self._map = MapInFrame(grid, "map")
         for which, cell in (("start", map_file.start), ("goal", map_file.goal)):
             if cell is not None:
@@ -123,30 +119,25 @@ class TrainerNode(BaseNode):
 
     def _on_map(self, message: OccupancyGrid) -> None:
         try:
-            grid = grid_from_message(
-                message, self._value("occupied_threshold"), self._value("allow_unknown")
-            )
-        except (ValueError, MemoryError) as error:
-            remedy = "; give a smaller one" if isinstance(error, MemoryError) else ""
-            self._refuse(f"map refused: {error}{remedy}")
+            grid = grid_from_message(message, *map(self.value, MAP_PARAMETERS))
+        except ValueError as error:
+            self._refuse(f"map refused: {error}")
             return
         self._map = MapInFrame(grid, message.header.frame_id)
         self.get_logger().info(f"map of {grid.width} x {grid.height} cells")
 
-    def _on_start_pose(self, message: PoseWithCovarianceStamped) -> None:
-        self._set_pose("start", PoseStamped(header=message.header, pose=message.pose.pose))
-
-    def _set_pose(self, which: str, pose: PoseStamped) -> None:
+    def _on_pose(self, which: str, message: PoseStamped | PoseWithCovarianceStamped) -> None:
+        pose = getattr(message.pose, "pose", message.pose)
         try:
             # A pose may come before the map: ~/start then checks its cell.
-            check_pose(f"the {which}", pose.header, pose.pose)
+            check_pose(f"the {which}", message.header, pose)
+            stamped = PoseStamped(header=message.header, pose=pose)
             if self._map is not None:
-                cell = self._cell(which, pose, self._map)
+                cell = self._cell(which, stamped, self._map)
                 self.get_logger().info(f"the {which} is cell {cell}")
+            self._poses[which] = stamped
         except ValueError as error:
             self._refuse(f"{which} refused: {error}")
-        else:
-            self._poses[which] = pose
 
     def _cell(self, which: str, pose: PoseStamped, place: MapInFrame) -> Cell:
         """Return the cell of a pose; ValueError if it is not a free cell of the map."""
@@ -201,13 +192,13 @@ class TrainerNode(BaseNode):
         return place, TrainingRun(
             self._folder(),
             [Scenario(place.grid, start, goal)],
-            MoveRule(self._value("move_rule")),
-            hyper_parameters(self),
-            self._value("seed"),
+            MoveRule(self.value("move_rule")),
+            self._hyper_parameters({}),
+            self.value("seed"),
         )
 
     def _folder(self) -> FilePath:
-        return FilePath(self._value("output_folder")).absolute()
+        return FilePath(self.value("output_folder")).absolute()
 
     def _on_stop(self) -> tuple[bool, str]:
         replay = "; the replay was stopped" if self._stop_replay() else ""
@@ -259,7 +250,7 @@ class TrainerNode(BaseNode):
 
     def _on_episode(self, episode: Episode, place: MapInFrame) -> None:
         self._reward_publisher.publish(Float32(data=episode.average_reward))
-        if episode.number % self._value("episode_interval") == 0 and self._replay_timer is None:
+        if episode.number % self.value("episode_interval") == 0 and self._replay_timer is None:
             self._publish_cells(episode.cells, place)
 
     def _on_saved(self, run: TrainingRun, step: int) -> None:
@@ -283,10 +274,8 @@ class TrainerNode(BaseNode):
         self._episode_publisher.publish(path_message(cells, place.grid, header, quaternion(0)))
 
     def _publish_diagnostics(self) -> None:
-        status = DiagnosticStatus(name=f"{self.get_fully_qualified_name()}: training")
         error = self._save_error or self._error
-        status.level = DiagnosticStatus.ERROR if error else DiagnosticStatus.OK
-        status.message = error or self._state
+        level = DiagnosticStatus.ERROR if error else DiagnosticStatus.OK
         values = {"state": self._state}
         for which, pose in self._poses.items():
             position = pose.pose.position
@@ -299,9 +288,7 @@ class TrainerNode(BaseNode):
                 "epsilon": f"{trainer.epsilon:.3f}",
                 "folder": str(self._run.folder),
             }
-        status.values = [KeyValue(key=key, value=value) for key, value in values.items()]
-        message = DiagnosticArray(status=[status])
-        message.header.stamp = self.get_clock().now().to_msg()
+        message = self.diagnostics("training", level, error or self._state, values)
         self._diagnostics_publisher.publish(message)
 
     # Replay
@@ -315,7 +302,7 @@ class TrainerNode(BaseNode):
         if place is None:
             return False, "no map was received yet; start a map server first"
         try:
-            episodes = read_cells(file, self._value("episode_interval"))
+            episodes = read_cells(file, self.value("episode_interval"))
             first = next(episodes, None)
         except OSError as error:
             return False, f"no recorded episodes ({error}); call ~/start first"
@@ -329,9 +316,9 @@ class TrainerNode(BaseNode):
             for count in range(len(cells))
         )
         self._replay_timer = self.create_timer(
-            self._value("replay_period"),
+            self.value("replay_period"),
             partial(self._replay_step, frames, place),
-            clock=self._steady_clock,
+            clock=STEADY,
         )
         return True, "replaying the recorded episodes on ~/episode"
 
@@ -383,17 +370,9 @@ def _with_remedy(error: Exception) -> str:
     return f"{error!r}; {REMEDY}"
 
 
-async def _answer(
-    handler: Callable[[], Any], _: Trigger.Request, response: Trigger.Response
-) -> Trigger.Response:
-    answer = handler()
-    response.success, response.message = await answer if isawaitable(answer) else answer
-    return response
-
-
 def main() -> int:
     """Run the trainer node until SIGINT or SIGTERM."""
-    return spin_until_shutdown(TrainerNode, declare_parameters)
+    return spin_until_shutdown(TrainerNode, PARAMETERS)
 
 
 if __name__ == "__main__":

@@ -10,6 +10,7 @@ import os
 import socket
 import subprocess
 from contextlib import suppress
+from functools import partial
 from pathlib import Path as FilePath
 
 import numpy as np
@@ -59,8 +60,8 @@ class WatchNode(Node):
         subscribe = self.create_subscription
         subscribe(OccupancyGrid, "map", self._on_map, LATCHED)
         subscribe(OccupancyGrid, f"{planner}/value", self._on_value, LATCHED)
-        subscribe(Path, "plan", lambda path: self._on_path(PLAN, path), LATCHED)
-        subscribe(Path, f"{trainer}/episode", lambda path: self._on_path(EPISODE, path), 10)
+        subscribe(Path, "plan", partial(self._on_path, PLAN), LATCHED)
+        subscribe(Path, f"{trainer}/episode", partial(self._on_path, EPISODE), 10)
         subscribe(Float32, f"{trainer}/average_reward", self._on_reward, 100)
 
     def _on_map(self, message: OccupancyGrid) -> None:

@@ -105,12 +105,11 @@ def _spreading(grid: GridMap, value: NDArray[np.float32] | None) -> Iterator[NDA
         return
     known = np.flatnonzero(np.isfinite(value) & ~grid.occupancy)
     known = known[np.argsort(-value.flat[known], kind="stable")]
-    # In float64, because the difference of two float32 may overflow.
-    finite = value.flat[known].astype(np.float64)
-    above_worst = finite - finite.min(initial=np.inf)
-    shares = above_worst / max(above_worst.max(initial=0), np.finfo(np.float64).tiny)
+    finite = value.flat[known]
+    span = finite.min(initial=np.inf), finite.max(initial=-np.inf)
+    levels = np.rint(np.interp(finite, span, (0, LEVELS - 1)))
     for indices in np.array_split(np.arange(known.size), min(FRAMES, known.size) or 1):
-        colours.flat[known[indices]] = np.rint((LEVELS - 1) * shares[indices])
+        colours.flat[known[indices]] = levels[indices]
         yield colours
 
 

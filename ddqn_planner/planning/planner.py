@@ -6,7 +6,8 @@ import threading
 import time
 from collections import OrderedDict
 from collections.abc import Iterator
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from dataclasses import field as dataclass_field
 from pathlib import Path
 
 import numpy as np
@@ -14,19 +15,44 @@ from numpy.typing import NDArray
 
 from ddqn_planner.grid import Cell, GridMap, MoveRule, legal_moves, path_cost
 from ddqn_planner.grid.arguments import as_cell
-from ddqn_planner.grid.moves import component_labels
 from ddqn_planner.model import ModelMetadata, QNetwork, load_model
+from ddqn_planner.model.move_costs import MoveCosts
+from ddqn_planner.planning.distance_field import DistanceField
 from ddqn_planner.planning.plan import Plan, PlanMethod, PlanRequest, PlanStatus
 from ddqn_planner.planning.q_field import QField
+from ddqn_planner.planning.repair import repaired, shift_between
 from ddqn_planner.planning.search import search
 from ddqn_planner.planning.simplification import simplify
 
 CACHE_BYTES = 2**29
-"""Memory for the Q fields that a planner keeps: two of 2000 x 2000 cells, at 45 bytes per cell."""
+"""Memory for the Q fields that a planner keeps: 14 of 2000 x 2000 cells, at 9 bytes per cell."""
+
+UNLABELLED_SHARE = 1 / 2
+"""Share of the map's cells that a request may visit before the connected cells are looked at. A
+request without a path would visit all that its goal is connected to."""
 
 ROUNDING = 1e-6
 """Relative error of a tolerance in cells: 0.15 m in cells of 0.05 m must reach 3 cells, not
 2.9999999."""
+
+
+@dataclass(eq=False)
+class _KnownMap:
+    """What a planner knows of a map under a move rule: the network's costs of moves, and fields.
+
+    The costs are None for a network that gives none, see `QNetwork.move_costs`.
+    """
+
+    grid: GridMap
+    move_rule: MoveRule
+    costs: MoveCosts | None
+    fields: OrderedDict[Cell, QField] = dataclass_field(default_factory=OrderedDict)
+
+    @property
+    def nbytes(self) -> int:
+        """Memory of the fields and the costs, bytes."""
+        of_costs = self.costs.patch.nbytes if self.costs else 0
+        return of_costs + sum(field.nbytes for field in self.fields.values())
 
 
 class Planner:
@@ -50,7 +76,7 @@ class Planner:
         self.network = network
         self.metadata = metadata
         self.cache_bytes = CACHE_BYTES
-        self._fields: OrderedDict[tuple[str, Cell, MoveRule], QField] = OrderedDict()
+        self._maps: list[_KnownMap] = []  # used last at the end
         self._lock = threading.Lock()
 
     @classmethod
@@ -82,29 +108,86 @@ class Planner:
                 f"the model was not trained for maps of {grid.width} x {grid.height} cells; "
                 "train one on such a map"
             )
-        field = self.known_field(grid, goal, rule)
+        with self._lock:
+            known = self._map(grid, rule)
+            field = known.fields.get(goal)
         if field is None:
-            q = self.network.q_values(grid, goal, rule)
-            field = QField(goal, q, legal_moves(grid.occupancy, rule), rule)
-            self._remember(grid, field)
+            if known.costs is None:
+                q = self.network.q_values(grid, goal, rule)
+                field = QField(goal, q, legal_moves(grid.occupancy, rule), rule)
+            else:
+                field = self._repaired(known, goal)
+                field = field or DistanceField(goal, grid, known.costs, rule)
+        self._remember(known, field)
         return field
 
     def known_field(
         self, grid: GridMap, goal: Cell, move_rule: MoveRule | str | None = None
     ) -> QField | None:
         """Return the Q field of a map toward a goal if it is in the cache, else None."""
-        key = (grid.fingerprint, as_cell(goal, "the goal"), self._rule(move_rule))
+        goal, rule = as_cell(goal, "the goal"), self._rule(move_rule)
         with self._lock:
-            if key in self._fields:
-                self._fields.move_to_end(key)
-            return self._fields.get(key)
+            known = self._known_map(grid, rule)
+            field = known.fields.get(goal) if known else None
+            if known and field:
+                self._use(known, field)
+            return field
 
-    def _remember(self, grid: GridMap, field: QField) -> None:
+    def _known_map(self, grid: GridMap, rule: MoveRule) -> _KnownMap | None:
+        """Return what is known of an equal map."""
+        for known in reversed(self._maps):
+            if known.move_rule is rule and known.grid.same_cells(grid):
+                known.grid = grid  # which may lie elsewhere
+                return known
+        return None
+
+    def _map(self, grid: GridMap, rule: MoveRule) -> _KnownMap:
+        """Return what is known of an equal map, or what the network says of a new one."""
+        known = self._known_map(grid, rule)
+        if known is None:
+            known = _KnownMap(grid, rule, self.network.move_costs(grid, rule))
+            self._maps.append(known)
+        return known
+
+    def _repaired(self, known: _KnownMap, goal: Cell) -> QField | None:
+        """Return the field of a map that a field of an older one becomes, if there is one."""
+        assert known.costs is not None
         with self._lock:
-            self._fields[grid.fingerprint, field.goal, field.move_rule] = field
-            size = sum(known.nbytes for known in self._fields.values())
-            while size > self.cache_bytes and len(self._fields) > 1:
-                size -= self._fields.popitem(last=False)[1].nbytes
+            olders = [other for other in reversed(self._maps) if other is not known]
+        for older in olders:
+            shift = shift_between(older.grid, known.grid)
+            if shift is None or older.move_rule is not known.move_rule:
+                continue
+            old_goal = goal[0] - shift[0], goal[1] - shift[1]
+            field = older.fields.get(old_goal)
+            if isinstance(field, DistanceField):
+                new = repaired(field, goal, known.grid, known.costs, shift)
+                if new:  # it has the older one's memory
+                    with self._lock:
+                        older.fields.pop(old_goal, None)
+                return new
+        return None
+
+    def _remember(self, known: _KnownMap, field: QField) -> None:
+        """Keep a field, and forget the oldest ones beyond the bound."""
+        with self._lock:
+            self._use(known, field)
+            size = sum(other.nbytes for other in self._maps)
+            while size > self.cache_bytes and (len(self._maps) > 1 or len(known.fields) > 1):
+                oldest = self._maps[0]
+                size -= oldest.nbytes
+                oldest.fields.popitem(last=False)
+                if oldest.fields:
+                    size += oldest.nbytes
+                else:
+                    del self._maps[0]
+
+    def _use(self, known: _KnownMap, field: QField) -> None:
+        """Put a map and its field where those lie that were used last."""
+        known.fields[field.goal] = field
+        known.fields.move_to_end(field.goal)
+        self._maps = [other for other in self._maps if other is not known and other.fields]
+        self._maps.append(known)
 
     def _rule(self, move_rule: MoveRule | str | None) -> MoveRule:
         return self.metadata.move_rule if move_rule is None else MoveRule(move_rule)
@@ -155,22 +238,28 @@ class Planner:
         Plan or None
             None before each step that may be slow (a new field, a search); at last the plan.
         """
-        grid, goal, rule = request.grid, request.goal, request.move_rule
+        grid, start, goal, rule = request.grid, request.start, request.goal, request.move_rule
         status = self._refusal(request)
         if status is not None:
             yield Plan(status, move_rule=rule)
             return
         field_time, rollout_time = _Stopwatch(), _Stopwatch()
-        way_out: tuple[Cell, ...] = (request.start,)
+        way_out: tuple[Cell, ...] = (start,)
         with field_time:
-            field = self.known_field(grid, goal, rule) if grid.is_free(request.start) else None
+            field = self.known_field(grid, goal, rule) if grid.is_free(start) else None
         with rollout_time:
-            plan = field.rollout(request.start) if field else None
-        if field is None or plan is None or not plan.cells:
-            if field is None or _reach(request) >= 1:
-                yield None
+            plan = field.rollout_if_known(start) if field else None
+        if plan is None or (not plan.cells and _reach(request) >= 1):
+            yield None
+        if plan is None and grid.is_free(start) and grid.is_free(goal):
             with field_time:
-                way_out, end = _way_out_and_end(request)
+                field, plan = self._visit_some(request)
+        if plan is None or not plan.cells:
+            with field_time:
+                if plan and plan.status is PlanStatus.NO_PATH and _reach(request) < 1:
+                    way_out, end = (), goal
+                else:
+                    way_out, end = _way_out_and_end(request)
                 if way_out and (field is None or field.goal != end):
                     field, plan = self.q_field(grid, end, rule), None
             if field is None or not way_out:
@@ -185,6 +274,7 @@ class Planner:
                 with rollout_time:
                     cells = search(way_out[-1], end, field.legal, costs, rule, field.value)
                 plan = Plan(PlanStatus.SUCCEEDED, cells, PlanMethod.ASTAR_FALLBACK)
+        assert field is not None
         cells, cost = plan.cells, None
         with rollout_time:
             if cells:
@@ -193,6 +283,25 @@ class Planner:
                 cells = simplify(cells, grid, rule) if request.simplified else cells
         plan = replace(plan, cells=cells, move_rule=rule, cost=cost, goal=field.goal)
         yield replace(plan, field_ms=field_time.ms, rollout_ms=rollout_time.ms)
+
+    def _visit_some(self, request: PlanRequest) -> tuple[QField | None, Plan | None]:
+        """Return the field of the goal and the plan from it, if these take few visits of cells.
+
+        So most requests need no connected components.
+        """
+        grid, rule = request.grid, request.move_rule
+        with self._lock:
+            known = self._map(grid, rule)
+        if known.costs is None:
+            return None, None
+        field = self.q_field(grid, request.goal, rule)
+        assert isinstance(field, DistanceField)
+        plan = field.rollout(request.start, int(UNLABELLED_SHARE * grid.occupancy.size))
+        if plan.status is PlanStatus.ROLLOUT_TRAPPED:
+            labels = grid.labels(rule)
+            joined = labels[request.start[::-1]] == labels[request.goal[::-1]]
+            plan = field.rollout(request.start) if joined else Plan(PlanStatus.NO_PATH)
+        return field, plan
 
     def _refusal(self, request: PlanRequest) -> PlanStatus | None:
         """Return why there is no path, where one look at start and goal says so."""
@@ -241,7 +350,7 @@ def _way_out_and_end(request: PlanRequest) -> tuple[tuple[Cell, ...], Cell]:
     to a cell within the tolerance: connected cells say so, without a field.
     """
     grid, start, goal, rule = request.grid, request.start, request.goal, request.move_rule
-    labels = component_labels(grid.occupancy, rule)
+    labels = grid.labels(rule)
     goals = [np.array([goal])] if grid.is_free(goal) else []
     if _reach(request) >= 1:
         goals.append(_free_cells(grid, goal, _reach(request)))

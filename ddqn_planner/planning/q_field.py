@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
@@ -15,7 +14,6 @@ from ddqn_planner.planning.plan import Plan, PlanStatus
 _STEPS: list[Cell] = [(int(dx), int(dy)) for dx, dy in MOVES]
 
 
-@dataclass(frozen=True, eq=False)
 class QField:
     """Q(s, a) of every cell of one map toward one goal.
 
@@ -31,10 +29,17 @@ class QField:
         The rule by which they are legal.
     """
 
-    goal: Cell
     q: NDArray[np.float32]
     legal: NDArray[np.bool_]
-    move_rule: MoveRule = MoveRule.ROBOT_SAFE
+
+    def __init__(
+        self,
+        goal: Cell,
+        q: NDArray[np.float32],
+        legal: NDArray[np.bool_],
+        move_rule: MoveRule = MoveRule.ROBOT_SAFE,
+    ) -> None:
+        self.goal, self.q, self.legal, self.move_rule = goal, q, legal, move_rule
 
     @cached_property
     def value(self) -> NDArray[np.float32]:
@@ -67,6 +72,10 @@ class QField:
         legal = self.legal & (actions_A11 == greedy_1HW)
         return QField(self.goal, self.q, legal, self.move_rule)
 
+    def rollout_if_known(self, start: Cell) -> Plan | None:
+        """Return the rollout from a start if no more of the field is needed, else None."""
+        return self.rollout(start)
+
     def rollout(self, start: Cell) -> Plan:
         """Take greedy steps from a free cell until the goal, and return the path.
 
@@ -78,10 +87,7 @@ class QField:
             If the start is no cell of the map.
         """
         policy = self.policy
-        cell = as_cell(start, "the start")
-        height, width = policy.shape
-        if not (0 <= cell[0] < width and 0 <= cell[1] < height):
-            raise ValueError(f"the start {cell} lies outside the map of {width} x {height} cells")
+        cell = check_inside(start, policy.shape)
         cells, visited = [cell], {cell}
         while cell != self.goal:
             action = int(policy[cell[1], cell[0]])
@@ -91,3 +97,12 @@ class QField:
             visited.add(cell)
             cells.append(cell)
         return Plan(PlanStatus.SUCCEEDED, tuple(cells), move_rule=self.move_rule)
+
+
+def check_inside(start: Cell, shape: tuple[int, ...]) -> Cell:
+    """Return a start as a cell; ValueError if it is no cell of a map of shape (H, W)."""
+    cell = as_cell(start, "the start")
+    height, width = shape
+    if not (0 <= cell[0] < width and 0 <= cell[1] < height):
+        raise ValueError(f"the start {cell} lies outside the map of {width} x {height} cells")
+    return cell

@@ -48,17 +48,8 @@ def random_scenarios(seed: int, maps: int = MAPS) -> list[Scenario]:
     10 to 60 % of the cells are occupied, each independently: of the map types in
     `ddqn_planner.grid.generators`, training uses only this one. The high fill rates show 3x3
     patches that are rare otherwise. Each move rule has half of the maps. A quarter of the maps has
-    no costs, a quarter random costs, a quarter one constant cost, a quarter unknown cells.
-
-    Parameters
-    ----------
-    seed : int
-    maps : int
-
-    Returns
-    -------
-    list of Scenario
-        A path connects each start with its goal.
+    no costs, a quarter random costs, a quarter one constant cost, a quarter unknown cells. A path
+    connects each start with its goal.
     """
     random = np.random.default_rng(seed)
     return [_random_scenario(RULES[number % 2], random) for number in range(maps)]

@@ -1,4 +1,4 @@
-"""Double DQN: the target and the update of the online network."""
+"""Double DQN: the target y and the loss of the online network θ."""
 
 from __future__ import annotations
 
@@ -8,36 +8,26 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
+Network = Callable[[Tensor], Tensor]
+"""From states (B, ...) to Q (B, 8)."""
+
 
 def double_dqn_target(
     reward_B: Tensor, discount_B: Tensor, next_q_selection_BA: Tensor, next_q_evaluation_BA: Tensor
 ) -> Tensor:
-    """Return r + γ Q(s', argmax_a Q(s', a; selection); evaluation).
+    """Return y = r + γ Q(s', argmax_a Q(s', a; selection); evaluation): (B,) float32.
 
-    The selection network selects the next action, the evaluation network gives its value. In Double
-    DQN (van Hasselt et al. 2016, equation 4) these are the online network θ and the target network
-    θ⁻. In DQN (Mnih et al. 2015) both are θ⁻. In the paper's target as printed both are θ.
-
-    Parameters
-    ----------
-    reward_B : (B,) float32
-    discount_B : (B,) float32
-        γ, or 0 after a terminal transition.
-    next_q_selection_BA, next_q_evaluation_BA : (B, 8) float32
-        Q of the next state by the two networks.
-
-    Returns
-    -------
-    (B,) float32
+    The selection network selects the next action, the evaluation network gives its value. The
+    discount is γ, or 0 after a terminal transition.
     """
     greedy_B1 = next_q_selection_BA.argmax(dim=1, keepdim=True)
     return reward_B + discount_B * next_q_evaluation_BA.gather(1, greedy_B1).squeeze(1)
 
 
 def double_dqn_loss(
-    online: Callable[[Tensor], Tensor],
-    selection: Callable[[Tensor], Tensor],
-    evaluation: Callable[[Tensor], Tensor],
+    online: Network,
+    target: Network,
+    kind: str,
     state_B: Tensor,
     action_B: Tensor,
     reward_B: Tensor,
@@ -48,18 +38,21 @@ def double_dqn_loss(
 
     Parameters
     ----------
-    online, selection, evaluation : callable
-        From states (B, ...) to Q (B, 8): by θ, which learns, and by the two networks of
-        `double_dqn_target`.
+    online, target : callable
+        The networks θ, which learns, and θ⁻.
+    kind : str
+        Which networks select and evaluate the next action. "double_dqn" (van Hasselt et al. 2016,
+        equation 4): θ and θ⁻. "dqn" (Mnih et al. 2015): θ⁻ does both. "printed", the paper's target
+        as printed: θ does both.
     state_B, next_state_B : (B, ...)
-        What the callables take.
     action_B : (B,) int64
     reward_B, discount_B : (B,) float32
         See `double_dqn_target`.
     """
+    selection = target if kind == "dqn" else online
+    evaluation = online if kind == "printed" else target
     with torch.no_grad():
-        y_B = double_dqn_target(
-            reward_B, discount_B, selection(next_state_B), evaluation(next_state_B)
-        )
+        next_q = selection(next_state_B), evaluation(next_state_B)
+        y_B = double_dqn_target(reward_B, discount_B, *next_q)
     q_B = online(state_B).gather(1, action_B.unsqueeze(1)).squeeze(1)
     return functional.mse_loss(q_B, y_B)

@@ -6,8 +6,7 @@ Observation space
     ``Box(H, W) float32``: the matrix of `ddqn_planner.model.observation`.
 Rewards
     ``obstacle_reward`` for an illegal move, after which the robot stays in its cell. For a legal
-    move with the parameter ``reward = "paper"``: ``goal_reward`` for reaching the goal, else
-    `free_cell_reward`. With ``reward = "path_cost"``: `path_cost_reward`.
+    move that of `ddqn_planner.training.reward.move_reward`.
 End of an episode
     Terminated at the goal or at an illegal move, truncated after ``max_episode_steps``.
 """
@@ -16,7 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
+from typing import Any
 
 import gymnasium
 import numpy as np
@@ -24,38 +23,25 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
-from ddqn_planner.grid import MOVES, Cell, GridMap, MoveRule, legal_moves, neighbours, read_map_file
+from ddqn_planner.grid import MOVES, Cell, GridMap, MoveRule, legal_moves, read_map_file
 from ddqn_planner.model.observation import GOAL, OBSTACLE, ROBOT, observation_background, observe
 from ddqn_planner.resources import find_resource
 from ddqn_planner.training.exploring_starts import initial_cells
 from ddqn_planner.training.hyper_parameters import HyperParameters
-from ddqn_planner.training.reward import free_cell_reward, path_cost_reward
+from ddqn_planner.training.reward import move_reward
 
 Observations = NDArray[np.float32]
 
 
 @dataclass(frozen=True)
 class Scenario:
-    """One path planning problem.
-
-    Parameters
-    ----------
-    grid : GridMap
-    start, goal : (x, y)
-        Two different free cells.
-    move_rule : MoveRule, optional
-        By default the rule of its environment.
-
-    Raises
-    ------
-    ValueError
-        If the start or the goal is occupied or outside the map, or both are the same cell.
-    """
+    """One path planning problem; a ValueError unless start and goal are two free cells."""
 
     grid: GridMap
     start: Cell
     goal: Cell
     move_rule: MoveRule | None = None
+    """By default the rule of its environment."""
 
     def __post_init__(self) -> None:
         for name, cell in (("start", self.start), ("goal", self.goal)):
@@ -73,38 +59,11 @@ def paper_scenario() -> Scenario:
     return Scenario(map_file.grid(), map_file.start, map_file.goal)
 
 
-def move_reward(
-    scenario: Scenario, move_rule: MoveRule, parameters: HyperParameters
-) -> NDArray[np.float32]:
-    """Return the reward of each legal move: (8, H, W) float32."""
-    grid = scenario.grid
-    if parameters.reward == "path_cost":
-        return path_cost_reward(grid, move_rule)
-    shape = (grid.height, grid.width)
-    reward = free_cell_reward(shape, scenario.start, scenario.goal, parameters)
-    to_goal = neighbours(shape) == scenario.goal[1] * grid.width + scenario.goal[0]
-    reward[to_goal.reshape(reward.shape)] = parameters.goal_reward
-    return reward
-
-
-class StepResult(NamedTuple):
-    """The result of one step of N robots."""
-
-    cell: NDArray[np.int64]
-    """(N,) the cell after the step, y * W + x."""
-    reward: NDArray[np.float32]
-    """(N,)"""
-    terminated: NDArray[np.bool_]
-    """(N,) whether the robot reached the goal or collided."""
-    truncated: NDArray[np.bool_]
-    """(N,) whether the episode is out of steps."""
-
-
 class GridVectorEnvironment(VectorEnv[Observations, NDArray[np.int64], Any]):
     """N robots on grid maps, all moved in one step.
 
-    The results of all moves are looked up in tables, (S scenarios, 8 actions, H * W). An ended
-    episode keeps its last observation until `reset` is called with
+    Cells are numbers y * W + x. The results of all moves are looked up in tables, (S scenarios, 8
+    actions, H * W). An ended episode keeps its last observation until `reset` is called with
     ``options={"reset_mask": mask}`` (Gymnasium's autoreset mode "disabled").
 
     Parameters
@@ -112,6 +71,7 @@ class GridVectorEnvironment(VectorEnv[Observations, NDArray[np.int64], Any]):
     scenarios : sequence of Scenario
         Maps of one size; each episode draws one of them.
     move_rule : MoveRule
+        Of the scenarios that have none.
     parameters : HyperParameters
         For N (``environments``), the rewards, p_r and ``max_episode_steps``.
     """
@@ -137,27 +97,27 @@ class GridVectorEnvironment(VectorEnv[Observations, NDArray[np.int64], Any]):
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
 
         width = self.shape[1]
-        with_rules = list(zip(scenarios, self.move_rules, strict=True))
-        tables = (len(scenarios), len(MOVES), -1)
-        self._offset = MOVES[:, 1] * width + MOVES[:, 0]
-        self.start = np.array([s.start[1] * width + s.start[0] for s in scenarios])
-        self.goal = np.array([s.goal[1] * width + s.goal[0] for s in scenarios])
+        tables = (len(self.scenarios), len(MOVES), -1)
+        with_rules = list(zip(self.scenarios, self.move_rules, strict=True))
         self.background = np.stack(
-            [observation_background(s.grid.occupancy, s.goal) for s in scenarios]
+            [observation_background(s.grid.occupancy, s.goal) for s in self.scenarios]
         )
-        self._legal = np.stack(
-            [legal_moves(s.grid.occupancy, rule) for s, rule in with_rules]
-        ).reshape(tables)
+        self.legal = np.stack([legal_moves(s.grid.occupancy, r) for s, r in with_rules])
+        self.legal = self.legal.reshape(tables)
         self.free_reward = np.stack(
-            [move_reward(s, rule, parameters) for s, rule in with_rules]
+            [move_reward(s.grid, s.start, s.goal, r, parameters) for s, r in with_rules]
         ).reshape(tables)
-        self._reward = np.where(
-            self._legal, self.free_reward, np.float32(parameters.obstacle_reward)
-        )
-        free = [np.flatnonzero(~s.grid.occupancy) for s in scenarios]
-        free = [cells[cells != goal] for cells, goal in zip(free, self.goal, strict=True)]
-        self._free_count = np.array([len(cells) for cells in free])
-        self._free = np.stack([np.resize(cells, self._free_count.max()) for cells in free])
+        collision = np.float32(parameters.obstacle_reward)
+        self._reward = np.where(self.legal, self.free_reward, collision)
+        self._offset = MOVES[:, 1] * width + MOVES[:, 0]
+
+        self.start = np.array([s.start[1] * width + s.start[0] for s in self.scenarios])
+        self.goal = np.array([s.goal[1] * width + s.goal[0] for s in self.scenarios])
+        free_SC = np.stack([~s.grid.occupancy.ravel() for s in self.scenarios])
+        free_SC[np.arange(len(self.goal)), self.goal] = False
+        _, self._free = np.nonzero(free_SC)
+        self._free_count = free_SC.sum(axis=1)
+        self._free_first = np.cumsum(self._free_count) - self._free_count
 
         self.scenario = np.zeros(self.num_envs, dtype=np.int64)
         self.cell = self.start[self.scenario]
@@ -176,31 +136,33 @@ class GridVectorEnvironment(VectorEnv[Observations, NDArray[np.int64], Any]):
     ) -> tuple[Observations, NDArray[Any], NDArray[np.bool_], NDArray[np.bool_], dict[str, Any]]:
         """Move each robot once: (N,) actions."""
         result = self.move(actions)
-        return self.observations(), result.reward, result.terminated, result.truncated, {}
+        return self.observations(), *result, {}
 
     def reset_where(self, mask: NDArray[np.bool_]) -> None:
-        """Start a new episode in each environment where `mask` (N,) is True."""
+        """Start new episodes as `reset` does, without making the observations."""
         scenario = self.np_random.integers(len(self.start), size=int(mask.sum()))
         self.scenario[mask] = scenario
         self.cell[mask] = initial_cells(
             self.start[scenario],
-            self._free[scenario],
+            self._free,
+            self._free_first[scenario],
             self._free_count[scenario],
             self.parameters.p_r,
             self.np_random,
         )
         self.steps[mask] = 0
 
-    def move(self, actions: NDArray[np.int64]) -> StepResult:
-        """Move each robot once, as `step` does, without making the observations."""
+    def move(
+        self, actions: NDArray[np.int64]
+    ) -> tuple[NDArray[np.float32], NDArray[np.bool_], NDArray[np.bool_]]:
+        """Move as `step` does: return reward, terminated and truncated, but no observations."""
         lookup = (self.scenario, actions, self.cell)
-        legal, reward = self._legal[lookup], self._reward[lookup]
+        legal, reward = self.legal[lookup], self._reward[lookup]
         self.cell = np.where(legal, self.cell + self._offset[actions], self.cell)
-        reached = self.cell == self.goal[self.scenario]
         self.steps += 1
-        terminated = reached | ~legal
-        truncated = (self.steps >= self.parameters.max_episode_steps) & ~terminated
-        return StepResult(self.cell, reward, terminated, truncated)
+        terminated = ~legal | (self.cell == self.goal[self.scenario])
+        truncated = ~terminated & (self.steps >= self.parameters.max_episode_steps)
+        return reward, terminated, truncated
 
     def observations(self) -> Observations:
         """Return what the robots observe: (N, H, W) float32."""
@@ -208,16 +170,9 @@ class GridVectorEnvironment(VectorEnv[Observations, NDArray[np.int64], Any]):
 
 
 class GridEnvironment(gymnasium.Env[Observations, np.int64]):
-    """One robot on one grid map: a `GridVectorEnvironment` with N = 1.
+    """One robot on one grid map, by default the paper's: a `GridVectorEnvironment` with N = 1.
 
     ``gymnasium.make("ddqn_planner.training:ddqn_planner/Grid-v0")`` gives the paper's map.
-
-    Parameters
-    ----------
-    scenario : Scenario, optional
-        By default the paper's map, start and goal.
-    move_rule : MoveRule
-    parameters : HyperParameters
     """
 
     metadata = {"render_modes": []}  # noqa: RUF012

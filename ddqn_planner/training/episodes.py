@@ -5,7 +5,7 @@ from __future__ import annotations
 import io
 import re
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack, closing
 from dataclasses import dataclass
 from enum import Enum
@@ -17,14 +17,9 @@ from ddqn_planner.grid import Cell, MoveRule, path_length
 
 # Not torch's SummaryWriter: its thread ends at the first error, for example of a full disk.
 try:
-    from tensorboard.compat.proto.event_pb2 import (  # type: ignore[import-untyped]
-        Event,
-        SessionLog,
-    )
-    from tensorboard.compat.proto.summary_pb2 import Summary  # type: ignore[import-untyped]
-    from tensorboard.summary.writer.record_writer import (  # type: ignore[import-untyped]
-        RecordWriter,
-    )
+    from tensorboard.compat.proto.event_pb2 import Event, SessionLog
+    from tensorboard.compat.proto.summary_pb2 import Summary
+    from tensorboard.summary.writer.record_writer import RecordWriter
 except ImportError:  # an extra: the CSV file has the curves too
     Event = None
 
@@ -44,14 +39,12 @@ class EpisodeEnd(str, Enum):
 
 @dataclass(frozen=True)
 class Episode:
-    """An episode that has ended (the paper's round)."""
+    """An episode that has ended (the paper's round), the first one with number 1."""
 
     number: int
-    """1 for the first."""
     step: int
     """Environment steps of the training when it ended."""
     scenario: int
-    """Number of its scenario."""
     outcome: EpisodeEnd
     cells: tuple[Cell, ...]
     """The visited cells in order, with the initial one."""
@@ -68,53 +61,43 @@ class Episode:
 class EpisodeLog:
     """Appends episodes to ``episodes.csv``, and to TensorBoard's curves where it is installed.
 
-    Parameters
-    ----------
-    path : Path
-        The CSV file: one row per episode, its cells as ``x:y``. TensorBoard's file is beside it.
-    episodes, step : int
-        The training continues from there: later rows and events of an earlier process are dropped.
-
-    Raises
-    ------
-    OSError
-        If a file cannot be written.
+    The CSV file at `path` has one row per episode, its cells as ``x:y``; TensorBoard's file is
+    beside it. The training continues from `episodes` and `step`: later rows and events of an
+    earlier process are dropped. An OSError if a file cannot be written.
     """
 
     def __init__(self, path: Path, episodes: int, step: int) -> None:
         remove_temporaries(path)
         _cut_rows(path, episodes)
-        self._board: Appender | None = None
         with ExitStack() as stack:
-            self._rows = stack.enter_context(closing(Appender(path)))
+            rows = stack.enter_context(closing(Appender(path)))
+            self._files: list[tuple[Appender, Callable[[Episode, MoveRule], bytes]]]
+            self._files = [(rows, _row)]
             if Event is not None:
                 # TensorBoard reads the files of a folder in the order of their names.
                 name = f"events.out.tfevents.{time.time_ns()}.ddqn_planner"
-                self._board = stack.enter_context(closing(Appender(path.with_name(name))))
-                self._board.append(_first_events(step))
-            self._files = stack.pop_all()
+                board = stack.enter_context(closing(Appender(path.with_name(name))))
+                board.append(_first_events(step))
+                self._files.append((board, _events))
+            self._open_files = stack.pop_all()
 
     def append(self, episode: Episode, move_rule: MoveRule) -> None:
         """Append an episode; see `Appender.append` for errors."""
-        self._rows.append(_row(episode, move_rule))
-        if self._board is not None:
-            self._board.append(_events(episode))
+        for file, record in self._files:
+            file.append(record(episode, move_rule))
 
     def flush(self) -> None:
         """Write the rest of the last records; see `Appender.append` for errors."""
-        self._rows.flush()
-        if self._board is not None:
-            self._board.flush()
+        for file, _ in self._files:
+            file.flush()
 
     def close(self) -> None:
         """Close the files."""
-        self._files.close()
+        self._open_files.close()
 
 
 def read_cells(path: str | Path, every: int) -> Iterator[tuple[Cell, ...]]:
-    """Yield the cells of each `every`-th episode of an ``episodes.csv``.
-
-    Rows that are not complete are skipped.
+    """Yield the cells of each `every`-th episode of an ``episodes.csv`` in its complete rows.
 
     Raises
     ------
@@ -154,7 +137,7 @@ def _first_events(step: int) -> bytes:
     )
 
 
-def _events(episode: Episode) -> bytes:
+def _events(episode: Episode, _: MoveRule) -> bytes:
     values = {"average_reward": episode.average_reward, "episode_moves": episode.moves}
     summary = Summary(value=[Summary.Value(tag=t, simple_value=v) for t, v in values.items()])
     return _records(Event(wall_time=time.time(), step=episode.step, summary=summary))

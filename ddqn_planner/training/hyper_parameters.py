@@ -21,13 +21,8 @@ class HyperParameters:
     """The values of the paper's Table 1, and our values where the paper gives none.
 
     ``p_r = 0`` switches off improvement 1 (initialisation), ``alpha = beta = 0`` improvement 2
-    (reward).
-
-    Raises
-    ------
-    ValueError
-        If a value is outside its range or not one of its choices, or the replay buffer cannot hold
-        one step of all environments.
+    (reward). A ValueError if a value is outside its range or not one of its choices, or the replay
+    buffer cannot hold one step of all environments.
     """
 
     network: str = _choice(*NETWORKS, source="ours: the Q-network, see model/")

@@ -22,13 +22,7 @@ class MemoryShortageError(ValueError):
 
 
 def check_memory(scenarios: Sequence[Scenario], parameters: HyperParameters) -> int:
-    """Return `training_bytes`.
-
-    Raises
-    ------
-    MemoryShortageError
-        If less is available.
-    """
+    """Return `training_bytes`; a MemoryShortageError if less is available."""
     needed, available = training_bytes(scenarios, parameters), available_bytes()
     if needed > available:
         raise MemoryShortageError(

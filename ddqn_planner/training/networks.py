@@ -1,34 +1,31 @@
 """The Q-networks as torch modules, for training.
 
 The modules and the networks of `ddqn_planner.model.networks` have the same tensors; planning uses
-the latter, see `TrainableNetwork.to_numpy`. Dimensions: B = a batch, A = 8 actions, F = filters.
+the latter, see `TrainableNetwork.to_numpy`. `ddqn_planner.training.encoders` makes their states.
+Dimensions: B = a batch, A = 8 actions, F = filters, I = inputs of the first layer, L = windows.
 """
 
 from __future__ import annotations
 
-from typing import ClassVar, TypeVar, cast
+from typing import ClassVar, Final, TypeVar, cast
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from ddqn_planner.grid import MOVES
+from ddqn_planner.grid import LENGTHS, MOVES
 from ddqn_planner.model import AnyMapQNetwork, PaperQNetwork, PropagationQNetwork, QNetwork
+
+LENGTHS_A: Final = torch.tensor(LENGTHS, dtype=torch.float32)
 
 Module = TypeVar("Module", bound="TrainableNetwork")
 
 
 class TrainableNetwork(nn.Module):
-    """A Q-network that torch can train.
-
-    Parameters
-    ----------
-    **sizes : int
-        A value for each of the `size_names` of `numpy_class`.
-    """
+    """A Q-network that torch can train: from states (B, ...) to Q(s, a), (B, 8)."""
 
     numpy_class: ClassVar[type[QNetwork]]
-    """The same network for planning."""
+    """The same network for planning, whose `size_names` a module takes as arguments."""
 
     def __init__(self, **sizes: int) -> None:
         super().__init__()
@@ -61,35 +58,31 @@ class PaperModule(TrainableNetwork):
         self.hidden = nn.Linear(features, hidden_units) if hidden_units else None
         self.fully_connected = nn.Linear(hidden_units or features, len(MOVES))
 
-    def forward(self, observation_BHW: Tensor) -> Tensor:
-        """Return Q(s, a): (B, 8) for observations (B, H, W)."""
-        return self.q_of_windows(self.windows(observation_BHW))
-
     @staticmethod
     def windows(observation_BHW: Tensor) -> Tensor:
-        """Return the input of the filters: (B, 9, L), L windows of 3x3 cells.
+        """Return the states for observations (B, H, W): (B, 9, L), L windows of 3x3 cells.
 
         On windows the convolution is a matrix product, which is faster on small maps; and two
         networks can share them.
         """
         return functional.unfold(observation_BHW.unsqueeze(1), 3, padding=1, stride=2)
 
-    def q_of_windows(self, window_BKL: Tensor) -> Tensor:
+    def forward(self, window_BKL: Tensor) -> Tensor:
         """Return Q(s, a): (B, 8) for the windows of observations (B, 9, L)."""
-        convolution, hidden, fully_connected = self.convolution, self.hidden, self.fully_connected
-        weight_BFK = convolution.weight.flatten(1).expand(len(window_BKL), -1, -1)
-        bias_F1 = cast(Tensor, convolution.bias).unsqueeze(1)
-        feature_BFL = torch.baddbmm(bias_F1, weight_BFK, window_BKL).relu_()
-        feature_BF = feature_BFL.flatten(1)
-        if hidden is not None:
-            feature_BF = functional.linear(feature_BF, hidden.weight, hidden.bias).relu_()
-        return functional.linear(feature_BF, fully_connected.weight, fully_connected.bias)
+        weight_BFK = self.convolution.weight.flatten(1).expand(len(window_BKL), -1, -1)
+        bias_F1 = cast(Tensor, self.convolution.bias).unsqueeze(1)
+        feature_BF = torch.baddbmm(bias_F1, weight_BFK, window_BKL).relu_().flatten(1)
+        if self.hidden is not None:
+            feature_BF = self.hidden(feature_BF).relu_()
+        q_BA: Tensor = self.fully_connected(feature_BF)
+        return q_BA
 
 
 class PropagationModule(TrainableNetwork):
     """The propagation network, see `PropagationQNetwork`."""
 
     numpy_class: ClassVar[type[PropagationQNetwork]] = PropagationQNetwork
+    learns_costs: ClassVar[bool] = False
 
     def __init__(self, filters: int) -> None:
         super().__init__(filters=filters)
@@ -97,17 +90,30 @@ class PropagationModule(TrainableNetwork):
         self.hidden = nn.Linear(filters, filters)
         self.moves = nn.Linear(filters, len(MOVES))
 
+    def forward(self, state_BX: Tensor) -> Tensor:
+        """Return Q(s, a) = p (r + γ V(s')) + (1 - p) r_o: (B, 8), see `PropagationEncoder`."""
+        inputs = self.numpy_class.inputs
+        # Contiguous as in `update_target`, since how a layer rounds depends on the layout.
+        feature_BI, collision_B1 = state_BX[:, :inputs].contiguous(), state_BX[:, -1:]
+        gain_BA = state_BX[:, inputs:-1] - self.cost(feature_BI) - collision_B1
+        return collision_B1 + self.success(feature_BI) * gain_BA
+
     def success(self, feature_BI: Tensor) -> Tensor:
         """Return p(s, a) in 0..1: (B, 8), for the features of patches (B, I)."""
         hidden_BF = self.hidden(self.convolution(feature_BI).relu()).relu()
         p_BA: Tensor = self.moves(hidden_BF).sigmoid()
         return p_BA
 
+    def cost(self, feature_BI: Tensor) -> Tensor:
+        """Return the learned cost of each move: (B, 8); 0 where the reward is given."""
+        return torch.zeros(1).expand(*feature_BI.shape[:-1], len(MOVES))
+
 
 class AnyMapModule(PropagationModule):
     """The network for any map, see `AnyMapQNetwork`."""
 
     numpy_class = AnyMapQNetwork
+    learns_costs = True
 
     def __init__(self, filters: int) -> None:
         super().__init__(filters)
@@ -119,3 +125,13 @@ class AnyMapModule(PropagationModule):
         """Return the cost multiplier of each move, at least 1: (B, 8)."""
         multiplier_BA: Tensor = 1 + self.prices(feature_BI).relu()
         return multiplier_BA
+
+    def cost(self, feature_BI: Tensor) -> Tensor:
+        """Return length times cost multiplier of each move: (B, 8)."""
+        return LENGTHS_A * self.multiplier(feature_BI)
+
+
+MODULES: Final[dict[str, type[TrainableNetwork]]] = {
+    module.numpy_class.name: module for module in (PaperModule, PropagationModule, AnyMapModule)
+}
+"""By the hyper-parameter ``network``."""

@@ -9,29 +9,19 @@ from numpy.typing import NDArray
 
 
 class Transitions(NamedTuple):
-    """B transitions as arrays."""
+    """B transitions as arrays, (B,) each; cells are numbers y * W + x on the scenario's map."""
 
     scenario: NDArray[np.int64]
-    """(B,) number of the scenario."""
     cell: NDArray[np.int64]
-    """(B,) the robot's cell before the move, y * W + x."""
     action: NDArray[np.int64]
-    """(B,) 0..7."""
     reward: NDArray[np.float32]
-    """(B,)"""
     next_cell: NDArray[np.int64]
-    """(B,) the robot's cell after the move."""
     discount: NDArray[np.float32]
-    """(B,) γ, or 0 where the move terminated the episode; a truncated episode keeps γ."""
+    """γ, or 0 where the move terminated the episode; a truncated episode keeps γ."""
 
 
 class ReplayBuffer:
-    """The last `capacity` transitions.
-
-    Parameters
-    ----------
-    capacity : int
-    """
+    """The last `capacity` transitions."""
 
     def __init__(self, capacity: int) -> None:
         self.capacity = capacity

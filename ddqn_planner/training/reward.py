@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from ddqn_planner.grid import LENGTHS, MOVES, Cell, GridMap, MoveRule, move_costs
+from ddqn_planner.grid import LENGTHS, MOVES, Cell, GridMap, MoveRule, move_costs, neighbours
 from ddqn_planner.training.hyper_parameters import HyperParameters
 
 
@@ -46,21 +46,19 @@ def free_cell_reward(
     return (parameters.alpha * progress + parameters.beta * detour).astype(np.float32)
 
 
-def path_cost_reward(grid: GridMap, move_rule: MoveRule) -> NDArray[np.float32]:
-    """Reward each move by minus its cost, so that the best return is the cheapest path.
+def move_reward(
+    grid: GridMap, start: Cell, goal: Cell, move_rule: MoveRule, parameters: HyperParameters
+) -> NDArray[np.float32]:
+    """Return the reward of each legal move: (8, H, W) float32.
 
-    Unlike the paper's reward it depends on neither start nor goal, only on the cells around the
-    robot. The move onto the goal has the same reward as any other.
-
-    Parameters
-    ----------
-    grid : GridMap
-    move_rule : MoveRule
-
-    Returns
-    -------
-    (8, H, W) float32
-        See `ddqn_planner.grid.move_costs`.
+    With ``reward = "paper"`` this is ``goal_reward`` onto the goal, else `free_cell_reward`. With
+    ``"path_cost"`` it is minus the move's cost, so that the best return is the cheapest path. That
+    depends on neither start nor goal, only on the cells around the robot.
     """
-    reward: NDArray[np.float32] = -move_costs(grid.cost_multiplier, move_rule).astype(np.float32)
+    if parameters.reward == "path_cost":
+        return -move_costs(grid.cost_multiplier, move_rule).astype(np.float32)
+    shape = (grid.height, grid.width)
+    reward = free_cell_reward(shape, start, goal, parameters)
+    to_goal = neighbours(shape) == goal[1] * grid.width + goal[0]
+    reward[to_goal.reshape(reward.shape)] = parameters.goal_reward
     return reward

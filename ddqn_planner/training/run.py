@@ -36,20 +36,15 @@ class TrainingRun:
     ``training.lock``, which keeps other processes out until `close` or the end of the process. The
     folder must be new or empty, or belong to a training.
 
-    Parameters
-    ----------
-    folder : str or Path
-    scenarios, move_rule, parameters, seed
-        See `Trainer`. A checkpoint must have the same, except ``steps``.
-
     Raises
     ------
     CheckpointError
-        If the folder holds a checkpoint that cannot be read, or of another training.
+        If the folder holds a checkpoint that cannot be read, or one with another move rule or seed,
+        or other scenarios or parameters, except ``steps``.
     FolderError
         If the folder contains files but no training, or another process trains in it.
     MemoryShortageError
-        If the training does not fit into the memory; `memory` is its estimate in bytes.
+        If the training does not fit into the memory.
     OSError
         If the folder cannot be written.
     """
@@ -66,7 +61,7 @@ class TrainingRun:
         self.model_path = self.folder / "model.safetensors"
         self.checkpoint_path = self.folder / CHECKPOINT
         self.curves_path = self.folder / "episodes.csv"
-        self.memory = check_memory(scenarios, parameters)
+        memory = check_memory(scenarios, parameters)
         self.save_error = ""
         with ExitStack() as stack:  # unlocks the folder if the rest fails
             stack.enter_context(_claim(self.folder))
@@ -84,19 +79,15 @@ class TrainingRun:
             self._open_files = stack.pop_all()
         self.description = (
             f"training in {self.folder} from step {self.trainer.steps} to {parameters.steps}, "
-            f"with about {megabytes(self.memory)} of memory"
+            f"with about {megabytes(memory)} of memory"
         )
 
     def steps(self) -> Iterator[list[Episode]]:
         """Train until ``parameters.steps``; save every `SAVE_INTERVAL` steps and at the end.
 
-        If a save fails, or the episodes cannot be written, the training continues, and `save_error`
-        says why until a save succeeds. Episodes that end meanwhile may be missing in the log.
-
-        Yields
-        ------
-        list of Episode
-            The episodes that ended with this step, often none; they are in the log.
+        Yield the episodes that ended with each step; they are in the log. If a save fails, or the
+        episodes cannot be written, the training continues, and `save_error` says why until a save
+        succeeds. Episodes that end meanwhile may be missing in the log.
         """
         for finished in self.trainer.run(self.trainer.parameters.steps):
             for episode in finished:
@@ -111,12 +102,19 @@ class TrainingRun:
         self.try_to_save()
 
     def try_to_save(self) -> None:
-        """Save. If that fails, `save_error` says why, and the last good files stay."""
+        """Write the model and the checkpoint.
+
+        If that fails, `save_error` says why, and the last good files stay.
+        """
+        self.saved_at = self.trainer.steps
         try:
-            self.save()
+            # A kill between the two leaves a model that is newer than the checkpoint. Both are
+            # complete, and nothing needs them to be of the same step.
+            self.trainer.save_model(self.model_path)
+            self.trainer.save_checkpoint(self.checkpoint_path)
+            self._log.flush()
             self.save_error = ""
         except OSError as error:
-            self.saved_at = self.trainer.steps
             self._fail(error)
 
     def _fail(self, error: OSError) -> None:
@@ -126,23 +124,8 @@ class TrainingRun:
             f"there: the training continues and tries again every {SAVE_INTERVAL} steps"
         )
 
-    def save(self) -> None:
-        """Write the model and the checkpoint.
-
-        Raises
-        ------
-        OSError
-            If one of the two or the log cannot be written; the last good files then stay.
-        """
-        # A kill between the two leaves a model that is newer than the checkpoint. Both are
-        # complete, and nothing needs them to be of the same step: the next save replaces the model.
-        self.trainer.save_model(self.model_path)
-        self.trainer.save_checkpoint(self.checkpoint_path)
-        self._log.flush()
-        self.saved_at = self.trainer.steps
-
     def close(self) -> None:
-        """Close the files and unlock the folder. `save` first."""
+        """Close the files and unlock the folder. `try_to_save` first."""
         self._open_files.close()
 
 

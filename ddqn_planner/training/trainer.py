@@ -5,9 +5,8 @@ from __future__ import annotations
 import copy
 import hashlib
 import json
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict
-from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -22,12 +21,12 @@ from ddqn_planner.grid import MOVES, MoveRule
 from ddqn_planner.model import ModelMetadata, package_version, save_model
 from ddqn_planner.planning import Planner
 from ddqn_planner.training.double_dqn import double_dqn_loss
-from ddqn_planner.training.encoders import ENCODERS
+from ddqn_planner.training.encoders import ObservationEncoder, PropagationEncoder
 from ddqn_planner.training.environment import GridVectorEnvironment, Scenario
 from ddqn_planner.training.episodes import Episode, EpisodeEnd
 from ddqn_planner.training.hyper_parameters import HyperParameters
 from ddqn_planner.training.memory import MemoryShortageError, check_memory
-from ddqn_planner.training.networks import TrainableNetwork
+from ddqn_planner.training.networks import MODULES, PropagationModule
 from ddqn_planner.training.replay_buffer import ReplayBuffer, Transitions
 
 CHECKPOINT_KEY = "ddqn_planner_checkpoint"
@@ -45,19 +44,10 @@ class CheckpointError(ValueError):
 
 
 class Trainer:
-    """Trains a Q-network by Double DQN.
+    """Trains a Q-network by Double DQN in a `GridVectorEnvironment`; the seed is at least 0.
 
     The same scenarios, parameters and seed give the same network, bit for bit, also when
     `save_checkpoint` and `load_checkpoint` interrupt the training.
-
-    Parameters
-    ----------
-    scenarios : sequence of Scenario
-        Maps of one size; each episode draws one of them.
-    move_rule : MoveRule
-    parameters : HyperParameters
-    seed : int
-        At least 0.
     """
 
     def __init__(
@@ -80,13 +70,16 @@ class Trainer:
         self.environment.np_random = np.random.default_rng(environment)
         self._exploration = np.random.default_rng(exploration)
         self._sampling = np.random.default_rng(replay)
-        self._encoder = ENCODERS[parameters.network](self.environment)
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(int(weights.generate_state(1)[0]))
             sizes = parameters.network_sizes(self.environment.shape)
-            self.network = self._encoder.module_class(**sizes)
+            self.network = MODULES[parameters.network](**sizes)
         self._target = copy.deepcopy(self.network).requires_grad_(False)
-        self._encoder.update_target(self._target)
+        self.encoder = (
+            PropagationEncoder(self.environment, self._target)
+            if isinstance(self._target, PropagationModule)
+            else ObservationEncoder(self.environment)
+        )
         self._weights = tuple(self.network.parameters())
         self._optimiser = torch.optim.Adam(self._weights, parameters.learning_rate, fused=FUSED)
         self._replay = ReplayBuffer(parameters.replay_capacity)
@@ -105,42 +98,36 @@ class Trainer:
     def run(self, until: int) -> Iterator[list[Episode]]:
         """Train until the trainer has made `until` environment steps in all.
 
-        Yields
-        ------
-        list of Episode
-            The episodes that ended with this step, often none. Between two steps the caller may
-            save the trainer or leave the loop.
+        Yield the episodes that ended with each step, often none. Between two steps the caller may
+        save the trainer or leave the loop.
         """
         p = self.parameters
         while self.steps < until:
             scenario, cell = self.environment.scenario.copy(), self.environment.cell
             actions = self._choose_actions()
-            result = self.environment.move(actions)
-            discount = np.where(result.terminated, 0.0, p.gamma).astype(np.float32)
-            self._replay.add(
-                Transitions(scenario, cell, actions, result.reward, result.cell, discount)
-            )
+            reward, terminated, truncated = self.environment.move(actions)
+            next_cell = self.environment.cell
+            discount = np.where(terminated, 0.0, p.gamma).astype(np.float32)
+            self._replay.add(Transitions(scenario, cell, actions, reward, next_cell, discount))
             before, self.steps = self.steps, self.steps + p.environments
             if self.steps > p.learning_starts:
                 for _ in range(self.steps // p.update_interval - before // p.update_interval):
                     self._update()
-            self._total_reward += result.reward
-            for visited, entered in zip(self._visited, result.cell.tolist(), strict=True):
+            self._total_reward += reward
+            for visited, entered in zip(self._visited, next_cell.tolist(), strict=True):
                 visited.append(entered)
-            ended = result.terminated | result.truncated
-            yield self._end_episodes(ended, result.terminated) if ended.any() else []
+            ended = terminated | truncated
+            yield self._end_episodes(ended, terminated) if ended.any() else []
 
     def _choose_actions(self) -> NDArray[np.int64]:
         """Draw ε-greedy actions, independently for each environment."""
-        environment = self.environment
         count = self.parameters.environments
         actions = self._exploration.integers(len(MOVES), size=count)
         greedy = self._exploration.random(count) >= self.epsilon
         if greedy.any():
+            states = self.encoder.states(self.environment.scenario, self.environment.cell)
             with torch.inference_mode():
-                q_NA = self._q(self.network)(
-                    self._encoder.states(environment.scenario, environment.cell)
-                )
+                q_NA = self.network(states)
             actions[greedy] = q_NA.argmax(dim=1).numpy()[greedy]
         return actions
 
@@ -148,20 +135,14 @@ class Trainer:
         """Make one Double DQN update with a batch from the replay buffer."""
         p = self.parameters
         batch = self._replay.sample(p.batch_size, self._sampling)
-        states = self._encoder.states(
+        states = self.encoder.states(
             np.tile(batch.scenario, 2), np.concatenate([batch.cell, batch.next_cell])
         )
         state, next_state = states.chunk(2)
-        online, target = self._q(self.network), self._q(self._target)
-        selection, evaluation = {
-            "double_dqn": (online, target),
-            "dqn": (target, target),
-            "printed": (online, online),
-        }[p.target]
         loss = double_dqn_loss(
-            online,
-            selection,
-            evaluation,
+            self.network,
+            self._target,
+            p.target,
             state,
             torch.from_numpy(batch.action),
             torch.from_numpy(batch.reward),
@@ -176,50 +157,42 @@ class Trainer:
         self.updates += 1
         if self.updates % p.target_interval == 0:
             self._target.load_state_dict(self.network.state_dict())
-            self._encoder.update_target(self._target)
-
-    def _q(self, network: TrainableNetwork) -> Callable[[Tensor], Tensor]:
-        return partial(self._encoder.q, network)
+            self.encoder.update_target(self._target)
 
     def _end_episodes(
         self, ended: NDArray[np.bool_], terminated: NDArray[np.bool_]
     ) -> list[Episode]:
         """Return the ended episodes, and start new ones in their environments."""
-        indices = np.flatnonzero(ended).tolist()
-        episodes = [self._end_episode(index, bool(terminated[index])) for index in indices]
+        episodes = []
+        width = self.environment.shape[1]
+        for index in np.flatnonzero(ended).tolist():
+            cells, scenario = self._visited[index], int(self.environment.scenario[index])
+            moves, outcome = len(cells) - 1, EpisodeEnd.OUT_OF_STEPS
+            if terminated[index] and cells[-1] == self.environment.goal[scenario]:
+                outcome = EpisodeEnd.REACHED_GOAL
+            elif terminated[index]:
+                outcome, cells = EpisodeEnd.COLLIDED, cells[:-1]
+            self.episodes += 1
+            episodes.append(
+                Episode(
+                    number=self.episodes,
+                    step=self.steps,
+                    scenario=scenario,
+                    outcome=outcome,
+                    cells=tuple((cell % width, cell // width) for cell in cells),
+                    moves=moves,
+                    total_reward=float(self._total_reward[index]),
+                )
+            )
         self.environment.reset_where(ended)
-        for index in indices:
+        for index in np.flatnonzero(ended).tolist():
             self._visited[index] = [int(self.environment.cell[index])]
         self._total_reward[ended] = 0.0
         return episodes
 
-    def _end_episode(self, index: int, terminated: bool) -> Episode:
-        self.episodes += 1
-        visited, scenario = self._visited[index], int(self.environment.scenario[index])
-        cells, width = visited, self.environment.shape[1]
-        if not terminated:
-            outcome = EpisodeEnd.OUT_OF_STEPS
-        elif visited[-1] == self.environment.goal[scenario]:
-            outcome = EpisodeEnd.REACHED_GOAL
-        else:
-            outcome, cells = EpisodeEnd.COLLIDED, visited[:-1]
-        return Episode(
-            number=self.episodes,
-            step=self.steps,
-            scenario=scenario,
-            outcome=outcome,
-            cells=tuple((cell % width, cell // width) for cell in cells),
-            moves=len(visited) - 1,
-            total_reward=float(self._total_reward[index]),
-        )
-
     def planner(self) -> Planner:
         """Return a planner with a copy of the network as it is now."""
-        return Planner(self.network.to_numpy(), self.metadata())
-
-    def metadata(self) -> ModelMetadata:
-        """Return the metadata of a model file with the network as it is now."""
-        return ModelMetadata(
+        metadata = ModelMetadata(
             network=self.parameters.network,
             sizes=self.network.sizes,
             move_rule=self.move_rule,
@@ -229,10 +202,12 @@ class Trainer:
             seed=self.seed,
             package_version=package_version(),
         )
+        return Planner(self.network.to_numpy(), metadata)
 
     def save_model(self, path: str | Path) -> None:
         """Write the network as it is now to a model file; see `save_model` for errors."""
-        save_model(path, self.network.to_numpy(), self.metadata())
+        planner = self.planner()
+        save_model(path, planner.network, planner.metadata)
 
     def save_checkpoint(self, path: str | Path) -> None:
         """Write all that `load_checkpoint` needs to continue as if nothing had happened.
@@ -258,13 +233,7 @@ class Trainer:
 
     @classmethod
     def load_checkpoint(cls, path: str | Path, scenarios: Sequence[Scenario]) -> Trainer:
-        """Return the trainer that `save_checkpoint` wrote.
-
-        Parameters
-        ----------
-        path : str or Path
-        scenarios : sequence of Scenario
-            The same as those of the saved trainer; a checkpoint holds no maps.
+        """Return the trainer that `save_checkpoint` wrote; a checkpoint holds no scenarios.
 
         Raises
         ------
@@ -302,11 +271,10 @@ class Trainer:
                 raise ValueError("its digest is another")
             for key, tensor in tensors.items():
                 tensor.copy_(saved[key])
-            trainer._encoder.update_target(trainer._target)
+            trainer.encoder.update_target(trainer._target)
             trainer._visited = description["walked"]
-            for generator, state in zip(
-                trainer._generators(), description["generators"], strict=True
-            ):
+            states = description["generators"]
+            for generator, state in zip(trainer._generators(), states, strict=True):
                 generator.bit_generator.state = state
         except (CheckpointError, MemoryShortageError):
             raise
@@ -320,19 +288,16 @@ class Trainer:
     def _tensors(self) -> dict[str, Tensor]:
         """Return the tensors of a checkpoint. They share the trainer's memory."""
         environment, stored = self.environment, len(self._replay)
-        arrays = {
-            f"replay.{name}": values[:stored]
-            for name, values in self._replay.transitions._asdict().items()
+        replay = self._replay.transitions._asdict()
+        groups = {
+            "network": self.network.state_dict(),
+            "target": self._target.state_dict(),
+            "replay": {name: torch.from_numpy(values[:stored]) for name, values in replay.items()},
+            "environment": {
+                name: torch.from_numpy(getattr(environment, name))
+                for name in ("scenario", "cell", "steps")
+            },
         }
-        arrays |= {
-            "environment.scenario": environment.scenario,
-            "environment.cell": environment.cell,
-            "environment.steps": environment.steps,
-            "total_reward": self._total_reward,
-        }
-        tensors = {name: torch.from_numpy(values) for name, values in arrays.items()}
-        tensors |= _prefixed("network", self.network.state_dict())
-        tensors |= _prefixed("target", self._target.state_dict())
         # Adam makes its state at the first update.
         for index, weight in enumerate(self._weights if self.updates else ()):
             state = self._optimiser.state[weight]
@@ -340,8 +305,12 @@ class Trainer:
                 state["step"] = torch.zeros(())
                 state["exp_avg"] = torch.zeros_like(weight)
                 state["exp_avg_sq"] = torch.zeros_like(weight)
-            tensors |= _prefixed(f"optimiser.{index}", state)
-        return tensors
+            groups[f"optimiser.{index}"] = state
+        return {"total_reward": torch.from_numpy(self._total_reward)} | {
+            f"{group}.{name}": tensor
+            for group, tensors in groups.items()
+            for name, tensor in tensors.items()
+        }
 
     def _generators(self) -> tuple[np.random.Generator, ...]:
         return self.environment.np_random, self._exploration, self._sampling
@@ -357,7 +326,3 @@ def _digest(text: str, tensors: dict[str, Tensor]) -> str:
         digest.update(name.encode())
         digest.update(tensors[name].numpy().ravel().data)
     return digest.hexdigest()
-
-
-def _prefixed(prefix: str, tensors: dict[str, Tensor]) -> dict[str, Tensor]:
-    return {f"{prefix}.{name}": tensor for name, tensor in tensors.items()}

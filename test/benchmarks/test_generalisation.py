@@ -44,7 +44,7 @@ from ddqn_planner.grid import (
     shortest_distances,
 )
 from ddqn_planner.grid.generators import KINDS
-from ddqn_planner.model import ModelMetadata
+from ddqn_planner.model import ModelMetadata, QNetwork
 from ddqn_planner.model.model_file import save_model
 from ddqn_planner.planning import Planner
 
@@ -61,8 +61,7 @@ class PerfectNetwork:
     def __init__(self, bonus: float = -math.inf) -> None:
         self.bonus = bonus
 
-    def supports(self, shape: tuple[int, int]) -> bool:
-        return True
+    supports, move_costs = QNetwork.supports, QNetwork.move_costs
 
     def q_values(self, grid: GridMap, goal: Cell, move_rule: MoveRule) -> np.ndarray:
         distance = np.pad(shortest_distances(grid, goal, move_rule), 1, constant_values=np.inf)

@@ -94,9 +94,9 @@ def test_the_optimal_value_is_what_the_best_policy_earns(small: Scenario, alpha:
         returns = []
         for action in range(len(MOVES)):
             environment.cell = np.array([y * 5 + x])
-            moved = environment.move(np.array([action]))
-            onward = 0.0 if moved.terminated[0] else parameters.gamma * value[moved.cell[0]]
-            returns.append(float(moved.reward[0] + onward))
+            reward, terminated, _ = environment.move(np.array([action]))
+            onward = 0.0 if terminated[0] else parameters.gamma * value[environment.cell[0]]
+            returns.append(float(reward[0] + onward))
         assert value[y * 5 + x] == pytest.approx(max(returns), abs=0.02)
 
 

@@ -4,11 +4,12 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from strategies import occupancies
 
 from ddqn_planner.grid import UNKNOWN, GridMap, MoveRule, clearance, inflate
+from ddqn_planner.grid.body import Inflation, inflate_changed
 from ddqn_planner.grid.moves import component_labels
 
 RESOLUTION = 0.05
@@ -102,3 +103,43 @@ def test_obstacles_must_be_occupied() -> None:
         GridMap(np.zeros((2, 2)), obstacles=np.eye(2, dtype=bool))
     with pytest.raises(ValueError, match=r"shape \(3, 3\)"):
         GridMap(np.ones((2, 2)), obstacles=np.eye(3, dtype=bool))
+
+
+@settings(max_examples=200)
+@given(
+    st.integers(0, 2**32),
+    st.sampled_from([0.0, 0.4, 1.0, 2.3]),
+    st.sampled_from([0.0, 0.3, 1.0]),
+    st.booleans(),
+    st.integers(0, 3),
+)
+def test_a_changed_map_is_inflated_near_its_changed_cells_as_if_it_were_whole(
+    seed: int, radius: float, weight: float, with_costs: bool, changes: int
+) -> None:
+    random = np.random.default_rng(seed)
+    occupancy = random.random((40, 60)) < random.choice([0.0, 0.02, 0.3])
+    cost = random.integers(-1, 100, occupancy.shape) if with_costs else None
+    before = GridMap(occupancy, 0.5, cost=cost)
+    grid = before
+    for _ in range(changes):
+        x, y = random.integers(0, 38, 2).tolist()
+        grid = grid.with_patch(random.random((2, 2)) < 0.5, x, y)
+    expected = inflate(grid, radius, weight)
+    found = inflate_changed(grid, before, inflate(before, radius, weight), radius, weight)
+    assert found.same_cells(expected)
+    for cell in np.ndindex(60, 40):
+        assert found.is_obstacle(cell) == expected.is_obstacle(cell)
+
+
+def test_a_map_of_another_size_is_inflated_whole() -> None:
+    before, grid = GridMap(np.eye(9)), GridMap(np.eye(12))
+    found = inflate_changed(grid, before, inflate(before, 1.5), 1.5)
+    assert found.same_cells(inflate(grid, 1.5))
+
+
+def test_maps_that_come_one_after_another_are_inflated_for_the_body_of_now() -> None:
+    inflation, random = Inflation(), np.random.default_rng(0)
+    grid = GridMap(random.random((30, 30)) < 0.05, 0.5)
+    for body in ((0.6, 0.0), (0.6, 0.0), (1.1, 0.5), (1.1, 0.5), (0.0, 0.0), (0.6, 0.0)):
+        grid = grid.with_patch(random.random((2, 2)) < 0.5, 4, 5)
+        assert inflation(grid, *body).same_cells(inflate(grid, *body))

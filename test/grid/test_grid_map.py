@@ -9,10 +9,11 @@ import numpy as np
 import pytest
 from hypothesis import assume, given
 from hypothesis import strategies as st
-from strategies import occupancies
+from strategies import grids_with_costs, occupancies
 
-from ddqn_planner.grid import UNKNOWN, GridMap
+from ddqn_planner.grid import UNKNOWN, GridMap, MoveRule, inflate
 from ddqn_planner.grid.arguments import as_cell
+from ddqn_planner.grid.moves import component_labels
 
 origins = st.tuples(
     st.floats(-100, 100), st.floats(-100, 100), st.floats(-2 * math.pi, 2 * math.pi)
@@ -198,3 +199,100 @@ def test_cells_on_the_edges_are_inside_and_those_beyond_are_not() -> None:
 def test_only_some_occupied_cells_may_be_obstacles() -> None:
     grid = GridMap([[1, 1, 0]], obstacles=np.array([[1, 0, 0]]))  # type: ignore[arg-type]
     assert [grid.is_obstacle((x, 0)) for x in range(3)] == [True, False, False]
+
+
+@given(
+    grids_with_costs(), occupancies, st.sampled_from(["none", "map", "patch", "both"]), st.data()
+)
+def test_a_patched_map_is_the_map_of_the_patched_arrays(
+    grid_and_cell: tuple[GridMap, tuple[int, int]],
+    patch: np.ndarray,
+    with_costs: str,
+    data: st.DataObject,
+) -> None:
+    whole, _ = grid_and_cell
+    grid = GridMap(
+        whole.occupancy, 0.5, (1.0, 2.0, 3.0), whole.cost if with_costs in ("map", "both") else None
+    )
+    fingerprint, labels = grid.fingerprint, grid.labels("unit").copy()
+    patch = patch[: grid.height, : grid.width]
+    (height, width), costs = patch.shape, None
+    x, y = (
+        data.draw(st.integers(0, whole_side - side))
+        for whole_side, side in ((grid.width, width), (grid.height, height))
+    )
+    occupancy, cost = grid.occupancy.copy(), grid.cost
+    occupancy[y : y + height, x : x + width] = patch
+    if with_costs in ("patch", "both"):
+        values = st.lists(st.integers(-1, 99), min_size=patch.size, max_size=patch.size)
+        costs = np.reshape(data.draw(values), patch.shape)
+        cost = np.zeros(occupancy.shape, dtype=np.int8) if cost is None else cost.copy()
+        cost[y : y + height, x : x + width] = costs
+    patched, expected = grid.with_patch(patch, x, y, costs), GridMap(occupancy, cost=cost)
+    assert (patched.resolution, patched.origin) == (grid.resolution, grid.origin)
+    assert patched.fingerprint == expected.fingerprint
+    np.testing.assert_array_equal(patched.cost_multiplier, expected.cost_multiplier)
+    np.testing.assert_array_equal(patched.labels("unit"), expected.labels("unit"))
+    assert GridMap(grid.occupancy, cost=grid.cost).fingerprint == fingerprint
+    np.testing.assert_array_equal(grid.labels("unit"), labels)
+
+
+def test_a_patched_map_keeps_read_only_copies() -> None:
+    patch = np.ones((1, 1), dtype=bool)
+    grid = GridMap(np.zeros((2, 2)), cost=np.full((2, 2), 7)).with_patch(patch, 1, 0)
+    patch[0, 0] = False
+    assert grid.occupancy.tolist() == [[False, True], [False, False]]
+    assert grid.cost is not None
+    assert grid.cost.tolist() == [[7, 0], [7, 7]]
+    for array in (grid.occupancy, grid.cost):
+        with pytest.raises(ValueError, match="read-only"):
+            array[0, 0] = True
+
+
+def test_newly_free_cells_cost_nothing_and_the_others_keep_their_costs() -> None:
+    grid = GridMap([[1, 0, 0]], cost=[[50, 60, 70]])  # type: ignore[arg-type]
+    cost = grid.with_patch([[0, 0]], 0, 0).cost
+    assert cost is not None
+    assert cost.tolist() == [[0, 60, 70]]
+
+
+def test_the_occupied_cells_of_a_patch_are_obstacles() -> None:
+    inflated = inflate(GridMap(np.array([[1, 0, 0, 0, 0]])), 2.0)
+    assert inflated.occupancy.tolist() == [[True, True, False, False, False]]
+    patched = inflated.with_patch([[0, 1, 1]], 0, 0)
+    assert [patched.is_obstacle((x, 0)) for x in range(5)] == [False, True, True, False, False]
+    assert patched.occupancy.tolist() == [[False, True, True, False, False]]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "named"),
+    [
+        (
+            (np.zeros((2, 2)), 2, 0),
+            r"2 x 2 cells from \(2, 0\) is not inside the map of 3 x 2; cut",
+        ),
+        ((np.zeros((2, 2)), 0, 1), r"from \(0, 1\) is not inside"),
+        ((np.zeros((1, 1)), -1, 0), r"from \(-1, 0\) is not inside"),
+        ((np.zeros((3, 1)), 0, 0), "1 x 3 cells .* is not inside"),
+        ((np.zeros((0, 1)), 0, 0), r"occupancy has shape \(0, 1\); give \(H, W\)"),
+        ((np.zeros(3), 0, 0), r"occupancy has shape \(3,\)"),
+        ((np.zeros((1, 1)), 0.5, 0), "first cell of the patch is .*; give two whole numbers"),
+        ((np.zeros((1, 1)), 0, 0, [[1, 2]]), r"cost has shape \(1, 2\); give \(1, 1\)"),
+        ((np.zeros((1, 1)), 0, 0, [[100]]), "hold 100; give whole numbers -1..99"),
+    ],
+)
+def test_a_wrong_patch_is_named_and_the_remedy_too(arguments: tuple, named: str) -> None:
+    for cost in (None, np.zeros((2, 3))):
+        with pytest.raises(ValueError, match=named):
+            GridMap(np.zeros((2, 3)), cost=cost).with_patch(*arguments)
+
+
+@given(occupancies)
+def test_the_map_computes_its_labels_once_per_kind_of_rule(occupancy: np.ndarray) -> None:
+    grid = GridMap(occupancy)
+    for rule in MoveRule:
+        np.testing.assert_array_equal(grid.labels(rule), component_labels(occupancy, rule))
+        assert grid.labels(rule.value) is grid.labels(rule)
+    assert grid.labels("unit") is grid.labels("corner_cutting")
+    with pytest.raises(ValueError, match="give one of robot_safe"):
+        grid.labels("nope")

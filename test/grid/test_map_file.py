@@ -310,7 +310,7 @@ def test_the_papers_map_names_start_and_goal() -> None:
         ({"mode": []}, r"mode is \[\]"),
         ({"image": []}, r"image is \[\]"),
         ({"ddqn_planner": {"start": [0, 9]}}, r"start is \(0, 9\)"),
-        ({"ddqn_planner": {"goal": [0.5, 0]}}, r"goal is \['0\.5', '0'\]"),
+        ({"ddqn_planner": {"goal": [0.5, 0]}}, r"goal is \[0\.5, 0\.0\]"),
         ({"ddqn_planner": {"goal": "there"}}, "goal is 'there'"),
         ({"ddqn_planner": {"goal": "12"}}, "goal is '12'"),
         ({"ddqn_planner": {"gaol": [0, 0]}}, "ddqn_planner is"),

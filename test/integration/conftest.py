@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import fcntl
 import importlib.util
 import itertools
 import os
@@ -37,7 +38,7 @@ class NodeProcess:
 
     def __init__(self, name: str, arguments: list[str], log: Path) -> None:
         self.log_path = log
-        with log.open("wb") as file:
+        with log.open("ab") as file:
             self.process = subprocess.Popen(
                 [executable(name), *arguments],
                 stdout=file,
@@ -47,7 +48,11 @@ class NodeProcess:
 
     @property
     def log(self) -> str:
+        """What the process wrote since `forget_log`."""
         return self.log_path.read_text(encoding="utf-8", errors="replace")
+
+    def forget_log(self) -> None:
+        os.truncate(self.log_path, 0)
 
     def wait_for_log(self, pattern: str) -> None:
         deadline = time.monotonic() + TIMEOUT
@@ -166,13 +171,25 @@ def small_values() -> np.ndarray:
 
 @pytest.fixture(scope="session")
 def trained_model(tmp_path_factory: pytest.TempPathFactory, small_values: np.ndarray) -> Path:
-    """Train a model of the small map toward (5, 5) from anywhere, and return its file."""
+    """Return a model of the small map toward (5, 5) from anywhere, trained once for all workers."""
+    folder = tmp_path_factory.getbasetemp()
+    if "PYTEST_XDIST_WORKER" in os.environ:
+        folder = folder.parent
+    path = folder / "small.safetensors"
+    with (folder / "small.lock").open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        if not path.exists():
+            train(small_values, path)
+    return path
+
+
+def train(values: np.ndarray, path: Path) -> None:
     from ddqn_planner.grid import GridMap, MoveRule
     from ddqn_planner.training.environment import Scenario
     from ddqn_planner.training.hyper_parameters import HyperParameters
     from ddqn_planner.training.trainer import Trainer
 
-    grid = GridMap(small_values > 0)
+    grid = GridMap(values > 0)
     parameters = HyperParameters(
         learning_rate=3e-3,
         p_r=1.0,
@@ -188,9 +205,7 @@ def trained_model(tmp_path_factory: pytest.TempPathFactory, small_values: np.nda
         pass
     planner = trainer.planner()
     assert all(planner.plan(grid, cell, (5, 5)).cells for cell in grid.free_cells())
-    path = tmp_path_factory.mktemp("models") / "small.safetensors"
     trainer.save_model(path)
-    return path
 
 
 @pytest.fixture(scope="module")

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 import re
+from collections.abc import Mapping
 from itertools import pairwise
 from pathlib import Path as FilePath
 from typing import Any
@@ -17,14 +19,22 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import PoseStamped, Quaternion
 from nav_msgs.msg import OccupancyGrid, Path
 from networks import turning_network
+from rclpy.qos import DurabilityPolicy, QoSProfile
 
 from ddqn_planner.grid import Cell, GridMap, MoveRule, legal_moves
 from ddqn_planner.model import ModelMetadata, save_model
+from ddqn_planner.nodes.report import seconds
 from ddqn_planner.nodes.runtime import LATCHED
 
 START, GOAL = (0, 0), (5, 5)
 RESOLUTION, ORIGIN = 0.5, (-1.0, 2.0, 0.0)
 GOAL_YAW = 1.2
+
+NUMBERS = itertools.count(1)
+"""Stamps of maps and yaws of goals, to tell one from another."""
+
+ALL = QoSProfile(depth=1000, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+"""The last message of a latched topic, and every one after it."""
 
 
 class Robot:
@@ -37,8 +47,8 @@ class Robot:
         self.name = name
         self.values = values
         self.model = model
-        self.plans = client.subscribe(Path, "plan", LATCHED)
-        self.value = client.subscribe(OccupancyGrid, "planner/value", LATCHED)
+        self.plans = client.subscribe(Path, "plan", ALL)
+        self.value = client.subscribe(OccupancyGrid, "planner/value", ALL)
         self.diagnostics = client.subscribe(DiagnosticArray, "/diagnostics")
         self.grid = self.grid_of(values)
 
@@ -65,26 +75,37 @@ class Robot:
     def get_plan(self, start: PoseStamped, goal: PoseStamped) -> Path:
         return self.client.get_plan(start, goal)
 
-    def wait_for_path(self, start: Cell, goal: Cell, grid: GridMap | None = None) -> Path:
-        """Wait for a plan between two cells, and check all that can be said of it."""
+    def wait_for_path(
+        self, start: Cell, goal: Cell, grid: GridMap | None = None, yaw: float | None = None
+    ) -> Path:
+        """Wait for a plan between two cells, to this yaw, and check all that can be said of it."""
         grid = grid or self.grid
         ends = [grid.cell_to_world(start), grid.cell_to_world(goal)]
 
-        def joins_ends(path: Path) -> bool:
-            return len(path.poses) > 0 and np.allclose(
-                [points_of(path)[0], points_of(path)[-1]], ends, atol=1e-6
-            )
+        def is_asked_for(path: Path) -> bool:
+            if not path.poses:
+                return False
+            last = yaw_of(path.poses[-1].pose.orientation)
+            found = [points_of(path)[0], points_of(path)[-1]]
+            return np.allclose(found, ends, atol=1e-6) and (yaw is None or abs(last - yaw) < 1e-6)
 
-        path: Path = self.plans.wait(joins_ends)
+        path: Path = self.plans.wait(is_asked_for)
         check_path(path, grid)
         return path
 
-    def wait_for_reason(self, pattern: str) -> DiagnosticStatus:
-        """Wait until the diagnostics of this node say something."""
+    def wait_for_reason(
+        self, pattern: str, values: Mapping[str, str] | None = None
+    ) -> DiagnosticStatus:
+        """Wait until the diagnostics of this node say something, and have such values."""
+        expected = (values or {}).items()
 
         def says(message: DiagnosticArray) -> bool:
             status = message.status[0]
-            return status.name == f"{self.name}: plan" and bool(re.search(pattern, status.message))
+            return (
+                status.name == f"{self.name}: plan"
+                and bool(re.search(pattern, status.message))
+                and expected <= values_of(status).items()
+            )
 
         return self.diagnostics.wait(says).status[0]
 
@@ -98,14 +119,25 @@ class Robot:
         """Wait until the planner has a map: its diagnostics name its stamp."""
         wait_for_map(self.diagnostics, message.header.stamp, self.name)
 
-    def begin(self) -> None:
-        """Send a map, a start and a goal, and wait for the path."""
+    def stamped_map(self, values: np.ndarray | None = None) -> OccupancyGrid:
+        """Return the message of the map, or of other values, with a stamp of its own."""
+        return map_message(self.values if values is None else values, self.grid, next(NUMBERS))
+
+    def set_map(self, message: OccupancyGrid) -> None:
+        """Send a map with a stamp of its own, and wait until the planner has it."""
+        self.send_map(message)
+        self.wait_for_map(message)
+
+    def begin(self, start: Cell = START, goal: Cell = GOAL) -> None:
+        """Send a map, a start and a goal, and wait until the planner has planned with all three."""
         self.clear()
-        self.send_map()
-        self.send_start(self.pose(START))
-        self.send_goal(self.pose(GOAL, GOAL_YAW))
-        self.wait_for_path(START, GOAL)
-        self.wait_for_reason("^a path of [^;]*$")
+        message, yaw = self.stamped_map(), next(NUMBERS) % 3000 / 1000
+        self.send_map(message)
+        self.send_start(self.pose(start))
+        self.send_goal(self.pose(goal, yaw))
+        self.wait_for_path(start, goal, yaw=yaw)
+        planned_on = seconds(message.header.stamp)
+        self.wait_for_reason("^a path of [^;]*$", {"planned on the map of (s)": planned_on})
         self.clear()
 
     def clear(self) -> None:

@@ -9,7 +9,7 @@ import pytest
 from bursts import BurstClients, burst_requests
 from nav_msgs.srv import GetMap
 
-pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("bursts")]
+pytestmark = pytest.mark.slow
 
 
 @pytest.mark.parametrize("clients", [1, 20])

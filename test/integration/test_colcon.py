@@ -37,7 +37,6 @@ COLCON = shutil.which("colcon", path=os.pathsep.join([sysconfig.get_path("script
 
 pytestmark = [
     pytest.mark.slow,
-    pytest.mark.xdist_group("colcon"),
     pytest.mark.skipif(COLCON is None, reason="colcon is not installed"),
 ]
 

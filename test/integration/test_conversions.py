@@ -5,8 +5,12 @@ import math
 
 import numpy as np
 import pytest
+from builtin_interfaces.msg import Time
 from geometry_msgs.msg import Pose, Quaternion
-from nav_msgs.msg import OccupancyGrid
+from hypothesis import given
+from hypothesis import strategies as st
+from nav_msgs.msg import OccupancyGrid, Path
+from rclpy.serialization import deserialize_message, serialize_message
 from std_msgs.msg import Header
 
 from ddqn_planner.grid import MOVES, GridMap
@@ -18,6 +22,7 @@ from ddqn_planner.nodes.conversions import (
     occupancy_message,
     path_message,
     quaternion,
+    serialized_path,
     value_message,
 )
 from ddqn_planner.planning import QField
@@ -216,3 +221,26 @@ def test_a_tolerance_is_a_finite_number_of_metres() -> None:
     for bad in (-1e-9, math.nan, math.inf):
         with pytest.raises(ValueError, match=f"the tolerance is {bad}; give metres"):
             check_tolerance(bad)
+
+
+@given(
+    st.lists(st.tuples(st.integers(0, 300), st.integers(0, 300)), max_size=8),
+    st.text(st.characters(min_codepoint=1, codec="utf-8"), max_size=12),
+    st.floats(-4, 4),
+)
+def test_a_serialized_path_is_the_path_message(
+    cells: list[tuple[int, int]], frame: str, yaw: float
+) -> None:
+    grid = GridMap(np.zeros((2, 2)), 0.05, (1.5, -20.25, yaw))
+    header = Header(frame_id=frame, stamp=Time(sec=5, nanosec=77))
+    path = path_message(cells, grid, header, quaternion(0.7))
+    sent = deserialize_message(serialized_path(cells, grid, header, quaternion(0.7)), Path)
+    assert sent.header == header
+    assert [pose.header for pose in sent.poses] == [pose.header for pose in path.poses]
+    for name, axes in (("position", "xyz"), ("orientation", "xyzw")):
+        values, expected = (
+            [[getattr(getattr(p.pose, name), axis) for axis in axes] for p in message.poses]
+            for message in (sent, path)
+        )
+        np.testing.assert_allclose(values, expected, atol=1e-12)
+    assert len(serialize_message(sent)) == len(serialize_message(path))

@@ -21,7 +21,7 @@ from processes import running
 pytestmark = pytest.mark.slow
 
 DEMO = Path(__file__).resolve().parents[2] / "scripts" / "demo.py"
-END_TIMEOUT = 240.0
+END_TIMEOUT = 600.0
 """Seconds that the whole demo may take on a loaded machine."""
 
 STOP_TIMEOUT = 120.0

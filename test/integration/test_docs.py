@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 import pytest
+from client import wait_for
 from rcl_interfaces.msg import ParameterDescriptor, ParameterType
 from rcl_interfaces.srv import DescribeParameters, ListParameters
 
@@ -71,26 +73,41 @@ def test_each_topic_service_and_parameter_is_described_as_it_is(
     run_node: Any, make_client: Callable[[str], Any], node: str
 ) -> None:
     client, namespace = make_client("/described"), "/described"
-    name = f"{namespace}/{node}"
+    documented = documented_topics(node)
     parameters = {"follow_trainer": True} if node == "planner" else {}
     with run_node(f"{node}_node", parameters, namespace=namespace):
         found = described(client, node)
         if node == "planner":
             found["follow_trainer"][1] = "`false`"
-        topics = {
-            (kind, topic.replace(f"{name}/", "~/").replace(f"{namespace}/", ""), message)
-            for kind, get in (
-                ("publishes", client.node.get_publisher_names_and_types_by_node),
-                ("subscribes", client.node.get_subscriber_names_and_types_by_node),
-                ("service", client.node.get_service_names_and_types_by_node),
-            )
-            for topic, (message, *_) in get(node, namespace)
-            if topic not in OF_EVERY_NODE and "parameter" not in topic and "type_desc" not in topic
-        }
-    rows = rows_of(node)
+        # The client may discover the last of them late.
+        with suppress(TimeoutError):
+            wait_for("documented topics", lambda: topics_of(client, node) == documented)
+        assert documented == topics_of(client, node)
+    of_parameters = {row[0].strip("`"): row[1:4] for row in rows_of(node) if len(row) == 5}
+    del of_parameters["parameter"]
+    assert of_parameters == found
+
+
+def topics_of(client: Any, node: str) -> set[tuple[str, str, str]]:
+    """What a client has discovered of a node."""
+    namespace = client.node.get_namespace()
+    return {
+        (kind, topic.replace(f"{namespace}/{node}/", "~/").replace(f"{namespace}/", ""), message)
+        for kind, get in (
+            ("publishes", client.node.get_publisher_names_and_types_by_node),
+            ("subscribes", client.node.get_subscriber_names_and_types_by_node),
+            ("service", client.node.get_service_names_and_types_by_node),
+        )
+        for topic, (message, *_) in get(node, namespace)
+        if topic not in OF_EVERY_NODE and "parameter" not in topic and "type_desc" not in topic
+    }
+
+
+def documented_topics(node: str) -> set[tuple[str, str, str]]:
+    """The topics and services in the tables below a node's heading."""
     documented = {
         (row[0], row[1].strip("`"), re.sub(r"/(?=\w+$)", "/msg/", row[2].split(",")[0]))
-        for row in rows
+        for row in rows_of(node)
         if row[0] in ("publishes", "subscribes", "service")
     }
     documented = {
@@ -101,7 +118,4 @@ def test_each_topic_service_and_parameter_is_described_as_it_is(
         documented.remove(
             ("subscribes", "odom", "nav_msgs/msg/Odometry")
         )  # by another start_source
-    assert documented == topics
-    of_parameters = {row[0].strip("`"): row[1:4] for row in rows if len(row) == 5}
-    del of_parameters["parameter"]
-    assert of_parameters == found
+    return documented

@@ -9,10 +9,10 @@ from pathlib import Path
 
 import pytest
 
-pytestmark = pytest.mark.slow
+pytestmark = pytest.mark.slow(seconds=25)
 
 FAULTS = Path(__file__).resolve().parents[2] / "scripts" / "faults.py"
-TIMEOUT = 180.0
+TIMEOUT = 600.0
 """Seconds that it may take on a loaded machine."""
 
 

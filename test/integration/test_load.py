@@ -18,7 +18,7 @@ from soak import Work, growth, soak
 from ddqn_planner.grid import Cell, MapFile
 
 
-@pytest.mark.slow
+@pytest.mark.slow(seconds=20)
 def test_every_answer_is_right_while_the_map_changes_and_goals_are_planned_in_order(
     run_node: Callable[..., Any], capfd: pytest.CaptureFixture[str]
 ) -> None:

@@ -51,8 +51,8 @@ from ddqn_planner.nodes.runtime import LATCHED
 def test_goal_pose_is_answered_by_a_plan_a_value_and_diagnostics(robot: Robot) -> None:
     robot.send_start(robot.pose((0, 3)))
     robot.send_goal(robot.pose(GOAL, GOAL_YAW))
-    path = robot.wait_for_path((0, 3), GOAL)
-    assert yaw_of(path.poses[-1].pose.orientation) == pytest.approx(GOAL_YAW)
+    # With the goal before it the path may have another yaw.
+    path = robot.wait_for_path((0, 3), GOAL, yaw=GOAL_YAW)
 
     value = robot.value.wait()
     assert value.header.frame_id == "map"
@@ -62,16 +62,16 @@ def test_goal_pose_is_answered_by_a_plan_a_value_and_diagnostics(robot: Robot) -
     assert percent[GOAL[1], GOAL[0]] == percent.max() == 100
     assert percent[robot.values == 0].min() == 0
 
-    status = robot.wait_for_reason("^a path of ")
+    length = {"path length (cells)": f"{length_of(path) / RESOLUTION:.3f}"}
+    status = robot.wait_for_reason("^a path of ", length)
     assert status.level == DiagnosticStatus.OK
     values = values_of(status)
     assert values["status"] == "SUCCEEDED"
-    steps = np.hypot(*np.diff(points_of(path), axis=0).T)
-    assert float(values["path length (cells)"]) == pytest.approx(steps.sum() / RESOLUTION, abs=1e-2)
     assert float(values["rollout time (ms)"]) > 0
     assert values["model file"] == values["model"] == str(robot.model)
     assert values["model move rule"] == values["move rule"] == "robot_safe"
     assert values["model training steps"] == "3000"
+    assert values["model certificate"].startswith("nothing can be proved: ")
 
 
 def test_diagnostics_come_though_nothing_changes(robot: Robot) -> None:
@@ -140,6 +140,7 @@ def test_plans_again_when_threshold_or_unknown_cells_change(robot: Robot) -> Non
     assert robot.client.set_parameters("planner", occupied_threshold=50)[0].successful
     robot.plans.wait(lambda path: not path.poses)
     robot.wait_for_reason("the goal is occupied")
+    robot.clear()
     assert robot.client.set_parameters("planner", occupied_threshold=65)[0].successful
     robot.wait_for_path(START, GOAL)
 
@@ -147,6 +148,7 @@ def test_plans_again_when_threshold_or_unknown_cells_change(robot: Robot) -> Non
     robot.clear()
     robot.send_map(occupancy_message(values, RESOLUTION, ORIGIN, Header(frame_id="map")))
     robot.wait_for_reason("the goal is occupied")
+    robot.clear()
     assert robot.client.set_parameters("planner", allow_unknown=True)[0].successful
     robot.wait_for_path(START, GOAL)
     assert robot.client.set_parameters("planner", allow_unknown=False)[0].successful
@@ -155,8 +157,7 @@ def test_plans_again_when_threshold_or_unknown_cells_change(robot: Robot) -> Non
 def test_move_rule_is_changed_at_run_time(robot: Robot) -> None:
     assert robot.client.set_parameters("planner", move_rule="corner_cutting")[0].successful
     robot.plans.wait()
-    status = robot.wait_for_reason(".")
-    assert values_of(status)["move rule"] == "corner_cutting"
+    status = robot.wait_for_reason(".", {"move rule": "corner_cutting"})
     assert values_of(status)["model move rule"] == "robot_safe"
     assert robot.client.set_parameters("planner", move_rule="")[0].successful
 
@@ -354,8 +355,9 @@ def test_malformed_goal_has_an_empty_plan_and_replaces_the_active_goal(
     planner.wait_for_log(f"no plan: the goal's .*{reason}")
     robot.clear()
     robot.send_start(robot.pose((3, 3)))
-    assert robot.plans.wait().poses == []
+    robot.plans.wait()
     robot.assert_works()
+    assert all(path.poses == [] for path in robot.plans.messages())
 
 
 @pytest.mark.parametrize("name", ["start", "goal"])
@@ -446,7 +448,7 @@ def test_without_parameters_it_plans_on_maps_of_any_size_and_heeds_costs(
         values = np.zeros((7, 20), dtype=np.int8)
         values[2:5, 3:17] = 60
         robot = Robot(client, values, model, "/anywhere/planner")
-        robot.send_map()
+        robot.set_map(robot.stamped_map())
         straight = robot.get_plan(robot.pose((0, 3)), robot.pose((19, 3)))
         assert length_of(straight) == pytest.approx(19 * RESOLUTION)
         assert client.set_parameters("planner", use_map_costs=True)[0].successful
@@ -507,9 +509,8 @@ def robot_before(
 
 def ask_for_plan(robot: Robot, node: Any) -> Any:
     """Return the future of the plan from START to GOAL, once its field waits at the gate."""
-    client = robot.client.node.create_client(GetPlan, "planner/get_plan")
-    assert client.wait_for_service(TIMEOUT)
-    plan = client.call_async(GetPlan.Request(start=robot.pose(START), goal=robot.pose(GOAL)))
+    service = robot.client.service(GetPlan, "planner/get_plan")
+    plan = service.call_async(GetPlan.Request(start=robot.pose(START), goal=robot.pose(GOAL)))
     node.wait_for_log("a field waits")
     return plan
 
@@ -595,8 +596,7 @@ def test_all_else_is_answered_while_a_path_is_searched_for(
         assert robot.get_plan(robot.pose(START), robot.pose(GOAL)).poses == []
         assert client.set_parameters("planner", mode="astar_fallback")[0].successful
         gate.unlink()
-        plans = client.node.create_client(GetPlan, "planner/get_plan")
-        assert plans.wait_for_service(TIMEOUT)
+        plans = client.service(GetPlan, "planner/get_plan")
         answered = threading.Event()
         plan = plans.call_async(GetPlan.Request(start=robot.pose(START), goal=robot.pose(GOAL)))
         plan.add_done_callback(lambda _: answered.set())

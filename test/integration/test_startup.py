@@ -88,8 +88,7 @@ def load_gate(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 def ask_for_plan(robot: Robot) -> tuple[Any, threading.Event]:
     """Return the future of a plan from START to GOAL, and the event that it is there."""
-    plans = robot.client.node.create_client(GetPlan, "planner/get_plan")
-    assert plans.wait_for_service(TIMEOUT)
+    plans = robot.client.service(GetPlan, "planner/get_plan")
     answered = threading.Event()
     plan = plans.call_async(GetPlan.Request(start=robot.pose(START), goal=robot.pose(GOAL)))
     plan.add_done_callback(lambda _: answered.set())

@@ -17,6 +17,7 @@ from pathlib import Path as FilePath
 from typing import Any
 
 import pytest
+from client import wait_for
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import Pose, PoseStamped, PoseWithCovarianceStamped
 from hypothesis import given
@@ -41,6 +42,7 @@ from ddqn_planner.model import load_model
 from ddqn_planner.nodes import trainer_node
 from ddqn_planner.nodes.conversions import occupancy_message, quaternion
 from ddqn_planner.nodes.runtime import LATCHED
+from ddqn_planner.nodes.trainer_parameters import PARAMETERS
 from ddqn_planner.training.environment import Scenario
 from ddqn_planner.training.hyper_parameters import HyperParameters
 from ddqn_planner.training.run import TrainingRun
@@ -50,9 +52,29 @@ TIMEOUT = 120.0
 ENDLESS = {"steps": 10**9, "filters": 4, "learning_starts": 100}
 
 
+NAMESPACE = "/training"
+"""Of the trainer that the tests share."""
+
+DEFAULTS = {
+    name: declared.default for name, declared in PARAMETERS.items() if not declared.read_only
+} | {entry.name: entry.default for entry in fields(HyperParameters)}
+
+OFTEN = """
+from rclpy.node import Node
+
+create_timer = Node.create_timer
+
+def create_fast_timer(node, period, *arguments, **options):
+    return create_timer(node, min(period, 0.1), *arguments, **options)
+
+Node.create_timer = create_fast_timer
+"""
+"""What a trainer runs first (as its ``sitecustomize``): the tests wait for many diagnostics."""
+
+
 @pytest.fixture
 def namespace(request: pytest.FixtureRequest) -> str:
-    """A namespace for each test: lasting topics of one test do not reach the next."""
+    """A namespace for a test with a node of its own."""
     return "/" + re.sub(r"\W+", "_", request.node.name).strip("_")
 
 
@@ -74,28 +96,32 @@ def stamped(x: float, y: float, frame: str = "map") -> PoseStamped:
     return message
 
 
-def publish_map(client: Any, values: Any, resolution: float = 1.0, frame: str = "map") -> None:
+def publish_map(
+    client: Any, values: Any, resolution: float = 1.0, frame: str = "map", listeners: int = 1
+) -> None:
     header = Header(frame_id=frame)
     message = occupancy_message(values, resolution, (0.0, 0.0, 0.0), header)
-    client.publish("map", message, LATCHED)
+    client.publish("map", message, LATCHED, listeners)
 
 
-def set_up(
-    client: Any, values: Any, start: PoseStamped, goal: PoseStamped, listeners: int = 1
-) -> None:
-    """Publish the map, the start and the goal to so many nodes."""
-    publish_map(client, values)
-    initial_pose = PoseWithCovarianceStamped(header=start.header)
-    initial_pose.pose.pose = start.pose
+def set_up(node: Any, client: Any, values: Any, listeners: int = 1) -> None:
+    """Publish the map, a start and a goal to so many nodes, and wait until the trainer has them."""
+    node.forget_log()
+    publish_map(client, values, listeners=listeners)
+    node.wait_for_log("map of 6 x 6 cells")
+    initial_pose = PoseWithCovarianceStamped(header=Header(frame_id="map"))
+    initial_pose.pose.pose = stamped(0.5, 0.5).pose
     client.publish("initialpose", initial_pose, listeners=listeners)
-    client.publish("goal_pose", goal, listeners=listeners)
+    client.publish("goal_pose", stamped(5.5, 5.5), listeners=listeners)
+    node.wait_for_log(r"the start is cell \(0, 0\)")
+    node.wait_for_log(r"the goal is cell \(5, 5\)")
 
 
-def wait_for_state(listener: Listener, namespace: str, **expected: str) -> dict[str, str]:
-    """Return the first diagnostics of a namespace's trainer that hold the expected texts."""
+def wait_for_state(listener: Listener, **expected: str) -> dict[str, str]:
+    """Return the first diagnostics of the shared trainer that hold the expected texts."""
     while True:
         (status,) = listener.next().status
-        if status.name != f"{namespace}/trainer: training":
+        if status.name != f"{NAMESPACE}/trainer: training":
             continue
         values = {entry.key: entry.value for entry in status.values}
         values["message"] = status.message
@@ -104,186 +130,210 @@ def wait_for_state(listener: Listener, namespace: str, **expected: str) -> dict[
 
 
 def start_training(client: Any) -> str:
-    """Call ~/start until the poses, which come by other topics, have arrived too."""
-    for _ in range(100):
-        response = client.call(Trigger, "trainer/start")
-        if response.success:
-            return str(response.message)
-        assert "unknown" in response.message or "no map" in response.message
-        time.sleep(0.05)
-    raise AssertionError(response.message)
+    answer = client.call(Trigger, "trainer/start")
+    assert answer.success, answer.message
+    return str(answer.message)
+
+
+def refusal(client: Any) -> str:
+    """Return why ~/start refuses."""
+    answer = client.call(Trigger, "trainer/start")
+    assert not answer.success
+    return str(answer.message)
+
+
+@pytest.fixture(scope="module")
+def shared_trainer(
+    run_node: Any, make_client: Any, tmp_path_factory: pytest.TempPathFactory
+) -> Iterator[Any]:
+    """A trainer for many tests, and its client: to start one takes seconds."""
+    folder = tmp_path_factory.mktemp("often")
+    (folder / "sitecustomize.py").write_text(OFTEN)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("PYTHONPATH", str(folder), prepend=os.pathsep)
+        with run_node("trainer_node", {}, namespace=NAMESPACE) as node:
+            yield node, make_client(NAMESPACE)
+
+
+@pytest.fixture
+def trainer(shared_trainer: Any, small_values: Any, tmp_path: FilePath) -> Iterator[Any]:
+    """The shared trainer and its client; it has a map, a start, a goal, and does nothing."""
+    node, client = shared_trainer
+    configure(client, tmp_path / "run", **DEFAULTS)
+    set_up(node, client, small_values)
+    yield node, client
+    node.forget_log()
+    if "saves and stops" in client.call(Trigger, "trainer/stop").message:
+        node.wait_for_log("the training stopped")
+
+
+def configure(client: Any, folder: FilePath, **parameters: Any) -> None:
+    """Set parameters of the shared trainer; the next test has their defaults again."""
+    parameters["output_folder"] = str(folder)
+    result = set_atomically(client, *(message_of(*item) for item in parameters.items()))
+    assert result.successful, result.reason
 
 
 def test_a_training_can_be_watched_saved_stopped_resumed_and_replayed(
-    run_node: Any, make_client: Any, namespace: str, small_values: Any, tmp_path: FilePath
+    trainer: Any, small_values: Any, tmp_path: FilePath
 ) -> None:
-    client = make_client(namespace)
-    parameters = {**ENDLESS, "output_folder": str(tmp_path / "run"), "replay_period": 0.002}
-    with run_node("trainer_node", {**parameters, "move_rule": "robot_safe"}, namespace=namespace):
-        rewards = Listener(client, Float32, "trainer/average_reward")
-        episodes = Listener(client, Path, "trainer/episode")
-        saved = Listener(client, String, "trainer/model_saved", LATCHED)
-        diagnostics = Listener(client, DiagnosticArray, "/diagnostics")
+    node, client = trainer
+    configure(client, tmp_path, **ENDLESS, replay_period=0.002, move_rule="robot_safe")
+    rewards = Listener(client, Float32, "trainer/average_reward")
+    episodes = Listener(client, Path, "trainer/episode")
+    saved = client.subscribe(String, "trainer/model_saved", LATCHED)
+    diagnostics = Listener(client, DiagnosticArray, "/diagnostics")
 
-        refused = client.call(Trigger, "trainer/start")
-        assert not refused.success
-        assert "no map" in refused.message
+    assert "from step 0" in start_training(client)
+    assert "training already" in refusal(client)
+    assert -10.0 <= rewards.next().data <= 10.0
 
-        set_up(client, small_values, stamped(0.5, 0.5), stamped(5.5, 5.5))
-        assert "from step 0" in start_training(client)
-        assert not client.call(Trigger, "trainer/start").success
-        assert -10.0 <= rewards.next().data <= 10.0
+    legal = legal_moves(GridMap(small_values > 0).occupancy, MoveRule.ROBOT_SAFE)
+    episode = episodes.next()
+    assert episode.header.frame_id == "map"
+    cells = [(int(p.pose.position.x), int(p.pose.position.y)) for p in episode.poses]
+    moves = MOVES.tolist()
+    for (x, y), (next_x, next_y) in itertools.pairwise(cells):
+        assert legal[moves.index([next_x - x, next_y - y]), y, x]
 
-        legal = legal_moves(GridMap(small_values > 0).occupancy, MoveRule.ROBOT_SAFE)
-        episode = episodes.next()
-        assert episode.header.frame_id == "map"
-        cells = [(int(p.pose.position.x), int(p.pose.position.y)) for p in episode.poses]
-        moves = MOVES.tolist()
-        for (x, y), (next_x, next_y) in itertools.pairwise(cells):
-            assert legal[moves.index([next_x - x, next_y - y]), y, x]
+    assert client.call(Trigger, "trainer/save").success
+    # The model of an earlier training is latched.
+    path = saved.wait(lambda message: FilePath(message.data).parent == tmp_path).data
+    _, metadata = load_model(path)
+    assert metadata.steps > 0
+    assert metadata.map_fingerprint == GridMap(small_values > 0).fingerprint
 
-        assert client.call(Trigger, "trainer/save").success
-        _, metadata = load_model(saved.next().data)
-        assert metadata.steps > 0
-        assert metadata.map_fingerprint == GridMap(small_values > 0).fingerprint
+    assert client.call(Trigger, "trainer/stop").success
+    stopped = wait_for_state(diagnostics, state="stopped", folder=str(tmp_path))
+    steps = int(stopped["steps"].split()[0])
+    assert f"from step {steps} " in start_training(client)
+    client.call(Trigger, "trainer/stop")
+    node.wait_for_log("the training stopped(.|\n)*the training stopped")
 
-        assert client.call(Trigger, "trainer/stop").success
-        stopped = wait_for_state(diagnostics, namespace, state="stopped")
-        steps = int(stopped["steps"].split()[0])
-        assert f"from step {steps}" in start_training(client)
-        client.call(Trigger, "trainer/stop")
-        wait_for_state(diagnostics, namespace, state="stopped")
-
-        replay = client.call(Trigger, "trainer/replay")
-        assert replay.success, replay.message
-        lengths = []
-        while len(lengths) < 3 or lengths[-3:-1] != [1, 2]:
-            lengths.append(len(episodes.next().poses))
+    replay = client.call(Trigger, "trainer/replay")
+    assert replay.success, replay.message
+    lengths: list[int] = []
+    while len(lengths) < 3 or lengths[-3:-1] != [1, 2]:
+        lengths.append(len(episodes.next().poses))
 
 
 def test_episodes_are_drawn_on_the_map_of_their_own_training(
-    run_node: Any, make_client: Any, namespace: str, small_values: Any, tmp_path: FilePath
+    trainer: Any, small_values: Any, tmp_path: FilePath
 ) -> None:
-    client = make_client(namespace)
-    parameters = {**ENDLESS, "output_folder": str(tmp_path / "run"), "replay_period": 0.001}
-    with run_node("trainer_node", parameters, namespace=namespace) as node:
-        episodes = Listener(client, Path, "trainer/episode")
-        set_up(client, small_values, stamped(0.5, 0.5), stamped(5.5, 5.5))
-        start_training(client)
+    node, client = trainer
+    configure(client, tmp_path / "run", **ENDLESS, replay_period=0.001)
+    episodes = Listener(client, Path, "trainer/episode")
+    start_training(client)
 
-        def next_episode() -> tuple[str, set[float]]:
-            """Return the frame, and the places within a cell of all poses."""
-            episode = episodes.next()
-            coordinates = [(p.pose.position.x, p.pose.position.y) for p in episode.poses]
-            return episode.header.frame_id, {round(c % 1.0, 3) for xy in coordinates for c in xy}
+    def next_episode() -> tuple[str, set[float]]:
+        """Return the frame, and the places within a cell of all poses."""
+        episode = episodes.next()
+        coordinates = [(p.pose.position.x, p.pose.position.y) for p in episode.poses]
+        return episode.header.frame_id, {round(c % 1.0, 3) for xy in coordinates for c in xy}
 
+    assert next_episode() == ("map", {0.5})
+    publish_map(client, small_values, 0.25, "site")
+    node.wait_for_log("6 x 6 cells(.|\n)*6 x 6 cells")
+    for _ in range(20):
         assert next_episode() == ("map", {0.5})
-        publish_map(client, small_values, 0.25, "site")
-        node.wait_for_log("6 x 6 cells(.|\n)*6 x 6 cells")
-        for _ in range(20):
-            assert next_episode() == ("map", {0.5})
-        client.call(Trigger, "trainer/stop")
-        node.wait_for_log("the training stopped")
-        assert client.call(Trigger, "trainer/replay").success
-        for _ in range(20):
-            assert next_episode() == ("map", {0.5})
-        # This process has not seen that training: the last map is the best guess.
-        (tmp_path / "run").rename(tmp_path / "earlier")
-        client.set_parameters("trainer", output_folder=str(tmp_path / "earlier"))
-        assert client.call(Trigger, "trainer/replay").success
-        while next_episode()[0] != "site":
-            pass
+    client.call(Trigger, "trainer/stop")
+    node.wait_for_log("the training stopped")
+    assert client.call(Trigger, "trainer/replay").success
+    for _ in range(20):
+        assert next_episode() == ("map", {0.5})
+    # This process has not seen that training: the last map is the best guess.
+    (tmp_path / "run").rename(tmp_path / "earlier")
+    configure(client, tmp_path / "earlier")
+    assert client.call(Trigger, "trainer/replay").success
+    while next_episode()[0] != "site":
+        pass
 
 
 def test_a_replay_is_not_mixed_with_the_training_and_stop_says_what_it_stopped(
-    run_node: Any, make_client: Any, namespace: str, small_values: Any, tmp_path: FilePath
+    trainer: Any, tmp_path: FilePath
 ) -> None:
-    client = make_client(namespace)
-    parameters = {**ENDLESS, "output_folder": str(tmp_path / "run"), "episode_interval": 1}
-    with run_node("trainer_node", parameters, namespace=namespace) as node:
+    node, client = trainer
+    configure(client, tmp_path, **ENDLESS, episode_interval=1)
 
-        def stop() -> str:
-            answer = client.call(Trigger, "trainer/stop")
-            assert answer.success
-            return str(answer.message)
+    def stop() -> str:
+        answer = client.call(Trigger, "trainer/stop")
+        assert answer.success
+        return str(answer.message)
 
-        episodes = Listener(client, Path, "trainer/episode")
-        diagnostics = Listener(client, DiagnosticArray, "/diagnostics")
-        assert stop() == "no training was running"
-        set_up(client, small_values, stamped(0.5, 0.5), stamped(5.5, 5.5))
-        start_training(client)
-        episodes.next()
-        assert client.call(Trigger, "trainer/replay").success
-        answered = time.time_ns()
-        while Time.from_msg((first := episodes.next()).header.stamp).nanoseconds <= answered:
-            pass  # what the training published before
-        count = int(wait_for_state(diagnostics, namespace, state="training")["episodes"])
-        lengths = [len(first.poses), *(len(episodes.next().poses) for _ in range(40))]
-        while int(wait_for_state(diagnostics, namespace)["episodes"]) < count + 20:
-            pass
-        lengths += [len(episodes.next().poses) for _ in range(20)]
-        assert all(b in (1, a + 1) for a, b in itertools.pairwise(lengths)), lengths
+    episodes = Listener(client, Path, "trainer/episode")
+    diagnostics = Listener(client, DiagnosticArray, "/diagnostics")
+    assert stop() == "no training was running"
+    start_training(client)
+    episodes.next()
+    assert client.call(Trigger, "trainer/replay").success
+    answered = time.time_ns()
+    while Time.from_msg((first := episodes.next()).header.stamp).nanoseconds <= answered:
+        pass  # what the training published before
+    of_run = {"state": "training", "folder": str(tmp_path)}
+    count = int(wait_for_state(diagnostics, **of_run)["episodes"])
+    lengths = [len(first.poses), *(len(episodes.next().poses) for _ in range(40))]
+    while int(wait_for_state(diagnostics, **of_run)["episodes"]) < count + 20:
+        pass
+    lengths += [len(episodes.next().poses) for _ in range(20)]
+    assert all(b in (1, a + 1) for a, b in itertools.pairwise(lengths)), lengths
 
-        assert "; the replay was stopped" in stop()
-        node.wait_for_log("the training stopped")
-        assert client.call(Trigger, "trainer/replay").success
-        assert stop() == "no training was running; the replay was stopped"
-        assert stop() == "no training was running"
+    assert "; the replay was stopped" in stop()
+    node.wait_for_log("the training stopped")
+    assert client.call(Trigger, "trainer/replay").success
+    assert stop() == "no training was running; the replay was stopped"
+    assert stop() == "no training was running"
 
 
 def test_the_log_says_when_a_training_starts_and_what_is_saved(
-    run_node: Any, make_client: Any, namespace: str, small_values: Any, tmp_path: FilePath
+    trainer: Any, tmp_path: FilePath
 ) -> None:
-    client = make_client(namespace)
-    parameters = {"steps": 300, "filters": 4, "output_folder": str(tmp_path / "run")}
-    with run_node("trainer_node", parameters, namespace=namespace) as node:
-        set_up(client, small_values, stamped(0.5, 0.5), stamped(5.5, 5.5))
-        start_training(client)
-        node.wait_for_log(f"training in {tmp_path}/run from step 0 to 300")
-        node.wait_for_log(f"step 300 is saved in {tmp_path}/run/checkpoint.safetensors")
-        node.wait_for_log("the training finished")
+    node, client = trainer
+    configure(client, tmp_path, steps=300, filters=4)
+    start_training(client)
+    node.wait_for_log(f"training in {tmp_path} from step 0 to 300")
+    node.wait_for_log(f"step 300 is saved in {tmp_path}/checkpoint.safetensors")
+    node.wait_for_log("the training finished")
     assert node.log.count("is saved in") == 1
 
 
 def test_a_folder_of_something_else_or_in_use_is_refused_and_left_as_it_is(
-    run_node: Any, make_client: Any, namespace: str, small_values: Any, tmp_path: FilePath
+    trainer: Any, small_values: Any, tmp_path: FilePath
 ) -> None:
-    client = make_client(namespace)
+    _, client = trainer
     for name in ("episodes.csv", "model.safetensors"):
         (tmp_path / name).write_text("mine")
     used = tmp_path.with_name("used")
     scenario = Scenario(GridMap(small_values > 0), (0, 0), (5, 5))
     other = TrainingRun(used, [scenario], MoveRule.ROBOT_SAFE, HyperParameters(), seed=0)
-    with run_node("trainer_node", {"output_folder": str(tmp_path)}, namespace=namespace):
-        set_up(client, small_values, stamped(0.5, 0.5), stamped(5.5, 5.5))
-        with pytest.raises(AssertionError, match="no training; give a new or empty folder"):
-            start_training(client)
-        client.set_parameters("trainer", output_folder=str(used))
-        assert "another process trains" in client.call(Trigger, "trainer/start").message
+    configure(client, tmp_path)
+    assert "no training; give a new or empty folder" in refusal(client)
+    configure(client, used)
+    assert "another process trains" in refusal(client)
     other.close()
     assert sorted(path.name for path in tmp_path.iterdir()) == ["episodes.csv", "model.safetensors"]
     assert all(path.read_text() == "mine" for path in tmp_path.iterdir())
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_a_signal_saves_a_checkpoint_that_a_new_process_continues(
-    run_node: Any, make_client: Any, namespace: str, tmp_path: FilePath, number: int
+    run_node: Any, make_client: Any, namespace: str, tmp_path: FilePath
 ) -> None:
-    client = make_client(namespace)
+    client, steps = make_client(namespace), 0
     parameters = {
         **ENDLESS,
         "output_folder": str(tmp_path),
         "map_file": str(FilePath(__file__).resolve().parents[2] / "maps" / "dilemma.yaml"),
     }
-    with run_node("trainer_node", parameters, namespace=namespace) as node:
-        rewards = Listener(client, Float32, "trainer/average_reward")
-        start_training(client)
-        for _ in range(20):
-            rewards.next()
-        assert node.stop(number) == 0, node.log
-    map_file_scenario = paper_scenario_of(parameters["map_file"])
-    steps = Trainer.load_checkpoint(tmp_path / "checkpoint.safetensors", [map_file_scenario]).steps
-    assert steps > 0
+    scenario = paper_scenario_of(parameters["map_file"])
+    for number in (signal.SIGINT, signal.SIGTERM):
+        with run_node("trainer_node", parameters, namespace=namespace) as node:
+            rewards = Listener(client, Float32, "trainer/average_reward")
+            assert f"from step {steps} " in start_training(client)
+            for _ in range(20):
+                rewards.next()
+            assert node.stop(number) == 0, node.log
+        before = steps
+        steps = Trainer.load_checkpoint(tmp_path / "checkpoint.safetensors", [scenario]).steps
+        assert steps > before
     with run_node("trainer_node", parameters, namespace=namespace):
         assert f"from step {steps} " in start_training(client)
 
@@ -297,39 +347,46 @@ def paper_scenario_of(map_file: Any) -> Scenario:
 
 @pytest.mark.parametrize("network", ["paper", "propagation"])
 def test_a_planner_that_follows_the_trainer_plans_with_each_model_it_saves(
-    run_node: Any,
-    make_client: Any,
-    namespace: str,
-    small_values: Any,
-    tmp_path: FilePath,
-    network: str,
+    run_node: Any, trainer: Any, small_values: Any, tmp_path: FilePath, network: str
 ) -> None:
-    client = make_client(namespace)
-    trainer_parameters = {
-        "steps": 6000,
-        "network": network,
-        "learning_rate": 0.003,
-        "p_r": 1.0,
-        "update_interval": 2,
-        "target_interval": 100,
-        "epsilon_steps": 2000,
-        "move_rule": "robot_safe",
-        "output_folder": str(tmp_path),
-    }
-    planner = run_node("planner_node", {"follow_trainer": True}, namespace=namespace)
-    with run_node("trainer_node", trainer_parameters, namespace=namespace), planner:
-        plans = Listener(client, Path, "plan", LATCHED)
-        set_up(client, small_values, stamped(0.5, 0.5), stamped(5.5, 5.5), listeners=2)
+    node, client = trainer
+    configure(
+        client,
+        tmp_path,
+        steps=1500,
+        network=network,
+        filters=16,
+        learning_rate=0.003,
+        learning_starts=100,
+        p_r=1.0,
+        update_interval=2,
+        target_interval=100,
+        epsilon_steps=1000,
+        max_episode_steps=40,
+        move_rule="robot_safe",
+        seed=1,
+    )
+    saved = tmp_path / "model.safetensors"
+    request = GetPlan.Request(start=stamped(0.5, 0.5), goal=stamped(5.5, 5.5))
+    with run_node("planner_node", {"follow_trainer": True}, namespace=NAMESPACE):
+        plans = client.subscribe(Path, "plan", LATCHED)
+        set_up(node, client, small_values, listeners=2)
         start_training(client)
+        asked = [time.time_ns()]
+
+        def has_its_model() -> bool:
+            time.sleep(0.05)
+            asked.append(time.time_ns())
+            return bool(client.get_parameter("planner", "model") == str(saved))
+
+        wait_for("its model", has_its_model)
+
+        def is_with_its_model(plan: Path) -> bool:
+            return Time.from_msg(plan.header.stamp).nanoseconds > asked[-2]
+
         # The planner plans for the active goal again with each model, until one is good enough.
-        while not plans.next().poses:
-            pass
-        answer = client.call(
-            GetPlan,
-            "planner/get_plan",
-            GetPlan.Request(start=stamped(0.5, 0.5), goal=stamped(5.5, 5.5)),
-        )
-        assert answer.plan.poses
+        plans.wait(lambda plan: plan.poses and is_with_its_model(plan))
+        wait_for("plan", lambda: client.call(GetPlan, "planner/get_plan", request).plan.poses)
 
 
 @pytest.mark.parametrize(
@@ -343,57 +400,30 @@ def test_a_planner_that_follows_the_trainer_plans_with_each_model_it_saves(
     ],
 )
 def test_bad_input_is_refused_by_name_and_the_training_continues(
-    training: Any, topic: str, message: Any, named: str
+    trainer: Any, tmp_path: FilePath, topic: str, message: Any, named: str
 ) -> None:
-    client, diagnostics, namespace = training
+    _, client = trainer
+    configure(client, tmp_path, **ENDLESS)
+    start_training(client)
+    diagnostics = Listener(client, DiagnosticArray, "/diagnostics")
     client.publish(topic, message, LATCHED if topic == "map" else 10)
-    before = wait_for_state(diagnostics, namespace, state="training", message=named)
-    after = wait_for_state(diagnostics, namespace, state="training")
+    before = wait_for_state(diagnostics, state="training", message=named)
+    after = wait_for_state(diagnostics, state="training")
     assert before["goal"] == after["goal"] == "(5.5, 5.5)"
     while int(after["steps"].split()[0]) <= int(before["steps"].split()[0]):
-        after = wait_for_state(diagnostics, namespace, state="training")
-
-
-@pytest.fixture(scope="module")
-def trainer(
-    run_node: Any, make_client: Any, small_values: Any, tmp_path_factory: pytest.TempPathFactory
-) -> Any:
-    """A trainer that can train, and its diagnostics."""
-    namespace = "/training"
-    client = make_client(namespace)
-    folder = tmp_path_factory.mktemp("training")
-    with run_node("trainer_node", {**ENDLESS, "output_folder": str(folder)}, namespace=namespace):
-        diagnostics = Listener(client, DiagnosticArray, "/diagnostics")
-        set_up(client, small_values, stamped(0.5, 0.5), stamped(5.5, 5.5))
-        yield client, diagnostics, namespace
-
-
-@pytest.fixture
-def training(trainer: Any) -> Any:
-    """A trainer that trains during the test, but not beside the tests after it."""
-    client, diagnostics, namespace = trainer
-    start_training(client)
-    yield trainer
-    client.call(Trigger, "trainer/stop")
-    wait_for_state(diagnostics, namespace, state="stopped")
+        after = wait_for_state(diagnostics, state="training")
 
 
 def test_a_folder_with_another_training_is_left_alone(
-    run_node: Any, make_client: Any, namespace: str, small_values: Any, tmp_path: FilePath
+    trainer: Any, small_values: Any, tmp_path: FilePath
 ) -> None:
     scenario = Scenario(GridMap(small_values > 0), (0, 0), (5, 5))
-    trainer = Trainer([scenario], MoveRule.ROBOT_SAFE, HyperParameters(gamma=0.5), seed=0)
-    trainer.save_checkpoint(tmp_path / "checkpoint.safetensors")
+    other = Trainer([scenario], MoveRule.ROBOT_SAFE, HyperParameters(gamma=0.5), seed=0)
+    other.save_checkpoint(tmp_path / "checkpoint.safetensors")
     before = (tmp_path / "checkpoint.safetensors").read_bytes()
-    client = make_client(namespace)
-    with run_node(
-        "trainer_node",
-        {"output_folder": str(tmp_path), "move_rule": "robot_safe"},
-        namespace=namespace,
-    ):
-        set_up(client, small_values, stamped(0.5, 0.5), stamped(5.5, 5.5))
-        with pytest.raises(AssertionError, match=r"gamma 0\.5 \(now 0\.95\)"):
-            start_training(client)
+    _, client = trainer
+    configure(client, tmp_path, move_rule="robot_safe")
+    assert re.search(r"gamma 0\.5 \(now 0\.95\)", refusal(client))
     assert (tmp_path / "checkpoint.safetensors").read_bytes() == before
 
 
@@ -452,7 +482,7 @@ def message_of(name: str, value: Any) -> Any:
 def test_an_invalid_value_is_refused_with_its_reason_and_nothing_is_half_set(
     trainer: Any, name: str, value: Any, reason: str
 ) -> None:
-    client, _, _ = trainer
+    _, client = trainer
     good = [message_of("replay_capacity", 3000), message_of("epsilon_end", 0.2)]
     assert set_atomically(client, *good).successful
     for order in (1, -1):
@@ -470,7 +500,7 @@ def test_an_invalid_value_is_refused_with_its_reason_and_nothing_is_half_set(
 
 
 def test_values_that_limit_one_another_can_be_set_together(trainer: Any) -> None:
-    client, _, _ = trainer
+    _, client = trainer
     both = message_of("environments", 4096), message_of("replay_capacity", 4096)
     assert set_atomically(client, *both).successful
     both = message_of("replay_capacity", 50_000), message_of("environments", 1)
@@ -478,7 +508,7 @@ def test_values_that_limit_one_another_can_be_set_together(trainer: Any) -> None
 
 
 def test_a_value_of_an_unknown_type_is_refused(trainer: Any) -> None:
-    client, _, _ = trainer
+    _, client = trainer
     strange = ParameterMessage(name="seed", value=ParameterValue(type=77))
     assert "ParameterType" in set_atomically(client, strange).reason
     request = SetParameters.Request(parameters=[strange, message_of("seed", 7)])
@@ -488,7 +518,7 @@ def test_a_value_of_an_unknown_type_is_refused(trainer: Any) -> None:
 
 
 def test_each_parameter_says_what_may_be_set(trainer: Any) -> None:
-    client, _, _ = trainer
+    _, client = trainer
     names = client.call(ListParameters, "trainer/list_parameters").result.names
     own = [name for name in names if name not in ("use_sim_time", "start_type_description_service")]
     request = DescribeParameters.Request(names=own)
@@ -528,41 +558,38 @@ def no_folder(_: Any, folder: FilePath) -> Iterator[None]:
 
 @pytest.mark.parametrize("fault", [full_disk, no_folder])
 def test_a_disk_error_is_logged_once_and_the_training_continues(
-    run_node: Any,
-    make_client: Any,
-    namespace: str,
-    small_values: Any,
-    tmp_path: FilePath,
-    fault: Any,
+    trainer: Any, small_values: Any, tmp_path: FilePath, fault: Any
 ) -> None:
-    client, folder = make_client(namespace), tmp_path / "run"
-    parameters = {**ENDLESS, "output_folder": str(folder), "move_rule": "robot_safe"}
-    with run_node("trainer_node", parameters, namespace=namespace) as node:
-        saved = Listener(client, String, "trainer/model_saved", LATCHED)
-        diagnostics = Listener(client, DiagnosticArray, "/diagnostics")
-        set_up(client, small_values, stamped(0.5, 0.5), stamped(5.5, 5.5))
-        start_training(client)
+    (node, client), folder = trainer, tmp_path / "run"
+    configure(client, folder, **ENDLESS, move_rule="robot_safe")
+    saved = client.subscribe(String, "trainer/model_saved", LATCHED)
+    diagnostics = Listener(client, DiagnosticArray, "/diagnostics")
+    start_training(client)
+    client.call(Trigger, "trainer/save")
+    saved.wait(lambda message: FilePath(message.data).parent == folder)
+    model, checkpoint = folder / "model.safetensors", folder / "checkpoint.safetensors"
+    wait_until(checkpoint.exists)
+    with fault(node.process, folder):
         client.call(Trigger, "trainer/save")
-        saved.next()
-        model, checkpoint = folder / "model.safetensors", folder / "checkpoint.safetensors"
-        wait_until(checkpoint.exists)
-        with fault(node.process, folder):
+        failing = wait_for_state(diagnostics, message=f"cannot save to {folder} (")
+        kept = folder if folder.exists() else folder.with_name("moved")
+        before = [(kept / path.name).read_bytes() for path in (model, checkpoint)]
+        for _ in range(3):
             client.call(Trigger, "trainer/save")
-            failing = wait_for_state(diagnostics, namespace, message=f"cannot save to {folder} (")
-            kept = folder if folder.exists() else folder.with_name("moved")
-            before = [(kept / path.name).read_bytes() for path in (model, checkpoint)]
-            for _ in range(3):
-                client.call(Trigger, "trainer/save")
-                after = wait_for_state(diagnostics, namespace, message="make room")
-            assert int(after["steps"].split()[0]) > int(failing["steps"].split()[0])
-            assert after["state"] == "training"
-            assert [(kept / path.name).read_bytes() for path in (model, checkpoint)] == before
-        client.call(Trigger, "trainer/save")
-        wait_for_state(diagnostics, namespace, state="training", message="training")
-        assert load_model(saved.next().data)[1].steps > 0
-        size = (folder / "episodes.csv").stat().st_size
-        wait_until(lambda: (folder / "episodes.csv").stat().st_size > size)
-        assert node.stop() == 0
+            after = wait_for_state(diagnostics, message="make room")
+        while int(after["steps"].split()[0]) <= int(failing["steps"].split()[0]):
+            after = wait_for_state(diagnostics, message="make room")
+        assert after["state"] == "training"
+        assert [(kept / path.name).read_bytes() for path in (model, checkpoint)] == before
+    saved.clear()
+    client.call(Trigger, "trainer/save")
+    node.wait_for_log("saved again")
+    assert load_model(saved.wait().data)[1].steps > int(failing["steps"].split()[0])
+    wait_for_state(diagnostics, state="training", message="training")
+    size = (folder / "episodes.csv").stat().st_size
+    wait_until(lambda: (folder / "episodes.csv").stat().st_size > size)
+    client.call(Trigger, "trainer/stop")
+    node.wait_for_log("the training stopped")
     assert node.log.count("cannot save") == 1
     assert node.log.count("saved again") == 1
     assert "Traceback" not in node.log
@@ -588,7 +615,7 @@ def test_a_last_save_that_fails_is_logged_when_the_node_ends(
     client, folder = make_client(namespace), tmp_path / "run"
     parameters = {**ENDLESS, "output_folder": str(folder)}
     with run_node("trainer_node", parameters, namespace=namespace) as node:
-        set_up(client, small_values, stamped(0.5, 0.5), stamped(5.5, 5.5))
+        set_up(node, client, small_values)
         start_training(client)
         with no_folder(node.process, folder):
             assert node.stop() == 0
@@ -605,15 +632,12 @@ def test_what_cannot_be_started_or_replayed_is_answered_with_the_remedy(
     (broken / "episodes.csv").write_bytes(b"\0\xff,'\n" * 1000)
     (tmp_path / "file").touch()
     with run_node("trainer_node", {"output_folder": str(broken)}, namespace=namespace) as node:
-        set_up(client, small_values, stamped(0.5, 0.5), stamped(5.5, 5.5))
-        with pytest.raises(AssertionError, match="remove it to train anew"):
-            start_training(client)
+        set_up(node, client, small_values)
+        assert "remove it to train anew" in refusal(client)
         assert "no episode" in client.call(Trigger, "trainer/replay").message
         for folder in (tmp_path / "file", tmp_path / ("x" * 300)):
             client.set_parameters("trainer", output_folder=str(folder))
-            answer = client.call(Trigger, "trainer/start")
-            assert not answer.success
-            assert "set output_folder to a folder that can be written" in answer.message
+            assert "set output_folder to a folder that can be written" in refusal(client)
             assert "call ~/start first" in client.call(Trigger, "trainer/replay").message
         # Less memory than the replay buffer needs.
         limits = resource.prlimit(node.process.pid, resource.RLIMIT_AS)
@@ -621,11 +645,9 @@ def test_what_cannot_be_started_or_replayed_is_answered_with_the_remedy(
         client.set_parameters("trainer", output_folder=str(tmp_path / "run"))
         client.set_parameters("trainer", replay_capacity=10**7)
         resource.prlimit(node.process.pid, resource.RLIMIT_AS, (used + 10**8, limits[1]))
-        answer = client.call(Trigger, "trainer/start")
-        assert not answer.success
-        assert "smaller filters, batch_size, environments or replay_capacity" in answer.message
+        assert "smaller filters, batch_size, environments or replay_capacity" in refusal(client)
         client.set_parameters("trainer", replay_capacity=1000)
-        assert client.call(Trigger, "trainer/start").success
+        start_training(client)
 
 
 def test_the_module_of_the_node_imports_no_torch() -> None:
@@ -648,9 +670,7 @@ def test_without_its_libraries_a_start_is_refused_and_the_node_lives(
     client = make_client(namespace)
     parameters = {"map_file": "dilemma", "output_folder": str(tmp_path / "run")}
     with run_node("trainer_node", parameters, namespace=namespace) as node:
-        answer = client.call(Trigger, "trainer/start")
-        assert not answer.success
-        assert f"needs another library ({missing})" in answer.message
+        assert f"needs another library ({missing})" in refusal(client)
         assert "call ~/start first" in client.call(Trigger, "trainer/replay").message
     assert "Traceback" not in node.log
 
@@ -663,7 +683,8 @@ def test_nothing_that_comes_in_ends_the_node(
     parameters = {**ENDLESS, "output_folder": str(tmp_path / "run")}
     with run_node("trainer_node", parameters, namespace=namespace) as node:
         names = client.call(ListParameters, "trainer/list_parameters").result.names
-        set_up(client, small_values, stamped(0.5, 0.5), stamped(5.5, 5.5))
+        assert "no map" in refusal(client)
+        set_up(node, client, small_values)
         start_training(client)
 
         @given(maps(), POSES, HEADERS, some_parameters(names))

@@ -110,6 +110,7 @@ def test_a_recording_holds_what_the_nodes_published(
         for reward in (0.25, -0.5):
             client.publish("b/average_reward", Float32(data=reward))
         wait_until(lambda: {MAP, VALUE, PLAN, EPISODE, REWARD} <= set(read(file)))
+        wait_until(lambda: len(read(file)[REWARD]["scalars"]) == 2)
         client.publish("other_plan", Path(header=HEADER), LATCHED)
         wait_until(lambda: strips(read(file), PLAN)[-1:] == [[]])
         # The field of a map of another size goes with its map.

@@ -28,7 +28,7 @@ from ddqn_planner.model import (
     load_model,
     save_model,
 )
-from ddqn_planner.model.networks import MAX_LEARNED_MULTIPLIER
+from ddqn_planner.model.move_costs import MAX_MULTIPLIER
 
 METADATA = ModelMetadata(
     network="paper",
@@ -296,7 +296,7 @@ def test_whatever_finite_weights_say_each_q_is_a_length_or_no_way(
     grid, goal = grid_and_goal
     loaded, _ = load_model(path)
     q = loaded.q_values(grid, goal, rule)
-    longest = 2 * MAX_LEARNED_MULTIPLIER * grid.occupancy.size
+    longest = 2 * MAX_MULTIPLIER * grid.occupancy.size
     assert (np.isneginf(q) | ((q <= -1) & (q >= -longest))).all()
 
 

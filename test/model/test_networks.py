@@ -9,12 +9,12 @@ from networks import random_network
 from strategies import grids_with_costs, grids_with_free_cell
 
 from ddqn_planner.grid import Cell, GridMap, MoveRule, legal_moves
-from ddqn_planner.model import NETWORKS, load_model, networks
-from ddqn_planner.model.networks import MAX_LEARNED_MULTIPLIER, AnyMapQNetwork, PropagationQNetwork
+from ddqn_planner.model import NETWORKS, load_model, networks, wavefront
+from ddqn_planner.model.move_costs import MAX_MULTIPLIER
+from ddqn_planner.model.networks import AnyMapQNetwork, PropagationQNetwork
 from ddqn_planner.model.observation import observation_background, observe, patches
 from ddqn_planner.model.wavefront import propagate_values
-from ddqn_planner.training.encoders import ENCODERS
-from ddqn_planner.training.networks import AnyMapModule, PaperModule, PropagationModule
+from ddqn_planner.training.networks import MODULES, AnyMapModule, PaperModule, PropagationModule
 
 SIZES = {
     "paper": {"height": 5, "width": 8, "filters": 3, "hidden_units": 6},
@@ -28,7 +28,7 @@ SIZES = {
 
 @pytest.mark.parametrize("name", NETWORKS)
 def test_a_module_has_the_tensors_of_its_network(name: str) -> None:
-    module = ENCODERS[name].module_class(**SIZES[name])
+    module = MODULES[name](**SIZES[name])
     assert {key: tuple(t.shape) for key, t in module.state_dict().items()} == NETWORKS[name].shapes(
         SIZES[name]
     )
@@ -55,7 +55,8 @@ def test_the_papers_network_answers_in_each_cell_as_its_module(
     cells = np.arange(grid.occupancy.size)
     observations = torch.from_numpy(observe(background, cells, grid.occupancy.shape))
     with torch.inference_mode():
-        expected = PaperModule.from_numpy(network)(observations).T.reshape(q.shape)
+        states = PaperModule.windows(observations)
+        expected = PaperModule.from_numpy(network)(states).T.reshape(q.shape)
     np.testing.assert_allclose(q, expected.numpy(), rtol=1e-5, atol=1e-5)
 
 
@@ -90,7 +91,8 @@ def test_the_shipped_models_answer_as_their_modules(paper) -> None:  # type: ign
     background = observation_background(paper.grid.occupancy, paper.goal)
     observations = observe(background, np.arange(400), (20, 20))
     with torch.inference_mode():
-        expected = PaperModule.from_numpy(network)(torch.from_numpy(observations))
+        states = PaperModule.windows(torch.from_numpy(observations))
+        expected = PaperModule.from_numpy(network)(states)
     np.testing.assert_allclose(q.reshape(8, -1).T, expected.numpy(), rtol=1e-5, atol=1e-5)
 
     any_map, _ = load_model("any_map")
@@ -121,7 +123,9 @@ def test_the_network_is_the_papers_convolution_relu_and_fully_connected_layer() 
     module = PaperModule(7, 10, filters=5)
     observations = torch.randn(6, 7, 10)
     features = module.convolution(observations.unsqueeze(1)).relu().flatten(1)
-    torch.testing.assert_close(module(observations), module.fully_connected(features))
+    torch.testing.assert_close(
+        module(module.windows(observations)), module.fully_connected(features)
+    )
 
 
 def test_a_hidden_layer_with_relu_lies_between_the_two() -> None:
@@ -130,7 +134,7 @@ def test_a_hidden_layer_with_relu_lies_between_the_two() -> None:
     observations = torch.randn(6, 7, 10)
     features = module.convolution(observations.unsqueeze(1)).relu().flatten(1)
     hidden = module.hidden(features).relu()
-    torch.testing.assert_close(module(observations), module.fully_connected(hidden))
+    torch.testing.assert_close(module(module.windows(observations)), module.fully_connected(hidden))
 
 
 # The networks for maps of any size
@@ -180,7 +184,7 @@ def test_a_move_is_possible_where_it_succeeds_more_often_than_not(name: str) -> 
 def test_a_cost_above_the_upper_bound_counts_as_the_bound() -> None:
     grid = GridMap(np.zeros((1, 2)))
     for multiplier, used in (
-        (MAX_LEARNED_MULTIPLIER - 1, MAX_LEARNED_MULTIPLIER - 1),
+        (MAX_MULTIPLIER - 1, MAX_MULTIPLIER - 1),
         (1e4, 100.0),
     ):
         network = answering("any_map", 0.9, multiplier)
@@ -195,7 +199,7 @@ def test_a_move_whose_cost_or_p_is_nan_is_not_possible(
         assert not np.isnan(cost_PA).any()  # with NaN the propagation would never end
         return propagate_values(patch_id, cost_PA, goal)
 
-    monkeypatch.setattr(networks, "propagate_values", checked)
+    monkeypatch.setattr(wavefront, "propagate_values", checked)
     network = answering("any_map", 0.9)
     network.tensors[tensor][0] = np.nan
     q = network.q_values(GridMap(np.zeros((2, 2))), (1, 0), MoveRule.ROBOT_SAFE)

@@ -363,9 +363,9 @@ def test_a_plan_tells_how_long_field_and_rollout_took() -> None:
         def __getattr__(self, name: str) -> Any:
             return getattr(ANY_MAP.network, name)
 
-        def q_values(self, *arguments: Any) -> Any:
+        def move_costs(self, *arguments: Any) -> Any:
             time.sleep(0.05)
-            return ANY_MAP.network.q_values(*arguments)
+            return ANY_MAP.network.move_costs(*arguments)
 
     planner, grid = Planner(SlowNetwork(), ANY_MAP.metadata), GridMap(np.zeros((5, 5)))  # type: ignore[arg-type]
     ANY_MAP.plan(GridMap(np.zeros((2, 2))), (0, 0), (1, 1))
@@ -480,7 +480,7 @@ def test_a_goal_moves_to_the_nearest_reachable_free_cell_within_the_tolerance(
     )
     planner = Planner(ANY_MAP.network, ANY_MAP.metadata)
     if field_is_known and grid.is_free(goal):
-        planner.q_field(grid, goal, rule)
+        _ = planner.q_field(grid, goal, rule).value  # all of it
     quick = is_answered_at_once(planner, grid, start, goal, rule, tolerance=tolerance)
     plan = planner.plan(grid, start, goal, rule, tolerance=tolerance)
     rows, columns = np.nonzero(connected_cells(grid.occupancy, start, rule))

@@ -21,8 +21,8 @@ def test_the_loss_moves_the_online_network_alone() -> None:
     online, target = nn.Linear(2, 3), nn.Linear(2, 3)
     loss = double_dqn_loss(
         online,
-        online,
         target,
+        "double_dqn",
         torch.ones(4, 2),
         torch.tensor([0, 1, 2, 0]),
         torch.zeros(4),

@@ -218,11 +218,11 @@ def test_a_move_that_succeeds_is_rewarded_for_the_goal_only_beside_it(small: Sce
 
 
 def test_an_episode_starts_in_each_free_cell_of_its_map_equally_often() -> None:
-    # The first map has two free cells; the padding of its row is never drawn.
-    free = np.array([[1, 2, -1], [3, 4, 5]]).repeat(3000, axis=0)
-    count = np.array([2, 3]).repeat(3000)
+    # The first map has two free cells, the second one three.
+    free = np.arange(1, 6)
+    first, count = np.array([[0, 2], [2, 3]]).repeat(3000, axis=1)
     start = np.zeros(6000, dtype=np.int64)
-    cells = initial_cells(start, free, count, 1.0, np.random.default_rng(0))
+    cells = initial_cells(start, free, first, count, 1.0, np.random.default_rng(0))
     drawn, times = np.unique(cells, return_counts=True)
     assert drawn.tolist() == [1, 2, 3, 4, 5]
     assert times == pytest.approx([1500, 1500, 1000, 1000, 1000], rel=0.15)

@@ -188,7 +188,7 @@ def test_the_metadata_of_a_model_say_how_it_was_trained(small: Scenario) -> None
     other = replace(small, grid=GridMap(np.zeros((4, 5))))
     trainer = Trainer([small, other], MoveRule.UNIT, replace(QUICK, gamma=0.8), seed=3)
     train(trainer, 2)
-    metadata = trainer.metadata()
+    metadata = trainer.planner().metadata
     assert (metadata.network, metadata.gamma, metadata.move_rule) == ("paper", 0.8, MoveRule.UNIT)
     assert (metadata.seed, metadata.steps) == (3, 2)
     assert metadata.map_fingerprint == small.grid.fingerprint != other.grid.fingerprint
@@ -248,7 +248,7 @@ def test_a_saved_model_plans_as_the_trainer_does(small: Scenario, tmp_path: Path
     train(trainer, 300)
     trainer.save_model(tmp_path / "model.safetensors")
     network, metadata = load_model(tmp_path / "model.safetensors")
-    assert metadata == trainer.metadata()
+    assert metadata == trainer.planner().metadata
     assert metadata.steps == 300
     expected = trainer.planner().q_field(small.grid, small.goal).q
     q = network.q_values(small.grid, small.goal, metadata.move_rule)

@@ -35,7 +35,7 @@ def about_to_update(scenarios: list[Scenario], parameters: HyperParameters) -> T
     torch.manual_seed(0)
     for weight in trainer._target.parameters():
         weight.add_(0.3 * torch.randn_like(weight))
-    trainer._encoder.update_target(trainer._target)
+    trainer.encoder.update_target(trainer._target)
     return trainer
 
 
@@ -89,7 +89,7 @@ def test_an_update_of_the_papers_network_is_that_of_the_equations(
             observation = torch.where(torch.tensor(scenario.grid.occupancy), -0.1, 0.0)
             observation[scenario.goal[::-1]] = 1.0
             observation[cell[::-1]] = 3.0
-            answer: Tensor = network(observation[None])[0]
+            answer: Tensor = network(PaperModule.windows(observation[None]))[0]
             return answer
 
         return q

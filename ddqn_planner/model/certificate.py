@@ -1,0 +1,301 @@
+"""Proves which moves a propagation network takes for possible, whatever the cells cost.
+
+The network sees a 3x3 patch. Which of its cells are occupied gives 256 patterns with a free centre;
+the free cells may have any cost or be unknown. For all of these at once, each ReLU is enclosed by
+two lines. So each logit is enclosed by two linear functions of the costs, whose extreme values are
+known exactly (CROWN, Zhang et al. 2018, "Efficient neural network robustness certification with
+general activation functions"). For the bounds of the hidden layer, both lines have one slope, so
+that one product gives both bounds (Fast-Lin, Weng et al. 2018).
+
+Dimensions: P = 256 patterns, A = 8 actions, F = filters, I = inputs, C = 18 inputs for costs and
+unknown cells (0 for a network that uses no costs).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import TYPE_CHECKING, Final, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ddqn_planner.grid import MAX_COST_MULTIPLIER, MOVES, OCCUPIED, UNKNOWN, MoveRule, legal_moves
+
+if TYPE_CHECKING:
+    from ddqn_planner.model.networks import PropagationQNetwork, QNetwork
+
+Float64: TypeAlias = NDArray[np.float64]
+
+MOVE_RULES: Final = (MoveRule.ROBOT_SAFE, MoveRule.CORNER_CUTTING)
+"""One of each class: under `MoveRule.UNIT`, the same moves are legal as under the second."""
+
+CENTRE = 4
+"""The robot's cell in a patch."""
+
+COSTS = slice(9, 27)
+"""The features for costs and unknown cells; see `AnyMapQNetwork.features`."""
+
+NO_CERTIFICATE = "nothing can be proved: the moves depend on the whole map, not on 3x3 patches"
+"""Said of a network that `certificate_of` gives none, such as the paper's."""
+
+MAX_FILTERS = 256
+"""For more, the proof would take seconds, and it is not tried."""
+
+ROUNDING = 2.0**-23
+"""Twice the relative error of a float32 operation. The errors of the bounds themselves, in float64,
+are far below the other half."""
+
+
+@dataclass(frozen=True)
+class Certificate:
+    """What is proved about a network, for all costs and unknown cells.
+
+    A decision is whether the network takes one action for possible in one pattern under one rule.
+    It is right if this equals `legal_moves`, for all costs.
+
+    Parameters
+    ----------
+    decisions : int
+        How many there are.
+    undecided : int
+        Those that are neither proved nor known to be wrong.
+    wrong : int
+        Those for which costs are known that make the network wrong.
+    margin : float
+        Least proved distance of a right decision's logit from 0; 0 if none is right.
+    multiplier_error : float
+        Bound on the relative error of the learned cost multipliers, over all legal moves.
+    """
+
+    decisions: int
+    undecided: int
+    wrong: int
+    margin: float
+    multiplier_error: float
+
+    @property
+    def proved(self) -> bool:
+        """Whether all decisions are right."""
+        return self.undecided == self.wrong == 0 and math.isfinite(self.multiplier_error)
+
+    @property
+    def path_error(self) -> float:
+        """Bound on the cost of a planned path over the optimum, minus 1; infinite if not proved.
+
+        If the learned cost of every move lies within a factor 1 - e to 1 + e of the true one, so
+        does that of every path. Then the path of the least learned cost costs at most
+        (1 + e) / (1 - e) of the optimum.
+        """
+        if not self.proved or self.multiplier_error >= 1:
+            return math.inf
+        return 2 * self.multiplier_error / (1 - self.multiplier_error)
+
+    def __str__(self) -> str:
+        if not self.proved:
+            return (
+                f"not proved: {self.undecided:,} of {self.decisions:,} decisions are open, "
+                f"{self.wrong:,} are wrong"
+            )
+        text = f"proved: all {self.decisions:,} decisions, margin {self.margin:.1f}"
+        if math.isfinite(self.path_error):
+            text += (
+                f"; costs within {_percent(self.multiplier_error)}, "
+                f"so paths within {_percent(self.path_error)} of the optimum"
+            )
+        return text
+
+
+def _percent(error: float) -> str:
+    """Return a bound in percent, rounded up."""
+    return f"{math.ceil(error * 1e4) / 100:g} %"
+
+
+def certify(
+    network: PropagationQNetwork, move_rules: Sequence[MoveRule] = MOVE_RULES
+) -> Certificate:
+    """Prove what a network takes for possible, and bound the error of its costs.
+
+    Parameters
+    ----------
+    network : PropagationQNetwork
+        One that does not observe the move rule can be right under one rule only.
+    move_rules : sequence of MoveRule
+        The rules under which it must be right; by default one of each class.
+    """
+    patch_P9 = np.where(np.arange(2**9)[:, None] >> np.arange(9) & 1, OCCUPIED, 0).astype(np.int8)
+    patch_P9 = patch_P9[patch_P9[:, CENTRE] != OCCUPIED]
+    decisions = len(move_rules) * len(patch_P9) * len(MOVES)
+    if network.sizes["filters"] > MAX_FILTERS:
+        return Certificate(decisions, decisions, 0, 0.0, math.inf)
+    undecided, wrong, least, error = 0, 0, math.inf, 0.0
+    with np.errstate(over="ignore", invalid="ignore"):  # a broken model may overflow
+        for rule in move_rules:
+            feature_PI, legal_PA = network.features(patch_P9, rule), _legal_moves(patch_P9, rule)
+            margin_PA, weight_CPA = _margins(network, feature_PI, legal_PA)
+            right_PA = margin_PA > 0  # False for NaN
+            least = min(least, float(margin_PA[right_PA].min(initial=math.inf)))
+            pattern, action = np.nonzero(~right_PA)
+            example_B9 = _worst_costs(weight_CPA[:, pattern, action].T, patch_P9[pattern])
+            p_BA = network.success(network.features(example_B9, rule))
+            possible = p_BA[np.arange(len(action)), action] > 0.5
+            found = int(np.count_nonzero(possible != legal_PA[pattern, action]))
+            wrong += found
+            undecided += len(action) - found
+            error = max(error, _multiplier_error(network, feature_PI, legal_PA))
+    return Certificate(decisions, undecided, wrong, least if least < math.inf else 0.0, error)
+
+
+@lru_cache(maxsize=1)
+def certificate_of(network: QNetwork, move_rule: MoveRule) -> Certificate | None:
+    """Return the certificate of a loaded network; None if its moves depend on the whole map.
+
+    The last one is kept. A network that does not observe the move rule is certified for the one of
+    its training.
+    """
+    from ddqn_planner.model.networks import AnyMapQNetwork, PropagationQNetwork  # import this
+
+    if isinstance(network, AnyMapQNetwork):
+        return network.certificate
+    return certify(network, [move_rule]) if isinstance(network, PropagationQNetwork) else None
+
+
+def _legal_moves(patch_P9: NDArray[np.int8], move_rule: MoveRule) -> NDArray[np.bool_]:
+    """Return which actions are legal in the centre of each patch: (P, 8)."""
+    # The patches lie one above the other: a move out of a centre stays in its patch.
+    legal = legal_moves((patch_P9 == OCCUPIED).reshape(-1, 3), move_rule)
+    legal_PA: NDArray[np.bool_] = legal[:, 1::3, 1].T
+    return legal_PA
+
+
+def _margins(
+    network: PropagationQNetwork,
+    feature_PI: NDArray[np.float32],
+    legal_PA: NDArray[np.bool_],
+) -> tuple[Float64, Float64]:
+    """Bound by how much each logit is above 0 for a legal move, or below 0 for another.
+
+    Returns
+    -------
+    (P, A)
+        The bound, also for float32.
+    (C, P, A)
+        What the bounded function gains with each input for costs and unknown cells.
+    """
+    tensors = {name: tensor.astype(np.float64) for name, tensor in network.tensors.items()}
+    # Copies, as arrays in another order than the rest are slow.
+    weight_IF, hidden_FF = tensors["convolution.weight"].T.copy(), tensors["hidden.weight"].T.copy()
+    base_PF = feature_PI @ weight_IF + tensors["convolution.bias"]
+    low_PF, high_PF = _extremes(lambda inputs: weight_IF[inputs, None], feature_PI)
+    first = _Lines(base_PF + low_PF, base_PF + high_PF)
+
+    # With the upper line's slope for both lines, only their distance differs.
+    base_PF = (first.slope * base_PF) @ hidden_FF + tensors["hidden.bias"]
+    low_PF, high_PF = _extremes(
+        lambda inputs: (first.slope * weight_IF[inputs, None]) @ hidden_FF, feature_PI
+    )
+    low_PF += first.distance @ np.minimum(hidden_FF, 0)
+    high_PF += first.distance @ np.maximum(hidden_FF, 0)
+    second = _Lines(base_PF + low_PF, base_PF + high_PF)
+
+    # Back from the logits: what a positive weight multiplies is at least its lower line.
+    sign_PA = np.where(legal_PA, 1.0, -1.0)
+    bound_PA = sign_PA * tensors["moves.bias"]
+    weight_PIA = np.empty((*feature_PI.shape, len(MOVES)))
+    for action in range(len(MOVES)):
+        weight = sign_PA[:, action, None] * tensors["moves.weight"][action]
+        for layer, lines in (("hidden", second), ("convolution", first)):
+            bound_PA[:, action] += (np.minimum(weight, 0) * lines.distance).sum(axis=1)
+            weight *= np.where(weight > 0, lines.lower_slope, lines.slope)
+            bound_PA[:, action] += weight @ tensors[f"{layer}.bias"]
+            weight = weight @ tensors[f"{layer}.weight"]
+        bound_PA[:, action] += (weight * feature_PI).sum(axis=1)
+        weight_PIA[:, :, action] = weight
+    weight_IPA = weight_PIA.transpose(1, 0, 2)
+    low_PA, _ = _extremes(lambda inputs: weight_IPA[inputs], feature_PI)
+    ones_I = np.ones_like(feature_PI[0])
+    layers = [("convolution", ones_I), ("hidden", first.greatest), ("moves", second.greatest)]
+    return bound_PA + low_PA - _rounding_error(network, layers), weight_IPA[9:27]
+
+
+class _Lines:
+    """Two lines for each ReLU, given the bounds of its input: it lies between them.
+
+    The upper line is slope * input + distance. The lower line is either slope * input, or
+    lower_slope * input, whose slope is 0 or 1, whichever is nearer to the ReLU.
+    """
+
+    def __init__(self, low_PF: Float64, high_PF: Float64) -> None:
+        above, below = np.maximum(high_PF, 0), np.minimum(low_PF, 0)
+        self.slope = above / np.maximum(above - below, np.finfo(np.float64).tiny)
+        self.distance = -below * self.slope
+        self.lower_slope = (high_PF > -low_PF).astype(np.float64)
+        self.greatest = above.max(axis=0).astype(np.float32)
+
+
+def _extremes(
+    weights: Callable[[slice], Float64], feature_PI: NDArray[np.float32]
+) -> tuple[Float64, Float64]:
+    """Return the least and the greatest weighted sum of inputs for costs and unknown cells: (P, U).
+
+    A free cell has a cost of 0 to 1, or it is unknown. `weights` returns the (2, P, U) weights of
+    the two inputs of one cell: small arrays are several times as fast as large ones.
+    """
+    low_PU, high_PU = np.float64(0), np.float64(0)
+    for cell in range(9):
+        choice_2PU = weights(slice(9 + cell, 27, 9)) * (1 - feature_PI[:, cell, None])
+        low_PU = low_PU + choice_2PU.min(axis=0, initial=0)
+        high_PU = high_PU + choice_2PU.max(axis=0, initial=0)
+    return low_PU, high_PU
+
+
+def _worst_costs(weight_BC: Float64, patch_B9: NDArray[np.int8]) -> NDArray[np.int8]:
+    """Give the free cells of patches the costs that make a weighted sum least."""
+    choice_BK9 = weight_BC.reshape(len(weight_BC), weight_BC.shape[1] // 9, 9)
+    choice_BK9 = np.concatenate([np.zeros((len(weight_BC), 1, 9)), choice_BK9], axis=1)
+    value_B9 = np.array([0, OCCUPIED - 1, UNKNOWN], dtype=np.int8)[choice_BK9.argmin(axis=1)]
+    return np.where(patch_B9 == OCCUPIED, patch_B9, value_B9)
+
+
+def _multiplier_error(
+    network: PropagationQNetwork,
+    feature_PI: NDArray[np.float32],
+    legal_PA: NDArray[np.bool_],
+) -> float:
+    """Bound the relative error of the cost multipliers of legal moves.
+
+    As true multipliers are at least 1, the absolute error is a bound. That the learned ones are at
+    least 1 too makes the error only smaller.
+    """
+    if not network.uses_costs:  # 1 instead of at most the greatest one
+        return 1 - 1 / MAX_COST_MULTIPLIER
+    error_IA = network.tensors["prices.weight"].T.astype(np.float64, order="C")
+    for action, (dx, dy) in enumerate(MOVES.tolist()):
+        for cell in (CENTRE, CENTRE + 3 * dy + dx):
+            error_IA[[9 + cell, 18 + cell], action] -= (MAX_COST_MULTIPLIER - 1) / 2
+    base_PA = feature_PI @ error_IA + network.tensors["prices.bias"]
+    low_PA, high_PA = _extremes(lambda inputs: error_IA[inputs, None], feature_PI)
+    error_PA = np.maximum(base_PA + high_PA, -base_PA - low_PA)
+    error_PA += _rounding_error(network, [("prices", np.ones_like(feature_PI[0]))])
+    error = float(error_PA[legal_PA].max())
+    return math.inf if math.isnan(error) else error
+
+
+def _rounding_error(
+    network: PropagationQNetwork, layers: Sequence[tuple[str, NDArray[np.float32]]]
+) -> NDArray[np.float32]:
+    """Bound the rounding errors of layers in float32, given their greatest inputs.
+
+    The arrays are float32 too: the bound is infinite where the layers may overflow.
+    """
+    error_U = np.zeros_like(layers[0][1])
+    for layer, greatest_I in layers:
+        weight_UI = np.abs(network.tensors[f"{layer}.weight"])
+        inherited_U = weight_UI @ error_U
+        sum_U = weight_UI @ greatest_I + inherited_U + np.abs(network.tensors[f"{layer}.bias"])
+        # The greatest multiplier stands for what is done with the last layer's output.
+        sum_U += MAX_COST_MULTIPLIER
+        error_U = inherited_U + (weight_UI.shape[1] + 2) * ROUNDING * sum_U
+    return error_U

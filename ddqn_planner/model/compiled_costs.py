@@ -1,0 +1,62 @@
+"""The costs of moves in compiled code, see `MoveCosts`. numba is imported with it."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ddqn_planner.compiled import compiled_now
+from ddqn_planner.grid import MOVES
+from ddqn_planner.model.move_costs import MAX_MULTIPLIER, OCCUPIED_PATCH
+
+MOVE_X, MOVE_Y = MOVES.T.copy()
+
+
+@compiled_now
+def patch_numbers(occupancy: NDArray[np.bool_]) -> NDArray[np.uint16]:
+    """Return the patch of each cell, with a border: (C,) uint16.
+
+    Bit 3 y + x is set where the patch's cell (x, y) is occupied; see `OCCUPIED_PATCH`.
+    """
+    height, width = occupancy.shape
+    padded = np.empty((height + 2, width + 2), np.uint8)
+    padded[0], padded[height + 1] = 1, 1
+    for y in range(height):
+        row = padded[y + 1]
+        row[0], row[width + 1] = 1, 1
+        for x in range(width):
+            row[x + 1] = occupancy[y, x]
+    numbers = np.empty((height + 2, width + 2), np.uint16)
+    numbers[0], numbers[height + 1] = OCCUPIED_PATCH, OCCUPIED_PATCH
+    for y in range(1, height + 1):
+        below, here, above, out = padded[y - 1], padded[y], padded[y + 1], numbers[y]
+        out[0], out[width + 1] = OCCUPIED_PATCH, OCCUPIED_PATCH
+        for x in range(1, width + 1):
+            bits = below[x - 1] + 2 * below[x] + 4 * below[x + 1] + 8 * here[x - 1]
+            bits += 32 * here[x + 1] + 64 * above[x - 1] + 128 * above[x] + 256 * above[x + 1]
+            out[x] = OCCUPIED_PATCH if here[x] else bits
+    return numbers.ravel()
+
+
+@compiled_now
+def cost_of(
+    patch: Any, table: Any, value: Any, terms: Any, width: int, cell: int, action: int
+) -> Any:
+    """Return the cost of a move, float32; infinite if it is not possible. See `MoveCosts`."""
+    cost = table[patch[cell], action]
+    if terms is None:
+        return cost
+    if cost == np.inf:
+        return cost
+    total = np.float32(0)
+    for row in range(3):
+        middle = cell + (row - 1) * width
+        total += (
+            terms[3 * row, value[middle - 1], action]
+            + terms[3 * row + 1, value[middle], action]
+            + terms[3 * row + 2, value[middle + 1], action]
+        )
+    multiplier = np.float32(1) + max(total, np.float32(0))
+    return cost * min(multiplier, np.float32(MAX_MULTIPLIER))

@@ -1,0 +1,134 @@
+"""Repair of a field when its map changes: what a robot sees changes some cells of millions."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ddqn_planner.grid import Cell, GridMap
+from ddqn_planner.model.move_costs import MoveCosts
+from ddqn_planner.planning.distance_field import DistanceField, FieldArrays
+
+REPAIRED_SHARE = 0.02
+"""Share of the known cells that a repair may take back: with more, a new field for the one start is
+often cheaper, and the repair that gives up costs more than that. See docs/benchmarks.md."""
+
+MIN_REPAIRED = 300
+"""Cells that a repair may take back in any case."""
+
+CHANGED_SHARE = 0.02
+"""Share of the map's cells that may have changed: with more, a new field is cheaper."""
+
+SAME_PLACE = 0.01
+"""By how many cells a map may be off the grid of another one, and still count as shifted by whole
+cells: ROS messages give the resolution in float32."""
+
+
+def shift_between(old: GridMap, new: GridMap) -> Cell | None:
+    """Return by how many cells a map's cells have moved in a newer one; None if not by whole ones.
+
+    The cell (x, y) of the old map is (x + dx, y + dy) in the new one. As a map grows, mapping
+    shifts it.
+    """
+    same = math.isclose(old.resolution, new.resolution, rel_tol=1e-6)
+    if not same or old.origin[2] != new.origin[2] or (old.cost is None) != (new.cost is None):
+        return None
+    corner = old.cell_to_world((0, 0))
+    shift = new.world_to_cell(*corner)
+    apart = math.dist(corner, new.cell_to_world(shift))
+    return shift if apart < SAME_PLACE * new.resolution else None
+
+
+def repaired(
+    field: DistanceField, goal: Cell, grid: GridMap, costs: MoveCosts, shift: Cell
+) -> DistanceField | None:
+    """Return the field of a newer map, given that of an older one; None if too much changed.
+
+    Its values are those of a new field. The older field hands over its memory, and begins anew.
+
+    Parameters
+    ----------
+    field : DistanceField
+        Of a map with as many costs as the new one: none, or one per cell.
+    goal : (x, y)
+        In the new map, the same place as the field's.
+    grid, costs
+        The new map.
+    shift : (dx, dy)
+        See `shift_between`.
+    """
+    from ddqn_planner.planning.invalidation import take_back
+
+    changed = _changed_cells(field.grid, grid, shift)
+    if changed is None:
+        return None
+    arrays = field.hand_over()
+    if shift != (0, 0) or field.grid.occupancy.shape != grid.occupancy.shape:
+        arrays = _moved(arrays, field.grid, grid, shift)
+    distance, state, opened = arrays
+    new = DistanceField(goal, grid, costs, field.move_rule)
+    limit = max(MIN_REPAIRED, int(REPAIRED_SHARE * np.count_nonzero(state)))
+    reopened, kept = take_back(distance, state, costs, changed, limit)
+    if not kept:
+        return None
+    new.arrays = distance, state, np.concatenate([opened, reopened])
+    new.closed_is_final = False
+    return new
+
+
+def _overlap(old: GridMap, new: GridMap, shift: Cell) -> tuple[int, int, int, int]:
+    """Return the box of the new map that both maps show: left, bottom, right, top, half-open."""
+    left, bottom = max(shift[0], 0), max(shift[1], 0)
+    right, top = min(shift[0] + old.width, new.width), min(shift[1] + old.height, new.height)
+    return left, bottom, max(right, left), max(top, bottom)
+
+
+def _changed_cells(old: GridMap, new: GridMap, shift: Cell) -> NDArray[np.int32] | None:
+    """Return the cells whose moves may differ, as numbers of the padded new map; None for many."""
+    left, bottom, right, top = _overlap(old, new, shift)
+    inside = slice(bottom, top), slice(left, right)
+    before = (
+        slice(bottom - shift[1], top - shift[1]),
+        slice(left - shift[0], right - shift[0]),
+    )
+    differs = old.occupancy[before] != new.occupancy[inside]
+    if old.cost is not None and new.cost is not None:
+        differs |= old.cost[before] != new.cost[inside]
+    if np.count_nonzero(differs) > CHANGED_SHARE * differs.size:
+        return None
+    width = new.width + 2
+    number = np.flatnonzero(differs)
+    y, x = np.divmod(number, max(right - left, 1))
+    cells = [(y + bottom + 1) * width + x + left + 1]
+    if shift != (0, 0) or old.occupancy.shape != new.occupancy.shape:
+        # What lay beyond the border of one map is inside the other.
+        for row in (bottom, top + 1):
+            cells.append(row * width + np.arange(left, right + 2))
+        for column in (left, right + 1):
+            cells.append(np.arange(bottom, top + 2) * width + column)
+    around = (np.arange(-1, 2)[:, None] * width + np.arange(-1, 2)).ravel()
+    numbers = np.unique((np.concatenate(cells)[:, None] + around).ravel())
+    size = width * (new.height + 2)
+    return numbers[(numbers > width) & (numbers < size - width - 1)].astype(np.int32)
+
+
+def _moved(arrays: FieldArrays, old: GridMap, new: GridMap, shift: Cell) -> FieldArrays:
+    """Return the arrays of a field with each cell where it is in the new map."""
+    left, bottom, right, top = _overlap(old, new, shift)
+
+    def moved(array: NDArray[Any]) -> NDArray[Any]:
+        target = np.zeros((new.height + 2, new.width + 2), dtype=array.dtype)
+        source = array.reshape(old.height + 2, old.width + 2)
+        target[bottom + 1 : top + 1, left + 1 : right + 1] = source[
+            bottom - shift[1] + 1 : top - shift[1] + 1, left - shift[0] + 1 : right - shift[0] + 1
+        ]
+        return target.ravel()
+
+    y, x = np.divmod(arrays[2], old.width + 2)
+    y, x = y + shift[1], x + shift[0]
+    inside = (left < x) & (x <= right) & (bottom < y) & (y <= top)
+    opened = (y * (new.width + 2) + x)[inside].astype(np.int32)
+    return moved(arrays[0]), moved(arrays[1]), opened

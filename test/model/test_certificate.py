@@ -1,0 +1,322 @@
+from __future__ import annotations
+
+import math
+from itertools import product
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as numpy_st
+from networks import random_network
+from strategies import grids_with_costs
+
+from ddqn_planner.cli import main
+from ddqn_planner.grid import (
+    MAX_COST_MULTIPLIER,
+    MOVES,
+    OCCUPIED,
+    UNKNOWN,
+    Cell,
+    GridMap,
+    MoveRule,
+    path_cost,
+    shortest_distances,
+)
+from ddqn_planner.model import NETWORKS, ModelMetadata, PropagationQNetwork, load_model
+from ddqn_planner.model.certificate import (
+    MAX_FILTERS,
+    MOVE_RULES,
+    Certificate,
+    _legal_moves,
+    _margins,
+    certificate_of,
+    certify,
+)
+from ddqn_planner.planning import Planner
+
+GUARANTEES = Path(__file__).resolve().parents[2] / "docs" / "guarantees.md"
+
+PATCHES = np.array(list(product([0, OCCUPIED], repeat=9)), dtype=np.int8)
+PATCHES = PATCHES[PATCHES[:, 4] == 0]
+CELLS = [4 + 3 * dy + dx for dx, dy in MOVES.tolist()]
+"""The place in a patch that each action leads to."""
+
+
+@st.composite
+def patches(draw: st.DrawFn) -> np.ndarray:
+    """Patches with a free centre: (20, 9) int8."""
+    values = st.sampled_from([0, 0, 1, 40, 99, UNKNOWN, OCCUPIED, OCCUPIED])
+    patch_B9: np.ndarray = draw(numpy_st.arrays(np.int8, (20, 9), elements=values))
+    patch_B9[patch_B9[:, 4] == OCCUPIED, 4] = 0
+    return patch_B9
+
+
+def any_map() -> PropagationQNetwork:
+    """The shipped network, with tensors that a test may change."""
+    network, _ = load_model("any_map")
+    assert isinstance(network, PropagationQNetwork)
+    return network
+
+
+def right_network(name: str, move_rule: MoveRule | None = None) -> PropagationQNetwork:
+    """A network that is right under the rule that it observes, or under the given one.
+
+    Each logit is 5 less 10 for each occupied cell that the move needs free. The costs are exact.
+    """
+    network = random_network(name, scale=0, filters=16)
+    assert isinstance(network, PropagationQNetwork)
+    tensors = network.tensors
+    for action, target in enumerate(CELLS):
+        tensors["convolution.weight"][action, target] = 1
+        if action % 2 and move_rule is not MoveRule.CORNER_CUTTING:
+            sides = [CELLS[action - 1], CELLS[(action + 1) % 8]]
+            tensors["convolution.weight"][8 + action, sides] = 1
+        if name == "any_map":
+            tensors["convolution.weight"][8 + action, 27] = -2
+            for cell in (4, target):
+                tensors["prices.weight"][action, [9 + cell, 18 + cell]] = 2
+        tensors["moves.weight"][action, [action, 8 + action]] = -10
+    tensors["hidden.weight"][:] = np.eye(16)
+    tensors["moves.bias"][:] = 5
+    return network
+
+
+def logits(network: PropagationQNetwork, feature_BI: np.ndarray) -> np.ndarray:
+    """Return the logits of p(s, a) in float32."""
+    hidden_BF = np.maximum(network._layer("convolution", feature_BI), 0)
+    hidden_BF = np.maximum(network._layer("hidden", hidden_BF), 0)
+    return network._layer("moves", hidden_BF)
+
+
+def true_multipliers(patch_B9: np.ndarray) -> np.ndarray:
+    """Return the mean cost multiplier of the two cells of each move: (B, 8)."""
+    share = np.where(patch_B9 == UNKNOWN, 1, patch_B9 / 100)
+    multiplier = 1 + (MAX_COST_MULTIPLIER - 1) * share
+    return (multiplier[:, [4]] + multiplier[:, CELLS]) / 2
+
+
+# What is proved holds
+
+
+def test_the_shipped_model_is_proved() -> None:
+    certificate = certify(any_map())
+    assert certificate.proved
+    assert (certificate.decisions, certificate.undecided, certificate.wrong) == (4096, 0, 0)
+    assert str(certificate) == (
+        "proved: all 4,096 decisions, margin 3.3; "
+        "costs within 1.6 %, so paths within 3.25 % of the optimum"
+    )
+
+
+@given(patches(), st.sampled_from(MoveRule))
+def test_decisions_and_costs_of_any_patch_are_as_certified(
+    patch_B9: np.ndarray, rule: MoveRule
+) -> None:
+    network = any_map()
+    certificate = certify(network)
+    feature_BI, legal_BA = network.features(patch_B9, rule), _legal_moves(patch_B9, rule)
+    np.testing.assert_array_equal(network.success(feature_BI) > 0.5, legal_BA)
+    distance_BA = np.where(legal_BA, 1, -1) * logits(network, feature_BI)
+    assert distance_BA.min() >= certificate.margin
+    true_BA = true_multipliers(patch_B9)
+    error_BA = np.abs(network.multiplier(feature_BI) - true_BA) / true_BA
+    assert error_BA[legal_BA].max(initial=0) <= certificate.multiplier_error
+
+
+@given(
+    patches(),
+    st.sampled_from(MOVE_RULES),
+    st.sampled_from(["propagation", "any_map"]),
+    st.integers(0, 99),
+    st.sampled_from([0.1, 0.5, 3.0]),
+)
+def test_no_margin_of_any_network_is_above_a_sampled_one(
+    patch_B9: np.ndarray, rule: MoveRule, name: str, seed: int, scale: float
+) -> None:
+    network = random_network(name, seed, scale, filters=6)
+    assert isinstance(network, PropagationQNetwork)
+    plain_B9 = np.where(patch_B9 == OCCUPIED, OCCUPIED, 0).astype(np.int8)
+    legal_BA = _legal_moves(patch_B9, rule)
+    margin_BA, _ = _margins(network, network.features(plain_B9, rule), legal_BA)
+    sampled_BA = np.where(legal_BA, 1, -1) * logits(network, network.features(patch_B9, rule))
+    assert (margin_BA <= sampled_BA).all()
+
+
+@given(patches(), st.integers(0, 99))
+def test_decisions_that_are_wrong_for_some_costs_are_open_or_wrong(
+    patch_B9: np.ndarray, seed: int
+) -> None:
+    network = any_map()
+    random = np.random.default_rng(seed)
+    for name in ("convolution", "hidden"):
+        network.tensors[f"{name}.weight"] *= random.normal(
+            1, 0.5, network.tensors[f"{name}.weight"].shape
+        )
+    wrong = set()
+    for rule in MOVE_RULES:
+        possible_BA = network.success(network.features(patch_B9, rule)) > 0.5
+        for row, action in np.argwhere(possible_BA != _legal_moves(patch_B9, rule)).tolist():
+            wrong.add((rule, tuple(patch_B9[row] == OCCUPIED), action))
+    certificate = certify(network)
+    assert len(wrong) <= certificate.wrong + certificate.undecided
+    assert not (wrong and certificate.proved)
+
+
+@given(grids_with_costs(), st.sampled_from(MOVE_RULES), st.sampled_from([0.0, 0.02]))
+def test_no_path_costs_more_than_certified(
+    grid_and_goal: tuple[GridMap, Cell], rule: MoveRule, noise: float
+) -> None:
+    grid, goal = grid_and_goal
+    network = any_map()
+    network.tensors["prices.weight"] += np.random.default_rng(0).normal(0, noise, (8, 28))
+    certificate = certify(network)
+    assert (noise > 0.0) == (certificate.path_error > 0.05)
+    metadata = ModelMetadata("any_map", {"filters": 64}, rule, 1.0, "", 0, 0, "")
+    field = Planner(network, metadata).q_field(grid, goal, rule)
+    optimum = shortest_distances(grid, goal, rule)
+    for start in grid.free_cells():
+        plan = field.rollout(start)
+        assert bool(plan.cells) == math.isfinite(optimum[start[1], start[0]])
+        if plan.cells:
+            cost = path_cost(plan.cells, grid.cost_multiplier, rule)
+            bound = (1 + certificate.path_error) * optimum[start[1], start[0]]
+            assert cost <= bound * (1 + 1e-6)
+
+
+# What is not right is not proved
+
+
+def test_a_wrong_decision_is_found() -> None:
+    network = any_map()
+    network.tensors["moves.bias"][0] = -1000
+    certificate = certify(network)
+    assert not certificate.proved
+    assert (certificate.undecided, certificate.wrong) == (0, 2 * 128)
+    assert str(certificate) == "not proved: 0 of 4,096 decisions are open, 256 are wrong"
+
+
+def test_a_decision_that_only_costs_make_wrong_is_found() -> None:
+    network = right_network("any_map")
+    assert certify(network).proved
+    network.tensors["convolution.weight"][0, 9 + CELLS[3]] = 0.6
+    certificate = certify(network)
+    # Action 0 seems impossible where the cost beside its target is high.
+    assert certificate.wrong == 2 * 64
+    assert certificate.undecided == 0
+
+
+def test_bounds_that_are_too_loose_leave_decisions_open() -> None:
+    network = right_network("any_map")
+    tensors = network.tensors
+    for unit in (8, 10):  # two equal units, whose difference is 0 but has loose bounds
+        tensors["convolution.weight"][unit, 9] = 2
+        tensors["convolution.bias"][unit] = -1
+    tensors["hidden.weight"][8, [8, 10]] = [100, -100]
+    tensors["hidden.weight"][10, 10] = 0
+    certificate = certify(network)
+    assert certificate.wrong == 0
+    assert certificate.undecided > 0
+    assert not certificate.proved
+    assert certificate.path_error == math.inf
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, 3e38])
+@pytest.mark.parametrize(
+    "name", ["convolution.weight", "hidden.bias", "moves.weight", "prices.bias"]
+)
+def test_a_broken_network_is_not_proved(name: str, value: float) -> None:
+    network = any_map()
+    network.tensors[name][:] = value
+    certificate = certify(network)
+    assert not certificate.proved or certificate.path_error == math.inf
+    assert not math.isnan(certificate.margin + certificate.multiplier_error)
+
+
+def test_the_proof_of_a_large_network_is_not_tried() -> None:
+    network = random_network("any_map", filters=MAX_FILTERS + 1)
+    assert isinstance(network, PropagationQNetwork)
+    assert certify(network) == Certificate(4096, 4096, 0, 0.0, math.inf)
+
+
+# How good the bounds are
+
+
+@pytest.mark.parametrize("rule", MOVE_RULES)
+def test_a_network_without_costs_is_certified_exactly_under_its_rule(rule: MoveRule) -> None:
+    network = right_network("propagation", rule)
+    certificate = certify(network, [rule])
+    assert certificate.proved
+    assert certificate.decisions == 2048
+    assert certificate.margin == pytest.approx(5, abs=1e-3)
+    differing = _legal_moves(PATCHES, MOVE_RULES[0]) != _legal_moves(PATCHES, MOVE_RULES[1])
+    both = certify(network)
+    assert (both.decisions, both.undecided, both.wrong) == (4096, 0, differing.sum())
+
+
+def test_the_margin_of_a_network_that_ignores_costs_is_exact() -> None:
+    certificate = certify(right_network("any_map"))
+    assert certificate.margin == pytest.approx(5, abs=1e-3)
+    assert 0 < certificate.multiplier_error < 1e-4
+
+
+def test_the_error_of_the_costs_is_the_greatest_one() -> None:
+    network = right_network("any_map")
+    network.tensors["prices.bias"][3] = 0.1
+    assert certify(network).multiplier_error == pytest.approx(0.1, abs=1e-4)
+    network.tensors["prices.bias"][3] = -0.1  # the learned multiplier is at least 1 all the same
+    network.tensors["prices.weight"][3, 0] = -0.2
+    certificate = certify(network)
+    assert certificate.multiplier_error == pytest.approx(0.3, abs=1e-4)
+    assert certificate.path_error == pytest.approx(1.3 / 0.7 - 1, abs=1e-3)
+
+
+def test_on_a_map_without_costs_the_shipped_models_costs_are_closer() -> None:
+    network = any_map()
+    for rule in MOVE_RULES:
+        error_PA = network.multiplier(network.features(PATCHES, rule)) - 1
+        assert error_PA[_legal_moves(PATCHES, rule)].max() < 0.0033
+
+
+# Which networks have a certificate
+
+
+def test_a_loaded_network_is_certified_once() -> None:
+    network = any_map()
+    certificate = certificate_of(network, MoveRule.ROBOT_SAFE)
+    assert certificate == certify(network)
+    assert certificate_of(network, MoveRule.ROBOT_SAFE) is certificate
+
+
+def test_a_network_that_does_not_observe_the_rule_is_certified_for_its_own() -> None:
+    network = right_network("propagation", MoveRule.ROBOT_SAFE)
+    of_rule = [certificate_of(network, rule) for rule in MOVE_RULES]
+    assert [bool(one and one.proved) for one in of_rule] == [True, False]
+
+
+def test_the_papers_network_has_no_certificate() -> None:
+    network, metadata = load_model("dilemma")
+    assert type(network) is NETWORKS["paper"]
+    assert certificate_of(network, metadata.move_rule) is None
+
+
+# What a user reads
+
+
+def test_certify_prints_the_proof_that_the_documentation_shows(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    assert main(["certify", "any_map"]) == 0
+    printed = capsys.readouterr().out
+    assert printed.startswith("proved: all 4,096 decisions, ")
+    assert printed in GUARANTEES.read_text(encoding="utf-8")
+
+
+def test_certify_says_that_nothing_can_be_proved_about_the_papers_network(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    assert main(["certify", "dilemma"]) == 1
+    assert capsys.readouterr().out == (
+        "nothing can be proved: the moves depend on the whole map, not on 3x3 patches\n"
+    )
