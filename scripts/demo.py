@@ -82,11 +82,8 @@ def show_path(client: Client, case: Case, children: Sequence[Popen[bytes]], bega
         return next((v for v in values if v["path length (cells)"] == f"{length:.3f}"), None)
 
     found = wait_for("diagnostics", times, children)
-    print(
-        f"Q field computed in {float(found['field time (ms)']):.1f} ms, path followed in "
-        f"{float(found['rollout time (ms)']):.2f} ms; first plan {seconds:.1f} s after the nodes "
-        "were started"
-    )
+    planned = sum(float(found[f"{part} time (ms)"]) for part in ("field", "rollout"))
+    print(f"planned in {planned:.1f} ms; first plan {seconds:.1f} s after the nodes were started")
     value = wait_for("value field", fields.find, children)
     values = np.array(value.data, dtype=np.float32).reshape(grid.height, grid.width)
     values[values < 0] = np.nan

@@ -79,7 +79,8 @@ class Plan:
         Where the path ends, or would end: the goal asked for, or the cell to which it moved. None
         if no Q field is needed to say that there is no path, or for a rollout.
     field_ms, rollout_ms : float
-        How long it took to get the Q field, and the path from it, in milliseconds.
+        How long it took to get the Q field, and the path from it, in milliseconds. Where the field
+        had to grow for the start, its time includes the path.
     """
 
     status: PlanStatus
