@@ -146,7 +146,8 @@ class Planner:
         known = self._known_map(grid, rule)
         if known is None:
             known = _KnownMap(grid, rule, self.network.move_costs(grid, rule))
-            self._maps.append(known)
+            # A map on which no goal got a field is not kept.
+            self._maps = [*(other for other in self._maps if other.fields), known]
         return known
 
     def _repaired(self, known: _KnownMap, goal: Cell) -> QField | None:

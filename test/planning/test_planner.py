@@ -1,7 +1,9 @@
 from __future__ import annotations
 
+import gc
 import json
 import time
+import weakref
 from collections.abc import Callable
 from itertools import pairwise
 from typing import Any
@@ -244,6 +246,17 @@ def test_the_memory_for_fields_is_bounded_and_the_last_ones_are_kept() -> None:
     planner.q_field(last, (0, 0))
     assert planner.known_field(last, (0, 0)) is not None  # whatever its size
     assert not any(planner.known_field(grid, goal) for goal in grid.free_cells())
+
+
+def test_maps_on_which_there_was_no_path_are_not_kept() -> None:
+    planner, kept = random_planner(3, 5, 0), []
+    for cost in range(5):
+        grid = GridMap(np.array([[0, 0, 1, 0, 0]] * 3), cost=np.full((3, 5), cost))
+        assert planner.plan(grid, (0, 0), (4, 2)).status is PlanStatus.NO_PATH
+        kept.append(weakref.ref(grid))
+    del grid
+    gc.collect()
+    assert sum(reference() is not None for reference in kept) <= 1
 
 
 def test_of_the_fields_those_are_kept_that_were_asked_for_last() -> None:
