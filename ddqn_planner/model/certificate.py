@@ -22,7 +22,8 @@ from typing import TYPE_CHECKING, Final, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from ddqn_planner.grid import MAX_COST_MULTIPLIER, MOVES, OCCUPIED, UNKNOWN, MoveRule, legal_moves
+from ddqn_planner.grid import MAX_COST_MULTIPLIER, MOVES, OCCUPIED, UNKNOWN, MoveRule
+from ddqn_planner.model.move_costs import every_patch, legal_in_patches
 
 if TYPE_CHECKING:
     from ddqn_planner.model.networks import PropagationQNetwork, QNetwork
@@ -125,7 +126,7 @@ def certify(
     move_rules : sequence of MoveRule
         The rules under which it must be right; by default one of each class.
     """
-    patch_P9 = np.where(np.arange(2**9)[:, None] >> np.arange(9) & 1, OCCUPIED, 0).astype(np.int8)
+    patch_P9 = every_patch()
     patch_P9 = patch_P9[patch_P9[:, CENTRE] != OCCUPIED]
     decisions = len(move_rules) * len(patch_P9) * len(MOVES)
     if network.sizes["filters"] > MAX_FILTERS:
@@ -133,7 +134,10 @@ def certify(
     undecided, wrong, least, error = 0, 0, math.inf, 0.0
     with np.errstate(over="ignore", invalid="ignore"):  # a broken model may overflow
         for rule in move_rules:
-            feature_PI, legal_PA = network.features(patch_P9, rule), _legal_moves(patch_P9, rule)
+            feature_PI, legal_PA = (
+                network.features(patch_P9, rule),
+                legal_in_patches(patch_P9, rule),
+            )
             margin_PA, weight_CPA = _margins(network, feature_PI, legal_PA)
             right_PA = margin_PA > 0  # False for NaN
             least = min(least, float(margin_PA[right_PA].min(initial=math.inf)))
@@ -160,14 +164,6 @@ def certificate_of(network: QNetwork, move_rule: MoveRule) -> Certificate | None
     if isinstance(network, AnyMapQNetwork):
         return network.certificate
     return certify(network, [move_rule]) if isinstance(network, PropagationQNetwork) else None
-
-
-def _legal_moves(patch_P9: NDArray[np.int8], move_rule: MoveRule) -> NDArray[np.bool_]:
-    """Return which actions are legal in the centre of each patch: (P, 8)."""
-    # The patches lie one above the other: a move out of a centre stays in its patch.
-    legal = legal_moves((patch_P9 == OCCUPIED).reshape(-1, 3), move_rule)
-    legal_PA: NDArray[np.bool_] = legal[:, 1::3, 1].T
-    return legal_PA
 
 
 def _margins(

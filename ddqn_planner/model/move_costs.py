@@ -6,7 +6,6 @@ Dimensions: C = cells of the padded map, P = patches, A = 8 actions, N = 9 cells
 
 from __future__ import annotations
 
-from functools import cache
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -83,12 +82,12 @@ def every_patch() -> NDArray[np.int8]:
     return ((np.arange(OCCUPIED_PATCH)[:, None] >> np.arange(9) & 1) * OCCUPIED).astype(np.int8)
 
 
-@cache
-def legal_in_every_patch(move_rule: MoveRule) -> NDArray[np.bool_]:
-    """Return which moves are legal in the middle of each patch: (512, 8) bool."""
-    rows = every_patch().reshape(-1, 3) == OCCUPIED  # the patches, one above the other
-    legal: NDArray[np.bool_] = legal_moves(rows, move_rule)[:, 1::3, 1].T
-    return legal
+def legal_in_patches(patch_P9: NDArray[np.int8], move_rule: MoveRule) -> NDArray[np.bool_]:
+    """Return which actions are legal in the centre of each patch: (P, 8) bool."""
+    # The patches lie one above the other: a move out of a centre stays in its patch.
+    legal = legal_moves((patch_P9 == OCCUPIED).reshape(-1, 3), move_rule)
+    legal_PA: NDArray[np.bool_] = legal[:, 1::3, 1].T
+    return legal_PA
 
 
 def cell_values(grid: GridMap) -> NDArray[np.uint8]:

@@ -34,7 +34,7 @@ from ddqn_planner.model.move_costs import (
     cell_values,
     costs_by_patch,
     every_patch,
-    legal_in_every_patch,
+    legal_in_patches,
 )
 from ddqn_planner.model.observation import ROBOT, observation_background, unique_patches
 
@@ -245,7 +245,7 @@ class PropagationQNetwork(QNetwork):
         patch_P9 = every_patch()
         table_PA = self._costs_of(patch_P9, move_rule)
         table_PA[patch_P9[:, 4] == OCCUPIED] = np.inf
-        if not np.array_equal(np.isfinite(table_PA), legal_in_every_patch(move_rule)):
+        if not np.array_equal(np.isfinite(table_PA), legal_in_patches(patch_P9, move_rule)):
             return None
         table_PA = np.pad(table_PA, ((0, 1), (0, 0)), constant_values=np.inf)
         return costs_by_patch(NO_PATCHES, table_PA, 0)
@@ -346,7 +346,9 @@ class AnyMapQNetwork(PropagationQNetwork):
         if not self.certificate.proved:
             return None
         table_PA = np.full((OCCUPIED_PATCH + 1, len(MOVES)), np.inf, dtype=np.float32)
-        np.copyto(table_PA[:-1], move_rule.lengths, where=legal_in_every_patch(move_rule))
+        np.copyto(
+            table_PA[:-1], move_rule.lengths, where=legal_in_patches(every_patch(), move_rule)
+        )
         costs, terms_9LA = costs_by_patch(NO_PATCHES, table_PA, 0), self.terms(move_rule)
         greatest = 1 + max(0.0, float(terms_9LA.max(axis=1).sum(axis=0).max()))
         return costs._replace(

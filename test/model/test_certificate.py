@@ -29,11 +29,11 @@ from ddqn_planner.model.certificate import (
     MAX_FILTERS,
     MOVE_RULES,
     Certificate,
-    _legal_moves,
     _margins,
     certificate_of,
     certify,
 )
+from ddqn_planner.model.move_costs import legal_in_patches
 from ddqn_planner.planning import Planner
 
 GUARANTEES = Path(__file__).resolve().parents[2] / "docs" / "guarantees.md"
@@ -116,7 +116,7 @@ def test_decisions_and_costs_of_any_patch_are_as_certified(
 ) -> None:
     network = any_map()
     certificate = certify(network)
-    feature_BI, legal_BA = network.features(patch_B9, rule), _legal_moves(patch_B9, rule)
+    feature_BI, legal_BA = network.features(patch_B9, rule), legal_in_patches(patch_B9, rule)
     np.testing.assert_array_equal(network.success(feature_BI) > 0.5, legal_BA)
     distance_BA = np.where(legal_BA, 1, -1) * logits(network, feature_BI)
     assert distance_BA.min() >= certificate.margin
@@ -138,7 +138,7 @@ def test_no_margin_of_any_network_is_above_a_sampled_one(
     network = random_network(name, seed, scale, filters=6)
     assert isinstance(network, PropagationQNetwork)
     plain_B9 = np.where(patch_B9 == OCCUPIED, OCCUPIED, 0).astype(np.int8)
-    legal_BA = _legal_moves(patch_B9, rule)
+    legal_BA = legal_in_patches(patch_B9, rule)
     margin_BA, _ = _margins(network, network.features(plain_B9, rule), legal_BA)
     sampled_BA = np.where(legal_BA, 1, -1) * logits(network, network.features(patch_B9, rule))
     assert (margin_BA <= sampled_BA).all()
@@ -157,7 +157,7 @@ def test_decisions_that_are_wrong_for_some_costs_are_open_or_wrong(
     wrong = set()
     for rule in MOVE_RULES:
         possible_BA = network.success(network.features(patch_B9, rule)) > 0.5
-        for row, action in np.argwhere(possible_BA != _legal_moves(patch_B9, rule)).tolist():
+        for row, action in np.argwhere(possible_BA != legal_in_patches(patch_B9, rule)).tolist():
             wrong.add((rule, tuple(patch_B9[row] == OCCUPIED), action))
     certificate = certify(network)
     assert len(wrong) <= certificate.wrong + certificate.undecided
@@ -250,7 +250,7 @@ def test_a_network_without_costs_is_certified_exactly_under_its_rule(rule: MoveR
     assert certificate.proved
     assert certificate.decisions == 2048
     assert certificate.margin == pytest.approx(5, abs=1e-3)
-    differing = _legal_moves(PATCHES, MOVE_RULES[0]) != _legal_moves(PATCHES, MOVE_RULES[1])
+    differing = legal_in_patches(PATCHES, MOVE_RULES[0]) != legal_in_patches(PATCHES, MOVE_RULES[1])
     both = certify(network)
     assert (both.decisions, both.undecided, both.wrong) == (4096, 0, differing.sum())
 
@@ -276,7 +276,7 @@ def test_on_a_map_without_costs_the_shipped_models_costs_are_closer() -> None:
     network = any_map()
     for rule in MOVE_RULES:
         error_PA = network.multiplier(network.features(PATCHES, rule)) - 1
-        assert error_PA[_legal_moves(PATCHES, rule)].max() < 0.0033
+        assert error_PA[legal_in_patches(PATCHES, rule)].max() < 0.0033
 
 
 # Which networks have a certificate
