@@ -147,16 +147,14 @@ def _grow(
                 continue
             state[cell] = CLOSED
             visited += 1
+            here = distance[cell]
+            # With terms, the table has lower bounds: few moves need more than that.
             better = 0
             for action in range(8):
                 previous = cell - offsets[action]
-                through[action] = distance[cell] + cost_of(
-                    patch, table, value, terms, width, previous, action
-                )
+                through[action] = here + table[patch[previous], action]
                 known = distance[previous]
-                is_better = (through[action] < known) | (
-                    (known == 0.0) & (through[action] < np.inf)
-                )
+                is_better = (through[action] < known) | ((known == 0) & (through[action] < np.inf))
                 better |= int(is_better) << action
             y = cell // width
             x = cell - y * width
@@ -164,11 +162,16 @@ def _grow(
                 action = FIRST[better]
                 better &= better - 1
                 previous = cell - offsets[action]
+                known, cost = distance[previous], through[action]
+                if terms is not None:
+                    cost = here + cost_of(patch, table, value, terms, width, previous, action)
+                    if cost >= known > 0:
+                        continue
                 dx, dy = x - MOVE_X[action] - start_x, y - MOVE_Y[action] - start_y
                 remaining = _octile(dx, dy, straight, diagonal)
-                new = max(int((through[action] + remaining) * BUCKETS), front)
-                old = max(int((distance[previous] + remaining) * BUCKETS), front)
-                distance[previous] = through[action]
+                new = max(int((cost + remaining) * BUCKETS), front)
+                old = max(int((known + remaining) * BUCKETS), front)
+                distance[previous] = cost
                 if state[previous] == OPEN and old == new:
                     continue
                 state[previous] = OPEN
@@ -230,12 +233,11 @@ def _grow_whole(distance: Distances, state: States, opened: Cells, costs: MoveCo
                 continue
             state[cell] = CLOSED
             here = distance[cell]
+            # With terms, the table has lower bounds: few moves need more than that.
             better = 0
             for action in range(8):
                 previous = cell - offsets[action]
-                through[action] = here + cost_of(
-                    patch, table, value, terms, width, previous, action
-                )
+                through[action] = here + table[patch[previous], action]
                 known = distance[previous]
                 is_better = (through[action] < known) | ((known == 0) & (through[action] < np.inf))
                 better |= int(is_better) << action
@@ -243,8 +245,13 @@ def _grow_whole(distance: Distances, state: States, opened: Cells, costs: MoveCo
                 action = FIRST[better]
                 better &= better - 1
                 previous = cell - offsets[action]
-                new, known = int(through[action]), distance[previous]
-                distance[previous] = through[action]
+                known, cost = distance[previous], through[action]
+                if terms is not None:
+                    cost = here + cost_of(patch, table, value, terms, width, previous, action)
+                    if cost >= known > 0:
+                        continue
+                distance[previous] = cost
+                new = int(cost)
                 if state[previous] == OPEN and int(known) == new:
                     continue
                 state[previous] = OPEN
