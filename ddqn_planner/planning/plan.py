@@ -4,6 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from enum import Enum
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
 
 from ddqn_planner.grid import Cell, GridMap, MoveRule, path_length
 from ddqn_planner.grid.arguments import Choice
@@ -58,16 +62,18 @@ class PlanRequest:
     simplified: bool = False
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Plan:
     """A path, or the reason why there is none.
+
+    Two plans are equal if all but their times is equal.
 
     Parameters
     ----------
     status : PlanStatus
-    cells : tuple of (x, y)
-        From start to goal, every move legal, or every segment if the path was simplified; empty
-        unless the status is SUCCEEDED.
+    path : (N, 2) int32
+        The cells from start to goal, every move legal, or every segment if the path was simplified;
+        empty unless the status is SUCCEEDED. It cannot be written to.
     method : PlanMethod
         ASTAR_FALLBACK if it was searched for because the greedy steps were trapped.
     move_rule : MoveRule
@@ -84,15 +90,35 @@ class Plan:
     """
 
     status: PlanStatus
-    cells: tuple[Cell, ...] = ()
+    path: NDArray[np.int32] = field(default_factory=lambda: np.empty((0, 2), np.int32))
     method: PlanMethod = PlanMethod.GREEDY
     move_rule: MoveRule = MoveRule.ROBOT_SAFE
     cost: float | None = None
     goal: Cell | None = None
-    field_ms: float = field(default=0.0, compare=False)
-    rollout_ms: float = field(default=0.0, compare=False)
+    field_ms: float = 0.0
+    rollout_ms: float = 0.0
+
+    def __post_init__(self) -> None:
+        path = np.asarray(self.path, np.int32).reshape(-1, 2)  # sequences of cells do as well
+        path.flags.writeable = False
+        object.__setattr__(self, "path", path)
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, Plan) and self._identity() == other._identity()
+
+    def __hash__(self) -> int:
+        return hash(self._identity())
+
+    def _identity(self) -> tuple[object, ...]:
+        path = self.path.tobytes()
+        return self.status, path, self.method, self.move_rule, self.cost, self.goal
+
+    @cached_property
+    def cells(self) -> tuple[Cell, ...]:
+        """The path as pairs of Python ints, made when asked for."""
+        return tuple(zip(*self.path.T.tolist(), strict=True))
 
     @property
     def length(self) -> float:
         """Length in cells under the plan's rule, see `path_length`."""
-        return path_length(self.cells, self.move_rule)
+        return path_length(self.path, self.move_rule)
