@@ -14,21 +14,18 @@ import ctypes
 import os
 from collections.abc import Callable
 from contextlib import suppress
-from types import SimpleNamespace
 from typing import Any, NoReturn
 
 from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped
 from nav_msgs.msg import OccupancyGrid, Odometry, Path
 from nav_msgs.srv import GetPlan
-from rcl_interfaces.msg import SetParametersResult
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup, ReentrantCallbackGroup
 from rclpy.parameter import Parameter
 from rclpy.task import Future
 from std_msgs.msg import Header, String
 
-from ddqn_planner.grid import Cell, GridMap, MoveRule
+from ddqn_planner.grid import Cell, GridMap
 from ddqn_planner.grid.body import Inflation
-from ddqn_planner.model.certificate import NO_CERTIFICATE, certificate_of
 from ddqn_planner.nodes.conversions import (
     cell_from_pose,
     check_pose,
@@ -38,9 +35,11 @@ from ddqn_planner.nodes.conversions import (
     serialized_path,
 )
 from ddqn_planner.nodes.field_display import FieldDisplay, Shown
-from ddqn_planner.nodes.model_loading import load, load_and_warm_up
+from ddqn_planner.nodes.lifecycle import ManagedNode
+from ddqn_planner.nodes.model_loading import ModelSource, load, move_rule
 from ddqn_planner.nodes.planner_parameters import PARAMETERS
 from ddqn_planner.nodes.report import (
+    NOT_ACTIVE,
     Outcome,
     Report,
     RequestError,
@@ -49,7 +48,7 @@ from ddqn_planner.nodes.report import (
     reason_of,
     seconds,
 )
-from ddqn_planner.nodes.runtime import LATCHED, STEADY, BaseNode, Worker, spin_until_shutdown
+from ddqn_planner.nodes.runtime import LATCHED, STEADY, Unless, Worker, spin_until_shutdown
 from ddqn_planner.nodes.start_source import StartSource, check_tf
 from ddqn_planner.planning import PlanMethod, Planner, PlanRequest
 from ddqn_planner.planning.planner import last_step
@@ -61,38 +60,54 @@ LOOK_PERIOD = 0.1
 """Seconds between two looks whether something changed: an answer does not wait for diagnostics."""
 
 
-class PlannerNode(BaseNode):
+class PlannerNode(ManagedNode):
     """Plans from where the robot is to the active goal, the last ``goal_pose``.
 
     The active goal stays until the next ``goal_pose``, even if there is no plan for it. The node
     plans for it again whenever the map, the ``initialpose``, the model or a parameter changes.
     Triggers during planning are coalesced into one more plan with the latest inputs. A malformed
     map, start or model is refused, and the one before it stays. A request that comes while the
-    first model is loaded waits for it.
+    first model is loaded waits for it. While the node is not active, it refuses requests.
     """
 
     def __init__(self) -> None:
         super().__init__("planner", PARAMETERS)
-        self._map: OccupancyGrid | None = None
-        self._inflated: Future | None = None
-        self._inflate = Inflation()
-        self._goal: PoseStamped | None = None
-        self._planner: Planner | None = None
-        self._model_file = ""
         self._settings = self.settings()
+        self._report = Report(self)
         self._worker = Worker(self)
         # Maps must not wait for fields: 2000 x 2000 cells take over a second.
         self._map_worker = Worker(self)
-        # While it loads, DDS discovers, and the node says what else is missing.
-        self._first_planner = self._worker.call(load_and_warm_up, self._settings.model)
-        self._model_is_due = True
-        self._display = FieldDisplay(self)
-        self._report = Report(self)
+        self._model = ModelSource(self, self._report, self._worker)
+        if self._settings.autostart:
+            # While it loads, DDS discovers, and the node says what else is missing.
+            self._model.load()
+        self._next_look = Future()
+        self._answering = 0
+        self._forget()
+        self.create_timer(LOOK_PERIOD, self._on_look, clock=STEADY)
+        self.add_post_set_parameters_callback(self._apply_parameters)
+        if self._settings.autostart:
+            self.start()
+
+    # Lifecycle
+
+    def _forget(self) -> None:
+        """Have no map and no goal, and refuse requests."""
+        self._is_configured = False
+        self._stopped = Future()
+        self._stop()
+        self._map: OccupancyGrid | None = None
+        self._grid: GridMap | None = None
+        self._inflated: Future | None = None
+        self._inflate = Inflation()
+        self._goal: PoseStamped | None = None
         self._logged: tuple[PoseStamped, object] | None = None
         self._logged_map = ""
-        self._next_look = Future()
         self._waits_for_start = False
 
+    def configure(self) -> None:
+        """Listen to the map and to where the robot is, and create what answers requests."""
+        self._display = FieldDisplay(self)
         self._plan_publisher = self.create_publisher(Path, "plan", LATCHED)
         # In a group of its own: triggers that come while it plans make it plan once more after.
         self._replan = self.create_guard_condition(
@@ -104,17 +119,50 @@ class PlannerNode(BaseNode):
         self.get_logger().info(f"waiting for a map on {self._map_topic}")
         self.create_subscription(PoseStamped, "goal_pose", self._on_goal_pose, 10)
         if self._settings.follow_trainer:
-            self.create_subscription(String, "trainer/model_saved", self._on_model_saved, LATCHED)
+            self.create_subscription(String, "trainer/model_saved", self._model.on_saved, LATCHED)
         # Reentrant: a request that waits for its field does not keep out the others.
         self.create_service(
             GetPlan, "~/get_plan", self._on_get_plan, callback_group=ReentrantCallbackGroup()
         )
-        self.create_trigger("~/reload_model", self._on_reload_model)
-        self.create_timer(LOOK_PERIOD, self._on_look, clock=STEADY)
-        self.add_post_set_parameters_callback(self._apply_parameters)
+        self.create_trigger("~/reload_model", self._model.on_reload)
+        self._is_configured = True
+
+    def activate(self) -> None:
+        """Answer requests from now on."""
+        self._stopped = Future()
+        self._report.change()
         self._replan.trigger()
 
-    # Parameters and the model
+    def deactivate(self) -> None:
+        """Forget the active goal."""
+        self._goal = None
+        self._report.change()
+
+    def cleanup(self) -> None:
+        """Free the map, the model and its fields."""
+        self._forget()
+        self._report.forget()
+        del self._display, self._start
+        self._model.forget()
+
+    async def prepare(self, transition: str) -> bool:
+        """Load the model before ``configure``; answer what waits before the node stops."""
+        if transition == "configure":
+            self._model.load()
+            await self._model.first()
+            return self._model.planner is not None
+        if transition in ("deactivate", "shutdown"):
+            self._stop()
+            while self._answering:
+                await self._next_look
+        return True
+
+    def _stop(self) -> None:
+        """Answer all requests that wait, and those that come from now on, that it is not active."""
+        if not self._stopped.done():
+            self._stopped.set_result(NOT_ACTIVE)
+
+    # Parameters
 
     def check_parameters(self, new: dict[str, Any]) -> None:
         """Check new values as `BaseNode` does, whether TF can be used, and load a new model."""
@@ -126,11 +174,13 @@ class PlannerNode(BaseNode):
 
     def _apply_parameters(self, parameters: list[Parameter]) -> None:
         settings = self._settings = self.settings()
+        if not self._is_configured:
+            return
         changed = {parameter.name for parameter in parameters}
         if "model" in changed:
-            self._use_planner(*self._candidate)
-        if self._planner is not None:
-            self._planner.cache_bytes = settings.field_cache_bytes
+            self._model.use(*self._candidate)
+        if self._model.planner is not None:
+            self._model.planner.cache_bytes = settings.field_cache_bytes
         if settings.start_source != self._start.name:
             # What the other source said, and what was refused of it, no longer counts.
             self._start.close()
@@ -139,42 +189,6 @@ class PlannerNode(BaseNode):
         if self._map is not None and changed.intersection(MAP_PARAMETERS + BODY_PARAMETERS):
             self._use_map(self._map)
         self._replan.trigger()
-
-    async def _first_model(self) -> None:
-        """Wait for the model of the start, and use it unless another one was set since."""
-        if not self._model_is_due:
-            return
-        try:
-            loaded = await self._first_planner
-            if self._model_is_due:
-                self._use_planner(*loaded)
-        except Exception as error:
-            if self._model_is_due:
-                self._model_is_due = False
-                reason = f"{str(error) or repr(error)}; or set the parameter 'model'"
-                self._report.refuse("model", reason)
-
-    def _use_planner(self, planner: Planner, model_file: str) -> None:
-        """Plan with it from now on."""
-        self._planner, self._model_file, self._model_is_due = planner, model_file, False
-        planner.cache_bytes = self._settings.field_cache_bytes
-        self._report.accept("model")
-        self._report.change()
-        self.get_logger().info(f"planning with the model {model_file}")
-
-    def _set_model(self, name: str) -> SetParametersResult:
-        return self.set_parameters([Parameter("model", Parameter.Type.STRING, name)])[0]
-
-    def _on_model_saved(self, message: String) -> None:
-        result = self._set_model(message.data)
-        if not result.successful:
-            self._report.refuse("model", f"the trainer's model was refused: {result.reason}")
-
-    def _on_reload_model(self) -> tuple[bool, str]:
-        result = self._set_model(self._settings.model)
-        if not result.successful:
-            self.get_logger().error(f"the model was not loaded again: {result.reason}")
-        return result.successful, result.reason or f"loaded {self._model_file}"
 
     # Map, start and goal
 
@@ -236,6 +250,10 @@ class PlannerNode(BaseNode):
             await self._next_look
 
     def _on_goal_pose(self, message: PoseStamped) -> None:
+        if self._stopped.done():
+            self._report.note(NOT_ACTIVE)
+            self._report.log(NOT_ACTIVE)
+            return
         self._goal = message
         self._display.show_again()
         self._replan.trigger()
@@ -260,11 +278,13 @@ class PlannerNode(BaseNode):
         return response
 
     async def _plan_for_active_goal(self) -> None:
-        await self._first_model()
+        await self._model.first()
         goal = self._goal
         if goal is None:
             return
         header, outcome = await self._answer(None, goal, self._settings.tolerance)
+        if outcome is NOT_ACTIVE:
+            return
         self._plan_publisher.publish(_path(serialized_path, outcome, header, goal))
         self._waits_for_start = outcome.status == "NO_START"
         # The places and lengths in the reason may differ.
@@ -289,13 +309,16 @@ class PlannerNode(BaseNode):
         whatever changes while it waits. Its stamp is the time of the answer.
         """
         frame = self._frame() or goal.header.frame_id
+        self._answering += 1
         try:
-            outcome = await self._plan(start, goal, tolerance)
+            outcome = await Unless(self._stopped, self._plan(start, goal, tolerance))
         except RequestError as error:
             outcome = Outcome(error.status, str(error))
         except Exception as error:  # as when no memory is left: the node must survive
             remedy = "give a smaller map, or another model"
             outcome = Outcome("FAILED", f"the planning failed ({error!r}); {remedy}")
+        finally:
+            self._answering -= 1
         self._report.note(outcome)
         return Header(stamp=self.get_clock().now().to_msg(), frame_id=frame), outcome
 
@@ -307,8 +330,8 @@ class PlannerNode(BaseNode):
         if map_message is None:
             raise RequestError("NO_MAP", self._missing_map())
         inflated = self._inflated_map()
-        await self._first_model()
-        planner = self._planner
+        await self._model.first()
+        planner = self._model.planner
         if planner is None:
             raise RequestError("NO_MODEL", f"no model is loaded: {self._report.refused['model']}")
         frame = map_message.header.frame_id
@@ -326,21 +349,17 @@ class PlannerNode(BaseNode):
             tolerance=checked("INVALID_TOLERANCE", check_tolerance, tolerance) / grid.resolution,
             start=cell("INVALID_START", "the start", start),
             goal=cell("INVALID_GOAL", "the goal", goal),
-            move_rule=self._move_rule(settings, planner),
+            move_rule=move_rule(settings.move_rule, planner),
             method=PlanMethod(settings.mode),
             simplified=settings.path_simplification == "line_of_sight",
         )
         steps = planner.steps(request)
         plan = next(steps)
         if plan is None:  # a slow step follows
-            plan = await self._worker.call(last_step, steps)
+            plan = await self._worker.run(last_step, steps)
         reason = reason_of(request, plan, start, goal, settings.robot_radius)
         stamp = seconds(map_message.header.stamp)
         return Outcome(plan.status.name, reason, planner, request, plan, stamp)
-
-    @staticmethod
-    def _move_rule(settings: SimpleNamespace, planner: Planner) -> MoveRule:
-        return MoveRule(settings.move_rule or planner.metadata.move_rule)
 
     # Diagnostics
 
@@ -354,23 +373,15 @@ class PlannerNode(BaseNode):
                 self._waits_for_start = False
                 self._replan.trigger()
         if self._report.is_due:
-            missing = [self._missing_map()] if self._map is None else []
-            missing += ["the model is being loaded"] if self._model_is_due else []
-            fatal = self._planner is None and not self._model_is_due
+            missing = [NOT_ACTIVE.reason] if self._stopped.done() else []
+            missing += [self._missing_map()] if self._is_configured and self._map is None else []
+            missing += ["the model is being loaded"] if self._model.is_loading else []
+            fatal = self._model.planner is None and "model" in self._report.refused
             self._report.publish(fatal, "; ".join(missing), self._describe())
 
     def _describe(self) -> dict[str, str]:
-        description = {"model": self._settings.model}
-        if self._planner is not None:
-            rule = self._move_rule(self._settings, self._planner)
-            description |= {"model file": self._model_file, "move rule": rule.value}
-            metadata = self._planner.metadata
-            description["model move rule"] = metadata.move_rule.value
-            sizes = metadata.sizes.items()
-            description["model sizes"] = ", ".join(f"{key} {size}" for key, size in sizes)
-            description["model training steps"] = str(metadata.steps)
-            certificate = certificate_of(self._planner.network, metadata.move_rule)
-            description["model certificate"] = str(certificate or NO_CERTIFICATE)
+        rule = self._settings.move_rule
+        description = {"state": self.state, **self._model.describe(rule)}
         if self._map is not None:
             description["map"] = describe_map(self._map)
             description["map stamp (s)"] = seconds(self._map.header.stamp)

@@ -10,6 +10,11 @@ from ddqn_planner.planning import PlanMethod
 from ddqn_planner.planning.planner import CACHE_BYTES
 
 PARAMETERS: Final = {
+    "autostart": Declared(
+        True,
+        "Whether the node configures and activates itself; else a lifecycle manager does it",
+        read_only=True,
+    ),
     "model": Declared(
         "any_map",
         "Name of a shipped model, or path of a model file",

@@ -71,6 +71,14 @@ class Outcome:
     map_stamp: str = ""
 
 
+NO_REQUEST = Outcome("NO_REQUEST", "no plan was asked for yet")
+NOT_ACTIVE = Outcome(
+    "NOT_ACTIVE",
+    "the node is not active; configure and activate it, with a lifecycle manager or "
+    "`ros2 lifecycle set`",
+)
+
+
 def reason_of(
     request: PlanRequest, plan: Plan, start: PoseStamped, goal: PoseStamped, robot_radius: float
 ) -> str:
@@ -119,7 +127,7 @@ class Report:
 
     def __init__(self, node: BaseNode) -> None:
         self.refused: dict[str, str] = {}
-        self._outcome = Outcome("NO_REQUEST", "no plan was asked for yet")
+        self._outcome = NO_REQUEST
         self._node = node
         self._publisher = node.create_publisher(DiagnosticArray, "/diagnostics", 10)
         self._to_be_logged: list[str] = []
@@ -141,6 +149,12 @@ class Report:
         """Forget that something was refused."""
         if self.refused.pop(what, None):
             self.change()
+
+    def forget(self) -> None:
+        """Forget what was refused, and the last outcome."""
+        self.refused.clear()
+        self._outcome = NO_REQUEST
+        self.change()
 
     def note(self, outcome: Outcome) -> None:
         """Store the last outcome for the diagnostics."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Coroutine, Generator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from inspect import isawaitable
 from pathlib import Path
@@ -209,10 +209,15 @@ class Worker:
         self._wake = node.create_guard_condition(lambda: None)
 
     def call(self, function: Callable[..., Any], *arguments: object) -> Future:
-        """Return the future of a call; it has the exception if the function raises one."""
+        """Return the future of a call; it has the exception if the function raises one.
+
+        A call whose future is cancelled before it begins is left out.
+        """
         future = Future()
 
         def work() -> None:
+            if future.cancelled():
+                return
             try:
                 future.set_result(function(*arguments))
             except Exception as error:
@@ -221,6 +226,30 @@ class Worker:
 
         self._thread.submit(work)
         return future
+
+    async def run(self, function: Callable[..., Any], *arguments: object) -> Any:
+        """Return the result of a call, which is left out if nobody awaits it when it begins."""
+        future = self.call(function, *arguments)
+        try:
+            return await future
+        finally:
+            future.cancel()
+
+
+class Unless:
+    """Await a coroutine, or close it and have a future's result as soon as that is there."""
+
+    def __init__(self, given_up: Future, coroutine: Coroutine[None, None, Any]) -> None:
+        self._given_up, self._coroutine = given_up, coroutine
+
+    def __await__(self) -> Generator[None, None, Any]:
+        while not self._given_up.done():
+            try:
+                yield self._coroutine.send(None)
+            except StopIteration as end:
+                return end.value
+        self._coroutine.close()
+        return self._given_up.result()
 
 
 HELP = """\
