@@ -50,7 +50,7 @@ from ddqn_planner.nodes.report import (
 )
 from ddqn_planner.nodes.runtime import LATCHED, STEADY, Unless, Worker, spin_until_shutdown
 from ddqn_planner.nodes.start_source import StartSource, check_tf
-from ddqn_planner.planning import PlanMethod, Planner, PlanRequest
+from ddqn_planner.planning import PlanMethod, PlanRequest
 from ddqn_planner.planning.planner import last_step
 
 MAP_PARAMETERS = ("occupied_threshold", "allow_unknown", "use_map_costs")
