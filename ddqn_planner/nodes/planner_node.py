@@ -26,6 +26,7 @@ from std_msgs.msg import Header, String
 
 from ddqn_planner.grid import Cell, GridMap
 from ddqn_planner.grid.body import Inflation
+from ddqn_planner.nodes.active_goal import UNCHANGED, ActiveGoal
 from ddqn_planner.nodes.conversions import (
     cell_from_pose,
     check_pose,
@@ -63,11 +64,11 @@ LOOK_PERIOD = 0.1
 class PlannerNode(ManagedNode):
     """Plans from where the robot is to the active goal, the last ``goal_pose``.
 
-    The active goal stays until the next ``goal_pose``, even if there is no plan for it. The node
-    plans for it again whenever the map, the ``initialpose``, the model or a parameter changes.
-    Triggers during planning are coalesced into one more plan with the latest inputs. A malformed
-    map, start or model is refused, and the one before it stays. A request that comes while the
-    first model is loaded waits for it. While the node is not active, it refuses requests.
+    The active goal stays until the next ``goal_pose``, though there may be no plan. `ActiveGoal`
+    decides when the node plans for it again, and what it publishes. Triggers during planning are
+    coalesced into one more plan with the latest inputs. A malformed map, start or model is refused,
+    and the one before it stays. A request that comes while the first model is loaded waits for it. While
+    the node is not active, it refuses requests.
     """
 
     def __init__(self) -> None:
@@ -100,7 +101,7 @@ class PlannerNode(ManagedNode):
         self._grid: GridMap | None = None
         self._inflated: Future | None = None
         self._inflate = Inflation()
-        self._goal: PoseStamped | None = None
+        self._active = ActiveGoal()
         self._logged: tuple[PoseStamped, object] | None = None
         self._logged_map = ""
         self._waits_for_start = False
@@ -135,7 +136,7 @@ class PlannerNode(ManagedNode):
 
     def deactivate(self) -> None:
         """Forget the active goal."""
-        self._goal = None
+        self._active = ActiveGoal()
         self._report.change()
 
     def cleanup(self) -> None:
@@ -188,6 +189,7 @@ class PlannerNode(ManagedNode):
             self._start = StartSource(self, settings.start_source, self._on_start)
         if self._map is not None and changed.intersection(MAP_PARAMETERS + BODY_PARAMETERS):
             self._use_map(self._map)
+        self._active.restart()
         self._replan.trigger()
 
     # Map, start and goal
@@ -234,6 +236,7 @@ class PlannerNode(ManagedNode):
             return
         self._report.accept(self._start.topic)
         if due:
+            self._active.plan_at_once()
             self._replan.trigger()
 
     def _start_pose(self, frame: str) -> PoseStamped:
@@ -254,7 +257,7 @@ class PlannerNode(ManagedNode):
             self._report.note(NOT_ACTIVE)
             self._report.log(NOT_ACTIVE)
             return
-        self._goal = message
+        self._active.set(message)
         self._display.show_again()
         self._replan.trigger()
 
@@ -279,13 +282,15 @@ class PlannerNode(ManagedNode):
 
     async def _plan_for_active_goal(self) -> None:
         await self._model.first()
-        goal = self._goal
+        goal = self._active.pose
         if goal is None:
             return
-        header, outcome = await self._answer(None, goal, self._settings.tolerance)
-        if outcome is NOT_ACTIVE:
+        self._active.begin(self._settings.replan_period)
+        header, outcome = await self._answer(None, goal, self._settings.tolerance, self._active)
+        if outcome in (UNCHANGED, NOT_ACTIVE):
             return
-        self._plan_publisher.publish(_path(serialized_path, outcome, header, goal))
+        if self._active.is_news(outcome, header.frame_id):
+            self._plan_publisher.publish(_path(serialized_path, outcome, header, goal))
         self._waits_for_start = outcome.status == "NO_START"
         # The places and lengths in the reason may differ.
         logged = goal, (outcome.status, outcome.plan.method)
@@ -301,9 +306,15 @@ class PlannerNode(ManagedNode):
             self._display.show(shown)
 
     async def _answer(
-        self, start: PoseStamped | None, goal: PoseStamped, tolerance: float
+        self,
+        start: PoseStamped | None,
+        goal: PoseStamped,
+        tolerance: float,
+        active: ActiveGoal | None = None,
     ) -> tuple[Header, Outcome]:
         """Return the path's header, and what became of the request.
+
+        For the active goal that may be `UNCHANGED`.
 
         A path is planned with the map, model and parameters that are there when this begins,
         whatever changes while it waits. Its stamp is the time of the answer.
@@ -311,7 +322,8 @@ class PlannerNode(ManagedNode):
         frame = self._frame() or goal.header.frame_id
         self._answering += 1
         try:
-            outcome = await Unless(self._stopped, self._plan(start, goal, tolerance))
+            planning = self._plan(start, goal, tolerance, active)
+            outcome = await Unless(self._stopped, planning)
         except RequestError as error:
             outcome = Outcome(error.status, str(error))
         except Exception as error:  # as when no memory is left: the node must survive
@@ -319,11 +331,16 @@ class PlannerNode(ManagedNode):
             outcome = Outcome("FAILED", f"the planning failed ({error!r}); {remedy}")
         finally:
             self._answering -= 1
-        self._report.note(outcome)
+        if outcome is not UNCHANGED:
+            self._report.note(outcome)
         return Header(stamp=self.get_clock().now().to_msg(), frame_id=frame), outcome
 
     async def _plan(
-        self, start: PoseStamped | None, goal: PoseStamped, tolerance: float
+        self,
+        start: PoseStamped | None,
+        goal: PoseStamped,
+        tolerance: float,
+        active: ActiveGoal | None,
     ) -> Outcome:
         checked("INVALID_GOAL", check_pose, "the goal", goal.header, goal.pose, self._frame())
         map_message, settings = self._map, self._settings
@@ -353,6 +370,11 @@ class PlannerNode(ManagedNode):
             method=PlanMethod(settings.mode),
             simplified=settings.path_simplification == "line_of_sight",
         )
+        if active is not None:
+            next_request = active.next_request(request, frame, settings.switch_threshold)
+            if next_request is None:
+                return UNCHANGED
+            request = next_request
         steps = planner.steps(request)
         plan = next(steps)
         if plan is None:  # a slow step follows
@@ -372,6 +394,8 @@ class PlannerNode(ManagedNode):
                 self._start_pose(self._frame())
                 self._waits_for_start = False
                 self._replan.trigger()
+        if self._active.is_look_due():
+            self._replan.trigger()
         if self._report.is_due:
             missing = [NOT_ACTIVE.reason] if self._stopped.done() else []
             missing += [self._missing_map()] if self._is_configured and self._map is None else []

@@ -48,6 +48,18 @@ PARAMETERS: Final = {
         "How far a goal_pose that is occupied or cut off may move to a reachable free cell, metres",
         (0, 1000),
     ),
+    "replan_period": Declared(
+        1.0,
+        "How soon the path to the goal_pose follows a changed map or a moving robot while it is "
+        "not blocked, seconds; 0: with each map",
+        (0, 3600),
+    ),
+    "switch_threshold": Declared(
+        0.03,
+        "How much more the path under way may cost than a new one and still be kept, as a share; "
+        "~/get_plan always has the new one",
+        (0, 10),
+    ),
     "mode": Declared(
         "greedy",
         "Whether to search where the greedy steps are trapped: astar_fallback",

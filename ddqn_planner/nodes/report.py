@@ -100,6 +100,8 @@ def reason_of(
         if plan.method is PlanMethod.GREEDY
         else "searched for in the order of the Q field: the greedy steps were trapped"
     )
+    if plan.extra_cost:
+        reason += f", kept: its cost is {plan.extra_cost:+.1%} beside that of a new one"
     if plan.cells[-1] != request.goal:
         metres = math.dist(plan.cells[-1], request.goal) * grid.resolution
         why = "is cut off" if grid.is_free(request.goal) else "is occupied"
