@@ -321,10 +321,7 @@ class PlannerNode(BaseNode):
             description["model training steps"] = str(metadata.steps)
             certificate = certificate_of(self._planner.network, metadata.move_rule)
             description["model certificate"] = str(certificate or NO_CERTIFICATE)
-        if self._map.header is not None:
-            description["map"] = self._map.description
-            description["map stamp (s)"] = seconds(self._map.header.stamp)
-        return description
+        return description | self._map.describe()
 
 
 def _path(make: Callable[..., Any], outcome: Outcome, header: Header, goal: PoseStamped) -> Any:
