@@ -17,7 +17,7 @@ from contextlib import suppress
 from typing import Any, NoReturn
 
 from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped
-from nav_msgs.msg import OccupancyGrid, Odometry, Path
+from nav_msgs.msg import Odometry, Path
 from nav_msgs.srv import GetPlan
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup, ReentrantCallbackGroup
 from rclpy.parameter import Parameter
@@ -25,18 +25,17 @@ from rclpy.task import Future
 from std_msgs.msg import Header, String
 
 from ddqn_planner.grid import Cell, GridMap
-from ddqn_planner.grid.body import Inflation
 from ddqn_planner.nodes.active_goal import UNCHANGED, ActiveGoal
 from ddqn_planner.nodes.conversions import (
     cell_from_pose,
     check_pose,
     check_tolerance,
-    grid_from_message,
     path_message,
     serialized_path,
 )
 from ddqn_planner.nodes.field_display import FieldDisplay, Shown
 from ddqn_planner.nodes.lifecycle import ManagedNode
+from ddqn_planner.nodes.map_source import MapSource
 from ddqn_planner.nodes.model_loading import ModelSource, load, move_rule
 from ddqn_planner.nodes.planner_parameters import PARAMETERS
 from ddqn_planner.nodes.report import (
@@ -45,7 +44,6 @@ from ddqn_planner.nodes.report import (
     Report,
     RequestError,
     checked,
-    describe_map,
     reason_of,
     seconds,
 )
@@ -53,9 +51,6 @@ from ddqn_planner.nodes.runtime import LATCHED, STEADY, Unless, Worker, spin_unt
 from ddqn_planner.nodes.start_source import StartSource, check_tf
 from ddqn_planner.planning import PlanMethod, PlanRequest
 from ddqn_planner.planning.planner import last_step
-
-MAP_PARAMETERS = ("occupied_threshold", "allow_unknown", "use_map_costs")
-BODY_PARAMETERS = ("robot_radius", "clearance_weight")
 
 LOOK_PERIOD = 0.1
 """Seconds between two looks whether something changed: an answer does not wait for diagnostics."""
@@ -67,8 +62,8 @@ class PlannerNode(ManagedNode):
     The active goal stays until the next ``goal_pose``, though there may be no plan. `ActiveGoal`
     decides when the node plans for it again, and what it publishes. Triggers during planning are
     coalesced into one more plan with the latest inputs. A malformed map, start or model is refused,
-    and the one before it stays. A request that comes while the first model is loaded waits for it. While
-    the node is not active, it refuses requests.
+    and the one before it stays. A request that comes while the first model is loaded waits for it.
+    While the node is not active, it refuses requests.
     """
 
     def __init__(self) -> None:
@@ -76,8 +71,6 @@ class PlannerNode(ManagedNode):
         self._settings = self.settings()
         self._report = Report(self)
         self._worker = Worker(self)
-        # Maps must not wait for fields: 2000 x 2000 cells take over a second.
-        self._map_worker = Worker(self)
         self._model = ModelSource(self, self._report, self._worker)
         if self._settings.autostart:
             # While it loads, DDS discovers, and the node says what else is missing.
@@ -97,13 +90,8 @@ class PlannerNode(ManagedNode):
         self._is_configured = False
         self._stopped = Future()
         self._stop()
-        self._map: OccupancyGrid | None = None
-        self._grid: GridMap | None = None
-        self._inflated: Future | None = None
-        self._inflate = Inflation()
         self._active = ActiveGoal()
         self._logged: tuple[PoseStamped, object] | None = None
-        self._logged_map = ""
         self._waits_for_start = False
 
     def configure(self) -> None:
@@ -115,9 +103,7 @@ class PlannerNode(ManagedNode):
             self._plan_for_active_goal, MutuallyExclusiveCallbackGroup()
         )
         self._start = StartSource(self, self._settings.start_source, self._on_start)
-        maps = self.create_subscription(OccupancyGrid, "map", self._on_map, LATCHED)
-        self._map_topic = maps.topic_name
-        self.get_logger().info(f"waiting for a map on {self._map_topic}")
+        self._map = MapSource(self, self._report, self._on_map)
         self.create_subscription(PoseStamped, "goal_pose", self._on_goal_pose, 10)
         if self._settings.follow_trainer:
             self.create_subscription(String, "trainer/model_saved", self._model.on_saved, LATCHED)
@@ -143,7 +129,7 @@ class PlannerNode(ManagedNode):
         """Free the map, the model and its fields."""
         self._forget()
         self._report.forget()
-        del self._display, self._start
+        del self._display, self._start, self._map
         self._model.forget()
 
     async def prepare(self, transition: str) -> bool:
@@ -187,50 +173,21 @@ class PlannerNode(ManagedNode):
             self._start.close()
             self._report.accept(self._start.topic)
             self._start = StartSource(self, settings.start_source, self._on_start)
-        if self._map is not None and changed.intersection(MAP_PARAMETERS + BODY_PARAMETERS):
-            self._use_map(self._map)
+        self._map.apply_parameters(changed)
         self._active.restart()
         self._replan.trigger()
 
     # Map, start and goal
 
-    def _on_map(self, message: OccupancyGrid) -> None:
-        if not self._use_map(message):
-            return
-        if message.header.frame_id != self._frame():
+    def _on_map(self, frame_changed: bool) -> None:
+        if frame_changed:
             # What was refused for its frame may be right now.
             self._report.accept(self._start.topic)
-        self._map = message
-        self._report.change()
-        described = describe_map(message)
-        if described != self._logged_map:
-            self._logged_map = described
-            self.get_logger().info(f"map of {described}")
         self._replan.trigger()
-
-    def _use_map(self, message: OccupancyGrid) -> bool:
-        """Plan on it from now on, or refuse it."""
-        try:
-            self._grid = grid_from_message(message, *map(self.value, MAP_PARAMETERS))
-        except ValueError as error:
-            self._report.refuse("map", str(error))
-            return False
-        self._report.accept("map")
-        self._inflated = None
-        return True
-
-    def _inflated_map(self) -> Future:
-        """Return the map for the robot's body, which is computed for the first request."""
-        if self._inflated is None:
-            radius, weight = map(self.value, BODY_PARAMETERS)
-            # ROS accepts a value that is above the range by a millionth.
-            body = radius, min(weight, 1.0)
-            self._inflated = self._map_worker.call(self._inflate, self._grid, *body)
-        return self._inflated
 
     def _on_start(self, message: PoseWithCovarianceStamped | Odometry) -> None:
         try:
-            due = self._start.take(message, self._frame())
+            due = self._start.take(message, self._map.frame)
         except ValueError as error:
             self._report.refuse(self._start.topic, str(error))
             return
@@ -260,14 +217,6 @@ class PlannerNode(ManagedNode):
         self._active.set(message)
         self._display.show_again()
         self._replan.trigger()
-
-    def _frame(self) -> str:
-        return self._map.header.frame_id if self._map is not None else ""
-
-    def _missing_map(self) -> str:
-        refused = self._report.refused.get("map")
-        because = f" ({refused})" if refused else ""
-        return f"no map was received on {self._map_topic} yet{because}; start a map server"
 
     # Planning
 
@@ -319,7 +268,7 @@ class PlannerNode(ManagedNode):
         A path is planned with the map, model and parameters that are there when this begins,
         whatever changes while it waits. Its stamp is the time of the answer.
         """
-        frame = self._frame() or goal.header.frame_id
+        frame = self._map.frame or goal.header.frame_id
         self._answering += 1
         try:
             planning = self._plan(start, goal, tolerance, active)
@@ -342,16 +291,16 @@ class PlannerNode(ManagedNode):
         tolerance: float,
         active: ActiveGoal | None,
     ) -> Outcome:
-        checked("INVALID_GOAL", check_pose, "the goal", goal.header, goal.pose, self._frame())
-        map_message, settings = self._map, self._settings
-        if map_message is None:
-            raise RequestError("NO_MAP", self._missing_map())
-        inflated = self._inflated_map()
+        checked("INVALID_GOAL", check_pose, "the goal", goal.header, goal.pose, self._map.frame)
+        map_header, settings = self._map.header, self._settings
+        if map_header is None:
+            raise RequestError("NO_MAP", self._map.missing)
+        inflated = self._map.inflated()
         await self._model.first()
         planner = self._model.planner
         if planner is None:
             raise RequestError("NO_MODEL", f"no model is loaded: {self._report.refused['model']}")
-        frame = map_message.header.frame_id
+        frame = map_header.frame_id
         if start is None:
             start = await self._known_start(frame)
         grid: GridMap = await inflated
@@ -380,7 +329,7 @@ class PlannerNode(ManagedNode):
         if plan is None:  # a slow step follows
             plan = await self._worker.run(last_step, steps)
         reason = reason_of(request, plan, start, goal, settings.robot_radius)
-        stamp = seconds(map_message.header.stamp)
+        stamp = seconds(map_header.stamp)
         return Outcome(plan.status.name, reason, planner, request, plan, stamp)
 
     # Diagnostics
@@ -391,25 +340,21 @@ class PlannerNode(ManagedNode):
         looked.set_result(None)
         if self._waits_for_start and self._start.name == "tf":
             with suppress(RequestError):
-                self._start_pose(self._frame())
+                self._start_pose(self._map.frame)
                 self._waits_for_start = False
                 self._replan.trigger()
         if self._active.is_look_due():
             self._replan.trigger()
         if self._report.is_due:
             missing = [NOT_ACTIVE.reason] if self._stopped.done() else []
-            missing += [self._missing_map()] if self._is_configured and self._map is None else []
+            missing += [self._map.missing] if self._is_configured else []
             missing += ["the model is being loaded"] if self._model.is_loading else []
             fatal = self._model.planner is None and "model" in self._report.refused
-            self._report.publish(fatal, "; ".join(missing), self._describe())
+            self._report.publish(fatal, "; ".join(filter(None, missing)), self._describe())
 
     def _describe(self) -> dict[str, str]:
-        rule = self._settings.move_rule
-        description = {"state": self.state, **self._model.describe(rule)}
-        if self._map is not None:
-            description["map"] = describe_map(self._map)
-            description["map stamp (s)"] = seconds(self._map.header.stamp)
-        return description
+        of_map = self._map.describe() if self._is_configured else {}
+        return {"state": self.state, **self._model.describe(self._settings.move_rule), **of_map}
 
 
 def _path(make: Callable[..., Any], outcome: Outcome, header: Header, goal: PoseStamped) -> Any:

@@ -246,7 +246,7 @@ def test_cleanup_frees_map_model_and_fields(make_robot: MakeRobot, model: Path) 
         robot = make_robot("freed")
         manager = Manager(robot)
         robot.begin()
-        planner, grid = node._model.planner, node._grid
+        planner, grid = node._model.planner, node._map._grid
         assert planner is not None
         freed = [weakref.ref(it) for it in (planner, grid, planner.q_field(grid, GOAL))]
         del planner, grid
