@@ -151,6 +151,9 @@ class ManagedNode(LifecycleNodeMixin, BaseNode):
     def _break_bond(self) -> None:
         if self._bond is not None:
             self._bond.shutdown()
+            # It has destroyed these, and the node still has them in its lists.
+            self.destroy_subscription(self._bond.sub)
+            self.destroy_publisher(self._bond.pub)
             self._bond = None
 
     # Entities

@@ -12,8 +12,9 @@ from __future__ import annotations
 
 import ctypes
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Coroutine, Sequence
 from contextlib import suppress
+from dataclasses import replace
 from typing import Any, NoReturn
 
 from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped
@@ -37,6 +38,8 @@ from ddqn_planner.nodes.field_display import FieldDisplay, Shown
 from ddqn_planner.nodes.lifecycle import ManagedNode
 from ddqn_planner.nodes.map_source import MapSource
 from ddqn_planner.nodes.model_loading import ModelSource, load, move_rule
+from ddqn_planner.nodes.nav2_interface import serve_nav2
+from ddqn_planner.nodes.path_action import check_request
 from ddqn_planner.nodes.planner_parameters import PARAMETERS
 from ddqn_planner.nodes.report import (
     NOT_ACTIVE,
@@ -49,7 +52,9 @@ from ddqn_planner.nodes.report import (
 )
 from ddqn_planner.nodes.runtime import LATCHED, STEADY, Unless, Worker, spin_until_shutdown
 from ddqn_planner.nodes.start_source import StartSource, check_tf
-from ddqn_planner.planning import PlanMethod, PlanRequest
+from ddqn_planner.nodes.via_points import joined
+from ddqn_planner.planning import Plan, PlanMethod, Planner, PlanRequest
+from ddqn_planner.planning.path_under_way import is_path_valid
 from ddqn_planner.planning.planner import last_step
 
 LOOK_PERIOD = 0.1
@@ -112,6 +117,7 @@ class PlannerNode(ManagedNode):
             GetPlan, "~/get_plan", self._on_get_plan, callback_group=ReentrantCallbackGroup()
         )
         self.create_trigger("~/reload_model", self._model.on_reload)
+        serve_nav2(self, self._is_active, self._plan_for_action, self._on_is_path_valid)
         self._is_configured = True
 
     def activate(self) -> None:
@@ -144,9 +150,12 @@ class PlannerNode(ManagedNode):
                 await self._next_look
         return True
 
+    def _is_active(self) -> bool:
+        return not self._stopped.done()
+
     def _stop(self) -> None:
         """Answer all requests that wait, and those that come from now on, that it is not active."""
-        if not self._stopped.done():
+        if self._is_active():
             self._stopped.set_result(NOT_ACTIVE)
 
     # Parameters
@@ -210,7 +219,7 @@ class PlannerNode(ManagedNode):
             await self._next_look
 
     def _on_goal_pose(self, message: PoseStamped) -> None:
-        if self._stopped.done():
+        if not self._is_active():
             self._report.note(NOT_ACTIVE)
             self._report.log(NOT_ACTIVE)
             return
@@ -224,7 +233,8 @@ class PlannerNode(ManagedNode):
         self, request: GetPlan.Request, response: GetPlan.Response
     ) -> GetPlan.Response:
         start = request.start if request.start.header.frame_id else None
-        header, outcome = await self._answer(start, request.goal, request.tolerance)
+        planning = self._plan(start, [request.goal], request.tolerance)
+        header, outcome = await self._answer(planning, request.goal)
         response.plan = _path(path_message, outcome, header, request.goal)
         self._report.log(outcome)
         return response
@@ -235,7 +245,8 @@ class PlannerNode(ManagedNode):
         if goal is None:
             return
         self._active.begin(self._settings.replan_period)
-        header, outcome = await self._answer(None, goal, self._settings.tolerance, self._active)
+        planning = self._plan(None, [goal], self._settings.tolerance, self._active)
+        header, outcome = await self._answer(planning, goal)
         if outcome in (UNCHANGED, NOT_ACTIVE):
             return
         if self._active.is_news(outcome, header.frame_id):
@@ -254,16 +265,48 @@ class PlannerNode(ManagedNode):
             shown = Shown(outcome.planner, request.grid, field_goal, rule, header)
             self._display.show(shown)
 
+    async def _plan_for_action(
+        self, start: PoseStamped | None, goals: list[PoseStamped], planner_id: str, given_up: Future
+    ) -> tuple[Path, Outcome]:
+        goal = goals[-1] if goals else PoseStamped()
+        planning = self._plan(start, goals, self._settings.tolerance, planner_id=planner_id)
+        header, outcome = await self._answer(planning, goal, given_up)
+        if outcome.plan.cells:
+            self._plan_publisher.publish(_path(serialized_path, outcome, header, goal))
+        self._report.log(outcome)
+        return _path(path_message, outcome, header, goal), outcome
+
+    async def _on_is_path_valid(self, request: Any, response: Any) -> Any:
+        """Answer Nav2's IsPathValid: whether the robot can drive the rest of a path."""
+        response.is_valid = False
+        try:
+            checking = self._is_path_valid(request.path)
+            response.is_valid = await Unless(checking, self._stopped) is True
+        except RequestError as error:
+            self.get_logger().warning(f"no path to check: {error}")
+        return response
+
+    async def _is_path_valid(self, path: Path) -> bool:
+        header, grid, planner = await self._inputs()
+        frame = header.frame_id
+        cells = [
+            checked("INVALID_PATH", cell_from_pose, "the path", path.header, it.pose, grid, frame)
+            for it in path.poses
+        ]
+        rule = move_rule(self._settings.move_rule, planner)
+        robot = cells[0] if cells else None
+        with suppress(RequestError):
+            start = await self._known_start(frame)
+            robot = cell_from_pose("the start", start.header, start.pose, grid, frame)
+        return robot is not None and is_path_valid(cells, robot, grid, rule)
+
     async def _answer(
-        self,
-        start: PoseStamped | None,
-        goal: PoseStamped,
-        tolerance: float,
-        active: ActiveGoal | None = None,
+        self, planning: Coroutine[None, None, Outcome], goal: PoseStamped, *given_up: Future
     ) -> tuple[Header, Outcome]:
         """Return the path's header, and what became of the request.
 
-        For the active goal that may be `UNCHANGED`.
+        For the active goal that may be `UNCHANGED`. Without an answer, the request is given up as
+        soon as the node is stopped, or one of the futures has an outcome.
 
         A path is planned with the map, model and parameters that are there when this begins,
         whatever changes while it waits. Its stamp is the time of the answer.
@@ -271,8 +314,7 @@ class PlannerNode(ManagedNode):
         frame = self._map.frame or goal.header.frame_id
         self._answering += 1
         try:
-            planning = self._plan(start, goal, tolerance, active)
-            outcome = await Unless(self._stopped, planning)
+            outcome = await Unless(planning, self._stopped, *given_up)
         except RequestError as error:
             outcome = Outcome(error.status, str(error))
         except Exception as error:  # as when no memory is left: the node must survive
@@ -287,23 +329,19 @@ class PlannerNode(ManagedNode):
     async def _plan(
         self,
         start: PoseStamped | None,
-        goal: PoseStamped,
+        goals: Sequence[PoseStamped],
         tolerance: float,
-        active: ActiveGoal | None,
+        active: ActiveGoal | None = None,
+        planner_id: str = "",
     ) -> Outcome:
-        checked("INVALID_GOAL", check_pose, "the goal", goal.header, goal.pose, self._map.frame)
-        map_header, settings = self._map.header, self._settings
-        if map_header is None:
-            raise RequestError("NO_MAP", self._map.missing)
-        inflated = self._map.inflated()
-        await self._model.first()
-        planner = self._model.planner
-        if planner is None:
-            raise RequestError("NO_MODEL", f"no model is loaded: {self._report.refused['model']}")
+        settings = self._settings
+        check_request(goals, planner_id, settings.planner_id)
+        for goal in goals:
+            checked("INVALID_GOAL", check_pose, "the goal", goal.header, goal.pose, self._map.frame)
+        map_header, grid, planner = await self._inputs()
         frame = map_header.frame_id
         if start is None:
             start = await self._known_start(frame)
-        grid: GridMap = await inflated
 
         def cell(status: str, name: str, stamped: PoseStamped) -> Cell:
             pose = stamped.header, stamped.pose
@@ -314,7 +352,7 @@ class PlannerNode(ManagedNode):
             grid,
             tolerance=checked("INVALID_TOLERANCE", check_tolerance, tolerance) / grid.resolution,
             start=cell("INVALID_START", "the start", start),
-            goal=cell("INVALID_GOAL", "the goal", goal),
+            goal=cell("INVALID_GOAL", "the goal", goals[0]),
             move_rule=move_rule(settings.move_rule, planner),
             method=PlanMethod(settings.mode),
             simplified=settings.path_simplification == "line_of_sight",
@@ -324,13 +362,37 @@ class PlannerNode(ManagedNode):
             if next_request is None:
                 return UNCHANGED
             request = next_request
-        steps = planner.steps(request)
-        plan = next(steps)
-        if plan is None:  # a slow step follows
-            plan = await self._worker.run(last_step, steps)
-        reason = reason_of(request, plan, start, goal, settings.robot_radius)
+        plans: list[Plan] = []
+        for goal in goals:
+            if plans:
+                goal_cell = cell("INVALID_GOAL", "the goal", goal)
+                request = replace(request, start=plans[-1].cells[-1], goal=goal_cell)
+            steps = planner.steps(request)
+            plan = next(steps)
+            if plan is None:  # a slow step follows
+                plan = await self._worker.run(last_step, steps)
+            plans.append(plan)
+            if not plan.cells:
+                break
+        plan = joined(plans)
+        before, goal = [start, *goals][len(plans) - 1 : len(plans) + 1]
+        reason = reason_of(request, plan, before, goal, settings.robot_radius)
+        if len(goals) > 1 and not plan.cells:
+            reason = f"goal {len(plans)} of {len(goals)}: {reason}"
         stamp = seconds(map_header.stamp)
         return Outcome(plan.status.name, reason, planner, request, plan, stamp)
+
+    async def _inputs(self) -> tuple[Header, GridMap, Planner]:
+        """Return the header of the map of now, this map for the robot's body, and the planner."""
+        header = self._map.header
+        if header is None:
+            raise RequestError("NO_MAP", self._map.missing)
+        inflated = self._map.inflated()
+        await self._model.first()
+        planner = self._model.planner
+        if planner is None:
+            raise RequestError("NO_MODEL", f"no model is loaded: {self._report.refused['model']}")
+        return header, await inflated, planner
 
     # Diagnostics
 
@@ -346,7 +408,7 @@ class PlannerNode(ManagedNode):
         if self._active.is_look_due():
             self._replan.trigger()
         if self._report.is_due:
-            missing = [NOT_ACTIVE.reason] if self._stopped.done() else []
+            missing = [NOT_ACTIVE.reason] if not self._is_active() else []
             missing += [self._map.missing] if self._is_configured else []
             missing += ["the model is being loaded"] if self._model.is_loading else []
             fatal = self._model.planner is None and "model" in self._report.refused

@@ -89,6 +89,9 @@ PARAMETERS: Final = {
         "Memory for the Q fields in the cache, bytes; the last one is always kept",
         (0, 2**40),
     ),
+    "planner_id": Declared(
+        "GridBased", "The planner_id that Nav2's requests may name, beside the empty one"
+    ),
     "follow_trainer": Declared(
         False, "Whether to load each model that trainer/model_saved names", read_only=True
     ),

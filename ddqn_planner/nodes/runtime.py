@@ -237,19 +237,19 @@ class Worker:
 
 
 class Unless:
-    """Await a coroutine, or close it and have a future's result as soon as that is there."""
+    """Await a coroutine; or as soon as a future is done, close it and have that future's result."""
 
-    def __init__(self, given_up: Future, coroutine: Coroutine[None, None, Any]) -> None:
-        self._given_up, self._coroutine = given_up, coroutine
+    def __init__(self, coroutine: Coroutine[None, None, Any], *given_up: Future) -> None:
+        self._coroutine, self._given_up = coroutine, given_up
 
     def __await__(self) -> Generator[None, None, Any]:
-        while not self._given_up.done():
+        while not any(future.done() for future in self._given_up):
             try:
                 yield self._coroutine.send(None)
             except StopIteration as end:
                 return end.value
         self._coroutine.close()
-        return self._given_up.result()
+        return next(future.result() for future in self._given_up if future.done())
 
 
 HELP = """\
