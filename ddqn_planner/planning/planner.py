@@ -18,6 +18,7 @@ from ddqn_planner.grid.arguments import as_cell
 from ddqn_planner.model import ModelMetadata, QNetwork, load_model
 from ddqn_planner.model.move_costs import MoveCosts
 from ddqn_planner.planning.distance_field import DistanceField
+from ddqn_planner.planning.path_under_way import keep_or_switch
 from ddqn_planner.planning.plan import Plan, PlanMethod, PlanRequest, PlanStatus
 from ddqn_planner.planning.q_field import QField
 from ddqn_planner.planning.repair import repaired, shift_between
@@ -276,11 +277,16 @@ class Planner:
                     cells = search(way_out[-1], end, field.legal, costs, rule, field.value)
                 plan = Plan(PlanStatus.SUCCEEDED, np.array(cells), PlanMethod.ASTAR_FALLBACK)
         assert field is not None
-        path, cost = plan.path, None
+        path, cost, extra_cost = plan.path, None, None
         with rollout_time:
+            if path.size and len(request.under_way):
+                path, extra_cost = keep_or_switch(
+                    request.under_way, path, grid, rule, request.switch_threshold
+                )
+            if path.size and len(way_out) > 1:
+                path = np.concatenate([way_out[:-1], path], dtype=np.int32)
+            every_cell = path
             if path.size:
-                if len(way_out) > 1:
-                    path = np.concatenate([way_out[:-1], path], dtype=np.int32)
                 cost = None if grid.cost is None else path_cost(path, grid.cost_multiplier, rule)
                 if request.simplified:
                     path = np.array(simplify(path.tolist(), grid, rule))
@@ -290,6 +296,8 @@ class Planner:
             move_rule=rule,
             cost=cost,
             goal=field.goal,
+            every_cell=every_cell,
+            extra_cost=extra_cost,
             field_ms=field_time.ms,
             rollout_ms=rollout_time.ms,
         )

@@ -1,0 +1,33 @@
+"""A plan through several goals, of the plans from one to the next."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from ddqn_planner.planning import Plan, PlanMethod
+
+
+def joined(plans: Sequence[Plan]) -> Plan:
+    """Return one plan of several, each from the last cell of the one before, which is there once.
+
+    If the last one has no path, neither has the whole.
+    """
+    last = plans[-1]
+    if len(plans) == 1 or not last.path.size:
+        return last
+    costs = [plan.cost for plan in plans if plan.cost is not None]
+    searched = any(plan.method is PlanMethod.ASTAR_FALLBACK for plan in plans)
+    return replace(
+        last,
+        path=np.concatenate([plans[0].path[:1], *(plan.path[1:] for plan in plans)]),
+        every_cell=np.concatenate(
+            [plans[0].every_cell[:1], *(plan.every_cell[1:] for plan in plans)]
+        ),
+        method=PlanMethod.ASTAR_FALLBACK if searched else PlanMethod.GREEDY,
+        cost=sum(costs) if costs else None,
+        field_ms=sum(plan.field_ms for plan in plans),
+        rollout_ms=sum(plan.rollout_ms for plan in plans),
+    )
