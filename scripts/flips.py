@@ -58,7 +58,7 @@ class Drive:
 
 
 def main(_: Sequence[str]) -> int:
-    """Print a table: flips per 100 replans, and cost and length beside those without a threshold."""
+    """Print the flips per 100 replans; cost and length beside those of the first threshold."""
     rows, planner = [], Planner.load("any_map")
     for kind in KINDS:
         drives = {
@@ -147,7 +147,7 @@ def noisy(
 
 
 def is_flip(rest: NDArray[np.int32], path: NDArray[np.int32]) -> bool:
-    """Return whether a path leads away from what is left of the last one; both from the robot on."""
+    """Return whether a path leads away from what is left of the last one, near the robot."""
     if not len(rest):
         return False
     apart = np.hypot(*(path[:AHEAD, None] - rest[None]).transpose(2, 0, 1)).min(axis=1)
