@@ -26,9 +26,9 @@ from ddqn_planner.planning.path_under_way import rest_of_path
 from ddqn_planner.planning.planner import last_step
 
 RULE = MoveRule.ROBOT_SAFE
-THRESHOLDS = (0.0, 0.01, 0.03, 0.05, 0.1)
+THRESHOLDS = (0.0, 0.03, 0.05, 0.1)
 KINDS = ("two ways", "rooms", "office", "random_10")
-SIDE, RUNS, REPLANS = 160, 4, 100
+SIDE, RUNS, REPLANS = 160, 16, 100
 """Cells of a side, and for each kind: runs, and replans of one run at most."""
 
 STRIDE = 2

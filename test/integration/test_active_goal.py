@@ -41,7 +41,7 @@ def hall_robot(
 
 @pytest.fixture
 def robot(hall_robot: Robot) -> Robot:
-    before = {"replan_period": 1.0, "switch_threshold": 0.03, "start_source": "initialpose"}
+    before = {"replan_period": 1.0, "switch_threshold": 0.05, "start_source": "initialpose"}
     set_parameters(hall_robot, **before)
     hall_robot.begin(START, GOAL)
     return hall_robot
