@@ -102,7 +102,7 @@ def drive(planner: Planner, kind: str, seed: int, threshold: float, side: int = 
         plan = last_step(planner.steps(request))
         if not plan.cells:  # it waits
             continue
-        rest, path = rest_of_path(path, robot, grid, RULE), np.array(plan.cells, dtype=np.int32)
+        rest, path = rest_of_path(path, robot, grid, RULE), plan.path
         driven.replans += 1
         driven.flips += is_flip(rest, path)
         moved = plan.cells[1 : 1 + STRIDE]

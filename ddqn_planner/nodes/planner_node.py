@@ -405,7 +405,7 @@ def _path(make: Callable[..., Any], outcome: Outcome, header: Header, goal: Pose
     """Return the path of an outcome, or an empty one, made by a function of `conversions`."""
     if outcome.request is None:
         return Path(header=header)
-    return make(outcome.plan.cells, outcome.request.grid, header, goal.pose.orientation)
+    return make(outcome.plan.path, outcome.request.grid, header, goal.pose.orientation)
 
 
 def main() -> NoReturn:

@@ -230,7 +230,7 @@ def test_a_simplified_path_is_kept_as_a_whole() -> None:
     assert len(first.cells) < len(first.every_cell)
     kept = plan(two_corridors(22, 20), 0.1, first.every_cell, simplified=True)
     assert is_upper(kept)
-    assert list(kept.every_cell) == list(first.every_cell)
+    assert np.array_equal(kept.every_cell, first.every_cell)
     assert len(kept.cells) < len(kept.every_cell)
 
 
