@@ -10,8 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ddqn_planner.grid import Cell, GridMap, MoveRule, path_length
-from ddqn_planner.grid.arguments import Choice
-from ddqn_planner.planning.path_under_way import Path
+from ddqn_planner.grid.arguments import Cells, Choice
 
 
 class PlanStatus(str, Enum):
@@ -52,7 +51,7 @@ class PlanRequest:
         that a path reaches.
     simplified : bool
         Whether to leave out cells, see `simplify`.
-    under_way : (N, 2)
+    under_way : (N, 2) int32
         The path that the robot follows, move by move, if there is one.
     switch_threshold : float
         How much more the rest of it may cost than the new path, as a share, see `keep_or_switch`.
@@ -65,7 +64,7 @@ class PlanRequest:
     method: PlanMethod = PlanMethod.GREEDY
     tolerance: float = 0.0
     simplified: bool = False
-    under_way: Path = field(default=(), compare=False)
+    under_way: Cells = field(default=(), compare=False)
     switch_threshold: float = 0.0
 
 
@@ -91,7 +90,7 @@ class Plan:
     goal : (x, y), optional
         Where the path ends, or would end: the goal asked for, or the cell to which it moved. None
         if no Q field is needed to say that there is no path, or for a rollout.
-    every_cell : (N, 2)
+    every_cell : (N, 2) int32
         The path move by move, before it was simplified, if a planner made the plan.
     extra_cost : float, optional
         How much more the path costs than a new one, as a share, if it is the rest of the one under
@@ -107,7 +106,7 @@ class Plan:
     move_rule: MoveRule = MoveRule.ROBOT_SAFE
     cost: float | None = None
     goal: Cell | None = None
-    every_cell: Path = ()
+    every_cell: Cells = ()
     extra_cost: float | None = None
     field_ms: float = 0.0
     rollout_ms: float = 0.0
@@ -124,8 +123,8 @@ class Plan:
         return hash(self._identity())
 
     def _identity(self) -> tuple[object, ...]:
-        path = self.path.tobytes()
-        return self.status, path, self.method, self.move_rule, self.cost, self.goal, self.extra_cost
+        path, costs = self.path.tobytes(), (self.cost, self.extra_cost)
+        return self.status, path, self.method, self.move_rule, costs, self.goal
 
     @cached_property
     def cells(self) -> tuple[Cell, ...]:

@@ -279,17 +279,18 @@ class Planner:
         assert field is not None
         path, cost, extra_cost = plan.path, None, None
         with rollout_time:
-            if path.size and len(request.under_way):
-                path, extra_cost = keep_or_switch(
-                    request.under_way, path, grid, rule, request.switch_threshold
-                )
-            if path.size and len(way_out) > 1:
-                path = np.concatenate([way_out[:-1], path], dtype=np.int32)
-            every_cell = path
             if path.size:
+                if len(request.under_way):
+                    threshold = request.switch_threshold
+                    path, extra_cost = keep_or_switch(
+                        request.under_way, path, grid, rule, threshold
+                    )
+                if len(way_out) > 1:
+                    path = np.concatenate([way_out[:-1], path], dtype=np.int32)
                 cost = None if grid.cost is None else path_cost(path, grid.cost_multiplier, rule)
-                if request.simplified:
-                    path = np.array(simplify(path.tolist(), grid, rule))
+            every_cell = path
+            if request.simplified:
+                path = np.array(simplify(path.tolist(), grid, rule), dtype=np.int32)
         yield replace(
             plan,
             path=path,
