@@ -152,12 +152,17 @@ class GridMap:
         return cls(occupied, resolution, origin, cost, forbidden=forbidden)  # type: ignore[arg-type]
 
     def with_patch(
-        self, occupancy: ArrayLike, x: int, y: int, cost: ArrayLike | None = None
+        self,
+        occupancy: ArrayLike,
+        x: int,
+        y: int,
+        cost: ArrayLike | None = None,
+        obstacles: ArrayLike | None = None,
     ) -> GridMap:
         """Return the same map with other cells from (x, y) on; this map stays as it is.
 
-        On a map that `inflate` made, occupied cells of the patch are obstacles, and the cells
-        around them are not inflated: better patch the map of the obstacles, and inflate it again.
+        On a map that `inflate` made, the cells around the patch are not inflated: better patch the
+        map of the obstacles, and inflate it again.
 
         Parameters
         ----------
@@ -168,6 +173,9 @@ class GridMap:
         cost : (h, w) array of whole numbers, optional
             Costs of the new free cells, as for `GridMap`. By default free cells keep their costs,
             and those that were occupied cost 0. On a map without costs, the other cells cost 0.
+        obstacles : (h, w) bool, optional
+            Which of the new occupied cells are obstacles, as for `GridMap`; by default all. On a
+            map without obstacles of its own they are ignored.
 
         Raises
         ------
@@ -187,12 +195,13 @@ class GridMap:
         if costs is not None or cost is not None:
             costs = np.zeros(self.occupancy.shape, dtype=np.int8) if costs is None else costs
             costs = _replaced(costs, box, _costs(costs[box] if cost is None else cost, patch))
+        closed = patch if obstacles is None else patch & np.asarray(obstacles, dtype=np.bool_)
         patched = object.__new__(GridMap)  # the cells outside the patch need no check
         patched._set("occupancy", _replaced(self.occupancy, box, patch))
         patched._set("resolution", self.resolution)
         patched._set("origin", self.origin)
         patched._set("cost", costs)
-        patched._set("obstacles", _replaced(self.obstacles, box, patch))
+        patched._set("obstacles", _replaced(self.obstacles, box, closed))
         patched._set("forbidden", self.forbidden)
         return patched
 

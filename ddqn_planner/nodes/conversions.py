@@ -19,6 +19,7 @@ from rclpy.serialization import serialize_message
 from std_msgs.msg import Header
 
 from ddqn_planner.grid import Cell, GridMap
+from ddqn_planner.grid.costmap import grid_from_costmap
 from ddqn_planner.grid.map_file import MAX_CELLS
 
 if TYPE_CHECKING:
@@ -38,8 +39,9 @@ def grid_from_message(
     occupied_threshold: int = 65,
     allow_unknown: bool = False,
     use_map_costs: bool = False,
+    map_type: str = "map",
 ) -> GridMap:
-    """Make a grid map of a map message; see `GridMap.from_occupancy_values`.
+    """Make a grid map of a map message; for the rest see `grid_from_values`.
 
     Raises
     ------
@@ -50,11 +52,30 @@ def grid_from_message(
     info = message.info
     values = np.frombuffer(message.data, np.int8).reshape(info.height, info.width)
     origin = (info.origin.position.x, info.origin.position.y, _yaw(info.origin.orientation))
-    rules = occupied_threshold, allow_unknown, use_map_costs
+    rules = occupied_threshold, allow_unknown, use_map_costs, map_type
     try:
-        return GridMap.from_occupancy_values(values, info.resolution, origin, *rules)
+        return grid_from_values(values, info.resolution, origin, *rules)
     except MemoryError:
         raise ValueError("no memory is left for the map; give a smaller one") from None
+
+
+def grid_from_values(
+    values: NDArray[np.int8],
+    resolution: float,
+    origin: tuple[float, float, float],
+    occupied_threshold: int,
+    allow_unknown: bool,
+    use_map_costs: bool,
+    map_type: str,
+) -> GridMap:
+    """Make a grid map: `GridMap.from_occupancy_values`, or `grid_from_costmap` for a costmap.
+
+    A costmap has its own threshold and costs.
+    """
+    if map_type == "costmap":
+        return grid_from_costmap(values, resolution, origin, allow_unknown)
+    rules = occupied_threshold, allow_unknown, use_map_costs
+    return GridMap.from_occupancy_values(values, resolution, origin, *rules)
 
 
 def occupancy_message(

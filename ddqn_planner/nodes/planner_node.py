@@ -18,7 +18,7 @@ from types import SimpleNamespace
 from typing import Any, NoReturn
 
 from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped
-from nav_msgs.msg import OccupancyGrid, Odometry, Path
+from nav_msgs.msg import Odometry, Path
 from nav_msgs.srv import GetPlan
 from rcl_interfaces.msg import SetParametersResult
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup, ReentrantCallbackGroup
@@ -27,17 +27,16 @@ from rclpy.task import Future
 from std_msgs.msg import Header, String
 
 from ddqn_planner.grid import Cell, GridMap, MoveRule
-from ddqn_planner.grid.body import Inflation
 from ddqn_planner.model.certificate import NO_CERTIFICATE, certificate_of
 from ddqn_planner.nodes.conversions import (
     cell_from_pose,
     check_pose,
     check_tolerance,
-    grid_from_message,
     path_message,
     serialized_path,
 )
 from ddqn_planner.nodes.field_display import FieldDisplay, Shown
+from ddqn_planner.nodes.map_source import MapSource
 from ddqn_planner.nodes.model_loading import load, load_and_warm_up
 from ddqn_planner.nodes.planner_parameters import PARAMETERS
 from ddqn_planner.nodes.report import (
@@ -45,7 +44,6 @@ from ddqn_planner.nodes.report import (
     Report,
     RequestError,
     checked,
-    describe_map,
     reason_of,
     seconds,
 )
@@ -53,9 +51,6 @@ from ddqn_planner.nodes.runtime import LATCHED, STEADY, BaseNode, Worker, spin_u
 from ddqn_planner.nodes.start_source import StartSource, check_tf
 from ddqn_planner.planning import PlanMethod, Planner, PlanRequest
 from ddqn_planner.planning.planner import last_step
-
-MAP_PARAMETERS = ("occupied_threshold", "allow_unknown", "use_map_costs")
-BODY_PARAMETERS = ("robot_radius", "clearance_weight")
 
 LOOK_PERIOD = 0.1
 """Seconds between two looks whether something changed: an answer does not wait for diagnostics."""
@@ -73,23 +68,17 @@ class PlannerNode(BaseNode):
 
     def __init__(self) -> None:
         super().__init__("planner", PARAMETERS)
-        self._map: OccupancyGrid | None = None
-        self._inflated: Future | None = None
-        self._inflate = Inflation()
         self._goal: PoseStamped | None = None
         self._planner: Planner | None = None
         self._model_file = ""
         self._settings = self.settings()
         self._worker = Worker(self)
-        # Maps must not wait for fields: 2000 x 2000 cells take over a second.
-        self._map_worker = Worker(self)
         # While it loads, DDS discovers, and the node says what else is missing.
         self._first_planner = self._worker.call(load_and_warm_up, self._settings.model)
         self._model_is_due = True
         self._display = FieldDisplay(self)
         self._report = Report(self)
         self._logged: tuple[PoseStamped, object] | None = None
-        self._logged_map = ""
         self._next_look = Future()
         self._waits_for_start = False
 
@@ -99,9 +88,7 @@ class PlannerNode(BaseNode):
             self._plan_for_active_goal, MutuallyExclusiveCallbackGroup()
         )
         self._start = StartSource(self, self._settings.start_source, self._on_start)
-        maps = self.create_subscription(OccupancyGrid, "map", self._on_map, LATCHED)
-        self._map_topic = maps.topic_name
-        self.get_logger().info(f"waiting for a map on {self._map_topic}")
+        self._map = MapSource(self, self._report, self._on_map)
         self.create_subscription(PoseStamped, "goal_pose", self._on_goal_pose, 10)
         if self._settings.follow_trainer:
             self.create_subscription(String, "trainer/model_saved", self._on_model_saved, LATCHED)
@@ -136,8 +123,7 @@ class PlannerNode(BaseNode):
             self._start.close()
             self._report.accept(self._start.topic)
             self._start = StartSource(self, settings.start_source, self._on_start)
-        if self._map is not None and changed.intersection(MAP_PARAMETERS + BODY_PARAMETERS):
-            self._use_map(self._map)
+        self._map.apply_parameters(changed)
         self._replan.trigger()
 
     async def _first_model(self) -> None:
@@ -178,43 +164,15 @@ class PlannerNode(BaseNode):
 
     # Map, start and goal
 
-    def _on_map(self, message: OccupancyGrid) -> None:
-        if not self._use_map(message):
-            return
-        if message.header.frame_id != self._frame():
+    def _on_map(self, frame_changed: bool) -> None:
+        if frame_changed:
             # What was refused for its frame may be right now.
             self._report.accept(self._start.topic)
-        self._map = message
-        self._report.change()
-        described = describe_map(message)
-        if described != self._logged_map:
-            self._logged_map = described
-            self.get_logger().info(f"map of {described}")
         self._replan.trigger()
-
-    def _use_map(self, message: OccupancyGrid) -> bool:
-        """Plan on it from now on, or refuse it."""
-        try:
-            self._grid = grid_from_message(message, *map(self.value, MAP_PARAMETERS))
-        except ValueError as error:
-            self._report.refuse("map", str(error))
-            return False
-        self._report.accept("map")
-        self._inflated = None
-        return True
-
-    def _inflated_map(self) -> Future:
-        """Return the map for the robot's body, which is computed for the first request."""
-        if self._inflated is None:
-            radius, weight = map(self.value, BODY_PARAMETERS)
-            # ROS accepts a value that is above the range by a millionth.
-            body = radius, min(weight, 1.0)
-            self._inflated = self._map_worker.call(self._inflate, self._grid, *body)
-        return self._inflated
 
     def _on_start(self, message: PoseWithCovarianceStamped | Odometry) -> None:
         try:
-            due = self._start.take(message, self._frame())
+            due = self._start.take(message, self._map.frame)
         except ValueError as error:
             self._report.refuse(self._start.topic, str(error))
             return
@@ -239,14 +197,6 @@ class PlannerNode(BaseNode):
         self._goal = message
         self._display.show_again()
         self._replan.trigger()
-
-    def _frame(self) -> str:
-        return self._map.header.frame_id if self._map is not None else ""
-
-    def _missing_map(self) -> str:
-        refused = self._report.refused.get("map")
-        because = f" ({refused})" if refused else ""
-        return f"no map was received on {self._map_topic} yet{because}; start a map server"
 
     # Planning
 
@@ -288,7 +238,7 @@ class PlannerNode(BaseNode):
         A path is planned with the map, model and parameters that are there when this begins,
         whatever changes while it waits. Its stamp is the time of the answer.
         """
-        frame = self._frame() or goal.header.frame_id
+        frame = self._map.frame or goal.header.frame_id
         try:
             outcome = await self._plan(start, goal, tolerance)
         except RequestError as error:
@@ -302,16 +252,16 @@ class PlannerNode(BaseNode):
     async def _plan(
         self, start: PoseStamped | None, goal: PoseStamped, tolerance: float
     ) -> Outcome:
-        checked("INVALID_GOAL", check_pose, "the goal", goal.header, goal.pose, self._frame())
-        map_message, settings = self._map, self._settings
-        if map_message is None:
-            raise RequestError("NO_MAP", self._missing_map())
-        inflated = self._inflated_map()
+        checked("INVALID_GOAL", check_pose, "the goal", goal.header, goal.pose, self._map.frame)
+        map_header, settings = self._map.header, self._settings
+        if map_header is None:
+            raise RequestError("NO_MAP", self._map.missing)
+        inflated = self._map.inflated()
         await self._first_model()
         planner = self._planner
         if planner is None:
             raise RequestError("NO_MODEL", f"no model is loaded: {self._report.refused['model']}")
-        frame = map_message.header.frame_id
+        frame = map_header.frame_id
         if start is None:
             start = await self._known_start(frame)
         grid: GridMap = await inflated
@@ -335,7 +285,7 @@ class PlannerNode(BaseNode):
         if plan is None:  # a slow step follows
             plan = await self._worker.call(last_step, steps)
         reason = reason_of(request, plan, start, goal, settings.robot_radius)
-        stamp = seconds(map_message.header.stamp)
+        stamp = seconds(map_header.stamp)
         return Outcome(plan.status.name, reason, planner, request, plan, stamp)
 
     @staticmethod
@@ -350,12 +300,12 @@ class PlannerNode(BaseNode):
         looked.set_result(None)
         if self._waits_for_start and self._start.name == "tf":
             with suppress(RequestError):
-                self._start_pose(self._frame())
+                self._start_pose(self._map.frame)
                 self._waits_for_start = False
                 self._replan.trigger()
         if self._report.is_due:
-            missing = [self._missing_map()] if self._map is None else []
-            missing += ["the model is being loaded"] if self._model_is_due else []
+            loading = "the model is being loaded" if self._model_is_due else ""
+            missing = filter(None, (self._map.missing, loading))
             fatal = self._planner is None and not self._model_is_due
             self._report.publish(fatal, "; ".join(missing), self._describe())
 
@@ -371,10 +321,7 @@ class PlannerNode(BaseNode):
             description["model training steps"] = str(metadata.steps)
             certificate = certificate_of(self._planner.network, metadata.move_rule)
             description["model certificate"] = str(certificate or NO_CERTIFICATE)
-        if self._map is not None:
-            description["map"] = describe_map(self._map)
-            description["map stamp (s)"] = seconds(self._map.header.stamp)
-        return description
+        return description | self._map.describe()
 
 
 def _path(make: Callable[..., Any], outcome: Outcome, header: Header, goal: PoseStamped) -> Any:

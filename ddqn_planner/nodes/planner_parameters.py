@@ -20,6 +20,11 @@ PARAMETERS: Final = {
         "Which diagonal moves are legal; '' for the rule of the model",
         ["", *(rule.value for rule in MoveRule)],
     ),
+    "map_type": Declared(
+        "map",
+        "How the map's values are read: as a map's, or as a costmap's of Nav2",
+        ["map", "costmap"],
+    ),
     "occupied_threshold": Declared(
         65, "A cell of this value or more is occupied, percent", (1, 100)
     ),

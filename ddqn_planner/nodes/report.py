@@ -85,7 +85,8 @@ def reason_of(
             f"goal: {_place(goal, request.goal)}; map: {grid.width} x {grid.height} cells)"
         )
         if plan.status is PlanStatus.GOAL_OCCUPIED and not grid.is_obstacle(request.goal):
-            reason += f", nearer to an obstacle than robot_radius, {robot_radius:g} m"
+            near = f"robot_radius, {robot_radius:g} m" if robot_radius else "the costmap allows"
+            reason += f", nearer to an obstacle than {near}"
         return f"{reason}; {REMEDIES[plan.status]}"
     reason = f"a path of {plan.length:.2f} cells, " + (
         "by greedy steps"
