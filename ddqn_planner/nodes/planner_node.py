@@ -254,7 +254,7 @@ class PlannerNode(BaseNode):
     ) -> Outcome:
         checked("INVALID_GOAL", check_pose, "the goal", goal.header, goal.pose, self._map.frame)
         map_header, settings = self._map.header, self._settings
-        if map_header is None:
+        if map_header is None or self._map.missing:
             raise RequestError("NO_MAP", self._map.missing)
         inflated = self._map.inflated()
         await self._first_model()

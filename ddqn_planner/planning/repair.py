@@ -35,10 +35,15 @@ def shift_between(old: GridMap, new: GridMap) -> Cell | None:
     The cell (x, y) of the old map is (x + dx, y + dy) in the new one. As a map grows, mapping
     shifts it.
     """
+    if (old.cost is None, old.forbidden is None) != (new.cost is None, new.forbidden is None):
+        return None
+    return offset_between(old, new)
+
+
+def offset_between(old: GridMap, new: GridMap) -> Cell | None:
+    """Return where cell (0, 0) of one map lies in another; None if their cells do not match."""
     same = math.isclose(old.resolution, new.resolution, rel_tol=1e-6)
     if not same or old.origin[2] != new.origin[2]:
-        return None
-    if (old.cost is None, old.forbidden is None) != (new.cost is None, new.forbidden is None):
         return None
     corner = old.cell_to_world((0, 0))
     shift = new.world_to_cell(*corner)
