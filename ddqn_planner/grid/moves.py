@@ -117,14 +117,19 @@ def connected_cells(
     return connected
 
 
-def path_length(cells: Sequence[Cell], move_rule: MoveRule | str = MoveRule.ROBOT_SAFE) -> float:
+def path_length(
+    cells: Sequence[Cell] | NDArray[np.integer[Any]],
+    move_rule: MoveRule | str = MoveRule.ROBOT_SAFE,
+) -> float:
     """Return the length in cells of a path of straight segments between the given cells."""
     x, y = np.asarray(cells, dtype=np.int64).reshape(-1, 2).T
     return float(segment_lengths(np.diff(x), np.diff(y), move_rule).sum())
 
 
 def path_cost(
-    cells: Sequence[Cell], multiplier: NDArray[np.float32], move_rule: MoveRule | str
+    cells: Sequence[Cell] | NDArray[np.integer[Any]],
+    multiplier: NDArray[np.float32],
+    move_rule: MoveRule | str,
 ) -> float:
     """Return the cost of a path of neighbouring cells: the sum of its moves, see `move_costs`."""
     x, y = np.asarray(cells, dtype=np.int64).reshape(-1, 2).T

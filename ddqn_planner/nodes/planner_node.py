@@ -12,22 +12,21 @@ from __future__ import annotations
 
 import ctypes
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Coroutine, Sequence
 from contextlib import suppress
-from types import SimpleNamespace
+from dataclasses import replace
 from typing import Any, NoReturn
 
 from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped
 from nav_msgs.msg import Odometry, Path
 from nav_msgs.srv import GetPlan
-from rcl_interfaces.msg import SetParametersResult
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup, ReentrantCallbackGroup
 from rclpy.parameter import Parameter
 from rclpy.task import Future
 from std_msgs.msg import Header, String
 
-from ddqn_planner.grid import Cell, GridMap, MoveRule
-from ddqn_planner.model.certificate import NO_CERTIFICATE, certificate_of
+from ddqn_planner.grid import Cell, GridMap
+from ddqn_planner.nodes.active_goal import UNCHANGED, ActiveGoal
 from ddqn_planner.nodes.conversions import (
     cell_from_pose,
     check_pose,
@@ -36,10 +35,14 @@ from ddqn_planner.nodes.conversions import (
     serialized_path,
 )
 from ddqn_planner.nodes.field_display import FieldDisplay, Shown
+from ddqn_planner.nodes.lifecycle import ManagedNode
 from ddqn_planner.nodes.map_source import MapSource
-from ddqn_planner.nodes.model_loading import load, load_and_warm_up
+from ddqn_planner.nodes.model_loading import ModelSource, load, move_rule
+from ddqn_planner.nodes.nav2_interface import serve_nav2
+from ddqn_planner.nodes.path_action import check_request
 from ddqn_planner.nodes.planner_parameters import PARAMETERS
 from ddqn_planner.nodes.report import (
+    NOT_ACTIVE,
     Outcome,
     Report,
     RequestError,
@@ -47,41 +50,58 @@ from ddqn_planner.nodes.report import (
     reason_of,
     seconds,
 )
-from ddqn_planner.nodes.runtime import LATCHED, STEADY, BaseNode, Worker, spin_until_shutdown
+from ddqn_planner.nodes.runtime import LATCHED, STEADY, Unless, Worker, spin_until_shutdown
 from ddqn_planner.nodes.start_source import StartSource, check_tf
-from ddqn_planner.planning import PlanMethod, Planner, PlanRequest
+from ddqn_planner.nodes.via_points import joined
+from ddqn_planner.planning import Plan, PlanMethod, Planner, PlanRequest
+from ddqn_planner.planning.path_under_way import is_path_valid
 from ddqn_planner.planning.planner import last_step
 
 LOOK_PERIOD = 0.1
 """Seconds between two looks whether something changed: an answer does not wait for diagnostics."""
 
 
-class PlannerNode(BaseNode):
+class PlannerNode(ManagedNode):
     """Plans from where the robot is to the active goal, the last ``goal_pose``.
 
-    The active goal stays until the next ``goal_pose``, even if there is no plan for it. The node
-    plans for it again whenever the map, the ``initialpose``, the model or a parameter changes.
-    Triggers during planning are coalesced into one more plan with the latest inputs. A malformed
-    map, start or model is refused, and the one before it stays. A request that comes while the
-    first model is loaded waits for it.
+    The active goal stays until the next ``goal_pose``, though there may be no plan. `ActiveGoal`
+    decides when the node plans for it again, and what it publishes. Triggers during planning are
+    coalesced into one more plan with the latest inputs. A malformed map, start or model is refused,
+    and the one before it stays. A request that comes while the first model is loaded waits for it.
+    While the node is not active, it refuses requests.
     """
 
     def __init__(self) -> None:
         super().__init__("planner", PARAMETERS)
-        self._goal: PoseStamped | None = None
-        self._planner: Planner | None = None
-        self._model_file = ""
         self._settings = self.settings()
-        self._worker = Worker(self)
-        # While it loads, DDS discovers, and the node says what else is missing.
-        self._first_planner = self._worker.call(load_and_warm_up, self._settings.model)
-        self._model_is_due = True
-        self._display = FieldDisplay(self)
         self._report = Report(self)
-        self._logged: tuple[PoseStamped, object] | None = None
+        self._worker = Worker(self)
+        self._model = ModelSource(self, self._report, self._worker)
+        if self._settings.autostart:
+            # While it loads, DDS discovers, and the node says what else is missing.
+            self._model.load()
         self._next_look = Future()
+        self._answering = 0
+        self._forget()
+        self.create_timer(LOOK_PERIOD, self._on_look, clock=STEADY)
+        self.add_post_set_parameters_callback(self._apply_parameters)
+        if self._settings.autostart:
+            self.start()
+
+    # Lifecycle
+
+    def _forget(self) -> None:
+        """Have no map and no goal, and refuse requests."""
+        self._is_configured = False
+        self._stopped = Future()
+        self._stop()
+        self._active = ActiveGoal()
+        self._logged: tuple[PoseStamped, object] | None = None
         self._waits_for_start = False
 
+    def configure(self) -> None:
+        """Listen to the map and to where the robot is, and create what answers requests."""
+        self._display = FieldDisplay(self)
         self._plan_publisher = self.create_publisher(Path, "plan", LATCHED)
         # In a group of its own: triggers that come while it plans make it plan once more after.
         self._replan = self.create_guard_condition(
@@ -91,17 +111,54 @@ class PlannerNode(BaseNode):
         self._map = MapSource(self, self._report, self._on_map)
         self.create_subscription(PoseStamped, "goal_pose", self._on_goal_pose, 10)
         if self._settings.follow_trainer:
-            self.create_subscription(String, "trainer/model_saved", self._on_model_saved, LATCHED)
+            self.create_subscription(String, "trainer/model_saved", self._model.on_saved, LATCHED)
         # Reentrant: a request that waits for its field does not keep out the others.
         self.create_service(
             GetPlan, "~/get_plan", self._on_get_plan, callback_group=ReentrantCallbackGroup()
         )
-        self.create_trigger("~/reload_model", self._on_reload_model)
-        self.create_timer(LOOK_PERIOD, self._on_look, clock=STEADY)
-        self.add_post_set_parameters_callback(self._apply_parameters)
+        self.create_trigger("~/reload_model", self._model.on_reload)
+        serve_nav2(self, self._is_active, self._plan_for_action, self._on_is_path_valid)
+        self._is_configured = True
+
+    def activate(self) -> None:
+        """Answer requests from now on."""
+        self._stopped = Future()
+        self._report.change()
         self._replan.trigger()
 
-    # Parameters and the model
+    def deactivate(self) -> None:
+        """Forget the active goal."""
+        self._active = ActiveGoal()
+        self._report.change()
+
+    def cleanup(self) -> None:
+        """Free the map, the model and its fields."""
+        self._forget()
+        self._report.forget()
+        del self._display, self._start, self._map
+        self._model.forget()
+
+    async def prepare(self, transition: str) -> bool:
+        """Load the model before ``configure``; answer what waits before the node stops."""
+        if transition == "configure":
+            self._model.load()
+            await self._model.first()
+            return self._model.planner is not None
+        if transition in ("deactivate", "shutdown"):
+            self._stop()
+            while self._answering:
+                await self._next_look
+        return True
+
+    def _is_active(self) -> bool:
+        return not self._stopped.done()
+
+    def _stop(self) -> None:
+        """Answer all requests that wait, and those that come from now on, that it is not active."""
+        if self._is_active():
+            self._stopped.set_result(NOT_ACTIVE)
+
+    # Parameters
 
     def check_parameters(self, new: dict[str, Any]) -> None:
         """Check new values as `BaseNode` does, whether TF can be used, and load a new model."""
@@ -113,54 +170,21 @@ class PlannerNode(BaseNode):
 
     def _apply_parameters(self, parameters: list[Parameter]) -> None:
         settings = self._settings = self.settings()
+        if not self._is_configured:
+            return
         changed = {parameter.name for parameter in parameters}
         if "model" in changed:
-            self._use_planner(*self._candidate)
-        if self._planner is not None:
-            self._planner.cache_bytes = settings.field_cache_bytes
+            self._model.use(*self._candidate)
+        if self._model.planner is not None:
+            self._model.planner.cache_bytes = settings.field_cache_bytes
         if settings.start_source != self._start.name:
             # What the other source said, and what was refused of it, no longer counts.
             self._start.close()
             self._report.accept(self._start.topic)
             self._start = StartSource(self, settings.start_source, self._on_start)
         self._map.apply_parameters(changed)
+        self._active.restart()
         self._replan.trigger()
-
-    async def _first_model(self) -> None:
-        """Wait for the model of the start, and use it unless another one was set since."""
-        if not self._model_is_due:
-            return
-        try:
-            loaded = await self._first_planner
-            if self._model_is_due:
-                self._use_planner(*loaded)
-        except Exception as error:
-            if self._model_is_due:
-                self._model_is_due = False
-                reason = f"{str(error) or repr(error)}; or set the parameter 'model'"
-                self._report.refuse("model", reason)
-
-    def _use_planner(self, planner: Planner, model_file: str) -> None:
-        """Plan with it from now on."""
-        self._planner, self._model_file, self._model_is_due = planner, model_file, False
-        planner.cache_bytes = self._settings.field_cache_bytes
-        self._report.accept("model")
-        self._report.change()
-        self.get_logger().info(f"planning with the model {model_file}")
-
-    def _set_model(self, name: str) -> SetParametersResult:
-        return self.set_parameters([Parameter("model", Parameter.Type.STRING, name)])[0]
-
-    def _on_model_saved(self, message: String) -> None:
-        result = self._set_model(message.data)
-        if not result.successful:
-            self._report.refuse("model", f"the trainer's model was refused: {result.reason}")
-
-    def _on_reload_model(self) -> tuple[bool, str]:
-        result = self._set_model(self._settings.model)
-        if not result.successful:
-            self.get_logger().error(f"the model was not loaded again: {result.reason}")
-        return result.successful, result.reason or f"loaded {self._model_file}"
 
     # Map, start and goal
 
@@ -178,6 +202,7 @@ class PlannerNode(BaseNode):
             return
         self._report.accept(self._start.topic)
         if due:
+            self._active.plan_at_once()
             self._replan.trigger()
 
     def _start_pose(self, frame: str) -> PoseStamped:
@@ -194,7 +219,11 @@ class PlannerNode(BaseNode):
             await self._next_look
 
     def _on_goal_pose(self, message: PoseStamped) -> None:
-        self._goal = message
+        if not self._is_active():
+            self._report.note(NOT_ACTIVE)
+            self._report.log(NOT_ACTIVE)
+            return
+        self._active.set(message)
         self._display.show_again()
         self._replan.trigger()
 
@@ -204,18 +233,24 @@ class PlannerNode(BaseNode):
         self, request: GetPlan.Request, response: GetPlan.Response
     ) -> GetPlan.Response:
         start = request.start if request.start.header.frame_id else None
-        header, outcome = await self._answer(start, request.goal, request.tolerance)
+        planning = self._plan(start, [request.goal], request.tolerance)
+        header, outcome = await self._answer(planning, request.goal)
         response.plan = _path(path_message, outcome, header, request.goal)
         self._report.log(outcome)
         return response
 
     async def _plan_for_active_goal(self) -> None:
-        await self._first_model()
-        goal = self._goal
+        await self._model.first()
+        goal = self._active.pose
         if goal is None:
             return
-        header, outcome = await self._answer(None, goal, self._settings.tolerance)
-        self._plan_publisher.publish(_path(serialized_path, outcome, header, goal))
+        self._active.begin(self._settings.replan_period)
+        planning = self._plan(None, [goal], self._settings.tolerance, self._active)
+        header, outcome = await self._answer(planning, goal)
+        if outcome in (UNCHANGED, NOT_ACTIVE):
+            return
+        if self._active.is_news(outcome, header.frame_id):
+            self._plan_publisher.publish(_path(serialized_path, outcome, header, goal))
         self._waits_for_start = outcome.status == "NO_START"
         # The places and lengths in the reason may differ.
         logged = goal, (outcome.status, outcome.plan.method)
@@ -230,41 +265,83 @@ class PlannerNode(BaseNode):
             shown = Shown(outcome.planner, request.grid, field_goal, rule, header)
             self._display.show(shown)
 
+    async def _plan_for_action(
+        self, start: PoseStamped | None, goals: list[PoseStamped], planner_id: str, given_up: Future
+    ) -> tuple[Path, Outcome]:
+        goal = goals[-1] if goals else PoseStamped()
+        planning = self._plan(start, goals, self._settings.tolerance, planner_id=planner_id)
+        header, outcome = await self._answer(planning, goal, given_up)
+        if outcome.plan.cells:
+            self._plan_publisher.publish(_path(serialized_path, outcome, header, goal))
+        self._report.log(outcome)
+        return _path(path_message, outcome, header, goal), outcome
+
+    async def _on_is_path_valid(self, request: Any, response: Any) -> Any:
+        """Answer Nav2's IsPathValid: whether the robot can drive the rest of a path."""
+        response.is_valid = False
+        try:
+            checking = self._is_path_valid(request.path)
+            response.is_valid = await Unless(checking, self._stopped) is True
+        except RequestError as error:
+            self.get_logger().warning(f"no path to check: {error}")
+        return response
+
+    async def _is_path_valid(self, path: Path) -> bool:
+        header, grid, planner = await self._inputs()
+        frame = header.frame_id
+        cells = [
+            checked("INVALID_PATH", cell_from_pose, "the path", path.header, it.pose, grid, frame)
+            for it in path.poses
+        ]
+        rule = move_rule(self._settings.move_rule, planner)
+        robot = cells[0] if cells else None
+        with suppress(RequestError):
+            start = await self._known_start(frame)
+            robot = cell_from_pose("the start", start.header, start.pose, grid, frame)
+        return robot is not None and is_path_valid(cells, robot, grid, rule)
+
     async def _answer(
-        self, start: PoseStamped | None, goal: PoseStamped, tolerance: float
+        self, planning: Coroutine[None, None, Outcome], goal: PoseStamped, *given_up: Future
     ) -> tuple[Header, Outcome]:
         """Return the path's header, and what became of the request.
+
+        For the active goal that may be `UNCHANGED`. Without an answer, the request is given up as
+        soon as the node is stopped, or one of the futures has an outcome.
 
         A path is planned with the map, model and parameters that are there when this begins,
         whatever changes while it waits. Its stamp is the time of the answer.
         """
         frame = self._map.frame or goal.header.frame_id
+        self._answering += 1
         try:
-            outcome = await self._plan(start, goal, tolerance)
+            outcome = await Unless(planning, self._stopped, *given_up)
         except RequestError as error:
             outcome = Outcome(error.status, str(error))
         except Exception as error:  # as when no memory is left: the node must survive
             remedy = "give a smaller map, or another model"
             outcome = Outcome("FAILED", f"the planning failed ({error!r}); {remedy}")
-        self._report.note(outcome)
+        finally:
+            self._answering -= 1
+        if outcome is not UNCHANGED:
+            self._report.note(outcome)
         return Header(stamp=self.get_clock().now().to_msg(), frame_id=frame), outcome
 
     async def _plan(
-        self, start: PoseStamped | None, goal: PoseStamped, tolerance: float
+        self,
+        start: PoseStamped | None,
+        goals: Sequence[PoseStamped],
+        tolerance: float,
+        active: ActiveGoal | None = None,
+        planner_id: str = "",
     ) -> Outcome:
-        checked("INVALID_GOAL", check_pose, "the goal", goal.header, goal.pose, self._map.frame)
-        map_header, settings = self._map.header, self._settings
-        if map_header is None or self._map.missing:
-            raise RequestError("NO_MAP", self._map.missing)
-        inflated = self._map.inflated()
-        await self._first_model()
-        planner = self._planner
-        if planner is None:
-            raise RequestError("NO_MODEL", f"no model is loaded: {self._report.refused['model']}")
+        settings = self._settings
+        check_request(goals, planner_id, settings.planner_id)
+        for goal in goals:
+            checked("INVALID_GOAL", check_pose, "the goal", goal.header, goal.pose, self._map.frame)
+        map_header, grid, planner = await self._inputs()
         frame = map_header.frame_id
         if start is None:
             start = await self._known_start(frame)
-        grid: GridMap = await inflated
 
         def cell(status: str, name: str, stamped: PoseStamped) -> Cell:
             pose = stamped.header, stamped.pose
@@ -275,22 +352,47 @@ class PlannerNode(BaseNode):
             grid,
             tolerance=checked("INVALID_TOLERANCE", check_tolerance, tolerance) / grid.resolution,
             start=cell("INVALID_START", "the start", start),
-            goal=cell("INVALID_GOAL", "the goal", goal),
-            move_rule=self._move_rule(settings, planner),
+            goal=cell("INVALID_GOAL", "the goal", goals[0]),
+            move_rule=move_rule(settings.move_rule, planner),
             method=PlanMethod(settings.mode),
             simplified=settings.path_simplification == "line_of_sight",
         )
-        steps = planner.steps(request)
-        plan = next(steps)
-        if plan is None:  # a slow step follows
-            plan = await self._worker.call(last_step, steps)
-        reason = reason_of(request, plan, start, goal, settings.robot_radius)
+        if active is not None:
+            next_request = active.next_request(request, frame, settings.switch_threshold)
+            if next_request is None:
+                return UNCHANGED
+            request = next_request
+        plans: list[Plan] = []
+        for goal in goals:
+            if plans:
+                goal_cell = cell("INVALID_GOAL", "the goal", goal)
+                request = replace(request, start=plans[-1].cells[-1], goal=goal_cell)
+            steps = planner.steps(request)
+            plan = next(steps)
+            if plan is None:  # a slow step follows
+                plan = await self._worker.run(last_step, steps)
+            plans.append(plan)
+            if not plan.cells:
+                break
+        plan = joined(plans)
+        before, goal = [start, *goals][len(plans) - 1 : len(plans) + 1]
+        reason = reason_of(request, plan, before, goal, settings.robot_radius)
+        if len(goals) > 1 and not plan.cells:
+            reason = f"goal {len(plans)} of {len(goals)}: {reason}"
         stamp = seconds(map_header.stamp)
         return Outcome(plan.status.name, reason, planner, request, plan, stamp)
 
-    @staticmethod
-    def _move_rule(settings: SimpleNamespace, planner: Planner) -> MoveRule:
-        return MoveRule(settings.move_rule or planner.metadata.move_rule)
+    async def _inputs(self) -> tuple[Header, GridMap, Planner]:
+        """Return the header of the map of now, this map for the robot's body, and the planner."""
+        header = self._map.header
+        if header is None or self._map.missing:
+            raise RequestError("NO_MAP", self._map.missing)
+        inflated = self._map.inflated()
+        await self._model.first()
+        planner = self._model.planner
+        if planner is None:
+            raise RequestError("NO_MODEL", f"no model is loaded: {self._report.refused['model']}")
+        return header, await inflated, planner
 
     # Diagnostics
 
@@ -303,25 +405,18 @@ class PlannerNode(BaseNode):
                 self._start_pose(self._map.frame)
                 self._waits_for_start = False
                 self._replan.trigger()
+        if self._active.is_look_due():
+            self._replan.trigger()
         if self._report.is_due:
-            loading = "the model is being loaded" if self._model_is_due else ""
-            missing = filter(None, (self._map.missing, loading))
-            fatal = self._planner is None and not self._model_is_due
-            self._report.publish(fatal, "; ".join(missing), self._describe())
+            missing = [NOT_ACTIVE.reason] if not self._is_active() else []
+            missing += [self._map.missing] if self._is_configured else []
+            missing += ["the model is being loaded"] if self._model.is_loading else []
+            fatal = self._model.planner is None and "model" in self._report.refused
+            self._report.publish(fatal, "; ".join(filter(None, missing)), self._describe())
 
     def _describe(self) -> dict[str, str]:
-        description = {"model": self._settings.model}
-        if self._planner is not None:
-            rule = self._move_rule(self._settings, self._planner)
-            description |= {"model file": self._model_file, "move rule": rule.value}
-            metadata = self._planner.metadata
-            description["model move rule"] = metadata.move_rule.value
-            sizes = metadata.sizes.items()
-            description["model sizes"] = ", ".join(f"{key} {size}" for key, size in sizes)
-            description["model training steps"] = str(metadata.steps)
-            certificate = certificate_of(self._planner.network, metadata.move_rule)
-            description["model certificate"] = str(certificate or NO_CERTIFICATE)
-        return description | self._map.describe()
+        of_map = self._map.describe() if self._is_configured else {}
+        return {"state": self.state, **self._model.describe(self._settings.move_rule), **of_map}
 
 
 def _path(make: Callable[..., Any], outcome: Outcome, header: Header, goal: PoseStamped) -> Any:

@@ -10,6 +10,11 @@ from ddqn_planner.planning import PlanMethod
 from ddqn_planner.planning.planner import CACHE_BYTES
 
 PARAMETERS: Final = {
+    "autostart": Declared(
+        True,
+        "Whether the node configures and activates itself; else a lifecycle manager does it",
+        read_only=True,
+    ),
     "model": Declared(
         "any_map",
         "Name of a shipped model, or path of a model file",
@@ -51,6 +56,18 @@ PARAMETERS: Final = {
         "How far a goal_pose that is occupied or cut off may move to a reachable free cell, metres",
         (0, 1000),
     ),
+    "replan_period": Declared(
+        1.0,
+        "How soon the path to the goal_pose follows a changed map or a moving robot while it is "
+        "not blocked, seconds; 0: with each map",
+        (0, 3600),
+    ),
+    "switch_threshold": Declared(
+        0.03,
+        "How much more the path under way may cost than a new one and still be kept, as a share; "
+        "~/get_plan always has the new one",
+        (0, 10),
+    ),
     "mode": Declared(
         "greedy",
         "Whether to search where the greedy steps are trapped: astar_fallback",
@@ -74,6 +91,9 @@ PARAMETERS: Final = {
         CACHE_BYTES,
         "Memory for the Q fields in the cache, bytes; the last one is always kept",
         (0, 2**40),
+    ),
+    "planner_id": Declared(
+        "GridBased", "The planner_id that Nav2's requests may name, beside the empty one"
     ),
     "follow_trainer": Declared(
         False, "Whether to load each model that trainer/model_saved names", read_only=True

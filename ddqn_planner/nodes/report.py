@@ -71,6 +71,14 @@ class Outcome:
     map_stamp: str = ""
 
 
+NO_REQUEST = Outcome("NO_REQUEST", "no plan was asked for yet")
+NOT_ACTIVE = Outcome(
+    "NOT_ACTIVE",
+    "the node is not active; configure and activate it, with a lifecycle manager or "
+    "`ros2 lifecycle set`",
+)
+
+
 def reason_of(
     request: PlanRequest, plan: Plan, start: PoseStamped, goal: PoseStamped, robot_radius: float
 ) -> str:
@@ -93,6 +101,8 @@ def reason_of(
         if plan.method is PlanMethod.GREEDY
         else "searched for in the order of the Q field: the greedy steps were trapped"
     )
+    if plan.extra_cost:
+        reason += f", kept: its cost is {plan.extra_cost:+.1%} beside that of a new one"
     if plan.cells[-1] != request.goal:
         metres = math.dist(plan.cells[-1], request.goal) * grid.resolution
         why = "is cut off" if grid.is_free(request.goal) else "is occupied"
@@ -120,7 +130,7 @@ class Report:
 
     def __init__(self, node: BaseNode) -> None:
         self.refused: dict[str, str] = {}
-        self._outcome = Outcome("NO_REQUEST", "no plan was asked for yet")
+        self._outcome = NO_REQUEST
         self._node = node
         self._publisher = node.create_publisher(DiagnosticArray, "/diagnostics", 10)
         self._to_be_logged: list[str] = []
@@ -142,6 +152,12 @@ class Report:
         """Forget that something was refused."""
         if self.refused.pop(what, None):
             self.change()
+
+    def forget(self) -> None:
+        """Forget what was refused, and the last outcome."""
+        self.refused.clear()
+        self._outcome = NO_REQUEST
+        self.change()
 
     def note(self, outcome: Outcome) -> None:
         """Store the last outcome for the diagnostics."""

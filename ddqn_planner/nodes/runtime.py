@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Coroutine, Generator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from inspect import isawaitable
 from pathlib import Path
@@ -209,10 +209,15 @@ class Worker:
         self._wake = node.create_guard_condition(lambda: None)
 
     def call(self, function: Callable[..., Any], *arguments: object) -> Future:
-        """Return the future of a call; it has the exception if the function raises one."""
+        """Return the future of a call; it has the exception if the function raises one.
+
+        A call whose future is cancelled before it begins is left out.
+        """
         future = Future()
 
         def work() -> None:
+            if future.cancelled():
+                return
             try:
                 future.set_result(function(*arguments))
             except Exception as error:
@@ -221,6 +226,30 @@ class Worker:
 
         self._thread.submit(work)
         return future
+
+    async def run(self, function: Callable[..., Any], *arguments: object) -> Any:
+        """Return the result of a call, which is left out if nobody awaits it when it begins."""
+        future = self.call(function, *arguments)
+        try:
+            return await future
+        finally:
+            future.cancel()
+
+
+class Unless:
+    """Await a coroutine; or as soon as a future is done, close it and have that future's result."""
+
+    def __init__(self, coroutine: Coroutine[None, None, Any], *given_up: Future) -> None:
+        self._coroutine, self._given_up = coroutine, given_up
+
+    def __await__(self) -> Generator[None, None, Any]:
+        while not any(future.done() for future in self._given_up):
+            try:
+                yield self._coroutine.send(None)
+            except StopIteration as end:
+                return end.value
+        self._coroutine.close()
+        return next(future.result() for future in self._given_up if future.done())
 
 
 HELP = """\

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from enum import Enum
 
 from ddqn_planner.grid import Cell, GridMap, MoveRule, path_length
 from ddqn_planner.grid.arguments import Choice
+from ddqn_planner.planning.path_under_way import Path
 
 
 class PlanStatus(str, Enum):
@@ -47,6 +49,10 @@ class PlanRequest:
         that a path reaches.
     simplified : bool
         Whether to leave out cells, see `simplify`.
+    under_way : (N, 2)
+        The path that the robot follows, move by move, if there is one.
+    switch_threshold : float
+        How much more the rest of it may cost than the new path, as a share, see `keep_or_switch`.
     """
 
     grid: GridMap
@@ -56,6 +62,8 @@ class PlanRequest:
     method: PlanMethod = PlanMethod.GREEDY
     tolerance: float = 0.0
     simplified: bool = False
+    under_way: Path = field(default=(), compare=False)
+    switch_threshold: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -78,6 +86,11 @@ class Plan:
     goal : (x, y), optional
         Where the path ends, or would end: the goal asked for, or the cell to which it moved. None
         if no Q field is needed to say that there is no path, or for a rollout.
+    every_cell : sequence of (x, y)
+        The path move by move, before it was simplified, if a planner made the plan.
+    extra_cost : float, optional
+        How much more the path costs than a new one, as a share, if it is the rest of the one under
+        way; None for a new path.
     field_ms, rollout_ms : float
         How long it took to get the Q field, and the path from it, in milliseconds. Where the field
         had to grow for the start, its time includes the path.
@@ -89,6 +102,8 @@ class Plan:
     move_rule: MoveRule = MoveRule.ROBOT_SAFE
     cost: float | None = None
     goal: Cell | None = None
+    every_cell: Sequence[Cell] = field(default=(), compare=False)
+    extra_cost: float | None = None
     field_ms: float = field(default=0.0, compare=False)
     rollout_ms: float = field(default=0.0, compare=False)
 

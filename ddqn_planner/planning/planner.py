@@ -18,6 +18,7 @@ from ddqn_planner.grid.arguments import as_cell
 from ddqn_planner.model import ModelMetadata, QNetwork, load_model
 from ddqn_planner.model.move_costs import MoveCosts
 from ddqn_planner.planning.distance_field import DistanceField
+from ddqn_planner.planning.path_under_way import keep_or_switch
 from ddqn_planner.planning.plan import Plan, PlanMethod, PlanRequest, PlanStatus
 from ddqn_planner.planning.q_field import QField
 from ddqn_planner.planning.repair import repaired, shift_between
@@ -276,13 +277,19 @@ class Planner:
                     cells = search(way_out[-1], end, field.legal, costs, rule, field.value)
                 plan = Plan(PlanStatus.SUCCEEDED, cells, PlanMethod.ASTAR_FALLBACK)
         assert field is not None
-        cells, cost = plan.cells, None
+        cells, cost, extra_cost = plan.cells, None, None
         with rollout_time:
+            if cells and len(request.under_way):
+                kept, extra_cost = keep_or_switch(
+                    request.under_way, cells, grid, rule, request.switch_threshold
+                )
+                cells = tuple(map(tuple, kept.tolist()))
+            every_cell = cells = way_out[:-1] + cells if cells else ()
             if cells:
-                cells = way_out[:-1] + cells
                 cost = None if grid.cost is None else path_cost(cells, grid.cost_multiplier, rule)
                 cells = simplify(cells, grid, rule) if request.simplified else cells
         plan = replace(plan, cells=cells, move_rule=rule, cost=cost, goal=field.goal)
+        plan = replace(plan, every_cell=every_cell, extra_cost=extra_cost)
         yield replace(plan, field_ms=field_time.ms, rollout_ms=rollout_time.ms)
 
     def _visit_some(self, request: PlanRequest) -> tuple[QField | None, Plan | None]:

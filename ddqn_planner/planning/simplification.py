@@ -42,10 +42,7 @@ def simplify(cells: Sequence[Cell], grid: GridMap, move_rule: MoveRule | str) ->
     def joins(first: int, last: int) -> bool:
         if last - first == 1:  # a move of the path itself
             return True
-        touched = touched_cells(path[first], path[last], rule)
-        if grid.occupancy[touched[:, 1], touched[:, 0]].any():
-            return False
-        if grid.forbidden is not None and goes_against(path[first], path[last], grid.forbidden):
+        if not is_legal_segment(path[first], path[last], grid, rule):
             return False
         cost = segment_cost(path[first], path[last], multiplier, rule)
         return cost <= (1 + ROUNDING) * path_cost(path[first : last + 1], multiplier, rule)
@@ -77,15 +74,20 @@ def touched_cells(first: Cell, last: Cell, move_rule: MoveRule | str) -> NDArray
     return np.concatenate([passed, np.stack([x, next_y], 1), np.stack([next_x, y], 1)])
 
 
-def goes_against(first: Cell, last: Cell, forbidden: NDArray[np.uint8]) -> bool:
-    """Return whether a segment leaves a cell that forbids one of the moves that it replaces."""
+def is_legal_segment(first: Cell, last: Cell, grid: GridMap, move_rule: MoveRule | str) -> bool:
+    """Return whether a segment between two cells of a map is legal, see `simplify`."""
+    x, y = touched_cells(first, last, move_rule).T
+    if grid.occupancy[y, x].any():
+        return False
+    if grid.forbidden is None:
+        return True
     vector = np.subtract(last, first)
     moves = [np.sign(vector)]  # as many diagonal ones as it has room for, and straight ones
     if abs(vector[0]) != abs(vector[1]):
         moves.append(np.where(np.abs(vector) == np.abs(vector).max(), moves[0], 0))
     x, y = _passed_cells(first, last)[0][:-1].T
-    return any(
-        (forbidden[y, x] >> action & 1).any()
+    return not any(
+        (grid.forbidden[y, x] >> action & 1).any()
         for move in moves
         for action in np.flatnonzero((move == MOVES).all(axis=1))
     )

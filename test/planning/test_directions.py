@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import itertools
 from dataclasses import replace
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -25,6 +25,7 @@ from ddqn_planner.grid import (
 )
 from ddqn_planner.planning import repair, simplify
 from ddqn_planner.planning.distance_field import DistanceField
+from ddqn_planner.planning.path_under_way import is_path_valid, legal_segments, rest_of_path
 from ddqn_planner.planning.simplification import touched_cells
 
 RULES = st.sampled_from(list(MoveRule))
@@ -52,7 +53,7 @@ def directed_distances(grid: GridMap, goal: Cell, rule: MoveRule) -> np.ndarray:
 def assert_obeys(cells: tuple[Cell, ...], grid: GridMap, rule: MoveRule) -> None:
     legal = grid.legal_moves(rule)
     moves = MOVES.tolist()
-    for (x, y), (next_x, next_y) in itertools.pairwise(cells):
+    for (x, y), (next_x, next_y) in pairwise(cells):
         assert legal[moves.index([next_x - x, next_y - y]), y, x]
 
 
@@ -281,7 +282,7 @@ def test_a_simplified_path_obeys(
     assert kept[:1] + kept[-1:] == tuple(path[:1] + path[-1:])
     moves = MOVES.tolist()
     assert grid.forbidden is None or grid.forbidden.any()
-    for first, last in itertools.pairwise(kept):
+    for first, last in pairwise(kept):
         if [last[0] - first[0], last[1] - first[1]] in moves:
             continue  # a move of the path
         angle = np.arctan2(last[1] - first[1], last[0] - first[0]) / (np.pi / 4)
@@ -289,6 +290,34 @@ def test_a_simplified_path_obeys(
         for x, y in touched_cells(first, last, MoveRule.UNIT).tolist():
             if (x, y) != last and grid.forbidden is not None:
                 assert not any(grid.forbidden[y, x] >> action & 1 for action in actions)
+
+
+@given(grids_with_directions(), RULES, st.data())
+def test_a_path_under_way_is_legal_while_it_obeys(
+    grid_and_goal: tuple[GridMap, Cell], rule: MoveRule, data: st.DataObject
+) -> None:
+    grid, goal = grid_and_goal
+    start = data.draw(st.sampled_from(grid.free_cells()))
+    anywhere = shortest_path(replace(grid, forbidden=None), start, goal, rule)
+    legal, moves = grid.legal_moves(rule), MOVES.tolist()
+    expected = [
+        legal[moves.index([after[0] - x, after[1] - y]), y, x]
+        for (x, y), after in pairwise(anywhere)
+    ]
+    assert legal_segments(anywhere, grid, rule).tolist() == expected
+    if anywhere:
+        assert is_path_valid(anywhere, start, grid, rule) == all(expected)
+    path = shortest_path(grid, start, goal, rule)
+    assert legal_segments(simplify(path, grid, rule), grid, rule).all()
+
+
+def test_where_the_directions_turn_round_a_path_under_way_is_given_up() -> None:
+    planner, grid = Planner(NETWORK, METADATA), corridor(ONLY_EAST)
+    cells = planner.plan(grid, (0, 0), (5, 0)).cells
+    for path in (cells, cells[:: len(cells) - 1]):
+        assert is_path_valid(path, (0, 0), grid, "robot_safe")
+        assert not is_path_valid(path, (0, 0), corridor(ONLY_WEST), "robot_safe")
+        assert not len(rest_of_path(path, (0, 0), corridor(ONLY_WEST), "robot_safe"))
 
 
 def test_new_obstacles_leave_a_path_that_obeys() -> None:
