@@ -13,7 +13,14 @@ from numpy.typing import ArrayLike, NDArray
 
 from ddqn_planner.grid.arguments import Cell as Cell
 from ddqn_planner.grid.arguments import Occupancy, as_cell, whole_numbers
-from ddqn_planner.grid.moves import MoveRule, component_labels
+from ddqn_planner.grid.labels import flood
+from ddqn_planner.grid.moves import (
+    MOVES,
+    MoveRule,
+    component_labels,
+    legal_moves,
+    reversed_moves,
+)
 
 OCCUPIED = 100
 """The value of an occupied cell in ``nav_msgs/OccupancyGrid``."""
@@ -50,11 +57,17 @@ class GridMap:
         Which occupied cells are obstacles. The others are only too near to an obstacle for the
         robot's body, and a robot that starts there may leave; `inflate` makes such maps. By default
         all occupied cells are obstacles.
+    forbidden : (H, W) array of whole numbers 0..255, optional
+        One-way zones: action a must not leave a cell where bit a is set, ``forbidden >> a & 1``.
+        The actions are those of `MOVES`, in the directions of the map's own x and y. A cell may
+        always be entered, so 0b00111000 = 56 in each cell of an aisle (bits 3, 4 and 5: all moves
+        with dx = -1) lets a robot drive through it toward greater x, and not back. Directions
+        belong to the place: they stay where a cell becomes occupied or free.
 
     Raises
     ------
     ValueError
-        If a shape, a number or a cost is wrong, or if an obstacle lies on a free cell.
+        If a shape, a number, a cost or a direction is wrong, or if an obstacle lies on a free cell.
     """
 
     occupancy: Occupancy
@@ -62,6 +75,7 @@ class GridMap:
     origin: tuple[float, float, float] = (0.0, 0.0, 0.0)
     cost: NDArray[np.int8] | None = None
     obstacles: Occupancy | None = None
+    forbidden: NDArray[np.uint8] | None = None
 
     def __post_init__(self) -> None:
         occupancy = _occupancy(self.occupancy)
@@ -85,6 +99,8 @@ class GridMap:
                     f"{occupancy.shape}, within the occupied cells"
                 )
             self._set("obstacles", obstacles)
+        if self.forbidden is not None:
+            self._set("forbidden", _directions(self.forbidden, occupancy.shape))
 
     def _set(self, name: str, value: Any) -> None:
         if isinstance(value, np.ndarray):
@@ -100,6 +116,7 @@ class GridMap:
         occupied_threshold: int = 65,
         allow_unknown: bool = False,
         use_map_costs: bool = False,
+        forbidden: ArrayLike | None = None,
     ) -> GridMap:
         """Make a grid map from the values of a ``nav_msgs/OccupancyGrid``.
 
@@ -107,7 +124,7 @@ class GridMap:
         ----------
         values : (H, W) array of integers -128..127
             Occupancy in percent. Any value below 0 is unknown, any above 100 is occupied.
-        resolution, origin
+        resolution, origin, forbidden
             As for `GridMap`.
         occupied_threshold : int
             A cell of this value or more is occupied, 1..100. The default is the usual
@@ -132,7 +149,7 @@ class GridMap:
         if not allow_unknown:
             occupied |= array < 0
         cost = np.maximum(array, UNKNOWN) if use_map_costs else None
-        return cls(occupied, resolution, origin, cost)
+        return cls(occupied, resolution, origin, cost, forbidden=forbidden)  # type: ignore[arg-type]
 
     def with_patch(
         self,
@@ -185,6 +202,7 @@ class GridMap:
         patched._set("origin", self.origin)
         patched._set("cost", costs)
         patched._set("obstacles", _replaced(self.obstacles, box, closed))
+        patched._set("forbidden", self.forbidden)
         return patched
 
     @property
@@ -217,27 +235,52 @@ class GridMap:
             self._labels[rule.cuts_corners] = component_labels(self.occupancy, rule)
         return self._labels[rule.cuts_corners]
 
+    def legal_moves(self, move_rule: MoveRule | str) -> NDArray[np.bool_]:
+        """Return which moves are legal in each cell, see `legal_moves`: (8, H, W) bool."""
+        return legal_moves(self.occupancy, move_rule, self.forbidden)
+
+    def reachable(
+        self, cells: ArrayLike, move_rule: MoveRule | str, backward: bool = False
+    ) -> NDArray[np.bool_]:
+        """Return (H, W) bool: some free cells, and where paths lead that start in one of them.
+
+        Parameters
+        ----------
+        cells : (N, 2) array of whole numbers
+            As (x, y).
+        move_rule : MoveRule
+        backward : bool
+            Whether paths end, instead of start, in one of the cells.
+        """
+        array = np.asarray(cells, dtype=np.int64).reshape(-1, 2)
+        if self.forbidden is None:
+            labels = self.labels(move_rule)
+            return np.isin(labels, labels[array[:, 1], array[:, 0]])
+        legal = self.legal_moves(move_rule)
+        return flood(reversed_moves(legal) if backward else legal, array, MOVES)
+
     @cached_property
     def _labels(self) -> dict[bool, NDArray[np.int32]]:
         return {}
 
     @cached_property
     def fingerprint(self) -> str:
-        """Hexadecimal digest of size, occupancy and costs; equal maps have the same digest."""
+        """Hexadecimal digest of size and cells; equal maps have the same digest."""
         digest = hashlib.sha256(f"{self.height}x{self.width}:".encode())
         digest.update(np.packbits(self.occupancy).tobytes())
         if self.cost is not None:
             digest.update(self.cost.tobytes())
+        if self.forbidden is not None:
+            digest.update(b"forbidden:" + self.forbidden.tobytes())
         return digest.hexdigest()[:16]
 
     def same_cells(self, other: GridMap) -> bool:
-        """Return whether the occupancy and the costs of two maps are equal, wherever they lie."""
-        if self is other:
-            return True
-        same = np.array_equal(self.occupancy, other.occupancy)
-        if not same or self.cost is None or other.cost is None:
-            return same and self.cost is other.cost
-        return np.array_equal(self.cost, other.cost)
+        """Return whether all cells of two maps are equal, wherever the maps lie."""
+        return self is other or (
+            np.array_equal(self.occupancy, other.occupancy)
+            and _equal(self.cost, other.cost)
+            and _equal(self.forbidden, other.forbidden)
+        )
 
     def contains(self, cell: Cell) -> bool:
         """Return whether a cell lies inside the map."""
@@ -310,3 +353,17 @@ def _replaced(array: NDArray[Any] | None, box: tuple[slice, slice], values: NDAr
         array = array.copy()
         array[box] = values
     return array
+
+
+def _directions(forbidden: ArrayLike, shape: tuple[int, int]) -> NDArray[np.uint8] | None:
+    """Return a copy, checked; None where nothing is forbidden."""
+    if np.shape(forbidden) != shape:
+        raise ValueError(f"forbidden has shape {np.shape(forbidden)}; give {shape}")
+    array = whole_numbers("forbidden directions", forbidden, 0, 255)
+    return array.astype(np.uint8, order="C") if array.any() else None
+
+
+def _equal(some: NDArray[Any] | None, others: NDArray[Any] | None) -> bool:
+    if some is None or others is None or some is others:
+        return some is others
+    return np.array_equal(some, others)

@@ -41,6 +41,15 @@ def patch_numbers(occupancy: NDArray[np.bool_]) -> NDArray[np.uint16]:
 
 
 @compiled_now
+def occurring(values: NDArray[np.uint8]) -> NDArray[np.bool_]:
+    """Return which values occur: (256,) bool."""
+    occurs = np.zeros(256, np.bool_)
+    for value in values:
+        occurs[value] = True
+    return occurs
+
+
+@compiled_now
 def cost_of(
     patch: Any, table: Any, value: Any, terms: Any, width: int, cell: int, action: int
 ) -> Any:

@@ -77,6 +77,36 @@ def costs_by_patch(patch_C: NDArray[Any], table_PA: Array, width: int) -> MoveCo
     return MoveCosts(patch_C, table_PA, None, None, width, highest, straight, diagonal)
 
 
+def with_directions(
+    patch: NDArray[Any], table_PA: Array, forbidden: NDArray[np.uint8] | None
+) -> tuple[NDArray[Any], Array]:
+    """Return patches and a table of costs in which forbidden moves are not possible.
+
+    Each set of forbidden actions that occurs has its own copy of the table.
+
+    Parameters
+    ----------
+    patch : (...) uint16 or int32
+        The number of each cell's patch.
+    table_PA : (P, 8) float32
+    forbidden : (...) uint8, optional
+        See `GridMap`.
+    """
+    if forbidden is None:
+        return patch, table_PA
+    from ddqn_planner.model.compiled_costs import occurring
+
+    occurs = occurring(forbidden.ravel())
+    sets = np.flatnonzero(occurs)
+    is_forbidden_SA = (sets[:, None] >> np.arange(table_PA.shape[1]) & 1).astype(np.bool_)
+    tables_SPA = np.where(is_forbidden_SA[:, None], np.float32(np.inf), table_PA)
+    small = len(sets) * len(table_PA) <= 2**16
+    first_row = ((np.cumsum(occurs) - 1) * len(table_PA)).astype(np.uint16 if small else np.int32)
+    rows = first_row.take(forbidden)
+    rows += patch.astype(rows.dtype, copy=False)
+    return rows, tables_SPA.reshape(-1, table_PA.shape[1])
+
+
 def every_patch() -> NDArray[np.int8]:
     """Return all 512 patches without costs, in the order of their numbers: (512, 9) int8."""
     return ((np.arange(OCCUPIED_PATCH)[:, None] >> np.arange(9) & 1) * OCCUPIED).astype(np.int8)

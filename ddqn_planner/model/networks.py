@@ -35,6 +35,7 @@ from ddqn_planner.model.move_costs import (
     costs_by_patch,
     every_patch,
     legal_in_patches,
+    with_directions,
 )
 from ddqn_planner.model.observation import ROBOT, observation_background, unique_patches
 
@@ -231,9 +232,10 @@ class PropagationQNetwork(QNetwork):
         if costs is None:
             return None
         value = cell_values(grid) if with_costs else None
-        return costs._replace(
-            patch=patch_numbers(grid.occupancy), value=value, width=grid.width + 2
-        )
+        patch, table = patch_numbers(grid.occupancy), costs.table
+        if grid.forbidden is not None:
+            patch, table = with_directions(patch, table, np.pad(grid.forbidden, 1).ravel())
+        return costs._replace(patch=patch, table=table, value=value, width=grid.width + 2)
 
     @cached_property
     def _costs_by_rule(self) -> dict[tuple[MoveRule, bool], MoveCosts | None]:
@@ -267,7 +269,8 @@ class PropagationQNetwork(QNetwork):
         from ddqn_planner.model.wavefront import propagate_values
 
         patch_id, patch_P9 = unique_patches(grid.occupancy, grid.cost if self.uses_costs else None)
-        return propagate_values(patch_id, self._costs_of(patch_P9, move_rule), goal)
+        cost_PA = self._costs_of(patch_P9, move_rule)
+        return propagate_values(*with_directions(patch_id, cost_PA, grid.forbidden), goal)
 
     def _costs_of(self, patch_P9: NDArray[np.int8], move_rule: MoveRule) -> Array:
         """Return the cost of each move in each patch, infinite if not possible: (P, 8) float32."""

@@ -96,6 +96,18 @@ def occupancy_message(
     return message
 
 
+def directions_message(
+    forbidden: NDArray[np.uint8] | None,
+    resolution: float,
+    origin: tuple[float, float, float],
+    header: Header,
+) -> OccupancyGrid:
+    """Make the message of a map's forbidden directions, see `GridMap`; without cells for none."""
+    if forbidden is None:
+        return OccupancyGrid(header=header)
+    return occupancy_message(forbidden.view(np.int8), resolution, origin, header)
+
+
 def value_message(field: QField | None, grid: GridMap, header: Header) -> OccupancyGrid:
     """Make a map message of a value field: 0 the lowest value, 100 the goal's, -1 for no value."""
     percent = np.full(grid.occupancy.shape, -1, dtype=np.int8)

@@ -15,6 +15,7 @@ from std_msgs.msg import Header
 
 from ddqn_planner.grid.body import Inflation
 from ddqn_planner.nodes.conversions import grid_from_message, grid_from_values
+from ddqn_planner.nodes.map_directions import MapDirections
 from ddqn_planner.nodes.report import Report, describe_map, seconds
 from ddqn_planner.nodes.runtime import LATCHED, BaseNode, Worker
 
@@ -42,7 +43,7 @@ class MapSource:
         It says what was refused.
     on_map : callable
         Called after each map and each update that was not refused, with whether the map's frame is
-        a new one.
+        a new one; for a map that waits for its directions, once it has them.
 
     Attributes
     ----------
@@ -62,8 +63,10 @@ class MapSource:
         self._inflate = Inflation()
         # Maps must not wait for fields: 2000 x 2000 cells take over a second.
         self._worker = Worker(node)
+        self._incomplete = ""
+        self._directions = MapDirections(node, report, self._take_directions)
         maps = node.create_subscription(OccupancyGrid, "map", self._take, LATCHED)
-        self._subscriptions = [maps]
+        self._subscriptions = [self._directions.subscription, maps]
         self._topic = maps.topic_name
         self._updates_topic = f"{self._topic}_updates"
         if OccupancyGridUpdate is not None:
@@ -81,9 +84,9 @@ class MapSource:
 
     @property
     def missing(self) -> str:
-        """Why there is no map and what to do; empty with a map."""
+        """Why there is no map to plan on, and what to do; empty with a map."""
         if self.header is not None:
-            return ""
+            return self._incomplete
         refused = self._report.refused.get("map")
         because = f" ({refused})" if refused else ""
         return f"no map was received on {self._topic} yet{because}; start a map server"
@@ -110,7 +113,8 @@ class MapSource:
 
     def apply_parameters(self, changed: set[str]) -> None:
         """Read and inflate the map anew if one of the parameters that changed says so."""
-        if self._message is not None and changed.intersection(MAP_PARAMETERS + BODY_PARAMETERS):
+        read = {*MAP_PARAMETERS, *BODY_PARAMETERS, "require_directions"}
+        if self._message is not None and changed & read:
             self._read(self._message)
 
     def close(self) -> None:
@@ -138,12 +142,20 @@ class MapSource:
                 once=True,
             )
         self._report.change()
-        self._on_map(frame_changed)
+        if not self._incomplete:
+            self._on_map(frame_changed)
+
+    def _take_directions(self) -> None:
+        if self._message is not None and self._read(self._message):
+            self._report.change()
+            if not self._incomplete:
+                self._on_map(True)  # the map's frame may be new since the last complete one
 
     def _read(self, message: OccupancyGrid) -> bool:
         """Plan on it from now on, or refuse it."""
         try:
-            self._grid = grid_from_message(message, *self._rules())
+            grid = grid_from_message(message, *self._rules())
+            self._grid, self._incomplete = self._directions.on(grid, message.header)
         except ValueError as error:
             self._report.refuse("map", str(error))
             return False
@@ -175,7 +187,8 @@ class MapSource:
         self._updates += 1
         self._inflated = None
         self._report.change()
-        self._on_map(False)
+        if not self._incomplete:
+            self._on_map(False)
 
 
 def updated_values(message: OccupancyGrid | None, update: Any) -> NDArray[np.int8]:

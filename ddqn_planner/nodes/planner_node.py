@@ -385,7 +385,7 @@ class PlannerNode(ManagedNode):
     async def _inputs(self) -> tuple[Header, GridMap, Planner]:
         """Return the header of the map of now, this map for the robot's body, and the planner."""
         header = self._map.header
-        if header is None:
+        if header is None or self._map.missing:
             raise RequestError("NO_MAP", self._map.missing)
         inflated = self._map.inflated()
         await self._model.first()

@@ -30,6 +30,9 @@ PARAMETERS: Final = {
         "How the map's values are read: as a map's, or as a costmap's of Nav2",
         ["map", "costmap"],
     ),
+    "require_directions": Declared(
+        False, "Whether to wait for map_directions even if no node publishes them"
+    ),
     "occupied_threshold": Declared(
         65, "A cell of this value or more is occupied, percent", (1, 100)
     ),

@@ -9,7 +9,7 @@ from typing import TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from ddqn_planner.grid import Cell, GridMap, MoveRule, legal_moves
+from ddqn_planner.grid import Cell, GridMap, MoveRule
 from ddqn_planner.model.move_costs import MoveCosts
 from ddqn_planner.planning.plan import Plan, PlanStatus
 from ddqn_planner.planning.q_field import QField, check_inside
@@ -126,7 +126,7 @@ class DistanceField(QField):
     @cached_property
     def legal(self) -> NDArray[np.bool_]:  # type: ignore[override]
         """(8, H, W) bool: the legal moves."""
-        return legal_moves(self.grid.occupancy, self.move_rule)
+        return self.grid.legal_moves(self.move_rule)
 
     @cached_property
     def value(self) -> NDArray[np.float32]:

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from ddqn_planner.grid import Cell, GridMap, MoveRule, path_cost, path_length
+from ddqn_planner.grid import MOVES, Cell, GridMap, MoveRule, path_cost, path_length
 from ddqn_planner.grid.arguments import Cells
-from ddqn_planner.planning.simplification import touched_cells
+from ddqn_planner.planning.simplification import is_legal_segment
 
 REACH = 5
 """Cells along an axis that a robot may be beside its path, and still come back to it."""
@@ -32,10 +32,14 @@ def legal_segments(path: Cells, grid: GridMap, move_rule: MoveRule | str) -> NDA
         diagonal = np.flatnonzero(legal & (sides == 1).all(axis=1))
         (x, y), (next_x, next_y) = cells[diagonal].T, cells[diagonal + 1].T
         legal[diagonal] = ~(grid.occupancy[y, next_x] | grid.occupancy[next_y, x])
+    if grid.forbidden is not None:
+        moves = np.flatnonzero(legal & (sides.max(axis=1) == 1))
+        (x, y), (dx, dy) = cells[moves].T, (cells[moves + 1] - cells[moves]).T
+        actions = np.rint(np.arctan2(dy, dx) / (np.pi / 4)).astype(np.int64) % len(MOVES)
+        legal[moves] = (grid.forbidden[y, x] >> actions & 1) == 0
     for index in np.flatnonzero(legal & (sides.max(axis=1) > 1)).tolist():
         first, last = cells[index : index + 2].tolist()
-        x, y = touched_cells(first, last, rule).T
-        legal[index] = not grid.occupancy[y, x].any()
+        legal[index] = is_legal_segment(first, last, grid, rule)
     return legal
 
 

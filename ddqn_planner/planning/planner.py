@@ -115,7 +115,7 @@ class Planner:
         if field is None:
             if known.costs is None:
                 q = self.network.q_values(grid, goal, rule)
-                field = QField(goal, q, legal_moves(grid.occupancy, rule), rule)
+                field = QField(goal, q, grid.legal_moves(rule), rule)
             else:
                 field = self._repaired(known, goal)
                 field = field or DistanceField(goal, grid, known.costs, rule)
@@ -369,22 +369,21 @@ def _way_out_and_end(request: PlanRequest) -> tuple[tuple[Cell, ...], Cell]:
     to a cell within the tolerance: connected cells say so, without a field.
     """
     grid, start, goal, rule = request.grid, request.start, request.goal, request.move_rule
-    labels = grid.labels(rule)
     goals = [np.array([goal])] if grid.is_free(goal) else []
     if _reach(request) >= 1:
         goals.append(_free_cells(grid, goal, _reach(request)))
     for ends in goals:
-        labels_of_ends = labels[ends[:, 1], ends[:, 0]]
-        joined = np.isin(labels, labels_of_ends)
+        joined = grid.reachable(ends, rule, backward=True)
         way_out: tuple[Cell, ...] = (start,)
         if not grid.is_free(start):
             # The robot is too near to an obstacle: the shortest way through such cells.
             assert grid.obstacles is not None
-            legal = legal_moves(~joined & (grid.obstacles | ~grid.occupancy), rule)
+            closed = ~joined & (grid.obstacles | ~grid.occupancy)
+            legal = legal_moves(closed, rule, grid.forbidden)
             way_out = search(start, joined, legal, np.ones(joined.shape, np.float32), rule)
         if way_out and joined[way_out[-1][1], way_out[-1][0]]:
-            label = labels[way_out[-1][1], way_out[-1][0]]
-            x, y = ends[np.argmax(labels_of_ends == label)].tolist()
+            reached = grid.reachable([way_out[-1]], rule)
+            x, y = ends[np.argmax(reached[ends[:, 1], ends[:, 0]])].tolist()
             return way_out, (x, y)
     return (), goal
 

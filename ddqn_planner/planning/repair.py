@@ -30,11 +30,20 @@ cells: ROS messages give the resolution in float32."""
 def shift_between(old: GridMap, new: GridMap) -> Cell | None:
     """Return by how many cells a map's cells have moved in a newer one; None if not by whole ones.
 
+    None too if only one of them has costs, or one-way zones.
+
     The cell (x, y) of the old map is (x + dx, y + dy) in the new one. As a map grows, mapping
     shifts it.
     """
+    if (old.cost is None, old.forbidden is None) != (new.cost is None, new.forbidden is None):
+        return None
+    return offset_between(old, new)
+
+
+def offset_between(old: GridMap, new: GridMap) -> Cell | None:
+    """Return where cell (0, 0) of one map lies in another; None if their cells do not match."""
     same = math.isclose(old.resolution, new.resolution, rel_tol=1e-6)
-    if not same or old.origin[2] != new.origin[2] or (old.cost is None) != (new.cost is None):
+    if not same or old.origin[2] != new.origin[2]:
         return None
     corner = old.cell_to_world((0, 0))
     shift = new.world_to_cell(*corner)
@@ -52,7 +61,7 @@ def repaired(
     Parameters
     ----------
     field : DistanceField
-        Of a map with as many costs as the new one: none, or one per cell.
+        Of a map that has costs and one-way zones if the new one has them.
     goal : (x, y)
         In the new map, the same place as the field's.
     grid, costs
@@ -97,6 +106,8 @@ def _changed_cells(old: GridMap, new: GridMap, shift: Cell) -> NDArray[np.int32]
     differs = old.occupancy[before] != new.occupancy[inside]
     if old.cost is not None and new.cost is not None:
         differs |= old.cost[before] != new.cost[inside]
+    if old.forbidden is not None and new.forbidden is not None:
+        differs |= old.forbidden[before] != new.forbidden[inside]
     if np.count_nonzero(differs) > CHANGED_SHARE * differs.size:
         return None
     width = new.width + 2
