@@ -84,7 +84,10 @@ class MapDirections:
             return grid, missing if is_needed else ""
         if self._directions is None:
             return grid, ""
-        offset = offset_between(self._directions, grid)
+        try:
+            offset = offset_between(self._directions, grid)
+        except (OverflowError, ValueError):  # too far away to have a number of cells
+            offset = None
         if self._header.frame_id != header.frame_id or offset is None:
             return grid, (
                 f"the directions on {self._topic} are not for this map: they have the frame "

@@ -229,7 +229,7 @@ def test_a_costmap_of_any_stamp_has_the_directions_of_its_region(
 
 
 @pytest.mark.parametrize(
-    "changes", [{"frame": "odom"}, {"x": 0.2}, {"resolution": 0.25}], ids=["frame", "x", "size"]
+    "changes", [{"frame": "odom"}, {"x": 0.2}, {"x": 1e308}, {"x": 1e30}, {"resolution": 0.25}]
 )
 def test_directions_of_another_frame_or_other_cells_are_not_used(
     node: BaseNode, source: MapSource, changes: dict[str, Any]
