@@ -12,10 +12,11 @@ from __future__ import annotations
 
 import ctypes
 import os
+import time
 from collections.abc import Callable
 from contextlib import suppress
 from types import SimpleNamespace
-from typing import Any, NoReturn
+from typing import Any, NoReturn, TypeVar
 
 from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped
 from nav_msgs.msg import Odometry, Path
@@ -30,12 +31,12 @@ from ddqn_planner.grid import Cell, GridMap, MoveRule
 from ddqn_planner.model.certificate import NO_CERTIFICATE, certificate_of
 from ddqn_planner.nodes.conversions import (
     cell_from_pose,
-    check_pose,
     check_tolerance,
     path_message,
     serialized_path,
 )
 from ddqn_planner.nodes.field_display import FieldDisplay, Shown
+from ddqn_planner.nodes.frames import Frames, check_tf
 from ddqn_planner.nodes.map_source import MapSource
 from ddqn_planner.nodes.model_loading import load, load_and_warm_up
 from ddqn_planner.nodes.planner_parameters import PARAMETERS
@@ -48,9 +49,11 @@ from ddqn_planner.nodes.report import (
     seconds,
 )
 from ddqn_planner.nodes.runtime import LATCHED, STEADY, BaseNode, Worker, spin_until_shutdown
-from ddqn_planner.nodes.start_source import StartSource, check_tf
+from ddqn_planner.nodes.start_source import StartSource
 from ddqn_planner.planning import PlanMethod, Planner, PlanRequest
 from ddqn_planner.planning.planner import last_step
+
+T = TypeVar("T")
 
 LOOK_PERIOD = 0.1
 """Seconds between two looks whether something changed: an answer does not wait for diagnostics."""
@@ -72,7 +75,7 @@ class PlannerNode(BaseNode):
         self._planner: Planner | None = None
         self._model_file = ""
         self._settings = self.settings()
-        self._worker = Worker(self)
+        self._worker, self._map_worker = Worker(self), Worker(self)
         # While it loads, DDS discovers, and the node says what else is missing.
         self._first_planner = self._worker.call(load_and_warm_up, self._settings.model)
         self._model_is_due = True
@@ -80,15 +83,16 @@ class PlannerNode(BaseNode):
         self._report = Report(self)
         self._logged: tuple[PoseStamped, object] | None = None
         self._next_look = Future()
-        self._waits_for_start = False
+        self._waits_for_pose = False
 
         self._plan_publisher = self.create_publisher(Path, "plan", LATCHED)
         # In a group of its own: triggers that come while it plans make it plan once more after.
         self._replan = self.create_guard_condition(
             self._plan_for_active_goal, MutuallyExclusiveCallbackGroup()
         )
-        self._start = StartSource(self, self._settings.start_source, self._on_start)
-        self._map = MapSource(self, self._report, self._on_map)
+        self._frames = Frames(self)
+        self._start = self._start_source()
+        self._map = MapSource(self, self._report, self._map_worker, self._on_map)
         self.create_subscription(PoseStamped, "goal_pose", self._on_goal_pose, 10)
         if self._settings.follow_trainer:
             self.create_subscription(String, "trainer/model_saved", self._on_model_saved, LATCHED)
@@ -122,7 +126,7 @@ class PlannerNode(BaseNode):
             # What the other source said, and what was refused of it, no longer counts.
             self._start.close()
             self._report.accept(self._start.topic)
-            self._start = StartSource(self, settings.start_source, self._on_start)
+            self._start = self._start_source()
         self._map.apply_parameters(changed)
         self._replan.trigger()
 
@@ -170,6 +174,9 @@ class PlannerNode(BaseNode):
             self._report.accept(self._start.topic)
         self._replan.trigger()
 
+    def _start_source(self) -> StartSource:
+        return StartSource(self, self._settings.start_source, self._frames, self._on_start)
+
     def _on_start(self, message: PoseWithCovarianceStamped | Odometry) -> None:
         try:
             due = self._start.take(message, self._map.frame)
@@ -184,14 +191,28 @@ class PlannerNode(BaseNode):
         settings = self._settings
         return self._start.pose(frame, settings.robot_frame, settings.transform_tolerance)
 
-    async def _known_start(self, frame: str) -> PoseStamped:
+    async def _wait_for(self, get: Callable[[], T], may_come: Callable[[], bool]) -> T:
+        """Return what a function returns as soon as it raises no RequestError, if that may come."""
         while True:
             try:
-                return self._start_pose(frame)
+                return get()
             except RequestError:
-                if not self._start.may_come:
+                if not may_come():
                     raise
             await self._next_look
+
+    def _check_pose(self, name: str, stamped: PoseStamped, frame: str) -> None:
+        status = f"INVALID_{name.removeprefix('the ').upper()}"
+        checked(status, self._frames.check, name, stamped.header, stamped.pose, frame)
+
+    async def _in_map(self, name: str, stamped: PoseStamped, frame: str) -> PoseStamped:
+        """Return a pose in the map's frame; wait for its transform up to transform_tolerance."""
+        self._check_pose(name, stamped, frame)
+        deadline = time.monotonic() + self._settings.transform_tolerance
+        return await self._wait_for(
+            lambda: self._frames.to_map(name, stamped, frame),
+            lambda: self._frames.may_come or time.monotonic() < deadline,
+        )
 
     def _on_goal_pose(self, message: PoseStamped) -> None:
         self._goal = message
@@ -205,7 +226,7 @@ class PlannerNode(BaseNode):
     ) -> GetPlan.Response:
         start = request.start if request.start.header.frame_id else None
         header, outcome = await self._answer(start, request.goal, request.tolerance)
-        response.plan = _path(path_message, outcome, header, request.goal)
+        response.plan = _path(path_message, outcome, header)
         self._report.log(outcome)
         return response
 
@@ -215,8 +236,10 @@ class PlannerNode(BaseNode):
         if goal is None:
             return
         header, outcome = await self._answer(None, goal, self._settings.tolerance)
-        self._plan_publisher.publish(_path(serialized_path, outcome, header, goal))
-        self._waits_for_start = outcome.status == "NO_START"
+        self._plan_publisher.publish(_path(serialized_path, outcome, header))
+        self._waits_for_pose = outcome.status in ("NO_START", "TF_ERROR")
+        if outcome.goal is not None and self._goal is goal:
+            self._goal = goal = outcome.goal  # it stays where it is when its own frame moves
         # The places and lengths in the reason may differ.
         logged = goal, (outcome.status, outcome.plan.method)
         if self._logged != logged:
@@ -252,7 +275,7 @@ class PlannerNode(BaseNode):
     async def _plan(
         self, start: PoseStamped | None, goal: PoseStamped, tolerance: float
     ) -> Outcome:
-        checked("INVALID_GOAL", check_pose, "the goal", goal.header, goal.pose, self._map.frame)
+        self._check_pose("the goal", goal, self._map.frame)
         map_header, settings = self._map.header, self._settings
         if map_header is None:
             raise RequestError("NO_MAP", self._map.missing)
@@ -263,7 +286,11 @@ class PlannerNode(BaseNode):
             raise RequestError("NO_MODEL", f"no model is loaded: {self._report.refused['model']}")
         frame = map_header.frame_id
         if start is None:
-            start = await self._known_start(frame)
+            start = await self._wait_for(
+                lambda: self._start_pose(frame), lambda: self._start.may_come
+            )
+        start = await self._in_map("the start", start, frame)
+        goal = await self._in_map("the goal", goal, frame)
         grid: GridMap = await inflated
 
         def cell(status: str, name: str, stamped: PoseStamped) -> Cell:
@@ -286,7 +313,7 @@ class PlannerNode(BaseNode):
             plan = await self._worker.call(last_step, steps)
         reason = reason_of(request, plan, start, goal, settings.robot_radius)
         stamp = seconds(map_header.stamp)
-        return Outcome(plan.status.name, reason, planner, request, plan, stamp)
+        return Outcome(plan.status.name, reason, planner, request, plan, goal, stamp)
 
     @staticmethod
     def _move_rule(settings: SimpleNamespace, planner: Planner) -> MoveRule:
@@ -298,10 +325,13 @@ class PlannerNode(BaseNode):
         self._report.log_paths()
         looked, self._next_look = self._next_look, Future()
         looked.set_result(None)
-        if self._waits_for_start and self._start.name == "tf":
+        frame = self._map.frame
+        self._start.transform(frame)
+        if self._waits_for_pose and self._goal is not None:
             with suppress(RequestError):
-                self._start_pose(self._map.frame)
-                self._waits_for_start = False
+                self._frames.to_map("the start", self._start_pose(frame), frame)
+                self._frames.to_map("the goal", self._goal, frame)
+                self._waits_for_pose = False
                 self._replan.trigger()
         if self._report.is_due:
             loading = "the model is being loaded" if self._model_is_due else ""
@@ -324,11 +354,11 @@ class PlannerNode(BaseNode):
         return description | self._map.describe()
 
 
-def _path(make: Callable[..., Any], outcome: Outcome, header: Header, goal: PoseStamped) -> Any:
+def _path(make: Callable[..., Any], outcome: Outcome, header: Header) -> Any:
     """Return the path of an outcome, or an empty one, made by a function of `conversions`."""
-    if outcome.request is None:
+    if outcome.request is None or outcome.goal is None:
         return Path(header=header)
-    return make(outcome.plan.cells, outcome.request.grid, header, goal.pose.orientation)
+    return make(outcome.plan.cells, outcome.request.grid, header, outcome.goal.pose.orientation)
 
 
 def main() -> NoReturn:
