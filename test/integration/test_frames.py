@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 import math
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from geometry_msgs.msg import PoseStamped, Quaternion, TransformStamped
 from hypothesis import given
 from hypothesis import strategies as st
+from rclpy.time import Time
 from std_msgs.msg import Header
 
 from ddqn_planner.nodes.conversions import quaternion
-from ddqn_planner.nodes.frames import transformed
+from ddqn_planner.nodes.frames import Frames, transformed
+from ddqn_planner.nodes.report import RequestError
 
 ANGLES = st.floats(-math.pi, math.pi)
 METRES = st.floats(-100, 100)
@@ -106,3 +109,81 @@ def test_a_camera_that_is_tilted_still_points_ahead() -> None:
     assert yaw_of(found.pose.orientation) == pytest.approx(0)
     assert found.pose.position.x == pytest.approx(2 * math.cos(0.5))
     assert found.pose.position.z == 0
+
+
+class Buffer:
+    """What `Frames` asks of tf2_ros.Buffer: transforms from odom to map at some seconds."""
+
+    def __init__(self, *seconds: int) -> None:
+        self.seconds = seconds
+
+    def lookup_transform(self, target: str, source: str, stamp: Time) -> TransformStamped:
+        if (target, source) != ("map", "odom") or not self.seconds:
+            raise KeyError(f"{source} does not exist")
+        nanoseconds = stamp.nanoseconds or max(self.seconds) * 10**9
+        if not min(self.seconds) * 10**9 <= nanoseconds <= max(self.seconds) * 10**9:
+            raise KeyError("extrapolation")
+        found = transform((1.0, 0.0, 0.0), Quaternion())
+        found.header.stamp = Time(nanoseconds=nanoseconds).to_msg()
+        return found
+
+
+def frames_with(buffer: Buffer) -> Frames:
+    """Return frames that have listened for a while; they need no node any more."""
+    frames = Frames(None)
+    frames.available, frames._listener, frames._buffer = True, object(), buffer
+    frames._tf2_ros = SimpleNamespace(TransformException=KeyError)
+    return frames
+
+
+def pose_at(seconds: float, frame: str = "odom") -> PoseStamped:
+    stamped = stamped_pose((2.0, 0.0, 0.0), Quaternion())
+    stamped.header = Header(stamp=Time(nanoseconds=int(seconds * 1e9)).to_msg(), frame_id=frame)
+    return stamped
+
+
+@pytest.mark.parametrize(
+    ("asked", "known", "used"),
+    [
+        (100, (100, 110), 100),
+        (105, (100, 110), 105),
+        (0, (100, 110), 110),  # a pose without a time
+        (99.5, (100,), 100),  # from just before the node listened
+    ],
+)
+def test_a_pose_is_transformed_by_the_transform_of_its_time(
+    asked: float, known: tuple[int, ...], used: int
+) -> None:
+    found = frames_with(Buffer(*known)).to_map("the goal", pose_at(asked), "map")
+    assert found.header.stamp.sec == used
+    assert found.pose.position.x == 3.0
+
+
+@pytest.mark.parametrize("asked", [98.9, 110.5])
+def test_a_pose_from_a_time_that_tf_does_not_know_is_refused(asked: float) -> None:
+    with pytest.raises(RequestError, match=r"the goal's frame is 'odom'.*extrapol.*; publish") as e:
+        frames_with(Buffer(100, 110)).to_map("the goal", pose_at(asked), "map")
+    assert e.value.status == "TF_ERROR"
+
+
+def test_a_frame_that_tf_does_not_know_is_refused() -> None:
+    with pytest.raises(RequestError, match=r"the map's, 'map' .*moon does not exist") as e:
+        frames_with(Buffer(100)).to_map("the start", pose_at(100, "moon"), "map")
+    assert e.value.status == "TF_ERROR"
+
+
+def test_a_pose_in_the_maps_frame_needs_no_transform() -> None:
+    stamped = pose_at(1, "map")
+    assert Frames(None).to_map("the goal", stamped, "map") is stamped
+
+
+def test_other_frames_are_refused_without_tf_and_the_remedy_names_it() -> None:
+    stamped, frames = pose_at(1), frames_with(Buffer(100))
+    frames.check("the goal", stamped.header, stamped.pose, "map")
+    with pytest.raises(ValueError, match="frame is ''"):
+        frames.check("the goal", Header(), stamped.pose, "map")
+    frames.available = False
+    with pytest.raises(ValueError, match=r"'odom', the map's is 'map'; transform .* tf2_ros"):
+        frames.check("the goal", stamped.header, stamped.pose, "map")
+    with pytest.raises(RequestError, match="tf2_ros is not installed"):
+        frames.to_map("the goal", stamped, "map")
