@@ -12,10 +12,11 @@ from __future__ import annotations
 
 import ctypes
 import os
+import time
 from collections.abc import Callable, Coroutine, Sequence
 from contextlib import suppress
 from dataclasses import replace
-from typing import Any, NoReturn
+from typing import Any, NoReturn, TypeVar
 
 from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped
 from nav_msgs.msg import Odometry, Path
@@ -29,12 +30,12 @@ from ddqn_planner.grid import Cell, GridMap
 from ddqn_planner.nodes.active_goal import UNCHANGED, ActiveGoal
 from ddqn_planner.nodes.conversions import (
     cell_from_pose,
-    check_pose,
     check_tolerance,
     path_message,
     serialized_path,
 )
 from ddqn_planner.nodes.field_display import FieldDisplay, Shown
+from ddqn_planner.nodes.frames import Frames, check_tf
 from ddqn_planner.nodes.lifecycle import ManagedNode
 from ddqn_planner.nodes.map_source import MapSource
 from ddqn_planner.nodes.model_loading import ModelSource, load, move_rule
@@ -51,11 +52,13 @@ from ddqn_planner.nodes.report import (
     seconds,
 )
 from ddqn_planner.nodes.runtime import LATCHED, STEADY, Unless, Worker, spin_until_shutdown
-from ddqn_planner.nodes.start_source import StartSource, check_tf
+from ddqn_planner.nodes.start_source import StartSource
 from ddqn_planner.nodes.via_points import joined
 from ddqn_planner.planning import Plan, PlanMethod, Planner, PlanRequest
 from ddqn_planner.planning.path_under_way import is_path_valid
 from ddqn_planner.planning.planner import last_step
+
+T = TypeVar("T")
 
 LOOK_PERIOD = 0.1
 """Seconds between two looks whether something changed: an answer does not wait for diagnostics."""
@@ -75,7 +78,7 @@ class PlannerNode(ManagedNode):
         super().__init__("planner", PARAMETERS)
         self._settings = self.settings()
         self._report = Report(self)
-        self._worker = Worker(self)
+        self._worker, self._map_worker = Worker(self), Worker(self)
         self._model = ModelSource(self, self._report, self._worker)
         if self._settings.autostart:
             # While it loads, DDS discovers, and the node says what else is missing.
@@ -97,7 +100,7 @@ class PlannerNode(ManagedNode):
         self._stop()
         self._active = ActiveGoal()
         self._logged: tuple[PoseStamped, object] | None = None
-        self._waits_for_start = False
+        self._waits_for_pose = False
 
     def configure(self) -> None:
         """Listen to the map and to where the robot is, and create what answers requests."""
@@ -107,8 +110,9 @@ class PlannerNode(ManagedNode):
         self._replan = self.create_guard_condition(
             self._plan_for_active_goal, MutuallyExclusiveCallbackGroup()
         )
-        self._start = StartSource(self, self._settings.start_source, self._on_start)
-        self._map = MapSource(self, self._report, self._on_map)
+        self._frames = Frames(self)
+        self._start = self._start_source()
+        self._map = MapSource(self, self._report, self._map_worker, self._on_map)
         self.create_subscription(PoseStamped, "goal_pose", self._on_goal_pose, 10)
         if self._settings.follow_trainer:
             self.create_subscription(String, "trainer/model_saved", self._model.on_saved, LATCHED)
@@ -181,7 +185,7 @@ class PlannerNode(ManagedNode):
             # What the other source said, and what was refused of it, no longer counts.
             self._start.close()
             self._report.accept(self._start.topic)
-            self._start = StartSource(self, settings.start_source, self._on_start)
+            self._start = self._start_source()
         self._map.apply_parameters(changed)
         self._active.restart()
         self._replan.trigger()
@@ -193,6 +197,9 @@ class PlannerNode(ManagedNode):
             # What was refused for its frame may be right now.
             self._report.accept(self._start.topic)
         self._replan.trigger()
+
+    def _start_source(self) -> StartSource:
+        return StartSource(self, self._settings.start_source, self._frames, self._on_start)
 
     def _on_start(self, message: PoseWithCovarianceStamped | Odometry) -> None:
         try:
@@ -210,13 +217,30 @@ class PlannerNode(ManagedNode):
         return self._start.pose(frame, settings.robot_frame, settings.transform_tolerance)
 
     async def _known_start(self, frame: str) -> PoseStamped:
+        return await self._wait_for(lambda: self._start_pose(frame), lambda: self._start.may_come)
+
+    async def _wait_for(self, get: Callable[[], T], may_come: Callable[[], bool]) -> T:
+        """Return what a function returns as soon as it raises no RequestError, if that may come."""
         while True:
             try:
-                return self._start_pose(frame)
+                return get()
             except RequestError:
-                if not self._start.may_come:
+                if not may_come():
                     raise
             await self._next_look
+
+    def _check_pose(self, name: str, stamped: PoseStamped, frame: str) -> None:
+        status = f"INVALID_{name.removeprefix('the ').upper()}"
+        checked(status, self._frames.check, name, stamped.header, stamped.pose, frame)
+
+    async def _in_map(self, name: str, stamped: PoseStamped, frame: str) -> PoseStamped:
+        """Return a pose in the map's frame; wait for its transform up to transform_tolerance."""
+        self._check_pose(name, stamped, frame)
+        deadline = time.monotonic() + self._settings.transform_tolerance
+        return await self._wait_for(
+            lambda: self._frames.to_map(name, stamped, frame),
+            lambda: self._frames.may_come or time.monotonic() < deadline,
+        )
 
     def _on_goal_pose(self, message: PoseStamped) -> None:
         if not self._is_active():
@@ -235,7 +259,7 @@ class PlannerNode(ManagedNode):
         start = request.start if request.start.header.frame_id else None
         planning = self._plan(start, [request.goal], request.tolerance)
         header, outcome = await self._answer(planning, request.goal)
-        response.plan = _path(path_message, outcome, header, request.goal)
+        response.plan = _path(path_message, outcome, header)
         self._report.log(outcome)
         return response
 
@@ -250,8 +274,10 @@ class PlannerNode(ManagedNode):
         if outcome in (UNCHANGED, NOT_ACTIVE):
             return
         if self._active.is_news(outcome, header.frame_id):
-            self._plan_publisher.publish(_path(serialized_path, outcome, header, goal))
-        self._waits_for_start = outcome.status == "NO_START"
+            self._plan_publisher.publish(_path(serialized_path, outcome, header))
+        self._waits_for_pose = outcome.status in ("NO_START", "TF_ERROR")
+        if outcome.goal is not None and self._active.pose is goal:
+            self._active.pose = goal = outcome.goal  # it stays where it is when its own frame moves
         # The places and lengths in the reason may differ.
         logged = goal, (outcome.status, outcome.plan.method)
         if self._logged != logged:
@@ -272,9 +298,9 @@ class PlannerNode(ManagedNode):
         planning = self._plan(start, goals, self._settings.tolerance, planner_id=planner_id)
         header, outcome = await self._answer(planning, goal, given_up)
         if outcome.plan.path.size:
-            self._plan_publisher.publish(_path(serialized_path, outcome, header, goal))
+            self._plan_publisher.publish(_path(serialized_path, outcome, header))
         self._report.log(outcome)
-        return _path(path_message, outcome, header, goal), outcome
+        return _path(path_message, outcome, header), outcome
 
     async def _on_is_path_valid(self, request: Any, response: Any) -> Any:
         """Answer Nav2's IsPathValid: whether the robot can drive the rest of a path."""
@@ -296,7 +322,7 @@ class PlannerNode(ManagedNode):
         rule = move_rule(self._settings.move_rule, planner)
         robot = cells[0] if cells else None
         with suppress(RequestError):
-            start = await self._known_start(frame)
+            start = await self._in_map("the start", await self._known_start(frame), frame)
             robot = cell_from_pose("the start", start.header, start.pose, grid, frame)
         return robot is not None and is_path_valid(cells, robot, grid, rule)
 
@@ -337,11 +363,13 @@ class PlannerNode(ManagedNode):
         settings = self._settings
         check_request(goals, planner_id, settings.planner_id)
         for goal in goals:
-            checked("INVALID_GOAL", check_pose, "the goal", goal.header, goal.pose, self._map.frame)
+            self._check_pose("the goal", goal, self._map.frame)
         map_header, grid, planner = await self._inputs()
         frame = map_header.frame_id
         if start is None:
             start = await self._known_start(frame)
+        start = await self._in_map("the start", start, frame)
+        goals = [await self._in_map("the goal", goal, frame) for goal in goals]
 
         def cell(status: str, name: str, stamped: PoseStamped) -> Cell:
             pose = stamped.header, stamped.pose
@@ -380,7 +408,7 @@ class PlannerNode(ManagedNode):
         if len(goals) > 1 and not plan.path.size:
             reason = f"goal {len(plans)} of {len(goals)}: {reason}"
         stamp = seconds(map_header.stamp)
-        return Outcome(plan.status.name, reason, planner, request, plan, stamp)
+        return Outcome(plan.status.name, reason, planner, request, plan, goal, stamp)
 
     async def _inputs(self) -> tuple[Header, GridMap, Planner]:
         """Return the header of the map of now, this map for the robot's body, and the planner."""
@@ -400,10 +428,14 @@ class PlannerNode(ManagedNode):
         self._report.log_paths()
         looked, self._next_look = self._next_look, Future()
         looked.set_result(None)
-        if self._waits_for_start and self._start.name == "tf":
+        if self._is_configured:
+            self._start.transform(self._map.frame)
+        if self._waits_for_pose and self._active.pose is not None:
+            frame = self._map.frame
             with suppress(RequestError):
-                self._start_pose(self._map.frame)
-                self._waits_for_start = False
+                self._frames.to_map("the start", self._start_pose(frame), frame)
+                self._frames.to_map("the goal", self._active.pose, frame)
+                self._waits_for_pose = False
                 self._replan.trigger()
         if self._active.is_look_due():
             self._replan.trigger()
@@ -419,11 +451,11 @@ class PlannerNode(ManagedNode):
         return {"state": self.state, **self._model.describe(self._settings.move_rule), **of_map}
 
 
-def _path(make: Callable[..., Any], outcome: Outcome, header: Header, goal: PoseStamped) -> Any:
+def _path(make: Callable[..., Any], outcome: Outcome, header: Header) -> Any:
     """Return the path of an outcome, or an empty one, made by a function of `conversions`."""
-    if outcome.request is None:
+    if outcome.request is None or outcome.goal is None:
         return Path(header=header)
-    return make(outcome.plan.path, outcome.request.grid, header, goal.pose.orientation)
+    return make(outcome.plan.path, outcome.request.grid, header, outcome.goal.pose.orientation)
 
 
 def main() -> NoReturn:
