@@ -139,6 +139,7 @@ class PlannerNode(ManagedNode):
         """Free the map, the model and its fields."""
         self._forget()
         self._report.forget()
+        self._frames.close()
         del self._display, self._start, self._map
         self._model.forget()
 
