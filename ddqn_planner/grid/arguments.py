@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from enum import Enum
 from typing import Any, TypeAlias
 
@@ -10,6 +11,9 @@ from numpy.typing import ArrayLike, NDArray
 
 Cell: TypeAlias = tuple[int, int]
 """(x, y): x is the column, y is the row of ``occupancy[y, x]``."""
+
+Cells: TypeAlias = Sequence[Cell] | NDArray[np.integer[Any]]
+"""The cells of a path: pairs, or an array (N, 2)."""
 
 Occupancy: TypeAlias = NDArray[np.bool_]
 """(H, W) bool: True where a cell is occupied."""

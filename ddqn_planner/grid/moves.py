@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ddqn_planner.grid.arguments import Cell, Choice, Occupancy, as_cell
+from ddqn_planner.grid.arguments import Cell, Cells, Choice, Occupancy, as_cell
 from ddqn_planner.grid.labels import label_cells
 
 MOVES: NDArray[np.int64] = np.array(
@@ -106,20 +105,13 @@ def connected_cells(
     return connected
 
 
-def path_length(
-    cells: Sequence[Cell] | NDArray[np.integer[Any]],
-    move_rule: MoveRule | str = MoveRule.ROBOT_SAFE,
-) -> float:
+def path_length(cells: Cells, move_rule: MoveRule | str = MoveRule.ROBOT_SAFE) -> float:
     """Return the length in cells of a path of straight segments between the given cells."""
     x, y = np.asarray(cells, dtype=np.int64).reshape(-1, 2).T
     return float(segment_lengths(np.diff(x), np.diff(y), move_rule).sum())
 
 
-def path_cost(
-    cells: Sequence[Cell] | NDArray[np.integer[Any]],
-    multiplier: NDArray[np.float32],
-    move_rule: MoveRule | str,
-) -> float:
+def path_cost(cells: Cells, multiplier: NDArray[np.float32], move_rule: MoveRule | str) -> float:
     """Return the cost of a path of neighbouring cells: the sum of its moves, see `move_costs`."""
     x, y = np.asarray(cells, dtype=np.int64).reshape(-1, 2).T
     lengths = segment_lengths(np.diff(x), np.diff(y), move_rule)

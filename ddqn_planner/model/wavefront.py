@@ -303,8 +303,8 @@ def next_action(
 
 
 @compiled_now
-def roll_out(distance: Distances, costs: MoveCosts, start: int) -> Cells:
-    """Return the greedy steps from a closed start to the goal, with both cells: (N,) int32."""
+def roll_out(distance: Distances, costs: MoveCosts, start: int) -> NDArray[np.int32]:
+    """Return the (x, y) of greedy steps from a closed start to the goal, both too: (N, 2) int32."""
     patch, table, value, terms, width = costs[:5]
     cells: Cells = np.empty(64, np.int32)
     cell, number = start, 0
@@ -315,7 +315,10 @@ def roll_out(distance: Distances, costs: MoveCosts, start: int) -> Cells:
         number += 1
         action = next_action(distance, patch, table, value, terms, width, cell)
         if distance[cell] == AT_GOAL or action < 0:
-            path: Cells = cells[:number].copy()
+            path: NDArray[np.int32] = np.empty((number, 2), np.int32)
+            for step in range(number):
+                path[step, 0] = cells[step] % width - 1
+                path[step, 1] = cells[step] // width - 1
             return path
         cell += MOVE_Y[action] * width + MOVE_X[action]
 

@@ -9,9 +9,10 @@ import numpy as np
 from geometry_msgs.msg import PoseStamped
 
 from ddqn_planner.grid import Cell, GridMap
+from ddqn_planner.grid.arguments import Cells
 from ddqn_planner.nodes.report import Outcome
 from ddqn_planner.planning import PlanRequest, PlanStatus
-from ddqn_planner.planning.path_under_way import Path, rest_of_path
+from ddqn_planner.planning.path_under_way import rest_of_path
 from ddqn_planner.planning.repair import shift_between
 
 SUCCEEDED = PlanStatus.SUCCEEDED.name
@@ -32,7 +33,7 @@ class ActiveGoal:
         self.pose: PoseStamped | None = None
         # The path under way: of the paths that were published for this goal, the last one. Its
         # cells are those of the map `_grid`, in the frame `_frame`.
-        self._path: Path = ()
+        self._path: Cells = ()
         self._grid: GridMap | None = None
         self._frame = ""
         # What was planned last; None to plan whatever is asked.
@@ -97,12 +98,14 @@ class ActiveGoal:
             self._path = path
         return True
 
-    def _path_on(self, grid: GridMap, frame: str) -> Path:
+    def _path_on(self, grid: GridMap, frame: str) -> Cells:
         """Return the path under way in cells of a map; empty if it has no such cells."""
         if not len(self._path) or self._grid is None or frame != self._frame:
             return ()
-        shift = shift_between(self._grid, grid)
-        return () if shift is None else np.add(self._path, shift, dtype=np.int32)
+        shift, (x, y) = shift_between(self._grid, grid), self._path[-1]
+        if shift is None or not grid.contains((int(x) + shift[0], int(y) + shift[1])):
+            return ()
+        return np.asarray(self._path, dtype=np.int32) + np.array(shift, dtype=np.int32)
 
     def _wait_for_next_look(self) -> None:
         self._next_look = time.monotonic() + self._period

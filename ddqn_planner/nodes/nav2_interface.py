@@ -12,8 +12,8 @@ from ddqn_planner.nodes.path_action import PathAction, Plan
 from ddqn_planner.nodes.runtime import BaseNode
 
 RESULT_TIMEOUT = 5
-"""Seconds for which a result is kept. Each status message names all goals whose results are kept, so
-that rclpy's 900 would slow down clients, and fill the memory."""
+"""Seconds for which a result is kept. Each status message names all goals whose results are kept:
+rclpy's 900 would slow down clients, and fill the memory."""
 
 
 def serve_nav2(

@@ -271,7 +271,7 @@ class PlannerNode(ManagedNode):
         goal = goals[-1] if goals else PoseStamped()
         planning = self._plan(start, goals, self._settings.tolerance, planner_id=planner_id)
         header, outcome = await self._answer(planning, goal, given_up)
-        if outcome.plan.cells:
+        if len(outcome.plan.path):
             self._plan_publisher.publish(_path(serialized_path, outcome, header, goal))
         self._report.log(outcome)
         return _path(path_message, outcome, header, goal), outcome
@@ -372,12 +372,12 @@ class PlannerNode(ManagedNode):
             if plan is None:  # a slow step follows
                 plan = await self._worker.run(last_step, steps)
             plans.append(plan)
-            if not plan.cells:
+            if not len(plan.path):
                 break
         plan = joined(plans)
         before, goal = [start, *goals][len(plans) - 1 : len(plans) + 1]
         reason = reason_of(request, plan, before, goal, settings.robot_radius)
-        if len(goals) > 1 and not plan.cells:
+        if len(goals) > 1 and not len(plan.path):
             reason = f"goal {len(plans)} of {len(goals)}: {reason}"
         stamp = seconds(map_header.stamp)
         return Outcome(plan.status.name, reason, planner, request, plan, stamp)
@@ -423,7 +423,7 @@ def _path(make: Callable[..., Any], outcome: Outcome, header: Header, goal: Pose
     """Return the path of an outcome, or an empty one, made by a function of `conversions`."""
     if outcome.request is None:
         return Path(header=header)
-    return make(outcome.plan.cells, outcome.request.grid, header, goal.pose.orientation)
+    return make(outcome.plan.path, outcome.request.grid, header, goal.pose.orientation)
 
 
 def main() -> NoReturn:

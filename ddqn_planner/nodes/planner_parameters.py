@@ -60,7 +60,7 @@ PARAMETERS: Final = {
         (0, 3600),
     ),
     "switch_threshold": Declared(
-        0.03,
+        0.05,
         "How much more the path under way may cost than a new one and still be kept, as a share; "
         "~/get_plan always has the new one",
         (0, 10),

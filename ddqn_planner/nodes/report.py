@@ -103,8 +103,8 @@ def reason_of(
     )
     if plan.extra_cost:
         reason += f", kept: its cost is {plan.extra_cost:+.1%} beside that of a new one"
-    if plan.cells[-1] != request.goal:
-        metres = math.dist(plan.cells[-1], request.goal) * grid.resolution
+    if plan.goal is not None and plan.goal != request.goal:
+        metres = math.dist(plan.goal, request.goal) * grid.resolution
         why = "is cut off" if grid.is_free(request.goal) else "is occupied"
         reason += f"; the goal {why} and moved {metres:.3g} m"
     return reason
@@ -166,7 +166,7 @@ class Report:
 
     def log(self, outcome: Outcome) -> None:
         """Log a failure at once, and a path after its answer, which comes 1.2 times as fast."""
-        if outcome.plan.cells:
+        if outcome.plan.path.size:
             self._to_be_logged.append(outcome.reason)
         else:
             self.log_paths()
@@ -193,7 +193,7 @@ class Report:
         problems = [f"{what} refused: {reason}" for what, reason in self.refused.items()]
         if missing and missing != outcome.reason:
             problems.append(missing)
-        good = not problems and (plan.cells or outcome.status == "NO_REQUEST")
+        good = not problems and (plan.path.size or outcome.status == "NO_REQUEST")
         level = DiagnosticStatus.OK if good else DiagnosticStatus.WARN
         if fatal:
             level = DiagnosticStatus.ERROR

@@ -5,6 +5,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 
+import numpy as np
+
+from ddqn_planner.grid.arguments import Cells
 from ddqn_planner.planning import Plan, PlanMethod
 
 
@@ -14,16 +17,20 @@ def joined(plans: Sequence[Plan]) -> Plan:
     If the last one has no path, neither has the whole.
     """
     last = plans[-1]
-    if len(plans) == 1 or not last.cells:
+    if len(plans) == 1 or not len(last.path):
         return last
     costs = [plan.cost for plan in plans if plan.cost is not None]
     searched = any(plan.method is PlanMethod.ASTAR_FALLBACK for plan in plans)
     return replace(
         last,
-        cells=(plans[0].cells[0], *(cell for plan in plans for cell in plan.cells[1:])),
-        every_cell=(plans[0].every_cell[0], *(c for plan in plans for c in plan.every_cell[1:])),
+        path=_joined([plan.path for plan in plans]),
+        every_cell=_joined([plan.every_cell for plan in plans]),
         method=PlanMethod.ASTAR_FALLBACK if searched else PlanMethod.GREEDY,
         cost=sum(costs) if costs else None,
         field_ms=sum(plan.field_ms for plan in plans),
         rollout_ms=sum(plan.rollout_ms for plan in plans),
     )
+
+
+def _joined(paths: Sequence[Cells]) -> Cells:
+    return np.concatenate([paths[0][:1], *(path[1:] for path in paths)])

@@ -105,10 +105,8 @@ class DistanceField(QField):
             if not self._reach(start, limit):
                 status = PlanStatus.NO_PATH if self.is_whole else PlanStatus.ROLLOUT_TRAPPED
                 return Plan(status, move_rule=self.move_rule)
-            numbers = self.wavefront.roll_out(self.arrays[0], self.costs, self._number(start))
-        y, x = np.divmod(numbers, np.int32(self.costs.width))
-        cells = tuple(zip((x - 1).tolist(), (y - 1).tolist(), strict=True))
-        return Plan(PlanStatus.SUCCEEDED, cells, move_rule=self.move_rule)
+            path = self.wavefront.roll_out(self.arrays[0], self.costs, self._number(start))
+        return Plan(PlanStatus.SUCCEEDED, path, move_rule=self.move_rule)
 
     def _whole(self) -> NDArray[np.float64]:
         """Return the distance of every cell of the padded map, 0 where there is none: (C,)."""

@@ -2,17 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import Any, TypeAlias
-
 import numpy as np
 from numpy.typing import NDArray
 
 from ddqn_planner.grid import Cell, GridMap, MoveRule, path_cost, path_length
+from ddqn_planner.grid.arguments import Cells
 from ddqn_planner.planning.simplification import touched_cells
-
-Path: TypeAlias = Sequence[Cell] | NDArray[np.integer[Any]]
-"""The cells of a path, (N, 2)."""
 
 REACH = 5
 """Cells along an axis that a robot may be beside its path, and still come back to it."""
@@ -21,7 +16,7 @@ ROUNDING = 1e-9
 """Relative error of a sum of costs."""
 
 
-def legal_segments(path: Path, grid: GridMap, move_rule: MoveRule | str) -> NDArray[np.bool_]:
+def legal_segments(path: Cells, grid: GridMap, move_rule: MoveRule | str) -> NDArray[np.bool_]:
     """Return which segments of a path are legal on a map: (N - 1,) bool.
 
     A segment is a move, or joins two cells of a simplified path, see `simplify`. If it is legal,
@@ -44,7 +39,7 @@ def legal_segments(path: Path, grid: GridMap, move_rule: MoveRule | str) -> NDAr
     return legal
 
 
-def is_path_valid(path: Path, robot: Cell, grid: GridMap, move_rule: MoveRule | str) -> bool:
+def is_path_valid(path: Cells, robot: Cell, grid: GridMap, move_rule: MoveRule | str) -> bool:
     """Return whether all of a path from its cell nearest to the robot on is free and legal.
 
     The path may be simplified, or come from another planner. An empty one is not valid.
@@ -57,7 +52,7 @@ def is_path_valid(path: Path, robot: Cell, grid: GridMap, move_rule: MoveRule | 
 
 
 def rest_of_path(
-    path: Path, robot: Cell, grid: GridMap, move_rule: MoveRule | str
+    path: Cells, robot: Cell, grid: GridMap, move_rule: MoveRule | str
 ) -> NDArray[np.int32]:
     """Return what is left of a path for a robot, from its cell on: (N, 2); empty if it is lost.
 
@@ -80,7 +75,7 @@ def rest_of_path(
 
 
 def keep_or_switch(
-    under_way: Path, new: Path, grid: GridMap, move_rule: MoveRule | str, threshold: float
+    under_way: Cells, new: Cells, grid: GridMap, move_rule: MoveRule | str, threshold: float
 ) -> tuple[NDArray[np.int32], float | None]:
     """Return what is left of the path under way if it is good enough, otherwise the new path.
 
@@ -122,7 +117,7 @@ def _legal_from(cells: NDArray[np.int32], grid: GridMap, move_rule: MoveRule | s
     return int(np.flatnonzero(~legal).max(initial=-1)) + 1
 
 
-def _array(path: Path) -> NDArray[np.int32]:
+def _array(path: Cells) -> NDArray[np.int32]:
     return np.asarray(path, dtype=np.int32).reshape(-1, 2)
 
 

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 from enum import Enum
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
 
 from ddqn_planner.grid import Cell, GridMap, MoveRule, path_length
-from ddqn_planner.grid.arguments import Choice
-from ddqn_planner.planning.path_under_way import Path
+from ddqn_planner.grid.arguments import Cells, Choice
 
 
 class PlanStatus(str, Enum):
@@ -49,7 +51,7 @@ class PlanRequest:
         that a path reaches.
     simplified : bool
         Whether to leave out cells, see `simplify`.
-    under_way : (N, 2)
+    under_way : (N, 2) int32
         The path that the robot follows, move by move, if there is one.
     switch_threshold : float
         How much more the rest of it may cost than the new path, as a share, see `keep_or_switch`.
@@ -62,20 +64,22 @@ class PlanRequest:
     method: PlanMethod = PlanMethod.GREEDY
     tolerance: float = 0.0
     simplified: bool = False
-    under_way: Path = field(default=(), compare=False)
+    under_way: Cells = field(default=(), compare=False)
     switch_threshold: float = 0.0
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Plan:
     """A path, or the reason why there is none.
+
+    Two plans are equal if all but their times is equal.
 
     Parameters
     ----------
     status : PlanStatus
-    cells : tuple of (x, y)
-        From start to goal, every move legal, or every segment if the path was simplified; empty
-        unless the status is SUCCEEDED.
+    path : (N, 2) int32
+        The cells from start to goal, every move legal, or every segment if the path was simplified;
+        empty unless the status is SUCCEEDED. It cannot be written to.
     method : PlanMethod
         ASTAR_FALLBACK if it was searched for because the greedy steps were trapped.
     move_rule : MoveRule
@@ -86,7 +90,7 @@ class Plan:
     goal : (x, y), optional
         Where the path ends, or would end: the goal asked for, or the cell to which it moved. None
         if no Q field is needed to say that there is no path, or for a rollout.
-    every_cell : sequence of (x, y)
+    every_cell : (N, 2) int32
         The path move by move, before it was simplified, if a planner made the plan.
     extra_cost : float, optional
         How much more the path costs than a new one, as a share, if it is the rest of the one under
@@ -97,17 +101,37 @@ class Plan:
     """
 
     status: PlanStatus
-    cells: tuple[Cell, ...] = ()
+    path: NDArray[np.int32] = field(default_factory=lambda: np.empty((0, 2), np.int32))
     method: PlanMethod = PlanMethod.GREEDY
     move_rule: MoveRule = MoveRule.ROBOT_SAFE
     cost: float | None = None
     goal: Cell | None = None
-    every_cell: Sequence[Cell] = field(default=(), compare=False)
+    every_cell: Cells = ()
     extra_cost: float | None = None
-    field_ms: float = field(default=0.0, compare=False)
-    rollout_ms: float = field(default=0.0, compare=False)
+    field_ms: float = 0.0
+    rollout_ms: float = 0.0
+
+    def __post_init__(self) -> None:
+        path = np.asarray(self.path, np.int32).reshape(-1, 2)  # sequences of cells do as well
+        path.flags.writeable = False
+        object.__setattr__(self, "path", path)
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, Plan) and self._identity() == other._identity()
+
+    def __hash__(self) -> int:
+        return hash(self._identity())
+
+    def _identity(self) -> tuple[object, ...]:
+        path, costs = self.path.tobytes(), (self.cost, self.extra_cost)
+        return self.status, path, self.method, self.move_rule, costs, self.goal
+
+    @cached_property
+    def cells(self) -> tuple[Cell, ...]:
+        """The path as pairs of Python ints, made when asked for."""
+        return tuple(zip(*self.path.T.tolist(), strict=True))
 
     @property
     def length(self) -> float:
         """Length in cells under the plan's rule, see `path_length`."""
-        return path_length(self.cells, self.move_rule)
+        return path_length(self.path, self.move_rule)

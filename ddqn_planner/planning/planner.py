@@ -251,12 +251,12 @@ class Planner:
             field = self.known_field(grid, goal, rule) if grid.is_free(start) else None
         with rollout_time:
             plan = field.rollout_if_known(start) if field else None
-        if plan is None or (not plan.cells and _reach(request) >= 1):
+        if plan is None or (not plan.path.size and _reach(request) >= 1):
             yield None
         if plan is None and grid.is_free(start) and grid.is_free(goal):
             with field_time:
                 field, plan = self._visit_some(request)
-        if plan is None or not plan.cells:
+        if plan is None or not plan.path.size:
             with field_time:
                 if plan and plan.status is PlanStatus.NO_PATH and _reach(request) < 1:
                     way_out, end = (), goal
@@ -270,27 +270,38 @@ class Planner:
                 return
             with rollout_time:
                 plan = plan or field.rollout(way_out[-1])
-            if not plan.cells and request.method is PlanMethod.ASTAR_FALLBACK:
+            if not plan.path.size and request.method is PlanMethod.ASTAR_FALLBACK:
                 yield None
                 costs = grid.cost_multiplier
                 with rollout_time:
                     cells = search(way_out[-1], end, field.legal, costs, rule, field.value)
-                plan = Plan(PlanStatus.SUCCEEDED, cells, PlanMethod.ASTAR_FALLBACK)
+                plan = Plan(PlanStatus.SUCCEEDED, np.array(cells), PlanMethod.ASTAR_FALLBACK)
         assert field is not None
-        cells, cost, extra_cost = plan.cells, None, None
+        path, cost, extra_cost = plan.path, None, None
         with rollout_time:
-            if cells and len(request.under_way):
-                kept, extra_cost = keep_or_switch(
-                    request.under_way, cells, grid, rule, request.switch_threshold
-                )
-                cells = tuple(map(tuple, kept.tolist()))
-            every_cell = cells = way_out[:-1] + cells if cells else ()
-            if cells:
-                cost = None if grid.cost is None else path_cost(cells, grid.cost_multiplier, rule)
-                cells = simplify(cells, grid, rule) if request.simplified else cells
-        plan = replace(plan, cells=cells, move_rule=rule, cost=cost, goal=field.goal)
-        plan = replace(plan, every_cell=every_cell, extra_cost=extra_cost)
-        yield replace(plan, field_ms=field_time.ms, rollout_ms=rollout_time.ms)
+            if path.size:
+                if len(request.under_way):
+                    threshold = request.switch_threshold
+                    path, extra_cost = keep_or_switch(
+                        request.under_way, path, grid, rule, threshold
+                    )
+                if len(way_out) > 1:
+                    path = np.concatenate([way_out[:-1], path], dtype=np.int32)
+                cost = None if grid.cost is None else path_cost(path, grid.cost_multiplier, rule)
+            every_cell = path
+            if request.simplified:
+                path = np.array(simplify(path.tolist(), grid, rule), dtype=np.int32)
+        yield replace(
+            plan,
+            path=path,
+            move_rule=rule,
+            cost=cost,
+            goal=field.goal,
+            every_cell=every_cell,
+            extra_cost=extra_cost,
+            field_ms=field_time.ms,
+            rollout_ms=rollout_time.ms,
+        )
 
     def _visit_some(self, request: PlanRequest) -> tuple[QField | None, Plan | None]:
         """Return the field of the goal and the plan from it, if these take few visits of cells.

@@ -96,7 +96,7 @@ class QField:
                 return Plan(PlanStatus.ROLLOUT_TRAPPED, move_rule=self.move_rule)
             visited.add(cell)
             cells.append(cell)
-        return Plan(PlanStatus.SUCCEEDED, tuple(cells), move_rule=self.move_rule)
+        return Plan(PlanStatus.SUCCEEDED, np.array(cells), move_rule=self.move_rule)
 
 
 def check_inside(start: Cell, shape: tuple[int, ...]) -> Cell:

@@ -243,7 +243,7 @@ def odometry(robot: Robot, cell: Cell, frame: str = "map") -> Odometry:
 
 def test_the_start_comes_from_odometry(robot: Robot) -> None:
     robot.send_goal(robot.pose((19, 14)))
-    with parameters_of(robot, start_source="odometry"):
+    with parameters_of(robot, start_source="odometry", replan_period=3600.0):
         robot.wait_for_reason("start is unknown; nothing came on /hall/odom in the map's frame")
         robot.client.publish("odom", odometry(robot, (2, 2)))
         robot.wait_for_path((2, 2), (19, 14))
