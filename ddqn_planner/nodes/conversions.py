@@ -169,8 +169,12 @@ def _copy(message: Message) -> Message:
     return copied
 
 
-def check_pose(name: str, header: Header, pose: Pose, frame: str = "") -> None:
+def check_pose(
+    name: str, header: Header, pose: Pose, frame: str = "", other_remedy: str = ""
+) -> None:
     """Check a pose, which the error calls by its name, as ``"the goal"``.
+
+    The error for another frame than the map's also names the other remedy.
 
     Raises
     ------
@@ -182,7 +186,7 @@ def check_pose(name: str, header: Header, pose: Pose, frame: str = "") -> None:
         expected = f"the map's is {frame!r}" if frame else "it needs the map's frame"
         raise ValueError(
             f"{name}'s frame is {header.frame_id!r}, {expected}; transform the pose to that frame "
-            "(in RViz: set Fixed Frame to it)"
+            f"(in RViz: set Fixed Frame to it){other_remedy}"
         )
     _check_pose(name, pose)
 

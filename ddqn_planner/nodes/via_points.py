@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ddqn_planner.grid.arguments import Cells
 from ddqn_planner.planning import Plan, PlanMethod
@@ -32,5 +33,5 @@ def joined(plans: Sequence[Plan]) -> Plan:
     )
 
 
-def _joined(paths: Sequence[Cells]) -> Cells:
-    return np.concatenate([paths[0][:1], *(path[1:] for path in paths)])
+def _joined(paths: Sequence[Cells]) -> NDArray[np.int32]:
+    return np.concatenate([paths[0][:1], *(path[1:] for path in paths)], dtype=np.int32)
