@@ -142,10 +142,10 @@ class PathAction:
         result.planning_time = Duration(seconds=time.monotonic() - began).to_msg()
         result.error_code = error_code(outcome.status, self._unknown)
         if hasattr(result, "error_msg"):  # Nav2 has added it later
-            result.error_msg = "" if outcome.plan.path.size else outcome.reason
+            result.error_msg = outcome.reason if result.error_code else ""
         if handle.is_cancel_requested:
             handle.canceled()
-        elif outcome.plan.path.size:
+        elif outcome.status == PlanStatus.SUCCEEDED.name:
             handle.succeed()
         else:
             handle.abort()

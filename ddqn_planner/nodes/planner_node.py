@@ -12,11 +12,9 @@ from __future__ import annotations
 
 import ctypes
 import os
-import time
-from collections.abc import Callable, Coroutine, Sequence
+from collections.abc import Callable, Coroutine
 from contextlib import suppress
-from dataclasses import replace
-from typing import Any, NoReturn, TypeVar
+from typing import Any, NoReturn
 
 from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped
 from nav_msgs.msg import Odometry, Path
@@ -26,39 +24,19 @@ from rclpy.parameter import Parameter
 from rclpy.task import Future
 from std_msgs.msg import Header, String
 
-from ddqn_planner.grid import Cell, GridMap
 from ddqn_planner.nodes.active_goal import UNCHANGED, ActiveGoal
-from ddqn_planner.nodes.conversions import (
-    cell_from_pose,
-    check_tolerance,
-    path_message,
-    serialized_path,
-)
+from ddqn_planner.nodes.conversions import path_message, serialized_path
 from ddqn_planner.nodes.field_display import FieldDisplay, Shown
 from ddqn_planner.nodes.frames import Frames, check_tf
 from ddqn_planner.nodes.lifecycle import ManagedNode
 from ddqn_planner.nodes.map_source import MapSource
-from ddqn_planner.nodes.model_loading import ModelSource, load, move_rule
+from ddqn_planner.nodes.model_loading import ModelSource, load
 from ddqn_planner.nodes.nav2_interface import serve_nav2
-from ddqn_planner.nodes.path_action import check_request
 from ddqn_planner.nodes.planner_parameters import PARAMETERS
-from ddqn_planner.nodes.report import (
-    NOT_ACTIVE,
-    Outcome,
-    Report,
-    RequestError,
-    checked,
-    reason_of,
-    seconds,
-)
+from ddqn_planner.nodes.report import NOT_ACTIVE, Outcome, Report, RequestError
+from ddqn_planner.nodes.requests import Looks, Requests
 from ddqn_planner.nodes.runtime import LATCHED, STEADY, Unless, Worker, spin_until_shutdown
 from ddqn_planner.nodes.start_source import StartSource
-from ddqn_planner.nodes.via_points import joined
-from ddqn_planner.planning import Plan, PlanMethod, Planner, PlanRequest
-from ddqn_planner.planning.path_under_way import is_path_valid
-from ddqn_planner.planning.planner import last_step
-
-T = TypeVar("T")
 
 LOOK_PERIOD = 0.1
 """Seconds between two looks whether something changed: an answer does not wait for diagnostics."""
@@ -83,7 +61,7 @@ class PlannerNode(ManagedNode):
         if self._settings.autostart:
             # While it loads, DDS discovers, and the node says what else is missing.
             self._model.load()
-        self._next_look = Future()
+        self._looks = Looks()
         self._answering = 0
         self._forget()
         self.create_timer(LOOK_PERIOD, self._on_look, clock=STEADY)
@@ -113,6 +91,15 @@ class PlannerNode(ManagedNode):
         self._frames = Frames(self)
         self._start = self._start_source()
         self._map = MapSource(self, self._report, self._map_worker, self._on_map)
+        self._requests = Requests(
+            self._settings,
+            self._map,
+            self._start,
+            self._frames,
+            self._model,
+            self._worker,
+            self._looks,
+        )
         self.create_subscription(PoseStamped, "goal_pose", self._on_goal_pose, 10)
         if self._settings.follow_trainer:
             self.create_subscription(String, "trainer/model_saved", self._model.on_saved, LATCHED)
@@ -140,7 +127,7 @@ class PlannerNode(ManagedNode):
         self._forget()
         self._report.forget()
         self._frames.close()
-        del self._display, self._start, self._map
+        del self._display, self._start, self._map, self._requests
         self._model.forget()
 
     async def prepare(self, transition: str) -> bool:
@@ -152,7 +139,7 @@ class PlannerNode(ManagedNode):
         if transition in ("deactivate", "shutdown"):
             self._stop()
             while self._answering:
-                await self._next_look
+                await self._looks.coming
         return True
 
     def _is_active(self) -> bool:
@@ -186,7 +173,8 @@ class PlannerNode(ManagedNode):
             # What the other source said, and what was refused of it, no longer counts.
             self._start.close()
             self._report.accept(self._start.topic)
-            self._start = self._start_source()
+            self._start = self._requests.start = self._start_source()
+        self._requests.settings = settings
         self._map.apply_parameters(changed)
         self._active.restart()
         self._replan.trigger()
@@ -213,36 +201,6 @@ class PlannerNode(ManagedNode):
             self._active.plan_at_once()
             self._replan.trigger()
 
-    def _start_pose(self, frame: str) -> PoseStamped:
-        settings = self._settings
-        return self._start.pose(frame, settings.robot_frame, settings.transform_tolerance)
-
-    async def _known_start(self, frame: str) -> PoseStamped:
-        return await self._wait_for(lambda: self._start_pose(frame), lambda: self._start.may_come)
-
-    async def _wait_for(self, get: Callable[[], T], may_come: Callable[[], bool]) -> T:
-        """Return what a function returns as soon as it raises no RequestError, if that may come."""
-        while True:
-            try:
-                return get()
-            except RequestError:
-                if not may_come():
-                    raise
-            await self._next_look
-
-    def _check_pose(self, name: str, stamped: PoseStamped, frame: str) -> None:
-        status = f"INVALID_{name.removeprefix('the ').upper()}"
-        checked(status, self._frames.check, name, stamped.header, stamped.pose, frame)
-
-    async def _in_map(self, name: str, stamped: PoseStamped, frame: str) -> PoseStamped:
-        """Return a pose in the map's frame; wait for its transform up to transform_tolerance."""
-        self._check_pose(name, stamped, frame)
-        deadline = time.monotonic() + self._settings.transform_tolerance
-        return await self._wait_for(
-            lambda: self._frames.to_map(name, stamped, frame),
-            lambda: self._frames.may_come or time.monotonic() < deadline,
-        )
-
     def _on_goal_pose(self, message: PoseStamped) -> None:
         if not self._is_active():
             self._report.note(NOT_ACTIVE)
@@ -258,7 +216,7 @@ class PlannerNode(ManagedNode):
         self, request: GetPlan.Request, response: GetPlan.Response
     ) -> GetPlan.Response:
         start = request.start if request.start.header.frame_id else None
-        planning = self._plan(start, [request.goal], request.tolerance)
+        planning = self._requests.plan(start, [request.goal], request.tolerance)
         header, outcome = await self._answer(planning, request.goal)
         response.plan = _path(path_message, outcome, header)
         self._report.log(outcome)
@@ -270,7 +228,7 @@ class PlannerNode(ManagedNode):
         if goal is None:
             return
         self._active.begin(self._settings.replan_period)
-        planning = self._plan(None, [goal], self._settings.tolerance, self._active)
+        planning = self._requests.plan(None, [goal], self._settings.tolerance, self._active)
         header, outcome = await self._answer(planning, goal)
         if outcome in (UNCHANGED, NOT_ACTIVE):
             return
@@ -296,9 +254,11 @@ class PlannerNode(ManagedNode):
         self, start: PoseStamped | None, goals: list[PoseStamped], planner_id: str, given_up: Future
     ) -> tuple[Path, Outcome]:
         goal = goals[-1] if goals else PoseStamped()
-        planning = self._plan(start, goals, self._settings.tolerance, planner_id=planner_id)
+        planning = self._requests.plan(
+            start, goals, self._settings.tolerance, planner_id=planner_id
+        )
         header, outcome = await self._answer(planning, goal, given_up)
-        if outcome.plan.path.size:
+        if len(outcome.plan.path):
             self._plan_publisher.publish(_path(serialized_path, outcome, header))
         self._report.log(outcome)
         return _path(path_message, outcome, header), outcome
@@ -307,25 +267,11 @@ class PlannerNode(ManagedNode):
         """Answer Nav2's IsPathValid: whether the robot can drive the rest of a path."""
         response.is_valid = False
         try:
-            checking = self._is_path_valid(request.path)
+            checking = self._requests.is_path_valid(request.path)
             response.is_valid = await Unless(checking, self._stopped) is True
         except RequestError as error:
             self.get_logger().warning(f"no path to check: {error}")
         return response
-
-    async def _is_path_valid(self, path: Path) -> bool:
-        header, grid, planner = await self._inputs()
-        frame = header.frame_id
-        cells = [
-            checked("INVALID_PATH", cell_from_pose, "the path", path.header, it.pose, grid, frame)
-            for it in path.poses
-        ]
-        rule = move_rule(self._settings.move_rule, planner)
-        robot = cells[0] if cells else None
-        with suppress(RequestError):
-            start = await self._in_map("the start", await self._known_start(frame), frame)
-            robot = cell_from_pose("the start", start.header, start.pose, grid, frame)
-        return robot is not None and is_path_valid(cells, robot, grid, rule)
 
     async def _answer(
         self, planning: Coroutine[None, None, Outcome], goal: PoseStamped, *given_up: Future
@@ -353,89 +299,16 @@ class PlannerNode(ManagedNode):
             self._report.note(outcome)
         return Header(stamp=self.get_clock().now().to_msg(), frame_id=frame), outcome
 
-    async def _plan(
-        self,
-        start: PoseStamped | None,
-        goals: Sequence[PoseStamped],
-        tolerance: float,
-        active: ActiveGoal | None = None,
-        planner_id: str = "",
-    ) -> Outcome:
-        settings = self._settings
-        check_request(goals, planner_id, settings.planner_id)
-        for goal in goals:
-            self._check_pose("the goal", goal, self._map.frame)
-        map_header, grid, planner = await self._inputs()
-        frame = map_header.frame_id
-        if start is None:
-            start = await self._known_start(frame)
-        start = await self._in_map("the start", start, frame)
-        goals = [await self._in_map("the goal", goal, frame) for goal in goals]
-
-        def cell(status: str, name: str, stamped: PoseStamped) -> Cell:
-            pose = stamped.header, stamped.pose
-            found: Cell = checked(status, cell_from_pose, name, *pose, grid, frame)
-            return found
-
-        request = PlanRequest(
-            grid,
-            tolerance=checked("INVALID_TOLERANCE", check_tolerance, tolerance) / grid.resolution,
-            start=cell("INVALID_START", "the start", start),
-            goal=cell("INVALID_GOAL", "the goal", goals[0]),
-            move_rule=move_rule(settings.move_rule, planner),
-            method=PlanMethod(settings.mode),
-            simplified=settings.path_simplification == "line_of_sight",
-        )
-        if active is not None:
-            next_request = active.next_request(request, frame, settings.switch_threshold)
-            if next_request is None:
-                return UNCHANGED
-            request = next_request
-        plans: list[Plan] = []
-        for goal in goals:
-            if plans:
-                goal_cell = cell("INVALID_GOAL", "the goal", goal)
-                request = replace(request, start=plans[-1].cells[-1], goal=goal_cell)
-            steps = planner.steps(request)
-            plan = next(steps)
-            if plan is None:  # a slow step follows
-                plan = await self._worker.run(last_step, steps)
-            plans.append(plan)
-            if not plan.path.size:
-                break
-        plan = joined(plans)
-        before, goal = [start, *goals][len(plans) - 1 : len(plans) + 1]
-        reason = reason_of(request, plan, before, goal, settings.robot_radius)
-        if len(goals) > 1 and not plan.path.size:
-            reason = f"goal {len(plans)} of {len(goals)}: {reason}"
-        stamp = seconds(map_header.stamp)
-        return Outcome(plan.status.name, reason, planner, request, plan, goal, stamp)
-
-    async def _inputs(self) -> tuple[Header, GridMap, Planner]:
-        """Return the header of the map of now, this map for the robot's body, and the planner."""
-        header = self._map.header
-        if header is None or self._map.missing:
-            raise RequestError("NO_MAP", self._map.missing)
-        inflated = self._map.inflated()
-        await self._model.first()
-        planner = self._model.planner
-        if planner is None:
-            raise RequestError("NO_MODEL", f"no model is loaded: {self._report.refused['model']}")
-        return header, await inflated, planner
-
     # Diagnostics
 
     def _on_look(self) -> None:
         self._report.log_paths()
-        looked, self._next_look = self._next_look, Future()
-        looked.set_result(None)
+        self._looks.next()
         if self._is_configured:
             self._start.transform(self._map.frame)
         if self._waits_for_pose and self._active.pose is not None:
-            frame = self._map.frame
             with suppress(RequestError):
-                self._frames.to_map("the start", self._start_pose(frame), frame)
-                self._frames.to_map("the goal", self._active.pose, frame)
+                self._requests.look(self._active.pose)
                 self._waits_for_pose = False
                 self._replan.trigger()
         if self._active.is_look_due():
