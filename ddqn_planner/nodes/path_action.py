@@ -42,11 +42,8 @@ CODE_OF_STATUS = {
     PlanStatus.GOAL_OCCUPIED.name: "GOAL_OCCUPIED",
     PlanStatus.NO_PATH.name: "NO_VALID_PATH",
     PlanStatus.ROLLOUT_TRAPPED.name: "NO_VALID_PATH",
-    # None of these has a place in the map's frame.
     "TF_ERROR": "TF_ERROR",
     "NO_START": "TF_ERROR",
-    "INVALID_START": "TF_ERROR",
-    "INVALID_GOAL": "TF_ERROR",
     "INVALID_PLANNER": "INVALID_PLANNER",
     "NO_GOALS": "NO_VIAPOINTS_GIVEN",
     # As Nav2's planners time out while their costmap is not current.

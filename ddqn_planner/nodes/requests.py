@@ -135,7 +135,7 @@ class Requests:
     async def _inputs(self) -> tuple[Header, GridMap, Planner]:
         """Return the header of the map of now, this map for the robot's body, and the planner."""
         header = self.map.header
-        if header is None:
+        if header is None or self.map.missing:
             raise RequestError("NO_MAP", self.map.missing)
         inflated = self.map.inflated()
         await self.model.first()
