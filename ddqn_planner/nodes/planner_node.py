@@ -24,7 +24,7 @@ from rclpy.parameter import Parameter
 from rclpy.task import Future
 from std_msgs.msg import Header, String
 
-from ddqn_planner.nodes.active_goal import UNCHANGED, ActiveGoal
+from ddqn_planner.nodes.active_goal import UNCHANGED, ActiveGoal, PathUnderWay
 from ddqn_planner.nodes.conversions import path_message, serialized_path
 from ddqn_planner.nodes.field_display import FieldDisplay, Shown
 from ddqn_planner.nodes.frames import Frames, check_tf
@@ -76,7 +76,7 @@ class PlannerNode(ManagedNode):
         self._is_configured = False
         self._stopped = Future()
         self._stop()
-        self._active = ActiveGoal()
+        self._active, self._followed = ActiveGoal(), PathUnderWay()
         self._logged: tuple[PoseStamped, object] | None = None
         self._waits_for_pose = False
 
@@ -119,7 +119,7 @@ class PlannerNode(ManagedNode):
 
     def deactivate(self) -> None:
         """Forget the active goal."""
-        self._active = ActiveGoal()
+        self._active, self._followed = ActiveGoal(), PathUnderWay()
         self._report.change()
 
     def cleanup(self) -> None:
@@ -255,7 +255,11 @@ class PlannerNode(ManagedNode):
     ) -> tuple[Path, Outcome]:
         goal = goals[-1] if goals else PoseStamped()
         planning = self._requests.plan(
-            start, goals, self._settings.tolerance, planner_id=planner_id
+            start,
+            goals,
+            self._settings.tolerance,
+            planner_id=planner_id,
+            followed=self._followed,
         )
         header, outcome = await self._answer(planning, goal, given_up)
         if len(outcome.plan.path):

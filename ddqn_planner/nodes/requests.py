@@ -15,7 +15,7 @@ from rclpy.task import Future
 from std_msgs.msg import Header
 
 from ddqn_planner.grid import Cell, GridMap
-from ddqn_planner.nodes.active_goal import UNCHANGED, ActiveGoal
+from ddqn_planner.nodes.active_goal import UNCHANGED, ActiveGoal, PathUnderWay
 from ddqn_planner.nodes.conversions import cell_from_pose, check_tolerance
 from ddqn_planner.nodes.frames import Frames
 from ddqn_planner.nodes.map_source import MapSource
@@ -67,10 +67,11 @@ class Requests:
         tolerance: float,
         active: ActiveGoal | None = None,
         planner_id: str = "",
+        followed: PathUnderWay | None = None,
     ) -> Outcome:
         """Plan from a start, or from where the robot is, through goals.
 
-        The active goal may be `UNCHANGED`.
+        The active goal may be `UNCHANGED`. To one goal, a path that is followed may be kept.
         """
         settings = self.settings
         check_request(goals, planner_id, settings.planner_id)
@@ -95,6 +96,10 @@ class Requests:
             if next_request is None:
                 return UNCHANGED
             request = next_request
+        if followed is not None and not more:
+            under_way = followed.on(grid, frame)
+            threshold = settings.switch_threshold
+            request = replace(request, under_way=under_way, switch_threshold=threshold)
         plans = [await self._plan_one(planner, request)]
         for cell in more:
             if not len(plans[-1].path):
@@ -102,6 +107,8 @@ class Requests:
             request = replace(request, start=plans[-1].cells[-1], goal=cell)
             plans.append(await self._plan_one(planner, request))
         plan, number = joined(plans), len(plans)
+        if followed is not None and len(plan.every_cell):
+            followed.keep(plan.every_cell, grid, frame)
         before, goal = [start, *goals][number - 1 : number + 1]
         reason = reason_of(request, plan, before, goal, settings.robot_radius)
         if more and not len(plan.path):
