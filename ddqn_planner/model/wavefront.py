@@ -391,13 +391,13 @@ def propagate_values(
     padded = np.pad(patch_id, 1, constant_values=outside)
     table_PA = np.pad(cost_PA, ((0, 1), (0, 0)), constant_values=np.inf)
     costs = costs_by_patch(padded.ravel(), table_PA, padded.shape[1])
-    distance, state, opened = new_field(padded.size, (goal[1] + 1) * costs.width + goal[0] + 1)
+    root = np.array([(goal[1] + 1) * costs.width + goal[0] + 1], np.int32)
+    distance, state, opened = begun(np.zeros(padded.size), np.zeros(padded.size, np.uint8), root)
     grow_whole(distance, state, opened, costs)
     return q_of(distance, costs)
 
 
-def new_field(cells: int, goal: int) -> tuple[Distances, States, Cells]:
-    """Return the distances, states and open cells of a field that is still to grow."""
-    distance, state = np.zeros(cells), np.zeros(cells, dtype=np.uint8)
-    distance[goal], state[goal] = AT_GOAL, OPEN
-    return distance, state, np.array([goal], dtype=np.int32)
+def begun(distance: Distances, state: States, roots: Cells) -> tuple[Distances, States, Cells]:
+    """Return a field that is still to grow from its roots, made of zeros."""
+    distance[roots], state[roots] = AT_GOAL, OPEN
+    return distance, state, roots

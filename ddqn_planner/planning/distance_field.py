@@ -43,18 +43,20 @@ class DistanceField(QField):
         self.goal, self.grid, self.costs, self.move_rule = goal, grid, costs, move_rule
         self.lock = threading.RLock()
         self.is_whole = False
-        # After a repair the distance of a closed cell may be too great, until `_reach` is called.
+        # After a repair the distance of a closed cell may be too great, until `reach` is called.
         self.closed_is_final = True
 
     @cached_property
     def arrays(self) -> FieldArrays:
         """What is known, at first the goal alone."""
-        return self.wavefront.new_field(self.costs.patch.size, self._number(self.goal))
+        cells = self.costs.patch.size
+        roots = np.array([self._number(self.goal)], np.int32)
+        return self.wavefront.begun(np.zeros(cells), np.zeros(cells, np.uint8), roots)
 
     def _number(self, cell: Cell) -> int:
         return (cell[1] + 1) * self.costs.width + cell[0] + 1
 
-    def hand_over(self) -> FieldArrays:
+    def forget(self) -> FieldArrays:
         """Return what is known, and begin anew."""
         with self.lock:
             arrays = self.arrays
@@ -62,7 +64,12 @@ class DistanceField(QField):
             self.is_whole, self.closed_is_final = False, True
             return arrays
 
-    def _reach(self, start: Cell, limit: int | None = None) -> bool:
+    @property
+    def has_values_of_all(self) -> bool:
+        """Whether values of the whole map were asked for."""
+        return not self.__dict__.keys().isdisjoint(("q", "value", "policy"))
+
+    def reach(self, start: Cell, limit: int | None = None) -> bool:
         """Compute the field as far as a start needs it; return whether its distance is known."""
         distance, state, opened = self.arrays
         number, closed, done = self._number(start), self.wavefront.CLOSED, True
@@ -102,7 +109,7 @@ class DistanceField(QField):
         """
         start = check_inside(start, (self.grid.height, self.grid.width))
         with self.lock:
-            if not self._reach(start, limit):
+            if not self.reach(start, limit):
                 status = PlanStatus.NO_PATH if self.is_whole else PlanStatus.ROLLOUT_TRAPPED
                 return Plan(status, move_rule=self.move_rule)
             path = self.wavefront.roll_out(self.arrays[0], self.costs, self._number(start))

@@ -21,7 +21,7 @@ from ddqn_planner.planning.distance_field import DistanceField
 from ddqn_planner.planning.path_under_way import keep_or_switch
 from ddqn_planner.planning.plan import Plan, PlanMethod, PlanRequest, PlanStatus
 from ddqn_planner.planning.q_field import QField
-from ddqn_planner.planning.repair import repaired, shift_between
+from ddqn_planner.planning.repair import changed_cells, hand_over, shift_between
 from ddqn_planner.planning.search import search
 from ddqn_planner.planning.simplification import simplify
 
@@ -109,16 +109,22 @@ class Planner:
                 f"the model was not trained for maps of {grid.width} x {grid.height} cells; "
                 "train one on such a map"
             )
+        return self._field(grid, goal, rule)
+
+    def _field(
+        self, grid: GridMap, goal: Cell, rule: MoveRule, start: Cell | None = None
+    ) -> QField:
+        """Return the Q field toward a free cell, from the cache or new, perhaps for one start."""
+        known = self._map(grid, rule)
         with self._lock:
-            known = self._map(grid, rule)
             field = known.fields.get(goal)
         if field is None:
             if known.costs is None:
                 q = self.network.q_values(grid, goal, rule)
                 field = QField(goal, q, grid.legal_moves(rule), rule)
             else:
-                field = self._repaired(known, goal)
-                field = field or DistanceField(goal, grid, known.costs, rule)
+                field = DistanceField(goal, grid, known.costs, rule)
+                self._repair(known, field, start)
         self._remember(known, field)
         return field
 
@@ -144,31 +150,34 @@ class Planner:
 
     def _map(self, grid: GridMap, rule: MoveRule) -> _KnownMap:
         """Return what is known of an equal map, or what the network says of a new one."""
-        known = self._known_map(grid, rule)
-        if known is None:
-            known = _KnownMap(grid, rule, self.network.move_costs(grid, rule))
-            # A map on which no goal got a field is not kept.
-            self._maps = [*(other for other in self._maps if other.fields), known]
-        return known
+        with self._lock:
+            known = self._known_map(grid, rule)
+        if known is not None:
+            return known
+        new = _KnownMap(grid, rule, self.network.move_costs(grid, rule))
+        with self._lock:
+            known = self._known_map(grid, rule)  # another thread may have been faster
+            if known is None:
+                # A map on which no goal got a field is not kept.
+                self._maps = [*(other for other in self._maps if other.fields), new]
+        return known or new
 
-    def _repaired(self, known: _KnownMap, goal: Cell) -> QField | None:
-        """Return the field of a map that a field of an older one becomes, if there is one."""
-        assert known.costs is not None
+    def _repair(self, known: _KnownMap, new: DistanceField, start: Cell | None) -> None:
+        """Give a new field what a field of an older map knows, if there is one."""
         with self._lock:
             olders = [other for other in reversed(self._maps) if other is not known]
         for older in olders:
             shift = shift_between(older.grid, known.grid)
             if shift is None or older.move_rule is not known.move_rule:
                 continue
-            old_goal = goal[0] - shift[0], goal[1] - shift[1]
-            field = older.fields.get(old_goal)
-            if isinstance(field, DistanceField):
-                new = repaired(field, goal, known.grid, known.costs, shift)
-                if new:  # it has the older one's memory
+            old_goal = new.goal[0] - shift[0], new.goal[1] - shift[1]
+            old = older.fields.get(old_goal)
+            if isinstance(old, DistanceField):
+                changed = changed_cells(old.grid, new.grid, shift)
+                if changed is not None and hand_over(old, new, changed, shift, start):
                     with self._lock:
                         older.fields.pop(old_goal, None)
-                return new
-        return None
+                return
 
     def _remember(self, known: _KnownMap, field: QField) -> None:
         """Keep a field, and forget the oldest ones beyond the bound."""
@@ -263,7 +272,7 @@ class Planner:
                 else:
                     way_out, end = _way_out_and_end(request)
                 if way_out and (field is None or field.goal != end):
-                    field, plan = self.q_field(grid, end, rule), None
+                    field, plan = self._field(grid, end, rule, way_out[-1]), None
             if field is None or not way_out:
                 status = PlanStatus.NO_PATH if grid.is_free(goal) else PlanStatus.GOAL_OCCUPIED
                 yield Plan(status, move_rule=rule, field_ms=field_time.ms)
@@ -309,11 +318,10 @@ class Planner:
         So most requests need no connected components.
         """
         grid, rule = request.grid, request.move_rule
-        with self._lock:
-            known = self._map(grid, rule)
+        known = self._map(grid, rule)
         if known.costs is None:
             return None, None
-        field = self.q_field(grid, request.goal, rule)
+        field = self._field(grid, request.goal, rule, request.start)
         assert isinstance(field, DistanceField)
         plan = field.rollout(request.start, int(UNLABELLED_SHARE * grid.occupancy.size))
         if plan.status is PlanStatus.ROLLOUT_TRAPPED:
