@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
 from enum import Enum
 from functools import cached_property
 
@@ -51,6 +52,9 @@ class PlanRequest:
         that a path reaches.
     simplified : bool
         Whether to leave out cells, see `simplify`.
+    others : tuple of (x, y)
+        Goals that do as well: the path leads to the nearest of all that are free. They do not go
+        together with a tolerance.
     """
 
     grid: GridMap
@@ -60,6 +64,7 @@ class PlanRequest:
     method: PlanMethod = PlanMethod.GREEDY
     tolerance: float = 0.0
     simplified: bool = False
+    others: tuple[Cell, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,8 +87,9 @@ class Plan:
         What the path costs before it is simplified, see `path_cost`: on a map with costs, if a
         planner made the plan.
     goal : (x, y), optional
-        Where the path ends, or would end: the goal asked for, or the cell to which it moved. None
-        if no Q field is needed to say that there is no path, or for a rollout.
+        Where the path ends, or would end: the goal asked for, the nearest of several, or the cell
+        to which it moved. None if no Q field is needed to say that there is no path, or for a
+        rollout.
     field_ms, rollout_ms : float
         How long it took to get the Q field, and the path from it, in milliseconds. Where the field
         had to grow for the start, its time includes the path.
@@ -122,3 +128,25 @@ class Plan:
     def length(self) -> float:
         """Length in cells under the plan's rule, see `path_length`."""
         return path_length(self.path, self.move_rule)
+
+
+def joined(plans: Sequence[Plan]) -> Plan:
+    """Return the plan of a path through several goals: each plan starts where the last one ended.
+
+    Where two paths meet, their common cell is there once. The costs and the times are the sums.
+
+    Parameters
+    ----------
+    plans : sequence of Plan
+        At least one, all SUCCEEDED and under one move rule, on one map.
+    """
+    first, *others = plans
+    searched = any(plan.method is PlanMethod.ASTAR_FALLBACK for plan in plans)
+    return replace(
+        plans[-1],
+        path=np.concatenate([first.path, *(plan.path[1:] for plan in others)]),
+        method=PlanMethod.ASTAR_FALLBACK if searched else PlanMethod.GREEDY,
+        cost=None if first.cost is None else sum(plan.cost or 0.0 for plan in plans),
+        field_ms=sum(plan.field_ms for plan in plans),
+        rollout_ms=sum(plan.rollout_ms for plan in plans),
+    )
