@@ -24,9 +24,9 @@ from ddqn_planner.nodes.path_action import check_request
 from ddqn_planner.nodes.report import Outcome, RequestError, checked, reason_of, seconds
 from ddqn_planner.nodes.runtime import Worker
 from ddqn_planner.nodes.start_source import StartSource
-from ddqn_planner.nodes.via_points import joined
 from ddqn_planner.planning import Plan, PlanMethod, Planner, PlanRequest
 from ddqn_planner.planning.path_under_way import is_path_valid
+from ddqn_planner.planning.plan import joined
 from ddqn_planner.planning.planner import last_step
 
 T = TypeVar("T")

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from ddqn_planner.grid import Cell, GridMap, MoveRule
 from ddqn_planner.model.move_costs import MoveCosts
 from ddqn_planner.planning.plan import Plan, PlanStatus
-from ddqn_planner.planning.q_field import QField, check_inside
+from ddqn_planner.planning.q_field import Goals, QField, check_inside
 
 FieldArrays: TypeAlias = tuple[NDArray[np.float64], NDArray[np.uint8], NDArray[np.int32]]
 """The distances, (C,); the states of the cells, (C,); the open cells, (N,). See `wavefront`."""
@@ -28,19 +28,20 @@ class DistanceField(QField):
 
     Parameters
     ----------
-    goal : (x, y)
-        A free cell.
+    goals : tuple of (x, y)
+        Free cells. Paths lead to the nearest one; `goal` is the first.
     grid : GridMap
     costs : MoveCosts
         Of this map under the move rule.
     move_rule : MoveRule
     """
 
-    def __init__(self, goal: Cell, grid: GridMap, costs: MoveCosts, move_rule: MoveRule) -> None:
+    def __init__(self, goals: Goals, grid: GridMap, costs: MoveCosts, move_rule: MoveRule) -> None:
         from ddqn_planner.model import wavefront
 
         self.wavefront = wavefront
-        self.goal, self.grid, self.costs, self.move_rule = goal, grid, costs, move_rule
+        self.grid, self.costs, self.move_rule = grid, costs, move_rule
+        self.goal, self.goals = goals[0], goals
         self.lock = threading.RLock()
         self.is_whole = False
         # After a repair the distance of a closed cell may be too great, until `reach` is called.
@@ -48,9 +49,9 @@ class DistanceField(QField):
 
     @cached_property
     def arrays(self) -> FieldArrays:
-        """What is known, at first the goal alone."""
+        """What is known, at first the goals alone."""
         cells = self.costs.patch.size
-        roots = np.array([self._number(self.goal)], np.int32)
+        roots = np.array([self._number(goal) for goal in self.goals], np.int32)
         return self.wavefront.begun(np.zeros(cells), np.zeros(cells, np.uint8), roots)
 
     def _number(self, cell: Cell) -> int:
@@ -93,7 +94,7 @@ class DistanceField(QField):
             self.lock.release()
 
     def rollout(self, start: Cell, limit: int | None = None) -> Plan:
-        """Take greedy steps from a free cell until the goal, and return the path.
+        """Take greedy steps from a free cell until a goal, and return the path.
 
         Parameters
         ----------
@@ -142,8 +143,9 @@ class DistanceField(QField):
             distance = self._whole().reshape(-1, self.costs.width)[1:-1, 1:-1]
             value = np.negative(distance, dtype=np.float32, casting="same_kind")
             value[value == 0] = -np.inf
-        value[self.goal[1], self.goal[0]] = -np.inf
-        value[self.goal[1], self.goal[0]] = value.max()
+        x, y = np.transpose(self.goals)
+        value[y, x] = -np.inf
+        value[y, x] = value.max()
         return value
 
     @cached_property

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import threading
+import math
 import time
-from collections import OrderedDict
-from collections.abc import Iterator
-from dataclasses import dataclass, replace
-from dataclasses import field as dataclass_field
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -16,17 +14,13 @@ from numpy.typing import NDArray
 from ddqn_planner.grid import Cell, GridMap, MoveRule, legal_moves, path_cost
 from ddqn_planner.grid.arguments import as_cell
 from ddqn_planner.model import ModelMetadata, QNetwork, load_model
-from ddqn_planner.model.move_costs import MoveCosts
 from ddqn_planner.planning.distance_field import DistanceField
+from ddqn_planner.planning.field_cache import FieldCache
 from ddqn_planner.planning.path_under_way import keep_or_switch
-from ddqn_planner.planning.plan import Plan, PlanMethod, PlanRequest, PlanStatus
-from ddqn_planner.planning.q_field import QField
-from ddqn_planner.planning.repair import changed_cells, hand_over, shift_between
+from ddqn_planner.planning.plan import Plan, PlanMethod, PlanRequest, PlanStatus, joined
+from ddqn_planner.planning.q_field import Goals, QField
 from ddqn_planner.planning.search import search
 from ddqn_planner.planning.simplification import simplify
-
-CACHE_BYTES = 2**29
-"""Memory for the Q fields that a planner keeps: 14 of 2000 x 2000 cells, at 9 bytes per cell."""
 
 UNLABELLED_SHARE = 1 / 2
 """Share of the map's cells that a request may visit before the connected cells are looked at. A
@@ -35,25 +29,6 @@ request without a path would visit all that its goal is connected to."""
 ROUNDING = 1e-6
 """Relative error of a tolerance in cells: 0.15 m in cells of 0.05 m must reach 3 cells, not
 2.9999999."""
-
-
-@dataclass(eq=False)
-class _KnownMap:
-    """What a planner knows of a map under a move rule: the network's costs of moves, and fields.
-
-    The costs are None for a network that gives none, see `QNetwork.move_costs`.
-    """
-
-    grid: GridMap
-    move_rule: MoveRule
-    costs: MoveCosts | None
-    fields: OrderedDict[Cell, QField] = dataclass_field(default_factory=OrderedDict)
-
-    @property
-    def nbytes(self) -> int:
-        """Memory of the fields and the costs, bytes."""
-        of_costs = self.costs.patch.nbytes if self.costs else 0
-        return of_costs + sum(field.nbytes for field in self.fields.values())
 
 
 class Planner:
@@ -66,19 +41,12 @@ class Planner:
     network : QNetwork
     metadata : ModelMetadata
         Its move rule is the default of `plan` and `q_field`.
-
-    Attributes
-    ----------
-    cache_bytes : int
-        Memory for the fields that it keeps, those used last; the last one is always kept.
     """
 
     def __init__(self, network: QNetwork, metadata: ModelMetadata) -> None:
         self.network = network
         self.metadata = metadata
-        self.cache_bytes = CACHE_BYTES
-        self._maps: list[_KnownMap] = []  # used last at the end
-        self._lock = threading.Lock()
+        self._fields = FieldCache(network)
 
     @classmethod
     def load(cls, model: str | Path) -> Planner:
@@ -90,6 +58,15 @@ class Planner:
             If there is no such model, or its file cannot be used.
         """
         return cls(*load_model(model))
+
+    @property
+    def cache_bytes(self) -> int:
+        """Memory for the fields that it keeps, those used last; the last one is always kept."""
+        return self._fields.nbytes
+
+    @cache_bytes.setter
+    def cache_bytes(self, nbytes: int) -> None:
+        self._fields.nbytes = nbytes
 
     def q_field(self, grid: GridMap, goal: Cell, move_rule: MoveRule | str | None = None) -> QField:
         """Return the Q field of a map toward a goal, a free cell, computed or from the cache.
@@ -109,96 +86,13 @@ class Planner:
                 f"the model was not trained for maps of {grid.width} x {grid.height} cells; "
                 "train one on such a map"
             )
-        return self._field(grid, goal, rule)
-
-    def _field(
-        self, grid: GridMap, goal: Cell, rule: MoveRule, start: Cell | None = None
-    ) -> QField:
-        """Return the Q field toward a free cell, from the cache or new, perhaps for one start."""
-        known = self._map(grid, rule)
-        with self._lock:
-            field = known.fields.get(goal)
-        if field is None:
-            if known.costs is None:
-                q = self.network.q_values(grid, goal, rule)
-                field = QField(goal, q, grid.legal_moves(rule), rule)
-            else:
-                field = DistanceField(goal, grid, known.costs, rule)
-                self._repair(known, field, start)
-        self._remember(known, field)
-        return field
+        return self._fields.get(grid, (goal,), rule)
 
     def known_field(
         self, grid: GridMap, goal: Cell, move_rule: MoveRule | str | None = None
     ) -> QField | None:
         """Return the Q field of a map toward a goal if it is in the cache, else None."""
-        goal, rule = as_cell(goal, "the goal"), self._rule(move_rule)
-        with self._lock:
-            known = self._known_map(grid, rule)
-            field = known.fields.get(goal) if known else None
-            if known and field:
-                self._use(known, field)
-            return field
-
-    def _known_map(self, grid: GridMap, rule: MoveRule) -> _KnownMap | None:
-        """Return what is known of an equal map."""
-        for known in reversed(self._maps):
-            if known.move_rule is rule and known.grid.same_cells(grid):
-                known.grid = grid  # which may lie elsewhere
-                return known
-        return None
-
-    def _map(self, grid: GridMap, rule: MoveRule) -> _KnownMap:
-        """Return what is known of an equal map, or what the network says of a new one."""
-        with self._lock:
-            known = self._known_map(grid, rule)
-        if known is not None:
-            return known
-        new = _KnownMap(grid, rule, self.network.move_costs(grid, rule))
-        with self._lock:
-            known = self._known_map(grid, rule)  # another thread may have been faster
-            if known is None:
-                # A map on which no goal got a field is not kept.
-                self._maps = [*(other for other in self._maps if other.fields), new]
-        return known or new
-
-    def _repair(self, known: _KnownMap, new: DistanceField, start: Cell | None) -> None:
-        """Give a new field what a field of an older map knows, if there is one."""
-        with self._lock:
-            olders = [other for other in reversed(self._maps) if other is not known]
-        for older in olders:
-            shift = shift_between(older.grid, known.grid)
-            if shift is None or older.move_rule is not known.move_rule:
-                continue
-            old_goal = new.goal[0] - shift[0], new.goal[1] - shift[1]
-            old = older.fields.get(old_goal)
-            if isinstance(old, DistanceField):
-                changed = changed_cells(old.grid, new.grid, shift)
-                if changed is not None and hand_over(old, new, changed, shift, start):
-                    with self._lock:
-                        older.fields.pop(old_goal, None)
-                return
-
-    def _remember(self, known: _KnownMap, field: QField) -> None:
-        """Keep a field, and forget the oldest ones beyond the bound."""
-        with self._lock:
-            self._use(known, field)
-            size = sum(other.nbytes for other in self._maps)
-            while size > self.cache_bytes and (len(self._maps) > 1 or len(known.fields) > 1):
-                oldest = self._maps[0]
-                size -= oldest.nbytes
-                oldest.fields.popitem(last=False)
-                if oldest.fields:
-                    size += oldest.nbytes
-                else:
-                    del self._maps[0]
-
-    def _use(self, known: _KnownMap, field: QField) -> None:
-        """Put a map and its field where those lie that were used last."""
-        known.fields[field.goal] = field
-        known.fields.move_to_end(field.goal)
-        self._maps = [other for other in self._maps if other is not known and other.fields]
-        self._maps.append(known)
+        return self._fields.find(grid, (as_cell(goal, "the goal"),), self._rule(move_rule))
 
     def _rule(self, move_rule: MoveRule | str | None) -> MoveRule:
         return self.metadata.move_rule if move_rule is None else MoveRule(move_rule)
@@ -241,6 +135,80 @@ class Planner:
         request = PlanRequest(grid, start, goal, rule, method, tolerance, simplified)
         return last_step(self.steps(request))
 
+    def plan_nearest(
+        self,
+        grid: GridMap,
+        start: Cell,
+        goals: Sequence[Cell],
+        move_rule: MoveRule | str | None = None,
+        method: PlanMethod | str = PlanMethod.GREEDY,
+        simplified: bool = False,
+    ) -> Plan:
+        """Plan a path to the goal that the cheapest path reaches; `Plan.goal` tells which.
+
+        Goals that are occupied or outside the map are left out. If all are, the status says so:
+        GOAL_OCCUPIED if any lies on the map. One field leads to all goals that are free.
+
+        Parameters
+        ----------
+        grid, start, method, simplified
+            See `PlanRequest`.
+        goals : sequence of (x, y)
+            At least one, in any order. No goal moves: there is no tolerance.
+        move_rule : MoveRule, optional
+            As for `plan`.
+
+        Raises
+        ------
+        ValueError
+            As for `plan`, or if there is no goal.
+        """
+        first, *others = _cells_of_goals(goals)
+        rule, method = self._rule(move_rule), PlanMethod(method)
+        start = as_cell(start, "the start")
+        request = PlanRequest(
+            grid, start, first, rule, method, simplified=simplified, others=tuple(others)
+        )
+        return last_step(self.steps(request))
+
+    def plan_through(
+        self,
+        grid: GridMap,
+        start: Cell,
+        goals: Sequence[Cell],
+        move_rule: MoveRule | str | None = None,
+        method: PlanMethod | str = PlanMethod.GREEDY,
+        tolerance: float = 0.0,
+        simplified: bool = False,
+    ) -> Plan:
+        """Plan a path through all goals in their order, see `joined`.
+
+        Parameters
+        ----------
+        grid, start, move_rule, method, tolerance, simplified
+            As for `plan`. The tolerance holds for each goal. A simplified path keeps all goals.
+        goals : sequence of (x, y)
+            At least one.
+
+        Returns
+        -------
+        Plan
+            If there is no path to one of the goals, its status tells why, and its goal which.
+
+        Raises
+        ------
+        ValueError
+            As for `plan`, or if there is no goal.
+        """
+        plans: list[Plan] = []
+        for goal in _cells_of_goals(goals):
+            plans.append(self.plan(grid, start, goal, move_rule, method, tolerance, simplified))
+            if plans[-1].status is not PlanStatus.SUCCEEDED:
+                return replace(plans[-1], goal=goal)
+            assert plans[-1].goal is not None
+            start = plans[-1].goal
+        return joined(plans)
+
     def steps(self, request: PlanRequest) -> Iterator[Plan | None]:
         """Plan a path in steps, so that a caller can take the slow ones in another thread.
 
@@ -249,32 +217,38 @@ class Planner:
         Plan or None
             None before each step that may be slow (a new field, a search); at last the plan.
         """
-        grid, start, goal, rule = request.grid, request.start, request.goal, request.move_rule
+        grid, start, rule = request.grid, request.start, request.move_rule
         status = self._refusal(request)
         if status is not None:
             yield Plan(status, move_rule=rule)
             return
+        goals = _free_goals(request)
+        if len(goals) > 1 and not self._fields.has_costs(grid, rule):
+            yield None
+            each = [replace(request, goal=goal, others=()) for goal in goals]
+            yield min((last_step(self.steps(one)) for one in each), key=_cost)
+            return
         field_time, rollout_time = _Stopwatch(), _Stopwatch()
         way_out: tuple[Cell, ...] = (start,)
         with field_time:
-            field = self.known_field(grid, goal, rule) if grid.is_free(start) else None
+            field = self._fields.find(grid, goals, rule) if grid.is_free(start) else None
         with rollout_time:
             plan = field.rollout_if_known(start) if field else None
         if plan is None or (not plan.path.size and _reach(request) >= 1):
             yield None
-        if plan is None and grid.is_free(start) and grid.is_free(goal):
+        if plan is None and grid.is_free(start) and goals:
             with field_time:
-                field, plan = self._visit_some(request)
+                field, plan = self._visit_some(request, goals)
         if plan is None or not plan.path.size:
             with field_time:
                 if plan and plan.status is PlanStatus.NO_PATH and _reach(request) < 1:
-                    way_out, end = (), goal
+                    way_out, ends = (), goals
                 else:
-                    way_out, end = _way_out_and_end(request)
-                if way_out and (field is None or field.goal != end):
-                    field, plan = self._field(grid, end, rule, way_out[-1]), None
+                    way_out, ends = _way_out_and_ends(request, goals)
+                if way_out and (field is None or field.goals != ends):
+                    field, plan = self._fields.get(grid, ends, rule, way_out[-1]), None
             if field is None or not way_out:
-                status = PlanStatus.NO_PATH if grid.is_free(goal) else PlanStatus.GOAL_OCCUPIED
+                status = PlanStatus.NO_PATH if goals else PlanStatus.GOAL_OCCUPIED
                 yield Plan(status, move_rule=rule, field_ms=field_time.ms)
                 return
             with rollout_time:
@@ -283,10 +257,10 @@ class Planner:
                 yield None
                 costs = grid.cost_multiplier
                 with rollout_time:
-                    cells = search(way_out[-1], end, field.legal, costs, rule, field.value)
+                    cells = search(way_out[-1], ends[0], field.legal, costs, rule, field.value)
                 plan = Plan(PlanStatus.SUCCEEDED, np.array(cells), PlanMethod.ASTAR_FALLBACK)
         assert field is not None
-        path, cost, extra_cost = plan.path, None, None
+        path, cost, extra_cost, goal = plan.path, None, None, field.goal
         with rollout_time:
             if path.size:
                 if len(request.under_way):
@@ -294,6 +268,7 @@ class Planner:
                     path, extra_cost = keep_or_switch(
                         request.under_way, path, grid, rule, threshold
                     )
+                goal = (int(path[-1, 0]), int(path[-1, 1]))
                 if len(way_out) > 1:
                     path = np.concatenate([way_out[:-1], path], dtype=np.int32)
                 cost = None if grid.cost is None else path_cost(path, grid.cost_multiplier, rule)
@@ -305,41 +280,40 @@ class Planner:
             path=path,
             move_rule=rule,
             cost=cost,
-            goal=field.goal,
+            goal=goal,
             every_cell=every_cell,
             extra_cost=extra_cost,
             field_ms=field_time.ms,
             rollout_ms=rollout_time.ms,
         )
 
-    def _visit_some(self, request: PlanRequest) -> tuple[QField | None, Plan | None]:
-        """Return the field of the goal and the plan from it, if these take few visits of cells.
+    def _visit_some(self, request: PlanRequest, goals: Goals) -> tuple[QField | None, Plan | None]:
+        """Return the field of the goals and the plan from it, if these take few visits of cells.
 
         So most requests need no connected components.
         """
-        grid, rule = request.grid, request.move_rule
-        known = self._map(grid, rule)
-        if known.costs is None:
+        grid, start, rule = request.grid, request.start, request.move_rule
+        if not self._fields.has_costs(grid, rule):
             return None, None
-        field = self._field(grid, request.goal, rule, request.start)
+        field = self._fields.get(grid, goals, rule, start)
         assert isinstance(field, DistanceField)
-        plan = field.rollout(request.start, int(UNLABELLED_SHARE * grid.occupancy.size))
+        plan = field.rollout(start, int(UNLABELLED_SHARE * grid.occupancy.size))
         if plan.status is PlanStatus.ROLLOUT_TRAPPED:
             labels = grid.labels(rule)
-            joined = labels[request.start[::-1]] == labels[request.goal[::-1]]
-            plan = field.rollout(request.start) if joined else Plan(PlanStatus.NO_PATH)
+            joined_to_start = any(labels[y, x] == labels[start[::-1]] for x, y in goals)
+            plan = field.rollout(start) if joined_to_start else Plan(PlanStatus.NO_PATH)
         return field, plan
 
     def _refusal(self, request: PlanRequest) -> PlanStatus | None:
-        """Return why there is no path, where one look at start and goal says so."""
+        """Return why there is no path, where one look at start and goals says so."""
         grid = request.grid
         if not grid.contains(request.start):
             return PlanStatus.START_OUTSIDE_MAP
-        if not grid.contains(request.goal):
+        if not any(grid.contains(goal) for goal in (request.goal, *request.others)):
             return PlanStatus.GOAL_OUTSIDE_MAP
         if grid.is_obstacle(request.start):
             return PlanStatus.START_OCCUPIED
-        if not grid.is_free(request.goal) and _reach(request) < 1:
+        if not _free_goals(request) and _reach(request) < 1:
             return PlanStatus.GOAL_OCCUPIED
         if not self.network.supports((grid.height, grid.width)):
             return PlanStatus.MAP_SIZE_UNSUPPORTED
@@ -370,30 +344,49 @@ def _reach(request: PlanRequest) -> float:
     return request.tolerance * (1 + ROUNDING)
 
 
-def _way_out_and_end(request: PlanRequest) -> tuple[tuple[Cell, ...], Cell]:
+def _cells_of_goals(goals: Sequence[Cell]) -> list[Cell]:
+    cells = [as_cell(goal, f"goal {number}") for number, goal in enumerate(goals, 1)]
+    if not cells:
+        raise ValueError("there is no goal; give at least one cell")
+    return cells
+
+
+def _free_goals(request: PlanRequest) -> Goals:
+    """Return the free ones of a request's goals, each once."""
+    return tuple(sorted({g for g in (request.goal, *request.others) if request.grid.is_free(g)}))
+
+
+def _cost(plan: Plan) -> float:
+    if plan.status is not PlanStatus.SUCCEEDED:
+        return math.inf
+    return plan.length if plan.cost is None else plan.cost
+
+
+def _way_out_and_ends(request: PlanRequest, goals: Goals) -> tuple[tuple[Cell, ...], Goals]:
     """Return the way from the start to the first free cell, and where the path can end.
 
-    The way is the start alone where that is free. It is empty where no path leads to the goal, nor
+    The way is the start alone where that is free. It is empty where no path leads to a goal, nor
     to a cell within the tolerance: connected cells say so, without a field.
     """
-    grid, start, goal, rule = request.grid, request.start, request.goal, request.move_rule
-    goals = [np.array([goal])] if grid.is_free(goal) else []
+    grid, start, rule = request.grid, request.start, request.move_rule
+    candidates = [(np.array(goals), len(goals))] if goals else []
     if _reach(request) >= 1:
-        goals.append(_free_cells(grid, goal, _reach(request)))
-    for ends in goals:
-        joined = grid.reachable(ends, rule, backward=True)
+        candidates.append((_free_cells(grid, request.goal, _reach(request)), 1))
+    for ends, number in candidates:
+        joined_to_ends = grid.reachable(ends, rule, backward=True)
         way_out: tuple[Cell, ...] = (start,)
         if not grid.is_free(start):
             # The robot is too near to an obstacle: the shortest way through such cells.
             assert grid.obstacles is not None
-            closed = ~joined & (grid.obstacles | ~grid.occupancy)
+            closed = ~joined_to_ends & (grid.obstacles | ~grid.occupancy)
             legal = legal_moves(closed, rule, grid.forbidden)
-            way_out = search(start, joined, legal, np.ones(joined.shape, np.float32), rule)
-        if way_out and joined[way_out[-1][1], way_out[-1][0]]:
+            everywhere_1 = np.ones(closed.shape, np.float32)
+            way_out = search(start, joined_to_ends, legal, everywhere_1, rule)
+        if way_out and joined_to_ends[way_out[-1][1], way_out[-1][0]]:
             reached = grid.reachable([way_out[-1]], rule)
-            x, y = ends[np.argmax(reached[ends[:, 1], ends[:, 0]])].tolist()
-            return way_out, (x, y)
-    return (), goal
+            reached_ends = ends[reached[ends[:, 1], ends[:, 0]]]
+            return way_out, tuple((x, y) for x, y in reached_ends[:number].tolist())
+    return (), goals
 
 
 def _free_cells(grid: GridMap, goal: Cell, tolerance: float) -> NDArray[np.int64]:

@@ -10,6 +10,7 @@ from networks import turning_network
 from ddqn_planner.grid import Cell, GridMap, MoveRule
 from ddqn_planner.model import ModelMetadata
 from ddqn_planner.planning import Plan, PlanMethod, Planner, PlanRequest, PlanStatus, QField
+from ddqn_planner.planning.field_cache import FieldCache
 from ddqn_planner.planning.planner import last_step
 
 RULE = MoveRule.ROBOT_SAFE
@@ -35,8 +36,8 @@ def test_a_search_continues_from_what_the_trapped_rollout_found(
     assert trapped.status is PlanStatus.ROLLOUT_TRAPPED
     steps = planner.steps(request)
     assert next(steps) is None  # the search: the field is known
-    for name in ("q_field", "known_field"):
-        monkeypatch.delattr(Planner, name)
+    for name in ("get", "find"):
+        monkeypatch.delattr(FieldCache, name)
     monkeypatch.delattr(QField, "rollout")
     found = last_step(steps)
     assert found == whole
