@@ -50,6 +50,11 @@ class GridMap:
         Which occupied cells are obstacles. The others are only too near to an obstacle for the
         robot's body, and a robot that starts there may leave; `inflate` makes such maps. By default
         all occupied cells are obstacles.
+    slowness : (H, W) float32, optional
+        The expected time in each cell over that at nominal speed, 1 or more. It multiplies the
+        cost; see `with_slowness`.
+    seconds_per_cell : float, optional
+        The time for the length of a cell at nominal speed: with it, `Plan.cost` is in seconds.
 
     Raises
     ------
@@ -62,6 +67,8 @@ class GridMap:
     origin: tuple[float, float, float] = (0.0, 0.0, 0.0)
     cost: NDArray[np.int8] | None = None
     obstacles: Occupancy | None = None
+    slowness: NDArray[np.float32] | None = None
+    seconds_per_cell: float | None = None
 
     def __post_init__(self) -> None:
         occupancy = _occupancy(self.occupancy)
@@ -85,6 +92,16 @@ class GridMap:
                     f"{occupancy.shape}, within the occupied cells"
                 )
             self._set("obstacles", obstacles)
+        if self.slowness is not None:
+            slowness = np.array(self.slowness, dtype=np.float32, order="C")
+            if slowness.shape != occupancy.shape or not (1 <= slowness.min() <= slowness.max()):
+                raise ValueError(
+                    f"slowness has shape {slowness.shape}, or values below 1 or NaN; give "
+                    f"{occupancy.shape}, 1 or more"
+                )
+            self._set("slowness", slowness)
+        if self.seconds_per_cell is not None and not 0 < self.seconds_per_cell < math.inf:
+            raise ValueError(f"seconds_per_cell is {self.seconds_per_cell}; give more than 0")
 
     def _set(self, name: str, value: Any) -> None:
         if isinstance(value, np.ndarray):
@@ -176,7 +193,26 @@ class GridMap:
         patched._set("origin", self.origin)
         patched._set("cost", costs)
         patched._set("obstacles", _replaced(self.obstacles, box, patch))
+        patched._set("slowness", self.slowness)
+        patched._set("seconds_per_cell", self.seconds_per_cell)
         return patched
+
+    def with_slowness(self, slowness: NDArray[np.float32], seconds_per_cell: float) -> GridMap:
+        """Return the same map with other expected times; it shares all other arrays with this one.
+
+        Parameters
+        ----------
+        slowness : (H, W) float32
+            Not copied and not checked, see `GridMap`. It becomes read-only.
+        seconds_per_cell : float
+        """
+        timed = object.__new__(GridMap)
+        for name, value in self.__dict__.items():
+            if name not in ("cost_multiplier", "fingerprint"):  # which depend on the slowness
+                object.__setattr__(timed, name, value)
+        timed._set("slowness", slowness)
+        timed._set("seconds_per_cell", float(seconds_per_cell))
+        return timed
 
     @property
     def height(self) -> int:
@@ -192,11 +228,15 @@ class GridMap:
     def cost_multiplier(self) -> NDArray[np.float32]:
         """(H, W) float32: cost of a path in each cell per cell of its length, see `move_costs`.
 
-        It grows linearly from 1 for cost 0, or without costs, to `MAX_COST_MULTIPLIER`.
+        It grows linearly from 1 for cost 0, or without costs, to `MAX_COST_MULTIPLIER`, times the
+        slowness of the cell.
         """
         if self.cost is None:
+            if self.slowness is not None:
+                return self.slowness
             return np.ones(self.occupancy.shape, dtype=np.float32)
-        return _MULTIPLIERS.take(self.cost, mode="wrap")  # -1 finds the last one
+        multiplier = _MULTIPLIERS.take(self.cost, mode="wrap")  # -1 finds the last one
+        return multiplier if self.slowness is None else multiplier * self.slowness
 
     def labels(self, move_rule: MoveRule | str) -> NDArray[np.int32]:
         """Return the connected component of each cell, see `component_labels`.
@@ -219,16 +259,17 @@ class GridMap:
         digest.update(np.packbits(self.occupancy).tobytes())
         if self.cost is not None:
             digest.update(self.cost.tobytes())
+        if self.slowness is not None:
+            digest.update(b"slowness:" + self.slowness.tobytes())
         return digest.hexdigest()[:16]
 
     def same_cells(self, other: GridMap) -> bool:
-        """Return whether the occupancy and the costs of two maps are equal, wherever they lie."""
-        if self is other:
-            return True
-        same = np.array_equal(self.occupancy, other.occupancy)
-        if not same or self.cost is None or other.cost is None:
-            return same and self.cost is other.cost
-        return np.array_equal(self.cost, other.cost)
+        """Return whether all cells of two maps are equal, wherever the maps lie."""
+        return self is other or (
+            _equal(self.occupancy, other.occupancy)
+            and _equal(self.cost, other.cost)
+            and _equal(self.slowness, other.slowness)
+        )
 
     def contains(self, cell: Cell) -> bool:
         """Return whether a cell lies inside the map."""
@@ -301,3 +342,9 @@ def _replaced(array: NDArray[Any] | None, box: tuple[slice, slice], values: NDAr
         array = array.copy()
         array[box] = values
     return array
+
+
+def _equal(some: NDArray[Any] | None, others: NDArray[Any] | None) -> bool:
+    if some is None or others is None or some is others:
+        return some is others
+    return np.array_equal(some, others)

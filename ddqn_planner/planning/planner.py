@@ -280,7 +280,9 @@ class Planner:
         with rollout_time:
             if cells:
                 cells = way_out[:-1] + cells
-                cost = None if grid.cost is None else path_cost(cells, grid.cost_multiplier, rule)
+                if grid.cost is not None or grid.slowness is not None:
+                    cost = path_cost(cells, grid.cost_multiplier, rule)
+                    cost *= grid.seconds_per_cell or 1.0
                 cells = simplify(cells, grid, rule) if request.simplified else cells
         plan = replace(plan, cells=cells, move_rule=rule, cost=cost, goal=field.goal)
         yield replace(plan, field_ms=field_time.ms, rollout_ms=rollout_time.ms)

@@ -36,6 +36,8 @@ def shift_between(old: GridMap, new: GridMap) -> Cell | None:
     same = math.isclose(old.resolution, new.resolution, rel_tol=1e-6)
     if not same or old.origin[2] != new.origin[2] or (old.cost is None) != (new.cost is None):
         return None
+    if (old.slowness is None) != (new.slowness is None):
+        return None
     corner = old.cell_to_world((0, 0))
     shift = new.world_to_cell(*corner)
     apart = math.dist(corner, new.cell_to_world(shift))
@@ -97,6 +99,8 @@ def _changed_cells(old: GridMap, new: GridMap, shift: Cell) -> NDArray[np.int32]
     differs = old.occupancy[before] != new.occupancy[inside]
     if old.cost is not None and new.cost is not None:
         differs |= old.cost[before] != new.cost[inside]
+    if old.slowness is not None and new.slowness is not None:
+        differs |= old.slowness[before] != new.slowness[inside]
     if np.count_nonzero(differs) > CHANGED_SHARE * differs.size:
         return None
     width = new.width + 2

@@ -1,0 +1,297 @@
+"""What driving has shown about places of the world: `Experience`."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ddqn_planner.experience.drives import Visits, visits_of
+from ddqn_planner.experience.evidence import Evidence, Sums
+from ddqn_planner.experience.forecasts import Forecasts
+from ddqn_planner.grid import Cell, GridMap
+
+Float32 = NDArray[np.float32]
+
+REACH = 1.5
+"""How far a visit tells of the places around, in widths of the robot."""
+
+PRIOR = 1.0
+"""Variance of the log slowness of a place before it is visited; its mean is 0."""
+
+NOISE = 0.1
+"""Variance of the log slowness of one visit, before drives tell it."""
+
+PRIOR_SUCCESSES = 2.0
+"""So many successes are assumed where nothing was driven."""
+
+OUTLIER = 2.5
+"""A visit is moved to so many standard deviations from what was expected, if it lies beyond."""
+
+LARGEST = 100.0
+"""No place counts as slower than this."""
+
+STEP = 0.02
+"""Slowness is told in steps of this share, so that fields need no repair for less."""
+
+FADING_STEPS = 32
+"""So often per half-life does all evidence fade: in between it would change too little."""
+
+
+class ExpectedTime(NamedTuple):
+    """The expected time of a path in seconds, and the bounds of an interval of 90 %."""
+
+    seconds: float
+    low: float
+    high: float
+
+
+class Experience:
+    """How long driving takes at places of the world, learned from poses of a robot.
+
+    The logarithm of the slowness, that is seconds over seconds at nominal speed, has a normal
+    posterior at each place, whose prior is a nominal place. A visit tells of the places around it
+    too, as far as `REACH`, along paths and not through walls. All is kept by places of the world, so
+    maps may grow, shift or come in another resolution. Memory grows with the driven area.
+
+    Evidence fades with the time that the robot drives: what it learned does not fade overnight.
+
+    Parameters
+    ----------
+    nominal_speed : float
+        Metres per second in the open.
+    robot_width : float
+        Metres: the size of a place is half of it.
+    half_life : float
+        Seconds of driving after which evidence counts half.
+    max_pause : float
+        Seconds: a place that takes longer shows something else than driving, and is left out.
+    """
+
+    def __init__(
+        self,
+        nominal_speed: float,
+        robot_width: float = 0.5,
+        half_life: float = 3600.0,
+        max_pause: float = 90.0,
+    ) -> None:
+        given = {
+            "nominal_speed": nominal_speed,
+            "robot_width": robot_width,
+            "half_life": half_life,
+            "max_pause": max_pause,
+        }
+        for name, value in given.items():
+            if not 0 < value < math.inf:
+                raise ValueError(f"{name} is {value}; give more than 0, and finite")
+        self.nominal_speed = float(nominal_speed)
+        self.robot_width = float(robot_width)
+        self.half_life = float(half_life)
+        self.max_pause = float(max_pause)
+        self.evidence = Evidence(self.robot_width / 2, self.half_life)
+        self.forecasts = Forecasts(NOISE)
+        self._spread: _Spread | None = None
+
+    def record(self, seconds: ArrayLike, positions: ArrayLike) -> None:
+        """Learn from a drive, or a part of one.
+
+        Parameters
+        ----------
+        seconds : (N,) array
+            The time of each pose, of any clock.
+        positions : (N, 2) array
+            In metres, in the frame of the map.
+
+        Raises
+        ------
+        ValueError
+            If the shapes are wrong. Wrong values are left out, see `visits_of`.
+        """
+        step, speed = self.evidence.side, self.nominal_speed
+        visits = visits_of(seconds, positions, step, 3 * speed, self.max_pause)
+        if not len(visits.seconds):
+            return
+        log = np.log(np.clip(visits.seconds * speed / visits.metres, 1 / 3, LARGEST))
+        sums = self.evidence.around(visits.position, REACH * self.robot_width)
+        noise = self.forecasts.noise
+        precision = sums.weight / noise + 1 / PRIOR
+        expected = (sums.log / noise) / precision
+        deviation = np.sqrt(noise + 1 / precision)
+        believed = expected + np.clip(log - expected, -OUTLIER * deviation, OUTLIER * deviation)
+        self._learn_noise(visits, believed - expected, precision, sums)
+        self.evidence.add(
+            visits.position, visits.metres / step, believed, float(visits.seconds.sum())
+        )
+
+    def _learn_noise(
+        self, visits: Visits, surprise: NDArray[np.float64], precision: Any, sums: Sums
+    ) -> None:
+        """Compare a drive with what was expected of it."""
+        noise = self.forecasts.noise
+        known = sums.weight >= 1
+        if known.any():
+            self.forecasts.add_surprises(surprise[known], 1 / (precision[known] * noise))
+        nominal = visits.metres / self.nominal_speed
+        log = _log_slowness(sums, noise)
+        expected = nominal * np.exp(np.clip(log, 0, math.log(LARGEST)))
+        if known.mean() > 0.8 and len(nominal) >= 8:
+            spread = self.forecasts.deviation(expected, visits.metres, 1 / precision, self._length)
+            self.forecasts.add_drive(
+                math.log(visits.seconds.sum() / expected.sum()) / spread
+            )
+
+    @property
+    def _length(self) -> float:
+        return REACH * self.robot_width
+
+    def record_failure(self, position: Sequence[float]) -> None:
+        """Learn that the robot failed at a place: it got stuck, was sent back, or gave up."""
+        x, y = (float(value) for value in position)
+        if not (math.isfinite(x) and math.isfinite(y)):
+            raise ValueError(f"the position is {(x, y)}; give finite metres")
+        self.evidence.add_failure(x, y)
+
+    def forget(self) -> None:
+        """Forget all."""
+        self.evidence = Evidence(self.robot_width / 2, self.half_life)
+        self.forecasts = Forecasts(NOISE)
+        self._spread = None
+
+    def apply(self, grid: GridMap) -> GridMap:
+        """Return a map whose moves cost expected time, so that `Plan.cost` is in seconds.
+
+        Costs of the map itself multiply it. Where moves fail, a move is tried until it succeeds: the
+        time is that of one try over the probability of success.
+        """
+        spread = self._spread_over(grid)
+        return grid.with_slowness(spread.slowness.copy(), grid.resolution / self.nominal_speed)
+
+    def slowness(self, grid: GridMap) -> Float32:
+        """Return (H, W) float32: expected seconds over those at nominal speed, 1 or more."""
+        return self._spread_over(grid).slowness.copy()
+
+    def uncertainty(self, grid: GridMap) -> Float32:
+        """Return (H, W) float32: the standard deviation of the log slowness."""
+        spread = self._spread_over(grid)
+        weight = np.maximum(spread.sums[..., 0], 0)
+        return (1 / np.sqrt(weight / spread.noise + 1 / PRIOR)).astype(np.float32)
+
+    def expected_time(self, grid: GridMap, cells: Sequence[Cell]) -> ExpectedTime:
+        """Return the time that a path of neighbouring cells takes, with an interval of 90 %.
+
+        The interval is that of the posterior, with the noise of a drive, and as wide as drives so
+        far have shown.
+        """
+        spread = self._spread_over(grid)
+        if len(cells) < 2:
+            return ExpectedTime(0.0, 0.0, 0.0)
+        x, y = np.asarray(cells, dtype=np.int64).T
+        metres = np.hypot(np.diff(x), np.diff(y)) * grid.resolution
+        slowness = spread.slowness[y, x].astype(np.float64)
+        variance = self.uncertainty(grid)[y, x].astype(np.float64) ** 2
+        seconds = metres / self.nominal_speed * (slowness[1:] + slowness[:-1]) / 2
+        deviation = self.forecasts.deviation(
+            seconds, metres, (variance[1:] + variance[:-1]) / 2, self._length
+        )
+        low, middle, high = np.exp(self.forecasts.quantiles() * deviation)
+        total = float(seconds.sum())
+        return ExpectedTime(total * middle, total * low, total * high)
+
+    def _spread_over(self, grid: GridMap) -> _Spread:
+        """Return the evidence spread over the cells of a map, computed only where it changed."""
+        epoch = self.evidence.epoch(FADING_STEPS)
+        old = self._spread
+        if old is None or old.epoch != epoch or not _same_place(old.grid, grid):
+            noise = self.forecasts.noise
+            self._spread = old = _Spread(grid, epoch, noise)
+        elif old.grid.occupancy is not grid.occupancy:
+            if not np.array_equal(old.grid.occupancy, grid.occupancy):
+                self._spread = old = _Spread(grid, epoch, old.noise)
+        old.grid = grid
+        old.update(self.evidence, REACH * self.robot_width)
+        return old
+
+    def save(self, path: str | Path) -> None:
+        """Save to a file, atomically; an OSError leaves an old file unchanged."""
+        from ddqn_planner.experience.experience_file import save
+
+        save(self, Path(path))
+
+    @classmethod
+    def load(cls, path: str | Path) -> Experience:
+        """Load from a file.
+
+        Raises
+        ------
+        ExperienceFileError
+            If the file is missing, broken, or no experience.
+        """
+        from ddqn_planner.experience.experience_file import load
+
+        return load(Path(path))
+
+
+def _log_slowness(sums: Sums, noise: float) -> NDArray[np.float64]:
+    """Return the log of the mean slowness: half of the noise is the mean of its exponential."""
+    log: NDArray[np.float64] = (sums.log / noise + sums.weight / 2) / (
+        sums.weight / noise + 1 / PRIOR
+    )
+    return log
+
+
+def _same_place(old: GridMap, new: GridMap) -> bool:
+    return (old.occupancy.shape, old.resolution, old.origin) == (
+        new.occupancy.shape,
+        new.resolution,
+        new.origin,
+    )
+
+
+@dataclass(eq=False)
+class _Spread:
+    """Evidence spread over the cells of a map."""
+
+    grid: GridMap
+    epoch: int
+    noise: float
+
+    def __post_init__(self) -> None:
+        shape = self.grid.occupancy.shape
+        self.sums = np.zeros((*shape, 3), dtype=np.float32)
+        self.slowness = np.ones(shape, dtype=np.float32)
+        self.touched = np.zeros(shape, dtype=np.bool_)
+        self.version = 0
+        self.cells = np.empty((0, 2), dtype=np.int64)
+        self.amounts = np.empty((0, 3), dtype=np.float32)
+
+    def update(self, evidence: Evidence, reach: float) -> None:
+        """Spread what changed since the last call: the old evidence is taken away."""
+        from ddqn_planner.experience.spreading import refresh, spread
+
+        changed = evidence.changed_since(self.version)
+        self.version = evidence.version
+        if not len(changed):
+            return
+        cells, amounts = evidence.on_map(changed, self.grid, self.epoch, FADING_STEPS)
+        grown = evidence.places - len(self.cells)
+        self.cells = np.pad(self.cells, ((0, grown), (0, 0)), constant_values=-1)
+        self.amounts = np.pad(self.amounts, ((0, grown), (0, 0)))
+        before, taken = self.cells[changed], -self.amounts[changed]
+        self.cells[changed], self.amounts[changed] = cells, amounts
+        moved = (before != cells).any(axis=1)
+        amounts = np.where(moved[:, None], amounts, amounts + taken)
+        cells = np.concatenate([cells, before[moved]])
+        amounts = np.concatenate([amounts, taken[moved]])
+        inside = cells[:, 0] >= 0
+        occupancy = self.grid.occupancy
+        in_cells = max(reach / self.grid.resolution, 0.5)
+        spread(occupancy, cells[inside], amounts[inside], in_cells, self.sums, self.touched)
+        refresh(
+            self.sums, self.touched, self.noise, PRIOR, PRIOR_SUCCESSES, 0.0, LARGEST, STEP,
+            self.slowness,
+        )
