@@ -37,12 +37,12 @@ class Visits(NamedTuple):
 
 
 def visits_of(
-    seconds: ArrayLike, positions: ArrayLike, step: float, max_speed: float, max_pause: float
+    seconds: ArrayLike, positions: ArrayLike, side: float, max_speed: float, max_pause: float
 ) -> Visits:
-    """Divide a drive into places.
+    """Divide a drive into places, squares of the world.
 
-    A place ends when the robot is `step` away from where it began: so noise of the pose and the rate
-    of the samples hardly matter, and waiting counts as time. Not believed are poses that are not
+    The drive is followed in steps of half a square: so noise of the pose and the rate of the samples
+    hardly matter, and waiting counts as time. Not believed are poses that are not
     finite, clocks that go back or stand still, places that take longer than `max_pause`, and moves
     that are faster than `max_speed`. A pose that jumps far is not believed until it jumps back to
     where the robot can be.
@@ -52,8 +52,8 @@ def visits_of(
     seconds : (N,) array
     positions : (N, 2) array
         In metres.
-    step : float
-        Metres.
+    side : float
+        Of a square, metres.
     max_speed : float
         Metres per second.
     max_pause : float
@@ -75,6 +75,7 @@ def visits_of(
     fresh = np.diff(time, prepend=np.nan) != 0  # a repeated time adds nothing
     time, position = time[fresh], position[fresh]
     rows: list[tuple[float, ...]] = []
+    step = side / 2
     for first, end in _believed_parts(time, position, max_speed, max_pause):
         rows += _steps(time[first:end].tolist(), position[first:end].tolist(), step)
     array = np.array(rows).reshape(-1, 6)
@@ -86,7 +87,14 @@ def visits_of(
     count = np.repeat(count, count)
     share = ((number + 0.5) / count)[:, None]
     middle = array[:, 0:2] * (1 - share) + array[:, 2:4] * share
-    return Visits(middle, array[:, 4] / count, array[:, 5] / count)
+    if not len(middle):
+        return Visits(middle, array[:, 4], array[:, 5])
+    square = np.floor(middle / side)
+    first = np.flatnonzero(np.append(True, (np.diff(square, axis=0) != 0).any(axis=1)))
+    metres = array[:, 5] / count
+    sums = np.column_stack([middle * metres[:, None], array[:, 4] / count, metres])
+    sums = np.add.reduceat(sums, first)
+    return Visits(sums[:, :2] / sums[:, 3:], sums[:, 2], sums[:, 3])
 
 
 def _believed_parts(

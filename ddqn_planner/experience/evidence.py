@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import Any, Final, NamedTuple
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,13 +18,6 @@ MOST = 6.0
 COLUMNS: Final = ("weight", "log", "failures", "x", "y", "time")
 """Of each place: the weight of its visits, that times their log slowness, the weight of failures,
 the weight of all times their position, and the driven time when these were last faded."""
-
-
-class Sums(NamedTuple):
-    """Weight of visits, and weight times log slowness: (N,) float64 each."""
-
-    weight: Float64
-    log: Float64
 
 
 class Evidence:
@@ -108,34 +101,12 @@ class Evidence:
         """Return the rows that changed after a version."""
         return np.flatnonzero(self._changed[: self.places] > version)
 
-    def around(self, position: Float64, reach: float) -> Sums:
-        """Return what is known around positions, as if there were no walls."""
-        side = int(reach / self.side)
-        offsets = np.arange(-side, side + 1)
-        apart = np.hypot(offsets[:, None], offsets) * self.side / reach
-        share = np.where(apart < 1, (1 - apart**2) ** 2, 0)
-        sums = np.zeros((len(position), 2))
-        keys = self._keys(position)
-        known: dict[tuple[int, int], tuple[float, float]] = {}
-        faded = self.table[:, :2] * (0.5 ** ((self.driven - self.table[:, 5]) / self.half_life))[:, None]
-        near = [
-            (dx, dy, share[j, i])
-            for i, dx in enumerate(offsets.tolist())
-            for j, dy in enumerate(offsets.tolist())
-            if share[j, i] > 0
-        ]
-        for index, (x, y) in enumerate(keys):
-            total = known.get((x, y))
-            if total is None:
-                weight = log = 0.0
-                for dx, dy, part in near:
-                    row = self.number.get((x + dx, y + dy))
-                    if row is not None:
-                        weight += part * faded[row, 0]
-                        log += part * faded[row, 1]
-                total = known[x, y] = weight, log
-            sums[index] = total
-        return Sums(sums[:, 0], sums[:, 1])
+    def at(self, position: Float64) -> tuple[Float64, Float64]:
+        """Return the weight of visits at positions, and that times log slowness: (N,) each."""
+        rows = np.array([self.number.get(key, -1) for key in self._keys(position)], dtype=np.int64)
+        table = np.where(rows[:, None] >= 0, self._table[rows], 0.0)
+        share = 0.5 ** ((self.driven - table[:, 5]) / self.half_life)
+        return share * table[:, 0], share * table[:, 1]
 
     def epoch(self, steps: int) -> int:
         """Return how many steps of fading there were so far, of so many per half-life."""
@@ -151,33 +122,38 @@ class Evidence:
         """
         table = self._table[rows]
         weight = table[:, 0] + table[:, 2]
-        x, y = (table[:, 3:5] / np.maximum(weight, 1e-300)[:, None]).T
-        origin_x, origin_y, yaw = grid.origin
-        cos, sin = math.cos(yaw), math.sin(yaw)
-        along_x = (cos * (x - origin_x) + sin * (y - origin_y)) / grid.resolution
-        along_y = (cos * (y - origin_y) - sin * (x - origin_x)) / grid.resolution
-        cells = np.floor(np.column_stack([along_x, along_y])).astype(np.int64)
-        exact = np.column_stack([along_x, along_y]) - 0.5
-        cells = _nearest_free(cells, exact, grid, int(self.side / grid.resolution))
+        position = table[:, 3:5] / np.maximum(weight, 1e-300)[:, None]
+        cells, free = cells_of(position, grid)
+        cells = _nearest_free(cells, free, grid, int(self.side / grid.resolution))
         age = epoch * self.half_life / steps - table[:, 5]
         amounts = table[:, :3] * (0.5 ** (age / self.half_life))[:, None]
         return cells, amounts.astype(np.float32)
 
 
+def cells_of(position: Float64, grid: GridMap) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
+    """Return the cells of positions, (N, 2) as (x, y), and which of them are free: (N,)."""
+    origin_x, origin_y, yaw = grid.origin
+    x, y = position[:, 0] - origin_x, position[:, 1] - origin_y
+    cos, sin = math.cos(yaw), math.sin(yaw)
+    along = np.column_stack([cos * x + sin * y, cos * y - sin * x])
+    cells = np.floor(along / grid.resolution).astype(np.int64)
+    free = ((cells >= 0) & (cells < (grid.width, grid.height))).all(axis=1)
+    x, y = cells[free].T
+    free[free] = ~grid.occupancy[y, x]
+    return cells, free
+
+
 def _nearest_free(
-    cells: NDArray[np.int64], exact: Float64, grid: GridMap, reach: int
+    cells: NDArray[np.int64], free: NDArray[np.bool_], grid: GridMap, reach: int
 ) -> NDArray[np.int64]:
-    """Return the nearest free cell of each within some cells; (-1, -1) without one."""
-    inside = ((cells >= 0) & (cells < (grid.width, grid.height))).all(axis=1)
-    near: Any = np.clip(cells, 0, (grid.width - 1, grid.height - 1))
-    free = inside & ~grid.occupancy[near[:, 1], near[:, 0]]
+    """Return the free cell nearest to each within some cells; (-1, -1) without one."""
     result = np.where(free[:, None], cells, -1)
     for index in np.flatnonzero(~free):
-        (x, y), (at_x, at_y) = cells[index].tolist(), exact[index].tolist()
+        x, y = cells[index].tolist()
         left, bottom = max(x - reach, 0), max(y - reach, 0)
         box = grid.occupancy[bottom : max(y + reach + 1, 0), left : max(x + reach + 1, 0)]
         free_y, free_x = np.nonzero(~box)
         if len(free_x):
-            best = np.hypot(free_x + left - at_x, free_y + bottom - at_y).argmin()
+            best = np.hypot(free_x + left - x, free_y + bottom - y).argmin()
             result[index] = free_x[best] + left, free_y[best] + bottom
     return result

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ddqn_planner.experience.drives import Visits, visits_of
-from ddqn_planner.experience.evidence import Evidence, Sums
+from ddqn_planner.experience.evidence import Evidence, cells_of
 from ddqn_planner.experience.forecasts import Forecasts
 from ddqn_planner.grid import Cell, GridMap
 
@@ -35,6 +35,9 @@ OUTLIER = 2.5
 
 LARGEST = 100.0
 """No place counts as slower than this."""
+
+SHORTEST = 8
+"""A drive through fewer places says little about how sure expected times are."""
 
 STEP = 0.02
 """Slowness is told in steps of this share, so that fields need no repair for less."""
@@ -112,42 +115,37 @@ class Experience:
         ValueError
             If the shapes are wrong. Wrong values are left out, see `visits_of`.
         """
-        step, speed = self.evidence.side, self.nominal_speed
-        visits = visits_of(seconds, positions, step, 3 * speed, self.max_pause)
+        side, speed = self.evidence.side, self.nominal_speed
+        visits = visits_of(seconds, positions, side, 3 * speed, self.max_pause)
         if not len(visits.seconds):
             return
         log = np.log(np.clip(visits.seconds * speed / visits.metres, 1 / 3, LARGEST))
-        sums = self.evidence.around(visits.position, REACH * self.robot_width)
+        weight, sum_of_log = self.evidence.at(visits.position)
         noise = self.forecasts.noise
-        precision = sums.weight / noise + 1 / PRIOR
-        expected = (sums.log / noise) / precision
-        deviation = np.sqrt(noise + 1 / precision)
-        believed = expected + np.clip(log - expected, -OUTLIER * deviation, OUTLIER * deviation)
-        self._learn_noise(visits, believed - expected, precision, sums)
-        self.evidence.add(
-            visits.position, visits.metres / step, believed, float(visits.seconds.sum())
+        variance = 1 / (weight / noise + 1 / PRIOR)
+        surprise = log - sum_of_log / noise * variance
+        most = OUTLIER * np.sqrt(noise + variance)
+        believed = np.clip(surprise, -most, most)
+        known = weight >= 1
+        self.forecasts.add_surprises(believed[known], variance[known] / noise)
+        if self._spread is not None:
+            self._compare(visits, self._spread)
+        duration = float(visits.seconds.sum())
+        self.evidence.add(visits.position, visits.metres / side, log - surprise + believed, duration)
+
+    def _compare(self, visits: Visits, spread: _Spread) -> None:
+        """Compare the time of a drive with the one expected on the last map."""
+        cells, inside = cells_of(visits.position, spread.grid)
+        x, y = cells[inside].T
+        if len(x) < SHORTEST:
+            return
+        metres = visits.metres[inside]
+        expected = metres / self.nominal_speed * spread.slowness[y, x]
+        deviation = self.forecasts.deviation(
+            expected, metres, spread.variance(x, y), REACH * self.robot_width
         )
-
-    def _learn_noise(
-        self, visits: Visits, surprise: NDArray[np.float64], precision: Any, sums: Sums
-    ) -> None:
-        """Compare a drive with what was expected of it."""
-        noise = self.forecasts.noise
-        known = sums.weight >= 1
-        if known.any():
-            self.forecasts.add_surprises(surprise[known], 1 / (precision[known] * noise))
-        nominal = visits.metres / self.nominal_speed
-        log = _log_slowness(sums, noise)
-        expected = nominal * np.exp(np.clip(log, 0, math.log(LARGEST)))
-        if known.mean() > 0.8 and len(nominal) >= 8:
-            spread = self.forecasts.deviation(expected, visits.metres, 1 / precision, self._length)
-            self.forecasts.add_drive(
-                math.log(visits.seconds.sum() / expected.sum()) / spread
-            )
-
-    @property
-    def _length(self) -> float:
-        return REACH * self.robot_width
+        ratio = visits.seconds[inside].sum() / expected.sum()
+        self.forecasts.add_drive(math.log(ratio) / deviation)
 
     def record_failure(self, position: Sequence[float]) -> None:
         """Learn that the robot failed at a place: it got stuck, was sent back, or gave up."""
@@ -178,8 +176,7 @@ class Experience:
     def uncertainty(self, grid: GridMap) -> Float32:
         """Return (H, W) float32: the standard deviation of the log slowness."""
         spread = self._spread_over(grid)
-        weight = np.maximum(spread.sums[..., 0], 0)
-        return (1 / np.sqrt(weight / spread.noise + 1 / PRIOR)).astype(np.float32)
+        return np.sqrt(spread.variance(slice(None), slice(None))).astype(np.float32)
 
     def expected_time(self, grid: GridMap, cells: Sequence[Cell]) -> ExpectedTime:
         """Return the time that a path of neighbouring cells takes, with an interval of 90 %.
@@ -193,10 +190,10 @@ class Experience:
         x, y = np.asarray(cells, dtype=np.int64).T
         metres = np.hypot(np.diff(x), np.diff(y)) * grid.resolution
         slowness = spread.slowness[y, x].astype(np.float64)
-        variance = self.uncertainty(grid)[y, x].astype(np.float64) ** 2
+        variance = spread.variance(x, y)
         seconds = metres / self.nominal_speed * (slowness[1:] + slowness[:-1]) / 2
         deviation = self.forecasts.deviation(
-            seconds, metres, (variance[1:] + variance[:-1]) / 2, self._length
+            seconds, metres, (variance[1:] + variance[:-1]) / 2, REACH * self.robot_width
         )
         low, middle, high = np.exp(self.forecasts.quantiles() * deviation)
         total = float(seconds.sum())
@@ -236,14 +233,6 @@ class Experience:
         return load(Path(path))
 
 
-def _log_slowness(sums: Sums, noise: float) -> NDArray[np.float64]:
-    """Return the log of the mean slowness: half of the noise is the mean of its exponential."""
-    log: NDArray[np.float64] = (sums.log / noise + sums.weight / 2) / (
-        sums.weight / noise + 1 / PRIOR
-    )
-    return log
-
-
 def _same_place(old: GridMap, new: GridMap) -> bool:
     return (old.occupancy.shape, old.resolution, old.origin) == (
         new.occupancy.shape,
@@ -268,6 +257,12 @@ class _Spread:
         self.version = 0
         self.cells = np.empty((0, 2), dtype=np.int64)
         self.amounts = np.empty((0, 3), dtype=np.float32)
+
+    def variance(self, x: Any, y: Any) -> NDArray[np.float64]:
+        """Return the variance of the log slowness of some cells."""
+        weight = np.maximum(self.sums[y, x, 0].astype(np.float64), 0)
+        variance: NDArray[np.float64] = 1 / (weight / self.noise + 1 / PRIOR)
+        return variance
 
     def update(self, evidence: Evidence, reach: float) -> None:
         """Spread what changed since the last call: the old evidence is taken away."""

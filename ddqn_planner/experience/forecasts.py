@@ -84,7 +84,9 @@ class Forecasts:
         """Return the 5 % quantile, the mean, and the 95 % quantile of the errors of drives."""
         assumed = NORMAL * np.linspace(-1.05, 1.05, ASSUMED)
         errors = np.concatenate([self.errors, assumed])
-        low, high = np.quantile(errors, (0.05, 0.95))
+        # Of n errors and the next one, as many lie outside on each side as of a sample of n + 1.
+        tail = 0.05 * (1 + 1 / len(errors)) - 1 / len(errors)
+        low, high = np.quantile(errors, (max(tail, 0), min(1 - tail, 1)))
         return np.array([low, errors.mean(), high])
 
     def restore(self, noise: Sequence[float], errors: Sequence[float]) -> None:
