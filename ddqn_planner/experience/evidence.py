@@ -12,12 +12,12 @@ from ddqn_planner.grid import GridMap
 
 Float64 = NDArray[np.float64]
 
-MOST = 6.0
-"""Weight of visits that a place keeps: a new visit then counts a seventh, whatever was before."""
+MOST = 4.0
+"""Weight of visits that a place keeps: a new visit then counts a fifth, whatever was before."""
 
 COLUMNS: Final = ("weight", "log", "failures", "x", "y", "time")
 """Of each place: the weight of its visits, that times their log slowness, the weight of failures,
-the weight of all times their position, and the driven time when these were last faded."""
+where it was visited first, and the driven time when the weights were last faded."""
 
 
 class Evidence:
@@ -58,39 +58,44 @@ class Evidence:
     def _keys(self, position: Float64) -> list[tuple[int, int]]:
         return list(map(tuple, np.floor(position / self.side).astype(np.int64).tolist()))
 
-    def _rows(self, keys: list[tuple[int, int]]) -> NDArray[np.int64]:
-        """Return the row of each place; new ones get one."""
-        rows = [self.number.setdefault(key, len(self.number)) for key in keys]
+    def _rows(self, position: Float64) -> NDArray[np.int64]:
+        """Return the row of each position; new places get one."""
+        keys = self._keys(position)
+        before = self.places
+        rows = np.array([self.number.setdefault(key, len(self.number)) for key in keys])
         missing = self.places - len(self._table)
         if missing > 0:
             missing += self.places
             self._table = np.pad(self._table, ((0, missing), (0, 0)))
             self._changed = np.pad(self._changed, (0, missing))
-        return np.array(rows, dtype=np.int64)
+        fresh, first = np.unique(rows, return_index=True)
+        first = first[fresh >= before]
+        self._table[rows[first], 3:5] = position[first]
+        return rows
 
     def _fade(self, rows: NDArray[np.int64]) -> None:
         """Fade places to the driven time."""
         age = self.driven - self._table[rows, 5]
-        self._table[rows, :5] *= (0.5 ** (age / self.half_life))[:, None]
+        self._table[rows, :3] *= (0.5 ** (age / self.half_life))[:, None]
         self._table[rows, 5] = self.driven
 
     def add(self, position: Float64, weight: Float64, log: Float64, seconds: float) -> None:
         """Add the visits of a drive that took some seconds."""
         self.driven += seconds
-        rows = self._rows(self._keys(position))
+        rows = self._rows(position)
         places = np.unique(rows)
         self._fade(places)
-        values = np.column_stack([np.ones(len(log)), log, np.zeros(len(log)), position])
-        np.add.at(self._table, (rows[:, None], np.arange(5)), values * weight[:, None])
+        np.add.at(self._table[:, 0], rows, weight)
+        np.add.at(self._table[:, 1], rows, weight * log)
         surplus = np.maximum(self._table[places, 0] / MOST, 1)
-        self._table[places, :5] /= surplus[:, None]
+        self._table[places, :3] /= surplus[:, None]
         self._mark(places)
 
     def add_failure(self, x: float, y: float) -> None:
         """Add a failure."""
-        rows = self._rows(self._keys(np.array([[x, y]])))
+        rows = self._rows(np.array([[x, y]]))
         self._fade(rows)
-        self._table[rows, 2:5] += (1, x, y)
+        self._table[rows, 2] += 1
         self._mark(rows)
 
     def _mark(self, rows: NDArray[np.int64]) -> None:
@@ -108,25 +113,20 @@ class Evidence:
         share = 0.5 ** ((self.driven - table[:, 5]) / self.half_life)
         return share * table[:, 0], share * table[:, 1]
 
-    def epoch(self, steps: int) -> int:
-        """Return how many steps of fading there were so far, of so many per half-life."""
-        return math.floor(self.driven * steps / self.half_life)
-
     def on_map(
-        self, rows: NDArray[np.int64], grid: GridMap, epoch: int, steps: int
+        self, rows: NDArray[np.int64], grid: GridMap, driven: float
     ) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
-        """Return the cells of places, (N, 2), and what was seen there, faded to an epoch: (N, 3).
+        """Return the cells of places, (N, 2), and the weights seen there, (N, 3).
 
-        A cell is that of the mean position. If it is occupied, it is the nearest free one within the
+        These are faded to a driven time.
+
+        A cell is that of the first visit. If it is occupied, it is the nearest free one within the
         side of a place; without one, the cell is (-1, -1).
         """
         table = self._table[rows]
-        weight = table[:, 0] + table[:, 2]
-        position = table[:, 3:5] / np.maximum(weight, 1e-300)[:, None]
-        cells, free = cells_of(position, grid)
+        cells, free = cells_of(table[:, 3:5], grid)
         cells = _nearest_free(cells, free, grid, int(self.side / grid.resolution))
-        age = epoch * self.half_life / steps - table[:, 5]
-        amounts = table[:, :3] * (0.5 ** (age / self.half_life))[:, None]
+        amounts = table[:, :3] * (0.5 ** ((driven - table[:, 5]) / self.half_life))[:, None]
         return cells, amounts.astype(np.float32)
 
 

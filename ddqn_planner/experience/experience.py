@@ -30,6 +30,8 @@ NOISE = 0.1
 PRIOR_SUCCESSES = 2.0
 """So many successes are assumed where nothing was driven."""
 
+CAUTION = 0.0
+
 OUTLIER = 2.5
 """A visit is moved to so many standard deviations from what was expected, if it lies beyond."""
 
@@ -42,8 +44,11 @@ SHORTEST = 8
 STEP = 0.02
 """Slowness is told in steps of this share, so that fields need no repair for less."""
 
-FADING_STEPS = 32
-"""So often per half-life does all evidence fade: in between it would change too little."""
+FADING_STEPS = 4
+"""So often per half-life does all evidence fade, so that few changes of a map come at once."""
+
+REBASE = 2.0**16
+"""Evidence is spread anew when the weights of a map have grown so much against the oldest."""
 
 
 class ExpectedTime(NamedTuple):
@@ -80,7 +85,7 @@ class Experience:
         self,
         nominal_speed: float,
         robot_width: float = 0.5,
-        half_life: float = 3600.0,
+        half_life: float = 1800.0,
         max_pause: float = 90.0,
     ) -> None:
         given = {
@@ -167,7 +172,7 @@ class Experience:
         time is that of one try over the probability of success.
         """
         spread = self._spread_over(grid)
-        return grid.with_slowness(spread.slowness.copy(), grid.resolution / self.nominal_speed)
+        return grid.with_slowness(spread.slowness, grid.resolution / self.nominal_speed)
 
     def slowness(self, grid: GridMap) -> Float32:
         """Return (H, W) float32: expected seconds over those at nominal speed, 1 or more."""
@@ -201,17 +206,12 @@ class Experience:
 
     def _spread_over(self, grid: GridMap) -> _Spread:
         """Return the evidence spread over the cells of a map, computed only where it changed."""
-        epoch = self.evidence.epoch(FADING_STEPS)
-        old = self._spread
-        if old is None or old.epoch != epoch or not _same_place(old.grid, grid):
-            noise = self.forecasts.noise
-            self._spread = old = _Spread(grid, epoch, noise)
-        elif old.grid.occupancy is not grid.occupancy:
-            if not np.array_equal(old.grid.occupancy, grid.occupancy):
-                self._spread = old = _Spread(grid, epoch, old.noise)
-        old.grid = grid
-        old.update(self.evidence, REACH * self.robot_width)
-        return old
+        period = self.half_life / FADING_STEPS
+        driven = math.floor(self.evidence.driven / period) * period
+        if self._spread is None or not self._spread.fits(grid, driven):
+            self._spread = _Spread(grid, driven, self.half_life)
+        self._spread.update(grid, driven, self.forecasts.noise, self.evidence, self.robot_width)
+        return self._spread
 
     def save(self, path: str | Path) -> None:
         """Save to a file, atomically; an OSError leaves an old file unchanged."""
@@ -233,21 +233,22 @@ class Experience:
         return load(Path(path))
 
 
-def _same_place(old: GridMap, new: GridMap) -> bool:
-    return (old.occupancy.shape, old.resolution, old.origin) == (
-        new.occupancy.shape,
-        new.resolution,
-        new.origin,
-    )
-
-
 @dataclass(eq=False)
 class _Spread:
-    """Evidence spread over the cells of a map."""
+    """Evidence spread over the cells of a map.
+
+    Parameters
+    ----------
+    grid : GridMap
+    since : float
+        The driven time to which the weights of the sums are faded. They fade by one factor, so they
+        are not spread again for it.
+    half_life : float
+    """
 
     grid: GridMap
-    epoch: int
-    noise: float
+    since: float
+    half_life: float
 
     def __post_init__(self) -> None:
         shape = self.grid.occupancy.shape
@@ -255,38 +256,54 @@ class _Spread:
         self.slowness = np.ones(shape, dtype=np.float32)
         self.touched = np.zeros(shape, dtype=np.bool_)
         self.version = 0
+        self.driven, self.noise = self.since, NOISE
         self.cells = np.empty((0, 2), dtype=np.int64)
         self.amounts = np.empty((0, 3), dtype=np.float32)
 
+    def fits(self, grid: GridMap, driven: float) -> bool:
+        """Return whether a map has the same cells, and the weights are in range."""
+        old = self.grid
+        return (
+            old.resolution == grid.resolution
+            and old.origin == grid.origin
+            and (old.occupancy is grid.occupancy or np.array_equal(old.occupancy, grid.occupancy))
+            and self.faded(driven) > 1 / REBASE
+        )
+
+    def faded(self, driven: float) -> float:
+        """Return by what factor weights have faded."""
+        return float(0.5 ** ((driven - self.since) / self.half_life))
+
     def variance(self, x: Any, y: Any) -> NDArray[np.float64]:
         """Return the variance of the log slowness of some cells."""
-        weight = np.maximum(self.sums[y, x, 0].astype(np.float64), 0)
+        weight = np.maximum(self.sums[y, x, 0].astype(np.float64), 0) * self.faded(self.driven)
         variance: NDArray[np.float64] = 1 / (weight / self.noise + 1 / PRIOR)
         return variance
 
-    def update(self, evidence: Evidence, reach: float) -> None:
+    def update(
+        self, grid: GridMap, driven: float, noise: float, evidence: Evidence, width: float
+    ) -> None:
         """Spread what changed since the last call: the old evidence is taken away."""
         from ddqn_planner.experience.spreading import refresh, spread
 
+        self.grid = grid
         changed = evidence.changed_since(self.version)
         self.version = evidence.version
-        if not len(changed):
+        if len(changed):
+            cells, amounts = evidence.on_map(changed, grid, self.since)
+            grown = evidence.places - len(self.cells)
+            self.cells = np.pad(self.cells, ((0, grown), (0, 0)))
+            self.amounts = np.pad(self.amounts, ((0, grown), (0, 0)))
+            more = amounts - self.amounts[changed]
+            self.cells[changed], self.amounts[changed] = cells, amounts
+            free = cells[:, 0] >= 0
+            reach = max(REACH * width / grid.resolution, 0.5)
+            spread(grid.occupancy, cells[free], more[free], reach, self.sums, self.touched)
+        if driven != self.driven:
+            self.driven, self.noise = driven, noise
+            self.touched |= self.sums[..., 0] > 0
+        if not (len(changed) or self.touched.any()):
             return
-        cells, amounts = evidence.on_map(changed, self.grid, self.epoch, FADING_STEPS)
-        grown = evidence.places - len(self.cells)
-        self.cells = np.pad(self.cells, ((0, grown), (0, 0)), constant_values=-1)
-        self.amounts = np.pad(self.amounts, ((0, grown), (0, 0)))
-        before, taken = self.cells[changed], -self.amounts[changed]
-        self.cells[changed], self.amounts[changed] = cells, amounts
-        moved = (before != cells).any(axis=1)
-        amounts = np.where(moved[:, None], amounts, amounts + taken)
-        cells = np.concatenate([cells, before[moved]])
-        amounts = np.concatenate([amounts, taken[moved]])
-        inside = cells[:, 0] >= 0
-        occupancy = self.grid.occupancy
-        in_cells = max(reach / self.grid.resolution, 0.5)
-        spread(occupancy, cells[inside], amounts[inside], in_cells, self.sums, self.touched)
-        refresh(
-            self.sums, self.touched, self.noise, PRIOR, PRIOR_SUCCESSES, 0.0, LARGEST, STEP,
-            self.slowness,
-        )
+        self.slowness = self.slowness.copy()  # maps have the old one
+        settings = self.noise, PRIOR, PRIOR_SUCCESSES, CAUTION, LARGEST, STEP
+        refresh(self.sums, self.touched, self.faded(driven), settings, self.slowness)

@@ -96,15 +96,15 @@ def spread(
 def refresh(
     sums: NDArray[np.float32],
     touched: NDArray[np.bool_],
-    noise: float,
-    prior: float,
-    prior_successes: float,
-    caution: float,
-    largest: float,
-    step: float,
+    faded: float,
+    settings: tuple[float, ...],
     slowness: NDArray[np.float32],
 ) -> None:
-    """Compute the slowness of the touched cells, see `Experience`; then none is touched."""
+    """Compute the slowness of the touched cells, see `Experience`; then none is touched.
+
+    Half of the noise is added, as the mean of its exponential is more than 1.
+    """
+    noise, prior, prior_successes, caution, largest, step = settings
     scale = np.log(1 + step)
     for y in range(touched.shape[0]):
         for x in range(touched.shape[1]):
@@ -112,10 +112,10 @@ def refresh(
                 continue
             touched[y, x] = False
             # Differences of sums may leave a rest below 0.
-            weight = max(sums[y, x, WEIGHT], np.float32(0))
-            failures = max(sums[y, x, FAILURES], np.float32(0))
+            weight = max(sums[y, x, WEIGHT], np.float32(0)) * faded
+            failures = max(sums[y, x, FAILURES], np.float32(0)) * faded
             precision = weight / noise + 1 / prior
-            mean = (sums[y, x, LOG] / noise + weight / 2) / precision
+            mean = (sums[y, x, LOG] * faded / noise + weight / 2) / precision
             log = max(mean + caution / precision, 0.0)
             log += np.log((prior_successes + weight + failures) / (prior_successes + weight))
             slowness[y, x] = min(np.exp(np.rint(log / scale) * scale), largest)

@@ -266,9 +266,9 @@ class GridMap:
     def same_cells(self, other: GridMap) -> bool:
         """Return whether all cells of two maps are equal, wherever the maps lie."""
         return self is other or (
-            _equal(self.occupancy, other.occupancy)
+            _equal(self.slowness, other.slowness)
+            and _equal(self.occupancy, other.occupancy)
             and _equal(self.cost, other.cost)
-            and _equal(self.slowness, other.slowness)
         )
 
     def contains(self, cell: Cell) -> bool:
@@ -347,4 +347,6 @@ def _replaced(array: NDArray[Any] | None, box: tuple[slice, slice], values: NDAr
 def _equal(some: NDArray[Any] | None, others: NDArray[Any] | None) -> bool:
     if some is None or others is None or some is others:
         return some is others
-    return np.array_equal(some, others)
+    # A planner compares a map with each one that it knows; a look at some cells often suffices.
+    some_of = slice(None, None, 8), slice(None, None, 8)
+    return np.array_equal(some[some_of], others[some_of]) and np.array_equal(some, others)
