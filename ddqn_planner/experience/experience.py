@@ -18,7 +18,7 @@ from ddqn_planner.grid import Cell, GridMap
 
 Float32 = NDArray[np.float32]
 
-REACH = 1.5
+REACH = 2.5
 """How far a visit tells of the places around, in widths of the robot."""
 
 PRIOR = 1.0
