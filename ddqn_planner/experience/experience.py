@@ -83,7 +83,7 @@ class Experience:
         self,
         nominal_speed: float,
         robot_width: float = 0.5,
-        half_life: float = 1800.0,
+        half_life: float = 900.0,
         max_pause: float = 90.0,
     ) -> None:
         given = {

@@ -22,6 +22,10 @@ OLD_VISITS = 500.0
 """The noise of visits is that of about so many."""
 
 
+TAIL = 0.04
+"""Share of the errors beyond each bound. It is less than 5 %, because successive drives are alike:
+they show less of the tails than as many independent ones."""
+
 PARTS = 256
 """Parts of a path between which it is computed what they have in common."""
 
@@ -90,11 +94,11 @@ class Forecasts:
         return float(np.sqrt(weighted @ same @ weighted + of_visits))
 
     def quantiles(self) -> Float64:
-        """Return the 5 % quantile, the mean, and the 95 % quantile of the errors of drives."""
+        """Return the lower bound, the mean, and the upper bound of 90 % of the errors of drives."""
         assumed = NORMAL * np.linspace(-1.05, 1.05, ASSUMED)
         errors = np.concatenate([self.errors, assumed])
         # Of n errors and the next one, as many lie outside on each side as of a sample of n + 1.
-        tail = 0.05 * (1 + 1 / len(errors)) - 1 / len(errors)
+        tail = TAIL * (1 + 1 / len(errors)) - 1 / len(errors)
         low, high = np.quantile(errors, (max(tail, 0), min(1 - tail, 1)))
         return np.array([low, errors.mean(), high])
 
