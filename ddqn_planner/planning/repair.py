@@ -24,7 +24,7 @@ REPAIRED_SHARE = 0.02
 CHANGED_SHARE = 0.02
 """Share of the map's cells that may have changed: with more, a new field is cheaper."""
 
-LAYERS = "occupancy", "cost", "forbidden"
+LAYERS = "occupancy", "cost", "forbidden", "slowness"
 """What a map says of each cell that moves depend on. Two maps with other layers have no shift."""
 
 SAME_PLACE = 0.01
