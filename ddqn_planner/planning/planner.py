@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Generator, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -21,6 +21,9 @@ from ddqn_planner.planning.q_field import Goals, QField
 from ddqn_planner.planning.search import search
 from ddqn_planner.planning.simplification import simplify
 from ddqn_planner.planning.way_out import reach, way_out_and_ends
+
+VISITS = 2**18
+"""About how many cells a field visits in one step of a plan: some 30 ms, then comes another."""
 
 UNLABELLED_SHARE = 1 / 2
 """Share of the map's cells that a request may visit before the connected cells are looked at. A
@@ -211,7 +214,8 @@ class Planner:
         Yields
         ------
         Plan or None
-            None before each step that may be slow (a new field, a search); at last the plan.
+            None before each step that may be slow (a part of a new field, a search); at last the
+            plan.
         """
         grid, start, rule = request.grid, request.start, request.move_rule
         status = self._refusal(request)
@@ -234,7 +238,10 @@ class Planner:
             yield None
         if plan is None and grid.is_free(start) and goals:
             with field_time:
-                field, plan = self._visit_some(request, goals)
+                if self._fields.has_costs(grid, rule):
+                    field = self._fields.get(grid, goals, rule, start)
+            if isinstance(field, DistanceField):
+                plan = yield from _in_parts(field, request, field_time)
         if plan is None or not plan.path.size:
             with field_time:
                 if plan and plan.status is PlanStatus.NO_PATH and reach(request) < 1:
@@ -285,23 +292,6 @@ class Planner:
             rollout_ms=rollout_time.ms,
         )
 
-    def _visit_some(self, request: PlanRequest, goals: Goals) -> tuple[QField | None, Plan | None]:
-        """Return the field of the goals and the plan from it, if these take few visits of cells.
-
-        So most requests need no connected components.
-        """
-        grid, start, rule = request.grid, request.start, request.move_rule
-        if not self._fields.has_costs(grid, rule):
-            return None, None
-        field = self._fields.get(grid, goals, rule, start)
-        assert isinstance(field, DistanceField)
-        plan = field.rollout(start, int(UNLABELLED_SHARE * grid.occupancy.size))
-        if plan.status is PlanStatus.ROLLOUT_TRAPPED:
-            labels = grid.labels(rule)
-            joined_to_start = any(labels[y, x] == labels[start[::-1]] for x, y in goals)
-            plan = field.rollout(start) if joined_to_start else Plan(PlanStatus.NO_PATH)
-        return field, plan
-
     def _refusal(self, request: PlanRequest) -> PlanStatus | None:
         """Return why there is no path, where one look at start and goals says so."""
         grid = request.grid
@@ -323,6 +313,30 @@ def last_step(steps: Iterator[Plan | None]) -> Plan:
     *_, plan = steps
     assert plan is not None
     return plan
+
+
+def _in_parts(
+    field: DistanceField, request: PlanRequest, field_time: _Stopwatch
+) -> Generator[None, None, Plan]:
+    """Return the rollout from the start; after each part that the field grows for it, yield.
+
+    Once the field has visited many cells, the connected cells say whether there is a path: most
+    requests need not look at them.
+    """
+    grid, start = request.grid, request.start
+    until_labels = int(UNLABELLED_SHARE * grid.occupancy.size)
+    while True:
+        with field_time:
+            visits = min(VISITS, until_labels) or VISITS
+            plan = field.rollout(start, visits)
+            if plan.status is not PlanStatus.ROLLOUT_TRAPPED:
+                return plan
+            if until_labels == visits:
+                labels = grid.labels(request.move_rule)
+                if all(labels[y, x] != labels[start[::-1]] for x, y in field.goals):
+                    return Plan(PlanStatus.NO_PATH)
+            until_labels = max(until_labels - visits, 0)
+        yield None
 
 
 class _Stopwatch:
