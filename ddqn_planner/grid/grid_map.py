@@ -63,6 +63,11 @@ class GridMap:
         always be entered, so 0b00111000 = 56 in each cell of an aisle (bits 3, 4 and 5: all moves
         with dx = -1) lets a robot drive through it toward greater x, and not back. Directions
         belong to the place: they stay where a cell becomes occupied or free.
+    slowness : (H, W) float32, optional
+        The expected time in each cell over that at nominal speed, 1 or more. It multiplies the
+        cost; see `with_slowness`.
+    seconds_per_cell : float, optional
+        The time for the length of a cell at nominal speed: with it, `Plan.cost` is in seconds.
 
     Raises
     ------
@@ -76,6 +81,8 @@ class GridMap:
     cost: NDArray[np.int8] | None = None
     obstacles: Occupancy | None = None
     forbidden: NDArray[np.uint8] | None = None
+    slowness: NDArray[np.float32] | None = None
+    seconds_per_cell: float | None = None
 
     def __post_init__(self) -> None:
         occupancy = _occupancy(self.occupancy)
@@ -101,6 +108,16 @@ class GridMap:
             self._set("obstacles", obstacles)
         if self.forbidden is not None:
             self._set("forbidden", _directions(self.forbidden, occupancy.shape))
+        if self.slowness is not None:
+            slowness = np.array(self.slowness, dtype=np.float32, order="C")
+            if slowness.shape != occupancy.shape or not (1 <= slowness.min() <= slowness.max()):
+                raise ValueError(
+                    f"slowness has shape {slowness.shape}, or values below 1 or NaN; give "
+                    f"{occupancy.shape}, 1 or more"
+                )
+            self._set("slowness", slowness)
+        if self.seconds_per_cell is not None and not 0 < self.seconds_per_cell < math.inf:
+            raise ValueError(f"seconds_per_cell is {self.seconds_per_cell}; give more than 0")
 
     def _set(self, name: str, value: Any) -> None:
         if isinstance(value, np.ndarray):
@@ -203,7 +220,26 @@ class GridMap:
         patched._set("cost", costs)
         patched._set("obstacles", _replaced(self.obstacles, box, closed))
         patched._set("forbidden", self.forbidden)
+        patched._set("slowness", self.slowness)
+        patched._set("seconds_per_cell", self.seconds_per_cell)
         return patched
+
+    def with_slowness(self, slowness: NDArray[np.float32], seconds_per_cell: float) -> GridMap:
+        """Return the same map with other expected times; it shares all other arrays with this one.
+
+        Parameters
+        ----------
+        slowness : (H, W) float32
+            Not copied and not checked, see `GridMap`. It becomes read-only.
+        seconds_per_cell : float
+        """
+        timed = object.__new__(GridMap)
+        for name, value in self.__dict__.items():
+            if name not in ("cost_multiplier", "fingerprint"):  # which depend on the slowness
+                object.__setattr__(timed, name, value)
+        timed._set("slowness", slowness)
+        timed._set("seconds_per_cell", float(seconds_per_cell))
+        return timed
 
     @property
     def height(self) -> int:
@@ -215,15 +251,24 @@ class GridMap:
         """Number of columns."""
         return int(self.occupancy.shape[1])
 
+    @property
+    def has_costs(self) -> bool:
+        """Whether cells differ in what their moves cost."""
+        return self.cost is not None or self.slowness is not None
+
     @cached_property
     def cost_multiplier(self) -> NDArray[np.float32]:
         """(H, W) float32: cost of a path in each cell per cell of its length, see `move_costs`.
 
-        It grows linearly from 1 for cost 0, or without costs, to `MAX_COST_MULTIPLIER`.
+        It grows linearly from 1 for cost 0, or without costs, to `MAX_COST_MULTIPLIER`, times the
+        slowness of the cell.
         """
         if self.cost is None:
+            if self.slowness is not None:
+                return self.slowness
             return np.ones(self.occupancy.shape, dtype=np.float32)
-        return _MULTIPLIERS.take(self.cost, mode="wrap")  # -1 finds the last one
+        multiplier = _MULTIPLIERS.take(self.cost, mode="wrap")  # -1 finds the last one
+        return multiplier if self.slowness is None else multiplier * self.slowness
 
     def labels(self, move_rule: MoveRule | str) -> NDArray[np.int32]:
         """Return the connected component of each cell, see `component_labels`.
@@ -272,12 +317,15 @@ class GridMap:
             digest.update(self.cost.tobytes())
         if self.forbidden is not None:
             digest.update(b"forbidden:" + self.forbidden.tobytes())
+        if self.slowness is not None:
+            digest.update(b"slowness:" + self.slowness.tobytes())
         return digest.hexdigest()[:16]
 
     def same_cells(self, other: GridMap) -> bool:
         """Return whether all cells of two maps are equal, wherever the maps lie."""
         return self is other or (
-            np.array_equal(self.occupancy, other.occupancy)
+            _equal(self.slowness, other.slowness)
+            and _equal(self.occupancy, other.occupancy)
             and _equal(self.cost, other.cost)
             and _equal(self.forbidden, other.forbidden)
         )
@@ -366,4 +414,6 @@ def _directions(forbidden: ArrayLike, shape: tuple[int, int]) -> NDArray[np.uint
 def _equal(some: NDArray[Any] | None, others: NDArray[Any] | None) -> bool:
     if some is None or others is None or some is others:
         return some is others
-    return np.array_equal(some, others)
+    # A planner compares a map with each one that it knows; a look at some cells often suffices.
+    some_of = slice(None, None, 8), slice(None, None, 8)
+    return np.array_equal(some[some_of], others[some_of]) and np.array_equal(some, others)

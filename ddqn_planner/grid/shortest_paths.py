@@ -63,7 +63,7 @@ def _graph(grid: GridMap, move_rule: MoveRule | str) -> Any:
     cell, place = np.divmod(edge.astype(np.int32), np.int32(len(MOVES)))
     next_cell = cell + step[actions].astype(np.int32)[place]
     cost = MoveRule(move_rule).lengths[actions][place]
-    if grid.cost is not None:
+    if grid.has_costs:
         multiplier = grid.cost_multiplier.ravel().astype(np.float64)
         cost *= (multiplier[cell] + multiplier[next_cell]) / 2
     row_end = np.cumsum(np.count_nonzero(legal_NA, axis=1), dtype=np.int32)

@@ -53,10 +53,13 @@ def occurring(values: NDArray[np.uint8]) -> NDArray[np.bool_]:
 def cost_of(
     patch: Any, table: Any, value: Any, terms: Any, width: int, cell: int, action: int
 ) -> Any:
-    """Return the cost of a move, float32; infinite if it is not possible. See `MoveCosts`."""
+    """Return the cost of a move, infinite if it is not possible. See `MoveCosts`."""
     cost = table[patch[cell], action]
     if terms is None:
-        return cost
+        if value is None:
+            return cost
+        after = cell + MOVE_Y[action] * width + MOVE_X[action]
+        return cost * (np.float64(value[cell]) + value[after]) / 2
     if cost == np.inf:
         return cost
     total = np.float32(0)

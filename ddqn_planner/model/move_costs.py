@@ -38,7 +38,8 @@ class MoveCosts(NamedTuple):
     """The cost of each move of each cell, on a map with a border of one cell.
 
     It is ``table[patch[cell], action]``; with terms, that is only the length of the move, and
-    is multiplied by ``1 + max(0, sum of terms)``, at most `MAX_MULTIPLIER`.
+    is multiplied by ``1 + max(0, sum of terms)``, at most `MAX_MULTIPLIER`. With values and no
+    terms, it is multiplied by the mean value of the two cells.
 
     Parameters
     ----------
@@ -46,8 +47,8 @@ class MoveCosts(NamedTuple):
         The number of each cell's patch.
     table : (P, 8) float32
         At least 1; infinite where a move is not possible.
-    value : (C,) uint8, optional
-        The value of each cell, for the terms.
+    value : (C,) uint8 or float32, optional
+        The value of each cell for the terms, or what multiplies its moves, 1 or more.
     terms : (9, 102, 8) float32, optional
         What each value of each cell of a patch adds.
     width : int
@@ -105,6 +106,12 @@ def with_directions(
     rows = first_row.take(forbidden)
     rows += patch.astype(rows.dtype, copy=False)
     return rows, tables_SPA.reshape(-1, table_PA.shape[1])
+
+
+def multiplied(costs: MoveCosts, multiplier: NDArray[np.float32]) -> MoveCosts:
+    """Return the costs of moves times what multiplies them in the cells of a map, (H, W)."""
+    value = np.pad(multiplier, 1, constant_values=1).ravel()
+    return costs._replace(value=value, highest=costs.highest * float(multiplier.max()))
 
 
 def every_patch() -> NDArray[np.int8]:

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from ddqn_planner.compiled import compiled_now
 from ddqn_planner.grid import Cell
 from ddqn_planner.model.compiled_costs import MOVE_X, MOVE_Y, cost_of
-from ddqn_planner.model.move_costs import MoveCosts, costs_by_patch
+from ddqn_planner.model.move_costs import MoveCosts, costs_by_patch, multiplied
 
 Distances = NDArray[np.float64]
 States = NDArray[np.uint8]
@@ -367,7 +367,10 @@ def q_of(distance: Distances, costs: MoveCosts) -> NDArray[np.float32]:
 
 
 def propagate_values(
-    patch_id: NDArray[np.int32], cost_PA: NDArray[np.float32], goal: Cell
+    patch_id: NDArray[np.int32],
+    cost_PA: NDArray[np.float32],
+    goal: Cell,
+    multiplier: NDArray[np.float32] | None = None,
 ) -> NDArray[np.float32]:
     """Return the greatest Q that satisfies Q(s, a) = -cost(s, a) + max_a' Q(s', a'), 0 at the goal.
 
@@ -380,6 +383,8 @@ def propagate_values(
     cost_PA : (P, 8) float32
         At least 1; infinite where a move is not possible. A move off the map is never possible.
     goal : (x, y)
+    multiplier : (H, W) float32, optional
+        Multiplies the costs, see `multiplied`.
 
     Returns
     -------
@@ -391,6 +396,8 @@ def propagate_values(
     padded = np.pad(patch_id, 1, constant_values=outside)
     table_PA = np.pad(cost_PA, ((0, 1), (0, 0)), constant_values=np.inf)
     costs = costs_by_patch(padded.ravel(), table_PA, padded.shape[1])
+    if multiplier is not None:
+        costs = multiplied(costs, multiplier)
     distance, state, opened = new_field(padded.size, (goal[1] + 1) * costs.width + goal[0] + 1)
     grow_whole(distance, state, opened, costs)
     return q_of(distance, costs)

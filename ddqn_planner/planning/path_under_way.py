@@ -127,7 +127,7 @@ def _array(path: Cells) -> NDArray[np.int32]:
 
 
 def _cost(path: NDArray[np.int32], grid: GridMap, move_rule: MoveRule | str) -> float:
-    if grid.cost is None:
+    if not grid.has_costs:
         return path_length(path, move_rule)
     return path_cost(path, grid.cost_multiplier, move_rule)
 

@@ -86,7 +86,7 @@ class Plan:
         The rule under which the moves are legal.
     cost : float, optional
         What the path costs before it is simplified, see `path_cost`: on a map with costs, if a
-        planner made the plan.
+        planner made the plan. On a map of expected times it is in seconds.
     goal : (x, y), optional
         Where the path ends, or would end: the goal asked for, or the cell to which it moved. None
         if no Q field is needed to say that there is no path, or for a rollout.

@@ -287,7 +287,9 @@ class Planner:
                     )
                 if len(way_out) > 1:
                     path = np.concatenate([way_out[:-1], path], dtype=np.int32)
-                cost = None if grid.cost is None else path_cost(path, grid.cost_multiplier, rule)
+                if grid.has_costs:
+                    cost = path_cost(path, grid.cost_multiplier, rule)
+                    cost *= grid.seconds_per_cell or 1.0
             every_cell = path
             if request.simplified:
                 path = np.array(simplify(path.tolist(), grid, rule), dtype=np.int32)

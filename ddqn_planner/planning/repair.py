@@ -22,6 +22,9 @@ MIN_REPAIRED = 300
 CHANGED_SHARE = 0.02
 """Share of the map's cells that may have changed: with more, a new field is cheaper."""
 
+LAYERS = "occupancy", "cost", "forbidden", "slowness"
+"""What a map says of each cell that moves depend on. Two maps with other layers have no shift."""
+
 SAME_PLACE = 0.01
 """By how many cells a map may be off the grid of another one, and still count as shifted by whole
 cells: ROS messages give the resolution in float32."""
@@ -35,8 +38,9 @@ def shift_between(old: GridMap, new: GridMap) -> Cell | None:
     The cell (x, y) of the old map is (x + dx, y + dy) in the new one. As a map grows, mapping
     shifts it.
     """
-    if (old.cost is None, old.forbidden is None) != (new.cost is None, new.forbidden is None):
-        return None
+    for layer in LAYERS:
+        if (getattr(old, layer) is None) != (getattr(new, layer) is None):
+            return None
     return offset_between(old, new)
 
 
@@ -103,11 +107,11 @@ def _changed_cells(old: GridMap, new: GridMap, shift: Cell) -> NDArray[np.int32]
         slice(bottom - shift[1], top - shift[1]),
         slice(left - shift[0], right - shift[0]),
     )
-    differs = old.occupancy[before] != new.occupancy[inside]
-    if old.cost is not None and new.cost is not None:
-        differs |= old.cost[before] != new.cost[inside]
-    if old.forbidden is not None and new.forbidden is not None:
-        differs |= old.forbidden[before] != new.forbidden[inside]
+    differs = np.zeros((max(top - bottom, 0), max(right - left, 0)), dtype=np.bool_)
+    for layer in LAYERS:
+        one, other = getattr(old, layer), getattr(new, layer)
+        if one is not None and other is not None and one is not other:
+            differs |= one[before] != other[inside]
     if np.count_nonzero(differs) > CHANGED_SHARE * differs.size:
         return None
     width = new.width + 2

@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 import torch
@@ -174,11 +176,15 @@ def test_a_field_has_one_q_per_action_and_cell_of_a_map_of_any_shape(name: str) 
 
 
 @pytest.mark.parametrize("name", ["propagation", "any_map"])
-def test_a_move_is_possible_where_it_succeeds_more_often_than_not(name: str) -> None:
-    for success, possible in ((0.55, True), (0.45, False)):
+def test_a_move_is_tried_until_it_succeeds_if_it_does_more_often_than_not(name: str) -> None:
+    for success, cost in ((0.995, 1), (0.9, 1 / 0.9), (0.55, 1 / 0.55), (0.45, np.inf)):
         network = answering(name, success)
-        q = network.q_values(GridMap(np.zeros((1, 2))), (1, 0), MoveRule.ROBOT_SAFE)
-        assert q[0, 0, 0] == (-1.0 if possible else -np.inf)
+        for grid, multiplier in (
+            (GridMap(np.zeros((1, 2))), 1),
+            (GridMap(np.zeros((1, 2)), slowness=np.array([[3, 5]])), 4),
+        ):
+            q = network.q_values(grid, (1, 0), MoveRule.ROBOT_SAFE)
+            assert q[0, 0, 0] == pytest.approx(-cost * multiplier)
 
 
 def test_a_cost_above_the_upper_bound_counts_as_the_bound() -> None:
@@ -188,16 +194,17 @@ def test_a_cost_above_the_upper_bound_counts_as_the_bound() -> None:
         (1e4, 100.0),
     ):
         network = answering("any_map", 0.9, multiplier)
-        assert network.q_values(grid, (1, 0), MoveRule.ROBOT_SAFE)[0, 0, 0] == -used
+        q = network.q_values(grid, (1, 0), MoveRule.ROBOT_SAFE)
+        assert q[0, 0, 0] == pytest.approx(-used / 0.9)
 
 
 @pytest.mark.parametrize("tensor", ["prices.bias", "moves.bias"])
 def test_a_move_whose_cost_or_p_is_nan_is_not_possible(
     monkeypatch: pytest.MonkeyPatch, tensor: str
 ) -> None:
-    def checked(patch_id: np.ndarray, cost_PA: np.ndarray, goal: Cell) -> np.ndarray:
+    def checked(patch_id: np.ndarray, cost_PA: np.ndarray, *others: Any) -> np.ndarray:
         assert not np.isnan(cost_PA).any()  # with NaN the propagation would never end
-        return propagate_values(patch_id, cost_PA, goal)
+        return propagate_values(patch_id, cost_PA, *others)
 
     monkeypatch.setattr(wavefront, "propagate_values", checked)
     network = answering("any_map", 0.9)
