@@ -16,6 +16,7 @@ COMMANDS: Final = {
     "evaluate": "measure a model on maps that it never saw",
     "certify": "prove which moves a model takes for possible",
     "reproduce": "train and measure the paper's experiments",
+    "experiment": "measure what driving teaches",
     "watch": "show live what the ROS nodes publish",
 }
 """Each is a module of `ddqn_planner.commands`."""

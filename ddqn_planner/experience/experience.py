@@ -30,8 +30,6 @@ NOISE = 0.1
 PRIOR_SUCCESSES = 2.0
 """So many successes are assumed where nothing was driven."""
 
-CAUTION = 0.0
-
 OUTLIER = 2.5
 """A visit is moved to so many standard deviations from what was expected, if it lies beyond."""
 
@@ -136,7 +134,9 @@ class Experience:
         if self._spread is not None:
             self._compare(visits, self._spread)
         duration = float(visits.seconds.sum())
-        self.evidence.add(visits.position, visits.metres / side, log - surprise + believed, duration)
+        self.evidence.add(
+            visits.position, visits.metres / side, log - surprise + believed, duration
+        )
 
     def _compare(self, visits: Visits, spread: _Spread) -> None:
         """Compare the time of a drive with the one expected on the last map."""
@@ -305,5 +305,5 @@ class _Spread:
         if not (len(changed) or self.touched.any()):
             return
         self.slowness = self.slowness.copy()  # maps have the old one
-        settings = self.noise, PRIOR, PRIOR_SUCCESSES, CAUTION, LARGEST, STEP
+        settings = self.noise, PRIOR, PRIOR_SUCCESSES, LARGEST, STEP
         refresh(self.sums, self.touched, self.faded(driven), settings, self.slowness)

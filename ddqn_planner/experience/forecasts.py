@@ -53,7 +53,10 @@ class Forecasts:
         self.square_sum += float((surprise**2 / (1 + relative)).sum())
         self.square_weight += len(surprise)
         surplus = max(self.square_weight / OLD_VISITS, 1)
-        self.square_sum, self.square_weight = self.square_sum / surplus, self.square_weight / surplus
+        self.square_sum, self.square_weight = (
+            self.square_sum / surplus,
+            self.square_weight / surplus,
+        )
 
     def add_drive(self, error: float) -> None:
         """Learn the error of a drive's log time, in standard deviations."""

@@ -104,7 +104,7 @@ def refresh(
 
     Half of the noise is added, as the mean of its exponential is more than 1.
     """
-    noise, prior, prior_successes, caution, largest, step = settings
+    noise, prior, prior_successes, largest, step = settings
     scale = np.log(1 + step)
     for y in range(touched.shape[0]):
         for x in range(touched.shape[1]):
@@ -116,6 +116,6 @@ def refresh(
             failures = max(sums[y, x, FAILURES], np.float32(0)) * faded
             precision = weight / noise + 1 / prior
             mean = (sums[y, x, LOG] * faded / noise + weight / 2) / precision
-            log = max(mean + caution / precision, 0.0)
+            log = max(mean, 0.0)
             log += np.log((prior_successes + weight + failures) / (prior_successes + weight))
             slowness[y, x] = min(np.exp(np.rint(log / scale) * scale), largest)

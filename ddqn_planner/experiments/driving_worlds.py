@@ -10,7 +10,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ddqn_planner.grid import Cell, GridMap, MoveRule
-from ddqn_planner.grid.arguments import Occupancy
 from ddqn_planner.grid.generators import generate_map
 from ddqn_planner.grid.moves import component_labels, segment_lengths
 
@@ -27,7 +26,7 @@ STATIONS: Final = 6
 
 HOUR: Final = 3600.0
 NOISE: Final = 0.3
-"""Standard deviation of the log time of each cell, for each drive anew."""
+"""Standard deviation of the log time of each 25 cm, for each drive anew."""
 DRIVE_NOISE: Final = 0.03
 """Standard deviation of the log time of a drive."""
 POSE_NOISE: Final = 0.02
@@ -71,37 +70,38 @@ class World:
         return self.grid.with_slowness(slowness, self.grid.resolution / SPEED)
 
 
-def _zone(
-    shape: tuple[int, int], centre: NDArray[np.int64], radius: float, factor: float
+def _discs(
+    grid: GridMap,
+    count: int,
+    radius: tuple[float, float],
+    factor: tuple[float, float],
+    random: np.random.Generator,
 ) -> Float64:
-    """Return the slowness of a disc: (H, W)."""
-    y, x = np.ogrid[: shape[0], : shape[1]]
-    return np.where(np.hypot(y - centre[0], x - centre[1]) < radius, factor, 1.0)
-
-
-def slow_zones(occupancy: Occupancy, count: int, random: np.random.Generator) -> Float64:
-    """Draw slow discs, 2 to 5 m wide and 2 to 6 times as slow: (H, W)."""
-    free = np.argwhere(~occupancy)
-    slowness = np.ones(occupancy.shape)
+    """Draw discs of some radius (metres) and slowness around free cells: (H, W)."""
+    free = np.argwhere(~grid.occupancy)
+    y, x = np.ogrid[: grid.height, : grid.width]
+    slowness = np.ones(grid.occupancy.shape)
     for _ in range(count):
-        centre = free[random.integers(len(free))]
-        zone = _zone(occupancy.shape, centre, random.uniform(4, 10), random.uniform(2, 6))
-        slowness = np.maximum(slowness, zone)
+        centre_y, centre_x = free[random.integers(len(free))]
+        metres = np.hypot(y - centre_y, x - centre_x) * grid.resolution
+        inside = metres < random.uniform(*radius)
+        slowness = np.maximum(slowness, np.where(inside, random.uniform(*factor), 1))
     return slowness
 
 
-def make_world(occupancy: Occupancy, random: np.random.Generator) -> World:
-    """Draw what is slow on a map, and stations."""
-    labels = component_labels(occupancy, MoveRule.ROBOT_SAFE)
+def slow_zones(grid: GridMap, random: np.random.Generator) -> Float64:
+    """Draw six slow zones, 2 to 5 m wide and 2 to 6 times as slow: (H, W)."""
+    return _discs(grid, 6, (1, 2.5), (2, 6), random)
+
+
+def make_world(grid: GridMap, random: np.random.Generator) -> World:
+    """Draw what is slow on a map, and stations; all in its largest part that is connected."""
+    labels = component_labels(grid.occupancy, MoveRule.ROBOT_SAFE)
     occupancy = labels != np.bincount(labels[labels > 0]).argmax()
+    grid = GridMap(occupancy, grid.resolution, grid.origin)
     free = np.argwhere(~occupancy)
-    always = slow_zones(occupancy, 6, random)
-    carpet = _zone(occupancy.shape, free[random.integers(len(free))], random.uniform(6, 12), 1.4)
-    always = np.maximum(always, carpet)
-    crowds = [
-        _zone(occupancy.shape, free[random.integers(len(free))], random.uniform(4, 8), 2.0)
-        for _ in range(2)
-    ]
+    always = np.maximum(slow_zones(grid, random), _discs(grid, 1, (1.5, 3), (1.4, 1.4), random))
+    crowds = [_discs(grid, 1, (1, 2), (2, 2), random) for _ in range(2)]
     # A door: a free cell between two walls, where one waits for some 10 s.
     wall = np.pad(occupancy, 1, constant_values=True)
     beside = (wall[1:-1, :-2] & wall[1:-1, 2:]) | (wall[:-2, 1:-1] & wall[2:, 1:-1])
@@ -110,13 +110,13 @@ def make_world(occupancy: Occupancy, random: np.random.Generator) -> World:
         y, x = narrow[random.integers(len(narrow))]
         always[y, x] = 20.0
     stations = [(int(x), int(y)) for y, x in free[random.choice(len(free), STATIONS, False)]]
-    return World(GridMap(occupancy, RESOLUTION), always, crowds, stations)
+    return World(grid, always, crowds, stations)
 
 
 def generated_world(kind: str, seed: int) -> World:
     """Make a world on a generated map."""
     random = np.random.default_rng([seed, *kind.encode()])
-    return make_world(generate_map(kind, (SIDE, SIDE), random), random)
+    return make_world(GridMap(generate_map(kind, (SIDE, SIDE), random), RESOLUTION), random)
 
 
 @dataclass(frozen=True)
@@ -140,10 +140,12 @@ def path_seconds(cells: Sequence[Cell], slowness: Float64, grid: GridMap) -> flo
 def drive(cells: Sequence[Cell], world: World, clock: float, random: np.random.Generator) -> Drive:
     """Drive a path: each half of a move is as slow as its cell, with noise."""
     x, y = np.asarray(cells).T
-    noise = random.normal(0, NOISE, len(x))
+    lengths = segment_lengths(np.diff(x), np.diff(y), MoveRule.ROBOT_SAFE)
+    metres = np.concatenate([[0], np.cumsum(lengths)]) * world.grid.resolution
+    part = (metres / 0.25).astype(np.int64)
+    noise = random.normal(0, NOISE, part[-1] + 1)[part]
     shown = world.slowness(clock)[y, x] * np.exp(noise - NOISE**2 / 2)
     shown *= np.exp(random.normal(0, DRIVE_NOISE))
-    lengths = segment_lengths(np.diff(x), np.diff(y), MoveRule.ROBOT_SAFE)
     halves = np.repeat(lengths / 2, 2) * np.repeat(shown, 2)[1:-1]
     at = np.concatenate([[0], np.cumsum(halves)]) * world.grid.resolution / SPEED
     centres = np.column_stack([x, y]) + 0.5
