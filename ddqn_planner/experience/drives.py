@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -15,6 +16,12 @@ CORRECTION = 0.25
 
 RELOCATION = 1.0
 """A jump by this many metres more puts the robot at a place that is not believed."""
+
+FARTHEST = 1e7
+"""Metres from the origin of the map; a pose beyond is not believed."""
+
+LATEST = 1e12
+"""Seconds of a clock, in the same way."""
 
 MEMORY = 60.0
 """Seconds over which a robot whose pose is not believed counts as driving on, at most."""
@@ -41,11 +48,11 @@ def visits_of(
 ) -> Visits:
     """Divide a drive into places, squares of the world.
 
-    The drive is followed in steps of half a square: so noise of the pose and the rate of the samples
-    hardly matter, and waiting counts as time. Not believed are poses that are not
-    finite, clocks that go back or stand still, places that take longer than `max_pause`, and moves
-    that are faster than `max_speed`. A pose that jumps far is not believed until it jumps back to
-    where the robot can be.
+    The drive is followed in steps of half a square. So noise of the pose and the rate of the
+    samples hardly matter, and waiting counts as time. Not believed are poses that are not finite,
+    clocks that go back, places that take longer than `max_pause`, and moves that are faster than
+    `max_speed`. A pose that jumps far is not believed until it jumps back to where the robot can
+    be.
 
     Parameters
     ----------
@@ -70,8 +77,9 @@ def visits_of(
         raise ValueError(
             f"seconds have shape {time.shape} and positions {position.shape}; give (N,) and (N, 2)"
         )
-    finite = np.isfinite(time) & np.isfinite(position).all(axis=1)
-    time, position = time[finite], position[finite]
+    # Comparisons with NaN are false.
+    possible = (np.abs(time) < LATEST) & (np.abs(position) < FARTHEST).all(axis=1)
+    time, position = time[possible], position[possible]
     fresh = np.diff(time, prepend=np.nan) != 0  # a repeated time adds nothing
     time, position = time[fresh], position[fresh]
     rows: list[tuple[float, ...]] = []
@@ -90,10 +98,10 @@ def visits_of(
     if not len(middle):
         return Visits(middle, array[:, 4], array[:, 5])
     square = np.floor(middle / side)
-    first = np.flatnonzero(np.append(True, (np.diff(square, axis=0) != 0).any(axis=1)))
+    begins = np.flatnonzero(np.append(True, (np.diff(square, axis=0) != 0).any(axis=1)))
     metres = array[:, 5] / count
     sums = np.column_stack([middle * metres[:, None], array[:, 4] / count, metres])
-    sums = np.add.reduceat(sums, first)
+    sums = np.add.reduceat(sums, begins)
     return Visits(sums[:, :2] / sums[:, 3:], sums[:, 2], sums[:, 3])
 
 
@@ -106,16 +114,18 @@ def _believed_parts(
     reach = max_speed * np.maximum(elapsed, 0) + CORRECTION
     broken = (elapsed <= 0) | (elapsed > max_pause) | (distance > reach)
     edges = [0, *(np.flatnonzero(broken) + 1).tolist(), len(time)]
-    parts, lost_at = [], None
-    for first, end in zip(edges, edges[1:], strict=False):
-        if first and distance[first - 1] > min(reach[first - 1], MEMORY * max_speed) + RELOCATION:
+    parts: list[tuple[int, int]] = []
+    lost_at: int | None = None
+    farthest = np.minimum(reach, MEMORY * max_speed) + RELOCATION
+    for first, end in pairwise(edges):
+        if first and distance[first - 1] > farthest[first - 1]:
             if lost_at is None:
                 lost_at = first - 1
             else:
                 elapsed_since = np.clip(time[first] - time[lost_at], 0, MEMORY)
                 apart = math.dist(position[first], position[lost_at])
                 lost_at = None if apart <= max_speed * elapsed_since + RELOCATION else lost_at
-        if lost_at is None:
+        if lost_at is None and end - first > 1:
             parts.append((first, end))
     return parts
 

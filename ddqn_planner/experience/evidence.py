@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -137,9 +137,10 @@ def cells_of(position: Float64, grid: GridMap) -> tuple[NDArray[np.int64], NDArr
     cos, sin = math.cos(yaw), math.sin(yaw)
     along = np.column_stack([cos * x + sin * y, cos * y - sin * x])
     cells = np.floor(along / grid.resolution).astype(np.int64)
-    free = ((cells >= 0) & (cells < (grid.width, grid.height))).all(axis=1)
-    x, y = cells[free].T
-    free[free] = ~grid.occupancy[y, x]
+    last = np.array([grid.width - 1, grid.height - 1])
+    x, y = np.clip(cells, 0, last).T
+    inside = ((cells >= 0) & (cells <= last)).all(axis=1)
+    free: NDArray[np.bool_] = inside & ~grid.occupancy[y, x]
     return cells, free
 
 

@@ -6,7 +6,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -18,7 +18,7 @@ from ddqn_planner.grid import Cell, GridMap
 
 Float32 = NDArray[np.float32]
 
-REACH = 1.5
+REACH = 2.5
 """How far a visit tells of the places around, in widths of the robot."""
 
 PRIOR = 1.0
@@ -62,7 +62,7 @@ class Experience:
 
     The logarithm of the slowness, that is seconds over seconds at nominal speed, has a normal
     posterior at each place, whose prior is a nominal place. A visit tells of the places around it
-    too, as far as `REACH`, along paths and not through walls. All is kept by places of the world, so
+    too, as far as `REACH`, along paths and not through walls. All is kept by places of the world:
     maps may grow, shift or come in another resolution. Memory grows with the driven area.
 
     Evidence fades with the time that the robot drives: what it learned does not fade overnight.
@@ -168,8 +168,8 @@ class Experience:
     def apply(self, grid: GridMap) -> GridMap:
         """Return a map whose moves cost expected time, so that `Plan.cost` is in seconds.
 
-        Costs of the map itself multiply it. Where moves fail, a move is tried until it succeeds: the
-        time is that of one try over the probability of success.
+        Costs of the map itself multiply it. Where moves fail, a move is tried until it succeeds:
+        its time is that of one try over the probability of success.
         """
         spread = self._spread_over(grid)
         return grid.with_slowness(spread.slowness, grid.resolution / self.nominal_speed)
@@ -181,7 +181,9 @@ class Experience:
     def uncertainty(self, grid: GridMap) -> Float32:
         """Return (H, W) float32: the standard deviation of the log slowness."""
         spread = self._spread_over(grid)
-        return np.sqrt(spread.variance(slice(None), slice(None))).astype(np.float32)
+        variance = spread.variance(slice(None), slice(None))
+        deviation: Float32 = np.sqrt(variance).astype(np.float32)
+        return deviation
 
     def expected_time(self, grid: GridMap, cells: Sequence[Cell]) -> ExpectedTime:
         """Return the time that a path of neighbouring cells takes, with an interval of 90 %.

@@ -30,7 +30,7 @@ def spread(
 ) -> None:
     """Add evidence to the cells around it, less with the distance of a path, not through walls.
 
-    The share is ``(1 - (distance / reach)^2)^2``.
+    The share is ``(1 - (distance / reach)^2)^3``.
 
     Parameters
     ----------
@@ -46,11 +46,11 @@ def spread(
         Set where the sums changed.
     """
     height, width = occupancy.shape
-    side = int(reach)
+    side = int(reach) + 1  # no path within reach leads to the border
     furthest = int(STRAIGHT * reach)
     share = np.empty(furthest + 1, np.float32)
     for distance in range(furthest + 1):
-        share[distance] = (1 - (distance / (STRAIGHT * reach)) ** 2) ** 2
+        share[distance] = (1 - (distance / (STRAIGHT * reach)) ** 2) ** 3
     size = (2 * side + 1) ** 2
     best = np.empty((2 * side + 1, 2 * side + 1), np.int64)
     first = np.empty(furthest + 1, np.int64)  # of the linked list of each distance
@@ -78,18 +78,18 @@ def spread(
                 touched[row, column] = True
                 for dy in range(-1, 2):
                     for dx in range(-1, 2):
+                        length = distance + (DIAGONAL if dx != 0 and dy != 0 else STRAIGHT)
+                        if length >= best[y + dy, x + dx]:
+                            continue
                         to_y, to_x = row + dy, column + dx
-                        inside = abs(y + dy - side) <= side and abs(x + dx - side) <= side
-                        if not inside or not (0 <= to_y < height and 0 <= to_x < width):
+                        if not (0 <= to_y < height and 0 <= to_x < width):
                             continue
                         if occupancy[to_y, to_x] or occupancy[row, to_x] or occupancy[to_y, column]:
                             continue
-                        length = distance + (DIAGONAL if dx != 0 and dy != 0 else STRAIGHT)
-                        if length < best[y + dy, x + dx] and length <= furthest:
-                            best[y + dy, x + dx] = length
-                            queued_y[queued], queued_x[queued] = y + dy, x + dx
-                            following[queued], first[length] = first[length], queued
-                            queued += 1
+                        best[y + dy, x + dx] = length
+                        queued_y[queued], queued_x[queued] = y + dy, x + dx
+                        following[queued], first[length] = first[length], queued
+                        queued += 1
 
 
 @compiled_now

@@ -39,6 +39,8 @@ from ddqn_planner.planning import Planner
 
 BARS = {"1 to 20": 1.08, "21 to 50": 1.04, "51 to 100": 1.02}
 COLOURS = dict(zip(PLANNERS, ("#0072B2", "#777777", "#D55E00", "#009E73"), strict=True))
+VISITED = 0.95
+"""Uncertainty of a cell below which the robot was near."""
 SMOOTHED = 10
 """Missions that a point of the curve averages."""
 
@@ -204,12 +206,14 @@ def _picture(path: Path, kind: str = "office", seed: int = 1, missions: int = 50
     # The mission on which knowing matters most.
     start, goal = max(stations, key=lambda s: seconds(grid, *s) - seconds(world.known(clock), *s))
     figure, both = plt.subplots(1, 2, figsize=(11, 5.6), layout="constrained")
-    learned = experience.slowness(grid)
+    visited = experience.uncertainty(grid) < VISITED
+    learned = np.where(visited, experience.slowness(grid), np.nan)
     for axes, slowness, title in (
         (both[0], truth, "what nobody told the robot: true slowness"),
-        (both[1], learned, f"what it learned from {missions} missions"),
+        (both[1], learned, f"what it learned from {missions} missions (grey: never there)"),
     ):
         shown = np.where(grid.occupancy, np.nan, slowness)
+        axes.set_facecolor("#e6e6e6")
         image = axes.imshow(shown, origin="lower", cmap="YlOrRd", norm=LogNorm(1, 8))
         draw_obstacles(axes, grid)
         for name, (on, colour, style) in grids.items():
@@ -221,6 +225,7 @@ def _picture(path: Path, kind: str = "office", seed: int = 1, missions: int = 50
         axes.set_title(title, loc="left", fontsize=11)
     bar = figure.colorbar(image, ax=both, label="seconds over seconds at nominal speed", shrink=0.8)
     bar.set_ticks([1, 2, 4, 8], labels=["1", "2", "4", "8"])
+    bar.minorticks_off()
     figure.legend(*both[0].get_legend_handles_labels(), loc="outside lower center", ncols=3)
     return _saved(figure, path, "True and learned slowness, and the routes")
 

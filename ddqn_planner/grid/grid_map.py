@@ -110,9 +110,11 @@ class GridMap:
             self._set("forbidden", _directions(self.forbidden, occupancy.shape))
         if self.slowness is not None:
             slowness = np.array(self.slowness, dtype=np.float32, order="C")
-            if slowness.shape != occupancy.shape or not (1 <= slowness.min() <= slowness.max()):
+            if slowness.shape != occupancy.shape or not (
+                1 <= slowness.min() <= slowness.max() < np.inf
+            ):
                 raise ValueError(
-                    f"slowness has shape {slowness.shape}, or values below 1 or NaN; give "
+                    f"slowness has shape {slowness.shape}, or values below 1 or not finite; give "
                     f"{occupancy.shape}, 1 or more"
                 )
             self._set("slowness", slowness)

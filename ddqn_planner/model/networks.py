@@ -265,11 +265,11 @@ class PropagationQNetwork(QNetwork):
 
         There is no discount, and a move counts as possible where p > 1/2: so the greatest Q is the
         cheapest path at any distance. A move that may fail leaves the robot where it was, and is
-        tried again: its expected cost is that of one try over p, see `CERTAIN`. On a map of expected
-        times, these take the place of the learned cost multiplier. (Along a whole path, the progress and detour terms of the
-        paper's reward, section 4.2, add up to a constant of its two ends.) Cost multipliers are
-        clamped to `MAX_MULTIPLIER`. A move with NaN as its p or cost multiplier is not
-        possible.
+        tried again: its expected cost is that of one try over p, see `CERTAIN`. On a map of
+        expected times, these take the place of the learned cost multiplier. (Along a whole path,
+        the progress and detour terms of the paper's reward, section 4.2, add up to a constant of
+        its two ends.) Cost multipliers are clamped to `MAX_MULTIPLIER`. A move with NaN as its p or
+        cost multiplier is not possible.
 
         Returns
         -------
