@@ -227,6 +227,10 @@ class Worker:
         self._thread.submit(work)
         return future
 
+    def close(self) -> None:
+        """Wait until all calls have ended; take no more."""
+        self._thread.shutdown()
+
     async def run(self, function: Callable[..., Any], *arguments: object) -> Any:
         """Return the result of a call, which is left out if nobody awaits it when it begins."""
         future = self.call(function, *arguments)
