@@ -41,6 +41,8 @@ class MapSource:
         It has the parameters `MAP_PARAMETERS` and `BODY_PARAMETERS`.
     report : Report
         It says what was refused.
+    worker : Worker
+        It inflates. Maps must not wait for fields: 2000 x 2000 cells take over a second.
     on_map : callable
         Called after each map and each update that was not refused, with whether the map's frame is
         a new one; for a map that waits for its directions, once it has them.
@@ -51,7 +53,9 @@ class MapSource:
         Of the last map or update.
     """
 
-    def __init__(self, node: BaseNode, report: Report, on_map: Callable[[bool], None]) -> None:
+    def __init__(
+        self, node: BaseNode, report: Report, worker: Worker, on_map: Callable[[bool], None]
+    ) -> None:
         self.header: Header | None = None
         self._node = node
         self._report = report
@@ -61,8 +65,7 @@ class MapSource:
         self._updates = self._refused_updates = 0
         self._inflated: Future | None = None
         self._inflate = Inflation()
-        # Maps must not wait for fields: 2000 x 2000 cells take over a second.
-        self._worker = Worker(node)
+        self._worker = worker
         self._incomplete = ""
         self._directions = MapDirections(node, report, self._take_directions)
         maps = node.create_subscription(OccupancyGrid, "map", self._take, LATCHED)

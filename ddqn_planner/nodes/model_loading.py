@@ -65,6 +65,11 @@ class ModelSource:
         """Whether the first model is still being loaded."""
         return self._loading is not None
 
+    @property
+    def refused(self) -> str:
+        """Why the last model was refused."""
+        return self._report.refused["model"]
+
     def load(self) -> None:
         """Begin to load the first model."""
         self._loading = self._worker.call(load_and_warm_up, self._node.value("model"))

@@ -11,8 +11,9 @@ from rclpy.callback_groups import ReentrantCallbackGroup
 from ddqn_planner.nodes.path_action import PathAction, Plan
 from ddqn_planner.nodes.runtime import BaseNode
 
-RESULT_TIMEOUT = 10
-"""Seconds for which a result is kept, as Nav2 does; rclpy's 900 would fill the memory."""
+RESULT_TIMEOUT = 5
+"""Seconds for which a result is kept. Each status message names all goals whose results are kept:
+rclpy's 900 would slow down clients, and fill the memory."""
 
 
 def serve_nav2(

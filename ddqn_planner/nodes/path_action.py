@@ -42,11 +42,8 @@ CODE_OF_STATUS = {
     PlanStatus.GOAL_OCCUPIED.name: "GOAL_OCCUPIED",
     PlanStatus.NO_PATH.name: "NO_VALID_PATH",
     PlanStatus.ROLLOUT_TRAPPED.name: "NO_VALID_PATH",
-    # None of these has a place in the map's frame.
     "TF_ERROR": "TF_ERROR",
     "NO_START": "TF_ERROR",
-    "INVALID_START": "TF_ERROR",
-    "INVALID_GOAL": "TF_ERROR",
     "INVALID_PLANNER": "INVALID_PLANNER",
     "NO_GOALS": "NO_VIAPOINTS_GIVEN",
     # As Nav2's planners time out while their costmap is not current.
@@ -142,10 +139,10 @@ class PathAction:
         result.planning_time = Duration(seconds=time.monotonic() - began).to_msg()
         result.error_code = error_code(outcome.status, self._unknown)
         if hasattr(result, "error_msg"):  # Nav2 has added it later
-            result.error_msg = "" if outcome.plan.path.size else outcome.reason
+            result.error_msg = outcome.reason if result.error_code else ""
         if handle.is_cancel_requested:
             handle.canceled()
-        elif outcome.plan.path.size:
+        elif outcome.status == PlanStatus.SUCCEEDED.name:
             handle.succeed()
         else:
             handle.abort()

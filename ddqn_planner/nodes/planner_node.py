@@ -12,9 +12,8 @@ from __future__ import annotations
 
 import ctypes
 import os
-from collections.abc import Callable, Coroutine, Sequence
+from collections.abc import Callable, Coroutine
 from contextlib import suppress
-from dataclasses import replace
 from typing import Any, NoReturn
 
 from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped
@@ -25,37 +24,19 @@ from rclpy.parameter import Parameter
 from rclpy.task import Future
 from std_msgs.msg import Header, String
 
-from ddqn_planner.grid import Cell, GridMap
 from ddqn_planner.nodes.active_goal import UNCHANGED, ActiveGoal
-from ddqn_planner.nodes.conversions import (
-    cell_from_pose,
-    check_pose,
-    check_tolerance,
-    path_message,
-    serialized_path,
-)
+from ddqn_planner.nodes.conversions import path_message, serialized_path
 from ddqn_planner.nodes.field_display import FieldDisplay, Shown
+from ddqn_planner.nodes.frames import Frames, check_tf
 from ddqn_planner.nodes.lifecycle import ManagedNode
 from ddqn_planner.nodes.map_source import MapSource
-from ddqn_planner.nodes.model_loading import ModelSource, load, move_rule
+from ddqn_planner.nodes.model_loading import ModelSource, load
 from ddqn_planner.nodes.nav2_interface import serve_nav2
-from ddqn_planner.nodes.path_action import check_request
 from ddqn_planner.nodes.planner_parameters import PARAMETERS
-from ddqn_planner.nodes.report import (
-    NOT_ACTIVE,
-    Outcome,
-    Report,
-    RequestError,
-    checked,
-    reason_of,
-    seconds,
-)
+from ddqn_planner.nodes.report import NOT_ACTIVE, Outcome, Report, RequestError
+from ddqn_planner.nodes.requests import Looks, Requests
 from ddqn_planner.nodes.runtime import LATCHED, STEADY, Unless, Worker, spin_until_shutdown
-from ddqn_planner.nodes.start_source import StartSource, check_tf
-from ddqn_planner.nodes.via_points import joined
-from ddqn_planner.planning import Plan, PlanMethod, Planner, PlanRequest
-from ddqn_planner.planning.path_under_way import is_path_valid
-from ddqn_planner.planning.planner import last_step
+from ddqn_planner.nodes.start_source import StartSource
 
 LOOK_PERIOD = 0.1
 """Seconds between two looks whether something changed: an answer does not wait for diagnostics."""
@@ -75,12 +56,12 @@ class PlannerNode(ManagedNode):
         super().__init__("planner", PARAMETERS)
         self._settings = self.settings()
         self._report = Report(self)
-        self._worker = Worker(self)
+        self._worker, self._map_worker = Worker(self), Worker(self)
         self._model = ModelSource(self, self._report, self._worker)
         if self._settings.autostart:
             # While it loads, DDS discovers, and the node says what else is missing.
             self._model.load()
-        self._next_look = Future()
+        self._looks = Looks()
         self._answering = 0
         self._forget()
         self.create_timer(LOOK_PERIOD, self._on_look, clock=STEADY)
@@ -97,7 +78,7 @@ class PlannerNode(ManagedNode):
         self._stop()
         self._active = ActiveGoal()
         self._logged: tuple[PoseStamped, object] | None = None
-        self._waits_for_start = False
+        self._waits_for_pose = False
 
     def configure(self) -> None:
         """Listen to the map and to where the robot is, and create what answers requests."""
@@ -107,8 +88,18 @@ class PlannerNode(ManagedNode):
         self._replan = self.create_guard_condition(
             self._plan_for_active_goal, MutuallyExclusiveCallbackGroup()
         )
-        self._start = StartSource(self, self._settings.start_source, self._on_start)
-        self._map = MapSource(self, self._report, self._on_map)
+        self._frames = Frames(self)
+        self._start = self._start_source()
+        self._map = MapSource(self, self._report, self._map_worker, self._on_map)
+        self._requests = Requests(
+            self._settings,
+            self._map,
+            self._start,
+            self._frames,
+            self._model,
+            self._worker,
+            self._looks,
+        )
         self.create_subscription(PoseStamped, "goal_pose", self._on_goal_pose, 10)
         if self._settings.follow_trainer:
             self.create_subscription(String, "trainer/model_saved", self._model.on_saved, LATCHED)
@@ -135,7 +126,8 @@ class PlannerNode(ManagedNode):
         """Free the map, the model and its fields."""
         self._forget()
         self._report.forget()
-        del self._display, self._start, self._map
+        self._frames.close()
+        del self._display, self._start, self._map, self._requests
         self._model.forget()
 
     async def prepare(self, transition: str) -> bool:
@@ -147,7 +139,7 @@ class PlannerNode(ManagedNode):
         if transition in ("deactivate", "shutdown"):
             self._stop()
             while self._answering:
-                await self._next_look
+                await self._looks.coming
         return True
 
     def _is_active(self) -> bool:
@@ -181,7 +173,8 @@ class PlannerNode(ManagedNode):
             # What the other source said, and what was refused of it, no longer counts.
             self._start.close()
             self._report.accept(self._start.topic)
-            self._start = StartSource(self, settings.start_source, self._on_start)
+            self._start = self._requests.start = self._start_source()
+        self._requests.settings = settings
         self._map.apply_parameters(changed)
         self._active.restart()
         self._replan.trigger()
@@ -194,6 +187,9 @@ class PlannerNode(ManagedNode):
             self._report.accept(self._start.topic)
         self._replan.trigger()
 
+    def _start_source(self) -> StartSource:
+        return StartSource(self, self._settings.start_source, self._frames, self._on_start)
+
     def _on_start(self, message: PoseWithCovarianceStamped | Odometry) -> None:
         try:
             due = self._start.take(message, self._map.frame)
@@ -204,19 +200,6 @@ class PlannerNode(ManagedNode):
         if due:
             self._active.plan_at_once()
             self._replan.trigger()
-
-    def _start_pose(self, frame: str) -> PoseStamped:
-        settings = self._settings
-        return self._start.pose(frame, settings.robot_frame, settings.transform_tolerance)
-
-    async def _known_start(self, frame: str) -> PoseStamped:
-        while True:
-            try:
-                return self._start_pose(frame)
-            except RequestError:
-                if not self._start.may_come:
-                    raise
-            await self._next_look
 
     def _on_goal_pose(self, message: PoseStamped) -> None:
         if not self._is_active():
@@ -233,9 +216,9 @@ class PlannerNode(ManagedNode):
         self, request: GetPlan.Request, response: GetPlan.Response
     ) -> GetPlan.Response:
         start = request.start if request.start.header.frame_id else None
-        planning = self._plan(start, [request.goal], request.tolerance)
+        planning = self._requests.plan(start, [request.goal], request.tolerance)
         header, outcome = await self._answer(planning, request.goal)
-        response.plan = _path(path_message, outcome, header, request.goal)
+        response.plan = _path(path_message, outcome, header)
         self._report.log(outcome)
         return response
 
@@ -245,13 +228,15 @@ class PlannerNode(ManagedNode):
         if goal is None:
             return
         self._active.begin(self._settings.replan_period)
-        planning = self._plan(None, [goal], self._settings.tolerance, self._active)
+        planning = self._requests.plan(None, [goal], self._settings.tolerance, self._active)
         header, outcome = await self._answer(planning, goal)
         if outcome in (UNCHANGED, NOT_ACTIVE):
             return
         if self._active.is_news(outcome, header.frame_id):
-            self._plan_publisher.publish(_path(serialized_path, outcome, header, goal))
-        self._waits_for_start = outcome.status == "NO_START"
+            self._plan_publisher.publish(_path(serialized_path, outcome, header))
+        self._waits_for_pose = outcome.status in ("NO_START", "TF_ERROR")
+        if outcome.goal is not None and self._active.pose is goal:
+            self._active.pose = goal = outcome.goal  # it stays where it is when its own frame moves
         # The places and lengths in the reason may differ.
         logged = goal, (outcome.status, outcome.plan.method)
         if self._logged != logged:
@@ -269,36 +254,24 @@ class PlannerNode(ManagedNode):
         self, start: PoseStamped | None, goals: list[PoseStamped], planner_id: str, given_up: Future
     ) -> tuple[Path, Outcome]:
         goal = goals[-1] if goals else PoseStamped()
-        planning = self._plan(start, goals, self._settings.tolerance, planner_id=planner_id)
+        planning = self._requests.plan(
+            start, goals, self._settings.tolerance, planner_id=planner_id
+        )
         header, outcome = await self._answer(planning, goal, given_up)
-        if outcome.plan.path.size:
-            self._plan_publisher.publish(_path(serialized_path, outcome, header, goal))
+        if len(outcome.plan.path):
+            self._plan_publisher.publish(_path(serialized_path, outcome, header))
         self._report.log(outcome)
-        return _path(path_message, outcome, header, goal), outcome
+        return _path(path_message, outcome, header), outcome
 
     async def _on_is_path_valid(self, request: Any, response: Any) -> Any:
         """Answer Nav2's IsPathValid: whether the robot can drive the rest of a path."""
         response.is_valid = False
         try:
-            checking = self._is_path_valid(request.path)
+            checking = self._requests.is_path_valid(request.path)
             response.is_valid = await Unless(checking, self._stopped) is True
         except RequestError as error:
             self.get_logger().warning(f"no path to check: {error}")
         return response
-
-    async def _is_path_valid(self, path: Path) -> bool:
-        header, grid, planner = await self._inputs()
-        frame = header.frame_id
-        cells = [
-            checked("INVALID_PATH", cell_from_pose, "the path", path.header, it.pose, grid, frame)
-            for it in path.poses
-        ]
-        rule = move_rule(self._settings.move_rule, planner)
-        robot = cells[0] if cells else None
-        with suppress(RequestError):
-            start = await self._known_start(frame)
-            robot = cell_from_pose("the start", start.header, start.pose, grid, frame)
-        return robot is not None and is_path_valid(cells, robot, grid, rule)
 
     async def _answer(
         self, planning: Coroutine[None, None, Outcome], goal: PoseStamped, *given_up: Future
@@ -326,84 +299,17 @@ class PlannerNode(ManagedNode):
             self._report.note(outcome)
         return Header(stamp=self.get_clock().now().to_msg(), frame_id=frame), outcome
 
-    async def _plan(
-        self,
-        start: PoseStamped | None,
-        goals: Sequence[PoseStamped],
-        tolerance: float,
-        active: ActiveGoal | None = None,
-        planner_id: str = "",
-    ) -> Outcome:
-        settings = self._settings
-        check_request(goals, planner_id, settings.planner_id)
-        for goal in goals:
-            checked("INVALID_GOAL", check_pose, "the goal", goal.header, goal.pose, self._map.frame)
-        map_header, grid, planner = await self._inputs()
-        frame = map_header.frame_id
-        if start is None:
-            start = await self._known_start(frame)
-
-        def cell(status: str, name: str, stamped: PoseStamped) -> Cell:
-            pose = stamped.header, stamped.pose
-            found: Cell = checked(status, cell_from_pose, name, *pose, grid, frame)
-            return found
-
-        request = PlanRequest(
-            grid,
-            tolerance=checked("INVALID_TOLERANCE", check_tolerance, tolerance) / grid.resolution,
-            start=cell("INVALID_START", "the start", start),
-            goal=cell("INVALID_GOAL", "the goal", goals[0]),
-            move_rule=move_rule(settings.move_rule, planner),
-            method=PlanMethod(settings.mode),
-            simplified=settings.path_simplification == "line_of_sight",
-        )
-        if active is not None:
-            next_request = active.next_request(request, frame, settings.switch_threshold)
-            if next_request is None:
-                return UNCHANGED
-            request = next_request
-        plans: list[Plan] = []
-        for goal in goals:
-            if plans:
-                goal_cell = cell("INVALID_GOAL", "the goal", goal)
-                request = replace(request, start=plans[-1].cells[-1], goal=goal_cell)
-            steps = planner.steps(request)
-            plan = next(steps)
-            if plan is None:  # a slow step follows
-                plan = await self._worker.run(last_step, steps)
-            plans.append(plan)
-            if not plan.path.size:
-                break
-        plan = joined(plans)
-        before, goal = [start, *goals][len(plans) - 1 : len(plans) + 1]
-        reason = reason_of(request, plan, before, goal, settings.robot_radius)
-        if len(goals) > 1 and not plan.path.size:
-            reason = f"goal {len(plans)} of {len(goals)}: {reason}"
-        stamp = seconds(map_header.stamp)
-        return Outcome(plan.status.name, reason, planner, request, plan, stamp)
-
-    async def _inputs(self) -> tuple[Header, GridMap, Planner]:
-        """Return the header of the map of now, this map for the robot's body, and the planner."""
-        header = self._map.header
-        if header is None or self._map.missing:
-            raise RequestError("NO_MAP", self._map.missing)
-        inflated = self._map.inflated()
-        await self._model.first()
-        planner = self._model.planner
-        if planner is None:
-            raise RequestError("NO_MODEL", f"no model is loaded: {self._report.refused['model']}")
-        return header, await inflated, planner
-
     # Diagnostics
 
     def _on_look(self) -> None:
         self._report.log_paths()
-        looked, self._next_look = self._next_look, Future()
-        looked.set_result(None)
-        if self._waits_for_start and self._start.name == "tf":
+        self._looks.next()
+        if self._is_configured:
+            self._start.transform(self._map.frame)
+        if self._waits_for_pose and self._active.pose is not None:
             with suppress(RequestError):
-                self._start_pose(self._map.frame)
-                self._waits_for_start = False
+                self._requests.look(self._active.pose)
+                self._waits_for_pose = False
                 self._replan.trigger()
         if self._active.is_look_due():
             self._replan.trigger()
@@ -419,11 +325,11 @@ class PlannerNode(ManagedNode):
         return {"state": self.state, **self._model.describe(self._settings.move_rule), **of_map}
 
 
-def _path(make: Callable[..., Any], outcome: Outcome, header: Header, goal: PoseStamped) -> Any:
+def _path(make: Callable[..., Any], outcome: Outcome, header: Header) -> Any:
     """Return the path of an outcome, or an empty one, made by a function of `conversions`."""
-    if outcome.request is None:
+    if outcome.request is None or outcome.goal is None:
         return Path(header=header)
-    return make(outcome.plan.path, outcome.request.grid, header, goal.pose.orientation)
+    return make(outcome.plan.path, outcome.request.grid, header, outcome.goal.pose.orientation)
 
 
 def main() -> NoReturn:

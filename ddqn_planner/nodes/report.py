@@ -59,6 +59,8 @@ class Outcome:
         The name of a `PlanStatus`, or that of a `RequestError`.
     reason : str
         What a user reads: how the path was found, or why there is none and what to do.
+    goal : PoseStamped or None
+        The pose of the goal in the map's frame.
     map_stamp : str
         The stamp of the map of the request, seconds; empty without a map.
     """
@@ -68,6 +70,7 @@ class Outcome:
     planner: Planner | None = None
     request: PlanRequest | None = None
     plan: Plan = NO_PLAN
+    goal: PoseStamped | None = None
     map_stamp: str = ""
 
 

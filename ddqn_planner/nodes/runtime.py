@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import sys
 from collections.abc import Callable, Coroutine, Generator, Mapping
+from concurrent.futures import Future as ConcurrentFuture
 from concurrent.futures import ThreadPoolExecutor
 from inspect import isawaitable
 from pathlib import Path
@@ -205,39 +206,45 @@ class Worker:
 
     def __init__(self, node: Node) -> None:
         self._thread = ThreadPoolExecutor(1)
+        self._given_up: ConcurrentFuture[None] | None = None
         # A future alone does not wake an executor in another thread.
         self._wake = node.create_guard_condition(lambda: None)
 
     def call(self, function: Callable[..., Any], *arguments: object) -> Future:
-        """Return the future of a call; it has the exception if the function raises one.
+        """Return the future of a call; it has the exception if the function raises one."""
+        return self._submit(function, *arguments)[0]
 
-        A call whose future is cancelled before it begins is left out.
-        """
+    def _submit(
+        self, function: Callable[..., Any], *arguments: object
+    ) -> tuple[Future, ConcurrentFuture[None]]:
         future = Future()
 
         def work() -> None:
-            if future.cancelled():
-                return
             try:
                 future.set_result(function(*arguments))
             except Exception as error:
                 future.set_exception(error)
             self._wake.trigger()
 
-        self._thread.submit(work)
-        return future
+        return future, self._thread.submit(work)
 
     def close(self) -> None:
         """Wait until all calls have ended; take no more."""
         self._thread.shutdown()
 
     async def run(self, function: Callable[..., Any], *arguments: object) -> Any:
-        """Return the result of a call, which is left out if nobody awaits it when it begins."""
-        future = self.call(function, *arguments)
+        """Return the result of a call, which the caller may give up.
+
+        Then the call is left out if it has not begun. If it has, the next calls do not wait for it:
+        they go to another thread, except while there is such a call already.
+        """
+        future, work = self._submit(function, *arguments)
         try:
             return await future
         finally:
-            future.cancel()
+            is_running = not future.done() and not work.cancel()
+            if is_running and (self._given_up is None or self._given_up.done()):
+                self._given_up, self._thread = work, ThreadPoolExecutor(1)
 
 
 class Unless:

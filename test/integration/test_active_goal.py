@@ -140,6 +140,13 @@ def test_a_map_that_grows_by_whole_cells_keeps_the_plan_quiet(robot: Robot) -> N
     assert last_plan(robot).header.stamp == first.header.stamp
 
 
+def test_a_map_far_away_has_nothing_of_the_path(robot: Robot) -> None:
+    far = robot.grid_of(robot.values, (1e12, 0.0, 0.0))
+    robot.send_map(map_message(robot.values, far, next(NUMBERS)))
+    robot.wait_for_reason("the start lies outside the map")
+    assert robot.plans.wait().poses == []
+
+
 def test_the_path_under_way_is_kept_up_to_the_threshold(robot: Robot) -> None:
     set_and_settle(robot, replan_period=SOON)
     plan_on(robot, robot.stamped_map())

@@ -28,7 +28,7 @@ from ddqn_planner.nodes.conversions import directions_message, occupancy_message
 from ddqn_planner.nodes.map_source import MapSource
 from ddqn_planner.nodes.planner_parameters import PARAMETERS
 from ddqn_planner.nodes.report import Report
-from ddqn_planner.nodes.runtime import LATCHED, BaseNode
+from ddqn_planner.nodes.runtime import LATCHED, BaseNode, Worker
 from ddqn_planner.resources import find_map
 
 EAST, WEST = 0b00111000, 0b10000011
@@ -125,7 +125,7 @@ def node() -> Iterator[BaseNode]:
 
 @pytest.fixture
 def source(node: BaseNode) -> Iterator[MapSource]:
-    source = MapSource(node, Report(node), lambda _: None)
+    source = MapSource(node, Report(node), Worker(node), lambda _: None)
     yield source
     source.close()
     defaults = {name: PARAMETERS[name].default for name in ("map_type", "require_directions")}

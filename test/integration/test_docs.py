@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 import re
 from collections.abc import Callable
 from contextlib import suppress
@@ -109,6 +110,7 @@ def documented_topics(node: str) -> set[tuple[str, str, str]]:
         (row[0], row[1].strip("`"), re.sub(r"/(?=\w+$)", "/msg/", row[2].split(",")[0]))
         for row in rows_of(node)
         if row[0] in ("publishes", "subscribes", "service")
+        and importlib.util.find_spec(row[2].split("/")[0])  # some packages may be missing
     }
     documented = {
         (kind, topic, message.replace("/msg/", "/srv/") if kind == "service" else message)

@@ -28,7 +28,7 @@ from ddqn_planner.nodes.conversions import occupancy_message
 from ddqn_planner.nodes.map_source import MapSource, updated_values
 from ddqn_planner.nodes.planner_parameters import PARAMETERS
 from ddqn_planner.nodes.report import Report
-from ddqn_planner.nodes.runtime import BaseNode
+from ddqn_planner.nodes.runtime import BaseNode, Worker
 
 MAP = occupancy_message(
     np.arange(20, dtype=np.int8).reshape(4, 5),
@@ -138,7 +138,7 @@ def test_after_updates_the_map_is_as_if_it_came_whole(
     defaults = {name: PARAMETERS[name].default for name in parameters}
     node.set_parameters([Parameter(name, value=value) for name, value in parameters.items()])
     random, heard = np.random.default_rng(0), []
-    source, whole = (MapSource(node, Report(node), heard.append) for _ in range(2))
+    source, whole = (MapSource(node, Report(node), Worker(node), heard.append) for _ in range(2))
     first = random_map(random, 1)
     source._take(first)
     values = np.array(first.data, dtype=np.int8).reshape(30, 40)
@@ -177,7 +177,7 @@ def inflated(source: MapSource) -> GridMap:
 
 def test_refused_updates_are_counted_and_change_nothing(node: BaseNode) -> None:
     report, heard = Report(node), []
-    source = MapSource(node, report, heard.append)
+    source = MapSource(node, report, Worker(node), heard.append)
     source._take_update(update())
     assert report.refused["map_updates"].startswith("an update came before a map")
     assert source.describe() == {"map updates applied": "0", "map updates refused": "1"}
