@@ -83,7 +83,7 @@ class Experience:
         self,
         nominal_speed: float,
         robot_width: float = 0.5,
-        half_life: float = 1800.0,
+        half_life: float = 900.0,
         max_pause: float = 90.0,
     ) -> None:
         given = {
@@ -147,7 +147,7 @@ class Experience:
         metres = visits.metres[inside]
         expected = metres / self.nominal_speed * spread.slowness[y, x]
         deviation = self.forecasts.deviation(
-            expected, metres, spread.variance(x, y), REACH * self.robot_width
+            expected, metres, spread.variance(x, y), self.evidence.side
         )
         ratio = visits.seconds[inside].sum() / expected.sum()
         self.forecasts.add_drive(math.log(ratio) / deviation)
@@ -176,7 +176,8 @@ class Experience:
 
     def slowness(self, grid: GridMap) -> Float32:
         """Return (H, W) float32: expected seconds over those at nominal speed, 1 or more."""
-        return self._spread_over(grid).slowness.copy()
+        slowness: Float32 = self._spread_over(grid).slowness.copy()
+        return slowness
 
     def uncertainty(self, grid: GridMap) -> Float32:
         """Return (H, W) float32: the standard deviation of the log slowness."""
@@ -200,7 +201,7 @@ class Experience:
         variance = spread.variance(x, y)
         seconds = metres / self.nominal_speed * (slowness[1:] + slowness[:-1]) / 2
         deviation = self.forecasts.deviation(
-            seconds, metres, (variance[1:] + variance[:-1]) / 2, REACH * self.robot_width
+            seconds, metres, (variance[1:] + variance[:-1]) / 2, self.evidence.side
         )
         low, middle, high = np.exp(self.forecasts.quantiles() * deviation)
         total = float(seconds.sum())

@@ -22,6 +22,17 @@ OLD_VISITS = 500.0
 """The noise of visits is that of about so many."""
 
 
+TAIL = 0.04
+"""Share of the errors beyond each bound. It is less than 5 %, because successive drives are alike:
+they show less of the tails than as many independent ones."""
+
+PARTS = 256
+"""Parts of a path between which it is computed what they have in common."""
+
+CORRELATED = 5.0
+"""Places that are so many sides apart have a third of their error in common."""
+
+
 class Forecasts:
     """The noise of visits, and the errors of drives in standard deviations.
 
@@ -62,33 +73,32 @@ class Forecasts:
         """Learn the error of a drive's log time, in standard deviations."""
         self.errors = [*self.errors, error][-KEPT:]
 
-    def deviation(
-        self, seconds: Float64, metres: Float64, variance: Float64, length: float
-    ) -> float:
+    def deviation(self, seconds: Float64, metres: Float64, variance: Float64, side: float) -> float:
         """Return the standard deviation of the log time of a drive.
 
         Parameters
         ----------
         seconds, metres : (N,) float64
-            Of its places, one after the other.
+            Of its parts, one after the other.
         variance : (N,) float64
-            Of their log slowness. That of places less than about `length` apart is the same.
-        length : float
-            Metres.
+            Of the log slowness there. That of parts less than some places apart is the same.
+        side : float
+            Of a place, metres: each has a noise of its own.
         """
         share = seconds / seconds.sum()
-        at = np.cumsum(metres)
-        same = np.exp(-np.abs(at[:, None] - at) / length)
-        weighted = share * np.sqrt(variance)
-        of_visits = self.noise * share**2
-        return float(np.sqrt(weighted @ same @ weighted + of_visits.sum()))
+        of_visits = self.noise * (share**2 * np.maximum(side / metres, 1)).sum()
+        weighted, at = share * np.sqrt(variance), np.cumsum(metres)
+        begins = np.unique(np.linspace(0, len(at) - 1, PARTS).astype(np.int64))
+        weighted, at = np.add.reduceat(weighted, begins), at[begins]
+        same = np.exp(-np.abs(at[:, None] - at) / (CORRELATED * side))
+        return float(np.sqrt(weighted @ same @ weighted + of_visits))
 
     def quantiles(self) -> Float64:
-        """Return the 5 % quantile, the mean, and the 95 % quantile of the errors of drives."""
+        """Return the lower bound, the mean, and the upper bound of 90 % of the errors of drives."""
         assumed = NORMAL * np.linspace(-1.05, 1.05, ASSUMED)
         errors = np.concatenate([self.errors, assumed])
         # Of n errors and the next one, as many lie outside on each side as of a sample of n + 1.
-        tail = 0.05 * (1 + 1 / len(errors)) - 1 / len(errors)
+        tail = TAIL * (1 + 1 / len(errors)) - 1 / len(errors)
         low, high = np.quantile(errors, (max(tail, 0), min(1 - tail, 1)))
         return np.array([low, errors.mean(), high])
 

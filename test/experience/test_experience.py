@@ -281,6 +281,7 @@ def test_a_map_is_the_same_while_nothing_was_learned() -> None:
     experience = driven(straight((2, 5), (12, 5), 3))
     assert experience.apply(HALL).same_cells(experience.apply(HALL))
     before = experience.apply(HALL)
+    assert before.slowness is not None
     kept = before.slowness.copy()
     experience.record(*straight((2, 5), (12, 5), 9))
     assert not experience.apply(HALL).same_cells(before)
