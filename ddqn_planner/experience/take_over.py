@@ -25,6 +25,7 @@ def take_over(newer: Experience, older: Experience) -> None:
         return
     changed = np.ones(len(table), dtype=np.bool_)
     changed[:known] = (table[:known] != older.evidence.table).any(axis=1)
+    changed[older.evidence.changed_since(spread.version)] = True
     newer.evidence.version = older.evidence.version + 1
     newer.evidence._changed = np.where(changed, newer.evidence.version, 0)
     newer._spread, older._spread = spread, None
