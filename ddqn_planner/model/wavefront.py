@@ -156,7 +156,7 @@ def _grow(
             state[cell] = CLOSED
             visited += 1
             here = distance[cell]
-            # With terms, the table has lower bounds: few moves need more than that.
+            # With values, the table has lower bounds: few moves need more than that.
             better = 0
             for action in range(8):
                 previous = cell - offsets[action]
@@ -171,7 +171,7 @@ def _grow(
                 better &= better - 1
                 previous = cell - offsets[action]
                 known, cost = distance[previous], through[action]
-                if terms is not None:
+                if value is not None:
                     cost = here + cost_of(patch, table, value, terms, width, previous, action)
                     if cost >= known > 0:
                         continue
@@ -241,7 +241,7 @@ def _grow_whole(distance: Distances, state: States, opened: Cells, costs: MoveCo
                 continue
             state[cell] = CLOSED
             here = distance[cell]
-            # With terms, the table has lower bounds: few moves need more than that.
+            # With values, the table has lower bounds: few moves need more than that.
             better = 0
             for action in range(8):
                 previous = cell - offsets[action]
@@ -254,7 +254,7 @@ def _grow_whole(distance: Distances, state: States, opened: Cells, costs: MoveCo
                 better &= better - 1
                 previous = cell - offsets[action]
                 known, cost = distance[previous], through[action]
-                if terms is not None:
+                if value is not None:
                     cost = here + cost_of(patch, table, value, terms, width, previous, action)
                     if cost >= known > 0:
                         continue
