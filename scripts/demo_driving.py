@@ -38,7 +38,7 @@ from ddqn_planner.nodes.runtime import LATCHED
 from ddqn_planner.pictures.picture import draw_obstacles
 from ddqn_planner.planning import Planner
 
-WORLD, SEED, SPEED_UP = "office", 1, 40.0
+WORLD, SEED, SPEED_UP = "office", 9, 40.0
 MISSIONS = 40
 RULE = MoveRule.ROBOT_SAFE
 MEAN_OF = 8
@@ -100,17 +100,14 @@ class Driver:
         self.saved.clear()
         stamped = pose(grid, goal)
         self.client.publish("goal_pose", stamped)
-        print("DBG", self.at, goal, self.odometry.messages()[-1].pose.pose.position)
         path = self.wait("plan", self.plans, lambda plan: plan.poses)
+        cells = cells_of(grid, path)
         routes = {
-            "shortest": self.plan(grid, self.at, goal),
-            "learned": cells_of(grid, path),
-            "best possible": self.plan(world.known(began), self.at, goal),
+            "shortest": self.plan(grid, cells[0], goal),
+            "learned": cells,
+            "best possible": self.plan(world.known(began), cells[0], goal),
         }
         seconds = {name: path_seconds(cells, truth, grid) for name, cells in routes.items()}
-        time.sleep(3); print("DBG", len(path.poses), self.odometry.messages()[-1].pose.pose.position)
-        from diagnostic_msgs.msg import DiagnosticArray
-        r=self.client.subscribe(DiagnosticArray,"/diagnostics"); time.sleep(1.5); print([m.status[0] for m in r.messages()])
         self.wait("drive", self.saved)
         time.sleep(0.3)  # the planner loads it
         self.at = goal

@@ -45,23 +45,28 @@ class DriveRecorder:
     ----------
     on_drive : callable
         Called with the outcome, the seconds (N,) and the positions (N, 2) of each drive that ends.
+
+    Attributes
+    ----------
+    goal : (x, y) or None
+        The last goal, metres.
     """
 
     def __init__(self, on_drive: Callable[[DriveEnd, Float64, Float64], None]) -> None:
         self._on_drive = on_drive
-        self._goal: tuple[float, float] | None = None
+        self.goal: tuple[float, float] | None = None
         self.forget()
 
     def forget(self) -> None:
-        """Begin anew, without the samples and without the goal."""
+        """Forget the drive that is under way, and where the robot is."""
         self._samples: list[tuple[float, float, float]] = []
         self._last: tuple[float, float, float] | None = None
         self._stands: tuple[float, float, float] | None = None
 
     @property
-    def is_driving(self) -> bool:
-        """Whether a drive has begun."""
-        return len(self._samples) > 0
+    def position(self) -> tuple[float, float] | None:
+        """Where the robot is, metres."""
+        return self._last[1:] if self._last is not None else None
 
     def add(self, seconds: float, x: float, y: float) -> None:
         """Take a pose of the robot, in order.
@@ -99,15 +104,15 @@ class DriveRecorder:
 
     @property
     def _is_at_goal(self) -> bool:
-        if self._goal is None or self._last is None:
+        if self.goal is None or self.position is None:
             return False
-        return math.dist(self._goal, self._last[1:]) <= ARRIVAL_DISTANCE
+        return math.dist(self.goal, self.position) <= ARRIVAL_DISTANCE
 
     def set_goal(self, x: float, y: float) -> None:
         """Take a new goal; the same one again changes nothing."""
-        if (x, y) != self._goal:
+        if (x, y) != self.goal:
             self.end(DriveEnd.ARRIVED if self._is_at_goal else DriveEnd.NEW_GOAL)
-            self._goal = x, y
+            self.goal = x, y
 
     def abort(self) -> None:
         """End the drive because the robot gave up, also where it could not even begin."""

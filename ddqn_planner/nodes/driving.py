@@ -129,9 +129,10 @@ class Driving:
             if status.status == GoalStatus.STATUS_ABORTED
         }
         # What failed before the node listened failed elsewhere.
-        if self._aborted is not None and aborted - self._aborted and self._state == "recording":
+        before = aborted if self._aborted is None else self._aborted
+        self._aborted = before | aborted
+        if self._state == "recording" and aborted - before:
             self._recorder.abort()
-        self._aborted = aborted
 
     # Drives
 
@@ -315,7 +316,12 @@ class Driving:
         if missing:
             problems.append("no map was received yet; start a map server, or set map_file")
             level = max(level, DiagnosticStatus.WARN)
-        values = {"state": self._state, "last drive": self._last_drive}
+        values = {
+            "state": self._state,
+            "robot": _place_of(self._recorder.position),
+            "goal": _place_of(self._recorder.goal),
+            "last drive": self._last_drive,
+        }
         if self._folder is not None:
             values |= {
                 "drives": str(self._folder.drives),
@@ -334,6 +340,10 @@ class Driving:
             self._folder.close()
             if self._folder.save_error:
                 self._node.get_logger().error(self._folder.save_error)
+
+
+def _place_of(position: tuple[float, float] | None) -> str:
+    return "unknown" if position is None else f"({position[0]:.6g}, {position[1]:.6g})"
 
 
 def open_folder(folder: str, nominal_speed: float, robot_width: float) -> DriveFolder:

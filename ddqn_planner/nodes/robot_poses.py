@@ -73,7 +73,7 @@ class RobotPoses:
             self._frames.listen()
             node.create_timer(TF_PERIOD, self._look_up, clock=STEADY)
         else:
-            node.create_subscription(Odometry, "odom", self._on_odometry, 100)
+            node.create_subscription(Odometry, "odom", self._on_odometry, 1000)
 
     def in_map(self, name: str, pose: PoseStamped, frame: str) -> tuple[float, float]:
         """Return a pose's position in the map's frame; ValueError if it has none."""

@@ -48,7 +48,7 @@ def test_drives_are_recorded_and_teach(tmp_path: Path) -> None:
     np.testing.assert_allclose(first.positions, positions, atol=1e-3)
     learned = slowness(folder.folder)
     assert learned[20, 60] > 2
-    assert learned[20, 100] > 1.2 * learned[20, 60]  # where the robot gave up
+    assert learned[20, 100] > 1.1 * learned[20, 60]  # where the robot gave up
 
 
 def test_the_record_has_the_columns_that_its_header_names(tmp_path: Path) -> None:
