@@ -23,6 +23,7 @@ matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 import numpy as np
 from client import Client, Recorder, cells_of, pose, wait_for
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import LogNorm
 from matplotlib.patheffects import withStroke
 from nav_msgs.msg import OccupancyGrid, Odometry, Path
@@ -140,8 +141,9 @@ def save_film(path: FilePath, world: World, missions: Sequence[Mission]) -> None
         ratio = mission.seconds["learned"] / mission.seconds["best possible"]
         figure.suptitle(f"mission {number}: {ratio:.2f} of the best possible time", fontsize=11)
         figure.legend(*both[0].get_legend_handles_labels(), loc="outside lower center", ncols=3)
-        figure.canvas.draw()
-        image = Image.fromarray(np.asarray(figure.canvas.buffer_rgba())).convert("RGB")
+        canvas: Any = FigureCanvasAgg(figure)
+        canvas.draw()
+        image = Image.fromarray(np.asarray(canvas.buffer_rgba())).convert("RGB")
         frames.append(image.quantize(64))
         plt.close(figure)
     times = [1200 if number in (0, len(frames) - 1) else 450 for number in range(len(frames))]

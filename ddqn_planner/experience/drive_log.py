@@ -219,7 +219,7 @@ def _check_same(
     if differences:
         raise ValueError(
             f"{folder} holds experience with {', '.join(differences)}; give those values, another "
-            f"folder, or learn anew: ddqn-planner learn {folder}"
+            f"folder, or learn anew: ddqn-planner learn {folder} --map MAP"
         )
 
 
