@@ -11,10 +11,12 @@ from numpy.typing import NDArray
 from rclpy.qos import QoSProfile
 from rclpy.task import Future
 from rclpy.time import Time
-from std_msgs.msg import Header
+from std_msgs.msg import Header, String
 
+from ddqn_planner.grid import GridMap
 from ddqn_planner.grid.body import Inflation
 from ddqn_planner.nodes.conversions import grid_from_message, grid_from_values
+from ddqn_planner.nodes.expected_times import ExpectedTimes
 from ddqn_planner.nodes.map_directions import MapDirections
 from ddqn_planner.nodes.report import Report, describe_map, seconds
 from ddqn_planner.nodes.runtime import LATCHED, BaseNode, Worker
@@ -43,6 +45,8 @@ class MapSource:
         It says what was refused.
     worker : Worker
         It inflates. Maps must not wait for fields: 2000 x 2000 cells take over a second.
+    times : ExpectedTimes
+        The expected times of the map's places; only the worker uses them.
     on_map : callable
         Called after each map and each update that was not refused, with whether the map's frame is
         a new one; for a map that waits for its directions, once it has them.
@@ -54,7 +58,12 @@ class MapSource:
     """
 
     def __init__(
-        self, node: BaseNode, report: Report, worker: Worker, on_map: Callable[[bool], None]
+        self,
+        node: BaseNode,
+        report: Report,
+        worker: Worker,
+        times: ExpectedTimes,
+        on_map: Callable[[bool], None],
     ) -> None:
         self.header: Header | None = None
         self._node = node
@@ -65,6 +74,7 @@ class MapSource:
         self._updates = self._refused_updates = 0
         self._inflated: Future | None = None
         self._inflate = Inflation()
+        self._times = times
         self._worker = worker
         self._incomplete = ""
         self._directions = MapDirections(node, report, self._take_directions)
@@ -106,13 +116,32 @@ class MapSource:
         return description
 
     def inflated(self) -> Future:
-        """Return the `GridMap` for the robot's body, which is computed for the first request."""
+        """Return the `GridMap` for the robot's body, which is computed for the first request.
+
+        Where the trainer has learned from drives, its moves cost expected time.
+        """
         if self._inflated is None:
             radius, weight = map(self._node.value, BODY_PARAMETERS)
             # ROS accepts a value that is above the range by a millionth.
             body = radius, min(weight, 1.0)
-            self._inflated = self._worker.call(self._inflate, self._grid, *body)
+            self._inflated = self._worker.call(self._made, self._grid, *body)
         return self._inflated
+
+    def _made(self, grid: GridMap, *body: float) -> GridMap:
+        return self._times.apply(self._inflate(grid, *body))
+
+    async def on_experience_saved(self, message: String) -> None:
+        """Plan by what the trainer has learned from drives, or refuse its file."""
+        try:
+            await self._worker.call(self._times.load, message.data)
+        except Exception as error:  # what was learned before stays
+            self._report.refuse("experience", str(error) or repr(error))
+            return
+        self._report.accept("experience")
+        self._inflated = None
+        self._report.change()
+        if not self.missing:
+            self._on_map(False)
 
     def apply_parameters(self, changed: set[str]) -> None:
         """Read and inflate the map anew if one of the parameters that changed says so."""

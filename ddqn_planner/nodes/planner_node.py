@@ -26,6 +26,7 @@ from std_msgs.msg import Header, String
 
 from ddqn_planner.nodes.active_goal import UNCHANGED, ActiveGoal, PathUnderWay
 from ddqn_planner.nodes.conversions import path_message, serialized_path
+from ddqn_planner.nodes.expected_times import ExpectedTimes, Forecast
 from ddqn_planner.nodes.field_display import FieldDisplay, Shown
 from ddqn_planner.nodes.frames import Frames, check_tf
 from ddqn_planner.nodes.lifecycle import ManagedNode
@@ -90,7 +91,9 @@ class PlannerNode(ManagedNode):
         )
         self._frames = Frames(self)
         self._start = self._start_source()
-        self._map = MapSource(self, self._report, self._map_worker, self._on_map)
+        self._times = ExpectedTimes()
+        self._forecast = Forecast(self._times, self._map_worker)
+        self._map = MapSource(self, self._report, self._map_worker, self._times, self._on_map)
         self._requests = Requests(
             self._settings,
             self._map,
@@ -103,6 +106,14 @@ class PlannerNode(ManagedNode):
         self.create_subscription(PoseStamped, "goal_pose", self._on_goal_pose, 10)
         if self._settings.follow_trainer:
             self.create_subscription(String, "trainer/model_saved", self._model.on_saved, LATCHED)
+            on_experience_saved: Any = self._map.on_experience_saved
+            self.create_subscription(
+                String,
+                "trainer/experience_saved",
+                on_experience_saved,
+                LATCHED,
+                callback_group=MutuallyExclusiveCallbackGroup(),  # it waits for a worker
+            )
         # Reentrant: a request that waits for its field does not keep out the others.
         self.create_service(
             GetPlan, "~/get_plan", self._on_get_plan, callback_group=ReentrantCallbackGroup()
@@ -127,7 +138,7 @@ class PlannerNode(ManagedNode):
         self._forget()
         self._report.forget()
         self._frames.close()
-        del self._display, self._start, self._map, self._requests
+        del self._display, self._start, self._map, self._requests, self._times, self._forecast
         self._model.forget()
 
     async def prepare(self, transition: str) -> bool:
@@ -317,6 +328,8 @@ class PlannerNode(ManagedNode):
                 self._replan.trigger()
         if self._active.is_look_due():
             self._replan.trigger()
+        if self._is_configured and self._forecast.look(self._report.outcome):
+            self._report.change()
         if self._report.is_due:
             missing = [NOT_ACTIVE.reason] if not self._is_active() else []
             missing += [self._map.missing] if self._is_configured else []
@@ -325,7 +338,7 @@ class PlannerNode(ManagedNode):
             self._report.publish(fatal, "; ".join(filter(None, missing)), self._describe())
 
     def _describe(self) -> dict[str, str]:
-        of_map = self._map.describe() if self._is_configured else {}
+        of_map = self._map.describe() | self._forecast.describe() if self._is_configured else {}
         return {"state": self.state, **self._model.describe(self._settings.move_rule), **of_map}
 
 

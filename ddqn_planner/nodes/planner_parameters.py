@@ -99,6 +99,9 @@ PARAMETERS: Final = {
         "GridBased", "The planner_id that Nav2's requests may name, beside the empty one"
     ),
     "follow_trainer": Declared(
-        False, "Whether to load each model that trainer/model_saved names", read_only=True
+        False,
+        "Whether to load each model that trainer/model_saved names, and to plan by expected time "
+        "with what trainer/experience_saved names",
+        read_only=True,
     ),
 }

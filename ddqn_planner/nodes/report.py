@@ -162,6 +162,11 @@ class Report:
         self._outcome = NO_REQUEST
         self.change()
 
+    @property
+    def outcome(self) -> Outcome:
+        """The last outcome."""
+        return self._outcome
+
     def note(self, outcome: Outcome) -> None:
         """Store the last outcome for the diagnostics."""
         self._outcome = outcome

@@ -227,6 +227,10 @@ class Worker:
 
         return future, self._thread.submit(work)
 
+    def close(self) -> None:
+        """Wait until all calls have ended; take no more."""
+        self._thread.shutdown()
+
     async def run(self, function: Callable[..., Any], *arguments: object) -> Any:
         """Return the result of a call, which is left out if the caller gives it up before."""
         future, work = self._submit(function, *arguments)
