@@ -127,7 +127,8 @@ def changed_cells(old: GridMap, new: GridMap, shift: Cell) -> NDArray[np.int32] 
     differs = np.zeros((top - bottom, right - left), dtype=np.bool_)
     for layer in LAYERS:
         one, other = getattr(old, layer), getattr(new, layer)
-        if one is not None and other is not None and one is not other:
+        moved = one is not other or shift != (0, 0)
+        if moved and one is not None and other is not None:
             differs |= one[before] != other[inside]
     number = np.flatnonzero(differs)
     if number.size > CHANGED_SHARE * differs.size:
