@@ -266,7 +266,7 @@ class PropagationQNetwork(QNetwork):
         (8, H, W) float32
             -inf where no path is known.
         """
-        from ddqn_planner.model.wavefront import propagate_values
+        from ddqn_planner.model.field_values import propagate_values
 
         patch_id, patch_P9 = unique_patches(grid.occupancy, grid.cost if self.uses_costs else None)
         cost_PA = self._costs_of(patch_P9, move_rule)

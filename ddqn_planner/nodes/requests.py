@@ -27,7 +27,6 @@ from ddqn_planner.nodes.start_source import StartSource
 from ddqn_planner.planning import Plan, PlanMethod, Planner, PlanRequest
 from ddqn_planner.planning.path_under_way import is_path_valid
 from ddqn_planner.planning.plan import joined
-from ddqn_planner.planning.planner import last_step
 
 T = TypeVar("T")
 
@@ -164,8 +163,8 @@ class Requests:
     async def _plan_one(self, planner: Planner, request: PlanRequest) -> Plan:
         steps = planner.steps(request)
         plan = next(steps)
-        if plan is None:  # a slow step follows
-            plan = await self.worker.run(last_step, steps)
+        while plan is None:  # a slow step follows; between two of them others have a turn
+            plan = await self.worker.run(next, steps)
         return plan
 
     def _start_pose(self, frame: str) -> PoseStamped:

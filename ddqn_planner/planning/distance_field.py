@@ -37,9 +37,9 @@ class DistanceField(QField):
     """
 
     def __init__(self, goals: Goals, grid: GridMap, costs: MoveCosts, move_rule: MoveRule) -> None:
-        from ddqn_planner.model import wavefront
+        from ddqn_planner.model import field_values, wavefront
 
-        self.wavefront = wavefront
+        self.wavefront, self.field_values = wavefront, field_values
         self.grid, self.costs, self.move_rule = grid, costs, move_rule
         self.goal, self.goals = goals[0], goals
         self.lock = threading.RLock()
@@ -113,7 +113,7 @@ class DistanceField(QField):
             if not self.reach(start, limit):
                 status = PlanStatus.NO_PATH if self.is_whole else PlanStatus.ROLLOUT_TRAPPED
                 return Plan(status, move_rule=self.move_rule)
-            path = self.wavefront.roll_out(self.arrays[0], self.costs, self._number(start))
+            path = self.field_values.roll_out(self.arrays[0], self.costs, self._number(start))
         return Plan(PlanStatus.SUCCEEDED, path, move_rule=self.move_rule)
 
     def _whole(self) -> NDArray[np.float64]:
@@ -129,7 +129,7 @@ class DistanceField(QField):
     def q(self) -> NDArray[np.float32]:  # type: ignore[override]
         """(8, H, W) float32: Q(s, a); -inf where no path to the goal begins with the action."""
         with self.lock:
-            return self.wavefront.q_of(self._whole(), self.costs)
+            return self.field_values.q_of(self._whole(), self.costs)
 
     @cached_property
     def legal(self) -> NDArray[np.bool_]:  # type: ignore[override]
@@ -152,7 +152,7 @@ class DistanceField(QField):
     def policy(self) -> NDArray[np.int8]:
         """(H, W) int8: the action of a rollout in each cell; -1 without one."""
         with self.lock:
-            return self.wavefront.policy_of(self._whole(), self.costs)
+            return self.field_values.policy_of(self._whole(), self.costs)
 
     @property
     def nbytes(self) -> int:

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Generator, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
-from ddqn_planner.grid import Cell, GridMap, MoveRule, legal_moves, path_cost
+from ddqn_planner.grid import Cell, GridMap, MoveRule, path_cost
 from ddqn_planner.grid.arguments import as_cell
 from ddqn_planner.model import ModelMetadata, QNetwork, load_model
 from ddqn_planner.planning.distance_field import DistanceField
@@ -21,14 +20,14 @@ from ddqn_planner.planning.plan import Plan, PlanMethod, PlanRequest, PlanStatus
 from ddqn_planner.planning.q_field import Goals, QField
 from ddqn_planner.planning.search import search
 from ddqn_planner.planning.simplification import simplify
+from ddqn_planner.planning.way_out import reach, way_out_and_ends
+
+VISITS = 2**18
+"""About how many cells a field visits in one step of a plan: some 30 ms, then comes another."""
 
 UNLABELLED_SHARE = 1 / 2
 """Share of the map's cells that a request may visit before the connected cells are looked at. A
 request without a path would visit all that its goal is connected to."""
-
-ROUNDING = 1e-6
-"""Relative error of a tolerance in cells: 0.15 m in cells of 0.05 m must reach 3 cells, not
-2.9999999."""
 
 
 class Planner:
@@ -213,7 +212,8 @@ class Planner:
         Yields
         ------
         Plan or None
-            None before each step that may be slow (a new field, a search); at last the plan.
+            None before each step that may be slow (a part of a new field, a search); at last the
+            plan.
         """
         grid, start, rule = request.grid, request.start, request.move_rule
         status = self._refusal(request)
@@ -232,17 +232,20 @@ class Planner:
             field = self._fields.find(grid, goals, rule) if grid.is_free(start) else None
         with rollout_time:
             plan = field.rollout_if_known(start) if field else None
-        if plan is None or (not plan.path.size and _reach(request) >= 1):
+        if plan is None or (not plan.path.size and reach(request) >= 1):
             yield None
         if plan is None and grid.is_free(start) and goals:
             with field_time:
-                field, plan = self._visit_some(request, goals)
+                if self._fields.has_costs(grid, rule):
+                    field = self._fields.get(grid, goals, rule, start)
+            if isinstance(field, DistanceField):
+                plan = yield from _in_parts(field, request, field_time)
         if plan is None or not plan.path.size:
             with field_time:
-                if plan and plan.status is PlanStatus.NO_PATH and _reach(request) < 1:
+                if plan and plan.status is PlanStatus.NO_PATH and reach(request) < 1:
                     way_out, ends = (), goals
                 else:
-                    way_out, ends = _way_out_and_ends(request, goals)
+                    way_out, ends = way_out_and_ends(request, goals)
                 if way_out and (field is None or field.goals != ends):
                     field, plan = self._fields.get(grid, ends, rule, way_out[-1]), None
             if field is None or not way_out:
@@ -285,23 +288,6 @@ class Planner:
             rollout_ms=rollout_time.ms,
         )
 
-    def _visit_some(self, request: PlanRequest, goals: Goals) -> tuple[QField | None, Plan | None]:
-        """Return the field of the goals and the plan from it, if these take few visits of cells.
-
-        So most requests need no connected components.
-        """
-        grid, start, rule = request.grid, request.start, request.move_rule
-        if not self._fields.has_costs(grid, rule):
-            return None, None
-        field = self._fields.get(grid, goals, rule, start)
-        assert isinstance(field, DistanceField)
-        plan = field.rollout(start, int(UNLABELLED_SHARE * grid.occupancy.size))
-        if plan.status is PlanStatus.ROLLOUT_TRAPPED:
-            labels = grid.labels(rule)
-            joined_to_start = any(labels[y, x] == labels[start[::-1]] for x, y in goals)
-            plan = field.rollout(start) if joined_to_start else Plan(PlanStatus.NO_PATH)
-        return field, plan
-
     def _refusal(self, request: PlanRequest) -> PlanStatus | None:
         """Return why there is no path, where one look at start and goals says so."""
         grid = request.grid
@@ -311,7 +297,7 @@ class Planner:
             return PlanStatus.GOAL_OUTSIDE_MAP
         if grid.is_obstacle(request.start):
             return PlanStatus.START_OCCUPIED
-        if not _free_goals(request) and _reach(request) < 1:
+        if not _free_goals(request) and reach(request) < 1:
             return PlanStatus.GOAL_OCCUPIED
         if not self.network.supports((grid.height, grid.width)):
             return PlanStatus.MAP_SIZE_UNSUPPORTED
@@ -325,6 +311,30 @@ def last_step(steps: Iterator[Plan | None]) -> Plan:
     return plan
 
 
+def _in_parts(
+    field: DistanceField, request: PlanRequest, field_time: _Stopwatch
+) -> Generator[None, None, Plan]:
+    """Return the rollout from the start; after each part that the field grows for it, yield.
+
+    Once the field has visited many cells, the connected cells say whether there is a path: most
+    requests need not look at them.
+    """
+    grid, start = request.grid, request.start
+    until_labels = int(UNLABELLED_SHARE * grid.occupancy.size)
+    while True:
+        with field_time:
+            visits = min(VISITS, until_labels) or VISITS
+            plan = field.rollout(start, visits)
+            if plan.status is not PlanStatus.ROLLOUT_TRAPPED:
+                return plan
+            if until_labels == visits:
+                labels = grid.labels(request.move_rule)
+                if all(labels[y, x] != labels[start[::-1]] for x, y in field.goals):
+                    return Plan(PlanStatus.NO_PATH)
+            until_labels = max(until_labels - visits, 0)
+        yield None
+
+
 class _Stopwatch:
     """Adds up the milliseconds of some blocks of code."""
 
@@ -336,10 +346,6 @@ class _Stopwatch:
 
     def __exit__(self, *_: object) -> None:
         self.ms += 1e3 * (time.perf_counter() - self._began)
-
-
-def _reach(request: PlanRequest) -> float:
-    return request.tolerance * (1 + ROUNDING)
 
 
 def _cells_of_goals(goals: Sequence[Cell]) -> list[Cell]:
@@ -358,41 +364,3 @@ def _cost(plan: Plan) -> float:
     if plan.status is not PlanStatus.SUCCEEDED:
         return math.inf
     return plan.length if plan.cost is None else plan.cost
-
-
-def _way_out_and_ends(request: PlanRequest, goals: Goals) -> tuple[tuple[Cell, ...], Goals]:
-    """Return the way from the start to the first free cell, and where the path can end.
-
-    The way is the start alone where that is free. It is empty where no path leads to a goal, nor
-    to a cell within the tolerance: connected cells say so, without a field.
-    """
-    grid, start, rule = request.grid, request.start, request.move_rule
-    candidates = [(np.array(goals), len(goals))] if goals else []
-    if _reach(request) >= 1:
-        candidates.append((_free_cells(grid, request.goal, _reach(request)), 1))
-    for ends, number in candidates:
-        joined_to_ends = grid.reachable(ends, rule, backward=True)
-        way_out: tuple[Cell, ...] = (start,)
-        if not grid.is_free(start):
-            # The robot is too near to an obstacle: the shortest way through such cells.
-            assert grid.obstacles is not None
-            closed = ~joined_to_ends & (grid.obstacles | ~grid.occupancy)
-            legal = legal_moves(closed, rule, grid.forbidden)
-            everywhere_1 = np.ones(closed.shape, np.float32)
-            way_out = search(start, joined_to_ends, legal, everywhere_1, rule)
-        if way_out and joined_to_ends[way_out[-1][1], way_out[-1][0]]:
-            reached = grid.reachable([way_out[-1]], rule)
-            reached_ends = ends[reached[ends[:, 1], ends[:, 0]]]
-            return way_out, tuple((x, y) for x, y in reached_ends[:number].tolist())
-    return (), goals
-
-
-def _free_cells(grid: GridMap, goal: Cell, tolerance: float) -> NDArray[np.int64]:
-    """Return the free cells within a distance of a cell, the nearest first: (N, 2) int64."""
-    reach = int(min(tolerance, max(grid.height, grid.width)))
-    left, bottom = max(goal[0] - reach, 0), max(goal[1] - reach, 0)
-    near = ~grid.occupancy[bottom : goal[1] + reach + 1, left : goal[0] + reach + 1]
-    cells: NDArray[np.int64] = np.argwhere(near)[:, ::-1] + (left, bottom)
-    distance = np.hypot(*(cells - goal).T)
-    order = np.argsort(distance, kind="stable")
-    return cells[order[: np.count_nonzero(distance <= tolerance)]]
