@@ -47,12 +47,12 @@ class ActiveGoal:
 
     Attributes
     ----------
-    pose : PoseStamped or None
-        The last ``goal_pose``.
+    poses : list of PoseStamped
+        The last ``goal_pose``, or the last ``goal_poses``, of which the nearest one counts.
     """
 
     def __init__(self) -> None:
-        self.pose: PoseStamped | None = None
+        self.poses: list[PoseStamped] = []
         # Of the paths that were published for this goal, the last one.
         self._path = PathUnderWay()
         # What was planned last; None to plan whatever is asked.
@@ -62,9 +62,9 @@ class ActiveGoal:
         self._is_new = self._is_due = self._looks = False
         self._period = self._next_look = 0.0
 
-    def set(self, pose: PoseStamped) -> None:
+    def set(self, poses: list[PoseStamped]) -> None:
         """Take a new goal."""
-        self.pose = pose
+        self.poses = poses
         self.restart()
 
     def restart(self) -> None:
@@ -77,7 +77,7 @@ class ActiveGoal:
 
     def is_look_due(self) -> bool:
         """Return whether it is time to look if something changed."""
-        return self.pose is not None and time.monotonic() >= self._next_look
+        return bool(self.poses) and time.monotonic() >= self._next_look
 
     def begin(self, replan_period: float) -> None:
         """Begin to look whether to plan; `next_request` follows, and `is_news` after a plan."""

@@ -62,7 +62,7 @@ class Requests:
     async def plan(
         self,
         start: PoseStamped | None,
-        goals: Sequence[PoseStamped],
+        goals: list[PoseStamped],
         tolerance: float,
         active: ActiveGoal | None = None,
         planner_id: str = "",
@@ -70,17 +70,22 @@ class Requests:
     ) -> Outcome:
         """Plan from a start, or from where the robot is, through goals.
 
-        The active goal may be `UNCHANGED`. To one goal, a path that is followed may be kept.
+        The path to the active goal leads to the nearest of the goals, or it is `UNCHANGED`. To one
+        goal, a path that is followed may be kept.
         """
         settings = self.settings
         check_request(goals, planner_id, settings.planner_id)
-        for goal in goals:
-            self._check_pose("the goal", goal, self.map.frame)
+        several = len(goals) > 1
+        names = [f"goal {n}" for n in range(1, len(goals) + 1)] if several else ["the goal"]
+        for named in zip(names, goals, strict=True):
+            self._check_pose(*named, self.map.frame)
         map_header, grid, planner = await self._inputs()
         frame = map_header.frame_id
         start = await self._in_map("the start", start or await self._known_start(frame), frame)
-        goals = [await self._in_map("the goal", goal, frame) for goal in goals]
-        first, *more = [self._cell("the goal", goal, grid, frame) for goal in goals]
+        in_map = [await self._in_map(*named, frame) for named in zip(names, goals, strict=True)]
+        if active is not None:
+            goals[:] = in_map  # the active goal stays where it is when its own frame moves
+        first, *more = [self._cell(*at, grid, frame) for at in zip(names, in_map, strict=True)]
         request = PlanRequest(
             grid,
             tolerance=checked("INVALID_TOLERANCE", check_tolerance, tolerance) / grid.resolution,
@@ -91,6 +96,8 @@ class Requests:
             simplified=settings.path_simplification == "line_of_sight",
         )
         if active is not None:
+            if more:
+                request, more = replace(request, tolerance=0.0, others=tuple(more)), []
             next_request = active.next_request(request, frame, settings.switch_threshold)
             if next_request is None:
                 return UNCHANGED
@@ -108,7 +115,9 @@ class Requests:
         plan, number = joined(plans), len(plans)
         if followed is not None and len(plan.every_cell):
             followed.keep(plan.every_cell, grid, frame)
-        before, goal = [start, *goals][number - 1 : number + 1]
+        before, goal = [start, *in_map][number - 1 : number + 1]
+        if request.others and plan.goal in request.goals:
+            goal = in_map[request.goals.index(plan.goal)]
         reason = reason_of(request, plan, before, goal, settings.robot_radius)
         if more and not len(plan.path):
             reason = f"goal {number} of {len(goals)}: {reason}"
@@ -132,11 +141,12 @@ class Requests:
             robot = self._cell("the start", start, grid, frame)
         return is_path_valid(cells, robot, grid, move_rule(self.settings.move_rule, planner))
 
-    def look(self, goal: PoseStamped) -> None:
-        """Raise a RequestError while the start or the goal is not known in the map's frame."""
+    def look(self, goals: Sequence[PoseStamped]) -> None:
+        """Raise a RequestError while the start or a goal is not known in the map's frame."""
         frame = self.map.frame
         self.frames.to_map("the start", self._start_pose(frame), frame)
-        self.frames.to_map("the goal", goal, frame)
+        for goal in goals:
+            self.frames.to_map("the goal", goal, frame)
 
     async def _inputs(self) -> tuple[Header, GridMap, Planner]:
         """Return the header of the map of now, this map for the robot's body, and the planner."""
@@ -194,4 +204,4 @@ class Requests:
 
 
 def _invalid(name: str) -> str:
-    return f"INVALID_{name.removeprefix('the ').upper()}"
+    return f"INVALID_{name.removeprefix('the ').split()[0].upper()}"

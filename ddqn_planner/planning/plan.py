@@ -72,6 +72,11 @@ class PlanRequest:
     switch_threshold: float = 0.0
     others: tuple[Cell, ...] = ()
 
+    @property
+    def goals(self) -> tuple[Cell, ...]:
+        """The goal and the others, in their order."""
+        return self.goal, *self.others
+
 
 @dataclass(frozen=True, eq=False)
 class Plan:

@@ -165,9 +165,7 @@ class Planner:
         first, *others = _cells_of_goals(goals)
         rule, method = self._rule(move_rule), PlanMethod(method)
         start = as_cell(start, "the start")
-        request = PlanRequest(
-            grid, start, first, rule, method, simplified=simplified, others=tuple(others)
-        )
+        request = PlanRequest(grid, start, first, rule, method, 0.0, simplified, others=(*others,))
         return last_step(self.steps(request))
 
     def plan_through(
@@ -222,13 +220,13 @@ class Planner:
         if status is not None:
             yield Plan(status, move_rule=rule)
             return
-        goals = _free_goals(request)
+        goals, field_time, rollout_time = _free_goals(request), _Stopwatch(), _Stopwatch()
         if len(goals) > 1 and not self._fields.has_costs(grid, rule):
             yield None
-            each = [replace(request, goal=goal, others=()) for goal in goals]
-            yield min((last_step(self.steps(one)) for one in each), key=_cost)
-            return
-        field_time, rollout_time = _Stopwatch(), _Stopwatch()
+            each = [replace(request, goal=goal, others=(), under_way=()) for goal in goals]
+            with field_time:
+                nearest = min((last_step(self.steps(one)) for one in each), key=_cost)
+            goals = nearest.cells[-1:] or goals[:1]
         way_out: tuple[Cell, ...] = (start,)
         with field_time:
             field = self._fields.find(grid, goals, rule) if grid.is_free(start) else None
@@ -269,7 +267,7 @@ class Planner:
                 if len(request.under_way):
                     threshold = request.switch_threshold
                     path, extra_cost = keep_or_switch(
-                        request.under_way, path, grid, rule, threshold
+                        request.under_way, path, grid, rule, threshold, request.goals
                     )
                 goal = (int(path[-1, 0]), int(path[-1, 1]))
                 if len(way_out) > 1:
@@ -297,7 +295,7 @@ class Planner:
         grid = request.grid
         if not grid.contains(request.start):
             return PlanStatus.START_OUTSIDE_MAP
-        if not any(grid.contains(goal) for goal in (request.goal, *request.others)):
+        if not any(grid.contains(goal) for goal in request.goals):
             return PlanStatus.GOAL_OUTSIDE_MAP
         if grid.is_obstacle(request.start):
             return PlanStatus.START_OCCUPIED
@@ -361,7 +359,7 @@ def _cells_of_goals(goals: Sequence[Cell]) -> list[Cell]:
 
 def _free_goals(request: PlanRequest) -> Goals:
     """Return the free ones of a request's goals, each once."""
-    return tuple(sorted({g for g in (request.goal, *request.others) if request.grid.is_free(g)}))
+    return tuple(sorted({goal for goal in request.goals if request.grid.is_free(goal)}))
 
 
 def _cost(plan: Plan) -> float:

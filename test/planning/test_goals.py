@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from itertools import pairwise
 from typing import Any
 
@@ -17,7 +18,8 @@ from ddqn_planner.grid import Cell, shortest_distances
 from ddqn_planner.model import ModelMetadata
 from ddqn_planner.planning import repair
 from ddqn_planner.planning.distance_field import DistanceField
-from ddqn_planner.planning.plan import joined
+from ddqn_planner.planning.plan import PlanRequest, joined
+from ddqn_planner.planning.planner import last_step
 
 RULES = st.sampled_from(list(MoveRule))
 ANY_MAP = Planner.load("any_map")
@@ -119,8 +121,8 @@ def test_a_start_too_near_to_an_obstacle_leaves_for_the_nearest_goal() -> None:
     assert plan.cells[0] == (6, 3)
 
 
-def turning_planner() -> Planner:
-    network = turning_network(6)
+def turning_planner(size: int = 6) -> Planner:
+    network = turning_network(size)
     metadata = ModelMetadata("paper", network.sizes, MoveRule.ROBOT_SAFE, 0.9, "", 1, 0, "")
     return Planner(network, metadata)
 
@@ -130,6 +132,22 @@ def test_a_network_without_costs_plans_to_each_goal() -> None:
     found = planner.plan_nearest(grid, (0, 0), goals, method=PlanMethod.ASTAR_FALLBACK)
     assert found == planner.plan(grid, (0, 0), (0, 3), method=PlanMethod.ASTAR_FALLBACK)
     assert planner.plan_nearest(grid, (0, 0), goals).status is PlanStatus.ROLLOUT_TRAPPED
+
+
+@pytest.mark.parametrize("has_costs", [True, False])
+def test_a_robot_between_two_docks_keeps_to_one_of_them(has_costs: bool) -> None:
+    planner = ANY_MAP if has_costs else turning_planner(21)
+    grid, left, right = GridMap(np.zeros((21, 21))), (0, 10), (20, 10)
+    request = PlanRequest(grid, (9, 10), left, MoveRule.ROBOT_SAFE, PlanMethod.ASTAR_FALLBACK)
+    first = last_step(planner.steps(replace(request, others=(right,))))
+    assert first.goal == left
+    request = replace(request, start=(11, 10), others=(right,), under_way=first.every_cell)
+    kept = last_step(planner.steps(replace(request, switch_threshold=0.5)))
+    assert (kept.goal, kept.length) == (left, 11)
+    assert kept.extra_cost == pytest.approx(11 / 9 - 1)
+    assert last_step(planner.steps(replace(request, switch_threshold=0.2))).goal == right
+    taken = replace(request, grid=grid.with_patch([[True]], *left), switch_threshold=10.0)
+    assert last_step(planner.steps(taken)).goal == right
 
 
 @given(GRIDS, RULES, st.booleans(), st.sampled_from([0.0, 2.0]), st.data())
