@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ddqn_planner.grid.arguments import whole_numbers
-from ddqn_planner.grid.grid_map import MAX_COST_MULTIPLIER, OCCUPIED, UNKNOWN, GridMap
+from ddqn_planner.grid.arguments import OCCUPIED, UNKNOWN, whole_numbers
+from ddqn_planner.grid.grid_map import MAX_COST_MULTIPLIER, GridMap
 
 INSCRIBED = 99
 """The value of a cell that is free, but so near to an obstacle that the robot would touch it."""

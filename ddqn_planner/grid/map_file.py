@@ -15,8 +15,8 @@ import yaml
 from numpy.typing import NDArray
 
 from ddqn_planner.files import write_atomically
-from ddqn_planner.grid.arguments import Cell, as_cell, whole_numbers
-from ddqn_planner.grid.grid_map import OCCUPIED, UNKNOWN, GridMap
+from ddqn_planner.grid.arguments import OCCUPIED, UNKNOWN, Cell, as_cell, whole_numbers
+from ddqn_planner.grid.grid_map import GridMap
 from ddqn_planner.grid.map_image import (
     DIRECTION_FORMATS,
     IMAGE_FORMATS,

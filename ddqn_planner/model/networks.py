@@ -276,7 +276,7 @@ class PropagationQNetwork(QNetwork):
         (8, H, W) float32
             -inf where no path is known.
         """
-        from ddqn_planner.model.wavefront import propagate_values
+        from ddqn_planner.model.field_values import propagate_values
 
         timed = grid.slowness is not None
         cost = grid.cost if self.uses_costs and not timed else None

@@ -44,6 +44,9 @@ CODE_OF_STATUS = {
     PlanStatus.ROLLOUT_TRAPPED.name: "NO_VALID_PATH",
     "TF_ERROR": "TF_ERROR",
     "NO_START": "TF_ERROR",
+    # Malformed, or in another frame without TF: clearing costmaps, as after UNKNOWN, does not help.
+    "INVALID_START": "TF_ERROR",
+    "INVALID_GOAL": "TF_ERROR",
     "INVALID_PLANNER": "INVALID_PLANNER",
     "NO_GOALS": "NO_VIAPOINTS_GIVEN",
     # As Nav2's planners time out while their costmap is not current.

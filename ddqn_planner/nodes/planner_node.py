@@ -16,7 +16,7 @@ from collections.abc import Callable, Coroutine
 from contextlib import suppress
 from typing import Any, NoReturn
 
-from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped
+from geometry_msgs.msg import PoseArray, PoseStamped, PoseWithCovarianceStamped
 from nav_msgs.msg import Odometry, Path
 from nav_msgs.srv import GetPlan
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup, ReentrantCallbackGroup
@@ -24,7 +24,7 @@ from rclpy.parameter import Parameter
 from rclpy.task import Future
 from std_msgs.msg import Header, String
 
-from ddqn_planner.nodes.active_goal import UNCHANGED, ActiveGoal
+from ddqn_planner.nodes.active_goal import UNCHANGED, ActiveGoal, PathUnderWay
 from ddqn_planner.nodes.conversions import path_message, serialized_path
 from ddqn_planner.nodes.expected_times import Forecast
 from ddqn_planner.nodes.field_display import FieldDisplay, Shown
@@ -44,9 +44,9 @@ LOOK_PERIOD = 0.1
 
 
 class PlannerNode(ManagedNode):
-    """Plans from where the robot is to the active goal, the last ``goal_pose``.
+    """Plans from where the robot is to the active goal: ``goal_pose``, or ``goal_poses``.
 
-    The active goal stays until the next ``goal_pose``, though there may be no plan. `ActiveGoal`
+    The active goal stays until the next one comes, though there may be no plan. `ActiveGoal`
     decides when the node plans for it again, and what it publishes. Triggers during planning are
     coalesced into one more plan with the latest inputs. A malformed map, start or model is refused,
     and the one before it stays. A request that comes while the first model is loaded waits for it.
@@ -77,8 +77,8 @@ class PlannerNode(ManagedNode):
         self._is_configured = False
         self._stopped = Future()
         self._stop()
-        self._active = ActiveGoal()
-        self._logged: tuple[PoseStamped, object] | None = None
+        self._active, self._followed = ActiveGoal(), PathUnderWay()
+        self._logged: tuple[object, ...] = ()
         self._waits_for_pose = False
 
     def configure(self) -> None:
@@ -102,7 +102,8 @@ class PlannerNode(ManagedNode):
             self._worker,
             self._looks,
         )
-        self.create_subscription(PoseStamped, "goal_pose", self._on_goal_pose, 10)
+        self.create_subscription(PoseStamped, "goal_pose", lambda goal: self._on_goals([goal]), 10)
+        self.create_subscription(PoseArray, "goal_poses", self._on_goal_poses, 10)
         if self._settings.follow_trainer:
             self.create_subscription(String, "trainer/model_saved", self._model.on_saved, LATCHED)
             on_experience_saved: Any = self._map.on_experience_saved
@@ -129,7 +130,7 @@ class PlannerNode(ManagedNode):
 
     def deactivate(self) -> None:
         """Forget the active goal."""
-        self._active = ActiveGoal()
+        self._active, self._followed = ActiveGoal(), PathUnderWay()
         self._report.change()
 
     def cleanup(self) -> None:
@@ -211,12 +212,20 @@ class PlannerNode(ManagedNode):
             self._active.plan_at_once()
             self._replan.trigger()
 
-    def _on_goal_pose(self, message: PoseStamped) -> None:
+    def _on_goal_poses(self, message: PoseArray) -> None:
+        goals = [PoseStamped(header=message.header, pose=pose) for pose in message.poses]
+        if goals:
+            self._on_goals(goals)
+        else:
+            self._report.refuse("goal_poses", "the array has no pose; give one or more")
+
+    def _on_goals(self, goals: list[PoseStamped]) -> None:
         if not self._is_active():
             self._report.note(NOT_ACTIVE)
             self._report.log(NOT_ACTIVE)
             return
-        self._active.set(message)
+        self._report.accept("goal_poses")
+        self._active.set(goals)
         self._display.show_again()
         self._replan.trigger()
 
@@ -227,28 +236,26 @@ class PlannerNode(ManagedNode):
     ) -> GetPlan.Response:
         start = request.start if request.start.header.frame_id else None
         planning = self._requests.plan(start, [request.goal], request.tolerance)
-        header, outcome = await self._answer(planning, request.goal)
+        header, outcome = await self._answer(planning, [request.goal])
         response.plan = _path(path_message, outcome, header)
         self._report.log(outcome)
         return response
 
     async def _plan_for_active_goal(self) -> None:
         await self._model.first()
-        goal = self._active.pose
-        if goal is None:
+        goals = self._active.poses
+        if not goals:
             return
         self._active.begin(self._settings.replan_period)
-        planning = self._requests.plan(None, [goal], self._settings.tolerance, self._active)
-        header, outcome = await self._answer(planning, goal)
+        planning = self._requests.plan(None, goals, self._settings.tolerance, self._active)
+        header, outcome = await self._answer(planning, goals)
         if outcome in (UNCHANGED, NOT_ACTIVE):
             return
         if self._active.is_news(outcome, header.frame_id):
             self._plan_publisher.publish(_path(serialized_path, outcome, header))
         self._waits_for_pose = outcome.status in ("NO_START", "TF_ERROR")
-        if outcome.goal is not None and self._active.pose is goal:
-            self._active.pose = goal = outcome.goal  # it stays where it is when its own frame moves
         # The places and lengths in the reason may differ.
-        logged = goal, (outcome.status, outcome.plan.method)
+        logged = goals, outcome.goal, outcome.status, outcome.plan.method
         if self._logged != logged:
             self._logged = logged
             self._report.log(outcome)
@@ -263,11 +270,14 @@ class PlannerNode(ManagedNode):
     async def _plan_for_action(
         self, start: PoseStamped | None, goals: list[PoseStamped], planner_id: str, given_up: Future
     ) -> tuple[Path, Outcome]:
-        goal = goals[-1] if goals else PoseStamped()
         planning = self._requests.plan(
-            start, goals, self._settings.tolerance, planner_id=planner_id
+            start,
+            goals,
+            self._settings.tolerance,
+            planner_id=planner_id,
+            followed=self._followed,
         )
-        header, outcome = await self._answer(planning, goal, given_up)
+        header, outcome = await self._answer(planning, goals, given_up)
         if len(outcome.plan.path):
             self._plan_publisher.publish(_path(serialized_path, outcome, header))
         self._report.log(outcome)
@@ -284,7 +294,7 @@ class PlannerNode(ManagedNode):
         return response
 
     async def _answer(
-        self, planning: Coroutine[None, None, Outcome], goal: PoseStamped, *given_up: Future
+        self, planning: Coroutine[None, None, Outcome], goals: list[PoseStamped], *given_up: Future
     ) -> tuple[Header, Outcome]:
         """Return the path's header, and what became of the request.
 
@@ -294,7 +304,7 @@ class PlannerNode(ManagedNode):
         A path is planned with the map, model and parameters that are there when this begins,
         whatever changes while it waits. Its stamp is the time of the answer.
         """
-        frame = self._map.frame or goal.header.frame_id
+        frame = self._map.frame or (goals[0].header.frame_id if goals else "")
         self._answering += 1
         try:
             outcome = await Unless(planning, self._stopped, *given_up)
@@ -316,9 +326,9 @@ class PlannerNode(ManagedNode):
         self._looks.next()
         if self._is_configured:
             self._start.transform(self._map.frame)
-        if self._waits_for_pose and self._active.pose is not None:
+        if self._waits_for_pose and self._active.poses:
             with suppress(RequestError):
-                self._requests.look(self._active.pose)
+                self._requests.look(self._active.poses)
                 self._waits_for_pose = False
                 self._replan.trigger()
         if self._active.is_look_due():

@@ -20,13 +20,16 @@ from ddqn_planner.planning import Plan, PlanMethod, Planner, PlanRequest, PlanSt
 PERIOD = 1.0
 """Seconds between two diagnostics when nothing changes."""
 
+TOLERANCE = ", or a greater tolerance"
+"""The part of a remedy that does not help with several goals: none of them moves."""
+
 REMEDIES = {
     PlanStatus.START_OUTSIDE_MAP: "set the start on the map",
     PlanStatus.GOAL_OUTSIDE_MAP: "set the goal on the map",
     PlanStatus.START_OCCUPIED: "set the start on a free cell",
-    PlanStatus.GOAL_OCCUPIED: "set the goal on a free cell, or a greater tolerance",
+    PlanStatus.GOAL_OCCUPIED: f"set the goal on a free cell{TOLERANCE}",
     PlanStatus.MAP_SIZE_UNSUPPORTED: "set the parameter 'model' to one trained for this size",
-    PlanStatus.NO_PATH: "set the goal where free cells lead to, or a greater tolerance",
+    PlanStatus.NO_PATH: f"set the goal where free cells lead to{TOLERANCE}",
     PlanStatus.ROLLOUT_TRAPPED: "train the model longer, or set mode to 'astar_fallback'",
 }
 
@@ -89,24 +92,32 @@ def reason_of(
 
     `start` and `goal` are the poses of the request, and `robot_radius` inflated its map.
     """
-    grid = request.grid
+    grid, goals = request.grid, request.goals
     if plan.status is not PlanStatus.SUCCEEDED:
+        status, remedy = plan.status.value, REMEDIES[plan.status]
+        to = f"goal: {_place(goal, request.goal)}"
+        if request.others:
+            status = f"no path to any of {len(goals)} goals: {status}"
+            remedy = remedy.removesuffix(TOLERANCE)
+            to = f"goals: cells {', '.join(map(str, goals[:5]))}{', ...' * (len(goals) > 5)}"
         reason = (
-            f"{plan.status.value} (start: {_place(start, request.start)}; "
-            f"goal: {_place(goal, request.goal)}; map: {grid.width} x {grid.height} cells)"
+            f"{status} (start: {_place(start, request.start)}; {to}; "
+            f"map: {grid.width} x {grid.height} cells)"
         )
-        if plan.status is PlanStatus.GOAL_OCCUPIED and not grid.is_obstacle(request.goal):
+        on_map = filter(grid.contains, goals)
+        if plan.status is PlanStatus.GOAL_OCCUPIED and not all(map(grid.is_obstacle, on_map)):
             near = f"robot_radius, {robot_radius:g} m" if robot_radius else "the costmap allows"
             reason += f", nearer to an obstacle than {near}"
-        return f"{reason}; {REMEDIES[plan.status]}"
-    reason = f"a path of {plan.length:.2f} cells, " + (
+        return f"{reason}; {remedy}"
+    number = f" to goal {goals.index(plan.goal) + 1} of {len(goals)}" if request.others else ""
+    reason = f"a path of {plan.length:.2f} cells{number}, " + (
         "by greedy steps"
         if plan.method is PlanMethod.GREEDY
         else "searched for in the order of the Q field: the greedy steps were trapped"
     )
     if plan.extra_cost:
         reason += f", kept: its cost is {plan.extra_cost:+.1%} beside that of a new one"
-    if plan.goal is not None and plan.goal != request.goal:
+    if plan.goal is not None and plan.goal not in goals:
         metres = math.dist(plan.goal, request.goal) * grid.resolution
         why = "is cut off" if grid.is_free(request.goal) else "is occupied"
         reason += f"; the goal {why} and moved {metres:.3g} m"

@@ -15,7 +15,7 @@ from rclpy.task import Future
 from std_msgs.msg import Header
 
 from ddqn_planner.grid import Cell, GridMap
-from ddqn_planner.nodes.active_goal import UNCHANGED, ActiveGoal
+from ddqn_planner.nodes.active_goal import UNCHANGED, ActiveGoal, PathUnderWay
 from ddqn_planner.nodes.conversions import cell_from_pose, check_tolerance
 from ddqn_planner.nodes.frames import Frames
 from ddqn_planner.nodes.map_source import MapSource
@@ -24,10 +24,9 @@ from ddqn_planner.nodes.path_action import check_request
 from ddqn_planner.nodes.report import Outcome, RequestError, checked, reason_of, seconds
 from ddqn_planner.nodes.runtime import Worker
 from ddqn_planner.nodes.start_source import StartSource
-from ddqn_planner.nodes.via_points import joined
 from ddqn_planner.planning import Plan, PlanMethod, Planner, PlanRequest
 from ddqn_planner.planning.path_under_way import is_path_valid
-from ddqn_planner.planning.planner import last_step
+from ddqn_planner.planning.plan import joined
 
 T = TypeVar("T")
 
@@ -63,24 +62,30 @@ class Requests:
     async def plan(
         self,
         start: PoseStamped | None,
-        goals: Sequence[PoseStamped],
+        goals: list[PoseStamped],
         tolerance: float,
         active: ActiveGoal | None = None,
         planner_id: str = "",
+        followed: PathUnderWay | None = None,
     ) -> Outcome:
         """Plan from a start, or from where the robot is, through goals.
 
-        The active goal may be `UNCHANGED`.
+        The path to the active goal leads to the nearest of the goals, or it is `UNCHANGED`. To one
+        goal, a path that is followed may be kept.
         """
         settings = self.settings
         check_request(goals, planner_id, settings.planner_id)
-        for goal in goals:
-            self._check_pose("the goal", goal, self.map.frame)
+        several = len(goals) > 1
+        names = [f"goal {n}" for n in range(1, len(goals) + 1)] if several else ["the goal"]
+        for named in zip(names, goals, strict=True):
+            self._check_pose(*named, self.map.frame)
         map_header, grid, planner = await self._inputs()
         frame = map_header.frame_id
         start = await self._in_map("the start", start or await self._known_start(frame), frame)
-        goals = [await self._in_map("the goal", goal, frame) for goal in goals]
-        first, *more = [self._cell("the goal", goal, grid, frame) for goal in goals]
+        in_map = [await self._in_map(*named, frame) for named in zip(names, goals, strict=True)]
+        if active is not None:
+            goals[:] = in_map  # the active goal stays where it is when its own frame moves
+        first, *more = [self._cell(*at, grid, frame) for at in zip(names, in_map, strict=True)]
         request = PlanRequest(
             grid,
             tolerance=checked("INVALID_TOLERANCE", check_tolerance, tolerance) / grid.resolution,
@@ -91,10 +96,16 @@ class Requests:
             simplified=settings.path_simplification == "line_of_sight",
         )
         if active is not None:
+            if more:
+                request, more = replace(request, tolerance=0.0, others=tuple(more)), []
             next_request = active.next_request(request, frame, settings.switch_threshold)
             if next_request is None:
                 return UNCHANGED
             request = next_request
+        if followed is not None and not more:
+            under_way = followed.on(grid, frame)
+            threshold = settings.switch_threshold
+            request = replace(request, under_way=under_way, switch_threshold=threshold)
         plans = [await self._plan_one(planner, request)]
         for cell in more:
             if not len(plans[-1].path):
@@ -102,7 +113,11 @@ class Requests:
             request = replace(request, start=plans[-1].cells[-1], goal=cell)
             plans.append(await self._plan_one(planner, request))
         plan, number = joined(plans), len(plans)
-        before, goal = [start, *goals][number - 1 : number + 1]
+        if followed is not None and len(plan.every_cell):
+            followed.keep(plan.every_cell, grid, frame)
+        before, goal = [start, *in_map][number - 1 : number + 1]
+        if request.others and plan.goal in request.goals:
+            goal = in_map[request.goals.index(plan.goal)]
         reason = reason_of(request, plan, before, goal, settings.robot_radius)
         if more and not len(plan.path):
             reason = f"goal {number} of {len(goals)}: {reason}"
@@ -126,11 +141,12 @@ class Requests:
             robot = self._cell("the start", start, grid, frame)
         return is_path_valid(cells, robot, grid, move_rule(self.settings.move_rule, planner))
 
-    def look(self, goal: PoseStamped) -> None:
-        """Raise a RequestError while the start or the goal is not known in the map's frame."""
+    def look(self, goals: Sequence[PoseStamped]) -> None:
+        """Raise a RequestError while the start or a goal is not known in the map's frame."""
         frame = self.map.frame
         self.frames.to_map("the start", self._start_pose(frame), frame)
-        self.frames.to_map("the goal", goal, frame)
+        for goal in goals:
+            self.frames.to_map("the goal", goal, frame)
 
     async def _inputs(self) -> tuple[Header, GridMap, Planner]:
         """Return the header of the map of now, this map for the robot's body, and the planner."""
@@ -147,8 +163,8 @@ class Requests:
     async def _plan_one(self, planner: Planner, request: PlanRequest) -> Plan:
         steps = planner.steps(request)
         plan = next(steps)
-        if plan is None:  # a slow step follows
-            plan = await self.worker.run(last_step, steps)
+        while plan is None:  # a slow step follows; between two of them others have a turn
+            plan = await self.worker.run(next, steps)
         return plan
 
     def _start_pose(self, frame: str) -> PoseStamped:
@@ -188,4 +204,4 @@ class Requests:
 
 
 def _invalid(name: str) -> str:
-    return f"INVALID_{name.removeprefix('the ').upper()}"
+    return f"INVALID_{name.removeprefix('the ').split()[0].upper()}"

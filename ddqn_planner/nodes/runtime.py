@@ -206,7 +206,6 @@ class Worker:
 
     def __init__(self, node: Node) -> None:
         self._thread = ThreadPoolExecutor(1)
-        self._given_up: ConcurrentFuture[None] | None = None
         # A future alone does not wake an executor in another thread.
         self._wake = node.create_guard_condition(lambda: None)
 
@@ -233,18 +232,12 @@ class Worker:
         self._thread.shutdown()
 
     async def run(self, function: Callable[..., Any], *arguments: object) -> Any:
-        """Return the result of a call, which the caller may give up.
-
-        Then the call is left out if it has not begun. If it has, the next calls do not wait for it:
-        they go to another thread, except while there is such a call already.
-        """
+        """Return the result of a call, which is left out if the caller gives it up before."""
         future, work = self._submit(function, *arguments)
         try:
             return await future
         finally:
-            is_running = not future.done() and not work.cancel()
-            if is_running and (self._given_up is None or self._given_up.done()):
-                self._given_up, self._thread = work, ThreadPoolExecutor(1)
+            work.cancel()
 
 
 class Unless:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -79,7 +81,12 @@ def rest_of_path(
 
 
 def keep_or_switch(
-    under_way: Cells, new: Cells, grid: GridMap, move_rule: MoveRule | str, threshold: float
+    under_way: Cells,
+    new: Cells,
+    grid: GridMap,
+    move_rule: MoveRule | str,
+    threshold: float,
+    goals: Sequence[Cell] = (),
 ) -> tuple[NDArray[np.int32], float | None]:
     """Return what is left of the path under way if it is good enough, otherwise the new path.
 
@@ -93,11 +100,13 @@ def keep_or_switch(
         What both are judged by: the map of now.
     threshold : float
         How much more the rest may cost than the new path, as a share of the new path's cost.
+    goals : sequence of (x, y)
+        Other cells where the rest may end.
 
     Returns
     -------
     (K, 2) int32
-        A legal path from the robot's cell to the goal.
+        A legal path from the robot's cell to a goal.
     float or None
         How much more the rest costs than the new path, as a share, if it is kept; None if the path
         is another one.
@@ -105,7 +114,7 @@ def keep_or_switch(
     best = _array(new)
     x, y = best[0].tolist()
     rest = rest_of_path(under_way, (x, y), grid, move_rule)
-    if not len(rest) or (rest[-1] != best[-1]).any():
+    if not len(rest) or rest[-1].tolist() not in [best[-1].tolist(), *map(list, goals)]:
         return best, None
     if np.array_equal(rest, best):
         return best, 0.0

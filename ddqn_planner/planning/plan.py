@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
 from enum import Enum
 from functools import cached_property
 
@@ -55,6 +56,9 @@ class PlanRequest:
         The path that the robot follows, move by move, if there is one.
     switch_threshold : float
         How much more the rest of it may cost than the new path, as a share, see `keep_or_switch`.
+    others : tuple of (x, y)
+        Goals that do as well: the path leads to the nearest of all that are free. They do not go
+        together with a tolerance.
     """
 
     grid: GridMap
@@ -66,6 +70,12 @@ class PlanRequest:
     simplified: bool = False
     under_way: Cells = field(default=(), compare=False)
     switch_threshold: float = 0.0
+    others: tuple[Cell, ...] = ()
+
+    @property
+    def goals(self) -> tuple[Cell, ...]:
+        """The goal and the others, in their order."""
+        return self.goal, *self.others
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,8 +98,9 @@ class Plan:
         What the path costs before it is simplified, see `path_cost`: on a map with costs, if a
         planner made the plan. On a map of expected times it is in seconds.
     goal : (x, y), optional
-        Where the path ends, or would end: the goal asked for, or the cell to which it moved. None
-        if no Q field is needed to say that there is no path, or for a rollout.
+        Where the path ends, or would end: the goal asked for, the nearest of several, or the cell
+        to which it moved. None if no Q field is needed to say that there is no path, or for a
+        rollout.
     every_cell : (N, 2) int32
         The path move by move, before it was simplified, if a planner made the plan.
     extra_cost : float, optional
@@ -135,3 +146,33 @@ class Plan:
     def length(self) -> float:
         """Length in cells under the plan's rule, see `path_length`."""
         return path_length(self.path, self.move_rule)
+
+
+def joined(plans: Sequence[Plan]) -> Plan:
+    """Return the plan of a path through several goals: each plan starts where the last one ended.
+
+    Where two paths meet, their common cell is there once. The costs and the times are the sums. If
+    the last plan has no path, neither has the whole.
+
+    Parameters
+    ----------
+    plans : sequence of Plan
+        At least one, all SUCCEEDED except perhaps the last, under one move rule and on one map.
+    """
+    first, last = plans[0], plans[-1]
+    if not last.path.size:
+        return last
+    searched = any(plan.method is PlanMethod.ASTAR_FALLBACK for plan in plans)
+    return replace(
+        last,
+        path=_joined([plan.path for plan in plans]),
+        every_cell=_joined([plan.every_cell for plan in plans]),
+        method=PlanMethod.ASTAR_FALLBACK if searched else PlanMethod.GREEDY,
+        cost=None if first.cost is None else sum(plan.cost or 0.0 for plan in plans),
+        field_ms=sum(plan.field_ms for plan in plans),
+        rollout_ms=sum(plan.rollout_ms for plan in plans),
+    )
+
+
+def _joined(paths: Sequence[Cells]) -> NDArray[np.int32]:
+    return np.concatenate([paths[0][:1], *(path[1:] for path in paths)], dtype=np.int32)

@@ -3,18 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Coroutine
-from itertools import pairwise
 from types import SimpleNamespace
 from typing import Any
 
-import numpy as np
 import pytest
 from geometry_msgs.msg import PoseStamped
 from nav_msgs.msg import Path
 from rclpy.action.server import CancelResponse, GoalResponse
 from rclpy.task import Future
 
-from ddqn_planner.grid import GridMap, MoveRule
 from ddqn_planner.nodes.path_action import (
     CODES,
     PREEMPTED,
@@ -24,8 +21,7 @@ from ddqn_planner.nodes.path_action import (
 )
 from ddqn_planner.nodes.report import NOT_ACTIVE, Outcome, RequestError
 from ddqn_planner.nodes.runtime import Unless
-from ddqn_planner.nodes.via_points import joined
-from ddqn_planner.planning import Plan, Planner, PlanStatus
+from ddqn_planner.planning import Plan, PlanStatus
 
 UNKNOWN = 200
 FOUND = Outcome("SUCCEEDED", "a path", plan=Plan(PlanStatus.SUCCEEDED, ((0, 0),)))
@@ -43,8 +39,8 @@ def test_codes_are_nav2s() -> None:
         "INVALID_PLANNER": 201,
         "NO_START": 202,
         "TF_ERROR": 202,
-        "INVALID_START": 200,
-        "INVALID_GOAL": 200,
+        "INVALID_START": 202,
+        "INVALID_GOAL": 202,
         "START_OUTSIDE_MAP": 203,
         "GOAL_OUTSIDE_MAP": 204,
         "START_OCCUPIED": 205,
@@ -224,30 +220,3 @@ def test_goals_are_rejected_while_the_node_is_not_active_and_aborted_when_it_sto
     result = end(execution)
     assert (handle.state, result.error_code) == ("aborted", UNKNOWN)
     assert server.action.accept(handle.request) is GoalResponse.REJECT
-
-
-def test_plans_through_cells_are_joined_without_a_doubled_cell() -> None:
-    grid = GridMap(np.zeros((8, 8), dtype=np.bool_))
-    planner = Planner.load("any_map")
-    cells = [(0, 0), (5, 0), (5, 0), (5, 6)]
-    plans = [planner.plan(grid, *ends) for ends in pairwise(cells)]
-    plan = joined(plans)
-    assert plan.status is PlanStatus.SUCCEEDED
-    assert plan.cells == (*((x, 0) for x in range(6)), *((5, y) for y in range(1, 7)))
-    assert np.array_equal(plan.every_cell, plan.path)
-    assert plan.goal == (5, 6)
-    assert plan.length == pytest.approx(sum(piece.length for piece in plans))
-    assert plan.field_ms == pytest.approx(sum(piece.field_ms for piece in plans))
-    assert joined([plans[0]]) is plans[0]
-    failed = planner.plan(grid, (5, 0), (9, 0))
-    assert joined([plans[0], failed]) is failed
-
-
-def test_the_cost_of_joined_plans_is_the_sum() -> None:
-    cost = np.arange(64, dtype=np.int8).reshape(8, 8)
-    grid = GridMap(np.zeros((8, 8), dtype=np.bool_), cost=cost)
-    planner = Planner.load("any_map")
-    plans = [planner.plan(grid, (0, 0), (7, 0)), planner.plan(grid, (7, 0), (0, 7))]
-    pieces = [plan.cost or 0.0 for plan in plans]
-    assert joined(plans).cost == pytest.approx(sum(pieces))
-    assert joined(plans).move_rule is MoveRule.ROBOT_SAFE

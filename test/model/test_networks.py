@@ -11,11 +11,11 @@ from networks import random_network
 from strategies import grids_with_costs, grids_with_free_cell
 
 from ddqn_planner.grid import Cell, GridMap, MoveRule, legal_moves
-from ddqn_planner.model import NETWORKS, load_model, networks, wavefront
+from ddqn_planner.model import NETWORKS, field_values, load_model, networks
+from ddqn_planner.model.field_values import propagate_values
 from ddqn_planner.model.move_costs import MAX_MULTIPLIER
 from ddqn_planner.model.networks import AnyMapQNetwork, PropagationQNetwork
 from ddqn_planner.model.observation import observation_background, observe, patches
-from ddqn_planner.model.wavefront import propagate_values
 from ddqn_planner.training.networks import MODULES, AnyMapModule, PaperModule, PropagationModule
 
 SIZES = {
@@ -206,7 +206,7 @@ def test_a_move_whose_cost_or_p_is_nan_is_not_possible(
         assert not np.isnan(cost_PA).any()  # with NaN the propagation would never end
         return propagate_values(patch_id, cost_PA, *others)
 
-    monkeypatch.setattr(wavefront, "propagate_values", checked)
+    monkeypatch.setattr(field_values, "propagate_values", checked)
     network = answering("any_map", 0.9)
     network.tensors[tensor][0] = np.nan
     q = network.q_values(GridMap(np.zeros((2, 2))), (1, 0), MoveRule.ROBOT_SAFE)

@@ -107,10 +107,9 @@ def test_what_is_left_of_a_path_leads_from_the_robot_onto_it_by_legal_moves(
     assert after.is_free(robot)
     assert legal_segments(rest, after, rule).all()
     assert all(max(abs(x - a), abs(y - b)) == 1 for (x, y), (a, b) in pairwise(rest))
-    joins = next(index for index, cell in enumerate(rest) if cell in path)
+    joins = next(index for index in range(len(rest)) if rest[index:] == path[index - len(rest) :])
     assert joins <= REACH
-    assert rest[joins:] == path[path.index(rest[joins]) :]
-    if robot in path:
+    if robot in path and is_path_valid(path[path.index(robot) :], robot, after, rule):
         assert rest == path[path.index(robot) :]
 
 
@@ -245,3 +244,34 @@ def test_a_robot_too_near_to_an_obstacle_leaves_and_keeps_its_path() -> None:
     assert is_upper(kept)
     assert kept.extra_cost is not None
     assert legal_segments(kept.cells[1:], too_near, MoveRule.ROBOT_SAFE).all()
+
+
+@given(GRIDS, RULES, st.sampled_from([0.0, 0.3, 10.0]), st.data())
+def test_a_path_to_another_goal_is_kept_up_to_the_threshold_while_that_goal_is_free(
+    grid_and_cell: tuple[GridMap, Cell], rule: MoveRule, threshold: float, data: st.DataObject
+) -> None:
+    grid, start = grid_and_cell
+    cells = st.lists(st.sampled_from(grid.free_cells()), min_size=2, max_size=4)
+    goal, *others = goals = data.draw(cells)
+    first = last_step(ANY_MAP.steps(PlanRequest(grid, start, goal, rule, others=(*others,))))
+    assume(first.cells)
+    after = data.draw(changed(grid))
+    robot = data.draw(st.sampled_from(first.cells))
+    request = PlanRequest(after, robot, goal, rule, others=(*others,))
+    best = last_step(ANY_MAP.steps(request))
+    request = replace(request, under_way=first.every_cell, switch_threshold=threshold)
+    plan = last_step(ANY_MAP.steps(request))
+    assert plan.status is best.status
+    if not best.cells:
+        return
+    cost, least = cost_of(plan.cells, after, rule), cost_of(best.cells, after, rule)
+    rest = rest_of_path(first.every_cell, robot, after, rule)
+    assert (plan.cells[0], plan.cells[-1]) == (robot, plan.goal)
+    assert plan.goal in goals
+    assert after.is_free(plan.goal)
+    assert legal_segments(plan.cells, after, rule).all()
+    assert cost <= (1 + threshold) * least * (1 + 1e-6)
+    if len(rest) and cost_of(rest, after, rule) <= (1 + threshold) * least * (1 - 1e-6):
+        assert plan.path.tolist() == rest.tolist()
+    if plan.extra_cost is None:
+        assert plan == best
