@@ -2,8 +2,8 @@
 
 It starts the map server, the planner, the trainer and a simulated robot, each as a process of its
 own, in a ROS domain of their own, and sends goals. It saves a film of the missions, a picture of
-what the robot learned, and a curve of its time over the best possible. With a number, so many
-missions.
+what the robot learned, and a curve of the true time of its routes over the best possible. With a
+number, so many missions.
 """
 
 from __future__ import annotations
@@ -185,7 +185,7 @@ def save_picture(path: FilePath, world: World, driver: Driver) -> None:
 
 
 def save_curve(path: FilePath, missions: Sequence[Mission]) -> None:
-    """Save the time over the best possible, from mission to mission."""
+    """Save the true time of the routes over the best possible, from mission to mission."""
     figure, axes = plt.subplots(figsize=(7.2, 3.6), layout="constrained")
     width = min(MEAN_OF, len(missions))
     seconds = {
@@ -197,7 +197,7 @@ def save_curve(path: FilePath, missions: Sequence[Mission]) -> None:
         number = np.arange(len(ratio)) + width
         axes.plot(number, ratio, STYLES[name], color=COLOURS[name], linewidth=2, label=name)
     axes.axhline(1, color="black", linewidth=0.8)
-    axes.set(xlabel=f"mission (mean of the last {width})", ylabel="time over the best possible")
+    axes.set(xlabel=f"mission (mean of the last {width})", ylabel="true time of the route over the best")
     axes.legend(frameon=False)
     axes.grid(alpha=0.3)
     figure.savefig(path, dpi=110)

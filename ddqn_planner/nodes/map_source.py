@@ -45,8 +45,6 @@ class MapSource:
         It says what was refused.
     worker : Worker
         It inflates. Maps must not wait for fields: 2000 x 2000 cells take over a second.
-    times : ExpectedTimes
-        The expected times of the map's places; only the worker uses them.
     on_map : callable
         Called after each map and each update that was not refused, with whether the map's frame is
         a new one; for a map that waits for its directions, once it has them.
@@ -55,15 +53,12 @@ class MapSource:
     ----------
     header : Header or None
         Of the last map or update.
+    times : ExpectedTimes
+        Of the map's places; only the worker uses them.
     """
 
     def __init__(
-        self,
-        node: BaseNode,
-        report: Report,
-        worker: Worker,
-        times: ExpectedTimes,
-        on_map: Callable[[bool], None],
+        self, node: BaseNode, report: Report, worker: Worker, on_map: Callable[[bool], None]
     ) -> None:
         self.header: Header | None = None
         self._node = node
@@ -74,7 +69,7 @@ class MapSource:
         self._updates = self._refused_updates = 0
         self._inflated: Future | None = None
         self._inflate = Inflation()
-        self._times = times
+        self.times = ExpectedTimes()
         self._worker = worker
         self._incomplete = ""
         self._directions = MapDirections(node, report, self._take_directions)
@@ -128,12 +123,12 @@ class MapSource:
         return self._inflated
 
     def _made(self, grid: GridMap, *body: float) -> GridMap:
-        return self._times.apply(self._inflate(grid, *body))
+        return self.times.apply(self._inflate(grid, *body))
 
     async def on_experience_saved(self, message: String) -> None:
         """Plan by what the trainer has learned from drives, or refuse its file."""
         try:
-            await self._worker.call(self._times.load, message.data)
+            await self._worker.call(self.times.load, message.data)
         except Exception as error:  # what was learned before stays
             self._report.refuse("experience", str(error) or repr(error))
             return

@@ -26,7 +26,7 @@ from std_msgs.msg import Header, String
 
 from ddqn_planner.nodes.active_goal import UNCHANGED, ActiveGoal, PathUnderWay
 from ddqn_planner.nodes.conversions import path_message, serialized_path
-from ddqn_planner.nodes.expected_times import ExpectedTimes, Forecast
+from ddqn_planner.nodes.expected_times import Forecast
 from ddqn_planner.nodes.field_display import FieldDisplay, Shown
 from ddqn_planner.nodes.frames import Frames, check_tf
 from ddqn_planner.nodes.lifecycle import ManagedNode
@@ -91,9 +91,8 @@ class PlannerNode(ManagedNode):
         )
         self._frames = Frames(self)
         self._start = self._start_source()
-        self._times = ExpectedTimes()
-        self._forecast = Forecast(self._times, self._map_worker)
-        self._map = MapSource(self, self._report, self._map_worker, self._times, self._on_map)
+        self._map = MapSource(self, self._report, self._map_worker, self._on_map)
+        self._forecast = Forecast(self._map.times, self._map_worker)
         self._requests = Requests(
             self._settings,
             self._map,
@@ -139,7 +138,7 @@ class PlannerNode(ManagedNode):
         self._forget()
         self._report.forget()
         self._frames.close()
-        del self._display, self._start, self._map, self._requests, self._times, self._forecast
+        del self._display, self._start, self._map, self._requests, self._forecast
         self._model.forget()
 
     async def prepare(self, transition: str) -> bool:
