@@ -45,6 +45,7 @@ def write_command_line() -> None:
         "certify",
         "reproduce",
         "experiment",
+        "learn",
     ):
         command = [sys.executable, "-m", "ddqn_planner.cli", name, "--help"]
         text = subprocess.run(command, env=environment, stdout=subprocess.PIPE, check=True).stdout

@@ -197,13 +197,7 @@ def save_curve(path: FilePath, missions: Sequence[Mission]) -> None:
         number = np.arange(len(ratio)) + width
         axes.plot(number, ratio, STYLES[name], color=COLOURS[name], linewidth=2, label=name)
     axes.axhline(1, color="black", linewidth=0.8)
-<<<<<<< HEAD
-    axes.set(
-        xlabel=f"mission (mean of the last {width})", ylabel="true time of the route over the best"
-    )
-=======
     axes.set(xlabel=f"mission (mean of the last {width})", ylabel="true time over the best")
->>>>>>> driving
     axes.legend(frameon=False)
     axes.grid(alpha=0.3)
     figure.savefig(path, dpi=110)
