@@ -44,6 +44,9 @@ class MapDirections:
         self._node, self._report, self._on_change = node, report, on_change
         self._header: Header | None = None
         self._directions: GridMap | None = None  # None for none
+        # Those of the map before: a server that is killed may have sent those of a map that never
+        # comes.
+        self._before: tuple[Header | None, GridMap | None] = None, None
         self.subscription = node.create_subscription(OccupancyGrid, NAME, self._take, LATCHED)
         self._topic = self.subscription.topic_name
 
@@ -59,8 +62,14 @@ class MapDirections:
                 self._report.refuse(NAME, str(error))
                 return
         self._report.accept(NAME)
+        self._before = self._header, self._directions
         self._header, self._directions = message.header, directions
         self._on_change()
+
+    def may_change(self, header: Header) -> bool:
+        """Return whether the last directions may be for a map."""
+        of_costmap = self._node.value("map_type") == "costmap"
+        return of_costmap or (self._header is not None and self._header.stamp == header.stamp)
 
     def on(self, grid: GridMap, header: Header) -> tuple[GridMap, str]:
         """Return a map with its directions, and why it must not be planned on; '' if it may.
@@ -75,27 +84,32 @@ class MapDirections:
             remedy = "let a map server publish them, or set require_directions to false"
             missing = f"the map's directions were not received on {self._topic} yet; {remedy}"
             return grid, missing if is_needed else ""
-        if not is_costmap and self._header.stamp != header.stamp:
+        directions_header, directions = self._header, self._directions
+        before, directions_before = self._before
+        newer = self._header.stamp == header.stamp or is_costmap
+        if before is not None and before.stamp == header.stamp and not newer:
+            directions_header, directions = before, directions_before
+        if not is_costmap and directions_header.stamp != header.stamp:
             stamps = seconds(header.stamp), seconds(self._header.stamp)
             missing = (
                 f"the map's stamp is {stamps[0]}, that of the directions on {self._topic} is "
                 f"{stamps[1]}; let one map server publish both, or set map_type to costmap"
             )
             return grid, missing if is_needed else ""
-        if self._directions is None:
+        if directions is None:
             return grid, ""
         try:
-            offset = offset_between(self._directions, grid)
+            offset = offset_between(directions, grid)
         except (OverflowError, ValueError):  # too far away to have a number of cells
             offset = None
-        if self._header.frame_id != header.frame_id or offset is None:
+        if directions_header.frame_id != header.frame_id or offset is None:
             return grid, (
                 f"the directions on {self._topic} are not for this map: they have the frame "
-                f"{self._header.frame_id!r} and {self._directions.resolution:.6g} m per cell, the "
+                f"{directions_header.frame_id!r} and {directions.resolution:.6g} m per cell, the "
                 f"map {header.frame_id!r} and {grid.resolution:.6g} m; give both one frame, and "
                 "cells that lie on each other"
             )
-        return replace(grid, forbidden=_moved(self._directions, offset, grid)), ""
+        return replace(grid, forbidden=_moved(directions, offset, grid)), ""
 
 
 def _moved(directions: GridMap, offset: tuple[int, int], grid: GridMap) -> NDArray[np.uint8]:

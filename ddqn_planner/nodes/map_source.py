@@ -173,7 +173,10 @@ class MapSource:
             self._on_map(frame_changed)
 
     def _take_directions(self) -> None:
-        if self._message is not None and self._read(self._message):
+        message = self._message
+        if message is None or not (self._incomplete or self._directions.may_change(message.header)):
+            return  # a map that has its own waits for the next map, whose directions come first
+        if self._read(message):
             self._report.change()
             if not self._incomplete:
                 self._on_map(True)  # the map's frame may be new since the last complete one

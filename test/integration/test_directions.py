@@ -187,14 +187,17 @@ def test_a_map_waits_for_the_directions_of_its_stamp(source: MapSource, publishe
     assert not source.missing
     assert len(heard) == 1
     assert forbidden_on(source) == [[EAST] * 5] * 4
-    # The directions of the next map come first, then after it.
+    # The directions of the next map come first; until it comes, if ever, this one has its own.
     take_directions(source, directions_of(2, WEST))
-    assert "the map's stamp is 1.000000000, that of the directions" in source.missing
+    set_parameter(source._node, source, "map_type", "map")
+    assert not source.missing
+    assert forbidden_on(source) == [[EAST] * 5] * 4
     source._take(map_of(2))
     assert not source.missing
     assert forbidden_on(source) == [[WEST] * 5] * 4
+    # They come after it.
     source._take(map_of(3))
-    assert source.missing
+    assert "the map's stamp is 3.000000000, that of the directions" in source.missing
     take_directions(source, directions_of(3, None))
     assert not source.missing
     assert forbidden_on(source) is None
