@@ -1,4 +1,4 @@
-# make setup | demo | test | test-fast | docs | lint | format | types | bench | body | faults | fuzz | load | soak | model | model-dilemma
+# make setup | demo | demo-driving | test | test-fast | docs | lint | format | types | bench | body | faults | fuzz | load | soak | model | model-dilemma
 PYTHON ?= python3
 TORCH ?= torch==2.13.0
 VENV := .venv
@@ -7,12 +7,12 @@ BIN := $(VENV)/bin
 # With a sourced ROS 2 Jazzy its rclpy is used, else the wheels from PyPI.
 ifeq ($(ROS_DISTRO),jazzy)
 VENV_FLAGS := --system-site-packages
-EXTRAS := experiments,figures,tensorboard,test,watch
+EXTRAS := bags,experiments,figures,tensorboard,test,watch
 else
-EXTRAS := experiments,figures,ros,tensorboard,test,watch
+EXTRAS := bags,experiments,figures,ros,tensorboard,test,watch
 endif
 
-.PHONY: setup demo test test-fast docs lint format types bench body faults fuzz load soak model model-dilemma
+.PHONY: setup demo demo-driving test test-fast docs lint format types bench body faults fuzz load soak model model-dilemma
 .DEFAULT_GOAL := help
 
 .PHONY: help
@@ -30,6 +30,10 @@ $(VENV)/installed: setup.py Makefile
 
 demo: setup
 	$(BIN)/python scripts/demo.py
+
+# A robot learns by driving where it is slow: a film, a picture and a curve.
+demo-driving: setup
+	$(BIN)/python scripts/demo_driving.py $(MISSIONS)
 
 # One process per core; each has its nodes in a ROS domain of its own.
 PYTEST := $(BIN)/python -m pytest --numprocesses auto --maxprocesses 4 --dist loadfile --no-loadscope-reorder

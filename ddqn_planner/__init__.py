@@ -6,10 +6,12 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from ddqn_planner.experience import Experience
     from ddqn_planner.grid import GridMap, MoveRule, inflate, load_map
     from ddqn_planner.planning import Plan, PlanMethod, Planner, PlanStatus, QField, simplify
 
 __all__ = [
+    "Experience",
     "GridMap",
     "MoveRule",
     "Plan",
@@ -27,8 +29,12 @@ def __getattr__(name: str) -> Any:
     """Import a public name at its first use, so that a program loads only what it uses."""
     if name not in __all__:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    of_grid = name in ("GridMap", "MoveRule", "inflate", "load_map")
-    value = getattr(import_module(f"{__name__}.{'grid' if of_grid else 'planning'}"), name)
+    layer = "planning"
+    if name in ("GridMap", "MoveRule", "inflate", "load_map"):
+        layer = "grid"
+    elif name == "Experience":
+        layer = "experience"
+    value = getattr(import_module(f"{__name__}.{layer}"), name)
     globals()[name] = value
     return value
 

@@ -16,12 +16,16 @@ COMMANDS: Final = {
     "evaluate": "measure a model on maps that it never saw",
     "certify": "prove which moves a model takes for possible",
     "reproduce": "train and measure the paper's experiments",
+    "experiment": "measure what driving teaches",
+    "learn": "learn from recorded drives how long places take",
     "watch": "show live what the ROS nodes publish",
 }
 """Each is a module of `ddqn_planner.commands`."""
 
 INSTALL: Final = {
     "matplotlib": "pip install 'ddqn_planner[experiments]'",
+    "mcap": "pip install 'ddqn_planner[bags]'",
+    "mcap_ros2": "pip install 'ddqn_planner[bags]'",
     "nav_msgs": "source ROS 2 Jazzy, or pip install 'ddqn_planner[ros]'",
     "rclpy": "source ROS 2 Jazzy, or pip install 'ddqn_planner[ros]'",
     "rerun": "pip install 'ddqn_planner[watch]'",

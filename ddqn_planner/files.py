@@ -7,6 +7,7 @@ import fcntl
 import glob
 import io
 import os
+import reprlib
 import secrets
 from collections.abc import Iterable, Sequence
 from contextlib import suppress
@@ -52,6 +53,42 @@ def lock(path: Path) -> BinaryIO:
         file.close()
         raise
     return file
+
+
+class FolderError(ValueError):
+    """A folder belongs to something else, or another process works in it."""
+
+
+def claim(folder: Path, marks: Sequence[str], content: str, works: str) -> BinaryIO:
+    """Lock a folder, which is made if it is missing, until the returned file is closed.
+
+    Parameters
+    ----------
+    folder : Path
+    marks : sequence of str
+        A folder with one of these files is the right one; the first is the lock. It is there from
+        the start, so that a process that was killed early can begin again in its folder.
+    content, works : str
+        What the folder should hold, and what a process does in it, for errors.
+
+    Raises
+    ------
+    FolderError
+        If the folder contains files and none of the marks, or another process works in it.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    names = sorted(path.name for path in folder.iterdir())
+    if names and not any((folder / name).is_file() for name in marks):
+        raise FolderError(
+            f"{folder} holds {reprlib.repr(names)} but no {content}; give a new or empty folder"
+        )
+    try:
+        return lock(folder / marks[0])
+    except BlockingIOError:
+        raise FolderError(
+            f"another process {works} in {folder}; wait for its end, stop it, or give another "
+            "folder"
+        ) from None
 
 
 class Appender:

@@ -27,8 +27,8 @@ from std_srvs.srv import Trigger
 
 from ddqn_planner import GridMap, MoveRule, Planner, load_map
 from ddqn_planner.grid import Cell, save_map
+from ddqn_planner.grid.arguments import OCCUPIED
 from ddqn_planner.grid.generators import generate_map, random_requests
-from ddqn_planner.grid.grid_map import OCCUPIED
 from ddqn_planner.nodes.runtime import LATCHED
 from ddqn_planner.resources import find_map
 

@@ -104,6 +104,12 @@ def memory(process: int, kind: str = "VmRSS") -> float:
     return int(status.split(f"{kind}:")[1].split()[0]) / 1e3
 
 
+def cpu_seconds(process: int) -> float:
+    """Return how long a process has computed so far, in all its threads."""
+    fields = Path(f"/proc/{process}/stat").read_text(encoding="utf-8").rpartition(")")[2].split()
+    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+
+
 def run_script(main: Callable[[Sequence[str]], int]) -> NoReturn:
     """Exit with what `main` returns for the arguments; when a signal ends it, so do its nodes."""
     # A shell starts what it runs in the background with SIGINT ignored, and so would the nodes be.

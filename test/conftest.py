@@ -15,6 +15,10 @@ import pytest
 # Read by the first import of a message type.
 os.environ["ROS_PYTHON_CHECK_FIELDS"] = "1"
 
+# Read by the first node. Tests have several nodes in one process, and Fast DDS 2.14 was seen to
+# deadlock when one of them ended while it told the others by a call instead of a message.
+os.environ["FASTRTPS_DEFAULT_PROFILES_FILE"] = str(Path(__file__).with_name("fastdds.xml"))
+
 import torch
 
 from ddqn_planner.grid import GridMap

@@ -45,3 +45,14 @@ def grids_with_costs(draw: st.DrawFn) -> tuple[GridMap, tuple[int, int]]:
     grid, cell = draw(grids_with_free_cell())
     costs = numpy_st.arrays(np.int8, grid.occupancy.shape, elements=st.integers(-1, 99))
     return GridMap(grid.occupancy, cost=draw(costs)), cell
+
+
+@st.composite
+def grids_with_directions(draw: st.DrawFn) -> tuple[GridMap, tuple[int, int]]:
+    """A map with forbidden directions, with or without costs, and one of its free cells."""
+    grid, cell = draw(grids_with_free_cell() | grids_with_costs())
+    # Few or many different sets of forbidden actions, and cells without any.
+    masks = [*draw(st.lists(st.integers(0, 255), min_size=1, max_size=4)), 0]
+    elements = st.sampled_from(masks) | st.integers(0, 255)
+    forbidden = draw(numpy_st.arrays(np.uint8, grid.occupancy.shape, elements=elements))
+    return GridMap(grid.occupancy, cost=grid.cost, forbidden=forbidden), cell

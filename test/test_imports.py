@@ -36,6 +36,7 @@ def loaded(code: str) -> set[str]:
         "import ddqn_planner.model",
         "import ddqn_planner.planning",
         "from ddqn_planner import GridMap, Planner, load_map",
+        "from ddqn_planner import Experience; Experience(nominal_speed=0.5)",
         "from ddqn_planner import Planner; Planner.load('any_map')",
     ],
 )

@@ -16,6 +16,7 @@ ROOMS = [
     "grid",
     "model",
     "planning",
+    "experience",
     "pictures",
     "training",
     "benchmarks",

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from ddqn_planner.commands.options import add_map_options, add_move_rule, read_map
-from ddqn_planner.grid import GridMap, inflate, legal_moves, path_length
+from ddqn_planner.grid import GridMap, inflate, path_length
 from ddqn_planner.pictures import MAX_TEXT_WIDTH, draw_text, save_animation, save_picture
 from ddqn_planner.planning import Plan, PlanMethod, Planner
 from ddqn_planner.planning.search import search
@@ -76,7 +76,7 @@ def run(options: argparse.Namespace) -> int:
 def _print(options: argparse.Namespace, grid: GridMap, plan: Plan, seconds: float) -> None:
     optimum = None
     if plan.cells and grid.is_free(plan.cells[0]):
-        legal = legal_moves(grid.occupancy, plan.move_rule)
+        legal = grid.legal_moves(plan.move_rule)
         without_costs = np.ones(grid.occupancy.shape, dtype=np.float32)
         ends = plan.cells[0], plan.cells[-1]
         optimum = path_length(search(*ends, legal, without_costs, plan.move_rule), plan.move_rule)

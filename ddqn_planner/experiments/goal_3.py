@@ -184,7 +184,7 @@ def _rows(settings: Settings, maps: NoisyMaps, noise: Noise) -> list[list[str]]:
 def _on_map(path: tuple[Cell, ...], scenario: Scenario) -> Plan:
     """Return the path as a plan on a map: trapped if a cell of it is occupied."""
     if all(map(scenario.grid.is_free, path)):
-        return Plan(PlanStatus.SUCCEEDED, path)
+        return Plan(PlanStatus.SUCCEEDED, np.array(path))
     return Plan(PlanStatus.ROLLOUT_TRAPPED)
 
 

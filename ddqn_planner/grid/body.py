@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from ddqn_planner.grid.arguments import Occupancy
-from ddqn_planner.grid.grid_map import OCCUPIED, UNKNOWN, GridMap
+from ddqn_planner.grid.arguments import OCCUPIED, UNKNOWN, Occupancy
+from ddqn_planner.grid.grid_map import GridMap
 
 CLEARANCE_SCALE = 1.0
 """Metres beyond the body over which the cost near an obstacle falls to an eighth.

@@ -12,9 +12,8 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from ddqn_planner.grid.arguments import Cell, Occupancy
+from ddqn_planner.grid.arguments import UNKNOWN, Cell, Occupancy
 from ddqn_planner.grid.body import clearance
-from ddqn_planner.grid.grid_map import UNKNOWN
 from ddqn_planner.grid.moves import MoveRule, component_labels
 
 MINIMUM_SIDE = 5

@@ -11,15 +11,26 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ddqn_planner.grid.arguments import (
+    OCCUPIED,
+    UNKNOWN,
+    Occupancy,
+    as_cell,
+    as_costs,
+    as_directions,
+    as_occupancy,
+    as_slowness,
+    whole_numbers,
+)
 from ddqn_planner.grid.arguments import Cell as Cell
-from ddqn_planner.grid.arguments import Occupancy, as_cell, whole_numbers
-from ddqn_planner.grid.moves import MoveRule, component_labels
-
-OCCUPIED = 100
-"""The value of an occupied cell in ``nav_msgs/OccupancyGrid``."""
-
-UNKNOWN = -1
-"""The value of an unknown cell in ``nav_msgs/OccupancyGrid``."""
+from ddqn_planner.grid.labels import flood
+from ddqn_planner.grid.moves import (
+    MOVES,
+    MoveRule,
+    component_labels,
+    legal_moves,
+    reversed_moves,
+)
 
 MAX_COST_MULTIPLIER = 5.0
 """The cost multiplier of a cell of value 100, and of an unknown cell.
@@ -50,11 +61,22 @@ class GridMap:
         Which occupied cells are obstacles. The others are only too near to an obstacle for the
         robot's body, and a robot that starts there may leave; `inflate` makes such maps. By default
         all occupied cells are obstacles.
+    forbidden : (H, W) array of whole numbers 0..255, optional
+        One-way zones: action a must not leave a cell where bit a is set, ``forbidden >> a & 1``.
+        The actions are those of `MOVES`, in the directions of the map's own x and y. A cell may
+        always be entered, so 0b00111000 = 56 in each cell of an aisle (bits 3, 4 and 5: all moves
+        with dx = -1) lets a robot drive through it toward greater x, and not back. Directions
+        belong to the place: they stay where a cell becomes occupied or free.
+    slowness : (H, W) float32, optional
+        The expected time in each cell over that at nominal speed, 1 or more. It multiplies the
+        cost; see `with_slowness`.
+    seconds_per_cell : float, optional
+        The time for the length of a cell at nominal speed: with it, `Plan.cost` is in seconds.
 
     Raises
     ------
     ValueError
-        If a shape, a number or a cost is wrong, or if an obstacle lies on a free cell.
+        If a shape, a number, a cost or a direction is wrong, or if an obstacle lies on a free cell.
     """
 
     occupancy: Occupancy
@@ -62,9 +84,12 @@ class GridMap:
     origin: tuple[float, float, float] = (0.0, 0.0, 0.0)
     cost: NDArray[np.int8] | None = None
     obstacles: Occupancy | None = None
+    forbidden: NDArray[np.uint8] | None = None
+    slowness: NDArray[np.float32] | None = None
+    seconds_per_cell: float | None = None
 
     def __post_init__(self) -> None:
-        occupancy = _occupancy(self.occupancy)
+        occupancy = as_occupancy(self.occupancy)
         if not (math.isfinite(self.resolution) and self.resolution > 0):
             raise ValueError(
                 f"resolution is {self.resolution}; give metres per cell, finite and > 0"
@@ -76,7 +101,7 @@ class GridMap:
         self._set("resolution", float(self.resolution))
         self._set("origin", origin)
         if self.cost is not None:
-            self._set("cost", _costs(self.cost, occupancy))
+            self._set("cost", as_costs(self.cost, occupancy))
         if self.obstacles is not None:
             obstacles = np.array(self.obstacles, dtype=np.bool_, order="C")
             if obstacles.shape != occupancy.shape or (obstacles & ~occupancy).any():
@@ -85,6 +110,12 @@ class GridMap:
                     f"{occupancy.shape}, within the occupied cells"
                 )
             self._set("obstacles", obstacles)
+        if self.forbidden is not None:
+            self._set("forbidden", as_directions(self.forbidden, occupancy.shape))
+        if self.slowness is not None:
+            self._set("slowness", as_slowness(self.slowness, occupancy.shape))
+        if self.seconds_per_cell is not None and not 0 < self.seconds_per_cell < math.inf:
+            raise ValueError(f"seconds_per_cell is {self.seconds_per_cell}; give more than 0")
 
     def _set(self, name: str, value: Any) -> None:
         if isinstance(value, np.ndarray):
@@ -100,6 +131,7 @@ class GridMap:
         occupied_threshold: int = 65,
         allow_unknown: bool = False,
         use_map_costs: bool = False,
+        forbidden: ArrayLike | None = None,
     ) -> GridMap:
         """Make a grid map from the values of a ``nav_msgs/OccupancyGrid``.
 
@@ -107,7 +139,7 @@ class GridMap:
         ----------
         values : (H, W) array of integers -128..127
             Occupancy in percent. Any value below 0 is unknown, any above 100 is occupied.
-        resolution, origin
+        resolution, origin, forbidden
             As for `GridMap`.
         occupied_threshold : int
             A cell of this value or more is occupied, 1..100. The default is the usual
@@ -132,15 +164,20 @@ class GridMap:
         if not allow_unknown:
             occupied |= array < 0
         cost = np.maximum(array, UNKNOWN) if use_map_costs else None
-        return cls(occupied, resolution, origin, cost)
+        return cls(occupied, resolution, origin, cost, forbidden=forbidden)  # type: ignore[arg-type]
 
     def with_patch(
-        self, occupancy: ArrayLike, x: int, y: int, cost: ArrayLike | None = None
+        self,
+        occupancy: ArrayLike,
+        x: int,
+        y: int,
+        cost: ArrayLike | None = None,
+        obstacles: ArrayLike | None = None,
     ) -> GridMap:
         """Return the same map with other cells from (x, y) on; this map stays as it is.
 
-        On a map that `inflate` made, occupied cells of the patch are obstacles, and the cells
-        around them are not inflated: better patch the map of the obstacles, and inflate it again.
+        On a map that `inflate` made, the cells around the patch are not inflated: better patch the
+        map of the obstacles, and inflate it again.
 
         Parameters
         ----------
@@ -151,13 +188,16 @@ class GridMap:
         cost : (h, w) array of whole numbers, optional
             Costs of the new free cells, as for `GridMap`. By default free cells keep their costs,
             and those that were occupied cost 0. On a map without costs, the other cells cost 0.
+        obstacles : (h, w) bool, optional
+            Which of the new occupied cells are obstacles, as for `GridMap`; by default all. On a
+            map without obstacles of its own they are ignored.
 
         Raises
         ------
         ValueError
             If the patch is empty or not inside the map, or its costs are wrong.
         """
-        patch = _occupancy(occupancy)
+        patch = as_occupancy(occupancy)
         left, bottom = as_cell((x, y), "the first cell of the patch")
         height, width = patch.shape
         if not (0 <= left <= self.width - width and 0 <= bottom <= self.height - height):
@@ -169,14 +209,35 @@ class GridMap:
         costs = self.cost
         if costs is not None or cost is not None:
             costs = np.zeros(self.occupancy.shape, dtype=np.int8) if costs is None else costs
-            costs = _replaced(costs, box, _costs(costs[box] if cost is None else cost, patch))
+            costs = _replaced(costs, box, as_costs(costs[box] if cost is None else cost, patch))
+        closed = patch if obstacles is None else patch & np.asarray(obstacles, dtype=np.bool_)
         patched = object.__new__(GridMap)  # the cells outside the patch need no check
         patched._set("occupancy", _replaced(self.occupancy, box, patch))
         patched._set("resolution", self.resolution)
         patched._set("origin", self.origin)
         patched._set("cost", costs)
-        patched._set("obstacles", _replaced(self.obstacles, box, patch))
+        patched._set("obstacles", _replaced(self.obstacles, box, closed))
+        patched._set("forbidden", self.forbidden)
+        patched._set("slowness", self.slowness)
+        patched._set("seconds_per_cell", self.seconds_per_cell)
         return patched
+
+    def with_slowness(self, slowness: NDArray[np.float32], seconds_per_cell: float) -> GridMap:
+        """Return the same map with other expected times; it shares all other arrays with this one.
+
+        Parameters
+        ----------
+        slowness : (H, W) float32
+            Not copied and not checked, see `GridMap`. It becomes read-only.
+        seconds_per_cell : float
+        """
+        timed = object.__new__(GridMap)
+        for name, value in self.__dict__.items():
+            if name not in ("cost_multiplier", "fingerprint"):  # which depend on the slowness
+                object.__setattr__(timed, name, value)
+        timed._set("slowness", slowness)
+        timed._set("seconds_per_cell", float(seconds_per_cell))
+        return timed
 
     @property
     def height(self) -> int:
@@ -188,15 +249,24 @@ class GridMap:
         """Number of columns."""
         return int(self.occupancy.shape[1])
 
+    @property
+    def has_costs(self) -> bool:
+        """Whether cells differ in what their moves cost."""
+        return self.cost is not None or self.slowness is not None
+
     @cached_property
     def cost_multiplier(self) -> NDArray[np.float32]:
         """(H, W) float32: cost of a path in each cell per cell of its length, see `move_costs`.
 
-        It grows linearly from 1 for cost 0, or without costs, to `MAX_COST_MULTIPLIER`.
+        It grows linearly from 1 for cost 0, or without costs, to `MAX_COST_MULTIPLIER`, times the
+        slowness of the cell.
         """
         if self.cost is None:
+            if self.slowness is not None:
+                return self.slowness
             return np.ones(self.occupancy.shape, dtype=np.float32)
-        return _MULTIPLIERS.take(self.cost, mode="wrap")  # -1 finds the last one
+        multiplier = _MULTIPLIERS.take(self.cost, mode="wrap")  # -1 finds the last one
+        return multiplier if self.slowness is None else multiplier * self.slowness
 
     def labels(self, move_rule: MoveRule | str) -> NDArray[np.int32]:
         """Return the connected component of each cell, see `component_labels`.
@@ -208,27 +278,62 @@ class GridMap:
             self._labels[rule.cuts_corners] = component_labels(self.occupancy, rule)
         return self._labels[rule.cuts_corners]
 
+    def legal_moves(self, move_rule: MoveRule | str) -> NDArray[np.bool_]:
+        """Return which moves are legal in each cell, see `legal_moves`: (8, H, W) bool."""
+        return legal_moves(self.occupancy, move_rule, self.forbidden)
+
+    def reachable(
+        self, cells: ArrayLike, move_rule: MoveRule | str, backward: bool = False
+    ) -> NDArray[np.bool_]:
+        """Return (H, W) bool: some free cells, and where paths lead that start in one of them.
+
+        Parameters
+        ----------
+        cells : (N, 2) array of whole numbers
+            As (x, y).
+        move_rule : MoveRule
+        backward : bool
+            Whether paths end, instead of start, in one of the cells.
+        """
+        array = np.asarray(cells, dtype=np.int64).reshape(-1, 2)
+        if self.forbidden is None:
+            labels = self.labels(move_rule)
+            return np.isin(labels, labels[array[:, 1], array[:, 0]])
+        legal = self.legal_moves(move_rule)
+        return flood(reversed_moves(legal) if backward else legal, array, MOVES)
+
     @cached_property
     def _labels(self) -> dict[bool, NDArray[np.int32]]:
         return {}
 
     @cached_property
     def fingerprint(self) -> str:
-        """Hexadecimal digest of size, occupancy and costs; equal maps have the same digest."""
+        """Hexadecimal digest of size and cells; equal maps have the same digest."""
         digest = hashlib.sha256(f"{self.height}x{self.width}:".encode())
         digest.update(np.packbits(self.occupancy).tobytes())
         if self.cost is not None:
             digest.update(self.cost.tobytes())
+        if self.forbidden is not None:
+            digest.update(b"forbidden:" + self.forbidden.tobytes())
+        if self.slowness is not None:
+            digest.update(b"slowness:" + self.slowness.tobytes())
         return digest.hexdigest()[:16]
 
+    @cached_property
+    def _checksum(self) -> int:
+        """A sum that differs between most maps, and is quicker than to compare them."""
+        words = self.occupancy.ravel()[: self.occupancy.size // 8 * 8].view(np.uint64)
+        return int(words.sum())
+
     def same_cells(self, other: GridMap) -> bool:
-        """Return whether the occupancy and the costs of two maps are equal, wherever they lie."""
-        if self is other:
-            return True
-        same = np.array_equal(self.occupancy, other.occupancy)
-        if not same or self.cost is None or other.cost is None:
-            return same and self.cost is other.cost
-        return np.array_equal(self.cost, other.cost)
+        """Return whether all cells of two maps are equal, wherever the maps lie."""
+        return self is other or (
+            _equal(self.slowness, other.slowness)
+            and self._checksum == other._checksum
+            and np.array_equal(self.occupancy, other.occupancy)
+            and _equal(self.cost, other.cost)
+            and _equal(self.forbidden, other.forbidden)
+        )
 
     def contains(self, cell: Cell) -> bool:
         """Return whether a cell lies inside the map."""
@@ -274,30 +379,17 @@ class GridMap:
         )
 
 
-def _occupancy(cells: ArrayLike) -> Occupancy:
-    """Return a copy in C order, checked."""
-    occupancy = np.array(cells, dtype=np.bool_, order="C")
-    if occupancy.ndim != 2 or occupancy.size == 0:
-        raise ValueError(f"occupancy has shape {occupancy.shape}; give (H, W) with H, W >= 1")
-    return occupancy
-
-
-def _costs(cost: ArrayLike, occupancy: Occupancy) -> NDArray[np.int8]:
-    """Return a copy with 0 in occupied cells, checked."""
-    if np.shape(cost) != occupancy.shape:
-        raise ValueError(f"cost has shape {np.shape(cost)}; give {occupancy.shape}")
-    of_free = np.array(cost, order="C")
-    if of_free.dtype.kind in "iu":
-        of_free *= ~occupancy  # fifty times as fast as the assignment below
-    else:  # NaN times 0 is NaN
-        of_free[occupancy] = 0
-    whole_numbers("costs of free cells", of_free, UNKNOWN, OCCUPIED - 1)
-    return of_free.astype(np.int8, copy=False)
-
-
 def _replaced(array: NDArray[Any] | None, box: tuple[slice, slice], values: NDArray[Any]) -> Any:
     """Return a copy with other values in a box."""
     if array is not None:
         array = array.copy()
         array[box] = values
     return array
+
+
+def _equal(some: NDArray[Any] | None, others: NDArray[Any] | None) -> bool:
+    if some is None or others is None or some is others:
+        return some is others
+    # A planner compares a map with each one that it knows; a look at some cells often suffices.
+    some_of = slice(None, None, 32), slice(None, None, 32)
+    return np.array_equal(some[some_of], others[some_of]) and np.array_equal(some, others)

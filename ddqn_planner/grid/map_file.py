@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import re
 import reprlib
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -14,9 +15,14 @@ import yaml
 from numpy.typing import NDArray
 
 from ddqn_planner.files import write_atomically
-from ddqn_planner.grid.arguments import Cell, as_cell, whole_numbers
-from ddqn_planner.grid.grid_map import OCCUPIED, UNKNOWN, GridMap
-from ddqn_planner.grid.map_image import IMAGE_FORMATS, read_grey
+from ddqn_planner.grid.arguments import OCCUPIED, UNKNOWN, Cell, as_cell, whole_numbers
+from ddqn_planner.grid.grid_map import GridMap
+from ddqn_planner.grid.map_image import (
+    DIRECTION_FORMATS,
+    IMAGE_FORMATS,
+    read_directions,
+    read_grey,
+)
 
 MAX_CELLS = 2**26
 """A larger map is refused before its cells are read."""
@@ -64,6 +70,8 @@ class MapFile:
         As for `GridMap`.
     start, goal : (x, y), optional
         Cells between which to plan.
+    forbidden : (H, W) uint8, optional
+        As for `GridMap`.
 
     Raises
     ------
@@ -76,10 +84,13 @@ class MapFile:
     origin: tuple[float, float, float] = (0.0, 0.0, 0.0)
     start: Cell | None = None
     goal: Cell | None = None
+    forbidden: NDArray[np.uint8] | None = None
 
     def __post_init__(self) -> None:
         values = whole_numbers("values", self.values, UNKNOWN, OCCUPIED)
-        checked = GridMap(values == OCCUPIED, self.resolution, self.origin)
+        checked = GridMap(
+            values == OCCUPIED, self.resolution, self.origin, forbidden=self.forbidden
+        )
         for name in ("start", "goal"):
             if (cell := getattr(self, name)) is None:
                 continue
@@ -92,13 +103,16 @@ class MapFile:
         object.__setattr__(self, "values", values)
         object.__setattr__(self, "resolution", checked.resolution)
         object.__setattr__(self, "origin", checked.origin)
+        object.__setattr__(self, "forbidden", checked.forbidden)
 
     def grid(
         self, occupied_threshold: int = 65, allow_unknown: bool = False, use_map_costs: bool = False
     ) -> GridMap:
         """Return the grid map; the parameters are those of `GridMap.from_occupancy_values`."""
         options = (occupied_threshold, allow_unknown, use_map_costs)
-        return GridMap.from_occupancy_values(self.values, self.resolution, self.origin, *options)
+        return GridMap.from_occupancy_values(
+            self.values, self.resolution, self.origin, *options, forbidden=self.forbidden
+        )
 
 
 def load_map(
@@ -125,8 +139,9 @@ def read_map_file(path: str | Path) -> MapFile:
       channel, and PNG with a transparent colour outside a palette.
     - The image must lie in the folder of the YAML file or below it, so that a map from elsewhere
       cannot name any file of this machine.
-    - The YAML may hold ``ddqn_planner: {start: [x, y], goal: [x, y]}``, the cells of a scenario,
-      which map_server ignores.
+    - The YAML may hold ``ddqn_planner: {start: [x, y], goal: [x, y], directions: FILE}``, which
+      map_server ignores: the cells of a scenario, and an image of the same size in 8-bit grey (PGM
+      or PNG), whose values are those of `GridMap.forbidden`: 0, black, where all moves are legal.
 
     Parameters
     ----------
@@ -165,7 +180,8 @@ def save_map(grid: GridMap | MapFile, path: str | Path) -> None:
 
     A `MapFile` reads back equal. So does a `GridMap` without costs by ``load_map(path)``, and one
     with costs by ``load_map(path, occupied_threshold=100, allow_unknown=True,
-    use_map_costs=True)``. `GridMap.obstacles` is not written.
+    use_map_costs=True)``. `GridMap.obstacles` is not written. Forbidden directions are written to
+    one more PGM, ``NAME_directions.pgm``.
 
     Parameters
     ----------
@@ -186,7 +202,7 @@ def save_map(grid: GridMap | MapFile, path: str | Path) -> None:
     if isinstance(grid, GridMap):
         cost = 0 if grid.cost is None else grid.cost
         percent = np.where(grid.occupancy, 100, cost).astype(np.int8)
-        grid = MapFile(percent, grid.resolution, grid.origin)
+        grid = MapFile(percent, grid.resolution, grid.origin, forbidden=grid.forbidden)
     values = grid.values
     if np.isin(values, (-1, 0, 100)).all():
         mode, grey = "trinary", np.select([values == 0, values == 100], [254, 0], 205)
@@ -203,12 +219,21 @@ def save_map(grid: GridMap | MapFile, path: str | Path) -> None:
         "free_thresh": 0.196,  # grey 205 would be free at 0.25
     }
     scenario = {"start": grid.start, "goal": grid.goal}
-    if cells := {name: list(cell) for name, cell in scenario.items() if cell is not None}:
-        metadata["ddqn_planner"] = cells
-    pixels = grey[::-1].astype(np.uint8).tobytes()  # the top row comes first; raw -1 becomes 255
-    write_atomically(image, b"P5\n%d %d\n255\n" % values.shape[::-1] + pixels)
+    ours: dict[str, Any] = {name: list(cell) for name, cell in scenario.items() if cell is not None}
+    write_atomically(image, _pgm(grey))  # raw -1 becomes 255
+    if grid.forbidden is not None:
+        directions = path.with_name(f"{path.stem}_directions.pgm")
+        write_atomically(directions, _pgm(grid.forbidden))
+        ours["directions"] = directions.name
+    if ours:
+        metadata["ddqn_planner"] = ours
     text = yaml.safe_dump(metadata, sort_keys=False, allow_unicode=True, default_flow_style=None)
     write_atomically(path, text.encode())
+
+
+def _pgm(values: NDArray[Any]) -> bytes:
+    top_row_first = values[::-1].astype(np.uint8).tobytes()
+    return b"P5\n%d %d\n255\n" % values.shape[::-1] + top_row_first
 
 
 def _read_bytes(path: Path, limit: int, error_class: type[MapFileError]) -> bytes:
@@ -252,39 +277,56 @@ def _read_moving_ai(path: Path) -> MapFile:
 
 def _read_ros(path: Path) -> MapFile:
     document = _parse_yaml(_read_bytes(path, MAX_YAML_BYTES, MapMetadataError))
-    image = _image_path(path, document.get("image"))
+    image = _image_path(path, "image", document.get("image"))
     mode = _text(document, "mode", "trinary")
     percent = _percent_of_grey(document, mode)
     resolution = _number(document.get("resolution"), "resolution")
     x, y, yaw = _numbers(document.get("origin"), "origin", "[x, y, yaw]")
-    scenario = document.get("ddqn_planner", {})
-    if not isinstance(scenario, dict) or not scenario.keys() <= {"start", "goal"}:
-        raise ValueError(f"ddqn_planner is {_short(scenario)}; give {{start: , goal: }}")
-    cells: Any = {name: _numbers(cell, name, "[x, y]") for name, cell in scenario.items()}
-    try:
-        grey, clear = read_grey(image, MAX_CELLS)
-    except Exception as error:  # Pillow's decoders raise many exceptions on broken bytes
-        raise MapDataError(
-            f"{str(image)!r}: not readable ({error}); give a {', '.join(IMAGE_FORMATS)} image of at"
-            f" most {MAX_CELLS} pixels"
-        ) from error
+    ours = document.get("ddqn_planner", {})
+    if not isinstance(ours, dict) or not ours.keys() <= {"start", "goal", "directions"}:
+        raise ValueError(
+            f"ddqn_planner is {_short(ours)}; give some of {{start: , goal: , directions: }}"
+        )
+    directions = ours.pop("directions", None)
+    if directions is not None:
+        directions = _image_path(path, "directions", directions)
+    cells: Any = {name: _numbers(cell, name, "[x, y]") for name, cell in ours.items()}
+    grey, clear = _read_image(read_grey, image, IMAGE_FORMATS)
     values: NDArray[np.int8] = percent[grey]
     if mode != "raw":
         values[clear] = UNKNOWN
-    return MapFile(values[::-1], resolution, (x, y, yaw), **cells)
+    forbidden = None
+    if directions is not None:
+        forbidden = _read_image(read_directions, directions, DIRECTION_FORMATS)[::-1]
+        if forbidden.shape != values.shape:
+            sizes = [f"{width} x {height}" for height, width in (forbidden.shape, values.shape)]
+            raise MapDataError(
+                f"{str(directions)!r}: has {sizes[0]} pixels; give {sizes[1]}, as the map's image"
+            )
+    return MapFile(values[::-1], resolution, (x, y, yaw), **cells, forbidden=forbidden)
 
 
-def _image_path(path: Path, name: object) -> Path:
+def _read_image(read: Callable[[Path, int], Any], image: Path, formats: Iterable[str]) -> Any:
+    try:
+        return read(image, MAX_CELLS)
+    except Exception as error:  # Pillow's decoders raise many exceptions on broken bytes
+        raise MapDataError(
+            f"{str(image)!r}: not readable ({error}); give a {', '.join(formats)} image of at"
+            f" most {MAX_CELLS} pixels"
+        ) from error
+
+
+def _image_path(path: Path, key: str, name: object) -> Path:
     if not isinstance(name, str) or not name:
-        raise ValueError(f"image is {_short(name)}; give the path of an image")
+        raise ValueError(f"{key} is {_short(name)}; give the path of an image")
     image = path.parent / name
     if not os.path.isfile(image):
-        raise MapDataError(f"{str(image)!r}: no such image; check 'image' in the YAML file")
+        raise MapDataError(f"{str(image)!r}: no such image; check {key!r} in the YAML file")
     # In a linked colcon workspace the YAML file is itself a link: allow the folder of either.
     folders = path.parent.resolve(), path.resolve().parent
     if not any(image.resolve().is_relative_to(folder) for folder in folders):
         raise ValueError(
-            f"image is {name!r}, outside of the folder of the YAML file; put it beside the YAML"
+            f"{key} is {name!r}, outside of the folder of the YAML file; put it beside the YAML"
         )
     return image
 

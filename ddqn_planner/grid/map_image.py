@@ -1,4 +1,7 @@
-"""Images of maps, read as map_server's GraphicsMagick reads them (with 16 bits per channel)."""
+"""Images of maps, read as map_server's GraphicsMagick reads them (with 16 bits per channel).
+
+And images of forbidden directions, whose grey values are read as they are.
+"""
 
 from __future__ import annotations
 
@@ -10,6 +13,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 IMAGE_FORMATS = ("PPM", "PNG", "BMP", "JPEG")
+DIRECTION_FORMATS = ("PPM", "PNG")
 
 RAW_MODES = {"1", "1;I", "L", "L;2", "L;4", "LA", "I;16B", "P", "P;1", "P;2", "P;4"}
 RAW_MODES |= {"RGB", "RGBA", "BGR", "BGRA", "CMYK;I"}
@@ -25,16 +29,29 @@ def read_grey(path: Path, max_pixels: int) -> tuple[NDArray[np.uint8], NDArray[n
     broken bytes.
     """
     with Image.open(path, formats=IMAGE_FORMATS) as image:
-        if image.width * image.height > max_pixels:
-            raise ValueError(f"{image.width} x {image.height} pixels")
-        _check_layout(image)
+        _check_layout(image, max_pixels)
         grey = _grey(image)
         if "A" not in image.getbands() and "transparency" not in image.info:
             return grey, np.zeros(grey.shape, dtype=np.bool_)
         return grey, np.asarray(image.convert("RGBA").getchannel("A")) < 255
 
 
-def _check_layout(image: Any) -> None:
+def read_directions(path: Path, max_pixels: int) -> NDArray[np.uint8]:
+    """Return the values 0..255 of a lossless image of 8-bit grey, top row first.
+
+    Any other image is a ValueError; Pillow's decoders may raise any other exception on broken
+    bytes.
+    """
+    with Image.open(path, formats=DIRECTION_FORMATS) as image:
+        raw_mode = _check_layout(image, max_pixels)
+        if raw_mode != "L":
+            raise ValueError(f"its pixels are stored as {raw_mode}; save 8 bits of grey, no alpha")
+        return np.asarray(image)
+
+
+def _check_layout(image: Any, max_pixels: int) -> str:
+    if image.width * image.height > max_pixels:
+        raise ValueError(f"{image.width} x {image.height} pixels")
     codec, *_, arguments = image.tile[0]
     raw_mode, *rest = [arguments] if isinstance(arguments, str) else arguments
     # The last argument of a PPM is its greatest value, unless that is the greatest of its bytes.
@@ -45,6 +62,7 @@ def _check_layout(image: Any) -> None:
         raise ValueError(f"its pixels are stored as {codec} {arguments}; save an 8-bit PNG")
     if "transparency" in image.info and image.mode != "P":
         raise ValueError("one of its colours is transparent; save it with an alpha channel")
+    return str(raw_mode)
 
 
 def _grey(image: Image.Image) -> NDArray[np.uint8]:

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ddqn_planner.grid.arguments import Cell, Choice, Occupancy, as_cell
+from ddqn_planner.grid.arguments import Cell, Cells, Choice, Occupancy, as_cell
 from ddqn_planner.grid.labels import label_cells
 
 MOVES: NDArray[np.int64] = np.array(
@@ -47,11 +46,13 @@ def _shifted(padded: NDArray[Any], dx: int, dy: int) -> NDArray[Any]:
     return padded[1 + dy : height - 1 + dy, 1 + dx : width - 1 + dx]
 
 
-def legal_moves(occupancy: Occupancy, move_rule: MoveRule | str) -> NDArray[np.bool_]:
+def legal_moves(
+    occupancy: Occupancy, move_rule: MoveRule | str, forbidden: NDArray[np.uint8] | None = None
+) -> NDArray[np.bool_]:
     """Return (8, H, W) bool: which of the eight moves are legal in each cell.
 
     ``[a, y, x]`` is True if action ``a`` leads from the free cell (x, y) to a free cell of the map
-    and the rule allows it.
+    and the rule allows it, and `forbidden` too, see `GridMap`.
     """
     rule = MoveRule(move_rule)
     free = np.pad(~occupancy, 1)
@@ -60,7 +61,15 @@ def legal_moves(occupancy: Occupancy, move_rule: MoveRule | str) -> NDArray[np.b
         legal[action] = _shifted(free, 0, 0) & _shifted(free, dx, dy)
         if dx and dy and not rule.cuts_corners:
             legal[action] &= _shifted(free, dx, 0) & _shifted(free, 0, dy)
+        if forbidden is not None:
+            legal[action] &= (forbidden >> action & 1) == 0
     return legal
+
+
+def reversed_moves(legal: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Return (8, H, W) bool: action ``a`` where the opposite move leads back to the cell."""
+    padded = np.pad(np.roll(legal, len(MOVES) // 2, axis=0), ((0, 0), (1, 1), (1, 1)))
+    return np.stack([_shifted(padded[a], dx, dy) for a, (dx, dy) in enumerate(MOVES.tolist())])
 
 
 def neighbours(shape: tuple[int, int]) -> NDArray[np.int64]:
@@ -90,7 +99,8 @@ def move_costs(multiplier: NDArray[np.float32], move_rule: MoveRule | str) -> ND
 def component_labels(occupancy: Occupancy, move_rule: MoveRule | str) -> NDArray[np.int32]:
     """Return the connected component of each cell, (H, W) int32.
 
-    Two free cells have the same label, 1 or more, if a path joins them. Occupied cells have 0.
+    Two free cells have the same label, 1 or more, if a path joins them that may go against
+    forbidden directions. Occupied cells have 0.
     """
     # If a diagonal move needs both side cells free, two straight moves can replace it.
     return label_cells(occupancy, corners=MoveRule(move_rule).cuts_corners)
@@ -106,15 +116,13 @@ def connected_cells(
     return connected
 
 
-def path_length(cells: Sequence[Cell], move_rule: MoveRule | str = MoveRule.ROBOT_SAFE) -> float:
+def path_length(cells: Cells, move_rule: MoveRule | str = MoveRule.ROBOT_SAFE) -> float:
     """Return the length in cells of a path of straight segments between the given cells."""
     x, y = np.asarray(cells, dtype=np.int64).reshape(-1, 2).T
     return float(segment_lengths(np.diff(x), np.diff(y), move_rule).sum())
 
 
-def path_cost(
-    cells: Sequence[Cell], multiplier: NDArray[np.float32], move_rule: MoveRule | str
-) -> float:
+def path_cost(cells: Cells, multiplier: NDArray[np.float32], move_rule: MoveRule | str) -> float:
     """Return the cost of a path of neighbouring cells: the sum of its moves, see `move_costs`."""
     x, y = np.asarray(cells, dtype=np.int64).reshape(-1, 2).T
     lengths = segment_lengths(np.diff(x), np.diff(y), move_rule)

@@ -9,7 +9,7 @@ import numpy as np
 
 from ddqn_planner.grid.arguments import Cell, Choice
 from ddqn_planner.grid.grid_map import GridMap
-from ddqn_planner.grid.moves import MoveRule, connected_cells
+from ddqn_planner.grid.moves import MoveRule
 
 MAX_NEW_OBSTACLES = 5
 """The paper adds 1 to 5 obstacles."""
@@ -53,8 +53,9 @@ def scatter_obstacles(
         for index in random.choice(len(candidates), size=count, replace=False):
             x, y = candidates[index]
             occupancy[y, x] = True
-        if connected_cells(occupancy, goal, move_rule)[start[1], start[0]]:
-            return replace(grid, occupancy=occupancy), rejected
+        noisy = replace(grid, occupancy=occupancy)
+        if noisy.reachable([start], move_rule)[goal[1], goal[0]]:
+            return noisy, rejected
     raise ValueError(
         f"none of {MAX_TRIES} draws of new obstacles left a path from {start} to {goal}"
     )

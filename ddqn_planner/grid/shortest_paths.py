@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from ddqn_planner.grid.arguments import Cell, as_cell
 from ddqn_planner.grid.grid_map import GridMap
-from ddqn_planner.grid.moves import MOVES, MoveRule, legal_moves
+from ddqn_planner.grid.moves import MOVES, MoveRule
 
 
 def shortest_distances(grid: GridMap, goal: Cell, move_rule: MoveRule | str) -> NDArray[np.float64]:
@@ -36,7 +36,7 @@ def shortest_path(grid: GridMap, start: Cell, goal: Cell, move_rule: MoveRule | 
 def _dijkstra(grid: GridMap, goal: Cell, move_rule: MoveRule | str) -> Any:
     """Return each cell's distance from the goal, and the next cell on its path to the goal.
 
-    The search runs from the goal: every move is legal, and costs the same, in both directions.
+    The search runs from the goal, over moves in the opposite direction.
     """
     from scipy.sparse.csgraph import dijkstra
 
@@ -44,6 +44,8 @@ def _dijkstra(grid: GridMap, goal: Cell, move_rule: MoveRule | str) -> Any:
     if not grid.contains((x, y)):
         raise ValueError(f"the goal {goal} lies outside the map of {grid.width} x {grid.height}")
     graph = _graph(grid, move_rule)
+    if grid.forbidden is not None:  # else every move is legal, and costs the same, both ways
+        graph = graph.T
     return dijkstra(graph, indices=y * grid.width + x, return_predecessors=True)
 
 
@@ -56,12 +58,12 @@ def _graph(grid: GridMap, move_rule: MoveRule | str) -> Any:
 
     step = MOVES[:, 1] * grid.width + MOVES[:, 0]
     actions = np.argsort(step)  # puts the columns of each row in order
-    legal_NA = legal_moves(grid.occupancy, move_rule)[actions].reshape(len(MOVES), -1).T
+    legal_NA = grid.legal_moves(move_rule)[actions].reshape(len(MOVES), -1).T
     edge = np.flatnonzero(legal_NA)
     cell, place = np.divmod(edge.astype(np.int32), np.int32(len(MOVES)))
     next_cell = cell + step[actions].astype(np.int32)[place]
     cost = MoveRule(move_rule).lengths[actions][place]
-    if grid.cost is not None:
+    if grid.has_costs:
         multiplier = grid.cost_multiplier.ravel().astype(np.float64)
         cost *= (multiplier[cell] + multiplier[next_cell]) / 2
     row_end = np.cumsum(np.count_nonzero(legal_NA, axis=1), dtype=np.int32)

@@ -21,17 +21,15 @@ def patch_numbers(occupancy: NDArray[np.bool_]) -> NDArray[np.uint16]:
     Bit 3 y + x is set where the patch's cell (x, y) is occupied; see `OCCUPIED_PATCH`.
     """
     height, width = occupancy.shape
-    padded = np.empty((height + 2, width + 2), np.uint8)
-    padded[0], padded[height + 1] = 1, 1
-    for y in range(height):
-        row = padded[y + 1]
-        row[0], row[width + 1] = 1, 1
-        for x in range(width):
-            row[x + 1] = occupancy[y, x]
+    rows = np.ones((3, width + 2), np.uint8)  # all rows would be memory to fetch
     numbers = np.empty((height + 2, width + 2), np.uint16)
     numbers[0], numbers[height + 1] = OCCUPIED_PATCH, OCCUPIED_PATCH
-    for y in range(1, height + 1):
-        below, here, above, out = padded[y - 1], padded[y], padded[y + 1], numbers[y]
+    for y in range(height + 1):
+        below, here, above, out = rows[(y + 2) % 3], rows[y % 3], rows[(y + 1) % 3], numbers[y]
+        for x in range(width):
+            above[x + 1] = occupancy[y, x] if y < height else 1
+        if y == 0:
+            continue
         out[0], out[width + 1] = OCCUPIED_PATCH, OCCUPIED_PATCH
         for x in range(1, width + 1):
             bits = below[x - 1] + 2 * below[x] + 4 * below[x + 1] + 8 * here[x - 1]
@@ -41,13 +39,25 @@ def patch_numbers(occupancy: NDArray[np.bool_]) -> NDArray[np.uint16]:
 
 
 @compiled_now
+def occurring(values: NDArray[np.uint8]) -> NDArray[np.bool_]:
+    """Return which values occur: (256,) bool."""
+    occurs = np.zeros(256, np.bool_)
+    for value in values:
+        occurs[value] = True
+    return occurs
+
+
+@compiled_now
 def cost_of(
     patch: Any, table: Any, value: Any, terms: Any, width: int, cell: int, action: int
 ) -> Any:
-    """Return the cost of a move, float32; infinite if it is not possible. See `MoveCosts`."""
+    """Return the cost of a move, infinite if it is not possible. See `MoveCosts`."""
     cost = table[patch[cell], action]
     if terms is None:
-        return cost
+        if value is None:
+            return cost
+        after = cell + MOVE_Y[action] * width + MOVE_X[action]
+        return cost * (np.float64(value[cell]) + value[after]) / 2
     if cost == np.inf:
         return cost
     total = np.float32(0)

@@ -38,7 +38,8 @@ class MoveCosts(NamedTuple):
     """The cost of each move of each cell, on a map with a border of one cell.
 
     It is ``table[patch[cell], action]``; with terms, that is only the length of the move, and
-    is multiplied by ``1 + max(0, sum of terms)``, at most `MAX_MULTIPLIER`.
+    is multiplied by ``1 + max(0, sum of terms)``, at most `MAX_MULTIPLIER`. With values and no
+    terms, it is multiplied by the mean value of the two cells.
 
     Parameters
     ----------
@@ -46,8 +47,8 @@ class MoveCosts(NamedTuple):
         The number of each cell's patch.
     table : (P, 8) float32
         At least 1; infinite where a move is not possible.
-    value : (C,) uint8, optional
-        The value of each cell, for the terms.
+    value : (C,) uint8 or float32, optional
+        The value of each cell for the terms, or what multiplies its moves, 1 or more.
     terms : (9, 102, 8) float32, optional
         What each value of each cell of a patch adds.
     width : int
@@ -75,6 +76,42 @@ def costs_by_patch(patch_C: NDArray[Any], table_PA: Array, width: int) -> MoveCo
     straight = float(table_PA[:, 0::2].min(initial=highest))
     diagonal = float(table_PA[:, 1::2].min(initial=2 * straight))
     return MoveCosts(patch_C, table_PA, None, None, width, highest, straight, diagonal)
+
+
+def with_directions(
+    patch: NDArray[Any], table_PA: Array, forbidden: NDArray[np.uint8] | None
+) -> tuple[NDArray[Any], Array]:
+    """Return patches and a table of costs in which forbidden moves are not possible.
+
+    Each set of forbidden actions that occurs has its own copy of the table.
+
+    Parameters
+    ----------
+    patch : (...) uint16 or int32
+        The number of each cell's patch.
+    table_PA : (P, 8) float32
+    forbidden : (...) uint8, optional
+        See `GridMap`.
+    """
+    if forbidden is None:
+        return patch, table_PA
+    from ddqn_planner.model.compiled_costs import occurring
+
+    occurs = occurring(forbidden.ravel())
+    sets = np.flatnonzero(occurs)
+    is_forbidden_SA = (sets[:, None] >> np.arange(table_PA.shape[1]) & 1).astype(np.bool_)
+    tables_SPA = np.where(is_forbidden_SA[:, None], np.float32(np.inf), table_PA)
+    small = len(sets) * len(table_PA) <= 2**16
+    first_row = ((np.cumsum(occurs) - 1) * len(table_PA)).astype(np.uint16 if small else np.int32)
+    rows = first_row.take(forbidden)
+    rows += patch.astype(rows.dtype, copy=False)
+    return rows, tables_SPA.reshape(-1, table_PA.shape[1])
+
+
+def multiplied(costs: MoveCosts, multiplier: NDArray[np.float32]) -> MoveCosts:
+    """Return the costs of moves times what multiplies them in the cells of a map, (H, W)."""
+    value = np.pad(multiplier, 1, constant_values=1).ravel()
+    return costs._replace(value=value, highest=costs.highest * float(multiplier.max()))
 
 
 def every_patch() -> NDArray[np.int8]:

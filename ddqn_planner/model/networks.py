@@ -35,10 +35,16 @@ from ddqn_planner.model.move_costs import (
     costs_by_patch,
     every_patch,
     legal_in_patches,
+    multiplied,
+    with_directions,
 )
 from ddqn_planner.model.observation import ROBOT, observation_background, unique_patches
 
 Array: TypeAlias = NDArray[np.float32]
+
+CERTAIN = 0.99
+"""A move that succeeds with this probability or more counts as one that always does: the sigmoid
+function never reaches 1, and its rest must not decide between paths."""
 
 BATCH = 2**12
 """Patches per evaluation of a network. The layers' outputs then fit into a cache; those of all
@@ -224,26 +230,30 @@ class PropagationQNetwork(QNetwork):
         """Return the costs of a map's moves if the possible ones are exactly the legal ones."""
         from ddqn_planner.model.compiled_costs import patch_numbers
 
-        with_costs = self.uses_costs and grid.cost is not None
-        if (move_rule, with_costs) not in self._costs_by_rule:
-            self._costs_by_rule[move_rule, with_costs] = self._costs(move_rule, with_costs)
-        costs = self._costs_by_rule[move_rule, with_costs]
+        timed = grid.slowness is not None
+        with_costs = self.uses_costs and grid.cost is not None and not timed
+        key = move_rule, with_costs, timed
+        if key not in self._costs_by_rule:
+            self._costs_by_rule[key] = self._costs(*key)
+        costs = self._costs_by_rule[key]
         if costs is None:
             return None
         value = cell_values(grid) if with_costs else None
-        return costs._replace(
-            patch=patch_numbers(grid.occupancy), value=value, width=grid.width + 2
-        )
+        patch, table = patch_numbers(grid.occupancy), costs.table
+        if grid.forbidden is not None:
+            patch, table = with_directions(patch, table, np.pad(grid.forbidden, 1).ravel())
+        costs = costs._replace(patch=patch, table=table, value=value, width=grid.width + 2)
+        return multiplied(costs, grid.cost_multiplier) if timed else costs
 
     @cached_property
-    def _costs_by_rule(self) -> dict[tuple[MoveRule, bool], MoveCosts | None]:
+    def _costs_by_rule(self) -> dict[tuple[MoveRule, bool, bool], MoveCosts | None]:
         """What holds for all maps, so that it is computed once."""
         return {}
 
-    def _costs(self, move_rule: MoveRule, with_costs: bool) -> MoveCosts | None:
+    def _costs(self, move_rule: MoveRule, with_costs: bool, timed: bool) -> MoveCosts | None:
         """Return the costs of moves without what depends on the map."""
         patch_P9 = every_patch()
-        table_PA = self._costs_of(patch_P9, move_rule)
+        table_PA = self._costs_of(patch_P9, move_rule, timed)
         table_PA[patch_P9[:, 4] == OCCUPIED] = np.inf
         if not np.array_equal(np.isfinite(table_PA), legal_in_patches(patch_P9, move_rule)):
             return None
@@ -254,31 +264,43 @@ class PropagationQNetwork(QNetwork):
         """Return minus the cost of the best path through each action: length times cost multiplier.
 
         There is no discount, and a move counts as possible where p > 1/2: so the greatest Q is the
-        cheapest path at any distance. (Along a whole path, the progress and detour terms of the
-        paper's reward, section 4.2, add up to a constant of its two ends.) Cost multipliers are
-        clamped to `MAX_MULTIPLIER`. A move with NaN as its p or cost multiplier is not
-        possible.
+        cheapest path at any distance. A move that may fail leaves the robot where it was, and is
+        tried again: its expected cost is that of one try over p, see `CERTAIN`. On a map of
+        expected times, these take the place of the learned cost multiplier. (Along a whole path,
+        the progress and detour terms of the paper's reward, section 4.2, add up to a constant of
+        its two ends.) Cost multipliers are clamped to `MAX_MULTIPLIER`. A move with NaN as its p or
+        cost multiplier is not possible.
 
         Returns
         -------
         (8, H, W) float32
             -inf where no path is known.
         """
-        from ddqn_planner.model.wavefront import propagate_values
+        from ddqn_planner.model.field_values import propagate_values
 
-        patch_id, patch_P9 = unique_patches(grid.occupancy, grid.cost if self.uses_costs else None)
-        return propagate_values(patch_id, self._costs_of(patch_P9, move_rule), goal)
+        timed = grid.slowness is not None
+        cost = grid.cost if self.uses_costs and not timed else None
+        patch_id, patch_P9 = unique_patches(grid.occupancy, cost)
+        cost_PA = self._costs_of(patch_P9, move_rule, timed)
+        patch_id, cost_PA = with_directions(patch_id, cost_PA, grid.forbidden)
+        return propagate_values(patch_id, cost_PA, goal, grid.cost_multiplier if timed else None)
 
-    def _costs_of(self, patch_P9: NDArray[np.int8], move_rule: MoveRule) -> Array:
-        """Return the cost of each move in each patch, infinite if not possible: (P, 8) float32."""
+    def _costs_of(self, patch_P9: NDArray[np.int8], move_rule: MoveRule, timed: bool) -> Array:
+        """Return the cost of each move in each patch, infinite if not possible: (P, 8) float32.
+
+        If times are measured, the learned cost multiplier is left out.
+        """
         cost_PA = np.empty((len(patch_P9), len(MOVES)), dtype=np.float32)
         for begin in range(0, len(patch_P9), BATCH):
             batch = slice(begin, begin + BATCH)
             feature_BI = self.features(patch_P9[batch], move_rule)
             multiplier_BA = np.minimum(self.multiplier(feature_BI), MAX_MULTIPLIER)
             # Comparisons with NaN are false, and NumPy's minimum and maximum keep it.
-            possible_BA = (self.success(feature_BI) > 0.5) & (multiplier_BA >= 1)
-            cost_PA[batch] = np.where(possible_BA, move_rule.lengths * multiplier_BA, np.inf)
+            p_BA = self.success(feature_BI)
+            possible_BA = (p_BA > 0.5) & (multiplier_BA >= 1)
+            tries_BA = 1 / np.where((p_BA > 0.5) & (p_BA < CERTAIN), p_BA, np.float32(1))
+            cost_BA = move_rule.lengths * tries_BA * (1 if timed else multiplier_BA)
+            cost_PA[batch] = np.where(possible_BA, cost_BA, np.inf)
         return cost_PA
 
 
@@ -339,10 +361,10 @@ class AnyMapQNetwork(PropagationQNetwork):
         terms_9LA[4] += bias_A + weight_AI[:, 27] * move_rule.cuts_corners
         return terms_9LA
 
-    def _costs(self, move_rule: MoveRule, with_costs: bool) -> MoveCosts | None:
+    def _costs(self, move_rule: MoveRule, with_costs: bool, timed: bool) -> MoveCosts | None:
         """Return the costs of moves without what depends on the map."""
         if not with_costs:
-            return super()._costs(move_rule, with_costs)
+            return super()._costs(move_rule, with_costs, timed)
         if not self.certificate.proved:
             return None
         table_PA = np.full((OCCUPIED_PATCH + 1, len(MOVES)), np.inf, dtype=np.float32)

@@ -11,15 +11,14 @@ lose the order of neighbours above some 10^6.
 
 from __future__ import annotations
 
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ddqn_planner.compiled import compiled_now
-from ddqn_planner.grid import Cell
 from ddqn_planner.model.compiled_costs import MOVE_X, MOVE_Y, cost_of
-from ddqn_planner.model.move_costs import MoveCosts, costs_by_patch
+from ddqn_planner.model.move_costs import MoveCosts
 
 Distances = NDArray[np.float64]
 States = NDArray[np.uint8]
@@ -38,9 +37,6 @@ AT_GOAL: Final = 5e-324
 
 BUCKETS: Final = 2
 """Per unit of cost. More buckets mean fewer visits of cells that the start does not need."""
-
-SAME: Final = 1 + 1e-12
-"""Paths whose costs differ by a smaller factor cost the same: sums of floats are rounded."""
 
 FIRST: NDArray[np.int8] = np.array(
     [0] + [(bits & -bits).bit_length() - 1 for bits in range(1, 256)], np.int8
@@ -88,15 +84,23 @@ def grow(
         Whether all was visited that the start needs.
     """
     # Lower bounds, whatever the rounding.
-    straight, diagonal = costs.straight * (1 - 1e-7), costs.diagonal * (1 - 1e-7)
-    start_y, start_x = divmod(start, costs.width)
-    dx = np.abs(opened % costs.width - start_x)
-    dy = np.abs(opened // costs.width - start_y)
-    remaining = straight * np.abs(dx - dy) + diagonal * np.minimum(dx, dy)
-    order = ((distance[opened] + remaining) * BUCKETS).astype(np.int64)
+    bounds = costs.straight * (1 - 1e-7), costs.diagonal * (1 - 1e-7)
+    order = _orders(distance, opened, costs.width, start, bounds)
     first = np.argsort(order)
-    bounds = straight, diagonal
     return _grow(distance, state, opened[first], order[first], costs, start, bounds, limit)
+
+
+@compiled_now
+def _orders(
+    distance: Distances, opened: Cells, width: int, start: int, bounds: tuple[float, float]
+) -> NDArray[np.int64]:
+    """Return the bucket of each open cell, in the order of A*."""
+    order = np.empty(opened.size, np.int64)
+    for number in range(opened.size):
+        cell = opened[number]
+        dx, dy = cell % width - start % width, cell // width - start // width
+        order[number] = (distance[cell] + _octile(dx, dy, bounds[0], bounds[1])) * BUCKETS
+    return order
 
 
 @compiled_now
@@ -147,16 +151,14 @@ def _grow(
                 continue
             state[cell] = CLOSED
             visited += 1
+            here = distance[cell]
+            # With values, the table has lower bounds: few moves need more than that.
             better = 0
             for action in range(8):
                 previous = cell - offsets[action]
-                through[action] = distance[cell] + cost_of(
-                    patch, table, value, terms, width, previous, action
-                )
+                through[action] = here + table[patch[previous], action]
                 known = distance[previous]
-                is_better = (through[action] < known) | (
-                    (known == 0.0) & (through[action] < np.inf)
-                )
+                is_better = (through[action] < known) | ((known == 0) & (through[action] < np.inf))
                 better |= int(is_better) << action
             y = cell // width
             x = cell - y * width
@@ -164,11 +166,16 @@ def _grow(
                 action = FIRST[better]
                 better &= better - 1
                 previous = cell - offsets[action]
+                known, cost = distance[previous], through[action]
+                if value is not None:
+                    cost = here + cost_of(patch, table, value, terms, width, previous, action)
+                    if cost >= known > 0:
+                        continue
                 dx, dy = x - MOVE_X[action] - start_x, y - MOVE_Y[action] - start_y
                 remaining = _octile(dx, dy, straight, diagonal)
-                new = max(int((through[action] + remaining) * BUCKETS), front)
-                old = max(int((distance[previous] + remaining) * BUCKETS), front)
-                distance[previous] = through[action]
+                new = max(int((cost + remaining) * BUCKETS), front)
+                old = max(int((known + remaining) * BUCKETS), front)
+                distance[previous] = cost
                 if state[previous] == OPEN and old == new:
                     continue
                 state[previous] = OPEN
@@ -230,12 +237,11 @@ def _grow_whole(distance: Distances, state: States, opened: Cells, costs: MoveCo
                 continue
             state[cell] = CLOSED
             here = distance[cell]
+            # With values, the table has lower bounds: few moves need more than that.
             better = 0
             for action in range(8):
                 previous = cell - offsets[action]
-                through[action] = here + cost_of(
-                    patch, table, value, terms, width, previous, action
-                )
+                through[action] = here + table[patch[previous], action]
                 known = distance[previous]
                 is_better = (through[action] < known) | ((known == 0) & (through[action] < np.inf))
                 better |= int(is_better) << action
@@ -243,8 +249,13 @@ def _grow_whole(distance: Distances, state: States, opened: Cells, costs: MoveCo
                 action = FIRST[better]
                 better &= better - 1
                 previous = cell - offsets[action]
-                new, known = int(through[action]), distance[previous]
-                distance[previous] = through[action]
+                known, cost = distance[previous], through[action]
+                if value is not None:
+                    cost = here + cost_of(patch, table, value, terms, width, previous, action)
+                    if cost >= known > 0:
+                        continue
+                distance[previous] = cost
+                new = int(cost)
                 if state[previous] == OPEN and int(known) == new:
                     continue
                 state[previous] = OPEN
@@ -288,98 +299,7 @@ def _still_open(
     return still_open
 
 
-@compiled_now
-def next_action(
-    distance: Any, patch: Any, table: Any, value: Any, terms: Any, width: int, cell: int
-) -> int:
-    """Return the greedy action of a closed cell, the lowest of those that tie; -1 without one."""
-    for action in range(8):
-        after = distance[cell + MOVE_Y[action] * width + MOVE_X[action]]
-        if after > 0:
-            cost = cost_of(patch, table, value, terms, width, cell, action)
-            if after + cost <= distance[cell] * SAME:
-                return action
-    return -1
-
-
-@compiled_now
-def roll_out(distance: Distances, costs: MoveCosts, start: int) -> Cells:
-    """Return the greedy steps from a closed start to the goal, with both cells: (N,) int32."""
-    patch, table, value, terms, width = costs[:5]
-    cells: Cells = np.empty(64, np.int32)
-    cell, number = start, 0
-    while True:
-        if number == cells.size:
-            cells = np.concatenate((cells, np.empty(number, np.int32)))
-        cells[number] = cell
-        number += 1
-        action = next_action(distance, patch, table, value, terms, width, cell)
-        if distance[cell] == AT_GOAL or action < 0:
-            path: Cells = cells[:number].copy()
-            return path
-        cell += MOVE_Y[action] * width + MOVE_X[action]
-
-
-@compiled_now
-def policy_of(distance: Distances, costs: MoveCosts) -> NDArray[np.int8]:
-    """Return the greedy action of each cell of a whole field, -1 without one: (H, W) int8."""
-    patch, table, value, terms, width = costs[:5]
-    policy = np.full((distance.size // width - 2, width - 2), -1, np.int8)
-    for y in range(policy.shape[0]):
-        for x in range(policy.shape[1]):
-            cell = (y + 1) * width + x + 1
-            policy[y, x] = next_action(distance, patch, table, value, terms, width, cell)
-    return policy
-
-
-@compiled_now
-def q_of(distance: Distances, costs: MoveCosts) -> NDArray[np.float32]:
-    """Return minus the cost of the best path through each action: (8, H, W) float32."""
-    patch, table, value, terms, width = costs[:5]
-    q = np.full((8, distance.size // width - 2, width - 2), -np.inf, np.float32)
-    for action in range(8):
-        for y in range(q.shape[1]):
-            for x in range(q.shape[2]):
-                cell = (y + 1) * width + x + 1
-                after = distance[cell + MOVE_Y[action] * width + MOVE_X[action]]
-                if after > 0:
-                    cost = cost_of(patch, table, value, terms, width, cell, action)
-                    q[action, y, x] = -(cost + after)
-    return q
-
-
-def propagate_values(
-    patch_id: NDArray[np.int32], cost_PA: NDArray[np.float32], goal: Cell
-) -> NDArray[np.float32]:
-    """Return the greatest Q that satisfies Q(s, a) = -cost(s, a) + max_a' Q(s', a'), 0 at the goal.
-
-    Value iteration without discount converges to it.
-
-    Parameters
-    ----------
-    patch_id : (H, W) int32
-        0..P-1; cells with the same patch have the same costs.
-    cost_PA : (P, 8) float32
-        At least 1; infinite where a move is not possible. A move off the map is never possible.
-    goal : (x, y)
-
-    Returns
-    -------
-    (8, H, W) float32
-        -inf where a move is not possible or no path leads from it to the goal. Summed in double
-        precision, rounded once.
-    """
-    outside = len(cost_PA)
-    padded = np.pad(patch_id, 1, constant_values=outside)
-    table_PA = np.pad(cost_PA, ((0, 1), (0, 0)), constant_values=np.inf)
-    costs = costs_by_patch(padded.ravel(), table_PA, padded.shape[1])
-    distance, state, opened = new_field(padded.size, (goal[1] + 1) * costs.width + goal[0] + 1)
-    grow_whole(distance, state, opened, costs)
-    return q_of(distance, costs)
-
-
-def new_field(cells: int, goal: int) -> tuple[Distances, States, Cells]:
-    """Return the distances, states and open cells of a field that is still to grow."""
-    distance, state = np.zeros(cells), np.zeros(cells, dtype=np.uint8)
-    distance[goal], state[goal] = AT_GOAL, OPEN
-    return distance, state, np.array([goal], dtype=np.int32)
+def begun(distance: Distances, state: States, roots: Cells) -> tuple[Distances, States, Cells]:
+    """Return a field that is still to grow from its roots, made of zeros."""
+    distance[roots], state[roots] = AT_GOAL, OPEN
+    return distance, state, roots

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import array
 import math
-from collections.abc import Sequence
 from itertools import zip_longest
 from typing import TYPE_CHECKING, TypeVar
 
@@ -19,6 +18,8 @@ from rclpy.serialization import serialize_message
 from std_msgs.msg import Header
 
 from ddqn_planner.grid import Cell, GridMap
+from ddqn_planner.grid.arguments import Cells
+from ddqn_planner.grid.costmap import grid_from_costmap
 from ddqn_planner.grid.map_file import MAX_CELLS
 
 if TYPE_CHECKING:
@@ -38,8 +39,9 @@ def grid_from_message(
     occupied_threshold: int = 65,
     allow_unknown: bool = False,
     use_map_costs: bool = False,
+    map_type: str = "map",
 ) -> GridMap:
-    """Make a grid map of a map message; see `GridMap.from_occupancy_values`.
+    """Make a grid map of a map message; for the rest see `grid_from_values`.
 
     Raises
     ------
@@ -50,11 +52,30 @@ def grid_from_message(
     info = message.info
     values = np.frombuffer(message.data, np.int8).reshape(info.height, info.width)
     origin = (info.origin.position.x, info.origin.position.y, _yaw(info.origin.orientation))
-    rules = occupied_threshold, allow_unknown, use_map_costs
+    rules = occupied_threshold, allow_unknown, use_map_costs, map_type
     try:
-        return GridMap.from_occupancy_values(values, info.resolution, origin, *rules)
+        return grid_from_values(values, info.resolution, origin, *rules)
     except MemoryError:
         raise ValueError("no memory is left for the map; give a smaller one") from None
+
+
+def grid_from_values(
+    values: NDArray[np.int8],
+    resolution: float,
+    origin: tuple[float, float, float],
+    occupied_threshold: int,
+    allow_unknown: bool,
+    use_map_costs: bool,
+    map_type: str,
+) -> GridMap:
+    """Make a grid map: `GridMap.from_occupancy_values`, or `grid_from_costmap` for a costmap.
+
+    A costmap has its own threshold and costs.
+    """
+    if map_type == "costmap":
+        return grid_from_costmap(values, resolution, origin, allow_unknown)
+    rules = occupied_threshold, allow_unknown, use_map_costs
+    return GridMap.from_occupancy_values(values, resolution, origin, *rules)
 
 
 def occupancy_message(
@@ -75,6 +96,18 @@ def occupancy_message(
     return message
 
 
+def directions_message(
+    forbidden: NDArray[np.uint8] | None,
+    resolution: float,
+    origin: tuple[float, float, float],
+    header: Header,
+) -> OccupancyGrid:
+    """Make the message of a map's forbidden directions, see `GridMap`; without cells for none."""
+    if forbidden is None:
+        return OccupancyGrid(header=header)
+    return occupancy_message(forbidden.view(np.int8), resolution, origin, header)
+
+
 def value_message(field: QField | None, grid: GridMap, header: Header) -> OccupancyGrid:
     """Make a map message of a value field: 0 the lowest value, 100 the goal's, -1 for no value."""
     percent = np.full(grid.occupancy.shape, -1, dtype=np.int8)
@@ -87,9 +120,7 @@ def value_message(field: QField | None, grid: GridMap, header: Header) -> Occupa
     return occupancy_message(percent, grid.resolution, grid.origin, header)
 
 
-def path_message(
-    cells: Sequence[Cell], grid: GridMap, header: Header, goal_orientation: Quaternion
-) -> Path:
+def path_message(cells: Cells, grid: GridMap, header: Header, goal_orientation: Quaternion) -> Path:
     """Make a path message of cells, which may be none.
 
     Each pose faces the next one, and the last has the goal's orientation. All have the same header
@@ -98,6 +129,7 @@ def path_message(
     path, blank = Path(header=header), PoseStamped(header=header)
     # Poses in the same direction share a quaternion: most of an answer's time is making messages.
     towards: dict[Cell, Quaternion] = {}
+    cells = np.asarray(cells).tolist()  # Python's numbers are faster than numpy's one by one
     for cell, next_cell in zip_longest(cells, cells[1:]):
         stamped = _copy(blank)
         stamped.pose = pose = _copy(blank.pose)
@@ -115,30 +147,44 @@ def path_message(
 
 
 def serialized_path(
-    cells: Sequence[Cell], grid: GridMap, header: Header, goal_orientation: Quaternion
+    cells: Cells, grid: GridMap, header: Header, goal_orientation: Quaternion
 ) -> bytes:
     """Return what `path_message` returns in the form in which it is sent, which publishers take.
 
-    It saves nearly all of an answer's time: rclpy converts a message pose by pose. The form is CDR
-    (OMG DDS-XTypes, plain CDR, little-endian): numbers are aligned to their size, so that a pose
-    has the same bytes before its seven numbers each time, except for the first one.
+    It saves nearly all of an answer's time: rclpy converts a message pose by pose.
     """
-    start = serialize_message(Path(header=header))[4:-4] + len(cells).to_bytes(4, "little")
+    x, y = np.asarray(cells, dtype=np.float64).reshape(-1, 2).T
+    yaw = grid.origin[2] + np.arctan2(np.diff(y), np.diff(x))
+    positions = np.column_stack(grid.cell_to_world((x, y)))
+    return serialized_poses(positions, yaw, header, goal_orientation)
+
+
+def serialized_poses(
+    positions: NDArray[np.float64],
+    yaw: NDArray[np.float64],
+    header: Header,
+    last_orientation: Quaternion,
+) -> bytes:
+    """Return the path of positions (N, 2) and directions (N - 1) in the form in which it is sent.
+
+    The form is CDR (OMG DDS-XTypes, plain CDR, little-endian): numbers are aligned to their size,
+    so that a pose has the same bytes before its seven numbers each time, except for the first one.
+    """
+    count = len(positions)
+    start = serialize_message(Path(header=header))[4:-4] + count.to_bytes(4, "little")
     start += bytes(-len(start) % 4)
     stamp = serialize_message(header)[4:]
     first, others = (stamp + bytes(-(at + len(stamp)) % 8) for at in (len(start), 0))
     pose = np.dtype([("header", f"V{len(others)}"), ("numbers", "<f8", 7)])
-    poses = np.zeros(len(cells), dtype=pose)
-    if len(cells):
+    poses = np.zeros(count, dtype=pose)
+    if count:
         poses["header"] = np.void(others)
-        x, y = np.array(cells, dtype=np.float64).T
-        yaw = grid.origin[2] + np.arctan2(np.diff(y), np.diff(x))
         numbers = poses["numbers"]
-        numbers[:, 0], numbers[:, 1] = grid.cell_to_world((x, y))
+        numbers[:, :2] = positions
         numbers[:-1, 5], numbers[:-1, 6] = np.sin(yaw / 2), np.cos(yaw / 2)
-        last = goal_orientation
+        last = last_orientation
         numbers[-1, 3:] = last.x, last.y, last.z, last.w
-    return b"\0\1\0\0" + start + (first + poses.tobytes()[len(others) :] if len(cells) else b"")
+    return b"\0\1\0\0" + start + (first + poses.tobytes()[len(others) :] if count else b"")
 
 
 def _copy(message: Message) -> Message:
@@ -149,8 +195,12 @@ def _copy(message: Message) -> Message:
     return copied
 
 
-def check_pose(name: str, header: Header, pose: Pose, frame: str = "") -> None:
+def check_pose(
+    name: str, header: Header, pose: Pose, frame: str = "", other_remedy: str = ""
+) -> None:
     """Check a pose, which the error calls by its name, as ``"the goal"``.
+
+    The error for another frame than the map's also names the other remedy.
 
     Raises
     ------
@@ -162,7 +212,7 @@ def check_pose(name: str, header: Header, pose: Pose, frame: str = "") -> None:
         expected = f"the map's is {frame!r}" if frame else "it needs the map's frame"
         raise ValueError(
             f"{name}'s frame is {header.frame_id!r}, {expected}; transform the pose to that frame "
-            "(in RViz: set Fixed Frame to it)"
+            f"(in RViz: set Fixed Frame to it){other_remedy}"
         )
     _check_pose(name, pose)
 

@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 
 from nav_msgs.msg import OccupancyGrid
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
+from rclpy.exceptions import InvalidHandle
 from rclpy.node import Node
 from rclpy.publisher import Publisher
 from std_msgs.msg import Header
@@ -92,6 +93,8 @@ class FieldDisplay:
             layer.is_due, layer.has_field = False, has_field
             try:
                 layer.publisher.publish(await self._worker.call(_message, layer, shown))
+            except InvalidHandle:  # cleaned up meanwhile
+                return
             except Exception as error:  # as when no memory is left: the node must survive
                 reason = f"({error!r}); give a smaller map"
                 self._logger.error(f"the {layer.name} cannot be shown {reason}")

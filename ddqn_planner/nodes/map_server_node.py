@@ -22,7 +22,7 @@ from ddqn_planner.grid import (
     shortest_path,
 )
 from ddqn_planner.grid.map_file import MapDataError, MapMetadataError, MapNotFoundError
-from ddqn_planner.nodes.conversions import MIN_RESOLUTION, occupancy_message
+from ddqn_planner.nodes.conversions import MIN_RESOLUTION, directions_message, occupancy_message
 from ddqn_planner.nodes.runtime import LATCHED, BaseNode, Declared, spin_until_shutdown
 from ddqn_planner.resources import PACKAGE, find_map
 
@@ -47,7 +47,7 @@ PARAMETERS: Final = {
 
 
 class MapServerNode(BaseNode):
-    """Serves one map, latched on a topic and as a service.
+    """Serves one map, latched on a topic and as a service, and its directions on another topic.
 
     ``~/scatter_obstacles`` always adds to the loaded map, so that each call is an independent draw;
     the parameter ``seed`` makes a sequence of calls repeatable. A path remains under
@@ -61,7 +61,10 @@ class MapServerNode(BaseNode):
         self._served = OccupancyGrid()
 
         self._random = np.random.default_rng(self.value("seed"))
-        self._publisher = self.create_publisher(OccupancyGrid, self.value("topic_name"), LATCHED)
+        topic = self.value("topic_name")
+        # First, so that whoever receives a map knows that its directions come too.
+        self._directions = self.create_publisher(OccupancyGrid, f"{topic}_directions", LATCHED)
+        self._publisher = self.create_publisher(OccupancyGrid, topic, LATCHED)
         self._load(self.value("yaml_filename"))
         self.create_service(GetMap, "~/map", self._on_get_map)
         self.create_service(LoadMap, "~/load_map", self._on_load_map)
@@ -92,9 +95,9 @@ class MapServerNode(BaseNode):
     def _serve(self, values: NDArray[np.int8]) -> None:
         assert self._loaded is not None
         header = Header(stamp=self.get_clock().now().to_msg(), frame_id=self.value("frame_id"))
-        self._served = occupancy_message(
-            values, self._loaded.resolution, self._loaded.origin, header
-        )
+        place = self._loaded.resolution, self._loaded.origin, header
+        self._served = occupancy_message(values, *place)
+        self._directions.publish(directions_message(self._loaded.forbidden, *place))
         self._publisher.publish(self._served)
 
     def _on_get_map(self, request: GetMap.Request, response: GetMap.Response) -> GetMap.Response:

@@ -1,13 +1,20 @@
-"""Loads models for the planner node, the first one with all that a first plan needs."""
+"""The planner node's model: loaded by a worker, or set while the node runs."""
 
 from __future__ import annotations
 
 import gc
 
 import numpy as np
+from rcl_interfaces.msg import SetParametersResult
+from rclpy.parameter import Parameter
+from rclpy.task import Future
+from std_msgs.msg import String
 
-from ddqn_planner.grid import GridMap
+from ddqn_planner.grid import GridMap, MoveRule
 from ddqn_planner.model import find_model
+from ddqn_planner.model.certificate import NO_CERTIFICATE, certificate_of
+from ddqn_planner.nodes.report import Report
+from ddqn_planner.nodes.runtime import BaseNode, Worker
 from ddqn_planner.planning import Planner
 
 
@@ -29,3 +36,104 @@ def load_and_warm_up(model: str) -> tuple[Planner, str]:
     planner.plan(grid, (0, 0), (shape[1] - 1, shape[0] - 1))
     gc.freeze()
     return planner, path
+
+
+def move_rule(rule: str, planner: Planner) -> MoveRule:
+    """Return a rule by its name, or the rule of the model if the name is empty."""
+    return MoveRule(rule or planner.metadata.move_rule)
+
+
+class ModelSource:
+    """Has the planner with the last model that could be loaded.
+
+    Attributes
+    ----------
+    planner : Planner or None
+        None before the first model is loaded.
+    file : str
+        The file of its model.
+    """
+
+    def __init__(self, node: BaseNode, report: Report, worker: Worker) -> None:
+        self.planner: Planner | None = None
+        self.file = ""
+        self._node, self._report, self._worker = node, report, worker
+        self._loading: Future | None = None
+
+    @property
+    def is_loading(self) -> bool:
+        """Whether the first model is still being loaded."""
+        return self._loading is not None
+
+    @property
+    def refused(self) -> str:
+        """Why the last model was refused."""
+        return self._report.refused["model"]
+
+    def load(self) -> None:
+        """Begin to load the first model."""
+        self._loading = self._worker.call(load_and_warm_up, self._node.value("model"))
+
+    async def first(self) -> None:
+        """Wait for the first model, and use it unless another one was set since."""
+        loading = self._loading
+        if loading is None:
+            return
+        try:
+            loaded = await loading
+            if self._loading is loading:
+                self.use(*loaded)
+        except Exception as error:
+            if self._loading is loading:
+                self._loading = None
+                reason = f"{str(error) or repr(error)}; or set the parameter 'model'"
+                self._report.refuse("model", reason)
+
+    def use(self, planner: Planner, file: str) -> None:
+        """Plan with it from now on."""
+        self.planner, self.file, self._loading = planner, file, None
+        planner.cache_bytes = self._node.value("field_cache_bytes")
+        self._report.accept("model")
+        self._report.change()
+        self._node.get_logger().info(f"planning with the model {file}")
+
+    def set(self, name: str) -> SetParametersResult:
+        """Set the node's parameter, which loads the model."""
+        parameter = Parameter("model", Parameter.Type.STRING, name)
+        return self._node.set_parameters([parameter])[0]
+
+    def on_saved(self, message: String) -> None:
+        """Use a model that the trainer saved."""
+        result = self.set(message.data)
+        if not result.successful:
+            self._report.refuse("model", f"the trainer's model was refused: {result.reason}")
+
+    def on_reload(self) -> tuple[bool, str]:
+        """Load the file of the model again."""
+        result = self.set(self._node.value("model"))
+        if not result.successful:
+            self._node.get_logger().error(f"the model was not loaded again: {result.reason}")
+        return result.successful, result.reason or f"loaded {self.file}"
+
+    def describe(self, rule: str) -> dict[str, str]:
+        """Return what the diagnostics say of it, with the value of the parameter ``move_rule``."""
+        description = {"model": self._node.value("model")}
+        if self.planner is not None:
+            metadata = self.planner.metadata
+            certificate = certificate_of(self.planner.network, metadata.move_rule)
+            sizes = metadata.sizes.items()
+            description |= {
+                "model file": self.file,
+                "move rule": move_rule(rule, self.planner).value,
+                "model move rule": metadata.move_rule.value,
+                "model sizes": ", ".join(f"{key} {size}" for key, size in sizes),
+                "model training steps": str(metadata.steps),
+                "model certificate": str(certificate or NO_CERTIFICATE),
+            }
+        return description
+
+    def forget(self) -> None:
+        """Free the model and its fields, with what `load_and_warm_up` kept from collection."""
+        self.planner, self.file, self._loading = None, "", None
+        gc.unfreeze()
+        gc.collect()

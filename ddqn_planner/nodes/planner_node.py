@@ -12,109 +12,156 @@ from __future__ import annotations
 
 import ctypes
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Coroutine
 from contextlib import suppress
-from types import SimpleNamespace
 from typing import Any, NoReturn
 
-from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped
-from nav_msgs.msg import OccupancyGrid, Odometry, Path
+from geometry_msgs.msg import PoseArray, PoseStamped, PoseWithCovarianceStamped
+from nav_msgs.msg import Odometry, Path
 from nav_msgs.srv import GetPlan
-from rcl_interfaces.msg import SetParametersResult
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup, ReentrantCallbackGroup
 from rclpy.parameter import Parameter
 from rclpy.task import Future
 from std_msgs.msg import Header, String
 
-from ddqn_planner.grid import Cell, GridMap, MoveRule
-from ddqn_planner.grid.body import Inflation
-from ddqn_planner.model.certificate import NO_CERTIFICATE, certificate_of
-from ddqn_planner.nodes.conversions import (
-    cell_from_pose,
-    check_pose,
-    check_tolerance,
-    grid_from_message,
-    path_message,
-    serialized_path,
-)
+from ddqn_planner.nodes.active_goal import UNCHANGED, ActiveGoal, PathUnderWay
+from ddqn_planner.nodes.conversions import path_message, serialized_path
+from ddqn_planner.nodes.expected_times import Forecast
 from ddqn_planner.nodes.field_display import FieldDisplay, Shown
-from ddqn_planner.nodes.model_loading import load, load_and_warm_up
+from ddqn_planner.nodes.frames import Frames, check_tf
+from ddqn_planner.nodes.lifecycle import ManagedNode
+from ddqn_planner.nodes.map_source import MapSource
+from ddqn_planner.nodes.model_loading import ModelSource, load
+from ddqn_planner.nodes.nav2_interface import serve_nav2
 from ddqn_planner.nodes.planner_parameters import PARAMETERS
-from ddqn_planner.nodes.report import (
-    Outcome,
-    Report,
-    RequestError,
-    checked,
-    describe_map,
-    reason_of,
-    seconds,
-)
-from ddqn_planner.nodes.runtime import LATCHED, STEADY, BaseNode, Worker, spin_until_shutdown
-from ddqn_planner.nodes.start_source import StartSource, check_tf
-from ddqn_planner.planning import PlanMethod, Planner, PlanRequest
-from ddqn_planner.planning.planner import last_step
-
-MAP_PARAMETERS = ("occupied_threshold", "allow_unknown", "use_map_costs")
-BODY_PARAMETERS = ("robot_radius", "clearance_weight")
+from ddqn_planner.nodes.report import NOT_ACTIVE, Outcome, Report, RequestError
+from ddqn_planner.nodes.requests import Looks, Requests
+from ddqn_planner.nodes.runtime import LATCHED, STEADY, Unless, Worker, spin_until_shutdown
+from ddqn_planner.nodes.start_source import StartSource
 
 LOOK_PERIOD = 0.1
 """Seconds between two looks whether something changed: an answer does not wait for diagnostics."""
 
 
-class PlannerNode(BaseNode):
-    """Plans from where the robot is to the active goal, the last ``goal_pose``.
+class PlannerNode(ManagedNode):
+    """Plans from where the robot is to the active goal: ``goal_pose``, or ``goal_poses``.
 
-    The active goal stays until the next ``goal_pose``, even if there is no plan for it. The node
-    plans for it again whenever the map, the ``initialpose``, the model or a parameter changes.
-    Triggers during planning are coalesced into one more plan with the latest inputs. A malformed
-    map, start or model is refused, and the one before it stays. A request that comes while the
-    first model is loaded waits for it.
+    The active goal stays until the next one comes, though there may be no plan. `ActiveGoal`
+    decides when the node plans for it again, and what it publishes. Triggers during planning are
+    coalesced into one more plan with the latest inputs. A malformed map, start or model is refused,
+    and the one before it stays. A request that comes while the first model is loaded waits for it.
+    While the node is not active, it refuses requests.
     """
 
     def __init__(self) -> None:
         super().__init__("planner", PARAMETERS)
-        self._map: OccupancyGrid | None = None
-        self._inflated: Future | None = None
-        self._inflate = Inflation()
-        self._goal: PoseStamped | None = None
-        self._planner: Planner | None = None
-        self._model_file = ""
         self._settings = self.settings()
-        self._worker = Worker(self)
-        # Maps must not wait for fields: 2000 x 2000 cells take over a second.
-        self._map_worker = Worker(self)
-        # While it loads, DDS discovers, and the node says what else is missing.
-        self._first_planner = self._worker.call(load_and_warm_up, self._settings.model)
-        self._model_is_due = True
-        self._display = FieldDisplay(self)
         self._report = Report(self)
-        self._logged: tuple[PoseStamped, object] | None = None
-        self._logged_map = ""
-        self._next_look = Future()
-        self._waits_for_start = False
+        self._worker, self._map_worker = Worker(self), Worker(self)
+        self._model = ModelSource(self, self._report, self._worker)
+        if self._settings.autostart:
+            # While it loads, DDS discovers, and the node says what else is missing.
+            self._model.load()
+        self._looks = Looks()
+        self._answering = 0
+        self._forget()
+        self.create_timer(LOOK_PERIOD, self._on_look, clock=STEADY)
+        self.add_post_set_parameters_callback(self._apply_parameters)
+        if self._settings.autostart:
+            self.start()
 
+    # Lifecycle
+
+    def _forget(self) -> None:
+        """Have no map and no goal, and refuse requests."""
+        self._is_configured = False
+        self._stopped = Future()
+        self._stop()
+        self._active, self._followed = ActiveGoal(), PathUnderWay()
+        self._logged: tuple[object, ...] = ()
+        self._waits_for_pose = False
+
+    def configure(self) -> None:
+        """Listen to the map and to where the robot is, and create what answers requests."""
+        self._display = FieldDisplay(self)
         self._plan_publisher = self.create_publisher(Path, "plan", LATCHED)
         # In a group of its own: triggers that come while it plans make it plan once more after.
         self._replan = self.create_guard_condition(
             self._plan_for_active_goal, MutuallyExclusiveCallbackGroup()
         )
-        self._start = StartSource(self, self._settings.start_source, self._on_start)
-        maps = self.create_subscription(OccupancyGrid, "map", self._on_map, LATCHED)
-        self._map_topic = maps.topic_name
-        self.get_logger().info(f"waiting for a map on {self._map_topic}")
-        self.create_subscription(PoseStamped, "goal_pose", self._on_goal_pose, 10)
+        self._frames = Frames(self)
+        self._start = self._start_source()
+        self._map = MapSource(self, self._report, self._map_worker, self._on_map)
+        self._forecast = Forecast(self._map.times, self._map_worker)
+        self._requests = Requests(
+            self._settings,
+            self._map,
+            self._start,
+            self._frames,
+            self._model,
+            self._worker,
+            self._looks,
+        )
+        self.create_subscription(PoseStamped, "goal_pose", lambda goal: self._on_goals([goal]), 10)
+        self.create_subscription(PoseArray, "goal_poses", self._on_goal_poses, 10)
         if self._settings.follow_trainer:
-            self.create_subscription(String, "trainer/model_saved", self._on_model_saved, LATCHED)
+            self.create_subscription(String, "trainer/model_saved", self._model.on_saved, LATCHED)
+            on_experience_saved: Any = self._map.on_experience_saved
+            self.create_subscription(
+                String,
+                "trainer/experience_saved",
+                on_experience_saved,
+                LATCHED,
+                callback_group=MutuallyExclusiveCallbackGroup(),  # it waits for a worker
+            )
         # Reentrant: a request that waits for its field does not keep out the others.
         self.create_service(
             GetPlan, "~/get_plan", self._on_get_plan, callback_group=ReentrantCallbackGroup()
         )
-        self.create_trigger("~/reload_model", self._on_reload_model)
-        self.create_timer(LOOK_PERIOD, self._on_look, clock=STEADY)
-        self.add_post_set_parameters_callback(self._apply_parameters)
+        self.create_trigger("~/reload_model", self._model.on_reload)
+        serve_nav2(self, self._is_active, self._plan_for_action, self._on_is_path_valid)
+        self._is_configured = True
+
+    def activate(self) -> None:
+        """Answer requests from now on."""
+        self._stopped = Future()
+        self._report.change()
         self._replan.trigger()
 
-    # Parameters and the model
+    def deactivate(self) -> None:
+        """Forget the active goal."""
+        self._active, self._followed = ActiveGoal(), PathUnderWay()
+        self._report.change()
+
+    def cleanup(self) -> None:
+        """Free the map, the model and its fields."""
+        self._forget()
+        self._report.forget()
+        self._frames.close()
+        del self._display, self._start, self._map, self._requests, self._forecast
+        self._model.forget()
+
+    async def prepare(self, transition: str) -> bool:
+        """Load the model before ``configure``; answer what waits before the node stops."""
+        if transition == "configure":
+            self._model.load()
+            await self._model.first()
+            return self._model.planner is not None
+        if transition in ("deactivate", "shutdown"):
+            self._stop()
+            while self._answering:
+                await self._looks.coming
+        return True
+
+    def _is_active(self) -> bool:
+        return not self._stopped.done()
+
+    def _stop(self) -> None:
+        """Answer all requests that wait, and those that come from now on, that it is not active."""
+        if self._is_active():
+            self._stopped.set_result(NOT_ACTIVE)
+
+    # Parameters
 
     def check_parameters(self, new: dict[str, Any]) -> None:
         """Check new values as `BaseNode` does, whether TF can be used, and load a new model."""
@@ -126,127 +173,61 @@ class PlannerNode(BaseNode):
 
     def _apply_parameters(self, parameters: list[Parameter]) -> None:
         settings = self._settings = self.settings()
+        if not self._is_configured:
+            return
         changed = {parameter.name for parameter in parameters}
         if "model" in changed:
-            self._use_planner(*self._candidate)
-        if self._planner is not None:
-            self._planner.cache_bytes = settings.field_cache_bytes
+            self._model.use(*self._candidate)
+        if self._model.planner is not None:
+            self._model.planner.cache_bytes = settings.field_cache_bytes
         if settings.start_source != self._start.name:
             # What the other source said, and what was refused of it, no longer counts.
             self._start.close()
             self._report.accept(self._start.topic)
-            self._start = StartSource(self, settings.start_source, self._on_start)
-        if self._map is not None and changed.intersection(MAP_PARAMETERS + BODY_PARAMETERS):
-            self._use_map(self._map)
+            self._start = self._requests.start = self._start_source()
+        self._requests.settings = settings
+        self._map.apply_parameters(changed)
+        self._active.restart()
         self._replan.trigger()
-
-    async def _first_model(self) -> None:
-        """Wait for the model of the start, and use it unless another one was set since."""
-        if not self._model_is_due:
-            return
-        try:
-            loaded = await self._first_planner
-            if self._model_is_due:
-                self._use_planner(*loaded)
-        except Exception as error:
-            if self._model_is_due:
-                self._model_is_due = False
-                reason = f"{str(error) or repr(error)}; or set the parameter 'model'"
-                self._report.refuse("model", reason)
-
-    def _use_planner(self, planner: Planner, model_file: str) -> None:
-        """Plan with it from now on."""
-        self._planner, self._model_file, self._model_is_due = planner, model_file, False
-        planner.cache_bytes = self._settings.field_cache_bytes
-        self._report.accept("model")
-        self._report.change()
-        self.get_logger().info(f"planning with the model {model_file}")
-
-    def _set_model(self, name: str) -> SetParametersResult:
-        return self.set_parameters([Parameter("model", Parameter.Type.STRING, name)])[0]
-
-    def _on_model_saved(self, message: String) -> None:
-        result = self._set_model(message.data)
-        if not result.successful:
-            self._report.refuse("model", f"the trainer's model was refused: {result.reason}")
-
-    def _on_reload_model(self) -> tuple[bool, str]:
-        result = self._set_model(self._settings.model)
-        if not result.successful:
-            self.get_logger().error(f"the model was not loaded again: {result.reason}")
-        return result.successful, result.reason or f"loaded {self._model_file}"
 
     # Map, start and goal
 
-    def _on_map(self, message: OccupancyGrid) -> None:
-        if not self._use_map(message):
-            return
-        if message.header.frame_id != self._frame():
+    def _on_map(self, frame_changed: bool) -> None:
+        if frame_changed:
             # What was refused for its frame may be right now.
             self._report.accept(self._start.topic)
-        self._map = message
-        self._report.change()
-        described = describe_map(message)
-        if described != self._logged_map:
-            self._logged_map = described
-            self.get_logger().info(f"map of {described}")
         self._replan.trigger()
 
-    def _use_map(self, message: OccupancyGrid) -> bool:
-        """Plan on it from now on, or refuse it."""
-        try:
-            self._grid = grid_from_message(message, *map(self.value, MAP_PARAMETERS))
-        except ValueError as error:
-            self._report.refuse("map", str(error))
-            return False
-        self._report.accept("map")
-        self._inflated = None
-        return True
-
-    def _inflated_map(self) -> Future:
-        """Return the map for the robot's body, which is computed for the first request."""
-        if self._inflated is None:
-            radius, weight = map(self.value, BODY_PARAMETERS)
-            # ROS accepts a value that is above the range by a millionth.
-            body = radius, min(weight, 1.0)
-            self._inflated = self._map_worker.call(self._inflate, self._grid, *body)
-        return self._inflated
+    def _start_source(self) -> StartSource:
+        return StartSource(self, self._settings.start_source, self._frames, self._on_start)
 
     def _on_start(self, message: PoseWithCovarianceStamped | Odometry) -> None:
         try:
-            due = self._start.take(message, self._frame())
+            due = self._start.take(message, self._map.frame)
         except ValueError as error:
             self._report.refuse(self._start.topic, str(error))
             return
         self._report.accept(self._start.topic)
         if due:
+            self._active.plan_at_once()
             self._replan.trigger()
 
-    def _start_pose(self, frame: str) -> PoseStamped:
-        settings = self._settings
-        return self._start.pose(frame, settings.robot_frame, settings.transform_tolerance)
+    def _on_goal_poses(self, message: PoseArray) -> None:
+        goals = [PoseStamped(header=message.header, pose=pose) for pose in message.poses]
+        if goals:
+            self._on_goals(goals)
+        else:
+            self._report.refuse("goal_poses", "the array has no pose; give one or more")
 
-    async def _known_start(self, frame: str) -> PoseStamped:
-        while True:
-            try:
-                return self._start_pose(frame)
-            except RequestError:
-                if not self._start.may_come:
-                    raise
-            await self._next_look
-
-    def _on_goal_pose(self, message: PoseStamped) -> None:
-        self._goal = message
+    def _on_goals(self, goals: list[PoseStamped]) -> None:
+        if not self._is_active():
+            self._report.note(NOT_ACTIVE)
+            self._report.log(NOT_ACTIVE)
+            return
+        self._report.accept("goal_poses")
+        self._active.set(goals)
         self._display.show_again()
         self._replan.trigger()
-
-    def _frame(self) -> str:
-        return self._map.header.frame_id if self._map is not None else ""
-
-    def _missing_map(self) -> str:
-        refused = self._report.refused.get("map")
-        because = f" ({refused})" if refused else ""
-        return f"no map was received on {self._map_topic} yet{because}; start a map server"
 
     # Planning
 
@@ -254,21 +235,27 @@ class PlannerNode(BaseNode):
         self, request: GetPlan.Request, response: GetPlan.Response
     ) -> GetPlan.Response:
         start = request.start if request.start.header.frame_id else None
-        header, outcome = await self._answer(start, request.goal, request.tolerance)
-        response.plan = _path(path_message, outcome, header, request.goal)
+        planning = self._requests.plan(start, [request.goal], request.tolerance)
+        header, outcome = await self._answer(planning, [request.goal])
+        response.plan = _path(path_message, outcome, header)
         self._report.log(outcome)
         return response
 
     async def _plan_for_active_goal(self) -> None:
-        await self._first_model()
-        goal = self._goal
-        if goal is None:
+        await self._model.first()
+        goals = self._active.poses
+        if not goals:
             return
-        header, outcome = await self._answer(None, goal, self._settings.tolerance)
-        self._plan_publisher.publish(_path(serialized_path, outcome, header, goal))
-        self._waits_for_start = outcome.status == "NO_START"
+        self._active.begin(self._settings.replan_period)
+        planning = self._requests.plan(None, goals, self._settings.tolerance, self._active)
+        header, outcome = await self._answer(planning, goals)
+        if outcome in (UNCHANGED, NOT_ACTIVE):
+            return
+        if self._active.is_news(outcome, header.frame_id):
+            self._plan_publisher.publish(_path(serialized_path, outcome, header))
+        self._waits_for_pose = outcome.status in ("NO_START", "TF_ERROR")
         # The places and lengths in the reason may differ.
-        logged = goal, (outcome.status, outcome.plan.method)
+        logged = goals, outcome.goal, outcome.status, outcome.plan.method
         if self._logged != logged:
             self._logged = logged
             self._report.log(outcome)
@@ -280,108 +267,91 @@ class PlannerNode(BaseNode):
             shown = Shown(outcome.planner, request.grid, field_goal, rule, header)
             self._display.show(shown)
 
+    async def _plan_for_action(
+        self, start: PoseStamped | None, goals: list[PoseStamped], planner_id: str, given_up: Future
+    ) -> tuple[Path, Outcome]:
+        planning = self._requests.plan(
+            start,
+            goals,
+            self._settings.tolerance,
+            planner_id=planner_id,
+            followed=self._followed,
+        )
+        header, outcome = await self._answer(planning, goals, given_up)
+        if len(outcome.plan.path):
+            self._plan_publisher.publish(_path(serialized_path, outcome, header))
+        self._report.log(outcome)
+        return _path(path_message, outcome, header), outcome
+
+    async def _on_is_path_valid(self, request: Any, response: Any) -> Any:
+        """Answer Nav2's IsPathValid: whether the robot can drive the rest of a path."""
+        response.is_valid = False
+        try:
+            checking = self._requests.is_path_valid(request.path)
+            response.is_valid = await Unless(checking, self._stopped) is True
+        except RequestError as error:
+            self.get_logger().warning(f"no path to check: {error}")
+        return response
+
     async def _answer(
-        self, start: PoseStamped | None, goal: PoseStamped, tolerance: float
+        self, planning: Coroutine[None, None, Outcome], goals: list[PoseStamped], *given_up: Future
     ) -> tuple[Header, Outcome]:
         """Return the path's header, and what became of the request.
+
+        For the active goal that may be `UNCHANGED`. Without an answer, the request is given up as
+        soon as the node is stopped, or one of the futures has an outcome.
 
         A path is planned with the map, model and parameters that are there when this begins,
         whatever changes while it waits. Its stamp is the time of the answer.
         """
-        frame = self._frame() or goal.header.frame_id
+        frame = self._map.frame or (goals[0].header.frame_id if goals else "")
+        self._answering += 1
         try:
-            outcome = await self._plan(start, goal, tolerance)
+            outcome = await Unless(planning, self._stopped, *given_up)
         except RequestError as error:
             outcome = Outcome(error.status, str(error))
         except Exception as error:  # as when no memory is left: the node must survive
             remedy = "give a smaller map, or another model"
             outcome = Outcome("FAILED", f"the planning failed ({error!r}); {remedy}")
-        self._report.note(outcome)
+        finally:
+            self._answering -= 1
+        if outcome is not UNCHANGED:
+            self._report.note(outcome)
         return Header(stamp=self.get_clock().now().to_msg(), frame_id=frame), outcome
-
-    async def _plan(
-        self, start: PoseStamped | None, goal: PoseStamped, tolerance: float
-    ) -> Outcome:
-        checked("INVALID_GOAL", check_pose, "the goal", goal.header, goal.pose, self._frame())
-        map_message, settings = self._map, self._settings
-        if map_message is None:
-            raise RequestError("NO_MAP", self._missing_map())
-        inflated = self._inflated_map()
-        await self._first_model()
-        planner = self._planner
-        if planner is None:
-            raise RequestError("NO_MODEL", f"no model is loaded: {self._report.refused['model']}")
-        frame = map_message.header.frame_id
-        if start is None:
-            start = await self._known_start(frame)
-        grid: GridMap = await inflated
-
-        def cell(status: str, name: str, stamped: PoseStamped) -> Cell:
-            pose = stamped.header, stamped.pose
-            found: Cell = checked(status, cell_from_pose, name, *pose, grid, frame)
-            return found
-
-        request = PlanRequest(
-            grid,
-            tolerance=checked("INVALID_TOLERANCE", check_tolerance, tolerance) / grid.resolution,
-            start=cell("INVALID_START", "the start", start),
-            goal=cell("INVALID_GOAL", "the goal", goal),
-            move_rule=self._move_rule(settings, planner),
-            method=PlanMethod(settings.mode),
-            simplified=settings.path_simplification == "line_of_sight",
-        )
-        steps = planner.steps(request)
-        plan = next(steps)
-        if plan is None:  # a slow step follows
-            plan = await self._worker.call(last_step, steps)
-        reason = reason_of(request, plan, start, goal, settings.robot_radius)
-        stamp = seconds(map_message.header.stamp)
-        return Outcome(plan.status.name, reason, planner, request, plan, stamp)
-
-    @staticmethod
-    def _move_rule(settings: SimpleNamespace, planner: Planner) -> MoveRule:
-        return MoveRule(settings.move_rule or planner.metadata.move_rule)
 
     # Diagnostics
 
     def _on_look(self) -> None:
         self._report.log_paths()
-        looked, self._next_look = self._next_look, Future()
-        looked.set_result(None)
-        if self._waits_for_start and self._start.name == "tf":
+        self._looks.next()
+        if self._is_configured:
+            self._start.transform(self._map.frame)
+        if self._waits_for_pose and self._active.poses:
             with suppress(RequestError):
-                self._start_pose(self._frame())
-                self._waits_for_start = False
+                self._requests.look(self._active.poses)
+                self._waits_for_pose = False
                 self._replan.trigger()
+        if self._active.is_look_due():
+            self._replan.trigger()
+        if self._is_configured and self._forecast.look(self._report.outcome):
+            self._report.change()
         if self._report.is_due:
-            missing = [self._missing_map()] if self._map is None else []
-            missing += ["the model is being loaded"] if self._model_is_due else []
-            fatal = self._planner is None and not self._model_is_due
-            self._report.publish(fatal, "; ".join(missing), self._describe())
+            missing = [NOT_ACTIVE.reason] if not self._is_active() else []
+            missing += [self._map.missing] if self._is_configured else []
+            missing += ["the model is being loaded"] if self._model.is_loading else []
+            fatal = self._model.planner is None and "model" in self._report.refused
+            self._report.publish(fatal, "; ".join(filter(None, missing)), self._describe())
 
     def _describe(self) -> dict[str, str]:
-        description = {"model": self._settings.model}
-        if self._planner is not None:
-            rule = self._move_rule(self._settings, self._planner)
-            description |= {"model file": self._model_file, "move rule": rule.value}
-            metadata = self._planner.metadata
-            description["model move rule"] = metadata.move_rule.value
-            sizes = metadata.sizes.items()
-            description["model sizes"] = ", ".join(f"{key} {size}" for key, size in sizes)
-            description["model training steps"] = str(metadata.steps)
-            certificate = certificate_of(self._planner.network, metadata.move_rule)
-            description["model certificate"] = str(certificate or NO_CERTIFICATE)
-        if self._map is not None:
-            description["map"] = describe_map(self._map)
-            description["map stamp (s)"] = seconds(self._map.header.stamp)
-        return description
+        of_map = self._map.describe() | self._forecast.describe() if self._is_configured else {}
+        return {"state": self.state, **self._model.describe(self._settings.move_rule), **of_map}
 
 
-def _path(make: Callable[..., Any], outcome: Outcome, header: Header, goal: PoseStamped) -> Any:
+def _path(make: Callable[..., Any], outcome: Outcome, header: Header) -> Any:
     """Return the path of an outcome, or an empty one, made by a function of `conversions`."""
-    if outcome.request is None:
+    if outcome.request is None or outcome.goal is None:
         return Path(header=header)
-    return make(outcome.plan.cells, outcome.request.grid, header, goal.pose.orientation)
+    return make(outcome.plan.path, outcome.request.grid, header, outcome.goal.pose.orientation)
 
 
 def main() -> NoReturn:

@@ -7,9 +7,14 @@ from typing import Final
 from ddqn_planner.grid import MoveRule
 from ddqn_planner.nodes.runtime import Declared
 from ddqn_planner.planning import PlanMethod
-from ddqn_planner.planning.planner import CACHE_BYTES
+from ddqn_planner.planning.field_cache import CACHE_BYTES
 
 PARAMETERS: Final = {
+    "autostart": Declared(
+        True,
+        "Whether the node configures and activates itself; else a lifecycle manager does it",
+        read_only=True,
+    ),
     "model": Declared(
         "any_map",
         "Name of a shipped model, or path of a model file",
@@ -19,6 +24,14 @@ PARAMETERS: Final = {
         "",
         "Which diagonal moves are legal; '' for the rule of the model",
         ["", *(rule.value for rule in MoveRule)],
+    ),
+    "map_type": Declared(
+        "map",
+        "How the map's values are read: as a map's, or as a costmap's of Nav2",
+        ["map", "costmap"],
+    ),
+    "require_directions": Declared(
+        False, "Whether to wait for map_directions even if no node publishes them"
     ),
     "occupied_threshold": Declared(
         65, "A cell of this value or more is occupied, percent", (1, 100)
@@ -43,6 +56,18 @@ PARAMETERS: Final = {
         "How far a goal_pose that is occupied or cut off may move to a reachable free cell, metres",
         (0, 1000),
     ),
+    "replan_period": Declared(
+        1.0,
+        "How soon the path to the goal_pose follows a changed map or a moving robot while it is "
+        "not blocked, seconds; 0: with each map",
+        (0, 3600),
+    ),
+    "switch_threshold": Declared(
+        0.05,
+        "How much more the path under way may cost than a new one and still be kept, as a share; "
+        "~/get_plan always has the new one",
+        (0, 10),
+    ),
     "mode": Declared(
         "greedy",
         "Whether to search where the greedy steps are trapped: astar_fallback",
@@ -60,14 +85,23 @@ PARAMETERS: Final = {
     ),
     "robot_frame": Declared("base_link", "The robot's frame, for the start_source tf", "not empty"),
     "transform_tolerance": Declared(
-        0.3, "Maximum age of a transform, for the start_source tf, seconds", (0, 1000)
+        0.3,
+        "Maximum age of a transform, for the start_source tf, and how long a request waits for the "
+        "transform of a pose in another frame than the map's, seconds",
+        (0, 1000),
     ),
     "field_cache_bytes": Declared(
         CACHE_BYTES,
         "Memory for the Q fields in the cache, bytes; the last one is always kept",
         (0, 2**40),
     ),
+    "planner_id": Declared(
+        "GridBased", "The planner_id that Nav2's requests may name, beside the empty one"
+    ),
     "follow_trainer": Declared(
-        False, "Whether to load each model that trainer/model_saved names", read_only=True
+        False,
+        "Whether to load each model that trainer/model_saved names, and to plan by expected time "
+        "with what trainer/experience_saved names",
+        read_only=True,
     ),
 }

@@ -20,13 +20,16 @@ from ddqn_planner.planning import Plan, PlanMethod, Planner, PlanRequest, PlanSt
 PERIOD = 1.0
 """Seconds between two diagnostics when nothing changes."""
 
+TOLERANCE = ", or a greater tolerance"
+"""The part of a remedy that does not help with several goals: none of them moves."""
+
 REMEDIES = {
     PlanStatus.START_OUTSIDE_MAP: "set the start on the map",
     PlanStatus.GOAL_OUTSIDE_MAP: "set the goal on the map",
     PlanStatus.START_OCCUPIED: "set the start on a free cell",
-    PlanStatus.GOAL_OCCUPIED: "set the goal on a free cell, or a greater tolerance",
+    PlanStatus.GOAL_OCCUPIED: f"set the goal on a free cell{TOLERANCE}",
     PlanStatus.MAP_SIZE_UNSUPPORTED: "set the parameter 'model' to one trained for this size",
-    PlanStatus.NO_PATH: "set the goal where free cells lead to, or a greater tolerance",
+    PlanStatus.NO_PATH: f"set the goal where free cells lead to{TOLERANCE}",
     PlanStatus.ROLLOUT_TRAPPED: "train the model longer, or set mode to 'astar_fallback'",
 }
 
@@ -59,6 +62,8 @@ class Outcome:
         The name of a `PlanStatus`, or that of a `RequestError`.
     reason : str
         What a user reads: how the path was found, or why there is none and what to do.
+    goal : PoseStamped or None
+        The pose of the goal in the map's frame.
     map_stamp : str
         The stamp of the map of the request, seconds; empty without a map.
     """
@@ -68,7 +73,16 @@ class Outcome:
     planner: Planner | None = None
     request: PlanRequest | None = None
     plan: Plan = NO_PLAN
+    goal: PoseStamped | None = None
     map_stamp: str = ""
+
+
+NO_REQUEST = Outcome("NO_REQUEST", "no plan was asked for yet")
+NOT_ACTIVE = Outcome(
+    "NOT_ACTIVE",
+    "the node is not active; configure and activate it, with a lifecycle manager or "
+    "`ros2 lifecycle set`",
+)
 
 
 def reason_of(
@@ -78,22 +92,33 @@ def reason_of(
 
     `start` and `goal` are the poses of the request, and `robot_radius` inflated its map.
     """
-    grid = request.grid
+    grid, goals = request.grid, request.goals
     if plan.status is not PlanStatus.SUCCEEDED:
+        status, remedy = plan.status.value, REMEDIES[plan.status]
+        to = f"goal: {_place(goal, request.goal)}"
+        if request.others:
+            status = f"no path to any of {len(goals)} goals: {status}"
+            remedy = remedy.removesuffix(TOLERANCE)
+            to = f"goals: cells {', '.join(map(str, goals[:5]))}{', ...' * (len(goals) > 5)}"
         reason = (
-            f"{plan.status.value} (start: {_place(start, request.start)}; "
-            f"goal: {_place(goal, request.goal)}; map: {grid.width} x {grid.height} cells)"
+            f"{status} (start: {_place(start, request.start)}; {to}; "
+            f"map: {grid.width} x {grid.height} cells)"
         )
-        if plan.status is PlanStatus.GOAL_OCCUPIED and not grid.is_obstacle(request.goal):
-            reason += f", nearer to an obstacle than robot_radius, {robot_radius:g} m"
-        return f"{reason}; {REMEDIES[plan.status]}"
-    reason = f"a path of {plan.length:.2f} cells, " + (
+        on_map = filter(grid.contains, goals)
+        if plan.status is PlanStatus.GOAL_OCCUPIED and not all(map(grid.is_obstacle, on_map)):
+            near = f"robot_radius, {robot_radius:g} m" if robot_radius else "the costmap allows"
+            reason += f", nearer to an obstacle than {near}"
+        return f"{reason}; {remedy}"
+    number = f" to goal {goals.index(plan.goal) + 1} of {len(goals)}" if request.others else ""
+    reason = f"a path of {plan.length:.2f} cells{number}, " + (
         "by greedy steps"
         if plan.method is PlanMethod.GREEDY
         else "searched for in the order of the Q field: the greedy steps were trapped"
     )
-    if plan.cells[-1] != request.goal:
-        metres = math.dist(plan.cells[-1], request.goal) * grid.resolution
+    if plan.extra_cost:
+        reason += f", kept: its cost is {plan.extra_cost:+.1%} beside that of a new one"
+    if plan.goal is not None and plan.goal not in goals:
+        metres = math.dist(plan.goal, request.goal) * grid.resolution
         why = "is cut off" if grid.is_free(request.goal) else "is occupied"
         reason += f"; the goal {why} and moved {metres:.3g} m"
     return reason
@@ -119,7 +144,7 @@ class Report:
 
     def __init__(self, node: BaseNode) -> None:
         self.refused: dict[str, str] = {}
-        self._outcome = Outcome("NO_REQUEST", "no plan was asked for yet")
+        self._outcome = NO_REQUEST
         self._node = node
         self._publisher = node.create_publisher(DiagnosticArray, "/diagnostics", 10)
         self._to_be_logged: list[str] = []
@@ -142,6 +167,17 @@ class Report:
         if self.refused.pop(what, None):
             self.change()
 
+    def forget(self) -> None:
+        """Forget what was refused, and the last outcome."""
+        self.refused.clear()
+        self._outcome = NO_REQUEST
+        self.change()
+
+    @property
+    def outcome(self) -> Outcome:
+        """The last outcome."""
+        return self._outcome
+
     def note(self, outcome: Outcome) -> None:
         """Store the last outcome for the diagnostics."""
         self._outcome = outcome
@@ -149,7 +185,7 @@ class Report:
 
     def log(self, outcome: Outcome) -> None:
         """Log a failure at once, and a path after its answer, which comes 1.2 times as fast."""
-        if outcome.plan.cells:
+        if outcome.plan.path.size:
             self._to_be_logged.append(outcome.reason)
         else:
             self.log_paths()
@@ -176,7 +212,7 @@ class Report:
         problems = [f"{what} refused: {reason}" for what, reason in self.refused.items()]
         if missing and missing != outcome.reason:
             problems.append(missing)
-        good = not problems and (plan.cells or outcome.status == "NO_REQUEST")
+        good = not problems and (plan.path.size or outcome.status == "NO_REQUEST")
         level = DiagnosticStatus.OK if good else DiagnosticStatus.WARN
         if fatal:
             level = DiagnosticStatus.ERROR

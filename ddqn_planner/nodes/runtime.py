@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import json
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Coroutine, Generator, Mapping
+from concurrent.futures import Future as ConcurrentFuture
 from concurrent.futures import ThreadPoolExecutor
 from inspect import isawaitable
 from pathlib import Path
@@ -210,6 +211,11 @@ class Worker:
 
     def call(self, function: Callable[..., Any], *arguments: object) -> Future:
         """Return the future of a call; it has the exception if the function raises one."""
+        return self._submit(function, *arguments)[0]
+
+    def _submit(
+        self, function: Callable[..., Any], *arguments: object
+    ) -> tuple[Future, ConcurrentFuture[None]]:
         future = Future()
 
         def work() -> None:
@@ -219,8 +225,35 @@ class Worker:
                 future.set_exception(error)
             self._wake.trigger()
 
-        self._thread.submit(work)
-        return future
+        return future, self._thread.submit(work)
+
+    def close(self) -> None:
+        """Wait until all calls have ended; take no more."""
+        self._thread.shutdown()
+
+    async def run(self, function: Callable[..., Any], *arguments: object) -> Any:
+        """Return the result of a call, which is left out if the caller gives it up before."""
+        future, work = self._submit(function, *arguments)
+        try:
+            return await future
+        finally:
+            work.cancel()
+
+
+class Unless:
+    """Await a coroutine; or as soon as a future is done, close it and have that future's result."""
+
+    def __init__(self, coroutine: Coroutine[None, None, Any], *given_up: Future) -> None:
+        self._coroutine, self._given_up = coroutine, given_up
+
+    def __await__(self) -> Generator[None, None, Any]:
+        while not any(future.done() for future in self._given_up):
+            try:
+                yield self._coroutine.send(None)
+            except StopIteration as end:
+                return end.value
+        self._coroutine.close()
+        return next(future.result() for future in self._given_up if future.done())
 
 
 HELP = """\

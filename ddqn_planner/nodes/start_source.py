@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import importlib.util
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from typing import Any
 
 from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped
@@ -12,20 +12,11 @@ from nav_msgs.msg import Odometry
 from rclpy.node import Node
 from rclpy.time import Time
 
-from ddqn_planner.nodes.conversions import check_pose
+from ddqn_planner.nodes.frames import Frames
 from ddqn_planner.nodes.report import RequestError
 
 PATIENCE = 1.0
 """Seconds within which the first message of `odom` or TF is expected after the node subscribes."""
-
-
-def check_tf() -> None:
-    """Raise a RuntimeError with the remedy if tf2_ros is not installed; PyPI does not have it."""
-    if importlib.util.find_spec("tf2_ros") is None:
-        raise RuntimeError(
-            "start_source is 'tf', which needs tf2_ros, and that is not installed: "
-            "apt install ros-jazzy-tf2-ros-py, or set start_source to 'initialpose' or 'odometry'"
-        )
 
 
 class StartSource:
@@ -36,22 +27,22 @@ class StartSource:
     node : Node
     name : str
         A value of the parameter ``start_source``; for ``tf`` see `check_tf`.
+    frames : Frames
     on_message : callable
         Called with each message, if the source is a topic.
     """
 
-    def __init__(self, node: Node, name: str, on_message: Callable[[Any], None]) -> None:
+    def __init__(
+        self, node: Node, name: str, frames: Frames, on_message: Callable[[Any], None]
+    ) -> None:
         self.name = name
         self.topic = "odom" if name == "odometry" else name
         self._node = node
+        self._frames = frames
         self._began = time.monotonic()
         self._pose: PoseStamped | None = None
         if name == "tf":
-            import tf2_ros
-
-            self._tf2_ros = tf2_ros
-            self._buffer = tf2_ros.Buffer()
-            self._listener = tf2_ros.TransformListener(self._buffer, node)
+            frames.listen()
         else:
             message_type = Odometry if self.topic == "odom" else PoseWithCovarianceStamped
             self._subscription = node.create_subscription(message_type, self.topic, on_message, 10)
@@ -62,16 +53,22 @@ class StartSource:
         Raises
         ------
         ValueError
-            If it is malformed or in another frame; the pose before it stays.
+            If it is malformed, or in another frame without TF; the pose before it stays.
         """
-        check_pose("the start", message.header, message.pose.pose, map_frame)
+        self._frames.check("the start", message.header, message.pose.pose, map_frame)
         # Odometry comes all the time: it only triggers a plan that waits for the first pose.
         due = self._pose is None or self.name == "initialpose"
         self._pose = PoseStamped(header=message.header, pose=message.pose.pose)
         return due
 
+    def transform(self, map_frame: str) -> None:
+        """Transform the last `initialpose` as soon as TF can: it forgets the times before."""
+        if self.name == "initialpose" and self._pose is not None and map_frame:
+            with suppress(RequestError):
+                self._pose = self._frames.to_map("the start", self._pose, map_frame)
+
     def pose(self, map_frame: str, robot_frame: str, tolerance: float) -> PoseStamped:
-        """Return the last pose; by TF that of `robot_frame`, at most `tolerance` seconds old.
+        """Return the last pose in its own frame; by TF, the map's, at most `tolerance` seconds old.
 
         Raises
         ------
@@ -94,8 +91,8 @@ class StartSource:
 
     def _transformed_pose(self, map_frame: str, robot_frame: str, tolerance: float) -> PoseStamped:
         try:
-            transform = self._buffer.lookup_transform(map_frame, robot_frame, Time())
-        except self._tf2_ros.TransformException as error:
+            transform = self._frames.lookup(map_frame, robot_frame)
+        except ValueError as error:
             raise RequestError(
                 "NO_START",
                 f"the start is unknown: no transform leads from {robot_frame!r} to {map_frame!r} "
@@ -125,6 +122,6 @@ class StartSource:
     def close(self) -> None:
         """Stop listening."""
         if self.name == "tf":
-            self._listener.unregister()
+            self._frames.close()
         else:
             self._node.destroy_subscription(self._subscription)

@@ -8,25 +8,23 @@ already answers; ``~/start`` waits for it, and the other services do not.
 from __future__ import annotations
 
 import importlib
-import itertools
 import queue
 import sys
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from contextlib import suppress
 from functools import partial
 from pathlib import Path as FilePath
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped
 from nav_msgs.msg import OccupancyGrid, Path
 from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.exceptions import InvalidParameterValueException
-from rclpy.timer import Timer
 from std_msgs.msg import Float32, Header, String
 
-from ddqn_planner.grid import Cell, GridMap, MoveRule, read_map_file
+from ddqn_planner.grid import Cell, MoveRule, read_map_file
 from ddqn_planner.nodes.conversions import (
     cell_from_pose,
     check_pose,
@@ -34,6 +32,9 @@ from ddqn_planner.nodes.conversions import (
     path_message,
     quaternion,
 )
+from ddqn_planner.nodes.driving import Driving
+from ddqn_planner.nodes.replay import Replay
+from ddqn_planner.nodes.robot_poses import MapInFrame, check_pose_source
 from ddqn_planner.nodes.runtime import LATCHED, STEADY, BaseNode, Worker, spin_until_shutdown
 from ddqn_planner.nodes.trainer_parameters import HYPER_PARAMETERS, PARAMETERS
 from ddqn_planner.resources import find_map
@@ -47,15 +48,10 @@ if TYPE_CHECKING:
 MAP_PARAMETERS = ("occupied_threshold", "allow_unknown")
 
 
-class MapInFrame(NamedTuple):
-    """A map, and the frame of its origin."""
-
-    grid: GridMap
-    frame: str
-
-
 class TrainerNode(BaseNode):
     """Trains on the last ``map`` from the last ``initialpose`` to the last ``goal_pose``.
+
+    Or with the parameter ``learn_from``, it learns from the robot's drives: see `Driving`.
 
     With the parameter ``map_file`` it takes all three from a map file, until others are published.
     A training keeps the map, start and goal with which it was started. Its folder holds a
@@ -72,15 +68,20 @@ class TrainerNode(BaseNode):
         self._stop = threading.Event()
         self._save = threading.Event()
         self._events: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()
-        self._replay_timer: Timer | None = None
+        self._replay = Replay(self, self._refuse)
         self._state, self._error, self._save_error = "idle", "", ""
 
         self._episode_publisher = self.create_publisher(Path, "~/episode", 10)
-        self._reward_publisher = self.create_publisher(Float32, "~/average_reward", 100)
-        self._saved_publisher = self.create_publisher(String, "~/model_saved", LATCHED)
         self._diagnostics_publisher = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
         self._read_map_file()
         self.create_subscription(OccupancyGrid, "map", self._on_map, LATCHED)
+        self.create_timer(1.0, self._publish_diagnostics, clock=STEADY)
+        self._driving: Driving | None = None
+        if self.value("learn_from") == "driving":
+            self._driving = Driving(self, self._replay, self._episode_publisher, lambda: self._map)
+            return
+        self._reward_publisher = self.create_publisher(Float32, "~/average_reward", 100)
+        self._saved_publisher = self.create_publisher(String, "~/model_saved", LATCHED)
         on_start, on_goal = (partial(self._on_pose, which) for which in ("start", "goal"))
         self.create_subscription(PoseWithCovarianceStamped, "initialpose", on_start, 10)
         self.create_subscription(PoseStamped, "goal_pose", on_goal, 10)
@@ -88,12 +89,12 @@ class TrainerNode(BaseNode):
         for name in ("start", "stop", "save", "replay"):
             self.create_trigger(f"~/{name}", getattr(self, f"_on_{name}"), callback_group=group)
         self.create_timer(0.1, self._on_events, clock=STEADY)
-        self.create_timer(1.0, self._publish_diagnostics, clock=STEADY)
         self._imported = Worker(self).call(import_training)
 
     def check_parameters(self, new: dict[str, Any]) -> None:
         """Check new values as `BaseNode` does, and hyper-parameters together: some limit others."""
         super().check_parameters(new)
+        check_pose_source(new.get("pose_source", ""))
         self._hyper_parameters(new)
 
     def _hyper_parameters(self, new: dict[str, Any]) -> HyperParameters:
@@ -201,7 +202,7 @@ class TrainerNode(BaseNode):
         return FilePath(self.value("output_folder")).absolute()
 
     def _on_stop(self) -> tuple[bool, str]:
-        replay = "; the replay was stopped" if self._stop_replay() else ""
+        replay = "; the replay was stopped" if self._replay.stop() else ""
         if not self._is_training():
             return True, f"no training was running{replay}"
         self._stop.set()
@@ -250,7 +251,7 @@ class TrainerNode(BaseNode):
 
     def _on_episode(self, episode: Episode, place: MapInFrame) -> None:
         self._reward_publisher.publish(Float32(data=episode.average_reward))
-        if episode.number % self.value("episode_interval") == 0 and self._replay_timer is None:
+        if episode.number % self.value("episode_interval") == 0 and not self._replay.is_running:
             self._publish_cells(episode.cells, place)
 
     def _on_saved(self, run: TrainingRun, step: int) -> None:
@@ -274,6 +275,9 @@ class TrainerNode(BaseNode):
         self._episode_publisher.publish(path_message(cells, place.grid, header, quaternion(0)))
 
     def _publish_diagnostics(self) -> None:
+        if self._driving is not None:
+            self._diagnostics_publisher.publish(self._driving.diagnostics())
+            return
         error = self._save_error or self._error
         level = DiagnosticStatus.ERROR if error else DiagnosticStatus.OK
         values = {"state": self._state}
@@ -301,47 +305,14 @@ class TrainerNode(BaseNode):
         place = self._run_map if is_of_run else self._map
         if place is None:
             return False, "no map was received yet; start a map server first"
-        try:
-            episodes = read_cells(file, self.value("episode_interval"))
-            first = next(episodes, None)
-        except OSError as error:
-            return False, f"no recorded episodes ({error}); call ~/start first"
-        if first is None:
-            return False, f"{file} holds no episode to replay yet; train on"
-        self._stop_replay()
-        # Each episode step by step: its first cell, its first two, and so on.
-        frames = (
-            cells[: count + 1]
-            for cells in itertools.chain([first], episodes)
-            for count in range(len(cells))
-        )
-        self._replay_timer = self.create_timer(
-            self.value("replay_period"),
-            partial(self._replay_step, frames, place),
-            clock=STEADY,
-        )
-        return True, "replaying the recorded episodes on ~/episode"
-
-    def _replay_step(self, frames: Iterator[tuple[Cell, ...]], place: MapInFrame) -> None:
-        try:
-            frame = next(frames, None)
-        except OSError as error:
-            self._refuse(f"the replay ends: episodes.csv can no longer be read ({error})")
-            frame = None
-        if frame is None:
-            self._stop_replay()
-        else:
-            self._publish_cells(frame, place)
-
-    def _stop_replay(self) -> bool:
-        """Stop a replay; return whether there was one."""
-        timer, self._replay_timer = self._replay_timer, None
-        if timer is not None:
-            self.destroy_timer(timer)
-        return timer is not None
+        episodes = read_cells(file, self.value("episode_interval"))
+        draw = partial(self._publish_cells, place=place)
+        return self._replay.start(file, episodes, draw, "train on")
 
     def destroy_node(self) -> None:
-        """Let the training save and end, then destroy the node."""
+        """Let the training or the recording save and end, then destroy the node."""
+        if self._driving is not None:
+            self._driving.close()
         self._stop.set()
         if self._thread is not None:
             self._thread.join()

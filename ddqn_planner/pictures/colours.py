@@ -9,6 +9,7 @@ from PIL import ImageColor
 OBSTACLE_COLOUR = "#22223b"
 PATH_COLOUR = "#d1495b"
 EPISODE_COLOUR = "#edae49"
+DIRECTION_COLOUR = "#6c757d"
 
 VALUE_COLOURS = ("#f4f1de", "#cfe8dc", "#93cfc8", "#4fa3b5")
 """From the worst value to the best: light to dark, so that the order shows without colours too.

@@ -9,8 +9,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ddqn_planner.grid import Cell, GridMap
+from ddqn_planner.grid import LENGTHS, MOVES, Cell, GridMap
 from ddqn_planner.pictures.colours import (
+    DIRECTION_COLOUR,
     MAX_SIDE_WITH_LINES,
     OBSTACLE_COLOUR,
     PATH_COLOUR,
@@ -21,13 +22,28 @@ MAX_TEXT_WIDTH = 64
 """Cells of the widest map that is worth printing as text: a cell takes two characters."""
 
 
+MAX_ARROWS = 48
+"""Arrows of one-way zones along the longest side of a map."""
+
+ONE_WAY = 1e-9
+"""The mean direction of a cell that is not one-way is shorter than this."""
+
+
 class PictureError(ImportError):
     """A picture cannot be drawn; the message says what is missing."""
 
 
 def draw_text(grid: GridMap, cells: Sequence[Cell]) -> str:
-    """Return the map as text, y upwards: ``#`` occupied, ``.`` free, ``*`` path, ``S``, ``G``."""
-    letters = np.where(grid.occupancy, "#", ".")
+    """Return the map as text, y upwards: ``#`` occupied, ``.`` free, ``*`` path, ``S``, ``G``.
+
+    Free cells of one-way zones are ``>``, ``^``, ``<`` or ``v``, after their mean direction.
+    """
+    letters = np.full(grid.occupancy.shape, ".")
+    if grid.forbidden is not None:
+        x, y = mean_directions(grid.forbidden)
+        quarter = np.rint(np.arctan2(y, x) / (np.pi / 2)).astype(np.int64)
+        letters = np.where(np.hypot(x, y) > ONE_WAY, np.array(list(">^<v"))[quarter], letters)
+    letters[grid.occupancy] = "#"
     for x, y in cells:
         letters[y, x] = "*"
     for letter, (x, y) in zip("SG", (*cells[:1], *cells[-1:]), strict=False):
@@ -43,7 +59,7 @@ def save_picture(
     title: str,
     value_label: str = "value: max Q(s, a)",
 ) -> None:
-    """Draw map, value field and path into a picture file.
+    """Draw map, value field and path into a picture file, and arrows in one-way zones.
 
     Parameters
     ----------
@@ -95,7 +111,7 @@ def save_picture(
 
 
 def draw_obstacles(axes: Any, grid: GridMap) -> None:
-    """Draw the occupied cells of a map into matplotlib axes, and lines between its cells."""
+    """Draw a map's occupied cells and one-way zones into matplotlib axes, and lines of cells."""
     from matplotlib.colors import ListedColormap
 
     occupied = np.where(grid.occupancy, 1.0, np.nan)
@@ -106,6 +122,26 @@ def draw_obstacles(axes: Any, grid: GridMap) -> None:
         axes.set_yticks(np.arange(-0.5, grid.height), minor=True)
         axes.grid(which="minor", color="white", linewidth=0.8)
         axes.tick_params(which="minor", length=0)
+    if grid.forbidden is not None:
+        _draw_directions(axes, grid, grid.forbidden)
+
+
+def mean_directions(forbidden: NDArray[np.uint8]) -> NDArray[np.float64]:
+    """Return (2, H, W) float64: the sum of the legal directions of each cell, x and y."""
+    legal = (forbidden >> np.arange(len(MOVES))[:, None, None] & 1) == 0
+    directions: NDArray[np.float64] = np.tensordot((MOVES / LENGTHS[:, None]).T, legal, 1)
+    return directions
+
+
+def _draw_directions(axes: Any, grid: GridMap, forbidden: NDArray[np.uint8]) -> None:
+    step = -(-max(grid.width, grid.height) // MAX_ARROWS)
+    directions = mean_directions(forbidden)
+    shown = (np.hypot(*directions) > ONE_WAY) & ~grid.occupancy
+    y, x = np.nonzero(shown[::step, ::step])
+    along = directions[:, y * step, x * step]
+    along *= 0.8 * step / np.hypot(*along)
+    style = {"pivot": "middle", "angles": "xy", "scale_units": "xy", "scale": 1}
+    axes.quiver(x * step, y * step, *along, color=DIRECTION_COLOUR, width=0.002, **style)
 
 
 def _draw_path(axes: Any, cells: Sequence[Cell]) -> None:

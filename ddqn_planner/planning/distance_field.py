@@ -9,10 +9,10 @@ from typing import TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from ddqn_planner.grid import Cell, GridMap, MoveRule, legal_moves
+from ddqn_planner.grid import Cell, GridMap, MoveRule
 from ddqn_planner.model.move_costs import MoveCosts
 from ddqn_planner.planning.plan import Plan, PlanStatus
-from ddqn_planner.planning.q_field import QField, check_inside
+from ddqn_planner.planning.q_field import Goals, QField, check_inside
 
 FieldArrays: TypeAlias = tuple[NDArray[np.float64], NDArray[np.uint8], NDArray[np.int32]]
 """The distances, (C,); the states of the cells, (C,); the open cells, (N,). See `wavefront`."""
@@ -28,33 +28,36 @@ class DistanceField(QField):
 
     Parameters
     ----------
-    goal : (x, y)
-        A free cell.
+    goals : tuple of (x, y)
+        Free cells. Paths lead to the nearest one; `goal` is the first.
     grid : GridMap
     costs : MoveCosts
         Of this map under the move rule.
     move_rule : MoveRule
     """
 
-    def __init__(self, goal: Cell, grid: GridMap, costs: MoveCosts, move_rule: MoveRule) -> None:
-        from ddqn_planner.model import wavefront
+    def __init__(self, goals: Goals, grid: GridMap, costs: MoveCosts, move_rule: MoveRule) -> None:
+        from ddqn_planner.model import field_values, wavefront
 
-        self.wavefront = wavefront
-        self.goal, self.grid, self.costs, self.move_rule = goal, grid, costs, move_rule
+        self.wavefront, self.field_values = wavefront, field_values
+        self.grid, self.costs, self.move_rule = grid, costs, move_rule
+        self.goal, self.goals = goals[0], goals
         self.lock = threading.RLock()
         self.is_whole = False
-        # After a repair the distance of a closed cell may be too great, until `_reach` is called.
+        # After a repair the distance of a closed cell may be too great, until `reach` is called.
         self.closed_is_final = True
 
     @cached_property
     def arrays(self) -> FieldArrays:
-        """What is known, at first the goal alone."""
-        return self.wavefront.new_field(self.costs.patch.size, self._number(self.goal))
+        """What is known, at first the goals alone."""
+        cells = self.costs.patch.size
+        roots = np.array([self._number(goal) for goal in self.goals], np.int32)
+        return self.wavefront.begun(np.zeros(cells), np.zeros(cells, np.uint8), roots)
 
     def _number(self, cell: Cell) -> int:
         return (cell[1] + 1) * self.costs.width + cell[0] + 1
 
-    def hand_over(self) -> FieldArrays:
+    def forget(self) -> FieldArrays:
         """Return what is known, and begin anew."""
         with self.lock:
             arrays = self.arrays
@@ -62,7 +65,12 @@ class DistanceField(QField):
             self.is_whole, self.closed_is_final = False, True
             return arrays
 
-    def _reach(self, start: Cell, limit: int | None = None) -> bool:
+    @property
+    def has_values_of_all(self) -> bool:
+        """Whether values of the whole map were asked for."""
+        return not self.__dict__.keys().isdisjoint(("q", "value", "policy"))
+
+    def reach(self, start: Cell, limit: int | None = None) -> bool:
         """Compute the field as far as a start needs it; return whether its distance is known."""
         distance, state, opened = self.arrays
         number, closed, done = self._number(start), self.wavefront.CLOSED, True
@@ -86,7 +94,7 @@ class DistanceField(QField):
             self.lock.release()
 
     def rollout(self, start: Cell, limit: int | None = None) -> Plan:
-        """Take greedy steps from a free cell until the goal, and return the path.
+        """Take greedy steps from a free cell until a goal, and return the path.
 
         Parameters
         ----------
@@ -102,13 +110,11 @@ class DistanceField(QField):
         """
         start = check_inside(start, (self.grid.height, self.grid.width))
         with self.lock:
-            if not self._reach(start, limit):
+            if not self.reach(start, limit):
                 status = PlanStatus.NO_PATH if self.is_whole else PlanStatus.ROLLOUT_TRAPPED
                 return Plan(status, move_rule=self.move_rule)
-            numbers = self.wavefront.roll_out(self.arrays[0], self.costs, self._number(start))
-        y, x = np.divmod(numbers, np.int32(self.costs.width))
-        cells = tuple(zip((x - 1).tolist(), (y - 1).tolist(), strict=True))
-        return Plan(PlanStatus.SUCCEEDED, cells, move_rule=self.move_rule)
+            path = self.field_values.roll_out(self.arrays[0], self.costs, self._number(start))
+        return Plan(PlanStatus.SUCCEEDED, path, move_rule=self.move_rule)
 
     def _whole(self) -> NDArray[np.float64]:
         """Return the distance of every cell of the padded map, 0 where there is none: (C,)."""
@@ -123,12 +129,12 @@ class DistanceField(QField):
     def q(self) -> NDArray[np.float32]:  # type: ignore[override]
         """(8, H, W) float32: Q(s, a); -inf where no path to the goal begins with the action."""
         with self.lock:
-            return self.wavefront.q_of(self._whole(), self.costs)
+            return self.field_values.q_of(self._whole(), self.costs)
 
     @cached_property
     def legal(self) -> NDArray[np.bool_]:  # type: ignore[override]
         """(8, H, W) bool: the legal moves."""
-        return legal_moves(self.grid.occupancy, self.move_rule)
+        return self.grid.legal_moves(self.move_rule)
 
     @cached_property
     def value(self) -> NDArray[np.float32]:
@@ -137,15 +143,16 @@ class DistanceField(QField):
             distance = self._whole().reshape(-1, self.costs.width)[1:-1, 1:-1]
             value = np.negative(distance, dtype=np.float32, casting="same_kind")
             value[value == 0] = -np.inf
-        value[self.goal[1], self.goal[0]] = -np.inf
-        value[self.goal[1], self.goal[0]] = value.max()
+        x, y = np.transpose(self.goals)
+        value[y, x] = -np.inf
+        value[y, x] = value.max()
         return value
 
     @cached_property
     def policy(self) -> NDArray[np.int8]:
         """(H, W) int8: the action of a rollout in each cell; -1 without one."""
         with self.lock:
-            return self.wavefront.policy_of(self._whole(), self.costs)
+            return self.field_values.policy_of(self._whole(), self.costs)
 
     @property
     def nbytes(self) -> int:

@@ -46,7 +46,7 @@ def take_back(
     (M,) int32
         The cells that it opened.
     bool
-        Whether the limit was kept; if not, the field is of no more use.
+        Whether the limit was kept; if not, the field is as it was.
     """
     patch, table, value, terms, width = costs[:5]
     offsets = MOVE_Y * width + MOVE_X
@@ -73,6 +73,8 @@ def take_back(
         state[cell] |= MARKED
         lost.append(cell)
         if len(lost) > limit:
+            for lost_cell in lost:
+                state[lost_cell] ^= MARKED
             return changed[:0], False
         for action in range(8):
             before = cell - offsets[action]

@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
 from enum import Enum
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
 
 from ddqn_planner.grid import Cell, GridMap, MoveRule, path_length
-from ddqn_planner.grid.arguments import Choice
+from ddqn_planner.grid.arguments import Cells, Choice
 
 
 class PlanStatus(str, Enum):
@@ -47,6 +52,13 @@ class PlanRequest:
         that a path reaches.
     simplified : bool
         Whether to leave out cells, see `simplify`.
+    under_way : (N, 2) int32
+        The path that the robot follows, move by move, if there is one.
+    switch_threshold : float
+        How much more the rest of it may cost than the new path, as a share, see `keep_or_switch`.
+    others : tuple of (x, y)
+        Goals that do as well: the path leads to the nearest of all that are free. They do not go
+        together with a tolerance.
     """
 
     grid: GridMap
@@ -56,43 +68,111 @@ class PlanRequest:
     method: PlanMethod = PlanMethod.GREEDY
     tolerance: float = 0.0
     simplified: bool = False
+    under_way: Cells = field(default=(), compare=False)
+    switch_threshold: float = 0.0
+    others: tuple[Cell, ...] = ()
+
+    @property
+    def goals(self) -> tuple[Cell, ...]:
+        """The goal and the others, in their order."""
+        return self.goal, *self.others
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Plan:
     """A path, or the reason why there is none.
+
+    Two plans are equal if all but their times is equal.
 
     Parameters
     ----------
     status : PlanStatus
-    cells : tuple of (x, y)
-        From start to goal, every move legal, or every segment if the path was simplified; empty
-        unless the status is SUCCEEDED.
+    path : (N, 2) int32
+        The cells from start to goal, every move legal, or every segment if the path was simplified;
+        empty unless the status is SUCCEEDED. It cannot be written to.
     method : PlanMethod
         ASTAR_FALLBACK if it was searched for because the greedy steps were trapped.
     move_rule : MoveRule
         The rule under which the moves are legal.
     cost : float, optional
         What the path costs before it is simplified, see `path_cost`: on a map with costs, if a
-        planner made the plan.
+        planner made the plan. On a map of expected times it is in seconds.
     goal : (x, y), optional
-        Where the path ends, or would end: the goal asked for, or the cell to which it moved. None
-        if no Q field is needed to say that there is no path, or for a rollout.
+        Where the path ends, or would end: the goal asked for, the nearest of several, or the cell
+        to which it moved. None if no Q field is needed to say that there is no path, or for a
+        rollout.
+    every_cell : (N, 2) int32
+        The path move by move, before it was simplified, if a planner made the plan.
+    extra_cost : float, optional
+        How much more the path costs than a new one, as a share, if it is the rest of the one under
+        way; None for a new path.
     field_ms, rollout_ms : float
         How long it took to get the Q field, and the path from it, in milliseconds. Where the field
         had to grow for the start, its time includes the path.
     """
 
     status: PlanStatus
-    cells: tuple[Cell, ...] = ()
+    path: NDArray[np.int32] = field(default_factory=lambda: np.empty((0, 2), np.int32))
     method: PlanMethod = PlanMethod.GREEDY
     move_rule: MoveRule = MoveRule.ROBOT_SAFE
     cost: float | None = None
     goal: Cell | None = None
-    field_ms: float = field(default=0.0, compare=False)
-    rollout_ms: float = field(default=0.0, compare=False)
+    every_cell: Cells = ()
+    extra_cost: float | None = None
+    field_ms: float = 0.0
+    rollout_ms: float = 0.0
+
+    def __post_init__(self) -> None:
+        path = np.asarray(self.path, np.int32).reshape(-1, 2)  # sequences of cells do as well
+        path.flags.writeable = False
+        object.__setattr__(self, "path", path)
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, Plan) and self._identity() == other._identity()
+
+    def __hash__(self) -> int:
+        return hash(self._identity())
+
+    def _identity(self) -> tuple[object, ...]:
+        path, costs = self.path.tobytes(), (self.cost, self.extra_cost)
+        return self.status, path, self.method, self.move_rule, costs, self.goal
+
+    @cached_property
+    def cells(self) -> tuple[Cell, ...]:
+        """The path as pairs of Python ints, made when asked for."""
+        return tuple(zip(*self.path.T.tolist(), strict=True))
 
     @property
     def length(self) -> float:
         """Length in cells under the plan's rule, see `path_length`."""
-        return path_length(self.cells, self.move_rule)
+        return path_length(self.path, self.move_rule)
+
+
+def joined(plans: Sequence[Plan]) -> Plan:
+    """Return the plan of a path through several goals: each plan starts where the last one ended.
+
+    Where two paths meet, their common cell is there once. The costs and the times are the sums. If
+    the last plan has no path, neither has the whole.
+
+    Parameters
+    ----------
+    plans : sequence of Plan
+        At least one, all SUCCEEDED except perhaps the last, under one move rule and on one map.
+    """
+    first, last = plans[0], plans[-1]
+    if not last.path.size:
+        return last
+    searched = any(plan.method is PlanMethod.ASTAR_FALLBACK for plan in plans)
+    return replace(
+        last,
+        path=_joined([plan.path for plan in plans]),
+        every_cell=_joined([plan.every_cell for plan in plans]),
+        method=PlanMethod.ASTAR_FALLBACK if searched else PlanMethod.GREEDY,
+        cost=None if first.cost is None else sum(plan.cost or 0.0 for plan in plans),
+        field_ms=sum(plan.field_ms for plan in plans),
+        rollout_ms=sum(plan.rollout_ms for plan in plans),
+    )
+
+
+def _joined(paths: Sequence[Cells]) -> NDArray[np.int32]:
+    return np.concatenate([paths[0][:1], *(path[1:] for path in paths)], dtype=np.int32)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from functools import cached_property
+from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,6 +11,9 @@ from numpy.typing import NDArray
 from ddqn_planner.grid import MOVES, Cell, MoveRule
 from ddqn_planner.grid.arguments import as_cell
 from ddqn_planner.planning.plan import Plan, PlanStatus
+
+Goals: TypeAlias = tuple[Cell, ...]
+"""Different free cells, sorted: a path may end in any of them."""
 
 _STEPS: list[Cell] = [(int(dx), int(dy)) for dx, dy in MOVES]
 
@@ -40,6 +44,7 @@ class QField:
         move_rule: MoveRule = MoveRule.ROBOT_SAFE,
     ) -> None:
         self.goal, self.q, self.legal, self.move_rule = goal, q, legal, move_rule
+        self.goals: Goals = (goal,)
 
     @cached_property
     def value(self) -> NDArray[np.float32]:
@@ -96,7 +101,7 @@ class QField:
                 return Plan(PlanStatus.ROLLOUT_TRAPPED, move_rule=self.move_rule)
             visited.add(cell)
             cells.append(cell)
-        return Plan(PlanStatus.SUCCEEDED, tuple(cells), move_rule=self.move_rule)
+        return Plan(PlanStatus.SUCCEEDED, np.array(cells), move_rule=self.move_rule)
 
 
 def check_inside(start: Cell, shape: tuple[int, ...]) -> Cell:

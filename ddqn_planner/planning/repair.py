@@ -9,18 +9,23 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ddqn_planner.grid import Cell, GridMap
-from ddqn_planner.model.move_costs import MoveCosts
 from ddqn_planner.planning.distance_field import DistanceField, FieldArrays
 
-REPAIRED_SHARE = 0.02
-"""Share of the known cells that a repair may take back: with more, a new field for the one start is
-often cheaper, and the repair that gives up costs more than that. See docs/benchmarks.md."""
+REPAIRED = 100
+"""Cells that a repair may take back before a new field is begun."""
 
-MIN_REPAIRED = 300
-"""Cells that a repair may take back in any case."""
+VISITS = 8
+"""Visits of a new field per cell that a repair may take back, while both take turns: to take a cell
+back takes longer, and it is visited again. See docs/benchmarks.md."""
+
+REPAIRED_SHARE = 0.02
+"""Share of the map's cells that a repair may take back."""
 
 CHANGED_SHARE = 0.02
 """Share of the map's cells that may have changed: with more, a new field is cheaper."""
+
+LAYERS = "occupancy", "cost", "forbidden", "slowness"
+"""What a map says of each cell that moves depend on. Two maps with other layers have no shift."""
 
 SAME_PLACE = 0.01
 """By how many cells a map may be off the grid of another one, and still count as shifted by whole
@@ -30,11 +35,21 @@ cells: ROS messages give the resolution in float32."""
 def shift_between(old: GridMap, new: GridMap) -> Cell | None:
     """Return by how many cells a map's cells have moved in a newer one; None if not by whole ones.
 
+    None too if only one of them has costs, or one-way zones.
+
     The cell (x, y) of the old map is (x + dx, y + dy) in the new one. As a map grows, mapping
     shifts it.
     """
+    for layer in LAYERS:
+        if (getattr(old, layer) is None) != (getattr(new, layer) is None):
+            return None
+    return offset_between(old, new)
+
+
+def offset_between(old: GridMap, new: GridMap) -> Cell | None:
+    """Return where cell (0, 0) of one map lies in another; None if their cells do not match."""
     same = math.isclose(old.resolution, new.resolution, rel_tol=1e-6)
-    if not same or old.origin[2] != new.origin[2] or (old.cost is None) != (new.cost is None):
+    if not same or old.origin[2] != new.origin[2]:
         return None
     corner = old.cell_to_world((0, 0))
     shift = new.world_to_cell(*corner)
@@ -42,41 +57,53 @@ def shift_between(old: GridMap, new: GridMap) -> Cell | None:
     return shift if apart < SAME_PLACE * new.resolution else None
 
 
-def repaired(
-    field: DistanceField, goal: Cell, grid: GridMap, costs: MoveCosts, shift: Cell
-) -> DistanceField | None:
-    """Return the field of a newer map, given that of an older one; None if too much changed.
+def hand_over(
+    old: DistanceField,
+    new: DistanceField,
+    changed: NDArray[np.int32],
+    shift: Cell,
+    start: Cell | None = None,
+) -> bool:
+    """Repair what an older field knows and give it to a new one, unless a new start is quicker.
 
-    Its values are those of a new field. The older field hands over its memory, and begins anew.
+    The values are the same. With a start, repair and new field take turns, each time with four
+    times the limit: so the quicker one wins, and its time is not exceeded by much.
 
     Parameters
     ----------
-    field : DistanceField
-        Of a map with as many costs as the new one: none, or one per cell.
-    goal : (x, y)
-        In the new map, the same place as the field's.
-    grid, costs
-        The new map.
-    shift : (dx, dy)
-        See `shift_between`.
+    old : DistanceField
+        It begins anew if its memory is handed over, else it stays as it is.
+    new : DistanceField
+        To the same place on the new map. Nothing of it is known yet.
+    changed, shift
+        See `changed_cells` and `shift_between`.
+    start : (x, y), optional
+        From where a path is asked for, in the new map. By default the whole field is wanted.
+
+    Returns
+    -------
+    bool
+        Whether the new field has the older one's memory.
     """
     from ddqn_planner.planning.invalidation import take_back
 
-    changed = _changed_cells(field.grid, grid, shift)
-    if changed is None:
-        return None
-    arrays = field.hand_over()
-    if shift != (0, 0) or field.grid.occupancy.shape != grid.occupancy.shape:
-        arrays = _moved(arrays, field.grid, grid, shift)
-    distance, state, opened = arrays
-    new = DistanceField(goal, grid, costs, field.move_rule)
-    limit = max(MIN_REPAIRED, int(REPAIRED_SHARE * np.count_nonzero(state)))
-    reopened, kept = take_back(distance, state, costs, changed, limit)
-    if not kept:
-        return None
-    new.arrays = distance, state, np.concatenate([opened, reopened])
-    new.closed_is_final = False
-    return new
+    most = max(REPAIRED, int(REPAIRED_SHARE * new.grid.occupancy.size))
+    limit = most if start is None or old.has_values_of_all else REPAIRED
+    with old.lock:
+        arrays = old.arrays
+        if shift != (0, 0) or old.grid.occupancy.shape != new.grid.occupancy.shape:
+            arrays = _moved(arrays, old.grid, new.grid, shift)
+        distance, state, opened = arrays
+        while True:
+            reopened, kept = take_back(distance, state, new.costs, changed, limit)
+            if kept:
+                old.forget()
+                new.arrays = distance, state, np.concatenate([opened, reopened])
+                new.closed_is_final = False
+                return True
+            limit *= 4
+            if start is None or limit > most or new.reach(start, VISITS * limit) or new.is_whole:
+                return False
 
 
 def _overlap(old: GridMap, new: GridMap, shift: Cell) -> tuple[int, int, int, int]:
@@ -86,21 +113,27 @@ def _overlap(old: GridMap, new: GridMap, shift: Cell) -> tuple[int, int, int, in
     return left, bottom, max(right, left), max(top, bottom)
 
 
-def _changed_cells(old: GridMap, new: GridMap, shift: Cell) -> NDArray[np.int32] | None:
-    """Return the cells whose moves may differ, as numbers of the padded new map; None for many."""
+def changed_cells(old: GridMap, new: GridMap, shift: Cell) -> NDArray[np.int32] | None:
+    """Return the cells whose moves may differ, as numbers of the padded new map; None for many.
+
+    Both maps have costs, or none has.
+    """
     left, bottom, right, top = _overlap(old, new, shift)
     inside = slice(bottom, top), slice(left, right)
     before = (
         slice(bottom - shift[1], top - shift[1]),
         slice(left - shift[0], right - shift[0]),
     )
-    differs = old.occupancy[before] != new.occupancy[inside]
-    if old.cost is not None and new.cost is not None:
-        differs |= old.cost[before] != new.cost[inside]
-    if np.count_nonzero(differs) > CHANGED_SHARE * differs.size:
+    differs = np.zeros((top - bottom, right - left), dtype=np.bool_)
+    for layer in LAYERS:
+        one, other = getattr(old, layer), getattr(new, layer)
+        moved = one is not other or shift != (0, 0)
+        if moved and one is not None and other is not None:
+            differs |= one[before] != other[inside]
+    number = np.flatnonzero(differs)
+    if number.size > CHANGED_SHARE * differs.size:
         return None
     width = new.width + 2
-    number = np.flatnonzero(differs)
     y, x = np.divmod(number, max(right - left, 1))
     cells = [(y + bottom + 1) * width + x + left + 1]
     if shift != (0, 0) or old.occupancy.shape != new.occupancy.shape:

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from ddqn_planner.grid import Cell, GridMap, MoveRule, path_cost
+from ddqn_planner.grid import MOVES, Cell, GridMap, MoveRule, path_cost
 from ddqn_planner.grid.arguments import as_cell
 from ddqn_planner.grid.moves import segment_lengths
 
@@ -19,8 +19,9 @@ def simplify(cells: Sequence[Cell], grid: GridMap, move_rule: MoveRule | str) ->
     """Return some of a path's cells, the first and the last included, joined by legal segments.
 
     A segment is legal if all cells that it passes through are free; under `MoveRule.ROBOT_SAFE`
-    also those that it touches at a corner. It must not cost more than the part of the path that it
-    replaces, so that the path keeps away from cells of high cost. The length of each segment is
+    also those that it touches at a corner. None of them except the last may forbid one of the two
+    actions between whose directions it lies. It must not cost more than the part of the path that
+    it replaces, so that the path keeps away from cells of high cost. The length of each segment is
     found by doubling and halving.
 
     Parameters
@@ -41,8 +42,7 @@ def simplify(cells: Sequence[Cell], grid: GridMap, move_rule: MoveRule | str) ->
     def joins(first: int, last: int) -> bool:
         if last - first == 1:  # a move of the path itself
             return True
-        touched = touched_cells(path[first], path[last], rule)
-        if grid.occupancy[touched[:, 1], touched[:, 0]].any():
+        if not is_legal_segment(path[first], path[last], grid, rule):
             return False
         cost = segment_cost(path[first], path[last], multiplier, rule)
         return cost <= (1 + ROUNDING) * path_cost(path[first : last + 1], multiplier, rule)
@@ -72,6 +72,25 @@ def touched_cells(first: Cell, last: Cell, move_rule: MoveRule | str) -> NDArray
     # Between two cells that share only a corner, two more are touched; else the same two again.
     (x, y), (next_x, next_y) = passed[:-1].T, passed[1:].T
     return np.concatenate([passed, np.stack([x, next_y], 1), np.stack([next_x, y], 1)])
+
+
+def is_legal_segment(first: Cell, last: Cell, grid: GridMap, move_rule: MoveRule | str) -> bool:
+    """Return whether a segment between two cells of a map is legal, see `simplify`."""
+    x, y = touched_cells(first, last, move_rule).T
+    if grid.occupancy[y, x].any():
+        return False
+    if grid.forbidden is None:
+        return True
+    vector = np.subtract(last, first)
+    moves = [np.sign(vector)]  # as many diagonal ones as it has room for, and straight ones
+    if abs(vector[0]) != abs(vector[1]):
+        moves.append(np.where(np.abs(vector) == np.abs(vector).max(), moves[0], 0))
+    x, y = _passed_cells(first, last)[0][:-1].T
+    return not any(
+        (grid.forbidden[y, x] >> action & 1).any()
+        for move in moves
+        for action in np.flatnonzero((move == MOVES).all(axis=1))
+    )
 
 
 def segment_cost(

@@ -23,7 +23,7 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
-from ddqn_planner.grid import MOVES, Cell, GridMap, MoveRule, legal_moves, read_map_file
+from ddqn_planner.grid import MOVES, Cell, GridMap, MoveRule, read_map_file
 from ddqn_planner.model.observation import GOAL, OBSTACLE, ROBOT, observation_background, observe
 from ddqn_planner.resources import find_resource
 from ddqn_planner.training.exploring_starts import initial_cells
@@ -102,7 +102,7 @@ class GridVectorEnvironment(VectorEnv[Observations, NDArray[np.int64], Any]):
         self.background = np.stack(
             [observation_background(s.grid.occupancy, s.goal) for s in self.scenarios]
         )
-        self.legal = np.stack([legal_moves(s.grid.occupancy, r) for s, r in with_rules])
+        self.legal = np.stack([s.grid.legal_moves(r) for s, r in with_rules])
         self.legal = self.legal.reshape(tables)
         self.free_reward = np.stack(
             [move_reward(s.grid, s.start, s.goal, r, parameters) for s, r in with_rules]

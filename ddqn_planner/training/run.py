@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import reprlib
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, closing
 from dataclasses import asdict, replace
 from pathlib import Path
-from typing import BinaryIO
 
-from ddqn_planner.files import lock, remove_temporaries
+from ddqn_planner.files import claim, remove_temporaries
 from ddqn_planner.grid import MoveRule
 from ddqn_planner.training.environment import Scenario
 from ddqn_planner.training.episodes import Episode, EpisodeLog
@@ -20,13 +18,8 @@ from ddqn_planner.training.trainer import CheckpointError, Trainer
 SAVE_INTERVAL = 5_000
 """Environment steps between two checkpoints."""
 
-LOCK, CHECKPOINT = "training.lock", "checkpoint.safetensors"
-"""A folder with one of these files belongs to a training. The lock file is there from the start, so
-that a training that was killed before its first checkpoint can start again in its folder."""
-
-
-class FolderError(ValueError):
-    """A folder contains files but no training, or another process trains in it."""
+MARKS = LOCK, CHECKPOINT = "training.lock", "checkpoint.safetensors"
+"""A folder with one of these files belongs to a training."""
 
 
 class TrainingRun:
@@ -64,7 +57,7 @@ class TrainingRun:
         memory = check_memory(scenarios, parameters)
         self.save_error = ""
         with ExitStack() as stack:  # unlocks the folder if the rest fails
-            stack.enter_context(_claim(self.folder))
+            stack.enter_context(claim(self.folder, MARKS, "training", "trains"))
             if self.checkpoint_path.exists():
                 self.trainer = Trainer.load_checkpoint(self.checkpoint_path, scenarios)
                 _check_same_training(self.trainer, move_rule, parameters, seed, self.folder)
@@ -127,22 +120,6 @@ class TrainingRun:
     def close(self) -> None:
         """Close the files and unlock the folder. `try_to_save` first."""
         self._open_files.close()
-
-
-def _claim(folder: Path) -> BinaryIO:
-    """Lock a folder for a training until the returned file is closed."""
-    folder.mkdir(parents=True, exist_ok=True)
-    names = sorted(path.name for path in folder.iterdir())
-    if names and not any((folder / name).is_file() for name in (LOCK, CHECKPOINT)):
-        raise FolderError(
-            f"{folder} holds {reprlib.repr(names)} but no training; give a new or empty folder"
-        )
-    try:
-        return lock(folder / LOCK)
-    except BlockingIOError:
-        raise FolderError(
-            f"another process trains in {folder}; wait for its end, stop it, or give another folder"
-        ) from None
 
 
 def _check_same_training(

@@ -296,3 +296,35 @@ def test_the_map_computes_its_labels_once_per_kind_of_rule(occupancy: np.ndarray
     assert grid.labels("unit") is grid.labels("corner_cutting")
     with pytest.raises(ValueError, match="give one of robot_safe"):
         grid.labels("nope")
+
+
+def test_slowness_multiplies_the_costs() -> None:
+    cost, slowness = np.array([[0, 50, -1]]), np.array([[2, 1, 3]])
+    grid = GridMap(np.zeros((1, 3)), cost=cost, slowness=slowness, seconds_per_cell=0.5)
+    plain = GridMap(np.zeros((1, 3)), cost=cost)
+    np.testing.assert_allclose(grid.cost_multiplier, plain.cost_multiplier * slowness)
+    assert not grid.same_cells(plain)
+    assert grid.fingerprint != plain.fingerprint
+    timed = plain.with_slowness(slowness.astype(np.float32), 0.5)
+    assert timed.same_cells(grid)
+    assert timed.fingerprint == grid.fingerprint
+    assert timed.seconds_per_cell == 0.5
+    patched = timed.with_patch([[True]], 1, 0)
+    assert patched.slowness is timed.slowness
+    assert patched.seconds_per_cell == 0.5
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"slowness": np.full((2, 2), 0.5)}, "slowness"),
+        ({"slowness": np.full((2, 2), np.nan)}, "slowness"),
+        ({"slowness": np.full((2, 2), np.inf)}, "slowness"),
+        ({"slowness": np.ones((2, 3))}, "slowness"),
+        ({"seconds_per_cell": 0.0}, "seconds_per_cell"),
+        ({"seconds_per_cell": np.nan}, "seconds_per_cell"),
+    ],
+)
+def test_wrong_times_are_refused(options: dict, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        GridMap(np.zeros((2, 2)), **options)

@@ -13,7 +13,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as numpy_st
 from PIL import Image
-from strategies import grids_with_costs, occupancies
+from strategies import grids_with_costs, grids_with_directions, occupancies
 
 from ddqn_planner.grid import UNKNOWN, Cell, GridMap, MapFile, load_map, read_map_file, save_map
 from ddqn_planner.grid.map_file import (
@@ -457,8 +457,93 @@ def test_numbers_of_numpy_are_saved(tmp_path: Path) -> None:
         {"goal": (2, 0)},
         {"goal": (0.5, 0)},
         {"start": (0, 0, 0)},
+        {"forbidden": np.zeros((2, 3))},
+        {"forbidden": np.full((2, 2), 256)},
     ],
 )
 def test_an_impossible_map_file_cannot_be_made(wrong: dict[str, Any]) -> None:
     with pytest.raises(ValueError, match="give"):
         MapFile(**{"values": np.zeros((2, 2)), **wrong})
+
+
+# Forbidden directions
+
+
+def with_directions(folder: Path, directions: Image.Image | bytes, name: str = "d.png") -> Path:
+    path = write(folder, np.full((2, 3), 254, dtype=np.uint8), ddqn_planner={"directions": name})
+    if isinstance(directions, bytes):
+        (folder / name).write_bytes(directions)
+    else:
+        directions.save(folder / name)
+    return path
+
+
+@same_folder
+@given(grids_with_directions())
+def test_a_saved_map_keeps_its_directions(
+    tmp_path: Path, grid_and_cell: tuple[GridMap, Cell]
+) -> None:
+    grid, _ = grid_and_cell
+    save_map(grid, tmp_path / "saved.yaml")
+    options = {"occupied_threshold": 100, "allow_unknown": True}
+    read = load_map(tmp_path / "saved.yaml", use_map_costs=grid.cost is not None, **options)
+    assert read.fingerprint == grid.fingerprint
+    save_map(read_map_file(tmp_path / "saved.yaml"), tmp_path / "again.yaml")
+    assert load_map(tmp_path / "again.yaml", 100, True, True).same_cells(
+        load_map(tmp_path / "saved.yaml", 100, True, True)
+    )
+
+
+@pytest.mark.parametrize("name", ["d.png", "d.pgm"])
+def test_the_bottom_row_of_the_image_of_directions_is_row_0(tmp_path: Path, name: str) -> None:
+    values = np.array([[1, 2, 3], [4, 5, 255]], dtype=np.uint8)
+    path = with_directions(tmp_path, Image.fromarray(values), name)
+    forbidden = load_map(path).forbidden
+    assert forbidden is not None
+    assert forbidden.tolist() == [[4, 5, 255], [1, 2, 3]]
+    assert not forbidden.flags.writeable
+
+
+def test_a_map_whose_image_of_directions_is_black_has_none(tmp_path: Path) -> None:
+    path = with_directions(tmp_path, Image.fromarray(np.zeros((2, 3), dtype=np.uint8)))
+    assert load_map(path).forbidden is None
+
+
+GREY = Image.fromarray(np.full((2, 3), 7, dtype=np.uint8))
+
+
+@pytest.mark.parametrize(
+    ("image", "name", "named"),
+    [
+        (GREY.resize((2, 3)), "d.png", "has 2 x 3 pixels; give 3 x 2, as the map's image"),
+        (GREY.convert("RGB"), "d.png", "stored as RGB; save 8 bits of grey"),
+        (GREY.convert("LA"), "d.png", "stored as LA"),
+        (GREY.convert("P"), "d.png", "stored as P"),
+        (GREY.convert("1"), "d.png", "stored as 1"),
+        (GREY.convert("I;16"), "d.png", "stored as I;16B"),
+        (GREY, "d.jpg", "not readable .* give a PPM, PNG image"),
+        (b"P5\n3 2\n100\n" + bytes(6), "d.pgm", "save an 8-bit PNG"),
+        (b"P5\n3 2\n255\n" + bytes(5), "d.pgm", "not readable"),
+        (b"", "d.png", "not readable"),
+    ],
+)
+def test_an_image_that_holds_no_directions_is_refused(
+    tmp_path: Path, image: Image.Image | bytes, name: str, named: str
+) -> None:
+    with pytest.raises(MapDataError, match=rf"{name}'.*{named}"):
+        read_map_file(with_directions(tmp_path, image, name))
+
+
+def test_the_image_of_directions_is_checked_as_the_maps(tmp_path: Path) -> None:
+    pixels = np.zeros((2, 3), dtype=np.uint8)
+    for directions, error, named in (
+        ("none.png", MapDataError, "no such image; check 'directions'"),
+        (["map.png"], MapMetadataError, "directions is .*; give the path of an image"),
+        ("../map.png", MapMetadataError, r"directions is '\.\./map\.png', outside of the folder"),
+    ):
+        folder = tmp_path / "folder"
+        folder.mkdir(exist_ok=True)
+        write(tmp_path, pixels)
+        path = write(folder, pixels, ddqn_planner={"directions": directions})
+        with pytest.raises(error, match=named):
+            read_map_file(path)

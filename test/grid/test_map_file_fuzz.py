@@ -210,7 +210,7 @@ def test_any_value_of_any_key_is_read_or_refused(folder: Path, changes: dict[str
 
 
 @same_folder
-@given(st.dictionaries(st.sampled_from(["start", "goal"]), YAML_VALUES, min_size=1))
+@given(st.dictionaries(st.sampled_from(["start", "goal", "directions"]), YAML_VALUES, min_size=1))
 def test_any_value_of_a_scenario_is_read_or_refused(folder: Path, scenario: dict[str, Any]) -> None:
     path = write_yaml(folder, ddqn_planner=scenario)
     with suppress(MapFileError):

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped
+from geometry_msgs.msg import PoseArray, PoseStamped, PoseWithCovarianceStamped
 from hypothesis import HealthCheck, assume, given, settings
 from hypothesis import strategies as st
 from integration.messages import NUMBERS_32, STAMPED_POSES, TEXTS, maps, some_parameters
@@ -81,11 +81,17 @@ def test_any_request_is_answered(
 
 
 @fuzz
-@given(message=STAMPED_POSES, topic=st.sampled_from(["initialpose", "goal_pose", "odom"]))
+@given(
+    message=STAMPED_POSES,
+    topic=st.sampled_from(["initialpose", "goal_pose", "goal_poses", "odom"]),
+)
 def test_any_pose_is_taken_or_refused(unharmed: Robot, message: PoseStamped, topic: str) -> None:
     robot = unharmed
     pose_message: Any = message
-    if topic != "goal_pose":
+    if topic == "goal_poses":
+        good = robot.pose(GOAL).pose
+        pose_message = PoseArray(header=message.header, poses=[good, message.pose])
+    elif topic != "goal_pose":
         pose_type = Odometry if topic == "odom" else PoseWithCovarianceStamped
         pose_message = pose_type(header=message.header)
         pose_message.pose.pose = message.pose

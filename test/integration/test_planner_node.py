@@ -43,6 +43,7 @@ from std_srvs.srv import Trigger
 from ddqn_planner.grid import MoveRule, shortest_distances
 from ddqn_planner.grid.generators import generate_map, random_requests
 from ddqn_planner.nodes.conversions import occupancy_message
+from ddqn_planner.nodes.report import seconds
 from ddqn_planner.nodes.runtime import LATCHED
 
 # What it is for
@@ -134,8 +135,10 @@ def test_plans_again_when_the_map_changes(robot: Robot) -> None:
 def test_plans_again_when_threshold_or_unknown_cells_change(robot: Robot) -> None:
     values = robot.values.copy()
     values[GOAL[1], GOAL[0]] = 50
-    robot.send_map(occupancy_message(values, RESOLUTION, ORIGIN, Header(frame_id="map")))
-    robot.wait_for_path(START, GOAL)
+    message = robot.stamped_map(values)
+    robot.send_map(message)
+    planned_on = {"planned on the map of (s)": seconds(message.header.stamp)}
+    robot.wait_for_reason("^a path of ", planned_on)
     robot.clear()
     assert robot.client.set_parameters("planner", occupied_threshold=50)[0].successful
     robot.plans.wait(lambda path: not path.poses)

@@ -15,7 +15,7 @@ import pytest
 from client import initial_pose, map_message, pose
 from client import wait_for_map as wait_for_stamp
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
-from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped, TransformStamped
+from geometry_msgs.msg import PoseArray, PoseStamped, PoseWithCovarianceStamped, TransformStamped
 from integration.robot import (
     GOAL_YAW,
     Robot,
@@ -243,7 +243,7 @@ def odometry(robot: Robot, cell: Cell, frame: str = "map") -> Odometry:
 
 def test_the_start_comes_from_odometry(robot: Robot) -> None:
     robot.send_goal(robot.pose((19, 14)))
-    with parameters_of(robot, start_source="odometry"):
+    with parameters_of(robot, start_source="odometry", replan_period=3600.0):
         robot.wait_for_reason("start is unknown; nothing came on /hall/odom in the map's frame")
         robot.client.publish("odom", odometry(robot, (2, 2)))
         robot.wait_for_path((2, 2), (19, 14))
@@ -355,6 +355,28 @@ def test_a_goal_waits_for_the_first_transform(transformed: Robot) -> None:
     assert client.set_parameters("planner", start_source="initialpose")[0].successful
     robot.send_start(robot.pose((5, 5)))
     robot.wait_for_path((5, 5), (19, 14))
+
+
+def test_docks_in_another_frame_stay_where_they_are_when_it_moves(transformed: Robot) -> None:
+    robot, client = transformed, transformed.client
+    odom = transform(robot, (3, 2))
+    odom.child_frame_id = "odom"
+    x, y = robot.grid.cell_to_world((3, 2))
+    docks = [robot.pose((1, 7), 0.5).pose, robot.pose((18, 3), 1.5).pose]
+    for dock in docks:
+        dock.position.x, dock.position.y = dock.position.x - x, dock.position.y - y
+    client.publish("tf", transform(robot, (4, 7)))
+    client.publish("tf", odom)
+    client.publish("goal_poses", PoseArray(header=Header(frame_id="odom"), poses=docks))
+    robot.wait_for_path((4, 7), (1, 7), yaw=0.5)
+    robot.wait_for_reason("^a path of 3.00 cells to goal 1 of 2, ")
+    odom.transform.translation.x += 1.0
+    client.publish("tf", odom)
+    client.publish("tf", transform(robot, (4, 12)))
+    taken = robot.values.copy()
+    taken[7, 1] = 100
+    robot.send_map(robot.stamped_map(taken))
+    robot.wait_for_path((4, 12), (18, 3), yaw=1.5)
 
 
 def test_an_old_transform_is_no_start(transformed: Robot) -> None:

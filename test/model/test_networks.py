@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 import torch
@@ -9,11 +11,11 @@ from networks import random_network
 from strategies import grids_with_costs, grids_with_free_cell
 
 from ddqn_planner.grid import Cell, GridMap, MoveRule, legal_moves
-from ddqn_planner.model import NETWORKS, load_model, networks, wavefront
+from ddqn_planner.model import NETWORKS, field_values, load_model, networks
+from ddqn_planner.model.field_values import propagate_values
 from ddqn_planner.model.move_costs import MAX_MULTIPLIER
 from ddqn_planner.model.networks import AnyMapQNetwork, PropagationQNetwork
 from ddqn_planner.model.observation import observation_background, observe, patches
-from ddqn_planner.model.wavefront import propagate_values
 from ddqn_planner.training.networks import MODULES, AnyMapModule, PaperModule, PropagationModule
 
 SIZES = {
@@ -174,11 +176,15 @@ def test_a_field_has_one_q_per_action_and_cell_of_a_map_of_any_shape(name: str) 
 
 
 @pytest.mark.parametrize("name", ["propagation", "any_map"])
-def test_a_move_is_possible_where_it_succeeds_more_often_than_not(name: str) -> None:
-    for success, possible in ((0.55, True), (0.45, False)):
+def test_a_move_is_tried_until_it_succeeds_if_it_does_more_often_than_not(name: str) -> None:
+    for success, cost in ((0.995, 1), (0.9, 1 / 0.9), (0.55, 1 / 0.55), (0.45, np.inf)):
         network = answering(name, success)
-        q = network.q_values(GridMap(np.zeros((1, 2))), (1, 0), MoveRule.ROBOT_SAFE)
-        assert q[0, 0, 0] == (-1.0 if possible else -np.inf)
+        for grid, multiplier in (
+            (GridMap(np.zeros((1, 2))), 1),
+            (GridMap(np.zeros((1, 2)), slowness=np.array([[3, 5]])), 4),
+        ):
+            q = network.q_values(grid, (1, 0), MoveRule.ROBOT_SAFE)
+            assert q[0, 0, 0] == pytest.approx(-cost * multiplier)
 
 
 def test_a_cost_above_the_upper_bound_counts_as_the_bound() -> None:
@@ -188,23 +194,24 @@ def test_a_cost_above_the_upper_bound_counts_as_the_bound() -> None:
         (1e4, 100.0),
     ):
         network = answering("any_map", 0.9, multiplier)
-        assert network.q_values(grid, (1, 0), MoveRule.ROBOT_SAFE)[0, 0, 0] == -used
+        q = network.q_values(grid, (1, 0), MoveRule.ROBOT_SAFE)
+        assert q[0, 0, 0] == pytest.approx(-used / 0.9)
 
 
 @pytest.mark.parametrize("tensor", ["prices.bias", "moves.bias"])
 def test_a_move_whose_cost_or_p_is_nan_is_not_possible(
     monkeypatch: pytest.MonkeyPatch, tensor: str
 ) -> None:
-    def checked(patch_id: np.ndarray, cost_PA: np.ndarray, goal: Cell) -> np.ndarray:
+    def checked(patch_id: np.ndarray, cost_PA: np.ndarray, *others: Any) -> np.ndarray:
         assert not np.isnan(cost_PA).any()  # with NaN the propagation would never end
-        return propagate_values(patch_id, cost_PA, goal)
+        return propagate_values(patch_id, cost_PA, *others)
 
-    monkeypatch.setattr(wavefront, "propagate_values", checked)
+    monkeypatch.setattr(field_values, "propagate_values", checked)
     network = answering("any_map", 0.9)
     network.tensors[tensor][0] = np.nan
     q = network.q_values(GridMap(np.zeros((2, 2))), (1, 0), MoveRule.ROBOT_SAFE)
     assert q[0, 0, 0] == -np.inf
-    assert q[2, 0, 0] == pytest.approx(-1 - 2**0.5)  # up, and then down to the right
+    assert q[2, 0, 0] == pytest.approx(-(1 + 2**0.5) / 0.9)  # up, and then down to the right
 
 
 def test_the_network_for_any_map_tells_legal_moves() -> None:

@@ -17,7 +17,7 @@ from ddqn_planner.grid import (
     move_costs,
     shortest_distances,
 )
-from ddqn_planner.model.wavefront import propagate_values
+from ddqn_planner.model.field_values import propagate_values
 
 PATCH_IDS = numpy_st.arrays(
     np.int32,

@@ -18,10 +18,29 @@ def test_a_map_as_text_has_its_first_row_below() -> None:
     assert draw_text(grid, [(2, 1)]) == ". # G\n. . #"
 
 
+def test_one_way_zones_are_arrows() -> None:
+    # All moves to the east, north, west and south, and no zone.
+    forbidden = [[0b10000011, 0b00111000, 0], [0b00001110, 0b11100000, 255]]
+    grid = GridMap(np.array([[0, 0, 0], [0, 0, 1]]), forbidden=np.array(forbidden))
+    assert draw_text(grid, []) == "v ^ #\n< > ."
+
+
 def test_the_ramp_leads_from_the_worst_colour_to_the_best() -> None:
     ramp = value_ramp(7)
     assert ["#" + bytes(ramp[level]).hex() for level in (0, 2, 4, 6)] == list(VALUE_COLOURS)
     assert (np.diff(ramp.astype(int).sum(axis=1)) < 0).all()
+
+
+def test_a_picture_shows_one_way_zones(tmp_path: Path) -> None:
+    pytest.importorskip("matplotlib")
+    for name, forbidden in (("plain", None), ("one_way", np.full((60, 50), 56))):
+        grid = GridMap(np.zeros((60, 50)), forbidden=forbidden)
+        save_picture(tmp_path / f"{name}.png", grid, [], None, "a title")
+    plain, one_way = (
+        np.asarray(Image.open(tmp_path / f"{name}.png").convert("L"))
+        for name in ("plain", "one_way")
+    )
+    assert (plain != one_way).mean() > 0.01
 
 
 @pytest.mark.parametrize("cells", [[], [(0, 0), (1, 1)]])

@@ -90,6 +90,7 @@ def any_share(monkeypatch: pytest.MonkeyPatch) -> None:
     """Repair the small maps of these tests, however much of them changes."""
     monkeypatch.setattr(repair, "CHANGED_SHARE", 1.0)
     monkeypatch.setattr(repair, "REPAIRED_SHARE", 1.0)
+    monkeypatch.setattr(repair, "REPAIRED", repair.REPAIRED)  # tests change it
 
 
 @st.composite
@@ -141,6 +142,7 @@ def test_a_repaired_field_is_a_fresh_one_bit_for_bit(
 ) -> None:
     plain, goal = grid_and_goal
     grid = GridMap(plain.occupancy, 0.05, (1.25, -3.0, yaw), plain.cost)
+    repair.REPAIRED = data.draw(st.sampled_from([1, 3, 300]), label="limit of a repair")
     planner = Planner(NETWORK, METADATA)
     if data.draw(st.booleans(), label="whole"):
         _ = planner.q_field(grid, goal, rule).value
@@ -167,26 +169,38 @@ def test_a_changed_map_uses_what_is_known_of_the_one_before() -> None:
     before = planner.plan(grid, start, goal)
     x, y = before.cells[3]
     changed = grid.with_patch(np.ones((1, 1)), x, y)
-    older, costs = planner.q_field(grid, goal), NETWORK.move_costs(changed, MoveRule.ROBOT_SAFE)
+    older, field = planner.q_field(grid, goal), fresh_field(changed, goal, MoveRule.ROBOT_SAFE)
     assert isinstance(older, DistanceField)
-    assert costs is not None
     known = np.count_nonzero(older.arrays[0])
-    field = repair.repaired(older, goal, changed, costs, (0, 0))
-    assert field is not None
+    cells = repair.changed_cells(grid, changed, (0, 0))
+    assert cells is not None
+    assert repair.hand_over(older, field, cells, (0, 0))
     assert np.count_nonzero(field.arrays[0]) > 0.9 * known
     assert np.count_nonzero(older.arrays[0]) == 1  # it handed over its memory
     assert field.rollout(start) == fresh_field(changed, goal, MoveRule.ROBOT_SAFE).rollout(start)
     assert older.rollout(start).cells == before.cells  # and begins anew
 
 
+def test_a_repair_that_takes_too_long_leaves_the_older_field_as_it_was() -> None:
+    repair.REPAIRED = 5
+    grid, goal = GridMap(np.zeros((60, 60))), (30, 30)
+    planner = Planner(NETWORK, METADATA)
+    older = planner.q_field(grid, goal)
+    before = older.rollout((0, 0))
+    changed = grid.with_patch(np.ones((1, 12)), 20, 29)  # a wall beside the goal
+    start = (30, 32)
+    assert planner.plan(changed, start, goal) == Planner(NETWORK, METADATA).plan(
+        changed, start, goal
+    )
+    assert planner.known_field(grid, goal) is older
+    assert older.rollout_if_known((0, 0)) == before
+    assert_same(older, fresh_field(grid, goal, MoveRule.ROBOT_SAFE))
+
+
 def test_with_too_many_changes_a_field_is_computed_anew(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.undo()
     grid, other = (GridMap(np.random.default_rng(n).random((60, 60)) < 0.2) for n in (0, 1))
-    goal = next(cell for cell in grid.free_cells() if other.is_free(cell))
-    older = fresh_field(grid, goal, MoveRule.ROBOT_SAFE)
-    costs = NETWORK.move_costs(other, MoveRule.ROBOT_SAFE)
-    assert costs is not None
-    assert repair.repaired(older, goal, other, costs, (0, 0)) is None
+    assert repair.changed_cells(grid, other, (0, 0)) is None
 
 
 def test_the_fields_of_another_map_are_kept(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -10,6 +10,7 @@ from networks import turning_network
 from ddqn_planner.grid import Cell, GridMap, MoveRule
 from ddqn_planner.model import ModelMetadata
 from ddqn_planner.planning import Plan, PlanMethod, Planner, PlanRequest, PlanStatus, QField
+from ddqn_planner.planning.field_cache import FieldCache
 from ddqn_planner.planning.planner import last_step
 
 RULE = MoveRule.ROBOT_SAFE
@@ -35,8 +36,8 @@ def test_a_search_continues_from_what_the_trapped_rollout_found(
     assert trapped.status is PlanStatus.ROLLOUT_TRAPPED
     steps = planner.steps(request)
     assert next(steps) is None  # the search: the field is known
-    for name in ("q_field", "known_field"):
-        monkeypatch.delattr(Planner, name)
+    for name in ("get", "find"):
+        monkeypatch.delattr(FieldCache, name)
     monkeypatch.delattr(QField, "rollout")
     found = last_step(steps)
     assert found == whole
@@ -80,3 +81,28 @@ def test_the_time_between_two_steps_does_not_count() -> None:
     plan = last_step(steps)
     waited = 1e3 * (time.perf_counter() - began)
     assert plan.field_ms + plan.rollout_ms < waited - 400
+
+
+def test_a_field_grows_in_steps_between_which_others_are_answered(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    occupancy = np.zeros((40, 40), dtype=np.bool_)
+    occupancy[20, :39] = True
+    grid, planner = GridMap(occupancy), Planner.load("any_map")
+    whole = planner.plan(grid, (0, 0), (0, 39))
+    closed = occupancy.copy()
+    closed[20] = True
+    monkeypatch.setattr("ddqn_planner.planning.planner.VISITS", 20)
+    planner = Planner.load("any_map")
+    steps = planner.steps(PlanRequest(grid, (0, 0), (0, 39), RULE))
+    waited = 0
+    for plan in steps:
+        waited += plan is None
+        assert planner.plan(grid, (waited % 40, 0), (5, 5)).status is PlanStatus.SUCCEEDED
+    assert waited > 10
+    assert plan == whole
+    given_up = planner.steps(PlanRequest(grid, (0, 0), (1, 39), RULE))
+    assert next(given_up) is next(given_up) is None
+    given_up.close()  # type: ignore[attr-defined]
+    assert planner.plan(grid, (0, 0), (1, 39)).status is PlanStatus.SUCCEEDED
+    assert planner.plan(GridMap(closed), (0, 0), (0, 39)).status is PlanStatus.NO_PATH

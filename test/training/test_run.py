@@ -15,13 +15,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ddqn_planner import MoveRule
+from ddqn_planner.files import FolderError
 from ddqn_planner.grid import path_length
 from ddqn_planner.model import load_model
 from ddqn_planner.training import run as run_module
 from ddqn_planner.training.environment import Scenario
 from ddqn_planner.training.episodes import Episode, read_cells
 from ddqn_planner.training.hyper_parameters import HyperParameters
-from ddqn_planner.training.run import FolderError, TrainingRun
+from ddqn_planner.training.run import TrainingRun
 from ddqn_planner.training.trainer import CheckpointError
 
 PARAMETERS = HyperParameters(steps=400, filters=4, learning_starts=50)

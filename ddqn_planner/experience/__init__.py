@@ -1,0 +1,9 @@
+"""What driving has shown about places: how long they take, and how often moves fail there.
+
+It needs neither ROS nor torch.
+"""
+
+from ddqn_planner.experience.experience import ExpectedTime, Experience
+from ddqn_planner.experience.experience_file import ExperienceFileError
+
+__all__ = ["ExpectedTime", "Experience", "ExperienceFileError"]

@@ -1,0 +1,180 @@
+"""A node that a lifecycle manager, or the node itself, configures, activates, and stops.
+
+rclpy's `LifecycleNodeMixin` ends the process on a transition that its state does not have, and
+drops the exceptions of transitions. Here both are logged, and the answer is that it failed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+from lifecycle_msgs.srv import ChangeState
+from rclpy.callback_groups import ReentrantCallbackGroup
+from rclpy.lifecycle import LifecycleNodeMixin, LifecycleState, TransitionCallbackReturn
+
+from ddqn_planner.nodes.runtime import BaseNode, Parameters
+
+HEARTBEAT_PERIOD, HEARTBEAT_TIMEOUT = 0.1, 4.0
+"""Seconds, as Nav2's nodes and lifecycle manager have them."""
+
+
+class ManagedNode(LifecycleNodeMixin, BaseNode):
+    """Node whose `cleanup` destroys all publishers, services and so on since `configure`.
+
+    A transition that raises an exception is undone.
+    """
+
+    def __init__(self, name: str, parameters: Parameters) -> None:
+        BaseNode.__init__(self, name, parameters)
+        # Reentrant: the state can be asked for while a transition waits.
+        LifecycleNodeMixin.__init__(self, callback_group=ReentrantCallbackGroup())
+        change_state: Any = self._service_change_state
+        change_state.callback = self._on_change_state
+        self._is_changing = False
+        self._error: Exception | None = None
+        self._bond: Any = None
+
+    @property
+    def state(self) -> str:
+        """The name of the state: unconfigured, inactive, active or finalized."""
+        label: str = self._state_machine.current_state[1]
+        return label
+
+    def start(self) -> None:
+        """Configure and activate the node; it raises what they raise."""
+        for trigger in (self.trigger_configure, self.trigger_activate):
+            if trigger() is not TransitionCallbackReturn.SUCCESS and self._error is not None:
+                raise self._error
+
+    # What a node does in its transitions
+
+    async def prepare(self, transition: str) -> bool:
+        """Do what takes long before a transition that was asked for; False to refuse it."""
+        return True
+
+    def configure(self) -> None:
+        """Create what the node needs."""
+
+    def activate(self) -> None:
+        """Begin to answer requests."""
+
+    def deactivate(self) -> None:
+        """Stop."""
+
+    def cleanup(self) -> None:
+        """Free what `configure` created, also if it failed."""
+
+    # rclpy calls these
+
+    def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Configure the node, or leave nothing behind."""
+        self._kept = {entity for entity, _ in self._entities()}
+        result = self._attempt("configure", self.configure)
+        if result is not TransitionCallbackReturn.SUCCESS:
+            self._attempt("cleanup", self._clean_up)
+        return result
+
+    def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Activate the node."""
+        return self._attempt("activate", self.activate)
+
+    def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Stop the node, and end the bond."""
+        self._break_bond()
+        return self._attempt("deactivate", self.deactivate)
+
+    def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Undo `configure`."""
+        return self._attempt("cleanup", self._clean_up)
+
+    def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Stop the node and free all that it has, whatever its state is."""
+        if state.label == "active":
+            self.on_deactivate(state)
+        if state.label in ("active", "inactive"):
+            self.on_cleanup(state)
+        return TransitionCallbackReturn.SUCCESS
+
+    def _attempt(self, what: str, function: Callable[[], None]) -> TransitionCallbackReturn:
+        try:
+            function()
+        except Exception as error:
+            self._error = error
+            self.get_logger().error(f"{what} failed: {str(error) or repr(error)}")
+            return TransitionCallbackReturn.FAILURE
+        return TransitionCallbackReturn.SUCCESS
+
+    async def _on_change_state(
+        self, request: ChangeState.Request, response: ChangeState.Response
+    ) -> ChangeState.Response:
+        asked = request.transition
+        possible = {
+            number: label for number, label, *_ in self._state_machine.available_transitions
+        }
+        label = asked.label or possible.get(asked.id, "")
+        if self._is_changing or label not in possible.values():
+            what = repr(asked.label) if asked.label else f"transition {asked.id}"
+            while_what = "while it changes its state" if self._is_changing else f"when {self.state}"
+            choices = ", ".join(possible.values()) or "none"
+            self.get_logger().error(f"{what} refused: the node has {choices} {while_what}")
+            return response
+        self._is_changing = True
+        try:
+            if await self.prepare(label):
+                result = getattr(self, f"trigger_{label}")()
+                response.success = result is TransitionCallbackReturn.SUCCESS
+                if response.success and label == "activate":
+                    self._form_bond()
+        except Exception as error:  # the node must survive
+            self.get_logger().error(f"{label} failed: {str(error) or repr(error)}")
+        finally:
+            self._is_changing = False
+        return response
+
+    # The bond, by which a lifecycle manager sees that the process lives
+
+    def _form_bond(self) -> None:
+        try:
+            from bondpy.bondpy import Bond
+        except ImportError:
+            self.get_logger().info(
+                "no bond: bondpy is not installed; apt install ros-jazzy-bondpy, or set "
+                "bond_timeout to 0.0 in the lifecycle manager"
+            )
+            return
+        self._bond = Bond(self, "bond", self.get_name())
+        self._bond.heartbeat_period = HEARTBEAT_PERIOD
+        self._bond.heartbeat_timeout = HEARTBEAT_TIMEOUT
+        self._bond.start()
+
+    def _break_bond(self) -> None:
+        if self._bond is not None:
+            self._bond.shutdown()
+            # It has destroyed these, and the node still has them in its lists.
+            self.destroy_subscription(self._bond.sub)
+            self.destroy_publisher(self._bond.pub)
+            self._bond = None
+
+    # Entities
+
+    def _clean_up(self) -> None:
+        for entity, destroy in self._entities():
+            if entity not in self._kept:
+                destroy(entity)
+        self.cleanup()
+
+    def _entities(self) -> list[tuple[Any, Callable[[Any], Any]]]:
+        """Return what the node has created, each with the function that destroys it."""
+        users: list[Any] = [*self.publishers, *self.subscriptions]
+        handlers = {handler for user in users for handler in user.event_handlers}
+        waitables: list[Any] = [each for each in self.waitables if each not in handlers]
+        return [
+            *((entity, self.destroy_publisher) for entity in self.publishers),
+            *((entity, self.destroy_subscription) for entity in self.subscriptions),
+            *((entity, self.destroy_client) for entity in self.clients),
+            *((entity, self.destroy_service) for entity in self.services),
+            *((entity, self.destroy_timer) for entity in self.timers),
+            *((entity, self.destroy_guard_condition) for entity in self.guards),
+            *((action_server, type(action_server).destroy) for action_server in waitables),
+        ]

@@ -1,0 +1,265 @@
+"""The map that the planner plans on: the last one received, with its updates, and its inflation."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from nav_msgs.msg import OccupancyGrid
+from numpy.typing import NDArray
+from rclpy.qos import QoSProfile
+from rclpy.task import Future
+from rclpy.time import Time
+from std_msgs.msg import Header, String
+
+from ddqn_planner.grid import GridMap
+from ddqn_planner.grid.body import Inflation
+from ddqn_planner.nodes.conversions import grid_from_message, grid_from_values
+from ddqn_planner.nodes.expected_times import ExpectedTimes
+from ddqn_planner.nodes.map_directions import MapDirections
+from ddqn_planner.nodes.report import Report, describe_map, seconds
+from ddqn_planner.nodes.runtime import LATCHED, BaseNode, Worker
+
+try:
+    from map_msgs.msg import OccupancyGridUpdate
+except ImportError:  # PyPI does not have it
+    OccupancyGridUpdate = None
+
+MAP_PARAMETERS = ("occupied_threshold", "allow_unknown", "use_map_costs", "map_type")
+BODY_PARAMETERS = ("robot_radius", "clearance_weight")
+
+UPDATES_QUALITY = QoSProfile(depth=100)
+"""An update that is lost leaves old cells. Reliable, and volatile: the last update alone, which a
+latched topic would send, does not make an old map a new one."""
+
+
+class MapSource:
+    """Listens to maps and their updates, and inflates the last map for the robot's body.
+
+    Parameters
+    ----------
+    node : BaseNode
+        It has the parameters `MAP_PARAMETERS` and `BODY_PARAMETERS`.
+    report : Report
+        It says what was refused.
+    worker : Worker
+        It inflates. Maps must not wait for fields: 2000 x 2000 cells take over a second.
+    on_map : callable
+        Called after each map and each update that was not refused, with whether the map's frame is
+        a new one; for a map that waits for its directions, once it has them.
+
+    Attributes
+    ----------
+    header : Header or None
+        Of the last map or update.
+    times : ExpectedTimes
+        Of the map's places; only the worker uses them.
+    """
+
+    def __init__(
+        self, node: BaseNode, report: Report, worker: Worker, on_map: Callable[[bool], None]
+    ) -> None:
+        self.header: Header | None = None
+        self._node = node
+        self._report = report
+        self._on_map = on_map
+        self._message: OccupancyGrid | None = None
+        self._described = ""
+        self._updates = self._refused_updates = 0
+        self._inflated: Future | None = None
+        self._inflate = Inflation()
+        self.times = ExpectedTimes()
+        self._worker = worker
+        self._incomplete = ""
+        self._directions = MapDirections(node, report, self._take_directions)
+        maps = node.create_subscription(OccupancyGrid, "map", self._take, LATCHED)
+        self._subscriptions = [self._directions.subscription, maps]
+        self._topic = maps.topic_name
+        self._updates_topic = f"{self._topic}_updates"
+        if OccupancyGridUpdate is not None:
+            self._subscriptions.append(
+                node.create_subscription(
+                    OccupancyGridUpdate, self._updates_topic, self._take_update, UPDATES_QUALITY
+                )
+            )
+        node.get_logger().info(f"waiting for a map on {self._topic}")
+
+    @property
+    def frame(self) -> str:
+        """The frame of the map; empty without one."""
+        return self.header.frame_id if self.header is not None else ""
+
+    @property
+    def missing(self) -> str:
+        """Why there is no map to plan on, and what to do; empty with a map."""
+        if self.header is not None:
+            return self._incomplete
+        refused = self._report.refused.get("map")
+        because = f" ({refused})" if refused else ""
+        return f"no map was received on {self._topic} yet{because}; start a map server"
+
+    def describe(self) -> dict[str, str]:
+        """Return what the diagnostics say of the map."""
+        description = {}
+        if self.header is not None:
+            description["map"] = self._described
+            description["map stamp (s)"] = seconds(self.header.stamp)
+        if self._updates or self._refused_updates:
+            description["map updates applied"] = str(self._updates)
+            description["map updates refused"] = str(self._refused_updates)
+        return description
+
+    def inflated(self) -> Future:
+        """Return the `GridMap` for the robot's body, which is computed for the first request.
+
+        Where the trainer has learned from drives, its moves cost expected time.
+        """
+        if self._inflated is None:
+            radius, weight = map(self._node.value, BODY_PARAMETERS)
+            # ROS accepts a value that is above the range by a millionth.
+            body = radius, min(weight, 1.0)
+            self._inflated = self._worker.call(self._made, self._grid, *body)
+        return self._inflated
+
+    def _made(self, grid: GridMap, *body: float) -> GridMap:
+        return self.times.apply(self._inflate(grid, *body))
+
+    async def on_experience_saved(self, message: String) -> None:
+        """Plan by what the trainer has learned from drives, or refuse its file."""
+        try:
+            await self._worker.call(self.times.load, message.data)
+        except Exception as error:  # what was learned before stays
+            self._report.refuse("experience", str(error) or repr(error))
+            return
+        self._report.accept("experience")
+        self._inflated = None
+        self._report.change()
+        if not self.missing:
+            self._on_map(False)
+
+    def apply_parameters(self, changed: set[str]) -> None:
+        """Read and inflate the map anew if one of the parameters that changed says so."""
+        read = {*MAP_PARAMETERS, *BODY_PARAMETERS, "require_directions"}
+        if self._message is not None and changed & read:
+            self._read(self._message)
+
+    def close(self) -> None:
+        """Stop listening."""
+        for subscription in self._subscriptions:
+            self._node.destroy_subscription(subscription)
+
+    def _rules(self) -> tuple[Any, ...]:
+        return tuple(map(self._node.value, MAP_PARAMETERS))
+
+    def _take(self, message: OccupancyGrid) -> None:
+        if not self._read(message):
+            return
+        frame_changed = message.header.frame_id != self.frame
+        self._message, self.header = message, message.header
+        self._report.accept("map_updates")
+        described = describe_map(message)
+        if described != self._described:
+            self._described = described
+            self._node.get_logger().info(f"map of {described}")
+        if OccupancyGridUpdate is None and self._node.count_publishers(self._updates_topic):
+            self._node.get_logger().warning(
+                f"{self._updates_topic} is not read: map_msgs is not installed; apt install "
+                "ros-jazzy-map-msgs, or let the map's publisher always send the full map",
+                once=True,
+            )
+        self._report.change()
+        if not self._incomplete:
+            self._on_map(frame_changed)
+
+    def _take_directions(self) -> None:
+        message = self._message
+        if message is None or not (self._incomplete or self._directions.may_change(message.header)):
+            return  # a map that has its own waits for the next map, whose directions come first
+        if self._read(message):
+            self._report.change()
+            if not self._incomplete:
+                self._on_map(True)  # the map's frame may be new since the last complete one
+
+    def _read(self, message: OccupancyGrid) -> bool:
+        """Plan on it from now on, or refuse it."""
+        try:
+            grid = grid_from_message(message, *self._rules())
+            self._grid, self._incomplete = self._directions.on(grid, message.header)
+        except ValueError as error:
+            self._report.refuse("map", str(error))
+            return False
+        self._report.accept("map")
+        self._inflated = None
+        return True
+
+    def _take_update(self, update: Any) -> None:
+        """Plan on the map with other values in a box from now on, or refuse the update."""
+        try:
+            values = updated_values(self._message, update)
+            patch = grid_from_values(values, 1.0, (0.0, 0.0, 0.0), *self._rules())
+            cells = patch.occupancy, update.x, update.y, patch.cost, patch.obstacles
+            self._grid = self._grid.with_patch(*cells)
+        except (ValueError, MemoryError) as error:
+            self._refused_updates = count = self._refused_updates + 1
+            self._report.refused["map_updates"] = str(error)
+            self._report.change()
+            if count & (count - 1) == 0:  # 1, 2, 4, ...: updates come often
+                self._node.get_logger().error(f"update {count} of the map refused: {error}")
+            return
+        assert self._message is not None
+        # In place, for the day when a parameter changes and the map is read anew.
+        info, (height, width) = self._message.info, values.shape
+        whole = np.frombuffer(self._message.data, np.int8).reshape(info.height, info.width)
+        whole[update.y : update.y + height, update.x : update.x + width] = values
+        self._report.accept("map_updates")
+        self.header = update.header
+        self._updates += 1
+        self._inflated = None
+        self._report.change()
+        if not self._incomplete:
+            self._on_map(False)
+
+
+def updated_values(message: OccupancyGrid | None, update: Any) -> NDArray[np.int8]:
+    """Return the values that an update puts into a map, (h, w) int8.
+
+    Parameters
+    ----------
+    message : OccupancyGrid or None
+        The last map.
+    update : map_msgs.msg.OccupancyGridUpdate
+
+    Raises
+    ------
+    ValueError
+        If there is no map yet, or it is in another frame or newer; if the update does not lie
+        inside the map, or its data has another length than its size says.
+    """
+    remedy = "let the map's publisher send the full map"
+    if message is None:
+        raise ValueError(f"an update came before a map; {remedy}")
+    if update.header.frame_id != message.header.frame_id:
+        raise ValueError(
+            f"the update's frame is {update.header.frame_id!r}, the map's is "
+            f"{message.header.frame_id!r}; publish both in one frame"
+        )
+    stamp, map_stamp = map(Time.from_msg, (update.header.stamp, message.header.stamp))
+    if 0 < stamp.nanoseconds < map_stamp.nanoseconds:
+        raise ValueError(
+            f"the map's stamp, {seconds(message.header.stamp)}, is later than the update's, "
+            f"{seconds(update.header.stamp)}; {remedy} if time was set back"
+        )
+    info, width, height = message.info, update.width, update.height
+    x, y = update.x, update.y
+    if not (0 <= x < x + width <= info.width and 0 <= y < y + height <= info.height):
+        raise ValueError(
+            f"an update of {width} x {height} cells from {(x, y)} is not inside the map of "
+            f"{info.width} x {info.height}; {remedy}"
+        )
+    if len(update.data) != width * height:
+        raise ValueError(
+            f"the update's data has {len(update.data)} values; its {width} x {height} cells need "
+            f"{width * height}"
+        )
+    return np.frombuffer(update.data, np.int8).reshape(height, width)

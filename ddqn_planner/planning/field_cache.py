@@ -1,0 +1,148 @@
+"""The Q fields that a planner keeps, of the maps and goals used last."""
+
+from __future__ import annotations
+
+import threading
+from collections import OrderedDict
+from dataclasses import dataclass, field
+
+from ddqn_planner.grid import Cell, GridMap, MoveRule
+from ddqn_planner.model import QNetwork
+from ddqn_planner.model.move_costs import MoveCosts
+from ddqn_planner.planning.distance_field import DistanceField
+from ddqn_planner.planning.q_field import Goals, QField
+from ddqn_planner.planning.repair import changed_cells, hand_over, shift_between
+
+CACHE_BYTES = 2**29
+"""Memory for the Q fields that a planner keeps: 14 of 2000 x 2000 cells, at 9 bytes per cell."""
+
+
+@dataclass(eq=False)
+class _KnownMap:
+    """What a planner knows of a map under a move rule: the network's costs of moves, and fields.
+
+    The costs are None for a network that gives none, see `QNetwork.move_costs`.
+    """
+
+    grid: GridMap
+    move_rule: MoveRule
+    costs: MoveCosts | None
+    fields: OrderedDict[Goals, QField] = field(default_factory=OrderedDict)
+
+    @property
+    def nbytes(self) -> int:
+        """Memory of the fields and the costs, bytes."""
+        of_costs = self.costs.patch.nbytes if self.costs else 0
+        return of_costs + sum(field.nbytes for field in self.fields.values())
+
+
+class FieldCache:
+    """Gives the Q fields of a network, computed, repaired or kept. Several threads may use it.
+
+    Parameters
+    ----------
+    network : QNetwork
+
+    Attributes
+    ----------
+    nbytes : int
+        Memory for the fields that are kept, those used last; the last one is always kept.
+    """
+
+    def __init__(self, network: QNetwork) -> None:
+        self.network = network
+        self.nbytes = CACHE_BYTES
+        self._maps: list[_KnownMap] = []  # used last at the end
+        self._lock = threading.Lock()
+
+    def has_costs(self, grid: GridMap, rule: MoveRule) -> bool:
+        """Return whether the network gives the costs of a map's moves, see `DistanceField`."""
+        return self._map(grid, rule).costs is not None
+
+    def find(self, grid: GridMap, goals: Goals, rule: MoveRule) -> QField | None:
+        """Return the field of a map toward the nearest of some goals if it is kept, else None."""
+        with self._lock:
+            known = self._known_map(grid, rule)
+            found = known.fields.get(goals) if known else None
+            if known and found:
+                self._use(known, found)
+            return found
+
+    def get(self, grid: GridMap, goals: Goals, rule: MoveRule, start: Cell | None = None) -> QField:
+        """Return the field of a map toward the nearest of some goals, perhaps for one start.
+
+        Only a network that gives costs knows fields toward several goals.
+        """
+        known = self._map(grid, rule)
+        with self._lock:
+            found = known.fields.get(goals)
+        if found is None:
+            if known.costs is None:
+                (goal,) = goals
+                q = self.network.q_values(grid, goal, rule)
+                found = QField(goal, q, grid.legal_moves(rule), rule)
+            else:
+                found = DistanceField(goals, grid, known.costs, rule)
+                self._repair(known, found, start)
+        self._remember(known, found)
+        return found
+
+    def _known_map(self, grid: GridMap, rule: MoveRule) -> _KnownMap | None:
+        """Return what is known of an equal map."""
+        for known in reversed(self._maps):
+            if known.move_rule is rule and known.grid.same_cells(grid):
+                known.grid = grid  # which may lie elsewhere
+                return known
+        return None
+
+    def _map(self, grid: GridMap, rule: MoveRule) -> _KnownMap:
+        """Return what is known of an equal map, or what the network says of a new one."""
+        with self._lock:
+            known = self._known_map(grid, rule)
+        if known is not None:
+            return known
+        new = _KnownMap(grid, rule, self.network.move_costs(grid, rule))
+        with self._lock:
+            known = self._known_map(grid, rule)  # another thread may have been faster
+            if known is None:
+                # A map on which no goal got a field is not kept.
+                self._maps = [*(other for other in self._maps if other.fields), new]
+        return known or new
+
+    def _repair(self, known: _KnownMap, new: DistanceField, start: Cell | None) -> None:
+        """Give a new field what a field of an older map knows, if there is one."""
+        with self._lock:
+            olders = [other for other in reversed(self._maps) if other is not known]
+        for older in olders:
+            shift = shift_between(older.grid, known.grid)
+            if shift is None or older.move_rule is not known.move_rule:
+                continue
+            old_goals = tuple((x - shift[0], y - shift[1]) for x, y in new.goals)
+            old = older.fields.get(old_goals)
+            if isinstance(old, DistanceField):
+                changed = changed_cells(old.grid, new.grid, shift)
+                if changed is not None and hand_over(old, new, changed, shift, start):
+                    with self._lock:
+                        older.fields.pop(old_goals, None)
+                return
+
+    def _remember(self, known: _KnownMap, used: QField) -> None:
+        """Keep a field, and forget the oldest ones beyond the bound."""
+        with self._lock:
+            self._use(known, used)
+            size = sum(other.nbytes for other in self._maps)
+            while size > self.nbytes and (len(self._maps) > 1 or len(known.fields) > 1):
+                oldest = self._maps[0]
+                size -= oldest.nbytes
+                oldest.fields.popitem(last=False)
+                if oldest.fields:
+                    size += oldest.nbytes
+                else:
+                    del self._maps[0]
+
+    def _use(self, known: _KnownMap, used: QField) -> None:
+        """Put a map and its field where those lie that were used last."""
+        known.fields[used.goals] = used
+        known.fields.move_to_end(used.goals)
+        self._maps = [other for other in self._maps if other is not known and other.fields]
+        self._maps.append(known)

@@ -1,0 +1,246 @@
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from ddqn_planner import Experience, GridMap
+from ddqn_planner.cli import main
+from ddqn_planner.experience.drive_log import DriveEnd, DriveFolder
+from ddqn_planner.experience.recordings import drives_of, read_mcap
+from ddqn_planner.grid import save_map
+
+GRID = GridMap(np.zeros((40, 120), dtype=np.bool_), resolution=0.25)
+
+HEADER = """std_msgs/Header header
+"""
+POSE_DEFINITIONS = """
+================================================================================
+MSG: std_msgs/Header
+builtin_interfaces/Time stamp
+string frame_id
+================================================================================
+MSG: builtin_interfaces/Time
+int32 sec
+uint32 nanosec
+================================================================================
+MSG: geometry_msgs/Pose
+geometry_msgs/Point position
+geometry_msgs/Quaternion orientation
+================================================================================
+MSG: geometry_msgs/Point
+float64 x
+float64 y
+float64 z
+================================================================================
+MSG: geometry_msgs/Quaternion
+float64 x
+float64 y
+float64 z
+float64 w
+================================================================================
+MSG: geometry_msgs/PoseWithCovariance
+geometry_msgs/Pose pose
+float64[36] covariance
+================================================================================
+MSG: geometry_msgs/TransformStamped
+std_msgs/Header header
+string child_frame_id
+geometry_msgs/Transform transform
+================================================================================
+MSG: geometry_msgs/Transform
+geometry_msgs/Vector3 translation
+geometry_msgs/Quaternion rotation
+================================================================================
+MSG: geometry_msgs/Vector3
+float64 x
+float64 y
+float64 z
+"""
+DEFINITIONS = {
+    "nav_msgs/msg/Odometry": HEADER + "geometry_msgs/PoseWithCovariance pose\n",
+    "geometry_msgs/msg/PoseStamped": HEADER + "geometry_msgs/Pose pose\n",
+    "geometry_msgs/msg/PoseWithCovarianceStamped": (
+        HEADER + "geometry_msgs/PoseWithCovariance pose\n"
+    ),
+    "tf2_msgs/msg/TFMessage": "geometry_msgs/TransformStamped[] transforms\n",
+    "std_msgs/msg/String": "string data\n",
+}
+
+Sample = tuple[float, float, float]
+
+
+def slow_drive() -> list[Sample]:
+    """20 m along x at a third of the nominal speed."""
+    return [(1e9 + t, 5 + t / 6, 5.0) for t in np.arange(0, 120, 0.1).tolist()]
+
+
+def header(seconds: float, frame: str = "map") -> dict[str, Any]:
+    whole = int(seconds)
+    return {
+        "stamp": {"sec": whole, "nanosec": int(1e9 * (seconds - whole))},
+        "frame_id": frame,
+    }
+
+
+def pose(x: float, y: float) -> dict[str, Any]:
+    return {
+        "position": {"x": x, "y": y, "z": 0.0},
+        "orientation": {"x": 0.0, "y": 0.0, "z": 0.0, "w": 1.0},
+    }
+
+
+def message(kind: str, sample: Sample, frame: str = "map") -> dict[str, Any]:
+    seconds, x, y = sample
+    placed: dict[str, Any] = pose(x, y)
+    if not kind.endswith("PoseStamped"):
+        placed = {"pose": placed, "covariance": [0.0] * 36}
+    return {"header": header(seconds, frame), "pose": placed}
+
+
+def transform(
+    seconds: float, frame: str, child: str, x: float, y: float, yaw: float = 0.0
+) -> dict[str, Any]:
+    rotation = {"x": 0.0, "y": 0.0, "z": math.sin(yaw / 2), "w": math.cos(yaw / 2)}
+    return {
+        "header": header(seconds, frame),
+        "child_frame_id": child,
+        "transform": {"translation": {"x": x, "y": y, "z": 0.0}, "rotation": rotation},
+    }
+
+
+def write_mcap(path: Path, messages: list[tuple[str, str, dict[str, Any]]]) -> Path:
+    """Write messages as (topic, kind, content)."""
+    pytest.importorskip("mcap_ros2")
+    from mcap_ros2.writer import Writer
+
+    with path.open("wb") as file:
+        writer = Writer(file)
+        schemas = {
+            kind: writer.register_msgdef(kind, text + POSE_DEFINITIONS)
+            for kind, text in DEFINITIONS.items()
+        }
+        for number, (topic, kind, content) in enumerate(messages):
+            writer.write_message(topic, schemas[kind], content, log_time=number)
+        writer.finish()
+    return path
+
+
+@pytest.fixture
+def map_file(tmp_path: Path) -> Path:
+    save_map(GRID, tmp_path / "map" / "map.yaml")
+    return tmp_path / "map" / "map.yaml"
+
+
+def slowness(path: Path) -> float:
+    return float(Experience.load(path).slowness(GRID)[20, 60])
+
+
+def test_a_folder_is_learned_anew(tmp_path: Path, map_file: Path, capsys: Any) -> None:
+    folder = DriveFolder(tmp_path / "drives", 0.5, 0.5)
+    seconds, *positions = np.transpose(slow_drive())
+    for _ in range(3):
+        folder.add(DriveEnd.ARRIVED, seconds, np.column_stack(positions), GRID)
+    command = ["learn", str(folder.folder), "--map", str(map_file)]
+    assert main(command) == 2  # the trainer records there
+    assert "another process records" in capsys.readouterr().err
+    folder.close()
+    before = slowness(folder.experience_path)
+    folder.experience_path.write_text("broken")
+    assert main(command) == 0
+    assert slowness(folder.experience_path) == pytest.approx(before, rel=0.03)
+    output = capsys.readouterr().out
+    assert "3 drives, 60 m, 6.0 min" in output
+    assert f"saved {folder.experience_path}" in output
+    DriveFolder(tmp_path / "drives", 0.5, 0.5).close()
+
+
+def test_a_csv_file_is_learned(tmp_path: Path, map_file: Path, capsys: Any) -> None:
+    file = tmp_path / "drive.csv"
+    rows = [f"{t},{x},note,{y}" for t, x, y in slow_drive()]
+    file.write_text("\n".join(["seconds,x,what,y", *rows]))
+    out = tmp_path / "new" / "learned.npz"
+    options = ["--map", str(map_file), "--out", str(out), "--nominal-speed", "1.0"]
+    assert main(["learn", str(file), *options]) == 0
+    assert slowness(out) > 3
+    assert Experience.load(out).nominal_speed == 1
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "reason"),
+    [
+        ("drive.csv", "time,x,y\n1,2,3\n", "the columns seconds are missing"),
+        ("drive.csv", "seconds,x,y\n1,2,three\n", "line 2: .* no numbers"),
+        ("drive.csv", "seconds,x,y\n1,2\n", "line 2: .* no numbers"),
+        ("drive.csv", "seconds,x,y\n1,2,nan\n", "holds no drive"),
+        ("drive.csv", "", "columns seconds, x, y are missing"),
+        ("drive.bag", "", r"ends in neither .csv nor .mcap"),
+        ("missing.csv", None, "No such file"),
+    ],
+)
+def test_what_cannot_be_learned_is_refused(
+    tmp_path: Path, map_file: Path, capsys: Any, name: str, text: str | None, reason: str
+) -> None:
+    file = tmp_path / name
+    if text is not None:
+        file.write_text(text)
+    assert main(["learn", str(file), "--map", str(map_file)]) == 2
+    assert __import__("re").search(reason, capsys.readouterr().err)
+    assert not (tmp_path / "experience.npz").exists()
+
+
+@pytest.mark.parametrize("kind", list(DEFINITIONS)[:3])
+def test_poses_of_an_mcap_file_are_learned(
+    tmp_path: Path, map_file: Path, kind: str, capsys: Any
+) -> None:
+    messages = [("/where", kind, message(kind, sample)) for sample in slow_drive()]
+    other = ("/odom", "nav_msgs/msg/Odometry")
+    messages += [(*other, message(other[1], (t, 0.0, 0.0), "odom")) for t in range(9)]
+    messages += [("/chatter", "std_msgs/msg/String", {"data": "hello"})]
+    file = write_mcap(tmp_path / "drive.mcap", messages)
+    assert main(["learn", str(file), "--map", str(map_file)]) == 0
+    assert slowness(tmp_path / "experience.npz") > 2
+    assert "1200 poses of /where" in capsys.readouterr().out
+
+
+def test_transforms_of_an_mcap_file_lead_to_the_map(tmp_path: Path) -> None:
+    kind = "tf2_msgs/msg/TFMessage"
+    turned = transform(0, "map", "odom", 10.0, 20.0, math.pi / 2)
+    messages = [("/tf", kind, {"transforms": [turned]})]
+    for t in range(5):
+        own = transform(100.0 + t, "odom", "base_link", float(t), 1.0)
+        messages.append(("/tf", kind, {"transforms": [transform(t, "map", "door", 0, 0), own]}))
+    file = write_mcap(tmp_path / "tf.mcap", messages)
+    topic, samples = read_mcap(file, "", "map", "base_link")
+    assert topic == "/tf"
+    expected = [(100.0 + t, 9.0, 20.0 + t) for t in range(5)]
+    np.testing.assert_allclose(samples, expected, atol=1e-9)
+
+
+def test_an_mcap_file_without_poses_on_the_map_names_what_it_has(tmp_path: Path) -> None:
+    kind = "nav_msgs/msg/Odometry"
+    file = write_mcap(tmp_path / "odom.mcap", [("/odom", kind, message(kind, (1, 2, 3), "odom"))])
+    with pytest.raises(ValueError, match=r"no poses in the frame 'map' .*/odom in \['odom'\]"):
+        read_mcap(file, "", "map", "base_link")
+    assert read_mcap(file, "/odom", "odom", "base_link")[1] == [(1, 2, 3)]
+
+
+@pytest.mark.parametrize("cut", [0, 20, 400])
+def test_a_broken_mcap_file_is_refused(tmp_path: Path, cut: int) -> None:
+    kind = "nav_msgs/msg/Odometry"
+    messages = [("/odom", kind, message(kind, sample)) for sample in slow_drive()]
+    file = write_mcap(tmp_path / "drive.mcap", messages)
+    file.write_bytes(file.read_bytes()[:cut])
+    with pytest.raises(ValueError, match="cannot be read as MCAP"):
+        read_mcap(file, "", "map", "base_link")
+
+
+def test_a_recording_of_hours_has_a_drive_for_each_way() -> None:
+    way = [(t, min(t / 2, 10.0), 0.0) for t in np.arange(0, 200, 0.1).tolist()]
+    back = [(200 + t, 10 - x, y) for t, x, y in way]
+    drives = drives_of([*way, *back, (math.nan, 0.0, 0.0)])
+    assert [drive.outcome.value for drive in drives] == ["paused", "paused"]
+    assert [round(drive.metres) for drive in drives] == [10, 10]

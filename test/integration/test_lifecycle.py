@@ -1,0 +1,260 @@
+"""The planner's lifecycle: configure creates, activate enables, deactivate stops, cleanup frees."""
+
+from __future__ import annotations
+
+import gc
+import shutil
+import threading
+import weakref
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import rclpy
+from client import initial_pose, wait_for
+from diagnostic_msgs.msg import DiagnosticStatus
+from integration.robot import GOAL, START, Robot
+from integration.test_startup import ask_for_plan
+from integration.test_startup import load_gate as load_gate
+from lifecycle_msgs.msg import Transition
+from lifecycle_msgs.srv import ChangeState, GetState
+from nav_msgs.srv import GetPlan
+
+from ddqn_planner.nodes.planner_node import PlannerNode
+
+CYCLE = ["configure", "activate", "deactivate", "cleanup"]
+OF_CONFIGURED = {"planner/get_plan", "planner/reload_model", "plan", "map", "goal_pose"}
+
+
+class Manager:
+    """What a lifecycle manager does with the planner."""
+
+    def __init__(self, robot: Robot) -> None:
+        self.client = robot.client
+
+    def change(self, label: str = "", number: int = 0) -> bool:
+        transition = Transition(id=number, label=label)
+        request = ChangeState.Request(transition=transition)
+        answer: bool = self.client.call(ChangeState, "planner/change_state", request).success
+        return answer
+
+    @property
+    def state(self) -> str:
+        label: str = self.client.call(GetState, "planner/get_state").current_state.label
+        return label
+
+    def created(self) -> set[str]:
+        """Which of the topics and services of a configured planner it has."""
+        node, namespace = self.client.node, self.client.node.get_namespace()
+        found = {
+            name.removeprefix(f"{namespace}/")
+            for get in (
+                node.get_publisher_names_and_types_by_node,
+                node.get_subscriber_names_and_types_by_node,
+                node.get_service_names_and_types_by_node,
+            )
+            for name, _ in get("planner", namespace)
+        }
+        return found & OF_CONFIGURED
+
+
+MakeRobot = Callable[[str], Robot]
+
+
+@pytest.fixture
+def make_robot(
+    make_client: Callable[[str], Any], small_values: np.ndarray, model: Path
+) -> MakeRobot:
+    def make(name: str) -> Robot:
+        return Robot(make_client(f"/{name}"), small_values, model, f"/{name}/planner")
+
+    return make
+
+
+def test_a_manager_starts_and_stops_the_planner_twice(
+    run_node: Any, make_robot: MakeRobot, model: Path
+) -> None:
+    parameters = {"autostart": False, "model": str(model)}
+    with run_node("planner_node", parameters, namespace="/managed") as node:
+        robot = make_robot("managed")
+        manager = Manager(robot)
+        for _ in range(2):
+            assert manager.state == "unconfigured"
+            wait_for("only what is always there", lambda: not manager.created())
+            status = robot.wait_for_reason("the node is not active; configure and activate it")
+            assert status.level == DiagnosticStatus.WARN
+            assert manager.change("configure")
+            assert manager.state == "inactive"
+            wait_for("what configure creates", lambda: manager.created() == OF_CONFIGURED)
+            robot.set_map(robot.stamped_map())  # a map is taken, requests are not
+            robot.send_start(robot.pose(START))
+            robot.clear()
+            assert robot.get_plan(robot.pose(START), robot.pose(GOAL)).poses == []
+            robot.wait_for_reason("the node is not active", {"status": "NOT_ACTIVE"})
+            node.wait_for_log("no plan: the node is not active")
+            robot.send_goal(robot.pose(GOAL))
+            robot.wait_for_reason("the node is not active", {"status": "NOT_ACTIVE"})
+            assert manager.change("activate")
+            assert manager.state == "active"
+            robot.assert_works()
+            assert robot.plans.messages() == []  # of the goal that was refused
+            robot.begin()
+            assert manager.change("deactivate")
+            assert manager.state == "inactive"
+            robot.clear()
+            robot.send_start(robot.pose((1, 0)))
+            robot.set_map(robot.stamped_map())
+            assert robot.get_plan(robot.pose(START), robot.pose(GOAL)).poses == []
+            assert manager.change("activate")
+            robot.assert_works()
+            assert robot.plans.messages() == []  # the goal was dropped
+            assert manager.change("deactivate")
+            assert manager.change("cleanup")
+            robot.clear()
+            node.forget_log()
+        assert manager.change("configure")
+        assert manager.change("activate")
+        assert manager.change("shutdown")
+        assert manager.state == "finalized"
+        assert not any(manager.change(label) for label in [*CYCLE, "shutdown"])
+
+
+def test_no_request_for_a_transition_ends_the_planner(
+    run_node: Any, make_robot: MakeRobot, model: Path
+) -> None:
+    with run_node("planner_node", {"model": str(model)}, namespace="/asked") as node:
+        robot = make_robot("asked")
+        manager = Manager(robot)
+        assert manager.state == "active"
+        for label in ("configure", "activate", "cleanup", "no_such", "transition_error", "ü" * 99):
+            assert not manager.change(label)
+        for number in (0, 1, 2, 3, 5, 6, 8, 10, 60, 62, 77, 255):
+            assert not manager.change(number=number)
+        node.wait_for_log("'configure' refused: the node has deactivate, shutdown when active")
+        node.wait_for_log("transition 255 refused")
+        assert manager.state == "active"
+        robot.set_map(robot.stamped_map())
+        robot.assert_works()
+        assert manager.change(number=Transition.TRANSITION_DEACTIVATE)
+        assert manager.state == "inactive"
+
+
+def test_a_model_that_cannot_be_loaded_fails_configure(
+    run_node: Any, make_robot: MakeRobot, model: Path, tmp_path: Path
+) -> None:
+    file = tmp_path / "model.safetensors"
+    parameters = {"autostart": False, "model": str(file)}
+    with run_node("planner_node", parameters, namespace="/failing") as node:
+        robot = make_robot("failing")
+        manager = Manager(robot)
+        for content, reason in ((None, "no model"), (b"a model", "cannot be read as safetensors")):
+            if content:
+                file.write_bytes(content)
+            assert not manager.change("configure")
+            assert manager.state == "unconfigured"
+            node.wait_for_log(f"model refused: .*{reason}.*; or set the parameter 'model'")
+            status = robot.wait_for_reason(f"model refused: .*{reason}")
+            assert status.level == DiagnosticStatus.ERROR
+            assert manager.created() == set()
+        shutil.copy(model, file)
+        assert manager.change("configure")
+        assert manager.change("activate")
+        robot.set_map(robot.stamped_map())
+        robot.assert_works()
+
+
+def test_the_parameters_of_an_unconfigured_planner_are_checked_and_used(
+    run_node: Any, make_robot: MakeRobot, model: Path
+) -> None:
+    with run_node("planner_node", {"autostart": False}, namespace="/unconfigured"):
+        robot = make_robot("unconfigured")
+        client, manager = robot.client, Manager(robot)
+        assert not client.set_parameters("planner", model="no_such_model")[0].successful
+        assert client.set_parameters("planner", model=str(model))[0].successful
+        assert client.set_parameters("planner", start_source="odometry")[0].successful
+        assert manager.change("configure")
+        assert manager.change("activate")
+        robot.wait_for_reason("", {"model file": str(model), "state": "active"})
+        robot.set_map(robot.stamped_map())
+        robot.assert_works()
+
+
+def test_requests_that_wait_are_answered_when_the_planner_is_stopped(
+    run_node: Any, make_robot: MakeRobot, load_gate: Path
+) -> None:
+    with run_node("planner_node", {}, namespace="/stopped") as node:
+        robot = make_robot("stopped")
+        manager = Manager(robot)
+        robot.set_map(robot.stamped_map())
+        robot.send_start(robot.pose(START))
+        robot.send_goal(robot.pose(GOAL))
+        node.wait_for_log("a model waits")
+        plan, answered = ask_for_plan(robot)
+        robot.wait_for_reason("the model is being loaded")
+        assert manager.change("deactivate")
+        assert answered.wait(60)
+        assert plan.result().plan.poses == []
+        robot.wait_for_reason("the node is not active", {"status": "NOT_ACTIVE"})
+        assert manager.change("cleanup")
+        load_gate.touch()
+        assert manager.change("configure")
+        assert manager.change("activate")
+        robot.set_map(robot.stamped_map())
+        robot.assert_works()
+        assert robot.plans.messages() == []
+
+
+def test_the_planner_survives_transitions_among_requests(
+    run_node: Any, make_robot: MakeRobot, model: Path
+) -> None:
+    parameters = {"autostart": False, "model": str(model)}
+    with run_node("planner_node", parameters, namespace="/busy"):
+        robot = make_robot("busy")
+        manager = Manager(robot)
+        node = robot.client.node
+        plans = node.create_client(GetPlan, "planner/get_plan")
+        publishers = [
+            (node.create_publisher(type(message), topic, 10), message)
+            for topic, message in (
+                ("map", robot.map_message()),
+                ("goal_pose", robot.pose(GOAL)),
+                ("initialpose", initial_pose(robot.pose(START))),
+            )
+        ]
+        request = GetPlan.Request(start=robot.pose(START), goal=robot.pose(GOAL))
+        for label in CYCLE * 5:
+            for _ in range(20):
+                plans.call_async(request)
+                for publisher, message in publishers:
+                    publisher.publish(message)
+            assert manager.change(label)
+        assert manager.state == "unconfigured"
+        assert manager.change("configure")
+        assert manager.change("activate")
+        robot.set_map(robot.stamped_map())
+        robot.assert_works()
+
+
+def test_cleanup_frees_map_model_and_fields(make_robot: MakeRobot, model: Path) -> None:
+    rclpy.init(args=["--ros-args", "-p", f"model:={model}", "-r", "__ns:=/freed"])
+    node = PlannerNode()
+    spinning = threading.Thread(target=rclpy.spin, args=[node])
+    spinning.start()
+    try:
+        robot = make_robot("freed")
+        manager = Manager(robot)
+        robot.begin()
+        planner, grid = node._model.planner, node._map._grid
+        assert planner is not None
+        freed = [weakref.ref(it) for it in (planner, grid, planner.q_field(grid, GOAL))]
+        del planner, grid
+        assert manager.change("deactivate")
+        assert all(reference() for reference in freed)
+        assert manager.change("cleanup")
+        wait_for("free memory", lambda: gc.collect() >= 0 and not any(it() for it in freed))
+    finally:
+        rclpy.shutdown()
+        spinning.join()
+        node.destroy_node()

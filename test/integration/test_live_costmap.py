@@ -1,0 +1,158 @@
+"""A costmap, its updates, and poses in other frames over DDS."""
+
+from __future__ import annotations
+
+import array
+import itertools
+from collections.abc import Callable, Iterator
+from pathlib import Path as FilePath
+from typing import Any
+
+import numpy as np
+import pytest
+from builtin_interfaces.msg import Time
+from geometry_msgs.msg import PoseStamped, TransformStamped
+from integration.robot import Robot, points_of, values_of
+from std_msgs.msg import Header
+
+from ddqn_planner.grid import GridMap
+from ddqn_planner.nodes.runtime import LATCHED
+
+DOORS = [(4, 30), (12, 30)]
+"""(x, y) of the cells in which a wall is open."""
+
+NEEDS_MAP_MSGS = "PyPI does not have map_msgs; apt install ros-jazzy-map-msgs"
+
+
+@pytest.fixture(scope="module")
+def costmap() -> np.ndarray:
+    """(20, 40) int8: two rooms, and two doors that inflation has nearly closed."""
+    values = np.zeros((20, 40), dtype=np.int8)
+    values[:, 29:32] = 99
+    values[:, 30] = 100
+    for y, x in DOORS:
+        values[y, x - 1 : x + 2] = 90
+    return values
+
+
+class CostmapRobot(Robot):
+    @staticmethod
+    def grid_of(values: np.ndarray, origin: tuple[float, float, float] = (-1.0, 2.0, 0.0)) -> Any:
+        return GridMap(values >= 99, 0.5, origin)
+
+
+@pytest.fixture(scope="module")
+def robot(
+    run_node: Any, make_client: Callable[[str], Any], costmap: np.ndarray, model: FilePath
+) -> Iterator[Robot]:
+    client = make_client("/live")
+    parameters = {"map_type": "costmap"}
+    remaps = ["map:=global_costmap/costmap"]
+    with run_node("planner_node", parameters, remaps, namespace="/live"):
+        robot = CostmapRobot(client, costmap, model, "/live/planner")
+        client.publish("global_costmap/costmap", robot.stamped_map(), LATCHED)
+        robot.send_start(robot.pose((5, 5)))
+        yield robot
+
+
+def test_a_costmap_is_planned_on_where_the_same_values_as_a_map_leave_no_path(
+    robot: Robot,
+) -> None:
+    robot.send_goal(robot.pose((35, 5)))
+    robot.wait_for_path((5, 5), (35, 5))
+    assert robot.client.set_parameters("planner", map_type="map")[0].successful
+    robot.wait_for_reason("no path leads from")
+    assert robot.client.set_parameters("planner", map_type="costmap")[0].successful
+    robot.clear()
+    robot.wait_for_reason("^a path of")
+    (result,) = robot.client.set_parameters("planner", map_type="octree")
+    assert "give one of map, costmap" in result.reason
+
+
+def test_the_goal_in_the_inscribed_zone_is_said_to_be_so(robot: Robot) -> None:
+    assert robot.get_plan(robot.pose((5, 5)), robot.pose((29, 0))).poses == []
+    robot.wait_for_reason("the goal is occupied .* nearer to an obstacle than the costmap allows")
+
+
+def test_updates_close_and_open_doors(robot: Robot) -> None:
+    map_msgs = pytest.importorskip("map_msgs.msg", reason=NEEDS_MAP_MSGS)
+    stamps = itertools.count(10_000)
+
+    def send(x: int, y: int, values: list[list[int]]) -> None:
+        cells = np.array(values, dtype=np.int8)
+        update = map_msgs.OccupancyGridUpdate(x=x, y=y)
+        update.header = Header(frame_id="map", stamp=Time(sec=next(stamps)))
+        update.height, update.width = (int(size) for size in cells.shape)
+        update.data = array.array("b", cells.tobytes())
+        robot.client.publish("global_costmap/costmap_updates", update)
+
+    def is_passed(door: tuple[int, int]) -> Callable[[Any], bool]:
+        place = robot.grid.cell_to_world((door[1], door[0]))
+        return lambda path: any(np.allclose(place, point) for point in points_of(path))
+
+    robot.send_goal(robot.pose((35, 5)))
+    robot.plans.wait(is_passed(DOORS[0]))
+    robot.clear()
+    send(29, 4, [[99, 100, 99]])
+    robot.plans.wait(is_passed(DOORS[1]))
+    robot.wait_for_reason("^a path of", {"planned on the map of (s)": "10000.000000000"})
+    send(29, 12, [[99, 100, 99]])
+    robot.plans.wait(lambda path: not path.poses)
+    robot.clear()
+    send(38, 0, [[0, 0, 0]])
+    robot.wait_for_reason("map_updates refused: .* is not inside", {"map updates refused": "1"})
+    send(29, 4, [[90, 90, 90]])
+    robot.plans.wait(is_passed(DOORS[0]))
+    robot.clear()
+    robot.wait_for_reason("^a path of [^;]*$", {"map updates applied": "3"})
+
+
+def test_poses_in_other_frames_are_transformed(robot: Robot) -> None:
+    pytest.importorskip("tf2_ros", reason="PyPI does not have tf2_ros; see docs/install.md")
+    from tf2_msgs.msg import TFMessage
+
+    client, clock = robot.client, robot.client.node.get_clock()
+    robot_is_at = [0.0]
+
+    def in_frame(frame: str, x: float, y: float) -> PoseStamped:
+        stamped = PoseStamped(header=Header(frame_id=frame, stamp=clock.now().to_msg()))
+        stamped.pose.position.x, stamped.pose.position.y = x, y
+        return stamped
+
+    def send_transforms() -> None:
+        message = TFMessage()
+        for parent, child, x, y in (("map", "odom", 5.0, 4.0), ("odom", "base", *robot_is_at, 0.0)):
+            of_frame = TransformStamped(child_frame_id=child)
+            of_frame.header = in_frame(parent, 0.0, 0.0).header
+            of_frame.transform.translation.x, of_frame.transform.translation.y = x, y
+            message.transforms.append(of_frame)
+        client.publish("/tf", message, listeners=0)
+
+    def ends(path: Any) -> list[tuple[int, int]]:
+        return [
+            robot.grid.world_to_cell(*point) for point in points_of(path)[:: len(path.poses) - 1]
+        ]
+
+    assert client.set_parameters("planner", transform_tolerance=60.0)[0].successful
+    timer = client.node.create_timer(0.02, send_transforms)
+    try:
+        path = robot.get_plan(in_frame("odom", 0.1, 0.1), in_frame("base", 3.1, 2.1))
+        expected = [robot.grid.world_to_cell(*point) for point in ((5.1, 4.1), (8.1, 6.1))]
+        assert path.header.frame_id == "map"
+        assert ends(path) == expected
+        # A goal stays where it was when the robot's frame moves on.
+        robot.clear()
+        robot.send_start(in_frame("odom", 0.1, 0.1))
+        robot.send_goal(in_frame("base", 3.1, 2.1))
+        robot.plans.wait(lambda path: len(path.poses) > 1 and ends(path) == expected)
+        robot_is_at[0] = 2.0
+        assert client.set_parameters("planner", transform_tolerance=1.0)[0].successful
+        robot.clear()
+        robot.send_start(robot.pose((3, 3)))
+        path = robot.plans.wait(lambda path: len(path.poses) > 1 and ends(path)[0] == (3, 3))
+        assert ends(path)[1] == expected[1]
+    finally:
+        client.node.destroy_timer(timer)
+    assert robot.get_plan(robot.pose((3, 3)), in_frame("moon", 0.0, 0.0)).poses == []
+    status = robot.wait_for_reason("the goal's frame is 'moon', and no transform leads from it")
+    assert values_of(status)["status"] == "TF_ERROR"

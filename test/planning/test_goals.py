@@ -1,0 +1,223 @@
+"""Paths through several goals, and to the nearest of several."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from networks import turning_network
+from strategies import grids_in_parts, grids_with_costs, grids_with_free_cell
+
+from ddqn_planner import GridMap, MoveRule, PlanMethod, Planner, PlanStatus, inflate
+from ddqn_planner.grid import Cell, shortest_distances
+from ddqn_planner.model import ModelMetadata
+from ddqn_planner.planning import repair
+from ddqn_planner.planning.distance_field import DistanceField
+from ddqn_planner.planning.plan import PlanRequest, joined
+from ddqn_planner.planning.planner import last_step
+
+RULES = st.sampled_from(list(MoveRule))
+ANY_MAP = Planner.load("any_map")
+GRIDS = grids_with_free_cell() | grids_with_costs() | grids_in_parts()
+
+
+def new_planner() -> Planner:
+    return Planner(ANY_MAP.network, ANY_MAP.metadata)
+
+
+def cells_of(grid: GridMap) -> st.SearchStrategy[Cell]:
+    return st.tuples(st.integers(0, grid.width - 1), st.integers(0, grid.height - 1))
+
+
+@settings(max_examples=300)
+@given(GRIDS, RULES, st.data())
+def test_the_nearest_goal_is_that_of_the_cheapest_plan(
+    grid_and_start: tuple[GridMap, Cell], rule: MoveRule, data: st.DataObject
+) -> None:
+    grid, start = grid_and_start
+    goals = data.draw(st.lists(cells_of(grid), min_size=1, max_size=4))
+    plan = new_planner().plan_nearest(grid, start, goals, rule)
+    free = [goal for goal in goals if grid.is_free(goal)]
+    optimum = [shortest_distances(grid, goal, rule)[start[::-1]] for goal in free]
+    if not free:
+        assert plan.status is PlanStatus.GOAL_OCCUPIED
+    elif np.isinf(min(optimum)):
+        assert plan.status is PlanStatus.NO_PATH
+    else:
+        assert plan.goal == plan.cells[-1]
+        assert plan.goal in free
+        cost = plan.length if plan.cost is None else plan.cost
+        assert min(optimum) - 1e-9 <= cost <= 1.02 * min(optimum)
+        singles = [new_planner().plan(grid, start, goal, rule) for goal in free]
+        assert cost <= 1.02 * min(p.cost or p.length for p in singles if p.cells)
+
+
+@settings(max_examples=300)
+@given(GRIDS, RULES, st.data())
+def test_a_field_toward_several_goals_is_the_best_of_their_fields(
+    grid_and_goal: tuple[GridMap, Cell], rule: MoveRule, data: st.DataObject
+) -> None:
+    grid, goal = grid_and_goal
+    more = data.draw(st.lists(st.sampled_from(grid.free_cells()), max_size=3))
+    goals = tuple(sorted({goal, *more}))
+    costs = ANY_MAP.network.move_costs(grid, rule)
+    assert costs is not None
+    field = DistanceField(goals, grid, costs, rule)
+    value = np.max([new_planner().q_field(grid, goal, rule).q for goal in goals], axis=0)
+    np.testing.assert_array_equal(field.q, value)
+    for x, y in goals:
+        assert field.value[y, x] == field.value.max()
+        assert field.policy[y, x] == -1
+    start = data.draw(st.sampled_from(grid.free_cells()))
+    whole = field.rollout(start)
+    assert DistanceField(goals, grid, costs, rule).rollout(start) == whole
+    if whole.cells:
+        assert set(whole.cells) & set(goals) == {whole.cells[-1]}
+
+
+@given(GRIDS, RULES, st.data())
+def test_a_field_toward_several_goals_is_repaired(
+    grid_and_goal: tuple[GridMap, Cell], rule: MoveRule, data: st.DataObject
+) -> None:
+    grid, start = grid_and_goal
+    goals = data.draw(st.lists(cells_of(grid), min_size=2, max_size=4))
+    planner = new_planner()
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(repair, "CHANGED_SHARE", 1.0)
+        patch.setattr(repair, "REPAIRED", data.draw(st.sampled_from([1, 300])))
+        for _ in range(3):
+            plan = planner.plan_nearest(grid, start, goals, rule)
+            assert plan == new_planner().plan_nearest(grid, start, goals, rule)
+            x, y = data.draw(cells_of(grid))
+            grid = grid.with_patch([[data.draw(st.booleans())]], x, y)
+
+
+def test_goals_that_are_not_free_are_left_out() -> None:
+    occupancy = np.zeros((3, 9), dtype=bool)
+    occupancy[:, 7] = True
+    grid = GridMap(occupancy)
+    plan = ANY_MAP.plan_nearest(grid, (6, 1), [(7, 1), (8, 1), (20, 1), (0, 1), (3, 1)])
+    assert (plan.goal, plan.cells[-1], plan.length) == ((3, 1), (3, 1), 3)
+    for goals, status in (
+        ([(7, 1), (20, 1)], PlanStatus.GOAL_OCCUPIED),
+        ([(-1, 1), (20, 1)], PlanStatus.GOAL_OUTSIDE_MAP),
+        ([(8, 0), (8, 2)], PlanStatus.NO_PATH),
+    ):
+        assert ANY_MAP.plan_nearest(grid, (6, 1), goals).status is status
+    assert ANY_MAP.plan_nearest(grid, (7, 0), [(0, 0)]).status is PlanStatus.START_OCCUPIED
+
+
+def test_a_start_too_near_to_an_obstacle_leaves_for_the_nearest_goal() -> None:
+    occupancy = np.zeros((7, 12), dtype=bool)
+    occupancy[3, 5] = True
+    grid = inflate(GridMap(occupancy), 1.1)
+    plan = ANY_MAP.plan_nearest(grid, (6, 3), [(0, 3), (11, 3)])
+    assert plan.goal == (11, 3)
+    assert plan.cells[0] == (6, 3)
+
+
+def turning_planner(size: int = 6) -> Planner:
+    network = turning_network(size)
+    metadata = ModelMetadata("paper", network.sizes, MoveRule.ROBOT_SAFE, 0.9, "", 1, 0, "")
+    return Planner(network, metadata)
+
+
+def test_a_network_without_costs_plans_to_each_goal() -> None:
+    grid, planner, goals = GridMap(np.zeros((6, 6))), turning_planner(), [(5, 5), (0, 3)]
+    found = planner.plan_nearest(grid, (0, 0), goals, method=PlanMethod.ASTAR_FALLBACK)
+    assert found == planner.plan(grid, (0, 0), (0, 3), method=PlanMethod.ASTAR_FALLBACK)
+    assert planner.plan_nearest(grid, (0, 0), goals).status is PlanStatus.ROLLOUT_TRAPPED
+
+
+@pytest.mark.parametrize("has_costs", [True, False])
+def test_a_robot_between_two_docks_keeps_to_one_of_them(has_costs: bool) -> None:
+    planner = ANY_MAP if has_costs else turning_planner(21)
+    grid, left, right = GridMap(np.zeros((21, 21))), (0, 10), (20, 10)
+    request = PlanRequest(grid, (9, 10), left, MoveRule.ROBOT_SAFE, PlanMethod.ASTAR_FALLBACK)
+    first = last_step(planner.steps(replace(request, others=(right,))))
+    assert first.goal == left
+    request = replace(request, start=(11, 10), others=(right,), under_way=first.every_cell)
+    kept = last_step(planner.steps(replace(request, switch_threshold=0.5)))
+    assert (kept.goal, kept.length) == (left, 11)
+    assert kept.extra_cost == pytest.approx(11 / 9 - 1)
+    assert last_step(planner.steps(replace(request, switch_threshold=0.2))).goal == right
+    taken = replace(request, grid=grid.with_patch([[True]], *left), switch_threshold=10.0)
+    assert last_step(planner.steps(taken)).goal == right
+
+
+@given(GRIDS, RULES, st.booleans(), st.sampled_from([0.0, 2.0]), st.data())
+def test_a_path_through_goals_is_the_sum_of_its_pieces(
+    grid_and_start: tuple[GridMap, Cell],
+    rule: MoveRule,
+    simplified: bool,
+    tolerance: float,
+    data: st.DataObject,
+) -> None:
+    grid, start = grid_and_start
+    goals = data.draw(st.lists(cells_of(grid), min_size=1, max_size=4))
+    options: dict[str, Any] = {"tolerance": tolerance, "simplified": simplified}
+    plan = ANY_MAP.plan_through(grid, start, goals, rule, **options)
+    pieces, here = [], start
+    for goal in goals:
+        pieces.append(ANY_MAP.plan(grid, here, goal, rule, **options))
+        if pieces[-1].status is not PlanStatus.SUCCEEDED:
+            assert (plan.status, plan.goal, plan.cells) == (pieces[-1].status, goal, ())
+            return
+        here = pieces[-1].cells[-1]
+    cells = [cell for piece in pieces for cell in piece.cells]
+    assert list(plan.cells) == cells[:1] + [cell for last, cell in pairwise(cells) if last != cell]
+    assert plan.goal == here
+    assert plan.length == pytest.approx(sum(piece.length for piece in pieces))
+    assert (plan.cost is None) == (grid.cost is None)
+    if plan.cost is not None:
+        assert plan.cost == pytest.approx(sum(piece.cost or 0 for piece in pieces))
+
+
+def test_a_path_through_goals_tells_where_it_was_searched_for() -> None:
+    grid, planner = GridMap(np.zeros((6, 6))), turning_planner()
+    goals = [(2, 0), (5, 5)]
+    plan = planner.plan_through(grid, (5, 0), goals, method="astar_fallback")
+    assert plan.method is PlanMethod.ASTAR_FALLBACK
+    trapped = planner.plan_through(grid, (5, 0), goals)
+    assert (trapped.status, trapped.goal) == (PlanStatus.ROLLOUT_TRAPPED, (5, 5))
+
+
+def test_wrong_goals_are_named() -> None:
+    grid = GridMap(np.zeros((3, 3)))
+    for plan in (ANY_MAP.plan_nearest, ANY_MAP.plan_through):
+        with pytest.raises(ValueError, match="there is no goal; give at least one cell"):
+            plan(grid, (0, 0), [])
+        with pytest.raises(ValueError, match=r"goal 2 is .*; give two whole numbers"):
+            plan(grid, (0, 0), [(1, 1), (0.5, 1)])  # type: ignore[list-item]
+
+
+def test_plans_through_cells_are_joined_without_a_doubled_cell() -> None:
+    grid = GridMap(np.zeros((8, 8), dtype=np.bool_))
+    planner = Planner.load("any_map")
+    cells = [(0, 0), (5, 0), (5, 0), (5, 6)]
+    plans = [planner.plan(grid, *ends) for ends in pairwise(cells)]
+    plan = joined(plans)
+    assert plan.status is PlanStatus.SUCCEEDED
+    assert plan.cells == (*((x, 0) for x in range(6)), *((5, y) for y in range(1, 7)))
+    assert np.array_equal(plan.every_cell, plan.path)
+    assert plan.goal == (5, 6)
+    assert plan.length == pytest.approx(sum(piece.length for piece in plans))
+    assert plan.field_ms == pytest.approx(sum(piece.field_ms for piece in plans))
+    assert joined([plans[0]]) == plans[0]
+    failed = planner.plan(grid, (5, 0), (9, 0))
+    assert joined([plans[0], failed]) is failed
+
+
+def test_the_cost_of_joined_plans_is_the_sum() -> None:
+    cost = np.arange(64, dtype=np.int8).reshape(8, 8)
+    grid = GridMap(np.zeros((8, 8), dtype=np.bool_), cost=cost)
+    planner = Planner.load("any_map")
+    plans = [planner.plan(grid, (0, 0), (7, 0)), planner.plan(grid, (7, 0), (0, 7))]
+    pieces = [plan.cost or 0.0 for plan in plans]
+    assert joined(plans).cost == pytest.approx(sum(pieces))
+    assert joined(plans).move_rule is MoveRule.ROBOT_SAFE

@@ -1,0 +1,277 @@
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import assume, given, settings
+from hypothesis import strategies as st
+from strategies import grids_with_costs, grids_with_free_cell
+
+from ddqn_planner import GridMap, MoveRule, Planner
+from ddqn_planner.grid import MOVES, Cell, legal_moves, path_cost, shortest_path
+from ddqn_planner.planning import Plan, PlanRequest, simplify
+from ddqn_planner.planning.path_under_way import (
+    REACH,
+    is_path_valid,
+    keep_or_switch,
+    legal_segments,
+    rest_of_path,
+)
+from ddqn_planner.planning.planner import last_step
+from ddqn_planner.planning.simplification import touched_cells
+
+RULES = st.sampled_from(list(MoveRule))
+GRIDS = grids_with_free_cell() | grids_with_costs()
+ANY_MAP = Planner.load("any_map")
+
+
+def is_legal(first: Cell, last: Cell, grid: GridMap, rule: MoveRule) -> bool:
+    """Say whether a segment is legal, from the whole map's moves or from all cells it touches."""
+    if not (grid.is_free(first) and grid.is_free(last)):
+        return False
+    step = [last[0] - first[0], last[1] - first[1]]
+    if step in MOVES.tolist():
+        legal = legal_moves(grid.occupancy, rule)
+        return bool(legal[MOVES.tolist().index(step), first[1], first[0]])
+    return all(grid.is_free(cell) for cell in touched_cells(first, last, rule).tolist())
+
+
+@st.composite
+def changed(draw: st.DrawFn, grid: GridMap) -> GridMap:
+    """The map with some other cells and costs."""
+    cells = st.tuples(st.integers(0, grid.width - 1), st.integers(0, grid.height - 1))
+    occupancy = grid.occupancy.copy()
+    cost = None if grid.cost is None else grid.cost.copy()
+    for x, y in draw(st.lists(cells, max_size=6)):
+        occupancy[y, x] ^= draw(st.booleans())
+        if cost is not None:
+            cost[y, x] = draw(st.integers(0, 99))
+    return GridMap(occupancy, cost=cost)
+
+
+@given(GRIDS, RULES, st.data())
+def test_legal_segments_are_those_of_legal_moves_or_through_free_cells(
+    grid_and_cell: tuple[GridMap, Cell], rule: MoveRule, data: st.DataObject
+) -> None:
+    grid, _ = grid_and_cell
+    cell = st.tuples(st.integers(-1, grid.width), st.integers(-1, grid.height))
+    path = data.draw(st.lists(cell, min_size=1, max_size=6))
+    for move in data.draw(st.lists(st.sampled_from(MOVES.tolist()), max_size=6)):
+        path.append((path[-1][0] + move[0], path[-1][1] + move[1]))
+    expected = [is_legal(*segment, grid, rule) for segment in pairwise(path)]
+    assert legal_segments(path, grid, rule).tolist() == expected
+
+
+@given(GRIDS, RULES, st.data())
+def test_a_path_is_valid_if_all_of_it_from_the_cell_nearest_to_the_robot_on_is_legal(
+    grid_and_cell: tuple[GridMap, Cell], rule: MoveRule, data: st.DataObject
+) -> None:
+    grid, goal = grid_and_cell
+    path = list(shortest_path(grid, data.draw(st.sampled_from(grid.free_cells())), goal, rule))
+    assume(path)
+    path = data.draw(st.sampled_from([path, [*simplify(path, grid, rule)]]))
+    robot = data.draw(st.tuples(st.integers(-99, 99), st.integers(-99, 99)))
+    after = data.draw(changed(grid))
+    nearest = min(range(len(path)), key=lambda index: math.dist(path[index], robot))
+    rest = path[nearest:]
+    expected = after.is_free(rest[-1]) and all(is_legal(*s, after, rule) for s in pairwise(rest))
+    assert is_path_valid(path, robot, after, rule) == expected
+    assert is_path_valid(path, robot, grid, rule)
+
+
+def test_an_empty_path_is_not_valid_and_nothing_is_left_of_it() -> None:
+    grid = GridMap(np.zeros((3, 3)))
+    assert not is_path_valid([], (0, 0), grid, "robot_safe")
+    assert not len(rest_of_path([], (0, 0), grid, "robot_safe"))
+
+
+@given(GRIDS, RULES, st.data())
+def test_what_is_left_of_a_path_leads_from_the_robot_onto_it_by_legal_moves(
+    grid_and_cell: tuple[GridMap, Cell], rule: MoveRule, data: st.DataObject
+) -> None:
+    grid, goal = grid_and_cell
+    path = list(shortest_path(grid, data.draw(st.sampled_from(grid.free_cells())), goal, rule))
+    assume(path)
+    after = data.draw(changed(grid))
+    robot = data.draw(st.tuples(st.integers(-1, 9), st.integers(-1, 9)) | st.sampled_from(path))
+    rest = list(map(tuple, rest_of_path(path, robot, after, rule).tolist()))
+    if not rest:
+        if robot in path:
+            assert not is_path_valid(path[path.index(robot) :], robot, after, rule)
+        return
+    assert (rest[0], rest[-1]) == (robot, goal)
+    assert after.is_free(robot)
+    assert legal_segments(rest, after, rule).all()
+    assert all(max(abs(x - a), abs(y - b)) == 1 for (x, y), (a, b) in pairwise(rest))
+    joins = next(index for index in range(len(rest)) if rest[index:] == path[index - len(rest) :])
+    assert joins <= REACH
+    if robot in path and is_path_valid(path[path.index(robot) :], robot, after, rule):
+        assert rest == path[path.index(robot) :]
+
+
+def test_a_robot_beside_its_path_comes_back_to_it_and_a_far_one_has_lost_it() -> None:
+    grid = GridMap(np.zeros((20, 30)))
+    path = [(x, 5) for x in range(30)]
+    rest = rest_of_path(path, (10, 3), grid, "robot_safe").tolist()
+    assert rest[:4] == [[10, 3], [11, 4], [12, 5], [13, 5]]
+    assert len(rest_of_path(path, (10, 5 + REACH), grid, "robot_safe"))
+    assert not len(rest_of_path(path, (10, 6 + REACH), grid, "robot_safe"))
+    assert not len(rest_of_path(path, (10**30, 5), grid, "robot_safe"))
+
+
+def test_a_wall_between_a_robot_and_its_path_is_not_crossed() -> None:
+    occupancy = np.zeros((9, 12), dtype=np.bool_)
+    occupancy[4, :10] = True
+    grid = GridMap(occupancy)
+    path = list(shortest_path(grid, (0, 5), (0, 3), MoveRule.ROBOT_SAFE))
+    beside = rest_of_path(path, (3, 5), grid, MoveRule.ROBOT_SAFE).tolist()
+    assert beside == list(map(list, path[3:]))
+    assert not len(rest_of_path(path[-4:], (3, 5), grid, MoveRule.ROBOT_SAFE))
+
+
+def cost_of(path: Any, grid: GridMap, rule: MoveRule) -> float:
+    return path_cost(np.asarray(path), grid.cost_multiplier, rule)
+
+
+@settings(max_examples=300)
+@given(GRIDS, RULES, st.sampled_from([0.0, 0.03, 0.3, 10.0]), st.data())
+def test_what_is_kept_is_legal_and_costs_at_most_the_threshold_more(
+    grid_and_cell: tuple[GridMap, Cell], rule: MoveRule, threshold: float, data: st.DataObject
+) -> None:
+    grid, goal = grid_and_cell
+    start = data.draw(st.sampled_from(grid.free_cells()))
+    under_way = shortest_path(grid, start, goal, rule)
+    after = data.draw(changed(grid))
+    assume(after.is_free(goal) and after.free_cells())
+    robot = data.draw(st.sampled_from([*filter(after.is_free, under_way), *after.free_cells()]))
+    new = shortest_path(after, robot, goal, rule)
+    assume(new)
+    path, extra_cost = keep_or_switch(under_way, new, after, rule, threshold)
+    assert (tuple(path[0]), tuple(path[-1])) == (robot, goal)
+    assert legal_segments(path, after, rule).all()
+    cost, best = cost_of(path, after, rule), cost_of(new, after, rule)
+    assert cost <= (1 + threshold) * best * (1 + 1e-6)
+    assert cost >= best * (1 - 1e-6)
+    rest = rest_of_path(under_way, robot, after, rule)
+    if extra_cost is None:
+        assert path.tolist() == list(map(list, new))
+        if len(rest):
+            assert cost_of(rest, after, rule) > (1 + threshold) * best * (1 - 1e-6)
+    else:
+        assert path.tolist() == rest.tolist()
+        assert cost == pytest.approx((1 + extra_cost) * best)
+
+
+@given(GRIDS, RULES, st.data())
+def test_a_path_to_another_goal_is_not_kept(
+    grid_and_cell: tuple[GridMap, Cell], rule: MoveRule, data: st.DataObject
+) -> None:
+    grid, goal = grid_and_cell
+    start, other = (data.draw(st.sampled_from(grid.free_cells())) for _ in range(2))
+    assume(other != goal)
+    new, under_way = (shortest_path(grid, start, end, rule) for end in (goal, other))
+    assume(new)
+    path, extra_cost = keep_or_switch(under_way, new, grid, rule, 10.0)
+    assert path.tolist() == list(map(list, new))
+    assert extra_cost is None
+
+
+def two_corridors(upper: int, lower: int) -> GridMap:
+    """Return a hall with two ways round a block, whose cells have these costs."""
+    occupancy = np.zeros((11, 40), dtype=np.bool_)
+    occupancy[3:8, 5:35] = True
+    cost = np.zeros(occupancy.shape, dtype=np.int8)
+    cost[:3, 10:30], cost[8:, 10:30] = lower, upper
+    return GridMap(occupancy, cost=cost)
+
+
+def plan(grid: GridMap, threshold: float, under_way: Any = (), simplified: bool = False) -> Plan:
+    rule = MoveRule.ROBOT_SAFE
+    request = PlanRequest(grid, (0, 5), (39, 5), rule, simplified=simplified)
+    request = replace(request, under_way=under_way, switch_threshold=threshold)
+    return last_step(ANY_MAP.steps(request))
+
+
+def is_upper(path: Plan) -> bool:
+    return max(y for _, y in path.cells) > 7
+
+
+def test_a_planner_keeps_the_path_under_way_up_to_the_threshold() -> None:
+    first = plan(two_corridors(20, 22), 0.03)
+    assert is_upper(first)
+    assert first.extra_cost is None
+    slightly, much = two_corridors(22, 20), two_corridors(60, 20)
+    kept = plan(slightly, 0.1, first.every_cell)
+    assert kept.cells == first.cells
+    assert kept.extra_cost is not None
+    best = plan(slightly, 0.1)
+    assert 0 < kept.extra_cost < 0.1
+    assert kept.cost == pytest.approx((1 + kept.extra_cost) * best.cost)
+    for other in (plan(slightly, 0.0, first.every_cell), plan(much, 0.1, first.every_cell)):
+        assert not is_upper(other)
+        assert other.extra_cost is None
+    blocked = two_corridors(20, 20).with_patch(np.ones((3, 1)), 20, 8)
+    assert not is_upper(plan(blocked, 10.0, first.every_cell))
+
+
+def test_the_same_path_is_no_new_one() -> None:
+    grid = two_corridors(20, 22)
+    first = plan(grid, 0.0)
+    assert plan(grid, 0.0, first.every_cell) == replace(first, extra_cost=0.0)
+
+
+def test_a_simplified_path_is_kept_as_a_whole() -> None:
+    first = plan(two_corridors(20, 22), 0.1, simplified=True)
+    assert len(first.cells) < len(first.every_cell)
+    kept = plan(two_corridors(22, 20), 0.1, first.every_cell, simplified=True)
+    assert is_upper(kept)
+    assert np.array_equal(kept.every_cell, first.every_cell)
+    assert len(kept.cells) < len(kept.every_cell)
+
+
+def test_a_robot_too_near_to_an_obstacle_leaves_and_keeps_its_path() -> None:
+    grid = two_corridors(20, 22)
+    first = plan(grid, 0.0)
+    occupancy = grid.occupancy.copy()
+    occupancy[4:7, 0] = True
+    too_near = GridMap(occupancy, cost=grid.cost, obstacles=np.zeros_like(occupancy))
+    kept = plan(too_near, 0.1, first.every_cell)
+    assert kept.cells[0] == (0, 5)
+    assert is_upper(kept)
+    assert kept.extra_cost is not None
+    assert legal_segments(kept.cells[1:], too_near, MoveRule.ROBOT_SAFE).all()
+
+
+@given(GRIDS, RULES, st.sampled_from([0.0, 0.3, 10.0]), st.data())
+def test_a_path_to_another_goal_is_kept_up_to_the_threshold_while_that_goal_is_free(
+    grid_and_cell: tuple[GridMap, Cell], rule: MoveRule, threshold: float, data: st.DataObject
+) -> None:
+    grid, start = grid_and_cell
+    cells = st.lists(st.sampled_from(grid.free_cells()), min_size=2, max_size=4)
+    goal, *others = goals = data.draw(cells)
+    first = last_step(ANY_MAP.steps(PlanRequest(grid, start, goal, rule, others=(*others,))))
+    assume(first.cells)
+    after = data.draw(changed(grid))
+    robot = data.draw(st.sampled_from(first.cells))
+    request = PlanRequest(after, robot, goal, rule, others=(*others,))
+    best = last_step(ANY_MAP.steps(request))
+    request = replace(request, under_way=first.every_cell, switch_threshold=threshold)
+    plan = last_step(ANY_MAP.steps(request))
+    assert plan.status is best.status
+    if not best.cells:
+        return
+    cost, least = cost_of(plan.cells, after, rule), cost_of(best.cells, after, rule)
+    rest = rest_of_path(first.every_cell, robot, after, rule)
+    assert (plan.cells[0], plan.cells[-1]) == (robot, plan.goal)
+    assert plan.goal in goals
+    assert after.is_free(plan.goal)
+    assert legal_segments(plan.cells, after, rule).all()
+    assert cost <= (1 + threshold) * least * (1 + 1e-6)
+    if len(rest) and cost_of(rest, after, rule) <= (1 + threshold) * least * (1 - 1e-6):
+        assert plan.path.tolist() == rest.tolist()
+    if plan.extra_cost is None:
+        assert plan == best
