@@ -109,7 +109,7 @@ def _print(options: argparse.Namespace, grid: GridMap, plan: Plan, seconds: floa
         _print_map(grid, plan)
         if options.cells:
             print(*(f"{x} {y}" for x, y in plan.cells), sep="\n")
-        metres = plan.length * grid.resolution
+        metres = path_length(plan.path) * grid.resolution
         print(f"start {plan.cells[0]}, goal {plan.cells[-1]}, {metres:.2f} m")
         known = "" if optimum is None else f"optimum {optimum:.2f} under {plan.move_rule.value}, "
         known += "" if plan.cost is None else f"cost {plan.cost:.2f}, "
