@@ -30,17 +30,16 @@ setup(
     zip_safe=False,
     python_requires=">=3.10",
     install_requires=[
-        "gymnasium>=1.1",
         "numba>=0.58",
         "numpy>=1.26",
         "Pillow>=10.0",
         "PyYAML>=6.0",
         "safetensors>=0.4",
         "scipy>=1.11",
-        "torch>=2.1",
         "tqdm>=4.60",
     ],
     extras_require={
+        "train": ["gymnasium>=1.1", "torch>=2.1"],
         "ros": ["ros-jazzy-rclpy[fastrtps]>=7.1.5,<8", "ros-jazzy-common-interfaces>=5.3,<6"],
         "figures": ["matplotlib>=3.6"],
         "experiments": ["matplotlib>=3.6"],
@@ -65,9 +64,9 @@ setup(
     entry_points={
         "console_scripts": [
             "ddqn-planner = ddqn_planner.cli:main",
-            "map_server_node = ddqn_planner.nodes.map_server_node:main",
-            "planner_node = ddqn_planner.nodes.planner_node:main",
-            "trainer_node = ddqn_planner.nodes.trainer_node:main",
+            "map_server_node = ddqn_planner.nodes:run_map_server",
+            "planner_node = ddqn_planner.nodes:run_planner",
+            "trainer_node = ddqn_planner.nodes:run_trainer",
         ],
     },
 )

@@ -9,6 +9,8 @@ from collections.abc import Sequence
 from importlib import import_module
 from typing import Final
 
+from ddqn_planner.libraries import with_remedy
+
 COMMANDS: Final = {
     "plan": "plan a path on a map file",
     "train": "train a model on a map file",
@@ -21,17 +23,6 @@ COMMANDS: Final = {
     "watch": "show live what the ROS nodes publish",
 }
 """Each is a module of `ddqn_planner.commands`."""
-
-INSTALL: Final = {
-    "matplotlib": "pip install 'ddqn_planner[experiments]'",
-    "mcap": "pip install 'ddqn_planner[bags]'",
-    "mcap_ros2": "pip install 'ddqn_planner[bags]'",
-    "nav_msgs": "source ROS 2 Jazzy, or pip install 'ddqn_planner[ros]'",
-    "rclpy": "source ROS 2 Jazzy, or pip install 'ddqn_planner[ros]'",
-    "rerun": "pip install 'ddqn_planner[watch]'",
-    "torch": "pip install torch",
-}
-"""How to get the libraries that not every command needs."""
 
 
 class HelpFormatter(argparse.HelpFormatter):
@@ -64,9 +55,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         options = parser.parse_args(arguments)
         return int(options.run(options))
     except (OSError, ValueError, ImportError) as error:
-        library = (getattr(error, "name", None) or "").partition(".")[0]
-        hint = INSTALL.get(library)
-        print(f"ddqn-planner: {error}" + (f"; {hint}" if hint else ""), file=sys.stderr)
+        print(f"ddqn-planner: {with_remedy(error)}", file=sys.stderr)
         return 2
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable
 from functools import cache, wraps
 from threading import Lock
@@ -51,6 +52,7 @@ def _import_numba() -> Any:
     from numba.np import linalg
 
     with _importing:
+        _announce_compiling()
         check = linalg.ensure_blas
         linalg.ensure_blas = lambda: None
         try:
@@ -58,3 +60,31 @@ def _import_numba() -> Any:
         finally:
             linalg.ensure_blas = check
     return numba
+
+
+@cache
+def _announce_compiling() -> None:
+    """Log once when a function is compiled: loaded from the cache it would take no time."""
+    from numba.core import event
+
+    class Announcement(event.Listener):
+        def on_start(self, compiling: Any) -> None:
+            dispatcher = compiling.data["dispatcher"]
+            if dispatcher.py_func.__module__.startswith("ddqn_planner."):
+                _announce(bool(dispatcher.stats.cache_path))
+
+        def on_end(self, compiling: Any) -> None:
+            pass
+
+    event.register("numba:compile", Announcement())  # type: ignore[no-untyped-call]
+
+
+@cache
+def _announce(is_kept: bool) -> None:
+    """Log a line, which Python prints to stderr where the program has set up no logging."""
+    kept = "the result is kept for the next start"
+    lost = "set NUMBA_CACHE_DIR to a folder that can be written to keep the result"
+    logging.getLogger("ddqn_planner").warning(
+        "ddqn_planner compiles its functions, which takes some seconds; %s",
+        kept if is_kept else lost,
+    )

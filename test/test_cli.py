@@ -8,6 +8,7 @@ import subprocess
 import sys
 import sysconfig
 import time
+from collections.abc import Callable, Sequence
 from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
@@ -15,6 +16,7 @@ from typing import Any
 import numpy as np
 import pytest
 from PIL import Image
+from processes import executable
 
 from ddqn_planner.cli import main
 from ddqn_planner.grid import GridMap, MapFile, save_map
@@ -47,7 +49,9 @@ def test_plan_prints_the_papers_path(capsys: pytest.CaptureFixture[str]) -> None
 
 def test_plan_counts_by_its_rule(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["plan", "dilemma", "--move-rule", "unit"]) == 0
-    assert "length 18.00 cells, optimum 18.00 under unit" in capsys.readouterr().out
+    printed = capsys.readouterr().out
+    assert "length 18.00 cells, optimum 18.00 under unit" in printed
+    assert "11.49 m" in printed  # as the robot drives, whatever the rule counts
 
 
 def test_plan_reaches_the_cells_that_the_metres_of_its_tolerance_name(
@@ -65,8 +69,36 @@ def test_plan_takes_the_model_for_any_map_and_prints_no_wide_map(
 ) -> None:
     assert main(["plan", "office"]) == 0
     printed = capsys.readouterr().out
-    assert "length 789.95 cells, optimum 789.95 under robot_safe" in printed
-    assert "#" not in printed
+    start, length = printed.splitlines()
+    assert start == "start (15, 15), goal (550, 330), 39.50 m"
+    assert length.startswith("length 789.95 cells, optimum 789.95 under robot_safe, greedy, ")
+
+
+def test_plan_draws_a_wide_map_for_a_terminal(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(sys.stdout, "isatty", lambda: True)
+    monkeypatch.setenv("COLUMNS", "100")
+    monkeypatch.setenv("LINES", "40")
+    assert main(["plan", "office", "--clearance-weight", "1"]) == 0
+    *blocks, start, length = capsys.readouterr().out.splitlines()
+    assert [line.count("▀") for line in blocks] == [96] * 32  # 6 cells per square
+    assert "goal (550, 330)" in start
+    assert re.search(r"cost \d{4}\.\d\d, greedy", length)
+
+
+def test_plan_gives_every_cell_that_is_asked_for(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    file = tmp_path / "path.csv"
+    assert main(["plan", "office", "--cells", "--csv", str(file)]) == 0
+    *cells, _, _ = capsys.readouterr().out.splitlines()
+    assert (cells[0], cells[-1]) == ("15 15", "550 330")
+    header, *rows = file.read_text().splitlines()
+    assert (header, rows[0]) == ("x,y,x_metres,y_metres", "15,15,0.775,0.775")
+    assert cells == [" ".join(row.split(",")[:2]) for row in rows]
+    assert main(["plan", "dilemma", "--start", "1", "19", "--csv", str(file)]) == 1
+    assert file.read_text().splitlines() == [header]  # of no other plan
 
 
 def test_plan_writes_json_and_a_picture(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
@@ -200,7 +232,7 @@ def test_a_command_imports_only_what_it_needs(
     """
     command = [sys.executable, "-c", code]
     done = subprocess.run(command, check=True, capture_output=True, text=True)
-    assert done.stderr == "[]\n"
+    assert done.stderr.splitlines()[-1] == "[]"  # after a line where functions are compiled
     assert done.stdout
 
 
@@ -213,7 +245,71 @@ def test_a_missing_library_is_named_with_how_to_get_it(
     assert main(["watch"]) == 2
     error = capsys.readouterr().err
     assert "rerun" in error
-    assert "pip install 'ddqn_planner[watch]'" in error
+    assert "pip install 'rerun-sdk>=0.39'" in error
+
+
+ABSENT = """
+import sys
+
+class Absent:
+    def find_spec(name, *_):
+        library = name.partition(".")[0]
+        if library in {libraries} or library.endswith("_msgs"):
+            raise ModuleNotFoundError(f"No module named {{name!r}}", name=name)
+
+sys.meta_path.insert(0, Absent)
+"""
+"""What a process runs first, as its ``sitecustomize``."""
+
+
+@pytest.fixture
+def without(tmp_path: Path) -> Callable[..., subprocess.CompletedProcess[str]]:
+    """Run an executable of the package as if neither ROS nor some libraries were installed."""
+
+    def run(libraries: Sequence[str], *command: str) -> subprocess.CompletedProcess[str]:
+        (tmp_path / "sitecustomize.py").write_text(ABSENT.format(libraries=libraries))
+        path = os.pathsep.join([str(tmp_path), os.environ.get("PYTHONPATH", "")])
+        return subprocess.run(
+            [executable(command[0]), *command[1:]],
+            env={**os.environ, "PYTHONPATH": path},
+            capture_output=True,
+            text=True,
+        )
+
+    return run
+
+
+@pytest.mark.parametrize(
+    ("library", "command"),
+    [
+        ("torch", ["train", "dilemma"]),
+        ("gymnasium", ["train", "dilemma"]),
+        ("torch", ["train-any-map"]),
+        ("torch", ["reproduce"]),
+    ],
+)
+def test_training_says_in_one_line_what_it_needs(
+    without: Any, tmp_path: Path, library: str, command: list[str]
+) -> None:
+    done = without([library], "ddqn-planner", *command, "--out", str(tmp_path / "run"))
+    expected = f"ddqn-planner: No module named '{library}'; pip install torch gymnasium\n"
+    assert (done.stderr, done.returncode) == (expected, 2)
+
+
+def test_what_only_plans_and_measures_needs_no_torch(without: Any) -> None:
+    small = ["--kinds", "rooms", "--sizes", "32", "--maps", "1", "--requests", "2"]
+    for command in (["plan", "office"], ["certify"], ["evaluate", *small]):
+        done = without(["torch", "gymnasium"], "ddqn-planner", *command)
+        assert done.returncode == 0, done.stderr
+        assert done.stdout
+
+
+@pytest.mark.parametrize("node", ["map_server_node", "planner_node", "trainer_node"])
+def test_a_node_without_ros_says_in_one_line_how_to_get_it(without: Any, node: str) -> None:
+    done = without(["rclpy"], node)
+    remedy = "install ROS 2 Jazzy and source it, or in the repository: pip install '.[ros]'"
+    assert re.fullmatch(rf"{node}: No module named '\w+'; {re.escape(remedy)}\n", done.stderr)
+    assert done.returncode == 1
 
 
 def test_plan_says_why_there_is_no_path(capsys: pytest.CaptureFixture[str]) -> None:

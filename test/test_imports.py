@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 
@@ -75,3 +77,20 @@ else:
     raise AssertionError
 """
     assert "torch" not in loaded(code)
+
+
+def test_compiling_is_announced_once_and_a_load_from_the_cache_is_not(tmp_path: Path) -> None:
+    code = """if True:
+        import numpy as np
+        from ddqn_planner.grid.labels import _labels
+        for kind in (bool, np.uint8):
+            _labels(np.zeros((2, 2), kind), 1)
+    """
+    environment = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path)}
+    command = [sys.executable, "-c", code]
+    printed = [
+        subprocess.run(command, env=environment, check=True, stderr=subprocess.PIPE, text=True)
+        for _ in range(2)
+    ]
+    words = "ddqn_planner compiles its functions, which takes some seconds; the result is kept for "
+    assert [done.stderr for done in printed] == [f"{words}the next start\n", ""]

@@ -2,10 +2,13 @@ from __future__ import annotations
 
 import ast
 import os
+import re
 import subprocess
 import sys
 import sysconfig
 from pathlib import Path
+from xml.etree import ElementTree
+from zipfile import ZipFile
 
 import pytest
 
@@ -67,6 +70,31 @@ def wheel(source_copy: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     (path,) = folder.glob("*.whl")
     return path
 
+
+@pytest.mark.slow
+def test_the_wheel_asks_for_torch_only_to_train(wheel: Path) -> None:
+    with ZipFile(wheel) as archive:
+        (name,) = (name for name in archive.namelist() if name.endswith("/METADATA"))
+        needed = re.findall(
+            r"^Requires-Dist: (\w+)([^;\n]*)(.*)$", archive.read(name).decode(), re.M
+        )
+    assert {"numba", "numpy", "safetensors"} <= {
+        library for library, _, extra in needed if not extra
+    }
+    of_training = {(library, extra) for library, _, extra in needed if library in TRAINING}
+    assert of_training == {(library, '; extra == "train"') for library in TRAINING}
+
+
+def test_the_newest_release_of_the_changelog_is_of_the_packages_version() -> None:
+    version = ElementTree.parse(ROOT / "package.xml").findtext("version")
+    released = re.search(
+        r"^## (\S+) \(\d{4}-\d\d-\d\d\)$", (ROOT / "CHANGELOG.md").read_text(), re.M
+    )
+    assert released is not None
+    assert released[1] == version
+
+
+TRAINING = {"torch", "gymnasium"}
 
 PIP = [sys.executable, "-m", "pip", "--quiet"]
 

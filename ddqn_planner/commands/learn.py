@@ -40,6 +40,9 @@ def run(options: argparse.Namespace) -> int:
     experience = Experience(options.nominal_speed, options.robot_width)
     with ExitStack() as stack:
         if source.is_dir():
+            if not (source / RECORD).is_file():
+                remedy = "give a trainer's folder, or the .mcap file in a bag's"
+                raise ValueError(f"{source} holds no {RECORD}; {remedy}")
             stack.enter_context(claim(source, [LOCK, RECORD], "drives", "records"))
         drives = read(source, options)
         for drive in drives:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import shutil
 import sys
 import time
 from pathlib import Path
@@ -11,8 +12,15 @@ from pathlib import Path
 import numpy as np
 
 from ddqn_planner.commands.options import add_map_options, add_move_rule, read_map
+from ddqn_planner.files import write_csv
 from ddqn_planner.grid import GridMap, inflate, path_length
-from ddqn_planner.pictures import MAX_TEXT_WIDTH, draw_text, save_animation, save_picture
+from ddqn_planner.pictures import (
+    MAX_TEXT_WIDTH,
+    draw_blocks,
+    draw_text,
+    save_animation,
+    save_picture,
+)
 from ddqn_planner.planning import Plan, PlanMethod, Planner
 from ddqn_planner.planning.search import search
 
@@ -36,6 +44,8 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         ("tolerance", "how far a goal that is occupied or cut off may move, metres"),
     ):
         add(f"--{name}", type=float, default=0.0, metavar="X", help=words)
+    add("--cells", action="store_true", help="print each cell of the path, as X Y")
+    add("--csv", type=Path, metavar="FILE", help="write the path's cells and their metres")
     add("--json", action="store_true", help="print JSON instead of text")
     add("--picture", type=Path, metavar="FILE", help="draw map, value and path")
     add("--animate", type=Path, metavar="FILE", help="draw how value and path grow, a .gif")
@@ -58,6 +68,9 @@ def run(options: argparse.Namespace) -> int:
     began = time.perf_counter()
     plan = planner.plan(grid, start, goal, options.move_rule, options.mode, tolerance)
     _print(options, grid, plan, time.perf_counter() - began)
+    if options.csv:
+        rows = ((*cell, *np.round(grid.cell_to_world(cell), 6)) for cell in plan.cells)
+        write_csv(options.csv, ("x", "y", "x_metres", "y_metres"), rows)
     if plan.cells:
         goal = plan.cells[-1]  # another one if it moved within the tolerance
     if options.picture or options.animate:
@@ -93,13 +106,23 @@ def _print(options: argparse.Namespace, grid: GridMap, plan: Plan, seconds: floa
         }
         print(json.dumps(answer))
     elif plan.cells:
-        if grid.width <= MAX_TEXT_WIDTH:
-            print(draw_text(grid, plan.cells))
-        print("path: " + " ".join(f"({x}, {y})" for x, y in plan.cells))
+        _print_map(grid, plan)
+        if options.cells:
+            print(*(f"{x} {y}" for x, y in plan.cells), sep="\n")
+        metres = path_length(plan.path) * grid.resolution
+        print(f"start {plan.cells[0]}, goal {plan.cells[-1]}, {metres:.2f} m")
         known = "" if optimum is None else f"optimum {optimum:.2f} under {plan.move_rule.value}, "
+        known += "" if plan.cost is None else f"cost {plan.cost:.2f}, "
         print(
             f"length {plan.length:.2f} cells, {known}{plan.method.value}, "
             f"planned in {seconds * 1e3:.1f} ms"
         )
     else:
         print(f"no path: {plan.status.value}", file=sys.stderr)
+
+
+def _print_map(grid: GridMap, plan: Plan) -> None:
+    if grid.width <= MAX_TEXT_WIDTH:
+        print(draw_text(grid, plan.cells))
+    elif sys.stdout.isatty() and sys.stdout.encoding.lower() == "utf-8":
+        print(draw_blocks(grid, plan.cells, *shutil.get_terminal_size()))

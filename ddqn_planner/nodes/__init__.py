@@ -1,7 +1,28 @@
 """The three ROS 2 nodes and the message conversions; nothing else of the package imports rclpy."""
 
 import os
+import sys
+from functools import partial
+from importlib import import_module
+
+from ddqn_planner.libraries import with_remedy
 
 # NumPy is imported after this. The networks' products are small: more threads than one only wait
 # for each other, ten times as long on a busy machine.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
+
+def run(name: str) -> int:
+    """Run a node; return its exit code, which is 1 if a library is missing."""
+    try:
+        module = import_module(f"{__name__}.{name}")
+    except ImportError as error:
+        print(f"{name}: {with_remedy(error)}", file=sys.stderr)
+        return 1
+    return int(module.main())
+
+
+run_map_server, run_planner, run_trainer = (
+    partial(run, f"{name}_node") for name in ("map_server", "planner", "trainer")
+)
+"""What the executables call."""

@@ -25,6 +25,7 @@ from rclpy.exceptions import InvalidParameterValueException
 from std_msgs.msg import Float32, Header, String
 
 from ddqn_planner.grid import Cell, MoveRule, read_map_file
+from ddqn_planner.libraries import with_remedy
 from ddqn_planner.nodes.conversions import (
     cell_from_pose,
     check_pose,
@@ -335,7 +336,7 @@ def _with_remedy(error: Exception) -> str:
     if isinstance(error, ValueError):
         return str(error)
     if isinstance(error, ImportError):
-        return f"training needs another library ({error}); install it"
+        return f"training needs another library: {with_remedy(error)}"
     from ddqn_planner.training.memory import REMEDY
 
     return f"{error!r}; {REMEDY}"

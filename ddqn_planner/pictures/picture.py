@@ -22,6 +22,9 @@ MAX_TEXT_WIDTH = 64
 """Cells of the widest map that is worth printing as text: a cell takes two characters."""
 
 
+TERMINAL = ("9", "8;5;255", "8;5;236", "8;5;167", "8;5;33")
+"""Codes of the colours outside the map, of free and occupied cells, of the path and its ends."""
+
 MAX_ARROWS = 48
 """Arrows of one-way zones along the longest side of a map."""
 
@@ -49,6 +52,27 @@ def draw_text(grid: GridMap, cells: Sequence[Cell]) -> str:
     for letter, (x, y) in zip("SG", (*cells[:1], *cells[-1:]), strict=False):
         letters[y, x] = letter
     return "\n".join(" ".join(row) for row in letters[::-1])
+
+
+def draw_blocks(grid: GridMap, cells: Sequence[Cell], columns: int, lines: int) -> str:
+    """Return the map for a terminal of so many characters: two coloured squares in each.
+
+    A square with an occupied cell is dark, one with a cell of the path has the path's colour, one
+    with the start or the goal that of an end.
+    """
+    side = max(-(-grid.width // columns), -(-grid.height // (2 * lines)))  # cells
+    shown = np.where(grid.occupancy, 2, 1)
+    shown[tuple(np.transpose(cells)[::-1])] = 3
+    for x, y in (cells[0], cells[-1]):
+        shown[y, x] = 4
+    shown = np.pad(shown, [(0, -grid.height % (2 * side)), (0, -grid.width % side)])
+    rows, width = shown.shape[0] // side, shown.shape[1] // side
+    squares = shown.reshape(rows, side, width, side).max(axis=(1, 3))[::-1]
+    return "\n".join(
+        "".join(f"\x1b[3{TERMINAL[a]};4{TERMINAL[b]}m▀" for a, b in zip(*pair, strict=True))
+        + "\x1b[0m"
+        for pair in zip(squares[::2], squares[1::2], strict=True)
+    )
 
 
 def save_picture(
@@ -87,9 +111,7 @@ def save_picture(
         from matplotlib.colors import LinearSegmentedColormap
         from matplotlib.ticker import MaxNLocator
     except ImportError as error:
-        raise PictureError(
-            f"pictures need matplotlib ({error}): pip install 'ddqn_planner[figures]'"
-        ) from None
+        raise PictureError(f"pictures need matplotlib ({error}): pip install matplotlib") from None
     tall = min(max(grid.height / grid.width, 0.4), 1.0)
     figure, axes = plt.subplots(figsize=(7.2, 1.5 + 5.1 * tall), dpi=120, layout="constrained")
     axes.set(facecolor="white", xlabel="x [cells]", ylabel="y [cells]", aspect="equal")

@@ -179,6 +179,7 @@ def test_a_csv_file_is_learned(tmp_path: Path, map_file: Path, capsys: Any) -> N
         ("drive.csv", "", "columns seconds, x, y are missing"),
         ("drive.bag", "", r"ends in neither .csv nor .mcap"),
         ("missing.csv", None, "No such file"),
+        (".", None, r"holds no episodes\.csv; give .* the \.mcap file in a bag's"),
     ],
 )
 def test_what_cannot_be_learned_is_refused(
@@ -189,7 +190,7 @@ def test_what_cannot_be_learned_is_refused(
         file.write_text(text)
     assert main(["learn", str(file), "--map", str(map_file)]) == 2
     assert __import__("re").search(reason, capsys.readouterr().err)
-    assert not (tmp_path / "experience.npz").exists()
+    assert not [*tmp_path.glob("experience.npz"), *tmp_path.glob("*.lock")]
 
 
 @pytest.mark.parametrize("kind", list(DEFINITIONS)[:3])

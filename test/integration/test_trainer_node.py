@@ -665,12 +665,13 @@ def test_without_its_libraries_a_start_is_refused_and_the_node_lives(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     missing = f"No module named '{library}'"
-    (tmp_path / f"{library}.py").write_text(f'raise ModuleNotFoundError("{missing}")')
+    error = f'ModuleNotFoundError("{missing}", name="{library}")'
+    (tmp_path / f"{library}.py").write_text(f"raise {error}")
     monkeypatch.setenv("PYTHONPATH", f"{tmp_path}:{os.environ.get('PYTHONPATH', '')}")
     client = make_client(namespace)
     parameters = {"map_file": "dilemma", "output_folder": str(tmp_path / "run")}
     with run_node("trainer_node", parameters, namespace=namespace) as node:
-        assert f"needs another library ({missing})" in refusal(client)
+        assert f"needs another library: {missing}; pip install torch gymnasium" in refusal(client)
         assert "call ~/start first" in client.call(Trigger, "trainer/replay").message
     assert "Traceback" not in node.log
 

@@ -162,8 +162,11 @@ def test_without_a_display_it_exits_and_says_what_to_do(
 @pytest.mark.parametrize(
     ("missing", "remedy"),
     [
-        ("rerun", "pip install 'ddqn_planner[watch]'"),
-        ("rclpy.node", "source ROS 2 Jazzy, or pip install 'ddqn_planner[ros]'"),
+        ("rerun", "pip install 'rerun-sdk>=0.39'"),
+        (
+            "rclpy.node",
+            "install ROS 2 Jazzy and source it, or in the repository: pip install '.[ros]'",
+        ),
     ],
 )
 def test_a_missing_library_is_named_with_the_way_to_install_it(

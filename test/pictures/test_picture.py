@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import numpy as np
@@ -7,8 +8,9 @@ import pytest
 from PIL import Image
 
 from ddqn_planner.grid import GridMap
-from ddqn_planner.pictures import draw_text, save_picture
+from ddqn_planner.pictures import draw_blocks, draw_text, save_picture
 from ddqn_planner.pictures.colours import VALUE_COLOURS, value_ramp
+from ddqn_planner.pictures.picture import TERMINAL
 
 
 def test_a_map_as_text_has_its_first_row_below() -> None:
@@ -23,6 +25,20 @@ def test_one_way_zones_are_arrows() -> None:
     forbidden = [[0b10000011, 0b00111000, 0], [0b00001110, 0b11100000, 255]]
     grid = GridMap(np.array([[0, 0, 0], [0, 0, 1]]), forbidden=np.array(forbidden))
     assert draw_text(grid, []) == "v ^ #\n< > ."
+
+
+def test_a_wide_map_fits_into_its_terminal() -> None:
+    occupancy = np.zeros((9, 20))
+    occupancy[8, 19] = 1
+    grid, cells = GridMap(occupancy), [(0, 0), (1, 1), (2, 2), (3, 3)]
+    drawn = draw_blocks(grid, cells, columns=10, lines=24).splitlines()  # 2x2 cells per square
+    pairs = [re.findall("\x1b\\[3([^m]+);4([^m]+)m▀", line) for line in drawn]
+    outside, free, occupied, path, end = TERMINAL
+    assert [[*map(len, pairs)], pairs[0][-1]] == [[10] * 3, (outside, occupied)]
+    assert (pairs[-1][0], pairs[-1][1]) == ((free, end), (end, free))
+    tall = draw_blocks(grid, cells, columns=10, lines=2).splitlines()  # 3x3 cells
+    assert [line.count("▀") for line in tall] == [7, 7]
+    assert f"3{path};" not in tall[0]
 
 
 def test_the_ramp_leads_from_the_worst_colour_to_the_best() -> None:
