@@ -201,10 +201,10 @@ def test_transforms_from_before_the_clock_jumped_back_are_forgotten(
         TransformListener=lambda *_: listener,
         TransformException=KeyError,
     )
-    monkeypatch.setitem(sys.modules, "tf2_ros", tf2_ros)
     node = SimpleNamespace(after_jump_back=set())
     frames = Frames(node)
     frames.available = True
+    monkeypatch.setitem(sys.modules, "tf2_ros", tf2_ros)
     frames.lookup("map", "odom")
     for forget in node.after_jump_back:  # as the node does
         forget()
