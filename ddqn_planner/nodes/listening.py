@@ -44,9 +44,10 @@ class ListeningNode(Node):
         self._jumps = self.get_clock().create_jump_callback(JUMP_BACK, post_callback=self._on_jump)
 
     def _on_jump(self, jump: TimeJump) -> None:
+        seconds = jump.delta.nanoseconds / 1e9
+        what = f"jumped by {seconds:.6g} s" if seconds else "changed"
         self.get_logger().warning(
-            f"the clock jumped by {jump.delta.nanoseconds / 1e9:.6g} s: transforms and odometry "
-            "from before are forgotten"
+            f"the clock {what}: transforms and odometry from before are forgotten"
         )
         for forget in self.after_jump_back:
             forget()
@@ -61,17 +62,18 @@ class ListeningNode(Node):
     ) -> Subscription:
         """Create a subscription with the quality that parameters may override."""
         name = self.resolve_topic_name(topic)
-        return super().create_subscription(
-            msg_type,
-            topic,
-            callback,
-            copy(qos_profile),  # rclpy writes what the parameters say into the profile
-            qos_overriding_options=QoSOverridingOptions(OVERRIDABLE),
-            event_callbacks=SubscriptionEventCallbacks(
-                incompatible_qos=lambda _: self._incompatible.add(name)
-            ),
-            **options,
+        options["qos_overriding_options"] = QoSOverridingOptions(OVERRIDABLE)
+        options["event_callbacks"] = SubscriptionEventCallbacks(
+            incompatible_qos=lambda _: self._incompatible.add(name)
         )
+        quality = copy(qos_profile)  # rclpy writes what the parameters say into it
+        try:
+            return super().create_subscription(msg_type, topic, callback, quality, **options)
+        except RuntimeError as error:
+            raise RuntimeError(
+                f"cannot subscribe to {name} ({error}); give qos_overrides.{name}.subscription "
+                "values that ROS knows, or none"
+            ) from None
 
     def topic_problems(self) -> list[str]:
         """Say which publishers are not received, and of which odometry there is too much.

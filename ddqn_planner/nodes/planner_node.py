@@ -137,9 +137,11 @@ class PlannerNode(ManagedNode):
         """Free the map, the model and its fields."""
         self._forget()
         self._report.forget()
-        self._start.close()
-        self._frames.close()
-        del self._display, self._start, self._map, self._requests, self._forecast
+        made = vars(self)  # not all, if `configure` failed
+        for name in ("_start", "_frames", "_display", "_map", "_requests", "_forecast"):
+            part = made.pop(name, None)
+            if isinstance(part, (StartSource, Frames)):
+                part.close()
         self._model.forget()
 
     async def prepare(self, transition: str) -> bool:

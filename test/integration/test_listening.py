@@ -34,9 +34,10 @@ def robot(make_client: Callable[[str], Any], small_values: np.ndarray, model: Pa
 def run(run_node: Any, robot: Robot, model: Path) -> Callable[..., Any]:
     """Return a function that runs a planner which asks odometry where the robot is."""
 
-    def run(parameters: dict[str, Any]) -> Any:
+    def run(parameters: dict[str, Any], exit_code: int = 0) -> Any:
         parameters = {"model": str(model), "start_source": "odometry", **parameters}
-        return run_node("planner_node", parameters, namespace=robot.client.node.get_namespace())
+        namespace = robot.client.node.get_namespace()
+        return run_node("planner_node", parameters, namespace=namespace, exit_code=exit_code)
 
     return run
 
@@ -96,6 +97,11 @@ def test_what_cannot_be_heard_is_said_with_the_remedy_which_helps(run: Any, robo
     with run({remedy: "volatile"}):
         client.publish("map", message, volatile)
         robot.wait_for_map(message)
+    with run({remedy: "flighty"}, exit_code=1) as node:
+        node.wait_for_end()
+    assert f"cannot start: cannot subscribe to {topic} (" in node.log
+    assert "`flighty`" in node.log
+    assert "Traceback" not in node.log
 
 
 def test_two_publishers_of_odometry_are_said(run: Any, robot: Robot) -> None:
