@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 import re
 from collections.abc import Iterator
@@ -33,6 +34,9 @@ ROW = re.compile(rb"(\d{1,18}),([a-z_]{1,20}),(%b),%b,%b,((?:%b:%b:%b ?)+)\r\n" 
 FARTHEST = 1e12
 """Metres, and seconds of a drive: beyond, a row is left out, as the places have no numbers."""
 
+WINDOW, STEP = 0.5, 0.25
+"""A drive's length joins mean positions of so many seconds that are so many metres apart."""
+
 
 class DriveEnd(str, Enum):
     """How a drive ended."""
@@ -44,7 +48,7 @@ class DriveEnd(str, Enum):
     CUT = "cut"
     """It had so many samples that the next drive goes on from there."""
     STOPPED = "stopped"
-    """The recording ended."""
+    """The recording ended, or its clock jumped back."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,8 +72,16 @@ class Drive:
 
     @property
     def metres(self) -> float:
-        """How far the robot drove."""
-        return float(np.hypot(*np.diff(self.positions, axis=0).T).sum())
+        """How far the robot drove; noise of its poses counts as little as standing does."""
+        window = np.floor((self.seconds - self.seconds[0]) / WINDOW)
+        begins = np.flatnonzero(np.append(True, np.diff(window) != 0))
+        counts = np.diff(begins, append=len(window))[:, None]
+        means = (np.add.reduceat(self.positions, begins) / counts).tolist()
+        total, at = 0.0, self.positions[0].tolist()
+        for mean in means:
+            if math.dist(at, mean) >= STEP:
+                total, at = total + math.dist(at, mean), mean
+        return total + math.dist(at, self.positions[-1].tolist())
 
     def teach(self, experience: Experience) -> None:
         """Let experience learn from it; where the robot gave up, moves fail."""

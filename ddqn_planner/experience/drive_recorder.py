@@ -35,11 +35,16 @@ MOST_SAMPLES = 2000
 """A drive that has so many is cut, so that the robot learns while it drives for hours."""
 
 
+JUMP = 1.0
+"""Seconds: a clock that goes back by more begins anew, as when a bag loops or a simulator is reset.
+The robot may be elsewhere."""
+
+
 class DriveRecorder:
     """Divides poses into drives.
 
     A drive begins when the robot drives off. It ends when the robot stands at its goal, stands for
-    a long time, gets another goal, or gave up.
+    a long time, gets another goal, or gave up, and when the clock jumps back.
 
     Parameters
     ----------
@@ -81,6 +86,9 @@ class DriveRecorder:
             raise ValueError(
                 f"the robot is at {(x, y)} at {seconds} s; give finite numbers up to {FARTHEST:g}"
             )
+        if self._last is not None and seconds < self._last[0] - JUMP:
+            self.end(DriveEnd.STOPPED)
+            self.forget()
         stands = self._stands
         if stands is None or math.dist(stands[1:], sample[1:]) > STAND_DISTANCE:
             if stands is not None and self._last is not None and not self._samples:

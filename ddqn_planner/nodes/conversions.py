@@ -208,11 +208,13 @@ def check_pose(
         If the pose has no frame or another one than the map's `frame`, if that is known; if its
         position is not finite, or its quaternion is not of norm 1.
     """
-    if not header.frame_id or (frame and header.frame_id != frame):
-        expected = f"the map's is {frame!r}" if frame else "it needs the map's frame"
+    if not header.frame_id:
+        known = f", the map's is {frame!r}" if frame else ""
+        raise ValueError(f"{name}'s frame is ''{known}; name one in header.frame_id")
+    if frame and header.frame_id != frame:
         raise ValueError(
-            f"{name}'s frame is {header.frame_id!r}, {expected}; transform the pose to that frame "
-            f"(in RViz: set Fixed Frame to it){other_remedy}"
+            f"{name}'s frame is {header.frame_id!r}, the map's is {frame!r}; transform the pose to "
+            f"that frame (in RViz: set Fixed Frame to it){other_remedy}"
         )
     _check_pose(name, pose)
 

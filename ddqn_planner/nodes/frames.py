@@ -5,15 +5,16 @@ from __future__ import annotations
 import importlib.util
 import math
 import time
+from collections.abc import Callable
 from typing import Any
 
 from geometry_msgs.msg import Pose, PoseStamped, Quaternion, TransformStamped
-from rclpy.node import Node
 from rclpy.time import Time
 from std_msgs.msg import Header
 
 from ddqn_planner.nodes.conversions import check_pose, quaternion
 from ddqn_planner.nodes.report import RequestError
+from ddqn_planner.nodes.runtime import BaseNode
 
 PATIENCE = 1.0
 """Seconds within which a new listener hears the first transforms. A pose that was stamped before
@@ -40,11 +41,14 @@ class Frames:
     """Transforms poses to the map's frame by TF.
 
     It listens to TF from the first pose on that needs it: a listener costs time for each message of
-    the robot's TF, and most robots give all poses in the map's frame.
+    the robot's TF, and most robots give all poses in the map's frame. When the clock jumps back, it
+    forgets all transforms: tf2 takes none that is older than those it has.
 
     Parameters
     ----------
-    node : Node
+    node : BaseNode
+    tolerance : callable
+        It returns how many seconds the newest transform may be old, or in the future.
 
     Attributes
     ----------
@@ -52,9 +56,9 @@ class Frames:
         Whether tf2_ros is installed.
     """
 
-    def __init__(self, node: Node) -> None:
+    def __init__(self, node: BaseNode, tolerance: Callable[[], float] = lambda: math.inf) -> None:
         self.available = has_tf()
-        self._node = node
+        self._node, self._tolerance = node, tolerance
         self._buffer: Any = None
         self._listener: Any = None
         self._began = -math.inf
@@ -91,6 +95,8 @@ class Frames:
 
     def _transform_at(self, stamped: PoseStamped, map_frame: str) -> TransformStamped:
         stamp, frame = Time.from_msg(stamped.header.stamp), stamped.header.frame_id
+        if not stamp.nanoseconds:
+            return self.newest(map_frame, frame)
         try:
             return self.lookup(map_frame, frame, stamp)
         except ValueError:
@@ -108,6 +114,30 @@ class Frames:
             self._tf2_ros, self._buffer = tf2_ros, tf2_ros.Buffer()
             self._listener = tf2_ros.TransformListener(self._buffer, self._node)
             self._began = time.monotonic()
+            self._node.after_jump_back.add(self._forget)
+
+    def _forget(self) -> None:
+        self._buffer.clear()
+        self._began = time.monotonic()
+
+    def newest(self, target: str, source: str) -> TransformStamped:
+        """Return the newest transform from a frame to another.
+
+        Raises
+        ------
+        ValueError
+            If there is none, or it is older than the tolerance, or as far in the future.
+        """
+        newest = self.lookup(target, source)
+        stamp = Time.from_msg(newest.header.stamp)
+        age = (self._node.get_clock().now() - stamp).nanoseconds / 1e9
+        # Static transforms have the stamp 0, and are never too old.
+        if stamp.nanoseconds and abs(age) > self._tolerance():
+            when = f"{age:.3g} s old" if age > 0 else f"{-age:.3g} s in the future"
+            raise ValueError(
+                f"the newest is {when}, more than transform_tolerance, {self._tolerance():g} s"
+            )
+        return newest
 
     def lookup(self, target: str, source: str, stamp: Time | None = None) -> TransformStamped:
         """Return the transform from a frame to another at a time, by default the newest.
@@ -133,6 +163,7 @@ class Frames:
     def close(self) -> None:
         """Stop listening, until a transform is needed again."""
         if self._listener is not None:
+            self._node.after_jump_back.discard(self._forget)
             self._listener.unregister()
             self._buffer = self._listener = None
 

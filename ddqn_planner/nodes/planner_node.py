@@ -89,7 +89,7 @@ class PlannerNode(ManagedNode):
         self._replan = self.create_guard_condition(
             self._plan_for_active_goal, MutuallyExclusiveCallbackGroup()
         )
-        self._frames = Frames(self)
+        self._frames = Frames(self, lambda: float(self._settings.transform_tolerance))
         self._start = self._start_source()
         self._map = MapSource(self, self._report, self._map_worker, self._on_map)
         self._forecast = Forecast(self._map.times, self._map_worker)
@@ -137,8 +137,11 @@ class PlannerNode(ManagedNode):
         """Free the map, the model and its fields."""
         self._forget()
         self._report.forget()
-        self._frames.close()
-        del self._display, self._start, self._map, self._requests, self._forecast
+        made = vars(self)  # not all, if `configure` failed
+        for name in ("_start", "_frames", "_display", "_map", "_requests", "_forecast"):
+            part = made.pop(name, None)
+            if isinstance(part, (StartSource, Frames)):
+                part.close()
         self._model.forget()
 
     async def prepare(self, transition: str) -> bool:
@@ -173,9 +176,9 @@ class PlannerNode(ManagedNode):
 
     def _apply_parameters(self, parameters: list[Parameter]) -> None:
         settings = self._settings = self.settings()
-        if not self._is_configured:
+        changed = {parameter.name for parameter in parameters} & self._declared.keys()
+        if not (changed and self._is_configured):  # subscriptions declare parameters, too
             return
-        changed = {parameter.name for parameter in parameters}
         if "model" in changed:
             self._model.use(*self._candidate)
         if self._model.planner is not None:

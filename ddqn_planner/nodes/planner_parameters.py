@@ -86,8 +86,8 @@ PARAMETERS: Final = {
     "robot_frame": Declared("base_link", "The robot's frame, for the start_source tf", "not empty"),
     "transform_tolerance": Declared(
         0.3,
-        "Maximum age of a transform, for the start_source tf, and how long a request waits for the "
-        "transform of a pose in another frame than the map's, seconds",
+        "How far the newest transform's time may be from now, how long odometry may be silent (at "
+        "least 2 s), and how long a request waits for the transform of a pose, seconds",
         (0, 1000),
     ),
     "field_cache_bytes": Declared(

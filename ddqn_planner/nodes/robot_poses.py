@@ -11,6 +11,7 @@ from rclpy.time import Time
 
 from ddqn_planner.grid import GridMap
 from ddqn_planner.nodes.frames import Frames, has_tf
+from ddqn_planner.nodes.listening import best_effort
 from ddqn_planner.nodes.runtime import STEADY, BaseNode
 
 TF_PERIOD = 0.05
@@ -73,7 +74,7 @@ class RobotPoses:
             self._frames.listen()
             node.create_timer(TF_PERIOD, self._look_up, clock=STEADY)
         else:
-            node.create_subscription(Odometry, "odom", self._on_odometry, 1000)
+            node.create_subscription(Odometry, "odom", self._on_odometry, best_effort(1000))
 
     def in_map(self, name: str, pose: PoseStamped, frame: str) -> tuple[float, float]:
         """Return a pose's position in the map's frame; ValueError if it has none."""

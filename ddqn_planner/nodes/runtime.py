@@ -35,6 +35,8 @@ from rclpy.task import Future
 from rclpy.utilities import ok, try_shutdown
 from std_srvs.srv import Trigger
 
+from ddqn_planner.nodes.listening import ListeningNode
+
 LATCHED = QoSProfile(
     depth=1,
     reliability=ReliabilityPolicy.RELIABLE,
@@ -99,7 +101,7 @@ class Declared(NamedTuple):
 Parameters = Mapping[str, Declared]
 
 
-class BaseNode(Node):
+class BaseNode(ListeningNode):
     """Node with checked parameters, whose services lose no request and survive malformed ones.
 
     Raises
@@ -158,7 +160,10 @@ class BaseNode(Node):
     def diagnostics(
         self, what: str, level: bytes, message: str, values: Mapping[str, str]
     ) -> DiagnosticArray:
-        """Return a message for `/diagnostics` with one status."""
+        """Return a message for `/diagnostics` with one status, and what is wrong with topics."""
+        problems = self.topic_problems()
+        if problems:
+            level, message = max(level, DiagnosticStatus.WARN), "; ".join([message, *problems])
         status = DiagnosticStatus(name=f"{self.get_fully_qualified_name()}: {what}")
         status.level, status.message = level, message
         status.values = [KeyValue(key=key, value=value) for key, value in values.items()]
@@ -262,7 +267,8 @@ usage: {program} [--ros-args [-p PARAMETER:=VALUE] [--params-file FILE] [-r NAME
 {summary}
 
 Set parameters at the start with -p or in a file. Those that are not read-only can also be set while
-the node runs, with `ros2 param set NODE PARAMETER VALUE`:
+the node runs, with `ros2 param set NODE PARAMETER VALUE`. Each topic that the node reads also has
+qos_overrides.TOPIC.subscription.POLICY, where POLICY is history, depth, durability or reliability.
 """
 
 

@@ -13,6 +13,7 @@ import pytest
 from ddqn_planner import Experience, GridMap
 from ddqn_planner.experience import ExperienceFileError
 from ddqn_planner.experience.drive_log import Drive, DriveEnd, DriveFolder, read_drives
+from ddqn_planner.experience.drive_recorder import DriveRecorder
 from ddqn_planner.files import FolderError
 
 GRID = GridMap(np.zeros((40, 200), dtype=np.bool_), resolution=0.25)
@@ -49,6 +50,19 @@ def test_drives_are_recorded_and_teach(tmp_path: Path) -> None:
     learned = slowness(folder.folder)
     assert learned[20, 60] > 2
     assert learned[20, 100] > 1.1 * learned[20, 60]  # where the robot gave up
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.05])
+def test_a_drives_length_does_not_count_noise(noise: float) -> None:
+    """20 Hz, 100 m at 0.5 m/s, then a stand of a minute."""
+    drives: list[Drive] = []
+    recorder = DriveRecorder(lambda *drive: drives.append(Drive(1, *drive)))
+    random = np.random.default_rng(1)
+    for index in range(5200):
+        x = min(index, 4000) * 0.025
+        recorder.add(100 + index / 20, *random.normal([x, 2.0], noise).tolist())
+    recorder.end(DriveEnd.STOPPED)
+    assert sum(drive.metres for drive in drives) == pytest.approx(100, rel=0.01)
 
 
 def test_the_record_has_the_columns_that_its_header_names(tmp_path: Path) -> None:

@@ -124,12 +124,19 @@ def test_a_long_drive_is_cut_and_goes_on(robot: Robot) -> None:
         assert before[-1] == after[0]
 
 
-def test_a_clock_that_jumps_back_ends_no_drive(robot: Robot) -> None:
+@pytest.mark.parametrize(("jump", "drives"), [(0.9, 1), (50, 2)])
+def test_a_clock_that_jumps_back_ends_the_drive_and_the_next_has_its_times(
+    robot: Robot, jump: float, drives: int
+) -> None:
     robot.move(2)
-    robot.now -= 50
+    robot.now -= jump
+    robot.x = 0.0
     robot.move(2)
     robot.recorder.end(DriveEnd.STOPPED)
-    assert robot.outcomes == ["stopped"]
+    assert robot.outcomes == ["stopped"] * drives
+    for _, seconds, positions in robot.drives[-drives:]:
+        assert drives == 1 or (np.diff(seconds) > 0).all()
+        assert positions[-1] == pytest.approx([2, 2], abs=0.1)
 
 
 def test_noise_of_the_pose_is_no_drive(robot: Robot) -> None:

@@ -184,7 +184,10 @@ def odometry(robot: Robot, cell: Cell) -> Odometry:
 
 
 def test_the_path_of_a_moving_robot_is_published_only_where_it_leaves_it(robot: Robot) -> None:
-    set_parameters(robot, replan_period=SOON, start_source="odometry")
+    values = {"replan_period": SOON, "transform_tolerance": 1000.0}
+    set_parameters(robot, start_source="odometry", **values)
+    robot.client.publisher(Odometry, "odom")
+    robot.client.wait_for_discovery("planner")
     robot.client.publish("odom", odometry(robot, START))
     path = cells_of(robot.grid, robot.wait_for_path(START, GOAL))
     robot.get_plan(robot.pose(START), robot.pose(START))  # what came before it is done

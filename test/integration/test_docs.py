@@ -54,7 +54,7 @@ def rows_of(node: str) -> list[list[str]]:
 def described(client: Any, node: str) -> dict[str, list[str]]:
     """What a running node says of each parameter: its type, default and range."""
     names = client.call(ListParameters, f"{node}/list_parameters").result.names
-    names = [name for name in names if name not in OF_EVERY_NODE]
+    names = [name for name in names if name not in OF_EVERY_NODE and "qos_over" not in name]
     request = DescribeParameters.Request(names=names)
     answer = client.call(DescribeParameters, f"{node}/describe_parameters", request)
     return {

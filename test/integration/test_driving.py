@@ -28,6 +28,7 @@ from ddqn_planner.experience.drive_log import read_drives
 from ddqn_planner.nodes import trainer_node
 from ddqn_planner.nodes.conversions import quaternion
 from ddqn_planner.nodes.driving import NAVIGATION
+from ddqn_planner.nodes.listening import best_effort
 from ddqn_planner.nodes.runtime import LATCHED
 
 VALUES = np.zeros((40, 100), dtype=np.int8)
@@ -54,6 +55,8 @@ class Site:
 
     def begin(self, listeners: int = 1) -> None:
         """Send the map, and wait until the trainer has it and records."""
+        self.client.publisher(Odometry, "odom", best_effort(1000))
+        self.client.wait_for_discovery("trainer")
         self.client.publish("map", map_message(VALUES, GRID), LATCHED, listeners)
         self.wait_for_state("recording", "^recording$")
 
@@ -80,7 +83,7 @@ class Site:
         return message
 
     def send(self, message: Odometry) -> None:
-        self.client.publish("odom", message, QoSProfile(depth=1000))
+        self.client.publish("odom", message, best_effort(1000))
 
     def send_goal(self, x: float, y: float) -> None:
         """Send a goal, and wait until the trainer has it: poses may overtake it."""

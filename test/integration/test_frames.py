@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import sys
 from types import SimpleNamespace
 
 import numpy as np
@@ -10,12 +11,14 @@ import pytest
 from geometry_msgs.msg import PoseStamped, Quaternion, TransformStamped
 from hypothesis import given
 from hypothesis import strategies as st
+from rclpy.clock_type import ClockType
 from rclpy.time import Time
 from std_msgs.msg import Header
 
 from ddqn_planner.nodes.conversions import quaternion
 from ddqn_planner.nodes.frames import Frames, transformed
 from ddqn_planner.nodes.report import RequestError
+from ddqn_planner.nodes.start_source import StartSource
 
 ANGLES = st.floats(-math.pi, math.pi)
 METRES = st.floats(-100, 100)
@@ -117,6 +120,9 @@ class Buffer:
     def __init__(self, *seconds: int) -> None:
         self.seconds = seconds
 
+    def clear(self) -> None:
+        self.seconds = ()
+
     def lookup_transform(self, target: str, source: str, stamp: Time) -> TransformStamped:
         if (target, source) != ("map", "odom") or not self.seconds:
             raise KeyError(f"{source} does not exist")
@@ -128,9 +134,14 @@ class Buffer:
         return found
 
 
-def frames_with(buffer: Buffer) -> Frames:
-    """Return frames that have listened for a while; they need no node any more."""
-    frames = Frames(None)
+NOW = 111
+"""Seconds of the node's clock."""
+
+
+def frames_with(buffer: Buffer, tolerance: float = 20.0) -> Frames:
+    """Return frames that have listened for a while, and need only the node's clock."""
+    clock = SimpleNamespace(now=lambda: Time(seconds=NOW, clock_type=ClockType.ROS_TIME))
+    frames = Frames(SimpleNamespace(get_clock=lambda: clock), lambda: tolerance)
     frames.available, frames._listener, frames._buffer = True, object(), buffer
     frames._tf2_ros = SimpleNamespace(TransformException=KeyError)
     return frames
@@ -159,6 +170,51 @@ def test_a_pose_is_transformed_by_the_transform_of_its_time(
     assert found.pose.position.x == 3.0
 
 
+@pytest.mark.parametrize(
+    ("stamp", "words"),
+    [(NOW - 6, "6 s old"), (NOW + 6, "6 s in the future"), (NOW - 2, ""), (NOW + 2, ""), (0, "")],
+)
+def test_the_newest_transform_is_not_used_when_its_age_is_beyond_the_tolerance(
+    stamp: int, words: str
+) -> None:
+    frames = frames_with(Buffer(stamp), tolerance=5.0)
+    start = StartSource(None, "tf", frames, lambda _: None)
+    if not words:
+        assert start.pose("map", "odom", 5.0).pose.position.x == 1.0
+        assert frames.to_map("the goal", pose_at(0), "map").header.stamp.sec == stamp
+        return
+    expected = rf"'odom' to 'map' \(the newest is {words}, more than transform_tolerance, 5 s\)"
+    with pytest.raises(RequestError, match=expected) as error:
+        start.pose("map", "odom", 5.0)
+    assert error.value.status == "NO_START"
+    with pytest.raises(RequestError, match=f"the newest is {words}") as error:
+        frames.to_map("the goal", pose_at(0), "map")
+    assert error.value.status == "TF_ERROR"
+
+
+def test_transforms_from_before_the_clock_jumped_back_are_forgotten(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    listener = SimpleNamespace(unregister=lambda: None)
+    tf2_ros = SimpleNamespace(
+        Buffer=lambda: Buffer(100),
+        TransformListener=lambda *_: listener,
+        TransformException=KeyError,
+    )
+    node = SimpleNamespace(after_jump_back=set())
+    frames = Frames(node)
+    frames.available = True
+    monkeypatch.setitem(sys.modules, "tf2_ros", tf2_ros)
+    frames.lookup("map", "odom")
+    for forget in node.after_jump_back:  # as the node does
+        forget()
+    with pytest.raises(ValueError, match="does not exist"):
+        frames.lookup("map", "odom")
+    assert frames.may_come
+    frames.close()
+    assert not node.after_jump_back
+
+
 @pytest.mark.parametrize("asked", [98.9, 110.5])
 def test_a_pose_from_a_time_that_tf_does_not_know_is_refused(asked: float) -> None:
     with pytest.raises(RequestError, match=r"the goal's frame is 'odom'.*extrapol.*; publish") as e:
@@ -180,7 +236,7 @@ def test_a_pose_in_the_maps_frame_needs_no_transform() -> None:
 def test_other_frames_are_refused_without_tf_and_the_remedy_names_it() -> None:
     stamped, frames = pose_at(1), frames_with(Buffer(100))
     frames.check("the goal", stamped.header, stamped.pose, "map")
-    with pytest.raises(ValueError, match="frame is ''"):
+    with pytest.raises(ValueError, match=r"frame is ''; name one in header\.frame_id$"):
         frames.check("the goal", Header(), stamped.pose, "map")
     frames.available = False
     with pytest.raises(ValueError, match=r"'odom', the map's is 'map'; transform .* tf2_ros"):
