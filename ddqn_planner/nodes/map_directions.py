@@ -1,7 +1,7 @@
-"""The forbidden directions of the planner's map, which come on a topic of their own.
+"""The forbidden directions of the planner's maps, which come on a topic of their own.
 
-A map server publishes them for each of its maps, with the map's stamp: an ``OccupancyGrid`` whose
-values are the bytes of `GridMap.forbidden`, and without cells where nothing is forbidden.
+A map server publishes them before each of its maps: an ``OccupancyGrid`` whose values are the bytes
+of `GridMap.forbidden`, and without cells where nothing is forbidden.
 """
 
 from __future__ import annotations
@@ -12,11 +12,10 @@ from dataclasses import replace
 import numpy as np
 from nav_msgs.msg import OccupancyGrid
 from numpy.typing import NDArray
-from std_msgs.msg import Header
 
 from ddqn_planner.grid import GridMap
 from ddqn_planner.nodes.conversions import grid_from_message
-from ddqn_planner.nodes.report import Report, seconds
+from ddqn_planner.nodes.report import Report
 from ddqn_planner.nodes.runtime import LATCHED, BaseNode
 from ddqn_planner.planning.repair import offset_between
 
@@ -24,7 +23,10 @@ NAME = "map_directions"
 
 
 class MapDirections:
-    """Listens to forbidden directions, and says whether a map may be planned on without them.
+    """Listens to forbidden directions; the last ones hold for each map, in the region they share.
+
+    Their stamps need not match: of messages that come faster than they are read, only the last one
+    of each topic is seen, and a map server that is killed sends no more.
 
     Make it before the subscription of the map: then directions that come with a map are taken
     first. A map server creates the publisher of directions before that of maps, so that whoever
@@ -33,20 +35,23 @@ class MapDirections:
     Parameters
     ----------
     node : BaseNode
-        It has the parameters ``map_type`` and ``require_directions``.
+        It has the parameter ``require_directions``.
     report : Report
         It says what was refused.
     on_change : callable
         Called after each message that was not refused.
+
+    Attributes
+    ----------
+    held : bool
+        Whether a map has had directions; that may be none at all.
     """
 
     def __init__(self, node: BaseNode, report: Report, on_change: Callable[[], None]) -> None:
         self._node, self._report, self._on_change = node, report, on_change
-        self._header: Header | None = None
-        self._directions: GridMap | None = None  # None for none
-        # Those of the map before: a server that is killed may have sent those of a map that never
-        # comes.
-        self._before: tuple[Header | None, GridMap | None] = None, None
+        self.held = False
+        self._frame: str | None = None  # None until the first ones came
+        self._directions: GridMap | None = None  # None where nothing is forbidden
         self.subscription = node.create_subscription(OccupancyGrid, NAME, self._take, LATCHED)
         self._topic = self.subscription.topic_name
 
@@ -62,54 +67,42 @@ class MapDirections:
                 self._report.refuse(NAME, str(error))
                 return
         self._report.accept(NAME)
-        self._before = self._header, self._directions
-        self._header, self._directions = message.header, directions
+        self._frame, self._directions = message.header.frame_id, directions
         self._on_change()
 
-    def may_change(self, header: Header) -> bool:
-        """Return whether the last directions may be for a map."""
-        of_costmap = self._node.value("map_type") == "costmap"
-        return of_costmap or (self._header is not None and self._header.stamp == header.stamp)
+    def on(self, grid: GridMap, frame: str) -> GridMap:
+        """Return a map of a frame with its directions.
 
-    def on(self, grid: GridMap, header: Header) -> tuple[GridMap, str]:
-        """Return a map with its directions, and why it must not be planned on; '' if it may.
-
-        On a map, directions of the same stamp are needed if a node publishes any. A costmap comes
-        from another node: directions hold for the region that they share with it.
+        Raises
+        ------
+        ValueError
+            If none came, though a node publishes them or they are required; if they have another
+            frame, or other cells.
         """
-        published = self._node.count_publishers(self._topic) > 0
-        is_needed = published or self._node.value("require_directions")
-        is_costmap = self._node.value("map_type") == "costmap"
-        if self._header is None:
-            remedy = "let a map server publish them, or set require_directions to false"
-            missing = f"the map's directions were not received on {self._topic} yet; {remedy}"
-            return grid, missing if is_needed else ""
-        directions_header, directions = self._header, self._directions
-        before, directions_before = self._before
-        newer = self._header.stamp == header.stamp or is_costmap
-        if before is not None and before.stamp == header.stamp and not newer:
-            directions_header, directions = before, directions_before
-        if not is_costmap and directions_header.stamp != header.stamp:
-            stamps = seconds(header.stamp), seconds(self._header.stamp)
-            missing = (
-                f"the map's stamp is {stamps[0]}, that of the directions on {self._topic} is "
-                f"{stamps[1]}; let one map server publish both, or set map_type to costmap"
-            )
-            return grid, missing if is_needed else ""
+        if self._frame is None:
+            if self._node.value("require_directions") or self._node.count_publishers(self._topic):
+                raise ValueError(
+                    f"the map's directions were not received on {self._topic} yet; let a map "
+                    "server publish them, or set require_directions to false"
+                )
+            return grid
+        directions = self._directions
         if directions is None:
-            return grid, ""
+            self.held = True
+            return grid
         try:
             offset = offset_between(directions, grid)
         except (OverflowError, ValueError):  # too far away to have a number of cells
             offset = None
-        if directions_header.frame_id != header.frame_id or offset is None:
-            return grid, (
+        if self._frame != frame or offset is None:
+            raise ValueError(
                 f"the directions on {self._topic} are not for this map: they have the frame "
-                f"{directions_header.frame_id!r} and {directions.resolution:.6g} m per cell, the "
-                f"map {header.frame_id!r} and {grid.resolution:.6g} m; give both one frame, and "
-                "cells that lie on each other"
+                f"{self._frame!r} and {directions.resolution:.6g} m per cell, the map {frame!r} "
+                f"and {grid.resolution:.6g} m; give both one frame, and cells that lie on each "
+                "other"
             )
-        return replace(grid, forbidden=_moved(directions, offset, grid)), ""
+        self.held = True
+        return replace(grid, forbidden=_moved(directions, offset, grid))
 
 
 def _moved(directions: GridMap, offset: tuple[int, int], grid: GridMap) -> NDArray[np.uint8]:

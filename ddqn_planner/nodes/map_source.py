@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable
 from typing import Any
 
@@ -18,7 +19,7 @@ from ddqn_planner.grid.body import Inflation
 from ddqn_planner.nodes.conversions import grid_from_message, grid_from_values
 from ddqn_planner.nodes.expected_times import ExpectedTimes
 from ddqn_planner.nodes.map_directions import MapDirections
-from ddqn_planner.nodes.report import Report, describe_map, seconds
+from ddqn_planner.nodes.report import Report, RequestError, describe_map, seconds
 from ddqn_planner.nodes.runtime import LATCHED, BaseNode, Worker
 
 try:
@@ -33,26 +34,31 @@ UPDATES_QUALITY = QoSProfile(depth=100)
 """An update that is lost leaves old cells. Reliable, and volatile: the last update alone, which a
 latched topic would send, does not make an old map a new one."""
 
+PATIENCE = 1.0
+"""Seconds within which the first map is expected after the node subscribes."""
+
 
 class MapSource:
     """Listens to maps and their updates, and inflates the last map for the robot's body.
 
+    A map that the directions do not fit waits for others, and the map before it stays meanwhile.
+
     Parameters
     ----------
     node : BaseNode
-        It has the parameters `MAP_PARAMETERS` and `BODY_PARAMETERS`.
+        It has the parameters `MAP_PARAMETERS`, `BODY_PARAMETERS` and ``map_timeout``.
     report : Report
         It says what was refused.
     worker : Worker
         It inflates. Maps must not wait for fields: 2000 x 2000 cells take over a second.
     on_map : callable
-        Called after each map and each update that was not refused, with whether the map's frame is
-        a new one; for a map that waits for its directions, once it has them.
+        Called with whether the map's frame is a new one, each time when there is something new to
+        plan on: a map, an update, directions.
 
     Attributes
     ----------
     header : Header or None
-        Of the last map or update.
+        Of the last map or update that is planned on.
     times : ExpectedTimes
         Of the map's places; only the worker uses them.
     """
@@ -65,14 +71,17 @@ class MapSource:
         self._report = report
         self._on_map = on_map
         self._message: OccupancyGrid | None = None
+        self._waits = False
+        # Of the last map or update, also of a map that waits.
+        self._newest = Header(), 0.0
+        self._came, self._began = 0.0, time.monotonic()
         self._described = ""
         self._updates = self._refused_updates = 0
         self._inflated: Future | None = None
         self._inflate = Inflation()
         self.times = ExpectedTimes()
         self._worker = worker
-        self._incomplete = ""
-        self._directions = MapDirections(node, report, self._take_directions)
+        self._directions = MapDirections(node, report, self._read_again)
         maps = node.create_subscription(OccupancyGrid, "map", self._take, LATCHED)
         self._subscriptions = [self._directions.subscription, maps]
         self._topic = maps.topic_name
@@ -90,14 +99,37 @@ class MapSource:
         """The frame of the map; empty without one."""
         return self.header.frame_id if self.header is not None else ""
 
+    def check(self) -> Header:
+        """Return the header of the map of now; a RequestError says why there is none to plan on."""
+        refused = self._report.refused.get("map")
+        because = f" ({refused})" if refused else ""
+        if self.header is None:
+            missing = f"no map was received on {self._topic} yet{because}; start a map server"
+            raise RequestError("NO_MAP", refused if refused and self._waits else missing)
+        timeout = self._node.value("map_timeout")
+        is_costmap = self._node.value("map_type") == "costmap"
+        if is_costmap and 0 < timeout < time.monotonic() - self._came:
+            raise RequestError(
+                "MAP_TIMEOUT",
+                f"nothing came on {self._topic} for longer than map_timeout, {timeout:g} s"
+                f"{because}; start the costmap again, or set map_timeout if it is published less "
+                "often",
+            )
+        return self.header
+
     @property
     def missing(self) -> str:
         """Why there is no map to plan on, and what to do; empty with a map."""
-        if self.header is not None:
-            return self._incomplete
-        refused = self._report.refused.get("map")
-        because = f" ({refused})" if refused else ""
-        return f"no map was received on {self._topic} yet{because}; start a map server"
+        try:
+            self.check()
+        except RequestError as error:
+            return str(error)
+        return ""
+
+    @property
+    def may_come(self) -> bool:
+        """Whether the first map is still expected, as the node has subscribed just now."""
+        return self.header is None and time.monotonic() - self._began < PATIENCE
 
     def describe(self) -> dict[str, str]:
         """Return what the diagnostics say of the map."""
@@ -135,14 +167,14 @@ class MapSource:
         self._report.accept("experience")
         self._inflated = None
         self._report.change()
-        if not self.missing:
+        if self.header is not None:
             self._on_map(False)
 
     def apply_parameters(self, changed: set[str]) -> None:
         """Read and inflate the map anew if one of the parameters that changed says so."""
-        read = {*MAP_PARAMETERS, *BODY_PARAMETERS, "require_directions"}
-        if self._message is not None and changed & read:
-            self._read(self._message)
+        if changed & {*MAP_PARAMETERS, *BODY_PARAMETERS, "require_directions"}:
+            self._inflated = None
+            self._read_again()
 
     def close(self) -> None:
         """Stop listening."""
@@ -153,12 +185,41 @@ class MapSource:
         return tuple(map(self._node.value, MAP_PARAMETERS))
 
     def _take(self, message: OccupancyGrid) -> None:
-        if not self._read(message):
-            return
-        frame_changed = message.header.frame_id != self.frame
-        self._message, self.header = message, message.header
-        self._report.accept("map_updates")
-        described = describe_map(message)
+        try:
+            self._read(message, message.header, time.monotonic())
+        except ValueError as error:
+            self._report.refuse("map", str(error))
+
+    def _read_again(self) -> None:
+        if self._message is not None:
+            try:
+                self._read(self._message, *self._newest)
+            except ValueError as error:  # no log: a map that the directions fit may be on its way
+                self._report.refused["map"] = str(error)
+                self._report.change()
+
+    def _read(self, message: OccupancyGrid, header: Header, came: float) -> None:
+        """Plan on a map from now on; a ValueError says why not, or why it has to wait."""
+        grid = grid_from_message(message, *self._rules())
+        if message is not self._message:
+            self._report.accept("map_updates")
+        self._message, self._newest = message, (header, came)
+        try:
+            self._grid = self._directions.on(grid, header.frame_id)
+        except ValueError:
+            self._waits = True
+            if not self._directions.held:  # no map before it had any
+                self.header = None
+            raise
+        frame_changed, self._waits = header.frame_id != self.frame, False
+        self.header, self._came = header, came
+        self._inflated = None
+        self._report.accept("map")
+        self._report.change()
+        self._say(describe_map(message))
+        self._on_map(frame_changed)
+
+    def _say(self, described: str) -> None:
         if described != self._described:
             self._described = described
             self._node.get_logger().info(f"map of {described}")
@@ -168,38 +229,15 @@ class MapSource:
                 "ros-jazzy-map-msgs, or let the map's publisher always send the full map",
                 once=True,
             )
-        self._report.change()
-        if not self._incomplete:
-            self._on_map(frame_changed)
-
-    def _take_directions(self) -> None:
-        message = self._message
-        if message is None or not (self._incomplete or self._directions.may_change(message.header)):
-            return  # a map that has its own waits for the next map, whose directions come first
-        if self._read(message):
-            self._report.change()
-            if not self._incomplete:
-                self._on_map(True)  # the map's frame may be new since the last complete one
-
-    def _read(self, message: OccupancyGrid) -> bool:
-        """Plan on it from now on, or refuse it."""
-        try:
-            grid = grid_from_message(message, *self._rules())
-            self._grid, self._incomplete = self._directions.on(grid, message.header)
-        except ValueError as error:
-            self._report.refuse("map", str(error))
-            return False
-        self._report.accept("map")
-        self._inflated = None
-        return True
 
     def _take_update(self, update: Any) -> None:
         """Plan on the map with other values in a box from now on, or refuse the update."""
         try:
             values = updated_values(self._message, update)
-            patch = grid_from_values(values, 1.0, (0.0, 0.0, 0.0), *self._rules())
-            cells = patch.occupancy, update.x, update.y, patch.cost, patch.obstacles
-            self._grid = self._grid.with_patch(*cells)
+            if not self._waits:
+                patch = grid_from_values(values, 1.0, (0.0, 0.0, 0.0), *self._rules())
+                cells = patch.occupancy, update.x, update.y, patch.cost, patch.obstacles
+                self._grid = self._grid.with_patch(*cells)
         except (ValueError, MemoryError) as error:
             self._refused_updates = count = self._refused_updates + 1
             self._report.refused["map_updates"] = str(error)
@@ -213,11 +251,12 @@ class MapSource:
         whole = np.frombuffer(self._message.data, np.int8).reshape(info.height, info.width)
         whole[update.y : update.y + height, update.x : update.x + width] = values
         self._report.accept("map_updates")
-        self.header = update.header
+        self._newest = update.header, time.monotonic()
         self._updates += 1
-        self._inflated = None
         self._report.change()
-        if not self._incomplete:
+        if not self._waits:
+            self.header, self._came = self._newest
+            self._inflated = None
             self._on_map(False)
 
 
