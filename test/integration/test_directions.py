@@ -191,20 +191,57 @@ def test_the_first_map_waits_for_directions_where_a_node_publishes_them(
     assert forbidden_on(source) == [[EAST] * 5] * 4
 
 
+def test_a_map_servers_map_waits_for_its_own_directions_and_the_one_before_stays(
+    node: BaseNode, source: MapSource, published: None
+) -> None:
+    def is_planned_on(stamp: int, value: int | None) -> bool:
+        assert not source.missing
+        forbidden = value and [[value] * 5] * 4
+        return source.header == map_of(stamp).header and forbidden_on(source) == forbidden
+
+    take_directions(source, directions_of(1))
+    source._take(map_of(1))
+    assert is_planned_on(1, EAST)
+    # A map comes before its directions, or without them: its map server was killed.
+    source._take(map_of(2))
+    assert is_planned_on(1, EAST)
+    assert "directions, with its stamp, 2.000000000, were not" in source._report.refused["map"]
+    set_parameter(node, source, "occupied_threshold", 1)
+    assert is_planned_on(1, EAST)
+    take_directions(source, directions_of(2, WEST))
+    assert is_planned_on(2, WEST)
+    assert not source._report.refused
+    # The directions come first, or alone.
+    take_directions(source, directions_of(3, None))
+    assert is_planned_on(2, WEST)
+    set_parameter(node, source, "occupied_threshold", 65)
+    assert is_planned_on(2, WEST)
+    # Of those of two maps, each time one was lost.
+    source._take(map_of(4))
+    assert is_planned_on(2, WEST)
+    take_directions(source, directions_of(5, EAST))
+    assert is_planned_on(2, WEST)
+    source._take(map_of(5))
+    assert is_planned_on(5, EAST)
+
+
+def test_without_a_map_server_the_next_map_does_not_wait(source: MapSource) -> None:
+    take_directions(source, directions_of(1))
+    source._take(map_of(1))
+    source._take(map_of(2))
+    assert source.header == map_of(2).header
+    assert forbidden_on(source) == [[EAST] * 5] * 4
+
+
 @pytest.mark.parametrize("map_type", ["map", "costmap"])
-def test_directions_hold_for_the_region_of_each_map_whatever_their_stamps(
+def test_directions_hold_for_the_region_of_maps_of_another_node(
     node: BaseNode, source: MapSource, published: None, map_type: str
 ) -> None:
     set_parameter(node, source, "map_type", map_type)
     heard: list[bool] = []
     source._on_map = heard.append
     take_directions(source, directions_of(1))
-    for map_stamp, x, expected in (
-        (1, 0.0, [EAST] * 5),
-        (2, 0.0, [EAST] * 5),  # as from a map server that was killed before its next directions
-        (7, 1.0, [EAST] * 3 + [0] * 2),
-        (8, -1.5, [0] * 3 + [EAST] * 2),
-    ):
+    for map_stamp, x, expected in ((7, 1.0, [EAST] * 3 + [0] * 2), (8, -1.5, [0] * 3 + [EAST] * 2)):
         source._take(map_of(map_stamp, x=x))
         assert not source.missing
         assert forbidden_on(source) == [expected] * 4
