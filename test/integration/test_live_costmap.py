@@ -89,14 +89,15 @@ def test_a_costmap_that_stops_takes_its_path_back_until_it_comes_again(robot: Ro
     assert robot.client.set_parameters("planner", map_timeout=TIMEOUT)[0].successful
     robot.client.publish("global_costmap/costmap", robot.stamped_map(), LATCHED)
     robot.wait_for_path((5, 5), (35, 5))
-    # It stops by itself: nobody sets a parameter or asks.
-    assert robot.client.set_parameters("planner", map_timeout=3.0)[0].successful
+    # It stops by itself: nobody sets a parameter or asks, and it is not time to plan again.
+    periods = robot.client.set_parameters("planner", map_timeout=3.0, replan_period=3600.0)
+    assert all(result.successful for result in periods)
     robot.clear()
     robot.client.publish("global_costmap/costmap", robot.stamped_map(), LATCHED)
     robot.plans.wait(lambda path: not path.poses)
     robot.client.publish("global_costmap/costmap", robot.stamped_map(), LATCHED)
     robot.plans.wait(lambda path: path.poses)
-    assert robot.client.set_parameters("planner", map_timeout=0.0)[0].successful
+    robot.client.set_parameters("planner", map_timeout=0.0, replan_period=1.0)
 
 
 def test_updates_close_and_open_doors(robot: Robot) -> None:
