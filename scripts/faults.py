@@ -1,8 +1,8 @@
 """Kills each node in turn while it works, starts it again, and checks that nothing is broken.
 
 The planner is killed while it plans, the map server while it publishes, the trainer while it saves:
-by SIGKILL, each time at a random moment. `make faults` kills 50 times; an argument gives another
-number.
+by SIGKILL, each time at a random moment. After each kill there must be a plan within a minute, also
+while the map server is gone. `make faults` kills 50 times; an argument gives another number.
 """
 
 from __future__ import annotations
@@ -21,7 +21,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from client import Client, initial_pose, plan_request, pose, wait_for
+from client import TIMEOUT, Client, initial_pose, plan_request, pose, wait_for
+from diagnostic_msgs.msg import DiagnosticArray
 from map_fixture import RULE, MapFixture
 from nav_msgs.msg import OccupancyGrid
 from nav_msgs.msg import Path as PathMessage
@@ -52,6 +53,9 @@ TRY_TIME = 1.0
 START_TIME = 20.0
 """The same for ~/start, which a second question would find started."""
 
+PLAN_TIME = 60.0
+"""Seconds within which there must be a plan after a kill, on a loaded machine."""
+
 LAST_WAIT = 0.5
 """Seconds that a client waits after a kill until it gives up."""
 
@@ -69,13 +73,15 @@ class Tally:
     restarts: int = 0
     answers: int = 0
     time_outs: int = 0
+    without_a_plan: int = 0
     wrong_paths: int = 0
     temporaries: int = 0
 
     @property
     def right(self) -> bool:
-        """Whether every restart worked, and nothing wrong came or stayed."""
-        return self.restarts == self.kills and not self.wrong_paths and not self.temporaries
+        """Whether all restarts worked, no plan was missing, and nothing wrong came or stayed."""
+        wrong = self.without_a_plan or self.wrong_paths or self.temporaries
+        return self.restarts == self.kills and not wrong
 
 
 class Killed:
@@ -106,6 +112,7 @@ class Faults:
         self.client = client
         self.maps = client.subscribe(OccupancyGrid, "map", LATCHED, keep=1)
         self.plans = client.subscribe(PathMessage, "plan", LATCHED, keep=1)
+        self.diagnostics = client.subscribe(DiagnosticArray, "/diagnostics", keep=20)
         self._draw, self._random = random.Random(0), np.random.default_rng(0)
         self.map_path, self.training_folder = folder / "map.yaml", folder / "training"
         occupancy = generate_map("office", (SIDE, SIDE), self._random)
@@ -146,6 +153,7 @@ class Faults:
         request: Any = None,
         accept: Callable[[Any], Any] = bool,
         try_time: float = TRY_TIME,
+        timeout: float = TIMEOUT,
     ) -> Any:
         """Ask until an answer is accepted; return it."""
 
@@ -157,12 +165,25 @@ class Faults:
             time.sleep(0.05)
             return None
 
-        return wait_for(f"answer from {name}", answer, self.children)
+        return wait_for(f"answer from {name}", answer, self.children, timeout)
 
-    def ask_for_plan(self, start: Cell, goal: Cell) -> PathMessage:
-        """Ask for a plan until there is one."""
+    def ask_for_plan(
+        self, start: Cell, goal: Cell, accept: Callable[[Any], Any] = lambda found: found.plan.poses
+    ) -> PathMessage:
+        """Ask for a plan until there is one, or an answer is accepted."""
         request = plan_request(self._map.grid, start, goal)
-        return self.ask(GetPlan, GET_PLAN, request, lambda answer: answer.plan.poses).plan
+        return self.ask(GetPlan, GET_PLAN, request, accept, timeout=PLAN_TIME).plan
+
+    def has_plan(self, tally: Tally, ask: Callable[[], PathMessage]) -> bool:
+        """Ask for a plan; if there is none, or none comes in time, count that and print why."""
+        with suppress(TimeoutError):
+            if ask().poses:
+                return True
+        tally.without_a_plan += 1
+        said = [message.status[0] for message in self.diagnostics.messages()]
+        reasons = [status.message for status in said if status.name == "/planner: plan"]
+        print(f"no plan after kill {tally.kills} of {tally.node}: {reasons[-1:]}", flush=True)
+        return False
 
     def trigger(self, name: str, try_time: float = TRY_TIME) -> str:
         """Call a Trigger service until it succeeds; return its message."""
@@ -218,9 +239,13 @@ class Faults:
         for cells, answer in zip(asked, self.kill(self.planner, tally, calls), strict=True):
             tally.wrong_paths += answer is not None and not self.is_right(answer.plan, *cells)
         self.planner.start()
-        plan = self.ask_for_plan(*asked[0])
-        tally.wrong_paths += not self.is_right(plan, *asked[0])
-        tally.restarts += 1
+
+        def plan() -> PathMessage:
+            found = self.ask_for_plan(*asked[0])
+            tally.wrong_paths += not self.is_right(found, *asked[0])
+            return found
+
+        tally.restarts += self.has_plan(tally, plan)
 
     def kill_map_server(self, tally: Tally) -> None:
         """Kill the map server while it loads, scatters over and restores its map."""
@@ -235,28 +260,29 @@ class Faults:
         calls = [(service, service.call_async(request)) for service, request in requests]
         time.sleep(self._draw.uniform(0.0, 2.0))
         self.kill(self.map_server, tally, calls)
-        # When that is answered, the plans of the last maps are out.
-        self.ask_for_plan(*self._watched)
+        # The first answer must be a plan. With it, the plans of the last maps are out.
+        self.has_plan(tally, lambda: self.ask_for_plan(*self._watched, accept=bool))
         whole = self.is_whole(self.maps.wait())
         self.maps.clear()
         self.map_server.start()
         served = self.maps.wait()
-        self.plan_for_active_goal()
-        tally.wrong_paths += not self.is_right(self.plans.wait(), *self._watched)
+        if self.has_plan(tally, self.plan_for_active_goal):
+            tally.wrong_paths += not self.is_right(self.plans.wait(), *self._watched)
         tally.restarts += whole and served.data == array.array("b", self._map.values.tobytes())
 
-    def plan_for_active_goal(self) -> None:
+    def plan_for_active_goal(self) -> PathMessage:
         """Give the planner a start and an active goal until it plans: it may be a new one."""
         start, goal = (pose(self._map.grid, cell) for cell in self._watched)
         self.plans.clear()
 
-        def planned() -> bool:
+        def planned() -> PathMessage | None:
             self.client.publish("initialpose", initial_pose(start))
             self.client.publish("goal_pose", goal)
             time.sleep(0.2)
-            return self.plans.find(lambda plan: plan.poses) is not None
+            found: PathMessage | None = self.plans.find(lambda plan: plan.poses)
+            return found
 
-        wait_for("plan", planned)
+        return wait_for("plan", planned, timeout=PLAN_TIME)
 
     def kill_trainer(self, tally: Tally) -> None:
         """Kill the trainer while it saves after each step, soon after a save was seen to begin."""

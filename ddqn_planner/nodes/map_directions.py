@@ -1,4 +1,4 @@
-"""The forbidden directions of the planner's map, which come on a topic of their own.
+"""The forbidden directions of the planner's maps, which come on a topic of their own.
 
 A map server publishes them for each of its maps, with the map's stamp: an ``OccupancyGrid`` whose
 values are the bytes of `GridMap.forbidden`, and without cells where nothing is forbidden.
@@ -24,7 +24,11 @@ NAME = "map_directions"
 
 
 class MapDirections:
-    """Listens to forbidden directions, and says whether a map may be planned on without them.
+    """Listens to forbidden directions; the last ones hold for each map, in the region they share.
+
+    Directions and maps that have had one stamp come from one map server: then the next map waits
+    for its own directions. The middleware does not keep the order of two topics: those of a large
+    map may come seconds after it, or never if the map server is killed.
 
     Make it before the subscription of the map: then directions that come with a map are taken
     first. A map server creates the publisher of directions before that of maps, so that whoever
@@ -33,7 +37,7 @@ class MapDirections:
     Parameters
     ----------
     node : BaseNode
-        It has the parameters ``map_type`` and ``require_directions``.
+        It has the parameter ``require_directions``.
     report : Report
         It says what was refused.
     on_change : callable
@@ -42,13 +46,17 @@ class MapDirections:
 
     def __init__(self, node: BaseNode, report: Report, on_change: Callable[[], None]) -> None:
         self._node, self._report, self._on_change = node, report, on_change
-        self._header: Header | None = None
-        self._directions: GridMap | None = None  # None for none
-        # Those of the map before: a server that is killed may have sent those of a map that never
-        # comes.
-        self._before: tuple[Header | None, GridMap | None] = None, None
+        # The last ones, and those of the map in use; without a map where nothing is forbidden.
+        self._last: tuple[Header, GridMap | None] | None = None
+        self._used: tuple[Header, GridMap | None] | None = None
+        self._are_paired = False
         self.subscription = node.create_subscription(OccupancyGrid, NAME, self._take, LATCHED)
         self._topic = self.subscription.topic_name
+
+    @property
+    def held(self) -> bool:
+        """Whether a map has had directions; that may be none at all."""
+        return self._used is not None
 
     def _take(self, message: OccupancyGrid) -> None:
         directions = None
@@ -62,54 +70,50 @@ class MapDirections:
                 self._report.refuse(NAME, str(error))
                 return
         self._report.accept(NAME)
-        self._before = self._header, self._directions
-        self._header, self._directions = message.header, directions
+        self._last = message.header, directions
         self._on_change()
 
-    def may_change(self, header: Header) -> bool:
-        """Return whether the last directions may be for a map."""
-        of_costmap = self._node.value("map_type") == "costmap"
-        return of_costmap or (self._header is not None and self._header.stamp == header.stamp)
+    def on(self, grid: GridMap, header: Header) -> GridMap:
+        """Return a map with its directions.
 
-    def on(self, grid: GridMap, header: Header) -> tuple[GridMap, str]:
-        """Return a map with its directions, and why it must not be planned on; '' if it may.
-
-        On a map, directions of the same stamp are needed if a node publishes any. A costmap comes
-        from another node: directions hold for the region that they share with it.
+        Raises
+        ------
+        ValueError
+            If its own have not come yet, or the last ones have another frame or other cells.
         """
         published = self._node.count_publishers(self._topic) > 0
-        is_needed = published or self._node.value("require_directions")
-        is_costmap = self._node.value("map_type") == "costmap"
-        if self._header is None:
-            remedy = "let a map server publish them, or set require_directions to false"
-            missing = f"the map's directions were not received on {self._topic} yet; {remedy}"
-            return grid, missing if is_needed else ""
-        directions_header, directions = self._header, self._directions
-        before, directions_before = self._before
-        newer = self._header.stamp == header.stamp or is_costmap
-        if before is not None and before.stamp == header.stamp and not newer:
-            directions_header, directions = before, directions_before
-        if not is_costmap and directions_header.stamp != header.stamp:
-            stamps = seconds(header.stamp), seconds(self._header.stamp)
-            missing = (
-                f"the map's stamp is {stamps[0]}, that of the directions on {self._topic} is "
-                f"{stamps[1]}; let one map server publish both, or set map_type to costmap"
+        if self._last is None:
+            if published or self._node.value("require_directions"):
+                raise ValueError(
+                    f"the map's directions were not received on {self._topic} yet; let a map "
+                    "server publish them, or set require_directions to false"
+                )
+            return grid
+        known = [found for found in (self._last, self._used) if found is not None]
+        own = [found for found in known if found[0].stamp == header.stamp]
+        if self._are_paired and published and not own:
+            raise ValueError(
+                f"the map's directions, with its stamp, {seconds(header.stamp)}, were not received "
+                f"on {self._topic} yet; if they do not come, load the map again"
             )
-            return grid, missing if is_needed else ""
-        if directions is None:
-            return grid, ""
+        of_map, directions = (own or known)[0]
+        if directions is not None:
+            grid = self._placed(directions, of_map.frame_id, grid, header.frame_id)
+        self._used, self._are_paired = (of_map, directions), bool(own)
+        return grid
+
+    def _placed(self, directions: GridMap, frame: str, grid: GridMap, map_frame: str) -> GridMap:
         try:
             offset = offset_between(directions, grid)
         except (OverflowError, ValueError):  # too far away to have a number of cells
             offset = None
-        if directions_header.frame_id != header.frame_id or offset is None:
-            return grid, (
+        if frame != map_frame or offset is None:
+            raise ValueError(
                 f"the directions on {self._topic} are not for this map: they have the frame "
-                f"{directions_header.frame_id!r} and {directions.resolution:.6g} m per cell, the "
-                f"map {header.frame_id!r} and {grid.resolution:.6g} m; give both one frame, and "
-                "cells that lie on each other"
+                f"{frame!r} and {directions.resolution:.6g} m per cell, the map {map_frame!r} and "
+                f"{grid.resolution:.6g} m; give both one frame, and cells that lie on each other"
             )
-        return replace(grid, forbidden=_moved(directions, offset, grid)), ""
+        return replace(grid, forbidden=_moved(directions, offset, grid))
 
 
 def _moved(directions: GridMap, offset: tuple[int, int], grid: GridMap) -> NDArray[np.uint8]:

@@ -51,6 +51,7 @@ CODE_OF_STATUS = {
     "NO_GOALS": "NO_VIAPOINTS_GIVEN",
     # As Nav2's planners time out while their costmap is not current.
     "NO_MAP": "TIMEOUT",
+    "MAP_TIMEOUT": "TIMEOUT",
 }
 """Which code an outcome has; UNKNOWN if it is not here."""
 

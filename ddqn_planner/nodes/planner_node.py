@@ -79,7 +79,7 @@ class PlannerNode(ManagedNode):
         self._stop()
         self._active, self._followed = ActiveGoal(), PathUnderWay()
         self._logged: tuple[object, ...] = ()
-        self._waits_for_pose = False
+        self._waits_for_pose = self._lacks_map = False
 
     def configure(self) -> None:
         """Listen to the map and to where the robot is, and create what answers requests."""
@@ -307,7 +307,6 @@ class PlannerNode(ManagedNode):
         A path is planned with the map, model and parameters that are there when this begins,
         whatever changes while it waits. Its stamp is the time of the answer.
         """
-        frame = self._map.frame or (goals[0].header.frame_id if goals else "")
         self._answering += 1
         try:
             outcome = await Unless(planning, self._stopped, *given_up)
@@ -320,6 +319,9 @@ class PlannerNode(ManagedNode):
             self._answering -= 1
         if outcome is not UNCHANGED:
             self._report.note(outcome)
+        frame = self._map.frame or (goals[0].header.frame_id if goals else "")
+        if outcome.goal is not None:  # the map may be another one by now
+            frame = outcome.goal.header.frame_id
         return Header(stamp=self.get_clock().now().to_msg(), frame_id=frame), outcome
 
     # Diagnostics
@@ -329,6 +331,9 @@ class PlannerNode(ManagedNode):
         self._looks.next()
         if self._is_configured:
             self._start.transform(self._map.frame)
+            lacks, self._lacks_map = self._lacks_map, bool(self._map.missing)
+            if self._lacks_map and not lacks:  # a costmap stopped: its path is taken back
+                self._replan.trigger()
         if self._waits_for_pose and self._active.poses:
             with suppress(RequestError):
                 self._requests.look(self._active.poses)

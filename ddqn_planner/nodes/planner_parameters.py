@@ -30,6 +30,12 @@ PARAMETERS: Final = {
         "How the map's values are read: as a map's, or as a costmap's of Nav2",
         ["map", "costmap"],
     ),
+    "map_timeout": Declared(
+        5.0,
+        "With the map_type costmap: how long after the last message to plan on a costmap, seconds; "
+        "0: always",
+        (0, 3600),
+    ),
     "require_directions": Declared(
         False, "Whether to wait for map_directions even if no node publishes them"
     ),

@@ -150,9 +150,7 @@ class Requests:
 
     async def _inputs(self) -> tuple[Header, GridMap, Planner]:
         """Return the header of the map of now, this map for the robot's body, and the planner."""
-        header = self.map.header
-        if header is None or self.map.missing:
-            raise RequestError("NO_MAP", self.map.missing)
+        header = await self._wait_for(self.map.check, lambda: self.map.may_come)
         inflated = self.map.inflated()
         await self.model.first()
         planner = self.model.planner

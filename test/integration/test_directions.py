@@ -177,7 +177,9 @@ def test_without_a_publisher_of_directions_a_map_needs_none(source: MapSource) -
     assert forbidden_on(source) is None
 
 
-def test_a_map_waits_for_the_directions_of_its_stamp(source: MapSource, published: None) -> None:
+def test_the_first_map_waits_for_directions_where_a_node_publishes_them(
+    source: MapSource, published: None
+) -> None:
     heard: list[bool] = []
     source._on_map = heard.append
     source._take(map_of(1))
@@ -185,64 +187,118 @@ def test_a_map_waits_for_the_directions_of_its_stamp(source: MapSource, publishe
     assert not heard
     take_directions(source, directions_of(1))
     assert not source.missing
-    assert len(heard) == 1
+    assert heard == [True]
     assert forbidden_on(source) == [[EAST] * 5] * 4
-    # The directions of the next map come first; until it comes, if ever, this one has its own.
+
+
+def test_a_map_servers_map_waits_for_its_own_directions_and_the_one_before_stays(
+    node: BaseNode, source: MapSource, published: None
+) -> None:
+    def is_planned_on(stamp: int, value: int | None) -> bool:
+        assert not source.missing
+        forbidden = value and [[value] * 5] * 4
+        return source.header == map_of(stamp).header and forbidden_on(source) == forbidden
+
+    take_directions(source, directions_of(1))
+    source._take(map_of(1))
+    assert is_planned_on(1, EAST)
+    # A map comes before its directions, or without them: its map server was killed.
+    source._take(map_of(2))
+    assert is_planned_on(1, EAST)
+    assert "directions, with its stamp, 2.000000000, were not" in source._report.refused["map"]
+    set_parameter(node, source, "occupied_threshold", 1)
+    assert is_planned_on(1, EAST)
     take_directions(source, directions_of(2, WEST))
-    set_parameter(source._node, source, "map_type", "map")
+    assert is_planned_on(2, WEST)
+    assert not source._report.refused
+    # The directions come first, or alone.
+    take_directions(source, directions_of(3, None))
+    assert is_planned_on(2, WEST)
+    set_parameter(node, source, "occupied_threshold", 65)
+    assert is_planned_on(2, WEST)
+    # Of those of two maps, each time one was lost.
+    source._take(map_of(4))
+    assert is_planned_on(2, WEST)
+    take_directions(source, directions_of(5, EAST))
+    assert is_planned_on(2, WEST)
+    source._take(map_of(5))
+    assert is_planned_on(5, EAST)
+
+
+def test_without_a_map_server_the_next_map_does_not_wait(source: MapSource) -> None:
+    take_directions(source, directions_of(1))
+    source._take(map_of(1))
+    source._take(map_of(2))
+    assert source.header == map_of(2).header
+    assert forbidden_on(source) == [[EAST] * 5] * 4
+
+
+@pytest.mark.parametrize("map_type", ["map", "costmap"])
+def test_directions_hold_for_the_region_of_maps_of_another_node(
+    node: BaseNode, source: MapSource, published: None, map_type: str
+) -> None:
+    set_parameter(node, source, "map_type", map_type)
+    heard: list[bool] = []
+    source._on_map = heard.append
+    take_directions(source, directions_of(1))
+    for map_stamp, x, expected in ((7, 1.0, [EAST] * 3 + [0] * 2), (8, -1.5, [0] * 3 + [EAST] * 2)):
+        source._take(map_of(map_stamp, x=x))
+        assert not source.missing
+        assert forbidden_on(source) == [expected] * 4
+    source._take(map_of(9, x=50.0))
+    assert forbidden_on(source) is None
+    source._take(map_of(10))
+    heard.clear()
+    for stamp, value in ((3, WEST), (20, None)):  # also older ones than the map
+        take_directions(source, directions_of(stamp, value))
+        assert not source.missing
+        assert forbidden_on(source) == (value and [[value] * 5] * 4)
+    assert heard == [False, False]
+
+
+def test_required_directions_are_waited_for_once(node: BaseNode, source: MapSource) -> None:
+    set_parameter(node, source, "require_directions", True)
+    source._take(map_of(1))
+    assert "or set require_directions to false" in source.missing
+    set_parameter(node, source, "require_directions", False)
+    assert not source.missing
+    set_parameter(node, source, "require_directions", True)
+    assert source.missing
+    take_directions(source, directions_of(9))
     assert not source.missing
     assert forbidden_on(source) == [[EAST] * 5] * 4
     source._take(map_of(2))
     assert not source.missing
-    assert forbidden_on(source) == [[WEST] * 5] * 4
-    # They come after it.
-    source._take(map_of(3))
-    assert "the map's stamp is 3.000000000, that of the directions" in source.missing
-    take_directions(source, directions_of(3, None))
-    assert not source.missing
-    assert forbidden_on(source) is None
-    assert len(heard) == 3
-
-
-def test_with_require_directions_no_map_is_planned_on_without(
-    node: BaseNode, source: MapSource
-) -> None:
-    source._take(map_of(1))
-    set_parameter(node, source, "require_directions", True)
-    assert "or set require_directions to false" in source.missing
-    take_directions(source, directions_of(1))
-    assert not source.missing
-    assert forbidden_on(source) == [[EAST] * 5] * 4
-
-
-def test_a_costmap_of_any_stamp_has_the_directions_of_its_region(
-    node: BaseNode, source: MapSource, published: None
-) -> None:
-    set_parameter(node, source, "map_type", "costmap")
-    source._take(map_of(7, x=1.0))
-    assert source.missing
-    take_directions(source, directions_of(1))
-    assert not source.missing
-    assert forbidden_on(source) == [[EAST] * 3 + [0] * 2] * 4
-    source._take(map_of(8, x=-1.5))
-    assert forbidden_on(source) == [[0] * 3 + [EAST] * 2] * 4
-    source._take(map_of(9, x=50.0))
-    assert not source.missing
-    assert forbidden_on(source) is None
 
 
 @pytest.mark.parametrize(
     "changes", [{"frame": "odom"}, {"x": 0.2}, {"x": 1e308}, {"x": 1e30}, {"resolution": 0.25}]
 )
-def test_directions_of_another_frame_or_other_cells_are_not_used(
-    node: BaseNode, source: MapSource, changes: dict[str, Any]
+def test_no_map_is_planned_on_with_directions_of_another_frame_or_other_cells(
+    source: MapSource, changes: dict[str, Any]
 ) -> None:
-    set_parameter(node, source, "map_type", "costmap")
+    other = map_of(2, **changes)
+    source._take(other)
+    assert not source.missing
+    # What was planned on without directions is not once there are some.
     take_directions(source, directions_of(1))
-    source._take(map_of(2, **changes))
-    assert "not for this map" in source.missing
+    assert source.missing.startswith("the directions on /map_directions are not for this map")
     source._take(map_of(3))
     assert not source.missing
+    assert "map" not in source._report.refused
+    # The map before it stays, until directions come for the one that waits.
+    source._take(other)
+    assert "not for this map" in source._report.refused["map"]
+    assert not source.missing
+    assert (source.header, forbidden_on(source)) == (map_of(3).header, [[EAST] * 5] * 4)
+    take_directions(source, directions_of(4, None))
+    assert source.header == other.header
+    assert forbidden_on(source) is None
+    assert "map" not in source._report.refused
+    # So it does if the directions of the next map come first.
+    take_directions(source, directions_of(5))
+    assert not source.missing
+    assert source.header == other.header
 
 
 def test_malformed_directions_are_refused_and_those_before_them_stay(

@@ -11,8 +11,9 @@ from typing import Any
 import numpy as np
 import pytest
 from builtin_interfaces.msg import Time
+from diagnostic_msgs.msg import DiagnosticStatus
 from geometry_msgs.msg import PoseStamped, TransformStamped
-from integration.robot import Robot, points_of, values_of
+from integration.robot import TIMEOUT, Robot, points_of, values_of
 from std_msgs.msg import Header
 
 from ddqn_planner.grid import GridMap
@@ -46,7 +47,7 @@ def robot(
     run_node: Any, make_client: Callable[[str], Any], costmap: np.ndarray, model: FilePath
 ) -> Iterator[Robot]:
     client = make_client("/live")
-    parameters = {"map_type": "costmap"}
+    parameters = {"map_type": "costmap", "map_timeout": 0.0}
     remaps = ["map:=global_costmap/costmap"]
     with run_node("planner_node", parameters, remaps, namespace="/live"):
         robot = CostmapRobot(client, costmap, model, "/live/planner")
@@ -72,6 +73,31 @@ def test_a_costmap_is_planned_on_where_the_same_values_as_a_map_leave_no_path(
 def test_the_goal_in_the_inscribed_zone_is_said_to_be_so(robot: Robot) -> None:
     assert robot.get_plan(robot.pose((5, 5)), robot.pose((29, 0))).poses == []
     robot.wait_for_reason("the goal is occupied .* nearer to an obstacle than the costmap allows")
+
+
+def test_a_costmap_that_stops_takes_its_path_back_until_it_comes_again(robot: Robot) -> None:
+    robot.send_goal(robot.pose((35, 5)))
+    robot.wait_for_path((5, 5), (35, 5))
+    robot.clear()
+    assert robot.client.set_parameters("planner", map_timeout=0.2)[0].successful
+    assert robot.plans.wait(lambda path: not path.poses).header.frame_id == "map"
+    assert robot.get_plan(robot.pose((5, 5)), robot.pose((9, 9))).poses == []
+    status = robot.wait_for_reason("nothing came on /live/global_costmap/costmap for longer than")
+    assert status.level == DiagnosticStatus.WARN
+    assert values_of(status)["status"] == "MAP_TIMEOUT"
+    robot.clear()
+    assert robot.client.set_parameters("planner", map_timeout=TIMEOUT)[0].successful
+    robot.client.publish("global_costmap/costmap", robot.stamped_map(), LATCHED)
+    robot.wait_for_path((5, 5), (35, 5))
+    # It stops by itself: nobody sets a parameter or asks, and it is not time to plan again.
+    periods = robot.client.set_parameters("planner", map_timeout=3.0, replan_period=3600.0)
+    assert all(result.successful for result in periods)
+    robot.clear()
+    robot.client.publish("global_costmap/costmap", robot.stamped_map(), LATCHED)
+    robot.plans.wait(lambda path: not path.poses)
+    robot.client.publish("global_costmap/costmap", robot.stamped_map(), LATCHED)
+    robot.plans.wait(lambda path: path.poses)
+    robot.client.set_parameters("planner", map_timeout=0.0, replan_period=1.0)
 
 
 def test_updates_close_and_open_doors(robot: Robot) -> None:

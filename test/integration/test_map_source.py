@@ -6,6 +6,7 @@ Here a message of map_msgs is a stand-in with the same fields; PyPI does not hav
 from __future__ import annotations
 
 import array
+import re
 import time
 from collections.abc import Iterator
 from types import SimpleNamespace
@@ -24,10 +25,10 @@ from rclpy.utilities import try_shutdown
 from std_msgs.msg import Header
 
 from ddqn_planner.grid import GridMap
-from ddqn_planner.nodes.conversions import occupancy_message
+from ddqn_planner.nodes.conversions import directions_message, occupancy_message
 from ddqn_planner.nodes.map_source import MapSource, updated_values
 from ddqn_planner.nodes.planner_parameters import PARAMETERS
-from ddqn_planner.nodes.report import Report
+from ddqn_planner.nodes.report import Report, RequestError
 from ddqn_planner.nodes.runtime import BaseNode, Worker
 
 MAP = occupancy_message(
@@ -195,3 +196,67 @@ def test_refused_updates_are_counted_and_change_nothing(node: BaseNode) -> None:
     source._take_update(update())
     assert "map_updates" not in report.refused
     assert heard == [True, False]
+
+
+def test_an_update_of_a_map_that_waits_changes_that_map_alone(node: BaseNode) -> None:
+    source = MapSource(node, Report(node), Worker(node), lambda _: None)
+    header = Header(frame_id="map", stamp=Time(sec=1))
+    zones = np.full((4, 5), 1, dtype=np.uint8)
+    source._directions._take(directions_message(zones, 0.5, (0.0, 0.0, 0.0), header))
+    source._take(MAP)
+    before = inflated(source)
+    waiting = occupancy_message(np.zeros((4, 5), np.int8), 1.0, (0.0, 0.0, 0.0), MAP.header)
+    source._take(waiting)
+    source._take_update(update(data=array.array("b", [100] * 6)))
+    assert inflated(source) is before
+    assert source.header == MAP.header
+    source._directions._take(directions_message(None, 0.5, (0.0, 0.0, 0.0), header))
+    assert inflated(source).occupancy.tolist() == 3 * [[0, 1, 1, 0, 0]] + [[0] * 5]
+    assert source.header == update().header
+
+
+def test_a_costmap_is_planned_on_for_map_timeout_after_its_last_message(
+    node: BaseNode, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    now = [100.0]
+    clock = SimpleNamespace(monotonic=lambda: now[0])
+    monkeypatch.setattr("ddqn_planner.nodes.map_source.time", clock)
+    source = MapSource(node, Report(node), Worker(node), lambda _: None)
+
+    def status() -> str:
+        if not source.missing:
+            return ""
+        with pytest.raises(RequestError, match=re.escape(source.missing)) as error:
+            source.check()
+        return error.value.status
+
+    def after(seconds: float) -> str:
+        now[0] += seconds
+        return status()
+
+    def set_parameter(name: str, value: Any) -> None:
+        assert node.set_parameters([Parameter(name, value=value)])[0].successful
+        source.apply_parameters({name})
+
+    message = occupancy_message(np.zeros((4, 5), np.int8), 0.5, (0.0, 0.0, 0.0), MAP.header)
+    source._take(message)
+    assert after(1e6) == ""  # a map
+    set_parameter("map_type", "costmap")
+    try:
+        assert status() == "MAP_TIMEOUT"
+        assert "nothing came on /map for longer than map_timeout, 5 s; start" in source.missing
+        source._take(message)
+        assert [after(4.9), after(0.2)] == ["", "MAP_TIMEOUT"]
+        source._take_update(update())
+        assert [status(), after(4.9), after(0.2)] == ["", "", "MAP_TIMEOUT"]
+        source._take_update(update(x=40))  # what is refused is no news
+        assert status() == "MAP_TIMEOUT"
+        set_parameter("robot_radius", 0.4)  # nor is a parameter
+        assert status() == "MAP_TIMEOUT"
+        set_parameter("map_timeout", 20.0)
+        assert [status(), after(15.0)] == ["", "MAP_TIMEOUT"]
+        set_parameter("map_timeout", 0.0)
+        assert after(1e6) == ""
+    finally:
+        for name in ("map_type", "map_timeout", "robot_radius"):
+            set_parameter(name, PARAMETERS[name].default)

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from client import wait_for
 from geometry_msgs.msg import PoseStamped
-from integration.robot import GOAL, START, Robot, check_path, points_of
+from integration.robot import GOAL, NUMBERS, START, Robot, check_path, points_of
 from integration.test_lifecycle import Manager
 from integration.test_startup import load_gate as load_gate
 from nav_msgs.msg import Path as PathMessage
@@ -181,8 +181,10 @@ def waiting(
     load_gate: Path,
 ) -> Iterator[Navigator]:
     """Yield a navigator of a planner whose plans wait for its model, as they wait for a field."""
-    with run_node("planner_node", {}, namespace="/waiting") as node:
-        robot = Robot(make_client("/waiting"), small_values, model, "/waiting/planner")
+    # A name of its own: the clients of the tests before live on, with their latched maps.
+    namespace = f"/waiting_{next(NUMBERS)}"
+    with run_node("planner_node", {}, namespace=namespace) as node:
+        robot = Robot(make_client(namespace), small_values, model, f"{namespace}/planner")
         robot.set_map(robot.stamped_map())
         node.wait_for_log("a model waits")
         yield Navigator(robot)

@@ -46,6 +46,7 @@ def test_codes_are_nav2s() -> None:
         "START_OCCUPIED": 205,
         "GOAL_OCCUPIED": 206,
         "NO_MAP": 207,
+        "MAP_TIMEOUT": 207,
         "NO_PATH": 208,
         "ROLLOUT_TRAPPED": 208,
     }

@@ -18,6 +18,7 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import PoseArray, PoseStamped, PoseWithCovarianceStamped, TransformStamped
 from integration.robot import (
     GOAL_YAW,
+    NUMBERS,
     Robot,
     check_path,
     constant_model,
@@ -326,9 +327,11 @@ def transformed(
         f"source.PATIENCE *= {getattr(request, 'param', 1)}\n"
     )
     monkeypatch.setenv("PYTHONPATH", str(tmp_path), prepend=":")
-    client = make_client("/transformed")
-    with run_node("planner_node", {"start_source": "tf"}, namespace="/transformed"):
-        robot = Robot(client, hall, model, "/transformed/planner")
+    # A name of its own: the clients of the tests before live on, with their latched maps.
+    namespace = f"/transformed_{next(NUMBERS)}"
+    client = make_client(namespace)
+    with run_node("planner_node", {"start_source": "tf"}, namespace=namespace):
+        robot = Robot(client, hall, model, f"{namespace}/planner")
         robot.set_map(robot.stamped_map())
         client.publisher(TransformStamped, "tf")
         client.wait_for_discovery("planner")

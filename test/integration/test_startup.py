@@ -95,6 +95,33 @@ def ask_for_plan(robot: Robot) -> tuple[Any, threading.Event]:
     return plan, answered
 
 
+def test_requests_wait_a_while_for_the_first_map(
+    run_node: Any,
+    make_client: Callable[[str], Any],
+    small_values: np.ndarray,
+    model: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    (tmp_path / "sitecustomize.py").write_text(
+        f"import ddqn_planner.nodes.map_source as source\nsource.PATIENCE = {TIMEOUT}\n"
+    )
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path), prepend=os.pathsep)
+    client = make_client("/awaited")
+    with run_node("planner_node", {"model": str(model)}, namespace="/awaited"):
+        robot = Robot(client, small_values, model, "/awaited/planner")
+        robot.send_start(robot.pose(START))
+        robot.send_goal(robot.pose(GOAL))
+        plan, answered = ask_for_plan(robot)
+        assert client.get_parameter("planner", "mode") == "greedy"
+        assert not plan.done()
+        robot.send_map()
+        assert answered.wait(TIMEOUT)
+        check_path(plan.result().plan, robot.grid)
+        robot.wait_for_path(START, GOAL)
+        assert all(path.poses for path in robot.plans.messages())
+
+
 def test_requests_before_the_model_is_loaded_wait_for_it(
     run_node: Any,
     make_client: Callable[[str], Any],
