@@ -278,6 +278,8 @@ class Planner:
                 goal = (int(path[-1, 0]), int(path[-1, 1]))
                 if len(way_out) > 1:
                     path = np.concatenate([way_out[:-1], path], dtype=np.int32)
+                    if not np.array_equal(path, np.asarray(request.under_way)[-len(path) :]):
+                        extra_cost = None  # only from the first free cell on it is the one kept
                 if grid.has_costs:
                     cost = path_cost(path, grid.cost_multiplier, rule)
                     cost *= grid.seconds_per_cell or 1.0

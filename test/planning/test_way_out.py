@@ -14,7 +14,9 @@ from strategies import grids_with_directions, grids_with_free_cell
 
 from ddqn_planner import GridMap, MoveRule, PlanMethod, Planner, PlanStatus, inflate
 from ddqn_planner.grid import Cell, path_length
+from ddqn_planner.planning import PlanRequest
 from ddqn_planner.planning.path_under_way import is_path_valid
+from ddqn_planner.planning.planner import last_step
 
 RULES = st.sampled_from(list(MoveRule))
 ANY_MAP = Planner.load("any_map")
@@ -162,6 +164,32 @@ def test_a_path_that_leaves_is_valid_until_another_obstacle_lies_on_it() -> None
     assert is_path_valid([(2, 2), (1, 2)], (2, 2), one_way, "robot_safe", 1)
     for robot in ((1, 2), (-9, 2)):  # a robot beside the obstacle has to go round it
         assert not is_path_valid(path, robot, grid, "robot_safe", 2)
+
+
+@pytest.mark.parametrize(
+    ("blocked", "extra_cost", "begin"),
+    [
+        (slice(2, 3), 0.0, [(2, 0), (3, 0), (4, 0)]),  # the robot's cell alone: straight on
+        (slice(2, 4), None, [(2, 0), (2, 1), (3, 1)]),  # its path goes on through an obstacle
+    ],
+)
+def test_a_path_under_way_is_kept_if_the_way_out_lies_on_it(
+    blocked: slice, extra_cost: float | None, begin: list[Cell]
+) -> None:
+    occupancy = np.zeros((5, 12), dtype=bool)
+    under_way = ANY_MAP.plan(GridMap(occupancy), (0, 0), (11, 0)).path
+    occupancy[0, blocked] = True
+    request = PlanRequest(
+        GridMap(occupancy),
+        (2, 0),
+        (11, 0),
+        MoveRule.ROBOT_SAFE,
+        under_way=under_way,
+        start_clearing_radius=0.5,
+    )
+    plan = last_step(ANY_MAP.steps(request))
+    assert plan.extra_cost == extra_cost
+    assert [*plan.cells[:3]] == begin
 
 
 @pytest.mark.parametrize("method", list(PlanMethod))
