@@ -32,7 +32,6 @@ from nav_msgs.msg import OccupancyGrid, Odometry, Path
 from numpy.typing import NDArray
 from PIL import Image
 from processes import claim_ros_domain, run_script, running, running_node
-from std_msgs.msg import String
 
 from ddqn_planner.experience.drive_recorder import ARRIVAL_DISTANCE
 from ddqn_planner.experiments.driving_worlds import World, generated_world, path_seconds
@@ -45,6 +44,9 @@ from ddqn_planner.planning import Planner
 WORLD, SEED, SPEED_UP = "office", 9, 40.0
 MISSIONS = 40
 RULE = MoveRule.ROBOT_SAFE
+LISTENERS = 3
+"""To goals: the planner, the trainer and the robot."""
+
 MEAN_OF = 8
 """Missions that a point of the curve sums up."""
 
@@ -70,9 +72,10 @@ class Driver:
     def __init__(self, client: Client, world: World, children: Sequence[Popen[bytes]]) -> None:
         self.client, self.world, self.children = client, world, children
         self.odometry = client.subscribe(Odometry, "odom", keep=1)
-        self.slowness = client.subscribe(OccupancyGrid, "trainer/slowness", LATCHED, keep=1)
-        self.saved = client.subscribe(String, "trainer/experience_saved", LATCHED)
+        self.drives = client.subscribe(Path, "trainer/episode")
         self.plans = client.subscribe(Path, "plan", LATCHED, keep=1)
+        # The last one: once its latched message comes, the others are connected, too.
+        self.slowness = client.subscribe(OccupancyGrid, "trainer/slowness", LATCHED, keep=1)
         self.planner = Planner.load("any_map")
         self.at = world.stations[0]
 
@@ -85,14 +88,9 @@ class Driver:
         stamp = self.wait("odometry", self.odometry).header.stamp
         return float(stamp.sec + stamp.nanosec / 1e9)
 
-    def is_at(self, goal: PoseStamped) -> bool:
-        """Return whether the robot has arrived."""
-        at, there = self.wait("odometry", self.odometry).pose.pose.position, goal.pose.position
-        return math.dist((at.x, at.y), (there.x, there.y)) <= ARRIVAL_DISTANCE
-
     def plan(self, grid: GridMap, start: Cell, goal: Cell) -> tuple[Cell, ...]:
         """Return the path on a map."""
-        return self.planner.plan(grid, start, goal, RULE).cells
+        return self.planner.plan(grid, start, goal, RULE, start_clearing_radius=1).cells
 
     def known_slowness(self) -> NDArray[np.float64]:
         """Return what the trainer says: (H, W)."""
@@ -106,25 +104,31 @@ class Driver:
         slowness, began = self.known_slowness(), self.now()
         truth = world.slowness(began)
         self.plans.clear()
-        self.saved.clear()
+        self.drives.clear()
         stamped = pose(grid, goal)
-        self.client.publish("goal_pose", stamped)
-        path = self.wait("plan", self.plans, lambda plan: plan.poses)
+        self.client.publish("goal_pose", stamped, listeners=LISTENERS)
+        # The planner may still publish a path to the last goal.
+        path = self.wait("plan", self.plans, lambda plan: cells_of(grid, plan)[-1:] == [goal])
         cells = cells_of(grid, path)
+        self.wait("odometry at the goal", self.odometry, lambda at: _is_at(at.pose, stamped))
+        # Other drives end on the way: one that is long, or if the trainer hears the goal late.
+        self.wait("drive", self.drives, lambda path: _is_at(path.poses[-1], stamped, 2))
+        measured = self.now() - began
+        time.sleep(0.3)  # the planner loads it
+        self.at = goal
         routes = {
             "shortest": self.plan(grid, cells[0], goal),
             "learned": cells,
             "best possible": self.plan(world.known(began), cells[0], goal),
         }
         seconds = {name: path_seconds(cells, truth, grid) for name, cells in routes.items()}
-        while True:  # a goal that the trainer hears late ends a drive, too
-            self.wait("drive", self.saved)
-            if self.is_at(stamped):
-                break
-            self.saved.clear()
-        time.sleep(0.3)  # the planner loads it
-        self.at = goal
-        return Mission(routes, seconds, self.now() - began, truth, slowness)
+        return Mission(routes, seconds, measured, truth, slowness)
+
+
+def _is_at(stamped: Any, goal: PoseStamped, factor: float = 1) -> bool:
+    """Return whether a pose is so near to the goal that the robot has arrived."""
+    at, there = stamped.pose.position, goal.pose.position
+    return math.dist((at.x, at.y), (there.x, there.y)) <= factor * ARRIVAL_DISTANCE
 
 
 def draw(axes: Any, world: World, slowness: NDArray[np.float64], routes: Routes) -> Any:

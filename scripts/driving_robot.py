@@ -2,7 +2,8 @@
 
 It follows the last `plan`, and publishes `odom` and, where tf2_ros is installed, a transform. Slow
 zones, a carpet on which wheels slip, a door, and crowds that come and go by the hour slow it down.
-Its time runs faster than the clock: the stamps are simulated.
+It stops before an obstacle. Where it stands without a path that it can follow, it sends the last
+`goal_pose` again. Its time runs faster than the clock: the stamps are simulated.
 
     python scripts/driving_robot.py --ros-args -p world:=office -p seed:=1 -p speed_up:=30.0
 """
@@ -15,12 +16,13 @@ import time
 
 import numpy as np
 from builtin_interfaces.msg import Time
-from geometry_msgs.msg import TransformStamped
+from geometry_msgs.msg import PoseStamped, TransformStamped
 from nav_msgs.msg import Odometry, Path
 from numpy.typing import NDArray
 from rclpy.node import Node
 from std_msgs.msg import Header
 
+from ddqn_planner.experience.drive_recorder import ARRIVAL_DISTANCE
 from ddqn_planner.experiments.driving_worlds import NOISE, SPEED, World, generated_world
 from ddqn_planner.nodes.conversions import quaternion
 from ddqn_planner.nodes.runtime import LATCHED, STEADY, spin_until_shutdown
@@ -40,9 +42,22 @@ TURN_RATE = 2.0
 ARRIVED = 0.15
 """Metres."""
 
+JOIN_DISTANCE = 2.0
+"""Metres from which the robot drives to the nearest point of a new path."""
+
+SIGHT = 0.005
+"""Metres between the points at which a straight line is looked at for obstacles."""
+
+MOST_BEHIND = 5.0
+"""Simulated seconds that a process which was stalled catches up. A robot that was away for longer
+would have left the path that is planned for it."""
+
+PATIENCE = 2.0
+"""Seconds that the robot stands before it asks for a path again."""
+
 
 class Robot:
-    """A robot that follows paths by pure pursuit.
+    """A robot that follows paths by pure pursuit, and sees obstacles.
 
     Parameters
     ----------
@@ -60,40 +75,78 @@ class Robot:
         self._path = np.empty((0, 2))
         self._cell, self._noise = (-1, -1), 1.0
 
+    @property
+    def is_driving(self) -> bool:
+        """Whether it has a path that it can follow."""
+        return len(self._path) > 0
+
     def follow(self, path: NDArray[np.float64]) -> None:
         """Follow a path from now on, (N, 2) in metres; an empty one stops the robot."""
-        self._path = path
+        away = np.hypot(*(path - (self.x, self.y)).T)
+        near = np.flatnonzero(away <= JOIN_DISTANCE)
+        near = near[self._sees(path[near])]
+        self._path = path[near[away[near].argmin()] :] if len(near) else path[:0]
 
     def step(self) -> None:
         """Drive for `STEP` seconds."""
         self.now += STEP
         left = STEP
-        while left > 1e-9 and len(self._path):
+        while left > 1e-9 and self.is_driving:
             left -= self._move(left)
+
+    def _sees(self, points: NDArray[np.float64]) -> NDArray[np.bool_]:
+        """Return whether a straight line leads to each point without an obstacle: (N,) bool."""
+        here = np.array([self.x, self.y])
+        metres = np.hypot(*(points - here).T).max(initial=0)
+        share = np.linspace(0, 1, int(metres / SIGHT) + 2)[:, None, None]
+        cells = self._cells(here + share * (points - here))
+        height, width = self.world.grid.occupancy.shape
+        inside = ((cells >= 0) & (cells < (width, height))).all(axis=-1)
+        x, y = np.moveaxis(cells.clip(0, (width - 1, height - 1)), -1, 0)
+        # A robot on an obstacle may leave.
+        is_own = (cells == self._cells(here)).all(axis=-1)
+        sees: NDArray[np.bool_] = (inside & ~self.world.grid.occupancy[y, x] | is_own).all(axis=0)
+        return sees
+
+    def _cells(self, points: NDArray[np.float64]) -> NDArray[np.int64]:
+        """Return the cells of points (..., 2)."""
+        grid = self.world.grid
+        return np.floor((points - grid.origin[:2]) / grid.resolution).astype(np.int64)
 
     def _move(self, seconds: float) -> float:
         """Turn, or drive in an arc; return how long it took."""
         away = np.hypot(*(self._path - (self.x, self.y)).T)
-        nearest = int(away.argmin())
-        self._path, away = self._path[nearest:], away[nearest:]
+        beyond = np.flatnonzero(away >= LOOK_AHEAD)
+        seen = np.flatnonzero(self._sees(self._path[: beyond[0] + 1 if len(beyond) else None]))
+        if not len(seen):  # it has to ask for another path
+            self._path = self._path[:0]
+            return seconds
+        aim_x, aim_y = self._path[seen[-1]]
+        nearest = int(seen[away[seen].argmin()])
+        self._path = self._path[nearest:]
         if away[-1] < ARRIVED and len(self._path) <= 2 / self.world.grid.resolution:
             self._path = self._path[:0]
             return seconds
-        ahead = np.flatnonzero(away >= LOOK_AHEAD)
-        aim_x, aim_y = self._path[ahead[0] if len(ahead) else -1]
         bearing = math.atan2(aim_y - self.y, aim_x - self.x) - self.yaw
         bearing = math.remainder(bearing, 2 * math.pi)
         if abs(bearing) > math.pi / 4:
-            turn = min(abs(bearing), TURN_RATE * seconds)
-            self.yaw += math.copysign(turn, bearing)
-            return turn / TURN_RATE
+            return self._turn(bearing, seconds)
         seconds = min(seconds, 0.05)
         metres = self._speed() * seconds
         distance = max(math.dist((aim_x, aim_y), (self.x, self.y)), 0.05)
-        self.yaw += 2 * math.sin(bearing) / distance * metres
-        self.x += metres * math.cos(self.yaw)
-        self.y += metres * math.sin(self.yaw)
+        yaw = self.yaw + 2 * math.sin(bearing) / distance * metres
+        x, y = self.x + metres * math.cos(yaw), self.y + metres * math.sin(yaw)
+        grid = self.world.grid
+        if abs(bearing) > 1e-3 and not grid.is_free(grid.world_to_cell(x, y)):
+            return self._turn(bearing, seconds)  # then the way is straight, and free
+        self.x, self.y, self.yaw = x, y, yaw
         return seconds
+
+    def _turn(self, angle: float, seconds: float) -> float:
+        """Turn on the spot; return how long it took."""
+        turn = min(abs(angle), TURN_RATE * seconds)
+        self.yaw += math.copysign(turn, angle)
+        return turn / TURN_RATE
 
     def _speed(self) -> float:
         grid = self.world.grid
@@ -126,6 +179,10 @@ class RobotNode(Node):
             self._broadcaster = TransformBroadcaster(self)
         except ImportError:
             self.get_logger().info("no transforms: tf2_ros is not installed")
+        self._goal: PoseStamped | None = None
+        self._waits_since = time.monotonic()
+        self._goals = self.create_publisher(PoseStamped, "goal_pose", 10)
+        self.create_subscription(PoseStamped, "goal_pose", self._on_goal, 10)
         self.create_subscription(Path, "plan", self._on_plan, LATCHED)
         self.create_timer(0.02, self._on_timer, clock=STEADY)
 
@@ -133,11 +190,35 @@ class RobotNode(Node):
         positions = [(it.pose.position.x, it.pose.position.y) for it in message.poses]
         self._robot.follow(np.array(positions).reshape(-1, 2))
 
+    def _on_goal(self, message: PoseStamped) -> None:
+        self._goal, self._waits_since = message, time.monotonic()
+
     def _on_timer(self) -> None:
         until = MORNING + (time.monotonic() - self._began) * self._speed_up
+        behind = until - self._robot.now - MOST_BEHIND
+        if behind > 0:
+            self._began += behind / self._speed_up
+            until -= behind
         while self._robot.now + STEP <= until:
             self._robot.step()
             self._publish()
+        self._ask_again()
+
+    def _ask_again(self) -> None:
+        """Send the goal again where the robot stands away from it."""
+        now = time.monotonic()
+        if self._goal is None or self._robot.is_driving:
+            self._waits_since = now
+        elif now - self._waits_since > PATIENCE:
+            self._waits_since = now
+            goal, robot = self._goal.pose.position, self._robot
+            metres = math.dist((goal.x, goal.y), (robot.x, robot.y))
+            if metres > ARRIVAL_DISTANCE:
+                self.get_logger().warning(
+                    f"standing at ({robot.x:.2f}, {robot.y:.2f}), {metres:.1f} m from the goal, "
+                    "without a path; the goal is sent again"
+                )
+                self._goals.publish(self._goal)
 
     def _publish(self) -> None:
         robot = self._robot

@@ -34,7 +34,13 @@ from ddqn_planner.nodes.map_source import MapSource
 from ddqn_planner.nodes.model_loading import ModelSource, load
 from ddqn_planner.nodes.nav2_interface import serve_nav2
 from ddqn_planner.nodes.planner_parameters import PARAMETERS
-from ddqn_planner.nodes.report import NOT_ACTIVE, Outcome, Report, RequestError
+from ddqn_planner.nodes.report import (
+    NOT_ACTIVE,
+    Outcome,
+    Report,
+    RequestError,
+    begins_on_obstacle,
+)
 from ddqn_planner.nodes.requests import Looks, Requests
 from ddqn_planner.nodes.runtime import LATCHED, STEADY, Unless, Worker, spin_until_shutdown
 from ddqn_planner.nodes.start_source import StartSource
@@ -257,12 +263,13 @@ class PlannerNode(ManagedNode):
         if self._active.is_news(outcome, header.frame_id):
             self._plan_publisher.publish(_path(serialized_path, outcome, header))
         self._waits_for_pose = outcome.status in ("NO_START", "TF_ERROR")
+        request, field_goal = outcome.request, outcome.plan.goal
         # The places and lengths in the reason may differ.
-        logged = goals, outcome.goal, outcome.status, outcome.plan.method
+        kind = outcome.status, outcome.plan.method, begins_on_obstacle(request, outcome.plan)
+        logged = goals, outcome.goal, *kind
         if self._logged != logged:
             self._logged = logged
             self._report.log(outcome)
-        request, field_goal = outcome.request, outcome.plan.goal
         if request is None or field_goal is None or outcome.planner is None:
             self._display.clear(header)
         else:

@@ -51,6 +51,12 @@ PARAMETERS: Final = {
     "robot_radius": Declared(
         0.0, "Cells nearer than this to an obstacle are occupied, metres", (0, 100)
     ),
+    "start_clearing_radius": Declared(
+        -1.0,
+        "A robot on an obstacle may leave: obstacles this near to its cell do not count, metres; "
+        "-1: robot_radius, at least one cell; 0: such a start is refused",
+        (-1, 100),
+    ),
     "clearance_weight": Declared(
         0.0,
         "How strongly to avoid cells near obstacles: 0 for not at all. For models that learned "

@@ -26,7 +26,7 @@ TOLERANCE = ", or a greater tolerance"
 REMEDIES = {
     PlanStatus.START_OUTSIDE_MAP: "set the start on the map",
     PlanStatus.GOAL_OUTSIDE_MAP: "set the goal on the map",
-    PlanStatus.START_OCCUPIED: "set the start on a free cell",
+    PlanStatus.START_OCCUPIED: "set the start on a free cell, or a greater start_clearing_radius",
     PlanStatus.GOAL_OCCUPIED: f"set the goal on a free cell{TOLERANCE}",
     PlanStatus.MAP_SIZE_UNSUPPORTED: "set the parameter 'model' to one trained for this size",
     PlanStatus.NO_PATH: f"set the goal where free cells lead to{TOLERANCE}",
@@ -93,6 +93,7 @@ def reason_of(
     `start` and `goal` are the poses of the request, and `robot_radius` inflated its map.
     """
     grid, goals = request.grid, request.goals
+    cleared = f"{request.start_clearing_radius * grid.resolution:.3g} m"
     if plan.status is not PlanStatus.SUCCEEDED:
         status, remedy = plan.status.value, REMEDIES[plan.status]
         to = f"goal: {_place(goal, request.goal)}"
@@ -108,6 +109,8 @@ def reason_of(
         if plan.status is PlanStatus.GOAL_OCCUPIED and not all(map(grid.is_obstacle, on_map)):
             near = f"robot_radius, {robot_radius:g} m" if robot_radius else "the costmap allows"
             reason += f", nearer to an obstacle than {near}"
+        if plan.status is PlanStatus.START_OCCUPIED and request.start_clearing_radius:
+            reason += f", deeper than the start_clearing_radius, {cleared}"
         return f"{reason}; {remedy}"
     number = f" to goal {goals.index(plan.goal) + 1} of {len(goals)}" if request.others else ""
     reason = f"a path of {plan.length:.2f} cells{number}, " + (
@@ -121,7 +124,14 @@ def reason_of(
         metres = math.dist(plan.goal, request.goal) * grid.resolution
         why = "is cut off" if grid.is_free(request.goal) else "is occupied"
         reason += f"; the goal {why} and moved {metres:.3g} m"
+    if begins_on_obstacle(request, plan):
+        reason += f"; the start is occupied: obstacles within {cleared} of it were ignored"
     return reason
+
+
+def begins_on_obstacle(request: PlanRequest | None, plan: Plan) -> bool:
+    """Return whether a plan has a path that leaves an obstacle."""
+    return request is not None and len(plan.path) > 0 and request.grid.is_obstacle(plan.path[0])
 
 
 def _place(stamped: PoseStamped, cell: Cell) -> str:

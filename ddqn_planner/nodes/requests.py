@@ -94,6 +94,7 @@ class Requests:
             move_rule=move_rule(settings.move_rule, planner),
             method=PlanMethod(settings.mode),
             simplified=settings.path_simplification == "line_of_sight",
+            start_clearing_radius=_clearing_radius(settings, grid),
         )
         if active is not None:
             if more:
@@ -139,7 +140,9 @@ class Requests:
         with suppress(RequestError):
             start = await self._in_map("the start", await self._known_start(frame), frame)
             robot = self._cell("the start", start, grid, frame)
-        return is_path_valid(cells, robot, grid, move_rule(self.settings.move_rule, planner))
+        settings = self.settings
+        rule = move_rule(settings.move_rule, planner)
+        return is_path_valid(cells, robot, grid, rule, _clearing_radius(settings, grid))
 
     def look(self, goals: Sequence[PoseStamped]) -> None:
         """Raise a RequestError while the start or a goal is not known in the map's frame."""
@@ -199,6 +202,14 @@ class Requests:
         pose = stamped.header, stamped.pose
         cell: Cell = checked(_invalid(name), cell_from_pose, name, *pose, grid, frame)
         return cell
+
+
+def _clearing_radius(settings: SimpleNamespace, grid: GridMap) -> float:
+    """Return the start_clearing_radius in cells."""
+    metres: float = settings.start_clearing_radius
+    if metres < 0:
+        metres = max(settings.robot_radius, grid.resolution)
+    return metres / grid.resolution
 
 
 def _invalid(name: str) -> str:

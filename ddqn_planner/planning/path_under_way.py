@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from ddqn_planner.grid import MOVES, Cell, GridMap, MoveRule, path_cost, path_length
 from ddqn_planner.grid.arguments import Cells
 from ddqn_planner.planning.simplification import is_legal_segment
+from ddqn_planner.planning.way_out import obstacles_in_the_way
 
 REACH = 5
 """Cells along an axis that a robot may be beside its path, and still come back to it."""
@@ -45,16 +46,30 @@ def legal_segments(path: Cells, grid: GridMap, move_rule: MoveRule | str) -> NDA
     return legal
 
 
-def is_path_valid(path: Cells, robot: Cell, grid: GridMap, move_rule: MoveRule | str) -> bool:
+def is_path_valid(
+    path: Cells,
+    robot: Cell,
+    grid: GridMap,
+    move_rule: MoveRule | str,
+    start_clearing_radius: float = 0.0,
+) -> bool:
     """Return whether all of a path from its cell nearest to the robot on is free and legal.
 
-    The path may be simplified, or come from another planner. An empty one is not valid.
+    A robot whose cell is not free may leave, see `PlanRequest.start_clearing_radius`. The path may
+    be simplified, or come from another planner. An empty one is not valid.
     """
     cells = _array(path)
     if not len(cells):
         return False
-    nearest = np.hypot(*(cells - np.array(robot, dtype=np.float64)).T).argmin()
-    return _legal_from(cells[nearest:], grid, move_rule) == 0
+    rest = cells[np.hypot(*(cells - np.array(robot, dtype=np.float64)).T).argmin() :]
+    if grid.contains(robot) and not grid.is_free(robot):
+        out = next((index for index, (x, y) in enumerate(rest) if grid.is_free((x, y))), len(rest))
+        obstacles = obstacles_in_the_way(grid, robot, start_clearing_radius)
+        leaving = GridMap(obstacles, forbidden=grid.forbidden)
+        if not legal_segments(rest[: out + 1], leaving, move_rule).all():
+            return False
+        rest = rest[out:]
+    return len(rest) > 0 and _legal_from(rest, grid, move_rule) == 0
 
 
 def rest_of_path(

@@ -59,6 +59,9 @@ class PlanRequest:
     others : tuple of (x, y)
         Goals that do as well: the path leads to the nearest of all that are free. They do not go
         together with a tolerance.
+    start_clearing_radius : float
+        Where the start is an obstacle, those within so many cells of it, itself included, do not
+        count until the path has reached its first free cell, the nearest one. With 0 they count.
     """
 
     grid: GridMap
@@ -71,6 +74,7 @@ class PlanRequest:
     under_way: Cells = field(default=(), compare=False)
     switch_threshold: float = 0.0
     others: tuple[Cell, ...] = ()
+    start_clearing_radius: float = 0.0
 
     @property
     def goals(self) -> tuple[Cell, ...]:

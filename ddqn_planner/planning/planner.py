@@ -20,7 +20,7 @@ from ddqn_planner.planning.plan import Plan, PlanMethod, PlanRequest, PlanStatus
 from ddqn_planner.planning.q_field import Goals, QField
 from ddqn_planner.planning.search import search
 from ddqn_planner.planning.simplification import simplify
-from ddqn_planner.planning.way_out import reach, way_out_and_ends
+from ddqn_planner.planning.way_out import can_leave, reach, way_out_and_ends
 
 VISITS = 2**18
 """About how many cells a field visits in one step of a plan: some 30 ms, then comes another."""
@@ -105,12 +105,13 @@ class Planner:
         method: PlanMethod | str = PlanMethod.GREEDY,
         tolerance: float = 0.0,
         simplified: bool = False,
+        start_clearing_radius: float = 0.0,
     ) -> Plan:
         """Plan a path.
 
         Parameters
         ----------
-        grid, start, goal, method, tolerance, simplified
+        grid, start, goal, method, tolerance, simplified, start_clearing_radius
             See `PlanRequest`.
         move_rule : MoveRule, optional
             By default the rule that the model was trained for.
@@ -119,20 +120,20 @@ class Planner:
         -------
         Plan
             Every move of its path is legal under the rule, whatever the network says. The cells
-            are free, except the first ones of a start that is too near to an obstacle.
+            are free, except the first ones of a start that is too near to an obstacle, or on one.
 
         Raises
         ------
         ValueError
-            If the tolerance is negative or NaN, the start or the goal is no pair of whole numbers,
-            or there is no such move rule or method.
+            If the tolerance or the radius is negative or NaN, the start or the goal is no pair of
+            whole numbers, or there is no such move rule or method.
         """
         start, goal = as_cell(start, "the start"), as_cell(goal, "the goal")
         rule, method = self._rule(move_rule), PlanMethod(method)
         if not tolerance >= 0:
             raise ValueError(f"the tolerance is {tolerance}; give 0 or more")
         request = PlanRequest(grid, start, goal, rule, method, tolerance, simplified)
-        return last_step(self.steps(request))
+        return last_step(self.steps(_clearing(request, start_clearing_radius)))
 
     def plan_nearest(
         self,
@@ -142,6 +143,7 @@ class Planner:
         move_rule: MoveRule | str | None = None,
         method: PlanMethod | str = PlanMethod.GREEDY,
         simplified: bool = False,
+        start_clearing_radius: float = 0.0,
     ) -> Plan:
         """Plan a path to the goal that the cheapest path reaches; `Plan.goal` tells which.
 
@@ -150,7 +152,7 @@ class Planner:
 
         Parameters
         ----------
-        grid, start, method, simplified
+        grid, start, method, simplified, start_clearing_radius
             See `PlanRequest`.
         goals : sequence of (x, y)
             At least one, in any order. No goal moves: there is no tolerance.
@@ -166,7 +168,7 @@ class Planner:
         rule, method = self._rule(move_rule), PlanMethod(method)
         start = as_cell(start, "the start")
         request = PlanRequest(grid, start, first, rule, method, 0.0, simplified, others=(*others,))
-        return last_step(self.steps(request))
+        return last_step(self.steps(_clearing(request, start_clearing_radius)))
 
     def plan_through(
         self,
@@ -177,12 +179,13 @@ class Planner:
         method: PlanMethod | str = PlanMethod.GREEDY,
         tolerance: float = 0.0,
         simplified: bool = False,
+        start_clearing_radius: float = 0.0,
     ) -> Plan:
         """Plan a path through all goals in their order, see `joined`.
 
         Parameters
         ----------
-        grid, start, move_rule, method, tolerance, simplified
+        grid, start, move_rule, method, tolerance, simplified, start_clearing_radius
             As for `plan`. The tolerance holds for each goal. A simplified path keeps all goals.
         goals : sequence of (x, y)
             At least one.
@@ -198,8 +201,9 @@ class Planner:
             As for `plan`, or if there is no goal.
         """
         plans: list[Plan] = []
+        how = move_rule, method, tolerance, simplified, start_clearing_radius
         for goal in _cells_of_goals(goals):
-            plans.append(self.plan(grid, start, goal, move_rule, method, tolerance, simplified))
+            plans.append(self.plan(grid, start, goal, *how))
             if plans[-1].status is not PlanStatus.SUCCEEDED:
                 return replace(plans[-1], goal=goal)
             assert plans[-1].goal is not None
@@ -250,6 +254,8 @@ class Planner:
                     field, plan = self._fields.get(grid, ends, rule, way_out[-1]), None
             if field is None or not way_out:
                 status = PlanStatus.NO_PATH if goals else PlanStatus.GOAL_OCCUPIED
+                if grid.is_obstacle(start) and not can_leave(request):
+                    status = PlanStatus.START_OCCUPIED
                 yield Plan(status, move_rule=rule, field_ms=field_time.ms)
                 return
             with rollout_time:
@@ -272,6 +278,8 @@ class Planner:
                 goal = (int(path[-1, 0]), int(path[-1, 1]))
                 if len(way_out) > 1:
                     path = np.concatenate([way_out[:-1], path], dtype=np.int32)
+                    if not np.array_equal(path, np.asarray(request.under_way)[-len(path) :]):
+                        extra_cost = None  # only from the first free cell on it is the one kept
                 if grid.has_costs:
                     cost = path_cost(path, grid.cost_multiplier, rule)
                     cost *= grid.seconds_per_cell or 1.0
@@ -297,7 +305,7 @@ class Planner:
             return PlanStatus.START_OUTSIDE_MAP
         if not any(grid.contains(goal) for goal in request.goals):
             return PlanStatus.GOAL_OUTSIDE_MAP
-        if grid.is_obstacle(request.start):
+        if grid.is_obstacle(request.start) and request.start_clearing_radius == 0:
             return PlanStatus.START_OCCUPIED
         if not _free_goals(request) and reach(request) < 1:
             return PlanStatus.GOAL_OCCUPIED
@@ -355,6 +363,12 @@ def _cells_of_goals(goals: Sequence[Cell]) -> list[Cell]:
     if not cells:
         raise ValueError("there is no goal; give at least one cell")
     return cells
+
+
+def _clearing(request: PlanRequest, radius: float) -> PlanRequest:
+    if not radius >= 0:
+        raise ValueError(f"start_clearing_radius is {radius}; give cells, 0 or more")
+    return replace(request, start_clearing_radius=radius)
 
 
 def _free_goals(request: PlanRequest) -> Goals:

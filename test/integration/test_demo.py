@@ -102,7 +102,9 @@ def test_demo_finds_the_shortest_paths_and_draws_them(demo: Demo, tmp_path: Path
 def test_a_robot_learns_by_driving_and_what_it_learned_is_drawn(demo: Demo, tmp_path: Path) -> None:
     pytest.importorskip("matplotlib")
     assert demo.process.wait(END_TIMEOUT) == 0, demo.output
-    assert re.search(r"mission  3: drove +\d+\.\d s; its route takes 1\.\d\d of", demo.output)
+    # No route is better than the best possible one.
+    routes = re.findall(r"mission +\d: drove +\d+\.\d s; its route takes 1\.\d\d of", demo.output)
+    assert len(routes) == 3
     assert demo.commands() == {}
     with Image.open(tmp_path / "demo_driving.gif") as film:
         assert film.n_frames == 3

@@ -137,6 +137,7 @@ def test_each_cause_has_its_code(navigator: Navigator) -> None:
         through = navigator.plan([fields.pop("goal")], **fields, use_start=True).result
         assert through.error_code == getattr(nav2.ComputePathThroughPoses.Result, name)
 
+    assert client.set_parameters("planner", start_clearing_radius=0.0)[0].successful
     for name, fields in causes:
         assert_code(name, fields)
     none = navigator.plan([], start=start, use_start=True).result

@@ -392,11 +392,13 @@ def test_pose_outside_the_map_has_an_empty_plan(
 
 @pytest.mark.parametrize("name", ["start", "goal"])
 def test_occupied_pose_has_an_empty_plan(robot: Robot, name: str) -> None:
+    assert robot.client.set_parameters("planner", start_clearing_radius=0.0)[0].successful
     send = {"start": robot.send_start, "goal": robot.send_goal}[name]
     send(robot.pose((2, 1)))
     assert robot.plans.wait(lambda path: not path.poses).header.frame_id == "map"
     status = robot.wait_for_reason(rf"the {name} is occupied .*{name}: \(0.3, 2.7\) m in cell")
     assert values_of(status)["status"] == f"{name.upper()}_OCCUPIED"
+    assert robot.client.set_parameters("planner", start_clearing_radius=-1.0)[0].successful
     robot.assert_works()
 
 

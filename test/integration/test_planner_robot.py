@@ -106,15 +106,45 @@ def test_paths_keep_the_robots_radius_from_obstacles_and_are_as_short_as_that_le
     assert length_of(path) < optimum * RESOLUTION
 
 
-def test_a_start_beside_an_obstacle_leaves_and_one_on_it_does_not(robot: Robot) -> None:
+def test_a_start_beside_an_obstacle_or_on_one_leaves(robot: Robot, hall: np.ndarray) -> None:
     inflated = inflate(robot.grid, 1.2)
+
+    def get_cells(start: Cell) -> list[Cell]:
+        robot.clear()
+        return cells_of(robot, robot.get_plan(robot.pose(start), robot.pose((0, 0))))
+
     with parameters_of(robot, robot_radius=1.2):
-        cells = cells_of(robot, robot.get_plan(robot.pose((9, 4)), robot.pose((0, 0))))
+        cells = get_cells((9, 4))
         assert cells[:2] == [(9, 4), (8, 4)]
         free = [inflated.is_free(cell) for cell in cells]
         assert free == sorted(free)
-        assert robot.get_plan(robot.pose((10, 4)), robot.pose((0, 0))).poses == []
-        robot.wait_for_reason("the start is occupied")
+        assert get_cells((10, 4)) == [(10, 4), *cells]
+        robot.wait_for_reason("; the start is occupied: obstacles within 1.2 m of it were ignored")
+        with parameters_of(robot, start_clearing_radius=0.0):
+            assert get_cells((10, 4)) == []
+            robot.wait_for_reason(
+                r"the start is occupied \(.*cells\); set .* start_clearing_radius"
+            )
+    thick = hall.copy()
+    thick[:, 8:13] = 100
+    robot.set_map(robot.stamped_map(thick))
+    assert get_cells((9, 4))[:3] == [(9, 4), (8, 4), (7, 4)]
+    assert get_cells((10, 4)) == []
+    robot.wait_for_reason("deeper than the start_clearing_radius, 0.5 m; set the start on a free")
+    with parameters_of(robot, start_clearing_radius=1.0):
+        assert get_cells((10, 4))[:4] == [(10, 4), (9, 4), (8, 4), (7, 4)]
+
+
+def test_specks_on_the_robot_do_not_stop_it(robot: Robot, hall: np.ndarray) -> None:
+    specks = hall.copy()
+    specks[0, 0] = specks[0, 1] = 100
+    robot.set_map(robot.stamped_map(specks))
+    robot.wait_for_reason("obstacles within 0.5 m of it were ignored")
+    specks[:2, :3] = 100  # now the path has to go another way
+    robot.set_map(robot.stamped_map(specks))
+    path = robot.plans.wait(lambda path: cells_of(robot, path)[2:3] == [(0, 2)])
+    assert cells_of(robot, path)[-1] == (19, 0)
+    assert all(path.poses for path in robot.plans.messages())
 
 
 def test_costs_near_obstacles_keep_the_path_away_from_them(robot: Robot, hall: np.ndarray) -> None:

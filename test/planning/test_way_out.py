@@ -1,0 +1,200 @@
+"""A start that is not free: the way out of it, against an oracle that shares no code with it."""
+
+from __future__ import annotations
+
+import heapq
+import math
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from strategies import grids_with_directions, grids_with_free_cell
+
+from ddqn_planner import GridMap, MoveRule, PlanMethod, Planner, PlanStatus, inflate
+from ddqn_planner.grid import Cell, path_length
+from ddqn_planner.planning import PlanRequest
+from ddqn_planner.planning.path_under_way import is_path_valid
+from ddqn_planner.planning.planner import last_step
+
+RULES = st.sampled_from(list(MoveRule))
+ANY_MAP = Planner.load("any_map")
+ACTIONS = [(1, 0), (1, 1), (0, 1), (-1, 1), (-1, 0), (-1, -1), (0, -1), (1, -1)]
+RADII = [0, 0.5, 1, 1.5, 2, 3, math.inf]
+Cells = set[Cell]
+
+
+def moves(cell: Cell, allowed: Cells, grid: GridMap, rule: MoveRule) -> list[tuple[Cell, float]]:
+    """The cells that one move leads to, within some, and the length of each."""
+    (x, y), found = cell, []
+    for action, (dx, dy) in enumerate(ACTIONS):
+        past_corner = dx and dy and not {(x + dx, y), (x, y + dy)} <= allowed
+        is_forbidden = grid.forbidden is not None and int(grid.forbidden[y, x]) >> action & 1
+        if is_forbidden or (rule is MoveRule.ROBOT_SAFE and past_corner):
+            continue
+        if (x + dx, y + dy) in allowed:
+            length = 1.0 if rule is MoveRule.UNIT else math.hypot(dx, dy)
+            found.append(((x + dx, y + dy), length))
+    return found
+
+
+def lengths_from(
+    start: Cell, allowed: Cells, grid: GridMap, rule: MoveRule, ends: Cells
+) -> dict[Cell, float]:
+    """The lengths of the shortest ways to the ends, each of which stops a way."""
+    lengths: dict[Cell, float] = {}
+    waiting = [(0.0, start)]
+    while waiting:
+        length, cell = heapq.heappop(waiting)
+        if cell in lengths:
+            continue
+        lengths[cell] = length
+        if cell not in ends:
+            for after, more in moves(cell, allowed, grid, rule):
+                heapq.heappush(waiting, (length + more, after))
+    return {cell: length for cell, length in lengths.items() if cell in ends}
+
+
+@settings(max_examples=300)
+@given(
+    grids_with_free_cell() | grids_with_directions(),
+    RULES,
+    st.sampled_from([0, 1.1, 1.5, 2.1]),
+    st.sampled_from(RADII),
+    st.data(),
+)
+def test_a_start_that_is_not_free_is_left_by_the_shortest_way(
+    grid_and_cell: tuple[GridMap, Cell],
+    rule: MoveRule,
+    robot_radius: float,
+    clearing_radius: float,
+    data: st.DataObject,
+) -> None:
+    plain, some_cell = grid_and_cell
+    grid = inflate(plain, robot_radius)
+    cells = [(x, y) for y in range(grid.height) for x in range(grid.width)]
+    free = {cell for cell in cells if not grid.occupancy[cell[::-1]]}
+    obstacles = {cell for cell in cells if plain.occupancy[cell[::-1]]}
+    blocked = sorted({*cells} - free) or cells
+    start = data.draw(st.sampled_from(blocked) | st.sampled_from(cells), label="start")
+    goal = data.draw(st.sampled_from(sorted(free) or [some_cell]), label="goal")
+    plan = ANY_MAP.plan(grid, start, goal, rule, start_clearing_radius=clearing_radius)
+    if start in obstacles and clearing_radius == 0:
+        assert plan.status is PlanStatus.START_OCCUPIED
+        return
+    if start in free:
+        assert plan == ANY_MAP.plan(grid, start, goal, rule)
+        return
+    if goal not in free:
+        assert plan.status is PlanStatus.GOAL_OCCUPIED
+        return
+    near = {cell for cell in obstacles if math.dist(cell, start) <= clearing_radius}
+    closed = obstacles - near if start in obstacles else obstacles
+    joined = {cell for cell in free if lengths_from(cell, free, grid, rule, {goal})}
+    allowed = {cell for cell in cells if cell in joined or cell not in free | closed}
+    ways = lengths_from(start, allowed, grid, rule, joined)
+    if not ways:
+        leaves = lengths_from(start, {*cells} - closed, grid, rule, free)
+        stuck = start in obstacles and not leaves
+        assert plan.status is (PlanStatus.START_OCCUPIED if stuck else PlanStatus.NO_PATH)
+        return
+    number = next(index for index, cell in enumerate(plan.cells) if cell in free)
+    way, rest = plan.cells[: number + 1], plan.cells[number:]
+    assert (way[0], rest[-1]) == (start, goal)
+    assert not closed & {*plan.cells}
+    for cell, after in pairwise(way):
+        assert after in dict(moves(cell, allowed, grid, rule))
+    shortest = min(ways.values())
+    assert path_length(way, rule) == pytest.approx(shortest)
+    tied = [end for end, length in ways.items() if length < shortest + 1e-6]
+    assert math.dist(way[-1], goal) == pytest.approx(min(math.dist(end, goal) for end in tied))
+    assert rest == ANY_MAP.plan(grid, way[-1], goal, rule).cells
+    assert is_path_valid(plan.cells, start, grid, rule, clearing_radius)
+    if start in obstacles:
+        assert not is_path_valid(plan.cells, start, grid, rule)
+        several = ANY_MAP.plan_nearest(grid, start, [goal], rule, "greedy", False, clearing_radius)
+        assert several.cells == plan.cells
+
+
+def wall(thickness: int) -> GridMap:
+    """A wall across a hall of 21 x 5 cells, from x = 8 on."""
+    occupancy = np.zeros((5, 21), dtype=bool)
+    occupancy[:, 8 : 8 + thickness] = True
+    return GridMap(occupancy)
+
+
+def test_a_start_deeper_in_a_wall_than_the_radius_stays_occupied() -> None:
+    grid = wall(5)
+    for radius, status in ((0, "START_OCCUPIED"), (1.9, "START_OCCUPIED"), (2, "SUCCEEDED")):
+        plan = ANY_MAP.plan(grid, (10, 2), (0, 2), start_clearing_radius=radius)
+        assert plan.status.name == status
+    # The wall's far side is no way to a goal on this one, however near it is.
+    plan = ANY_MAP.plan(grid, (11, 2), (0, 2), start_clearing_radius=2)
+    assert plan.status is PlanStatus.NO_PATH
+    with pytest.raises(ValueError, match="start_clearing_radius is nan"):
+        ANY_MAP.plan(grid, (10, 2), (0, 2), start_clearing_radius=math.nan)
+
+
+def test_only_the_first_start_of_a_path_through_goals_is_cleared() -> None:
+    occupancy = np.zeros((7, 9), dtype=bool)
+    occupancy[2:5, 1:4] = occupancy[3, 6] = True
+    grid = GridMap(occupancy)
+    plan = ANY_MAP.plan_through(grid, (2, 3), [(5, 3), (8, 3)], start_clearing_radius=1)
+    assert (plan.cells[0], plan.cells[-1]) == ((2, 3), (8, 3))
+    assert [cell for cell in plan.cells if grid.is_obstacle(cell)] == [(2, 3), (3, 3)]
+    plan = ANY_MAP.plan_through(grid, (2, 3), [(6, 3), (8, 3)], start_clearing_radius=1)
+    assert (plan.status, plan.goal) == (PlanStatus.GOAL_OCCUPIED, (6, 3))
+
+
+def test_a_path_that_leaves_is_valid_until_another_obstacle_lies_on_it() -> None:
+    occupancy = np.zeros((5, 12), dtype=bool)
+    occupancy[2, 2:5] = True
+    grid = GridMap(occupancy)
+    path = [(x, 2) for x in range(2, 12)]
+    assert is_path_valid(path, (4, 2), grid, "robot_safe", 1)
+    assert is_path_valid(path, (2, 2), grid, "robot_safe", 2)
+    assert not is_path_valid(path, (2, 2), grid, "robot_safe", 1)  # its third cell is beyond
+    assert not is_path_valid(path[:3], (2, 2), grid, "robot_safe", 2)  # it leads nowhere
+    assert not is_path_valid(path, (2, 2), grid.with_patch([[True]], 8, 2), "robot_safe", 2)
+    only_west = np.full(occupancy.shape, 0b10000011, dtype=np.uint8)
+    only_west[:, 5:] = 0
+    one_way = GridMap(occupancy, forbidden=only_west)
+    assert not is_path_valid(path, (4, 2), one_way, "robot_safe", 1)
+    assert is_path_valid([(2, 2), (1, 2)], (2, 2), one_way, "robot_safe", 1)
+    for robot in ((1, 2), (-9, 2)):  # a robot beside the obstacle has to go round it
+        assert not is_path_valid(path, robot, grid, "robot_safe", 2)
+
+
+@pytest.mark.parametrize(
+    ("blocked", "extra_cost", "begin"),
+    [
+        (slice(2, 3), 0.0, [(2, 0), (3, 0), (4, 0)]),  # the robot's cell alone: straight on
+        (slice(2, 4), None, [(2, 0), (2, 1), (3, 1)]),  # its path goes on through an obstacle
+    ],
+)
+def test_a_path_under_way_is_kept_if_the_way_out_lies_on_it(
+    blocked: slice, extra_cost: float | None, begin: list[Cell]
+) -> None:
+    occupancy = np.zeros((5, 12), dtype=bool)
+    under_way = ANY_MAP.plan(GridMap(occupancy), (0, 0), (11, 0)).path
+    occupancy[0, blocked] = True
+    request = PlanRequest(
+        GridMap(occupancy),
+        (2, 0),
+        (11, 0),
+        MoveRule.ROBOT_SAFE,
+        under_way=under_way,
+        start_clearing_radius=0.5,
+    )
+    plan = last_step(ANY_MAP.steps(request))
+    assert plan.extra_cost == extra_cost
+    assert [*plan.cells[:3]] == begin
+
+
+@pytest.mark.parametrize("method", list(PlanMethod))
+def test_a_simplified_path_keeps_the_cells_of_the_way_out(method: PlanMethod) -> None:
+    plan = ANY_MAP.plan(
+        wall(2), (9, 2), (20, 2), method=method, simplified=True, start_clearing_radius=1
+    )
+    assert plan.cells == ((9, 2), (10, 2), (20, 2))
