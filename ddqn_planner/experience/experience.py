@@ -211,10 +211,12 @@ class Experience:
         """Return the evidence spread over the cells of a map, computed only where it changed."""
         period = self.half_life / FADING_STEPS
         driven = math.floor(self.evidence.driven / period) * period
-        if self._spread is None or not self._spread.fits(grid, driven):
-            self._spread = _Spread(grid, driven, self.half_life)
-        self._spread.update(grid, driven, self.forecasts.noise, self.evidence, self.robot_width)
-        return self._spread
+        spread, self._spread = self._spread, None  # an exception must not leave a part of it
+        if spread is None or not spread.fits(grid, driven):
+            spread = _Spread(grid, driven, self.half_life)
+        spread.update(grid, driven, self.forecasts.noise, self.evidence, self.robot_width)
+        self._spread = spread
+        return spread
 
     def save(self, path: str | Path) -> None:
         """Save to a file, atomically; an OSError leaves an old file unchanged."""
