@@ -10,9 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ddqn_planner.grid import Cell, GridMap, MoveRule
+from ddqn_planner.grid.arguments import cell_inside
 from ddqn_planner.model.move_costs import MoveCosts
 from ddqn_planner.planning.plan import Plan, PlanStatus
-from ddqn_planner.planning.q_field import Goals, QField, check_inside
+from ddqn_planner.planning.q_field import Goals, QField
 
 
 class Known(NamedTuple):
@@ -109,10 +110,11 @@ class DistanceField(QField):
 
     def rollout_if_known(self, start: Cell) -> Plan | None:
         """Return the rollout from a start if no more of the field is needed, else None."""
+        start = cell_inside(start, self.grid.occupancy.shape, "the start")
         if not self.lock.acquire(blocking=False):
             return None  # another thread computes it
         try:
-            return self.rollout(start) if self._is_final(self._number(start)) else None
+            return self._rollout(start) if self._is_final(self._number(start)) else None
         finally:
             self.lock.release()
 
@@ -131,7 +133,9 @@ class DistanceField(QField):
         ValueError
             If the start is no cell of the map.
         """
-        start = check_inside(start, (self.grid.height, self.grid.width))
+        return self._rollout(cell_inside(start, self.grid.occupancy.shape, "the start"), limit)
+
+    def _rollout(self, start: Cell, limit: int | None = None) -> Plan:
         with self.lock:
             if not self.reach(start, limit):
                 status = PlanStatus.NO_PATH if self.is_whole else PlanStatus.ROLLOUT_TRAPPED
