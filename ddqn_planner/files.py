@@ -12,7 +12,15 @@ import secrets
 from collections.abc import Iterable, Sequence
 from contextlib import suppress
 from pathlib import Path
-from typing import BinaryIO
+from typing import Any, BinaryIO
+
+
+def as_path(path: Any, name: str = "path") -> Path:
+    """Return a path; ValueError for what is none."""
+    try:
+        return Path(path)
+    except TypeError:
+        raise ValueError(f"{name} is {path!r}; give a str or a Path") from None
 
 
 def write_atomically(path: Path, content: bytes) -> None:

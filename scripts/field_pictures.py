@@ -47,7 +47,7 @@ def draw_visited_cells() -> None:
     plan = planner.plan(grid, start, goal, RULE)
     field = planner.q_field(grid, goal, RULE)
     assert isinstance(field, DistanceField)
-    closed = field.arrays[1].reshape(grid.height + 2, -1)[1:-1, 1:-1] == field.wavefront.CLOSED
+    closed = field.known.state.reshape(grid.height + 2, -1)[1:-1, 1:-1] == field.wavefront.CLOSED
     ends = start[::-1], goal[::-1]
     _, _, history = nano_astar.astar(occupancy.astype(np.uint8), *ends, return_history=True)
     by_a_star = np.zeros_like(closed)

@@ -9,6 +9,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ddqn_planner.grid.arguments import numbers
+
 Float64 = NDArray[np.float64]
 
 CORRECTION = 0.25
@@ -69,10 +71,10 @@ def visits_of(
     Raises
     ------
     ValueError
-        If the shapes are wrong.
+        If the shapes or types are wrong.
     """
-    time = np.asarray(seconds, dtype=np.float64)
-    position = np.asarray(positions, dtype=np.float64)
+    time = numbers("seconds", seconds).astype(np.float64)
+    position = numbers("positions", positions).astype(np.float64)
     if time.ndim != 1 or position.shape != (len(time), 2):
         raise ValueError(
             f"seconds have shape {time.shape} and positions {position.shape}; give (N,) and (N, 2)"

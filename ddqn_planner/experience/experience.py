@@ -11,10 +11,13 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ddqn_planner.experience.drives import Visits, visits_of
+from ddqn_planner.experience.drives import FARTHEST, Visits, visits_of
 from ddqn_planner.experience.evidence import Evidence, cells_of
 from ddqn_planner.experience.forecasts import Forecasts
-from ddqn_planner.grid import Cell, GridMap
+from ddqn_planner.files import as_path
+from ddqn_planner.grid import GridMap
+from ddqn_planner.grid.arguments import MAX_SLOWNESS, Cells, cells_inside, numbers, real
+from ddqn_planner.grid.grid_map import check_grid
 
 Float32 = NDArray[np.float32]
 
@@ -32,9 +35,6 @@ PRIOR_SUCCESSES = 2.0
 
 OUTLIER = 2.5
 """A visit is moved to so many standard deviations from what was expected, if it lies beyond."""
-
-LARGEST = 100.0
-"""No place counts as slower than this."""
 
 SHORTEST = 8
 """A drive through fewer places says little about how sure expected times are."""
@@ -93,8 +93,8 @@ class Experience:
             "max_pause": max_pause,
         }
         for name, value in given.items():
-            if not 0 < value < math.inf:
-                raise ValueError(f"{name} is {value}; give more than 0, and finite")
+            if not 0 < real(value) < math.inf:
+                raise ValueError(f"{name} is {value!r}; give more than 0, and finite")
         self.nominal_speed = float(nominal_speed)
         self.robot_width = float(robot_width)
         self.half_life = float(half_life)
@@ -116,13 +116,13 @@ class Experience:
         Raises
         ------
         ValueError
-            If the shapes are wrong. Wrong values are left out, see `visits_of`.
+            If the shapes or types are wrong. Wrong values are left out, see `visits_of`.
         """
         side, speed = self.evidence.side, self.nominal_speed
         visits = visits_of(seconds, positions, side, 3 * speed, self.max_pause)
         if not len(visits.seconds):
             return
-        log = np.log(np.clip(visits.seconds * speed / visits.metres, 1 / 3, LARGEST))
+        log = np.log(np.clip(visits.seconds * speed / visits.metres, 1 / 3, MAX_SLOWNESS))
         weight, sum_of_log = self.evidence.at(visits.position)
         noise = self.forecasts.noise
         variance = 1 / (weight / noise + 1 / PRIOR)
@@ -154,10 +154,10 @@ class Experience:
 
     def record_failure(self, position: Sequence[float]) -> None:
         """Learn that the robot failed at a place: it got stuck, was sent back, or gave up."""
-        x, y = (float(value) for value in position)
-        if not (math.isfinite(x) and math.isfinite(y)):
-            raise ValueError(f"the position is {(x, y)}; give finite metres")
-        self.evidence.add_failure(x, y)
+        point = numbers("the position", position, (2,))
+        if not (np.abs(point) < FARTHEST).all():
+            raise ValueError(f"the position is {position!r}; give metres, at most {FARTHEST:g}")
+        self.evidence.add_failure(float(point[0]), float(point[1]))
 
     def forget(self) -> None:
         """Forget all."""
@@ -172,7 +172,8 @@ class Experience:
         its time is that of one try over the probability of success.
         """
         spread = self._spread_over(grid)
-        return grid.with_slowness(spread.slowness, grid.resolution / self.nominal_speed)
+        seconds_per_cell = grid.resolution / self.nominal_speed
+        return grid._changed(slowness=spread.slowness, seconds_per_cell=seconds_per_cell)
 
     def slowness(self, grid: GridMap) -> Float32:
         """Return (H, W) float32: expected seconds over those at nominal speed, 1 or more."""
@@ -186,16 +187,24 @@ class Experience:
         deviation: Float32 = np.sqrt(variance).astype(np.float32)
         return deviation
 
-    def expected_time(self, grid: GridMap, cells: Sequence[Cell]) -> ExpectedTime:
+    def expected_time(self, grid: GridMap, cells: Cells) -> ExpectedTime:
         """Return the time that a path of neighbouring cells takes, with an interval of 90 %.
 
         The interval is that of the posterior, with the noise of a drive, and as wide as drives so
         far have shown.
+
+        Raises
+        ------
+        ValueError
+            If the cells are no path in the map.
         """
         spread = self._spread_over(grid)
-        if len(cells) < 2:
+        path = cells_inside(cells, grid.occupancy.shape)
+        if len(path) < 2:
             return ExpectedTime(0.0, 0.0, 0.0)
-        x, y = np.asarray(cells, dtype=np.int64).T
+        if (np.abs(np.diff(path, axis=0)).max(axis=1) != 1).any():
+            raise ValueError("the cells are no path; give neighbouring cells, as Plan.every_cell")
+        x, y = path.T
         metres = np.hypot(np.diff(x), np.diff(y)) * grid.resolution
         slowness = spread.slowness[y, x].astype(np.float64)
         variance = spread.variance(x, y)
@@ -209,18 +218,21 @@ class Experience:
 
     def _spread_over(self, grid: GridMap) -> _Spread:
         """Return the evidence spread over the cells of a map, computed only where it changed."""
+        check_grid(grid)
         period = self.half_life / FADING_STEPS
         driven = math.floor(self.evidence.driven / period) * period
-        if self._spread is None or not self._spread.fits(grid, driven):
-            self._spread = _Spread(grid, driven, self.half_life)
-        self._spread.update(grid, driven, self.forecasts.noise, self.evidence, self.robot_width)
-        return self._spread
+        spread, self._spread = self._spread, None  # an exception must not leave a part of it
+        if spread is None or not spread.fits(grid, driven):
+            spread = _Spread(grid, driven, self.half_life)
+        spread.update(grid, driven, self.forecasts.noise, self.evidence, self.robot_width)
+        self._spread = spread
+        return spread
 
     def save(self, path: str | Path) -> None:
         """Save to a file, atomically; an OSError leaves an old file unchanged."""
         from ddqn_planner.experience.experience_file import save
 
-        save(self, Path(path))
+        save(self, as_path(path))
 
     @classmethod
     def load(cls, path: str | Path) -> Experience:
@@ -233,7 +245,7 @@ class Experience:
         """
         from ddqn_planner.experience.experience_file import load
 
-        return load(Path(path))
+        return load(as_path(path))
 
 
 @dataclass(eq=False)
@@ -308,5 +320,5 @@ class _Spread:
         if not (len(changed) or self.touched.any()):
             return
         self.slowness = self.slowness.copy()  # maps have the old one
-        settings = self.noise, PRIOR, PRIOR_SUCCESSES, LARGEST, STEP
+        settings = self.noise, PRIOR, PRIOR_SUCCESSES, MAX_SLOWNESS, STEP
         refresh(self.sums, self.touched, self.faded(driven), settings, self.slowness)

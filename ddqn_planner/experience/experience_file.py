@@ -5,9 +5,12 @@ from __future__ import annotations
 import io
 import zipfile
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
+from ddqn_planner.experience.drives import FARTHEST
 from ddqn_planner.experience.evidence import COLUMNS
 from ddqn_planner.experience.experience import Experience
 from ddqn_planner.files import remove_temporaries, write_atomically
@@ -65,14 +68,24 @@ def load(path: Path) -> Experience:
             )
             if not right or array.dtype.kind not in "if" or not np.isfinite(array).all():
                 raise ValueError(f"{name} has shape {array.shape} of {array.dtype}, or no numbers")
-        evidence = values["evidence"]
-        if len(values["places"]) != len(evidence) or (evidence[:, [0, 2]] < 0).any():
-            raise ValueError("its places and its evidence do not fit")
+        _check_values(values)
     except Exception as error:  # broken bytes make zipfile and NumPy raise many kinds of errors
         raise ExperienceFileError(
             f"{path}: cannot be read ({error}); give a file that `Experience.save` wrote, or "
             "delete it to begin anew"
         ) from error
-    experience.evidence.restore(values["places"], evidence, float(values["driven"]))
+    experience.evidence.restore(values["places"], values["evidence"], float(values["driven"]))
     experience.forecasts.restore(values["noise"].tolist(), values["errors"].tolist())
     return experience
+
+
+def _check_values(values: dict[str, NDArray[Any]]) -> None:
+    places, evidence, driven = values["places"], values["evidence"], float(values["driven"])
+    unique = len(np.unique(places, axis=0))
+    if places.dtype.kind != "i" or not unique == len(places) == len(evidence):
+        raise ValueError("its places and its evidence do not fit")
+    amount, position, time = evidence[:, [0, 2]], evidence[:, 3:5], evidence[:, 5]
+    if (amount < 0).any() or (np.abs(position) > FARTHEST).any() or (time > driven).any():
+        raise ValueError("its evidence cannot be true")
+    if values["noise"][0] < 0 or values["noise"][1] <= 0:
+        raise ValueError("its noise cannot be true")

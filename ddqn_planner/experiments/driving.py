@@ -28,6 +28,7 @@ from ddqn_planner.experiments.driving_worlds import (
     with_faults,
 )
 from ddqn_planner.grid import Cell, GridMap, MoveRule, inflate, load_map
+from ddqn_planner.grid.arguments import MAX_SLOWNESS
 from ddqn_planner.planning import Planner
 
 Float64 = NDArray[np.float64]
@@ -111,7 +112,8 @@ class CellTimes:
 
     def apply(self) -> GridMap:
         """Return a map whose moves cost what was seen."""
-        slowness = np.maximum(self.sum / np.maximum(self.count, 1), 1).astype(np.float32)
+        mean = self.sum / np.maximum(self.count, 1)
+        slowness = np.clip(mean, 1, MAX_SLOWNESS).astype(np.float32)
         return self.grid.with_slowness(slowness, self.grid.resolution / SPEED)
 
 

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from enum import Enum
+from numbers import Real
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -23,6 +25,10 @@ OCCUPIED = 100
 
 UNKNOWN = -1
 """The value of an unknown cell in ``nav_msgs/OccupancyGrid``."""
+
+MAX_SLOWNESS = 100.0
+"""No place may be slower. The time and memory of a field grow with the costliest move: with this,
+and costs, it keeps some 1,400 lists of cells at once."""
 
 
 class Choice(str, Enum):
@@ -49,17 +55,71 @@ def as_cell(cell: Any, name: str = "the cell") -> Cell:
     raise ValueError(f"{name} is {cell!r}; give two whole numbers (x, y)")
 
 
+def cell_inside(cell: Any, shape: tuple[int, ...], name: str = "the cell") -> Cell:
+    """Return a cell of a map of shape (H, W), as `as_cell`; ValueError if it lies outside."""
+    x, y = as_cell(cell, name)
+    height, width = shape
+    if not (0 <= x < width and 0 <= y < height):
+        raise ValueError(f"{name} {(x, y)} lies outside the map of {width} x {height} cells")
+    return x, y
+
+
+def cells_inside(cells: Any, shape: tuple[int, ...]) -> NDArray[np.int64]:
+    """Return cells of a map of shape (H, W): (N, 2) int64; ValueError as by `cell_inside`."""
+    is_checked = False
+    if isinstance(cells, np.ndarray) and cells.dtype.kind == "i" and cells.shape[1:] == (2,):
+        is_checked = bool(((cells >= 0) & (cells < shape[::-1])).all())
+    if not is_checked:
+        cells = [cell_inside(cell, shape) for cell in listed(cells, "the cells")]
+    return np.array(cells, dtype=np.int64).reshape(-1, 2)
+
+
+def listed(values: Any, name: str) -> list[Any]:
+    """Return the elements of what has some; ValueError for anything else."""
+    try:
+        return list(values)
+    except TypeError:
+        raise ValueError(f"{name} is {values!r}; give a list") from None
+
+
+def real(value: Any) -> float:
+    """Return a number of any type as a float; NaN, which no range contains, for anything else."""
+    if type(value) is float:  # a look at the kind of number takes longer
+        return value
+    try:
+        return float(value) if isinstance(value, Real) else math.nan
+    except OverflowError:
+        return math.copysign(math.inf, value > 0 or -1)
+
+
+def as_flag(name: str, value: Any) -> bool:
+    """Return a truth value of any type; ValueError for anything else, as "no"."""
+    if isinstance(value, (bool, np.bool_, int)) and value in (0, 1):
+        return bool(value)
+    raise ValueError(f"{name} is {value!r}; give True or False")
+
+
+def numbers(
+    name: str, values: ArrayLike, shape: tuple[int, ...] | None = None, kinds: str = "iuf"
+) -> NDArray[Any]:
+    """Return an array of numbers; ValueError if it has another shape or other elements."""
+    try:
+        array = np.asarray(values)
+    except ValueError as error:  # rows of different lengths
+        raise ValueError(f"{name}: no array ({error}); give rows of one length") from None
+    if shape is not None and array.shape != shape:
+        raise ValueError(f"{name} has shape {array.shape}; give {shape}")
+    if array.dtype.kind not in kinds:
+        raise ValueError(f"{name}: the elements are of type {array.dtype}; give numbers")
+    return array
+
+
 def whole_numbers(name: str, values: ArrayLike, lowest: int, highest: int) -> NDArray[Any]:
     """Return an array of whole numbers from `lowest` to `highest`; its dtype stays as it is.
 
     The message of the ValueError for anything else uses `name` and shows the first wrong value.
     """
-    try:
-        array = np.asarray(values)
-    except ValueError as error:  # rows of different lengths
-        raise ValueError(f"{name} are no array ({error}); give rows of one length") from None
-    if array.dtype.kind not in "iuf":
-        raise ValueError(f"{name} are of type {array.dtype}; give {lowest}..{highest}")
+    array = numbers(name, values)
     whole = array.dtype.kind != "f" or (array == np.floor(array)).all()  # False for NaN
     if whole and (array.size == 0 or lowest <= array.min() <= array.max() <= highest):
         return array
@@ -68,19 +128,22 @@ def whole_numbers(name: str, values: ArrayLike, lowest: int, highest: int) -> ND
     raise ValueError(f"{name} hold {wrong}; give whole numbers {lowest}..{highest}")
 
 
-def as_occupancy(cells: ArrayLike) -> Occupancy:
-    """Return a copy in C order, (H, W) bool; ValueError for another shape."""
-    occupancy = np.array(cells, dtype=np.bool_, order="C")
-    if occupancy.ndim != 2 or occupancy.size == 0:
-        raise ValueError(f"occupancy has shape {occupancy.shape}; give (H, W) with H, W >= 1")
-    return occupancy
+def as_mask(name: str, cells: ArrayLike, shape: tuple[int, ...] | None = None) -> Occupancy:
+    """Return a copy in C order, (H, W) bool; ValueError for another shape or other values."""
+    array = numbers(name, cells, shape, "biuf")
+    if array.ndim != 2 or array.size == 0:
+        raise ValueError(f"{name} has shape {array.shape}; give (H, W) with H, W >= 1")
+    mask = array.astype(np.bool_, order="C")
+    if array.dtype.kind != "b" and (wrong := array[array != mask]).size:
+        raise ValueError(
+            f"{name} holds {wrong[0]}; give True or False (for percent, see from_occupancy_values)"
+        )
+    return mask
 
 
 def as_costs(cost: ArrayLike, occupancy: Occupancy) -> NDArray[np.int8]:
     """Return a copy with 0 in occupied cells; ValueError for another shape or other values."""
-    if np.shape(cost) != occupancy.shape:
-        raise ValueError(f"cost has shape {np.shape(cost)}; give {occupancy.shape}")
-    of_free = np.array(cost, order="C")
+    of_free = np.array(numbers("cost", cost, occupancy.shape), order="C")
     if of_free.dtype.kind in "iu":
         of_free *= ~occupancy  # fifty times as fast as the assignment below
     else:  # NaN times 0 is NaN
@@ -91,18 +154,36 @@ def as_costs(cost: ArrayLike, occupancy: Occupancy) -> NDArray[np.int8]:
 
 def as_directions(forbidden: ArrayLike, shape: tuple[int, int]) -> NDArray[np.uint8] | None:
     """Return a copy, or None where nothing is forbidden; ValueError as for the costs."""
-    if np.shape(forbidden) != shape:
-        raise ValueError(f"forbidden has shape {np.shape(forbidden)}; give {shape}")
-    array = whole_numbers("forbidden directions", forbidden, 0, 255)
+    array = whole_numbers("forbidden directions", numbers("forbidden", forbidden, shape), 0, 255)
     return array.astype(np.uint8, order="C") if array.any() else None
 
 
 def as_slowness(slowness: ArrayLike, shape: tuple[int, int]) -> NDArray[np.float32]:
     """Return a copy; ValueError as for the costs."""
-    array = np.array(slowness, dtype=np.float32, order="C")
-    if array.shape != shape or not 1 <= array.min() <= array.max() < np.inf:
-        raise ValueError(
-            f"slowness has shape {array.shape}, or values below 1 or not finite; give {shape}, 1 "
-            "or more"
-        )
-    return array
+    array = numbers("slowness", slowness, shape)
+    if not 1 <= array.min() <= array.max() <= MAX_SLOWNESS:
+        wrong = array[~((array >= 1) & (array <= MAX_SLOWNESS))][0]
+        raise ValueError(f"slowness holds {wrong}; give 1 to {MAX_SLOWNESS:g}")
+    return array.astype(np.float32, order="C")
+
+
+def as_resolution(resolution: Any) -> float:
+    """Return metres per cell; ValueError unless finite and > 0."""
+    if not 0 < real(resolution) < math.inf:
+        raise ValueError(f"resolution is {resolution!r}; give metres per cell, finite and > 0")
+    return real(resolution)
+
+
+def as_seconds(seconds_per_cell: Any) -> float:
+    """Return seconds; ValueError unless finite and > 0."""
+    if not 0 < real(seconds_per_cell) < math.inf:
+        raise ValueError(f"seconds_per_cell is {seconds_per_cell!r}; give more than 0")
+    return real(seconds_per_cell)
+
+
+def as_origin(origin: Any) -> tuple[float, ...]:
+    """Return x, y and yaw; ValueError unless these are three finite numbers."""
+    pose = tuple(map(real, listed(origin, "origin")))
+    if len(pose) != 3 or not all(map(math.isfinite, pose)):
+        raise ValueError(f"origin is {origin!r}; give three finite numbers x, y, yaw")
+    return pose

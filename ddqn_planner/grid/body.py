@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from ddqn_planner.grid.arguments import OCCUPIED, UNKNOWN, Occupancy
-from ddqn_planner.grid.grid_map import GridMap
+from ddqn_planner.grid.arguments import OCCUPIED, UNKNOWN, Occupancy, real
+from ddqn_planner.grid.grid_map import GridMap, check_grid
 
 CLEARANCE_SCALE = 1.0
 """Metres beyond the body over which the cost near an obstacle falls to an eighth.
@@ -53,12 +53,14 @@ def inflate(grid: GridMap, robot_radius: float, clearance_weight: float = 0.0) -
     Raises
     ------
     ValueError
-        If the radius or the weight is out of its range.
+        If the radius or the weight is out of its range, or the map is none.
     """
-    if not 0 <= robot_radius < np.inf:
-        raise ValueError(f"robot_radius is {robot_radius}; give metres, finite and 0 or more")
-    if not 0 <= clearance_weight <= 1:
-        raise ValueError(f"clearance_weight is {clearance_weight}; give 0 to 1")
+    check_grid(grid)
+    if not 0 <= real(robot_radius) < np.inf:
+        raise ValueError(f"robot_radius is {robot_radius!r}; give metres, finite and 0 or more")
+    if not 0 <= real(clearance_weight) <= 1:
+        raise ValueError(f"clearance_weight is {clearance_weight!r}; give 0 to 1")
+    robot_radius, clearance_weight = real(robot_radius), real(clearance_weight)
     if robot_radius == 0 and clearance_weight == 0:
         return grid
     metres = clearance(grid.occupancy) * grid.resolution

@@ -18,8 +18,15 @@ from ddqn_planner.grid.arguments import (
     as_cell,
     as_costs,
     as_directions,
-    as_occupancy,
+    as_flag,
+    as_mask,
+    as_origin,
+    as_resolution,
+    as_seconds,
     as_slowness,
+    cell_inside,
+    cells_inside,
+    real,
     whole_numbers,
 )
 from ddqn_planner.grid.arguments import Cell as Cell
@@ -68,7 +75,7 @@ class GridMap:
         with dx = -1) lets a robot drive through it toward greater x, and not back. Directions
         belong to the place: they stay where a cell becomes occupied or free.
     slowness : (H, W) float32, optional
-        The expected time in each cell over that at nominal speed, 1 or more. It multiplies the
+        The expected time in each cell over that at nominal speed, 1 to 100. It multiplies the
         cost; see `with_slowness`.
     seconds_per_cell : float, optional
         The time for the length of a cell at nominal speed: with it, `Plan.cost` is in seconds.
@@ -89,33 +96,23 @@ class GridMap:
     seconds_per_cell: float | None = None
 
     def __post_init__(self) -> None:
-        occupancy = as_occupancy(self.occupancy)
-        if not (math.isfinite(self.resolution) and self.resolution > 0):
-            raise ValueError(
-                f"resolution is {self.resolution}; give metres per cell, finite and > 0"
-            )
-        origin = tuple(float(value) for value in self.origin)
-        if len(origin) != 3 or not all(map(math.isfinite, origin)):
-            raise ValueError(f"origin is {self.origin}; give three finite numbers x, y, yaw")
+        occupancy = as_mask("occupancy", self.occupancy)
         self._set("occupancy", occupancy)
-        self._set("resolution", float(self.resolution))
-        self._set("origin", origin)
+        self._set("resolution", as_resolution(self.resolution))
+        self._set("origin", as_origin(self.origin))
         if self.cost is not None:
             self._set("cost", as_costs(self.cost, occupancy))
         if self.obstacles is not None:
-            obstacles = np.array(self.obstacles, dtype=np.bool_, order="C")
-            if obstacles.shape != occupancy.shape or (obstacles & ~occupancy).any():
-                raise ValueError(
-                    f"obstacles have shape {obstacles.shape}, or lie on free cells; give "
-                    f"{occupancy.shape}, within the occupied cells"
-                )
+            obstacles = as_mask("obstacles", self.obstacles, occupancy.shape)
+            if (obstacles & ~occupancy).any():
+                raise ValueError("obstacles lie on free cells; give some within the occupied cells")
             self._set("obstacles", obstacles)
         if self.forbidden is not None:
             self._set("forbidden", as_directions(self.forbidden, occupancy.shape))
         if self.slowness is not None:
             self._set("slowness", as_slowness(self.slowness, occupancy.shape))
-        if self.seconds_per_cell is not None and not 0 < self.seconds_per_cell < math.inf:
-            raise ValueError(f"seconds_per_cell is {self.seconds_per_cell}; give more than 0")
+        if self.seconds_per_cell is not None:
+            self._set("seconds_per_cell", as_seconds(self.seconds_per_cell))
 
     def _set(self, name: str, value: Any) -> None:
         if isinstance(value, np.ndarray):
@@ -154,16 +151,17 @@ class GridMap:
         ValueError
             If the values, the threshold or the arguments of `GridMap` are wrong.
         """
-        if not 1 <= occupied_threshold <= OCCUPIED:
-            raise ValueError(f"occupied_threshold is {occupied_threshold}; give 1 to {OCCUPIED}")
+        if not 1 <= real(occupied_threshold) <= OCCUPIED:
+            raise ValueError(f"occupied_threshold is {occupied_threshold!r}; give 1 to {OCCUPIED}")
         array = whole_numbers("occupancy values", values, -128, 127)
         if array.dtype.kind == "f":  # these may be probabilities, 1.0 for occupied
             raise ValueError(f"occupancy values are of type {array.dtype}; give integers, percent")
         array = array.astype(np.int8, copy=False)
         occupied = array >= occupied_threshold
-        if not allow_unknown:
+        if not as_flag("allow_unknown", allow_unknown):
             occupied |= array < 0
-        cost = np.maximum(array, UNKNOWN) if use_map_costs else None
+        with_costs = as_flag("use_map_costs", use_map_costs)
+        cost = np.maximum(array, UNKNOWN) if with_costs else None
         return cls(occupied, resolution, origin, cost, forbidden=forbidden)  # type: ignore[arg-type]
 
     def with_patch(
@@ -195,9 +193,9 @@ class GridMap:
         Raises
         ------
         ValueError
-            If the patch is empty or not inside the map, or its costs are wrong.
+            If the patch is empty or not inside the map, or its costs or obstacles are wrong.
         """
-        patch = as_occupancy(occupancy)
+        patch = as_mask("occupancy", occupancy)
         left, bottom = as_cell((x, y), "the first cell of the patch")
         height, width = patch.shape
         if not (0 <= left <= self.width - width and 0 <= bottom <= self.height - height):
@@ -210,34 +208,41 @@ class GridMap:
         if costs is not None or cost is not None:
             costs = np.zeros(self.occupancy.shape, dtype=np.int8) if costs is None else costs
             costs = _replaced(costs, box, as_costs(costs[box] if cost is None else cost, patch))
-        closed = patch if obstacles is None else patch & np.asarray(obstacles, dtype=np.bool_)
-        patched = object.__new__(GridMap)  # the cells outside the patch need no check
-        patched._set("occupancy", _replaced(self.occupancy, box, patch))
-        patched._set("resolution", self.resolution)
-        patched._set("origin", self.origin)
-        patched._set("cost", costs)
-        patched._set("obstacles", _replaced(self.obstacles, box, closed))
-        patched._set("forbidden", self.forbidden)
-        patched._set("slowness", self.slowness)
-        patched._set("seconds_per_cell", self.seconds_per_cell)
-        return patched
+        closed = patch
+        if obstacles is not None:
+            closed = patch & as_mask("obstacles", obstacles, patch.shape)
+        return self._changed(
+            occupancy=_replaced(self.occupancy, box, patch),
+            cost=costs,
+            obstacles=_replaced(self.obstacles, box, closed),
+        )
 
     def with_slowness(self, slowness: NDArray[np.float32], seconds_per_cell: float) -> GridMap:
         """Return the same map with other expected times; it shares all other arrays with this one.
 
         Parameters
         ----------
-        slowness : (H, W) float32
-            Not copied and not checked, see `GridMap`. It becomes read-only.
-        seconds_per_cell : float
+        slowness, seconds_per_cell
+            As for `GridMap`.
+
+        Raises
+        ------
+        ValueError
+            If a shape or a number is wrong.
         """
-        timed = object.__new__(GridMap)
-        for name, value in self.__dict__.items():
-            if name not in ("cost_multiplier", "fingerprint"):  # which depend on the slowness
-                object.__setattr__(timed, name, value)
-        timed._set("slowness", slowness)
-        timed._set("seconds_per_cell", float(seconds_per_cell))
-        return timed
+        checked = as_slowness(slowness, self.occupancy.shape)
+        return self._changed(slowness=checked, seconds_per_cell=as_seconds(seconds_per_cell))
+
+    def _changed(self, **layers: Any) -> GridMap:
+        """Return the same map with other layers, which need no check: planners need it often."""
+        stale = {"cost_multiplier", "fingerprint"}
+        if "occupancy" in layers:
+            stale |= {"_labels", "_checksum"}
+        changed = object.__new__(GridMap)
+        for name, value in {**self.__dict__, **layers}.items():
+            if name not in stale:
+                changed._set(name, value)
+        return changed
 
     @property
     def height(self) -> int:
@@ -294,8 +299,13 @@ class GridMap:
         move_rule : MoveRule
         backward : bool
             Whether paths end, instead of start, in one of the cells.
+
+        Raises
+        ------
+        ValueError
+            If a cell lies outside the map.
         """
-        array = np.asarray(cells, dtype=np.int64).reshape(-1, 2)
+        array, backward = cells_inside(cells, self.occupancy.shape), as_flag("backward", backward)
         if self.forbidden is None:
             labels = self.labels(move_rule)
             return np.isin(labels, labels[array[:, 1], array[:, 0]])
@@ -327,6 +337,7 @@ class GridMap:
 
     def same_cells(self, other: GridMap) -> bool:
         """Return whether all cells of two maps are equal, wherever the maps lie."""
+        check_grid(other, "other")
         return self is other or (
             _equal(self.slowness, other.slowness)
             and self._checksum == other._checksum
@@ -346,8 +357,8 @@ class GridMap:
         return self.contains((x, y)) and not self.occupancy[y, x]
 
     def is_obstacle(self, cell: Cell) -> bool:
-        """Return whether a cell of the map is an obstacle, and not just too near to one."""
-        x, y = as_cell(cell)
+        """Return whether a cell is an obstacle, not just too near to one; ValueError if outside."""
+        x, y = cell_inside(cell, self.occupancy.shape)
         obstacles = self.occupancy if self.obstacles is None else self.obstacles
         return bool(obstacles[y, x])
 
@@ -363,20 +374,32 @@ class GridMap:
         map: see `contains`.
         """
         origin_x, origin_y, yaw = self.origin
-        dx, dy = x - origin_x, y - origin_y
-        along_x = math.cos(yaw) * dx + math.sin(yaw) * dy
-        along_y = -math.sin(yaw) * dx + math.cos(yaw) * dy
-        return math.floor(along_x / self.resolution), math.floor(along_y / self.resolution)
+        dx, dy = real(x) - origin_x, real(y) - origin_y
+        column = (math.cos(yaw) * dx + math.sin(yaw) * dy) / self.resolution
+        row = (-math.sin(yaw) * dx + math.cos(yaw) * dy) / self.resolution
+        if not (math.isfinite(column) and math.isfinite(row)):
+            raise ValueError(f"the point is {(x, y)}; give finite metres x, y")
+        return math.floor(column), math.floor(row)
 
     def cell_to_world(self, cell: Cell) -> tuple[float, float]:
         """Return the centre of a cell in the map frame, in metres."""
-        origin_x, origin_y, yaw = self.origin
-        along_x = (cell[0] + 0.5) * self.resolution
-        along_y = (cell[1] + 0.5) * self.resolution
-        return (
-            origin_x + math.cos(yaw) * along_x - math.sin(yaw) * along_y,
-            origin_y + math.sin(yaw) * along_x + math.cos(yaw) * along_y,
-        )
+        return centre(self, *as_cell(cell))
+
+
+def check_grid(grid: object, name: str = "grid") -> None:
+    """Raise a ValueError for anything else than a map."""
+    if not isinstance(grid, GridMap):
+        raise ValueError(f"{name} is {grid!r}; give a GridMap")
+
+
+def centre(grid: GridMap, x: Any, y: Any) -> tuple[Any, Any]:
+    """Return the centre of a cell, or of each of many (arrays), in the map frame, in metres."""
+    origin_x, origin_y, yaw = grid.origin
+    along_x, along_y = (x + 0.5) * grid.resolution, (y + 0.5) * grid.resolution
+    return (
+        origin_x + math.cos(yaw) * along_x - math.sin(yaw) * along_y,
+        origin_y + math.sin(yaw) * along_x + math.cos(yaw) * along_y,
+    )
 
 
 def _replaced(array: NDArray[Any] | None, box: tuple[slice, slice], values: NDArray[Any]) -> Any:

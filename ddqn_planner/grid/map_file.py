@@ -6,6 +6,7 @@ import os
 import re
 import reprlib
 from collections.abc import Callable, Iterable
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -14,7 +15,7 @@ import numpy as np
 import yaml
 from numpy.typing import NDArray
 
-from ddqn_planner.files import write_atomically
+from ddqn_planner.files import as_path, write_atomically
 from ddqn_planner.grid.arguments import OCCUPIED, UNKNOWN, Cell, as_cell, whole_numbers
 from ddqn_planner.grid.grid_map import GridMap
 from ddqn_planner.grid.map_image import (
@@ -157,10 +158,9 @@ def read_map_file(path: str | Path) -> MapFile:
     MapDataError
         If the cells of the map cannot be read.
     """
-    try:
+    path = as_path(path)
+    with suppress(ValueError):  # "~" with a user name that is impossible
         path = Path(os.path.expanduser(path))
-    except ValueError:  # "~" with a user name that is impossible
-        path = Path(path)
     if not os.path.isfile(path):
         raise MapNotFoundError(
             f"{str(path)!r}: no such file; give the path of a .yaml or .map file"

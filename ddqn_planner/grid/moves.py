@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ddqn_planner.grid.arguments import Cell, Cells, Choice, Occupancy, as_cell
+from ddqn_planner.grid.arguments import Cell, Cells, Choice, Occupancy, cell_inside
 from ddqn_planner.grid.labels import label_cells
 
 MOVES: NDArray[np.int64] = np.array(
@@ -110,7 +110,7 @@ def connected_cells(
     occupancy: Occupancy, cell: Cell, move_rule: MoveRule | str
 ) -> NDArray[np.bool_]:
     """Return (H, W) bool: True at the free cell `cell` and where a path leads to it."""
-    x, y = as_cell(cell)
+    x, y = cell_inside(cell, occupancy.shape)
     labels = component_labels(occupancy, move_rule)
     connected: NDArray[np.bool_] = labels == labels[y, x]
     return connected

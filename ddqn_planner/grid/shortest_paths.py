@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ddqn_planner.grid.arguments import Cell, as_cell
+from ddqn_planner.grid.arguments import Cell, cell_inside
 from ddqn_planner.grid.grid_map import GridMap
 from ddqn_planner.grid.moves import MOVES, MoveRule
 
@@ -24,7 +24,8 @@ def shortest_distances(grid: GridMap, goal: Cell, move_rule: MoveRule | str) -> 
 
 def shortest_path(grid: GridMap, start: Cell, goal: Cell, move_rule: MoveRule | str) -> list[Cell]:
     """Return the cells of one cheapest path, from start to goal; empty if there is none."""
-    start, goal = as_cell(start, "the start"), as_cell(goal, "the goal")
+    start = cell_inside(start, grid.occupancy.shape, "the start")
+    goal = cell_inside(goal, grid.occupancy.shape, "the goal")
     _, previous = _dijkstra(grid, goal, move_rule)
     cells, number = [start], start[1] * grid.width + start[0]
     while previous[number] >= 0:
@@ -40,9 +41,7 @@ def _dijkstra(grid: GridMap, goal: Cell, move_rule: MoveRule | str) -> Any:
     """
     from scipy.sparse.csgraph import dijkstra
 
-    x, y = as_cell(goal, "the goal")
-    if not grid.contains((x, y)):
-        raise ValueError(f"the goal {goal} lies outside the map of {grid.width} x {grid.height}")
+    x, y = cell_inside(goal, grid.occupancy.shape, "the goal")
     graph = _graph(grid, move_rule)
     if grid.forbidden is not None:  # else every move is legal, and costs the same, both ways
         graph = graph.T

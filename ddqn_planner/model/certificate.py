@@ -69,6 +69,9 @@ class Certificate:
         Least proved distance of a right decision's logit from 0; 0 if none is right.
     multiplier_error : float
         Bound on the relative error of the learned cost multipliers, over all legal moves.
+    tries : float
+        The most tries that a legal move is expected to take: 1/p, by which its cost grows on a map
+        without costs, or of expected times. It is 1 if the network is certain of all legal moves.
     """
 
     decisions: int
@@ -76,6 +79,7 @@ class Certificate:
     wrong: int
     margin: float
     multiplier_error: float
+    tries: float = 1.0
 
     @property
     def proved(self) -> bool:
@@ -83,16 +87,21 @@ class Certificate:
         return self.undecided == self.wrong == 0 and math.isfinite(self.multiplier_error)
 
     @property
+    def cost_error(self) -> float:
+        """Bound on the relative error of the learned costs of legal moves."""
+        return (1 + self.multiplier_error) * self.tries - 1
+
+    @property
     def path_error(self) -> float:
         """Bound on the cost of a planned path over the optimum, minus 1; infinite if not proved.
 
-        If the learned cost of every move lies within a factor 1 - e to 1 + e of the true one, so
-        does that of every path. Then the path of the least learned cost costs at most
-        (1 + e) / (1 - e) of the optimum.
+        If the learned cost of every move lies within a factor 1 - e to (1 + e) t of the true one,
+        with t for the tries, so does that of every path. Then the path of the least learned cost
+        costs at most (1 + e) t / (1 - e) of the optimum.
         """
         if not self.proved or self.multiplier_error >= 1:
             return math.inf
-        return 2 * self.multiplier_error / (1 - self.multiplier_error)
+        return (1 + self.cost_error) / (1 - self.multiplier_error) - 1
 
     def __str__(self) -> str:
         if not self.proved:
@@ -103,7 +112,7 @@ class Certificate:
         text = f"proved: all {self.decisions:,} decisions, margin {self.margin:.1f}"
         if math.isfinite(self.path_error):
             text += (
-                f"; costs within {_percent(self.multiplier_error)}, "
+                f"; costs within {_percent(self.cost_error)}, "
                 f"so paths within {_percent(self.path_error)} of the optimum"
             )
         return text
@@ -126,12 +135,12 @@ def certify(
     move_rules : sequence of MoveRule
         The rules under which it must be right; by default one of each class.
     """
-    patch_P9 = every_patch()
-    patch_P9 = patch_P9[patch_P9[:, CENTRE] != OCCUPIED]
+    every_P9 = every_patch()
+    patch_P9 = every_P9[every_P9[:, CENTRE] != OCCUPIED]
     decisions = len(move_rules) * len(patch_P9) * len(MOVES)
     if network.sizes["filters"] > MAX_FILTERS:
         return Certificate(decisions, decisions, 0, 0.0, math.inf)
-    undecided, wrong, least, error = 0, 0, math.inf, 0.0
+    undecided, wrong, least, error, tries = 0, 0, math.inf, 0.0, 1.0
     with np.errstate(over="ignore", invalid="ignore"):  # a broken model may overflow
         for rule in move_rules:
             feature_PI, legal_PA = (
@@ -149,7 +158,11 @@ def certify(
             wrong += found
             undecided += len(action) - found
             error = max(error, _multiplier_error(network, feature_PI, legal_PA))
-    return Certificate(decisions, undecided, wrong, least if least < math.inf else 0.0, error)
+            # Of all patches at once, as the planner does it: the same floats.
+            tries_PA = network.tries(network.features(every_P9, rule))
+            tries = max(tries, float(tries_PA[legal_in_patches(every_P9, rule)].max()))
+    least = least if least < math.inf else 0.0
+    return Certificate(decisions, undecided, wrong, least, error, tries)
 
 
 @lru_cache(maxsize=1)

@@ -13,7 +13,7 @@ import numpy as np
 import safetensors.numpy
 from safetensors import SafetensorError, safe_open
 
-from ddqn_planner.files import write_atomically
+from ddqn_planner.files import as_path, write_atomically
 from ddqn_planner.grid import MoveRule
 from ddqn_planner.model.networks import (
     AnyMapQNetwork,
@@ -103,7 +103,7 @@ def find_model(name: str | Path) -> Path:
     ModelFileError
         If there is neither such a file nor such a shipped model.
     """
-    if Path(name).suffix == MODEL_SUFFIX or Path(name).name != str(name):
+    if as_path(name, "the model").suffix == MODEL_SUFFIX or Path(name).name != str(name):
         if os.path.isfile(name):
             return Path(name)
         raise ModelFileError(f"there is no model file {str(name)!r}; check the path")

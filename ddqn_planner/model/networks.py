@@ -222,6 +222,13 @@ class PropagationQNetwork(QNetwork):
         p_BA: Array = 0.5 + 0.5 * np.tanh(0.5 * self._layer("moves", hidden_BF))
         return p_BA
 
+    def tries(self, feature_BI: Array) -> Array:
+        """Return 1/p, or 1 from `CERTAIN` on; infinite if p is at most 1/2, or NaN: (B, 8)."""
+        p_BA = self.success(feature_BI)
+        p_BA = np.where(p_BA >= CERTAIN, np.float32(1), p_BA)
+        tries_BA: Array = np.where(p_BA > 0.5, 1 / np.maximum(p_BA, 0.5), np.float32(np.inf))
+        return tries_BA
+
     def multiplier(self, feature_BI: Array) -> Array:
         """Return the cost multiplier of each move, here 1: (B, 8), given features (B, I)."""
         return np.ones((len(feature_BI), len(MOVES)), dtype=np.float32)
@@ -295,12 +302,10 @@ class PropagationQNetwork(QNetwork):
             batch = slice(begin, begin + BATCH)
             feature_BI = self.features(patch_P9[batch], move_rule)
             multiplier_BA = np.minimum(self.multiplier(feature_BI), MAX_MULTIPLIER)
+            cost_BA = move_rule.lengths * self.tries(feature_BI)
+            cost_BA *= 1 if timed else multiplier_BA
             # Comparisons with NaN are false, and NumPy's minimum and maximum keep it.
-            p_BA = self.success(feature_BI)
-            possible_BA = (p_BA > 0.5) & (multiplier_BA >= 1)
-            tries_BA = 1 / np.where((p_BA > 0.5) & (p_BA < CERTAIN), p_BA, np.float32(1))
-            cost_BA = move_rule.lengths * tries_BA * (1 if timed else multiplier_BA)
-            cost_PA[batch] = np.where(possible_BA, cost_BA, np.inf)
+            cost_PA[batch] = np.where(multiplier_BA >= 1, cost_BA, np.inf)
         return cost_PA
 
 

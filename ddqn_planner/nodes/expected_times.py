@@ -46,9 +46,7 @@ class ExpectedTimes:
         if self._spread_on is None or not _is_like(grid, self._spread_on):
             self._spread_on = grid
         timed = self._experience.apply(self._spread_on)
-        assert timed.slowness is not None
-        assert timed.seconds_per_cell is not None
-        return grid.with_slowness(timed.slowness, timed.seconds_per_cell)
+        return grid._changed(slowness=timed.slowness, seconds_per_cell=timed.seconds_per_cell)
 
     def expected_time(self, grid: GridMap, plan: Plan) -> ExpectedTime | None:
         """Return how long a plan takes; None if its map has no expected times, or is an old one."""
@@ -57,7 +55,7 @@ class ExpectedTimes:
             return None
         if not _is_like(grid, map_of_now):
             return None
-        return self._experience.expected_time(map_of_now, np.asarray(plan.every_cell).tolist())
+        return self._experience.expected_time(map_of_now, plan.every_cell)
 
 
 def _is_like(grid: GridMap, other: GridMap) -> bool:

@@ -4,18 +4,35 @@ from __future__ import annotations
 
 import threading
 from functools import cached_property
-from typing import TypeAlias
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ddqn_planner.grid import Cell, GridMap, MoveRule
+from ddqn_planner.grid.arguments import cell_inside
 from ddqn_planner.model.move_costs import MoveCosts
 from ddqn_planner.planning.plan import Plan, PlanStatus
-from ddqn_planner.planning.q_field import Goals, QField, check_inside
+from ddqn_planner.planning.q_field import Goals, QField
 
-FieldArrays: TypeAlias = tuple[NDArray[np.float64], NDArray[np.uint8], NDArray[np.int32]]
-"""The distances, (C,); the states of the cells, (C,); the open cells, (N,). See `wavefront`."""
+
+class Known(NamedTuple):
+    """What is known of a field, see `wavefront`.
+
+    Parameters
+    ----------
+    distance, state : (C,) float64, (C,) uint8
+    opened : (N,) int32
+        The open cells.
+    closed_is_final : bool
+        Whether the distances of closed cells are the least ones. After a repair they may be too
+        great, until the field grows to the cell.
+    """
+
+    distance: NDArray[np.float64]
+    state: NDArray[np.uint8]
+    opened: NDArray[np.int32]
+    closed_is_final: bool = True
 
 
 class DistanceField(QField):
@@ -43,27 +60,32 @@ class DistanceField(QField):
         self.grid, self.costs, self.move_rule = grid, costs, move_rule
         self.goal, self.goals = goals[0], goals
         self.lock = threading.RLock()
-        self.is_whole = False
-        # After a repair the distance of a closed cell may be too great, until `reach` is called.
-        self.closed_is_final = True
 
     @cached_property
-    def arrays(self) -> FieldArrays:
+    def known(self) -> Known:
         """What is known, at first the goals alone."""
         cells = self.costs.patch.size
         roots = np.array([self._number(goal) for goal in self.goals], np.int32)
-        return self.wavefront.begun(np.zeros(cells), np.zeros(cells, np.uint8), roots)
+        return Known(*self.wavefront.begun(np.zeros(cells), np.zeros(cells, np.uint8), roots))
 
     def _number(self, cell: Cell) -> int:
         return (cell[1] + 1) * self.costs.width + cell[0] + 1
 
-    def forget(self) -> FieldArrays:
-        """Return what is known, and begin anew."""
+    def take(self) -> Known:
+        """Return what is known, and begin anew.
+
+        What changes it takes it, and gives it back when it is done. So after any exception on the
+        way, as a lack of memory, the field begins anew.
+        """
         with self.lock:
-            arrays = self.arrays
-            del self.arrays
-            self.is_whole, self.closed_is_final = False, True
-            return arrays
+            known = self.known
+            del self.known
+            return known
+
+    @property
+    def is_whole(self) -> bool:
+        """Whether the distances of all cells are known."""
+        return not self.known.opened.size
 
     @property
     def has_values_of_all(self) -> bool:
@@ -72,24 +94,27 @@ class DistanceField(QField):
 
     def reach(self, start: Cell, limit: int | None = None) -> bool:
         """Compute the field as far as a start needs it; return whether its distance is known."""
-        distance, state, opened = self.arrays
-        number, closed, done = self._number(start), self.wavefront.CLOSED, True
-        if not self.is_whole and not (self.closed_is_final and state[number] == closed):
+        number, done = self._number(start), True
+        if not self._is_final(number):
+            distance, state, opened, closed_is_final = self.take()
             limit = distance.size if limit is None else limit
             opened, done = self.wavefront.grow(distance, state, opened, self.costs, number, limit)
-            self.arrays = distance, state, opened
-            self.is_whole = not opened.size
-            self.closed_is_final |= self.is_whole
-        return bool((done or self.is_whole) and state[number] == closed)
+            self.known = Known(distance, state, opened, closed_is_final)
+        closed = self.known.state[number] == self.wavefront.CLOSED
+        return bool((done or self.is_whole) and closed)
+
+    def _is_final(self, number: int) -> bool:
+        """Return whether no more of the field is needed to know the distance of a cell."""
+        closed = self.known.state[number] == self.wavefront.CLOSED
+        return self.is_whole or bool(self.known.closed_is_final and closed)
 
     def rollout_if_known(self, start: Cell) -> Plan | None:
         """Return the rollout from a start if no more of the field is needed, else None."""
+        start = cell_inside(start, self.grid.occupancy.shape, "the start")
         if not self.lock.acquire(blocking=False):
             return None  # another thread computes it
         try:
-            closed = self.arrays[1][self._number(start)] == self.wavefront.CLOSED
-            known = self.is_whole or (self.closed_is_final and closed)
-            return self.rollout(start) if known else None
+            return self._rollout(start) if self._is_final(self._number(start)) else None
         finally:
             self.lock.release()
 
@@ -108,22 +133,23 @@ class DistanceField(QField):
         ValueError
             If the start is no cell of the map.
         """
-        start = check_inside(start, (self.grid.height, self.grid.width))
+        return self._rollout(cell_inside(start, self.grid.occupancy.shape, "the start"), limit)
+
+    def _rollout(self, start: Cell, limit: int | None = None) -> Plan:
         with self.lock:
             if not self.reach(start, limit):
                 status = PlanStatus.NO_PATH if self.is_whole else PlanStatus.ROLLOUT_TRAPPED
                 return Plan(status, move_rule=self.move_rule)
-            path = self.field_values.roll_out(self.arrays[0], self.costs, self._number(start))
+            path = self.field_values.roll_out(self.known.distance, self.costs, self._number(start))
         return Plan(PlanStatus.SUCCEEDED, path, move_rule=self.move_rule)
 
     def _whole(self) -> NDArray[np.float64]:
         """Return the distance of every cell of the padded map, 0 where there is none: (C,)."""
         if not self.is_whole:
-            distance, state, opened = self.arrays
+            distance, state, opened, _ = self.take()
             self.wavefront.grow_whole(distance, state, opened, self.costs)
-            self.arrays = distance, state, opened[:0]
-            self.is_whole = self.closed_is_final = True
-        return self.arrays[0]
+            self.known = Known(distance, state, opened[:0])
+        return self.known.distance
 
     @cached_property
     def q(self) -> NDArray[np.float32]:  # type: ignore[override]

@@ -4,17 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from enum import Enum
 from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ddqn_planner.grid import Cell, GridMap, MoveRule, path_length
-from ddqn_planner.grid.arguments import Cells, Choice
+from ddqn_planner.grid.arguments import Cells, Choice, whole_numbers
 
 
-class PlanStatus(str, Enum):
+class PlanStatus(Choice):
     """The outcome of a request, each with the sentence that a user reads."""
 
     SUCCEEDED = "succeeded"
@@ -127,9 +126,17 @@ class Plan:
     rollout_ms: float = 0.0
 
     def __post_init__(self) -> None:
-        path = np.asarray(self.path, np.int32).reshape(-1, 2)  # sequences of cells do as well
+        path = self.path
+        if not isinstance(path, np.ndarray) or path.dtype != np.int32:  # cells do as well
+            path = whole_numbers("the path", path, -(2**31), 2**31 - 1).astype(np.int32)
+        if path.size and path.shape[1:] != (2,):
+            raise ValueError(f"the path has shape {path.shape}; give (N, 2)")
+        path = path.reshape(-1, 2)
         path.flags.writeable = False
         object.__setattr__(self, "path", path)
+        for name, kind in (("status", PlanStatus), ("method", PlanMethod), ("move_rule", MoveRule)):
+            if type(value := getattr(self, name)) is not kind:
+                object.__setattr__(self, name, kind(value))
 
     def __eq__(self, other: object) -> bool:
         return isinstance(other, Plan) and self._identity() == other._identity()

@@ -11,7 +11,8 @@ from pathlib import Path
 import numpy as np
 
 from ddqn_planner.grid import Cell, GridMap, MoveRule, path_cost
-from ddqn_planner.grid.arguments import as_cell
+from ddqn_planner.grid.arguments import as_cell, as_flag, listed, real
+from ddqn_planner.grid.grid_map import check_grid
 from ddqn_planner.model import ModelMetadata, QNetwork, load_model
 from ddqn_planner.planning.distance_field import DistanceField
 from ddqn_planner.planning.field_cache import FieldCache
@@ -43,6 +44,10 @@ class Planner:
     """
 
     def __init__(self, network: QNetwork, metadata: ModelMetadata) -> None:
+        if not (hasattr(network, "q_values") and hasattr(metadata, "move_rule")):
+            raise ValueError(
+                f"network is {network!r}, metadata is {metadata!r}; give what load_model returns"
+            )
         self.network = network
         self.metadata = metadata
         self._fields = FieldCache(network)
@@ -77,6 +82,7 @@ class Planner:
         ValueError
             If the goal is not a free cell of the map, or the model cannot plan on this size.
         """
+        check_grid(grid)
         goal, rule = as_cell(goal, "the goal"), self._rule(move_rule)
         if not grid.is_free(goal):
             raise ValueError(f"the goal {goal} is not a free cell of the map; give another")
@@ -128,10 +134,13 @@ class Planner:
             If the tolerance or the radius is negative or NaN, the start or the goal is no pair of
             whole numbers, or there is no such move rule or method.
         """
+        check_grid(grid)
         start, goal = as_cell(start, "the start"), as_cell(goal, "the goal")
         rule, method = self._rule(move_rule), PlanMethod(method)
+        tolerance, given = real(tolerance), tolerance
         if not tolerance >= 0:
-            raise ValueError(f"the tolerance is {tolerance}; give 0 or more")
+            raise ValueError(f"the tolerance is {given!r}; give 0 or more")
+        simplified = as_flag("simplified", simplified)
         request = PlanRequest(grid, start, goal, rule, method, tolerance, simplified)
         return last_step(self.steps(_clearing(request, start_clearing_radius)))
 
@@ -164,9 +173,10 @@ class Planner:
         ValueError
             As for `plan`, or if there is no goal.
         """
+        check_grid(grid)
         first, *others = _cells_of_goals(goals)
         rule, method = self._rule(move_rule), PlanMethod(method)
-        start = as_cell(start, "the start")
+        start, simplified = as_cell(start, "the start"), as_flag("simplified", simplified)
         request = PlanRequest(grid, start, first, rule, method, 0.0, simplified, others=(*others,))
         return last_step(self.steps(_clearing(request, start_clearing_radius)))
 
@@ -285,7 +295,7 @@ class Planner:
                     cost *= grid.seconds_per_cell or 1.0
             every_cell = path
             if request.simplified:
-                path = np.array(simplify(path.tolist(), grid, rule), dtype=np.int32)
+                path = np.array(simplify(path, grid, rule), dtype=np.int32)
         yield replace(
             plan,
             path=path,
@@ -359,6 +369,7 @@ class _Stopwatch:
 
 
 def _cells_of_goals(goals: Sequence[Cell]) -> list[Cell]:
+    goals = listed(goals, "goals")
     cells = [as_cell(goal, f"goal {number}") for number, goal in enumerate(goals, 1)]
     if not cells:
         raise ValueError("there is no goal; give at least one cell")

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ddqn_planner.grid import MOVES, Cell, MoveRule
-from ddqn_planner.grid.arguments import as_cell
+from ddqn_planner.grid.arguments import cell_inside, numbers
 from ddqn_planner.planning.plan import Plan, PlanStatus
 
 Goals: TypeAlias = tuple[Cell, ...]
@@ -43,8 +43,12 @@ class QField:
         legal: NDArray[np.bool_],
         move_rule: MoveRule = MoveRule.ROBOT_SAFE,
     ) -> None:
-        self.goal, self.q, self.legal, self.move_rule = goal, q, legal, move_rule
-        self.goals: Goals = (goal,)
+        self.q = numbers("q", q)
+        if self.q.ndim != 3 or len(self.q) != len(MOVES) or not self.q.size:
+            raise ValueError(f"q has shape {self.q.shape}; give (8, H, W)")
+        self.legal, self.move_rule = numbers("legal", legal, self.q.shape, "b"), MoveRule(move_rule)
+        self.goal = cell_inside(goal, self.q.shape[1:], "the goal")
+        self.goals: Goals = (self.goal,)
 
     @cached_property
     def value(self) -> NDArray[np.float32]:
@@ -92,7 +96,7 @@ class QField:
             If the start is no cell of the map.
         """
         policy = self.policy
-        cell = check_inside(start, policy.shape)
+        cell = cell_inside(start, policy.shape, "the start")
         cells, visited = [cell], {cell}
         while cell != self.goal:
             action = int(policy[cell[1], cell[0]])
@@ -102,12 +106,3 @@ class QField:
             visited.add(cell)
             cells.append(cell)
         return Plan(PlanStatus.SUCCEEDED, np.array(cells), move_rule=self.move_rule)
-
-
-def check_inside(start: Cell, shape: tuple[int, ...]) -> Cell:
-    """Return a start as a cell; ValueError if it is no cell of a map of shape (H, W)."""
-    cell = as_cell(start, "the start")
-    height, width = shape
-    if not (0 <= cell[0] < width and 0 <= cell[1] < height):
-        raise ValueError(f"the start {cell} lies outside the map of {width} x {height} cells")
-    return cell

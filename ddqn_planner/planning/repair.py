@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ddqn_planner.grid import Cell, GridMap
-from ddqn_planner.planning.distance_field import DistanceField, FieldArrays
+from ddqn_planner.planning.distance_field import DistanceField, Known
 
 REPAIRED = 100
 """Cells that a repair may take back before a new field is begun."""
@@ -90,19 +90,18 @@ def hand_over(
     most = max(REPAIRED, int(REPAIRED_SHARE * new.grid.occupancy.size))
     limit = most if start is None or old.has_values_of_all else REPAIRED
     with old.lock:
-        arrays = old.arrays
+        known = taken = old.take()
         if shift != (0, 0) or old.grid.occupancy.shape != new.grid.occupancy.shape:
-            arrays = _moved(arrays, old.grid, new.grid, shift)
-        distance, state, opened = arrays
+            known = _moved(taken, old.grid, new.grid, shift)
         while True:
-            reopened, kept = take_back(distance, state, new.costs, changed, limit)
+            reopened, kept = take_back(known.distance, known.state, new.costs, changed, limit)
             if kept:
-                old.forget()
-                new.arrays = distance, state, np.concatenate([opened, reopened])
-                new.closed_is_final = False
+                opened = np.concatenate([known.opened, reopened])
+                new.known = known._replace(opened=opened, closed_is_final=False)
                 return True
             limit *= 4
             if start is None or limit > most or new.reach(start, VISITS * limit) or new.is_whole:
+                old.known = taken
                 return False
 
 
@@ -148,8 +147,8 @@ def changed_cells(old: GridMap, new: GridMap, shift: Cell) -> NDArray[np.int32] 
     return numbers[(numbers > width) & (numbers < size - width - 1)].astype(np.int32)
 
 
-def _moved(arrays: FieldArrays, old: GridMap, new: GridMap, shift: Cell) -> FieldArrays:
-    """Return the arrays of a field with each cell where it is in the new map."""
+def _moved(known: Known, old: GridMap, new: GridMap, shift: Cell) -> Known:
+    """Return what is known of a field with each cell where it is in the new map."""
     left, bottom, right, top = _overlap(old, new, shift)
 
     def moved(array: NDArray[Any]) -> NDArray[Any]:
@@ -160,8 +159,8 @@ def _moved(arrays: FieldArrays, old: GridMap, new: GridMap, shift: Cell) -> Fiel
         ]
         return target.ravel()
 
-    y, x = np.divmod(arrays[2], old.width + 2)
+    y, x = np.divmod(known.opened, old.width + 2)
     y, x = y + shift[1], x + shift[0]
     inside = (left < x) & (x <= right) & (bottom < y) & (y <= top)
     opened = (y * (new.width + 2) + x)[inside].astype(np.int32)
-    return moved(arrays[0]), moved(arrays[1]), opened
+    return Known(moved(known.distance), moved(known.state), opened)

@@ -2,20 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import numpy as np
 from numpy.typing import NDArray
 
 from ddqn_planner.grid import MOVES, Cell, GridMap, MoveRule, path_cost
-from ddqn_planner.grid.arguments import as_cell
+from ddqn_planner.grid.arguments import Cells, cells_inside
+from ddqn_planner.grid.grid_map import check_grid
 from ddqn_planner.grid.moves import segment_lengths
 
 ROUNDING = 1e-9
 """Relative error of a sum of costs: a segment may cost this much more than what it replaces."""
 
 
-def simplify(cells: Sequence[Cell], grid: GridMap, move_rule: MoveRule | str) -> tuple[Cell, ...]:
+def simplify(cells: Cells, grid: GridMap, move_rule: MoveRule | str) -> tuple[Cell, ...]:
     """Return some of a path's cells, the first and the last included, joined by legal segments.
 
     A segment is legal if all cells that it passes through are free; under `MoveRule.ROBOT_SAFE`
@@ -34,10 +33,11 @@ def simplify(cells: Sequence[Cell], grid: GridMap, move_rule: MoveRule | str) ->
     Raises
     ------
     ValueError
-        If a cell is no pair of whole numbers, or there is no such move rule.
+        If a cell is no cell of the map, or there is no such move rule.
     """
+    check_grid(grid)
     rule, multiplier = MoveRule(move_rule), grid.cost_multiplier
-    path = [as_cell(cell) for cell in cells]
+    path = [(x, y) for x, y in cells_inside(cells, grid.occupancy.shape).tolist()]
 
     def joins(first: int, last: int) -> bool:
         if last - first == 1:  # a move of the path itself

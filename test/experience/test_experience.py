@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import math
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -8,6 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ddqn_planner import Experience, GridMap, Planner
+from ddqn_planner.experience import spreading
 from ddqn_planner.grid import MoveRule, shortest_distances
 
 SPEED = 0.5
@@ -129,10 +131,28 @@ def test_a_map_that_changes_gives_what_a_new_one_gives() -> None:
     experience.record(*straight((2, 5.5), (12, 6), 2))
     occupancy = HALL.occupancy.copy()
     occupancy[21, 10:30] = True
-    walls = GridMap(occupancy, 0.25)
-    again = driven(straight((2, 5), (12, 5), 3), straight((2, 5.5), (12, 6), 2))
-    np.testing.assert_allclose(experience.slowness(HALL), again.slowness(HALL), rtol=0.021)
-    np.testing.assert_allclose(experience.slowness(walls), again.slowness(walls), rtol=0.021)
+    again = (straight((2, 5), (12, 5), 3), straight((2, 5.5), (12, 6), 2))
+    for grid in (
+        HALL,
+        GridMap(occupancy, 0.25),
+        GridMap(occupancy, 0.25, (2.5, 0.0, 0.0)),
+        GridMap(occupancy, 0.5, (2.5, 0.0, 0.0)),
+    ):
+        expected = driven(*again).slowness(grid)
+        np.testing.assert_allclose(experience.slowness(grid), expected, rtol=0.021)
+
+
+def test_without_memory_for_a_map_nothing_is_lost(monkeypatch: pytest.MonkeyPatch) -> None:
+    drives = straight((2, 5), (12, 5), 3), straight((2, 5.5), (12, 6), 2)
+    for name in ("spread", "refresh"):
+        experience = driven(drives[0])
+        experience.apply(HALL)
+        experience.record(*drives[1])
+        with monkeypatch.context() as patch:
+            patch.setattr(spreading, name, Mock(side_effect=MemoryError))
+            with pytest.raises(MemoryError):
+                experience.apply(HALL)
+        np.testing.assert_array_equal(experience.slowness(HALL), driven(*drives).slowness(HALL))
 
 
 def test_evidence_fades_with_driven_time() -> None:

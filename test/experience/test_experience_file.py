@@ -80,6 +80,12 @@ def test_every_broken_file_is_named(tmp_path: Path) -> None:
         ("evidence", np.full((39, 6), np.nan)),
         ("driven", np.zeros(2)),
         ("noise", np.array(["a", "b"])),
+        ("noise", [1.0, 0.0]),
+        ("noise", [-1.0, 1.0]),
+        ("driven", -1.0),
+        ("places", np.zeros((39, 2), dtype=np.int64)),
+        ("places", np.arange(78.0).reshape(39, 2)),
+        ("evidence", np.full((39, 6), 1e9)),
     ],
 )
 def test_a_wrong_value_is_refused(tmp_path: Path, name: str, value: object) -> None:

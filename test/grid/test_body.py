@@ -141,5 +141,8 @@ def test_maps_that_come_one_after_another_are_inflated_for_the_body_of_now() -> 
     inflation, random = Inflation(), np.random.default_rng(0)
     grid = GridMap(random.random((30, 30)) < 0.05, 0.5)
     for body in ((0.6, 0.0), (0.6, 0.0), (1.1, 0.5), (1.1, 0.5), (0.0, 0.0), (0.6, 0.0)):
+        assert inflation(grid, *body).same_cells(inflate(grid, *body))
+        coarser = GridMap(grid.occupancy, 2 * grid.resolution)
+        assert inflation(coarser, *body).same_cells(inflate(coarser, *body))
         grid = grid.with_patch(random.random((2, 2)) < 0.5, 4, 5)
         assert inflation(grid, *body).same_cells(inflate(grid, *body))

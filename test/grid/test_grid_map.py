@@ -11,8 +11,9 @@ from hypothesis import assume, given
 from hypothesis import strategies as st
 from strategies import grids_with_costs, occupancies
 
+from ddqn_planner import Planner
 from ddqn_planner.grid import UNKNOWN, GridMap, MoveRule, inflate
-from ddqn_planner.grid.arguments import as_cell
+from ddqn_planner.grid.arguments import MAX_SLOWNESS, as_cell
 from ddqn_planner.grid.moves import component_labels
 
 origins = st.tuples(
@@ -89,6 +90,8 @@ def test_occupancy_values_are_cut_at_the_threshold(
     [
         ((np.zeros((0, 3)),), "shape"),
         ((np.zeros(3),), "shape"),
+        (([[0.2]],), r"occupancy holds 0\.2; give True or False"),
+        (([[math.nan]],), "occupancy holds nan"),
         ((np.zeros((1, 1)), 0.0), "resolution"),
         ((np.zeros((1, 1)), math.nan), "resolution"),
         ((np.zeros((1, 1)), 1.0, (0.0, math.inf, 0.0)), "origin"),
@@ -279,6 +282,8 @@ def test_the_occupied_cells_of_a_patch_are_obstacles() -> None:
         ((np.zeros((1, 1)), 0.5, 0), "first cell of the patch is .*; give two whole numbers"),
         ((np.zeros((1, 1)), 0, 0, [[1, 2]]), r"cost has shape \(1, 2\); give \(1, 1\)"),
         ((np.zeros((1, 1)), 0, 0, [[100]]), "hold 100; give whole numbers -1..99"),
+        ((np.ones((1, 2)), 0, 0, None, [[1]]), r"obstacles has shape \(1, 1\); give \(1, 2\)"),
+        (([[100]], 0, 0), "occupancy holds 100; give True or False"),
     ],
 )
 def test_a_wrong_patch_is_named_and_the_remedy_too(arguments: tuple, named: str) -> None:
@@ -320,7 +325,10 @@ def test_slowness_multiplies_the_costs() -> None:
         ({"slowness": np.full((2, 2), 0.5)}, "slowness"),
         ({"slowness": np.full((2, 2), np.nan)}, "slowness"),
         ({"slowness": np.full((2, 2), np.inf)}, "slowness"),
-        ({"slowness": np.ones((2, 3))}, "slowness"),
+        ({"slowness": np.full((2, 2), 100.1)}, r"slowness holds 100\.1; give 1 to 100"),
+        ({"slowness": np.ones((2, 3))}, r"slowness has shape \(2, 3\); give \(2, 2\)"),
+        ({"slowness": np.ones(4)}, "slowness has shape"),
+        ({"slowness": np.full((2, 2), "a")}, "slowness"),
         ({"seconds_per_cell": 0.0}, "seconds_per_cell"),
         ({"seconds_per_cell": np.nan}, "seconds_per_cell"),
     ],
@@ -328,3 +336,16 @@ def test_slowness_multiplies_the_costs() -> None:
 def test_wrong_times_are_refused(options: dict, message: str) -> None:
     with pytest.raises(ValueError, match=message):
         GridMap(np.zeros((2, 2)), **options)
+    times = {"slowness": np.ones((2, 2)), "seconds_per_cell": 1.0, **options}
+    with pytest.raises(ValueError, match=message):
+        GridMap(np.zeros((2, 2))).with_slowness(**times)
+
+
+def test_the_memory_of_a_field_on_the_slowest_map_is_bounded() -> None:
+    slowness = np.full((300, 300), MAX_SLOWNESS)
+    slowness[::2] = 1
+    grid = GridMap(np.zeros((300, 300)), cost=np.full((300, 300), UNKNOWN), slowness=slowness)
+    # The least memory for the lists of cells of about the same order, in `wavefront`.
+    costs = Planner.load("any_map").network.move_costs(grid, MoveRule.ROBOT_SAFE)
+    assert costs is not None
+    assert 4 * 256 * (2 * costs.highest + 3) < 2e6

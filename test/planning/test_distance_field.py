@@ -1,6 +1,10 @@
 from __future__ import annotations
 
+import sys
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
+from types import FrameType
 from typing import Any
 
 import numpy as np
@@ -12,7 +16,8 @@ from strategies import grids_with_costs, grids_with_free_cell
 from ddqn_planner import GridMap, MoveRule, Planner, PlanStatus
 from ddqn_planner.grid import Cell, shortest_distances
 from ddqn_planner.grid.generators import KINDS, generate_map, random_requests
-from ddqn_planner.planning import repair
+from ddqn_planner.model import wavefront
+from ddqn_planner.planning import distance_field, invalidation, repair
 from ddqn_planner.planning.distance_field import DistanceField
 
 RULES = st.sampled_from(list(MoveRule))
@@ -29,7 +34,7 @@ def fresh_field(grid: GridMap, goal: Cell, rule: MoveRule) -> DistanceField:
 def assert_same(field: Any, fresh: Any) -> None:
     for name in ("value", "policy", "q"):
         np.testing.assert_array_equal(getattr(field, name), getattr(fresh, name))
-    np.testing.assert_array_equal(field.arrays[0], fresh.arrays[0])  # bit for bit
+    np.testing.assert_array_equal(field.known.distance, fresh.known.distance)  # bit for bit
 
 
 @given(GRIDS, RULES, st.data())
@@ -65,7 +70,7 @@ def test_a_request_visits_few_cells_of_a_large_map() -> None:
     grid = GridMap(np.zeros((400, 400)))
     field = fresh_field(grid, (20, 20), MoveRule.ROBOT_SAFE)
     assert field.rollout((30, 25)).cells
-    assert np.count_nonzero(field.arrays[0]) < 500
+    assert np.count_nonzero(field.known.distance) < 500
     assert field.rollout_if_known((30, 25)) == field.rollout((30, 25))
     assert field.rollout_if_known((300, 300)) is None
     assert field.nbytes <= 10 * grid.occupancy.size
@@ -79,7 +84,7 @@ def test_a_request_without_a_path_does_not_visit_the_whole_map() -> None:
     field = planner.known_field(grid, (199, 199))
     assert isinstance(field, DistanceField)
     assert not field.is_whole
-    assert np.count_nonzero(field.arrays[0]) < 0.6 * occupancy.size
+    assert np.count_nonzero(field.known.distance) < 0.6 * occupancy.size
 
 
 # Repair
@@ -171,12 +176,12 @@ def test_a_changed_map_uses_what_is_known_of_the_one_before() -> None:
     changed = grid.with_patch(np.ones((1, 1)), x, y)
     older, field = planner.q_field(grid, goal), fresh_field(changed, goal, MoveRule.ROBOT_SAFE)
     assert isinstance(older, DistanceField)
-    known = np.count_nonzero(older.arrays[0])
+    known = np.count_nonzero(older.known.distance)
     cells = repair.changed_cells(grid, changed, (0, 0))
     assert cells is not None
     assert repair.hand_over(older, field, cells, (0, 0))
-    assert np.count_nonzero(field.arrays[0]) > 0.9 * known
-    assert np.count_nonzero(older.arrays[0]) == 1  # it handed over its memory
+    assert np.count_nonzero(field.known.distance) > 0.9 * known
+    assert np.count_nonzero(older.known.distance) == 1  # it handed over its memory
     assert field.rollout(start) == fresh_field(changed, goal, MoveRule.ROBOT_SAFE).rollout(start)
     assert older.rollout(start).cells == before.cells  # and begins anew
 
@@ -195,6 +200,67 @@ def test_a_repair_that_takes_too_long_leaves_the_older_field_as_it_was() -> None
     assert planner.known_field(grid, goal) is older
     assert older.rollout_if_known((0, 0)) == before
     assert_same(older, fresh_field(grid, goal, MoveRule.ROBOT_SAFE))
+
+
+@settings(max_examples=150)
+@given(GRIDS, RULES, st.booleans(), st.integers(0, 2), st.integers(1, 1500), st.data())
+def test_a_field_that_is_interrupted_anywhere_is_as_a_new_one(
+    grid_and_goal: tuple[GridMap, Cell],
+    rule: MoveRule,
+    whole: bool,
+    interrupted_step: int,
+    line: int,
+    data: st.DataObject,
+) -> None:
+    grid, goal = grid_and_goal
+    planner, start = Planner(NETWORK, METADATA), data.draw(st.sampled_from(grid.free_cells()))
+    x, y = data.draw(st.sampled_from(grid.free_cells()))
+    changed = grid.with_patch([[(x, y) != goal]], x, y)
+    older = planner.q_field(grid, goal, rule)
+    steps = [
+        lambda: older.value if whole else older.rollout(start),
+        lambda: planner.q_field(changed, goal, rule),
+        lambda: planner.plan(changed, start, goal, rule),
+    ]
+    for number, step in enumerate(steps):
+        if number == interrupted_step:
+            run_until(line, step)
+        step()
+    for each in (grid, changed):
+        assert planner.plan(each, start, goal, rule) == Planner(NETWORK, METADATA).plan(
+            each, start, goal, rule
+        )
+    fresh = fresh_field(grid, goal, rule)
+    assert older.rollout(start) == fresh.rollout(start)
+    assert_same(older, fresh)
+    assert_same(planner.q_field(changed, goal, rule), fresh_field(changed, goal, rule))
+
+
+def run_until(line: int, step: Callable[[], object]) -> None:
+    """Run a step, and fail where so many lines of the field's code were run, if it gets there."""
+    kernels = {wavefront: ("_grow", "_grow_whole", "_wider"), invalidation: ("take_back",)}
+    files = {module.__file__ for module in (distance_field, repair, *kernels)}
+    left = line
+
+    def trace(frame: FrameType, event: str, _: object) -> Any:
+        nonlocal left
+        if frame.f_code.co_filename not in files:
+            return None
+        left -= event == "line"
+        if not left:
+            raise MemoryError
+        return trace
+
+    before = sys.gettrace()
+    with pytest.MonkeyPatch.context() as patch, suppress(MemoryError):
+        for module, names in kernels.items():
+            for name in names:
+                patch.setattr(module, name, getattr(module, name).py_func)
+        sys.settrace(trace)
+        try:
+            step()
+        finally:
+            sys.settrace(before)
 
 
 def test_with_too_many_changes_a_field_is_computed_anew(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -220,6 +286,7 @@ def test_the_fields_of_another_map_are_kept(monkeypatch: pytest.MonkeyPatch) -> 
         (0.05, (0.02, 0.0, 0.0), None),
         (0.1, (0.0, 0.0, 0.0), None),
         (0.05, (0.0, 0.0, 0.1), None),
+        (0.05, (0.0, 0.0, 0.005), None),
     ],
 )
 def test_maps_are_compared_where_one_is_the_other_shifted_by_whole_cells(
