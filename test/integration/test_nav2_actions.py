@@ -140,6 +140,7 @@ def test_each_cause_has_its_code(navigator: Navigator) -> None:
     assert client.set_parameters("planner", start_clearing_radius=0.0)[0].successful
     for name, fields in causes:
         assert_code(name, fields)
+    assert client.set_parameters("planner", start_clearing_radius=-1.0)[0].successful
     none = navigator.plan([], start=start, use_start=True).result
     assert none.error_code == nav2.ComputePathThroughPoses.Result.NO_VIAPOINTS_GIVEN
     robot.set_map(robot.stamped_map(walled))
@@ -167,8 +168,12 @@ def test_a_path_is_valid_while_it_is_free(navigator: Navigator) -> None:
     blocked[y, x] = 100
     robot.set_map(robot.stamped_map(blocked))
     assert not is_valid(path)
-    robot.send_start(robot.pose(robot.grid.world_to_cell(*points_of(path)[4])))
+    x, y = robot.grid.world_to_cell(*points_of(path)[4])
+    robot.send_start(robot.pose((x, y)))
     wait_for("what is behind the robot not to count", lambda: is_valid(path))
+    blocked[y, x] = 100
+    robot.set_map(robot.stamped_map(blocked))
+    assert is_valid(path)  # the robot's own cell does not count
     path.header.frame_id = "no_such_frame"
     assert not is_valid(path)
 

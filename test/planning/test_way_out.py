@@ -167,29 +167,32 @@ def test_a_path_that_leaves_is_valid_until_another_obstacle_lies_on_it() -> None
 
 
 @pytest.mark.parametrize(
-    ("blocked", "extra_cost", "begin"),
+    ("blocked", "is_kept", "begin"),
     [
-        (slice(2, 3), 0.0, [(2, 0), (3, 0), (4, 0)]),  # the robot's cell alone: straight on
-        (slice(2, 4), None, [(2, 0), (2, 1), (3, 1)]),  # its path goes on through an obstacle
+        ([(2, 2)], True, [(2, 2), (2, 3), (3, 4), (4, 4)]),  # the robot's cell alone: straight on
+        ([(2, 2), (2, 3)], False, [(2, 2), (3, 2), (4, 3)]),  # round the next cell
     ],
 )
 def test_a_path_under_way_is_kept_if_the_way_out_lies_on_it(
-    blocked: slice, extra_cost: float | None, begin: list[Cell]
+    blocked: list[Cell], is_kept: bool, begin: list[Cell]
 ) -> None:
-    occupancy = np.zeros((5, 12), dtype=bool)
-    under_way = ANY_MAP.plan(GridMap(occupancy), (0, 0), (11, 0)).path
-    occupancy[0, blocked] = True
+    occupancy = np.zeros((6, 12), dtype=bool)
+    for x, y in blocked:
+        occupancy[y, x] = True
+    occupancy[2, 3] = is_kept  # so that there the way out leads north
+    under_way = [(0, 2), (1, 2), (2, 2), (2, 3), *((x, 4) for x in range(3, 12))]
     request = PlanRequest(
         GridMap(occupancy),
-        (2, 0),
-        (11, 0),
+        (2, 2),
+        (11, 4),
         MoveRule.ROBOT_SAFE,
         under_way=under_way,
+        switch_threshold=1.0,
         start_clearing_radius=0.5,
     )
     plan = last_step(ANY_MAP.steps(request))
-    assert plan.extra_cost == extra_cost
-    assert [*plan.cells[:3]] == begin
+    assert plan.cells == (*begin, *under_way[6:])
+    assert (plan.extra_cost is not None) == is_kept
 
 
 @pytest.mark.parametrize("method", list(PlanMethod))
