@@ -33,6 +33,7 @@ EXPERIENCE.record(np.arange(9.0), np.stack([np.arange(9) / 2, np.ones(9)], axis=
 
 CELLS = [(0, 0), (1, 1)]
 ON_MAP = {"move_rule": "unit", "method": "greedy", "simplified": False}
+AT_START = {**ON_MAP, "start_clearing_radius": 0.0}
 OF_MAP = {"resolution": 1.0, "origin": (0.0, 0.0, 0.0), "forbidden": None}
 FLAGS = {"occupied_threshold": 65, "allow_unknown": False, "use_map_costs": False}
 LAYERS = {"cost": None, "obstacles": None}
@@ -62,9 +63,9 @@ CALLS: dict[Callable[..., Any], dict[str, Any]] = {
     EXPERIENCE.expected_time: {"grid": GRID, "cells": CELLS},
     Planner: {"network": PLANNER.network, "metadata": PLANNER.metadata},
     Planner.load: {"model": "any_map"},
-    PLANNER.plan: {"grid": GRID, "start": (0, 0), "goal": (3, 3), "tolerance": 0.0, **ON_MAP},
-    PLANNER.plan_nearest: {"grid": GRID, "start": (0, 0), "goals": CELLS, **ON_MAP},
-    PLANNER.plan_through: {"grid": GRID, "start": (0, 0), "goals": CELLS, **ON_MAP},
+    PLANNER.plan: {"grid": GRID, "start": (0, 0), "goal": (3, 3), "tolerance": 0.0, **AT_START},
+    PLANNER.plan_nearest: {"grid": GRID, "start": (0, 0), "goals": CELLS, **AT_START},
+    PLANNER.plan_through: {"grid": GRID, "start": (0, 0), "goals": CELLS, **AT_START},
     PLANNER.q_field: {"grid": GRID, "goal": (3, 3), "move_rule": "unit"},
     Plan: {"status": PlanStatus.SUCCEEDED, "path": CELLS, "method": "greedy", "move_rule": "unit"},
     QField: {"goal": (0, 0), "q": Q, "legal": LEGAL, "move_rule": "unit"},

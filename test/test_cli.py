@@ -64,6 +64,18 @@ def test_plan_reaches_the_cells_that_the_metres_of_its_tolerance_name(
     assert json.loads(capsys.readouterr().out)["cells"][-1] == [5, 0]
 
 
+def test_plan_leaves_an_occupied_start_within_the_metres_of_its_clearing_radius(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    values = np.zeros((1, 9), dtype=np.int8)
+    values[0, :3] = 100
+    path = tmp_path / "speck.yaml"
+    save_map(MapFile(values, 0.05, start=(0, 0), goal=(8, 0)), path)
+    for metres, code, cells in (("0.05", 1, 0), ("0.1", 0, 9)):
+        assert main(["plan", str(path), "--json", "--start-clearing-radius", metres]) == code
+        assert len(json.loads(capsys.readouterr().out)["cells"]) == cells
+
+
 def test_plan_takes_the_model_for_any_map_and_prints_no_wide_map(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
@@ -145,6 +157,7 @@ def test_plan_heeds_the_robots_body(capsys: pytest.CaptureFixture[str], tmp_path
         (["--clearance-weight", "2"], "clearance_weight is 2.0"),
         (["--tolerance", "nan"], "--tolerance is nan; give metres"),
         (["--tolerance", "-1"], "--tolerance is -1; give metres"),
+        (["--start-clearing-radius", "-1"], "--start-clearing-radius is -1; give metres"),
     ):
         assert main(["plan", path, *bad]) == 2
         assert named in capsys.readouterr().err

@@ -42,6 +42,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         ("robot-radius", "distance that the path keeps from obstacles, metres"),
         ("clearance-weight", "how strongly to avoid cells near obstacles, 0 to 1"),
         ("tolerance", "how far a goal that is occupied or cut off may move, metres"),
+        ("start-clearing-radius", "obstacles so near to an occupied start do not count, metres"),
     ):
         add(f"--{name}", type=float, default=0.0, metavar="X", help=words)
     add("--cells", action="store_true", help="print each cell of the path, as X Y")
@@ -55,8 +56,10 @@ def run(options: argparse.Namespace) -> int:
     """Run the command; return the exit code."""
     if options.animate and options.animate.suffix.lower() != ".gif":
         raise ValueError(f"--animate is {options.animate}; give a file that ends in .gif")
-    if not options.tolerance >= 0:
-        raise ValueError(f"--tolerance is {options.tolerance:g}; give metres, 0 or more")
+    for name in ("tolerance", "start_clearing_radius"):
+        if not getattr(options, name) >= 0:
+            option = name.replace("_", "-")
+            raise ValueError(f"--{option} is {getattr(options, name):g}; give metres, 0 or more")
     map_file, start, goal = read_map(options)
     grid = map_file.grid(options.occupied_threshold, options.allow_unknown, options.use_map_costs)
     grid = inflate(grid, options.robot_radius, options.clearance_weight)
@@ -65,8 +68,17 @@ def run(options: argparse.Namespace) -> int:
     shape = tuple(planner.metadata.sizes.get(side, 3) for side in ("height", "width"))
     planner.plan(GridMap(np.zeros(shape, dtype=np.bool_)), (0, 0), (1, 1))
     tolerance = options.tolerance / grid.resolution
+    radius = options.start_clearing_radius / grid.resolution
     began = time.perf_counter()
-    plan = planner.plan(grid, start, goal, options.move_rule, options.mode, tolerance)
+    plan = planner.plan(
+        grid,
+        start,
+        goal,
+        options.move_rule,
+        options.mode,
+        tolerance,
+        start_clearing_radius=radius,
+    )
     _print(options, grid, plan, time.perf_counter() - began)
     if options.csv:
         rows = ((*cell, *np.round(grid.cell_to_world(cell), 6)) for cell in plan.cells)

@@ -137,12 +137,20 @@ class Planner:
         check_grid(grid)
         start, goal = as_cell(start, "the start"), as_cell(goal, "the goal")
         rule, method = self._rule(move_rule), PlanMethod(method)
-        tolerance, given = real(tolerance), tolerance
-        if not tolerance >= 0:
-            raise ValueError(f"the tolerance is {given!r}; give 0 or more")
+        tolerance = _cells("the tolerance", tolerance)
         simplified = as_flag("simplified", simplified)
-        request = PlanRequest(grid, start, goal, rule, method, tolerance, simplified)
-        return last_step(self.steps(_clearing(request, start_clearing_radius)))
+        radius = _cells("start_clearing_radius", start_clearing_radius)
+        request = PlanRequest(
+            grid,
+            start,
+            goal,
+            rule,
+            method,
+            tolerance,
+            simplified,
+            start_clearing_radius=radius,
+        )
+        return last_step(self.steps(request))
 
     def plan_nearest(
         self,
@@ -177,8 +185,18 @@ class Planner:
         first, *others = _cells_of_goals(goals)
         rule, method = self._rule(move_rule), PlanMethod(method)
         start, simplified = as_cell(start, "the start"), as_flag("simplified", simplified)
-        request = PlanRequest(grid, start, first, rule, method, 0.0, simplified, others=(*others,))
-        return last_step(self.steps(_clearing(request, start_clearing_radius)))
+        radius = _cells("start_clearing_radius", start_clearing_radius)
+        request = PlanRequest(
+            grid,
+            start,
+            first,
+            rule,
+            method,
+            simplified=simplified,
+            others=(*others,),
+            start_clearing_radius=radius,
+        )
+        return last_step(self.steps(request))
 
     def plan_through(
         self,
@@ -376,10 +394,10 @@ def _cells_of_goals(goals: Sequence[Cell]) -> list[Cell]:
     return cells
 
 
-def _clearing(request: PlanRequest, radius: float) -> PlanRequest:
-    if not radius >= 0:
-        raise ValueError(f"start_clearing_radius is {radius}; give cells, 0 or more")
-    return replace(request, start_clearing_radius=radius)
+def _cells(name: str, value: float) -> float:
+    if not real(value) >= 0:
+        raise ValueError(f"{name} is {value!r}; give 0 cells or more")
+    return real(value)
 
 
 def _free_goals(request: PlanRequest) -> Goals:

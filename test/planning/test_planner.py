@@ -507,5 +507,5 @@ def test_a_tolerance_larger_than_the_map_is_no_harm() -> None:
 
 @pytest.mark.parametrize("tolerance", [-1.0, np.nan])
 def test_a_tolerance_that_is_none_is_named(tolerance: float) -> None:
-    with pytest.raises(ValueError, match=f"the tolerance is {tolerance}; give 0 or more"):
+    with pytest.raises(ValueError, match=f"the tolerance is {tolerance}; give 0 cells or more"):
         ANY_MAP.plan(GridMap(np.zeros((2, 2))), (0, 0), (1, 1), tolerance=tolerance)
