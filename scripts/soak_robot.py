@@ -191,6 +191,7 @@ class SimulatedRobot:
             while time.monotonic() < happened + SILENCE:
                 began = time.monotonic()
                 is_late = began > happened + MAP_TIMEOUT + GRACE
+                time.sleep(0.1)
                 if self._cell_of_plan() is not None and is_late and must_not_plan:
                     self._note_stale(kind, "a plan in the silence")
             with self._lock:
