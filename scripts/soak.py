@@ -1,4 +1,6 @@
-"""Keeps both nodes at mixed work for minutes, bad input included, and watches their memory.
+"""Keeps the nodes at mixed work for minutes, bad input included, and watches their memory.
+
+Beside them a simulated robot drives, to which things happen, see soak_robot.py.
 
 After the first fifth of the time, in which caches fill, the memory has to stay flat: the median of
 the last tenth of what is left may lie no more than 5 % above that of its first tenth.
@@ -6,6 +8,7 @@ the last tenth of what is left may lie no more than 5 % above that of its first 
 
 from __future__ import annotations
 
+import itertools
 import math
 import random
 import statistics
@@ -13,7 +16,7 @@ import tempfile
 import time
 from collections import Counter
 from collections.abc import Sequence
-from contextlib import suppress
+from contextlib import ExitStack, closing, suppress
 from pathlib import Path
 from subprocess import Popen
 from typing import Any
@@ -25,15 +28,18 @@ from geometry_msgs.msg import PoseStamped
 from map_fixture import RULE, three_maps
 from nav_msgs.srv import GetPlan, LoadMap
 from processes import claim_ros_domain, memory, run_script, running_node
+from soak_robot import EVENTS, NAMESPACE, SOURCE, SimulatedRobot, parameters
 from std_srvs.srv import Trigger
 
 from ddqn_planner.grid import MapFile, MoveRule, save_map
 from ddqn_planner.grid.generators import random_requests
 from ddqn_planner.nodes.runtime import LATCHED
 
-MINUTES = 20.0
+MINUTES = 30.0
 PERIOD = 5.0
 """Seconds between two samples of the memory."""
+EVENT_PERIOD = 10.0
+"""Seconds between two events of the robot."""
 PAUSE = 0.02
 """Seconds between two pieces of work."""
 MAX_GROWTH = 0.05
@@ -134,12 +140,21 @@ class Work:
         return pose(grid, (self._draw.randrange(grid.width), self._draw.randrange(grid.height)))
 
 
-def soak(children: dict[str, Popen[bytes]], work: Work, minutes: float) -> Samples:
+def soak(
+    children: dict[str, Popen[bytes]],
+    work: Work,
+    minutes: float,
+    robot: SimulatedRobot | None = None,
+) -> Samples:
     """Work for some minutes; return the resident memory of each node, MB, as time went by."""
     samples: Samples = {name: [] for name in children}
-    began = time.monotonic()
+    began = next_event = time.monotonic()
+    events = itertools.cycle(EVENTS)
     while time.monotonic() < began + 60 * minutes:
         work()
+        if robot is not None and time.monotonic() >= next_event:
+            robot.event(next(events))
+            next_event = time.monotonic() + EVENT_PERIOD
         time.sleep(PAUSE)
         if time.monotonic() >= began + PERIOD * len(samples["planner_node"]):
             work.settle()
@@ -159,22 +174,37 @@ def growth(samples: Sequence[float]) -> tuple[float, float, float]:
 
 
 def main(arguments: Sequence[str]) -> int:
-    """Run both nodes at work; return 1 if one of them grows or leaves a call unanswered."""
+    """Run the nodes at work; return 1 if one grows, loses a call, or answers what is stale."""
     minutes = float(arguments[0]) if arguments else MINUTES
+    quiet, apart = ("--log-level", "fatal"), ("-r", f"__ns:={NAMESPACE}")
     with (
         claim_ros_domain(),
         tempfile.TemporaryDirectory() as folder,
-        running_node("map_server_node", "--log-level", "fatal") as map_server,
-        running_node("planner_node", "--log-level", "fatal") as planner,
+        running_node("map_server_node", *quiet) as map_server,
+        running_node("planner_node", *quiet) as planner,
+        ExitStack() as stack,
         Client() as client,
     ):
-        children = {"map_server_node": map_server, "planner_node": planner}
+        of_planner, of_trainer = parameters(Path(folder))
+        children = {
+            "map_server_node": map_server,
+            "planner_node": planner,
+            "robot's planner": stack.enter_context(
+                running_node("planner_node", *quiet, *apart, **of_planner)
+            ),
+            "robot's trainer": stack.enter_context(
+                running_node("trainer_node", *quiet, *apart, **of_trainer)
+            ),
+        }
+        robot = stack.enter_context(closing(SimulatedRobot()))
         work = Work(client, Path(folder))
-        samples = soak(children, work, minutes)
-    done = ", ".join(f"{name} {count}" for name, count in sorted(work.done.items()))
-    print(f"{minutes:g} minutes: {done}; {work.lost} calls lost")
+        samples = soak(children, work, minutes, robot)
+    for what in (work, robot):
+        done = ", ".join(f"{name} {count}" for name, count in sorted(what.done.items()))
+        print(f"{minutes:g} minutes: {done}; {what.lost} lost")
+    print(f"{robot.stale} stale answers; the robot's poses came by {SOURCE}")
     print(f"{'node':<16} {'samples':>7} {'at start':>9} {'warm':>9} {'at end':>9} {'growth':>7}")
-    fine = not work.lost
+    fine = not (work.lost or robot.lost or robot.stale)
     for name, sampled in samples.items():
         warm, last, grown = growth(sampled)
         fine &= grown <= MAX_GROWTH
