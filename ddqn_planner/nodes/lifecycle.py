@@ -47,6 +47,14 @@ class ManagedNode(LifecycleNodeMixin, BaseNode):
             if trigger() is not TransitionCallbackReturn.SUCCESS and self._error is not None:
                 raise self._error
 
+    def destroy_node(self) -> None:
+        """Shut the node down and destroy it: it leaves the graph at once."""
+        if self.context.ok() and self.state != "finalized":
+            self.trigger_shutdown()
+        # Whatever still has a handle keeps the node in the graph.
+        self._state_machine.destroy_when_not_in_use()
+        super().destroy_node()
+
     # What a node does in its transitions
 
     async def prepare(self, transition: str) -> bool:
