@@ -48,11 +48,14 @@ class ManagedNode(LifecycleNodeMixin, BaseNode):
                 raise self._error
 
     def destroy_node(self) -> None:
-        """Shut the node down and destroy it: it leaves the graph at once."""
-        if self.context.ok() and self.state != "finalized":
-            self.trigger_shutdown()
-        # Whatever still has a handle keeps the node in the graph.
+        """Free all that the node has, and destroy it, so that it leaves the graph at once."""
+        last_state = LifecycleState(self.state, 0)
+        # First, as a lifecycle manager calls them when the bond breaks, and waits without end.
         self._state_machine.destroy_when_not_in_use()
+        while self._services:
+            self.destroy_service(self._services[0])
+        if self.context.ok():
+            self.on_shutdown(last_state)
         super().destroy_node()
 
     # What a node does in its transitions

@@ -269,6 +269,24 @@ def test_a_planner_that_is_stopped_while_it_plans_leaves_the_graph_at_once(
         assert not any(answer.done() for answer in answers)
 
 
+def test_the_bond_breaks_when_the_planner_is_stopped(
+    run_node: Any, make_robot: MakeRobot, model: Path
+) -> None:
+    pytest.importorskip("bondpy", reason="bondpy is not on PyPI")
+    status = pytest.importorskip("bond.msg").Status
+    parameters = {"autostart": False, "model": str(model)}
+    with run_node("planner_node", parameters, namespace="/bonded") as node:
+        manager = Manager(make_robot("bonded"))
+        bond = manager.client.subscribe(status, "bond")
+        assert manager.change("configure")
+        assert manager.change("activate")
+        bond.wait(lambda message: message.active)
+        node.forget_log()
+        assert node.stop(signal.SIGTERM) == 0
+        bond.wait(lambda message: not message.active)
+        assert node.log == ""
+
+
 def test_a_planner_that_is_stopped_waits_for_no_model(run_node: Any, load_gate: Path) -> None:
     with run_node("planner_node", namespace="/loads_for_ever") as node:
         node.wait_for_log("a model waits")
