@@ -11,8 +11,11 @@ import numpy as np
 from client import SERVICE_QUALITY, TIMEOUT, Client, plan_request, wait_for
 from map_fixture import MapFixture, generated_map
 from nav_msgs.srv import GetPlan
+from rclpy.action.client import ActionClient
+from rclpy.task import Future
 
 from ddqn_planner.grid import Cell, GridMap
+from ddqn_planner.nodes.nav2_interface import QUEUES
 from ddqn_planner.nodes.runtime import LATCHED
 
 SIZES, COUNTS, CLIENTS, BURSTS = (20, 400, 2000), (20, 50, 200), (1, 20), 30
@@ -49,6 +52,38 @@ class BurstClients(Client):
         return [future.result() for _, future in pending]
 
 
+class GoalBursts(Client):
+    """A client of Nav2's action `compute_path_to_pose`; it needs nav2_msgs."""
+
+    def __init__(self, action: str = "compute_path_to_pose", node: str = "planner") -> None:
+        from nav2_msgs.action import ComputePathToPose
+
+        super().__init__(name="goal_bursts")
+        self._type = ComputePathToPose.Goal
+        self._client = ActionClient(self.node, ComputePathToPose, action, **QUEUES)
+        wait_for(action, self._client.server_is_ready)
+        self.wait_for_discovery(node)
+
+    def burst(self, requests: Sequence[GetPlan.Request]) -> tuple[int, int]:
+        """Send all requests as goals; return how many were acknowledged, and have a result."""
+        handles: list[Any] = []
+        results: list[Future] = []
+
+        def acknowledge(future: Future) -> None:
+            handles.append(future.result())
+            handles[-1].get_result_async().add_done_callback(results.append)
+
+        def send() -> None:
+            for asked in requests:
+                goal = self._type(start=asked.start, goal=asked.goal, use_start=True)
+                self._client.send_goal_async(goal).add_done_callback(acknowledge)
+
+        self._executor.create_task(send)  # rclpy loses answers that come before it has noted a goal
+        with suppress(TimeoutError):
+            wait_for("results", lambda: len(results) == len(requests))
+        return len(handles), len(results)
+
+
 def burst_requests(
     grid: GridMap, goals: Sequence[Cell], count: int, seed: int = 0
 ) -> list[GetPlan.Request]:
@@ -81,6 +116,16 @@ def load_bursts(
                 pass
             for count, clients in itertools.product(counts, CLIENTS):
                 fine &= load_burst(fixture, goals, clients, count, bursts)
+    with suppress(ModuleNotFoundError), GoalBursts() as action:
+        for count in counts:
+            sent = [burst_requests(fixture.grid, goals, count, seed) for seed in range(bursts)]
+            acknowledged, results = np.sum([action.burst(requests) for requests in sent], axis=0)
+            fine &= acknowledged == results == bursts * count
+            print(
+                f"bursts: {bursts} of {count} goals of compute_path_to_pose: acknowledged "
+                f"{acknowledged}, with a result {results} of {bursts * count}",
+                flush=True,
+            )
     return fine
 
 

@@ -47,6 +47,17 @@ class ManagedNode(LifecycleNodeMixin, BaseNode):
             if trigger() is not TransitionCallbackReturn.SUCCESS and self._error is not None:
                 raise self._error
 
+    def destroy_node(self) -> None:
+        """Free all that the node has, and destroy it, so that it leaves the graph at once."""
+        last_state = LifecycleState(self.state, 0)
+        # First, as a lifecycle manager calls them when the bond breaks, and waits without end.
+        self._state_machine.destroy_when_not_in_use()
+        while self._services:
+            self.destroy_service(self._services[0])
+        if self.context.ok():
+            self.on_shutdown(last_state)
+        super().destroy_node()
+
     # What a node does in its transitions
 
     async def prepare(self, transition: str) -> bool:

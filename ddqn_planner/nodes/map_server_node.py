@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import sys
-from typing import Final
+from contextlib import suppress
+from typing import Any, Final
 
 import numpy as np
 from nav_msgs.msg import OccupancyGrid
@@ -68,6 +69,11 @@ class MapServerNode(BaseNode):
         self._load(self.value("yaml_filename"))
         self.create_service(GetMap, "~/map", self._on_get_map)
         self.create_service(LoadMap, "~/load_map", self._on_load_map)
+        with suppress(ImportError):
+            from nav2_msgs.srv import LoadMap as Nav2LoadMap
+
+            # The codes are the same; a name can have but one type.
+            self.create_service(Nav2LoadMap, "~/load_map_nav2", self._on_load_map)
         self.create_trigger("~/scatter_obstacles", self._on_scatter_obstacles)
         self.create_trigger("~/restore_map", self._on_restore_map)
 
@@ -106,9 +112,7 @@ class MapServerNode(BaseNode):
         response.map = self._served
         return response
 
-    def _on_load_map(
-        self, request: LoadMap.Request, response: LoadMap.Response
-    ) -> LoadMap.Response:
+    def _on_load_map(self, request: Any, response: Any) -> Any:
         response.result = self._load(request.map_url)
         if response.result == LoadMap.Response.RESULT_SUCCESS:
             response.map = self._served

@@ -9,7 +9,12 @@ from rclpy.action.server import ActionServer
 from rclpy.callback_groups import ReentrantCallbackGroup
 
 from ddqn_planner.nodes.path_action import PathAction, Plan
-from ddqn_planner.nodes.runtime import BaseNode
+from ddqn_planner.nodes.runtime import SERVICE_QUALITY, BaseNode
+
+QUEUES: dict[str, Any] = {
+    f"{service}_service_qos_profile": SERVICE_QUALITY for service in ("goal", "cancel", "result")
+}
+"""Those of an action's services: without them, goals are lost like requests."""
 
 RESULT_TIMEOUT = 5
 """Seconds for which a result is kept. Each status message names all goals whose results are kept:
@@ -45,5 +50,6 @@ def serve_nav2(
             handle_accepted_callback=action.begin,
             cancel_callback=action.cancel,
             result_timeout=RESULT_TIMEOUT,
+            **QUEUES,
         )
     node.create_service(IsPathValid, "is_path_valid", on_is_path_valid, callback_group=group)

@@ -11,10 +11,10 @@ large map. A request that waits for a worker is a coroutine.
 from __future__ import annotations
 
 import ctypes
-import os
+import sys
 from collections.abc import Callable, Coroutine
 from contextlib import suppress
-from typing import Any, NoReturn
+from typing import Any
 
 from geometry_msgs.msg import PoseArray, PoseStamped, PoseWithCovarianceStamped
 from nav_msgs.msg import Odometry, Path
@@ -369,16 +369,15 @@ def _path(make: Callable[..., Any], outcome: Outcome, header: Header) -> Any:
     return make(outcome.plan.path, outcome.request.grid, header, outcome.goal.pose.orientation)
 
 
-def main() -> NoReturn:
+def main() -> int:
     """Run the planner node until SIGINT or SIGTERM."""
     # glibc reuses the memory of arrays up to 16 MB, because new pages would cost small fields a
     # third of their time. It returns larger arrays at once, so that the memory does not grow.
     with suppress(AttributeError):  # another C library
         for option in (-1, -3):  # M_TRIM_THRESHOLD, M_MMAP_THRESHOLD
             ctypes.CDLL(None).mallopt(option, 2**24)
-    # A field that is being computed cannot be stopped, and Python would wait for its thread.
-    os._exit(spin_until_shutdown(PlannerNode, PARAMETERS))
+    return spin_until_shutdown(PlannerNode, PARAMETERS)
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(main())

@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 import json
+import os
+import queue
+import signal
 import sys
+import threading
+import weakref
 from collections.abc import Callable, Coroutine, Generator, Mapping
-from concurrent.futures import Future as ConcurrentFuture
-from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from inspect import isawaitable
 from pathlib import Path
 from types import SimpleNamespace
@@ -23,16 +27,16 @@ from rcl_interfaces.msg import (
 from rcl_interfaces.srv import SetParameters, SetParametersAtomically
 from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
-from rclpy.exceptions import NameValidationException, ParameterException
-from rclpy.executors import ExternalShutdownException
+from rclpy.exceptions import InvalidHandle, NameValidationException, ParameterException
+from rclpy.executors import SingleThreadedExecutor
 from rclpy.logging import get_logger
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.parameter_service import ParameterService
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.service import Service
+from rclpy.signals import SignalHandlerOptions
 from rclpy.task import Future
-from rclpy.utilities import ok, try_shutdown
 from std_srvs.srv import Trigger
 
 from ddqn_planner.nodes.listening import ListeningNode
@@ -203,6 +207,8 @@ class _CheckedParameterService(ParameterService):
 class Worker:
     """Calls functions one after the other in a thread, and wakes the node's executor after each.
 
+    The process ends without waiting for a call that is under way.
+
     Parameters
     ----------
     node : Node
@@ -210,39 +216,48 @@ class Worker:
     """
 
     def __init__(self, node: Node) -> None:
-        self._thread = ThreadPoolExecutor(1)
         # A future alone does not wake an executor in another thread.
         self._wake = node.create_guard_condition(lambda: None)
+        self._calls: queue.SimpleQueue[Callable[[], None] | None] = queue.SimpleQueue()
+        self._thread = threading.Thread(target=_make_calls, args=[self._calls], daemon=True)
+        self._thread.start()
+        weakref.finalize(self, self._calls.put, None)
 
     def call(self, function: Callable[..., Any], *arguments: object) -> Future:
         """Return the future of a call; it has the exception if the function raises one."""
-        return self._submit(function, *arguments)[0]
-
-    def _submit(
-        self, function: Callable[..., Any], *arguments: object
-    ) -> tuple[Future, ConcurrentFuture[None]]:
-        future = Future()
+        future, wake = Future(), self._wake
 
         def work() -> None:
+            if future.cancelled():
+                return
             try:
                 future.set_result(function(*arguments))
             except Exception as error:
                 future.set_exception(error)
-            self._wake.trigger()
+            with suppress(InvalidHandle):  # the node was destroyed meanwhile
+                wake.trigger()
 
-        return future, self._thread.submit(work)
+        self._calls.put(work)
+        return future
 
     def close(self) -> None:
         """Wait until all calls have ended; take no more."""
-        self._thread.shutdown()
+        self._calls.put(None)
+        self._thread.join()
 
     async def run(self, function: Callable[..., Any], *arguments: object) -> Any:
         """Return the result of a call, which is left out if the caller gives it up before."""
-        future, work = self._submit(function, *arguments)
+        future = self.call(function, *arguments)
         try:
             return await future
         finally:
-            work.cancel()
+            future.cancel()
+
+
+def _make_calls(calls: queue.SimpleQueue[Callable[[], None] | None]) -> None:
+    while call := calls.get():
+        call()
+        del call  # it holds a map
 
 
 class Unless:
@@ -295,28 +310,48 @@ def spin_until_shutdown(make_node: Callable[[], Node], parameters: Parameters | 
         print(help_text(Path(sys.argv[0]).name, summary, parameters), flush=True)
         return 0
     try:
-        rclpy.init()
+        # With rclpy's handlers, nothing could be published any more when the node ends.
+        rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
     except Exception as error:  # an unknown ROS argument, a domain that is no number, no keys
         return _cannot_start(error)
-    node = None
+    node, executor, stopping = None, SingleThreadedExecutor(), threading.Event()
+    # A task, not a flag: the executor wakes and returns.
+    _at_signals(lambda: executor.create_task(stopping.set))
     try:
         node = make_node()
-        rclpy.spin(node)
-    except (KeyboardInterrupt, ExternalShutdownException):
-        pass
+        executor.add_node(node)
+        while not stopping.is_set():
+            executor.spin_once()
     except (NameValidationException, ParameterException) as error:
         return _cannot_start(error)
-    except Exception as error:
-        # A callback that runs when the signal comes fails at its next ROS call.
-        if ok():
-            if node is None and isinstance(error, RuntimeError):  # what ROS itself raises
-                return _cannot_start(error)
+    except RuntimeError as error:
+        if node is not None:
             raise
+        return _cannot_start(error)  # what ROS itself raises
     finally:
         if node is not None:
             node.destroy_node()
-        try_shutdown()
+        executor.shutdown()
+        rclpy.shutdown()
     return 0
+
+
+def _at_signals(function: Callable[[], object]) -> None:
+    """Have a thread call a function at the first SIGINT or SIGTERM, whatever else the process does.
+
+    Python's handlers run in the main thread, and not while that waits for messages.
+    """
+    heard, told = os.pipe()
+    os.set_blocking(told, False)
+    signal.set_wakeup_fd(told, warn_on_full_buffer=False)
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda *_: None)
+
+    def wait() -> None:
+        os.read(heard, 1)
+        function()
+
+    threading.Thread(target=wait, daemon=True).start()
 
 
 def _cannot_start(error: Exception) -> int:

@@ -90,7 +90,8 @@ class TrainerNode(BaseNode):
         for name in ("start", "stop", "save", "replay"):
             self.create_trigger(f"~/{name}", getattr(self, f"_on_{name}"), callback_group=group)
         self.create_timer(0.1, self._on_events, clock=STEADY)
-        self._imported = Worker(self).call(import_training)
+        self._importing = Worker(self)
+        self._imported = self._importing.call(import_training)
 
     def check_parameters(self, new: dict[str, Any]) -> None:
         """Check new values as `BaseNode` does, and hyper-parameters together: some limit others."""
@@ -319,6 +320,8 @@ class TrainerNode(BaseNode):
             self._thread.join()
         self._log_change_of_saving()
         super().destroy_node()
+        if self._driving is None:
+            self._importing.close()  # torch, half imported, may fail when the process ends
 
 
 def import_training() -> None:

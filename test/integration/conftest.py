@@ -101,6 +101,8 @@ def log_of_refused_start(
     def start(main: Callable[[], int], parameters: dict[str, Any]) -> str:
         arguments = parameter_arguments(parameters, tmp_path / "parameters.yaml")
         monkeypatch.setattr(sys, "argv", ["node", "--ros-args", *arguments])
+        # Signals are pytest's here.
+        monkeypatch.setattr("ddqn_planner.nodes.runtime._at_signals", lambda _: None)
         assert main() == 1
         return capfd.readouterr().err
 

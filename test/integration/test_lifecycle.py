@@ -4,23 +4,28 @@ from __future__ import annotations
 
 import gc
 import shutil
+import signal
 import threading
 import weakref
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import rclpy
-from client import initial_pose, wait_for
+from client import initial_pose, plan_request, wait_for
 from diagnostic_msgs.msg import DiagnosticStatus
-from integration.robot import GOAL, START, Robot
+from integration.robot import GOAL, NUMBERS, START, Robot
 from integration.test_startup import ask_for_plan
 from integration.test_startup import load_gate as load_gate
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState, GetState
+from map_fixture import generated_map
 from nav_msgs.srv import GetPlan
+from processes import cpu_seconds
+from rclpy.node import NodeNameNonExistentError
 
 from ddqn_planner.nodes.planner_node import PlannerNode
 
@@ -48,15 +53,21 @@ class Manager:
     def created(self) -> set[str]:
         """Which of the topics and services of a configured planner it has."""
         node, namespace = self.client.node, self.client.node.get_namespace()
-        found = {
-            name.removeprefix(f"{namespace}/")
-            for get in (
-                node.get_publisher_names_and_types_by_node,
-                node.get_subscriber_names_and_types_by_node,
-                node.get_service_names_and_types_by_node,
-            )
-            for name, _ in get("planner", namespace)
-        }
+
+        def names() -> list[str]:
+            with suppress(NodeNameNonExistentError):  # not discovered yet
+                return [
+                    name.removeprefix(f"{namespace}/")
+                    for get in (
+                        node.get_publisher_names_and_types_by_node,
+                        node.get_subscriber_names_and_types_by_node,
+                        node.get_service_names_and_types_by_node,
+                    )
+                    for name, _ in get("planner", namespace)
+                ]
+            return []
+
+        found = set(wait_for("discovery of the planner", names))
         return found & OF_CONFIGURED
 
 
@@ -157,7 +168,7 @@ def test_a_model_that_cannot_be_loaded_fails_configure(
             node.wait_for_log(f"model refused: .*{reason}.*; or set the parameter 'model'")
             status = robot.wait_for_reason(f"model refused: .*{reason}")
             assert status.level == DiagnosticStatus.ERROR
-            assert manager.created() == set()
+            wait_for("only what is always there", lambda: not manager.created())
         shutil.copy(model, file)
         assert manager.change("configure")
         assert manager.change("activate")
@@ -235,6 +246,51 @@ def test_the_planner_survives_transitions_among_requests(
         assert manager.change("activate")
         robot.set_map(robot.stamped_map())
         robot.assert_works()
+
+
+def test_a_planner_that_is_stopped_while_it_plans_leaves_the_graph_at_once(
+    run_node: Any, make_robot: MakeRobot
+) -> None:
+    with run_node("planner_node", namespace="/ended") as node:
+        robot = make_robot("ended")
+        rooms = generated_map("rooms", 2000)
+        robot.set_map(rooms.message(next(NUMBERS)))
+        start, *goals = rooms.grid.free_cells()
+        plans = robot.client.service(GetPlan, "planner/get_plan")
+        requests = [plan_request(rooms.grid, start, goal) for goal in goals[-20:]]
+        before = cpu_seconds(node.process.pid)
+        answers = [plans.call_async(request) for request in requests]
+        wait_for("fields under way", lambda: cpu_seconds(node.process.pid) > before + 1)
+        node.forget_log()
+        assert node.stop(signal.SIGTERM) == 0
+        assert node.log == ""
+        graph = robot.client.node
+        wait_for("farewell", lambda: "planner" not in graph.get_node_names(), timeout=10)
+        assert not any(answer.done() for answer in answers)
+
+
+def test_the_bond_breaks_when_the_planner_is_stopped(
+    run_node: Any, make_robot: MakeRobot, model: Path
+) -> None:
+    pytest.importorskip("bondpy", reason="bondpy is not on PyPI")
+    status = pytest.importorskip("bond.msg").Status
+    parameters = {"autostart": False, "model": str(model)}
+    with run_node("planner_node", parameters, namespace="/bonded") as node:
+        manager = Manager(make_robot("bonded"))
+        bond = manager.client.subscribe(status, "bond")
+        assert manager.change("configure")
+        assert manager.change("activate")
+        bond.wait(lambda message: message.active)
+        node.forget_log()
+        assert node.stop(signal.SIGTERM) == 0
+        bond.wait(lambda message: not message.active)
+        assert node.log == ""
+
+
+def test_a_planner_that_is_stopped_waits_for_no_model(run_node: Any, load_gate: Path) -> None:
+    with run_node("planner_node", namespace="/loads_for_ever") as node:
+        node.wait_for_log("a model waits")
+        assert node.stop(signal.SIGTERM) == 0
 
 
 def test_cleanup_frees_map_model_and_fields(make_robot: MakeRobot, model: Path) -> None:

@@ -70,6 +70,15 @@ def load_map(client: Any, url: object) -> Any:
     return client.call(LoadMap, "map_server/load_map", LoadMap.Request(map_url=str(url)))
 
 
+def test_nav2s_service_loads_a_map_too(client: Any, map_file: Path) -> None:
+    services = pytest.importorskip("nav2_msgs.srv", reason="nav2_msgs is not on PyPI")
+    for url, result in ((map_file, 0), ("unknown.yaml", 1)):
+        request = services.LoadMap.Request(map_url=str(url))
+        answer = client.call(services.LoadMap, "map_server/load_map_nav2", request)
+        assert answer.result == result
+        assert answer.map == (get_map(client) if result == 0 else OccupancyGrid())
+
+
 def published_map(client: Any, maps: Any) -> OccupancyGrid:
     """Return the map that is served, once the topic has brought it: those before it may be late."""
     served = get_map(client)

@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+import inspect
+import sys
 from collections.abc import Coroutine
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, cast
 
 import pytest
 from geometry_msgs.msg import PoseStamped
 from nav_msgs.msg import Path
-from rclpy.action.server import CancelResponse, GoalResponse
+from rclpy.action.server import ActionServer, CancelResponse, GoalResponse
 from rclpy.task import Future
 
+from ddqn_planner.nodes import nav2_interface
 from ddqn_planner.nodes.path_action import (
     CODES,
     PREEMPTED,
@@ -20,7 +23,7 @@ from ddqn_planner.nodes.path_action import (
     error_code,
 )
 from ddqn_planner.nodes.report import NOT_ACTIVE, Outcome, RequestError
-from ddqn_planner.nodes.runtime import Unless
+from ddqn_planner.nodes.runtime import SERVICE_QUALITY, Unless
 from ddqn_planner.planning import Plan, PlanStatus
 
 UNKNOWN = 200
@@ -221,3 +224,24 @@ def test_goals_are_rejected_while_the_node_is_not_active_and_aborted_when_it_sto
     result = end(execution)
     assert (handle.state, result.error_code) == ("aborted", UNKNOWN)
     assert server.action.accept(handle.request) is GoalResponse.REJECT
+
+
+def test_the_services_of_actions_have_the_queues_of_the_others(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    kind = SimpleNamespace(Result=SimpleNamespace(UNKNOWN=UNKNOWN))
+    types = {"ComputePathThroughPoses": kind, "ComputePathToPose": kind, "IsPathValid": None}
+    for module in ("nav2_msgs", "nav2_msgs.action", "nav2_msgs.srv"):
+        monkeypatch.setitem(sys.modules, module, SimpleNamespace(**types))
+    made: list[inspect.BoundArguments] = []
+    signature = inspect.signature(ActionServer)
+    record = lambda *given, **named: made.append(signature.bind(*given, **named))  # noqa: E731
+    monkeypatch.setattr(nav2_interface, "ActionServer", record)
+    node = SimpleNamespace(create_service=lambda *given, **named: None)
+    nav2_interface.serve_nav2(cast("Any", node), bool, cast("Any", None), print)
+    depths = [
+        made[n].arguments[f"{which}_service_qos_profile"].depth
+        for n in range(2)
+        for which in ("goal", "cancel", "result")
+    ]
+    assert depths == 6 * [SERVICE_QUALITY.depth]
