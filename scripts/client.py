@@ -7,6 +7,7 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable, Iterable
+from contextlib import suppress
 from subprocess import Popen
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -22,6 +23,7 @@ from rcl_interfaces.srv import GetParameters, SetParameters
 from rclpy._rclpy_pybind11 import RCLError
 from rclpy.context import Context
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rclpy.node import NodeNameNonExistentError
 from rclpy.parameter import Parameter, parameter_value_to_python
 from rclpy.qos import QoSProfile
 from std_msgs.msg import Header
@@ -173,6 +175,25 @@ class Client:
 
         wait_for(f"discovery by {node}", asked)
         self._executor.create_task(self.node.destroy_client, probe)  # its thread may hold it
+
+    def entities(self, node: str) -> set[tuple[str, str, str]]:
+        """Return the kind, name and type of what a node of this namespace has.
+
+        Nothing, until discovery has brought the node.
+        """
+        namespace = self.node.get_namespace()
+        kinds = {
+            "publishes": self.node.get_publisher_names_and_types_by_node,
+            "subscribes": self.node.get_subscriber_names_and_types_by_node,
+            "service": self.node.get_service_names_and_types_by_node,
+        }
+        with suppress(NodeNameNonExistentError):
+            return {
+                (kind, name.removeprefix(f"{namespace}/"), types[0])
+                for kind, get in kinds.items()
+                for name, types in get(node, namespace)
+            }
+        return set()
 
     def call(
         self, service_type: Any, name: str, request: Any = None, timeout: float = TIMEOUT

@@ -8,8 +8,9 @@ import numpy as np
 from client import cell_of, cells_of, map_message
 from nav_msgs.msg import OccupancyGrid, Path
 from nav_msgs.srv import GetPlan
+from numpy.typing import NDArray
 
-from ddqn_planner.grid import MOVES, MapFile, MoveRule, legal_moves, read_map_file
+from ddqn_planner.grid import MOVES, Cell, MapFile, MoveRule, legal_moves, read_map_file
 from ddqn_planner.grid.generators import generate_map
 from ddqn_planner.resources import find_map
 
@@ -44,11 +45,20 @@ class MapFixture:
             return f"no path from {start} to {goal}, where there is one" if possible else ""
         if (cells[0], cells[-1]) != (start, goal):
             return f"a path from {cells[0]} to {cells[-1]}, asked was {start} to {goal}"
+        legal = self._legal if self.grid.is_free(start) else self._legal_to_leave(start)
         for (x, y), (next_x, next_y) in pairwise(cells):
+            if self.grid.is_free((x, y)):
+                legal = self._legal
             action = ACTIONS.get((next_x - x, next_y - y))
-            if action is None or not self.grid.contains((x, y)) or not self._legal[action, y, x]:
+            if action is None or not self.grid.contains((x, y)) or not legal[action, y, x]:
                 return f"an illegal move from {(x, y)} to {(next_x, next_y)}"
         return ""
+
+    def _legal_to_leave(self, start: Cell) -> NDArray[np.bool_]:
+        """Return which moves are legal for a robot on an obstacle: those within a cell go."""
+        y, x = np.ogrid[: self.grid.height, : self.grid.width]
+        far = np.hypot(x - start[0], y - start[1]) > 1
+        return legal_moves(self.grid.occupancy & far, RULE)
 
 
 def generated_map(kind: str, side: int, resolution: float = 0.05) -> MapFixture:

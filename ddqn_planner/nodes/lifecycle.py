@@ -11,6 +11,7 @@ from typing import Any
 
 from lifecycle_msgs.srv import ChangeState
 from rclpy.callback_groups import ReentrantCallbackGroup
+from rclpy.duration import Duration
 from rclpy.lifecycle import LifecycleNodeMixin, LifecycleState, TransitionCallbackReturn
 
 from ddqn_planner.nodes.runtime import BaseNode, Parameters
@@ -161,6 +162,9 @@ class ManagedNode(LifecycleNodeMixin, BaseNode):
 
     def _break_bond(self) -> None:
         if self._bond is not None:
+            self._bond.break_bond()
+            # Else a publisher that ends at once takes its last message with it.
+            self._bond.pub.wait_for_all_acked(Duration(seconds=0.2))
             self._bond.shutdown()
             # It has destroyed these, and the node still has them in its lists.
             self.destroy_subscription(self._bond.sub)

@@ -118,16 +118,10 @@ def topics_of_driving(
 
 def topics_of(client: Any, node: str) -> set[tuple[str, str, str]]:
     """What a client has discovered of a node."""
-    namespace = client.node.get_namespace()
     return {
-        (kind, topic.replace(f"{namespace}/{node}/", "~/").replace(f"{namespace}/", ""), message)
-        for kind, get in (
-            ("publishes", client.node.get_publisher_names_and_types_by_node),
-            ("subscribes", client.node.get_subscriber_names_and_types_by_node),
-            ("service", client.node.get_service_names_and_types_by_node),
-        )
-        for topic, (message, *_) in get(node, namespace)
-        if topic not in OF_EVERY_NODE and "parameter" not in topic and "type_desc" not in topic
+        (kind, re.sub(f"^{node}/", "~/", name), message)
+        for kind, name, message in client.entities(node)
+        if name not in OF_EVERY_NODE and "parameter" not in name and "type_desc" not in name
     }
 
 

@@ -8,7 +8,6 @@ import signal
 import threading
 import weakref
 from collections.abc import Callable
-from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +24,6 @@ from lifecycle_msgs.srv import ChangeState, GetState
 from map_fixture import generated_map
 from nav_msgs.srv import GetPlan
 from processes import cpu_seconds
-from rclpy.node import NodeNameNonExistentError
 
 from ddqn_planner.nodes.planner_node import PlannerNode
 
@@ -52,23 +50,8 @@ class Manager:
 
     def created(self) -> set[str]:
         """Which of the topics and services of a configured planner it has."""
-        node, namespace = self.client.node, self.client.node.get_namespace()
-
-        def names() -> list[str]:
-            with suppress(NodeNameNonExistentError):  # not discovered yet
-                return [
-                    name.removeprefix(f"{namespace}/")
-                    for get in (
-                        node.get_publisher_names_and_types_by_node,
-                        node.get_subscriber_names_and_types_by_node,
-                        node.get_service_names_and_types_by_node,
-                    )
-                    for name, _ in get("planner", namespace)
-                ]
-            return []
-
-        found = set(wait_for("discovery of the planner", names))
-        return found & OF_CONFIGURED
+        entities = wait_for("discovery of the planner", lambda: self.client.entities("planner"))
+        return {name for _, name, _ in entities} & OF_CONFIGURED
 
 
 MakeRobot = Callable[[str], Robot]

@@ -8,7 +8,7 @@ import sys
 import time
 import warnings
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path as FilePath
 from typing import Any
 
@@ -65,9 +65,12 @@ def read(file: FilePath) -> dict[str, dict[str, list[Any]]]:
 
 def wait_until(condition: Callable[[], bool]) -> None:
     deadline = time.monotonic() + TIMEOUT
-    while not condition():
-        assert time.monotonic() < deadline
+    while time.monotonic() < deadline:
+        with suppress(RuntimeError):  # a message of the file is only half written
+            if condition():
+                return
         time.sleep(0.1)
+    assert condition()
 
 
 def drawn(image: dict[str, list[Any]]) -> np.ndarray:
