@@ -64,10 +64,11 @@ def test_a_place_is_as_slow_as_its_drives_at_any_rate_of_samples(
 
 @given(st.integers(0, 2**32 - 1))
 def test_noise_of_the_pose_hardly_matters(seed: int) -> None:
-    seconds, positions = straight((2, 5), (12, 5), 3, 50)
-    positions = positions + np.random.default_rng(seed).normal(0, 0.02, positions.shape)
-    slowness = driven((seconds, positions)).slowness(HALL)
-    assert at(HALL, slowness, 7, 5) == pytest.approx(3, rel=0.25)
+    random, (seconds, positions) = np.random.default_rng(seed), straight((2, 5), (12, 5), 3, 50)
+    drives = [(seconds, positions + random.normal(0, 0.02, positions.shape)) for _ in range(4)]
+    slowness = driven(*drives).slowness(HALL)
+    # Over 1,200 seeds: 2.97, with a standard deviation of 0.02. One place alone has 0.1, and tails.
+    assert np.mean([at(HALL, slowness, x, 5) for x in range(4, 11)]) == pytest.approx(3, rel=0.1)
 
 
 def test_waiting_counts_as_time_and_standing_before_a_drive_does_not() -> None:
