@@ -122,6 +122,8 @@ def topics_of(client: Any, node: str) -> set[tuple[str, str, str]]:
         (kind, re.sub(f"^{node}/", "~/", name), message)
         for kind, name, message in client.entities(node)
         if name not in OF_EVERY_NODE and "parameter" not in name and "type_desc" not in name
+        # An action's parts have no rows of their own.
+        if kind == "subscribes" or "/_action/" not in name
     }
 
 
