@@ -72,7 +72,7 @@ bench: setup
 body: setup
 	$(BIN)/python scripts/body.py $(MAP) $(RADIUS)
 
-# 50 kills, 1,000 inputs of each kind, 10,000 requests, 20 minutes; KILLS, REQUESTS, MINUTES change it.
+# 50 kills, 1,000 inputs of each kind, 10,000 requests, 30 minutes; KILLS, REQUESTS, MINUTES change it.
 faults: setup
 	$(BIN)/python scripts/faults.py $(KILLS)
 
