@@ -201,3 +201,13 @@ def test_a_simplified_path_keeps_the_cells_of_the_way_out(method: PlanMethod) ->
         wall(2), (9, 2), (20, 2), method=method, simplified=True, start_clearing_radius=1
     )
     assert plan.cells == ((9, 2), (10, 2), (20, 2))
+
+
+def test_the_corners_of_the_square_around_a_start_lie_beyond_a_radius_of_one_cell() -> None:
+    occupancy = np.ones((5, 5), dtype=bool)
+    occupancy[::4, ::4] = False  # the only way out leads over the corners
+    for radius, status in ((1.0, PlanStatus.START_OCCUPIED), (1.5, PlanStatus.SUCCEEDED)):
+        plan = ANY_MAP.plan(
+            GridMap(occupancy), (2, 2), (4, 4), "corner_cutting", start_clearing_radius=radius
+        )
+        assert plan.status is status
