@@ -60,7 +60,8 @@ def cell_inside(cell: Any, shape: tuple[int, ...], name: str = "the cell") -> Ce
     x, y = as_cell(cell, name)
     height, width = shape
     if not (0 <= x < width and 0 <= y < height):
-        raise ValueError(f"{name} {(x, y)} lies outside the map of {width} x {height} cells")
+        size = f"{width} x {height}"
+        raise ValueError(f"{name} {(x, y)} lies outside the map of {size} cells; give one inside")
     return x, y
 
 
