@@ -20,7 +20,6 @@ COMMANDS: Final = {
     "reproduce": "train and measure the paper's experiments",
     "experiment": "measure what driving teaches",
     "learn": "learn from recorded drives how long places take",
-    "watch": "show live what the ROS nodes publish",
 }
 """Each is a module of `ddqn_planner.commands`."""
 

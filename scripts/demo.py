@@ -21,7 +21,7 @@ from processes import claim_ros_domain, run_script, running_node
 from ddqn_planner.grid import Cell, MoveRule, path_length, read_map_file, shortest_distances
 from ddqn_planner.nodes.conversions import grid_from_message
 from ddqn_planner.nodes.runtime import LATCHED
-from ddqn_planner.pictures.picture import MAX_TEXT_WIDTH, draw_text, save_picture
+from ddqn_planner.pictures import MAX_TEXT_WIDTH, draw_text, save_picture
 from ddqn_planner.resources import find_map
 
 

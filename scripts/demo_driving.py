@@ -38,7 +38,7 @@ from ddqn_planner.experiments.driving_worlds import World, generated_world, path
 from ddqn_planner.grid import Cell, GridMap, MoveRule, save_map
 from ddqn_planner.nodes.driving import SLOWEST
 from ddqn_planner.nodes.runtime import LATCHED
-from ddqn_planner.pictures.picture import draw_obstacles
+from ddqn_planner.pictures import draw_obstacles
 from ddqn_planner.planning import Planner
 
 WORLD, SEED, SPEED_UP = "office", 9, 40.0

@@ -8,7 +8,7 @@ import numpy as np
 
 from ddqn_planner import Planner
 from ddqn_planner.grid import MOVES, OCCUPIED, MapFile, save_map
-from ddqn_planner.pictures.picture import draw_obstacles
+from ddqn_planner.pictures import draw_obstacles
 
 # What a lane forbids: all actions that lead against it, for NumPy's rows from the bottom up.
 EAST, NORTH, WEST, SOUTH = (
