@@ -8,7 +8,7 @@ It needs matplotlib.
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterator, Sequence
+from collections.abc import Generator, Sequence
 from typing import Any
 
 import matplotlib
@@ -49,7 +49,7 @@ def save_film(
     for cell, marker, size in ((plan.cells[0], "o", 14), (plan.cells[-1], "*", 28)):
         axes.plot(*cell, marker, color=PATH_COLOUR, markersize=size, markeredgecolor="white")
 
-    def frames() -> Iterator[tuple[float, int]]:
+    def frames() -> Generator[tuple[float, int], None, None]:
         """Yield the least value that is shown, and how many cells of the path."""
         for share in np.linspace(0, 1, steps):
             yield float(np.nanquantile(finite, 1 - share)), 0

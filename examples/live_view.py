@@ -39,7 +39,8 @@ def ramp(levels: int) -> NDArray[np.uint8]:
     rgb = np.array([ImageColor.getrgb(colour) for colour in VALUE_COLOURS])
     places, wanted = np.linspace(0, 1, len(rgb)), np.linspace(0, 1, levels)
     channels = [np.interp(wanted, places, channel) for channel in rgb.T]
-    return np.stack(channels, axis=1).round().astype(np.uint8)
+    rounded: NDArray[np.uint8] = np.stack(channels, axis=1).round().astype(np.uint8)
+    return rounded
 
 
 class LiveView(Node):

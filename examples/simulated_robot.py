@@ -5,7 +5,7 @@ zones, a carpet on which wheels slip, a door, and crowds that come and go by the
 It stops before an obstacle. Where it stands without a path that it can follow, it sends the last
 `goal_pose` again. Its time runs faster than the clock: the stamps are simulated.
 
-    python scripts/driving_robot.py --ros-args -p world:=office -p seed:=1 -p speed_up:=30.0
+    python scripts/simulated_robot.py --ros-args -p world:=office -p seed:=1 -p speed_up:=30.0
 """
 
 from __future__ import annotations
