@@ -1,4 +1,4 @@
-# make setup | demo | demo-driving | test | test-fast | docs | lint | format | types | bench | body | faults | fuzz | load | soak | model | model-dilemma
+# make setup | demo | demo-driving | test | test-fast | experiments-test | docs | lint | format | types | bench | body | faults | fuzz | load | soak | model | model-dilemma
 PYTHON ?= python3
 TORCH ?= torch==2.13.0
 VENV := .venv
@@ -12,7 +12,7 @@ else
 EXTRAS := bags,experiments,figures,ros,tensorboard,test,train,watch
 endif
 
-.PHONY: setup demo demo-driving test test-fast docs lint format types bench body faults fuzz load soak model model-dilemma
+.PHONY: setup demo demo-driving test test-fast experiments-test docs lint format types bench body faults fuzz load soak model model-dilemma
 .DEFAULT_GOAL := help
 
 .PHONY: help
@@ -44,6 +44,10 @@ test: setup
 # No ROS and nothing slow: for every save.
 test-fast: setup
 	$(PYTEST) --ignore test/integration -m "not slow"
+
+# What measures has tests of its own: they train and drive for minutes.
+experiments-test: setup
+	$(PYTEST) experiments/tests
 
 # The site, in docs/_build/html; a warning is an error.
 docs: setup

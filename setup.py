@@ -42,7 +42,7 @@ setup(
         "train": ["gymnasium>=1.1", "torch>=2.1"],
         "ros": ["ros-jazzy-rclpy[fastrtps]>=7.1.5,<8", "ros-jazzy-common-interfaces>=5.3,<6"],
         "figures": ["matplotlib>=3.6"],
-        "experiments": ["matplotlib>=3.6"],
+        "experiments": ["joblib>=1.3", "matplotlib>=3.6"],
         "tensorboard": ["tensorboard>=2.10"],
         "bags": ["mcap-ros2-support>=0.5"],
         "watch": ["rerun-sdk>=0.39"],
