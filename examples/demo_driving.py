@@ -32,7 +32,6 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from ddqn_planner.experience.drive_recorder import ARRIVAL_DISTANCE
-from ddqn_planner.experiments.driving_worlds import World, generated_world, path_seconds
 from ddqn_planner.grid import Cell, GridMap, MoveRule, save_map
 from ddqn_planner.nodes.driving import SLOWEST
 from ddqn_planner.nodes.runtime import LATCHED
@@ -41,6 +40,7 @@ from ddqn_planner.planning import Planner
 
 sys.path.insert(0, str(FilePath(__file__).resolve().parents[1] / "experiments"))
 from client import Client, Recorder, cells_of, pose, wait_for
+from driving_worlds import World, generated_world, path_seconds
 from processes import claim_ros_domain, run_script, running, running_node
 
 WORLD, SEED, SPEED_UP = "office", 9, 40.0

@@ -10,13 +10,13 @@ import numpy as np
 import pytest
 import simulated_robot
 from client import Client
+from driving_worlds import World
 from geometry_msgs.msg import PoseStamped
 from nav_msgs.msg import Odometry
 from processes import running
 from simulated_robot import Robot
 from std_msgs.msg import Header
 
-from ddqn_planner.experiments.driving_worlds import World
 from ddqn_planner.grid import Cell, GridMap, MoveRule, shortest_path
 
 
