@@ -54,7 +54,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
                 module.add_options(command)
         options = parser.parse_args(arguments)
         return int(options.run(options))
-    except (OSError, ValueError, ImportError) as error:
+    except (OSError, ValueError, ImportError, MemoryError) as error:
         print(f"ddqn-planner: {with_remedy(error)}", file=sys.stderr)
         return 2
 
