@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from enum import Enum
 from pathlib import Path
 
-from ddqn_planner.files import Appender, remove_temporaries, write_atomically
+from ddqn_planner.files import Appender, write_atomically
 from ddqn_planner.grid import Cell, MoveRule, path_length
 
 HEADER = b"episode,step,scenario,outcome,moves,length,total_reward,average_reward,cells\r\n"
@@ -48,7 +48,6 @@ class Episode:
 
 def open_record(path: Path, episodes: int) -> Appender:
     """Open an ``episodes.csv`` to append to its first `episodes`; its later rows are dropped."""
-    remove_temporaries(path)
     lines = [HEADER]
     if path.exists():
         with path.open("rb") as file:

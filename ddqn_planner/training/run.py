@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from contextlib import ExitStack, closing, contextmanager
+from contextlib import closing, contextmanager
 from dataclasses import asdict, replace
 from pathlib import Path
 
-from ddqn_planner.files import claim, remove_temporaries
+from ddqn_planner.files import WorkFolder
 from ddqn_planner.grid import MoveRule
 from ddqn_planner.training.environment import Scenario
 from ddqn_planner.training.episodes import Episode, open_record, record
@@ -46,9 +46,9 @@ class TrainingRun:
         self.model_path = self.folder / "model.safetensors"
         self.checkpoint_path = self.folder / CHECKPOINT
         self.curves_path = self.folder / "episodes.csv"
-        self.save_error = ""
-        with ExitStack() as stack:  # unlocks the folder if the rest fails
-            stack.enter_context(claim(self.folder, MARKS, "training", "trains"))
+        after = f"the training continues and tries again every {SAVE_INTERVAL} steps"
+        self._work = WorkFolder(self.folder, MARKS, "training", "trains", after)
+        with self._work.opening() as files:
             with _memory_with_remedy():
                 if self.checkpoint_path.exists():
                     self.trainer = Trainer.load_checkpoint(self.checkpoint_path, scenarios)
@@ -56,31 +56,29 @@ class TrainingRun:
                     self.trainer.parameters = parameters
                 else:
                     self.trainer = Trainer(scenarios, move_rule, parameters, seed)
-            self.saved_at = self.trainer.steps
-            for path in (self.model_path, self.checkpoint_path):
-                remove_temporaries(path)
             self._record = open_record(self.curves_path, self.trainer.episodes)
-            stack.enter_context(closing(self._record))
-            self._open_files = stack.pop_all()
+            files.enter_context(closing(self._record))
+        self.saved_at = self.trainer.steps
         self.description = (
             f"training in {self.folder} from step {self.trainer.steps} to {parameters.steps}"
         )
 
+    @property
+    def save_error(self) -> str:
+        """Why the last save failed; empty if it did not."""
+        return self._work.save_error
+
     def steps(self) -> Iterator[list[Episode]]:
         """Train until ``parameters.steps``; save every `SAVE_INTERVAL` steps and at the end.
 
-        Yield the episodes that ended with each step; they are recorded. If a save fails, or the
-        episodes cannot be written, the training continues, and `save_error` says why until a save
-        succeeds. Episodes that end meanwhile may be missing in the record.
+        Yield the episodes that ended with each step. If a save fails, the training continues, and
+        `save_error` says why until a save succeeds.
         """
         rules, until = self.trainer.environment.move_rules, self.trainer.parameters.steps
         with _memory_with_remedy():
             for finished in self.trainer.run(until):
                 for episode in finished:
-                    try:
-                        self._record.append(record(episode, rules[episode.scenario]))
-                    except OSError as error:
-                        self._fail(error)
+                    self._record.append(record(episode, rules[episode.scenario]))
                 due = self.trainer.steps // SAVE_INTERVAL != self.saved_at // SAVE_INTERVAL
                 if due and self.trainer.steps < until:
                     self.try_to_save()
@@ -88,31 +86,18 @@ class TrainingRun:
             self.try_to_save()
 
     def try_to_save(self) -> None:
-        """Write the model and the checkpoint.
-
-        If that fails, `save_error` says why, and the last good files stay.
-        """
+        """Write the model, the checkpoint and the episodes; if that fails, old files stay."""
         self.saved_at = self.trainer.steps
-        try:
+        with self._work.saving():
             # A kill between the two leaves a model that is newer than the checkpoint. Both are
             # complete, and nothing needs them to be of the same step.
             self.trainer.save_model(self.model_path)
             self.trainer.save_checkpoint(self.checkpoint_path)
             self._record.flush()
-            self.save_error = ""
-        except OSError as error:
-            self._fail(error)
-
-    def _fail(self, error: OSError) -> None:
-        # Without the error's file name: it is often that of a temporary file.
-        self.save_error = (
-            f"cannot save to {self.folder} ({error.strerror or error}); make room or allow writing "
-            f"there: the training continues and tries again every {SAVE_INTERVAL} steps"
-        )
 
     def close(self) -> None:
         """Close the files and unlock the folder. `try_to_save` first."""
-        self._open_files.close()
+        self._work.close()
 
 
 @contextmanager
