@@ -1,4 +1,4 @@
-"""Checks of what users pass in: choices, numbers, cells, arrays. All wrong values are ValueErrors."""
+"""Checks of what users pass in: choices, numbers, cells, arrays. A wrong value is a ValueError."""
 
 from __future__ import annotations
 

@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 
 from ddqn_planner.grid.arguments import UNKNOWN, Cell, Occupancy
 from ddqn_planner.grid.body import clearance
-from ddqn_planner.grid.moves import MoveRule, component_labels
+from ddqn_planner.grid.grid_map import GridMap
+from ddqn_planner.grid.moves import MoveRule
 
 MINIMUM_SIDE = 5
 """The shortest side of a map: a maze of two corridors between its walls."""
@@ -238,7 +239,7 @@ def random_requests(
     free cells is a ValueError.
     """
     cells = np.flatnonzero(~occupancy)
-    label_of_cell = component_labels(occupancy, move_rule).ravel()[cells]
+    label_of_cell = GridMap(occupancy).labels(move_rule).ravel()[cells]
     order = np.argsort(label_of_cell, kind="stable")
     cells, label_of_cell = cells[order], label_of_cell[order]
     sizes = np.bincount(label_of_cell)

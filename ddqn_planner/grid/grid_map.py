@@ -29,7 +29,8 @@ from ddqn_planner.grid.arguments import (
     real,
     whole_numbers,
 )
-from ddqn_planner.grid.moves import MOVES, MoveRule, legal_moves
+from ddqn_planner.grid.labels import component_labels, flood
+from ddqn_planner.grid.moves import MoveRule, legal_moves
 
 MAX_COST_MULTIPLIER = 5.0
 """The cost multiplier of a cell of value 100, and of an unknown cell.
@@ -146,12 +147,12 @@ class GridMap:
         ValueError
             If the values, the threshold or the arguments of `GridMap` are wrong.
         """
-        threshold = as_number("occupied_threshold", occupied_threshold, 1, OCCUPIED)
+        as_number("occupied_threshold", occupied_threshold, 1, OCCUPIED)
         array = whole_numbers("occupancy values", values, -128, 127)
         if array.dtype.kind == "f":  # these may be probabilities, 1.0 for occupied
             raise ValueError(f"occupancy values are of type {array.dtype}; give integers, percent")
         array = array.astype(np.int8, copy=False)
-        occupied = array >= threshold
+        occupied = array >= occupied_threshold
         if not as_flag("allow_unknown", allow_unknown):
             occupied |= array < 0
         with_costs = as_flag("use_map_costs", use_map_costs)
@@ -212,14 +213,14 @@ class GridMap:
         )
 
     def with_slowness(self, slowness: NDArray[np.float32], seconds_per_cell: float) -> GridMap:
-        """Return the same map with other expected times; it shares all other arrays with this one."""
+        """Return the same map with other expected times, which shares its other arrays."""
         return self.with_layers(
             slowness=_slowness(slowness, self.occupancy.shape),
             seconds_per_cell=_seconds(seconds_per_cell),
         )
 
     def with_layers(self, **layers: Any) -> GridMap:
-        """Return the same map with other layers, which are not checked, copied or writable again."""
+        """Return the same map with other layers, which are neither checked nor copied."""
         stale = {"cost_multiplier", "fingerprint"}
         if "occupancy" in layers:
             stale |= {"_labels", "_checksum"}
@@ -259,8 +260,6 @@ class GridMap:
 
     def labels(self, move_rule: MoveRule | str) -> NDArray[np.int32]:
         """Return the connected component of each cell, see `component_labels`; it is remembered."""
-        from ddqn_planner.grid.labels import component_labels  # which imports numba
-
         rule = MoveRule(move_rule)
         if rule.cuts_corners not in self._labels:
             self._labels[rule.cuts_corners] = component_labels(self.occupancy, rule)
@@ -281,8 +280,6 @@ class GridMap:
         if self.forbidden is None:
             labels = self.labels(move_rule)
             return np.isin(labels, labels[array[:, 1], array[:, 0]])
-        from ddqn_planner.grid.labels import flood
-
         return flood(self.legal_moves(move_rule), array, backward)
 
     @cached_property

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from ddqn_planner.compiled import compiled_now
+from ddqn_planner.compiled import compiled
 from ddqn_planner.grid.arguments import Occupancy
 from ddqn_planner.grid.moves import MOVES, MoveRule
 
@@ -23,7 +23,7 @@ def component_labels(occupancy: Occupancy, move_rule: MoveRule | str) -> NDArray
     return labels
 
 
-@compiled_now
+@compiled
 def _labels(free, reach):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Return (H, W) int32 labels, by union-find over the runs of free cells in each row.
 
@@ -75,9 +75,7 @@ def _labels(free, reach):  # type: ignore[no-untyped-def]  # pragma: no cover
     return labels
 
 
-def flood(
-    legal: NDArray[np.bool_], cells: NDArray[np.int64], backward: bool
-) -> NDArray[np.bool_]:
+def flood(legal: NDArray[np.bool_], cells: NDArray[np.int64], backward: bool) -> NDArray[np.bool_]:
     """Return (H, W) bool: the given cells (N, 2), and those to which legal moves lead from them.
 
     Or with `backward`, those from which legal moves lead to them.
@@ -88,7 +86,7 @@ def flood(
     return reached
 
 
-@compiled_now
+@compiled
 def _flood(legal, reached, moves, backward):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Mark all cells that are reached from those that are marked."""
     height, width = reached.shape

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as numpy_st
 from strategies import occupancies
 
-from ddqn_planner.grid import MOVES, UNKNOWN, Cell, MoveRule, connected_cells, legal_moves
+from ddqn_planner.grid import MOVES, UNKNOWN, Cell, GridMap, MoveRule, legal_moves
 from ddqn_planner.grid.generators import (
     KINDS,
     MINIMUM_SIDE,
@@ -218,7 +218,7 @@ def test_a_path_joins_start_and_goal_of_each_request(
     assert len(requests) == 5
     for start, goal in requests:
         assert start != goal
-        assert connected_cells(occupancy, start, rule)[goal[1], goal[0]]
+        assert GridMap(occupancy).reachable([start], rule)[goal[1], goal[0]]
 
 
 def test_requests_are_uniform_over_the_cells_that_have_a_move() -> None:

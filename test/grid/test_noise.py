@@ -9,7 +9,6 @@ from ddqn_planner.grid import (
     GridMap,
     MoveRule,
     Noise,
-    connected_cells,
     scatter_obstacles,
     shortest_path,
 )
@@ -32,7 +31,7 @@ def test_one_to_five_new_obstacles_lie_near_the_path_and_leave_a_path(
         distance = min(max(abs(x - px), abs(y - py)) for px, py in path)
         assert distance <= (0 if noise is Noise.ON_PATH else 1)
     start_x, start_y = paper.start
-    assert connected_cells(noisy.occupancy, paper.goal, rule)[start_y, start_x]
+    assert noisy.reachable([paper.goal], rule)[start_y, start_x]
 
 
 def test_all_counts_of_the_paper_are_drawn(paper: Scenario) -> None:
