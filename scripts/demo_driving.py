@@ -24,6 +24,7 @@ matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 import numpy as np
 from client import Client, Recorder, cells_of, pose, wait_for
+from driving_worlds import World, generated_world, path_seconds
 from geometry_msgs.msg import PoseStamped
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import LogNorm
@@ -34,7 +35,6 @@ from PIL import Image
 from processes import claim_ros_domain, run_script, running, running_node
 
 from ddqn_planner.experience.drive_recorder import ARRIVAL_DISTANCE
-from ddqn_planner.experiments.driving_worlds import World, generated_world, path_seconds
 from ddqn_planner.grid import Cell, GridMap, MoveRule, save_map
 from ddqn_planner.nodes.driving import SLOWEST
 from ddqn_planner.nodes.runtime import LATCHED

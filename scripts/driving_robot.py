@@ -16,6 +16,7 @@ import time
 
 import numpy as np
 from builtin_interfaces.msg import Time
+from driving_worlds import NOISE, SPEED, World, generated_world
 from geometry_msgs.msg import PoseStamped, TransformStamped
 from nav_msgs.msg import Odometry, Path
 from numpy.typing import NDArray
@@ -23,7 +24,6 @@ from rclpy.node import Node
 from std_msgs.msg import Header
 
 from ddqn_planner.experience.drive_recorder import ARRIVAL_DISTANCE
-from ddqn_planner.experiments.driving_worlds import NOISE, SPEED, World, generated_world
 from ddqn_planner.nodes.conversions import quaternion
 from ddqn_planner.nodes.runtime import LATCHED, STEADY, spin_until_shutdown
 

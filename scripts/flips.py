@@ -14,9 +14,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 from processes import run_script
+from tables import table
 
 from ddqn_planner import GridMap, MoveRule, Planner
-from ddqn_planner.benchmarks.tables import table
 from ddqn_planner.grid import Cell, path_cost, path_length
 from ddqn_planner.grid.arguments import Occupancy
 from ddqn_planner.grid.body import clearance

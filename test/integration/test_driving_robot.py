@@ -11,12 +11,12 @@ import numpy as np
 import pytest
 from client import Client
 from driving_robot import Robot
+from driving_worlds import World
 from geometry_msgs.msg import PoseStamped
 from nav_msgs.msg import Odometry
 from processes import running
 from std_msgs.msg import Header
 
-from ddqn_planner.experiments.driving_worlds import World
 from ddqn_planner.grid import Cell, GridMap, MoveRule, shortest_path
 
 

@@ -3,22 +3,20 @@
 from __future__ import annotations
 
 import csv
-import multiprocessing
-import os
-import signal
 import time
 from collections.abc import Callable, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
 from contextlib import closing
 from dataclasses import astuple, dataclass, fields
 from pathlib import Path
+from typing import Any, Final
 
+import joblib
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from profiles import MOVE_RULE
 from tqdm import tqdm
 
-from ddqn_planner.experiments.profiles import MOVE_RULE
 from ddqn_planner.files import write_csv
 from ddqn_planner.grid import neighbours
 from ddqn_planner.planning import Plan, Planner
@@ -27,6 +25,9 @@ from ddqn_planner.training.hyper_parameters import HyperParameters
 from ddqn_planner.training.run import TrainingRun
 from ddqn_planner.training.trainer import Trainer
 from ddqn_planner.training.value_iteration import value_iteration
+
+BACKENDS: Final = ("loky", "ray", "dask", "sequential")
+"""Of joblib: this machine's cores, two kinds of cluster, or one training after the other."""
 
 
 @dataclass(frozen=True)
@@ -61,32 +62,31 @@ class TrainingEvaluation:
     of the best policy; NaN for a network whose Q is not the return."""
 
 
-def in_parallel(job: Callable[[Training], None], trainings: Sequence[Training]) -> None:
-    """Call ``job(training)`` for each training, in one process per core.
+def in_parallel(
+    job: Callable[[Any], Any], items: Sequence[Any], backend: str = "loky", unit: str = "training"
+) -> list[Any]:
+    """Return ``job(item)`` for each item, in order: as many at a time as there are cores.
 
-    The first exception of a job is raised: running jobs are terminated, and no others start.
+    The first exception of a job is raised: running jobs are ended, and no others start.
     """
-    spawn = multiprocessing.get_context("spawn")
-    with (
-        ProcessPoolExecutor(os.cpu_count(), spawn, _prepare_process) as pool,
+    if backend == "ray":
+        from ray.util.joblib import register_ray
+
+        register_ray()
+    elif backend == "dask":
+        from distributed import Client
+
+        Client()  # of the scheduler that DASK_SCHEDULER_ADDRESS names, else of this machine
+    jobs = (joblib.delayed(_in_one_thread)(job, item) for item in items)
+    with joblib.parallel_config(backend, n_jobs=-1):
+        results = joblib.Parallel(return_as="generator")(jobs)
         # disable=None: no bar if the output is not a terminal.
-        tqdm(total=len(trainings), unit="training", disable=None) as bar,
-    ):
-        futures = [pool.submit(job, training) for training in trainings]
-        try:
-            for future in as_completed(futures):
-                future.result()
-                bar.update()
-        except BaseException:
-            for process in multiprocessing.active_children():
-                process.terminate()
-            raise
+        return list(tqdm(results, total=len(items), unit=unit, disable=None))
 
 
-def _prepare_process() -> None:
+def _in_one_thread(job: Callable[[Any], Any], item: Any) -> Any:
     torch.set_num_threads(1)
-    # Ctrl-C reaches every process of a shell's job; the main process decides which ones end.
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    return job(item)
 
 
 def train(training: Training) -> None:

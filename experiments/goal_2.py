@@ -5,23 +5,23 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
+import goal_1
 import matplotlib.pyplot as plt
 import numpy as np
 import torch
+from figures import draw_border, draw_map, draw_share, save_figure
 from numpy.typing import NDArray
+from profiles import MOVE_RULE, PROFILES, START_DEAD_END
+from settings import Settings, mean_and_worst, median_and_range
+from tables import write_table
+from trainings import Training
 
-from ddqn_planner.benchmarks.evaluation import length_ratios
-from ddqn_planner.benchmarks.tables import write_table
-from ddqn_planner.experiments import goal_1
-from ddqn_planner.experiments.figures import draw_border, draw_map, draw_share, save_figure
-from ddqn_planner.experiments.profiles import MOVE_RULE, PROFILES, START_DEAD_END
-from ddqn_planner.experiments.settings import Settings, mean_and_worst, median_and_range
-from ddqn_planner.experiments.trainings import Training
 from ddqn_planner.grid import MOVES, legal_moves
 from ddqn_planner.planning import Planner
 from ddqn_planner.planning.q_field import QField
 from ddqn_planner.training.encoders import PropagationEncoder
 from ddqn_planner.training.environment import GridVectorEnvironment, Scenario, paper_scenario
+from ddqn_planner.training.evaluation import length_ratios
 from ddqn_planner.training.networks import PropagationModule
 
 TITLE = "Goal ii: from every free cell"

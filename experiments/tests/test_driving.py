@@ -4,18 +4,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-
-from ddqn_planner.cli import main
-from ddqn_planner.experiments.driving import (
-    LAST,
-    LEARNED,
-    MEAN,
-    PLANNERS,
-    CellTimes,
-    Job,
-    run,
-)
-from ddqn_planner.experiments.driving_worlds import (
+from driving import main
+from driving_worlds import (
     HOUR,
     KINDS,
     NOISE,
@@ -26,6 +16,16 @@ from ddqn_planner.experiments.driving_worlds import (
     path_seconds,
     with_faults,
 )
+from missions import (
+    LAST,
+    LEARNED,
+    MEAN,
+    PLANNERS,
+    CellTimes,
+    Job,
+    run,
+)
+
 from ddqn_planner.grid import GridMap, MoveRule
 from ddqn_planner.planning import Planner
 
@@ -105,9 +105,9 @@ def test_no_planner_is_faster_than_the_one_that_knows() -> None:
 def test_the_experiment_writes_its_report(
     capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
-    command = ["experiment", "driving", "--quick", "--seeds", "1", "--out", str(tmp_path)]
+    command = ["--backend", "sequential", "--quick", "--seeds", "1", "--out", str(tmp_path)]
     assert main(command) == 0
-    folder = tmp_path / "driving" / "quick"
+    folder = tmp_path / "quick"
     assert "| learned | 1." in capsys.readouterr().out
     assert {path.name for path in folder.iterdir()} >= {
         "report.md",
@@ -122,5 +122,5 @@ def test_the_experiment_writes_its_report(
 
 
 def test_wrong_options_are_refused(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
-    assert main(["experiment", "driving", "--seeds", "0", "--out", str(tmp_path)]) == 2
+    assert main(["--seeds", "0", "--out", str(tmp_path)]) == 2
     assert "--seeds is 0" in capsys.readouterr().err

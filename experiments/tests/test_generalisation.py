@@ -8,30 +8,30 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import generalisation
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
-from networks import random_network
-
-from ddqn_planner.benchmarks import generalisation
-from ddqn_planner.benchmarks.generalisation import (
-    Rollout,
-    Summary,
-    illegal_moves,
-    markdown,
-    measure,
-    summarise,
-)
-from ddqn_planner.benchmarks.map_files import describe_files, find_files, read_maps
-from ddqn_planner.benchmarks.maps import (
+from benchmark_files import describe_files, find_files, read_maps
+from benchmark_maps import (
     COSTS,
     GOALS,
     BenchmarkMap,
     RequestSettings,
     generated_maps,
 )
-from ddqn_planner.cli import main
+from generalisation import (
+    Rollout,
+    Summary,
+    illegal_moves,
+    main,
+    markdown,
+    measure,
+    summarise,
+)
+from hypothesis import given
+from hypothesis import strategies as st
+from networks import random_network
+
 from ddqn_planner.grid import (
     MOVES,
     Cell,
@@ -426,7 +426,7 @@ def test_evaluate_prints_and_writes_its_tables(
     capsys: pytest.CaptureFixture[str], tmp_path: Path, model: str, ending: str
 ) -> None:
     out = tmp_path / "deeper" / f"tables.{ending}"
-    command = ["evaluate", "--model", model, "--kinds", "maze", "random_10", "--sizes", "8", "16"]
+    command = ["--model", model, "--kinds", "maze", "random_10", "--sizes", "8", "16"]
     assert main([*command, "--maps", "2", "--requests", "12", "--out", str(out)]) == 0
     printed = capsys.readouterr().out
     assert f"Model {model} (propagation, 1,000 steps, seed 3), move rule robot_safe" in printed
@@ -449,7 +449,7 @@ def test_evaluate_gives_free_cells_the_costs_asked_for(tmp_path: Path, model: st
     means = {}
     for costs in ("none", "random"):
         out = tmp_path / f"{costs}.csv"
-        command = ["evaluate", "--model", model, "--kinds", "random_10", "--sizes", "16"]
+        command = ["--model", model, "--kinds", "random_10", "--sizes", "16"]
         assert main([*command, "--costs", costs, "--out", str(out)]) == 0
         means[costs] = float(list(csv.DictReader(out.read_text().splitlines()))[-1]["mean"])
     assert means["random"] > 1.1 * means["none"]  # this model does not see them
@@ -463,7 +463,7 @@ def test_evaluate_says_which_sets_it_found(
     write_moving_ai(data, "c", CORNER, ["0 c.map 3 3 0 0 0 2 2"])
     write_mpd(data / "m.npz")
     (data / "LICENCE").write_text("free")
-    command = ["evaluate", "--model", model, "--data", str(data), "--move-rule", "unit"]
+    command = ["--model", model, "--data", str(data), "--move-rule", "unit"]
     assert main(command) == 0
     printed, error = capsys.readouterr()
     assert "1 MovingAI maps, 1 MovingAI scenario files, 1 MPD files" in error
@@ -488,7 +488,7 @@ def test_evaluate_says_which_sets_it_found(
 def test_evaluate_refuses_bad_input_with_its_name(
     capsys: pytest.CaptureFixture[str], model: str, arguments: list[str], named: str
 ) -> None:
-    assert main(["evaluate", "--model", model, *arguments]) == 2
+    assert main(["--model", model, *arguments]) == 2
     error = capsys.readouterr().err
     assert re.search(named, error)
     assert "Traceback" not in error
@@ -499,7 +499,7 @@ def test_evaluate_ends_with_2_if_no_file_can_be_read(
 ) -> None:
     (tmp_path / "data").mkdir()
     (tmp_path / "data" / "compose.yaml").write_text("services: {}")
-    assert main(["evaluate", "--model", model, "--data", str(tmp_path / "data")]) == 2
+    assert main(["--model", model, "--data", str(tmp_path / "data")]) == 2
     error = capsys.readouterr().err
     assert "compose.yaml" in error
     assert "none of its files has a request" in error
@@ -514,7 +514,7 @@ def test_an_interrupted_evaluation_prints_what_it_has(
         raise KeyboardInterrupt
 
     monkeypatch.setattr(generalisation, "measure", interrupted)
-    assert main(["evaluate", "--model", model, "--kinds", "maze", "--sizes", "8"]) == 130
+    assert main(["--model", model, "--kinds", "maze", "--sizes", "8"]) == 130
     printed, error = capsys.readouterr()
     assert "| all | all | 2 | 250 |" in printed
     assert "interrupted" in error

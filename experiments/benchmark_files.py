@@ -12,14 +12,14 @@ from pathlib import Path
 from typing import Final
 
 import numpy as np
-from tqdm import tqdm
-
-from ddqn_planner.benchmarks.maps import (
+from benchmark_maps import (
     BenchmarkMap,
     RequestSettings,
     random_starts,
     with_random_requests,
 )
+from tqdm import tqdm
+
 from ddqn_planner.grid import Cell, GridMap, MoveRule, read_map_file
 from ddqn_planner.grid.moves import component_labels
 

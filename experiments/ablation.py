@@ -4,15 +4,14 @@ from __future__ import annotations
 
 import csv
 
+import goal_1
 import matplotlib.pyplot as plt
 import numpy as np
-
-from ddqn_planner.benchmarks.tables import write_table
-from ddqn_planner.experiments import goal_1
-from ddqn_planner.experiments.figures import Curve, draw_curves, save_figure, share_curve
-from ddqn_planner.experiments.profiles import PROFILES, VARIANTS
-from ddqn_planner.experiments.settings import Settings
-from ddqn_planner.experiments.trainings import Training
+from figures import Curve, draw_curves, save_figure, share_curve
+from profiles import PROFILES, VARIANTS
+from settings import Settings
+from tables import write_table
+from trainings import Training
 
 TITLE = "Goal i: the ablation"
 

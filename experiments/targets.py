@@ -6,15 +6,15 @@ from dataclasses import replace
 
 import matplotlib.pyplot as plt
 import numpy as np
+from figures import draw_curves, evaluation_curve, save_figure, share_curve
+from goal_2 import count_solved, free_starts
+from profiles import MOVE_RULE, PROFILES
+from settings import Settings, median_and_range
+from tables import write_table
+from trainings import Training
 
-from ddqn_planner.benchmarks.evaluation import length_ratios
-from ddqn_planner.benchmarks.tables import write_table
-from ddqn_planner.experiments.figures import draw_curves, evaluation_curve, save_figure, share_curve
-from ddqn_planner.experiments.goal_2 import count_solved, free_starts
-from ddqn_planner.experiments.profiles import MOVE_RULE, PROFILES
-from ddqn_planner.experiments.settings import Settings, median_and_range
-from ddqn_planner.experiments.trainings import Training
 from ddqn_planner.training.environment import paper_scenario
+from ddqn_planner.training.evaluation import length_ratios
 
 TITLE = "What the printed target does"
 

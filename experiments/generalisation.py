@@ -1,8 +1,14 @@
-"""Measures greedy rollouts of a model on maps that it never saw, and compares with Dijkstra."""
+"""Measure greedy rollouts of a model on maps that it never saw.
+
+Starts and goals are random, maps are generated or those of benchmarks. Costs are compared with the
+exact optimum, times with those of scipy's Dijkstra.
+"""
 
 from __future__ import annotations
 
+import argparse
 import math
+import sys
 import time
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
@@ -12,10 +18,13 @@ from pathlib import Path
 from typing import Any, Final, TypeAlias
 
 import numpy as np
+from benchmark_files import describe_files, find_files, read_maps
+from benchmark_maps import COSTS, BenchmarkMap, RequestSettings, generated_maps
 from numpy.typing import NDArray
+from tables import table
+from tqdm import tqdm
 
-from ddqn_planner.benchmarks.maps import BenchmarkMap
-from ddqn_planner.benchmarks.tables import table
+from ddqn_planner.cli import HelpFormatter, exit_code
 from ddqn_planner.files import write_atomically, write_csv
 from ddqn_planner.grid import (
     MOVES,
@@ -26,6 +35,7 @@ from ddqn_planner.grid import (
     path_cost,
     shortest_distances,
 )
+from ddqn_planner.grid.generators import KINDS
 from ddqn_planner.planning import Planner, QField
 
 OPTIMAL = 1 + 1e-6
@@ -218,3 +228,66 @@ def write_report(path: Path, rollouts: Sequence[Rollout], text: str) -> None:
         write_csv(path, [*summaries[0]], [[*summary.values()] for summary in summaries])
     else:
         write_atomically(path, text.encode())
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the program; return the exit code."""
+    parser = argparse.ArgumentParser(
+        "generalisation.py", None, __doc__, formatter_class=HelpFormatter
+    )
+    add = parser.add_argument
+    add("--model", default="any_map", help="name or file")
+    rules = [rule.value for rule in MoveRule]
+    add("--move-rule", choices=rules, default="robot_safe", help="which diagonal moves are legal")
+    data = "MovingAI .map and .scen, MPD .npz, ROS .yaml instead of generated maps"
+    add("--data", type=Path, metavar="FOLDER", help=data)
+    add("--kinds", nargs="+", choices=KINDS, default=[*KINDS], help="kinds of generated maps")
+    add("--sizes", nargs="+", type=int, default=[32, 64, 128, 256], help="sides of maps, cells")
+    add("--maps", type=int, default=3, metavar="N", help="maps per kind and size")
+    add("--requests", type=int, default=200, metavar="N", help="requests per map")
+    add("--costs", choices=COSTS, default="none", help="costs of free cells")
+    add("--seed", type=int, default=0, help="seed of maps and requests")
+    add("--out", type=Path, metavar="FILE", help="a .md or .csv file for the tables")
+    options = parser.parse_args(arguments)
+    return exit_code(parser.prog, lambda: run(options))
+
+
+def run(options: argparse.Namespace) -> int:
+    """Run the program with its options; return the exit code."""
+    if options.maps < 1:
+        raise ValueError(f"--maps is {options.maps}; give at least 1")
+    if options.out and options.out.suffix.lower() not in (".csv", ".md"):
+        raise ValueError(f"--out is {options.out}; give a file that ends in .csv or .md")
+    rule = MoveRule(options.move_rule)
+    settings = RequestSettings(rule, options.requests, options.costs, options.seed)
+    planner = Planner.load(options.model)
+    maps = generated_maps(options.kinds, options.sizes, options.maps, settings)
+    if options.data:
+        files = find_files(options.data)
+        print(f"found in {options.data}: {describe_files(files)}", file=sys.stderr)
+        maps = read_maps(files, settings)
+    rollouts = []
+    interrupted = False
+    try:
+        for rollout in measure(planner, tqdm(maps, unit="map", disable=None), rule):
+            rollouts.append(rollout)
+    except KeyboardInterrupt:
+        interrupted = True
+        print("interrupted; the tables hold the maps so far", file=sys.stderr)
+    if rollouts:
+        model = planner.metadata
+        text = markdown(
+            rollouts,
+            f"Model {options.model} ({model.network}, {model.steps:,} steps, seed {model.seed}), "
+            f"move rule {rule.value}, costs {options.costs}, requests of seed {options.seed}.",
+        )
+        print(text, end="")
+        if options.out:
+            write_report(options.out, rollouts, text)
+    elif not interrupted:
+        raise ValueError(f"{options.data}: none of its files has a request; see above")
+    return 130 if interrupted else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

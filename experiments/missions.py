@@ -2,20 +2,14 @@
 
 from __future__ import annotations
 
-import multiprocessing
 import time
-from collections.abc import Callable, Sequence
-from concurrent.futures import ProcessPoolExecutor
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
-from tqdm import tqdm
-
-from ddqn_planner.experience import Experience
-from ddqn_planner.experiments.driving_worlds import (
+from driving_worlds import (
     KINDS,
     SPEED,
     STATIONS,
@@ -27,6 +21,9 @@ from ddqn_planner.experiments.driving_worlds import (
     slow_zones,
     with_faults,
 )
+from numpy.typing import NDArray
+
+from ddqn_planner.experience import Experience
 from ddqn_planner.grid import Cell, GridMap, MoveRule, inflate, load_map
 from ddqn_planner.grid.arguments import MAX_SLOWNESS
 from ddqn_planner.planning import Planner
@@ -155,13 +152,6 @@ def run(job: Job) -> Result:
         clock += measured.duration
     arrays = {name: np.array(values) for name, values in seconds.items() if values}
     return Result(job, np.array(best), arrays, np.array(forecast))
-
-
-def run_all(jobs: Sequence[Job], function: Callable[[Job], Any] = run) -> list[Any]:
-    """Run jobs, one process per core; return their results in order."""
-    spawn = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(mp_context=spawn) as pool:
-        return list(tqdm(pool.map(function, jobs), total=len(jobs), unit="world", disable=None))
 
 
 def jobs_of(kinds: Sequence[str], seeds: int, quick: bool) -> list[Job]:

@@ -10,10 +10,10 @@ from __future__ import annotations
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from profiles import MOVE_RULE
 from torch import Tensor
+from trainings import Training
 
-from ddqn_planner.experiments.profiles import MOVE_RULE
-from ddqn_planner.experiments.trainings import Training
 from ddqn_planner.grid import LENGTHS, legal_moves, neighbours, shortest_distances
 from ddqn_planner.training.environment import Scenario
 from ddqn_planner.training.trainer import Trainer

@@ -6,12 +6,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-
-from ddqn_planner.benchmarks.tables import table, write_table
-from ddqn_planner.experiments.profiles import MOVE_RULE
-from ddqn_planner.experiments.settings import first_kept, mean_and_worst, median_and_range
-from ddqn_planner.experiments.supervised import best_moves, cross_entropy, train_supervised
-from ddqn_planner.experiments.trainings import (
+from profiles import MOVE_RULE
+from settings import first_kept, mean_and_worst, median_and_range
+from supervised import best_moves, cross_entropy, train_supervised
+from tables import table, write_table
+from trainings import (
     Training,
     TrainingEvaluation,
     evaluate_training,
@@ -20,6 +19,7 @@ from ddqn_planner.experiments.trainings import (
     read_evaluations,
     train,
 )
+
 from ddqn_planner.grid import LENGTHS, MOVES, shortest_distances
 from ddqn_planner.model import load_model
 from ddqn_planner.planning import Planner

@@ -3,9 +3,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from ddqn_planner.benchmarks.evaluation import Evaluation, evaluate, length_ratios
 from ddqn_planner.grid import GridMap, MoveRule, legal_moves
 from ddqn_planner.planning import QField
+from ddqn_planner.training.evaluation import Evaluation, evaluate, length_ratios
 
 RULE = MoveRule.ROBOT_SAFE
 GRID = GridMap(np.array([[0, 0, 0, 1, 0], [0, 0, 0, 1, 0]]))

@@ -6,14 +6,14 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any, Final
 
+import goal_1
+import goal_3
 import numpy as np
+from profiles import MOVE_RULE
+from settings import Settings, median_and_range
+from tables import write_table
+from trainings import Training, rollouts, solved
 
-from ddqn_planner.benchmarks.evaluation import evaluate
-from ddqn_planner.benchmarks.tables import write_table
-from ddqn_planner.experiments import goal_1, goal_3
-from ddqn_planner.experiments.profiles import MOVE_RULE
-from ddqn_planner.experiments.settings import Settings, median_and_range
-from ddqn_planner.experiments.trainings import Training, rollouts, solved
 from ddqn_planner.grid import (
     OCCUPIED,
     UNKNOWN,
@@ -28,6 +28,7 @@ from ddqn_planner.model import AnyMapQNetwork
 from ddqn_planner.planning import Planner
 from ddqn_planner.training.any_map import ANY_MAP, RULES, random_scenarios
 from ddqn_planner.training.environment import paper_scenario
+from ddqn_planner.training.evaluation import evaluate
 
 TITLE = "The model for any map"
 

@@ -9,12 +9,12 @@ from functools import partial
 
 import matplotlib.pyplot as plt
 import numpy as np
+from figures import draw_map, draw_path, save_figure
+from profiles import PROFILES, VARIANTS
+from settings import Settings, first_kept, median_and_range, optimal_length
+from tables import table, write_table
+from trainings import Training, TrainingEvaluation
 
-from ddqn_planner.benchmarks.tables import table, write_table
-from ddqn_planner.experiments.figures import draw_map, draw_path, save_figure
-from ddqn_planner.experiments.profiles import PROFILES, VARIANTS
-from ddqn_planner.experiments.settings import Settings, first_kept, median_and_range, optimal_length
-from ddqn_planner.experiments.trainings import Training, TrainingEvaluation
 from ddqn_planner.grid import Cell, MoveRule, legal_moves, path_length
 from ddqn_planner.planning import Planner
 from ddqn_planner.planning.search import search

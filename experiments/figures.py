@@ -15,8 +15,8 @@ from matplotlib.colors import BoundaryNorm, ListedColormap
 from matplotlib.patches import Rectangle
 from matplotlib.patheffects import withStroke
 from numpy.typing import NDArray
+from trainings import TrainingEvaluation
 
-from ddqn_planner.experiments.trainings import TrainingEvaluation
 from ddqn_planner.grid import Cell, GridMap
 from ddqn_planner.pictures.picture import draw_obstacles
 from ddqn_planner.training.environment import Scenario

@@ -1,7 +1,9 @@
-"""The tables and figures of `ddqn_planner.experiments.driving`."""
+"""Measure what driving teaches, with many seeds, and write tables and figures."""
 
 from __future__ import annotations
 
+import argparse
+import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -11,13 +13,10 @@ import matplotlib
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 import numpy as np
+from driving_worlds import KINDS, SPEED, drive
 from matplotlib.colors import LogNorm
 from matplotlib.patheffects import withStroke
-from numpy.typing import NDArray
-
-from ddqn_planner.benchmarks.tables import write_table
-from ddqn_planner.experience import Experience
-from ddqn_planner.experiments.driving import (
+from missions import (
     LEARNED,
     MOVED_AT,
     PLANNERS,
@@ -28,10 +27,15 @@ from ddqn_planner.experiments.driving import (
     Result,
     jobs_of,
     map_files,
-    run_all,
+    run,
     update_times,
 )
-from ddqn_planner.experiments.driving_worlds import KINDS, SPEED, drive
+from numpy.typing import NDArray
+from tables import write_table
+from trainings import BACKENDS, in_parallel
+
+from ddqn_planner.cli import HelpFormatter, exit_code
+from ddqn_planner.experience import Experience
 from ddqn_planner.files import write_atomically
 from ddqn_planner.grid import MoveRule
 from ddqn_planner.pictures.picture import draw_obstacles
@@ -45,10 +49,12 @@ SMOOTHED = 10
 """Missions that a point of the curve averages."""
 
 
-def report(out: Path, seeds: int, quick: bool = False, maps: Path | None = None) -> str:
+def report(
+    out: Path, seeds: int, quick: bool = False, maps: Path | None = None, backend: str = "loky"
+) -> str:
     """Run the experiment, write its tables, figures and ``report.md``, and return the text."""
     out.mkdir(parents=True, exist_ok=True)
-    results = run_all(jobs_of(KINDS, seeds, quick))
+    results = in_parallel(run, jobs_of(KINDS, seeds, quick), backend, "world")
     plain = [result for result in results if not result.job.faults]
     faulty = [result for result in results if result.job.faults]
     sections = [
@@ -62,7 +68,7 @@ def report(out: Path, seeds: int, quick: bool = False, maps: Path | None = None)
         _picture(out / "driving_map.png"),
     ]
     if maps is not None:
-        results = run_all(jobs_of(map_files(maps), seeds, quick))
+        results = in_parallel(run, jobs_of(map_files(maps), seeds, quick), backend, "world")
         of_maps = [result for result in results if not result.job.faults]
         sections.append("### Maps from files\n\n" + _stages(out / "maps.csv", of_maps))
         sections.append(_worlds(out / "maps_worlds.csv", of_maps))
@@ -234,3 +240,31 @@ def _saved(figure: Any, path: Path, caption: str) -> str:
     figure.savefig(path, dpi=110)
     plt.close(figure)
     return f"![{caption}]({path.name})"
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the program; return the exit code."""
+    parser = argparse.ArgumentParser("driving.py", None, __doc__, formatter_class=HelpFormatter)
+    add = parser.add_argument
+    add("--seeds", type=int, default=5, metavar="N", help="worlds of each kind")
+    add("--out", type=Path, default=Path("runs/driving"), help="folder of the report")
+    add("--maps", type=Path, metavar="FOLDER", help="measure on the ROS maps of a folder too")
+    add("--quick", action="store_true", help="fewer missions, into the folder quick")
+    words = "what drives the missions: this machine's cores, or a cluster"
+    add("--backend", choices=BACKENDS, default="loky", help=words)
+    options = parser.parse_args(arguments)
+    return exit_code(parser.prog, lambda: run_report(options))
+
+
+def run_report(options: argparse.Namespace) -> int:
+    """Run the program with its options; return the exit code."""
+    if options.seeds < 1:
+        raise ValueError(f"--seeds is {options.seeds}; give at least 1")
+    out = options.out / "quick" if options.quick else options.out
+    print(report(out, options.seeds, options.quick, options.maps, options.backend))
+    print(f"saved {out / 'report.md'}")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

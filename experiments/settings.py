@@ -8,9 +8,9 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
+from profiles import HIDDEN_UNITS, MOVE_RULE
+from trainings import Training, TrainingEvaluation, read_evaluations
 
-from ddqn_planner.experiments.profiles import HIDDEN_UNITS, MOVE_RULE
-from ddqn_planner.experiments.trainings import Training, TrainingEvaluation, read_evaluations
 from ddqn_planner.grid import Noise, shortest_distances
 from ddqn_planner.planning import Planner
 from ddqn_planner.training.environment import Scenario
@@ -19,7 +19,7 @@ from ddqn_planner.training.hyper_parameters import HyperParameters
 
 @dataclass(frozen=True)
 class Settings:
-    """The options of ``ddqn-planner reproduce``."""
+    """The options of ``reproduce.py``."""
 
     out: Path
     """Folder of the trainings, tables, figures and the report."""
@@ -30,6 +30,8 @@ class Settings:
     noise: tuple[Noise, ...] = tuple(Noise)
     hidden_units: tuple[int, ...] = HIDDEN_UNITS
     """With the noise the readings of goal iii: hidden layers of the paper's network."""
+    backend: str = "loky"
+    """Where the trainings run; see `in_parallel`."""
 
     def options(self) -> str:
         """Return the options of the command line that give these settings, except the folder."""

@@ -13,13 +13,13 @@ from strategies import grids_with_free_cell
 
 pytest.importorskip("matplotlib", reason="matplotlib, of the extra experiments, is missing")
 
-from ddqn_planner.benchmarks.evaluation import length_ratios
-from ddqn_planner.experiments import any_map
-from ddqn_planner.experiments.goal_1 import a_star, convergence_row
-from ddqn_planner.experiments.goal_2 import free_starts, trained_field
-from ddqn_planner.experiments.goal_3 import fixed_path, noisy_maps
-from ddqn_planner.experiments.profiles import MOVE_RULE, PROFILES, VARIANTS
-from ddqn_planner.experiments.trainings import TrainingEvaluation
+import any_map
+from goal_1 import a_star, convergence_row
+from goal_2 import free_starts, trained_field
+from goal_3 import fixed_path, noisy_maps
+from profiles import MOVE_RULE, PROFILES, VARIANTS
+from trainings import TrainingEvaluation
+
 from ddqn_planner.grid import (
     MOVES,
     Cell,
@@ -34,6 +34,7 @@ from ddqn_planner.grid import (
 from ddqn_planner.model import ModelMetadata
 from ddqn_planner.planning import Planner
 from ddqn_planner.training.environment import Scenario
+from ddqn_planner.training.evaluation import length_ratios
 
 
 @given(grids_with_free_cell(), st.sampled_from(list(MoveRule)), st.data())

@@ -12,18 +12,18 @@ from typing import Any, Final, NamedTuple
 
 import matplotlib.pyplot as plt
 import numpy as np
-
-from ddqn_planner.benchmarks.tables import write_table
-from ddqn_planner.experiments.figures import draw_map, draw_new_obstacles, draw_path, save_figure
-from ddqn_planner.experiments.profiles import MOVE_RULE, PROFILES
-from ddqn_planner.experiments.settings import (
+from figures import draw_map, draw_new_obstacles, draw_path, save_figure
+from profiles import MOVE_RULE, PROFILES
+from settings import (
     Settings,
     mean_and_worst,
     median_and_range,
     optimal_length,
 )
-from ddqn_planner.experiments.supervised import train_supervised
-from ddqn_planner.experiments.trainings import Training, in_parallel, rollouts, solved
+from supervised import train_supervised
+from tables import write_table
+from trainings import Training, in_parallel, rollouts, solved
+
 from ddqn_planner.grid import Cell, Noise, legal_moves, scatter_obstacles, shortest_path
 from ddqn_planner.planning import Plan, PlanStatus
 from ddqn_planner.planning.search import search
@@ -145,7 +145,7 @@ def fixed_path(maps: Sequence[Scenario]) -> tuple[Cell, ...]:
 
 def report(settings: Settings) -> str:
     """Write the table and the figure of goal iii, and return its Markdown."""
-    in_parallel(train_supervised, supervised_trainings(settings))
+    in_parallel(train_supervised, supervised_trainings(settings), settings.backend)
     rows, drawn = [], []
     for noise in settings.noise:
         maps = drawn_maps(settings, noise)
