@@ -17,7 +17,6 @@ COMMANDS: Final = {
     "train-any-map": "train a model for any map on random maps",
     "certify": "prove which moves a model takes for possible",
     "learn": "learn from recorded drives how long places take",
-    "watch": "show live what the ROS nodes publish",
 }
 """Each is a module of `ddqn_planner.commands`."""
 
@@ -60,7 +59,7 @@ def exit_code(program: str, run: Callable[[], int]) -> int:
     """Return what a program returns, or 2 after a line that names its error."""
     try:
         return run()
-    except (OSError, ValueError, ImportError) as error:
+    except (OSError, ValueError, ImportError, MemoryError) as error:
         print(f"{program}: {with_remedy(error)}", file=sys.stderr)
         return 2
 

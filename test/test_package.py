@@ -20,7 +20,6 @@ ROOMS = [
     "model",
     "planning",
     "experience",
-    "pictures",
     "training",
     "nodes",
     "commands",

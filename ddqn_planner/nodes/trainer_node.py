@@ -341,13 +341,11 @@ def import_training() -> None:
 def _with_remedy(error: Exception) -> str:
     if isinstance(error, OSError):
         return f"{error}; set output_folder to a folder that can be written"
-    if isinstance(error, ValueError):
+    if isinstance(error, (ValueError, MemoryError)):
         return str(error)
     if isinstance(error, ImportError):
         return f"training needs another library: {with_remedy(error)}"
-    from ddqn_planner.training.memory import REMEDY
-
-    return f"{error!r}; {REMEDY}"
+    return repr(error)
 
 
 def main() -> int:
