@@ -1,11 +1,11 @@
-"""``ddqn-planner``: planning, training and experiments from a shell."""
+"""``ddqn-planner``: planning and training from a shell."""
 
 from __future__ import annotations
 
 import argparse
 import os
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from importlib import import_module
 from typing import Final
 
@@ -15,12 +15,8 @@ COMMANDS: Final = {
     "plan": "plan a path on a map file",
     "train": "train a model on a map file",
     "train-any-map": "train a model for any map on random maps",
-    "evaluate": "measure a model on maps that it never saw",
     "certify": "prove which moves a model takes for possible",
-    "reproduce": "train and measure the paper's experiments",
-    "experiment": "measure what driving teaches",
     "learn": "learn from recorded drives how long places take",
-    "watch": "show live what the ROS nodes publish",
 }
 """Each is a module of `ddqn_planner.commands`."""
 
@@ -44,7 +40,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     arguments = sys.argv[1:] if arguments is None else arguments
     parser = argparse.ArgumentParser(prog="ddqn-planner", description=__doc__.replace("`", ""))
     commands = parser.add_subparsers(required=True, metavar="|".join(COMMANDS))
-    try:
+
+    def run() -> int:
         for name, words in COMMANDS.items():
             command = commands.add_parser(name, help=words, formatter_class=HelpFormatter)
             if name in arguments[:1]:  # the other commands' modules would take long to import
@@ -54,8 +51,16 @@ def main(arguments: Sequence[str] | None = None) -> int:
                 module.add_options(command)
         options = parser.parse_args(arguments)
         return int(options.run(options))
-    except (OSError, ValueError, ImportError) as error:
-        print(f"ddqn-planner: {with_remedy(error)}", file=sys.stderr)
+
+    return exit_code(parser.prog, run)
+
+
+def exit_code(program: str, run: Callable[[], int]) -> int:
+    """Return what a program returns, or 2 after a line that names its error."""
+    try:
+        return run()
+    except (OSError, ValueError, ImportError, MemoryError) as error:
+        print(f"{program}: {with_remedy(error)}", file=sys.stderr)
         return 2
 
 

@@ -14,13 +14,7 @@ import numpy as np
 from ddqn_planner.commands.options import add_map_options, add_move_rule, read_map
 from ddqn_planner.files import write_csv
 from ddqn_planner.grid import GridMap, inflate, path_length
-from ddqn_planner.pictures import (
-    MAX_TEXT_WIDTH,
-    draw_blocks,
-    draw_text,
-    save_animation,
-    save_picture,
-)
+from ddqn_planner.pictures import MAX_TEXT_WIDTH, draw_blocks, draw_text, save_picture
 from ddqn_planner.planning import Plan, PlanMethod, Planner
 from ddqn_planner.planning.search import search
 
@@ -49,13 +43,10 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     add("--csv", type=Path, metavar="FILE", help="write the path's cells and their metres")
     add("--json", action="store_true", help="print JSON instead of text")
     add("--picture", type=Path, metavar="FILE", help="draw map, value and path")
-    add("--animate", type=Path, metavar="FILE", help="draw how value and path grow, a .gif")
 
 
 def run(options: argparse.Namespace) -> int:
     """Run the command; return the exit code."""
-    if options.animate and options.animate.suffix.lower() != ".gif":
-        raise ValueError(f"--animate is {options.animate}; give a file that ends in .gif")
     for name in ("tolerance", "start_clearing_radius"):
         if not getattr(options, name) >= 0:
             option = name.replace("_", "-")
@@ -83,18 +74,12 @@ def run(options: argparse.Namespace) -> int:
     if options.csv:
         rows = ((*cell, *np.round(grid.cell_to_world(cell), 6)) for cell in plan.cells)
         write_csv(options.csv, ("x", "y", "x_metres", "y_metres"), rows)
-    if plan.cells:
-        goal = plan.cells[-1]  # another one if it moved within the tolerance
-    if options.picture or options.animate:
+    if options.picture:
         value = None
-        if grid.is_free(goal) and planner.network.supports((grid.height, grid.width)):
-            value = planner.q_field(grid, goal, plan.move_rule).value
-        if options.picture:
-            title = f"{plan.length:.2f} cells" if plan.cells else plan.status.value
-            shown = value if plan.cells else None
-            save_picture(options.picture, grid, plan.cells, shown, title)
-        if options.animate:
-            save_animation(options.animate, grid, start, goal, value, plan.cells)
+        if plan.cells and planner.network.supports((grid.height, grid.width)):
+            value = planner.q_field(grid, plan.cells[-1], plan.move_rule).value
+        title = f"{plan.length:.2f} cells" if plan.cells else plan.status.value
+        save_picture(options.picture, grid, plan.cells, value, title)
     return 0 if plan.cells else 1
 
 

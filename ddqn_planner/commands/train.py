@@ -13,10 +13,10 @@ from pathlib import Path
 import torch
 from tqdm import tqdm
 
-from ddqn_planner.benchmarks.evaluation import evaluate
 from ddqn_planner.commands.options import add_map_options, add_move_rule, read_map
 from ddqn_planner.grid import MoveRule
 from ddqn_planner.training.environment import Scenario
+from ddqn_planner.training.evaluation import evaluate
 from ddqn_planner.training.hyper_parameters import HyperParameters
 from ddqn_planner.training.run import TrainingRun
 

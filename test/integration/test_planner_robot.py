@@ -353,7 +353,7 @@ def transformed(
     """Run a planner with a map that asks TF where it is, with so many times its patience."""
     (tmp_path / "tf2_ros.py").write_text(TF2_ROS)
     (tmp_path / "sitecustomize.py").write_text(
-        "import ddqn_planner.nodes.start_source as source\n"
+        "import ddqn_planner.nodes.poses as source\n"
         f"source.PATIENCE *= {getattr(request, 'param', 1)}\n"
     )
     monkeypatch.setenv("PYTHONPATH", str(tmp_path), prepend=":")

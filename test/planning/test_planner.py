@@ -25,7 +25,6 @@ from ddqn_planner import (
     inflate,
     simplify,
 )
-from ddqn_planner.benchmarks.evaluation import evaluate
 from ddqn_planner.grid import (
     LENGTHS,
     MOVES,
@@ -37,6 +36,7 @@ from ddqn_planner.grid import (
 )
 from ddqn_planner.model import ModelMetadata
 from ddqn_planner.planning import PlanRequest
+from ddqn_planner.training.evaluation import evaluate
 
 RULES = st.sampled_from(list(MoveRule))
 ANY_MAP = Planner.load("any_map")
