@@ -43,7 +43,6 @@ setup(
         "ros": ["ros-jazzy-rclpy[fastrtps]>=7.1.5,<8", "ros-jazzy-common-interfaces>=5.3,<6"],
         "figures": ["matplotlib>=3.6"],
         "experiments": ["joblib>=1.3", "matplotlib>=3.6"],
-        "tensorboard": ["tensorboard>=2.10"],
         "bags": ["mcap-ros2-support>=0.5"],
         "watch": ["rerun-sdk>=0.39"],
         "docs": ["furo", "myst-parser>=3.0", "sphinx>=7.3"],

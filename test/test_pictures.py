@@ -8,9 +8,7 @@ import pytest
 from PIL import Image
 
 from ddqn_planner.grid import GridMap
-from ddqn_planner.pictures import draw_blocks, draw_text, save_picture
-from ddqn_planner.pictures.colours import VALUE_COLOURS, value_ramp
-from ddqn_planner.pictures.picture import TERMINAL
+from ddqn_planner.pictures import TERMINAL, draw_blocks, draw_text, save_picture
 
 
 def test_a_map_as_text_has_its_first_row_below() -> None:
@@ -39,12 +37,6 @@ def test_a_wide_map_fits_into_its_terminal() -> None:
     tall = draw_blocks(grid, cells, columns=10, lines=2).splitlines()  # 3x3 cells
     assert [line.count("▀") for line in tall] == [7, 7]
     assert f"3{path};" not in tall[0]
-
-
-def test_the_ramp_leads_from_the_worst_colour_to_the_best() -> None:
-    ramp = value_ramp(7)
-    assert ["#" + bytes(ramp[level]).hex() for level in (0, 2, 4, 6)] == list(VALUE_COLOURS)
-    assert (np.diff(ramp.astype(int).sum(axis=1)) < 0).all()
 
 
 def test_a_picture_shows_one_way_zones(tmp_path: Path) -> None:

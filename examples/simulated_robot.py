@@ -5,7 +5,7 @@ zones, a carpet on which wheels slip, a door, and crowds that come and go by the
 It stops before an obstacle. Where it stands without a path that it can follow, it sends the last
 `goal_pose` again. Its time runs faster than the clock: the stamps are simulated.
 
-    python scripts/driving_robot.py --ros-args -p world:=office -p seed:=1 -p speed_up:=30.0
+    python examples/simulated_robot.py --ros-args -p world:=office -p seed:=1 -p speed_up:=30.0
 """
 
 from __future__ import annotations
@@ -13,10 +13,10 @@ from __future__ import annotations
 import math
 import sys
 import time
+from pathlib import Path as FilePath
 
 import numpy as np
 from builtin_interfaces.msg import Time
-from driving_worlds import NOISE, SPEED, World, generated_world
 from geometry_msgs.msg import PoseStamped, TransformStamped
 from nav_msgs.msg import Odometry, Path
 from numpy.typing import NDArray
@@ -26,6 +26,9 @@ from std_msgs.msg import Header
 from ddqn_planner.experience.drive_recorder import ARRIVAL_DISTANCE
 from ddqn_planner.nodes.conversions import quaternion
 from ddqn_planner.nodes.runtime import LATCHED, STEADY, spin_until_shutdown
+
+sys.path.insert(0, str(FilePath(__file__).resolve().parents[1] / "experiments"))
+from driving_worlds import NOISE, SPEED, World, generated_world
 
 STEP = 0.2
 """Simulated seconds from one pose to the next."""

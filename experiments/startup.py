@@ -12,7 +12,6 @@ from contextlib import suppress
 from functools import partial
 
 from client import Client, initial_pose, pose, wait_for
-from demo import start_and_goal
 from map_fixture import MapFixture
 from nav_msgs.msg import OccupancyGrid, Path
 from processes import (
@@ -61,7 +60,7 @@ def node_usage(process: int, began: float) -> Usage:
 
 def start_planner(dilemma: MapFixture) -> Usage:
     """Start the planner node; return what it takes until its first plan."""
-    start, goal = (pose(dilemma.grid, cell) for cell in start_and_goal("dilemma"))
+    start, goal = (pose(dilemma.grid, cell) for cell in ((6, 6), (17, 19)))
     # A client per start: one that has seen other nodes end is discovered more slowly.
     with Client() as client:
         plans = client.subscribe(Path, "plan", LATCHED)

@@ -6,15 +6,15 @@ import math
 import sys
 from collections.abc import Callable
 
-import driving_robot
 import numpy as np
 import pytest
+import simulated_robot
 from client import Client
-from driving_robot import Robot
 from driving_worlds import World
 from geometry_msgs.msg import PoseStamped
 from nav_msgs.msg import Odometry
 from processes import running
+from simulated_robot import Robot
 from std_msgs.msg import Header
 
 from ddqn_planner.grid import Cell, GridMap, MoveRule, shortest_path
@@ -45,7 +45,7 @@ def test_a_robot_drives_round_obstacles_and_never_into_one(seed: int) -> None:
             robot.step()
             assert robot.world.grid.is_free(robot.world.grid.world_to_cell(robot.x, robot.y))
         end = robot.world.grid.cell_to_world(goal)
-        assert math.dist((robot.x, robot.y), end) <= driving_robot.ARRIVED
+        assert math.dist((robot.x, robot.y), end) <= simulated_robot.ARRIVED
         at, drives = goal, drives + 1
     assert drives > 5
 
@@ -66,7 +66,7 @@ def test_a_robot_that_has_no_path_sends_its_goal_again(
     client = make_client("/stranded")
     goals = client.subscribe(PoseStamped, "goal_pose")
     odometry = client.subscribe(Odometry, "odom", keep=1)
-    script = driving_robot.__file__
+    script = simulated_robot.__file__
     with running(sys.executable, script, "--ros-args", "-r", "__ns:=/stranded"):
         at = odometry.wait().pose.pose.position
         goal = PoseStamped(header=Header(frame_id="map"))

@@ -1,4 +1,4 @@
-"""A plan as text, and as a picture of map, value field and path."""
+"""Plans to look at: as text, in a terminal's colours, and as a picture file. No ROS is needed."""
 
 from __future__ import annotations
 
@@ -10,30 +10,27 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ddqn_planner.grid import LENGTHS, MOVES, Cell, GridMap
-from ddqn_planner.pictures.colours import (
-    DIRECTION_COLOUR,
-    MAX_SIDE_WITH_LINES,
-    OBSTACLE_COLOUR,
-    PATH_COLOUR,
-    VALUE_COLOURS,
-)
+
+OBSTACLE_COLOUR, PATH_COLOUR, DIRECTION_COLOUR = "#22223b", "#d1495b", "#6c757d"
+
+VALUE_COLOURS = ("#f4f1de", "#cfe8dc", "#93cfc8", "#4fa3b5")
+"""From the worst value to the best: light to dark, so that the order shows without colours too.
+The darkest is far from the colour of obstacles."""
+
+TERMINAL = ("9", "8;5;255", "8;5;236", "8;5;167", "8;5;33")
+"""Codes of the colours outside the map, of free and occupied cells, of the path and its ends."""
 
 MAX_TEXT_WIDTH = 64
 """Cells of the widest map that is worth printing as text: a cell takes two characters."""
 
-
-TERMINAL = ("9", "8;5;255", "8;5;236", "8;5;167", "8;5;33")
-"""Codes of the colours outside the map, of free and occupied cells, of the path and its ends."""
+MAX_SIDE_WITH_LINES = 64
+"""Cells of the longest side of a map that is drawn with lines between its cells."""
 
 MAX_ARROWS = 48
 """Arrows of one-way zones along the longest side of a map."""
 
 ONE_WAY = 1e-9
 """The mean direction of a cell that is not one-way is shorter than this."""
-
-
-class PictureError(ImportError):
-    """A picture cannot be drawn; the message says what is missing."""
 
 
 def draw_text(grid: GridMap, cells: Sequence[Cell]) -> str:
@@ -43,7 +40,7 @@ def draw_text(grid: GridMap, cells: Sequence[Cell]) -> str:
     """
     letters = np.full(grid.occupancy.shape, ".")
     if grid.forbidden is not None:
-        x, y = mean_directions(grid.forbidden)
+        x, y = _mean_directions(grid.forbidden)
         quarter = np.rint(np.arctan2(y, x) / (np.pi / 2)).astype(np.int64)
         letters = np.where(np.hypot(x, y) > ONE_WAY, np.array(list(">^<v"))[quarter], letters)
     letters[grid.occupancy] = "#"
@@ -83,35 +80,14 @@ def save_picture(
     title: str,
     value_label: str = "value: max Q(s, a)",
 ) -> None:
-    """Draw map, value field and path into a picture file, and arrows in one-way zones.
+    """Draw the map, the value where it is finite, and the path if there is one into a file."""
+    import matplotlib
 
-    Parameters
-    ----------
-    path : str or Path
-        Its ending (``.png``, ``.svg``, ``.pdf``) sets the format.
-    grid : GridMap
-    cells : sequence of (x, y)
-        The path; if it is empty, none is drawn.
-    value : (H, W) float32, optional
-        The value field, drawn where it is finite.
-    title, value_label : str
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+    from matplotlib.colors import LinearSegmentedColormap
+    from matplotlib.ticker import MaxNLocator
 
-    Raises
-    ------
-    PictureError
-        If matplotlib is not installed.
-    OSError, ValueError
-        If the file cannot be written, or matplotlib does not know its ending.
-    """
-    try:
-        import matplotlib
-
-        matplotlib.use("Agg")
-        import matplotlib.pyplot as plt
-        from matplotlib.colors import LinearSegmentedColormap
-        from matplotlib.ticker import MaxNLocator
-    except ImportError as error:
-        raise PictureError(f"pictures need matplotlib ({error}): pip install matplotlib") from None
     tall = min(max(grid.height / grid.width, 0.4), 1.0)
     figure, axes = plt.subplots(figsize=(7.2, 1.5 + 5.1 * tall), dpi=120, layout="constrained")
     axes.set(facecolor="white", xlabel="x [cells]", ylabel="y [cells]", aspect="equal")
@@ -148,7 +124,7 @@ def draw_obstacles(axes: Any, grid: GridMap) -> None:
         _draw_directions(axes, grid, grid.forbidden)
 
 
-def mean_directions(forbidden: NDArray[np.uint8]) -> NDArray[np.float64]:
+def _mean_directions(forbidden: NDArray[np.uint8]) -> NDArray[np.float64]:
     """Return (2, H, W) float64: the sum of the legal directions of each cell, x and y."""
     legal = (forbidden >> np.arange(len(MOVES))[:, None, None] & 1) == 0
     directions: NDArray[np.float64] = np.tensordot((MOVES / LENGTHS[:, None]).T, legal, 1)
@@ -157,7 +133,7 @@ def mean_directions(forbidden: NDArray[np.uint8]) -> NDArray[np.float64]:
 
 def _draw_directions(axes: Any, grid: GridMap, forbidden: NDArray[np.uint8]) -> None:
     step = -(-max(grid.width, grid.height) // MAX_ARROWS)
-    directions = mean_directions(forbidden)
+    directions = _mean_directions(forbidden)
     shown = (np.hypot(*directions) > ONE_WAY) & ~grid.occupancy
     y, x = np.nonzero(shown[::step, ::step])
     along = directions[:, y * step, x * step]

@@ -23,8 +23,6 @@ import matplotlib
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 import numpy as np
-from client import Client, Recorder, cells_of, pose, wait_for
-from driving_worlds import World, generated_world, path_seconds
 from geometry_msgs.msg import PoseStamped
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import LogNorm
@@ -32,14 +30,18 @@ from matplotlib.patheffects import withStroke
 from nav_msgs.msg import OccupancyGrid, Odometry, Path
 from numpy.typing import NDArray
 from PIL import Image
-from processes import claim_ros_domain, run_script, running, running_node
 
 from ddqn_planner.experience.drive_recorder import ARRIVAL_DISTANCE
 from ddqn_planner.grid import Cell, GridMap, MoveRule, save_map
 from ddqn_planner.nodes.driving import SLOWEST
 from ddqn_planner.nodes.runtime import LATCHED
-from ddqn_planner.pictures.picture import draw_obstacles
+from ddqn_planner.pictures import draw_obstacles
 from ddqn_planner.planning import Planner
+
+sys.path.insert(0, str(FilePath(__file__).resolve().parents[1] / "experiments"))
+from client import Client, Recorder, cells_of, pose, wait_for
+from driving_worlds import World, generated_world, path_seconds
+from processes import claim_ros_domain, run_script, running, running_node
 
 WORLD, SEED, SPEED_UP = "office", 9, 40.0
 MISSIONS = 40
@@ -224,7 +226,7 @@ def main(arguments: Sequence[str]) -> int:
     """Drive the missions, and save what they show."""
     count = int(arguments[0]) if arguments else MISSIONS
     world = generated_world(WORLD, SEED)
-    robot = [sys.executable, str(FilePath(__file__).with_name("driving_robot.py")), "--ros-args"]
+    robot = [sys.executable, str(FilePath(__file__).with_name("simulated_robot.py")), "--ros-args"]
     for name, value in {"world": WORLD, "seed": SEED, "speed_up": SPEED_UP}.items():
         robot += ["-p", f"{name}:={value}"]
     random = np.random.default_rng(SEED)
