@@ -9,7 +9,7 @@ from __future__ import annotations
 import argparse
 
 from ddqn_planner.model import load_model
-from ddqn_planner.model.certificate import NO_CERTIFICATE, certificate_of
+from ddqn_planner.model.certificate import NO_CERTIFICATE
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -20,6 +20,6 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace) -> int:
     """Run the command; return the exit code."""
     network, metadata = load_model(options.model)
-    certificate = certificate_of(network, metadata.move_rule)
+    certificate = network.certificate(metadata.move_rule)
     print(certificate or NO_CERTIFICATE)
     return 0 if certificate and certificate.proved else 1
