@@ -7,12 +7,19 @@ import fcntl
 import glob
 import io
 import os
+import re
 import reprlib
 import secrets
-from collections.abc import Iterable, Sequence
-from contextlib import suppress
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import ExitStack, closing, contextmanager, suppress
 from pathlib import Path
 from typing import Any, BinaryIO
+
+TEMPORARY = re.compile(r"\..+\.[0-9a-f]{16}")
+"""The name of a file that is being written."""
+
+MAX_REST = 2**24
+"""Bytes of records that are kept while a disk is full; records beyond are left out."""
 
 
 def as_path(path: Any, name: str = "path") -> Path:
@@ -27,7 +34,7 @@ def write_atomically(path: Path, content: bytes) -> None:
     """Write a temporary file beside `path` and rename it; missing folders are made.
 
     After an OSError, an old file at `path` is unchanged. If the process is killed meanwhile, the
-    temporary file remains: see `remove_temporaries`.
+    temporary file remains, in a `WorkFolder` until the next process opens it.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_name(f".{path.name}.{secrets.token_hex(8)}")
@@ -43,6 +50,108 @@ def write_atomically(path: Path, content: bytes) -> None:
         raise
 
 
+def write_csv(path: Path, columns: Sequence[str], rows: Iterable[Sequence[object]]) -> None:
+    """Write a table with a header row; see `write_atomically` for errors."""
+    text = io.StringIO(newline="")
+    csv.writer(text).writerows([columns, *rows])
+    write_atomically(path, text.getvalue().encode())
+
+
+class FolderError(ValueError):
+    """A folder belongs to something else, or another process works in it."""
+
+
+class WorkFolder:
+    """A folder in which one process works until `close` or its end; a missing folder is made.
+
+    A folder with one of the files `marks` is the right one; the first is the lock. It is there from
+    the start, so that a process that was killed early can begin again in its folder. For errors,
+    `content` says what the folder should hold, `works` what a process does in it, and `after` what
+    follows a failed save. A FolderError says why the folder is the wrong one.
+    """
+
+    def __init__(
+        self, folder: Path, marks: Sequence[str], content: str, works: str, after: str = ""
+    ) -> None:
+        folder.mkdir(parents=True, exist_ok=True)
+        names = sorted(path.name for path in folder.iterdir())
+        if names and not any((folder / name).is_file() for name in marks):
+            raise FolderError(
+                f"{folder} holds {reprlib.repr(names)} but no {content}; give a new or empty folder"
+            )
+        self.folder, self.save_error, self._after = folder, "", after
+        self._open_files = ExitStack()
+        with self.opening() as files:
+            # The system closes the file, and so unlocks it, when the process ends.
+            file = files.enter_context((folder / marks[0]).open("ab"))
+            try:
+                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                raise FolderError(
+                    f"another process {works} in {folder}; wait for its end, stop it, or give "
+                    "another folder"
+                ) from None
+            for path in folder.iterdir():
+                if TEMPORARY.fullmatch(path.name):  # of a process that was killed
+                    path.unlink()
+
+    @contextmanager
+    def opening(self) -> Iterator[ExitStack]:
+        """Give what shall be closed with the folder; if the block fails, close all of it."""
+        with self._open_files as files:
+            yield files
+            self._open_files = files.pop_all()
+
+    @contextmanager
+    def saving(self) -> Iterator[None]:
+        """Catch an OSError: `save_error` says it until the next block that saves."""
+        try:
+            yield
+            self.save_error = ""
+        except OSError as error:
+            # Without the error's file name: it is often that of a temporary file.
+            self.save_error = (
+                f"cannot save to {self.folder} ({error.strerror or error}); make room or allow "
+                f"writing there: {self._after}"
+            )
+
+    def close(self) -> None:
+        """Close the files and unlock the folder."""
+        self._open_files.close()
+
+
+class Appender:
+    """Appends records to a file, each of them complete before the next one begins.
+
+    When the disk is full, the file may end with a part of a record. The rest is kept, with the
+    records that follow, and written first as soon as that is possible.
+    """
+
+    def __init__(self, path: Path) -> None:
+        # Unbuffered: readers see every record, also after a crash.
+        self._file = path.open("ab", buffering=0)
+        self._rest = bytearray()
+
+    def append(self, record: bytes) -> None:
+        """Append a record, now or later: `flush` says why it cannot be written."""
+        if len(self._rest) < MAX_REST:
+            self._rest += record
+        with suppress(OSError):
+            self.flush()
+
+    def flush(self) -> None:
+        """Write what is left of the records; an OSError if that fails."""
+        while self._rest:
+            del self._rest[: self._file.write(self._rest)]
+
+    def close(self) -> None:
+        """Close the file."""
+        self._file.close()
+
+
+# `WorkFolder` replaces what follows.
+
+
 def remove_temporaries(path: Path) -> None:
     """Remove the temporary files that killed processes left beside `path`."""
     for temporary in path.parent.glob(f".{glob.escape(path.name)}.*"):
@@ -50,10 +159,7 @@ def remove_temporaries(path: Path) -> None:
 
 
 def lock(path: Path) -> BinaryIO:
-    """Lock a file until the returned file is closed; BlockingIOError if it is locked already.
-
-    A missing file is made, and stays. The system closes the file when the process ends.
-    """
+    """Lock a file until the returned file is closed; BlockingIOError if it is locked already."""
     file = path.open("ab")
     try:
         fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -63,76 +169,6 @@ def lock(path: Path) -> BinaryIO:
     return file
 
 
-class FolderError(ValueError):
-    """A folder belongs to something else, or another process works in it."""
-
-
-def claim(folder: Path, marks: Sequence[str], content: str, works: str) -> BinaryIO:
-    """Lock a folder, which is made if it is missing, until the returned file is closed.
-
-    Parameters
-    ----------
-    folder : Path
-    marks : sequence of str
-        A folder with one of these files is the right one; the first is the lock. It is there from
-        the start, so that a process that was killed early can begin again in its folder.
-    content, works : str
-        What the folder should hold, and what a process does in it, for errors.
-
-    Raises
-    ------
-    FolderError
-        If the folder contains files and none of the marks, or another process works in it.
-    """
-    folder.mkdir(parents=True, exist_ok=True)
-    names = sorted(path.name for path in folder.iterdir())
-    if names and not any((folder / name).is_file() for name in marks):
-        raise FolderError(
-            f"{folder} holds {reprlib.repr(names)} but no {content}; give a new or empty folder"
-        )
-    try:
-        return lock(folder / marks[0])
-    except BlockingIOError:
-        raise FolderError(
-            f"another process {works} in {folder}; wait for its end, stop it, or give another "
-            "folder"
-        ) from None
-
-
-class Appender:
-    """Appends records to a file, each of them complete before the next one begins.
-
-    When the disk is full, the file may end with a part of a record. The rest is kept and written
-    before the next record.
-    """
-
-    def __init__(self, path: Path) -> None:
-        # Unbuffered: readers see every record, also after a crash.
-        self._file = path.open("ab", buffering=0)
-        self._rest = b""
-
-    def append(self, record: bytes) -> None:
-        """Append a record.
-
-        After an OSError, the next call that can write writes the rest of it first, or leaves it out
-        if the record before it is still incomplete.
-        """
-        self.flush()
-        self._rest = record
-        self.flush()
-
-    def flush(self) -> None:
-        """Write the rest of the last record; see `append` for errors."""
-        while self._rest:
-            self._rest = self._rest[self._file.write(self._rest) :]
-
-    def close(self) -> None:
-        """Close the file."""
-        self._file.close()
-
-
-def write_csv(path: Path, columns: Sequence[str], rows: Iterable[Sequence[object]]) -> None:
-    """Write a table with a header row; see `write_atomically` for errors."""
-    text = io.StringIO(newline="")
-    csv.writer(text).writerows([columns, *rows])
-    write_atomically(path, text.getvalue().encode())
+def claim(folder: Path, marks: Sequence[str], content: str, works: str) -> closing[WorkFolder]:
+    """Lock a folder while the block runs."""
+    return closing(WorkFolder(folder, marks, content, works))

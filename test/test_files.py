@@ -74,12 +74,13 @@ def test_records_stay_complete_while_the_disk_is_full_for_a_time(tmp_path: Path)
     records.append(b"first\n")
     with files_no_longer_than(10):
         for record in (b"second\n", b"third\n"):
+            records.append(record)
             with pytest.raises(OSError, match="too large"):
-                records.append(record)
+                records.flush()
         assert path.read_bytes() == b"first\nseco"
     records.append(b"fourth\n")
     records.close()
-    assert path.read_bytes() == b"first\nsecond\nfourth\n"
+    assert path.read_bytes() == b"first\nsecond\nthird\nfourth\n"
 
 
 def test_only_the_temporaries_of_that_file_are_removed(tmp_path: Path) -> None:

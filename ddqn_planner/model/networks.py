@@ -218,7 +218,7 @@ class PropagationQNetwork(QNetwork):
         return np.ones((len(feature_BI), len(MOVES)), dtype=np.float32)
 
     def certificate(self, move_rule: MoveRule) -> Certificate:
-        """Return what is proved of its moves: under all rules, or the one that it was trained for."""
+        """Return what is proved of its moves: under all rules, or the one it was trained for."""
         rules = MOVE_RULES if self.uses_costs else (move_rule,)
         if rules not in self._certificates:
             self._certificates[rules] = certify(self, rules)

@@ -37,8 +37,9 @@ from ddqn_planner.experience.drive_log import (
 from ddqn_planner.experience.drive_recorder import DriveRecorder
 from ddqn_planner.grid import GridMap
 from ddqn_planner.nodes.conversions import occupancy_message, quaternion, serialized_poses
+from ddqn_planner.nodes.poses import MapInFrame, RobotPoses
 from ddqn_planner.nodes.replay import Replay
-from ddqn_planner.nodes.robot_poses import MapInFrame, Problems, RobotPoses
+from ddqn_planner.nodes.report import Refusals
 from ddqn_planner.nodes.runtime import LATCHED, STEADY, BaseNode, Worker
 
 Float64 = NDArray[np.float64]
@@ -71,6 +72,7 @@ class Driving:
         Of each drive that ends.
     place : callable
         It returns the last map, or None.
+    refusals : Refusals
     """
 
     def __init__(
@@ -79,13 +81,14 @@ class Driving:
         replay: Replay,
         episodes: Publisher,
         place: Callable[[], MapInFrame | None],
+        refusals: Refusals,
     ) -> None:
         self._node, self._replay, self._episodes, self._place = node, replay, episodes, place
+        self._refusals = refusals
         self._recorder = DriveRecorder(self._on_drive)
         self._worker = Worker(node)
         self._folder: DriveFolder | None = None
         self._work: deque[tuple[Future, Callable[[Any], None]]] = deque()
-        self._problems = Problems(node)
         self._state, self._save_error = "stopped", ""
         self._retry_at = math.inf
         self._aborted: set[bytes] | None = None
@@ -97,7 +100,7 @@ class Driving:
         self._slowness = node.create_publisher(OccupancyGrid, "~/slowness", LATCHED)
         node.create_subscription(PoseStamped, "goal_pose", self._on_goal, 10)
         node.create_subscription(GoalStatusArray, NAVIGATION, self._on_status, STATUS_QUALITY)
-        self._poses = RobotPoses(node, place, self._problems, self._on_pose)
+        self._poses = RobotPoses(node, place, refusals, self._on_pose)
         node.create_timer(0.1, self._look, clock=STEADY)
         group = ReentrantCallbackGroup()  # a service that waits for the worker keeps no other out
         for name in ("start", "stop", "save", "replay", "forget"):
@@ -117,9 +120,9 @@ class Driving:
         try:
             self._recorder.set_goal(*self._poses.in_map("the goal", message, place.frame))
         except ValueError as error:
-            self._problems.begin("goal_pose", str(error))
+            self._refusals.refuse("goal_pose", str(error))
             return
-        self._problems.end("goal_pose")
+        self._refusals.accept("goal_pose")
 
     def _on_status(self, message: GoalStatusArray) -> None:
         """End the drive where the robot's navigation gives up."""
@@ -175,7 +178,7 @@ class Driving:
     def _on_opened(self, folder: DriveFolder) -> None:
         self._folder, self._state = folder, "recording"
         self._recorder.forget()
-        self._problems.end("output_folder")
+        self._refusals.accept("output_folder")
         self._node.get_logger().info(f"recording drives in {folder.folder}")
         self._on_saved(None)
 
@@ -235,7 +238,7 @@ class Driving:
             self._retry_at = time.monotonic() + RETRY_PERIOD
         if self._state == "opening":
             self._state = "failed"
-        self._problems.begin("output_folder", with_remedy(error))
+        self._refusals.refuse("output_folder", with_remedy(error))
 
     # Services: each returns whether it succeeds, and a message
 
@@ -310,7 +313,7 @@ class Driving:
 
     def diagnostics(self) -> DiagnosticArray:
         """Return what `/diagnostics` says."""
-        problems = [*self._problems, *filter(None, [self._save_error])]
+        problems = [*self._refusals.problems(), *filter(None, [self._save_error])]
         level = DiagnosticStatus.ERROR if problems else DiagnosticStatus.OK
         missing = self._place() is None
         if missing:

@@ -16,8 +16,8 @@ from collections.abc import Callable, Coroutine
 from contextlib import suppress
 from typing import Any
 
-from geometry_msgs.msg import PoseArray, PoseStamped, PoseWithCovarianceStamped
-from nav_msgs.msg import Odometry, Path
+from geometry_msgs.msg import PoseArray, PoseStamped
+from nav_msgs.msg import Path
 from nav_msgs.srv import GetPlan
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup, ReentrantCallbackGroup
 from rclpy.parameter import Parameter
@@ -28,12 +28,12 @@ from ddqn_planner.nodes.active_goal import UNCHANGED, ActiveGoal, PathUnderWay
 from ddqn_planner.nodes.conversions import path_message, serialized_path
 from ddqn_planner.nodes.expected_times import Forecast
 from ddqn_planner.nodes.field_display import FieldDisplay, Shown
-from ddqn_planner.nodes.frames import Frames, check_tf
 from ddqn_planner.nodes.lifecycle import ManagedNode
 from ddqn_planner.nodes.map_source import MapSource
 from ddqn_planner.nodes.model_loading import ModelSource, load
 from ddqn_planner.nodes.nav2_interface import serve_nav2
-from ddqn_planner.nodes.planner_parameters import PARAMETERS
+from ddqn_planner.nodes.parameters import PLANNER_PARAMETERS
+from ddqn_planner.nodes.poses import Frames, StartSource, check_source
 from ddqn_planner.nodes.report import (
     NOT_ACTIVE,
     Outcome,
@@ -43,7 +43,6 @@ from ddqn_planner.nodes.report import (
 )
 from ddqn_planner.nodes.requests import Looks, Requests
 from ddqn_planner.nodes.runtime import LATCHED, STEADY, Unless, Worker, spin_until_shutdown
-from ddqn_planner.nodes.start_source import StartSource
 
 LOOK_PERIOD = 0.1
 """Seconds between two looks whether something changed: an answer does not wait for diagnostics."""
@@ -60,7 +59,7 @@ class PlannerNode(ManagedNode):
     """
 
     def __init__(self) -> None:
-        super().__init__("planner", PARAMETERS)
+        super().__init__("planner", PLANNER_PARAMETERS)
         self._settings = self.settings()
         self._report = Report(self)
         self._worker, self._map_worker = Worker(self), Worker(self)
@@ -96,8 +95,10 @@ class PlannerNode(ManagedNode):
             self._plan_for_active_goal, MutuallyExclusiveCallbackGroup()
         )
         self._frames = Frames(self, lambda: float(self._settings.transform_tolerance))
-        self._start = self._start_source()
         self._map = MapSource(self, self._report, self._map_worker, self._on_map)
+        self._start = StartSource(
+            self, self._frames, self._report, lambda: self._map.frame, self._on_start
+        )
         self._forecast = Forecast(self._map.times, self._map_worker)
         self._requests = Requests(
             self._settings,
@@ -175,8 +176,7 @@ class PlannerNode(ManagedNode):
     def check_parameters(self, new: dict[str, Any]) -> None:
         """Check new values as `BaseNode` does, whether TF can be used, and load a new model."""
         super().check_parameters(new)
-        if new.get("start_source") == "tf":
-            check_tf()
+        check_source("start_source", new.get("start_source", ""), "'initialpose' or 'odometry'")
         if "model" in new and hasattr(self, "_settings"):  # a worker loads the first one
             self._candidate = load(new["model"])
 
@@ -189,11 +189,7 @@ class PlannerNode(ManagedNode):
             self._model.use(*self._candidate)
         if self._model.planner is not None:
             self._model.planner.cache_bytes = settings.field_cache_bytes
-        if settings.start_source != self._start.name:
-            # What the other source said, and what was refused of it, no longer counts.
-            self._start.close()
-            self._report.accept(self._start.topic)
-            self._start = self._requests.start = self._start_source()
+        self._start.listen()
         self._requests.settings = settings
         self._map.apply_parameters(changed)
         self._active.restart()
@@ -204,22 +200,12 @@ class PlannerNode(ManagedNode):
     def _on_map(self, frame_changed: bool) -> None:
         if frame_changed:
             # What was refused for its frame may be right now.
-            self._report.accept(self._start.topic)
+            self._start.accept()
         self._replan.trigger()
 
-    def _start_source(self) -> StartSource:
-        return StartSource(self, self._settings.start_source, self._frames, self._on_start)
-
-    def _on_start(self, message: PoseWithCovarianceStamped | Odometry) -> None:
-        try:
-            due = self._start.take(message, self._map.frame)
-        except ValueError as error:
-            self._report.refuse(self._start.topic, str(error))
-            return
-        self._report.accept(self._start.topic)
-        if due:
-            self._active.plan_at_once()
-            self._replan.trigger()
+    def _on_start(self) -> None:
+        self._active.plan_at_once()
+        self._replan.trigger()
 
     def _on_goal_poses(self, message: PoseArray) -> None:
         goals = [PoseStamped(header=message.header, pose=pose) for pose in message.poses]
@@ -337,7 +323,7 @@ class PlannerNode(ManagedNode):
         self._report.log_paths()
         self._looks.next()
         if self._is_configured:
-            self._start.transform(self._map.frame)
+            self._start.transform()
             lacks, self._lacks_map = self._lacks_map, bool(self._map.missing)
             if self._lacks_map and not lacks:  # a costmap stopped: its path is taken back
                 self._replan.trigger()
@@ -376,7 +362,7 @@ def main() -> int:
     with suppress(AttributeError):  # another C library
         for option in (-1, -3):  # M_TRIM_THRESHOLD, M_MMAP_THRESHOLD
             ctypes.CDLL(None).mallopt(option, 2**24)
-    return spin_until_shutdown(PlannerNode, PARAMETERS)
+    return spin_until_shutdown(PlannerNode, PLANNER_PARAMETERS)
 
 
 if __name__ == "__main__":

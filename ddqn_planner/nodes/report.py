@@ -56,16 +56,8 @@ def checked(status: str, function: Any, *arguments: Any) -> Any:
 class Outcome:
     """What became of a request; without a planner and a `PlanRequest` if it is not well-formed.
 
-    Parameters
-    ----------
-    status : str
-        The name of a `PlanStatus`, or that of a `RequestError`.
-    reason : str
-        What a user reads: how the path was found, or why there is none and what to do.
-    goal : PoseStamped or None
-        The pose of the goal in the map's frame.
-    map_stamp : str
-        The stamp of the map of the request, seconds; empty without a map.
+    The status is the name of a `PlanStatus`, or that of a `RequestError`; the goal is in the map's
+    frame. The stamp is that of the map of the request, in seconds.
     """
 
     status: str
@@ -139,23 +131,39 @@ def _place(stamped: PoseStamped, cell: Cell) -> str:
     return f"({position.x:.6g}, {position.y:.6g}) m in cell ({cell[0]:.6g}, {cell[1]:.6g})"
 
 
-class Report:
-    """Logs what happens, and publishes the last outcome with what was refused.
-
-    Parameters
-    ----------
-    node : BaseNode
-
-    Attributes
-    ----------
-    refused : dict of str to str
-        What was refused and not accepted since, and why.
-    """
+class Refusals:
+    """What a node refused and has not accepted since, and why; it is logged when that changes."""
 
     def __init__(self, node: BaseNode) -> None:
+        self.node = node
         self.refused: dict[str, str] = {}
-        self._outcome = NO_REQUEST
-        self._node = node
+
+    def refuse(self, what: str, reason: str, once: bool = False) -> None:
+        """Refuse something; with `once`, another reason than the first one is not logged."""
+        before = self.refused.get(what)
+        self.refused[what] = reason
+        if before is None or (before != reason and not once):
+            self.node.get_logger().error(f"{what} refused: {reason}")
+
+    def accept(self, what: str) -> None:
+        """Forget that something was refused."""
+        self.refused.pop(what, None)
+
+    def forget(self) -> None:
+        """Forget all that was refused."""
+        self.refused.clear()
+
+    def problems(self) -> list[str]:
+        """Return what a user reads of all that is refused."""
+        return [f"{what} refused: {reason}" for what, reason in self.refused.items()]
+
+
+class Report(Refusals):
+    """Logs what the planner node does, and publishes the last outcome with what was refused."""
+
+    def __init__(self, node: BaseNode) -> None:
+        super().__init__(node)
+        self.outcome = NO_REQUEST
         self._publisher = node.create_publisher(DiagnosticArray, "/diagnostics", 10)
         self._to_be_logged: list[str] = []
         self._due = 0.0
@@ -164,33 +172,25 @@ class Report:
         """Publish soon: something about the node changed."""
         self._due = 0.0
 
-    def refuse(self, what: str, reason: str) -> None:
-        """Log that something was refused, unless the last log of it said the same."""
-        repeated = self.refused.get(what) == reason
-        self.refused[what] = reason
+    def refuse(self, what: str, reason: str, once: bool = False) -> None:
+        """Refuse something, and publish it soon."""
+        super().refuse(what, reason, once)
         self.change()
-        if not repeated:
-            self._node.get_logger().error(f"{what} refused: {reason}")
 
     def accept(self, what: str) -> None:
-        """Forget that something was refused."""
-        if self.refused.pop(what, None):
+        """Forget that something was refused, and publish that soon."""
+        if what in self.refused:
+            super().accept(what)
             self.change()
 
     def forget(self) -> None:
         """Forget what was refused, and the last outcome."""
-        self.refused.clear()
-        self._outcome = NO_REQUEST
-        self.change()
-
-    @property
-    def outcome(self) -> Outcome:
-        """The last outcome."""
-        return self._outcome
+        super().forget()
+        self.note(NO_REQUEST)
 
     def note(self, outcome: Outcome) -> None:
-        """Store the last outcome for the diagnostics."""
-        self._outcome = outcome
+        """Keep the last outcome for the diagnostics."""
+        self.outcome = outcome
         self.change()
 
     def log(self, outcome: Outcome) -> None:
@@ -199,12 +199,12 @@ class Report:
             self._to_be_logged.append(outcome.reason)
         else:
             self.log_paths()
-            self._node.get_logger().warning(f"no plan: {outcome.reason}")
+            self.node.get_logger().warning(f"no plan: {outcome.reason}")
 
     def log_paths(self) -> None:
         """Log the paths that were found since the last call."""
         for reason in self._to_be_logged:
-            self._node.get_logger().info(reason)
+            self.node.get_logger().info(reason)
         self._to_be_logged.clear()
 
     @property
@@ -218,8 +218,7 @@ class Report:
         It is fatal if the node cannot plan until its user does something.
         """
         self._due = time.monotonic() + PERIOD
-        outcome, plan = self._outcome, self._outcome.plan
-        problems = [f"{what} refused: {reason}" for what, reason in self.refused.items()]
+        outcome, plan, problems = self.outcome, self.outcome.plan, self.problems()
         if missing and missing != outcome.reason:
             problems.append(missing)
         good = not problems and (plan.path.size or outcome.status == "NO_REQUEST")
@@ -238,7 +237,7 @@ class Report:
             **{f"refused {what}": reason for what, reason in self.refused.items()},
         }
         message = "; ".join([outcome.reason, *problems])
-        self._publisher.publish(self._node.diagnostics("plan", level, message, values))
+        self._publisher.publish(self.node.diagnostics("plan", level, message, values))
 
 
 def describe_map(message: OccupancyGrid) -> str:

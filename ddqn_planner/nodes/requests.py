@@ -17,13 +17,12 @@ from std_msgs.msg import Header
 from ddqn_planner.grid import Cell, GridMap
 from ddqn_planner.nodes.active_goal import UNCHANGED, ActiveGoal, PathUnderWay
 from ddqn_planner.nodes.conversions import cell_from_pose, check_tolerance
-from ddqn_planner.nodes.frames import Frames
 from ddqn_planner.nodes.map_source import MapSource
 from ddqn_planner.nodes.model_loading import ModelSource, move_rule
 from ddqn_planner.nodes.path_action import check_request
+from ddqn_planner.nodes.poses import Frames, StartSource
 from ddqn_planner.nodes.report import Outcome, RequestError, checked, reason_of, seconds
 from ddqn_planner.nodes.runtime import Worker
-from ddqn_planner.nodes.start_source import StartSource
 from ddqn_planner.planning import Plan, PlanMethod, Planner, PlanRequest
 from ddqn_planner.planning.path_under_way import is_path_valid
 from ddqn_planner.planning.plan import joined
@@ -81,7 +80,7 @@ class Requests:
             self._check_pose(*named, self.map.frame)
         map_header, grid, planner = await self._inputs()
         frame = map_header.frame_id
-        start = await self._in_map("the start", start or await self._known_start(frame), frame)
+        start = await self._in_map("the start", start or await self._known_start(), frame)
         in_map = [await self._in_map(*named, frame) for named in zip(names, goals, strict=True)]
         if active is not None:
             goals[:] = in_map  # the active goal stays where it is when its own frame moves
@@ -138,7 +137,7 @@ class Requests:
         ]
         robot = cells[0] if cells else (0, 0)
         with suppress(RequestError):
-            start = await self._in_map("the start", await self._known_start(frame), frame)
+            start = await self._in_map("the start", await self._known_start(), frame)
             robot = self._cell("the start", start, grid, frame)
         settings = self.settings
         rule = move_rule(settings.move_rule, planner)
@@ -147,7 +146,7 @@ class Requests:
     def look(self, goals: Sequence[PoseStamped]) -> None:
         """Raise a RequestError while the start or a goal is not known in the map's frame."""
         frame = self.map.frame
-        self.frames.to_map("the start", self._start_pose(frame), frame)
+        self.frames.to_map("the start", self.start.pose(), frame)
         for goal in goals:
             self.frames.to_map("the goal", goal, frame)
 
@@ -168,12 +167,8 @@ class Requests:
             plan = await self.worker.run(next, steps)
         return plan
 
-    def _start_pose(self, frame: str) -> PoseStamped:
-        settings = self.settings
-        return self.start.pose(frame, settings.robot_frame, settings.transform_tolerance)
-
-    async def _known_start(self, frame: str) -> PoseStamped:
-        return await self._wait_for(lambda: self._start_pose(frame), lambda: self.start.may_come)
+    async def _known_start(self) -> PoseStamped:
+        return await self._wait_for(self.start.pose, lambda: self.start.may_come)
 
     async def _in_map(self, name: str, stamped: PoseStamped, frame: str) -> PoseStamped:
         """Return a pose in the map's frame; wait for its transform up to transform_tolerance."""

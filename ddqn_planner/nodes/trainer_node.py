@@ -34,19 +34,17 @@ from ddqn_planner.nodes.conversions import (
     quaternion,
 )
 from ddqn_planner.nodes.driving import Driving
+from ddqn_planner.nodes.parameters import HYPER_PARAMETERS, OF_MAPS, TRAINER_PARAMETERS
+from ddqn_planner.nodes.poses import MapInFrame, check_source
 from ddqn_planner.nodes.replay import Replay
-from ddqn_planner.nodes.robot_poses import MapInFrame, check_pose_source
+from ddqn_planner.nodes.report import Refusals
 from ddqn_planner.nodes.runtime import LATCHED, STEADY, BaseNode, Worker, spin_until_shutdown
-from ddqn_planner.nodes.trainer_parameters import HYPER_PARAMETERS, PARAMETERS
 from ddqn_planner.resources import find_map
 from ddqn_planner.training.hyper_parameters import HyperParameters
 
 if TYPE_CHECKING:
     from ddqn_planner.training.episodes import Episode
     from ddqn_planner.training.run import TrainingRun
-
-
-MAP_PARAMETERS = ("occupied_threshold", "allow_unknown")
 
 
 class TrainerNode(BaseNode):
@@ -60,7 +58,7 @@ class TrainerNode(BaseNode):
     """
 
     def __init__(self) -> None:
-        super().__init__("trainer", PARAMETERS)
+        super().__init__("trainer", TRAINER_PARAMETERS)
         self._map: MapInFrame | None = None
         self._poses: dict[str, PoseStamped] = {}
         self._run: TrainingRun | None = None
@@ -69,7 +67,8 @@ class TrainerNode(BaseNode):
         self._stop = threading.Event()
         self._save = threading.Event()
         self._events: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()
-        self._replay = Replay(self, self._refuse)
+        self._refusals = Refusals(self)
+        self._replay = Replay(self, self._fail)
         self._state, self._error, self._save_error = "idle", "", ""
 
         self._episode_publisher = self.create_publisher(Path, "~/episode", 10)
@@ -79,7 +78,9 @@ class TrainerNode(BaseNode):
         self.create_timer(1.0, self._publish_diagnostics, clock=STEADY)
         self._driving: Driving | None = None
         if self.value("learn_from") == "driving":
-            self._driving = Driving(self, self._replay, self._episode_publisher, lambda: self._map)
+            self._driving = Driving(
+                self, self._replay, self._episode_publisher, lambda: self._map, self._refusals
+            )
             return
         self._reward_publisher = self.create_publisher(Float32, "~/average_reward", 100)
         self._saved_publisher = self.create_publisher(String, "~/model_saved", LATCHED)
@@ -96,7 +97,7 @@ class TrainerNode(BaseNode):
     def check_parameters(self, new: dict[str, Any]) -> None:
         """Check new values as `BaseNode` does, and hyper-parameters together: some limit others."""
         super().check_parameters(new)
-        check_pose_source(new.get("pose_source", ""))
+        check_source("pose_source", new.get("pose_source", ""), "'odometry'")
         self._hyper_parameters(new)
 
     def _hyper_parameters(self, new: dict[str, Any]) -> HyperParameters:
@@ -111,7 +112,7 @@ class TrainerNode(BaseNode):
             map_file = read_map_file(find_map(name))
         except (ValueError, OSError) as error:
             raise InvalidParameterValueException("map_file", name, str(error)) from None
-        grid = map_file.grid(*map(self.value, MAP_PARAMETERS))
+        grid = map_file.grid(*map(self.value, OF_MAPS))
         self._map = MapInFrame(grid, "map")
         for which, cell in (("start", map_file.start), ("goal", map_file.goal)):
             if cell is not None:
@@ -122,10 +123,11 @@ class TrainerNode(BaseNode):
 
     def _on_map(self, message: OccupancyGrid) -> None:
         try:
-            grid = grid_from_message(message, *map(self.value, MAP_PARAMETERS))
+            grid = grid_from_message(message, *map(self.value, OF_MAPS))
         except ValueError as error:
-            self._refuse(f"map refused: {error}")
+            self._refusals.refuse("map", str(error))
             return
+        self._refusals.accept("map")
         self._map = MapInFrame(grid, message.header.frame_id)
         self.get_logger().info(f"map of {grid.width} x {grid.height} cells")
 
@@ -138,9 +140,11 @@ class TrainerNode(BaseNode):
             if self._map is not None:
                 cell = self._cell(which, stamped, self._map)
                 self.get_logger().info(f"the {which} is cell {cell}")
-            self._poses[which] = stamped
         except ValueError as error:
-            self._refuse(f"{which} refused: {error}")
+            self._refusals.refuse(which, str(error))
+            return
+        self._refusals.accept(which)
+        self._poses[which] = stamped
 
     def _cell(self, which: str, pose: PoseStamped, place: MapInFrame) -> Cell:
         """Return the cell of a pose; ValueError if it is not a free cell of the map."""
@@ -151,7 +155,7 @@ class TrainerNode(BaseNode):
             )
         return cell
 
-    def _refuse(self, reason: str) -> None:
+    def _fail(self, reason: str) -> None:
         self._error = reason
         self.get_logger().error(reason)
 
@@ -168,11 +172,12 @@ class TrainerNode(BaseNode):
             place, run = self._open_run()
         except Exception as error:  # the node must survive any error
             reason = _with_remedy(error)
-            self._refuse(f"the training cannot start: {reason}")
+            self._fail(f"the training cannot start: {reason}")
             return False, reason
         self._stop.clear()
         self._save.clear()
         self._state, self._error, self._save_error = "training", "", ""
+        self._refusals.forget()
         self._run, self._run_map = run, place
         self.get_logger().info(run.description)
         self._thread = threading.Thread(target=self._train, args=(run, place), name="training")
@@ -262,7 +267,7 @@ class TrainerNode(BaseNode):
 
     def _on_failure(self, error: Exception) -> None:
         self._state = "failed"
-        self._refuse(f"the training failed: {error!r}; ~/start continues from its checkpoint")
+        self._fail(f"the training failed: {error!r}; ~/start continues from its checkpoint")
 
     def _log_change_of_saving(self) -> None:
         """Log when saving begins to fail or works again, not at each try."""
@@ -280,7 +285,7 @@ class TrainerNode(BaseNode):
         if self._driving is not None:
             self._diagnostics_publisher.publish(self._driving.diagnostics())
             return
-        error = self._save_error or self._error
+        error = self._save_error or self._error or "; ".join(self._refusals.problems())
         level = DiagnosticStatus.ERROR if error else DiagnosticStatus.OK
         values = {"state": self._state}
         for which, pose in self._poses.items():
@@ -336,18 +341,16 @@ def import_training() -> None:
 def _with_remedy(error: Exception) -> str:
     if isinstance(error, OSError):
         return f"{error}; set output_folder to a folder that can be written"
-    if isinstance(error, ValueError):
+    if isinstance(error, (ValueError, MemoryError)):
         return str(error)
     if isinstance(error, ImportError):
         return f"training needs another library: {with_remedy(error)}"
-    from ddqn_planner.training.memory import REMEDY
-
-    return f"{error!r}; {REMEDY}"
+    return repr(error)
 
 
 def main() -> int:
     """Run the trainer node until SIGINT or SIGTERM."""
-    return spin_until_shutdown(TrainerNode, PARAMETERS)
+    return spin_until_shutdown(TrainerNode, TRAINER_PARAMETERS)
 
 
 if __name__ == "__main__":

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import heapq
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -44,7 +45,9 @@ def search(
 
 
 @compiled
-def _search(start, ends, legal, multiplier, lengths, value, moves):  # type: ignore[no-untyped-def]  # pragma: no cover
+def _search(
+    start: Cell, ends: Any, legal: Any, multiplier: Any, lengths: Any, value: Any, moves: Any
+) -> tuple[NDArray[np.int8], int]:
     """Return the action by which each cell was entered, (H, W) int8, and the end's number or -1."""
     width = ends.shape[1]
     entered_by = np.full(ends.shape, -1, dtype=np.int8)

@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from contextlib import ExitStack, closing
+from contextlib import closing, contextmanager
 from dataclasses import asdict, replace
 from pathlib import Path
 
-from ddqn_planner.files import claim, remove_temporaries
+from ddqn_planner.files import WorkFolder
 from ddqn_planner.grid import MoveRule
 from ddqn_planner.training.environment import Scenario
-from ddqn_planner.training.episodes import Episode, EpisodeLog
+from ddqn_planner.training.episodes import Episode, open_record, record
 from ddqn_planner.training.hyper_parameters import HyperParameters
-from ddqn_planner.training.memory import check_memory, megabytes
 from ddqn_planner.training.trainer import CheckpointError, Trainer
 
 SAVE_INTERVAL = 5_000
@@ -25,21 +24,14 @@ MARKS = LOCK, CHECKPOINT = "training.lock", "checkpoint.safetensors"
 class TrainingRun:
     """Trains into a folder, or continues there when the folder holds a checkpoint.
 
-    The run writes ``model.safetensors``, ``checkpoint.safetensors``, the files of `EpisodeLog`, and
+    The run writes ``model.safetensors``, ``checkpoint.safetensors``, ``episodes.csv``, and
     ``training.lock``, which keeps other processes out until `close` or the end of the process. The
     folder must be new or empty, or belong to a training.
 
-    Raises
-    ------
-    CheckpointError
-        If the folder holds a checkpoint that cannot be read, or one with another move rule or seed,
-        or other scenarios or parameters, except ``steps``.
-    FolderError
-        If the folder contains files but no training, or another process trains in it.
-    MemoryShortageError
-        If the training does not fit into the memory.
-    OSError
-        If the folder cannot be written.
+    A FolderError if it does not, or if another process trains there. A CheckpointError if the
+    checkpoint cannot be read, or is one of another move rule or seed, or of other scenarios or
+    parameters, except ``steps``. An OSError if the folder cannot be written. A MemoryError if the
+    training does not fit into the memory, also from `steps`.
     """
 
     def __init__(
@@ -54,72 +46,72 @@ class TrainingRun:
         self.model_path = self.folder / "model.safetensors"
         self.checkpoint_path = self.folder / CHECKPOINT
         self.curves_path = self.folder / "episodes.csv"
-        memory = check_memory(scenarios, parameters)
-        self.save_error = ""
-        with ExitStack() as stack:  # unlocks the folder if the rest fails
-            stack.enter_context(claim(self.folder, MARKS, "training", "trains"))
-            if self.checkpoint_path.exists():
-                self.trainer = Trainer.load_checkpoint(self.checkpoint_path, scenarios)
-                _check_same_training(self.trainer, move_rule, parameters, seed, self.folder)
-                self.trainer.parameters = parameters
-            else:
-                self.trainer = Trainer(scenarios, move_rule, parameters, seed)
-            self.saved_at = self.trainer.steps
-            for path in (self.model_path, self.checkpoint_path):
-                remove_temporaries(path)
-            log = EpisodeLog(self.curves_path, self.trainer.episodes, self.trainer.steps)
-            self._log = stack.enter_context(closing(log))
-            self._open_files = stack.pop_all()
+        after = f"the training continues and tries again every {SAVE_INTERVAL} steps"
+        self._work = WorkFolder(self.folder, MARKS, "training", "trains", after)
+        with self._work.opening() as files:
+            with _memory_with_remedy():
+                if self.checkpoint_path.exists():
+                    self.trainer = Trainer.load_checkpoint(self.checkpoint_path, scenarios)
+                    _check_same_training(self.trainer, move_rule, parameters, seed, self.folder)
+                    self.trainer.parameters = parameters
+                else:
+                    self.trainer = Trainer(scenarios, move_rule, parameters, seed)
+            self._record = open_record(self.curves_path, self.trainer.episodes)
+            files.enter_context(closing(self._record))
+        self.saved_at = self.trainer.steps
         self.description = (
-            f"training in {self.folder} from step {self.trainer.steps} to {parameters.steps}, "
-            f"with about {megabytes(memory)} of memory"
+            f"training in {self.folder} from step {self.trainer.steps} to {parameters.steps}"
         )
+
+    @property
+    def save_error(self) -> str:
+        """Why the last save failed; empty if it did not."""
+        return self._work.save_error
 
     def steps(self) -> Iterator[list[Episode]]:
         """Train until ``parameters.steps``; save every `SAVE_INTERVAL` steps and at the end.
 
-        Yield the episodes that ended with each step; they are in the log. If a save fails, or the
-        episodes cannot be written, the training continues, and `save_error` says why until a save
-        succeeds. Episodes that end meanwhile may be missing in the log.
+        Yield the episodes that ended with each step. If a save fails, the training continues, and
+        `save_error` says why until a save succeeds.
         """
-        for finished in self.trainer.run(self.trainer.parameters.steps):
-            for episode in finished:
-                try:
-                    self._log.append(episode, self.trainer.environment.move_rules[episode.scenario])
-                except OSError as error:
-                    self._fail(error)
-            due = self.trainer.steps // SAVE_INTERVAL != self.saved_at // SAVE_INTERVAL
-            if due and self.trainer.steps < self.trainer.parameters.steps:
-                self.try_to_save()
-            yield finished
-        self.try_to_save()
+        rules, until = self.trainer.environment.move_rules, self.trainer.parameters.steps
+        with _memory_with_remedy():
+            for finished in self.trainer.run(until):
+                for episode in finished:
+                    self._record.append(record(episode, rules[episode.scenario]))
+                due = self.trainer.steps // SAVE_INTERVAL != self.saved_at // SAVE_INTERVAL
+                if due and self.trainer.steps < until:
+                    self.try_to_save()
+                yield finished
+            self.try_to_save()
 
     def try_to_save(self) -> None:
-        """Write the model and the checkpoint.
-
-        If that fails, `save_error` says why, and the last good files stay.
-        """
+        """Write the model, the checkpoint and the episodes; if that fails, old files stay."""
         self.saved_at = self.trainer.steps
-        try:
+        with self._work.saving():
             # A kill between the two leaves a model that is newer than the checkpoint. Both are
             # complete, and nothing needs them to be of the same step.
             self.trainer.save_model(self.model_path)
             self.trainer.save_checkpoint(self.checkpoint_path)
-            self._log.flush()
-            self.save_error = ""
-        except OSError as error:
-            self._fail(error)
-
-    def _fail(self, error: OSError) -> None:
-        # Without the error's file name: it is often that of a temporary file.
-        self.save_error = (
-            f"cannot save to {self.folder} ({error.strerror or error}); make room or allow writing "
-            f"there: the training continues and tries again every {SAVE_INTERVAL} steps"
-        )
+            self._record.flush()
 
     def close(self) -> None:
         """Close the files and unlock the folder. `try_to_save` first."""
-        self._open_files.close()
+        self._work.close()
+
+
+@contextmanager
+def _memory_with_remedy() -> Iterator[None]:
+    """Say what to do where the memory is too small, for torch too, which has no error for it."""
+    try:
+        yield
+    except (MemoryError, RuntimeError) as error:
+        if isinstance(error, RuntimeError) and "can't allocate memory" not in str(error):
+            raise
+        raise MemoryError(
+            "the training does not fit into the memory; take a smaller map, or smaller filters, "
+            "hidden_units, batch_size, environments or replay_capacity"
+        ) from error
 
 
 def _check_same_training(

@@ -25,7 +25,6 @@ from ddqn_planner.training.encoders import ObservationEncoder, PropagationEncode
 from ddqn_planner.training.environment import GridVectorEnvironment, Scenario
 from ddqn_planner.training.episodes import Episode, EpisodeEnd
 from ddqn_planner.training.hyper_parameters import HyperParameters
-from ddqn_planner.training.memory import MemoryShortageError, check_memory
 from ddqn_planner.training.networks import MODULES, PropagationModule
 from ddqn_planner.training.replay_buffer import ReplayBuffer, Transitions
 
@@ -239,8 +238,6 @@ class Trainer:
         ------
         CheckpointError
             If the file is missing, broken or no checkpoint, or was made with other scenarios.
-        MemoryShortageError
-            If the training does not fit into the memory.
         """
         try:
             with safe_open(path, framework="pt") as file:
@@ -253,7 +250,6 @@ class Trainer:
                         "train into another folder"
                     )
                 parameters = HyperParameters(**description["parameters"])
-                check_memory(scenarios, parameters)
                 rule = MoveRule(description["move_rule"])
                 trainer = cls(scenarios, rule, parameters, description["seed"])
                 trainer.steps, trainer.updates, trainer.episodes, trainer._replay.added = (
@@ -276,7 +272,7 @@ class Trainer:
             states = description["generators"]
             for generator, state in zip(trainer._generators(), states, strict=True):
                 generator.bit_generator.state = state
-        except (CheckpointError, MemoryShortageError):
+        except (CheckpointError, MemoryError):
             raise
         except Exception as error:  # a broken file can raise any error in the libraries
             raise CheckpointError(

@@ -15,7 +15,7 @@ from nav_msgs.msg import Path
 from std_msgs.msg import Header
 
 from ddqn_planner.grid import Cell
-from ddqn_planner.nodes.frames import has_tf
+from ddqn_planner.nodes.poses import has_tf
 from ddqn_planner.nodes.runtime import LATCHED
 
 LEFT, RIGHT = (1, 5), (29, 5)

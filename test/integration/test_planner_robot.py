@@ -353,7 +353,7 @@ def transformed(
     """Run a planner with a map that asks TF where it is, with so many times its patience."""
     (tmp_path / "tf2_ros.py").write_text(TF2_ROS)
     (tmp_path / "sitecustomize.py").write_text(
-        "import ddqn_planner.nodes.start_source as source\n"
+        "import ddqn_planner.nodes.poses as source\n"
         f"source.PATIENCE *= {getattr(request, 'param', 1)}\n"
     )
     monkeypatch.setenv("PYTHONPATH", str(tmp_path), prepend=":")
@@ -493,7 +493,7 @@ def test_the_bound_of_the_kept_fields_holds_from_the_start(
 
 
 COUNT = """
-from ddqn_planner.planning.distance_field import DistanceField
+from ddqn_planner.planning.field import DistanceField
 
 begin = DistanceField.__init__
 

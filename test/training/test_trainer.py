@@ -11,10 +11,11 @@ import torch
 from safetensors import safe_open
 
 from ddqn_planner import GridMap, MoveRule, PlanStatus
-from ddqn_planner.benchmarks.evaluation import evaluate
 from ddqn_planner.model import load_model
+from ddqn_planner.planning import Planner
 from ddqn_planner.training.environment import Scenario
 from ddqn_planner.training.episodes import Episode, EpisodeEnd
+from ddqn_planner.training.evaluation import evaluate
 from ddqn_planner.training.hyper_parameters import HyperParameters
 from ddqn_planner.training.replay_buffer import Transitions
 from ddqn_planner.training.trainer import CheckpointError, Trainer
@@ -251,7 +252,7 @@ def test_a_saved_model_plans_as_the_trainer_does(small: Scenario, tmp_path: Path
     assert metadata == trainer.planner().metadata
     assert metadata.steps == 300
     expected = trainer.planner().q_field(small.grid, small.goal).q
-    q = network.q_values(small.grid, small.goal, metadata.move_rule)
+    q = Planner(network, metadata).q_field(small.grid, small.goal).q
     assert (q == expected).all()
 
 
@@ -343,3 +344,36 @@ def test_a_checkpoint_with_another_bit_is_refused_with_the_remedy(
         path.write_bytes(broken)
         with pytest.raises(CheckpointError, match="remove it to train anew, or train into another"):
             Trainer.load_checkpoint(path, [small])
+
+
+def test_a_checkpoint_of_holes_is_refused_before_it_is_read(
+    small: Scenario, tmp_path: Path
+) -> None:
+    path = tmp_path / "checkpoint.safetensors"
+    make(small).save_checkpoint(path)
+    header = json.loads(path.read_bytes()[8:].split(b"}}", 1)[0] + b"}}")
+    size = 2**30
+    for entry in header.values():
+        if "data_offsets" in entry:
+            entry.update(shape=[0], data_offsets=[size, size])
+    header["network.convolution.weight"].update(shape=[size // 4], data_offsets=[0, size])
+    text = json.dumps(header).encode()
+    with path.open("wb") as file:
+        file.write(len(text).to_bytes(8, "little") + text)
+        file.truncate(file.tell() + size)
+    with safe_open(path, framework="pt") as opened:  # it is what it seems to be
+        assert opened.get_slice("network.convolution.weight").get_shape() == [size // 4]
+    before = peak_after_reset()
+    with pytest.raises(CheckpointError, match="its tensors have other names, types or shapes"):
+        Trainer.load_checkpoint(path, [small])
+    assert peak() - before < 2**27
+
+
+def peak() -> int:
+    lines = dict(line.split(":") for line in Path("/proc/self/status").read_text().splitlines())
+    return int(lines["VmHWM"].split()[0]) * 1024
+
+
+def peak_after_reset() -> int:
+    Path("/proc/self/clear_refs").write_text("5")
+    return peak()

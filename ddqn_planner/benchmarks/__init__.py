@@ -1,1 +1,0 @@
-"""How good greedy rollouts are on maps that a model never saw: ``ddqn-planner evaluate``."""

@@ -1,1 +1,0 @@
-"""The paper's three experiments with many seeds: ``ddqn-planner reproduce``."""

@@ -1,0 +1,371 @@
+"""Where the robot is, and poses in the map's frame: for the planner and for the trainer.
+
+TF transforms poses in other frames than the map's, where tf2_ros is installed.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import math
+import time
+from collections.abc import Callable
+from contextlib import suppress
+from typing import Any, NamedTuple
+
+from geometry_msgs.msg import (
+    Pose,
+    PoseStamped,
+    PoseWithCovarianceStamped,
+    Quaternion,
+    TransformStamped,
+)
+from nav_msgs.msg import Odometry
+from rclpy.time import Time
+from std_msgs.msg import Header
+
+from ddqn_planner.grid import GridMap
+from ddqn_planner.nodes.conversions import check_pose, quaternion
+from ddqn_planner.nodes.listening import best_effort
+from ddqn_planner.nodes.report import Refusals, RequestError
+from ddqn_planner.nodes.runtime import STEADY, BaseNode
+
+PATIENCE = 1.0
+"""Seconds within which a new listener hears the first message of `odom` or TF. A pose that was
+stamped before may be transformed by a transform that is later by so much."""
+
+SILENCE = 2.0
+"""Seconds after which odometry that comes no more does not tell where the robot is."""
+
+TF_PERIOD = 0.05
+"""Seconds between two looks at the transform of a robot whose every pose counts."""
+
+REMEDY = "; or install tf2_ros (apt install ros-jazzy-tf2-ros-py), which transforms it"
+
+Point = tuple[float, float, float]
+
+
+class MapInFrame(NamedTuple):
+    """A map, and the frame of its origin."""
+
+    grid: GridMap
+    frame: str
+
+
+def has_tf() -> bool:
+    """Return whether tf2_ros is installed, without importing it; PyPI does not have it."""
+    return importlib.util.find_spec("tf2_ros") is not None
+
+
+def check_source(parameter: str, value: str, others: str) -> None:
+    """Raise a RuntimeError with the remedy if a parameter asks for TF without tf2_ros."""
+    if value == "tf" and not has_tf():
+        raise RuntimeError(
+            f"{parameter} is 'tf', which needs tf2_ros, and that is not installed: "
+            f"apt install ros-jazzy-tf2-ros-py, or set {parameter} to {others}"
+        )
+
+
+class Frames:
+    """Transforms poses to the map's frame by TF.
+
+    It listens to TF from the first pose on that needs it: a listener costs time for each message of
+    the robot's TF, and most robots give all poses in the map's frame. When the clock jumps back, it
+    forgets all transforms: tf2 takes none that is older than those it has.
+
+    `tolerance` returns how many seconds the newest transform may be old, or in the future.
+    """
+
+    def __init__(self, node: BaseNode, tolerance: Callable[[], float] = lambda: math.inf) -> None:
+        self.available = has_tf()
+        self._node, self._tolerance = node, tolerance
+        self._buffer: Any = None
+        self._listener: Any = None
+        self._began = -math.inf
+
+    def check(self, name: str, header: Header, pose: Pose, map_frame: str) -> None:
+        """Check a pose as `check_pose` does; its frame may be any with TF."""
+        check_pose(name, header, pose, "" if self.available else map_frame, REMEDY)
+
+    def to_map(self, name: str, stamped: PoseStamped, map_frame: str) -> PoseStamped:
+        """Return a pose in the map's frame, by the transform of the pose's time.
+
+        A RequestError says why TF has no such transform, or not yet: TF_ERROR.
+        """
+        frame = stamped.header.frame_id
+        if frame == map_frame:
+            return stamped
+        try:
+            return transformed(stamped, self._transform_at(stamped, map_frame))
+        except ValueError as error:
+            raise RequestError(
+                "TF_ERROR",
+                f"{name}'s frame is {frame!r}, and no transform leads from it to the map's, "
+                f"{map_frame!r} ({error}); publish one, or give the pose in the map's frame",
+            ) from None
+
+    def _transform_at(self, stamped: PoseStamped, map_frame: str) -> TransformStamped:
+        stamp, frame = Time.from_msg(stamped.header.stamp), stamped.header.frame_id
+        if not stamp.nanoseconds:
+            return self._newest(map_frame, frame)
+        try:
+            return self._lookup(map_frame, frame, stamp)
+        except ValueError:
+            newest = self._lookup(map_frame, frame)
+            later = (Time.from_msg(newest.header.stamp) - stamp).nanoseconds / 1e9
+            if not 0 < later <= PATIENCE:
+                raise
+            return newest
+
+    def origin_of(self, frame: str, map_frame: str) -> PoseStamped:
+        """Return where a frame's origin is now; ValueError if TF does not know it of now."""
+        return transformed(PoseStamped(), self._newest(map_frame, frame))
+
+    def _newest(self, target: str, source: str) -> TransformStamped:
+        newest = self._lookup(target, source)
+        stamp = Time.from_msg(newest.header.stamp)
+        age = (self._node.get_clock().now() - stamp).nanoseconds / 1e9
+        # Static transforms have the stamp 0, and are never too old.
+        if stamp.nanoseconds and abs(age) > self._tolerance():
+            when = f"{age:.3g} s old" if age > 0 else f"{-age:.3g} s in the future"
+            raise ValueError(
+                f"the newest is {when}, more than transform_tolerance, {self._tolerance():g} s"
+            )
+        return newest
+
+    def _lookup(self, target: str, source: str, stamp: Time | None = None) -> TransformStamped:
+        """Return the transform from a frame to another at a time, by default the newest."""
+        if not self.available:
+            raise ValueError("tf2_ros is not installed")
+        self.listen()
+        try:
+            return self._buffer.lookup_transform(target, source, stamp or Time())
+        except self._tf2_ros.TransformException as error:
+            raise ValueError(str(error)) from None
+
+    @property
+    def may_come(self) -> bool:
+        """Whether the first transforms are still expected, as the node has subscribed just now."""
+        return time.monotonic() - self._began < PATIENCE
+
+    def listen(self) -> None:
+        """Listen to TF from now on."""
+        if self._listener is None:
+            import tf2_ros  # it takes a while, and most robots do not need it
+
+            self._tf2_ros, self._buffer = tf2_ros, tf2_ros.Buffer()
+            self._listener = tf2_ros.TransformListener(self._buffer, self._node)
+            self._began = time.monotonic()
+            self._node.after_jump_back.add(self._forget)
+
+    def _forget(self) -> None:
+        self._buffer.clear()
+        self._began = time.monotonic()
+
+    def close(self) -> None:
+        """Stop listening, until a transform is needed again."""
+        if self._listener is not None:
+            self._node.after_jump_back.discard(self._forget)
+            self._listener.unregister()
+            self._buffer = self._listener = None
+
+
+def transformed(stamped: PoseStamped, transform: TransformStamped) -> PoseStamped:
+    """Return a pose in the transform's frame, projected to the plane: z is 0, and yaw is left."""
+    turn, shift = transform.transform.rotation, transform.transform.translation
+    position = stamped.pose.position
+    x, y, _ = _turned(turn, (position.x, position.y, position.z))
+    ahead_x, ahead_y, _ = _turned(turn, _turned(stamped.pose.orientation, (1.0, 0.0, 0.0)))
+    result = PoseStamped(header=transform.header)
+    result.pose.position.x, result.pose.position.y = x + shift.x, y + shift.y
+    result.pose.orientation = quaternion(math.atan2(ahead_y, ahead_x))
+    return result
+
+
+def _turned(rotation: Quaternion, point: Point) -> Point:
+    """Return p + 2 r × (r × p + w p), where r is the quaternion's vector and w its real part."""
+    x, y, z, w = rotation.x, rotation.y, rotation.z, rotation.w
+    px, py, pz = point
+    a, b, c = y * pz - z * py + w * px, z * px - x * pz + w * py, x * py - y * px + w * pz
+    return px + 2 * (y * c - z * b), py + 2 * (z * a - x * c), pz + 2 * (x * b - y * a)
+
+
+class StartSource:
+    """Where the planner's robot is, by its parameter ``start_source``.
+
+    That is the last `initialpose`, the last `odom`, or TF. A malformed message is refused, and the
+    one before it stays. `on_start` is called with each pose from which to plan at once.
+    """
+
+    def __init__(
+        self,
+        node: BaseNode,
+        frames: Frames,
+        refusals: Refusals,
+        map_frame: Callable[[], str],
+        on_start: Callable[[], None],
+    ) -> None:
+        self._node, self._frames, self._refusals = node, frames, refusals
+        self._map_frame, self._on_start = map_frame, on_start
+        self._pose: PoseStamped | None = None
+        self.source = self._topic = ""
+        self.listen()
+
+    def listen(self) -> None:
+        """Listen to what the parameter names, from when it is another one on."""
+        source = self._node.value("start_source")
+        if source == self.source:
+            return
+        self.close()
+        self.source, self._topic = source, "odom" if source == "odometry" else source
+        self._forget()
+        if source == "tf":
+            self._frames.listen()
+            return
+        message: Any = PoseWithCovarianceStamped
+        if source == "odometry":
+            message = Odometry
+            self._node.after_jump_back.add(self._forget)
+        quality = best_effort(10) if source == "odometry" else 10
+        self._subscription = self._node.create_subscription(
+            message, self._topic, self._take, quality
+        )
+
+    def close(self) -> None:
+        """Stop listening; what was refused no longer counts."""
+        self.accept()
+        if self.source == "tf":
+            self._frames.close()
+        elif self.source:
+            self._node.after_jump_back.discard(self._forget)
+            self._node.destroy_subscription(self._subscription)
+
+    def accept(self) -> None:
+        """Forget what was refused: it may be right now."""
+        self._refusals.accept(self._topic)
+
+    def _take(self, message: PoseWithCovarianceStamped | Odometry) -> None:
+        pose = message.pose.pose
+        try:
+            self._frames.check("the start", message.header, pose, self._map_frame())
+        except ValueError as error:
+            self._refusals.refuse(self._topic, str(error))
+            return
+        self.accept()
+        # Odometry comes all the time: it only triggers a plan that waits for the first pose.
+        is_due = self._pose is None or self.source == "initialpose"
+        self._pose = PoseStamped(header=message.header, pose=pose)
+        self._came = self._node.get_clock().now()
+        if is_due:
+            self._on_start()
+
+    def _forget(self) -> None:
+        self._pose, self._began = None, time.monotonic()
+
+    def transform(self) -> None:
+        """Transform the last `initialpose` as soon as TF can: it forgets the times before."""
+        frame = self._map_frame()
+        if self.source == "initialpose" and self._pose is not None and frame:
+            with suppress(RequestError):
+                self._pose = self._frames.to_map("the start", self._pose, frame)
+
+    def pose(self) -> PoseStamped:
+        """Return the last pose in its own frame; by TF, in the map's.
+
+        Odometry counts while it comes: its stamps may be those of another clock. A RequestError
+        says why there is no pose: NO_START.
+        """
+        if self.source == "tf":
+            return self._pose_by_tf()
+        topic, problem = self._subscription.topic_name, ""
+        if self._pose is None:
+            problem = f"nothing came on {topic} in the map's frame"
+            if self.source == "initialpose":
+                problem = f"set it on {topic} (in RViz: 2D Pose Estimate)"
+        elif self.source == "odometry":
+            silent = (self._node.get_clock().now() - self._came).nanoseconds / 1e9
+            if silent > max(self._node.value("transform_tolerance"), SILENCE):
+                problem = (
+                    f"nothing came on {topic} for {silent:.3g} s; publish it more often, set "
+                    "transform_tolerance"
+                )
+        if problem or self._pose is None:
+            raise RequestError(
+                "NO_START",
+                f"the start is unknown; {problem}; or set start_source, or give the request's "
+                "start its frame",
+            )
+        return self._pose
+
+    def _pose_by_tf(self) -> PoseStamped:
+        robot_frame, map_frame = self._node.value("robot_frame"), self._map_frame()
+        try:
+            return self._frames.origin_of(robot_frame, map_frame)
+        except ValueError as error:
+            raise RequestError(
+                "NO_START",
+                f"the start is unknown: no transform leads from {robot_frame!r} to {map_frame!r} "
+                f"({error}); publish one, or set robot_frame or start_source",
+            ) from None
+
+    @property
+    def may_come(self) -> bool:
+        """Whether the first pose is still expected, as the node has subscribed just now."""
+        return self.source != "initialpose" and time.monotonic() - self._began < PATIENCE
+
+
+class RobotPoses:
+    """Each pose of the trainer's robot, by its parameter ``pose_source``: `odom`, or TF.
+
+    `on_pose` is called with the seconds and the position in the map's frame, metres; its ValueError
+    refuses the pose. While `place` returns no map, poses are left out.
+    """
+
+    def __init__(
+        self,
+        node: BaseNode,
+        place: Callable[[], MapInFrame | None],
+        refusals: Refusals,
+        on_pose: Callable[[float, float, float], None],
+    ) -> None:
+        self._node, self._place, self._refusals, self._on_pose = node, place, refusals, on_pose
+        self._frames = Frames(node)
+        if node.value("pose_source") == "tf":
+            self._frames.listen()
+            node.create_timer(TF_PERIOD, self._look_up, clock=STEADY)
+        else:
+            node.create_subscription(Odometry, "odom", self._on_odometry, best_effort(1000))
+
+    def in_map(self, name: str, pose: PoseStamped, frame: str) -> tuple[float, float]:
+        """Return a pose's position in the map's frame; ValueError if it has none."""
+        self._frames.check(name, pose.header, pose.pose, frame)
+        position = self._frames.to_map(name, pose, frame).pose.position
+        return position.x, position.y
+
+    def _on_odometry(self, message: Odometry) -> None:
+        self._take("odom", PoseStamped(header=message.header, pose=message.pose.pose))
+
+    def _look_up(self) -> None:
+        place = self._place()
+        if place is None:
+            return
+        try:
+            pose = self._frames.origin_of(self._node.value("robot_frame"), place.frame)
+        except ValueError as error:
+            reason = f"{error}; publish a transform, or set robot_frame"
+            self._refusals.refuse("tf", reason, once=True)
+        else:
+            self._take("tf", pose)
+
+    def _take(self, topic: str, pose: PoseStamped) -> None:
+        place = self._place()
+        if place is None:
+            return
+        try:
+            seconds = Time.from_msg(pose.header.stamp).nanoseconds / 1e9
+            if not seconds:
+                raise ValueError("the robot's pose has no stamp; give it the time")
+            self._on_pose(seconds, *self.in_map("the robot's pose", pose, place.frame))
+        except ValueError as error:
+            self._refusals.refuse(topic, str(error), once=True)
+        else:
+            self._refusals.accept(topic)

@@ -1,0 +1,231 @@
+"""Goal iii (section 5.3, Fig. 9): maps with new obstacles, most of them never trained on.
+
+The paper leaves two things open: where the new obstacles lie (`Noise`), and whether its network has
+a hidden layer after the convolution. All four combinations are trained.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any, Final, NamedTuple
+
+import matplotlib.pyplot as plt
+import numpy as np
+from figures import draw_map, draw_new_obstacles, draw_path, save_figure
+from profiles import MOVE_RULE, PROFILES
+from settings import (
+    Settings,
+    mean_and_worst,
+    median_and_range,
+    optimal_length,
+)
+from supervised import train_supervised
+from tables import write_table
+from trainings import Training, in_parallel, rollouts, solved
+
+from ddqn_planner.grid import Cell, Noise, legal_moves, scatter_obstacles, shortest_path
+from ddqn_planner.planning import Plan, PlanStatus
+from ddqn_planner.planning.search import search
+from ddqn_planner.training.environment import Scenario, paper_scenario
+from ddqn_planner.training.hyper_parameters import HyperParameters
+
+TITLE = "Goal iii: noisy maps"
+
+TRAINING_MAPS, TEST_MAPS = 100, 200
+PAPER: Final = replace(PROFILES["paper"], steps=120_000, replay_capacity=120_000, filters=32)
+"""The profile paper for many maps: the steps are the paper's, memory and filters ours."""
+NOISE_SEED = 0
+EVALUATION_INTERVAL = 1_000
+SUPERVISED_UPDATES = 10_000
+
+COLUMNS = (
+    "new obstacles",
+    "planner",
+    "training maps solved",
+    "training, without action masking",
+    "test maps solved",
+    "test, without action masking",
+    "mean length / optimum, test",
+    "worst",
+    "distinct paths, test",
+    "steps",
+    "seconds",
+)
+
+
+class NoisyMaps(NamedTuple):
+    """Different maps with new obstacles on or next to the path of goal i."""
+
+    training: list[Scenario]
+    test: list[Scenario]
+    rejected: int
+    """Draws rejected because they closed every path."""
+    repeated: int
+    """Draws rejected because they repeated a map."""
+
+
+def noisy_maps(training: int, test: int, noise: Noise, seed: int = NOISE_SEED) -> NoisyMaps:
+    """Draw different noisy maps around the shortest path of goal i.
+
+    The training maps do not depend on the number of test maps.
+    """
+    scenario = paper_scenario()
+    path = shortest_path(scenario.grid, scenario.start, scenario.goal, MOVE_RULE)
+    random = np.random.default_rng(seed)
+    scenarios: dict[str, Scenario] = {}
+    rejected = repeated = 0
+    while len(scenarios) < training + test:
+        grid, closed = scatter_obstacles(scenario.grid, path, MOVE_RULE, random, noise)
+        rejected += closed
+        repeated += grid.fingerprint in scenarios
+        scenarios.setdefault(grid.fingerprint, replace(scenario, grid=grid))
+    drawn = list(scenarios.values())
+    return NoisyMaps(drawn[:training], drawn[training:], rejected, repeated)
+
+
+def drawn_maps(settings: Settings, noise: Noise) -> NoisyMaps:
+    """Return the noisy maps of the experiment."""
+    counts = (4, 6) if settings.quick else (TRAINING_MAPS, TEST_MAPS)
+    return noisy_maps(*counts, noise)
+
+
+def networks(settings: Settings) -> dict[str, tuple[str, HyperParameters]]:
+    """Return the folder and the parameters of each network, by its label in the table."""
+    papers = {
+        f"paper, {units} hidden units" if units else "paper": (
+            f"paper/hidden_{units}",
+            replace(PAPER, hidden_units=units),
+        )
+        for units in settings.hidden_units
+    }
+    return papers | {"propagation": ("propagation", PROFILES["propagation"])}
+
+
+def trainings(settings: Settings) -> list[Training]:
+    """Return the trainings of each network on the training maps of each noise."""
+    return [
+        training
+        for noise in settings.noise
+        for training in settings.trainings(
+            {f"{noise.value}/{folder}": p for folder, p in networks(settings).values()},
+            drawn_maps(settings, noise).training,
+            EVALUATION_INTERVAL,
+        )
+    ]
+
+
+def supervised_trainings(settings: Settings) -> list[Training]:
+    """Return the trainings for `train_supervised`: the paper's networks on maps near the path.
+
+    Obstacles on the path alone can be avoided by one fixed path.
+    """
+    if Noise.NEAR_PATH not in settings.noise:
+        return []
+    parameters_of = {
+        f"near_path/{folder}/supervised": replace(parameters, steps=SUPERVISED_UPDATES)
+        for folder, parameters in networks(settings).values()
+        if parameters.network == "paper"
+    }
+    return settings.trainings(parameters_of, drawn_maps(settings, Noise.NEAR_PATH).training)
+
+
+def fixed_path(maps: Sequence[Scenario]) -> tuple[Cell, ...]:
+    """Return a path from start to end that is free in many of the maps at once.
+
+    It does not depend on the map at hand, so a network must solve more maps, or find shorter
+    paths, to show that it sees the map. It is the cheapest path of the paper's map if a cell costs
+    1, and 1 more for each of the maps in which it is a new obstacle.
+    """
+    paper = paper_scenario()
+    occupied = sum(scenario.grid.occupancy.astype(np.float32) for scenario in maps)
+    legal = legal_moves(paper.grid.occupancy, MOVE_RULE)
+    return search(paper.start, paper.goal, legal, np.float32(1) + occupied, MOVE_RULE)
+
+
+def report(settings: Settings) -> str:
+    """Write the table and the figure of goal iii, and return its Markdown."""
+    in_parallel(train_supervised, supervised_trainings(settings), settings.backend)
+    rows, drawn = [], []
+    for noise in settings.noise:
+        maps = drawn_maps(settings, noise)
+        rows += [[noise.value, *row] for row in _rows(settings, maps, noise)]
+        drawn.append(
+            f"{noise.value}: {len(maps.training)} training and {len(maps.test)} test maps, all "
+            f"different; {maps.rejected} draws were rejected because they closed every path, "
+            f"{maps.repeated} because they repeated a map."
+        )
+    table = write_table(settings.out / "goal_3.csv", COLUMNS, rows)
+    return "\n\n".join([*drawn, table, _draw(settings)])
+
+
+def _rows(settings: Settings, maps: NoisyMaps, noise: Noise) -> list[list[str]]:
+    rows, scenarios = [], [*maps.training, *maps.test]
+    for label, (folder, parameters) in networks(settings).items():
+        name = f"{noise.value}/{folder}"
+        models = [(label, name, "kept.safetensors")]
+        if parameters.network == "paper":
+            models.append((f"{label}, last network", name, "model.safetensors"))
+            if noise is Noise.NEAR_PATH:
+                models.append((f"{label}, supervised", f"{name}/supervised", "model.safetensors"))
+        for model, trained, file in models:
+            plans = [rollouts(planner, scenarios) for planner in settings.planners(trained, file)]
+            ends = [run[-1] for run in settings.evaluations(trained) if run]
+            cost = [
+                median_and_range([end.step for end in ends]),
+                median_and_range([end.seconds for end in ends], 1),
+            ]
+            rows.append([model, *_columns(plans, maps), *(cost if ends else ["-", "-"])])
+    path = fixed_path(maps.training)
+    on_maps = [_on_map(path, scenario) for scenario in scenarios]
+    return [*rows, ["one fixed path", *_columns([(on_maps, on_maps)], maps), "-", "-"]]
+
+
+def _on_map(path: tuple[Cell, ...], scenario: Scenario) -> Plan:
+    """Return the path as a plan on a map: trapped if a cell of it is occupied."""
+    if all(map(scenario.grid.is_free, path)):
+        return Plan(PlanStatus.SUCCEEDED, np.array(path))
+    return Plan(PlanStatus.ROLLOUT_TRAPPED)
+
+
+def _columns(of_seeds: Sequence[tuple[list[Plan], list[Plan]]], maps: NoisyMaps) -> list[str]:
+    """Return the cells of the table: the plans of each seed on all maps, see `rollouts`."""
+    training, test = slice(len(maps.training)), slice(len(maps.training), None)
+    optimum = [optimal_length(scenario) for scenario in maps.test]
+    ratios = [
+        [p.length / least for p, least in zip(plans[test], optimum, strict=True) if p.cells]
+        for plans, _ in of_seeds
+    ]
+    return [
+        *(
+            median_and_range([solved(plans[masking][part]) for plans in of_seeds])
+            for part in (training, test)
+            for masking in (0, 1)
+        ),
+        *mean_and_worst(ratios),
+        median_and_range([len({p.cells for p in plans[test] if p.cells}) for plans, _ in of_seeds]),
+    ]
+
+
+def _draw(settings: Settings) -> str:
+    size = (12, 4.2 * len(settings.noise))
+    figure, panels = plt.subplots(
+        len(settings.noise), 3, figsize=size, layout="constrained", squeeze=False
+    )
+    legend: dict[str, Any] = {}
+    for noise, row in zip(settings.noise, panels, strict=True):
+        planners = {
+            label: settings.planners(f"{noise.value}/{folder}", "kept.safetensors")[0]
+            for label, (folder, _) in networks(settings).items()
+        }
+        for axes, scenario in zip(row, drawn_maps(settings, noise).test, strict=False):
+            draw_map(axes, scenario, noise.value)
+            draw_new_obstacles(axes, scenario.grid, paper_scenario().grid)
+            for number, (label, planner) in enumerate(planners.items()):
+                plan = planner.plan(scenario.grid, scenario.start, scenario.goal)
+                draw_path(axes, plan.cells, number, label)
+            handles, labels = axes.get_legend_handles_labels()
+            legend |= dict(zip(labels, handles, strict=True))
+    figure.legend([*legend.values()], [*legend], loc="outside lower center", ncols=len(legend))
+    caption = "Fig. 9: the first three test maps of each reading"
+    return save_figure(figure, settings.out / "goal_3.png", caption)

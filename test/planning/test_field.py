@@ -1,0 +1,325 @@
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
+from types import FrameType
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from strategies import grids_with_costs, grids_with_free_cell
+
+from ddqn_planner import GridMap, MoveRule, Planner, PlanStatus
+from ddqn_planner.grid import Cell, shortest_distances
+from ddqn_planner.grid.generators import KINDS, generate_map, random_requests
+from ddqn_planner.planning import field as fields
+from ddqn_planner.planning import kernels, repair
+from ddqn_planner.planning.field import DistanceField, network_field
+
+RULES = st.sampled_from(list(MoveRule))
+NETWORK, METADATA = (lambda planner: (planner.network, planner.metadata))(Planner.load("any_map"))
+GRIDS = grids_with_free_cell() | grids_with_costs()
+
+
+def fresh_field(grid: GridMap, goal: Cell, rule: MoveRule) -> DistanceField:
+    field = Planner(NETWORK, METADATA).q_field(grid, goal, rule)
+    assert isinstance(field, DistanceField)
+    return field
+
+
+def assert_same(field: Any, fresh: Any) -> None:
+    for name in ("value", "policy", "q"):
+        np.testing.assert_array_equal(getattr(field, name), getattr(fresh, name))
+    np.testing.assert_array_equal(field.known.distance, fresh.known.distance)  # bit for bit
+
+
+@given(GRIDS, RULES, st.data())
+def test_the_path_is_the_same_whatever_was_asked_before(
+    grid_and_goal: tuple[GridMap, Cell], rule: MoveRule, data: st.DataObject
+) -> None:
+    grid, goal = grid_and_goal
+    grown, whole = fresh_field(grid, goal, rule), fresh_field(grid, goal, rule)
+    _ = whole.value
+    exact = shortest_distances(grid, goal, rule)
+    for start in data.draw(st.lists(st.sampled_from(grid.free_cells()), min_size=1, max_size=5)):
+        plan = grown.rollout(start)
+        assert plan == whole.rollout(start) == fresh_field(grid, goal, rule).rollout(start)
+        assert (plan.status is PlanStatus.NO_PATH) == np.isinf(exact[start[::-1]])
+    assert_same(grown, whole)
+
+
+@given(GRIDS, RULES)
+def test_the_whole_field_is_that_of_the_network(
+    grid_and_goal: tuple[GridMap, Cell], rule: MoveRule
+) -> None:
+    grid, goal = grid_and_goal
+    field = fresh_field(grid, goal, rule)
+    q = network_field(NETWORK, grid, goal, rule).q
+    np.testing.assert_allclose(
+        np.where(field.legal, field.q, -np.inf), np.where(field.legal, q, -np.inf), rtol=1e-5
+    )
+    np.testing.assert_array_equal(np.isfinite(field.q), np.isfinite(q) & field.legal)
+    np.testing.assert_array_equal(field.policy >= 0, (field.policy >= 0) & field.legal.any(axis=0))
+
+
+def test_a_request_visits_few_cells_of_a_large_map() -> None:
+    grid = GridMap(np.zeros((400, 400)))
+    field = fresh_field(grid, (20, 20), MoveRule.ROBOT_SAFE)
+    assert field.rollout((30, 25)).cells
+    assert np.count_nonzero(field.known.distance) < 500
+    assert field.rollout_if_known((30, 25)) == field.rollout((30, 25))
+    assert field.rollout_if_known((300, 300)) is None
+    assert field.nbytes <= 10 * grid.occupancy.size
+
+
+def test_a_request_without_a_path_does_not_visit_the_whole_map() -> None:
+    occupancy = np.zeros((200, 200))
+    occupancy[:, 10] = 1
+    grid, planner = GridMap(occupancy), Planner(NETWORK, METADATA)
+    assert planner.plan(grid, (0, 0), (199, 199)).status is PlanStatus.NO_PATH
+    field = planner.known_field(grid, (199, 199))
+    assert isinstance(field, DistanceField)
+    assert not field.is_whole
+    assert np.count_nonzero(field.known.distance) < 0.6 * occupancy.size
+
+
+# Repair
+
+
+@pytest.fixture(autouse=True)
+def any_share(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Repair the small maps of these tests, however much of them changes."""
+    monkeypatch.setattr(repair, "CHANGED_SHARE", 1.0)
+    monkeypatch.setattr(fields, "REPAIRED_SHARE", 1.0)
+    monkeypatch.setattr(fields, "REPAIRED", fields.REPAIRED)  # tests change it
+
+
+@st.composite
+def changed_maps(draw: st.DrawFn, grid: GridMap) -> GridMap:
+    """Draw a map of the same place: other cells in a box, or another cut of it."""
+    if draw(st.booleans()):
+        width, height = draw(st.integers(1, grid.width)), draw(st.integers(1, grid.height))
+        x = draw(st.integers(0, grid.width - width))
+        y = draw(st.integers(0, grid.height - height))
+        random = np.random.default_rng(draw(st.integers(0, 2**32)))
+        patch = random.random((height, width)) < draw(st.sampled_from([0, 0.3, 1]))
+        cost = None if grid.cost is None else random.integers(-1, 100, patch.shape)
+        return grid.with_patch(patch, x, y, cost)
+    left, right, below, above = (draw(st.integers(-2, 3)) for _ in range(4))
+    if grid.width + left + right < 1 or grid.height + below + above < 1:
+        left = right = below = above = 1
+
+    def cut(array: np.ndarray) -> np.ndarray:
+        sides = ((max(below, 0), max(above, 0)), (max(left, 0), max(right, 0)))
+        padded = np.pad(array, sides, constant_values=0)
+        height, width = padded.shape
+        return padded[
+            max(-below, 0) : height - max(-above, 0), max(-left, 0) : width - max(-right, 0)
+        ]
+
+    corner = grid.cell_to_world((-left, -below))
+    first = grid.cell_to_world((0, 0))
+    origin = (
+        grid.origin[0] + corner[0] - first[0],
+        grid.origin[1] + corner[1] - first[1],
+        grid.origin[2],
+    )
+    cost = None if grid.cost is None else cut(grid.cost)
+    return GridMap(cut(grid.occupancy), grid.resolution, origin, cost)
+
+
+def place_of(cell: Cell, old: GridMap, new: GridMap) -> Cell:
+    return new.world_to_cell(*old.cell_to_world(cell))
+
+
+@settings(max_examples=400)
+@given(GRIDS, RULES, st.floats(0, 6), st.integers(1, 4), st.data())
+def test_a_repaired_field_is_a_fresh_one_bit_for_bit(
+    grid_and_goal: tuple[GridMap, Cell],
+    rule: MoveRule,
+    yaw: float,
+    changes: int,
+    data: st.DataObject,
+) -> None:
+    plain, goal = grid_and_goal
+    grid = GridMap(plain.occupancy, 0.05, (1.25, -3.0, yaw), plain.cost)
+    fields.REPAIRED = data.draw(st.sampled_from([1, 3, 300]), label="limit of a repair")
+    planner = Planner(NETWORK, METADATA)
+    if data.draw(st.booleans(), label="whole"):
+        _ = planner.q_field(grid, goal, rule).value
+    for _ in range(changes):
+        start = data.draw(st.sampled_from(grid.free_cells()))
+        planner.plan(grid, start, goal, rule)
+        changed = data.draw(changed_maps(grid))
+        goal = place_of(goal, grid, changed)
+        if not changed.is_free(goal):
+            return
+        grid = changed
+        start = data.draw(st.sampled_from(grid.free_cells()))
+        fresh = Planner(NETWORK, METADATA)
+        assert planner.plan(grid, start, goal, rule) == fresh.plan(grid, start, goal, rule)
+        if data.draw(st.booleans(), label="compare"):
+            assert_same(planner.q_field(grid, goal, rule), fresh_field(grid, goal, rule))
+
+
+def test_a_changed_map_uses_what_is_known_of_the_one_before() -> None:
+    random = np.random.default_rng(0)
+    grid = GridMap(generate_map("office", (200, 200), random))
+    ((start, goal),) = random_requests(grid.occupancy, MoveRule.ROBOT_SAFE, 1, random)
+    planner = Planner(NETWORK, METADATA)
+    before = planner.plan(grid, start, goal)
+    x, y = before.cells[3]
+    changed = grid.with_patch(np.ones((1, 1)), x, y)
+    older, field = planner.q_field(grid, goal), fresh_field(changed, goal, MoveRule.ROBOT_SAFE)
+    assert isinstance(older, DistanceField)
+    known = np.count_nonzero(older.known.distance)
+    cells = repair.changed_cells(grid, changed, (0, 0))
+    assert cells is not None
+    assert field.take_over(older, cells, (0, 0))
+    assert np.count_nonzero(field.known.distance) > 0.9 * known
+    assert np.count_nonzero(older.known.distance) == 1  # it handed over its memory
+    assert field.rollout(start) == fresh_field(changed, goal, MoveRule.ROBOT_SAFE).rollout(start)
+    assert older.rollout(start).cells == before.cells  # and begins anew
+
+
+def test_a_repair_that_takes_too_long_leaves_the_older_field_as_it_was() -> None:
+    fields.REPAIRED = 5
+    grid, goal = GridMap(np.zeros((60, 60))), (30, 30)
+    planner = Planner(NETWORK, METADATA)
+    older = planner.q_field(grid, goal)
+    before = older.rollout((0, 0))
+    changed = grid.with_patch(np.ones((1, 12)), 20, 29)  # a wall beside the goal
+    start = (30, 32)
+    assert planner.plan(changed, start, goal) == Planner(NETWORK, METADATA).plan(
+        changed, start, goal
+    )
+    assert planner.known_field(grid, goal) is older
+    assert older.rollout_if_known((0, 0)) == before
+    assert_same(older, fresh_field(grid, goal, MoveRule.ROBOT_SAFE))
+
+
+@settings(max_examples=150)
+@given(GRIDS, RULES, st.booleans(), st.integers(0, 2), st.integers(1, 1500), st.data())
+def test_a_field_that_is_interrupted_anywhere_is_as_a_new_one(
+    grid_and_goal: tuple[GridMap, Cell],
+    rule: MoveRule,
+    whole: bool,
+    interrupted_step: int,
+    line: int,
+    data: st.DataObject,
+) -> None:
+    grid, goal = grid_and_goal
+    planner, start = Planner(NETWORK, METADATA), data.draw(st.sampled_from(grid.free_cells()))
+    x, y = data.draw(st.sampled_from(grid.free_cells()))
+    changed = grid.with_patch([[(x, y) != goal]], x, y)
+    older = planner.q_field(grid, goal, rule)
+    steps = [
+        lambda: older.value if whole else older.rollout(start),
+        lambda: planner.q_field(changed, goal, rule),
+        lambda: planner.plan(changed, start, goal, rule),
+    ]
+    for number, step in enumerate(steps):
+        if number == interrupted_step:
+            run_until(line, step)
+        step()
+    for each in (grid, changed):
+        assert planner.plan(each, start, goal, rule) == Planner(NETWORK, METADATA).plan(
+            each, start, goal, rule
+        )
+    fresh = fresh_field(grid, goal, rule)
+    assert older.rollout(start) == fresh.rollout(start)
+    assert_same(older, fresh)
+    assert_same(planner.q_field(changed, goal, rule), fresh_field(changed, goal, rule))
+
+
+def run_until(line: int, step: Callable[[], object]) -> None:
+    """Run a step, and fail where so many lines of the field's code were run, if it gets there."""
+    files = {module.__file__ for module in (fields, repair, kernels)}
+    left = line
+
+    def trace(frame: FrameType, event: str, _: object) -> Any:
+        nonlocal left
+        if frame.f_code.co_filename not in files:
+            return None
+        left -= event == "line"
+        if not left:
+            raise MemoryError
+        return trace
+
+    before = sys.gettrace()
+    with pytest.MonkeyPatch.context() as patch, suppress(MemoryError):
+        for name in ("_grow", "_wider", "take_back"):
+            patch.setattr(kernels, name, getattr(kernels, name).__wrapped__)
+        sys.settrace(trace)
+        try:
+            step()
+        finally:
+            sys.settrace(before)
+
+
+def test_with_too_many_changes_a_field_is_computed_anew(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.undo()
+    grid, other = (GridMap(np.random.default_rng(n).random((60, 60)) < 0.2) for n in (0, 1))
+    assert repair.changed_cells(grid, other, (0, 0)) is None
+
+
+def test_the_fields_of_another_map_are_kept(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.undo()
+    first, second = (GridMap(np.random.default_rng(n).random((60, 60)) < 0.2) for n in (0, 1))
+    goal = next(cell for cell in first.free_cells() if second.is_free(cell))
+    planner = Planner(NETWORK, METADATA)
+    fields = [planner.q_field(grid, goal) for grid in (first, second, first, second)]
+    assert fields[:2] == fields[2:]
+
+
+@pytest.mark.parametrize(
+    ("resolution", "origin", "shift"),
+    [
+        (0.05, (0.0, 0.0, 0.0), (0, 0)),
+        (float(np.float32(0.05)), (-1.0, 0.5, 0.0), (20, -10)),
+        (0.05, (0.02, 0.0, 0.0), None),
+        (0.1, (0.0, 0.0, 0.0), None),
+        (0.05, (0.0, 0.0, 0.1), None),
+        (0.05, (0.0, 0.0, 0.005), None),
+    ],
+)
+def test_maps_are_compared_where_one_is_the_other_shifted_by_whole_cells(
+    resolution: float, origin: tuple[float, float, float], shift: Cell | None
+) -> None:
+    cells = np.zeros((9, 9))
+    old = GridMap(cells, 0.05)
+    assert repair.shift_between(old, GridMap(cells, resolution, origin)) == shift
+    with_costs = GridMap(cells, resolution, origin, np.ones((9, 9), dtype=np.int8))
+    assert repair.shift_between(old, with_costs) is None
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_threads_share_a_planner_while_the_map_changes(kind: str) -> None:
+    random = np.random.default_rng(1)
+    grid = GridMap(generate_map(kind, (60, 60), random))
+    requests = random_requests(grid.occupancy, MoveRule.ROBOT_SAFE, 4, random)
+    maps = [grid]
+    for _ in range(5):
+        x, y = random.integers(0, 58, 2).tolist()
+        maps.append(maps[-1].with_patch(random.random((2, 2)) < 0.5, x, y))
+    expected = {
+        (number, request): Planner(NETWORK, METADATA).plan(changed, *request)
+        for number, changed in enumerate(maps)
+        for request in requests
+    }
+    planner = Planner(NETWORK, METADATA)
+
+    def count_wrong(seed: int) -> int:
+        order, wrong = np.random.default_rng(seed), 0
+        for _ in range(100):
+            number = int(order.integers(len(maps)))
+            request = requests[int(order.integers(len(requests)))]
+            wrong += planner.plan(maps[number], *request) != expected[number, request]
+        return wrong
+
+    with ThreadPoolExecutor(4) as threads:
+        assert list(threads.map(count_wrong, range(4))) == [0, 0, 0, 0]
