@@ -20,11 +20,12 @@ import numpy as np
 import pyastar2d
 from benchmark import report
 from processes import run_script
+from random_maps import KINDS, generate_map
 
 from ddqn_planner import GridMap, MoveRule, Plan, Planner, QField
 from ddqn_planner.grid import Cell, shortest_distances
 from ddqn_planner.grid.arguments import Occupancy
-from ddqn_planner.grid.generators import KINDS, generate_map, random_costs, random_requests
+from ddqn_planner.grid.noise import random_costs, random_requests
 from ddqn_planner.planning.field import network_field
 
 RULE = MoveRule.ROBOT_SAFE

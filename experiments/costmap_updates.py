@@ -31,10 +31,10 @@ from nav_msgs.msg import Path
 from nav_msgs.srv import GetPlan
 from numpy.typing import NDArray
 from processes import claim_ros_domain, cpu_seconds, run_script, running_node
+from random_maps import generate_map
 from std_msgs.msg import Header
 
 from ddqn_planner.grid import Cell, GridMap, clearance, connected_cells
-from ddqn_planner.grid.generators import generate_map
 from ddqn_planner.nodes.runtime import LATCHED
 
 try:

@@ -15,10 +15,11 @@ import matplotlib.pyplot as plt
 import nano_astar
 import numpy as np
 from numpy.typing import NDArray
+from random_maps import generate_map
 
 from ddqn_planner import GridMap, MoveRule, Planner
 from ddqn_planner.grid import shortest_distances
-from ddqn_planner.grid.generators import generate_map, random_requests
+from ddqn_planner.grid.noise import random_requests
 from ddqn_planner.planning.field import DistanceField
 from ddqn_planner.planning.kernels import CLOSED
 

@@ -38,7 +38,7 @@ from processes import claim_ros_domain, memory, run_script, running_node
 from rclpy.qos import DurabilityPolicy, QoSProfile
 
 from ddqn_planner.grid import connected_cells
-from ddqn_planner.grid.generators import random_requests
+from ddqn_planner.grid.noise import random_requests
 from ddqn_planner.nodes.runtime import LATCHED
 
 REQUESTS, CLIENTS, CHANGES = 10_000, 8, 50
