@@ -656,8 +656,7 @@ def test_what_cannot_be_shown_does_not_end_the_node(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     (tmp_path / "sitecustomize.py").write_text(
-        "import ddqn_planner.nodes.display as display\n"
-        f"display.{name}_message = lambda *_: [][0]\n"
+        f"import ddqn_planner.nodes.display as display\ndisplay.{name}_message = lambda *_: [][0]\n"
     )
     monkeypatch.setenv("PYTHONPATH", str(tmp_path), prepend=":")
     client = make_client(f"/no_{name}")
