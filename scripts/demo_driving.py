@@ -34,7 +34,7 @@ from numpy.typing import NDArray
 from PIL import Image
 from processes import claim_ros_domain, run_script, running, running_node
 
-from ddqn_planner.experience.drive_recorder import ARRIVAL_DISTANCE
+from ddqn_planner.experience.drives import ARRIVAL_DISTANCE
 from ddqn_planner.grid import Cell, GridMap, MoveRule, save_map
 from ddqn_planner.nodes.driving import SLOWEST
 from ddqn_planner.nodes.runtime import LATCHED

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from ddqn_planner.experience import Experience
-from ddqn_planner.experience.drive_log import EXPERIENCE, LOCK, RECORD, Drive, read_drives
+from ddqn_planner.experience.drives import EXPERIENCE, LOCK, RECORD, Drive, read_drives
 from ddqn_planner.experience.recordings import drives_of, read_csv, read_mcap
 from ddqn_planner.files import claim
 from ddqn_planner.grid import load_map
@@ -46,8 +46,7 @@ def run(options: argparse.Namespace) -> int:
             stack.enter_context(claim(source, [LOCK, RECORD], "drives", "records"))
         drives = read(source, options)
         for drive in drives:
-            experience.apply(grid)  # so that the time is compared with the expected one
-            drive.teach(experience)
+            drive.teach(experience, grid)
         if not drives:
             raise ValueError(f"{source} holds no drive; drive on")
         out = options.out or (source if source.is_dir() else source.parent) / EXPERIENCE

@@ -8,7 +8,6 @@ import numpy as np
 from rclpy.task import Future
 
 from ddqn_planner.experience import ExpectedTime, Experience
-from ddqn_planner.experience.take_over import take_over
 from ddqn_planner.grid import GridMap
 from ddqn_planner.nodes.report import Outcome
 from ddqn_planner.nodes.runtime import Worker
@@ -36,7 +35,7 @@ class ExpectedTimes:
         """
         newer = Experience.load(path)
         if self._experience is not None:
-            take_over(newer, self._experience)
+            newer.take_over(self._experience)
         self._experience = newer
 
     def apply(self, grid: GridMap) -> GridMap:
