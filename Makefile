@@ -29,11 +29,11 @@ $(VENV)/installed: setup.py Makefile
 	touch $@
 
 demo: setup
-	$(BIN)/python scripts/demo.py
+	$(BIN)/python examples/demo.py
 
 # A robot learns by driving where it is slow: a film, a picture and a curve.
 demo-driving: setup
-	$(BIN)/python scripts/demo_driving.py $(MISSIONS)
+	$(BIN)/python examples/demo_driving.py $(MISSIONS)
 
 # One process per core; each has its nodes in a ROS domain of its own.
 PYTEST := $(BIN)/python -m pytest --numprocesses auto --maxprocesses 4 --dist loadfile --no-loadscope-reorder
@@ -67,18 +67,18 @@ types: setup
 
 bench: setup
 	$(BIN)/pip install --quiet --editable ".[$(EXTRAS),bench]"
-	$(BIN)/python scripts/startup.py
-	$(BIN)/python scripts/benchmark.py
-	$(BIN)/python scripts/benchmark_fields.py
-	$(BIN)/python scripts/benchmark_any_map.py $(MAP)
+	$(BIN)/python experiments/startup.py
+	$(BIN)/python experiments/benchmark.py
+	$(BIN)/python experiments/benchmark_fields.py
+	$(BIN)/python experiments/benchmark_any_map.py $(MAP)
 
 # What a robot's body costs, on MAP (the office by default) and with RADIUS, metres.
 body: setup
-	$(BIN)/python scripts/body.py $(MAP) $(RADIUS)
+	$(BIN)/python experiments/body.py $(MAP) $(RADIUS)
 
 # 50 kills, 1,000 inputs of each kind, 10,000 requests, 30 minutes; KILLS, REQUESTS, MINUTES change it.
 faults: setup
-	$(BIN)/python scripts/faults.py $(KILLS)
+	$(BIN)/python experiments/faults.py $(KILLS)
 
 fuzz: setup
 	$(BIN)/python -m pytest --hypothesis-profile=fuzz --hypothesis-show-statistics -m hypothesis \
@@ -86,10 +86,10 @@ fuzz: setup
 		test/training/test_run.py test/integration
 
 load: setup
-	$(BIN)/python scripts/load.py $(REQUESTS)
+	$(BIN)/python experiments/load.py $(REQUESTS)
 
 soak: setup
-	$(BIN)/python scripts/soak.py $(MINUTES)
+	$(BIN)/python experiments/soak.py $(MINUTES)
 
 # These train the shipped models from nothing: the one for any map, and the paper's network.
 model: setup

@@ -15,7 +15,6 @@ REMEDIES: Final = {
     "mcap_ros2": "pip install mcap-ros2-support",
     "numba": "pip install numba",
     "rclpy": ROS,
-    "rerun": "pip install 'rerun-sdk>=0.39'",
     "safetensors": "pip install safetensors",
     "torch": TRAINING,
 }

@@ -38,7 +38,7 @@ from ddqn_planner.cli import HelpFormatter, exit_code
 from ddqn_planner.experience import Experience
 from ddqn_planner.files import write_atomically
 from ddqn_planner.grid import MoveRule
-from ddqn_planner.pictures.picture import draw_obstacles
+from ddqn_planner.pictures import draw_obstacles
 from ddqn_planner.planning import Planner
 
 BARS = {"1 to 20": 1.08, "21 to 50": 1.04, "51 to 100": 1.02}

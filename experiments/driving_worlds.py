@@ -8,9 +8,9 @@ from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
+from random_maps import generate_map
 
 from ddqn_planner.grid import Cell, GridMap, MoveRule
-from ddqn_planner.grid.generators import generate_map
 from ddqn_planner.grid.moves import component_labels, segment_lengths
 
 Float64 = NDArray[np.float64]

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from trainings import TrainingEvaluation
 
 from ddqn_planner.grid import Cell, GridMap
-from ddqn_planner.pictures.picture import draw_obstacles
+from ddqn_planner.pictures import draw_obstacles
 from ddqn_planner.training.environment import Scenario
 
 COLOURS: Final = ("#0072B2", "#D55E00", "#009E73", "#CC79A7")

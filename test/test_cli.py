@@ -196,37 +196,11 @@ def test_plan_searches_in_fallback_mode(capsys: pytest.CaptureFixture[str]) -> N
     assert ", astar_fallback, planned in" in printed
 
 
-def test_plan_writes_an_animation(tmp_path: Path) -> None:
-    assert main(["plan", "office", "--animate", str(tmp_path / "plan.gif")]) == 0
-    assert (tmp_path / "plan.gif").stat().st_size < 2**21
-    with Image.open(tmp_path / "plan.gif") as animation:
-        assert 60 < animation.n_frames <= 81
-
-
-@pytest.mark.parametrize(
-    ("start", "goal", "spreads"), [("1", "6", True), ("6", "1", False), ("99", "6", True)]
-)
-def test_an_animation_without_a_path_shows_the_field_if_there_is_one(
-    tmp_path: Path, start: str, goal: str, spreads: bool
-) -> None:
-    ends = ["--start", start, "19", "--goal", goal, "19"]
-    assert main(["plan", "dilemma", *ends, "--animate", str(tmp_path / "plan.GIF")]) == 1
-    with Image.open(tmp_path / "plan.GIF") as animation:
-        assert (animation.n_frames > 1) == spreads
-
-
-def test_an_animation_that_is_no_gif_is_refused_before_planning(
-    capsys: pytest.CaptureFixture[str],
-) -> None:
-    assert main(["plan", "no_such_map", "--animate", "plan.mp4"]) == 2
-    assert "--animate is plan.mp4; give a file that ends in .gif" in capsys.readouterr().err
-
-
 @pytest.mark.parametrize(
     ("arguments", "unused"),
     [
         (["--help"], ("numpy", "ddqn_planner.grid")),
-        (["watch", "--help"], ("numpy", "rclpy", "rerun")),
+        (["plan", "--help"], ("rclpy", "matplotlib")),
         (["plan", "dilemma"], ("torch", "matplotlib", "ddqn_planner.training", "tqdm")),
         (["certify"], ("torch", "numba", "scipy", "ddqn_planner.planning")),
     ],
@@ -250,15 +224,11 @@ def test_a_command_imports_only_what_it_needs(
 
 
 def test_a_missing_library_is_named_with_how_to_get_it(
-    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    monkeypatch.setitem(sys.modules, "rerun", None)
-    monkeypatch.delitem(sys.modules, "ddqn_planner.commands.watch", raising=False)
-    monkeypatch.delitem(sys.modules, "ddqn_planner.nodes.watch", raising=False)
-    assert main(["watch"]) == 2
-    error = capsys.readouterr().err
-    assert "rerun" in error
-    assert "pip install 'rerun-sdk>=0.39'" in error
+    monkeypatch.setitem(sys.modules, "matplotlib", None)
+    assert main(["plan", "dilemma", "--picture", str(tmp_path / "plan.png")]) == 2
+    assert capsys.readouterr().err.endswith("; pip install matplotlib\n")
 
 
 ABSENT = """

@@ -15,7 +15,7 @@ CLEARANCE_SCALE = 1.0
 
 It falls as 1 / (1 + distance / scale)^3. Linear and exponential costs were compared with it, each
 with paths at most 1.10 times as long on eight maps of this package; none kept clearly greater
-distances. See docs/reliability.md."""
+distances. See docs/tuning.md."""
 
 ROUNDING = 1e-6
 """A message has the resolution as float32: 0.2 m must be 4 cells of 0.05 m, not 3.9999999."""

@@ -31,6 +31,7 @@ from generalisation import (
 from hypothesis import given
 from hypothesis import strategies as st
 from networks import random_network
+from random_maps import KINDS
 
 from ddqn_planner.grid import (
     MOVES,
@@ -43,7 +44,6 @@ from ddqn_planner.grid import (
     save_map,
     shortest_distances,
 )
-from ddqn_planner.grid.generators import KINDS
 from ddqn_planner.model import ModelMetadata, QNetwork
 from ddqn_planner.model.model_file import save_model
 from ddqn_planner.planning import Planner

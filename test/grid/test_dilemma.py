@@ -1,4 +1,4 @@
-"""The rebuilt map has each property that the paper's text gives; see docs/dilemma_map.md."""
+"""The rebuilt map has each property that the paper's text gives; see docs/reproduction.md."""
 
 from __future__ import annotations
 

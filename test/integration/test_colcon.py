@@ -31,7 +31,7 @@ START_TIMEOUT = 120.0
 """Seconds in which a node of a loaded machine imports torch and speaks."""
 
 
-PYTHONPATH = os.pathsep.join([str(ROOT / "scripts"), sysconfig.get_path("purelib")])
+PYTHONPATH = os.pathsep.join([str(ROOT / "experiments"), sysconfig.get_path("purelib")])
 
 COLCON = shutil.which("colcon", path=os.pathsep.join([sysconfig.get_path("scripts"), os.defpath]))
 

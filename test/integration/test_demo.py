@@ -21,7 +21,7 @@ from processes import running
 
 pytestmark = pytest.mark.slow
 
-SCRIPTS = Path(__file__).resolve().parents[2] / "scripts"
+EXAMPLES = Path(__file__).resolve().parents[2] / "examples"
 END_TIMEOUT = 600.0
 """Seconds that the whole demo may take on a loaded machine."""
 
@@ -41,7 +41,7 @@ class Demo:
         self._output = folder / "output.txt"
         with self._output.open("wb") as file:
             self.process = subprocess.Popen(
-                [sys.executable, str(SCRIPTS / command[0]), *command[1:]],
+                [sys.executable, str(EXAMPLES / command[0]), *command[1:]],
                 cwd=folder,
                 env={**os.environ, MARK: mark},
                 stdout=file,

@@ -11,7 +11,7 @@ import pytest
 
 pytestmark = pytest.mark.slow(seconds=25)
 
-FAULTS = Path(__file__).resolve().parents[2] / "scripts" / "faults.py"
+FAULTS = Path(__file__).resolve().parents[2] / "experiments" / "faults.py"
 TIMEOUT = 600.0
 """Seconds that it may take on a loaded machine."""
 

@@ -11,11 +11,12 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from random_maps import KINDS, generate_map
 from strategies import grids_with_costs, grids_with_free_cell
 
 from ddqn_planner import GridMap, MoveRule, Planner, PlanStatus
 from ddqn_planner.grid import Cell, shortest_distances
-from ddqn_planner.grid.generators import KINDS, generate_map, random_requests
+from ddqn_planner.grid.noise import random_requests
 from ddqn_planner.model import wavefront
 from ddqn_planner.planning import distance_field, invalidation, repair
 from ddqn_planner.planning.distance_field import DistanceField

@@ -10,11 +10,12 @@ import pytest
 import safetensors.torch
 from hypothesis import given
 from hypothesis import strategies as st
+from random_maps import generate_map
 
 from ddqn_planner import GridMap, MoveRule, Planner
 from ddqn_planner.cli import main
 from ddqn_planner.grid import UNKNOWN, Cell, connected_cells
-from ddqn_planner.grid.generators import generate_map, random_costs
+from ddqn_planner.grid.noise import random_costs
 from ddqn_planner.training.any_map import ANY_MAP, MAPS, RULES, random_scenarios
 from ddqn_planner.training.evaluation import Evaluation, evaluate
 from ddqn_planner.training.trainer import Trainer

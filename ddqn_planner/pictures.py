@@ -1,0 +1,153 @@
+"""Plans to look at: as text, in a terminal's colours, and as a picture file. No ROS is needed."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ddqn_planner.grid import LENGTHS, MOVES, Cell, GridMap
+
+OBSTACLE_COLOUR, PATH_COLOUR, DIRECTION_COLOUR = "#22223b", "#d1495b", "#6c757d"
+
+VALUE_COLOURS = ("#f4f1de", "#cfe8dc", "#93cfc8", "#4fa3b5")
+"""From the worst value to the best: light to dark, so that the order shows without colours too.
+The darkest is far from the colour of obstacles."""
+
+TERMINAL = ("9", "8;5;255", "8;5;236", "8;5;167", "8;5;33")
+"""Codes of the colours outside the map, of free and occupied cells, of the path and its ends."""
+
+MAX_TEXT_WIDTH = 64
+"""Cells of the widest map that is worth printing as text: a cell takes two characters."""
+
+MAX_SIDE_WITH_LINES = 64
+"""Cells of the longest side of a map that is drawn with lines between its cells."""
+
+MAX_ARROWS = 48
+"""Arrows of one-way zones along the longest side of a map."""
+
+ONE_WAY = 1e-9
+"""The mean direction of a cell that is not one-way is shorter than this."""
+
+
+def draw_text(grid: GridMap, cells: Sequence[Cell]) -> str:
+    """Return the map as text, y upwards: ``#`` occupied, ``.`` free, ``*`` path, ``S``, ``G``.
+
+    Free cells of one-way zones are ``>``, ``^``, ``<`` or ``v``, after their mean direction.
+    """
+    letters = np.full(grid.occupancy.shape, ".")
+    if grid.forbidden is not None:
+        x, y = _mean_directions(grid.forbidden)
+        quarter = np.rint(np.arctan2(y, x) / (np.pi / 2)).astype(np.int64)
+        letters = np.where(np.hypot(x, y) > ONE_WAY, np.array(list(">^<v"))[quarter], letters)
+    letters[grid.occupancy] = "#"
+    for x, y in cells:
+        letters[y, x] = "*"
+    for letter, (x, y) in zip("SG", (*cells[:1], *cells[-1:]), strict=False):
+        letters[y, x] = letter
+    return "\n".join(" ".join(row) for row in letters[::-1])
+
+
+def draw_blocks(grid: GridMap, cells: Sequence[Cell], columns: int, lines: int) -> str:
+    """Return the map for a terminal of so many characters: two coloured squares in each.
+
+    A square with an occupied cell is dark, one with a cell of the path has the path's colour, one
+    with the start or the goal that of an end.
+    """
+    side = max(-(-grid.width // columns), -(-grid.height // (2 * lines)))  # cells
+    shown = np.where(grid.occupancy, 2, 1)
+    shown[tuple(np.transpose(cells)[::-1])] = 3
+    for x, y in (cells[0], cells[-1]):
+        shown[y, x] = 4
+    shown = np.pad(shown, [(0, -grid.height % (2 * side)), (0, -grid.width % side)])
+    rows, width = shown.shape[0] // side, shown.shape[1] // side
+    squares = shown.reshape(rows, side, width, side).max(axis=(1, 3))[::-1]
+    return "\n".join(
+        "".join(f"\x1b[3{TERMINAL[a]};4{TERMINAL[b]}m▀" for a, b in zip(*pair, strict=True))
+        + "\x1b[0m"
+        for pair in zip(squares[::2], squares[1::2], strict=True)
+    )
+
+
+def save_picture(
+    path: str | Path,
+    grid: GridMap,
+    cells: Sequence[Cell],
+    value: NDArray[np.float32] | None,
+    title: str,
+    value_label: str = "value: max Q(s, a)",
+) -> None:
+    """Draw the map, the value where it is finite, and the path if there is one into a file."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+    from matplotlib.colors import LinearSegmentedColormap
+    from matplotlib.ticker import MaxNLocator
+
+    tall = min(max(grid.height / grid.width, 0.4), 1.0)
+    figure, axes = plt.subplots(figsize=(7.2, 1.5 + 5.1 * tall), dpi=120, layout="constrained")
+    axes.set(facecolor="white", xlabel="x [cells]", ylabel="y [cells]", aspect="equal")
+    axes.set_title(title, loc="left", fontsize=12)
+    for axis in (axes.xaxis, axes.yaxis):
+        axis.set_major_locator(MaxNLocator(integer=True))
+    if value is not None:
+        finite = np.where(np.isfinite(value), value, np.nan)
+        colours = LinearSegmentedColormap.from_list("value", VALUE_COLOURS)
+        image = axes.imshow(finite, origin="lower", cmap=colours, interpolation="nearest")
+        bar = axes.inset_axes((1.02, 0, 0.035, 1))  # as high as the map
+        figure.colorbar(image, bar, label=value_label)
+    draw_obstacles(axes, grid)
+    if cells:
+        _draw_path(axes, cells)
+        figure.legend(loc="outside lower center", ncols=3, frameon=False)
+    figure.savefig(path)
+    plt.close(figure)
+
+
+def draw_obstacles(axes: Any, grid: GridMap) -> None:
+    """Draw a map's occupied cells and one-way zones into matplotlib axes, and lines of cells."""
+    from matplotlib.colors import ListedColormap
+
+    occupied = np.where(grid.occupancy, 1.0, np.nan)
+    colours = ListedColormap([OBSTACLE_COLOUR])
+    axes.imshow(occupied, origin="lower", cmap=colours, interpolation="nearest")
+    if max(grid.width, grid.height) <= MAX_SIDE_WITH_LINES:
+        axes.set_xticks(np.arange(-0.5, grid.width), minor=True)
+        axes.set_yticks(np.arange(-0.5, grid.height), minor=True)
+        axes.grid(which="minor", color="white", linewidth=0.8)
+        axes.tick_params(which="minor", length=0)
+    if grid.forbidden is not None:
+        _draw_directions(axes, grid, grid.forbidden)
+
+
+def _mean_directions(forbidden: NDArray[np.uint8]) -> NDArray[np.float64]:
+    """Return (2, H, W) float64: the sum of the legal directions of each cell, x and y."""
+    legal = (forbidden >> np.arange(len(MOVES))[:, None, None] & 1) == 0
+    directions: NDArray[np.float64] = np.tensordot((MOVES / LENGTHS[:, None]).T, legal, 1)
+    return directions
+
+
+def _draw_directions(axes: Any, grid: GridMap, forbidden: NDArray[np.uint8]) -> None:
+    step = -(-max(grid.width, grid.height) // MAX_ARROWS)
+    directions = _mean_directions(forbidden)
+    shown = (np.hypot(*directions) > ONE_WAY) & ~grid.occupancy
+    y, x = np.nonzero(shown[::step, ::step])
+    along = directions[:, y * step, x * step]
+    along *= 0.8 * step / np.hypot(*along)
+    style = {"pivot": "middle", "angles": "xy", "scale_units": "xy", "scale": 1}
+    axes.quiver(x * step, y * step, *along, color=DIRECTION_COLOUR, width=0.002, **style)
+
+
+def _draw_path(axes: Any, cells: Sequence[Cell]) -> None:
+    from matplotlib.patheffects import withStroke
+
+    x, y = np.transpose(cells)
+    outline = [withStroke(linewidth=5.5, foreground="white")]
+    axes.plot(x, y, color=PATH_COLOUR, linewidth=3, path_effects=outline, label="path")
+    for label, end, marker, size in (("start", 0, "o", 110), ("goal", -1, "*", 300)):
+        ends = {"marker": marker, "s": size, "edgecolors": "white", "linewidths": 1.5, "zorder": 3}
+        axes.scatter(x[end], y[end], color=PATH_COLOUR, label=label, **ends)

@@ -1,0 +1,244 @@
+"""A simulated robot with two driven wheels, as a ROS node, in a world whose slowness nobody tells.
+
+It follows the last `plan`, and publishes `odom` and, where tf2_ros is installed, a transform. Slow
+zones, a carpet on which wheels slip, a door, and crowds that come and go by the hour slow it down.
+It stops before an obstacle. Where it stands without a path that it can follow, it sends the last
+`goal_pose` again. Its time runs faster than the clock: the stamps are simulated.
+
+    python examples/simulated_robot.py --ros-args -p world:=office -p seed:=1 -p speed_up:=30.0
+"""
+
+from __future__ import annotations
+
+import math
+import sys
+import time
+from pathlib import Path as FilePath
+
+import numpy as np
+from builtin_interfaces.msg import Time
+from geometry_msgs.msg import PoseStamped, TransformStamped
+from nav_msgs.msg import Odometry, Path
+from numpy.typing import NDArray
+from rclpy.node import Node
+from std_msgs.msg import Header
+
+from ddqn_planner.experience.drives import ARRIVAL_DISTANCE
+from ddqn_planner.nodes.conversions import quaternion
+from ddqn_planner.nodes.runtime import LATCHED, STEADY, spin_until_shutdown
+
+sys.path.insert(0, str(FilePath(__file__).resolve().parents[1] / "experiments"))
+from driving_worlds import NOISE, SPEED, World, generated_world
+
+STEP = 0.2
+"""Simulated seconds from one pose to the next."""
+
+MORNING = 3000.0
+"""When the simulated time begins, seconds: ten minutes later the first crowd goes."""
+
+LOOK_AHEAD = 0.4
+"""Metres from the robot to the point of the path that it drives to."""
+
+TURN_RATE = 2.0
+"""Radians per second."""
+
+ARRIVED = 0.15
+"""Metres."""
+
+JOIN_DISTANCE = 2.0
+"""Metres from which the robot drives to the nearest point of a new path."""
+
+SIGHT = 0.005
+"""Metres between the points at which a straight line is looked at for obstacles."""
+
+MOST_BEHIND = 5.0
+"""Simulated seconds that a process which was stalled catches up. A robot that was away for longer
+would have left the path that is planned for it."""
+
+PATIENCE = 2.0
+"""Seconds that the robot stands before it asks for a path again."""
+
+
+class Robot:
+    """A robot that follows paths by pure pursuit, and sees obstacles.
+
+    Parameters
+    ----------
+    world : World
+    seed : int
+        Of the noise of its speed.
+    """
+
+    def __init__(self, world: World, seed: int) -> None:
+        self.world = world
+        self.now = MORNING
+        self.x, self.y = world.grid.cell_to_world(world.stations[0])
+        self.yaw = 0.0
+        self._random = np.random.default_rng([seed, 7])
+        self._path = np.empty((0, 2))
+        self._cell, self._noise = (-1, -1), 1.0
+
+    @property
+    def is_driving(self) -> bool:
+        """Whether it has a path that it can follow."""
+        return len(self._path) > 0
+
+    def follow(self, path: NDArray[np.float64]) -> None:
+        """Follow a path from now on, (N, 2) in metres; an empty one stops the robot."""
+        away = np.hypot(*(path - (self.x, self.y)).T)
+        near = np.flatnonzero(away <= JOIN_DISTANCE)
+        near = near[self._sees(path[near])]
+        self._path = path[near[away[near].argmin()] :] if len(near) else path[:0]
+
+    def step(self) -> None:
+        """Drive for `STEP` seconds."""
+        self.now += STEP
+        left = STEP
+        while left > 1e-9 and self.is_driving:
+            left -= self._move(left)
+
+    def _sees(self, points: NDArray[np.float64]) -> NDArray[np.bool_]:
+        """Return whether a straight line leads to each point without an obstacle: (N,) bool."""
+        here = np.array([self.x, self.y])
+        metres = np.hypot(*(points - here).T).max(initial=0)
+        share = np.linspace(0, 1, int(metres / SIGHT) + 2)[:, None, None]
+        cells = self._cells(here + share * (points - here))
+        height, width = self.world.grid.occupancy.shape
+        inside = ((cells >= 0) & (cells < (width, height))).all(axis=-1)
+        x, y = np.moveaxis(cells.clip(0, (width - 1, height - 1)), -1, 0)
+        # A robot on an obstacle may leave.
+        is_own = (cells == self._cells(here)).all(axis=-1)
+        sees: NDArray[np.bool_] = (inside & ~self.world.grid.occupancy[y, x] | is_own).all(axis=0)
+        return sees
+
+    def _cells(self, points: NDArray[np.float64]) -> NDArray[np.int64]:
+        """Return the cells of points (..., 2)."""
+        grid = self.world.grid
+        return np.floor((points - grid.origin[:2]) / grid.resolution).astype(np.int64)
+
+    def _move(self, seconds: float) -> float:
+        """Turn, or drive in an arc; return how long it took."""
+        away = np.hypot(*(self._path - (self.x, self.y)).T)
+        beyond = np.flatnonzero(away >= LOOK_AHEAD)
+        seen = np.flatnonzero(self._sees(self._path[: beyond[0] + 1 if len(beyond) else None]))
+        if not len(seen):  # it has to ask for another path
+            self._path = self._path[:0]
+            return seconds
+        aim_x, aim_y = self._path[seen[-1]]
+        nearest = int(seen[away[seen].argmin()])
+        self._path = self._path[nearest:]
+        if away[-1] < ARRIVED and len(self._path) <= 2 / self.world.grid.resolution:
+            self._path = self._path[:0]
+            return seconds
+        bearing = math.atan2(aim_y - self.y, aim_x - self.x) - self.yaw
+        bearing = math.remainder(bearing, 2 * math.pi)
+        if abs(bearing) > math.pi / 4:
+            return self._turn(bearing, seconds)
+        seconds = min(seconds, 0.05)
+        metres = self._speed() * seconds
+        distance = max(math.dist((aim_x, aim_y), (self.x, self.y)), 0.05)
+        yaw = self.yaw + 2 * math.sin(bearing) / distance * metres
+        x, y = self.x + metres * math.cos(yaw), self.y + metres * math.sin(yaw)
+        grid = self.world.grid
+        if abs(bearing) > 1e-3 and not grid.is_free(grid.world_to_cell(x, y)):
+            return self._turn(bearing, seconds)  # then the way is straight, and free
+        self.x, self.y, self.yaw = x, y, yaw
+        return seconds
+
+    def _turn(self, angle: float, seconds: float) -> float:
+        """Turn on the spot; return how long it took."""
+        turn = min(abs(angle), TURN_RATE * seconds)
+        self.yaw += math.copysign(turn, angle)
+        return turn / TURN_RATE
+
+    def _speed(self) -> float:
+        grid = self.world.grid
+        cell = grid.world_to_cell(self.x, self.y)
+        if cell != self._cell:
+            self._cell = cell
+            self._noise = math.exp(self._random.normal(0, NOISE) - NOISE**2 / 2)
+        if not grid.is_free(cell):
+            return SPEED
+        return SPEED / (float(self.world.slowness(self.now)[cell[1], cell[0]]) * self._noise)
+
+
+class RobotNode(Node):
+    """The robot's topics."""
+
+    def __init__(self) -> None:
+        super().__init__("robot")
+        defaults = {"world": "office", "seed": 1, "speed_up": 30.0}
+        world, seed, speed_up = (
+            self.declare_parameter(name, default).value for name, default in defaults.items()
+        )
+        self._robot = Robot(generated_world(str(world), int(seed)), int(seed))
+        self._speed_up = float(speed_up)
+        self._began = time.monotonic()
+        self._odometry = self.create_publisher(Odometry, "odom", 100)
+        self._broadcaster = None
+        try:
+            from tf2_ros import TransformBroadcaster
+
+            self._broadcaster = TransformBroadcaster(self)
+        except ImportError:
+            self.get_logger().info("no transforms: tf2_ros is not installed")
+        self._goal: PoseStamped | None = None
+        self._waits_since = time.monotonic()
+        self._goals = self.create_publisher(PoseStamped, "goal_pose", 10)
+        self.create_subscription(PoseStamped, "goal_pose", self._on_goal, 10)
+        self.create_subscription(Path, "plan", self._on_plan, LATCHED)
+        self.create_timer(0.02, self._on_timer, clock=STEADY)
+
+    def _on_plan(self, message: Path) -> None:
+        positions = [(it.pose.position.x, it.pose.position.y) for it in message.poses]
+        self._robot.follow(np.array(positions).reshape(-1, 2))
+
+    def _on_goal(self, message: PoseStamped) -> None:
+        self._goal, self._waits_since = message, time.monotonic()
+
+    def _on_timer(self) -> None:
+        until = MORNING + (time.monotonic() - self._began) * self._speed_up
+        behind = until - self._robot.now - MOST_BEHIND
+        if behind > 0:
+            self._began += behind / self._speed_up
+            until -= behind
+        while self._robot.now + STEP <= until:
+            self._robot.step()
+            self._publish()
+        self._ask_again()
+
+    def _ask_again(self) -> None:
+        """Send the goal again where the robot stands away from it."""
+        now = time.monotonic()
+        if self._goal is None or self._robot.is_driving:
+            self._waits_since = now
+        elif now - self._waits_since > PATIENCE:
+            self._waits_since = now
+            goal, robot = self._goal.pose.position, self._robot
+            metres = math.dist((goal.x, goal.y), (robot.x, robot.y))
+            if metres > ARRIVAL_DISTANCE:
+                self.get_logger().warning(
+                    f"standing at ({robot.x:.2f}, {robot.y:.2f}), {metres:.1f} m from the goal, "
+                    "without a path; the goal is sent again"
+                )
+                self._goals.publish(self._goal)
+
+    def _publish(self) -> None:
+        robot = self._robot
+        whole = int(robot.now)
+        stamp = Time(sec=whole, nanosec=int((robot.now - whole) * 1e9))
+        header = Header(stamp=stamp, frame_id="map")
+        odometry = Odometry(header=header, child_frame_id="base_link")
+        odometry.pose.pose.position.x, odometry.pose.pose.position.y = robot.x, robot.y
+        odometry.pose.pose.orientation = quaternion(robot.yaw)
+        self._odometry.publish(odometry)
+        if self._broadcaster is not None:
+            transform = TransformStamped(header=header, child_frame_id="base_link")
+            moved = transform.transform.translation
+            moved.x, moved.y = robot.x, robot.y
+            transform.transform.rotation = odometry.pose.pose.orientation
+            self._broadcaster.sendTransform(transform)
+
+
+if __name__ == "__main__":
+    sys.exit(spin_until_shutdown(RobotNode))

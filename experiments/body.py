@@ -1,0 +1,139 @@
+"""Measures what a robot's body costs: distances to obstacles, and lengths beside the optimum.
+
+With the path of a ROS map, and the robot's radius in metres.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import scipy.ndimage
+import scipy.sparse
+from numpy.typing import NDArray
+
+from ddqn_planner import GridMap, MoveRule, Planner, inflate, load_map
+from ddqn_planner.grid import (
+    MOVES,
+    Cell,
+    clearance,
+    legal_moves,
+    move_costs,
+    path_length,
+    shortest_distances,
+)
+from ddqn_planner.grid.noise import random_requests
+from ddqn_planner.resources import find_map
+
+RULE = MoveRule.ROBOT_SAFE
+REQUESTS = 200
+WEIGHTS = (0.0, 0.5, 1.0)
+MAX_RATIO = 1.10
+BOUND_FACTORS = np.array([1.01, 1.1, 1.3, 1.6, 2.5, 5.0])
+
+
+@dataclass(frozen=True)
+class Measured:
+    """The distances from all poses of all paths to obstacles, metres, and the lengths."""
+
+    least: float
+    mean: float
+    edge: float  # the least distance to the edge of an occupied cell
+    ratio: NDArray[np.float64]  # (N,) lengths over the optimum; infinite without a path
+
+
+def main(arguments: Sequence[str]) -> int:
+    """Print a row for each weight; return 1 if a request was not solved."""
+    path = str(arguments[0] if arguments else find_map("office"))
+    radius = float(arguments[1]) if len(arguments) > 1 else 0.15
+    grid = load_map(path)
+    inflated, metres = inflate(grid, radius), clearance(grid.occupancy) * grid.resolution
+    requests = random_requests(inflated.occupancy, RULE, REQUESTS, np.random.default_rng(0))
+    optima = [shortest_distances(inflated, goal, RULE)[start[::-1]] for start, goal in requests]
+    print(f"{Path(path).stem}: {len(requests)} requests, robot_radius {radius} m")
+    planner, measured = Planner.load("any_map"), {}
+    for weight in WEIGHTS:
+        body = inflate(grid, radius, weight)
+        paths = [planner.plan(body, start, goal, RULE).cells for start, goal in requests]
+        measured[weight] = measure(paths, optima, metres, edge_distances(grid))
+    plain = measured[0.0]
+    for weight, of_paths in measured.items():
+        print(
+            f"clearance_weight {weight}: solved {np.isfinite(of_paths.ratio).sum()}; length over "
+            f"the optimum: mean {of_paths.ratio.mean():.4f}, worst {of_paths.ratio.max():.4f}; "
+            f"distance to an obstacle's cell: least {of_paths.least:.3f} m (to its edge "
+            f"{of_paths.edge:.3f} m), mean {of_paths.mean:.3f} m, "
+            f"{of_paths.mean / plain.mean:.2f} of without; between it and the body "
+            f"{(of_paths.mean - radius) / (plain.mean - radius):.2f} of without"
+        )
+    bound = greatest_distance(inflated, metres, requests, MAX_RATIO)
+    print(
+        f"no paths of {MAX_RATIO} times the least total length have a mean distance above "
+        f"{bound:.3f} m, {bound / plain.mean:.2f} of without"
+    )
+    return int(not all(np.isfinite(of_paths.ratio).all() for of_paths in measured.values()))
+
+
+def measure(
+    paths: Sequence[Sequence[Cell]],
+    optima: Sequence[float],
+    metres: NDArray[np.float64],
+    edges: NDArray[np.float64],
+) -> Measured:
+    """Measure all paths; empty ones are requests that were not solved."""
+    ratios = [
+        path_length(cells) / optimum if cells else np.inf
+        for cells, optimum in zip(paths, optima, strict=True)
+    ]
+    x, y = np.transpose([cell for cells in paths for cell in cells])
+    distances = metres[y, x]
+    return Measured(distances.min(), distances.mean(), edges[y, x].min(), np.array(ratios))
+
+
+def edge_distances(grid: GridMap) -> NDArray[np.float64]:
+    """Return the distance from each cell's centre to the nearest edge of an occupied cell, metres.
+
+    On a lattice of half cells an occupied cell is its centre, its corners and its sides' middles.
+    """
+    lattice = np.zeros((2 * grid.height + 1, 2 * grid.width + 1), dtype=np.bool_)
+    lattice[1::2, 1::2] = grid.occupancy
+    lattice = scipy.ndimage.binary_dilation(lattice, np.ones((3, 3)))
+    distance: NDArray[np.float64] = clearance(lattice)[1::2, 1::2] * grid.resolution / 2
+    return distance
+
+
+def greatest_distance(
+    grid: GridMap,
+    metres: NDArray[np.float64],
+    requests: Sequence[tuple[Cell, Cell]],
+    share: float,
+) -> float:
+    """Return a bound of the mean distance that paths can keep, metres.
+
+    The mean is that along all paths, of a total length L of `share` times the least. For any c
+    above all distances d, the paths of the least integral of c - d say how great that of d can be:
+    c L less theirs (Lagrange). The least of the bounds of some c is returned.
+    """
+    action, y, x = np.nonzero(legal_moves(grid.occupancy, RULE))
+    cell = y * grid.width + x
+    next_cell = cell + MOVES[action, 1] * grid.width + MOVES[action, 0]
+
+    def integrals(density: NDArray[np.float64]) -> float:
+        costs = move_costs(density.astype(np.float32), RULE)[action, y, x]
+        graph = scipy.sparse.csr_array((costs, (cell, next_cell)), shape=(metres.size,) * 2)
+        total = 0.0
+        for start, goal in requests:
+            to_goal = scipy.sparse.csgraph.dijkstra(graph, indices=goal[1] * grid.width + goal[0])
+            total += to_goal[start[1] * grid.width + start[0]]
+        return total
+
+    length = share * integrals(np.ones_like(metres))
+    greatest = metres[~grid.occupancy].max()
+    return float(min(c - integrals(c - metres) / length for c in greatest * BOUND_FACTORS))
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

@@ -1,0 +1,160 @@
+"""Counts how often the path of a robot flips on noisy costmaps, and what it costs to keep it.
+
+A robot drives over maps of some kinds and plans again after each two cells. The costmap flickers
+around it: free cells are seen as obstacles, beside walls more often than elsewhere, and obstacles
+raise the costs around them. A flip is a new path that, within its next 3 m, leads more than 0.5 m
+away from what was left of the last one, although that was still legal.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from processes import run_script
+from random_maps import generate_map, inflated_costs
+from tables import table
+
+from ddqn_planner import GridMap, MoveRule, Planner
+from ddqn_planner.grid import Cell, path_cost, path_length
+from ddqn_planner.grid.arguments import Occupancy
+from ddqn_planner.grid.body import clearance
+from ddqn_planner.grid.noise import random_requests
+from ddqn_planner.planning import PlanRequest
+from ddqn_planner.planning.path_under_way import rest_of_path
+from ddqn_planner.planning.planner import last_step
+
+RULE = MoveRule.ROBOT_SAFE
+THRESHOLDS = (0.0, 0.03, 0.05, 0.1)
+KINDS = ("two ways", "rooms", "office", "random_10")
+SIDE, RUNS, REPLANS = 160, 16, 100
+"""Cells of a side, and for each kind: runs, and replans of one run at most."""
+
+STRIDE = 2
+"""Cells that the robot drives between two replans: at 5 cm, 0.5 m/s and 5 Hz."""
+
+SIGHT = 80
+"""Cells: farther away than this nothing flickers."""
+
+SEEN_BESIDE_WALLS, SEEN_ELSEWHERE = 0.03, 0.001
+"""Shares of the free cells that are seen as obstacles."""
+
+INFLATION = 8.0
+"""Cells around an obstacle that cost more."""
+
+AHEAD, APART = 60, 10
+"""Cells: how far ahead a path counts, and how far from the last one it has flipped."""
+
+
+@dataclass
+class Drive:
+    """What was counted while a robot drove: replans, flips, and its way's cost and length."""
+
+    replans: int = 0
+    flips: int = 0
+    cost: float = 0.0
+    length: float = 0.0
+
+
+def main(_: Sequence[str]) -> int:
+    """Print the flips per 100 replans; cost and length beside those of the first threshold."""
+    rows, planner = [], Planner.load("any_map")
+    planner.cache_bytes = 0  # each map comes once
+    for kind in KINDS:
+        drives = {
+            threshold: [drive(planner, kind, seed, threshold) for seed in range(RUNS)]
+            for threshold in THRESHOLDS
+        }
+        cost, length = (sum(getattr(d, key) for d in drives[0.0]) for key in ("cost", "length"))
+        for threshold, driven in drives.items():
+            replans, flips = sum(d.replans for d in driven), sum(d.flips for d in driven)
+            more_cost = sum(d.cost for d in driven) / cost - 1
+            more_length = sum(d.length for d in driven) / length - 1
+            flips_per_100 = f"{100 * flips / replans:.1f}"
+            rows.append(
+                [
+                    kind,
+                    threshold,
+                    replans,
+                    flips_per_100,
+                    f"{more_cost:+.2%}",
+                    f"{more_length:+.2%}",
+                ]
+            )
+    header = ["map", "switch_threshold", "replans", "flips per 100", "cost driven", "length driven"]
+    print(table(header, rows))
+    return 0
+
+
+def drive(planner: Planner, kind: str, seed: int, threshold: float, side: int = SIDE) -> Drive:
+    """Drive from a start to a goal; the seed and the kind fix the map and its noise."""
+    random = np.random.default_rng([seed, KINDS.index(kind)])
+    occupancy, robot, goal = scenario(kind, side, random)
+    beside_walls = clearance(occupancy) < 2
+    true_map = GridMap(occupancy, cost=inflated_costs(occupancy, INFLATION))
+    way, path, driven = [robot], np.empty((0, 2), dtype=np.int32), Drive()
+    for number in range(REPLANS):
+        # The noise depends on the time, not on what was drawn for another way of the robot.
+        noise = np.random.default_rng([seed, number])
+        grid = noisy(occupancy, beside_walls, robot, goal, noise)
+        request = PlanRequest(grid, robot, goal, RULE, under_way=path, switch_threshold=threshold)
+        plan = last_step(planner.steps(request))
+        if not plan.cells:  # it waits
+            continue
+        rest, path = rest_of_path(path, robot, grid, RULE), plan.path
+        driven.replans += 1
+        driven.flips += is_flip(rest, path)
+        moved = plan.cells[1 : 1 + STRIDE]
+        way += moved
+        robot = way[-1]
+        if robot == goal:
+            break
+    else:  # the best path from there, so that all drives end at the goal
+        way += planner.plan(true_map, robot, goal, RULE).cells[1:]
+    driven.cost = path_cost(way, true_map.cost_multiplier, RULE)
+    driven.length = path_length(way, RULE)
+    return driven
+
+
+def scenario(kind: str, side: int, random: np.random.Generator) -> tuple[Occupancy, Cell, Cell]:
+    """Return a map, a start and a goal at least half a side away."""
+    if kind == "two ways":
+        occupancy = np.zeros((side // 2, side), dtype=np.bool_)
+        occupancy[side // 8 : -side // 8, side // 3 : -side // 8] = True
+        return occupancy, (2, side // 4), (side - 3, side // 4)
+    occupancy = generate_map(kind, (side, side), random)
+    while True:
+        ((start, goal),) = random_requests(occupancy, RULE, 1, random)
+        if max(abs(goal[0] - start[0]), abs(goal[1] - start[1])) >= side / 2:
+            return occupancy, start, goal
+
+
+def noisy(
+    occupancy: Occupancy,
+    beside_walls: Occupancy,
+    robot: Cell,
+    goal: Cell,
+    random: np.random.Generator,
+) -> GridMap:
+    """Return what the robot sees: more obstacles, with costs around all."""
+    y, x = np.ogrid[: occupancy.shape[0], : occupancy.shape[1]]
+    is_seen = np.hypot(x - robot[0], y - robot[1]) <= SIGHT
+    share = np.where(beside_walls, SEEN_BESIDE_WALLS, SEEN_ELSEWHERE)
+    seen = occupancy | (is_seen & (random.random(occupancy.shape) < share))
+    for free in (robot, goal):
+        seen[free[1], free[0]] = False
+    return GridMap(seen, cost=inflated_costs(seen, INFLATION))
+
+
+def is_flip(rest: NDArray[np.int32], path: NDArray[np.int32]) -> bool:
+    """Return whether a path leads away from what is left of the last one, near the robot."""
+    if not len(rest):
+        return False
+    apart = np.hypot(*(path[:AHEAD, None] - rest[None]).transpose(2, 0, 1)).min(axis=1)
+    return bool((apart > APART).any())
+
+
+if __name__ == "__main__":
+    run_script(main)

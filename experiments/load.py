@@ -1,0 +1,226 @@
+"""Asks one planner node from many processes while its map changes, and checks every answer.
+
+Part one: processes ask `get_plan` on three maps that take turns. Each answer is checked against the
+maps that the planner had between request and answer, mostly one. Part two: goals come at 200 Hz;
+the plans have to follow in their order, and the last one has to be the last goal's. Part three:
+bursts, see bursts.py.
+"""
+
+from __future__ import annotations
+
+import itertools
+import multiprocessing
+import signal
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from builtin_interfaces.msg import Time
+from bursts import load_bursts
+from client import (
+    TIMEOUT,
+    Client,
+    cell_of,
+    initial_pose,
+    plan_request,
+    pose,
+    wait_for,
+    wait_for_map,
+)
+from diagnostic_msgs.msg import DiagnosticArray
+from geometry_msgs.msg import PoseStamped
+from map_fixture import RULE, three_maps
+from nav_msgs.msg import Path
+from nav_msgs.srv import GetPlan
+from processes import claim_ros_domain, memory, run_script, running_node
+from rclpy.qos import DurabilityPolicy, QoSProfile
+
+from ddqn_planner.grid import connected_cells
+from ddqn_planner.grid.noise import random_requests
+from ddqn_planner.nodes.runtime import LATCHED
+
+REQUESTS, CLIENTS, CHANGES = 10_000, 8, 50
+WARM_UP = 0.3
+"""Share of the requests in which the planner comes to keep as many fields as it may."""
+
+GOALS_PER_MAP = 40
+GOALS, GOALS_PERIOD = 2000, 0.005
+
+
+@dataclass
+class Shared:
+    """What the processes tell each other."""
+
+    ready: Any  # a barrier
+    done: Any  # how many requests were answered or lost
+    confirmed: Any  # the number of the last map that the planner is known to have
+    published: Any  # the number of the last map that was published
+    results: Any  # a queue of what `ask` puts into it per process
+
+
+def ask(seed: int, count: int, shared: Shared) -> None:
+    """Ask for plans and check each answer: the work of one process.
+
+    It puts into the queue how long each answer took in milliseconds, how many were empty, and what
+    is wrong with requests that were lost or answered wrong.
+    """
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # it ends with its parent
+    random, maps = np.random.default_rng(seed), three_maps()
+    milliseconds: list[float] = []
+    errors: list[str] = []
+    empty = 0
+    goals = [
+        [goal for _, goal in random_requests(m.grid.occupancy, RULE, GOALS_PER_MAP, random)]
+        for m in maps
+    ]
+    starts = [m.grid.free_cells() for m in maps]
+    with Client() as client:
+        client.call(GetPlan, "planner/get_plan")  # not measured: it waits for the service
+        shared.ready.wait(TIMEOUT)
+        for _ in range(count):
+            first = shared.confirmed.value
+            current = first % len(maps)
+            start = starts[current][random.integers(len(starts[current]))]
+            goal = goals[current][random.integers(GOALS_PER_MAP)]
+            request = plan_request(maps[current].grid, start, goal)
+            began = time.perf_counter()
+            try:
+                plan = client.call(GetPlan, "planner/get_plan", request).plan
+            except TimeoutError as error:
+                errors.append(f"{start} to {goal} on map {current}: {error}")
+            else:
+                milliseconds.append(1e3 * (time.perf_counter() - began))
+                empty += not plan.poses
+                possible = {n % len(maps) for n in range(first, shared.published.value + 1)}
+                wrong = [maps[number].error(request, plan) for number in possible]
+                if all(wrong):
+                    errors.append(f"on map {first} or later: {wrong[0]}")
+            with shared.done.get_lock():
+                shared.done.value += 1
+    shared.results.put((milliseconds, empty, errors))
+
+
+def load_requests(planner: int, requests: int, clients: int) -> bool:
+    """Ask a running planner from several processes under changing maps; print a table.
+
+    The planner, given by its process, has no other map yet. Return whether all is answered right.
+    """
+    context = multiprocessing.get_context("spawn")
+    maps = three_maps()
+    number = len(maps)
+    shared = Shared(
+        context.Barrier(clients + 1),
+        context.Value("i"),
+        context.Value("i", number),
+        context.Value("i", number),
+        context.Queue(),
+    )
+    processes = [
+        context.Process(target=ask, args=(n, len(range(n, requests, clients)), shared), daemon=True)
+        for n in range(clients)
+    ]
+    with Client() as client:
+        diagnostics = client.subscribe(DiagnosticArray, "/diagnostics", keep=1)
+
+        def send_map(number: int) -> None:
+            client.publish("map", maps[number % len(maps)].message(number), LATCHED)
+            wait_for_map(diagnostics, Time(sec=number))
+
+        send_map(number)
+        for process in processes:
+            process.start()
+        shared.ready.wait(TIMEOUT)
+        began, first_memory = time.monotonic(), 0.0
+        while shared.done.value < requests and any(process.is_alive() for process in processes):
+            if shared.done.value >= (number - 2) * requests / CHANGES:
+                number += 1
+                shared.published.value = number
+                send_map(number)
+                shared.confirmed.value = number
+            if not first_memory and shared.done.value >= WARM_UP * requests:
+                first_memory = memory(planner)
+            time.sleep(0.005)
+        seconds = time.monotonic() - began
+        last_memory = memory(planner)
+    # It fails if a process did.
+    results = [shared.results.get(timeout=TIMEOUT) for _ in processes]
+    for process in processes:
+        process.join()
+    times, empty, errors = zip(*results, strict=True)
+    milliseconds, wrong_or_lost = np.concatenate(times), list(itertools.chain(*errors))
+    for error in wrong_or_lost[:10]:
+        print(error)
+    lost = requests - len(milliseconds)
+    median, slow = np.percentile(milliseconds, (50, 99))
+    print(
+        f"GetPlan: {requests} requests of {clients} processes in {seconds:.0f} s, "
+        f"{number - len(maps)} changes of the map\n"
+        f"  answered {len(milliseconds)}, lost {lost}, wrong {len(wrong_or_lost) - lost}\n"
+        f"  paths {len(milliseconds) - sum(empty)}, empty answers {sum(empty)}\n"
+        f"  latency median {median:.1f} ms, 99 % {slow:.1f} ms\n"
+        f"  planner's resident memory {first_memory:.0f} MB after {WARM_UP:.0%} of them, "
+        f"{last_memory:.0f} MB at the end: {last_memory / first_memory - 1:+.1%}",
+        flush=True,
+    )
+    return not wrong_or_lost
+
+
+def load_goals(goals: int) -> bool:
+    """Send goals at 200 Hz to a running planner; print what became of them.
+
+    Return whether the plans came in the order of the goals, and the last is the last goal's.
+    """
+    office = three_maps()[2]
+    grid, random = office.grid, np.random.default_rng(0)
+    ((start, _),) = random_requests(grid.occupancy, RULE, 1, random)
+    rows, columns = np.nonzero(connected_cells(grid.occupancy, start, RULE))
+    chosen = random.permutation(len(rows))[:goals]
+    cells = list(zip(columns[chosen].tolist(), rows[chosen].tolist(), strict=True))
+    numbers = {cell: number for number, cell in enumerate(cells)}
+    with Client() as client:
+        diagnostics = client.subscribe(DiagnosticArray, "/diagnostics", keep=1)
+        stamp = 2**20
+        client.publish("map", office.message(stamp), LATCHED)
+        wait_for_map(diagnostics, Time(sec=stamp))
+        from_start = pose(grid, start)
+        client.publish("initialpose", initial_pose(from_start))
+        wait_for("start", lambda: client.get_plan(PoseStamped(), from_start).poses)
+        everything = QoSProfile(depth=goals, durability=DurabilityPolicy.VOLATILE)
+        plans = client.subscribe(Path, "plan", everything)
+        wait_for("publisher of plan", lambda: client.node.count_publishers("plan"))
+        publisher = client.publisher(PoseStamped, "goal_pose")
+
+        def heard() -> list[int]:
+            ends = [plan.poses[-1:] for plan in plans.messages()]
+            return [numbers.get(cell_of(grid, end[0]), -1) if end else -1 for end in ends]
+
+        began = time.monotonic()
+        for sent, cell in enumerate(cells):
+            time.sleep(max(0.0, began + sent * GOALS_PERIOD - time.monotonic()))
+            publisher.publish(pose(grid, cell))
+        seconds = time.monotonic() - began
+        wait_for("plan to the last goal", lambda: goals - 1 in heard())
+        time.sleep(2)  # a plan for an older goal would come now
+        order = heard()
+    late = sum(later < earlier for earlier, later in itertools.pairwise(order))
+    right = order[-1] == goals - 1 and not late
+    print(
+        f"goal_pose: {goals} goals in {seconds:.1f} s, {len(order)} plans published, "
+        f"{late} late; the last is {'' if right else 'not '}the last goal's",
+        flush=True,
+    )
+    return right
+
+
+def main(arguments: Sequence[str]) -> int:
+    """Load a planner node with requests and with goals; return 1 if anything is lost or wrong."""
+    requests = int(arguments[0]) if arguments else REQUESTS
+    with claim_ros_domain(), running_node("planner_node", "--log-level", "error") as planner:
+        fine = [load_requests(planner.pid, requests, CLIENTS), load_goals(GOALS), load_bursts()]
+    return int(not all(fine))
+
+
+if __name__ == "__main__":
+    run_script(main)

@@ -1,0 +1,249 @@
+"""Random maps of nine kinds and any size, and costs of their cells.
+
+The documented figures depend on these maps: the same seed must always give the same ones.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ddqn_planner.grid.arguments import Occupancy
+from ddqn_planner.grid.body import clearance
+from ddqn_planner.grid.noise import in_free_cells
+
+MINIMUM_SIDE = 5
+"""The shortest side of a map: a maze of two corridors between its walls."""
+
+SHORTEST_STEP = 3
+"""Cells from one wall of a room to the next: a room is at least two cells wide."""
+
+EXTRA_LINKS = 0.15
+"""Share of the links outside the spanning tree that are opened too."""
+
+
+def _independent(share: float, shape: tuple[int, int], random: np.random.Generator) -> Occupancy:
+    """Occupy each cell with the same probability."""
+    while True:  # a small map may have no two free cells side by side
+        occupancy = random.random(shape) < share
+        if not (occupancy[:, 1:] | occupancy[:, :-1]).all():
+            return occupancy
+
+
+def _maze(shape: tuple[int, int], random: np.random.Generator) -> Occupancy:
+    """Dig a tree of corridors, one cell wide, that reaches every cell of odd x and y."""
+    occupancy = np.ones(shape, dtype=np.bool_)
+    rows, columns = (shape[0] - 1) // 2, (shape[1] - 1) // 2
+    occupancy[1 : 2 * rows : 2, 1 : 2 * columns : 2] = False
+    row, column, next_row, next_column = _links(rows, columns, 0.0, random)
+    occupancy[row + next_row + 1, column + next_column + 1] = False
+    return occupancy
+
+
+def _rooms(shape: tuple[int, int], random: np.random.Generator) -> Occupancy:
+    """Divide the map into rooms by walls one cell thick, with doors so that all are connected."""
+    longest = int(random.integers(SHORTEST_STEP, np.clip(min(shape) // 3, SHORTEST_STEP, 15) + 1))
+    y, x = (_wall_lines(0, side - 1, longest, random) for side in shape)
+    occupancy = np.zeros(shape, dtype=np.bool_)
+    occupancy[y] = occupancy[:, x] = True
+    row, column, next_row, next_column = _links(len(y) - 1, len(x) - 1, EXTRA_LINKS, random)
+    beside = next_column > column
+    row, next_column = row[beside], next_column[beside]
+    column, next_row = column[~beside], next_row[~beside]
+    _open_doors(occupancy, x[next_column], y[row], y[row + 1], random)
+    _open_doors(occupancy.T, y[next_row], x[column], x[column + 1], random)
+    return occupancy
+
+
+def _corridors(shape: tuple[int, int], random: np.random.Generator) -> Occupancy:
+    """Dig L-shaped corridors, one to three cells wide, between random points of a solid block."""
+    # One point in each part of the map, and links only between neighbours, keep most of it solid.
+    spacing = int(random.integers(5, 11))
+    rows, columns = (max(2, (side - 2) // spacing) for side in shape)
+    y_edges = np.linspace(1, shape[0] - 1, rows + 1).astype(np.int64)
+    x_edges = np.linspace(1, shape[1] - 1, columns + 1).astype(np.int64)
+    y = random.integers(y_edges[:-1, None], y_edges[1:, None], (rows, columns))
+    x = random.integers(x_edges[:-1], x_edges[1:], (rows, columns))
+    row, column, next_row, next_column = _links(rows, columns, EXTRA_LINKS, random)
+    widths = random.integers(1, 4, len(row))
+    turns = random.random(len(row)) < 0.5
+    first, second = (row, column), (next_row, next_column)
+    links = np.stack([y[first], x[first], y[second], x[second], widths, turns], axis=1)
+    occupancy = np.ones(shape, dtype=np.bool_)
+    for y0, x0, y1, x1, width, turn in links.tolist():
+        corner_y, corner_x = (y0, x1) if turn else (y1, x0)
+        occupancy[min(y0, y1) : max(y0, y1) + width, corner_x : corner_x + width] = False
+        occupancy[corner_y : corner_y + width, min(x0, x1) : max(x0, x1) + width] = False
+    occupancy[[0, -1]] = occupancy[:, [0, -1]] = True
+    return occupancy
+
+
+def _dead_ends(shape: tuple[int, int], random: np.random.Generator) -> Occupancy:
+    """Scatter U-shaped walls, each open to one of the four sides, in free space."""
+    occupancy = np.zeros(shape, dtype=np.bool_)
+    longest = int(np.clip(min(shape) // 3, 3, 25))
+    tries = 1 + occupancy.size // 25
+    sizes = random.integers(3, longest + 1, (tries, 2)).tolist()
+    for size, turns in zip(sizes, random.integers(0, 4, tries).tolist(), strict=True):
+        bay = np.ones(size, dtype=np.bool_)
+        bay[1:-1, 1:] = False
+        _stamp(occupancy, np.rot90(bay, turns), random)
+    return occupancy
+
+
+def _office(shape: tuple[int, int], random: np.random.Generator) -> Occupancy:
+    """Draw the plan of a building: a net of corridors, rooms along them, desks in the rooms."""
+    along_x = random.random() < 0.5
+    height, width = shape if along_x else shape[::-1]
+    count = max(1, round(height / random.integers(14, 25)))
+    corridors = _corridor_spans(height, count, random)
+    # Two or more corridors need another corridor across them, or they would not be connected.
+    cross_count = max(int(count > 1), round(width / random.integers(30, 61)))
+    cross_corridors = _corridor_spans(width, cross_count, random)
+    corridor = np.zeros((height, width), dtype=np.bool_)
+    for first, end in corridors:
+        corridor[first:end, 1:-1] = True
+    for first, end in cross_corridors:
+        corridor[1:-1, first:end] = True
+    occupancy = ~corridor
+    for top, bottom in _between(corridors, height):
+        if top > 0 and bottom < height - 1:  # two rows of rooms back to back
+            middle = (top + bottom) // 2
+            rows = [(top, middle, top), (middle, bottom, bottom)]
+        else:
+            rows = [(top, bottom, top if top > 0 else bottom)]
+        for left, right in _between(cross_corridors, width):
+            for above, below, door in rows:
+                if min(below - above, right - left) < 2:
+                    continue
+                x = _wall_lines(left, right, 9, random)
+                occupancy[above + 1 : below, left + 1 : right] = False
+                occupancy[above + 1 : below, x] = True
+                _open_doors(occupancy.T, np.full(len(x) - 1, door), x[:-1], x[1:], random)
+    for desk in random.integers(1, 4, (occupancy.size // 25, 2)).tolist():
+        _stamp(occupancy, np.ones(desk, dtype=np.bool_), random)
+    occupancy &= ~corridor  # desks stand in rooms only
+    return occupancy if along_x else np.ascontiguousarray(occupancy.T)
+
+
+def _links(
+    rows: int, columns: int, extra: float, random: np.random.Generator
+) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
+    """Link the nodes of a lattice by a random spanning tree and a share of all other links.
+
+    Returns the row and column of one end of each link, then those of the other end, which lies
+    below it or to its right.
+    """
+    from scipy.sparse import coo_matrix
+    from scipy.sparse.csgraph import minimum_spanning_tree
+
+    node = np.arange(rows * columns, dtype=np.int64).reshape(rows, columns)
+    first = np.concatenate([node[:, :-1].ravel(), node[:-1].ravel()])
+    second = np.concatenate([node[:, 1:].ravel(), node[1:].ravel()])
+    # The links are in random order: the number of a link is its weight and tells it in the tree.
+    order = random.permutation(len(first))
+    first, second = first[order], second[order]
+    numbers = np.arange(1, len(first) + 1)  # scipy reads a weight of 0 as no link
+    tree = minimum_spanning_tree(coo_matrix((numbers, (first, second)), (node.size, node.size)))
+    linked = random.random(len(first)) < extra
+    linked[tree.data.astype(np.int64) - 1] = True
+    return *np.divmod(first[linked], columns), *np.divmod(second[linked], columns)
+
+
+def _wall_lines(
+    first: int, last: int, longest: int, random: np.random.Generator
+) -> NDArray[np.int64]:
+    """Return where walls stand from the first to the last one, random steps apart."""
+    steps = random.integers(SHORTEST_STEP, longest + 1, (last - first) // SHORTEST_STEP + 1)
+    lines = first + np.cumsum(steps)
+    return np.concatenate([[first], lines[lines <= last - SHORTEST_STEP], [last]])
+
+
+def _open_doors(
+    occupancy: Occupancy, columns: Any, tops: Any, bottoms: Any, random: np.random.Generator
+) -> None:
+    """Open a door of one or two cells in walls along columns, between their top and bottom rows."""
+    first = random.integers(tops + 1, bottoms)
+    last = np.minimum(first + random.integers(0, 2, len(first)), bottoms - 1)
+    occupancy[first, columns] = occupancy[last, columns] = False
+
+
+def _stamp(occupancy: Occupancy, pattern: Occupancy, random: np.random.Generator) -> None:
+    """Occupy the cells of a pattern at a random place, if all cells in and around it are free.
+
+    The ring of free cells around the pattern keeps connected what was connected before.
+    """
+    height, width = pattern.shape
+    top = int(random.integers(1, occupancy.shape[0] - height))
+    left = int(random.integers(1, occupancy.shape[1] - width))
+    if not occupancy[top - 1 : top + height + 1, left - 1 : left + width + 1].any():
+        occupancy[top : top + height, left : left + width] = pattern
+
+
+def _corridor_spans(side: int, count: int, random: np.random.Generator) -> list[tuple[int, int]]:
+    """Return the first cell of each corridor and the cell after its last."""
+    spans = []
+    for index in range(count):
+        width = int(random.integers(2, min(4, side - 2) + 1))
+        first = round((index + 0.5) * side / count - width / 2) + int(random.integers(-1, 2))
+        first = min(max(first, 1), side - 1 - width)
+        spans.append((first, first + width))
+    return spans
+
+
+def _between(spans: list[tuple[int, int]], side: int) -> list[tuple[int, int]]:
+    """Return the first and last cell of each part of a side that lies between corridors."""
+    firsts = [0, *(end for _, end in spans)]
+    lasts = [*(first - 1 for first, _ in spans), side - 1]
+    return list(zip(firsts, lasts, strict=True))
+
+
+KINDS: Final[dict[str, Callable[[tuple[int, int], np.random.Generator], Occupancy]]] = {
+    "random_10": partial(_independent, 0.1),
+    "random_20": partial(_independent, 0.2),
+    "random_30": partial(_independent, 0.3),
+    "random_40": partial(_independent, 0.4),
+    "maze": _maze,
+    "rooms": _rooms,
+    "corridors": _corridors,
+    "dead_ends": _dead_ends,
+    "office": _office,
+}
+"""The function that makes each kind of map. All free cells are connected, except in random_*."""
+
+
+def generate_map(kind: str, shape: tuple[int, int], random: np.random.Generator) -> Occupancy:
+    """Make a random map, of a kind in `KINDS`, in which a path joins at least two free cells.
+
+    Its shape is (H, W) in cells, each at least `MINIMUM_SIDE`.
+    """
+    if kind not in KINDS:
+        raise ValueError(f"the kind {kind!r} is unknown; give one of {', '.join(KINDS)}")
+    if min(shape) < MINIMUM_SIDE:
+        raise ValueError(f"shape is {shape}; give (H, W) with H, W >= {MINIMUM_SIDE}")
+    return KINDS[kind](shape, random)
+
+
+def gradient_costs(occupancy: Occupancy, random: np.random.Generator) -> NDArray[np.int8]:
+    """Return (H, W) costs that rise linearly over the map in a random direction, from 0 to 99."""
+    angle = random.uniform(0, 2 * np.pi)
+    y, x = np.ogrid[: occupancy.shape[0], : occupancy.shape[1]]
+    distance = np.cos(angle) * x + np.sin(angle) * y
+    distance -= distance.min()
+    return in_free_cells(occupancy, np.rint(99 * distance / max(distance.max(), 1e-9)))
+
+
+def inflated_costs(occupancy: Occupancy, radius: float) -> NDArray[np.int8]:
+    """Return (H, W) costs that fall exponentially with the distance from obstacles, as in costmaps.
+
+    They are ``99 ** (1 - (d - 1) / radius)`` at a distance of d cells, and 0 beyond `radius` cells.
+    """
+    if not 0 < radius < np.inf:
+        raise ValueError(f"radius is {radius}; give cells, finite and > 0")
+    distance = np.maximum(clearance(occupancy), 1)  # occupied cells do not matter
+    costs = np.where(distance <= radius, np.rint(99 ** (1 - (distance - 1) / radius)), 0)
+    return in_free_cells(occupancy, costs)
