@@ -126,7 +126,7 @@ class Experience:
         """
         slowness = self.evidence.over(grid).slowness
         seconds_per_cell = grid.resolution / self.nominal_speed
-        return grid._changed(slowness=slowness, seconds_per_cell=seconds_per_cell)
+        return grid.with_layers(slowness=slowness, seconds_per_cell=seconds_per_cell)
 
     def slowness(self, grid: GridMap) -> Float32:
         """Return (H, W) float32: expected seconds over those at nominal speed, 1 or more."""

@@ -29,7 +29,6 @@ from ddqn_planner.grid import (
     LENGTHS,
     MOVES,
     Cell,
-    connected_cells,
     legal_moves,
     path_cost,
     shortest_distances,
@@ -460,7 +459,7 @@ def test_a_goal_moves_to_the_nearest_reachable_free_cell_within_the_tolerance(
         _ = planner.q_field(grid, goal, rule).value  # all of it
     quick = is_answered_at_once(planner, grid, start, goal, rule, tolerance=tolerance)
     plan = planner.plan(grid, start, goal, rule, tolerance=tolerance)
-    rows, columns = np.nonzero(connected_cells(grid.occupancy, start, rule))
+    rows, columns = np.nonzero(grid.reachable([start], rule))
     nearest = np.hypot(columns - goal[0], rows - goal[1]).min()
     if nearest <= tolerance:
         assert plan.cells[0] == start
