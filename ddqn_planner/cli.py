@@ -266,11 +266,11 @@ def certify(parser: argparse.ArgumentParser, arguments: Sequence[str]) -> int:
     code is 1 if there is no proof.
     """
     from ddqn_planner.model import load_model
-    from ddqn_planner.model.certificate import NO_CERTIFICATE, certificate_of
+    from ddqn_planner.model.certificate import NO_CERTIFICATE
 
     parser.add_argument("model", nargs="?", default="any_map", help="name or file")
     network, metadata = load_model(parser.parse_args(arguments).model)
-    certificate = certificate_of(network, metadata.move_rule)
+    certificate = network.certificate(metadata.move_rule)
     print(certificate or NO_CERTIFICATE)
     return 0 if certificate and certificate.proved else 1
 

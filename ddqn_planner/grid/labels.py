@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -24,7 +26,7 @@ def component_labels(occupancy: Occupancy, move_rule: MoveRule | str) -> NDArray
 
 
 @compiled
-def _labels(free, reach):  # type: ignore[no-untyped-def]  # pragma: no cover
+def _labels(free: Any, reach: int) -> Any:  # pragma: no cover
     """Return (H, W) int32 labels, by union-find over the runs of free cells in each row.
 
     Run r is from edges[2 * r] to before edges[2 * r + 1]. Two runs of neighbouring rows are
@@ -87,7 +89,7 @@ def flood(legal: NDArray[np.bool_], cells: NDArray[np.int64], backward: bool) ->
 
 
 @compiled
-def _flood(legal, reached, moves, backward):  # type: ignore[no-untyped-def]  # pragma: no cover
+def _flood(legal: Any, reached: Any, moves: Any, backward: bool) -> None:  # pragma: no cover
     """Mark all cells that are reached from those that are marked."""
     height, width = reached.shape
     waiting = np.empty(height * width, dtype=np.int32)  # each cell waits at most once
