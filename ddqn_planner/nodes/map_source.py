@@ -16,7 +16,6 @@ from rclpy.time import Time
 from std_msgs.msg import Header, String
 
 from ddqn_planner.experience import Experience
-from ddqn_planner.experience.take_over import take_over
 from ddqn_planner.grid import GridMap
 from ddqn_planner.grid.body import Inflation
 from ddqn_planner.nodes.conversions import grid_from_message, grid_from_values
@@ -385,7 +384,7 @@ class ExpectedTimes:
         """Use a file of the trainer from now on; after an error, what was used before stays."""
         newer = Experience.load(path)
         if self._experience is not None:
-            take_over(newer, self._experience)
+            newer.take_over(self._experience)
         self._experience = newer
 
     def apply(self, grid: GridMap) -> GridMap:
