@@ -128,7 +128,7 @@ def component_labels(occupancy: Occupancy, move_rule: MoveRule | str) -> NDArray
 
 
 @compiled
-def _labels(free, reach):  # type: ignore[no-untyped-def]  # pragma: no cover
+def _labels(free: Any, reach: int) -> Any:  # pragma: no cover
     """Return (H, W) int32 labels, by union-find over the runs of free cells in each row.
 
     Run r is from edges[2 * r] to before edges[2 * r + 1]. Two runs of neighbouring rows are
@@ -191,7 +191,7 @@ def flood(legal: NDArray[np.bool_], cells: NDArray[np.int64], backward: bool) ->
 
 
 @compiled
-def _flood(legal, reached, cells, backward):  # type: ignore[no-untyped-def]  # pragma: no cover
+def _flood(legal: Any, reached: Any, cells: Any, backward: bool) -> None:  # pragma: no cover
     """Mark all cells that are reached from those that are marked."""
     height, width = reached.shape
     waiting = np.empty(height * width, dtype=np.int64)  # each cell waits at most once

@@ -35,6 +35,7 @@ from ddqn_planner.grid import (
 )
 from ddqn_planner.model import ModelMetadata
 from ddqn_planner.planning import PlanRequest
+from ddqn_planner.planning.field import network_field
 from ddqn_planner.training.evaluation import evaluate
 
 RULES = st.sampled_from(list(MoveRule))
@@ -187,7 +188,7 @@ def test_the_model_for_any_map_judges_every_move_in_every_patch_rightly(
         for action, (dx, dy) in enumerate(MOVES.tolist()):
             goal = (1 + dx, 1 + dy)
             if legal[action]:
-                q = network.q_values(grid, goal, rule)[:, 1, 1]
+                q = network_field(network, grid, goal, rule).q[:, 1, 1]
                 assert q[action] == pytest.approx(-rule.lengths[action], abs=0.01)
                 assert not np.isfinite(q[~legal]).any()
 
