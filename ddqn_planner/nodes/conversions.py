@@ -19,7 +19,6 @@ from std_msgs.msg import Header
 from ddqn_planner.grid import Cell, GridMap
 from ddqn_planner.grid.arguments import Cells
 from ddqn_planner.grid.costmap import grid_from_costmap
-from ddqn_planner.grid.grid_map import centre
 from ddqn_planner.grid.map_file import MAX_CELLS
 
 if TYPE_CHECKING:
@@ -150,7 +149,7 @@ def _along(cells: Cells, grid: GridMap) -> tuple[NDArray[np.float64], NDArray[np
     """Return the centres of cells (N, 2), and the directions from each to the next (N - 1)."""
     x, y = np.asarray(cells, dtype=np.float64).reshape(-1, 2).T
     yaws = grid.origin[2] + np.arctan2(np.diff(y), np.diff(x))
-    return np.column_stack(centre(grid, x, y)), yaws
+    return np.column_stack(grid.centres(x, y)), yaws
 
 
 def serialized_poses(

@@ -15,14 +15,14 @@ from rclpy.publisher import Publisher
 from rclpy.qos import DurabilityPolicy, QoSProfile
 from std_msgs.msg import Header, String
 
-from ddqn_planner.experience.drive_log import (
+from ddqn_planner.experience.drives import (
     EXPERIENCE,
     RECORD,
     DriveEnd,
     DriveFolder,
+    DriveRecorder,
     read_drives,
 )
-from ddqn_planner.experience.drive_recorder import DriveRecorder
 from ddqn_planner.grid import GridMap
 from ddqn_planner.nodes.conversions import occupancy_message, quaternion, serialized_poses
 from ddqn_planner.nodes.poses import MapInFrame, RobotPoses

@@ -8,7 +8,6 @@ import numpy as np
 from rclpy.task import Future
 
 from ddqn_planner.experience import ExpectedTime, Experience
-from ddqn_planner.experience.take_over import take_over
 from ddqn_planner.grid import GridMap
 from ddqn_planner.nodes.report import Outcome
 from ddqn_planner.nodes.runtime import Worker
@@ -36,7 +35,7 @@ class ExpectedTimes:
         """
         newer = Experience.load(path)
         if self._experience is not None:
-            take_over(newer, self._experience)
+            newer.take_over(self._experience)
         self._experience = newer
 
     def apply(self, grid: GridMap) -> GridMap:
@@ -46,7 +45,7 @@ class ExpectedTimes:
         if self._spread_on is None or not _is_like(grid, self._spread_on):
             self._spread_on = grid
         timed = self._experience.apply(self._spread_on)
-        return grid._changed(slowness=timed.slowness, seconds_per_cell=timed.seconds_per_cell)
+        return grid.with_layers(slowness=timed.slowness, seconds_per_cell=timed.seconds_per_cell)
 
     def expected_time(self, grid: GridMap, plan: Plan) -> ExpectedTime | None:
         """Return how long a plan takes; None if its map has no expected times, or is an old one."""

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from ddqn_planner import Experience, GridMap, Planner
-from ddqn_planner.experience import ExperienceFileError, spreading
+from ddqn_planner.experience import ExperienceFileError, evidence
 from ddqn_planner.nodes.expected_times import ExpectedTimes
 
 GRID = GridMap(np.zeros((40, 120), dtype=np.bool_), resolution=0.25)
@@ -47,7 +47,7 @@ def test_a_map_in_which_a_person_stands_needs_no_new_spreading(
     times: ExpectedTimes, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     before = times.apply(GRID).slowness
-    monkeypatch.setattr(spreading, "spread", None)  # it fails if it is called
+    monkeypatch.setattr(evidence, "spread_evidence", None)  # it fails if it is called
     person = GRID.with_patch(np.ones((3, 3), dtype=np.bool_), 60, 19)
     timed = times.apply(person)
     np.testing.assert_array_equal(timed.slowness, before)
