@@ -219,7 +219,7 @@ def test_the_robot_goes_round_what_was_slow_until_it_forgets(planner: Any, site:
     site.begin(listeners=2)
     plans = site.client.subscribe(Path, "plan", LATCHED)
     ends = pose(GRID, START), pose(GRID, GOAL)
-    assert is_below(site.client.get_plan(*ends))
+    wait_for("first way", lambda: is_below(site.client.get_plan(*ends)))
 
     episode = site.drive(LOWER, speed=0.1)
     assert episode.header.frame_id == "map"
