@@ -21,6 +21,7 @@ from nav_msgs.msg import OccupancyGrid
 from nav_msgs.msg import Path as PathMessage
 from nav_msgs.srv import GetPlan
 from processes import claim_ros_domain, memory, run_script, running_node
+from random_maps import generate_map
 from rcl_interfaces.srv import GetParameters, ListParameters
 from startup import node_usage
 from std_srvs.srv import Trigger
@@ -28,7 +29,7 @@ from std_srvs.srv import Trigger
 from ddqn_planner import GridMap, MoveRule, Planner, load_map
 from ddqn_planner.grid import Cell, save_map
 from ddqn_planner.grid.arguments import OCCUPIED
-from ddqn_planner.grid.generators import generate_map, random_requests
+from ddqn_planner.grid.noise import random_requests
 from ddqn_planner.nodes.runtime import LATCHED
 from ddqn_planner.resources import find_map
 

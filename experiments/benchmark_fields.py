@@ -20,11 +20,13 @@ import numpy as np
 import pyastar2d
 from benchmark import report
 from processes import run_script
+from random_maps import KINDS, generate_map
 
 from ddqn_planner import GridMap, MoveRule, Plan, Planner, QField
-from ddqn_planner.grid import Cell, legal_moves, shortest_distances
+from ddqn_planner.grid import Cell, shortest_distances
 from ddqn_planner.grid.arguments import Occupancy
-from ddqn_planner.grid.generators import KINDS, generate_map, random_costs, random_requests
+from ddqn_planner.grid.noise import random_costs, random_requests
+from ddqn_planner.planning.field import network_field
 
 RULE = MoveRule.ROBOT_SAFE
 REQUEST_KINDS = ("random_20", "rooms", "office", "maze")
@@ -207,8 +209,7 @@ def plan_by_q_values(change: Change, start: Cell, goal: Cell) -> Callable[[], Pl
     grid = GridMap(change.occupancy).with_patch(*change[1:])
 
     def plan() -> Plan:
-        q = LOADED.network.q_values(grid, goal, RULE)
-        return QField(goal, q, legal_moves(grid.occupancy, RULE), RULE).rollout(start)
+        return network_field(LOADED.network, grid, goal, RULE).rollout(start)
 
     return plan
 

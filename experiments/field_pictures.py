@@ -15,11 +15,13 @@ import matplotlib.pyplot as plt
 import nano_astar
 import numpy as np
 from numpy.typing import NDArray
+from random_maps import generate_map
 
 from ddqn_planner import GridMap, MoveRule, Planner
 from ddqn_planner.grid import shortest_distances
-from ddqn_planner.grid.generators import generate_map, random_requests
-from ddqn_planner.planning.distance_field import DistanceField
+from ddqn_planner.grid.noise import random_requests
+from ddqn_planner.planning.field import DistanceField
+from ddqn_planner.planning.kernels import CLOSED
 
 FOLDER = Path(__file__).resolve().parents[1] / "docs" / "images"
 RULE = MoveRule.ROBOT_SAFE
@@ -47,7 +49,7 @@ def draw_visited_cells() -> None:
     plan = planner.plan(grid, start, goal, RULE)
     field = planner.q_field(grid, goal, RULE)
     assert isinstance(field, DistanceField)
-    closed = field.known.state.reshape(grid.height + 2, -1)[1:-1, 1:-1] == field.wavefront.CLOSED
+    closed = field.known.state.reshape(grid.height + 2, -1)[1:-1, 1:-1] == CLOSED
     ends = start[::-1], goal[::-1]
     _, _, history = nano_astar.astar(occupancy.astype(np.uint8), *ends, return_history=True)
     by_a_star = np.zeros_like(closed)

@@ -37,8 +37,7 @@ from nav_msgs.srv import GetPlan
 from processes import claim_ros_domain, memory, run_script, running_node
 from rclpy.qos import DurabilityPolicy, QoSProfile
 
-from ddqn_planner.grid import connected_cells
-from ddqn_planner.grid.generators import random_requests
+from ddqn_planner.grid.noise import random_requests
 from ddqn_planner.nodes.runtime import LATCHED
 
 REQUESTS, CLIENTS, CHANGES = 10_000, 8, 50
@@ -175,7 +174,7 @@ def load_goals(goals: int) -> bool:
     office = three_maps()[2]
     grid, random = office.grid, np.random.default_rng(0)
     ((start, _),) = random_requests(grid.occupancy, RULE, 1, random)
-    rows, columns = np.nonzero(connected_cells(grid.occupancy, start, RULE))
+    rows, columns = np.nonzero(grid.reachable([start], RULE))
     chosen = random.permutation(len(rows))[:goals]
     cells = list(zip(columns[chosen].tolist(), rows[chosen].tolist(), strict=True))
     numbers = {cell: number for number, cell in enumerate(cells)}

@@ -26,15 +26,15 @@ from rclpy.qos import DurabilityPolicy, QoSProfile
 from rclpy.task import Future
 from std_msgs.msg import Header, String
 
-from ddqn_planner.experience.drive_log import (
+from ddqn_planner.experience.drives import (
     EXPERIENCE,
     RECORD,
     Drive,
     DriveEnd,
     DriveFolder,
+    DriveRecorder,
     read_drives,
 )
-from ddqn_planner.experience.drive_recorder import DriveRecorder
 from ddqn_planner.grid import GridMap
 from ddqn_planner.nodes.conversions import occupancy_message, quaternion, serialized_poses
 from ddqn_planner.nodes.poses import MapInFrame, RobotPoses

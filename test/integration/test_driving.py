@@ -24,7 +24,7 @@ from std_msgs.msg import Header, String
 from std_srvs.srv import Trigger
 
 from ddqn_planner import Experience, GridMap
-from ddqn_planner.experience.drive_log import read_drives
+from ddqn_planner.experience.drives import read_drives
 from ddqn_planner.nodes import trainer_node
 from ddqn_planner.nodes.conversions import quaternion
 from ddqn_planner.nodes.driving import NAVIGATION
