@@ -22,5 +22,5 @@ def test_killed_nodes_leave_nothing_broken_and_work_again() -> None:
         [sys.executable, str(FAULTS), "3"], capture_output=True, text=True, timeout=TIMEOUT
     )
     assert run.returncode == 0, run.stdout + run.stderr
-    killed_once = re.findall(r"^(\w+)_node +\w+ +1 ", run.stdout, re.MULTILINE)
+    killed_once = re.findall(r"^\| (\w+)_node \| \w+ \| 1 \|", run.stdout, re.MULTILINE)
     assert killed_once == ["planner", "map_server", "trainer"], run.stdout
