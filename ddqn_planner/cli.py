@@ -3,22 +3,31 @@
 from __future__ import annotations
 
 import argparse
+import json
 import os
+import shutil
+import signal
 import sys
+import threading
+import time
 from collections.abc import Callable, Sequence
-from importlib import import_module
-from typing import Final
+from contextlib import ExitStack, closing
+from dataclasses import fields
+from pathlib import Path
+from typing import TYPE_CHECKING, Final
 
+from ddqn_planner.files import claim, write_csv
 from ddqn_planner.libraries import with_remedy
+from ddqn_planner.resources import find_map
 
-COMMANDS: Final = {
-    "plan": "plan a path on a map file",
-    "train": "train a model on a map file",
-    "train-any-map": "train a model for any map on random maps",
-    "certify": "prove which moves a model takes for possible",
-    "learn": "learn from recorded drives how long places take",
-}
-"""Each is a module of `ddqn_planner.commands`."""
+# A command imports what it needs, and no other command's libraries.
+if TYPE_CHECKING:
+    from ddqn_planner.experience.drive_log import Drive
+    from ddqn_planner.grid import Cell, GridMap, MapFile, MoveRule
+    from ddqn_planner.planning import Plan
+    from ddqn_planner.training.environment import Scenario
+    from ddqn_planner.training.hyper_parameters import HyperParameters
+    from ddqn_planner.training.run import TrainingRun
 
 
 class HelpFormatter(argparse.HelpFormatter):
@@ -27,6 +36,345 @@ class HelpFormatter(argparse.HelpFormatter):
     def _get_help_string(self, action: argparse.Action) -> str:
         has_default = action.default not in (None, argparse.SUPPRESS) and action.nargs != 0
         return f"{action.help} (default: %(default)s)" if has_default else str(action.help)
+
+
+def exit_code(program: str, run: Callable[[], int]) -> int:
+    """Return what a program returns, or 2 after a line that names its error."""
+    try:
+        return run()
+    except (OSError, ValueError, ImportError, MemoryError) as error:
+        print(f"{program}: {with_remedy(error)}", file=sys.stderr)
+        return 2
+
+
+def plan(parser: argparse.ArgumentParser, arguments: Sequence[str]) -> int:
+    """Plan a path on a map file, and print it."""
+    import numpy as np
+
+    from ddqn_planner.grid import GridMap, inflate
+    from ddqn_planner.pictures import save_picture
+    from ddqn_planner.planning import Planner
+
+    _add_plan_options(parser)
+    options = parser.parse_args(arguments)
+    for name in ("tolerance", "start_clearing_radius"):
+        if not getattr(options, name) >= 0:
+            option = name.replace("_", "-")
+            raise ValueError(f"--{option} is {getattr(options, name):g}; give metres, 0 or more")
+    map_file, start, goal = _read_map(options)
+    grid = map_file.grid(options.occupied_threshold, options.allow_unknown, options.use_map_costs)
+    grid = inflate(grid, options.robot_radius, options.clearance_weight)
+    planner = Planner.load(options.model)
+    # A first plan loads compiled code, which the time of the second one leaves out.
+    shape = tuple(planner.metadata.sizes.get(side, 3) for side in ("height", "width"))
+    planner.plan(GridMap(np.zeros(shape, dtype=np.bool_)), (0, 0), (1, 1))
+    began = time.perf_counter()
+    plan = planner.plan(
+        grid,
+        start,
+        goal,
+        options.move_rule,
+        options.mode,
+        options.tolerance / grid.resolution,
+        start_clearing_radius=options.start_clearing_radius / grid.resolution,
+    )
+    _print_plan(options, grid, plan, time.perf_counter() - began)
+    if options.csv:
+        rows = ((*cell, *np.round(grid.cell_to_world(cell), 6)) for cell in plan.cells)
+        write_csv(options.csv, ("x", "y", "x_metres", "y_metres"), rows)
+    if options.picture:
+        value = None
+        if plan.cells and planner.network.supports((grid.height, grid.width)):
+            value = planner.q_field(grid, plan.cells[-1], plan.move_rule).value
+        title = f"{plan.length:.2f} cells" if plan.cells else plan.status.value
+        save_picture(options.picture, grid, plan.cells, value, title)
+    return 0 if plan.cells else 1
+
+
+def _add_plan_options(parser: argparse.ArgumentParser) -> None:
+    from ddqn_planner.planning import PlanMethod
+
+    add = parser.add_argument
+    _add_map_options(parser, None)
+    add("--model", default="any_map", help="name or file")
+    modes = [method.value for method in PlanMethod]
+    add("--mode", choices=modes, default="greedy", help="astar_fallback: search if steps get stuck")
+    occupied = "a cell of this value or more is occupied, percent"
+    add("--occupied-threshold", type=int, default=65, metavar="N", help=occupied)
+    add("--allow-unknown", action="store_true", help="treat unknown cells as free")
+    costs = "a free cell costs more, the greater its value; an unknown one costs most"
+    add("--use-map-costs", action="store_true", help=costs)
+    for name, words in (
+        ("robot-radius", "distance that the path keeps from obstacles, metres"),
+        ("clearance-weight", "how strongly to avoid cells near obstacles, 0 to 1"),
+        ("tolerance", "how far a goal that is occupied or cut off may move, metres"),
+        ("start-clearing-radius", "obstacles so near to an occupied start do not count, metres"),
+    ):
+        add(f"--{name}", type=float, default=0.0, metavar="X", help=words)
+    add("--cells", action="store_true", help="print each cell of the path, as X Y")
+    add("--csv", type=Path, metavar="FILE", help="write the path's cells and their metres")
+    add("--json", action="store_true", help="print JSON instead of text")
+    add("--picture", type=Path, metavar="FILE", help="draw map, value and path")
+
+
+def _print_plan(options: argparse.Namespace, grid: GridMap, plan: Plan, seconds: float) -> None:
+    from ddqn_planner.grid import path_length
+    from ddqn_planner.pictures import MAX_TEXT_WIDTH, draw_blocks, draw_text
+
+    optimum = _shortest_length(grid, plan)
+    if options.json:
+        answer = {
+            "status": plan.status.name,
+            "reason": plan.status.value,
+            "cells": plan.cells,
+            "method": plan.method.value,
+            "length": plan.length,
+            "optimum": optimum,
+            "move_rule": plan.move_rule.value,
+            "planning_seconds": seconds,
+        }
+        print(json.dumps(answer))
+    elif plan.cells:
+        if grid.width <= MAX_TEXT_WIDTH:
+            print(draw_text(grid, plan.cells))
+        elif sys.stdout.isatty() and sys.stdout.encoding.lower() == "utf-8":
+            print(draw_blocks(grid, plan.cells, *shutil.get_terminal_size()))
+        if options.cells:
+            print(*(f"{x} {y}" for x, y in plan.cells), sep="\n")
+        metres = path_length(plan.path) * grid.resolution
+        print(f"start {plan.cells[0]}, goal {plan.cells[-1]}, {metres:.2f} m")
+        known = "" if optimum is None else f"optimum {optimum:.2f} under {plan.move_rule.value}, "
+        known += "" if plan.cost is None else f"cost {plan.cost:.2f}, "
+        print(
+            f"length {plan.length:.2f} cells, {known}{plan.method.value}, "
+            f"planned in {seconds * 1e3:.1f} ms"
+        )
+    else:
+        print(f"no path: {plan.status.value}", file=sys.stderr)
+
+
+def _shortest_length(grid: GridMap, plan: Plan) -> float | None:
+    """Return the least length of a path with the plan's ends; None if there is no such path."""
+    import numpy as np
+
+    from ddqn_planner.grid import path_length
+    from ddqn_planner.planning.search import search
+
+    if not plan.cells or not grid.is_free(plan.cells[0]):
+        return None
+    legal = grid.legal_moves(plan.move_rule)
+    without_costs = np.ones(grid.occupancy.shape, dtype=np.float32)
+    cells = search(plan.cells[0], plan.cells[-1], legal, without_costs, plan.move_rule)
+    return path_length(cells, plan.move_rule)
+
+
+def train(parser: argparse.ArgumentParser, arguments: Sequence[str]) -> int:
+    """Train a model on a map file, into a folder. Run the same command again to resume."""
+    from ddqn_planner.grid import MoveRule
+    from ddqn_planner.training.environment import Scenario
+    from ddqn_planner.training.evaluation import evaluate
+    from ddqn_planner.training.hyper_parameters import HyperParameters
+
+    _add_map_options(parser, "corner_cutting")
+    _add_training_options(parser, "runs/train", HyperParameters())
+    options = parser.parse_args(arguments)
+    map_file, start, goal = _read_map(options)
+    scenario, rule = Scenario(map_file.grid(), start, goal), MoveRule(options.move_rule)
+    run = _run_training(options, [scenario], rule)
+    field = run.trainer.planner().q_field(scenario.grid, goal)
+    evaluation, plan = evaluate(field, scenario.grid, rule), field.rollout(start)
+    print(
+        f"the greedy rollout solves {evaluation.solved} of {evaluation.starts} starts, mean length "
+        f"{evaluation.mean_ratio:.4f} of the optimum; from the start "
+        + (f"{plan.length:.2f} cells" if plan.cells else "it is trapped")
+    )
+    return 0
+
+
+def train_any_map(parser: argparse.ArgumentParser, arguments: Sequence[str]) -> int:
+    """Train a model for any map on small random maps. Run the same command again to resume."""
+    from ddqn_planner.grid import MoveRule
+    from ddqn_planner.training.any_map import ANY_MAP, MAPS, random_scenarios
+
+    parser.add_argument("--maps", type=int, default=MAPS, metavar="N", help="number of maps")
+    _add_training_options(parser, "runs/any_map", ANY_MAP)
+    options = parser.parse_args(arguments)
+    if options.maps < 1:
+        raise ValueError(f"--maps is {options.maps}; give at least 1")
+    scenarios = random_scenarios(options.seed, options.maps)
+    _run_training(options, scenarios, MoveRule.ROBOT_SAFE)
+    return 0
+
+
+def _add_training_options(
+    parser: argparse.ArgumentParser, out: str, parameters: HyperParameters
+) -> None:
+    """Add the folder, the seed and each hyper-parameter with its default."""
+    parser.add_argument("--out", type=Path, default=Path(out), help="folder of the run")
+    parser.add_argument("--seed", type=int, default=0, help="seed of the training")
+    for entry in fields(parameters):
+        parser.add_argument(
+            f"--{entry.name.replace('_', '-')}",
+            type=type(entry.default),
+            default=getattr(parameters, entry.name),
+            choices=entry.metadata.get("choices"),
+            help=entry.metadata["source"],
+        )
+
+
+def _run_training(
+    options: argparse.Namespace, scenarios: Sequence[Scenario], move_rule: MoveRule
+) -> TrainingRun:
+    """Train into ``--out`` until ``--steps`` or a signal to stop; return the closed run."""
+    import torch
+    from tqdm import tqdm
+
+    from ddqn_planner.training.hyper_parameters import HyperParameters
+    from ddqn_planner.training.run import TrainingRun
+
+    torch.set_num_threads(1)  # as fast as two for such small networks, and always the same result
+    values = {entry.name: getattr(options, entry.name) for entry in fields(HyperParameters)}
+    parameters = HyperParameters(**values)
+    with closing(TrainingRun(options.out, scenarios, move_rule, parameters, options.seed)) as run:
+        trainer = run.trainer
+        print(run.description)
+        interrupted = threading.Event()
+        # An exception could interrupt a step; a flag is read between two steps.
+        for number in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(number, lambda *_: interrupted.set())
+        # disable=None: no bar if the output is not a terminal.
+        with tqdm(total=parameters.steps, initial=trainer.steps, disable=None) as bar:
+            for finished in run.steps():
+                bar.update(trainer.steps - bar.n)
+                for episode in finished:
+                    figures = {"episode": episode.number, "average reward": episode.average_reward}
+                    bar.set_postfix(figures, refresh=False)
+                if interrupted.is_set():
+                    run.try_to_save()
+                    print(f"stopped at step {trainer.steps}; run the same command to resume")
+                    break
+    if run.save_error:
+        raise OSError(run.save_error)
+    print(f"{trainer.steps} steps, {trainer.episodes} episodes, saved {run.model_path}")
+    return run
+
+
+def certify(parser: argparse.ArgumentParser, arguments: Sequence[str]) -> int:
+    """Prove which moves a model takes for possible, for all costs and unknown cells.
+
+    The proof bounds the error of the learned costs too, and so the cost of planned paths. The exit
+    code is 1 if there is no proof.
+    """
+    from ddqn_planner.model import load_model
+    from ddqn_planner.model.certificate import NO_CERTIFICATE
+
+    parser.add_argument("model", nargs="?", default="any_map", help="name or file")
+    network, metadata = load_model(parser.parse_args(arguments).model)
+    certificate = network.certificate(metadata.move_rule)
+    print(certificate or NO_CERTIFICATE)
+    return 0 if certificate and certificate.proved else 1
+
+
+def learn(parser: argparse.ArgumentParser, arguments: Sequence[str]) -> int:
+    """Learn from a robot's recorded drives how long places take."""
+    import numpy as np
+
+    from ddqn_planner.experience import Experience
+    from ddqn_planner.experience.drive_log import EXPERIENCE, LOCK, RECORD
+    from ddqn_planner.grid import load_map
+
+    add = parser.add_argument
+    words = "a trainer's folder, a CSV file with the columns seconds, x, y, or an MCAP file"
+    add("drives", type=Path, help=words)
+    add("--map", required=True, help="ROS map YAML, or name of a shipped map")
+    words = "by default experience.npz in the folder, or beside the file"
+    add("--out", type=Path, metavar="FILE", help=words)
+    words = "the robot's speed where nothing slows it down, metres per second"
+    add("--nominal-speed", type=float, default=0.5, metavar="X", help=words)
+    add("--robot-width", type=float, default=0.5, metavar="X", help="metres")
+    words = "MCAP: the topic of the poses, by default the one with most poses; or /tf"
+    add("--topic", default="", help=words)
+    add("--frame", default="map", help="MCAP: the map's frame")
+    add("--robot-frame", default="base_link", help="MCAP: the robot's frame, for /tf")
+    options = parser.parse_args(arguments)
+    source: Path = options.drives
+    grid = load_map(find_map(options.map))
+    experience = Experience(options.nominal_speed, options.robot_width)
+    with ExitStack() as stack:
+        if source.is_dir():
+            if not (source / RECORD).is_file():
+                remedy = "give a trainer's folder, or the .mcap file in a bag's"
+                raise ValueError(f"{source} holds no {RECORD}; {remedy}")
+            stack.enter_context(claim(source, [LOCK, RECORD], "drives", "records"))
+        drives = _read_drives(source, options)
+        for drive in drives:
+            experience.apply(grid)  # so that the time is compared with the expected one
+            drive.teach(experience)
+        if not drives:
+            raise ValueError(f"{source} holds no drive; drive on")
+        out = options.out or (source if source.is_dir() else source.parent) / EXPERIENCE
+        experience.save(out)
+    slowness, known = experience.slowness(grid), experience.uncertainty(grid) < 0.9
+    seconds = sum(float(np.ptp(drive.seconds)) for drive in drives)
+    print(f"{len(drives)} drives, {sum(d.metres for d in drives):.0f} m, {seconds / 60:.1f} min")
+    free = known & ~grid.occupancy
+    print(f"known now: {free.sum() / max((~grid.occupancy).sum(), 1):.0%} of the free cells")
+    if free.any():
+        middle, slow = np.quantile(slowness[free], (0.5, 0.95))
+        print(f"seconds over nominal ones there: median {middle:.2f}, slowest 5 % from {slow:.2f}")
+    print(f"saved {out}")
+    return 0
+
+
+def _read_drives(source: Path, options: argparse.Namespace) -> list[Drive]:
+    """Return the drives of a folder or a file."""
+    from ddqn_planner.experience.drive_log import RECORD, read_drives
+    from ddqn_planner.experience.recordings import drives_of, read_csv, read_mcap
+
+    if source.is_dir():
+        return list(read_drives(source / RECORD))
+    ending = source.suffix.lower()
+    if ending == ".mcap":
+        topic, samples = read_mcap(source, options.topic, options.frame, options.robot_frame)
+        print(f"{len(samples)} poses of {topic}")
+        return drives_of(samples)
+    if ending == ".csv":
+        return list(read_drives(source)) if source.name == RECORD else drives_of(read_csv(source))
+    raise ValueError(f"{source} is no folder, and ends in neither .csv nor .mcap; give one of them")
+
+
+def _add_map_options(parser: argparse.ArgumentParser, move_rule: str | None) -> None:
+    """Add a map file with start and goal, see `_read_map`, and the move rule with its default."""
+    from ddqn_planner.grid import MoveRule
+
+    parser.add_argument("map", help="ROS map YAML, MovingAI .map, or name of a shipped map")
+    for name in ("start", "goal"):
+        words = f"the {name}'s cell, by default the map file's"
+        parser.add_argument(f"--{name}", type=int, nargs=2, metavar=("X", "Y"), help=words)
+    words = "which diagonal moves are legal" + ("" if move_rule else ", by default as in training")
+    rules = [rule.value for rule in MoveRule]
+    parser.add_argument("--move-rule", choices=rules, default=move_rule, help=words)
+
+
+def _read_map(options: argparse.Namespace) -> tuple[MapFile, Cell, Cell]:
+    """Return the map file, the start and the goal that the options give."""
+    from ddqn_planner.grid import read_map_file
+
+    map_file = read_map_file(find_map(options.map))
+    start = tuple(options.start) if options.start else map_file.start
+    goal = tuple(options.goal) if options.goal else map_file.goal
+    if start is None or goal is None:
+        raise ValueError(f"{options.map} names no start and goal; give --start X Y and --goal X Y")
+    return map_file, start, goal
+
+
+COMMANDS: Final = {
+    "plan": ("plan a path on a map file", plan),
+    "train": ("train a model on a map file", train),
+    "train-any-map": ("train a model for any map on random maps", train_any_map),
+    "certify": ("prove which moves a model takes for possible", certify),
+    "learn": ("learn from recorded drives how long places take", learn),
+}
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -38,30 +386,18 @@ def main(arguments: Sequence[str] | None = None) -> int:
     # machine several are ten times as slow.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     arguments = sys.argv[1:] if arguments is None else arguments
-    parser = argparse.ArgumentParser(prog="ddqn-planner", description=__doc__.replace("`", ""))
-    commands = parser.add_subparsers(required=True, metavar="|".join(COMMANDS))
-
-    def run() -> int:
-        for name, words in COMMANDS.items():
-            command = commands.add_parser(name, help=words, formatter_class=HelpFormatter)
-            if name in arguments[:1]:  # the other commands' modules would take long to import
-                module = import_module(f"ddqn_planner.commands.{name.replace('-', '_')}")
-                command.description = module.__doc__
-                command.set_defaults(run=module.run)
-                module.add_options(command)
-        options = parser.parse_args(arguments)
-        return int(options.run(options))
-
-    return exit_code(parser.prog, run)
-
-
-def exit_code(program: str, run: Callable[[], int]) -> int:
-    """Return what a program returns, or 2 after a line that names its error."""
-    try:
-        return run()
-    except (OSError, ValueError, ImportError, MemoryError) as error:
-        print(f"{program}: {with_remedy(error)}", file=sys.stderr)
-        return 2
+    parser = argparse.ArgumentParser(prog="ddqn-planner", description=str(__doc__).replace("`", ""))
+    names = parser.add_subparsers(required=True, metavar="|".join(COMMANDS))
+    parsers = {
+        name: names.add_parser(
+            name, help=words, description=command.__doc__, formatter_class=HelpFormatter
+        )
+        for name, (words, command) in COMMANDS.items()
+    }
+    if not arguments or arguments[0] not in COMMANDS:
+        parser.parse_args(arguments)  # ends with the help, or an error
+    name, *others = arguments
+    return exit_code(parser.prog, lambda: COMMANDS[name][1](parsers[name], others))
 
 
 if __name__ == "__main__":

@@ -6,32 +6,37 @@ import logging
 from collections.abc import Callable
 from functools import cache, wraps
 from threading import Lock
-from typing import Any, TypeVar
+from types import FunctionType
+from typing import Any, TypeVar, cast
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 
 _importing = Lock()
 
 
-def compiled(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Compile a function at its first call. It calls no other compiled function."""
+def compiled(function: Function) -> Function:
+    """Compile a function at its first call, with the functions of this kind that it calls."""
 
     @cache
-    def dispatcher() -> Callable[..., Any]:
-        return compiled_now(function)
+    def dispatcher() -> Any:
+        scope = dict(function.__globals__)
+        for name in function.__code__.co_names:
+            if hasattr(scope.get(name), "dispatcher"):
+                scope[name] = scope[name].dispatcher()
+        return compiled_now(FunctionType(function.__code__, scope))
 
     @wraps(function)
     def call(*arguments: Any) -> Any:
         return dispatcher()(*arguments)
 
-    return call
+    call.dispatcher = dispatcher  # type: ignore[attr-defined]
+    return cast(Function, call)
 
 
 def compiled_now(function: Function) -> Function:
-    """Import numba, and compile a function for its first call, also by other compiled functions.
+    """Import numba, and compile a function for its first call.
 
-    The code is kept for other processes where a folder is writable. For modules that are imported
-    when they are needed.
+    The code is kept for other processes where a folder is writable.
     """
     numba = _import_numba()
     try:

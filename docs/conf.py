@@ -37,16 +37,7 @@ def write_command_line() -> None:
     folder = DOCS / "_build" / "help"
     folder.mkdir(parents=True, exist_ok=True)
     environment = {**os.environ, "COLUMNS": "88", "PYTHONPATH": str(DOCS.parent)}
-    for name in (
-        "plan",
-        "train",
-        "train-any-map",
-        "evaluate",
-        "certify",
-        "reproduce",
-        "experiment",
-        "learn",
-    ):
+    for name in ("plan", "train", "train-any-map", "certify", "learn"):
         command = [sys.executable, "-m", "ddqn_planner.cli", name, "--help"]
         text = subprocess.run(command, env=environment, stdout=subprocess.PIPE, check=True).stdout
         (folder / f"{name}.txt").write_bytes(text)

@@ -10,6 +10,7 @@ import goal_1
 import goal_3
 import numpy as np
 from profiles import MOVE_RULE
+from random_maps import generate_map
 from settings import Settings, median_and_range
 from tables import write_table
 from trainings import Training, rollouts, solved
@@ -23,7 +24,7 @@ from ddqn_planner.grid import (
     move_costs,
     path_length,
 )
-from ddqn_planner.grid.generators import generate_map, random_costs
+from ddqn_planner.grid.noise import random_costs
 from ddqn_planner.model import AnyMapQNetwork
 from ddqn_planner.planning import Planner
 from ddqn_planner.training.any_map import ANY_MAP, RULES, random_scenarios

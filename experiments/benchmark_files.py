@@ -21,7 +21,6 @@ from benchmark_maps import (
 from tqdm import tqdm
 
 from ddqn_planner.grid import Cell, GridMap, MoveRule, read_map_file
-from ddqn_planner.grid.moves import component_labels
 
 FILES: Final = {
     ".map": "MovingAI maps",
@@ -102,7 +101,7 @@ def _read_scenario(
     Report bad lines on stderr. Return also the greatest rounding error of an optimum: half a unit
     of the last decimal that the file gives.
     """
-    labels = component_labels(grid.occupancy, move_rule)
+    labels = grid.labels(move_rule)
     requests, bad, decimals = [], [], 0
     for number, line in enumerate(path.read_text(errors="replace").splitlines(), start=1):
         if (number == 1 and line.startswith("version")) or not line.strip():

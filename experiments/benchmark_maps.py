@@ -8,17 +8,11 @@ from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
+from random_maps import generate_map, gradient_costs, inflated_costs
 
-from ddqn_planner.grid import Cell, GridMap, MoveRule, connected_cells
+from ddqn_planner.grid import Cell, GridMap, MoveRule
 from ddqn_planner.grid.arguments import Occupancy
-from ddqn_planner.grid.generators import (
-    generate_map,
-    gradient_costs,
-    inflated_costs,
-    random_costs,
-    random_requests,
-    unknown_costs,
-)
+from ddqn_planner.grid.noise import random_costs, random_requests, unknown_costs
 
 INFLATION_RADIUS = 5.0
 """How far the cost of an obstacle reaches, cells."""
@@ -126,7 +120,7 @@ def random_starts(
     occupancy: Occupancy, goal: Cell, move_rule: MoveRule, count: int, random: np.random.Generator
 ) -> list[Cell]:
     """Draw cells, except the goal, from which a path leads to the goal; they may repeat."""
-    connected = connected_cells(occupancy, goal, move_rule)
+    connected = GridMap(occupancy).reachable([goal], move_rule)
     connected[goal[1], goal[0]] = False
     cells = np.argwhere(connected)
     if not len(cells):

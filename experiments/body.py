@@ -25,7 +25,7 @@ from ddqn_planner.grid import (
     path_length,
     shortest_distances,
 )
-from ddqn_planner.grid.generators import random_requests
+from ddqn_planner.grid.noise import random_requests
 from ddqn_planner.resources import find_map
 
 RULE = MoveRule.ROBOT_SAFE

@@ -28,14 +28,14 @@ from nav_msgs.msg import OccupancyGrid
 from nav_msgs.msg import Path as PathMessage
 from nav_msgs.srv import GetPlan, LoadMap
 from processes import claim_ros_domain, run_script, running_node
+from random_maps import generate_map
 from rcl_interfaces.srv import GetParameters, SetParameters
 from rclpy.parameter import Parameter
 from std_srvs.srv import Trigger
 from tables import table
 
 from ddqn_planner.grid import OCCUPIED, Cell, MapFile, save_map
-from ddqn_planner.grid.generators import generate_map, random_requests
-from ddqn_planner.grid.noise import MAX_NEW_OBSTACLES
+from ddqn_planner.grid.noise import MAX_NEW_OBSTACLES, random_requests
 from ddqn_planner.model import load_model
 from ddqn_planner.nodes.runtime import LATCHED
 from ddqn_planner.training.environment import paper_scenario

@@ -14,13 +14,14 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 from processes import run_script
+from random_maps import generate_map, inflated_costs
 from tables import table
 
 from ddqn_planner import GridMap, MoveRule, Planner
 from ddqn_planner.grid import Cell, path_cost, path_length
 from ddqn_planner.grid.arguments import Occupancy
 from ddqn_planner.grid.body import clearance
-from ddqn_planner.grid.generators import generate_map, inflated_costs, random_requests
+from ddqn_planner.grid.noise import random_requests
 from ddqn_planner.planning import PlanRequest
 from ddqn_planner.planning.path_under_way import rest_of_path
 from ddqn_planner.planning.planner import last_step

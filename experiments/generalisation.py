@@ -21,6 +21,7 @@ import numpy as np
 from benchmark_files import describe_files, find_files, read_maps
 from benchmark_maps import COSTS, BenchmarkMap, RequestSettings, generated_maps
 from numpy.typing import NDArray
+from random_maps import KINDS
 from tables import table
 from tqdm import tqdm
 
@@ -35,7 +36,6 @@ from ddqn_planner.grid import (
     path_cost,
     shortest_distances,
 )
-from ddqn_planner.grid.generators import KINDS
 from ddqn_planner.planning import Planner, QField
 
 OPTIMAL = 1 + 1e-6

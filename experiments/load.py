@@ -37,8 +37,7 @@ from nav_msgs.srv import GetPlan
 from processes import claim_ros_domain, memory, run_script, running_node
 from rclpy.qos import DurabilityPolicy, QoSProfile
 
-from ddqn_planner.grid import connected_cells
-from ddqn_planner.grid.generators import random_requests
+from ddqn_planner.grid.noise import random_requests
 from ddqn_planner.nodes.runtime import LATCHED
 
 REQUESTS, CLIENTS, CHANGES = 10_000, 8, 50
@@ -166,7 +165,7 @@ def load_goals(goals: int) -> bool:
     office, random = three_maps()[2], np.random.default_rng(0)
     grid = office.grid
     ((start, _),) = random_requests(grid.occupancy, RULE, 1, random)
-    reachable = np.argwhere(connected_cells(grid.occupancy, start, RULE))[:, ::-1]
+    reachable = np.argwhere(grid.reachable([start], RULE))[:, ::-1]
     cells = [(int(x), int(y)) for x, y in random.permutation(reachable)[:goals]]
     numbers = {cell: number for number, cell in enumerate(cells)}
     with Client() as client:

@@ -9,9 +9,9 @@ from client import cell_of, cells_of, map_message
 from nav_msgs.msg import OccupancyGrid, Path
 from nav_msgs.srv import GetPlan
 from numpy.typing import NDArray
+from random_maps import generate_map
 
 from ddqn_planner.grid import MOVES, Cell, MapFile, MoveRule, legal_moves, read_map_file
-from ddqn_planner.grid.generators import generate_map
 from ddqn_planner.resources import find_map
 
 RULE = MoveRule.ROBOT_SAFE

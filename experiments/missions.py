@@ -22,10 +22,12 @@ from driving_worlds import (
     with_faults,
 )
 from numpy.typing import NDArray
+from random_maps import generate_map
 
 from ddqn_planner.experience import Experience
 from ddqn_planner.grid import Cell, GridMap, MoveRule, inflate, load_map
 from ddqn_planner.grid.arguments import MAX_SLOWNESS
+from ddqn_planner.grid.noise import random_requests
 from ddqn_planner.planning import Planner
 
 Float64 = NDArray[np.float64]
@@ -175,8 +177,6 @@ def update_times(rounds: int = 20) -> Float64:
         Milliseconds of the processor: of `Experience.record`, of `Experience.apply`, and of
         `Planner.plan` toward a goal of which the field of the last map is known.
     """
-    from ddqn_planner.grid.generators import generate_map, random_requests
-
     random = np.random.default_rng(0)
     occupancy = generate_map("office", (1000, 1000), random)
     grid, planner = GridMap(occupancy, 0.05), Planner.load("any_map")

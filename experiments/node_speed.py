@@ -36,13 +36,14 @@ from processes import (
     running,
     running_node,
 )
+from random_maps import generate_map
 from rcl_interfaces.srv import GetParameters, ListParameters
 from std_srvs.srv import Trigger
 from tables import report
 
 from ddqn_planner import GridMap, Planner, load_map
 from ddqn_planner.grid import OCCUPIED, Cell, save_map
-from ddqn_planner.grid.generators import generate_map, random_requests
+from ddqn_planner.grid.noise import random_requests
 from ddqn_planner.nodes.runtime import LATCHED
 from ddqn_planner.resources import find_map
 

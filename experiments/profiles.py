@@ -8,7 +8,7 @@ from ddqn_planner.grid import Cell, MoveRule
 from ddqn_planner.training.hyper_parameters import HyperParameters
 
 MOVE_RULE: Final = MoveRule.CORNER_CUTTING
-"""The rule under which the paper's 22.97 is the shortest path (docs/dilemma_map.md)."""
+"""The rule under which the paper's 22.97 is the shortest path (docs/reproduction.md)."""
 
 HIDDEN_UNITS: Final = (0, 128)
 """Sizes of the hidden layer with which goal iii tries the paper's network; 0 for none."""

@@ -32,7 +32,7 @@ from soak_robot import EVENTS, NAMESPACE, SOURCE, SimulatedRobot, parameters
 from std_srvs.srv import Trigger
 
 from ddqn_planner.grid import MapFile, MoveRule, save_map
-from ddqn_planner.grid.generators import random_requests
+from ddqn_planner.grid.noise import random_requests
 from ddqn_planner.nodes.runtime import LATCHED
 
 MINUTES = 30.0

@@ -27,7 +27,7 @@ from rosgraph_msgs.msg import Clock
 from std_msgs.msg import Header
 
 from ddqn_planner.grid import Cell
-from ddqn_planner.grid.generators import random_requests
+from ddqn_planner.grid.noise import random_requests
 from ddqn_planner.nodes.runtime import LATCHED
 from ddqn_planner.planning import Planner
 

@@ -27,6 +27,7 @@ import nano_astar
 import numpy as np
 import pyastar2d
 import torch
+from random_maps import KINDS, generate_map
 from stable_baselines3 import DQN
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from tables import report
@@ -35,8 +36,9 @@ from torch import nn
 from ddqn_planner import GridMap, MoveRule, Planner, QField
 from ddqn_planner.grid import Cell, shortest_distances
 from ddqn_planner.grid.arguments import Occupancy
-from ddqn_planner.grid.generators import KINDS, generate_map, random_costs, random_requests
-from ddqn_planner.planning.distance_field import DistanceField
+from ddqn_planner.grid.noise import random_costs, random_requests
+from ddqn_planner.planning.field import DistanceField
+from ddqn_planner.planning.kernels import CLOSED
 from ddqn_planner.training.environment import GridEnvironment, paper_scenario
 from ddqn_planner.training.hyper_parameters import HyperParameters
 from ddqn_planner.training.trainer import Trainer
@@ -336,7 +338,7 @@ def draw_visited_cells() -> None:
     plan = planner.plan(grid, start, goal, RULE)
     field = planner.q_field(grid, goal, RULE)
     assert isinstance(field, DistanceField)
-    closed = field.known.state.reshape(grid.height + 2, -1)[1:-1, 1:-1] == field.wavefront.CLOSED
+    closed = field.known.state.reshape(grid.height + 2, -1)[1:-1, 1:-1] == CLOSED
     cells = start[::-1], goal[::-1]
     _, _, history = nano_astar.astar(grid.occupancy.astype(np.uint8), *cells, return_history=True)
     by_a_star = np.zeros_like(closed)

@@ -173,7 +173,7 @@ class Experience:
         """
         spread = self._spread_over(grid)
         seconds_per_cell = grid.resolution / self.nominal_speed
-        return grid._changed(slowness=spread.slowness, seconds_per_cell=seconds_per_cell)
+        return grid.with_layers(slowness=spread.slowness, seconds_per_cell=seconds_per_cell)
 
     def slowness(self, grid: GridMap) -> Float32:
         """Return (H, W) float32: expected seconds over those at nominal speed, 1 or more."""

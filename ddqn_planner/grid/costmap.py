@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ddqn_planner.grid.arguments import OCCUPIED, UNKNOWN, whole_numbers
+from ddqn_planner.grid.arguments import OCCUPIED, UNKNOWN
 from ddqn_planner.grid.grid_map import MAX_COST_MULTIPLIER, GridMap
 
 INSCRIBED = 99
@@ -17,9 +17,9 @@ _COSTMAP_COST = 1 + (np.arange(INSCRIBED) - 1) * 251 / 97
 _MULTIPLIER = (50 + 0.8 * _COSTMAP_COST) / 50
 """NavFn's cost of a cell beside its neutral cost: from 1 to 5."""
 
-_COSTS = np.rint((_MULTIPLIER - 1) / (MAX_COST_MULTIPLIER - 1) * OCCUPIED)
-_COSTS = _COSTS.clip(0, OCCUPIED - 1).astype(np.int8)
-"""(99,) int8: the cost of each value, 0 to 98, in a `GridMap`."""
+_COSTS = np.rint((_MULTIPLIER - 1) / (MAX_COST_MULTIPLIER - 1) * OCCUPIED).clip(0, OCCUPIED - 1)
+_COSTS = np.append(_COSTS, UNKNOWN).astype(np.int8)
+"""(100,) int8: the cost in a `GridMap` of each value, 0 to 98, and last of an unknown cell, -1."""
 
 
 def grid_from_costmap(
@@ -32,27 +32,13 @@ def grid_from_costmap(
 
     A cell of value 100 is an obstacle. One of 99 is too near to an obstacle for the robot's body:
     it is occupied, and a robot that starts there may leave. Values of 1 to 98 become costs as in
-    Nav2's NavFn planner: 50 for a free cell plus 0.8 times the costmap's cost, 0 to 252.
-
-    Parameters
-    ----------
-    values : (H, W) array of integers -128..127
-        Any value below 0 is unknown, any above 100 is an obstacle.
-    resolution, origin
-        As for `GridMap`.
-    allow_unknown : bool
-        Whether unknown cells are free. They then have the highest cost, as in NavFn.
-
-    Raises
-    ------
-    ValueError
-        If the values or the arguments of `GridMap` are wrong.
+    Nav2's NavFn planner: 50 for a free cell plus 0.8 times the costmap's cost, 0 to 252. Unknown
+    cells, if they are free, have the highest cost. The rest is as for
+    `GridMap.from_occupancy_values`.
     """
-    array = whole_numbers("costmap values", values, -128, 127)
-    unknown = array < 0
-    occupied = array >= INSCRIBED
-    if not allow_unknown:
-        occupied |= unknown
-    cost = _COSTS.take(array, mode="clip")
-    cost[unknown] = UNKNOWN
-    return GridMap(occupied, resolution, origin, cost, occupied & (array != INSCRIBED))
+    grid = GridMap.from_occupancy_values(
+        values, resolution, origin, INSCRIBED, allow_unknown, use_map_costs=True
+    )
+    assert grid.cost is not None
+    obstacles = grid.occupancy & (np.asarray(values) != INSCRIBED)
+    return grid.with_layers(cost=_COSTS.take(grid.cost, mode="wrap"), obstacles=obstacles)

@@ -2,26 +2,31 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
 from ddqn_planner.compiled import compiled
+from ddqn_planner.grid.arguments import Occupancy
+from ddqn_planner.grid.moves import MOVES, MoveRule
 
 
-def label_cells(occupancy: NDArray[np.bool_], corners: bool) -> NDArray[np.int32]:
+def component_labels(occupancy: Occupancy, move_rule: MoveRule | str) -> NDArray[np.int32]:
     """Return (H, W) int32: the connected component of each free cell, 0 in occupied cells.
 
-    They are numbered from 1, in the order of their first cells. `corners` says whether two cells
-    that share only a corner are connected.
+    Two cells are in one component if a path joins them that may go against forbidden directions.
+    Components are numbered from 1, in the order of their first cells.
     """
     # One layout, and a fresh array: numba compiles again for every other, and for read-only ones.
     free = np.logical_not(occupancy, order="C")
-    labels: NDArray[np.int32] = _labels(free, int(corners))
+    # If a diagonal move needs both side cells free, two straight moves can replace it.
+    labels: NDArray[np.int32] = _labels(free, int(MoveRule(move_rule).cuts_corners))
     return labels
 
 
 @compiled
-def _labels(free, reach):  # type: ignore[no-untyped-def]  # pragma: no cover
+def _labels(free: Any, reach: int) -> Any:  # pragma: no cover
     """Return (H, W) int32 labels, by union-find over the runs of free cells in each row.
 
     Run r is from edges[2 * r] to before edges[2 * r + 1]. Two runs of neighbouring rows are
@@ -72,18 +77,19 @@ def _labels(free, reach):  # type: ignore[no-untyped-def]  # pragma: no cover
     return labels
 
 
-def flood(
-    legal: NDArray[np.bool_], cells: NDArray[np.int64], moves: NDArray[np.int64]
-) -> NDArray[np.bool_]:
-    """Return (H, W) bool: the given cells (N, 2), and those to which legal moves lead from them."""
+def flood(legal: NDArray[np.bool_], cells: NDArray[np.int64], backward: bool) -> NDArray[np.bool_]:
+    """Return (H, W) bool: the given cells (N, 2), and those to which legal moves lead from them.
+
+    Or with `backward`, those from which legal moves lead to them.
+    """
     reached = np.zeros(legal.shape[1:], dtype=np.bool_)
     reached[cells[:, 1], cells[:, 0]] = True
-    _flood(np.ascontiguousarray(legal), reached, moves)
+    _flood(legal, reached, MOVES, backward)
     return reached
 
 
 @compiled
-def _flood(legal, reached, moves):  # type: ignore[no-untyped-def]  # pragma: no cover
+def _flood(legal: Any, reached: Any, moves: Any, backward: bool) -> None:  # pragma: no cover
     """Mark all cells that are reached from those that are marked."""
     height, width = reached.shape
     waiting = np.empty(height * width, dtype=np.int32)  # each cell waits at most once
@@ -97,7 +103,10 @@ def _flood(legal, reached, moves):  # type: ignore[no-untyped-def]  # pragma: no
         y, x = waiting[count] // width, waiting[count] % width
         for action in range(8):
             next_x, next_y = x + moves[action, 0], y + moves[action, 1]
-            if legal[action, y, x] and not reached[next_y, next_x]:
+            if not (0 <= next_x < width and 0 <= next_y < height) or reached[next_y, next_x]:
+                continue
+            # The opposite move leads back from the next cell.
+            if legal[(action + 4) % 8, next_y, next_x] if backward else legal[action, y, x]:
                 reached[next_y, next_x] = True
                 waiting[count] = next_y * width + next_x
                 count += 1

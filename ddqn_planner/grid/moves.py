@@ -7,8 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ddqn_planner.grid.arguments import Cell, Cells, Choice, Occupancy, cell_inside
-from ddqn_planner.grid.labels import label_cells
+from ddqn_planner.grid.arguments import Cells, Choice, Occupancy
 
 MOVES: NDArray[np.int64] = np.array(
     [(1, 0), (1, 1), (0, 1), (-1, 1), (-1, 0), (-1, -1), (0, -1), (1, -1)], dtype=np.int64
@@ -66,12 +65,6 @@ def legal_moves(
     return legal
 
 
-def reversed_moves(legal: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Return (8, H, W) bool: action ``a`` where the opposite move leads back to the cell."""
-    padded = np.pad(np.roll(legal, len(MOVES) // 2, axis=0), ((0, 0), (1, 1), (1, 1)))
-    return np.stack([_shifted(padded[a], dx, dy) for a, (dx, dy) in enumerate(MOVES.tolist())])
-
-
 def neighbours(shape: tuple[int, int]) -> NDArray[np.int64]:
     """Return (8, H * W) int64: the cell number y * W + x that each action leads to from each cell.
 
@@ -94,26 +87,6 @@ def move_costs(multiplier: NDArray[np.float32], move_rule: MoveRule | str) -> ND
         MoveRule(move_rule).lengths[:, None, None] * (multiplier + target) / 2
     )
     return costs
-
-
-def component_labels(occupancy: Occupancy, move_rule: MoveRule | str) -> NDArray[np.int32]:
-    """Return the connected component of each cell, (H, W) int32.
-
-    Two free cells have the same label, 1 or more, if a path joins them that may go against
-    forbidden directions. Occupied cells have 0.
-    """
-    # If a diagonal move needs both side cells free, two straight moves can replace it.
-    return label_cells(occupancy, corners=MoveRule(move_rule).cuts_corners)
-
-
-def connected_cells(
-    occupancy: Occupancy, cell: Cell, move_rule: MoveRule | str
-) -> NDArray[np.bool_]:
-    """Return (H, W) bool: True at the free cell `cell` and where a path leads to it."""
-    x, y = cell_inside(cell, occupancy.shape)
-    labels = component_labels(occupancy, move_rule)
-    connected: NDArray[np.bool_] = labels == labels[y, x]
-    return connected
 
 
 def path_length(cells: Cells, move_rule: MoveRule | str = MoveRule.ROBOT_SAFE) -> float:

@@ -1,13 +1,18 @@
-"""The paper's static noise (section 4.3): new obstacles on a known path, or also next to it."""
+"""What is random on a map: the paper's static noise (section 4.3), and costs and requests.
+
+The trained models and the documented figures depend on them: a seed must always give the same.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from ddqn_planner.grid.arguments import Cell, Choice
+from ddqn_planner.grid.arguments import UNKNOWN, Cell, Choice, Occupancy
 from ddqn_planner.grid.grid_map import GridMap
 from ddqn_planner.grid.moves import MoveRule
 
@@ -59,3 +64,46 @@ def scatter_obstacles(
     raise ValueError(
         f"none of {MAX_TRIES} draws of new obstacles left a path from {start} to {goal}"
     )
+
+
+def random_requests(
+    occupancy: Occupancy, move_rule: MoveRule, count: int, random: np.random.Generator
+) -> list[tuple[Cell, Cell]]:
+    """Draw `count` pairs of start and goal: different free cells that a path joins.
+
+    The start is uniform over the free cells that have a legal move, the goal is uniform over the
+    other cells that the robot can reach from there. Pairs may repeat. A map where no path joins two
+    free cells is a ValueError.
+    """
+    cells = np.flatnonzero(~occupancy)
+    label_of_cell = GridMap(occupancy).labels(move_rule).ravel()[cells]
+    order = np.argsort(label_of_cell, kind="stable")
+    cells, label_of_cell = cells[order], label_of_cell[order]
+    sizes = np.bincount(label_of_cell)
+    first_of_label = np.cumsum(sizes) - sizes
+    candidates = np.flatnonzero(sizes[label_of_cell] > 1)
+    if not len(candidates):
+        raise ValueError("no two free cells of the map are joined; give a map with a path")
+    starts = random.choice(candidates, count)
+    first, size = first_of_label[label_of_cell[starts]], sizes[label_of_cell[starts]]
+    # The goal is 1 to size - 1 cells further in the list of the component, which is a ring.
+    goals = first + (starts - first + random.integers(1, size)) % size
+    y, x = np.divmod(cells[np.stack([starts, goals], axis=1)], occupancy.shape[1])
+    return [((sx, sy), (gx, gy)) for (sx, gx), (sy, gy) in zip(x.tolist(), y.tolist(), strict=True)]
+
+
+def random_costs(occupancy: Occupancy, random: np.random.Generator) -> NDArray[np.int8]:
+    """Draw (H, W) costs of free cells, each independent and uniform in 0..99."""
+    return in_free_cells(occupancy, random.integers(0, 100, occupancy.shape, dtype=np.int8))
+
+
+def unknown_costs(
+    occupancy: Occupancy, share: float, random: np.random.Generator
+) -> NDArray[np.int8]:
+    """Draw (H, W) costs: each free cell is `UNKNOWN` with probability `share`, otherwise 0."""
+    return in_free_cells(occupancy, np.where(random.random(occupancy.shape) < share, UNKNOWN, 0))
+
+
+def in_free_cells(occupancy: Occupancy, costs: NDArray[Any]) -> NDArray[np.int8]:
+    """Return costs as a map has them: 0 in occupied cells."""
+    return np.where(occupancy, 0, costs).astype(np.int8)

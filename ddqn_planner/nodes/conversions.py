@@ -20,7 +20,6 @@ from std_msgs.msg import Header
 from ddqn_planner.grid import Cell, GridMap
 from ddqn_planner.grid.arguments import Cells
 from ddqn_planner.grid.costmap import grid_from_costmap
-from ddqn_planner.grid.grid_map import centre
 from ddqn_planner.grid.map_file import MAX_CELLS
 
 if TYPE_CHECKING:
@@ -135,7 +134,7 @@ def path_message(cells: Cells, grid: GridMap, header: Header, goal_orientation: 
         stamped = _copy(blank)
         stamped.pose = pose = _copy(blank.pose)
         pose.position = point = _copy(blank.pose.position)
-        point.x, point.y = centre(grid, *cell)
+        point.x, point.y = grid.centres(*cell)
         if next_cell is None:
             pose.orientation = goal_orientation
         else:
@@ -156,7 +155,7 @@ def serialized_path(
     """
     x, y = np.asarray(cells, dtype=np.float64).reshape(-1, 2).T
     yaw = grid.origin[2] + np.arctan2(np.diff(y), np.diff(x))
-    positions = np.column_stack(centre(grid, x, y))
+    positions = np.column_stack(grid.centres(x, y))
     return serialized_poses(positions, yaw, header, goal_orientation)
 
 

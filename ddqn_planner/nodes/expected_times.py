@@ -46,7 +46,7 @@ class ExpectedTimes:
         if self._spread_on is None or not _is_like(grid, self._spread_on):
             self._spread_on = grid
         timed = self._experience.apply(self._spread_on)
-        return grid._changed(slowness=timed.slowness, seconds_per_cell=timed.seconds_per_cell)
+        return grid.with_layers(slowness=timed.slowness, seconds_per_cell=timed.seconds_per_cell)
 
     def expected_time(self, grid: GridMap, plan: Plan) -> ExpectedTime | None:
         """Return how long a plan takes; None if its map has no expected times, or is an old one."""

@@ -30,8 +30,7 @@ class ManagedNode(LifecycleNodeMixin, BaseNode):
         BaseNode.__init__(self, name, parameters)
         # Reentrant: the state can be asked for while a transition waits.
         LifecycleNodeMixin.__init__(self, callback_group=ReentrantCallbackGroup())
-        change_state: Any = self._service_change_state
-        change_state.callback = self._on_change_state
+        self.answer_with(ChangeState, self._on_change_state)
         self._is_changing = False
         self._error: Exception | None = None
         self._bond: Any = None
@@ -53,8 +52,8 @@ class ManagedNode(LifecycleNodeMixin, BaseNode):
         last_state = LifecycleState(self.state, 0)
         # First, as a lifecycle manager calls them when the bond breaks, and waits without end.
         self._state_machine.destroy_when_not_in_use()
-        while self._services:
-            self.destroy_service(self._services[0])
+        for service in [*self.services]:
+            self.destroy_service(service)
         if self.context.ok():
             self.on_shutdown(last_state)
         super().destroy_node()
@@ -121,15 +120,13 @@ class ManagedNode(LifecycleNodeMixin, BaseNode):
         self, request: ChangeState.Request, response: ChangeState.Response
     ) -> ChangeState.Response:
         asked = request.transition
-        possible = {
-            number: label for number, label, *_ in self._state_machine.available_transitions
-        }
-        label = asked.label or possible.get(asked.id, "")
-        if self._is_changing or label not in possible.values():
+        known = {number: label for number, label, *_ in self._state_machine.available_transitions}
+        label = asked.label or known.get(asked.id, "")
+        if self._is_changing or label not in known.values():
             what = repr(asked.label) if asked.label else f"transition {asked.id}"
-            while_what = "while it changes its state" if self._is_changing else f"when {self.state}"
-            choices = ", ".join(possible.values()) or "none"
-            self.get_logger().error(f"{what} refused: the node has {choices} {while_what}")
+            choices = ", ".join(known.values()) or "none"
+            when = "while it changes its state" if self._is_changing else f"when {self.state}"
+            self.get_logger().error(f"{what} refused: the node has {choices} {when}")
             return response
         self._is_changing = True
         try:
@@ -181,15 +178,19 @@ class ManagedNode(LifecycleNodeMixin, BaseNode):
 
     def _entities(self) -> list[tuple[Any, Callable[[Any], Any]]]:
         """Return what the node has created, each with the function that destroys it."""
-        users: list[Any] = [*self.publishers, *self.subscriptions]
-        handlers = {handler for user in users for handler in user.event_handlers}
-        waitables: list[Any] = [each for each in self.waitables if each not in handlers]
+        listening: list[Any] = [*self.publishers, *self.subscriptions]
+        handlers = {handler for entity in listening for handler in entity.event_handlers}
+        of_actions = [each for each in self.waitables if each not in handlers]
         return [
-            *((entity, self.destroy_publisher) for entity in self.publishers),
-            *((entity, self.destroy_subscription) for entity in self.subscriptions),
-            *((entity, self.destroy_client) for entity in self.clients),
-            *((entity, self.destroy_service) for entity in self.services),
-            *((entity, self.destroy_timer) for entity in self.timers),
-            *((entity, self.destroy_guard_condition) for entity in self.guards),
-            *((action_server, type(action_server).destroy) for action_server in waitables),
+            (entity, destroy)
+            for entities, destroy in (
+                (self.publishers, self.destroy_publisher),
+                (self.subscriptions, self.destroy_subscription),
+                (self.clients, self.destroy_client),
+                (self.services, self.destroy_service),
+                (self.timers, self.destroy_timer),
+                (self.guards, self.destroy_guard_condition),
+                (of_actions, lambda server: server.destroy()),
+            )
+            for entity in entities
         ]

@@ -32,7 +32,7 @@ from ddqn_planner.nodes.lifecycle import ManagedNode
 from ddqn_planner.nodes.map_source import MapSource
 from ddqn_planner.nodes.model_loading import ModelSource, load
 from ddqn_planner.nodes.nav2_interface import serve_nav2
-from ddqn_planner.nodes.planner_parameters import PARAMETERS
+from ddqn_planner.nodes.parameters import PLANNER_PARAMETERS
 from ddqn_planner.nodes.poses import Frames, StartSource, check_source
 from ddqn_planner.nodes.report import (
     NOT_ACTIVE,
@@ -59,7 +59,7 @@ class PlannerNode(ManagedNode):
     """
 
     def __init__(self) -> None:
-        super().__init__("planner", PARAMETERS)
+        super().__init__("planner", PLANNER_PARAMETERS)
         self._settings = self.settings()
         self._report = Report(self)
         self._worker, self._map_worker = Worker(self), Worker(self)
@@ -362,7 +362,7 @@ def main() -> int:
     with suppress(AttributeError):  # another C library
         for option in (-1, -3):  # M_TRIM_THRESHOLD, M_MMAP_THRESHOLD
             ctypes.CDLL(None).mallopt(option, 2**24)
-    return spin_until_shutdown(PlannerNode, PARAMETERS)
+    return spin_until_shutdown(PlannerNode, PLANNER_PARAMETERS)
 
 
 if __name__ == "__main__":

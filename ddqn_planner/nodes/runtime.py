@@ -1,4 +1,4 @@
-"""What the nodes share: latched topics, parameters, worker threads, ``--help``, the shutdown."""
+"""What the nodes share: parameters, services, the background worker, ``--help``, the shutdown."""
 
 from __future__ import annotations
 
@@ -24,15 +24,20 @@ from rcl_interfaces.msg import (
     ParameterDescriptor,
     SetParametersResult,
 )
+from rcl_interfaces.msg import Parameter as ParameterMessage
 from rcl_interfaces.srv import SetParameters, SetParametersAtomically
 from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
-from rclpy.exceptions import InvalidHandle, NameValidationException, ParameterException
+from rclpy.exceptions import (
+    InvalidHandle,
+    NameValidationException,
+    ParameterException,
+    ParameterNotDeclaredException,
+)
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.logging import get_logger
 from rclpy.node import Node
 from rclpy.parameter import Parameter
-from rclpy.parameter_service import ParameterService
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.service import Service
 from rclpy.signals import SignalHandlerOptions
@@ -108,14 +113,11 @@ Parameters = Mapping[str, Declared]
 class BaseNode(ListeningNode):
     """Node with checked parameters, whose services lose no request and survive malformed ones.
 
-    Raises
-    ------
-    ParameterException
-        If the node was started with invalid parameters.
+    A ParameterException if it was started with invalid parameters.
     """
 
     def __init__(self, name: str, parameters: Parameters) -> None:
-        super().__init__(name, start_parameter_services=False)
+        super().__init__(name)
         self._declared = parameters
         for parameter, declared in parameters.items():
             self.declare_parameter(parameter, declared.default, declared.descriptor())
@@ -123,7 +125,8 @@ class BaseNode(ListeningNode):
         if not result.successful:
             raise ParameterException("a parameter is invalid", result.reason)
         self.add_on_set_parameters_callback(self._check)
-        self._parameter_services = _CheckedParameterService(self)
+        for service_type in (SetParameters, SetParametersAtomically):
+            self.answer_with(service_type, self._on_set_parameters)
 
     def _check(self, parameters: list[Parameter]) -> SetParametersResult:
         try:
@@ -145,6 +148,32 @@ class BaseNode(ListeningNode):
     def settings(self) -> SimpleNamespace:
         """Return the values that all parameters have now."""
         return SimpleNamespace(**{name: self.value(name) for name in self._declared})
+
+    def _on_set_parameters(self, request: Any, response: Any) -> Any:
+        """Set parameters one by one, or together; rclpy's own answer to bad ones ends the node."""
+        if isinstance(response, SetParameters.Response):
+            response.results = [self._set([parameter]) for parameter in request.parameters]
+        else:
+            response.result = self._set(request.parameters)
+        return response
+
+    def _set(self, messages: list[ParameterMessage]) -> SetParametersResult:
+        reason = "a parameter has no name; give one"
+        try:
+            if all(message.name for message in messages):
+                return self.set_parameters_atomically(
+                    [*map(Parameter.from_parameter_msg, messages)]
+                )
+        except ParameterNotDeclaredException as error:
+            reason = str(error)
+        except ValueError as error:
+            reason = f"{error}; give one of rcl_interfaces/msg/ParameterType"
+        return SetParametersResult(successful=False, reason=reason)
+
+    def answer_with(self, service_type: Any, callback: Callable[..., Any]) -> None:
+        """Answer the service of a type, which rclpy has created, with another callback."""
+        (service,) = [each for each in self.services if each.srv_type is service_type]
+        service.callback = callback
 
     def create_service(self, *arguments: Any, **options: Any) -> Service:
         """Create a service with the queue of `SERVICE_QUALITY`."""
@@ -176,43 +205,11 @@ class BaseNode(ListeningNode):
         return array
 
 
-class _CheckedParameterService(ParameterService):
-    """Refuses a value of an unknown type, which ends rclpy's own, and a parameter without a name.
-
-    rclpy takes the empty name for declared.
-    """
-
-    def _set_parameters_callback(
-        self, request: SetParameters.Request, response: SetParameters.Response
-    ) -> SetParameters.Response:
-        for parameter in request.parameters:
-            one = SetParametersAtomically.Request(parameters=[parameter])
-            answer = SetParametersAtomically.Response()
-            response.results.append(self._set_parameters_atomically_callback(one, answer).result)
-        return response
-
-    def _set_parameters_atomically_callback(
-        self, request: SetParametersAtomically.Request, response: SetParametersAtomically.Response
-    ) -> SetParametersAtomically.Response:
-        reason = "a parameter has no name; give one"
-        try:
-            if all(parameter.name for parameter in request.parameters):
-                return super()._set_parameters_atomically_callback(request, response)
-        except ValueError as error:
-            reason = f"{error}; give one of rcl_interfaces/msg/ParameterType"
-        response.result = SetParametersResult(successful=False, reason=reason)
-        return response
-
-
 class Worker:
     """Calls functions one after the other in a thread, and wakes the node's executor after each.
 
-    The process ends without waiting for a call that is under way.
-
-    Parameters
-    ----------
-    node : Node
-        The thread touches nothing else of it.
+    The thread touches nothing else of the node. The process ends without waiting for a call that is
+    under way.
     """
 
     def __init__(self, node: Node) -> None:
@@ -240,11 +237,6 @@ class Worker:
         self._calls.put(work)
         return future
 
-    def close(self) -> None:
-        """Wait until all calls have ended; take no more."""
-        self._calls.put(None)
-        self._thread.join()
-
     async def run(self, function: Callable[..., Any], *arguments: object) -> Any:
         """Return the result of a call, which is left out if the caller gives it up before."""
         future = self.call(function, *arguments)
@@ -252,6 +244,11 @@ class Worker:
             return await future
         finally:
             future.cancel()
+
+    def close(self) -> None:
+        """Wait until all calls have ended; take no more."""
+        self._calls.put(None)
+        self._thread.join()
 
 
 def _make_calls(calls: queue.SimpleQueue[Callable[[], None] | None]) -> None:
@@ -322,12 +319,10 @@ def spin_until_shutdown(make_node: Callable[[], Node], parameters: Parameters | 
         executor.add_node(node)
         while not stopping.is_set():
             executor.spin_once()
-    except (NameValidationException, ParameterException) as error:
-        return _cannot_start(error)
-    except RuntimeError as error:
-        if node is not None:
+    except (NameValidationException, ParameterException, RuntimeError) as error:
+        if node is not None and isinstance(error, RuntimeError):
             raise
-        return _cannot_start(error)  # what ROS itself raises
+        return _cannot_start(error)  # what ROS itself raises is a RuntimeError
     finally:
         if node is not None:
             node.destroy_node()

@@ -34,20 +34,17 @@ from ddqn_planner.nodes.conversions import (
     quaternion,
 )
 from ddqn_planner.nodes.driving import Driving
+from ddqn_planner.nodes.parameters import HYPER_PARAMETERS, OF_MAPS, TRAINER_PARAMETERS
 from ddqn_planner.nodes.poses import MapInFrame, check_source
 from ddqn_planner.nodes.replay import Replay
 from ddqn_planner.nodes.report import Refusals
 from ddqn_planner.nodes.runtime import LATCHED, STEADY, BaseNode, Worker, spin_until_shutdown
-from ddqn_planner.nodes.trainer_parameters import HYPER_PARAMETERS, PARAMETERS
 from ddqn_planner.resources import find_map
 from ddqn_planner.training.hyper_parameters import HyperParameters
 
 if TYPE_CHECKING:
     from ddqn_planner.training.episodes import Episode
     from ddqn_planner.training.run import TrainingRun
-
-
-MAP_PARAMETERS = ("occupied_threshold", "allow_unknown")
 
 
 class TrainerNode(BaseNode):
@@ -61,7 +58,7 @@ class TrainerNode(BaseNode):
     """
 
     def __init__(self) -> None:
-        super().__init__("trainer", PARAMETERS)
+        super().__init__("trainer", TRAINER_PARAMETERS)
         self._map: MapInFrame | None = None
         self._poses: dict[str, PoseStamped] = {}
         self._run: TrainingRun | None = None
@@ -115,7 +112,7 @@ class TrainerNode(BaseNode):
             map_file = read_map_file(find_map(name))
         except (ValueError, OSError) as error:
             raise InvalidParameterValueException("map_file", name, str(error)) from None
-        grid = map_file.grid(*map(self.value, MAP_PARAMETERS))
+        grid = map_file.grid(*map(self.value, OF_MAPS))
         self._map = MapInFrame(grid, "map")
         for which, cell in (("start", map_file.start), ("goal", map_file.goal)):
             if cell is not None:
@@ -126,7 +123,7 @@ class TrainerNode(BaseNode):
 
     def _on_map(self, message: OccupancyGrid) -> None:
         try:
-            grid = grid_from_message(message, *map(self.value, MAP_PARAMETERS))
+            grid = grid_from_message(message, *map(self.value, OF_MAPS))
         except ValueError as error:
             self._refusals.refuse("map", str(error))
             return
@@ -353,7 +350,7 @@ def _with_remedy(error: Exception) -> str:
 
 def main() -> int:
     """Run the trainer node until SIGINT or SIGTERM."""
-    return spin_until_shutdown(TrainerNode, PARAMETERS)
+    return spin_until_shutdown(TrainerNode, TRAINER_PARAMETERS)
 
 
 if __name__ == "__main__":

@@ -7,7 +7,7 @@ from typing import Final
 import numpy as np
 
 from ddqn_planner.grid import GridMap, MoveRule
-from ddqn_planner.grid.generators import random_costs, random_requests, unknown_costs
+from ddqn_planner.grid.noise import random_costs, random_requests, unknown_costs
 from ddqn_planner.training.environment import Scenario
 from ddqn_planner.training.hyper_parameters import HyperParameters
 
@@ -46,7 +46,7 @@ def random_scenarios(seed: int, maps: int = MAPS) -> list[Scenario]:
     """Draw the maps to train on. The same seed gives the same maps.
 
     10 to 60 % of the cells are occupied, each independently: of the map types in
-    `ddqn_planner.grid.generators`, training uses only this one. The high fill rates show 3x3
+    `experiments/random_maps.py`, training uses only this one. The high fill rates show 3x3
     patches that are rare otherwise. Each move rule has half of the maps. A quarter of the maps has
     no costs, a quarter random costs, a quarter one constant cost, a quarter unknown cells. A path
     connects each start with its goal.

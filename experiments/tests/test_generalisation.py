@@ -31,19 +31,18 @@ from generalisation import (
 from hypothesis import given
 from hypothesis import strategies as st
 from networks import random_network
+from random_maps import KINDS
 
 from ddqn_planner.grid import (
     MOVES,
     Cell,
     GridMap,
     MoveRule,
-    connected_cells,
     legal_moves,
     move_costs,
     save_map,
     shortest_distances,
 )
-from ddqn_planner.grid.generators import KINDS
 from ddqn_planner.model import ModelMetadata, QNetwork
 from ddqn_planner.model.model_file import save_model
 from ddqn_planner.planning import Planner
@@ -223,7 +222,7 @@ def test_a_path_joins_start_and_goal_of_each_drawn_request_and_few_goals_are_dra
     assert len({goal for _, goal in drawn.requests}) <= GOALS
     for start, goal in drawn.requests:
         assert start != goal
-        assert connected_cells(drawn.grid.occupancy, goal, rule)[start[1], start[0]]
+        assert drawn.grid.reachable([goal], rule)[start[1], start[0]]
 
 
 @pytest.mark.parametrize("costs", COSTS)
@@ -354,7 +353,7 @@ def test_mpd_maps_keep_their_goal_and_give_the_optimum_under_their_rule(
         assert len(benchmark_map.requests) == 4
         for start, goal in benchmark_map.requests:
             assert goal == (4, 2) != start
-            assert connected_cells(occupancy, goal, rule)[start[1], start[0]]
+            assert GridMap(occupancy).reachable([goal], rule)[start[1], start[0]]
         assert (benchmark_map.optima is not None) == (rule is MoveRule.UNIT)
     rollouts = rollouts_of(PerfectNetwork(), *read, rule=rule)
     agrees = "the oracle agrees with 12/12" in markdown(rollouts, "")

@@ -90,7 +90,7 @@ def test_a_patch_of_a_costmap_is_read_as_the_whole_costmap(
 
 @pytest.mark.parametrize("values", [[[0.5]], [[128]], [["a"]], [[None]]])
 def test_values_of_no_costmap_are_refused(values: object) -> None:
-    with pytest.raises(ValueError, match="costmap values"):
+    with pytest.raises(ValueError, match="occupancy values"):
         grid_from_costmap(values)  # type: ignore[arg-type]
 
 

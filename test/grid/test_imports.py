@@ -5,7 +5,7 @@ import sys
 
 PROGRAM = """
 import sys
-from ddqn_planner.grid import generators, inflate, legal_moves, load_map, move_costs
+from ddqn_planner.grid import inflate, legal_moves, load_map, move_costs
 from ddqn_planner.resources import find_map
 grid = load_map(find_map("dilemma"))
 inflate(grid, 0.0)

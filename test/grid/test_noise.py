@@ -1,57 +1,46 @@
 from __future__ import annotations
 
-import itertools
+from collections import Counter
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from strategies import occupancies
 
 from ddqn_planner.grid import (
+    UNKNOWN,
     GridMap,
     MoveRule,
     Noise,
-    connected_cells,
+    legal_moves,
     scatter_obstacles,
     shortest_path,
 )
+from ddqn_planner.grid.noise import random_costs, random_requests, unknown_costs
 from ddqn_planner.training.environment import Scenario
 
 
 @pytest.mark.parametrize("noise", Noise)
-@pytest.mark.parametrize("seed", range(20))
-def test_one_to_five_new_obstacles_lie_near_the_path_and_leave_a_path(
-    paper: Scenario, noise: Noise, seed: int
+def test_one_to_five_new_obstacles_lie_where_the_noise_says_and_leave_a_path(
+    paper: Scenario, noise: Noise
 ) -> None:
     grid, rule = paper.grid, MoveRule.CORNER_CUTTING
     path = shortest_path(grid, paper.start, paper.goal, rule)
-    noisy, rejected = scatter_obstacles(grid, path, rule, np.random.default_rng(seed), noise)
-    new = np.argwhere(noisy.occupancy & ~grid.occupancy)
-    assert 1 <= len(new) <= 5
-    assert not (grid.occupancy & ~noisy.occupancy).any()
-    assert rejected >= 0
-    for y, x in new:
-        distance = min(max(abs(x - px), abs(y - py)) for px, py in path)
-        assert distance <= (0 if noise is Noise.ON_PATH else 1)
-    start_x, start_y = paper.start
-    assert connected_cells(noisy.occupancy, paper.goal, rule)[start_y, start_x]
-
-
-def test_all_counts_of_the_paper_are_drawn(paper: Scenario) -> None:
-    path = shortest_path(paper.grid, paper.start, paper.goal, MoveRule.ROBOT_SAFE)
-    occupied, counts = np.count_nonzero(paper.grid.occupancy), set()
-    for seed in range(60):
-        random = np.random.default_rng(seed)
-        noisy, _ = scatter_obstacles(paper.grid, path, MoveRule.ROBOT_SAFE, random)
-        counts.add(np.count_nonzero(noisy.occupancy) - occupied)
+    counts, distances = set(), set()
+    for seed in range(40):
+        noisy, rejected = scatter_obstacles(grid, path, rule, np.random.default_rng(seed), noise)
+        again, _ = scatter_obstacles(grid, path, rule, np.random.default_rng(seed), noise)
+        assert noisy.fingerprint == again.fingerprint
+        assert rejected >= 0
+        assert not (grid.occupancy & ~noisy.occupancy).any()
+        assert noisy.reachable([paper.goal], rule)[paper.start[::-1]]
+        new = np.argwhere(noisy.occupancy & ~grid.occupancy)
+        counts.add(len(new))
+        for y, x in new:
+            distances.add(min(max(abs(x - px), abs(y - py)) for px, py in path))
     assert counts == {1, 2, 3, 4, 5}
-
-
-def test_the_same_seed_scatters_the_same_obstacles(paper: Scenario) -> None:
-    path = shortest_path(paper.grid, paper.start, paper.goal, MoveRule.ROBOT_SAFE)
-    first, second = (
-        scatter_obstacles(paper.grid, path, MoveRule.ROBOT_SAFE, np.random.default_rng(7))[0]
-        for _ in range(2)
-    )
-    assert first.fingerprint == second.fingerprint
+    assert distances == ({0} if noise is Noise.ON_PATH else {0, 1})
 
 
 def test_a_corridor_that_any_obstacle_closes_is_refused() -> None:
@@ -71,12 +60,45 @@ def test_a_path_with_no_cell_to_occupy_is_refused(noise: str, where: str) -> Non
         )
 
 
-def test_obstacles_may_lie_beside_the_path_only_where_the_noise_says_so(paper: Scenario) -> None:
-    path = shortest_path(paper.grid, paper.start, paper.goal, MoveRule.CORNER_CUTTING)
-    beside = dict.fromkeys(Noise, 0)
-    for noise, seed in itertools.product(Noise, range(10)):
-        random = np.random.default_rng(seed)
-        noisy, _ = scatter_obstacles(paper.grid, path, MoveRule.CORNER_CUTTING, random, noise)
-        new = np.argwhere(noisy.occupancy & ~paper.grid.occupancy)[:, ::-1].tolist()
-        beside[noise] += sum(tuple(cell) not in path for cell in new)
-    assert beside[Noise.ON_PATH] == 0 < beside[Noise.NEAR_PATH]
+@given(occupancies, st.sampled_from(list(MoveRule)), st.integers(0, 2**32 - 1))
+def test_a_path_joins_start_and_goal_of_each_request(
+    occupancy: np.ndarray, rule: MoveRule, seed: int
+) -> None:
+    random = np.random.default_rng(seed)
+    if not legal_moves(occupancy, rule).any():
+        with pytest.raises(ValueError, match="no two free cells"):
+            random_requests(occupancy, rule, 5, random)
+        return
+    requests = random_requests(occupancy, rule, 5, random)
+    assert len(requests) == 5
+    for start, goal in requests:
+        assert start != goal
+        assert GridMap(occupancy).reachable([start], rule)[goal[1], goal[0]]
+
+
+@pytest.mark.parametrize("rule", MoveRule)
+def test_requests_are_uniform_over_the_cells_that_have_a_move(rule: MoveRule) -> None:
+    # Three connected cells, one alone, two connected ones; corner cutting connects the first four.
+    occupancy = np.array(
+        [[0, 0, 0, 1, 1, 1], [1, 1, 1, 0, 1, 1], [1, 1, 1, 1, 1, 0], [1] * 5 + [0]]
+    )
+    cells = {(0, 0), (1, 0), (2, 0), (5, 2), (5, 3)} | ({(3, 1)} if rule.cuts_corners else set())
+    requests = random_requests(occupancy == 1, rule, 12000, np.random.default_rng(0))
+    for counts in map(Counter, zip(*requests, strict=True)):
+        assert counts.keys() == cells
+        for count in counts.values():
+            assert count == pytest.approx(12000 / len(cells), rel=0.1)
+
+
+def test_costs_of_free_cells_are_uniform_or_unknown_in_a_share_of_them() -> None:
+    random = np.random.default_rng(0)
+    occupancy = random.random((200, 200)) < 0.3
+    costs, unknown = random_costs(occupancy, random), unknown_costs(occupancy, 0.2, random)
+    for values in (costs, unknown):
+        assert values.dtype == np.int8
+        assert not values[occupancy].any()
+    counts = np.bincount(costs[~occupancy])
+    assert len(counts) == 100
+    assert counts.min() > 200
+    assert set(np.unique(unknown)) == {UNKNOWN, 0}
+    assert (unknown[~occupancy] == UNKNOWN).mean() == pytest.approx(0.2, abs=0.02)

@@ -1,9 +1,9 @@
 from __future__ import annotations
 
 import numpy as np
+from random_maps import generate_map
 
 from ddqn_planner.grid import OCCUPIED, read_map_file
-from ddqn_planner.grid.generators import generate_map
 from ddqn_planner.resources import find_map
 
 

@@ -26,7 +26,7 @@ from ddqn_planner import Planner
 from ddqn_planner.grid import MOVES, Cell, GridMap, MapFile, read_map_file, save_map
 from ddqn_planner.nodes.conversions import directions_message, occupancy_message
 from ddqn_planner.nodes.map_source import MapSource
-from ddqn_planner.nodes.planner_parameters import PARAMETERS
+from ddqn_planner.nodes.parameters import PLANNER_PARAMETERS
 from ddqn_planner.nodes.report import Report
 from ddqn_planner.nodes.runtime import LATCHED, BaseNode, Worker
 from ddqn_planner.resources import find_map
@@ -117,7 +117,7 @@ def test_each_map_is_planned_on_with_its_own_directions(client: Any, tmp_path: P
 @pytest.fixture(scope="module")
 def node() -> Iterator[BaseNode]:
     rclpy.init(args=[])
-    node = BaseNode("map_source", PARAMETERS)
+    node = BaseNode("map_source", PLANNER_PARAMETERS)
     yield node
     node.destroy_node()
     try_shutdown()
@@ -128,7 +128,9 @@ def source(node: BaseNode) -> Iterator[MapSource]:
     source = MapSource(node, Report(node), Worker(node), lambda _: None)
     yield source
     source.close()
-    defaults = {name: PARAMETERS[name].default for name in ("map_type", "require_directions")}
+    defaults = {
+        name: PLANNER_PARAMETERS[name].default for name in ("map_type", "require_directions")
+    }
     node.set_parameters([Parameter(name, value=value) for name, value in defaults.items()])
 
 

@@ -26,7 +26,6 @@ from std_srvs.srv import Trigger
 from ddqn_planner.grid import (
     MapFile,
     MoveRule,
-    connected_cells,
     read_map_file,
     save_map,
     scatter_obstacles,
@@ -115,7 +114,7 @@ def test_scatter_draws_on_the_loaded_map_and_restore_undoes_it(
         assert (noisy[new] == 100).all()
         assert 1 <= len(new[0]) <= 5
         grid = grid_from_message(message)
-        assert connected_cells(grid.occupancy, GOAL, MoveRule.ROBOT_SAFE)[START[1], START[0]]
+        assert grid.reachable([GOAL], MoveRule.ROBOT_SAFE)[START[1], START[0]]
         named = re.findall(r"\((\S+), (\S+)\)", response.message)
         assert {grid.world_to_cell(float(x), float(y)) for x, y in named} == {
             (x, y) for y, x in zip(*new, strict=True)

@@ -27,7 +27,7 @@ from std_msgs.msg import Header
 from ddqn_planner.grid import GridMap
 from ddqn_planner.nodes.conversions import directions_message, occupancy_message
 from ddqn_planner.nodes.map_source import MapSource, updated_values
-from ddqn_planner.nodes.planner_parameters import PARAMETERS
+from ddqn_planner.nodes.parameters import PLANNER_PARAMETERS
 from ddqn_planner.nodes.report import Report, RequestError
 from ddqn_planner.nodes.runtime import BaseNode, Worker
 
@@ -110,7 +110,7 @@ def test_an_update_is_taken_if_all_its_cells_are_inside_and_have_values(
 @pytest.fixture(scope="module")
 def node() -> Iterator[BaseNode]:
     rclpy.init(args=[])
-    node = BaseNode("map_source", PARAMETERS)
+    node = BaseNode("map_source", PLANNER_PARAMETERS)
     yield node
     node.destroy_node()
     try_shutdown()
@@ -136,7 +136,7 @@ def random_map(random: np.random.Generator, stamp: int) -> OccupancyGrid:
 def test_after_updates_the_map_is_as_if_it_came_whole(
     node: BaseNode, parameters: dict[str, Any]
 ) -> None:
-    defaults = {name: PARAMETERS[name].default for name in parameters}
+    defaults = {name: PLANNER_PARAMETERS[name].default for name in parameters}
     node.set_parameters([Parameter(name, value=value) for name, value in parameters.items()])
     random, heard = np.random.default_rng(0), []
     source, whole = (MapSource(node, Report(node), Worker(node), heard.append) for _ in range(2))
@@ -259,4 +259,4 @@ def test_a_costmap_is_planned_on_for_map_timeout_after_its_last_message(
         assert after(1e6) == ""
     finally:
         for name in ("map_type", "map_timeout", "robot_radius"):
-            set_parameter(name, PARAMETERS[name].default)
+            set_parameter(name, PLANNER_PARAMETERS[name].default)

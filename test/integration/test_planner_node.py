@@ -36,12 +36,13 @@ from integration.robot import (
 )
 from nav_msgs.msg import OccupancyGrid, Path
 from nav_msgs.srv import GetPlan
+from random_maps import generate_map
 from rcl_interfaces.srv import DescribeParameters, ListParameters
 from std_msgs.msg import Header, String
 from std_srvs.srv import Trigger
 
 from ddqn_planner.grid import MoveRule, shortest_distances
-from ddqn_planner.grid.generators import generate_map, random_requests
+from ddqn_planner.grid.noise import random_requests
 from ddqn_planner.nodes.conversions import occupancy_message
 from ddqn_planner.nodes.report import seconds
 from ddqn_planner.nodes.runtime import LATCHED

@@ -493,7 +493,7 @@ def test_the_bound_of_the_kept_fields_holds_from_the_start(
 
 
 COUNT = """
-from ddqn_planner.planning.distance_field import DistanceField
+from ddqn_planner.planning.field import DistanceField
 
 begin = DistanceField.__init__
 

@@ -41,8 +41,8 @@ from ddqn_planner.grid import MOVES, GridMap, MoveRule, legal_moves, read_map_fi
 from ddqn_planner.model import load_model
 from ddqn_planner.nodes import trainer_node
 from ddqn_planner.nodes.conversions import occupancy_message, quaternion
+from ddqn_planner.nodes.parameters import TRAINER_PARAMETERS
 from ddqn_planner.nodes.runtime import LATCHED
-from ddqn_planner.nodes.trainer_parameters import PARAMETERS
 from ddqn_planner.training.environment import Scenario
 from ddqn_planner.training.hyper_parameters import HyperParameters
 from ddqn_planner.training.run import TrainingRun
@@ -56,7 +56,9 @@ NAMESPACE = "/training"
 """Of the trainer that the tests share."""
 
 DEFAULTS = {
-    name: declared.default for name, declared in PARAMETERS.items() if not declared.read_only
+    name: declared.default
+    for name, declared in TRAINER_PARAMETERS.items()
+    if not declared.read_only
 } | {entry.name: entry.default for entry in fields(HyperParameters)}
 
 OFTEN = """

@@ -12,6 +12,7 @@ from safetensors import safe_open
 
 from ddqn_planner import GridMap, MoveRule, PlanStatus
 from ddqn_planner.model import load_model
+from ddqn_planner.planning import Planner
 from ddqn_planner.training.environment import Scenario
 from ddqn_planner.training.episodes import Episode, EpisodeEnd
 from ddqn_planner.training.evaluation import evaluate
@@ -251,7 +252,7 @@ def test_a_saved_model_plans_as_the_trainer_does(small: Scenario, tmp_path: Path
     assert metadata == trainer.planner().metadata
     assert metadata.steps == 300
     expected = trainer.planner().q_field(small.grid, small.goal).q
-    q = network.q_values(small.grid, small.goal, metadata.move_rule)
+    q = Planner(network, metadata).q_field(small.grid, small.goal).q
     assert (q == expected).all()
 
 

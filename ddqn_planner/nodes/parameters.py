@@ -1,15 +1,25 @@
-"""The planner node's parameters, as a user reads of them."""
+"""The parameters of the planner and of the trainer, as a user reads of them."""
 
 from __future__ import annotations
 
+from dataclasses import fields
 from typing import Final
 
 from ddqn_planner.grid import MoveRule
 from ddqn_planner.nodes.runtime import Declared
 from ddqn_planner.planning import PlanMethod
 from ddqn_planner.planning.field_cache import CACHE_BYTES
+from ddqn_planner.training.hyper_parameters import HyperParameters
 
-PARAMETERS: Final = {
+OF_MAPS: Final = {
+    "occupied_threshold": Declared(
+        65, "A cell of this value or more is occupied, percent", (1, 100)
+    ),
+    "allow_unknown": Declared(False, "Whether unknown cells are free"),
+}
+"""How both nodes read a map."""
+
+PLANNER_PARAMETERS: Final = {
     "autostart": Declared(
         True,
         "Whether the node configures and activates itself; else a lifecycle manager does it",
@@ -39,10 +49,7 @@ PARAMETERS: Final = {
     "require_directions": Declared(
         False, "Whether to wait for map_directions even if no node publishes them"
     ),
-    "occupied_threshold": Declared(
-        65, "A cell of this value or more is occupied, percent", (1, 100)
-    ),
-    "allow_unknown": Declared(False, "Whether unknown cells are free"),
+    **OF_MAPS,
     "use_map_costs": Declared(
         False,
         "Whether to use the values of free cells as costs; an unknown cell that is free has the "
@@ -116,4 +123,63 @@ PARAMETERS: Final = {
         "with what trainer/experience_saved names",
         read_only=True,
     ),
+}
+
+HYPER_PARAMETERS: Final = {
+    entry.name: Declared(
+        entry.default,
+        entry.metadata["source"],
+        entry.metadata.get("range") or [*entry.metadata["choices"]],
+    )
+    for entry in fields(HyperParameters)
+}
+
+TRAINER_PARAMETERS: Final = {
+    "learn_from": Declared(
+        "simulation",
+        "Whether to train a model in simulated episodes, or to learn from the robot's drives",
+        ["simulation", "driving"],
+        read_only=True,
+    ),
+    "output_folder": Declared(
+        "runs/trainer",
+        "A folder for the checkpoint, model and curves, or for drives and experience; used by the "
+        "next ~/start",
+        "not empty",
+    ),
+    "map_file": Declared(
+        "",
+        "Map file with start and goal, or a shipped map's name; '' to wait for topics",
+        read_only=True,
+    ),
+    "move_rule": Declared(
+        "corner_cutting",
+        "Which diagonal moves are legal; used by the next ~/start",
+        [rule.value for rule in MoveRule],
+    ),
+    "seed": Declared(0, "Seed of the training", (0, 2**31 - 1)),
+    **OF_MAPS,
+    "episode_interval": Declared(10, "Publish each n-th episode", (1, 10**6)),
+    "replay_period": Declared(0.05, "Seconds per step of ~/replay", (1e-3, 10.0)),
+    "pose_source": Declared(
+        "odometry",
+        "Driving: where the robot is: a topic, odom, or a transform",
+        ["odometry", "tf"],
+        read_only=True,
+    ),
+    "robot_frame": Declared(
+        "base_link", "Driving: the robot's frame, for the pose_source tf", "not empty"
+    ),
+    "nominal_speed": Declared(
+        0.5,
+        "Driving: the robot's speed where nothing slows it down, metres per second; used by the "
+        "next ~/start",
+        (0.01, 100.0),
+    ),
+    "robot_width": Declared(
+        0.5,
+        "Driving: places are squares of half of it, metres; used by the next ~/start",
+        (0.05, 10.0),
+    ),
+    **HYPER_PARAMETERS,
 }

@@ -1,4 +1,4 @@
-"""Random maps of nine kinds and any size, requests on them, and costs of their cells.
+"""Random maps of nine kinds and any size, and costs of their cells.
 
 The documented figures depend on these maps: the same seed must always give the same ones.
 """
@@ -12,9 +12,9 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from ddqn_planner.grid.arguments import UNKNOWN, Cell, Occupancy
+from ddqn_planner.grid.arguments import Occupancy
 from ddqn_planner.grid.body import clearance
-from ddqn_planner.grid.moves import MoveRule, component_labels
+from ddqn_planner.grid.noise import in_free_cells
 
 MINIMUM_SIDE = 5
 """The shortest side of a map: a maze of two corridors between its walls."""
@@ -228,51 +228,13 @@ def generate_map(kind: str, shape: tuple[int, int], random: np.random.Generator)
     return KINDS[kind](shape, random)
 
 
-def random_requests(
-    occupancy: Occupancy, move_rule: MoveRule, count: int, random: np.random.Generator
-) -> list[tuple[Cell, Cell]]:
-    """Draw `count` pairs of start and goal: different free cells that a path joins.
-
-    The start is uniform over the free cells that have a legal move, the goal is uniform over the
-    other cells that the robot can reach from there. Pairs may repeat. A map where no path joins two
-    free cells is a ValueError.
-    """
-    cells = np.flatnonzero(~occupancy)
-    label_of_cell = component_labels(occupancy, move_rule).ravel()[cells]
-    order = np.argsort(label_of_cell, kind="stable")
-    cells, label_of_cell = cells[order], label_of_cell[order]
-    sizes = np.bincount(label_of_cell)
-    first_of_label = np.cumsum(sizes) - sizes
-    candidates = np.flatnonzero(sizes[label_of_cell] > 1)
-    if not len(candidates):
-        raise ValueError("no two free cells of the map are joined; give a map with a path")
-    starts = random.choice(candidates, count)
-    first, size = first_of_label[label_of_cell[starts]], sizes[label_of_cell[starts]]
-    # The goal is 1 to size - 1 cells further in the list of the component, which is a ring.
-    goals = first + (starts - first + random.integers(1, size)) % size
-    y, x = np.divmod(cells[np.stack([starts, goals], axis=1)], occupancy.shape[1])
-    return [((sx, sy), (gx, gy)) for (sx, gx), (sy, gy) in zip(x.tolist(), y.tolist(), strict=True)]
-
-
-def random_costs(occupancy: Occupancy, random: np.random.Generator) -> NDArray[np.int8]:
-    """Draw (H, W) costs of free cells, each independent and uniform in 0..99."""
-    return _in_free_cells(occupancy, random.integers(0, 100, occupancy.shape, dtype=np.int8))
-
-
-def unknown_costs(
-    occupancy: Occupancy, share: float, random: np.random.Generator
-) -> NDArray[np.int8]:
-    """Draw (H, W) costs: each free cell is `UNKNOWN` with probability `share`, otherwise 0."""
-    return _in_free_cells(occupancy, np.where(random.random(occupancy.shape) < share, UNKNOWN, 0))
-
-
 def gradient_costs(occupancy: Occupancy, random: np.random.Generator) -> NDArray[np.int8]:
     """Return (H, W) costs that rise linearly over the map in a random direction, from 0 to 99."""
     angle = random.uniform(0, 2 * np.pi)
     y, x = np.ogrid[: occupancy.shape[0], : occupancy.shape[1]]
     distance = np.cos(angle) * x + np.sin(angle) * y
     distance -= distance.min()
-    return _in_free_cells(occupancy, np.rint(99 * distance / max(distance.max(), 1e-9)))
+    return in_free_cells(occupancy, np.rint(99 * distance / max(distance.max(), 1e-9)))
 
 
 def inflated_costs(occupancy: Occupancy, radius: float) -> NDArray[np.int8]:
@@ -284,8 +246,4 @@ def inflated_costs(occupancy: Occupancy, radius: float) -> NDArray[np.int8]:
         raise ValueError(f"radius is {radius}; give cells, finite and > 0")
     distance = np.maximum(clearance(occupancy), 1)  # occupied cells do not matter
     costs = np.where(distance <= radius, np.rint(99 ** (1 - (distance - 1) / radius)), 0)
-    return _in_free_cells(occupancy, costs)
-
-
-def _in_free_cells(occupancy: Occupancy, costs: NDArray[Any]) -> NDArray[np.int8]:
-    return np.where(occupancy, 0, costs).astype(np.int8)
+    return in_free_cells(occupancy, costs)

@@ -1,1 +1,0 @@
-"""The commands of ``ddqn-planner``: each module has ``add_options`` and ``run``."""
