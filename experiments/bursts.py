@@ -15,7 +15,7 @@ from rclpy.action.client import ActionClient
 from rclpy.task import Future
 
 from ddqn_planner.grid import Cell, GridMap
-from ddqn_planner.nodes.nav2_interface import QUEUES
+from ddqn_planner.nodes.nav2 import QUEUES
 from ddqn_planner.nodes.runtime import LATCHED
 
 SIZES, COUNTS, CLIENTS, BURSTS = (20, 400, 2000), (20, 50, 200), (1, 20), 30
