@@ -252,6 +252,20 @@ def _still_open(
 
 
 @compiled
+def _least(
+    distance: Any, state: Any, patch: Any, table: Any, value: Any, terms: Any, width: int, cell: int
+) -> float:
+    """Return the least cost of a path from a cell through those around it that are not marked."""
+    least = np.inf
+    for action in range(8):
+        after = cell + MOVE_Y[action] * width + MOVE_X[action]
+        if distance[after] > 0 and not state[after] & MARKED:
+            cost = cost_of(patch, table, value, terms, width, cell, action)
+            least = min(least, distance[after] + cost)
+    return least
+
+
+@compiled
 def take_back(
     distance: Distances, state: States, costs: MoveCosts, changed: Cells, limit: int
 ) -> tuple[Cells, bool]:
@@ -273,13 +287,7 @@ def take_back(
         known, cell = heapq.heappop(waiting)
         if state[cell] & MARKED:
             continue
-        supported = False
-        for action in range(8):
-            after = cell + offsets[action]
-            if distance[after] > 0 and not state[after] & MARKED:
-                cost = cost_of(patch, table, value, terms, width, cell, action)
-                supported |= distance[after] + cost <= known
-        if supported:
+        if _least(distance, state, patch, table, value, terms, width, cell) <= known:
             continue
         state[cell] |= MARKED
         lost.append(cell)
@@ -299,12 +307,7 @@ def take_back(
     opened = np.empty(len(lost), np.int32)
     number = 0
     for cell in lost:
-        best = np.inf
-        for action in range(8):
-            after = cell + offsets[action]
-            if distance[after] > 0:
-                cost = cost_of(patch, table, value, terms, width, cell, action)
-                best = min(best, distance[after] + cost)
+        best = _least(distance, state, patch, table, value, terms, width, cell)
         if best < np.inf and (distance[cell] == 0 or best < distance[cell]):
             distance[cell], state[cell] = best, OPEN
             opened[number] = cell
