@@ -12,7 +12,7 @@ from ddqn_planner.grid import Cell, GridMap
 from ddqn_planner.grid.arguments import Cells
 from ddqn_planner.nodes.report import Outcome
 from ddqn_planner.planning import PlanRequest, PlanStatus
-from ddqn_planner.planning.path_under_way import rest_of_path
+from ddqn_planner.planning.paths import rest_of_path
 from ddqn_planner.planning.repair import shift_between
 
 SUCCEEDED = PlanStatus.SUCCEEDED.name

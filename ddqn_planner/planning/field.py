@@ -257,8 +257,8 @@ class DistanceField(QField):
         """Return the distance of every cell of the padded map, 0 where there is none: (C,)."""
         if not self.is_whole:
             distance, state, opened, _ = self._take()
-            kernels.grow_whole(distance, state, opened, self.costs)
-            self.known = Known(distance, state, opened[:0])
+            opened, _ = kernels.grow(distance, state, opened, self.costs)
+            self.known = Known(distance, state, opened)
         return self.known.distance
 
     @cached_property

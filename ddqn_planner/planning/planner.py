@@ -17,11 +17,9 @@ from ddqn_planner.grid.grid_map import check_grid
 from ddqn_planner.model import ModelMetadata, QNetwork, load_model
 from ddqn_planner.planning.field import DistanceField, Goals, QField
 from ddqn_planner.planning.field_cache import FieldCache
-from ddqn_planner.planning.path_under_way import keep_or_switch
+from ddqn_planner.planning.paths import can_leave, keep_or_switch, reach, simplify, way_out_and_ends
 from ddqn_planner.planning.plan import Plan, PlanMethod, PlanRequest, PlanStatus, joined
 from ddqn_planner.planning.search import search
-from ddqn_planner.planning.simplification import simplify
-from ddqn_planner.planning.way_out import can_leave, reach, way_out_and_ends
 
 T = TypeVar("T")
 
@@ -199,12 +197,7 @@ class Planner:
         grid, start, move_rule, method, tolerance, simplified, start_clearing_radius
             As for `plan`. The tolerance holds for each goal. A simplified path keeps all goals.
         goals : sequence of (x, y)
-            At least one.
-
-        Returns
-        -------
-        Plan
-            If there is no path to one of the goals, its status tells why, and its goal which.
+            At least one. If one has no path, the plan's status tells why, and its goal which.
 
         Raises
         ------
