@@ -22,7 +22,7 @@ from ddqn_planner.resources import find_map
 
 # A command imports what it needs, and no other command's libraries.
 if TYPE_CHECKING:
-    from ddqn_planner.experience.drive_log import Drive
+    from ddqn_planner.experience.drives import Drive
     from ddqn_planner.grid import Cell, GridMap, MapFile, MoveRule
     from ddqn_planner.planning import Plan
     from ddqn_planner.training.environment import Scenario
@@ -266,11 +266,11 @@ def certify(parser: argparse.ArgumentParser, arguments: Sequence[str]) -> int:
     code is 1 if there is no proof.
     """
     from ddqn_planner.model import load_model
-    from ddqn_planner.model.certificate import NO_CERTIFICATE, certificate_of
+    from ddqn_planner.model.certificate import NO_CERTIFICATE
 
     parser.add_argument("model", nargs="?", default="any_map", help="name or file")
     network, metadata = load_model(parser.parse_args(arguments).model)
-    certificate = certificate_of(network, metadata.move_rule)
+    certificate = network.certificate(metadata.move_rule)
     print(certificate or NO_CERTIFICATE)
     return 0 if certificate and certificate.proved else 1
 
@@ -280,7 +280,7 @@ def learn(parser: argparse.ArgumentParser, arguments: Sequence[str]) -> int:
     import numpy as np
 
     from ddqn_planner.experience import Experience
-    from ddqn_planner.experience.drive_log import EXPERIENCE, LOCK, RECORD
+    from ddqn_planner.experience.drives import EXPERIENCE, LOCK, RECORD
     from ddqn_planner.grid import load_map
 
     add = parser.add_argument
@@ -308,8 +308,7 @@ def learn(parser: argparse.ArgumentParser, arguments: Sequence[str]) -> int:
             stack.enter_context(claim(source, [LOCK, RECORD], "drives", "records"))
         drives = _read_drives(source, options)
         for drive in drives:
-            experience.apply(grid)  # so that the time is compared with the expected one
-            drive.teach(experience)
+            drive.teach(experience, grid)
         if not drives:
             raise ValueError(f"{source} holds no drive; drive on")
         out = options.out or (source if source.is_dir() else source.parent) / EXPERIENCE
@@ -328,7 +327,7 @@ def learn(parser: argparse.ArgumentParser, arguments: Sequence[str]) -> int:
 
 def _read_drives(source: Path, options: argparse.Namespace) -> list[Drive]:
     """Return the drives of a folder or a file."""
-    from ddqn_planner.experience.drive_log import RECORD, read_drives
+    from ddqn_planner.experience.drives import RECORD, read_drives
     from ddqn_planner.experience.recordings import drives_of, read_csv, read_mcap
 
     if source.is_dir():

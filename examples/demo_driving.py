@@ -31,7 +31,7 @@ from nav_msgs.msg import OccupancyGrid, Odometry, Path
 from numpy.typing import NDArray
 from PIL import Image
 
-from ddqn_planner.experience.drive_recorder import ARRIVAL_DISTANCE
+from ddqn_planner.experience.drives import ARRIVAL_DISTANCE
 from ddqn_planner.grid import Cell, GridMap, MoveRule, save_map
 from ddqn_planner.nodes.driving import SLOWEST
 from ddqn_planner.nodes.runtime import LATCHED

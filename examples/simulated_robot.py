@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from rclpy.node import Node
 from std_msgs.msg import Header
 
-from ddqn_planner.experience.drive_recorder import ARRIVAL_DISTANCE
+from ddqn_planner.experience.drives import ARRIVAL_DISTANCE
 from ddqn_planner.nodes.conversions import quaternion
 from ddqn_planner.nodes.runtime import LATCHED, STEADY, spin_until_shutdown
 

@@ -17,9 +17,8 @@ from numpy.typing import NDArray
 from random_maps import generate_map, gradient_costs, inflated_costs
 from tqdm import tqdm
 
-from ddqn_planner.grid import Cell, GridMap, MoveRule, connected_cells, read_map_file
+from ddqn_planner.grid import Cell, GridMap, MoveRule, read_map_file
 from ddqn_planner.grid.arguments import Occupancy
-from ddqn_planner.grid.moves import component_labels
 from ddqn_planner.grid.noise import random_costs, random_requests, unknown_costs
 
 INFLATION_RADIUS = 5.0
@@ -130,7 +129,7 @@ def _random_starts(
     occupancy: Occupancy, goal: Cell, move_rule: MoveRule, count: int, random: np.random.Generator
 ) -> list[Cell]:
     """Draw cells, except the goal, from which a path leads to the goal; they may repeat."""
-    connected = connected_cells(occupancy, goal, move_rule)
+    connected = GridMap(occupancy).reachable([goal], move_rule)
     connected[goal[1], goal[0]] = False
     cells = np.argwhere(connected)
     return [(x, y) for y, x in random.choice(cells, count).tolist()] if len(cells) else []
@@ -185,7 +184,7 @@ def _scenario_map(path: Path, scenario: Path, settings: RequestSettings) -> Benc
     """
     random, rule = settings.random(path.stem), settings.move_rule
     grid = settings.grid(read_map_file(path).grid().occupancy, random)
-    labels = component_labels(grid.occupancy, rule)
+    labels = grid.labels(rule)
     lines, bad, decimals = [], [], 0
     for number, line in enumerate(scenario.read_text(errors="replace").splitlines(), start=1):
         if (number == 1 and line.startswith("version")) or not line.strip():

@@ -34,7 +34,7 @@ from processes import claim_ros_domain, cpu_seconds, run_script, running_node
 from random_maps import generate_map
 from std_msgs.msg import Header
 
-from ddqn_planner.grid import Cell, GridMap, clearance, connected_cells
+from ddqn_planner.grid import Cell, GridMap, clearance
 from ddqn_planner.nodes.runtime import LATCHED
 
 try:
@@ -125,7 +125,7 @@ def measure(seconds: float, by_service: bool) -> bool:
     random = np.random.default_rng(0)
     costmap = Costmap(random)
     grid = costmap.grid()
-    free = np.argwhere(connected_cells(grid.occupancy, grid.free_cells()[0], RULE))[:, ::-1]
+    free = np.argwhere(grid.reachable([grid.free_cells()[0]], RULE))[:, ::-1]
     robot: Cell = tuple(free[0].tolist())
     costmap.follow(robot)
     goal = sent_goal = robot

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from random_maps import generate_map
 
 from ddqn_planner.grid import Cell, GridMap, MoveRule
-from ddqn_planner.grid.moves import component_labels, segment_lengths
+from ddqn_planner.grid.moves import segment_lengths
 
 Float64 = NDArray[np.float64]
 
@@ -96,7 +96,7 @@ def slow_zones(grid: GridMap, random: np.random.Generator) -> Float64:
 
 def make_world(grid: GridMap, random: np.random.Generator) -> World:
     """Draw what is slow on a map, and stations; all in its largest part that is connected."""
-    labels = component_labels(grid.occupancy, MoveRule.ROBOT_SAFE)
+    labels = grid.labels(MoveRule.ROBOT_SAFE)
     occupancy = labels != np.bincount(labels[labels > 0]).argmax()
     grid = GridMap(occupancy, grid.resolution, grid.origin)
     free = np.argwhere(~occupancy)

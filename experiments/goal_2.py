@@ -18,8 +18,7 @@ from tables import mean_and_worst, median_and_range, write_table
 from trainings import MOVE_RULE, Training
 
 from ddqn_planner.grid import MOVES, legal_moves
-from ddqn_planner.planning import Planner
-from ddqn_planner.planning.q_field import QField
+from ddqn_planner.planning import Planner, QField
 from ddqn_planner.training.encoders import PropagationEncoder
 from ddqn_planner.training.environment import GridVectorEnvironment, Scenario, paper_scenario
 from ddqn_planner.training.evaluation import length_ratios

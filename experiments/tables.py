@@ -71,3 +71,12 @@ def mean_and_worst(ratios: Sequence[Sequence[float] | NDArray[np.float64]]) -> l
         median_and_range([float(function(of_seed)) for of_seed in some], 4)
         for function in (np.mean, np.max)
     ]
+
+
+def report(figure: str, value: float, unit: str, bound: float, at_most: bool = True) -> bool:
+    """Print a figure beside its bound, unless that is infinite; return whether it is missed."""
+    missed = value > bound if at_most else value < bound
+    sign, verdict = "at most" if at_most else "at least", "MISSED" if missed else "ok"
+    beside = "" if bound == float("inf") else f"{sign:8} {bound:6.1f}  {verdict}"
+    print(f"{figure:62} {value:8.2f} {unit:3} {beside}", flush=True)
+    return missed

@@ -3,7 +3,6 @@
 It needs neither ROS nor torch.
 """
 
-from ddqn_planner.experience.experience import ExpectedTime, Experience
-from ddqn_planner.experience.experience_file import ExperienceFileError
+from ddqn_planner.experience.experience import ExpectedTime, Experience, ExperienceFileError
 
 __all__ = ["ExpectedTime", "Experience", "ExperienceFileError"]

@@ -1,151 +1,297 @@
-"""From the poses of a drive to the time that each place took, without what cannot be true."""
+"""A robot's drives: from its poses, in their record, and in a folder that learns from them."""
 
 from __future__ import annotations
 
 import math
-from itertools import pairwise
-from typing import NamedTuple
+import os
+import re
+from collections.abc import Callable, Iterator
+from contextlib import closing
+from dataclasses import dataclass
+from enum import Enum
+from pathlib import Path
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
-from ddqn_planner.grid.arguments import numbers
+from ddqn_planner.experience.experience import Experience
+from ddqn_planner.files import Appender, WorkFolder
+from ddqn_planner.grid import GridMap
 
 Float64 = NDArray[np.float64]
+Sample = tuple[float, float, float]
+"""Seconds, and x and y in metres in the frame of the map."""
 
-CORRECTION = 0.25
-"""Metres by which a localisation may move a pose at once: the drive goes on from there."""
+RECORD, EXPERIENCE = "episodes.csv", "experience.npz"
+FORGOTTEN = "experience_forgotten.npz"
+LOCK = "driving.lock"
+"""A folder with this file belongs to a robot's drives."""
 
-RELOCATION = 1.0
-"""A jump by this many metres more puts the robot at a place that is not believed."""
+HEADER = b"episode,outcome,start_time,seconds,metres,samples\r\n"
 
-FARTHEST = 1e7
-"""Metres from the origin of the map; a pose beyond is not believed."""
+NUMBER = rb"-?\d{1,18}(?:\.\d{1,9})?"
+ROW = re.compile(rb"(\d{1,18}),([a-z_]{1,20}),(%b),%b,%b,((?:%b:%b:%b ?)+)\r\n" % ((NUMBER,) * 6))
+"""A complete row."""
 
-LATEST = 1e12
-"""Seconds of a clock, in the same way."""
+FARTHEST = 1e12  # metres, and seconds: a pose beyond is none
 
-MEMORY = 60.0
-"""Seconds over which a robot whose pose is not believed counts as driving on, at most."""
+SAMPLE_DISTANCE, SAMPLE_PERIOD = 0.05, 0.5  # from the last kept pose, metres or seconds
+STAND_DISTANCE = 0.1  # metres: a robot that stays within stands, as localisation is not exact
+STAND_PERIOD = 2.0  # seconds after which a robot that stands at its goal has arrived
+ARRIVAL_DISTANCE = 0.5  # metres from the goal
+PAUSE = 120.0  # seconds: a robot that stands for longer waits for no door and no crowd
+SHORTEST = 0.5  # metres: a robot that went no farther away has not driven
+MOST_SAMPLES = 2000  # a drive is cut there, so that the robot learns while it drives for hours
+JUMP = 1.0  # seconds back by which a clock begins anew: a bag loops, a simulator is reset
+
+WINDOW, STEP = 0.5, 0.25
+"""A drive's length joins mean positions of so many seconds that are so many metres apart."""
 
 
-class Visits(NamedTuple):
-    """The places of a drive, one after the other.
+class DriveEnd(str, Enum):
+    """How a drive ended."""
 
-    Parameters
-    ----------
-    position : (V, 2) float64
-        The middle of each place, metres.
-    seconds, metres : (V,) float64
-        The time that the robot took there, and the distance that it made.
-    """
+    ARRIVED = "arrived"
+    NEW_GOAL = "new_goal"
+    PAUSED = "paused"
+    ABORTED = "aborted"
+    CUT = "cut"
+    """It had so many samples that the next drive goes on from there."""
+    STOPPED = "stopped"
+    """The recording ended, or its clock jumped back."""
 
-    position: Float64
+
+@dataclass(frozen=True, eq=False)
+class Drive:
+    """A drive that has ended, the first one with number 1."""
+
+    number: int
+    outcome: DriveEnd
     seconds: Float64
-    metres: Float64
+    """(N,): the time of each sample."""
+    positions: Float64
+    """(N, 2): in metres, in the frame of the map."""
 
+    @property
+    def metres(self) -> float:
+        """How far the robot drove; noise of its poses counts as little as standing does."""
+        window = np.floor((self.seconds - self.seconds[0]) / WINDOW)
+        begins = np.flatnonzero(np.append(True, np.diff(window) != 0))
+        counts = np.diff(begins, append=len(window))[:, None]
+        means = (np.add.reduceat(self.positions, begins) / counts).tolist()
+        total, at = 0.0, self.positions[0].tolist()
+        for mean in means:
+            if math.dist(at, mean) >= STEP:
+                total, at = total + math.dist(at, mean), mean
+        return total + math.dist(at, self.positions[-1].tolist())
 
-def visits_of(
-    seconds: ArrayLike, positions: ArrayLike, side: float, max_speed: float, max_pause: float
-) -> Visits:
-    """Divide a drive into places, squares of the world.
+    def teach(self, experience: Experience, grid: GridMap | None = None) -> None:
+        """Let experience learn from it; where the robot gave up, moves fail.
 
-    The drive is followed in steps of half a square. So noise of the pose and the rate of the
-    samples hardly matter, and waiting counts as time. Not believed are poses that are not finite,
-    clocks that go back, places that take longer than `max_pause`, and moves that are faster than
-    `max_speed`. A pose that jumps far is not believed until it jumps back to where the robot can
-    be.
+        With a map, its time is compared with the expected one, which tells how sure that is.
+        """
+        if grid is not None:
+            experience.apply(grid)
+        experience.record(self.seconds, self.positions)
+        if self.outcome is DriveEnd.ABORTED:
+            experience.record_failure(self.positions[-1])
 
-    Parameters
-    ----------
-    seconds : (N,) array
-    positions : (N, 2) array
-        In metres.
-    side : float
-        Of a square, metres.
-    max_speed : float
-        Metres per second.
-    max_pause : float
-        Seconds.
-
-    Raises
-    ------
-    ValueError
-        If the shapes or types are wrong.
-    """
-    time = numbers("seconds", seconds).astype(np.float64)
-    position = numbers("positions", positions).astype(np.float64)
-    if time.ndim != 1 or position.shape != (len(time), 2):
-        raise ValueError(
-            f"seconds have shape {time.shape} and positions {position.shape}; give (N,) and (N, 2)"
+    def row(self) -> bytes:
+        """Return its row of ``episodes.csv``."""
+        start = self.seconds[0]
+        elapsed = self.seconds - start
+        samples = " ".join(
+            f"{t:.3f}:{x:.3f}:{y:.3f}"
+            for t, (x, y) in zip(elapsed.tolist(), self.positions.tolist(), strict=True)
         )
-    # Comparisons with NaN are false.
-    possible = (np.abs(time) < LATEST) & (np.abs(position) < FARTHEST).all(axis=1)
-    time, position = time[possible], position[possible]
-    fresh = np.diff(time, prepend=np.nan) != 0  # a repeated time adds nothing
-    time, position = time[fresh], position[fresh]
-    rows: list[tuple[float, ...]] = []
-    step = side / 2
-    for first, end in _believed_parts(time, position, max_speed, max_pause):
-        rows += _steps(time[first:end].tolist(), position[first:end].tolist(), step)
-    array = np.array(rows).reshape(-1, 6)
-    array = array[(array[:, 4] <= max_pause) & (array[:, 5] <= max_speed * array[:, 4])]
-    # Where samples are rare, one step passes several places.
-    count = np.maximum(np.rint(array[:, 5] / step), 1).astype(np.int64)
-    number = np.arange(count.sum()) - np.repeat(np.cumsum(count) - count, count)
-    array = np.repeat(array, count, axis=0)
-    count = np.repeat(count, count)
-    share = ((number + 0.5) / count)[:, None]
-    middle = array[:, 0:2] * (1 - share) + array[:, 2:4] * share
-    if not len(middle):
-        return Visits(middle, array[:, 4], array[:, 5])
-    square = np.floor(middle / side)
-    begins = np.flatnonzero(np.append(True, (np.diff(square, axis=0) != 0).any(axis=1)))
-    metres = array[:, 5] / count
-    sums = np.column_stack([middle * metres[:, None], array[:, 4] / count, metres])
-    sums = np.add.reduceat(sums, begins)
-    return Visits(sums[:, :2] / sums[:, 3:], sums[:, 2], sums[:, 3])
+        numbers = f"{start:.3f},{elapsed[-1]:.3f},{self.metres:.3f}"
+        return f"{self.number},{self.outcome.value},{numbers},{samples}\r\n".encode()
 
 
-def _believed_parts(
-    time: Float64, position: Float64, max_speed: float, max_pause: float
-) -> list[tuple[int, int]]:
-    """Return the first sample and the end of each part of a drive without jumps."""
-    elapsed = np.diff(time)
-    distance = np.hypot(*np.diff(position, axis=0).T)
-    reach = max_speed * np.maximum(elapsed, 0) + CORRECTION
-    broken = (elapsed <= 0) | (elapsed > max_pause) | (distance > reach)
-    edges = [0, *(np.flatnonzero(broken) + 1).tolist(), len(time)]
-    parts: list[tuple[int, int]] = []
-    lost_at: int | None = None
-    farthest = np.minimum(reach, MEMORY * max_speed) + RELOCATION
-    for first, end in pairwise(edges):
-        if first and distance[first - 1] > farthest[first - 1]:
-            if lost_at is None:
-                lost_at = first - 1
-            else:
-                elapsed_since = np.clip(time[first] - time[lost_at], 0, MEMORY)
-                apart = math.dist(position[first], position[lost_at])
-                lost_at = None if apart <= max_speed * elapsed_since + RELOCATION else lost_at
-        if lost_at is None and end - first > 1:
-            parts.append((first, end))
-    return parts
+def read_drives(path: str | Path) -> Iterator[Drive]:
+    """Yield the drives of an ``episodes.csv`` in its complete rows; an OSError if it has none."""
+    ends = {end.value.encode(): end for end in DriveEnd}
+    with Path(path).open("rb") as file:
+        for row in map(ROW.fullmatch, file):
+            if row and row[2] in ends:
+                text = [sample.split(b":") for sample in row[4].split()]
+                samples = np.array(text, dtype=np.float64)
+                if np.abs(samples).max() <= FARTHEST:
+                    seconds = samples[:, 0] + float(row[3])
+                    yield Drive(int(row[1]), ends[row[2]], seconds, samples[:, 1:])
 
 
-def _steps(
-    time: list[float], position: list[list[float]], step: float
-) -> list[tuple[float, float, float, float, float, float]]:
-    """Return x and y before and after each step, its seconds and its metres.
+class DriveRecorder:
+    """Divides the poses of a robot into drives, and calls `on_drive` with each: end, times, places.
 
-    How long the robot stands before it drives off says nothing about the place.
+    A drive begins when the robot drives off. It ends when the robot stands at its goal, stands for
+    a long time, gets another goal, or gave up, and when the clock jumps back.
     """
-    away = (index for index, at in enumerate(position) if math.dist(at, position[0]) >= step / 4)
-    start = max(next(away, len(time)) - 1, 0)
-    began, (from_x, from_y) = time[start], position[start]
-    steps = []
-    for now, (x, y) in zip(time[start:], position[start:], strict=True):
-        distance = math.hypot(x - from_x, y - from_y)
-        if distance >= step:
-            steps.append((from_x, from_y, x, y, now - began, distance))
-            began, from_x, from_y = now, x, y
-    return steps
+
+    def __init__(self, on_drive: Callable[[DriveEnd, Float64, Float64], None]) -> None:
+        self._on_drive = on_drive
+        self.goal: tuple[float, float] | None = None
+        self.forget()
+
+    def forget(self) -> None:
+        """Forget the drive that is under way, and where the robot is."""
+        self._samples: list[Sample] = []
+        self._last: Sample | None = None
+        self._stands: Sample | None = None
+
+    @property
+    def position(self) -> tuple[float, float] | None:
+        """Where the robot is, metres."""
+        return self._last[1:] if self._last is not None else None
+
+    def add(self, seconds: float, x: float, y: float) -> None:
+        """Take a pose of the robot, in order; a ValueError if its numbers name no place."""
+        sample = seconds, x, y
+        if not all(abs(value) <= FARTHEST for value in sample):  # NaN fails too
+            raise ValueError(
+                f"the robot is at {(x, y)} at {seconds} s; give finite numbers up to {FARTHEST:g}"
+            )
+        if self._last is not None and seconds < self._last[0] - JUMP:
+            self.end(DriveEnd.STOPPED)
+            self.forget()
+        stands = self._stands
+        if stands is None or math.dist(stands[1:], sample[1:]) > STAND_DISTANCE:
+            if stands is not None and self._last is not None and not self._samples:
+                self._samples.append(self._last)
+            stands = self._stands = sample
+        self._last = sample
+        if not self._samples:
+            return
+        before = self._samples[-1]
+        moved = math.dist(before[1:], sample[1:]) >= SAMPLE_DISTANCE
+        if moved or abs(seconds - before[0]) >= SAMPLE_PERIOD:
+            self._samples.append(sample)
+        stood = abs(seconds - stands[0])
+        if stood >= STAND_PERIOD and self._is_at_goal:
+            self.end(DriveEnd.ARRIVED)
+        elif stood >= PAUSE:
+            self.end(DriveEnd.PAUSED)
+        elif len(self._samples) >= MOST_SAMPLES:
+            self.end(DriveEnd.CUT)
+            self._samples.append(sample)
+
+    @property
+    def _is_at_goal(self) -> bool:
+        if self.goal is None or self.position is None:
+            return False
+        return math.dist(self.goal, self.position) <= ARRIVAL_DISTANCE
+
+    def set_goal(self, x: float, y: float) -> None:
+        """Take a new goal; the same one again changes nothing."""
+        if (x, y) != self.goal:
+            self.end(DriveEnd.ARRIVED if self._is_at_goal else DriveEnd.NEW_GOAL)
+            self.goal = x, y
+
+    def abort(self) -> None:
+        """End the drive because the robot gave up, also where it could not even begin."""
+        if not self._samples and self._last is not None:
+            self._samples.append(self._last)
+        self.end(DriveEnd.ABORTED)
+
+    def end(self, outcome: DriveEnd) -> None:
+        """End the drive, if there is one; the robot has to drive off again."""
+        samples, self._samples = np.array(self._samples), []
+        self._stands = self._last
+        if len(samples) == 0:
+            return
+        extent = np.hypot(*(samples[:, 1:] - samples[0, 1:]).T).max()
+        if extent >= SHORTEST or outcome is DriveEnd.ABORTED:
+            self._on_drive(outcome, samples[:, 0], samples[:, 1:])
+
+
+class DriveFolder:
+    """Records a robot's drives in a folder, and keeps there what they teach.
+
+    The folder holds ``episodes.csv``, ``experience.npz``, and ``driving.lock``, which keeps other
+    processes out until `close` or the end of the process. It must be new or empty, or belong to
+    drives, or a FolderError says so. Without ``experience.npz``, experience is learned anew from
+    ``episodes.csv``; an ExperienceFileError if it cannot be read, a ValueError if it has another
+    nominal speed or robot's width.
+    """
+
+    def __init__(self, folder: str | Path, nominal_speed: float, robot_width: float) -> None:
+        self.folder = Path(folder)
+        self.record_path, self.experience_path = self.folder / RECORD, self.folder / EXPERIENCE
+        self.experience = Experience(nominal_speed, robot_width)
+        after = "the recording continues, and saving is tried again"
+        self._work = WorkFolder(self.folder, [LOCK], "drives", "records", after)
+        with self._work.opening() as files:
+            self.drives = _cut_incomplete_row(self.record_path)
+            """The number of the last drive."""
+            if self.experience_path.exists():
+                saved = Experience.load(self.experience_path)
+                _check_same(saved, self.experience, self.folder)
+                self.experience = saved
+            elif self.drives:
+                for drive in read_drives(self.record_path):
+                    drive.teach(self.experience)
+            self._record = files.enter_context(closing(Appender(self.record_path)))
+            if self.record_path.stat().st_size == 0:
+                self._record.append(HEADER)
+
+    @property
+    def save_error(self) -> str:
+        """Why the last save failed; empty if it did not."""
+        return self._work.save_error
+
+    def add(
+        self, outcome: DriveEnd, seconds: Float64, positions: Float64, grid: GridMap | None = None
+    ) -> Drive:
+        """Record a drive, learn from it, and save; see `Drive.teach` for the map."""
+        self.drives += 1
+        drive = Drive(self.drives, outcome, seconds, positions)
+        self._record.append(drive.row())
+        drive.teach(self.experience, grid)
+        self.try_to_save()
+        return drive
+
+    def forget(self) -> Path | None:
+        """Forget all that was learned; return the file that keeps it, if there was one."""
+        kept = None
+        if self.experience_path.exists():
+            kept = self.experience_path.replace(self.folder / FORGOTTEN)
+        self.experience.forget()
+        self.try_to_save()
+        return kept
+
+    def try_to_save(self) -> None:
+        """Write the drives and the experience.
+
+        If that fails, `save_error` says why, and the next call tries again with all that is left.
+        """
+        with self._work.saving():
+            self._record.flush()
+            self.experience.save(self.experience_path)
+
+    def close(self) -> None:
+        """Close the files and unlock the folder. `try_to_save` first."""
+        self._work.close()
+
+
+def _check_same(saved: Experience, now: Experience, folder: Path) -> None:
+    differences = [
+        f"{name} {getattr(saved, name):g} (now {getattr(now, name):g})"
+        for name in ("nominal_speed", "robot_width")
+        if getattr(saved, name) != getattr(now, name)
+    ]
+    if differences:
+        raise ValueError(
+            f"{folder} holds experience with {', '.join(differences)}; give those values, another "
+            f"folder, or learn anew: ddqn-planner learn {folder} --map MAP"
+        )
+
+
+def _cut_incomplete_row(path: Path) -> int:
+    """Cut what a crash left of a row at the end; return the number of the last drive, or 0."""
+    if not path.exists():
+        return 0
+    complete, end, rest = path.read_bytes().rpartition(b"\r\n")
+    if rest:
+        os.truncate(path, len(complete + end))
+    rows = map(ROW.fullmatch, (complete + end).splitlines(keepends=True))
+    return max((int(row[1]) for row in rows if row), default=0)

@@ -1,43 +1,78 @@
-"""Evidence by places of the world: sparse squares that a robot has driven through."""
+"""What visits tell of places of the world: log slowness, how sure it is, and both on a map.
+
+The log slowness of a place has a normal posterior, whose prior is a nominal place. A visit tells of
+the places around it too, as far as `REACH`, along paths and not through walls.
+"""
 
 from __future__ import annotations
 
 import math
-from typing import Final
+from collections.abc import Mapping
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ddqn_planner.compiled import compiled
 from ddqn_planner.grid import GridMap
+from ddqn_planner.grid.arguments import MAX_SLOWNESS
+from ddqn_planner.grid.grid_map import check_grid
 
 Float64 = NDArray[np.float64]
 
-MOST = 4.0
-"""Weight of visits that a place keeps: a new visit then counts a fifth, whatever was before."""
+FARTHEST = 1e7  # metres from the origin of the map: a place beyond is not believed
+
+REACH = 2.5  # how far a visit tells of the places around, in widths of the robot
+PRIOR = 1.0  # variance of the log slowness of a place before it is visited; its mean is 0
+PRIOR_SUCCESSES = 2.0  # so many are assumed where nothing was driven
+NOISE, NOISY_VISITS = 0.1, 50.0  # variance of the log slowness of one visit, as if of so many
+OLD_VISITS = 500.0  # the noise of visits is that of about the last so many
+OUTLIER = 2.5  # a visit is moved to so many standard deviations from what was expected
+MOST = 4.0  # weight of visits that a place keeps: a new visit then counts a fifth
+
+STEP = 0.02  # slowness is told in steps of this share: fields need no repair for less
+FADING_STEPS = 4  # so often per half-life all evidence fades: few changes of a map come at once
+REBASE = 2.0**16  # evidence is spread anew when weights have grown so much against the oldest
+
+SHORTEST = 8  # a drive through fewer places says little about how sure expected times are
+KEPT, ASSUMED = 64, 8  # drives whose errors count, and drives assumed before, with normal errors
+NORMAL = 1.645  # 90 % of a normal distribution lie within so many standard deviations
+TAIL = 0.04  # share of errors beyond each bound: not 5 %, as successive drives are alike
+PARTS = 256  # of a path, between which it is computed what they have in common
+CORRELATED = 5.0  # places so many sides apart have a third of their error in common
+
+STRAIGHT: Final = 5
+DIAGONAL: Final = 7
+"""Lengths of moves in whole numbers: within 4 % of the true ones."""
 
 COLUMNS: Final = ("weight", "log", "failures", "x", "y", "time")
 """Of each place: the weight of its visits, that times their log slowness, the weight of failures,
 where it was visited first, and the driven time when the weights were last faded."""
 
 
+class Visits(NamedTuple):
+    """The places of a drive, one after the other: V of them."""
+
+    position: Float64
+    """(V, 2): the middle of each place, metres."""
+    seconds: Float64
+    metres: Float64
+
+
 class Evidence:
-    """What was seen at each place.
+    """What was seen at each place, a square of the world. It fades with the time that is driven."""
 
-    Parameters
-    ----------
-    side : float
-        Metres: places are squares of the world of this side.
-    half_life : float
-        Driven seconds after which evidence counts half.
-    """
-
-    def __init__(self, side: float, half_life: float) -> None:
-        self.side, self.half_life = side, half_life
+    def __init__(self, nominal_speed: float, robot_width: float, half_life: float) -> None:
+        self.nominal_speed, self.half_life = nominal_speed, half_life
+        self.side, self.reach = robot_width / 2, REACH * robot_width
         self.driven = 0.0
-        self.version = 0
         self.number: dict[tuple[int, int], int] = {}
-        self._table = np.zeros((64, len(COLUMNS)))
-        self._changed = np.zeros(64, dtype=np.int64)
+        self.table = np.zeros((0, len(COLUMNS)))
+        self.noise_sums = NOISY_VISITS * NOISE, NOISY_VISITS
+        self.errors: list[float] = []
+        """Of the log times of the last drives, in standard deviations."""
+        self.spread: Spread | None = None
+        """That over the last map."""
 
     @property
     def places(self) -> int:
@@ -45,89 +80,209 @@ class Evidence:
         return len(self.number)
 
     @property
-    def table(self) -> Float64:
-        """(P, 6) float64: a row per place, see `COLUMNS`."""
-        return self._table[: self.places]
+    def noise(self) -> float:
+        """Variance of the log slowness of one visit."""
+        total, visits = self.noise_sums
+        return max(total / visits, 1e-4)
 
-    def restore(self, keys: NDArray[np.int64], table: Float64, driven: float) -> None:
-        """Take the place of what is there."""
-        self.number = {key: row for row, key in enumerate(map(tuple, keys.tolist()))}
-        self._table, self.driven, self.version = table, driven, 1
-        self._changed = np.ones(len(table), dtype=np.int64)
-
-    def _keys(self, position: Float64) -> list[tuple[int, int]]:
-        return list(map(tuple, np.floor(position / self.side).astype(np.int64).tolist()))
-
-    def _rows(self, position: Float64) -> NDArray[np.int64]:
-        """Return the row of each position; new places get one."""
-        keys = self._keys(position)
-        before = self.places
-        rows = np.array([self.number.setdefault(key, len(self.number)) for key in keys])
-        missing = self.places - len(self._table)
-        if missing > 0:
-            missing += self.places
-            self._table = np.pad(self._table, ((0, missing), (0, 0)))
-            self._changed = np.pad(self._changed, (0, missing))
-        fresh, first = np.unique(rows, return_index=True)
-        first = first[fresh >= before]
-        self._table[rows[first], 3:5] = position[first]
-        return rows
-
-    def _fade(self, rows: NDArray[np.int64]) -> None:
-        """Fade places to the driven time."""
-        age = self.driven - self._table[rows, 5]
-        self._table[rows, :3] *= (0.5 ** (age / self.half_life))[:, None]
-        self._table[rows, 5] = self.driven
-
-    def add(self, position: Float64, weight: Float64, log: Float64, seconds: float) -> None:
-        """Add the visits of a drive that took some seconds."""
-        self.driven += seconds
-        rows = self._rows(position)
-        places = np.unique(rows)
-        self._fade(places)
-        np.add.at(self._table[:, 0], rows, weight)
-        np.add.at(self._table[:, 1], rows, weight * log)
-        surplus = np.maximum(self._table[places, 0] / MOST, 1)
-        self._table[places, :3] /= surplus[:, None]
-        self._mark(places)
+    def add(self, visits: Visits) -> None:
+        """Learn from the visits of a drive, and from how far its time was from the expected one."""
+        rows, noise = self._rows(visits.position), self.noise
+        slowness = visits.seconds * self.nominal_speed / visits.metres
+        log = np.log(np.clip(slowness, 1 / 3, MAX_SLOWNESS))
+        weight, sum_of_log, *_ = self.faded(self.table[rows], self.driven).T
+        variance = 1 / (weight / noise + 1 / PRIOR)
+        surprise = log - sum_of_log / noise * variance
+        most = OUTLIER * np.sqrt(noise + variance)
+        believed = np.clip(surprise, -most, most)
+        known = weight >= 1
+        self._learn_noise(believed[known], variance[known] / noise)
+        if self.spread is not None:
+            self._compare(visits, self.spread)
+        self.driven += float(visits.seconds.sum())
+        places = self._fade(rows)
+        weight = visits.metres / self.side
+        np.add.at(self.table[:, 0], rows, weight)
+        np.add.at(self.table[:, 1], rows, weight * (log - surprise + believed))
+        self.table[places, :3] /= np.maximum(self.table[places, :1] / MOST, 1)
 
     def add_failure(self, x: float, y: float) -> None:
         """Add a failure."""
         rows = self._rows(np.array([[x, y]]))
         self._fade(rows)
-        self._table[rows, 2] += 1
-        self._mark(rows)
+        self.table[rows, 2] += 1
 
-    def _mark(self, rows: NDArray[np.int64]) -> None:
-        self.version += 1
-        self._changed[rows] = self.version
+    def _rows(self, position: Float64) -> NDArray[np.int64]:
+        """Return the row of each position; new places get one."""
+        before = self.places
+        keys = map(tuple, np.floor(position / self.side).astype(np.int64).tolist())
+        rows = np.array([self.number.setdefault(key, len(self.number)) for key in keys])
+        self.table = np.pad(self.table, ((0, self.places - before), (0, 0)))
+        fresh, first = np.unique(rows, return_index=True)
+        first = first[fresh >= before]
+        self.table[rows[first], 3:5] = position[first]
+        return rows
 
-    def changed_since(self, version: int) -> NDArray[np.int64]:
-        """Return the rows that changed after a version."""
-        return np.flatnonzero(self._changed[: self.places] > version)
+    def share_left(self, seconds: Any) -> Any:
+        """Return what share of evidence is left after so many driven seconds."""
+        return 0.5 ** (seconds / self.half_life)
 
-    def at(self, position: Float64) -> tuple[Float64, Float64]:
-        """Return the weight of visits at positions, and that times log slowness: (N,) each."""
-        rows = np.array([self.number.get(key, -1) for key in self._keys(position)], dtype=np.int64)
-        table = np.where(rows[:, None] >= 0, self._table[rows], 0.0)
-        share = 0.5 ** ((self.driven - table[:, 5]) / self.half_life)
-        return share * table[:, 0], share * table[:, 1]
+    def faded(self, table: Float64, driven: float) -> Float64:
+        """Return the weights of rows of the table, faded to a driven time: (N, 3)."""
+        weights: Float64 = table[:, :3] * self.share_left(driven - table[:, 5:])
+        return weights
 
-    def on_map(
-        self, rows: NDArray[np.int64], grid: GridMap, driven: float
-    ) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
-        """Return the cells of places, (N, 2), and the weights seen there, (N, 3).
+    def _fade(self, rows: NDArray[np.int64]) -> NDArray[np.int64]:
+        """Fade places to the driven time; return each of them once."""
+        places = np.unique(rows)
+        self.table[places, :3] = self.faded(self.table[places], self.driven)
+        self.table[places, 5] = self.driven
+        return places
 
-        These are faded to a driven time.
+    def _learn_noise(self, surprise: Float64, relative: Float64) -> None:
+        """Learn from log slowness minus that expected, of a variance relative to the noise."""
+        total, visits = self.noise_sums
+        total += float((surprise**2 / (1 + relative)).sum())
+        visits += len(surprise)
+        surplus = max(visits / OLD_VISITS, 1)
+        self.noise_sums = total / surplus, visits / surplus
 
-        A cell is that of the first visit. If it is occupied, it is the nearest free one within the
-        side of a place; without one, the cell is (-1, -1).
+    def _compare(self, visits: Visits, spread: Spread) -> None:
+        """Compare the time of a drive with the one expected on the last map."""
+        cells, free = cells_of(visits.position, spread.grid)
+        x, y = cells[free].T
+        if len(x) < SHORTEST:
+            return
+        metres = visits.metres[free]
+        expected = metres / self.nominal_speed * spread.slowness[y, x]
+        deviation = self.deviation(expected, metres, spread.variance(x, y))
+        error = math.log(visits.seconds[free].sum() / expected.sum()) / deviation
+        self.errors = [*self.errors, error][-KEPT:]
+
+    def deviation(self, seconds: Float64, metres: Float64, variance: Float64) -> float:
+        """Return the standard deviation of the log time of a drive, from those of its parts.
+
+        Each place has a noise of its own; the log slowness of near places, whose variance is given,
+        is wrong in the same way.
         """
-        table = self._table[rows]
-        cells, free = cells_of(table[:, 3:5], grid)
-        cells = _nearest_free(cells, free, grid, int(self.side / grid.resolution))
-        amounts = table[:, :3] * (0.5 ** ((driven - table[:, 5]) / self.half_life))[:, None]
-        return cells, amounts.astype(np.float32)
+        share = seconds / seconds.sum()
+        of_visits = self.noise * (share**2 * np.maximum(self.side / metres, 1)).sum()
+        weighted, at = share * np.sqrt(variance), np.cumsum(metres)
+        begins = np.unique(np.linspace(0, len(at) - 1, PARTS).astype(np.int64))
+        weighted, at = np.add.reduceat(weighted, begins), at[begins]
+        same = np.exp(-np.abs(at[:, None] - at) / (CORRELATED * self.side))
+        return float(np.sqrt(weighted @ same @ weighted + of_visits))
+
+    def quantiles(self) -> Float64:
+        """Return the lower bound, the mean, and the upper bound of 90 % of the errors of drives."""
+        errors = np.concatenate([self.errors, NORMAL * np.linspace(-1.05, 1.05, ASSUMED)])
+        # Of n errors and the next one, as many lie outside on each side as of a sample of n + 1.
+        tail = TAIL * (1 + 1 / len(errors)) - 1 / len(errors)
+        low, high = np.quantile(errors, (max(tail, 0), min(1 - tail, 1)))
+        return np.array([low, errors.mean(), high])
+
+    def over(self, grid: GridMap) -> Spread:
+        """Return the evidence spread over a map, computed only where it changed."""
+        check_grid(grid)
+        period = self.half_life / FADING_STEPS
+        driven = math.floor(self.driven / period) * period
+        spread, self.spread = self.spread, None  # an exception must not leave a part of it
+        is_old = spread and self.share_left(driven - spread.since) <= 1 / REBASE
+        if spread is None or is_old or not spread.fits(grid):
+            spread = Spread(grid, driven)
+        spread.grid = grid
+        spread.update(self, driven)
+        self.spread = spread
+        return spread
+
+    def take_over(self, older: Evidence) -> None:
+        """Take what older evidence has spread over its map, if this one has grown out of it."""
+        if list(self.number)[: older.places] == list(older.number):
+            self.spread, older.spread = older.spread, None
+
+    def arrays(self) -> dict[str, Any]:
+        """Return what a file keeps."""
+        return {
+            "places": np.array(list(self.number), dtype=np.int64).reshape(-1, 2),
+            "evidence": self.table,
+            "driven": self.driven,
+            "noise": self.noise_sums,
+            "errors": np.array(self.errors),
+        }
+
+    def restore(self, arrays: Mapping[str, NDArray[Any]]) -> None:
+        """Take what `arrays` gave; a ValueError if it cannot be true."""
+        names = ("places", "evidence", "driven", "noise", "errors")
+        places, table, driven, noise, errors = given = [arrays[name] for name in names]
+        if not all(array.dtype.kind in "if" and np.isfinite(array).all() for array in given):
+            raise ValueError("it holds what is no finite number")
+        number = {(x, y): row for row, (x, y) in enumerate(places.tolist())}
+        shapes = places.shape, table.shape, driven.shape, noise.shape, errors.shape
+        fitting = (len(number), 2), (len(number), len(COLUMNS)), (), (2,), (errors.size,)
+        if shapes != fitting or places.dtype.kind != "i":
+            raise ValueError(f"its arrays do not fit: they have the shapes {shapes}")
+        far = np.abs(table[:, 3:5]) > FARTHEST
+        if (table[:, [0, 2]] < 0).any() or far.any() or (table[:, 5] > driven).any():
+            raise ValueError("its evidence cannot be true")
+        total, visits = noise.tolist()
+        if total < 0 or visits <= 0:
+            raise ValueError("its noise cannot be true")
+        self.number, self.table, self.driven = number, table, float(driven)
+        self.noise_sums, self.errors = (total, visits), errors.tolist()
+
+
+class Spread:
+    """Evidence spread over the cells of a map.
+
+    The weights of the sums are faded to the driven time `since`. All fade further by one factor, so
+    they are not spread again for it.
+    """
+
+    def __init__(self, grid: GridMap, since: float) -> None:
+        shape = grid.occupancy.shape
+        self.grid, self.since, self.driven = grid, since, since
+        self.faded, self.noise = 1.0, NOISE
+        self.sums = np.zeros((*shape, 3), dtype=np.float32)
+        """Of weights of visits, of these times log slowness, and of failures."""
+        self.slowness = np.ones(shape, dtype=np.float32)
+        self.touched = np.zeros(shape, dtype=np.bool_)
+        self.table = np.zeros((0, len(COLUMNS)))
+        """What was spread of `Evidence.table`."""
+
+    def fits(self, grid: GridMap) -> bool:
+        """Return whether a map has the same cells at the same places."""
+        old = self.grid
+        return (old.resolution, old.origin) == (grid.resolution, grid.origin) and (
+            old.occupancy is grid.occupancy or np.array_equal(old.occupancy, grid.occupancy)
+        )
+
+    def update(self, evidence: Evidence, driven: float) -> None:
+        """Spread what changed, less what was spread of the same places before."""
+        before = np.pad(self.table, ((0, evidence.places - len(self.table)), (0, 0)))
+        changed = (evidence.table != before).any(axis=1)
+        if changed.any():
+            before, now = before[changed], evidence.table[changed]
+            before, after = (evidence.faded(table, self.since) for table in (before, now))
+            more = after.astype(np.float32) - before.astype(np.float32)
+            cells = nearest_free(now[:, 3:5], self.grid, evidence.side)
+            inside = cells[:, 0] >= 0
+            reach = max(evidence.reach / self.grid.resolution, 0.5)
+            occupancy, cells, more = self.grid.occupancy, cells[inside], more[inside]
+            spread_evidence(occupancy, cells, more, reach, self.sums, self.touched)
+            self.table = evidence.table.copy()
+        if driven != self.driven:
+            self.driven, self.noise = driven, evidence.noise
+            self.faded = evidence.share_left(driven - self.since)
+            self.touched |= self.sums[..., 0] > 0
+        if self.touched.any():
+            self.slowness = self.slowness.copy()  # maps have the old one
+            refresh(self.sums, self.touched, self.faded, self.noise, self.slowness)
+
+    def variance(self, x: Any, y: Any) -> Float64:
+        """Return the variance of the log slowness of some cells."""
+        weight = np.maximum(self.sums[y, x, 0].astype(np.float64), 0) * self.faded
+        variance: Float64 = 1 / (weight / self.noise + 1 / PRIOR)
+        return variance
 
 
 def cells_of(position: Float64, grid: GridMap) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
@@ -144,10 +299,10 @@ def cells_of(position: Float64, grid: GridMap) -> tuple[NDArray[np.int64], NDArr
     return cells, free
 
 
-def _nearest_free(
-    cells: NDArray[np.int64], free: NDArray[np.bool_], grid: GridMap, reach: int
-) -> NDArray[np.int64]:
-    """Return the free cell nearest to each within some cells; (-1, -1) without one."""
+def nearest_free(position: Float64, grid: GridMap, metres: float) -> NDArray[np.int64]:
+    """Return the free cells of positions, or the nearest within some metres, or (-1, -1)."""
+    cells, free = cells_of(position, grid)
+    reach = int(metres / grid.resolution)
     result = np.where(free[:, None], cells, -1)
     for index in np.flatnonzero(~free):
         x, y = cells[index].tolist()
@@ -158,3 +313,93 @@ def _nearest_free(
             best = np.hypot(free_x + left - x, free_y + bottom - y).argmin()
             result[index] = free_x[best] + left, free_y[best] + bottom
     return result
+
+
+@compiled
+def spread_evidence(
+    occupancy: NDArray[np.bool_],
+    cells: NDArray[np.int64],
+    amounts: NDArray[np.float32],
+    reach: float,
+    sums: NDArray[np.float32],
+    touched: NDArray[np.bool_],
+) -> None:
+    """Add evidence (B, 3) of free cells (B, 2) to sums (H, W, 3) around them; set touched (H, W).
+
+    It becomes less with the length d of a path, not through walls: (1 - (d / reach)^2)^3.
+    """
+    height, width = occupancy.shape
+    middle = int(reach) + 1  # no path within reach leads to the border
+    size = 2 * middle + 1
+    furthest = int(STRAIGHT * reach)
+    share = np.empty(furthest + 1, np.float32)
+    for distance in range(furthest + 1):
+        share[distance] = (1 - (distance / (STRAIGHT * reach)) ** 2) ** 3
+    best = np.empty((size, size), np.int64)
+    waits = np.zeros((size, size), np.bool_)
+    queue = np.empty((size * size, 2), np.int64)
+    reached = np.empty((size * size, 2), np.int64)
+    for number in range(cells.shape[0]):
+        left, bottom = cells[number, 0] - middle, cells[number, 1] - middle
+        best[:] = furthest + 1
+        best[middle, middle] = 0
+        queue[0] = reached[0] = middle
+        first, end, count = 0, 1, 1
+        while first != end:
+            x, y = queue[first, 0], queue[first, 1]
+            first = first + 1 if first + 1 < len(queue) else 0
+            waits[y, x] = False
+            row, column = bottom + y, left + x
+            for dy in range(-1, 2):
+                for dx in range(-1, 2):
+                    length = best[y, x] + (DIAGONAL if dx != 0 and dy != 0 else STRAIGHT)
+                    if length >= best[y + dy, x + dx]:
+                        continue
+                    to_row, to_column = row + dy, column + dx
+                    if not (0 <= to_row < height and 0 <= to_column < width):
+                        continue
+                    corner = occupancy[row, to_column] or occupancy[to_row, column]
+                    if corner or occupancy[to_row, to_column]:
+                        continue
+                    if best[y + dy, x + dx] > furthest:
+                        reached[count, 0], reached[count, 1] = x + dx, y + dy
+                        count += 1
+                    best[y + dy, x + dx] = length
+                    if not waits[y + dy, x + dx]:
+                        waits[y + dy, x + dx] = True
+                        queue[end, 0], queue[end, 1] = x + dx, y + dy
+                        end = end + 1 if end + 1 < len(queue) else 0
+        for index in range(count):
+            x, y = reached[index, 0], reached[index, 1]
+            touched[bottom + y, left + x] = True
+            for kind in range(3):
+                part = share[best[y, x]] * amounts[number, kind]
+                sums[bottom + y, left + x, kind] += part
+
+
+@compiled
+def refresh(
+    sums: NDArray[np.float32],
+    touched: NDArray[np.bool_],
+    faded: float,
+    noise: float,
+    slowness: NDArray[np.float32],
+) -> None:
+    """Compute the slowness of the touched cells; then none is touched.
+
+    Half of the noise is added, as the mean of its exponential is more than 1.
+    """
+    scale = np.log(1 + STEP)
+    for y in range(touched.shape[0]):
+        for x in range(touched.shape[1]):
+            if not touched[y, x]:
+                continue
+            touched[y, x] = False
+            weight, sum_of_log, failures = sums[y, x]
+            # Differences of sums may leave a rest below 0.
+            weight = max(weight, np.float32(0)) * faded
+            failures = max(failures, np.float32(0)) * faded
+            mean = (sum_of_log * faded / noise + weight / 2) / (weight / noise + 1 / PRIOR)
+            tries = (PRIOR_SUCCESSES + weight + failures) / (PRIOR_SUCCESSES + weight)
+            steps = np.rint((max(mean, 0.0) + np.log(tries)) / scale)
+            slowness[y, x] = min(np.exp(steps * scale), MAX_SLOWNESS)

@@ -2,51 +2,37 @@
 
 from __future__ import annotations
 
+import io
 import math
+import zipfile
 from collections.abc import Sequence
-from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ddqn_planner.experience.drives import FARTHEST, Visits, visits_of
-from ddqn_planner.experience.evidence import Evidence, cells_of
-from ddqn_planner.experience.forecasts import Forecasts
-from ddqn_planner.files import as_path
+from ddqn_planner.experience.evidence import FARTHEST, Evidence, Visits
+from ddqn_planner.files import as_path, write_atomically
 from ddqn_planner.grid import GridMap
-from ddqn_planner.grid.arguments import MAX_SLOWNESS, Cells, cells_inside, numbers, real
-from ddqn_planner.grid.grid_map import check_grid
+from ddqn_planner.grid.arguments import Cells, cells_inside, numbers, real
 
 Float32 = NDArray[np.float32]
+Float64 = NDArray[np.float64]
 
-REACH = 2.5
-"""How far a visit tells of the places around, in widths of the robot."""
+VERSION = 1
+OPTIONS = ("nominal_speed", "robot_width", "half_life", "max_pause")
+"""Of a file."""
 
-PRIOR = 1.0
-"""Variance of the log slowness of a place before it is visited; its mean is 0."""
+LATEST = 1e12  # seconds of a clock: a pose of a later time is not believed
+CORRECTION = 0.25  # metres by which a localisation may move a pose at once: the drive goes on
+RELOCATION = 1.0  # a jump by this many metres more puts the robot at a place not believed
+MEMORY = 60.0  # seconds over which a robot whose pose is not believed counts as driving on
 
-NOISE = 0.1
-"""Variance of the log slowness of one visit, before drives tell it."""
 
-PRIOR_SUCCESSES = 2.0
-"""So many successes are assumed where nothing was driven."""
-
-OUTLIER = 2.5
-"""A visit is moved to so many standard deviations from what was expected, if it lies beyond."""
-
-SHORTEST = 8
-"""A drive through fewer places says little about how sure expected times are."""
-
-STEP = 0.02
-"""Slowness is told in steps of this share, so that fields need no repair for less."""
-
-FADING_STEPS = 4
-"""So often per half-life does all evidence fade, so that few changes of a map come at once."""
-
-REBASE = 2.0**16
-"""Evidence is spread anew when the weights of a map have grown so much against the oldest."""
+class ExperienceFileError(ValueError):
+    """A file that cannot be used, with the reason."""
 
 
 class ExpectedTime(NamedTuple):
@@ -86,22 +72,19 @@ class Experience:
         half_life: float = 900.0,
         max_pause: float = 90.0,
     ) -> None:
-        given = {
-            "nominal_speed": nominal_speed,
-            "robot_width": robot_width,
-            "half_life": half_life,
-            "max_pause": max_pause,
-        }
-        for name, value in given.items():
+        given = nominal_speed, robot_width, half_life, max_pause
+        for name, value in zip(OPTIONS, given, strict=True):
             if not 0 < real(value) < math.inf:
                 raise ValueError(f"{name} is {value!r}; give more than 0, and finite")
         self.nominal_speed = float(nominal_speed)
         self.robot_width = float(robot_width)
         self.half_life = float(half_life)
         self.max_pause = float(max_pause)
-        self.evidence = Evidence(self.robot_width / 2, self.half_life)
-        self.forecasts = Forecasts(NOISE)
-        self._spread: _Spread | None = None
+        self.forget()
+
+    def forget(self) -> None:
+        """Forget all."""
+        self.evidence = Evidence(self.nominal_speed, self.robot_width, self.half_life)
 
     def record(self, seconds: ArrayLike, positions: ArrayLike) -> None:
         """Learn from a drive, or a part of one.
@@ -116,41 +99,12 @@ class Experience:
         Raises
         ------
         ValueError
-            If the shapes or types are wrong. Wrong values are left out, see `visits_of`.
+            If the shapes or types are wrong. Values that cannot be true are left out.
         """
-        side, speed = self.evidence.side, self.nominal_speed
-        visits = visits_of(seconds, positions, side, 3 * speed, self.max_pause)
-        if not len(visits.seconds):
-            return
-        log = np.log(np.clip(visits.seconds * speed / visits.metres, 1 / 3, MAX_SLOWNESS))
-        weight, sum_of_log = self.evidence.at(visits.position)
-        noise = self.forecasts.noise
-        variance = 1 / (weight / noise + 1 / PRIOR)
-        surprise = log - sum_of_log / noise * variance
-        most = OUTLIER * np.sqrt(noise + variance)
-        believed = np.clip(surprise, -most, most)
-        known = weight >= 1
-        self.forecasts.add_surprises(believed[known], variance[known] / noise)
-        if self._spread is not None:
-            self._compare(visits, self._spread)
-        duration = float(visits.seconds.sum())
-        self.evidence.add(
-            visits.position, visits.metres / side, log - surprise + believed, duration
-        )
-
-    def _compare(self, visits: Visits, spread: _Spread) -> None:
-        """Compare the time of a drive with the one expected on the last map."""
-        cells, inside = cells_of(visits.position, spread.grid)
-        x, y = cells[inside].T
-        if len(x) < SHORTEST:
-            return
-        metres = visits.metres[inside]
-        expected = metres / self.nominal_speed * spread.slowness[y, x]
-        deviation = self.forecasts.deviation(
-            expected, metres, spread.variance(x, y), self.evidence.side
-        )
-        ratio = visits.seconds[inside].sum() / expected.sum()
-        self.forecasts.add_drive(math.log(ratio) / deviation)
+        speed, side = 3 * self.nominal_speed, self.evidence.side
+        visits = visits_of(seconds, positions, side, speed, self.max_pause)
+        if len(visits.seconds):
+            self.evidence.add(visits)
 
     def record_failure(self, position: Sequence[float]) -> None:
         """Learn that the robot failed at a place: it got stuck, was sent back, or gave up."""
@@ -159,11 +113,10 @@ class Experience:
             raise ValueError(f"the position is {position!r}; give metres, at most {FARTHEST:g}")
         self.evidence.add_failure(float(point[0]), float(point[1]))
 
-    def forget(self) -> None:
-        """Forget all."""
-        self.evidence = Evidence(self.robot_width / 2, self.half_life)
-        self.forecasts = Forecasts(NOISE)
-        self._spread = None
+    def take_over(self, older: Experience) -> None:
+        """Use what older experience of the same robot computed for its map, which forgets it."""
+        if [getattr(self, name) for name in OPTIONS] == [getattr(older, name) for name in OPTIONS]:
+            self.evidence.take_over(older.evidence)
 
     def apply(self, grid: GridMap) -> GridMap:
         """Return a map whose moves cost expected time, so that `Plan.cost` is in seconds.
@@ -171,34 +124,33 @@ class Experience:
         Costs of the map itself multiply it. Where moves fail, a move is tried until it succeeds:
         its time is that of one try over the probability of success.
         """
-        spread = self._spread_over(grid)
+        slowness = self.evidence.over(grid).slowness
         seconds_per_cell = grid.resolution / self.nominal_speed
-        return grid._changed(slowness=spread.slowness, seconds_per_cell=seconds_per_cell)
+        return grid.with_layers(slowness=slowness, seconds_per_cell=seconds_per_cell)
 
     def slowness(self, grid: GridMap) -> Float32:
         """Return (H, W) float32: expected seconds over those at nominal speed, 1 or more."""
-        slowness: Float32 = self._spread_over(grid).slowness.copy()
+        slowness: Float32 = self.evidence.over(grid).slowness.copy()
         return slowness
 
     def uncertainty(self, grid: GridMap) -> Float32:
         """Return (H, W) float32: the standard deviation of the log slowness."""
-        spread = self._spread_over(grid)
-        variance = spread.variance(slice(None), slice(None))
+        variance = self.evidence.over(grid).variance(slice(None), slice(None))
         deviation: Float32 = np.sqrt(variance).astype(np.float32)
         return deviation
 
     def expected_time(self, grid: GridMap, cells: Cells) -> ExpectedTime:
         """Return the time that a path of neighbouring cells takes, with an interval of 90 %.
 
-        The interval is that of the posterior, with the noise of a drive, and as wide as drives so
-        far have shown.
+        The interval follows from how sure the times of its places are, and is widened until it held
+        for 90 % of the last drives.
 
         Raises
         ------
         ValueError
             If the cells are no path in the map.
         """
-        spread = self._spread_over(grid)
+        spread = self.evidence.over(grid)
         path = cells_inside(cells, grid.occupancy.shape)
         if len(path) < 2:
             return ExpectedTime(0.0, 0.0, 0.0)
@@ -209,30 +161,17 @@ class Experience:
         slowness = spread.slowness[y, x].astype(np.float64)
         variance = spread.variance(x, y)
         seconds = metres / self.nominal_speed * (slowness[1:] + slowness[:-1]) / 2
-        deviation = self.forecasts.deviation(
-            seconds, metres, (variance[1:] + variance[:-1]) / 2, self.evidence.side
-        )
-        low, middle, high = np.exp(self.forecasts.quantiles() * deviation)
+        deviation = self.evidence.deviation(seconds, metres, (variance[1:] + variance[:-1]) / 2)
+        low, middle, high = np.exp(self.evidence.quantiles() * deviation)
         total = float(seconds.sum())
         return ExpectedTime(total * middle, total * low, total * high)
 
-    def _spread_over(self, grid: GridMap) -> _Spread:
-        """Return the evidence spread over the cells of a map, computed only where it changed."""
-        check_grid(grid)
-        period = self.half_life / FADING_STEPS
-        driven = math.floor(self.evidence.driven / period) * period
-        spread, self._spread = self._spread, None  # an exception must not leave a part of it
-        if spread is None or not spread.fits(grid, driven):
-            spread = _Spread(grid, driven, self.half_life)
-        spread.update(grid, driven, self.forecasts.noise, self.evidence, self.robot_width)
-        self._spread = spread
-        return spread
-
     def save(self, path: str | Path) -> None:
         """Save to a file, atomically; an OSError leaves an old file unchanged."""
-        from ddqn_planner.experience.experience_file import save
-
-        save(self, as_path(path))
+        content = io.BytesIO()
+        options = [getattr(self, name) for name in OPTIONS]
+        np.savez(content, version=VERSION, options=options, **self.evidence.arrays())
+        write_atomically(as_path(path), content.getvalue())
 
     @classmethod
     def load(cls, path: str | Path) -> Experience:
@@ -243,82 +182,111 @@ class Experience:
         ExperienceFileError
             If the file is missing, broken, or no experience.
         """
-        from ddqn_planner.experience.experience_file import load
+        path = as_path(path)
+        try:
+            with zipfile.ZipFile(path) as archive:
+                broken = archive.testzip()
+            if broken is not None:
+                raise ValueError(f"{broken} is damaged")
+            with np.load(path, allow_pickle=False) as file:
+                arrays = dict(file)
+            if int(arrays["version"]) != VERSION:
+                raise ValueError(f"it has version {arrays['version']}, not {VERSION}")
+            options = dict(zip(OPTIONS, arrays["options"].tolist(), strict=True))
+            experience = cls(**options)
+            experience.evidence.restore(arrays)
+        except Exception as error:  # broken bytes make zipfile and NumPy raise many kinds of errors
+            raise ExperienceFileError(
+                f"{path}: cannot be read ({error}); give a file that `Experience.save` wrote, or "
+                "delete it to begin anew"
+            ) from error
+        return experience
 
-        return load(as_path(path))
 
+def visits_of(
+    seconds: ArrayLike, positions: ArrayLike, side: float, max_speed: float, max_pause: float
+) -> Visits:
+    """Divide a drive into places, squares of the world.
 
-@dataclass(eq=False)
-class _Spread:
-    """Evidence spread over the cells of a map.
-
-    Parameters
-    ----------
-    grid : GridMap
-    since : float
-        The driven time to which the weights of the sums are faded. They fade by one factor, so they
-        are not spread again for it.
-    half_life : float
+    The drive is followed in steps of half a square. So noise of the pose and the rate of the
+    samples hardly matter, and waiting counts as time. Not believed are poses that are not finite,
+    clocks that go back, places that take longer than `max_pause`, and moves that are faster than
+    `max_speed`. A pose that jumps far is not believed until it jumps back to where the robot can
+    be.
     """
-
-    grid: GridMap
-    since: float
-    half_life: float
-
-    def __post_init__(self) -> None:
-        shape = self.grid.occupancy.shape
-        self.sums = np.zeros((*shape, 3), dtype=np.float32)
-        self.slowness = np.ones(shape, dtype=np.float32)
-        self.touched = np.zeros(shape, dtype=np.bool_)
-        self.version = 0
-        self.driven, self.noise = self.since, NOISE
-        self.cells = np.empty((0, 2), dtype=np.int64)
-        self.amounts = np.empty((0, 3), dtype=np.float32)
-
-    def fits(self, grid: GridMap, driven: float) -> bool:
-        """Return whether a map has the same cells, and the weights are in range."""
-        old = self.grid
-        return (
-            old.resolution == grid.resolution
-            and old.origin == grid.origin
-            and (old.occupancy is grid.occupancy or np.array_equal(old.occupancy, grid.occupancy))
-            and self.faded(driven) > 1 / REBASE
+    time = numbers("seconds", seconds).astype(np.float64)
+    position = numbers("positions", positions).astype(np.float64)
+    if time.ndim != 1 or position.shape != (len(time), 2):
+        raise ValueError(
+            f"seconds have shape {time.shape} and positions {position.shape}; give (N,) and (N, 2)"
         )
+    # Comparisons with NaN are false.
+    possible = (np.abs(time) < LATEST) & (np.abs(position) < FARTHEST).all(axis=1)
+    time, position = time[possible], position[possible]
+    fresh = np.diff(time, prepend=np.nan) != 0  # a repeated time adds nothing
+    time, position = time[fresh], position[fresh]
+    rows: list[tuple[float, ...]] = []
+    step = side / 2
+    for first, end in _believed_parts(time, position, max_speed, max_pause):
+        rows += _steps(time[first:end].tolist(), position[first:end].tolist(), step)
+    array = np.array(rows).reshape(-1, 6)
+    array = array[(array[:, 4] <= max_pause) & (array[:, 5] <= max_speed * array[:, 4])]
+    # Where samples are rare, one step passes several places.
+    count = np.maximum(np.rint(array[:, 5] / step), 1).astype(np.int64)
+    number = np.arange(count.sum()) - np.repeat(np.cumsum(count) - count, count)
+    array = np.repeat(array, count, axis=0)
+    count = np.repeat(count, count)
+    share = ((number + 0.5) / count)[:, None]
+    middle = array[:, 0:2] * (1 - share) + array[:, 2:4] * share
+    if not len(middle):
+        return Visits(middle, array[:, 4], array[:, 5])
+    square = np.floor(middle / side)
+    begins = np.flatnonzero(np.append(True, (np.diff(square, axis=0) != 0).any(axis=1)))
+    metres = array[:, 5] / count
+    sums = np.column_stack([middle * metres[:, None], array[:, 4] / count, metres])
+    sums = np.add.reduceat(sums, begins)
+    return Visits(sums[:, :2] / sums[:, 3:], sums[:, 2], sums[:, 3])
 
-    def faded(self, driven: float) -> float:
-        """Return by what factor weights have faded."""
-        return float(0.5 ** ((driven - self.since) / self.half_life))
 
-    def variance(self, x: Any, y: Any) -> NDArray[np.float64]:
-        """Return the variance of the log slowness of some cells."""
-        weight = np.maximum(self.sums[y, x, 0].astype(np.float64), 0) * self.faded(self.driven)
-        variance: NDArray[np.float64] = 1 / (weight / self.noise + 1 / PRIOR)
-        return variance
+def _believed_parts(
+    time: Float64, position: Float64, max_speed: float, max_pause: float
+) -> list[tuple[int, int]]:
+    """Return the first sample and the end of each part of a drive without jumps."""
+    elapsed = np.diff(time)
+    distance = np.hypot(*np.diff(position, axis=0).T)
+    reach = max_speed * np.maximum(elapsed, 0) + CORRECTION
+    broken = (elapsed <= 0) | (elapsed > max_pause) | (distance > reach)
+    edges = [0, *(np.flatnonzero(broken) + 1).tolist(), len(time)]
+    parts: list[tuple[int, int]] = []
+    lost_at: int | None = None
+    farthest = np.minimum(reach, MEMORY * max_speed) + RELOCATION
+    for first, end in pairwise(edges):
+        if first and distance[first - 1] > farthest[first - 1]:
+            if lost_at is None:
+                lost_at = first - 1
+            else:
+                elapsed_since = np.clip(time[first] - time[lost_at], 0, MEMORY)
+                apart = math.dist(position[first], position[lost_at])
+                lost_at = None if apart <= max_speed * elapsed_since + RELOCATION else lost_at
+        if lost_at is None and end - first > 1:
+            parts.append((first, end))
+    return parts
 
-    def update(
-        self, grid: GridMap, driven: float, noise: float, evidence: Evidence, width: float
-    ) -> None:
-        """Spread what changed since the last call: the old evidence is taken away."""
-        from ddqn_planner.experience.spreading import refresh, spread
 
-        self.grid = grid
-        changed = evidence.changed_since(self.version)
-        self.version = evidence.version
-        if len(changed):
-            cells, amounts = evidence.on_map(changed, grid, self.since)
-            grown = evidence.places - len(self.cells)
-            self.cells = np.pad(self.cells, ((0, grown), (0, 0)))
-            self.amounts = np.pad(self.amounts, ((0, grown), (0, 0)))
-            more = amounts - self.amounts[changed]
-            self.cells[changed], self.amounts[changed] = cells, amounts
-            free = cells[:, 0] >= 0
-            reach = max(REACH * width / grid.resolution, 0.5)
-            spread(grid.occupancy, cells[free], more[free], reach, self.sums, self.touched)
-        if driven != self.driven:
-            self.driven, self.noise = driven, noise
-            self.touched |= self.sums[..., 0] > 0
-        if not (len(changed) or self.touched.any()):
-            return
-        self.slowness = self.slowness.copy()  # maps have the old one
-        settings = self.noise, PRIOR, PRIOR_SUCCESSES, MAX_SLOWNESS, STEP
-        refresh(self.sums, self.touched, self.faded(driven), settings, self.slowness)
+def _steps(
+    time: list[float], position: list[list[float]], step: float
+) -> list[tuple[float, float, float, float, float, float]]:
+    """Return x and y before and after each step, its seconds and its metres.
+
+    How long the robot stands before it drives off says nothing about the place.
+    """
+    away = (index for index, at in enumerate(position) if math.dist(at, position[0]) >= step / 4)
+    start = max(next(away, len(time)) - 1, 0)
+    began, (from_x, from_y) = time[start], position[start]
+    steps = []
+    for now, (x, y) in zip(time[start:], position[start:], strict=True):
+        distance = math.hypot(x - from_x, y - from_y)
+        if distance >= step:
+            steps.append((from_x, from_y, x, y, now - began, distance))
+            began, from_x, from_y = now, x, y
+    return steps

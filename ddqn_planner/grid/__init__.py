@@ -3,15 +3,14 @@
 `import ddqn_planner.grid` loads no SciPy: what needs it imports it at its first call.
 """
 
-from ddqn_planner.grid.arguments import OCCUPIED, UNKNOWN
+from ddqn_planner.grid.arguments import OCCUPIED, UNKNOWN, Cell
 from ddqn_planner.grid.body import clearance, inflate
-from ddqn_planner.grid.grid_map import MAX_COST_MULTIPLIER, Cell, GridMap
+from ddqn_planner.grid.grid_map import MAX_COST_MULTIPLIER, GridMap
 from ddqn_planner.grid.map_file import MapFile, MapFileError, load_map, read_map_file, save_map
 from ddqn_planner.grid.moves import (
     LENGTHS,
     MOVES,
     MoveRule,
-    connected_cells,
     legal_moves,
     move_costs,
     neighbours,
@@ -34,7 +33,6 @@ __all__ = [
     "MoveRule",
     "Noise",
     "clearance",
-    "connected_cells",
     "inflate",
     "legal_moves",
     "load_map",

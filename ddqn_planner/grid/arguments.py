@@ -1,8 +1,9 @@
-"""Checks of what users pass in: choices, whole numbers, cells, the layers of a map."""
+"""Checks of what users pass in: choices, numbers, cells, arrays. A wrong value is a ValueError."""
 
 from __future__ import annotations
 
 import math
+import sys
 from collections.abc import Sequence
 from enum import Enum
 from numbers import Real
@@ -30,6 +31,9 @@ MAX_SLOWNESS = 100.0
 """No place may be slower. The time and memory of a field grow with the costliest move: with this,
 and costs, it keeps some 1,400 lists of cells at once."""
 
+POSITIVE = math.ulp(0.0), sys.float_info.max
+"""The range of finite numbers above 0."""
+
 
 class Choice(str, Enum):
     """An enum whose members can be given by value: ``MoveRule("unit")``."""
@@ -41,10 +45,7 @@ class Choice(str, Enum):
 
 
 def as_cell(cell: Any, name: str = "the cell") -> Cell:
-    """Return a pair of whole numbers of any type (a list, an array, ...) as Python ints.
-
-    The message of the ValueError for anything else uses `name`.
-    """
+    """Return a pair of whole numbers of any type (a list, an array, ...) as Python ints."""
     try:
         if len(cell) == 2:
             x, y = int(cell[0]), int(cell[1])
@@ -56,16 +57,17 @@ def as_cell(cell: Any, name: str = "the cell") -> Cell:
 
 
 def cell_inside(cell: Any, shape: tuple[int, ...], name: str = "the cell") -> Cell:
-    """Return a cell of a map of shape (H, W), as `as_cell`; ValueError if it lies outside."""
+    """Return a cell of a map of shape (H, W), as `as_cell`."""
     x, y = as_cell(cell, name)
     height, width = shape
     if not (0 <= x < width and 0 <= y < height):
-        raise ValueError(f"{name} {(x, y)} lies outside the map of {width} x {height} cells")
+        size = f"{width} x {height}"
+        raise ValueError(f"{name} {(x, y)} lies outside the map of {size} cells; give one inside")
     return x, y
 
 
 def cells_inside(cells: Any, shape: tuple[int, ...]) -> NDArray[np.int64]:
-    """Return cells of a map of shape (H, W): (N, 2) int64; ValueError as by `cell_inside`."""
+    """Return cells of a map of shape (H, W): (N, 2) int64."""
     is_checked = False
     if isinstance(cells, np.ndarray) and cells.dtype.kind == "i" and cells.shape[1:] == (2,):
         is_checked = bool(((cells >= 0) & (cells < shape[::-1])).all())
@@ -75,7 +77,7 @@ def cells_inside(cells: Any, shape: tuple[int, ...]) -> NDArray[np.int64]:
 
 
 def listed(values: Any, name: str) -> list[Any]:
-    """Return the elements of what has some; ValueError for anything else."""
+    """Return the elements of what has some."""
     try:
         return list(values)
     except TypeError:
@@ -92,17 +94,30 @@ def real(value: Any) -> float:
         return math.copysign(math.inf, value > 0 or -1)
 
 
+def as_number(name: str, value: Any, lowest: float, highest: float, remedy: str = "") -> float:
+    """Return a number from `lowest` to `highest` as a float."""
+    if lowest <= (number := real(value)) <= highest:
+        return number
+    raise ValueError(f"{name} is {value!r}; give {remedy or f'{lowest:g} to {highest:g}'}")
+
+
 def as_flag(name: str, value: Any) -> bool:
-    """Return a truth value of any type; ValueError for anything else, as "no"."""
+    """Return a truth value of any type, but not "no"."""
     if isinstance(value, (bool, np.bool_, int)) and value in (0, 1):
         return bool(value)
     raise ValueError(f"{name} is {value!r}; give True or False")
 
 
 def numbers(
-    name: str, values: ArrayLike, shape: tuple[int, ...] | None = None, kinds: str = "iuf"
+    name: str,
+    values: ArrayLike,
+    shape: tuple[int, ...] | None = None,
+    kinds: str = "iuf",
+    between: tuple[float, float] | None = None,
+    whole: bool = True,
+    remedy: str = "",
 ) -> NDArray[Any]:
-    """Return an array of numbers; ValueError if it has another shape or other elements."""
+    """Return an array of one shape and of some kinds of numbers, or of those in a range."""
     try:
         array = np.asarray(values)
     except ValueError as error:  # rows of different lengths
@@ -111,79 +126,21 @@ def numbers(
         raise ValueError(f"{name} has shape {array.shape}; give {shape}")
     if array.dtype.kind not in kinds:
         raise ValueError(f"{name}: the elements are of type {array.dtype}; give numbers")
+    if between is None or array.dtype.kind == "b" or array.size == 0:
+        return array
+    lowest, highest = between
+    fractions = whole and array.dtype.kind == "f" and not (array == np.floor(array)).all()
+    if fractions or not lowest <= array.min() <= array.max() <= highest:  # or NaN
+        right = (array >= lowest) & (array <= highest) & (not whole or array == np.floor(array))
+        remedy = remedy or f"{'whole numbers ' if whole else ''}{lowest:g} to {highest:g}"
+        raise ValueError(f"{name} holds {array[~right].flat[0]}; give {remedy}")
     return array
 
 
-def whole_numbers(name: str, values: ArrayLike, lowest: int, highest: int) -> NDArray[Any]:
-    """Return an array of whole numbers from `lowest` to `highest`; its dtype stays as it is.
-
-    The message of the ValueError for anything else uses `name` and shows the first wrong value.
-    """
-    array = numbers(name, values)
-    whole = array.dtype.kind != "f" or (array == np.floor(array)).all()  # False for NaN
-    if whole and (array.size == 0 or lowest <= array.min() <= array.max() <= highest):
-        return array
-    valid = (array >= lowest) & (array <= highest) & (array == np.floor(array))
-    wrong = array[~valid].flat[0]
-    raise ValueError(f"{name} hold {wrong}; give whole numbers {lowest}..{highest}")
-
-
 def as_mask(name: str, cells: ArrayLike, shape: tuple[int, ...] | None = None) -> Occupancy:
-    """Return a copy in C order, (H, W) bool; ValueError for another shape or other values."""
-    array = numbers(name, cells, shape, "biuf")
+    """Return a copy in C order, (H, W) bool."""
+    remedy = "True or False (for percent, see from_occupancy_values)"
+    array = numbers(name, cells, shape, "biuf", (0, 1), remedy=remedy)
     if array.ndim != 2 or array.size == 0:
         raise ValueError(f"{name} has shape {array.shape}; give (H, W) with H, W >= 1")
-    mask = array.astype(np.bool_, order="C")
-    if array.dtype.kind != "b" and (wrong := array[array != mask]).size:
-        raise ValueError(
-            f"{name} holds {wrong[0]}; give True or False (for percent, see from_occupancy_values)"
-        )
-    return mask
-
-
-def as_costs(cost: ArrayLike, occupancy: Occupancy) -> NDArray[np.int8]:
-    """Return a copy with 0 in occupied cells; ValueError for another shape or other values."""
-    of_free = np.array(numbers("cost", cost, occupancy.shape), order="C")
-    if of_free.dtype.kind in "iu":
-        of_free *= ~occupancy  # fifty times as fast as the assignment below
-    else:  # NaN times 0 is NaN
-        of_free[occupancy] = 0
-    whole_numbers("costs of free cells", of_free, UNKNOWN, OCCUPIED - 1)
-    return of_free.astype(np.int8, copy=False)
-
-
-def as_directions(forbidden: ArrayLike, shape: tuple[int, int]) -> NDArray[np.uint8] | None:
-    """Return a copy, or None where nothing is forbidden; ValueError as for the costs."""
-    array = whole_numbers("forbidden directions", numbers("forbidden", forbidden, shape), 0, 255)
-    return array.astype(np.uint8, order="C") if array.any() else None
-
-
-def as_slowness(slowness: ArrayLike, shape: tuple[int, int]) -> NDArray[np.float32]:
-    """Return a copy; ValueError as for the costs."""
-    array = numbers("slowness", slowness, shape)
-    if not 1 <= array.min() <= array.max() <= MAX_SLOWNESS:
-        wrong = array[~((array >= 1) & (array <= MAX_SLOWNESS))][0]
-        raise ValueError(f"slowness holds {wrong}; give 1 to {MAX_SLOWNESS:g}")
-    return array.astype(np.float32, order="C")
-
-
-def as_resolution(resolution: Any) -> float:
-    """Return metres per cell; ValueError unless finite and > 0."""
-    if not 0 < real(resolution) < math.inf:
-        raise ValueError(f"resolution is {resolution!r}; give metres per cell, finite and > 0")
-    return real(resolution)
-
-
-def as_seconds(seconds_per_cell: Any) -> float:
-    """Return seconds; ValueError unless finite and > 0."""
-    if not 0 < real(seconds_per_cell) < math.inf:
-        raise ValueError(f"seconds_per_cell is {seconds_per_cell!r}; give more than 0")
-    return real(seconds_per_cell)
-
-
-def as_origin(origin: Any) -> tuple[float, ...]:
-    """Return x, y and yaw; ValueError unless these are three finite numbers."""
-    pose = tuple(map(real, listed(origin, "origin")))
-    if len(pose) != 3 or not all(map(math.isfinite, pose)):
-        raise ValueError(f"origin is {origin!r}; give three finite numbers x, y, yaw")
-    return pose
+    return array.astype(np.bool_, order="C")

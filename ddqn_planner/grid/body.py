@@ -1,14 +1,17 @@
-"""The robot's body: which cells are too near to an obstacle, and which are better avoided."""
+"""The robot's body: which cells are too near to an obstacle, and which are better avoided.
+
+`inflate` finds them, or Nav2 has found them in a costmap.
+"""
 
 from __future__ import annotations
 
-from dataclasses import replace
+import sys
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
-from ddqn_planner.grid.arguments import OCCUPIED, UNKNOWN, Occupancy, real
-from ddqn_planner.grid.grid_map import GridMap, check_grid
+from ddqn_planner.grid.arguments import OCCUPIED, UNKNOWN, Occupancy, as_number
+from ddqn_planner.grid.grid_map import MAX_COST_MULTIPLIER, GridMap, check_grid
 
 CLEARANCE_SCALE = 1.0
 """Metres beyond the body over which the cost near an obstacle falls to an eighth.
@@ -19,6 +22,19 @@ distances. See docs/tuning.md."""
 
 ROUNDING = 1e-6
 """A message has the resolution as float32: 0.2 m must be 4 cells of 0.05 m, not 3.9999999."""
+
+INSCRIBED = 99
+"""The value of a cell that is free, but so near to an obstacle that the robot would touch it."""
+
+_COSTMAP_COST = 1 + (np.arange(INSCRIBED) - 1) * 251 / 97
+"""The smallest cost of a costmap, 1 to 252, that its publisher writes as each value, 1 to 98."""
+
+_MULTIPLIER = (50 + 0.8 * _COSTMAP_COST) / 50
+"""NavFn's cost of a cell beside its neutral cost: from 1 to 5."""
+
+_COSTS = np.rint((_MULTIPLIER - 1) / (MAX_COST_MULTIPLIER - 1) * OCCUPIED).clip(0, OCCUPIED - 1)
+_COSTS = np.append(_COSTS, UNKNOWN).astype(np.int8)
+"""(100,) int8: the cost in a `GridMap` of each value, 0 to 98, and last of an unknown cell, -1."""
 
 
 def clearance(obstacles: Occupancy) -> NDArray[np.float64]:
@@ -56,11 +72,9 @@ def inflate(grid: GridMap, robot_radius: float, clearance_weight: float = 0.0) -
         If the radius or the weight is out of its range, or the map is none.
     """
     check_grid(grid)
-    if not 0 <= real(robot_radius) < np.inf:
-        raise ValueError(f"robot_radius is {robot_radius!r}; give metres, finite and 0 or more")
-    if not 0 <= real(clearance_weight) <= 1:
-        raise ValueError(f"clearance_weight is {clearance_weight!r}; give 0 to 1")
-    robot_radius, clearance_weight = real(robot_radius), real(clearance_weight)
+    largest, remedy = sys.float_info.max, "metres, finite and 0 or more"
+    robot_radius = as_number("robot_radius", robot_radius, 0, largest, remedy)
+    clearance_weight = as_number("clearance_weight", clearance_weight, 0, 1)
     if robot_radius == 0 and clearance_weight == 0:
         return grid
     metres = clearance(grid.occupancy) * grid.resolution
@@ -72,79 +86,91 @@ def inflate(grid: GridMap, robot_radius: float, clearance_weight: float = 0.0) -
         cost = np.rint((OCCUPIED - 1) * share).astype(np.int8)
         if grid.cost is not None:
             cost = np.where(grid.cost == UNKNOWN, UNKNOWN, np.maximum(cost, grid.cost))
-    return replace(grid, occupancy=occupancy, cost=cost, obstacles=grid.occupancy)
+    cost = None if cost is None else cost * ~occupancy
+    return grid.with_layers(occupancy=occupancy, cost=cost, obstacles=grid.occupancy)
 
 
 class Inflation:
     """Inflates maps as they come: of a map like the last one, only what is near changed cells."""
 
     def __init__(self) -> None:
-        self._last: tuple[tuple[float, float], GridMap, GridMap] | None = None
+        self._last: tuple[GridMap, GridMap, tuple[float, float]] | None = None
 
-    def __call__(self, grid: GridMap, *body: float) -> GridMap:
-        """Return what `inflate` returns; `body` is the radius and the weight."""
-        radius, weight = body
-        if self._last is None or self._last[0] != body:
-            inflated = inflate(grid, radius, weight)
+    def __call__(self, grid: GridMap, robot_radius: float, clearance_weight: float) -> GridMap:
+        """Return what `inflate` returns."""
+        body = robot_radius, clearance_weight
+        if self._last is not None and self._last[2] == body and _alike(grid, self._last[0]):
+            inflated = _inflate_changed(grid, *self._last)
         else:
-            inflated = inflate_changed(grid, *self._last[1:], radius, weight)
-        self._last = (radius, weight), grid, inflated
+            inflated = inflate(grid, *body)
+        self._last = grid, inflated, body
         return inflated
 
 
-def inflate_changed(
-    grid: GridMap,
-    before: GridMap,
-    inflated: GridMap,
-    robot_radius: float,
-    clearance_weight: float = 0.0,
-) -> GridMap:
-    """Return what `inflate` returns, computed only near the cells that differ from another map.
+def _alike(grid: GridMap, other: GridMap) -> bool:
+    """Return whether two maps differ in their cells at most."""
+    return (grid.occupancy.shape, grid.resolution, grid.cost is None) == (
+        other.occupancy.shape,
+        other.resolution,
+        other.cost is None,
+    )
 
-    Parameters
-    ----------
-    grid : GridMap
-    before, inflated : GridMap
-        The other map, and what `inflate` made of it with the same radius and weight.
-    robot_radius, clearance_weight : float
-        As for `inflate`.
-    """
-    shape = grid.occupancy.shape
-    same_kind = before.occupancy.shape == shape and before.resolution == grid.resolution
-    if not same_kind or (before.cost is None) != (grid.cost is None) or inflated is before:
-        return inflate(grid, robot_radius, clearance_weight)
+
+def _inflate_changed(
+    grid: GridMap, before: GridMap, inflated: GridMap, body: tuple[float, float]
+) -> GridMap:
+    """Return what `inflate` returns, given what it returned for a map that is alike."""
+    robot_radius, clearance_weight = body
+    if inflated is before:  # no body
+        return grid
     differs = before.occupancy != grid.occupancy
     if before.cost is not None and grid.cost is not None:
         differs |= before.cost != grid.cost
-    # Farther away than this, an obstacle has no effect: the cost that it adds is rounded to 0.
-    reach = robot_radius
-    if clearance_weight > 0:
-        greatest = 2 * (OCCUPIED - 1) * clearance_weight
-        reach += max(np.cbrt(greatest) - 1, 0) * CLEARANCE_SCALE
-    cells = int(reach / grid.resolution) + 2
     occupancy, cost = inflated.occupancy, inflated.cost
     if differs.any():
-        spans = [np.flatnonzero(differs.any(axis=axis))[[0, -1]] + (0, 1) for axis in (1, 0)]
-        box, window = (
-            tuple(
-                slice(max(first - margin, 0), min(last + margin, size))
-                for (first, last), size in zip(spans, shape, strict=True)
-            )
-            for margin in (cells, 2 * cells)
-        )
-        part = GridMap(grid.occupancy[window], grid.resolution, cost=_part(grid.cost, window))
-        part = inflate(part, robot_radius, clearance_weight)
-        within = tuple(
-            slice(inner.start - outer.start, inner.stop - outer.start)
-            for inner, outer in zip(box, window, strict=True)
-        )
+        # Farther away than this, an obstacle has no effect: the cost that it adds is rounded to 0.
+        reach = robot_radius
+        if clearance_weight > 0:
+            greatest = 2 * (OCCUPIED - 1) * clearance_weight
+            reach += max(np.cbrt(greatest) - 1, 0) * CLEARANCE_SCALE
+        cells = int(reach / grid.resolution) + 2
+        near = np.zeros_like(differs)
+        near[_around(differs, cells)] = True
+        window = _around(differs, 2 * cells)
+        near = near[window]
+        given = None if grid.cost is None else grid.cost[window]
+        part = inflate(GridMap(grid.occupancy[window], grid.resolution, cost=given), *body)
         occupancy = occupancy.copy()
-        occupancy[box] = part.occupancy[within]
+        occupancy[window][near] = part.occupancy[near]
         if cost is not None and part.cost is not None:
             cost = cost.copy()
-            cost[box] = part.cost[within]
-    return replace(grid, occupancy=occupancy, cost=cost, obstacles=grid.occupancy)
+            cost[window][near] = part.cost[near]
+    return grid.with_layers(occupancy=occupancy, cost=cost, obstacles=grid.occupancy)
 
 
-def _part(cost: NDArray[np.int8] | None, box: tuple[slice, ...]) -> NDArray[np.int8] | None:
-    return None if cost is None else cost[box]
+def _around(cells: NDArray[np.bool_], margin: int) -> tuple[slice, ...]:
+    """Return the box of some cells, with a margin."""
+    ends = [np.flatnonzero(cells.any(axis=axis))[[0, -1]] for axis in (1, 0)]
+    return tuple(slice(max(first - margin, 0), last + margin + 1) for first, last in ends)
+
+
+def grid_from_costmap(
+    values: ArrayLike,
+    resolution: float = 1.0,
+    origin: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    allow_unknown: bool = False,
+) -> GridMap:
+    """Make a grid map from the values of a costmap that Nav2 publishes as an ``OccupancyGrid``.
+
+    A cell of value 100 is an obstacle. One of 99 is too near to an obstacle for the robot's body:
+    it is occupied, and a robot that starts there may leave. Values of 1 to 98 become costs as in
+    Nav2's NavFn planner: 50 for a free cell plus 0.8 times the costmap's cost, 0 to 252. Unknown
+    cells, if they are free, have the highest cost. The rest is as for
+    `GridMap.from_occupancy_values`.
+    """
+    grid = GridMap.from_occupancy_values(
+        values, resolution, origin, INSCRIBED, allow_unknown, use_map_costs=True
+    )
+    assert grid.cost is not None
+    obstacles = grid.occupancy & (np.asarray(values) != INSCRIBED)
+    return grid.with_layers(cost=_COSTS.take(grid.cost, mode="wrap"), obstacles=obstacles)

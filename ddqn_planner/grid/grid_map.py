@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
@@ -12,32 +12,23 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ddqn_planner.grid.arguments import (
+    MAX_SLOWNESS,
     OCCUPIED,
+    POSITIVE,
     UNKNOWN,
+    Cell,
     Occupancy,
     as_cell,
-    as_costs,
-    as_directions,
     as_flag,
     as_mask,
-    as_origin,
-    as_resolution,
-    as_seconds,
-    as_slowness,
+    as_number,
     cell_inside,
     cells_inside,
+    listed,
+    numbers,
     real,
-    whole_numbers,
 )
-from ddqn_planner.grid.arguments import Cell as Cell
-from ddqn_planner.grid.labels import flood
-from ddqn_planner.grid.moves import (
-    MOVES,
-    MoveRule,
-    component_labels,
-    legal_moves,
-    reversed_moves,
-)
+from ddqn_planner.grid.moves import MoveRule, component_labels, flood, legal_moves
 
 MAX_COST_MULTIPLIER = 5.0
 """The cost multiplier of a cell of value 100, and of an unknown cell.
@@ -50,7 +41,9 @@ _MULTIPLIERS = np.linspace(1, MAX_COST_MULTIPLIER, OCCUPIED + 1, dtype=np.float3
 
 @dataclass(frozen=True, eq=False)
 class GridMap:
-    """A map of free and occupied cells. It keeps read-only copies of the arrays.
+    """A map of free and occupied cells, which keeps read-only copies of the arrays.
+
+    Here and in all methods, a ValueError names what is wrong and what would be right.
 
     Parameters
     ----------
@@ -65,9 +58,8 @@ class GridMap:
         Cost of each free cell: 0..99, or -1 for an unknown cell; see `cost_multiplier`. Values of
         occupied cells are ignored and become 0. By default all free cells cost the same.
     obstacles : (H, W) bool, optional
-        Which occupied cells are obstacles. The others are only too near to an obstacle for the
-        robot's body, and a robot that starts there may leave; `inflate` makes such maps. By default
-        all occupied cells are obstacles.
+        Which occupied cells are obstacles, by default all. The others are only too near to an
+        obstacle for the robot's body, and a robot that starts there may leave; see `inflate`.
     forbidden : (H, W) array of whole numbers 0..255, optional
         One-way zones: action a must not leave a cell where bit a is set, ``forbidden >> a & 1``.
         The actions are those of `MOVES`, in the directions of the map's own x and y. A cell may
@@ -75,15 +67,9 @@ class GridMap:
         with dx = -1) lets a robot drive through it toward greater x, and not back. Directions
         belong to the place: they stay where a cell becomes occupied or free.
     slowness : (H, W) float32, optional
-        The expected time in each cell over that at nominal speed, 1 to 100. It multiplies the
-        cost; see `with_slowness`.
+        The expected time in each cell over that at nominal speed, 1 to 100; it multiplies the cost.
     seconds_per_cell : float, optional
         The time for the length of a cell at nominal speed: with it, `Plan.cost` is in seconds.
-
-    Raises
-    ------
-    ValueError
-        If a shape, a number, a cost or a direction is wrong, or if an obstacle lies on a free cell.
     """
 
     occupancy: Occupancy
@@ -97,27 +83,31 @@ class GridMap:
 
     def __post_init__(self) -> None:
         occupancy = as_mask("occupancy", self.occupancy)
-        self._set("occupancy", occupancy)
-        self._set("resolution", as_resolution(self.resolution))
-        self._set("origin", as_origin(self.origin))
+        metres = as_number("resolution", self.resolution, *POSITIVE, "metres per cell, > 0")
+        self._set(occupancy=occupancy, resolution=metres, origin=_origin(self.origin))
         if self.cost is not None:
-            self._set("cost", as_costs(self.cost, occupancy))
+            self._set(cost=_costs(self.cost, occupancy))
         if self.obstacles is not None:
             obstacles = as_mask("obstacles", self.obstacles, occupancy.shape)
             if (obstacles & ~occupancy).any():
                 raise ValueError("obstacles lie on free cells; give some within the occupied cells")
-            self._set("obstacles", obstacles)
+            self._set(obstacles=obstacles)
         if self.forbidden is not None:
-            self._set("forbidden", as_directions(self.forbidden, occupancy.shape))
+            bits = numbers("forbidden", self.forbidden, occupancy.shape, between=(0, 255))
+            self._set(forbidden=bits.astype(np.uint8, order="C") if bits.any() else None)
         if self.slowness is not None:
-            self._set("slowness", as_slowness(self.slowness, occupancy.shape))
+            slowest = 1, MAX_SLOWNESS
+            slowness = numbers("slowness", self.slowness, occupancy.shape, "iuf", slowest, False)
+            self._set(slowness=slowness.astype(np.float32, order="C"))
         if self.seconds_per_cell is not None:
-            self._set("seconds_per_cell", as_seconds(self.seconds_per_cell))
+            seconds = as_number("seconds_per_cell", self.seconds_per_cell, *POSITIVE, "more than 0")
+            self._set(seconds_per_cell=seconds)
 
-    def _set(self, name: str, value: Any) -> None:
-        if isinstance(value, np.ndarray):
-            value.flags.writeable = False
-        object.__setattr__(self, name, value)  # the dataclass is frozen
+    def _set(self, **layers: Any) -> None:
+        for value in layers.values():
+            if isinstance(value, np.ndarray):
+                value.flags.writeable = False
+        vars(self).update(layers)  # the dataclass is frozen
 
     @classmethod
     def from_occupancy_values(
@@ -139,23 +129,16 @@ class GridMap:
         resolution, origin, forbidden
             As for `GridMap`.
         occupied_threshold : int
-            A cell of this value or more is occupied, 1..100. The default is the usual
-            ``occupied_thresh`` of map_server, in percent.
+            A cell of this value or more is occupied, 1..100; map_server has 65 by default.
         allow_unknown : bool
             Whether unknown cells are free.
         use_map_costs : bool
             Whether free cells keep their values as costs; otherwise all cost the same.
-
-        Raises
-        ------
-        ValueError
-            If the values, the threshold or the arguments of `GridMap` are wrong.
         """
-        if not 1 <= real(occupied_threshold) <= OCCUPIED:
-            raise ValueError(f"occupied_threshold is {occupied_threshold!r}; give 1 to {OCCUPIED}")
-        array = whole_numbers("occupancy values", values, -128, 127)
+        as_number("occupied_threshold", occupied_threshold, 1, OCCUPIED)
+        array = numbers("the array of values", values, between=(-128, 127))
         if array.dtype.kind == "f":  # these may be probabilities, 1.0 for occupied
-            raise ValueError(f"occupancy values are of type {array.dtype}; give integers, percent")
+            raise ValueError(f"the values are of type {array.dtype}; give integers, percent")
         array = array.astype(np.int8, copy=False)
         occupied = array >= occupied_threshold
         if not as_flag("allow_unknown", allow_unknown):
@@ -189,11 +172,6 @@ class GridMap:
         obstacles : (h, w) bool, optional
             Which of the new occupied cells are obstacles, as for `GridMap`; by default all. On a
             map without obstacles of its own they are ignored.
-
-        Raises
-        ------
-        ValueError
-            If the patch is empty or not inside the map, or its costs or obstacles are wrong.
         """
         patch = as_mask("occupancy", occupancy)
         left, bottom = as_cell((x, y), "the first cell of the patch")
@@ -207,41 +185,28 @@ class GridMap:
         costs = self.cost
         if costs is not None or cost is not None:
             costs = np.zeros(self.occupancy.shape, dtype=np.int8) if costs is None else costs
-            costs = _replaced(costs, box, as_costs(costs[box] if cost is None else cost, patch))
+            costs = _replaced(costs, box, _costs(costs[box] if cost is None else cost, patch))
         closed = patch
         if obstacles is not None:
             closed = patch & as_mask("obstacles", obstacles, patch.shape)
-        return self._changed(
+        return self.with_layers(
             occupancy=_replaced(self.occupancy, box, patch),
             cost=costs,
             obstacles=_replaced(self.obstacles, box, closed),
         )
 
     def with_slowness(self, slowness: NDArray[np.float32], seconds_per_cell: float) -> GridMap:
-        """Return the same map with other expected times; it shares all other arrays with this one.
+        """Return the same map with other expected times."""
+        return replace(self, slowness=slowness, seconds_per_cell=seconds_per_cell)
 
-        Parameters
-        ----------
-        slowness, seconds_per_cell
-            As for `GridMap`.
-
-        Raises
-        ------
-        ValueError
-            If a shape or a number is wrong.
-        """
-        checked = as_slowness(slowness, self.occupancy.shape)
-        return self._changed(slowness=checked, seconds_per_cell=as_seconds(seconds_per_cell))
-
-    def _changed(self, **layers: Any) -> GridMap:
-        """Return the same map with other layers, which need no check: planners need it often."""
+    def with_layers(self, **layers: Any) -> GridMap:
+        """Return the same map with other layers, which are neither checked nor copied."""
         stale = {"cost_multiplier", "fingerprint"}
         if "occupancy" in layers:
             stale |= {"_labels", "_checksum"}
+        kept = {name: value for name, value in vars(self).items() if name not in stale}
         changed = object.__new__(GridMap)
-        for name, value in {**self.__dict__, **layers}.items():
-            if name not in stale:
-                changed._set(name, value)
+        changed._set(**{**kept, **layers})
         return changed
 
     @property
@@ -274,10 +239,7 @@ class GridMap:
         return multiplier if self.slowness is None else multiplier * self.slowness
 
     def labels(self, move_rule: MoveRule | str) -> NDArray[np.int32]:
-        """Return the connected component of each cell, see `component_labels`.
-
-        The map computes them once per kind of move rule, and remembers them: 4 bytes per cell.
-        """
+        """Return the connected component of each cell, see `component_labels`; it is remembered."""
         rule = MoveRule(move_rule)
         if rule.cuts_corners not in self._labels:
             self._labels[rule.cuts_corners] = component_labels(self.occupancy, rule)
@@ -290,27 +252,15 @@ class GridMap:
     def reachable(
         self, cells: ArrayLike, move_rule: MoveRule | str, backward: bool = False
     ) -> NDArray[np.bool_]:
-        """Return (H, W) bool: some free cells, and where paths lead that start in one of them.
+        """Return (H, W) bool: some free cells (N, 2), and where paths lead that start in them.
 
-        Parameters
-        ----------
-        cells : (N, 2) array of whole numbers
-            As (x, y).
-        move_rule : MoveRule
-        backward : bool
-            Whether paths end, instead of start, in one of the cells.
-
-        Raises
-        ------
-        ValueError
-            If a cell lies outside the map.
+        With `backward`, they end there. A cell outside the map is a ValueError.
         """
         array, backward = cells_inside(cells, self.occupancy.shape), as_flag("backward", backward)
         if self.forbidden is None:
             labels = self.labels(move_rule)
             return np.isin(labels, labels[array[:, 1], array[:, 0]])
-        legal = self.legal_moves(move_rule)
-        return flood(reversed_moves(legal) if backward else legal, array, MOVES)
+        return flood(self.legal_moves(move_rule), array, backward)
 
     @cached_property
     def _labels(self) -> dict[bool, NDArray[np.int32]]:
@@ -321,12 +271,10 @@ class GridMap:
         """Hexadecimal digest of size and cells; equal maps have the same digest."""
         digest = hashlib.sha256(f"{self.height}x{self.width}:".encode())
         digest.update(np.packbits(self.occupancy).tobytes())
-        if self.cost is not None:
-            digest.update(self.cost.tobytes())
-        if self.forbidden is not None:
-            digest.update(b"forbidden:" + self.forbidden.tobytes())
-        if self.slowness is not None:
-            digest.update(b"slowness:" + self.slowness.tobytes())
+        layers = (b"", self.cost), (b"forbidden:", self.forbidden), (b"slowness:", self.slowness)
+        for name, layer in layers:
+            if layer is not None:
+                digest.update(name + layer.tobytes())
         return digest.hexdigest()[:16]
 
     @cached_property
@@ -338,12 +286,10 @@ class GridMap:
     def same_cells(self, other: GridMap) -> bool:
         """Return whether all cells of two maps are equal, wherever the maps lie."""
         check_grid(other, "other")
+        names = "occupancy", "cost", "forbidden", "slowness"
         return self is other or (
-            _equal(self.slowness, other.slowness)
-            and self._checksum == other._checksum
-            and np.array_equal(self.occupancy, other.occupancy)
-            and _equal(self.cost, other.cost)
-            and _equal(self.forbidden, other.forbidden)
+            self._checksum == other._checksum
+            and all(_equal(getattr(self, name), getattr(other, name)) for name in names)
         )
 
     def contains(self, cell: Cell) -> bool:
@@ -383,7 +329,16 @@ class GridMap:
 
     def cell_to_world(self, cell: Cell) -> tuple[float, float]:
         """Return the centre of a cell in the map frame, in metres."""
-        return centre(self, *as_cell(cell))
+        return self.centres(*as_cell(cell))
+
+    def centres(self, x: Any, y: Any) -> tuple[Any, Any]:
+        """Return the centre of a cell, or of each of many (arrays), in the map frame, in metres."""
+        origin_x, origin_y, yaw = self.origin
+        along_x, along_y = (x + 0.5) * self.resolution, (y + 0.5) * self.resolution
+        return (
+            origin_x + math.cos(yaw) * along_x - math.sin(yaw) * along_y,
+            origin_y + math.sin(yaw) * along_x + math.cos(yaw) * along_y,
+        )
 
 
 def check_grid(grid: object, name: str = "grid") -> None:
@@ -392,14 +347,22 @@ def check_grid(grid: object, name: str = "grid") -> None:
         raise ValueError(f"{name} is {grid!r}; give a GridMap")
 
 
-def centre(grid: GridMap, x: Any, y: Any) -> tuple[Any, Any]:
-    """Return the centre of a cell, or of each of many (arrays), in the map frame, in metres."""
-    origin_x, origin_y, yaw = grid.origin
-    along_x, along_y = (x + 0.5) * grid.resolution, (y + 0.5) * grid.resolution
-    return (
-        origin_x + math.cos(yaw) * along_x - math.sin(yaw) * along_y,
-        origin_y + math.sin(yaw) * along_x + math.cos(yaw) * along_y,
-    )
+def _origin(origin: Any) -> tuple[float, ...]:
+    pose = tuple(map(real, listed(origin, "origin")))
+    if len(pose) != 3 or not all(map(math.isfinite, pose)):
+        raise ValueError(f"origin is {origin!r}; give three finite numbers x, y, yaw")
+    return pose
+
+
+def _costs(cost: ArrayLike, occupancy: Occupancy) -> NDArray[np.int8]:
+    """Return a copy with 0 in occupied cells."""
+    of_free = np.array(numbers("cost", cost, occupancy.shape), order="C")
+    if of_free.dtype.kind in "iu":
+        of_free *= ~occupancy  # fifty times as fast as the assignment below
+    else:  # NaN times 0 is NaN
+        of_free[occupancy] = 0
+    numbers("cost", of_free, between=(UNKNOWN, OCCUPIED - 1))
+    return of_free.astype(np.int8, copy=False)
 
 
 def _replaced(array: NDArray[Any] | None, box: tuple[slice, slice], values: NDArray[Any]) -> Any:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import re
 import reprlib
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,27 +14,24 @@ from typing import Any
 import numpy as np
 import yaml
 from numpy.typing import NDArray
+from PIL import Image
 
 from ddqn_planner.files import as_path, write_atomically
-from ddqn_planner.grid.arguments import OCCUPIED, UNKNOWN, Cell, as_cell, whole_numbers
+from ddqn_planner.grid.arguments import OCCUPIED, UNKNOWN, Cell, cell_inside, numbers
 from ddqn_planner.grid.grid_map import GridMap
-from ddqn_planner.grid.map_image import (
-    DIRECTION_FORMATS,
-    IMAGE_FORMATS,
-    read_directions,
-    read_grey,
-)
 
 MAX_CELLS = 2**26
 """A larger map is refused before its cells are read."""
 
 MAX_YAML_BYTES = 2**16
 
-NEGATE = {
-    **dict.fromkeys(("0", "n", "no", "false", "off"), False),
-    **dict.fromkeys(("1", "y", "yes", "true", "on"), True),
-}
+YES, NO = ("1", "y", "yes", "true", "on"), ("0", "n", "no", "false", "off")
 """Values of ``negate``: whether light pixels are occupied instead of dark ones."""
+
+LAYOUTS = {"1", "1;I", "L", "L;2", "L;4", "LA", "I;16B", "P", "P;1", "P;2", "P;4"}
+LAYOUTS |= {"RGB", "RGBA", "BGR", "BGRA", "CMYK;I"}
+"""Pillow's names of the pixel layouts in files that it reads as map_server does. In other layouts
+Pillow drops bits, or map_server takes the fourth byte of a pixel as its opacity."""
 
 _shortener = reprlib.Repr()
 _shortener.maxlevel = 2  # YAML aliases can nest lists that are huge when they are printed
@@ -59,25 +56,12 @@ class MapMetadataError(MapFileError):
 
 @dataclass(frozen=True, eq=False)
 class MapFile:
-    """The content of a map file.
+    """The content of a map file; a value out of its range is a ValueError.
 
-    Parameters
-    ----------
-    values : (H, W) int8
-        Occupancy in percent, 0..100, or -1 where unknown; a read-only copy is kept. Row y = 0 is
-        the bottom row of a ROS map's image, but the first row of a MovingAI file, so that x and y
-        of its scenario files are valid.
-    resolution, origin
-        As for `GridMap`.
-    start, goal : (x, y), optional
-        Cells between which to plan.
-    forbidden : (H, W) uint8, optional
-        As for `GridMap`.
-
-    Raises
-    ------
-    ValueError
-        If a value is out of its range, or the start or the goal lies outside the map.
+    `values` are occupancies in percent, 0..100, or -1 where unknown; a read-only copy is kept. Row
+    y = 0 is the bottom row of a ROS map's image, but the first row of a MovingAI file, so that x
+    and y of its scenario files are valid. `start` and `goal` are cells between which to plan. The
+    rest is as for `GridMap`.
     """
 
     values: NDArray[np.int8]
@@ -88,23 +72,17 @@ class MapFile:
     forbidden: NDArray[np.uint8] | None = None
 
     def __post_init__(self) -> None:
-        values = whole_numbers("values", self.values, UNKNOWN, OCCUPIED)
-        checked = GridMap(
-            values == OCCUPIED, self.resolution, self.origin, forbidden=self.forbidden
-        )
-        for name in ("start", "goal"):
-            if (cell := getattr(self, name)) is None:
-                continue
-            if not checked.contains(cell := as_cell(cell, name)):
-                size = f"{checked.width} x {checked.height}"
-                raise ValueError(f"{name} is {cell}; give a cell (x, y) of the map of {size} cells")
-            object.__setattr__(self, name, cell)
+        values = numbers("the array of values", self.values, between=(UNKNOWN, OCCUPIED))
         values = values.astype(np.int8)
+        occupancy = values == OCCUPIED
+        grid = GridMap(occupancy, self.resolution, self.origin, forbidden=self.forbidden)
         values.flags.writeable = False
-        object.__setattr__(self, "values", values)
-        object.__setattr__(self, "resolution", checked.resolution)
-        object.__setattr__(self, "origin", checked.origin)
-        object.__setattr__(self, "forbidden", checked.forbidden)
+        names = "resolution", "origin", "forbidden"
+        checked = {"values": values, **{name: getattr(grid, name) for name in names}}
+        for name in ("start", "goal"):
+            if (cell := getattr(self, name)) is not None:
+                checked[name] = cell_inside(cell, values.shape, name)
+        vars(self).update(checked)  # the dataclass is frozen
 
     def grid(
         self, occupied_threshold: int = 65, allow_unknown: bool = False, use_map_costs: bool = False
@@ -122,15 +100,6 @@ def load_map(
     allow_unknown: bool = False,
     use_map_costs: bool = False,
 ) -> GridMap:
-    """Read a grid map from a ROS map (.yaml) or a MovingAI map (.map).
-
-    See `read_map_file` for the path and the errors, and `GridMap.from_occupancy_values` for the
-    other parameters.
-    """
-    return read_map_file(path).grid(occupied_threshold, allow_unknown, use_map_costs)
-
-
-def read_map_file(path: str | Path) -> MapFile:
     """Read a ROS map (.yaml or .yml) or a map of the MovingAI benchmark (.map).
 
     A ROS map is read as Nav2's map_server 1.3.7 and later reads it, with these differences:
@@ -148,6 +117,8 @@ def read_map_file(path: str | Path) -> MapFile:
     ----------
     path : str or Path
         A leading ``~`` stands for the home folder.
+    occupied_threshold, allow_unknown, use_map_costs
+        As for `GridMap.from_occupancy_values`.
 
     Raises
     ------
@@ -158,6 +129,11 @@ def read_map_file(path: str | Path) -> MapFile:
     MapDataError
         If the cells of the map cannot be read.
     """
+    return read_map_file(path).grid(occupied_threshold, allow_unknown, use_map_costs)
+
+
+def read_map_file(path: str | Path) -> MapFile:
+    """Read all that a map file holds; see `load_map` for the path and the errors."""
     path = as_path(path)
     with suppress(ValueError):  # "~" with a user name that is impossible
         path = Path(os.path.expanduser(path))
@@ -181,20 +157,7 @@ def save_map(grid: GridMap | MapFile, path: str | Path) -> None:
     A `MapFile` reads back equal. So does a `GridMap` without costs by ``load_map(path)``, and one
     with costs by ``load_map(path, occupied_threshold=100, allow_unknown=True,
     use_map_costs=True)``. `GridMap.obstacles` is not written. Forbidden directions are written to
-    one more PGM, ``NAME_directions.pgm``.
-
-    Parameters
-    ----------
-    grid : GridMap or MapFile
-    path : str or Path
-        The YAML file; missing folders are made.
-
-    Raises
-    ------
-    MapFileError
-        If the path does not end in .yaml or .yml.
-    OSError
-        If a file cannot be written.
+    one more PGM, ``NAME_directions.pgm``. Missing folders are made.
     """
     path = Path(os.path.expanduser(path))
     if path.suffix.lower() not in (".yaml", ".yml"):
@@ -287,33 +250,22 @@ def _read_ros(path: Path) -> MapFile:
         raise ValueError(
             f"ddqn_planner is {_short(ours)}; give some of {{start: , goal: , directions: }}"
         )
-    directions = ours.pop("directions", None)
-    if directions is not None:
-        directions = _image_path(path, "directions", directions)
+    name = ours.pop("directions", None)
+    directions = None if name is None else _image_path(path, "directions", name)
     cells: Any = {name: _numbers(cell, name, "[x, y]") for name, cell in ours.items()}
-    grey, clear = _read_image(read_grey, image, IMAGE_FORMATS)
+    grey, clear = _read_image(image, _grey, ("PPM", "PNG", "BMP", "JPEG"))
     values: NDArray[np.int8] = percent[grey]
     if mode != "raw":
         values[clear] = UNKNOWN
     forbidden = None
     if directions is not None:
-        forbidden = _read_image(read_directions, directions, DIRECTION_FORMATS)[::-1]
+        forbidden = _read_image(directions, _directions, ("PPM", "PNG"))[::-1]
         if forbidden.shape != values.shape:
             sizes = [f"{width} x {height}" for height, width in (forbidden.shape, values.shape)]
             raise MapDataError(
                 f"{str(directions)!r}: has {sizes[0]} pixels; give {sizes[1]}, as the map's image"
             )
     return MapFile(values[::-1], resolution, (x, y, yaw), **cells, forbidden=forbidden)
-
-
-def _read_image(read: Callable[[Path, int], Any], image: Path, formats: Iterable[str]) -> Any:
-    try:
-        return read(image, MAX_CELLS)
-    except Exception as error:  # Pillow's decoders raise many exceptions on broken bytes
-        raise MapDataError(
-            f"{str(image)!r}: not readable ({error}); give a {', '.join(formats)} image of at"
-            f" most {MAX_CELLS} pixels"
-        ) from error
 
 
 def _image_path(path: Path, key: str, name: object) -> Path:
@@ -329,6 +281,62 @@ def _image_path(path: Path, key: str, name: object) -> Path:
             f"{key} is {name!r}, outside of the folder of the YAML file; put it beside the YAML"
         )
     return image
+
+
+def _read_image(path: Path, pixels: Callable[[Any, str], Any], formats: tuple[str, ...]) -> Any:
+    """Return what `pixels` makes of an image and the layout of its pixels in the file."""
+    try:
+        with Image.open(path, formats=formats) as image:
+            return pixels(image, _layout(image))
+    except Exception as error:  # Pillow's decoders raise many exceptions on broken bytes
+        raise MapDataError(
+            f"{str(path)!r}: not readable ({error}); give a {', '.join(formats)} image of at"
+            f" most {MAX_CELLS} pixels"
+        ) from error
+
+
+def _layout(image: Any) -> str:
+    """Return Pillow's name of the layout; ValueError if map_server reads it differently."""
+    if image.width * image.height > MAX_CELLS:
+        raise ValueError(f"{image.width} x {image.height} pixels")
+    codec, *_, arguments = image.tile[0]
+    layout, *rest = [arguments] if isinstance(arguments, str) else arguments
+    # The last argument of a PPM is its greatest value, unless that is the greatest of its bytes.
+    scaled = codec.startswith("ppm") and rest not in ([], [255])
+    if image.mode == "I" and rest == [65535]:
+        scaled = False
+    if scaled or layout not in LAYOUTS or codec == "bmp_rle":
+        raise ValueError(f"its pixels are stored as {codec} {arguments}; save an 8-bit PNG")
+    if "transparency" in image.info and image.mode != "P":
+        raise ValueError("one of its colours is transparent; save it with an alpha channel")
+    return str(layout)
+
+
+def _directions(image: Any, layout: str) -> NDArray[np.uint8]:
+    if layout != "L":
+        raise ValueError(f"its pixels are stored as {layout}; save 8 bits of grey, no alpha")
+    return np.asarray(image)
+
+
+def _grey(image: Any, _: str) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
+    """Return the grey values, and which pixels are not opaque.
+
+    They are those of map_server's GraphicsMagick, with 16 bits per channel: colours become their
+    Rec. 601 luma.
+    """
+    if image.mode.startswith("I"):
+        grey = np.asarray(image) // 257
+    elif image.mode in ("1", "L", "LA"):
+        grey = np.asarray(image.convert("L"))
+    else:
+        colours = image.convert("RGBA" if image.mode == "P" else "RGB")
+        red, green, blue = np.moveaxis(np.asarray(colours, dtype=np.int32), 2, 0)[:3]
+        # The luma is rounded to 16 bits, and cut to 8.
+        grey = (257 * (299 * red + 587 * green + 114 * blue) + 500) // 1000 // 257
+    clear = np.zeros(grey.shape, dtype=np.bool_)
+    if "A" in image.getbands() or "transparency" in image.info:
+        clear = np.asarray(image.convert("RGBA").getchannel("A")) < 255
+    return grey.astype(np.uint8, copy=False), clear
 
 
 def _parse_yaml(content: bytes) -> dict[str, Any]:
@@ -372,8 +380,8 @@ def _percent_of_grey(document: dict[str, Any], mode: str) -> NDArray[np.int8]:
             f"free_thresh is {free_thresh}, occupied_thresh is {occupied_thresh}; give"
             " 0 <= free_thresh <= occupied_thresh <= 1"
         )
-    negate = NEGATE.get(_text(document, "negate"))
-    if negate is None:
+    negate = _text(document, "negate")
+    if negate not in YES + NO:
         raise ValueError(f"negate is {_short(document['negate'])}; give 0 or 1")
     grey = np.arange(256)
     if mode == "raw":
@@ -383,7 +391,7 @@ def _percent_of_grey(document: dict[str, Any], mode: str) -> NDArray[np.int8]:
     # map_server computes in single precision, and a grey value may equal a threshold.
     free, occupied = np.float32(free_thresh), np.float32(occupied_thresh)
     p = grey.astype(np.float32) / np.float32(255)
-    if not negate:
+    if negate in NO:
         p = np.float32(1) - p
     percent = np.full(256, -1.0)
     if mode == "scale" and free < occupied:

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from ddqn_planner.grid.arguments import UNKNOWN, Cell, Choice, Occupancy
 from ddqn_planner.grid.grid_map import GridMap
-from ddqn_planner.grid.moves import MoveRule, component_labels
+from ddqn_planner.grid.moves import MoveRule
 
 MAX_NEW_OBSTACLES = 5
 """The paper adds 1 to 5 obstacles."""
@@ -76,7 +76,7 @@ def random_requests(
     free cells is a ValueError.
     """
     cells = np.flatnonzero(~occupancy)
-    label_of_cell = component_labels(occupancy, move_rule).ravel()[cells]
+    label_of_cell = GridMap(occupancy).labels(move_rule).ravel()[cells]
     order = np.argsort(label_of_cell, kind="stable")
     cells, label_of_cell = cells[order], label_of_cell[order]
     sizes = np.bincount(label_of_cell)

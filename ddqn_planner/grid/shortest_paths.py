@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from ddqn_planner.grid.arguments import Cell, cell_inside
 from ddqn_planner.grid.grid_map import GridMap
-from ddqn_planner.grid.moves import MOVES, MoveRule
+from ddqn_planner.grid.moves import MOVES, MoveRule, move_costs
 
 
 def shortest_distances(grid: GridMap, goal: Cell, move_rule: MoveRule | str) -> NDArray[np.float64]:
@@ -39,32 +39,19 @@ def _dijkstra(grid: GridMap, goal: Cell, move_rule: MoveRule | str) -> Any:
 
     The search runs from the goal, over moves in the opposite direction.
     """
+    from scipy.sparse import csr_array
     from scipy.sparse.csgraph import dijkstra
 
     x, y = cell_inside(goal, grid.occupancy.shape, "the goal")
-    graph = _graph(grid, move_rule)
+    # The matrix is built in scipy's own order, columns sorted: to sort edges would take longer.
+    step = (MOVES[:, 1] * grid.width + MOVES[:, 0]).astype(np.int32)
+    order = np.argsort(step)
+    legal_NA = grid.legal_moves(move_rule)[order].reshape(len(MOVES), -1).T
+    cost_NA = move_costs(grid.cost_multiplier, move_rule)[order].reshape(len(MOVES), -1).T
+    next_NA = np.arange(len(legal_NA), dtype=np.int32)[:, None] + step[order]
+    ends = np.cumsum(np.count_nonzero(legal_NA, axis=1), dtype=np.int32)
+    rows = np.append(np.int32(0), ends)
+    graph = csr_array((cost_NA[legal_NA], next_NA[legal_NA], rows), shape=(len(ends), len(ends)))
     if grid.forbidden is not None:  # else every move is legal, and costs the same, both ways
         graph = graph.T
     return dijkstra(graph, indices=y * grid.width + x, return_predecessors=True)
-
-
-def _graph(grid: GridMap, move_rule: MoveRule | str) -> Any:
-    """Return the cost of each legal move, from cell number y * width + x to another.
-
-    The rows of the sparse matrix are built in scipy's own order: sorting edges would take longer.
-    """
-    from scipy.sparse import csr_array
-
-    step = MOVES[:, 1] * grid.width + MOVES[:, 0]
-    actions = np.argsort(step)  # puts the columns of each row in order
-    legal_NA = grid.legal_moves(move_rule)[actions].reshape(len(MOVES), -1).T
-    edge = np.flatnonzero(legal_NA)
-    cell, place = np.divmod(edge.astype(np.int32), np.int32(len(MOVES)))
-    next_cell = cell + step[actions].astype(np.int32)[place]
-    cost = MoveRule(move_rule).lengths[actions][place]
-    if grid.has_costs:
-        multiplier = grid.cost_multiplier.ravel().astype(np.float64)
-        cost *= (multiplier[cell] + multiplier[next_cell]) / 2
-    row_end = np.cumsum(np.count_nonzero(legal_NA, axis=1), dtype=np.int32)
-    row_start = np.concatenate([np.zeros(1, dtype=np.int32), row_end])
-    return csr_array((cost, next_cell, row_start), shape=(legal_NA.shape[0],) * 2)

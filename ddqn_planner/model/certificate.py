@@ -16,7 +16,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import lru_cache
 from typing import TYPE_CHECKING, Final, TypeAlias
 
 import numpy as np
@@ -26,7 +25,7 @@ from ddqn_planner.grid import MAX_COST_MULTIPLIER, MOVES, OCCUPIED, UNKNOWN, Mov
 from ddqn_planner.model.move_costs import every_patch, legal_in_patches
 
 if TYPE_CHECKING:
-    from ddqn_planner.model.networks import PropagationQNetwork, QNetwork
+    from ddqn_planner.model.networks import PropagationQNetwork
 
 Float64: TypeAlias = NDArray[np.float64]
 
@@ -40,7 +39,7 @@ COSTS = slice(9, 27)
 """The features for costs and unknown cells; see `AnyMapQNetwork.features`."""
 
 NO_CERTIFICATE = "nothing can be proved: the moves depend on the whole map, not on 3x3 patches"
-"""Said of a network that `certificate_of` gives none, such as the paper's."""
+"""Said of a network that has no certificate, such as the paper's."""
 
 MAX_FILTERS = 256
 """For more, the proof would take seconds, and it is not tried."""
@@ -163,20 +162,6 @@ def certify(
             tries = max(tries, float(tries_PA[legal_in_patches(every_P9, rule)].max()))
     least = least if least < math.inf else 0.0
     return Certificate(decisions, undecided, wrong, least, error, tries)
-
-
-@lru_cache(maxsize=1)
-def certificate_of(network: QNetwork, move_rule: MoveRule) -> Certificate | None:
-    """Return the certificate of a loaded network; None if its moves depend on the whole map.
-
-    The last one is kept. A network that does not observe the move rule is certified for the one of
-    its training.
-    """
-    from ddqn_planner.model.networks import AnyMapQNetwork, PropagationQNetwork  # import this
-
-    if isinstance(network, AnyMapQNetwork):
-        return network.certificate
-    return certify(network, [move_rule]) if isinstance(network, PropagationQNetwork) else None
 
 
 def _margins(

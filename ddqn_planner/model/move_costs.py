@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from ddqn_planner.compiled import compiled
 from ddqn_planner.grid import (
     MAX_COST_MULTIPLIER,
     OCCUPIED,
@@ -30,8 +31,6 @@ Time and memory of a field grow with the highest cost, and a broken model may pr
 
 OCCUPIED_PATCH = 512
 """The patch of all occupied cells, and of those outside the map: no move leads out of them."""
-
-NO_PATCHES = np.empty(0, dtype=np.uint16)
 
 
 class MoveCosts(NamedTuple):
@@ -68,50 +67,114 @@ class MoveCosts(NamedTuple):
     straight: float
     diagonal: float
 
+    @classmethod
+    def of_table(cls, table_PA: Array) -> MoveCosts:
+        """Return the costs that a table gives, and one more patch without moves; for no map yet."""
+        table_PA = np.pad(table_PA, ((0, 1), (0, 0)), constant_values=np.inf)
+        highest = float(table_PA.max(where=np.isfinite(table_PA), initial=1))
+        straight = float(table_PA[:, 0::2].min(initial=highest))
+        diagonal = float(table_PA[:, 1::2].min(initial=2 * straight))
+        nowhere = np.empty(0, dtype=np.uint16)
+        return cls(nowhere, table_PA, None, None, 0, highest, straight, diagonal)
 
-def costs_by_patch(patch_C: NDArray[Any], table_PA: Array, width: int) -> MoveCosts:
-    """Return the costs of moves that a table gives."""
-    possible_PA = np.isfinite(table_PA)
-    highest = float(table_PA.max(where=possible_PA, initial=1))
-    straight = float(table_PA[:, 0::2].min(initial=highest))
-    diagonal = float(table_PA[:, 1::2].min(initial=2 * straight))
-    return MoveCosts(patch_C, table_PA, None, None, width, highest, straight, diagonal)
+    def on(self, grid: GridMap, patch: NDArray[Any]) -> MoveCosts:
+        """Return the costs on a map, given its patches, with its directions and expected times."""
+        costs = self._replace(patch=patch, width=grid.width + 2)
+        if self.terms is not None:
+            costs = costs._replace(value=_cell_values(grid))
+        if grid.forbidden is not None:
+            patch, table = _with_directions(patch, self.table, np.pad(grid.forbidden, 1).ravel())
+            costs = costs._replace(patch=patch, table=table)
+        if grid.slowness is None:
+            return costs
+        multiplier = grid.cost_multiplier
+        value = np.pad(multiplier, 1, constant_values=1).ravel()
+        return costs._replace(value=value, highest=costs.highest * float(multiplier.max()))
 
 
-def with_directions(
-    patch: NDArray[Any], table_PA: Array, forbidden: NDArray[np.uint8] | None
+def _with_directions(
+    patch_C: NDArray[Any], table_PA: Array, forbidden_C: NDArray[np.uint8]
 ) -> tuple[NDArray[Any], Array]:
     """Return patches and a table of costs in which forbidden moves are not possible.
 
     Each set of forbidden actions that occurs has its own copy of the table.
-
-    Parameters
-    ----------
-    patch : (...) uint16 or int32
-        The number of each cell's patch.
-    table_PA : (P, 8) float32
-    forbidden : (...) uint8, optional
-        See `GridMap`.
     """
-    if forbidden is None:
-        return patch, table_PA
-    from ddqn_planner.model.compiled_costs import occurring
-
-    occurs = occurring(forbidden.ravel())
+    occurs = _occurring(forbidden_C)
     sets = np.flatnonzero(occurs)
     is_forbidden_SA = (sets[:, None] >> np.arange(table_PA.shape[1]) & 1).astype(np.bool_)
     tables_SPA = np.where(is_forbidden_SA[:, None], np.float32(np.inf), table_PA)
     small = len(sets) * len(table_PA) <= 2**16
     first_row = ((np.cumsum(occurs) - 1) * len(table_PA)).astype(np.uint16 if small else np.int32)
-    rows = first_row.take(forbidden)
-    rows += patch.astype(rows.dtype, copy=False)
-    return rows, tables_SPA.reshape(-1, table_PA.shape[1])
+    rows_C = first_row.take(forbidden_C)
+    rows_C += patch_C.astype(rows_C.dtype, copy=False)
+    return rows_C, tables_SPA.reshape(-1, table_PA.shape[1])
 
 
-def multiplied(costs: MoveCosts, multiplier: NDArray[np.float32]) -> MoveCosts:
-    """Return the costs of moves times what multiplies them in the cells of a map, (H, W)."""
-    value = np.pad(multiplier, 1, constant_values=1).ravel()
-    return costs._replace(value=value, highest=costs.highest * float(multiplier.max()))
+@compiled
+def _occurring(values: NDArray[np.uint8]) -> NDArray[np.bool_]:
+    """Return which values occur: (256,) bool."""
+    occurs = np.zeros(256, np.bool_)
+    for value in values:
+        occurs[value] = True
+    return occurs
+
+
+def _cell_values(grid: GridMap) -> NDArray[np.uint8]:
+    """Return the value of each cell of a map with costs, with a border: (C,) uint8."""
+    assert grid.cost is not None
+    value = np.full((grid.height + 2, grid.width + 2), VALUES - 1, dtype=np.uint8)
+    inside = value[1:-1, 1:-1]
+    np.subtract(grid.cost, UNKNOWN, out=inside, casting="unsafe")
+    inside[grid.occupancy] = VALUES - 1
+    return value.ravel()
+
+
+@compiled
+def patch_numbers(occupancy: NDArray[np.bool_]) -> NDArray[np.uint16]:
+    """Return the patch of each cell, with a border: (C,) uint16.
+
+    Bit 3 y + x is set where the patch's cell (x, y) is occupied; see `OCCUPIED_PATCH`.
+    """
+    height, width = occupancy.shape
+    rows = np.ones((3, width + 2), np.uint8)  # all rows would be memory to fetch
+    numbers = np.empty((height + 2, width + 2), np.uint16)
+    numbers[0], numbers[height + 1] = OCCUPIED_PATCH, OCCUPIED_PATCH
+    for y in range(height + 1):
+        below, here, above, out = rows[(y + 2) % 3], rows[y % 3], rows[(y + 1) % 3], numbers[y]
+        for x in range(width):
+            above[x + 1] = occupancy[y, x] if y < height else 1
+        if y == 0:
+            continue
+        out[0], out[width + 1] = OCCUPIED_PATCH, OCCUPIED_PATCH
+        for x in range(1, width + 1):
+            bits = below[x - 1] + 2 * below[x] + 4 * below[x + 1] + 8 * here[x - 1]
+            bits += 32 * here[x + 1] + 64 * above[x - 1] + 128 * above[x] + 256 * above[x + 1]
+            out[x] = OCCUPIED_PATCH if here[x] else bits
+    return numbers.ravel()
+
+
+def unique_patches(
+    occupancy: NDArray[np.bool_], cost: NDArray[np.int8] | None
+) -> tuple[NDArray[np.int32], NDArray[np.int8]]:
+    """Return the number of each cell's patch, (H, W), and the different patches, (P, 9).
+
+    So that a network evaluates each one once. Without costs they are all 512 possible ones.
+    """
+    base, digits, outside = 2, occupancy.astype(np.int32), 1
+    if cost is not None:
+        base, outside = 128, OCCUPIED - UNKNOWN
+        digits = np.where(occupancy, outside, cost.astype(np.int64) - UNKNOWN)
+    padded = np.pad(digits, 1, constant_values=outside)
+    height, width = occupancy.shape
+    code = np.zeros(occupancy.shape, dtype=padded.dtype)
+    for place in range(9):
+        y, x = divmod(place, 3)
+        code += padded[y : y + height, x : x + width] * base**place
+    if cost is None:
+        return code, every_patch()
+    codes, patch_id = np.unique(code, return_inverse=True)
+    patch_P9 = codes[:, None] // base ** np.arange(9) % base + UNKNOWN
+    return patch_id.reshape(code.shape).astype(np.int32), patch_P9.astype(np.int8)
 
 
 def every_patch() -> NDArray[np.int8]:
@@ -125,13 +188,3 @@ def legal_in_patches(patch_P9: NDArray[np.int8], move_rule: MoveRule) -> NDArray
     legal = legal_moves((patch_P9 == OCCUPIED).reshape(-1, 3), move_rule)
     legal_PA: NDArray[np.bool_] = legal[:, 1::3, 1].T
     return legal_PA
-
-
-def cell_values(grid: GridMap) -> NDArray[np.uint8]:
-    """Return the value of each cell of a map with costs, with a border: (C,) uint8."""
-    assert grid.cost is not None
-    value = np.full((grid.height + 2, grid.width + 2), VALUES - 1, dtype=np.uint8)
-    inside = value[1:-1, 1:-1]
-    np.subtract(grid.cost, UNKNOWN, out=inside, casting="unsafe")
-    inside[grid.occupancy] = VALUES - 1
-    return value.ravel()

@@ -9,36 +9,24 @@ of a map.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
-from functools import cached_property
+from collections.abc import Mapping, Sequence
 from typing import ClassVar, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ddqn_planner.grid import (
-    MOVES,
-    OCCUPIED,
-    UNKNOWN,
-    Cell,
-    GridMap,
-    MoveRule,
-)
-from ddqn_planner.model.certificate import Certificate, certify
+from ddqn_planner.grid import MOVES, OCCUPIED, UNKNOWN, Cell, GridMap, MoveRule
+from ddqn_planner.model.certificate import MOVE_RULES, Certificate, certify
 from ddqn_planner.model.move_costs import (
     MAX_MULTIPLIER,
-    NO_PATCHES,
-    OCCUPIED_PATCH,
     VALUES,
     MoveCosts,
-    cell_values,
-    costs_by_patch,
     every_patch,
     legal_in_patches,
-    multiplied,
-    with_directions,
+    patch_numbers,
+    unique_patches,
 )
-from ddqn_planner.model.observation import ROBOT, observation_background, unique_patches
+from ddqn_planner.model.observation import ROBOT, observation_background
 
 Array: TypeAlias = NDArray[np.float32]
 
@@ -52,7 +40,7 @@ patches of a large map would need gigabytes."""
 
 
 class QNetwork(ABC):
-    """A trained Q-network. It computes the Q field of a map toward one goal.
+    """A trained Q-network: what it says of the moves on a map.
 
     Parameters
     ----------
@@ -79,6 +67,10 @@ class QNetwork(ABC):
         """Say whether the network can plan on maps of shape (H, W)."""
         return True
 
+    def certificate(self, move_rule: MoveRule) -> Certificate | None:
+        """Return what is proved of its moves; None if they depend on the whole map."""
+        return None
+
     def move_costs(self, grid: GridMap, move_rule: MoveRule) -> MoveCosts | None:
         """Return the costs of a map's moves if the possible ones are exactly the legal ones.
 
@@ -86,21 +78,9 @@ class QNetwork(ABC):
         """
         return None
 
-    @abstractmethod
     def q_values(self, grid: GridMap, goal: Cell, move_rule: MoveRule) -> Array:
-        """Return Q(s, a) of every cell toward one goal.
-
-        Parameters
-        ----------
-        grid : GridMap
-            Of a shape that the network supports.
-        goal : (x, y)
-        move_rule : MoveRule
-
-        Returns
-        -------
-        (8, H, W) float32
-        """
+        """Return Q(s, a) of every cell toward one goal, if it does not follow from costs."""
+        raise NotImplementedError
 
     def _layer(self, name: str, input_BI: Array) -> Array:
         """Return the output of a fully connected layer: (B, O)."""
@@ -139,13 +119,11 @@ class PaperQNetwork(QNetwork):
         return shape == (self.sizes["height"], self.sizes["width"])
 
     def q_values(self, grid: GridMap, goal: Cell, move_rule: MoveRule) -> Array:
-        """Evaluate the observation of a robot in each cell.
+        """Evaluate the observation of a robot in each cell: Q(s, a) toward one goal, (8, H, W).
 
         The robot changes at most 2 x 2 outputs of the convolution. So these alone are evaluated
-        again for each cell, one row of the map at once, and all else once for the map.
-
-        The costs of the map are not used, nor is the move rule: the network knows that of its
-        training.
+        again for each cell, one row of the map at once, and all else once for the map. The costs of
+        the map are not used, nor is the move rule: the network knows that of its training.
         """
         # In double precision: differences of large sums stay exact enough, and do not overflow.
         tensors = {name: tensor.astype(np.float64) for name, tensor in self.tensors.items()}
@@ -195,7 +173,13 @@ class PropagationQNetwork(QNetwork):
     inputs: ClassVar[int] = 9
     """Number of features."""
     uses_costs: ClassVar[bool] = False
-    """Whether the costs of the cells are among the features."""
+    """Whether the costs of the cells, and the move rule, are among the features."""
+
+    def __init__(self, sizes: Mapping[str, int], tensors: Mapping[str, Array]) -> None:
+        super().__init__(sizes, tensors)
+        # What holds for all maps, so that it is computed once.
+        self._proved: dict[tuple[MoveRule, bool, bool], MoveCosts | None] = {}
+        self._certificates: dict[Sequence[MoveRule], Certificate] = {}
 
     @classmethod
     def shapes(cls, sizes: Mapping[str, int]) -> dict[str, tuple[int, ...]]:
@@ -233,64 +217,47 @@ class PropagationQNetwork(QNetwork):
         """Return the cost multiplier of each move, here 1: (B, 8), given features (B, I)."""
         return np.ones((len(feature_BI), len(MOVES)), dtype=np.float32)
 
+    def certificate(self, move_rule: MoveRule) -> Certificate:
+        """Return what is proved of its moves: under all rules, or the one it was trained for."""
+        rules = MOVE_RULES if self.uses_costs else (move_rule,)
+        if rules not in self._certificates:
+            self._certificates[rules] = certify(self, rules)
+        return self._certificates[rules]
+
     def move_costs(self, grid: GridMap, move_rule: MoveRule) -> MoveCosts | None:
         """Return the costs of a map's moves if the possible ones are exactly the legal ones."""
-        from ddqn_planner.model.compiled_costs import patch_numbers
-
         timed = grid.slowness is not None
-        with_costs = self.uses_costs and grid.cost is not None and not timed
-        key = move_rule, with_costs, timed
-        if key not in self._costs_by_rule:
-            self._costs_by_rule[key] = self._costs(*key)
-        costs = self._costs_by_rule[key]
-        if costs is None:
-            return None
-        value = cell_values(grid) if with_costs else None
-        patch, table = patch_numbers(grid.occupancy), costs.table
-        if grid.forbidden is not None:
-            patch, table = with_directions(patch, table, np.pad(grid.forbidden, 1).ravel())
-        costs = costs._replace(patch=patch, table=table, value=value, width=grid.width + 2)
-        return multiplied(costs, grid.cost_multiplier) if timed else costs
+        key = move_rule, self.uses_costs and grid.cost is not None and not timed, timed
+        if key not in self._proved:
+            self._proved[key] = self._proved_costs(*key)
+        costs = self._proved[key]
+        return costs and costs.on(grid, patch_numbers(grid.occupancy))
 
-    @cached_property
-    def _costs_by_rule(self) -> dict[tuple[MoveRule, bool, bool], MoveCosts | None]:
-        """What holds for all maps, so that it is computed once."""
-        return {}
-
-    def _costs(self, move_rule: MoveRule, with_costs: bool, timed: bool) -> MoveCosts | None:
+    def _proved_costs(self, move_rule: MoveRule, with_costs: bool, timed: bool) -> MoveCosts | None:
         """Return the costs of moves without what depends on the map."""
         patch_P9 = every_patch()
         table_PA = self._costs_of(patch_P9, move_rule, timed)
         table_PA[patch_P9[:, 4] == OCCUPIED] = np.inf
         if not np.array_equal(np.isfinite(table_PA), legal_in_patches(patch_P9, move_rule)):
             return None
-        table_PA = np.pad(table_PA, ((0, 1), (0, 0)), constant_values=np.inf)
-        return costs_by_patch(NO_PATCHES, table_PA, 0)
+        return MoveCosts.of_table(table_PA)
 
-    def q_values(self, grid: GridMap, goal: Cell, move_rule: MoveRule) -> Array:
-        """Return minus the cost of the best path through each action: length times cost multiplier.
+    def believed_costs(self, grid: GridMap, move_rule: MoveRule) -> MoveCosts:
+        """Return the costs of a map's moves, right or not.
 
-        There is no discount, and a move counts as possible where p > 1/2: so the greatest Q is the
-        cheapest path at any distance. A move that may fail leaves the robot where it was, and is
-        tried again: its expected cost is that of one try over p, see `CERTAIN`. On a map of
-        expected times, these take the place of the learned cost multiplier. (Along a whole path,
-        the progress and detour terms of the paper's reward, section 4.2, add up to a constant of
-        its two ends.) Cost multipliers are clamped to `MAX_MULTIPLIER`. A move with NaN as its p or
+        The greatest Q is the cheapest path at any distance: there is no discount, and a move counts
+        as possible where p > 1/2. A move that may fail leaves the robot where it was, and is tried
+        again: its expected cost is that of one try over p, see `CERTAIN`. On a map of expected
+        times, these take the place of the learned cost multiplier. (Along a whole path, the
+        progress and detour terms of the paper's reward, section 4.2, add up to a constant of its
+        two ends.) Cost multipliers are clamped to `MAX_MULTIPLIER`. A move with NaN as its p or
         cost multiplier is not possible.
-
-        Returns
-        -------
-        (8, H, W) float32
-            -inf where no path is known.
         """
-        from ddqn_planner.model.field_values import propagate_values
-
         timed = grid.slowness is not None
         cost = grid.cost if self.uses_costs and not timed else None
         patch_id, patch_P9 = unique_patches(grid.occupancy, cost)
-        cost_PA = self._costs_of(patch_P9, move_rule, timed)
-        patch_id, cost_PA = with_directions(patch_id, cost_PA, grid.forbidden)
-        return propagate_values(patch_id, cost_PA, goal, grid.cost_multiplier if timed else None)
+        patch_C = np.pad(patch_id, 1, constant_values=len(patch_P9)).ravel()
+        return MoveCosts.of_table(self._costs_of(patch_P9, move_rule, timed)).on(grid, patch_C)
 
     def _costs_of(self, patch_P9: NDArray[np.int8], move_rule: MoveRule, timed: bool) -> Array:
         """Return the cost of each move in each patch, infinite if not possible: (P, 8) float32.
@@ -344,20 +311,8 @@ class AnyMapQNetwork(PropagationQNetwork):
         multiplier_BA: Array = 1 + np.maximum(self._layer("prices", feature_BI), 0)
         return multiplier_BA
 
-    @cached_property
-    def certificate(self) -> Certificate:
-        """What is proved of its judgement of moves, whatever the costs."""
-        return certify(self)
-
     def terms(self, move_rule: MoveRule) -> Array:
-        """Return what each value of each cell of a patch adds to the cost multiplier.
-
-        The layer is linear, so its output is a sum over the cells; see `MoveCosts`.
-
-        Returns
-        -------
-        (9, 102, 8) float32
-        """
+        """Return the terms of `MoveCosts`: the layer is linear, its output a sum over the cells."""
         weight_AI, bias_A = self.tensors["prices.weight"], self.tensors["prices.bias"]
         occupied_9A, cost_9A, unknown_9A = weight_AI[:, :27].T.reshape(3, 9, -1)
         terms_9LA = np.empty((9, VALUES, len(MOVES)), dtype=np.float32)
@@ -366,21 +321,18 @@ class AnyMapQNetwork(PropagationQNetwork):
         terms_9LA[4] += bias_A + weight_AI[:, 27] * move_rule.cuts_corners
         return terms_9LA
 
-    def _costs(self, move_rule: MoveRule, with_costs: bool, timed: bool) -> MoveCosts | None:
+    def _proved_costs(self, move_rule: MoveRule, with_costs: bool, timed: bool) -> MoveCosts | None:
         """Return the costs of moves without what depends on the map."""
         if not with_costs:
-            return super()._costs(move_rule, with_costs, timed)
-        if not self.certificate.proved:
+            return super()._proved_costs(move_rule, with_costs, timed)
+        if not self.certificate(move_rule).proved:
             return None
-        table_PA = np.full((OCCUPIED_PATCH + 1, len(MOVES)), np.inf, dtype=np.float32)
-        np.copyto(
-            table_PA[:-1], move_rule.lengths, where=legal_in_patches(every_patch(), move_rule)
-        )
-        costs, terms_9LA = costs_by_patch(NO_PATCHES, table_PA, 0), self.terms(move_rule)
+        legal_PA = legal_in_patches(every_patch(), move_rule)
+        lengths_PA = np.where(legal_PA, move_rule.lengths, np.inf).astype(np.float32)
+        costs, terms_9LA = MoveCosts.of_table(lengths_PA), self.terms(move_rule)
         greatest = 1 + max(0.0, float(terms_9LA.max(axis=1).sum(axis=0).max()))
-        return costs._replace(
-            terms=terms_9LA, highest=costs.highest * min(greatest, MAX_MULTIPLIER)
-        )
+        highest = costs.highest * min(greatest, MAX_MULTIPLIER)
+        return costs._replace(terms=terms_9LA, highest=highest)
 
 
 def _with_biases(weights: Mapping[str, tuple[int, ...]]) -> dict[str, tuple[int, ...]]:

@@ -1,10 +1,10 @@
-"""The map that the planner plans on: the last one received, with its updates, and its inflation."""
+"""The map that the planner plans on: the last one received, with its updates and its directions."""
 
 from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -15,19 +15,21 @@ from rclpy.task import Future
 from rclpy.time import Time
 from std_msgs.msg import Header, String
 
+from ddqn_planner.experience import Experience
 from ddqn_planner.grid import GridMap
 from ddqn_planner.grid.body import Inflation
 from ddqn_planner.nodes.conversions import grid_from_message, grid_from_values
-from ddqn_planner.nodes.expected_times import ExpectedTimes
-from ddqn_planner.nodes.map_directions import MapDirections
-from ddqn_planner.nodes.report import Report, RequestError, describe_map, seconds
+from ddqn_planner.nodes.report import Outcome, Report, RequestError, describe_map, seconds
 from ddqn_planner.nodes.runtime import LATCHED, BaseNode, Worker
+from ddqn_planner.planning import Plan
+from ddqn_planner.planning.repair import offset_between
 
 try:
     from map_msgs.msg import OccupancyGridUpdate
 except ImportError:  # PyPI does not have it
     OccupancyGridUpdate = None
 
+DIRECTIONS = "map_directions"
 MAP_PARAMETERS = ("occupied_threshold", "allow_unknown", "use_map_costs", "map_type")
 BODY_PARAMETERS = ("robot_radius", "clearance_weight")
 
@@ -37,6 +39,10 @@ latched topic would send, does not make an old map a new one."""
 
 PATIENCE = 1.0
 """Seconds within which the first map is expected after the node subscribes."""
+
+CHANGED_SHARE = 0.02
+"""Share of cells that may change before experience is spread anew over the map, which takes long.
+What a robot sees on its way, as a person who stands there, changes little of what it learned."""
 
 
 @dataclass
@@ -52,31 +58,15 @@ class MapSource:
     """Listens to maps and their updates, and inflates the last map for the robot's body.
 
     A map whose directions have not come waits for them, and the map before it stays meanwhile.
-
-    Parameters
-    ----------
-    node : BaseNode
-        It has the parameters `MAP_PARAMETERS`, `BODY_PARAMETERS` and ``map_timeout``.
-    report : Report
-        It says what was refused.
-    worker : Worker
-        It inflates. Maps must not wait for fields: 2000 x 2000 cells take over a second.
-    on_map : callable
-        Called with whether the map's frame is a new one, each time when there is something new to
-        plan on: a map, an update, directions.
-
-    Attributes
-    ----------
-    times : ExpectedTimes
-        Of the map's places; only the worker uses them.
+    `on_map` is called with whether the map's frame is a new one, each time when there is something
+    new to plan on. The worker inflates: maps must not wait for fields, and 2000 x 2000 cells take
+    over a second.
     """
 
     def __init__(
         self, node: BaseNode, report: Report, worker: Worker, on_map: Callable[[bool], None]
     ) -> None:
-        self._node = node
-        self._report = report
-        self._on_map = on_map
+        self._node, self._report, self._worker, self._on_map = node, report, worker, on_map
         # The map in use and the last one, which waits for its directions if it is another one.
         self._used: Received | None = None
         self._newest: Received | None = None
@@ -84,28 +74,19 @@ class MapSource:
         self._described = ""
         self._updates = self._refused_updates = 0
         self._inflated: Future | None = None
-        self._inflate = Inflation()
-        self.times = ExpectedTimes()
-        self._worker = worker
-        self._directions = MapDirections(
-            node, report, lambda: self._read_again(self._newest, self._used)
-        )
-        maps = node.create_subscription(OccupancyGrid, "map", self._take, LATCHED)
-        self._subscriptions = [self._directions.subscription, maps]
-        self._topic = maps.topic_name
+        self._inflate, self._times = Inflation(), ExpectedTimes()
+        self._forecast_of: Outcome | None = None
+        self._computing: Future | None = None
+        # Before the subscription of the map: directions that come with a map are taken first.
+        node.create_subscription(OccupancyGrid, DIRECTIONS, self._take_directions, LATCHED)
+        self._directions = Directions(node)
+        self._topic = node.create_subscription(OccupancyGrid, "map", self._take, LATCHED).topic_name
         self._updates_topic = f"{self._topic}_updates"
         if OccupancyGridUpdate is not None:
-            self._subscriptions.append(
-                node.create_subscription(
-                    OccupancyGridUpdate, self._updates_topic, self._take_update, UPDATES_QUALITY
-                )
+            node.create_subscription(
+                OccupancyGridUpdate, self._updates_topic, self._take_update, UPDATES_QUALITY
             )
         node.get_logger().info(f"waiting for a map on {self._topic}")
-
-    @property
-    def header(self) -> Header | None:
-        """The header of the last map or update that is planned on."""
-        return self._used.header if self._used is not None else None
 
     @property
     def frame(self) -> str:
@@ -113,7 +94,7 @@ class MapSource:
         return self._used.header.frame_id if self._used is not None else ""
 
     def check(self) -> Header:
-        """Return the header of the map of now; a RequestError says why there is none to plan on."""
+        """Return the header of the map or update that is planned on, or raise a RequestError."""
         refused = self._report.refused.get("map")
         because = f" ({refused})" if refused else ""
         if self._used is None:
@@ -144,8 +125,8 @@ class MapSource:
         """Whether the first map is still expected, as the node has subscribed just now."""
         return self._used is None and time.monotonic() - self._began < PATIENCE
 
-    def describe(self) -> dict[str, str]:
-        """Return what the diagnostics say of the map."""
+    def describe(self, outcome: Outcome) -> dict[str, str]:
+        """Return what the diagnostics say of the map, and of the time of a plan on it."""
         description = {}
         if self._used is not None:
             description["map"] = self._described
@@ -153,13 +134,23 @@ class MapSource:
         if self._updates or self._refused_updates:
             description["map updates applied"] = str(self._updates)
             description["map updates refused"] = str(self._refused_updates)
+        return description | self._forecast(outcome)
+
+    def _forecast(self, outcome: Outcome) -> dict[str, str]:
+        """Return how long a plan takes, once the worker knows it: then the report is due."""
+        if outcome is not self._forecast_of:
+            self._forecast_of, self._computing = outcome, None
+            request, plan = outcome.request, outcome.plan
+            if request is not None and len(plan.path) and request.grid.slowness is not None:
+                self._computing = self._worker.call(self._times.describe, request.grid, plan)
+                self._computing.add_done_callback(lambda _: self._report.change())
+        if self._computing is None or not self._computing.done():
+            return {}
+        description: dict[str, str] = self._computing.result()
         return description
 
     def inflated(self) -> Future:
-        """Return the `GridMap` for the robot's body, which is computed for the first request.
-
-        Where the trainer has learned from drives, its moves cost expected time.
-        """
+        """Return the `GridMap` for the robot's body, which is computed for the first request."""
         if self._inflated is None:
             radius, weight = map(self._node.value, BODY_PARAMETERS)
             # ROS accepts a value that is above the range by a millionth.
@@ -168,37 +159,29 @@ class MapSource:
         return self._inflated
 
     def _made(self, grid: GridMap, *body: float) -> GridMap:
-        return self.times.apply(self._inflate(grid, *body))
+        return self._times.apply(self._inflate(grid, *body))
 
     async def on_experience_saved(self, message: String) -> None:
         """Plan by what the trainer has learned from drives, or refuse its file."""
         try:
-            await self._worker.call(self.times.load, message.data)
+            await self._worker.call(self._times.load, message.data)
         except Exception as error:  # what was learned before stays
             self._report.refuse("experience", str(error) or repr(error))
             return
         self._report.accept("experience")
-        self._inflated = None
-        self._report.change()
-        if self._used is not None:
-            self._on_map(False)
+        self._changed()
 
     def apply_parameters(self, changed: set[str]) -> None:
         """Read and inflate the map anew if one of the parameters that changed says so."""
         if changed & {*MAP_PARAMETERS, *BODY_PARAMETERS, "require_directions"}:
             self._read_again(self._used or self._newest)
 
-    def close(self) -> None:
-        """Stop listening."""
-        for subscription in self._subscriptions:
-            self._node.destroy_subscription(subscription)
-
-    def _rules(self) -> tuple[Any, ...]:
-        return tuple(map(self._node.value, MAP_PARAMETERS))
+    def _read(self, message: OccupancyGrid) -> GridMap:
+        return grid_from_message(message, *map(self._node.value, MAP_PARAMETERS))
 
     def _take(self, message: OccupancyGrid) -> None:
         try:
-            grid = grid_from_message(message, *self._rules())
+            grid = self._read(message)
         except ValueError as error:
             self._report.refuse("map", str(error))
             return
@@ -206,10 +189,19 @@ class MapSource:
         self._report.accept("map_updates")
         self._use(grid, self._newest)
 
+    def _take_directions(self, message: OccupancyGrid) -> None:
+        try:
+            self._directions.take(message)
+        except ValueError as error:
+            self._report.refuse(DIRECTIONS, str(error))
+            return
+        self._report.accept(DIRECTIONS)
+        self._read_again(self._newest, self._used)
+
     def _read_again(self, *candidates: Received | None) -> None:
         """Plan on the first one whose directions have come."""
         for received in filter(None, candidates):
-            if self._use(grid_from_message(received.message, *self._rules()), received):
+            if self._use(self._read(received.message), received):
                 break
 
     def _use(self, grid: GridMap, received: Received) -> bool:
@@ -220,19 +212,12 @@ class MapSource:
             if not self._directions.held:  # no map before it had any
                 self._used = None
             if received is self._newest:  # without a log: they may be on their way
-                self._report.refused["map"] = str(error)
-                self._report.change()
+                self._report.refuse("map", str(error), log=False)
             return False
         frame_changed, self._used = received.header.frame_id != self.frame, received
-        self._inflated = None
         if received is self._newest:
             self._report.accept("map")
-        self._report.change()
-        self._say(describe_map(received.message))
-        self._on_map(frame_changed)
-        return True
-
-    def _say(self, described: str) -> None:
+        described = describe_map(received.message)
         if described != self._described:
             self._described = described
             self._node.get_logger().info(f"map of {described}")
@@ -242,6 +227,15 @@ class MapSource:
                 "ros-jazzy-map-msgs, or let the map's publisher always send the full map",
                 once=True,
             )
+        self._changed(frame_changed)
+        return True
+
+    def _changed(self, frame_changed: bool = False) -> None:
+        """Plan on what is new."""
+        self._inflated = None
+        self._report.change()
+        if self._used is not None:
+            self._on_map(frame_changed)
 
     def _take_update(self, update: Any) -> None:
         """Plan on the map with other values in a box from now on, or refuse the update."""
@@ -249,13 +243,13 @@ class MapSource:
             message = self._newest.message if self._newest is not None else None
             values = updated_values(message, update)
             if self._newest is self._used:
-                patch = grid_from_values(values, 1.0, (0.0, 0.0, 0.0), *self._rules())
+                rules = map(self._node.value, MAP_PARAMETERS)
+                patch = grid_from_values(values, 1.0, (0.0, 0.0, 0.0), *rules)
                 cells = patch.occupancy, update.x, update.y, patch.cost, patch.obstacles
                 self._grid = self._grid.with_patch(*cells)
         except (ValueError, MemoryError) as error:
             self._refused_updates = count = self._refused_updates + 1
-            self._report.refused["map_updates"] = str(error)
-            self._report.change()
+            self._report.refuse("map_updates", str(error), log=False)
             if count & (count - 1) == 0:  # 1, 2, 4, ...: updates come often
                 self._node.get_logger().error(f"update {count} of the map refused: {error}")
             return
@@ -267,27 +261,12 @@ class MapSource:
         self._report.accept("map_updates")
         self._newest.header, self._newest.came = update.header, time.monotonic()
         self._updates += 1
-        self._report.change()
         if self._newest is self._used:
-            self._inflated = None
-            self._on_map(False)
+            self._changed()
 
 
 def updated_values(message: OccupancyGrid | None, update: Any) -> NDArray[np.int8]:
-    """Return the values that an update puts into a map, (h, w) int8.
-
-    Parameters
-    ----------
-    message : OccupancyGrid or None
-        The last map.
-    update : map_msgs.msg.OccupancyGridUpdate
-
-    Raises
-    ------
-    ValueError
-        If there is no map yet, or it is in another frame or newer; if the update does not lie
-        inside the map, or its data has another length than its size says.
-    """
+    """Return the values that an update puts into the last map, (h, w); ValueError if none fit."""
     remedy = "let the map's publisher send the full map"
     if message is None:
         raise ValueError(f"an update came before a map; {remedy}")
@@ -315,3 +294,127 @@ def updated_values(message: OccupancyGrid | None, update: Any) -> NDArray[np.int
             f"{width * height}"
         )
     return np.frombuffer(update.data, np.int8).reshape(height, width)
+
+
+class Directions:
+    """Forbidden directions: the last ones hold for each map, in the region they share.
+
+    A map server publishes them for each of its maps, with the map's stamp: an ``OccupancyGrid``
+    whose values are the bytes of `GridMap.forbidden`, and without cells where nothing is forbidden.
+    Directions and maps that have had one stamp come from one map server: then the next map waits
+    for its own directions. The middleware does not keep the order of two topics: those of a large
+    map may come seconds after it, or never if the map server is killed.
+    """
+
+    def __init__(self, node: BaseNode) -> None:
+        self._node, self._topic = node, node.resolve_topic_name(DIRECTIONS)
+        # The last ones, and those of the map in use; without a map where nothing is forbidden.
+        self._last: tuple[Header, GridMap | None] | None = None
+        self._used: tuple[Header, GridMap | None] | None = None
+        self._are_paired = False
+
+    @property
+    def held(self) -> bool:
+        """Whether a map has had directions; that may be none at all."""
+        return self._used is not None
+
+    def take(self, message: OccupancyGrid) -> None:
+        """Take a message; ValueError if it is malformed, and those before it stay."""
+        directions = None
+        if message.info.width or message.info.height or message.data:
+            place = grid_from_message(message)
+            forbidden = np.frombuffer(message.data, np.uint8).reshape(place.occupancy.shape)
+            free = np.zeros(forbidden.shape, dtype=np.bool_)
+            directions = GridMap(free, place.resolution, place.origin, forbidden=forbidden)
+        self._last = message.header, directions
+
+    def on(self, grid: GridMap, header: Header) -> GridMap:
+        """Return a map with its directions; ValueError if they have not come or do not fit it."""
+        # A map server creates this publisher first: whoever receives its map sees it already.
+        published = self._node.count_publishers(self._topic) > 0
+        if self._last is None:
+            if published or self._node.value("require_directions"):
+                raise ValueError(
+                    f"the map's directions were not received on {self._topic} yet; let a map "
+                    "server publish them, or set require_directions to false"
+                )
+            return grid
+        known = [found for found in (self._last, self._used) if found is not None]
+        own = [found for found in known if found[0].stamp == header.stamp]
+        if self._are_paired and published and not own:
+            raise ValueError(
+                f"the map's directions, with its stamp, {seconds(header.stamp)}, were not received "
+                f"on {self._topic} yet; if they do not come, load the map again"
+            )
+        of_map, directions = (own or known)[0]
+        if directions is not None:
+            grid = self._placed(directions, of_map.frame_id, grid, header.frame_id)
+        self._used, self._are_paired = (of_map, directions), bool(own)
+        return grid
+
+    def _placed(self, directions: GridMap, frame: str, grid: GridMap, map_frame: str) -> GridMap:
+        """Return a map with the directions of its cells, 0 where there are none."""
+        try:
+            offset = offset_between(directions, grid)
+        except (OverflowError, ValueError):  # too far away to have a number of cells
+            offset = None
+        if frame != map_frame or offset is None:
+            raise ValueError(
+                f"the directions on {self._topic} are not for this map: they have the frame "
+                f"{frame!r} and {directions.resolution:.6g} m per cell, the map {map_frame!r} and "
+                f"{grid.resolution:.6g} m; give both one frame, and cells that lie on each other"
+            )
+        assert directions.forbidden is not None
+        forbidden, (x, y) = np.zeros(grid.occupancy.shape, dtype=np.uint8), offset
+        part = directions.forbidden[max(-y, 0) :, max(-x, 0) :]
+        target = forbidden[max(y, 0) :, max(x, 0) :]
+        height, width = (min(sides) for sides in zip(part.shape, target.shape, strict=True))
+        target[:height, :width] = part[:height, :width]
+        return replace(grid, forbidden=forbidden)
+
+
+class ExpectedTimes:
+    """Puts on maps what the trainer has learned of the robot's drives. One worker uses it."""
+
+    def __init__(self) -> None:
+        self._experience: Experience | None = None
+        self._spread_on: GridMap | None = None
+
+    def load(self, path: str) -> None:
+        """Use a file of the trainer from now on; after an error, what was used before stays."""
+        newer = Experience.load(path)
+        if self._experience is not None:
+            newer.take_over(self._experience)
+        self._experience = newer
+
+    def apply(self, grid: GridMap) -> GridMap:
+        """Return a map whose moves cost expected time, or the same map before a drive."""
+        if self._experience is None or self._experience.evidence.places == 0:
+            return grid
+        if self._spread_on is None or not _is_like(grid, self._spread_on):
+            self._spread_on = grid
+        timed = self._experience.apply(self._spread_on)
+        return grid.with_layers(slowness=timed.slowness, seconds_per_cell=timed.seconds_per_cell)
+
+    def describe(self, grid: GridMap, plan: Plan) -> dict[str, str]:
+        """Return how long a plan takes; nothing if its map is an old one, or no memory is left."""
+        map_of_now = self._spread_on
+        if self._experience is None or map_of_now is None or not _is_like(grid, map_of_now):
+            return {}
+        try:
+            seconds, low, high = self._experience.expected_time(map_of_now, plan.every_cell)
+        except MemoryError:
+            return {}
+        return {
+            "expected time (s)": f"{seconds:.1f}",
+            "expected time, 90 % interval (s)": f"{low:.1f} to {high:.1f}",
+        }
+
+
+def _is_like(grid: GridMap, other: GridMap) -> bool:
+    return (
+        grid.occupancy.shape == other.occupancy.shape
+        and grid.resolution == other.resolution
+        and grid.origin == other.origin
+        and np.mean(grid.occupancy != other.occupancy) <= CHANGED_SHARE
+    )

@@ -12,7 +12,7 @@ from std_msgs.msg import String
 
 from ddqn_planner.grid import GridMap, MoveRule
 from ddqn_planner.model import find_model
-from ddqn_planner.model.certificate import NO_CERTIFICATE, certificate_of
+from ddqn_planner.model.certificate import NO_CERTIFICATE
 from ddqn_planner.nodes.report import Report
 from ddqn_planner.nodes.runtime import BaseNode, Worker
 from ddqn_planner.planning import Planner
@@ -120,7 +120,7 @@ class ModelSource:
         description = {"model": self._node.value("model")}
         if self.planner is not None:
             metadata = self.planner.metadata
-            certificate = certificate_of(self.planner.network, metadata.move_rule)
+            certificate = self.planner.network.certificate(metadata.move_rule)
             sizes = metadata.sizes.items()
             description |= {
                 "model file": self.file,

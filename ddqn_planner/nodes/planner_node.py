@@ -24,14 +24,12 @@ from rclpy.parameter import Parameter
 from rclpy.task import Future
 from std_msgs.msg import Header, String
 
-from ddqn_planner.nodes.active_goal import UNCHANGED, ActiveGoal, PathUnderWay
 from ddqn_planner.nodes.conversions import path_message, serialized_path
-from ddqn_planner.nodes.expected_times import Forecast
-from ddqn_planner.nodes.field_display import FieldDisplay, Shown
+from ddqn_planner.nodes.display import FieldDisplay, Shown
 from ddqn_planner.nodes.lifecycle import ManagedNode
 from ddqn_planner.nodes.map_source import MapSource
 from ddqn_planner.nodes.model_loading import ModelSource, load
-from ddqn_planner.nodes.nav2_interface import serve_nav2
+from ddqn_planner.nodes.nav2 import serve_nav2
 from ddqn_planner.nodes.parameters import PLANNER_PARAMETERS
 from ddqn_planner.nodes.poses import Frames, StartSource, check_source
 from ddqn_planner.nodes.report import (
@@ -41,7 +39,7 @@ from ddqn_planner.nodes.report import (
     RequestError,
     begins_on_obstacle,
 )
-from ddqn_planner.nodes.requests import Looks, Requests
+from ddqn_planner.nodes.requests import UNCHANGED, ActiveGoal, PathUnderWay, Requests
 from ddqn_planner.nodes.runtime import LATCHED, STEADY, Unless, Worker, spin_until_shutdown
 
 LOOK_PERIOD = 0.1
@@ -67,7 +65,6 @@ class PlannerNode(ManagedNode):
         if self._settings.autostart:
             # While it loads, DDS discovers, and the node says what else is missing.
             self._model.load()
-        self._looks = Looks()
         self._answering = 0
         self._forget()
         self.create_timer(LOOK_PERIOD, self._on_look, clock=STEADY)
@@ -79,12 +76,11 @@ class PlannerNode(ManagedNode):
 
     def _forget(self) -> None:
         """Have no map and no goal, and refuse requests."""
-        self._is_configured = False
+        self._is_configured = self._waits_for_pose = self._lacks_map = False
         self._stopped = Future()
         self._stop()
         self._active, self._followed = ActiveGoal(), PathUnderWay()
         self._logged: tuple[object, ...] = ()
-        self._waits_for_pose = self._lacks_map = False
 
     def configure(self) -> None:
         """Listen to the map and to where the robot is, and create what answers requests."""
@@ -99,15 +95,8 @@ class PlannerNode(ManagedNode):
         self._start = StartSource(
             self, self._frames, self._report, lambda: self._map.frame, self._on_start
         )
-        self._forecast = Forecast(self._map.times, self._map_worker)
         self._requests = Requests(
-            self._settings,
-            self._map,
-            self._start,
-            self._frames,
-            self._model,
-            self._worker,
-            self._looks,
+            self._settings, self._map, self._start, self._frames, self._model, self._worker
         )
         self.create_subscription(PoseStamped, "goal_pose", lambda goal: self._on_goals([goal]), 10)
         self.create_subscription(PoseArray, "goal_poses", self._on_goal_poses, 10)
@@ -144,11 +133,9 @@ class PlannerNode(ManagedNode):
         """Free the map, the model and its fields."""
         self._forget()
         self._report.forget()
-        made = vars(self)  # not all, if `configure` failed
-        for name in ("_start", "_frames", "_display", "_map", "_requests", "_forecast"):
-            part = made.pop(name, None)
-            if isinstance(part, (StartSource, Frames)):
-                part.close()
+        self.after_jump_back.clear()
+        for name in ("_start", "_frames", "_display", "_map", "_requests"):
+            vars(self).pop(name, None)  # not all are there, if `configure` failed
         self._model.forget()
 
     async def prepare(self, transition: str) -> bool:
@@ -160,7 +147,7 @@ class PlannerNode(ManagedNode):
         if transition in ("deactivate", "shutdown"):
             self._stop()
             while self._answering:
-                await self._looks.coming
+                await self._requests.next_look
         return True
 
     def _is_active(self) -> bool:
@@ -242,7 +229,8 @@ class PlannerNode(ManagedNode):
         if not goals:
             return
         self._active.begin(self._settings.replan_period)
-        planning = self._requests.plan(None, goals, self._settings.tolerance, self._active)
+        tolerance = self._settings.tolerance
+        planning = self._requests.plan(None, goals, tolerance, followed=self._active)
         header, outcome = await self._answer(planning, goals)
         if outcome in (UNCHANGED, NOT_ACTIVE):
             return
@@ -266,15 +254,11 @@ class PlannerNode(ManagedNode):
     async def _plan_for_action(
         self, start: PoseStamped | None, goals: list[PoseStamped], planner_id: str, given_up: Future
     ) -> tuple[Path, Outcome]:
-        planning = self._requests.plan(
-            start,
-            goals,
-            self._settings.tolerance,
-            planner_id=planner_id,
-            followed=self._followed,
-        )
+        tolerance, followed = self._settings.tolerance, self._followed
+        planning = self._requests.plan(start, goals, tolerance, planner_id, followed)
         header, outcome = await self._answer(planning, goals, given_up)
-        if len(outcome.plan.path):
+        if outcome.request is not None and len(outcome.plan.path):
+            followed.keep(outcome.plan.every_cell, outcome.request.grid, header.frame_id)
             self._plan_publisher.publish(_path(serialized_path, outcome, header))
         self._report.log(outcome)
         return _path(path_message, outcome, header), outcome
@@ -321,31 +305,30 @@ class PlannerNode(ManagedNode):
 
     def _on_look(self) -> None:
         self._report.log_paths()
-        self._looks.next()
         if self._is_configured:
-            self._start.transform()
-            lacks, self._lacks_map = self._lacks_map, bool(self._map.missing)
-            if self._lacks_map and not lacks:  # a costmap stopped: its path is taken back
-                self._replan.trigger()
-        if self._waits_for_pose and self._active.poses:
-            with suppress(RequestError):
-                self._requests.look(self._active.poses)
-                self._waits_for_pose = False
-                self._replan.trigger()
-        if self._active.is_look_due():
-            self._replan.trigger()
-        if self._is_configured and self._forecast.look(self._report.outcome):
-            self._report.change()
+            self._look_for_news()
         if self._report.is_due:
             missing = [NOT_ACTIVE.reason] if not self._is_active() else []
             missing += [self._map.missing] if self._is_configured else []
             missing += ["the model is being loaded"] if self._model.is_loading else []
             fatal = self._model.planner is None and "model" in self._report.refused
-            self._report.publish(fatal, "; ".join(filter(None, missing)), self._describe())
+            values = {"state": self.state, **self._model.describe(self._settings.move_rule)}
+            if self._is_configured:
+                values |= self._map.describe(self._report.outcome)
+            self._report.publish(fatal, "; ".join(filter(None, missing)), values)
 
-    def _describe(self) -> dict[str, str]:
-        of_map = self._map.describe() | self._forecast.describe() if self._is_configured else {}
-        return {"state": self.state, **self._model.describe(self._settings.move_rule), **of_map}
+    def _look_for_news(self) -> None:
+        self._requests.look_again()
+        self._start.transform()
+        lacked, self._lacks_map = self._lacks_map, bool(self._map.missing)
+        is_due = self._active.is_look_due()
+        is_due |= self._lacks_map and not lacked  # a costmap stopped: its path is taken back
+        if self._waits_for_pose and self._active.poses:
+            with suppress(RequestError):
+                self._requests.look(self._active.poses)
+                self._waits_for_pose, is_due = False, True
+        if is_due:
+            self._replan.trigger()
 
 
 def _path(make: Callable[..., Any], outcome: Outcome, header: Header) -> Any:

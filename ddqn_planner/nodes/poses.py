@@ -20,6 +20,7 @@ from geometry_msgs.msg import (
     TransformStamped,
 )
 from nav_msgs.msg import Odometry
+from rclpy.subscription import Subscription
 from rclpy.time import Time
 from std_msgs.msg import Header
 
@@ -189,11 +190,36 @@ def _turned(rotation: Quaternion, point: Point) -> Point:
     return px + 2 * (y * c - z * b), py + 2 * (z * a - x * c), pz + 2 * (x * b - y * a)
 
 
+def listen(
+    node: BaseNode,
+    topic: str,
+    depth: int,
+    refusals: Refusals,
+    take: Callable[[PoseStamped], None],
+) -> Subscription:
+    """Hand each pose of `odom` or `initialpose` to a function, whose ValueError refuses it."""
+    is_odometry = topic == "odom"
+
+    def on_message(message: Odometry | PoseWithCovarianceStamped) -> None:
+        try:
+            take(PoseStamped(header=message.header, pose=message.pose.pose))
+        except ValueError as error:
+            # It comes all the time, and its reason may have numbers: its first one is logged.
+            log = not is_odometry or topic not in refusals.refused
+            refusals.refuse(topic, str(error), log)
+        else:
+            refusals.accept(topic)
+
+    if is_odometry:
+        return node.create_subscription(Odometry, topic, on_message, best_effort(depth))
+    return node.create_subscription(PoseWithCovarianceStamped, topic, on_message, depth)
+
+
 class StartSource:
     """Where the planner's robot is, by its parameter ``start_source``.
 
-    That is the last `initialpose`, the last `odom`, or TF. A malformed message is refused, and the
-    one before it stays. `on_start` is called with each pose from which to plan at once.
+    That is the last `initialpose`, the last `odom`, or TF. A malformed pose is refused, and the one
+    before it stays. `on_start` is called with each pose from which to plan at once.
     """
 
     def __init__(
@@ -211,7 +237,7 @@ class StartSource:
         self.listen()
 
     def listen(self) -> None:
-        """Listen to what the parameter names, from when it is another one on."""
+        """Listen to what the parameter names, if it is another source."""
         source = self._node.value("start_source")
         if source == self.source:
             return
@@ -221,14 +247,9 @@ class StartSource:
         if source == "tf":
             self._frames.listen()
             return
-        message: Any = PoseWithCovarianceStamped
+        self._subscription = listen(self._node, self._topic, 10, self._refusals, self._take)
         if source == "odometry":
-            message = Odometry
             self._node.after_jump_back.add(self._forget)
-        quality = best_effort(10) if source == "odometry" else 10
-        self._subscription = self._node.create_subscription(
-            message, self._topic, self._take, quality
-        )
 
     def close(self) -> None:
         """Stop listening; what was refused no longer counts."""
@@ -243,23 +264,16 @@ class StartSource:
         """Forget what was refused: it may be right now."""
         self._refusals.accept(self._topic)
 
-    def _take(self, message: PoseWithCovarianceStamped | Odometry) -> None:
-        pose = message.pose.pose
-        try:
-            self._frames.check("the start", message.header, pose, self._map_frame())
-        except ValueError as error:
-            self._refusals.refuse(self._topic, str(error))
-            return
-        self.accept()
-        # Odometry comes all the time: it only triggers a plan that waits for the first pose.
-        is_due = self._pose is None or self.source == "initialpose"
-        self._pose = PoseStamped(header=message.header, pose=pose)
-        self._came = self._node.get_clock().now()
-        if is_due:
-            self._on_start()
-
     def _forget(self) -> None:
         self._pose, self._began = None, time.monotonic()
+
+    def _take(self, pose: PoseStamped) -> None:
+        self._frames.check("the start", pose.header, pose.pose, self._map_frame())
+        # Odometry comes all the time: it only triggers a plan that waits for the first pose.
+        is_due = self._pose is None or self.source == "initialpose"
+        self._pose, self._came = pose, self._node.get_clock().now()
+        if is_due:
+            self._on_start()
 
     def transform(self) -> None:
         """Transform the last `initialpose` as soon as TF can: it forgets the times before."""
@@ -333,7 +347,7 @@ class RobotPoses:
             self._frames.listen()
             node.create_timer(TF_PERIOD, self._look_up, clock=STEADY)
         else:
-            node.create_subscription(Odometry, "odom", self._on_odometry, best_effort(1000))
+            listen(node, "odom", 1000, refusals, self._take)
 
     def in_map(self, name: str, pose: PoseStamped, frame: str) -> tuple[float, float]:
         """Return a pose's position in the map's frame; ValueError if it has none."""
@@ -341,31 +355,23 @@ class RobotPoses:
         position = self._frames.to_map(name, pose, frame).pose.position
         return position.x, position.y
 
-    def _on_odometry(self, message: Odometry) -> None:
-        self._take("odom", PoseStamped(header=message.header, pose=message.pose.pose))
+    def _take(self, pose: PoseStamped) -> None:
+        place = self._place()
+        if place is None:
+            return
+        seconds = Time.from_msg(pose.header.stamp).nanoseconds / 1e9
+        if not seconds:
+            raise ValueError("the robot's pose has no stamp; give it the time")
+        self._on_pose(seconds, *self.in_map("the robot's pose", pose, place.frame))
 
     def _look_up(self) -> None:
         place = self._place()
         if place is None:
             return
         try:
-            pose = self._frames.origin_of(self._node.value("robot_frame"), place.frame)
+            self._take(self._frames.origin_of(self._node.value("robot_frame"), place.frame))
         except ValueError as error:
             reason = f"{error}; publish a transform, or set robot_frame"
-            self._refusals.refuse("tf", reason, once=True)
+            self._refusals.refuse("tf", reason, log="tf" not in self._refusals.refused)
         else:
-            self._take("tf", pose)
-
-    def _take(self, topic: str, pose: PoseStamped) -> None:
-        place = self._place()
-        if place is None:
-            return
-        try:
-            seconds = Time.from_msg(pose.header.stamp).nanoseconds / 1e9
-            if not seconds:
-                raise ValueError("the robot's pose has no stamp; give it the time")
-            self._on_pose(seconds, *self.in_map("the robot's pose", pose, place.frame))
-        except ValueError as error:
-            self._refusals.refuse(topic, str(error), once=True)
-        else:
-            self._refusals.accept(topic)
+            self._refusals.accept("tf")

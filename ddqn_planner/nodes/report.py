@@ -138,11 +138,11 @@ class Refusals:
         self.node = node
         self.refused: dict[str, str] = {}
 
-    def refuse(self, what: str, reason: str, once: bool = False) -> None:
-        """Refuse something; with `once`, another reason than the first one is not logged."""
-        before = self.refused.get(what)
+    def refuse(self, what: str, reason: str, log: bool = True) -> None:
+        """Refuse something, and perhaps log it, unless the last reason was the same."""
+        repeated = self.refused.get(what) == reason
         self.refused[what] = reason
-        if before is None or (before != reason and not once):
+        if log and not repeated:
             self.node.get_logger().error(f"{what} refused: {reason}")
 
     def accept(self, what: str) -> None:
@@ -172,9 +172,9 @@ class Report(Refusals):
         """Publish soon: something about the node changed."""
         self._due = 0.0
 
-    def refuse(self, what: str, reason: str, once: bool = False) -> None:
+    def refuse(self, what: str, reason: str, log: bool = True) -> None:
         """Refuse something, and publish it soon."""
-        super().refuse(what, reason, once)
+        super().refuse(what, reason, log)
         self.change()
 
     def accept(self, what: str) -> None:

@@ -9,9 +9,8 @@ from dataclasses import dataclass, field
 from ddqn_planner.grid import Cell, GridMap, MoveRule
 from ddqn_planner.model import QNetwork
 from ddqn_planner.model.move_costs import MoveCosts
-from ddqn_planner.planning.distance_field import DistanceField
-from ddqn_planner.planning.q_field import Goals, QField
-from ddqn_planner.planning.repair import changed_cells, hand_over, shift_between
+from ddqn_planner.planning.field import DistanceField, Goals, QField, network_field
+from ddqn_planner.planning.repair import changed_cells, shift_between
 
 CACHE_BYTES = 2**29
 """Memory for the Q fields that a planner keeps: 14 of 2000 x 2000 cells, at 9 bytes per cell."""
@@ -37,21 +36,11 @@ class _KnownMap:
 
 
 class FieldCache:
-    """Gives the Q fields of a network, computed, repaired or kept. Several threads may use it.
-
-    Parameters
-    ----------
-    network : QNetwork
-
-    Attributes
-    ----------
-    nbytes : int
-        Memory for the fields that are kept, those used last; the last one is always kept.
-    """
+    """Gives the Q fields of a network, computed, repaired or kept. Several threads may use it."""
 
     def __init__(self, network: QNetwork) -> None:
         self.network = network
-        self.nbytes = CACHE_BYTES
+        self.nbytes = CACHE_BYTES  # the field used last is always kept
         self._maps: list[_KnownMap] = []  # used last at the end
         self._lock = threading.Lock()
 
@@ -79,8 +68,7 @@ class FieldCache:
         if found is None:
             if known.costs is None:
                 (goal,) = goals
-                q = self.network.q_values(grid, goal, rule)
-                found = QField(goal, q, grid.legal_moves(rule), rule)
+                found = network_field(self.network, grid, goal, rule)
             else:
                 found = DistanceField(goals, grid, known.costs, rule)
                 self._repair(known, found, start)
@@ -121,7 +109,7 @@ class FieldCache:
             old = older.fields.get(old_goals)
             if isinstance(old, DistanceField):
                 changed = changed_cells(old.grid, new.grid, shift)
-                if changed is not None and hand_over(old, new, changed, shift, start):
+                if changed is not None and new.take_over(old, changed, shift, start):
                     with self._lock:
                         older.fields.pop(old_goals, None)
                 return

@@ -14,11 +14,10 @@ from ddqn_planner.grid import Cell, GridMap, MoveRule, path_cost
 from ddqn_planner.grid.arguments import as_cell, as_flag, listed, real
 from ddqn_planner.grid.grid_map import check_grid
 from ddqn_planner.model import ModelMetadata, QNetwork, load_model
-from ddqn_planner.planning.distance_field import DistanceField
+from ddqn_planner.planning.field import DistanceField, Goals, QField
 from ddqn_planner.planning.field_cache import FieldCache
 from ddqn_planner.planning.path_under_way import keep_or_switch
 from ddqn_planner.planning.plan import Plan, PlanMethod, PlanRequest, PlanStatus, joined
-from ddqn_planner.planning.q_field import Goals, QField
 from ddqn_planner.planning.search import search
 from ddqn_planner.planning.simplification import simplify
 from ddqn_planner.planning.way_out import can_leave, reach, way_out_and_ends
@@ -44,7 +43,7 @@ class Planner:
     """
 
     def __init__(self, network: QNetwork, metadata: ModelMetadata) -> None:
-        if not (hasattr(network, "q_values") and hasattr(metadata, "move_rule")):
+        if not (hasattr(network, "move_costs") and hasattr(metadata, "move_rule")):
             raise ValueError(
                 f"network is {network!r}, metadata is {metadata!r}; give what load_model returns"
             )

@@ -1,25 +1,18 @@
-"""Repair of a field when its map changes: what a robot sees changes some cells of millions."""
+"""What has changed between two maps of one place: what a robot sees changes some cells of millions.
+
+A field is repaired for it, see `DistanceField.take_over`.
+"""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ddqn_planner.grid import Cell, GridMap
-from ddqn_planner.planning.distance_field import DistanceField, Known
-
-REPAIRED = 100
-"""Cells that a repair may take back before a new field is begun."""
-
-VISITS = 8
-"""Visits of a new field per cell that a repair may take back, while both take turns: to take a cell
-back takes longer, and it is visited again. See docs/benchmarks.md."""
-
-REPAIRED_SHARE = 0.02
-"""Share of the map's cells that a repair may take back."""
 
 CHANGED_SHARE = 0.02
 """Share of the map's cells that may have changed: with more, a new field is cheaper."""
@@ -35,10 +28,8 @@ cells: ROS messages give the resolution in float32."""
 def shift_between(old: GridMap, new: GridMap) -> Cell | None:
     """Return by how many cells a map's cells have moved in a newer one; None if not by whole ones.
 
-    None too if only one of them has costs, or one-way zones.
-
-    The cell (x, y) of the old map is (x + dx, y + dy) in the new one. As a map grows, mapping
-    shifts it.
+    None too if only one of them has costs, or one-way zones. The cell (x, y) of the old map is
+    (x + dx, y + dy) in the new one. As a map grows, mapping shifts it.
     """
     for layer in LAYERS:
         if (getattr(old, layer) is None) != (getattr(new, layer) is None):
@@ -55,54 +46,6 @@ def offset_between(old: GridMap, new: GridMap) -> Cell | None:
     shift = new.world_to_cell(*corner)
     apart = math.dist(corner, new.cell_to_world(shift))
     return shift if apart < SAME_PLACE * new.resolution else None
-
-
-def hand_over(
-    old: DistanceField,
-    new: DistanceField,
-    changed: NDArray[np.int32],
-    shift: Cell,
-    start: Cell | None = None,
-) -> bool:
-    """Repair what an older field knows and give it to a new one, unless a new start is quicker.
-
-    The values are the same. With a start, repair and new field take turns, each time with four
-    times the limit: so the quicker one wins, and its time is not exceeded by much.
-
-    Parameters
-    ----------
-    old : DistanceField
-        It begins anew if its memory is handed over, else it stays as it is.
-    new : DistanceField
-        To the same place on the new map. Nothing of it is known yet.
-    changed, shift
-        See `changed_cells` and `shift_between`.
-    start : (x, y), optional
-        From where a path is asked for, in the new map. By default the whole field is wanted.
-
-    Returns
-    -------
-    bool
-        Whether the new field has the older one's memory.
-    """
-    from ddqn_planner.planning.invalidation import take_back
-
-    most = max(REPAIRED, int(REPAIRED_SHARE * new.grid.occupancy.size))
-    limit = most if start is None or old.has_values_of_all else REPAIRED
-    with old.lock:
-        known = taken = old.take()
-        if shift != (0, 0) or old.grid.occupancy.shape != new.grid.occupancy.shape:
-            known = _moved(taken, old.grid, new.grid, shift)
-        while True:
-            reopened, kept = take_back(known.distance, known.state, new.costs, changed, limit)
-            if kept:
-                opened = np.concatenate([known.opened, reopened])
-                new.known = known._replace(opened=opened, closed_is_final=False)
-                return True
-            limit *= 4
-            if start is None or limit > most or new.reach(start, VISITS * limit) or new.is_whole:
-                old.known = taken
-                return False
 
 
 def _overlap(old: GridMap, new: GridMap, shift: Cell) -> tuple[int, int, int, int]:
@@ -126,8 +69,7 @@ def changed_cells(old: GridMap, new: GridMap, shift: Cell) -> NDArray[np.int32] 
     differs = np.zeros((top - bottom, right - left), dtype=np.bool_)
     for layer in LAYERS:
         one, other = getattr(old, layer), getattr(new, layer)
-        moved = one is not other or shift != (0, 0)
-        if moved and one is not None and other is not None:
+        if one is not None and (one is not other or shift != (0, 0)):
             differs |= one[before] != other[inside]
     number = np.flatnonzero(differs)
     if number.size > CHANGED_SHARE * differs.size:
@@ -147,20 +89,27 @@ def changed_cells(old: GridMap, new: GridMap, shift: Cell) -> NDArray[np.int32] 
     return numbers[(numbers > width) & (numbers < size - width - 1)].astype(np.int32)
 
 
-def _moved(known: Known, old: GridMap, new: GridMap, shift: Cell) -> Known:
-    """Return what is known of a field with each cell where it is in the new map."""
-    left, bottom, right, top = _overlap(old, new, shift)
+def moved(
+    known: Sequence[NDArray[Any]], old: GridMap, new: GridMap, shift: Cell
+) -> tuple[NDArray[Any], ...]:
+    """Return the distance, state and open cells of a field with each cell where it is in a new map.
 
-    def moved(array: NDArray[Any]) -> NDArray[Any]:
-        target = np.zeros((new.height + 2, new.width + 2), dtype=array.dtype)
-        source = array.reshape(old.height + 2, old.width + 2)
-        target[bottom + 1 : top + 1, left + 1 : right + 1] = source[
+    Without a shift they are the same arrays.
+    """
+    *layers, opened = known
+    if shift == (0, 0) and old.occupancy.shape == new.occupancy.shape:
+        return *layers, opened
+    left, bottom, right, top = _overlap(old, new, shift)
+    rows, columns = slice(bottom + 1, top + 1), slice(left + 1, right + 1)
+    result = []
+    for layer in layers:
+        target = np.zeros((new.height + 2, new.width + 2), dtype=layer.dtype)
+        source = layer.reshape(old.height + 2, old.width + 2)
+        target[rows, columns] = source[
             bottom - shift[1] + 1 : top - shift[1] + 1, left - shift[0] + 1 : right - shift[0] + 1
         ]
-        return target.ravel()
-
-    y, x = np.divmod(known.opened, old.width + 2)
+        result.append(target.ravel())
+    y, x = np.divmod(opened, old.width + 2)
     y, x = y + shift[1], x + shift[0]
     inside = (left < x) & (x <= right) & (bottom < y) & (y <= top)
-    opened = (y * (new.width + 2) + x)[inside].astype(np.int32)
-    return Known(moved(known.distance), moved(known.state), opened)
+    return *result, (y * (new.width + 2) + x)[inside].astype(np.int32)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import heapq
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,25 +20,12 @@ def search(
     move_rule: MoveRule,
     value: NDArray[np.float32] | None = None,
 ) -> tuple[Cell, ...]:
-    """Return a path from one cell to another, or to one of several; empty if there is none.
+    """Return a path from one cell to another, or to one of a mask of several; empty without one.
 
-    Cells are visited in the order of the path's cost so far minus V(s): A* (Hart, Nilsson and
-    Raphael 1968) with -V as its heuristic. A good field leads straight to the end. With any
-    field, each cell is visited at most once, so an end is found if a path leads to one.
-
-    Parameters
-    ----------
-    start : (x, y)
-    end : (x, y), or (H, W) bool
-        The end, or a mask of several.
-    legal : (8, H, W) bool
-        The moves that may be made.
-    multiplier : (H, W) float32
-        See `GridMap.cost_multiplier`.
-    move_rule : MoveRule
-        Gives the length of a move.
-    value : (H, W) float32, optional
-        V(s); by default 0, which gives the cheapest path to the nearest end (Dijkstra).
+    Only the `legal` moves, (8, H, W), are made. Cells are visited in the order of the path's cost
+    so far minus V(s): A* (Hart, Nilsson and Raphael 1968) with -V as its heuristic. A good field
+    leads straight to the end. With any field, each cell is visited at most once, so an end is found
+    if a path leads to one. Without values it is the cheapest path to the nearest end (Dijkstra).
     """
     if not isinstance(end, np.ndarray):
         (x, y), end = end, np.zeros(multiplier.shape, dtype=np.bool_)
@@ -57,7 +45,9 @@ def search(
 
 
 @compiled
-def _search(start, ends, legal, multiplier, lengths, value, moves):  # type: ignore[no-untyped-def]  # pragma: no cover
+def _search(
+    start: Cell, ends: Any, legal: Any, multiplier: Any, lengths: Any, value: Any, moves: Any
+) -> tuple[NDArray[np.int8], int]:
     """Return the action by which each cell was entered, (H, W) int8, and the end's number or -1."""
     width = ends.shape[1]
     entered_by = np.full(ends.shape, -1, dtype=np.int8)

@@ -7,8 +7,8 @@ from numpy.typing import NDArray
 
 from ddqn_planner.grid import Cell, GridMap, legal_moves
 from ddqn_planner.grid.arguments import Occupancy
+from ddqn_planner.planning.field import Goals
 from ddqn_planner.planning.plan import PlanRequest
-from ddqn_planner.planning.q_field import Goals
 from ddqn_planner.planning.search import search
 
 ROUNDING = 1e-6

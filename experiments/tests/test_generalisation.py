@@ -40,7 +40,6 @@ from ddqn_planner.grid import (
     Cell,
     GridMap,
     MoveRule,
-    connected_cells,
     legal_moves,
     move_costs,
     save_map,
@@ -137,7 +136,7 @@ def test_a_perfect_network_solves_every_request_at_the_least_cost(
         assert (drawn.grid.cost is None) == (costs == "none")
         for start, goal in drawn.requests:
             assert start != goal
-            assert connected_cells(drawn.grid.occupancy, goal, rule)[start[1], start[0]]
+            assert drawn.grid.reachable([goal], rule)[start[1], start[0]]
     rollouts = rollouts_of(PerfectNetwork(), *maps, rule=rule)
     assert total(rollouts, *COLUMNS[:8]) == ["2", *["54"], *["54/54"] * 3, *["1.0000"] * 2, "0"]
     first, *groups, _ = summarise(rollouts)

@@ -12,8 +12,7 @@ import pytest
 
 from ddqn_planner import Experience, GridMap
 from ddqn_planner.experience import ExperienceFileError
-from ddqn_planner.experience.drive_log import Drive, DriveEnd, DriveFolder, read_drives
-from ddqn_planner.experience.drive_recorder import DriveRecorder
+from ddqn_planner.experience.drives import Drive, DriveEnd, DriveFolder, DriveRecorder, read_drives
 from ddqn_planner.files import FolderError
 
 GRID = GridMap(np.zeros((40, 200), dtype=np.bool_), resolution=0.25)
@@ -145,7 +144,7 @@ def test_a_folder_of_something_else_is_refused_and_left_as_it_is(tmp_path: Path)
 def test_no_other_process_gets_into_a_folder_until_the_first_one_is_killed(tmp_path: Path) -> None:
     code = (
         "import sys, time\n"
-        "from ddqn_planner.experience.drive_log import DriveFolder\n"
+        "from ddqn_planner.experience.drives import DriveFolder\n"
         "folder = DriveFolder(sys.argv[1], 0.5, 0.5)\n"
         "print('open', flush=True)\n"
         "time.sleep(1000)\n"

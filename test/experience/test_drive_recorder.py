@@ -5,8 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from ddqn_planner.experience.drive_log import DriveEnd
-from ddqn_planner.experience.drive_recorder import MOST_SAMPLES, DriveRecorder
+from ddqn_planner.experience.drives import MOST_SAMPLES, DriveEnd, DriveRecorder
 
 RATE = 20.0
 

@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ddqn_planner import Experience, GridMap, Planner
-from ddqn_planner.experience import spreading
+from ddqn_planner.experience import evidence
 from ddqn_planner.grid import MoveRule, shortest_distances
 
 SPEED = 0.5
@@ -145,12 +145,12 @@ def test_a_map_that_changes_gives_what_a_new_one_gives() -> None:
 
 def test_without_memory_for_a_map_nothing_is_lost(monkeypatch: pytest.MonkeyPatch) -> None:
     drives = straight((2, 5), (12, 5), 3), straight((2, 5.5), (12, 6), 2)
-    for name in ("spread", "refresh"):
+    for name in ("spread_evidence", "refresh"):
         experience = driven(drives[0])
         experience.apply(HALL)
         experience.record(*drives[1])
         with monkeypatch.context() as patch:
-            patch.setattr(spreading, name, Mock(side_effect=MemoryError))
+            patch.setattr(evidence, name, Mock(side_effect=MemoryError))
             with pytest.raises(MemoryError):
                 experience.apply(HALL)
         np.testing.assert_array_equal(experience.slowness(HALL), driven(*drives).slowness(HALL))

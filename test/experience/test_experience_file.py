@@ -38,7 +38,8 @@ def test_what_is_saved_is_loaded(tmp_path: Path) -> None:
     np.testing.assert_array_equal(loaded.evidence.table, experience.evidence.table)
     assert loaded.evidence.number == experience.evidence.number
     assert loaded.evidence.driven == experience.evidence.driven
-    assert loaded.forecasts.__dict__ == experience.forecasts.__dict__
+    assert loaded.evidence.noise == experience.evidence.noise
+    assert loaded.evidence.errors == experience.evidence.errors
     np.testing.assert_allclose(loaded.slowness(HALL), experience.slowness(HALL), rtol=0.021)
     seconds = np.arange(0, 30, 0.1)
     positions = np.column_stack([2 + seconds * 0.3, np.full(len(seconds), 6.0)])
@@ -165,5 +166,3 @@ while True:
             time.sleep(random.uniform(0, 0.1))
             process.send_signal(signal.SIGKILL)
         assert Experience.load(path).evidence.places > 30
-    some_experience().save(path)
-    assert list(tmp_path.iterdir()) == [path]  # what killed processes left is removed

@@ -9,7 +9,7 @@ import pytest
 
 from ddqn_planner import Experience, GridMap
 from ddqn_planner.cli import main
-from ddqn_planner.experience.drive_log import DriveEnd, DriveFolder
+from ddqn_planner.experience.drives import DriveEnd, DriveFolder
 from ddqn_planner.experience.recordings import drives_of, read_mcap
 from ddqn_planner.grid import save_map
 

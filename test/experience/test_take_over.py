@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from ddqn_planner import Experience, GridMap
-from ddqn_planner.experience import spreading
-from ddqn_planner.experience.take_over import take_over
+from ddqn_planner.experience import evidence
 
 GRID = GridMap(np.zeros((60, 200), dtype=np.bool_), resolution=0.25)
 
@@ -21,13 +20,13 @@ def drive(experience: Experience, y: float, seconds: float = 80.0) -> None:
 def counted(monkeypatch: pytest.MonkeyPatch) -> list[int]:
     """How many places were spread by each call."""
     counts: list[int] = []
-    spread = spreading.spread
+    spread = evidence.spread_evidence
 
     def counting(occupancy: np.ndarray, cells: np.ndarray, *rest: object) -> None:
         counts.append(len(cells))
         spread(occupancy, cells, *rest)
 
-    monkeypatch.setattr(spreading, "spread", counting)
+    monkeypatch.setattr(evidence, "spread_evidence", counting)
     return counts
 
 
@@ -43,7 +42,7 @@ def test_only_what_is_new_is_spread_and_the_result_is_the_same(
         trainer.save(path)
         newer = Experience.load(path)
         if used is not None:
-            take_over(newer, used)
+            newer.take_over(used)
         used = newer
         if number == 2:
             continue  # this one is never spread
@@ -62,6 +61,6 @@ def test_experience_that_was_forgotten_begins_anew(tmp_path: Path) -> None:
     drive(newer, 11.0, 200.0)
     newer.save(path)
     loaded = Experience.load(path)
-    take_over(loaded, trainer)
+    loaded.take_over(trainer)
     np.testing.assert_array_equal(loaded.slowness(GRID), Experience.load(path).slowness(GRID))
     assert trainer.slowness(GRID)[12, 60] > 1.5

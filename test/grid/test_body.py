@@ -9,8 +9,7 @@ from hypothesis import strategies as st
 from strategies import occupancies
 
 from ddqn_planner.grid import UNKNOWN, GridMap, MoveRule, clearance, inflate
-from ddqn_planner.grid.body import Inflation, inflate_changed
-from ddqn_planner.grid.moves import component_labels
+from ddqn_planner.grid.body import Inflation
 
 RESOLUTION = 0.05
 
@@ -47,7 +46,7 @@ def test_clearance_costs_fall_with_the_distance_and_occupy_no_cell(
     plain = GridMap(occupancy, RESOLUTION, cost=np.full(occupancy.shape, values, dtype=np.int8))
     grid = inflate(plain, 0.07, weight)
     assert (grid.occupancy == inflate(plain, 0.07).occupancy).all()
-    labels = [component_labels(g.occupancy, MoveRule.ROBOT_SAFE) for g in (grid, plain)]
+    labels = [g.labels(MoveRule.ROBOT_SAFE) for g in (grid, plain)]
     assert (labels[0] > 0).sum() <= (labels[1] > 0).sum()
     free, distance = ~grid.occupancy, clearance(occupancy)
     multiplier = grid.cost_multiplier[free][np.argsort(distance[free])]
@@ -124,17 +123,12 @@ def test_a_changed_map_is_inflated_near_its_changed_cells_as_if_it_were_whole(
     for _ in range(changes):
         x, y = random.integers(0, 38, 2).tolist()
         grid = grid.with_patch(random.random((2, 2)) < 0.5, x, y)
-    expected = inflate(grid, radius, weight)
-    found = inflate_changed(grid, before, inflate(before, radius, weight), radius, weight)
+    inflation = Inflation()
+    inflation(before, radius, weight)
+    expected, found = inflate(grid, radius, weight), inflation(grid, radius, weight)
     assert found.same_cells(expected)
     for cell in np.ndindex(60, 40):
         assert found.is_obstacle(cell) == expected.is_obstacle(cell)
-
-
-def test_a_map_of_another_size_is_inflated_whole() -> None:
-    before, grid = GridMap(np.eye(9)), GridMap(np.eye(12))
-    found = inflate_changed(grid, before, inflate(before, 1.5), 1.5)
-    assert found.same_cells(inflate(grid, 1.5))
 
 
 def test_maps_that_come_one_after_another_are_inflated_for_the_body_of_now() -> None:

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from settings import START_DEAD_END
 
-from ddqn_planner.grid import MOVES, MoveRule, connected_cells, legal_moves, shortest_distances
+from ddqn_planner.grid import MOVES, GridMap, MoveRule, legal_moves, shortest_distances
 from ddqn_planner.training.environment import Scenario
 
 DEAD_ENDS_ON_THE_WAY = [
@@ -64,7 +64,7 @@ def test_the_start_lies_in_a_dead_end_of_ten_cells_that_opens_away_from_the_end(
     closed = paper.grid.occupancy.copy()
     for x, y in opening:
         closed[y, x] = True
-    inside = connected_cells(closed, paper.start, MoveRule.CORNER_CUTTING)
+    inside = GridMap(closed).reachable([paper.start], MoveRule.CORNER_CUTTING)
     assert {(int(x), int(y)) for y, x in np.argwhere(inside)} == START_DEAD_END
 
 
@@ -88,7 +88,7 @@ def test_two_more_dead_ends_catch_a_robot_that_heads_for_the_end(
 
 @pytest.mark.parametrize("rule", MoveRule)
 def test_every_free_cell_is_connected_to_the_end(paper: Scenario, rule: MoveRule) -> None:
-    connected = connected_cells(paper.grid.occupancy, paper.goal, rule)
+    connected = paper.grid.reachable([paper.goal], rule)
     np.testing.assert_array_equal(connected, ~paper.grid.occupancy)
 
 

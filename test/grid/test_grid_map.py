@@ -14,7 +14,6 @@ from strategies import grids_with_costs, occupancies
 from ddqn_planner import Planner
 from ddqn_planner.grid import UNKNOWN, GridMap, MoveRule, inflate
 from ddqn_planner.grid.arguments import MAX_SLOWNESS, as_cell
-from ddqn_planner.grid.moves import component_labels
 
 origins = st.tuples(
     st.floats(-100, 100), st.floats(-100, 100), st.floats(-2 * math.pi, 2 * math.pi)
@@ -98,9 +97,9 @@ def test_occupancy_values_are_cut_at_the_threshold(
         ((np.zeros((1, 1)), 1.0, (0.0, 0.0)), "origin"),
         ((np.zeros((1, 1)), 1.0, (0.0, 0.0, 0.0), np.zeros((1, 2))), "cost has shape"),
         ((np.zeros((1, 1)), 1.0, (0.0, 0.0, 0.0), np.full((1, 1), -2)), "-2"),
-        ((np.zeros((1, 1)), 1.0, (0.0, 0.0, 0.0), np.full((1, 1), 100)), "hold 100; .*-1..99"),
-        ((np.zeros((1, 1)), 1.0, (0.0, 0.0, 0.0), [[0.7]]), r"hold 0\.7"),
-        ((np.zeros((1, 1)), 1.0, (0.0, 0.0, 0.0), [[math.nan]]), "hold nan"),
+        ((np.zeros((1, 1)), 1.0, (0.0, 0.0, 0.0), np.full((1, 1), 100)), "holds 100; .*-1 to 99"),
+        ((np.zeros((1, 1)), 1.0, (0.0, 0.0, 0.0), [[0.7]]), r"holds 0\.7"),
+        ((np.zeros((1, 1)), 1.0, (0.0, 0.0, 0.0), [[math.nan]]), "holds nan"),
         ((np.zeros((1, 1)), 1.0, (0.0, 0.0, 0.0), [["dear"]]), "are of type <U"),
         ((np.zeros((1, 1)), 1.0, (0.0, 0.0, 0.0), 7), r"cost has shape \(\)"),
         ((np.zeros((1, 1)), 1.0, (0.0, 0.0, 0.0), [7]), r"cost has shape \(1,\)"),
@@ -138,10 +137,10 @@ def test_costs_may_be_lists_or_arrays_and_those_of_occupied_cells_are_ignored() 
 @pytest.mark.parametrize(
     ("values", "threshold", "named"),
     [
-        ([[0, 65536]], 65, "hold 65536"),
-        ([[0, 128]], 65, "hold 128"),
-        ([[0, -129]], 65, "hold -129"),
-        ([[0.0, 0.4]], 65, r"hold 0\.4"),
+        ([[0, 65536]], 65, "holds 65536"),
+        ([[0, 128]], 65, "holds 128"),
+        ([[0, -129]], 65, "holds -129"),
+        ([[0.0, 0.4]], 65, r"holds 0\.4"),
         ([[0.0, 1.0]], 65, "of type float64; give integers, percent"),
         ([[True, False]], 65, "of type bool"),
         ([[0, 1], [0]], 65, "no array"),
@@ -281,7 +280,7 @@ def test_the_occupied_cells_of_a_patch_are_obstacles() -> None:
         ((np.zeros(3), 0, 0), r"occupancy has shape \(3,\)"),
         ((np.zeros((1, 1)), 0.5, 0), "first cell of the patch is .*; give two whole numbers"),
         ((np.zeros((1, 1)), 0, 0, [[1, 2]]), r"cost has shape \(1, 2\); give \(1, 1\)"),
-        ((np.zeros((1, 1)), 0, 0, [[100]]), "hold 100; give whole numbers -1..99"),
+        ((np.zeros((1, 1)), 0, 0, [[100]]), "holds 100; give whole numbers -1 to 99"),
         ((np.ones((1, 2)), 0, 0, None, [[1]]), r"obstacles has shape \(1, 1\); give \(1, 2\)"),
         (([[100]], 0, 0), "occupancy holds 100; give True or False"),
     ],
@@ -296,7 +295,7 @@ def test_a_wrong_patch_is_named_and_the_remedy_too(arguments: tuple, named: str)
 def test_the_map_computes_its_labels_once_per_kind_of_rule(occupancy: np.ndarray) -> None:
     grid = GridMap(occupancy)
     for rule in MoveRule:
-        np.testing.assert_array_equal(grid.labels(rule), component_labels(occupancy, rule))
+        np.testing.assert_array_equal(grid.labels(rule), GridMap(occupancy).labels(rule))
         assert grid.labels(rule.value) is grid.labels(rule)
     assert grid.labels("unit") is grid.labels("corner_cutting")
     with pytest.raises(ValueError, match="give one of robot_safe"):

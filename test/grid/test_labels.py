@@ -7,8 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from strategies import occupancies
 
-from ddqn_planner.grid import MoveRule
-from ddqn_planner.grid.moves import component_labels
+from ddqn_planner.grid import GridMap, MoveRule
 
 
 def scipy_labels(occupancy: np.ndarray, rule: MoveRule) -> np.ndarray:
@@ -20,7 +19,7 @@ def scipy_labels(occupancy: np.ndarray, rule: MoveRule) -> np.ndarray:
 @given(occupancies, st.sampled_from(MoveRule))
 def test_the_labels_are_those_of_scipy(occupancy: np.ndarray, rule: MoveRule) -> None:
     expected = scipy_labels(occupancy, rule)
-    np.testing.assert_array_equal(component_labels(occupancy, rule), expected)
+    np.testing.assert_array_equal(GridMap(occupancy).labels(rule), expected)
 
 
 @pytest.mark.parametrize("rule", MoveRule)
@@ -28,4 +27,4 @@ def test_the_labels_of_large_maps_are_those_of_scipy(rule: MoveRule) -> None:
     for share in (0.4, 0.5, 0.6):
         occupancy = np.random.default_rng(0).random((150, 211)) < share
         expected = scipy_labels(occupancy, rule)
-        np.testing.assert_array_equal(component_labels(occupancy, rule), expected)
+        np.testing.assert_array_equal(GridMap(occupancy).labels(rule), expected)

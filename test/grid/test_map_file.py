@@ -309,7 +309,7 @@ def test_the_papers_map_names_start_and_goal() -> None:
         ({"mode": "quaternary"}, "mode is 'quaternary'"),
         ({"mode": []}, r"mode is \[\]"),
         ({"image": []}, r"image is \[\]"),
-        ({"ddqn_planner": {"start": [0, 9]}}, r"start is \(0, 9\)"),
+        ({"ddqn_planner": {"start": [0, 9]}}, r"start \(0, 9\) lies outside the map of 2 x 2"),
         ({"ddqn_planner": {"goal": [0.5, 0]}}, r"goal is \[0\.5, 0\.0\]"),
         ({"ddqn_planner": {"goal": "there"}}, "goal is 'there'"),
         ({"ddqn_planner": {"goal": "12"}}, "goal is '12'"),

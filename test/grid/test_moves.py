@@ -16,7 +16,6 @@ from ddqn_planner.grid import (
     MOVES,
     GridMap,
     MoveRule,
-    connected_cells,
     legal_moves,
     move_costs,
     neighbours,
@@ -64,7 +63,7 @@ def test_connected_cells_have_a_finite_distance(
 ) -> None:
     grid, cell = grid_and_cell
     expected = np.isfinite(shortest_distances(grid, cell, rule))
-    np.testing.assert_array_equal(connected_cells(grid.occupancy, cell, rule), expected)
+    np.testing.assert_array_equal(grid.reachable([cell], rule), expected)
 
 
 @given(grids_with_costs(), RULES)
@@ -90,7 +89,7 @@ def test_a_rule_is_given_as_a_member_or_as_its_value(rule: MoveRule) -> None:
     by_rule: list[Callable[[MoveRule | str], object]] = [
         lambda rule: legal_moves(occupancy, rule).tolist(),
         lambda rule: move_costs(multiplier, rule).tolist(),
-        lambda rule: connected_cells(occupancy, (2, 0), rule).tolist(),
+        lambda rule: GridMap(occupancy).reachable([(2, 0)], rule).tolist(),
         lambda rule: path_length(cells, rule),
         lambda rule: path_cost(cells, multiplier, rule),
         lambda rule: shortest_distances(GridMap(occupancy), (0, 0), rule).tolist(),

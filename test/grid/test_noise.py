@@ -13,7 +13,6 @@ from ddqn_planner.grid import (
     GridMap,
     MoveRule,
     Noise,
-    connected_cells,
     legal_moves,
     scatter_obstacles,
     shortest_path,
@@ -35,7 +34,7 @@ def test_one_to_five_new_obstacles_lie_where_the_noise_says_and_leave_a_path(
         assert noisy.fingerprint == again.fingerprint
         assert rejected >= 0
         assert not (grid.occupancy & ~noisy.occupancy).any()
-        assert connected_cells(noisy.occupancy, paper.goal, rule)[paper.start[::-1]]
+        assert noisy.reachable([paper.goal], rule)[paper.start[::-1]]
         new = np.argwhere(noisy.occupancy & ~grid.occupancy)
         counts.add(len(new))
         for y, x in new:
@@ -74,7 +73,7 @@ def test_a_path_joins_start_and_goal_of_each_request(
     assert len(requests) == 5
     for start, goal in requests:
         assert start != goal
-        assert connected_cells(occupancy, start, rule)[goal[1], goal[0]]
+        assert GridMap(occupancy).reachable([start], rule)[goal[1], goal[0]]
 
 
 @pytest.mark.parametrize("rule", MoveRule)

@@ -16,7 +16,6 @@ from ddqn_planner.grid import (
     shortest_distances,
     shortest_path,
 )
-from ddqn_planner.grid.shortest_paths import _graph
 
 RULES = st.sampled_from(list(MoveRule))
 
@@ -53,15 +52,6 @@ def test_any_pair_of_whole_numbers_is_a_goal() -> None:
     for outside in ((3, 0), (0, 2), (-1, 0)):
         with pytest.raises(ValueError, match="outside the map of 3 x 2"):
             shortest_distances(grid, outside, "unit")
-
-
-def test_columns_of_the_graph_are_sorted_and_int32() -> None:
-    graph = _graph(GridMap(np.zeros((7, 5))), MoveRule.ROBOT_SAFE)
-    assert graph.indices.dtype == graph.indptr.dtype == np.int32
-    graph.has_sorted_indices = graph.has_canonical_format = False
-    sorted_graph = graph.sorted_indices()
-    assert (sorted_graph.indices == graph.indices).all()
-    assert (sorted_graph.data == graph.data).all()
 
 
 @given(grids_with_costs(), RULES, st.data())

@@ -1,4 +1,4 @@
-"""Updates of maps: which are refused, and what becomes of the map.
+"""Which map is planned on, whatever of maps, updates, directions and experience comes when.
 
 Here a message of map_msgs is a stand-in with the same fields; PyPI does not have map_msgs.
 """
@@ -8,7 +8,8 @@ from __future__ import annotations
 import array
 import re
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -16,7 +17,7 @@ import numpy as np
 import pytest
 import rclpy
 from builtin_interfaces.msg import Time
-from client import TIMEOUT
+from client import TIMEOUT, wait_for
 from hypothesis import given
 from hypothesis import strategies as st
 from nav_msgs.msg import OccupancyGrid
@@ -24,87 +25,18 @@ from rclpy.parameter import Parameter
 from rclpy.utilities import try_shutdown
 from std_msgs.msg import Header
 
-from ddqn_planner.grid import GridMap
+from ddqn_planner import Experience, GridMap, Planner
+from ddqn_planner.experience import ExperienceFileError
 from ddqn_planner.nodes.conversions import directions_message, occupancy_message
-from ddqn_planner.nodes.map_source import MapSource, updated_values
+from ddqn_planner.nodes.map_source import ExpectedTimes, MapSource, updated_values
 from ddqn_planner.nodes.parameters import PLANNER_PARAMETERS
 from ddqn_planner.nodes.report import Report, RequestError
-from ddqn_planner.nodes.runtime import BaseNode, Worker
+from ddqn_planner.nodes.runtime import LATCHED, BaseNode, Worker
 
-MAP = occupancy_message(
-    np.arange(20, dtype=np.int8).reshape(4, 5),
-    0.5,
-    (0.0, 0.0, 0.0),
-    Header(frame_id="map", stamp=Time(sec=5, nanosec=7)),
-)
-"""5 x 4 cells."""
+EAST, WEST = 0b00111000, 0b10000011
+"""What lanes to the east and to the west forbid."""
 
-
-def update(**fields: Any) -> SimpleNamespace:
-    """Return an update of 2 x 3 cells from (1, 0), or with other fields."""
-    usual = {
-        "header": Header(frame_id="map", stamp=Time(sec=6)),
-        **{"x": 1, "y": 0, "width": 2, "height": 3, "data": array.array("b", range(40, 46))},
-    }
-    return SimpleNamespace(**{**usual, **fields})
-
-
-def test_the_values_of_an_update_come_row_by_row() -> None:
-    assert updated_values(MAP, update()).tolist() == [[40, 41], [42, 43], [44, 45]]
-
-
-@pytest.mark.parametrize("stamp", [Time(), Time(sec=5, nanosec=7), Time(sec=9)])
-def test_an_update_may_have_the_maps_stamp_or_a_later_one_or_none(stamp: Time) -> None:
-    header = Header(frame_id="map", stamp=stamp)
-    assert updated_values(MAP, update(header=header)).shape == (3, 2)
-
-
-@pytest.mark.parametrize(
-    ("fields", "reason"),
-    [
-        ({"x": -1}, "is not inside the map of 5 x 4"),
-        ({"y": -1}, "is not inside"),
-        ({"x": 4}, "2 x 3 cells from .4, 0. is not inside"),
-        ({"y": 2}, "is not inside"),
-        ({"width": 0, "data": array.array("b")}, "is not inside"),
-        ({"height": 0, "data": array.array("b")}, "is not inside"),
-        ({"width": 2**32 - 1, "height": 2**32 - 1}, "is not inside"),
-        ({"data": array.array("b", range(5))}, "5 values; its 2 x 3 cells need 6"),
-        ({"data": array.array("b", range(7))}, "7 values"),
-        ({"header": Header(frame_id="odom", stamp=Time(sec=6))}, "'odom', the map's is 'map'"),
-        ({"header": Header(stamp=Time(sec=6))}, "frame is ''"),
-        ({"header": Header(frame_id="map", stamp=Time(sec=5, nanosec=6))}, "later than the upd"),
-    ],
-)
-def test_an_update_that_does_not_fit_the_map_is_refused(
-    fields: dict[str, Any], reason: str
-) -> None:
-    with pytest.raises(ValueError, match=reason):
-        updated_values(MAP, update(**fields))
-
-
-def test_an_update_before_a_map_is_refused() -> None:
-    with pytest.raises(ValueError, match="before a map"):
-        updated_values(None, update())
-
-
-SIZES = st.integers(0, 7)
-PLACES = st.integers(-8, 8)
-
-
-@given(PLACES, PLACES, SIZES, SIZES, SIZES)
-def test_an_update_is_taken_if_all_its_cells_are_inside_and_have_values(
-    x: int, y: int, width: int, height: int, surplus: int
-) -> None:
-    data = array.array("b", bytes(max(width * height + surplus - 3, 0)))
-    cells = {(x + dx, y + dy) for dx in range(width) for dy in range(height)}
-    fits = bool(cells) and cells <= {(x, y) for x in range(5) for y in range(4)}
-    sent = update(x=x, y=y, width=width, height=height, data=data)
-    if fits and len(data) == width * height:
-        assert updated_values(MAP, sent).shape == (height, width)
-    else:
-        with pytest.raises(ValueError, match="update"):
-            updated_values(MAP, sent)
+SetParameters = Callable[..., None]
 
 
 @pytest.fixture(scope="module")
@@ -116,11 +48,113 @@ def node() -> Iterator[BaseNode]:
     try_shutdown()
 
 
-def random_map(random: np.random.Generator, stamp: int) -> OccupancyGrid:
-    values = random.choice([0, 0, 0, 0, 20, 98, 99, 100, -1], (30, 40)).astype(np.int8)
-    return occupancy_message(
-        values, 0.5, (-1.0, 2.0, 0.3), Header(frame_id="map", stamp=Time(sec=stamp))
-    )
+class Source(MapSource):
+    """A source of maps which has what the test gives it, and says what the planner would know."""
+
+    def __init__(self, node: BaseNode) -> None:
+        self.heard: list[bool] = []
+        self.report = Report(node)
+        super().__init__(node, self.report, Worker(node), self.heard.append)
+
+    def grid(self) -> GridMap:
+        future, deadline = self.inflated(), time.monotonic() + TIMEOUT
+        while not future.done():
+            assert time.monotonic() < deadline
+            time.sleep(0.001)
+        return future.result()
+
+    def forbidden(self) -> Any:
+        forbidden = self.grid().forbidden
+        return None if forbidden is None else forbidden.tolist()
+
+
+@pytest.fixture
+def source(node: BaseNode) -> Source:
+    return Source(node)
+
+
+@pytest.fixture
+def set_parameters(node: BaseNode, source: Source) -> Iterator[SetParameters]:
+    changed: set[str] = set()
+
+    def set_parameters(**values: Any) -> None:
+        changed.update(values)
+        for name, value in values.items():
+            assert node.set_parameters([Parameter(name, value=value)])[0].successful
+        source.apply_parameters({*values})
+
+    yield set_parameters
+    set_parameters(**{name: PLANNER_PARAMETERS[name].default for name in changed})
+
+
+@pytest.fixture
+def published(node: BaseNode) -> Iterator[None]:
+    """A publisher of directions, which the node has discovered."""
+    publisher = node.create_publisher(OccupancyGrid, "map_directions", LATCHED)
+    wait_for("publisher", lambda: node.count_publishers("map_directions") > 0)
+    yield
+    node.destroy_publisher(publisher)
+    wait_for("end of the publisher", lambda: node.count_publishers("map_directions") == 0)
+
+
+def map_of(stamp: int, frame: str = "map", x: float = 0.0, resolution: float = 0.5) -> Any:
+    """Return a free map of 5 x 4 cells."""
+    header = Header(frame_id=frame, stamp=Time(sec=stamp))
+    return occupancy_message(np.zeros((4, 5), np.int8), resolution, (x, 0.0, 0.0), header)
+
+
+# Updates
+
+
+def update(**fields: Any) -> SimpleNamespace:
+    """Return an update of 2 x 3 cells from (1, 0), or with other fields."""
+    usual = {
+        "header": Header(frame_id="map", stamp=Time(sec=6)),
+        **{"x": 1, "y": 0, "width": 2, "height": 3, "data": array.array("b", range(40, 46))},
+    }
+    return SimpleNamespace(**{**usual, **fields})
+
+
+PLACES, SIZES = st.integers(-8, 8), st.integers(0, 7) | st.just(2**32 - 1)
+
+
+@given(PLACES, PLACES, SIZES, SIZES, st.integers(-1, 1))
+def test_an_update_is_taken_if_all_its_cells_are_inside_and_have_values(
+    x: int, y: int, width: int, height: int, surplus: int
+) -> None:
+    data = array.array("b", range(max(min(width * height, 20) + surplus, 0)))
+    fits = width * height > 0 and 0 <= x <= 5 - width and 0 <= y <= 4 - height
+    sent = update(x=x, y=y, width=width, height=height, data=data)
+    if fits and surplus == 0:
+        assert (
+            updated_values(map_of(5), sent).tolist() == np.reshape(data, (height, width)).tolist()
+        )
+    else:
+        reason = "is not inside the map of 5 x 4" if not fits else f"need {width * height}"
+        with pytest.raises(ValueError, match=reason):
+            updated_values(map_of(5), sent)
+
+
+@pytest.mark.parametrize(
+    ("frame", "stamp", "reason"),
+    [
+        ("map", Time(), ""),
+        ("map", Time(sec=5), ""),
+        ("map", Time(sec=9), ""),
+        ("odom", Time(sec=6), "'odom', the map's is 'map'"),
+        ("", Time(sec=6), "frame is ''"),
+        ("map", Time(sec=4, nanosec=999), "later than the update"),
+    ],
+)
+def test_an_update_has_the_maps_frame_and_its_stamp_or_a_later_one_or_none(
+    frame: str, stamp: Time, reason: str
+) -> None:
+    sent = update(header=Header(frame_id=frame, stamp=stamp))
+    if not reason:
+        assert updated_values(map_of(5), sent).shape == (3, 2)
+        return
+    with pytest.raises(ValueError, match=reason):
+        updated_values(map_of(5), sent)
 
 
 @pytest.mark.parametrize(
@@ -134,129 +168,315 @@ def random_map(random: np.random.Generator, stamp: int) -> OccupancyGrid:
     ],
 )
 def test_after_updates_the_map_is_as_if_it_came_whole(
-    node: BaseNode, parameters: dict[str, Any]
+    node: BaseNode, source: Source, set_parameters: SetParameters, parameters: dict[str, Any]
 ) -> None:
-    defaults = {name: PLANNER_PARAMETERS[name].default for name in parameters}
-    node.set_parameters([Parameter(name, value=value) for name, value in parameters.items()])
-    random, heard = np.random.default_rng(0), []
-    source, whole = (MapSource(node, Report(node), Worker(node), heard.append) for _ in range(2))
-    first = random_map(random, 1)
-    source._take(first)
-    values = np.array(first.data, dtype=np.int8).reshape(30, 40)
+    set_parameters(**parameters)
+    random, whole = np.random.default_rng(0), Source(node)
+    values = random.choice([0, 0, 0, 0, 20, 98, 99, 100, -1], (30, 40)).astype(np.int8)
+    place = 0.5, (-1.0, 2.0, 0.3)
+    source._take(occupancy_message(values, *place, map_of(1).header))
     for stamp in range(2, 12):
         height, width = random.integers(1, 12, 2).tolist()
         y, x = random.integers(30 - height), random.integers(40 - width)
         patch = random.choice([0, 0, 50, 99, 100, -1], (height, width)).astype(np.int8)
         values[y : y + height, x : x + width] = patch
-        header = Header(frame_id="map", stamp=Time(sec=stamp))
-        data = array.array("b", patch.tobytes())
-        source._take_update(
-            update(header=header, x=int(x), y=int(y), width=width, height=height, data=data)
-        )
-        message = occupancy_message(values, 0.5, (-1.0, 2.0, 0.3), header)
-        whole._take(message)
-        found, expected = inflated(source), inflated(whole)
+        header, data = map_of(stamp).header, array.array("b", patch.tobytes())
+        box = {"x": int(x), "y": int(y), "width": width, "height": height}
+        source._take_update(update(header=header, data=data, **box))
+        whole._take(occupancy_message(values, *place, header))
+        found, expected = source.grid(), whole.grid()
         assert found.same_cells(expected)
         assert found.origin == expected.origin
-        assert np.array_equal(found.obstacles, expected.obstacles)  # type: ignore[arg-type]
-        assert source.header == header
-        assert source.describe()["map stamp (s)"] == f"{stamp}.000000000"
-        # Set parameters read the stored values.
-        source.apply_parameters({"allow_unknown"})
-        assert inflated(source).same_cells(expected)
-    assert source.describe()["map updates applied"] == "10"
-    node.set_parameters([Parameter(name, value=value) for name, value in defaults.items()])
+        np.testing.assert_array_equal(found.obstacles, expected.obstacles)
+        assert source.check() == header
+        set_parameters(allow_unknown=parameters.get("allow_unknown", False))  # it reads anew
+        assert source.grid().same_cells(expected)
+    said = source.describe(source.report.outcome)
+    assert said["map stamp (s)"] == "11.000000000"
+    assert said["map updates applied"] == "10"
 
 
-def inflated(source: MapSource) -> GridMap:
-    future, deadline = source.inflated(), time.monotonic() + TIMEOUT
-    while not future.done():
-        assert time.monotonic() < deadline
-        time.sleep(0.001)
-    return future.result()
+def test_refused_updates_are_counted_and_change_nothing(source: Source) -> None:
+    def said() -> Any:
+        return source.describe(source.report.outcome)["map updates refused"]
 
-
-def test_refused_updates_are_counted_and_change_nothing(node: BaseNode) -> None:
-    report, heard = Report(node), []
-    source = MapSource(node, report, Worker(node), heard.append)
+    refused = source.report.refused
     source._take_update(update())
-    assert report.refused["map_updates"].startswith("an update came before a map")
-    assert source.describe() == {"map updates applied": "0", "map updates refused": "1"}
+    assert refused["map_updates"].startswith("an update came before a map")
+    assert said() == "1"
     assert source.missing
-    message = random_map(np.random.default_rng(0), 1)
-    source._take(message)
-    assert "map_updates" not in report.refused
-    before = inflated(source)
+    source._take(map_of(1))
+    assert "map_updates" not in refused
+    before = source.grid()
     source._take_update(update(x=40))
-    assert "not inside" in report.refused["map_updates"]
-    assert source.describe()["map updates refused"] == "2"
-    assert inflated(source) is before
-    assert source.header == message.header
-    assert heard == [True]
+    assert "not inside" in refused["map_updates"]
+    assert said() == "2"
+    assert source.grid() is before
+    assert source.check() == map_of(1).header
+    assert source.heard == [True]
     source._take_update(update())
-    assert "map_updates" not in report.refused
-    assert heard == [True, False]
+    assert "map_updates" not in refused
+    assert source.heard == [True, False]
 
 
-def test_an_update_of_a_map_that_waits_changes_that_map_alone(node: BaseNode) -> None:
-    source = MapSource(node, Report(node), Worker(node), lambda _: None)
-    header = Header(frame_id="map", stamp=Time(sec=1))
-    zones = np.full((4, 5), 1, dtype=np.uint8)
-    source._directions._take(directions_message(zones, 0.5, (0.0, 0.0, 0.0), header))
-    source._take(MAP)
-    before = inflated(source)
-    waiting = occupancy_message(np.zeros((4, 5), np.int8), 1.0, (0.0, 0.0, 0.0), MAP.header)
-    source._take(waiting)
+def test_an_update_of_a_map_that_waits_changes_that_map_alone(source: Source) -> None:
+    source._take_directions(directions_of(1))
+    source._take(map_of(5))
+    before = source.grid()
+    source._take(map_of(5, resolution=1.0))
     source._take_update(update(data=array.array("b", [100] * 6)))
-    assert inflated(source) is before
-    assert source.header == MAP.header
-    source._directions._take(directions_message(None, 0.5, (0.0, 0.0, 0.0), header))
-    assert inflated(source).occupancy.tolist() == 3 * [[0, 1, 1, 0, 0]] + [[0] * 5]
-    assert source.header == update().header
+    assert source.grid() is before
+    assert source.check() == map_of(5).header
+    source._take_directions(directions_of(1, None))
+    assert source.grid().occupancy.tolist() == 3 * [[0, 1, 1, 0, 0]] + [[0] * 5]
+    assert source.check() == update().header
 
 
 def test_a_costmap_is_planned_on_for_map_timeout_after_its_last_message(
-    node: BaseNode, monkeypatch: pytest.MonkeyPatch
+    source: Source, set_parameters: SetParameters, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     now = [100.0]
     clock = SimpleNamespace(monotonic=lambda: now[0])
     monkeypatch.setattr("ddqn_planner.nodes.map_source.time", clock)
-    source = MapSource(node, Report(node), Worker(node), lambda _: None)
 
-    def status() -> str:
+    def after(seconds: float) -> str:
+        now[0] += seconds
         if not source.missing:
             return ""
         with pytest.raises(RequestError, match=re.escape(source.missing)) as error:
             source.check()
         return error.value.status
 
-    def after(seconds: float) -> str:
-        now[0] += seconds
-        return status()
-
-    def set_parameter(name: str, value: Any) -> None:
-        assert node.set_parameters([Parameter(name, value=value)])[0].successful
-        source.apply_parameters({name})
-
-    message = occupancy_message(np.zeros((4, 5), np.int8), 0.5, (0.0, 0.0, 0.0), MAP.header)
-    source._take(message)
+    source._take(map_of(5))
     assert after(1e6) == ""  # a map
-    set_parameter("map_type", "costmap")
-    try:
-        assert status() == "MAP_TIMEOUT"
-        assert "nothing came on /map for longer than map_timeout, 5 s; start" in source.missing
-        source._take(message)
-        assert [after(4.9), after(0.2)] == ["", "MAP_TIMEOUT"]
-        source._take_update(update())
-        assert [status(), after(4.9), after(0.2)] == ["", "", "MAP_TIMEOUT"]
-        source._take_update(update(x=40))  # what is refused is no news
-        assert status() == "MAP_TIMEOUT"
-        set_parameter("robot_radius", 0.4)  # nor is a parameter
-        assert status() == "MAP_TIMEOUT"
-        set_parameter("map_timeout", 20.0)
-        assert [status(), after(15.0)] == ["", "MAP_TIMEOUT"]
-        set_parameter("map_timeout", 0.0)
-        assert after(1e6) == ""
-    finally:
-        for name in ("map_type", "map_timeout", "robot_radius"):
-            set_parameter(name, PLANNER_PARAMETERS[name].default)
+    set_parameters(map_type="costmap")
+    assert after(0) == "MAP_TIMEOUT"
+    assert "nothing came on /map for longer than map_timeout, 5 s; start" in source.missing
+    source._take(map_of(5))
+    assert [after(4.9), after(0.2)] == ["", "MAP_TIMEOUT"]
+    source._take_update(update())
+    assert [after(0), after(4.9), after(0.2)] == ["", "", "MAP_TIMEOUT"]
+    source._take_update(update(x=40))  # what is refused is no news
+    assert after(0) == "MAP_TIMEOUT"
+    set_parameters(robot_radius=0.4)  # nor is a parameter
+    assert after(0) == "MAP_TIMEOUT"
+    set_parameters(map_timeout=20.0)
+    assert [after(0), after(15.0)] == ["", "MAP_TIMEOUT"]
+    set_parameters(map_timeout=0.0)
+    assert after(1e6) == ""
+
+
+# Directions: no path may go the wrong way, whatever is late
+
+
+def directions_of(stamp: int, value: int | None = EAST) -> Any:
+    forbidden = None if value is None else np.full((4, 5), value, dtype=np.uint8)
+    return directions_message(forbidden, 0.5, (0.0, 0.0, 0.0), map_of(stamp).header)
+
+
+def test_without_a_publisher_of_directions_a_map_needs_none(source: Source) -> None:
+    source._take(map_of(1))
+    assert not source.missing
+    assert source.forbidden() is None
+    # The next map does not wait for directions either, once there were some.
+    source._take_directions(directions_of(1))
+    source._take(map_of(2))
+    assert source.check() == map_of(2).header
+    assert source.forbidden() == [[EAST] * 5] * 4
+
+
+def test_the_first_map_waits_for_directions_where_a_node_publishes_them(
+    source: Source, published: None
+) -> None:
+    source._take(map_of(1))
+    assert "directions were not received on /map_directions yet; let a map server" in source.missing
+    assert not source.heard
+    source._take_directions(directions_of(1))
+    assert not source.missing
+    assert source.heard == [True]
+    assert source.forbidden() == [[EAST] * 5] * 4
+
+
+def test_a_map_servers_map_waits_for_its_own_directions_and_the_one_before_stays(
+    source: Source, published: None, set_parameters: SetParameters
+) -> None:
+    def is_planned_on(stamp: int, value: int | None) -> bool:
+        forbidden = value and [[value] * 5] * 4
+        return source.check() == map_of(stamp).header and source.forbidden() == forbidden
+
+    source._take_directions(directions_of(1))
+    source._take(map_of(1))
+    assert is_planned_on(1, EAST)
+    # A map comes before its directions, or without them: its map server was killed.
+    source._take(map_of(2))
+    assert is_planned_on(1, EAST)
+    assert "directions, with its stamp, 2.000000000, were not" in source.report.refused["map"]
+    set_parameters(occupied_threshold=1)
+    assert is_planned_on(1, EAST)
+    source._take_directions(directions_of(2, WEST))
+    assert is_planned_on(2, WEST)
+    assert not source.report.refused
+    # The directions come first, or alone.
+    source._take_directions(directions_of(3, None))
+    assert is_planned_on(2, WEST)
+    set_parameters(occupied_threshold=65)
+    assert is_planned_on(2, WEST)
+    # Of those of two maps, each time one was lost.
+    source._take(map_of(4))
+    assert is_planned_on(2, WEST)
+    source._take_directions(directions_of(5, EAST))
+    assert is_planned_on(2, WEST)
+    source._take(map_of(5))
+    assert is_planned_on(5, EAST)
+
+
+@pytest.mark.parametrize("map_type", ["map", "costmap"])
+def test_directions_hold_for_the_region_of_maps_of_another_node(
+    source: Source, published: None, set_parameters: SetParameters, map_type: str
+) -> None:
+    set_parameters(map_type=map_type)
+    source._take_directions(directions_of(1))
+    for map_stamp, x, expected in ((7, 1.0, [EAST] * 3 + [0] * 2), (8, -1.5, [0] * 3 + [EAST] * 2)):
+        source._take(map_of(map_stamp, x=x))
+        assert not source.missing
+        assert source.forbidden() == [expected] * 4
+    source._take(map_of(9, x=50.0))
+    assert source.forbidden() is None
+    source._take(map_of(10))
+    source.heard.clear()
+    for stamp, value in ((3, WEST), (20, None)):  # also older ones than the map
+        source._take_directions(directions_of(stamp, value))
+        assert not source.missing
+        assert source.forbidden() == (value and [[value] * 5] * 4)
+    assert source.heard == [False, False]
+
+
+def test_required_directions_are_waited_for_once(
+    source: Source, set_parameters: SetParameters
+) -> None:
+    set_parameters(require_directions=True)
+    source._take(map_of(1))
+    assert "or set require_directions to false" in source.missing
+    set_parameters(require_directions=False)
+    assert not source.missing
+    set_parameters(require_directions=True)
+    assert source.missing
+    source._take_directions(directions_of(9))
+    assert not source.missing
+    assert source.forbidden() == [[EAST] * 5] * 4
+    source._take(map_of(2))
+    assert not source.missing
+
+
+@pytest.mark.parametrize(
+    "changes", [{"frame": "odom"}, {"x": 0.2}, {"x": 1e308}, {"x": 1e30}, {"resolution": 0.25}]
+)
+def test_no_map_is_planned_on_with_directions_of_another_frame_or_other_cells(
+    source: Source, changes: dict[str, Any]
+) -> None:
+    other = map_of(2, **changes)
+    source._take(other)
+    assert not source.missing
+    # What was planned on without directions is not once there are some.
+    source._take_directions(directions_of(1))
+    assert source.missing.startswith("the directions on /map_directions are not for this map")
+    source._take(map_of(3))
+    assert not source.missing
+    assert "map" not in source.report.refused
+    # The map before it stays, until directions come for the one that waits.
+    source._take(other)
+    assert "not for this map" in source.report.refused["map"]
+    assert (source.check(), source.forbidden()) == (map_of(3).header, [[EAST] * 5] * 4)
+    source._take_directions(directions_of(4, None))
+    assert (source.check(), source.forbidden()) == (other.header, None)
+    assert "map" not in source.report.refused
+    # So it does if the directions of the next map come first.
+    source._take_directions(directions_of(5))
+    assert source.check() == other.header
+
+
+def test_malformed_directions_are_refused_and_those_before_them_stay(
+    source: Source, published: None
+) -> None:
+    source._take_directions(directions_of(1))
+    broken = directions_of(2)
+    broken.data = broken.data[:-1]
+    source._take_directions(broken)
+    assert "20" in source.report.refused["map_directions"]
+    source._take(map_of(1))
+    assert not source.missing
+    source._take_directions(directions_of(1))
+    assert "map_directions" not in source.report.refused
+
+
+# Expected times
+
+GRID = GridMap(np.zeros((40, 120), dtype=np.bool_), resolution=0.25)
+
+
+def saved(path: Path, speed: float = 0.1) -> Path:
+    """Save what a drive of 20 m along x teaches, at a fifth of the nominal speed."""
+    experience = Experience(0.5)
+    time = np.linspace(0, 20 / speed, 201)
+    experience.record(time, np.column_stack([5 + speed * time, np.full(201, 5.0)]))
+    experience.save(path)
+    return path
+
+
+@pytest.fixture
+def times(tmp_path: Path) -> ExpectedTimes:
+    times = ExpectedTimes()
+    times.load(str(saved(tmp_path / "experience.npz")))
+    return times
+
+
+def test_a_map_has_expected_times_once_there_are_drives(
+    times: ExpectedTimes, tmp_path: Path
+) -> None:
+    assert ExpectedTimes().apply(GRID) is GRID
+    slowness = times.apply(GRID).slowness
+    assert slowness is not None
+    assert slowness[20, 60] > 2
+    broken = tmp_path / "broken.npz"
+    broken.write_bytes((tmp_path / "experience.npz").read_bytes()[:-9])
+    for path in (broken, tmp_path / "missing.npz"):
+        with pytest.raises(ExperienceFileError):
+            times.load(str(path))
+    np.testing.assert_array_equal(times.apply(GRID).slowness, slowness)
+    Experience(0.5).save(tmp_path / "empty.npz")
+    times.load(str(tmp_path / "empty.npz"))  # it was forgotten
+    assert times.apply(GRID) is GRID
+
+
+def test_a_map_in_which_a_person_stands_has_the_same_times(times: ExpectedTimes) -> None:
+    before = times.apply(GRID).slowness
+    person = GRID.with_patch(np.ones((3, 3), dtype=np.bool_), 60, 19)
+    timed = times.apply(person)
+    np.testing.assert_array_equal(timed.slowness, before)
+    np.testing.assert_array_equal(timed.occupancy, person.occupancy)
+
+
+def test_a_map_that_grows_has_the_times_at_the_same_places(times: ExpectedTimes) -> None:
+    before = times.apply(GRID).slowness
+    assert before is not None
+    grown = GridMap(np.zeros((60, 150), dtype=np.bool_), 0.25, (-2.5, -1.25, 0.0))
+    after = times.apply(grown).slowness
+    assert after is not None
+    np.testing.assert_allclose(after[5:45, 10:130], before, rtol=0.021)
+
+
+def test_the_plan_goes_round_and_its_time_is_told(times: ExpectedTimes) -> None:
+    planner = Planner.load("any_map")
+    timed = times.apply(GRID)
+    plan = planner.plan(timed, (22, 20), (98, 20))
+    told = times.describe(timed, plan)
+    seconds = float(told["expected time (s)"])
+    low, high = map(float, told["expected time, 90 % interval (s)"].split(" to "))
+    assert plan.cost is not None
+    assert low < seconds < high
+    assert seconds == pytest.approx(plan.cost, rel=0.05)
+    assert 19 / 0.5 < plan.cost < 19 / 0.2  # not straight on
+    other = GridMap(np.zeros((10, 10), dtype=np.bool_)).with_slowness(
+        np.ones((10, 10), dtype=np.float32), 1.0
+    )
+    assert times.describe(other, plan) == {}  # an old map

@@ -7,7 +7,7 @@ from std_msgs.msg import Header
 from visualization_msgs.msg import Marker
 
 from ddqn_planner.grid import MOVES, Cell, GridMap, MoveRule, legal_moves, shortest_distances
-from ddqn_planner.nodes.markers import MAX_ARROWS, policy_message
+from ddqn_planner.nodes.display import MAX_ARROWS, policy_message
 from ddqn_planner.planning import QField
 
 HEADER = Header(frame_id="map")

@@ -14,15 +14,15 @@ from nav_msgs.msg import Path
 from rclpy.action.server import ActionServer, CancelResponse, GoalResponse
 from rclpy.task import Future
 
-from ddqn_planner.nodes import nav2_interface
-from ddqn_planner.nodes.path_action import (
+from ddqn_planner.nodes import nav2
+from ddqn_planner.nodes.nav2 import (
     CODES,
     PREEMPTED,
     PathAction,
-    check_request,
     error_code,
 )
 from ddqn_planner.nodes.report import NOT_ACTIVE, Outcome, RequestError
+from ddqn_planner.nodes.requests import check_request
 from ddqn_planner.nodes.runtime import SERVICE_QUALITY, Unless
 from ddqn_planner.planning import Plan, PlanStatus
 
@@ -236,9 +236,9 @@ def test_the_services_of_actions_have_the_queues_of_the_others(
     made: list[inspect.BoundArguments] = []
     signature = inspect.signature(ActionServer)
     record = lambda *given, **named: made.append(signature.bind(*given, **named))  # noqa: E731
-    monkeypatch.setattr(nav2_interface, "ActionServer", record)
+    monkeypatch.setattr(nav2, "ActionServer", record)
     node = SimpleNamespace(create_service=lambda *given, **named: None)
-    nav2_interface.serve_nav2(cast("Any", node), bool, cast("Any", None), print)
+    nav2.serve_nav2(cast("Any", node), bool, cast("Any", None), print)
     depths = [
         made[n].arguments[f"{which}_service_qos_profile"].depth
         for n in range(2)

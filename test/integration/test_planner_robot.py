@@ -493,7 +493,7 @@ def test_the_bound_of_the_kept_fields_holds_from_the_start(
 
 
 COUNT = """
-from ddqn_planner.planning.distance_field import DistanceField
+from ddqn_planner.planning.field import DistanceField
 
 begin = DistanceField.__init__
 
@@ -599,7 +599,7 @@ def test_nothing_is_shown_of_a_goal_without_a_field(robot: Robot) -> None:
 
 
 TOLD = """
-import ddqn_planner.nodes.conversions as conversions
+import ddqn_planner.nodes.display as display
 from ddqn_planner.grid.body import Inflation
 
 def told(words, function):
@@ -610,7 +610,7 @@ def told(words, function):
     return say_and_call
 
 Inflation.__call__ = told("a map is inflated", Inflation.__call__)
-conversions.value_message = told("a value is shown", conversions.value_message)
+display.value_message = told("a value is shown", display.value_message)
 """
 
 
@@ -656,9 +656,7 @@ def test_what_cannot_be_shown_does_not_end_the_node(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     (tmp_path / "sitecustomize.py").write_text(
-        "import ddqn_planner.nodes.conversions as value\n"
-        "import ddqn_planner.nodes.markers as policy\n"
-        f"{name}.{name}_message = lambda *_: [][0]\n"
+        f"import ddqn_planner.nodes.display as display\ndisplay.{name}_message = lambda *_: [][0]\n"
     )
     monkeypatch.setenv("PYTHONPATH", str(tmp_path), prepend=":")
     client = make_client(f"/no_{name}")

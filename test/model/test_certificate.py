@@ -30,7 +30,6 @@ from ddqn_planner.model.certificate import (
     MOVE_RULES,
     Certificate,
     _margins,
-    certificate_of,
     certify,
 )
 from ddqn_planner.model.move_costs import legal_in_patches
@@ -320,21 +319,21 @@ def test_on_a_map_without_costs_the_shipped_models_costs_are_closer() -> None:
 
 def test_a_loaded_network_is_certified_once() -> None:
     network = any_map()
-    certificate = certificate_of(network, MoveRule.ROBOT_SAFE)
+    certificate = network.certificate(MoveRule.ROBOT_SAFE)
     assert certificate == certify(network)
-    assert certificate_of(network, MoveRule.ROBOT_SAFE) is certificate
+    assert network.certificate(MoveRule.ROBOT_SAFE) is certificate
 
 
 def test_a_network_that_does_not_observe_the_rule_is_certified_for_its_own() -> None:
     network = right_network("propagation", MoveRule.ROBOT_SAFE)
-    of_rule = [certificate_of(network, rule) for rule in MOVE_RULES]
+    of_rule = [network.certificate(rule) for rule in MOVE_RULES]
     assert [bool(one and one.proved) for one in of_rule] == [True, False]
 
 
 def test_the_papers_network_has_no_certificate() -> None:
     network, metadata = load_model("dilemma")
     assert type(network) is NETWORKS["paper"]
-    assert certificate_of(network, metadata.move_rule) is None
+    assert network.certificate(metadata.move_rule) is None
 
 
 # What a user reads

@@ -29,6 +29,7 @@ from ddqn_planner.model import (
     save_model,
 )
 from ddqn_planner.model.move_costs import MAX_MULTIPLIER
+from ddqn_planner.planning.field import network_field
 
 METADATA = ModelMetadata(
     network="paper",
@@ -61,7 +62,9 @@ def test_a_saved_model_comes_back_the_same(model_path: Path, network: QNetwork) 
     loaded, metadata = load_model(model_path)
     assert metadata == METADATA
     request = GridMap(np.zeros((4, 5))), (1, 1), MoveRule.ROBOT_SAFE
-    np.testing.assert_array_equal(loaded.q_values(*request), network.q_values(*request))
+    np.testing.assert_array_equal(
+        network_field(loaded, *request).q, network_field(network, *request).q
+    )
 
 
 def test_a_model_file_that_names_no_hidden_units_has_none(
@@ -72,7 +75,9 @@ def test_a_model_file_that_names_no_hidden_units_has_none(
     loaded, metadata = load_model(path)
     assert metadata == METADATA
     request = GridMap(np.zeros((4, 5))), (1, 1), MoveRule.ROBOT_SAFE
-    np.testing.assert_array_equal(loaded.q_values(*request), network.q_values(*request))
+    np.testing.assert_array_equal(
+        network_field(loaded, *request).q, network_field(network, *request).q
+    )
 
 
 def test_a_network_with_a_hidden_layer_comes_back_the_same(tmp_path: Path) -> None:
@@ -82,7 +87,9 @@ def test_a_network_with_a_hidden_layer_comes_back_the_same(tmp_path: Path) -> No
     loaded, metadata = load_model(tmp_path / "hidden.safetensors")
     assert metadata.sizes == sizes
     request = GridMap(np.zeros((4, 5))), (1, 1), MoveRule.ROBOT_SAFE
-    np.testing.assert_array_equal(loaded.q_values(*request), network.q_values(*request))
+    np.testing.assert_array_equal(
+        network_field(loaded, *request).q, network_field(network, *request).q
+    )
 
 
 def test_a_file_that_is_truncated_anywhere_is_refused(model_path: Path) -> None:
@@ -178,7 +185,9 @@ def test_a_network_for_any_size_comes_back_the_same(tmp_path: Path, kind: str) -
     loaded, read = load_model(path)
     assert read == description
     request = GridMap(np.zeros((3, 6))), (5, 2), MoveRule.CORNER_CUTTING
-    np.testing.assert_array_equal(loaded.q_values(*request), network.q_values(*request))
+    np.testing.assert_array_equal(
+        network_field(loaded, *request).q, network_field(network, *request).q
+    )
 
 
 def test_safetensors_of_another_program_are_refused(tmp_path: Path) -> None:
@@ -295,7 +304,7 @@ def test_whatever_finite_weights_say_each_q_is_a_length_or_no_way(
     save_model(path, network, replace(METADATA, network=kind, sizes={"filters": 3}))
     grid, goal = grid_and_goal
     loaded, _ = load_model(path)
-    q = loaded.q_values(grid, goal, rule)
+    q = network_field(loaded, grid, goal, rule).q
     longest = 2 * MAX_MULTIPLIER * grid.occupancy.size
     assert (np.isneginf(q) | ((q <= -1) & (q >= -longest))).all()
 

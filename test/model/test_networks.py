@@ -1,7 +1,5 @@
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 import pytest
 import torch
@@ -11,11 +9,11 @@ from networks import random_network
 from strategies import grids_with_costs, grids_with_free_cell
 
 from ddqn_planner.grid import Cell, GridMap, MoveRule, legal_moves
-from ddqn_planner.model import NETWORKS, field_values, load_model, networks
-from ddqn_planner.model.field_values import propagate_values
+from ddqn_planner.model import NETWORKS, load_model, networks
 from ddqn_planner.model.move_costs import MAX_MULTIPLIER
 from ddqn_planner.model.networks import AnyMapQNetwork, PropagationQNetwork
 from ddqn_planner.model.observation import observation_background, observe, patches
+from ddqn_planner.planning.field import network_field
 from ddqn_planner.training.networks import MODULES, AnyMapModule, PaperModule, PropagationModule
 
 SIZES = {
@@ -154,13 +152,17 @@ def answering(name: str, success: float, multiplier: float = 1.0) -> Propagation
     return network
 
 
+def q_values(network: PropagationQNetwork, grid: GridMap, goal: Cell) -> np.ndarray:
+    return network_field(network, grid, goal, MoveRule.ROBOT_SAFE).q
+
+
 def test_many_unique_patches_are_evaluated_in_batches(monkeypatch: pytest.MonkeyPatch) -> None:
     cost = np.random.default_rng(0).integers(0, 99, (8, 9)).astype(np.int8)
     grid, network = GridMap(np.zeros((8, 9)), cost=cost), random_network("any_map", filters=4)
-    at_once = network.q_values(grid, (3, 3), MoveRule.ROBOT_SAFE)
+    at_once = q_values(network, grid, (3, 3))
     assert np.isfinite(at_once).any()
     monkeypatch.setattr(networks, "BATCH", 7)
-    in_batches = network.q_values(grid, (3, 3), MoveRule.ROBOT_SAFE)
+    in_batches = q_values(network, grid, (3, 3))
     np.testing.assert_allclose(in_batches, at_once, rtol=1e-5)
 
 
@@ -168,7 +170,7 @@ def test_many_unique_patches_are_evaluated_in_batches(monkeypatch: pytest.Monkey
 def test_a_field_has_one_q_per_action_and_cell_of_a_map_of_any_shape(name: str) -> None:
     network = random_network(name, filters=4)
     for shape in ((1, 1), (3, 7), (9, 2)):
-        q = network.q_values(GridMap(np.zeros(shape)), (0, 0), MoveRule.ROBOT_SAFE)
+        q = q_values(network, GridMap(np.zeros(shape)), (0, 0))
         assert network.supports(shape)
         assert q.shape == (8, *shape)
         assert q.dtype == np.float32
@@ -183,7 +185,7 @@ def test_a_move_is_tried_until_it_succeeds_if_it_does_more_often_than_not(name: 
             (GridMap(np.zeros((1, 2))), 1),
             (GridMap(np.zeros((1, 2)), slowness=np.array([[3, 5]])), 4),
         ):
-            q = network.q_values(grid, (1, 0), MoveRule.ROBOT_SAFE)
+            q = q_values(network, grid, (1, 0))
             assert q[0, 0, 0] == pytest.approx(-cost * multiplier)
 
 
@@ -194,22 +196,18 @@ def test_a_cost_above_the_upper_bound_counts_as_the_bound() -> None:
         (1e4, 100.0),
     ):
         network = answering("any_map", 0.9, multiplier)
-        q = network.q_values(grid, (1, 0), MoveRule.ROBOT_SAFE)
+        q = q_values(network, grid, (1, 0))
         assert q[0, 0, 0] == pytest.approx(-used / 0.9)
 
 
 @pytest.mark.parametrize("tensor", ["prices.bias", "moves.bias"])
-def test_a_move_whose_cost_or_p_is_nan_is_not_possible(
-    monkeypatch: pytest.MonkeyPatch, tensor: str
-) -> None:
-    def checked(patch_id: np.ndarray, cost_PA: np.ndarray, *others: Any) -> np.ndarray:
-        assert not np.isnan(cost_PA).any()  # with NaN the propagation would never end
-        return propagate_values(patch_id, cost_PA, *others)
-
-    monkeypatch.setattr(field_values, "propagate_values", checked)
+def test_a_move_whose_cost_or_p_is_nan_is_not_possible(tensor: str) -> None:
     network = answering("any_map", 0.9)
     network.tensors[tensor][0] = np.nan
-    q = network.q_values(GridMap(np.zeros((2, 2))), (1, 0), MoveRule.ROBOT_SAFE)
+    grid = GridMap(np.zeros((2, 2)))
+    costs = network.believed_costs(grid, MoveRule.ROBOT_SAFE)
+    assert not np.isnan(costs.table).any()  # with NaN the field would never end
+    q = q_values(network, grid, (1, 0))
     assert q[0, 0, 0] == -np.inf
     assert q[2, 0, 0] == pytest.approx(-(1 + 2**0.5) / 0.9)  # up, and then down to the right
 

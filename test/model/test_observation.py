@@ -7,6 +7,7 @@ from strategies import grids_with_costs, grids_with_free_cell
 
 from ddqn_planner.grid import MOVES, OCCUPIED, Cell, GridMap, MoveRule, neighbours
 from ddqn_planner.model import AnyMapQNetwork
+from ddqn_planner.model.move_costs import unique_patches
 from ddqn_planner.model.observation import (
     FREE,
     GOAL,
@@ -15,7 +16,6 @@ from ddqn_planner.model.observation import (
     observation_background,
     observe,
     patches,
-    unique_patches,
 )
 
 

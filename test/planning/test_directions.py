@@ -23,8 +23,9 @@ from ddqn_planner.grid import (
     shortest_distances,
     shortest_path,
 )
+from ddqn_planner.planning import field as fields
 from ddqn_planner.planning import repair, simplify
-from ddqn_planner.planning.distance_field import DistanceField
+from ddqn_planner.planning.field import DistanceField, network_field
 from ddqn_planner.planning.path_under_way import is_path_valid, legal_segments, rest_of_path
 from ddqn_planner.planning.simplification import touched_cells
 
@@ -97,7 +98,7 @@ def test_a_plan_is_a_cheapest_path_that_obeys(
 @given(grids_with_directions(), RULES)
 def test_the_network_alone_obeys(grid_and_goal: tuple[GridMap, Cell], rule: MoveRule) -> None:
     grid, goal = grid_and_goal
-    q, exact = NETWORK.q_values(grid, goal, rule), shortest_distances(grid, goal, rule)
+    q, exact = network_field(NETWORK, grid, goal, rule).q, shortest_distances(grid, goal, rule)
     value = np.where(grid.legal_moves(rule), q, -np.inf).max(axis=0)
     value[goal[::-1]] = 0
     np.testing.assert_allclose(-value, exact, rtol=1e-2)
@@ -109,8 +110,8 @@ class Blind(type(NETWORK)):  # type: ignore[misc]
     def move_costs(self, grid: GridMap, move_rule: MoveRule) -> None:
         return None
 
-    def q_values(self, grid: GridMap, goal: Cell, move_rule: MoveRule) -> Any:
-        return super().q_values(replace(grid, forbidden=None), goal, move_rule)
+    def believed_costs(self, grid: GridMap, move_rule: MoveRule) -> Any:
+        return super().believed_costs(replace(grid, forbidden=None), move_rule)
 
 
 @given(grids_with_directions(), RULES, st.data())
@@ -179,7 +180,7 @@ def test_a_field_repaired_for_other_cells_and_directions_is_a_fresh_one_bit_for_
     planner = Planner(NETWORK, METADATA)
     with pytest.MonkeyPatch.context() as patched:
         patched.setattr(repair, "CHANGED_SHARE", 1.0)  # however much of the small map changes
-        patched.setattr(repair, "REPAIRED_SHARE", 1.0)
+        patched.setattr(fields, "REPAIRED_SHARE", 1.0)
         for _ in range(changes):
             start = data.draw(st.sampled_from(grid.free_cells()))
             planner.plan(grid, start, goal, rule)

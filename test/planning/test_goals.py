@@ -16,8 +16,9 @@ from strategies import grids_in_parts, grids_with_costs, grids_with_free_cell
 from ddqn_planner import GridMap, MoveRule, PlanMethod, Planner, PlanStatus, inflate
 from ddqn_planner.grid import Cell, shortest_distances
 from ddqn_planner.model import ModelMetadata
+from ddqn_planner.planning import field as fields
 from ddqn_planner.planning import repair
-from ddqn_planner.planning.distance_field import DistanceField
+from ddqn_planner.planning.field import DistanceField
 from ddqn_planner.planning.plan import PlanRequest, joined
 from ddqn_planner.planning.planner import last_step
 
@@ -89,7 +90,7 @@ def test_a_field_toward_several_goals_is_repaired(
     planner = new_planner()
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(repair, "CHANGED_SHARE", 1.0)
-        patch.setattr(repair, "REPAIRED", data.draw(st.sampled_from([1, 300])))
+        patch.setattr(fields, "REPAIRED", data.draw(st.sampled_from([1, 300])))
         for _ in range(3):
             plan = planner.plan_nearest(grid, start, goals, rule)
             assert plan == new_planner().plan_nearest(grid, start, goals, rule)

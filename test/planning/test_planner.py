@@ -29,13 +29,13 @@ from ddqn_planner.grid import (
     LENGTHS,
     MOVES,
     Cell,
-    connected_cells,
     legal_moves,
     path_cost,
     shortest_distances,
 )
 from ddqn_planner.model import ModelMetadata
 from ddqn_planner.planning import PlanRequest
+from ddqn_planner.planning.field import network_field
 from ddqn_planner.training.evaluation import evaluate
 
 RULES = st.sampled_from(list(MoveRule))
@@ -188,7 +188,7 @@ def test_the_model_for_any_map_judges_every_move_in_every_patch_rightly(
         for action, (dx, dy) in enumerate(MOVES.tolist()):
             goal = (1 + dx, 1 + dy)
             if legal[action]:
-                q = network.q_values(grid, goal, rule)[:, 1, 1]
+                q = network_field(network, grid, goal, rule).q[:, 1, 1]
                 assert q[action] == pytest.approx(-rule.lengths[action], abs=0.01)
                 assert not np.isfinite(q[~legal]).any()
 
@@ -460,7 +460,7 @@ def test_a_goal_moves_to_the_nearest_reachable_free_cell_within_the_tolerance(
         _ = planner.q_field(grid, goal, rule).value  # all of it
     quick = is_answered_at_once(planner, grid, start, goal, rule, tolerance=tolerance)
     plan = planner.plan(grid, start, goal, rule, tolerance=tolerance)
-    rows, columns = np.nonzero(connected_cells(grid.occupancy, start, rule))
+    rows, columns = np.nonzero(grid.reachable([start], rule))
     nearest = np.hypot(columns - goal[0], rows - goal[1]).min()
     if nearest <= tolerance:
         assert plan.cells[0] == start

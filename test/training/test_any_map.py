@@ -14,7 +14,7 @@ from random_maps import generate_map
 
 from ddqn_planner import GridMap, MoveRule, Planner
 from ddqn_planner.cli import main
-from ddqn_planner.grid import UNKNOWN, Cell, connected_cells
+from ddqn_planner.grid import UNKNOWN, Cell
 from ddqn_planner.grid.noise import random_costs
 from ddqn_planner.training.any_map import ANY_MAP, MAPS, RULES, random_scenarios
 from ddqn_planner.training.evaluation import Evaluation, evaluate
@@ -72,7 +72,7 @@ def test_the_maps_to_train_on_are_those_of_the_seed(seed: int) -> None:
         assert (scenario.start, scenario.goal) == (same.start, same.goal)
         start: Cell = scenario.start
         assert scenario.move_rule is not None
-        joined = connected_cells(scenario.grid.occupancy, scenario.goal, scenario.move_rule)
+        joined = scenario.grid.reachable([scenario.goal], scenario.move_rule)
         assert joined[start[1], start[0]]
     assert {scenario.move_rule for scenario in scenarios} == set(RULES)
     other = random_scenarios(seed + 1, maps=8)

@@ -12,6 +12,7 @@ from safetensors import safe_open
 
 from ddqn_planner import GridMap, MoveRule, PlanStatus
 from ddqn_planner.model import load_model
+from ddqn_planner.planning import Planner
 from ddqn_planner.training.environment import Scenario
 from ddqn_planner.training.episodes import Episode, EpisodeEnd
 from ddqn_planner.training.evaluation import evaluate
@@ -251,7 +252,7 @@ def test_a_saved_model_plans_as_the_trainer_does(small: Scenario, tmp_path: Path
     assert metadata == trainer.planner().metadata
     assert metadata.steps == 300
     expected = trainer.planner().q_field(small.grid, small.goal).q
-    q = network.q_values(small.grid, small.goal, metadata.move_rule)
+    q = Planner(network, metadata).q_field(small.grid, small.goal).q
     assert (q == expected).all()
 
 
@@ -363,7 +364,7 @@ def test_a_checkpoint_of_holes_is_refused_before_it_is_read(
     with safe_open(path, framework="pt") as opened:  # it is what it seems to be
         assert opened.get_slice("network.convolution.weight").get_shape() == [size // 4]
     before = peak_after_reset()
-    with pytest.raises(CheckpointError, match="its tensors have other names, types or shapes"):
+    with pytest.raises(CheckpointError, match="its tensors have other names or shapes"):
         Trainer.load_checkpoint(path, [small])
     assert peak() - before < 2**27
 

@@ -1,22 +1,33 @@
-"""What decides in Nav2's planning actions: acceptance, preemption, cancelling, and error codes.
+"""Nav2's planning actions and its service, for a node where nav2_msgs is installed.
 
-It imports none of Nav2's types, so that it can be tested where these are not installed.
+`PathAction` uses none of Nav2's types, so that it can be tested where these are not installed.
 """
 
 from __future__ import annotations
 
 import time
-from collections.abc import Awaitable, Callable, Sequence
+from collections.abc import Awaitable, Callable
 from typing import Any
 
 from geometry_msgs.msg import PoseStamped
 from nav_msgs.msg import Path
-from rclpy.action.server import CancelResponse, GoalResponse
+from rclpy.action.server import ActionServer, CancelResponse, GoalResponse
+from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.duration import Duration
 from rclpy.task import Future
 
-from ddqn_planner.nodes.report import Outcome, RequestError
+from ddqn_planner.nodes.report import Outcome
+from ddqn_planner.nodes.runtime import SERVICE_QUALITY, BaseNode
 from ddqn_planner.planning import PlanStatus
+
+QUEUES: dict[str, Any] = {
+    f"{service}_service_qos_profile": SERVICE_QUALITY for service in ("goal", "cancel", "result")
+}
+"""Those of an action's services: without them, goals are lost like requests."""
+
+RESULT_TIMEOUT = 5
+"""Seconds for which a result is kept. Each status message names all goals whose results are kept:
+rclpy's 900 would slow down clients, and fill the memory."""
 
 CANCELED = Outcome("CANCELED", "the goal was canceled")
 PREEMPTED = Outcome("PREEMPTED", "a newer goal of the same action came")
@@ -35,52 +46,30 @@ CODES = (
 )
 """Nav2's error codes, in the order of their numbers; the first one is another in each action."""
 
-CODE_OF_STATUS = {
-    PlanStatus.START_OUTSIDE_MAP.name: "START_OUTSIDE_MAP",
-    PlanStatus.GOAL_OUTSIDE_MAP.name: "GOAL_OUTSIDE_MAP",
-    PlanStatus.START_OCCUPIED.name: "START_OCCUPIED",
-    PlanStatus.GOAL_OCCUPIED.name: "GOAL_OCCUPIED",
+OTHER_NAMES = {
     PlanStatus.NO_PATH.name: "NO_VALID_PATH",
     PlanStatus.ROLLOUT_TRAPPED.name: "NO_VALID_PATH",
-    "TF_ERROR": "TF_ERROR",
     "NO_START": "TF_ERROR",
     # Malformed, or in another frame without TF: clearing costmaps, as after UNKNOWN, does not help.
     "INVALID_START": "TF_ERROR",
     "INVALID_GOAL": "TF_ERROR",
-    "INVALID_PLANNER": "INVALID_PLANNER",
     "NO_GOALS": "NO_VIAPOINTS_GIVEN",
     # As Nav2's planners time out while their costmap is not current.
     "NO_MAP": "TIMEOUT",
     "MAP_TIMEOUT": "TIMEOUT",
 }
-"""Which code an outcome has; UNKNOWN if it is not here."""
-
-
-def check_request(goals: Sequence[object], planner_id: str, known_id: str) -> None:
-    """Raise a RequestError if there is no goal, or the name is not this planner's, or empty."""
-    if not goals:
-        raise RequestError("NO_GOALS", "the request has no goal; give one or more")
-    if planner_id not in ("", known_id):
-        raise RequestError(
-            "INVALID_PLANNER",
-            f"there is no planner {planner_id!r}; give {known_id!r} or '' as the planner_id, or "
-            "set the parameter 'planner_id'",
-        )
+"""The codes of statuses that Nav2 calls by another name; UNKNOWN is what it does not know."""
 
 
 def error_code(status: str, unknown: int) -> int:
-    """Return Nav2's error code of an outcome: 0 for a path, and for a goal that was canceled.
+    """Return Nav2's error code of an `Outcome`: 0 for a path, and for a goal that was canceled.
 
-    Parameters
-    ----------
-    status : str
-        See `Outcome`.
-    unknown : int
-        The action's code for UNKNOWN.
+    `unknown` is the action's code for UNKNOWN.
     """
     if status in (PlanStatus.SUCCEEDED.name, CANCELED.status):
         return 0
-    return unknown + CODES.index(CODE_OF_STATUS.get(status, "UNKNOWN"))
+    name = OTHER_NAMES.get(status, status)
+    return unknown + (CODES.index(name) if name in CODES else 0)
 
 
 Plan = Callable[
@@ -93,16 +82,7 @@ future has an `Outcome` with which the goal is to be given up."""
 class PathAction:
     """Answers the goals of one action, of which the newest one preempts the one under way.
 
-    Parameters
-    ----------
-    result : callable
-        Makes an empty result.
-    unknown : int
-        The action's error code for UNKNOWN.
-    is_active : callable
-        Whether goals are accepted.
-    plan : callable
-        See `Plan`.
+    `result` makes an empty result, and `unknown` is the action's error code for UNKNOWN.
     """
 
     def __init__(
@@ -160,3 +140,37 @@ def _give_up(given_up: Future, outcome: Outcome) -> None:
 
 def _key(handle: Any) -> bytes:
     return bytes(handle.goal_id.uuid)
+
+
+def serve_nav2(
+    node: BaseNode, is_active: Callable[[], bool], plan: Plan, on_is_path_valid: Callable[..., Any]
+) -> None:
+    """Create Nav2's actions and service, or log what is missing."""
+    try:
+        from nav2_msgs.action import ComputePathThroughPoses, ComputePathToPose
+        from nav2_msgs.srv import IsPathValid
+    except ImportError as error:
+        node.get_logger().info(
+            f"no actions for Nav2 ({error}); to have them: apt install ros-jazzy-nav2-msgs"
+        )
+        return
+    # Reentrant: the newest goal must be able to preempt another one.
+    group = ReentrantCallbackGroup()
+    for name, kind in (
+        ("compute_path_to_pose", ComputePathToPose),
+        ("compute_path_through_poses", ComputePathThroughPoses),
+    ):
+        action = PathAction(kind.Result, kind.Result.UNKNOWN, is_active, plan)
+        ActionServer(
+            node,
+            kind,
+            name,
+            action.execute,
+            callback_group=group,
+            goal_callback=action.accept,
+            handle_accepted_callback=action.begin,
+            cancel_callback=action.cancel,
+            result_timeout=RESULT_TIMEOUT,
+            **QUEUES,
+        )
+    node.create_service(IsPathValid, "is_path_valid", on_is_path_valid, callback_group=group)

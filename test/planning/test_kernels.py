@@ -17,7 +17,8 @@ from ddqn_planner.grid import (
     move_costs,
     shortest_distances,
 )
-from ddqn_planner.model.field_values import propagate_values
+from ddqn_planner.model.move_costs import MoveCosts
+from ddqn_planner.planning.field import DistanceField
 
 PATCH_IDS = numpy_st.arrays(
     np.int32,
@@ -27,6 +28,16 @@ PATCH_IDS = numpy_st.arrays(
 COSTS = numpy_st.arrays(
     np.float32, (4, 8), elements=st.floats(1, 20, width=32) | st.just(float("inf"))
 )
+
+
+def propagate_values(patch_id: np.ndarray, cost_PA: np.ndarray, goal: Cell) -> np.ndarray:
+    """Return Q(s, a) toward a goal, given the costs of each patch: (8, H, W)."""
+    grid, patch_C = (
+        GridMap(np.zeros(patch_id.shape)),
+        np.pad(patch_id, 1, constant_values=len(cost_PA)),
+    )
+    costs = MoveCosts.of_table(cost_PA).on(grid, patch_C.ravel())
+    return DistanceField((goal,), grid, costs, MoveRule.ROBOT_SAFE).q
 
 
 @given(grids_with_costs(), st.sampled_from(MoveRule))

@@ -17,9 +17,9 @@ from strategies import grids_with_costs, grids_with_free_cell
 from ddqn_planner import GridMap, MoveRule, Planner, PlanStatus
 from ddqn_planner.grid import Cell, shortest_distances
 from ddqn_planner.grid.noise import random_requests
-from ddqn_planner.model import wavefront
-from ddqn_planner.planning import distance_field, invalidation, repair
-from ddqn_planner.planning.distance_field import DistanceField
+from ddqn_planner.planning import field as fields
+from ddqn_planner.planning import kernels, repair
+from ddqn_planner.planning.field import DistanceField, network_field
 
 RULES = st.sampled_from(list(MoveRule))
 NETWORK, METADATA = (lambda planner: (planner.network, planner.metadata))(Planner.load("any_map"))
@@ -59,7 +59,7 @@ def test_the_whole_field_is_that_of_the_network(
 ) -> None:
     grid, goal = grid_and_goal
     field = fresh_field(grid, goal, rule)
-    q = NETWORK.q_values(grid, goal, rule)
+    q = network_field(NETWORK, grid, goal, rule).q
     np.testing.assert_allclose(
         np.where(field.legal, field.q, -np.inf), np.where(field.legal, q, -np.inf), rtol=1e-5
     )
@@ -95,8 +95,8 @@ def test_a_request_without_a_path_does_not_visit_the_whole_map() -> None:
 def any_share(monkeypatch: pytest.MonkeyPatch) -> None:
     """Repair the small maps of these tests, however much of them changes."""
     monkeypatch.setattr(repair, "CHANGED_SHARE", 1.0)
-    monkeypatch.setattr(repair, "REPAIRED_SHARE", 1.0)
-    monkeypatch.setattr(repair, "REPAIRED", repair.REPAIRED)  # tests change it
+    monkeypatch.setattr(fields, "REPAIRED_SHARE", 1.0)
+    monkeypatch.setattr(fields, "REPAIRED", fields.REPAIRED)  # tests change it
 
 
 @st.composite
@@ -148,7 +148,7 @@ def test_a_repaired_field_is_a_fresh_one_bit_for_bit(
 ) -> None:
     plain, goal = grid_and_goal
     grid = GridMap(plain.occupancy, 0.05, (1.25, -3.0, yaw), plain.cost)
-    repair.REPAIRED = data.draw(st.sampled_from([1, 3, 300]), label="limit of a repair")
+    fields.REPAIRED = data.draw(st.sampled_from([1, 3, 300]), label="limit of a repair")
     planner = Planner(NETWORK, METADATA)
     if data.draw(st.booleans(), label="whole"):
         _ = planner.q_field(grid, goal, rule).value
@@ -180,7 +180,7 @@ def test_a_changed_map_uses_what_is_known_of_the_one_before() -> None:
     known = np.count_nonzero(older.known.distance)
     cells = repair.changed_cells(grid, changed, (0, 0))
     assert cells is not None
-    assert repair.hand_over(older, field, cells, (0, 0))
+    assert field.take_over(older, cells, (0, 0))
     assert np.count_nonzero(field.known.distance) > 0.9 * known
     assert np.count_nonzero(older.known.distance) == 1  # it handed over its memory
     assert field.rollout(start) == fresh_field(changed, goal, MoveRule.ROBOT_SAFE).rollout(start)
@@ -188,7 +188,7 @@ def test_a_changed_map_uses_what_is_known_of_the_one_before() -> None:
 
 
 def test_a_repair_that_takes_too_long_leaves_the_older_field_as_it_was() -> None:
-    repair.REPAIRED = 5
+    fields.REPAIRED = 5
     grid, goal = GridMap(np.zeros((60, 60))), (30, 30)
     planner = Planner(NETWORK, METADATA)
     older = planner.q_field(grid, goal)
@@ -239,8 +239,7 @@ def test_a_field_that_is_interrupted_anywhere_is_as_a_new_one(
 
 def run_until(line: int, step: Callable[[], object]) -> None:
     """Run a step, and fail where so many lines of the field's code were run, if it gets there."""
-    kernels = {wavefront: ("_grow", "_grow_whole", "_wider"), invalidation: ("take_back",)}
-    files = {module.__file__ for module in (distance_field, repair, *kernels)}
+    files = {module.__file__ for module in (fields, repair, kernels)}
     left = line
 
     def trace(frame: FrameType, event: str, _: object) -> Any:
@@ -254,9 +253,8 @@ def run_until(line: int, step: Callable[[], object]) -> None:
 
     before = sys.gettrace()
     with pytest.MonkeyPatch.context() as patch, suppress(MemoryError):
-        for module, names in kernels.items():
-            for name in names:
-                patch.setattr(module, name, getattr(module, name).py_func)
+        for name in ("_grow", "_wider", "take_back"):
+            patch.setattr(kernels, name, getattr(kernels, name).__wrapped__)
         sys.settrace(trace)
         try:
             step()

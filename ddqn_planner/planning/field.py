@@ -1,0 +1,303 @@
+"""The Q field: Q(s, a) of every cell toward one goal, and greedy rollouts in it."""
+
+from __future__ import annotations
+
+import threading
+from functools import cached_property
+from typing import NamedTuple, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ddqn_planner.grid import MOVES, Cell, GridMap, MoveRule
+from ddqn_planner.grid.arguments import cell_inside, numbers
+from ddqn_planner.model import PropagationQNetwork, QNetwork
+from ddqn_planner.model.move_costs import MoveCosts
+from ddqn_planner.planning import kernels
+from ddqn_planner.planning.plan import Plan, PlanStatus
+from ddqn_planner.planning.repair import moved
+
+Goals: TypeAlias = tuple[Cell, ...]
+"""Different free cells, sorted: a path may end in any of them."""
+
+REPAIRED = 100
+"""Cells that a repair may take back before a new field is begun."""
+
+VISITS = 8
+"""Visits of a new field per cell that a repair may take back, while both take turns: to take a cell
+back takes longer, and it is visited again. See docs/benchmarks.md."""
+
+REPAIRED_SHARE = 0.02
+"""Share of the map's cells that a repair may take back."""
+
+_STEPS: list[Cell] = [(int(dx), int(dy)) for dx, dy in MOVES]
+
+
+class QField:
+    """Q(s, a) of every cell of one map toward one goal.
+
+    Parameters
+    ----------
+    goal : (x, y)
+        A free cell.
+    q : (8, H, W) float32
+        The network's value of each action in each cell; -inf where no way to the goal is known.
+    legal : (8, H, W) bool
+        The legal moves. The robot knows its map and takes no other.
+    move_rule : MoveRule
+        The rule by which they are legal.
+    """
+
+    q: NDArray[np.float32]
+    legal: NDArray[np.bool_]
+
+    def __init__(
+        self,
+        goal: Cell,
+        q: NDArray[np.float32],
+        legal: NDArray[np.bool_],
+        move_rule: MoveRule = MoveRule.ROBOT_SAFE,
+    ) -> None:
+        self.q = numbers("q", q)
+        if self.q.ndim != 3 or len(self.q) != len(MOVES) or not self.q.size:
+            raise ValueError(f"q has shape {self.q.shape}; give (8, H, W)")
+        self.legal, self.move_rule = numbers("legal", legal, self.q.shape, "b"), MoveRule(move_rule)
+        self.goal = cell_inside(goal, self.q.shape[1:], "the goal")
+        self.goals: Goals = (self.goal,)
+
+    @cached_property
+    def value(self) -> NDArray[np.float32]:
+        """(H, W) float32: the greatest Q of a legal move, and at the goal the greatest of all."""
+        legal_q = np.where(self.legal, self.q, np.float32(-np.inf))
+        value: NDArray[np.float32] = legal_q.max(axis=0)
+        value[self.goal[1], self.goal[0]] = value.max()
+        return value
+
+    @cached_property
+    def policy(self) -> NDArray[np.int8]:
+        """(H, W) int8: the legal action of the greatest Q; -1 where that is -inf."""
+        best = np.full(self.q.shape[1:], -np.inf, dtype=np.float32)
+        policy = np.full(self.q.shape[1:], -1, dtype=np.int8)
+        for action, (q, legal) in enumerate(zip(self.q, self.legal, strict=True)):
+            better = legal & (q > best)
+            np.copyto(best, q, where=better)
+            np.copyto(policy, action, where=better)
+        return policy
+
+    @property
+    def nbytes(self) -> int:
+        """Memory of the field with its value and policy, bytes."""
+        return int(self.q.nbytes + self.legal.nbytes + 5 * self.q[0].size)
+
+    def unmasked(self) -> QField:
+        """Return the field without action masking: a rollout is trapped by an illegal move."""
+        greedy_1HW = self.q.argmax(axis=0, keepdims=True)
+        actions_A11 = np.arange(len(MOVES)).reshape(-1, 1, 1)
+        legal = self.legal & (actions_A11 == greedy_1HW)
+        return QField(self.goal, self.q, legal, self.move_rule)
+
+    def rollout_if_known(self, start: Cell) -> Plan | None:
+        """Return the rollout from a start if no more of the field is needed, else None."""
+        return self.rollout(start)
+
+    def rollout(self, start: Cell) -> Plan:
+        """Take greedy steps from a free cell until the goal, and return the path.
+
+        The plan is ROLLOUT_TRAPPED as soon as a cell is entered again: the steps would repeat.
+
+        Raises
+        ------
+        ValueError
+            If the start is no cell of the map.
+        """
+        policy = self.policy
+        cell = cell_inside(start, policy.shape, "the start")
+        cells, visited = [cell], {cell}
+        while cell != self.goal:
+            action = int(policy[cell[1], cell[0]])
+            cell = (cell[0] + _STEPS[action][0], cell[1] + _STEPS[action][1])
+            if action < 0 or cell in visited:
+                return Plan(PlanStatus.ROLLOUT_TRAPPED, move_rule=self.move_rule)
+            visited.add(cell)
+            cells.append(cell)
+        return Plan(PlanStatus.SUCCEEDED, np.array(cells), move_rule=self.move_rule)
+
+
+class Known(NamedTuple):
+    """What is known of a field, see `kernels`."""
+
+    distance: NDArray[np.float64]
+    state: NDArray[np.uint8]
+    opened: NDArray[np.int32]
+    """The open cells."""
+    closed_is_final: bool = True
+    """Whether the distances of closed cells are the least ones. After a repair they may be too
+    great, until the field grows to the cell."""
+
+
+class DistanceField(QField):
+    """The Q field that costs of moves give: computed where a request needs it, and repaired.
+
+    Q(s, a) is minus the cost of a and of the cheapest path from where it leads, so distances to the
+    nearest goal hold all of it. They grow from the goals until they reach a start; `q`, `value` and
+    `policy` are made of the whole map when asked for. Several threads may use one field.
+    """
+
+    def __init__(self, goals: Goals, grid: GridMap, costs: MoveCosts, move_rule: MoveRule) -> None:
+        self.grid, self.costs, self.move_rule = grid, costs, move_rule
+        self.goal, self.goals = goals[0], goals
+        self._lock = threading.RLock()
+
+    @cached_property
+    def known(self) -> Known:
+        """What is known, at first the goals alone."""
+        cells = self.costs.patch.size
+        distance, state = np.zeros(cells), np.zeros(cells, np.uint8)
+        roots = np.array([self._number(goal) for goal in self.goals], np.int32)
+        distance[roots], state[roots] = kernels.AT_GOAL, kernels.OPEN
+        return Known(distance, state, roots)
+
+    def _number(self, cell: Cell) -> int:
+        return (cell[1] + 1) * self.costs.width + cell[0] + 1
+
+    def _take(self) -> Known:
+        """Return what is known, and begin anew.
+
+        What changes it takes it, and gives it back when it is done. So after any exception on the
+        way, as a lack of memory, the field begins anew.
+        """
+        known = self.known
+        del self.known
+        return known
+
+    @property
+    def is_whole(self) -> bool:
+        """Whether the distances of all cells are known."""
+        return not self.known.opened.size
+
+    def _reach(self, start: Cell, limit: int | None = None) -> bool:
+        """Compute the field as far as a start needs it; return whether its distance is known."""
+        number, done = self._number(start), True
+        if not self._is_final(number):
+            distance, state, opened, closed_is_final = self._take()
+            limit = distance.size if limit is None else limit
+            opened, done = kernels.grow(distance, state, opened, self.costs, number, limit)
+            self.known = Known(distance, state, opened, closed_is_final)
+        closed = self.known.state[number] == kernels.CLOSED
+        return bool((done or self.is_whole) and closed)
+
+    def _is_final(self, number: int) -> bool:
+        """Return whether no more of the field is needed to know the distance of a cell."""
+        closed = self.known.state[number] == kernels.CLOSED
+        return self.is_whole or bool(self.known.closed_is_final and closed)
+
+    def rollout_if_known(self, start: Cell) -> Plan | None:
+        """Return the rollout from a start if no more of the field is needed, else None."""
+        if not self._lock.acquire(blocking=False):
+            return None  # another thread computes it
+        try:
+            return self.rollout(start) if self._is_final(self._number(start)) else None
+        finally:
+            self._lock.release()
+
+    def rollout(self, start: Cell, limit: int | None = None) -> Plan:
+        """Take greedy steps from a free cell until a goal, and return the path.
+
+        To compute the field as far as the start, about as many cells as the limit may be visited.
+        The plan is ROLLOUT_TRAPPED if that is not enough.
+        """
+        start = cell_inside(start, self.grid.occupancy.shape, "the start")
+        with self._lock:
+            if not self._reach(start, limit):
+                status = PlanStatus.NO_PATH if self.is_whole else PlanStatus.ROLLOUT_TRAPPED
+                return Plan(status, move_rule=self.move_rule)
+            cells = kernels.roll_out(self.known.distance, self.costs, self._number(start))
+        y, x = np.divmod(cells, self.costs.width)
+        path = np.stack([x - 1, y - 1], axis=1).astype(np.int32)
+        return Plan(PlanStatus.SUCCEEDED, path, move_rule=self.move_rule)
+
+    def take_over(
+        self,
+        old: DistanceField,
+        changed: NDArray[np.int32],
+        shift: Cell,
+        start: Cell | None = None,
+    ) -> bool:
+        """Repair and take what an older field knows of the same place, unless to begin is quicker.
+
+        The values are the same. For one start, repair and new field take turns, each time with four
+        times the limit: so the quicker one wins, and its time is not exceeded by much. The older
+        field begins anew if it was taken over, else it stays as it is. See `shift_between` and
+        `changed_cells`; return whether it was taken over.
+        """
+        most = max(REPAIRED, int(REPAIRED_SHARE * self.grid.occupancy.size))
+        has_values_of_all = not vars(old).keys().isdisjoint(("q", "value", "policy"))
+        limit = most if start is None or has_values_of_all else REPAIRED
+        with old._lock:
+            taken = old._take()
+            distance, state, opened = moved(taken[:3], old.grid, self.grid, shift)
+            while True:
+                reopened, kept = kernels.take_back(distance, state, self.costs, changed, limit)
+                if kept:
+                    opened = np.concatenate([opened, reopened])
+                    self.known = Known(distance, state, opened, closed_is_final=False)
+                    return True
+                limit *= 4
+                quicker = start is None or limit > most or self._reach(start, VISITS * limit)
+                if quicker or self.is_whole:
+                    old.known = taken
+                    return False
+
+    def _whole(self) -> NDArray[np.float64]:
+        """Return the distance of every cell of the padded map, 0 where there is none: (C,)."""
+        if not self.is_whole:
+            distance, state, opened, _ = self._take()
+            kernels.grow_whole(distance, state, opened, self.costs)
+            self.known = Known(distance, state, opened[:0])
+        return self.known.distance
+
+    @cached_property
+    def q(self) -> NDArray[np.float32]:  # type: ignore[override]
+        """(8, H, W) float32: Q(s, a); -inf where no path to the goal begins with the action."""
+        with self._lock:
+            return kernels.q_of(self._whole(), self.costs)
+
+    @cached_property
+    def legal(self) -> NDArray[np.bool_]:  # type: ignore[override]
+        """(8, H, W) bool: the legal moves."""
+        return self.grid.legal_moves(self.move_rule)
+
+    @cached_property
+    def value(self) -> NDArray[np.float32]:
+        """(H, W) float32: the greatest Q of a legal move, and at the goal the greatest of all."""
+        with self._lock:
+            distance = self._whole().reshape(-1, self.costs.width)[1:-1, 1:-1]
+            value = np.negative(distance, dtype=np.float32, casting="same_kind")
+            value[value == 0] = -np.inf
+        x, y = np.transpose(self.goals)
+        value[y, x] = -np.inf
+        value[y, x] = value.max()
+        return value
+
+    @cached_property
+    def policy(self) -> NDArray[np.int8]:
+        """(H, W) int8: the action of a rollout in each cell; -1 without one."""
+        with self._lock:
+            return kernels.policy_of(self._whole(), self.costs)
+
+    @property
+    def nbytes(self) -> int:
+        """Memory, bytes: 9 per cell, and more once `q` and so on were made."""
+        made = (vars(self).get(name) for name in ("q", "legal", "value", "policy"))
+        cells = int(self.costs.patch.size)
+        return 9 * cells + sum(int(array.nbytes) for array in made if array is not None)
+
+
+def network_field(network: QNetwork, grid: GridMap, goal: Cell, move_rule: MoveRule) -> QField:
+    """Return the field of a network that may judge moves wrong, or see the whole map at once."""
+    if isinstance(network, PropagationQNetwork):
+        costs = network.believed_costs(grid, move_rule)
+        q = DistanceField((goal,), grid, costs, move_rule).q
+    else:
+        q = network.q_values(grid, goal, move_rule)
+    return QField(goal, q, grid.legal_moves(move_rule), move_rule)

@@ -1,0 +1,370 @@
+"""How values spread from the goal over a map, how they are repaired and read: in compiled code.
+
+A field is spread from its goal in the order of A*, so that a request visits the cells that its
+start needs and no others (resumable reverse A*, Silver 2005). Buckets hold the cells of about the
+same order (Dial 1969). After a change of the map, the distances that lose their support are taken
+back, and the cells that the change offers a path are opened (Ramalingam and Reps 1996; LPA*, Koenig
+and Likhachev 2002, is the same for one start).
+
+Cells are numbers of a padded map, see `MoveCosts`. Of each cell there is the distance to the goal,
+the least cost of a path, and its state: distance (C,) float64, state (C,) uint8. The functions
+compare distances in float64: float32 would lose the order of neighbours above some 10^6.
+"""
+
+from __future__ import annotations
+
+import heapq
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ddqn_planner.compiled import compiled
+from ddqn_planner.grid import MOVES
+from ddqn_planner.model.move_costs import MAX_MULTIPLIER, MoveCosts
+
+Distances = NDArray[np.float64]
+States = NDArray[np.uint8]
+Cells = NDArray[np.int32]
+
+UNREACHED: Final = 0
+OPEN: Final = 1
+CLOSED: Final = 2
+MARKED: Final = 4
+"""States of cells. The distance of an open cell may fall; that of a closed one is the least. Until
+a cell is reached its distance is 0: then pages of memory that no request needs are never touched.
+"""
+
+AT_GOAL: Final = 5e-324
+"""The distance of the goal: not 0, and as good as 0 in every sum."""
+
+BUCKETS: Final = 2
+"""Per unit of cost. More buckets mean fewer visits of cells that the start does not need."""
+
+SAME: Final = 1 + 1e-12
+"""Paths whose costs differ by a smaller factor cost the same: sums of floats are rounded."""
+
+MOVE_X, MOVE_Y = MOVES.T.copy()
+
+FIRST: NDArray[np.int8] = np.array(
+    [0] + [(bits & -bits).bit_length() - 1 for bits in range(1, 256)], np.int8
+)
+"""The lowest bit of a byte that is set."""
+
+
+@compiled
+def cost_of(
+    patch: Any, table: Any, value: Any, terms: Any, width: int, cell: int, action: int
+) -> Any:
+    """Return the cost of a move, infinite if it is not possible. See `MoveCosts`."""
+    cost = table[patch[cell], action]
+    if terms is None:
+        if value is None:
+            return cost
+        after = cell + MOVE_Y[action] * width + MOVE_X[action]
+        return cost * (np.float64(value[cell]) + value[after]) / 2
+    if cost == np.inf:
+        return cost
+    total = np.float32(0)
+    for row in range(3):
+        middle = cell + (row - 1) * width
+        total += (
+            terms[3 * row, value[middle - 1], action]
+            + terms[3 * row + 1, value[middle], action]
+            + terms[3 * row + 2, value[middle + 1], action]
+        )
+    multiplier = np.float32(1) + max(total, np.float32(0))
+    return cost * min(multiplier, np.float32(MAX_MULTIPLIER))
+
+
+# The wavefront
+
+
+def grow(
+    distance: Distances, state: States, opened: Cells, costs: MoveCosts, start: int, limit: int
+) -> tuple[Cells, bool]:
+    """Close cells in the order of A* until the distance of a start is known.
+
+    All cells that tie with those of the start's best path are closed too. So a rollout does not
+    depend on what was asked before. It gives up when it has visited more cells than the limit.
+    Distances and states are changed in place. Return the cells that stay open, and whether all was
+    visited that the start needs.
+    """
+    # Lower bounds, whatever the rounding.
+    bounds = costs.straight * (1 - 1e-7), costs.diagonal * (1 - 1e-7)
+    order = _orders(distance, opened, costs.width, start, bounds)
+    first = np.argsort(order)
+    return _grow(distance, state, opened[first], order[first], costs, start, bounds, BUCKETS, limit)
+
+
+def grow_whole(distance: Distances, state: States, opened: Cells, costs: MoveCosts) -> None:
+    """Give each cell that a path joins to the goal its distance, in place: Dijkstra's algorithm.
+
+    No move costs less than 1, so that there is one bucket per unit: a cell cannot change its own.
+    """
+    order = distance[opened].astype(np.int64)
+    first = np.argsort(order)
+    border = 0  # no path reaches it
+    bounds, limit = (0.0, 0.0), 2**62
+    _grow(distance, state, opened[first], order[first], costs, border, bounds, 1, limit)
+
+
+@compiled
+def _orders(
+    distance: Distances, opened: Cells, width: int, start: int, bounds: tuple[float, float]
+) -> NDArray[np.int64]:
+    """Return the bucket of each open cell, in the order of A*."""
+    order = np.empty(opened.size, np.int64)
+    for number in range(opened.size):
+        cell = opened[number]
+        x, y = cell % width - start % width, cell // width - start // width
+        order[number] = (distance[cell] + _remaining(x, y, bounds)) * BUCKETS
+    return order
+
+
+@compiled
+def _remaining(x: int, y: int, bounds: tuple[float, float]) -> float:
+    """Return the least cost of moves over (x, y), given that of a straight and a diagonal one."""
+    x, y = abs(x), abs(y)
+    both = min(x, y)
+    return bounds[0] * (max(x, y) - both) + bounds[1] * both
+
+
+@compiled
+def _grow(
+    distance: Distances,
+    state: States,
+    opened: Cells,
+    order: NDArray[np.int64],
+    costs: MoveCosts,
+    start: int,
+    bounds: tuple[float, float],
+    buckets: int,
+    limit: int,
+) -> tuple[Cells, bool]:
+    """Do the work of `grow`, with the open cells in their order."""
+    patch, table, value, terms, width = costs[:5]
+    offsets = MOVE_Y * width + MOVE_X
+    start_y, start_x = start // width, start % width
+    ring = int((costs.highest + bounds[1]) * buckets) + 3
+    capacity = 256
+    bucket = np.empty((ring, capacity), np.int32)
+    count = np.zeros(ring, np.int64)
+    through = np.empty(8)
+    taken, waiting, front, visited = 0, 0, 0, 0
+    done = False
+    while visited <= limit:
+        if waiting == 0:
+            if taken == opened.size:
+                done = True
+                break
+            front = max(front, order[taken])
+        if state[start] == CLOSED and distance[start] * (1 + 1e-6) * buckets < front:
+            done = True
+            break
+        slot = front % ring
+        used = 0
+        while True:
+            if taken < opened.size and order[taken] <= front:
+                cell = opened[taken]
+                taken += 1
+            elif used < count[slot]:
+                cell = bucket[slot, used]
+                used += 1
+                waiting -= 1
+            else:
+                break
+            if state[cell] != OPEN:
+                continue
+            state[cell] = CLOSED
+            visited += 1
+            here = distance[cell]
+            # With values, the table has lower bounds: few moves need more than that.
+            better = 0
+            for action in range(8):
+                previous = cell - offsets[action]
+                through[action] = here + table[patch[previous], action]
+                known = distance[previous]
+                is_better = (through[action] < known) | ((known == 0) & (through[action] < np.inf))
+                better |= int(is_better) << action
+            y = cell // width
+            x = cell - y * width
+            while better:
+                action = FIRST[better]
+                better &= better - 1
+                previous = cell - offsets[action]
+                known, cost = distance[previous], through[action]
+                if value is not None:
+                    cost = here + cost_of(patch, table, value, terms, width, previous, action)
+                    if cost >= known > 0:
+                        continue
+                remaining = _remaining(
+                    x - MOVE_X[action] - start_x, y - MOVE_Y[action] - start_y, bounds
+                )
+                new = max(int((cost + remaining) * buckets), front)
+                old = max(int((known + remaining) * buckets), front)
+                distance[previous] = cost
+                if state[previous] == OPEN and old == new:
+                    continue
+                state[previous] = OPEN
+                slot_of_new = new % ring
+                if count[slot_of_new] == capacity:
+                    bucket, capacity = _wider(bucket), 2 * capacity
+                bucket[slot_of_new, count[slot_of_new]] = previous
+                count[slot_of_new] += 1
+                waiting += 1
+        count[slot] = 0
+        front += 1
+    return _still_open(state, opened[taken:], bucket, count), done
+
+
+@compiled
+def _wider(bucket: NDArray[np.int32]) -> NDArray[np.int32]:
+    """Return buckets of twice the capacity with the same cells."""
+    wider = np.empty((bucket.shape[0], 2 * bucket.shape[1]), np.int32)
+    for slot in range(bucket.shape[0]):  # numba compiles it in a third of the time of a slice
+        for number in range(bucket.shape[1]):
+            wider[slot, number] = bucket[slot, number]
+    return wider
+
+
+@compiled
+def _still_open(
+    state: States, opened: Cells, bucket: NDArray[np.int32], count: NDArray[np.int64]
+) -> Cells:
+    """Return each open cell of those given and of the buckets once."""
+    found: Cells = np.empty(opened.size + count.sum(), np.int32)
+    number = 0
+    for slot in range(-1, count.size):
+        cells = opened if slot < 0 else bucket[slot, : count[slot]]
+        for cell in cells:
+            if state[cell] == OPEN:
+                state[cell] = OPEN | MARKED
+                found[number] = cell
+                number += 1
+    for cell in found[:number]:
+        state[cell] = OPEN
+    still_open: Cells = found[:number].copy()
+    return still_open
+
+
+# What changes of the map take back
+
+
+@compiled
+def take_back(
+    distance: Distances, state: States, costs: MoveCosts, changed: Cells, limit: int
+) -> tuple[Cells, bool]:
+    """Take back what changed moves no longer support, in place, and open what they offer.
+
+    The costs are those after the change; `changed` are all cells whose own moves changed, and more
+    do no harm. Return the cells that it opened, and whether no more than the limit were taken back;
+    if not, the field is as it was.
+    """
+    patch, table, value, terms, width = costs[:5]
+    offsets = MOVE_Y * width + MOVE_X
+    # In the order of the old distances: what supports a cell is judged before it.
+    waiting = [(np.float64(0), np.int64(0)) for _ in range(0)]
+    for cell in changed:
+        if distance[cell] > AT_GOAL:
+            heapq.heappush(waiting, (distance[cell], np.int64(cell)))
+    lost = [np.int64(0) for _ in range(0)]
+    while len(waiting) > 0:
+        known, cell = heapq.heappop(waiting)
+        if state[cell] & MARKED:
+            continue
+        supported = False
+        for action in range(8):
+            after = cell + offsets[action]
+            if distance[after] > 0 and not state[after] & MARKED:
+                cost = cost_of(patch, table, value, terms, width, cell, action)
+                supported |= distance[after] + cost <= known
+        if supported:
+            continue
+        state[cell] |= MARKED
+        lost.append(cell)
+        if len(lost) > limit:
+            for lost_cell in lost:
+                state[lost_cell] ^= MARKED
+            return changed[:0], False
+        for action in range(8):
+            before = cell - offsets[action]
+            cost = cost_of(patch, table, value, terms, width, before, action)
+            if distance[before] >= known + cost and not state[before] & MARKED:
+                heapq.heappush(waiting, (distance[before], np.int64(before)))
+    for cell in lost:
+        distance[cell], state[cell] = 0.0, UNREACHED
+    for cell in changed:
+        lost.append(np.int64(cell))
+    opened = np.empty(len(lost), np.int32)
+    number = 0
+    for cell in lost:
+        best = np.inf
+        for action in range(8):
+            after = cell + offsets[action]
+            if distance[after] > 0:
+                cost = cost_of(patch, table, value, terms, width, cell, action)
+                best = min(best, distance[after] + cost)
+        if best < np.inf and (distance[cell] == 0 or best < distance[cell]):
+            distance[cell], state[cell] = best, OPEN
+            opened[number] = cell
+            number += 1
+    return opened[:number].copy(), True
+
+
+# What distances say
+
+
+@compiled
+def _next_action(
+    distance: Any, patch: Any, table: Any, value: Any, terms: Any, width: int, cell: int
+) -> int:
+    """Return the greedy action of a closed cell, the lowest of those that tie; -1 without one."""
+    for action in range(8):
+        after = distance[cell + MOVE_Y[action] * width + MOVE_X[action]]
+        if after > 0:
+            cost = cost_of(patch, table, value, terms, width, cell, action)
+            if after + cost <= distance[cell] * SAME:
+                return action
+    return -1
+
+
+@compiled
+def roll_out(distance: Distances, costs: MoveCosts, start: int) -> NDArray[np.int64]:
+    """Return the cells of greedy steps from a closed start to the goal, both too."""
+    patch, table, value, terms, width = costs[:5]
+    cells = [start]
+    while True:
+        cell = cells[-1]
+        action = _next_action(distance, patch, table, value, terms, width, cell)
+        if distance[cell] == AT_GOAL or action < 0:
+            return np.array(cells)
+        cells.append(cell + MOVE_Y[action] * width + MOVE_X[action])
+
+
+@compiled
+def policy_of(distance: Distances, costs: MoveCosts) -> NDArray[np.int8]:
+    """Return the greedy action of each cell of a whole field, -1 without one: (H, W) int8."""
+    patch, table, value, terms, width = costs[:5]
+    policy = np.full((distance.size // width - 2, width - 2), -1, np.int8)
+    for y in range(policy.shape[0]):
+        for x in range(policy.shape[1]):
+            cell = (y + 1) * width + x + 1
+            policy[y, x] = _next_action(distance, patch, table, value, terms, width, cell)
+    return policy
+
+
+@compiled
+def q_of(distance: Distances, costs: MoveCosts) -> NDArray[np.float32]:
+    """Return minus the cost of the best path through each action: (8, H, W) float32."""
+    patch, table, value, terms, width = costs[:5]
+    q = np.full((8, distance.size // width - 2, width - 2), -np.inf, np.float32)
+    for action in range(8):
+        for y in range(q.shape[1]):
+            for x in range(q.shape[2]):
+                cell = (y + 1) * width + x + 1
+                after = distance[cell + MOVE_Y[action] * width + MOVE_X[action]]
+                if after > 0:
+                    cost = cost_of(patch, table, value, terms, width, cell, action)
+                    q[action, y, x] = -(cost + after)
+    return q
