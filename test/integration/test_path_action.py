@@ -115,7 +115,7 @@ class Server:
         self.is_active = True
         self.asked: list[tuple[Any, Any]] = []
         self.planned, self.stopped = Future(), Future()
-        self.action = PathAction(self.result, UNKNOWN, lambda: self.is_active, self.plan)
+        self.action = PathAction(Result, lambda: self.is_active, self.plan)
 
     def result(self) -> SimpleNamespace:
         return SimpleNamespace(error_msg="")
