@@ -1,18 +1,9 @@
-"""The trainer that learns from driving: it records the robot's drives, and what they teach.
-
-A worker thread has the files and the experience. The executor's thread divides poses into drives,
-and looks ten times per second what the worker has done.
-"""
+"""The trainer that learns from driving: it records the robot's drives, and what they teach."""
 
 from __future__ import annotations
 
-import math
-import time
-from collections import deque
 from collections.abc import Callable
-from contextlib import suppress
 from pathlib import Path as FilePath
-from typing import Any
 
 import numpy as np
 from action_msgs.msg import GoalStatus, GoalStatusArray
@@ -20,16 +11,13 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import PoseStamped
 from nav_msgs.msg import OccupancyGrid
 from numpy.typing import NDArray
-from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.publisher import Publisher
 from rclpy.qos import DurabilityPolicy, QoSProfile
-from rclpy.task import Future
 from std_msgs.msg import Header, String
 
 from ddqn_planner.experience.drives import (
     EXPERIENCE,
     RECORD,
-    Drive,
     DriveEnd,
     DriveFolder,
     DriveRecorder,
@@ -40,7 +28,7 @@ from ddqn_planner.nodes.conversions import occupancy_message, quaternion, serial
 from ddqn_planner.nodes.poses import MapInFrame, RobotPoses
 from ddqn_planner.nodes.replay import Replay
 from ddqn_planner.nodes.report import Refusals
-from ddqn_planner.nodes.runtime import LATCHED, STEADY, BaseNode, Worker
+from ddqn_planner.nodes.runtime import LATCHED, STEADY, BaseNode
 
 Float64 = NDArray[np.float64]
 
@@ -56,23 +44,13 @@ SLOWEST = 10.0
 REPLAYED = 5
 """A replay draws each n-th sample."""
 
-
 NOT_RECORDING = "no drives are being recorded; call ~/start first"
 
 
 class Driving:
     """Records the robot's drives in ``output_folder``, and learns from them.
 
-    Parameters
-    ----------
-    node : BaseNode
-        It has the trainer's parameters.
-    replay : Replay
-    episodes : Publisher
-        Of each drive that ends.
-    place : callable
-        It returns the last map, or None.
-    refusals : Refusals
+    `episodes` publishes each drive that ends; `place` returns the last map, or None.
     """
 
     def __init__(
@@ -86,13 +64,10 @@ class Driving:
         self._node, self._replay, self._episodes, self._place = node, replay, episodes, place
         self._refusals = refusals
         self._recorder = DriveRecorder(self._on_drive)
-        self._worker = Worker(node)
         self._folder: DriveFolder | None = None
-        self._work: deque[tuple[Future, Callable[[Any], None]]] = deque()
-        self._state, self._save_error = "stopped", ""
-        self._retry_at = math.inf
+        self._state, self._save_error, self._last_drive = "stopped", "", ""
+        self._is_disk_full = False
         self._aborted: set[bytes] | None = None
-        self._last_drive = ""
         self._learned = 0
         self._shown: tuple[GridMap | None, int] = None, 0
 
@@ -101,11 +76,33 @@ class Driving:
         node.create_subscription(PoseStamped, "goal_pose", self._on_goal, 10)
         node.create_subscription(GoalStatusArray, NAVIGATION, self._on_status, STATUS_QUALITY)
         self._poses = RobotPoses(node, place, refusals, self._on_pose)
-        node.create_timer(0.1, self._look, clock=STEADY)
-        group = ReentrantCallbackGroup()  # a service that waits for the worker keeps no other out
+        node.create_timer(0.1, self._show_slowness, clock=STEADY)
+        node.create_timer(RETRY_PERIOD, self._retry, clock=STEADY)
         for name in ("start", "stop", "save", "replay", "forget"):
-            node.create_trigger(f"~/{name}", getattr(self, f"_on_{name}"), callback_group=group)
+            node.create_trigger(f"~/{name}", getattr(self, f"_on_{name}"))
         self._begin()
+
+    def _begin(self) -> str:
+        """Open the folder and record; return why that failed."""
+        names = "nominal_speed", "robot_width"
+        try:
+            folder = DriveFolder(self._path(), *map(self._node.value, names))
+        except Exception as error:  # the node must survive
+            self._state, self._is_disk_full = "failed", isinstance(error, OSError)
+            self._refusals.refuse("output_folder", explained(error))
+            return explained(error)
+        self._folder, self._state = folder, "recording"
+        self._recorder.forget()
+        self._refusals.accept("output_folder")
+        self._node.get_logger().info(f"recording drives in {folder.folder}")
+        self._save(folder)
+        return ""
+
+    def _path(self) -> FilePath:
+        return FilePath(self._node.value("output_folder")).absolute()
+
+    def _recording(self) -> DriveFolder | None:
+        return self._folder if self._state == "recording" else None
 
     # Where the robot is
 
@@ -140,155 +137,106 @@ class Driving:
     # Drives
 
     def _on_drive(self, outcome: DriveEnd, seconds: Float64, positions: Float64) -> None:
-        place = self._place()
-        if place is not None:
-            call = self._worker.call(self._learn, outcome, seconds, positions, place)
-            self._work.append((call, self._on_learned))
-
-    def _on_learned(self, learned: tuple[Drive, bytes]) -> None:
-        drive, path = learned
-        self._last_drive = f"{drive.number}: {drive.metres:.1f} m, {drive.outcome.value}"
+        place, folder = self._place(), self._recording()
+        if place is None or folder is None:
+            return
+        try:
+            drive = folder.add(outcome, seconds, positions, place.grid)
+        except Exception as error:  # the node must survive
+            self._refusals.refuse("output_folder", explained(error))
+            return
+        self._last_drive = f"{drive.number}: {drive.metres:.1f} m, {outcome.value}"
         self._node.get_logger().info(f"drive {self._last_drive}")
         if not self._replay.is_running:
-            self._episodes.publish(path)
-        self._on_saved(None)
+            self._draw(positions, place)
+        self._tell_saved(folder)
 
-    def _on_saved(self, _: object) -> None:
+    def _save(self, folder: DriveFolder) -> None:
+        folder.try_to_save()
+        self._tell_saved(folder)
+
+    def _tell_saved(self, folder: DriveFolder) -> None:
         """Say where the experience is, or why it could not be saved."""
-        assert self._folder is not None
         self._learned += 1
-        before, self._save_error = self._save_error, self._folder.save_error
-        if self._save_error:
-            self._retry_at = time.monotonic() + RETRY_PERIOD
-            if not before:
-                self._node.get_logger().error(self._save_error)
-            return
-        if before:
-            self._node.get_logger().info("the drives are saved again")
-        self._saved.publish(String(data=str(self._folder.experience_path)))
+        log_change_of_saving(
+            self._node, self._save_error, folder.save_error, "the drives are saved again"
+        )
+        self._save_error = folder.save_error
+        if not self._save_error:
+            self._saved.publish(String(data=str(folder.experience_path)))
 
-    def _begin(self) -> Future:
-        """Record as soon as the worker has opened the folder."""
-        self._state = "opening"
-        names = "output_folder", "nominal_speed", "robot_width"
-        self._opening = self._worker.call(open_folder, *map(self._node.value, names))
-        self._work.append((self._opening, self._on_opened))
-        return self._opening
+    def _retry(self) -> None:
+        folder = self._recording()
+        if folder is not None and folder.save_error:
+            self._save(folder)
+        elif self._state == "failed" and self._is_disk_full:
+            self._begin()
 
-    def _on_opened(self, folder: DriveFolder) -> None:
-        self._folder, self._state = folder, "recording"
-        self._recorder.forget()
-        self._refusals.accept("output_folder")
-        self._node.get_logger().info(f"recording drives in {folder.folder}")
-        self._on_saved(None)
+    # What RViz shows
 
-    # What the worker does
-
-    def _learn(
-        self, outcome: DriveEnd, seconds: Float64, positions: Float64, place: MapInFrame
-    ) -> tuple[Drive, bytes]:
-        assert self._folder is not None
-        drive = self._folder.add(outcome, seconds, positions, place.grid)
-        return drive, self._path(positions, place)
-
-    def _path(self, positions: Float64, place: MapInFrame) -> bytes:
+    def _draw(self, positions: Float64, place: MapInFrame) -> None:
         yaw = np.arctan2(*np.diff(positions, axis=0).T[::-1])
-        header = Header(stamp=self._node.get_clock().now().to_msg(), frame_id=place.frame)
-        return serialized_poses(positions, yaw, header, quaternion(yaw[-1] if len(yaw) else 0))
+        last = quaternion(yaw[-1] if len(yaw) else 0)
+        self._episodes.publish(serialized_poses(positions, yaw, self._header(place), last))
 
-    def _draw_slowness(self, place: MapInFrame) -> OccupancyGrid:
-        assert self._folder is not None
-        grid = place.grid
-        slowness = self._folder.experience.slowness(grid)
+    def _show_slowness(self) -> None:
+        place, folder = self._place(), self._recording()
+        if place is None or folder is None:
+            return
+        grid, (shown_on, learned) = place.grid, self._shown
+        is_old = shown_on is not grid or learned != self._learned
+        if not (is_old and self._slowness.get_subscription_count()):
+            return
+        self._shown = grid, self._learned
+        slowness = folder.experience.slowness(grid)
         percent = np.clip(100 * np.log(slowness) / np.log(SLOWEST), 0, 100).round()
         percent[grid.occupancy] = -1
-        header = Header(stamp=self._node.get_clock().now().to_msg(), frame_id=place.frame)
-        return occupancy_message(percent, grid.resolution, grid.origin, header)
+        header = self._header(place)
+        self._slowness.publish(occupancy_message(percent, grid.resolution, grid.origin, header))
 
-    # Ten times per second
-
-    def _look(self) -> None:
-        while self._work and self._work[0][0].done():
-            future, take = self._work.popleft()
-            try:
-                result = future.result()
-            except Exception as error:  # the node must survive
-                self._on_error(error)
-                continue
-            take(result)
-        if time.monotonic() >= self._retry_at:
-            self._retry_at = math.inf
-            if self._state == "recording" and self._folder is not None:
-                call = self._worker.call(self._folder.try_to_save)
-                self._work.append((call, self._on_saved))
-            elif self._state == "failed":
-                self._begin()
-        place = self._place()
-        if self._state != "recording" or place is None or self._work:
-            return
-        is_old = self._shown[0] is not place.grid or self._shown[1] != self._learned
-        if is_old and self._slowness.get_subscription_count():
-            self._shown = place.grid, self._learned
-            self._work.append(
-                (self._worker.call(self._draw_slowness, place), self._slowness.publish)
-            )
-
-    def _on_error(self, error: Exception) -> None:
-        if isinstance(error, OSError):
-            self._retry_at = time.monotonic() + RETRY_PERIOD
-        if self._state == "opening":
-            self._state = "failed"
-        self._refusals.refuse("output_folder", with_remedy(error))
+    def _header(self, place: MapInFrame) -> Header:
+        return Header(stamp=self._node.get_clock().now().to_msg(), frame_id=place.frame)
 
     # Services: each returns whether it succeeds, and a message
 
-    async def _on_start(self) -> tuple[bool, str]:
-        if self._state in ("opening", "recording"):
+    def _on_start(self) -> tuple[bool, str]:
+        if self._state == "recording":
             return False, "drives are being recorded already; call ~/stop first"
-        try:
-            await self._begin()
-        except Exception as error:  # `_look` logs it
-            return False, with_remedy(error)
-        finally:
-            self._look()
-        assert self._folder is not None
-        return True, f"recording in {self._folder.folder} after drive {self._folder.drives}"
+        error, folder = self._begin(), self._folder
+        if error or folder is None:
+            return False, error
+        return True, f"recording in {folder.folder} after drive {folder.drives}"
 
-    async def _on_stop(self) -> tuple[bool, str]:
+    def _on_stop(self) -> tuple[bool, str]:
         replay = "; the replay was stopped" if self._replay.stop() else ""
-        if self._state == "opening":
-            with suppress(Exception):
-                await self._opening
-            self._look()
-        if self._state != "recording":
-            self._state, self._retry_at = "stopped", math.inf
+        folder = self._recording()
+        if folder is None:
+            self._state = "stopped"
             return True, f"no drives were being recorded{replay}"
         self._recorder.end(DriveEnd.STOPPED)
-        is_saved, message = await self._on_save()
-        if not is_saved:
-            return False, message
-        assert self._folder is not None
-        self._folder.close()
+        self._save(folder)
+        if self._save_error:
+            return False, self._save_error
+        folder.close()
         self._state = "stopped"
-        return True, f"stopped after drive {self._folder.drives}; ~/start continues{replay}"
+        return True, f"stopped after drive {folder.drives}; ~/start continues{replay}"
 
-    async def _on_save(self) -> tuple[bool, str]:
-        if self._state != "recording" or self._folder is None:
+    def _on_save(self) -> tuple[bool, str]:
+        folder = self._recording()
+        if folder is None:
             return False, NOT_RECORDING
-        await self._worker.call(self._folder.try_to_save)
-        self._look()
-        self._on_saved(None)
-        return not self._save_error, self._save_error or f"saved in {self._folder.folder}"
+        self._save(folder)
+        return not self._save_error, self._save_error or f"saved in {folder.folder}"
 
-    async def _on_forget(self) -> tuple[bool, str]:
-        if self._state != "recording" or self._folder is None:
+    def _on_forget(self) -> tuple[bool, str]:
+        folder = self._recording()
+        if folder is None:
             return False, NOT_RECORDING
         try:
-            kept = await self._worker.call(self._folder.forget)
+            kept = folder.forget()
         except OSError as error:
-            return False, with_remedy(error)
-        self._look()
-        self._on_saved(None)
+            return False, explained(error)
+        self._tell_saved(folder)
         if self._save_error:
             return False, self._save_error
         return True, (
@@ -300,14 +248,11 @@ class Driving:
         place = self._place()
         if place is None:
             return False, "no map was received yet; start a map server first"
-        file = FilePath(self._node.value("output_folder")).absolute() / RECORD
+        file = self._path() / RECORD
         drives = (drive.positions[::REPLAYED] for drive in read_drives(file))
         return self._replay.start(
             file, drives, lambda positions: self._draw(positions, place), "drive on"
         )
-
-    def _draw(self, positions: Float64, place: MapInFrame) -> None:
-        self._episodes.publish(self._path(positions, place))
 
     # What the node asks for
 
@@ -315,8 +260,7 @@ class Driving:
         """Return what `/diagnostics` says."""
         problems = [*self._refusals.problems(), *filter(None, [self._save_error])]
         level = DiagnosticStatus.ERROR if problems else DiagnosticStatus.OK
-        missing = self._place() is None
-        if missing:
+        if self._place() is None:
             problems.append("no map was received yet; start a map server, or set map_file")
             level = max(level, DiagnosticStatus.WARN)
         values = {
@@ -334,30 +278,29 @@ class Driving:
         return self._node.diagnostics("driving", level, "; ".join(problems) or self._state, values)
 
     def close(self) -> None:
-        """Record the drive that is under way, save, and wait for it."""
-        if self._state == "recording" and self._folder is not None:
+        """Record the drive that is under way, and save."""
+        folder = self._recording()
+        if folder is not None:
             self._recorder.end(DriveEnd.STOPPED)
-            self._worker.call(self._folder.try_to_save)
-        self._worker.close()
-        if self._folder is not None and self._state == "recording":
-            self._folder.close()
-            if self._folder.save_error:
-                self._node.get_logger().error(self._folder.save_error)
+            self._save(folder)
+            folder.close()
 
 
 def _place_of(position: tuple[float, float] | None) -> str:
     return "unknown" if position is None else f"({position[0]:.6g}, {position[1]:.6g})"
 
 
-def open_folder(folder: str, nominal_speed: float, robot_width: float) -> DriveFolder:
-    """Open a folder, and save there what it holds."""
-    opened = DriveFolder(FilePath(folder).absolute(), nominal_speed, robot_width)
-    opened.try_to_save()
-    return opened
+def log_change_of_saving(node: BaseNode, before: str, error: str, again: str) -> None:
+    """Log when saving begins to fail, or works again, not at each try."""
+    if error and not before:
+        node.get_logger().error(error)
+    if before and not error:
+        node.get_logger().info(again)
 
 
-def with_remedy(error: Exception) -> str:
-    """Return an error's words; for one of the disk, also what to do."""
+def explained(error: Exception) -> str:
+    """Return what an error says; for one of the disk, also what to do."""
     if isinstance(error, OSError):
         return f"{error}; set output_folder to a folder that can be written"
-    return str(error) or repr(error)
+    is_clear = isinstance(error, (ValueError, MemoryError)) and str(error)
+    return str(error) if is_clear else repr(error)

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Callable, Iterator
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -14,18 +12,10 @@ from ddqn_planner.nodes.runtime import STEADY, BaseNode
 
 
 class Replay:
-    """Replays episodes, one at a time.
+    """Replays episodes, one at a time; `fail` is called with the reason if one ends early."""
 
-    Parameters
-    ----------
-    node : BaseNode
-        It has the parameter ``replay_period``.
-    refuse : callable
-        Called with the reason when a replay has to end early.
-    """
-
-    def __init__(self, node: BaseNode, refuse: Callable[[str], None]) -> None:
-        self._node, self._refuse = node, refuse
+    def __init__(self, node: BaseNode, fail: Callable[[str], None]) -> None:
+        self._node, self._fail = node, fail
         self._timer: Timer | None = None
 
     @property
@@ -36,47 +26,35 @@ class Replay:
     def start(
         self, file: Path, episodes: Iterator[Any], draw: Callable[[Any], None], remedy: str
     ) -> tuple[bool, str]:
-        """Replay from now on; return whether it succeeds, and a message.
+        """Replay a file's episodes from now on; return whether it succeeds, and a message.
 
-        Parameters
-        ----------
-        file : Path
-            The file of the episodes.
-        episodes : iterator of sequences
-            The places of each.
-        draw : callable
-            Called with the first place of an episode, its first two, and so on.
-        remedy : str
-            What to do if there is none.
+        `draw` is called with the first place of an episode, its first two, and so on. The remedy is
+        for a file without episodes.
         """
+        frames = (places[: n + 1] for places in episodes for n in range(len(places)))
         try:
-            first = next(episodes, None)
+            first = next(frames, None)
         except OSError as error:
             return False, f"no recorded episodes ({error}); call ~/start first"
         if first is None:
             return False, f"{file} holds no episode to replay yet; {remedy}"
         self.stop()
-        frames = (
-            places[: count + 1]
-            for places in itertools.chain([first], episodes)
-            for count in range(len(places))
-        )
-        period = self._node.value("replay_period")
-        self._timer = self._node.create_timer(
-            period, partial(self._step, frames, draw), clock=STEADY
-        )
-        return True, "replaying the recorded episodes on ~/episode"
+        draw(first)
 
-    def _step(self, frames: Iterator[Any], draw: Callable[[Any], None]) -> None:
-        try:
-            frame = next(frames, None)
-        except OSError as error:
-            self._refuse(f"the replay ends: episodes.csv can no longer be read ({error})")
-            frame = None
-        if frame is None:
-            self.stop()
-        else:
-            draw(frame)
+        def step() -> None:
+            try:
+                frame = next(frames, None)
+            except OSError as error:
+                self._fail(f"the replay ends: {file.name} can no longer be read ({error})")
+                frame = None
+            if frame is None:
+                self.stop()
+            else:
+                draw(frame)
+
+        period = self._node.value("replay_period")
+        self._timer = self._node.create_timer(period, step, clock=STEADY)
+        return True, "replaying the recorded episodes on ~/episode"
 
     def stop(self) -> bool:
         """Stop a replay; return whether there was one."""

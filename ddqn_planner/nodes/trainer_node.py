@@ -1,17 +1,16 @@
-"""The trainer node: trains a model on the map in a thread, and replays episodes.
+"""The trainer node: trains a model on the map, or learns from drives, and replays episodes.
 
-The training thread makes no ROS call: it puts functions into a queue, and a timer calls them. So
-checkpoints are saved even after ROS has shut down. Another thread imports torch while the node
-already answers; ``~/start`` waits for it, and the other services do not.
+The worker trains for a tenth of a second at a time, and makes no ROS call: in between, the node
+publishes what became of it. First the worker imports torch, while the node already answers;
+``~/start`` waits for it, and the other services do not.
 """
 
 from __future__ import annotations
 
 import importlib
-import queue
 import sys
-import threading
-from collections.abc import Callable
+import time
+from collections.abc import Iterator
 from contextlib import suppress
 from functools import partial
 from pathlib import Path as FilePath
@@ -32,8 +31,9 @@ from ddqn_planner.nodes.conversions import (
     grid_from_message,
     path_message,
     quaternion,
+    serialized_path,
 )
-from ddqn_planner.nodes.driving import Driving
+from ddqn_planner.nodes.driving import Driving, explained, log_change_of_saving
 from ddqn_planner.nodes.parameters import HYPER_PARAMETERS, OF_MAPS, TRAINER_PARAMETERS
 from ddqn_planner.nodes.poses import MapInFrame, check_source
 from ddqn_planner.nodes.replay import Replay
@@ -45,6 +45,9 @@ from ddqn_planner.training.hyper_parameters import HyperParameters
 if TYPE_CHECKING:
     from ddqn_planner.training.episodes import Episode
     from ddqn_planner.training.run import TrainingRun
+
+SLICE = 0.1
+"""Seconds for which the worker trains before the node has a look."""
 
 
 class TrainerNode(BaseNode):
@@ -63,10 +66,7 @@ class TrainerNode(BaseNode):
         self._poses: dict[str, PoseStamped] = {}
         self._run: TrainingRun | None = None
         self._run_map: MapInFrame | None = None
-        self._thread: threading.Thread | None = None
-        self._stop = threading.Event()
-        self._save = threading.Event()
-        self._events: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()
+        self._is_stopping = self._is_saving = False
         self._refusals = Refusals(self)
         self._replay = Replay(self, self._fail)
         self._state, self._error, self._save_error = "idle", "", ""
@@ -76,6 +76,7 @@ class TrainerNode(BaseNode):
         self._read_map_file()
         self.create_subscription(OccupancyGrid, "map", self._on_map, LATCHED)
         self.create_timer(1.0, self._publish_diagnostics, clock=STEADY)
+        self._worker = Worker(self)
         self._driving: Driving | None = None
         if self.value("learn_from") == "driving":
             self._driving = Driving(
@@ -90,9 +91,7 @@ class TrainerNode(BaseNode):
         group = ReentrantCallbackGroup()  # the others are answered while ~/start waits
         for name in ("start", "stop", "save", "replay"):
             self.create_trigger(f"~/{name}", getattr(self, f"_on_{name}"), callback_group=group)
-        self.create_timer(0.1, self._on_events, clock=STEADY)
-        self._importing = Worker(self)
-        self._imported = self._importing.call(import_training)
+        self._imported = self._worker.call(import_training)
 
     def check_parameters(self, new: dict[str, Any]) -> None:
         """Check new values as `BaseNode` does, and hyper-parameters together: some limit others."""
@@ -161,27 +160,25 @@ class TrainerNode(BaseNode):
 
     # Services: each returns whether it succeeds, and a message
 
-    def _is_training(self) -> bool:
-        return self._thread is not None and self._thread.is_alive()
-
     async def _on_start(self) -> tuple[bool, str]:
         await self._imported
-        if self._is_training():
+        if self._state == "training":
             return False, "training already; call ~/stop first"
         try:
             place, run = self._open_run()
         except Exception as error:  # the node must survive any error
-            reason = _with_remedy(error)
+            reason = explained(error)
+            if isinstance(error, ImportError):
+                reason = f"training needs another library: {with_remedy(error)}"
             self._fail(f"the training cannot start: {reason}")
             return False, reason
-        self._stop.clear()
-        self._save.clear()
         self._state, self._error, self._save_error = "training", "", ""
+        self._is_stopping = self._is_saving = False
         self._refusals.forget()
         self._run, self._run_map = run, place
         self.get_logger().info(run.description)
-        self._thread = threading.Thread(target=self._train, args=(run, place), name="training")
-        self._thread.start()
+        executor: Any = self.executor
+        executor.create_task(self._train(run, place))
         return True, run.description
 
     def _open_run(self) -> tuple[MapInFrame, TrainingRun]:
@@ -194,7 +191,7 @@ class TrainerNode(BaseNode):
                 "map_file to a map with both"
             )
         start, goal = (self._cell(name, self._poses[name], place) for name in ("start", "goal"))
-        from ddqn_planner.training.environment import Scenario
+        from ddqn_planner.training.environment import Scenario  # these import torch
         from ddqn_planner.training.run import TrainingRun
 
         return place, TrainingRun(
@@ -210,76 +207,69 @@ class TrainerNode(BaseNode):
 
     def _on_stop(self) -> tuple[bool, str]:
         replay = "; the replay was stopped" if self._replay.stop() else ""
-        if not self._is_training():
+        if self._state != "training":
             return True, f"no training was running{replay}"
-        self._stop.set()
+        self._is_stopping = True
         return True, f"the training saves and stops, and ~/start continues it{replay}"
 
     def _on_save(self) -> tuple[bool, str]:
-        if not self._is_training():
+        if self._state != "training":
             return False, "no training is running; it was saved when it ended"
-        self._save.set()
+        self._is_saving = True
         return True, "saving after this step; ~/model_saved or an error follows"
 
-    # Training, in its own thread
+    def _on_replay(self) -> tuple[bool, str]:
+        from ddqn_planner.training.episodes import read_cells
 
-    def _train(self, run: TrainingRun, place: MapInFrame) -> None:
-        def announce_save() -> None:
-            if not run.save_error:
-                self._events.put(partial(self._on_saved, run, run.trainer.steps))
+        file = self._folder() / "episodes.csv"
+        is_of_run = self._run is not None and self._run.folder == self._folder()
+        place = self._run_map if is_of_run else self._map
+        if place is None:
+            return False, "no map was received yet; start a map server first"
+        episodes = read_cells(file, self.value("episode_interval"))
+        draw = partial(self._publish_cells, place=place)
+        return self._replay.start(file, episodes, draw, "train on")
 
+    # Training
+
+    async def _train(self, run: TrainingRun, place: MapInFrame) -> None:
+        """Train until the end or ~/stop."""
+        steps, announced = run.steps(), run.saved_at
+        ends = ""
         try:
-            for finished in run.steps():
-                for episode in finished:
-                    self._events.put(partial(self._on_episode, episode, place))
-                stopping = self._stop.is_set()
-                if stopping or self._save.is_set():
-                    self._save.clear()
-                    run.try_to_save()
-                if run.saved_at == run.trainer.steps:
-                    announce_save()
-                if stopping:
-                    return
-            announce_save()
+            while not ends:
+                episodes, is_finished = await self._worker.call(train_for_a_slice, steps)
+                for episode in episodes:
+                    self._on_episode(episode, place)
+                ends = "stopped" if self._is_stopping else "finished" if is_finished else ""
+                if self._is_stopping or self._is_saving:
+                    self._is_saving = False
+                    await self._worker.call(run.try_to_save)
+                self._log_change_of_saving(run)
+                if not run.save_error and (ends == "finished" or run.saved_at != announced):
+                    self.get_logger().info(f"step {run.saved_at} is saved in {run.checkpoint_path}")
+                    self._saved_publisher.publish(String(data=str(run.model_path)))
+                announced = run.saved_at
         except Exception as error:  # the node must survive any error
-            self._events.put(partial(self._on_failure, error))
+            ends = "failed"
+            self._fail(f"the training failed: {error!r}; ~/start continues from its checkpoint")
         finally:
             run.close()
-
-    # Events of the training thread
-
-    def _on_events(self) -> None:
-        while not self._events.empty():
-            self._events.get()()
-        self._log_change_of_saving()
-        if self._state == "training" and not self._is_training():
-            self._state = "stopped" if self._stop.is_set() else "finished"
-            self.get_logger().info(f"the training {self._state}")
+        self._state = ends
+        self.get_logger().info(f"the training {ends}")
 
     def _on_episode(self, episode: Episode, place: MapInFrame) -> None:
         self._reward_publisher.publish(Float32(data=episode.average_reward))
         if episode.number % self.value("episode_interval") == 0 and not self._replay.is_running:
             self._publish_cells(episode.cells, place)
 
-    def _on_saved(self, run: TrainingRun, step: int) -> None:
-        self.get_logger().info(f"step {step} is saved in {run.checkpoint_path}")
-        self._saved_publisher.publish(String(data=str(run.model_path)))
-
-    def _on_failure(self, error: Exception) -> None:
-        self._state = "failed"
-        self._fail(f"the training failed: {error!r}; ~/start continues from its checkpoint")
-
-    def _log_change_of_saving(self) -> None:
-        """Log when saving begins to fail or works again, not at each try."""
-        before, self._save_error = self._save_error, self._run.save_error if self._run else ""
-        if self._save_error and not before:
-            self.get_logger().error(self._save_error)
-        if before and not self._save_error:
-            self.get_logger().info("the training is saved again")
+    def _log_change_of_saving(self, run: TrainingRun) -> None:
+        log_change_of_saving(self, self._save_error, run.save_error, "the training is saved again")
+        self._save_error = run.save_error
 
     def _publish_cells(self, cells: tuple[Cell, ...], place: MapInFrame) -> None:
         header = Header(stamp=self.get_clock().now().to_msg(), frame_id=place.frame)
-        self._episode_publisher.publish(path_message(cells, place.grid, header, quaternion(0)))
+        self._episode_publisher.publish(serialized_path(cells, place.grid, header, quaternion(0)))
 
     def _publish_diagnostics(self) -> None:
         if self._driving is not None:
@@ -302,31 +292,27 @@ class TrainerNode(BaseNode):
         message = self.diagnostics("training", level, error or self._state, values)
         self._diagnostics_publisher.publish(message)
 
-    # Replay
-
-    def _on_replay(self) -> tuple[bool, str]:
-        from ddqn_planner.training.episodes import read_cells
-
-        file = self._folder() / "episodes.csv"
-        is_of_run = self._run is not None and self._run.folder == self._folder()
-        place = self._run_map if is_of_run else self._map
-        if place is None:
-            return False, "no map was received yet; start a map server first"
-        episodes = read_cells(file, self.value("episode_interval"))
-        draw = partial(self._publish_cells, place=place)
-        return self._replay.start(file, episodes, draw, "train on")
-
     def destroy_node(self) -> None:
-        """Let the training or the recording save and end, then destroy the node."""
+        """Destroy the node at once, then wait for the worker and save what it trained."""
         if self._driving is not None:
             self._driving.close()
-        self._stop.set()
-        if self._thread is not None:
-            self._thread.join()
-        self._log_change_of_saving()
         super().destroy_node()
-        if self._driving is None:
-            self._importing.close()  # torch, half imported, may fail when the process ends
+        self._worker.close()  # torch, half imported, may fail when the process ends
+        if self._run is not None and self._state == "training":
+            self._run.try_to_save()
+            self._run.close()
+            self._log_change_of_saving(self._run)
+
+
+def train_for_a_slice(steps: Iterator[list[Episode]]) -> tuple[list[Episode], bool]:
+    """Train; return the episodes that ended, and whether the training has finished."""
+    episodes: list[Episode] = []
+    until = time.monotonic() + SLICE
+    for ended in steps:
+        episodes += ended
+        if time.monotonic() >= until:
+            return episodes, False
+    return episodes, True
 
 
 def import_training() -> None:
@@ -336,16 +322,6 @@ def import_training() -> None:
         importlib.import_module("ddqn_planner.training.run")
         torch.set_num_threads(1)  # as fast as two for these networks, and leaves ROS a core
         torch.optim.Adam([torch.zeros(1)])  # the first optimiser imports for a second
-
-
-def _with_remedy(error: Exception) -> str:
-    if isinstance(error, OSError):
-        return f"{error}; set output_folder to a folder that can be written"
-    if isinstance(error, (ValueError, MemoryError)):
-        return str(error)
-    if isinstance(error, ImportError):
-        return f"training needs another library: {with_remedy(error)}"
-    return repr(error)
 
 
 def main() -> int:

@@ -11,7 +11,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
@@ -93,15 +93,19 @@ def parameter_arguments(parameters: dict[str, Any] | None, file: Path) -> list[s
 @pytest.fixture
 def log_of_refused_start(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
-) -> Callable[[Callable[[], int], dict[str, Any]], str]:
+) -> Callable[..., str]:
     """Return a function that sees a node refuse to start with parameters, and returns its log.
 
     The node is in this process: to start one that imports torch takes seconds.
     """
 
-    def start(main: Callable[[], int], parameters: dict[str, Any]) -> str:
-        arguments = parameter_arguments(parameters, tmp_path / "parameters.yaml")
-        monkeypatch.setattr(sys, "argv", ["node", "--ros-args", *arguments])
+    def start(
+        main: Callable[[], int],
+        parameters: dict[str, Any] | None = None,
+        arguments: Sequence[str] = (),
+    ) -> str:
+        given = parameter_arguments(parameters, tmp_path / "parameters.yaml")
+        monkeypatch.setattr(sys, "argv", ["node", "--ros-args", *given, *arguments])
         # Signals are pytest's here.
         monkeypatch.setattr("ddqn_planner.nodes.runtime._at_signals", lambda _: None)
         assert main() == 1

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import importlib.util
 import math
+import os
 import re
 import resource
 import signal
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path as FilePath
 from typing import Any
 
@@ -40,14 +42,29 @@ START, GOAL = (3, 18), (96, 18)
 LOWER = [(0.875, 4.625), (3.0, 3.5), (22.0, 3.5), (24.125, 4.625)]
 """Metres: from the start to the goal below the block."""
 
+NAMESPACE = "/drives"
+"""Of the trainer and the planner that most tests share."""
+
+SOON = """
+import rclpy.node
+from ddqn_planner.nodes import driving
+
+driving.RETRY_PERIOD, create_timer = 0.2, rclpy.node.Node.create_timer
+
+def create_fast_timer(node, period, *arguments, **options):
+    return create_timer(node, min(period, 0.1), *arguments, **options)
+
+rclpy.node.Node.create_timer = create_fast_timer
+"""
+"""What the shared trainer runs first (as its ``sitecustomize``): the tests wait for diagnostics."""
+
 
 class Site:
     """A trainer's user: it says where the robot is, and sees what the trainer says."""
 
-    def __init__(self, client: Client) -> None:
-        self.client = client
-        self.now = 1000.0
-        self.at = LOWER[0]
+    def __init__(self, client: Client, folder: FilePath) -> None:
+        self.client, self.folder = client, folder
+        self.now, self.at = time.monotonic(), LOWER[0]
         self.episodes = client.subscribe(Path, "trainer/episode", QoSProfile(depth=1000))
         self.saved = client.subscribe(String, "trainer/experience_saved", LATCHED)
         self.slowness = client.subscribe(OccupancyGrid, "trainer/slowness", LATCHED)
@@ -60,24 +77,24 @@ class Site:
         self.client.publish("map", map_message(VALUES, GRID), LATCHED, listeners)
         self.wait_for_state("recording", "^recording$")
 
-    def wait_for_state(self, state: str, message: str) -> dict[str, str]:
+    def wait_for_state(self, state: str, message: str) -> None:
         self.diagnostics.clear()
 
         def says(array: DiagnosticArray) -> bool:
             status = array.status[0]
+            is_mine = status.name == f"{self.client.node.get_namespace()}/trainer: driving"
             return (
-                status.name.endswith("/trainer: driving")
+                is_mine
                 and bool(re.search(message, status.message))
                 and values_of(status)["state"] == state
             )
 
-        return values_of(self.diagnostics.wait(says).status[0])
+        self.diagnostics.wait(says)
 
-    def odometry(self, x: float, y: float, frame: str = "map") -> Odometry:
+    def odometry(self, x: float, y: float) -> Odometry:
         whole = int(self.now)
-        header = Header(stamp=Time(sec=whole, nanosec=int(1e9 * (self.now - whole))))
-        header.frame_id = frame
-        message = Odometry(header=header)
+        stamp = Time(sec=whole, nanosec=int(1e9 * (self.now - whole)))
+        message = Odometry(header=Header(stamp=stamp, frame_id="map"))
         message.pose.pose.position.x, message.pose.pose.position.y = x, y
         message.pose.pose.orientation = quaternion(0.0)
         return message
@@ -111,20 +128,20 @@ class Site:
             self.at = x, y
         self.wait_for_place("robot", self.at)
 
-    def stand(self) -> None:
-        self.now += 0.1
-        self.send(self.odometry(*self.at))
-        time.sleep(0.01)
-
-    def drive(self, points: list[tuple[float, float]], speed: float) -> Path:
-        """Drive to a goal; return the episode of it."""
+    def drive(
+        self, points: list[tuple[float, float]], speed: float, then: Any = lambda: None
+    ) -> Path:
+        """Drive to a goal and stand there; return the episode of it."""
         self.episodes.clear()
         self.saved.clear()
         self.send_goal(*points[-1])
         self.move(points, speed)
 
         def ends() -> Path | None:
-            self.stand()
+            self.now += 0.1
+            self.send(self.odometry(*self.at))
+            then()
+            time.sleep(0.01)
             return self.episodes.find()
 
         episode = wait_for("episode", ends)
@@ -134,271 +151,249 @@ class Site:
     def call(self, service: str) -> Any:
         return self.client.call(Trigger, f"trainer/{service}")
 
+    def refusal(self, service: str = "start") -> str:
+        answer = self.call(service)
+        assert not answer.success
+        return str(answer.message)
 
-@pytest.fixture
-def site(make_client: Any, request: pytest.FixtureRequest, tmp_path: FilePath) -> Site:
-    return Site(make_client(namespace_of(request)))
+    @property
+    def outcomes(self) -> list[str]:
+        return [drive.outcome.value for drive in read_drives(self.folder / "episodes.csv")]
+
+    def learned(self) -> np.ndarray:
+        return Experience.load(self.folder / "experience.npz").slowness(GRID)
 
 
-def namespace_of(request: pytest.FixtureRequest) -> str:
-    return "/" + "".join(c if c.isalnum() else "_" for c in request.node.name)
+RunTrainer = Callable[..., Any]
 
 
-@pytest.fixture
-def run_trainer(run_node: Any, request: pytest.FixtureRequest, tmp_path: FilePath) -> Any:
-    def run(exit_code: int = 0, **parameters: Any) -> Any:
-        given = {"learn_from": "driving", "output_folder": str(tmp_path / "drives"), **parameters}
-        namespace = namespace_of(request)
+@pytest.fixture(scope="module")
+def run_trainer(run_node: Any) -> RunTrainer:
+    def run(folder: FilePath, namespace: str, exit_code: int = 0) -> Any:
+        given = {"learn_from": "driving", "output_folder": str(folder), "replay_period": 0.002}
         return run_node("trainer_node", given, namespace=namespace, exit_code=exit_code)
 
     return run
 
 
-@pytest.fixture
-def planner(run_node: Any, request: pytest.FixtureRequest) -> Iterator[Any]:
+@pytest.fixture(scope="module")
+def trainer(run_trainer: RunTrainer, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
+    folder = tmp_path_factory.mktemp("first")
+    (folder / "sitecustomize.py").write_text(SOON)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("PYTHONPATH", str(folder), prepend=os.pathsep)
+        with run_trainer(folder / "drives", NAMESPACE) as node:
+            yield node
+
+
+@pytest.fixture(scope="module")
+def planner(run_node: Any) -> Iterator[Any]:
     parameters = {"follow_trainer": True, "move_rule": "robot_safe"}
-    with run_node("planner_node", parameters, namespace=namespace_of(request)) as node:
+    with run_node("planner_node", parameters, namespace=NAMESPACE) as node:
         yield node
 
 
-def outcomes(tmp_path: FilePath) -> list[str]:
-    return [drive.outcome.value for drive in read_drives(tmp_path / "drives" / "episodes.csv")]
+@pytest.fixture(scope="module")
+def client(make_client: Any) -> Client:
+    return make_client(NAMESPACE)
+
+
+@pytest.fixture
+def site(trainer: Any, client: Client, tmp_path: FilePath) -> Iterator[Site]:
+    """The user of the shared trainer, which records in a new folder."""
+    site = Site(client, tmp_path / "drives")
+    site.call("stop")
+    trainer.forget_log()
+    site.client.set_parameters("trainer", output_folder=str(site.folder))
+    assert site.call("start").success
+    site.begin()
+    yield site
+    assert "Traceback" not in trainer.log
 
 
 def is_below(path: Path) -> bool:
     return len(path.poses) > 0 and all(it.pose.position.y < 5 for it in path.poses)
 
 
-def test_the_robot_goes_round_what_was_slow_until_it_forgets(
-    run_trainer: Any, planner: Any, site: Site, tmp_path: FilePath
-) -> None:
+def test_the_robot_goes_round_what_was_slow_until_it_forgets(planner: Any, site: Site) -> None:
+    site.begin(listeners=2)
     plans = site.client.subscribe(Path, "plan", LATCHED)
-    with run_trainer(replay_period=0.002):
-        site.begin(listeners=2)
-        ends = pose(GRID, START), pose(GRID, GOAL)
-        assert is_below(site.client.get_plan(*ends))
-
-        episode = site.drive(LOWER, speed=0.1)
-        assert episode.header.frame_id == "map"
-        first, last = episode.poses[0].pose.position, episode.poses[-1].pose.position
-        assert (first.x, first.y) == pytest.approx(LOWER[0], abs=0.2)
-        assert (last.x, last.y) == pytest.approx(LOWER[-1], abs=0.1)
-        (drive,) = read_drives(tmp_path / "drives" / "episodes.csv")
-        assert drive.outcome.value == "arrived"
-        assert drive.metres == pytest.approx(23.8, abs=0.5)
-        assert drive.seconds[-1] - drive.seconds[0] == pytest.approx(238, abs=10)
-
-        saved = site.saved.wait().data
-        assert FilePath(saved) == tmp_path / "drives" / "experience.npz"
-        slowness = Experience.load(saved).slowness(GRID)
-        assert slowness[14, 50] > 2
-        shown = site.slowness.wait(lambda message: max(message.data) > 0)
-        values = np.array(shown.data).reshape(VALUES.shape)
-        assert (values[VALUES > 0] == -1).all()
-        assert values[14, 50] == pytest.approx(100 * math.log10(slowness[14, 50]), abs=1)
-        assert values[35, 50] == 0
-
-        wait_for("other way", lambda: not is_below(site.client.get_plan(*ends)))
-        site.client.publish("initialpose", initial_pose(ends[0]))
-        site.client.publish("goal_pose", ends[1])
-        plan = plans.wait(lambda plan: len(plan.poses) > 50)
-
-        def forecast(array: DiagnosticArray) -> bool:
-            return "expected time (s)" in values_of(array.status[0])
-
-        said = values_of(site.diagnostics.wait(forecast).status[0])
-        expected = float(said["expected time (s)"])
-        low, high = map(float, said["expected time, 90 % interval (s)"].split(" to "))
-        assert low < expected < high
-        assert expected > 0.25 * len(plan.poses) / 0.5 * 0.8
-
-        site.episodes.clear()
-        assert site.call("replay").success
-        site.episodes.wait(lambda path: len(path.poses) == 3)
-        site.episodes.wait(lambda path: len(path.poses) > 40)
-
-        site.slowness.clear()
-        forgotten = site.call("forget")
-        assert forgotten.success
-        assert "experience_forgotten.npz has what was known" in forgotten.message
-        site.slowness.wait(lambda message: max(message.data) == 0)
-        wait_for("first way", lambda: is_below(site.client.get_plan(*ends)))
-        assert outcomes(tmp_path) == ["arrived"]
-
-
-def test_a_broken_file_of_the_trainer_is_refused_and_the_one_before_stays(
-    run_trainer: Any, planner: Any, site: Site, tmp_path: FilePath
-) -> None:
     ends = pose(GRID, START), pose(GRID, GOAL)
-    with run_trainer():
-        site.begin(listeners=2)
-        site.drive(LOWER, speed=0.1)
-        wait_for("other way", lambda: not is_below(site.client.get_plan(*ends)))
-        broken = tmp_path / "broken.npz"
-        broken.write_bytes((tmp_path / "drives" / "experience.npz").read_bytes()[:-20])
-        site.client.publish("trainer/experience_saved", String(data=str(broken)), LATCHED)
-        planner.wait_for_log(r"experience refused: .*broken.npz: cannot be read")
-        assert not is_below(site.client.get_plan(*ends))
+    wait_for("first way", lambda: is_below(site.client.get_plan(*ends)))
+
+    episode = site.drive(LOWER, speed=0.1)
+    assert episode.header.frame_id == "map"
+    first, last = episode.poses[0].pose.position, episode.poses[-1].pose.position
+    assert (first.x, first.y) == pytest.approx(LOWER[0], abs=0.2)
+    assert (last.x, last.y) == pytest.approx(LOWER[-1], abs=0.1)
+    (drive,) = read_drives(site.folder / "episodes.csv")
+    assert drive.outcome.value == "arrived"
+    assert drive.metres == pytest.approx(23.8, abs=0.5)
+    assert drive.seconds[-1] - drive.seconds[0] == pytest.approx(238, abs=10)
+
+    assert FilePath(site.saved.wait().data) == site.folder / "experience.npz"
+    slowness = site.learned()
+    assert slowness[14, 50] > 2
+    shown = site.slowness.wait(lambda message: max(message.data) > 0)
+    values = np.array(shown.data).reshape(VALUES.shape)
+    assert (values[VALUES > 0] == -1).all()
+    assert values[14, 50] == pytest.approx(100 * math.log10(slowness[14, 50]), abs=1)
+    assert values[35, 50] == 0
+
+    wait_for("other way", lambda: not is_below(site.client.get_plan(*ends)))
+    site.client.publish("initialpose", initial_pose(ends[0]))
+    site.client.publish("goal_pose", ends[1], listeners=2)
+    plan = plans.wait(lambda plan: len(plan.poses) > 50)
+    forecast = site.diagnostics.wait(
+        lambda array: "expected time (s)" in values_of(array.status[0])
+    )
+    said = values_of(forecast.status[0])
+    expected = float(said["expected time (s)"])
+    low, high = map(float, said["expected time, 90 % interval (s)"].split(" to "))
+    assert low < expected < high
+    assert expected > 0.25 * len(plan.poses) / 0.5 * 0.8
+
+    broken = site.folder / "broken.npz"
+    broken.write_bytes((site.folder / "experience.npz").read_bytes()[:-20])
+    site.client.publish("trainer/experience_saved", String(data=str(broken)), LATCHED)
+    planner.wait_for_log(r"experience refused: .*broken.npz: cannot be read")
+    assert not is_below(site.client.get_plan(*ends))
+
+    site.episodes.clear()
+    assert site.call("replay").success
+    site.episodes.wait(lambda path: len(path.poses) == 3)
+    site.episodes.wait(lambda path: len(path.poses) > 40)
+
+    site.slowness.clear()
+    forgotten = site.call("forget")
+    assert forgotten.success
+    assert "experience_forgotten.npz has what was known" in forgotten.message
+    site.slowness.wait(lambda message: max(message.data) == 0)
+    wait_for("first way", lambda: is_below(site.client.get_plan(*ends)))
+    assert site.outcomes == ["arrived"]
 
 
-def test_a_kill_loses_nothing_but_the_drive_under_way(
-    run_trainer: Any, site: Site, tmp_path: FilePath
+def test_a_kill_loses_nothing_but_the_drive_under_way_and_an_end_not_even_that(
+    run_trainer: RunTrainer, make_client: Any, tmp_path: FilePath
 ) -> None:
-    with run_trainer(exit_code=-signal.SIGKILL) as node:
+    site = Site(make_client("/killed"), tmp_path / "drives")
+    with run_trainer(site.folder, "/killed", exit_code=-signal.SIGKILL) as node:
         site.begin()
-        site.drive(LOWER, speed=0.1)
+        site.drive(LOWER[:2], speed=0.1)
         site.send_goal(*LOWER[0])
-        site.move([LOWER[1]], 0.5)
+        site.move([LOWER[2]], 0.5)
         node.process.kill()
         node.process.wait()
-    with run_trainer() as node:
+    with run_trainer(site.folder, "/killed") as node:
         site.begin()
-        site.at = LOWER[1]
-        site.drive([LOWER[2]], speed=0.5)
+        site.drive([LOWER[3]], speed=0.5)
         assert "drive 2: " in node.log
-    assert outcomes(tmp_path) == ["arrived", "arrived"]
-    known = Experience.load(tmp_path / "drives" / "experience.npz")
-    assert known.slowness(GRID)[18, 3] > 2  # of the first drive
-
-
-def test_the_end_of_the_node_ends_the_drive_under_way(
-    run_trainer: Any, site: Site, tmp_path: FilePath
-) -> None:
-    with run_trainer():
-        site.begin()
-        site.move(LOWER[1:3], 0.5)
+        site.send_goal(*LOWER[0])
+        site.move([LOWER[2]], 0.5)
         assert site.call("save").success
-    assert outcomes(tmp_path) == ["stopped"]
+    assert site.outcomes == ["arrived", "arrived", "stopped"]
+    assert site.learned()[18, 3] > 2  # of the first drive
 
 
-def test_recording_stops_and_continues(run_trainer: Any, site: Site, tmp_path: FilePath) -> None:
-    with run_trainer():
-        site.begin()
-        assert "call ~/stop first" in site.call("start").message
-        site.move(LOWER[1:2], 0.5)
-        assert "stopped after drive 1" in site.call("stop").message
-        for service in ("save", "forget"):
-            answer = site.call(service)
-            assert not answer.success
-            assert "call ~/start first" in answer.message
-        assert "no drives were being recorded" in site.call("stop").message
-        assert "after drive 1" in site.call("start").message
-        site.move(LOWER[2:3], 0.5)
-    assert outcomes(tmp_path) == ["stopped", "stopped"]
+def test_recording_stops_and_continues(site: Site) -> None:
+    assert "call ~/stop first" in site.refusal()
+    site.move(LOWER[1:2], 0.5)
+    assert "stopped after drive 1" in site.call("stop").message
+    assert "call ~/start first" in site.refusal("save")
+    assert "call ~/start first" in site.refusal("forget")
+    assert "no drives were being recorded" in site.call("stop").message
+    assert "after drive 1" in site.call("start").message
+    site.move(LOWER[2:3], 0.5)
+    site.call("stop")
+    assert site.outcomes == ["stopped", "stopped"]
 
 
-def test_who_gives_up_ends_the_drive_and_moves_fail_there(
-    run_trainer: Any, site: Site, tmp_path: FilePath
-) -> None:
+def test_who_gives_up_ends_the_drive_and_moves_fail_there(site: Site) -> None:
     def send(number: int, status: int) -> None:
         message = GoalStatusArray(status_list=[GoalStatus(status=status)])
         message.status_list[0].goal_info.goal_id.uuid = [number] * 16
         site.client.publish(NAVIGATION, message, LATCHED)
 
-    with run_trainer():
-        site.begin()
-        send(1, GoalStatus.STATUS_ABORTED)  # before: nobody knows where
-        site.move(LOWER[1:3], 0.5)
+    def aborts() -> None:
+        send(1, GoalStatus.STATUS_ABORTED)
+        send(2, GoalStatus.STATUS_ABORTED)
 
-        def aborts() -> Path | None:
-            site.stand()
-            send(1, GoalStatus.STATUS_ABORTED)
-            send(2, GoalStatus.STATUS_ABORTED)
-            return site.episodes.find()
-
-        wait_for("episode", aborts)
-    assert outcomes(tmp_path) == ["aborted"]
-    slowness = Experience.load(tmp_path / "drives" / "experience.npz").slowness(GRID)
+    send(1, GoalStatus.STATUS_ABORTED)  # before: nobody knows where
+    site.send_goal(*LOWER[3])
+    site.drive(LOWER[1:3], 0.5, then=aborts)
+    assert site.outcomes == ["aborted"]
+    slowness = site.learned()
     assert slowness[14, 87] > slowness[14, 50]
 
 
-@pytest.mark.parametrize(
-    ("change", "reason"),
-    [
-        (lambda m: setattr(m.header, "frame_id", "odom"), "frame is 'odom', the map's is 'map'"),
-        (lambda m: setattr(m.header, "stamp", Time()), "has no stamp"),
-        (lambda m: setattr(m.pose.pose.position, "x", math.nan), "give finite numbers"),
-        (lambda m: setattr(m.pose.pose.position, "x", 1e300), "give finite numbers"),
-    ],
-    ids=["frame", "stamp", "nan", "far"],
-)
-def test_malformed_odometry_is_refused_and_the_next_is_taken(
-    run_trainer: Any, site: Site, tmp_path: FilePath, change: Any, reason: str
-) -> None:
-    with run_trainer() as node:
-        site.begin()
+MALFORMED = {
+    "frame is 'odom', the map's is 'map'": lambda m: setattr(m.header, "frame_id", "odom"),
+    "has no stamp": lambda m: setattr(m.header, "stamp", Time()),
+    r"\(nan, 1.0\).*give finite numbers|x = nan": lambda m: setattr(
+        m.pose.pose.position, "x", math.nan
+    ),
+    r"\(1e\+300, 1.0\).*give finite numbers": lambda m: setattr(m.pose.pose.position, "x", 1e300),
+}
+
+
+def test_malformed_odometry_is_refused_and_the_next_is_taken(site: Site, trainer: Any) -> None:
+    for reason, change in MALFORMED.items():
+        trainer.forget_log()
         message = site.odometry(1.0, 1.0)
         change(message)
         for _ in range(5):
             site.send(message)
-        site.wait_for_state("recording", f"odom refused: .*{reason}")
-        assert node.log.count("odom refused") == 1
+        site.wait_for_state("recording", f"odom refused: .*({reason})")
+        assert trainer.log.count("odom refused") == 1
         site.move(LOWER[1:2], 0.5)
         site.wait_for_state("recording", "^recording$")
-    assert outcomes(tmp_path) == ["stopped"]
+    site.call("stop")
+    assert site.outcomes == ["stopped"]
 
 
-def test_a_broken_experience_is_not_overwritten(
-    run_trainer: Any, site: Site, tmp_path: FilePath
-) -> None:
-    with run_trainer():
-        site.begin()
-        site.move(LOWER[1:], 0.1)
-    file = tmp_path / "drives" / "experience.npz"
+def test_a_broken_experience_is_not_overwritten(site: Site) -> None:
+    site.move(LOWER[1:], 0.1)
+    site.call("stop")
+    file = site.folder / "experience.npz"
     file.write_bytes(file.read_bytes()[:-20])
     broken = file.read_bytes()
-    with run_trainer():
-        site.client.publish("map", map_message(VALUES, GRID), LATCHED)
-        site.wait_for_state("failed", "experience.npz: cannot be read")
-        answer = site.call("start")
-        assert not answer.success
-        assert "cannot be read" in answer.message
-        assert file.read_bytes() == broken
-        file.unlink()
-        assert "after drive 1" in site.call("start").message
-    assert Experience.load(file).slowness(GRID)[14, 50] > 2  # from the record
+    assert "experience.npz: cannot be read" in site.refusal()
+    site.wait_for_state("failed", "experience.npz: cannot be read")
+    assert file.read_bytes() == broken
+    file.unlink()
+    assert "after drive 1" in site.call("start").message
+    assert site.learned()[14, 50] > 2  # from the record
 
 
-def test_nothing_is_lost_while_the_disk_is_full(
-    run_trainer: Any, site: Site, tmp_path: FilePath
-) -> None:
-    with run_trainer() as node:
-        site.begin()
-        site.drive(LOWER, 0.1)
-        limits = resource.prlimit(node.process.pid, resource.RLIMIT_FSIZE)
-        size = (tmp_path / "drives" / "episodes.csv").stat().st_size + 10
-        resource.prlimit(node.process.pid, resource.RLIMIT_FSIZE, (size, limits[1]))
-        site.move(LOWER[::-1][1:], 0.1)
-        site.send_goal(9.0, 9.0)
-        site.wait_for_state("recording", "cannot save to .*; make room")
-        assert outcomes(tmp_path) == ["arrived"]
-        assert not site.call("stop").success  # it would lose the drive
-        resource.prlimit(node.process.pid, resource.RLIMIT_FSIZE, limits)
-        node.wait_for_log("the drives are saved again")
-        assert node.log.count("make room") == 1
-    assert outcomes(tmp_path) == ["arrived", "new_goal"]
+def test_nothing_is_lost_while_the_disk_is_full(site: Site, trainer: Any) -> None:
+    site.drive(LOWER[:2], 0.1)
+    process = trainer.process.pid
+    limits = resource.prlimit(process, resource.RLIMIT_FSIZE)
+    size = (site.folder / "episodes.csv").stat().st_size + 10
+    resource.prlimit(process, resource.RLIMIT_FSIZE, (size, limits[1]))
+    site.move(LOWER[2:], 0.1)
+    site.send_goal(9.0, 9.0)
+    site.wait_for_state("recording", "cannot save to .*; make room")
+    assert site.outcomes == ["arrived"]
+    site.refusal("stop")  # it would lose the drive
+    resource.prlimit(process, resource.RLIMIT_FSIZE, limits)
+    trainer.wait_for_log("the drives are saved again")
+    assert trainer.log.count("make room") == 1
+    assert site.outcomes == ["arrived", "new_goal"]
 
 
-def test_a_folder_of_a_training_is_refused(
-    run_trainer: Any, site: Site, tmp_path: FilePath
-) -> None:
-    (tmp_path / "drives").mkdir()
-    (tmp_path / "drives" / "training.lock").touch()
-    with run_trainer():
-        site.wait_for_state("failed", "holds .* but no drives; give a new or empty folder")
-        site.client.set_parameters("trainer", output_folder=str(tmp_path / "other"))
-        assert site.call("start").success
-        site.wait_for_state("recording", "no map was received yet")
+def test_a_folder_of_a_training_is_refused(site: Site, tmp_path: FilePath) -> None:
+    site.call("stop")
+    (tmp_path / "training.lock").touch()
+    site.client.set_parameters("trainer", output_folder=str(tmp_path))
+    assert re.search("holds .* but no drives; give a new or empty folder", site.refusal())
+    site.client.set_parameters("trainer", output_folder=str(tmp_path / "other"))
+    assert site.call("start").success
 
 
 def test_tf_that_is_not_installed_is_refused(log_of_refused_start: Any) -> None:
-    pytest.importorskip("rclpy")
-    try:
-        import tf2_ros  # noqa: F401
-    except ImportError:
-        log = log_of_refused_start(
-            trainer_node.main, {"learn_from": "driving", "pose_source": "tf"}
-        )
-        assert "apt install ros-jazzy-tf2-ros-py" in log
-    else:
+    if importlib.util.find_spec("tf2_ros"):
         pytest.skip("tf2_ros is installed")
+    parameters = {"learn_from": "driving", "pose_source": "tf"}
+    log = log_of_refused_start(trainer_node.main, parameters)
+    assert "apt install ros-jazzy-tf2-ros-py" in log

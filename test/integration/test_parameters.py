@@ -1,18 +1,19 @@
-"""The parameters of all nodes: no request ends a node."""
+"""The nodes as docs/nodes.md tells of them, and their parameters: no request ends a node."""
 
 from __future__ import annotations
 
-import os
+import importlib.util
 import re
-import subprocess
-from collections.abc import Callable
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import suppress
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
 import pytest
-from processes import executable
-from rcl_interfaces.msg import Parameter as ParameterMessage
-from rcl_interfaces.msg import ParameterValue
+from client import Client, wait_for
+from rcl_interfaces.msg import Parameter, ParameterDescriptor, ParameterType, ParameterValue
 from rcl_interfaces.srv import (
     DescribeParameters,
     GetParameters,
@@ -23,81 +24,185 @@ from rcl_interfaces.srv import (
 )
 
 DOCS = (Path(__file__).resolve().parents[2] / "docs" / "nodes.md").read_text(encoding="utf-8")
+NODES = ["map_server", "planner", "trainer"]
 NAMES = ["", "no_such", "a.b", "/", "ü" * 300]
+TYPES = {
+    ParameterType.PARAMETER_BOOL: "bool",
+    ParameterType.PARAMETER_INTEGER: "integer",
+    ParameterType.PARAMETER_DOUBLE: "double",
+    ParameterType.PARAMETER_STRING: "string",
+}
+OF_EVERY_NODE = {"/rosout", "/parameter_events", "use_sim_time", "start_type_description_service"}
+OF_DRIVING = {
+    "odom",
+    "navigate_to_pose/_action/status",
+    "~/experience_saved",
+    "~/slowness",
+    "~/forget",
+}
+"""What the trainer has only where it learns from driving."""
 
 
-@pytest.mark.parametrize("name", ["map_server", "planner", "trainer"])
-def test_no_request_for_parameters_ends_a_node(
-    run_node: Any, make_client: Callable[[str], Any], name: str
+class Running:
+    """A node that runs, and its client."""
+
+    def __init__(self, name: str, client: Client, node: Any) -> None:
+        self.name, self.client, self.node = name, client, node
+
+    def call(self, service: Any, kind: str, **request: Any) -> Any:
+        return self.client.call(service, f"{self.name}/{kind}", service.Request(**request))
+
+    def topics(self) -> set[tuple[str, str, str]]:
+        """What the client has discovered of the node."""
+        return {
+            (kind, re.sub(f"^{self.name}/", "~/", name), message)
+            for kind, name, message in self.client.entities(self.name)
+            if name not in OF_EVERY_NODE and "parameter" not in name and "type_desc" not in name
+            # An action's parts have no rows of their own.
+            if kind == "subscribes" or "/_action/" not in name
+        }
+
+
+@pytest.fixture(scope="module", params=NODES)
+def running(
+    request: pytest.FixtureRequest, run_node: Any, make_client: Callable[[str], Client]
+) -> Iterator[Running]:
+    name, namespace = request.param, f"/described/{request.param}"
+    parameters = {"follow_trainer": True} if name == "planner" else {}
+    with run_node(f"{name}_node", parameters, namespace=namespace) as node:
+        yield Running(name, make_client(namespace), node)
+
+
+def rows_of(node: str) -> list[list[str]]:
+    """The cells of the tables below a node's heading."""
+    (section,) = (part for part in DOCS.split("\n## ") if part.startswith(f"{node}_node"))
+    rows = (line for line in section.splitlines() if line.startswith("| "))
+    return [[cell.strip() for cell in row.strip("|").split("|")] for row in rows]
+
+
+def documented_parameters(node: str) -> dict[str, list[str]]:
+    """The type, default and range of each parameter."""
+    rows = {row[0].strip("`"): row[1:4] for row in rows_of(node) if len(row) == 5}
+    del rows["parameter"]
+    return rows
+
+
+def documented_topics(node: str) -> set[tuple[str, str, str]]:
+    """The topics and services in the tables below a node's heading."""
+    documented = set()
+    for row in rows_of(node):
+        if row[0] not in ("publishes", "subscribes", "service"):
+            continue
+        package, _, message = row[2].split(",")[0].partition("/")
+        if importlib.util.find_spec(package):  # some may be missing
+            folder = "srv" if row[0] == "service" else "msg"
+            documented.add((row[0], row[1].strip("`"), f"{package}/{folder}/{message}"))
+    if node == "planner":  # by another start_source
+        documented.remove(("subscribes", "odom", "nav_msgs/msg/Odometry"))
+    return documented
+
+
+def range_of(entry: ParameterDescriptor) -> str:
+    parts = [f"{r.from_value:g} to {r.to_value:g}" for r in entry.floating_point_range]
+    parts += [f"{r.from_value} to {r.to_value}" for r in entry.integer_range]
+    parts += [entry.additional_constraints] if entry.additional_constraints else []
+    return "; ".join([*parts, *(["read-only"] if entry.read_only else [])])
+
+
+def test_each_parameter_is_documented_as_it_is(running: Running) -> None:
+    names = running.call(ListParameters, "list_parameters").result.names
+    names = [name for name in names if name not in OF_EVERY_NODE and "qos_over" not in name]
+    described = running.call(DescribeParameters, "describe_parameters", names=names)
+    found = {}
+    for entry in described.descriptors:
+        assert entry.description
+        value = running.client.get_parameter(running.name, entry.name)
+        text = str(value).lower() if isinstance(value, bool) else repr(value)
+        default = f"`{text}`".replace("''", "")
+        found[entry.name] = [TYPES[entry.type], default, range_of(entry)]
+    if running.name == "planner":
+        found["follow_trainer"][1] = "`false`"
+    assert found == documented_parameters(running.name)
+
+
+def test_each_topic_and_service_is_documented_as_it_is(
+    running: Running, run_node: Any, make_client: Callable[[str], Client], tmp_path: Path
 ) -> None:
-    client = make_client(f"/asked/{name}")
-    with run_node(f"{name}_node", {}, namespace=f"/asked/{name}") as node:
-
-        def call(service: Any, kind: str, **request: Any) -> Any:
-            return client.call(service, f"{name}/{kind}", service.Request(**request))
-
-        unknown_type = ParameterMessage(name="use_sim_time", value=ParameterValue(type=77))
-        no_name = ParameterMessage(value=ParameterValue(type=1, bool_value=True))
-        unset = ParameterMessage(name="use_sim_time")
-        for bad, reason in (
-            (unknown_type, "77.*ParameterType"),
-            (no_name, "no name; give one"),
-            (unset, "."),
-        ):
-            (result,) = call(SetParameters, "set_parameters", parameters=[bad]).results
-            together = call(
-                SetParametersAtomically, "set_parameters_atomically", parameters=[bad]
-            ).result
-            for refused in (result, together):
-                assert not refused.successful
-                assert re.search(reason, refused.reason)
-        assert call(SetParameters, "set_parameters").results == []
-        assert call(SetParametersAtomically, "set_parameters_atomically").result.successful
-        call(ListParameters, "list_parameters", prefixes=NAMES, depth=2**64 - 1)
-        for kind, service in (
-            ("describe_parameters", DescribeParameters),
-            ("get_parameters", GetParameters),
-            ("get_parameter_types", GetParameterTypes),
-        ):
-            call(service, kind, names=NAMES)
-        names = call(ListParameters, "list_parameters").result.names
-        assert len(call(GetParameters, "get_parameters", names=names).values) == len(names) > 3
-        assert "Traceback" not in node.log
+    documented, more = documented_topics(running.name), set()
+    if running.name == "trainer":
+        parameters = {"learn_from": "driving", "output_folder": str(tmp_path / "drives")}
+        with run_node("trainer_node", parameters, namespace="/driving") as node:
+            driving = Running("trainer", make_client("/driving"), node)
+            driving.call(ListParameters, "list_parameters")
+            expected = {row for row in documented if row[1] in OF_DRIVING}
+            wait_for("topics of driving", lambda: driving.topics() >= expected)
+            more = driving.topics()
+    # The client may discover the last of them late.
+    with suppress(TimeoutError):
+        wait_for("documented topics", lambda: more | running.topics() == documented)
+    assert documented == more | running.topics()
 
 
-ROW = re.compile(r"\| `(\w+)` \| (\w+) \| `(.*?)` \|(.*?)\|")
+def test_no_request_for_parameters_ends_a_node(running: Running) -> None:
+    unknown_type = Parameter(name="use_sim_time", value=ParameterValue(type=77))
+    no_name = Parameter(value=ParameterValue(type=1, bool_value=True))
+    unset = Parameter(name="use_sim_time")
+    for bad, reason in (
+        (unknown_type, "77.*ParameterType"),
+        (no_name, "no name; give one"),
+        (unset, "."),
+        (Parameter(name="no_such", value=ParameterValue(type=1)), "undeclared"),
+    ):
+        (result,) = running.call(SetParameters, "set_parameters", parameters=[bad]).results
+        service = SetParametersAtomically, "set_parameters_atomically"
+        together = running.call(*service, parameters=[bad]).result
+        for refused in (result, together):
+            assert not refused.successful
+            assert re.search(reason, refused.reason)
+    good = Parameter(name="use_sim_time", value=ParameterValue(type=1))
+    results = running.call(SetParameters, "set_parameters", parameters=[unknown_type, good]).results
+    assert [result.successful for result in results] == [False, True]
+    assert running.call(SetParameters, "set_parameters").results == []
+    assert running.call(*service).result.successful
+    running.call(ListParameters, "list_parameters", prefixes=NAMES, depth=2**64 - 1)
+    for kind, service_type in (
+        ("describe_parameters", DescribeParameters),
+        ("get_parameters", GetParameters),
+        ("get_parameter_types", GetParameterTypes),
+    ):
+        running.call(service_type, kind, names=NAMES)
+    names = running.call(ListParameters, "list_parameters").result.names
+    values = running.call(GetParameters, "get_parameters", names=names).values
+    assert len(values) == len(names) > 3
+    assert "Traceback" not in running.node.log
 
 
 @pytest.mark.parametrize("option", ["--help", "-h"])
-@pytest.mark.parametrize("name", ["map_server", "planner", "trainer"])
+@pytest.mark.parametrize("name", NODES)
 def test_help_says_of_each_parameter_what_the_docs_say_and_starts_no_node(
-    name: str, option: str, tmp_path: Path
+    name: str,
+    option: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capfd: pytest.CaptureFixture[str],
 ) -> None:
     # With such a domain, such parameters and in such a folder no node starts.
-    environment = {**os.environ, "ROS_DOMAIN_ID": "abc"}
     arguments = [option, "--ros-args", "-p", "model:=no_such", "-p", "map_file:=no_such"]
-    helped = subprocess.run(
-        [executable(f"{name}_node"), *arguments],
-        env=environment,
-        cwd=tmp_path,
-        capture_output=True,
-        text=True,
-        timeout=600,
-    )
-    assert helped.returncode == 0, helped.stderr
-    assert helped.stderr == ""
+    monkeypatch.setenv("ROS_DOMAIN_ID", "abc")
+    monkeypatch.setattr(sys, "argv", [f"{name}_node", *arguments])
+    monkeypatch.chdir(tmp_path)
+    assert import_module(f"ddqn_planner.nodes.{name}_node").main() == 0
+    helped = capfd.readouterr()
+    assert helped.err == ""
     assert list(tmp_path.iterdir()) == []
-    assert f"usage: {name}_node" in helped.stdout
-    (section,) = (part for part in DOCS.split("\n## ") if part.startswith(f"{name}_node"))
-    documented = {}
-    for parameter, kind, default, limits in map(re.Match[str].groups, ROW.finditer(section)):
-        value = default or "''"
-        documented[parameter] = "; ".join(
-            filter(None, [f"{kind}, default {value}", limits.strip()])
+    assert f"usage: {name}_node" in helped.out
+    printed = re.findall(r"^  (\w+): (.*)\n      \S.*", helped.out, re.MULTILINE)
+    assert dict(printed) == {
+        parameter: "; ".join(
+            filter(None, [f"{kind}, default {default.strip('`') or repr('')}", limits])
         )
-    printed = re.findall(r"^  (\w+): (.*)\n      (\S.*)", helped.stdout, re.MULTILINE)
-    assert {parameter: rest for parameter, rest, _ in printed} == documented
-    assert len(printed) == len(documented) > 3
+        for parameter, (kind, default, limits) in documented_parameters(name).items()
+    }
 
 
 @pytest.mark.parametrize(
@@ -118,12 +223,15 @@ def test_help_says_of_each_parameter_what_the_docs_say_and_starts_no_node(
     ],
 )
 def test_what_ros_cannot_start_with_is_said_and_ends_with_1(
-    arguments: list[str], environment: dict[str, str], reason: str
+    log_of_refused_start: Any,
+    monkeypatch: pytest.MonkeyPatch,
+    arguments: list[str],
+    environment: dict[str, str],
+    reason: str,
 ) -> None:
-    command = [executable("map_server_node"), "--ros-args", *arguments]
-    ended = subprocess.run(
-        command, env={**os.environ, **environment}, capture_output=True, text=True, timeout=600
-    )
-    assert ended.returncode == 1
-    assert re.search(f"cannot start: .*({reason})", ended.stdout + ended.stderr)
-    assert "Traceback" not in ended.stderr
+    for variable, value in environment.items():
+        monkeypatch.setenv(variable, value)
+    main = import_module("ddqn_planner.nodes.map_server_node").main
+    log = log_of_refused_start(main, arguments=arguments)
+    assert re.search(f"cannot start: .*({reason})", log)
+    assert "Traceback" not in log

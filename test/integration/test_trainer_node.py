@@ -1,6 +1,5 @@
 from __future__ import annotations
 
-import csv
 import itertools
 import os
 import queue
@@ -10,7 +9,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import fields
 from pathlib import Path as FilePath
@@ -24,10 +23,7 @@ from hypothesis import given
 from integration.messages import HEADERS, POSES, maps, some_parameters
 from nav_msgs.msg import OccupancyGrid, Path
 from nav_msgs.srv import GetPlan
-from rcl_interfaces.msg import Parameter as ParameterMessage
-from rcl_interfaces.msg import ParameterType, ParameterValue
 from rcl_interfaces.srv import (
-    DescribeParameters,
     ListParameters,
     SetParameters,
     SetParametersAtomically,
@@ -37,13 +33,13 @@ from rclpy.time import Time
 from std_msgs.msg import Float32, Header, String
 from std_srvs.srv import Trigger
 
-from ddqn_planner.grid import MOVES, GridMap, MoveRule, legal_moves, read_map_file
+from ddqn_planner.grid import MOVES, GridMap, MoveRule, legal_moves
 from ddqn_planner.model import load_model
 from ddqn_planner.nodes import trainer_node
 from ddqn_planner.nodes.conversions import occupancy_message, quaternion
 from ddqn_planner.nodes.parameters import TRAINER_PARAMETERS
 from ddqn_planner.nodes.runtime import LATCHED
-from ddqn_planner.training.environment import Scenario
+from ddqn_planner.training.environment import Scenario, paper_scenario
 from ddqn_planner.training.hyper_parameters import HyperParameters
 from ddqn_planner.training.run import TrainingRun
 from ddqn_planner.training.trainer import Trainer
@@ -154,7 +150,9 @@ def shared_trainer(
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("PYTHONPATH", str(folder), prepend=os.pathsep)
         with run_node("trainer_node", {}, namespace=NAMESPACE) as node:
-            yield node, make_client(NAMESPACE)
+            client = make_client(NAMESPACE)
+            assert "no map" in refusal(client)
+            yield node, client
 
 
 @pytest.fixture
@@ -298,65 +296,36 @@ def test_the_log_says_when_a_training_starts_and_what_is_saved(
     assert node.log.count("is saved in") == 1
 
 
-def test_a_folder_of_something_else_or_in_use_is_refused_and_left_as_it_is(
-    trainer: Any, small_values: Any, tmp_path: FilePath
-) -> None:
-    _, client = trainer
-    for name in ("episodes.csv", "model.safetensors"):
-        (tmp_path / name).write_text("mine")
-    used = tmp_path.with_name("used")
-    scenario = Scenario(GridMap(small_values > 0), (0, 0), (5, 5))
-    other = TrainingRun(used, [scenario], MoveRule.ROBOT_SAFE, HyperParameters(), seed=0)
-    configure(client, tmp_path)
-    assert "no training; give a new or empty folder" in refusal(client)
-    configure(client, used)
-    assert "another process trains" in refusal(client)
-    other.close()
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["episodes.csv", "model.safetensors"]
-    assert all(path.read_text() == "mine" for path in tmp_path.iterdir())
-
-
 def test_a_signal_saves_a_checkpoint_that_a_new_process_continues(
     run_node: Any, make_client: Any, namespace: str, tmp_path: FilePath
 ) -> None:
-    client, steps = make_client(namespace), 0
-    parameters = {
-        **ENDLESS,
-        "output_folder": str(tmp_path),
-        "map_file": str(FilePath(__file__).resolve().parents[2] / "maps" / "dilemma.yaml"),
-    }
-    scenario = paper_scenario_of(parameters["map_file"])
-    for number in (signal.SIGINT, signal.SIGTERM):
-        with run_node("trainer_node", parameters, namespace=namespace) as node:
-            rewards = Listener(client, Float32, "trainer/average_reward")
-            assert f"from step {steps} " in start_training(client)
-            for _ in range(20):
-                rewards.next()
-            assert node.stop(number) == 0, node.log
-        before = steps
-        steps = Trainer.load_checkpoint(tmp_path / "checkpoint.safetensors", [scenario]).steps
-        assert steps > before
-    with run_node("trainer_node", parameters, namespace=namespace):
+    client, folder = make_client(namespace), tmp_path / "run"
+    parameters = {**ENDLESS, "output_folder": str(folder), "map_file": "dilemma"}
+
+    def train(steps: int) -> None:
+        rewards = Listener(client, Float32, "trainer/average_reward")
         assert f"from step {steps} " in start_training(client)
+        rewards.next()
+
+    with run_node("trainer_node", parameters, namespace=namespace):
+        train(0)
+    steps = Trainer.load_checkpoint(folder / "checkpoint.safetensors", [paper_scenario()]).steps
+    assert steps > 0
+    with run_node("trainer_node", parameters, namespace=namespace) as node:
+        train(steps)
+        with no_folder(node.process, folder):
+            assert node.stop(signal.SIGTERM) == 0
+    assert node.log.count("cannot save") == 1
 
 
-def paper_scenario_of(map_file: Any) -> Scenario:
-    read = read_map_file(map_file)
-    assert read.start is not None
-    assert read.goal is not None
-    return Scenario(read.grid(), read.start, read.goal)
-
-
-@pytest.mark.parametrize("network", ["paper", "propagation"])
 def test_a_planner_that_follows_the_trainer_plans_with_each_model_it_saves(
-    run_node: Any, trainer: Any, small_values: Any, tmp_path: FilePath, network: str
+    run_node: Any, trainer: Any, small_values: Any, tmp_path: FilePath
 ) -> None:
     node, client = trainer
     configure(
         client,
         tmp_path,
         steps=1500,
-        network=network,
         filters=16,
         learning_rate=0.003,
         learning_starts=100,
@@ -391,42 +360,29 @@ def test_a_planner_that_follows_the_trainer_plans_with_each_model_it_saves(
         wait_for("plan", lambda: client.call(GetPlan, "planner/get_plan", request).plan.poses)
 
 
-@pytest.mark.parametrize(
-    ("topic", "message", "named"),
-    [
-        ("goal_pose", stamped(0.5, 0.5, "odom"), "odom"),
-        ("goal_pose", stamped(float("nan"), 0.5), "nan"),
-        ("goal_pose", stamped(99.0, 0.5), "(99, 0)"),
-        ("goal_pose", stamped(1.5, 1.5), "(1, 1)"),
-        ("map", OccupancyGrid(header=Header(frame_id="map")), "resolution"),
-    ],
-)
+BAD = {
+    "odom": ("goal_pose", stamped(0.5, 0.5, "odom")),
+    "nan": ("goal_pose", stamped(float("nan"), 0.5)),
+    "(99, 0)": ("goal_pose", stamped(99.0, 0.5)),
+    "(1, 1)": ("goal_pose", stamped(1.5, 1.5)),
+    "resolution": ("map", OccupancyGrid(header=Header(frame_id="map"))),
+}
+
+
 def test_bad_input_is_refused_by_name_and_the_training_continues(
-    trainer: Any, tmp_path: FilePath, topic: str, message: Any, named: str
+    trainer: Any, tmp_path: FilePath
 ) -> None:
     _, client = trainer
     configure(client, tmp_path, **ENDLESS)
     start_training(client)
     diagnostics = Listener(client, DiagnosticArray, "/diagnostics")
-    client.publish(topic, message, LATCHED if topic == "map" else 10)
-    before = wait_for_state(diagnostics, state="training", message=named)
-    after = wait_for_state(diagnostics, state="training")
-    assert before["goal"] == after["goal"] == "(5.5, 5.5)"
-    while int(after["steps"].split()[0]) <= int(before["steps"].split()[0]):
+    for named, (topic, message) in BAD.items():
+        client.publish(topic, message, LATCHED if topic == "map" else 10)
+        before = wait_for_state(diagnostics, state="training", message=named)
         after = wait_for_state(diagnostics, state="training")
-
-
-def test_a_folder_with_another_training_is_left_alone(
-    trainer: Any, small_values: Any, tmp_path: FilePath
-) -> None:
-    scenario = Scenario(GridMap(small_values > 0), (0, 0), (5, 5))
-    other = Trainer([scenario], MoveRule.ROBOT_SAFE, HyperParameters(gamma=0.5), seed=0)
-    other.save_checkpoint(tmp_path / "checkpoint.safetensors")
-    before = (tmp_path / "checkpoint.safetensors").read_bytes()
-    _, client = trainer
-    configure(client, tmp_path, move_rule="robot_safe")
-    assert re.search(r"gamma 0\.5 \(now 0\.95\)", refusal(client))
-    assert (tmp_path / "checkpoint.safetensors").read_bytes() == before
+        assert before["goal"] == after["goal"] == "(5.5, 5.5)"
+        while int(after["steps"].split()[0]) <= int(before["steps"].split()[0]):
+            after = wait_for_state(diagnostics, state="training")
 
 
 @pytest.mark.parametrize(
@@ -436,6 +392,7 @@ def test_a_folder_with_another_training_is_left_alone(
         ({"move_rule": "diagonal"}, "move_rule is 'diagonal'; give one of .*robot_safe"),
         ({"output_folder": ""}, "output_folder is ''; name a folder"),
         ({"environments": 8, "replay_capacity": 4}, "environments is 8; .* at most .* 4"),
+        ({"map_file": "no_such_map.yaml"}, "no_such_map"),
     ],
 )
 def test_a_node_does_not_start_with_an_invalid_parameter(
@@ -444,14 +401,6 @@ def test_a_node_does_not_start_with_an_invalid_parameter(
     log = log_of_refused_start(trainer_node.main, parameters)
     assert re.search(reason, log)
     assert "Traceback" not in log
-
-
-def test_a_map_file_that_cannot_be_read_ends_the_start_with_its_reason(run_node: Any) -> None:
-    with (
-        pytest.raises(AssertionError, match="no_such_map"),
-        run_node("trainer_node", {"map_file": "no_such_map.yaml"}) as node,
-    ):
-        assert node.process.wait(TIMEOUT) == 1
 
 
 def set_atomically(client: Any, *parameters: Any) -> Any:
@@ -509,35 +458,6 @@ def test_values_that_limit_one_another_can_be_set_together(trainer: Any) -> None
     assert set_atomically(client, *both).successful
 
 
-def test_a_value_of_an_unknown_type_is_refused(trainer: Any) -> None:
-    _, client = trainer
-    strange = ParameterMessage(name="seed", value=ParameterValue(type=77))
-    assert "ParameterType" in set_atomically(client, strange).reason
-    request = SetParameters.Request(parameters=[strange, message_of("seed", 7)])
-    results = client.call(SetParameters, "trainer/set_parameters", request).results
-    assert [result.successful for result in results] == [False, True]
-    assert client.get_parameter("trainer", "seed") == 7
-
-
-def test_each_parameter_says_what_may_be_set(trainer: Any) -> None:
-    _, client = trainer
-    names = client.call(ListParameters, "trainer/list_parameters").result.names
-    of_ros = ("qos_overrides.", "start_type_description_service", "use_sim_time")
-    own = [name for name in names if not name.startswith(of_ros)]
-    request = DescribeParameters.Request(names=own)
-    descriptors = client.call(DescribeParameters, "trainer/describe_parameters", request)
-    assert {entry.name for entry in fields(HyperParameters)} <= set(own)
-    for descriptor in descriptors.descriptors:
-        assert descriptor.description
-        limited = (
-            descriptor.integer_range
-            or descriptor.floating_point_range
-            or descriptor.additional_constraints
-        )
-        unlimited = descriptor.type == ParameterType.PARAMETER_BOOL or descriptor.name == "map_file"
-        assert bool(limited) != unlimited, descriptor.name
-
-
 @contextmanager
 def full_disk(process: Any, folder: FilePath) -> Iterator[None]:
     """Let the writes of a running process fail in their middle, as on a full disk."""
@@ -559,98 +479,78 @@ def no_folder(_: Any, folder: FilePath) -> Iterator[None]:
     moved.rename(folder)
 
 
-@pytest.mark.parametrize("fault", [full_disk, no_folder])
-def test_a_disk_error_is_logged_once_and_the_training_continues(
-    trainer: Any, small_values: Any, tmp_path: FilePath, fault: Any
+def test_a_full_disk_is_logged_once_and_the_training_continues(
+    trainer: Any, tmp_path: FilePath
 ) -> None:
     (node, client), folder = trainer, tmp_path / "run"
-    configure(client, folder, **ENDLESS, move_rule="robot_safe")
+    configure(client, folder, **ENDLESS)
     saved = client.subscribe(String, "trainer/model_saved", LATCHED)
     diagnostics = Listener(client, DiagnosticArray, "/diagnostics")
+
+    def save() -> None:
+        assert client.call(Trigger, "trainer/save").success
+
     start_training(client)
-    client.call(Trigger, "trainer/save")
-    saved.wait(lambda message: FilePath(message.data).parent == folder)
-    model, checkpoint = folder / "model.safetensors", folder / "checkpoint.safetensors"
-    wait_until(checkpoint.exists)
-    with fault(node.process, folder):
-        client.call(Trigger, "trainer/save")
+    save()
+    model = FilePath(saved.wait(lambda message: str(folder) in message.data).data)
+    with full_disk(node.process, folder):
+        before = model.read_bytes()
+        save()
         failing = wait_for_state(diagnostics, message=f"cannot save to {folder} (")
-        kept = folder if folder.exists() else folder.with_name("moved")
-        before = [(kept / path.name).read_bytes() for path in (model, checkpoint)]
         for _ in range(3):
-            client.call(Trigger, "trainer/save")
+            save()
             after = wait_for_state(diagnostics, message="make room")
         while int(after["steps"].split()[0]) <= int(failing["steps"].split()[0]):
             after = wait_for_state(diagnostics, message="make room")
         assert after["state"] == "training"
-        assert [(kept / path.name).read_bytes() for path in (model, checkpoint)] == before
+        assert model.read_bytes() == before
     saved.clear()
-    client.call(Trigger, "trainer/save")
+    save()
     node.wait_for_log("saved again")
     assert load_model(saved.wait().data)[1].steps > int(failing["steps"].split()[0])
     wait_for_state(diagnostics, state="training", message="training")
-    size = (folder / "episodes.csv").stat().st_size
-    wait_until(lambda: (folder / "episodes.csv").stat().st_size > size)
-    client.call(Trigger, "trainer/stop")
-    node.wait_for_log("the training stopped")
     assert node.log.count("cannot save") == 1
     assert node.log.count("saved again") == 1
-    assert "Traceback" not in node.log
-    scenario = Scenario(GridMap(small_values > 0), (0, 0), (5, 5))
-    episodes = Trainer.load_checkpoint(checkpoint, [scenario]).episodes
-    with (folder / "episodes.csv").open(newline="") as file:
-        numbers = [int(row["episode"]) for row in csv.DictReader(file)]
-    assert numbers == sorted(set(numbers))
-    assert numbers[-1] == episodes
-    assert list(folder.glob(".*")) == []
-
-
-def wait_until(condition: Callable[[], bool]) -> None:
-    deadline = time.monotonic() + TIMEOUT
-    while not condition():
-        assert time.monotonic() < deadline
-        time.sleep(0.02)
-
-
-def test_a_last_save_that_fails_is_logged_when_the_node_ends(
-    run_node: Any, make_client: Any, namespace: str, small_values: Any, tmp_path: FilePath
-) -> None:
-    client, folder = make_client(namespace), tmp_path / "run"
-    parameters = {**ENDLESS, "output_folder": str(folder)}
-    with run_node("trainer_node", parameters, namespace=namespace) as node:
-        set_up(node, client, small_values)
-        start_training(client)
-        with no_folder(node.process, folder):
-            assert node.stop() == 0
-    assert node.log.count("cannot save") == 1
 
 
 def test_what_cannot_be_started_or_replayed_is_answered_with_the_remedy(
-    run_node: Any, make_client: Any, namespace: str, small_values: Any, tmp_path: FilePath
+    trainer: Any, small_values: Any, tmp_path: FilePath
 ) -> None:
-    client = make_client(namespace)
-    broken = tmp_path / "broken"
+    node, client = trainer
+    broken, used, other = (tmp_path / name for name in ("broken", "used", "other"))
     broken.mkdir()
     (broken / "checkpoint.safetensors").write_bytes(b"no checkpoint")
     (broken / "episodes.csv").write_bytes(b"\0\xff,'\n" * 1000)
+    scenario = Scenario(GridMap(small_values > 0), (0, 0), (5, 5))
+    training = TrainingRun(used, [scenario], MoveRule.ROBOT_SAFE, HyperParameters(), seed=0)
+    different = Trainer([scenario], MoveRule.ROBOT_SAFE, HyperParameters(gamma=0.5), seed=0)
+    different.save_checkpoint(other / "checkpoint.safetensors")
+    before = (other / "checkpoint.safetensors").read_bytes()
     (tmp_path / "file").touch()
-    with run_node("trainer_node", {"output_folder": str(broken)}, namespace=namespace) as node:
-        set_up(node, client, small_values)
-        assert "remove it to train anew" in refusal(client)
-        assert "no episode" in client.call(Trigger, "trainer/replay").message
-        for folder in (tmp_path / "file", tmp_path / ("x" * 300)):
-            client.set_parameters("trainer", output_folder=str(folder))
-            assert "set output_folder to a folder that can be written" in refusal(client)
-            assert "call ~/start first" in client.call(Trigger, "trainer/replay").message
-        # Less memory than the replay buffer needs.
-        limits = resource.prlimit(node.process.pid, resource.RLIMIT_AS)
-        used = int(FilePath(f"/proc/{node.process.pid}/statm").read_text().split()[0]) * 4096
-        client.set_parameters("trainer", output_folder=str(tmp_path / "run"))
-        client.set_parameters("trainer", replay_capacity=10**7)
-        resource.prlimit(node.process.pid, resource.RLIMIT_AS, (used + 10**8, limits[1]))
-        assert "smaller filters, batch_size, environments or replay_capacity" in refusal(client)
-        client.set_parameters("trainer", replay_capacity=1000)
-        start_training(client)
+    unwritable = "set output_folder to a folder that can be written", "call ~/start first"
+    for folder, reason, of_replay in (
+        (broken, "remove it to train anew", "no episode"),
+        (tmp_path / "file", *unwritable),
+        (tmp_path / ("x" * 300), *unwritable),
+        (tmp_path, "no training; give a new or empty folder", "call ~/start first"),
+        (used, "another process trains", "no episode"),
+        (other, r"gamma 0\.5 \(now 0\.95\)", "call ~/start first"),
+    ):
+        configure(client, folder, move_rule="robot_safe")
+        assert re.search(reason, refusal(client))
+        assert of_replay in client.call(Trigger, "trainer/replay").message
+    training.close()
+    assert (other / "checkpoint.safetensors").read_bytes() == before
+    # Less memory than the replay buffer needs.
+    configure(client, tmp_path / "run", replay_capacity=10**7)
+    limits = resource.prlimit(node.process.pid, resource.RLIMIT_AS)
+    used_bytes = int(FilePath(f"/proc/{node.process.pid}/statm").read_text().split()[0]) * 4096
+    resource.prlimit(node.process.pid, resource.RLIMIT_AS, (used_bytes + 10**8, limits[1]))
+    reason = refusal(client)
+    resource.prlimit(node.process.pid, resource.RLIMIT_AS, limits)
+    assert re.search("the memory; take .* smaller .* replay_capacity", reason)
+    configure(client, tmp_path / "run", replay_capacity=1000)
+    start_training(client)
 
 
 def test_the_module_of_the_node_imports_no_torch() -> None:
@@ -680,33 +580,28 @@ def test_without_its_libraries_a_start_is_refused_and_the_node_lives(
 
 
 @pytest.mark.hypothesis
-def test_nothing_that_comes_in_ends_the_node(
-    run_node: Any, make_client: Any, namespace: str, small_values: Any, tmp_path: FilePath
-) -> None:
-    client = make_client(namespace)
-    parameters = {**ENDLESS, "output_folder": str(tmp_path / "run")}
-    with run_node("trainer_node", parameters, namespace=namespace) as node:
-        names = client.call(ListParameters, "trainer/list_parameters").result.names
-        assert "no map" in refusal(client)
-        set_up(node, client, small_values)
-        start_training(client)
+def test_nothing_that_comes_in_ends_the_node(trainer: Any, tmp_path: FilePath) -> None:
+    node, client = trainer
+    configure(client, tmp_path, **ENDLESS)
+    names = client.call(ListParameters, "trainer/list_parameters").result.names
+    start_training(client)
 
-        @given(maps(), POSES, HEADERS, some_parameters(names))
-        def fuzz(grid: Any, pose: Pose, header: Header, some: list[Any]) -> None:
-            client.publish("map", grid, LATCHED)
-            initial_pose = PoseWithCovarianceStamped(header=header)
-            initial_pose.pose.pose = pose
-            client.publish("initialpose", initial_pose)
-            client.publish("goal_pose", PoseStamped(header=header, pose=pose))
-            request = SetParameters.Request(parameters=some)
-            results = client.call(SetParameters, "trainer/set_parameters", request).results
-            assert len(results) == len(some)
-            result = set_atomically(client, *some)
-            assert all(one.successful or one.reason for one in [*results, result])
-            assert client.call(Trigger, "trainer/save").success
+    @given(maps(), POSES, HEADERS, some_parameters(names))
+    def fuzz(grid: Any, pose: Pose, header: Header, some: list[Any]) -> None:
+        client.publish("map", grid, LATCHED)
+        initial_pose = PoseWithCovarianceStamped(header=header)
+        initial_pose.pose.pose = pose
+        client.publish("initialpose", initial_pose)
+        client.publish("goal_pose", PoseStamped(header=header, pose=pose))
+        request = SetParameters.Request(parameters=some)
+        results = client.call(SetParameters, "trainer/set_parameters", request).results
+        assert len(results) == len(some)
+        result = set_atomically(client, *some)
+        assert all(one.successful or one.reason for one in [*results, result])
+        assert client.call(Trigger, "trainer/save").success
 
-        fuzz()
-        client.call(Trigger, "trainer/stop")
-        client.call(Trigger, "trainer/replay")
-        client.call(Trigger, "trainer/start")
+    fuzz()
+    for service in ("stop", "replay", "start"):
+        client.call(Trigger, f"trainer/{service}")
+    client.set_parameters("trainer", use_sim_time=False)
     assert "Traceback" not in node.log
