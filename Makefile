@@ -67,10 +67,8 @@ types: setup
 
 bench: setup
 	$(BIN)/pip install --quiet --editable ".[$(EXTRAS),bench]"
-	$(BIN)/python experiments/startup.py
-	$(BIN)/python experiments/benchmark.py
-	$(BIN)/python experiments/benchmark_fields.py
-	$(BIN)/python experiments/benchmark_any_map.py $(MAP)
+	$(BIN)/python experiments/speed.py
+	$(BIN)/python experiments/node_speed.py $(MAP)
 
 # What a robot's body costs, on MAP (the office by default) and with RADIUS, metres.
 body: setup

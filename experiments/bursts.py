@@ -78,7 +78,7 @@ class GoalBursts(Client):
                 goal = self._type(start=asked.start, goal=asked.goal, use_start=True)
                 self._client.send_goal_async(goal).add_done_callback(acknowledge)
 
-        self._executor.create_task(send)  # rclpy loses answers that come before it has noted a goal
+        self.run(send)  # rclpy loses answers that come before it has noted a goal
         with suppress(TimeoutError):
             wait_for("results", lambda: len(results) == len(requests))
         return len(handles), len(results)
@@ -99,10 +99,18 @@ def burst_requests(
     return requests
 
 
+def count_right(
+    fixture: MapFixture, requests: Sequence[GetPlan.Request], answers: Sequence[Any]
+) -> int:
+    """Return how many answers are a path, or empty because there is none."""
+    pairs = zip(requests, answers, strict=True)
+    return sum(bool(answer) and not fixture.error(asked, answer.plan) for asked, answer in pairs)
+
+
 def load_bursts(
     sizes: Sequence[int] = SIZES, counts: Sequence[int] = COUNTS, bursts: int = BURSTS
 ) -> bool:
-    """Send bursts to a running planner; return whether each request has its right answer."""
+    """Send bursts to a running planner; print and return whether each has its right answers."""
     fine = True
     for size in sizes:
         fixture = generated_map("rooms", size, resolution=0.5)
@@ -115,7 +123,17 @@ def load_bursts(
             while count_right(fixture, all_pairs, one.burst(all_pairs)) < len(all_pairs):
                 pass
             for count, clients in itertools.product(counts, CLIENTS):
-                fine &= load_burst(fixture, goals, clients, count, bursts)
+                right = 0
+                with BurstClients(clients) as asking:
+                    for seed in range(bursts):
+                        requests = burst_requests(fixture.grid, goals, count, seed)
+                        right += count_right(fixture, requests, asking.burst(requests))
+                fine &= right == bursts * count
+                print(
+                    f"bursts: {size} x {size} cells, {bursts} of {count} requests, {clients} "
+                    f"clients: right {right} of {bursts * count}",
+                    flush=True,
+                )
     with suppress(ModuleNotFoundError), GoalBursts() as action:
         for count in counts:
             sent = [burst_requests(fixture.grid, goals, count, seed) for seed in range(bursts)]
@@ -127,30 +145,3 @@ def load_bursts(
                 flush=True,
             )
     return fine
-
-
-def count_right(
-    fixture: MapFixture, requests: Sequence[GetPlan.Request], answers: Sequence[Any]
-) -> int:
-    """Return how many answers are a path, or empty because there is none."""
-    pairs = zip(requests, answers, strict=True)
-    return sum(bool(answer) and not fixture.error(asked, answer.plan) for asked, answer in pairs)
-
-
-def load_burst(
-    fixture: MapFixture, goals: Sequence[Cell], clients: int, count: int, bursts: int
-) -> bool:
-    """Send bursts of one size from so many clients; print what became of them."""
-    answered = right = 0
-    with BurstClients(clients) as asking:
-        for seed in range(bursts):
-            requests = burst_requests(fixture.grid, goals, count, seed)
-            answers = asking.burst(requests)
-            answered += sum(answer is not None for answer in answers)
-            right += count_right(fixture, requests, answers)
-    print(
-        f"bursts: {fixture.grid.width} x {fixture.grid.height} cells, {bursts} of {count} "
-        f"requests, {clients} clients: answered {answered}, right {right} of {bursts * count}",
-        flush=True,
-    )
-    return right == bursts * count

@@ -144,6 +144,10 @@ class Client:
             if self._context.ok():
                 raise
 
+    def run(self, function: Callable[..., Any], *arguments: Any) -> Any:
+        """Call a function in the thread that spins; return the future of its result."""
+        return self._executor.create_task(function, *arguments)
+
     def service(self, service_type: Any, name: str) -> Any:
         """Return rclpy's client of a service, always the same one, once node and client are ready.
 
@@ -174,7 +178,7 @@ class Client:
             return answered.wait(1.0)
 
         wait_for(f"discovery by {node}", asked)
-        self._executor.create_task(self.node.destroy_client, probe)  # its thread may hold it
+        self.run(self.node.destroy_client, probe)  # its thread may hold it
 
     def entities(self, node: str) -> set[tuple[str, str, str]]:
         """Return the kind, name and type of what a node of this namespace has.

@@ -32,6 +32,7 @@ from random_maps import generate_map
 from rcl_interfaces.srv import GetParameters, SetParameters
 from rclpy.parameter import Parameter
 from std_srvs.srv import Trigger
+from tables import table
 
 from ddqn_planner.grid import OCCUPIED, Cell, MapFile, save_map
 from ddqn_planner.grid.noise import MAX_NEW_OBSTACLES, random_requests
@@ -84,27 +85,6 @@ class Tally:
         return self.restarts == self.kills and not wrong
 
 
-class Killed:
-    """A node that is killed and started again."""
-
-    def __init__(self, stack: ExitStack, name: str, *arguments: str, **parameters: object) -> None:
-        self._run = partial(running_node, name, "--log-level", "fatal", *arguments, **parameters)
-        self._stack = stack
-        self.child: subprocess.Popen[bytes] | None = None
-        self.start()
-
-    def start(self) -> None:
-        """Start it."""
-        self.child = self._stack.enter_context(self._run())
-
-    def kill(self) -> None:
-        """End it as a power cut would."""
-        assert self.child is not None
-        self.child.kill()
-        self.child.wait()
-        self.child = None
-
-
 class Faults:
     """The nodes, which end with a stack, and what a client sees of them."""
 
@@ -120,29 +100,41 @@ class Faults:
         map_file = MapFile(OCCUPIED * occupancy, 1.0, (0.0, 0.0, 0.0), *self._watched)
         save_map(map_file, self.map_path)
         self._map = MapFixture(map_file)
-        self.tallies = {
-            self.kill_planner: Tally("planner_node", "planning"),
-            self.kill_map_server: Tally("map_server_node", "publishing"),
-            self.kill_trainer: Tally("trainer_node", "saving"),
+        quiet, apart = ("--log-level", "fatal"), ("-r", "__ns:=/training")
+        training = {"map_file": "dilemma", "steps": 10**9, "output_folder": self.training_folder}
+        self._nodes: dict[str, Callable[[], Any]] = {
+            "map_server": partial(
+                running_node, "map_server_node", *quiet, yaml_filename=self.map_path
+            ),
+            "planner": partial(running_node, "planner_node", *quiet),
+            "trainer": partial(running_node, "trainer_node", *quiet, *apart, **training),
+            "follower": partial(running_node, "planner_node", *quiet, *apart, follow_trainer=True),
         }
-        apart = ("-r", "__ns:=/training")
-        self.map_server = Killed(stack, "map_server_node", yaml_filename=self.map_path)
-        self.planner = Killed(stack, "planner_node")
-        self.trainer = Killed(
-            stack,
-            "trainer_node",
-            *apart,
-            map_file="dilemma",
-            steps=1_000_000_000,
-            output_folder=self.training_folder,
-        )
-        self.follower = Killed(stack, "planner_node", *apart, follow_trainer=True)
+        self._stack = stack
+        self.children: dict[str, subprocess.Popen[bytes]] = {}
+        for name in self._nodes:
+            self.start(name)
 
-    @property
-    def children(self) -> list[subprocess.Popen[bytes]]:
-        """The processes that have to live."""
-        nodes = (self.map_server, self.planner, self.trainer, self.follower)
-        return [node.child for node in nodes if node.child]
+    # Nodes
+
+    def start(self, name: str) -> None:
+        """Start a node."""
+        self.children[name] = self._stack.enter_context(self._nodes[name]())
+
+    def kill(self, name: str, tally: Tally, calls: Sequence[tuple[Any, Any]]) -> list[Any]:
+        """Kill a node, as a power cut would, under calls: pairs of a service and a future.
+
+        Count the answers that came before, and the time-outs; return the answers, or None.
+        """
+        child = self.children.pop(name)
+        child.kill()
+        child.wait()
+        time.sleep(LAST_WAIT)
+        for service, future in calls:
+            tally.answers += future.done()
+            tally.time_outs += not future.done()
+            service.remove_pending_request(future)
+        return [future.result() for _, future in calls]
 
     # Asking
 
@@ -165,25 +157,7 @@ class Faults:
             time.sleep(0.05)
             return None
 
-        return wait_for(f"answer from {name}", answer, self.children, timeout)
-
-    def ask_for_plan(
-        self, start: Cell, goal: Cell, accept: Callable[[Any], Any] = lambda found: found.plan.poses
-    ) -> PathMessage:
-        """Ask for a plan until there is one, or an answer is accepted."""
-        request = plan_request(self._map.grid, start, goal)
-        return self.ask(GetPlan, GET_PLAN, request, accept, timeout=PLAN_TIME).plan
-
-    def has_plan(self, tally: Tally, ask: Callable[[], PathMessage]) -> bool:
-        """Ask for a plan; if there is none, or none comes in time, count that and print why."""
-        with suppress(TimeoutError):
-            if ask().poses:
-                return True
-        tally.without_a_plan += 1
-        said = [message.status[0] for message in self.diagnostics.messages()]
-        reasons = [status.message for status in said if status.name == "/planner: plan"]
-        print(f"no plan after kill {tally.kills} of {tally.node}: {reasons[-1:]}", flush=True)
-        return False
+        return wait_for(f"answer from {name}", answer, self.children.values(), timeout)
 
     def trigger(self, name: str, try_time: float = TRY_TIME) -> str:
         """Call a Trigger service until it succeeds; return its message."""
@@ -195,80 +169,12 @@ class Faults:
         request = GetParameters.Request(names=[name])
         return self.ask(GetParameters, f"{node}/get_parameters", request).values[0]
 
-    def is_right(self, plan: Any, start: Cell, goal: Cell) -> bool:
-        """Say whether a plan leads from the start to the goal by legal moves on the map.
-
-        A plan of a map with new obstacles must be right on the map without them too.
-        """
+    def ask_for_plan(
+        self, start: Cell, goal: Cell, accept: Callable[[Any], Any] = lambda found: found.plan.poses
+    ) -> PathMessage:
+        """Ask for a plan until there is one, or an answer is accepted."""
         request = plan_request(self._map.grid, start, goal)
-        return bool(plan.poses) and not self._map.error(request, plan)
-
-    def is_whole(self, message: OccupancyGrid) -> bool:
-        """Say whether a map is the loaded one with at most five obstacles more."""
-        values = np.frombuffer(message.data, np.int8).reshape(self._map.values.shape)
-        new = values[values != self._map.values]
-        return bool((new == OCCUPIED).all()) and len(new) <= MAX_NEW_OBSTACLES
-
-    # Killing
-
-    def begin(self) -> None:
-        """Wait until all nodes work, and start the training."""
-        self.ask_for_plan(*self._watched)
-        self.trigger("/training/trainer/start", START_TIME)
-        self.parameter("/training/planner", "model")
-
-    def kill(self, node: Killed, tally: Tally, calls: Sequence[tuple[Any, Any]]) -> list[Any]:
-        """Kill a node under calls, which are pairs of a service and a future.
-
-        Count the answers that came before, and the time-outs; return the answers, or None.
-        """
-        node.kill()
-        time.sleep(LAST_WAIT)
-        for service, future in calls:
-            tally.answers += future.done()
-            tally.time_outs += not future.done()
-            service.remove_pending_request(future)
-        return [future.result() for _, future in calls]
-
-    def kill_planner(self, tally: Tally) -> None:
-        """Kill the planner while it plans toward goals that it does not know."""
-        get_plan, grid = self.client.service(GetPlan, GET_PLAN), self._map.grid
-        asked = random_requests(grid.occupancy, RULE, GOALS, self._random)
-        calls = [(get_plan, get_plan.call_async(plan_request(grid, *cells))) for cells in asked]
-        time.sleep(self._draw.uniform(0.0, 1.0))
-        for cells, answer in zip(asked, self.kill(self.planner, tally, calls), strict=True):
-            tally.wrong_paths += answer is not None and not self.is_right(answer.plan, *cells)
-        self.planner.start()
-
-        def plan() -> PathMessage:
-            found = self.ask_for_plan(*asked[0])
-            tally.wrong_paths += not self.is_right(found, *asked[0])
-            return found
-
-        tally.restarts += self.has_plan(tally, plan)
-
-    def kill_map_server(self, tally: Tally) -> None:
-        """Kill the map server while it loads, scatters over and restores its map."""
-        self.plan_for_active_goal()
-        load = LoadMap.Request(map_url=str(self.map_path))
-        requests = [
-            *[(self.client.service(Trigger, "map_server/restore_map"), Trigger.Request())] * 20,
-            *[(self.client.service(LoadMap, "map_server/load_map"), load)] * 4,
-            (self.client.service(Trigger, "map_server/scatter_obstacles"), Trigger.Request()),
-        ]
-        self._draw.shuffle(requests)
-        calls = [(service, service.call_async(request)) for service, request in requests]
-        time.sleep(self._draw.uniform(0.0, 2.0))
-        self.kill(self.map_server, tally, calls)
-        # The first answer must be a plan. With it, the plans of the last maps are out.
-        self.has_plan(tally, lambda: self.ask_for_plan(*self._watched, accept=bool))
-        whole = self.is_whole(self.maps.wait())
-        self.maps.clear()
-        self.map_server.start()
-        served = self.maps.wait()
-        if self.has_plan(tally, self.plan_for_active_goal):
-            tally.wrong_paths += not self.is_right(self.plans.wait(), *self._watched)
-        tally.restarts += whole and served.data == array.array("b", self._map.values.tobytes())
+        return self.ask(GetPlan, GET_PLAN, request, accept, timeout=PLAN_TIME).plan
 
     def plan_for_active_goal(self) -> PathMessage:
         """Give the planner a start and an active goal until it plans: it may be a new one."""
@@ -284,6 +190,68 @@ class Faults:
 
         return wait_for("plan", planned, timeout=PLAN_TIME)
 
+    def check_plan(
+        self, tally: Tally, ask: Callable[[], PathMessage], cells: tuple[Cell, Cell]
+    ) -> bool:
+        """Ask for a plan; count it if it is wrong, or none comes in time; return whether one came.
+
+        A plan of a map with new obstacles must be right on the map without them too.
+        """
+        with suppress(TimeoutError):
+            if (plan := ask()).poses:
+                tally.wrong_paths += bool(self._map.error(self._request(cells), plan))
+                return True
+        tally.without_a_plan += 1
+        said = [message.status[0] for message in self.diagnostics.messages()]
+        reasons = [status.message for status in said if status.name == "/planner: plan"]
+        print(f"no plan after kill {tally.kills} of {tally.node}: {reasons[-1:]}", flush=True)
+        return False
+
+    def _request(self, cells: tuple[Cell, Cell]) -> GetPlan.Request:
+        return plan_request(self._map.grid, *cells)
+
+    # Killing
+
+    def kill_planner(self, tally: Tally) -> None:
+        """Kill the planner while it plans toward goals that it does not know."""
+        get_plan = self.client.service(GetPlan, GET_PLAN)
+        asked = random_requests(self._map.grid.occupancy, RULE, GOALS, self._random)
+        calls = [(get_plan, get_plan.call_async(self._request(cells))) for cells in asked]
+        time.sleep(self._draw.uniform(0.0, 1.0))
+        for cells, answer in zip(asked, self.kill("planner", tally, calls), strict=True):
+            if answer is not None:
+                plan = answer.plan
+                wrong = not plan.poses or self._map.error(self._request(cells), plan)
+                tally.wrong_paths += bool(wrong)
+        self.start("planner")
+        tally.restarts += self.check_plan(tally, partial(self.ask_for_plan, *asked[0]), asked[0])
+
+    def kill_map_server(self, tally: Tally) -> None:
+        """Kill the map server while it loads, scatters over and restores its map."""
+        self.plan_for_active_goal()
+        load = LoadMap.Request(map_url=str(self.map_path))
+        requests = [
+            *[(self.client.service(Trigger, "map_server/restore_map"), Trigger.Request())] * 20,
+            *[(self.client.service(LoadMap, "map_server/load_map"), load)] * 4,
+            (self.client.service(Trigger, "map_server/scatter_obstacles"), Trigger.Request()),
+        ]
+        self._draw.shuffle(requests)
+        calls = [(service, service.call_async(request)) for service, request in requests]
+        time.sleep(self._draw.uniform(0.0, 2.0))
+        self.kill("map_server", tally, calls)
+        # The first answer must be a plan. With it, the plans of the last maps are out.
+        first_answer = partial(self.ask_for_plan, *self._watched, accept=bool)
+        self.check_plan(tally, first_answer, self._watched)
+        # The map is the loaded one with at most five obstacles more.
+        values = np.frombuffer(self.maps.wait().data, np.int8).reshape(self._map.values.shape)
+        new = values[values != self._map.values]
+        whole = bool((new == OCCUPIED).all()) and len(new) <= MAX_NEW_OBSTACLES
+        self.maps.clear()
+        self.start("map_server")
+        served = self.maps.wait()
+        self.check_plan(tally, self.plan_for_active_goal, self._watched)
+        tally.restarts += whole and served.data == array.array("b", self._map.values.tobytes())
+
     def kill_trainer(self, tally: Tally) -> None:
         """Kill the trainer while it saves after each step, soon after a save was seen to begin."""
         save = self.client.service(Trigger, "/training/trainer/save")
@@ -295,10 +263,10 @@ class Faults:
         while not self.temporaries() and time.monotonic() < until + LAST_WAIT:
             pass
         time.sleep(self._draw.uniform(0.0, 0.002))
-        self.kill(self.trainer, tally, calls)
+        self.kill("trainer", tally, calls)
         tally.in_a_save += bool(self.temporaries())
         steps = self.saved_steps()
-        self.trainer.start()
+        self.start("trainer")
         self.parameter("/training/trainer", "seed")
         message = self.trigger("/training/trainer/start", START_TIME)
         self.follow()
@@ -330,19 +298,28 @@ class Faults:
         model = partial(self.parameter, "/training/planner", "model")
         wait_for("model", lambda: model().string_value == saved)
 
-
-def show(tallies: Sequence[Tally]) -> None:
-    """Print the table."""
-    names = [name.replace("_", " ") for name in vars(tallies[0])]
-    rows = [names, *([str(value) for value in vars(tally).values()] for tally in tallies)]
-    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-    for row in rows:
-        print("  ".join(text.ljust(width) for text, width in zip(row, widths, strict=True)))
+    def kill_in_turn(self, kills: int) -> bool:
+        """Kill so many times, and print what became of it; return whether all is right."""
+        self.ask_for_plan(*self._watched)
+        self.trigger("/training/trainer/start", START_TIME)
+        self.parameter("/training/planner", "model")
+        tallies = {
+            self.kill_planner: Tally("planner_node", "planning"),
+            self.kill_map_server: Tally("map_server_node", "publishing"),
+            self.kill_trainer: Tally("trainer_node", "saving"),
+        }
+        try:
+            for kill, tally in islice(cycle(tallies.items()), kills):
+                tally.kills += 1
+                kill(tally)
+        finally:
+            header = [name.replace("_", " ") for name in Tally.__annotations__]
+            print(table(header, [[*vars(tally).values()] for tally in tallies.values()]))
+        return all(tally.right for tally in tallies.values())
 
 
 def main(arguments: Sequence[str]) -> int:
-    """Kill so many times, and print what became of it; return 1 if anything is wrong."""
-    kills = int(arguments[0]) if arguments else KILLS
+    """Kill so many times; return 1 if anything is wrong."""
     with (
         claim_ros_domain(),
         Client() as client,
@@ -350,14 +327,7 @@ def main(arguments: Sequence[str]) -> int:
         ExitStack() as stack,
     ):
         faults = Faults(client, Path(folder), stack)
-        faults.begin()
-        try:
-            for kill, tally in islice(cycle(faults.tallies.items()), kills):
-                tally.kills += 1
-                kill(tally)
-        finally:
-            show([*faults.tallies.values()])
-    return int(not all(tally.right for tally in faults.tallies.values()))
+        return int(not faults.kill_in_turn(int(arguments[0]) if arguments else KILLS))
 
 
 if __name__ == "__main__":

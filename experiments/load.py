@@ -106,16 +106,10 @@ def load_requests(planner: int, requests: int, clients: int) -> bool:
 
     The planner, given by its process, has no other map yet. Return whether all is answered right.
     """
-    context = multiprocessing.get_context("spawn")
-    maps = three_maps()
+    context, maps = multiprocessing.get_context("spawn"), three_maps()
     number = len(maps)
-    shared = Shared(
-        context.Barrier(clients + 1),
-        context.Value("i"),
-        context.Value("i", number),
-        context.Value("i", number),
-        context.Queue(),
-    )
+    numbers = (context.Value("i"), context.Value("i", number), context.Value("i", number))
+    shared = Shared(context.Barrier(clients + 1), *numbers, context.Queue())
     processes = [
         context.Process(target=ask, args=(n, len(range(n, requests, clients)), shared), daemon=True)
         for n in range(clients)
@@ -141,26 +135,23 @@ def load_requests(planner: int, requests: int, clients: int) -> bool:
             if not first_memory and shared.done.value >= WARM_UP * requests:
                 first_memory = memory(planner)
             time.sleep(0.005)
-        seconds = time.monotonic() - began
-        last_memory = memory(planner)
+        seconds, last_memory = time.monotonic() - began, memory(planner)
     # It fails if a process did.
     results = [shared.results.get(timeout=TIMEOUT) for _ in processes]
-    for process in processes:
-        process.join()
     times, empty, errors = zip(*results, strict=True)
     milliseconds, wrong_or_lost = np.concatenate(times), list(itertools.chain(*errors))
-    for error in wrong_or_lost[:10]:
-        print(error)
     lost = requests - len(milliseconds)
     median, slow = np.percentile(milliseconds, (50, 99))
     print(
+        *wrong_or_lost[:10],
         f"GetPlan: {requests} requests of {clients} processes in {seconds:.0f} s, "
-        f"{number - len(maps)} changes of the map\n"
-        f"  answered {len(milliseconds)}, lost {lost}, wrong {len(wrong_or_lost) - lost}\n"
-        f"  paths {len(milliseconds) - sum(empty)}, empty answers {sum(empty)}\n"
-        f"  latency median {median:.1f} ms, 99 % {slow:.1f} ms\n"
+        f"{number - len(maps)} changes of the map",
+        f"  answered {len(milliseconds)}, lost {lost}, wrong {len(wrong_or_lost) - lost}",
+        f"  paths {len(milliseconds) - sum(empty)}, empty answers {sum(empty)}",
+        f"  latency median {median:.1f} ms, 99 % {slow:.1f} ms",
         f"  planner's resident memory {first_memory:.0f} MB after {WARM_UP:.0%} of them, "
         f"{last_memory:.0f} MB at the end: {last_memory / first_memory - 1:+.1%}",
+        sep="\n",
         flush=True,
     )
     return not wrong_or_lost
@@ -171,12 +162,11 @@ def load_goals(goals: int) -> bool:
 
     Return whether the plans came in the order of the goals, and the last is the last goal's.
     """
-    office = three_maps()[2]
-    grid, random = office.grid, np.random.default_rng(0)
+    office, random = three_maps()[2], np.random.default_rng(0)
+    grid = office.grid
     ((start, _),) = random_requests(grid.occupancy, RULE, 1, random)
-    rows, columns = np.nonzero(grid.reachable([start], RULE))
-    chosen = random.permutation(len(rows))[:goals]
-    cells = list(zip(columns[chosen].tolist(), rows[chosen].tolist(), strict=True))
+    reachable = np.argwhere(grid.reachable([start], RULE))[:, ::-1]
+    cells = [(int(x), int(y)) for x, y in random.permutation(reachable)[:goals]]
     numbers = {cell: number for number, cell in enumerate(cells)}
     with Client() as client:
         diagnostics = client.subscribe(DiagnosticArray, "/diagnostics", keep=1)

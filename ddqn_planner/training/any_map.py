@@ -34,8 +34,6 @@ ANY_MAP: Final = HyperParameters(
 than any rollout on these maps; and the agent keeps exploring moves it believes impossible."""
 
 MAPS: Final = 512
-"""Number of maps."""
-
 SIDE: Final = 10
 """Width and height of each map in cells."""
 
@@ -52,15 +50,15 @@ def random_scenarios(seed: int, maps: int = MAPS) -> list[Scenario]:
     connects each start with its goal.
     """
     random = np.random.default_rng(seed)
-    return [_random_scenario(RULES[number % 2], random) for number in range(maps)]
-
-
-def _random_scenario(rule: MoveRule, random: np.random.Generator) -> Scenario:
-    occupancy = random.random((SIDE, SIDE)) < random.uniform(0.1, 0.6)
-    # All four are drawn each time: the draws belong to what one seed gives.
-    constant = np.full((SIDE, SIDE), random.integers(100), dtype=np.int8)
-    unknown = unknown_costs(occupancy, 0.3, random)
-    costs = (None, random_costs(occupancy, random), constant, unknown)
-    grid = GridMap(occupancy, cost=costs[random.integers(len(costs))])
-    ((start, goal),) = random_requests(occupancy, rule, 1, random)
-    return Scenario(grid, start, goal, rule)
+    scenarios = []
+    for number in range(maps):
+        rule = RULES[number % 2]
+        occupancy = random.random((SIDE, SIDE)) < random.uniform(0.1, 0.6)
+        # All four are drawn each time: the draws belong to what one seed gives.
+        constant = np.full((SIDE, SIDE), random.integers(100), dtype=np.int8)
+        unknown = unknown_costs(occupancy, 0.3, random)
+        costs = (None, random_costs(occupancy, random), constant, unknown)
+        grid = GridMap(occupancy, cost=costs[random.integers(len(costs))])
+        ((start, goal),) = random_requests(occupancy, rule, 1, random)
+        scenarios.append(Scenario(grid, start, goal, rule))
+    return scenarios

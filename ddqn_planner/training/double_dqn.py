@@ -1,4 +1,7 @@
-"""Double DQN: the target y and the loss of the online network θ."""
+"""Double DQN: the target y and the loss of the online network θ; θ⁻ is the target network.
+
+Dimensions: B = a batch, A = 8 actions.
+"""
 
 from __future__ import annotations
 
@@ -36,18 +39,9 @@ def double_dqn_loss(
 ) -> Tensor:
     """Return the mean squared temporal-difference error of a batch, a scalar.
 
-    Parameters
-    ----------
-    online, target : callable
-        The networks θ, which learns, and θ⁻.
-    kind : str
-        Which networks select and evaluate the next action. "double_dqn" (van Hasselt et al. 2016,
-        equation 4): θ and θ⁻. "dqn" (Mnih et al. 2015): θ⁻ does both. "printed", the paper's target
-        as printed: θ does both.
-    state_B, next_state_B : (B, ...)
-    action_B : (B,) int64
-    reward_B, discount_B : (B,) float32
-        See `double_dqn_target`.
+    Which networks select and evaluate the next action, `kind` says. "double_dqn" (van Hasselt et
+    al. 2016, equation 4): θ and θ⁻. "dqn" (Mnih et al. 2015): θ⁻ does both. "printed", the paper's
+    target as printed: θ does both.
     """
     selection = target if kind == "dqn" else online
     evaluation = online if kind == "printed" else target

@@ -17,6 +17,13 @@ from ddqn_planner.training.networks import PaperModule, PropagationModule, Train
 from ddqn_planner.training.value_iteration import value_iteration
 
 
+def encoder_for(target: TrainableNetwork, environment: GridVectorEnvironment) -> ObservationEncoder:
+    """Return the encoder for a network, with its copy θ⁻."""
+    if isinstance(target, PropagationModule):
+        return PropagationEncoder(environment, target)
+    return ObservationEncoder(environment)
+
+
 class ObservationEncoder:
     """The paper's network observes the whole map with the robot in it."""
 
@@ -65,17 +72,14 @@ class PropagationEncoder(ObservationEncoder):
         """Settle V on every map under the new target network."""
         assert isinstance(target, PropagationModule)
         environment, feature_SCI = self._environment, torch.from_numpy(self._feature_SCI)
+        gamma, collision = environment.parameters.gamma, environment.parameters.obstacle_reward
         with torch.inference_mode():
             p_SAC = target.success(feature_SCI).numpy().transpose(0, 2, 1)
             cost_SAC = target.cost(feature_SCI).numpy().transpose(0, 2, 1)
-        return_SAC = value_iteration(
-            p_SAC,
-            -cost_SAC if target.learns_costs else environment.free_reward,
-            environment.goal,
-            neighbours(environment.shape),
-            environment.parameters.gamma,
-            environment.parameters.obstacle_reward,
-        )
+        reward_SAC = -cost_SAC if target.learns_costs else environment.free_reward
+        near_AC = neighbours(environment.shape)
+        goal_S = environment.goal
+        return_SAC = value_iteration(p_SAC, reward_SAC, goal_S, near_AC, gamma, collision)
         return_SAC += cost_SAC
         self._return_SCX[..., :-1] = return_SAC.transpose(0, 2, 1)
-        self._return_SCX[..., -1] = environment.parameters.obstacle_reward
+        self._return_SCX[..., -1] = collision

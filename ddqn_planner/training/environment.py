@@ -62,18 +62,10 @@ def paper_scenario() -> Scenario:
 class GridVectorEnvironment(VectorEnv[Observations, NDArray[np.int64], Any]):
     """N robots on grid maps, all moved in one step.
 
-    Cells are numbers y * W + x. The results of all moves are looked up in tables, (S scenarios, 8
-    actions, H * W). An ended episode keeps its last observation until `reset` is called with
-    ``options={"reset_mask": mask}`` (Gymnasium's autoreset mode "disabled").
-
-    Parameters
-    ----------
-    scenarios : sequence of Scenario
-        Maps of one size; each episode draws one of them.
-    move_rule : MoveRule
-        Of the scenarios that have none.
-    parameters : HyperParameters
-        For N (``environments``), the rewards, p_r and ``max_episode_steps``.
+    Each episode draws one of the scenarios, on maps of one size; `move_rule` is that of those that
+    have none. Cells are numbers y * W + x. The results of all moves are looked up in tables, (S
+    scenarios, 8 actions, H * W). An ended episode keeps its last observation until `reset` is
+    called with ``options={"reset_mask": mask}`` (Gymnasium's autoreset mode "disabled").
     """
 
     metadata = {"render_modes": [], "autoreset_mode": AutoresetMode.DISABLED}  # noqa: RUF012
@@ -96,19 +88,17 @@ class GridVectorEnvironment(VectorEnv[Observations, NDArray[np.int64], Any]):
         self.action_space = batch_space(self.single_action_space, self.num_envs)
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
 
-        width = self.shape[1]
-        tables = (len(self.scenarios), len(MOVES), -1)
         with_rules = list(zip(self.scenarios, self.move_rules, strict=True))
-        self.background = np.stack(
-            [observation_background(s.grid.occupancy, s.goal) for s in self.scenarios]
-        )
-        self.legal = np.stack([s.grid.legal_moves(r) for s, r in with_rules])
-        self.legal = self.legal.reshape(tables)
-        self.free_reward = np.stack(
-            [move_reward(s.grid, s.start, s.goal, r, parameters) for s, r in with_rules]
-        ).reshape(tables)
+        maps = [observation_background(s.grid.occupancy, s.goal) for s in self.scenarios]
+        legal = [s.grid.legal_moves(rule) for s, rule in with_rules]
+        reward = [move_reward(s.grid, s.start, s.goal, rule, parameters) for s, rule in with_rules]
+        tables = (len(self.scenarios), len(MOVES), -1)
+        self.background = np.stack(maps)
+        self.legal = np.stack(legal).reshape(tables)
+        self.free_reward = np.stack(reward).reshape(tables)
         collision = np.float32(parameters.obstacle_reward)
         self._reward = np.where(self.legal, self.free_reward, collision)
+        width = self.shape[1]
         self._offset = MOVES[:, 1] * width + MOVES[:, 0]
 
         self.start = np.array([s.start[1] * width + s.start[0] for s in self.scenarios])

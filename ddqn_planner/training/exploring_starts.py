@@ -17,20 +17,10 @@ def initial_cells(
     p_r: float,
     random: np.random.Generator,
 ) -> NDArray[np.int64]:
-    """Draw the cells in which N episodes start: (N,) cell numbers.
+    """Draw the cells in which N episodes start: random ones with probability p_r, else `start_N`.
 
-    Parameters
-    ----------
-    start_N : (N,) int64
-        The given start of each episode.
-    free_cells : (F,) int64
-        The free cells of all maps, except the goals. Those of an episode's map are the `count_N`
-        cells from place `first_N` on.
-    first_N, count_N : (N,) int64
-    p_r : float
-        Probability of a random free cell, 0..1; 0.5 in the paper. With 0 every episode starts at
-        the given start.
-    random : numpy.random.Generator
+    `free_cells` are those of all maps, except the goals: `count_N` cells from place `first_N` on
+    are those of an episode's map.
     """
     at_random_N = random.random(len(start_N)) < p_r
     return np.where(at_random_N, free_cells[first_N + random.integers(count_N)], start_N)

@@ -57,13 +57,10 @@ class HyperParameters:
 
     def __post_init__(self) -> None:
         for entry in fields(self):
-            value = getattr(self, entry.name)
-            if "choices" in entry.metadata:
-                if value not in entry.metadata["choices"]:
-                    choices = ", ".join(entry.metadata["choices"])
-                    raise ValueError(f"{entry.name} is {value!r}; give one of {choices}")
-                continue
-            low, high = entry.metadata["range"]
+            value, choices = getattr(self, entry.name), entry.metadata.get("choices")
+            if choices is not None and value not in choices:
+                raise ValueError(f"{entry.name} is {value!r}; give one of {', '.join(choices)}")
+            low, high = entry.metadata.get("range", (value, value))
             if not low <= value <= high:
                 raise ValueError(f"{entry.name} is {value}; it must lie in {low} to {high}")
         if self.environments > self.replay_capacity:

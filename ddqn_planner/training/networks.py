@@ -62,8 +62,7 @@ class PaperModule(TrainableNetwork):
     def windows(observation_BHW: Tensor) -> Tensor:
         """Return the states for observations (B, H, W): (B, 9, L), L windows of 3x3 cells.
 
-        On windows the convolution is a matrix product, which is faster on small maps; and two
-        networks can share them.
+        On windows the convolution is a matrix product, which is faster on small maps.
         """
         return functional.unfold(observation_BHW.unsqueeze(1), 3, padding=1, stride=2)
 

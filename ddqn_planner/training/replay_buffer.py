@@ -36,11 +36,10 @@ class ReplayBuffer:
 
     def add(self, transitions: Transitions) -> None:
         """Add B transitions, B <= capacity; they replace the oldest ones."""
-        count = len(transitions.cell)
-        indices = (self.added + np.arange(count)) % self.capacity
+        indices = (self.added + np.arange(len(transitions.cell))) % self.capacity
         for name in Transitions._fields:
             getattr(self.transitions, name)[indices] = getattr(transitions, name)
-        self.added += count
+        self.added += len(indices)
 
     def sample(self, count: int, random: np.random.Generator) -> Transitions:
         """Draw `count` transitions uniformly, with replacement."""

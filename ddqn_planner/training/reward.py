@@ -12,28 +12,15 @@ from ddqn_planner.training.hyper_parameters import HyperParameters
 def free_cell_reward(
     shape: tuple[int, int], start: Cell, goal: Cell, parameters: HyperParameters
 ) -> NDArray[np.float32]:
-    """Reward each move for its progress toward the goal, and punish a detour from the start.
+    """Return R_t of each move onto a free cell: (8, H, W), ``[a, y, x]`` of action a in (x, y).
 
     R_t = α (d_re(t-1) - d_re(t)) + β (d_rs(t) - d_rs(t-1) - d(t, t-1)), with d_re and d_rs the
     Euclidean distances of the robot to the end (the goal) and to the start, and d(t, t-1) the
-    length of the move. The start is always the given one, also in an episode that starts elsewhere:
-    so the reward depends only on what the robot observes.
-
-    Parameters
-    ----------
-    shape : (H, W)
-    start, goal : (x, y)
-    parameters : HyperParameters
-        For α and β. With α = β = 0, as in plain DDQN, free cells have no reward.
-
-    Returns
-    -------
-    (8, H, W) float32
-        ``[a, y, x]`` is the reward of action ``a`` in (x, y). It holds only for moves onto a free
-        cell other than the goal.
+    length of the move: α rewards progress toward the goal, β punishes a detour from the start. The
+    start is always the given one, also in an episode that starts elsewhere: so the reward depends
+    only on what the robot observes. With α = β = 0, as in plain DDQN, free cells have no reward.
     """
-    height, width = shape
-    y, x = np.mgrid[0:height, 0:width]
+    y, x = np.mgrid[0 : shape[0], 0 : shape[1]]
 
     def change_of_distance(cell: Cell) -> NDArray[np.float64]:
         before = np.hypot(x - cell[0], y - cell[1])

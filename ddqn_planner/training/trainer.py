@@ -5,9 +5,10 @@ from __future__ import annotations
 import copy
 import hashlib
 import json
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import safetensors.torch
@@ -21,18 +22,15 @@ from ddqn_planner.grid import MOVES, MoveRule
 from ddqn_planner.model import ModelMetadata, package_version, save_model
 from ddqn_planner.planning import Planner
 from ddqn_planner.training.double_dqn import double_dqn_loss
-from ddqn_planner.training.encoders import ObservationEncoder, PropagationEncoder
+from ddqn_planner.training.encoders import encoder_for
 from ddqn_planner.training.environment import GridVectorEnvironment, Scenario
 from ddqn_planner.training.episodes import Episode, EpisodeEnd
 from ddqn_planner.training.hyper_parameters import HyperParameters
-from ddqn_planner.training.networks import MODULES, PropagationModule
+from ddqn_planner.training.networks import MODULES
 from ddqn_planner.training.replay_buffer import ReplayBuffer, Transitions
 
 CHECKPOINT_KEY = "ddqn_planner_checkpoint"
 DIGEST_KEY = "sha256"
-
-DTYPES = {torch.float32: "F32", torch.float64: "F64", torch.int64: "I64"}
-"""The names of the types in a safetensors file."""
 
 FUSED = tuple(map(int, torch.__version__.split(".")[:2])) >= (2, 4)
 """Whether torch has the fused Adam also for the CPU."""
@@ -74,11 +72,7 @@ class Trainer:
             sizes = parameters.network_sizes(self.environment.shape)
             self.network = MODULES[parameters.network](**sizes)
         self._target = copy.deepcopy(self.network).requires_grad_(False)
-        self.encoder = (
-            PropagationEncoder(self.environment, self._target)
-            if isinstance(self._target, PropagationModule)
-            else ObservationEncoder(self.environment)
-        )
+        self.encoder = encoder_for(self._target, self.environment)
         self._weights = tuple(self.network.parameters())
         self._optimiser = torch.optim.Adam(self._weights, parameters.learning_rate, fused=FUSED)
         self._replay = ReplayBuffer(parameters.replay_capacity)
@@ -162,29 +156,21 @@ class Trainer:
         self, ended: NDArray[np.bool_], terminated: NDArray[np.bool_]
     ) -> list[Episode]:
         """Return the ended episodes, and start new ones in their environments."""
-        episodes = []
-        width = self.environment.shape[1]
-        for index in np.flatnonzero(ended).tolist():
+        episodes: list[Episode] = []
+        places, width = np.flatnonzero(ended).tolist(), self.environment.shape[1]
+        for index in places:
             cells, scenario = self._visited[index], int(self.environment.scenario[index])
             moves, outcome = len(cells) - 1, EpisodeEnd.OUT_OF_STEPS
             if terminated[index] and cells[-1] == self.environment.goal[scenario]:
                 outcome = EpisodeEnd.REACHED_GOAL
             elif terminated[index]:
                 outcome, cells = EpisodeEnd.COLLIDED, cells[:-1]
-            self.episodes += 1
-            episodes.append(
-                Episode(
-                    number=self.episodes,
-                    step=self.steps,
-                    scenario=scenario,
-                    outcome=outcome,
-                    cells=tuple((cell % width, cell // width) for cell in cells),
-                    moves=moves,
-                    total_reward=float(self._total_reward[index]),
-                )
-            )
+            visited = tuple((cell % width, cell // width) for cell in cells)
+            number, total = self.episodes + len(episodes) + 1, float(self._total_reward[index])
+            episodes.append(Episode(number, self.steps, scenario, outcome, visited, moves, total))
+        self.episodes += len(episodes)
         self.environment.reset_where(ended)
-        for index in np.flatnonzero(ended).tolist():
+        for index in places:
             self._visited[index] = [int(self.environment.cell[index])]
         self._total_reward[ended] = 0.0
         return episodes
@@ -211,10 +197,7 @@ class Trainer:
     def save_checkpoint(self, path: str | Path) -> None:
         """Write all that `load_checkpoint` needs to continue as if nothing had happened.
 
-        Raises
-        ------
-        OSError
-            If the file cannot be written; the one before it then stays as it is.
+        After an OSError, the file before it stays as it is.
         """
         description = {  # with the names of 0.1, whose checkpoints load too
             "seed": self.seed,
@@ -234,10 +217,8 @@ class Trainer:
     def load_checkpoint(cls, path: str | Path, scenarios: Sequence[Scenario]) -> Trainer:
         """Return the trainer that `save_checkpoint` wrote; a checkpoint holds no scenarios.
 
-        Raises
-        ------
-        CheckpointError
-            If the file is missing, broken or no checkpoint, or was made with other scenarios.
+        A CheckpointError if the file is missing, broken or no checkpoint, or was made with other
+        scenarios.
         """
         try:
             with safe_open(path, framework="pt") as file:
@@ -252,26 +233,7 @@ class Trainer:
                 parameters = HyperParameters(**description["parameters"])
                 rule = MoveRule(description["move_rule"])
                 trainer = cls(scenarios, rule, parameters, description["seed"])
-                trainer.steps, trainer.updates, trainer.episodes, trainer._replay.added = (
-                    description["counters"]
-                )
-                tensors = trainer._tensors()
-                expected = {key: (DTYPES[t.dtype], [*t.shape]) for key, t in tensors.items()}
-                slices = {key: file.get_slice(key) for key in file.keys()}  # noqa: SIM118
-                found = {key: (part.get_dtype(), part.get_shape()) for key, part in slices.items()}
-                # Before any is read: a small sparse file can claim tensors of any size.
-                if found != expected:
-                    raise ValueError("its tensors have other names, types or shapes")
-                saved = {key: file.get_tensor(key) for key in found}
-            if metadata[DIGEST_KEY] != _digest(text, saved):
-                raise ValueError("its digest is another")
-            for key, tensor in tensors.items():
-                tensor.copy_(saved[key])
-            trainer.encoder.update_target(trainer._target)
-            trainer._visited = description["walked"]
-            states = description["generators"]
-            for generator, state in zip(trainer._generators(), states, strict=True):
-                generator.bit_generator.state = state
+                trainer._restore(description, file, metadata[DIGEST_KEY], text)
         except (CheckpointError, MemoryError):
             raise
         except Exception as error:  # a broken file can raise any error in the libraries
@@ -281,32 +243,48 @@ class Trainer:
             ) from error
         return trainer
 
+    def _restore(self, description: Any, file: Any, digest: str, text: str) -> None:
+        """Continue where a checkpoint was made; a ValueError if its tensors are not those."""
+        self.steps, self.updates, self.episodes, self._replay.added = description["counters"]
+        tensors = self._tensors()
+        expected = {name: [*tensor.shape] for name, tensor in tensors.items()}
+        # Before any is read: a small sparse file can claim tensors of any size.
+        if {name: file.get_slice(name).get_shape() for name in file.keys()} != expected:  # noqa: SIM118
+            raise ValueError("its tensors have other names or shapes")
+        saved = {name: file.get_tensor(name) for name in expected}
+        if digest != _digest(text, saved):
+            raise ValueError("its digest is another")
+        for name, tensor in tensors.items():
+            tensor.copy_(saved[name])
+        self.encoder.update_target(self._target)
+        self._visited = description["walked"]
+        states = description["generators"]
+        for generator, state in zip(self._generators(), states, strict=True):
+            generator.bit_generator.state = state
+
     def _tensors(self) -> dict[str, Tensor]:
         """Return the tensors of a checkpoint. They share the trainer's memory."""
         environment, stored = self.environment, len(self._replay)
+        tensors = {"total_reward": torch.from_numpy(self._total_reward)}
+
+        def add(group: str, parts: Mapping[str, Tensor | NDArray[Any]]) -> None:
+            for name, part in parts.items():
+                tensors[f"{group}.{name}"] = torch.as_tensor(part)
+
+        add("network", self.network.state_dict())
+        add("target", self._target.state_dict())
         replay = self._replay.transitions._asdict()
-        groups = {
-            "network": self.network.state_dict(),
-            "target": self._target.state_dict(),
-            "replay": {name: torch.from_numpy(values[:stored]) for name, values in replay.items()},
-            "environment": {
-                name: torch.from_numpy(getattr(environment, name))
-                for name in ("scenario", "cell", "steps")
-            },
-        }
+        add("replay", {name: values[:stored] for name, values in replay.items()})
+        names = ("scenario", "cell", "steps")
+        add("environment", {name: getattr(environment, name) for name in names})
         # Adam makes its state at the first update.
         for index, weight in enumerate(self._weights if self.updates else ()):
             state = self._optimiser.state[weight]
             if not state:
-                state["step"] = torch.zeros(())
-                state["exp_avg"] = torch.zeros_like(weight)
-                state["exp_avg_sq"] = torch.zeros_like(weight)
-            groups[f"optimiser.{index}"] = state
-        return {"total_reward": torch.from_numpy(self._total_reward)} | {
-            f"{group}.{name}": tensor
-            for group, tensors in groups.items()
-            for name, tensor in tensors.items()
-        }
+                zeros = torch.zeros_like
+                state.update(step=torch.zeros(()), exp_avg=zeros(weight), exp_avg_sq=zeros(weight))
+            add(f"optimiser.{index}", state)
+        return tensors
 
     def _generators(self) -> tuple[np.random.Generator, ...]:
         return self.environment.np_random, self._exploration, self._sampling

@@ -24,20 +24,10 @@ def value_iteration(
 ) -> NDArray[np.float32]:
     """Iterate V until it settles; return r + γ V(s') of each successful move: (S, 8, C) float32.
 
-    V(s) = max_a Q(s, a) with Q(s, a) = p (r + γ V(s')) + (1 - p) r_o; V(goal) = 0, and V = r_o
-    outside the map. Occupied cells have no rule of their own: p says that moves into them fail.
-
-    Parameters
-    ----------
-    success_SAC, reward_SAC : (S, 8, C) float32
-        p, 0..1, and r of a move that succeeds.
-    goal_S : (S,) int64
-    neighbours_AC : (8, C) int64
-        See `ddqn_planner.grid.neighbours`.
-    gamma : float
-        γ, 0..1.
-    collision : float
-        r_o. With γ = 1 it must be less than any path's return.
+    V(s) = max_a Q(s, a) with Q(s, a) = p (r + γ V(s')) + (1 - p) r_o, from the success p of a move,
+    its reward r, and r_o of a collision, which with γ = 1 must be less than any path's return;
+    V(goal) = 0, and V = r_o outside the map. Occupied cells have no rule of their own: p says that
+    moves into them fail.
     """
     maps, _, cells = success_SAC.shape
     gain_SAC = np.float32(gamma) * success_SAC

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import re
 import signal
 import subprocess
 import sys
@@ -21,7 +20,7 @@ from processes import running
 
 pytestmark = pytest.mark.slow
 
-EXAMPLES = Path(__file__).resolve().parents[2] / "examples"
+DEMO = Path(__file__).resolve().parents[2] / "examples" / "demo.py"
 END_TIMEOUT = 600.0
 """Seconds that the whole demo may take on a loaded machine."""
 
@@ -34,14 +33,14 @@ MARK = "DDQN_PLANNER_TEST_DEMO"
 class Demo:
     """A running demo, and the processes that came from it."""
 
-    def __init__(self, folder: Path, *command: str) -> None:
+    def __init__(self, folder: Path) -> None:
         # The demo's nodes are in sessions of their own; they inherit its environment.
         mark = uuid.uuid4().hex
         self._entry = f"{MARK}={mark}".encode()
         self._output = folder / "output.txt"
         with self._output.open("wb") as file:
             self.process = subprocess.Popen(
-                [sys.executable, str(EXAMPLES / command[0]), *command[1:]],
+                [sys.executable, str(DEMO)],
                 cwd=folder,
                 env={**os.environ, MARK: mark},
                 stdout=file,
@@ -72,9 +71,9 @@ class Demo:
 
 
 @pytest.fixture
-def demo(tmp_path: Path, request: pytest.FixtureRequest) -> Iterator[Demo]:
+def demo(tmp_path: Path) -> Iterator[Demo]:
     """Run the demo in a temporary folder; nothing of it outlives the test."""
-    demo = Demo(tmp_path, *getattr(request, "param", ["demo.py"]))
+    demo = Demo(tmp_path)
     yield demo
     for process in demo.commands():
         with suppress(ProcessLookupError):
@@ -96,22 +95,6 @@ def test_demo_finds_the_shortest_paths_and_draws_them(demo: Demo, tmp_path: Path
         colours, counts = np.unique(pixels.reshape(-1, 3), axis=0, return_counts=True)
         assert len(colours) > 100
         assert counts.max() < 0.8 * counts.sum()
-
-
-@pytest.mark.parametrize("demo", [["demo_driving.py", "3"]], indirect=True)
-def test_a_robot_learns_by_driving_and_what_it_learned_is_drawn(demo: Demo, tmp_path: Path) -> None:
-    pytest.importorskip("matplotlib")
-    assert demo.process.wait(END_TIMEOUT) == 0, demo.output
-    # No route is better than the best possible one.
-    routes = re.findall(r"mission +\d: drove +\d+\.\d s; its route takes 1\.\d\d of", demo.output)
-    assert len(routes) == 3
-    assert demo.commands() == {}
-    with Image.open(tmp_path / "demo_driving.gif") as film:
-        assert film.n_frames == 3
-    for name in ("demo_driving.png", "demo_driving_curve.png"):
-        with Image.open(tmp_path / name) as picture:
-            assert min(picture.size) >= 300
-            assert len(picture.convert("RGB").getcolors(10**7)) > 50
 
 
 @pytest.mark.parametrize(("signal_number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])

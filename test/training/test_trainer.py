@@ -364,7 +364,7 @@ def test_a_checkpoint_of_holes_is_refused_before_it_is_read(
     with safe_open(path, framework="pt") as opened:  # it is what it seems to be
         assert opened.get_slice("network.convolution.weight").get_shape() == [size // 4]
     before = peak_after_reset()
-    with pytest.raises(CheckpointError, match="its tensors have other names, types or shapes"):
+    with pytest.raises(CheckpointError, match="its tensors have other names or shapes"):
         Trainer.load_checkpoint(path, [small])
     assert peak() - before < 2**27
 

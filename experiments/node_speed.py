@@ -1,0 +1,366 @@
+"""Measures the executables: how soon they are of use, how fast they answer, what they take.
+
+Part of `make bench`. With the path of a ROS map, as of turtlebot3, the planner is asked on that one
+in place of the office.
+"""
+
+from __future__ import annotations
+
+import gc
+import os
+import signal
+import statistics
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from client import TIMEOUT, Client, initial_pose, map_message, plan_request, pose, wait_for
+from map_fixture import RULE
+from nav_msgs.msg import OccupancyGrid
+from nav_msgs.msg import Path as PathMessage
+from nav_msgs.srv import GetPlan
+from processes import (
+    claim_ros_domain,
+    cpu_seconds,
+    executable,
+    memory,
+    run_script,
+    running,
+    running_node,
+)
+from random_maps import generate_map
+from rcl_interfaces.srv import GetParameters, ListParameters
+from std_srvs.srv import Trigger
+from tables import report
+
+from ddqn_planner import GridMap, Planner, load_map
+from ddqn_planner.grid import OCCUPIED, Cell, save_map
+from ddqn_planner.grid.noise import random_requests
+from ddqn_planner.nodes.runtime import LATCHED
+from ddqn_planner.resources import find_map
+
+BARE = [sys.executable, str(Path(__file__).with_name("bare_service.py"))]
+STARTS, CALLS, GOALS, LARGE, CHANGING = 10, 200, 7, 2000, 1024
+RATE = 5
+"""Maps per second."""
+SETTLED = 0.6
+"""Seconds after which a client is known to DDS."""
+
+Usage = tuple[float, float, float]
+"""Wall time and CPU time, seconds; resident memory, MB."""
+
+
+def message_of(grid: GridMap) -> OccupancyGrid:
+    """Return the message of a map."""
+    return map_message(OCCUPIED * grid.occupancy.astype(np.int8), grid)
+
+
+def publish_request(client: Client, grid: GridMap, start: Cell, goal: Cell) -> None:
+    """Publish the start and the goal."""
+    client.publish("initialpose", initial_pose(pose(grid, start)))
+    client.publish("goal_pose", pose(grid, goal))
+
+
+def office(side: int) -> tuple[GridMap, Cell, Cell]:
+    """Return a generated office, with a start and a goal that a path joins."""
+    random = np.random.default_rng(0)
+    grid = GridMap(generate_map("office", (side, side), random))
+    ((start, goal),) = random_requests(grid.occupancy, RULE, 1, random)
+    return grid, start, goal
+
+
+# Starts
+
+
+def start_planner() -> Usage:
+    """Start the planner node; return what it takes until its first plan."""
+    grid = load_map(find_map("dilemma"))
+    # A client per start: one that has seen other nodes end is discovered more slowly.
+    with Client() as client:
+        plans = client.subscribe(PathMessage, "plan", LATCHED)
+        client.publish("map", message_of(grid), LATCHED, listeners=0)
+        time.sleep(SETTLED)
+        began = time.monotonic()
+        with running_node("planner_node", "--log-level", "error") as node:
+            publish_request(client, grid, (6, 6), (17, 19))
+            plans.wait(lambda plan: plan.poses)
+            return time.monotonic() - began, cpu_seconds(node.pid), memory(node.pid)
+
+
+def start_map_server() -> Usage:
+    """Start the map server; return what it takes until its first map is received."""
+    with Client() as client:
+        maps = client.subscribe(OccupancyGrid, "map", LATCHED)
+        time.sleep(SETTLED)
+        began = time.monotonic()
+        with running_node("map_server_node", "--log-level", "error") as node:
+            maps.wait()
+            return time.monotonic() - began, cpu_seconds(node.pid), memory(node.pid)
+
+
+def start_bare_node() -> Usage:
+    """Start a node with one service; return what it takes until it is discovered."""
+    with Client() as client:
+        service = client.node.create_client(GetPlan, "bare/get_plan")
+        time.sleep(SETTLED)
+        began = time.monotonic()
+        with running(*BARE, "0") as node:
+            wait_for("the bare node", service.service_is_ready)
+            return time.monotonic() - began, cpu_seconds(node.pid), memory(node.pid)
+
+
+def run_command(*command: str) -> Usage:
+    """Return what a command takes from start to end."""
+    began, peak, ended = time.monotonic(), 0.0, 0
+    child = subprocess.Popen(command, stdout=subprocess.DEVNULL)
+    while not ended:
+        # Not ru_maxrss: that begins with the memory of this process.
+        with suppress(IndexError, OSError):
+            peak = memory(child.pid, "VmHWM")
+        time.sleep(0.002)
+        ended, status, used = os.wait4(child.pid, os.WNOHANG)
+    seconds = time.monotonic() - began
+    child.returncode = os.waitstatus_to_exitcode(status)
+    assert child.returncode == 0, f"{command} ended with {child.returncode}"
+    return seconds, used.ru_utime + used.ru_stime, peak
+
+
+def measure_starts() -> list[bool]:
+    """Print the medians of some starts beside their bounds."""
+    program, free = executable("ddqn-planner"), float("inf")
+    starts: dict[str, tuple[Callable[[], Usage], Usage]] = {
+        "a bare rclpy node, discovered": (start_bare_node, (free, free, free)),
+        "map_server_node to its first map": (start_map_server, (0.8, free, 90)),
+        "planner_node to its first plan": (start_planner, (1.5, 0.9, 210)),
+        "import ddqn_planner": (
+            partial(run_command, sys.executable, "-c", "import ddqn_planner"),
+            (free, 0.3, free),
+        ),
+        "ddqn-planner plan dilemma": (
+            partial(run_command, program, "plan", "dilemma"),
+            (1.2, free, free),
+        ),
+        "ddqn-planner --help": (partial(run_command, program, "--help"), (0.3, free, free)),
+    }
+    missed = []
+    for name, (start, bounds) in starts.items():
+        columns = list(zip(*(start() for _ in range(STARTS)), strict=True))
+        name = f"{name} (slowest {max(columns[0]):.2f} s)"
+        for column, unit, bound in zip(columns, ("s", "CPU", "MB"), bounds, strict=True):
+            missed.append(report(name, statistics.median(column), unit, bound))
+    return missed
+
+
+# Answers
+
+
+def timed(service: Any, request: Any) -> tuple[float, Any]:
+    """Call a service; return how long its answer took, milliseconds, and the answer."""
+    answered = threading.Event()
+    began = time.perf_counter()
+    future = service.call_async(request)
+    future.add_done_callback(lambda _: answered.set())
+    assert answered.wait(TIMEOUT), f"no answer from {service.srv_name}"
+    return 1e3 * (time.perf_counter() - began), future.result()
+
+
+def first_answer(client: Client, request: GetPlan.Request) -> tuple[float, int]:
+    """Ask the planner until it has its map; return its first plan's milliseconds and poses."""
+    service = client.service(GetPlan, "planner/get_plan")
+
+    def answer() -> tuple[float, int] | None:
+        took, response = timed(service, request)
+        return (took, len(response.plan.poses)) if response.plan.poses else None
+
+    return wait_for("plan", answer)
+
+
+def measure_requests(client: Client, map_file: Path) -> list[bool]:
+    """Measure the first and the later answers of the planner node on a map."""
+    grid = load_map(map_file)
+    pairs = random_requests(grid.occupancy, RULE, GOALS, np.random.default_rng(0))
+    requests = [plan_request(grid, *cells) for cells in pairs]
+    first, ratios = [], []
+    server = running_node("map_server_node", yaml_filename=map_file.resolve())
+    with server, running_node("planner_node"):
+        planner = client.service(GetPlan, "planner/get_plan")
+        starting, _ = first_answer(client, requests[0])
+        for request in requests[1:]:
+            took, poses = first_answer(client, request)
+            first.append(took)
+            with running(*BARE, str(poses)):
+                bare = client.service(GetPlan, "bare/get_plan")
+                timed(bare, request)
+                times = [
+                    (timed(planner, request)[0], timed(bare, request)[0]) for _ in range(CALLS)
+                ]
+            ours, theirs = (statistics.median(column) for column in zip(*times, strict=True))
+            ratios.append(ours / theirs)
+            print(
+                f"GetPlan of {poses} poses: first {took:.1f} ms, then {ours:.2f} ms; bare "
+                f"service {theirs:.2f} ms"
+            )
+    name = f"{map_file.stem}, {grid.width}x{grid.height}"
+    # The node answers before its model is loaded: the first request waits for it.
+    print(f"{name}: first GetPlan of a node that is starting {starting:.1f} ms")
+    return [
+        report(f"{name}: GetPlan to a new goal, slowest", max(first), "ms", 100),
+        report(f"{name}: GetPlan again / bare service, worst", max(ratios), "x", 1.5),
+    ]
+
+
+def measure_large_map(client: Client) -> list[bool]:
+    """Measure memory, and what other services take while a large field is computed."""
+    random = np.random.default_rng(0)
+    grid = GridMap(generate_map("office", (LARGE, LARGE), random))
+    cells = random_requests(grid.occupancy, RULE, GOALS + 1, random)
+    new = [plan_request(grid, *both) for both in cells[1:]]
+    # Of one pose: a long path takes its own time.
+    known = plan_request(grid, cells[0][0], cells[0][0])
+    questions = {
+        "get_parameters": (GetParameters, GetParameters.Request(names=["model"])),
+        "list_parameters": (ListParameters, ListParameters.Request()),
+        "get_plan": (GetPlan, known),
+        "reload_model": (Trigger, Trigger.Request()),
+    }
+    missed, waited = [], []
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder, "large.yaml")
+        save_map(grid, path)
+        server = running_node("map_server_node", yaml_filename=path)
+        with server, running_node("planner_node") as planner:
+            first_answer(client, known)
+            get_plan = client.service(GetPlan, "planner/get_plan")
+            for name, (service_type, question) in questions.items():
+                service, times = client.service(service_type, f"planner/{name}"), []
+                for request in new:
+                    timed(get_plan, known)
+                    began = time.perf_counter()
+                    plan = get_plan.call_async(request)
+                    while not plan.done():
+                        times.append(timed(service, question)[0])
+                    waited.append(1e3 * (time.perf_counter() - began))
+                figure = f"{LARGE}x{LARGE}, field under way: {name}, slowest of {len(times)}"
+                missed.append(report(figure, max(times), "ms", 100))
+            peak = memory(planner.pid, "VmHWM")
+    print(f"{LARGE}x{LARGE}: GetPlan with a new field, median {statistics.median(waited):.0f} ms")
+    return [*missed, report(f"{LARGE}x{LARGE}: planner node, greatest memory", peak, "MB", 2000)]
+
+
+def measure_new_maps(client: Client) -> list[bool]:
+    """Measure how soon a new large map brings a path to the active goal."""
+    plans, times = client.subscribe(PathMessage, "plan", LATCHED), []
+    small = message_of(GridMap(np.zeros((5, 5), dtype=np.bool_)))
+    first, *_ = office(LARGE)
+    with running_node("planner_node"):
+        for turns in range(4):
+            grid = GridMap(np.rot90(first.occupancy, turns))
+            client.publish("map", small, LATCHED)
+            random = np.random.default_rng(turns)
+            ((start, goal),) = random_requests(grid.occupancy, RULE, 1, random)
+            publish_request(client, grid, start, goal)
+            time.sleep(2)  # until the node has answered that these lie outside the small map
+            message = message_of(grid)
+            plans.clear()
+            began = time.monotonic()
+            client.publish("map", message, LATCHED)
+            plans.wait(lambda plan: plan.poses)
+            times.append(time.monotonic() - began)
+    print(f"{LARGE}x{LARGE}: new map to path, first of the node {times[0]:.2f} s")
+    seconds = statistics.median(times[1:])
+    return [report(f"{LARGE}x{LARGE}: new map to path, median", seconds, "s", 0.3)]
+
+
+def measure_changing_map(client: Client) -> list[bool]:
+    """Measure the planner's share of a core while its map changes in a few cells, 5 Hz."""
+    plans = client.subscribe(PathMessage, "plan", LATCHED)
+    grid, start, goal = office(CHANGING)
+    local, random, messages = Planner.load("any_map"), np.random.default_rng(0), [message_of(grid)]
+    path = local.plan(grid, start, goal, RULE).cells
+    while len(messages) < 12 * RATE:
+        x, y = random.choice(path[3:-3])
+        changed = grid.with_patch(~grid.occupancy[y : y + 2, x : x + 2], x, y)
+        if local.plan(changed, start, goal, RULE).cells:
+            messages.append(message_of(changed))
+    with running_node("planner_node") as planner:
+        publish_request(client, grid, start, goal)
+        for number, message in enumerate(messages):
+            if number == 2 * RATE:  # the node is warm
+                plans.clear()
+                began, computed = time.monotonic(), cpu_seconds(planner.pid)
+            client.publish("map", message, LATCHED)
+            time.sleep(1 / RATE)
+        seconds, computed = time.monotonic() - began, cpu_seconds(planner.pid) - computed
+    print(f"{CHANGING}x{CHANGING}: {len(plans.messages())} plans in {seconds:.1f} s")
+    figure = f"{CHANGING}x{CHANGING}: a few cells change, 5 Hz: share of a core"
+    return [report(figure, 100 * computed / seconds, "%", 10)]
+
+
+def measure_trainer(client: Client) -> list[bool]:
+    """Measure the trainer node while it trains: its services, and how soon a signal ends it."""
+    missed: list[bool] = []
+    slowest: dict[str, float] = {}
+
+    def call(name: str, times: int = 1) -> float:
+        service = client.service(Trigger, f"trainer/{name}")
+        return max(timed(service, Trigger.Request())[0] for _ in range(times))
+
+    for number in (signal.SIGINT, signal.SIGTERM):
+        with (
+            tempfile.TemporaryDirectory() as folder,
+            running_node(
+                "trainer_node", output_folder=folder, map_file="dilemma", steps=1_000_000
+            ) as trainer,
+        ):
+            # A service is found before its node spins: the first answer says that it does.
+            print(f"trainer: first answer of the node, while it starts: {call('stop'):.0f} ms")
+            print(f"trainer: first ~/start, once torch is imported: {call('start'):.0f} ms")
+            call("stop")
+            time.sleep(1)  # until it has saved itself
+            slowest["start"] = max(slowest.get("start", 0.0), call("start"))
+            time.sleep(10)  # thousands of steps: a checkpoint and curves of some size
+            for name in ("start", "save", "replay", "stop"):
+                slowest[name] = max(slowest.get(name, 0.0), call(name, 50))
+            for _ in range(20):  # until the training that was stopped has saved itself
+                call("start")
+                time.sleep(0.1)
+            began = time.monotonic()
+            trainer.send_signal(number)
+            assert trainer.wait() == 0, f"{number.name} ended it with {trainer.returncode}"
+            seconds = time.monotonic() - began
+        missed.append(report(f"trainer: {number.name} to exit", seconds, "s", 3))
+    return missed + [
+        report(f"trainer: ~/{name} while it trains, slowest of 100", ms, "ms", 100)
+        for name, ms in slowest.items()
+    ]
+
+
+def main(arguments: Sequence[str]) -> int:
+    """Print each figure beside its bound; return 1 if one is missed."""
+    map_file = Path(arguments[0] if arguments else find_map("office"))
+    with claim_ros_domain():
+        missed = measure_starts()
+        gc.freeze()  # else this process pauses to look for garbage among what it has imported
+        for measure in (
+            partial(measure_requests, map_file=find_map("dilemma")),
+            partial(measure_requests, map_file=map_file),
+            measure_large_map,
+            measure_new_maps,
+            measure_changing_map,
+            measure_trainer,
+        ):
+            with Client() as client:  # else its last map would reach the next node
+                missed += measure(client)
+    return int(any(missed))
+
+
+if __name__ == "__main__":
+    run_script(main)

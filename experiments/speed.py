@@ -1,0 +1,400 @@
+"""Measures planning and training beside their peers: `make bench`. Needs the extra `bench`.
+
+Compared calls take turns in one run, and ratios are of their medians. Times are CPU times of this
+process, which vary less on a loaded machine; each call uses one thread. Each call plans with a
+planner that knows no map, on a `GridMap` that was made before the clock began. With `--pictures`
+it draws the cells that a request visits and the times of requests into docs/images/.
+"""
+
+from __future__ import annotations
+
+import gc
+import math
+import statistics
+import sys
+import time
+from collections.abc import Callable, Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import matplotlib
+
+matplotlib.use("Agg")
+import gymnasium
+import matplotlib.pyplot as plt
+import nano_astar
+import numpy as np
+import pyastar2d
+import torch
+from random_maps import KINDS, generate_map
+from stable_baselines3 import DQN
+from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
+from tables import report
+from torch import nn
+
+from ddqn_planner import GridMap, MoveRule, Planner, QField
+from ddqn_planner.grid import Cell, shortest_distances
+from ddqn_planner.grid.arguments import Occupancy
+from ddqn_planner.grid.noise import random_costs, random_requests
+from ddqn_planner.planning.field import DistanceField
+from ddqn_planner.planning.kernels import CLOSED
+from ddqn_planner.training.environment import GridEnvironment, paper_scenario
+from ddqn_planner.training.hyper_parameters import HyperParameters
+from ddqn_planner.training.trainer import Trainer
+
+RULE = MoveRule.ROBOT_SAFE
+COLOURS = {"random_20": "#0072B2", "rooms": "#D55E00", "office": "#009E73", "maze": "#CC79A7"}
+"""The kinds of maps of requests, each with a colour that colour-blind readers can tell apart."""
+REQUESTS, ROUNDS, FIELDS, CHANGES = 15, 3, 100, 100
+STEPS, TRAINING_ROUNDS = 3_000, 5
+FLIPPED = 10
+"""Cells that a change near a place flips, of the 25 around it."""
+WALL = 41
+"""Cells of a wall that opens or closes."""
+SHORTEST = 40
+"""Moves of the shortest path for replans: robot and goal are far from each other."""
+
+IMAGES = Path(__file__).resolve().parents[1] / "docs" / "images"
+
+Call = Callable[[], Any]
+"""What is timed. A `Callable[[], Call]` makes all that it needs."""
+
+LOADED = Planner.load("any_map")
+
+
+def new_planner() -> Planner:
+    """Return a planner that knows no map yet; the tables of its network are made."""
+    return Planner(LOADED.network, LOADED.metadata)
+
+
+def new_request(occupancy: Occupancy, start: Cell, goal: Cell) -> Call:
+    """Return the call that plans on a new map."""
+    return partial(new_planner().plan, GridMap(occupancy), start, goal, RULE)
+
+
+def ready(function: Callable[..., Any], *arguments: Any, **options: Any) -> Callable[[], Call]:
+    """Return the preparation of a call that needs none."""
+    return lambda: partial(function, *arguments, **options)
+
+
+def take_turns(*prepare: Callable[[], Call], rounds: int = ROUNDS) -> tuple[list[float], list[Any]]:
+    """Prepare and time each call in turn; return their median milliseconds and last answers."""
+    times: list[list[float]] = [[] for _ in prepare]
+    answers: list[Any] = [None for _ in prepare]
+    for _ in range(rounds):
+        for number, make in enumerate(prepare):
+            call = make()
+            began = time.process_time()
+            answers[number] = call()
+            times[number].append(1e3 * (time.process_time() - began))
+    return [statistics.median(of_call) for of_call in times], answers
+
+
+def medians(times: Sequence[Sequence[float]]) -> list[float]:
+    """Return the median of each column."""
+    return [statistics.median(column) for column in zip(*times, strict=True)]
+
+
+def measure_paper_map() -> list[bool]:
+    """Time the Q field of the paper's map, computed anew each time."""
+    planner, scenario = Planner.load("dilemma"), paper_scenario()
+    rule = planner.metadata.move_rule
+    field = ready(planner.network.q_values, scenario.grid, scenario.goal, rule)
+    ((took,), _) = take_turns(field, rounds=FIELDS)
+    return [report("Q field of the 20x20 map", took, "ms", 20)]
+
+
+def measure_requests(side: int) -> list[bool]:
+    """Compare a request on a new map with A* in C++, and time one to a goal that is known."""
+    missed = []
+    for kind in COLOURS:
+        random, times = np.random.default_rng(0), []
+        occupancy = generate_map(kind, (side, side), random)
+        of_nano = occupancy.astype(np.uint8)
+        weights = np.where(occupancy, np.inf, 1).astype(np.float32)
+        for start, goal in random_requests(occupancy, RULE, REQUESTS, random):
+            cells = start[::-1], goal[::-1]
+            took, (plan, (_, length), _) = take_turns(
+                partial(new_request, occupancy, start, goal),
+                ready(nano_astar.astar, of_nano, *cells),
+                ready(pyastar2d.astar_path, weights, *cells, allow_diagonal=True),
+            )
+            assert math.isclose(plan.length, length, rel_tol=1e-6), (plan.length, length)
+            planner, grid = new_planner(), GridMap(occupancy)
+            moved = planner.plan(grid, start, goal, RULE).cells[1]
+            ((known,), _) = take_turns(ready(planner.plan, grid, moved, goal, RULE), rounds=1)
+            times.append((*took, known, len(plan.cells)))
+        our_ms, nano_ms, pyastar_ms, known_ms, moves = medians(times)
+        name = f"{side}x{side} {kind}: request {our_ms:.2f} ms"
+        missed += [
+            report(f"{name}, nano-astar {nano_ms:.2f}; ratio", our_ms / nano_ms, "x", 1.0),
+            report(f"{name}, pyastar2d* {pyastar_ms:.2f}; ratio", our_ms / pyastar_ms, "x", 1.3),
+            report(f"{side}x{side} {kind}: known goal, {moves:.0f} cells", known_ms, "ms", 0.1),
+        ]
+    print("* cuts corners, and a diagonal counts 1: its paths are no paths under our rule")
+    return missed
+
+
+class Change(NamedTuple):
+    """A map, and a patch of it that replaces some of its cells."""
+
+    occupancy: Occupancy
+    patch: Occupancy
+    x: int
+    y: int
+
+
+def flipped(occupancy: Occupancy, random: np.random.Generator, place: Cell | None = None) -> Change:
+    """Return a change of some cells around a place, or of as many all over the map."""
+    x, y = (int(np.clip(c - 2, 0, len(occupancy) - 5)) for c in place) if place else (0, 0)
+    box = (slice(y, y + 5), slice(x, x + 5)) if place else (slice(None), slice(None))
+    patch = occupancy[box].copy()
+    patch.flat[random.choice(patch.size, FLIPPED, replace=False)] ^= True
+    return Change(occupancy, patch, x, y)
+
+
+def wall(occupancy: Occupancy, path: Sequence[Cell], at: int, opens: bool) -> Change:
+    """Return the change that a wall across a path opens or closes."""
+    (x0, y0), (x, y), (x1, y1) = path[at - 2], path[at], path[at + 2]
+    along_x = abs(y1 - y0) > abs(x1 - x0)
+    x, y = (max(x - WALL // 2, 0), y) if along_x else (x, max(y - WALL // 2, 0))
+    height, width = (1, WALL) if along_x else (WALL, 1)
+    box = slice(y, y + height), slice(x, x + width)
+    if not opens:
+        return Change(occupancy, np.ones_like(occupancy[box]), x, y)
+    closed = occupancy.copy()
+    closed[box] = True
+    return Change(closed, occupancy[box], x, y)
+
+
+CHANGE_KINDS: dict[str, Callable[[Occupancy, Sequence[Cell], np.random.Generator], Change]] = {
+    "cells near the robot": lambda map_, path, random: flipped(map_, random, path[10]),
+    "cells near the goal": lambda map_, path, random: flipped(map_, random, path[-11]),
+    "cells anywhere": lambda map_, path, random: flipped(map_, random),
+    "a wall opens": lambda map_, path, random: wall(map_, path, len(path) // 2, True),
+    "a wall closes": lambda map_, path, random: wall(map_, path, len(path) // 2, False),
+    "a wall beside the goal": lambda map_, path, random: wall(
+        map_, path, len(path) - 3, random.random() < 0.5
+    ),
+}
+
+
+def plan_after(change: Change, start: Cell, goal: Cell, knows_before: bool) -> Call:
+    """Return the call that plans after a change, with the plan before it or without."""
+    planner, grid = new_planner(), GridMap(change.occupancy)
+    if knows_before:
+        planner.plan(grid, start, goal, RULE)
+    return partial(planner.plan, grid.with_patch(*change[1:]), start, goal, RULE)
+
+
+def draw_changes(
+    map_kind: str, side: int, change_kind: str, count: int
+) -> list[tuple[Change, Cell, Cell]]:
+    """Draw changes that leave start and goal free, each with its start and goal."""
+    drawn: list[tuple[Change, Cell, Cell]] = []
+    random = np.random.default_rng(0)
+    occupancy = generate_map(map_kind, (side, side), random)
+    while len(drawn) < count:
+        ((start, goal),) = random_requests(occupancy, RULE, 1, random)
+        path = new_planner().plan(GridMap(occupancy), start, goal, RULE).cells
+        if len(path) <= SHORTEST:
+            continue
+        change = CHANGE_KINDS[change_kind](occupancy, path, random)
+        after = GridMap(change.occupancy).with_patch(*change[1:])
+        if after.is_free(start) and after.is_free(goal):
+            drawn.append((change, start, goal))
+    return drawn
+
+
+def measure_replans(side: int) -> list[bool]:
+    """Compare replans with a new field on the changed map, which must give the same path."""
+    missed = []
+    for change_kind in CHANGE_KINDS:
+        ratios: list[tuple[float, str, float, float]] = []
+        for map_kind in COLOURS:
+            for drawn in draw_changes(map_kind, side, change_kind, CHANGES // len(COLOURS)):
+                (ms, fresh_ms), (ours, fresh) = take_turns(
+                    partial(plan_after, *drawn, True), partial(plan_after, *drawn, False)
+                )
+                assert ours.cells == fresh.cells, drawn[1:]
+                ratios.append((ms / fresh_ms, map_kind, ms, fresh_ms))
+        typical, (worst, kind, ms, fresh_ms) = statistics.median(r[0] for r in ratios), max(ratios)
+        print(f"worst: {kind}, {ms:.1f} ms; new field {fresh_ms:.1f} ms")
+        figure = f"{side}x{side}, {change_kind}: replan / new, median {typical:.3f}; worst"
+        missed.append(report(figure, worst, "x", 2.0))
+    return missed
+
+
+def whole_field(grid: GridMap, goal: Cell, rule: MoveRule) -> QField:
+    """Return a field whose value was asked for in every cell."""
+    field = new_planner().q_field(grid, goal, rule)
+    _ = field.value
+    return field
+
+
+def on_new_map(function: Callable[..., Any], occupancy: Occupancy, cost: Any, goal: Cell) -> Call:
+    """Return the call of a function of a map that it does not know."""
+    return partial(function, GridMap(occupancy, cost=cost), goal, RULE)
+
+
+def measure_whole_fields(side: int, costs: bool, bound: float) -> list[bool]:
+    """Compare the value of every cell with scipy's Dijkstra, graph included, on each kind."""
+    ratios, nbytes, name = {}, 0, f"{side}x{side}{', random costs' if costs else ''}"
+    for kind in KINDS:
+        random, times = np.random.default_rng(0), []
+        occupancy = generate_map(kind, (side, side), random)
+        cost = random_costs(occupancy, random) if costs else None
+        for _, goal in random_requests(occupancy, RULE, ROUNDS, random):
+            took, (field, _) = take_turns(
+                partial(on_new_map, whole_field, occupancy, cost, goal),
+                partial(on_new_map, shortest_distances, occupancy, cost, goal),
+                rounds=ROUNDS if side < 1000 else 1,
+            )
+            times.append(took)
+            nbytes = max(nbytes, field.nbytes - field.value.nbytes)
+        ours, dijkstra = medians(times)
+        ratios[kind] = ours / dijkstra
+        print(f"{name}, {kind}: field {ours:.1f} ms, Dijkstra {dijkstra:.1f} ms", flush=True)
+    worst = max(ratios, key=lambda kind: ratios[kind])
+    figure = f"{name}: field / Dijkstra, worst kind ({worst})"
+    missed = [report(figure, 100 * ratios[worst], "%", bound)]
+    if side > 32:
+        figure = f"{name}: bytes per cell of a field"
+        missed.append(report(figure, nbytes / side**2, "B", 10))
+    return missed
+
+
+class PaperFeatures(BaseFeaturesExtractor):
+    """The paper's convolution, for Stable-Baselines3; its Q head is the fully connected layer."""
+
+    def __init__(self, observation_space: gymnasium.spaces.Box, filters: int) -> None:
+        height, width = observation_space.shape
+        super().__init__(observation_space, filters * ((height + 1) // 2) * ((width + 1) // 2))
+        self.convolution = nn.Conv2d(1, filters, kernel_size=3, stride=2, padding=1)
+
+    def forward(self, observations: torch.Tensor) -> torch.Tensor:
+        """Return (B, features)."""
+        return torch.relu(self.convolution(observations.unsqueeze(1))).flatten(1)
+
+
+def measure_training() -> list[bool]:
+    """Compare our steps per second with those of Stable-Baselines3's DQN, an update a step.
+
+    Network, batch and replay ratio are the same. ε is at its last value for both from the start: a
+    random action costs no forward pass.
+    """
+    p = HyperParameters(epsilon_start=HyperParameters().epsilon_end)
+    scenario = paper_scenario()
+    ours = Trainer([scenario], MoveRule.CORNER_CUTTING, p, seed=0)
+    theirs = DQN(
+        "MlpPolicy",
+        GridEnvironment(scenario, MoveRule.CORNER_CUTTING, p),
+        learning_rate=p.learning_rate,
+        buffer_size=p.replay_capacity,
+        learning_starts=p.learning_starts,
+        batch_size=p.batch_size,
+        gamma=p.gamma,
+        train_freq=p.update_interval,
+        gradient_steps=1,
+        target_update_interval=p.target_interval,
+        exploration_initial_eps=p.epsilon_start,
+        exploration_final_eps=p.epsilon_end,
+        policy_kwargs={
+            "features_extractor_class": PaperFeatures,
+            "features_extractor_kwargs": {"filters": p.filters},
+            "net_arch": [],
+        },
+        seed=0,
+        device="cpu",
+    )
+    our_size, their_size = (
+        sum(weights.numel() for weights in network.parameters())
+        for network in (ours.network, theirs.q_net)
+    )
+    assert our_size == their_size
+    times: list[tuple[float, float]] = []
+    for _ in range(1 + TRAINING_ROUNDS):
+        began = time.perf_counter()
+        for _ in ours.run(ours.steps + STEPS):
+            pass
+        middle = time.perf_counter()
+        theirs.learn(STEPS, reset_num_timesteps=False)
+        times.append((middle - began, time.perf_counter() - middle))
+    del times[0]  # both past `learning_starts`, and warm
+    our_rate, their_rate = (STEPS / seconds for seconds in medians(times))
+    ratio = statistics.median(theirs / ours for ours, theirs in times)
+    figure = f"training: {our_rate:.0f} steps/s; Stable-Baselines3 {their_rate:.0f}; ratio"
+    return [report(figure, ratio, "x", 1.5, at_most=False)]
+
+
+def draw_visited_cells() -> None:
+    """Draw what one request visits, beside A* and Dijkstra's algorithm."""
+    random = np.random.default_rng(1)
+    grid = GridMap(generate_map("office", (160, 160), random))
+    requests = random_requests(grid.occupancy, RULE, 30, random)
+    start, goal = max(requests, key=lambda cells: math.dist(*cells))
+    planner = new_planner()
+    plan = planner.plan(grid, start, goal, RULE)
+    field = planner.q_field(grid, goal, RULE)
+    assert isinstance(field, DistanceField)
+    closed = field.known.state.reshape(grid.height + 2, -1)[1:-1, 1:-1] == CLOSED
+    cells = start[::-1], goal[::-1]
+    _, _, history = nano_astar.astar(grid.occupancy.astype(np.uint8), *cells, return_history=True)
+    by_a_star = np.zeros_like(closed)
+    by_a_star[tuple(history.T)] = True
+    distances = shortest_distances(grid, goal, RULE)
+    by_dijkstra = distances <= distances[start[1], start[0]]
+    figure, axes = plt.subplots(1, 3, figsize=(10.5, 3.9), layout="constrained")
+    panels = {"this planner": closed, "A* (nano-astar)": by_a_star, "Dijkstra": by_dijkstra}
+    for axis, (name, visited) in zip(axes, panels.items(), strict=True):
+        colours = np.full((*visited.shape, 3), 1.0)
+        colours[visited] = (0.68, 0.83, 0.93)
+        colours[grid.occupancy] = (0.35, 0.35, 0.35)
+        axis.imshow(colours, origin="lower", interpolation="nearest")
+        axis.plot(*np.transpose(plan.cells), color="#D55E00", linewidth=1.5)
+        axis.plot(*start, "o", *goal, "*", color="black", markersize=7)
+        axis.set(xticks=[], yticks=[], title=f"{name}: {np.count_nonzero(visited):,} cells")
+    figure.savefig(IMAGES / "visited_cells.png", dpi=120)
+
+
+def draw_times() -> None:
+    """Draw the time of a request on a new map against the length of its path."""
+    sides = (256, 512, 1024, 2000)
+    shared: dict[str, Any] = {"sharex": True, "sharey": True, "layout": "constrained"}
+    figure, axes = plt.subplots(1, len(sides), figsize=(10.5, 3.2), **shared)
+    for axis, side in zip(axes, sides, strict=True):
+        for kind, colour in COLOURS.items():
+            random, points = np.random.default_rng(0), []
+            occupancy = generate_map(kind, (side, side), random)
+            for cells in random_requests(occupancy, RULE, 2 * REQUESTS, random):
+                ((took,), (plan,)) = take_turns(partial(new_request, occupancy, *cells))
+                points.append((plan.length, took))
+            axis.loglog(*np.transpose(points), ".", color=colour, label=kind)
+        axis.set(title=f"{side} x {side}", xlabel="length of the path, cells")
+        axis.grid(alpha=0.3)
+    axes[0].set_ylabel("CPU time, ms")
+    axes[0].legend(fontsize=8)
+    figure.savefig(IMAGES / "request_times.png", dpi=120)
+
+
+def main(arguments: Sequence[str]) -> int:
+    """Print each figure beside its bound; return 1 if one is missed."""
+    torch.set_num_threads(1)
+    gc.freeze()  # else this process pauses to look for garbage among what it has imported
+    if "--pictures" in arguments:
+        draw_visited_cells()
+        draw_times()
+        return 0
+    missed = measure_paper_map() + measure_training()
+    for side in (256, 1024):
+        missed += measure_requests(side)
+    missed += measure_replans(1024)
+    missed += measure_whole_fields(32, False, 50)
+    for side in (256, 1024, 2000):
+        missed += measure_whole_fields(side, False, 20) + measure_whole_fields(side, True, 25)
+    return int(any(missed))
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))
