@@ -12,7 +12,7 @@ from std_msgs.msg import String
 
 from ddqn_planner.grid import GridMap, MoveRule
 from ddqn_planner.model import find_model
-from ddqn_planner.model.certificate import NO_CERTIFICATE, certificate_of
+from ddqn_planner.model.certificate import NO_CERTIFICATE
 from ddqn_planner.nodes.report import Report
 from ddqn_planner.nodes.runtime import BaseNode, Worker
 from ddqn_planner.planning import Planner
@@ -110,7 +110,7 @@ class ModelSource:
         if self.planner is None:
             return description
         metadata = self.planner.metadata
-        certificate = certificate_of(self.planner.network, metadata.move_rule)
+        certificate = self.planner.network.certificate(metadata.move_rule)
         return description | {
             "model file": self.file,
             "move rule": move_rule(rule, self.planner).value,
