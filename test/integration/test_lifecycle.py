@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gc
+import re
 import shutil
 import signal
 import threading
@@ -251,9 +252,8 @@ def test_a_planner_that_is_stopped_while_it_plans_leaves_the_graph_at_once(
         before = cpu_seconds(node.process.pid)
         answers = [plans.call_async(request) for request in requests]
         wait_for("fields under way", lambda: cpu_seconds(node.process.pid) > before + 0.2)
-        node.forget_log()
         assert node.stop(signal.SIGTERM) == 0
-        assert node.log == ""
+        assert not re.search("ERROR|Traceback", node.log)
         graph = robot.client.node
         wait_for("farewell", lambda: "planner" not in graph.get_node_names(), timeout=10)
         assert not all(answer.done() for answer in answers)
