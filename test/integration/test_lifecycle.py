@@ -255,7 +255,8 @@ def test_a_planner_that_is_stopped_while_it_plans_leaves_the_graph_at_once(
         assert node.stop(signal.SIGTERM) == 0
         assert not re.search("ERROR|Traceback", node.log)
         graph = robot.client.node
-        wait_for("farewell", lambda: "planner" not in graph.get_node_names(), timeout=10)
+        name = "planner", "/ended"
+        wait_for("farewell", lambda: name not in graph.get_node_names_and_namespaces(), timeout=10)
         assert not all(answer.done() for answer in answers)
 
 
