@@ -39,7 +39,7 @@ from visualization_msgs.msg import Marker, MarkerArray
 from ddqn_planner.grid import Cell, MoveRule, clearance, inflate, shortest_distances
 from ddqn_planner.nodes.conversions import occupancy_message
 from ddqn_planner.nodes.runtime import LATCHED
-from ddqn_planner.planning.simplification import touched_cells
+from ddqn_planner.planning.paths import touched_cells
 
 RULE = MoveRule.ROBOT_SAFE
 RESOLUTION = 0.5
