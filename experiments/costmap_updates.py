@@ -16,7 +16,6 @@ import numpy as np
 from builtin_interfaces.msg import Time
 from client import (
     Client,
-    cell_of,
     cells_of,
     initial_pose,
     map_message,
@@ -26,7 +25,7 @@ from client import (
     wait_for_map,
 )
 from diagnostic_msgs.msg import DiagnosticArray
-from map_fixture import RULE
+from map_fixture import RULE, path_error
 from nav_msgs.msg import Path
 from nav_msgs.srv import GetPlan
 from numpy.typing import NDArray
@@ -42,8 +41,7 @@ try:
 except ImportError:
     OccupancyGridUpdate = None
 
-SIDE, RESOLUTION = 1000, 0.05
-RATE = 20.0
+SIDE, RESOLUTION, RATE = 1000, 0.05, 20.0
 WINDOW = 60
 """Cells per side of an update."""
 REACH = 14
@@ -64,158 +62,140 @@ def inflated(obstacles: NDArray[np.bool_]) -> NDArray[np.int8]:
     return values.astype(np.int8)
 
 
-class Costmap:
-    """A costmap that changes in a window around a robot."""
+class Drive:
+    """A robot on a costmap that changes in a window around it, and a planner's client."""
 
-    def __init__(self, random: np.random.Generator) -> None:
-        self._random = random
+    def __init__(self, client: Client, by_service: bool) -> None:
+        self.client, self.by_service = client, by_service
+        self.random = np.random.default_rng(0)
         # Rooms of 1.5 to 7.5 m; walls and doors of 0.5 m.
-        rooms = generate_map("rooms", (SIDE // 10, SIDE // 10), random)
-        self._walls = rooms.repeat(10, axis=0).repeat(10, axis=1)
-        self._still = inflated(self._walls)
-        self.values = self._still.copy()
-        self.corner: Cell = (0, 0)
-
-    def grid(self) -> GridMap:
-        """Return which cells are free."""
-        return GridMap(self.values >= 99, RESOLUTION)
+        rooms = generate_map("rooms", (SIDE // 10, SIDE // 10), self.random)
+        self.walls = rooms.repeat(10, axis=0).repeat(10, axis=1)
+        self.still = inflated(self.walls)
+        self.values = self.still.copy()
+        self.grid = GridMap(self.values >= 99, RESOLUTION)
+        reachable = self.grid.reachable([self.grid.free_cells()[0]], RULE)
+        self.free = np.argwhere(reachable)[:, ::-1]
+        self.robot: Cell = tuple(self.free[0].tolist())
+        self.goal = self.sent_goal = self.robot
+        self.path = [self.robot]
+        self.version, self.corner = 1, (REACH, REACH)
+        self.kept: dict[int, NDArray[np.bool_]] = {}  # which cells each version occupies
+        self.wrong: list[str] = []
+        self.none = 0
+        self.diagnostics = client.subscribe(DiagnosticArray, "/diagnostics", keep=1)
+        self.plans = client.subscribe(Path, "plan")
+        self.publish(whole=True)
+        wait_for_map(self.diagnostics, Time(sec=1))
 
     def window(self) -> tuple[slice, slice]:
         """Return the box that changes."""
         x, y = self.corner
         return slice(y, y + WINDOW), slice(x, x + WINDOW)
 
-    def follow(self, robot: Cell) -> None:
-        """Move the window to the robot."""
-        x, y = (min(max(c - WINDOW // 2, REACH), SIDE - WINDOW - REACH) for c in robot)
-        self.corner = x, y
-
-    def change(self, robot: Cell, path: NDArray[np.int64], is_clear: bool) -> None:
+    def change(self) -> None:
         """Put obstacles on the path, where they do not touch the robot, in place of the old."""
-        box = self.window()
-        self.values[box] = self._still[box]
-        x, y = self.corner
-        in_window = path - (x - REACH, y - REACH)
+        if self.version % STAY == 0:
+            x, y = (min(max(c - WINDOW // 2, REACH), SIDE - WINDOW - REACH) for c in self.robot)
+            self.corner = x, y
+        box, path = self.window(), np.array(self.path)
+        self.values[box] = self.still[box]
+        in_window = path - np.array(self.corner) + REACH
         inside = ((in_window >= 2 * REACH) & (in_window < WINDOW)).all(axis=1)
-        away = np.hypot(*(path - robot).T) > 9
-        places = in_window[inside & away]
-        if is_clear or not len(places):
+        places = in_window[inside & (np.hypot(*(path - self.robot).T) > 9)]
+        if self.version % STAY < STAY - 1 and len(places):
+            wide = tuple(slice(side.start - REACH, side.stop + REACH) for side in box)
+            obstacles = self.walls[wide].copy()
+            for x, y in self.random.choice(places, 2):
+                obstacles[y : y + 2, x : x + 2] = True
+            self.values[box] = inflated(obstacles)[REACH:-REACH, REACH:-REACH]
+        self.version += 1
+        self.publish(whole=False)
+
+    def publish(self, whole: bool) -> None:
+        """Publish the costmap or its window, stamped with its version."""
+        self.kept[self.version] = self.values >= 99
+        self.kept.pop(self.version - OLD, None)
+        if whole or OccupancyGridUpdate is None:
+            self.client.publish("map", map_message(self.values, self.grid, self.version), LATCHED)
             return
-        wide = tuple(slice(side.start - REACH, side.stop + REACH) for side in box)
-        obstacles = self._walls[wide].copy()
-        for place_x, place_y in self._random.choice(places, 2):
-            obstacles[place_y : place_y + 2, place_x : place_x + 2] = True
-        self.values[box] = inflated(obstacles)[REACH:-REACH, REACH:-REACH]
+        stamp, (x, y) = Time(sec=self.version), self.corner
+        update: Any = OccupancyGridUpdate(header=Header(frame_id="map", stamp=stamp), x=x, y=y)
+        update.width = update.height = WINDOW
+        update.data = array.array("b", self.values[self.window()].tobytes())
+        self.client.publish("map_updates", update)
 
+    def new_plan(self) -> list[Cell]:
+        """Return the plan from where the robot is now, by the service or by the topic."""
+        if self.by_service:
+            request = plan_request(self.grid, self.robot, self.goal)
+            answer = self.client.call(GetPlan, "planner/get_plan", request).plan
+            return cells_of(self.grid, answer)
+        if self.goal != self.sent_goal:
+            self.client.publish("goal_pose", pose(self.grid, self.goal))
+            self.sent_goal = self.goal
+        self.client.publish("initialpose", initial_pose(pose(self.grid, self.robot)))
+        asked = [self.robot, self.goal]
 
-def error(occupied: NDArray[np.bool_], cells: NDArray[np.int64], start: Cell, goal: Cell) -> str:
-    """Say what is wrong with a path on a costmap; "" if nothing is."""
-    if tuple(cells[0]) != start or tuple(cells[-1]) != goal:
-        return f"a path from {cells[0]} to {cells[-1]}"
-    (x, y), (next_x, next_y) = cells[:-1].T, cells[1:].T
-    if max(np.abs(next_x - x).max(initial=0), np.abs(next_y - y).max(initial=0)) > 1:
-        return "a step that is no move"
-    # A diagonal move needs both cells beside it; for a straight one these are its own two.
-    passed = occupied[next_y, next_x] | occupied[y, next_x] | occupied[next_y, x]
-    return f"through {cells[1:][passed][0]}" if passed.any() else ""
+        def answers(plan: Path) -> bool:
+            cells = cells_of(self.grid, plan)
+            return not cells or [cells[0], cells[-1]] == asked
+
+        return cells_of(self.grid, self.plans.wait(answers))
+
+    def step(self) -> float:
+        """Change the costmap, plan, and drive by a cell; return the plan's milliseconds."""
+        if np.hypot(*np.subtract(self.goal, self.robot)) < 100:
+            self.goal = tuple(self.random.choice(self.free).tolist())
+        heard = self.diagnostics.find()
+        known = int(float(values_of(heard.status[0])["map stamp (s)"])) if heard else 0
+        self.plans.clear()
+        self.change()
+        asked = time.perf_counter()
+        cells = self.new_plan()
+        milliseconds = 1e3 * (time.perf_counter() - asked)
+        if not cells:
+            self.none += 1
+            self.goal = self.robot
+            return milliseconds
+        errors = [
+            path_error(occupied, cells, self.robot, self.goal)
+            for version, occupied in self.kept.items()
+            if version >= known
+        ]
+        if all(errors):
+            self.wrong.append(f"on costmap {self.version}: {errors[-1]}")
+        self.path, self.robot = cells, cells[min(1, len(cells) - 1)]
+        return milliseconds
 
 
 def measure(seconds: float, by_service: bool) -> bool:
     """Drive through a costmap that changes; print a table, and return whether no path was wrong."""
-    random = np.random.default_rng(0)
-    costmap = Costmap(random)
-    grid = costmap.grid()
-    free = np.argwhere(grid.reachable([grid.free_cells()[0]], RULE))[:, ::-1]
-    robot: Cell = tuple(free[0].tolist())
-    costmap.follow(robot)
-    goal = sent_goal = robot
-    path = np.array([robot])
-    milliseconds: list[float] = []
-    wrong: list[str] = []
-    kept: dict[int, NDArray[np.bool_]] = {}
-    none = version = known = 0
     with (
         running_node("planner_node", "--log-level", "error", map_type="costmap") as planner,
         Client() as client,
     ):
-        diagnostics = client.subscribe(DiagnosticArray, "/diagnostics", keep=1)
-        plans = client.subscribe(Path, "plan")
-
-        def new_plan() -> Path:
-            """Return the plan from where the robot is now, by the service or by the topic."""
-            if by_service:
-                request = plan_request(grid, robot, goal)
-                return client.call(GetPlan, "planner/get_plan", request).plan
-            if goal != sent_goal:
-                client.publish("goal_pose", pose(grid, goal))
-            client.publish("initialpose", initial_pose(pose(grid, robot)))
-            return plans.wait(
-                lambda plan: (
-                    not plan.poses
-                    or [cell_of(grid, plan.poses[end]) for end in (0, -1)] == [robot, goal]
-                )
-            )
-
-        def publish(whole: bool) -> None:
-            stamp = Time(sec=version)
-            kept[version] = costmap.values >= 99
-            kept.pop(version - OLD, None)
-            if whole or OccupancyGridUpdate is None:
-                client.publish("map", map_message(costmap.values, grid, version), LATCHED)
-                return
-            update: Any = OccupancyGridUpdate(header=Header(frame_id="map", stamp=stamp))
-            update.x, update.y = costmap.corner
-            update.width = update.height = WINDOW
-            update.data = array.array("b", costmap.values[costmap.window()].tobytes())
-            client.publish("map_updates", update)
-
-        version = 1
-        publish(whole=True)
-        wait_for_map(diagnostics, Time(sec=1))
-        began = time.monotonic()
-        computed = cpu_seconds(planner.pid)
+        drive, milliseconds = Drive(client, by_service), []
+        began, computed = time.monotonic(), cpu_seconds(planner.pid)
         while (now := time.monotonic()) < began + seconds:
-            if np.hypot(*np.subtract(goal, robot)) < 100:
-                goal = tuple(random.choice(free).tolist())
-            if version % STAY == 0:
-                costmap.follow(robot)
-            costmap.change(robot, path, is_clear=version % STAY >= STAY - 1)
-            heard = diagnostics.find()
-            if heard:
-                known = int(float(values_of(heard.status[0])["map stamp (s)"]))
-            version += 1
-            plans.clear()
-            publish(whole=False)
-            asked = time.perf_counter()
-            answer, sent_goal = new_plan(), goal
-            milliseconds.append(1e3 * (time.perf_counter() - asked))
-            cells = np.array(cells_of(grid, answer))
-            if len(cells):
-                possible = [v for v in kept if v >= known]
-                errors = [error(kept[v], cells, robot, goal) for v in possible]
-                if all(errors):
-                    wrong.append(f"on costmap {version}: {errors[-1]}")
-                path = cells
-                robot = tuple(cells[min(1, len(cells) - 1)].tolist())
-            else:
-                none += 1
-                goal = robot
+            milliseconds.append(drive.step())
             time.sleep(max(0.0, now + 1 / RATE - time.monotonic()))
         took = time.monotonic() - began
         share = (cpu_seconds(planner.pid) - computed) / took
-    for line in wrong[:10]:
-        print(line)
     kind = "full costmaps" if OccupancyGridUpdate is None else f"updates of {WINDOW} x {WINDOW}"
     median, slow = np.percentile(milliseconds, (50, 99))
+    count = len(milliseconds)
     print(
-        f"{SIDE} x {SIDE} cells, {version - 1} {kind} in {took:.0f} s, {(version - 1) / took:.1f} "
-        f"per second, a plan after each by {'get_plan' if by_service else 'the topic plan'}\n"
-        f"  paths {len(milliseconds) - none}, none {none}, wrong {len(wrong)}\n"
-        f"  latency median {median:.1f} ms, 99 % {slow:.1f} ms\n"
+        *drive.wrong[:10],
+        f"{SIDE} x {SIDE} cells, {count} {kind} in {took:.0f} s, {count / took:.1f} per second, "
+        f"a plan after each by {'get_plan' if by_service else 'the topic plan'}",
+        f"  paths {count - drive.none}, none {drive.none}, wrong {len(drive.wrong)}",
+        f"  latency median {median:.1f} ms, 99 % {slow:.1f} ms",
         f"  the planner computes {share:.2f} of the time of one core",
+        sep="\n",
         flush=True,
     )
-    return not wrong
+    return not drive.wrong
 
 
 def main(arguments: Sequence[str]) -> int:
