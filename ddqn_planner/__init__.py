@@ -24,17 +24,16 @@ __all__ = [
     "simplify",
 ]
 
+_LAYERS = {"Experience": "experience"}
+_LAYERS |= dict.fromkeys(("GridMap", "MoveRule", "inflate", "load_map"), "grid")
+"""Where a name is, unless in `planning`."""
+
 
 def __getattr__(name: str) -> Any:
     """Import a public name at its first use, so that a program loads only what it uses."""
     if name not in __all__:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    layer = "planning"
-    if name in ("GridMap", "MoveRule", "inflate", "load_map"):
-        layer = "grid"
-    elif name == "Experience":
-        layer = "experience"
-    value = getattr(import_module(f"{__name__}.{layer}"), name)
+    value = getattr(import_module(f"{__name__}.{_LAYERS.get(name, 'planning')}"), name)
     globals()[name] = value
     return value
 

@@ -16,7 +16,7 @@ from dataclasses import fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
-from ddqn_planner.files import claim, write_csv
+from ddqn_planner.files import WorkFolder, write_csv
 from ddqn_planner.libraries import with_remedy
 from ddqn_planner.resources import find_map
 
@@ -305,7 +305,7 @@ def learn(parser: argparse.ArgumentParser, arguments: Sequence[str]) -> int:
             if not (source / RECORD).is_file():
                 remedy = "give a trainer's folder, or the .mcap file in a bag's"
                 raise ValueError(f"{source} holds no {RECORD}; {remedy}")
-            stack.enter_context(claim(source, [LOCK, RECORD], "drives", "records"))
+            stack.callback(WorkFolder(source, [LOCK, RECORD], "drives", "records").close)
         drives = _read_drives(source, options)
         for drive in drives:
             drive.teach(experience, grid)

@@ -15,7 +15,10 @@ _importing = Lock()
 
 
 def compiled(function: Function) -> Function:
-    """Compile a function at its first call, with the functions of this kind that it calls."""
+    """Compile a function at its first call, with the functions of this kind that it calls.
+
+    The code is kept for other processes where a folder is writable.
+    """
 
     @cache
     def dispatcher() -> Any:
@@ -23,7 +26,13 @@ def compiled(function: Function) -> Function:
         for name in function.__code__.co_names:
             if hasattr(scope.get(name), "dispatcher"):
                 scope[name] = scope[name].dispatcher()
-        return compiled_now(FunctionType(function.__code__, scope))
+        to_compile = FunctionType(function.__code__, scope)
+        with _importing:
+            numba = _import_numba()
+        try:
+            return numba.njit(cache=True, nogil=True)(to_compile)
+        except RuntimeError:  # no folder is writable: each process compiles again
+            return numba.njit(nogil=True)(to_compile)
 
     @wraps(function)
     def call(*arguments: Any) -> Any:
@@ -33,20 +42,7 @@ def compiled(function: Function) -> Function:
     return cast(Function, call)
 
 
-def compiled_now(function: Function) -> Function:
-    """Import numba, and compile a function for its first call.
-
-    The code is kept for other processes where a folder is writable.
-    """
-    numba = _import_numba()
-    try:
-        with_cache: Function = numba.njit(cache=True, nogil=True)(function)
-        return with_cache
-    except RuntimeError:  # no folder is writable: each process compiles again
-        without_cache: Function = numba.njit(nogil=True)(function)
-        return without_cache
-
-
+@cache
 def _import_numba() -> Any:
     """Import numba without scipy.linalg, which takes 0.2 s and no function here needs.
 
@@ -54,23 +50,15 @@ def _import_numba() -> Any:
     one: the first check can be left out.
     """
     import numba
+    from numba.core import event
     from numba.np import linalg
 
-    with _importing:
-        _announce_compiling()
-        check = linalg.ensure_blas
-        linalg.ensure_blas = lambda: None
-        try:
-            from numba.np import arraymath  # noqa: F401
-        finally:
-            linalg.ensure_blas = check
-    return numba
-
-
-@cache
-def _announce_compiling() -> None:
-    """Log once when a function is compiled: loaded from the cache it would take no time."""
-    from numba.core import event
+    check = linalg.ensure_blas
+    linalg.ensure_blas = lambda: None
+    try:
+        from numba.np import arraymath  # noqa: F401
+    finally:
+        linalg.ensure_blas = check
 
     class Announcement(event.Listener):
         def on_start(self, compiling: Any) -> None:
@@ -82,11 +70,12 @@ def _announce_compiling() -> None:
             pass
 
     event.register("numba:compile", Announcement())  # type: ignore[no-untyped-call]
+    return numba
 
 
 @cache
 def _announce(is_kept: bool) -> None:
-    """Log a line, which Python prints to stderr where the program has set up no logging."""
+    """Log once that a function is compiled: loaded from the cache it would take no time."""
     kept = "the result is kept for the next start"
     lost = "set NUMBA_CACHE_DIR to a folder that can be written to keep the result"
     logging.getLogger("ddqn_planner").warning(

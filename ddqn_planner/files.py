@@ -4,16 +4,15 @@ from __future__ import annotations
 
 import csv
 import fcntl
-import glob
 import io
 import os
 import re
 import reprlib
 import secrets
 from collections.abc import Iterable, Iterator, Sequence
-from contextlib import ExitStack, closing, contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any
 
 TEMPORARY = re.compile(r"\..+\.[0-9a-f]{16}")
 """The name of a file that is being written."""
@@ -147,28 +146,3 @@ class Appender:
     def close(self) -> None:
         """Close the file."""
         self._file.close()
-
-
-# `WorkFolder` replaces what follows.
-
-
-def remove_temporaries(path: Path) -> None:
-    """Remove the temporary files that killed processes left beside `path`."""
-    for temporary in path.parent.glob(f".{glob.escape(path.name)}.*"):
-        temporary.unlink(missing_ok=True)
-
-
-def lock(path: Path) -> BinaryIO:
-    """Lock a file until the returned file is closed; BlockingIOError if it is locked already."""
-    file = path.open("ab")
-    try:
-        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BaseException:
-        file.close()
-        raise
-    return file
-
-
-def claim(folder: Path, marks: Sequence[str], content: str, works: str) -> closing[WorkFolder]:
-    """Lock a folder while the block runs."""
-    return closing(WorkFolder(folder, marks, content, works))

@@ -6,24 +6,24 @@ from typing import Final
 
 ROS: Final = "install ROS 2 Jazzy and source it, or in the repository: pip install '.[ros]'"
 
-TRAINING: Final = "pip install torch gymnasium"
-
-REMEDIES: Final = {
-    "gymnasium": TRAINING,
-    "matplotlib": "pip install matplotlib",
-    "mcap": "pip install mcap-ros2-support",
-    "mcap_ros2": "pip install mcap-ros2-support",
-    "numba": "pip install numba",
-    "rclpy": ROS,
-    "safetensors": "pip install safetensors",
-    "torch": TRAINING,
+PACKAGES: Final = {
+    "gymnasium": "torch gymnasium",
+    "matplotlib": "matplotlib",
+    "mcap": "mcap-ros2-support",
+    "mcap_ros2": "mcap-ros2-support",
+    "numba": "numba",
+    "rerun": "'rerun-sdk>=0.39'",
+    "safetensors": "safetensors",
+    "torch": "torch gymnasium",
 }
-"""By module, except those of ROS's messages."""
+"""What to give to pip, by module."""
 
 
 def with_remedy(error: Exception) -> str:
     """Return what an error says, and what to install if it is a missing library."""
     library = (getattr(error, "name", None) or "").partition(".")[0]
-    of_ros = library.endswith(("_interfaces", "_msgs", "_srvs"))
-    remedy = ROS if of_ros else REMEDIES.get(library)
-    return f"{error}; {remedy}" if remedy else str(error)
+    if library == "rclpy" or library.endswith(("_interfaces", "_msgs", "_srvs")):
+        return f"{error}; {ROS}"
+    if library in PACKAGES:
+        return f"{error}; pip install {PACKAGES[library]}"
+    return str(error)

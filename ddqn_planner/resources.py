@@ -1,7 +1,7 @@
 """Finds the maps and models that come with the package.
 
-They lie beside its code, however it was installed; in the source tree ``maps`` and ``models`` there
-are links to the folders at the top. The copies in ``share/ddqn_planner`` are only for ROS tools.
+They lie beside its code, however it was installed; in the source tree they are links. The copies in
+``share/ddqn_planner`` are only for ROS tools.
 """
 
 from __future__ import annotations
@@ -13,10 +13,7 @@ PACKAGE = "ddqn_planner"
 
 
 def find_resource(folder: str, name: str) -> Path:
-    """Return the path of a file of the folder ``"maps"`` or ``"models"``.
-
-    The FileNotFoundError for a wrong name, with its ending, names the files that are there.
-    """
+    """Return the path of a file of ``"maps"`` or ``"models"``; a FileNotFoundError lists all."""
     directory = Path(__file__).parent / folder
     if os.path.isfile(directory / name):
         return directory / name
@@ -25,24 +22,11 @@ def find_resource(folder: str, name: str) -> Path:
 
 
 def find_map(name: str) -> Path:
-    """Return the file of a map, given its path, its URL or the name of a shipped map.
+    """Return the file of a map: a path, a ``file://`` or ``package://`` URL, or a shipped map.
 
-    Parameters
-    ----------
-    name : str
-        A path, a ``file://`` or ``package://`` URL, or the name of a map that comes with this
-        package, with or without its ending. A file of the same name in the working directory has
-        priority.
-
-    Returns
-    -------
-    Path
-        It may be missing, unless it is a shipped map: whoever reads it reports that.
-
-    Raises
-    ------
-    FileNotFoundError
-        If there is no shipped map of that name, no such package, or if a URL leads out of it.
+    A shipped map may be named without its ending; a file of that name in the working directory has
+    priority. A file that is not shipped may be missing: whoever reads it reports that. A
+    FileNotFoundError if there is no such shipped map or package, or if a URL leads out of it.
     """
     path = Path(name.removeprefix("file://"))
     if name.startswith("package://"):

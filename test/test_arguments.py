@@ -156,7 +156,7 @@ def test_cells_outside_the_map_and_fractions_are_refused(cell: Any) -> None:
     for call in calls:
         with pytest.raises(ValueError, match=r"outside the map of 7 x 5|give two whole numbers"):
             call()
-    with pytest.raises(ValueError, match=r"hold 0\.5"):
+    with pytest.raises(ValueError, match=r"holds 0\.5"):
         Plan(PlanStatus.SUCCEEDED, [(0.5, 0)])  # type: ignore[arg-type]
 
 

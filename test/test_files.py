@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from ddqn_planner.files import Appender, remove_temporaries, write_atomically
+from ddqn_planner.files import Appender, WorkFolder, write_atomically
 
 
 @contextmanager
@@ -57,9 +57,11 @@ def test_a_kill_leaves_a_complete_file_and_a_temporary_that_can_be_removed(tmp_p
             writer.send_signal(signal.SIGKILL)
         assert path.read_bytes() == b"whole" * 100_000
         left = len(list(tmp_path.iterdir())) - 1
-    (tmp_path / ".another").touch()
-    remove_temporaries(path)
-    assert sorted(tmp_path.iterdir()) == [tmp_path / ".another", path]
+    others = [tmp_path / name for name in (".another", ".file.swp", "file.0123456789abcdef")]
+    for other in others:
+        other.touch()
+    WorkFolder(tmp_path, ["file"], "files", "writes").close()
+    assert sorted(tmp_path.iterdir()) == sorted([*others, path])
 
 
 def test_a_new_file_has_the_mode_of_any_other(tmp_path: Path) -> None:
@@ -81,10 +83,3 @@ def test_records_stay_complete_while_the_disk_is_full_for_a_time(tmp_path: Path)
     records.append(b"fourth\n")
     records.close()
     assert path.read_bytes() == b"first\nsecond\nthird\nfourth\n"
-
-
-def test_only_the_temporaries_of_that_file_are_removed(tmp_path: Path) -> None:
-    (tmp_path / ".file_1.0").touch()
-    (tmp_path / ".file_[1].0").touch()
-    remove_temporaries(tmp_path / "file_[1]")
-    assert list(tmp_path.iterdir()) == [tmp_path / ".file_1.0"]

@@ -82,7 +82,7 @@ else:
 def test_compiling_is_announced_once_and_a_load_from_the_cache_is_not(tmp_path: Path) -> None:
     code = """if True:
         import numpy as np
-        from ddqn_planner.grid.labels import _labels
+        from ddqn_planner.grid.moves import _labels
         for kind in (bool, np.uint8):
             _labels(np.zeros((2, 2), kind), 1)
     """

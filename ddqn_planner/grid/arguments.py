@@ -109,9 +109,15 @@ def as_flag(name: str, value: Any) -> bool:
 
 
 def numbers(
-    name: str, values: ArrayLike, shape: tuple[int, ...] | None = None, kinds: str = "iuf"
+    name: str,
+    values: ArrayLike,
+    shape: tuple[int, ...] | None = None,
+    kinds: str = "iuf",
+    between: tuple[float, float] | None = None,
+    whole: bool = True,
+    remedy: str = "",
 ) -> NDArray[Any]:
-    """Return an array of numbers, of one shape."""
+    """Return an array of one shape and of some kinds of numbers, or of those in a range."""
     try:
         array = np.asarray(values)
     except ValueError as error:  # rows of different lengths
@@ -120,30 +126,21 @@ def numbers(
         raise ValueError(f"{name} has shape {array.shape}; give {shape}")
     if array.dtype.kind not in kinds:
         raise ValueError(f"{name}: the elements are of type {array.dtype}; give numbers")
-    return array
-
-
-def whole_numbers(
-    name: str, values: ArrayLike, lowest: int, highest: int, shape: tuple[int, ...] | None = None
-) -> NDArray[Any]:
-    """Return an array of whole numbers from `lowest` to `highest`; its dtype stays as it is."""
-    array = numbers(name, values, shape)
-    whole = array.dtype.kind != "f" or (array == np.floor(array)).all()  # False for NaN
-    if whole and (array.size == 0 or lowest <= array.min() <= array.max() <= highest):
+    if between is None or array.dtype.kind == "b" or array.size == 0:
         return array
-    valid = (array >= lowest) & (array <= highest) & (array == np.floor(array))
-    wrong = array[~valid].flat[0]
-    raise ValueError(f"{name} hold {wrong}; give whole numbers {lowest}..{highest}")
+    lowest, highest = between
+    fractions = whole and array.dtype.kind == "f" and not (array == np.floor(array)).all()
+    if fractions or not lowest <= array.min() <= array.max() <= highest:  # or NaN
+        right = (array >= lowest) & (array <= highest) & (not whole or array == np.floor(array))
+        remedy = remedy or f"{'whole numbers ' if whole else ''}{lowest:g} to {highest:g}"
+        raise ValueError(f"{name} holds {array[~right].flat[0]}; give {remedy}")
+    return array
 
 
 def as_mask(name: str, cells: ArrayLike, shape: tuple[int, ...] | None = None) -> Occupancy:
     """Return a copy in C order, (H, W) bool."""
-    array = numbers(name, cells, shape, "biuf")
+    remedy = "True or False (for percent, see from_occupancy_values)"
+    array = numbers(name, cells, shape, "biuf", (0, 1), remedy=remedy)
     if array.ndim != 2 or array.size == 0:
         raise ValueError(f"{name} has shape {array.shape}; give (H, W) with H, W >= 1")
-    mask = array.astype(np.bool_, order="C")
-    if array.dtype.kind != "b" and (wrong := array[array != mask]).size:
-        raise ValueError(
-            f"{name} holds {wrong[0]}; give True or False (for percent, see from_occupancy_values)"
-        )
-    return mask
+    return array.astype(np.bool_, order="C")

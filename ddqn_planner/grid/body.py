@@ -1,14 +1,17 @@
-"""The robot's body: which cells are too near to an obstacle, and which are better avoided."""
+"""The robot's body: which cells are too near to an obstacle, and which are better avoided.
+
+`inflate` finds them, or Nav2 has found them in a costmap.
+"""
 
 from __future__ import annotations
 
 import sys
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from ddqn_planner.grid.arguments import OCCUPIED, UNKNOWN, Occupancy, as_number
-from ddqn_planner.grid.grid_map import GridMap, check_grid
+from ddqn_planner.grid.grid_map import MAX_COST_MULTIPLIER, GridMap, check_grid
 
 CLEARANCE_SCALE = 1.0
 """Metres beyond the body over which the cost near an obstacle falls to an eighth.
@@ -19,6 +22,19 @@ distances. See docs/tuning.md."""
 
 ROUNDING = 1e-6
 """A message has the resolution as float32: 0.2 m must be 4 cells of 0.05 m, not 3.9999999."""
+
+INSCRIBED = 99
+"""The value of a cell that is free, but so near to an obstacle that the robot would touch it."""
+
+_COSTMAP_COST = 1 + (np.arange(INSCRIBED) - 1) * 251 / 97
+"""The smallest cost of a costmap, 1 to 252, that its publisher writes as each value, 1 to 98."""
+
+_MULTIPLIER = (50 + 0.8 * _COSTMAP_COST) / 50
+"""NavFn's cost of a cell beside its neutral cost: from 1 to 5."""
+
+_COSTS = np.rint((_MULTIPLIER - 1) / (MAX_COST_MULTIPLIER - 1) * OCCUPIED).clip(0, OCCUPIED - 1)
+_COSTS = np.append(_COSTS, UNKNOWN).astype(np.int8)
+"""(100,) int8: the cost in a `GridMap` of each value, 0 to 98, and last of an unknown cell, -1."""
 
 
 def clearance(obstacles: Occupancy) -> NDArray[np.float64]:
@@ -136,3 +152,25 @@ def _around(cells: NDArray[np.bool_], margin: int) -> tuple[slice, ...]:
     """Return the box of some cells, with a margin."""
     ends = [np.flatnonzero(cells.any(axis=axis))[[0, -1]] for axis in (1, 0)]
     return tuple(slice(max(first - margin, 0), last + margin + 1) for first, last in ends)
+
+
+def grid_from_costmap(
+    values: ArrayLike,
+    resolution: float = 1.0,
+    origin: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    allow_unknown: bool = False,
+) -> GridMap:
+    """Make a grid map from the values of a costmap that Nav2 publishes as an ``OccupancyGrid``.
+
+    A cell of value 100 is an obstacle. One of 99 is too near to an obstacle for the robot's body:
+    it is occupied, and a robot that starts there may leave. Values of 1 to 98 become costs as in
+    Nav2's NavFn planner: 50 for a free cell plus 0.8 times the costmap's cost, 0 to 252. Unknown
+    cells, if they are free, have the highest cost. The rest is as for
+    `GridMap.from_occupancy_values`.
+    """
+    grid = GridMap.from_occupancy_values(
+        values, resolution, origin, INSCRIBED, allow_unknown, use_map_costs=True
+    )
+    assert grid.cost is not None
+    obstacles = grid.occupancy & (np.asarray(values) != INSCRIBED)
+    return grid.with_layers(cost=_COSTS.take(grid.cost, mode="wrap"), obstacles=obstacles)

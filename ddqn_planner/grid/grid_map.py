@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
@@ -27,10 +27,8 @@ from ddqn_planner.grid.arguments import (
     listed,
     numbers,
     real,
-    whole_numbers,
 )
-from ddqn_planner.grid.labels import component_labels, flood
-from ddqn_planner.grid.moves import MoveRule, legal_moves
+from ddqn_planner.grid.moves import MoveRule, component_labels, flood, legal_moves
 
 MAX_COST_MULTIPLIER = 5.0
 """The cost multiplier of a cell of value 100, and of an unknown cell.
@@ -43,7 +41,9 @@ _MULTIPLIERS = np.linspace(1, MAX_COST_MULTIPLIER, OCCUPIED + 1, dtype=np.float3
 
 @dataclass(frozen=True, eq=False)
 class GridMap:
-    """A map of free and occupied cells. It keeps read-only copies of the arrays.
+    """A map of free and occupied cells, which keeps read-only copies of the arrays.
+
+    Here and in all methods, a ValueError names what is wrong and what would be right.
 
     Parameters
     ----------
@@ -58,9 +58,8 @@ class GridMap:
         Cost of each free cell: 0..99, or -1 for an unknown cell; see `cost_multiplier`. Values of
         occupied cells are ignored and become 0. By default all free cells cost the same.
     obstacles : (H, W) bool, optional
-        Which occupied cells are obstacles. The others are only too near to an obstacle for the
-        robot's body, and a robot that starts there may leave; `inflate` makes such maps. By default
-        all occupied cells are obstacles.
+        Which occupied cells are obstacles, by default all. The others are only too near to an
+        obstacle for the robot's body, and a robot that starts there may leave; see `inflate`.
     forbidden : (H, W) array of whole numbers 0..255, optional
         One-way zones: action a must not leave a cell where bit a is set, ``forbidden >> a & 1``.
         The actions are those of `MOVES`, in the directions of the map's own x and y. A cell may
@@ -68,15 +67,9 @@ class GridMap:
         with dx = -1) lets a robot drive through it toward greater x, and not back. Directions
         belong to the place: they stay where a cell becomes occupied or free.
     slowness : (H, W) float32, optional
-        The expected time in each cell over that at nominal speed, 1 to 100. It multiplies the
-        cost; see `with_slowness`.
+        The expected time in each cell over that at nominal speed, 1 to 100; it multiplies the cost.
     seconds_per_cell : float, optional
         The time for the length of a cell at nominal speed: with it, `Plan.cost` is in seconds.
-
-    Raises
-    ------
-    ValueError
-        If a shape, a number, a cost or a direction is wrong, or if an obstacle lies on a free cell.
     """
 
     occupancy: Occupancy
@@ -100,14 +93,15 @@ class GridMap:
                 raise ValueError("obstacles lie on free cells; give some within the occupied cells")
             self._set(obstacles=obstacles)
         if self.forbidden is not None:
-            name, shape = "forbidden directions", occupancy.shape
-            forbidden = whole_numbers(name, self.forbidden, 0, 255, shape)
-            copy = forbidden.astype(np.uint8, order="C") if forbidden.any() else None
-            self._set(forbidden=copy)
+            bits = numbers("forbidden", self.forbidden, occupancy.shape, between=(0, 255))
+            self._set(forbidden=bits.astype(np.uint8, order="C") if bits.any() else None)
         if self.slowness is not None:
-            self._set(slowness=_slowness(self.slowness, occupancy.shape))
+            slowest = 1, MAX_SLOWNESS
+            slowness = numbers("slowness", self.slowness, occupancy.shape, "iuf", slowest, False)
+            self._set(slowness=slowness.astype(np.float32, order="C"))
         if self.seconds_per_cell is not None:
-            self._set(seconds_per_cell=_seconds(self.seconds_per_cell))
+            seconds = as_number("seconds_per_cell", self.seconds_per_cell, *POSITIVE, "more than 0")
+            self._set(seconds_per_cell=seconds)
 
     def _set(self, **layers: Any) -> None:
         for value in layers.values():
@@ -135,22 +129,16 @@ class GridMap:
         resolution, origin, forbidden
             As for `GridMap`.
         occupied_threshold : int
-            A cell of this value or more is occupied, 1..100. The default is the usual
-            ``occupied_thresh`` of map_server, in percent.
+            A cell of this value or more is occupied, 1..100; map_server has 65 by default.
         allow_unknown : bool
             Whether unknown cells are free.
         use_map_costs : bool
             Whether free cells keep their values as costs; otherwise all cost the same.
-
-        Raises
-        ------
-        ValueError
-            If the values, the threshold or the arguments of `GridMap` are wrong.
         """
         as_number("occupied_threshold", occupied_threshold, 1, OCCUPIED)
-        array = whole_numbers("occupancy values", values, -128, 127)
+        array = numbers("the array of values", values, between=(-128, 127))
         if array.dtype.kind == "f":  # these may be probabilities, 1.0 for occupied
-            raise ValueError(f"occupancy values are of type {array.dtype}; give integers, percent")
+            raise ValueError(f"the values are of type {array.dtype}; give integers, percent")
         array = array.astype(np.int8, copy=False)
         occupied = array >= occupied_threshold
         if not as_flag("allow_unknown", allow_unknown):
@@ -184,11 +172,6 @@ class GridMap:
         obstacles : (h, w) bool, optional
             Which of the new occupied cells are obstacles, as for `GridMap`; by default all. On a
             map without obstacles of its own they are ignored.
-
-        Raises
-        ------
-        ValueError
-            If the patch is empty or not inside the map, or its costs or obstacles are wrong.
         """
         patch = as_mask("occupancy", occupancy)
         left, bottom = as_cell((x, y), "the first cell of the patch")
@@ -213,11 +196,8 @@ class GridMap:
         )
 
     def with_slowness(self, slowness: NDArray[np.float32], seconds_per_cell: float) -> GridMap:
-        """Return the same map with other expected times, which shares its other arrays."""
-        return self.with_layers(
-            slowness=_slowness(slowness, self.occupancy.shape),
-            seconds_per_cell=_seconds(seconds_per_cell),
-        )
+        """Return the same map with other expected times."""
+        return replace(self, slowness=slowness, seconds_per_cell=seconds_per_cell)
 
     def with_layers(self, **layers: Any) -> GridMap:
         """Return the same map with other layers, which are neither checked nor copied."""
@@ -291,12 +271,10 @@ class GridMap:
         """Hexadecimal digest of size and cells; equal maps have the same digest."""
         digest = hashlib.sha256(f"{self.height}x{self.width}:".encode())
         digest.update(np.packbits(self.occupancy).tobytes())
-        if self.cost is not None:
-            digest.update(self.cost.tobytes())
-        if self.forbidden is not None:
-            digest.update(b"forbidden:" + self.forbidden.tobytes())
-        if self.slowness is not None:
-            digest.update(b"slowness:" + self.slowness.tobytes())
+        layers = (b"", self.cost), (b"forbidden:", self.forbidden), (b"slowness:", self.slowness)
+        for name, layer in layers:
+            if layer is not None:
+                digest.update(name + layer.tobytes())
         return digest.hexdigest()[:16]
 
     @cached_property
@@ -308,12 +286,10 @@ class GridMap:
     def same_cells(self, other: GridMap) -> bool:
         """Return whether all cells of two maps are equal, wherever the maps lie."""
         check_grid(other, "other")
+        names = "occupancy", "cost", "forbidden", "slowness"
         return self is other or (
-            _equal(self.slowness, other.slowness)
-            and self._checksum == other._checksum
-            and np.array_equal(self.occupancy, other.occupancy)
-            and _equal(self.cost, other.cost)
-            and _equal(self.forbidden, other.forbidden)
+            self._checksum == other._checksum
+            and all(_equal(getattr(self, name), getattr(other, name)) for name in names)
         )
 
     def contains(self, cell: Cell) -> bool:
@@ -385,20 +361,8 @@ def _costs(cost: ArrayLike, occupancy: Occupancy) -> NDArray[np.int8]:
         of_free *= ~occupancy  # fifty times as fast as the assignment below
     else:  # NaN times 0 is NaN
         of_free[occupancy] = 0
-    whole_numbers("costs of free cells", of_free, UNKNOWN, OCCUPIED - 1)
+    numbers("cost", of_free, between=(UNKNOWN, OCCUPIED - 1))
     return of_free.astype(np.int8, copy=False)
-
-
-def _slowness(slowness: ArrayLike, shape: tuple[int, ...]) -> NDArray[np.float32]:
-    array = numbers("slowness", slowness, shape)
-    if not 1 <= array.min() <= array.max() <= MAX_SLOWNESS:
-        wrong = array[~((array >= 1) & (array <= MAX_SLOWNESS))][0]
-        raise ValueError(f"slowness holds {wrong}; give 1 to {MAX_SLOWNESS:g}")
-    return array.astype(np.float32, order="C")
-
-
-def _seconds(seconds_per_cell: Any) -> float:
-    return as_number("seconds_per_cell", seconds_per_cell, *POSITIVE, "more than 0")
 
 
 def _replaced(array: NDArray[Any] | None, box: tuple[slice, slice], values: NDArray[Any]) -> Any:

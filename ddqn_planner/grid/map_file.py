@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from ddqn_planner.files import as_path, write_atomically
-from ddqn_planner.grid.arguments import OCCUPIED, UNKNOWN, Cell, cell_inside, whole_numbers
+from ddqn_planner.grid.arguments import OCCUPIED, UNKNOWN, Cell, cell_inside, numbers
 from ddqn_planner.grid.grid_map import GridMap
 
 MAX_CELLS = 2**26
@@ -25,10 +25,7 @@ MAX_CELLS = 2**26
 
 MAX_YAML_BYTES = 2**16
 
-NEGATE = {
-    **dict.fromkeys(("0", "n", "no", "false", "off"), False),
-    **dict.fromkeys(("1", "y", "yes", "true", "on"), True),
-}
+YES, NO = ("1", "y", "yes", "true", "on"), ("0", "n", "no", "false", "off")
 """Values of ``negate``: whether light pixels are occupied instead of dark ones."""
 
 LAYOUTS = {"1", "1;I", "L", "L;2", "L;4", "LA", "I;16B", "P", "P;1", "P;2", "P;4"}
@@ -75,7 +72,8 @@ class MapFile:
     forbidden: NDArray[np.uint8] | None = None
 
     def __post_init__(self) -> None:
-        values = whole_numbers("values", self.values, UNKNOWN, OCCUPIED).astype(np.int8)
+        values = numbers("the array of values", self.values, between=(UNKNOWN, OCCUPIED))
+        values = values.astype(np.int8)
         occupancy = values == OCCUPIED
         grid = GridMap(occupancy, self.resolution, self.origin, forbidden=self.forbidden)
         values.flags.writeable = False
@@ -382,8 +380,8 @@ def _percent_of_grey(document: dict[str, Any], mode: str) -> NDArray[np.int8]:
             f"free_thresh is {free_thresh}, occupied_thresh is {occupied_thresh}; give"
             " 0 <= free_thresh <= occupied_thresh <= 1"
         )
-    negate = NEGATE.get(_text(document, "negate"))
-    if negate is None:
+    negate = _text(document, "negate")
+    if negate not in YES + NO:
         raise ValueError(f"negate is {_short(document['negate'])}; give 0 or 1")
     grey = np.arange(256)
     if mode == "raw":
@@ -393,7 +391,7 @@ def _percent_of_grey(document: dict[str, Any], mode: str) -> NDArray[np.int8]:
     # map_server computes in single precision, and a grey value may equal a threshold.
     free, occupied = np.float32(free_thresh), np.float32(occupied_thresh)
     p = grey.astype(np.float32) / np.float32(255)
-    if not negate:
+    if negate in NO:
         p = np.float32(1) - p
     percent = np.full(256, -1.0)
     if mode == "scale" and free < occupied:

@@ -18,7 +18,7 @@ from std_msgs.msg import Header
 
 from ddqn_planner.grid import Cell, GridMap
 from ddqn_planner.grid.arguments import Cells
-from ddqn_planner.grid.costmap import grid_from_costmap
+from ddqn_planner.grid.body import grid_from_costmap
 from ddqn_planner.grid.map_file import MAX_CELLS
 
 if TYPE_CHECKING:

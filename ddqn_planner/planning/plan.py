@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ddqn_planner.grid import Cell, GridMap, MoveRule, path_length
-from ddqn_planner.grid.arguments import Cells, Choice, whole_numbers
+from ddqn_planner.grid.arguments import Cells, Choice, numbers
 
 
 class PlanStatus(Choice):
@@ -128,7 +128,7 @@ class Plan:
     def __post_init__(self) -> None:
         path = self.path
         if not isinstance(path, np.ndarray) or path.dtype != np.int32:  # cells do as well
-            path = whole_numbers("the path", path, -(2**31), 2**31 - 1).astype(np.int32)
+            path = numbers("the path", path, between=(-(2**31), 2**31 - 1)).astype(np.int32)
         if path.size and path.shape[1:] != (2,):
             raise ValueError(f"the path has shape {path.shape}; give (N, 2)")
         path = path.reshape(-1, 2)

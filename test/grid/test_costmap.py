@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as numpy_st
 
 from ddqn_planner.grid import GridMap, clearance
-from ddqn_planner.grid.costmap import grid_from_costmap
+from ddqn_planner.grid.body import grid_from_costmap
 from ddqn_planner.planning import Planner, PlanStatus
 
 RESOLUTION = 0.05
@@ -90,7 +90,7 @@ def test_a_patch_of_a_costmap_is_read_as_the_whole_costmap(
 
 @pytest.mark.parametrize("values", [[[0.5]], [[128]], [["a"]], [[None]]])
 def test_values_of_no_costmap_are_refused(values: object) -> None:
-    with pytest.raises(ValueError, match="occupancy values"):
+    with pytest.raises(ValueError, match="the array of values"):
         grid_from_costmap(values)  # type: ignore[arg-type]
 
 
