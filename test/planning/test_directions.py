@@ -26,8 +26,7 @@ from ddqn_planner.grid import (
 from ddqn_planner.planning import field as fields
 from ddqn_planner.planning import repair, simplify
 from ddqn_planner.planning.field import DistanceField, network_field
-from ddqn_planner.planning.path_under_way import is_path_valid, legal_segments, rest_of_path
-from ddqn_planner.planning.simplification import touched_cells
+from ddqn_planner.planning.paths import is_path_valid, legal_segments, rest_of_path, touched_cells
 
 RULES = st.sampled_from(list(MoveRule))
 NETWORK, METADATA = (lambda planner: (planner.network, planner.metadata))(Planner.load("any_map"))

@@ -14,15 +14,15 @@ from strategies import grids_with_costs, grids_with_free_cell
 from ddqn_planner import GridMap, MoveRule, Planner
 from ddqn_planner.grid import MOVES, Cell, legal_moves, path_cost, shortest_path
 from ddqn_planner.planning import Plan, PlanRequest, simplify
-from ddqn_planner.planning.path_under_way import (
+from ddqn_planner.planning.paths import (
     REACH,
     is_path_valid,
     keep_or_switch,
     legal_segments,
     rest_of_path,
+    touched_cells,
 )
 from ddqn_planner.planning.planner import last_step
-from ddqn_planner.planning.simplification import touched_cells
 
 RULES = st.sampled_from(list(MoveRule))
 GRIDS = grids_with_free_cell() | grids_with_costs()

@@ -12,7 +12,7 @@ from strategies import grids_with_costs, grids_with_free_cell
 
 from ddqn_planner.grid import Cell, GridMap, MoveRule, path_cost, path_length, shortest_path
 from ddqn_planner.planning import simplify
-from ddqn_planner.planning.simplification import segment_cost, touched_cells
+from ddqn_planner.planning.paths import segment_cost, touched_cells
 
 RULES = st.sampled_from(list(MoveRule))
 CELLS = st.tuples(st.integers(-12, 12), st.integers(-12, 12))

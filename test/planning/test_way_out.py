@@ -15,7 +15,7 @@ from strategies import grids_with_directions, grids_with_free_cell
 from ddqn_planner import GridMap, MoveRule, PlanMethod, Planner, PlanStatus, inflate
 from ddqn_planner.grid import Cell, path_length
 from ddqn_planner.planning import PlanRequest
-from ddqn_planner.planning.path_under_way import is_path_valid
+from ddqn_planner.planning.paths import is_path_valid
 from ddqn_planner.planning.planner import last_step
 
 RULES = st.sampled_from(list(MoveRule))
