@@ -9,11 +9,10 @@ from typing import Any, Final
 import goal_1
 import goal_3
 import numpy as np
-from profiles import MOVE_RULE
 from random_maps import generate_map
-from settings import Settings, median_and_range
-from tables import write_table
-from trainings import Training, rollouts, solved
+from settings import Settings
+from tables import median_and_range, write_table
+from trainings import MOVE_RULE, Training, rollouts, solved
 
 from ddqn_planner.grid import (
     OCCUPIED,
@@ -30,8 +29,6 @@ from ddqn_planner.planning import Planner
 from ddqn_planner.training.any_map import ANY_MAP, RULES, random_scenarios
 from ddqn_planner.training.environment import paper_scenario
 from ddqn_planner.training.evaluation import evaluate
-
-TITLE = "The model for any map"
 
 PAPERS_REWARD: Final = {"reward": "paper", "goal_reward": 10.0}
 VARIANTS: Final[dict[str, dict[str, Any]]] = {
@@ -61,11 +58,6 @@ ABLATION = (
 )
 
 
-def name(variant: str, steps: int) -> str:
-    """Return the name of the trainings of a variant."""
-    return f"any_map/{list(VARIANTS).index(variant)}/{steps}"
-
-
 def trainings(settings: Settings) -> list[Training]:
     """Return the trainings of the ablation. Each seed has maps of its own."""
     return [
@@ -78,15 +70,19 @@ def trainings(settings: Settings) -> list[Training]:
         )
         for variant, changes in VARIANTS.items()
         for steps in STEPS
-        for seed, folder in enumerate(settings.folders(name(variant, steps)))
+        for seed, folder in enumerate(settings.folders(_name(variant, steps)))
     ]
+
+
+def _name(variant: str, steps: int) -> str:
+    return f"any_map/{list(VARIANTS).index(variant)}/{steps}"
 
 
 def report(settings: Settings) -> str:
     """Write both tables, and return their Markdown."""
     zero_shot = _zero_shot(settings)
     rows = [
-        [variant, f"{steps:,}", *_row(settings.planners(name(variant, steps)))]
+        [variant, f"{steps:,}", *_row(settings.planners(_name(variant, steps)))]
         for variant in VARIANTS
         for steps in STEPS
     ]

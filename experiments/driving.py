@@ -1,93 +1,249 @@
-"""Measure what driving teaches, with many seeds, and write tables and figures."""
+"""Measure how much sooner a robot arrives that remembers how long places took.
+
+It drives missions in generated worlds with many seeds. Writes tables, figures and a report.
+"""
 
 from __future__ import annotations
 
 import argparse
+import os
 import sys
-from collections.abc import Sequence
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
-import matplotlib
+# Before NumPy is imported. On a busy machine, several threads are ten times as slow as one.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
-matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 import numpy as np
-from driving_worlds import KINDS, SPEED, drive
+from driving_worlds import (
+    KINDS,
+    SPEED,
+    STATIONS,
+    World,
+    drive,
+    generated_world,
+    make_world,
+    path_seconds,
+    slow_zones,
+    with_faults,
+)
+from figures import COLOURS, draw_curves, save_figure
 from matplotlib.colors import LogNorm
 from matplotlib.patheffects import withStroke
-from missions import (
-    LEARNED,
-    MOVED_AT,
-    PLANNERS,
-    RECOVERED,
-    SHORTEST,
-    STAGES,
-    Job,
-    Result,
-    jobs_of,
-    map_files,
-    run,
-    update_times,
-)
 from numpy.typing import NDArray
-from tables import write_table
+from random_maps import generate_map
+from tables import write_report, write_table
 from trainings import BACKENDS, in_parallel
 
 from ddqn_planner.cli import HelpFormatter, exit_code
 from ddqn_planner.experience import Experience
-from ddqn_planner.files import write_atomically
-from ddqn_planner.grid import MoveRule
+from ddqn_planner.grid import Cell, GridMap, MoveRule, inflate, load_map
+from ddqn_planner.grid.arguments import MAX_SLOWNESS
+from ddqn_planner.grid.noise import random_requests
 from ddqn_planner.pictures import draw_obstacles
 from ddqn_planner.planning import Planner
 
-BARS = {"1 to 20": 1.08, "21 to 50": 1.04, "51 to 100": 1.02}
-COLOURS = dict(zip(PLANNERS, ("#0072B2", "#777777", "#D55E00", "#009E73"), strict=True))
-VISITED = 0.95
-"""Uncertainty of a cell below which the robot was near."""
-SMOOTHED = 10
+Float64 = NDArray[np.float64]
+
+MISSIONS: Final = 150
+MOVED_AT: Final = 100
+"""The mission before which all slow zones move."""
+QUICK_MISSIONS: Final = 60
+FAULT_EVERY: Final = 900.0
+"""Seconds of driving from one fault to the next: four per hour, one of each kind on average."""
+ROBOT_RADIUS: Final = 0.2
+"""Metres, on maps from files."""
+
+STAGES: Final = {"1 to 20": (0, 20), "21 to 50": (20, 50), "51 to 100": (50, 100)}
+BARS: Final = ("1.08", "1.04", "1.02")
+"""What the learning planner should stay below in each stage."""
+MOVED_STAGES: Final = {
+    "91 to 100": (90, 100),
+    "101 to 110": (100, 110),
+    "111 to 120": (110, 120),
+    "121 to 140": (120, 140),
+    "141 to 150": (140, 150),
+}
+SMOOTHED: Final = 10
 """Missions that a point of the curve averages."""
+VISITED: Final = 0.95
+"""Uncertainty of a cell below which the robot was near."""
+
+LEARNED: Final = "learned"
+SHORTEST: Final = "shortest path"
+LAST: Final = "last time per cell"
+MEAN: Final = "mean per cell"
+PLANNERS: Final = (LEARNED, SHORTEST, LAST, MEAN)
 
 
-def report(
-    out: Path, seeds: int, quick: bool = False, maps: Path | None = None, backend: str = "loky"
-) -> str:
+@dataclass(frozen=True)
+class Job:
+    """A world and how the robot drives in it."""
+
+    kind: str
+    """A kind of generated map, or a map file."""
+    seed: int
+    missions: int
+    faults: bool = False
+    baselines: bool = True
+
+    def world(self) -> World:
+        """Return the world, always the same."""
+        if self.kind in KINDS:
+            return generated_world(self.kind, self.seed)
+        random = np.random.default_rng([self.seed, 1])
+        return make_world(inflate(load_map(self.kind), ROBOT_RADIUS), random)
+
+
+@dataclass(frozen=True)
+class Result:
+    """The missions of a job."""
+
+    job: Job
+    best: Float64
+    """(M,): expected seconds of the planner that knows."""
+    seconds: dict[str, Float64]
+    """Those of the planners."""
+    forecast: Float64
+    """(M, 4): measured seconds of the learning planner's drives, the expected time, its bounds."""
+
+    def ratio(self, planner: str, first: int, end: int) -> float:
+        """Return the total time over that of the planner that knows, over some missions."""
+        return float(self.seconds[planner][first:end].sum() / self.best[first:end].sum())
+
+
+class CellTimes:
+    """What the baselines remember: the last or the mean slowness of each cell."""
+
+    def __init__(self, grid: GridMap, is_mean: bool) -> None:
+        self.grid, self.is_mean = grid, is_mean
+        self.sum, self.count = np.ones(grid.occupancy.shape), np.zeros(grid.occupancy.shape)
+
+    def record(self, cells: Sequence[Cell], slowness: Float64) -> None:
+        """Learn from a drive."""
+        x, y = np.asarray(cells).T
+        self.sum[y, x] = slowness + (self.sum[y, x] * (self.count[y, x] > 0) * self.is_mean)
+        self.count[y, x] = self.count[y, x] * self.is_mean + 1
+
+    def apply(self) -> GridMap:
+        """Return a map whose moves cost what was seen."""
+        mean = self.sum / np.maximum(self.count, 1)
+        slowness = np.clip(mean, 1, MAX_SLOWNESS).astype(np.float32)
+        return self.grid.with_slowness(slowness, self.grid.resolution / SPEED)
+
+
+def run(job: Job) -> Result:
+    """Drive the missions of a job."""
+    world, planner = job.world(), Planner.load("any_map")
+    grid = world.grid
+    missions, noise, faults, moved = (np.random.default_rng([job.seed, n]) for n in range(4))
+    experience = Experience(SPEED)
+    memories = {LAST: CellTimes(grid, False), MEAN: CellTimes(grid, True)}
+    best: list[float] = []
+    seconds: dict[str, list[float]] = {name: [] for name in PLANNERS}
+    forecast: list[tuple[float, ...]] = []
+    clock, next_fault = 0.0, FAULT_EVERY / 2
+    for mission in range(job.missions):
+        if mission == MOVED_AT:
+            world.always = slow_zones(grid, moved)
+        start, goal = (world.stations[i] for i in missions.choice(STATIONS, 2, replace=False))
+        truth = world.slowness(clock)
+
+        def planned(on: GridMap, start: Cell = start, goal: Cell = goal) -> tuple[Cell, ...]:
+            return planner.plan(on, start, goal, MoveRule.ROBOT_SAFE).cells
+
+        best.append(path_seconds(planned(world.known(clock)), truth, grid))
+        cells = planned(experience.apply(grid))
+        seconds[LEARNED].append(path_seconds(cells, truth, grid))
+        measured = drive(cells, world, clock, noise)
+        forecast.append((measured.duration, *experience.expected_time(grid, cells)))
+        seen = measured
+        if job.faults and clock >= next_fault:
+            seen, next_fault = with_faults(measured, faults), next_fault + FAULT_EVERY
+        experience.record(seen.seconds, seen.positions)
+        if job.baselines:
+            seconds[SHORTEST].append(path_seconds(planned(grid), truth, grid))
+            for name, memory in memories.items():
+                cells = planned(memory.apply())
+                seconds[name].append(path_seconds(cells, truth, grid))
+                memory.record(cells, drive(cells, world, clock, noise).slowness)
+        clock += measured.duration
+    arrays = {name: np.array(values) for name, values in seconds.items() if values}
+    return Result(job, np.array(best), arrays, np.array(forecast))
+
+
+def measured_worlds(
+    kinds: Sequence[str], options: argparse.Namespace
+) -> tuple[list[Result], list[Result]]:
+    """Run each world as it is, and with faults; return the results of both."""
+    missions = QUICK_MISSIONS if options.quick else MISSIONS
+    worlds = [(kind, seed) for kind in kinds for seed in range(options.seeds)]
+    jobs = [Job(*world, missions) for world in worlds]
+    jobs += [Job(*world, min(missions, MOVED_AT), True, False) for world in worlds]
+    results = in_parallel(run, jobs, options.backend, "world")
+    return results[: len(worlds)], results[len(worlds) :]
+
+
+def report(out: Path, options: argparse.Namespace) -> str:
     """Run the experiment, write its tables, figures and ``report.md``, and return the text."""
+    maps = map_files(options.maps) if options.maps else []
     out.mkdir(parents=True, exist_ok=True)
-    results = in_parallel(run, jobs_of(KINDS, seeds, quick), backend, "world")
-    plain = [result for result in results if not result.job.faults]
-    faulty = [result for result in results if result.job.faults]
-    sections = [
-        _stages(out / "stages.csv", plain),
-        _worlds(out / "worlds.csv", plain),
-        _forecasts(out / "forecasts.csv", plain, faulty),
-        _faults(out / "faults.csv", plain, faulty),
-        _moved(out / "moved.csv", plain),
-        _times(out / "times.csv"),
-        _curve(out / "driving_curve.png", plain),
-        _picture(out / "driving_map.png"),
-    ]
-    if maps is not None:
-        results = in_parallel(run, jobs_of(map_files(maps), seeds, quick), backend, "world")
-        of_maps = [result for result in results if not result.job.faults]
-        sections.append("### Maps from files\n\n" + _stages(out / "maps.csv", of_maps))
-        sections.append(_worlds(out / "maps_worlds.csv", of_maps))
-    text = "\n\n".join(section for section in sections if section) + "\n"
-    write_atomically(out / "report.md", text.encode())
-    return text
+    plain, faulty = measured_worlds(KINDS, options)
+    both = {"as it is": plain, "with faults": faulty}
+    sections = {
+        "Time over the best possible": _stages(out / "stages.csv", plain),
+        "From mission to mission": _curve(out / "curve.png", plain),
+        "World by world": _worlds(out / "worlds.csv", plain),
+        "Expected times": _forecasts(out / "forecasts.csv", both),
+        "Faults": write_table(
+            out / "faults.csv",
+            ["drives", *STAGES],
+            [[name, *_medians(some, LEARNED, STAGES)] for name, some in both.items()],
+        ),
+        "Speed": _times(out / "times.csv"),
+        "True and learned slowness": _picture(out / "map.png"),
+    }
+    if not options.quick:
+        sections["When all slow zones move"] = write_table(
+            out / "moved.csv",
+            ["missions", *MOVED_STAGES],
+            [[name, *_medians(plain, name, MOVED_STAGES)] for name in PLANNERS],
+        )
+    if maps:
+        plain, _ = measured_worlds(maps, options)
+        sections["Maps from files"] = _stages(out / "maps.csv", plain)
+        sections["Maps from files, world by world"] = _worlds(out / "maps_worlds.csv", plain)
+    return write_report(out, sections, options.page)
+
+
+def map_files(folder: Path) -> list[str]:
+    """Return the ROS maps of a folder; a ValueError without one."""
+    files = sorted(map(str, folder.rglob("*.yaml")))
+    if not files:
+        raise ValueError(f"{folder}: found no ROS map (.yaml); check the path")
+    return files
 
 
 def _stages(path: Path, plain: Sequence[Result]) -> str:
-    """Return the time over that of the planner that knows: medians, and the worst world."""
-    rows = []
-    for name in PLANNERS:
-        row = [name]
+    """Return the time over that of the planner that knows: median, best and worst world."""
+    rows = [["bar", *BARS]]
+    for name in reversed(PLANNERS):
+        cells = []
         for stage in STAGES.values():
             ratios = [result.ratio(name, *stage) for result in plain]
-            row.append(f"{np.median(ratios):.3f} ({min(ratios):.3f} to {max(ratios):.3f})")
-        rows.append(row)
-    rows.append(["bar", *(f"{bar:.2f}" for bar in BARS.values())])
+            cells.append(f"{np.median(ratios):.3f} ({min(ratios):.3f} to {max(ratios):.3f})")
+        rows.insert(0, [name, *cells])
     return write_table(path, ["missions", *STAGES], rows)
+
+
+def _medians(
+    results: Sequence[Result], planner: str, stages: Mapping[str, tuple[int, int]]
+) -> list[str]:
+    return [f"{np.median([r.ratio(planner, *s) for r in results]):.3f}" for s in stages.values()]
 
 
 def _worlds(path: Path, plain: Sequence[Result]) -> str:
@@ -95,17 +251,16 @@ def _worlds(path: Path, plain: Sequence[Result]) -> str:
     rows = []
     for result in plain:
         ratios = [result.ratio(LEARNED, *stage) for stage in STAGES.values()]
-        end = MOVED_AT
-        shortest = result.ratio(LEARNED, 0, end) / result.ratio(SHORTEST, 0, end)
-        values = [f"{ratio:.3f}" for ratio in [*ratios, shortest]]
-        rows.append([Path(result.job.kind).stem, result.job.seed, *values])
+        ratios.append(result.ratio(LEARNED, 0, MOVED_AT) / result.ratio(SHORTEST, 0, MOVED_AT))
+        cells = [f"{ratio:.3f}" for ratio in ratios]
+        rows.append([Path(result.job.kind).stem, result.job.seed, *cells])
     return write_table(path, ["world", "seed", *STAGES, "over the shortest path"], rows)
 
 
-def _forecasts(path: Path, plain: Sequence[Result], faulty: Sequence[Result]) -> str:
+def _forecasts(path: Path, both: Mapping[str, Sequence[Result]]) -> str:
     """Return how far the expected time of a mission was from the measured one, after 50."""
     rows = []
-    for label, results in (("as it is", plain), ("with faults", faulty)):
+    for label, results in both.items():
         forecast = np.concatenate([result.forecast[50:MOVED_AT] for result in results])
         measured, expected, low, high = forecast.T
         error = np.abs(expected / measured - 1).mean()
@@ -116,73 +271,58 @@ def _forecasts(path: Path, plain: Sequence[Result], faulty: Sequence[Result]) ->
     return write_table(path, header, rows)
 
 
-def _faults(path: Path, plain: Sequence[Result], faulty: Sequence[Result]) -> str:
-    """Return what faults change."""
-    rows = []
-    for label, results in (("as it is", plain), ("with faults", faulty)):
-        medians = [
-            np.median([result.ratio(LEARNED, *stage) for result in results])
-            for stage in STAGES.values()
-        ]
-        rows.append([label, *(f"{median:.3f}" for median in medians)])
-    return write_table(path, ["drives", *STAGES], rows)
-
-
-def _moved(path: Path, plain: Sequence[Result]) -> str:
-    """Return the time after all slow zones moved; empty if the missions ended before."""
-    plain = [result for result in plain if result.job.missions >= RECOVERED[1]]
-    if not plain:
-        return ""
-    stages = {
-        "91 to 100": (90, 100),
-        "101 to 110": (100, 110),
-        "111 to 120": (110, 120),
-        "121 to 140": (120, 140),
-        "141 to 150": RECOVERED,
-    }
-    rows = []
-    for name in PLANNERS:
-        medians = [np.median([r.ratio(name, *stage) for r in plain]) for stage in stages.values()]
-        rows.append([name, *(f"{median:.3f}" for median in medians)])
-    return write_table(path, ["missions", *stages], rows)
-
-
 def _times(path: Path) -> str:
-    """Return how long an update takes."""
-    times = update_times()
-    times = np.column_stack([times, times.sum(axis=1)])
-    names = ("record", "apply", "plan again", "all")
-    rows = [
-        [name, f"{np.median(column):.1f}", f"{column.max():.1f}"]
-        for name, column in zip(names, times.T, strict=True)
-    ]
-    return write_table(
-        path, ["1,000 poses on 1000 x 1000 cells", "median [ms]", "worst [ms]"], rows
-    )
+    """Return how long it takes to learn from 1,000 poses on 1000 x 1000 cells, and to plan again.
+
+    It is the time of the processor: of `Experience.record`, of `Experience.apply`, and of
+    `Planner.plan` toward a goal of which the field of the last map is known.
+    """
+    random = np.random.default_rng(0)
+    occupancy = generate_map("office", (1000, 1000), random)
+    grid, planner = GridMap(occupancy, 0.05), Planner.load("any_map")
+    world = make_world(grid, random)
+    requests = random_requests(world.grid.occupancy, MoveRule.ROBOT_SAFE, 6, random)
+    goal, experience, clock = requests[0][1], Experience(SPEED), 0.0
+    times = []
+    for number in range(25):
+        cells = planner.plan(experience.apply(grid), requests[number % 6][0], goal).cells
+        measured = drive(cells[:1001], world, clock, random)
+        some = np.linspace(0, len(measured.seconds) - 1, 1000).astype(np.int64)
+        clock += measured.duration
+        began = [time.thread_time()]
+        experience.record(measured.seconds[some], measured.positions[some])
+        began.append(time.thread_time())
+        applied = experience.apply(grid)
+        began.append(time.thread_time())
+        planner.plan(applied, cells[: len(cells) // 2 + 1][-1], goal)
+        began.append(time.thread_time())
+        steps = 1e3 * np.diff(began)
+        times.append([*steps, steps.sum()])
+    columns = zip(("record", "apply", "plan again", "all"), np.array(times[5:]).T, strict=True)
+    rows = [[name, f"{np.median(ms):.1f}", f"{ms.max():.1f}"] for name, ms in columns]
+    header = ["1,000 poses on 1000 x 1000 cells", "median [ms]", "worst [ms]"]
+    return write_table(path, header, rows)
 
 
 def _curve(path: Path, plain: Sequence[Result]) -> str:
     """Draw the time over the best possible from mission to mission."""
+
+    def smoothed(seconds: Float64) -> Float64:
+        return np.convolve(seconds, np.ones(SMOOTHED), mode="valid")
+
     figure, axes = plt.subplots(figsize=(7.2, 3.6), layout="constrained")
+    curves = {}
     for name in PLANNERS:
-        ratios = np.array([_smoothed(r.seconds[name]) / _smoothed(r.best) for r in plain])
-        mission = np.arange(ratios.shape[1]) + SMOOTHED
-        axes.plot(mission, np.median(ratios, axis=0), color=COLOURS[name], linewidth=2, label=name)
-        if name == LEARNED:
-            low, high = np.quantile(ratios, (0.1, 0.9), axis=0)
-            axes.fill_between(mission, low, high, color=COLOURS[name], alpha=0.18, linewidth=0)
-    if mission[-1] > MOVED_AT:
+        worlds = [smoothed(result.seconds[name]) / smoothed(result.best) for result in plain]
+        curves[name] = worlds if name == LEARNED else [np.median(worlds, axis=0)]
+    missions = np.arange(len(curves[LEARNED][0])) + SMOOTHED
+    draw_curves(axes, missions, curves, "mission", "time over the best possible")
+    if missions[-1] > MOVED_AT:
         axes.axvline(MOVED_AT, color="black", linewidth=1, linestyle=":")
         axes.text(MOVED_AT + 1, axes.get_ylim()[1], "all slow zones move", va="top", fontsize=9)
     axes.axhline(1, color="black", linewidth=0.8)
-    axes.set(xlabel="mission", ylabel="time over the best possible")
     axes.legend(frameon=False)
-    axes.grid(alpha=0.3)
-    return _saved(figure, path, "Time over the best possible, from mission to mission")
-
-
-def _smoothed(seconds: NDArray[np.float64]) -> NDArray[np.float64]:
-    return np.convolve(seconds, np.ones(SMOOTHED), mode="valid")
+    return save_figure(figure, path, "Time over the best possible, from mission to mission")
 
 
 def _picture(path: Path, kind: str = "office", seed: int = 1, missions: int = 50) -> str:
@@ -190,40 +330,43 @@ def _picture(path: Path, kind: str = "office", seed: int = 1, missions: int = 50
     world, planner = Job(kind, seed, missions).world(), Planner.load("any_map")
     grid, experience, clock = world.grid, Experience(SPEED), 0.0
     random = np.random.default_rng(seed)
-    rule = MoveRule.ROBOT_SAFE
+
+    def planned(on: GridMap, start: Cell, goal: Cell) -> tuple[Cell, ...]:
+        return planner.plan(on, start, goal, MoveRule.ROBOT_SAFE).cells
+
     for _ in range(missions):
-        start, goal = (world.stations[i] for i in random.choice(len(world.stations), 2, False))
-        cells = planner.plan(experience.apply(grid), start, goal, rule).cells
-        measured = drive(cells, world, clock, random)
+        start, goal = (world.stations[i] for i in random.choice(STATIONS, 2, False))
+        measured = drive(planned(experience.apply(grid), start, goal), world, clock, random)
         experience.record(measured.seconds, measured.positions)
         clock += measured.duration
-    truth = world.slowness(clock)
-    grids = {
+    truth, known = world.slowness(clock), world.known(clock)
+
+    def saved(ends: tuple[Cell, Cell]) -> float:
+        """Return how much of a mission's time knowing saves."""
+        (x, y), (best_x, best_y) = (np.transpose(planned(on, *ends)) for on in (grid, known))
+        return float(truth[y, x].sum() - truth[best_y, best_x].sum())
+
+    start, goal = max(((a, b) for a in world.stations for b in world.stations if a < b), key=saved)
+    routes = {
         "shortest": (grid, "#555555", ":"),
-        "learned": (experience.apply(grid), COLOURS[LEARNED], "-"),
-        "best possible": (world.known(clock), "#CC79A7", "--"),
+        "learned": (experience.apply(grid), COLOURS[0], "-"),
+        "best possible": (known, COLOURS[3], "--"),
     }
-    stations = [(a, b) for a in world.stations for b in world.stations if a < b]
-
-    def seconds(on: Any, start: Any, goal: Any) -> float:
-        x, y = np.transpose(planner.plan(on, start, goal, rule).cells)
-        return float(truth[y, x].sum())
-
-    # The mission on which knowing matters most.
-    start, goal = max(stations, key=lambda s: seconds(grid, *s) - seconds(world.known(clock), *s))
-    figure, both = plt.subplots(1, 2, figsize=(11, 5.6), layout="constrained")
     visited = experience.uncertainty(grid) < VISITED
-    learned = np.where(visited, experience.slowness(grid), np.nan)
-    for axes, slowness, title in (
-        (both[0], truth, "what nobody told the robot: true slowness"),
-        (both[1], learned, f"what it learned from {missions} missions (grey: never there)"),
-    ):
+    panels: dict[str, Any] = {
+        "what nobody told the robot: true slowness": truth,
+        f"what it learned from {missions} missions (grey: never there)": np.where(
+            visited, experience.slowness(grid), np.nan
+        ),
+    }
+    figure, both = plt.subplots(1, 2, figsize=(11, 5.6), layout="constrained")
+    for axes, (title, slowness) in zip(both, panels.items(), strict=True):
         shown = np.where(grid.occupancy, np.nan, slowness)
         axes.set_facecolor("#e6e6e6")
         image = axes.imshow(shown, origin="lower", cmap="YlOrRd", norm=LogNorm(1, 8))
         draw_obstacles(axes, grid)
-        for name, (on, colour, style) in grids.items():
-            x, y = np.transpose(planner.plan(on, start, goal, rule).cells)
+        for name, (on, colour, style) in routes.items():
+            x, y = np.transpose(planned(on, start, goal))
             outline = [withStroke(linewidth=4, foreground="white")]
             axes.plot(x, y, style, color=colour, linewidth=2.2, label=name, path_effects=outline)
         axes.scatter(*np.transpose(world.stations), 40, color="black", zorder=4)
@@ -233,13 +376,7 @@ def _picture(path: Path, kind: str = "office", seed: int = 1, missions: int = 50
     bar.set_ticks([1, 2, 4, 8], labels=["1", "2", "4", "8"])
     bar.minorticks_off()
     figure.legend(*both[0].get_legend_handles_labels(), loc="outside lower center", ncols=3)
-    return _saved(figure, path, "True and learned slowness, and the routes")
-
-
-def _saved(figure: Any, path: Path, caption: str) -> str:
-    figure.savefig(path, dpi=110)
-    plt.close(figure)
-    return f"![{caption}]({path.name})"
+    return save_figure(figure, path, "True and learned slowness, and the routes")
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -252,18 +389,18 @@ def main(arguments: Sequence[str] | None = None) -> int:
     add("--quick", action="store_true", help="fewer missions, into the folder quick")
     words = "what drives the missions: this machine's cores, or a cluster"
     add("--backend", choices=BACKENDS, default="loky", help=words)
+    add("--page", type=Path, metavar="FILE", help="a page of the docs that gets the results too")
     options = parser.parse_args(arguments)
-    return exit_code(parser.prog, lambda: run_report(options))
 
+    def measure() -> int:
+        if options.seeds < 1:
+            raise ValueError(f"--seeds is {options.seeds}; give at least 1")
+        out = options.out / "quick" if options.quick else options.out
+        print(report(out, options))
+        print(f"saved {out / 'report.md'}")
+        return 0
 
-def run_report(options: argparse.Namespace) -> int:
-    """Run the program with its options; return the exit code."""
-    if options.seeds < 1:
-        raise ValueError(f"--seeds is {options.seeds}; give at least 1")
-    out = options.out / "quick" if options.quick else options.out
-    print(report(out, options.seeds, options.quick, options.maps, options.backend))
-    print(f"saved {out / 'report.md'}")
-    return 0
+    return exit_code(parser.prog, measure)
 
 
 if __name__ == "__main__":

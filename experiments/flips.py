@@ -23,7 +23,7 @@ from ddqn_planner.grid.arguments import Occupancy
 from ddqn_planner.grid.body import clearance
 from ddqn_planner.grid.noise import random_requests
 from ddqn_planner.planning import PlanRequest
-from ddqn_planner.planning.path_under_way import rest_of_path
+from ddqn_planner.planning.paths import rest_of_path
 from ddqn_planner.planning.planner import last_step
 
 RULE = MoveRule.ROBOT_SAFE

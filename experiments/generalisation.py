@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import argparse
 import math
+import os
 import sys
 import time
 from collections.abc import Iterable, Iterator, Sequence
@@ -15,11 +16,20 @@ from dataclasses import dataclass
 from itertools import groupby
 from operator import itemgetter
 from pathlib import Path
-from typing import Any, Final, TypeAlias
+from typing import Final
+
+# Before NumPy is imported. On a busy machine, several threads are ten times as slow as one.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import numpy as np
-from benchmark_files import describe_files, find_files, read_maps
-from benchmark_maps import COSTS, BenchmarkMap, RequestSettings, generated_maps
+from benchmark_maps import (
+    COSTS,
+    BenchmarkMap,
+    RequestSettings,
+    find_files,
+    generated_maps,
+    read_maps,
+)
 from numpy.typing import NDArray
 from random_maps import KINDS
 from tables import table
@@ -46,6 +56,22 @@ AGREES = 1e-4
 
 FIRST_GROUP_END = 16
 """Upper end of the first group of optima; each further group reaches twice as far."""
+
+GROUP: Final = ("set", "size", "optimum")
+COLUMNS: Final = (
+    "maps",
+    "requests",
+    "success",
+    "without action masking",
+    "optimal",
+    "mean",
+    "worst",
+    "illegal",
+    "field ms",
+    "Dijkstra ms",
+    "field/Dijkstra",
+    "path ms",
+)
 
 
 @dataclass(frozen=True)
@@ -79,36 +105,16 @@ class Rollout:
         return f"{upper // 2 if doublings else 0}-{upper}"
 
 
-Summary: TypeAlias = dict[str, Any]
-"""A row of a table, see `_summary`."""
-
-COLUMNS: Final = {
-    "maps": "{maps}",
-    "requests": "{requests}",
-    "success": "{success}/{requests}",
-    "without action masking": "{unmasked}/{requests}",
-    "optimal": "{optimal}/{requests}",
-    "mean": "{mean:.4f}",
-    "worst": "{worst:.4f}",
-    "illegal": "{illegal}",
-    "field ms": "{field_ms:.2f}",
-    "Dijkstra ms": "{dijkstra_ms:.2f}",
-    "field/Dijkstra": "{field_per_dijkstra:.2f}",
-    "path ms": "{path_ms:.3f}",
-}
-"""The columns of the Markdown tables, from a `Summary`."""
-
-
 def measure(
     planner: Planner, maps: Iterable[BenchmarkMap], move_rule: MoveRule
 ) -> Iterator[Rollout]:
     """Make a rollout for every request of every map; a ValueError if the model has another size."""
     warm = False
     for benchmark_map in maps:
-        grid, requests, given = benchmark_map.grid, benchmark_map.requests, benchmark_map.optima
+        grid, requests = benchmark_map.grid, benchmark_map.requests
         legal = legal_moves(grid.occupancy, move_rule)
-        optima_given = [math.nan] * len(requests) if given is None else given.tolist()
-        cases = [(goal, start, o) for (start, goal), o in zip(requests, optima_given, strict=True)]
+        given = benchmark_map.optima or [math.nan] * len(requests)
+        cases = [(goal, start, o) for (start, goal), o in zip(requests, given, strict=True)]
         for goal, of_goal in groupby(sorted(cases, key=itemgetter(0)), key=itemgetter(0)):
             if not warm:  # the first field of a process also loads compiled code
                 compare_with_dijkstra(planner, grid, goal, move_rule)
@@ -130,7 +136,7 @@ def measure(
                 yield Rollout(
                     set_name=benchmark_map.set_name,
                     map_name=benchmark_map.name,
-                    size=benchmark_map.size,
+                    size=f"{grid.width}x{grid.height}",
                     optimum=optimum,
                     agrees=None if math.isnan(given_optimum) else agrees,
                     ratio=cost / optimum if start != goal else 1.0,
@@ -168,47 +174,47 @@ def illegal_moves(cells: Sequence[Cell], legal: NDArray[np.bool_]) -> int:
     return int(np.count_nonzero(~(is_action & legal[:, y, x].T).any(axis=1)))
 
 
-def summarise(rollouts: Sequence[Rollout]) -> list[Summary]:
-    """Summarise the rollouts by set and size, then by optimum, and last all of them."""
+def summarise(rollouts: Sequence[Rollout]) -> list[list[str]]:
+    """Return rows of `GROUP` and `COLUMNS`: by set and size, then by optimum, and last of all."""
     groups: dict[tuple[str, str, str], list[Rollout]] = {}
     for rollout in rollouts:
         groups.setdefault((rollout.set_name, rollout.size, "all"), []).append(rollout)
     for rollout in sorted(rollouts, key=lambda rollout: rollout.optimum):
         groups.setdefault(("all", "all", rollout.length_group), []).append(rollout)
     groups["all", "all", "all"] = list(rollouts)
-    return [_summary(*group, members) for group, members in groups.items()]
+    return [[*group, *_row(members)] for group, members in groups.items()]
 
 
-def _summary(set_name: str, size: str, optimum: str, rollouts: Sequence[Rollout]) -> Summary:
-    """Return one row: counts of requests, ratios of the solved ones (NaN if none), median times."""
+def _row(rollouts: Sequence[Rollout]) -> list[str]:
+    """Return counts of requests, ratios of the solved ones (nan if none), and median times."""
+    requests = len(rollouts)
     ratios = np.array([rollout.ratio for rollout in rollouts])
     solved = ratios[np.isfinite(ratios)]
-    field_ms = float(np.median([rollout.field_ms for rollout in rollouts]))
-    dijkstra_ms = float(np.median([rollout.dijkstra_ms for rollout in rollouts]))
-    return {
-        "set_name": set_name,
-        "size": size,
-        "optimum": optimum,
-        "maps": len({(rollout.set_name, rollout.size, rollout.map_name) for rollout in rollouts}),
-        "requests": len(rollouts),
-        "success": len(solved),
-        "unmasked": sum(rollout.unmasked for rollout in rollouts),
-        "optimal": int(np.count_nonzero(ratios <= OPTIMAL)),
-        "mean": float(solved.mean()) if len(solved) else math.nan,
-        "worst": float(solved.max()) if len(solved) else math.nan,
-        "illegal": sum(rollout.illegal for rollout in rollouts),
-        "field_ms": field_ms,
-        "dijkstra_ms": dijkstra_ms,
-        "field_per_dijkstra": field_ms / dijkstra_ms,
-        "path_ms": float(np.median([rollout.path_ms for rollout in rollouts])),
-    }
+    field, dijkstra, path = (
+        float(np.median([getattr(rollout, name) for rollout in rollouts]))
+        for name in ("field_ms", "dijkstra_ms", "path_ms")
+    )
+    return [
+        str(len({(rollout.set_name, rollout.size, rollout.map_name) for rollout in rollouts})),
+        str(requests),
+        f"{len(solved)}/{requests}",
+        f"{sum(rollout.unmasked for rollout in rollouts)}/{requests}",
+        f"{np.count_nonzero(ratios <= OPTIMAL)}/{requests}",
+        f"{solved.mean() if len(solved) else math.nan:.4f}",
+        f"{solved.max() if len(solved) else math.nan:.4f}",
+        str(sum(rollout.illegal for rollout in rollouts)),
+        f"{field:.2f}",
+        f"{dijkstra:.2f}",
+        f"{field / dijkstra:.2f}",
+        f"{path:.3f}",
+    ]
 
 
 def markdown(rollouts: Sequence[Rollout], description: str) -> str:
     """Return the report: what was measured, a table by set and size, and one by optimum."""
-    cells = [(s, [column.format(**s) for column in COLUMNS.values()]) for s in summarise(rollouts)]
-    sets = [[s["set_name"], s["size"], *row] for s, row in cells if s["optimum"] == "all"]
-    lengths = [[s["optimum"], *row] for s, row in cells if s["optimum"] != "all"]
+    rows = summarise(rollouts)
+    sets = [[name, size, *cells] for name, size, optimum, *cells in rows if optimum == "all"]
+    lengths = [[optimum, *cells] for _, _, optimum, *cells in rows if optimum != "all"]
     text = (
         f"{description}\n\n"
         "Every request has a path. Without action masking: solved too by a rollout that may choose "
@@ -217,17 +223,8 @@ def markdown(rollouts: Sequence[Rollout], description: str) -> str:
     )
     if given := [rollout.agrees for rollout in rollouts if rollout.agrees is not None]:
         text += f"Optima given by files: the oracle agrees with {sum(given)}/{len(given)}.\n"
-    by_set, by_length = ["set", "size", *COLUMNS], ["optimum", *COLUMNS]
-    return f"{text}\n{table(by_set, sets)}\n\n{table(by_length, lengths)}\n"
-
-
-def write_report(path: Path, rollouts: Sequence[Rollout], text: str) -> None:
-    """Write the report's text, or its summaries as CSV if the path ends in ``.csv``."""
-    if path.suffix.lower() == ".csv":
-        summaries = summarise(rollouts)
-        write_csv(path, [*summaries[0]], [[*summary.values()] for summary in summaries])
-    else:
-        write_atomically(path, text.encode())
+    by_set = table(["set", "size", *COLUMNS], sets)
+    return f"{text}\n{by_set}\n\n{table(['optimum', *COLUMNS], lengths)}\n"
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -263,10 +260,8 @@ def run(options: argparse.Namespace) -> int:
     planner = Planner.load(options.model)
     maps = generated_maps(options.kinds, options.sizes, options.maps, settings)
     if options.data:
-        files = find_files(options.data)
-        print(f"found in {options.data}: {describe_files(files)}", file=sys.stderr)
-        maps = read_maps(files, settings)
-    rollouts = []
+        maps = read_maps(find_files(options.data), settings)
+    rollouts: list[Rollout] = []
     interrupted = False
     try:
         for rollout in measure(planner, tqdm(maps, unit="map", disable=None), rule):
@@ -282,8 +277,10 @@ def run(options: argparse.Namespace) -> int:
             f"move rule {rule.value}, costs {options.costs}, requests of seed {options.seed}.",
         )
         print(text, end="")
-        if options.out:
-            write_report(options.out, rollouts, text)
+        if options.out and options.out.suffix.lower() == ".csv":
+            write_csv(options.out, [*GROUP, *COLUMNS], summarise(rollouts))
+        elif options.out:
+            write_atomically(options.out, text.encode())
     elif not interrupted:
         raise ValueError(f"{options.data}: none of its files has a request; see above")
     return 130 if interrupted else 0

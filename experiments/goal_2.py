@@ -1,20 +1,21 @@
-"""Goal ii (section 5.2, Fig. 8): from every free cell to the given end."""
+"""Goal ii (section 5.2, Fig. 8): from every free cell; and what the printed target does."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import goal_1
 import matplotlib.pyplot as plt
 import numpy as np
 import torch
-from figures import draw_border, draw_map, draw_share, save_figure
+from figures import draw_curves, draw_map, save_figure
+from matplotlib.colors import BoundaryNorm, ListedColormap
 from numpy.typing import NDArray
-from profiles import MOVE_RULE, PROFILES, START_DEAD_END
-from settings import Settings, mean_and_worst, median_and_range
-from tables import write_table
-from trainings import Training
+from settings import PROFILES, START_DEAD_END, Settings
+from tables import mean_and_worst, median_and_range, write_table
+from trainings import MOVE_RULE, Training
 
 from ddqn_planner.grid import MOVES, legal_moves
 from ddqn_planner.planning import Planner, QField
@@ -23,8 +24,6 @@ from ddqn_planner.training.environment import GridVectorEnvironment, Scenario, p
 from ddqn_planner.training.evaluation import length_ratios
 from ddqn_planner.training.networks import PropagationModule
 
-TITLE = "Goal ii: from every free cell"
-
 COLUMNS = (
     "profile",
     "starts",
@@ -32,6 +31,22 @@ COLUMNS = (
     "solved without action masking",
     "of the dilemma's 10",
     "mean length / optimum",
+    "worst",
+)
+
+TARGETS = {
+    "double_dqn": ("Double DQN", "paper/both"),
+    "dqn": ("DQN", "paper/target_dqn"),
+    "printed": ("printed", "paper/target_printed"),
+}
+"""Label and name of the trainings with each target; Double DQN's are those of goal i. The paper's
+equation, as it is printed, leaves θ⁻ out."""
+
+TARGET_COLUMNS = (
+    "target",
+    "seeds solved from the start",
+    "starts solved",
+    "over-estimation, last 10 %",
     "worst",
 )
 
@@ -81,37 +96,81 @@ def report(settings: Settings) -> str:
         label: [length_ratios(field, scenario.grid, MOVE_RULE) for field in of_seeds]
         for label, of_seeds in fields.items()
     }
-    rows = [[label, *_row(fields[label], ratios[label], scenario)] for label in fields]
-    table = write_table(settings.out / "goal_2.csv", COLUMNS, rows)
-    return f"{table}\n\n{_draw(settings, scenario, ratios)}"
-
-
-def _row(
-    fields: list[QField], ratios: list[NDArray[np.float64]], scenario: Scenario
-) -> list[object]:
     starts = free_starts(scenario)
     x, y = np.transpose(sorted(START_DEAD_END - {scenario.start}))
-    unmasked = [length_ratios(field.unmasked(), scenario.grid, MOVE_RULE) for field in fields]
-    return [
-        int(starts.sum()),
-        count_solved(ratios, starts),
-        count_solved(unmasked, starts),
-        count_solved(ratios, (y, x)),
-        *mean_and_worst([ratio[starts & np.isfinite(ratio)] for ratio in ratios]),
-    ]
+    rows = []
+    for label, of in ratios.items():
+        unmasked = [length_ratios(f.unmasked(), scenario.grid, MOVE_RULE) for f in fields[label]]
+        solved = (
+            count_solved(of, starts),
+            count_solved(unmasked, starts),
+            count_solved(of, (y, x)),
+        )
+        lengths = mean_and_worst([ratio[starts & np.isfinite(ratio)] for ratio in of])
+        rows.append([label, int(starts.sum()), *solved, *lengths])
+    table = write_table(settings.out / "goal_2.csv", COLUMNS, rows)
+    return f"{table}\n\n{_draw(settings, scenario, ratios)}"
 
 
 def _draw(
     settings: Settings, scenario: Scenario, ratios: dict[str, list[NDArray[np.float64]]]
 ) -> str:
+    """Colour each cell by the number of seeds that solve it."""
     figure, panels = plt.subplots(1, len(PROFILES), figsize=(11, 5), layout="constrained")
+    seeds = settings.seeds
+    colours = ListedColormap(plt.get_cmap("RdYlBu")(np.linspace(0.08, 0.92, seeds + 1)))
+    norm = BoundaryNorm(np.arange(seeds + 2) - 0.5, seeds + 1)
     free = ~scenario.grid.occupancy
     free[scenario.goal[::-1]] = False
+    border = {"color": "black", "linewidth": 2.5, "zorder": 3}
     for axes, profile in zip(panels, PROFILES, strict=True):
         solved = np.sum([np.isfinite(ratio) for ratio in ratios[profile]], axis=0)
-        image = draw_share(axes, np.where(free, solved, np.nan), settings.seeds)
+        image = axes.imshow(np.where(free, solved, np.nan), cmap=colours, norm=norm, origin="lower")
         draw_map(axes, scenario, f"profile {profile}")
-        draw_border(axes, START_DEAD_END)
-    label, ticks = "seeds that solve the start", range(settings.seeds + 1)
-    figure.colorbar(image, ax=panels, label=label, ticks=ticks, shrink=0.8)
+        for x, y in START_DEAD_END:
+            for side in (-1, 1):
+                if (x + side, y) not in START_DEAD_END:
+                    axes.vlines(x + side / 2, y - 0.5, y + 0.5, **border)
+                if (x, y + side) not in START_DEAD_END:
+                    axes.hlines(y + side / 2, x - 0.5, x + 0.5, **border)
+    label = "seeds that solve the start"
+    figure.colorbar(image, ax=panels, label=label, ticks=range(seeds + 1), shrink=0.8)
     return save_figure(figure, settings.out / "goal_2.png", "Fig. 8: starts by outcome")
+
+
+def target_trainings(settings: Settings) -> list[Training]:
+    """Return the trainings of the profile paper with each target."""
+    paper = PROFILES["paper"]
+    parameters_of = {name: replace(paper, target=target) for target, (_, name) in TARGETS.items()}
+    return settings.trainings(parameters_of, [paper_scenario()])
+
+
+def target_report(settings: Settings) -> str:
+    """Write the table and the figure of the targets, and return its Markdown."""
+    scenario = paper_scenario()
+    starts = free_starts(scenario)
+    rows, runs = [], {label: settings.evaluations(name) for label, name in TARGETS.values()}
+    for label, name in TARGETS.values():
+        fields = [p.q_field(scenario.grid, scenario.goal) for p in settings.planners(name)]
+        ratios = [length_ratios(field, scenario.grid, MOVE_RULE) for field in fields]
+        errors = [run["overestimation"] for run in runs[label]]
+        late = [float(error[-max(len(error) // 10, 1) :].mean()) for error in errors]
+        rows.append(
+            [
+                label,
+                f"{sum(int(run['solved'][-1]) for run in runs[label])} of {settings.seeds}",
+                count_solved(ratios, starts),
+                median_and_range(late, 2),
+                median_and_range([error.max() for error in errors], 2),
+            ]
+        )
+    table = write_table(settings.out / "targets.csv", TARGET_COLUMNS, rows)
+    figure, (left, right) = plt.subplots(1, 2, figsize=(13, 4), layout="constrained")
+    estimates = {label: [run["overestimation"] for run in of] for label, of in runs.items()}
+    steps = runs["Double DQN"][0]["step"]
+    draw_curves(left, steps, estimates, "environment steps", "mean of max Q - V*")
+    left.set_yscale("symlog")
+    left.axhline(0, color="black", linewidth=0.8)
+    figure.legend(loc="outside lower center", ncols=len(TARGETS))
+    goal_1.draw_shares(right, runs)
+    return f"{table}\n\n{save_figure(figure, settings.out / 'targets.png', 'Over-estimation of Q')}"

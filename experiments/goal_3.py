@@ -12,25 +12,17 @@ from typing import Any, Final, NamedTuple
 
 import matplotlib.pyplot as plt
 import numpy as np
-from figures import draw_map, draw_new_obstacles, draw_path, save_figure
-from profiles import MOVE_RULE, PROFILES
-from settings import (
-    Settings,
-    mean_and_worst,
-    median_and_range,
-    optimal_length,
-)
-from supervised import train_supervised
-from tables import write_table
-from trainings import Training, in_parallel, rollouts, solved
+from figures import draw_map, draw_path, save_figure
+from matplotlib.patches import Rectangle
+from settings import PROFILES, Settings, optimal_length
+from tables import mean_and_worst, median_and_range, write_table
+from trainings import MOVE_RULE, Training, in_parallel, rollouts, solved, train_supervised
 
 from ddqn_planner.grid import Cell, Noise, legal_moves, scatter_obstacles, shortest_path
 from ddqn_planner.planning import Plan, PlanStatus
 from ddqn_planner.planning.search import search
 from ddqn_planner.training.environment import Scenario, paper_scenario
 from ddqn_planner.training.hyper_parameters import HyperParameters
-
-TITLE = "Goal iii: noisy maps"
 
 TRAINING_MAPS, TEST_MAPS = 100, 200
 PAPER: Final = replace(PROFILES["paper"], steps=120_000, replay_capacity=120_000, filters=32)
@@ -170,12 +162,11 @@ def _rows(settings: Settings, maps: NoisyMaps, noise: Noise) -> list[list[str]]:
                 models.append((f"{label}, supervised", f"{name}/supervised", "model.safetensors"))
         for model, trained, file in models:
             plans = [rollouts(planner, scenarios) for planner in settings.planners(trained, file)]
-            ends = [run[-1] for run in settings.evaluations(trained) if run]
-            cost = [
-                median_and_range([end.step for end in ends]),
-                median_and_range([end.seconds for end in ends], 1),
-            ]
-            rows.append([model, *_columns(plans, maps), *(cost if ends else ["-", "-"])])
+            ends = [run[-1] for run in settings.evaluations(trained) if len(run)]
+            steps = median_and_range([end["step"] for end in ends])
+            seconds = median_and_range([end["seconds"] for end in ends], 1)
+            cost = [steps, seconds] if ends else ["-", "-"]
+            rows.append([model, *_columns(plans, maps), *cost])
     path = fixed_path(maps.training)
     on_maps = [_on_map(path, scenario) for scenario in scenarios]
     return [*rows, ["one fixed path", *_columns([(on_maps, on_maps)], maps), "-", "-"]]
@@ -208,11 +199,12 @@ def _columns(of_seeds: Sequence[tuple[list[Plan], list[Plan]]], maps: NoisyMaps)
 
 
 def _draw(settings: Settings) -> str:
+    """Draw the first three test maps of each noise, with the paths of the first seed."""
     size = (12, 4.2 * len(settings.noise))
     figure, panels = plt.subplots(
         len(settings.noise), 3, figsize=size, layout="constrained", squeeze=False
     )
-    legend: dict[str, Any] = {}
+    before, legend = paper_scenario().grid.occupancy, dict[str, Any]()
     for noise, row in zip(settings.noise, panels, strict=True):
         planners = {
             label: settings.planners(f"{noise.value}/{folder}", "kept.safetensors")[0]
@@ -220,7 +212,9 @@ def _draw(settings: Settings) -> str:
         }
         for axes, scenario in zip(row, drawn_maps(settings, noise).test, strict=False):
             draw_map(axes, scenario, noise.value)
-            draw_new_obstacles(axes, scenario.grid, paper_scenario().grid)
+            for y, x in np.argwhere(scenario.grid.occupancy & ~before):
+                cell = Rectangle((x - 0.5, y - 0.5), 1, 1, facecolor="#E69F00", edgecolor="black")
+                axes.add_patch(cell)
             for number, (label, planner) in enumerate(planners.items()):
                 plan = planner.plan(scenario.grid, scenario.start, scenario.goal)
                 draw_path(axes, plan.cells, number, label)

@@ -6,62 +6,39 @@ Writes tables, figures and a report. Run the same command again to resume.
 from __future__ import annotations
 
 import argparse
+import os
 import signal
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Final
 
-import ablation
+# Before NumPy is imported. On a busy machine, several threads are ten times as slow as one.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
 import any_map
 import goal_1
 import goal_2
 import goal_3
-import targets
 import torch
-from profiles import HIDDEN_UNITS
-from settings import Settings
-from trainings import BACKENDS, in_parallel, train
+from settings import HIDDEN_UNITS, Settings
+from tables import write_report
+from trainings import BACKENDS, Training, in_parallel, train
 
 from ddqn_planner.cli import HelpFormatter, exit_code
-from ddqn_planner.files import write_atomically
 from ddqn_planner.grid import Noise
 
-EXPERIMENTS: Final = {
-    "goal-1": goal_1,
-    "ablation": ablation,
-    "goal-2": goal_2,
-    "goal-3": goal_3,
-    "targets": targets,
-    "any-map": any_map,
+EXPERIMENTS: Final[
+    dict[str, tuple[str, Callable[[Settings], list[Training]], Callable[[Settings], str]]]
+] = {
+    "goal-1": ("Goal i: from the given start", goal_1.trainings, goal_1.report),
+    "ablation": ("Goal i: the ablation", goal_1.ablation_trainings, goal_1.ablation_report),
+    "goal-2": ("Goal ii: from every free cell", goal_2.trainings, goal_2.report),
+    "goal-3": ("Goal iii: noisy maps", goal_3.trainings, goal_3.report),
+    "targets": ("What the printed target does", goal_2.target_trainings, goal_2.target_report),
+    "any-map": ("The model for any map", any_map.trainings, any_map.report),
 }
-"""Each has a title, ``trainings(settings)``, and ``report(settings)`` for their results."""
-
-
-def reproduce(names: list[str], settings: Settings) -> str:
-    """Run experiments, and write ``report.md`` with its tables (also as CSV) and figures.
-
-    Trainings that an earlier call finished in the same folder are not repeated. Return the report,
-    Markdown.
-    """
-    settings.out.mkdir(parents=True, exist_ok=True)
-    modules = {name: EXPERIMENTS[name] for name in names}
-    # Experiments share trainings: each folder is trained once.
-    trainings = {
-        training.folder: training
-        for module in modules.values()
-        for training in module.trainings(settings)
-    }
-    in_parallel(train, list(trainings.values()), settings.backend)
-    sections = [
-        f"## {module.TITLE}\n\n"
-        f"`python experiments/reproduce.py --experiment {name} {settings.options()}`\n\n"
-        f"{module.report(settings)}"
-        for name, module in modules.items()
-    ]
-    text = "\n\n".join(sections) + "\n"
-    write_atomically(settings.out / "report.md", text.encode())
-    return text
+"""Each has a title, its trainings, and the report of their results."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -76,30 +53,44 @@ def main(arguments: Sequence[str] | None = None) -> int:
     units = "hidden layers of the paper's network for goal iii"
     add("--hidden-units", nargs="+", type=int, default=[*HIDDEN_UNITS], metavar="N", help=units)
     add("--quick", action="store_true", help="train too briefly to learn, into the folder quick")
-
     words = "what runs the trainings: this machine's cores, or a cluster"
     add("--backend", choices=BACKENDS, default="loky", help=words)
+    add("--page", type=Path, metavar="FILE", help="a page of the docs that gets the results too")
     options = parser.parse_args(arguments)
-    return exit_code(parser.prog, lambda: run(options))
+    return exit_code(parser.prog, lambda: reproduce(options))
 
 
-def run(options: argparse.Namespace) -> int:
-    """Run the program with its options; return the exit code."""
+def reproduce(options: argparse.Namespace) -> int:
+    """Run experiments, and write ``report.md`` with its tables (also as CSV) and figures.
+
+    Trainings that an earlier call finished in the same folder are not repeated.
+    """
     if options.seeds < 1:
         raise ValueError(f"--seeds is {options.seeds}; give at least 1")
     torch.set_num_threads(1)  # so that planning times are those of one thread
+    settings = Settings(
+        options.out / "quick" if options.quick else options.out,
+        options.seeds,
+        options.quick,
+        tuple(map(Noise, dict.fromkeys(options.noise))),
+        tuple(dict.fromkeys(options.hidden_units)),
+        options.backend,
+    )
+    settings.out.mkdir(parents=True, exist_ok=True)
     names = [*EXPERIMENTS] if options.experiment == "all" else [options.experiment]
-    out = options.out / "quick" if options.quick else options.out
-    noise = tuple(map(Noise, dict.fromkeys(options.noise)))
-    hidden_units = tuple(dict.fromkeys(options.hidden_units))
-    settings = Settings(out, options.seeds, options.quick, noise, hidden_units, options.backend)
+    # Experiments share trainings: each folder is trained once.
+    trainings = {
+        training.folder: training for name in names for training in EXPERIMENTS[name][1](settings)
+    }
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
-        print(reproduce(names, settings))
+        in_parallel(train, list(trainings.values()), settings.backend)
+        sections = {EXPERIMENTS[name][0]: EXPERIMENTS[name][2](settings) for name in names}
     except KeyboardInterrupt:
         print("interrupted; run the same command to resume", file=sys.stderr)
         return 130
-    print(f"saved {out / 'report.md'}")
+    print(write_report(settings.out, sections, options.page))
+    print(f"saved {settings.out / 'report.md'}")
     return 0
 
 

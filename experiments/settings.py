@@ -1,20 +1,48 @@
-"""What the experiments have in common: their settings, their folders, and statistics over seeds."""
+"""What the paper's experiments have in common: two profiles, the options, and the folders."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any, Final
 
-import numpy as np
-from numpy.typing import NDArray
-from profiles import HIDDEN_UNITS, MOVE_RULE
-from trainings import Training, TrainingEvaluation, read_evaluations
+from trainings import MOVE_RULE, Evaluations, Training, read_evaluations
 
-from ddqn_planner.grid import Noise, shortest_distances
+from ddqn_planner.grid import Cell, Noise, shortest_distances
 from ddqn_planner.planning import Planner
 from ddqn_planner.training.environment import Scenario
 from ddqn_planner.training.hyper_parameters import HyperParameters
+
+HIDDEN_UNITS: Final = (0, 128)
+"""Sizes of the hidden layer with which goal iii tries the paper's network; 0 for none."""
+
+START_DEAD_END: Final[frozenset[Cell]] = frozenset(
+    {(6, 6), (4, 6), (4, 7), (4, 8), (5, 6), (5, 7), (5, 8), (6, 7), (6, 8), (7, 6), (7, 7)}
+)
+"""The paper's dilemma on its rebuilt map: the start and ten more cells."""
+
+PROFILES: Final[dict[str, HyperParameters]] = {
+    "paper": HyperParameters(),
+    "propagation": HyperParameters(
+        network="propagation",
+        filters=64,
+        learning_rate=0.001,
+        batch_size=128,
+        target_interval=100,
+        steps=15_000,
+    ),
+}
+"""``paper``: its network, observation and Table 1, our choice where it is silent. ``propagation``:
+the same rewards and initialisation, with another network and fewer steps."""
+
+VARIANTS: Final[dict[str, dict[str, Any]]] = {
+    "plain": {"p_r": 0.0, "alpha": 0.0, "beta": 0.0},
+    "initialisation": {"alpha": 0.0, "beta": 0.0},
+    "reward": {"p_r": 0.0},
+    "both": {},
+}
+"""Plain Double DQN, each improvement alone, and both: what each sets."""
 
 
 @dataclass(frozen=True)
@@ -33,19 +61,6 @@ class Settings:
     backend: str = "loky"
     """Where the trainings run; see `in_parallel`."""
 
-    def options(self) -> str:
-        """Return the options of the command line that give these settings, except the folder."""
-        options = [f"--seeds {self.seeds}"]
-        if self.noise != tuple(Noise):
-            options.append(f"--noise {' '.join(noise.value for noise in self.noise)}")
-        if self.hidden_units != HIDDEN_UNITS:
-            options.append(f"--hidden-units {' '.join(map(str, self.hidden_units))}")
-        return " ".join([*options, *(["--quick"] if self.quick else [])])
-
-    def shorten(self, parameters: HyperParameters) -> HyperParameters:
-        """Return the parameters, with fewer steps if the settings say quick."""
-        return replace(parameters, steps=min(parameters.steps, 1_000 if self.quick else 10**9))
-
     def folders(self, name: str) -> list[Path]:
         """Return the folders of the trainings with a name, one per seed."""
         return [self.out / "trainings" / name / f"seed_{seed}" for seed in range(self.seeds)]
@@ -63,8 +78,12 @@ class Settings:
             for seed, folder in enumerate(self.folders(name))
         ]
 
-    def evaluations(self, name: str) -> list[list[TrainingEvaluation]]:
-        """Return the evaluations of the trainings with a name, one list per seed."""
+    def shorten(self, parameters: HyperParameters) -> HyperParameters:
+        """Return the parameters, with fewer steps if the settings say quick."""
+        return replace(parameters, steps=min(parameters.steps, 1_000 if self.quick else 10**9))
+
+    def evaluations(self, name: str) -> list[Evaluations]:
+        """Return the evaluations of the trainings with a name, one table per seed."""
         return [read_evaluations(folder) for folder in self.folders(name)]
 
     def planners(self, name: str, file: str = "model.safetensors") -> list[Planner]:
@@ -76,39 +95,3 @@ def optimal_length(scenario: Scenario) -> float:
     """Return the length of the shortest path from start to goal, cells."""
     distances = shortest_distances(scenario.grid, scenario.goal, MOVE_RULE)
     return float(distances[scenario.start[::-1]])
-
-
-def median_and_range(values: Sequence[float], digits: int = 0) -> str:
-    """Return the median, least and greatest value of the seeds: ``"3 (1 to 4)"``.
-
-    Infinity means never; NaN is left out.
-    """
-    values = [value for value in values if not np.isnan(value)]
-    if not values:
-        return "none"
-    low, middle, high = (
-        "never" if np.isinf(v) else f"{v:,.{digits}f}"
-        for v in (min(values), float(np.median(values)), max(values))
-    )
-    return middle if low == high else f"{middle} ({low} to {high})"
-
-
-def mean_and_worst(ratios: Sequence[Sequence[float] | NDArray[np.float64]]) -> list[str]:
-    """Return two cells: the mean and the greatest ratio of each seed; a seed may have none."""
-    some = [of_seed for of_seed in ratios if len(of_seed)]
-    return [
-        median_and_range([float(function(of_seed)) for of_seed in some], 4)
-        for function in (np.mean, np.max)
-    ]
-
-
-def first_kept(
-    evaluations: Sequence[TrainingEvaluation], holds: Callable[[TrainingEvaluation], bool]
-) -> TrainingEvaluation | None:
-    """Return the evaluation from which on a condition holds to the end, if there is one."""
-    first = None
-    for evaluation in reversed(evaluations):
-        if not holds(evaluation):
-            break
-        first = evaluation
-    return first

@@ -1,11 +1,16 @@
-"""Markdown and CSV tables of the benchmarks' and experiments' reports."""
+"""Tables, statistics over seeds, and where they go: a report, and the pages of the docs."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import re
+import shutil
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from ddqn_planner.files import write_csv
+import numpy as np
+from numpy.typing import NDArray
+
+from ddqn_planner.files import write_atomically, write_csv
 
 
 def table(header: Sequence[str], rows: Sequence[Sequence[object]]) -> str:
@@ -18,6 +23,54 @@ def write_table(path: Path, header: Sequence[str], rows: Sequence[Sequence[objec
     """Write a table as CSV, and return it as Markdown; see `write_csv` for errors."""
     write_csv(path, header, rows)
     return table(header, rows)
+
+
+def write_report(out: Path, sections: Mapping[str, str], page: Path | None = None) -> str:
+    """Write the sections with their titles to ``report.md``, and return its text.
+
+    A page of the docs gets each section between its marks ``<!-- title -->`` and ``<!-- end -->``,
+    and the figures into a folder of its name in ``images``.
+    """
+    text = "\n".join(f"## {title}\n\n{section}\n" for title, section in sections.items())
+    write_atomically(out / "report.md", text.encode())
+    if page is not None:
+        content = page.read_text(encoding="utf-8")
+        images = page.parent / "images" / page.stem
+        images.mkdir(parents=True, exist_ok=True)
+        for figure in re.findall(r"\]\((.+\.png)\)", text):
+            shutil.copyfile(out / figure, images / figure)
+        for title, section in sections.items():
+            shown = re.sub(r"\]\((.+\.png)\)", rf"](images/{page.stem}/\1)", section)
+            before, mark, rest = content.partition(f"<!-- {title} -->\n")
+            if mark:
+                end = rest.index("<!-- end -->")
+                content = f"{before}{mark}{shown}\n\n{rest[end:]}"
+        write_atomically(page, content.encode())
+    return text
+
+
+def median_and_range(values: Sequence[float], digits: int = 0) -> str:
+    """Return the median, least and greatest value of the seeds: ``"3 (1 to 4)"``.
+
+    Infinity means never; NaN is left out.
+    """
+    values = [value for value in values if not np.isnan(value)]
+    if not values:
+        return "none"
+    low, middle, high = (
+        "never" if np.isinf(v) else f"{v:,.{digits}f}"
+        for v in (min(values), float(np.median(values)), max(values))
+    )
+    return middle if low == high else f"{middle} ({low} to {high})"
+
+
+def mean_and_worst(ratios: Sequence[Sequence[float] | NDArray[np.float64]]) -> list[str]:
+    """Return two cells: the mean and the greatest ratio of each seed; a seed may have none."""
+    some = [of_seed for of_seed in ratios if len(of_seed)]
+    return [
+        median_and_range([float(function(of_seed)) for of_seed in some], 4)
+        for function in (np.mean, np.max)
+    ]
 
 
 def report(figure: str, value: float, unit: str, bound: float, at_most: bool = True) -> bool:

@@ -2,23 +2,22 @@
 
 from __future__ import annotations
 
-import csv
 import time
 from collections.abc import Callable, Sequence
 from contextlib import closing
-from dataclasses import astuple, dataclass, fields
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, TypeAlias
 
 import joblib
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from profiles import MOVE_RULE
+from torch import Tensor
 from tqdm import tqdm
 
 from ddqn_planner.files import write_csv
-from ddqn_planner.grid import neighbours
+from ddqn_planner.grid import LENGTHS, MoveRule, legal_moves, neighbours, shortest_distances
 from ddqn_planner.planning import Plan, Planner
 from ddqn_planner.training.environment import GridVectorEnvironment, Scenario
 from ddqn_planner.training.hyper_parameters import HyperParameters
@@ -26,8 +25,16 @@ from ddqn_planner.training.run import TrainingRun
 from ddqn_planner.training.trainer import Trainer
 from ddqn_planner.training.value_iteration import value_iteration
 
+MOVE_RULE: Final = MoveRule.CORNER_CUTTING
+"""The rule under which the paper's 22.97 is the shortest path (docs/dilemma_map.md)."""
+
 BACKENDS: Final = ("loky", "ray", "dask", "sequential")
 """Of joblib: this machine's cores, two kinds of cluster, or one training after the other."""
+
+Evaluations: TypeAlias = NDArray[Any]
+"""A table of evaluations during a training, with the columns of `evaluate_training`."""
+
+SUPERVISED_BATCH, SUPERVISED_LEARNING_RATE = 128, 0.003
 
 
 @dataclass(frozen=True)
@@ -39,27 +46,6 @@ class Training:
     scenarios: tuple[Scenario, ...]
     seed: int
     evaluation_interval: int
-
-
-@dataclass(frozen=True)
-class TrainingEvaluation:
-    """The greedy rollouts of a network in training, from the start of each of its scenarios."""
-
-    step: int
-    """Environment steps."""
-    updates: int
-    episodes: int
-    seconds: float
-    """Wall-clock time since the training began, with evaluations."""
-    solved: int
-    """Scenarios whose rollout reaches the end."""
-    solved_unmasked: int
-    """The same without action masking: an illegal action ends the rollout."""
-    length: float
-    """Mean length of the solved ones, cells; NaN if there are none."""
-    overestimation: float
-    """Mean of max_a Q(s, a) - V*(s) over the free cells of the first scenario, V* the exact value
-    of the best policy; NaN for a network whose Q is not the return."""
 
 
 def in_parallel(
@@ -79,7 +65,8 @@ def in_parallel(
         Client()  # of the scheduler that DASK_SCHEDULER_ADDRESS names, else of this machine
     jobs = (joblib.delayed(_in_one_thread)(job, item) for item in items)
     with joblib.parallel_config(backend, n_jobs=-1):
-        results = joblib.Parallel(return_as="generator")(jobs)
+        # Ray's backend has no generator: its bar jumps to the end.
+        results = joblib.Parallel(return_as="list" if backend == "ray" else "generator")(jobs)
         # disable=None: no bar if the output is not a terminal.
         return list(tqdm(results, total=len(items), unit=unit, disable=None))
 
@@ -100,17 +87,17 @@ def train(training: Training) -> None:
         TrainingRun(folder, training.scenarios, MOVE_RULE, training.parameters, training.seed)
     ) as run:
         trainer = run.trainer
-        evaluations = [e for e in read_evaluations(folder) if e.step <= trainer.steps]
+        before = read_evaluations(folder)
+        before = before[before["step"] <= trainer.steps]
+        rows = [dict(zip(before.dtype.names or (), row, strict=True)) for row in before.tolist()]
         optimum = optimal_value(trainer.environment)
-        began = time.perf_counter() - (evaluations[-1].seconds if evaluations else 0.0)
+        began = time.perf_counter() - (rows[-1]["seconds"] if rows else 0.0)
         for _ in run.steps():
-            if trainer.steps // training.evaluation_interval > len(evaluations):
-                best = max((evaluation.solved for evaluation in evaluations), default=-1)
-                seconds = time.perf_counter() - began
-                evaluations.append(evaluate_training(trainer, optimum, seconds))
-                columns = [entry.name for entry in fields(TrainingEvaluation)]
-                write_csv(folder / "evaluations.csv", columns, map(astuple, evaluations))
-                if evaluations[-1].solved >= best:
+            if trainer.steps // training.evaluation_interval > len(rows):
+                best = max((row["solved"] for row in rows), default=-1)
+                rows.append(evaluate_training(trainer, optimum, time.perf_counter() - began))
+                write_csv(folder / "evaluations.csv", [*rows[0]], [[*row.values()] for row in rows])
+                if rows[-1]["solved"] >= best:
                     trainer.save_model(folder / "kept.safetensors")
     if run.save_error:
         raise OSError(run.save_error)
@@ -118,28 +105,32 @@ def train(training: Training) -> None:
 
 def evaluate_training(
     trainer: Trainer, optimum: NDArray[np.float32], seconds: float
-) -> TrainingEvaluation:
-    """Make rollouts with the current network; see `optimal_value` for `optimum`."""
+) -> dict[str, float]:
+    """Return figures of the current network's rollouts from the start of each scenario.
+
+    The over-estimation is the mean of max_a Q(s, a) - V*(s) over the free cells of the first
+    scenario, V* the `optimal_value`; NaN for a network whose Q is not the return.
+    """
     planner = trainer.planner()
     plans, unmasked = rollouts(planner, trainer.scenarios)
     lengths = [plan.length for plan in plans if plan.cells]
-    overestimation = float("nan")
+    overestimation = np.nan
     if trainer.parameters.network == "paper":
         scenario = trainer.scenarios[0]
         q = planner.q_field(scenario.grid, scenario.goal).q
         free = ~scenario.grid.occupancy
         free[scenario.goal[::-1]] = False
         overestimation = float((q.max(axis=0) - optimum.reshape(free.shape))[free].mean())
-    return TrainingEvaluation(
-        step=trainer.steps,
-        updates=trainer.updates,
-        episodes=trainer.episodes,
-        seconds=round(seconds, 3),
-        solved=len(lengths),
-        solved_unmasked=solved(unmasked),
-        length=float(np.mean(lengths)) if lengths else float("nan"),
-        overestimation=overestimation,
-    )
+    return {
+        "step": trainer.steps,
+        "updates": trainer.updates,
+        "episodes": trainer.episodes,
+        "seconds": round(seconds, 3),
+        "solved": len(lengths),
+        "solved_unmasked": solved(unmasked),
+        "length": float(np.mean(lengths)) if lengths else np.nan,
+        "overestimation": overestimation,
+    }
 
 
 def rollouts(planner: Planner, scenarios: Sequence[Scenario]) -> tuple[list[Plan], list[Plan]]:
@@ -172,16 +163,58 @@ def optimal_value(environment: GridVectorEnvironment) -> NDArray[np.float32]:
     return value_C
 
 
-def read_evaluations(folder: Path) -> list[TrainingEvaluation]:
+def read_evaluations(folder: Path) -> Evaluations:
     """Read ``evaluations.csv`` of a training's folder; empty if there is none."""
     path = folder / "evaluations.csv"
     if not path.exists():
-        return []
-    types = {
-        entry.name: int if entry.type == "int" else float for entry in fields(TrainingEvaluation)
-    }
-    with path.open(newline="", encoding="utf-8") as file:
-        return [
-            TrainingEvaluation(**{k: types[k](v) for k, v in row.items()})  # type: ignore[arg-type]
-            for row in csv.DictReader(file)
-        ]
+        return np.empty(0, [("step", np.float64)])
+    evaluations: Evaluations = np.genfromtxt(path, delimiter=",", names=True, ndmin=1)
+    return evaluations
+
+
+def train_supervised(training: Training) -> None:
+    """Train a network by cross-entropy on the best moves, for as many updates as it has steps.
+
+    This is a yardstick and not a planner: the exact oracle gives the first moves of all shortest
+    paths from every cell of every training map. What the network fails to learn even then is a
+    limit of its architecture, not of how it learns. It writes ``model.safetensors``, and does
+    nothing if that exists.
+    """
+    path = training.folder / "model.safetensors"
+    if path.exists():
+        return
+    path.parent.mkdir(parents=True, exist_ok=True)
+    trainer = Trainer(training.scenarios, MOVE_RULE, training.parameters, training.seed)
+    best_SCA = np.stack([best_moves(scenario) for scenario in training.scenarios])
+    scenario, cell = np.nonzero(best_SCA.any(axis=2))
+    random = np.random.default_rng(training.seed)
+    optimiser = torch.optim.Adam(trainer.network.parameters(), SUPERVISED_LEARNING_RATE)
+    steps = training.parameters.steps
+    decay = torch.optim.lr_scheduler.LinearLR(optimiser, 1.0, 0.05, steps)
+    for _ in range(steps):
+        drawn = random.integers(len(cell), size=SUPERVISED_BATCH)
+        states = trainer.encoder.states(scenario[drawn], cell[drawn])
+        best_BA = torch.from_numpy(best_SCA[scenario[drawn], cell[drawn]])
+        loss = cross_entropy(trainer.network(states), best_BA)
+        optimiser.zero_grad()
+        torch.autograd.backward(loss)
+        optimiser.step()
+        decay.step()
+    trainer.save_model(path)
+
+
+def cross_entropy(q_BA: Tensor, best_BA: Tensor) -> Tensor:
+    """Return the mean of -log of the probability that softmax(Q) gives to the best moves."""
+    best_B = q_BA.masked_fill(~best_BA, -torch.inf).logsumexp(dim=1)
+    return (q_BA.logsumexp(dim=1) - best_B).mean()
+
+
+def best_moves(scenario: Scenario) -> NDArray[np.bool_]:
+    """Return the moves that begin a shortest path: (C, 8) bool, none where there is no path."""
+    occupancy = scenario.grid.occupancy
+    distance = shortest_distances(scenario.grid, scenario.goal, MOVE_RULE).ravel()
+    onward_AC = np.append(distance, np.inf)[neighbours(occupancy.shape)] + LENGTHS[:, None]
+    legal_AC = legal_moves(occupancy, MOVE_RULE).reshape(len(LENGTHS), -1)
+    through_AC = np.where(legal_AC, onward_AC, np.inf)
+    best: NDArray[np.bool_] = (np.isfinite(through_AC) & (through_AC <= distance + 1e-9)).T
+    return best

@@ -55,30 +55,21 @@ class Certificate:
 
     A decision is whether the network takes one action for possible in one pattern under one rule.
     It is right if this equals `legal_moves`, for all costs.
-
-    Parameters
-    ----------
-    decisions : int
-        How many there are.
-    undecided : int
-        Those that are neither proved nor known to be wrong.
-    wrong : int
-        Those for which costs are known that make the network wrong.
-    margin : float
-        Least proved distance of a right decision's logit from 0; 0 if none is right.
-    multiplier_error : float
-        Bound on the relative error of the learned cost multipliers, over all legal moves.
-    tries : float
-        The most tries that a legal move is expected to take: 1/p, by which its cost grows on a map
-        without costs, or of expected times. It is 1 if the network is certain of all legal moves.
     """
 
     decisions: int
+    """How many there are."""
     undecided: int
+    """Those that are neither proved nor known to be wrong."""
     wrong: int
+    """Those for which costs are known that make the network wrong."""
     margin: float
+    """Least proved distance of a right decision's logit from 0; 0 if none is right."""
     multiplier_error: float
+    """Bound on the relative error of the learned cost multipliers, over all legal moves."""
     tries: float = 1.0
+    """The most tries that a legal move is expected to take: 1/p, by which its cost grows on a map
+    without costs, or of expected times. It is 1 if the network is certain of all legal moves."""
 
     @property
     def proved(self) -> bool:
@@ -125,14 +116,9 @@ def _percent(error: float) -> str:
 def certify(
     network: PropagationQNetwork, move_rules: Sequence[MoveRule] = MOVE_RULES
 ) -> Certificate:
-    """Prove what a network takes for possible, and bound the error of its costs.
+    """Prove what a network takes for possible under some rules, and bound the error of its costs.
 
-    Parameters
-    ----------
-    network : PropagationQNetwork
-        One that does not observe the move rule can be right under one rule only.
-    move_rules : sequence of MoveRule
-        The rules under which it must be right; by default one of each class.
+    One that does not observe the move rule can be right under one rule only.
     """
     every_P9 = every_patch()
     patch_P9 = every_P9[every_P9[:, CENTRE] != OCCUPIED]
@@ -169,14 +155,10 @@ def _margins(
     feature_PI: NDArray[np.float32],
     legal_PA: NDArray[np.bool_],
 ) -> tuple[Float64, Float64]:
-    """Bound by how much each logit is above 0 for a legal move, or below 0 for another.
+    """Bound by how much each logit is above 0 for a legal move, or below 0 for another: (P, A).
 
-    Returns
-    -------
-    (P, A)
-        The bound, also for float32.
-    (C, P, A)
-        What the bounded function gains with each input for costs and unknown cells.
+    The bounds hold for float32 too. Return also what the bounded function gains with each input for
+    costs and unknown cells: (C, P, A).
     """
     tensors = {name: tensor.astype(np.float64) for name, tensor in network.tensors.items()}
     # Copies, as arrays in another order than the rest are slow.

@@ -55,32 +55,14 @@ class ModelFileError(ValueError):
 
 @dataclass(frozen=True)
 class ModelMetadata:
-    """The description of a network in its model file.
+    """The description of a network in its model file."""
 
-    Parameters
-    ----------
-    network : str
-        A name in `NETWORKS`.
-    sizes : dict
-        A value for each of the network's `size_names`.
-    move_rule : MoveRule
-        The rule under which it was trained.
-    gamma : float
-        The discount γ of its Q values, 0..1.
-    map_fingerprint : str
-        `GridMap.fingerprint` of the map (the first of several) on which it was trained.
-    steps : int
-        Environment steps of its training.
-    seed : int
-    package_version : str
-    """
-
-    network: str
-    sizes: dict[str, int]
-    move_rule: MoveRule
-    gamma: float
-    map_fingerprint: str
-    steps: int
+    network: str  # a name in `NETWORKS`
+    sizes: dict[str, int]  # a value for each of its `size_names`
+    move_rule: MoveRule  # under which it was trained
+    gamma: float  # the discount γ of its Q values, 0..1
+    map_fingerprint: str  # of the first map on which it was trained
+    steps: int  # of its training
     seed: int
     package_version: str
 
@@ -96,13 +78,7 @@ def package_version() -> str:
 
 
 def find_model(name: str | Path) -> Path:
-    """Return the file of a model given by path, or by the name of a shipped one.
-
-    Raises
-    ------
-    ModelFileError
-        If there is neither such a file nor such a shipped model.
-    """
+    """Return the file of a model given by path, or by the name of a shipped one."""
     if as_path(name, "the model").suffix == MODEL_SUFFIX or Path(name).name != str(name):
         if os.path.isfile(name):
             return Path(name)
@@ -117,29 +93,15 @@ def find_model(name: str | Path) -> Path:
 
 
 def save_model(path: str | Path, network: QNetwork, description: ModelMetadata) -> None:
-    """Write a model file; the old file stays complete until the new one is.
-
-    Raises
-    ------
-    OSError
-        If the file cannot be written.
-    """
+    """Write a model file; the old file stays complete until the new one is."""
     text = json.dumps(asdict(description))
     write_atomically(Path(path), safetensors.numpy.save(network.tensors, {METADATA_KEY: text}))
 
 
 def load_model(name: str | Path) -> tuple[QNetwork, ModelMetadata]:
-    """Read a model file.
+    """Read a model file, given by its path or by the name of a shipped model.
 
-    Parameters
-    ----------
-    name : str or Path
-        Name of a shipped model, or the path of a ``.safetensors`` file.
-
-    Raises
-    ------
-    ModelFileError
-        If the file is missing, truncated, not safetensors, or not a model of this package.
+    It is a ModelFileError if the file is missing, truncated, not safetensors, or no model.
     """
     path = find_model(name)
     try:

@@ -16,6 +16,8 @@ from rclpy.lifecycle import LifecycleNodeMixin, LifecycleState, TransitionCallba
 
 from ddqn_planner.nodes.runtime import BaseNode, Parameters
 
+SUCCESS = TransitionCallbackReturn.SUCCESS
+
 HEARTBEAT_PERIOD, HEARTBEAT_TIMEOUT = 0.1, 4.0
 """Seconds, as Nav2's nodes and lifecycle manager have them."""
 
@@ -44,7 +46,7 @@ class ManagedNode(LifecycleNodeMixin, BaseNode):
     def start(self) -> None:
         """Configure and activate the node; it raises what they raise."""
         for trigger in (self.trigger_configure, self.trigger_activate):
-            if trigger() is not TransitionCallbackReturn.SUCCESS and self._error is not None:
+            if trigger() is not SUCCESS and self._error is not None:
                 raise self._error
 
     def destroy_node(self) -> None:
@@ -82,7 +84,7 @@ class ManagedNode(LifecycleNodeMixin, BaseNode):
         """Configure the node, or leave nothing behind."""
         self._kept = {entity for entity, _ in self._entities()}
         result = self._attempt("configure", self.configure)
-        if result is not TransitionCallbackReturn.SUCCESS:
+        if result is not SUCCESS:
             self._attempt("cleanup", self._clean_up)
         return result
 
@@ -105,7 +107,7 @@ class ManagedNode(LifecycleNodeMixin, BaseNode):
             self.on_deactivate(state)
         if state.label in ("active", "inactive"):
             self.on_cleanup(state)
-        return TransitionCallbackReturn.SUCCESS
+        return SUCCESS
 
     def _attempt(self, what: str, function: Callable[[], None]) -> TransitionCallbackReturn:
         try:
@@ -114,7 +116,7 @@ class ManagedNode(LifecycleNodeMixin, BaseNode):
             self._error = error
             self.get_logger().error(f"{what} failed: {str(error) or repr(error)}")
             return TransitionCallbackReturn.FAILURE
-        return TransitionCallbackReturn.SUCCESS
+        return SUCCESS
 
     async def _on_change_state(
         self, request: ChangeState.Request, response: ChangeState.Response
@@ -132,7 +134,7 @@ class ManagedNode(LifecycleNodeMixin, BaseNode):
         try:
             if await self.prepare(label):
                 result = getattr(self, f"trigger_{label}")()
-                response.success = result is TransitionCallbackReturn.SUCCESS
+                response.success = result is SUCCESS
                 if response.success and label == "activate":
                     self._form_bond()
         except Exception as error:  # the node must survive

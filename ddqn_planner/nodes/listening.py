@@ -30,10 +30,7 @@ def best_effort(depth: int) -> QoSProfile:
 class ListeningNode(Node):
     """Node whose parameters may override the quality of service of its subscriptions.
 
-    Attributes
-    ----------
-    after_jump_back : set of callables
-        Called when the clock jumps back, as when a bag loops or a simulator is reset.
+    It calls the functions in `after_jump_back` when a bag loops or a simulator is reset.
     """
 
     def __init__(self, name: str, **options: Any) -> None:
@@ -53,12 +50,7 @@ class ListeningNode(Node):
             forget()
 
     def create_subscription(
-        self,
-        msg_type: Any,
-        topic: str,
-        callback: Callable[..., Any],
-        qos_profile: QoSProfile | int,
-        **options: Any,
+        self, msg_type: Any, topic: str, callback: Any, qos_profile: Any, **options: Any
     ) -> Subscription:
         """Create a subscription with the quality that parameters may override."""
         name = self.resolve_topic_name(topic)
@@ -76,10 +68,7 @@ class ListeningNode(Node):
             ) from None
 
     def topic_problems(self) -> list[str]:
-        """Say which publishers are not received, and of which odometry there is too much.
-
-        What is new is logged.
-        """
+        """Say, and log once, which publishers are not received, and that odometry has several."""
         problems = [*self._topic_problems()]
         for problem in problems:
             if problem not in self._logged_problems:
@@ -89,14 +78,16 @@ class ListeningNode(Node):
 
     def _topic_problems(self) -> Iterator[str]:
         for subscription in self.subscriptions:
-            topic, is_odometry = subscription.topic_name, subscription.msg_type is Odometry
-            if not (is_odometry or topic in self._incompatible):
+            topic = subscription.topic_name
+            # To count is cheap; to ask who they are is not.
+            several = subscription.msg_type is Odometry and self.count_publishers(topic) > 1
+            if not several and topic not in self._incompatible:
                 continue
             publishers = [
                 (f"{each.node_namespace.rstrip('/')}/{each.node_name}", each.qos_profile)
                 for each in self.get_publishers_info_by_topic(topic)
             ]
-            if is_odometry and len(publishers) > 1:
+            if several:
                 names = ", ".join(sorted(name for name, _ in publishers))
                 yield (
                     f"{topic} has {len(publishers)} publishers ({names}), so the robot's place may "

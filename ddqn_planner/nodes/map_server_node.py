@@ -130,22 +130,15 @@ class MapServerNode(BaseNode):
     def _scatter_obstacles(self) -> str:
         if self._loaded is None:
             raise ValueError(NO_MAP)
-        grid, start, goal = self._loaded.grid(), self._loaded.start, self._loaded.goal
-        if start is None or goal is None:
-            raise ValueError(
-                "the map file names no start and goal, on whose path the obstacles would lie; add "
-                f"'{PACKAGE}: {{start: [x, y], goal: [x, y]}}' in cells to its YAML"
-            )
-        move_rule, path = known_path(grid, start, goal)
+        grid = self._loaded.grid()
+        move_rule, path = known_path(grid, self._loaded)
         noisy, rejected = scatter_obstacles(grid, path, move_rule, self._random)
         new = noisy.occupancy & ~grid.occupancy
         self._serve(np.where(new, np.int8(OCCUPIED), self._loaded.values))
         rows, columns = np.nonzero(new)
-        cells = [
-            "({:.3f}, {:.3f})".format(*grid.cell_to_world((x, y)))
-            for x, y in zip(columns.tolist(), rows.tolist(), strict=True)
-        ]
-        return f"{len(cells)} new obstacles at {', '.join(cells)} m; {rejected} draws thrown away"
+        places = zip(*grid.centres(columns, rows), strict=True)
+        cells = ", ".join(f"({x:.3f}, {y:.3f})" for x, y in places)
+        return f"{len(rows)} new obstacles at {cells} m; {rejected} draws thrown away"
 
     def _on_restore_map(self) -> tuple[bool, str]:
         if self._loaded is None:
@@ -154,14 +147,14 @@ class MapServerNode(BaseNode):
         return True, "the map is as it was loaded"
 
 
-def known_path(grid: GridMap, start: Cell, goal: Cell) -> tuple[MoveRule, list[Cell]]:
-    """Return the shortest path, and the safest rule under which there is one.
-
-    Raises
-    ------
-    ValueError
-        If there is none under either rule.
-    """
+def known_path(grid: GridMap, map_file: MapFile) -> tuple[MoveRule, list[Cell]]:
+    """Return the shortest path, and the safest rule under which there is one, or a ValueError."""
+    start, goal = map_file.start, map_file.goal
+    if start is None or goal is None:
+        raise ValueError(
+            "the map file names no start and goal, on whose path the obstacles would lie; add "
+            f"'{PACKAGE}: {{start: [x, y], goal: [x, y]}}' in cells to its YAML"
+        )
     for move_rule in (MoveRule.ROBOT_SAFE, MoveRule.CORNER_CUTTING):
         path = shortest_path(grid, start, goal, move_rule)
         if path:

@@ -19,7 +19,7 @@ from ddqn_planner.experience import Experience
 from ddqn_planner.grid import GridMap
 from ddqn_planner.grid.body import Inflation
 from ddqn_planner.nodes.conversions import grid_from_message, grid_from_values
-from ddqn_planner.nodes.report import Outcome, Report, RequestError, describe_map, seconds
+from ddqn_planner.nodes.report import Outcome, Report, RequestError, seconds
 from ddqn_planner.nodes.runtime import LATCHED, BaseNode, Worker
 from ddqn_planner.planning import Plan
 from ddqn_planner.planning.repair import offset_between
@@ -59,8 +59,7 @@ class MapSource:
 
     A map whose directions have not come waits for them, and the map before it stays meanwhile.
     `on_map` is called with whether the map's frame is a new one, each time when there is something
-    new to plan on. The worker inflates: maps must not wait for fields, and 2000 x 2000 cells take
-    over a second.
+    new to plan on. Its worker inflates, for over a second: maps must not wait for fields.
     """
 
     def __init__(
@@ -209,7 +208,7 @@ class MapSource:
         try:
             self._grid = self._directions.on(grid, received.message.header)
         except ValueError as error:
-            if not self._directions.held:  # no map before it had any
+            if self._directions.used is None:  # no map before it had any
                 self._used = None
             if received is self._newest:  # without a log: they may be on their way
                 self._report.refuse("map", str(error), log=False)
@@ -217,7 +216,10 @@ class MapSource:
         frame_changed, self._used = received.header.frame_id != self.frame, received
         if received is self._newest:
             self._report.accept("map")
-        described = describe_map(received.message)
+        info = received.message.info
+        described = (
+            f"{info.width} x {info.height} cells of {info.resolution:.6g} m in frame {self.frame!r}"
+        )
         if described != self._described:
             self._described = described
             self._node.get_logger().info(f"map of {described}")
@@ -302,21 +304,15 @@ class Directions:
     A map server publishes them for each of its maps, with the map's stamp: an ``OccupancyGrid``
     whose values are the bytes of `GridMap.forbidden`, and without cells where nothing is forbidden.
     Directions and maps that have had one stamp come from one map server: then the next map waits
-    for its own directions. The middleware does not keep the order of two topics: those of a large
-    map may come seconds after it, or never if the map server is killed.
+    for its own, which may come seconds after it, or never if the map server is killed.
     """
 
     def __init__(self, node: BaseNode) -> None:
         self._node, self._topic = node, node.resolve_topic_name(DIRECTIONS)
         # The last ones, and those of the map in use; without a map where nothing is forbidden.
         self._last: tuple[Header, GridMap | None] | None = None
-        self._used: tuple[Header, GridMap | None] | None = None
+        self.used: tuple[Header, GridMap | None] | None = None
         self._are_paired = False
-
-    @property
-    def held(self) -> bool:
-        """Whether a map has had directions; that may be none at all."""
-        return self._used is not None
 
     def take(self, message: OccupancyGrid) -> None:
         """Take a message; ValueError if it is malformed, and those before it stay."""
@@ -339,7 +335,7 @@ class Directions:
                     "server publish them, or set require_directions to false"
                 )
             return grid
-        known = [found for found in (self._last, self._used) if found is not None]
+        known = [found for found in (self._last, self.used) if found is not None]
         own = [found for found in known if found[0].stamp == header.stamp]
         if self._are_paired and published and not own:
             raise ValueError(
@@ -349,7 +345,7 @@ class Directions:
         of_map, directions = (own or known)[0]
         if directions is not None:
             grid = self._placed(directions, of_map.frame_id, grid, header.frame_id)
-        self._used, self._are_paired = (of_map, directions), bool(own)
+        self.used, self._are_paired = (of_map, directions), bool(own)
         return grid
 
     def _placed(self, directions: GridMap, frame: str, grid: GridMap, map_frame: str) -> GridMap:

@@ -32,8 +32,7 @@ def load_and_warm_up(model: str) -> tuple[Planner, str]:
     planner, path = load(model)
     sizes = planner.metadata.sizes
     shape = sizes.get("height", 3), sizes.get("width", 3)
-    grid = GridMap(np.zeros(shape, dtype=np.bool_))
-    planner.plan(grid, (0, 0), (shape[1] - 1, shape[0] - 1))
+    planner.plan(GridMap(np.zeros(shape, dtype=np.bool_)), (0, 0), (shape[1] - 1, shape[0] - 1))
     gc.freeze()
     return planner, path
 
@@ -44,15 +43,7 @@ def move_rule(rule: str, planner: Planner) -> MoveRule:
 
 
 class ModelSource:
-    """Has the planner with the last model that could be loaded.
-
-    Attributes
-    ----------
-    planner : Planner or None
-        None before the first model is loaded.
-    file : str
-        The file of its model.
-    """
+    """Has the planner with the last model that could be loaded, and its file."""
 
     def __init__(self, node: BaseNode, report: Report, worker: Worker) -> None:
         self.planner: Planner | None = None
@@ -77,17 +68,16 @@ class ModelSource:
     async def first(self) -> None:
         """Wait for the first model, and use it unless another one was set since."""
         loading = self._loading
-        if loading is None:
-            return
         try:
-            loaded = await loading
-            if self._loading is loading:
-                self.use(*loaded)
+            loaded = await loading if loading is not None else None
         except Exception as error:
             if self._loading is loading:
                 self._loading = None
                 reason = f"{str(error) or repr(error)}; or set the parameter 'model'"
                 self._report.refuse("model", reason)
+            return
+        if loaded is not None and self._loading is loading:
+            self.use(*loaded)
 
     def use(self, planner: Planner, file: str) -> None:
         """Plan with it from now on."""
@@ -97,20 +87,19 @@ class ModelSource:
         self._report.change()
         self._node.get_logger().info(f"planning with the model {file}")
 
-    def set(self, name: str) -> SetParametersResult:
+    def _set(self, name: str) -> SetParametersResult:
         """Set the node's parameter, which loads the model."""
-        parameter = Parameter("model", Parameter.Type.STRING, name)
-        return self._node.set_parameters([parameter])[0]
+        return self._node.set_parameters([Parameter("model", value=name)])[0]
 
     def on_saved(self, message: String) -> None:
         """Use a model that the trainer saved."""
-        result = self.set(message.data)
+        result = self._set(message.data)
         if not result.successful:
             self._report.refuse("model", f"the trainer's model was refused: {result.reason}")
 
     def on_reload(self) -> tuple[bool, str]:
         """Load the file of the model again."""
-        result = self.set(self._node.value("model"))
+        result = self._set(self._node.value("model"))
         if not result.successful:
             self._node.get_logger().error(f"the model was not loaded again: {result.reason}")
         return result.successful, result.reason or f"loaded {self.file}"
@@ -118,19 +107,18 @@ class ModelSource:
     def describe(self, rule: str) -> dict[str, str]:
         """Return what the diagnostics say of it, with the value of the parameter ``move_rule``."""
         description = {"model": self._node.value("model")}
-        if self.planner is not None:
-            metadata = self.planner.metadata
-            certificate = self.planner.network.certificate(metadata.move_rule)
-            sizes = metadata.sizes.items()
-            description |= {
-                "model file": self.file,
-                "move rule": move_rule(rule, self.planner).value,
-                "model move rule": metadata.move_rule.value,
-                "model sizes": ", ".join(f"{key} {size}" for key, size in sizes),
-                "model training steps": str(metadata.steps),
-                "model certificate": str(certificate or NO_CERTIFICATE),
-            }
-        return description
+        if self.planner is None:
+            return description
+        metadata = self.planner.metadata
+        certificate = self.planner.network.certificate(metadata.move_rule)
+        return description | {
+            "model file": self.file,
+            "move rule": move_rule(rule, self.planner).value,
+            "model move rule": metadata.move_rule.value,
+            "model sizes": ", ".join(f"{key} {size}" for key, size in metadata.sizes.items()),
+            "model training steps": str(metadata.steps),
+            "model certificate": str(certificate or NO_CERTIFICATE),
+        }
 
     def forget(self) -> None:
         """Free the model and its fields, with what `load_and_warm_up` kept from collection."""

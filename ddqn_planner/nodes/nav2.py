@@ -32,21 +32,7 @@ rclpy's 900 would slow down clients, and fill the memory."""
 CANCELED = Outcome("CANCELED", "the goal was canceled")
 PREEMPTED = Outcome("PREEMPTED", "a newer goal of the same action came")
 
-CODES = (
-    "UNKNOWN",
-    "INVALID_PLANNER",
-    "TF_ERROR",
-    "START_OUTSIDE_MAP",
-    "GOAL_OUTSIDE_MAP",
-    "START_OCCUPIED",
-    "GOAL_OCCUPIED",
-    "TIMEOUT",
-    "NO_VALID_PATH",
-    "NO_VIAPOINTS_GIVEN",
-)
-"""Nav2's error codes, in the order of their numbers; the first one is another in each action."""
-
-OTHER_NAMES = {
+CODES = {
     PlanStatus.NO_PATH.name: "NO_VALID_PATH",
     PlanStatus.ROLLOUT_TRAPPED.name: "NO_VALID_PATH",
     "NO_START": "TF_ERROR",
@@ -58,18 +44,14 @@ OTHER_NAMES = {
     "NO_MAP": "TIMEOUT",
     "MAP_TIMEOUT": "TIMEOUT",
 }
-"""The codes of statuses that Nav2 calls by another name; UNKNOWN is what it does not know."""
+"""What Nav2 calls a status, if by another name; UNKNOWN is all that it does not know."""
 
 
-def error_code(status: str, unknown: int) -> int:
-    """Return Nav2's error code of an `Outcome`: 0 for a path, and for a goal that was canceled.
-
-    `unknown` is the action's code for UNKNOWN.
-    """
+def error_code(status: str, result: Any) -> int:
+    """Return the error code of an `Outcome` in an action's Result: 0 also for a canceled goal."""
     if status in (PlanStatus.SUCCEEDED.name, CANCELED.status):
         return 0
-    name = OTHER_NAMES.get(status, status)
-    return unknown + (CODES.index(name) if name in CODES else 0)
+    return int(getattr(result, CODES.get(status, status), result.UNKNOWN))
 
 
 Plan = Callable[
@@ -80,16 +62,10 @@ future has an `Outcome` with which the goal is to be given up."""
 
 
 class PathAction:
-    """Answers the goals of one action, of which the newest one preempts the one under way.
+    """Answers the goals of one action, of which the newest one preempts the one under way."""
 
-    `result` makes an empty result, and `unknown` is the action's error code for UNKNOWN.
-    """
-
-    def __init__(
-        self, result: Callable[[], Any], unknown: int, is_active: Callable[[], bool], plan: Plan
-    ) -> None:
-        self._result, self._unknown = result, unknown
-        self._is_active, self._plan = is_active, plan
+    def __init__(self, result: Any, is_active: Callable[[], bool], plan: Plan) -> None:
+        self._result, self._is_active, self._plan = result, is_active, plan
         self._under_way: dict[bytes, Future] = {}
 
     def accept(self, goal: Any) -> GoalResponse:
@@ -121,7 +97,7 @@ class PathAction:
         result = self._result()
         result.path = path
         result.planning_time = Duration(seconds=time.monotonic() - began).to_msg()
-        result.error_code = error_code(outcome.status, self._unknown)
+        result.error_code = error_code(outcome.status, self._result)
         if hasattr(result, "error_msg"):  # Nav2 has added it later
             result.error_msg = outcome.reason if result.error_code else ""
         if handle.is_cancel_requested:
@@ -160,7 +136,7 @@ def serve_nav2(
         ("compute_path_to_pose", ComputePathToPose),
         ("compute_path_through_poses", ComputePathThroughPoses),
     ):
-        action = PathAction(kind.Result, kind.Result.UNKNOWN, is_active, plan)
+        action = PathAction(kind.Result, is_active, plan)
         ActionServer(
             node,
             kind,

@@ -291,24 +291,19 @@ class StartSource:
         if self.source == "tf":
             return self._pose_by_tf()
         topic, problem = self._subscription.topic_name, ""
-        if self._pose is None:
+        if self._pose is None and self.source == "initialpose":
+            problem = f"set it on {topic} (in RViz: 2D Pose Estimate)"
+        elif self._pose is None:
             problem = f"nothing came on {topic} in the map's frame"
-            if self.source == "initialpose":
-                problem = f"set it on {topic} (in RViz: 2D Pose Estimate)"
         elif self.source == "odometry":
             silent = (self._node.get_clock().now() - self._came).nanoseconds / 1e9
             if silent > max(self._node.value("transform_tolerance"), SILENCE):
-                problem = (
-                    f"nothing came on {topic} for {silent:.3g} s; publish it more often, set "
-                    "transform_tolerance"
-                )
-        if problem or self._pose is None:
-            raise RequestError(
-                "NO_START",
-                f"the start is unknown; {problem}; or set start_source, or give the request's "
-                "start its frame",
-            )
-        return self._pose
+                often = "publish it more often, set transform_tolerance"
+                problem = f"nothing came on {topic} for {silent:.3g} s; {often}"
+        if self._pose is not None and not problem:
+            return self._pose
+        remedy = "or set start_source, or give the request's start its frame"
+        raise RequestError("NO_START", f"the start is unknown; {problem}; {remedy}")
 
     def _pose_by_tf(self) -> PoseStamped:
         robot_frame, map_frame = self._node.value("robot_frame"), self._map_frame()

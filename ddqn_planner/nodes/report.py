@@ -11,7 +11,6 @@ from typing import Any
 from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import PoseStamped
-from nav_msgs.msg import OccupancyGrid
 
 from ddqn_planner.grid import Cell
 from ddqn_planner.nodes.runtime import BaseNode
@@ -80,10 +79,7 @@ NOT_ACTIVE = Outcome(
 def reason_of(
     request: PlanRequest, plan: Plan, start: PoseStamped, goal: PoseStamped, robot_radius: float
 ) -> str:
-    """Say how a path was found, or why there is none and what to do.
-
-    `start` and `goal` are the poses of the request, and `robot_radius` inflated its map.
-    """
+    """Say how a path between two poses was found, or why there is none and what to do."""
     grid, goals = request.grid, request.goals
     cleared = f"{request.start_clearing_radius * grid.resolution:.3g} m"
     if plan.status is not PlanStatus.SUCCEEDED:
@@ -142,12 +138,17 @@ class Refusals:
         """Refuse something, and perhaps log it, unless the last reason was the same."""
         repeated = self.refused.get(what) == reason
         self.refused[what] = reason
+        self.change()
         if log and not repeated:
             self.node.get_logger().error(f"{what} refused: {reason}")
 
     def accept(self, what: str) -> None:
         """Forget that something was refused."""
-        self.refused.pop(what, None)
+        if self.refused.pop(what, None):
+            self.change()
+
+    def change(self) -> None:
+        """Be told that something was refused or accepted."""
 
     def forget(self) -> None:
         """Forget all that was refused."""
@@ -171,17 +172,6 @@ class Report(Refusals):
     def change(self) -> None:
         """Publish soon: something about the node changed."""
         self._due = 0.0
-
-    def refuse(self, what: str, reason: str, log: bool = True) -> None:
-        """Refuse something, and publish it soon."""
-        super().refuse(what, reason, log)
-        self.change()
-
-    def accept(self, what: str) -> None:
-        """Forget that something was refused, and publish that soon."""
-        if what in self.refused:
-            super().accept(what)
-            self.change()
 
     def forget(self) -> None:
         """Forget what was refused, and the last outcome."""
@@ -213,10 +203,7 @@ class Report(Refusals):
         return time.monotonic() >= self._due
 
     def publish(self, fatal: bool, missing: str, more: Mapping[str, str]) -> None:
-        """Publish the diagnostics, with what is missing and more values.
-
-        It is fatal if the node cannot plan until its user does something.
-        """
+        """Publish the diagnostics; `fatal` if the node cannot plan until its user helps."""
         self._due = time.monotonic() + PERIOD
         outcome, plan, problems = self.outcome, self.outcome.plan, self.problems()
         if missing and missing != outcome.reason:
@@ -238,15 +225,6 @@ class Report(Refusals):
         }
         message = "; ".join([outcome.reason, *problems])
         self._publisher.publish(self.node.diagnostics("plan", level, message, values))
-
-
-def describe_map(message: OccupancyGrid) -> str:
-    """Return the size, resolution and frame of a map."""
-    info = message.info
-    return (
-        f"{info.width} x {info.height} cells of {info.resolution:.6g} m "
-        f"in frame {message.header.frame_id!r}"
-    )
 
 
 def seconds(stamp: Time) -> str:

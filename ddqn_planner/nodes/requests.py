@@ -24,7 +24,7 @@ from ddqn_planner.nodes.poses import Frames, StartSource
 from ddqn_planner.nodes.report import Outcome, RequestError, checked, reason_of, seconds
 from ddqn_planner.nodes.runtime import Worker
 from ddqn_planner.planning import Plan, PlanMethod, Planner, PlanRequest, PlanStatus
-from ddqn_planner.planning.path_under_way import is_path_valid, rest_of_path
+from ddqn_planner.planning.paths import is_path_valid, rest_of_path
 from ddqn_planner.planning.plan import joined
 from ddqn_planner.planning.repair import shift_between
 

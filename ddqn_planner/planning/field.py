@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import threading
+import time
 from functools import cached_property
-from typing import NamedTuple, TypeAlias
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -110,7 +111,7 @@ class QField:
         ValueError
             If the start is no cell of the map.
         """
-        policy = self.policy
+        began, policy = time.perf_counter(), self.policy
         cell = cell_inside(start, policy.shape, "the start")
         cells, visited = [cell], {cell}
         while cell != self.goal:
@@ -120,7 +121,11 @@ class QField:
                 return Plan(PlanStatus.ROLLOUT_TRAPPED, move_rule=self.move_rule)
             visited.add(cell)
             cells.append(cell)
-        return Plan(PlanStatus.SUCCEEDED, np.array(cells), move_rule=self.move_rule)
+        return self._succeeded(np.array(cells), began)
+
+    def _succeeded(self, path: NDArray[Any], began: float) -> Plan:
+        ms = 1e3 * (time.perf_counter() - began)
+        return Plan(PlanStatus.SUCCEEDED, path, move_rule=self.move_rule, rollout_ms=ms)
 
 
 class Known(NamedTuple):
@@ -211,10 +216,10 @@ class DistanceField(QField):
             if not self._reach(start, limit):
                 status = PlanStatus.NO_PATH if self.is_whole else PlanStatus.ROLLOUT_TRAPPED
                 return Plan(status, move_rule=self.move_rule)
+            began = time.perf_counter()
             cells = kernels.roll_out(self.known.distance, self.costs, self._number(start))
         y, x = np.divmod(cells, self.costs.width)
-        path = np.stack([x - 1, y - 1], axis=1).astype(np.int32)
-        return Plan(PlanStatus.SUCCEEDED, path, move_rule=self.move_rule)
+        return self._succeeded(np.stack([x - 1, y - 1], axis=1).astype(np.int32), began)
 
     def take_over(
         self,
@@ -252,8 +257,8 @@ class DistanceField(QField):
         """Return the distance of every cell of the padded map, 0 where there is none: (C,)."""
         if not self.is_whole:
             distance, state, opened, _ = self._take()
-            kernels.grow_whole(distance, state, opened, self.costs)
-            self.known = Known(distance, state, opened[:0])
+            opened, _ = kernels.grow(distance, state, opened, self.costs)
+            self.known = Known(distance, state, opened)
         return self.known.distance
 
     @cached_property

@@ -18,10 +18,7 @@ CACHE_BYTES = 2**29
 
 @dataclass(eq=False)
 class _KnownMap:
-    """What a planner knows of a map under a move rule: the network's costs of moves, and fields.
-
-    The costs are None for a network that gives none, see `QNetwork.move_costs`.
-    """
+    """What is known of a map under a move rule: `QNetwork.move_costs`, and fields."""
 
     grid: GridMap
     move_rule: MoveRule

@@ -81,44 +81,48 @@ def cost_of(
 
 
 def grow(
-    distance: Distances, state: States, opened: Cells, costs: MoveCosts, start: int, limit: int
+    distance: Distances,
+    state: States,
+    opened: Cells,
+    costs: MoveCosts,
+    start: int | None = None,
+    limit: int = 2**62,
 ) -> tuple[Cells, bool]:
-    """Close cells in the order of A* until the distance of a start is known.
+    """Close cells in the order of A*, in place, until the distance of a start is known.
 
     All cells that tie with those of the start's best path are closed too. So a rollout does not
     depend on what was asked before. It gives up when it has visited more cells than the limit.
-    Distances and states are changed in place. Return the cells that stay open, and whether all was
-    visited that the start needs.
+    Without a start, each cell that a path joins to the goal gets its distance (Dijkstra). Return
+    the cells that stay open, and whether all was visited that is asked for.
     """
-    # Lower bounds, whatever the rounding.
-    bounds = costs.straight * (1 - 1e-7), costs.diagonal * (1 - 1e-7)
-    order = _orders(distance, opened, costs.width, start, bounds)
+    if start is None:
+        # One bucket per unit: as no move costs less than 1, a cell cannot change its own. The start
+        # is on the border, which no path reaches.
+        start, bounds, buckets = 0, (0.0, 0.0), 1
+    else:  # lower bounds, whatever the rounding
+        bounds = costs.straight * (1 - 1e-7), costs.diagonal * (1 - 1e-7)
+        buckets = BUCKETS
+    order = _orders(distance, opened, costs.width, start, bounds, buckets)
     first = np.argsort(order)
-    return _grow(distance, state, opened[first], order[first], costs, start, bounds, BUCKETS, limit)
-
-
-def grow_whole(distance: Distances, state: States, opened: Cells, costs: MoveCosts) -> None:
-    """Give each cell that a path joins to the goal its distance, in place: Dijkstra's algorithm.
-
-    No move costs less than 1, so that there is one bucket per unit: a cell cannot change its own.
-    """
-    order = distance[opened].astype(np.int64)
-    first = np.argsort(order)
-    border = 0  # no path reaches it
-    bounds, limit = (0.0, 0.0), 2**62
-    _grow(distance, state, opened[first], order[first], costs, border, bounds, 1, limit)
+    order, opened = order[first], opened[first]
+    return _grow(distance, state, opened, order, costs, start, bounds, buckets, limit)
 
 
 @compiled
 def _orders(
-    distance: Distances, opened: Cells, width: int, start: int, bounds: tuple[float, float]
+    distance: Distances,
+    opened: Cells,
+    width: int,
+    start: int,
+    bounds: tuple[float, float],
+    buckets: int,
 ) -> NDArray[np.int64]:
     """Return the bucket of each open cell, in the order of A*."""
     order = np.empty(opened.size, np.int64)
     for number in range(opened.size):
         cell = opened[number]
         x, y = cell % width - start % width, cell // width - start // width
-        order[number] = (distance[cell] + _remaining(x, y, bounds)) * BUCKETS
+        order[number] = (distance[cell] + _remaining(x, y, bounds)) * buckets
     return order
 
 
@@ -252,6 +256,20 @@ def _still_open(
 
 
 @compiled
+def _least(
+    distance: Any, state: Any, patch: Any, table: Any, value: Any, terms: Any, width: int, cell: int
+) -> float:
+    """Return the least cost of a path from a cell through those around it that are not marked."""
+    least = np.inf
+    for action in range(8):
+        after = cell + MOVE_Y[action] * width + MOVE_X[action]
+        if distance[after] > 0 and not state[after] & MARKED:
+            cost = cost_of(patch, table, value, terms, width, cell, action)
+            least = min(least, distance[after] + cost)
+    return least
+
+
+@compiled
 def take_back(
     distance: Distances, state: States, costs: MoveCosts, changed: Cells, limit: int
 ) -> tuple[Cells, bool]:
@@ -273,13 +291,7 @@ def take_back(
         known, cell = heapq.heappop(waiting)
         if state[cell] & MARKED:
             continue
-        supported = False
-        for action in range(8):
-            after = cell + offsets[action]
-            if distance[after] > 0 and not state[after] & MARKED:
-                cost = cost_of(patch, table, value, terms, width, cell, action)
-                supported |= distance[after] + cost <= known
-        if supported:
+        if _least(distance, state, patch, table, value, terms, width, cell) <= known:
             continue
         state[cell] |= MARKED
         lost.append(cell)
@@ -299,12 +311,7 @@ def take_back(
     opened = np.empty(len(lost), np.int32)
     number = 0
     for cell in lost:
-        best = np.inf
-        for action in range(8):
-            after = cell + offsets[action]
-            if distance[after] > 0:
-                cost = cost_of(patch, table, value, terms, width, cell, action)
-                best = min(best, distance[after] + cost)
+        best = _least(distance, state, patch, table, value, terms, width, cell)
         if best < np.inf and (distance[cell] == 0 or best < distance[cell]):
             distance[cell], state[cell] = best, OPEN
             opened[number] = cell

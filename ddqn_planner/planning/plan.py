@@ -37,31 +37,7 @@ class PlanMethod(Choice):
 
 @dataclass(frozen=True)
 class PlanRequest:
-    """All that a path is planned with, so that a request may wait while other things change.
-
-    Parameters
-    ----------
-    grid : GridMap
-    start, goal : (x, y)
-    move_rule : MoveRule
-    method : PlanMethod
-        Whether to search where the greedy steps are trapped.
-    tolerance : float
-        How far a goal that is occupied or cut off may move, in cells: to the nearest free cell
-        that a path reaches.
-    simplified : bool
-        Whether to leave out cells, see `simplify`.
-    under_way : (N, 2) int32
-        The path that the robot follows, move by move, if there is one.
-    switch_threshold : float
-        How much more the rest of it may cost than the new path, as a share, see `keep_or_switch`.
-    others : tuple of (x, y)
-        Goals that do as well: the path leads to the nearest of all that are free. They do not go
-        together with a tolerance.
-    start_clearing_radius : float
-        Where the start is an obstacle, those within so many cells of it, itself included, do not
-        count until the path has reached its first free cell, the nearest one. With 0 they count.
-    """
+    """All that a path is planned with, so that a request may wait; see `Planner.plan`."""
 
     grid: GridMap
     start: Cell
@@ -70,8 +46,12 @@ class PlanRequest:
     method: PlanMethod = PlanMethod.GREEDY
     tolerance: float = 0.0
     simplified: bool = False
+    # The path that the robot follows, move by move, and how much more its rest may cost than the
+    # new path, as a share, see `keep_or_switch`.
     under_way: Cells = field(default=(), compare=False)
     switch_threshold: float = 0.0
+    # Goals that do as well: the path leads to the nearest of all that are free. They do not go
+    # together with a tolerance.
     others: tuple[Cell, ...] = ()
     start_clearing_radius: float = 0.0
 
@@ -162,13 +142,8 @@ class Plan:
 def joined(plans: Sequence[Plan]) -> Plan:
     """Return the plan of a path through several goals: each plan starts where the last one ended.
 
-    Where two paths meet, their common cell is there once. The costs and the times are the sums. If
-    the last plan has no path, neither has the whole.
-
-    Parameters
-    ----------
-    plans : sequence of Plan
-        At least one, all SUCCEEDED except perhaps the last, under one move rule and on one map.
+    All plans have succeeded, except perhaps the last: if it has no path, neither has the whole.
+    Where two paths meet, their common cell is there once. The costs and the times are the sums.
     """
     first, last = plans[0], plans[-1]
     if not last.path.size:

@@ -7,6 +7,7 @@ import time
 from collections.abc import Generator, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 
@@ -16,11 +17,11 @@ from ddqn_planner.grid.grid_map import check_grid
 from ddqn_planner.model import ModelMetadata, QNetwork, load_model
 from ddqn_planner.planning.field import DistanceField, Goals, QField
 from ddqn_planner.planning.field_cache import FieldCache
-from ddqn_planner.planning.path_under_way import keep_or_switch
+from ddqn_planner.planning.paths import can_leave, keep_or_switch, reach, simplify, way_out_and_ends
 from ddqn_planner.planning.plan import Plan, PlanMethod, PlanRequest, PlanStatus, joined
 from ddqn_planner.planning.search import search
-from ddqn_planner.planning.simplification import simplify
-from ddqn_planner.planning.way_out import can_leave, reach, way_out_and_ends
+
+T = TypeVar("T")
 
 VISITS = 2**18
 """About how many cells a field visits in one step of a plan: some 30 ms, then comes another."""
@@ -116,10 +117,21 @@ class Planner:
 
         Parameters
         ----------
-        grid, start, goal, method, tolerance, simplified, start_clearing_radius
-            See `PlanRequest`.
+        grid : GridMap
+        start, goal : (x, y)
         move_rule : MoveRule, optional
             By default the rule that the model was trained for.
+        method : PlanMethod
+            Whether to search where the greedy steps are trapped.
+        tolerance : float
+            How far a goal that is occupied or cut off may move, in cells: to the nearest free cell
+            that a path reaches.
+        simplified : bool
+            Whether to leave out cells, see `simplify`.
+        start_clearing_radius : float
+            Where the start is an obstacle, those within so many cells of it, itself included, do
+            not count until the path has reached its first free cell, the nearest one. With 0 they
+            count.
 
         Returns
         -------
@@ -133,23 +145,9 @@ class Planner:
             If the tolerance or the radius is negative or NaN, the start or the goal is no pair of
             whole numbers, or there is no such move rule or method.
         """
-        check_grid(grid)
-        start, goal = as_cell(start, "the start"), as_cell(goal, "the goal")
-        rule, method = self._rule(move_rule), PlanMethod(method)
-        tolerance = _cells("the tolerance", tolerance)
-        simplified = as_flag("simplified", simplified)
-        radius = _cells("start_clearing_radius", start_clearing_radius)
-        request = PlanRequest(
-            grid,
-            start,
-            goal,
-            rule,
-            method,
-            tolerance,
-            simplified,
-            start_clearing_radius=radius,
-        )
-        return last_step(self.steps(request))
+        goals = [as_cell(goal, "the goal")]
+        how = move_rule, method, tolerance, simplified, start_clearing_radius
+        return self._answer(grid, start, goals, how)
 
     def plan_nearest(
         self,
@@ -168,34 +166,18 @@ class Planner:
 
         Parameters
         ----------
-        grid, start, method, simplified, start_clearing_radius
-            See `PlanRequest`.
+        grid, start, move_rule, method, simplified, start_clearing_radius
+            As for `plan`.
         goals : sequence of (x, y)
             At least one, in any order. No goal moves: there is no tolerance.
-        move_rule : MoveRule, optional
-            As for `plan`.
 
         Raises
         ------
         ValueError
             As for `plan`, or if there is no goal.
         """
-        check_grid(grid)
-        first, *others = _cells_of_goals(goals)
-        rule, method = self._rule(move_rule), PlanMethod(method)
-        start, simplified = as_cell(start, "the start"), as_flag("simplified", simplified)
-        radius = _cells("start_clearing_radius", start_clearing_radius)
-        request = PlanRequest(
-            grid,
-            start,
-            first,
-            rule,
-            method,
-            simplified=simplified,
-            others=(*others,),
-            start_clearing_radius=radius,
-        )
-        return last_step(self.steps(request))
+        how = move_rule, method, 0.0, simplified, start_clearing_radius
+        return self._answer(grid, start, _cells_of_goals(goals), how)
 
     def plan_through(
         self,
@@ -215,12 +197,7 @@ class Planner:
         grid, start, move_rule, method, tolerance, simplified, start_clearing_radius
             As for `plan`. The tolerance holds for each goal. A simplified path keeps all goals.
         goals : sequence of (x, y)
-            At least one.
-
-        Returns
-        -------
-        Plan
-            If there is no path to one of the goals, its status tells why, and its goal which.
+            At least one. If one has no path, the plan's status tells why, and its goal which.
 
         Raises
         ------
@@ -237,93 +214,40 @@ class Planner:
             start = plans[-1].goal
         return joined(plans)
 
+    def _answer(self, grid: GridMap, start: Cell, goals: list[Cell], how: tuple[Any, ...]) -> Plan:
+        """Check what a user asks for, and plan."""
+        move_rule, method, tolerance, simplified, start_clearing_radius = how
+        check_grid(grid)
+        goal, *others = goals
+        request = PlanRequest(
+            grid,
+            as_cell(start, "the start"),
+            goal,
+            self._rule(move_rule),
+            PlanMethod(method),
+            _cells("the tolerance", tolerance),
+            as_flag("simplified", simplified),
+            others=(*others,),
+            start_clearing_radius=_cells("start_clearing_radius", start_clearing_radius),
+        )
+        return last_step(self.steps(request))
+
     def steps(self, request: PlanRequest) -> Iterator[Plan | None]:
         """Plan a path in steps, so that a caller can take the slow ones in another thread.
 
-        Yields
-        ------
-        Plan or None
-            None before each step that may be slow (a part of a new field, a search); at last the
-            plan.
+        None comes before each step that may be slow (a part of a new field, a search), and last the
+        plan.
         """
-        grid, start, rule = request.grid, request.start, request.move_rule
-        status = self._refusal(request)
-        if status is not None:
-            yield Plan(status, move_rule=rule)
+        found: PlanStatus | _Found | None = self._refusal(request)
+        field_ms = 0.0
+        if found is None:
+            found, field_ms = yield from _timed(self._find_field(request))
+        if isinstance(found, PlanStatus):
+            yield Plan(found, move_rule=request.move_rule, field_ms=field_ms)
             return
-        goals, field_time, rollout_time = _free_goals(request), _Stopwatch(), _Stopwatch()
-        if len(goals) > 1 and not self._fields.has_costs(grid, rule):
-            yield None
-            each = [replace(request, goal=goal, others=(), under_way=()) for goal in goals]
-            with field_time:
-                nearest = min((last_step(self.steps(one)) for one in each), key=_cost)
-            goals = nearest.cells[-1:] or goals[:1]
-        way_out: tuple[Cell, ...] = (start,)
-        with field_time:
-            field = self._fields.find(grid, goals, rule) if grid.is_free(start) else None
-        with rollout_time:
-            plan = field.rollout_if_known(start) if field else None
-        if plan is None or (not plan.path.size and reach(request) >= 1):
-            yield None
-        if plan is None and grid.is_free(start) and goals:
-            with field_time:
-                if self._fields.has_costs(grid, rule):
-                    field = self._fields.get(grid, goals, rule, start)
-            if isinstance(field, DistanceField):
-                plan = yield from _in_parts(field, request, field_time)
-        if plan is None or not plan.path.size:
-            with field_time:
-                if plan and plan.status is PlanStatus.NO_PATH and reach(request) < 1:
-                    way_out, ends = (), goals
-                else:
-                    way_out, ends = way_out_and_ends(request, goals)
-                if way_out and (field is None or field.goals != ends):
-                    field, plan = self._fields.get(grid, ends, rule, way_out[-1]), None
-            if field is None or not way_out:
-                status = PlanStatus.NO_PATH if goals else PlanStatus.GOAL_OCCUPIED
-                if grid.is_obstacle(start) and not can_leave(request):
-                    status = PlanStatus.START_OCCUPIED
-                yield Plan(status, move_rule=rule, field_ms=field_time.ms)
-                return
-            with rollout_time:
-                plan = plan or field.rollout(way_out[-1])
-            if not plan.path.size and request.method is PlanMethod.ASTAR_FALLBACK:
-                yield None
-                costs = grid.cost_multiplier
-                with rollout_time:
-                    cells = search(way_out[-1], ends[0], field.legal, costs, rule, field.value)
-                plan = Plan(PlanStatus.SUCCEEDED, np.array(cells), PlanMethod.ASTAR_FALLBACK)
-        assert field is not None
-        path, cost, extra_cost, goal = plan.path, None, None, field.goal
-        with rollout_time:
-            if path.size:
-                if len(request.under_way):
-                    threshold = request.switch_threshold
-                    path, extra_cost = keep_or_switch(
-                        request.under_way, path, grid, rule, threshold, request.goals
-                    )
-                goal = (int(path[-1, 0]), int(path[-1, 1]))
-                if len(way_out) > 1:
-                    path = np.concatenate([way_out[:-1], path], dtype=np.int32)
-                    if not np.array_equal(path, np.asarray(request.under_way)[-len(path) :]):
-                        extra_cost = None  # only from the first free cell on it is the one kept
-                if grid.has_costs:
-                    cost = path_cost(path, grid.cost_multiplier, rule)
-                    cost *= grid.seconds_per_cell or 1.0
-            every_cell = path
-            if request.simplified:
-                path = np.array(simplify(path, grid, rule), dtype=np.int32)
-        yield replace(
-            plan,
-            path=path,
-            move_rule=rule,
-            cost=cost,
-            goal=goal,
-            every_cell=every_cell,
-            extra_cost=extra_cost,
-            field_ms=field_time.ms,
-            rollout_ms=rollout_time.ms,
-        )
+        plan, rollout_ms = yield from _timed(_roll_out(request, found))
+        known_ms = found.plan.rollout_ms if found.plan else 0.0
+        yield replace(plan, field_ms=field_ms - known_ms, rollout_ms=rollout_ms + known_ms)
 
     def _refusal(self, request: PlanRequest) -> PlanStatus | None:
         """Return why there is no path, where one look at start and goals says so."""
@@ -334,23 +258,59 @@ class Planner:
             return PlanStatus.GOAL_OUTSIDE_MAP
         if grid.is_obstacle(request.start) and request.start_clearing_radius == 0:
             return PlanStatus.START_OCCUPIED
-        if not _free_goals(request) and reach(request) < 1:
+        if not any(grid.is_free(goal) for goal in request.goals) and reach(request) < 1:
             return PlanStatus.GOAL_OCCUPIED
         if not self.network.supports((grid.height, grid.width)):
             return PlanStatus.MAP_SIZE_UNSUPPORTED
         return None
 
+    def _find_field(self, request: PlanRequest) -> Generator[None, None, _Found | PlanStatus]:
+        """Return the field that leads to a goal, or why there is no path."""
+        grid, start, rule = request.grid, request.start, request.move_rule
+        goals = tuple(sorted({goal for goal in request.goals if grid.is_free(goal)}))
+        if len(goals) > 1 and not self._fields.has_costs(grid, rule):
+            yield
+            goals = self._nearest_alone(request, goals)
+        field: QField | None = None
+        plan: Plan | None = None
+        if grid.is_free(start):
+            field = self._fields.find(grid, goals, rule)
+            plan = field.rollout_if_known(start) if field else None
+        if plan is None or (not plan.path.size and reach(request) >= 1):
+            yield
+        if plan is None and goals and grid.is_free(start) and self._fields.has_costs(grid, rule):
+            field = self._fields.get(grid, goals, rule, start)
+            assert isinstance(field, DistanceField)
+            plan = yield from _in_parts(field, request)
+        if field and plan and plan.path.size:
+            return _Found(field, (start,), plan)
+        if plan and plan.status is PlanStatus.NO_PATH and reach(request) < 1:
+            return PlanStatus.NO_PATH
+        way_out, ends = way_out_and_ends(request, goals)
+        if not way_out and grid.is_obstacle(start) and not can_leave(request):
+            return PlanStatus.START_OCCUPIED
+        if not way_out:
+            return PlanStatus.NO_PATH if goals else PlanStatus.GOAL_OCCUPIED
+        if field is None or field.goals != ends:
+            field, plan = self._fields.get(grid, ends, rule, way_out[-1]), None
+        return _Found(field, way_out, plan)
 
-def last_step(steps: Iterator[Plan | None]) -> Plan:
-    """Take all steps that are left of `Planner.steps`, and return the plan."""
-    *_, plan = steps
-    assert plan is not None
-    return plan
+    def _nearest_alone(self, request: PlanRequest, goals: Goals) -> Goals:
+        """Return the nearest of several goals, by a field toward each."""
+        each = [replace(request, goal=goal, others=(), under_way=()) for goal in goals]
+        nearest = min((last_step(self.steps(one)) for one in each), key=_cost)
+        return nearest.cells[-1:] or goals[:1]
 
 
-def _in_parts(
-    field: DistanceField, request: PlanRequest, field_time: _Stopwatch
-) -> Generator[None, None, Plan]:
+class _Found(NamedTuple):
+    """The field that leads to a goal, the way out to a free cell, and the rollout where known."""
+
+    field: QField
+    way_out: tuple[Cell, ...]
+    plan: Plan | None
+
+
+def _in_parts(field: DistanceField, request: PlanRequest) -> Generator[None, None, Plan]:
     """Return the rollout from the start; after each part that the field grows for it, yield.
 
     Once the field has visited many cells, the connected cells say whether there is a path: most
@@ -359,30 +319,78 @@ def _in_parts(
     grid, start = request.grid, request.start
     until_labels = int(UNLABELLED_SHARE * grid.occupancy.size)
     while True:
-        with field_time:
-            visits = min(VISITS, until_labels) or VISITS
-            plan = field.rollout(start, visits)
-            if plan.status is not PlanStatus.ROLLOUT_TRAPPED:
-                return plan
-            if until_labels == visits:
-                labels = grid.labels(request.move_rule)
-                if all(labels[y, x] != labels[start[::-1]] for x, y in field.goals):
-                    return Plan(PlanStatus.NO_PATH)
-            until_labels = max(until_labels - visits, 0)
-        yield None
+        visits = min(VISITS, until_labels) or VISITS
+        plan = field.rollout(start, visits)
+        if plan.status is not PlanStatus.ROLLOUT_TRAPPED:
+            return plan
+        if until_labels == visits:
+            labels = grid.labels(request.move_rule)
+            if all(labels[y, x] != labels[start[::-1]] for x, y in field.goals):
+                return Plan(PlanStatus.NO_PATH)
+        until_labels = max(until_labels - visits, 0)
+        yield
 
 
-class _Stopwatch:
-    """Adds up the milliseconds of some blocks of code."""
+def _roll_out(request: PlanRequest, found: _Found) -> Generator[None, None, Plan]:
+    """Return the plan: the rollout, or where it is trapped perhaps a search, and dressed."""
+    start, field, rule = found.way_out[-1], found.field, request.move_rule
+    plan = found.plan or field.rollout(start)
+    if not plan.path.size and request.method is PlanMethod.ASTAR_FALLBACK:
+        yield
+        costs = request.grid.cost_multiplier
+        cells = search(start, field.goal, field.legal, costs, rule, field.value)
+        plan = Plan(PlanStatus.SUCCEEDED, np.array(cells), PlanMethod.ASTAR_FALLBACK)
+    return _dressed(request, found, plan)
 
-    def __init__(self) -> None:
-        self.ms = 0.0
 
-    def __enter__(self) -> None:
-        self._began = time.perf_counter()
+def _dressed(request: PlanRequest, found: _Found, plan: Plan) -> Plan:
+    """Return the plan with the way out, what is kept of the path under way, its cost and goal."""
+    grid, rule, way_out = request.grid, request.move_rule, found.way_out
+    path, cost, extra_cost, goal = plan.path, None, None, found.field.goal
+    if path.size:
+        if len(request.under_way):
+            path, extra_cost = keep_or_switch(
+                request.under_way, path, grid, rule, request.switch_threshold, request.goals
+            )
+        goal = (int(path[-1, 0]), int(path[-1, 1]))
+        if len(way_out) > 1:
+            path = np.concatenate([way_out[:-1], path], dtype=np.int32)
+            if not np.array_equal(path, np.asarray(request.under_way)[-len(path) :]):
+                extra_cost = None  # only from the first free cell on it is the one kept
+        if grid.has_costs:
+            cost = path_cost(path, grid.cost_multiplier, rule) * (grid.seconds_per_cell or 1.0)
+    every_cell = path
+    if request.simplified:
+        path = np.array(simplify(path, grid, rule), dtype=np.int32)
+    return replace(
+        plan,
+        path=path,
+        move_rule=rule,
+        cost=cost,
+        goal=goal,
+        every_cell=every_cell,
+        extra_cost=extra_cost,
+    )
 
-    def __exit__(self, *_: object) -> None:
-        self.ms += 1e3 * (time.perf_counter() - self._began)
+
+def _timed(steps: Generator[None, None, T]) -> Generator[None, None, tuple[T, float]]:
+    """Take some steps, and return what they return, and the milliseconds that they took."""
+    ms = 0.0
+    while True:
+        began = time.perf_counter()
+        try:
+            next(steps)
+        except StopIteration as done:
+            return done.value, ms + 1e3 * (time.perf_counter() - began)
+        ms += 1e3 * (time.perf_counter() - began)
+        yield
+
+
+def last_step(steps: Iterator[Plan | None]) -> Plan:
+    """Take all steps that are left of `Planner.steps`, and return the plan."""
+    *_, plan = steps
+    assert plan is not None
+    return plan
 
 
 def _cells_of_goals(goals: Sequence[Cell]) -> list[Cell]:
@@ -397,11 +405,6 @@ def _cells(name: str, value: float) -> float:
     if not real(value) >= 0:
         raise ValueError(f"{name} is {value!r}; give 0 cells or more")
     return real(value)
-
-
-def _free_goals(request: PlanRequest) -> Goals:
-    """Return the free ones of a request's goals, each once."""
-    return tuple(sorted({goal for goal in request.goals if request.grid.is_free(goal)}))
 
 
 def _cost(plan: Plan) -> float:

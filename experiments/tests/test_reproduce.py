@@ -6,59 +6,91 @@ import signal
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 
+import any_map
+import numpy as np
 import pytest
+from goal_1 import a_star, convergence_row, first_kept
+from goal_2 import free_starts, trained_field
+from goal_3 import fixed_path, noisy_maps
+from hypothesis import given
+from hypothesis import strategies as st
+from networks import random_network
 from PIL import Image
 from reproduce import EXPERIMENTS, main
+from strategies import grids_with_free_cell
+from tables import mean_and_worst, median_and_range, write_report, write_table
+from trainings import (
+    MOVE_RULE,
+    Training,
+    best_moves,
+    cross_entropy,
+    evaluate_training,
+    in_parallel,
+    optimal_value,
+    read_evaluations,
+    train,
+    train_supervised,
+)
+
+from ddqn_planner.grid import (
+    MOVES,
+    Cell,
+    GridMap,
+    MoveRule,
+    Noise,
+    path_length,
+    shortest_distances,
+    shortest_path,
+)
+from ddqn_planner.model import ModelMetadata, load_model
+from ddqn_planner.planning import Planner
+from ddqn_planner.training.environment import GridVectorEnvironment, Scenario
+from ddqn_planner.training.evaluation import length_ratios
+from ddqn_planner.training.hyper_parameters import HyperParameters
+from ddqn_planner.training.trainer import Trainer
 
 PROGRAM = Path(__file__).parents[1] / "reproduce.py"
-
+QUICK = HyperParameters(steps=900, filters=4, learning_starts=50, target_interval=100)
 PATIENCE = 300
 """Seconds to wait for what should come at once: a loaded machine is slow, not wrong."""
 
 
-@pytest.mark.slow(seconds=40)
 @pytest.mark.filterwarnings("ignore:All-NaN")  # of one seed that learns nothing
-def test_reproduce_runs_every_experiment_and_writes_its_report(
+def test_every_experiment_writes_its_report_and_trains_what_is_new(
     capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
-    reading = ["--noise", "on_path", "--hidden-units", "0"]
-
-    def reproduce(experiment: str, seeds: int) -> str:
-        command = [
-            "--backend",
-            "sequential",
-            "--quick",
-            "--experiment",
-            experiment,
-            "--seeds",
-            str(seeds),
-        ]
-        assert main([*command, "--out", str(tmp_path), *reading]) == 0
-        report = (folder / "report.md").read_text()
-        assert report in capsys.readouterr().out
-        for name in EXPERIMENTS if experiment == "all" else [experiment]:
-            options = f"--experiment {name} --seeds {seeds} {' '.join(reading)} --quick"
-            assert f"`python experiments/reproduce.py {options}`" in report
-        return report
-
+    page = tmp_path / "page.md"
+    page.write_text("before\n<!-- Goal ii: from every free cell -->\nold\n<!-- end -->\nafter\n")
+    command = ["--backend", "sequential", "--quick", "--out", str(tmp_path)]
+    command += ["--noise", "on_path", "--hidden-units", "3", "--page", str(page)]
+    assert main([*command, "--seeds", "1"]) == 0
     folder = tmp_path / "quick"
-    report = reproduce("all", seeds=1)
+    report = (folder / "report.md").read_text()
+    assert report in capsys.readouterr().out
+    for title, _, _ in EXPERIMENTS.values():
+        assert f"## {title}\n" in report
     for picture in re.findall(r"!\[.*?\]\((.*?)\)", report):
         with Image.open(folder / picture) as image:
             assert min(image.size) > 300
             assert len(image.convert("RGB").getcolors(image.width * image.height)) > 20
-    assert "| propagation | 286 |" in report
+    assert "| on_path | paper, 3 hidden units |" in report
+    assert "near_path" not in report
+    before, _, results = page.read_text().partition("<!-- Goal ii: from every free cell -->\n")
+    assert (before, results[-20:]) == ("before\n", "\n<!-- end -->\nafter\n")
+    assert "| propagation | 286 |" in results
+    assert "](images/page/goal_2.png)" in results
+    assert (tmp_path / "images" / "page" / "goal_2.png").exists()
     trained = {path: path.stat().st_mtime_ns for path in tmp_path.rglob("evaluations.csv")}
     assert len(trained) == 8 + 2 + 2
     # Only the second seed of both profiles is new.
-    assert "| propagation | 286 |" in reproduce("goal-2", seeds=2)
+    assert main([*command, "--experiment", "goal-2", "--seeds", "2"]) == 0
     assert trained == {path: path.stat().st_mtime_ns for path in trained}
     assert len([*tmp_path.rglob("evaluations.csv")]) == len(trained) + 2
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_interrupted_experiments_end_with_all_their_processes(tmp_path: Path, number: int) -> None:
     command = [sys.executable, PROGRAM, "--experiment", "goal-1", "--out", tmp_path]
@@ -75,28 +107,208 @@ def test_interrupted_experiments_end_with_all_their_processes(tmp_path: Path, nu
     assert "run the same command to resume" in printed
 
 
-def test_reproduce_refuses_less_than_one_seed(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["--seeds", "0"]) == 2
-    assert "--seeds is 0; give at least 1" in capsys.readouterr().err
-
-
-@pytest.mark.slow(seconds=15)
-def test_reproduce_may_be_asked_for_one_reading_of_goal_3(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+@pytest.mark.parametrize(
+    ("arguments", "named"),
+    [
+        (["--seeds", "0"], "--seeds is 0; give at least 1"),
+        (["--experiment", "goal-3", "--hidden-units", "-1"], "hidden_units is -1"),
+    ],
+)
+def test_wrong_options_are_refused(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], arguments: list[str], named: str
 ) -> None:
-    command = ["--backend", "sequential", "--quick", "--seeds", "1", "--out", str(tmp_path)]
-    assert main([*command, "--experiment", "goal-3", "--hidden-units", "3"]) == 0
-    report = capsys.readouterr().out
-    options = "--seeds 1 --hidden-units 3 --quick"
-    assert f"`python experiments/reproduce.py --experiment goal-3 {options}`" in report
-    for noise in ("on_path", "near_path"):
-        assert f"| {noise} | paper, 3 hidden units |" in report
-    assert "| paper |" not in report
+    assert main([*arguments, "--out", str(tmp_path)]) == 2
+    assert named in capsys.readouterr().err
 
 
-def test_reproduce_refuses_a_hidden_layer_that_cannot_be(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+def test_a_training_that_was_cut_off_ends_as_if_it_had_not_been(
+    small: Scenario, tmp_path: Path
 ) -> None:
-    command = ["--experiment", "goal-3", "--hidden-units", "-1"]
-    assert main([*command, "--out", str(tmp_path)]) == 2
-    assert "hidden_units is -1" in capsys.readouterr().err
+    folders = [tmp_path / name for name in ("whole", "cut")]
+    whole, cut = (Training(folder, QUICK, (small,), 1, 300) for folder in folders)
+    train(whole)
+    train(replace(cut, parameters=replace(QUICK, steps=600)))
+    in_parallel(train, [cut])
+    runs = [read_evaluations(folder) for folder in folders]
+    assert runs[0]["step"].tolist() == [300, 600, 900]
+    for name in set(runs[0].dtype.names or ()) - {"seconds"}:
+        np.testing.assert_array_equal(runs[0][name], runs[1][name])
+    assert (np.diff(runs[1]["seconds"]) >= 0).all()
+    models = [folder / "model.safetensors" for folder in folders]
+    assert models[0].read_bytes() == models[1].read_bytes()
+    other = replace(cut, parameters=replace(QUICK, gamma=0.5))
+    with pytest.raises(ValueError, match=r"gamma 0\.95"):
+        in_parallel(train, [other])
+
+
+def test_the_last_of_the_networks_that_solve_the_most_is_kept(
+    small: Scenario, tmp_path: Path
+) -> None:
+    train(Training(tmp_path, QUICK, (small,), seed=1, evaluation_interval=50))
+    solved = np.flatnonzero(read_evaluations(tmp_path)["solved"] == 1)
+    assert len(solved) > 1
+    assert load_model(tmp_path / "kept.safetensors")[1].steps == 50 * (solved[-1] + 1)
+
+
+def test_the_over_estimation_is_that_of_the_free_cells_but_the_goal(small: Scenario) -> None:
+    trainer = Trainer([small], MOVE_RULE, QUICK, seed=0)
+    found = evaluate_training(trainer, np.full(20, -2.0, dtype=np.float32), seconds=1.0)
+    value = trainer.planner().q_field(small.grid, small.goal).q.max(axis=0)
+    cells = [cell for cell in small.grid.free_cells() if cell != small.goal]
+    expected = np.mean([value[y, x] + 2.0 for x, y in cells])
+    assert found["overestimation"] == pytest.approx(expected, rel=1e-5)
+
+
+@pytest.mark.parametrize("alpha", [0.0, 0.6])
+def test_the_optimal_value_is_what_the_best_policy_earns(small: Scenario, alpha: float) -> None:
+    parameters = replace(QUICK, alpha=alpha)
+    environment = GridVectorEnvironment([small], MOVE_RULE, parameters)
+    value = optimal_value(environment)
+    # Bellman's equation, with what the environment itself does.
+    for x, y in small.grid.free_cells():
+        returns = []
+        for action in range(len(MOVES)):
+            environment.cell = np.array([y * 5 + x])
+            reward, terminated, _ = environment.move(np.array([action]))
+            onward = 0.0 if terminated[0] else parameters.gamma * value[environment.cell[0]]
+            returns.append(float(reward[0] + onward))
+        if (x, y) != small.goal:
+            assert value[y * 5 + x] == pytest.approx(max(returns), abs=0.02)
+
+
+def test_a_supervised_network_learns_the_best_moves(small: Scenario, tmp_path: Path) -> None:
+    best = best_moves(small).reshape(4, 5, 8)
+    distance = shortest_distances(small.grid, small.goal, MOVE_RULE)
+    assert not best[small.grid.occupancy].any()
+    assert not best[small.goal[::-1]].any()
+    for y, x, action in np.argwhere(best):
+        dx, dy = MOVES[action]
+        assert distance[y, x] - distance[y + dy, x + dx] == pytest.approx(np.hypot(dx, dy))
+    training = Training(tmp_path, replace(QUICK, steps=300), (small,), 0, 300)
+    train_supervised(training)
+    planner = Planner.load(tmp_path / "model.safetensors")
+    plan = planner.plan(small.grid, small.start, small.goal)
+    assert plan.length == pytest.approx(distance[small.start[::-1]])
+    (tmp_path / "model.safetensors").write_text("kept")
+    train_supervised(training)
+    assert (tmp_path / "model.safetensors").read_text() == "kept"
+
+
+def test_cross_entropy_is_that_of_all_best_moves_together() -> None:
+    torch = pytest.importorskip("torch")
+    best = torch.tensor([[True, True, False, False], [False, False, False, True]])
+    q = torch.tensor([[0.0, 0.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]])
+    expected = (np.log(2) + np.log(3 + np.e) - 1) / 2
+    assert float(cross_entropy(q, best)) == pytest.approx(expected)
+
+
+@given(grids_with_free_cell(), st.sampled_from(list(MoveRule)), st.data())
+def test_a_star_is_exact_under_every_rule(
+    grid_and_goal: tuple[GridMap, Cell], rule: MoveRule, data: st.DataObject
+) -> None:
+    grid, goal = grid_and_goal
+    start = data.draw(st.sampled_from(grid.free_cells()))
+    cells = a_star(Scenario(grid, start, goal), rule) if start != goal else ()
+    optimum = shortest_distances(grid, goal, rule)[start[1], start[0]]
+    assert bool(cells) == (np.isfinite(optimum) and start != goal)
+    if cells:
+        assert path_length(cells, rule) == pytest.approx(optimum)
+
+
+def test_a_row_tells_from_when_on_a_path_is_found_and_is_the_shortest(tmp_path: Path) -> None:
+    shortest, longer = 22.970562748, 24.142135624
+    header = ("step", "episodes", "seconds", "solved", "solved_unmasked", "length")
+    write_table(
+        tmp_path / "evaluations.csv",
+        header,
+        [
+            (100 * n, 2 * n, 0.5 * n, int(n > 0), 0, length)
+            for n, length in enumerate([np.nan, longer, shortest, longer, shortest])
+        ],
+    )
+    run = read_evaluations(tmp_path)
+    assert convergence_row([run]) == ["1 (0) of 1", "100", "2", "0.5", "400", "22.97"]
+    both = convergence_row([run, run[:1]])
+    assert (both[0], both[-1]) == ("1 (0) of 2", "22.97")
+    assert "never" in both[1]
+
+
+@pytest.mark.parametrize(
+    ("holds", "first"), [((0, 1, 0, 1, 1), 3), ((1, 1), 0), ((1, 0), None), ((), None)]
+)
+def test_what_is_solved_for_good_is_solved_to_the_end(
+    holds: tuple[int, ...], first: int | None
+) -> None:
+    assert first_kept(np.array(holds, dtype=np.bool_)) == first
+
+
+@pytest.mark.parametrize(("possible", "wrong"), [(True, False), (False, True)])
+def test_moves_count_as_wrong_that_are_legal_and_predicted_to_fail_or_the_other_way_round(
+    possible: bool, wrong: bool
+) -> None:
+    network = random_network("any_map", filters=2)
+    network.tensors["moves.bias"].fill(100.0 if possible else -100.0)
+    metadata = ModelMetadata("any_map", {"filters": 2}, MOVE_RULE, 0.95, "", 0, 0, "")
+    found, _ = any_map.move_errors(Planner(network, metadata))
+    # A straight move is legal in half of the 256 patches with a free centre. A diagonal one too
+    # if corners may be cut, else in an eighth.
+    legal = 4 * (128 + 128 + 128 + 32)
+    assert found == (legal if wrong else 4096 - legal)
+
+
+def test_the_q_that_the_loss_trains_adds_up_the_papers_rewards(paper: Scenario) -> None:
+    metadata = ModelMetadata("propagation", {"filters": 2}, MOVE_RULE, 0.95, "", 0, 0, "")
+    network = random_network("propagation", filters=2)
+    # Told that every move succeeds: its rollouts go straight to the goal, and are trapped by walls.
+    network.tensors["moves.bias"].fill(100.0)
+    planner = Planner(network, metadata)
+    ratios = length_ratios(planner.q_field(paper.grid, paper.goal), paper.grid, MOVE_RULE)
+    assert free_starts(paper).sum() == 286
+    assert 0 < np.isfinite(ratios)[free_starts(paper)].sum() < 286
+    field = trained_field(planner, paper)
+    goal_x, goal_y = paper.goal
+    assert field.q[0, goal_y, goal_x - 1] == pytest.approx(10.0, abs=1e-3)
+    # Two moves before the end: Section 4.2's reward of one, and the end's, discounted.
+    one, two = (np.hypot(goal_x - k - paper.start[0], goal_y - paper.start[1]) for k in (1, 2))
+    expected = 0.6 * 1.0 + 0.4 * (one - two - 1.0) + 0.95 * 10.0
+    assert field.q[0, goal_y, goal_x - 2] == pytest.approx(expected, abs=1e-3)
+
+
+@pytest.mark.parametrize("noise", Noise)
+def test_noisy_maps_differ_and_more_test_maps_leave_the_training_maps(
+    paper: Scenario, noise: Noise
+) -> None:
+    maps, more = noisy_maps(30, 30, noise), noisy_maps(30, 31, noise)
+    assert (len(maps.training), len(maps.test)) == (30, 30)
+    scenarios = [*maps.training, *maps.test]
+    assert len({scenario.grid.fingerprint for scenario in scenarios}) == 60
+    for scenario, same in zip(maps.training, more.training, strict=True):
+        assert scenario.grid.fingerprint == same.grid.fingerprint
+    path = fixed_path(maps.training)
+    assert (path[0], path[-1]) == (paper.start, paper.goal)
+    assert path_length(path) > path_length(
+        shortest_path(paper.grid, paper.start, paper.goal, MOVE_RULE)
+    )
+    if noise is Noise.ON_PATH:  # every inner cell of the path can be avoided at once
+        assert all(scenario.grid.is_free(cell) for scenario in scenarios for cell in path)
+
+
+def test_statistics_say_never_for_infinity_and_leave_nan_out() -> None:
+    assert median_and_range([3, 1, 2000]) == "3 (1 to 2,000)"
+    assert median_and_range([2.5, 2.5], 1) == "2.5"
+    assert median_and_range([500, np.inf, 700]) == "700 (500 to never)"
+    assert median_and_range([np.nan, 4]) == "4"
+    assert median_and_range([np.nan]) == "none"
+    expected = ["2.2500 (1.5000 to 3.0000)", "2.5000 (2.0000 to 3.0000)"]
+    assert mean_and_worst([[1.0, 2.0], [], [3.0]]) == expected
+    assert mean_and_worst([[]]) == ["none", "none"]
+
+
+def test_a_table_is_markdown_and_csv_and_a_page_without_marks_stays(tmp_path: Path) -> None:
+    expected = "| a | b |\n| --- | --- |\n| 1 | x |"
+    assert write_table(tmp_path / "table.csv", ["a", "b"], [[1, "x"]]) == expected
+    assert (tmp_path / "table.csv").read_text() == "a,b\n1,x\n"
+    page = tmp_path / "page.md"
+    page.write_text("nothing")
+    assert write_report(tmp_path, {"Title": expected}, page) == f"## Title\n\n{expected}\n"
+    assert page.read_text() == "nothing"

@@ -1,54 +1,29 @@
+"""What a drive teaches, and the file that keeps it."""
+
 from __future__ import annotations
 
 import math
-from unittest.mock import Mock
+import pickle
+from pathlib import Path
 
 import numpy as np
 import pytest
+from experience.straight_drives import HALL, SPEED, Poses, at, driven, straight
 from hypothesis import given
 from hypothesis import strategies as st
 
 from ddqn_planner import Experience, GridMap, Planner
-from ddqn_planner.experience import evidence
+from ddqn_planner.experience import ExperienceFileError
 from ddqn_planner.grid import MoveRule, shortest_distances
-
-SPEED = 0.5
-HALL = GridMap(np.zeros((40, 60), dtype=bool), 0.25)
-"""15 m by 10 m."""
-
-
-def straight(
-    start: tuple[float, float],
-    end: tuple[float, float],
-    slowness: float = 1.0,
-    rate: float = 10.0,
-    began: float = 0.0,
-) -> tuple[np.ndarray, np.ndarray]:
-    """Seconds and positions of a drive at constant speed."""
-    duration = math.dist(start, end) / SPEED * slowness
-    seconds = np.arange(0, duration + 0.5 / rate, 1 / rate)
-    share = (seconds / duration)[:, None]
-    return began + seconds, np.array(start) * (1 - share) + np.array(end) * share
-
-
-def driven(*drives: tuple[np.ndarray, np.ndarray], **options: float) -> Experience:
-    experience = Experience(SPEED, **options)
-    for drive in drives:
-        experience.record(*drive)
-    return experience
-
-
-def at(grid: GridMap, values: np.ndarray, x: float, y: float) -> float:
-    column, row = grid.world_to_cell(x, y)
-    return float(values[row, column])
 
 
 def test_without_drives_every_place_takes_its_nominal_time() -> None:
-    experience = Experience(SPEED)
-    assert (experience.slowness(HALL) == 1).all()
-    assert (experience.uncertainty(HALL) == 1).all()
-    plan = Planner.load("any_map").plan(experience.apply(HALL), (0, 0), (10, 0))
-    assert plan.cost == pytest.approx(2.5 / SPEED)
+    forgotten = driven(straight((2, 5), (12, 5), 3))
+    forgotten.forget()
+    for experience in (Experience(SPEED), forgotten):
+        assert (experience.slowness(HALL) == 1).all()
+        assert (experience.uncertainty(HALL) == 1).all()
+        assert experience.expected_time(HALL, [(0, 0)]).seconds == 0
 
 
 @given(st.floats(1.5, 10), st.sampled_from([1.0, 5.0, 10.0, 50.0]))
@@ -83,97 +58,13 @@ def test_waiting_counts_as_time_and_standing_before_a_drive_does_not() -> None:
     assert at(HALL, slowness, 2, 5) == at(HALL, slowness, 10, 5) < 1.06
 
 
-def test_what_was_seen_does_not_reach_through_walls() -> None:
-    occupancy = HALL.occupancy.copy()
-    occupancy[22, :50] = True
-    grid = GridMap(occupancy, 0.25)
-    experience = driven(straight((2, 5.4), (12, 5.4), 4))
-    assert at(grid, experience.slowness(grid), 7, 5.4) > 2
-    assert at(HALL, experience.slowness(HALL), 7, 5.9) > 1.5
-    assert at(grid, experience.slowness(grid), 7, 5.9) == 1
-    assert (experience.uncertainty(grid)[23:, :45] == 1).all()
-
-
-@given(
-    st.integers(-20, 20), st.integers(-20, 20), st.integers(0, 9), st.integers(0, 9), st.booleans()
-)
-def test_a_map_that_shifts_and_grows_keeps_it(
-    dx: int, dy: int, right: int, top: int, is_cached: bool
-) -> None:
-    experience = driven(straight((4, 4), (11, 6), 3), straight((11, 6), (6, 8), 2))
-    experience.record_failure((6, 6))
-    known = experience.slowness(HALL)
-    if not is_cached:
-        experience = driven(straight((4, 4), (11, 6), 3), straight((11, 6), (6, 8), 2))
-        experience.record_failure((6, 6))
-    shape = 60 + top, 80 + right
-    origin = (dx - 10) * 0.25, (dy - 10) * 0.25, 0.0
-    other = GridMap(np.zeros(shape, dtype=bool), 0.25, origin)
-    slowness = experience.slowness(other)
-    for x, y in ((5, 4.3), (8, 5), (9, 5.5), (8, 7.1), (6, 6)):
-        if other.contains(other.world_to_cell(x, y)):
-            assert at(other, slowness, x, y) == pytest.approx(at(HALL, known, x, y), rel=0.021)
-
-
-@pytest.mark.parametrize("resolution", [0.05, 0.1, 0.2])
-@pytest.mark.parametrize("yaw", [0.0, 0.7])
-def test_a_map_in_another_resolution_and_frame_keeps_it(resolution: float, yaw: float) -> None:
-    experience = driven(*[straight((4, 4), (11, 6), 3)] * 3)
-    shape = int(20 / resolution), int(20 / resolution)
-    grid = GridMap(np.zeros(shape, dtype=bool), resolution, (0.0, 0.0 if yaw == 0 else -8.0, yaw))
-    for share in (0.2, 0.5, 0.8):
-        x, y = 4 + 7 * share, 4 + 2 * share
-        assert at(grid, experience.slowness(grid), x, y) == pytest.approx(3, rel=0.1)
-
-
-def test_a_map_that_changes_gives_what_a_new_one_gives() -> None:
-    experience = driven(straight((2, 5), (12, 5), 3))
-    experience.apply(HALL)
-    experience.record(*straight((2, 5.5), (12, 6), 2))
-    occupancy = HALL.occupancy.copy()
-    occupancy[21, 10:30] = True
-    again = (straight((2, 5), (12, 5), 3), straight((2, 5.5), (12, 6), 2))
-    for grid in (
-        HALL,
-        GridMap(occupancy, 0.25),
-        GridMap(occupancy, 0.25, (2.5, 0.0, 0.0)),
-        GridMap(occupancy, 0.5, (2.5, 0.0, 0.0)),
-    ):
-        expected = driven(*again).slowness(grid)
-        np.testing.assert_allclose(experience.slowness(grid), expected, rtol=0.021)
-
-
-def test_without_memory_for_a_map_nothing_is_lost(monkeypatch: pytest.MonkeyPatch) -> None:
-    drives = straight((2, 5), (12, 5), 3), straight((2, 5.5), (12, 6), 2)
-    for name in ("spread_evidence", "refresh"):
-        experience = driven(drives[0])
-        experience.apply(HALL)
-        experience.record(*drives[1])
-        with monkeypatch.context() as patch:
-            patch.setattr(evidence, name, Mock(side_effect=MemoryError))
-            with pytest.raises(MemoryError):
-                experience.apply(HALL)
-        np.testing.assert_array_equal(experience.slowness(HALL), driven(*drives).slowness(HALL))
-
-
-def test_evidence_fades_with_driven_time() -> None:
-    experience = driven(straight((2, 5), (12, 5), 4), half_life=40.0)
-    slow, unsure = (
-        at(HALL, array, 7, 5) for array in (experience.slowness(HALL), experience.uncertainty(HALL))
-    )
-    for _ in range(60):
-        experience.record(*straight((2, 8.5), (12, 8.5)))
-    assert 1 <= at(HALL, experience.slowness(HALL), 7, 5) < slow / 2
-    assert at(HALL, experience.uncertainty(HALL), 7, 5) > 2 * unsure
-
-
 def test_the_clock_of_a_drive_does_not_matter() -> None:
     experiences = [driven(straight((2, 5), (12, 5), 3, began=began)) for began in (0.0, 1.75e9)]
     first, later = (experience.slowness(HALL) for experience in experiences)
     np.testing.assert_allclose(first, later, rtol=0.021)
 
 
-def faulty(fault: str) -> tuple[np.ndarray, np.ndarray]:
+def faulty(fault: str) -> Poses:
     """A drive at nominal speed with a fault in its middle."""
     seconds, positions = straight((2, 5), (12, 5))
     half = len(seconds) // 2
@@ -200,19 +91,19 @@ def faulty(fault: str) -> tuple[np.ndarray, np.ndarray]:
     return seconds, positions
 
 
-FAULTS = (
-    "pause",
-    "pause with samples",
-    "teleport",
-    "clock ahead",
-    "clock back",
-    "clock stands",
-    "odometry reset",
-    "not finite",
+@pytest.mark.parametrize(
+    "fault",
+    [
+        "pause",
+        "pause with samples",
+        "teleport",
+        "clock ahead",
+        "clock back",
+        "clock stands",
+        "odometry reset",
+        "not finite",
+    ],
 )
-
-
-@pytest.mark.parametrize("fault", FAULTS)
 def test_what_cannot_be_true_is_not_believed(fault: str) -> None:
     experience = driven(faulty(fault))
     slowness = experience.slowness(HALL)
@@ -223,16 +114,7 @@ def test_what_cannot_be_true_is_not_believed(fault: str) -> None:
     assert visited[20, 10:22].all()
 
 
-@given(
-    st.lists(
-        st.tuples(
-            st.floats(allow_nan=True, allow_infinity=True),
-            st.floats(allow_nan=True, allow_infinity=True),
-            st.floats(allow_nan=True, allow_infinity=True),
-        ),
-        max_size=30,
-    )
-)
+@given(st.lists(st.tuples(st.floats(), st.floats(), st.floats()), max_size=30))
 def test_no_drive_breaks_it(poses: list[tuple[float, float, float]]) -> None:
     array = np.array(poses).reshape(-1, 3)
     experience = Experience(SPEED)
@@ -240,26 +122,6 @@ def test_no_drive_breaks_it(poses: list[tuple[float, float, float]]) -> None:
     slowness = experience.slowness(HALL)
     assert np.isfinite(slowness).all()
     assert (slowness >= 1).all()
-
-
-def test_one_outlier_is_bounded() -> None:
-    usual = [straight((2, 5), (12, 5))] * 5
-    waited = straight((2, 5), (12, 5), 30)
-    slowness = at(HALL, driven(*usual, waited).slowness(HALL), 7, 5)
-    assert slowness < 1.5
-
-
-def test_failures_make_a_place_expensive_by_the_tries_that_it_takes() -> None:
-    experience = driven(straight((2, 5), (12, 5)))
-    for _ in range(4):
-        experience.record_failure((7, 5))
-    slowness = experience.slowness(HALL)
-    assert at(HALL, slowness, 7, 5) > 1.5
-    assert at(HALL, slowness, 3, 5) < 1.06
-    never_driven = Experience(SPEED)
-    never_driven.record_failure((7, 5))
-    # Two successes are assumed, so p = 2 / 3.
-    assert at(HALL, never_driven.slowness(HALL), 7.1, 5.1) == pytest.approx(1.5, rel=0.02)
 
 
 @given(st.integers(0, 2**32 - 1))
@@ -277,71 +139,11 @@ def test_the_cost_of_a_plan_is_its_expected_time_and_no_path_is_faster(seed: int
         plan = planner.plan(applied, start, goal, MoveRule.ROBOT_SAFE)
         if plan.cells:
             assert plan.cost == pytest.approx(seconds[start[1], start[0]], rel=1e-6, abs=1e-6)
+            if grid.cost is None:
+                told = experience.expected_time(grid, plan.every_cell)
+                assert told.seconds == pytest.approx(plan.cost, rel=1e-4)
         else:
             assert np.isinf(seconds[start[1], start[0]])
-
-
-def test_a_repaired_field_is_that_of_a_new_planner() -> None:
-    random, experience, planner = (
-        np.random.default_rng(0),
-        Experience(SPEED),
-        Planner.load("any_map"),
-    )
-    grid = GridMap(random.random((120, 120)) < 0.2, 0.25)
-    goal, *starts = grid.free_cells()[::997]
-    for x in range(3, 27, 3):
-        experience.record(*straight((x, 2), (x + 2, 4), 4))
-        applied = experience.apply(grid)
-        for start in starts:
-            plan = planner.plan(applied, start, goal, MoveRule.ROBOT_SAFE)
-            again = Planner.load("any_map").plan(applied, start, goal, MoveRule.ROBOT_SAFE)
-            assert plan == again
-
-
-def test_a_map_is_the_same_while_nothing_was_learned() -> None:
-    experience = driven(straight((2, 5), (12, 5), 3))
-    assert experience.apply(HALL).same_cells(experience.apply(HALL))
-    before = experience.apply(HALL)
-    assert before.slowness is not None
-    kept = before.slowness.copy()
-    experience.record(*straight((2, 5), (12, 5), 9))
-    assert not experience.apply(HALL).same_cells(before)
-    np.testing.assert_array_equal(before.slowness, kept)
-
-
-@pytest.mark.parametrize("noise", [0.1, 0.4])
-def test_nine_of_ten_drives_take_a_time_within_their_interval(noise: float) -> None:
-    random, experience = np.random.default_rng(0), Experience(SPEED)
-    cells = [(x, 20) for x in range(8, 48)]
-    inside = []
-    for _ in range(150):
-        expected = experience.expected_time(HALL, cells)
-        slow = np.repeat(np.exp(random.normal(0, noise, 40)), 5) * 2
-        places = np.linspace(2, 12, 201)
-        times = np.concatenate([[0], np.cumsum(slow * 0.05 / SPEED)])
-        seconds = np.arange(0, times[-1], 0.1)
-        positions = np.column_stack([np.interp(seconds, times, places), np.full(len(seconds), 5.1)])
-        experience.record(seconds, positions)
-        actual = times[-1] * 39 / 40  # from the first cell's centre to the last one's
-        inside.append(expected.low <= actual <= expected.high)
-    assert 0.8 < np.mean(inside[50:]) <= 1
-    assert expected.low < expected.seconds < expected.high
-    assert expected.seconds == pytest.approx(actual, rel=0.3)
-
-
-def test_memory_grows_with_the_driven_area() -> None:
-    experience = driven(*[straight((2, 5), (12, 5), 2)] * 3)
-    places = experience.evidence.places
-    assert 35 <= places <= 45
-    experience.apply(HALL)
-    experience.record(*straight((2, 5), (12, 5), 2))
-    assert experience.evidence.places == places
-
-
-def test_it_can_be_told_to_forget() -> None:
-    experience = driven(straight((2, 5), (12, 5), 3))
-    experience.forget()
-    assert (experience.slowness(HALL) == 1).all()
 
 
 @pytest.mark.parametrize("name", ["nominal_speed", "robot_width", "half_life", "max_pause"])
@@ -356,3 +158,106 @@ def test_a_wrong_shape_is_refused() -> None:
         Experience(SPEED).record(np.zeros(3), np.zeros((2, 2)))
     with pytest.raises(ValueError, match="position"):
         Experience(SPEED).record_failure((math.nan, 0))
+    with pytest.raises(ValueError, match="neighbouring cells"):
+        Experience(SPEED).expected_time(HALL, [(0, 0), (2, 0)])
+
+
+# Files
+
+
+@pytest.fixture
+def path(tmp_path: Path) -> Path:
+    """The file of a robot that drove and failed."""
+    experience = driven(
+        *[straight((2, 5), (12, 5), 3)] * 3, robot_width=0.4, half_life=900.0, max_pause=45.0
+    )
+    experience.record_failure((4, 4))
+    experience.save(tmp_path / "folder" / "experience.npz")
+    return tmp_path / "folder" / "experience.npz"
+
+
+def test_what_is_saved_is_loaded(path: Path) -> None:
+    experience = Experience(SPEED, 0.4, 900.0, 45.0)
+    for _ in range(3):
+        experience.apply(HALL)  # so that it learns how sure expected times are
+        experience.record(*straight((2, 5), (12, 5), 3))
+    experience.record_failure((4, 4))
+    experience.save(path)
+    loaded = Experience.load(path)
+    for name in ("nominal_speed", "robot_width", "half_life", "max_pause"):
+        assert getattr(loaded, name) == getattr(experience, name)
+    cells = [(x, 20) for x in range(8, 48)]
+    for _ in range(2):
+        np.testing.assert_allclose(loaded.slowness(HALL), experience.slowness(HALL), rtol=0.021)
+        expected = experience.expected_time(HALL, cells)
+        np.testing.assert_allclose(loaded.expected_time(HALL, cells), expected, rtol=0.03)
+        for one in (loaded, experience):
+            one.record(*straight((2, 6), (12, 6), 2))
+
+
+def test_nothing_is_loaded_from_nothing(tmp_path: Path) -> None:
+    Experience(0.5).save(tmp_path / "empty.npz")
+    loaded = Experience.load(tmp_path / "empty.npz")
+    assert (loaded.slowness(HALL) == 1).all()
+    loaded.record(*straight((2, 5), (12, 5), 3))
+    np.testing.assert_array_equal(
+        loaded.slowness(HALL), driven(straight((2, 5), (12, 5), 3)).slowness(HALL)
+    )
+
+
+def test_every_broken_file_is_named(path: Path) -> None:
+    content = path.read_bytes()
+    broken = [content[: len(content) * part // 8] for part in range(8)]
+    for place in range(200, len(content), len(content) // 12):
+        broken.append(content[:place] + bytes([content[place] ^ 0xFF]) + content[place + 1 :])
+    for bad in broken:
+        path.write_bytes(bad)
+        try:
+            Experience.load(path)
+        except ExperienceFileError as error:
+            assert str(path) in str(error)  # noqa: PT017 - some bytes mean nothing
+    path.write_bytes(b"")
+    with pytest.raises(ExperienceFileError, match=r"experience\.npz.*begin anew"):
+        Experience.load(path)
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("version", 2),
+        ("options", [0.5, -1.0, 900.0, 45.0]),
+        ("places", np.zeros((3, 2), dtype=np.int64)),
+        ("evidence", np.full((39, 6), np.nan)),
+        ("driven", np.zeros(2)),
+        ("noise", np.array(["a", "b"])),
+        ("noise", [1.0, 0.0]),
+        ("noise", [-1.0, 1.0]),
+        ("driven", -1.0),
+        ("places", np.zeros((39, 2), dtype=np.int64)),
+        ("places", np.arange(78.0).reshape(39, 2)),
+        ("evidence", np.full((39, 6), 1e9)),
+    ],
+)
+def test_a_wrong_value_is_refused(path: Path, name: str, value: object) -> None:
+    with np.load(path) as arrays:
+        values = dict(arrays)
+    np.savez(path, **{**values, name: value})
+    with pytest.raises(ExperienceFileError):
+        Experience.load(path)
+
+
+def test_a_missing_file_and_a_folder_are_named(tmp_path: Path) -> None:
+    for path in (tmp_path / "none.npz", tmp_path):
+        with pytest.raises(ExperienceFileError, match=path.name):
+            Experience.load(path)
+
+
+def test_nothing_is_unpickled(path: Path) -> None:
+    with np.load(path) as arrays:
+        values = dict(arrays)
+    np.savez(path, **{**values, "errors": np.array([print], dtype=object)}, allow_pickle=True)
+    with pytest.raises(ExperienceFileError):
+        Experience.load(path)
+    path.write_bytes(pickle.dumps(1.0))
+    with pytest.raises(ExperienceFileError):
+        Experience.load(path)

@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 import pytest
-from profiles import START_DEAD_END
+from settings import START_DEAD_END
 
 from ddqn_planner.grid import MOVES, GridMap, MoveRule, legal_moves, shortest_distances
 from ddqn_planner.training.environment import Scenario

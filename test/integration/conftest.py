@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import fcntl
 import importlib.util
 import itertools
 import os
@@ -21,6 +20,8 @@ import numpy as np
 import pytest
 import yaml
 from processes import claim_ros_domain, executable
+
+from ddqn_planner.model import find_model
 
 TIMEOUT = 120.0
 """Seconds that anything may take on a loaded machine; how long it does take, `make bench` says."""
@@ -170,55 +171,16 @@ SMALL_MAP = """
 
 @pytest.fixture(scope="session")
 def small_values() -> np.ndarray:
-    """(6, 6) int8: occupancy of a map that a small model can learn in seconds."""
+    """(6, 6) int8: occupancy of a map."""
     rows = [[100 if c == "#" else 0 for c in line] for line in SMALL_MAP.split()]
     return np.array(rows, dtype=np.int8)
 
 
-@pytest.fixture(scope="session")
-def trained_model(tmp_path_factory: pytest.TempPathFactory, small_values: np.ndarray) -> Path:
-    """Return a model of the small map toward (5, 5) from anywhere, trained once for all workers."""
-    folder = tmp_path_factory.getbasetemp()
-    if "PYTEST_XDIST_WORKER" in os.environ:
-        folder = folder.parent
-    path = folder / "small.safetensors"
-    with (folder / "small.lock").open("w") as lock:
-        fcntl.flock(lock, fcntl.LOCK_EX)
-        if not path.exists():
-            train(small_values, path)
-    return path
-
-
-def train(values: np.ndarray, path: Path) -> None:
-    from ddqn_planner.grid import GridMap, MoveRule
-    from ddqn_planner.training.environment import Scenario
-    from ddqn_planner.training.hyper_parameters import HyperParameters
-    from ddqn_planner.training.trainer import Trainer
-
-    grid = GridMap(values > 0)
-    parameters = HyperParameters(
-        learning_rate=3e-3,
-        p_r=1.0,
-        filters=16,
-        learning_starts=200,
-        update_interval=2,
-        target_interval=100,
-        epsilon_steps=2000,
-        max_episode_steps=40,
-    )
-    trainer = Trainer([Scenario(grid, (0, 0), (5, 5))], MoveRule.ROBOT_SAFE, parameters, seed=1)
-    for _ in trainer.run(3000):
-        pass
-    planner = trainer.planner()
-    assert all(planner.plan(grid, cell, (5, 5)).cells for cell in grid.free_cells())
-    trainer.save_model(path)
-
-
 @pytest.fixture(scope="module")
-def model(tmp_path_factory: pytest.TempPathFactory, trained_model: Path) -> Path:
-    """Return a copy that tests may overwrite, if they put it back."""
+def model(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return a copy of a model that tests may overwrite, if they put it back."""
     path = tmp_path_factory.mktemp("planner") / "model.safetensors"
-    shutil.copy(trained_model, path)
+    shutil.copy(find_model("any_map"), path)
     return path
 
 

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import gc
+import re
 import shutil
 import signal
 import threading
 import weakref
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -27,7 +28,6 @@ from processes import cpu_seconds
 
 from ddqn_planner.nodes.planner_node import PlannerNode
 
-CYCLE = ["configure", "activate", "deactivate", "cleanup"]
 OF_CONFIGURED = {"planner/get_plan", "planner/reload_model", "plan", "map", "goal_pose"}
 
 
@@ -67,72 +67,123 @@ def make_robot(
     return make
 
 
-def test_a_manager_starts_and_stops_the_planner_twice(
-    run_node: Any, make_robot: MakeRobot, model: Path
-) -> None:
+@pytest.fixture(scope="module")
+def managed(run_node: Any, model: Path) -> Iterator[Any]:
+    """A planner that most tests share."""
     parameters = {"autostart": False, "model": str(model)}
     with run_node("planner_node", parameters, namespace="/managed") as node:
-        robot = make_robot("managed")
-        manager = Manager(robot)
-        for _ in range(2):
-            assert manager.state == "unconfigured"
-            wait_for("only what is always there", lambda: not manager.created())
-            status = robot.wait_for_reason("the node is not active; configure and activate it")
-            assert status.level == DiagnosticStatus.WARN
-            assert manager.change("configure")
-            assert manager.state == "inactive"
-            wait_for("what configure creates", lambda: manager.created() == OF_CONFIGURED)
-            robot.set_map(robot.stamped_map())  # a map is taken, requests are not
-            robot.send_start(robot.pose(START))
-            robot.clear()
-            assert robot.get_plan(robot.pose(START), robot.pose(GOAL)).poses == []
-            robot.wait_for_reason("the node is not active", {"status": "NOT_ACTIVE"})
-            node.wait_for_log("no plan: the node is not active")
-            robot.send_goal(robot.pose(GOAL))
-            robot.wait_for_reason("the node is not active", {"status": "NOT_ACTIVE"})
-            assert manager.change("activate")
-            assert manager.state == "active"
-            robot.assert_works()
-            assert robot.plans.messages() == []  # of the goal that was refused
-            robot.begin()
-            assert manager.change("deactivate")
-            assert manager.state == "inactive"
-            robot.clear()
-            robot.send_start(robot.pose((1, 0)))
-            robot.set_map(robot.stamped_map())
-            assert robot.get_plan(robot.pose(START), robot.pose(GOAL)).poses == []
-            assert manager.change("activate")
-            robot.assert_works()
-            assert robot.plans.messages() == []  # the goal was dropped
-            assert manager.change("deactivate")
-            assert manager.change("cleanup")
-            robot.clear()
-            node.forget_log()
+        yield node
+
+
+@pytest.fixture(scope="module")
+def shared_robot(managed: Any, make_client: Any, small_values: np.ndarray, model: Path) -> Robot:
+    return Robot(make_client("/managed"), small_values, model, "/managed/planner")
+
+
+@pytest.fixture
+def robot(managed: Any, shared_robot: Robot) -> Robot:
+    """The user of the shared planner, which is unconfigured."""
+    manager = Manager(shared_robot)
+    for label in ("deactivate", "cleanup"):
+        manager.change(label)
+    managed.forget_log()
+    shared_robot.clear()
+    assert manager.state == "unconfigured"
+    return shared_robot
+
+
+def test_each_transition_creates_enables_stops_and_frees(robot: Robot, managed: Any) -> None:
+    manager = Manager(robot)
+    for _ in range(2):
+        wait_for("only what is always there", lambda: not manager.created())
+        status = robot.wait_for_reason("the node is not active; configure and activate it")
+        assert status.level == DiagnosticStatus.WARN
         assert manager.change("configure")
-        assert manager.change("activate")
-        assert manager.change("shutdown")
-        assert manager.state == "finalized"
-        assert not any(manager.change(label) for label in [*CYCLE, "shutdown"])
-
-
-def test_no_request_for_a_transition_ends_the_planner(
-    run_node: Any, make_robot: MakeRobot, model: Path
-) -> None:
-    with run_node("planner_node", {"model": str(model)}, namespace="/asked") as node:
-        robot = make_robot("asked")
-        manager = Manager(robot)
-        assert manager.state == "active"
-        for label in ("configure", "activate", "cleanup", "no_such", "transition_error", "ü" * 99):
-            assert not manager.change(label)
-        for number in (0, 1, 2, 3, 5, 6, 8, 10, 60, 62, 77, 255):
-            assert not manager.change(number=number)
-        node.wait_for_log("'configure' refused: the node has deactivate, shutdown when active")
-        node.wait_for_log("transition 255 refused")
-        assert manager.state == "active"
-        robot.set_map(robot.stamped_map())
-        robot.assert_works()
-        assert manager.change(number=Transition.TRANSITION_DEACTIVATE)
         assert manager.state == "inactive"
+        wait_for("what configure creates", lambda: manager.created() == OF_CONFIGURED)
+        robot.set_map(robot.stamped_map())  # a map is taken, requests are not
+        robot.send_start(robot.pose(START))
+        robot.clear()
+        assert robot.get_plan(robot.pose(START), robot.pose(GOAL)).poses == []
+        robot.wait_for_reason("the node is not active", {"status": "NOT_ACTIVE"})
+        managed.wait_for_log("no plan: the node is not active")
+        robot.send_goal(robot.pose(GOAL))
+        robot.wait_for_reason("the node is not active", {"status": "NOT_ACTIVE"})
+        assert manager.change("activate")
+        assert manager.state == "active"
+        robot.assert_works()
+        assert robot.plans.messages() == []  # of the goal that was refused
+        robot.begin()
+        assert manager.change("deactivate")
+        robot.clear()
+        robot.send_start(robot.pose((1, 0)))
+        robot.set_map(robot.stamped_map())
+        assert robot.get_plan(robot.pose(START), robot.pose(GOAL)).poses == []
+        assert manager.change("activate")
+        robot.assert_works()
+        assert robot.plans.messages() == []  # the goal was dropped
+        assert manager.change("deactivate")
+        assert manager.change("cleanup")
+        robot.clear()
+        managed.forget_log()
+
+
+def test_no_request_for_a_transition_ends_the_planner(robot: Robot, managed: Any) -> None:
+    manager = Manager(robot)
+    assert manager.change("configure")
+    assert manager.change("activate")
+    for label in ("configure", "activate", "cleanup", "no_such", "transition_error", "ü" * 99):
+        assert not manager.change(label)
+    for number in (0, 1, 2, 3, 5, 6, 8, 10, 60, 62, 77, 255):
+        assert not manager.change(number=number)
+    managed.wait_for_log("'configure' refused: the node has deactivate, shutdown when active")
+    managed.wait_for_log("transition 255 refused")
+    assert manager.state == "active"
+    robot.set_map(robot.stamped_map())
+    robot.assert_works()
+    assert manager.change(number=Transition.TRANSITION_DEACTIVATE)
+    assert manager.state == "inactive"
+
+
+def test_the_parameters_of_an_unconfigured_planner_are_checked_and_used(
+    robot: Robot, tmp_path: Path
+) -> None:
+    client, manager, other = robot.client, Manager(robot), tmp_path / "model.safetensors"
+    shutil.copy(robot.model, other)
+    assert not client.set_parameters("planner", model="no_such_model")[0].successful
+    assert client.set_parameters("planner", model=str(other))[0].successful
+    assert client.set_parameters("planner", start_source="odometry")[0].successful
+    assert manager.change("configure")
+    assert manager.change("activate")
+    robot.wait_for_reason("", {"model file": str(other), "state": "active"})
+    robot.set_map(robot.stamped_map())
+    robot.assert_works()
+    assert client.set_parameters("planner", start_source="initialpose")[0].successful
+
+
+def test_the_planner_survives_transitions_among_requests(robot: Robot) -> None:
+    manager, node = Manager(robot), robot.client.node
+    plans = node.create_client(GetPlan, "planner/get_plan")
+    publishers = [
+        (node.create_publisher(type(message), topic, 10), message)
+        for topic, message in (
+            ("map", robot.map_message()),
+            ("goal_pose", robot.pose(GOAL)),
+            ("initialpose", initial_pose(robot.pose(START))),
+        )
+    ]
+    request = GetPlan.Request(start=robot.pose(START), goal=robot.pose(GOAL))
+    for label in ["configure", "activate", "deactivate", "cleanup"] * 5:
+        for _ in range(20):
+            plans.call_async(request)
+            for publisher, message in publishers:
+                publisher.publish(message)
+        assert manager.change(label)
+    assert manager.state == "unconfigured"
+    assert manager.change("configure")
+    assert manager.change("activate")
+    robot.set_map(robot.stamped_map())
+    robot.assert_works()
 
 
 def test_a_model_that_cannot_be_loaded_fails_configure(
@@ -157,22 +208,10 @@ def test_a_model_that_cannot_be_loaded_fails_configure(
         assert manager.change("activate")
         robot.set_map(robot.stamped_map())
         robot.assert_works()
-
-
-def test_the_parameters_of_an_unconfigured_planner_are_checked_and_used(
-    run_node: Any, make_robot: MakeRobot, model: Path
-) -> None:
-    with run_node("planner_node", {"autostart": False}, namespace="/unconfigured"):
-        robot = make_robot("unconfigured")
-        client, manager = robot.client, Manager(robot)
-        assert not client.set_parameters("planner", model="no_such_model")[0].successful
-        assert client.set_parameters("planner", model=str(model))[0].successful
-        assert client.set_parameters("planner", start_source="odometry")[0].successful
-        assert manager.change("configure")
-        assert manager.change("activate")
-        robot.wait_for_reason("", {"model file": str(model), "state": "active"})
-        robot.set_map(robot.stamped_map())
-        robot.assert_works()
+        assert manager.change("shutdown")
+        assert manager.state == "finalized"
+        labels = "configure", "activate", "deactivate", "cleanup", "shutdown"
+        assert not any(map(manager.change, labels))
 
 
 def test_requests_that_wait_are_answered_when_the_planner_is_stopped(
@@ -200,56 +239,25 @@ def test_requests_that_wait_are_answered_when_the_planner_is_stopped(
         assert robot.plans.messages() == []
 
 
-def test_the_planner_survives_transitions_among_requests(
-    run_node: Any, make_robot: MakeRobot, model: Path
-) -> None:
-    parameters = {"autostart": False, "model": str(model)}
-    with run_node("planner_node", parameters, namespace="/busy"):
-        robot = make_robot("busy")
-        manager = Manager(robot)
-        node = robot.client.node
-        plans = node.create_client(GetPlan, "planner/get_plan")
-        publishers = [
-            (node.create_publisher(type(message), topic, 10), message)
-            for topic, message in (
-                ("map", robot.map_message()),
-                ("goal_pose", robot.pose(GOAL)),
-                ("initialpose", initial_pose(robot.pose(START))),
-            )
-        ]
-        request = GetPlan.Request(start=robot.pose(START), goal=robot.pose(GOAL))
-        for label in CYCLE * 5:
-            for _ in range(20):
-                plans.call_async(request)
-                for publisher, message in publishers:
-                    publisher.publish(message)
-            assert manager.change(label)
-        assert manager.state == "unconfigured"
-        assert manager.change("configure")
-        assert manager.change("activate")
-        robot.set_map(robot.stamped_map())
-        robot.assert_works()
-
-
 def test_a_planner_that_is_stopped_while_it_plans_leaves_the_graph_at_once(
     run_node: Any, make_robot: MakeRobot
 ) -> None:
     with run_node("planner_node", namespace="/ended") as node:
         robot = make_robot("ended")
-        rooms = generated_map("rooms", 2000)
+        rooms = generated_map("rooms", 1000)
         robot.set_map(rooms.message(next(NUMBERS)))
         start, *goals = rooms.grid.free_cells()
         plans = robot.client.service(GetPlan, "planner/get_plan")
-        requests = [plan_request(rooms.grid, start, goal) for goal in goals[-20:]]
+        requests = [plan_request(rooms.grid, start, goal) for goal in goals[-100:]]
         before = cpu_seconds(node.process.pid)
         answers = [plans.call_async(request) for request in requests]
-        wait_for("fields under way", lambda: cpu_seconds(node.process.pid) > before + 1)
-        node.forget_log()
+        wait_for("fields under way", lambda: cpu_seconds(node.process.pid) > before + 0.2)
         assert node.stop(signal.SIGTERM) == 0
-        assert node.log == ""
+        assert not re.search("ERROR|Traceback", node.log)
         graph = robot.client.node
-        wait_for("farewell", lambda: "planner" not in graph.get_node_names(), timeout=10)
-        assert not any(answer.done() for answer in answers)
+        name = "planner", "/ended"
+        wait_for("farewell", lambda: name not in graph.get_node_names_and_namespaces(), timeout=10)
+        assert not all(answer.done() for answer in answers)
 
 
 def test_the_bond_breaks_when_the_planner_is_stopped(

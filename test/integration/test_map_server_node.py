@@ -65,7 +65,7 @@ def load_map(client: Any, url: object) -> Any:
 def drawn(seed: int, map_file: Path) -> list[np.ndarray]:
     """Return what the first draws of a seed occupy."""
     read, random = read_map_file(map_file), np.random.default_rng(seed)
-    move_rule, path = known_path(read.grid(), read.start, read.goal)
+    move_rule, path = known_path(read.grid(), read)
     return [scatter_obstacles(read.grid(), path, move_rule, random)[0].occupancy for _ in range(4)]
 
 

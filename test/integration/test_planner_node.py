@@ -1,30 +1,26 @@
+"""The planner as its user sees it: plans, models, parameters, bad input, and what it waits for."""
+
 from __future__ import annotations
 
-import array
 import math
 import os
-import re
 import shutil
 import signal
 import threading
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from pathlib import Path as FilePath
 from typing import Any
 
 import numpy as np
 import pytest
-import safetensors.torch
-import torch
+from client import TIMEOUT
 from diagnostic_msgs.msg import DiagnosticStatus
 from geometry_msgs.msg import PoseStamped, Quaternion
 from integration.robot import (
     GOAL,
     GOAL_YAW,
-    ORIGIN,
     RESOLUTION,
     START,
-    TIMEOUT,
     Robot,
     changed,
     check_path,
@@ -36,16 +32,22 @@ from integration.robot import (
 )
 from nav_msgs.msg import OccupancyGrid, Path
 from nav_msgs.srv import GetPlan
-from random_maps import generate_map
-from rcl_interfaces.srv import DescribeParameters, ListParameters
+from rcl_interfaces.msg import SetParametersResult
+from rcl_interfaces.srv import DescribeParameters, ListParameters, SetParametersAtomically
+from rclpy.parameter import Parameter
 from std_msgs.msg import Header, String
 from std_srvs.srv import Trigger
 
 from ddqn_planner.grid import MoveRule, shortest_distances
-from ddqn_planner.grid.noise import random_requests
+from ddqn_planner.model import find_model
 from ddqn_planner.nodes.conversions import occupancy_message
 from ddqn_planner.nodes.report import seconds
 from ddqn_planner.nodes.runtime import LATCHED
+
+
+def set_parameters(robot: Robot, **values: Any) -> None:
+    assert all(r.successful for r in robot.client.set_parameters("planner", **values))
+
 
 # What it is for
 
@@ -72,20 +74,29 @@ def test_goal_pose_is_answered_by_a_plan_a_value_and_diagnostics(robot: Robot) -
     assert float(values["rollout time (ms)"]) > 0
     assert values["model file"] == values["model"] == str(robot.model)
     assert values["model move rule"] == values["move rule"] == "robot_safe"
-    assert values["model training steps"] == "3000"
-    assert values["model certificate"].startswith("nothing can be proved: ")
-
-
-def test_diagnostics_come_though_nothing_changes(robot: Robot) -> None:
-    for _ in range(2):
+    assert values["model training steps"] == "1536000"
+    assert values["model certificate"]
+    for _ in range(2):  # they come though nothing changes
         robot.diagnostics.clear()
         robot.wait_for_reason("^a path of ")
+    # Who subscribes late has the last plan and value.
+    robot.plans = robot.client.subscribe(Path, "plan", LATCHED)
+    robot.wait_for_path((0, 3), GOAL)
+    robot.client.subscribe(OccupancyGrid, "planner/value", LATCHED).wait()
 
 
-def test_start_and_goal_in_one_cell_make_a_path_of_one_pose(robot: Robot) -> None:
-    path = robot.get_plan(robot.pose(GOAL), robot.pose(GOAL, GOAL_YAW))
-    assert points_of(path) == [robot.grid.cell_to_world(GOAL)]
+def test_get_plan_answers_and_does_not_change_the_active_goal(robot: Robot) -> None:
+    path = robot.get_plan(robot.pose((2, 5)), robot.pose(GOAL, GOAL_YAW))
+    check_path(path, robot.grid)
+    assert points_of(path)[0] == pytest.approx(robot.grid.cell_to_world((2, 5)))
+    assert yaw_of(path.poses[-1].pose.orientation) == pytest.approx(GOAL_YAW)
+    path = robot.get_plan(PoseStamped(), robot.pose(GOAL))  # from the known start
+    assert points_of(path)[0] == pytest.approx(robot.grid.cell_to_world(START))
+    path = robot.get_plan(robot.pose(START), robot.pose(START, GOAL_YAW))
+    assert points_of(path) == [robot.grid.cell_to_world(START)]
     assert yaw_of(path.poses[0].pose.orientation) == pytest.approx(GOAL_YAW)
+    robot.send_start(robot.pose((3, 3)))
+    robot.wait_for_path((3, 3), GOAL)
 
 
 @pytest.mark.parametrize("yaw", [0.5, -2.5])
@@ -98,113 +109,82 @@ def test_plans_on_a_map_with_a_rotated_origin(robot: Robot, yaw: float) -> None:
     robot.wait_for_path((5, 0), GOAL, grid)
 
 
-def test_get_plan_does_not_change_the_active_goal(robot: Robot) -> None:
-    path = robot.get_plan(robot.pose((2, 5)), robot.pose(GOAL, GOAL_YAW))
-    check_path(path, robot.grid)
-    assert points_of(path)[0] == pytest.approx(robot.grid.cell_to_world((2, 5)))
-    assert yaw_of(path.poses[-1].pose.orientation) == pytest.approx(GOAL_YAW)
-    robot.get_plan(robot.pose((0, 0)), robot.pose((0, 0)))
-    robot.send_start(robot.pose((3, 3)))
-    robot.wait_for_path((3, 3), GOAL)
+def test_plans_again_when_the_map_or_how_it_is_read_changes(robot: Robot) -> None:
+    for value, reading, before in (
+        (50, {"occupied_threshold": 50}, 65),
+        (-1, {"allow_unknown": False}, True),
+    ):
+        ((name, _),) = reading.items()
+        values = robot.values.copy()
+        values[GOAL[1], GOAL[0]] = value
+        message = robot.stamped_map(values)
+        set_parameters(robot, **{name: before})
+        robot.send_map(message)
+        planned_on = {"planned on the map of (s)": seconds(message.header.stamp)}
+        robot.wait_for_reason("^a path of ", planned_on)
+        robot.clear()
+        set_parameters(robot, **reading)
+        robot.plans.wait(lambda path: not path.poses)
+        robot.wait_for_reason("the goal is occupied")
+        robot.clear()
+        set_parameters(robot, **{name: before})
+        robot.wait_for_path(START, GOAL)
+    set_parameters(robot, allow_unknown=False)
 
-
-def test_get_plan_without_a_start_begins_at_the_known_one(robot: Robot) -> None:
-    path = robot.get_plan(PoseStamped(), robot.pose(GOAL))
-    assert points_of(path)[0] == pytest.approx(robot.grid.cell_to_world(START))
-
-
-def test_plans_again_when_the_start_changes(robot: Robot) -> None:
-    for cell in ((0, 5), (5, 0)):
-        robot.send_start(robot.pose(cell))
-        robot.wait_for_path(cell, GOAL)
-
-
-def test_plans_again_when_the_map_changes(robot: Robot) -> None:
     grid = robot.grid_of(robot.values, (10.0, 0.0, 0.0))
+    robot.clear()
     robot.send_start(robot.pose(START, grid=grid))
-    robot.plans.wait(lambda path: not path.poses)
     robot.wait_for_reason("the start lies outside the map")
     robot.send_map(
         occupancy_message(robot.values, RESOLUTION, (10.0, 0.0, 0.0), Header(frame_id="map"))
     )
     robot.wait_for_reason("the goal lies outside the map")
-    robot.clear()
     robot.send_goal(robot.pose(GOAL, grid=grid))
     robot.wait_for_path(START, GOAL, grid)
 
 
-def test_plans_again_when_threshold_or_unknown_cells_change(robot: Robot) -> None:
-    values = robot.values.copy()
-    values[GOAL[1], GOAL[0]] = 50
-    message = robot.stamped_map(values)
-    robot.send_map(message)
-    planned_on = {"planned on the map of (s)": seconds(message.header.stamp)}
-    robot.wait_for_reason("^a path of ", planned_on)
-    robot.clear()
-    assert robot.client.set_parameters("planner", occupied_threshold=50)[0].successful
-    robot.plans.wait(lambda path: not path.poses)
-    robot.wait_for_reason("the goal is occupied")
-    robot.clear()
-    assert robot.client.set_parameters("planner", occupied_threshold=65)[0].successful
-    robot.wait_for_path(START, GOAL)
+def test_any_map_plans_on_maps_of_any_size_and_heeds_costs(robot: Robot) -> None:
+    client, random = robot.client, np.random.default_rng(0)
+    for shape in ((30, 70), (150, 110)):
+        values = np.where(random.random(shape) < 0.2, 100, 0).astype(np.int8)
+        other = Robot(client, values, robot.model)
+        goal = other.grid.free_cells()[0]
+        distances = shortest_distances(other.grid, goal, MoveRule.ROBOT_SAFE)
+        distances[np.isinf(distances)] = 0
+        y, x = (int(index) for index in np.unravel_index(distances.argmax(), shape))
+        other.set_map(other.stamped_map())
+        path = other.get_plan(other.pose((x, y)), other.pose(goal))
+        check_path(path, other.grid)
+        assert length_of(path) == pytest.approx(distances[y, x] * RESOLUTION)
 
-    values[GOAL[1], GOAL[0]] = -1
-    robot.clear()
-    robot.send_map(occupancy_message(values, RESOLUTION, ORIGIN, Header(frame_id="map")))
-    robot.wait_for_reason("the goal is occupied")
-    robot.clear()
-    assert robot.client.set_parameters("planner", allow_unknown=True)[0].successful
-    robot.wait_for_path(START, GOAL)
-    assert robot.client.set_parameters("planner", allow_unknown=False)[0].successful
-
-
-def test_move_rule_is_changed_at_run_time(robot: Robot) -> None:
-    assert robot.client.set_parameters("planner", move_rule="corner_cutting")[0].successful
-    robot.plans.wait()
-    status = robot.wait_for_reason(".", {"move rule": "corner_cutting"})
-    assert values_of(status)["model move rule"] == "robot_safe"
-    assert robot.client.set_parameters("planner", move_rule="")[0].successful
-
-
-def test_late_subscriber_has_the_last_plan_and_value(robot: Robot) -> None:
-    robot.plans = robot.client.subscribe(Path, "plan", LATCHED)
-    robot.wait_for_path(START, GOAL)
-    robot.client.subscribe(OccupancyGrid, "planner/value", LATCHED).wait()
+    # A wide corridor whose middle is dear: the straight way is short, the ones beside it cheap.
+    values = np.zeros((7, 20), dtype=np.int8)
+    values[2:5, 3:17] = 60
+    other = Robot(client, values, robot.model)
+    other.set_map(other.stamped_map())
+    straight = other.get_plan(other.pose((0, 3)), other.pose((19, 3)))
+    assert length_of(straight) == pytest.approx(19 * RESOLUTION)
+    set_parameters(robot, use_map_costs=True)
+    around = other.get_plan(other.pose((0, 3)), other.pose((19, 3)))
+    set_parameters(robot, use_map_costs=False)
+    check_path(around, other.grid)
+    cells = [other.grid.world_to_cell(x, y) for x, y in points_of(around)]
+    assert not any(values[y, x] for x, y in cells)
 
 
 # Models
 
 
-def broken_model(path: FilePath, kind: str) -> None:
-    whole = path.read_bytes() if path.exists() else b""
-    if kind == "missing":
-        path.unlink(missing_ok=True)
-    elif kind == "truncated":
-        path.write_bytes(whole[: len(whole) // 2])
-    elif kind == "foreign":
-        path.write_bytes(safetensors.torch.save({"weight": torch.zeros(2)}))
-    elif kind == "text":
-        path.write_text("a model")
-
-
-BROKEN_MODELS = [
-    ("missing", "there is no model file"),
-    ("truncated", "cannot be read as safetensors"),
-    ("foreign", "no model of ddqn_planner"),
-    ("text", "cannot be read as safetensors"),
-]
-
-
 @pytest.fixture
-def whole_model(robot: Robot, trained_model: FilePath) -> Iterator[FilePath]:
+def whole_model(robot: Robot) -> Iterator[FilePath]:
     """Put the whole model back after the test."""
     yield robot.model
-    shutil.copy(trained_model, robot.model)
-    assert robot.client.set_parameters("planner", model=str(robot.model))[0].successful
+    shutil.copy(find_model("any_map"), robot.model)
+    set_parameters(robot, model=str(robot.model))
 
 
 def test_reload_plans_again_with_what_the_file_holds_now(
-    robot: Robot, whole_model: FilePath, trained_model: FilePath
+    robot: Robot, whole_model: FilePath
 ) -> None:
     constant_model(whole_model, 6, 7)
     response = robot.client.call(Trigger, "planner/reload_model")
@@ -215,16 +195,26 @@ def test_reload_plans_again_with_what_the_file_holds_now(
     assert status.level == DiagnosticStatus.WARN
     assert values_of(status)["status"] == "ROLLOUT_TRAPPED"
     assert values_of(status)["model training steps"] == "7"
-    shutil.copy(trained_model, whole_model)
+    shutil.copy(find_model("any_map"), whole_model)
     assert robot.client.call(Trigger, "planner/reload_model").success
     robot.wait_for_path(START, GOAL)
 
 
-@pytest.mark.parametrize(("kind", "reason"), BROKEN_MODELS)
-def test_failed_reload_keeps_the_model(
-    robot: Robot, whole_model: FilePath, kind: str, reason: str
+def test_a_model_that_cannot_be_loaded_is_refused_and_the_one_before_stays(
+    robot: Robot, whole_model: FilePath, tmp_path: FilePath
 ) -> None:
-    broken_model(whole_model, kind)
+    broken, reason = tmp_path / "broken.safetensors", "cannot be read as safetensors"
+    broken.write_bytes(whole_model.read_bytes()[:-9])
+    for value, why in (
+        (str(broken), reason),
+        (str(tmp_path / "missing.safetensors"), "there is no model file"),
+        ("no_such_model", "no shipped model"),
+    ):
+        (result,) = robot.client.set_parameters("planner", model=value)
+        assert not result.successful
+        assert why in result.reason
+        assert robot.client.get_parameter("planner", "model") == str(robot.model)
+    shutil.copy(broken, whole_model)
     response = robot.client.call(Trigger, "planner/reload_model")
     assert not response.success
     assert reason in response.message
@@ -232,27 +222,11 @@ def test_failed_reload_keeps_the_model(
     robot.assert_works()
 
 
-@pytest.mark.parametrize(("kind", "reason"), [*BROKEN_MODELS, ("no name", "no shipped model")])
-def test_parameter_model_refuses_a_bad_file(
-    robot: Robot, tmp_path: FilePath, kind: str, reason: str
-) -> None:
-    path = tmp_path / "other.safetensors"
-    constant_model(path, 6, 1)
-    broken_model(path, kind)
-    value = "no_such_model" if kind == "no name" else str(path)
-    (result,) = robot.client.set_parameters("planner", model=value)
-    assert not result.successful
-    assert reason in result.reason
-    assert robot.client.get_parameter("planner", "model") == str(robot.model)
-    robot.assert_works()
-
-
 def test_model_of_another_size_says_so(
     robot: Robot, whole_model: FilePath, tmp_path: FilePath
 ) -> None:
     constant_model(tmp_path / "seven.safetensors", 7, 1)
-    path = str(tmp_path / "seven.safetensors")
-    assert robot.client.set_parameters("planner", model=path)[0].successful
+    set_parameters(robot, model=str(tmp_path / "seven.safetensors"))
     robot.plans.wait(lambda plan: not plan.poses)
     robot.wait_for_reason("not trained for maps of this size.*6 x 6 cells")
 
@@ -264,99 +238,112 @@ def test_follows_the_trainer(robot: Robot, whole_model: FilePath, tmp_path: File
     status = robot.wait_for_reason("greedy steps do not find it")
     assert values_of(status)["model training steps"] == "11"
     assert robot.client.get_parameter("planner", "model") == str(path)
-
     robot.clear()
     robot.client.publish("trainer/model_saved", String(data="/no/such.safetensors"), LATCHED)
     status = robot.wait_for_reason("trainer's model was refused: .*'/no/such.safetensors'")
     assert values_of(status)["model training steps"] == "11"
 
 
+def test_a_model_that_is_trapped_plans_in_fallback_mode_and_says_that_it_searched(
+    robot: Robot, planner: Any, whole_model: FilePath, tmp_path: FilePath
+) -> None:
+    constant_model(tmp_path / "constant.safetensors", 6, 1)
+    set_parameters(robot, model=str(tmp_path / "constant.safetensors"))
+    assert robot.get_plan(robot.pose(START), robot.pose(GOAL)).poses == []
+    robot.wait_for_reason("greedy steps do not find it.*or set mode to 'astar_fallback'")
+    set_parameters(robot, mode="astar_fallback")
+    for goal in robot.grid.free_cells()[::5]:
+        distances = shortest_distances(robot.grid, goal, MoveRule.ROBOT_SAFE)
+        for start in robot.grid.free_cells()[::2]:
+            plan = robot.get_plan(robot.pose(start), robot.pose(goal))
+            assert bool(plan.poses) == bool(np.isfinite(distances[start[::-1]]))
+            check_path(plan, robot.grid)
+    robot.get_plan(robot.pose(START), robot.pose(GOAL))
+    status = robot.wait_for_reason("searched for in the order of the Q field")
+    assert values_of(status)["method"] == "astar_fallback"
+    assert status.level == DiagnosticStatus.OK
+    planner.wait_for_log("a path of .* searched for in the order of the Q field")
+    # Of the two moves that the model knows one leads there.
+    robot.get_plan(robot.pose((2, 0)), robot.pose((0, 0)))
+    assert values_of(robot.wait_for_reason("^a path of 2.00 cells, by greedy steps"))["method"] == (
+        "greedy"
+    )
+    set_parameters(robot, mode="greedy")
+
+
 # Parameters
 
 
-def test_bad_parameters_are_refused_with_a_reason(robot: Robot) -> None:
-    for name, value, reason in (
-        ("move_rule", "diagonal", "move_rule is 'diagonal'"),
-        ("occupied_threshold", 0, "out of range"),
-        ("occupied_threshold", 101, "out of range"),
-        ("occupied_threshold", "many", "Wrong parameter type"),
-        ("follow_trainer", False, "read-only"),
+def test_move_rule_is_changed_at_run_time(robot: Robot) -> None:
+    set_parameters(robot, move_rule="corner_cutting")
+    status = robot.wait_for_reason(".", {"move rule": "corner_cutting"})
+    assert values_of(status)["model move rule"] == "robot_safe"
+    set_parameters(robot, move_rule="")
+
+
+def test_parameters_that_come_together_are_set_together_or_not_at_all(robot: Robot) -> None:
+    def set_together(**values: Any) -> SetParametersResult:
+        messages = [
+            Parameter(name, value=value).to_parameter_msg() for name, value in values.items()
+        ]
+        request = SetParametersAtomically.Request(parameters=messages)
+        name = "planner/set_parameters_atomically"
+        return robot.client.call(SetParametersAtomically, name, request).result
+
+    good = {"robot_radius": 0.4, "mode": "astar_fallback", "occupied_threshold": 50}
+    before = {name: robot.client.get_parameter("planner", name) for name in good}
+    for bad, reason in (
+        ({"clearance_weight": 1.5}, "out of range"),
+        ({"move_rule": "diagonal"}, "move_rule is 'diagonal'; give one of ''"),
+        ({"model": "no_such_model"}, "there is no shipped model 'no_such_model'"),
+        ({"start_source": "gps"}, "start_source is 'gps'; give one of"),
+        ({"robot_frame": ""}, "robot_frame is ''; name"),
+        ({"tolerance": math.nan}, "out of range"),
+        ({"allow_unknown": "many"}, "Wrong parameter type"),
+        ({"follow_trainer": False}, "read-only"),
+        ({"no_such": 1}, "undeclared"),
     ):
-        before = robot.client.get_parameter("planner", name)
-        (result,) = robot.client.set_parameters("planner", **{name: value})
-        assert not result.successful
-        assert reason in result.reason
-        assert robot.client.get_parameter("planner", name) == before
-    robot.assert_works()
+        for together in ({**good, **bad}, {**bad, **good}):
+            result = set_together(**together)
+            assert not result.successful
+            assert reason in result.reason
+            for name, value in before.items():
+                assert robot.client.get_parameter("planner", name) == value
+    assert set_together(**good).successful
+    assert robot.client.get_parameter("planner", "robot_radius") == 0.4
+    assert set_together(**before).successful
 
 
 # Bad input. After each, a good request has its plan.
 
 
-BAD_POSES = [
-    ("pose.position.x", math.nan, "x = nan"),
-    ("pose.position.y", math.inf, "y = inf"),
-    ("pose.orientation", Quaternion(w=0.0), "quaternion of norm 0"),
-    ("pose.orientation", Quaternion(w=1.01), "quaternion of norm 1.01"),
-    ("pose.orientation", Quaternion(z=math.nan), "quaternion of norm nan"),
-    ("header.frame_id", "odom", "frame is 'odom', the map's is 'map'; transform"),
-]
-
-UNREACHED_POSES = [
-    ("pose.position.x", 50.0, r"lies outside the map .*\(50, .*\) m.*6 x 6 cells"),
-    ("pose.position.x", -1e300, r"lies outside the map .*\(-1e\+300, .*\) m"),
-    ("pose.position.x", 1e308, "x = 1e[+]308.*too far"),
-]
-
-
-@pytest.mark.parametrize(
-    ("field", "value", "reason"),
-    [
-        ("data", array.array("b", [0] * 35), "the map's data has 35 values.*need 36"),
-        ("info.width", 0, "the map has 0 x 6 cells"),
-        ("info.resolution", 0.0, "the map's resolution is 0.0"),
-        ("info.resolution", math.nan, "the map's resolution is nan"),
-        ("header.frame_id", "", "the map's frame is ''"),
-        ("info.origin.orientation", Quaternion(w=0.5), "quaternion of norm 0.5"),
-        ("info.origin.position.x", math.inf, "x = inf"),
-    ],
-)
-def test_malformed_map_is_refused_and_the_old_one_stays(
-    robot: Robot, planner: Any, field: str, value: Any, reason: str
+def test_a_malformed_map_or_start_is_refused_and_the_old_one_stays(
+    robot: Robot, planner: Any
 ) -> None:
-    robot.send_map(changed(robot.map_message(), field, value))
-    status = robot.wait_for_reason(f"map refused: .*{reason}")
-    assert status.level == DiagnosticStatus.WARN
-    planner.wait_for_log(f"map refused: .*{reason}")
+    robot.send_map(changed(robot.map_message(), "info.width", 0))
+    robot.send_start(changed(robot.pose((3, 3)), "pose.orientation", Quaternion(w=0.0)))
+    for reason in (
+        "map refused: the map has 0 x 6 cells",
+        "initialpose refused: the start's orientation is .* a quaternion of norm 0",
+    ):
+        assert robot.wait_for_reason(reason).level == DiagnosticStatus.WARN
+        planner.wait_for_log(reason)
     robot.assert_works()
+    robot.clear()
+    robot.send_goal(robot.pose(GOAL, GOAL_YAW))
+    robot.wait_for_path(START, GOAL, yaw=GOAL_YAW)
 
 
-@pytest.mark.parametrize(
-    ("field", "value", "reason"), [*BAD_POSES, ("header.frame_id", "", "frame is ''")]
-)
-def test_malformed_start_is_refused_and_the_old_one_stays(
-    robot: Robot, planner: Any, field: str, value: Any, reason: str
+def test_a_malformed_goal_has_an_empty_plan_and_replaces_the_active_goal(
+    robot: Robot, planner: Any
 ) -> None:
-    robot.send_start(changed(robot.pose((3, 3)), field, value))
-    robot.wait_for_reason(f"initialpose refused: the start's .*{reason}")
-    planner.wait_for_log(f"initialpose refused: the start's .*{reason}")
-    robot.assert_works()
-    robot.send_goal(robot.pose(GOAL))
-    robot.wait_for_path(START, GOAL)
-
-
-@pytest.mark.parametrize(
-    ("field", "value", "reason"), [*BAD_POSES, ("header.frame_id", "", "frame is ''")]
-)
-def test_malformed_goal_has_an_empty_plan_and_replaces_the_active_goal(
-    robot: Robot, planner: Any, field: str, value: Any, reason: str
-) -> None:
-    robot.send_goal(changed(robot.pose(GOAL), field, value))
+    reason = "the goal's position is .*x = nan"
+    robot.send_goal(changed(robot.pose(GOAL), "pose.position.x", math.nan))
     plan = robot.plans.wait(lambda path: not path.poses)
     assert plan.header.frame_id == "map"
-    status = robot.wait_for_reason(f"the goal's .*{reason}")
+    status = robot.wait_for_reason(reason)
     assert (status.level, values_of(status)["status"]) == (DiagnosticStatus.WARN, "INVALID_GOAL")
-    planner.wait_for_log(f"no plan: the goal's .*{reason}")
+    planner.wait_for_log(f"no plan: {reason}")
     robot.clear()
     robot.send_start(robot.pose((3, 3)))
     robot.plans.wait()
@@ -365,344 +352,248 @@ def test_malformed_goal_has_an_empty_plan_and_replaces_the_active_goal(
 
 
 @pytest.mark.parametrize("name", ["start", "goal"])
-@pytest.mark.parametrize(("field", "value", "reason"), [*BAD_POSES, *UNREACHED_POSES])
-def test_bad_get_plan_has_an_empty_plan_and_a_reason(
-    robot: Robot, planner: Any, name: str, field: str, value: Any, reason: str
+def test_a_bad_request_has_an_empty_plan_and_a_reason(
+    robot: Robot, planner: Any, name: str
 ) -> None:
-    poses = {"start": robot.pose(START), "goal": robot.pose(GOAL)}
-    changed(poses[name], field, value)
-    path = robot.get_plan(**poses)
-    assert (path.poses, path.header.frame_id) == ([], "map")
-    status = robot.wait_for_reason(f"the {name}.*{reason}")
-    assert values_of(status)["reason"] == status.message
-    planner.wait_for_log(f"no plan: the {name}.*{reason}")
-    robot.assert_works()
-
-
-@pytest.mark.parametrize(("field", "value", "reason"), UNREACHED_POSES[:2])
-@pytest.mark.parametrize("name", ["start", "goal"])
-def test_pose_outside_the_map_has_an_empty_plan(
-    robot: Robot, name: str, field: str, value: float, reason: str
-) -> None:
-    send = {"start": robot.send_start, "goal": robot.send_goal}[name]
-    send(changed(robot.pose(START), field, value))
-    assert robot.plans.wait(lambda path: not path.poses).header.frame_id == "map"
-    robot.wait_for_reason(f"the {name} {reason}")
-    robot.assert_works()
-
-
-@pytest.mark.parametrize("name", ["start", "goal"])
-def test_occupied_pose_has_an_empty_plan(robot: Robot, name: str) -> None:
-    assert robot.client.set_parameters("planner", start_clearing_radius=0.0)[0].successful
-    send = {"start": robot.send_start, "goal": robot.send_goal}[name]
-    send(robot.pose((2, 1)))
-    assert robot.plans.wait(lambda path: not path.poses).header.frame_id == "map"
-    status = robot.wait_for_reason(rf"the {name} is occupied .*{name}: \(0.3, 2.7\) m in cell")
+    set_parameters(robot, start_clearing_radius=0.0)
+    for field, value, reason in (
+        ("pose.position.y", math.inf, "y = inf"),
+        ("pose.orientation", Quaternion(w=1.01), "quaternion of norm 1.01"),
+        ("header.frame_id", "odom", "frame is 'odom', .*the map's.* 'map'"),
+        ("pose.position.x", 50.0, r"lies outside the map .*\(50, .*\) m.*6 x 6 cells"),
+        ("pose.position.x", -1e300, r"lies outside the map .*\(-1e\+300, .*\) m"),
+        ("pose.position.x", 1e308, "x = 1e[+]308.*too far"),
+        ("pose", robot.pose((2, 1)).pose, rf"is occupied .*{name}: \(0.3, 2.7\) m in cell"),
+    ):
+        poses = {"start": robot.pose(START), "goal": robot.pose(GOAL)}
+        changed(poses[name], field, value)
+        robot.clear()
+        path = robot.get_plan(**poses)
+        assert (path.poses, path.header.frame_id) == ([], "map")
+        status = robot.wait_for_reason(f"the {name}.*{reason}")
+        assert values_of(status)["reason"] == status.message
+        planner.wait_for_log(f"no plan: the {name}.*{reason}")
     assert values_of(status)["status"] == f"{name.upper()}_OCCUPIED"
-    assert robot.client.set_parameters("planner", start_clearing_radius=-1.0)[0].successful
+    set_parameters(robot, start_clearing_radius=-1.0)
     robot.assert_works()
 
 
-def test_unreachable_goal_has_an_empty_plan_until_the_map_opens(robot: Robot) -> None:
+def test_a_goal_without_a_path_has_an_empty_plan_until_the_map_opens(robot: Robot) -> None:
     values = robot.values.copy()
     values[4:, 4] = values[4, 4:] = 100
-    robot.send_map(occupancy_message(values, RESOLUTION, ORIGIN, Header(frame_id="map")))
+    robot.send_map(robot.stamped_map(values))
     robot.plans.wait(lambda path: not path.poses)
     status = robot.wait_for_reason(r"no path leads from .*cell \(0, 0\).*cell \(5, 5\)")
     assert values_of(status)["status"] == "NO_PATH"
     robot.clear()
     robot.send_map()
     robot.wait_for_path(START, GOAL)
-
-
-def test_goal_waits_while_the_map_is_in_another_frame(robot: Robot) -> None:
+    robot.clear()
     other = robot.map_message()
     other.header.frame_id = "upstairs"
     robot.send_map(other)
     plan = robot.plans.wait(lambda path: not path.poses)
     assert plan.header.frame_id == "upstairs"
-    robot.wait_for_reason("the goal's frame is 'map', the map's is 'upstairs'")
-    robot.send_start(robot.pose((3, 3)))
-    robot.wait_for_reason("initialpose refused: the start's frame is 'map'")
+    robot.wait_for_reason("the goal's frame is 'map', .*'upstairs'")
     robot.clear()
     robot.send_map()
     robot.wait_for_path(START, GOAL)
     robot.wait_for_reason("^a path of [^;]*$")
 
 
-# The model for any map, which is there without a parameter
+def test_the_log_says_once_what_stays_the_same(robot: Robot, planner: Any) -> None:
+    def send_maps(frame: str = "map") -> None:
+        """Send three maps, one after the other is planned on."""
+        for _ in range(3):
+            message = robot.stamped_map()
+            message.header.frame_id = frame
+            robot.set_map(message)
+
+    def set_goal_again() -> None:
+        for radius in (0.1, 0.2, 0.3):
+            robot.plans.clear()
+            set_parameters(robot, robot_radius=radius)
+            robot.plans.wait()
+
+    planner.forget_log()
+    send_maps()
+    robot.send_goal(robot.pose((3, 3)))
+    robot.wait_for_path(START, (3, 3))
+    set_goal_again()
+    send_maps()
+    robot.send_goal(robot.pose((2, 1)))
+    robot.wait_for_reason("the goal is occupied")
+    set_goal_again()
+    set_parameters(robot, robot_radius=0.0)
+    for frame in ("", "", ""):
+        robot.send_start(changed(robot.pose(START), "header.frame_id", frame))
+    robot.send_start(changed(robot.pose(START), "pose.position.x", math.nan))
+    planner.wait_for_log("the start's position is .x = nan")
+    send_maps("upstairs")
+    planner.wait_for_log("no plan: the goal's frame")
+    assert "map of 6 x 6 cells of 0.5 m in frame 'map'" not in planner.log  # it was known
+    for line in (
+        "map of 6 x 6 cells of 0.5 m in frame 'upstairs'",
+        "a path of ",
+        "no plan: the goal is occupied",
+        "no plan: the goal's frame",
+        "initialpose refused: the start's frame is ''",
+    ):
+        assert planner.log.count(line) == 1, planner.log
 
 
-def test_without_parameters_it_plans_on_maps_of_any_size_and_heeds_costs(
-    run_node: Any, make_client: Callable[[str], Any], model: FilePath
-) -> None:
-    client, random = make_client("/anywhere"), np.random.default_rng(0)
-    with run_node("planner_node", {}, namespace="/anywhere"):
-        for shape in ((30, 70), (150, 110)):
-            occupancy = generate_map("office", shape, random)
-            ((start, goal),) = random_requests(occupancy, MoveRule.ROBOT_SAFE, 1, random)
-            values = np.where(occupancy, 100, 0).astype(np.int8)
-            robot = Robot(client, values, model, "/anywhere/planner")
-            robot.send_map()
-            robot.send_start(robot.pose(start))
-            robot.send_goal(robot.pose(goal))
-            path = robot.wait_for_path(start, goal)
-            optimum = shortest_distances(robot.grid, goal, MoveRule.ROBOT_SAFE)[start[::-1]]
-            assert length_of(path) == pytest.approx(optimum * RESOLUTION)
-
-        # A wide corridor whose middle is dear: the straight way is short, the ones beside it cheap.
-        values = np.zeros((7, 20), dtype=np.int8)
-        values[2:5, 3:17] = 60
-        robot = Robot(client, values, model, "/anywhere/planner")
-        robot.set_map(robot.stamped_map())
-        straight = robot.get_plan(robot.pose((0, 3)), robot.pose((19, 3)))
-        assert length_of(straight) == pytest.approx(19 * RESOLUTION)
-        assert client.set_parameters("planner", use_map_costs=True)[0].successful
-        around = robot.get_plan(robot.pose((0, 3)), robot.pose((19, 3)))
-        check_path(around, robot.grid)
-        cells = [robot.grid.world_to_cell(x, y) for x, y in points_of(around)]
-        assert not any(values[y, x] for x, y in cells)
-
-
-# While a field is computed
+# While a plan takes long
 
 
 GATE = """
 import os, time
-import ddqn_planner.planning.planner as planning
-from ddqn_planner.model import PaperQNetwork
+from ddqn_planner.planning import Planner
 
-def gated(function, name):
-    def wait_and_call(*arguments):
-        while not os.path.exists({gate!r}):
-            print(name, "waits", flush=True)
+steps = Planner.steps
+
+def gated(planner, request):
+    for plan in steps(planner, request):
+        yield plan
+        while plan is None and not os.path.exists({gate!r}):  # in the thread of the slow step
+            print("a plan waits", flush=True)
             time.sleep(0.01)
-        return function(*arguments)
 
-    return wait_and_call
-
-PaperQNetwork.q_values = gated(PaperQNetwork.q_values, "a field")
-planning.search = gated(planning.search, "a search")
+Planner.steps = gated
 """
 """What a planner runs first (as its ``sitecustomize``): as slow as a test likes."""
 
 
+@pytest.fixture(scope="module")
+def gated(
+    run_node: Any,
+    make_client: Callable[[str], Any],
+    small_values: np.ndarray,
+    model: FilePath,
+    tmp_path_factory: pytest.TempPathFactory,
+) -> Iterator[tuple[Robot, Any, FilePath]]:
+    """Run a planner that makes no plan which takes long without a file."""
+    folder, client = tmp_path_factory.mktemp("gate"), make_client("/gated")
+    (folder / "gate").touch()
+    (folder / "sitecustomize.py").write_text(GATE.format(gate=str(folder / "gate")))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("PYTHONPATH", str(folder), prepend=os.pathsep)
+        with run_node("planner_node", {"model": str(model)}, namespace="/gated") as node:
+            yield Robot(client, small_values, model, "/gated/planner"), node, folder / "gate"
+            assert "Traceback" not in node.log
+
+
 @pytest.fixture
-def gate(tmp_path: FilePath, monkeypatch: pytest.MonkeyPatch) -> FilePath:
-    """Return a file without which a planner of the test computes no field, and searches not."""
-    gate = tmp_path / "gate"
+def gate(gated: tuple[Robot, Any, FilePath]) -> Iterator[FilePath]:
+    """Close the gate of a planner that knows the field toward START, its active goal."""
+    robot, node, gate = gated
+    robot.begin(START, START)
+    gate.unlink()
+    node.forget_log()
+    yield gate
     gate.touch()
-    (tmp_path / "sitecustomize.py").write_text(GATE.format(gate=str(gate)))
-    monkeypatch.setenv("PYTHONPATH", str(tmp_path), prepend=os.pathsep)
-    return gate
 
 
-@contextmanager
-def robot_before(
-    gate: FilePath, run_node: Any, client: Any, values: np.ndarray, model: FilePath
-) -> Iterator[tuple[Robot, Any]]:
-    """Run a planner that knows the field toward START, its active goal; the gate closes then."""
-    namespace = client.node.get_namespace()
-    with run_node("planner_node", {"model": str(model)}, namespace=namespace) as node:
-        robot = Robot(client, values, model, f"{namespace}/planner")
-        robot.send_map()
-        robot.send_start(robot.pose(START))
-        robot.send_goal(robot.pose(START))
-        robot.wait_for_path(START, START)
-        gate.unlink()
-        yield robot, node
-
-
-def ask_for_plan(robot: Robot, node: Any) -> Any:
-    """Return the future of the plan from START to GOAL, once its field waits at the gate."""
-    service = robot.client.service(GetPlan, "planner/get_plan")
+def test_all_else_is_answered_while_a_plan_takes_long(
+    gated: tuple[Robot, Any, FilePath], gate: FilePath
+) -> None:
+    robot, node, _ = gated
+    client, answered = robot.client, threading.Event()
+    service = client.service(GetPlan, "planner/get_plan")
     plan = service.call_async(GetPlan.Request(start=robot.pose(START), goal=robot.pose(GOAL)))
-    node.wait_for_log("a field waits")
-    return plan
+    plan.add_done_callback(lambda _: answered.set())
+    node.wait_for_log("a plan waits")
+    assert len(robot.get_plan(robot.pose(START), robot.pose(START)).poses) == 1
+    outside = changed(robot.pose(START), "pose.position.x", 50.0)
+    assert robot.get_plan(outside, robot.pose((0, 5))).poses == []
+    assert client.get_parameter("planner", "model") == str(robot.model)
+    names = client.call(ListParameters, "planner/list_parameters").result.names
+    request = DescribeParameters.Request(names=names)
+    assert client.call(DescribeParameters, "planner/describe_parameters", request).descriptors
+    assert not client.set_parameters("planner", model="no_model")[0].successful
+    assert client.call(Trigger, "planner/reload_model").success
+    # The map grows by the robot's body, in another thread than that of the plan.
+    set_parameters(robot, robot_radius=0.6)
+    assert robot.get_plan(outside, robot.pose((0, 5))).poses == []
+    assert not plan.done()
+    gate.touch()
+    assert answered.wait(TIMEOUT)
+    check_path(plan.result().plan, robot.grid)
+    assert points_of(plan.result().plan)[-1] == pytest.approx(robot.grid.cell_to_world(GOAL))
+    set_parameters(robot, robot_radius=0.0)
 
 
-def test_all_else_is_answered_while_a_field_is_computed(
-    run_node: Any,
-    make_client: Callable[[str], Any],
-    small_values: np.ndarray,
-    model: FilePath,
-    gate: FilePath,
+def test_what_comes_while_a_plan_takes_long_has_the_last_plan(
+    gated: tuple[Robot, Any, FilePath], gate: FilePath
 ) -> None:
-    client = make_client("/meanwhile")
-    with robot_before(gate, run_node, client, small_values, model) as (robot, node):
-        plan = ask_for_plan(robot, node)
-        assert len(robot.get_plan(robot.pose(START), robot.pose(START)).poses) == 1
-        outside = changed(robot.pose(START), "pose.position.x", 50.0)
-        assert robot.get_plan(outside, robot.pose((0, 5))).poses == []
-        assert client.get_parameter("planner", "model") == str(model)
-        names = client.call(ListParameters, "planner/list_parameters").result.names
-        request = DescribeParameters.Request(names=names)
-        assert client.call(DescribeParameters, "planner/describe_parameters", request).descriptors
-        assert client.set_parameters("planner", allow_unknown=True)[0].successful
-        assert not client.set_parameters("planner", model="no_model")[0].successful
-        assert client.call(Trigger, "planner/reload_model").success
-        assert not plan.done()
+    robot, node, _ = gated
 
-        # The map grows by the robot's body, in another thread than that of the field.
-        assert client.set_parameters("planner", robot_radius=0.6)[0].successful
-        assert robot.get_plan(outside, robot.pose((0, 5))).poses == []
+    def last_plan() -> Path:
+        robot.get_plan(robot.pose(START), robot.pose(START))  # what came before it is done
+        return robot.client.subscribe(Path, "plan", LATCHED).wait()
 
-        gate.touch()
-        answered = threading.Event()
-        plan.add_done_callback(lambda _: answered.set())
-        assert answered.wait(TIMEOUT)
-        check_path(plan.result().plan, robot.grid)
-        assert points_of(plan.result().plan)[-1] == pytest.approx(robot.grid.cell_to_world(GOAL))
+    robot.send_goal(robot.pose((0, 5)))
+    node.wait_for_log("a plan waits")
+    robot.send_goal(robot.pose(GOAL))
+    robot.send_start(robot.pose((3, 3)))
+    gate.touch()
+    path = robot.wait_for_path((3, 3), GOAL)
+    assert points_of(last_plan()) == points_of(path)
+    gate.unlink()
+    robot.send_goal(robot.pose((5, 0)))
+    robot.send_goal(changed(robot.pose(GOAL), "header.frame_id", ""))
+    gate.touch()
+    node.wait_for_log("no plan: the goal's frame is ''")
+    assert last_plan().poses == []
 
 
-def test_what_comes_while_a_field_is_computed_has_the_last_plan(
-    run_node: Any,
-    make_client: Callable[[str], Any],
-    small_values: np.ndarray,
-    model: FilePath,
-    gate: FilePath,
+def test_a_signal_ends_the_node_while_a_plan_takes_long(
+    gated: tuple[Robot, Any, FilePath], gate: FilePath
 ) -> None:
-    client = make_client("/superseded")
-    with robot_before(gate, run_node, client, small_values, model) as (robot, node):
-
-        def last_plan() -> Path:
-            robot.get_plan(robot.pose(START), robot.pose(START))  # what came before it is done
-            return client.subscribe(Path, "plan", LATCHED).wait()
-
-        robot.send_goal(robot.pose((0, 5)))
-        node.wait_for_log("a field waits")
-        robot.send_goal(robot.pose(GOAL))
-        robot.send_start(robot.pose((3, 3)))
-        gate.touch()
-        path = robot.wait_for_path((3, 3), GOAL)
-        assert points_of(last_plan()) == points_of(path)
-
-        gate.unlink()
-        robot.send_goal(robot.pose((5, 0)))
-        robot.send_goal(changed(robot.pose(GOAL), "header.frame_id", "odom"))
-        gate.touch()
-        node.wait_for_log("no plan: the goal's frame is 'odom'")
-        assert last_plan().poses == []
+    robot, node, _ = gated
+    robot.send_goal(robot.pose(GOAL))
+    node.wait_for_log("a plan waits")
+    assert node.stop(signal.SIGTERM) == 0
 
 
-def test_all_else_is_answered_while_a_path_is_searched_for(
-    run_node: Any,
-    make_client: Callable[[str], Any],
-    small_values: np.ndarray,
-    tmp_path: FilePath,
-    gate: FilePath,
-) -> None:
-    bad = tmp_path / "bad.safetensors"
-    constant_model(bad, 6, 1)
-    client = make_client("/searching")
-    with run_node("planner_node", {"model": str(bad)}, namespace="/searching") as node:
-        robot = Robot(client, small_values, bad, "/searching/planner")
-        robot.send_map()
-        robot.wait_for_map(robot.map_message())
-        assert robot.get_plan(robot.pose(START), robot.pose(GOAL)).poses == []
-        assert client.set_parameters("planner", mode="astar_fallback")[0].successful
-        gate.unlink()
-        plans = client.service(GetPlan, "planner/get_plan")
-        answered = threading.Event()
-        plan = plans.call_async(GetPlan.Request(start=robot.pose(START), goal=robot.pose(GOAL)))
-        plan.add_done_callback(lambda _: answered.set())
-        node.wait_for_log("a search waits")
-        outside = changed(robot.pose(START), "pose.position.x", 50.0)
-        assert robot.get_plan(outside, robot.pose(GOAL)).poses == []
-        assert not plan.done()
-        gate.touch()
-        assert answered.wait(TIMEOUT)
-        check_path(plan.result().plan, robot.grid)
-        assert plan.result().plan.poses
-
-
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_a_signal_ends_the_node_while_a_field_is_computed(
-    run_node: Any,
-    make_client: Callable[[str], Any],
-    small_values: np.ndarray,
-    model: FilePath,
-    gate: FilePath,
-    number: signal.Signals,
-) -> None:
-    client = make_client(f"/{number.name.lower()}")
-    with robot_before(gate, run_node, client, small_values, model) as (robot, node):
-        ask_for_plan(robot, node)
-        assert node.stop(number) == 0
-        assert "Traceback" not in node.log
-
-
-# Processes of their own
+# A process of its own
 
 
 def test_says_what_it_waits_for_and_plans_once_it_is_there(
-    run_node: Any, make_client: Callable[[str], Any], small_values: np.ndarray, model: FilePath
-) -> None:
-    remaps = ["map:=plant", "plan:=route", "__node:=router"]
-    with run_node("planner_node", {"model": str(model)}, remaps) as node:
-        client = make_client("")
-        robot = Robot(client, small_values, model, "/router")
-        plans = client.subscribe(Path, "route", LATCHED)
-
-        def wait_for(reason: str) -> None:
-            robot.wait_for_reason(reason)
-            node.wait_for_log(reason)
-
-        node.wait_for_log("waiting for a map on /plant")
-        status = robot.wait_for_reason("no map was received on /plant yet; start a map server")
-        assert (status.level, values_of(status)["status"]) == (DiagnosticStatus.WARN, "NO_REQUEST")
-        client.publish("goal_pose", robot.pose(GOAL))
-        assert plans.wait().header.frame_id == "map"
-        wait_for("no map was received on /plant yet; start a map server")
-        malformed = changed(robot.map_message(), "info.resolution", 0.0)
-        client.publish("plant", malformed, LATCHED)
-        wait_for("map refused: the map's resolution is 0.0")
-
-        plans.clear()
-        client.publish("plant", robot.map_message(), LATCHED)
-        assert plans.wait().poses == []
-        wait_for("the start is unknown; set it on /initialpose")
-        request = GetPlan.Request(goal=robot.pose(GOAL))
-        assert client.call(GetPlan, "router/get_plan", request).plan.poses == []
-
-        robot.send_start(robot.pose(START))
-        check_path(plans.wait(lambda path: path.poses), robot.grid)
-        assert node.stop(signal.SIGTERM) == 0
-
-
-@pytest.mark.parametrize(("kind", "reason"), BROKEN_MODELS[:3])
-def test_without_a_model_at_the_start_the_node_lives_on(
     run_node: Any,
     make_client: Callable[[str], Any],
     small_values: np.ndarray,
-    trained_model: FilePath,
+    model: FilePath,
     tmp_path: FilePath,
-    kind: str,
-    reason: str,
 ) -> None:
-    path = tmp_path / "model.safetensors"
-    shutil.copy(trained_model, path)
-    broken_model(path, kind)
-    namespace = f"/{kind}"
-    with run_node("planner_node", {"model": str(path)}, namespace=namespace) as node:
-        robot = Robot(make_client(namespace), small_values, path, f"{namespace}/planner")
-        node.wait_for_log(f"model refused: .*{reason}")
-        robot.send_map()
-        robot.send_start(robot.pose(START))
-        robot.send_goal(robot.pose(GOAL))
-        robot.plans.wait(lambda plan: not plan.poses)
-        status = robot.wait_for_reason(f"no model is loaded: .*{reason}")
+    path, remaps = tmp_path / "model.safetensors", ["map:=plant", "plan:=route", "__node:=router"]
+    with run_node("planner_node", {"model": str(path)}, remaps) as node:
+        client = make_client("")
+        robot = Robot(client, small_values, path, "/router")
+        plans = client.subscribe(Path, "route", LATCHED)
+        node.wait_for_log("waiting for a map on /plant")
+        missing = "no map was received on /plant yet; start a map server"
+        assert values_of(robot.wait_for_reason(missing))["status"] == "NO_REQUEST"
+        client.publish("goal_pose", robot.pose(GOAL))
+        assert plans.wait().header.frame_id == "map"
+        robot.wait_for_reason(missing)
+        node.wait_for_log(f"no plan: {missing}")
+        malformed = changed(robot.map_message(), "info.resolution", 0.0)
+        client.publish("plant", malformed, LATCHED)
+        robot.wait_for_reason("map refused: the map's resolution is 0.0")
+
+        client.publish("plant", robot.map_message(), LATCHED)
+        no_model = "there is no model file"
+        status = robot.wait_for_reason(f"no model is loaded: .*{no_model}")
         assert status.level == DiagnosticStatus.ERROR
-        response = robot.client.call(Trigger, "planner/reload_model")
+        node.wait_for_log(f"model refused: .*{no_model}")
+        response = client.call(Trigger, "router/reload_model")
         assert not response.success
-        assert reason in response.message
-        shutil.copy(trained_model, path)
-        assert robot.client.call(Trigger, "planner/reload_model").success
-        robot.wait_for_path(START, GOAL)
+        assert no_model in response.message
+        shutil.copy(model, path)
+        assert client.call(Trigger, "router/reload_model").success
 
-
-def test_what_the_node_cannot_start_with_is_one_clear_line(run_node: Any) -> None:
-    with run_node("planner_node", {"move_rule": "diagonal"}, exit_code=1) as node:
-        node.wait_for_end()
-    assert re.search("cannot start: .*move_rule is 'diagonal'", node.log)
-    assert "Traceback" not in node.log
+        robot.wait_for_reason("the start is unknown; set it on /initialpose")
+        request = GetPlan.Request(goal=robot.pose(GOAL))
+        assert client.call(GetPlan, "router/get_plan", request).plan.poses == []
+        robot.send_start(robot.pose(START))
+        check_path(plans.wait(lambda path: path.poses), robot.grid)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Coroutine, Iterator
+from collections.abc import Iterator
 from typing import Any
 
 import pytest
@@ -26,42 +26,29 @@ def worker() -> Iterator[Worker]:
     context.try_shutdown()
 
 
-class Call:
-    """A call that runs until the test opens its gate."""
+def test_calls_run_one_after_the_other_and_those_given_up_not_at_all(worker: Worker) -> None:
+    begun, gate, done = threading.Event(), threading.Event(), []
 
-    def __init__(self, worker: Worker) -> None:
-        self.begun, self.gate = threading.Event(), threading.Event()
-        self.waiting: Coroutine[Any, Any, Any] = worker.run(self.work)
-        self.waiting.send(None)
+    def work(name: str) -> None:
+        begun.set()
+        assert gate.wait(TIMEOUT)
+        done.append(name)
 
-    def work(self) -> str:
-        self.begun.set()
-        assert self.gate.wait(TIMEOUT)
-        return "done"
-
-    def has_ended(self) -> bool:
-        try:
-            self.waiting.send(None)
-        except StopIteration as end:
-            return bool(end.value == "done")
-        return False
-
-
-def test_calls_run_one_after_the_other(worker: Worker) -> None:
-    first, second = Call(worker), Call(worker)
-    second.gate.set()
-    assert first.begun.wait(TIMEOUT)
-    assert not second.has_ended()
-    first.gate.set()
-    wait_for("both calls", lambda: first.has_ended())
-    wait_for("both calls", lambda: second.has_ended())
+    waiting: list[Any] = [worker.run(work, name) for name in ("first", "left out", "last")]
+    for coroutine in waiting:
+        coroutine.send(None)
+    assert begun.wait(TIMEOUT)
+    waiting[1].close()
+    assert done == []
+    gate.set()
+    wait_for("the last call", lambda: "last" in done)
+    assert done == ["first", "last"]
+    with pytest.raises(StopIteration):
+        waiting[0].send(None)
 
 
-def test_a_call_that_was_given_up_before_it_began_is_left_out(worker: Worker) -> None:
-    first, left_out, last = Call(worker), Call(worker), Call(worker)
-    assert first.begun.wait(TIMEOUT)
-    left_out.waiting.close()
-    for call in (first, last):
-        call.gate.set()
-    wait_for("the last call", last.has_ended)
-    assert not left_out.begun.is_set()
+def test_a_call_has_the_exception_of_its_function(worker: Worker) -> None:
+    failing = worker.call(int, "no number")
+    worker.close()
+    with pytest.raises(ValueError, match="no number"):
+        failing.result()

@@ -1,0 +1,344 @@
+"""Parts of paths: the way out of a start, what is left of a path, straight segments for moves."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ddqn_planner.grid import MOVES, Cell, GridMap, MoveRule, legal_moves, path_cost, path_length
+from ddqn_planner.grid.arguments import Cells, Occupancy, cells_inside
+from ddqn_planner.grid.grid_map import check_grid
+from ddqn_planner.grid.moves import segment_lengths
+from ddqn_planner.planning.field import Goals
+from ddqn_planner.planning.plan import PlanRequest
+from ddqn_planner.planning.search import search
+
+REACH = 5
+"""Cells along an axis that a robot may be beside its path, and still come back to it."""
+
+SAME_COST = 1 + 1e-9
+"""The relative error of a sum of costs: a path may cost this much more, and still as much."""
+
+ROUNDING = 1 + 1e-6
+"""The relative error of a distance in cells: 0.15 m in cells of 0.05 m must reach 3 cells, not
+2.9999999."""
+
+NEARER_TO_GOAL = 1e-9
+"""Of ways out of the same length, the one that ends nearer to the goal is taken: so little does a
+cell of this distance count beside one of the way."""
+
+
+# The way out, and the goals that are left
+
+
+def reach(request: PlanRequest) -> float:
+    """Return how far a goal may move, cells."""
+    return request.tolerance * ROUNDING
+
+
+def way_out_and_ends(request: PlanRequest, goals: Goals) -> tuple[tuple[Cell, ...], Goals]:
+    """Return the way from the start to the first free cell, and where the path can end.
+
+    The way is the start alone where that is free. It is empty where no path leads to a goal, nor
+    to a cell within the tolerance: connected cells say so, without a field.
+    """
+    grid, start, rule = request.grid, request.start, request.move_rule
+    candidates = [(np.array(goals), len(goals))] if goals else []
+    if reach(request) >= 1:
+        free_cells = _near(~grid.occupancy, request.goal, reach(request))
+        candidates.append((free_cells, 1))
+    for ends, number in candidates:
+        joined_to_ends = grid.reachable(ends, rule, backward=True)
+        way_out: tuple[Cell, ...] = (start,)
+        if not grid.is_free(start):
+            way_out = _way_out(request, joined_to_ends)
+        if way_out and joined_to_ends[way_out[-1][1], way_out[-1][0]]:
+            reached = grid.reachable([way_out[-1]], rule)
+            reached_ends = ends[reached[ends[:, 1], ends[:, 0]]]
+            return way_out, tuple((x, y) for x, y in reached_ends[:number].tolist())
+    return (), goals
+
+
+def can_leave(request: PlanRequest) -> bool:
+    """Return whether a start that is not free has a way out to any free cell."""
+    return bool(_way_out(request, ~request.grid.occupancy))
+
+
+def obstacles_in_the_way(grid: GridMap, start: Cell, clearing_radius: float) -> Occupancy:
+    """Return (H, W) bool: the obstacles through which no way out of a start leads.
+
+    The robot is on its start, so an obstacle there is none: it and those within the radius do not
+    count. Beside a start that is no obstacle itself, all count.
+    """
+    obstacles = grid.occupancy if grid.obstacles is None else grid.obstacles
+    if clearing_radius > 0 and grid.is_obstacle(start):
+        x, y = _near(obstacles, start, clearing_radius * ROUNDING).T
+        obstacles = obstacles.copy()
+        obstacles[y, x] = False
+    return obstacles
+
+
+def _way_out(request: PlanRequest, ends: NDArray[np.bool_]) -> tuple[Cell, ...]:
+    """Return the shortest way from a start that is not free to one of some free cells."""
+    grid, rule, (goal_x, goal_y) = request.grid, request.move_rule, request.goal
+    obstacles = obstacles_in_the_way(grid, request.start, request.start_clearing_radius)
+    legal = legal_moves(~ends & (obstacles | ~grid.occupancy), rule, grid.forbidden)
+    everywhere_1 = np.ones(ends.shape, np.float32)
+    y, x = np.ogrid[: grid.height, : grid.width]
+    value = (-NEARER_TO_GOAL * np.hypot(x - goal_x, y - goal_y)).astype(np.float32)
+    return search(request.start, ends, legal, everywhere_1, rule, value)
+
+
+def _near(cells: NDArray[np.bool_], centre: Cell, distance: float) -> NDArray[np.int64]:
+    """Return the cells of a mask within a distance of a cell, the nearest first: (N, 2) int64."""
+    side = int(min(distance, max(cells.shape)))
+    left, bottom = max(centre[0] - side, 0), max(centre[1] - side, 0)
+    near = cells[bottom : centre[1] + side + 1, left : centre[0] + side + 1]
+    found: NDArray[np.int64] = np.argwhere(near)[:, ::-1] + (left, bottom)
+    distances = np.hypot(*(found - centre).T)
+    order = np.argsort(distances, kind="stable")
+    return found[order[: np.count_nonzero(distances <= distance)]]
+
+
+# The path under way
+
+
+def legal_segments(path: Cells, grid: GridMap, move_rule: MoveRule | str) -> NDArray[np.bool_]:
+    """Return which segments of a path are legal on a map: (N - 1,) bool.
+
+    A segment is a move, or joins two cells of a simplified path, see `simplify`. If it is legal,
+    both its cells are free.
+    """
+    rule, cells = MoveRule(move_rule), _array(path)
+    inside = ((cells >= 0) & (cells < (grid.width, grid.height))).all(axis=1)
+    free = inside.copy()
+    free[inside] = ~grid.occupancy[cells[inside, 1], cells[inside, 0]]
+    legal: NDArray[np.bool_] = free[:-1] & free[1:]
+    sides = np.abs(np.diff(cells, axis=0))
+    if not rule.cuts_corners:
+        diagonal = np.flatnonzero(legal & (sides == 1).all(axis=1))
+        (x, y), (next_x, next_y) = cells[diagonal].T, cells[diagonal + 1].T
+        legal[diagonal] = ~(grid.occupancy[y, next_x] | grid.occupancy[next_y, x])
+    if grid.forbidden is not None:
+        moves = np.flatnonzero(legal & (sides.max(axis=1) == 1))
+        (x, y), (dx, dy) = cells[moves].T, (cells[moves + 1] - cells[moves]).T
+        actions = np.rint(np.arctan2(dy, dx) / (np.pi / 4)).astype(np.int64) % len(MOVES)
+        legal[moves] = (grid.forbidden[y, x] >> actions & 1) == 0
+    for index in np.flatnonzero(legal & (sides.max(axis=1) > 1)).tolist():
+        first, last = cells[index : index + 2].tolist()
+        legal[index] = is_legal_segment(first, last, grid, rule)
+    return legal
+
+
+def is_path_valid(
+    path: Cells,
+    robot: Cell,
+    grid: GridMap,
+    move_rule: MoveRule | str,
+    start_clearing_radius: float = 0.0,
+) -> bool:
+    """Return whether all of a path from its cell nearest to the robot on is free and legal.
+
+    A robot whose cell is not free may leave, see `PlanRequest.start_clearing_radius`. The path may
+    be simplified, or come from another planner. An empty one is not valid.
+    """
+    cells = _array(path)
+    if not len(cells):
+        return False
+    rest = cells[np.hypot(*(cells - np.array(robot, dtype=np.float64)).T).argmin() :]
+    if grid.contains(robot) and not grid.is_free(robot):
+        out = next((index for index, (x, y) in enumerate(rest) if grid.is_free((x, y))), len(rest))
+        obstacles = obstacles_in_the_way(grid, robot, start_clearing_radius)
+        leaving = GridMap(obstacles, forbidden=grid.forbidden)
+        if not legal_segments(rest[: out + 1], leaving, move_rule).all():
+            return False
+        rest = rest[out:]
+    return len(rest) > 0 and _legal_from(rest, grid, move_rule) == 0
+
+
+def rest_of_path(
+    path: Cells, robot: Cell, grid: GridMap, move_rule: MoveRule | str
+) -> NDArray[np.int32]:
+    """Return what is left of a path for a robot, from its cell on: (N, 2); empty if it is lost.
+
+    The robot may be up to `REACH` cells beside the path: then straight moves lead back to the
+    nearest cell of it that can be reached so. The path is lost if the robot is farther away, or if
+    a move of the rest is not legal any more.
+    """
+    cells = _array(path)
+    if not len(cells) or not grid.is_free(robot):
+        return cells[:0]
+    first = _legal_from(cells, grid, move_rule)
+    distances = np.abs(cells - robot).max(axis=1)
+    near = first + np.flatnonzero(distances[first:] <= REACH)
+    # The nearest first, and of those the farthest along the path.
+    for index in near[np.lexsort((-near, distances[near]))].tolist():
+        way = _straight_moves(robot, cells[index])
+        if legal_segments(way, grid, move_rule).all():
+            return np.concatenate([way[:-1], cells[index:]], dtype=np.int32)
+    return cells[:0]
+
+
+def keep_or_switch(
+    under_way: Cells,
+    new: Cells,
+    grid: GridMap,
+    move_rule: MoveRule | str,
+    threshold: float,
+    goals: Sequence[Cell] = (),
+) -> tuple[NDArray[np.int32], float | None]:
+    """Return what is left of the path under way if it is good enough, otherwise the new path.
+
+    Both are judged move by move on the map of now. The rest may cost more than the new path by the
+    threshold, as a share, and end at the new path's end or at one of some other goals. Return too
+    how much more it costs, as a share, if it is kept; None for another path.
+    """
+    best = _array(new)
+    x, y = best[0].tolist()
+    rest = rest_of_path(under_way, (x, y), grid, move_rule)
+    if not len(rest) or rest[-1].tolist() not in [best[-1].tolist(), *map(list, goals)]:
+        return best, None
+    if np.array_equal(rest, best):
+        return best, 0.0
+    cost, best_cost = _cost(rest, grid, move_rule), _cost(best, grid, move_rule)
+    if cost > (1 + threshold) * best_cost * SAME_COST:
+        return best, None
+    return rest, cost / best_cost - 1
+
+
+def _legal_from(cells: NDArray[np.int32], grid: GridMap, move_rule: MoveRule | str) -> int:
+    """Return the first cell of a path from which on all of it is legal; N if its end is not."""
+    # As a segment of no length the last cell has to be free too.
+    legal = legal_segments(np.concatenate([cells, cells[-1:]]), grid, move_rule)
+    return int(np.flatnonzero(~legal).max(initial=-1)) + 1
+
+
+def _array(path: Cells) -> NDArray[np.int32]:
+    return np.asarray(path, dtype=np.int32).reshape(-1, 2)
+
+
+def _cost(path: NDArray[np.int32], grid: GridMap, move_rule: MoveRule | str) -> float:
+    if not grid.has_costs:
+        return path_length(path, move_rule)
+    return path_cost(path, grid.cost_multiplier, move_rule)
+
+
+def _straight_moves(first: Cell, last: NDArray[np.int32]) -> NDArray[np.int32]:
+    """Return the cells of the fewest moves between two cells, the diagonal ones first."""
+    cell = np.array(first, dtype=np.int32)
+    vector = last - cell
+    steps = np.arange(np.abs(vector).max() + 1, dtype=np.int32)[:, None]
+    moves: NDArray[np.int32] = cell + np.sign(vector) * np.minimum(steps, np.abs(vector))
+    return moves
+
+
+# Simplification
+
+
+def simplify(cells: Cells, grid: GridMap, move_rule: MoveRule | str) -> tuple[Cell, ...]:
+    """Return some of a path's cells, the first and the last included, joined by legal segments.
+
+    A segment is legal if all cells that it passes through are free; under `MoveRule.ROBOT_SAFE`
+    also those that it touches at a corner. None of them except the last may forbid one of the two
+    actions between whose directions it lies. It must not cost more than the part of the path that
+    it replaces, so that the path keeps away from cells of high cost. The length of each segment is
+    found by doubling and halving.
+
+    Parameters
+    ----------
+    cells : sequence of (x, y)
+        Each cell is a neighbour of the one before it.
+    grid : GridMap
+    move_rule : MoveRule
+
+    Raises
+    ------
+    ValueError
+        If a cell is no cell of the map, or there is no such move rule.
+    """
+    check_grid(grid)
+    rule, multiplier = MoveRule(move_rule), grid.cost_multiplier
+    path = [(x, y) for x, y in cells_inside(cells, grid.occupancy.shape).tolist()]
+
+    def joins(first: int, last: int) -> bool:
+        if last - first == 1:  # a move of the path itself
+            return True
+        if not is_legal_segment(path[first], path[last], grid, rule):
+            return False
+        cost = segment_cost(path[first], path[last], multiplier, rule)
+        return cost <= SAME_COST * path_cost(path[first : last + 1], multiplier, rule)
+
+    kept, last = [0] if path else [], len(path) - 1
+    while kept and kept[-1] < last:
+        first, step, reached = kept[-1], 1, kept[-1] + 1
+        while reached < last and joins(first, min(reached + step, last)):
+            reached, step = min(reached + step, last), 2 * step
+        while step > 1:
+            step //= 2
+            if reached + step <= last and joins(first, reached + step):
+                reached += step
+        kept.append(reached)
+    return tuple(path[index] for index in kept)
+
+
+def touched_cells(first: Cell, last: Cell, move_rule: MoveRule | str) -> NDArray[np.int64]:
+    """Return the cells that a segment between two cells' centres passes through: (N, 2) int64.
+
+    Unless the rule cuts corners, cells that it touches at a corner count too. Some cells are
+    repeated.
+    """
+    passed, _ = _passed_cells(first, last)
+    if MoveRule(move_rule).cuts_corners:
+        return passed
+    # Between two cells that share only a corner, two more are touched; else the same two again.
+    (x, y), (next_x, next_y) = passed[:-1].T, passed[1:].T
+    return np.concatenate([passed, np.stack([x, next_y], 1), np.stack([next_x, y], 1)])
+
+
+def is_legal_segment(first: Cell, last: Cell, grid: GridMap, move_rule: MoveRule | str) -> bool:
+    """Return whether a segment between two cells of a map is legal, see `simplify`."""
+    x, y = touched_cells(first, last, move_rule).T
+    if grid.occupancy[y, x].any():
+        return False
+    if grid.forbidden is None:
+        return True
+    vector = np.subtract(last, first)
+    moves = [np.sign(vector)]  # as many diagonal ones as it has room for, and straight ones
+    if abs(vector[0]) != abs(vector[1]):
+        moves.append(np.where(np.abs(vector) == np.abs(vector).max(), moves[0], 0))
+    x, y = _passed_cells(first, last)[0][:-1].T
+    return not any(
+        (grid.forbidden[y, x] >> action & 1).any()
+        for move in moves
+        for action in np.flatnonzero((move == MOVES).all(axis=1))
+    )
+
+
+def segment_cost(
+    first: Cell, last: Cell, multiplier: NDArray[np.float32], move_rule: MoveRule | str
+) -> float:
+    """Return what the segment between two cells' centres costs, as `path_cost` for a path.
+
+    Each cell's cost multiplier is weighted by the share of the segment within that cell, as half of
+    a move lies in each of its two cells.
+    """
+    passed, share = _passed_cells(first, last)
+    vector = np.subtract(last, first)
+    length = segment_lengths(vector[:1], vector[1:], move_rule).item()
+    return length * float(share @ multiplier[passed[:, 1], passed[:, 0]].astype(np.float64))
+
+
+def _passed_cells(first: Cell, last: Cell) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    """Return the cells of a segment in order, (N, 2), and the share within each, (N,) float64."""
+    vector = np.subtract(last, first)
+    width, height = np.maximum(np.abs(vector), 1).tolist()
+    # Positions on the segment count from 0 at its first point to `unit` at its last one: then all
+    # crossings of edges of cells are whole numbers.
+    unit = 2 * width * height
+    columns, rows = (np.arange(1, 2 * abs(side), 2) for side in vector.tolist())
+    crossings = np.unique(np.concatenate([[0, unit], height * columns, width * rows]))
+    middle = crossings[:-1] + crossings[1:]  # twice the middle of each part
+    cells = np.asarray(first) + (middle[:, None] * vector + unit) // (2 * unit)
+    return cells, np.diff(crossings) / unit

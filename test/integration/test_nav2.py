@@ -1,0 +1,493 @@
+"""Nav2's actions: what decides in them without Nav2's types, and the real ones where installed."""
+
+from __future__ import annotations
+
+import inspect
+import sys
+import threading
+from collections.abc import Callable, Coroutine, Iterator
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, cast
+
+import numpy as np
+import pytest
+import rclpy
+from client import map_message, pose, wait_for
+from geometry_msgs.msg import PoseStamped
+from integration.robot import GOAL, NUMBERS, START, Robot, check_path, points_of
+from integration.test_lifecycle import Manager
+from integration.test_startup import load_gate as load_gate
+from nav_msgs.msg import Path as PathMessage
+from rclpy.action.client import ActionClient
+from rclpy.action.server import ActionServer, CancelResponse, GoalResponse
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.parameter import Parameter
+from rclpy.task import Future
+from rclpy.utilities import try_shutdown
+
+from ddqn_planner.grid import GridMap
+from ddqn_planner.nodes import nav2
+from ddqn_planner.nodes.nav2 import PREEMPTED, PathAction, error_code
+from ddqn_planner.nodes.planner_node import PlannerNode
+from ddqn_planner.nodes.report import NOT_ACTIVE, Outcome, RequestError
+from ddqn_planner.nodes.requests import check_request
+from ddqn_planner.nodes.runtime import SERVICE_QUALITY, Unless
+from ddqn_planner.planning import Plan, PlanStatus
+
+FOUND = Outcome("SUCCEEDED", "a path", plan=Plan(PlanStatus.SUCCEEDED, ((0, 0),)))
+NO_PATH = Outcome("NO_PATH", "no path leads there")
+
+CODES = {
+    "UNKNOWN": ["FAILED", "NO_MODEL", "NOT_ACTIVE", "MAP_SIZE_UNSUPPORTED", "PREEMPTED"],
+    "INVALID_PLANNER": ["INVALID_PLANNER"],
+    "TF_ERROR": ["NO_START", "TF_ERROR", "INVALID_START", "INVALID_GOAL"],
+    "START_OUTSIDE_MAP": ["START_OUTSIDE_MAP"],
+    "GOAL_OUTSIDE_MAP": ["GOAL_OUTSIDE_MAP"],
+    "START_OCCUPIED": ["START_OCCUPIED"],
+    "GOAL_OCCUPIED": ["GOAL_OCCUPIED"],
+    "TIMEOUT": ["NO_MAP", "MAP_TIMEOUT"],
+    "NO_VALID_PATH": ["NO_PATH", "ROLLOUT_TRAPPED"],
+    "NO_VIAPOINTS_GIVEN": ["NO_GOALS"],
+}
+"""Nav2's codes in the order of their numbers, each with the statuses that have it."""
+
+
+class Result(SimpleNamespace):
+    """What the Result of Nav2's action through poses has."""
+
+    UNKNOWN, INVALID_PLANNER, TF_ERROR, START_OUTSIDE_MAP, GOAL_OUTSIDE_MAP = range(300, 305)
+    START_OCCUPIED, GOAL_OCCUPIED, TIMEOUT, NO_VALID_PATH, NO_VIAPOINTS_GIVEN = range(305, 310)
+    error_msg = ""
+
+
+@pytest.mark.parametrize("name", ["", "ComputePathToPose", "ComputePathThroughPoses"])
+def test_codes_are_nav2s(name: str) -> None:
+    result: Any = Result
+    if name:
+        actions = pytest.importorskip("nav2_msgs.action", reason="nav2_msgs is not on PyPI")
+        result = getattr(actions, name).Result
+    for number, (code, statuses) in enumerate(CODES.items()):
+        if hasattr(result, code):
+            assert getattr(result, code) == result.UNKNOWN + number
+            assert {error_code(status, result) for status in statuses} == {result.UNKNOWN + number}
+    assert [error_code(status, result) for status in ("SUCCEEDED", "CANCELED")] == [0, 0]
+
+
+@pytest.mark.parametrize("name", ["", "GridBased"])
+def test_the_planner_is_named_by_its_id_or_not_at_all(name: str) -> None:
+    check_request([1], name, "GridBased")
+    with pytest.raises(RequestError, match="no planner 'Smac'; give 'GridBased' or ''") as error:
+        check_request([1], "Smac", "GridBased")
+    assert error.value.status == "INVALID_PLANNER"
+    with pytest.raises(RequestError, match="no goal; give one or more") as error:
+        check_request([], name, "GridBased")
+    assert error.value.status == "NO_GOALS"
+
+
+class Handle:
+    """What rclpy's handle of a goal has, with the transitions that it allows."""
+
+    def __init__(self, number: int, goals: int | None = None, use_start: bool = True) -> None:
+        self.goal_id = SimpleNamespace(uuid=[number] * 16)
+        start, goal = (PoseStamped() for _ in range(2))
+        named = {"goal": goal} if goals is None else {"goals": [goal] * goals}
+        self.request = SimpleNamespace(start=start, use_start=use_start, planner_id="", **named)
+        self.state = "accepted"
+
+    @property
+    def is_cancel_requested(self) -> bool:
+        return self.state == "canceling"
+
+    def execute(self) -> None:
+        if self.state != "canceling":
+            self.state = "executing"
+
+    def succeed(self) -> None:
+        assert self.state in ("executing", "canceling")
+        self.state = "succeeded"
+
+    def abort(self) -> None:
+        assert self.state in ("executing", "canceling")
+        self.state = "aborted"
+
+    def canceled(self) -> None:
+        assert self.state == "canceling"
+        self.state = "canceled"
+
+
+class Server:
+    """An action whose plans are there when the test says so."""
+
+    def __init__(self) -> None:
+        self.is_active = True
+        self.asked: list[tuple[Any, Any]] = []
+        self.planned, self.stopped = Future(), Future()
+        self.action = PathAction(Result, lambda: self.is_active, self.plan)
+
+    async def plan(
+        self, start: PoseStamped | None, goals: list[PoseStamped], name: str, given_up: Future
+    ) -> tuple[PathMessage, Outcome]:
+        self.asked.append((start, goals))
+
+        async def planning() -> Any:
+            return await self.planned
+
+        return PathMessage(), await Unless(planning(), self.stopped, given_up)
+
+    def begin(self, handle: Handle) -> Coroutine[Any, Any, Any]:
+        """Accept a goal, and let it wait for its plan."""
+        assert self.action.accept(handle.request) is GoalResponse.ACCEPT
+        self.action.begin(handle)
+        execution = self.action.execute(handle)
+        execution.send(None)
+        return execution
+
+    def cancel(self, handle: Handle) -> None:
+        assert self.action.cancel(handle) is CancelResponse.ACCEPT
+        handle.state = "canceling"
+
+
+def end(execution: Coroutine[Any, Any, Any]) -> Any:
+    """Resume an execution once, and return its result."""
+    with pytest.raises(StopIteration) as ended:
+        execution.send(None)
+    return ended.value.value
+
+
+@pytest.mark.parametrize(
+    ("outcome", "state", "code"), [(FOUND, "succeeded", 0), (NO_PATH, "aborted", 308)]
+)
+def test_a_goal_ends_with_its_outcome(outcome: Outcome, state: str, code: int) -> None:
+    server, handle = Server(), Handle(1)
+    execution = server.begin(handle)
+    server.planned.set_result(outcome)
+    result = end(execution)
+    assert (handle.state, result.error_code) == (state, code)
+    assert result.error_msg == ("" if code == 0 else "no path leads there")
+    assert result.planning_time.sec == 0
+    assert result.planning_time.nanosec > 0
+
+
+def test_the_start_and_the_goals_are_those_of_the_request() -> None:
+    server = Server()
+    first, second = Handle(1, use_start=False), Handle(2, goals=3)
+    executions = [server.begin(handle) for handle in (first, second)]
+    request = second.request
+    assert server.asked == [(None, [first.request.goal]), (request.start, request.goals)]
+    for execution in executions:
+        execution.close()
+
+
+def test_the_newest_goal_preempts_the_one_under_way() -> None:
+    server, first, second = Server(), Handle(1), Handle(2)
+    executions = [server.begin(first), server.begin(second)]
+    result = end(executions[0])
+    assert (first.state, result.error_code, result.error_msg) == (
+        "aborted",
+        Result.UNKNOWN,
+        PREEMPTED.reason,
+    )
+    assert second.state == "executing"
+    server.planned.set_result(FOUND)
+    end(executions[1])
+    assert second.state == "succeeded"
+
+
+def test_a_goal_is_canceled_while_it_is_planned() -> None:
+    server, handle = Server(), Handle(1)
+    execution = server.begin(handle)
+    server.cancel(handle)
+    result = end(execution)
+    assert (handle.state, result.error_code) == ("canceled", 0)
+    assert result.error_msg == ""
+    server.cancel(handle)  # too late: nothing to give up
+
+
+def test_a_goal_is_canceled_before_it_is_executed() -> None:
+    server, handle = Server(), Handle(1)
+    server.action.begin(handle)
+    server.cancel(handle)
+    assert end(server.action.execute(handle)).error_code == 0
+    assert handle.state == "canceled"
+
+
+def test_a_goal_that_is_preempted_and_canceled_is_canceled() -> None:
+    server, first, second = Server(), Handle(1), Handle(2)
+    execution, other = server.begin(first), server.begin(second)
+    server.cancel(first)
+    end(execution)
+    other.close()
+    assert (first.state, second.state) == ("canceled", "executing")
+
+
+def test_goals_are_rejected_while_the_node_is_not_active_and_aborted_when_it_stops() -> None:
+    server, handle = Server(), Handle(1)
+    execution = server.begin(handle)
+    server.stopped.set_result(NOT_ACTIVE)
+    server.is_active = False
+    result = end(execution)
+    assert (handle.state, result.error_code) == ("aborted", Result.UNKNOWN)
+    assert server.action.accept(handle.request) is GoalResponse.REJECT
+
+
+def test_the_services_of_actions_have_the_queues_of_the_others(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    kind = SimpleNamespace(Result=Result)
+    types = {"ComputePathThroughPoses": kind, "ComputePathToPose": kind, "IsPathValid": None}
+    for module in ("nav2_msgs", "nav2_msgs.action", "nav2_msgs.srv"):
+        monkeypatch.setitem(sys.modules, module, SimpleNamespace(**types))
+    made: list[inspect.BoundArguments] = []
+    signature = inspect.signature(ActionServer)
+    record = lambda *given, **named: made.append(signature.bind(*given, **named))  # noqa: E731
+    monkeypatch.setattr(nav2, "ActionServer", record)
+    node = SimpleNamespace(create_service=lambda *given, **named: None)
+    nav2.serve_nav2(cast("Any", node), bool, cast("Any", None), print)
+    depths = [
+        made[n].arguments[f"{which}_service_qos_profile"].depth
+        for n in range(2)
+        for which in ("goal", "cancel", "result")
+    ]
+    assert depths == 6 * [SERVICE_QUALITY.depth]
+
+
+def test_a_path_to_one_goal_is_kept_while_it_is_nearly_as_good_as_a_new_one() -> None:
+    """The node is asked as its actions ask it, which need nav2_msgs."""
+    parameters = "use_map_costs:=true", "field_cache_bytes:=0"
+    rclpy.init(args=["--ros-args", *(word for it in parameters for word in ("-p", it))])
+    node, executor = PlannerNode(), SingleThreadedExecutor()
+    try:
+        executor.add_node(node)
+        values = np.zeros((11, 30), dtype=np.int8)
+        values[3:8, 4:26] = 100
+        grid = GridMap(values > 0)
+        ends = pose(grid, (0, 5)), pose(grid, (29, 5))
+
+        def plan(dear: slice, threshold: float) -> tuple[bool, str]:
+            """Return whether the path leads above the block, where one way costs a little more."""
+            node.set_parameters([Parameter("switch_threshold", value=threshold)])
+            costs = values.copy()
+            costs[dear, 10:20] = 2
+            node._map._take(map_message(costs, grid, next(NUMBERS)))
+            asked = ends[0], [ends[1]], "", Future()
+            answer = executor.create_task(node._plan_for_action(*asked))
+            executor.spin_until_future_complete(answer, 60)
+            path, outcome = answer.result()
+            return max(stamped.pose.position.y for stamped in path.poses) > 8, outcome.reason
+
+        below, above = slice(0, 3), slice(8, 11)
+        assert plan(below, 0.05)[0]
+        leads_above, reason = plan(above, 0.05)
+        assert leads_above
+        assert "kept: its cost is +" in reason
+        assert not plan(above, 0.0)[0]
+        assert not plan(below, 0.05)[0]
+        assert node._model.planner is not None
+        assert node._model.planner.cache_bytes == 0  # what the node was started with holds
+    finally:
+        node.destroy_node()
+        try_shutdown()
+
+
+# With the real types
+
+REASON = "nav2_msgs is not on PyPI"
+
+SUCCEEDED, CANCELED, ABORTED = 4, 5, 6
+"""The states of action_msgs/msg/GoalStatus."""
+
+
+class Navigator:
+    """What Nav2's behaviour tree does with the planner's actions."""
+
+    def __init__(self, robot: Robot) -> None:
+        self.actions = pytest.importorskip("nav2_msgs.action", reason=REASON)
+        self.services = pytest.importorskip("nav2_msgs.srv", reason=REASON)
+        self.robot, node = robot, robot.client.node
+        to_pose, through = self.actions.ComputePathToPose, self.actions.ComputePathThroughPoses
+        self.pose = ActionClient(node, to_pose, "compute_path_to_pose")
+        self.poses = ActionClient(node, through, "compute_path_through_poses")
+        self.validity = node.create_client(self.services.IsPathValid, "is_path_valid")
+        for client in (self.pose, self.poses):
+            wait_for("an action", client.server_is_ready)
+        wait_for("is_path_valid", self.validity.service_is_ready)
+        robot.client.wait_for_discovery("planner")
+
+    def ask(self, function: Callable[..., Any], *arguments: object) -> Any:
+        """Return the future of a request that the client's own thread sends.
+
+        rclpy's action client ignores an answer that comes before the request is noted.
+        """
+        return done(self.robot.client._executor.create_task(function, *arguments))
+
+    def send(self, goal: PoseStamped | list[PoseStamped], **fields: Any) -> Any:
+        """Send a goal, and return its handle."""
+        if isinstance(goal, list):
+            request = self.actions.ComputePathThroughPoses.Goal(goals=goal, **fields)
+            return done(self.ask(self.poses.send_goal_async, request))
+        request = self.actions.ComputePathToPose.Goal(goal=goal, **fields)
+        return done(self.ask(self.pose.send_goal_async, request))
+
+    def plan(self, goal: PoseStamped | list[PoseStamped], **fields: Any) -> Any:
+        """Return the answer of a goal that is accepted."""
+        handle = self.send(goal, **fields)
+        assert handle.accepted
+        return done(self.ask(handle.get_result_async))
+
+
+def done(future: Any, timeout: float = 60.0) -> Any:
+    ready = threading.Event()
+    future.add_done_callback(lambda _: ready.set())
+    assert ready.wait(timeout)
+    return future.result()
+
+
+@pytest.fixture(scope="module")
+def of_any_map(
+    run_node: Any, make_client: Callable[[str], Any], small_values: np.ndarray, model: Path
+) -> Iterator[Navigator]:
+    pytest.importorskip("nav2_msgs.action", reason=REASON)
+    with run_node("planner_node", {}, namespace="/nav2"):
+        robot = Robot(make_client("/nav2"), small_values, model, "/nav2/planner")
+        yield Navigator(robot)
+
+
+@pytest.fixture
+def navigator(of_any_map: Navigator) -> Navigator:
+    of_any_map.robot.begin()
+    return of_any_map
+
+
+def test_a_path_to_a_pose(navigator: Navigator) -> None:
+    robot = navigator.robot
+    answer = navigator.plan(robot.pose(GOAL), start=robot.pose(START), use_start=True)
+    result = answer.result
+    assert (answer.status, result.error_code) == (SUCCEEDED, 0)
+    check_path(result.path, robot.grid)
+    assert 0 < result.planning_time.sec + result.planning_time.nanosec / 1e9 < 60
+    expected = robot.get_plan(robot.pose(START), robot.pose(GOAL))
+    assert points_of(result.path) == points_of(expected)
+    published = robot.plans.wait(lambda path: path.header.stamp == result.path.header.stamp)
+    assert published == result.path
+    known_start = navigator.plan(robot.pose(GOAL), planner_id="GridBased").result
+    assert points_of(known_start.path) == points_of(expected)
+
+
+def test_a_path_through_poses(navigator: Navigator) -> None:
+    robot = navigator.robot
+    goals = [robot.pose(cell) for cell in ((5, 0), (5, 0), (0, 5), GOAL)]
+    answer = navigator.plan(goals, start=robot.pose(START), use_start=True)
+    path = answer.result.path
+    assert (answer.status, answer.result.error_code) == (SUCCEEDED, 0)
+    check_path(path, robot.grid)
+    cells = [robot.grid.world_to_cell(*point) for point in points_of(path)]
+    assert (cells[0], cells[-1]) == (START, GOAL)
+    assert cells.index((5, 0)) < cells.index((0, 5))
+
+
+def test_each_cause_has_its_code(navigator: Navigator) -> None:
+    robot, client = navigator.robot, navigator.robot.client
+    start, goal, blocked = (robot.pose(cell) for cell in (START, GOAL, (1, 1)))
+    outside, other_frame = robot.pose((99, 0)), robot.pose(GOAL)
+    other_frame.header.frame_id = "no_such_frame"
+    walled = robot.values.copy()
+    walled[:, 3] = 100
+    causes: list[tuple[str, dict[str, Any]]] = [
+        ("INVALID_PLANNER", {"goal": goal, "start": start, "planner_id": "Smac"}),
+        ("START_OUTSIDE_MAP", {"goal": goal, "start": outside}),
+        ("GOAL_OUTSIDE_MAP", {"goal": outside, "start": start}),
+        ("START_OCCUPIED", {"goal": goal, "start": blocked}),
+        ("GOAL_OCCUPIED", {"goal": blocked, "start": start}),
+        ("TF_ERROR", {"goal": other_frame, "start": start}),
+        ("TF_ERROR", {"goal": goal, "start": other_frame}),
+    ]
+
+    def assert_code(name: str, fields: dict[str, Any]) -> None:
+        answer = navigator.plan(**fields, use_start=True)
+        code = getattr(navigator.actions.ComputePathToPose.Result, name)
+        assert (answer.status, answer.result.error_code) == (ABORTED, code)
+        assert answer.result.error_msg
+        assert answer.result.path.poses == []
+        through = navigator.plan([fields.pop("goal")], **fields, use_start=True).result
+        assert through.error_code == getattr(navigator.actions.ComputePathThroughPoses.Result, name)
+
+    assert client.set_parameters("planner", start_clearing_radius=0.0)[0].successful
+    for name, fields in causes:
+        assert_code(name, fields)
+    assert client.set_parameters("planner", start_clearing_radius=-1.0)[0].successful
+    none = navigator.plan([], start=start, use_start=True).result
+    assert none.error_code == navigator.actions.ComputePathThroughPoses.Result.NO_VIAPOINTS_GIVEN
+    robot.set_map(robot.stamped_map(walled))
+    assert_code("NO_VALID_PATH", {"goal": goal, "start": start})
+    second = navigator.plan([robot.pose((0, 5)), goal], start=start, use_start=True).result
+    assert second.error_msg.startswith("goal 2 of 2: no path leads from the start to the goal")
+    assert client.set_parameters("planner", planner_id="Smac")[0].successful
+    assert_code("NO_VALID_PATH", {"goal": goal, "start": start, "planner_id": "Smac"})
+    assert client.set_parameters("planner", planner_id="GridBased")[0].successful
+
+
+def test_a_path_is_valid_while_it_is_free(navigator: Navigator) -> None:
+    robot = navigator.robot
+
+    def is_valid(path: PathMessage) -> bool:
+        request = navigator.services.IsPathValid.Request(path=path)
+        answer: bool = done(navigator.validity.call_async(request)).is_valid
+        return answer
+
+    path = robot.get_plan(robot.pose(START), robot.pose(GOAL))
+    assert is_valid(path)
+    assert not is_valid(PathMessage(header=path.header))
+    x, y = robot.grid.world_to_cell(*points_of(path)[2])
+    blocked = robot.values.copy()
+    blocked[y, x] = 100
+    robot.set_map(robot.stamped_map(blocked))
+    assert not is_valid(path)
+    x, y = robot.grid.world_to_cell(*points_of(path)[4])
+    robot.send_start(robot.pose((x, y)))
+    wait_for("what is behind the robot not to count", lambda: is_valid(path))
+    blocked[y, x] = 100
+    robot.set_map(robot.stamped_map(blocked))
+    assert is_valid(path)  # the robot's own cell does not count
+    path.header.frame_id = "no_such_frame"
+    assert not is_valid(path)
+
+
+def test_goals_that_wait_are_canceled_preempted_and_stopped(
+    run_node: Any,
+    make_client: Callable[[str], Any],
+    small_values: np.ndarray,
+    model: Path,
+    load_gate: Path,
+) -> None:
+    pytest.importorskip("nav2_msgs.action", reason=REASON)
+    # Plans wait for the planner's model, as they wait for a field.
+    with run_node("planner_node", {}, namespace="/waiting") as node:
+        robot = Robot(make_client("/waiting"), small_values, model, "/waiting/planner")
+        robot.set_map(robot.stamped_map())
+        node.wait_for_log("a model waits")
+        waiting, manager = Navigator(robot), Manager(robot)
+        goal, fields = robot.pose(GOAL), {"start": robot.pose(START), "use_start": True}
+
+        canceled = waiting.send([goal], **fields)
+        result = waiting.ask(canceled.get_result_async)
+        assert len(done(waiting.ask(canceled.cancel_goal_async)).goals_canceling) == 1
+        assert done(result).status == CANCELED
+
+        first, second = (waiting.send(goal, **fields) for _ in range(2))
+        answer = done(waiting.ask(first.get_result_async))
+        assert (answer.status, answer.result.error_code) == (ABORTED, 200)
+        assert answer.result.error_msg == "a newer goal of the same action came"
+
+        assert manager.change("deactivate")
+        answer = done(waiting.ask(second.get_result_async))
+        assert (answer.status, answer.result.error_code) == (ABORTED, 200)
+        assert not waiting.send(goal, **fields).accepted
+
+        load_gate.touch()
+        assert manager.change("activate")
+        answer = waiting.plan(goal, **fields)
+        assert answer.status == SUCCEEDED
+        check_path(answer.result.path, robot.grid)
+        assert manager.change("deactivate")
+        assert manager.change("cleanup")
