@@ -1,4 +1,4 @@
-"""When the planner plans for the active goal again, and what it publishes then."""
+"""When the planner plans for the active goal again, and which of several goals it leads to."""
 
 from __future__ import annotations
 
@@ -9,12 +9,14 @@ from typing import Any
 import numpy as np
 import pytest
 from builtin_interfaces.msg import Time
-from client import cells_of, map_message
+from client import cell_of, cells_of, map_message
+from geometry_msgs.msg import PoseArray
 from integration.robot import NUMBERS, Robot, check_path
 from nav_msgs.msg import OccupancyGrid, Odometry, Path
 from std_msgs.msg import Header
 
 from ddqn_planner.grid import Cell
+from ddqn_planner.nodes.poses import has_tf
 from ddqn_planner.nodes.report import seconds
 from ddqn_planner.nodes.runtime import LATCHED
 
@@ -200,3 +202,124 @@ def test_the_path_of_a_moving_robot_is_published_only_where_it_leaves_it(robot: 
     x, y = path[10]
     robot.client.publish("odom", odometry(robot, (x, y - 8)))
     robot.wait_for_path((x, y - 8), GOAL)
+
+
+# The nearest of several goals, as docks are
+
+LEFT, RIGHT = (1, 5), (29, 5)
+DOCKED = (14, 5)
+OUTSIDE, WALL = (99, 5), (15, 10)
+YAWS = {LEFT: 1.0, RIGHT: -2.0, OUTSIDE: 0.1, WALL: 0.2}
+
+
+@pytest.fixture
+def docks(hall_robot: Robot, make_client: Callable[[str], Any]) -> Robot:
+    """A planner in an empty hall, of which the top row is a wall."""
+    values = np.zeros((11, 31), dtype=np.int8)
+    values[10] = 100
+    robot = Robot(make_client("/followed"), values, hall_robot.model, hall_robot.name)
+    before = {"replan_period": SOON, "switch_threshold": 0.05, "start_source": "initialpose"}
+    set_parameters(robot, **before)
+    robot.begin(DOCKED, RIGHT)
+    return robot
+
+
+def send_goals(docks: Robot, *cells: Cell, frame: str = "map") -> None:
+    poses = [docks.pose(cell, YAWS[cell]).pose for cell in cells]
+    docks.client.publish("goal_poses", PoseArray(header=Header(frame_id=frame), poses=poses))
+
+
+def wait_for_dock(docks: Robot, dock: Cell, reason: str, start: Cell = DOCKED) -> None:
+    docks.wait_for_path(start, dock, yaw=YAWS[dock])
+    docks.wait_for_reason(f"^a path of .* cells {reason}, by greedy steps")
+
+
+def test_the_path_leads_to_the_nearest_free_dock_of_the_map_of_now(docks: Robot) -> None:
+    send_goals(docks, WALL, LEFT, OUTSIDE, RIGHT)
+    wait_for_dock(docks, LEFT, "to goal 2 of 4")
+    taken = docks.values.copy()
+    taken[LEFT[::-1]] = 100
+    docks.clear()
+    docks.send_map(docks.stamped_map(taken))
+    wait_for_dock(docks, RIGHT, "to goal 4 of 4")
+    docks.clear()
+    docks.send_map(docks.stamped_map())
+    wait_for_dock(docks, LEFT, "to goal 2 of 4")
+
+
+@pytest.mark.parametrize(
+    ("threshold", "dock", "reason"),
+    [
+        (0.3, LEFT, r"to goal 1 of 2, by greedy steps, kept: its cost is \+15.4%"),
+        (0.1, RIGHT, "2 of 2"),
+    ],
+)
+def test_a_robot_between_two_docks_keeps_to_one_up_to_the_threshold(
+    docks: Robot, threshold: float, dock: Cell, reason: str
+) -> None:
+    set_parameters(docks, switch_threshold=threshold)
+    send_goals(docks, LEFT, RIGHT)
+    wait_for_dock(docks, LEFT, "to goal 1 of 2")
+    docks.clear()
+    docks.send_start(docks.pose((16, 5)))  # 15 cells from the left dock, 13 from the right one
+    docks.wait_for_path((16, 5), dock, yaw=YAWS[dock])
+    docks.wait_for_reason(reason)
+
+
+def test_goals_none_of_which_can_be_reached_have_an_empty_plan(docks: Robot) -> None:
+    send_goals(docks, WALL, OUTSIDE)
+    assert docks.plans.wait(lambda path: not path.poses).header.frame_id == "map"
+    docks.wait_for_reason(
+        r"^no path to any of 2 goals: the goal is occupied \(start: .*; goals: cells \(15, 10\), "
+        r"\(99, 5\); map: 31 x 11 cells\); set the goal on a free cell$"
+    )
+    walled = docks.values.copy()
+    walled[:, (5, 25)] = 100
+    docks.set_map(docks.stamped_map(walled))
+    send_goals(docks, WALL, LEFT, RIGHT)
+    docks.wait_for_reason(
+        "^no path to any of 3 goals: no path leads .*; set the goal where free cells lead to$"
+    )
+    docks.clear()
+    docks.send_map(docks.stamped_map())
+    wait_for_dock(docks, LEFT, "to goal 2 of 3")
+
+
+def test_a_malformed_goal_is_named(docks: Robot) -> None:
+    poses = [docks.pose(LEFT).pose, docks.pose(RIGHT).pose]
+    poses[1].orientation.w = 9.0
+    docks.client.publish("goal_poses", PoseArray(header=Header(frame_id="map"), poses=poses))
+    docks.wait_for_reason(
+        "^goal 2's orientation is .*; give one of norm 1", {"status": "INVALID_GOAL"}
+    )
+    assert docks.plans.wait(lambda path: not path.poses)
+
+
+@pytest.mark.skipif(has_tf(), reason="tf2_ros is installed")
+def test_goals_in_another_frame_are_refused_without_tf(docks: Robot) -> None:
+    send_goals(docks, LEFT, RIGHT, frame="odom")
+    docks.wait_for_reason(
+        "^goal 1's frame is 'odom', the map's is 'map'", {"status": "INVALID_GOAL"}
+    )
+
+
+def test_goals_and_a_single_goal_replace_each_other(docks: Robot) -> None:
+    send_goals(docks, LEFT, RIGHT)
+    wait_for_dock(docks, LEFT, "to goal 1 of 2")
+    docks.clear()
+    docks.send_goal(docks.pose(RIGHT, 0.5))
+    docks.wait_for_path(DOCKED, RIGHT, yaw=0.5)
+    docks.wait_for_reason("^a path of [0-9.]+ cells, by greedy steps$")
+    docks.clear()
+    send_goals(docks, RIGHT)
+    docks.wait_for_path(DOCKED, RIGHT, yaw=YAWS[RIGHT])
+    docks.wait_for_reason("^a path of [0-9.]+ cells, by greedy steps$")
+
+
+def test_an_array_without_poses_is_refused_and_the_goal_stays(docks: Robot) -> None:
+    send_goals(docks)
+    docks.wait_for_reason("; goal_poses refused: the array has no pose; give one or more")
+    assert cell_of(docks.grid, last_plan(docks).poses[-1]) == RIGHT
+    docks.clear()
+    send_goals(docks, LEFT)
+    docks.wait_for_reason("^a path of [^;]*$")

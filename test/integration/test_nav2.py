@@ -254,7 +254,8 @@ def test_the_services_of_actions_have_the_queues_of_the_others(
 
 def test_a_path_to_one_goal_is_kept_while_it_is_nearly_as_good_as_a_new_one() -> None:
     """The node is asked as its actions ask it, which need nav2_msgs."""
-    rclpy.init(args=["--ros-args", "-p", "use_map_costs:=true"])
+    parameters = "use_map_costs:=true", "field_cache_bytes:=0"
+    rclpy.init(args=["--ros-args", *(word for it in parameters for word in ("-p", it))])
     node, executor = PlannerNode(), SingleThreadedExecutor()
     try:
         executor.add_node(node)
@@ -282,6 +283,8 @@ def test_a_path_to_one_goal_is_kept_while_it_is_nearly_as_good_as_a_new_one() ->
         assert "kept: its cost is +" in reason
         assert not plan(above, 0.0)[0]
         assert not plan(below, 0.05)[0]
+        assert node._model.planner is not None
+        assert node._model.planner.cache_bytes == 0  # what the node was started with holds
     finally:
         node.destroy_node()
         try_shutdown()

@@ -1,4 +1,4 @@
-"""A robot with a body, that is somewhere, and wants more than greedy steps."""
+"""A robot with a body, that is somewhere, and goals that it can nearly reach."""
 
 from __future__ import annotations
 
@@ -12,33 +12,23 @@ from typing import Any
 
 import numpy as np
 import pytest
-from client import initial_pose, map_message, pose
-from client import wait_for_map as wait_for_stamp
-from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from diagnostic_msgs.msg import DiagnosticStatus
 from geometry_msgs.msg import PoseArray, PoseStamped, PoseWithCovarianceStamped, TransformStamped
 from integration.robot import (
     GOAL_YAW,
-    NUMBERS,
     Robot,
     check_path,
-    constant_model,
     length_of,
     points_of,
     values_of,
     yaw_of,
 )
-from nav_msgs.msg import OccupancyGrid, Odometry, Path
+from nav_msgs.msg import Odometry, Path
 from nav_msgs.srv import GetPlan
-from rcl_interfaces.msg import SetParametersResult
-from rcl_interfaces.srv import SetParametersAtomically
 from rclpy.duration import Duration
-from rclpy.parameter import Parameter
 from std_msgs.msg import Header
-from visualization_msgs.msg import Marker, MarkerArray
 
 from ddqn_planner.grid import Cell, MoveRule, clearance, inflate, shortest_distances
-from ddqn_planner.nodes.conversions import occupancy_message
-from ddqn_planner.nodes.runtime import LATCHED
 from ddqn_planner.planning.paths import touched_cells
 
 RULE = MoveRule.ROBOT_SAFE
@@ -228,41 +218,6 @@ def test_simplified_paths_have_fewer_poses_and_no_illegal_segment(robot: Robot) 
     assert yaw_of(path.poses[-1].pose.orientation) == pytest.approx(GOAL_YAW)
 
 
-# Searching
-
-
-def test_a_bad_model_plans_in_fallback_mode_and_says_that_it_searched(
-    run_node: Any,
-    make_client: Callable[[str], Any],
-    small_values: np.ndarray,
-    tmp_path: FilePath,
-) -> None:
-    path = tmp_path / "bad.safetensors"
-    constant_model(path, 6, 1)
-    grid = Robot.grid_of(small_values)
-    with run_node("planner_node", {"model": str(path)}, namespace="/bad") as node:
-        robot = Robot(make_client("/bad"), small_values, path, "/bad/planner")
-        robot.set_map(robot.stamped_map())
-        assert robot.get_plan(robot.pose((0, 0)), robot.pose((5, 5))).poses == []
-        robot.wait_for_reason("greedy steps do not find it.*or set mode to 'astar_fallback'")
-        assert robot.client.set_parameters("planner", mode="astar_fallback")[0].successful
-        for goal in grid.free_cells()[::3]:
-            distances = shortest_distances(grid, goal, RULE)
-            for start in grid.free_cells():
-                plan = robot.get_plan(robot.pose(start), robot.pose(goal))
-                assert bool(plan.poses) == bool(np.isfinite(distances[start[::-1]]))
-                check_path(plan, grid)
-        robot.get_plan(robot.pose((0, 0)), robot.pose((5, 5)))
-        status = robot.wait_for_reason("searched for in the order of the Q field")
-        assert values_of(status)["method"] == "astar_fallback"
-        assert status.level == DiagnosticStatus.OK
-        node.wait_for_log("a path of .* searched for in the order of the Q field")
-        # Of the two moves that the model knows one leads there.
-        robot.get_plan(robot.pose((2, 0)), robot.pose((0, 0)))
-        status = robot.wait_for_reason("a path of 2.00 cells, by greedy steps")
-        assert values_of(status)["method"] == "greedy"
-
-
 # Where the robot is
 
 
@@ -340,32 +295,28 @@ class TransformListener:
 """As much of tf2_ros as the node uses, which is no package of PyPI: one transform, no tree."""
 
 
-@pytest.fixture
+@pytest.fixture(scope="module")
 def transformed(
     run_node: Any,
     make_client: Callable[[str], Any],
     hall: np.ndarray,
     model: FilePath,
-    tmp_path: FilePath,
-    monkeypatch: pytest.MonkeyPatch,
-    request: pytest.FixtureRequest,
+    tmp_path_factory: pytest.TempPathFactory,
 ) -> Iterator[Robot]:
-    """Run a planner with a map that asks TF where it is, with so many times its patience."""
-    (tmp_path / "tf2_ros.py").write_text(TF2_ROS)
-    (tmp_path / "sitecustomize.py").write_text(
-        "import ddqn_planner.nodes.poses as source\n"
-        f"source.PATIENCE *= {getattr(request, 'param', 1)}\n"
+    """Run a planner with a map that asks TF where it is."""
+    folder, client = tmp_path_factory.mktemp("tf"), make_client("/transformed")
+    (folder / "tf2_ros.py").write_text(TF2_ROS)
+    (folder / "sitecustomize.py").write_text(
+        "import ddqn_planner.nodes.poses as poses\nposes.PATIENCE = 5.0  # on a loaded machine\n"
     )
-    monkeypatch.setenv("PYTHONPATH", str(tmp_path), prepend=":")
-    # A name of its own: the clients of the tests before live on, with their latched maps.
-    namespace = f"/transformed_{next(NUMBERS)}"
-    client = make_client(namespace)
-    with run_node("planner_node", {"start_source": "tf"}, namespace=namespace):
-        robot = Robot(client, hall, model, f"{namespace}/planner")
-        robot.set_map(robot.stamped_map())
-        client.publisher(TransformStamped, "tf")
-        client.wait_for_discovery("planner")
-        yield robot
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("PYTHONPATH", str(folder), prepend=":")
+        with run_node("planner_node", {"start_source": "tf"}, namespace="/transformed"):
+            robot = Robot(client, hall, model, "/transformed/planner")
+            robot.set_map(robot.stamped_map())
+            client.publisher(TransformStamped, "tf")
+            client.wait_for_discovery("planner")
+            yield robot
 
 
 def transform(robot: Robot, cell: Cell, age: float | None = None) -> TransformStamped:
@@ -380,17 +331,21 @@ def transform(robot: Robot, cell: Cell, age: float | None = None) -> TransformSt
     return message
 
 
-def test_a_goal_waits_for_the_first_transform(transformed: Robot) -> None:
+def test_a_goal_waits_for_the_first_transform_that_is_not_too_old(transformed: Robot) -> None:
     robot, client = transformed, transformed.client
     robot.send_goal(robot.pose((19, 14)))
     robot.wait_for_reason("no transform leads from 'base_link' to 'map' .*publish one, or set")
     assert all(plan.poses == [] for plan in [robot.plans.wait(), *robot.plans.messages()])
+    client.publish("tf", transform(robot, (4, 7), age=6.0))
+    status = robot.wait_for_reason(
+        r"no transform leads from 'base_link' to 'map' \(the newest is ([6-9]|\d\d)[.\d]* s old, "
+        r"more than transform_tolerance, 0.3 s\); publish"
+    )
+    assert values_of(status)["status"] == "NO_START"
+    assert all(not plan.poses for plan in robot.plans.messages())
     client.publish("tf", transform(robot, (4, 7)))
     robot.wait_for_path((4, 7), (19, 14))
     assert robot.get_plan(PoseStamped(), robot.pose((0, 0))).poses
-    assert client.set_parameters("planner", start_source="initialpose")[0].successful
-    robot.send_start(robot.pose((5, 5)))
-    robot.wait_for_path((5, 5), (19, 14))
 
 
 def test_docks_in_another_frame_stay_where_they_are_when_it_moves(transformed: Robot) -> None:
@@ -415,25 +370,11 @@ def test_docks_in_another_frame_stay_where_they_are_when_it_moves(transformed: R
     robot.wait_for_path((4, 12), (18, 3), yaw=1.5)
 
 
-def test_an_old_transform_is_no_start(transformed: Robot) -> None:
-    robot, client = transformed, transformed.client
-    client.publish("tf", transform(robot, (4, 7), age=6.0))
-    robot.send_goal(robot.pose((19, 14)))
-    status = robot.wait_for_reason(
-        r"no transform leads from 'base_link' to 'map' \(the newest is ([6-9]|\d\d)[.\d]* s old, "
-        r"more than transform_tolerance, 0.3 s\); publish"
-    )
-    assert values_of(status)["status"] == "NO_START"
-    assert all(not plan.poses for plan in robot.plans.messages())
-    assert client.set_parameters("planner", transform_tolerance=500.0)[0].successful
-    robot.wait_for_path((4, 7), (19, 14))
-
-
-@pytest.mark.parametrize("transformed", [60], indirect=True)  # on a loaded machine
 def test_a_new_listener_to_transforms_has_no_empty_plan(transformed: Robot) -> None:
     robot, client = transformed, transformed.client
     values = {"start_source": "initialpose", "transform_tolerance": 100.0}
     assert all(result.successful for result in client.set_parameters("planner", **values))
+    robot.send_map(robot.stamped_map())
     robot.send_start(robot.pose((5, 5)))
     robot.send_goal(robot.pose((19, 14)))
     robot.wait_for_path((5, 5), (19, 14))
@@ -449,7 +390,7 @@ def test_a_new_listener_to_transforms_has_no_empty_plan(transformed: Robot) -> N
     assert all(plan.poses for plan in robot.plans.messages())
 
 
-# Parameters that come together
+# Parameters
 
 
 def test_what_was_refused_of_one_source_is_forgotten_with_it(robot: Robot) -> None:
@@ -471,73 +412,6 @@ def test_what_was_refused_of_one_source_is_forgotten_with_it(robot: Robot) -> No
 def test_a_weight_that_its_range_lets_pass_is_one_that_plans(robot: Robot) -> None:
     with parameters_of(robot, clearance_weight=1.0000005):
         assert robot.get_plan(robot.pose((0, 0)), robot.pose((3, 3))).poses
-
-
-def test_the_bound_of_the_kept_fields_holds_from_the_start(
-    run_node: Any,
-    make_client: Callable[[str], Any],
-    hall: np.ndarray,
-    model: FilePath,
-    tmp_path: FilePath,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    (tmp_path / "sitecustomize.py").write_text(COUNT)
-    monkeypatch.setenv("PYTHONPATH", str(tmp_path), prepend=":")
-    client = make_client("/bounded")
-    with run_node("planner_node", {"field_cache_bytes": 0}, namespace="/bounded") as node:
-        robot = Robot(client, hall, model, "/bounded/planner")
-        robot.set_map(robot.stamped_map())
-        for goal in ((3, 3), (4, 4), (3, 3)):
-            assert robot.get_plan(robot.pose((0, 0)), robot.pose(goal)).poses
-        node.wait_for_log(r"(?s)(field of 20.*){3}")
-
-
-COUNT = """
-from ddqn_planner.planning.field import DistanceField
-
-begin = DistanceField.__init__
-
-def counted(field, goal, grid, *arguments):
-    print("field of", grid.width, flush=True)
-    begin(field, goal, grid, *arguments)
-
-DistanceField.__init__ = counted
-"""
-
-
-def test_parameters_that_come_together_are_set_together_or_not_at_all(robot: Robot) -> None:
-    def set_together(**values: Any) -> SetParametersResult:
-        messages = [
-            Parameter(name, value=value).to_parameter_msg() for name, value in values.items()
-        ]
-        request = SetParametersAtomically.Request(parameters=messages)
-        name = "planner/set_parameters_atomically"
-        return robot.client.call(SetParametersAtomically, name, request).result
-
-    good = {"robot_radius": 0.4, "mode": "astar_fallback", "occupied_threshold": 50}
-    before = {name: robot.client.get_parameter("planner", name) for name in good}
-    for bad, reason in (
-        ({"clearance_weight": 1.5}, "out of range"),
-        ({"move_rule": "diagonal"}, "move_rule is 'diagonal'; give one of ''"),
-        ({"model": "no_such_model"}, "there is no shipped model 'no_such_model'"),
-        ({"start_source": "gps"}, "start_source is 'gps'; give one of"),
-        ({"robot_frame": ""}, "robot_frame is ''; name"),
-        ({"tolerance": math.nan}, "out of range"),
-        ({"follow_trainer": True}, "read-only"),
-        ({"no_such": 1}, "undeclared"),
-    ):
-        for together in ({**good, **bad}, {**bad, **good}):
-            result = set_together(**together)
-            assert not result.successful
-            assert reason in result.reason
-            for name, value in before.items():
-                assert robot.client.get_parameter("planner", name) == value
-    assert set_together(**good).successful
-    assert robot.client.get_parameter("planner", "robot_radius") == 0.4
-    assert set_together(**before).successful
-
-
-# What is to be looked at
 
 
 def test_plan_and_value_are_stamped_when_answered_and_the_diagnostics_name_the_map(
@@ -563,180 +437,3 @@ def test_plan_and_value_are_stamped_when_answered_and_the_diagnostics_name_the_m
         assert is_new(robot.get_plan(robot.pose((1, 0)), robot.pose((3, 3))))
         values = values_of(robot.wait_for_reason("^a path of ", planned_on))
         assert values["map"] == "20 x 15 cells of 0.5 m in frame 'map'"
-
-
-def test_the_value_is_published_once_a_goal(robot: Robot) -> None:
-    first, second = 6 * 20 + 3, 7 * 20 + 4
-    robot.send_start(robot.pose((0, 0)))
-    robot.send_goal(robot.pose((3, 6)))
-    robot.wait_for_path((0, 0), (3, 6))
-    robot.value.wait(lambda value: value.data[first] == 100)
-    robot.send_start(robot.pose((1, 0)))
-    robot.wait_for_path((1, 0), (3, 6))
-    robot.send_goal(robot.pose((4, 7)))
-    robot.value.wait(lambda value: value.data[second] == 100)
-    assert sum(value.data[first] == 100 for value in robot.value.messages()) == 1
-
-
-def test_nothing_is_shown_of_a_goal_without_a_field(robot: Robot) -> None:
-    policies = robot.client.subscribe(MarkerArray, "planner/policy", LATCHED)
-    robot.send_start(robot.pose((0, 0)))
-    robot.send_goal(robot.pose((3, 3)))
-    robot.value.wait(lambda value: value.data[3 * 20 + 3] == 100)
-    policies.wait(lambda message: message.markers[0].action == Marker.ADD)
-    robot.clear()
-    policies.clear()
-    robot.send_goal(robot.pose((10, 2)))
-    robot.plans.wait(lambda plan: not plan.poses)
-    value = robot.value.wait(lambda value: set(value.data) == {-1})
-    assert (value.info.width, value.header.frame_id) == (20, "map")
-    policies.wait(lambda message: message.markers[0].action == Marker.DELETE)
-    robot.clear()
-    policies.clear()
-    robot.send_goal(robot.pose((3, 3)))
-    robot.value.wait(lambda value: value.data[3 * 20 + 3] == 100)
-    policies.wait(lambda message: message.markers[0].action == Marker.ADD)
-
-
-TOLD = """
-import ddqn_planner.nodes.display as display
-from ddqn_planner.grid.body import Inflation
-
-def told(words, function):
-    def say_and_call(*arguments):
-        print(words, flush=True)
-        return function(*arguments)
-
-    return say_and_call
-
-Inflation.__call__ = told("a map is inflated", Inflation.__call__)
-display.value_message = told("a value is shown", display.value_message)
-"""
-
-
-def test_what_nobody_asks_for_is_not_computed(
-    run_node: Any,
-    make_client: Callable[[str], Any],
-    hall: np.ndarray,
-    tmp_path: FilePath,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    (tmp_path / "sitecustomize.py").write_text(TOLD)
-    monkeypatch.setenv("PYTHONPATH", str(tmp_path), prepend=":")
-    client, grid = make_client("/unseen"), Robot.grid_of(hall)
-    with run_node("planner_node", {}, namespace="/unseen") as node:
-        diagnostics = client.subscribe(DiagnosticArray, "/diagnostics")
-        plans = client.subscribe(Path, "plan", LATCHED)
-        for seconds in (1, 2):
-            message = map_message(hall, grid, seconds)
-            client.publish("map", message, LATCHED)
-            wait_for_stamp(diagnostics, message.header.stamp, "/unseen/planner")
-        assert "a map is inflated" not in node.log
-        client.publish("initialpose", initial_pose(pose(grid, (0, 0))))
-        for goal in ((3, 3), (4, 4)):
-            plans.clear()
-            client.publish("goal_pose", pose(grid, goal))
-            plans.wait(lambda path: path.poses)
-            time.sleep(0.3)
-        assert node.log.count("a map is inflated") == 1
-        assert "a value is shown" not in node.log
-        value = client.subscribe(OccupancyGrid, "planner/value", LATCHED).wait()
-        assert value.data[4 * 20 + 4] == 100
-        assert node.log.count("a value is shown") == 1
-
-
-@pytest.mark.parametrize("name", ["value", "policy"])
-def test_what_cannot_be_shown_does_not_end_the_node(
-    name: str,
-    run_node: Any,
-    make_client: Callable[[str], Any],
-    hall: np.ndarray,
-    model: FilePath,
-    tmp_path: FilePath,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    (tmp_path / "sitecustomize.py").write_text(
-        f"import ddqn_planner.nodes.display as display\ndisplay.{name}_message = lambda *_: [][0]\n"
-    )
-    monkeypatch.setenv("PYTHONPATH", str(tmp_path), prepend=":")
-    client = make_client(f"/no_{name}")
-    client.subscribe(MarkerArray, "planner/policy", LATCHED)
-    with run_node("planner_node", {}, namespace=f"/no_{name}") as node:
-        robot = Robot(client, hall, model, f"/no_{name}/planner")
-        robot.send_map()
-        robot.send_start(robot.pose((0, 0)))
-        robot.send_goal(robot.pose((3, 3)))
-        robot.wait_for_path((0, 0), (3, 3))
-        node.wait_for_log(f"the {name} cannot be shown .IndexError")
-        assert robot.get_plan(robot.pose((0, 0)), robot.pose((4, 4))).poses
-
-
-# What the log says
-
-
-def test_the_log_says_once_what_stays_the_same(
-    run_node: Any, make_client: Callable[[str], Any], hall: np.ndarray, model: FilePath
-) -> None:
-    client = make_client("/quiet")
-    with run_node("planner_node", {}, namespace="/quiet") as node:
-        robot = Robot(client, hall, model, "/quiet/planner")
-
-        def send_maps(frame: str, first: int) -> None:
-            """Send three maps, one after the other is planned on."""
-            for seconds in range(first, first + 3):
-                message = robot.map_message()
-                message.header.frame_id, message.header.stamp.sec = frame, seconds
-                robot.send_map(message)
-                robot.wait_for_map(message)
-
-        def set_goal_again() -> None:
-            for radius in (0.1, 0.2, 0.3):
-                robot.plans.clear()
-                assert client.set_parameters("planner", robot_radius=radius)[0].successful
-                robot.plans.wait()
-
-        send_maps("map", 1)
-        robot.send_start(robot.pose((0, 0)))
-        robot.send_goal(robot.pose((3, 3)))
-        robot.wait_for_path((0, 0), (3, 3))
-        set_goal_again()
-        send_maps("map", 4)
-        robot.send_goal(robot.pose((10, 2)))
-        robot.wait_for_reason("the goal is occupied")
-        set_goal_again()
-        for frame in ("nowhere", "nowhere", "nowhere", "elsewhere"):
-            pose = robot.pose((0, 0))
-            pose.header.frame_id = frame
-            robot.send_start(pose)
-        node.wait_for_log("the start's frame is 'elsewhere'")
-        send_maps("upstairs", 7)
-        node.wait_for_log("no plan: the goal's frame")
-        for line in (
-            r"map of 20 x 15 cells of 0.5 m in frame 'map'",
-            r"map of 20 x 15 cells of 0.5 m in frame 'upstairs'",
-            "a path of ",
-            "no plan: the goal is occupied",
-            "no plan: the goal's frame",
-            "initialpose refused: the start's frame is 'nowhere'",
-        ):
-            assert node.log.count(line) == 1, node.log
-
-
-def test_the_policy_is_drawn_for_who_looks(robot: Robot, hall: np.ndarray) -> None:
-    robot.send_start(robot.pose((0, 0)))
-    robot.send_goal(robot.pose((19, 14)))
-    robot.wait_for_path((0, 0), (19, 14))
-    policies = robot.client.subscribe(MarkerArray, "planner/policy", LATCHED)
-
-    def arrows(message: MarkerArray) -> int:
-        (marker,) = message.markers
-        return len(marker.points) // 6 if marker.action == Marker.ADD else 0
-
-    free = int((hall == 0).sum())
-    message = policies.wait(lambda m: arrows(m) == free - 1)
-    assert message.markers[0].header.frame_id == "map"
-    policies.clear()
-    values = hall.copy()
-    values[13:, 0] = 100
-    robot.send_map(occupancy_message(values, RESOLUTION, (-1.0, 2.0, 0.0), Header(frame_id="map")))
-    policies.wait(lambda m: arrows(m) == free - 3)

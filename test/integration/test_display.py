@@ -1,0 +1,209 @@
+"""What RViz shows of a field, and that nothing is computed for nobody."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from pathlib import Path as FilePath
+from typing import Any
+
+import numpy as np
+import pytest
+from integration.robot import Robot
+from nav_msgs.msg import OccupancyGrid
+from rclpy.serialization import serialize_message
+from std_msgs.msg import Header
+from visualization_msgs.msg import Marker, MarkerArray
+
+from ddqn_planner.grid import MOVES, Cell, GridMap, MoveRule, legal_moves, shortest_distances
+from ddqn_planner.nodes.display import MAX_ARROWS, policy_message
+from ddqn_planner.nodes.runtime import LATCHED
+from ddqn_planner.planning import QField
+
+HEADER = Header(frame_id="map")
+
+
+def exact_field(grid: GridMap, goal: Cell) -> QField:
+    """Return a field whose policy goes down the exact distances."""
+    distances = np.pad(
+        shortest_distances(grid, goal, MoveRule.ROBOT_SAFE), 1, constant_values=np.inf
+    )
+    beside = [np.roll(distances, (-dy, -dx), (0, 1))[1:-1, 1:-1] for dx, dy in MOVES]
+    lengths = np.hypot(*MOVES.T).reshape(-1, 1, 1)
+    return QField(
+        goal,
+        -(np.array(beside) + lengths).astype(np.float32),
+        legal_moves(grid.occupancy, MoveRule.ROBOT_SAFE),
+    )
+
+
+def arrows_of(marker: Marker) -> np.ndarray:
+    """Return (arrows, 6, 2): the ends of shaft and barbs, metres."""
+    return np.array([(point.x, point.y) for point in marker.points]).reshape(-1, 6, 2)
+
+
+@pytest.mark.parametrize("origin", [(0.0, 0.0, 0.0), (-1.0, 2.0, 0.7), (3.0, 0.0, -2.5)])
+def test_each_free_cell_except_the_goal_has_its_greedy_arrow(
+    small_values: np.ndarray, origin: tuple[float, float, float]
+) -> None:
+    grid = GridMap.from_occupancy_values(small_values, 0.5, origin)
+    field = exact_field(grid, (5, 5))
+    (marker,) = policy_message(field, grid, HEADER).markers
+    assert (marker.type, marker.action) == (Marker.LINE_LIST, Marker.ADD)
+    assert marker.header.frame_id == "map"
+    assert marker.pose.orientation.w == 1.0
+    assert marker.scale.x > 0
+    assert marker.color.a > 0
+    found = {}
+    for shaft_tail, tip, *barbs in arrows_of(marker):
+        cell = grid.world_to_cell(*(shaft_tail + tip) / 2)
+        assert (shaft_tail + tip) / 2 == pytest.approx(grid.cell_to_world(cell))
+        found[cell] = np.subtract(tip, shaft_tail)
+        assert barbs[0] == pytest.approx(tip)
+        assert barbs[2] == pytest.approx(tip)
+        # A barb lies behind the tip, and the two are mirrored.
+        sides = np.cross(
+            np.append(found[cell], 0), np.append([barbs[1] - tip, barbs[3] - tip], [[0], [0]], 1)
+        )
+        assert sides[0, 2] == pytest.approx(-sides[1, 2])
+        assert max((barbs[1] - tip) @ found[cell], (barbs[3] - tip) @ found[cell]) < 0
+    assert set(found) == set(grid.free_cells()) - {(5, 5)}
+    for (x, y), direction in found.items():
+        dx, dy = MOVES[field.policy[y, x]]
+        ahead = np.subtract(grid.cell_to_world((x + dx, y + dy)), grid.cell_to_world((x, y)))
+        assert direction / np.linalg.norm(direction) == pytest.approx(ahead / np.linalg.norm(ahead))
+
+
+def test_a_new_message_replaces_the_old_one_and_none_deletes_it() -> None:
+    free, walled = GridMap(np.zeros((3, 3), bool)), GridMap(np.ones((3, 3), bool))
+    (shown,) = policy_message(exact_field(free, (1, 1)), free, HEADER).markers
+    lost = QField((1, 1), np.zeros((8, 3, 3), np.float32), np.zeros((8, 3, 3), bool))
+    (empty,) = policy_message(lost, walled, HEADER).markers
+    assert (shown.ns, shown.id) == (empty.ns, empty.id)
+    assert empty.action == Marker.DELETE
+    assert len(empty.points) == 0
+
+
+@pytest.mark.parametrize("shape", [(100, 100), (384, 576), (1, 30000)])
+def test_large_maps_have_no_more_arrows_than_the_bound(shape: tuple[int, int]) -> None:
+    grid = GridMap(np.zeros(shape, bool), 0.05)
+    q = np.random.default_rng(0).random((8, *shape), np.float32)
+    field = QField((0, 0), q, legal_moves(grid.occupancy, MoveRule.ROBOT_SAFE))
+    message = policy_message(field, grid, HEADER)
+    arrows = arrows_of(message.markers[0])
+    assert MAX_ARROWS / 2 <= len(arrows) <= MAX_ARROWS
+    assert len(serialize_message(message)) > 24 * 6 * len(arrows)
+
+
+# Over DDS
+
+TOLD = """
+import ddqn_planner.nodes.display as display
+from ddqn_planner.grid.body import Inflation
+
+def told(words, function):
+    def say_and_call(*arguments):
+        print(words, flush=True)
+        return function(*arguments)
+
+    return say_and_call
+
+Inflation.__call__ = told("a map is inflated", Inflation.__call__)
+display.value_message = told("a value is shown", display.value_message)
+"""
+
+
+@pytest.fixture(scope="module")
+def hall() -> np.ndarray:
+    """(15, 20) int8: a hall with a wall across, open at its upper end."""
+    values = np.zeros((15, 20), dtype=np.int8)
+    values[:9, 10] = 100
+    return values
+
+
+@pytest.fixture
+def run(
+    run_node: Any, tmp_path: FilePath, monkeypatch: pytest.MonkeyPatch
+) -> Callable[[str, str], Any]:
+    """Return a function that runs a planner in a namespace after a program of the test."""
+
+    def run(namespace: str, program: str) -> Any:
+        (tmp_path / "sitecustomize.py").write_text(program)
+        monkeypatch.setenv("PYTHONPATH", str(tmp_path), prepend=":")
+        return run_node("planner_node", {}, namespace=namespace)
+
+    return run
+
+
+def test_what_nobody_asks_for_is_not_computed_and_what_somebody_sees_is_of_the_goal(
+    run: Any, make_client: Callable[[str], Any], hall: np.ndarray, model: FilePath
+) -> None:
+    client = make_client("/seen")
+    with run("/seen", TOLD) as node:
+        robot = Robot(client, hall, model, "/seen/planner")
+        client.node.destroy_subscription(
+            next(it for it in client.node.subscriptions if it.topic_name == "/seen/planner/value")
+        )
+        for _ in range(2):
+            robot.set_map(robot.stamped_map())
+        assert "a map is inflated" not in node.log
+        robot.send_start(robot.pose((0, 0)))
+        for goal in ((3, 3), (4, 4)):
+            robot.send_goal(robot.pose(goal))
+            robot.wait_for_path((0, 0), goal)
+            time.sleep(0.3)
+        assert node.log.count("a map is inflated") == 1
+        assert "a value is shown" not in node.log
+
+        values = client.subscribe(OccupancyGrid, "planner/value", LATCHED)
+        policies = client.subscribe(MarkerArray, "planner/policy", LATCHED)
+
+        def wait_for(goal: Cell) -> None:
+            values.wait(lambda value: value.data[goal[1] * 20 + goal[0]] == 100)
+            policies.wait(lambda message: message.markers[0].action == Marker.ADD)
+
+        def arrows(message: MarkerArray) -> int:
+            return len(message.markers[0].points) // 6
+
+        wait_for((4, 4))
+        free = int((hall == 0).sum())
+        message = policies.wait(lambda message: arrows(message) == free - 1)
+        assert message.markers[0].header.frame_id == "map"
+        # Once a goal, not once a plan.
+        robot.send_start(robot.pose((1, 0)))
+        robot.wait_for_path((1, 0), (4, 4))
+        robot.send_goal(robot.pose((3, 6)))
+        wait_for((3, 6))
+        assert sum(value.data[4 * 20 + 4] == 100 for value in values.messages()) == 1
+        # Nothing of a goal without a field.
+        values.clear()
+        policies.clear()
+        robot.send_goal(robot.pose((10, 2)))
+        value = values.wait(lambda value: set(value.data) == {-1})
+        assert (value.info.width, value.header.frame_id) == (20, "map")
+        policies.wait(lambda message: message.markers[0].action == Marker.DELETE)
+        robot.send_goal(robot.pose((3, 6)))
+        wait_for((3, 6))
+        # The map's changes are shown too.
+        changed = hall.copy()
+        changed[13:, 0] = 100
+        robot.send_map(robot.stamped_map(changed))
+        policies.wait(lambda message: arrows(message) == free - 3)
+
+
+def test_what_cannot_be_shown_does_not_end_the_node(
+    run: Any, make_client: Callable[[str], Any], hall: np.ndarray, model: FilePath
+) -> None:
+    client = make_client("/broken")
+    client.subscribe(MarkerArray, "planner/policy", LATCHED)
+    program = "import ddqn_planner.nodes.display as display\n"
+    program += "display.value_message = display.policy_message = lambda *_: [][0]\n"
+    with run("/broken", program) as node:
+        robot = Robot(client, hall, model, "/broken/planner")
+        robot.send_map()
+        robot.send_start(robot.pose((0, 0)))
+        robot.send_goal(robot.pose((3, 3)))
+        robot.wait_for_path((0, 0), (3, 3))
+        for name in ("value", "policy"):
+            node.wait_for_log(f"the {name} cannot be shown .IndexError")
+        assert robot.get_plan(robot.pose((0, 0)), robot.pose((4, 4))).poses
