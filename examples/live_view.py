@@ -3,8 +3,8 @@
     python examples/live_view.py                                  # opens rerun's viewer
     python examples/live_view.py --save run.rrd --ros-args -r __ns:=/robot
 
-All is drawn in cells of the map, with y upwards. It needs `pip install rerun-sdk matplotlib`; RViz shows the
-same topics.
+All is drawn in cells of the map, with y upwards. It needs `pip install rerun-sdk matplotlib`; RViz
+shows the same topics.
 """
 
 from __future__ import annotations
