@@ -43,8 +43,7 @@ from client import Client, Recorder, cells_of, pose, wait_for
 from driving_worlds import World, generated_world, path_seconds
 from processes import claim_ros_domain, run_script, running, running_node
 
-WORLD, SEED, SPEED_UP = "office", 9, 40.0
-MISSIONS = 40
+WORLD, SEED, SPEED_UP, MISSIONS = "office", 9, 40.0, 40
 RULE = MoveRule.ROBOT_SAFE
 LISTENERS = 3
 """To goals: the planner, the trainer and the robot."""
@@ -52,9 +51,13 @@ LISTENERS = 3
 MEAN_OF = 8
 """Missions that a point of the curve sums up."""
 
-COLOURS = {"shortest": "#555555", "learned": "#0072B2", "best possible": "#CC79A7"}
-STYLES = {"shortest": ":", "learned": "-", "best possible": "--"}
+STYLES = {
+    "shortest": {"color": "#555555", "linestyle": ":"},
+    "learned": {"color": "#0072B2", "linestyle": "-"},
+    "best possible": {"color": "#CC79A7", "linestyle": "--"},
+}
 Routes = dict[str, Sequence[Cell]]
+Slowness = NDArray[np.float64]
 
 
 @dataclass
@@ -64,8 +67,8 @@ class Mission:
     routes: Routes
     seconds: dict[str, float]
     measured: float
-    truth: NDArray[np.float64]
-    slowness: NDArray[np.float64]
+    truth: Slowness
+    slowness: Slowness
 
 
 class Driver:
@@ -90,41 +93,59 @@ class Driver:
         stamp = self.wait("odometry", self.odometry).header.stamp
         return float(stamp.sec + stamp.nanosec / 1e9)
 
-    def plan(self, grid: GridMap, start: Cell, goal: Cell) -> tuple[Cell, ...]:
-        """Return the path on a map."""
-        return self.planner.plan(grid, start, goal, RULE, start_clearing_radius=1).cells
-
-    def known_slowness(self) -> NDArray[np.float64]:
+    def known_slowness(self) -> Slowness:
         """Return what the trainer says: (H, W)."""
         message = self.wait("slowness", self.slowness)
         shape = self.world.grid.occupancy.shape
         return np.asarray(SLOWEST ** (np.array(message.data).reshape(shape).clip(0) / 100))
 
+    def routes(self, learned: Sequence[Cell], known: GridMap) -> Routes:
+        """Return the learned route, and those of one who knows nothing and of one who knows all."""
+        ends = learned[0], learned[-1]
+        shortest, best = (
+            self.planner.plan(grid, *ends, RULE, start_clearing_radius=1).cells
+            for grid in (self.world.grid, known)
+        )
+        return {"shortest": shortest, "learned": learned, "best possible": best}
+
+    def seconds(self, routes: Routes, truth: Slowness) -> dict[str, float]:
+        """Return the true time of each route."""
+        grid = self.world.grid
+        return {name: path_seconds(cells, truth, grid) for name, cells in routes.items()}
+
     def drive(self, goal: Cell) -> Mission:
         """Drive to a station, and wait until the planner knows what that taught."""
-        world, grid = self.world, self.world.grid
-        slowness, began = self.known_slowness(), self.now()
-        truth = world.slowness(began)
+        grid, slowness, began = self.world.grid, self.known_slowness(), self.now()
+        truth = self.world.slowness(began)
         self.plans.clear()
         self.drives.clear()
         stamped = pose(grid, goal)
         self.client.publish("goal_pose", stamped, listeners=LISTENERS)
         # The planner may still publish a path to the last goal.
         path = self.wait("plan", self.plans, lambda plan: cells_of(grid, plan)[-1:] == [goal])
-        cells = cells_of(grid, path)
         self.wait("odometry at the goal", self.odometry, lambda at: _is_at(at.pose, stamped))
         # Other drives end on the way: one that is long, or if the trainer hears the goal late.
         self.wait("drive", self.drives, lambda path: _is_at(path.poses[-1], stamped, 2))
         measured = self.now() - began
         time.sleep(0.3)  # the planner loads it
         self.at = goal
-        routes = {
-            "shortest": self.plan(grid, cells[0], goal),
-            "learned": cells,
-            "best possible": self.plan(world.known(began), cells[0], goal),
-        }
-        seconds = {name: path_seconds(cells, truth, grid) for name, cells in routes.items()}
-        return Mission(routes, seconds, measured, truth, slowness)
+        routes = self.routes(cells_of(grid, path), self.world.known(began))
+        return Mission(routes, self.seconds(routes, truth), measured, truth, slowness)
+
+    def worst_pair(self) -> Routes:
+        """Return the routes between the two stations where knowing matters most."""
+        now, stations = self.now(), self.world.stations
+        truth, known = self.world.slowness(now), self.world.known(now)
+        all_routes = [self.routes((a, b), known) for a in stations for b in stations if a < b]
+
+        def lost(routes: Routes) -> float:
+            names = ("shortest", "best possible")
+            shortest, best = (path_seconds(routes[n], truth, self.world.grid) for n in names)
+            return float(shortest - best)
+
+        routes = max(all_routes, key=lost)
+        start, goal = (pose(self.world.grid, cell) for cell in routes["learned"])
+        return {**routes, "learned": cells_of(self.world.grid, self.client.get_plan(start, goal))}
 
 
 def _is_at(stamped: Any, goal: PoseStamped, factor: float = 1) -> bool:
@@ -133,32 +154,36 @@ def _is_at(stamped: Any, goal: PoseStamped, factor: float = 1) -> bool:
     return math.dist((at.x, at.y), (there.x, there.y)) <= factor * ARRIVAL_DISTANCE
 
 
-def draw(axes: Any, world: World, slowness: NDArray[np.float64], routes: Routes) -> Any:
-    """Draw slowness and routes."""
-    shown = np.where(world.grid.occupancy, np.nan, slowness)
-    image = axes.imshow(shown, origin="lower", cmap="YlOrRd", norm=LogNorm(1, SLOWEST))
-    draw_obstacles(axes, world.grid)
-    for name, cells in routes.items():
-        outline = [withStroke(linewidth=4, foreground="white")]
-        style = {"color": COLOURS[name], "label": name, "path_effects": outline}
-        axes.plot(*np.transpose(cells), STYLES[name], linewidth=2.2, **style)
-    axes.scatter(*np.transpose(world.stations), 30, color="black", zorder=4)
-    axes.set(xticks=[], yticks=[])
-    return image
+def draw(world: World, truth: Slowness, learned: Slowness, *routes: Routes) -> Any:
+    """Return a figure of true and learned slowness, with routes in each."""
+    figure, both = plt.subplots(1, 2, figsize=(8.4, 4.7), layout="constrained")
+    titles = ("what nobody told the robot", "what it has learned")
+    for axes, slowness, shown, title in zip(both, (truth, learned), routes, titles, strict=True):
+        values = np.where(world.grid.occupancy, np.nan, slowness)
+        image = axes.imshow(values, origin="lower", cmap="YlOrRd", norm=LogNorm(1, SLOWEST))
+        draw_obstacles(axes, world.grid)
+        for name, cells in shown.items():
+            outline = [withStroke(linewidth=4, foreground="white")]
+            line: dict[str, Any] = {"label": name, "path_effects": outline, **STYLES[name]}
+            axes.plot(*np.transpose(cells), linewidth=2.2, **line)
+        axes.scatter(*np.transpose(world.stations), 30, color="black", zorder=4)
+        axes.set(xticks=[], yticks=[])
+        axes.set_title(title, loc="left", fontsize=10)
+    bar = figure.colorbar(image, ax=both, label="seconds over seconds at nominal speed", shrink=0.8)
+    bar.set_ticks([1, 2, 5, 10], labels=["1", "2", "5", "10"])
+    bar.minorticks_off()
+    figure.legend(*both[0].get_legend_handles_labels(), loc="outside lower center", ncols=3)
+    return figure
 
 
 def save_film(path: FilePath, world: World, missions: Sequence[Mission]) -> None:
     """Save a GIF with a frame per mission."""
     frames = []
     for number, mission in enumerate(missions, start=1):
-        figure, both = plt.subplots(1, 2, figsize=(8.4, 4.7), layout="constrained")
-        draw(both[0], world, mission.truth, mission.routes)
-        both[0].set_title("what nobody told the robot", loc="left", fontsize=10)
-        draw(both[1], world, mission.slowness, {"learned": mission.routes["learned"]})
-        both[1].set_title("what it has learned", loc="left", fontsize=10)
+        learned = {"learned": mission.routes["learned"]}
+        figure = draw(world, mission.truth, mission.slowness, mission.routes, learned)
         ratio = mission.seconds["learned"] / mission.seconds["best possible"]
         figure.suptitle(f"mission {number}: {ratio:.2f} of the best possible time", fontsize=11)
-        figure.legend(*both[0].get_legend_handles_labels(), loc="outside lower center", ncols=3)
         canvas: Any = FigureCanvasAgg(figure)
         canvas.draw()
         image = Image.fromarray(np.asarray(canvas.buffer_rgba())).convert("RGB")
@@ -168,58 +193,23 @@ def save_film(path: FilePath, world: World, missions: Sequence[Mission]) -> None
     frames[0].save(path, save_all=True, append_images=frames[1:], duration=times, loop=0)
 
 
-def save_picture(path: FilePath, world: World, driver: Driver) -> None:
-    """Save true and learned slowness, with the routes of the mission where it matters most."""
-    truth, learned = world.slowness(driver.now()), driver.known_slowness()
-    known = world.grid.with_slowness(truth.astype(np.float32), 0.5)
-    pairs = [(a, b) for a in world.stations for b in world.stations if a < b]
-
-    def lost(pair: tuple[Cell, Cell]) -> float:
-        return float(
-            path_seconds(driver.plan(world.grid, *pair), truth, world.grid)
-            - path_seconds(driver.plan(known, *pair), truth, world.grid)
-        )
-
-    start, goal = max(pairs, key=lost)
-    asked = driver.client.get_plan(pose(world.grid, start), pose(world.grid, goal))
-    routes = {
-        "shortest": driver.plan(world.grid, start, goal),
-        "learned": cells_of(world.grid, asked),
-        "best possible": driver.plan(known, start, goal),
-    }
-    figure, both = plt.subplots(1, 2, figsize=(11, 5.6), layout="constrained")
-    for axes, slowness, title in (
-        (both[0], truth, "true slowness, which nobody told the robot"),
-        (both[1], learned, "what it learned by driving"),
-    ):
-        image = draw(axes, world, slowness, routes)
-        axes.set_title(title, loc="left", fontsize=11)
-    bar = figure.colorbar(image, ax=both, label="seconds over seconds at nominal speed", shrink=0.8)
-    bar.set_ticks([1, 2, 5, 10], labels=["1", "2", "5", "10"])
-    bar.minorticks_off()
-    figure.legend(*both[0].get_legend_handles_labels(), loc="outside lower center", ncols=3)
-    figure.savefig(path, dpi=110)
-    plt.close(figure)
-
-
 def save_curve(path: FilePath, missions: Sequence[Mission]) -> None:
     """Save the true time of the routes over the best possible, from mission to mission."""
     figure, axes = plt.subplots(figsize=(7.2, 3.6), layout="constrained")
     width = min(MEAN_OF, len(missions))
     seconds = {
         name: np.convolve([m.seconds[name] for m in missions], np.ones(width), mode="valid")
-        for name in COLOURS
+        for name in STYLES
     }
     for name in ("shortest", "learned"):
         ratio = seconds[name] / seconds["best possible"]
-        number = np.arange(len(ratio)) + width
-        axes.plot(number, ratio, STYLES[name], color=COLOURS[name], linewidth=2, label=name)
+        line: dict[str, Any] = {"label": name, **STYLES[name]}
+        axes.plot(np.arange(len(ratio)) + width, ratio, linewidth=2, **line)
     axes.axhline(1, color="black", linewidth=0.8)
     axes.set(xlabel=f"mission (mean of the last {width})", ylabel="true time over the best")
     axes.legend(frameon=False)
     axes.grid(alpha=0.3)
     figure.savefig(path, dpi=110)
-    plt.close(figure)
 
 
 def main(arguments: Sequence[str]) -> int:
@@ -255,7 +245,9 @@ def main(arguments: Sequence[str]) -> int:
                     f"shortest {each['shortest'] / each['best possible']:.2f}",
                     flush=True,
                 )
-            save_picture(FilePath("demo_driving.png"), world, driver)
+            truth, learned = world.slowness(driver.now()), driver.known_slowness()
+            routes = driver.worst_pair()
+            draw(world, truth, learned, routes, routes).savefig("demo_driving.png", dpi=110)
     save_film(FilePath("demo_driving.gif"), world, missions)
     save_curve(FilePath("demo_driving_curve.png"), missions)
     print("saved demo_driving.gif, demo_driving.png and demo_driving_curve.png")

@@ -17,17 +17,17 @@ from pathlib import Path as FilePath
 
 import numpy as np
 from builtin_interfaces.msg import Time
-from geometry_msgs.msg import PoseStamped, TransformStamped
-from nav_msgs.msg import Odometry, Path
+from geometry_msgs.msg import PoseStamped
+from nav_msgs.msg import Path
 from numpy.typing import NDArray
 from rclpy.node import Node
 from std_msgs.msg import Header
 
 from ddqn_planner.experience.drives import ARRIVAL_DISTANCE
-from ddqn_planner.nodes.conversions import quaternion
 from ddqn_planner.nodes.runtime import LATCHED, STEADY, spin_until_shutdown
 
 sys.path.insert(0, str(FilePath(__file__).resolve().parents[1] / "experiments"))
+from client import RobotPoses
 from driving_worlds import NOISE, SPEED, World, generated_world
 
 STEP = 0.2
@@ -174,14 +174,7 @@ class RobotNode(Node):
         self._robot = Robot(generated_world(str(world), int(seed)), int(seed))
         self._speed_up = float(speed_up)
         self._began = time.monotonic()
-        self._odometry = self.create_publisher(Odometry, "odom", 100)
-        self._broadcaster = None
-        try:
-            from tf2_ros import TransformBroadcaster
-
-            self._broadcaster = TransformBroadcaster(self)
-        except ImportError:
-            self.get_logger().info("no transforms: tf2_ros is not installed")
+        self._poses = RobotPoses(self)
         self._goal: PoseStamped | None = None
         self._waits_since = time.monotonic()
         self._goals = self.create_publisher(PoseStamped, "goal_pose", 10)
@@ -204,7 +197,9 @@ class RobotNode(Node):
             until -= behind
         while self._robot.now + STEP <= until:
             self._robot.step()
-            self._publish()
+            stamp = Time(sec=int(self._robot.now), nanosec=int(self._robot.now % 1 * 1e9))
+            header = Header(stamp=stamp, frame_id="map")
+            self._poses.publish(header, self._robot.x, self._robot.y, self._robot.yaw)
         self._ask_again()
 
     def _ask_again(self) -> None:
@@ -222,22 +217,6 @@ class RobotNode(Node):
                     "without a path; the goal is sent again"
                 )
                 self._goals.publish(self._goal)
-
-    def _publish(self) -> None:
-        robot = self._robot
-        whole = int(robot.now)
-        stamp = Time(sec=whole, nanosec=int((robot.now - whole) * 1e9))
-        header = Header(stamp=stamp, frame_id="map")
-        odometry = Odometry(header=header, child_frame_id="base_link")
-        odometry.pose.pose.position.x, odometry.pose.pose.position.y = robot.x, robot.y
-        odometry.pose.pose.orientation = quaternion(robot.yaw)
-        self._odometry.publish(odometry)
-        if self._broadcaster is not None:
-            transform = TransformStamped(header=header, child_frame_id="base_link")
-            moved = transform.transform.translation
-            moved.x, moved.y = robot.x, robot.y
-            transform.transform.rotation = odometry.pose.pose.orientation
-            self._broadcaster.sendTransform(transform)
 
 
 if __name__ == "__main__":

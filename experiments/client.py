@@ -15,8 +15,8 @@ import numpy as np
 import rclpy
 from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
-from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped
-from nav_msgs.msg import OccupancyGrid, Path
+from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped, TransformStamped
+from nav_msgs.msg import OccupancyGrid, Odometry, Path
 from nav_msgs.srv import GetPlan
 from numpy.typing import NDArray
 from rcl_interfaces.srv import GetParameters, SetParameters
@@ -181,10 +181,7 @@ class Client:
         self.run(self.node.destroy_client, probe)  # its thread may hold it
 
     def entities(self, node: str) -> set[tuple[str, str, str]]:
-        """Return the kind, name and type of what a node of this namespace has.
-
-        Nothing, until discovery has brought the node.
-        """
+        """Return the kind, name and type of what a node of this namespace has, once discovered."""
         namespace = self.node.get_namespace()
         kinds = {
             "publishes": self.node.get_publisher_names_and_types_by_node,
@@ -250,6 +247,30 @@ class Client:
         request = GetParameters.Request(names=[name])
         response = self.call(GetParameters, f"{node}/get_parameters", request)
         return parameter_value_to_python(response.values[0])
+
+
+class RobotPoses:
+    """Publishes a robot's poses: `odom` and, where tf2_ros is installed, a transform."""
+
+    def __init__(self, node: Any) -> None:
+        self._odometry = node.create_publisher(Odometry, "odom", 100)
+        self._broadcaster: Any = None
+        with suppress(ImportError):
+            from tf2_ros import TransformBroadcaster
+
+            self._broadcaster = TransformBroadcaster(node)
+
+    def publish(self, header: Header, x: float, y: float, yaw: float = 0.0) -> None:
+        """Publish a pose of `base_link` in the header's frame, in metres and radians."""
+        odometry = Odometry(header=header, child_frame_id="base_link")
+        odometry.pose.pose.position.x, odometry.pose.pose.position.y = x, y
+        odometry.pose.pose.orientation = quaternion(yaw)
+        self._odometry.publish(odometry)
+        if self._broadcaster is not None:
+            transform = TransformStamped(header=header, child_frame_id="base_link")
+            transform.transform.translation.x, transform.transform.translation.y = x, y
+            transform.transform.rotation = odometry.pose.pose.orientation
+            self._broadcaster.sendTransform(transform)
 
 
 def pose(grid: GridMap, cell: Cell, yaw: float = 0.0, offset: float = 0.0) -> PoseStamped:

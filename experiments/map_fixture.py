@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from itertools import pairwise
+from collections.abc import Sequence
 
 import numpy as np
 from client import cell_of, cells_of, map_message
@@ -11,13 +11,26 @@ from nav_msgs.srv import GetPlan
 from numpy.typing import NDArray
 from random_maps import generate_map
 
-from ddqn_planner.grid import MOVES, Cell, MapFile, MoveRule, legal_moves, read_map_file
+from ddqn_planner.grid import Cell, MapFile, MoveRule, read_map_file
 from ddqn_planner.resources import find_map
 
 RULE = MoveRule.ROBOT_SAFE
 """The rule of the planner's default model."""
 
-ACTIONS = {(dx, dy): action for action, (dx, dy) in enumerate(MOVES.tolist())}
+
+def path_error(occupied: NDArray[np.bool_], cells: Sequence[Cell], start: Cell, goal: Cell) -> str:
+    """Say what is wrong with a path on a map for a robot that cuts no corners; "" if nothing is."""
+    if (cells[0], cells[-1]) != (start, goal):
+        return f"a path from {cells[0]} to {cells[-1]}, asked was {start} to {goal}"
+    path = np.array(cells)
+    if ((path < 0) | (path >= occupied.shape[::-1])).any():
+        return "an illegal move out of the map"
+    (x, y), (next_x, next_y) = path[:-1].T, path[1:].T
+    # A diagonal move needs both cells beside it; for a straight one these are its own two.
+    wrong = occupied[next_y, next_x] | (occupied[y, next_x] & (next_x != x))
+    wrong |= occupied[next_y, x] & (next_y != y)
+    wrong |= np.maximum(abs(next_x - x), abs(next_y - y)) != 1
+    return f"an illegal move to {path[1:][wrong][0]}" if wrong.any() else ""
 
 
 class MapFixture:
@@ -28,7 +41,6 @@ class MapFixture:
         resolution = float(np.float32(map_file.resolution))
         self.values = map_file.values
         self.grid = MapFile(map_file.values, resolution, map_file.origin).grid()
-        self._legal = legal_moves(self.grid.occupancy, RULE)
 
     def message(self, stamp: int = 0) -> OccupancyGrid:
         """Return the map message, stamped with a number of seconds."""
@@ -36,29 +48,21 @@ class MapFixture:
 
     def error(self, request: GetPlan.Request, plan: Path) -> str:
         """Say what is wrong with an answer; "" if nothing is."""
-        start, goal = (cell_of(self.grid, pose) for pose in (request.start, request.goal))
-        labels = self.grid.labels(RULE)
-        both_free = self.grid.is_free(start) and self.grid.is_free(goal)
-        possible = both_free and labels[start[::-1]] == labels[goal[::-1]]
-        cells = cells_of(self.grid, plan)
+        grid = self.grid
+        start, goal = (cell_of(grid, pose) for pose in (request.start, request.goal))
+        cells = cells_of(grid, plan)
         if not cells:
+            labels = grid.labels(RULE)
+            both_free = grid.is_free(start) and grid.is_free(goal)
+            possible = both_free and labels[start[::-1]] == labels[goal[::-1]]
             return f"no path from {start} to {goal}, where there is one" if possible else ""
-        if (cells[0], cells[-1]) != (start, goal):
-            return f"a path from {cells[0]} to {cells[-1]}, asked was {start} to {goal}"
-        legal = self._legal if self.grid.is_free(start) else self._legal_to_leave(start)
-        for (x, y), (next_x, next_y) in pairwise(cells):
-            if self.grid.is_free((x, y)):
-                legal = self._legal
-            action = ACTIONS.get((next_x - x, next_y - y))
-            if action is None or not self.grid.contains((x, y)) or not legal[action, y, x]:
-                return f"an illegal move from {(x, y)} to {(next_x, next_y)}"
-        return ""
-
-    def _legal_to_leave(self, start: Cell) -> NDArray[np.bool_]:
-        """Return which moves are legal for a robot on an obstacle: those within a cell go."""
-        y, x = np.ogrid[: self.grid.height, : self.grid.width]
+        free = (number for number, cell in enumerate(cells) if grid.is_free(cell))
+        first = next(free, len(cells) - 1)  # a robot on an obstacle may leave it
+        y, x = np.ogrid[: grid.height, : grid.width]
         far = np.hypot(x - start[0], y - start[1]) > 1
-        return legal_moves(self.grid.occupancy & far, RULE)
+        return path_error(
+            grid.occupancy & far, cells[: first + 1], start, cells[first]
+        ) or path_error(grid.occupancy, cells[first:], cells[first], goal)
 
 
 def generated_map(kind: str, side: int, resolution: float = 0.05) -> MapFixture:

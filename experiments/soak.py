@@ -1,18 +1,23 @@
 """Keeps the nodes at mixed work for minutes, bad input included, and watches their memory.
 
-Beside them a simulated robot drives, to which things happen, see soak_robot.py.
-
 After the first fifth of the time, in which caches fill, the memory has to stay flat: the median of
 the last tenth of what is left may lie no more than 5 % above that of its first tenth.
+
+Beside them a planner with a costmap and a trainer that records drives work for a simulated robot,
+in simulated time. Its clock jumps, its costmap and poses stop, it is set elsewhere. After each such
+event the planner must plan from where the robot is now, and the trainer must record on. While the
+costmap or the poses are silent, there must be no plan.
 """
 
 from __future__ import annotations
 
+import importlib.util
 import itertools
 import math
 import random
 import statistics
 import tempfile
+import threading
 import time
 from collections import Counter
 from collections.abc import Sequence
@@ -22,27 +27,38 @@ from subprocess import Popen
 from typing import Any
 
 import numpy as np
-from client import Client, initial_pose, plan_request, pose, wait_for_map
+from builtin_interfaces.msg import Time
+from client import (
+    Client,
+    RobotPoses,
+    cell_of,
+    initial_pose,
+    map_message,
+    plan_request,
+    pose,
+    values_of,
+    wait_for_map,
+)
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseStamped
 from map_fixture import RULE, three_maps
+from nav_msgs.msg import OccupancyGrid
 from nav_msgs.srv import GetPlan, LoadMap
 from processes import claim_ros_domain, memory, run_script, running_node
-from soak_robot import EVENTS, NAMESPACE, SOURCE, SimulatedRobot, parameters
+from rosgraph_msgs.msg import Clock
+from std_msgs.msg import Header
 from std_srvs.srv import Trigger
+from tables import table
 
-from ddqn_planner.grid import MapFile, MoveRule, save_map
+from ddqn_planner.grid import Cell, MapFile, MoveRule, save_map
 from ddqn_planner.grid.noise import random_requests
 from ddqn_planner.nodes.runtime import LATCHED
+from ddqn_planner.planning import Planner
 
-MINUTES = 30.0
-PERIOD = 5.0
-"""Seconds between two samples of the memory."""
-EVENT_PERIOD = 10.0
-"""Seconds between two events of the robot."""
-PAUSE = 0.02
-"""Seconds between two pieces of work."""
-MAX_GROWTH = 0.05
+MINUTES, MAX_GROWTH = 30.0, 0.05
+PERIOD, EVENT_PERIOD, PAUSE = 5.0, 10.0, 0.02
+"""Seconds between two samples of the memory, events of the robot, and pieces of work."""
+
 STEADY_FIELDS = 8
 """Fields that are computed before each sample."""
 
@@ -52,7 +68,30 @@ SHARES = {
 }
 """How often each kind of work is drawn."""
 
-Samples = dict[str, list[float]]
+NAMESPACE = "/robot"
+SOURCE = "tf" if importlib.util.find_spec("tf2_ros") else "odometry"
+"""Where the robot's planner and trainer get its poses."""
+
+STEP, SPEED_UP, COSTMAP_PERIOD, SPEED = 0.05, 4.0, 5, 1.0
+"""Seconds of the clock per step; simulated seconds per second; steps from costmap to costmap;
+metres per simulated second."""
+
+TOLERANCE, MAP_TIMEOUT = 1.0, 1.0
+"""The planner's transform_tolerance and map_timeout, seconds; silent odometry has 2 seconds."""
+
+GRACE, SILENCE, RECOVERY = 1.5, 5.0, 60.0
+"""Seconds after an event until the nodes must know of it, on a loaded machine; of silence; and
+until all must be well again."""
+
+JUMP_IN_SILENCE = "clock back, then no poses"
+EVENTS = (
+    "clock back",
+    "clock forward",
+    "set elsewhere",
+    "poses stop",
+    "costmap stops",
+    JUMP_IN_SILENCE,
+)
 
 
 class Work:
@@ -140,14 +179,144 @@ class Work:
         return pose(grid, (self._draw.randrange(grid.width), self._draw.randrange(grid.height)))
 
 
+class SimulatedRobot:
+    """Drives between random cells, and publishes clock, costmap and poses from a thread."""
+
+    def __init__(self) -> None:
+        self._client = Client(NAMESPACE, "simulated_robot")
+        node = self._client.node
+        self._clock = node.create_publisher(Clock, "/clock", 10)
+        self._costmap = node.create_publisher(OccupancyGrid, "map", LATCHED)
+        self._goals = node.create_publisher(PoseStamped, "goal_pose", 10)
+        self._poses = RobotPoses(node)
+        self._diagnostics = self._client.subscribe(DiagnosticArray, "/diagnostics", keep=100)
+        self._map = three_maps()[0]
+        self._grid = self._map.grid
+        self._planner = Planner.load("any_map")
+        self._draw = random.Random(0)
+        requests = random_requests(self._grid.occupancy, RULE, 50, np.random.default_rng(0))
+        self._cells = [start for start, _ in requests]
+        self._lock = threading.Lock()
+        self._now, self._steps, self._along = 1000.0, 0, 0.0
+        self._silent = ""  # the event that made the costmap or the poses stop
+        self._path: list[Cell] = []
+        self._visited: set[Cell] = set()
+        self._set_elsewhere()
+        self.stale = self.lost = 0
+        self.done: Counter[str] = Counter()
+        self._is_over = threading.Event()
+        self._thread = threading.Thread(target=self._run, daemon=True)
+        self._thread.start()
+
+    def close(self) -> None:
+        """Stop."""
+        self._is_over.set()
+        self._thread.join()
+        self._client.close()
+
+    def _run(self) -> None:
+        due = time.monotonic()
+        while not self._is_over.is_set():
+            with self._lock:
+                self._step()
+            due = max(due + STEP, time.monotonic() - 1.0)
+            time.sleep(max(0.0, due - time.monotonic()))
+
+    def _step(self) -> None:
+        self._now += STEP * SPEED_UP
+        self._steps += 1
+        stamp = Time(sec=int(self._now), nanosec=int(self._now % 1 * 1e9))
+        self._clock.publish(Clock(clock=stamp))
+        if self._silent != "costmap stops" and self._steps % COSTMAP_PERIOD == 0:
+            message = map_message(self._map.values, self._grid)
+            message.header.stamp = stamp
+            self._costmap.publish(message)
+        self._along += STEP * SPEED_UP * SPEED / self._grid.resolution
+        if self._along >= len(self._path) - 1:
+            self._drive_on(self._path[-1])
+        cell = self._path[int(self._along)]
+        self._visited.add(cell)
+        if self._silent not in ("poses stop", JUMP_IN_SILENCE):
+            header = Header(stamp=stamp, frame_id="map")
+            self._poses.publish(header, *self._grid.cell_to_world(cell))
+
+    def _drive_on(self, start: Cell) -> None:
+        goal = self._draw.choice([cell for cell in self._cells if math.dist(cell, start) > 5])
+        self._path, self._along = list(self._planner.plan(self._grid, start, goal).cells), 0.0
+        self._goals.publish(pose(self._grid, goal))
+
+    def _set_elsewhere(self) -> None:
+        """Put the robot on a cell where it has not been since it was put down last."""
+        far = [cell for cell in self._cells if cell not in self._visited]
+        self._drive_on(self._draw.choice(far or self._cells))
+        self._visited = {self._path[0]}
+
+    def event(self, kind: str) -> None:
+        """Let something happen, and see that all is well after it."""
+        self.done[kind] += 1
+        with self._lock:
+            self._set_elsewhere()
+            if kind in ("poses stop", "costmap stops", JUMP_IN_SILENCE):
+                self._silent = kind
+            if kind in ("clock back", JUMP_IN_SILENCE):
+                self._now = max(1.0, self._now - self._draw.uniform(1, 600))
+            elif kind == "clock forward":
+                self._now += self._draw.uniform(20, 600)
+        happened = time.monotonic()
+        if self._silent:
+            while (began := time.monotonic()) < happened + SILENCE:
+                time.sleep(0.1)
+                if self._start_of_plan() and began > happened + MAP_TIMEOUT + GRACE:
+                    self._note_stale(kind, "a plan in the silence")
+            with self._lock:
+                self._silent = ""
+            happened = time.monotonic()
+        self._recover(kind, happened)
+
+    def _recover(self, kind: str, happened: float) -> None:
+        """Wait for a plan from where the robot is, and for drives that began after the event."""
+        planned, drives = False, -1
+        while (began := time.monotonic()) < happened + RECOVERY:
+            cell = self._start_of_plan()
+            with self._lock:
+                is_right = cell in self._visited
+            planned |= is_right
+            if began > happened + GRACE:
+                if cell is not None and not is_right:
+                    self._note_stale(kind, f"a plan from {cell}")
+                drives = self._drives() if drives < 0 else drives
+                if planned and self._drives() >= drives + 2:
+                    return
+            time.sleep(0.1)
+        self.lost += 1
+        what = "no new drive" if planned else "no plan"
+        print(f"after {kind}: {what} in {RECOVERY:g} s", flush=True)
+
+    def _note_stale(self, kind: str, what: str) -> None:
+        self.stale += 1
+        print(f"after {kind}: {what}", flush=True)
+
+    def _start_of_plan(self) -> Cell | None:
+        """Return the start of a plan from where the planner thinks that the robot is."""
+        goal = pose(self._grid, self._draw.choice(self._cells))
+        poses = self._client.get_plan(PoseStamped(), goal).poses
+        return cell_of(self._grid, poses[0]) if poses else None
+
+    def _drives(self) -> int:
+        """Return how many drives the trainer has recorded."""
+        statuses = [status for m in self._diagnostics.messages() for status in m.status]
+        of_trainer = [s for s in statuses if s.name == f"{NAMESPACE}/trainer: driving"]
+        return int(values_of(of_trainer[-1])["drives"]) if of_trainer else 0
+
+
 def soak(
     children: dict[str, Popen[bytes]],
     work: Work,
     minutes: float,
     robot: SimulatedRobot | None = None,
-) -> Samples:
+) -> dict[str, list[float]]:
     """Work for some minutes; return the resident memory of each node, MB, as time went by."""
-    samples: Samples = {name: [] for name in children}
+    samples: dict[str, list[float]] = {name: [] for name in children}
     began = next_event = time.monotonic()
     events = itertools.cycle(EVENTS)
     while time.monotonic() < began + 60 * minutes:
@@ -176,26 +345,35 @@ def growth(samples: Sequence[float]) -> tuple[float, float, float]:
 def main(arguments: Sequence[str]) -> int:
     """Run the nodes at work; return 1 if one grows, loses a call, or answers what is stale."""
     minutes = float(arguments[0]) if arguments else MINUTES
-    quiet, apart = ("--log-level", "fatal"), ("-r", f"__ns:={NAMESPACE}")
+    quiet, apart = (
+        ("--log-level", "fatal"),
+        ("-r", f"__ns:={NAMESPACE}", "-p", "use_sim_time:=true"),
+    )
     with (
         claim_ros_domain(),
         tempfile.TemporaryDirectory() as folder,
-        running_node("map_server_node", *quiet) as map_server,
-        running_node("planner_node", *quiet) as planner,
         ExitStack() as stack,
         Client() as client,
     ):
-        of_planner, of_trainer = parameters(Path(folder))
-        children = {
-            "map_server_node": map_server,
-            "planner_node": planner,
-            "robot's planner": stack.enter_context(
-                running_node("planner_node", *quiet, *apart, **of_planner)
-            ),
-            "robot's trainer": stack.enter_context(
-                running_node("trainer_node", *quiet, *apart, **of_trainer)
-            ),
+        of_planner = {
+            "start_source": SOURCE,
+            "transform_tolerance": TOLERANCE,
+            "map_type": "costmap",
+            "map_timeout": MAP_TIMEOUT,
+            "follow_trainer": True,
         }
+        of_trainer = {
+            "learn_from": "driving",
+            "pose_source": SOURCE,
+            "output_folder": f"{folder}/drives",
+        }
+        nodes = {
+            "map_server_node": running_node("map_server_node", *quiet),
+            "planner_node": running_node("planner_node", *quiet),
+            "robot's planner": running_node("planner_node", *quiet, *apart, **of_planner),
+            "robot's trainer": running_node("trainer_node", *quiet, *apart, **of_trainer),
+        }
+        children = {name: stack.enter_context(node) for name, node in nodes.items()}
         robot = stack.enter_context(closing(SimulatedRobot()))
         work = Work(client, Path(folder))
         samples = soak(children, work, minutes, robot)
@@ -203,16 +381,14 @@ def main(arguments: Sequence[str]) -> int:
         done = ", ".join(f"{name} {count}" for name, count in sorted(what.done.items()))
         print(f"{minutes:g} minutes: {done}; {what.lost} lost")
     print(f"{robot.stale} stale answers; the robot's poses came by {SOURCE}")
-    print(f"{'node':<16} {'samples':>7} {'at start':>9} {'warm':>9} {'at end':>9} {'growth':>7}")
-    fine = not (work.lost or robot.lost or robot.stale)
-    for name, sampled in samples.items():
-        warm, last, grown = growth(sampled)
-        fine &= grown <= MAX_GROWTH
-        print(
-            f"{name:<16} {len(sampled):>7} {sampled[0]:>6.1f} MB {warm:>6.1f} MB {last:>6.1f} MB "
-            f"{grown:>+7.1%}"
-        )
-    return int(not fine)
+    rows = [
+        [name, len(sampled), f"{sampled[0]:.1f}", f"{warm:.1f}", f"{last:.1f}", f"{grown:+.1%}"]
+        for name, sampled in samples.items()
+        for warm, last, grown in [growth(sampled)]
+    ]
+    print(table(["node", "samples", "MB at start", "warm", "at end", "growth"], rows))
+    grows = any(growth(sampled)[2] > MAX_GROWTH for sampled in samples.values())
+    return int(bool(work.lost or robot.lost or robot.stale or grows))
 
 
 if __name__ == "__main__":

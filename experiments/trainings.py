@@ -65,7 +65,8 @@ def in_parallel(
         Client()  # of the scheduler that DASK_SCHEDULER_ADDRESS names, else of this machine
     jobs = (joblib.delayed(_in_one_thread)(job, item) for item in items)
     with joblib.parallel_config(backend, n_jobs=-1):
-        results = joblib.Parallel(return_as="generator")(jobs)
+        # Ray's backend has no generator: its bar jumps to the end.
+        results = joblib.Parallel(return_as="list" if backend == "ray" else "generator")(jobs)
         # disable=None: no bar if the output is not a terminal.
         return list(tqdm(results, total=len(items), unit=unit, disable=None))
 

@@ -58,13 +58,29 @@ def model_path(tmp_path: Path, network: QNetwork) -> Path:
     return path
 
 
-def test_a_saved_model_comes_back_the_same(model_path: Path, network: QNetwork) -> None:
-    loaded, metadata = load_model(model_path)
-    assert metadata == METADATA
-    request = GridMap(np.zeros((4, 5))), (1, 1), MoveRule.ROBOT_SAFE
-    np.testing.assert_array_equal(
-        network_field(loaded, *request).q, network_field(network, *request).q
-    )
+@pytest.mark.parametrize(
+    ("kind", "sizes"),
+    [
+        ("paper", METADATA.sizes),
+        ("paper", {**METADATA.sizes, "hidden_units": 3}),
+        ("propagation", {"filters": 3}),
+        ("any_map", {"filters": 3}),
+    ],
+)
+def test_a_saved_model_comes_back_the_same(
+    tmp_path: Path, kind: str, sizes: dict[str, int]
+) -> None:
+    path, network = tmp_path / "model.safetensors", random_network(kind, **sizes)
+    description = replace(METADATA, network=kind, sizes=sizes)
+    save_model(path, network, description)
+    loaded, metadata = load_model(path)
+    assert metadata == description
+    assert type(loaded) is type(network)
+    for key, tensor in network.tensors.items():
+        np.testing.assert_array_equal(loaded.tensors[key], tensor)
+    path.write_bytes(bytes(path.stat().st_size))  # what is loaded stays as it is
+    for key, tensor in network.tensors.items():
+        np.testing.assert_array_equal(loaded.tensors[key], tensor)
 
 
 def test_a_model_file_that_names_no_hidden_units_has_none(
@@ -72,24 +88,7 @@ def test_a_model_file_that_names_no_hidden_units_has_none(
 ) -> None:
     path = tmp_path / "old.safetensors"
     save_model(path, network, replace(METADATA, sizes={"height": 4, "width": 5, "filters": 2}))
-    loaded, metadata = load_model(path)
-    assert metadata == METADATA
-    request = GridMap(np.zeros((4, 5))), (1, 1), MoveRule.ROBOT_SAFE
-    np.testing.assert_array_equal(
-        network_field(loaded, *request).q, network_field(network, *request).q
-    )
-
-
-def test_a_network_with_a_hidden_layer_comes_back_the_same(tmp_path: Path) -> None:
-    sizes = {**METADATA.sizes, "hidden_units": 3}
-    network = random_network("paper", **sizes)
-    save_model(tmp_path / "hidden.safetensors", network, replace(METADATA, sizes=sizes))
-    loaded, metadata = load_model(tmp_path / "hidden.safetensors")
-    assert metadata.sizes == sizes
-    request = GridMap(np.zeros((4, 5))), (1, 1), MoveRule.ROBOT_SAFE
-    np.testing.assert_array_equal(
-        network_field(loaded, *request).q, network_field(network, *request).q
-    )
+    assert load_model(path)[1] == METADATA
 
 
 def test_a_file_that_is_truncated_anywhere_is_refused(model_path: Path) -> None:
@@ -119,13 +118,6 @@ def test_a_file_with_one_wrong_byte_is_a_model_or_refused(model_path: Path) -> N
     assert refused > 100
 
 
-def test_a_loaded_model_does_not_change_with_its_file(model_path: Path) -> None:
-    loaded, _ = load_model(model_path)
-    before = {key: tensor.copy() for key, tensor in loaded.tensors.items()}
-    model_path.write_bytes(bytes(model_path.stat().st_size))
-    assert all((before[key] == tensor).all() for key, tensor in loaded.tensors.items())
-
-
 def test_a_pickle_is_not_run(tmp_path: Path) -> None:
     class Bomb:
         def __reduce__(self) -> tuple[object, ...]:
@@ -138,8 +130,12 @@ def test_a_pickle_is_not_run(tmp_path: Path) -> None:
     assert not (tmp_path / "exploded").exists()
 
 
+MISSING = object()
+
+
 def save_as(path: Path, weights: QNetwork, /, **changes: object) -> None:
     description = {**asdict(METADATA), **changes}
+    description = {key: value for key, value in description.items() if value is not MISSING}
     content = safetensors.numpy.save(weights.tensors, {"ddqn_planner": json.dumps(description)})
     path.write_bytes(content)
 
@@ -166,6 +162,7 @@ def save_as(path: Path, weights: QNetwork, /, **changes: object) -> None:
         ({"gamma": 1.5}, r"gamma is 1\.5"),
         ({"steps": 1.5}, r"steps is 1\.5"),
         ({"map_fingerprint": None}, "map_fingerprint is None"),
+        ({"seed": MISSING}, r"metadata is wrong .*\['seed'\]"),
     ],
 )
 def test_wrong_metadata_is_refused_by_name(
@@ -177,34 +174,10 @@ def test_wrong_metadata_is_refused_by_name(
         load_model(path)
 
 
-@pytest.mark.parametrize("kind", ["propagation", "any_map"])
-def test_a_network_for_any_size_comes_back_the_same(tmp_path: Path, kind: str) -> None:
-    path, network = tmp_path / "model.safetensors", random_network(kind, filters=3)
-    description = replace(METADATA, network=kind, sizes={"filters": 3})
-    save_model(path, network, description)
-    loaded, read = load_model(path)
-    assert read == description
-    request = GridMap(np.zeros((3, 6))), (5, 2), MoveRule.CORNER_CUTTING
-    np.testing.assert_array_equal(
-        network_field(loaded, *request).q, network_field(network, *request).q
-    )
-
-
 def test_safetensors_of_another_program_are_refused(tmp_path: Path) -> None:
     path = tmp_path / "model.safetensors"
     path.write_bytes(safetensors.numpy.save({"weight": np.zeros(2)}))
     with pytest.raises(ModelFileError, match="no model of ddqn_planner"):
-        load_model(path)
-
-
-@pytest.mark.parametrize("key", list(asdict(METADATA)))
-def test_metadata_without_a_key_is_refused(tmp_path: Path, network: QNetwork, key: str) -> None:
-    description = asdict(METADATA)
-    del description[key]
-    path = tmp_path / "model.safetensors"
-    text = json.dumps(description)
-    path.write_bytes(safetensors.numpy.save(network.tensors, {"ddqn_planner": text}))
-    with pytest.raises(ModelFileError, match=rf"metadata is wrong .*{key}"):
         load_model(path)
 
 
@@ -307,15 +280,6 @@ def test_whatever_finite_weights_say_each_q_is_a_length_or_no_way(
     q = network_field(loaded, grid, goal, rule).q
     longest = 2 * MAX_MULTIPLIER * grid.occupancy.size
     assert (np.isneginf(q) | ((q <= -1) & (q >= -longest))).all()
-
-
-@same_folder
-@given(st.binary(max_size=300) | st.binary(max_size=300).map(lambda b: bytes([len(b)]) + b))
-def test_any_bytes_are_refused(tmp_path: Path, content: bytes) -> None:
-    path = tmp_path / "model.safetensors"
-    path.write_bytes(content)
-    with pytest.raises(ModelFileError, match="truncated or of another kind"):
-        load_model(path)
 
 
 def huge_files(folder: Path) -> list[Path]:

@@ -112,13 +112,6 @@ def test_the_shipped_models_answer_as_their_modules(paper) -> None:  # type: ign
 # The paper's network
 
 
-def test_a_robot_in_the_last_row_and_column_is_seen() -> None:
-    network = random_network("paper", height=20, width=20, filters=4, hidden_units=0)
-    q = network.q_values(GridMap(np.zeros((20, 20))), (3, 3), MoveRule.ROBOT_SAFE)
-    assert not np.allclose(q[:, 19, 19], q[:, 19, 18])
-    assert not np.allclose(q[:, 19, 19], q[:, 18, 19])
-
-
 def test_the_network_is_the_papers_convolution_relu_and_fully_connected_layer() -> None:
     module = PaperModule(7, 10, filters=5)
     observations = torch.randn(6, 7, 10)

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from networks import turning_network
 from strategies import grids_in_parts, grids_with_costs, grids_with_free_cell
 
-from ddqn_planner import GridMap, MoveRule, PlanMethod, Planner, PlanStatus, inflate
+from ddqn_planner import GridMap, MoveRule, PlanMethod, Planner, PlanStatus
 from ddqn_planner.grid import Cell, shortest_distances
 from ddqn_planner.model import ModelMetadata
 from ddqn_planner.planning import field as fields
@@ -113,15 +113,6 @@ def test_goals_that_are_not_free_are_left_out() -> None:
     assert ANY_MAP.plan_nearest(grid, (7, 0), [(0, 0)]).status is PlanStatus.START_OCCUPIED
 
 
-def test_a_start_too_near_to_an_obstacle_leaves_for_the_nearest_goal() -> None:
-    occupancy = np.zeros((7, 12), dtype=bool)
-    occupancy[3, 5] = True
-    grid = inflate(GridMap(occupancy), 1.1)
-    plan = ANY_MAP.plan_nearest(grid, (6, 3), [(0, 3), (11, 3)])
-    assert plan.goal == (11, 3)
-    assert plan.cells[0] == (6, 3)
-
-
 def turning_planner(size: int = 6) -> Planner:
     network = turning_network(size)
     metadata = ModelMetadata("paper", network.sizes, MoveRule.ROBOT_SAFE, 0.9, "", 1, 0, "")
@@ -179,15 +170,6 @@ def test_a_path_through_goals_is_the_sum_of_its_pieces(
         assert plan.cost == pytest.approx(sum(piece.cost or 0 for piece in pieces))
 
 
-def test_a_path_through_goals_tells_where_it_was_searched_for() -> None:
-    grid, planner = GridMap(np.zeros((6, 6))), turning_planner()
-    goals = [(2, 0), (5, 5)]
-    plan = planner.plan_through(grid, (5, 0), goals, method="astar_fallback")
-    assert plan.method is PlanMethod.ASTAR_FALLBACK
-    trapped = planner.plan_through(grid, (5, 0), goals)
-    assert (trapped.status, trapped.goal) == (PlanStatus.ROLLOUT_TRAPPED, (5, 5))
-
-
 def test_wrong_goals_are_named() -> None:
     grid = GridMap(np.zeros((3, 3)))
     for plan in (ANY_MAP.plan_nearest, ANY_MAP.plan_through):
@@ -212,13 +194,3 @@ def test_plans_through_cells_are_joined_without_a_doubled_cell() -> None:
     assert joined([plans[0]]) == plans[0]
     failed = planner.plan(grid, (5, 0), (9, 0))
     assert joined([plans[0], failed]) is failed
-
-
-def test_the_cost_of_joined_plans_is_the_sum() -> None:
-    cost = np.arange(64, dtype=np.int8).reshape(8, 8)
-    grid = GridMap(np.zeros((8, 8), dtype=np.bool_), cost=cost)
-    planner = Planner.load("any_map")
-    plans = [planner.plan(grid, (0, 0), (7, 0)), planner.plan(grid, (7, 0), (0, 7))]
-    pieces = [plan.cost or 0.0 for plan in plans]
-    assert joined(plans).cost == pytest.approx(sum(pieces))
-    assert joined(plans).move_rule is MoveRule.ROBOT_SAFE

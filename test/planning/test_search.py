@@ -59,14 +59,6 @@ def test_follows_the_values_even_on_a_detour() -> None:
     assert len(search((0, 0), (4, 0), legal, grid.cost_multiplier, rule)) == 5
 
 
-def test_visits_cells_without_a_value_last() -> None:
-    grid, rule = GridMap(np.array([[0, 0, 0], [0, 1, 0], [0, 0, 0]])), MoveRule.ROBOT_SAFE
-    value = np.zeros((3, 3), np.float32)
-    value[0, 1] = np.nan
-    legal = legal_moves(grid.occupancy, rule)
-    assert (1, 0) not in search((0, 0), (2, 0), legal, grid.cost_multiplier, rule, value)
-
-
 def test_a_move_costs_the_mean_cost_of_its_two_cells() -> None:
     # From a start of high cost the straight move is cheaper, though its end costs more.
     grid = GridMap(np.array([[0, 0, 1], [1, 0, 0]]), cost=np.array([[99, 3, 0], [0, 0, 0]]))

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from strategies import grids_with_costs, grids_with_free_cell
+from strategies import grids_with_costs, grids_with_directions, grids_with_free_cell
 
-from ddqn_planner.grid import Cell, GridMap, MoveRule, path_cost, path_length, shortest_path
-from ddqn_planner.planning import simplify
+from ddqn_planner import GridMap, MoveRule, simplify
+from ddqn_planner.grid import MOVES, Cell, path_cost, path_length, shortest_path
 from ddqn_planner.planning.paths import segment_cost, touched_cells
 
 RULES = st.sampled_from(list(MoveRule))
@@ -41,22 +41,6 @@ def test_corners_count_where_they_may_not_be_cut() -> None:
     assert touched_cells((0, 0), (1, 1), MoveRule.CORNER_CUTTING).tolist() == [[0, 0], [1, 1]]
     assert len(touched_cells((0, 0), (1, 1), MoveRule.ROBOT_SAFE)) == 4
     assert len(touched_cells((0, 0), (-3, 3), MoveRule.ROBOT_SAFE)) == 10
-
-
-@given(grids_with_free_cell(), RULES, st.data())
-def test_a_simplified_path_has_fewer_cells_no_illegal_segment_and_is_no_longer(
-    grid_and_goal: tuple[GridMap, Cell], rule: MoveRule, data: st.DataObject
-) -> None:
-    grid, goal = grid_and_goal
-    cells = shortest_path(grid, data.draw(st.sampled_from(grid.free_cells())), goal, rule)
-    simple = simplify(cells, grid, rule)
-    if cells:
-        assert (simple[0], simple[-1]) == (cells[0], cells[-1])
-    assert set(simple) <= set(cells)
-    assert path_length(simple) <= path_length(cells) + 1e-9
-    for first, last in pairwise(simple):
-        for x, y in touched_cells(first, last, rule).tolist():
-            assert not grid.occupancy[y, x]
 
 
 def share_within(cell: Cell, first: Cell, last: Cell) -> Fraction:
@@ -98,53 +82,53 @@ def test_each_cell_counts_by_the_length_of_the_segment_within_it(
         assert path_cost([first, last], grid.cost_multiplier, rule) == pytest.approx(exact)
 
 
-def check_costs(grid: GridMap, cells: list[Cell], rule: MoveRule) -> None:
-    for first, last in pairwise(simplify(cells, grid, rule)):
-        part = cells[cells.index(first) : cells.index(last) + 1]
+def check_simplified(path: list[Cell], grid: GridMap, rule: MoveRule) -> tuple[Cell, ...]:
+    """Check that each segment is legal, and costs no more than what it replaces."""
+    simple, moves = simplify(path, grid, rule), MOVES.tolist()
+    assert simple[:1] + simple[-1:] == (*path[:1], *path[-1:])
+    for first, last in pairwise(simple):
+        part = path[path.index(first) : path.index(last) + 1]
         replaced = sum(exact_cost(a, b, grid.cost_multiplier, rule) for a, b in pairwise(part))
         assert exact_cost(first, last, grid.cost_multiplier, rule) <= replaced * (1 + 1e-8)
+        step = [last[0] - first[0], last[1] - first[1]]
+        if step in moves:
+            continue  # a move of the path
+        for x, y in touched_cells(first, last, rule).tolist():
+            assert not grid.occupancy[y, x]
+        angle = np.arctan2(step[1], step[0]) / (np.pi / 4)
+        actions = {int(np.floor(angle + 1e-9)) % 8, int(np.ceil(angle - 1e-9)) % 8}
+        for x, y in touched_cells(first, last, MoveRule.UNIT).tolist():
+            if (x, y) != last and grid.forbidden is not None:
+                assert not any(grid.forbidden[y, x] >> action & 1 for action in actions)
+    return simple
 
 
-@settings(max_examples=200)
-@given(grids_with_costs(), RULES, st.data())
-def test_no_segment_costs_more_than_what_it_replaces(
+@settings(max_examples=300)
+@given(grids_with_free_cell() | grids_with_costs() | grids_with_directions(), RULES, st.data())
+def test_a_simplified_path_is_legal_and_costs_no_more(
     grid_and_goal: tuple[GridMap, Cell], rule: MoveRule, data: st.DataObject
 ) -> None:
     grid, goal = grid_and_goal
-    cells = shortest_path(grid, data.draw(st.sampled_from(grid.free_cells())), goal, rule)
-    check_costs(grid, cells, rule)
+    path = shortest_path(grid, data.draw(st.sampled_from(grid.free_cells())), goal, rule)
+    simple = check_simplified(path, grid, rule)
+    assert path_length(simple) <= path_length(path) + 1e-9
+    assert path_length(simple, MoveRule.UNIT) <= path_length(path, MoveRule.UNIT)
 
 
-def test_a_segment_through_little_of_what_is_dear_is_weighed_by_it() -> None:
+def test_a_segment_through_little_of_what_costs_much_is_weighed_by_it() -> None:
     cost = np.array([[0, 99, 0, 99], [50, 50, 50, 50]])
-    grid, cells = GridMap(np.zeros((2, 4)), cost=cost), [(0, 0), (1, 1), (2, 0), (3, 1)]
+    grid, path = GridMap(np.zeros((2, 4)), cost=cost), [(0, 0), (1, 1), (2, 0), (3, 1)]
     for rule in MoveRule:
-        check_costs(grid, cells, rule)
-        assert len(simplify(cells, grid, rule)) == 4
-    # The two cells that it passes through cost as much as those of the path.
-    grid = GridMap(np.zeros((2, 3)), cost=np.array([[10, 20, 30], [0, 0, 30]]))
-    assert simplify([(0, 0), (1, 0), (2, 0), (2, 1)], grid, "robot_safe")[0] == (0, 0)
+        assert len(check_simplified(path, grid, rule)) == 4
 
 
 def test_under_the_unit_rule_diagonals_are_joined_and_no_segment_counts_more() -> None:
-    grid = GridMap(np.zeros((9, 12)))
-    cells = [(x, x) for x in range(9)]
-    assert simplify(cells, grid, MoveRule.UNIT) == ((0, 0), (8, 8))
-    cells += [(9, 8), (10, 8), (11, 8)]
-    simple = simplify(cells, grid, MoveRule.UNIT)
+    grid, path = GridMap(np.zeros((9, 12))), [(x, x) for x in range(9)]
+    assert simplify(path, grid, MoveRule.UNIT) == ((0, 0), (8, 8))
+    path += [(9, 8), (10, 8), (11, 8)]
+    simple = simplify(path, grid, MoveRule.UNIT)
     assert len(simple) <= 3
-    assert path_length(simple, MoveRule.UNIT) == path_length(cells, MoveRule.UNIT) == 11
-
-
-@given(grids_with_free_cell(), st.data())
-def test_under_the_unit_rule_a_shortest_path_keeps_its_length(
-    grid_and_goal: tuple[GridMap, Cell], data: st.DataObject
-) -> None:
-    grid, goal = grid_and_goal
-    start = data.draw(st.sampled_from(grid.free_cells()))
-    cells = shortest_path(grid, start, goal, MoveRule.UNIT)
-    simple = simplify(cells, grid, MoveRule.UNIT)
-    assert path_length(simple, "unit") <= path_length(cells, "unit") == max(len(cells) - 1, 0)
+    assert path_length(simple, MoveRule.UNIT) == path_length(path, MoveRule.UNIT) == 11
 
 
 def test_any_pairs_of_whole_numbers_are_cells_and_come_back_as_python_ints() -> None:
@@ -152,22 +136,18 @@ def test_any_pairs_of_whole_numbers_are_cells_and_come_back_as_python_ints() -> 
     cells = np.array([(0, 0), (1, 0), (2, 0), (3, 1), (4, 2)])
     assert repr(simplify(cells, grid, "unit")) == repr(simplify(cells.tolist(), grid, "unit"))
     with pytest.raises(ValueError, match=r"the cell is \(0\.5, 0\)"):
-        simplify([(0.5, 0)], grid, "unit")  # type: ignore[list-item]
+        simplify([(0.5, 0)], grid, "unit")
 
 
-def test_a_segment_reaches_to_the_corner_of_a_corridor_of_any_length() -> None:
+def test_segments_are_as_long_as_can_be() -> None:
+    rule = MoveRule.ROBOT_SAFE
     for length in range(2, 20):
         occupancy = np.ones((4, length + 1), dtype=bool)
         occupancy[0] = occupancy[:, length] = False
-        cells = [(x, 0) for x in range(length + 1)] + [(length, y) for y in range(1, 4)]
+        path = [(x, 0) for x in range(length + 1)] + [(length, y) for y in range(1, 4)]
         expected = ((0, 0), (length, 0), (length, 3))
-        assert simplify(cells, GridMap(occupancy), MoveRule.ROBOT_SAFE) == expected
-
-
-def test_a_straight_way_has_two_cells_and_an_open_map_too() -> None:
-    grid, rule = GridMap(np.zeros((40, 90))), MoveRule.ROBOT_SAFE
-    assert simplify([(x, 3) for x in range(90)], grid, rule) == ((0, 3), (89, 3))
-    cells = shortest_path(grid, (2, 5), (80, 31), rule)
-    assert simplify(cells, grid, rule) == ((2, 5), (80, 31))
+        assert simplify(path, GridMap(occupancy), rule) == expected
+    grid = GridMap(np.zeros((40, 90)))
+    assert simplify(shortest_path(grid, (2, 5), (80, 31), rule), grid, rule) == ((2, 5), (80, 31))
     assert simplify([], grid, rule) == ()
     assert simplify([(1, 1)], grid, rule) == ((1, 1),)

@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from strategies import grids_with_directions, grids_with_free_cell
 
-from ddqn_planner import GridMap, MoveRule, PlanMethod, Planner, PlanStatus, inflate
+from ddqn_planner import GridMap, MoveRule, Planner, PlanStatus, inflate
 from ddqn_planner.grid import Cell, path_length
 from ddqn_planner.planning import PlanRequest
 from ddqn_planner.planning.paths import is_path_valid
@@ -193,14 +193,6 @@ def test_a_path_under_way_is_kept_if_the_way_out_lies_on_it(
     plan = last_step(ANY_MAP.steps(request))
     assert plan.cells == (*begin, *under_way[6:])
     assert (plan.extra_cost is not None) == is_kept
-
-
-@pytest.mark.parametrize("method", list(PlanMethod))
-def test_a_simplified_path_keeps_the_cells_of_the_way_out(method: PlanMethod) -> None:
-    plan = ANY_MAP.plan(
-        wall(2), (9, 2), (20, 2), method=method, simplified=True, start_clearing_radius=1
-    )
-    assert plan.cells == ((9, 2), (10, 2), (20, 2))
 
 
 def test_the_corners_of_the_square_around_a_start_lie_beyond_a_radius_of_one_cell() -> None:
