@@ -48,14 +48,13 @@ def test_training_on_small_random_maps_learns_the_moves_on_other_maps_and_their_
     assert evaluation.solved == evaluation.starts > 100
     assert evaluation.worst_ratio < 1.3
 
-    occupancy = random.random((30, 30)) < 0.2
-    cost = np.where(random.random((30, 30)) < 0.2, UNKNOWN, random_costs(occupancy, random))
-    with_costs = GridMap(occupancy, cost=cost.astype(np.int8))
+    cost = np.where(random.random((40, 50)) < 0.2, UNKNOWN, random_costs(rooms, random))
+    with_costs = GridMap(rooms, cost=cost.astype(np.int8))
     evaluation = evaluation_of(planner, with_costs, rule)
     assert evaluation.solved == evaluation.starts > 100
     # A planner that does not see the costs takes the shortest path, which costs more.
     goal = with_costs.free_cells()[-1]
-    blind = evaluate(planner.q_field(GridMap(occupancy), goal, rule), with_costs, rule)
+    blind = evaluate(planner.q_field(GridMap(rooms), goal, rule), with_costs, rule)
     assert evaluation.mean_ratio < (1 + blind.mean_ratio) / 2
 
 
