@@ -212,12 +212,6 @@ def test_a_planner_keeps_the_path_under_way_up_to_the_threshold() -> None:
     assert not is_upper(plan(blocked, 10.0, first.every_cell))
 
 
-def test_the_same_path_is_no_new_one() -> None:
-    grid = two_corridors(20, 22)
-    first = plan(grid, 0.0)
-    assert plan(grid, 0.0, first.every_cell) == replace(first, extra_cost=0.0)
-
-
 @given(GRIDS, RULES, st.sampled_from([0.0, 0.3, 10.0]), st.data())
 def test_a_path_to_another_goal_is_kept_up_to_the_threshold_while_that_goal_is_free(
     grid_and_cell: tuple[GridMap, Cell], rule: MoveRule, threshold: float, data: st.DataObject
