@@ -91,6 +91,13 @@ def test_a_path_is_valid_if_all_of_it_from_the_cell_nearest_to_the_robot_on_is_l
     assert is_path_valid(path, robot, grid, rule)
 
 
+def test_a_path_of_which_only_an_occupied_end_is_left_is_not_valid() -> None:
+    grid, path = GridMap(np.zeros((1, 9))), [(0, 0), (1, 0), (2, 0)]
+    for robot in ((9, 0), (2, 5)):  # off the map, so that its own cell does not count
+        assert is_path_valid(path, robot, grid, "robot_safe")
+        assert not is_path_valid(path, robot, grid.with_patch([[True]], 2, 0), "robot_safe")
+
+
 def test_an_empty_path_is_not_valid_and_nothing_is_left_of_it() -> None:
     grid = GridMap(np.zeros((3, 3)))
     assert not is_path_valid([], (0, 0), grid, "robot_safe")
