@@ -3,8 +3,8 @@
     python examples/live_view.py                                  # opens rerun's viewer
     python examples/live_view.py --save run.rrd --ros-args -r __ns:=/robot
 
-All is drawn in cells of the map, with y upwards. It needs `pip install rerun-sdk`; RViz shows the
-same topics.
+All is drawn in cells of the map, with y upwards. It needs `pip install rerun-sdk matplotlib`; RViz
+shows the same topics.
 """
 
 from __future__ import annotations
@@ -13,10 +13,12 @@ import argparse
 import sys
 from collections.abc import Sequence
 from functools import partial
+from typing import Any
 
 import numpy as np
 import rclpy
 import rerun as rr
+from matplotlib.colors import LinearSegmentedColormap
 from nav_msgs.msg import OccupancyGrid, Path
 from numpy.typing import NDArray
 from PIL import ImageColor
@@ -30,17 +32,9 @@ from ddqn_planner.pictures import PATH_COLOUR, VALUE_COLOURS
 
 LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 EPISODE_COLOUR = "#edae49"
+COLOURS = LinearSegmentedColormap.from_list("value", VALUE_COLOURS)
 LAYERS = ("map", "value", "plan", "episode")
 """From bottom to top."""
-
-
-def ramp(levels: int) -> NDArray[np.uint8]:
-    """Return (levels, 3) uint8, RGB: the colours of values from the worst to the best."""
-    rgb = np.array([ImageColor.getrgb(colour) for colour in VALUE_COLOURS])
-    places, wanted = np.linspace(0, 1, len(rgb)), np.linspace(0, 1, levels)
-    channels = [np.interp(wanted, places, channel) for channel in rgb.T]
-    rounded: NDArray[np.uint8] = np.stack(channels, axis=1).round().astype(np.uint8)
-    return rounded
 
 
 class LiveView(Node):
@@ -68,8 +62,8 @@ class LiveView(Node):
     def _on_value(self, message: OccupancyGrid) -> None:
         values = np.array(message.data, dtype=np.int16)
         if message.info.width == self._info.width and message.info.height == self._info.height:
-            alpha = np.where(values < 0, 0, 255)  # cells without a value show the map
-            self._draw_image("value", np.column_stack([ramp(101)[values.clip(0)], alpha]))
+            shown = np.ma.masked_less(values, 0)  # cells without a value show the map
+            self._draw_image("value", COLOURS(shown / 100, bytes=True))
 
     def _on_path(self, name: str, message: Path) -> None:
         self._paths[name] = message
@@ -78,7 +72,7 @@ class LiveView(Node):
     def _on_reward(self, message: Float32) -> None:
         rr.log("reward", rr.Scalars(message.data))
 
-    def _draw_image(self, name: str, colours: NDArray[np.int16]) -> None:
+    def _draw_image(self, name: str, colours: NDArray[Any]) -> None:
         image = colours.astype(np.uint8).reshape(self._info.height, self._info.width, -1)
         rr.log(f"map/{name}", rr.Image(image[::-1], draw_order=LAYERS.index(name)))
 

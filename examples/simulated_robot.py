@@ -1,9 +1,9 @@
-"""A simulated robot with two driven wheels, as a ROS node, in a world whose slowness nobody tells.
+"""A simulated robot as a ROS node, in a world whose slowness nobody tells.
 
 It follows the last `plan`, and publishes `odom` and, where tf2_ros is installed, a transform. Slow
 zones, a carpet on which wheels slip, a door, and crowds that come and go by the hour slow it down.
-It stops before an obstacle. Where it stands without a path that it can follow, it sends the last
-`goal_pose` again. Its time runs faster than the clock: the stamps are simulated.
+Where it stands without a path that it can join, it sends the last `goal_pose` again. Its time runs
+faster than the clock: the stamps are simulated.
 
     python examples/simulated_robot.py --ros-args -p world:=office -p seed:=1 -p speed_up:=30.0
 """
@@ -36,15 +36,6 @@ STEP = 0.2
 MORNING = 3000.0
 """When the simulated time begins, seconds: ten minutes later the first crowd goes."""
 
-LOOK_AHEAD = 0.4
-"""Metres from the robot to the point of the path that it drives to."""
-
-TURN_RATE = 2.0
-"""Radians per second."""
-
-ARRIVED = 0.15
-"""Metres."""
-
 JOIN_DISTANCE = 2.0
 """Metres from which the robot drives to the nearest point of a new path."""
 
@@ -60,14 +51,7 @@ PATIENCE = 2.0
 
 
 class Robot:
-    """A robot that follows paths by pure pursuit, and sees obstacles.
-
-    Parameters
-    ----------
-    world : World
-    seed : int
-        Of the noise of its speed.
-    """
+    """A robot that follows paths from point to point; the seed is that of its speed's noise."""
 
     def __init__(self, world: World, seed: int) -> None:
         self.world = world
@@ -117,39 +101,17 @@ class Robot:
         return np.floor((points - grid.origin[:2]) / grid.resolution).astype(np.int64)
 
     def _move(self, seconds: float) -> float:
-        """Turn, or drive in an arc; return how long it took."""
-        away = np.hypot(*(self._path - (self.x, self.y)).T)
-        beyond = np.flatnonzero(away >= LOOK_AHEAD)
-        seen = np.flatnonzero(self._sees(self._path[: beyond[0] + 1 if len(beyond) else None]))
-        if not len(seen):  # it has to ask for another path
-            self._path = self._path[:0]
-            return seconds
-        aim_x, aim_y = self._path[seen[-1]]
-        nearest = int(seen[away[seen].argmin()])
-        self._path = self._path[nearest:]
-        if away[-1] < ARRIVED and len(self._path) <= 2 / self.world.grid.resolution:
-            self._path = self._path[:0]
-            return seconds
-        bearing = math.atan2(aim_y - self.y, aim_x - self.x) - self.yaw
-        bearing = math.remainder(bearing, 2 * math.pi)
-        if abs(bearing) > math.pi / 4:
-            return self._turn(bearing, seconds)
-        seconds = min(seconds, 0.05)
-        metres = self._speed() * seconds
-        distance = max(math.dist((aim_x, aim_y), (self.x, self.y)), 0.05)
-        yaw = self.yaw + 2 * math.sin(bearing) / distance * metres
-        x, y = self.x + metres * math.cos(yaw), self.y + metres * math.sin(yaw)
-        grid = self.world.grid
-        if abs(bearing) > 1e-3 and not grid.is_free(grid.world_to_cell(x, y)):
-            return self._turn(bearing, seconds)  # then the way is straight, and free
-        self.x, self.y, self.yaw = x, y, yaw
-        return seconds
-
-    def _turn(self, angle: float, seconds: float) -> float:
-        """Turn on the spot; return how long it took."""
-        turn = min(abs(angle), TURN_RATE * seconds)
-        self.yaw += math.copysign(turn, angle)
-        return turn / TURN_RATE
+        """Drive toward the next point of the path; return how long it took."""
+        ahead = self._path[0] - (self.x, self.y)
+        away, speed = math.hypot(*ahead), self._speed()
+        metres = min(away, speed * min(seconds, 0.05))
+        if metres < away:
+            self.x, self.y = np.array([self.x, self.y]) + metres / away * ahead
+        else:
+            (self.x, self.y), self._path = self._path[0], self._path[1:]
+        if away:
+            self.yaw = math.atan2(ahead[1], ahead[0])
+        return metres / speed
 
     def _speed(self) -> float:
         grid = self.world.grid

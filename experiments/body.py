@@ -7,13 +7,13 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import scipy.ndimage
 import scipy.sparse
 from numpy.typing import NDArray
+from tables import table
 
 from ddqn_planner import GridMap, MoveRule, Planner, inflate, load_map
 from ddqn_planner.grid import (
@@ -33,64 +33,49 @@ REQUESTS = 200
 WEIGHTS = (0.0, 0.5, 1.0)
 MAX_RATIO = 1.10
 BOUND_FACTORS = np.array([1.01, 1.1, 1.3, 1.6, 2.5, 5.0])
-
-
-@dataclass(frozen=True)
-class Measured:
-    """The distances from all poses of all paths to obstacles, metres, and the lengths."""
-
-    least: float
-    mean: float
-    edge: float  # the least distance to the edge of an occupied cell
-    ratio: NDArray[np.float64]  # (N,) lengths over the optimum; infinite without a path
+HEADER = (
+    "clearance_weight",
+    "solved",
+    "length over the optimum, mean",
+    "worst",
+    "least metres to an obstacle's cell",
+    "to its edge",
+    "mean metres",
+    "over weight 0",
+    "without the body, over weight 0",
+)
 
 
 def main(arguments: Sequence[str]) -> int:
     """Print a row for each weight; return 1 if a request was not solved."""
     path = str(arguments[0] if arguments else find_map("office"))
     radius = float(arguments[1]) if len(arguments) > 1 else 0.15
-    grid = load_map(path)
+    grid, planner = load_map(path), Planner.load("any_map")
     inflated, metres = inflate(grid, radius), clearance(grid.occupancy) * grid.resolution
+    edges = edge_distances(grid)
     requests = random_requests(inflated.occupancy, RULE, REQUESTS, np.random.default_rng(0))
     optima = [shortest_distances(inflated, goal, RULE)[start[::-1]] for start, goal in requests]
-    print(f"{Path(path).stem}: {len(requests)} requests, robot_radius {radius} m")
-    planner, measured = Planner.load("any_map"), {}
+    rows, plain, lost = [], 0.0, 0
     for weight in WEIGHTS:
         body = inflate(grid, radius, weight)
         paths = [planner.plan(body, start, goal, RULE).cells for start, goal in requests]
-        measured[weight] = measure(paths, optima, metres, edge_distances(grid))
-    plain = measured[0.0]
-    for weight, of_paths in measured.items():
-        print(
-            f"clearance_weight {weight}: solved {np.isfinite(of_paths.ratio).sum()}; length over "
-            f"the optimum: mean {of_paths.ratio.mean():.4f}, worst {of_paths.ratio.max():.4f}; "
-            f"distance to an obstacle's cell: least {of_paths.least:.3f} m (to its edge "
-            f"{of_paths.edge:.3f} m), mean {of_paths.mean:.3f} m, "
-            f"{of_paths.mean / plain.mean:.2f} of without; between it and the body "
-            f"{(of_paths.mean - radius) / (plain.mean - radius):.2f} of without"
-        )
+        solved = [(path_length(cells), n) for n, cells in enumerate(paths) if cells]
+        ratios = np.array([length / optima[number] for length, number in solved])
+        x, y = np.transpose([cell for cells in paths for cell in cells])
+        mean = metres[y, x].mean()
+        plain = plain or mean
+        figures = [ratios.mean(), ratios.max(), metres[y, x].min(), edges[y, x].min(), mean]
+        figures += [mean / plain, (mean - radius) / (plain - radius)]
+        lost += REQUESTS - len(solved)
+        rows.append([weight, len(solved), *(f"{figure:.4f}" for figure in figures)])
+    print(f"{Path(path).stem}: {len(requests)} requests, robot_radius {radius} m")
+    print(table(HEADER, rows))
     bound = greatest_distance(inflated, metres, requests, MAX_RATIO)
     print(
         f"no paths of {MAX_RATIO} times the least total length have a mean distance above "
-        f"{bound:.3f} m, {bound / plain.mean:.2f} of without"
+        f"{bound:.3f} m, {bound / plain:.2f} of that of weight 0"
     )
-    return int(not all(np.isfinite(of_paths.ratio).all() for of_paths in measured.values()))
-
-
-def measure(
-    paths: Sequence[Sequence[Cell]],
-    optima: Sequence[float],
-    metres: NDArray[np.float64],
-    edges: NDArray[np.float64],
-) -> Measured:
-    """Measure all paths; empty ones are requests that were not solved."""
-    ratios = [
-        path_length(cells) / optimum if cells else np.inf
-        for cells, optimum in zip(paths, optima, strict=True)
-    ]
-    x, y = np.transpose([cell for cells in paths for cell in cells])
-    distances = metres[y, x]
-    return Measured(distances.min(), distances.mean(), edges[y, x].min(), np.array(ratios))
+    return int(lost > 0)
 
 
 def edge_distances(grid: GridMap) -> NDArray[np.float64]:

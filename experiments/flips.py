@@ -9,7 +9,7 @@ away from what was left of the last one, although that was still legal.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -48,14 +48,13 @@ AHEAD, APART = 60, 10
 """Cells: how far ahead a path counts, and how far from the last one it has flipped."""
 
 
-@dataclass
-class Drive:
+class Driven(NamedTuple):
     """What was counted while a robot drove: replans, flips, and its way's cost and length."""
 
-    replans: int = 0
-    flips: int = 0
-    cost: float = 0.0
-    length: float = 0.0
+    replans: int
+    flips: int
+    cost: float
+    length: float
 
 
 def main(_: Sequence[str]) -> int:
@@ -63,38 +62,25 @@ def main(_: Sequence[str]) -> int:
     rows, planner = [], Planner.load("any_map")
     planner.cache_bytes = 0  # each map comes once
     for kind in KINDS:
-        drives = {
-            threshold: [drive(planner, kind, seed, threshold) for seed in range(RUNS)]
-            for threshold in THRESHOLDS
-        }
-        cost, length = (sum(getattr(d, key) for d in drives[0.0]) for key in ("cost", "length"))
-        for threshold, driven in drives.items():
-            replans, flips = sum(d.replans for d in driven), sum(d.flips for d in driven)
-            more_cost = sum(d.cost for d in driven) / cost - 1
-            more_length = sum(d.length for d in driven) / length - 1
-            flips_per_100 = f"{100 * flips / replans:.1f}"
-            rows.append(
-                [
-                    kind,
-                    threshold,
-                    replans,
-                    flips_per_100,
-                    f"{more_cost:+.2%}",
-                    f"{more_length:+.2%}",
-                ]
-            )
+        first = None
+        for threshold in THRESHOLDS:
+            runs = [drive(planner, kind, seed, threshold) for seed in range(RUNS)]
+            replans, flips, *way = np.sum(runs, axis=0)
+            first = first or way
+            more = [f"{new / old - 1:+.2%}" for new, old in zip(way, first, strict=True)]
+            rows.append([kind, threshold, int(replans), f"{100 * flips / replans:.1f}", *more])
     header = ["map", "switch_threshold", "replans", "flips per 100", "cost driven", "length driven"]
     print(table(header, rows))
     return 0
 
 
-def drive(planner: Planner, kind: str, seed: int, threshold: float, side: int = SIDE) -> Drive:
+def drive(planner: Planner, kind: str, seed: int, threshold: float, side: int = SIDE) -> Driven:
     """Drive from a start to a goal; the seed and the kind fix the map and its noise."""
     random = np.random.default_rng([seed, KINDS.index(kind)])
     occupancy, robot, goal = scenario(kind, side, random)
     beside_walls = clearance(occupancy) < 2
     true_map = GridMap(occupancy, cost=inflated_costs(occupancy, INFLATION))
-    way, path, driven = [robot], np.empty((0, 2), dtype=np.int32), Drive()
+    way, path, replans, flips = [robot], np.empty((0, 2), dtype=np.int32), 0, 0
     for number in range(REPLANS):
         # The noise depends on the time, not on what was drawn for another way of the robot.
         noise = np.random.default_rng([seed, number])
@@ -104,18 +90,16 @@ def drive(planner: Planner, kind: str, seed: int, threshold: float, side: int = 
         if not plan.cells:  # it waits
             continue
         rest, path = rest_of_path(path, robot, grid, RULE), plan.path
-        driven.replans += 1
-        driven.flips += is_flip(rest, path)
-        moved = plan.cells[1 : 1 + STRIDE]
-        way += moved
+        replans += 1
+        flips += is_flip(rest, path)
+        way += plan.cells[1 : 1 + STRIDE]
         robot = way[-1]
         if robot == goal:
             break
     else:  # the best path from there, so that all drives end at the goal
         way += planner.plan(true_map, robot, goal, RULE).cells[1:]
-    driven.cost = path_cost(way, true_map.cost_multiplier, RULE)
-    driven.length = path_length(way, RULE)
-    return driven
+    cost = path_cost(way, true_map.cost_multiplier, RULE)
+    return Driven(replans, flips, cost, path_length(way, RULE))
 
 
 def scenario(kind: str, side: int, random: np.random.Generator) -> tuple[Occupancy, Cell, Cell]:

@@ -26,7 +26,7 @@ from ddqn_planner.training.trainer import Trainer
 from ddqn_planner.training.value_iteration import value_iteration
 
 MOVE_RULE: Final = MoveRule.CORNER_CUTTING
-"""The rule under which the paper's 22.97 is the shortest path (docs/dilemma_map.md)."""
+"""The rule under which the paper's 22.97 is the shortest path (docs/reproduction.md)."""
 
 BACKENDS: Final = ("loky", "ray", "dask", "sequential")
 """Of joblib: this machine's cores, two kinds of cluster, or one training after the other."""

@@ -71,7 +71,6 @@ CALLS: dict[Callable[..., Any], dict[str, Any]] = {
     QField: {"goal": (0, 0), "q": Q, "legal": LEGAL, "move_rule": "unit"},
     QField((0, 0), Q, LEGAL).rollout: {"start": (0, 0)},
     PLANNER.q_field(GRID, (3, 3)).rollout: {"start": (0, 0)},
-    PLANNER.q_field(GRID, (3, 3)).rollout_if_known: {"start": (0, 0)},
     simplify: {"cells": CELLS, "grid": GRID, "move_rule": "unit"},
 }
 ARGUMENTS = [
@@ -150,7 +149,6 @@ def test_cells_outside_the_map_and_fractions_are_refused(cell: Any) -> None:
         lambda: timed.reachable(np.array([cell]), "unit"),
         lambda: EXPERIENCE.expected_time(timed, [(0, 0), cell]),
         lambda: simplify([(0, 0), cell], timed, "unit"),
-        lambda: field.rollout_if_known(cell),
         lambda: field.rollout(cell),
     ]
     for call in calls:

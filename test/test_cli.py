@@ -6,7 +6,6 @@ import re
 import signal
 import subprocess
 import sys
-import sysconfig
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import fields, replace
@@ -39,41 +38,38 @@ def small_map(small: Scenario, tmp_path: Path) -> str:
     return str(path)
 
 
-def test_plan_prints_the_papers_path(capsys: pytest.CaptureFixture[str]) -> None:
+def test_plan_prints_the_papers_path_and_counts_by_its_rule(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
     assert main(["plan", "dilemma", "--model", "dilemma"]) == 0
     printed = capsys.readouterr().out
     assert "length 22.97 cells, optimum 22.97 under corner_cutting" in printed
     assert printed.count("*") == 17
     assert printed.count("S") == printed.count("G") == 1
-
-
-def test_plan_counts_by_its_rule(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["plan", "dilemma", "--move-rule", "unit"]) == 0
     printed = capsys.readouterr().out
     assert "length 18.00 cells, optimum 18.00 under unit" in printed
     assert "11.49 m" in printed  # as the robot drives, whatever the rule counts
+    assert main(["plan", "dilemma", "--start", "1", "19"]) == 1
+    assert "the start is occupied" in capsys.readouterr().err
 
 
-def test_plan_reaches_the_cells_that_the_metres_of_its_tolerance_name(
+def test_tolerance_and_clearing_radius_are_metres(
     capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
-    values = np.zeros((1, 9), dtype=np.int8)
-    values[0, 6:] = 100
-    save_map(MapFile(values, 0.05, start=(0, 0), goal=(8, 0)), tmp_path / "wall.yaml")
-    assert main(["plan", str(tmp_path / "wall.yaml"), "--json", "--tolerance", "0.15"]) == 0
-    assert json.loads(capsys.readouterr().out)["cells"][-1] == [5, 0]
-
-
-def test_plan_leaves_an_occupied_start_within_the_metres_of_its_clearing_radius(
-    capsys: pytest.CaptureFixture[str], tmp_path: Path
-) -> None:
-    values = np.zeros((1, 9), dtype=np.int8)
-    values[0, :3] = 100
-    path = tmp_path / "speck.yaml"
-    save_map(MapFile(values, 0.05, start=(0, 0), goal=(8, 0)), path)
-    for metres, code, cells in (("0.05", 1, 0), ("0.1", 0, 9)):
-        assert main(["plan", str(path), "--json", "--start-clearing-radius", metres]) == code
-        assert len(json.loads(capsys.readouterr().out)["cells"]) == cells
+    path = str(tmp_path / "row.yaml")
+    for occupied, option, metres, first, last in (
+        (slice(6, 9), "--tolerance", "0.15", 0, 5),
+        (slice(0, 3), "--start-clearing-radius", "0.1", 0, 8),
+        (slice(0, 3), "--start-clearing-radius", "0.05", None, None),
+    ):
+        values = np.zeros((1, 9), dtype=np.int8)
+        values[0, occupied] = 100
+        save_map(MapFile(values, 0.05, start=(0, 0), goal=(8, 0)), path)
+        assert main(["plan", path, "--json", option, metres]) == (first is None)
+        cells = [x for x, _ in json.loads(capsys.readouterr().out)["cells"]]
+        assert (cells[:1], cells[-1:]) == (([first], [last]) if cells else ([], []))
+        assert bool(cells) == (first is not None)
 
 
 def test_plan_takes_the_model_for_any_map_and_prints_no_wide_map(
@@ -293,42 +289,36 @@ def test_a_node_without_ros_says_in_one_line_how_to_get_it(without: Any, node: s
     assert done.returncode == 1
 
 
-def test_plan_says_why_there_is_no_path(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["plan", "dilemma", "--start", "1", "19"]) == 1
-    assert "the start is occupied" in capsys.readouterr().err
-
-
 @pytest.mark.parametrize(
     ("arguments", "named"),
     [
         (["plan", "no_such_map.yaml"], "no_such_map.yaml"),
+        (["plan", "bare.yaml"], "bare.yaml names no start and goal; give --start X Y"),
         (["plan", "dilemma", "--model", "no_such_model"], "no_such_model"),
         (["train", "dilemma", "--gamma", "2"], r"gamma is 2\.0"),
         (["train", "dilemma", "--start", "1", "19"], r"start \(1, 19\)"),
     ],
 )
 def test_bad_input_ends_with_2_and_its_name(
-    capsys: pytest.CaptureFixture[str], arguments: list[str], named: str
+    capsys: pytest.CaptureFixture[str],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    arguments: list[str],
+    named: str,
 ) -> None:
+    monkeypatch.chdir(tmp_path)
+    save_map(GridMap(np.zeros((2, 2))), "bare.yaml")
     assert main(arguments) == 2
     error = capsys.readouterr().err
     assert re.search(named, error)
     assert "Traceback" not in error
 
 
-def test_a_map_without_start_and_goal_asks_for_them(
-    capsys: pytest.CaptureFixture[str], small: Scenario, tmp_path: Path
-) -> None:
-    save_map(GridMap(small.grid.occupancy), tmp_path / "bare.yaml")
-    assert main(["plan", str(tmp_path / "bare.yaml")]) == 2
-    assert "--start X Y" in capsys.readouterr().err
-
-
 def test_a_trained_model_plans(
     capsys: pytest.CaptureFixture[str], small_map: str, tmp_path: Path
 ) -> None:
-    train = ["train", small_map, "--out", str(tmp_path / "run"), "--steps", "3000"]
-    train += ["--learning-rate", "0.003", "--epsilon-steps", "1500", "--target-interval", "100"]
+    train = ["train", small_map, "--out", str(tmp_path / "run"), "--network", "propagation"]
+    train += ["--steps", "1000", "--learning-rate", "0.003", "--target-interval", "50"]
     assert main(train) == 0
     assert "of 16 starts" in capsys.readouterr().out
     model = str(tmp_path / "run" / "model.safetensors")
@@ -369,26 +359,23 @@ def test_the_model_for_any_map_is_trained_with_parameters_of_its_own(tmp_path: P
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_an_interrupted_training_is_saved_and_resumed(
-    small_map: str, tmp_path: Path, number: int
-) -> None:
-    executable = Path(sysconfig.get_path("scripts")) / "ddqn-planner"
-    command = ["train", small_map, "--out", str(tmp_path / "run"), "--filters", "4"]
-    curves = tmp_path / "run" / "episodes.csv"
-    child = subprocess.Popen(
-        [executable, *command, "--steps", "1000000"], stdout=subprocess.PIPE, text=True
-    )
-    deadline = time.monotonic() + PATIENCE
-    while not curves.exists() or curves.read_text().count("\n") < 50:
-        assert time.monotonic() < deadline
-        assert child.poll() is None
-        time.sleep(0.05)
-    os.kill(child.pid, number)
-    printed, _ = child.communicate(timeout=PATIENCE)
-    assert child.returncode == 0
-    assert "run the same command to resume" in printed
-    steps = load_model(tmp_path / "run" / "model.safetensors")[1].steps
-    assert steps > 0
-    assert main([*command, "--steps", str(steps + 100)]) == 0
-    assert load_model(tmp_path / "run" / "model.safetensors")[1].steps == steps + 100
+def test_an_interrupted_training_is_saved_and_resumed(small_map: str, tmp_path: Path) -> None:
+    command = [executable("ddqn-planner"), "train", small_map, "--out", str(tmp_path / "run")]
+    curves, steps = tmp_path / "run" / "episodes.csv", 0
+    for number in (signal.SIGINT, signal.SIGTERM):
+        rows = curves.read_text().count("\n") if curves.exists() else 0
+        child = subprocess.Popen(
+            [*command, "--filters", "4", "--steps", "1000000"], stdout=subprocess.PIPE, text=True
+        )
+        deadline = time.monotonic() + PATIENCE
+        while not curves.exists() or curves.read_text().count("\n") < rows + 5:
+            assert time.monotonic() < deadline
+            assert child.poll() is None
+            time.sleep(0.05)
+        os.kill(child.pid, number)
+        printed, _ = child.communicate(timeout=PATIENCE)
+        assert child.returncode == 0
+        assert f"from step {steps} to" in printed
+        assert "run the same command to resume" in printed
+        before, steps = steps, load_model(tmp_path / "run" / "model.safetensors")[1].steps
+        assert steps > before

@@ -118,47 +118,21 @@ def test_maps_and_models_come_along_wherever_pip_installs(
     )
     # The libraries of this environment; its editable install of the package is not among them.
     path = [str(package.parents[1]), sysconfig.get_path("purelib")]
-    printed = subprocess.run(
-        [python, "-c", code],
-        env={**os.environ, "PYTHONPATH": os.pathsep.join(path)},
-        cwd=tmp_path,
-        check=True,
-        capture_output=True,
-        text=True,
-    )
-    assert all(Path(path).is_relative_to(folder) for path in printed.stdout.split())
+    environ = {**os.environ, "PYTHONPATH": os.pathsep.join(path)}
+
+    def run(*arguments: str | Path) -> str:
+        command = [python, *arguments]
+        return subprocess.check_output(command, env=environ, cwd=tmp_path, text=True)
+
+    assert all(Path(path).is_relative_to(folder) for path in run("-c", code).split())
+    (program,) = folder.rglob("bin/ddqn-planner")
+    assert "4,096" in run(program, "certify")
+    for name in ("map_server_node", "planner_node", "trainer_node"):
+        assert (program.parent / name).is_file()
     for name in ("maps", "models"):
         shipped = {path.name: path.read_bytes() for path in (ROOT / name).iterdir()}
         for copy in (package.parent / name, package_share(folder) / name):
             assert {path.name: path.read_bytes() for path in copy.iterdir()} == shipped
-
-
-@pytest.mark.slow
-def test_the_command_of_the_wheel_plans_in_another_folder(wheel: Path, tmp_path: Path) -> None:
-    environment, elsewhere = tmp_path / "environment", tmp_path / "elsewhere"
-    elsewhere.mkdir()
-    subprocess.run([sys.executable, "-m", "venv", "--without-pip", environment], check=True)
-    python = environment / "bin" / "python"
-    subprocess.run([*PIP, "--python", python, "install", "--no-deps", wheel], check=True)
-    (site,) = environment.glob("lib/*/site-packages")
-    # The libraries of this environment come after what was installed.
-    (site / "libraries.pth").write_text(sysconfig.get_path("purelib"))
-    without = {key: value for key, value in os.environ.items() if key != "PYTHONPATH"}
-
-    def run(name: str, *arguments: str) -> str:
-        return subprocess.run(
-            [environment / "bin" / name, *arguments],
-            env=without,
-            cwd=elsewhere,
-            check=True,
-            capture_output=True,
-            text=True,
-        ).stdout
-
-    assert "under corner_cutting" in run("ddqn-planner", "plan", "dilemma", "--model", "dilemma")
-    assert "length 789.95 cells" in run("ddqn-planner", "plan", "office")
-    for name in ("map_server_node", "planner_node", "trainer_node"):
-        assert (environment / "bin" / name).is_file()
 
 
 def package_share(prefix: Path) -> Path:

@@ -19,6 +19,7 @@ from visualization_msgs.msg import Marker, MarkerArray
 
 from ddqn_planner.grid import MOVES, Cell, GridMap, MoveRule
 from ddqn_planner.nodes.conversions import value_message
+from ddqn_planner.nodes.report import Outcome
 from ddqn_planner.nodes.runtime import LATCHED, STEADY, Worker
 from ddqn_planner.planning import Planner, QField
 
@@ -86,18 +87,20 @@ class FieldDisplay:
         """Publish the next field even if it is shown already."""
         self._shows_again = True
 
-    def show(self, shown: Shown) -> None:
-        """Show a field from now on."""
+    def show(self, outcome: Outcome, header: Header) -> None:
+        """Show the field of an outcome from now on; none if it has none, as of another goal."""
+        request, goal, shown = outcome.request, outcome.plan.goal, self._shown
+        if request is not None and goal is not None:
+            shown = Shown(outcome.planner, request.grid, goal, request.move_rule, header)
+        elif shown is not None:
+            header = Header(stamp=header.stamp, frame_id=shown.header.frame_id)
+            shown = shown._replace(planner=None, header=header)
+        if shown is None:
+            return
         if self._shows_again or self._shown is None or self._shown[:-1] != shown[:-1]:
             self._shown, self._shows_again = shown, False
             for layer in self._layers:
                 layer.is_due = True
-
-    def clear(self, now: Header) -> None:
-        """Show no field: the one that is shown is of another goal."""
-        if self._shown is not None:
-            header = Header(stamp=now.stamp, frame_id=self._shown.header.frame_id)
-            self.show(self._shown._replace(planner=None, header=header))
 
     async def _on_look(self) -> None:
         for layer in self._layers:

@@ -65,7 +65,8 @@ class Driving:
         self._refusals = refusals
         self._recorder = DriveRecorder(self._on_drive)
         self._folder: DriveFolder | None = None
-        self._state, self._save_error, self._last_drive = "stopped", "", ""
+        self._saving = SavingLog(node, "the drives are saved again")
+        self._state, self._last_drive = "stopped", ""
         self._is_disk_full = False
         self._aborted: set[bytes] | None = None
         self._learned = 0
@@ -158,11 +159,8 @@ class Driving:
     def _tell_saved(self, folder: DriveFolder) -> None:
         """Say where the experience is, or why it could not be saved."""
         self._learned += 1
-        log_change_of_saving(
-            self._node, self._save_error, folder.save_error, "the drives are saved again"
-        )
-        self._save_error = folder.save_error
-        if not self._save_error:
+        self._saving.note(folder.save_error)
+        if not folder.save_error:
             self._saved.publish(String(data=str(folder.experience_path)))
 
     def _retry(self) -> None:
@@ -215,8 +213,8 @@ class Driving:
             return True, f"no drives were being recorded{replay}"
         self._recorder.end(DriveEnd.STOPPED)
         self._save(folder)
-        if self._save_error:
-            return False, self._save_error
+        if folder.save_error:
+            return False, folder.save_error
         folder.close()
         self._state = "stopped"
         return True, f"stopped after drive {folder.drives}; ~/start continues{replay}"
@@ -226,7 +224,7 @@ class Driving:
         if folder is None:
             return False, NOT_RECORDING
         self._save(folder)
-        return not self._save_error, self._save_error or f"saved in {folder.folder}"
+        return not folder.save_error, folder.save_error or f"saved in {folder.folder}"
 
     def _on_forget(self) -> tuple[bool, str]:
         folder = self._recording()
@@ -237,8 +235,8 @@ class Driving:
         except OSError as error:
             return False, explained(error)
         self._tell_saved(folder)
-        if self._save_error:
-            return False, self._save_error
+        if folder.save_error:
+            return False, folder.save_error
         return True, (
             f"forgot all but the drives. {kept} has what was known: to undo it, call ~/stop, "
             f"rename that file to {EXPERIENCE}, and call ~/start"
@@ -258,7 +256,7 @@ class Driving:
 
     def diagnostics(self) -> DiagnosticArray:
         """Return what `/diagnostics` says."""
-        problems = [*self._refusals.problems(), *filter(None, [self._save_error])]
+        problems = [*self._refusals.problems(), *filter(None, [self._saving.error])]
         level = DiagnosticStatus.ERROR if problems else DiagnosticStatus.OK
         if self._place() is None:
             problems.append("no map was received yet; start a map server, or set map_file")
@@ -290,12 +288,19 @@ def _place_of(position: tuple[float, float] | None) -> str:
     return "unknown" if position is None else f"({position[0]:.6g}, {position[1]:.6g})"
 
 
-def log_change_of_saving(node: BaseNode, before: str, error: str, again: str) -> None:
-    """Log when saving begins to fail, or works again, not at each try."""
-    if error and not before:
-        node.get_logger().error(error)
-    if before and not error:
-        node.get_logger().info(again)
+class SavingLog:
+    """Logs when saving begins to fail, and when it works again, not at each try."""
+
+    def __init__(self, node: BaseNode, again: str) -> None:
+        self._node, self._again, self.error = node, again, ""
+
+    def note(self, error: str) -> None:
+        """Note why the last try failed; empty if it did not."""
+        before, self.error = self.error, error
+        if error and not before:
+            self._node.get_logger().error(error)
+        if before and not error:
+            self._node.get_logger().info(self._again)
 
 
 def explained(error: Exception) -> str:

@@ -98,7 +98,8 @@ class MapSource:
         because = f" ({refused})" if refused else ""
         if self._used is None:
             missing = f"no map was received on {self._topic} yet{because}; start a map server"
-            raise RequestError("NO_MAP", refused if refused and self._newest else missing)
+            may_come = time.monotonic() - self._began < PATIENCE
+            raise RequestError("NO_MAP", refused if refused and self._newest else missing, may_come)
         timeout = self._node.value("map_timeout")
         is_costmap = self._node.value("map_type") == "costmap"
         if is_costmap and 0 < timeout < time.monotonic() - self._used.came:
@@ -118,11 +119,6 @@ class MapSource:
         except RequestError as error:
             return str(error)
         return ""
-
-    @property
-    def may_come(self) -> bool:
-        """Whether the first map is still expected, as the node has subscribed just now."""
-        return self._used is None and time.monotonic() - self._began < PATIENCE
 
     def describe(self, outcome: Outcome) -> dict[str, str]:
         """Return what the diagnostics say of the map, and of the time of a plan on it."""

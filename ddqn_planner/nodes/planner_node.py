@@ -25,7 +25,7 @@ from rclpy.task import Future
 from std_msgs.msg import Header, String
 
 from ddqn_planner.nodes.conversions import path_message, serialized_path
-from ddqn_planner.nodes.display import FieldDisplay, Shown
+from ddqn_planner.nodes.display import FieldDisplay
 from ddqn_planner.nodes.lifecycle import ManagedNode
 from ddqn_planner.nodes.map_source import MapSource
 from ddqn_planner.nodes.model_loading import ModelSource, load
@@ -102,18 +102,12 @@ class PlannerNode(ManagedNode):
         self.create_subscription(PoseArray, "goal_poses", self._on_goal_poses, 10)
         if self._settings.follow_trainer:
             self.create_subscription(String, "trainer/model_saved", self._model.on_saved, LATCHED)
-            on_experience_saved: Any = self._map.on_experience_saved
-            self.create_subscription(
-                String,
-                "trainer/experience_saved",
-                on_experience_saved,
-                LATCHED,
-                callback_group=MutuallyExclusiveCallbackGroup(),  # it waits for a worker
-            )
+            on_saved, topic = self._map.on_experience_saved, "trainer/experience_saved"
+            group = MutuallyExclusiveCallbackGroup()  # it waits for a worker
+            self.create_subscription(String, topic, on_saved, LATCHED, callback_group=group)
         # Reentrant: a request that waits for its field does not keep out the others.
-        self.create_service(
-            GetPlan, "~/get_plan", self._on_get_plan, callback_group=ReentrantCallbackGroup()
-        )
+        reentrant = ReentrantCallbackGroup()
+        self.create_service(GetPlan, "~/get_plan", self._on_get_plan, callback_group=reentrant)
         self.create_trigger("~/reload_model", self._model.on_reload)
         serve_nav2(self, self._is_active, self._plan_for_action, self._on_is_path_valid)
         self._is_configured = True
@@ -237,19 +231,13 @@ class PlannerNode(ManagedNode):
         if self._active.is_news(outcome, header.frame_id):
             self._plan_publisher.publish(_path(serialized_path, outcome, header))
         self._waits_for_pose = outcome.status in ("NO_START", "TF_ERROR")
-        request, field_goal = outcome.request, outcome.plan.goal
         # The places and lengths in the reason may differ.
-        kind = outcome.status, outcome.plan.method, begins_on_obstacle(request, outcome.plan)
+        kind = outcome.status, outcome.plan.method, begins_on_obstacle(outcome)
         logged = goals, outcome.goal, *kind
         if self._logged != logged:
             self._logged = logged
             self._report.log(outcome)
-        if request is None or field_goal is None or outcome.planner is None:
-            self._display.clear(header)
-        else:
-            rule = request.move_rule
-            shown = Shown(outcome.planner, request.grid, field_goal, rule, header)
-            self._display.show(shown)
+        self._display.show(outcome, header)
 
     async def _plan_for_action(
         self, start: PoseStamped | None, goals: list[PoseStamped], planner_id: str, given_up: Future
@@ -276,13 +264,9 @@ class PlannerNode(ManagedNode):
     async def _answer(
         self, planning: Coroutine[None, None, Outcome], goals: list[PoseStamped], *given_up: Future
     ) -> tuple[Header, Outcome]:
-        """Return the path's header, and what became of the request.
+        """Return the path's header, and what became of the request; the stamp is that of now.
 
-        For the active goal that may be `UNCHANGED`. Without an answer, the request is given up as
-        soon as the node is stopped, or one of the futures has an outcome.
-
-        A path is planned with the map, model and parameters that are there when this begins,
-        whatever changes while it waits. Its stamp is the time of the answer.
+        The request is given up as soon as the node is stopped, or one of the futures is done.
         """
         self._answering += 1
         try:

@@ -102,6 +102,7 @@ class Frames:
                 "TF_ERROR",
                 f"{name}'s frame is {frame!r}, and no transform leads from it to the map's, "
                 f"{map_frame!r} ({error}); publish one, or give the pose in the map's frame",
+                self.may_come,
             ) from None
 
     def _transform_at(self, stamped: PoseStamped, map_frame: str) -> TransformStamped:
@@ -303,7 +304,8 @@ class StartSource:
         if self._pose is not None and not problem:
             return self._pose
         remedy = "or set start_source, or give the request's start its frame"
-        raise RequestError("NO_START", f"the start is unknown; {problem}; {remedy}")
+        may_come = self.source == "odometry" and time.monotonic() - self._began < PATIENCE
+        raise RequestError("NO_START", f"the start is unknown; {problem}; {remedy}", may_come)
 
     def _pose_by_tf(self) -> PoseStamped:
         robot_frame, map_frame = self._node.value("robot_frame"), self._map_frame()
@@ -314,12 +316,8 @@ class StartSource:
                 "NO_START",
                 f"the start is unknown: no transform leads from {robot_frame!r} to {map_frame!r} "
                 f"({error}); publish one, or set robot_frame or start_source",
+                self._frames.may_come,
             ) from None
-
-    @property
-    def may_come(self) -> bool:
-        """Whether the first pose is still expected, as the node has subscribed just now."""
-        return self.source != "initialpose" and time.monotonic() - self._began < PATIENCE
 
 
 class RobotPoses:

@@ -36,11 +36,14 @@ NO_PLAN = Plan(PlanStatus.NO_PATH)
 
 
 class RequestError(ValueError):
-    """There is no request for the planner; the message says why and what to do."""
+    """There is no request for the planner; the message says why and what to do.
 
-    def __init__(self, status: str, reason: str) -> None:
+    What is missing `may_come` soon, where the node has begun to listen just now.
+    """
+
+    def __init__(self, status: str, reason: str, may_come: bool = False) -> None:
         super().__init__(reason)
-        self.status = status
+        self.status, self.may_come = status, may_come
 
 
 def checked(status: str, function: Any, *arguments: Any) -> Any:
@@ -112,14 +115,15 @@ def reason_of(
         metres = math.dist(plan.goal, request.goal) * grid.resolution
         why = "is cut off" if grid.is_free(request.goal) else "is occupied"
         reason += f"; the goal {why} and moved {metres:.3g} m"
-    if begins_on_obstacle(request, plan):
+    if grid.is_obstacle(plan.path[0]):
         reason += f"; the start is occupied: obstacles within {cleared} of it were ignored"
     return reason
 
 
-def begins_on_obstacle(request: PlanRequest | None, plan: Plan) -> bool:
-    """Return whether a plan has a path that leaves an obstacle."""
-    return request is not None and len(plan.path) > 0 and request.grid.is_obstacle(plan.path[0])
+def begins_on_obstacle(outcome: Outcome) -> bool:
+    """Return whether there is a path, and it leaves an obstacle."""
+    request, path = outcome.request, outcome.plan.path
+    return request is not None and len(path) > 0 and request.grid.is_obstacle(path[0])
 
 
 def _place(stamped: PoseStamped, cell: Cell) -> str:

@@ -182,7 +182,8 @@ class Requests:
             self._check_pose(*named, self.map.frame)
         header, grid, planner = await self._inputs()
         frame = header.frame_id
-        start = await self._in_map("the start", start or await self._known_start(), frame)
+        start = start or await self._wait_for(self.start.pose)
+        start = await self._in_map("the start", start, frame)
         in_map = [await self._in_map(*named, frame) for named in zip(names, goals, strict=True)]
         first, *more = [_cell(*named, grid, frame) for named in zip(names, in_map, strict=True)]
         request = PlanRequest(
@@ -231,7 +232,7 @@ class Requests:
         cells = [_cell("the path", pose, grid, frame) for pose in poses]
         robot = cells[0] if cells else (0, 0)
         with suppress(RequestError):
-            start = await self._in_map("the start", await self._known_start(), frame)
+            start = await self._in_map("the start", await self._wait_for(self.start.pose), frame)
             robot = _cell("the start", start, grid, frame)
         rule = move_rule(settings.move_rule, planner)
         return is_path_valid(cells, robot, grid, rule, _clearing_radius(settings, grid))
@@ -245,7 +246,7 @@ class Requests:
 
     async def _inputs(self) -> tuple[Header, GridMap, Planner]:
         """Return the header of the map of now, this map for the robot's body, and the planner."""
-        header = await self._wait_for(self.map.check, lambda: self.map.may_come)
+        header = await self._wait_for(self.map.check)
         inflated = self.map.inflated()
         await self.model.first()
         planner = self.model.planner
@@ -260,25 +261,22 @@ class Requests:
             plan = await self.worker.run(next, steps)
         return plan
 
-    async def _known_start(self) -> PoseStamped:
-        return await self._wait_for(self.start.pose, lambda: self.start.may_come)
-
     async def _in_map(self, name: str, stamped: PoseStamped, frame: str) -> PoseStamped:
         """Return a pose in the map's frame; wait for its transform up to transform_tolerance."""
         self._check_pose(name, stamped, frame)
         deadline = time.monotonic() + self.settings.transform_tolerance
-        return await self._wait_for(
-            lambda: self.frames.to_map(name, stamped, frame),
-            lambda: self.frames.may_come or time.monotonic() < deadline,
-        )
+        return await self._wait_for(lambda: self.frames.to_map(name, stamped, frame), deadline)
 
-    async def _wait_for(self, get: Callable[[], T], may_come: Callable[[], bool]) -> T:
-        """Return what a function returns as soon as it raises no RequestError, if that may come."""
+    async def _wait_for(self, get: Callable[[], T], deadline: float = 0.0) -> T:
+        """Return what a function returns, as soon as it raises no RequestError, if that may come.
+
+        Until a deadline of the monotonic clock it may come in any case.
+        """
         while True:
             try:
                 return get()
-            except RequestError:
-                if not may_come():
+            except RequestError as error:
+                if not error.may_come and time.monotonic() >= deadline:
                     raise
             await self.next_look
 

@@ -24,7 +24,6 @@ from rcl_interfaces.msg import (
     ParameterDescriptor,
     SetParametersResult,
 )
-from rcl_interfaces.msg import Parameter as ParameterMessage
 from rcl_interfaces.srv import SetParameters, SetParametersAtomically
 from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
@@ -157,7 +156,7 @@ class BaseNode(ListeningNode):
             response.result = self._set(request.parameters)
         return response
 
-    def _set(self, messages: list[ParameterMessage]) -> SetParametersResult:
+    def _set(self, messages: list[Any]) -> SetParametersResult:
         reason = "a parameter has no name; give one"
         try:
             if all(message.name for message in messages):

@@ -33,7 +33,7 @@ from ddqn_planner.nodes.conversions import (
     quaternion,
     serialized_path,
 )
-from ddqn_planner.nodes.driving import Driving, explained, log_change_of_saving
+from ddqn_planner.nodes.driving import Driving, SavingLog, explained
 from ddqn_planner.nodes.parameters import HYPER_PARAMETERS, OF_MAPS, TRAINER_PARAMETERS
 from ddqn_planner.nodes.poses import MapInFrame, check_source
 from ddqn_planner.nodes.replay import Replay
@@ -69,7 +69,8 @@ class TrainerNode(BaseNode):
         self._is_stopping = self._is_saving = False
         self._refusals = Refusals(self)
         self._replay = Replay(self, self._fail)
-        self._state, self._error, self._save_error = "idle", "", ""
+        self._state, self._error = "idle", ""
+        self._saving = SavingLog(self, "the training is saved again")
 
         self._episode_publisher = self.create_publisher(Path, "~/episode", 10)
         self._diagnostics_publisher = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
@@ -172,7 +173,8 @@ class TrainerNode(BaseNode):
                 reason = f"training needs another library: {with_remedy(error)}"
             self._fail(f"the training cannot start: {reason}")
             return False, reason
-        self._state, self._error, self._save_error = "training", "", ""
+        self._state, self._error = "training", ""
+        self._saving = SavingLog(self, "the training is saved again")
         self._is_stopping = self._is_saving = False
         self._refusals.forget()
         self._run, self._run_map = run, place
@@ -245,7 +247,7 @@ class TrainerNode(BaseNode):
                 if self._is_stopping or self._is_saving:
                     self._is_saving = False
                     await self._worker.call(run.try_to_save)
-                self._log_change_of_saving(run)
+                self._saving.note(run.save_error)
                 if not run.save_error and (ends == "finished" or run.saved_at != announced):
                     self.get_logger().info(f"step {run.saved_at} is saved in {run.checkpoint_path}")
                     self._saved_publisher.publish(String(data=str(run.model_path)))
@@ -263,10 +265,6 @@ class TrainerNode(BaseNode):
         if episode.number % self.value("episode_interval") == 0 and not self._replay.is_running:
             self._publish_cells(episode.cells, place)
 
-    def _log_change_of_saving(self, run: TrainingRun) -> None:
-        log_change_of_saving(self, self._save_error, run.save_error, "the training is saved again")
-        self._save_error = run.save_error
-
     def _publish_cells(self, cells: tuple[Cell, ...], place: MapInFrame) -> None:
         header = Header(stamp=self.get_clock().now().to_msg(), frame_id=place.frame)
         self._episode_publisher.publish(serialized_path(cells, place.grid, header, quaternion(0)))
@@ -275,7 +273,7 @@ class TrainerNode(BaseNode):
         if self._driving is not None:
             self._diagnostics_publisher.publish(self._driving.diagnostics())
             return
-        error = self._save_error or self._error or "; ".join(self._refusals.problems())
+        error = self._saving.error or self._error or "; ".join(self._refusals.problems())
         level = DiagnosticStatus.ERROR if error else DiagnosticStatus.OK
         values = {"state": self._state}
         for which, pose in self._poses.items():
@@ -301,7 +299,7 @@ class TrainerNode(BaseNode):
         if self._run is not None and self._state == "training":
             self._run.try_to_save()
             self._run.close()
-            self._log_change_of_saving(self._run)
+            self._saving.note(self._run.save_error)
 
 
 def train_for_a_slice(steps: Iterator[list[Episode]]) -> tuple[list[Episode], bool]:

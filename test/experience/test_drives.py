@@ -13,6 +13,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from experience.straight_drives import straight
 
 from ddqn_planner import Experience, GridMap
 from ddqn_planner.experience import ExperienceFileError
@@ -176,39 +177,46 @@ def test_numbers_that_name_no_place_are_refused(robot: Robot, wrong: float) -> N
 
 
 GRID = GridMap(np.zeros((40, 200), dtype=np.bool_), resolution=0.25)
-
-
-def straight(
-    seconds: float = 40.0, y: float = 5.0, start: float = 1.7e9
-) -> tuple[np.ndarray, np.ndarray]:
-    """A drive of 20 m along x: nominal at 0.5 m/s."""
-    time = np.linspace(0, seconds, 201)
-    return start + time, np.column_stack([5 + time * 20 / seconds, np.full(201, y)])
+SLOW = straight((5, 5), (25, 5), 3.0, began=1.7e9)
 
 
 def opened(folder: Path, nominal_speed: float = 0.5) -> DriveFolder:
     return DriveFolder(folder, nominal_speed, 0.5)
 
 
+def record(folder: Path, count: int, outcome: DriveEnd = DriveEnd.ARRIVED) -> DriveFolder:
+    """Record slow drives, and close the folder."""
+    opened_folder = opened(folder)
+    for _ in range(count):
+        opened_folder.add(outcome, *SLOW, GRID)
+    opened_folder.close()
+    return opened_folder
+
+
+def numbers(folder: Path) -> list[int]:
+    return [drive.number for drive in read_drives(folder / "episodes.csv")]
+
+
 def slowness(folder: Path) -> np.ndarray:
     return Experience.load(folder / "experience.npz").slowness(GRID)
 
 
-def test_drives_are_recorded_and_teach(tmp_path: Path) -> None:
-    folder = opened(tmp_path / "new" / "folder")
-    seconds, positions = straight(120.0)
-    drive = folder.add(DriveEnd.ARRIVED, seconds, positions, GRID)
-    assert (drive.number, drive.metres) == (1, pytest.approx(20))
-    folder.add(DriveEnd.ABORTED, *straight(120.0))
-    folder.close()
-    first, second = read_drives(folder.record_path)
+def test_drives_are_recorded_and_teach_over_restarts(tmp_path: Path) -> None:
+    folder = record(tmp_path / "new" / "folder", 1).folder
+    record(folder, 1, DriveEnd.ABORTED)
+    first, second = read_drives(folder / "episodes.csv")
     assert (first.number, first.outcome) == (1, DriveEnd.ARRIVED)
     assert (second.number, second.outcome) == (2, DriveEnd.ABORTED)
-    np.testing.assert_allclose(first.seconds, seconds, atol=1e-3)
-    np.testing.assert_allclose(first.positions, positions, atol=1e-3)
-    learned = slowness(folder.folder)
+    assert first.metres == pytest.approx(20)
+    np.testing.assert_allclose(first.seconds, SLOW[0], atol=1e-3)
+    np.testing.assert_allclose(first.positions, SLOW[1], atol=1e-3)
+    learned = slowness(folder)
     assert learned[20, 60] > 2
     assert learned[20, 100] > 1.1 * learned[20, 60]  # where the robot gave up
+    (folder / "experience.npz").unlink()
+    again = opened(folder)  # what was learned is lost, but not what was recorded
+    np.testing.assert_allclose(again.experience.slowness(GRID), learned, rtol=0.05)
+    again.close()
 
 
 def test_the_record_has_the_columns_that_its_header_names(tmp_path: Path) -> None:
@@ -222,41 +230,13 @@ def test_the_record_has_the_columns_that_its_header_names(tmp_path: Path) -> Non
     )
 
 
-def test_a_restart_continues_with_the_next_number_and_what_was_learned(tmp_path: Path) -> None:
-    for number in (1, 2, 3):
-        folder = opened(tmp_path)
-        assert folder.add(DriveEnd.ARRIVED, *straight(120.0)).number == number
-        folder.close()
-    assert [drive.number for drive in read_drives(folder.record_path)] == [1, 2, 3]
-    once = Experience(0.5)
-    once.record(*straight(120.0))
-    assert slowness(tmp_path)[20, 60] > once.slowness(GRID)[20, 60]
-
-
-def test_without_experience_it_is_learned_from_the_record(tmp_path: Path) -> None:
-    folder = opened(tmp_path)
-    for _ in range(3):
-        folder.add(DriveEnd.ARRIVED, *straight(120.0))
-    folder.close()
-    before = slowness(tmp_path)
-    folder.experience_path.unlink()
-    folder = opened(tmp_path)
-    np.testing.assert_allclose(folder.experience.slowness(GRID), before, rtol=0.05)
-    folder.close()
-
-
 @pytest.mark.parametrize("cut", [1, 2, 10, 3000])
 def test_a_row_that_a_crash_cut_is_left_out_and_the_others_stay(tmp_path: Path, cut: int) -> None:
-    folder = opened(tmp_path)
-    folder.add(DriveEnd.ARRIVED, *straight())
-    folder.add(DriveEnd.ARRIVED, *straight())
-    folder.close()
-    os.truncate(folder.record_path, folder.record_path.stat().st_size - cut)
-    assert [drive.number for drive in read_drives(folder.record_path)] == [1]
-    folder = opened(tmp_path)
-    folder.add(DriveEnd.ARRIVED, *straight())
-    folder.close()
-    assert [drive.number for drive in read_drives(folder.record_path)] == [1, 2]
+    path = record(tmp_path, 2).record_path
+    os.truncate(path, path.stat().st_size - cut)
+    assert numbers(tmp_path) == [1]
+    record(tmp_path, 1)
+    assert numbers(tmp_path) == [1, 2]
 
 
 @pytest.mark.parametrize(
@@ -264,6 +244,7 @@ def test_a_row_that_a_crash_cut_is_left_out_and_the_others_stay(tmp_path: Path, 
     [
         b"",
         b"one,two,three\r\n",
+        b"one,two\nthree\r\n",
         b"3,arrived,0.0,1.0,1.0,\r\n",
         b"3,arrived,0.0,1.0,1.0,0:1\r\n",
         b"3,arrived,0.0,1.0,1.0,nan:1:1\r\n",
@@ -273,12 +254,11 @@ def test_a_row_that_a_crash_cut_is_left_out_and_the_others_stay(tmp_path: Path, 
     ],
 )
 def test_a_row_of_something_else_is_left_out(tmp_path: Path, row: bytes) -> None:
-    folder = opened(tmp_path)
-    folder.add(DriveEnd.ARRIVED, *straight())
-    folder.close()
-    with folder.record_path.open("ab") as file:
+    with record(tmp_path, 1).record_path.open("ab") as file:
         file.write(row + b"4,arrived,0.0,1.0,1.0,0:1:1 1:1:2\r\n")
-    assert [drive.number for drive in read_drives(folder.record_path)] == [1, 4]
+    assert numbers(tmp_path) == [1, 4]
+    record(tmp_path, 1)
+    assert numbers(tmp_path) == [1, 4, 5]
 
 
 def test_a_folder_of_something_else_is_refused_and_left_as_it_is(tmp_path: Path) -> None:
@@ -288,30 +268,22 @@ def test_a_folder_of_something_else_is_refused_and_left_as_it_is(tmp_path: Path)
     assert [path.name for path in tmp_path.iterdir()] == ["training.lock"]
 
 
-def test_broken_experience_is_refused_and_left_as_it_is(tmp_path: Path) -> None:
-    folder = opened(tmp_path)
-    folder.add(DriveEnd.ARRIVED, *straight())
-    folder.close()
-    folder.experience_path.write_bytes(folder.experience_path.read_bytes()[:-30])
-    before = folder.experience_path.read_bytes()
+def test_experience_that_is_broken_or_of_another_robot_is_refused(tmp_path: Path) -> None:
+    path = record(tmp_path, 1).experience_path
+    with pytest.raises(ValueError, match=r"nominal_speed 0.5 \(now 0.8\); give those values"):
+        opened(tmp_path, 0.8)
+    path.write_bytes(path.read_bytes()[:-30])
+    before = path.read_bytes()
     for _ in range(2):  # the folder is not left locked
         with pytest.raises(ExperienceFileError, match="cannot be read"):
             opened(tmp_path)
-    assert folder.experience_path.read_bytes() == before
-
-
-def test_experience_of_another_robot_is_refused(tmp_path: Path) -> None:
-    folder = opened(tmp_path)
-    folder.add(DriveEnd.ARRIVED, *straight())
-    folder.close()
-    with pytest.raises(ValueError, match=r"nominal_speed 0.5 \(now 0.8\); give those values"):
-        opened(tmp_path, 0.8)
+    assert path.read_bytes() == before
 
 
 def test_forgotten_experience_is_kept_beside_it(tmp_path: Path) -> None:
     folder = opened(tmp_path)
     assert folder.forget() is None
-    folder.add(DriveEnd.ARRIVED, *straight(120.0))
+    folder.add(DriveEnd.ARRIVED, *SLOW)
     before = slowness(tmp_path)
     kept = folder.forget()
     assert kept is not None
@@ -325,22 +297,22 @@ def test_forgotten_experience_is_kept_beside_it(tmp_path: Path) -> None:
 
 def test_nothing_is_lost_while_the_disk_is_full(tmp_path: Path) -> None:
     folder = opened(tmp_path)
-    folder.add(DriveEnd.ARRIVED, *straight())
+    folder.add(DriveEnd.ARRIVED, *SLOW)
     limits = resource.getrlimit(resource.RLIMIT_FSIZE)
     size = folder.record_path.stat().st_size
     signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
     resource.setrlimit(resource.RLIMIT_FSIZE, (size + 10, limits[1]))
     try:
         for _ in range(3):
-            folder.add(DriveEnd.ARRIVED, *straight())
+            folder.add(DriveEnd.ARRIVED, *SLOW)
             assert "make room" in folder.save_error
-        assert [drive.number for drive in read_drives(folder.record_path)] == [1]
+        assert numbers(tmp_path) == [1]
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, limits)
     folder.try_to_save()
     assert folder.save_error == ""
     folder.close()
-    assert [drive.number for drive in read_drives(folder.record_path)] == [1, 2, 3, 4]
+    assert numbers(tmp_path) == [1, 2, 3, 4]
     again = opened(tmp_path)
     assert again.experience.evidence.driven == pytest.approx(folder.experience.evidence.driven)
     again.close()

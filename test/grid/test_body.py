@@ -1,15 +1,20 @@
+"""Inflation, and costmaps as Nav2 makes and publishes them, written here after its formulas."""
+
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from hypothesis.extra import numpy as numpy_st
 from strategies import occupancies
 
-from ddqn_planner.grid import UNKNOWN, GridMap, MoveRule, clearance, inflate
-from ddqn_planner.grid.body import Inflation
+from ddqn_planner.grid import UNKNOWN, GridMap, clearance, inflate
+from ddqn_planner.grid.body import Inflation, grid_from_costmap
+from ddqn_planner.planning import Planner, PlanStatus
 
 RESOLUTION = 0.05
 
@@ -30,7 +35,7 @@ def test_cells_nearer_to_an_obstacle_than_the_radius_are_occupied(
 ) -> None:
     distance = distances_by_definition(occupancy)
     assert clearance(occupancy) == pytest.approx(distance)
-    # A message has the resolution in single precision.
+    # A message has the resolution in single precision: two cells of 0.05 m may be 0.099999999 m.
     grid = inflate(GridMap(occupancy, float(np.float32(RESOLUTION))), radius)
     near = np.round(distance * RESOLUTION, 6) < radius
     assert (grid.occupancy == (occupancy | near)).all()
@@ -38,105 +43,179 @@ def test_cells_nearer_to_an_obstacle_than_the_radius_are_occupied(
         assert grid.is_obstacle((x, y)) == occupancy[y, x]
 
 
-@given(occupancies, st.floats(0.01, 1.0), st.data())
+@given(occupancies, st.floats(0.01, 1.0), st.sampled_from([None, UNKNOWN, 0, 40]))
 def test_clearance_costs_fall_with_the_distance_and_occupy_no_cell(
-    occupancy: np.ndarray, weight: float, data: st.DataObject
+    occupancy: np.ndarray, weight: float, cost: int | None
 ) -> None:
-    values = data.draw(st.sampled_from([UNKNOWN, 0, 40]))
-    plain = GridMap(occupancy, RESOLUTION, cost=np.full(occupancy.shape, values, dtype=np.int8))
+    costs = None if cost is None else np.full(occupancy.shape, cost)
+    plain = GridMap(occupancy, RESOLUTION, cost=costs)
     grid = inflate(plain, 0.07, weight)
     assert (grid.occupancy == inflate(plain, 0.07).occupancy).all()
-    labels = [g.labels(MoveRule.ROBOT_SAFE) for g in (grid, plain)]
-    assert (labels[0] > 0).sum() <= (labels[1] > 0).sum()
     free, distance = ~grid.occupancy, clearance(occupancy)
     multiplier = grid.cost_multiplier[free][np.argsort(distance[free])]
     assert (np.diff(multiplier) <= 0).all()
     assert (multiplier >= plain.cost_multiplier[free]).all()
-
-
-def test_a_radius_of_whole_cells_leaves_the_cell_at_that_distance_free() -> None:
-    # In a message's single precision, two cells are 0.69999999 m.
-    grid = GridMap(np.array([[1, 0, 0, 0]]), float(np.float32(0.35)))
-    assert inflate(grid, 0.7).occupancy.tolist() == [[True, True, False, False]]
+    assert grid.cost is not None
+    assert not grid.cost[grid.occupancy].any()
 
 
 def test_the_cost_falls_to_an_eighth_where_the_docstring_says() -> None:
-    occupancy = np.zeros((1, 20), dtype=bool)
-    occupancy[0, 0] = True
-    cost = inflate(GridMap(occupancy, 0.1), 0.1, 1.0).cost
+    grid = GridMap(np.eye(1, 20), 0.1)
+    cost = inflate(grid, 0.1, 1.0).cost
     assert cost is not None
-    assert cost[0, 1] == 99
-    assert cost[0, 11] == 12  # 1 m beyond the body
-
-
-def test_a_robot_without_a_body_can_avoid_obstacles_too() -> None:
-    grid = inflate(GridMap(np.array([[1, 0, 0]])), 0.0, 1.0)
-    assert grid.cost is not None
-    assert grid.cost[0, 1] > grid.cost[0, 2] > 0
-    assert grid.occupancy.tolist() == [[True, False, False]]
-
-
-def test_without_a_body_the_map_is_the_same() -> None:
-    grid = GridMap(np.zeros((2, 2)))
+    assert (cost[0, 1], cost[0, 11]) == (99, 12)  # beside the body, and 1 m beyond it
+    without_body = inflate(grid, 0.0, 1.0)
+    assert without_body.cost is not None
+    assert without_body.cost[0, 1] > without_body.cost[0, 2] > 0
+    assert without_body.occupancy.sum() == 1
     assert inflate(grid, 0.0) is grid
 
 
-@pytest.mark.parametrize(
-    ("radius", "weight", "named"),
-    [
-        (-0.1, 0.0, "robot_radius is -0.1"),
-        (math.nan, 0.0, "robot_radius is nan"),
-        (math.inf, 0.0, "robot_radius is inf"),
-        (0.0, -0.1, "clearance_weight is -0.1"),
-        (0.0, 1.1, "clearance_weight is 1.1"),
-        (0.0, math.nan, "clearance_weight is nan"),
-    ],
-)
-def test_a_value_out_of_range_is_named(radius: float, weight: float, named: str) -> None:
-    with pytest.raises(ValueError, match=named):
-        inflate(GridMap(np.zeros((2, 2))), radius, weight)
+@pytest.mark.parametrize("wrong", [-0.1, math.nan, math.inf, 1.1])
+def test_a_value_out_of_range_is_named(wrong: float) -> None:
+    grid = GridMap(np.zeros((2, 2)))
+    with pytest.raises(ValueError, match=f"clearance_weight is {wrong}; give 0 to 1"):
+        inflate(grid, 0.0, wrong)
+    if wrong != 1.1:
+        with pytest.raises(ValueError, match=f"robot_radius is {wrong}; give metres"):
+            inflate(grid, wrong)
 
 
-def test_obstacles_must_be_occupied() -> None:
-    with pytest.raises(ValueError, match="within the occupied cells"):
-        GridMap(np.zeros((2, 2)), obstacles=np.eye(2, dtype=bool))
-    with pytest.raises(ValueError, match=r"shape \(3, 3\)"):
-        GridMap(np.ones((2, 2)), obstacles=np.eye(3, dtype=bool))
+BODIES = st.tuples(st.sampled_from([0.0, 0.4, 1.0, 2.3]), st.sampled_from([0.0, 0.3, 1.0]))
 
 
 @settings(max_examples=200)
-@given(
-    st.integers(0, 2**32),
-    st.sampled_from([0.0, 0.4, 1.0, 2.3]),
-    st.sampled_from([0.0, 0.3, 1.0]),
-    st.booleans(),
-    st.integers(0, 3),
-)
-def test_a_changed_map_is_inflated_near_its_changed_cells_as_if_it_were_whole(
-    seed: int, radius: float, weight: float, with_costs: bool, changes: int
+@given(st.integers(0, 2**32), st.lists(BODIES, min_size=1, max_size=2), st.booleans(), st.data())
+def test_maps_that_come_one_after_another_are_inflated_as_if_each_were_the_first(
+    seed: int, bodies: list[tuple[float, float]], with_costs: bool, data: st.DataObject
 ) -> None:
-    random = np.random.default_rng(seed)
-    occupancy = random.random((40, 60)) < random.choice([0.0, 0.02, 0.3])
+    random, inflation = np.random.default_rng(seed), Inflation()
+    occupancy = random.random((30, 45)) < random.choice([0.0, 0.02, 0.3])
     cost = random.integers(-1, 100, occupancy.shape) if with_costs else None
-    before = GridMap(occupancy, 0.5, cost=cost)
-    grid = before
-    for _ in range(changes):
-        x, y = random.integers(0, 38, 2).tolist()
-        grid = grid.with_patch(random.random((2, 2)) < 0.5, x, y)
-    inflation = Inflation()
-    inflation(before, radius, weight)
-    expected, found = inflate(grid, radius, weight), inflation(grid, radius, weight)
-    assert found.same_cells(expected)
-    for cell in np.ndindex(60, 40):
-        assert found.is_obstacle(cell) == expected.is_obstacle(cell)
+    grid = GridMap(occupancy, 0.5, cost=cost)
+    for _ in range(4):
+        change = data.draw(st.sampled_from(["none", "cells", "costs", "resolution", "size"]))
+        x, y = random.integers(0, 20, 2).tolist()
+        if change == "cells":
+            grid = grid.with_patch(random.random((2, 2)) < 0.5, x, y)
+        elif change == "costs":
+            grid = grid.with_patch([[0]], x, y, cost=[[7]])
+        elif change == "resolution":
+            grid = GridMap(grid.occupancy, 0.75 - grid.resolution, cost=grid.cost)
+        elif change == "size":
+            grid = GridMap(grid.occupancy[:-1], grid.resolution)
+        body = data.draw(st.sampled_from(bodies))
+        found, expected = inflation(grid, *body), inflate(grid, *body)
+        assert found.same_cells(expected)
+        assert found.resolution == grid.resolution
+        if body != (0.0, 0.0):
+            np.testing.assert_array_equal(found.obstacles, grid.occupancy)  # type: ignore[arg-type]
 
 
-def test_maps_that_come_one_after_another_are_inflated_for_the_body_of_now() -> None:
-    inflation, random = Inflation(), np.random.default_rng(0)
-    grid = GridMap(random.random((30, 30)) < 0.05, 0.5)
-    for body in ((0.6, 0.0), (0.6, 0.0), (1.1, 0.5), (1.1, 0.5), (0.0, 0.0), (0.6, 0.0)):
-        assert inflation(grid, *body).same_cells(inflate(grid, *body))
-        coarser = GridMap(grid.occupancy, 2 * grid.resolution)
-        assert inflation(coarser, *body).same_cells(inflate(coarser, *body))
-        grid = grid.with_patch(random.random((2, 2)) < 0.5, 4, 5)
-        assert inflation(grid, *body).same_cells(inflate(grid, *body))
+# Costmaps
+
+values_of_any_kind = numpy_st.arrays(
+    np.int8, numpy_st.array_shapes(min_dims=2, max_dims=2, min_side=1, max_side=9)
+)
+
+FREE, INSCRIBED, LETHAL, NO_INFORMATION = 0, 253, 254, 255
+
+
+def published(costs: np.ndarray) -> np.ndarray:
+    """Return what Nav2's costmap publisher sends for the costs of a costmap, 0 to 255."""
+    values = 1 + 97 * (costs.astype(int) - 1) // 251
+    for cost, value in ((FREE, 0), (INSCRIBED, 99), (LETHAL, 100), (NO_INFORMATION, -1)):
+        values[costs == cost] = value
+    return values.astype(np.int8)
+
+
+def inflated_as_by_nav2(obstacles: np.ndarray) -> np.ndarray:
+    """Return the costs that Nav2's inflation layer gives, 0 to 254."""
+    metres = clearance(obstacles) * RESOLUTION
+    costs = ((INSCRIBED - 1) * np.exp(-3.0 * (metres - 0.22))).clip(0, 252).astype(int)
+    costs[metres > 0.7] = FREE
+    costs[metres <= 0.22] = INSCRIBED
+    costs[obstacles] = LETHAL
+    return costs
+
+
+def test_costs_are_those_of_navfn() -> None:
+    costs = np.arange(253).reshape(1, -1)
+    grid = grid_from_costmap(published(costs))
+    assert not grid.occupancy.any()
+    navfn = np.minimum(50 + 0.8 * costs, 253).astype(int) / 50
+    # A value stands for two or three costs, and steps of 0.04 are what a map holds.
+    assert np.abs(grid.cost_multiplier - navfn).max() <= 0.0701
+    assert (np.diff(grid.cost_multiplier) >= 0).all()
+    assert grid.cost_multiplier[0, [0, -1]] == pytest.approx([1, 4.96])
+
+
+@given(values_of_any_kind, st.booleans())
+def test_only_unknown_inscribed_and_lethal_cells_are_closed(
+    values: np.ndarray, allow_unknown: bool
+) -> None:
+    grid = grid_from_costmap(values, allow_unknown=allow_unknown)
+    unknown = values < 0
+    assert grid.occupancy.tolist() == ((values >= 99) | (unknown & (not allow_unknown))).tolist()
+    assert grid.obstacles is not None
+    assert grid.obstacles.tolist() == (grid.occupancy & (values != 99)).tolist()
+    if allow_unknown:
+        assert (grid.cost_multiplier[unknown] == 5).all()
+    free = ~grid.occupancy & ~unknown
+    assert ((grid.cost_multiplier[free] == 1) == (values[free] <= 1)).all()
+
+
+@given(values_of_any_kind, st.booleans(), st.data())
+def test_a_patch_of_a_costmap_is_read_as_the_whole_costmap(
+    values: np.ndarray, allow_unknown: bool, data: st.DataObject
+) -> None:
+    height, width = values.shape
+    y, x = data.draw(st.integers(0, height - 1)), data.draw(st.integers(0, width - 1))
+    shape = data.draw(st.integers(1, height - y)), data.draw(st.integers(1, width - x))
+    new = data.draw(numpy_st.arrays(np.int8, shape))
+    before = grid_from_costmap(values, allow_unknown=allow_unknown)
+    part = grid_from_costmap(new, allow_unknown=allow_unknown)
+    patched = before.with_patch(part.occupancy, x, y, part.cost, part.obstacles)
+    values[y : y + shape[0], x : x + shape[1]] = new
+    whole = grid_from_costmap(values, allow_unknown=allow_unknown)
+    assert patched.same_cells(whole)
+    assert np.array_equal(patched.obstacles, whole.obstacles)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("values", [[[0.5]], [[128]], [["a"]], [[None]]])
+def test_values_of_no_costmap_are_refused(values: Any) -> None:
+    with pytest.raises(ValueError, match="the array of values"):
+        grid_from_costmap(values)
+
+
+def test_a_path_leads_through_the_doors_that_the_robot_fits_through() -> None:
+    planner = Planner.load("any_map")
+    for door in (0.4, 0.5, 0.6, 0.75):
+        obstacles = np.pad(np.zeros((58, 78), dtype=bool), 1, constant_values=True)
+        obstacles[:, 40] = True
+        obstacles[30 : 30 + round(door / RESOLUTION), 40] = False
+        values = published(inflated_as_by_nav2(obstacles))
+        grid = grid_from_costmap(values, RESOLUTION)
+        # What inflation puts into a narrow door is above the threshold of maps.
+        as_map = GridMap.from_occupancy_values(values, RESOLUTION, use_map_costs=True)
+        for read, least in ((grid, 0.5), (as_map, 0.75)):
+            found = planner.plan(read, (20, 15), (60, 15)).status
+            assert found is (PlanStatus.SUCCEEDED if door >= least else PlanStatus.NO_PATH)
+    # A robot in the inscribed zone may leave it.
+    assert values[15, 2] == 99
+    plan = planner.plan(grid, (2, 15), (60, 15))
+    assert (plan.status, plan.cells[0]) == (PlanStatus.SUCCEEDED, (2, 15))
+    assert planner.plan(grid, (60, 15), (2, 15)).status is PlanStatus.GOAL_OCCUPIED
+    assert planner.plan(grid, (0, 15), (60, 15)).status is PlanStatus.START_OCCUPIED
+
+
+@pytest.mark.parametrize("width", [0.65, 1.25])
+def test_a_path_keeps_to_the_middle_of_a_corridor(width: float) -> None:
+    cells = round(width / RESOLUTION)
+    obstacles = np.pad(np.zeros((cells, 98), dtype=bool), 1, constant_values=True)
+    grid = grid_from_costmap(published(inflated_as_by_nav2(obstacles)), RESOLUTION)
+    middle = (cells + 1) / 2
+    plan = Planner.load("any_map").plan(grid, (10, round(middle) - 2), (90, round(middle) + 2))
+    inside = [y for x, y in plan.cells if 20 <= x <= 80]
+    assert len(inside) >= 61
+    assert max(abs(y - middle) for y in inside) <= 0.5

@@ -81,55 +81,61 @@ def test_colcon_puts_everything_where_ros_looks_for_it(install: Path) -> None:
         assert {path.name: path.read_bytes() for path in (share / folder).iterdir()} == shipped
 
 
+def output(install: Path, *command: object) -> list[str]:
+    """Return the words that a command prints in the workspace's environment."""
+    # In the workspace: from the repository's folder Python would import the source.
+    words = subprocess.run(
+        sourced(install, *command), cwd=install, capture_output=True, text=True, check=True
+    )
+    return words.stdout.split()
+
+
 def test_sourced_workspace_goes_before_what_pip_installed(install: Path) -> None:
     look = "import importlib.util; print(importlib.util.find_spec('ddqn_planner').origin)"
-    # In the workspace: from the repository's folder Python would import the source.
-    found = subprocess.run(
-        sourced(install, sys.executable, "-c", look),
-        cwd=install,
-        capture_output=True,
-        text=True,
-        check=True,
-    )
-    assert Path(found.stdout.strip()).is_relative_to(install / "ddqn_planner" / "lib")
+    (found,) = output(install, sys.executable, "-c", look)
+    assert Path(found).is_relative_to(install / "ddqn_planner" / "lib")
     editable = importlib.util.find_spec("ddqn_planner")
     assert editable is not None
-    assert found.stdout.strip() != editable.origin
+    assert found != editable.origin
 
 
 def test_tests_that_colcon_runs_find_the_executables(install: Path, tmp_path: Path) -> None:
     # A Python into which pip has not installed the package, as that of ROS is.
     subprocess.run([sys.executable, "-m", "venv", "--without-pip", tmp_path], check=True)
     look = "import processes; print(processes.executable('planner_node'))"
-    found = subprocess.run(
-        sourced(install, "env", f"PYTHONPATH={PYTHONPATH}", tmp_path / "bin/python", "-c", look),
-        capture_output=True,
-        text=True,
-        check=True,
-    )
+    python = tmp_path / "bin" / "python"
+    (found,) = output(install, "env", f"PYTHONPATH={PYTHONPATH}", python, "-c", look)
     expected = install / "ddqn_planner" / "lib" / "ddqn_planner" / "planner_node"
-    assert Path(found.stdout.strip()) == expected
+    assert Path(found) == expected
 
 
-def test_linked_workspace_finds_maps_and_models(source_copy: Path, tmp_path: Path) -> None:
+def test_linked_workspace_finds_maps_and_models(
+    source_copy: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     (tmp_path / "src").symlink_to(source_copy.parent)
     install = build(tmp_path, "--symlink-install")
     look = (
         "from ddqn_planner.resources import find_map; from ddqn_planner.model import find_model\n"
         "print(find_map('dilemma').resolve(), find_model('any_map').resolve())"
     )
-    found = subprocess.run(
-        sourced(install, sys.executable, "-c", look),
-        cwd=tmp_path,
-        # Else the tests' own source may come first.
-        env={key: value for key, value in os.environ.items() if key != "PYTHONPATH"},
-        capture_output=True,
-        text=True,
-        check=True,
-    )
+    monkeypatch.delenv("PYTHONPATH", raising=False)  # else the tests' own source may come first
+    found = output(install, sys.executable, "-c", look)
     names = ("maps/dilemma.yaml", "models/any_map.safetensors")
     shipped = [str(source_copy / name) for name in names]
-    assert found.stdout.split() == shipped
+    assert found == shipped
+
+
+def take_compiled(source: Path, package: Path) -> None:
+    """Give a copy of the package the functions that numba has compiled, which takes seconds.
+
+    Numba knows them by the times of their files, which the build has rounded.
+    """
+    for file in source.rglob("*.py"):
+        shutil.copystat(file, package / file.relative_to(source))
+    for file in source.rglob("__pycache__/*.nb?"):
+        target = package / file.relative_to(source)
+        target.parent.mkdir(exist_ok=True)
+        shutil.copy2(file, target)
 
 
 def test_nodes_of_the_workspace_plan_with_its_model_on_its_map(
@@ -138,6 +144,9 @@ def test_nodes_of_the_workspace_plan_with_its_model_on_its_map(
     paper: Scenario,
     capfd: pytest.CaptureFixture[str],
 ) -> None:
+    (package,) = (install / "ddqn_planner" / "lib").glob("python*/site-packages/ddqn_planner")
+    take_compiled(ROOT / "ddqn_planner", package)
+
     def node(name: str, *arguments: str) -> AbstractContextManager[subprocess.Popen[bytes]]:
         return running(
             *sourced(install, install / "ddqn_planner" / "lib" / "ddqn_planner" / name, *arguments)
@@ -168,7 +177,6 @@ def test_nodes_of_the_workspace_plan_with_its_model_on_its_map(
     assert path_length(cells) == pytest.approx(14 + 8 * 2**0.5)
     assert (map_server.returncode, planner.returncode) == (0, 0)
 
-    (package,) = (install / "ddqn_planner" / "lib").glob("python*/site-packages/ddqn_planner")
     values = {entry.key: entry.value for entry in diagnosis.values}
     assert values["model file"] == str(package / "models" / "any_map.safetensors")
     assert f"serving {package / 'maps' / 'dilemma.yaml'}" in capfd.readouterr().err

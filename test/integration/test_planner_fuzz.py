@@ -4,18 +4,15 @@ from __future__ import annotations
 
 from typing import Any
 
-import numpy as np
 import pytest
 from geometry_msgs.msg import PoseArray, PoseStamped, PoseWithCovarianceStamped
 from hypothesis import HealthCheck, assume, given, settings
 from hypothesis import strategies as st
 from integration.messages import NUMBERS_32, STAMPED_POSES, TEXTS, maps, some_parameters
-from integration.robot import GOAL, NUMBERS, START, Robot, check_path, points_of
+from integration.robot import GOAL, NUMBERS, Robot, check_path
 from nav_msgs.msg import OccupancyGrid, Odometry
 from nav_msgs.srv import GetPlan
-from rcl_interfaces.msg import ParameterType
 from rcl_interfaces.srv import (
-    DescribeParameters,
     GetParameters,
     SetParameters,
     SetParametersAtomically,
@@ -26,6 +23,7 @@ from std_srvs.srv import Trigger
 
 from ddqn_planner.model import find_model
 from ddqn_planner.nodes.conversions import check_tolerance, grid_from_message
+from ddqn_planner.nodes.parameters import PLANNER_PARAMETERS
 from ddqn_planner.nodes.runtime import LATCHED
 
 fuzz = settings(suppress_health_check=[HealthCheck.function_scoped_fixture])
@@ -126,25 +124,7 @@ def test_any_name_of_no_model_is_refused(unharmed: Robot, name: str) -> None:
     robot.assert_works()
 
 
-NAMES = [
-    "model",
-    "move_rule",
-    "occupied_threshold",
-    "allow_unknown",
-    "use_map_costs",
-    "robot_radius",
-    "start_clearing_radius",
-    "clearance_weight",
-    "tolerance",
-    "mode",
-    "path_simplification",
-    "start_source",
-    "robot_frame",
-    "transform_tolerance",
-    "field_cache_bytes",
-    "follow_trainer",
-    "use_sim_time",
-]
+NAMES = [*PLANNER_PARAMETERS, "use_sim_time"]
 
 
 @fuzz
@@ -175,50 +155,8 @@ def test_any_parameters_are_set_or_refused_with_a_reason(
             whole = Parameter.from_parameter_msg(parameter).to_parameter_msg()
             expected[parameter.name] = whole.value
     assert read() == expected
-    defaults = {**DEFAULTS, "model": str(robot.model)}
+    changeable = {name: it for name, it in PLANNER_PARAMETERS.items() if not it.read_only}
+    defaults = {name: it.default for name, it in changeable.items()} | {"use_sim_time": False}
+    defaults["model"] = str(robot.model)
     assert all(result.successful for result in robot.client.set_parameters("planner", **defaults))
     robot.assert_works()
-
-
-DEFAULTS: dict[str, Any] = {
-    "move_rule": "",
-    "occupied_threshold": 65,
-    "allow_unknown": False,
-    "use_map_costs": False,
-    "robot_radius": 0.0,
-    "start_clearing_radius": -1.0,
-    "clearance_weight": 0.0,
-    "tolerance": 0.0,
-    "mode": "greedy",
-    "path_simplification": "none",
-    "start_source": "initialpose",
-    "robot_frame": "base_link",
-    "transform_tolerance": 0.3,
-    "field_cache_bytes": 2**29,
-    "use_sim_time": False,
-}
-
-
-def test_each_parameter_says_what_it_is_and_what_may_be_set(robot: Robot) -> None:
-    request = DescribeParameters.Request(names=NAMES)
-    response = robot.client.call(DescribeParameters, "planner/describe_parameters", request)
-    for descriptor in response.descriptors:
-        if descriptor.name == "use_sim_time":  # rclpy's own
-            continue
-        assert descriptor.description
-        if descriptor.type == ParameterType.PARAMETER_INTEGER:
-            assert descriptor.integer_range
-        elif descriptor.type == ParameterType.PARAMETER_DOUBLE:
-            assert descriptor.floating_point_range
-        elif descriptor.type == ParameterType.PARAMETER_STRING:
-            assert descriptor.additional_constraints
-
-
-def test_a_map_of_more_cells_than_memory_is_refused_before_it_is_looked_at(robot: Robot) -> None:
-    message = robot.map_message()
-    message.info.width = message.info.height = 2**14
-    robot.send_map(message)
-    robot.wait_for_reason("the map has 16384 x 16384 cells; give at most 67108864")
-    path = robot.get_plan(robot.pose(START), robot.pose(GOAL))
-    assert points_of(path)
-    assert np.isfinite(points_of(path)).all()

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import os
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -95,25 +96,36 @@ def ask_for_plan(robot: Robot) -> tuple[Any, threading.Event]:
     return plan, answered
 
 
+RunRobot = Callable[..., AbstractContextManager[tuple[Any, Robot]]]
+
+
+@pytest.fixture
+def run_robot(
+    run_node: Any, make_client: Callable[[str], Any], small_values: np.ndarray, model: Path
+) -> RunRobot:
+    """Return what runs a planner and its user in a namespace."""
+
+    @contextmanager
+    def run(namespace: str, **parameters: Any) -> Iterator[tuple[Any, Robot]]:
+        client = make_client(namespace)
+        with run_node("planner_node", parameters, namespace=namespace) as node:
+            yield node, Robot(client, small_values, model, f"{namespace}/planner")
+
+    return run
+
+
 def test_requests_wait_a_while_for_the_first_map(
-    run_node: Any,
-    make_client: Callable[[str], Any],
-    small_values: np.ndarray,
-    model: Path,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
+    run_robot: RunRobot, model: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (tmp_path / "sitecustomize.py").write_text(
         f"import ddqn_planner.nodes.map_source as source\nsource.PATIENCE = {TIMEOUT}\n"
     )
     monkeypatch.setenv("PYTHONPATH", str(tmp_path), prepend=os.pathsep)
-    client = make_client("/awaited")
-    with run_node("planner_node", {"model": str(model)}, namespace="/awaited"):
-        robot = Robot(client, small_values, model, "/awaited/planner")
+    with run_robot("/awaited", model=str(model)) as (_, robot):
         robot.send_start(robot.pose(START))
         robot.send_goal(robot.pose(GOAL))
         plan, answered = ask_for_plan(robot)
-        assert client.get_parameter("planner", "mode") == "greedy"
+        assert robot.client.get_parameter("planner", "mode") == "greedy"
         assert not plan.done()
         robot.send_map()
         assert answered.wait(TIMEOUT)
@@ -123,23 +135,16 @@ def test_requests_wait_a_while_for_the_first_map(
 
 
 def test_requests_before_the_model_is_loaded_wait_for_it(
-    run_node: Any,
-    make_client: Callable[[str], Any],
-    small_values: np.ndarray,
-    model: Path,
-    load_gate: Path,
+    run_robot: RunRobot, load_gate: Path
 ) -> None:
-    client = make_client("/early")
-    with run_node("planner_node", {}, namespace="/early") as node:
-        robot = Robot(client, small_values, model, "/early/planner")
-        robot.send_map()
-        robot.wait_for_map(robot.map_message())
+    with run_robot("/early") as (node, robot):
+        robot.set_map(robot.map_message())
         robot.send_start(robot.pose(START))
         robot.send_goal(robot.pose(GOAL))
         plan, answered = ask_for_plan(robot)
         status = robot.wait_for_reason("the model is being loaded")
         assert (status.level, values_of(status)["model"]) == (DiagnosticStatus.WARN, "any_map")
-        assert client.get_parameter("planner", "mode") == "greedy"
+        assert robot.client.get_parameter("planner", "mode") == "greedy"
         assert not plan.done()
         assert robot.plans.messages() == []
         load_gate.touch()
@@ -152,40 +157,24 @@ def test_requests_before_the_model_is_loaded_wait_for_it(
 
 
 def test_a_model_that_is_set_while_the_first_one_is_loaded_stays(
-    run_node: Any,
-    make_client: Callable[[str], Any],
-    small_values: np.ndarray,
-    model: Path,
-    load_gate: Path,
+    run_robot: RunRobot, model: Path, load_gate: Path
 ) -> None:
-    client = make_client("/overtaken")
-    with run_node("planner_node", {}, namespace="/overtaken") as node:
-        robot = Robot(client, small_values, model, "/overtaken/planner")
+    with run_robot("/overtaken") as (node, robot):
         node.wait_for_log("a model waits")
-        assert client.set_parameters("planner", model=str(model))[0].successful
+        assert robot.client.set_parameters("planner", model=str(model))[0].successful
         load_gate.touch()
-        robot.send_map()
-        robot.wait_for_map(robot.map_message())
+        robot.set_map(robot.map_message())
         robot.assert_works()
-        values = values_of(robot.wait_for_reason("^a path of "))
-        assert values["model file"] == str(model)
-        assert values["model training steps"] == "3000"
+        assert values_of(robot.wait_for_reason("^a path of "))["model file"] == str(model)
 
 
 def test_a_first_model_that_cannot_be_loaded_answers_the_requests_that_waited(
-    run_node: Any,
-    make_client: Callable[[str], Any],
-    small_values: np.ndarray,
-    model: Path,
-    tmp_path: Path,
-    load_gate: Path,
+    run_robot: RunRobot, tmp_path: Path, load_gate: Path
 ) -> None:
     broken = tmp_path / "any_map.safetensors"
     broken.write_text("a model")
-    with run_node("planner_node", {"model": str(broken)}, namespace="/broken") as node:
-        robot = Robot(make_client("/broken"), small_values, model, "/broken/planner")
-        robot.send_map()
-        robot.wait_for_map(robot.map_message())
+    with run_robot("/broken", model=str(broken)) as (node, robot):
+        robot.set_map(robot.map_message())
         plan, answered = ask_for_plan(robot)
         robot.wait_for_reason("the model is being loaded")
         load_gate.touch()

@@ -18,10 +18,6 @@ from ddqn_planner.training.hyper_parameters import HyperParameters
 PARAMETERS = HyperParameters(max_episode_steps=12)
 
 
-def set_cell(environment: GridEnvironment, cell: Cell) -> None:
-    environment.vector.cell[0] = cell[1] * environment.vector.shape[1] + cell[0]
-
-
 def step_by_hand(
     scenario: Scenario, rule: MoveRule, parameters: HyperParameters, cell: Cell, action: int
 ) -> tuple[Cell, float, bool]:
@@ -34,7 +30,9 @@ def step_by_hand(
         return cell, parameters.obstacle_reward, True
     if parameters.reward == "path_cost":
         length = 1.0 if rule is MoveRule.UNIT else hypot(dx, dy)
-        return after, -length, after == scenario.goal
+        multiplier = scenario.grid.cost_multiplier
+        mean = (multiplier[y, x] + multiplier[after[1], after[0]]) / 2
+        return after, -length * mean, after == scenario.goal
     if after == scenario.goal:
         return after, parameters.goal_reward, True
     d_re, d_re_before = dist(after, scenario.goal), dist(cell, scenario.goal)
@@ -50,12 +48,14 @@ def test_the_batch_agrees_with_one_robot_moved_by_hand(
     paper: Scenario, rule: MoveRule, count: int, reward: str
 ) -> None:
     parameters = replace(PARAMETERS, reward=reward, environments=count)
-    batch = GridVectorEnvironment([paper], rule, parameters)
+    cost = np.random.default_rng(0).integers(0, 99, (20, 20))
+    paper = replace(paper, grid=replace(paper.grid, cost=cost.astype(np.int8)), move_rule=rule)
+    batch = GridVectorEnvironment([paper], MoveRule.ROBOT_SAFE, parameters)
     random = np.random.default_rng(count)
     batch.reset(seed=1)
     background = observation_background(paper.grid.occupancy, paper.goal)
     steps = [0] * count
-    for _ in range(3_000):
+    for _ in range(1_000):
         cells = [(int(cell) % 20, int(cell) // 20) for cell in batch.cell]
         actions = random.integers(8, size=count)
         observations, rewards, terminated, truncated, _ = batch.step(actions)
@@ -79,7 +79,7 @@ def test_the_scalar_environment_is_a_batch_of_one(paper: Scenario) -> None:
     scalar = GridEnvironment(paper, MoveRule.ROBOT_SAFE, parameters)
     random = np.random.default_rng(0)
     starts = 0
-    for seed in (5, *[None] * 199):
+    for seed in (5, *[None] * 99):
         observations, _ = batch.reset(seed=seed)
         observation, info = scalar.reset(seed=seed)
         starts += scalar.vector.cell[0] == batch.start[0]
@@ -94,7 +94,7 @@ def test_the_scalar_environment_is_a_batch_of_one(paper: Scenario) -> None:
             assert found == [values[0] for values in expected]
             assert [type(value) for value in found] == [float, bool, bool]
             ended = found[1] or found[2]
-    assert 60 < starts < 140
+    assert 30 < starts < 70
 
 
 def test_a_masked_reset_leaves_the_other_episodes_and_their_last_observation(
@@ -110,54 +110,6 @@ def test_a_masked_reset_leaves_the_other_episodes_and_their_last_observation(
     np.testing.assert_array_equal(observations[1], last[1])
     assert observations[0, 0, 0] == ROBOT
     assert batch.steps.tolist() == [0, 1]
-
-
-def test_rewards_and_ends_of_one_episode_by_hand(small: Scenario) -> None:
-    parameters = HyperParameters(p_r=0.0)
-    environment = GridEnvironment(small, MoveRule.ROBOT_SAFE, parameters)
-    environment.reset(seed=0)
-    # From (0, 0) up to (0, 1): d_re grows from 4 to sqrt(17), d_rs from 0 to 1 by a move of 1.
-    _, reward, terminated, truncated, _ = environment.step(np.int64(2))
-    assert reward == pytest.approx(0.6 * (4 - 17**0.5) + 0.4 * (1 - 0 - 1), abs=1e-6)
-    assert not terminated
-    assert not truncated
-    # Down again: back at the start, a detour of 2 in all.
-    _, reward, *_ = environment.step(np.int64(6))
-    assert reward == pytest.approx(0.6 * (17**0.5 - 4) + 0.4 * (0 - 1 - 1), abs=1e-6)
-    _, reward, terminated, _, _ = environment.step(np.int64(4))
-    assert (reward, terminated) == (-10.0, True)
-    set_cell(environment, (4, 1))
-    _, reward, terminated, _, _ = environment.step(np.int64(6))
-    assert (reward, terminated) == (10.0, True)
-
-
-def test_path_costs_reward_a_move_by_minus_its_length_times_its_cost(small: Scenario) -> None:
-    cost = np.zeros((4, 5), dtype=np.int8)
-    cost[1, 0] = 50
-    with_costs = replace(
-        small, grid=replace(small.grid, cost=cost), move_rule=MoveRule.CORNER_CUTTING
-    )
-    parameters = HyperParameters(p_r=0.0, reward="path_cost")
-    environment = GridEnvironment(with_costs, MoveRule.ROBOT_SAFE, parameters)
-    environment.reset(seed=0)
-    assert environment.step(np.int64(2))[1] == pytest.approx(-(1 + 3) / 2)
-    set_cell(environment, (1, 2))
-    # The rule of the scenario overrides that of the environment: a corner may be cut.
-    _, reward, terminated, _, _ = environment.step(np.int64(1))
-    assert (reward, terminated) == (pytest.approx(-(2**0.5)), False)
-    set_cell(environment, (4, 1))
-    _, reward, terminated, _, _ = environment.step(np.int64(6))
-    assert (reward, terminated) == (-1.0, True)
-    environment.reset()
-    assert environment.step(np.int64(4))[1] == parameters.obstacle_reward
-
-
-def test_without_alpha_and_beta_free_cells_earn_nothing(small: Scenario) -> None:
-    environment = GridEnvironment(
-        small, MoveRule.ROBOT_SAFE, HyperParameters(alpha=0.0, beta=0.0, p_r=0.0)
-    )
-    environment.reset(seed=0)
-    assert environment.step(np.int64(2))[1] == 0.0
 
 
 @pytest.mark.parametrize(("p_r", "expected"), [(0.0, 0.0), (0.5, 0.5), (1.0, 1.0)])

@@ -60,17 +60,6 @@ def test_values_that_never_settle_end_anyway() -> None:
     assert return_SAC.shape == (1, 8, 4)
 
 
-def test_a_value_is_settled_when_it_no_longer_changes() -> None:
-    # Two cells with a move to and fro and no way to the goal: V = r + γ V, and so r / (1 - γ).
-    success, reward = np.zeros((2, 1, 8, 3), dtype=np.float32)
-    success[0, 0, 0] = success[0, 4, 1] = 1.0
-    reward[:] = -1.0
-    (return_AC,) = value_iteration(
-        success, reward, np.array([2]), neighbours((1, 3)), gamma=0.9, collision=-20.0
-    )
-    assert [return_AC[0, 0], return_AC[4, 1]] == pytest.approx([-10.0, -10.0], abs=0.01)
-
-
 def test_values_propagate_as_far_as_a_map_reaches() -> None:
     cells = 2500
     success, reward = np.zeros((2, 1, 8, cells), dtype=np.float32)
