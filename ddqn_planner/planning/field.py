@@ -196,6 +196,7 @@ class DistanceField(QField):
         return self.is_whole or bool(self.known.closed_is_final and closed)
 
     def rollout_if_known(self, start: Cell) -> Plan | None:
+        """Return the rollout from a start if no more of the field is needed, else None."""
         if not self._lock.acquire(blocking=False):
             return None  # another thread computes it
         try:
