@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 from ddqn_planner.experience.evidence import FARTHEST, Evidence, Visits
 from ddqn_planner.files import as_path, write_atomically
 from ddqn_planner.grid import GridMap
-from ddqn_planner.grid.arguments import Cells, cells_inside, numbers, real
+from ddqn_planner.grid.arguments import POSITIVE, Cells, as_number, cells_inside, numbers
 
 Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
@@ -74,8 +74,7 @@ class Experience:
     ) -> None:
         given = nominal_speed, robot_width, half_life, max_pause
         for name, value in zip(OPTIONS, given, strict=True):
-            if not 0 < real(value) < math.inf:
-                raise ValueError(f"{name} is {value!r}; give more than 0, and finite")
+            as_number(name, value, *POSITIVE, "more than 0, and finite")
         self.nominal_speed = float(nominal_speed)
         self.robot_width = float(robot_width)
         self.half_life = float(half_life)

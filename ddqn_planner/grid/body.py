@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import sys
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -94,33 +95,28 @@ class Inflation:
     """Inflates maps as they come: of a map like the last one, only what is near changed cells."""
 
     def __init__(self) -> None:
-        self._last: tuple[GridMap, GridMap, tuple[float, float]] | None = None
+        self._last: tuple[Any, GridMap, GridMap] | None = None
 
     def __call__(self, grid: GridMap, robot_radius: float, clearance_weight: float) -> GridMap:
         """Return what `inflate` returns."""
         body = robot_radius, clearance_weight
-        if self._last is not None and self._last[2] == body and _alike(grid, self._last[0]):
-            inflated = _inflate_changed(grid, *self._last)
+        key = body, grid.occupancy.shape, grid.resolution, grid.cost is None
+        if self._last is not None and self._last[0] == key:
+            inflated = _inflate_changed(grid, *self._last[1:], *body)
         else:
             inflated = inflate(grid, *body)
-        self._last = grid, inflated, body
+        self._last = key, grid, inflated
         return inflated
 
 
-def _alike(grid: GridMap, other: GridMap) -> bool:
-    """Return whether two maps differ in their cells at most."""
-    return (grid.occupancy.shape, grid.resolution, grid.cost is None) == (
-        other.occupancy.shape,
-        other.resolution,
-        other.cost is None,
-    )
-
-
 def _inflate_changed(
-    grid: GridMap, before: GridMap, inflated: GridMap, body: tuple[float, float]
+    grid: GridMap,
+    before: GridMap,
+    inflated: GridMap,
+    robot_radius: float,
+    clearance_weight: float,
 ) -> GridMap:
-    """Return what `inflate` returns, given what it returned for a map that is alike."""
-    robot_radius, clearance_weight = body
+    """Return what `inflate` returns, given what it returned for a map that has other cells."""
     if inflated is before:  # no body
         return grid
     differs = before.occupancy != grid.occupancy
@@ -139,7 +135,8 @@ def _inflate_changed(
         window = _around(differs, 2 * cells)
         near = near[window]
         given = None if grid.cost is None else grid.cost[window]
-        part = inflate(GridMap(grid.occupancy[window], grid.resolution, cost=given), *body)
+        part = GridMap(grid.occupancy[window], grid.resolution, cost=given)
+        part = inflate(part, robot_radius, clearance_weight)
         occupancy = occupancy.copy()
         occupancy[window][near] = part.occupancy[near]
         if cost is not None and part.cost is not None:

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple, TypeVar
 import numpy as np
 
 from ddqn_planner.grid import Cell, GridMap, MoveRule, path_cost
-from ddqn_planner.grid.arguments import as_cell, as_flag, listed, real
+from ddqn_planner.grid.arguments import as_cell, as_flag, as_number, listed
 from ddqn_planner.grid.grid_map import check_grid
 from ddqn_planner.model import ModelMetadata, QNetwork, load_model
 from ddqn_planner.planning.field import DistanceField, Goals, QField
@@ -402,9 +402,7 @@ def _cells_of_goals(goals: Sequence[Cell]) -> list[Cell]:
 
 
 def _cells(name: str, value: float) -> float:
-    if not real(value) >= 0:
-        raise ValueError(f"{name} is {value!r}; give 0 cells or more")
-    return real(value)
+    return as_number(name, value, 0, math.inf, "0 cells or more")
 
 
 def _cost(plan: Plan) -> float:

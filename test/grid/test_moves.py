@@ -1,19 +1,23 @@
 from __future__ import annotations
 
 import math
+import subprocess
+import sys
 from collections.abc import Callable
 from itertools import product
 
 import numpy as np
 import pytest
+import scipy.ndimage
 from hypothesis import given
 from hypothesis import strategies as st
-from strategies import grids_with_costs, grids_with_free_cell, occupancies
+from strategies import grids_with_costs, grids_with_directions, occupancies
 
 from ddqn_planner.grid import (
     LENGTHS,
     MAX_COST_MULTIPLIER,
     MOVES,
+    Cell,
     GridMap,
     MoveRule,
     legal_moves,
@@ -35,16 +39,21 @@ def test_action_k_points_at_k_times_45_degrees() -> None:
         assert LENGTHS[action] == pytest.approx(math.hypot(dx, dy))
 
 
-@given(occupancies, RULES)
-def test_legal_moves_follow_the_rule_in_each_cell(occupancy: np.ndarray, rule: MoveRule) -> None:
-    grid, legal = GridMap(occupancy), legal_moves(occupancy, rule)
-    for y in range(grid.height):
-        for x in range(grid.width):
-            for action, (dx, dy) in enumerate(MOVES.tolist()):
-                expected = grid.is_free((x, y)) and grid.is_free((x + dx, y + dy))
-                if rule is MoveRule.ROBOT_SAFE:
-                    expected = expected and grid.is_free((x + dx, y)) and grid.is_free((x, y + dy))
-                assert legal[action, y, x] == expected
+@given(grids_with_directions(), RULES)
+def test_legal_moves_follow_the_rule_in_each_cell(
+    grid_and_cell: tuple[GridMap, Cell], rule: MoveRule
+) -> None:
+    grid, _ = grid_and_cell
+    legal = grid.legal_moves(rule)
+    for (y, x), (action, (dx, dy)) in product(
+        np.ndindex(grid.occupancy.shape), enumerate(MOVES.tolist())
+    ):
+        expected = grid.is_free((x, y)) and grid.is_free((x + dx, y + dy))
+        if rule is MoveRule.ROBOT_SAFE:
+            expected = expected and grid.is_free((x + dx, y)) and grid.is_free((x, y + dy))
+        if grid.forbidden is not None:
+            expected = expected and not grid.forbidden[y, x] >> action & 1
+        assert legal[action, y, x] == expected
 
 
 @pytest.mark.parametrize("shape", [(1, 1), (1, 4), (3, 5)])
@@ -57,18 +66,9 @@ def test_neighbours_are_numbered_row_by_row_and_outside_comes_last(shape: tuple[
         assert found[action, y * width + x] == expected
 
 
-@given(grids_with_free_cell(), RULES)
-def test_connected_cells_have_a_finite_distance(
-    grid_and_cell: tuple[GridMap, tuple[int, int]], rule: MoveRule
-) -> None:
-    grid, cell = grid_and_cell
-    expected = np.isfinite(shortest_distances(grid, cell, rule))
-    np.testing.assert_array_equal(grid.reachable([cell], rule), expected)
-
-
 @given(grids_with_costs(), RULES)
 def test_a_legal_move_costs_its_length_times_the_mean_cost_and_the_same_in_return(
-    grid_and_cell: tuple[GridMap, tuple[int, int]], rule: MoveRule
+    grid_and_cell: tuple[GridMap, Cell], rule: MoveRule
 ) -> None:
     grid, _ = grid_and_cell
     assert ((grid.cost_multiplier >= 1) & (grid.cost_multiplier <= MAX_COST_MULTIPLIER)).all()
@@ -84,25 +84,24 @@ def test_a_legal_move_costs_its_length_times_the_mean_cost_and_the_same_in_retur
 
 @pytest.mark.parametrize("rule", MoveRule)
 def test_a_rule_is_given_as_a_member_or_as_its_value(rule: MoveRule) -> None:
-    occupancy = np.array([[0, 1, 0], [0, 0, 0], [0, 1, 1]], dtype=bool)
+    grid = GridMap(np.array([[0, 1, 0], [0, 0, 0], [0, 1, 1]]))
     multiplier, cells = np.arange(1, 10, dtype=np.float32).reshape(3, 3), [(0, 0), (1, 1), (2, 1)]
     by_rule: list[Callable[[MoveRule | str], object]] = [
-        lambda rule: legal_moves(occupancy, rule).tolist(),
+        lambda rule: grid.legal_moves(rule).tolist(),
+        lambda rule: grid.labels(rule).tolist(),
+        lambda rule: grid.reachable([(2, 0)], rule).tolist(),
         lambda rule: move_costs(multiplier, rule).tolist(),
-        lambda rule: GridMap(occupancy).reachable([(2, 0)], rule).tolist(),
         lambda rule: path_length(cells, rule),
         lambda rule: path_cost(cells, multiplier, rule),
-        lambda rule: shortest_distances(GridMap(occupancy), (0, 0), rule).tolist(),
-        lambda rule: shortest_path(GridMap(occupancy), (0, 0), (2, 1), rule),
-        lambda rule: simplify(cells, GridMap(occupancy), rule),
+        lambda rule: shortest_distances(grid, (0, 0), rule).tolist(),
+        lambda rule: shortest_path(grid, (0, 0), (2, 1), rule),
+        lambda rule: simplify(cells, grid, rule),
     ]
-    for function in by_rule:
+    for function, wrong in product(by_rule, ("nope", "", "ROBOT_SAFE", None)):
         assert function(rule.value) == function(rule)
-        for wrong in ("nope", "", "ROBOT_SAFE", None):
-            with pytest.raises(
-                ValueError, match=f"{wrong!r} is unknown; give one of robot_safe, corner_c.*, unit"
-            ):
-                function(wrong)  # type: ignore[arg-type]
+        message = f"{wrong!r} is unknown; give one of robot_safe, corner_c.*, unit"
+        with pytest.raises(ValueError, match=message):
+            function(wrong)  # type: ignore[arg-type]
 
 
 def test_a_length_counts_moves_under_the_unit_rule_and_along_straight_segments() -> None:
@@ -115,8 +114,83 @@ def test_a_length_counts_moves_under_the_unit_rule_and_along_straight_segments()
     assert path_length([], "unit") == path_length([(1, 1)]) == 0
 
 
-def test_without_costs_a_path_costs_its_length_or_under_the_unit_rule_its_moves() -> None:
-    path, multiplier = [(0, 0), (1, 1), (2, 1), (3, 2)], GridMap(np.zeros((3, 4))).cost_multiplier
-    assert path_cost(path, multiplier, MoveRule.ROBOT_SAFE) == pytest.approx(path_length(path))
-    assert path_cost(path, multiplier, MoveRule.UNIT) == 3
-    assert path_cost(path[:1], multiplier, MoveRule.UNIT) == 0
+def check_labels(occupancy: np.ndarray, rule: MoveRule) -> None:
+    structure = scipy.ndimage.generate_binary_structure(2, 2 if rule.cuts_corners else 1)
+    expected = scipy.ndimage.label(~occupancy, structure)[0]
+    np.testing.assert_array_equal(GridMap(occupancy).labels(rule), expected)
+
+
+@given(occupancies, RULES)
+def test_the_labels_are_those_of_scipy(occupancy: np.ndarray, rule: MoveRule) -> None:
+    check_labels(occupancy, rule)
+
+
+@pytest.mark.parametrize(("rule", "share"), list(product(MoveRule, (0.4, 0.5, 0.6))))
+def test_the_labels_of_large_maps_are_those_of_scipy(rule: MoveRule, share: float) -> None:
+    check_labels(np.random.default_rng(0).random((150, 211)) < share, rule)
+
+
+@given(grids_with_directions(), RULES)
+def test_reachable_cells_are_those_between_which_and_the_cell_a_path_leads(
+    grid_and_cell: tuple[GridMap, Cell], rule: MoveRule
+) -> None:
+    grid, cell = grid_and_cell
+    from_there = np.isfinite(shortest_distances(grid, cell, rule))
+    np.testing.assert_array_equal(grid.reachable([cell], rule, backward=True), from_there)
+    reached = {other for other in grid.free_cells() if shortest_path(grid, cell, other, rule)}
+    found = {(x, y) for y, x in np.argwhere(grid.reachable([cell], rule)).tolist()}
+    assert found == reached
+
+
+@given(grids_with_directions(), RULES, st.data())
+def test_distances_meet_bellmans_equation_and_the_path_is_as_long_as_they_say(
+    grid_and_goal: tuple[GridMap, Cell], rule: MoveRule, data: st.DataObject
+) -> None:
+    grid, goal = grid_and_goal
+    distance = shortest_distances(grid, goal, rule)
+    legal, cost = grid.legal_moves(rule), move_costs(grid.cost_multiplier, rule)
+    assert distance[goal[1], goal[0]] == 0
+    assert np.isinf(distance[grid.occupancy]).all()
+    for x, y in set(grid.free_cells()) - {goal}:
+        by_move = [
+            cost[a, y, x] + distance[y + MOVES[a, 1], x + MOVES[a, 0]]
+            for a in np.flatnonzero(legal[:, y, x])
+        ]
+        assert distance[y, x] == pytest.approx(min(by_move, default=np.inf))
+    start = data.draw(st.sampled_from(grid.free_cells()))
+    path = shortest_path(grid, start, goal, rule)
+    if np.isinf(distance[start[1], start[0]]):
+        assert path == []
+    else:
+        assert (path[0], path[-1]) == (start, goal)
+        length = path_cost(path, grid.cost_multiplier, rule)
+        assert length == pytest.approx(distance[start[1], start[0]])
+
+
+def test_any_pair_of_whole_numbers_is_a_goal() -> None:
+    grid = GridMap(np.zeros((2, 3)))
+    for goal in ([2, 1], np.array([2, 1]), (2.0, np.int8(1))):
+        path = shortest_path(grid, np.array([0, 0]), goal, "unit")  # type: ignore[arg-type]
+        assert repr(path) == repr(shortest_path(grid, (0, 0), (2, 1), "unit"))
+    for wrong, named in (((0.5, 0), "is"), (None, "is"), ((3, 0), "outside"), ((-1, 0), "outside")):
+        with pytest.raises(ValueError, match=f"the goal .*{named}"):
+            shortest_distances(grid, wrong, "unit")  # type: ignore[arg-type]
+        with pytest.raises(ValueError, match=f"the start .*{named}"):
+            shortest_path(grid, wrong, (0, 0), "unit")  # type: ignore[arg-type]
+
+
+PROGRAM = """
+import sys
+from ddqn_planner.grid import inflate, legal_moves, load_map, move_costs
+from ddqn_planner.resources import find_map
+grid = load_map(find_map("dilemma"))
+inflate(grid, 0.0)
+legal_moves(grid.occupancy, "robot_safe")
+move_costs(grid.cost_multiplier, "robot_safe")
+print(*sorted({"matplotlib", "numba", "rclpy", "scipy", "torch"} & sys.modules.keys()))
+"""
+
+
+def test_the_grid_loads_no_heavy_library_before_it_needs_one() -> None:
+    command = [sys.executable, "-c", PROGRAM]
+    assert subprocess.run(command, check=True, capture_output=True, text=True).stdout.split() == []

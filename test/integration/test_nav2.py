@@ -388,42 +388,36 @@ def test_a_path_through_poses(navigator: Navigator) -> None:
 
 def test_each_cause_has_its_code(navigator: Navigator) -> None:
     robot, client = navigator.robot, navigator.robot.client
-    start, goal, blocked = (robot.pose(cell) for cell in (START, GOAL, (1, 1)))
-    outside, other_frame = robot.pose((99, 0)), robot.pose(GOAL)
+    start, goal, blocked, outside = (robot.pose(at) for at in (START, GOAL, (1, 1), (99, 0)))
+    other_frame = robot.pose(GOAL)
     other_frame.header.frame_id = "no_such_frame"
     walled = robot.values.copy()
     walled[:, 3] = 100
-    causes: list[tuple[str, dict[str, Any]]] = [
-        ("INVALID_PLANNER", {"goal": goal, "start": start, "planner_id": "Smac"}),
-        ("START_OUTSIDE_MAP", {"goal": goal, "start": outside}),
-        ("GOAL_OUTSIDE_MAP", {"goal": outside, "start": start}),
-        ("START_OCCUPIED", {"goal": goal, "start": blocked}),
-        ("GOAL_OCCUPIED", {"goal": blocked, "start": start}),
-        ("TF_ERROR", {"goal": other_frame, "start": start}),
-        ("TF_ERROR", {"goal": goal, "start": other_frame}),
-    ]
 
-    def assert_code(name: str, fields: dict[str, Any]) -> None:
-        answer = navigator.plan(**fields, use_start=True)
+    def assert_code(name: str, goal: PoseStamped, **fields: Any) -> None:
+        answer = navigator.plan(goal, use_start=True, **fields)
         code = getattr(navigator.actions.ComputePathToPose.Result, name)
         assert (answer.status, answer.result.error_code) == (ABORTED, code)
         assert answer.result.error_msg
         assert answer.result.path.poses == []
-        through = navigator.plan([fields.pop("goal")], **fields, use_start=True).result
-        assert through.error_code == getattr(navigator.actions.ComputePathThroughPoses.Result, name)
+        through = navigator.plan([goal], use_start=True, **fields).result
+        assert through.error_code == code + 100
 
     assert client.set_parameters("planner", start_clearing_radius=0.0)[0].successful
-    for name, fields in causes:
-        assert_code(name, fields)
-    assert client.set_parameters("planner", start_clearing_radius=-1.0)[0].successful
-    none = navigator.plan([], start=start, use_start=True).result
-    assert none.error_code == navigator.actions.ComputePathThroughPoses.Result.NO_VIAPOINTS_GIVEN
+    assert_code("INVALID_PLANNER", goal, start=start, planner_id="Smac")
+    assert_code("START_OUTSIDE_MAP", goal, start=outside)
+    assert_code("GOAL_OUTSIDE_MAP", outside, start=start)
+    assert_code("START_OCCUPIED", goal, start=blocked)
+    assert_code("GOAL_OCCUPIED", blocked, start=start)
+    assert_code("TF_ERROR", other_frame, start=start)
+    assert_code("TF_ERROR", goal, start=other_frame)
+    values = {"start_clearing_radius": -1.0, "planner_id": "Smac"}
+    assert all(result.successful for result in client.set_parameters("planner", **values))
+    assert navigator.plan([], start=start, use_start=True).result.error_code == 309
     robot.set_map(robot.stamped_map(walled))
-    assert_code("NO_VALID_PATH", {"goal": goal, "start": start})
+    assert_code("NO_VALID_PATH", goal, start=start, planner_id="Smac")
     second = navigator.plan([robot.pose((0, 5)), goal], start=start, use_start=True).result
     assert second.error_msg.startswith("goal 2 of 2: no path leads from the start to the goal")
-    assert client.set_parameters("planner", planner_id="Smac")[0].successful
-    assert_code("NO_VALID_PATH", {"goal": goal, "start": start, "planner_id": "Smac"})
     assert client.set_parameters("planner", planner_id="GridBased")[0].successful
 
 
