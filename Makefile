@@ -47,7 +47,7 @@ test-fast: setup
 
 # What measures has tests of its own: they train and drive for minutes.
 experiments-test: setup
-	$(PYTEST) experiments/tests
+	$(PYTEST) --dist worksteal experiments/tests
 
 # The site, in docs/_build/html; a warning is an error.
 docs: setup
@@ -80,7 +80,7 @@ faults: setup
 
 fuzz: setup
 	$(BIN)/python -m pytest --hypothesis-profile=fuzz --hypothesis-show-statistics -m hypothesis \
-		test/grid/test_map_file.py test/grid/test_map_file_fuzz.py test/model/test_model_file.py \
+		test/grid/test_map_file.py test/model/test_model_file.py \
 		test/training/test_run.py test/integration
 
 load: setup

@@ -143,9 +143,8 @@ class Known(NamedTuple):
 class DistanceField(QField):
     """The Q field that costs of moves give: computed where a request needs it, and repaired.
 
-    Q(s, a) is minus the cost of a and of the cheapest path from where it leads, so distances to the
-    nearest goal hold all of it. They grow from the goals until they reach a start; `q`, `value` and
-    `policy` are made of the whole map when asked for. Several threads may use one field.
+    Distances to the nearest goal hold all of it. They grow from the goals until they reach a start;
+    `q`, `value` and `policy` are made of the whole map. Several threads may use one field.
     """
 
     def __init__(self, goals: Goals, grid: GridMap, costs: MoveCosts, move_rule: MoveRule) -> None:
@@ -206,11 +205,7 @@ class DistanceField(QField):
             self._lock.release()
 
     def rollout(self, start: Cell, limit: int | None = None) -> Plan:
-        """Take greedy steps from a free cell until a goal, and return the path.
-
-        To compute the field as far as the start, about as many cells as the limit may be visited.
-        The plan is ROLLOUT_TRAPPED if that is not enough.
-        """
+        """Return the path; ROLLOUT_TRAPPED if more cells than the limit must be visited for it."""
         start = cell_inside(start, self.grid.occupancy.shape, "the start")
         with self._lock:
             if not self._reach(start, limit):
@@ -230,10 +225,9 @@ class DistanceField(QField):
     ) -> bool:
         """Repair and take what an older field knows of the same place, unless to begin is quicker.
 
-        The values are the same. For one start, repair and new field take turns, each time with four
-        times the limit: so the quicker one wins, and its time is not exceeded by much. The older
-        field begins anew if it was taken over, else it stays as it is. See `shift_between` and
-        `changed_cells`; return whether it was taken over.
+        For one start, repair and new field take turns, each time with four times the limit: so the
+        quicker one wins. An older field that was taken over begins anew, else it stays as it is.
+        Return whether it was taken over; see `shift_between` and `changed_cells`.
         """
         most = max(REPAIRED, int(REPAIRED_SHARE * self.grid.occupancy.size))
         has_values_of_all = not vars(old).keys().isdisjoint(("q", "value", "policy"))

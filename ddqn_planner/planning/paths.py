@@ -41,8 +41,8 @@ def reach(request: PlanRequest) -> float:
 def way_out_and_ends(request: PlanRequest, goals: Goals) -> tuple[tuple[Cell, ...], Goals]:
     """Return the way from the start to the first free cell, and where the path can end.
 
-    The way is the start alone where that is free. It is empty where no path leads to a goal, nor
-    to a cell within the tolerance: connected cells say so, without a field.
+    The way is the start alone where that is free, and empty where no path leads to a goal or to a
+    cell within the tolerance: connected cells say so, without a field.
     """
     grid, start, rule = request.grid, request.start, request.move_rule
     candidates = [(np.array(goals), len(goals))] if goals else []

@@ -8,8 +8,8 @@ from hypothesis import strategies as st
 from networks import random_network
 from strategies import grids_with_costs, grids_with_free_cell
 
-from ddqn_planner.grid import Cell, GridMap, MoveRule, legal_moves
-from ddqn_planner.model import NETWORKS, load_model, networks
+from ddqn_planner.grid import Cell, GridMap, MoveRule
+from ddqn_planner.model import NETWORKS, networks
 from ddqn_planner.model.move_costs import MAX_MULTIPLIER
 from ddqn_planner.model.networks import AnyMapQNetwork, PropagationQNetwork
 from ddqn_planner.model.observation import observation_background, observe, patches
@@ -83,30 +83,6 @@ def test_the_propagation_networks_answer_on_each_patch_as_their_modules(
             ),
         ):
             np.testing.assert_allclose(answer, expected.numpy(), rtol=1e-5, atol=1e-5)
-
-
-def test_the_shipped_models_answer_as_their_modules(paper) -> None:  # type: ignore[no-untyped-def]
-    network, _ = load_model("dilemma")
-    q = network.q_values(paper.grid, paper.goal, MoveRule.CORNER_CUTTING)
-    background = observation_background(paper.grid.occupancy, paper.goal)
-    observations = observe(background, np.arange(400), (20, 20))
-    with torch.inference_mode():
-        states = PaperModule.windows(torch.from_numpy(observations))
-        expected = PaperModule.from_numpy(network)(states)
-    np.testing.assert_allclose(q.reshape(8, -1).T, expected.numpy(), rtol=1e-5, atol=1e-5)
-
-    any_map, _ = load_model("any_map")
-    assert isinstance(any_map, AnyMapQNetwork)
-    module = AnyMapModule.from_numpy(any_map)
-    random = np.random.default_rng(0)
-    features = AnyMapQNetwork.features(
-        random.integers(-1, 101, (2000, 9)).astype(np.int8), MoveRule.ROBOT_SAFE
-    )
-    with torch.inference_mode():
-        p = module.success(torch.from_numpy(features)).numpy()
-        multiplier = module.multiplier(torch.from_numpy(features)).numpy()
-    np.testing.assert_allclose(any_map.success(features), p, rtol=1e-5, atol=1e-5)
-    np.testing.assert_allclose(any_map.multiplier(features), multiplier, rtol=1e-5, atol=1e-5)
 
 
 # The paper's network
@@ -203,17 +179,6 @@ def test_a_move_whose_cost_or_p_is_nan_is_not_possible(tensor: str) -> None:
     q = q_values(network, grid, (1, 0))
     assert q[0, 0, 0] == -np.inf
     assert q[2, 0, 0] == pytest.approx(-(1 + 2**0.5) / 0.9)  # up, and then down to the right
-
-
-def test_the_network_for_any_map_tells_legal_moves() -> None:
-    network, _ = load_model("any_map")
-    assert isinstance(network, AnyMapQNetwork)
-    occupancy = np.random.default_rng(0).random((30, 30)) < 0.3
-    for rule in (MoveRule.ROBOT_SAFE, MoveRule.CORNER_CUTTING):
-        p = network.success(AnyMapQNetwork.features(patches(occupancy, None), rule))
-        free = ~occupancy.ravel()
-        legal = legal_moves(occupancy, rule).reshape(8, -1).T
-        np.testing.assert_array_equal(p[free] > 0.5, legal[free])
 
 
 def test_every_cost_begins_where_it_has_a_gradient() -> None:

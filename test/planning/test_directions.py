@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from strategies import grids_with_directions
 
-from ddqn_planner import GridMap, MoveRule, Planner, PlanStatus, inflate
+from ddqn_planner import GridMap, MoveRule, Planner
 from ddqn_planner.grid import (
     MOVES,
     Cell,
@@ -95,20 +95,6 @@ def test_a_map_may_hold_all_sets_of_directions(classes: int) -> None:
     np.testing.assert_allclose(-value, exact, rtol=1e-2)
 
 
-def test_a_robot_too_near_to_an_obstacle_leaves_in_an_allowed_direction() -> None:
-    occupancy = np.zeros((5, 9), dtype=bool)
-    occupancy[2, 4] = True
-    forbidden = np.full(occupancy.shape, ONLY_EAST)
-    grid = inflate(GridMap(occupancy, forbidden=forbidden), 1.2)
-    assert not grid.is_free((3, 2))
-    planner = Planner(NETWORK, METADATA)
-    plan = planner.plan(grid, (3, 2), (8, 2))
-    assert plan.cells[0] == (3, 2)
-    x = [cell[0] for cell in plan.cells]
-    assert x == sorted(x)
-    assert planner.plan(grid, (3, 2), (0, 2)).status is PlanStatus.NO_PATH
-
-
 def test_where_the_directions_turn_round_a_path_under_way_is_given_up() -> None:
     planner, grid = Planner(NETWORK, METADATA), corridor(ONLY_EAST)
     cells = planner.plan(grid, (0, 0), (5, 0)).cells
@@ -128,10 +114,3 @@ def test_new_obstacles_leave_a_path_that_obeys() -> None:
     path = [(0, 0), (1, 0), (2, 0), (3, 0), (4, 0)]
     with pytest.raises(ValueError, match="none of 1000 draws"):
         scatter_obstacles(grid, path, MoveRule.ROBOT_SAFE, np.random.default_rng(0), Noise.ON_PATH)
-    free, _ = scatter_obstacles(
-        replace(grid, forbidden=None),
-        path,
-        MoveRule.CORNER_CUTTING,
-        np.random.default_rng(0),
-    )
-    assert free.occupancy.sum() > occupancy.sum()

@@ -91,6 +91,13 @@ def test_a_path_is_valid_if_all_of_it_from_the_cell_nearest_to_the_robot_on_is_l
     assert is_path_valid(path, robot, grid, rule)
 
 
+def test_a_path_of_which_only_an_occupied_end_is_left_is_not_valid() -> None:
+    grid, path = GridMap(np.zeros((1, 9))), [(0, 0), (1, 0), (2, 0)]
+    for robot in ((9, 0), (2, 5)):  # off the map, so that its own cell does not count
+        assert is_path_valid(path, robot, grid, "robot_safe")
+        assert not is_path_valid(path, robot, grid.with_patch([[True]], 2, 0), "robot_safe")
+
+
 def test_an_empty_path_is_not_valid_and_nothing_is_left_of_it() -> None:
     grid = GridMap(np.zeros((3, 3)))
     assert not is_path_valid([], (0, 0), grid, "robot_safe")
@@ -210,12 +217,6 @@ def test_a_planner_keeps_the_path_under_way_up_to_the_threshold() -> None:
         assert other.extra_cost is None
     blocked = two_corridors(20, 20).with_patch(np.ones((3, 1)), 20, 8)
     assert not is_upper(plan(blocked, 10.0, first.every_cell))
-
-
-def test_the_same_path_is_no_new_one() -> None:
-    grid = two_corridors(20, 22)
-    first = plan(grid, 0.0)
-    assert plan(grid, 0.0, first.every_cell) == replace(first, extra_cost=0.0)
 
 
 @given(GRIDS, RULES, st.sampled_from([0.0, 0.3, 10.0]), st.data())

@@ -10,7 +10,6 @@ from networks import turning_network
 from ddqn_planner.grid import Cell, GridMap, MoveRule
 from ddqn_planner.model import ModelMetadata
 from ddqn_planner.planning import Plan, PlanMethod, Planner, PlanRequest, PlanStatus, QField
-from ddqn_planner.planning.field_cache import FieldCache
 from ddqn_planner.planning.planner import last_step
 
 RULE = MoveRule.ROBOT_SAFE
@@ -21,29 +20,6 @@ def turning_planner() -> Planner:
     network = turning_network(6)
     metadata = ModelMetadata("paper", network.sizes, MoveRule.ROBOT_SAFE, 0.9, "", 1, 0, "")
     return Planner(network, metadata)
-
-
-@pytest.mark.parametrize("simplified", [False, True])
-def test_a_search_continues_from_what_the_trapped_rollout_found(
-    simplified: bool, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    grid, planner = GridMap(np.zeros((6, 6))), turning_planner()
-    request = PlanRequest(
-        grid, (0, 0), (5, 5), RULE, PlanMethod.ASTAR_FALLBACK, simplified=simplified
-    )
-    whole = last_step(planner.steps(request))
-    trapped = planner.plan(grid, (0, 0), (5, 5), RULE)
-    assert trapped.status is PlanStatus.ROLLOUT_TRAPPED
-    steps = planner.steps(request)
-    assert next(steps) is None  # the search: the field is known
-    for name in ("get", "find"):
-        monkeypatch.delattr(FieldCache, name)
-    monkeypatch.delattr(QField, "rollout")
-    found = last_step(steps)
-    assert found == whole
-    assert found.goal == (5, 5)
-    assert found.method is PlanMethod.ASTAR_FALLBACK
-    assert len(found.cells) == (2 if simplified else 6)
 
 
 @pytest.mark.parametrize("method", PlanMethod)

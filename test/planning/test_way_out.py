@@ -136,17 +136,6 @@ def test_a_start_deeper_in_a_wall_than_the_radius_stays_occupied() -> None:
         ANY_MAP.plan(grid, (10, 2), (0, 2), start_clearing_radius=math.nan)
 
 
-def test_only_the_first_start_of_a_path_through_goals_is_cleared() -> None:
-    occupancy = np.zeros((7, 9), dtype=bool)
-    occupancy[2:5, 1:4] = occupancy[3, 6] = True
-    grid = GridMap(occupancy)
-    plan = ANY_MAP.plan_through(grid, (2, 3), [(5, 3), (8, 3)], start_clearing_radius=1)
-    assert (plan.cells[0], plan.cells[-1]) == ((2, 3), (8, 3))
-    assert [cell for cell in plan.cells if grid.is_obstacle(cell)] == [(2, 3), (3, 3)]
-    plan = ANY_MAP.plan_through(grid, (2, 3), [(6, 3), (8, 3)], start_clearing_radius=1)
-    assert (plan.status, plan.goal) == (PlanStatus.GOAL_OCCUPIED, (6, 3))
-
-
 def test_a_path_that_leaves_is_valid_until_another_obstacle_lies_on_it() -> None:
     occupancy = np.zeros((5, 12), dtype=bool)
     occupancy[2, 2:5] = True
