@@ -41,7 +41,7 @@ NOBODY = 65534
 NOT_SOURCE = (".*", "__pycache__", "*.egg-info", "build", "dist", "install", "log", "runs")
 
 
-ANY_WORKER = {"test_cli.py", "test_demo.py", "test_trainer.py"}
+ANY_WORKER = {"test_cli.py", "test_demo.py"}
 """Files whose tests take long and share nothing; the tests of another file share a worker."""
 
 
