@@ -245,12 +245,15 @@ class Planner:
         if isinstance(found, PlanStatus):
             yield Plan(found, move_rule=request.move_rule, field_ms=field_ms)
             return
-        plan, rollout_ms = yield from _timed(_roll_out(request, found))
-        began, known_ms = time.perf_counter(), found.plan.rollout_ms if found.plan else 0.0
+        plan, rollout_ms = found.plan, 0.0
+        if plan is None or not plan.path.size:
+            plan, rollout_ms = yield from _timed(_roll_out(request, found))
+        else:  # it was found with the field
+            field_ms, rollout_ms = field_ms - plan.rollout_ms, plan.rollout_ms
+        began = time.perf_counter()
         dress = _dress(request, found, plan)
-        dress["field_ms"] = field_ms - known_ms
-        dress["rollout_ms"] = rollout_ms + known_ms + 1e3 * (time.perf_counter() - began)
-        yield replace(plan, **dress)
+        rollout_ms += 1e3 * (time.perf_counter() - began)
+        yield replace(plan, **dress, field_ms=field_ms, rollout_ms=rollout_ms)
 
     def _refusal(self, request: PlanRequest) -> PlanStatus | None:
         """Return why there is no path, where one look at start and goals says so."""
