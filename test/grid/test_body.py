@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as numpy_st
 from strategies import occupancies
@@ -84,7 +84,6 @@ def test_a_value_out_of_range_is_named(wrong: float) -> None:
 BODIES = st.tuples(st.sampled_from([0.0, 0.4, 1.0, 2.3]), st.sampled_from([0.0, 0.3, 1.0]))
 
 
-@settings(max_examples=200)
 @given(st.integers(0, 2**32), st.lists(BODIES, min_size=1, max_size=2), st.booleans(), st.data())
 def test_maps_that_come_one_after_another_are_inflated_as_if_each_were_the_first(
     seed: int, bodies: list[tuple[float, float]], with_costs: bool, data: st.DataObject

@@ -1,0 +1,177 @@
+"""The shipped maps. The dilemma has each property of the paper's text; see docs/reproduction.md."""
+
+from __future__ import annotations
+
+import itertools
+import math
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+from random_maps import generate_map
+
+from ddqn_planner import Planner
+from ddqn_planner.grid import (
+    MOVES,
+    OCCUPIED,
+    Cell,
+    GridMap,
+    MoveRule,
+    load_map,
+    read_map_file,
+    save_map,
+    shortest_distances,
+)
+from ddqn_planner.resources import find_map
+from ddqn_planner.training.environment import Scenario
+
+START_DEAD_END = {(x, y) for x in (4, 5, 6) for y in (6, 7, 8)} | {(7, 6), (7, 7)}
+
+DEAD_ENDS_ON_THE_WAY = [
+    {(x, y) for x in range(14, 18) for y in (16, 17)},
+    {(x, y) for x in range(16, 19) for y in range(9, 13)},
+]
+
+
+def next_cells(paper: Scenario, cell: Cell, rule: MoveRule) -> list[Cell]:
+    x, y = cell
+    legal = paper.grid.legal_moves(rule)[:, y, x]
+    return [(x + dx, y + dy) for dx, dy in MOVES[legal].tolist()]
+
+
+def mouth(paper: Scenario, dead_end: set[Cell]) -> set[Cell]:
+    """The free cells outside a dead end that one move from inside reaches."""
+    moves = (next_cells(paper, cell, MoveRule.CORNER_CUTTING) for cell in dead_end)
+    return set(itertools.chain(*moves)) - dead_end
+
+
+def greedy_neighbour_walk(paper: Scenario, start: Cell, rule: MoveRule) -> set[Cell]:
+    """The cells entered by always stepping to the free neighbour nearest to the end."""
+    cell, entered = start, set()
+    while cell not in entered:
+        entered.add(cell)
+        cell = min(next_cells(paper, cell, rule), key=lambda c: math.dist(c, paper.goal))
+    return entered
+
+
+def test_there_are_286_free_cells_besides_start_and_end(paper: Scenario) -> None:
+    assert paper.grid.occupancy.shape == (20, 20)
+    assert len(set(paper.grid.free_cells()) - {paper.start, paper.goal}) == 286
+
+
+def test_the_start_lies_in_a_dead_end_of_ten_cells_that_opens_away_from_the_end(
+    paper: Scenario,
+) -> None:
+    assert paper.start in START_DEAD_END
+    assert len(START_DEAD_END - {paper.start}) == 10
+    opening = mouth(paper, START_DEAD_END)
+    assert all(math.dist(c, paper.goal) > math.dist(paper.start, paper.goal) for c in opening)
+    closed = paper.grid.occupancy.copy()
+    for x, y in opening:
+        closed[y, x] = True
+    inside = GridMap(closed).reachable([paper.start], MoveRule.CORNER_CUTTING)
+    assert {(int(x), int(y)) for y, x in np.argwhere(inside)} == START_DEAD_END
+
+
+@pytest.mark.parametrize("dead_end", DEAD_ENDS_ON_THE_WAY)
+def test_two_more_dead_ends_catch_a_robot_that_heads_for_the_end(
+    paper: Scenario, dead_end: set[Cell]
+) -> None:
+    opening = mouth(paper, dead_end)
+    deepest = min(dead_end, key=lambda cell: math.dist(cell, paper.goal))
+    assert min(math.dist(c, paper.start) for c in opening) < math.dist(deepest, paper.start)
+    caught = [
+        cell
+        for cell in paper.grid.free_cells()
+        if cell not in dead_end
+        and paper.goal
+        not in (walked := greedy_neighbour_walk(paper, cell, MoveRule.CORNER_CUTTING))
+        and walked & dead_end
+    ]
+    assert len(caught) > 20
+
+
+@pytest.mark.parametrize("rule", MoveRule)
+def test_every_free_cell_is_connected_to_the_end(paper: Scenario, rule: MoveRule) -> None:
+    connected = paper.grid.reachable([paper.goal], rule)
+    np.testing.assert_array_equal(connected, ~paper.grid.occupancy)
+
+
+@pytest.mark.parametrize(
+    ("rule", "length"),
+    [
+        (MoveRule.CORNER_CUTTING, 6 + 12 * math.sqrt(2)),
+        (MoveRule.ROBOT_SAFE, 14 + 8 * math.sqrt(2)),
+    ],
+)
+def test_the_shortest_path_has_the_papers_length(
+    paper: Scenario, rule: MoveRule, length: float
+) -> None:
+    distances = shortest_distances(paper.grid, paper.goal, rule)
+    assert distances[paper.start[1], paper.start[0]] == pytest.approx(length, abs=1e-9)
+
+
+@pytest.mark.parametrize("rule", MoveRule)
+def test_stepping_to_the_neighbour_nearest_to_the_end_gets_stuck(
+    paper: Scenario, rule: MoveRule
+) -> None:
+    assert greedy_neighbour_walk(paper, paper.start, rule) <= START_DEAD_END
+
+
+def test_the_shipped_office_is_a_generated_one_of_six_times_the_cells() -> None:
+    plan = generate_map("office", (64, 96), np.random.default_rng(4))
+    shipped = read_map_file(find_map("office"))
+    np.testing.assert_array_equal(shipped.values, OCCUPIED * np.kron(plan, np.ones((6, 6), bool)))
+    assert (shipped.resolution, shipped.start, shipped.goal) == (0.05, (15, 15), (550, 330))
+    assert shipped.grid().is_free(shipped.start)
+    assert shipped.grid().is_free(shipped.goal)
+
+
+# What a lane forbids: all actions that lead against it, for NumPy's rows from the bottom up.
+EAST, NORTH, WEST, SOUTH = (
+    sum(1 << action for action, move in enumerate(MOVES) if move @ along < 0)
+    for along in ((1, 0), (0, 1), (-1, 0), (0, -1))
+)
+
+
+def test_robots_keep_right_and_drive_there_and_back_in_different_aisles() -> None:
+    map_file, grid = read_map_file(find_map("warehouse")), load_map(find_map("warehouse"))
+    start, goal = map_file.start, map_file.goal
+    assert start is not None
+    assert goal is not None
+    planner = Planner.load("any_map")
+    there, back = (planner.plan(grid, *ends).cells for ends in ((start, goal), (goal, start)))
+    for cells, along in ((there, 1), (back, -1)):
+        aisle = [step for step in itertools.pairwise(cells) if 5 <= step[0][1] < 31]
+        assert aisle
+        assert all(along * (after[1] - before[1]) >= 0 for before, after in aisle)
+        corridor = [step for step in itertools.pairwise(cells) if step[0][1] < 5]
+        lanes = {before[1] in (1, 2) for before, after in corridor if before[1] == after[1]}
+        assert lanes == {along > 0}
+    aisles = [{x // 6 for x, y in cells if 6 <= y < 30} for cells in (there, back)]
+    assert aisles[0].isdisjoint(aisles[1])
+    assert not set(there[1:-1]) & set(back[1:-1])
+
+
+def test_the_example_of_the_documentation_makes_the_lanes_that_it_says(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    text = (Path(__file__).parents[2] / "docs" / "one_way.md").read_text(encoding="utf-8")
+    (example,) = re.findall(r"```python\n(.*?)```", text, re.DOTALL)
+    monkeypatch.chdir(tmp_path)
+    save_map(GridMap(np.zeros((240, 200))), "hall.yaml")
+    exec(example, {})
+    yaml = Path("hall.yaml").read_text(encoding="utf-8")
+    Path("hall.yaml").write_text(yaml + "ddqn_planner: {directions: hall_directions.png}\n")
+    forbidden = load_map("hall.yaml").forbidden
+    assert forbidden is not None
+    # Cells count from the bottom.
+    places = ((30, 100), (90, 100), (5, 50), (5, 70))
+    lanes = [int(forbidden[y, x]) for x, y in places]
+    assert lanes == [NORTH, SOUTH, EAST, WEST]
+    # The arrows of the table stand where they point.
+    table = np.array([[8, 4, 2], [16, 0, 1], [32, 64, 128]])
+    assert [int(table[1 - dy, 1 + dx]) for dx, dy in MOVES] == [1 << a for a in range(8)]
+    numbers = re.findall(r"[↖↑↗←→↙↓↘] (\d+)", text)
+    assert [int(number) for number in numbers[:8]] == table[table > 0].tolist()
