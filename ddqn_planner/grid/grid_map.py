@@ -302,7 +302,7 @@ class GridMap:
         """Return whether a cell lies inside the map and is not occupied."""
         x, y = as_cell(cell)
         height, width = self.occupancy.shape
-        return 0 <= x < width and 0 <= y < height and not self.occupancy[y, x]
+        return bool(0 <= x < width and 0 <= y < height and not self.occupancy[y, x])
 
     def is_obstacle(self, cell: Cell) -> bool:
         """Return whether a cell is an obstacle, not just too near to one; ValueError if outside."""
