@@ -296,7 +296,7 @@ class GridMap:
         """Return whether a cell lies inside the map."""
         x, y = as_cell(cell)
         height, width = self.occupancy.shape
-        return 0 <= x < width and 0 <= y < height
+        return bool(0 <= x < width and 0 <= y < height)
 
     def is_free(self, cell: Cell) -> bool:
         """Return whether a cell lies inside the map and is not occupied."""
