@@ -16,9 +16,10 @@ from ddqn_planner.grid.moves import (
     neighbours,
     path_cost,
     path_length,
+    shortest_distances,
+    shortest_path,
 )
 from ddqn_planner.grid.noise import Noise, scatter_obstacles
-from ddqn_planner.grid.shortest_paths import shortest_distances, shortest_path
 
 __all__ = [
     "LENGTHS",

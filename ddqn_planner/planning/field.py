@@ -212,9 +212,8 @@ class DistanceField(QField):
                 status = PlanStatus.NO_PATH if self.is_whole else PlanStatus.ROLLOUT_TRAPPED
                 return Plan(status, move_rule=self.move_rule)
             began = time.perf_counter()
-            cells = kernels.roll_out(self.known.distance, self.costs, self._number(start))
-        y, x = np.divmod(cells, self.costs.width)
-        return self._succeeded(np.stack([x - 1, y - 1], axis=1).astype(np.int32), began)
+            path = kernels.roll_out(self.known.distance, self.costs, self._number(start))
+        return self._succeeded(path, began)
 
     def take_over(
         self,

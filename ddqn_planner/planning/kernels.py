@@ -337,16 +337,25 @@ def _next_action(
 
 
 @compiled
-def roll_out(distance: Distances, costs: MoveCosts, start: int) -> NDArray[np.int64]:
-    """Return the cells of greedy steps from a closed start to the goal, both too."""
+def roll_out(distance: Distances, costs: MoveCosts, start: int) -> Cells:
+    """Return the (x, y) of greedy steps from a closed start to the goal, both too: (N, 2)."""
     patch, table, value, terms, width = costs[:5]
-    cells = [start]
+    cells: Cells = np.empty(64, np.int32)
+    cell, number = start, 0
     while True:
-        cell = cells[-1]
+        if number == cells.size:
+            cells = np.concatenate((cells, np.empty(number, np.int32)))
+        cells[number] = cell
+        number += 1
         action = _next_action(distance, patch, table, value, terms, width, cell)
         if distance[cell] == AT_GOAL or action < 0:
-            return np.array(cells)
-        cells.append(cell + MOVE_Y[action] * width + MOVE_X[action])
+            break
+        cell += MOVE_Y[action] * width + MOVE_X[action]
+    path: Cells = np.empty((number, 2), np.int32)
+    for step in range(number):
+        path[step, 0] = cells[step] % width - 1
+        path[step, 1] = cells[step] // width - 1
+    return path
 
 
 @compiled

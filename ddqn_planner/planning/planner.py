@@ -245,9 +245,15 @@ class Planner:
         if isinstance(found, PlanStatus):
             yield Plan(found, move_rule=request.move_rule, field_ms=field_ms)
             return
-        plan, rollout_ms = yield from _timed(_roll_out(request, found))
-        known_ms = found.plan.rollout_ms if found.plan else 0.0
-        yield replace(plan, field_ms=field_ms - known_ms, rollout_ms=rollout_ms + known_ms)
+        plan, rollout_ms = found.plan, 0.0
+        if plan is None or not plan.path.size:
+            plan, rollout_ms = yield from _timed(_roll_out(request, found))
+        else:  # it was found with the field
+            field_ms, rollout_ms = field_ms - plan.rollout_ms, plan.rollout_ms
+        began = time.perf_counter()
+        dress = _dress(request, found, plan)
+        rollout_ms += 1e3 * (time.perf_counter() - began)
+        yield replace(plan, **dress, field_ms=field_ms, rollout_ms=rollout_ms)
 
     def _refusal(self, request: PlanRequest) -> PlanStatus | None:
         """Return why there is no path, where one look at start and goals says so."""
@@ -332,7 +338,7 @@ def _in_parts(field: DistanceField, request: PlanRequest) -> Generator[None, Non
 
 
 def _roll_out(request: PlanRequest, found: _Found) -> Generator[None, None, Plan]:
-    """Return the plan: the rollout, or where it is trapped perhaps a search, and dressed."""
+    """Return the rollout, or where it is trapped perhaps a search."""
     start, field, rule = found.way_out[-1], found.field, request.move_rule
     plan = found.plan or field.rollout(start)
     if not plan.path.size and request.method is PlanMethod.ASTAR_FALLBACK:
@@ -340,11 +346,11 @@ def _roll_out(request: PlanRequest, found: _Found) -> Generator[None, None, Plan
         costs = request.grid.cost_multiplier
         cells = search(start, field.goal, field.legal, costs, rule, field.value)
         plan = Plan(PlanStatus.SUCCEEDED, np.array(cells), PlanMethod.ASTAR_FALLBACK)
-    return _dressed(request, found, plan)
+    return plan
 
 
-def _dressed(request: PlanRequest, found: _Found, plan: Plan) -> Plan:
-    """Return the plan with the way out, what is kept of the path under way, its cost and goal."""
+def _dress(request: PlanRequest, found: _Found, plan: Plan) -> dict[str, Any]:
+    """Return what a plan gets: way out, what is kept of the path under way, cost, goal."""
     grid, rule, way_out = request.grid, request.move_rule, found.way_out
     path, cost, extra_cost, goal = plan.path, None, None, found.field.goal
     if path.size:
@@ -362,15 +368,8 @@ def _dressed(request: PlanRequest, found: _Found, plan: Plan) -> Plan:
     every_cell = path
     if request.simplified:
         path = np.array(simplify(path, grid, rule), dtype=np.int32)
-    return replace(
-        plan,
-        path=path,
-        move_rule=rule,
-        cost=cost,
-        goal=goal,
-        every_cell=every_cell,
-        extra_cost=extra_cost,
-    )
+    dress = {"path": path, "every_cell": every_cell, "move_rule": rule}
+    return {**dress, "cost": cost, "extra_cost": extra_cost, "goal": goal}
 
 
 def _timed(steps: Generator[None, None, T]) -> Generator[None, None, tuple[T, float]]:
