@@ -299,7 +299,7 @@ class GridMap:
         names = "occupancy", "cost", "forbidden", "slowness"
         return self is other or (
             self._checksum == other._checksum
-            and all(_equal(getattr(self, name), getattr(other, name)) for name in names)
+            and all(equal(getattr(self, name), getattr(other, name)) for name in names)
         )
 
     def contains(self, cell: Cell) -> bool:
@@ -385,7 +385,8 @@ def _replaced(array: NDArray[Any] | None, box: tuple[slice, slice], values: NDAr
     return array
 
 
-def _equal(some: NDArray[Any] | None, others: NDArray[Any] | None) -> bool:
+def equal(some: NDArray[Any] | None, others: NDArray[Any] | None) -> bool:
+    """Return whether two layers are equal, soon where they are the same or very different."""
     if some is None or others is None or some is others:
         return some is others
     # A planner compares a map with each one that it knows; a look at some cells often suffices.
