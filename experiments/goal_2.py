@@ -19,10 +19,9 @@ from trainings import MOVE_RULE, Training
 
 from ddqn_planner.grid import MOVES, legal_moves
 from ddqn_planner.planning import Planner, QField
-from ddqn_planner.training.encoders import PropagationEncoder
 from ddqn_planner.training.environment import GridVectorEnvironment, Scenario, paper_scenario
 from ddqn_planner.training.evaluation import length_ratios
-from ddqn_planner.training.networks import PropagationModule
+from ddqn_planner.training.networks import PropagationEncoder, PropagationModule
 
 COLUMNS = (
     "profile",

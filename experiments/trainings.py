@@ -21,9 +21,9 @@ from ddqn_planner.grid import LENGTHS, MoveRule, legal_moves, neighbours, shorte
 from ddqn_planner.planning import Plan, Planner
 from ddqn_planner.training.environment import GridVectorEnvironment, Scenario
 from ddqn_planner.training.hyper_parameters import HyperParameters
+from ddqn_planner.training.networks import value_iteration
 from ddqn_planner.training.run import TrainingRun
 from ddqn_planner.training.trainer import Trainer
-from ddqn_planner.training.value_iteration import value_iteration
 
 MOVE_RULE: Final = MoveRule.CORNER_CUTTING
 """The rule under which the paper's 22.97 is the shortest path (docs/reproduction.md)."""

@@ -2,18 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from pathlib import Path as FilePath
-
 import numpy as np
 from action_msgs.msg import GoalStatus, GoalStatusArray
-from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import PoseStamped
 from nav_msgs.msg import OccupancyGrid
 from numpy.typing import NDArray
-from rclpy.publisher import Publisher
 from rclpy.qos import DurabilityPolicy, QoSProfile
-from std_msgs.msg import Header, String
+from rclpy.time import Time
+from std_msgs.msg import String
 
 from ddqn_planner.experience.drives import (
     EXPERIENCE,
@@ -25,10 +21,9 @@ from ddqn_planner.experience.drives import (
 )
 from ddqn_planner.grid import GridMap
 from ddqn_planner.nodes.conversions import occupancy_message, quaternion, serialized_poses
-from ddqn_planner.nodes.poses import MapInFrame, RobotPoses
-from ddqn_planner.nodes.replay import Replay
-from ddqn_planner.nodes.report import Refusals
-from ddqn_planner.nodes.runtime import LATCHED, STEADY, BaseNode
+from ddqn_planner.nodes.learning import NO_MAP, LearningNode, MapInFrame, explained
+from ddqn_planner.nodes.poses import Frames, listen
+from ddqn_planner.nodes.runtime import LATCHED, STEADY
 
 Float64 = NDArray[np.float64]
 
@@ -37,6 +32,9 @@ STATUS_QUALITY = QoSProfile(depth=10, durability=DurabilityPolicy.TRANSIENT_LOCA
 
 RETRY_PERIOD = 5.0
 """Seconds after which what failed for a full disk is tried again."""
+
+TF_PERIOD = 0.05
+"""Seconds between two looks at the transform of a robot whose every pose counts."""
 
 SLOWEST = 10.0
 """The slowness that ``~/slowness`` shows as 100."""
@@ -48,24 +46,12 @@ NOT_RECORDING = "no drives are being recorded; call ~/start first"
 
 
 class Driving:
-    """Records the robot's drives in ``output_folder``, and learns from them.
+    """Records the drives of a node's robot in its ``output_folder``, and learns from them."""
 
-    `episodes` publishes each drive that ends; `place` returns the last map, or None.
-    """
-
-    def __init__(
-        self,
-        node: BaseNode,
-        replay: Replay,
-        episodes: Publisher,
-        place: Callable[[], MapInFrame | None],
-        refusals: Refusals,
-    ) -> None:
-        self._node, self._replay, self._episodes, self._place = node, replay, episodes, place
-        self._refusals = refusals
+    def __init__(self, node: LearningNode) -> None:
+        self._node, self._frames = node, Frames(node)
         self._recorder = DriveRecorder(self._on_drive)
         self._folder: DriveFolder | None = None
-        self._saving = SavingLog(node, "the drives are saved again")
         self._state, self._last_drive = "stopped", ""
         self._is_disk_full = False
         self._aborted: set[bytes] | None = None
@@ -76,7 +62,11 @@ class Driving:
         self._slowness = node.create_publisher(OccupancyGrid, "~/slowness", LATCHED)
         node.create_subscription(PoseStamped, "goal_pose", self._on_goal, 10)
         node.create_subscription(GoalStatusArray, NAVIGATION, self._on_status, STATUS_QUALITY)
-        self._poses = RobotPoses(node, place, refusals, self._on_pose)
+        if node.value("pose_source") == "tf":
+            self._frames.listen()
+            node.create_timer(TF_PERIOD, self._look_up, clock=STEADY)
+        else:
+            listen(node, "odom", 1000, node.refusals, self._on_pose)
         node.create_timer(0.1, self._show_slowness, clock=STEADY)
         node.create_timer(RETRY_PERIOD, self._retry, clock=STEADY)
         for name in ("start", "stop", "save", "replay", "forget"):
@@ -87,40 +77,58 @@ class Driving:
         """Open the folder and record; return why that failed."""
         names = "nominal_speed", "robot_width"
         try:
-            folder = DriveFolder(self._path(), *map(self._node.value, names))
+            folder = DriveFolder(self._node.folder, *map(self._node.value, names))
         except Exception as error:  # the node must survive
             self._state, self._is_disk_full = "failed", isinstance(error, OSError)
-            self._refusals.refuse("output_folder", explained(error))
+            self._node.refusals.refuse("output_folder", explained(error))
             return explained(error)
         self._folder, self._state = folder, "recording"
         self._recorder.forget()
-        self._refusals.accept("output_folder")
+        self._node.refusals.accept("output_folder")
         self._node.get_logger().info(f"recording drives in {folder.folder}")
         self._save(folder)
         return ""
-
-    def _path(self) -> FilePath:
-        return FilePath(self._node.value("output_folder")).absolute()
 
     def _recording(self) -> DriveFolder | None:
         return self._folder if self._state == "recording" else None
 
     # Where the robot is
 
-    def _on_pose(self, seconds: float, x: float, y: float) -> None:
-        if self._state == "recording":
-            self._recorder.add(seconds, x, y)
-
-    def _on_goal(self, message: PoseStamped) -> None:
-        place = self._place()
+    def _on_pose(self, pose: PoseStamped) -> None:
+        """Record a pose; a ValueError refuses it."""
+        place = self._node.map
         if place is None:
             return
-        try:
-            self._recorder.set_goal(*self._poses.in_map("the goal", message, place.frame))
-        except ValueError as error:
-            self._refusals.refuse("goal_pose", str(error))
+        seconds = Time.from_msg(pose.header.stamp).nanoseconds / 1e9
+        if not seconds:
+            raise ValueError("the robot's pose has no stamp; give it the time")
+        position = self._position("the robot's pose", pose, place)
+        if self._state == "recording":
+            self._recorder.add(seconds, *position)
+
+    def _look_up(self) -> None:
+        place = self._node.map
+        if place is None:
             return
-        self._refusals.accept("goal_pose")
+        with self._node.refusals.taking("tf", often=True):
+            try:
+                pose = self._frames.origin_of(self._node.value("robot_frame"), place.frame)
+            except ValueError as error:
+                raise ValueError(f"{error}; publish a transform, or set robot_frame") from None
+            self._on_pose(pose)
+
+    def _on_goal(self, goal: PoseStamped) -> None:
+        place = self._node.map
+        if place is None:
+            return
+        with self._node.refusals.taking("goal_pose"):
+            self._recorder.set_goal(*self._position("the goal", goal, place))
+
+    def _position(self, name: str, pose: PoseStamped, place: MapInFrame) -> tuple[float, float]:
+        """Return a pose's position in the map's frame; ValueError if it has none."""
+        self._frames.check(name, pose.header, pose.pose, place.frame)
+        position = self._frames.to_map(name, pose, place.frame).pose.position
+        return position.x, position.y
 
     def _on_status(self, message: GoalStatusArray) -> None:
         """End the drive where the robot's navigation gives up."""
@@ -138,17 +146,17 @@ class Driving:
     # Drives
 
     def _on_drive(self, outcome: DriveEnd, seconds: Float64, positions: Float64) -> None:
-        place, folder = self._place(), self._recording()
+        place, folder = self._node.map, self._recording()
         if place is None or folder is None:
             return
         try:
             drive = folder.add(outcome, seconds, positions, place.grid)
         except Exception as error:  # the node must survive
-            self._refusals.refuse("output_folder", explained(error))
+            self._node.refusals.refuse("output_folder", explained(error))
             return
         self._last_drive = f"{drive.number}: {drive.metres:.1f} m, {outcome.value}"
         self._node.get_logger().info(f"drive {self._last_drive}")
-        if not self._replay.is_running:
+        if not self._node.is_replaying:
             self._draw(positions, place)
         self._tell_saved(folder)
 
@@ -159,7 +167,7 @@ class Driving:
     def _tell_saved(self, folder: DriveFolder) -> None:
         """Say where the experience is, or why it could not be saved."""
         self._learned += 1
-        self._saving.note(folder.save_error)
+        self._node.note_saving("the drives are", folder.save_error)
         if not folder.save_error:
             self._saved.publish(String(data=str(folder.experience_path)))
 
@@ -175,10 +183,11 @@ class Driving:
     def _draw(self, positions: Float64, place: MapInFrame) -> None:
         yaw = np.arctan2(*np.diff(positions, axis=0).T[::-1])
         last = quaternion(yaw[-1] if len(yaw) else 0)
-        self._episodes.publish(serialized_poses(positions, yaw, self._header(place), last))
+        header = self._node.header(place)
+        self._node.episodes.publish(serialized_poses(positions, yaw, header, last))
 
     def _show_slowness(self) -> None:
-        place, folder = self._place(), self._recording()
+        place, folder = self._node.map, self._recording()
         if place is None or folder is None:
             return
         grid, (shown_on, learned) = place.grid, self._shown
@@ -189,11 +198,8 @@ class Driving:
         slowness = folder.experience.slowness(grid)
         percent = np.clip(100 * np.log(slowness) / np.log(SLOWEST), 0, 100).round()
         percent[grid.occupancy] = -1
-        header = self._header(place)
+        header = self._node.header(place)
         self._slowness.publish(occupancy_message(percent, grid.resolution, grid.origin, header))
-
-    def _header(self, place: MapInFrame) -> Header:
-        return Header(stamp=self._node.get_clock().now().to_msg(), frame_id=place.frame)
 
     # Services: each returns whether it succeeds, and a message
 
@@ -206,7 +212,7 @@ class Driving:
         return True, f"recording in {folder.folder} after drive {folder.drives}"
 
     def _on_stop(self) -> tuple[bool, str]:
-        replay = "; the replay was stopped" if self._replay.stop() else ""
+        replay = self._node.stop_replay()
         folder = self._recording()
         if folder is None:
             self._state = "stopped"
@@ -243,26 +249,20 @@ class Driving:
         )
 
     def _on_replay(self) -> tuple[bool, str]:
-        place = self._place()
+        place = self._node.map
         if place is None:
-            return False, "no map was received yet; start a map server first"
-        file = self._path() / RECORD
+            return False, f"{NO_MAP} first"
+        file = self._node.folder / RECORD
         drives = (drive.positions[::REPLAYED] for drive in read_drives(file))
-        return self._replay.start(
+        return self._node.replay(
             file, drives, lambda positions: self._draw(positions, place), "drive on"
         )
 
     # What the node asks for
 
-    def diagnostics(self) -> DiagnosticArray:
-        """Return what `/diagnostics` says."""
-        problems = [*self._refusals.problems(), *filter(None, [self._saving.error])]
-        level = DiagnosticStatus.ERROR if problems else DiagnosticStatus.OK
-        if self._place() is None:
-            problems.append("no map was received yet; start a map server, or set map_file")
-            level = max(level, DiagnosticStatus.WARN)
+    def publish_diagnostics(self) -> None:
+        """Publish what `/diagnostics` says."""
         values = {
-            "state": self._state,
             "robot": _place_of(self._recorder.position),
             "goal": _place_of(self._recorder.goal),
             "last drive": self._last_drive,
@@ -273,7 +273,8 @@ class Driving:
                 "places": str(self._folder.experience.evidence.places),
                 "folder": str(self._folder.folder),
             }
-        return self._node.diagnostics("driving", level, "; ".join(problems) or self._state, values)
+        missing = f"{NO_MAP}, or set map_file" if self._node.map is None else ""
+        self._node.publish_diagnostics("driving", self._state, values, missing=missing)
 
     def close(self) -> None:
         """Record the drive that is under way, and save."""
@@ -286,26 +287,3 @@ class Driving:
 
 def _place_of(position: tuple[float, float] | None) -> str:
     return "unknown" if position is None else f"({position[0]:.6g}, {position[1]:.6g})"
-
-
-class SavingLog:
-    """Logs when saving begins to fail, and when it works again, not at each try."""
-
-    def __init__(self, node: BaseNode, again: str) -> None:
-        self._node, self._again, self.error = node, again, ""
-
-    def note(self, error: str) -> None:
-        """Note why the last try failed; empty if it did not."""
-        before, self.error = self.error, error
-        if error and not before:
-            self._node.get_logger().error(error)
-        if before and not error:
-            self._node.get_logger().info(self._again)
-
-
-def explained(error: Exception) -> str:
-    """Return what an error says; for one of the disk, also what to do."""
-    if isinstance(error, OSError):
-        return f"{error}; set output_folder to a folder that can be written"
-    is_clear = isinstance(error, (ValueError, MemoryError)) and str(error)
-    return str(error) if is_clear else repr(error)

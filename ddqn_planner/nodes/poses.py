@@ -10,7 +10,7 @@ import math
 import time
 from collections.abc import Callable
 from contextlib import suppress
-from typing import Any, NamedTuple
+from typing import Any
 
 from geometry_msgs.msg import (
     Pose,
@@ -24,11 +24,10 @@ from rclpy.subscription import Subscription
 from rclpy.time import Time
 from std_msgs.msg import Header
 
-from ddqn_planner.grid import GridMap
 from ddqn_planner.nodes.conversions import check_pose, quaternion
 from ddqn_planner.nodes.listening import best_effort
 from ddqn_planner.nodes.report import Refusals, RequestError
-from ddqn_planner.nodes.runtime import STEADY, BaseNode
+from ddqn_planner.nodes.runtime import BaseNode
 
 PATIENCE = 1.0
 """Seconds within which a new listener hears the first message of `odom` or TF. A pose that was
@@ -37,19 +36,9 @@ stamped before may be transformed by a transform that is later by so much."""
 SILENCE = 2.0
 """Seconds after which odometry that comes no more does not tell where the robot is."""
 
-TF_PERIOD = 0.05
-"""Seconds between two looks at the transform of a robot whose every pose counts."""
-
 REMEDY = "; or install tf2_ros (apt install ros-jazzy-tf2-ros-py), which transforms it"
 
 Point = tuple[float, float, float]
-
-
-class MapInFrame(NamedTuple):
-    """A map, and the frame of its origin."""
-
-    grid: GridMap
-    frame: str
 
 
 def has_tf() -> bool:
@@ -202,14 +191,8 @@ def listen(
     is_odometry = topic == "odom"
 
     def on_message(message: Odometry | PoseWithCovarianceStamped) -> None:
-        try:
+        with refusals.taking(topic, often=is_odometry):
             take(PoseStamped(header=message.header, pose=message.pose.pose))
-        except ValueError as error:
-            # It comes all the time, and its reason may have numbers: its first one is logged.
-            log = not is_odometry or topic not in refusals.refused
-            refusals.refuse(topic, str(error), log)
-        else:
-            refusals.accept(topic)
 
     if is_odometry:
         return node.create_subscription(Odometry, topic, on_message, best_effort(depth))
@@ -318,53 +301,3 @@ class StartSource:
                 f"({error}); publish one, or set robot_frame or start_source",
                 self._frames.may_come,
             ) from None
-
-
-class RobotPoses:
-    """Each pose of the trainer's robot, by its parameter ``pose_source``: `odom`, or TF.
-
-    `on_pose` is called with the seconds and the position in the map's frame, metres; its ValueError
-    refuses the pose. While `place` returns no map, poses are left out.
-    """
-
-    def __init__(
-        self,
-        node: BaseNode,
-        place: Callable[[], MapInFrame | None],
-        refusals: Refusals,
-        on_pose: Callable[[float, float, float], None],
-    ) -> None:
-        self._node, self._place, self._refusals, self._on_pose = node, place, refusals, on_pose
-        self._frames = Frames(node)
-        if node.value("pose_source") == "tf":
-            self._frames.listen()
-            node.create_timer(TF_PERIOD, self._look_up, clock=STEADY)
-        else:
-            listen(node, "odom", 1000, refusals, self._take)
-
-    def in_map(self, name: str, pose: PoseStamped, frame: str) -> tuple[float, float]:
-        """Return a pose's position in the map's frame; ValueError if it has none."""
-        self._frames.check(name, pose.header, pose.pose, frame)
-        position = self._frames.to_map(name, pose, frame).pose.position
-        return position.x, position.y
-
-    def _take(self, pose: PoseStamped) -> None:
-        place = self._place()
-        if place is None:
-            return
-        seconds = Time.from_msg(pose.header.stamp).nanoseconds / 1e9
-        if not seconds:
-            raise ValueError("the robot's pose has no stamp; give it the time")
-        self._on_pose(seconds, *self.in_map("the robot's pose", pose, place.frame))
-
-    def _look_up(self) -> None:
-        place = self._place()
-        if place is None:
-            return
-        try:
-            self._take(self._frames.origin_of(self._node.value("robot_frame"), place.frame))
-        except ValueError as error:
-            reason = f"{error}; publish a transform, or set robot_frame"
-            self._refusals.refuse("tf", reason, log="tf" not in self._refusals.refused)
-        else:
-            self._refusals.accept("tf")

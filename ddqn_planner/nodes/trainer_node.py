@@ -13,12 +13,9 @@ import time
 from collections.abc import Iterator
 from contextlib import suppress
 from functools import partial
-from pathlib import Path as FilePath
 from typing import TYPE_CHECKING, Any
 
-from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped
-from nav_msgs.msg import OccupancyGrid, Path
 from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.exceptions import InvalidParameterValueException
 from std_msgs.msg import Float32, Header, String
@@ -28,17 +25,15 @@ from ddqn_planner.libraries import with_remedy
 from ddqn_planner.nodes.conversions import (
     cell_from_pose,
     check_pose,
-    grid_from_message,
     path_message,
     quaternion,
     serialized_path,
 )
-from ddqn_planner.nodes.driving import Driving, SavingLog, explained
+from ddqn_planner.nodes.driving import Driving
+from ddqn_planner.nodes.learning import NO_MAP, LearningNode, MapInFrame, explained
 from ddqn_planner.nodes.parameters import HYPER_PARAMETERS, OF_MAPS, TRAINER_PARAMETERS
-from ddqn_planner.nodes.poses import MapInFrame, check_source
-from ddqn_planner.nodes.replay import Replay
-from ddqn_planner.nodes.report import Refusals
-from ddqn_planner.nodes.runtime import LATCHED, STEADY, BaseNode, Worker, spin_until_shutdown
+from ddqn_planner.nodes.poses import check_source
+from ddqn_planner.nodes.runtime import LATCHED, STEADY, Worker, spin_until_shutdown
 from ddqn_planner.resources import find_map
 from ddqn_planner.training.hyper_parameters import HyperParameters
 
@@ -50,7 +45,7 @@ SLICE = 0.1
 """Seconds for which the worker trains before the node has a look."""
 
 
-class TrainerNode(BaseNode):
+class TrainerNode(LearningNode):
     """Trains on the last ``map`` from the last ``initialpose`` to the last ``goal_pose``.
 
     Or with the parameter ``learn_from``, it learns from the robot's drives: see `Driving`.
@@ -62,27 +57,17 @@ class TrainerNode(BaseNode):
 
     def __init__(self) -> None:
         super().__init__("trainer", TRAINER_PARAMETERS)
-        self._map: MapInFrame | None = None
         self._poses: dict[str, PoseStamped] = {}
         self._run: TrainingRun | None = None
         self._run_map: MapInFrame | None = None
         self._is_stopping = self._is_saving = False
-        self._refusals = Refusals(self)
-        self._replay = Replay(self, self._fail)
-        self._state, self._error = "idle", ""
-        self._saving = SavingLog(self, "the training is saved again")
-
-        self._episode_publisher = self.create_publisher(Path, "~/episode", 10)
-        self._diagnostics_publisher = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
+        self._state = "idle"
         self._read_map_file()
-        self.create_subscription(OccupancyGrid, "map", self._on_map, LATCHED)
         self.create_timer(1.0, self._publish_diagnostics, clock=STEADY)
         self._worker = Worker(self)
         self._driving: Driving | None = None
         if self.value("learn_from") == "driving":
-            self._driving = Driving(
-                self, self._replay, self._episode_publisher, lambda: self._map, self._refusals
-            )
+            self._driving = Driving(self)
             return
         self._reward_publisher = self.create_publisher(Float32, "~/average_reward", 100)
         self._saved_publisher = self.create_publisher(String, "~/model_saved", LATCHED)
@@ -113,38 +98,24 @@ class TrainerNode(BaseNode):
         except (ValueError, OSError) as error:
             raise InvalidParameterValueException("map_file", name, str(error)) from None
         grid = map_file.grid(*map(self.value, OF_MAPS))
-        self._map = MapInFrame(grid, "map")
+        self.map = MapInFrame(grid, "map")
         for which, cell in (("start", map_file.start), ("goal", map_file.goal)):
             if cell is not None:
                 path = path_message([cell], grid, Header(frame_id="map"), quaternion(0))
                 self._poses[which] = path.poses[0]
 
-    # Map, start and goal
-
-    def _on_map(self, message: OccupancyGrid) -> None:
-        try:
-            grid = grid_from_message(message, *map(self.value, OF_MAPS))
-        except ValueError as error:
-            self._refusals.refuse("map", str(error))
-            return
-        self._refusals.accept("map")
-        self._map = MapInFrame(grid, message.header.frame_id)
-        self.get_logger().info(f"map of {grid.width} x {grid.height} cells")
+    # Start and goal
 
     def _on_pose(self, which: str, message: PoseStamped | PoseWithCovarianceStamped) -> None:
         pose = getattr(message.pose, "pose", message.pose)
-        try:
+        with self.refusals.taking(which):
             # A pose may come before the map: ~/start then checks its cell.
             check_pose(f"the {which}", message.header, pose)
             stamped = PoseStamped(header=message.header, pose=pose)
-            if self._map is not None:
-                cell = self._cell(which, stamped, self._map)
+            if self.map is not None:
+                cell = self._cell(which, stamped, self.map)
                 self.get_logger().info(f"the {which} is cell {cell}")
-        except ValueError as error:
-            self._refusals.refuse(which, str(error))
-            return
-        self._refusals.accept(which)
-        self._poses[which] = stamped
+            self._poses[which] = stamped
 
     def _cell(self, which: str, pose: PoseStamped, place: MapInFrame) -> Cell:
         """Return the cell of a pose; ValueError if it is not a free cell of the map."""
@@ -154,10 +125,6 @@ class TrainerNode(BaseNode):
                 f"the {which}'s cell {cell} is occupied or off the map; set it on a free cell"
             )
         return cell
-
-    def _fail(self, reason: str) -> None:
-        self._error = reason
-        self.get_logger().error(reason)
 
     # Services: each returns whether it succeeds, and a message
 
@@ -171,12 +138,11 @@ class TrainerNode(BaseNode):
             reason = explained(error)
             if isinstance(error, ImportError):
                 reason = f"training needs another library: {with_remedy(error)}"
-            self._fail(f"the training cannot start: {reason}")
+            self.fail(f"the training cannot start: {reason}")
             return False, reason
-        self._state, self._error = "training", ""
-        self._saving = SavingLog(self, "the training is saved again")
+        self._state, self.error, self.save_error = "training", "", ""
         self._is_stopping = self._is_saving = False
-        self._refusals.forget()
+        self.refusals.forget()
         self._run, self._run_map = run, place
         self.get_logger().info(run.description)
         executor: Any = self.executor
@@ -184,9 +150,9 @@ class TrainerNode(BaseNode):
         return True, run.description
 
     def _open_run(self) -> tuple[MapInFrame, TrainingRun]:
-        place = self._map
+        place = self.map
         if place is None:
-            raise ValueError("no map was received yet; start a map server, or set map_file")
+            raise ValueError(f"{NO_MAP}, or set map_file")
         if self._poses.keys() < {"start", "goal"}:
             raise ValueError(
                 "the start or the goal is unknown; publish initialpose and goal_pose, or set "
@@ -197,18 +163,15 @@ class TrainerNode(BaseNode):
         from ddqn_planner.training.run import TrainingRun
 
         return place, TrainingRun(
-            self._folder(),
+            self.folder,
             [Scenario(place.grid, start, goal)],
             MoveRule(self.value("move_rule")),
             self._hyper_parameters({}),
             self.value("seed"),
         )
 
-    def _folder(self) -> FilePath:
-        return FilePath(self.value("output_folder")).absolute()
-
     def _on_stop(self) -> tuple[bool, str]:
-        replay = "; the replay was stopped" if self._replay.stop() else ""
+        replay = self.stop_replay()
         if self._state != "training":
             return True, f"no training was running{replay}"
         self._is_stopping = True
@@ -223,14 +186,14 @@ class TrainerNode(BaseNode):
     def _on_replay(self) -> tuple[bool, str]:
         from ddqn_planner.training.episodes import read_cells
 
-        file = self._folder() / "episodes.csv"
-        is_of_run = self._run is not None and self._run.folder == self._folder()
-        place = self._run_map if is_of_run else self._map
+        file = self.folder / "episodes.csv"
+        is_of_run = self._run is not None and self._run.folder == self.folder
+        place = self._run_map if is_of_run else self.map
         if place is None:
-            return False, "no map was received yet; start a map server first"
+            return False, f"{NO_MAP} first"
         episodes = read_cells(file, self.value("episode_interval"))
         draw = partial(self._publish_cells, place=place)
-        return self._replay.start(file, episodes, draw, "train on")
+        return self.replay(file, episodes, draw, "train on")
 
     # Training
 
@@ -247,14 +210,14 @@ class TrainerNode(BaseNode):
                 if self._is_stopping or self._is_saving:
                     self._is_saving = False
                     await self._worker.call(run.try_to_save)
-                self._saving.note(run.save_error)
+                self.note_saving("the training is", run.save_error)
                 if not run.save_error and (ends == "finished" or run.saved_at != announced):
                     self.get_logger().info(f"step {run.saved_at} is saved in {run.checkpoint_path}")
                     self._saved_publisher.publish(String(data=str(run.model_path)))
                 announced = run.saved_at
         except Exception as error:  # the node must survive any error
             ends = "failed"
-            self._fail(f"the training failed: {error!r}; ~/start continues from its checkpoint")
+            self.fail(f"the training failed: {error!r}; ~/start continues from its checkpoint")
         finally:
             run.close()
         self._state = ends
@@ -262,20 +225,18 @@ class TrainerNode(BaseNode):
 
     def _on_episode(self, episode: Episode, place: MapInFrame) -> None:
         self._reward_publisher.publish(Float32(data=episode.average_reward))
-        if episode.number % self.value("episode_interval") == 0 and not self._replay.is_running:
+        if episode.number % self.value("episode_interval") == 0 and not self.is_replaying:
             self._publish_cells(episode.cells, place)
 
     def _publish_cells(self, cells: tuple[Cell, ...], place: MapInFrame) -> None:
-        header = Header(stamp=self.get_clock().now().to_msg(), frame_id=place.frame)
-        self._episode_publisher.publish(serialized_path(cells, place.grid, header, quaternion(0)))
+        path = serialized_path(cells, place.grid, self.header(place), quaternion(0))
+        self.episodes.publish(path)
 
     def _publish_diagnostics(self) -> None:
         if self._driving is not None:
-            self._diagnostics_publisher.publish(self._driving.diagnostics())
+            self._driving.publish_diagnostics()
             return
-        error = self._saving.error or self._error or "; ".join(self._refusals.problems())
-        level = DiagnosticStatus.ERROR if error else DiagnosticStatus.OK
-        values = {"state": self._state}
+        values = {}
         for which, pose in self._poses.items():
             position = pose.pose.position
             values[which] = f"({position.x:.6g}, {position.y:.6g})"
@@ -287,8 +248,7 @@ class TrainerNode(BaseNode):
                 "epsilon": f"{trainer.epsilon:.3f}",
                 "folder": str(self._run.folder),
             }
-        message = self.diagnostics("training", level, error or self._state, values)
-        self._diagnostics_publisher.publish(message)
+        self.publish_diagnostics("training", self._state, values, error=self.error)
 
     def destroy_node(self) -> None:
         """Destroy the node at once, then wait for the worker and save what it trained."""
@@ -299,7 +259,7 @@ class TrainerNode(BaseNode):
         if self._run is not None and self._state == "training":
             self._run.try_to_save()
             self._run.close()
-            self._saving.note(self._run.save_error)
+            self.note_saving("the training is", self._run.save_error)
 
 
 def train_for_a_slice(steps: Iterator[list[Episode]]) -> tuple[list[Episode], bool]:

@@ -19,8 +19,6 @@ from typing import Any
 
 import gymnasium
 import numpy as np
-from gymnasium.vector import AutoresetMode, VectorEnv
-from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
 from ddqn_planner.grid import MOVES, Cell, GridMap, MoveRule, read_map_file
@@ -59,19 +57,21 @@ def paper_scenario() -> Scenario:
     return Scenario(map_file.grid(), map_file.start, map_file.goal)
 
 
-class GridVectorEnvironment(VectorEnv[Observations, NDArray[np.int64], Any]):
+class GridVectorEnvironment:
     """N robots on grid maps, all moved in one step.
 
     Each episode draws one of the scenarios, on maps of one size; `move_rule` is that of those that
     have none. Cells are numbers y * W + x. The results of all moves are looked up in tables, (S
-    scenarios, 8 actions, H * W). An ended episode keeps its last observation until `reset` is
-    called with ``options={"reset_mask": mask}`` (Gymnasium's autoreset mode "disabled").
+    scenarios, 8 actions, H * W). An ended episode keeps its last cell until `reset`, which must
+    also begin the first episodes.
     """
 
-    metadata = {"render_modes": [], "autoreset_mode": AutoresetMode.DISABLED}  # noqa: RUF012
-
     def __init__(
-        self, scenarios: Sequence[Scenario], move_rule: MoveRule, parameters: HyperParameters
+        self,
+        scenarios: Sequence[Scenario],
+        move_rule: MoveRule,
+        parameters: HyperParameters,
+        random: np.random.Generator | None = None,
     ) -> None:
         shapes = {scenario.grid.occupancy.shape for scenario in scenarios}
         if len(shapes) != 1:
@@ -80,13 +80,7 @@ class GridVectorEnvironment(VectorEnv[Observations, NDArray[np.int64], Any]):
         self.scenarios = tuple(scenarios)
         self.parameters = parameters
         self.move_rules = tuple(s.move_rule or move_rule for s in scenarios)
-        self.num_envs = parameters.environments
-        self.single_action_space = gymnasium.spaces.Discrete(len(MOVES))
-        self.single_observation_space: gymnasium.spaces.Space[Any] = gymnasium.spaces.Box(
-            OBSTACLE, max(GOAL, ROBOT), self.shape, np.float32
-        )
-        self.action_space = batch_space(self.single_action_space, self.num_envs)
-        self.observation_space = batch_space(self.single_observation_space, self.num_envs)
+        self.random = random or np.random.default_rng()
 
         with_rules = list(zip(self.scenarios, self.move_rules, strict=True))
         maps = [observation_background(s.grid.occupancy, s.goal) for s in self.scenarios]
@@ -109,28 +103,14 @@ class GridVectorEnvironment(VectorEnv[Observations, NDArray[np.int64], Any]):
         self._free_count = free_SC.sum(axis=1)
         self._free_first = np.cumsum(self._free_count) - self._free_count
 
-        self.scenario = np.zeros(self.num_envs, dtype=np.int64)
+        self.scenario = np.zeros(parameters.environments, dtype=np.int64)
         self.cell = self.start[self.scenario]
-        self.steps = np.zeros(self.num_envs, dtype=np.int64)
+        self.steps = np.zeros(parameters.environments, dtype=np.int64)
 
-    def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[Observations, dict[str, Any]]:
-        """Start new episodes: all, or those where ``options["reset_mask"]`` (N,) bool is True."""
-        super().reset(seed=seed)
-        self.reset_where((options or {}).get("reset_mask", np.ones(self.num_envs, dtype=np.bool_)))
-        return self.observations(), {}
-
-    def step(
-        self, actions: NDArray[np.int64]
-    ) -> tuple[Observations, NDArray[Any], NDArray[np.bool_], NDArray[np.bool_], dict[str, Any]]:
-        """Move each robot once: (N,) actions."""
-        result = self.move(actions)
-        return self.observations(), *result, {}
-
-    def reset_where(self, mask: NDArray[np.bool_]) -> None:
-        """Start new episodes as `reset` does, without making the observations."""
-        scenario = self.np_random.integers(len(self.start), size=int(mask.sum()))
+    def reset(self, mask: NDArray[np.bool_] | None = None) -> None:
+        """Start new episodes: all, or those where `mask` (N,) is True."""
+        mask = np.ones(len(self.cell), dtype=np.bool_) if mask is None else mask
+        scenario = self.random.integers(len(self.start), size=int(mask.sum()))
         self.scenario[mask] = scenario
         self.cell[mask] = initial_cells(
             self.start[scenario],
@@ -138,14 +118,14 @@ class GridVectorEnvironment(VectorEnv[Observations, NDArray[np.int64], Any]):
             self._free_first[scenario],
             self._free_count[scenario],
             self.parameters.p_r,
-            self.np_random,
+            self.random,
         )
         self.steps[mask] = 0
 
     def move(
         self, actions: NDArray[np.int64]
     ) -> tuple[NDArray[np.float32], NDArray[np.bool_], NDArray[np.bool_]]:
-        """Move as `step` does: return reward, terminated and truncated, but no observations."""
+        """Move each robot once, (N,) actions; return reward, terminated and truncated."""
         lookup = (self.scenario, actions, self.cell)
         legal, reward = self.legal[lookup], self._reward[lookup]
         self.cell = np.where(legal, self.cell + self._offset[actions], self.cell)
@@ -175,19 +155,22 @@ class GridEnvironment(gymnasium.Env[Observations, np.int64]):
     ) -> None:
         parameters = replace(parameters or HyperParameters(), environments=1)
         self.vector = GridVectorEnvironment([scenario or paper_scenario()], move_rule, parameters)
-        self.action_space = self.vector.single_action_space
-        self.observation_space = self.vector.single_observation_space
+        self.action_space = gymnasium.spaces.Discrete(len(MOVES))
+        self.observation_space = gymnasium.spaces.Box(
+            OBSTACLE, max(GOAL, ROBOT), self.vector.shape, np.float32
+        )
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Observations, dict[str, Any]]:
         """Start an episode at the start or, with probability p_r, at a random free cell."""
         super().reset(seed=seed)
-        self.vector.np_random = self.np_random
-        observations, info = self.vector.reset()
-        return observations[0], info
+        self.vector.random = self.np_random
+        self.vector.reset()
+        return self.vector.observations()[0], {}
 
     def step(self, action: np.int64) -> tuple[Observations, float, bool, bool, dict[str, Any]]:
         """Move the robot once."""
-        observations, reward, terminated, truncated, info = self.vector.step(np.array([action]))
-        return observations[0], float(reward[0]), bool(terminated[0]), bool(truncated[0]), info
+        (reward,), (terminated,), (truncated,) = self.vector.move(np.array([action]))
+        observation = self.vector.observations()[0]
+        return observation, float(reward), bool(terminated), bool(truncated), {}

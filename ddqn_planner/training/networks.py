@@ -1,20 +1,31 @@
-"""The Q-networks as torch modules, for training.
+"""The Q-networks as torch modules, and their states, of robots in given cells of given maps.
 
 The modules and the networks of `ddqn_planner.model.networks` have the same tensors; planning uses
-the latter, see `TrainableNetwork.to_numpy`. `ddqn_planner.training.encoders` makes their states.
-Dimensions: B = a batch, A = 8 actions, F = filters, I = inputs of the first layer, L = windows.
+the latter, see `TrainableNetwork.to_numpy`.
+Dimensions: B = a batch, A = 8 actions, F = filters, I = inputs of the first layer, L = windows,
+S maps, C = H * W cells (cell y * W + x).
 """
 
 from __future__ import annotations
 
 from typing import ClassVar, Final, TypeVar, cast
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn import functional
 
-from ddqn_planner.grid import LENGTHS, MOVES
+from ddqn_planner.grid import LENGTHS, MOVES, neighbours
 from ddqn_planner.model import AnyMapQNetwork, PaperQNetwork, PropagationQNetwork, QNetwork
+from ddqn_planner.model.observation import observe, patches
+from ddqn_planner.training.environment import GridVectorEnvironment
+
+SETTLED = 1e-3
+"""Value iteration ends when no value changes by this or more."""
+
+MAX_ITERATIONS = 1000
+"""It ends in any case after this many iterations and one per cell of the map."""
 
 LENGTHS_A: Final = torch.tensor(LENGTHS, dtype=torch.float32)
 
@@ -134,3 +145,107 @@ MODULES: Final[dict[str, type[TrainableNetwork]]] = {
     module.numpy_class.name: module for module in (PaperModule, PropagationModule, AnyMapModule)
 }
 """By the hyper-parameter ``network``."""
+
+
+class ObservationEncoder:
+    """The paper's network observes the whole map with the robot in it."""
+
+    def __init__(self, environment: GridVectorEnvironment) -> None:
+        self._environment = environment
+
+    def states(self, scenario: NDArray[np.int64], cell: NDArray[np.int64]) -> Tensor:
+        """Return the states of robots in `cell` (B,) on the maps `scenario` (B,): (B, ...)."""
+        background = self._environment.background[scenario]
+        observation = observe(background, cell, self._environment.shape)
+        return PaperModule.windows(torch.from_numpy(observation))
+
+    def update_target(self, target: TrainableNetwork) -> None:
+        """Use a new target network θ⁻, where the states depend on it."""
+
+
+class PropagationEncoder(ObservationEncoder):
+    """A propagation network observes the 3x3 patch around the robot, and the returns beyond it.
+
+    A state, (I + 8 + 1,), is the features of the patch, the return r + γ V(s') of each move, and
+    r_o of a collision. V is settled under the target network θ⁻ and stays the same until the next
+    target copy. No gradient flows through it: back-propagation through the iteration diverges. For
+    a network that learns the cost of a move, the return is γ V(s') alone.
+    """
+
+    def __init__(self, environment: GridVectorEnvironment, target: PropagationModule) -> None:
+        super().__init__(environment)
+        with_rules = zip(environment.scenarios, environment.move_rules, strict=True)
+        self._feature_SCI = np.stack(
+            [
+                target.numpy_class.features(patches(s.grid.occupancy, s.grid.cost), rule)
+                for s, rule in with_rules
+            ]
+        )
+        maps, cells, _ = self._feature_SCI.shape
+        self._return_SCX = np.empty((maps, cells, len(MOVES) + 1), dtype=np.float32)
+        self.update_target(target)
+
+    def states(self, scenario: NDArray[np.int64], cell: NDArray[np.int64]) -> Tensor:
+        """Return the states of robots in `cell` (B,) on the maps `scenario` (B,): (B, I + 9)."""
+        at = (scenario, cell)
+        state_BX = np.concatenate([self._feature_SCI[at], self._return_SCX[at]], axis=1)
+        return torch.from_numpy(state_BX)
+
+    def update_target(self, target: TrainableNetwork) -> None:
+        """Settle V on every map under the new target network."""
+        assert isinstance(target, PropagationModule)
+        environment, feature_SCI = self._environment, torch.from_numpy(self._feature_SCI)
+        gamma, collision = environment.parameters.gamma, environment.parameters.obstacle_reward
+        with torch.inference_mode():
+            p_SAC = target.success(feature_SCI).numpy().transpose(0, 2, 1)
+            cost_SAC = target.cost(feature_SCI).numpy().transpose(0, 2, 1)
+        reward_SAC = -cost_SAC if target.learns_costs else environment.free_reward
+        near_AC = neighbours(environment.shape)
+        goal_S = environment.goal
+        return_SAC = value_iteration(p_SAC, reward_SAC, goal_S, near_AC, gamma, collision)
+        return_SAC += cost_SAC
+        self._return_SCX[..., :-1] = return_SAC.transpose(0, 2, 1)
+        self._return_SCX[..., -1] = collision
+
+
+def encoder_for(target: TrainableNetwork, environment: GridVectorEnvironment) -> ObservationEncoder:
+    """Return the encoder for a network, with its copy θ⁻."""
+    if isinstance(target, PropagationModule):
+        return PropagationEncoder(environment, target)
+    return ObservationEncoder(environment)
+
+
+def value_iteration(
+    success_SAC: NDArray[np.float32],
+    reward_SAC: NDArray[np.float32],
+    goal_S: NDArray[np.int64],
+    neighbours_AC: NDArray[np.int64],
+    gamma: float,
+    collision: float,
+) -> NDArray[np.float32]:
+    """Iterate V until it settles; return r + γ V(s') of each successful move: (S, 8, C) float32.
+
+    V(s) = max_a Q(s, a) with Q(s, a) = p (r + γ V(s')) + (1 - p) r_o, from the success p of a move,
+    its reward r, and r_o of a collision, which with γ = 1 must be less than any path's return;
+    V(goal) = 0, and V = r_o outside the map. Occupied cells have no rule of their own: p says that
+    moves into them fail.
+    """
+    maps, _, cells = success_SAC.shape
+    gain_SAC = np.float32(gamma) * success_SAC
+    base_SAC = success_SAC * reward_SAC + (1 - success_SAC) * np.float32(collision)
+    # The goal is worth 0, whatever its moves lead to.
+    gain_SAC[np.arange(maps), :, goal_S] = 0.0
+    base_SAC[np.arange(maps), :, goal_S] = 0.0
+    # From below, as if every move collided: values then rise outwards from the goal.
+    value_SC = np.full((maps, cells + 1), collision, dtype=np.float32)
+    for _ in range(cells + MAX_ITERATIONS):
+        q_SAC = value_SC.take(neighbours_AC, axis=1)
+        q_SAC *= gain_SAC
+        q_SAC += base_SAC
+        new_SC = q_SAC.max(axis=1)
+        change = np.abs(new_SC - value_SC[:, :-1]).max()
+        value_SC[:, :-1] = new_SC
+        if change < SETTLED:
+            break
+    return_SAC: NDArray[np.float32] = reward_SAC + np.float32(gamma) * value_SC[:, neighbours_AC]
+    return return_SAC

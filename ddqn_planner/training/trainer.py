@@ -22,11 +22,10 @@ from ddqn_planner.grid import MOVES, MoveRule
 from ddqn_planner.model import ModelMetadata, package_version, save_model
 from ddqn_planner.planning import Planner
 from ddqn_planner.training.double_dqn import double_dqn_loss
-from ddqn_planner.training.encoders import encoder_for
 from ddqn_planner.training.environment import GridVectorEnvironment, Scenario
 from ddqn_planner.training.episodes import Episode, EpisodeEnd
 from ddqn_planner.training.hyper_parameters import HyperParameters
-from ddqn_planner.training.networks import MODULES
+from ddqn_planner.training.networks import MODULES, encoder_for
 from ddqn_planner.training.replay_buffer import ReplayBuffer, Transitions
 
 CHECKPOINT_KEY = "ddqn_planner_checkpoint"
@@ -63,8 +62,8 @@ class Trainer:
         self.episodes = 0
 
         weights, environment, exploration, replay = np.random.SeedSequence(seed).spawn(4)
-        self.environment = GridVectorEnvironment(self.scenarios, move_rule, parameters)
-        self.environment.np_random = np.random.default_rng(environment)
+        drawing = np.random.default_rng(environment)
+        self.environment = GridVectorEnvironment(self.scenarios, move_rule, parameters, drawing)
         self._exploration = np.random.default_rng(exploration)
         self._sampling = np.random.default_rng(replay)
         with torch.random.fork_rng(devices=[]):
@@ -77,7 +76,7 @@ class Trainer:
         self._optimiser = torch.optim.Adam(self._weights, parameters.learning_rate, fused=FUSED)
         self._replay = ReplayBuffer(parameters.replay_capacity)
 
-        self.environment.reset_where(np.ones(parameters.environments, dtype=np.bool_))
+        self.environment.reset()
         self._visited: list[list[int]] = [[int(cell)] for cell in self.environment.cell]
         self._total_reward = np.zeros(parameters.environments)
 
@@ -169,7 +168,7 @@ class Trainer:
             number, total = self.episodes + len(episodes) + 1, float(self._total_reward[index])
             episodes.append(Episode(number, self.steps, scenario, outcome, visited, moves, total))
         self.episodes += len(episodes)
-        self.environment.reset_where(ended)
+        self.environment.reset(ended)
         for index in places:
             self._visited[index] = [int(self.environment.cell[index])]
         self._total_reward[ended] = 0.0
@@ -287,7 +286,7 @@ class Trainer:
         return tensors
 
     def _generators(self) -> tuple[np.random.Generator, ...]:
-        return self.environment.np_random, self._exploration, self._sampling
+        return self.environment.random, self._exploration, self._sampling
 
 
 def _fingerprints(scenarios: Sequence[Scenario]) -> list[list[object]]:

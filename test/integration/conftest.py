@@ -34,6 +34,15 @@ if importlib.util.find_spec("rclpy") is None:
 _claim = claim_ros_domain()
 
 
+HEAVY = {
+    "matplotlib": "/matplotlib/",
+    "numba": "/llvmlite/",
+    "scipy": "/scipy/",
+    "torch": "/torch/",
+}
+"""The folder of each library's shared objects."""
+
+
 class NodeProcess:
     """One executable in a process group of its own."""
 
@@ -51,6 +60,12 @@ class NodeProcess:
     def log(self) -> str:
         """What the process wrote since `forget_log`."""
         return self.log_path.read_text(encoding="utf-8", errors="replace")
+
+    @property
+    def heavy_libraries(self) -> set[str]:
+        """The large libraries that the process has loaded."""
+        maps = Path(f"/proc/{self.process.pid}/maps").read_text()
+        return {name for name, folder in HEAVY.items() if folder in maps}
 
     def forget_log(self) -> None:
         os.truncate(self.log_path, 0)

@@ -17,6 +17,8 @@ from client import Client, initial_pose, map_message, pose, wait_for_map
 from client import values_of as values_of
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import PoseStamped, Quaternion
+from lifecycle_msgs.msg import Transition
+from lifecycle_msgs.srv import ChangeState, GetState
 from nav_msgs.msg import OccupancyGrid, Path
 from networks import turning_network
 from rclpy.qos import DurabilityPolicy, QoSProfile
@@ -143,6 +145,23 @@ class Robot:
     def clear(self) -> None:
         for recorder in (self.plans, self.value, self.diagnostics):
             recorder.clear()
+
+
+class Manager:
+    """What a lifecycle manager does with the planner."""
+
+    def __init__(self, client: Client) -> None:
+        self.client = client
+
+    def change(self, label: str = "", number: int = 0) -> bool:
+        request = ChangeState.Request(transition=Transition(id=number, label=label))
+        answer: bool = self.client.call(ChangeState, "planner/change_state", request).success
+        return answer
+
+    @property
+    def state(self) -> str:
+        label: str = self.client.call(GetState, "planner/get_state").current_state.label
+        return label
 
 
 def points_of(path: Path) -> list[tuple[float, float]]:

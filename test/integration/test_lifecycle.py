@@ -8,7 +8,7 @@ import shutil
 import signal
 import threading
 import weakref
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -17,11 +17,11 @@ import pytest
 import rclpy
 from client import initial_pose, plan_request, wait_for
 from diagnostic_msgs.msg import DiagnosticStatus
-from integration.robot import GOAL, NUMBERS, START, Robot
-from integration.test_startup import ask_for_plan
+from integration.robot import GOAL, NUMBERS, START, Manager, Robot
+from integration.test_startup import MakeRobot, ask_for_plan
 from integration.test_startup import load_gate as load_gate
+from integration.test_startup import make_robot as make_robot
 from lifecycle_msgs.msg import Transition
-from lifecycle_msgs.srv import ChangeState, GetState
 from map_fixture import generated_map
 from nav_msgs.srv import GetPlan
 from processes import cpu_seconds
@@ -31,40 +31,10 @@ from ddqn_planner.nodes.planner_node import PlannerNode
 OF_CONFIGURED = {"planner/get_plan", "planner/reload_model", "plan", "map", "goal_pose"}
 
 
-class Manager:
-    """What a lifecycle manager does with the planner."""
-
-    def __init__(self, robot: Robot) -> None:
-        self.client = robot.client
-
-    def change(self, label: str = "", number: int = 0) -> bool:
-        transition = Transition(id=number, label=label)
-        request = ChangeState.Request(transition=transition)
-        answer: bool = self.client.call(ChangeState, "planner/change_state", request).success
-        return answer
-
-    @property
-    def state(self) -> str:
-        label: str = self.client.call(GetState, "planner/get_state").current_state.label
-        return label
-
-    def created(self) -> set[str]:
-        """Which of the topics and services of a configured planner it has."""
-        entities = wait_for("discovery of the planner", lambda: self.client.entities("planner"))
-        return {name for _, name, _ in entities} & OF_CONFIGURED
-
-
-MakeRobot = Callable[[str], Robot]
-
-
-@pytest.fixture
-def make_robot(
-    make_client: Callable[[str], Any], small_values: np.ndarray, model: Path
-) -> MakeRobot:
-    def make(name: str) -> Robot:
-        return Robot(make_client(f"/{name}"), small_values, model, f"/{name}/planner")
-
-    return make
+def created(robot: Robot) -> set[str]:
+    """Return which of the topics and services of a configured planner it has."""
+    entities = wait_for("discovery of the planner", lambda: robot.client.entities("planner"))
+    return {name for _, name, _ in entities} & OF_CONFIGURED
 
 
 @pytest.fixture(scope="module")
@@ -83,7 +53,7 @@ def shared_robot(managed: Any, make_client: Any, small_values: np.ndarray, model
 @pytest.fixture
 def robot(managed: Any, shared_robot: Robot) -> Robot:
     """The user of the shared planner, which is unconfigured."""
-    manager = Manager(shared_robot)
+    manager = Manager(shared_robot.client)
     for label in ("deactivate", "cleanup"):
         manager.change(label)
     managed.forget_log()
@@ -93,35 +63,40 @@ def robot(managed: Any, shared_robot: Robot) -> Robot:
 
 
 def test_each_transition_creates_enables_stops_and_frees(robot: Robot, managed: Any) -> None:
-    manager = Manager(robot)
+    manager = Manager(robot.client)
+
+    def assert_not_active() -> None:
+        robot.clear()
+        assert robot.get_plan(robot.pose(START), robot.pose(GOAL)).poses == []
+        robot.wait_for_reason("the node is not active", {"status": "NOT_ACTIVE"})
+
+    def assert_works_without_a_goal() -> None:
+        assert manager.change("activate")
+        robot.assert_works()
+        assert robot.plans.messages() == []
+
     for _ in range(2):
-        wait_for("only what is always there", lambda: not manager.created())
+        wait_for("only what is always there", lambda: not created(robot))
         status = robot.wait_for_reason("the node is not active; configure and activate it")
         assert status.level == DiagnosticStatus.WARN
         assert manager.change("configure")
         assert manager.state == "inactive"
-        wait_for("what configure creates", lambda: manager.created() == OF_CONFIGURED)
+        wait_for("what configure creates", lambda: created(robot) == OF_CONFIGURED)
         robot.set_map(robot.stamped_map())  # a map is taken, requests are not
         robot.send_start(robot.pose(START))
-        robot.clear()
-        assert robot.get_plan(robot.pose(START), robot.pose(GOAL)).poses == []
-        robot.wait_for_reason("the node is not active", {"status": "NOT_ACTIVE"})
+        assert_not_active()
         managed.wait_for_log("no plan: the node is not active")
+        robot.diagnostics.clear()
         robot.send_goal(robot.pose(GOAL))
         robot.wait_for_reason("the node is not active", {"status": "NOT_ACTIVE"})
-        assert manager.change("activate")
+        assert_works_without_a_goal()  # it was refused
         assert manager.state == "active"
-        robot.assert_works()
-        assert robot.plans.messages() == []  # of the goal that was refused
         robot.begin()
         assert manager.change("deactivate")
-        robot.clear()
         robot.send_start(robot.pose((1, 0)))
         robot.set_map(robot.stamped_map())
-        assert robot.get_plan(robot.pose(START), robot.pose(GOAL)).poses == []
-        assert manager.change("activate")
-        robot.assert_works()
-        assert robot.plans.messages() == []  # the goal was dropped
+        assert_not_active()
+        assert_works_without_a_goal()  # it was dropped
         assert manager.change("deactivate")
         assert manager.change("cleanup")
         robot.clear()
@@ -129,7 +104,7 @@ def test_each_transition_creates_enables_stops_and_frees(robot: Robot, managed: 
 
 
 def test_no_request_for_a_transition_ends_the_planner(robot: Robot, managed: Any) -> None:
-    manager = Manager(robot)
+    manager = Manager(robot.client)
     assert manager.change("configure")
     assert manager.change("activate")
     for label in ("configure", "activate", "cleanup", "no_such", "transition_error", "ü" * 99):
@@ -146,23 +121,33 @@ def test_no_request_for_a_transition_ends_the_planner(robot: Robot, managed: Any
 
 
 def test_the_parameters_of_an_unconfigured_planner_are_checked_and_used(
-    robot: Robot, tmp_path: Path
+    robot: Robot, managed: Any, tmp_path: Path
 ) -> None:
-    client, manager, other = robot.client, Manager(robot), tmp_path / "model.safetensors"
-    shutil.copy(robot.model, other)
+    client, manager, model = robot.client, Manager(robot.client), tmp_path / "model.safetensors"
+    shutil.copy(robot.model, model)
     assert not client.set_parameters("planner", model="no_such_model")[0].successful
-    assert client.set_parameters("planner", model=str(other))[0].successful
-    assert client.set_parameters("planner", start_source="odometry")[0].successful
+    results = client.set_parameters("planner", model=str(model), start_source="odometry")
+    assert all(result.successful for result in results)
+    model.unlink()
+    for reason in ("no model", "cannot be read as safetensors"):
+        assert not manager.change("configure")
+        assert manager.state == "unconfigured"
+        managed.wait_for_log(f"model refused: .*{reason}.*; or set the parameter 'model'")
+        status = robot.wait_for_reason(f"model refused: .*{reason}")
+        assert status.level == DiagnosticStatus.ERROR
+        wait_for("only what is always there", lambda: not created(robot))
+        model.write_text("a model")
+    shutil.copy(robot.model, model)
     assert manager.change("configure")
     assert manager.change("activate")
-    robot.wait_for_reason("", {"model file": str(other), "state": "active"})
+    robot.wait_for_reason("", {"model file": str(model), "state": "active"})
     robot.set_map(robot.stamped_map())
     robot.assert_works()
     assert client.set_parameters("planner", start_source="initialpose")[0].successful
 
 
 def test_the_planner_survives_transitions_among_requests(robot: Robot) -> None:
-    manager, node = Manager(robot), robot.client.node
+    manager, node = Manager(robot.client), robot.client.node
     plans = node.create_client(GetPlan, "planner/get_plan")
     publishers = [
         (node.create_publisher(type(message), topic, 10), message)
@@ -173,7 +158,7 @@ def test_the_planner_survives_transitions_among_requests(robot: Robot) -> None:
         )
     ]
     request = GetPlan.Request(start=robot.pose(START), goal=robot.pose(GOAL))
-    for label in ["configure", "activate", "deactivate", "cleanup"] * 5:
+    for label in ["configure", "activate", "deactivate", "cleanup"] * 3:
         for _ in range(20):
             plans.call_async(request)
             for publisher, message in publishers:
@@ -186,40 +171,12 @@ def test_the_planner_survives_transitions_among_requests(robot: Robot) -> None:
     robot.assert_works()
 
 
-def test_a_model_that_cannot_be_loaded_fails_configure(
-    run_node: Any, make_robot: MakeRobot, model: Path, tmp_path: Path
-) -> None:
-    file = tmp_path / "model.safetensors"
-    parameters = {"autostart": False, "model": str(file)}
-    with run_node("planner_node", parameters, namespace="/failing") as node:
-        robot = make_robot("failing")
-        manager = Manager(robot)
-        for content, reason in ((None, "no model"), (b"a model", "cannot be read as safetensors")):
-            if content:
-                file.write_bytes(content)
-            assert not manager.change("configure")
-            assert manager.state == "unconfigured"
-            node.wait_for_log(f"model refused: .*{reason}.*; or set the parameter 'model'")
-            status = robot.wait_for_reason(f"model refused: .*{reason}")
-            assert status.level == DiagnosticStatus.ERROR
-            wait_for("only what is always there", lambda: not manager.created())
-        shutil.copy(model, file)
-        assert manager.change("configure")
-        assert manager.change("activate")
-        robot.set_map(robot.stamped_map())
-        robot.assert_works()
-        assert manager.change("shutdown")
-        assert manager.state == "finalized"
-        labels = "configure", "activate", "deactivate", "cleanup", "shutdown"
-        assert not any(map(manager.change, labels))
-
-
 def test_requests_that_wait_are_answered_when_the_planner_is_stopped(
     run_node: Any, make_robot: MakeRobot, load_gate: Path
 ) -> None:
     with run_node("planner_node", {}, namespace="/stopped") as node:
-        robot = make_robot("stopped")
-        manager = Manager(robot)
+        robot = make_robot("/stopped")
+        manager = Manager(robot.client)
         robot.set_map(robot.stamped_map())
         robot.send_start(robot.pose(START))
         robot.send_goal(robot.pose(GOAL))
@@ -237,14 +194,18 @@ def test_requests_that_wait_are_answered_when_the_planner_is_stopped(
         robot.set_map(robot.stamped_map())
         robot.assert_works()
         assert robot.plans.messages() == []
+        assert manager.change("shutdown")
+        assert manager.state == "finalized"
+        labels = "configure", "activate", "deactivate", "cleanup", "shutdown"
+        assert not any(map(manager.change, labels))
 
 
 def test_a_planner_that_is_stopped_while_it_plans_leaves_the_graph_at_once(
     run_node: Any, make_robot: MakeRobot
 ) -> None:
     with run_node("planner_node", namespace="/ended") as node:
-        robot = make_robot("ended")
-        rooms = generated_map("rooms", 1000)
+        robot = make_robot("/ended")
+        rooms = generated_map("rooms", 500)
         robot.set_map(rooms.message(next(NUMBERS)))
         start, *goals = rooms.grid.free_cells()
         plans = robot.client.service(GetPlan, "planner/get_plan")
@@ -267,7 +228,7 @@ def test_the_bond_breaks_when_the_planner_is_stopped(
     status = pytest.importorskip("bond.msg").Status
     parameters = {"autostart": False, "model": str(model)}
     with run_node("planner_node", parameters, namespace="/bonded") as node:
-        manager = Manager(make_robot("bonded"))
+        manager = Manager(make_robot("/bonded"))
         bond = manager.client.subscribe(status, "bond")
         assert manager.change("configure")
         assert manager.change("activate")
@@ -278,20 +239,14 @@ def test_the_bond_breaks_when_the_planner_is_stopped(
         assert node.log == ""
 
 
-def test_a_planner_that_is_stopped_waits_for_no_model(run_node: Any, load_gate: Path) -> None:
-    with run_node("planner_node", namespace="/loads_for_ever") as node:
-        node.wait_for_log("a model waits")
-        assert node.stop(signal.SIGTERM) == 0
-
-
 def test_cleanup_frees_map_model_and_fields(make_robot: MakeRobot, model: Path) -> None:
     rclpy.init(args=["--ros-args", "-p", f"model:={model}", "-r", "__ns:=/freed"])
     node = PlannerNode()
     spinning = threading.Thread(target=rclpy.spin, args=[node])
     spinning.start()
     try:
-        robot = make_robot("freed")
-        manager = Manager(robot)
+        robot = make_robot("/freed")
+        manager = Manager(robot.client)
         robot.begin()
         planner, grid = node._model.planner, node._map._grid
         assert planner is not None

@@ -15,8 +15,7 @@ import pytest
 import rclpy
 from client import map_message, pose, wait_for
 from geometry_msgs.msg import PoseStamped
-from integration.robot import GOAL, NUMBERS, START, Robot, check_path, points_of
-from integration.test_lifecycle import Manager
+from integration.robot import GOAL, NUMBERS, START, Manager, Robot, check_path, points_of
 from integration.test_startup import load_gate as load_gate
 from nav_msgs.msg import Path as PathMessage
 from rclpy.action.client import ActionClient
@@ -460,7 +459,7 @@ def test_goals_that_wait_are_canceled_preempted_and_stopped(
         robot = Robot(make_client("/waiting"), small_values, model, "/waiting/planner")
         robot.set_map(robot.stamped_map())
         node.wait_for_log("a model waits")
-        waiting, manager = Navigator(robot), Manager(robot)
+        waiting, manager = Navigator(robot), Manager(robot.client)
         goal, fields = robot.pose(GOAL), {"start": robot.pose(START), "use_start": True}
 
         canceled = waiting.send([goal], **fields)

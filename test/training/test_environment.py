@@ -8,6 +8,7 @@ import gymnasium
 import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
+from gymnasium.utils.seeding import np_random
 
 from ddqn_planner.grid import MOVES, Cell, GridMap, MoveRule
 from ddqn_planner.model.observation import ROBOT, observation_background
@@ -52,13 +53,14 @@ def test_the_batch_agrees_with_one_robot_moved_by_hand(
     paper = replace(paper, grid=replace(paper.grid, cost=cost.astype(np.int8)), move_rule=rule)
     batch = GridVectorEnvironment([paper], MoveRule.ROBOT_SAFE, parameters)
     random = np.random.default_rng(count)
-    batch.reset(seed=1)
+    batch.reset()
     background = observation_background(paper.grid.occupancy, paper.goal)
     steps = [0] * count
     for _ in range(1_000):
         cells = [(int(cell) % 20, int(cell) // 20) for cell in batch.cell]
         actions = random.integers(8, size=count)
-        observations, rewards, terminated, truncated, _ = batch.step(actions)
+        rewards, terminated, truncated = batch.move(actions)
+        observations = batch.observations()
         for i, cell in enumerate(cells):
             after, reward_by_hand, ended = step_by_hand(paper, rule, parameters, cell, actions[i])
             steps[i] += 1
@@ -69,47 +71,36 @@ def test_the_batch_agrees_with_one_robot_moved_by_hand(
             assert terminated[i] == ended
             assert truncated[i] == (steps[i] == 12 and not ended)
             steps[i] *= not (terminated[i] or truncated[i])
-        batch.reset(options={"reset_mask": terminated | truncated})
+        batch.reset(terminated | truncated)
 
 
 def test_the_scalar_environment_is_a_batch_of_one(paper: Scenario) -> None:
     batch = GridVectorEnvironment([paper], MoveRule.ROBOT_SAFE, PARAMETERS)
     # How many environments a batch has does not matter here.
-    parameters = replace(PARAMETERS, environments=7)
-    scalar = GridEnvironment(paper, MoveRule.ROBOT_SAFE, parameters)
-    random = np.random.default_rng(0)
-    starts = 0
-    for seed in (5, *[None] * 99):
-        observations, _ = batch.reset(seed=seed)
+    scalar = GridEnvironment(paper, MoveRule.ROBOT_SAFE, replace(PARAMETERS, environments=7))
+    actions = np.random.default_rng(0)
+    for seed in range(30):
         observation, info = scalar.reset(seed=seed)
-        starts += scalar.vector.cell[0] == batch.start[0]
-        np.testing.assert_array_equal(observations[0], observation)
-        assert info == {}
+        batch.random = np_random(seed)[0]
+        batch.reset()
         ended = False
         while not ended:
-            action = random.integers(8)
-            observations, *expected, _ = batch.step(np.array([action]))
+            assert (batch.observations()[0] == observation).all()
+            action = actions.integers(8)
+            expected = batch.move(np.array([action]))
             observation, *found, info = scalar.step(action)
-            np.testing.assert_array_equal(observations[0], observation)
-            assert found == [values[0] for values in expected]
+            assert (found, info) == ([values[0] for values in expected], {})
             assert [type(value) for value in found] == [float, bool, bool]
             ended = found[1] or found[2]
-    assert 30 < starts < 70
 
 
-def test_a_masked_reset_leaves_the_other_episodes_and_their_last_observation(
-    small: Scenario,
-) -> None:
+def test_a_reset_leaves_the_other_episodes(small: Scenario) -> None:
     parameters = replace(PARAMETERS, environments=2, p_r=0.0)
     batch = GridVectorEnvironment([small], MoveRule.ROBOT_SAFE, parameters)
-    batch.reset(seed=0)
-    last, _, terminated, _, _ = batch.step(np.array([6, 2]))  # down, off the map; up
+    _, terminated, _ = batch.move(np.array([6, 2]))  # down, off the map; up
     assert terminated.tolist() == [True, False]
-    assert last[0, 0, 0] == ROBOT
-    observations, _ = batch.reset(options={"reset_mask": terminated})
-    np.testing.assert_array_equal(observations[1], last[1])
-    assert observations[0, 0, 0] == ROBOT
-    assert batch.steps.tolist() == [0, 1]
+    batch.reset(terminated)
+    assert (batch.cell.tolist(), batch.steps.tolist()) == ([0, 5], [0, 1])
 
 
 @pytest.mark.parametrize(("p_r", "expected"), [(0.0, 0.0), (0.5, 0.5), (1.0, 1.0)])
@@ -117,8 +108,9 @@ def test_episodes_start_at_random_free_cells_with_probability_p_r(
     paper: Scenario, p_r: float, expected: float
 ) -> None:
     parameters = HyperParameters(environments=4000, p_r=p_r)
-    batch = GridVectorEnvironment([paper], MoveRule.ROBOT_SAFE, parameters)
-    batch.reset(seed=2)
+    random = np.random.default_rng(2)
+    batch = GridVectorEnvironment([paper], MoveRule.ROBOT_SAFE, parameters, random)
+    batch.reset()
     start, goal = (cell[1] * 20 + cell[0] for cell in (paper.start, paper.goal))
     elsewhere = batch.cell[batch.cell != start]
     assert len(elsewhere) / 4000 == pytest.approx(expected * (1 - 1 / 287), abs=0.03)
@@ -132,7 +124,8 @@ def test_each_scenario_keeps_its_own_map(small: Scenario) -> None:
     open_map = Scenario(GridMap(np.zeros((4, 5))), (0, 0), (4, 3))
     parameters = HyperParameters(environments=64)
     batch = GridVectorEnvironment([small, open_map], MoveRule.ROBOT_SAFE, parameters)
-    observations, _ = batch.reset(seed=0)
+    batch.reset()
+    observations = batch.observations()
     assert set(batch.scenario) == {0, 1}
     for scenario, observation in zip(batch.scenario, observations, strict=True):
         assert (observation.min() < 0) == (scenario == 0)

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from strategies import grids_with_free_cell
 
 from ddqn_planner.grid import Cell, GridMap, MoveRule, legal_moves, neighbours, shortest_distances
-from ddqn_planner.training.value_iteration import value_iteration
+from ddqn_planner.training.networks import value_iteration
 
 
 @given(grids_with_free_cell(), st.sampled_from(MoveRule))
