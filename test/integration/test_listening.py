@@ -13,8 +13,7 @@ from builtin_interfaces.msg import Time
 from client import wait_for
 from diagnostic_msgs.msg import DiagnosticStatus
 from geometry_msgs.msg import PoseStamped
-from integration.robot import GOAL, START, Robot
-from integration.test_planner_robot import odometry
+from integration.robot import GOAL, START, Robot, odometry
 from nav_msgs.msg import OccupancyGrid, Odometry
 from rclpy.qos import QoSProfile
 from rosgraph_msgs.msg import Clock
