@@ -82,9 +82,9 @@ else:
 def test_compiling_is_announced_once_and_a_load_from_the_cache_is_not(tmp_path: Path) -> None:
     code = """if True:
         import numpy as np
-        from ddqn_planner.grid.moves import _labels
+        from ddqn_planner.grid.moves import component_labels
         for kind in (bool, np.uint8):
-            _labels(np.zeros((2, 2), kind), 1)
+            component_labels(np.zeros((2, 2), kind), 1)
     """
     environment = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path)}
     command = [sys.executable, "-c", code]

@@ -107,27 +107,22 @@ class Driving:
             self._recorder.add(seconds, *position)
 
     def _look_up(self) -> None:
-        place, refusals = self._node.map, self._node.refusals
+        place = self._node.map
         if place is None:
             return
-        try:
-            self._on_pose(self._frames.origin_of(self._node.value("robot_frame"), place.frame))
-        except ValueError as error:
-            reason = f"{error}; publish a transform, or set robot_frame"
-            refusals.refuse("tf", reason, log="tf" not in refusals.refused)
-        else:
-            refusals.accept("tf")
+        with self._node.refusals.taking("tf", often=True):
+            try:
+                pose = self._frames.origin_of(self._node.value("robot_frame"), place.frame)
+            except ValueError as error:
+                raise ValueError(f"{error}; publish a transform, or set robot_frame") from None
+            self._on_pose(pose)
 
     def _on_goal(self, goal: PoseStamped) -> None:
         place = self._node.map
         if place is None:
             return
-        try:
+        with self._node.refusals.taking("goal_pose"):
             self._recorder.set_goal(*self._position("the goal", goal, place))
-        except ValueError as error:
-            self._node.refusals.refuse("goal_pose", str(error))
-        else:
-            self._node.refusals.accept("goal_pose")
 
     def _position(self, name: str, pose: PoseStamped, place: MapInFrame) -> tuple[float, float]:
         """Return a pose's position in the map's frame; ValueError if it has none."""

@@ -46,14 +46,10 @@ class LearningNode(BaseNode):
         return FilePath(self.value("output_folder")).absolute()
 
     def _on_map(self, message: OccupancyGrid) -> None:
-        try:
+        with self.refusals.taking("map"):
             grid = grid_from_message(message, *map(self.value, OF_MAPS))
-        except ValueError as error:
-            self.refusals.refuse("map", str(error))
-            return
-        self.refusals.accept("map")
-        self.map = MapInFrame(grid, message.header.frame_id)
-        self.get_logger().info(f"map of {grid.width} x {grid.height} cells")
+            self.map = MapInFrame(grid, message.header.frame_id)
+            self.get_logger().info(f"map of {grid.width} x {grid.height} cells")
 
     def header(self, place: MapInFrame) -> Header:
         """Return the header of a message about now."""

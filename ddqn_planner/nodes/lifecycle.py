@@ -82,7 +82,7 @@ class ManagedNode(LifecycleNodeMixin, BaseNode):
 
     def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Configure the node, or leave nothing behind."""
-        self._kept = {entity for entity, _ in self._entities()}
+        self._kept = {*self._entities()}
         result = self._attempt("configure", self.configure)
         if result is not SUCCESS:
             self._attempt("cleanup", self._clean_up)
@@ -173,26 +173,23 @@ class ManagedNode(LifecycleNodeMixin, BaseNode):
     # Entities
 
     def _clean_up(self) -> None:
-        for entity, destroy in self._entities():
-            if entity not in self._kept:
-                destroy(entity)
+        destroyers = (
+            self.destroy_publisher,
+            self.destroy_subscription,
+            self.destroy_client,
+            self.destroy_service,
+            self.destroy_timer,
+            self.destroy_guard_condition,
+        )
+        for entity in self._entities():
+            # Each destroys what it knows. The rest are servers of actions; the handlers of events
+            # are waitables until their publisher or subscription is destroyed.
+            is_new = entity not in self._kept and not any(destroy(entity) for destroy in destroyers)
+            if is_new and entity in {*self.waitables}:
+                entity.destroy()
         self.cleanup()
 
-    def _entities(self) -> list[tuple[Any, Callable[[Any], Any]]]:
-        """Return what the node has created, each with the function that destroys it."""
-        listening: list[Any] = [*self.publishers, *self.subscriptions]
-        handlers = {handler for entity in listening for handler in entity.event_handlers}
-        of_actions = [each for each in self.waitables if each not in handlers]
-        return [
-            (entity, destroy)
-            for entities, destroy in (
-                (self.publishers, self.destroy_publisher),
-                (self.subscriptions, self.destroy_subscription),
-                (self.clients, self.destroy_client),
-                (self.services, self.destroy_service),
-                (self.timers, self.destroy_timer),
-                (self.guards, self.destroy_guard_condition),
-                (of_actions, lambda server: server.destroy()),
-            )
-            for entity in entities
-        ]
+    def _entities(self) -> list[Any]:
+        """Return what the node has created."""
+        waited_for = *self.publishers, *self.subscriptions, *self.clients, *self.services
+        return [*waited_for, *self.timers, *self.guards, *self.waitables]

@@ -185,13 +185,9 @@ class MapSource:
         self._use(grid, self._newest)
 
     def _take_directions(self, message: OccupancyGrid) -> None:
-        try:
+        with self._report.taking(DIRECTIONS):
             self._directions.take(message)
-        except ValueError as error:
-            self._report.refuse(DIRECTIONS, str(error))
-            return
-        self._report.accept(DIRECTIONS)
-        self._read_again(self._newest, self._used)
+            self._read_again(self._newest, self._used)
 
     def _read_again(self, *candidates: Received | None) -> None:
         """Plan on the first one whose directions have come."""

@@ -5,7 +5,6 @@ from __future__ import annotations
 import gc
 
 import numpy as np
-from rcl_interfaces.msg import SetParametersResult
 from rclpy.parameter import Parameter
 from rclpy.task import Future
 from std_msgs.msg import String
@@ -87,22 +86,22 @@ class ModelSource:
         self._report.change()
         self._node.get_logger().info(f"planning with the model {file}")
 
-    def _set(self, name: str) -> SetParametersResult:
-        """Set the node's parameter, which loads the model."""
-        return self._node.set_parameters([Parameter("model", value=name)])[0]
+    def set(self, name: str) -> str:
+        """Set the node's parameter, which loads the model; return why it was refused."""
+        (result,) = self._node.set_parameters([Parameter("model", value=name)])
+        reason: str = result.reason
+        return reason
 
     def on_saved(self, message: String) -> None:
         """Use a model that the trainer saved."""
-        result = self._set(message.data)
-        if not result.successful:
-            self._report.refuse("model", f"the trainer's model was refused: {result.reason}")
+        if reason := self.set(message.data):
+            self._report.refuse("model", f"the trainer's model was refused: {reason}")
 
     def on_reload(self) -> tuple[bool, str]:
         """Load the file of the model again."""
-        result = self._set(self._node.value("model"))
-        if not result.successful:
-            self._node.get_logger().error(f"the model was not loaded again: {result.reason}")
-        return result.successful, result.reason or f"loaded {self.file}"
+        if reason := self.set(self._node.value("model")):
+            self._node.get_logger().error(f"the model was not loaded again: {reason}")
+        return not reason, reason or f"loaded {self.file}"
 
     def describe(self, rule: str) -> dict[str, str]:
         """Return what the diagnostics say of it, with the value of the parameter ``move_rule``."""

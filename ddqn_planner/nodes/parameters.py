@@ -1,4 +1,4 @@
-"""The parameters of the planner and of the trainer, as a user reads of them."""
+"""The parameters of the planner and of the trainer, in the words of their ``--help``."""
 
 from __future__ import annotations
 
@@ -11,91 +11,41 @@ from ddqn_planner.planning import PlanMethod
 from ddqn_planner.planning.field_cache import CACHE_BYTES
 from ddqn_planner.training.hyper_parameters import HyperParameters
 
+MOVE_RULES: Final = [rule.value for rule in MoveRule]
+METHODS: Final = [method.value for method in PlanMethod]
+LOADABLE: Final = "a model that can be loaded; else the one before it stays"
+
 OF_MAPS: Final = {
-    "occupied_threshold": Declared(
-        65, "A cell of this value or more is occupied, percent", (1, 100)
-    ),
-    "allow_unknown": Declared(False, "Whether unknown cells are free"),
+    "occupied_threshold": Declared(65, "Percent from which on a cell is occupied", (1, 100)),
+    "allow_unknown": Declared(False, "Unknown cells are free"),
 }
 """How both nodes read a map."""
 
 PLANNER_PARAMETERS: Final = {
-    "autostart": Declared(
-        True,
-        "Whether the node configures and activates itself; else a lifecycle manager does it",
-        read_only=True,
-    ),
-    "model": Declared(
-        "any_map",
-        "Name of a shipped model, or path of a model file",
-        "a model that can be loaded; else the one before it stays",
-    ),
-    "move_rule": Declared(
-        "",
-        "Which diagonal moves are legal; '' for the rule of the model",
-        ["", *(rule.value for rule in MoveRule)],
-    ),
-    "map_type": Declared(
-        "map",
-        "How the map's values are read: as a map's, or as a costmap's of Nav2",
-        ["map", "costmap"],
-    ),
-    "map_timeout": Declared(
-        5.0,
-        "With the map_type costmap: how long after the last message to plan on a costmap, seconds; "
-        "0: always",
-        (0, 3600),
-    ),
-    "require_directions": Declared(
-        False, "Whether to wait for map_directions even if no node publishes them"
-    ),
+    "autostart": Declared(True, "Start without a lifecycle manager", read_only=True),
+    "model": Declared("any_map", "A shipped model's name, or a model file", LOADABLE),
+    "move_rule": Declared("", "Legal diagonal moves; '' for the model's rule", ["", *MOVE_RULES]),
+    "map_type": Declared("map", "Values of a map, or of a Nav2 costmap", ["map", "costmap"]),
+    "map_timeout": Declared(5.0, "Seconds to plan on the last costmap; 0: always", (0, 3600)),
+    "require_directions": Declared(False, "Wait for map_directions, even from a later node"),
     **OF_MAPS,
     "use_map_costs": Declared(
-        False,
-        "Whether to use the values of free cells as costs; an unknown cell that is free has the "
-        "highest. For models that learned cost multipliers: any_map",
+        False, "For any_map: a free cell's value is its cost; unknown has the highest"
     ),
-    "robot_radius": Declared(
-        0.0, "Cells nearer than this to an obstacle are occupied, metres", (0, 100)
-    ),
+    "robot_radius": Declared(0.0, "Metres: cells nearer to an obstacle are occupied", (0, 100)),
     "start_clearing_radius": Declared(
         -1.0,
-        "A robot on an obstacle may leave: obstacles this near to its cell do not count, metres; "
-        "-1: robot_radius, at least one cell; 0: such a start is refused",
+        "Metres: obstacles this near to a start on an obstacle do not count; -1: robot_radius, at "
+        "least one cell; 0: such a start is refused",
         (-1, 100),
     ),
-    "clearance_weight": Declared(
-        0.0,
-        "How strongly to avoid cells near obstacles: 0 for not at all. For models that learned "
-        "cost multipliers: any_map",
-        (0, 1),
-    ),
-    "tolerance": Declared(
-        0.0,
-        "How far a goal_pose that is occupied or cut off may move to a reachable free cell, metres",
-        (0, 1000),
-    ),
-    "replan_period": Declared(
-        1.0,
-        "How soon the path to the goal_pose follows a changed map or a moving robot while it is "
-        "not blocked, seconds; 0: with each map",
-        (0, 3600),
-    ),
-    "switch_threshold": Declared(
-        0.05,
-        "How much more the path under way may cost than a new one and still be kept, as a share; "
-        "~/get_plan always has the new one",
-        (0, 10),
-    ),
-    "mode": Declared(
-        "greedy",
-        "Whether to search where the greedy steps are trapped: astar_fallback",
-        [method.value for method in PlanMethod],
-    ),
+    "clearance_weight": Declared(0.0, "For any_map: how strongly to avoid obstacles", (0, 1)),
+    "tolerance": Declared(0.0, "Metres: how far an occupied or cut off goal may move", (0, 1000)),
+    "replan_period": Declared(1.0, "Seconds between plans on a free path; 0: each map", (0, 3600)),
+    "switch_threshold": Declared(0.05, "Share by which a kept path may cost more", (0, 10)),
+    "mode": Declared("greedy", "astar_fallback: search where greedy steps get stuck", METHODS),
     "path_simplification": Declared(
-        "none",
-        "Whether to keep only the poses at which a path turns: line_of_sight",
-        ["none", "line_of_sight"],
+        "none", "line_of_sight: poses only where a path turns", ["none", "line_of_sight"]
     ),
     "start_source": Declared(
         "initialpose",
@@ -105,24 +55,15 @@ PLANNER_PARAMETERS: Final = {
     "robot_frame": Declared("base_link", "The robot's frame, for the start_source tf", "not empty"),
     "transform_tolerance": Declared(
         0.3,
-        "How far the newest transform's time may be from now, how long odometry may be silent (at "
-        "least 2 s), and how long a request waits for the transform of a pose, seconds",
+        "Seconds: greatest age of a transform, how long a request waits for one, and how long "
+        "odometry may be silent (at least 2)",
         (0, 1000),
     ),
     "field_cache_bytes": Declared(
-        CACHE_BYTES,
-        "Memory for the Q fields in the cache, bytes; the last one is always kept",
-        (0, 2**40),
+        CACHE_BYTES, "Bytes for kept Q fields; the last always stays", (0, 2**40)
     ),
-    "planner_id": Declared(
-        "GridBased", "The planner_id that Nav2's requests may name, beside the empty one"
-    ),
-    "follow_trainer": Declared(
-        False,
-        "Whether to load each model that trainer/model_saved names, and to plan by expected time "
-        "with what trainer/experience_saved names",
-        read_only=True,
-    ),
+    "planner_id": Declared("GridBased", "What Nav2's requests may name, or leave empty"),
+    "follow_trainer": Declared(False, "Load what the trainer saves", read_only=True),
 }
 
 HYPER_PARAMETERS: Final = {
@@ -136,10 +77,7 @@ HYPER_PARAMETERS: Final = {
 
 TRAINER_PARAMETERS: Final = {
     "learn_from": Declared(
-        "simulation",
-        "Whether to train a model in simulated episodes, or to learn from the robot's drives",
-        ["simulation", "driving"],
-        read_only=True,
+        "simulation", "Episodes, or the robot's drives", ["simulation", "driving"], read_only=True
     ),
     "output_folder": Declared(
         "runs/trainer",
@@ -148,22 +86,16 @@ TRAINER_PARAMETERS: Final = {
         "not empty",
     ),
     "map_file": Declared(
-        "",
-        "Map file with start and goal, or a shipped map's name; '' to wait for topics",
-        read_only=True,
+        "", "Map file or shipped map with start and goal; '': topics", read_only=True
     ),
-    "move_rule": Declared(
-        "corner_cutting",
-        "Which diagonal moves are legal; used by the next ~/start",
-        [rule.value for rule in MoveRule],
-    ),
+    "move_rule": Declared("corner_cutting", "Which diagonal moves are legal", MOVE_RULES),
     "seed": Declared(0, "Seed of the training", (0, 2**31 - 1)),
     **OF_MAPS,
     "episode_interval": Declared(10, "Publish each n-th episode", (1, 10**6)),
     "replay_period": Declared(0.05, "Seconds per step of ~/replay", (1e-3, 10.0)),
     "pose_source": Declared(
         "odometry",
-        "Driving: where the robot is: a topic, odom, or a transform",
+        "Driving: odom, or the transform to robot_frame",
         ["odometry", "tf"],
         read_only=True,
     ),
@@ -171,15 +103,9 @@ TRAINER_PARAMETERS: Final = {
         "base_link", "Driving: the robot's frame, for the pose_source tf", "not empty"
     ),
     "nominal_speed": Declared(
-        0.5,
-        "Driving: the robot's speed where nothing slows it down, metres per second; used by the "
-        "next ~/start",
-        (0.01, 100.0),
+        0.5, "Driving: m/s where nothing slows the robot down", (0.01, 100.0)
     ),
-    "robot_width": Declared(
-        0.5,
-        "Driving: places are squares of half of it, metres; used by the next ~/start",
-        (0.05, 10.0),
-    ),
+    "robot_width": Declared(0.5, "Driving: metres; places are squares of half of it", (0.05, 10.0)),
     **HYPER_PARAMETERS,
 }
+"""The next ``~/start`` uses those that changed."""

@@ -191,14 +191,8 @@ def listen(
     is_odometry = topic == "odom"
 
     def on_message(message: Odometry | PoseWithCovarianceStamped) -> None:
-        try:
+        with refusals.taking(topic, often=is_odometry):
             take(PoseStamped(header=message.header, pose=message.pose.pose))
-        except ValueError as error:
-            # It comes all the time, and its reason may have numbers: its first one is logged.
-            log = not is_odometry or topic not in refusals.refused
-            refusals.refuse(topic, str(error), log)
-        else:
-            refusals.accept(topic)
 
     if is_odometry:
         return node.create_subscription(Odometry, topic, on_message, best_effort(depth))

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
 
@@ -137,6 +138,16 @@ class Refusals:
     def __init__(self, node: BaseNode) -> None:
         self.node = node
         self.refused: dict[str, str] = {}
+
+    @contextmanager
+    def taking(self, what: str, often: bool = False) -> Iterator[None]:
+        """Accept something, or refuse it by a ValueError; of what comes often, log the first."""
+        try:
+            yield
+        except ValueError as error:
+            self.refuse(what, str(error), log=not often or what not in self.refused)
+        else:
+            self.accept(what)
 
     def refuse(self, what: str, reason: str, log: bool = True) -> None:
         """Refuse something, and perhaps log it, unless the last reason was the same."""

@@ -108,18 +108,14 @@ class TrainerNode(LearningNode):
 
     def _on_pose(self, which: str, message: PoseStamped | PoseWithCovarianceStamped) -> None:
         pose = getattr(message.pose, "pose", message.pose)
-        try:
+        with self.refusals.taking(which):
             # A pose may come before the map: ~/start then checks its cell.
             check_pose(f"the {which}", message.header, pose)
             stamped = PoseStamped(header=message.header, pose=pose)
             if self.map is not None:
                 cell = self._cell(which, stamped, self.map)
                 self.get_logger().info(f"the {which} is cell {cell}")
-        except ValueError as error:
-            self.refusals.refuse(which, str(error))
-            return
-        self.refusals.accept(which)
-        self._poses[which] = stamped
+            self._poses[which] = stamped
 
     def _cell(self, which: str, pose: PoseStamped, place: MapInFrame) -> Cell:
         """Return the cell of a pose; ValueError if it is not a free cell of the map."""
