@@ -78,7 +78,9 @@ class WorkFolder:
             raise FolderError(
                 f"{folder} holds {reprlib.repr(names)} but no {content}; give a new or empty folder"
             )
-        self.folder, self.save_error, self._after = folder, "", after
+        self.folder, self._after = folder, after
+        self.save_error = ""
+        """Why the last save failed; empty if it did not."""
         self._open_files = ExitStack()
         with self.opening() as files:
             # The system closes the file, and so unlocks it, when the process ends.
@@ -115,7 +117,7 @@ class WorkFolder:
             )
 
     def close(self) -> None:
-        """Close the files and unlock the folder."""
+        """Close the files and unlock the folder, without saving."""
         self._open_files.close()
 
 

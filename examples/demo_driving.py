@@ -18,45 +18,33 @@ from pathlib import Path as FilePath
 from subprocess import Popen
 from typing import Any
 
-import matplotlib
-
-matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 import numpy as np
 from geometry_msgs.msg import PoseStamped
 from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.colors import LogNorm
-from matplotlib.patheffects import withStroke
 from nav_msgs.msg import OccupancyGrid, Odometry, Path
 from numpy.typing import NDArray
 from PIL import Image
 
 from ddqn_planner.experience.drives import ARRIVAL_DISTANCE
-from ddqn_planner.grid import Cell, GridMap, MoveRule, save_map
+from ddqn_planner.grid import Cell, save_map
 from ddqn_planner.nodes.driving import SLOWEST
 from ddqn_planner.nodes.runtime import LATCHED
-from ddqn_planner.pictures import draw_obstacles
 from ddqn_planner.planning import Planner
 
 sys.path.insert(0, str(FilePath(__file__).resolve().parents[1] / "experiments"))
 from client import Client, Recorder, cells_of, pose, wait_for
-from driving_worlds import World, generated_world, path_seconds
+from driving_worlds import RULE, Routes, World, generated_world, path_seconds
+from figures import ROUTE_STYLES, draw_slowness, draw_times
 from processes import claim_ros_domain, run_script, running, running_node
 
 WORLD, SEED, SPEED_UP, MISSIONS = "office", 9, 40.0, 40
-RULE = MoveRule.ROBOT_SAFE
 LISTENERS = 3
 """To goals: the planner, the trainer and the robot."""
 
 MEAN_OF = 8
 """Missions that a point of the curve sums up."""
 
-STYLES = {
-    "shortest": {"color": "#555555", "linestyle": ":"},
-    "learned": {"color": "#0072B2", "linestyle": "-"},
-    "best possible": {"color": "#CC79A7", "linestyle": "--"},
-}
-Routes = dict[str, Sequence[Cell]]
 Slowness = NDArray[np.float64]
 
 
@@ -99,24 +87,9 @@ class Driver:
         shape = self.world.grid.occupancy.shape
         return np.asarray(SLOWEST ** (np.array(message.data).reshape(shape).clip(0) / 100))
 
-    def routes(self, learned: Sequence[Cell], known: GridMap) -> Routes:
-        """Return the learned route, and those of one who knows nothing and of one who knows all."""
-        ends = learned[0], learned[-1]
-        shortest, best = (
-            self.planner.plan(grid, *ends, RULE, start_clearing_radius=1).cells
-            for grid in (self.world.grid, known)
-        )
-        return {"shortest": shortest, "learned": learned, "best possible": best}
-
-    def seconds(self, routes: Routes, truth: Slowness) -> dict[str, float]:
-        """Return the true time of each route."""
-        grid = self.world.grid
-        return {name: path_seconds(cells, truth, grid) for name, cells in routes.items()}
-
     def drive(self, goal: Cell) -> Mission:
         """Drive to a station, and wait until the planner knows what that taught."""
         grid, slowness, began = self.world.grid, self.known_slowness(), self.now()
-        truth = self.world.slowness(began)
         self.plans.clear()
         self.drives.clear()
         stamped = pose(grid, goal)
@@ -129,23 +102,24 @@ class Driver:
         measured = self.now() - began
         time.sleep(0.3)  # the planner loads it
         self.at = goal
-        routes = self.routes(cells_of(grid, path), self.world.known(began))
-        return Mission(routes, self.seconds(routes, truth), measured, truth, slowness)
+        return self.mission(cells_of(grid, path), began, measured, slowness)
 
-    def worst_pair(self) -> Routes:
-        """Return the routes between the two stations where knowing matters most."""
-        now, stations = self.now(), self.world.stations
-        truth, known = self.world.slowness(now), self.world.known(now)
-        all_routes = [self.routes((a, b), known) for a in stations for b in stations if a < b]
+    def mission(
+        self, learned: Sequence[Cell], now: float, measured: float, slowness: Slowness
+    ) -> Mission:
+        """Return a mission with the routes of those who know nothing and all beside the learned."""
+        shortest, best = self.world.routes(self.planner, learned[0], learned[-1], now).values()
+        routes = {"shortest": shortest, "learned": learned, "best possible": best}
+        truth = self.world.slowness(now)
+        seconds = {name: path_seconds(of, truth, self.world.grid) for name, of in routes.items()}
+        return Mission(routes, seconds, measured, truth, slowness)
 
-        def lost(routes: Routes) -> float:
-            names = ("shortest", "best possible")
-            shortest, best = (path_seconds(routes[n], truth, self.world.grid) for n in names)
-            return float(shortest - best)
-
-        routes = max(all_routes, key=lost)
-        start, goal = (pose(self.world.grid, cell) for cell in routes["learned"])
-        return {**routes, "learned": cells_of(self.world.grid, self.client.get_plan(start, goal))}
+    def last_mission(self) -> Mission:
+        """Return the mission between the two stations where knowing matters most, not driven."""
+        now, grid = self.now(), self.world.grid
+        start, goal = (pose(grid, cell) for cell in self.world.worst_pair(self.planner, now))
+        learned = cells_of(grid, self.client.get_plan(start, goal))
+        return self.mission(learned, now, math.nan, self.known_slowness())
 
 
 def _is_at(stamped: Any, goal: PoseStamped, factor: float = 1) -> bool:
@@ -154,26 +128,13 @@ def _is_at(stamped: Any, goal: PoseStamped, factor: float = 1) -> bool:
     return math.dist((at.x, at.y), (there.x, there.y)) <= factor * ARRIVAL_DISTANCE
 
 
-def draw(world: World, truth: Slowness, learned: Slowness, *routes: Routes) -> Any:
-    """Return a figure of true and learned slowness, with routes in each."""
-    figure, both = plt.subplots(1, 2, figsize=(8.4, 4.7), layout="constrained")
-    titles = ("what nobody told the robot", "what it has learned")
-    for axes, slowness, shown, title in zip(both, (truth, learned), routes, titles, strict=True):
-        values = np.where(world.grid.occupancy, np.nan, slowness)
-        image = axes.imshow(values, origin="lower", cmap="YlOrRd", norm=LogNorm(1, SLOWEST))
-        draw_obstacles(axes, world.grid)
-        for name, cells in shown.items():
-            outline = [withStroke(linewidth=4, foreground="white")]
-            line: dict[str, Any] = {"label": name, "path_effects": outline, **STYLES[name]}
-            axes.plot(*np.transpose(cells), linewidth=2.2, **line)
-        axes.scatter(*np.transpose(world.stations), 30, color="black", zorder=4)
-        axes.set(xticks=[], yticks=[])
-        axes.set_title(title, loc="left", fontsize=10)
-    bar = figure.colorbar(image, ax=both, label="seconds over seconds at nominal speed", shrink=0.8)
-    bar.set_ticks([1, 2, 5, 10], labels=["1", "2", "5", "10"])
-    bar.minorticks_off()
-    figure.legend(*both[0].get_legend_handles_labels(), loc="outside lower center", ncols=3)
-    return figure
+def draw(world: World, mission: Mission, learned: Routes) -> Any:
+    """Return a figure of true and learned slowness, with all routes, and those learned."""
+    panels = {
+        "what nobody told the robot": (mission.truth, mission.routes),
+        "what it has learned": (mission.slowness, learned),
+    }
+    return draw_slowness(world.grid, world.stations, panels, (8.4, 4.7))
 
 
 def save_film(path: FilePath, world: World, missions: Sequence[Mission]) -> None:
@@ -181,7 +142,7 @@ def save_film(path: FilePath, world: World, missions: Sequence[Mission]) -> None
     frames = []
     for number, mission in enumerate(missions, start=1):
         learned = {"learned": mission.routes["learned"]}
-        figure = draw(world, mission.truth, mission.slowness, mission.routes, learned)
+        figure = draw(world, mission, learned)
         ratio = mission.seconds["learned"] / mission.seconds["best possible"]
         figure.suptitle(f"mission {number}: {ratio:.2f} of the best possible time", fontsize=11)
         canvas: Any = FigureCanvasAgg(figure)
@@ -191,25 +152,6 @@ def save_film(path: FilePath, world: World, missions: Sequence[Mission]) -> None
         plt.close(figure)
     times = [1200 if number in (0, len(frames) - 1) else 450 for number in range(len(frames))]
     frames[0].save(path, save_all=True, append_images=frames[1:], duration=times, loop=0)
-
-
-def save_curve(path: FilePath, missions: Sequence[Mission]) -> None:
-    """Save the true time of the routes over the best possible, from mission to mission."""
-    figure, axes = plt.subplots(figsize=(7.2, 3.6), layout="constrained")
-    width = min(MEAN_OF, len(missions))
-    seconds = {
-        name: np.convolve([m.seconds[name] for m in missions], np.ones(width), mode="valid")
-        for name in STYLES
-    }
-    for name in ("shortest", "learned"):
-        ratio = seconds[name] / seconds["best possible"]
-        line: dict[str, Any] = {"label": name, **STYLES[name]}
-        axes.plot(np.arange(len(ratio)) + width, ratio, linewidth=2, **line)
-    axes.axhline(1, color="black", linewidth=0.8)
-    axes.set(xlabel=f"mission (mean of the last {width})", ylabel="true time over the best")
-    axes.legend(frameon=False)
-    axes.grid(alpha=0.3)
-    figure.savefig(path, dpi=110)
 
 
 def main(arguments: Sequence[str]) -> int:
@@ -245,11 +187,13 @@ def main(arguments: Sequence[str]) -> int:
                     f"shortest {each['shortest'] / each['best possible']:.2f}",
                     flush=True,
                 )
-            truth, learned = world.slowness(driver.now()), driver.known_slowness()
-            routes = driver.worst_pair()
-            draw(world, truth, learned, routes, routes).savefig("demo_driving.png", dpi=110)
+            last = driver.last_mission()
+    draw(world, last, last.routes).savefig("demo_driving.png", dpi=110)
     save_film(FilePath("demo_driving.gif"), world, missions)
-    save_curve(FilePath("demo_driving_curve.png"), missions)
+    seconds = {name: [np.array([each.seconds[name] for each in missions])] for name in ROUTE_STYLES}
+    best = seconds.pop("best possible")
+    curve, _ = draw_times(seconds, best, min(MEAN_OF, count), banded="learned")
+    curve.savefig("demo_driving_curve.png", dpi=110)
     print("saved demo_driving.gif, demo_driving.png and demo_driving_curve.png")
     return 0
 

@@ -11,7 +11,7 @@ import goal_3
 import numpy as np
 from random_maps import generate_map
 from settings import Settings
-from tables import median_and_range, write_table
+from tables import median_and_range, table
 from trainings import MOVE_RULE, Training, rollouts, solved
 
 from ddqn_planner.grid import (
@@ -41,15 +41,14 @@ VARIANTS: Final[dict[str, dict[str, Any]]] = {
 }
 """The changes to `ANY_MAP` of each variant."""
 
-STEPS: Final = (25_600, 256_000)
-"""Environment steps of the trainings of the ablation: a tenth of a minute, and a minute."""
+STEPS: Final = 256_000
+"""Environment steps of each training of the ablation."""
 
 HELD_OUT: Final = ("maze", "rooms", "corridors", "dead_ends", "office")
 SIDE: Final = 48
 
 ABLATION = (
     "variant",
-    "steps",
     "moves classified wrongly, of 4,096",
     "error of the cost multiplier",
     "starts solved, without action masking",
@@ -63,59 +62,47 @@ def trainings(settings: Settings) -> list[Training]:
     return [
         Training(
             folder,
-            settings.shorten(replace(ANY_MAP, steps=steps, **changes)),
+            settings.shorten(replace(ANY_MAP, steps=STEPS, **changes)),
             tuple(random_scenarios(seed)),
             seed,
             evaluation_interval=10**9,
         )
         for variant, changes in VARIANTS.items()
-        for steps in STEPS
-        for seed, folder in enumerate(settings.folders(_name(variant, steps)))
+        for seed, folder in enumerate(settings.folders(_folder(variant)))
     ]
 
 
-def _name(variant: str, steps: int) -> str:
-    return f"any_map/{list(VARIANTS).index(variant)}/{steps}"
+def _folder(variant: str) -> str:
+    return f"any_map/{list(VARIANTS).index(variant)}"
 
 
 def report(settings: Settings) -> str:
-    """Write both tables, and return their Markdown."""
-    zero_shot = _zero_shot(settings)
-    rows = [
-        [variant, f"{steps:,}", *_row(settings.planners(_name(variant, steps)))]
-        for variant in VARIANTS
-        for steps in STEPS
-    ]
-    path = settings.out / "any_map_zero_shot.csv"
-    first = write_table(path, [*zero_shot], [[*zero_shot.values()]])
-    return f"{first}\n\n{write_table(settings.out / 'any_map_ablation.csv', ABLATION, rows)}"
+    """Return the shipped model's results on the paper's goals, and the table of the ablation."""
+    ablation = [[name, *_row(settings.planners(_folder(name)))] for name in VARIANTS]
+    zero_shot = table(["the shipped model, which never saw these maps", ""], _zero_shot(settings))
+    return f"{zero_shot}\n\n{table(ABLATION, ablation)}"
 
 
-def _zero_shot(settings: Settings) -> dict[str, str]:
-    """Return the results of the shipped model on the paper's goals, whose maps it never saw."""
-    shipped = Planner.load("any_map")
+def _zero_shot(settings: Settings) -> list[list[str]]:
+    shipped, scenario = Planner.load("any_map"), paper_scenario()
     planner = Planner(shipped.network, replace(shipped.metadata, move_rule=MOVE_RULE))
-    scenario = paper_scenario()
-    cells, seconds = goal_1.timed_plan(planner, scenario)
+    cells, milliseconds = goal_1.timed_plan(planner, scenario)
     field = planner.q_field(scenario.grid, scenario.goal)
     # The given start, goal i, is one of the starts.
     starts = evaluate(field, scenario.grid, MOVE_RULE)
-    unmasked = evaluate(field.unmasked(), scenario.grid, MOVE_RULE)
-    row = {
-        "goal i, length": f"{path_length(cells):.2f}",
-        "goal ii with the given start, solved (without action masking)": (
-            f"{starts.solved} ({unmasked.solved}) of {starts.starts}"
-        ),
-        "mean length / optimum": f"{starts.mean_ratio:.4f}",
-    }
+    unmasked = evaluate(field.unmasked(), scenario.grid, MOVE_RULE).solved
+    rows = [
+        ["goal i, length", f"{path_length(cells):.2f}"],
+        ["planning time, ms", f"{milliseconds:.2f}"],
+        ["goal ii (without action masking)", f"{starts.solved} ({unmasked}) of {starts.starts}"],
+        ["goal ii, mean length / optimum", f"{starts.mean_ratio:.4f}"],
+    ]
     for noise in settings.noise:
-        maps = goal_3.drawn_maps(settings, noise)
-        for label, scenarios in (("first", maps.training), ("test", maps.test)):
-            plans, unmasked_plans = rollouts(planner, scenarios)
-            row[f"goal iii, {noise.value}, {label} maps (without action masking)"] = (
-                f"{solved(plans)} ({solved(unmasked_plans)}) of {len(plans)}"
-            )
-    return row | {"planning time, ms": f"{1e3 * seconds:.2f}"}
+        training, test = goal_3.drawn_maps(settings, noise)
+        plans, without_masking = rollouts(planner, [*training, *test])
+        counts = f"{solved(plans)} ({solved(without_masking)}) of {len(plans)}"
+        rows.append([f"goal iii, {noise.value} (without action masking)", counts])
+    return rows
 
 
 def _row(planners: Sequence[Planner]) -> list[str]:

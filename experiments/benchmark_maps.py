@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 import sys
 import zipfile
-from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from decimal import Decimal, InvalidOperation
@@ -39,14 +38,8 @@ COSTS: Final[dict[str, Callable[[Occupancy, np.random.Generator], NDArray[np.int
 GOALS = 10
 """Different goals per generated map: each needs a Q field and exact distances."""
 
-FILES: Final = {
-    ".map": "MovingAI maps",
-    ".scen": "MovingAI scenario files",
-    ".npz": "MPD files",
-    ".yaml": "ROS maps",
-    ".yml": "ROS maps",
-}
-"""The kind of file that each suffix stands for."""
+SUFFIXES: Final = (".map", ".scen", ".npz", ".yaml", ".yml")
+"""Of MovingAI's maps and scenarios, MPD's files, and ROS maps."""
 
 
 @dataclass(frozen=True)
@@ -137,17 +130,12 @@ def _random_starts(
 
 def find_files(folder: Path) -> list[Path]:
     """Return the benchmark files of a folder and its subfolders; a ValueError without a map."""
-    files = sorted(
-        path for path in folder.rglob("*") if path.suffix.lower() in FILES and path.is_file()
-    )
+    files = sorted(p for p in folder.rglob("*") if p.suffix.lower() in SUFFIXES and p.is_file())
     if all(path.suffix.lower() == ".scen" for path in files):
         raise ValueError(
             f"{folder}: found no MovingAI map (.map), MPD file (.npz) or ROS map (.yaml) in this "
             "folder; check the path"
         )
-    counts = Counter(FILES[path.suffix.lower()] for path in files)
-    words = ", ".join(f"{count} {name}" for name, count in counts.items())
-    print(f"found in {folder}: {words}", file=sys.stderr)
     return files
 
 

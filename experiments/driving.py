@@ -12,15 +12,15 @@ import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 # Before NumPy is imported. On a busy machine, several threads are ten times as slow as one.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
-import matplotlib.pyplot as plt
 import numpy as np
 from driving_worlds import (
     KINDS,
+    RULE,
     SPEED,
     STATIONS,
     World,
@@ -31,20 +31,17 @@ from driving_worlds import (
     slow_zones,
     with_faults,
 )
-from figures import COLOURS, draw_curves, save_figure
-from matplotlib.colors import LogNorm
-from matplotlib.patheffects import withStroke
+from figures import draw_slowness, draw_times, save_figure
 from numpy.typing import NDArray
 from random_maps import generate_map
-from tables import write_report, write_table
+from tables import table, write_report
 from trainings import BACKENDS, in_parallel
 
 from ddqn_planner.cli import HelpFormatter, exit_code
 from ddqn_planner.experience import Experience
-from ddqn_planner.grid import Cell, GridMap, MoveRule, inflate, load_map
+from ddqn_planner.grid import Cell, GridMap, inflate, load_map
 from ddqn_planner.grid.arguments import MAX_SLOWNESS
 from ddqn_planner.grid.noise import random_requests
-from ddqn_planner.pictures import draw_obstacles
 from ddqn_planner.planning import Planner
 
 Float64 = NDArray[np.float64]
@@ -154,7 +151,7 @@ def run(job: Job) -> Result:
         truth = world.slowness(clock)
 
         def planned(on: GridMap, start: Cell = start, goal: Cell = goal) -> tuple[Cell, ...]:
-            return planner.plan(on, start, goal, MoveRule.ROBOT_SAFE).cells
+            return planner.plan(on, start, goal, RULE).cells
 
         best.append(path_seconds(planned(world.known(clock)), truth, grid))
         cells = planned(experience.apply(grid))
@@ -195,28 +192,26 @@ def report(out: Path, options: argparse.Namespace) -> str:
     plain, faulty = measured_worlds(KINDS, options)
     both = {"as it is": plain, "with faults": faulty}
     sections = {
-        "Time over the best possible": _stages(out / "stages.csv", plain),
+        "Time over the best possible": _stages(plain),
         "From mission to mission": _curve(out / "curve.png", plain),
-        "World by world": _worlds(out / "worlds.csv", plain),
-        "Expected times": _forecasts(out / "forecasts.csv", both),
-        "Faults": write_table(
-            out / "faults.csv",
+        "World by world": _worlds(plain),
+        "Expected times": _forecasts(both),
+        "Faults": table(
             ["drives", *STAGES],
             [[name, *_medians(some, LEARNED, STAGES)] for name, some in both.items()],
         ),
-        "Speed": _times(out / "times.csv"),
+        "Speed": _times(),
         "True and learned slowness": _picture(out / "map.png"),
     }
     if not options.quick:
-        sections["When all slow zones move"] = write_table(
-            out / "moved.csv",
+        sections["When all slow zones move"] = table(
             ["missions", *MOVED_STAGES],
             [[name, *_medians(plain, name, MOVED_STAGES)] for name in PLANNERS],
         )
     if maps:
         plain, _ = measured_worlds(maps, options)
-        sections["Maps from files"] = _stages(out / "maps.csv", plain)
-        sections["Maps from files, world by world"] = _worlds(out / "maps_worlds.csv", plain)
+        sections["Maps from files"] = _stages(plain)
+        sections["Maps from files, world by world"] = _worlds(plain)
     return write_report(out, sections, options.page)
 
 
@@ -228,7 +223,7 @@ def map_files(folder: Path) -> list[str]:
     return files
 
 
-def _stages(path: Path, plain: Sequence[Result]) -> str:
+def _stages(plain: Sequence[Result]) -> str:
     """Return the time over that of the planner that knows: median, best and worst world."""
     rows = [["bar", *BARS]]
     for name in reversed(PLANNERS):
@@ -237,7 +232,7 @@ def _stages(path: Path, plain: Sequence[Result]) -> str:
             ratios = [result.ratio(name, *stage) for result in plain]
             cells.append(f"{np.median(ratios):.3f} ({min(ratios):.3f} to {max(ratios):.3f})")
         rows.insert(0, [name, *cells])
-    return write_table(path, ["missions", *STAGES], rows)
+    return table(["missions", *STAGES], rows)
 
 
 def _medians(
@@ -246,7 +241,7 @@ def _medians(
     return [f"{np.median([r.ratio(planner, *s) for r in results]):.3f}" for s in stages.values()]
 
 
-def _worlds(path: Path, plain: Sequence[Result]) -> str:
+def _worlds(plain: Sequence[Result]) -> str:
     """Return the same for each world, and the time over that of the shortest path."""
     rows = []
     for result in plain:
@@ -254,10 +249,10 @@ def _worlds(path: Path, plain: Sequence[Result]) -> str:
         ratios.append(result.ratio(LEARNED, 0, MOVED_AT) / result.ratio(SHORTEST, 0, MOVED_AT))
         cells = [f"{ratio:.3f}" for ratio in ratios]
         rows.append([Path(result.job.kind).stem, result.job.seed, *cells])
-    return write_table(path, ["world", "seed", *STAGES, "over the shortest path"], rows)
+    return table(["world", "seed", *STAGES, "over the shortest path"], rows)
 
 
-def _forecasts(path: Path, both: Mapping[str, Sequence[Result]]) -> str:
+def _forecasts(both: Mapping[str, Sequence[Result]]) -> str:
     """Return how far the expected time of a mission was from the measured one, after 50."""
     rows = []
     for label, results in both.items():
@@ -268,10 +263,10 @@ def _forecasts(path: Path, both: Mapping[str, Sequence[Result]]) -> str:
         width = np.median((high - low) / expected)
         rows.append([label, len(forecast), f"{error:.1%}", f"{inside:.1%}", f"{width:.1%}"])
     header = ["drives", "missions", "MAPE", "within the 90 % interval", "width of it, median"]
-    return write_table(path, header, rows)
+    return table(header, rows)
 
 
-def _times(path: Path) -> str:
+def _times() -> str:
     """Return how long it takes to learn from 1,000 poses on 1000 x 1000 cells, and to plan again.
 
     It is the time of the processor: of `Experience.record`, of `Experience.apply`, and of
@@ -281,7 +276,7 @@ def _times(path: Path) -> str:
     occupancy = generate_map("office", (1000, 1000), random)
     grid, planner = GridMap(occupancy, 0.05), Planner.load("any_map")
     world = make_world(grid, random)
-    requests = random_requests(world.grid.occupancy, MoveRule.ROBOT_SAFE, 6, random)
+    requests = random_requests(world.grid.occupancy, RULE, 6, random)
     goal, experience, clock = requests[0][1], Experience(SPEED), 0.0
     times = []
     for number in range(25):
@@ -301,27 +296,16 @@ def _times(path: Path) -> str:
     columns = zip(("record", "apply", "plan again", "all"), np.array(times[5:]).T, strict=True)
     rows = [[name, f"{np.median(ms):.1f}", f"{ms.max():.1f}"] for name, ms in columns]
     header = ["1,000 poses on 1000 x 1000 cells", "median [ms]", "worst [ms]"]
-    return write_table(path, header, rows)
+    return table(header, rows)
 
 
 def _curve(path: Path, plain: Sequence[Result]) -> str:
-    """Draw the time over the best possible from mission to mission."""
-
-    def smoothed(seconds: Float64) -> Float64:
-        return np.convolve(seconds, np.ones(SMOOTHED), mode="valid")
-
-    figure, axes = plt.subplots(figsize=(7.2, 3.6), layout="constrained")
-    curves = {}
-    for name in PLANNERS:
-        worlds = [smoothed(result.seconds[name]) / smoothed(result.best) for result in plain]
-        curves[name] = worlds if name == LEARNED else [np.median(worlds, axis=0)]
-    missions = np.arange(len(curves[LEARNED][0])) + SMOOTHED
-    draw_curves(axes, missions, curves, "mission", "time over the best possible")
-    if missions[-1] > MOVED_AT:
+    seconds = {name: [result.seconds[name] for result in plain] for name in PLANNERS}
+    best = [result.best for result in plain]
+    figure, axes = draw_times(seconds, best, SMOOTHED, banded=LEARNED)
+    if len(best[0]) > MOVED_AT:
         axes.axvline(MOVED_AT, color="black", linewidth=1, linestyle=":")
         axes.text(MOVED_AT + 1, axes.get_ylim()[1], "all slow zones move", va="top", fontsize=9)
-    axes.axhline(1, color="black", linewidth=0.8)
-    axes.legend(frameon=False)
     return save_figure(figure, path, "Time over the best possible, from mission to mission")
 
 
@@ -330,52 +314,23 @@ def _picture(path: Path, kind: str = "office", seed: int = 1, missions: int = 50
     world, planner = Job(kind, seed, missions).world(), Planner.load("any_map")
     grid, experience, clock = world.grid, Experience(SPEED), 0.0
     random = np.random.default_rng(seed)
-
-    def planned(on: GridMap, start: Cell, goal: Cell) -> tuple[Cell, ...]:
-        return planner.plan(on, start, goal, MoveRule.ROBOT_SAFE).cells
-
     for _ in range(missions):
         start, goal = (world.stations[i] for i in random.choice(STATIONS, 2, False))
-        measured = drive(planned(experience.apply(grid), start, goal), world, clock, random)
+        cells = planner.plan(experience.apply(grid), start, goal, RULE).cells
+        measured = drive(cells, world, clock, random)
         experience.record(measured.seconds, measured.positions)
         clock += measured.duration
-    truth, known = world.slowness(clock), world.known(clock)
-
-    def saved(ends: tuple[Cell, Cell]) -> float:
-        """Return how much of a mission's time knowing saves."""
-        (x, y), (best_x, best_y) = (np.transpose(planned(on, *ends)) for on in (grid, known))
-        return float(truth[y, x].sum() - truth[best_y, best_x].sum())
-
-    start, goal = max(((a, b) for a in world.stations for b in world.stations if a < b), key=saved)
-    routes = {
-        "shortest": (grid, "#555555", ":"),
-        "learned": (experience.apply(grid), COLOURS[0], "-"),
-        "best possible": (known, COLOURS[3], "--"),
-    }
+    start, goal = world.worst_pair(planner, clock)
+    shortest, best = world.routes(planner, start, goal, clock).values()
+    learned = planner.plan(experience.apply(grid), start, goal, RULE).cells
+    routes = {"shortest": shortest, "learned": learned, "best possible": best}
     visited = experience.uncertainty(grid) < VISITED
-    panels: dict[str, Any] = {
-        "what nobody told the robot: true slowness": truth,
-        f"what it learned from {missions} missions (grey: never there)": np.where(
-            visited, experience.slowness(grid), np.nan
-        ),
+    known = np.where(visited, experience.slowness(grid), np.nan)
+    panels = {
+        "what nobody told the robot: true slowness": (world.slowness(clock), routes),
+        f"what it learned from {missions} missions (grey: never there)": (known, routes),
     }
-    figure, both = plt.subplots(1, 2, figsize=(11, 5.6), layout="constrained")
-    for axes, (title, slowness) in zip(both, panels.items(), strict=True):
-        shown = np.where(grid.occupancy, np.nan, slowness)
-        axes.set_facecolor("#e6e6e6")
-        image = axes.imshow(shown, origin="lower", cmap="YlOrRd", norm=LogNorm(1, 8))
-        draw_obstacles(axes, grid)
-        for name, (on, colour, style) in routes.items():
-            x, y = np.transpose(planned(on, start, goal))
-            outline = [withStroke(linewidth=4, foreground="white")]
-            axes.plot(x, y, style, color=colour, linewidth=2.2, label=name, path_effects=outline)
-        axes.scatter(*np.transpose(world.stations), 40, color="black", zorder=4)
-        axes.set(xticks=[], yticks=[])
-        axes.set_title(title, loc="left", fontsize=11)
-    bar = figure.colorbar(image, ax=both, label="seconds over seconds at nominal speed", shrink=0.8)
-    bar.set_ticks([1, 2, 4, 8], labels=["1", "2", "4", "8"])
-    bar.minorticks_off()
-    figure.legend(*both[0].get_legend_handles_labels(), loc="outside lower center", ncols=3)
+    figure = draw_slowness(grid, world.stations, panels, (11, 5.6))
     return save_figure(figure, path, "True and learned slowness, and the routes")
 
 

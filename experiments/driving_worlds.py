@@ -12,8 +12,11 @@ from random_maps import generate_map
 
 from ddqn_planner.grid import Cell, GridMap, MoveRule
 from ddqn_planner.grid.moves import segment_lengths
+from ddqn_planner.planning import Planner
 
 Float64 = NDArray[np.float64]
+Routes = dict[str, Sequence[Cell]]
+RULE: Final = MoveRule.ROBOT_SAFE
 
 KINDS: Final = ("office", "rooms", "corridors")
 SIDE: Final = 96
@@ -37,22 +40,14 @@ RATE: Final = 10.0
 
 @dataclass
 class World:
-    """A map with the slowness that nobody tells the robot.
-
-    Parameters
-    ----------
-    grid : GridMap
-        What the robot knows.
-    always : (H, W) float64
-        Slowness of slow zones, of a slipping carpet, and of a door where one waits.
-    crowds : list of (H, W) float64
-        Slowness where crowds come and go by the hour; the first comes in the odd hours.
-    stations : list of (x, y)
-    """
+    """A map with the slowness that nobody tells the robot."""
 
     grid: GridMap
+    """What the robot knows."""
     always: Float64
+    """(H, W): of slow zones, of a slipping carpet, and of a door where one waits."""
     crowds: list[Float64]
+    """(H, W) each: where crowds come and go by the hour; the first comes in the odd hours."""
     stations: list[Cell]
 
     def slowness(self, seconds: float) -> Float64:
@@ -68,6 +63,26 @@ class World:
         """Return the map of one who knows."""
         slowness = self.slowness(seconds).astype(np.float32)
         return self.grid.with_slowness(slowness, self.grid.resolution / SPEED)
+
+    def routes(self, planner: Planner, start: Cell, goal: Cell, seconds: float) -> Routes:
+        """Return the routes of one who knows nothing, and of one who knows all."""
+        maps = {"shortest": self.grid, "best possible": self.known(seconds)}
+        return {
+            # A robot that stands a little off its cell may be on an obstacle.
+            name: planner.plan(grid, start, goal, RULE, start_clearing_radius=1).cells
+            for name, grid in maps.items()
+        }
+
+    def worst_pair(self, planner: Planner, seconds: float) -> tuple[Cell, Cell]:
+        """Return the two stations between which knowing saves most."""
+        truth = self.slowness(seconds)
+
+        def saved(ends: tuple[Cell, Cell]) -> float:
+            routes = self.routes(planner, *ends, seconds)
+            shortest, best = (path_seconds(cells, truth, self.grid) for cells in routes.values())
+            return shortest - best
+
+        return max(((a, b) for a in self.stations for b in self.stations if a < b), key=saved)
 
 
 def _discs(
@@ -96,7 +111,7 @@ def slow_zones(grid: GridMap, random: np.random.Generator) -> Float64:
 
 def make_world(grid: GridMap, random: np.random.Generator) -> World:
     """Draw what is slow on a map, and stations; all in its largest part that is connected."""
-    labels = grid.labels(MoveRule.ROBOT_SAFE)
+    labels = grid.labels(RULE)
     occupancy = labels != np.bincount(labels[labels > 0]).argmax()
     grid = GridMap(occupancy, grid.resolution, grid.origin)
     free = np.argwhere(~occupancy)
@@ -132,7 +147,7 @@ class Drive:
 def path_seconds(cells: Sequence[Cell], slowness: Float64, grid: GridMap) -> float:
     """Return how long a path takes, without noise."""
     x, y = np.asarray(cells).T
-    lengths = segment_lengths(np.diff(x), np.diff(y), MoveRule.ROBOT_SAFE)
+    lengths = segment_lengths(np.diff(x), np.diff(y), RULE)
     mean = (slowness[y[1:], x[1:]] + slowness[y[:-1], x[:-1]]) / 2
     return float((lengths * mean).sum() * grid.resolution / SPEED)
 
@@ -140,7 +155,7 @@ def path_seconds(cells: Sequence[Cell], slowness: Float64, grid: GridMap) -> flo
 def drive(cells: Sequence[Cell], world: World, clock: float, random: np.random.Generator) -> Drive:
     """Drive a path: each half of a move is as slow as its cell, with noise."""
     x, y = np.asarray(cells).T
-    lengths = segment_lengths(np.diff(x), np.diff(y), MoveRule.ROBOT_SAFE)
+    lengths = segment_lengths(np.diff(x), np.diff(y), RULE)
     metres = np.concatenate([[0], np.cumsum(lengths)]) * world.grid.resolution
     part = (metres / 0.25).astype(np.int64)
     noise = random.normal(0, NOISE, part[-1] + 1)[part]

@@ -4,23 +4,32 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import matplotlib
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 import numpy as np
+from matplotlib.colors import LogNorm
 from matplotlib.patheffects import withStroke
 from numpy.typing import NDArray
 
-from ddqn_planner.grid import Cell
+from ddqn_planner.grid import Cell, GridMap
 from ddqn_planner.pictures import draw_obstacles
-from ddqn_planner.training.environment import Scenario
+
+if TYPE_CHECKING:
+    from ddqn_planner.training.environment import Scenario
 
 COLOURS: Final = ("#0072B2", "#D55E00", "#009E73", "#CC79A7")
 """Of Okabe and Ito's palette, which colour-blind readers can tell apart."""
 STYLES: Final = ("-", "--", "-.", ":")
+ROUTE_STYLES: Final[dict[str, dict[str, str]]] = {
+    "shortest": {"color": "#555555", "linestyle": ":"},
+    "learned": {"color": COLOURS[0], "linestyle": "-"},
+    "best possible": {"color": COLOURS[3], "linestyle": "--"},
+}
+OUTLINE: Final = [withStroke(linewidth=4, foreground="white")]
 
 
 def save_figure(figure: Any, path: Path, caption: str) -> str:
@@ -48,6 +57,58 @@ def draw_curves(
     axes.grid(alpha=0.3)
 
 
+def draw_slowness(
+    grid: GridMap,
+    stations: Sequence[Cell],
+    panels: Mapping[str, tuple[NDArray[Any], Mapping[str, Sequence[Cell]]]],
+    size: tuple[float, float],
+) -> Any:
+    """Return a figure of slowness (H, W), with routes that `ROUTE_STYLES` names, by its title."""
+    figure, both = plt.subplots(1, len(panels), figsize=size, layout="constrained")
+    for axes, (title, (slowness, routes)) in zip(both, panels.items(), strict=True):
+        axes.set_facecolor("#e6e6e6")
+        values = np.where(grid.occupancy, np.nan, slowness)
+        image = axes.imshow(values, origin="lower", cmap="YlOrRd", norm=LogNorm(1, 8))
+        draw_obstacles(axes, grid)
+        for name, cells in routes.items():
+            line: dict[str, Any] = {"label": name, "path_effects": OUTLINE, **ROUTE_STYLES[name]}
+            axes.plot(*np.transpose(cells), linewidth=2.2, **line)
+        axes.scatter(*np.transpose(stations), 35, color="black", zorder=4)
+        axes.set(xticks=[], yticks=[])
+        axes.set_title(title, loc="left", fontsize=10)
+    bar = figure.colorbar(image, ax=both, label="seconds over seconds at nominal speed", shrink=0.8)
+    bar.set_ticks([1, 2, 4, 8], labels=["1", "2", "4", "8"])
+    bar.minorticks_off()
+    figure.legend(*both[0].get_legend_handles_labels(), loc="outside lower center", ncols=3)
+    return figure
+
+
+def draw_times(
+    seconds: Mapping[str, Sequence[NDArray[Any]]],
+    best: Sequence[NDArray[Any]],
+    width: int,
+    banded: str,
+) -> tuple[Any, Any]:
+    """Draw the time over the best possible from mission to mission, each mean of some missions.
+
+    Of each name it is the median of all worlds, and of one also a band. Return figure and axes.
+    """
+
+    def smoothed(values: NDArray[Any]) -> NDArray[Any]:
+        return np.convolve(values, np.ones(width), mode="valid")
+
+    curves: dict[str, Sequence[NDArray[Any]]] = {}
+    for name, of_worlds in seconds.items():
+        ratios = [smoothed(s) / smoothed(b) for s, b in zip(of_worlds, best, strict=True)]
+        curves[name] = ratios if name == banded else [np.median(ratios, axis=0)]
+    figure, axes = plt.subplots(figsize=(7.2, 3.6), layout="constrained")
+    missions = np.arange(len(curves[banded][0])) + width
+    draw_curves(axes, missions, curves, "mission", "time over the best possible")
+    axes.axhline(1, color="black", linewidth=0.8)
+    axes.legend(frameon=False)
+    return figure, axes
+
+
 def draw_map(axes: Any, scenario: Scenario, title: str) -> None:
     """Draw a map, its start and its goal."""
     draw_obstacles(axes, scenario.grid)
@@ -66,7 +127,7 @@ def draw_path(axes: Any, cells: Sequence[Cell], number: int, label: str) -> None
             STYLES[number],
             color=COLOURS[number],
             linewidth=2.2,
-            path_effects=[withStroke(linewidth=4, foreground="white")],
+            path_effects=OUTLINE,
             label=label,
             zorder=2 + number,
         )

@@ -36,7 +36,6 @@ from tables import table
 from tqdm import tqdm
 
 from ddqn_planner.cli import HelpFormatter, exit_code
-from ddqn_planner.files import write_atomically, write_csv
 from ddqn_planner.grid import (
     MOVES,
     Cell,
@@ -69,8 +68,6 @@ COLUMNS: Final = (
     "illegal",
     "field ms",
     "Dijkstra ms",
-    "field/Dijkstra",
-    "path ms",
 )
 
 
@@ -94,15 +91,6 @@ class Rollout:
     field_ms: float
     dijkstra_ms: float
     """See `compare_with_dijkstra`; requests with the same goal share both times."""
-    path_ms: float
-    """Time of the rollout in the field."""
-
-    @property
-    def length_group(self) -> str:
-        """The group of the optimum: 0-16, 16-32, 32-64 and so on, the upper end excluded."""
-        doublings = max(0, math.frexp(self.optimum / FIRST_GROUP_END)[1])
-        upper = FIRST_GROUP_END * 2**doublings
-        return f"{upper // 2 if doublings else 0}-{upper}"
 
 
 def measure(
@@ -124,9 +112,7 @@ def measure(
             )
             unmasked = field.unmasked()
             for _, start, given_optimum in of_goal:
-                began = time.perf_counter()
                 cells = field.rollout(start).cells
-                path_ms = 1e3 * (time.perf_counter() - began)
                 arrived = cells[:1] == (start,) and cells[-1:] == (goal,)
                 cost = path_cost(cells, grid.cost_multiplier, move_rule) if arrived else math.inf
                 optimum = float(optima[start[1], start[0]])
@@ -134,17 +120,16 @@ def measure(
                     given_optimum, optimum, rel_tol=AGREES, abs_tol=benchmark_map.precision
                 )
                 yield Rollout(
-                    set_name=benchmark_map.set_name,
-                    map_name=benchmark_map.name,
-                    size=f"{grid.width}x{grid.height}",
-                    optimum=optimum,
-                    agrees=None if math.isnan(given_optimum) else agrees,
-                    ratio=cost / optimum if start != goal else 1.0,
-                    unmasked=bool(unmasked.rollout(start).cells),
-                    illegal=illegal_moves(cells, legal),
-                    field_ms=field_ms,
-                    dijkstra_ms=dijkstra_ms,
-                    path_ms=path_ms,
+                    benchmark_map.set_name,
+                    benchmark_map.name,
+                    f"{grid.width}x{grid.height}",
+                    optimum,
+                    None if math.isnan(given_optimum) else agrees,
+                    cost / optimum if start != goal else 1.0,
+                    bool(unmasked.rollout(start).cells),
+                    illegal_moves(cells, legal),
+                    field_ms,
+                    dijkstra_ms,
                 )
 
 
@@ -175,12 +160,18 @@ def illegal_moves(cells: Sequence[Cell], legal: NDArray[np.bool_]) -> int:
 
 
 def summarise(rollouts: Sequence[Rollout]) -> list[list[str]]:
-    """Return rows of `GROUP` and `COLUMNS`: by set and size, then by optimum, and last of all."""
+    """Return rows of `GROUP` and `COLUMNS`: by set and size, then by optimum, and last of all.
+
+    The groups of the optimum are 0-16, 16-32, 32-64 and so on, the upper end excluded.
+    """
     groups: dict[tuple[str, str, str], list[Rollout]] = {}
     for rollout in rollouts:
         groups.setdefault((rollout.set_name, rollout.size, "all"), []).append(rollout)
     for rollout in sorted(rollouts, key=lambda rollout: rollout.optimum):
-        groups.setdefault(("all", "all", rollout.length_group), []).append(rollout)
+        doublings = max(0, math.frexp(rollout.optimum / FIRST_GROUP_END)[1])
+        upper = FIRST_GROUP_END * 2**doublings
+        group = f"{upper // 2 if doublings else 0}-{upper}"
+        groups.setdefault(("all", "all", group), []).append(rollout)
     groups["all", "all", "all"] = list(rollouts)
     return [[*group, *_row(members)] for group, members in groups.items()]
 
@@ -190,10 +181,6 @@ def _row(rollouts: Sequence[Rollout]) -> list[str]:
     requests = len(rollouts)
     ratios = np.array([rollout.ratio for rollout in rollouts])
     solved = ratios[np.isfinite(ratios)]
-    field, dijkstra, path = (
-        float(np.median([getattr(rollout, name) for rollout in rollouts]))
-        for name in ("field_ms", "dijkstra_ms", "path_ms")
-    )
     return [
         str(len({(rollout.set_name, rollout.size, rollout.map_name) for rollout in rollouts})),
         str(requests),
@@ -203,20 +190,17 @@ def _row(rollouts: Sequence[Rollout]) -> list[str]:
         f"{solved.mean() if len(solved) else math.nan:.4f}",
         f"{solved.max() if len(solved) else math.nan:.4f}",
         str(sum(rollout.illegal for rollout in rollouts)),
-        f"{field:.2f}",
-        f"{dijkstra:.2f}",
-        f"{field / dijkstra:.2f}",
-        f"{path:.3f}",
+        f"{np.median([rollout.field_ms for rollout in rollouts]):.2f}",
+        f"{np.median([rollout.dijkstra_ms for rollout in rollouts]):.2f}",
     ]
 
 
-def markdown(rollouts: Sequence[Rollout], description: str) -> str:
-    """Return the report: what was measured, a table by set and size, and one by optimum."""
+def markdown(rollouts: Sequence[Rollout]) -> str:
+    """Return the report: a table by set and size, and one by optimum."""
     rows = summarise(rollouts)
     sets = [[name, size, *cells] for name, size, optimum, *cells in rows if optimum == "all"]
     lengths = [[optimum, *cells] for _, _, optimum, *cells in rows if optimum != "all"]
     text = (
-        f"{description}\n\n"
         "Every request has a path. Without action masking: solved too by a rollout that may choose "
         "illegal moves, which end it. Optimal, mean, worst: cost of the rollout over that of the "
         "best path. Times are medians; Dijkstra's includes its graph.\n"
@@ -244,7 +228,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
     add("--requests", type=int, default=200, metavar="N", help="requests per map")
     add("--costs", choices=COSTS, default="none", help="costs of free cells")
     add("--seed", type=int, default=0, help="seed of maps and requests")
-    add("--out", type=Path, metavar="FILE", help="a .md or .csv file for the tables")
     options = parser.parse_args(arguments)
     return exit_code(parser.prog, lambda: run(options))
 
@@ -253,8 +236,6 @@ def run(options: argparse.Namespace) -> int:
     """Run the program with its options; return the exit code."""
     if options.maps < 1:
         raise ValueError(f"--maps is {options.maps}; give at least 1")
-    if options.out and options.out.suffix.lower() not in (".csv", ".md"):
-        raise ValueError(f"--out is {options.out}; give a file that ends in .csv or .md")
     rule = MoveRule(options.move_rule)
     settings = RequestSettings(rule, options.requests, options.costs, options.seed)
     planner = Planner.load(options.model)
@@ -271,16 +252,11 @@ def run(options: argparse.Namespace) -> int:
         print("interrupted; the tables hold the maps so far", file=sys.stderr)
     if rollouts:
         model = planner.metadata
-        text = markdown(
-            rollouts,
+        print(
             f"Model {options.model} ({model.network}, {model.steps:,} steps, seed {model.seed}), "
-            f"move rule {rule.value}, costs {options.costs}, requests of seed {options.seed}.",
+            f"move rule {rule.value}, costs {options.costs}, requests of seed {options.seed}.\n"
         )
-        print(text, end="")
-        if options.out and options.out.suffix.lower() == ".csv":
-            write_csv(options.out, [*GROUP, *COLUMNS], summarise(rollouts))
-        elif options.out:
-            write_atomically(options.out, text.encode())
+        print(markdown(rollouts), end="")
     elif not interrupted:
         raise ValueError(f"{options.data}: none of its files has a request; see above")
     return 130 if interrupted else 0

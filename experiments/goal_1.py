@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
-from functools import partial
 from typing import Any
 
 import matplotlib.pyplot as plt
@@ -13,12 +12,11 @@ import numpy as np
 from figures import draw_curves, draw_map, draw_path, save_figure
 from numpy.typing import NDArray
 from settings import PROFILES, VARIANTS, Settings, optimal_length
-from tables import median_and_range, table, write_table
+from tables import median_and_range, table
 from trainings import Evaluations, Training
 
-from ddqn_planner.grid import Cell, MoveRule, legal_moves, path_length
+from ddqn_planner.grid import Cell, MoveRule, path_length, shortest_path
 from ddqn_planner.planning import Planner
-from ddqn_planner.planning.search import search
 from ddqn_planner.training.environment import Scenario, paper_scenario
 
 TIMES = 50
@@ -28,12 +26,10 @@ BINS = 50
 """Intervals of the curves of the average reward."""
 
 CONVERGENCE = (
-    "seeds solved at the end (without action masking)",
+    "seeds solved (without action masking)",
     "steps until solved for good",
-    "episodes",
-    "seconds",
     "steps until shortest for good",
-    "final length",
+    "length",
 )
 
 
@@ -54,115 +50,77 @@ def ablation_trainings(settings: Settings) -> list[Training]:
 
 def convergence_row(runs: Sequence[Evaluations]) -> list[str]:
     """Return the cells of `CONVERGENCE` for the evaluations of each seed."""
-    optimum = optimal_length(paper_scenario())
-    reached = [first_kept(run["solved"] == 1) for run in runs]
-    shortest = [first_kept(run["length"] <= optimum + 1e-6) for run in runs]
-
-    def column(name: str, first: Sequence[int | None], digits: int = 0) -> str:
-        at = [np.inf if n is None else run[name][n] for run, n in zip(runs, first, strict=True)]
-        return median_and_range(at, digits)
-
-    ends = [run[-1] for run in runs]
+    optimum, ends = optimal_length(paper_scenario()), [run[-1] for run in runs]
     solved, unmasked = (sum(int(end[key]) for end in ends) for key in ("solved", "solved_unmasked"))
     return [
         f"{solved} ({unmasked}) of {len(ends)}",
-        column("step", reached),
-        column("episodes", reached),
-        column("seconds", reached, 1),
-        column("step", shortest),
+        median_and_range([at_first_kept(run, "step", run["solved"] == 1) for run in runs]),
+        median_and_range(
+            [at_first_kept(run, "step", run["length"] <= optimum + 1e-6) for run in runs]
+        ),
         median_and_range([end["length"] for end in ends if end["solved"]], 2),
     ]
 
 
-def first_kept(holds: NDArray[np.bool_]) -> int | None:
-    """Return the place from which on a condition holds to the end; None if there is none."""
+def at_first_kept(run: Evaluations, column: str, holds: NDArray[np.bool_]) -> float:
+    """Return a column where a condition begins to hold to the end; infinity if it does not."""
     first = int(np.flatnonzero(~holds)[-1]) + 1 if not holds.all() else 0
-    return first if first < len(holds) else None
+    return float(run[column][first]) if first < len(holds) else np.inf
 
 
 def report(settings: Settings) -> str:
-    """Write the tables and the figure of goal i, and return its Markdown."""
-    runs = {profile: settings.evaluations(f"{profile}/both") for profile in PROFILES}
-    convergence = [[profile, *convergence_row(runs[profile])] for profile in PROFILES]
-    speeds = [[profile, *_speeds(profile, runs[profile])] for profile in PROFILES]
-    scenario = paper_scenario()
-    paths, times = _paths_and_times(settings, scenario)
+    """Return the tables of goal i, and write its figure."""
+    scenario, rows, costs = paper_scenario(), [], []
+    paths: dict[str, Sequence[Cell]] = {}
+    for profile, parameters in PROFILES.items():
+        runs = settings.evaluations(f"{profile}/both")
+        rows.append([profile, *convergence_row(runs)])
+        planned = [timed_plan(p, scenario) for p in settings.planners(f"{profile}/both")]
+        seconds = [at_first_kept(run, "seconds", run["solved"] == 1) for run in runs]
+        ends = [run[-1] for run in runs]
+        replayed = [parameters.batch_size * end["updates"] / end["step"] for end in ends]
+        costs.append(
+            [
+                profile,
+                median_and_range(seconds, 1),
+                median_and_range([end["step"] / end["seconds"] for end in ends]),
+                median_and_range(replayed, 1),
+                median_and_range([milliseconds for _, milliseconds in planned], 2),
+            ]
+        )
+        by_length = sorted((cells for cells, _ in planned), key=lambda c: path_length(c) or np.inf)
+        paths[f"{profile}, median seed"] = by_length[len(planned) // 2]
+    for rule in (MoveRule.CORNER_CUTTING, MoveRule.ROBOT_SAFE):
+        shortest = shortest_path(scenario.grid, scenario.start, scenario.goal, rule)
+        paths[f"shortest, {rule.value}"] = shortest
     figure, panels = plt.subplots(1, len(paths), figsize=(15, 4.2), layout="constrained")
     for number, (axes, (planner, cells)) in enumerate(zip(panels, paths.items(), strict=True)):
         length = f"{path_length(cells):.2f} cells" if cells else "trapped"
         draw_map(axes, scenario, f"{planner}: {length}")
         draw_path(axes, cells, number, planner)
-    header = ["planner", "length, cells", "planning time, ms"]
+    of_costs = ("seconds until solved for good", "steps/s", "replay ratio", "planning time, ms")
     return "\n\n".join(
         [
-            write_table(settings.out / "goal_1.csv", ["profile", *CONVERGENCE], convergence),
-            table(["profile", "steps/s", "updates/s", "replay ratio"], speeds),
-            write_table(settings.out / "goal_1_planning.csv", header, times),
+            table(["profile", *CONVERGENCE], rows),
+            table(["profile", *of_costs], costs),
             save_figure(figure, settings.out / "goal_1.png", "Fig. 7: the paths of goal i"),
         ]
     )
 
 
-def _speeds(profile: str, runs: Sequence[Evaluations]) -> list[str]:
-    ends, batch = [run[-1] for run in runs], PROFILES[profile].batch_size
-    return [
-        median_and_range([end["step"] / end["seconds"] for end in ends]),
-        median_and_range([end["updates"] / end["seconds"] for end in ends]),
-        median_and_range([batch * end["updates"] / end["step"] for end in ends], 1),
-    ]
-
-
-def _paths_and_times(
-    settings: Settings, scenario: Scenario
-) -> tuple[dict[str, Sequence[Cell]], list[list[str]]]:
-    """Return the path of each planner, and a row of length and planning time for each."""
-    paths: dict[str, Sequence[Cell]] = {}
-    rows = []
-    for profile in PROFILES:
-        plans, seconds = zip(
-            *(timed_plan(planner, scenario) for planner in settings.planners(f"{profile}/both")),
-            strict=True,
-        )
-        lengths = [path_length(cells) if cells else np.inf for cells in plans]
-        paths[f"{profile}, median seed"] = plans[int(np.argsort(lengths)[len(lengths) // 2])]
-        length = median_and_range([n for n in lengths if np.isfinite(n)], 2)
-        rows.append([profile, length, median_and_range([1e3 * s for s in seconds], 2)])
-    for rule in (MoveRule.CORNER_CUTTING, MoveRule.ROBOT_SAFE):
-        cells, s = _timed(partial(a_star, scenario, rule))
-        paths[f"A*, {rule.value}"] = cells
-        rows.append([f"A*, {rule.value}", f"{path_length(cells):.2f}", f"{1e3 * s:.2f}"])
-    return paths, rows
-
-
 def timed_plan(planner: Planner, scenario: Scenario) -> tuple[Sequence[Cell], float]:
-    """Return a planner's path, and the median of its times with a new field, seconds."""
-    request = scenario.grid, scenario.start, scenario.goal
-    # A new planner has no Q field yet.
-    return _timed(lambda: Planner(planner.network, planner.metadata).plan(*request).cells)
-
-
-def _timed(plan: Callable[[], Sequence[Cell]]) -> tuple[Sequence[Cell], float]:
-    """Return a path, and the median of the times that it took, seconds."""
-    seconds = []
+    """Return a planner's path, and the median of its times with a new field, milliseconds."""
+    times = []
     for _ in range(TIMES):
         began = time.perf_counter()
-        cells = plan()
-        seconds.append(time.perf_counter() - began)
-    return cells, float(np.median(seconds))
-
-
-def a_star(scenario: Scenario, move_rule: MoveRule) -> Sequence[Cell]:
-    """Return a shortest path by A* with the octile distance to the goal as its heuristic."""
-    grid, (goal_x, goal_y) = scenario.grid, scenario.goal
-    y, x = np.indices(grid.occupancy.shape)
-    dx, dy = np.abs(x - goal_x), np.abs(y - goal_y)
-    octile = np.maximum(dx, dy) + (move_rule.lengths[1] - 1) * np.minimum(dx, dy)
-    value, legal = -octile.astype(np.float32), legal_moves(grid.occupancy, move_rule)
-    return search(scenario.start, scenario.goal, legal, grid.cost_multiplier, move_rule, value)
+        fresh = Planner(planner.network, planner.metadata)  # it has no Q field yet
+        cells = fresh.plan(scenario.grid, scenario.start, scenario.goal).cells
+        times.append(1e3 * (time.perf_counter() - began))
+    return cells, float(np.median(times))
 
 
 def ablation_report(settings: Settings) -> str:
-    """Write the table and the curves of the ablation, and return its Markdown."""
+    """Return the table of the ablation, and write its curves."""
     rows = []
     figure, panels = plt.subplots(2, len(PROFILES), figsize=(13, 7.5), layout="constrained")
     for (upper, lower), (profile, parameters) in zip(panels.T, PROFILES.items(), strict=True):
@@ -177,9 +135,8 @@ def ablation_report(settings: Settings) -> str:
     handles, labels = panels[0, 0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside lower center", ncols=len(VARIANTS))
     caption = "Fig. 6: average reward per step of an episode, and solved seeds"
-    header = ["profile", "variant", *CONVERGENCE]
-    table = write_table(settings.out / "ablation.csv", header, rows)
-    return f"{table}\n\n{save_figure(figure, settings.out / 'ablation.png', caption)}"
+    drawn = save_figure(figure, settings.out / "ablation.png", caption)
+    return f"{table(['profile', 'variant', *CONVERGENCE], rows)}\n\n{drawn}"
 
 
 def draw_shares(axes: Any, runs: dict[str, list[Evaluations]]) -> None:

@@ -14,7 +14,7 @@ from figures import draw_curves, draw_map, save_figure
 from matplotlib.colors import BoundaryNorm, ListedColormap
 from numpy.typing import NDArray
 from settings import PROFILES, START_DEAD_END, Settings
-from tables import mean_and_worst, median_and_range, write_table
+from tables import mean_and_worst, median_and_range, table
 from trainings import MOVE_RULE, Training
 
 from ddqn_planner.grid import MOVES, legal_moves
@@ -25,21 +25,15 @@ from ddqn_planner.training.networks import PropagationEncoder, PropagationModule
 
 COLUMNS = (
     "profile",
-    "starts",
-    "solved",
-    "solved without action masking",
+    "solved, of 286",
+    "without action masking",
     "of the dilemma's 10",
     "mean length / optimum",
     "worst",
 )
 
-TARGETS = {
-    "double_dqn": ("Double DQN", "paper/both"),
-    "dqn": ("DQN", "paper/target_dqn"),
-    "printed": ("printed", "paper/target_printed"),
-}
-"""Label and name of the trainings with each target; Double DQN's are those of goal i. The paper's
-equation, as it is printed, leaves θ⁻ out."""
+TARGETS = {"Double DQN": "double_dqn", "DQN": "dqn", "printed": "printed"}
+"""The paper's equation, as it is printed, leaves θ⁻ out."""
 
 TARGET_COLUMNS = (
     "target",
@@ -81,34 +75,29 @@ def trained_field(planner: Planner, scenario: Scenario) -> QField:
 
 
 def report(settings: Settings) -> str:
-    """Write the table and the figure of goal ii, and return its Markdown."""
-    scenario = paper_scenario()
-    planners = {profile: settings.planners(f"{profile}/both") for profile in PROFILES}
+    """Return the table of goal ii, and write its figure."""
+    scenario, starts = paper_scenario(), free_starts(paper_scenario())
     fields = {
-        profile: [planner.q_field(scenario.grid, scenario.goal) for planner in of_seeds]
-        for profile, of_seeds in planners.items()
+        profile: [
+            p.q_field(scenario.grid, scenario.goal) for p in settings.planners(f"{profile}/both")
+        ]
+        for profile in PROFILES
     }
     fields["propagation, Q as trained"] = [
-        trained_field(planner, scenario) for planner in planners["propagation"]
+        trained_field(planner, scenario) for planner in settings.planners("propagation/both")
     ]
-    ratios = {
-        label: [length_ratios(field, scenario.grid, MOVE_RULE) for field in of_seeds]
-        for label, of_seeds in fields.items()
-    }
-    starts = free_starts(scenario)
     x, y = np.transpose(sorted(START_DEAD_END - {scenario.start}))
-    rows = []
-    for label, of in ratios.items():
-        unmasked = [length_ratios(f.unmasked(), scenario.grid, MOVE_RULE) for f in fields[label]]
-        solved = (
-            count_solved(of, starts),
-            count_solved(unmasked, starts),
-            count_solved(of, (y, x)),
+    rows, ratios = [], {}
+    for label, of_seeds in fields.items():
+        masked, unmasked = (
+            [length_ratios(field, scenario.grid, MOVE_RULE) for field in some]
+            for some in (of_seeds, [field.unmasked() for field in of_seeds])
         )
-        lengths = mean_and_worst([ratio[starts & np.isfinite(ratio)] for ratio in of])
-        rows.append([label, int(starts.sum()), *solved, *lengths])
-    table = write_table(settings.out / "goal_2.csv", COLUMNS, rows)
-    return f"{table}\n\n{_draw(settings, scenario, ratios)}"
+        solved = count_solved(masked, starts), count_solved(unmasked, starts)
+        lengths = mean_and_worst([ratio[starts & np.isfinite(ratio)] for ratio in masked])
+        rows.append([label, *solved, count_solved(masked, (y, x)), *lengths])
+        ratios[label] = masked
+    return f"{table(COLUMNS, rows)}\n\n{_draw(settings, scenario, ratios)}"
 
 
 def _draw(
@@ -137,22 +126,30 @@ def _draw(
     return save_figure(figure, settings.out / "goal_2.png", "Fig. 8: starts by outcome")
 
 
+def _target_folder(label: str) -> str:
+    # Double DQN's trainings are those of goal i.
+    return "paper/both" if label == "Double DQN" else f"paper/target_{TARGETS[label]}"
+
+
 def target_trainings(settings: Settings) -> list[Training]:
     """Return the trainings of the profile paper with each target."""
     paper = PROFILES["paper"]
-    parameters_of = {name: replace(paper, target=target) for target, (_, name) in TARGETS.items()}
+    parameters_of = {
+        _target_folder(label): replace(paper, target=TARGETS[label]) for label in TARGETS
+    }
     return settings.trainings(parameters_of, [paper_scenario()])
 
 
 def target_report(settings: Settings) -> str:
-    """Write the table and the figure of the targets, and return its Markdown."""
+    """Return the table of the targets, and write their figure."""
     scenario = paper_scenario()
-    starts = free_starts(scenario)
-    rows, runs = [], {label: settings.evaluations(name) for label, name in TARGETS.values()}
-    for label, name in TARGETS.values():
-        fields = [p.q_field(scenario.grid, scenario.goal) for p in settings.planners(name)]
+    starts, rows = free_starts(scenario), []
+    runs = {label: settings.evaluations(_target_folder(label)) for label in TARGETS}
+    estimates = {label: [run["overestimation"] for run in of] for label, of in runs.items()}
+    for label, errors in estimates.items():
+        planners = settings.planners(_target_folder(label))
+        fields = [planner.q_field(scenario.grid, scenario.goal) for planner in planners]
         ratios = [length_ratios(field, scenario.grid, MOVE_RULE) for field in fields]
-        errors = [run["overestimation"] for run in runs[label]]
         late = [float(error[-max(len(error) // 10, 1) :].mean()) for error in errors]
         rows.append(
             [
@@ -163,13 +160,12 @@ def target_report(settings: Settings) -> str:
                 median_and_range([error.max() for error in errors], 2),
             ]
         )
-    table = write_table(settings.out / "targets.csv", TARGET_COLUMNS, rows)
     figure, (left, right) = plt.subplots(1, 2, figsize=(13, 4), layout="constrained")
-    estimates = {label: [run["overestimation"] for run in of] for label, of in runs.items()}
     steps = runs["Double DQN"][0]["step"]
     draw_curves(left, steps, estimates, "environment steps", "mean of max Q - V*")
     left.set_yscale("symlog")
     left.axhline(0, color="black", linewidth=0.8)
     figure.legend(loc="outside lower center", ncols=len(TARGETS))
     goal_1.draw_shares(right, runs)
-    return f"{table}\n\n{save_figure(figure, settings.out / 'targets.png', 'Over-estimation of Q')}"
+    drawn = save_figure(figure, settings.out / "targets.png", "Over-estimation of Q")
+    return f"{table(TARGET_COLUMNS, rows)}\n\n{drawn}"

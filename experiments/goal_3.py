@@ -8,14 +8,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any, Final, NamedTuple
+from typing import Any, Final
 
 import matplotlib.pyplot as plt
 import numpy as np
 from figures import draw_map, draw_path, save_figure
 from matplotlib.patches import Rectangle
 from settings import PROFILES, Settings, optimal_length
-from tables import mean_and_worst, median_and_range, write_table
+from tables import mean_and_worst, median_and_range, table
 from trainings import MOVE_RULE, Training, in_parallel, rollouts, solved, train_supervised
 
 from ddqn_planner.grid import Cell, Noise, legal_moves, scatter_obstacles, shortest_path
@@ -35,30 +35,19 @@ COLUMNS = (
     "new obstacles",
     "planner",
     "training maps solved",
-    "training, without action masking",
     "test maps solved",
-    "test, without action masking",
-    "mean length / optimum, test",
+    "without action masking",
+    "mean length / optimum",
     "worst",
-    "distinct paths, test",
-    "steps",
-    "seconds",
 )
 
 
-class NoisyMaps(NamedTuple):
-    """Different maps with new obstacles on or next to the path of goal i."""
-
-    training: list[Scenario]
-    test: list[Scenario]
-    rejected: int
-    """Draws rejected because they closed every path."""
-    repeated: int
-    """Draws rejected because they repeated a map."""
+NoisyMaps = tuple[list[Scenario], list[Scenario]]
+"""Training maps and test maps, all different."""
 
 
 def noisy_maps(training: int, test: int, noise: Noise, seed: int = NOISE_SEED) -> NoisyMaps:
-    """Draw different noisy maps around the shortest path of goal i.
+    """Draw different maps with new obstacles on or next to the shortest path of goal i.
 
     The training maps do not depend on the number of test maps.
     """
@@ -66,14 +55,11 @@ def noisy_maps(training: int, test: int, noise: Noise, seed: int = NOISE_SEED) -
     path = shortest_path(scenario.grid, scenario.start, scenario.goal, MOVE_RULE)
     random = np.random.default_rng(seed)
     scenarios: dict[str, Scenario] = {}
-    rejected = repeated = 0
     while len(scenarios) < training + test:
-        grid, closed = scatter_obstacles(scenario.grid, path, MOVE_RULE, random, noise)
-        rejected += closed
-        repeated += grid.fingerprint in scenarios
+        grid, _ = scatter_obstacles(scenario.grid, path, MOVE_RULE, random, noise)
         scenarios.setdefault(grid.fingerprint, replace(scenario, grid=grid))
     drawn = list(scenarios.values())
-    return NoisyMaps(drawn[:training], drawn[training:], rejected, repeated)
+    return drawn[:training], drawn[training:]
 
 
 def drawn_maps(settings: Settings, noise: Noise) -> NoisyMaps:
@@ -101,7 +87,7 @@ def trainings(settings: Settings) -> list[Training]:
         for noise in settings.noise
         for training in settings.trainings(
             {f"{noise.value}/{folder}": p for folder, p in networks(settings).values()},
-            drawn_maps(settings, noise).training,
+            drawn_maps(settings, noise)[0],
             EVALUATION_INTERVAL,
         )
     ]
@@ -119,7 +105,7 @@ def supervised_trainings(settings: Settings) -> list[Training]:
         for folder, parameters in networks(settings).values()
         if parameters.network == "paper"
     }
-    return settings.trainings(parameters_of, drawn_maps(settings, Noise.NEAR_PATH).training)
+    return settings.trainings(parameters_of, drawn_maps(settings, Noise.NEAR_PATH)[0])
 
 
 def fixed_path(maps: Sequence[Scenario]) -> tuple[Cell, ...]:
@@ -136,65 +122,46 @@ def fixed_path(maps: Sequence[Scenario]) -> tuple[Cell, ...]:
 
 
 def report(settings: Settings) -> str:
-    """Write the table and the figure of goal iii, and return its Markdown."""
+    """Return the table of goal iii, and write its figure."""
     in_parallel(train_supervised, supervised_trainings(settings), settings.backend)
-    rows, drawn = [], []
+    rows = []
     for noise in settings.noise:
-        maps = drawn_maps(settings, noise)
-        rows += [[noise.value, *row] for row in _rows(settings, maps, noise)]
-        drawn.append(
-            f"{noise.value}: {len(maps.training)} training and {len(maps.test)} test maps, all "
-            f"different; {maps.rejected} draws were rejected because they closed every path, "
-            f"{maps.repeated} because they repeated a map."
-        )
-    table = write_table(settings.out / "goal_3.csv", COLUMNS, rows)
-    return "\n\n".join([*drawn, table, _draw(settings)])
+        training, test = drawn_maps(settings, noise)
+        models = {}
+        for label, (folder, parameters) in networks(settings).items():
+            name = f"{noise.value}/{folder}"
+            models[label] = settings.planners(name, "kept.safetensors")
+            if parameters.network == "paper" and noise is Noise.NEAR_PATH:
+                models[f"{label}, supervised"] = settings.planners(f"{name}/supervised")
+        for label, planners in models.items():
+            plans = [rollouts(planner, [*training, *test]) for planner in planners]
+            rows.append([noise.value, label, *_columns(plans, test)])
+        fixed = _on_maps(fixed_path(training), [*training, *test])
+        rows.append([noise.value, "one fixed path", *_columns([(fixed, fixed)], test)])
+    return f"{table(COLUMNS, rows)}\n\n{_draw(settings)}"
 
 
-def _rows(settings: Settings, maps: NoisyMaps, noise: Noise) -> list[list[str]]:
-    rows, scenarios = [], [*maps.training, *maps.test]
-    for label, (folder, parameters) in networks(settings).items():
-        name = f"{noise.value}/{folder}"
-        models = [(label, name, "kept.safetensors")]
-        if parameters.network == "paper":
-            models.append((f"{label}, last network", name, "model.safetensors"))
-            if noise is Noise.NEAR_PATH:
-                models.append((f"{label}, supervised", f"{name}/supervised", "model.safetensors"))
-        for model, trained, file in models:
-            plans = [rollouts(planner, scenarios) for planner in settings.planners(trained, file)]
-            ends = [run[-1] for run in settings.evaluations(trained) if len(run)]
-            steps = median_and_range([end["step"] for end in ends])
-            seconds = median_and_range([end["seconds"] for end in ends], 1)
-            cost = [steps, seconds] if ends else ["-", "-"]
-            rows.append([model, *_columns(plans, maps), *cost])
-    path = fixed_path(maps.training)
-    on_maps = [_on_map(path, scenario) for scenario in scenarios]
-    return [*rows, ["one fixed path", *_columns([(on_maps, on_maps)], maps), "-", "-"]]
+def _on_maps(path: tuple[Cell, ...], scenarios: Sequence[Scenario]) -> list[Plan]:
+    """Return the path as a plan on each map: trapped if a cell of it is occupied."""
+    solved, trapped = Plan(PlanStatus.SUCCEEDED, np.array(path)), Plan(PlanStatus.ROLLOUT_TRAPPED)
+    return [solved if all(map(s.grid.is_free, path)) else trapped for s in scenarios]
 
 
-def _on_map(path: tuple[Cell, ...], scenario: Scenario) -> Plan:
-    """Return the path as a plan on a map: trapped if a cell of it is occupied."""
-    if all(map(scenario.grid.is_free, path)):
-        return Plan(PlanStatus.SUCCEEDED, np.array(path))
-    return Plan(PlanStatus.ROLLOUT_TRAPPED)
-
-
-def _columns(of_seeds: Sequence[tuple[list[Plan], list[Plan]]], maps: NoisyMaps) -> list[str]:
-    """Return the cells of the table: the plans of each seed on all maps, see `rollouts`."""
-    training, test = slice(len(maps.training)), slice(len(maps.training), None)
-    optimum = [optimal_length(scenario) for scenario in maps.test]
+def _columns(
+    of_seeds: Sequence[tuple[list[Plan], list[Plan]]], test: Sequence[Scenario]
+) -> list[str]:
+    """Return cells of the table for each seed's `rollouts`: the last are those on the test maps."""
+    optimum = [optimal_length(scenario) for scenario in test]
+    on_test = [(masked[-len(test) :], unmasked[-len(test) :]) for masked, unmasked in of_seeds]
     ratios = [
-        [p.length / least for p, least in zip(plans[test], optimum, strict=True) if p.cells]
-        for plans, _ in of_seeds
+        [plan.length / least for plan, least in zip(plans, optimum, strict=True) if plan.cells]
+        for plans, _ in on_test
     ]
     return [
-        *(
-            median_and_range([solved(plans[masking][part]) for plans in of_seeds])
-            for part in (training, test)
-            for masking in (0, 1)
-        ),
+        median_and_range([solved(masked[: -len(test)]) for masked, _ in of_seeds]),
+        median_and_range([solved(masked) for masked, _ in on_test]),
+        median_and_range([solved(unmasked) for _, unmasked in on_test]),
         *mean_and_worst(ratios),
-        median_and_range([len({p.cells for p in plans[test] if p.cells}) for plans, _ in of_seeds]),
     ]
 
 
@@ -210,7 +177,7 @@ def _draw(settings: Settings) -> str:
             label: settings.planners(f"{noise.value}/{folder}", "kept.safetensors")[0]
             for label, (folder, _) in networks(settings).items()
         }
-        for axes, scenario in zip(row, drawn_maps(settings, noise).test, strict=False):
+        for axes, scenario in zip(row, drawn_maps(settings, noise)[1], strict=False):
             draw_map(axes, scenario, noise.value)
             for y, x in np.argwhere(scenario.grid.occupancy & ~before):
                 cell = Rectangle((x - 0.5, y - 0.5), 1, 1, facecolor="#E69F00", edgecolor="black")

@@ -25,14 +25,13 @@ import numpy as np
 from client import (
     TIMEOUT,
     Client,
-    cells_of,
     initial_pose,
     map_message,
     plan_request,
     pose,
     wait_for,
 )
-from map_fixture import RULE, path_error
+from map_fixture import RULE
 from nav_msgs.msg import OccupancyGrid
 from nav_msgs.msg import Path as PathMessage
 from nav_msgs.srv import GetPlan
@@ -144,7 +143,7 @@ def run_command(*command: str) -> Usage:
 
 def measure_starts() -> list[bool]:
     """Print the medians of some starts beside their bounds."""
-    program, free = executable("ddqn-planner"), float("inf")
+    free, plan = float("inf"), (executable("ddqn-planner"), "plan", "dilemma")
     starts: dict[str, tuple[Callable[[], Usage], Usage]] = {
         "a bare rclpy node, discovered": (start_bare_node, (free, free, free)),
         "map_server_node to its first map": (start_map_server, (0.8, free, 90)),
@@ -153,11 +152,7 @@ def measure_starts() -> list[bool]:
             partial(run_command, sys.executable, "-c", "import ddqn_planner"),
             (free, 0.3, free),
         ),
-        "ddqn-planner plan dilemma": (
-            partial(run_command, program, "plan", "dilemma"),
-            (1.2, free, free),
-        ),
-        "ddqn-planner --help": (partial(run_command, program, "--help"), (0.3, free, free)),
+        "ddqn-planner plan dilemma": (partial(run_command, *plan), (1.2, free, free)),
     }
     missed = []
     for name, (start, bounds) in starts.items():
@@ -289,8 +284,7 @@ def measure_new_maps(client: Client) -> list[bool]:
 
 
 def measure_changing_map(client: Client) -> list[bool]:
-    """Measure the planner's share of a core, and check its plans, while a few cells change."""
-    plans = client.subscribe(PathMessage, "plan", LATCHED)
+    """Measure the planner's share of a core while a few cells of its map change."""
     grid, start, goal = office(CHANGING)
     local, random, maps = Planner.load("any_map"), np.random.default_rng(0), [grid]
     path = local.plan(grid, start, goal, RULE).cells
@@ -304,21 +298,12 @@ def measure_changing_map(client: Client) -> list[bool]:
         publish_request(client, grid, start, goal)
         for number, message in enumerate(messages):
             if number == 2 * RATE:  # the node is warm
-                plans.clear()
                 began, computed = time.monotonic(), cpu_seconds(planner.pid)
             client.publish("map", message, LATCHED)
             time.sleep(1 / RATE)
         seconds, computed = time.monotonic() - began, cpu_seconds(planner.pid) - computed
-    paths = [cells_of(grid, plan) for plan in plans.messages()]
-    wrong = sum(
-        all(path_error(changed.occupancy, cells, start, goal) for changed in maps)
-        for cells in paths
-    )
-    name = f"{CHANGING}x{CHANGING}: a few cells change, {RATE} Hz"
-    return [
-        report(f"{name}: share of a core", 100 * computed / seconds, "%", 10),
-        report(f"{name}: plans wrong, of {len(paths)}", wrong, "", 0),
-    ]
+    name = f"{CHANGING}x{CHANGING}: a few cells change, {RATE} Hz: share of a core"
+    return [report(name, 100 * computed / seconds, "%", 10)]
 
 
 def measure_trainer(client: Client) -> list[bool]:

@@ -10,19 +10,13 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from ddqn_planner.files import write_atomically, write_csv
+from ddqn_planner.files import write_atomically
 
 
 def table(header: Sequence[str], rows: Sequence[Sequence[object]]) -> str:
     """Return a Markdown table."""
     lines = [header, ["---"] * len(header), *rows]
     return "\n".join("| " + " | ".join(map(str, line)) + " |" for line in lines)
-
-
-def write_table(path: Path, header: Sequence[str], rows: Sequence[Sequence[object]]) -> str:
-    """Write a table as CSV, and return it as Markdown; see `write_csv` for errors."""
-    write_csv(path, header, rows)
-    return table(header, rows)
 
 
 def write_report(out: Path, sections: Mapping[str, str], page: Path | None = None) -> str:

@@ -4,5 +4,3 @@ It needs neither ROS nor torch.
 """
 
 from ddqn_planner.experience.experience import ExpectedTime, Experience, ExperienceFileError
-
-__all__ = ["ExpectedTime", "Experience", "ExperienceFileError"]

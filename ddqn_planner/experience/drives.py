@@ -204,7 +204,7 @@ class DriveRecorder:
             self._on_drive(outcome, samples[:, 0], samples[:, 1:])
 
 
-class DriveFolder:
+class DriveFolder(WorkFolder):
     """Records a robot's drives in a folder, and keeps there what they teach.
 
     The folder holds ``episodes.csv``, ``experience.npz``, and ``driving.lock``, which keeps other
@@ -215,12 +215,11 @@ class DriveFolder:
     """
 
     def __init__(self, folder: str | Path, nominal_speed: float, robot_width: float) -> None:
-        self.folder = Path(folder)
+        after = "the recording continues, and saving is tried again"
+        super().__init__(Path(folder), [LOCK], "drives", "records", after)
         self.record_path, self.experience_path = self.folder / RECORD, self.folder / EXPERIENCE
         self.experience = Experience(nominal_speed, robot_width)
-        after = "the recording continues, and saving is tried again"
-        self._work = WorkFolder(self.folder, [LOCK], "drives", "records", after)
-        with self._work.opening() as files:
+        with self.opening() as files:
             self.drives = _cut_incomplete_row(self.record_path)
             """The number of the last drive."""
             if self.experience_path.exists():
@@ -233,11 +232,6 @@ class DriveFolder:
             self._record = files.enter_context(closing(Appender(self.record_path)))
             if self.record_path.stat().st_size == 0:
                 self._record.append(HEADER)
-
-    @property
-    def save_error(self) -> str:
-        """Why the last save failed; empty if it did not."""
-        return self._work.save_error
 
     def add(
         self, outcome: DriveEnd, seconds: Float64, positions: Float64, grid: GridMap | None = None
@@ -264,13 +258,9 @@ class DriveFolder:
 
         If that fails, `save_error` says why, and the next call tries again with all that is left.
         """
-        with self._work.saving():
+        with self.saving():
             self._record.flush()
             self.experience.save(self.experience_path)
-
-    def close(self) -> None:
-        """Close the files and unlock the folder. `try_to_save` first."""
-        self._work.close()
 
 
 def _check_same(saved: Experience, now: Experience, folder: Path) -> None:

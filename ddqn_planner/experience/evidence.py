@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from ddqn_planner.compiled import compiled
 from ddqn_planner.grid import GridMap
 from ddqn_planner.grid.arguments import MAX_SLOWNESS
-from ddqn_planner.grid.grid_map import check_grid
+from ddqn_planner.grid.grid_map import check_grid, equal
 
 Float64 = NDArray[np.float64]
 
@@ -187,8 +187,12 @@ class Evidence:
         period = self.half_life / FADING_STEPS
         driven = math.floor(self.driven / period) * period
         spread, self.spread = self.spread, None  # an exception must not leave a part of it
-        is_old = spread and self.share_left(driven - spread.since) <= 1 / REBASE
-        if spread is None or is_old or not spread.fits(grid):
+        if (
+            spread is None
+            or self.share_left(driven - spread.since) <= 1 / REBASE
+            or (spread.grid.resolution, spread.grid.origin) != (grid.resolution, grid.origin)
+            or not equal(spread.grid.occupancy, grid.occupancy)
+        ):
             spread = Spread(grid, driven)
         spread.grid = grid
         spread.update(self, driven)
@@ -248,13 +252,6 @@ class Spread:
         self.touched = np.zeros(shape, dtype=np.bool_)
         self.table = np.zeros((0, len(COLUMNS)))
         """What was spread of `Evidence.table`."""
-
-    def fits(self, grid: GridMap) -> bool:
-        """Return whether a map has the same cells at the same places."""
-        old = self.grid
-        return (old.resolution, old.origin) == (grid.resolution, grid.origin) and (
-            old.occupancy is grid.occupancy or np.array_equal(old.occupancy, grid.occupancy)
-        )
 
     def update(self, evidence: Evidence, driven: float) -> None:
         """Spread what changed, less what was spread of the same places before."""

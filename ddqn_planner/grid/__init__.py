@@ -20,30 +20,3 @@ from ddqn_planner.grid.moves import (
     shortest_path,
 )
 from ddqn_planner.grid.noise import Noise, scatter_obstacles
-
-__all__ = [
-    "LENGTHS",
-    "MAX_COST_MULTIPLIER",
-    "MOVES",
-    "OCCUPIED",
-    "UNKNOWN",
-    "Cell",
-    "GridMap",
-    "MapFile",
-    "MapFileError",
-    "MoveRule",
-    "Noise",
-    "clearance",
-    "inflate",
-    "legal_moves",
-    "load_map",
-    "move_costs",
-    "neighbours",
-    "path_cost",
-    "path_length",
-    "read_map_file",
-    "save_map",
-    "scatter_obstacles",
-    "shortest_distances",
-    "shortest_path",
-]

@@ -239,11 +239,18 @@ class GridMap:
         return multiplier if self.slowness is None else multiplier * self.slowness
 
     def labels(self, move_rule: MoveRule | str) -> NDArray[np.int32]:
-        """Return the connected component of each cell, see `component_labels`; it is remembered."""
-        rule = MoveRule(move_rule)
-        if rule.cuts_corners not in self._labels:
-            self._labels[rule.cuts_corners] = component_labels(self.occupancy, rule)
-        return self._labels[rule.cuts_corners]
+        """Return the connected component of each free cell, 0 in occupied ones; it is remembered.
+
+        Two cells are in one component if a path joins them that may go against forbidden
+        directions. Components are numbered from 1, in the order of their first cells.
+        """
+        # If a diagonal move needs both side cells free, two straight moves can replace it.
+        reach = int(MoveRule(move_rule).cuts_corners)
+        if reach not in self._labels:
+            # One layout, and a fresh array: numba compiles again for others and read-only ones.
+            free = np.logical_not(self.occupancy, order="C")
+            self._labels[reach] = component_labels(free, reach)
+        return self._labels[reach]
 
     def legal_moves(self, move_rule: MoveRule | str) -> NDArray[np.bool_]:
         """Return which moves are legal in each cell, see `legal_moves`: (8, H, W) bool."""
@@ -260,10 +267,13 @@ class GridMap:
         if self.forbidden is None:
             labels = self.labels(move_rule)
             return np.isin(labels, labels[array[:, 1], array[:, 0]])
-        return flood(self.legal_moves(move_rule), array, backward)
+        reached = np.zeros(self.occupancy.shape, dtype=np.bool_)
+        reached[array[:, 1], array[:, 0]] = True
+        flood(self.legal_moves(move_rule), reached, np.flatnonzero(reached), backward)
+        return reached
 
     @cached_property
-    def _labels(self) -> dict[bool, NDArray[np.int32]]:
+    def _labels(self) -> dict[int, NDArray[np.int32]]:
         return {}
 
     @cached_property
@@ -289,7 +299,7 @@ class GridMap:
         names = "occupancy", "cost", "forbidden", "slowness"
         return self is other or (
             self._checksum == other._checksum
-            and all(_equal(getattr(self, name), getattr(other, name)) for name in names)
+            and all(equal(getattr(self, name), getattr(other, name)) for name in names)
         )
 
     def contains(self, cell: Cell) -> bool:
@@ -375,7 +385,8 @@ def _replaced(array: NDArray[Any] | None, box: tuple[slice, slice], values: NDAr
     return array
 
 
-def _equal(some: NDArray[Any] | None, others: NDArray[Any] | None) -> bool:
+def equal(some: NDArray[Any] | None, others: NDArray[Any] | None) -> bool:
+    """Return whether two layers are equal, soon where they are the same or very different."""
     if some is None or others is None or some is others:
         return some is others
     # A planner compares a map with each one that it knows; a look at some cells often suffices.

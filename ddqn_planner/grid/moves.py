@@ -162,25 +162,12 @@ def _dijkstra(grid: GridMap, goal: Cell, move_rule: MoveRule | str) -> Any:
     return dijkstra(graph, indices=y * grid.width + x, return_predecessors=True)
 
 
-def component_labels(occupancy: Occupancy, move_rule: MoveRule | str) -> NDArray[np.int32]:
-    """Return (H, W) int32: the connected component of each free cell, 0 in occupied cells.
-
-    Two cells are in one component if a path joins them that may go against forbidden directions.
-    Components are numbered from 1, in the order of their first cells.
-    """
-    # One layout, and a fresh array: numba compiles again for every other, and for read-only ones.
-    free = np.logical_not(occupancy, order="C")
-    # If a diagonal move needs both side cells free, two straight moves can replace it.
-    labels: NDArray[np.int32] = _labels(free, int(MoveRule(move_rule).cuts_corners))
-    return labels
-
-
 @compiled
-def _labels(free: Any, reach: int) -> Any:  # pragma: no cover
-    """Return (H, W) int32 labels, by union-find over the runs of free cells in each row.
+def component_labels(free: Any, reach: int) -> Any:  # pragma: no cover
+    """Return (H, W) int32 labels, see `GridMap.labels`, by union-find over runs of free cells.
 
-    Run r is from edges[2 * r] to before edges[2 * r + 1]. Two runs of neighbouring rows are
-    connected if they overlap when one of them is `reach` cells longer at both ends.
+    Run r of a row is from edges[2 * r] to before edges[2 * r + 1]. Two runs of neighbouring rows
+    are connected if they overlap when one of them is `reach` cells longer at both ends.
     """
     height, width = free.shape
     edges = np.empty(height * (width + 1) + 1, dtype=np.int32)
@@ -227,20 +214,12 @@ def _labels(free: Any, reach: int) -> Any:  # pragma: no cover
     return labels
 
 
-def flood(legal: NDArray[np.bool_], cells: NDArray[np.int64], backward: bool) -> NDArray[np.bool_]:
-    """Return (H, W) bool: the given cells (N, 2), and those to which legal moves lead from them.
-
-    Or with `backward`, those from which legal moves lead to them.
-    """
-    reached = np.zeros(legal.shape[1:], dtype=np.bool_)
-    reached[cells[:, 1], cells[:, 0]] = True
-    _flood(legal, reached, np.flatnonzero(reached), backward)
-    return reached
-
-
 @compiled
-def _flood(legal: Any, reached: Any, cells: Any, backward: bool) -> None:  # pragma: no cover
-    """Mark all cells that are reached from those that are marked."""
+def flood(legal: Any, reached: Any, cells: Any, backward: bool) -> None:  # pragma: no cover
+    """Mark all cells to which legal moves lead from marked ones, or backward, from which.
+
+    `cells` are the numbers y * W + x of those that are marked.
+    """
     height, width = reached.shape
     waiting = np.empty(height * width, dtype=np.int64)  # each cell waits at most once
     count = cells.size

@@ -21,7 +21,7 @@ MARKS = LOCK, CHECKPOINT = "training.lock", "checkpoint.safetensors"
 """A folder with one of these files belongs to a training."""
 
 
-class TrainingRun:
+class TrainingRun(WorkFolder):
     """Trains into a folder, or continues there when the folder holds a checkpoint.
 
     The run writes ``model.safetensors``, ``checkpoint.safetensors``, ``episodes.csv``, and
@@ -42,13 +42,12 @@ class TrainingRun:
         parameters: HyperParameters,
         seed: int,
     ) -> None:
-        self.folder = Path(folder)
+        after = f"the training continues and tries again every {SAVE_INTERVAL} steps"
+        super().__init__(Path(folder), MARKS, "training", "trains", after)
         self.model_path = self.folder / "model.safetensors"
         self.checkpoint_path = self.folder / CHECKPOINT
         self.curves_path = self.folder / "episodes.csv"
-        after = f"the training continues and tries again every {SAVE_INTERVAL} steps"
-        self._work = WorkFolder(self.folder, MARKS, "training", "trains", after)
-        with self._work.opening() as files:
+        with self.opening() as files:
             with _memory_with_remedy():
                 if self.checkpoint_path.exists():
                     self.trainer = Trainer.load_checkpoint(self.checkpoint_path, scenarios)
@@ -62,11 +61,6 @@ class TrainingRun:
         self.description = (
             f"training in {self.folder} from step {self.trainer.steps} to {parameters.steps}"
         )
-
-    @property
-    def save_error(self) -> str:
-        """Why the last save failed; empty if it did not."""
-        return self._work.save_error
 
     def steps(self) -> Iterator[list[Episode]]:
         """Train until ``parameters.steps``; save every `SAVE_INTERVAL` steps and at the end.
@@ -88,16 +82,12 @@ class TrainingRun:
     def try_to_save(self) -> None:
         """Write the model, the checkpoint and the episodes; if that fails, old files stay."""
         self.saved_at = self.trainer.steps
-        with self._work.saving():
+        with self.saving():
             # A kill between the two leaves a model that is newer than the checkpoint. Both are
             # complete, and nothing needs them to be of the same step.
             self.trainer.save_model(self.model_path)
             self.trainer.save_checkpoint(self.checkpoint_path)
             self._record.flush()
-
-    def close(self) -> None:
-        """Close the files and unlock the folder. `try_to_save` first."""
-        self._work.close()
 
 
 @contextmanager

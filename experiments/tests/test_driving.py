@@ -91,9 +91,8 @@ def test_the_experiment_writes_its_report(
     command = ["--backend", "sequential", "--quick", "--seeds", "1", "--out", str(tmp_path)]
     assert main(command) == 0
     assert "| learned | 1." in capsys.readouterr().out
-    tables = [f"{name}.csv" for name in ("stages", "worlds", "forecasts", "faults", "times")]
     written = {path.name for path in (tmp_path / "quick").iterdir()}
-    assert written == {"report.md", *tables, "curve.png", "map.png"}
+    assert written == {"report.md", "curve.png", "map.png"}
 
 
 def test_wrong_options_are_refused(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:

@@ -13,9 +13,8 @@ from PIL import Image
 from processes import claim_ros_domain, running_node
 
 pytest.importorskip("rclpy")
-from bursts import load_bursts
 from client import Client
-from load import load_goals, load_requests
+from load import load_bursts, load_goals, load_requests
 from soak import Work, growth, soak
 
 ROOT = Path(__file__).resolve().parents[2]

@@ -12,16 +12,13 @@ from pathlib import Path
 import any_map
 import numpy as np
 import pytest
-from goal_1 import a_star, convergence_row, first_kept
+from goal_1 import convergence_row
 from goal_2 import free_starts, trained_field
 from goal_3 import fixed_path, noisy_maps
-from hypothesis import given
-from hypothesis import strategies as st
 from networks import random_network
 from PIL import Image
 from reproduce import EXPERIMENTS, main
-from strategies import grids_with_free_cell
-from tables import mean_and_worst, median_and_range, write_report, write_table
+from tables import mean_and_worst, median_and_range, table, write_report
 from trainings import (
     MOVE_RULE,
     Training,
@@ -37,9 +34,6 @@ from trainings import (
 
 from ddqn_planner.grid import (
     MOVES,
-    Cell,
-    GridMap,
-    MoveRule,
     Noise,
     path_length,
     shortest_distances,
@@ -80,7 +74,7 @@ def test_every_experiment_writes_its_report_and_trains_what_is_new(
     assert "near_path" not in report
     before, _, results = page.read_text().partition("<!-- Goal ii: from every free cell -->\n")
     assert (before, results[-20:]) == ("before\n", "\n<!-- end -->\nafter\n")
-    assert "| propagation | 286 |" in results
+    assert "| propagation | " in results
     assert "](images/page/goal_2.png)" in results
     assert (tmp_path / "images" / "page" / "goal_2.png").exists()
     trained = {path: path.stat().st_mtime_ns for path in tmp_path.rglob("evaluations.csv")}
@@ -202,44 +196,25 @@ def test_cross_entropy_is_that_of_all_best_moves_together() -> None:
     assert float(cross_entropy(q, best)) == pytest.approx(expected)
 
 
-@given(grids_with_free_cell(), st.sampled_from(list(MoveRule)), st.data())
-def test_a_star_is_exact_under_every_rule(
-    grid_and_goal: tuple[GridMap, Cell], rule: MoveRule, data: st.DataObject
-) -> None:
-    grid, goal = grid_and_goal
-    start = data.draw(st.sampled_from(grid.free_cells()))
-    cells = a_star(Scenario(grid, start, goal), rule) if start != goal else ()
-    optimum = shortest_distances(grid, goal, rule)[start[1], start[0]]
-    assert bool(cells) == (np.isfinite(optimum) and start != goal)
-    if cells:
-        assert path_length(cells, rule) == pytest.approx(optimum)
+def evaluations(length: list[float]) -> np.ndarray:
+    """One evaluation per 100 steps, solved where it has a length."""
+    rows = [(100 * n, float(np.isfinite(c)), 0.0, c) for n, c in enumerate(length)]
+    names = ("step", "solved", "solved_unmasked", "length")
+    return np.array(rows, [(name, np.float64) for name in names])
 
 
-def test_a_row_tells_from_when_on_a_path_is_found_and_is_the_shortest(tmp_path: Path) -> None:
+def test_a_row_tells_from_when_on_a_path_is_found_and_is_the_shortest() -> None:
     shortest, longer = 22.970562748, 24.142135624
-    header = ("step", "episodes", "seconds", "solved", "solved_unmasked", "length")
-    write_table(
-        tmp_path / "evaluations.csv",
-        header,
-        [
-            (100 * n, 2 * n, 0.5 * n, int(n > 0), 0, length)
-            for n, length in enumerate([np.nan, longer, shortest, longer, shortest])
-        ],
-    )
-    run = read_evaluations(tmp_path)
-    assert convergence_row([run]) == ["1 (0) of 1", "100", "2", "0.5", "400", "22.97"]
-    both = convergence_row([run, run[:1]])
-    assert (both[0], both[-1]) == ("1 (0) of 2", "22.97")
-    assert "never" in both[1]
-
-
-@pytest.mark.parametrize(
-    ("holds", "first"), [((0, 1, 0, 1, 1), 3), ((1, 1), 0), ((1, 0), None), ((), None)]
-)
-def test_what_is_solved_for_good_is_solved_to_the_end(
-    holds: tuple[int, ...], first: int | None
-) -> None:
-    assert first_kept(np.array(holds, dtype=np.bool_)) == first
+    run = evaluations([np.nan, longer, shortest, np.nan, longer, shortest])
+    assert convergence_row([run]) == ["1 (0) of 1", "400", "500", "22.97"]
+    assert convergence_row([run, run[:4]]) == [
+        "1 (0) of 2",
+        "never (400 to never)",
+        "never (500 to never)",
+        "22.97",
+    ]
+    always = evaluations([shortest])
+    assert convergence_row([always]) == ["1 (0) of 1", "0", "0", "22.97"]
 
 
 @pytest.mark.parametrize(("possible", "wrong"), [(True, False), (False, True)])
@@ -278,13 +253,13 @@ def test_the_q_that_the_loss_trains_adds_up_the_papers_rewards(paper: Scenario) 
 def test_noisy_maps_differ_and_more_test_maps_leave_the_training_maps(
     paper: Scenario, noise: Noise
 ) -> None:
-    maps, more = noisy_maps(30, 30, noise), noisy_maps(30, 31, noise)
-    assert (len(maps.training), len(maps.test)) == (30, 30)
-    scenarios = [*maps.training, *maps.test]
+    training, test = noisy_maps(30, 30, noise)
+    assert (len(training), len(test)) == (30, 30)
+    scenarios = [*training, *test]
     assert len({scenario.grid.fingerprint for scenario in scenarios}) == 60
-    for scenario, same in zip(maps.training, more.training, strict=True):
+    for scenario, same in zip(training, noisy_maps(30, 31, noise)[0], strict=True):
         assert scenario.grid.fingerprint == same.grid.fingerprint
-    path = fixed_path(maps.training)
+    path = fixed_path(training)
     assert (path[0], path[-1]) == (paper.start, paper.goal)
     assert path_length(path) > path_length(
         shortest_path(paper.grid, paper.start, paper.goal, MOVE_RULE)
@@ -304,10 +279,9 @@ def test_statistics_say_never_for_infinity_and_leave_nan_out() -> None:
     assert mean_and_worst([[]]) == ["none", "none"]
 
 
-def test_a_table_is_markdown_and_csv_and_a_page_without_marks_stays(tmp_path: Path) -> None:
+def test_a_table_is_markdown_and_a_page_without_marks_stays(tmp_path: Path) -> None:
     expected = "| a | b |\n| --- | --- |\n| 1 | x |"
-    assert write_table(tmp_path / "table.csv", ["a", "b"], [[1, "x"]]) == expected
-    assert (tmp_path / "table.csv").read_text() == "a,b\n1,x\n"
+    assert table(["a", "b"], [[1, "x"]]) == expected
     page = tmp_path / "page.md"
     page.write_text("nothing")
     assert write_report(tmp_path, {"Title": expected}, page) == f"## Title\n\n{expected}\n"

@@ -160,6 +160,30 @@ def run_node(tmp_path_factory: pytest.TempPathFactory) -> RunNode:
     return run
 
 
+SOON = """
+import rclpy.node
+from ddqn_planner.nodes import driving
+
+driving.RETRY_PERIOD, create_timer = 0.2, rclpy.node.Node.create_timer
+
+def create_fast_timer(node, period, *arguments, **options):
+    return create_timer(node, min(period, 0.1), *arguments, **options)
+
+rclpy.node.Node.create_timer = create_fast_timer
+"""
+"""What a trainer runs first (as its ``sitecustomize``): the tests wait for many diagnostics."""
+
+
+@pytest.fixture(scope="module")
+def fast_timers(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+    """Let the nodes of the module look and speak ten times a second."""
+    folder = tmp_path_factory.mktemp("soon")
+    (folder / "sitecustomize.py").write_text(SOON)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("PYTHONPATH", str(folder), prepend=os.pathsep)
+        yield
+
+
 @pytest.fixture(scope="module")
 def make_client() -> Iterator[Callable[[str], Any]]:
     """Return a function that makes a client in a namespace; all end with the test module."""
@@ -191,7 +215,7 @@ def small_values() -> np.ndarray:
     return np.array(rows, dtype=np.int8)
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def model(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Return a copy of a model that tests may overwrite, if they put it back."""
     path = tmp_path_factory.mktemp("planner") / "model.safetensors"
@@ -199,8 +223,9 @@ def model(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def planner(run_node: RunNode, model: Path) -> Iterator[Any]:
+    """A planner that test files share: `Robot.reset` gives it its parameters back."""
     parameters = {"model": str(model), "follow_trainer": True}
     with run_node("planner_node", parameters, namespace="/robot") as node:
         yield node
@@ -217,6 +242,15 @@ def running_robot(
 
 @pytest.fixture
 def robot(running_robot: Any) -> Any:
-    """Give the planner a map, a start and a goal, whatever the test before left."""
+    """Give the planner its parameters, a map, a start and a goal, whatever was before."""
+    running_robot.reset()
     running_robot.begin()
     return running_robot
+
+
+@pytest.fixture(scope="module")
+def hall() -> np.ndarray:
+    """(15, 20) int8: a hall with a wall across, open at its upper end."""
+    values = np.zeros((15, 20), dtype=np.int8)
+    values[:9, 10] = 100
+    return values

@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from builtin_interfaces.msg import Time
 from client import TIMEOUT as TIMEOUT  # this and values_of are used by the tests of the planner
 from client import Client, initial_pose, map_message, pose, wait_for_map
 from client import values_of as values_of
@@ -19,17 +20,21 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import PoseStamped, Quaternion
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState, GetState
-from nav_msgs.msg import OccupancyGrid, Path
+from nav_msgs.msg import OccupancyGrid, Odometry, Path
 from networks import turning_network
+from rcl_interfaces.srv import GetParameters
+from rclpy.parameter import parameter_value_to_python
 from rclpy.qos import DurabilityPolicy, QoSProfile
+from std_msgs.msg import Header
 
 from ddqn_planner.grid import Cell, GridMap, MoveRule, legal_moves
 from ddqn_planner.model import ModelMetadata, save_model
+from ddqn_planner.nodes.parameters import PLANNER_PARAMETERS
 from ddqn_planner.nodes.report import seconds
 from ddqn_planner.nodes.runtime import LATCHED
 
 START, GOAL = (0, 0), (5, 5)
-RESOLUTION, ORIGIN = 0.5, (-1.0, 2.0, 0.0)
+RESOLUTION, ORIGIN = 0.5, (-1.0, 2.0, 0.5)
 GOAL_YAW = 1.2
 
 NUMBERS = itertools.count(1)
@@ -53,6 +58,33 @@ class Robot:
         self.value = client.subscribe(OccupancyGrid, "planner/value", ALL)
         self.diagnostics = client.subscribe(DiagnosticArray, "/diagnostics")
         self.grid = self.grid_of(values)
+
+    def set(self, **values: Any) -> None:
+        """Set parameters, which the planner must take."""
+        results = self.client.set_parameters("planner", **values)
+        assert all(result.successful for result in results), results
+
+    def change(self, **values: Any) -> None:
+        """Set parameters, and wait until the active goal has its new plan."""
+        self.plans.clear()
+        self.set(**values)
+        self.plans.wait()
+
+    def refuse(self, **values: Any) -> str:
+        """Set a parameter, which the planner must refuse; return its reason."""
+        (result,) = self.client.set_parameters("planner", **values)
+        assert not result.successful
+        return str(result.reason)
+
+    def reset(self, **values: Any) -> None:
+        """Set what has not its default, or these values."""
+        declared = {name: it for name, it in PLANNER_PARAMETERS.items() if not it.read_only}
+        wanted = {name: it.default for name, it in declared.items()}
+        wanted |= {"model": str(self.model), **values}
+        request = GetParameters.Request(names=[*wanted])
+        found = self.client.call(GetParameters, "planner/get_parameters", request).values
+        are = dict(zip(wanted, map(parameter_value_to_python, found), strict=True))
+        self.set(**{name: value for name, value in wanted.items() if are[name] != value})
 
     @staticmethod
     def grid_of(values: np.ndarray, origin: tuple[float, float, float] = ORIGIN) -> GridMap:
@@ -166,6 +198,13 @@ class Manager:
 
 def points_of(path: Path) -> list[tuple[float, float]]:
     return [(pose.pose.position.x, pose.pose.position.y) for pose in path.poses]
+
+
+def odometry(robot: Robot, cell: Cell, frame: str = "map") -> Odometry:
+    message = Odometry(header=Header(frame_id=frame, stamp=Time(sec=next(NUMBERS))))
+    message.child_frame_id = "base_link"
+    message.pose.pose = robot.pose(cell).pose
+    return message
 
 
 def length_of(path: Path) -> float:

@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path as FilePath
 from typing import Any
 
 import numpy as np
 import pytest
-from builtin_interfaces.msg import Time
 from client import cell_of, cells_of, map_message
 from geometry_msgs.msg import PoseArray
-from integration.robot import NUMBERS, Robot, check_path
+from integration.robot import NUMBERS, Robot, check_path, odometry
 from nav_msgs.msg import OccupancyGrid, Odometry, Path
 from std_msgs.msg import Header
 
@@ -25,39 +24,24 @@ NEVER, SOON = 3600.0, 0.05
 
 
 @pytest.fixture(scope="module")
-def hall() -> np.ndarray:
-    """(11, 30) int8: a hall with two ways round a block; the lower one costs a little more."""
+def hall_robot(planner: Any, make_client: Callable[[str], Any], model: FilePath) -> Robot:
+    """A hall with two ways round a block; the lower one costs a little more."""
     values = np.zeros((11, 30), dtype=np.int8)
     values[3:8, 4:26] = 100
     values[:3, 10:20] = 2
-    return values
-
-
-@pytest.fixture(scope="module")
-def hall_robot(
-    run_node: Any, make_client: Callable[[str], Any], hall: np.ndarray, model: FilePath
-) -> Iterator[Robot]:
-    with run_node("planner_node", {"use_map_costs": True}, namespace="/followed"):
-        yield Robot(make_client("/followed"), hall, model, "/followed/planner")
+    return Robot(make_client("/robot"), values, model)
 
 
 @pytest.fixture
 def robot(hall_robot: Robot) -> Robot:
-    before = {"replan_period": 1.0, "switch_threshold": 0.05, "start_source": "initialpose"}
-    set_parameters(hall_robot, **before)
+    hall_robot.reset(use_map_costs=True, replan_period=SOON)
     hall_robot.begin(START, GOAL)
     return hall_robot
 
 
-def set_parameters(robot: Robot, **values: Any) -> None:
-    assert all(r.successful for r in robot.client.set_parameters("planner", **values))
-
-
 def set_and_settle(robot: Robot, **values: Any) -> None:
     """Set parameters, and wait until their plans are out; then forget those."""
-    robot.plans.clear()
-    set_parameters(robot, **values)
-    robot.plans.wait()
+    robot.change(**values)
     robot.get_plan(robot.pose(START), robot.pose(START))  # what came before it is done
     robot.clear()
 
@@ -89,12 +73,19 @@ UPPER, LOWER = (slice(8, 11), 15), (slice(0, 3), 15)
 
 
 @pytest.mark.parametrize("period", [SOON, 0.0])
-def test_the_plan_stays_quiet_while_the_map_changes_elsewhere(robot: Robot, period: float) -> None:
+def test_the_plan_stays_quiet_while_the_map_changes_elsewhere_or_grows(
+    robot: Robot, period: float
+) -> None:
     set_and_settle(robot, replan_period=period)
     plan_on(robot, robot.stamped_map())
     first = last_plan(robot)
-    for x in range(10, 20):
+    for x in (10, 13, 16):
         plan_on(robot, with_values(robot, (1, x), 100))
+    values = np.pad(robot.values, ((4, 0), (6, 2)), constant_values=100)
+    shift = np.subtract(robot.grid.cell_to_world((-6, -4)), robot.grid.cell_to_world((0, 0)))
+    x, y, yaw = robot.grid.origin
+    grid = robot.grid_of(values, (x + shift[0], y + shift[1], yaw))
+    plan_on(robot, map_message(values, grid, next(NUMBERS)))
     assert last_plan(robot).header.stamp == first.header.stamp
 
 
@@ -118,6 +109,12 @@ def test_a_shortcut_that_opens_is_taken(robot: Robot) -> None:
     robot.clear()
     robot.send_map(with_values(robot, (5, slice(None)), 0))
     robot.plans.wait(lambda plan: len(plan.poses) == 30)
+    # A map far away has nothing of the path.
+    robot.clear()
+    far = robot.grid_of(robot.values, (1e12, 0.0, 0.0))
+    robot.send_map(map_message(robot.values, far, next(NUMBERS)))
+    robot.wait_for_reason("the start lies outside the map")
+    assert robot.plans.wait().poses == []
 
 
 def test_a_path_is_planned_at_once_where_there_was_none(robot: Robot) -> None:
@@ -131,26 +128,7 @@ def test_a_path_is_planned_at_once_where_there_was_none(robot: Robot) -> None:
     robot.wait_for_path(START, GOAL)
 
 
-def test_a_map_that_grows_by_whole_cells_keeps_the_plan_quiet(robot: Robot) -> None:
-    set_and_settle(robot, replan_period=SOON)
-    plan_on(robot, robot.stamped_map())
-    first = last_plan(robot)
-    values = np.pad(robot.values, ((4, 0), (6, 2)), constant_values=100)
-    x, y, yaw = robot.grid.origin
-    origin = (x - 6 * robot.grid.resolution, y - 4 * robot.grid.resolution, yaw)
-    plan_on(robot, map_message(values, robot.grid_of(values, origin), next(NUMBERS)))
-    assert last_plan(robot).header.stamp == first.header.stamp
-
-
-def test_a_map_far_away_has_nothing_of_the_path(robot: Robot) -> None:
-    far = robot.grid_of(robot.values, (1e12, 0.0, 0.0))
-    robot.send_map(map_message(robot.values, far, next(NUMBERS)))
-    robot.wait_for_reason("the start lies outside the map")
-    assert robot.plans.wait().poses == []
-
-
 def test_the_path_under_way_is_kept_up_to_the_threshold(robot: Robot) -> None:
-    set_and_settle(robot, replan_period=SOON)
     plan_on(robot, robot.stamped_map())
     first = last_plan(robot)
     other_way_round = robot.values.copy()
@@ -160,7 +138,7 @@ def test_the_path_under_way_is_kept_up_to_the_threshold(robot: Robot) -> None:
     best = robot.get_plan(robot.pose(START), robot.pose(GOAL))
     assert min(y for _, y in cells_of(robot.grid, best)) < 3
     robot.clear()
-    set_parameters(robot, switch_threshold=0.0)
+    robot.set(switch_threshold=0.0)
     robot.plans.wait(lambda plan: min(y for _, y in cells_of(robot.grid, plan)) < 3)
     robot.clear()
     robot.send_map(robot.stamped_map())
@@ -172,22 +150,15 @@ def test_what_a_user_sets_is_always_answered_by_a_plan(robot: Robot) -> None:
     for act in (
         lambda: robot.send_start(robot.pose(START)),
         lambda: robot.send_goal(robot.pose(GOAL)),
-        lambda: set_parameters(robot, tolerance=0.0),
+        lambda: robot.set(tolerance=0.0),
     ):
         act()
         robot.wait_for_path(START, GOAL)
         robot.clear()
 
 
-def odometry(robot: Robot, cell: Cell) -> Odometry:
-    message = Odometry(header=Header(frame_id="map", stamp=Time(sec=next(NUMBERS))))
-    message.pose.pose = robot.pose(cell).pose
-    return message
-
-
 def test_the_path_of_a_moving_robot_is_published_only_where_it_leaves_it(robot: Robot) -> None:
-    values = {"replan_period": SOON, "transform_tolerance": 1000.0}
-    set_parameters(robot, start_source="odometry", **values)
+    robot.set(start_source="odometry", transform_tolerance=1000.0)
     robot.client.publisher(Odometry, "odom")
     robot.client.wait_for_discovery("planner")
     robot.client.publish("odom", odometry(robot, START))
@@ -212,16 +183,19 @@ OUTSIDE, WALL = (99, 5), (15, 10)
 YAWS = {LEFT: 1.0, RIGHT: -2.0, OUTSIDE: 0.1, WALL: 0.2}
 
 
-@pytest.fixture
-def docks(hall_robot: Robot, make_client: Callable[[str], Any]) -> Robot:
-    """A planner in an empty hall, of which the top row is a wall."""
+@pytest.fixture(scope="module")
+def dock_robot(hall_robot: Robot) -> Robot:
+    """An empty hall, of which the top row is a wall."""
     values = np.zeros((11, 31), dtype=np.int8)
     values[10] = 100
-    robot = Robot(make_client("/followed"), values, hall_robot.model, hall_robot.name)
-    before = {"replan_period": SOON, "switch_threshold": 0.05, "start_source": "initialpose"}
-    set_parameters(robot, **before)
-    robot.begin(DOCKED, RIGHT)
-    return robot
+    return Robot(hall_robot.client, values, hall_robot.model)
+
+
+@pytest.fixture
+def docks(dock_robot: Robot) -> Robot:
+    dock_robot.reset(replan_period=SOON)
+    dock_robot.begin(DOCKED, RIGHT)
+    return dock_robot
 
 
 def send_goals(docks: Robot, *cells: Cell, frame: str = "map") -> None:
@@ -247,23 +221,16 @@ def test_the_path_leads_to_the_nearest_free_dock_of_the_map_of_now(docks: Robot)
     wait_for_dock(docks, LEFT, "to goal 2 of 4")
 
 
-@pytest.mark.parametrize(
-    ("threshold", "dock", "reason"),
-    [
-        (0.3, LEFT, r"to goal 1 of 2, by greedy steps, kept: its cost is \+15.4%"),
-        (0.1, RIGHT, "2 of 2"),
-    ],
-)
-def test_a_robot_between_two_docks_keeps_to_one_up_to_the_threshold(
-    docks: Robot, threshold: float, dock: Cell, reason: str
-) -> None:
-    set_parameters(docks, switch_threshold=threshold)
+def test_a_robot_between_two_docks_keeps_to_one_up_to_the_threshold(docks: Robot) -> None:
+    docks.set(switch_threshold=0.3)
     send_goals(docks, LEFT, RIGHT)
     wait_for_dock(docks, LEFT, "to goal 1 of 2")
     docks.clear()
     docks.send_start(docks.pose((16, 5)))  # 15 cells from the left dock, 13 from the right one
-    docks.wait_for_path((16, 5), dock, yaw=YAWS[dock])
-    docks.wait_for_reason(reason)
+    docks.wait_for_path((16, 5), LEFT, yaw=YAWS[LEFT])
+    docks.wait_for_reason(r"to goal 1 of 2, by greedy steps, kept: its cost is \+15.4%")
+    docks.set(switch_threshold=0.1)
+    wait_for_dock(docks, RIGHT, "to goal 2 of 2", (16, 5))
 
 
 def test_goals_none_of_which_can_be_reached_have_an_empty_plan(docks: Robot) -> None:
@@ -285,7 +252,13 @@ def test_goals_none_of_which_can_be_reached_have_an_empty_plan(docks: Robot) -> 
     wait_for_dock(docks, LEFT, "to goal 2 of 3")
 
 
-def test_a_malformed_goal_is_named(docks: Robot) -> None:
+def test_bad_goals_are_named_and_an_empty_array_leaves_the_goal(docks: Robot) -> None:
+    send_goals(docks)
+    docks.wait_for_reason("; goal_poses refused: the array has no pose; give one or more")
+    assert cell_of(docks.grid, last_plan(docks).poses[-1]) == RIGHT
+    docks.clear()
+    send_goals(docks, LEFT)
+    docks.wait_for_reason("^a path of [^;]*$")
     poses = [docks.pose(LEFT).pose, docks.pose(RIGHT).pose]
     poses[1].orientation.w = 9.0
     docks.client.publish("goal_poses", PoseArray(header=Header(frame_id="map"), poses=poses))
@@ -314,12 +287,3 @@ def test_goals_and_a_single_goal_replace_each_other(docks: Robot) -> None:
     send_goals(docks, RIGHT)
     docks.wait_for_path(DOCKED, RIGHT, yaw=YAWS[RIGHT])
     docks.wait_for_reason("^a path of [0-9.]+ cells, by greedy steps$")
-
-
-def test_an_array_without_poses_is_refused_and_the_goal_stays(docks: Robot) -> None:
-    send_goals(docks)
-    docks.wait_for_reason("; goal_poses refused: the array has no pose; give one or more")
-    assert cell_of(docks.grid, last_plan(docks).poses[-1]) == RIGHT
-    docks.clear()
-    send_goals(docks, LEFT)
-    docks.wait_for_reason("^a path of [^;]*$")

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from typing import Any
 
 import pytest
-from bursts import BurstClients, GoalBursts, burst_requests
+from load import BurstClients, GoalBursts, burst_requests
 from nav_msgs.srv import GetMap
 
 pytestmark = pytest.mark.slow

@@ -13,8 +13,7 @@ from builtin_interfaces.msg import Time
 from client import wait_for
 from diagnostic_msgs.msg import DiagnosticStatus
 from geometry_msgs.msg import PoseStamped
-from integration.robot import GOAL, START, Robot
-from integration.test_planner_robot import odometry
+from integration.robot import GOAL, START, Robot, odometry
 from nav_msgs.msg import OccupancyGrid, Odometry
 from rclpy.qos import QoSProfile
 from rosgraph_msgs.msg import Clock
@@ -56,7 +55,9 @@ def test_odometry_counts_while_it_comes_and_until_the_clock_jumps_back(
     def plans() -> bool:
         return bool(robot.get_plan(PoseStamped(), robot.pose(GOAL)).poses)
 
-    with run({"use_sim_time": True}) as node:
+    remedy = f"qos_overrides.{client.node.resolve_topic_name('map')}.subscription.durability"
+    with run({"use_sim_time": True, remedy: "volatile"}) as node:
+        client.publisher(OccupancyGrid, "map", QoSProfile(depth=1))
         robot.set_map(robot.stamped_map())
         client.publisher(Odometry, "odom", best_effort(10))  # as many drivers publish it
         client.publisher(Clock, "/clock")
@@ -96,9 +97,7 @@ def test_what_cannot_be_heard_is_said_with_the_remedy_which_helps(
     client = robot.client
     topic = client.node.resolve_topic_name("map")
     remedy = f"qos_overrides.{topic}.subscription.durability"
-    volatile = QoSProfile(depth=1)
-    message = robot.map_message()
-    map_publisher = client.publisher(OccupancyGrid, "map", volatile, listeners=0)
+    map_publisher = client.publisher(OccupancyGrid, "map", QoSProfile(depth=1), listeners=0)
     with run({}) as node:
         expected = (
             f"no map was received .*; nothing of {robot_name(client)} is "
@@ -111,10 +110,6 @@ def test_what_cannot_be_heard_is_said_with_the_remedy_which_helps(
         assert "New publisher discovered" not in node.log  # rclpy's words, without the remedy
         client.node.destroy_publisher(map_publisher)
         robot.wait_for_reason("no map was received [^;]*; start a map server$")
-    client._publishers.clear()
-    with run({remedy: "volatile"}):
-        client.publish("map", message, volatile)
-        robot.wait_for_map(message)
     bad = {"qos_overrides./map.subscription.durability": "flighty"}
     log = log_of_refused_start(planner_node.main, bad)
     assert "cannot start: cannot subscribe to /map (" in log

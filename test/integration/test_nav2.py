@@ -386,7 +386,7 @@ def test_a_path_through_poses(navigator: Navigator) -> None:
 
 
 def test_each_cause_has_its_code(navigator: Navigator) -> None:
-    robot, client = navigator.robot, navigator.robot.client
+    robot = navigator.robot
     start, goal, blocked, outside = (robot.pose(at) for at in (START, GOAL, (1, 1), (99, 0)))
     other_frame = robot.pose(GOAL)
     other_frame.header.frame_id = "no_such_frame"
@@ -402,7 +402,7 @@ def test_each_cause_has_its_code(navigator: Navigator) -> None:
         through = navigator.plan([goal], use_start=True, **fields).result
         assert through.error_code == code + 100
 
-    assert client.set_parameters("planner", start_clearing_radius=0.0)[0].successful
+    robot.set(start_clearing_radius=0.0)
     assert_code("INVALID_PLANNER", goal, start=start, planner_id="Smac")
     assert_code("START_OUTSIDE_MAP", goal, start=outside)
     assert_code("GOAL_OUTSIDE_MAP", outside, start=start)
@@ -410,14 +410,13 @@ def test_each_cause_has_its_code(navigator: Navigator) -> None:
     assert_code("GOAL_OCCUPIED", blocked, start=start)
     assert_code("TF_ERROR", other_frame, start=start)
     assert_code("TF_ERROR", goal, start=other_frame)
-    values = {"start_clearing_radius": -1.0, "planner_id": "Smac"}
-    assert all(result.successful for result in client.set_parameters("planner", **values))
+    robot.set(start_clearing_radius=-1.0, planner_id="Smac")
     assert navigator.plan([], start=start, use_start=True).result.error_code == 309
     robot.set_map(robot.stamped_map(walled))
     assert_code("NO_VALID_PATH", goal, start=start, planner_id="Smac")
     second = navigator.plan([robot.pose((0, 5)), goal], start=start, use_start=True).result
     assert second.error_msg.startswith("goal 2 of 2: no path leads from the start to the goal")
-    assert client.set_parameters("planner", planner_id="GridBased")[0].successful
+    robot.set(planner_id="GridBased")
 
 
 def test_a_path_is_valid_while_it_is_free(navigator: Navigator) -> None:

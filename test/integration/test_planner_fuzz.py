@@ -12,11 +12,7 @@ from integration.messages import NUMBERS_32, STAMPED_POSES, TEXTS, maps, some_pa
 from integration.robot import GOAL, NUMBERS, Robot, check_path
 from nav_msgs.msg import OccupancyGrid, Odometry
 from nav_msgs.srv import GetPlan
-from rcl_interfaces.srv import (
-    GetParameters,
-    SetParameters,
-    SetParametersAtomically,
-)
+from rcl_interfaces.srv import GetParameters, SetParameters, SetParametersAtomically
 from rclpy.parameter import Parameter
 from std_msgs.msg import String
 from std_srvs.srv import Trigger
@@ -36,6 +32,7 @@ def unharmed(planner: Any, robot: Robot) -> Any:
     robot.client.publisher(String, "trainer/model_saved", LATCHED)
     robot.client.wait_for_discovery("planner")
     yield robot
+    robot.reset()
     robot.begin()
     assert planner.process.poll() is None
     assert "Traceback" not in planner.log
@@ -94,11 +91,9 @@ def test_any_pose_is_taken_or_refused(unharmed: Robot, message: PoseStamped, top
         pose_message = pose_type(header=message.header)
         pose_message.pose.pose = message.pose
     source = "odometry" if topic == "odom" else "initialpose"
-    (result,) = robot.client.set_parameters("planner", start_source=source)
-    assert result.successful
+    robot.set(start_source=source)
     robot.client.publish(topic, pose_message)
     robot.assert_works()
-    assert robot.client.set_parameters("planner", start_source="initialpose")[0].successful
 
 
 def names_a_model(name: str) -> bool:
@@ -116,9 +111,7 @@ def test_any_name_of_no_model_is_refused(unharmed: Robot, name: str) -> None:
     robot = unharmed
     before = robot.client.get_parameter("planner", "model")
     robot.client.publish("trainer/model_saved", String(data=name), LATCHED)
-    (result,) = robot.client.set_parameters("planner", model=name)
-    assert not result.successful
-    assert result.reason
+    assert robot.refuse(model=name)
     assert robot.client.get_parameter("planner", "model") == before
     assert robot.client.call(Trigger, "planner/reload_model").success
     robot.assert_works()
@@ -155,8 +148,6 @@ def test_any_parameters_are_set_or_refused_with_a_reason(
             whole = Parameter.from_parameter_msg(parameter).to_parameter_msg()
             expected[parameter.name] = whole.value
     assert read() == expected
-    changeable = {name: it for name, it in PLANNER_PARAMETERS.items() if not it.read_only}
-    defaults = {name: it.default for name, it in changeable.items()} | {"use_sim_time": False}
-    defaults["model"] = str(robot.model)
-    assert all(result.successful for result in robot.client.set_parameters("planner", **defaults))
+    robot.set(use_sim_time=False)
+    robot.reset()
     robot.assert_works()
