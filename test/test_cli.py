@@ -274,13 +274,6 @@ def test_training_says_in_one_line_what_it_needs(
     assert (done.stderr, done.returncode) == (expected, 2)
 
 
-def test_what_only_plans_needs_no_torch(without: Any) -> None:
-    for command in (["plan", "office"], ["certify"]):
-        done = without(["torch", "gymnasium"], "ddqn-planner", *command)
-        assert done.returncode == 0, done.stderr
-        assert done.stdout
-
-
 @pytest.mark.parametrize("node", ["map_server_node", "planner_node", "trainer_node"])
 def test_a_node_without_ros_says_in_one_line_how_to_get_it(without: Any, node: str) -> None:
     done = without(["rclpy"], node)

@@ -22,6 +22,16 @@ assert Planner.load("dilemma").plan(load_map(find_map("dilemma")), (1, 1), (10, 
 """
 
 
+GRID = """
+from ddqn_planner import load_map, inflate
+from ddqn_planner.grid import legal_moves, move_costs
+from ddqn_planner.resources import find_map
+grid = inflate(load_map(find_map("dilemma")), 0.0)
+legal_moves(grid.occupancy, "robot_safe")
+move_costs(grid.cost_multiplier, "robot_safe")
+"""
+
+
 def loaded(code: str) -> set[str]:
     """Return the top-level packages that a new process has loaded after some code."""
     code += "\nimport sys; print(*{name.partition('.')[0] for name in sys.modules})"
@@ -37,7 +47,7 @@ def loaded(code: str) -> set[str]:
         "import ddqn_planner.grid",
         "import ddqn_planner.model",
         "import ddqn_planner.planning",
-        "from ddqn_planner import GridMap, Planner, load_map",
+        GRID,
         "from ddqn_planner import Experience; Experience(nominal_speed=0.5)",
         "from ddqn_planner import Planner; Planner.load('any_map')",
     ],

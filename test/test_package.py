@@ -38,14 +38,6 @@ def test_imports_run_downwards(room: str) -> None:
                 assert room == "nodes" or not module.startswith("rclpy"), f"{path}: {module}"
 
 
-def test_the_core_works_without_ros() -> None:
-    code = (
-        "import sys; sys.modules['rclpy'] = None; import ddqn_planner.training.any_map\n"
-        "from ddqn_planner.cli import main; main(['plan', 'dilemma'])"
-    )
-    subprocess.run([sys.executable, "-c", code], check=True)
-
-
 def test_the_source_tree_holds_maps_and_models() -> None:
     found = find_resource("maps", "dilemma.yaml")
     assert found.resolve() == ROOT / "maps" / "dilemma.yaml"

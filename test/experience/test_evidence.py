@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from unittest.mock import Mock
 
 import numpy as np
@@ -11,7 +10,7 @@ from experience.straight_drives import HALL, SPEED, at, driven, straight
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ddqn_planner import Experience, GridMap, Planner
+from ddqn_planner import Experience, GridMap
 from ddqn_planner.experience import evidence
 
 WALL = np.zeros((40, 60), dtype=bool)
@@ -59,26 +58,6 @@ def test_experience_that_was_forgotten_is_not_taken_over(is_of_the_same_robot: b
     assert at(HALL, older.slowness(HALL), 7, 3) > 2
 
 
-def test_only_what_is_new_is_spread(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    spread, counts = evidence.spread_evidence, list[int]()
-
-    def counting(occupancy: np.ndarray, cells: np.ndarray, *rest: object) -> None:
-        counts.append(len(cells))
-        spread(occupancy, cells, *rest)
-
-    monkeypatch.setattr(evidence, "spread_evidence", counting)
-    older = driven(*[straight((2, y), (12, y)) for y in range(1, 9)])
-    older.apply(HALL)
-    older.record(*straight((2, 9), (12, 9)))
-    older.save(tmp_path / "experience.npz")
-    newer = Experience.load(tmp_path / "experience.npz")
-    newer.take_over(older)
-    newer.apply(HALL)
-    newer.apply(HALL)
-    assert len(counts) == 2
-    assert counts[1] < counts[0] / 6
-
-
 def test_a_map_is_the_same_while_nothing_was_learned() -> None:
     experience = driven(straight((2, 5), (12, 5), 3))
     before = experience.apply(HALL)
@@ -103,19 +82,6 @@ def test_without_memory_for_a_map_nothing_is_lost(
         with pytest.raises(MemoryError):
             experience.apply(HALL)
     np.testing.assert_array_equal(experience.slowness(HALL), driven(*drives).slowness(HALL))
-
-
-def test_a_repaired_field_is_that_of_a_new_planner() -> None:
-    random, experience = np.random.default_rng(0), Experience(SPEED)
-    planner = Planner.load("any_map")
-    grid = GridMap(random.random((60, 60)) < 0.2, 0.25)
-    goal, *starts = grid.free_cells()[::397]
-    for x in range(2, 12, 3):
-        experience.record(*straight((x, 2), (x + 2, 4), 4))
-        applied = experience.apply(grid)
-        fresh = Planner.load("any_map")
-        for start in starts:
-            assert planner.plan(applied, start, goal) == fresh.plan(applied, start, goal)
 
 
 def test_what_was_seen_does_not_reach_through_walls_and_past_corners() -> None:

@@ -15,59 +15,30 @@ from ddqn_planner.grid import save_map
 
 GRID = GridMap(np.zeros((40, 120), dtype=np.bool_), resolution=0.25)
 
-HEADER = """std_msgs/Header header
-"""
-POSE_DEFINITIONS = """
-================================================================================
-MSG: std_msgs/Header
-builtin_interfaces/Time stamp
-string frame_id
-================================================================================
-MSG: builtin_interfaces/Time
-int32 sec
-uint32 nanosec
-================================================================================
-MSG: geometry_msgs/Pose
-geometry_msgs/Point position
-geometry_msgs/Quaternion orientation
-================================================================================
-MSG: geometry_msgs/Point
-float64 x
-float64 y
-float64 z
-================================================================================
-MSG: geometry_msgs/Quaternion
-float64 x
-float64 y
-float64 z
-float64 w
-================================================================================
-MSG: geometry_msgs/PoseWithCovariance
-geometry_msgs/Pose pose
-float64[36] covariance
-================================================================================
-MSG: geometry_msgs/TransformStamped
-std_msgs/Header header
-string child_frame_id
-geometry_msgs/Transform transform
-================================================================================
-MSG: geometry_msgs/Transform
-geometry_msgs/Vector3 translation
-geometry_msgs/Quaternion rotation
-================================================================================
-MSG: geometry_msgs/Vector3
-float64 x
-float64 y
-float64 z
-"""
-DEFINITIONS = {
-    "nav_msgs/msg/Odometry": HEADER + "geometry_msgs/PoseWithCovariance pose\n",
-    "geometry_msgs/msg/PoseStamped": HEADER + "geometry_msgs/Pose pose\n",
-    "geometry_msgs/msg/PoseWithCovarianceStamped": (
-        HEADER + "geometry_msgs/PoseWithCovariance pose\n"
+TYPES = {
+    "std_msgs/Header": "builtin_interfaces/Time stamp\nstring frame_id",
+    "builtin_interfaces/Time": "int32 sec\nuint32 nanosec",
+    "geometry_msgs/Pose": "geometry_msgs/Vector position",
+    "geometry_msgs/PoseWithCovariance": "geometry_msgs/Pose pose",
+    "geometry_msgs/Transform": (
+        "geometry_msgs/Vector translation\ngeometry_msgs/Quaternion rotation"
     ),
-    "tf2_msgs/msg/TFMessage": "geometry_msgs/TransformStamped[] transforms\n",
-    "std_msgs/msg/String": "string data\n",
+    "geometry_msgs/TransformStamped": (
+        "std_msgs/Header header\nstring child_frame_id\ngeometry_msgs/Transform transform"
+    ),
+    "geometry_msgs/Vector": "float64 x\nfloat64 y",
+    "geometry_msgs/Quaternion": "float64 z\nfloat64 w",
+}
+"""The types in messages, with the fields that are read."""
+
+DEFINITIONS = {
+    "nav_msgs/msg/Odometry": "std_msgs/Header header\ngeometry_msgs/PoseWithCovariance pose",
+    "geometry_msgs/msg/PoseStamped": "std_msgs/Header header\ngeometry_msgs/Pose pose",
+    "geometry_msgs/msg/PoseWithCovarianceStamped": (
+        "std_msgs/Header header\ngeometry_msgs/PoseWithCovariance pose"
+    ),
+    "tf2_msgs/msg/TFMessage": "geometry_msgs/TransformStamped[] transforms",
+    "std_msgs/msg/String": "string data",
 }
 
 Sample = tuple[float, float, float]
@@ -86,29 +57,22 @@ def header(seconds: float, frame: str = "map") -> dict[str, Any]:
     }
 
 
-def pose(x: float, y: float) -> dict[str, Any]:
-    return {
-        "position": {"x": x, "y": y, "z": 0.0},
-        "orientation": {"x": 0.0, "y": 0.0, "z": 0.0, "w": 1.0},
-    }
-
-
 def message(kind: str, sample: Sample, frame: str = "map") -> dict[str, Any]:
     seconds, x, y = sample
-    placed: dict[str, Any] = pose(x, y)
+    placed: dict[str, Any] = {"position": {"x": x, "y": y}}
     if not kind.endswith("PoseStamped"):
-        placed = {"pose": placed, "covariance": [0.0] * 36}
+        placed = {"pose": placed}
     return {"header": header(seconds, frame), "pose": placed}
 
 
 def transform(
     seconds: float, frame: str, child: str, x: float, y: float, yaw: float = 0.0
 ) -> dict[str, Any]:
-    rotation = {"x": 0.0, "y": 0.0, "z": math.sin(yaw / 2), "w": math.cos(yaw / 2)}
+    rotation = {"z": math.sin(yaw / 2), "w": math.cos(yaw / 2)}
     return {
         "header": header(seconds, frame),
         "child_frame_id": child,
-        "transform": {"translation": {"x": x, "y": y, "z": 0.0}, "rotation": rotation},
+        "transform": {"translation": {"x": x, "y": y}, "rotation": rotation},
     }
 
 
@@ -119,9 +83,9 @@ def write_mcap(path: Path, messages: list[tuple[str, str, dict[str, Any]]]) -> P
 
     with path.open("wb") as file:
         writer = Writer(file)
+        types = "".join(f"\n{'=' * 80}\nMSG: {kind}\n{text}" for kind, text in TYPES.items())
         schemas = {
-            kind: writer.register_msgdef(kind, text + POSE_DEFINITIONS)
-            for kind, text in DEFINITIONS.items()
+            kind: writer.register_msgdef(kind, text + types) for kind, text in DEFINITIONS.items()
         }
         for number, (topic, kind, content) in enumerate(messages):
             writer.write_message(topic, schemas[kind], content, log_time=number)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import numpy as np
 import pytest
@@ -181,12 +180,6 @@ def test_a_patch_of_a_costmap_is_read_as_the_whole_costmap(
     assert np.array_equal(patched.obstacles, whole.obstacles)  # type: ignore[arg-type]
 
 
-@pytest.mark.parametrize("values", [[[0.5]], [[128]], [["a"]], [[None]]])
-def test_values_of_no_costmap_are_refused(values: Any) -> None:
-    with pytest.raises(ValueError, match="the array of values"):
-        grid_from_costmap(values)
-
-
 def test_a_path_leads_through_the_doors_that_the_robot_fits_through() -> None:
     planner = Planner.load("any_map")
     for door in (0.4, 0.5, 0.6, 0.75):
@@ -206,15 +199,3 @@ def test_a_path_leads_through_the_doors_that_the_robot_fits_through() -> None:
     assert (plan.status, plan.cells[0]) == (PlanStatus.SUCCEEDED, (2, 15))
     assert planner.plan(grid, (60, 15), (2, 15)).status is PlanStatus.GOAL_OCCUPIED
     assert planner.plan(grid, (0, 15), (60, 15)).status is PlanStatus.START_OCCUPIED
-
-
-@pytest.mark.parametrize("width", [0.65, 1.25])
-def test_a_path_keeps_to_the_middle_of_a_corridor(width: float) -> None:
-    cells = round(width / RESOLUTION)
-    obstacles = np.pad(np.zeros((cells, 98), dtype=bool), 1, constant_values=True)
-    grid = grid_from_costmap(published(inflated_as_by_nav2(obstacles)), RESOLUTION)
-    middle = (cells + 1) / 2
-    plan = Planner.load("any_map").plan(grid, (10, round(middle) - 2), (90, round(middle) + 2))
-    inside = [y for x, y in plan.cells if 20 <= x <= 80]
-    assert len(inside) >= 61
-    assert max(abs(y - middle) for y in inside) <= 0.5

@@ -591,40 +591,6 @@ def test_any_value_of_any_key_is_read_or_refused(
             assert cell is None or map_file.grid().contains(cell)
 
 
-def edited(content: bytes) -> st.SearchStrategy[bytes]:
-    """Any bytes, or the content with some bytes replaced, left out or put in."""
-    edits = st.lists(
-        st.tuples(st.integers(0, len(content)), st.integers(0, 9), st.binary(max_size=9)),
-        min_size=1,
-        max_size=4,
-    )
-
-    def apply(edits: list[tuple[int, int, bytes]]) -> bytes:
-        changed = content
-        for place, length, new in edits:
-            changed = changed[:place] + new + changed[place + length :]
-        return changed
-
-    return st.binary() | edits.map(apply)
-
-
-GOOD_YAML = yaml.safe_dump(VALID).encode()
-GOOD_PGM = b"P5\n3 3\n255\n" + bytes(9)
-GOOD_MAP = b"type octile\nheight 2\nwidth 3\nmap\n.@.\n..@\n"
-
-
-@same_folder
-@given(edited(GOOD_YAML), edited(GOOD_PGM) | edited(png_of(3, 3)), edited(GOOD_MAP))
-def test_files_of_any_bytes_are_read_or_refused(
-    tmp_path: Path, text: bytes, image: bytes, rows: bytes
-) -> None:
-    (tmp_path / "map.png").write_bytes(image)
-    for name, content in (("any.yaml", text), ("image.yaml", GOOD_YAML), ("any.map", rows)):
-        (tmp_path / name).write_bytes(content)
-        with suppress(MapFileError):
-            assert read_map_file(tmp_path / name).values.size > 0
-
-
 @pytest.mark.parametrize("suffix", [".png", ".bmp", ".jpg", ".ppm"])
 def test_an_image_that_is_cut_off_anywhere_is_complete_or_refused(
     tmp_path: Path, suffix: str

@@ -160,6 +160,30 @@ def run_node(tmp_path_factory: pytest.TempPathFactory) -> RunNode:
     return run
 
 
+SOON = """
+import rclpy.node
+from ddqn_planner.nodes import driving
+
+driving.RETRY_PERIOD, create_timer = 0.2, rclpy.node.Node.create_timer
+
+def create_fast_timer(node, period, *arguments, **options):
+    return create_timer(node, min(period, 0.1), *arguments, **options)
+
+rclpy.node.Node.create_timer = create_fast_timer
+"""
+"""What a trainer runs first (as its ``sitecustomize``): the tests wait for many diagnostics."""
+
+
+@pytest.fixture(scope="module")
+def fast_timers(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+    """Let the nodes of the module look and speak ten times a second."""
+    folder = tmp_path_factory.mktemp("soon")
+    (folder / "sitecustomize.py").write_text(SOON)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("PYTHONPATH", str(folder), prepend=os.pathsep)
+        yield
+
+
 @pytest.fixture(scope="module")
 def make_client() -> Iterator[Callable[[str], Any]]:
     """Return a function that makes a client in a namespace; all end with the test module."""

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import importlib.util
 import math
-import os
 import re
 import resource
 import signal
@@ -19,7 +17,8 @@ from action_msgs.msg import GoalStatus, GoalStatusArray
 from builtin_interfaces.msg import Time
 from client import Client, initial_pose, map_message, pose, values_of, wait_for
 from diagnostic_msgs.msg import DiagnosticArray
-from geometry_msgs.msg import PoseStamped
+from geometry_msgs.msg import Point, Pose, PoseStamped
+from integration.robot import changed
 from nav_msgs.msg import OccupancyGrid, Odometry, Path
 from rclpy.qos import QoSProfile
 from std_msgs.msg import Header, String
@@ -27,7 +26,6 @@ from std_srvs.srv import Trigger
 
 from ddqn_planner import Experience, GridMap
 from ddqn_planner.experience.drives import read_drives
-from ddqn_planner.nodes import trainer_node
 from ddqn_planner.nodes.conversions import quaternion
 from ddqn_planner.nodes.driving import NAVIGATION
 from ddqn_planner.nodes.listening import best_effort
@@ -45,18 +43,9 @@ LOWER = [(0.875, 4.625), (3.0, 3.5), (22.0, 3.5), (24.125, 4.625)]
 NAMESPACE = "/drives"
 """Of the trainer and the planner that most tests share."""
 
-SOON = """
-import rclpy.node
-from ddqn_planner.nodes import driving
 
-driving.RETRY_PERIOD, create_timer = 0.2, rclpy.node.Node.create_timer
-
-def create_fast_timer(node, period, *arguments, **options):
-    return create_timer(node, min(period, 0.1), *arguments, **options)
-
-rclpy.node.Node.create_timer = create_fast_timer
-"""
-"""What the shared trainer runs first (as its ``sitecustomize``): the tests wait for diagnostics."""
+def pose_at(x: float, y: float) -> Pose:
+    return Pose(position=Point(x=x, y=y), orientation=quaternion(0.0))
 
 
 class Site:
@@ -79,15 +68,12 @@ class Site:
 
     def wait_for_state(self, state: str, message: str) -> None:
         self.diagnostics.clear()
+        mine = f"{self.client.node.get_namespace()}/trainer: driving"
 
         def says(array: DiagnosticArray) -> bool:
-            status = array.status[0]
-            is_mine = status.name == f"{self.client.node.get_namespace()}/trainer: driving"
-            return (
-                is_mine
-                and bool(re.search(message, status.message))
-                and values_of(status)["state"] == state
-            )
+            (status,) = array.status
+            is_it = status.name == mine and values_of(status)["state"] == state
+            return is_it and bool(re.search(message, status.message))
 
         self.diagnostics.wait(says)
 
@@ -95,8 +81,7 @@ class Site:
         whole = int(self.now)
         stamp = Time(sec=whole, nanosec=int(1e9 * (self.now - whole)))
         message = Odometry(header=Header(stamp=stamp, frame_id="map"))
-        message.pose.pose.position.x, message.pose.pose.position.y = x, y
-        message.pose.pose.orientation = quaternion(0.0)
+        message.pose.pose = pose_at(x, y)
         return message
 
     def send(self, message: Odometry) -> None:
@@ -104,9 +89,7 @@ class Site:
 
     def send_goal(self, x: float, y: float) -> None:
         """Send a goal, and wait until the trainer has it: poses may overtake it."""
-        goal = PoseStamped(header=Header(frame_id="map"))
-        goal.pose.position.x, goal.pose.position.y = x, y
-        goal.pose.orientation = quaternion(0.0)
+        goal = PoseStamped(header=Header(frame_id="map"), pose=pose_at(x, y))
         self.client.publish("goal_pose", goal)
         self.wait_for_place("goal", (x, y))
 
@@ -148,13 +131,15 @@ class Site:
         self.saved.wait()
         return episode
 
-    def call(self, service: str) -> Any:
-        return self.client.call(Trigger, f"trainer/{service}")
-
-    def refusal(self, service: str = "start") -> str:
-        answer = self.call(service)
-        assert not answer.success
+    def call(self, service: str, succeeds: bool = True) -> str:
+        """Call a service that has to succeed, or not to; return its message."""
+        answer = self.client.call(Trigger, f"trainer/{service}")
+        assert answer.success == succeeds, answer.message
         return str(answer.message)
+
+    def record_in(self, folder: FilePath) -> None:
+        self.client.set_parameters("trainer", output_folder=str(folder))
+        self.folder = folder
 
     @property
     def outcomes(self) -> list[str]:
@@ -168,7 +153,7 @@ RunTrainer = Callable[..., Any]
 
 
 @pytest.fixture(scope="module")
-def run_trainer(run_node: Any) -> RunTrainer:
+def run_trainer(run_node: Any, fast_timers: None) -> RunTrainer:
     def run(folder: FilePath, namespace: str, exit_code: int = 0) -> Any:
         given = {"learn_from": "driving", "output_folder": str(folder), "replay_period": 0.002}
         return run_node("trainer_node", given, namespace=namespace, exit_code=exit_code)
@@ -178,12 +163,8 @@ def run_trainer(run_node: Any) -> RunTrainer:
 
 @pytest.fixture(scope="module")
 def trainer(run_trainer: RunTrainer, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
-    folder = tmp_path_factory.mktemp("first")
-    (folder / "sitecustomize.py").write_text(SOON)
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("PYTHONPATH", str(folder), prepend=os.pathsep)
-        with run_trainer(folder / "drives", NAMESPACE) as node:
-            yield node
+    with run_trainer(tmp_path_factory.mktemp("first") / "drives", NAMESPACE) as node:
+        yield node
 
 
 @pytest.fixture(scope="module")
@@ -204,8 +185,8 @@ def site(trainer: Any, client: Client, tmp_path: FilePath) -> Iterator[Site]:
     site = Site(client, tmp_path / "drives")
     site.call("stop")
     trainer.forget_log()
-    site.client.set_parameters("trainer", output_folder=str(site.folder))
-    assert site.call("start").success
+    site.record_in(site.folder)
+    site.call("start")
     site.begin()
     yield site
     assert "Traceback" not in trainer.log
@@ -243,15 +224,10 @@ def test_the_robot_goes_round_what_was_slow_until_it_forgets(planner: Any, site:
     wait_for("other way", lambda: not is_below(site.client.get_plan(*ends)))
     site.client.publish("initialpose", initial_pose(ends[0]))
     site.client.publish("goal_pose", ends[1], listeners=2)
-    plan = plans.wait(lambda plan: len(plan.poses) > 50)
-    forecast = site.diagnostics.wait(
-        lambda array: "expected time (s)" in values_of(array.status[0])
-    )
-    said = values_of(forecast.status[0])
-    expected = float(said["expected time (s)"])
-    low, high = map(float, said["expected time, 90 % interval (s)"].split(" to "))
-    assert low < expected < high
-    assert expected > 0.25 * len(plan.poses) / 0.5 * 0.8
+    length = 0.25 * len(plans.wait(lambda plan: len(plan.poses) > 50).poses)
+    key = "expected time (s)"
+    forecast = site.diagnostics.wait(lambda array: key in values_of(array.status[0]))
+    assert float(values_of(forecast.status[0])[key]) > length / 0.5 * 0.8
 
     broken = site.folder / "broken.npz"
     broken.write_bytes((site.folder / "experience.npz").read_bytes()[:-20])
@@ -260,49 +236,32 @@ def test_the_robot_goes_round_what_was_slow_until_it_forgets(planner: Any, site:
     assert not is_below(site.client.get_plan(*ends))
 
     site.episodes.clear()
-    assert site.call("replay").success
+    site.call("replay")
     site.episodes.wait(lambda path: len(path.poses) == 3)
     site.episodes.wait(lambda path: len(path.poses) > 40)
 
     site.slowness.clear()
-    forgotten = site.call("forget")
-    assert forgotten.success
-    assert "experience_forgotten.npz has what was known" in forgotten.message
+    assert "experience_forgotten.npz has what was known" in site.call("forget")
     site.slowness.wait(lambda message: max(message.data) == 0)
     wait_for("first way", lambda: is_below(site.client.get_plan(*ends)))
     assert site.outcomes == ["arrived"]
 
 
-def test_a_kill_loses_nothing_but_the_drive_under_way_and_an_end_not_even_that(
-    run_trainer: RunTrainer, make_client: Any, tmp_path: FilePath
-) -> None:
-    site = Site(make_client("/killed"), tmp_path / "drives")
-    with run_trainer(site.folder, "/killed", exit_code=-signal.SIGKILL) as node:
-        site.begin()
-        site.drive(LOWER[:2], speed=0.1)
-        site.send_goal(*LOWER[0])
-        site.move([LOWER[2]], 0.5)
-        node.process.kill()
-        node.process.wait()
-    with run_trainer(site.folder, "/killed") as node:
-        site.begin()
-        site.drive([LOWER[3]], speed=0.5)
-        assert "drive 2: " in node.log
-        site.send_goal(*LOWER[0])
-        site.move([LOWER[2]], 0.5)
-        assert site.call("save").success
-    assert site.outcomes == ["arrived", "arrived", "stopped"]
-    assert site.learned()[18, 3] > 2  # of the first drive
-
-
-def test_recording_stops_and_continues(site: Site) -> None:
-    assert "call ~/stop first" in site.refusal()
-    site.move(LOWER[1:2], 0.5)
-    assert "stopped after drive 1" in site.call("stop").message
-    assert "call ~/start first" in site.refusal("save")
-    assert "call ~/start first" in site.refusal("forget")
-    assert "no drives were being recorded" in site.call("stop").message
-    assert "after drive 1" in site.call("start").message
+def test_recording_stops_and_continues_unless_the_experience_is_broken(site: Site) -> None:
+    assert "call ~/stop first" in site.call("start", succeeds=False)
+    site.move(LOWER[1:2], 0.1)
+    assert "stopped after drive 1" in site.call("stop")
+    for service in ("save", "forget"):
+        assert "call ~/start first" in site.call(service, succeeds=False)
+    assert "no drives were being recorded" in site.call("stop")
+    file = site.folder / "experience.npz"
+    file.write_bytes(broken := file.read_bytes()[:-20])
+    assert "experience.npz: cannot be read" in site.call("start", succeeds=False)
+    site.wait_for_state("failed", "experience.npz: cannot be read")
+    assert file.read_bytes() == broken
+    file.unlink()
+    assert "after drive 1" in site.call("start")
+    assert site.learned()[16, 7] > 2  # from the record
     site.move(LOWER[2:3], 0.5)
     site.call("stop")
     assert site.outcomes == ["stopped", "stopped"]
@@ -326,43 +285,22 @@ def test_who_gives_up_ends_the_drive_and_moves_fail_there(site: Site) -> None:
     assert slowness[14, 87] > slowness[14, 50]
 
 
-MALFORMED = {
-    "frame is 'odom', the map's is 'map'": lambda m: setattr(m.header, "frame_id", "odom"),
-    "has no stamp": lambda m: setattr(m.header, "stamp", Time()),
-    r"\(nan, 1.0\).*give finite numbers|x = nan": lambda m: setattr(
-        m.pose.pose.position, "x", math.nan
-    ),
-    r"\(1e\+300, 1.0\).*give finite numbers": lambda m: setattr(m.pose.pose.position, "x", 1e300),
-}
-
-
 def test_malformed_odometry_is_refused_and_the_next_is_taken(site: Site, trainer: Any) -> None:
-    for reason, change in MALFORMED.items():
+    for field, value, reason in (
+        ("header.frame_id", "odom", "frame is 'odom', the map's is 'map'"),
+        ("header.stamp", Time(), "has no stamp"),
+        ("pose.pose.position.x", math.nan, r"\(nan, 1.0\).*give finite numbers|x = nan"),
+        ("pose.pose.position.x", 1e300, r"\(1e\+300, 1.0\).*give finite numbers"),
+    ):
         trainer.forget_log()
-        message = site.odometry(1.0, 1.0)
-        change(message)
         for _ in range(5):
-            site.send(message)
+            site.send(changed(site.odometry(1.0, 1.0), field, value))
         site.wait_for_state("recording", f"odom refused: .*({reason})")
         assert trainer.log.count("odom refused") == 1
         site.move(LOWER[1:2], 0.5)
         site.wait_for_state("recording", "^recording$")
     site.call("stop")
     assert site.outcomes == ["stopped"]
-
-
-def test_a_broken_experience_is_not_overwritten(site: Site) -> None:
-    site.move(LOWER[1:], 0.1)
-    site.call("stop")
-    file = site.folder / "experience.npz"
-    file.write_bytes(file.read_bytes()[:-20])
-    broken = file.read_bytes()
-    assert "experience.npz: cannot be read" in site.refusal()
-    site.wait_for_state("failed", "experience.npz: cannot be read")
-    assert file.read_bytes() == broken
-    file.unlink()
-    assert "after drive 1" in site.call("start").message
-    assert site.learned()[14, 50] > 2  # from the record
 
 
 def test_nothing_is_lost_while_the_disk_is_full(site: Site, trainer: Any) -> None:
@@ -375,25 +313,32 @@ def test_nothing_is_lost_while_the_disk_is_full(site: Site, trainer: Any) -> Non
     site.send_goal(9.0, 9.0)
     site.wait_for_state("recording", "cannot save to .*; make room")
     assert site.outcomes == ["arrived"]
-    site.refusal("stop")  # it would lose the drive
+    site.call("stop", succeeds=False)  # it would lose the drive
     resource.prlimit(process, resource.RLIMIT_FSIZE, limits)
     trainer.wait_for_log("the drives are saved again")
     assert trainer.log.count("make room") == 1
     assert site.outcomes == ["arrived", "new_goal"]
 
 
-def test_a_folder_of_a_training_is_refused(site: Site, tmp_path: FilePath) -> None:
+def test_a_kill_loses_nothing_but_the_drive_under_way_and_an_end_not_even_that(
+    site: Site, trainer: Any, run_trainer: RunTrainer, make_client: Any, tmp_path: FilePath
+) -> None:
+    """The last test, as it ends the trainer of the others."""
+    killed = Site(make_client("/killed"), tmp_path / "killed")
+    with run_trainer(killed.folder, "/killed", exit_code=-signal.SIGKILL) as node:
+        killed.begin()
+        killed.drive(LOWER[:2], speed=0.1)
+        killed.send_goal(*LOWER[0])
+        killed.move([LOWER[2]], 0.5)
+        node.stop(signal.SIGKILL)
     site.call("stop")
-    (tmp_path / "training.lock").touch()
-    site.client.set_parameters("trainer", output_folder=str(tmp_path))
-    assert re.search("holds .* but no drives; give a new or empty folder", site.refusal())
-    site.client.set_parameters("trainer", output_folder=str(tmp_path / "other"))
-    assert site.call("start").success
-
-
-def test_tf_that_is_not_installed_is_refused(log_of_refused_start: Any) -> None:
-    if importlib.util.find_spec("tf2_ros"):
-        pytest.skip("tf2_ros is installed")
-    parameters = {"learn_from": "driving", "pose_source": "tf"}
-    log = log_of_refused_start(trainer_node.main, parameters)
-    assert "apt install ros-jazzy-tf2-ros-py" in log
+    site.record_in(killed.folder)
+    site.call("start")
+    site.drive([LOWER[3]], speed=0.5)
+    assert "drive 2: " in trainer.log
+    site.send_goal(*LOWER[0])
+    site.move([LOWER[2]], 0.5)
+    site.call("save")
+    assert trainer.stop() == 0
+    assert site.outcomes == ["arrived", "arrived", "stopped"]
+    assert site.learned()[18, 3] > 2  # of the first drive

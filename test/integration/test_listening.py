@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pytest
 from builtin_interfaces.msg import Time
 from client import wait_for
 from diagnostic_msgs.msg import DiagnosticStatus
@@ -21,30 +19,11 @@ from rosgraph_msgs.msg import Clock
 from ddqn_planner.nodes import planner_node
 from ddqn_planner.nodes.listening import best_effort
 
-NUMBERS = itertools.count()
-
-
-@pytest.fixture
-def robot(make_client: Callable[[str], Any], small_values: np.ndarray, model: Path) -> Robot:
-    namespace = f"/listening{next(NUMBERS)}"
-    return Robot(make_client(namespace), small_values, model, f"{namespace}/planner")
-
-
-@pytest.fixture
-def run(run_node: Any, robot: Robot, model: Path) -> Callable[..., Any]:
-    """Return a function that runs a planner which asks odometry where the robot is."""
-
-    def run(parameters: dict[str, Any]) -> Any:
-        parameters = {"model": str(model), "start_source": "odometry", **parameters}
-        namespace = robot.client.node.get_namespace()
-        return run_node("planner_node", parameters, namespace=namespace)
-
-    return run
-
 
 def test_odometry_counts_while_it_comes_and_until_the_clock_jumps_back(
-    run: Any, robot: Robot
+    run_node: Any, make_client: Callable[[str], Any], small_values: np.ndarray, model: Path
 ) -> None:
+    robot = Robot(make_client("/listening"), small_values, model, "/listening/planner")
     client = robot.client
 
     def set_clock(seconds: int) -> None:
@@ -55,7 +34,14 @@ def test_odometry_counts_while_it_comes_and_until_the_clock_jumps_back(
     def plans() -> bool:
         return bool(robot.get_plan(PoseStamped(), robot.pose(GOAL)).poses)
 
-    with run({"use_sim_time": True}) as node:
+    parameters = {
+        "model": str(model),
+        "start_source": "odometry",
+        "use_sim_time": True,
+        "qos_overrides./listening/map.subscription.durability": "volatile",
+    }
+    with run_node("planner_node", parameters, namespace="/listening") as node:
+        client.publisher(OccupancyGrid, "map", QoSProfile(depth=1))
         robot.set_map(robot.stamped_map())
         client.publisher(Odometry, "odom", best_effort(10))  # as many drivers publish it
         client.publisher(Clock, "/clock")
@@ -75,7 +61,8 @@ def test_odometry_counts_while_it_comes_and_until_the_clock_jumps_back(
         assert node.log.count("the clock jumped by -503 s") == 1
 
         robot.clear()
-        second, name = client.node.create_publisher(Odometry, "odom", 10), robot_name(client)
+        second = client.node.create_publisher(Odometry, "odom", 10)
+        name = client.node.get_fully_qualified_name()
         expected = rf"/odom has 2 publishers \({name}, {name}\), so the robot's place may jump"
         assert robot.wait_for_reason(expected).level == DiagnosticStatus.WARN
         assert node.log.count("has 2 publishers") == 1
@@ -84,36 +71,7 @@ def test_odometry_counts_while_it_comes_and_until_the_clock_jumps_back(
         robot.wait_for_reason("^((?!publishers).)*$")
 
 
-def robot_name(client: Any) -> str:
-    """Return the name of the node which publishes all that the planner hears."""
-    return str(client.node.get_fully_qualified_name())
-
-
-def test_what_cannot_be_heard_is_said_with_the_remedy_which_helps(
-    run: Any, robot: Robot, log_of_refused_start: Any
-) -> None:
-    client = robot.client
-    topic = client.node.resolve_topic_name("map")
-    remedy = f"qos_overrides.{topic}.subscription.durability"
-    volatile = QoSProfile(depth=1)
-    message = robot.map_message()
-    map_publisher = client.publisher(OccupancyGrid, "map", volatile, listeners=0)
-    with run({}) as node:
-        expected = (
-            f"no map was received .*; nothing of {robot_name(client)} is "
-            f"received on {topic}: its durability is volatile, and transient_local is asked for; "
-            f"let it publish so, or start this node with the parameter {remedy}:=volatile"
-        )
-        assert robot.wait_for_reason(expected).level == DiagnosticStatus.WARN
-        # A publisher may be discovered before its node, and named as unknown until then.
-        assert node.log.count(f"nothing of {robot_name(client)} ") == 1
-        assert "New publisher discovered" not in node.log  # rclpy's words, without the remedy
-        client.node.destroy_publisher(map_publisher)
-        robot.wait_for_reason("no map was received [^;]*; start a map server$")
-    client._publishers.clear()
-    with run({remedy: "volatile"}):
-        client.publish("map", message, volatile)
-        robot.wait_for_map(message)
+def test_a_quality_that_ros_does_not_know_is_named(log_of_refused_start: Any) -> None:
     bad = {"qos_overrides./map.subscription.durability": "flighty"}
     log = log_of_refused_start(planner_node.main, bad)
     assert "cannot start: cannot subscribe to /map (" in log

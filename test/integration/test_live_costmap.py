@@ -61,43 +61,38 @@ def test_a_costmap_is_planned_on_where_the_same_values_as_a_map_leave_no_path(
 ) -> None:
     robot.send_goal(robot.pose((35, 5)))
     robot.wait_for_path((5, 5), (35, 5))
-    assert robot.client.set_parameters("planner", map_type="map")[0].successful
+    robot.set(map_type="map")
     robot.wait_for_reason("no path leads from")
-    assert robot.client.set_parameters("planner", map_type="costmap")[0].successful
+    robot.set(map_type="costmap")
     robot.clear()
     robot.wait_for_reason("^a path of")
-    (result,) = robot.client.set_parameters("planner", map_type="octree")
-    assert "give one of map, costmap" in result.reason
-
-
-def test_the_goal_in_the_inscribed_zone_is_said_to_be_so(robot: Robot) -> None:
     assert robot.get_plan(robot.pose((5, 5)), robot.pose((29, 0))).poses == []
     robot.wait_for_reason("the goal is occupied .* nearer to an obstacle than the costmap allows")
+    assert "give one of map, costmap" in robot.refuse(map_type="octree")
 
 
 def test_a_costmap_that_stops_takes_its_path_back_until_it_comes_again(robot: Robot) -> None:
     robot.send_goal(robot.pose((35, 5)))
     robot.wait_for_path((5, 5), (35, 5))
     robot.clear()
-    assert robot.client.set_parameters("planner", map_timeout=0.2)[0].successful
+    robot.set(map_timeout=0.2)
     assert robot.plans.wait(lambda path: not path.poses).header.frame_id == "map"
     assert robot.get_plan(robot.pose((5, 5)), robot.pose((9, 9))).poses == []
     status = robot.wait_for_reason("nothing came on /live/global_costmap/costmap for longer than")
     assert status.level == DiagnosticStatus.WARN
     assert values_of(status)["status"] == "MAP_TIMEOUT"
     robot.clear()
-    assert robot.client.set_parameters("planner", map_timeout=TIMEOUT)[0].successful
+    robot.set(map_timeout=TIMEOUT)
     robot.client.publish("global_costmap/costmap", robot.stamped_map(), LATCHED)
     robot.wait_for_path((5, 5), (35, 5))
     # It stops by itself: nobody sets a parameter or asks, and it is not time to plan again.
-    periods = robot.client.set_parameters("planner", map_timeout=3.0, replan_period=3600.0)
-    assert all(result.successful for result in periods)
+    robot.set(map_timeout=1.5, replan_period=3600.0)
     robot.clear()
     robot.client.publish("global_costmap/costmap", robot.stamped_map(), LATCHED)
     robot.plans.wait(lambda path: not path.poses)
     robot.client.publish("global_costmap/costmap", robot.stamped_map(), LATCHED)
     robot.plans.wait(lambda path: path.poses)
-    robot.client.set_parameters("planner", map_timeout=0.0, replan_period=1.0)
+    robot.set(map_timeout=0.0, replan_period=1.0)
 
 
 def test_updates_close_and_open_doors(robot: Robot) -> None:
@@ -159,7 +154,7 @@ def test_poses_in_other_frames_are_transformed(robot: Robot) -> None:
             robot.grid.world_to_cell(*point) for point in points_of(path)[:: len(path.poses) - 1]
         ]
 
-    assert client.set_parameters("planner", transform_tolerance=60.0)[0].successful
+    robot.set(transform_tolerance=60.0)
     timer = client.node.create_timer(0.02, send_transforms)
     try:
         path = robot.get_plan(in_frame("odom", 0.1, 0.1), in_frame("base", 3.1, 2.1))
@@ -172,7 +167,7 @@ def test_poses_in_other_frames_are_transformed(robot: Robot) -> None:
         robot.send_goal(in_frame("base", 3.1, 2.1))
         robot.plans.wait(lambda path: len(path.poses) > 1 and ends(path) == expected)
         robot_is_at[0] = 2.0
-        assert client.set_parameters("planner", transform_tolerance=1.0)[0].successful
+        robot.set(transform_tolerance=1.0)
         robot.clear()
         robot.send_start(robot.pose((3, 3)))
         path = robot.plans.wait(lambda path: len(path.poses) > 1 and ends(path)[0] == (3, 3))

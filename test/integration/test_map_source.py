@@ -135,26 +135,17 @@ def test_an_update_is_taken_if_all_its_cells_are_inside_and_have_values(
             updated_values(map_of(5), sent)
 
 
-@pytest.mark.parametrize(
-    ("frame", "stamp", "reason"),
-    [
-        ("map", Time(), ""),
-        ("map", Time(sec=5), ""),
-        ("map", Time(sec=9), ""),
+def test_an_update_has_the_maps_frame_and_its_stamp_or_a_later_one_or_none() -> None:
+    for stamp in (Time(), Time(sec=5), Time(sec=9)):
+        sent = update(header=Header(frame_id="map", stamp=stamp))
+        assert updated_values(map_of(5), sent).shape == (3, 2)
+    for frame, stamp, reason in (
         ("odom", Time(sec=6), "'odom', the map's is 'map'"),
         ("", Time(sec=6), "frame is ''"),
         ("map", Time(sec=4, nanosec=999), "later than the update"),
-    ],
-)
-def test_an_update_has_the_maps_frame_and_its_stamp_or_a_later_one_or_none(
-    frame: str, stamp: Time, reason: str
-) -> None:
-    sent = update(header=Header(frame_id=frame, stamp=stamp))
-    if not reason:
-        assert updated_values(map_of(5), sent).shape == (3, 2)
-        return
-    with pytest.raises(ValueError, match=reason):
-        updated_values(map_of(5), sent)
+    ):
+        with pytest.raises(ValueError, match=reason):
+            updated_values(map_of(5), update(header=Header(frame_id=frame, stamp=stamp)))
 
 
 @pytest.mark.parametrize(
@@ -414,19 +405,15 @@ def test_malformed_directions_are_refused_and_those_before_them_stay(
 GRID = GridMap(np.zeros((40, 120), dtype=np.bool_), resolution=0.25)
 
 
-def saved(path: Path, speed: float = 0.1) -> Path:
-    """Save what a drive of 20 m along x teaches, at a fifth of the nominal speed."""
-    experience = Experience(0.5)
-    time = np.linspace(0, 20 / speed, 201)
-    experience.record(time, np.column_stack([5 + speed * time, np.full(201, 5.0)]))
-    experience.save(path)
-    return path
-
-
 @pytest.fixture
 def times(tmp_path: Path) -> ExpectedTimes:
+    """Times after a drive of 20 m along x, at a fifth of the nominal speed."""
+    experience, speed = Experience(0.5), 0.1
+    time = np.linspace(0, 20 / speed, 201)
+    experience.record(time, np.column_stack([5 + speed * time, np.full(201, 5.0)]))
+    experience.save(tmp_path / "experience.npz")
     times = ExpectedTimes()
-    times.load(str(saved(tmp_path / "experience.npz")))
+    times.load(str(tmp_path / "experience.npz"))
     return times
 
 
@@ -448,17 +435,15 @@ def test_a_map_has_expected_times_once_there_are_drives(
     assert times.apply(GRID) is GRID
 
 
-def test_a_map_in_which_a_person_stands_has_the_same_times(times: ExpectedTimes) -> None:
+def test_a_map_with_a_person_has_the_same_times_and_one_that_grows_those_of_its_places(
+    times: ExpectedTimes,
+) -> None:
     before = times.apply(GRID).slowness
+    assert before is not None
     person = GRID.with_patch(np.ones((3, 3), dtype=np.bool_), 60, 19)
     timed = times.apply(person)
     np.testing.assert_array_equal(timed.slowness, before)
     np.testing.assert_array_equal(timed.occupancy, person.occupancy)
-
-
-def test_a_map_that_grows_has_the_times_at_the_same_places(times: ExpectedTimes) -> None:
-    before = times.apply(GRID).slowness
-    assert before is not None
     grown = GridMap(np.zeros((60, 150), dtype=np.bool_), 0.25, (-2.5, -1.25, 0.0))
     after = times.apply(grown).slowness
     assert after is not None

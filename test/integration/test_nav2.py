@@ -15,7 +15,16 @@ import pytest
 import rclpy
 from client import map_message, pose, wait_for
 from geometry_msgs.msg import PoseStamped
-from integration.robot import GOAL, NUMBERS, START, Manager, Robot, check_path, points_of
+from integration.robot import (
+    GOAL,
+    NUMBERS,
+    START,
+    Manager,
+    Robot,
+    changed,
+    check_path,
+    points_of,
+)
 from integration.test_startup import load_gate as load_gate
 from nav_msgs.msg import Path as PathMessage
 from rclpy.action.client import ActionClient
@@ -193,31 +202,19 @@ def test_the_newest_goal_preempts_the_one_under_way() -> None:
     assert second.state == "succeeded"
 
 
-def test_a_goal_is_canceled_while_it_is_planned() -> None:
-    server, handle = Server(), Handle(1)
-    execution = server.begin(handle)
-    server.cancel(handle)
-    result = end(execution)
-    assert (handle.state, result.error_code) == ("canceled", 0)
-    assert result.error_msg == ""
-    server.cancel(handle)  # too late: nothing to give up
-
-
-def test_a_goal_is_canceled_before_it_is_executed() -> None:
-    server, handle = Server(), Handle(1)
-    server.action.begin(handle)
-    server.cancel(handle)
-    assert end(server.action.execute(handle)).error_code == 0
-    assert handle.state == "canceled"
-
-
-def test_a_goal_that_is_preempted_and_canceled_is_canceled() -> None:
-    server, first, second = Server(), Handle(1), Handle(2)
-    execution, other = server.begin(first), server.begin(second)
-    server.cancel(first)
-    end(execution)
-    other.close()
-    assert (first.state, second.state) == ("canceled", "executing")
+def test_a_goal_is_canceled_before_it_is_planned_meanwhile_or_once_it_is_preempted() -> None:
+    server, early, first, second = Server(), *map(Handle, range(3))
+    server.action.begin(early)
+    server.cancel(early)
+    executions = [server.action.execute(early), server.begin(first), server.begin(second)]
+    for handle in (first, second):
+        server.cancel(handle)
+    for handle, execution in zip((early, first, second), executions, strict=True):
+        result = end(execution)
+        assert handle.state == "canceled"
+        if handle is not first:  # which the second one preempted
+            assert (result.error_code, result.error_msg) == (0, "")
+    server.cancel(second)  # too late: nothing to give up
 
 
 def test_goals_are_rejected_while_the_node_is_not_active_and_aborted_when_it_stops() -> None:
@@ -386,38 +383,36 @@ def test_a_path_through_poses(navigator: Navigator) -> None:
 
 
 def test_each_cause_has_its_code(navigator: Navigator) -> None:
-    robot, client = navigator.robot, navigator.robot.client
+    robot = navigator.robot
     start, goal, blocked, outside = (robot.pose(at) for at in (START, GOAL, (1, 1), (99, 0)))
-    other_frame = robot.pose(GOAL)
-    other_frame.header.frame_id = "no_such_frame"
-    walled = robot.values.copy()
-    walled[:, 3] = 100
-
-    def assert_code(name: str, goal: PoseStamped, **fields: Any) -> None:
-        answer = navigator.plan(goal, use_start=True, **fields)
+    other_frame = changed(robot.pose(GOAL), "header.frame_id", "no_such_frame")
+    robot.set(start_clearing_radius=0.0)
+    for name, ends, planner_id in (
+        ("INVALID_PLANNER", (start, goal), "Smac"),
+        ("START_OUTSIDE_MAP", (outside, goal), ""),
+        ("GOAL_OUTSIDE_MAP", (start, outside), ""),
+        ("START_OCCUPIED", (blocked, goal), ""),
+        ("GOAL_OCCUPIED", (start, blocked), ""),
+        ("TF_ERROR", (start, other_frame), ""),
+        ("TF_ERROR", (other_frame, goal), ""),
+    ):
+        fields = {"start": ends[0], "use_start": True, "planner_id": planner_id}
+        answer = navigator.plan(ends[1], **fields)
         code = getattr(navigator.actions.ComputePathToPose.Result, name)
         assert (answer.status, answer.result.error_code) == (ABORTED, code)
         assert answer.result.error_msg
         assert answer.result.path.poses == []
-        through = navigator.plan([goal], use_start=True, **fields).result
-        assert through.error_code == code + 100
-
-    assert client.set_parameters("planner", start_clearing_radius=0.0)[0].successful
-    assert_code("INVALID_PLANNER", goal, start=start, planner_id="Smac")
-    assert_code("START_OUTSIDE_MAP", goal, start=outside)
-    assert_code("GOAL_OUTSIDE_MAP", outside, start=start)
-    assert_code("START_OCCUPIED", goal, start=blocked)
-    assert_code("GOAL_OCCUPIED", blocked, start=start)
-    assert_code("TF_ERROR", other_frame, start=start)
-    assert_code("TF_ERROR", goal, start=other_frame)
-    values = {"start_clearing_radius": -1.0, "planner_id": "Smac"}
-    assert all(result.successful for result in client.set_parameters("planner", **values))
-    assert navigator.plan([], start=start, use_start=True).result.error_code == 309
+        assert navigator.plan([ends[1]], **fields).result.error_code == code + 100
+    fields = {"start": start, "use_start": True, "planner_id": "Smac"}
+    robot.set(start_clearing_radius=-1.0, planner_id="Smac")
+    assert navigator.plan([], **fields).result.error_code == 309
+    walled = robot.values.copy()
+    walled[:, 3] = 100
     robot.set_map(robot.stamped_map(walled))
-    assert_code("NO_VALID_PATH", goal, start=start, planner_id="Smac")
-    second = navigator.plan([robot.pose((0, 5)), goal], start=start, use_start=True).result
+    second = navigator.plan([robot.pose((0, 5)), goal], **fields).result
+    assert second.error_code == 308
     assert second.error_msg.startswith("goal 2 of 2: no path leads from the start to the goal")
-    assert client.set_parameters("planner", planner_id="GridBased")[0].successful
+    robot.set(planner_id="GridBased")
 
 
 def test_a_path_is_valid_while_it_is_free(navigator: Navigator) -> None:

@@ -135,36 +135,33 @@ def pose_at(seconds: float, frame: str = "odom") -> PoseStamped:
 
 
 @pytest.mark.parametrize(
-    ("asked", "known", "used"),
+    ("asked", "frame", "known", "found"),
     [
-        (100, (100, 110), 100),
-        (105, (100, 110), 105),
-        (0, (100, 110), 110),  # a pose without a time
-        (99.5, (100,), 100),  # from just before the node listened
+        (100, "odom", (100, 110), 100),
+        (105, "odom", (100, 110), 105),
+        (0, "odom", (100, 110), 110),  # a pose without a time
+        (99.5, "odom", (100,), 100),  # from just before the node listened
+        (98.9, "odom", (100, 110), r"the goal's frame is 'odom'.*extrapol.*; publish"),
+        (110.5, "odom", (100, 110), r"the goal's frame is 'odom'.*extrapol.*; publish"),
+        (100, "moon", (100, 110), r"the map's, 'map' .*moon does not exist"),
     ],
 )
-def test_a_pose_is_transformed_by_the_transform_of_its_time(
-    monkeypatch: pytest.MonkeyPatch, asked: float, known: tuple[int, ...], used: int
+def test_a_pose_is_transformed_by_the_transform_of_its_time_or_refused(
+    monkeypatch: pytest.MonkeyPatch,
+    asked: float,
+    frame: str,
+    known: tuple[int, ...],
+    found: int | str,
 ) -> None:
-    found = listening(monkeypatch, *known).to_map("the goal", pose_at(asked), "map")
-    assert found.header.stamp.sec == used
-    assert found.pose.position.x == 3.0
-
-
-@pytest.mark.parametrize(
-    ("asked", "frame", "reason"),
-    [
-        (98.9, "odom", r"the goal's frame is 'odom'.*extrapol.*; publish"),
-        (110.5, "odom", r"the goal's frame is 'odom'.*extrapol.*; publish"),
-        (100, "moon", "the map's, 'map' .*moon does not exist"),
-    ],
-)
-def test_a_pose_without_a_transform_is_refused(
-    monkeypatch: pytest.MonkeyPatch, asked: float, frame: str, reason: str
-) -> None:
-    with pytest.raises(RequestError, match=reason) as error:
-        listening(monkeypatch, 100, 110).to_map("the goal", pose_at(asked, frame), "map")
-    assert error.value.status == "TF_ERROR"
+    frames, pose = listening(monkeypatch, *known), pose_at(asked, frame)
+    if isinstance(found, int):
+        in_map = frames.to_map("the goal", pose, "map")
+        assert in_map.header.stamp.sec == found
+        assert in_map.pose.position.x == 3.0
+    else:
+        with pytest.raises(RequestError, match=found) as error:
+            frames.to_map("the goal", pose, "map")
+        assert error.value.status == "TF_ERROR"
 
 
 @pytest.mark.parametrize(

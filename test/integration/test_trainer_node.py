@@ -1,55 +1,43 @@
 from __future__ import annotations
 
 import itertools
+import math
 import os
-import queue
 import re
 import resource
 import signal
-import subprocess
-import sys
-import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import fields
 from pathlib import Path as FilePath
 from typing import Any
 
+import numpy as np
 import pytest
-from client import wait_for
+from client import Client, initial_pose, map_message, pose, values_of, wait_for
 from diagnostic_msgs.msg import DiagnosticArray
-from geometry_msgs.msg import Pose, PoseStamped, PoseWithCovarianceStamped
+from geometry_msgs.msg import PoseStamped
 from hypothesis import given
-from integration.messages import HEADERS, POSES, maps, some_parameters
+from integration.messages import STAMPED_POSES, maps, some_parameters
+from integration.robot import changed
 from nav_msgs.msg import OccupancyGrid, Path
-from nav_msgs.srv import GetPlan
-from rcl_interfaces.srv import (
-    ListParameters,
-    SetParameters,
-    SetParametersAtomically,
-)
+from rcl_interfaces.srv import ListParameters, SetParameters, SetParametersAtomically
 from rclpy.parameter import Parameter
-from rclpy.time import Time
-from std_msgs.msg import Float32, Header, String
+from std_msgs.msg import Float32, String
 from std_srvs.srv import Trigger
 
-from ddqn_planner.grid import MOVES, GridMap, MoveRule, legal_moves
+from ddqn_planner.grid import MOVES, GridMap, MapFile, MoveRule, legal_moves, save_map
 from ddqn_planner.model import load_model
 from ddqn_planner.nodes import trainer_node
-from ddqn_planner.nodes.conversions import occupancy_message, quaternion
 from ddqn_planner.nodes.parameters import TRAINER_PARAMETERS
+from ddqn_planner.nodes.poses import has_tf
 from ddqn_planner.nodes.runtime import LATCHED
-from ddqn_planner.training.environment import Scenario, paper_scenario
 from ddqn_planner.training.hyper_parameters import HyperParameters
-from ddqn_planner.training.run import TrainingRun
-from ddqn_planner.training.trainer import Trainer
 
-TIMEOUT = 120.0
 ENDLESS = {"steps": 10**9, "filters": 4, "learning_starts": 100}
-
-
+START, GOAL = (0, 0), (5, 5)
 NAMESPACE = "/training"
-"""Of the trainer that the tests share."""
+"""Of the trainer that most tests share."""
 
 DEFAULTS = {
     name: declared.default
@@ -57,333 +45,242 @@ DEFAULTS = {
     if not declared.read_only
 } | {entry.name: entry.default for entry in fields(HyperParameters)}
 
-OFTEN = """
-from rclpy.node import Node
 
-create_timer = Node.create_timer
-
-def create_fast_timer(node, period, *arguments, **options):
-    return create_timer(node, min(period, 0.1), *arguments, **options)
-
-Node.create_timer = create_fast_timer
-"""
-"""What a trainer runs first (as its ``sitecustomize``): the tests wait for many diagnostics."""
+def message_of(name: str, value: Any) -> Any:
+    return Parameter(name, value=value).to_parameter_msg()
 
 
-@pytest.fixture
-def namespace(request: pytest.FixtureRequest) -> str:
-    """A namespace for a test with a node of its own."""
-    return "/" + re.sub(r"\W+", "_", request.node.name).strip("_")
+class User:
+    """What the user of a trainer does and sees."""
 
+    def __init__(self, client: Client, node: Any, values: np.ndarray) -> None:
+        self.client, self.node, self.values = client, node, values
+        self.grid = GridMap(values > 0)
+        self.rewards = client.subscribe(Float32, "trainer/average_reward", 100)
+        self.episodes = client.subscribe(Path, "trainer/episode", 1000)
+        self.saved = client.subscribe(String, "trainer/model_saved", LATCHED)
+        self.diagnostics = client.subscribe(DiagnosticArray, "/diagnostics")
 
-class Listener:
-    """The messages of a topic, in order."""
+    def set_up(self, listeners: int = 1) -> None:
+        """Send a map, a start and a goal to so many nodes; wait until the trainer has them."""
+        self.node.forget_log()
+        self.client.publish("map", map_message(self.values, self.grid), LATCHED, listeners)
+        self.node.wait_for_log("map of 6 x 6 cells")
+        start, goal = (pose(self.grid, cell) for cell in (START, GOAL))
+        self.client.publish("initialpose", initial_pose(start), listeners=listeners)
+        self.client.publish("goal_pose", goal, listeners=listeners)
+        self.node.wait_for_log(r"the start is cell \(0, 0\)")
+        self.node.wait_for_log(r"the goal is cell \(5, 5\)")
 
-    def __init__(self, client: Any, message_type: type, topic: str, qos: Any = 100) -> None:
-        self._messages: queue.SimpleQueue[Any] = queue.SimpleQueue()
-        client.node.create_subscription(message_type, topic, self._messages.put, qos)
+    def try_to_set(self, *parameters: Any) -> Any:
+        request = SetParametersAtomically.Request(parameters=[*parameters])
+        service = SetParametersAtomically, "trainer/set_parameters_atomically"
+        return self.client.call(*service, request).result
 
-    def next(self) -> Any:
-        return self._messages.get(timeout=TIMEOUT)
+    def configure(self, folder: FilePath, **parameters: Any) -> None:
+        """Set parameters; the next test has their defaults again."""
+        parameters["output_folder"] = str(folder)
+        result = self.try_to_set(*(message_of(*item) for item in parameters.items()))
+        assert result.successful, result.reason
 
+    def call(self, service: str, succeeds: bool = True) -> str:
+        """Call a service that has to succeed, or not to; return its message."""
+        answer = self.client.call(Trigger, f"trainer/{service}")
+        assert answer.success == succeeds, answer.message
+        return str(answer.message)
 
-def stamped(x: float, y: float, frame: str = "map") -> PoseStamped:
-    message = PoseStamped(header=Header(frame_id=frame))
-    message.pose.position.x, message.pose.position.y = x, y
-    message.pose.orientation = quaternion(0.0)
-    return message
+    def refusal(self) -> str:
+        return self.call("start", succeeds=False)
 
+    def state(self, **expected: str) -> dict[str, str]:
+        """Return the next diagnostics that hold the expected texts."""
 
-def publish_map(
-    client: Any, values: Any, resolution: float = 1.0, frame: str = "map", listeners: int = 1
-) -> None:
-    header = Header(frame_id=frame)
-    message = occupancy_message(values, resolution, (0.0, 0.0, 0.0), header)
-    client.publish("map", message, LATCHED, listeners)
+        def values(array: DiagnosticArray) -> dict[str, str] | None:
+            (status,) = array.status
+            found = values_of(status) | {"message": status.message}
+            is_it = status.name == f"{NAMESPACE}/trainer: training"
+            is_it &= all(text in found.get(key, "") for key, text in expected.items())
+            return found if is_it else None
 
+        self.diagnostics.clear()
+        found = values(self.diagnostics.wait(values))
+        assert found is not None
+        return found
 
-def set_up(node: Any, client: Any, values: Any, listeners: int = 1) -> None:
-    """Publish the map, a start and a goal to so many nodes, and wait until the trainer has them."""
-    node.forget_log()
-    publish_map(client, values, listeners=listeners)
-    node.wait_for_log("map of 6 x 6 cells")
-    initial_pose = PoseWithCovarianceStamped(header=Header(frame_id="map"))
-    initial_pose.pose.pose = stamped(0.5, 0.5).pose
-    client.publish("initialpose", initial_pose, listeners=listeners)
-    client.publish("goal_pose", stamped(5.5, 5.5), listeners=listeners)
-    node.wait_for_log(r"the start is cell \(0, 0\)")
-    node.wait_for_log(r"the goal is cell \(5, 5\)")
+    def train_on(self, **expected: str) -> dict[str, str]:
+        """Return the next state, once the training has made steps since."""
+        before = self.state(**expected)
+        number = before["steps"].split()[0]
+        wait_for("steps", lambda: self.state(**expected)["steps"].split()[0] != number)
+        return before
 
+    def next_episodes(self, count: int) -> list[Path]:
+        """Return so many messages that are published from now on."""
+        self.episodes.clear()
+        wait_for("episodes", lambda: len(self.episodes.messages()) >= count)
+        return self.episodes.messages()[:count]
 
-def wait_for_state(listener: Listener, **expected: str) -> dict[str, str]:
-    """Return the first diagnostics of the shared trainer that hold the expected texts."""
-    while True:
-        (status,) = listener.next().status
-        if status.name != f"{NAMESPACE}/trainer: training":
-            continue
-        values = {entry.key: entry.value for entry in status.values}
-        values["message"] = status.message
-        if all(text in values.get(key, "") for key, text in expected.items()):
-            return values
-
-
-def start_training(client: Any) -> str:
-    answer = client.call(Trigger, "trainer/start")
-    assert answer.success, answer.message
-    return str(answer.message)
-
-
-def refusal(client: Any) -> str:
-    """Return why ~/start refuses."""
-    answer = client.call(Trigger, "trainer/start")
-    assert not answer.success
-    return str(answer.message)
+    def lengths(self) -> list[int]:
+        """Return how many poses each episode had that came."""
+        return [len(path.poses) for path in self.episodes.messages()]
 
 
 @pytest.fixture(scope="module")
-def shared_trainer(
-    run_node: Any, make_client: Any, tmp_path_factory: pytest.TempPathFactory
-) -> Iterator[Any]:
-    """A trainer for many tests, and its client: to start one takes seconds."""
-    folder = tmp_path_factory.mktemp("often")
-    (folder / "sitecustomize.py").write_text(OFTEN)
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("PYTHONPATH", str(folder), prepend=os.pathsep)
-        with run_node("trainer_node", {}, namespace=NAMESPACE) as node:
-            client = make_client(NAMESPACE)
-            assert "no map" in refusal(client)
-            yield node, client
+def shared_user(
+    run_node: Any, make_client: Any, small_values: np.ndarray, fast_timers: None
+) -> Iterator[User]:
+    """The user of a trainer for many tests: to start one takes seconds."""
+    with run_node("trainer_node", {}, namespace=NAMESPACE) as node:
+        user = User(make_client(NAMESPACE), node, small_values)
+        assert "no map" in user.refusal()
+        yield user
 
 
 @pytest.fixture
-def trainer(shared_trainer: Any, small_values: Any, tmp_path: FilePath) -> Iterator[Any]:
-    """The shared trainer and its client; it has a map, a start, a goal, and does nothing."""
-    node, client = shared_trainer
-    configure(client, tmp_path / "run", **DEFAULTS)
-    set_up(node, client, small_values)
-    yield node, client
-    node.forget_log()
-    if "saves and stops" in client.call(Trigger, "trainer/stop").message:
-        node.wait_for_log("the training stopped")
-
-
-def configure(client: Any, folder: FilePath, **parameters: Any) -> None:
-    """Set parameters of the shared trainer; the next test has their defaults again."""
-    parameters["output_folder"] = str(folder)
-    result = set_atomically(client, *(message_of(*item) for item in parameters.items()))
-    assert result.successful, result.reason
+def user(shared_user: User, tmp_path: FilePath) -> Iterator[User]:
+    """The user of the shared trainer, which has a map, a start, a goal, and does nothing."""
+    user = shared_user
+    user.configure(tmp_path / "run", **DEFAULTS)
+    user.set_up()
+    for recorder in (user.rewards, user.episodes, user.saved):
+        recorder.clear()
+    yield user
+    user.node.forget_log()
+    if "saves and stops" in user.call("stop"):
+        user.node.wait_for_log("the training stopped")
 
 
 def test_a_training_can_be_watched_saved_stopped_resumed_and_replayed(
-    trainer: Any, small_values: Any, tmp_path: FilePath
+    user: User, tmp_path: FilePath
 ) -> None:
-    node, client = trainer
-    configure(client, tmp_path, **ENDLESS, replay_period=0.002, move_rule="robot_safe")
-    rewards = Listener(client, Float32, "trainer/average_reward")
-    episodes = Listener(client, Path, "trainer/episode")
-    saved = client.subscribe(String, "trainer/model_saved", LATCHED)
-    diagnostics = Listener(client, DiagnosticArray, "/diagnostics")
+    options = {"replay_period": 0.005, "episode_interval": 1, "move_rule": "robot_safe"}
+    user.configure(tmp_path, **ENDLESS, **options)
+    assert user.call("stop") == "no training was running"
+    assert "from step 0" in user.call("start")
+    assert "training already" in user.refusal()
+    assert -10.0 <= user.rewards.wait().data <= 10.0
 
-    assert "from step 0" in start_training(client)
-    assert "training already" in refusal(client)
-    assert -10.0 <= rewards.next().data <= 10.0
-
-    legal = legal_moves(GridMap(small_values > 0).occupancy, MoveRule.ROBOT_SAFE)
-    episode = episodes.next()
+    legal = legal_moves(user.grid.occupancy, MoveRule.ROBOT_SAFE)
+    episode = user.episodes.wait()
     assert episode.header.frame_id == "map"
     cells = [(int(p.pose.position.x), int(p.pose.position.y)) for p in episode.poses]
     moves = MOVES.tolist()
     for (x, y), (next_x, next_y) in itertools.pairwise(cells):
         assert legal[moves.index([next_x - x, next_y - y]), y, x]
 
-    assert client.call(Trigger, "trainer/save").success
-    # The model of an earlier training is latched.
-    path = saved.wait(lambda message: FilePath(message.data).parent == tmp_path).data
+    user.call("save")
+    path = FilePath(user.saved.wait().data)
+    assert path.parent == tmp_path
     _, metadata = load_model(path)
     assert metadata.steps > 0
-    assert metadata.map_fingerprint == GridMap(small_values > 0).fingerprint
+    assert metadata.map_fingerprint == user.grid.fingerprint
 
-    assert client.call(Trigger, "trainer/stop").success
-    stopped = wait_for_state(diagnostics, state="stopped", folder=str(tmp_path))
-    steps = int(stopped["steps"].split()[0])
-    assert f"from step {steps} " in start_training(client)
-    client.call(Trigger, "trainer/stop")
-    node.wait_for_log("the training stopped(.|\n)*the training stopped")
+    # The episodes of the training do not mix with a replay, which goes step by step.
+    user.call("replay")
+    user.episodes.clear()
+    count = int(user.state(state="training", folder=str(tmp_path))["episodes"])
+    wait_for("episodes", lambda: int(user.state()["episodes"]) > count + 20)
+    wait_for("replay", lambda: len(user.lengths()) > 60)
+    assert all(b in (1, a + 1) for a, b in itertools.pairwise(user.lengths()))
 
-    replay = client.call(Trigger, "trainer/replay")
-    assert replay.success, replay.message
-    lengths: list[int] = []
-    while len(lengths) < 3 or lengths[-3:-1] != [1, 2]:
-        lengths.append(len(episodes.next().poses))
+    assert "; the replay was stopped" in user.call("stop")
+    steps = user.state(state="stopped", folder=str(tmp_path))["steps"].split()[0]
+    assert f"from step {steps} " in user.call("start")
+    user.call("stop")
+    user.node.wait_for_log("the training stopped(.|\n)*the training stopped")
+    user.episodes.clear()
+    user.call("replay")
+    wait_for("an episode step by step", lambda: (1, 2) in itertools.pairwise(user.lengths()))
+    assert user.call("stop") == "no training was running; the replay was stopped"
+    assert user.call("stop") == "no training was running"
 
 
 def test_episodes_are_drawn_on_the_map_of_their_own_training(
-    trainer: Any, small_values: Any, tmp_path: FilePath
+    user: User, tmp_path: FilePath
 ) -> None:
-    node, client = trainer
-    configure(client, tmp_path / "run", **ENDLESS, replay_period=0.001)
-    episodes = Listener(client, Path, "trainer/episode")
-    start_training(client)
+    user.configure(tmp_path / "run", **ENDLESS, replay_period=0.001)
 
-    def next_episode() -> tuple[str, set[float]]:
+    def drawn_on(episode: Path) -> tuple[str, set[float]]:
         """Return the frame, and the places within a cell of all poses."""
-        episode = episodes.next()
-        coordinates = [(p.pose.position.x, p.pose.position.y) for p in episode.poses]
-        return episode.header.frame_id, {round(c % 1.0, 3) for xy in coordinates for c in xy}
+        places = [(p.pose.position.x, p.pose.position.y) for p in episode.poses]
+        return episode.header.frame_id, {round(c % 1.0, 3) for xy in places for c in xy}
 
-    assert next_episode() == ("map", {0.5})
-    publish_map(client, small_values, 0.25, "site")
-    node.wait_for_log("6 x 6 cells(.|\n)*6 x 6 cells")
-    for _ in range(20):
-        assert next_episode() == ("map", {0.5})
-    client.call(Trigger, "trainer/stop")
-    node.wait_for_log("the training stopped")
-    assert client.call(Trigger, "trainer/replay").success
-    for _ in range(20):
-        assert next_episode() == ("map", {0.5})
+    def is_drawn_on_its_own_map() -> bool:
+        return all(drawn_on(episode) == ("map", {0.5}) for episode in user.next_episodes(20))
+
+    user.call("start")
+    assert is_drawn_on_its_own_map()
+    other = map_message(user.values, GridMap(user.values > 0, resolution=0.25))
+    user.client.publish("map", changed(other, "header.frame_id", "site"), LATCHED)
+    user.node.wait_for_log("6 x 6 cells(.|\n)*6 x 6 cells")
+    assert is_drawn_on_its_own_map()
+    user.call("stop")
+    user.node.wait_for_log("the training stopped")
+    user.call("replay")
+    assert is_drawn_on_its_own_map()
     # This process has not seen that training: the last map is the best guess.
     (tmp_path / "run").rename(tmp_path / "earlier")
-    configure(client, tmp_path / "earlier")
-    assert client.call(Trigger, "trainer/replay").success
-    while next_episode()[0] != "site":
-        pass
-
-
-def test_a_replay_is_not_mixed_with_the_training_and_stop_says_what_it_stopped(
-    trainer: Any, tmp_path: FilePath
-) -> None:
-    node, client = trainer
-    configure(client, tmp_path, **ENDLESS, episode_interval=1)
-
-    def stop() -> str:
-        answer = client.call(Trigger, "trainer/stop")
-        assert answer.success
-        return str(answer.message)
-
-    episodes = Listener(client, Path, "trainer/episode")
-    diagnostics = Listener(client, DiagnosticArray, "/diagnostics")
-    assert stop() == "no training was running"
-    start_training(client)
-    episodes.next()
-    assert client.call(Trigger, "trainer/replay").success
-    answered = time.time_ns()
-    while Time.from_msg((first := episodes.next()).header.stamp).nanoseconds <= answered:
-        pass  # what the training published before
-    of_run = {"state": "training", "folder": str(tmp_path)}
-    count = int(wait_for_state(diagnostics, **of_run)["episodes"])
-    lengths = [len(first.poses), *(len(episodes.next().poses) for _ in range(40))]
-    while int(wait_for_state(diagnostics, **of_run)["episodes"]) < count + 20:
-        pass
-    lengths += [len(episodes.next().poses) for _ in range(20)]
-    assert all(b in (1, a + 1) for a, b in itertools.pairwise(lengths)), lengths
-
-    assert "; the replay was stopped" in stop()
-    node.wait_for_log("the training stopped")
-    assert client.call(Trigger, "trainer/replay").success
-    assert stop() == "no training was running; the replay was stopped"
-    assert stop() == "no training was running"
+    user.configure(tmp_path / "earlier")
+    user.call("replay")
+    user.episodes.wait(lambda episode: drawn_on(episode)[0] == "site")
 
 
 def test_the_log_says_when_a_training_starts_and_what_is_saved(
-    trainer: Any, tmp_path: FilePath
+    user: User, tmp_path: FilePath
 ) -> None:
-    node, client = trainer
-    configure(client, tmp_path, steps=300, filters=4)
-    start_training(client)
-    node.wait_for_log(f"training in {tmp_path} from step 0 to 300")
-    node.wait_for_log(f"step 300 is saved in {tmp_path}/checkpoint.safetensors")
-    node.wait_for_log("the training finished")
-    assert node.log.count("is saved in") == 1
+    user.configure(tmp_path, steps=300, filters=4)
+    user.call("start")
+    user.node.wait_for_log(f"training in {tmp_path} from step 0 to 300")
+    user.node.wait_for_log(f"step 300 is saved in {tmp_path}/checkpoint.safetensors")
+    user.node.wait_for_log("the training finished")
+    assert user.node.log.count("is saved in") == 1
 
 
-def test_a_signal_saves_a_checkpoint_that_a_new_process_continues(
-    run_node: Any, make_client: Any, namespace: str, tmp_path: FilePath
-) -> None:
-    client, folder = make_client(namespace), tmp_path / "run"
-    parameters = {**ENDLESS, "output_folder": str(folder), "map_file": "dilemma"}
-
-    def train(steps: int) -> None:
-        rewards = Listener(client, Float32, "trainer/average_reward")
-        assert f"from step {steps} " in start_training(client)
-        rewards.next()
-
-    with run_node("trainer_node", parameters, namespace=namespace):
-        train(0)
-    steps = Trainer.load_checkpoint(folder / "checkpoint.safetensors", [paper_scenario()]).steps
-    assert steps > 0
-    with run_node("trainer_node", parameters, namespace=namespace) as node:
-        train(steps)
-        folder.rename(folder.with_name("moved"))
-        folder.symlink_to("nowhere/else")  # nobody can write there, not even root
-        assert node.stop(signal.SIGTERM) == 0
-    assert node.log.count("cannot save") == 1
-
-
-def test_a_planner_that_follows_the_trainer_plans_with_each_model_it_saves(
-    run_node: Any, trainer: Any, small_values: Any, tmp_path: FilePath
-) -> None:
-    node, client = trainer
-    configure(
-        client,
-        tmp_path,
-        steps=1500,
-        filters=16,
-        learning_rate=0.003,
-        learning_starts=100,
-        p_r=1.0,
-        update_interval=2,
-        target_interval=100,
-        epsilon_steps=1000,
-        max_episode_steps=40,
-        move_rule="robot_safe",
-        seed=1,
-    )
-    saved = tmp_path / "model.safetensors"
-    request = GetPlan.Request(start=stamped(0.5, 0.5), goal=stamped(5.5, 5.5))
-    with run_node("planner_node", {"follow_trainer": True}, namespace=NAMESPACE):
-        plans = client.subscribe(Path, "plan", LATCHED)
-        set_up(node, client, small_values, listeners=2)
-        start_training(client)
-        asked = [time.time_ns()]
-
-        def has_its_model() -> bool:
-            time.sleep(0.05)
-            asked.append(time.time_ns())
-            return bool(client.get_parameter("planner", "model") == str(saved))
-
-        wait_for("its model", has_its_model)
-
-        def is_with_its_model(plan: Path) -> bool:
-            return Time.from_msg(plan.header.stamp).nanoseconds > asked[-2]
-
-        # The planner plans for the active goal again with each model, until one is good enough.
-        plans.wait(lambda plan: plan.poses and is_with_its_model(plan))
-        wait_for("plan", lambda: client.call(GetPlan, "planner/get_plan", request).plan.poses)
-
-
-BAD = {
-    "odom": ("goal_pose", stamped(0.5, 0.5, "odom")),
-    "nan": ("goal_pose", stamped(float("nan"), 0.5)),
-    "(99, 0)": ("goal_pose", stamped(99.0, 0.5)),
-    "(1, 1)": ("goal_pose", stamped(1.5, 1.5)),
-    "resolution": ("map", OccupancyGrid(header=Header(frame_id="map"))),
+QUICK = {
+    "learning_rate": 0.003,
+    "learning_starts": 100,
+    "p_r": 1.0,
+    "update_interval": 2,
+    "target_interval": 100,
+    "epsilon_steps": 1000,
+    "max_episode_steps": 40,
+    "move_rule": "robot_safe",
 }
 
 
-def test_bad_input_is_refused_by_name_and_the_training_continues(
-    trainer: Any, tmp_path: FilePath
+def test_a_planner_that_follows_the_trainer_plans_with_each_model_it_saves(
+    user: User, run_node: Any, tmp_path: FilePath
 ) -> None:
-    _, client = trainer
-    configure(client, tmp_path, **ENDLESS)
-    start_training(client)
-    diagnostics = Listener(client, DiagnosticArray, "/diagnostics")
-    for named, (topic, message) in BAD.items():
-        client.publish(topic, message, LATCHED if topic == "map" else 10)
-        before = wait_for_state(diagnostics, state="training", message=named)
-        after = wait_for_state(diagnostics, state="training")
-        assert before["goal"] == after["goal"] == "(5.5, 5.5)"
-        while int(after["steps"].split()[0]) <= int(before["steps"].split()[0]):
-            after = wait_for_state(diagnostics, state="training")
+    client = user.client
+    user.configure(tmp_path, steps=1500, **QUICK, seed=1)
+    with run_node("planner_node", {"follow_trainer": True}, namespace=NAMESPACE):
+        user.set_up(listeners=2)
+        user.call("start")
+        saved = str(tmp_path / "model.safetensors")
+        ends = [pose(user.grid, cell) for cell in (START, GOAL)]
+
+        def plans_with_its_model() -> bool:
+            is_its = client.get_parameter("planner", "model") == saved
+            return is_its and bool(client.get_plan(*ends).poses)
+
+        wait_for("a plan with its model", plans_with_its_model)
+
+
+def test_bad_input_is_refused_by_name_and_the_training_continues(
+    user: User, tmp_path: FilePath
+) -> None:
+    user.configure(tmp_path, **ENDLESS)
+    user.call("start")
+    for field, value, named in (
+        ("header.frame_id", "odom", "odom"),
+        ("pose.position.x", math.nan, "nan"),
+        ("pose.position.x", 99.0, "(99, 1)"),
+        ("pose.position.x", 1.5, "(1, 1)"),
+    ):
+        user.client.publish("goal_pose", changed(pose(user.grid, (0, 1)), field, value))
+        assert user.train_on(state="training", message=named)["goal"] == "(5.5, 5.5)"
+    user.client.publish("map", OccupancyGrid(), LATCHED)
+    user.train_on(state="training", message="the map's")
 
 
 @pytest.mark.parametrize(
@@ -392,6 +289,11 @@ def test_bad_input_is_refused_by_name_and_the_training_continues(
         ({"network": "perceptron"}, "network is 'perceptron'; give one of paper, propagation"),
         ({"environments": 8, "replay_capacity": 4}, "environments is 8; .* at most .* 4"),
         ({"map_file": "no_such_map.yaml"}, "no_such_map"),
+        pytest.param(
+            {"learn_from": "driving", "pose_source": "tf"},
+            "apt install ros-jazzy-tf2-ros-py",
+            marks=pytest.mark.skipif(has_tf(), reason="tf2_ros is installed"),
+        ),
     ],
 )
 def test_a_node_does_not_start_with_an_invalid_parameter(
@@ -402,175 +304,147 @@ def test_a_node_does_not_start_with_an_invalid_parameter(
     assert "Traceback" not in log
 
 
-def set_atomically(client: Any, *parameters: Any) -> Any:
-    request = SetParametersAtomically.Request(parameters=list(parameters))
-    return client.call(SetParametersAtomically, "trainer/set_parameters_atomically", request).result
-
-
-def message_of(name: str, value: Any) -> Any:
-    return Parameter(name, value=value).to_parameter_msg()
-
-
-def test_an_invalid_value_is_refused_with_its_reason_and_nothing_is_half_set(trainer: Any) -> None:
-    _, client = trainer
+def test_an_invalid_value_is_refused_with_its_reason_and_nothing_is_half_set(user: User) -> None:
     good = [message_of("replay_capacity", 3000), message_of("epsilon_end", 0.2)]
-    assert set_atomically(client, *good).successful
+    assert user.try_to_set(*good).successful
     for name, value, reason in (
         ("move_rule", "diagonal", "give one of .*robot_safe"),
         ("target", "", "give one of double_dqn"),
         ("output_folder", "", "name a folder"),
         ("map_file", "office", "read-only"),
         ("gamma", 1.0 + 1e-7, "must lie in 0.0 to 1.0"),
-        ("gamma", float("nan"), "out of range"),
-        ("seed", -1, "out of range"),
+        ("gamma", math.nan, "out of range"),
         ("seed", 1.0, "type"),
         ("environments", 4000, "at most replay_capacity, 3000"),
-        ("", 1, "no name"),
-        ("colour", 1, "undeclared"),
     ):
         bad = message_of(name, value)
         for parameters in ([message_of("epsilon_end", 0.3), bad], [bad, good[1]], [bad]):
-            result = set_atomically(client, *parameters)
+            result = user.try_to_set(*parameters)
             assert not result.successful
             assert re.search(reason, result.reason), result.reason
-        assert client.get_parameter("trainer", "epsilon_end") == 0.2
+        assert user.client.get_parameter("trainer", "epsilon_end") == 0.2
     both = message_of("environments", 4096), message_of("replay_capacity", 4096)
-    assert set_atomically(client, *both).successful  # they limit one another
+    assert user.try_to_set(*both).successful  # they limit one another
 
 
 @contextmanager
-def full_disk(process: Any, folder: FilePath) -> Iterator[None]:
-    """Let the writes of a running process fail in their middle, as on a full disk."""
-    limits = resource.prlimit(process.pid, resource.RLIMIT_FSIZE)
-    size = (folder / "model.safetensors").stat().st_size - 10
-    resource.prlimit(process.pid, resource.RLIMIT_FSIZE, (size, limits[1]))
+def limited(process: Any, kind: int, size: int) -> Iterator[None]:
+    """Limit what a running process may use."""
+    soft, hard = resource.prlimit(process.pid, kind)
+    resource.prlimit(process.pid, kind, (size, hard))
     yield
-    resource.prlimit(process.pid, resource.RLIMIT_FSIZE, limits)
+    resource.prlimit(process.pid, kind, (soft, hard))
 
 
 def test_a_full_disk_is_logged_once_and_the_training_continues(
-    trainer: Any, tmp_path: FilePath
+    user: User, tmp_path: FilePath
 ) -> None:
-    (node, client), folder = trainer, tmp_path / "run"
-    configure(client, folder, **ENDLESS)
-    saved = client.subscribe(String, "trainer/model_saved", LATCHED)
-    diagnostics = Listener(client, DiagnosticArray, "/diagnostics")
-
-    def save() -> None:
-        assert client.call(Trigger, "trainer/save").success
-
-    start_training(client)
-    save()
-    model = FilePath(saved.wait(lambda message: str(folder) in message.data).data)
-    with full_disk(node.process, folder):
-        before = model.read_bytes()
-        save()
-        failing = wait_for_state(diagnostics, message=f"cannot save to {folder} (")
+    user.configure(tmp_path, **ENDLESS)
+    user.call("start")
+    user.call("save")
+    model = FilePath(user.saved.wait().data)
+    before = model.read_bytes()
+    # The writes fail in their middle.
+    with limited(user.node.process, resource.RLIMIT_FSIZE, len(before) - 10):
+        user.call("save")
+        failing = user.state(message=f"cannot save to {tmp_path} (")
         for _ in range(3):
-            save()
-            after = wait_for_state(diagnostics, message="make room")
-        while int(after["steps"].split()[0]) <= int(failing["steps"].split()[0]):
-            after = wait_for_state(diagnostics, message="make room")
-        assert after["state"] == "training"
+            user.call("save")
+            user.state(message="make room")
+        assert user.train_on(message="make room")["state"] == "training"
         assert model.read_bytes() == before
-    saved.clear()
-    save()
-    node.wait_for_log("saved again")
-    assert load_model(saved.wait().data)[1].steps > int(failing["steps"].split()[0])
-    wait_for_state(diagnostics, state="training", message="training")
-    assert node.log.count("cannot save") == 1
-    assert node.log.count("saved again") == 1
+    user.saved.clear()
+    user.call("save")
+    user.node.wait_for_log("saved again")
+    assert load_model(user.saved.wait().data)[1].steps > int(failing["steps"].split()[0])
+    user.state(state="training", message="training")
+    assert user.node.log.count("cannot save") == 1
+    assert user.node.log.count("saved again") == 1
 
 
 def test_what_cannot_be_started_or_replayed_is_answered_with_the_remedy(
-    trainer: Any, small_values: Any, tmp_path: FilePath
+    user: User, tmp_path: FilePath
 ) -> None:
-    node, client = trainer
-    broken, used, other = (tmp_path / name for name in ("broken", "used", "other"))
+    broken, file = tmp_path / "broken", tmp_path / "file"
     broken.mkdir()
     (broken / "checkpoint.safetensors").write_bytes(b"no checkpoint")
     (broken / "episodes.csv").write_bytes(b"\0\xff,'\n" * 1000)
-    scenario = Scenario(GridMap(small_values > 0), (0, 0), (5, 5))
-    training = TrainingRun(used, [scenario], MoveRule.ROBOT_SAFE, HyperParameters(), seed=0)
-    different = Trainer([scenario], MoveRule.ROBOT_SAFE, HyperParameters(gamma=0.5), seed=0)
-    different.save_checkpoint(other / "checkpoint.safetensors")
-    before = (other / "checkpoint.safetensors").read_bytes()
-    (tmp_path / "file").touch()
-    unwritable = "set output_folder to a folder that can be written", "call ~/start first"
+    file.touch()
     for folder, reason, of_replay in (
         (broken, "remove it to train anew", "no episode"),
-        (tmp_path / "file", *unwritable),
-        (tmp_path / ("x" * 300), *unwritable),
+        (file, "set output_folder to a folder that can be written", "call ~/start first"),
         (tmp_path, "no training; give a new or empty folder", "call ~/start first"),
-        (used, "another process trains", "no episode"),
-        (other, r"gamma 0\.5 \(now 0\.95\)", "call ~/start first"),
     ):
-        configure(client, folder, move_rule="robot_safe")
-        assert re.search(reason, refusal(client))
-        assert of_replay in client.call(Trigger, "trainer/replay").message
-    training.close()
-    assert (other / "checkpoint.safetensors").read_bytes() == before
+        user.configure(folder)
+        assert reason in user.refusal()
+        assert of_replay in user.call("replay", succeeds=False)
     # Less memory than the replay buffer needs.
-    configure(client, tmp_path / "run", replay_capacity=10**7)
-    limits = resource.prlimit(node.process.pid, resource.RLIMIT_AS)
-    used_bytes = int(FilePath(f"/proc/{node.process.pid}/statm").read_text().split()[0]) * 4096
-    resource.prlimit(node.process.pid, resource.RLIMIT_AS, (used_bytes + 10**8, limits[1]))
-    reason = refusal(client)
-    resource.prlimit(node.process.pid, resource.RLIMIT_AS, limits)
-    assert re.search("the memory; take .* smaller .* replay_capacity", reason)
-    configure(client, tmp_path / "run", replay_capacity=1000)
-    start_training(client)
+    user.configure(tmp_path / "run", replay_capacity=10**7)
+    pages = int(FilePath(f"/proc/{user.node.process.pid}/statm").read_text().split()[0])
+    with limited(user.node.process, resource.RLIMIT_AS, pages * 4096 + 10**8):
+        assert re.search("the memory; take .* smaller .* replay_capacity", user.refusal())
+    user.configure(tmp_path / "run", replay_capacity=1000)
+    user.call("start")
 
 
-def test_the_module_of_the_node_imports_no_torch() -> None:
-    loaded = "import sys, ddqn_planner.nodes.trainer_node; sys.exit('torch' in sys.modules)"
-    assert subprocess.run([sys.executable, "-c", loaded]).returncode == 0
-
-
-@pytest.mark.parametrize("library", ["torch", "gymnasium"])
 def test_without_its_libraries_a_start_is_refused_and_the_node_lives(
-    library: str,
-    run_node: Any,
-    make_client: Any,
-    namespace: str,
-    tmp_path: FilePath,
-    monkeypatch: pytest.MonkeyPatch,
+    run_node: Any, make_client: Any, tmp_path: FilePath, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    missing = f"No module named '{library}'"
-    error = f'ModuleNotFoundError("{missing}", name="{library}")'
-    (tmp_path / f"{library}.py").write_text(f"raise {error}")
-    monkeypatch.setenv("PYTHONPATH", f"{tmp_path}:{os.environ.get('PYTHONPATH', '')}")
-    client = make_client(namespace)
+    missing = "No module named 'torch'"
+    (tmp_path / "torch.py").write_text(f'raise ModuleNotFoundError("{missing}", name="torch")')
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path), prepend=os.pathsep)
     parameters = {"map_file": "dilemma", "output_folder": str(tmp_path / "run")}
-    with run_node("trainer_node", parameters, namespace=namespace) as node:
-        assert f"needs another library: {missing}; pip install torch gymnasium" in refusal(client)
-        assert "call ~/start first" in client.call(Trigger, "trainer/replay").message
+    with run_node("trainer_node", parameters, namespace="/without") as node:
+        user = User(make_client("/without"), node, np.zeros((1, 1), np.int8))
+        assert f"needs another library: {missing}; pip install torch gymnasium" in user.refusal()
+        assert "call ~/start first" in user.call("replay", succeeds=False)
     assert "Traceback" not in node.log
 
 
 @pytest.mark.hypothesis
-def test_nothing_that_comes_in_ends_the_node(trainer: Any, tmp_path: FilePath) -> None:
-    node, client = trainer
-    configure(client, tmp_path, **ENDLESS)
-    names = client.call(ListParameters, "trainer/list_parameters").result.names
-    start_training(client)
+def test_nothing_that_comes_in_ends_the_node(user: User, tmp_path: FilePath) -> None:
+    user.configure(tmp_path, **ENDLESS)
+    names = user.client.call(ListParameters, "trainer/list_parameters").result.names
+    user.call("start")
 
-    @given(maps(), POSES, HEADERS, some_parameters(names))
-    def fuzz(grid: Any, pose: Pose, header: Header, some: list[Any]) -> None:
-        client.publish("map", grid, LATCHED)
-        initial_pose = PoseWithCovarianceStamped(header=header)
-        initial_pose.pose.pose = pose
-        client.publish("initialpose", initial_pose)
-        client.publish("goal_pose", PoseStamped(header=header, pose=pose))
+    @given(maps(), STAMPED_POSES, some_parameters(names))
+    def fuzz(grid: OccupancyGrid, stamped: PoseStamped, some: list[Any]) -> None:
+        user.client.publish("map", grid, LATCHED)
+        user.client.publish("initialpose", initial_pose(stamped))
+        user.client.publish("goal_pose", stamped)
         request = SetParameters.Request(parameters=some)
-        results = client.call(SetParameters, "trainer/set_parameters", request).results
+        results = user.client.call(SetParameters, "trainer/set_parameters", request).results
         assert len(results) == len(some)
-        result = set_atomically(client, *some)
-        assert all(one.successful or one.reason for one in [*results, result])
-        assert client.call(Trigger, "trainer/save").success
+        assert all(one.successful or one.reason for one in [*results, user.try_to_set(*some)])
+        user.call("save")
 
     fuzz()
     for service in ("stop", "replay", "start"):
-        client.call(Trigger, f"trainer/{service}")
-    client.set_parameters("trainer", use_sim_time=False)
-    assert "Traceback" not in node.log
+        user.client.call(Trigger, f"trainer/{service}")
+    user.client.set_parameters("trainer", use_sim_time=False)
+    assert "Traceback" not in user.node.log
+
+
+def test_a_signal_saves_a_checkpoint_that_a_new_process_continues(
+    shared_user: User, run_node: Any, make_client: Any, tmp_path: FilePath
+) -> None:
+    """The last test, as it ends the trainer of the others."""
+    user, folder, map_file = shared_user, tmp_path / "run", tmp_path / "map.yaml"
+    user.configure(folder, **DEFAULTS | ENDLESS)
+    user.set_up()
+    user.rewards.clear()
+    user.call("start")
+    user.rewards.wait()
+    assert user.node.stop() == 0
+    steps = load_model(folder / "model.safetensors")[1].steps
+    assert steps > 0
+    save_map(MapFile(user.values, 1.0, (0.0, 0.0, 0.0), START, GOAL), map_file)
+    parameters = {**ENDLESS, "output_folder": str(folder), "map_file": str(map_file)}
+    with run_node("trainer_node", parameters, namespace="/continued") as node:
+        user = User(make_client("/continued"), node, user.values)
+        assert f"from step {steps} " in user.call("start")
+        user.rewards.wait()
+        folder.rename(folder.with_name("moved"))
+        folder.symlink_to("nowhere/else")  # nobody can write there, not even root
+        assert node.stop(signal.SIGTERM) == 0
+    assert node.log.count("cannot save") == 1

@@ -1,15 +1,9 @@
 from __future__ import annotations
 
-import subprocess
-import sys
-from pathlib import Path
-
 import numpy as np
 import pytest
-import safetensors.torch
 
 from ddqn_planner import GridMap, MoveRule, Planner
-from ddqn_planner.cli import main
 from ddqn_planner.grid import UNKNOWN
 from ddqn_planner.grid.noise import random_costs
 from ddqn_planner.training.any_map import ANY_MAP, MAPS, RULES, random_scenarios
@@ -84,20 +78,3 @@ def test_the_maps_to_train_on_have_costs_of_every_sort() -> None:
     assert len(costs) < MAPS
     assert any((cost == UNKNOWN).any() for cost in costs)
     assert any(len(np.unique(cost)) > 20 for cost in costs)
-
-
-def command(out: Path, steps: int) -> list[str]:
-    options = ["--maps", "16", "--steps", str(steps), "--learning-starts", "640"]
-    return ["train-any-map", "--out", str(out), *options]
-
-
-def test_the_command_continues_where_it_stopped_and_gives_the_same_model(tmp_path: Path) -> None:
-    # In a process of its own: nothing of it is left except its files.
-    stopped = [sys.executable, "-m", "ddqn_planner.cli", *command(tmp_path / "cut", 3200)]
-    subprocess.run(stopped, check=True)
-    models = []
-    for folder in ("cut", "at_once"):
-        assert main(command(tmp_path / folder, 6400)) == 0
-        tensors = safetensors.torch.load_file(tmp_path / folder / "model.safetensors")
-        models.append({name: tensor.numpy().tobytes() for name, tensor in tensors.items()})
-    assert models[0] == models[1]

@@ -48,7 +48,8 @@ def step_by_hand(
 def test_the_batch_agrees_with_one_robot_moved_by_hand(
     paper: Scenario, rule: MoveRule, count: int, reward: str
 ) -> None:
-    parameters = replace(PARAMETERS, reward=reward, environments=count)
+    weights = {"alpha": 0.7, "beta": 0.2}
+    parameters = replace(PARAMETERS, reward=reward, environments=count, **weights)
     cost = np.random.default_rng(0).integers(0, 99, (20, 20))
     paper = replace(paper, grid=replace(paper.grid, cost=cost.astype(np.int8)), move_rule=rule)
     batch = GridVectorEnvironment([paper], MoveRule.ROBOT_SAFE, parameters)

@@ -1,7 +1,6 @@
 from __future__ import annotations
 
 import csv
-import resource
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
@@ -150,7 +149,8 @@ def test_a_save_that_failed_is_tried_again_at_the_next_interval_and_not_before(
     (tmp_path / "run").touch()
     while run.trainer.steps < 100:
         next(steps)
-    assert run.save_error
+    assert str(tmp_path / "run") in run.save_error
+    assert "make room" in run.save_error
     (tmp_path / "run").unlink()
     (tmp_path / "moved").rename(tmp_path / "run")
     while run.trainer.steps < 199:
@@ -168,68 +168,6 @@ def test_a_training_that_cannot_fit_is_refused_with_the_remedy(tmp_path: Path) -
     for _ in range(2):  # the folder is not left locked
         with pytest.raises(MemoryError, match="a smaller map, or smaller filters"):
             TrainingRun(tmp_path, [Scenario(grid, (0, 0), (1, 1))], MoveRule.UNIT, greedy, seed=0)
-
-
-def test_a_training_continues_while_the_disk_is_full_and_saves_when_it_no_longer_is(
-    small: Scenario, tmp_path: Path
-) -> None:
-    run = open_run(tmp_path, small, steps=10**6)
-    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
-    steps, errors, episodes = run.steps(), set(), 0
-
-    def train(until: int) -> None:
-        nonlocal episodes
-        while run.trainer.steps < until:
-            episodes += len(next(steps))
-            errors.add(run.save_error)
-
-    train(100)
-    run.try_to_save()
-    saved = run.checkpoint_path.read_bytes()
-    assert errors == {""}
-    size = run.curves_path.stat().st_size
-    # Full in the middle of a row.
-    resource.setrlimit(resource.RLIMIT_FSIZE, (size + 10, limits[1]))
-    try:
-        train(300)
-        run.try_to_save()
-        train(400)
-        content = run.curves_path.read_bytes()
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
-    (error,) = errors - {""}
-    assert error == run.save_error
-    assert "too large" in error
-    assert str(tmp_path) in error
-    assert "make room" in error
-    assert run.checkpoint_path.read_bytes() == saved
-    assert len(content) == size + 10
-
-    run.try_to_save()
-    assert run.save_error == ""
-    before = episodes
-    train(600)
-    run.try_to_save()
-    run.close()
-    numbers = [int(row["episode"]) for row in rows(tmp_path)]
-    assert numbers == sorted(set(numbers))
-    assert set(range(before + 1, episodes + 1)) <= set(numbers)
-    assert len(list(read_cells(run.curves_path, every=1))) == len(numbers) == episodes
-
-    resumed = open_run(tmp_path, small, steps=10**6)
-    resumed.close()
-    assert resumed.trainer.steps == 600
-    assert [int(row["episode"]) for row in rows(tmp_path)] == numbers
-
-
-def test_a_run_removes_what_killed_ones_left_in_its_folder(small: Scenario, tmp_path: Path) -> None:
-    open_run(tmp_path, small).close()
-    for name in ("model.safetensors", "checkpoint.safetensors", "episodes.csv"):
-        for number in range(50):
-            (tmp_path / f".{name}.{number:016x}").write_bytes(b"half")
-    (tmp_path / ".hidden").touch()
-    open_run(tmp_path, small).close()
-    assert [path.name for path in tmp_path.glob(".*")] == [".hidden"]
 
 
 GOOD = b"1,9,0,reached_goal,2,2.0,1.5,0.75,0:0 1:0 2:0\r\n"

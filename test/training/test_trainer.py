@@ -22,7 +22,6 @@ from ddqn_planner.training.trainer import CheckpointError, Trainer
 QUICK = HyperParameters(
     learning_rate=0.003, filters=8, learning_starts=50, epsilon_steps=1500, target_interval=100
 )
-REMEDY = "no complete checkpoint .* remove it to train anew, or train into another"
 
 
 def make(scenario: Scenario, parameters: HyperParameters = QUICK, seed: int = 0) -> Trainer:
@@ -273,7 +272,8 @@ def test_a_checkpoint_that_is_cut_or_has_another_bit_is_refused(
         broken.append(bytes(flipped))
     for bad in broken:
         checkpoint.write_bytes(bad)
-        with pytest.raises(CheckpointError, match=REMEDY):
+        # Another bit in a fingerprint is another map.
+        with pytest.raises(CheckpointError, match="or train into another folder"):
             Trainer.load_checkpoint(checkpoint, [small])
 
 
