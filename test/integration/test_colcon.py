@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 import os
 import shutil
 import subprocess
@@ -14,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from client import cells_of, initial_pose, pose
+from client import cells_of, initial_pose, pose, values_of
 from diagnostic_msgs.msg import DiagnosticArray
 from nav_msgs.msg import OccupancyGrid
 from nav_msgs.msg import Path as PathMessage
@@ -26,12 +25,6 @@ from ddqn_planner.nodes.runtime import LATCHED
 from ddqn_planner.training.environment import Scenario
 
 ROOT = Path(__file__).resolve().parents[2]
-
-START_TIMEOUT = 120.0
-"""Seconds in which a node of a loaded machine imports torch and speaks."""
-
-
-PYTHONPATH = os.pathsep.join([str(ROOT / "experiments"), sysconfig.get_path("purelib")])
 
 COLCON = shutil.which("colcon", path=os.pathsep.join([sysconfig.get_path("scripts"), os.defpath]))
 
@@ -90,21 +83,13 @@ def output(install: Path, *command: object) -> list[str]:
     return words.stdout.split()
 
 
-def test_sourced_workspace_goes_before_what_pip_installed(install: Path) -> None:
-    look = "import importlib.util; print(importlib.util.find_spec('ddqn_planner').origin)"
-    (found,) = output(install, sys.executable, "-c", look)
-    assert Path(found).is_relative_to(install / "ddqn_planner" / "lib")
-    editable = importlib.util.find_spec("ddqn_planner")
-    assert editable is not None
-    assert found != editable.origin
-
-
 def test_tests_that_colcon_runs_find_the_executables(install: Path, tmp_path: Path) -> None:
     # A Python into which pip has not installed the package, as that of ROS is.
     subprocess.run([sys.executable, "-m", "venv", "--without-pip", tmp_path], check=True)
+    paths = os.pathsep.join([str(ROOT / "experiments"), sysconfig.get_path("purelib")])
     look = "import processes; print(processes.executable('planner_node'))"
     python = tmp_path / "bin" / "python"
-    (found,) = output(install, "env", f"PYTHONPATH={PYTHONPATH}", python, "-c", look)
+    (found,) = output(install, "env", f"PYTHONPATH={paths}", python, "-c", look)
     expected = install / "ddqn_planner" / "lib" / "ddqn_planner" / "planner_node"
     assert Path(found) == expected
 
@@ -148,13 +133,12 @@ def test_nodes_of_the_workspace_plan_with_its_model_on_its_map(
     take_compiled(ROOT / "ddqn_planner", package)
 
     def node(name: str, *arguments: str) -> AbstractContextManager[subprocess.Popen[bytes]]:
-        return running(
-            *sourced(install, install / "ddqn_planner" / "lib" / "ddqn_planner" / name, *arguments)
-        )
+        program = install / "ddqn_planner" / "lib" / "ddqn_planner" / name
+        return running(*sourced(install, program, *arguments))
 
     def names_model(message: DiagnosticArray) -> bool:
         """The node speaks before it has loaded its model."""
-        return any(entry.key == "model file" for entry in message.status[0].values)
+        return "model file" in values_of(message.status[0])
 
     client = make_client()
     diagnostics = client.subscribe(DiagnosticArray, "/diagnostics")
@@ -164,8 +148,8 @@ def test_nodes_of_the_workspace_plan_with_its_model_on_its_map(
         node("map_server_node", "--ros-args", "-p", "yaml_filename:=dilemma.yaml") as map_server,
         node("planner_node") as planner,
     ):
-        grid = grid_from_message(maps.wait(timeout=START_TIMEOUT))
-        diagnosis = diagnostics.wait(names_model, timeout=START_TIMEOUT).status[0]
+        grid = grid_from_message(maps.wait())
+        diagnosis = diagnostics.wait(names_model).status[0]
 
         client.publish("initialpose", initial_pose(pose(grid, paper.start)))
         client.publish("goal_pose", pose(grid, paper.goal))
@@ -177,6 +161,6 @@ def test_nodes_of_the_workspace_plan_with_its_model_on_its_map(
     assert path_length(cells) == pytest.approx(14 + 8 * 2**0.5)
     assert (map_server.returncode, planner.returncode) == (0, 0)
 
-    values = {entry.key: entry.value for entry in diagnosis.values}
-    assert values["model file"] == str(package / "models" / "any_map.safetensors")
+    model = package / "models" / "any_map.safetensors"
+    assert values_of(diagnosis)["model file"] == str(model)
     assert f"serving {package / 'maps' / 'dilemma.yaml'}" in capfd.readouterr().err

@@ -8,6 +8,7 @@ import sys
 from collections.abc import Callable, Iterator
 from contextlib import suppress
 from importlib import import_module
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -33,13 +34,8 @@ TYPES = {
     ParameterType.PARAMETER_STRING: "string",
 }
 OF_EVERY_NODE = {"/rosout", "/parameter_events", "use_sim_time", "start_type_description_service"}
-OF_DRIVING = {
-    "odom",
-    "navigate_to_pose/_action/status",
-    "~/experience_saved",
-    "~/slowness",
-    "~/forget",
-}
+OF_DRIVING = {"~/experience_saved", "~/slowness", "~/forget"}
+OF_DRIVING |= {"odom", "navigate_to_pose/_action/status"}
 """What the trainer has only where it learns from driving."""
 
 
@@ -144,47 +140,36 @@ def test_each_topic_and_service_is_documented_as_it_is(
 
 
 def test_no_request_for_parameters_ends_a_node(running: Running) -> None:
+    together = SetParametersAtomically, "set_parameters_atomically"
     unknown_type = Parameter(name="use_sim_time", value=ParameterValue(type=77))
-    no_name = Parameter(value=ParameterValue(type=1, bool_value=True))
-    unset = Parameter(name="use_sim_time")
     for bad, reason in (
         (unknown_type, "77.*ParameterType"),
-        (no_name, "no name; give one"),
-        (unset, "."),
+        (Parameter(value=ParameterValue(type=1, bool_value=True)), "no name; give one"),
+        (Parameter(name="use_sim_time"), "."),
         (Parameter(name="no_such", value=ParameterValue(type=1)), "undeclared"),
     ):
         (result,) = running.call(SetParameters, "set_parameters", parameters=[bad]).results
-        service = SetParametersAtomically, "set_parameters_atomically"
-        together = running.call(*service, parameters=[bad]).result
-        for refused in (result, together):
+        for refused in (result, running.call(*together, parameters=[bad]).result):
             assert not refused.successful
             assert re.search(reason, refused.reason)
     good = Parameter(name="use_sim_time", value=ParameterValue(type=1))
     results = running.call(SetParameters, "set_parameters", parameters=[unknown_type, good]).results
     assert [result.successful for result in results] == [False, True]
     assert running.call(SetParameters, "set_parameters").results == []
-    assert running.call(*service).result.successful
+    assert running.call(*together).result.successful
     running.call(ListParameters, "list_parameters", prefixes=NAMES, depth=2**64 - 1)
-    for kind, service_type in (
-        ("describe_parameters", DescribeParameters),
-        ("get_parameters", GetParameters),
-        ("get_parameter_types", GetParameterTypes),
-    ):
-        running.call(service_type, kind, names=NAMES)
+    running.call(DescribeParameters, "describe_parameters", names=NAMES)
+    running.call(GetParameterTypes, "get_parameter_types", names=NAMES)
+    running.call(GetParameters, "get_parameters", names=NAMES)
     names = running.call(ListParameters, "list_parameters").result.names
     values = running.call(GetParameters, "get_parameters", names=names).values
     assert len(values) == len(names) > 3
     assert "Traceback" not in running.node.log
 
 
-@pytest.mark.parametrize("option", ["--help", "-h"])
-@pytest.mark.parametrize("name", NODES)
+@pytest.mark.parametrize(("name", "option"), [*product(NODES, ["--help", "-h"])])
 def test_help_says_of_each_parameter_what_the_docs_say_and_starts_no_node(
-    name: str,
-    option: str,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capfd: pytest.CaptureFixture[str],
+    name: str, option: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: Any
 ) -> None:
     # With such a domain, such parameters and in such a folder no node starts.
     arguments = [option, "--ros-args", "-p", "model:=no_such", "-p", "map_file:=no_such"]
@@ -197,12 +182,18 @@ def test_help_says_of_each_parameter_what_the_docs_say_and_starts_no_node(
     assert list(tmp_path.iterdir()) == []
     assert f"usage: {name}_node" in helped.out
     printed = re.findall(r"^  (\w+): (.*)\n      \S.*", helped.out, re.MULTILINE)
-    assert dict(printed) == {
-        parameter: "; ".join(
-            filter(None, [f"{kind}, default {default.strip('`') or repr('')}", limits])
-        )
-        for parameter, (kind, default, limits) in documented_parameters(name).items()
-    }
+    expected = {}
+    for parameter, (kind, default, limits) in documented_parameters(name).items():
+        parts = f"{kind}, default {default.strip('`') or repr('')}", limits
+        expected[parameter] = "; ".join(filter(None, parts))
+    assert dict(printed) == expected
+
+
+SECURITY = {
+    "ROS_SECURITY_ENABLE": "true",
+    "ROS_SECURITY_STRATEGY": "Enforce",
+    "ROS_SECURITY_KEYSTORE": "/no/such/keystore",
+}
 
 
 @pytest.mark.parametrize(
@@ -211,15 +202,7 @@ def test_help_says_of_each_parameter_what_the_docs_say_and_starts_no_node(
         (["-p", "model"], {}, "model"),
         (["--params-file", "/no/such.yaml"], {}, "such.yaml"),
         ([], {"ROS_DOMAIN_ID": "abc"}, "ROS_DOMAIN_ID"),
-        (
-            ["--enclave", "/nobody"],
-            {
-                "ROS_SECURITY_ENABLE": "true",
-                "ROS_SECURITY_STRATEGY": "Enforce",
-                "ROS_SECURITY_KEYSTORE": "/no/such/keystore",
-            },
-            "SECURITY|security|keystore|enclave",
-        ),
+        (["--enclave", "/nobody"], SECURITY, "SECURITY|security|keystore|enclave"),
     ],
 )
 def test_what_ros_cannot_start_with_is_said_and_ends_with_1(
