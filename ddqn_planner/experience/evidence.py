@@ -117,7 +117,7 @@ class Evidence:
         before = self.places
         keys = map(tuple, np.floor(position / self.side).astype(np.int64).tolist())
         rows = np.array([self.number.setdefault(key, len(self.number)) for key in keys])
-        self.table = np.pad(self.table, ((0, self.places - before), (0, 0)))
+        self.table = with_rows(self.table, self.places)
         fresh, first = np.unique(rows, return_index=True)
         first = first[fresh >= before]
         self.table[rows[first], 3:5] = position[first]
@@ -255,7 +255,7 @@ class Spread:
 
     def update(self, evidence: Evidence, driven: float) -> None:
         """Spread what changed, less what was spread of the same places before."""
-        before = np.pad(self.table, ((0, evidence.places - len(self.table)), (0, 0)))
+        before = with_rows(self.table, evidence.places)
         changed = (evidence.table != before).any(axis=1)
         if changed.any():
             before, now = before[changed], evidence.table[changed]
@@ -280,6 +280,11 @@ class Spread:
         weight = np.maximum(self.sums[y, x, 0].astype(np.float64), 0) * self.faded
         variance: Float64 = 1 / (weight / self.noise + 1 / PRIOR)
         return variance
+
+
+def with_rows(table: Float64, rows: int) -> Float64:
+    """Return a table with so many rows, new ones of zeros."""
+    return table if len(table) == rows else np.pad(table, ((0, rows - len(table)), (0, 0)))
 
 
 def cells_of(position: Float64, grid: GridMap) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:

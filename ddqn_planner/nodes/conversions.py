@@ -62,10 +62,7 @@ def grid_from_values(
     use_map_costs: bool,
     map_type: str,
 ) -> GridMap:
-    """Make a grid map: `GridMap.from_occupancy_values`, or `grid_from_costmap` for a costmap.
-
-    A costmap has its own threshold and costs.
-    """
+    """Make a grid map; a costmap has its own threshold and costs."""
     if map_type == "costmap":
         return grid_from_costmap(values, resolution, origin, allow_unknown)
     rules = occupied_threshold, allow_unknown, use_map_costs
@@ -191,11 +188,7 @@ def _copy(message: Message) -> Message:
 def check_pose(
     name: str, header: Header, pose: Pose, frame: str = "", other_remedy: str = ""
 ) -> None:
-    """Check a pose, which the error calls by its name, as ``"the goal"``.
-
-    A ValueError if the pose has no frame, or another one than the map's `frame`, if that is known;
-    if its position is not finite, or its quaternion is not of norm 1.
-    """
+    """Check a pose, which the ValueError calls by its name, and that it is in the map's frame."""
     if not header.frame_id:
         known = f", the map's is {frame!r}" if frame else ""
         raise ValueError(f"{name}'s frame is ''{known}; name one in header.frame_id")

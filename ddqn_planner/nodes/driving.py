@@ -67,6 +67,7 @@ class Driving:
             node.create_timer(TF_PERIOD, self._look_up, clock=STEADY)
         else:
             listen(node, "odom", 1000, node.refusals, self._on_pose)
+        node.create_timer(1.0, self._publish_diagnostics, clock=STEADY)
         node.create_timer(0.1, self._show_slowness, clock=STEADY)
         node.create_timer(RETRY_PERIOD, self._retry, clock=STEADY)
         for name in ("start", "stop", "save", "replay", "forget"):
@@ -258,10 +259,7 @@ class Driving:
             file, drives, lambda positions: self._draw(positions, place), "drive on"
         )
 
-    # What the node asks for
-
-    def publish_diagnostics(self) -> None:
-        """Publish what `/diagnostics` says."""
+    def _publish_diagnostics(self) -> None:
         values = {
             "robot": _place_of(self._recorder.position),
             "goal": _place_of(self._recorder.goal),

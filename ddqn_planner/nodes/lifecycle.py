@@ -23,10 +23,7 @@ HEARTBEAT_PERIOD, HEARTBEAT_TIMEOUT = 0.1, 4.0
 
 
 class ManagedNode(LifecycleNodeMixin, BaseNode):
-    """Node whose `cleanup` destroys all publishers, services and so on since `configure`.
-
-    A transition that raises an exception is undone.
-    """
+    """Node that destroys what `configure` created if that fails, and at ``cleanup``."""
 
     def __init__(self, name: str, parameters: Parameters) -> None:
         BaseNode.__init__(self, name, parameters)

@@ -50,10 +50,7 @@ PARAMETERS: Final = {
 class MapServerNode(BaseNode):
     """Serves one map, latched on a topic and as a service, and its directions on another topic.
 
-    ``~/scatter_obstacles`` always adds to the loaded map, so that each call is an independent draw;
-    the parameter ``seed`` makes a sequence of calls repeatable. A path remains under
-    `MoveRule.ROBOT_SAFE`, and so under any rule; under `MoveRule.CORNER_CUTTING` on a map that has
-    only such a path.
+    ``~/scatter_obstacles`` always adds to the loaded map, so that each call is an independent draw.
     """
 
     def __init__(self) -> None:

@@ -48,12 +48,8 @@ class ModelSource:
         self.planner: Planner | None = None
         self.file = ""
         self._node, self._report, self._worker = node, report, worker
-        self._loading: Future | None = None
-
-    @property
-    def is_loading(self) -> bool:
-        """Whether the first model is still being loaded."""
-        return self._loading is not None
+        self.loading: Future | None = None
+        """The first model, while it is being loaded."""
 
     @property
     def refused(self) -> str:
@@ -62,25 +58,25 @@ class ModelSource:
 
     def load(self) -> None:
         """Begin to load the first model."""
-        self._loading = self._worker.call(load_and_warm_up, self._node.value("model"))
+        self.loading = self._worker.call(load_and_warm_up, self._node.value("model"))
 
     async def first(self) -> None:
         """Wait for the first model, and use it unless another one was set since."""
-        loading = self._loading
+        loading = self.loading
         try:
             loaded = await loading if loading is not None else None
         except Exception as error:
-            if self._loading is loading:
-                self._loading = None
+            if self.loading is loading:
+                self.loading = None
                 reason = f"{str(error) or repr(error)}; or set the parameter 'model'"
                 self._report.refuse("model", reason)
             return
-        if loaded is not None and self._loading is loading:
+        if loaded is not None and self.loading is loading:
             self.use(*loaded)
 
     def use(self, planner: Planner, file: str) -> None:
         """Plan with it from now on."""
-        self.planner, self.file, self._loading = planner, file, None
+        self.planner, self.file, self.loading = planner, file, None
         planner.cache_bytes = self._node.value("field_cache_bytes")
         self._report.accept("model")
         self._report.change()
@@ -121,6 +117,6 @@ class ModelSource:
 
     def forget(self) -> None:
         """Free the model and its fields, with what `load_and_warm_up` kept from collection."""
-        self.planner, self.file, self._loading = None, "", None
+        self.planner, self.file, self.loading = None, "", None
         gc.unfreeze()
         gc.collect()

@@ -1,8 +1,5 @@
 """The planner node: plans on the map from the robot's pose to the goal pose.
 
-The node answers each request. If it cannot plan, the answer is an empty path in the map's frame;
-the log and `/diagnostics` say why.
-
 The executor's one thread holds all state, so that no lock is needed. What takes long runs in worker
 threads: loading the model and its libraries, and the Q fields, which take a second or more on a
 large map. A request that waits for a worker is a coroutine.
@@ -49,11 +46,8 @@ LOOK_PERIOD = 0.1
 class PlannerNode(ManagedNode):
     """Plans from where the robot is to the active goal: ``goal_pose``, or ``goal_poses``.
 
-    The active goal stays until the next one comes, though there may be no plan. `ActiveGoal`
-    decides when the node plans for it again, and what it publishes. Triggers during planning are
-    coalesced into one more plan with the latest inputs. A malformed map, start or model is refused,
-    and the one before it stays. A request that comes while the first model is loaded waits for it.
-    While the node is not active, it refuses requests.
+    A malformed map, start or model is refused, and the one before it stays. A request that cannot
+    be answered gets an empty path in the map's frame; the log and `/diagnostics` say why.
     """
 
     def __init__(self) -> None:
@@ -294,7 +288,7 @@ class PlannerNode(ManagedNode):
         if self._report.is_due:
             missing = [NOT_ACTIVE.reason] if not self._is_active() else []
             missing += [self._map.missing] if self._is_configured else []
-            missing += ["the model is being loaded"] if self._model.is_loading else []
+            missing += ["the model is being loaded"] if self._model.loading else []
             fatal = self._model.planner is None and "model" in self._report.refused
             values = {"state": self.state, **self._model.describe(self._settings.move_rule)}
             if self._is_configured:

@@ -274,18 +274,19 @@ class StartSource:
         """
         if self.source == "tf":
             return self._pose_by_tf()
-        topic, problem = self._subscription.topic_name, ""
-        if self._pose is None and self.source == "initialpose":
-            problem = f"set it on {topic} (in RViz: 2D Pose Estimate)"
-        elif self._pose is None:
-            problem = f"nothing came on {topic} in the map's frame"
-        elif self.source == "odometry":
-            silent = (self._node.get_clock().now() - self._came).nanoseconds / 1e9
-            if silent > max(self._node.value("transform_tolerance"), SILENCE):
-                often = "publish it more often, set transform_tolerance"
-                problem = f"nothing came on {topic} for {silent:.3g} s; {often}"
-        if self._pose is not None and not problem:
+        topic = self._subscription.topic_name
+        if self._pose is not None and self.source == "initialpose":
             return self._pose
+        if self._pose is not None:
+            silent = (self._node.get_clock().now() - self._came).nanoseconds / 1e9
+            if silent <= max(self._node.value("transform_tolerance"), SILENCE):
+                return self._pose
+            often = "publish it more often, set transform_tolerance"
+            problem = f"nothing came on {topic} for {silent:.3g} s; {often}"
+        elif self.source == "initialpose":
+            problem = f"set it on {topic} (in RViz: 2D Pose Estimate)"
+        else:
+            problem = f"nothing came on {topic} in the map's frame"
         remedy = "or set start_source, or give the request's start its frame"
         may_come = self.source == "odometry" and time.monotonic() - self._began < PATIENCE
         raise RequestError("NO_START", f"the start is unknown; {problem}; {remedy}", may_come)

@@ -37,10 +37,7 @@ NO_PLAN = Plan(PlanStatus.NO_PATH)
 
 
 class RequestError(ValueError):
-    """There is no request for the planner; the message says why and what to do.
-
-    What is missing `may_come` soon, where the node has begun to listen just now.
-    """
+    """There is no request for the planner; what is missing `may_come` soon in a new node."""
 
     def __init__(self, status: str, reason: str, may_come: bool = False) -> None:
         super().__init__(reason)

@@ -61,12 +61,10 @@ class PathUnderWay:
 
 
 class ActiveGoal:
-    """Decides when to plan again, and what to publish; the table in docs/nodes.md has the rules.
-
-    `poses` are the last ``goal_pose``, or the last ``goal_poses``, of which the nearest one counts.
-    """
+    """Decides when to plan again, and what to publish; the table in docs/nodes.md has the rules."""
 
     def __init__(self) -> None:
+        # The last ``goal_pose``, or the last ``goal_poses``, of which the nearest one counts.
         self.poses: list[PoseStamped] = []
         # Of the paths that were published for this goal, the last one.
         self._path = PathUnderWay()
@@ -81,10 +79,6 @@ class ActiveGoal:
         """Take a new goal."""
         self.poses = poses
         self.restart()
-
-    def settle(self, goals: list[PoseStamped], in_map: list[PoseStamped]) -> None:
-        """Keep goals where they are on the map now, though their own frame moves."""
-        goals[:] = in_map
 
     def restart(self) -> None:
         """Plan without the path under way, at once: the goal, the model or a parameter changed."""
@@ -197,7 +191,7 @@ class Requests:
             start_clearing_radius=_clearing_radius(settings, grid),
         )
         if isinstance(followed, ActiveGoal):
-            followed.settle(goals, in_map)
+            goals[:] = in_map  # there they stay, though their own frame moves
             if several:
                 request, more = replace(request, tolerance=0.0, others=tuple(more)), []
         if followed is not None and not more:

@@ -64,10 +64,7 @@ default queue of ten lost half of 20 requests. Fast DDS keeps 5,000 messages by 
 
 
 class Declared(NamedTuple):
-    """What a user reads of a parameter.
-
-    A number has a range; a text may have a list of choices, or words that say what it must be.
-    """
+    """What a user reads of a parameter; a number has a range, a text choices, or words for them."""
 
     default: Any
     description: str
@@ -110,10 +107,7 @@ Parameters = Mapping[str, Declared]
 
 
 class BaseNode(ListeningNode):
-    """Node with checked parameters, whose services lose no request and survive malformed ones.
-
-    A ParameterException if it was started with invalid parameters.
-    """
+    """Node with checked parameters, whose services lose no request and survive malformed ones."""
 
     def __init__(self, name: str, parameters: Parameters) -> None:
         super().__init__(name)
@@ -296,11 +290,7 @@ def help_text(program: str, summary: str, parameters: Parameters) -> str:
 
 
 def spin_until_shutdown(make_node: Callable[[], Node], parameters: Parameters | None = None) -> int:
-    """Run one node until SIGINT or SIGTERM, or print its parameters if the user asks for help.
-
-    Returns the exit code: 0, or 1 if the node cannot start with its parameters, names or
-    environment. Without `parameters` there is no ``--help``.
-    """
+    """Run one node until SIGINT or SIGTERM, or print help; return 1 if it cannot start."""
     if parameters and {"-h", "--help"} & {*sys.argv[1:]}:
         summary = (make_node.__doc__ or "").partition("\n")[0].replace("``", "")
         print(help_text(Path(sys.argv[0]).name, summary, parameters), flush=True)

@@ -48,11 +48,8 @@ SLICE = 0.1
 class TrainerNode(LearningNode):
     """Trains on the last ``map`` from the last ``initialpose`` to the last ``goal_pose``.
 
-    Or with the parameter ``learn_from``, it learns from the robot's drives: see `Driving`.
-
-    With the parameter ``map_file`` it takes all three from a map file, until others are published.
-    A training keeps the map, start and goal with which it was started. Its folder holds a
-    checkpoint: ``~/start`` continues from there, also after a restart.
+    A training keeps the map, start and goal with which it was started. With the parameter
+    ``learn_from``, the node learns from the robot's drives instead: see `Driving`.
     """
 
     def __init__(self) -> None:
@@ -63,12 +60,12 @@ class TrainerNode(LearningNode):
         self._is_stopping = self._is_saving = False
         self._state = "idle"
         self._read_map_file()
-        self.create_timer(1.0, self._publish_diagnostics, clock=STEADY)
         self._worker = Worker(self)
         self._driving: Driving | None = None
         if self.value("learn_from") == "driving":
             self._driving = Driving(self)
             return
+        self.create_timer(1.0, self._publish_diagnostics, clock=STEADY)
         self._reward_publisher = self.create_publisher(Float32, "~/average_reward", 100)
         self._saved_publisher = self.create_publisher(String, "~/model_saved", LATCHED)
         on_start, on_goal = (partial(self._on_pose, which) for which in ("start", "goal"))
@@ -233,9 +230,6 @@ class TrainerNode(LearningNode):
         self.episodes.publish(path)
 
     def _publish_diagnostics(self) -> None:
-        if self._driving is not None:
-            self._driving.publish_diagnostics()
-            return
         values = {}
         for which, pose in self._poses.items():
             position = pose.pose.position
