@@ -34,10 +34,10 @@ from driving_worlds import (
 from figures import draw_slowness, draw_times, save_figure
 from numpy.typing import NDArray
 from random_maps import generate_map
-from tables import table, write_report
-from trainings import BACKENDS, in_parallel
+from tables import median_and_range, table, write_report
+from trainings import in_parallel, make_folder, parser_of
 
-from ddqn_planner.cli import HelpFormatter, exit_code
+from ddqn_planner.cli import exit_code
 from ddqn_planner.experience import Experience
 from ddqn_planner.grid import Cell, GridMap, inflate, load_map
 from ddqn_planner.grid.arguments import MAX_SLOWNESS
@@ -185,32 +185,26 @@ def measured_worlds(
     return results[: len(worlds)], results[len(worlds) :]
 
 
-def report(out: Path, options: argparse.Namespace) -> str:
+def report(out: Path, options: argparse.Namespace, maps: Sequence[str]) -> str:
     """Run the experiment, write its tables, figures and ``report.md``, and return the text."""
-    maps = map_files(options.maps) if options.maps else []
-    out.mkdir(parents=True, exist_ok=True)
     plain, faulty = measured_worlds(KINDS, options)
     both = {"as it is": plain, "with faults": faulty}
     sections = {
-        "Time over the best possible": _stages(plain),
+        "Time over the best possible": _stages(plain, faulty),
         "From mission to mission": _curve(out / "curve.png", plain),
         "World by world": _worlds(plain),
         "Expected times": _forecasts(both),
-        "Faults": table(
-            ["drives", *STAGES],
-            [[name, *_medians(some, LEARNED, STAGES)] for name, some in both.items()],
-        ),
         "Speed": _times(),
         "True and learned slowness": _picture(out / "map.png"),
     }
     if not options.quick:
         sections["When all slow zones move"] = table(
             ["missions", *MOVED_STAGES],
-            [[name, *_medians(plain, name, MOVED_STAGES)] for name in PLANNERS],
+            [[name, *_ratios(plain, name, MOVED_STAGES)] for name in PLANNERS],
         )
     if maps:
-        plain, _ = measured_worlds(maps, options)
-        sections["Maps from files"] = _stages(plain)
+        plain, faulty = measured_worlds(maps, options)
+        sections["Maps from files"] = _stages(plain, faulty)
         sections["Maps from files, world by world"] = _worlds(plain)
     return write_report(out, sections, options.page)
 
@@ -223,22 +217,18 @@ def map_files(folder: Path) -> list[str]:
     return files
 
 
-def _stages(plain: Sequence[Result]) -> str:
+def _stages(plain: Sequence[Result], faulty: Sequence[Result]) -> str:
     """Return the time over that of the planner that knows: median, best and worst world."""
-    rows = [["bar", *BARS]]
-    for name in reversed(PLANNERS):
-        cells = []
-        for stage in STAGES.values():
-            ratios = [result.ratio(name, *stage) for result in plain]
-            cells.append(f"{np.median(ratios):.3f} ({min(ratios):.3f} to {max(ratios):.3f})")
-        rows.insert(0, [name, *cells])
+    rows = [[name, *_ratios(plain, name, STAGES)] for name in PLANNERS]
+    rows += [["learned, with faults", *_ratios(faulty, LEARNED, STAGES)], ["bar", *BARS]]
     return table(["missions", *STAGES], rows)
 
 
-def _medians(
+def _ratios(
     results: Sequence[Result], planner: str, stages: Mapping[str, tuple[int, int]]
 ) -> list[str]:
-    return [f"{np.median([r.ratio(planner, *s) for r in results]):.3f}" for s in stages.values()]
+    of_stages = [[result.ratio(planner, *of) for result in results] for of in stages.values()]
+    return [median_and_range(ratios, 3) for ratios in of_stages]
 
 
 def _worlds(plain: Sequence[Result]) -> str:
@@ -336,26 +326,20 @@ def _picture(path: Path, kind: str = "office", seed: int = 1, missions: int = 50
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the program; return the exit code."""
-    parser = argparse.ArgumentParser("driving.py", None, __doc__, formatter_class=HelpFormatter)
-    add = parser.add_argument
-    add("--seeds", type=int, default=5, metavar="N", help="worlds of each kind")
-    add("--out", type=Path, default=Path("runs/driving"), help="folder of the report")
-    add("--maps", type=Path, metavar="FOLDER", help="measure on the ROS maps of a folder too")
-    add("--quick", action="store_true", help="fewer missions, into the folder quick")
-    words = "what drives the missions: this machine's cores, or a cluster"
-    add("--backend", choices=BACKENDS, default="loky", help=words)
-    add("--page", type=Path, metavar="FILE", help="a page of the docs that gets the results too")
+    parser = parser_of("driving.py", __doc__, "runs/driving")
+    words = "measure on the ROS maps of a folder too"
+    parser.add_argument("--maps", type=Path, metavar="FOLDER", help=words)
     options = parser.parse_args(arguments)
+    return exit_code(parser.prog, lambda: measure(options))
 
-    def measure() -> int:
-        if options.seeds < 1:
-            raise ValueError(f"--seeds is {options.seeds}; give at least 1")
-        out = options.out / "quick" if options.quick else options.out
-        print(report(out, options))
-        print(f"saved {out / 'report.md'}")
-        return 0
 
-    return exit_code(parser.prog, measure)
+def measure(options: argparse.Namespace) -> int:
+    """Run the experiment, and print its report."""
+    maps = map_files(options.maps) if options.maps else []
+    out = make_folder(options)
+    print(report(out, options, maps))
+    print(f"saved {out / 'report.md'}")
+    return 0
 
 
 if __name__ == "__main__":

@@ -56,7 +56,6 @@ AGREES = 1e-4
 FIRST_GROUP_END = 16
 """Upper end of the first group of optima; each further group reaches twice as far."""
 
-GROUP: Final = ("set", "size", "optimum")
 COLUMNS: Final = (
     "maps",
     "requests",
@@ -159,21 +158,25 @@ def illegal_moves(cells: Sequence[Cell], legal: NDArray[np.bool_]) -> int:
     return int(np.count_nonzero(~(is_action & legal[:, y, x].T).any(axis=1)))
 
 
-def summarise(rollouts: Sequence[Rollout]) -> list[list[str]]:
-    """Return rows of `GROUP` and `COLUMNS`: by set and size, then by optimum, and last of all.
+def summarise(rollouts: Sequence[Rollout]) -> tuple[list[list[str]], list[list[str]]]:
+    """Return rows by set and size, and rows by optimum, of which the last is of all.
 
     The groups of the optimum are 0-16, 16-32, 32-64 and so on, the upper end excluded.
     """
-    groups: dict[tuple[str, str, str], list[Rollout]] = {}
+    by_set: dict[tuple[str, str], list[Rollout]] = {}
+    by_optimum: dict[str, list[Rollout]] = {}
     for rollout in rollouts:
-        groups.setdefault((rollout.set_name, rollout.size, "all"), []).append(rollout)
+        by_set.setdefault((rollout.set_name, rollout.size), []).append(rollout)
     for rollout in sorted(rollouts, key=lambda rollout: rollout.optimum):
         doublings = max(0, math.frexp(rollout.optimum / FIRST_GROUP_END)[1])
         upper = FIRST_GROUP_END * 2**doublings
         group = f"{upper // 2 if doublings else 0}-{upper}"
-        groups.setdefault(("all", "all", group), []).append(rollout)
-    groups["all", "all", "all"] = list(rollouts)
-    return [[*group, *_row(members)] for group, members in groups.items()]
+        by_optimum.setdefault(group, []).append(rollout)
+    by_optimum["all"] = [*rollouts]
+    return (
+        [[*names, *_row(members)] for names, members in by_set.items()],
+        [[name, *_row(members)] for name, members in by_optimum.items()],
+    )
 
 
 def _row(rollouts: Sequence[Rollout]) -> list[str]:
@@ -197,9 +200,7 @@ def _row(rollouts: Sequence[Rollout]) -> list[str]:
 
 def markdown(rollouts: Sequence[Rollout]) -> str:
     """Return the report: a table by set and size, and one by optimum."""
-    rows = summarise(rollouts)
-    sets = [[name, size, *cells] for name, size, optimum, *cells in rows if optimum == "all"]
-    lengths = [[optimum, *cells] for _, _, optimum, *cells in rows if optimum != "all"]
+    sets, optima = summarise(rollouts)
     text = (
         "Every request has a path. Without action masking: solved too by a rollout that may choose "
         "illegal moves, which end it. Optimal, mean, worst: cost of the rollout over that of the "
@@ -208,7 +209,7 @@ def markdown(rollouts: Sequence[Rollout]) -> str:
     if given := [rollout.agrees for rollout in rollouts if rollout.agrees is not None]:
         text += f"Optima given by files: the oracle agrees with {sum(given)}/{len(given)}.\n"
     by_set = table(["set", "size", *COLUMNS], sets)
-    return f"{text}\n{by_set}\n\n{table(['optimum', *COLUMNS], lengths)}\n"
+    return f"{text}\n{by_set}\n\n{table(['optimum', *COLUMNS], optima)}\n"
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -242,8 +242,6 @@ def inflated_costs(occupancy: Occupancy, radius: float) -> NDArray[np.int8]:
 
     They are ``99 ** (1 - (d - 1) / radius)`` at a distance of d cells, and 0 beyond `radius` cells.
     """
-    if not 0 < radius < np.inf:
-        raise ValueError(f"radius is {radius}; give cells, finite and > 0")
     distance = np.maximum(clearance(occupancy), 1)  # occupied cells do not matter
     costs = np.where(distance <= radius, np.rint(99 ** (1 - (distance - 1) / radius)), 0)
     return in_free_cells(occupancy, costs)

@@ -10,7 +10,6 @@ import os
 import signal
 import sys
 from collections.abc import Callable, Sequence
-from pathlib import Path
 from typing import Final
 
 # Before NumPy is imported. On a busy machine, several threads are ten times as slow as one.
@@ -23,9 +22,9 @@ import goal_3
 import torch
 from settings import HIDDEN_UNITS, Settings
 from tables import write_report
-from trainings import BACKENDS, Training, in_parallel, train
+from trainings import Training, in_parallel, make_folder, parser_of, train
 
-from ddqn_planner.cli import HelpFormatter, exit_code
+from ddqn_planner.cli import exit_code
 from ddqn_planner.grid import Noise
 
 EXPERIMENTS: Final[
@@ -43,40 +42,31 @@ EXPERIMENTS: Final[
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the program; return the exit code."""
-    parser = argparse.ArgumentParser("reproduce.py", None, __doc__, formatter_class=HelpFormatter)
+    parser = parser_of("reproduce.py", __doc__, "runs/reproduce")
     add = parser.add_argument
     add("--experiment", choices=[*EXPERIMENTS, "all"], default="all", help="one, or all")
-    add("--seeds", type=int, default=5, metavar="N", help="trainings per table row")
-    add("--out", type=Path, default=Path("runs/reproduce"), help="folder of trainings and report")
     noise = [noise.value for noise in Noise]
     add("--noise", nargs="+", choices=noise, default=noise, help="new obstacles of goal iii")
     units = "hidden layers of the paper's network for goal iii"
     add("--hidden-units", nargs="+", type=int, default=[*HIDDEN_UNITS], metavar="N", help=units)
-    add("--quick", action="store_true", help="train too briefly to learn, into the folder quick")
-    words = "what runs the trainings: this machine's cores, or a cluster"
-    add("--backend", choices=BACKENDS, default="loky", help=words)
-    add("--page", type=Path, metavar="FILE", help="a page of the docs that gets the results too")
     options = parser.parse_args(arguments)
     return exit_code(parser.prog, lambda: reproduce(options))
 
 
 def reproduce(options: argparse.Namespace) -> int:
-    """Run experiments, and write ``report.md`` with its tables (also as CSV) and figures.
+    """Run experiments, and write ``report.md`` with its tables and figures.
 
     Trainings that an earlier call finished in the same folder are not repeated.
     """
-    if options.seeds < 1:
-        raise ValueError(f"--seeds is {options.seeds}; give at least 1")
     torch.set_num_threads(1)  # so that planning times are those of one thread
     settings = Settings(
-        options.out / "quick" if options.quick else options.out,
+        make_folder(options),
         options.seeds,
         options.quick,
         tuple(map(Noise, dict.fromkeys(options.noise))),
         tuple(dict.fromkeys(options.hidden_units)),
         options.backend,
     )
-    settings.out.mkdir(parents=True, exist_ok=True)
     names = [*EXPERIMENTS] if options.experiment == "all" else [options.experiment]
     # Experiments share trainings: each folder is trained once.
     trainings = {

@@ -18,15 +18,13 @@ from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import matplotlib
-
-matplotlib.use("Agg")
 import gymnasium
 import matplotlib.pyplot as plt
 import nano_astar
 import numpy as np
 import pyastar2d
 import torch
+from figures import COLOURS
 from random_maps import KINDS, generate_map
 from stable_baselines3 import DQN
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
@@ -44,8 +42,7 @@ from ddqn_planner.training.hyper_parameters import HyperParameters
 from ddqn_planner.training.trainer import Trainer
 
 RULE = MoveRule.ROBOT_SAFE
-COLOURS = {"random_20": "#0072B2", "rooms": "#D55E00", "office": "#009E73", "maze": "#CC79A7"}
-"""The kinds of maps of requests, each with a colour that colour-blind readers can tell apart."""
+MAP_KINDS = ("random_20", "rooms", "office", "maze")
 REQUESTS, ROUNDS, FIELDS, CHANGES = 15, 3, 100, 100
 STEPS, TRAINING_ROUNDS = 3_000, 5
 FLIPPED = 10
@@ -108,7 +105,7 @@ def measure_paper_map() -> list[bool]:
 def measure_requests(side: int) -> list[bool]:
     """Compare a request on a new map with A* in C++, and time one to a goal that is known."""
     missed = []
-    for kind in COLOURS:
+    for kind in MAP_KINDS:
         random, times = np.random.default_rng(0), []
         occupancy = generate_map(kind, (side, side), random)
         of_nano = occupancy.astype(np.uint8)
@@ -212,8 +209,8 @@ def measure_replans(side: int) -> list[bool]:
     missed = []
     for change_kind in CHANGE_KINDS:
         ratios: list[tuple[float, str, float, float]] = []
-        for map_kind in COLOURS:
-            for drawn in draw_changes(map_kind, side, change_kind, CHANGES // len(COLOURS)):
+        for map_kind in MAP_KINDS:
+            for drawn in draw_changes(map_kind, side, change_kind, CHANGES // len(MAP_KINDS)):
                 (ms, fresh_ms), (ours, fresh) = take_turns(
                     partial(plan_after, *drawn, True), partial(plan_after, *drawn, False)
                 )
@@ -364,7 +361,7 @@ def draw_times() -> None:
     shared: dict[str, Any] = {"sharex": True, "sharey": True, "layout": "constrained"}
     figure, axes = plt.subplots(1, len(sides), figsize=(10.5, 3.2), **shared)
     for axis, side in zip(axes, sides, strict=True):
-        for kind, colour in COLOURS.items():
+        for kind, colour in zip(MAP_KINDS, COLOURS, strict=True):
             random, points = np.random.default_rng(0), []
             occupancy = generate_map(kind, (side, side), random)
             for cells in random_requests(occupancy, RULE, 2 * REQUESTS, random):

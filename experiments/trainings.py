@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import time
 from collections.abc import Callable, Sequence
 from contextlib import closing
@@ -16,6 +17,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 from tqdm import tqdm
 
+from ddqn_planner.cli import HelpFormatter
 from ddqn_planner.files import write_csv
 from ddqn_planner.grid import LENGTHS, MoveRule, legal_moves, neighbours, shortest_distances
 from ddqn_planner.planning import Plan, Planner
@@ -46,6 +48,28 @@ class Training:
     scenarios: tuple[Scenario, ...]
     seed: int
     evaluation_interval: int
+
+
+def parser_of(program: str, description: str | None, out: str) -> argparse.ArgumentParser:
+    """Return a parser with the options of an experiment with seeds."""
+    parser = argparse.ArgumentParser(program, None, description, formatter_class=HelpFormatter)
+    add = parser.add_argument
+    add("--seeds", type=int, default=5, metavar="N", help="trainings, or worlds of each kind")
+    add("--out", type=Path, default=Path(out), help="folder of what is written")
+    add("--quick", action="store_true", help="a short trial, into the folder quick")
+    words = "what runs the work: this machine's cores, or a cluster"
+    add("--backend", choices=BACKENDS, default="loky", help=words)
+    add("--page", type=Path, metavar="FILE", help="a page of the docs that gets the results too")
+    return parser
+
+
+def make_folder(options: argparse.Namespace) -> Path:
+    """Check the seeds; make and return the folder of the report."""
+    if options.seeds < 1:
+        raise ValueError(f"--seeds is {options.seeds}; give at least 1")
+    out: Path = options.out / "quick" if options.quick else options.out
+    out.mkdir(parents=True, exist_ok=True)
+    return out
 
 
 def in_parallel(

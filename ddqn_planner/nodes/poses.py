@@ -275,10 +275,11 @@ class StartSource:
         if self.source == "tf":
             return self._pose_by_tf()
         topic = self._subscription.topic_name
+        if self._pose is not None and self.source == "initialpose":
+            return self._pose
         if self._pose is not None:
             silent = (self._node.get_clock().now() - self._came).nanoseconds / 1e9
-            patience = max(self._node.value("transform_tolerance"), SILENCE)
-            if self.source == "initialpose" or silent <= patience:
+            if silent <= max(self._node.value("transform_tolerance"), SILENCE):
                 return self._pose
             often = "publish it more often, set transform_tolerance"
             problem = f"nothing came on {topic} for {silent:.3g} s; {often}"

@@ -29,4 +29,4 @@ def test_a_drive_is_the_same_each_time_and_flips_less_with_a_threshold() -> None
     )
     assert without == again
     assert with_threshold.flips < without.flips
-    assert min(without.length, with_threshold.length) >= 75
+    assert min(without.cost, with_threshold.cost) >= 75

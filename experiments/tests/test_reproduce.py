@@ -23,7 +23,6 @@ from trainings import (
     MOVE_RULE,
     Training,
     best_moves,
-    cross_entropy,
     evaluate_training,
     in_parallel,
     optimal_value,
@@ -186,14 +185,6 @@ def test_a_supervised_network_learns_the_best_moves(small: Scenario, tmp_path: P
     (tmp_path / "model.safetensors").write_text("kept")
     train_supervised(training)
     assert (tmp_path / "model.safetensors").read_text() == "kept"
-
-
-def test_cross_entropy_is_that_of_all_best_moves_together() -> None:
-    torch = pytest.importorskip("torch")
-    best = torch.tensor([[True, True, False, False], [False, False, False, True]])
-    q = torch.tensor([[0.0, 0.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]])
-    expected = (np.log(2) + np.log(3 + np.e) - 1) / 2
-    assert float(cross_entropy(q, best)) == pytest.approx(expected)
 
 
 def evaluations(length: list[float]) -> np.ndarray:

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from client import pose, wait_for, wait_for_map
+from client import cells_of, pose, wait_for, wait_for_map
 from diagnostic_msgs.msg import DiagnosticArray
 from nav_msgs.msg import OccupancyGrid
 from nav_msgs.msg import Path as PathMessage
@@ -17,7 +17,7 @@ from nav_msgs.srv import GetMap, LoadMap
 from std_srvs.srv import Trigger
 
 from ddqn_planner import Planner
-from ddqn_planner.grid import MOVES, Cell, GridMap, MapFile, read_map_file, save_map
+from ddqn_planner.grid import MOVES, GridMap, MapFile, read_map_file, save_map
 from ddqn_planner.nodes.runtime import LATCHED
 from ddqn_planner.resources import find_map
 
@@ -37,11 +37,6 @@ def client(run_node: Any, make_client: Callable[[str], Any]) -> Iterator[Any]:
         yield make_client("/hall")
 
 
-def cells_of(path: PathMessage, grid: GridMap) -> list[Cell]:
-    points = [stamped.pose.position for stamped in path.poses]
-    return [grid.world_to_cell(point.x, point.y) for point in points]
-
-
 def wait_until_planned(client: Any, ends: tuple[Any, Any]) -> PathMessage:
     """Return the first path that is not empty: before it, map or model may be missing."""
 
@@ -56,12 +51,10 @@ def test_paths_there_and_back_obey_the_served_directions(client: Any) -> None:
     map_file = read_map_file(find_map("warehouse"))
     grid, planner = map_file.grid(), Planner.load("any_map")
     legal, moves = grid.legal_moves("robot_safe"), MOVES.tolist()
-    start, goal = map_file.start, map_file.goal
-    assert start is not None
-    assert goal is not None
-    for ends in ((start, goal), (goal, start)):
+    there = map_file.start, map_file.goal
+    for ends in (there, there[::-1]):
         path = wait_until_planned(client, tuple(pose(grid, cell) for cell in ends))
-        cells = cells_of(path, grid)
+        cells = cells_of(grid, path)
         assert tuple(cells) == planner.plan(grid, *ends).cells
         for (x, y), (next_x, next_y) in pairwise(cells):
             assert legal[moves.index([next_x - x, next_y - y]), y, x]

@@ -11,9 +11,10 @@ from typing import Any
 import numpy as np
 import pytest
 from builtin_interfaces.msg import Time
+from client import cells_of
 from diagnostic_msgs.msg import DiagnosticStatus
 from geometry_msgs.msg import PoseStamped, TransformStamped
-from integration.robot import TIMEOUT, Robot, points_of, values_of
+from integration.robot import TIMEOUT, Robot, values_of
 from std_msgs.msg import Header
 
 from ddqn_planner.grid import GridMap
@@ -108,8 +109,7 @@ def test_updates_close_and_open_doors(robot: Robot) -> None:
         robot.client.publish("global_costmap/costmap_updates", update)
 
     def is_passed(door: tuple[int, int]) -> Callable[[Any], bool]:
-        place = robot.grid.cell_to_world((door[1], door[0]))
-        return lambda path: any(np.allclose(place, point) for point in points_of(path))
+        return lambda path: door[::-1] in cells_of(robot.grid, path)
 
     robot.send_goal(robot.pose((35, 5)))
     robot.plans.wait(is_passed(DOORS[0]))
@@ -150,9 +150,8 @@ def test_poses_in_other_frames_are_transformed(robot: Robot) -> None:
         client.publish("/tf", message, listeners=0)
 
     def ends(path: Any) -> list[tuple[int, int]]:
-        return [
-            robot.grid.world_to_cell(*point) for point in points_of(path)[:: len(path.poses) - 1]
-        ]
+        cells = cells_of(robot.grid, path)
+        return [cells[0], cells[-1]]
 
     robot.set(transform_tolerance=60.0)
     timer = client.node.create_timer(0.02, send_transforms)
