@@ -14,7 +14,6 @@ import pytest
 from ddqn_planner import (
     Experience,
     GridMap,
-    MoveRule,
     Plan,
     Planner,
     PlanStatus,
@@ -162,10 +161,3 @@ def test_cells_that_are_no_neighbours_have_no_expected_time() -> None:
     for cells in ([(0, 0), (2, 0)], [(0, 0), (0, 0)], [(0, 0), (1, 0), (1, 2)]):
         with pytest.raises(ValueError, match="neighbouring"):
             EXPERIENCE.expected_time(GRID, cells)
-
-
-@pytest.mark.parametrize("rule", MoveRule)
-def test_arrays_of_cells_are_as_good_as_lists(rule: MoveRule) -> None:
-    array = np.array(CELLS, dtype=np.int16)
-    assert simplify(array, GRID, rule) == simplify(CELLS, GRID, rule) == tuple(CELLS)
-    assert EXPERIENCE.expected_time(GRID, array) == EXPERIENCE.expected_time(GRID, CELLS)

@@ -192,33 +192,6 @@ def test_plan_searches_in_fallback_mode(capsys: pytest.CaptureFixture[str]) -> N
     assert ", astar_fallback, planned in" in printed
 
 
-@pytest.mark.parametrize(
-    ("arguments", "unused"),
-    [
-        (["--help"], ("numpy", "ddqn_planner.grid")),
-        (["plan", "--help"], ("rclpy", "matplotlib")),
-        (["plan", "dilemma"], ("torch", "matplotlib", "ddqn_planner.training", "tqdm")),
-        (["certify"], ("torch", "numba", "scipy", "ddqn_planner.planning")),
-    ],
-)
-def test_a_command_imports_only_what_it_needs(
-    arguments: list[str], unused: tuple[str, ...]
-) -> None:
-    code = f"""if True:
-        import sys
-        from ddqn_planner.cli import main
-        try:
-            main({arguments})
-        except SystemExit:
-            pass
-        print(sorted(set({unused}) & set(sys.modules)), file=sys.stderr)
-    """
-    command = [sys.executable, "-c", code]
-    done = subprocess.run(command, check=True, capture_output=True, text=True)
-    assert done.stderr.splitlines()[-1] == "[]"  # after a line where functions are compiled
-    assert done.stdout
-
-
 def test_a_missing_library_is_named_with_how_to_get_it(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:

@@ -69,6 +69,21 @@ def test_a_plan_needs_numba_alone() -> None:
     loaded(code)
 
 
+@pytest.mark.parametrize(
+    ("arguments", "unused"),
+    [
+        (["--help"], {"numpy"}),
+        (["plan", "--help"], {"rclpy", "matplotlib"}),
+        (["plan", "dilemma"], {"torch", "matplotlib", "gymnasium", "tqdm"}),
+        (["certify"], {"torch", "numba", "scipy"}),
+    ],
+)
+def test_a_command_loads_only_what_it_needs(arguments: list[str], unused: set[str]) -> None:
+    code = "import contextlib; from ddqn_planner.cli import main\n"
+    code += f"with contextlib.suppress(SystemExit): main({arguments})"
+    assert not loaded(code) & unused
+
+
 def test_where_torch_is_missing_a_plan_is_made() -> None:
     loaded("import sys; sys.modules['torch'] = None\n" + PLAN)
 

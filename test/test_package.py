@@ -38,12 +38,6 @@ def test_imports_run_downwards(room: str) -> None:
                 assert room == "nodes" or not module.startswith("rclpy"), f"{path}: {module}"
 
 
-def test_the_source_tree_holds_maps_and_models() -> None:
-    found = find_resource("maps", "dilemma.yaml")
-    assert found.resolve() == ROOT / "maps" / "dilemma.yaml"
-    assert find_resource("models", "dilemma.safetensors").is_file()
-
-
 def test_a_missing_resource_is_named_with_those_that_are_there() -> None:
     with pytest.raises(FileNotFoundError, match=r"'nowhere\.yaml'.*dilemma\.yaml, office"):
         find_resource("maps", "nowhere.yaml")
@@ -133,6 +127,16 @@ def package_share(prefix: Path) -> Path:
     return marker.parents[3] / "ddqn_planner"
 
 
+def test_a_map_is_a_shipped_one_or_a_path() -> None:
+    shipped = ROOT / "maps" / "dilemma.yaml"
+    for name in ("dilemma", "dilemma.yaml", "package://ddqn_planner/maps/dilemma.yaml"):
+        assert find_map(name).resolve() == shipped
+    assert find_map("file:///somewhere/map.yaml") == Path("/somewhere/map.yaml")
+    for name in ("no_such", "package://no_such/map.yaml"):
+        with pytest.raises(FileNotFoundError, match="no_such"):
+            find_map(name)
+
+
 def test_a_file_hides_a_shipped_map_but_a_folder_does_not(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -144,20 +148,3 @@ def test_a_file_hides_a_shipped_map_but_a_folder_does_not(
     (tmp_path / "office.yaml").touch()
     assert find_map("office.yaml") == Path("office.yaml")
     assert find_map("office").is_relative_to(shipped.parent)
-
-
-@pytest.mark.parametrize(
-    "name", ["dilemma", "dilemma.yaml", "package://ddqn_planner/maps/dilemma.yaml"]
-)
-def test_a_shipped_map_is_found_by_name(name: str) -> None:
-    assert find_map(name).resolve() == ROOT / "maps" / "dilemma.yaml"
-
-
-def test_a_path_is_left_as_it_is() -> None:
-    assert find_map("file:///somewhere/map.yaml") == Path("/somewhere/map.yaml")
-
-
-@pytest.mark.parametrize("name", ["no_such", "package://no_such/map.yaml"])
-def test_a_missing_map_is_named(name: str) -> None:
-    with pytest.raises(FileNotFoundError, match="no_such"):
-        find_map(name)

@@ -190,6 +190,9 @@ class Manager:
         answer: bool = self.client.call(ChangeState, "planner/change_state", request).success
         return answer
 
+    def start(self) -> None:
+        assert all(map(self.change, ("configure", "activate")))
+
     @property
     def state(self) -> str:
         label: str = self.client.call(GetState, "planner/get_state").current_state.label

@@ -105,8 +105,7 @@ def test_each_transition_creates_enables_stops_and_frees(robot: Robot, managed: 
 
 def test_no_request_for_a_transition_ends_the_planner(robot: Robot, managed: Any) -> None:
     manager = Manager(robot.client)
-    assert manager.change("configure")
-    assert manager.change("activate")
+    manager.start()
     for label in ("configure", "activate", "cleanup", "no_such", "transition_error", "ü" * 99):
         assert not manager.change(label)
     for number in (0, 1, 2, 3, 5, 6, 8, 10, 60, 62, 77, 255):
@@ -138,8 +137,7 @@ def test_the_parameters_of_an_unconfigured_planner_are_checked_and_used(
         wait_for("only what is always there", lambda: not created(robot))
         model.write_text("a model")
     shutil.copy(robot.model, model)
-    assert manager.change("configure")
-    assert manager.change("activate")
+    manager.start()
     robot.wait_for_reason("", {"model file": str(model), "state": "active"})
     robot.set_map(robot.stamped_map())
     robot.assert_works()
@@ -165,8 +163,7 @@ def test_the_planner_survives_transitions_among_requests(robot: Robot) -> None:
                 publisher.publish(message)
         assert manager.change(label)
     assert manager.state == "unconfigured"
-    assert manager.change("configure")
-    assert manager.change("activate")
+    manager.start()
     robot.set_map(robot.stamped_map())
     robot.assert_works()
 
@@ -189,8 +186,7 @@ def test_requests_that_wait_are_answered_when_the_planner_is_stopped(
         robot.wait_for_reason("the node is not active", {"status": "NOT_ACTIVE"})
         assert manager.change("cleanup")
         load_gate.touch()
-        assert manager.change("configure")
-        assert manager.change("activate")
+        manager.start()
         robot.set_map(robot.stamped_map())
         robot.assert_works()
         assert robot.plans.messages() == []
@@ -198,27 +194,6 @@ def test_requests_that_wait_are_answered_when_the_planner_is_stopped(
         assert manager.state == "finalized"
         labels = "configure", "activate", "deactivate", "cleanup", "shutdown"
         assert not any(map(manager.change, labels))
-
-
-def test_a_planner_that_is_stopped_while_it_plans_leaves_the_graph_at_once(
-    run_node: Any, make_robot: MakeRobot
-) -> None:
-    with run_node("planner_node", namespace="/ended") as node:
-        robot = make_robot("/ended")
-        rooms = generated_map("rooms", 500)
-        robot.set_map(rooms.message(next(NUMBERS)))
-        start, *goals = rooms.grid.free_cells()
-        plans = robot.client.service(GetPlan, "planner/get_plan")
-        requests = [plan_request(rooms.grid, start, goal) for goal in goals[-100:]]
-        before = cpu_seconds(node.process.pid)
-        answers = [plans.call_async(request) for request in requests]
-        wait_for("fields under way", lambda: cpu_seconds(node.process.pid) > before + 0.2)
-        assert node.stop(signal.SIGTERM) == 0
-        assert not re.search("ERROR|Traceback", node.log)
-        graph = robot.client.node
-        name = "planner", "/ended"
-        wait_for("farewell", lambda: name not in graph.get_node_names_and_namespaces(), timeout=10)
-        assert not all(answer.done() for answer in answers)
 
 
 def test_the_bond_breaks_when_the_planner_is_stopped(
@@ -230,8 +205,7 @@ def test_the_bond_breaks_when_the_planner_is_stopped(
     with run_node("planner_node", parameters, namespace="/bonded") as node:
         manager = Manager(make_robot("/bonded"))
         bond = manager.client.subscribe(status, "bond")
-        assert manager.change("configure")
-        assert manager.change("activate")
+        manager.start()
         bond.wait(lambda message: message.active)
         node.forget_log()
         assert node.stop(signal.SIGTERM) == 0
@@ -260,3 +234,23 @@ def test_cleanup_frees_map_model_and_fields(make_robot: MakeRobot, model: Path) 
         rclpy.shutdown()
         spinning.join()
         node.destroy_node()
+
+
+def test_a_planner_that_is_stopped_while_it_plans_leaves_the_graph_at_once(
+    robot: Robot, managed: Any
+) -> None:
+    """The last test, as it ends the planner of the others."""
+    Manager(robot.client).start()
+    rooms = generated_map("rooms", 500)
+    robot.set_map(rooms.message(next(NUMBERS)))
+    start, *goals = rooms.grid.free_cells()
+    plans = robot.client.service(GetPlan, "planner/get_plan")
+    requests = [plan_request(rooms.grid, start, goal) for goal in goals[-100:]]
+    before = cpu_seconds(managed.process.pid)
+    answers = [plans.call_async(request) for request in requests]
+    wait_for("fields under way", lambda: cpu_seconds(managed.process.pid) > before + 0.2)
+    assert managed.stop(signal.SIGTERM) == 0
+    assert not re.search("ERROR|Traceback", managed.log)
+    name, graph = ("planner", "/managed"), robot.client.node
+    wait_for("farewell", lambda: name not in graph.get_node_names_and_namespaces(), timeout=10)
+    assert not all(answer.done() for answer in answers)

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 from diagnostic_msgs.msg import DiagnosticStatus
-from integration.robot import GOAL, START, TIMEOUT, Manager, Robot, check_path, values_of
+from integration.robot import GOAL, START, TIMEOUT, Robot, values_of
 from nav_msgs.srv import GetPlan
 
 PATCHES = """
@@ -66,54 +66,53 @@ def make_robot(
     return make
 
 
-def test_requests_wait_for_the_first_model_and_the_first_map_and_need_no_torch(
+def test_requests_wait_for_the_first_map_and_need_no_torch(
     run_node: Any, make_robot: MakeRobot, load_gate: Path, model: Path
 ) -> None:
+    load_gate.touch()
     with run_node("planner_node", {}, namespace="/early") as node:
         robot = make_robot("/early")
-        client, manager = robot.client, Manager(robot.client)
-        for is_first in (True, False):
-            if is_first:
-                robot.set_map(robot.map_message())
-            robot.send_start(robot.pose(START))
-            robot.send_goal(robot.pose(GOAL))
-            plan, answered = ask_for_plan(robot)
-            if is_first:
-                status = robot.wait_for_reason("the model is being loaded")
-                assert (status.level, values_of(status)["model"]) == (
-                    DiagnosticStatus.WARN,
-                    "any_map",
-                )
-            assert client.get_parameter("planner", "mode") == "greedy"
-            assert not plan.done()
-            assert robot.plans.messages() == []
-            load_gate.touch() if is_first else robot.send_map()
-            assert answered.wait(TIMEOUT)
-            assert plan.result().plan.poses
-            check_path(plan.result().plan, robot.grid)
-            robot.wait_for_path(START, GOAL)
-            robot.wait_for_reason("^a path of [^;]*$")
-            assert all(path.poses for path in robot.plans.messages())
-            assert client.set_parameters("planner", model=str(model))[0].successful
-            robot.assert_works()
-            # Numba itself loads scipy.
-            assert node.heavy_libraries <= {"numba", "scipy"}
-            assert all(map(manager.change, ("deactivate", "cleanup", "configure", "activate")))
-            robot.clear()
-        assert "refused" not in node.log
-
-
-def test_a_model_that_is_set_while_the_first_one_is_loaded_stays(
-    run_node: Any, make_robot: MakeRobot, model: Path, load_gate: Path
-) -> None:
-    with run_node("planner_node", {}, namespace="/overtaken") as node:
-        robot = make_robot("/overtaken")
-        node.wait_for_log("a model waits")
+        robot.send_start(robot.pose(START))
+        robot.send_goal(robot.pose(GOAL))
+        plan, answered = ask_for_plan(robot)
+        robot.diagnostics.wait(lambda array: "model file" in values_of(array.status[0]))
+        assert not plan.done()
+        robot.send_map()
+        assert answered.wait(TIMEOUT)
+        assert plan.result().plan.poses
+        robot.wait_for_path(START, GOAL)
+        assert all(path.poses for path in robot.plans.messages())
         assert robot.client.set_parameters("planner", model=str(model))[0].successful
-        load_gate.touch()
-        robot.set_map(robot.map_message())
         robot.assert_works()
-        assert values_of(robot.wait_for_reason("^a path of "))["model file"] == str(model)
+        # Numba itself loads scipy.
+        assert node.heavy_libraries <= {"numba", "scipy"}
+
+
+@pytest.mark.parametrize("other", [False, True])
+def test_requests_wait_for_the_first_model_and_another_one_that_is_set_meanwhile_stays(
+    run_node: Any, make_robot: MakeRobot, model: Path, load_gate: Path, other: bool
+) -> None:
+    with run_node("planner_node", {}, namespace=f"/waiting_{other}") as node:
+        robot = make_robot(f"/waiting_{other}")
+        robot.set_map(robot.map_message())
+        robot.send_start(robot.pose(START))
+        robot.send_goal(robot.pose(GOAL))
+        plan, answered = ask_for_plan(robot)
+        status = robot.wait_for_reason("the model is being loaded")
+        assert (status.level, values_of(status)["model"]) == (DiagnosticStatus.WARN, "any_map")
+        assert robot.client.get_parameter("planner", "mode") == "greedy"
+        assert not plan.done()
+        assert robot.plans.messages() == []
+        if other:
+            assert robot.client.set_parameters("planner", model=str(model))[0].successful
+        load_gate.touch()
+        assert answered.wait(TIMEOUT)
+        assert plan.result().plan.poses
+        robot.wait_for_path(START, GOAL)
+        if other:
+            robot.assert_works()
+            assert values_of(robot.wait_for_reason("^a path of "))["model file"] == str(model)
+        assert "refused" not in node.log
 
 
 def test_a_first_model_that_cannot_be_loaded_answers_the_requests_that_waited(
