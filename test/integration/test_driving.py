@@ -277,6 +277,7 @@ def test_who_gives_up_ends_the_drive_and_moves_fail_there(site: Site) -> None:
         send(1, GoalStatus.STATUS_ABORTED)
         send(2, GoalStatus.STATUS_ABORTED)
 
+    site.move(LOWER[:1], 0.5)
     send(1, GoalStatus.STATUS_ABORTED)  # before: nobody knows where
     site.send_goal(*LOWER[3])
     site.drive(LOWER[1:3], 0.5, then=aborts)
