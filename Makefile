@@ -7,9 +7,9 @@ BIN := $(VENV)/bin
 # With a sourced ROS 2 Jazzy its rclpy is used, else the wheels from PyPI.
 ifeq ($(ROS_DISTRO),jazzy)
 VENV_FLAGS := --system-site-packages
-EXTRAS := bags,experiments,figures,test,train
+EXTRAS := bags,experiments,figures,test,train,watch
 else
-EXTRAS := bags,experiments,figures,ros,test,train
+EXTRAS := bags,experiments,figures,ros,test,train,watch
 endif
 
 .PHONY: setup demo demo-driving test test-fast experiments-test docs lint format types bench body faults fuzz load soak model model-dilemma

@@ -44,6 +44,7 @@ setup(
         "figures": ["matplotlib>=3.6"],
         "experiments": ["joblib>=1.3", "matplotlib>=3.6"],
         "bags": ["mcap-ros2-support>=0.5"],
+        "watch": ["rerun-sdk>=0.39"],
         "docs": ["furo", "myst-parser>=3.0", "sphinx>=7.3"],
         "bench": ["nano-astar>=0.1.2", "psutil>=5.9", "pyastar2d>=1.1", "stable-baselines3>=2.6"],
         "test": [

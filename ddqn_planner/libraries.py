@@ -12,6 +12,7 @@ PACKAGES: Final = {
     "mcap": "mcap-ros2-support",
     "mcap_ros2": "mcap-ros2-support",
     "numba": "numba",
+    "rerun": "'rerun-sdk>=0.39'",
     "safetensors": "safetensors",
     "torch": "torch gymnasium",
 }

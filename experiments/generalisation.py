@@ -36,6 +36,7 @@ from tables import table
 from tqdm import tqdm
 
 from ddqn_planner.cli import HelpFormatter, exit_code
+from ddqn_planner.files import write_atomically, write_csv
 from ddqn_planner.grid import (
     MOVES,
     Cell,
@@ -229,6 +230,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     add("--requests", type=int, default=200, metavar="N", help="requests per map")
     add("--costs", choices=COSTS, default="none", help="costs of free cells")
     add("--seed", type=int, default=0, help="seed of maps and requests")
+    add("--out", type=Path, metavar="FILE", help="a .md or .csv file for the tables")
     options = parser.parse_args(arguments)
     return exit_code(parser.prog, lambda: run(options))
 
@@ -237,6 +239,8 @@ def run(options: argparse.Namespace) -> int:
     """Run the program with its options; return the exit code."""
     if options.maps < 1:
         raise ValueError(f"--maps is {options.maps}; give at least 1")
+    if options.out and options.out.suffix.lower() not in (".csv", ".md"):
+        raise ValueError(f"--out is {options.out}; give a file that ends in .csv or .md")
     rule = MoveRule(options.move_rule)
     settings = RequestSettings(rule, options.requests, options.costs, options.seed)
     planner = Planner.load(options.model)
@@ -253,11 +257,19 @@ def run(options: argparse.Namespace) -> int:
         print("interrupted; the tables hold the maps so far", file=sys.stderr)
     if rollouts:
         model = planner.metadata
-        print(
+        text = (
             f"Model {options.model} ({model.network}, {model.steps:,} steps, seed {model.seed}), "
-            f"move rule {rule.value}, costs {options.costs}, requests of seed {options.seed}.\n"
+            f"move rule {rule.value}, costs {options.costs}, requests of seed {options.seed}.\n\n"
+            f"{markdown(rollouts)}"
         )
-        print(markdown(rollouts), end="")
+        print(text, end="")
+        if options.out and options.out.suffix.lower() == ".csv":
+            sets, lengths = summarise(rollouts)
+            rows = [[name, size, "all", *cells] for name, size, *cells in sets]
+            rows += [["all", "all", *row] for row in lengths]
+            write_csv(options.out, ["set", "size", "optimum", *COLUMNS], rows)
+        elif options.out:
+            write_atomically(options.out, text.encode())
     elif not interrupted:
         raise ValueError(f"{options.data}: none of its files has a request; see above")
     return 130 if interrupted else 0

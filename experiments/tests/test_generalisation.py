@@ -314,13 +314,20 @@ def model(tmp_path_factory: pytest.TempPathFactory) -> str:
     return str(path)
 
 
-def test_the_program_prints_its_tables(capsys: pytest.CaptureFixture[str], model: str) -> None:
+def test_the_program_prints_and_writes_its_tables(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path, model: str
+) -> None:
     command = ["--model", model, "--kinds", "maze", "random_10", "--sizes", "8", "16"]
-    assert main([*command, "--maps", "2", "--requests", "12"]) == 0
-    printed = capsys.readouterr().out
-    assert "move rule robot_safe, costs none, requests of seed 0." in printed
-    for row in ("maze | 8x8", "maze | 16x16", "random_10 | 8x8", "random_10 | 16x16"):
-        assert f"| {row} | 2 | 24 |" in printed
+    for name, mark in (("tables.md", " | "), ("tables.csv", ",")):
+        out = tmp_path / name
+        assert main([*command, "--maps", "2", "--requests", "12", "--out", str(out)]) == 0
+        printed = capsys.readouterr().out
+        assert "move rule robot_safe, costs none, requests of seed 0." in printed
+        assert out.suffix == ".csv" or out.read_text() == printed
+        for row in ("maze | 8x8", "maze | 16x16", "random_10 | 8x8", "random_10 | 16x16"):
+            assert f"| {row} | 2 | 24 |" in printed
+            group = [*row.split(" | "), *["all"] * (mark == ","), "2", "24", ""]
+            assert mark.join(group).strip() in out.read_text()
 
 
 @pytest.mark.parametrize(
@@ -331,6 +338,7 @@ def test_the_program_prints_its_tables(capsys: pytest.CaptureFixture[str], model
         (["--seed", "-1"], "seed is -1; give at least 0"),
         (["--sizes", "4"], "H, W >= 5"),
         (["--data", "no_such_folder"], "no_such_folder: .*check the path"),
+        (["--out", "tables.txt"], r"tables\.txt; give a file that ends in \.csv or \.md"),
         (["--model", "no_such_model"], "no_such_model"),
         (["--model", "dilemma"], "not trained for maps of 32 x 32"),
     ],

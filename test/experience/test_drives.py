@@ -274,8 +274,10 @@ def test_experience_that_is_broken_or_of_another_robot_is_refused(tmp_path: Path
     assert path.read_bytes() == before
 
 
-def test_forgotten_experience_is_kept_beside_it(tmp_path: Path) -> None:
+def test_a_folder_is_locked_and_keeps_forgotten_experience(tmp_path: Path) -> None:
     folder = opened(tmp_path)
+    with pytest.raises(FolderError, match="another process records in"):
+        opened(tmp_path)
     assert folder.forget() is None
     folder.add(DriveEnd.ARRIVED, *SLOW)
     before = slowness(tmp_path)

@@ -263,9 +263,10 @@ def test_a_wrong_patch_is_named_and_the_remedy_too(arguments: tuple, named: str)
 
 
 def test_a_map_computes_its_labels_once_per_kind_of_rule() -> None:
-    grid = GridMap(ZEROS)
+    grid = GridMap([[0, 1], [1, 0]])
     assert grid.labels("unit") is grid.labels("corner_cutting")
-    assert grid.with_slowness(np.ones((2, 3), np.float32), 1.0).labels("unit").max() == 1
+    assert grid.with_slowness(np.ones((2, 2), np.float32), 1.0).labels("unit").max() == 1
+    assert grid.labels("robot_safe").max() == 2
 
 
 def test_the_memory_of_a_field_on_the_slowest_map_is_bounded() -> None:
