@@ -203,7 +203,7 @@ def test_the_bond_breaks_when_the_planner_is_stopped(
     status = pytest.importorskip("bond.msg").Status
     parameters = {"autostart": False, "model": str(model)}
     with run_node("planner_node", parameters, namespace="/bonded") as node:
-        manager = Manager(make_robot("/bonded"))
+        manager = Manager(make_robot("/bonded").client)
         bond = manager.client.subscribe(status, "bond")
         manager.start()
         bond.wait(lambda message: message.active)
