@@ -137,8 +137,9 @@ def test_nodes_of_the_workspace_plan_with_its_model_on_its_map(
         return running(*sourced(install, program, *arguments))
 
     def names_model(message: DiagnosticArray) -> bool:
-        """The node speaks before it has loaded its model."""
-        return "model file" in values_of(message.status[0])
+        """The node speaks before it has loaded its model, and other tests' nodes speak too."""
+        (status,) = message.status
+        return status.name == "/planner: plan" and "model file" in values_of(status)
 
     client = make_client()
     diagnostics = client.subscribe(DiagnosticArray, "/diagnostics")

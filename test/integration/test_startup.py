@@ -75,7 +75,7 @@ def test_requests_wait_for_the_first_map_and_need_no_torch(
         robot.send_start(robot.pose(START))
         robot.send_goal(robot.pose(GOAL))
         plan, answered = ask_for_plan(robot)
-        robot.diagnostics.wait(lambda array: "model file" in values_of(array.status[0]))
+        node.wait_for_log("planning with the model")
         assert not plan.done()
         robot.send_map()
         assert answered.wait(TIMEOUT)
