@@ -16,7 +16,7 @@ import pytest
 from action_msgs.msg import GoalStatus, GoalStatusArray
 from builtin_interfaces.msg import Time
 from client import Client, initial_pose, map_message, pose, values_of, wait_for
-from diagnostic_msgs.msg import DiagnosticArray
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import Point, Pose, PoseStamped
 from integration.robot import changed
 from nav_msgs.msg import OccupancyGrid, Odometry, Path
@@ -68,14 +68,16 @@ class Site:
 
     def wait_for_state(self, state: str, message: str) -> None:
         self.diagnostics.clear()
+
+        def says(status: DiagnosticStatus) -> bool:
+            return values_of(status)["state"] == state and bool(re.search(message, status.message))
+
+        self._wait_until(says)
+
+    def _wait_until(self, says: Callable[[DiagnosticStatus], bool]) -> None:
+        """Wait for diagnostics of this site's trainer: those of all nodes come on one topic."""
         mine = f"{self.client.node.get_namespace()}/trainer: driving"
-
-        def says(array: DiagnosticArray) -> bool:
-            (status,) = array.status
-            is_it = status.name == mine and values_of(status)["state"] == state
-            return is_it and bool(re.search(message, status.message))
-
-        self.diagnostics.wait(says)
+        self.diagnostics.wait(lambda array: array.status[0].name == mine and says(array.status[0]))
 
     def odometry(self, x: float, y: float) -> Odometry:
         whole = int(self.now)
@@ -89,16 +91,18 @@ class Site:
 
     def send_goal(self, x: float, y: float) -> None:
         """Send a goal, and wait until the trainer has it: poses may overtake it."""
+        self.diagnostics.clear()
         goal = PoseStamped(header=Header(frame_id="map"), pose=pose_at(x, y))
         self.client.publish("goal_pose", goal)
         self.wait_for_place("goal", (x, y))
 
     def wait_for_place(self, which: str, place: tuple[float, float]) -> None:
         text = f"({place[0]:.6g}, {place[1]:.6g})"
-        self.diagnostics.wait(lambda array: values_of(array.status[0]).get(which) == text)
+        self._wait_until(lambda status: values_of(status)[which] == text)
 
     def move(self, points: list[tuple[float, float]], speed: float) -> None:
         """Drive along a line in steps of 0.1 m."""
+        self.diagnostics.clear()
         self.send(self.odometry(*self.at))
         for x, y in points:
             distance = math.dist(self.at, (x, y))
