@@ -235,13 +235,15 @@ def _run_training(
     torch.set_num_threads(1)  # as fast as two for such small networks, and always the same result
     values = {entry.name: getattr(options, entry.name) for entry in fields(HyperParameters)}
     parameters = HyperParameters(**values)
-    with closing(TrainingRun(options.out, scenarios, move_rule, parameters, options.seed)) as run:
-        trainer = run.trainer
+    with ExitStack() as stack:
+        run = TrainingRun(options.out, scenarios, move_rule, parameters, options.seed)
+        trainer = stack.enter_context(closing(run)).trainer
         print(run.description)
         interrupted = threading.Event()
         # An exception could interrupt a step; a flag is read between two steps.
         for number in (signal.SIGINT, signal.SIGTERM):
-            signal.signal(number, lambda *_: interrupted.set())
+            before = signal.signal(number, lambda *_: interrupted.set())
+            stack.callback(signal.signal, number, before)
         # disable=None: no bar if the output is not a terminal.
         with tqdm(total=parameters.steps, initial=trainer.steps, disable=None) as bar:
             for finished in run.steps():
