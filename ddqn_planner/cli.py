@@ -180,7 +180,7 @@ def train(parser: argparse.ArgumentParser, arguments: Sequence[str]) -> int:
     options = parser.parse_args(arguments)
     map_file, start, goal = _read_map(options)
     scenario, rule = Scenario(map_file.grid(), start, goal), MoveRule(options.move_rule)
-    run = _run_training(options, [scenario], rule)
+    run = _run_training(options, lambda: [scenario], rule)
     field = run.trainer.planner().q_field(scenario.grid, goal)
     evaluation, plan = evaluate(field, scenario.grid, rule), field.rollout(start)
     print(
@@ -201,8 +201,9 @@ def train_any_map(parser: argparse.ArgumentParser, arguments: Sequence[str]) -> 
     options = parser.parse_args(arguments)
     if options.maps < 1:
         raise ValueError(f"--maps is {options.maps}; give at least 1")
-    scenarios = random_scenarios(options.seed, options.maps)
-    _run_training(options, scenarios, MoveRule.ROBOT_SAFE)
+    _run_training(
+        options, lambda: random_scenarios(options.seed, options.maps), MoveRule.ROBOT_SAFE
+    )
     return 0
 
 
@@ -223,9 +224,12 @@ def _add_training_options(
 
 
 def _run_training(
-    options: argparse.Namespace, scenarios: Sequence[Scenario], move_rule: MoveRule
+    options: argparse.Namespace, scenarios: Callable[[], Sequence[Scenario]], move_rule: MoveRule
 ) -> TrainingRun:
-    """Train into ``--out`` until ``--steps`` or a signal to stop; return the closed run."""
+    """Train into ``--out`` until ``--steps`` or a signal to stop; return the closed run.
+
+    The scenarios, which may take seconds, are made once torch is known to be there.
+    """
     import torch
     from tqdm import tqdm
 
@@ -236,7 +240,7 @@ def _run_training(
     values = {entry.name: getattr(options, entry.name) for entry in fields(HyperParameters)}
     parameters = HyperParameters(**values)
     with ExitStack() as stack:
-        run = TrainingRun(options.out, scenarios, move_rule, parameters, options.seed)
+        run = TrainingRun(options.out, scenarios(), move_rule, parameters, options.seed)
         trainer = stack.enter_context(closing(run)).trainer
         print(run.description)
         interrupted = threading.Event()

@@ -2,14 +2,11 @@ from __future__ import annotations
 
 import os
 import shutil
-import signal
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-import hypothesis
-import numpy as np
 import pytest
 
 # Read by the first import of a message type.
@@ -19,19 +16,8 @@ os.environ["ROS_PYTHON_CHECK_FIELDS"] = "1"
 # deadlock when one of them ended while it told the others by a call instead of a message.
 os.environ["FASTRTPS_DEFAULT_PROFILES_FILE"] = str(Path(__file__).with_name("fastdds.xml"))
 
-import torch
-
-from ddqn_planner.grid import GridMap
-from ddqn_planner.training.environment import Scenario, paper_scenario
-
-# A shell starts what it runs in the background with SIGINT ignored; the processes that the tests
-# start would inherit that.
-signal.signal(signal.SIGINT, signal.default_int_handler)
-torch.set_num_threads(1)
-# A loaded machine is slow, not wrong.
-hypothesis.settings.register_profile("default", deadline=None, max_examples=25)
-hypothesis.settings.register_profile("fuzz", deadline=None, max_examples=1000)
-hypothesis.settings.load_profile("default")
+from shared import paper as paper
+from shared import small as small
 
 ROOT = Path(__file__).resolve().parent.parent
 
@@ -89,16 +75,3 @@ def source_copy(tmp_path_factory: pytest.TempPathFactory) -> Path:
     copy = tmp_path_factory.mktemp("workspace") / "src" / "ddqn_planner"
     ignore = shutil.ignore_patterns(*NOT_SOURCE)
     return Path(shutil.copytree(ROOT, copy, symlinks=True, ignore=ignore))
-
-
-@pytest.fixture(scope="session")
-def paper() -> Scenario:
-    return paper_scenario()
-
-
-@pytest.fixture
-def small() -> Scenario:
-    """A 5x4 map with a wall that is open at its top."""
-    occupancy = np.zeros((4, 5), dtype=bool)
-    occupancy[:3, 2] = True
-    return Scenario(GridMap(occupancy), start=(0, 0), goal=(4, 0))

@@ -156,7 +156,7 @@ class TrainerNode(LearningNode):
                 "map_file to a map with both"
             )
         start, goal = (self._cell(name, self._poses[name], place) for name in ("start", "goal"))
-        from ddqn_planner.training.environment import Scenario  # these import torch
+        from ddqn_planner.training.environment import Scenario  # these import gymnasium, torch
         from ddqn_planner.training.run import TrainingRun
 
         return place, TrainingRun(

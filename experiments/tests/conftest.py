@@ -1,27 +1,4 @@
 from __future__ import annotations
 
-import hypothesis
-import numpy as np
-import pytest
-import torch
-
-from ddqn_planner.grid import GridMap
-from ddqn_planner.training.environment import Scenario, paper_scenario
-
-torch.set_num_threads(1)
-# A loaded machine is slow, not wrong.
-hypothesis.settings.register_profile("default", deadline=None, max_examples=25)
-hypothesis.settings.load_profile("default")
-
-
-@pytest.fixture(scope="session")
-def paper() -> Scenario:
-    return paper_scenario()
-
-
-@pytest.fixture
-def small() -> Scenario:
-    """A 5x4 map with a wall that is open at its top."""
-    occupancy = np.zeros((4, 5), dtype=bool)
-    occupancy[:3, 2] = True
-    return Scenario(GridMap(occupancy), start=(0, 0), goal=(4, 0))
+from shared import paper as paper
+from shared import small as small

@@ -166,7 +166,8 @@ class Robot:
         """Send a map, a start and a goal, and wait until the planner has planned with all three."""
         self.clear()
         message, yaw = self.stamped_map(), next(NUMBERS) % 3000 / 1000
-        self.send_map(message)
+        # Else an earlier map may have the plan: no topic waits for another.
+        self.set_map(message)
         self.send_start(self.pose(start))
         self.send_goal(self.pose(goal, yaw))
         self.wait_for_path(start, goal, yaw=yaw)
