@@ -233,7 +233,8 @@ def gradient_costs(occupancy: Occupancy, random: np.random.Generator) -> NDArray
     y, x = np.ogrid[: occupancy.shape[0], : occupancy.shape[1]]
     distance = np.cos(angle) * x + np.sin(angle) * y
     distance -= distance.min()
-    return np.rint(99 * distance / max(distance.max(), 1e-9)).astype(np.int8) * ~occupancy
+    costs: NDArray[np.float64] = np.rint(99 * distance / max(distance.max(), 1e-9))
+    return costs.astype(np.int8) * ~occupancy
 
 
 def inflated_costs(occupancy: Occupancy, radius: float) -> NDArray[np.int8]:

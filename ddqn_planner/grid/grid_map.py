@@ -374,7 +374,7 @@ def _costs(cost: ArrayLike, occupancy: Occupancy) -> NDArray[np.int8]:
     return of_free.astype(np.int8, copy=False)
 
 
-def replaced(array: NDArray[Any] | None, box: tuple[slice, slice], values: NDArray[Any]) -> Any:
+def replaced(array: NDArray[Any] | None, box: tuple[slice, ...], values: NDArray[Any]) -> Any:
     """Return a copy with other values in a box."""
     if array is not None:
         array = array.copy()

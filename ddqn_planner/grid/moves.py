@@ -76,8 +76,9 @@ def move_costs(multiplier: NDArray[np.float32], move_rule: MoveRule | str) -> ND
     """Return (8, H, W) float64: the length of each move times the mean multiplier of its cells."""
     padded = np.pad(multiplier, 1, mode="edge").astype(np.float64)
     target = np.stack([_shifted(padded, dx, dy) for dx, dy in MOVES.tolist()])
-    lengths: NDArray[np.float64] = MoveRule(move_rule).lengths[:, None, None]
-    return lengths * (multiplier + target) / 2
+    lengths = MoveRule(move_rule).lengths[:, None, None]
+    costs: NDArray[np.float64] = lengths * (multiplier + target) / 2
+    return costs
 
 
 def path_length(cells: Cells, move_rule: MoveRule | str = MoveRule.ROBOT_SAFE) -> float:
