@@ -85,5 +85,5 @@ def unknown_costs(
     occupancy: Occupancy, share: float, random: np.random.Generator
 ) -> NDArray[np.int8]:
     """Draw (H, W) costs: each free cell is `UNKNOWN` with probability `share`, otherwise 0."""
-    unknown: NDArray[np.bool_] = random.random(occupancy.shape) < share
-    return (unknown & ~occupancy).astype(np.int8) * np.int8(UNKNOWN)
+    unknown = (random.random(occupancy.shape) < share) & ~occupancy
+    return np.where(unknown, UNKNOWN, 0).astype(np.int8)
