@@ -129,7 +129,8 @@ class Experience:
 
     def slowness(self, grid: GridMap) -> Float32:
         """Return (H, W) float32: expected seconds over those at nominal speed, 1 or more."""
-        return self.evidence.over(grid).slowness.copy()
+        slowness: Float32 = self.evidence.over(grid).slowness.copy()
+        return slowness
 
     def uncertainty(self, grid: GridMap) -> Float32:
         """Return (H, W) float32: the standard deviation of the log slowness."""
@@ -262,8 +263,10 @@ def _steps(
         if metres < step:
             continue
         if seconds <= max_pause and metres <= max_speed * seconds:
-            count = max(round(metres / step), 1)  # where samples are rare, it passes several places
-            for share in ((number + 0.5) / count for number in range(count)):
-                middle = from_x * (1 - share) + x * share, from_y * (1 - share) + y * share
-                yield *middle, seconds / count, metres / count
+            count = round(metres / step)  # where samples are rare, a step passes several places
+            for number in range(count):
+                share = (number + 0.5) / count
+                middle_x = from_x * (1 - share) + x * share
+                middle_y = from_y * (1 - share) + y * share
+                yield middle_x, middle_y, seconds / count, metres / count
         began, from_x, from_y = now, x, y
