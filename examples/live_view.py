@@ -43,6 +43,7 @@ class LiveView(Node):
     def __init__(self) -> None:
         super().__init__("live_view")
         self._info = OccupancyGrid().info
+        self._value = OccupancyGrid()
         self._paths: dict[str, Path] = {}
         subscribe = self.create_subscription
         subscribe(OccupancyGrid, "map", self._on_map, LATCHED)
@@ -56,13 +57,19 @@ class LiveView(Node):
         values = np.array(message.data, dtype=np.int16)
         shades = np.where(values < 0, 160, 255 - 2 * values.clip(0, 100))
         self._draw_image("map", shades[:, None].repeat(3, axis=1))
+        self._draw_value()
         for name in self._paths:
             self._draw_path(name)
 
     def _on_value(self, message: OccupancyGrid) -> None:
-        values = np.array(message.data, dtype=np.int16)
-        if message.info.width == self._info.width and message.info.height == self._info.height:
-            shown = np.ma.masked_less(values, 0)  # cells without a value show the map
+        self._value = message  # it may come before its map
+        self._draw_value()
+
+    def _draw_value(self) -> None:
+        info, of_map = self._value.info, self._info
+        if info.width and (info.width, info.height) == (of_map.width, of_map.height):
+            # Cells without a value show the map.
+            shown = np.ma.masked_less(np.array(self._value.data, dtype=np.int16), 0)
             self._draw_image("value", COLOURS(shown / 100, bytes=True))
 
     def _on_path(self, name: str, message: Path) -> None:

@@ -59,8 +59,9 @@ def test_a_recording_holds_what_the_nodes_published(
     grid = grid_from_message(message)
     view = [sys.executable, live_view.__file__, "--save", str(file)]
     with running(*view, "--ros-args", "-r", "__ns:=/watched"):
-        client.publish("map", message, LATCHED)
+        # The value first: no topic waits for another.
         client.publish("planner/value", occupancy_message(field, 0.5, ORIGIN, HEADER), LATCHED)
+        client.publish("map", message, LATCHED)
         for topic, cells in (("plan", CELLS["plan"]), ("trainer/episode", CELLS["episode"])):
             client.publish(topic, path_message(cells, grid, HEADER, Quaternion(w=1.0)), LATCHED)
         client.publish("trainer/average_reward", Float32(data=-0.5))
