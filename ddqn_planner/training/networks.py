@@ -73,8 +73,7 @@ class PaperModule(TrainableNetwork):
         feature_BF = torch.baddbmm(bias_F1, weight_BFK, window_BKL).relu_().flatten(1)
         if self.hidden is not None:
             feature_BF = self.hidden(feature_BF).relu_()
-        q_BA: Tensor = self.fully_connected(feature_BF)
-        return q_BA
+        return cast(Tensor, self.fully_connected(feature_BF))
 
 
 class PropagationModule(TrainableNetwork):
@@ -99,8 +98,7 @@ class PropagationModule(TrainableNetwork):
     def success(self, feature_BI: Tensor) -> Tensor:
         """Return p(s, a) in 0..1: (B, 8), for the features of patches (B, I)."""
         hidden_BF = self.hidden(self.convolution(feature_BI).relu()).relu()
-        p_BA: Tensor = self.moves(hidden_BF).sigmoid()
-        return p_BA
+        return cast(Tensor, self.moves(hidden_BF).sigmoid())
 
     def cost(self, feature_BI: Tensor) -> Tensor:
         """Return the learned cost of each move: (B, 8); 0 where the reward is given."""
@@ -120,8 +118,7 @@ class AnyMapModule(PropagationModule):
 
     def multiplier(self, feature_BI: Tensor) -> Tensor:
         """Return the cost multiplier of each move, at least 1: (B, 8)."""
-        multiplier_BA: Tensor = 1 + self.prices(feature_BI).relu()
-        return multiplier_BA
+        return cast(Tensor, 1 + self.prices(feature_BI).relu())
 
     def cost(self, feature_BI: Tensor) -> Tensor:
         """Return length times cost multiplier of each move: (B, 8)."""

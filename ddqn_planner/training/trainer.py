@@ -30,8 +30,7 @@ from ddqn_planner.training.networks import MODULES, encoder_for
 CHECKPOINT_KEY = "ddqn_planner_checkpoint"
 DIGEST_KEY = "sha256"
 
-FUSED = tuple(map(int, torch.__version__.split(".")[:2])) >= (2, 4)
-"""Whether torch has the fused Adam also for the CPU."""
+FUSED = tuple(map(int, torch.__version__.split(".")[:2])) >= (2, 4)  # Adam, on the CPU too
 
 
 class CheckpointError(ValueError):
@@ -54,11 +53,10 @@ class Trainer:
         self.seed = seed
         self.steps = self.updates = self.episodes = 0
 
-        weights, environment, exploration, replay = np.random.SeedSequence(seed).spawn(4)
-        drawing = np.random.default_rng(environment)
-        self.environment = GridVectorEnvironment(self.scenarios, move_rule, parameters, drawing)
-        self._exploration = np.random.default_rng(exploration)
-        self._sampling = np.random.default_rng(replay)
+        weights, *others = np.random.SeedSequence(seed).spawn(4)
+        self._generators = [np.random.default_rng(sequence) for sequence in others]
+        initial, self._exploration, self._sampling = self._generators
+        self.environment = GridVectorEnvironment(self.scenarios, move_rule, parameters, initial)
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(int(weights.generate_state(1)[0]))
             module, (height, width) = MODULES[parameters.network], self.environment.shape
@@ -187,7 +185,7 @@ class Trainer:
             "scenarios": _fingerprints(self.scenarios),
             "counters": [self.steps, self.updates, self.episodes, self._replay.added],
             "walked": self._visited,
-            "generators": [generator.bit_generator.state for generator in self._generators()],
+            "generators": [generator.bit_generator.state for generator in self._generators],
         }
         text, tensors = json.dumps(description), self._tensors()
         metadata = {CHECKPOINT_KEY: text, DIGEST_KEY: _digest(text, tensors)}
@@ -209,7 +207,9 @@ class Trainer:
                 parameters = HyperParameters(**description["parameters"])
                 rule = MoveRule(description["move_rule"])
                 trainer = cls(scenarios, rule, parameters, description["seed"])
-                trainer._restore(description, file, metadata[DIGEST_KEY], text)
+                trainer._continue(description, file)
+                if metadata[DIGEST_KEY] != _digest(text, trainer._tensors()):
+                    raise ValueError("its digest is another")
         except (CheckpointError, MemoryError):
             raise
         except Exception as error:  # a broken file can raise any error in the libraries
@@ -219,23 +219,19 @@ class Trainer:
             ) from error
         return trainer
 
-    def _restore(self, description: Any, file: Any, digest: str, text: str) -> None:
+    def _continue(self, description: Any, file: Any) -> None:
         """Continue where a checkpoint was made; a ValueError if its tensors are not those."""
         self.steps, self.updates, self.episodes, self._replay.added = description["counters"]
         tensors = self._tensors()
-        expected = {name: [*tensor.shape] for name, tensor in tensors.items()}
+        shapes = {name: [*tensor.shape] for name, tensor in tensors.items()}
         # Before any is read: a small sparse file can claim tensors of any size.
-        if {name: file.get_slice(name).get_shape() for name in file.keys()} != expected:  # noqa: SIM118
+        if {name: file.get_slice(name).get_shape() for name in file.keys()} != shapes:  # noqa: SIM118
             raise ValueError("its tensors have other names or shapes")
-        saved = {name: file.get_tensor(name) for name in expected}
-        if digest != _digest(text, saved):
-            raise ValueError("its digest is another")
         for name, tensor in tensors.items():
-            tensor.copy_(saved[name])
+            tensor.copy_(file.get_tensor(name))
         self.encoder.update_target(self._target)
         self._visited = description["walked"]
-        states = description["generators"]
-        for generator, state in zip(self._generators(), states, strict=True):
+        for generator, state in zip(self._generators, description["generators"], strict=True):
             generator.bit_generator.state = state
 
     def _tensors(self) -> dict[str, Tensor]:
@@ -256,9 +252,6 @@ class Trainer:
             for name, part in parts.items()
         }
         return tensors | {"total_reward": torch.from_numpy(self._total_reward)}
-
-    def _generators(self) -> tuple[np.random.Generator, ...]:
-        return self.environment.random, self._exploration, self._sampling
 
 
 def _fingerprints(scenarios: Sequence[Scenario]) -> list[list[object]]:
