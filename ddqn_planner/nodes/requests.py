@@ -275,8 +275,7 @@ class Requests:
             await self.next_look
 
     def _check_pose(self, name: str, stamped: PoseStamped, frame: str) -> None:
-        check = self.frames.check
-        checked(_invalid(name), check, name, stamped.header, stamped.pose, frame)
+        checked(_invalid(name), self.frames.check, name, stamped, frame)
 
 
 def check_request(goals: list[PoseStamped], planner_id: str, known_id: str) -> None:
@@ -292,8 +291,7 @@ def check_request(goals: list[PoseStamped], planner_id: str, known_id: str) -> N
 
 
 def _cell(name: str, stamped: PoseStamped, grid: GridMap, frame: str) -> Cell:
-    pose = stamped.header, stamped.pose
-    cell: Cell = checked(_invalid(name), cell_from_pose, name, *pose, grid, frame)
+    cell: Cell = checked(_invalid(name), cell_from_pose, name, stamped, grid, frame)
     return cell
 
 
