@@ -20,7 +20,7 @@ from trainings import MOVE_RULE, Training, in_parallel, rollouts, solved, train_
 
 from ddqn_planner.grid import Cell, Noise, legal_moves, scatter_obstacles, shortest_path
 from ddqn_planner.planning import Plan, PlanStatus
-from ddqn_planner.planning.search import search
+from ddqn_planner.planning.paths import search
 from ddqn_planner.training.environment import Scenario, paper_scenario
 from ddqn_planner.training.hyper_parameters import HyperParameters
 

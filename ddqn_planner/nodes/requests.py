@@ -24,9 +24,9 @@ from ddqn_planner.nodes.poses import Frames, StartSource
 from ddqn_planner.nodes.report import Outcome, RequestError, checked, reason_of, seconds
 from ddqn_planner.nodes.runtime import Worker
 from ddqn_planner.planning import Plan, PlanMethod, Planner, PlanRequest, PlanStatus
+from ddqn_planner.planning.field import shift_between
 from ddqn_planner.planning.paths import is_path_valid, rest_of_path
 from ddqn_planner.planning.plan import joined
-from ddqn_planner.planning.repair import shift_between
 
 UNCHANGED = Outcome("UNCHANGED", "the active goal needs no new plan")
 
