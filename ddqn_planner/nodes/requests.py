@@ -143,19 +143,16 @@ class Requests:
         asked = [start or await self._wait_for(self.start.pose), *goals]
         named = zip(["the start", *names], asked, strict=True)
         places = [await self._in_map(*it, grid, frame) for it in named]
-        poses, (first, goal_cell, *more) = (
-            [pose for pose, _ in places],
-            [cell for _, cell in places],
-        )
-        metres = settings.tolerance if tolerance is None else tolerance
+        poses, (first, second, *more) = zip(*places, strict=True)
+        given = settings.tolerance if tolerance is None else tolerance
+        metres = _checked("the tolerance", lambda _: check_tolerance(given))
         request = PlanRequest(
             grid,
             start=first,
-            goal=goal_cell,
+            goal=second,
             move_rule=move_rule(settings.move_rule, planner),
             method=PlanMethod(settings.mode),
-            tolerance=_checked("the tolerance", lambda _: check_tolerance(metres))
-            / grid.resolution,
+            tolerance=metres / grid.resolution,
             simplified=settings.path_simplification == "line_of_sight",
             start_clearing_radius=_clearing_radius(settings, grid),
         )
