@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 
 from ddqn_planner.grid.arguments import Occupancy
 from ddqn_planner.grid.body import clearance
-from ddqn_planner.grid.noise import in_free_cells
 
 MINIMUM_SIDE = 5
 """The shortest side of a map: a maze of two corridors between its walls."""
@@ -234,7 +233,8 @@ def gradient_costs(occupancy: Occupancy, random: np.random.Generator) -> NDArray
     y, x = np.ogrid[: occupancy.shape[0], : occupancy.shape[1]]
     distance = np.cos(angle) * x + np.sin(angle) * y
     distance -= distance.min()
-    return in_free_cells(occupancy, np.rint(99 * distance / max(distance.max(), 1e-9)))
+    costs: NDArray[np.float64] = np.rint(99 * distance / max(distance.max(), 1e-9))
+    return costs.astype(np.int8) * ~occupancy
 
 
 def inflated_costs(occupancy: Occupancy, radius: float) -> NDArray[np.int8]:
@@ -244,4 +244,4 @@ def inflated_costs(occupancy: Occupancy, radius: float) -> NDArray[np.int8]:
     """
     distance = np.maximum(clearance(occupancy), 1)  # occupied cells do not matter
     costs = np.where(distance <= radius, np.rint(99 ** (1 - (distance - 1) / radius)), 0)
-    return in_free_cells(occupancy, costs)
+    return costs.astype(np.int8) * ~occupancy

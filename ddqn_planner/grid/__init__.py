@@ -1,7 +1,4 @@
-"""What the robot moves on: the grid map, the eight moves, shortest paths, map files and noise.
-
-`import ddqn_planner.grid` loads no SciPy: what needs it imports it at its first call.
-"""
+"""What the robot moves on: the grid map, the eight moves, shortest paths, map files and noise."""
 
 from ddqn_planner.grid.arguments import OCCUPIED, UNKNOWN, Cell
 from ddqn_planner.grid.body import clearance, inflate

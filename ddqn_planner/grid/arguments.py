@@ -28,8 +28,7 @@ UNKNOWN = -1
 """The value of an unknown cell in ``nav_msgs/OccupancyGrid``."""
 
 MAX_SLOWNESS = 100.0
-"""No place may be slower. The time and memory of a field grow with the costliest move: with this,
-and costs, it keeps some 1,400 lists of cells at once."""
+"""No place may be slower: the time and memory of a field grow with the costliest move."""
 
 POSITIVE = math.ulp(0.0), sys.float_info.max
 """The range of finite numbers above 0."""
@@ -68,10 +67,8 @@ def cell_inside(cell: Any, shape: tuple[int, ...], name: str = "the cell") -> Ce
 
 def cells_inside(cells: Any, shape: tuple[int, ...]) -> NDArray[np.int64]:
     """Return cells of a map of shape (H, W): (N, 2) int64."""
-    is_checked = False
-    if isinstance(cells, np.ndarray) and cells.dtype.kind == "i" and cells.shape[1:] == (2,):
-        is_checked = bool(((cells >= 0) & (cells < shape[::-1])).all())
-    if not is_checked:
+    is_array = isinstance(cells, np.ndarray) and cells.dtype.kind == "i" and cells.shape[1:] == (2,)
+    if not is_array or not ((cells >= 0) & (cells < shape[::-1])).all():
         cells = [cell_inside(cell, shape) for cell in listed(cells, "the cells")]
     return np.array(cells, dtype=np.int64).reshape(-1, 2)
 

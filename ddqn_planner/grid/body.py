@@ -1,7 +1,4 @@
-"""The robot's body: which cells are too near to an obstacle, and which are better avoided.
-
-`inflate` finds them, or Nav2 has found them in a costmap.
-"""
+"""The robot's body: which cells are too near to an obstacle, and which are better avoided."""
 
 from __future__ import annotations
 
@@ -12,14 +9,11 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ddqn_planner.grid.arguments import OCCUPIED, UNKNOWN, Occupancy, as_number
-from ddqn_planner.grid.grid_map import MAX_COST_MULTIPLIER, GridMap, check_grid
+from ddqn_planner.grid.grid_map import MAX_COST_MULTIPLIER, GridMap, check_grid, replaced
 
+# Linear and exponential costs, with paths as long, kept no clearly greater distances.
 CLEARANCE_SCALE = 1.0
-"""Metres beyond the body over which the cost near an obstacle falls to an eighth.
-
-It falls as 1 / (1 + distance / scale)^3. Linear and exponential costs were compared with it, each
-with paths at most 1.10 times as long on eight maps of this package; none kept clearly greater
-distances. See docs/tuning.md."""
+"""Metres s beyond the body over which costs fall to an eighth: as 1 / (1 + distance / s)^3."""
 
 ROUNDING = 1e-6
 """A message has the resolution as float32: 0.2 m must be 4 cells of 0.05 m, not 3.9999999."""
@@ -30,19 +24,14 @@ INSCRIBED = 99
 _COSTMAP_COST = 1 + (np.arange(INSCRIBED) - 1) * 251 / 97
 """The smallest cost of a costmap, 1 to 252, that its publisher writes as each value, 1 to 98."""
 
-_MULTIPLIER = (50 + 0.8 * _COSTMAP_COST) / 50
-"""NavFn's cost of a cell beside its neutral cost: from 1 to 5."""
-
-_COSTS = np.rint((_MULTIPLIER - 1) / (MAX_COST_MULTIPLIER - 1) * OCCUPIED).clip(0, OCCUPIED - 1)
-_COSTS = np.append(_COSTS, UNKNOWN).astype(np.int8)
+# Nav2's NavFn: 50 for a free cell plus 0.8 times the costmap's cost.
+_COSTS = np.rint(0.8 * _COSTMAP_COST / 50 / (MAX_COST_MULTIPLIER - 1) * OCCUPIED)
+_COSTS = np.append(_COSTS.clip(0, OCCUPIED - 1), UNKNOWN).astype(np.int8)
 """(100,) int8: the cost in a `GridMap` of each value, 0 to 98, and last of an unknown cell, -1."""
 
 
 def clearance(obstacles: Occupancy) -> NDArray[np.float64]:
-    """Return (H, W) float64: the distance from each cell to the nearest obstacle, in cells.
-
-    It is that between the centres: 0 on an obstacle, infinite if there is none.
-    """
+    """Return (H, W) float64: cells from each centre to the nearest obstacle's; inf without any."""
     if not obstacles.any():
         return np.full(obstacles.shape, np.inf)
     import scipy.ndimage
@@ -101,8 +90,8 @@ class Inflation:
         """Return what `inflate` returns."""
         body = robot_radius, clearance_weight
         key = body, grid.occupancy.shape, grid.resolution, grid.cost is None
-        if self._last is not None and self._last[0] == key:
-            inflated = _inflate_changed(grid, *self._last[1:], *body)
+        if any(body) and self._last is not None and self._last[0] == key:
+            inflated = _inflate_changed(grid, *self._last[1:], body)
         else:
             inflated = inflate(grid, *body)
         self._last = key, grid, inflated
@@ -110,38 +99,24 @@ class Inflation:
 
 
 def _inflate_changed(
-    grid: GridMap,
-    before: GridMap,
-    inflated: GridMap,
-    robot_radius: float,
-    clearance_weight: float,
+    grid: GridMap, before: GridMap, inflated: GridMap, body: tuple[float, float]
 ) -> GridMap:
     """Return what `inflate` returns, given what it returned for a map that has other cells."""
-    if inflated is before:  # no body
-        return grid
     differs = before.occupancy != grid.occupancy
     if before.cost is not None and grid.cost is not None:
         differs |= before.cost != grid.cost
     occupancy, cost = inflated.occupancy, inflated.cost
     if differs.any():
         # Farther away than this, an obstacle has no effect: the cost that it adds is rounded to 0.
-        reach = robot_radius
-        if clearance_weight > 0:
-            greatest = 2 * (OCCUPIED - 1) * clearance_weight
-            reach += max(np.cbrt(greatest) - 1, 0) * CLEARANCE_SCALE
+        reach = body[0] + max(np.cbrt(2 * (OCCUPIED - 1) * body[1]) - 1, 0) * CLEARANCE_SCALE
         cells = int(reach / grid.resolution) + 2
-        near = np.zeros_like(differs)
-        near[_around(differs, cells)] = True
-        window = _around(differs, 2 * cells)
-        near = near[window]
+        near, window = _around(differs, cells), _around(differs, 2 * cells)
         given = None if grid.cost is None else grid.cost[window]
-        part = GridMap(grid.occupancy[window], grid.resolution, cost=given)
-        part = inflate(part, robot_radius, clearance_weight)
-        occupancy = occupancy.copy()
-        occupancy[window][near] = part.occupancy[near]
-        if cost is not None and part.cost is not None:
-            cost = cost.copy()
-            cost[window][near] = part.cost[near]
+        part = inflate(GridMap(grid.occupancy[window], grid.resolution, cost=given), *body)
+        in_part = _around(differs[window], cells)
+        occupancy = replaced(occupancy, near, part.occupancy[in_part])
+        if part.cost is not None:
+            cost = replaced(cost, near, part.cost[in_part])
     return grid.with_layers(occupancy=occupancy, cost=cost, obstacles=grid.occupancy)
 
 
@@ -157,14 +132,8 @@ def grid_from_costmap(
     origin: tuple[float, float, float] = (0.0, 0.0, 0.0),
     allow_unknown: bool = False,
 ) -> GridMap:
-    """Make a grid map from the values of a costmap that Nav2 publishes as an ``OccupancyGrid``.
-
-    A cell of value 100 is an obstacle. One of 99 is too near to an obstacle for the robot's body:
-    it is occupied, and a robot that starts there may leave. Values of 1 to 98 become costs as in
-    Nav2's NavFn planner: 50 for a free cell plus 0.8 times the costmap's cost, 0 to 252. Unknown
-    cells, if they are free, have the highest cost. The rest is as for
-    `GridMap.from_occupancy_values`.
-    """
+    """Make a grid map from a costmap that Nav2 publishes as an ``OccupancyGrid``."""
+    # A robot that starts in an inscribed cell may leave: such cells are occupied, no obstacles.
     grid = GridMap.from_occupancy_values(
         values, resolution, origin, INSCRIBED, allow_unknown, use_map_costs=True
     )

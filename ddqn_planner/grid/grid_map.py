@@ -31,9 +31,7 @@ from ddqn_planner.grid.arguments import (
 from ddqn_planner.grid.moves import MoveRule, component_labels, flood, legal_moves
 
 MAX_COST_MULTIPLIER = 5.0
-"""The cost multiplier of a cell of value 100, and of an unknown cell.
-
-The costs of Nav2's NavFn planner have the same range: 50 for a free cell and at most 253."""
+"""That of a cell of value 100 or unknown; as in Nav2's NavFn planner: 50 if free, at most 253."""
 
 _MULTIPLIERS = np.linspace(1, MAX_COST_MULTIPLIER, OCCUPIED + 1, dtype=np.float32)
 """(101,) float32: the multiplier of each cost, 0 to 100."""
@@ -185,14 +183,14 @@ class GridMap:
         costs = self.cost
         if costs is not None or cost is not None:
             costs = np.zeros(self.occupancy.shape, dtype=np.int8) if costs is None else costs
-            costs = _replaced(costs, box, _costs(costs[box] if cost is None else cost, patch))
+            costs = replaced(costs, box, _costs(costs[box] if cost is None else cost, patch))
         closed = patch
         if obstacles is not None:
             closed = patch & as_mask("obstacles", obstacles, patch.shape)
         return self.with_layers(
-            occupancy=_replaced(self.occupancy, box, patch),
+            occupancy=replaced(self.occupancy, box, patch),
             cost=costs,
-            obstacles=_replaced(self.obstacles, box, closed),
+            obstacles=replaced(self.obstacles, box, closed),
         )
 
     def with_slowness(self, slowness: NDArray[np.float32], seconds_per_cell: float) -> GridMap:
@@ -311,8 +309,7 @@ class GridMap:
     def is_free(self, cell: Cell) -> bool:
         """Return whether a cell lies inside the map and is not occupied."""
         x, y = as_cell(cell)
-        height, width = self.occupancy.shape
-        return bool(0 <= x < width and 0 <= y < height and not self.occupancy[y, x])
+        return self.contains((x, y)) and not self.occupancy[y, x]
 
     def is_obstacle(self, cell: Cell) -> bool:
         """Return whether a cell is an obstacle, not just too near to one; ValueError if outside."""
@@ -377,7 +374,7 @@ def _costs(cost: ArrayLike, occupancy: Occupancy) -> NDArray[np.int8]:
     return of_free.astype(np.int8, copy=False)
 
 
-def _replaced(array: NDArray[Any] | None, box: tuple[slice, slice], values: NDArray[Any]) -> Any:
+def replaced(array: NDArray[Any] | None, box: tuple[slice, ...], values: NDArray[Any]) -> Any:
     """Return a copy with other values in a box."""
     if array is not None:
         array = array.copy()

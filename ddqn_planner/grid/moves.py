@@ -52,11 +52,7 @@ def _shifted(padded: NDArray[Any], dx: int, dy: int) -> NDArray[Any]:
 def legal_moves(
     occupancy: Occupancy, move_rule: MoveRule | str, forbidden: NDArray[np.uint8] | None = None
 ) -> NDArray[np.bool_]:
-    """Return (8, H, W) bool: which of the eight moves are legal in each cell.
-
-    ``[a, y, x]`` is True if action ``a`` leads from the free cell (x, y) to a free cell of the map
-    and the rule allows it, and `forbidden` too, see `GridMap`.
-    """
+    """Return (8, H, W) bool: whether action a may leave the cell (x, y), in ``[a, y, x]``."""
     rule = MoveRule(move_rule)
     free = np.pad(~occupancy, 1)
     legal = np.empty((len(MOVES), *occupancy.shape), dtype=np.bool_)
@@ -70,26 +66,18 @@ def legal_moves(
 
 
 def neighbours(shape: tuple[int, int]) -> NDArray[np.int64]:
-    """Return (8, H * W) int64: the cell number y * W + x that each action leads to from each cell.
-
-    The number is H * W for all cells outside the map.
-    """
+    """Return (8, H * W) int64: the number y * W + x of each cell's neighbours; outside H * W."""
     cells = shape[0] * shape[1]
     padded = np.pad(np.arange(cells).reshape(shape), 1, constant_values=cells)
     return np.stack([_shifted(padded, dx, dy).ravel() for dx, dy in MOVES.tolist()])
 
 
 def move_costs(multiplier: NDArray[np.float32], move_rule: MoveRule | str) -> NDArray[np.float64]:
-    """Return (8, H, W) float64: the cost of action ``a`` from (x, y) in ``[a, y, x]``.
-
-    It is the length of the move times the mean of `GridMap.cost_multiplier` in its two cells, so a
-    path costs the same in both directions. It has no meaning where the move is illegal.
-    """
+    """Return (8, H, W) float64: the length of each move times the mean multiplier of its cells."""
     padded = np.pad(multiplier, 1, mode="edge").astype(np.float64)
     target = np.stack([_shifted(padded, dx, dy) for dx, dy in MOVES.tolist()])
-    costs: NDArray[np.float64] = (
-        MoveRule(move_rule).lengths[:, None, None] * (multiplier + target) / 2
-    )
+    lengths = MoveRule(move_rule).lengths[:, None, None]
+    costs: NDArray[np.float64] = lengths * (multiplier + target) / 2
     return costs
 
 
@@ -118,11 +106,7 @@ def segment_lengths(
 
 
 def shortest_distances(grid: GridMap, goal: Cell, move_rule: MoveRule | str) -> NDArray[np.float64]:
-    """Return (H, W) float64: the cost of the cheapest path from each cell to the goal, exactly.
-
-    See `path_cost`; it is the length of the shortest path on a map without costs, and infinite
-    where no path leads to the goal.
-    """
+    """Return (H, W) float64: the exact least cost of a path to the goal, inf without one."""
     distances: NDArray[np.float64] = _dijkstra(grid, goal, move_rule)[0]
     return distances.reshape(grid.height, grid.width)
 
@@ -140,10 +124,7 @@ def shortest_path(grid: GridMap, start: Cell, goal: Cell, move_rule: MoveRule | 
 
 
 def _dijkstra(grid: GridMap, goal: Cell, move_rule: MoveRule | str) -> Any:
-    """Return each cell's distance from the goal, and the next cell on its path to the goal.
-
-    The search runs from the goal, over moves in the opposite direction.
-    """
+    """Return each cell's distance to the goal, and the next cell on its path (by number)."""
     from scipy.sparse import csr_array
     from scipy.sparse.csgraph import dijkstra
 
@@ -164,11 +145,9 @@ def _dijkstra(grid: GridMap, goal: Cell, move_rule: MoveRule | str) -> Any:
 
 @compiled
 def component_labels(free: Any, reach: int) -> Any:  # pragma: no cover
-    """Return (H, W) int32 labels, see `GridMap.labels`, by union-find over runs of free cells.
-
-    Run r of a row is from edges[2 * r] to before edges[2 * r + 1]. Two runs of neighbouring rows
-    are connected if they overlap when one of them is `reach` cells longer at both ends.
-    """
+    """Return (H, W) int32 labels, see `GridMap.labels`, by union-find over runs of free cells."""
+    # Run r of a row is from edges[2 * r] to before edges[2 * r + 1]. Runs of neighbouring rows are
+    # connected if they overlap when one of them is `reach` cells longer at both ends.
     height, width = free.shape
     edges = np.empty(height * (width + 1) + 1, dtype=np.int32)
     edge_count = above = first = 0
@@ -216,10 +195,7 @@ def component_labels(free: Any, reach: int) -> Any:  # pragma: no cover
 
 @compiled
 def flood(legal: Any, reached: Any, cells: Any, backward: bool) -> None:  # pragma: no cover
-    """Mark all cells to which legal moves lead from marked ones, or backward, from which.
-
-    `cells` are the numbers y * W + x of those that are marked.
-    """
+    """Mark all cells to which legal moves lead from `cells` (numbers), or backward, from which."""
     height, width = reached.shape
     waiting = np.empty(height * width, dtype=np.int64)  # each cell waits at most once
     count = cells.size

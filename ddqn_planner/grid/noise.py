@@ -1,13 +1,11 @@
-"""What is random on a map: the paper's static noise (section 4.3), and costs and requests.
+"""What is random on a map: the paper's static noise (section 4.3), and costs and requests."""
 
-The trained models and the documented figures depend on them: a seed must always give the same.
-"""
+# The trained models and the documented figures depend on it: a seed must always give the same.
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -38,19 +36,12 @@ def scatter_obstacles(
     random: np.random.Generator,
     noise: Noise = Noise.NEAR_PATH,
 ) -> tuple[GridMap, int]:
-    """Occupy 1 to 5 free cells on or near a path, so that its ends stay free and connected.
-
-    The paper (goal iii) does this to the path of goal i.
-
-    Returns the new map, and how many draws were rejected because they left no path: 1,000 in a row
-    are a ValueError.
-    """
+    """Return the map with 1 to 5 obstacles more, which leave a path, and the rejected draws."""
     start, goal = path[0], path[-1]
-    offsets = (0,) if noise is Noise.ON_PATH else (-1, 0, 1)
+    offsets, where = ((0,), "on") if noise is Noise.ON_PATH else ((-1, 0, 1), "on or next to")
     near = {(x + dx, y + dy) for x, y in path for dx in offsets for dy in offsets}
     candidates = sorted(cell for cell in near - {start, goal} if grid.is_free(cell))
     if not candidates:
-        where = "on" if noise is Noise.ON_PATH else "on or next to"
         raise ValueError(f"no free cell lies {where} the path from {start} to {goal}")
     for rejected in range(MAX_TRIES):
         count = min(int(random.integers(1, MAX_NEW_OBSTACLES + 1)), len(candidates))
@@ -61,20 +52,13 @@ def scatter_obstacles(
         noisy = replace(grid, occupancy=occupancy)
         if noisy.reachable([start], move_rule)[goal[1], goal[0]]:
             return noisy, rejected
-    raise ValueError(
-        f"none of {MAX_TRIES} draws of new obstacles left a path from {start} to {goal}"
-    )
+    raise ValueError(f"none of {MAX_TRIES} draws of obstacles left a path from {start} to {goal}")
 
 
 def random_requests(
     occupancy: Occupancy, move_rule: MoveRule, count: int, random: np.random.Generator
 ) -> list[tuple[Cell, Cell]]:
-    """Draw `count` pairs of start and goal: different free cells that a path joins.
-
-    The start is uniform over the free cells that have a legal move, the goal is uniform over the
-    other cells that the robot can reach from there. Pairs may repeat. A map where no path joins two
-    free cells is a ValueError.
-    """
+    """Draw starts, uniform over the cells with a move, and goals, uniform over those in reach."""
     cells = np.flatnonzero(~occupancy)
     label_of_cell = GridMap(occupancy).labels(move_rule).ravel()[cells]
     order = np.argsort(label_of_cell, kind="stable")
@@ -94,16 +78,12 @@ def random_requests(
 
 def random_costs(occupancy: Occupancy, random: np.random.Generator) -> NDArray[np.int8]:
     """Draw (H, W) costs of free cells, each independent and uniform in 0..99."""
-    return in_free_cells(occupancy, random.integers(0, 100, occupancy.shape, dtype=np.int8))
+    return random.integers(0, 100, occupancy.shape, dtype=np.int8) * ~occupancy
 
 
 def unknown_costs(
     occupancy: Occupancy, share: float, random: np.random.Generator
 ) -> NDArray[np.int8]:
     """Draw (H, W) costs: each free cell is `UNKNOWN` with probability `share`, otherwise 0."""
-    return in_free_cells(occupancy, np.where(random.random(occupancy.shape) < share, UNKNOWN, 0))
-
-
-def in_free_cells(occupancy: Occupancy, costs: NDArray[Any]) -> NDArray[np.int8]:
-    """Return costs as a map has them: 0 in occupied cells."""
-    return np.where(occupancy, 0, costs).astype(np.int8)
+    unknown = (random.random(occupancy.shape) < share) & ~occupancy
+    return np.where(unknown, UNKNOWN, 0).astype(np.int8)

@@ -1,15 +1,4 @@
-"""Proves which moves a propagation network takes for possible, whatever the cells cost.
-
-The network sees a 3x3 patch. Which of its cells are occupied gives 256 patterns with a free centre;
-the free cells may have any cost or be unknown. For all of these at once, each ReLU is enclosed by
-two lines. So each logit is enclosed by two linear functions of the costs, whose extreme values are
-known exactly (CROWN, Zhang et al. 2018, "Efficient neural network robustness certification with
-general activation functions"). For the bounds of the hidden layer, both lines have one slope, so
-that one product gives both bounds (Fast-Lin, Weng et al. 2018).
-
-Dimensions: P = 256 patterns, A = 8 actions, F = filters, I = inputs, C = 18 inputs for costs and
-unknown cells (0 for a network that uses no costs).
-"""
+"""Proves which moves a propagation network takes for possible, whatever the cells cost."""
 
 from __future__ import annotations
 
@@ -29,47 +18,27 @@ if TYPE_CHECKING:
 
 Float64: TypeAlias = NDArray[np.float64]
 
+# Shapes: P = 256 patterns of occupied cells around a free one, A = 8 actions, F = filters,
+# I = inputs, C = 18 inputs for costs and unknown cells, U = outputs of a layer, B = a batch.
+
+# One of each class: under `MoveRule.UNIT`, the same moves are legal as under the second.
 MOVE_RULES: Final = (MoveRule.ROBOT_SAFE, MoveRule.CORNER_CUTTING)
-"""One of each class: under `MoveRule.UNIT`, the same moves are legal as under the second."""
-
-CENTRE = 4
-"""The robot's cell in a patch."""
-
-COSTS = slice(9, 27)
-"""The features for costs and unknown cells; see `AnyMapQNetwork.features`."""
-
+CENTRE = 4  # the robot's cell in a patch
 NO_CERTIFICATE = "nothing can be proved: the moves depend on the whole map, not on 3x3 patches"
-"""Said of a network that has no certificate, such as the paper's."""
-
-MAX_FILTERS = 256
-"""For more, the proof would take seconds, and it is not tried."""
-
-ROUNDING = 2.0**-23
-"""Twice the relative error of a float32 operation. The errors of the bounds themselves, in float64,
-are far below the other half."""
+MAX_FILTERS = 256  # for more, the proof would take seconds, and it is not tried
+ROUNDING = 2.0**-23  # a float32 operation's relative error, and as much for errors in float64
 
 
 @dataclass(frozen=True)
 class Certificate:
-    """What is proved about a network, for all costs and unknown cells.
+    """What is proved about a network, for all costs and unknown cells."""
 
-    A decision is whether the network takes one action for possible in one pattern under one rule.
-    It is right if this equals `legal_moves`, for all costs.
-    """
-
-    decisions: int
-    """How many there are."""
-    undecided: int
-    """Those that are neither proved nor known to be wrong."""
-    wrong: int
-    """Those for which costs are known that make the network wrong."""
-    margin: float
-    """Least proved distance of a right decision's logit from 0; 0 if none is right."""
-    multiplier_error: float
-    """Bound on the relative error of the learned cost multipliers, over all legal moves."""
-    tries: float = 1.0
-    """The most tries that a legal move is expected to take: 1/p, by which its cost grows on a map
-    without costs, or of expected times. It is 1 if the network is certain of all legal moves."""
+    decisions: int  # whether an action is possible in a pattern under a rule: how many there are
+    undecided: int  # those that are neither proved nor known to be wrong
+    wrong: int  # those that some known costs make wrong
+    margin: float  # least proved distance of a right decision's logit from 0; 0 if none is right
+    multiplier_error: float  # bound on the relative error of legal moves' learned cost multipliers
+    tries: float = 1.0  # the most that a legal move is expected to take: 1/p, or 1 if certain
 
     @property
     def proved(self) -> bool:
@@ -83,22 +52,16 @@ class Certificate:
 
     @property
     def path_error(self) -> float:
-        """Bound on the cost of a planned path over the optimum, minus 1; infinite if not proved.
-
-        If the learned cost of every move lies within a factor 1 - e to (1 + e) t of the true one,
-        with t for the tries, so does that of every path. Then the path of the least learned cost
-        costs at most (1 + e) t / (1 - e) of the optimum.
-        """
+        """Bound on the cost of a planned path over the optimum, minus 1; infinite if not proved."""
         if not self.proved or self.multiplier_error >= 1:
             return math.inf
+        # Each move, so each path, has a learned cost of 1 - e to (1 + e) tries of its true cost.
         return (1 + self.cost_error) / (1 - self.multiplier_error) - 1
 
     def __str__(self) -> str:
         if not self.proved:
-            return (
-                f"not proved: {self.undecided:,} of {self.decisions:,} decisions are open, "
-                f"{self.wrong:,} are wrong"
-            )
+            text = f"not proved: {self.undecided:,} of {self.decisions:,} decisions are open, "
+            return f"{text}{self.wrong:,} are wrong"
         text = f"proved: all {self.decisions:,} decisions, margin {self.margin:.1f}"
         if math.isfinite(self.path_error):
             text += (
@@ -116,10 +79,7 @@ def _percent(error: float) -> str:
 def certify(
     network: PropagationQNetwork, move_rules: Sequence[MoveRule] = MOVE_RULES
 ) -> Certificate:
-    """Prove what a network takes for possible under some rules, and bound the error of its costs.
-
-    One that does not observe the move rule can be right under one rule only.
-    """
+    """Prove what a network takes for possible under some rules, and bound its costs' errors."""
     every_P9 = every_patch()
     patch_P9 = every_P9[every_P9[:, CENTRE] != OCCUPIED]
     decisions = len(move_rules) * len(patch_P9) * len(MOVES)
@@ -128,10 +88,8 @@ def certify(
     undecided, wrong, least, error, tries = 0, 0, math.inf, 0.0, 1.0
     with np.errstate(over="ignore", invalid="ignore"):  # a broken model may overflow
         for rule in move_rules:
-            feature_PI, legal_PA = (
-                network.features(patch_P9, rule),
-                legal_in_patches(patch_P9, rule),
-            )
+            legal_PA = legal_in_patches(patch_P9, rule)
+            feature_PI = network.features(patch_P9, rule)
             margin_PA, weight_CPA = _margins(network, feature_PI, legal_PA)
             right_PA = margin_PA > 0  # False for NaN
             least = min(least, float(margin_PA[right_PA].min(initial=math.inf)))
@@ -151,15 +109,11 @@ def certify(
 
 
 def _margins(
-    network: PropagationQNetwork,
-    feature_PI: NDArray[np.float32],
-    legal_PA: NDArray[np.bool_],
+    network: PropagationQNetwork, feature_PI: NDArray[np.float32], legal_PA: NDArray[np.bool_]
 ) -> tuple[Float64, Float64]:
-    """Bound by how much each logit is above 0 for a legal move, or below 0 for another: (P, A).
-
-    The bounds hold for float32 too. Return also what the bounded function gains with each input for
-    costs and unknown cells: (C, P, A).
-    """
+    """Bound how far on its right side of 0 each logit is, (P, A), and its gains by C: (C, P, A)."""
+    # Two lines enclose a ReLU, so two linear functions a logit (CROWN, Zhang et al. 2018). With one
+    # slope for both, one product gives the bounds of a hidden layer (Fast-Lin, Weng et al. 2018).
     tensors = {name: tensor.astype(np.float64) for name, tensor in network.tensors.items()}
     # Copies, as arrays in another order than the rest are slow.
     weight_IF, hidden_FF = tensors["convolution.weight"].T.copy(), tensors["hidden.weight"].T.copy()
@@ -197,16 +151,13 @@ def _margins(
 
 
 class _Lines:
-    """Two lines for each ReLU, given the bounds of its input: it lies between them.
-
-    The upper line is slope * input + distance. The lower line is either slope * input, or
-    lower_slope * input, whose slope is 0 or 1, whichever is nearer to the ReLU.
-    """
+    """Lines around ReLUs of bounded inputs: slope * x + distance above, slope * x below."""
 
     def __init__(self, low_PF: Float64, high_PF: Float64) -> None:
         above, below = np.maximum(high_PF, 0), np.minimum(low_PF, 0)
         self.slope = above / np.maximum(above - below, np.finfo(np.float64).tiny)
         self.distance = -below * self.slope
+        # Below it lies this line too, of slope 0 or 1: whichever is nearer to the ReLU.
         self.lower_slope = (high_PF > -low_PF).astype(np.float64)
         self.greatest = above.max(axis=0).astype(np.float32)
 
@@ -214,11 +165,8 @@ class _Lines:
 def _extremes(
     weights: Callable[[slice], Float64], feature_PI: NDArray[np.float32]
 ) -> tuple[Float64, Float64]:
-    """Return the least and the greatest weighted sum of inputs for costs and unknown cells: (P, U).
-
-    A free cell has a cost of 0 to 1, or it is unknown. `weights` returns the (2, P, U) weights of
-    the two inputs of one cell: small arrays are several times as fast as large ones.
-    """
+    """Return the least and greatest weighted sums, (P, U), given a cell's (2, P, U) weights."""
+    # A free cell has a cost of 0 to 1, or it is unknown. Arrays of one cell each are the fastest.
     low_PU, high_PU = np.float64(0), np.float64(0)
     for cell in range(9):
         choice_2PU = weights(slice(9 + cell, 27, 9)) * (1 - feature_PI[:, cell, None])
@@ -236,15 +184,9 @@ def _worst_costs(weight_BC: Float64, patch_B9: NDArray[np.int8]) -> NDArray[np.i
 
 
 def _multiplier_error(
-    network: PropagationQNetwork,
-    feature_PI: NDArray[np.float32],
-    legal_PA: NDArray[np.bool_],
+    network: PropagationQNetwork, feature_PI: NDArray[np.float32], legal_PA: NDArray[np.bool_]
 ) -> float:
-    """Bound the relative error of the cost multipliers of legal moves.
-
-    As true multipliers are at least 1, the absolute error is a bound. That the learned ones are at
-    least 1 too makes the error only smaller.
-    """
+    """Bound the relative error of legal moves' cost multipliers; true ones are at least 1."""
     if not network.uses_costs:  # 1 instead of at most the greatest one
         return 1 - 1 / MAX_COST_MULTIPLIER
     error_IA = network.tensors["prices.weight"].T.astype(np.float64, order="C")
@@ -262,10 +204,8 @@ def _multiplier_error(
 def _rounding_error(
     network: PropagationQNetwork, layers: Sequence[tuple[str, NDArray[np.float32]]]
 ) -> NDArray[np.float32]:
-    """Bound the rounding errors of layers in float32, given their greatest inputs.
-
-    The arrays are float32 too: the bound is infinite where the layers may overflow.
-    """
+    """Bound the rounding errors of layers in float32, given their greatest inputs: (U,) float32."""
+    # In float32 too the bound is infinite where the layers may overflow.
     error_U = np.zeros_like(layers[0][1])
     for layer, greatest_I in layers:
         weight_UI = np.abs(network.tensors[f"{layer}.weight"])

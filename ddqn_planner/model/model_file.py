@@ -15,38 +15,22 @@ from safetensors import SafetensorError, safe_open
 
 from ddqn_planner.files import as_path, write_atomically
 from ddqn_planner.grid import MoveRule
-from ddqn_planner.model.networks import (
-    AnyMapQNetwork,
-    PaperQNetwork,
-    PropagationQNetwork,
-    QNetwork,
-)
+from ddqn_planner.model.networks import AnyMapQNetwork, PaperQNetwork, PropagationQNetwork, QNetwork
 from ddqn_planner.resources import PACKAGE, find_resource
 
 METADATA_KEY = "ddqn_planner"
 MODEL_SUFFIX = ".safetensors"
-MAX_SIZE = 4096
-"""Largest network size (height, width, filters, hidden units) that a model file may ask for."""
-
-MAX_FILE_BYTES = 2**28
-"""A larger file is refused before it is read."""
+MAX_SIZE = 4096  # of a network (height, width, filters, hidden units)
+MAX_FILE_BYTES = 2**28  # a larger file is refused before it is read
 
 NETWORKS: Final[dict[str, type[QNetwork]]] = {
     network.name: network for network in (PaperQNetwork, PropagationQNetwork, AnyMapQNetwork)
 }
-"""By their names in model files and hyper-parameters."""
-
-FIELD_TYPES: Final[dict[str, tuple[type, ...]]] = {
-    "network": (str,),
-    "sizes": (dict,),
-    "move_rule": (str,),
-    "gamma": (float, int),
-    "map_fingerprint": (str,),
-    "steps": (int,),
-    "seed": (int,),
-    "package_version": (str,),
+TYPES: Final[dict[str, tuple[type, ...]]] = {
+    **dict.fromkeys(("network", "move_rule", "map_fingerprint", "package_version"), (str,)),
+    **{"sizes": (dict,), "gamma": (float, int), "steps": (int,), "seed": (int,)},
 }
-"""The type of each entry of `ModelMetadata` in JSON."""
+"""The types of each entry of `ModelMetadata` in JSON."""
 
 
 class ModelFileError(ValueError):
@@ -86,10 +70,9 @@ def find_model(name: str | Path) -> Path:
     try:
         return find_resource("models", f"{name}{MODEL_SUFFIX}")
     except FileNotFoundError as error:
-        raise ModelFileError(
-            f"there is no shipped model {str(name)!r}: {error}; give one of these or the path of "
-            f"a {MODEL_SUFFIX} file"
-        ) from None
+        problem = f"there is no shipped model {str(name)!r}: {error}"
+        remedy = f"give one of these or the path of a {MODEL_SUFFIX} file"
+        raise ModelFileError(f"{problem}; {remedy}") from None
 
 
 def save_model(path: str | Path, network: QNetwork, description: ModelMetadata) -> None:
@@ -99,10 +82,7 @@ def save_model(path: str | Path, network: QNetwork, description: ModelMetadata) 
 
 
 def load_model(name: str | Path) -> tuple[QNetwork, ModelMetadata]:
-    """Read a model file, given by its path or by the name of a shipped model.
-
-    It is a ModelFileError if the file is missing, truncated, not safetensors, or no model.
-    """
+    """Read a model file, given by path or a shipped model's name; else raise ModelFileError."""
     path = find_model(name)
     try:
         with path.open("rb"):  # safetensors reports an unreadable file as missing
@@ -110,10 +90,8 @@ def load_model(name: str | Path) -> tuple[QNetwork, ModelMetadata]:
     except OSError as error:
         raise ModelFileError(f"{path}: cannot be read ({error}); check its rights") from None
     except SafetensorError as error:
-        raise ModelFileError(
-            f"{path}: cannot be read as safetensors ({error}); it is truncated or of another "
-            "kind: save or copy it again"
-        ) from None
+        problem = f"cannot be read as safetensors ({error}); it is truncated or of another kind"
+        raise ModelFileError(f"{path}: {problem}: save or copy it again") from None
 
 
 def _load(path: Path) -> tuple[QNetwork, ModelMetadata]:
@@ -130,18 +108,16 @@ def _load(path: Path) -> tuple[QNetwork, ModelMetadata]:
         try:
             description = _parse(json.loads(text))
         except (ValueError, RecursionError) as error:
-            raise ModelFileError(
-                f"{path}: its metadata is wrong ({error}); train the model again"
-            ) from None
+            problem = f"its metadata is wrong ({error})"
+            raise ModelFileError(f"{path}: {problem}; train the model again") from None
         network_class, sizes = NETWORKS[description.network], description.sizes
         shapes = network_class.shapes(sizes)
         expected = {key: ("F32", [*shape]) for key, shape in shapes.items()}
         slices = {key: file.get_slice(key) for key in file.keys()}  # noqa: SIM118
         found = {key: (part.get_dtype(), part.get_shape()) for key, part in slices.items()}
         if expected != found:
-            raise ModelFileError(
-                f"{path}: holds tensors {reprlib.repr(found)}, not {expected}; train it again"
-            )
+            problem = f"holds tensors {reprlib.repr(found)}, not {expected}"
+            raise ModelFileError(f"{path}: {problem}; train it again")
         tensors = {key: file.get_tensor(key) for key in found}
     if not all(np.isfinite(tensor).all() for tensor in tensors.values()):
         raise ModelFileError(f"{path}: its weights are not all finite; train it again")
@@ -151,10 +127,10 @@ def _load(path: Path) -> tuple[QNetwork, ModelMetadata]:
 def _parse(values: object) -> ModelMetadata:
     if not isinstance(values, dict):
         raise ValueError(f"it is {reprlib.repr(values)}; it must be a JSON object")
-    wrong = sorted(values.keys() ^ FIELD_TYPES.keys())
+    wrong = sorted(values.keys() ^ TYPES.keys())
     if wrong:
         raise ValueError(f"it lacks, or should not have, {reprlib.repr(wrong)}")
-    for key, types in FIELD_TYPES.items():
+    for key, types in TYPES.items():
         if type(values[key]) not in types:
             names = " or ".join(known.__name__ for known in types)
             raise ValueError(f"{key} is {reprlib.repr(values[key])}; it must be {names}")
@@ -169,9 +145,8 @@ def _parse(values: object) -> ModelMetadata:
     for name, size in sizes.items():
         least = 0 if name == "hidden_units" else 1
         if type(size) is not int or not least <= size <= MAX_SIZE:
-            raise ValueError(
-                f"size {name} is {reprlib.repr(size)}; it must lie in {least} to {MAX_SIZE}"
-            )
+            limits = f"{least} to {MAX_SIZE}"
+            raise ValueError(f"size {name} is {reprlib.repr(size)}; it must lie in {limits}")
     if not 0 <= values["gamma"] <= 1:
         raise ValueError(f"gamma is {values['gamma']}; it must lie in 0 to 1")
     return ModelMetadata(**{**values, "sizes": sizes, "move_rule": MoveRule(values["move_rule"])})

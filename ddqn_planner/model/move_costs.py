@@ -1,8 +1,4 @@
-"""What a network says of the moves on one map, in the form that fields are computed from.
-
-Dimensions: C = cells of the padded map, P = patches, A = 8 actions, N = 9 cells of a patch, L = the
-102 values of a cell: 0 for unknown, 1 to 100 for the costs 0 to 99, 101 for occupied.
-"""
+"""What a network says of the moves on one map, in the form that fields are computed from."""
 
 from __future__ import annotations
 
@@ -12,60 +8,30 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ddqn_planner.compiled import compiled
-from ddqn_planner.grid import (
-    MAX_COST_MULTIPLIER,
-    OCCUPIED,
-    UNKNOWN,
-    GridMap,
-    MoveRule,
-    legal_moves,
-)
+from ddqn_planner.grid import MAX_COST_MULTIPLIER, OCCUPIED, UNKNOWN, GridMap, MoveRule, legal_moves
 
+# Shapes: C = cells of the padded map, P = patches, S = sets of actions, A = 8 actions, L = the 102
+# values of a cell: 0 for unknown, 1 to 100 for the costs 0 to 99, 101 for occupied.
 Array = NDArray[np.float32]
-
 VALUES = OCCUPIED - UNKNOWN + 1
+# Above all true ones. Time and memory of a field grow with it, and a broken model predicts any.
 MAX_MULTIPLIER = 20 * MAX_COST_MULTIPLIER
-"""Upper bound on predicted cost multipliers, far above every true one.
-
-Time and memory of a field grow with the highest cost, and a broken model may predict any."""
-
-OCCUPIED_PATCH = 512
-"""The patch of all occupied cells, and of those outside the map: no move leads out of them."""
+OCCUPIED_PATCH = 512  # of occupied cells, and those outside the map: no move leads out of them
 
 
 class MoveCosts(NamedTuple):
-    """The cost of each move of each cell, on a map with a border of one cell.
+    """The cost of each move of each cell, on a map with a border of one cell."""
 
-    It is ``table[patch[cell], action]``; with terms, that is only the length of the move, and
-    is multiplied by ``1 + max(0, sum of terms)``, at most `MAX_MULTIPLIER`. With values and no
-    terms, it is multiplied by the mean value of the two cells.
-
-    Parameters
-    ----------
-    patch : (C,) uint16 or int32
-        The number of each cell's patch.
-    table : (P, 8) float32
-        At least 1; infinite where a move is not possible.
-    value : (C,) uint8 or float32, optional
-        The value of each cell for the terms, or what multiplies its moves, 1 or more.
-    terms : (9, 102, 8) float32, optional
-        What each value of each cell of a patch adds.
-    width : int
-        Columns of the padded map.
-    highest : float
-        No possible move costs more.
-    straight, diagonal : float
-        No straight and no diagonal move costs less.
-    """
-
-    patch: NDArray[Any]
-    table: Array
-    value: Any
-    terms: Any
-    width: int
-    highest: float
-    straight: float
-    diagonal: float
+    # It is table[patch[cell], action]. With terms, that is a length, times 1 + max(0, sum of them),
+    # at most MAX_MULTIPLIER; with values alone, it is multiplied by the mean of its two cells'.
+    patch: NDArray[Any]  # (C,) uint16 or int32: the number of each cell's patch
+    table: Array  # (P, 8) float32: at least 1; infinite where a move is not possible
+    value: Any  # (C,) uint8 for the terms, or float32 of 1 or more, or None
+    terms: Any  # (9, L, 8) float32: what each value of each cell of a patch adds, or None
+    width: int  # columns of the padded map
+    highest: float  # no possible move costs more
+    straight: float  # no straight move costs less
+    diagonal: float  # no diagonal move costs less
 
     @classmethod
     def of_table(cls, table_PA: Array) -> MoveCosts:
@@ -95,10 +61,7 @@ class MoveCosts(NamedTuple):
 def _with_directions(
     patch_C: NDArray[Any], table_PA: Array, forbidden_C: NDArray[np.uint8]
 ) -> tuple[NDArray[Any], Array]:
-    """Return patches and a table of costs in which forbidden moves are not possible.
-
-    Each set of forbidden actions that occurs has its own copy of the table.
-    """
+    """Return patches and costs without forbidden moves: a copy of the table per set that occurs."""
     occurs = _occurring(forbidden_C)
     sets = np.flatnonzero(occurs)
     is_forbidden_SA = (sets[:, None] >> np.arange(table_PA.shape[1]) & 1).astype(np.bool_)
@@ -131,10 +94,7 @@ def _cell_values(grid: GridMap) -> NDArray[np.uint8]:
 
 @compiled
 def patch_numbers(occupancy: NDArray[np.bool_]) -> NDArray[np.uint16]:
-    """Return the patch of each cell, with a border: (C,) uint16.
-
-    Bit 3 y + x is set where the patch's cell (x, y) is occupied; see `OCCUPIED_PATCH`.
-    """
+    """Return each cell's patch: (C,) uint16, with bit 3 y + x where its cell (x, y) is occupied."""
     height, width = occupancy.shape
     rows = np.ones((3, width + 2), np.uint8)  # all rows would be memory to fetch
     numbers = np.empty((height + 2, width + 2), np.uint16)
@@ -156,10 +116,7 @@ def patch_numbers(occupancy: NDArray[np.bool_]) -> NDArray[np.uint16]:
 def unique_patches(
     occupancy: NDArray[np.bool_], cost: NDArray[np.int8] | None
 ) -> tuple[NDArray[np.int32], NDArray[np.int8]]:
-    """Return the number of each cell's patch, (H, W), and the different patches, (P, 9).
-
-    So that a network evaluates each one once. Without costs they are all 512 possible ones.
-    """
+    """Return each cell's patch number, (H, W), and the different patches, (P, 9); 512 costless."""
     base, digits, outside = 2, occupancy.astype(np.int32), 1
     if cost is not None:
         base, outside = 128, OCCUPIED - UNKNOWN

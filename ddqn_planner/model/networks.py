@@ -1,10 +1,4 @@
-"""The Q-networks as the planner uses them: trained tensors, evaluated by NumPy.
-
-Their torch modules, which training needs, are in `ddqn_planner.training.networks`.
-Dimensions: A = 8 actions, B = a batch, I = inputs of a layer, P = unique patches, F = filters,
-R x L = rows and columns of the convolution's output, U = outputs of the layer after it, X = columns
-of a map.
-"""
+"""The Q-networks as the planner uses them: trained tensors, evaluated by NumPy."""
 
 from __future__ import annotations
 
@@ -30,28 +24,19 @@ from ddqn_planner.model.observation import ROBOT, observation_background
 
 Array: TypeAlias = NDArray[np.float32]
 
-CERTAIN = 0.99
-"""A move that succeeds with this probability or more counts as one that always does: the sigmoid
-function never reaches 1, and its rest must not decide between paths."""
+# Shapes: A = 8 actions, B = a batch, I and O = inputs and outputs of a layer, P = patches, F =
+# filters, R x L = rows and columns of a convolution, U = outputs after it, X and W = columns.
 
-BATCH = 2**12
-"""Patches per evaluation of a network. The layers' outputs then fit into a cache; those of all
-patches of a large map would need gigabytes."""
+# A move of at least this probability counts as one that always succeeds: the sigmoid function never
+# reaches 1, and its rest must not decide between paths.
+CERTAIN = 0.99
+BATCH = 2**12  # patches per evaluation: the layers' outputs then fit into a cache
 
 
 class QNetwork(ABC):
-    """A trained Q-network: what it says of the moves on a map.
+    """A trained Q-network, of `sizes` and float32 `tensors`: what it says of a map's moves."""
 
-    Parameters
-    ----------
-    sizes : mapping of str to int
-        A value for each of `size_names`.
-    tensors : mapping of str to (...) float32
-        Of the names and shapes that `shapes` returns.
-    """
-
-    name: ClassVar[str]
-    """The network's name in model files and hyper-parameters."""
+    name: ClassVar[str]  # in model files and hyper-parameters
     size_names: ClassVar[tuple[str, ...]]
 
     def __init__(self, sizes: Mapping[str, int], tensors: Mapping[str, Array]) -> None:
@@ -72,10 +57,7 @@ class QNetwork(ABC):
         return None
 
     def move_costs(self, grid: GridMap, move_rule: MoveRule) -> MoveCosts | None:
-        """Return the costs of a map's moves if the possible ones are exactly the legal ones.
-
-        None if the network knows no costs, or if it is not certain that it judges all moves right.
-        """
+        """Return the costs of a map's moves if proved: the possible ones are the legal ones."""
         return None
 
     def q_values(self, grid: GridMap, goal: Cell, move_rule: MoveRule) -> Array:
@@ -91,17 +73,10 @@ class QNetwork(ABC):
 
 
 class PaperQNetwork(QNetwork):
-    """The paper's network (Fig. 3): one convolution, one fully connected layer.
+    """The paper's network (Fig. 3), for maps of its own size: a 3x3 convolution, dense layers."""
 
-    A 3x3 convolution of stride 2, ReLU, and a fully connected layer with one output per action.
-    The paper gives neither the number of filters nor the padding. Our padding is 1: without it, no
-    filter covers the last row and column of a map of even size, and a robot there is invisible.
-
-    The paper's text ("one hidden layer is followed by ReLU") can also mean a second, fully
-    connected hidden layer between the two: `hidden_units` is its size, 0 for none. The network
-    plans on maps of its own height and width only; the paper's maps are 20 x 20 cells.
-    """
-
+    # The paper gives no padding. Without ours of 1, no filter covers the last row and column of a
+    # map of even size. Its text can mean a hidden layer of `hidden_units`; 0 is for none.
     name = "paper"
     size_names = ("height", "width", "filters", "hidden_units")
 
@@ -119,12 +94,9 @@ class PaperQNetwork(QNetwork):
         return shape == (self.sizes["height"], self.sizes["width"])
 
     def q_values(self, grid: GridMap, goal: Cell, move_rule: MoveRule) -> Array:
-        """Evaluate the observation of a robot in each cell: Q(s, a) toward one goal, (8, H, W).
-
-        The robot changes at most 2 x 2 outputs of the convolution. So these alone are evaluated
-        again for each cell, one row of the map at once, and all else once for the map. The costs of
-        the map are not used, nor is the move rule: the network knows that of its training.
-        """
+        """Evaluate a robot in each cell: Q(s, a) toward one goal, (8, H, W), whatever the rule."""
+        # The robot changes at most 2 x 2 outputs of the convolution. These alone are evaluated
+        # again for each cell, one row of the map at once, and all else once for the map.
         # In double precision: differences of large sums stay exact enough, and do not overflow.
         tensors = {name: tensor.astype(np.float64) for name, tensor in self.tensors.items()}
         first, *last = ["hidden", "fully_connected"][not self.sizes["hidden_units"] :]
@@ -159,21 +131,14 @@ class PaperQNetwork(QNetwork):
 
 
 class PropagationQNetwork(QNetwork):
-    """A Q-network for maps of any size: Q(s, a) = p(s, a) (r + γ V(s')) + (1 - p(s, a)) r_o.
+    """A Q-network for maps of any size: Q(s, a) = p(s, a) (r + γ V(s')) + (1 - p(s, a)) r_o."""
 
-    Learned is p(s, a), the probability that a move succeeds, from the 3x3 patch around the robot: a
-    3x3 convolution and two 1x1 layers. The rest is given: the cell that a successful move leads to,
-    its reward r, the reward r_o of a collision, and that V(s) is the greatest Q(s, a), propagated
-    from the goal. Related networks are the value iteration networks (VIN, Tamar et al. 2016), which
-    learn their reward too, and VProp (Nardelli et al. 2019), which learns how values propagate.
-    """
-
+    # Learned is p(s, a), from the 3x3 patch. Related: value iteration networks (VIN, Tamar et al.
+    # 2016) learn their reward too, and VProp (Nardelli et al. 2019) how values propagate.
     name = "propagation"
     size_names = ("filters",)
-    inputs: ClassVar[int] = 9
-    """Number of features."""
-    uses_costs: ClassVar[bool] = False
-    """Whether the costs of the cells, and the move rule, are among the features."""
+    inputs: ClassVar[int] = 9  # features
+    uses_costs: ClassVar[bool] = False  # whether the features tell costs and the move rule
 
     def __init__(self, sizes: Mapping[str, int], tensors: Mapping[str, Array]) -> None:
         super().__init__(sizes, tensors)
@@ -185,12 +150,8 @@ class PropagationQNetwork(QNetwork):
     def shapes(cls, sizes: Mapping[str, int]) -> dict[str, tuple[int, ...]]:
         """Return the shape of each tensor."""
         filters = sizes["filters"]
-        layers = {
-            "convolution": (filters, cls.inputs),
-            "hidden": (filters, filters),
-            "moves": (len(MOVES), filters),
-        }
-        return _with_biases(layers)
+        layers = {"convolution": (filters, cls.inputs), "hidden": (filters, filters)}
+        return _with_biases({**layers, "moves": (len(MOVES), filters)})
 
     @staticmethod
     def features(patch_B9: NDArray[np.int8], move_rule: MoveRule) -> Array:
@@ -243,16 +204,9 @@ class PropagationQNetwork(QNetwork):
         return MoveCosts.of_table(table_PA)
 
     def believed_costs(self, grid: GridMap, move_rule: MoveRule) -> MoveCosts:
-        """Return the costs of a map's moves, right or not.
-
-        The greatest Q is the cheapest path at any distance: there is no discount, and a move counts
-        as possible where p > 1/2. A move that may fail leaves the robot where it was, and is tried
-        again: its expected cost is that of one try over p, see `CERTAIN`. On a map of expected
-        times, these take the place of the learned cost multiplier. (Along a whole path, the
-        progress and detour terms of the paper's reward, section 4.2, add up to a constant of its
-        two ends.) Cost multipliers are clamped to `MAX_MULTIPLIER`. A move with NaN as its p or
-        cost multiplier is not possible.
-        """
+        """Return the costs of a map's moves, right or not: Q is minus the cheapest path's cost."""
+        # A move counts as possible where p > 1/2, and is tried until it succeeds. The progress and
+        # detour terms of the paper's reward (section 4.2) add up to a constant along a path.
         timed = grid.slowness is not None
         cost = grid.cost if self.uses_costs and not timed else None
         patch_id, patch_P9 = unique_patches(grid.occupancy, cost)
@@ -260,10 +214,7 @@ class PropagationQNetwork(QNetwork):
         return MoveCosts.of_table(self._costs_of(patch_P9, move_rule, timed)).on(grid, patch_C)
 
     def _costs_of(self, patch_P9: NDArray[np.int8], move_rule: MoveRule, timed: bool) -> Array:
-        """Return the cost of each move in each patch, infinite if not possible: (P, 8) float32.
-
-        If times are measured, the learned cost multiplier is left out.
-        """
+        """Return each move's cost, infinite if not possible, or the tries if `timed`: (P, 8)."""
         cost_PA = np.empty((len(patch_P9), len(MOVES)), dtype=np.float32)
         for begin in range(0, len(patch_P9), BATCH):
             batch = slice(begin, begin + BATCH)
@@ -277,13 +228,7 @@ class PropagationQNetwork(QNetwork):
 
 
 class AnyMapQNetwork(PropagationQNetwork):
-    """A propagation network for both move rules and for cells with different cost multipliers.
-
-    It learns the reward of a move too, r(s, a) = -length times m(s, a). Its input is more than the
-    obstacles of the patch: the costs of its cells, which of them are unknown, and the move rule.
-    The cost multiplier m is one linear layer of this input. That a move costs at least its length
-    is given.
-    """
+    """A propagation network that knows both move rules and learns r(s, a) = -length * m(s, a)."""
 
     name = "any_map"
     inputs = 28
@@ -296,11 +241,7 @@ class AnyMapQNetwork(PropagationQNetwork):
 
     @staticmethod
     def features(patch_B9: NDArray[np.int8], move_rule: MoveRule) -> Array:
-        """Return the features of patches, see `patches`: (B, 28).
-
-        For each of the 9 cells whether it is occupied, its cost as 0..1, and whether it is unknown;
-        then whether the rule allows to cut corners.
-        """
+        """Return of 9 cells which are occupied, costs of 0..1, which are unknown; rule: (B, 28)."""
         occupied, unknown = patch_B9 == OCCUPIED, patch_B9 == UNKNOWN
         cost_B9 = np.where(occupied | unknown, 0, patch_B9) / 100
         rule_B1 = np.full((len(patch_B9), 1), move_rule.cuts_corners)
@@ -311,16 +252,6 @@ class AnyMapQNetwork(PropagationQNetwork):
         multiplier_BA: Array = 1 + np.maximum(self._layer("prices", feature_BI), 0)
         return multiplier_BA
 
-    def terms(self, move_rule: MoveRule) -> Array:
-        """Return the terms of `MoveCosts`: the layer is linear, its output a sum over the cells."""
-        weight_AI, bias_A = self.tensors["prices.weight"], self.tensors["prices.bias"]
-        occupied_9A, cost_9A, unknown_9A = weight_AI[:, :27].T.reshape(3, 9, -1)
-        terms_9LA = np.empty((9, VALUES, len(MOVES)), dtype=np.float32)
-        terms_9LA[:, 0], terms_9LA[:, -1] = unknown_9A, occupied_9A
-        terms_9LA[:, 1:-1] = (np.arange(OCCUPIED) / 100)[:, None] * cost_9A[:, None]
-        terms_9LA[4] += bias_A + weight_AI[:, 27] * move_rule.cuts_corners
-        return terms_9LA
-
     def _proved_costs(self, move_rule: MoveRule, with_costs: bool, timed: bool) -> MoveCosts | None:
         """Return the costs of moves without what depends on the map."""
         if not with_costs:
@@ -329,7 +260,14 @@ class AnyMapQNetwork(PropagationQNetwork):
             return None
         legal_PA = legal_in_patches(every_patch(), move_rule)
         lengths_PA = np.where(legal_PA, move_rule.lengths, np.inf).astype(np.float32)
-        costs, terms_9LA = MoveCosts.of_table(lengths_PA), self.terms(move_rule)
+        costs = MoveCosts.of_table(lengths_PA)
+        # The layer is linear, so that its output is a sum over the patch's cells.
+        weight_AI, bias_A = self.tensors["prices.weight"], self.tensors["prices.bias"]
+        occupied_9A, cost_9A, unknown_9A = weight_AI[:, :27].T.reshape(3, 9, -1)
+        terms_9LA = np.empty((9, VALUES, len(MOVES)), dtype=np.float32)
+        terms_9LA[:, 0], terms_9LA[:, -1] = unknown_9A, occupied_9A
+        terms_9LA[:, 1:-1] = (np.arange(OCCUPIED) / 100)[:, None] * cost_9A[:, None]
+        terms_9LA[4] += bias_A + weight_AI[:, 27] * move_rule.cuts_corners
         greatest = 1 + max(0.0, float(terms_9LA.max(axis=1).sum(axis=0).max()))
         highest = costs.highest * min(greatest, MAX_MULTIPLIER)
         return costs._replace(terms=terms_9LA, highest=highest)

@@ -1,7 +1,4 @@
-"""What the networks observe: the whole map with the robot in it, or the 3x3 patch around it.
-
-Dimensions: B = a batch, C = H * W cells (cell y * W + x).
-"""
+"""What the networks observe: the whole map with the robot in it, or the 3x3 patch around it."""
 
 from __future__ import annotations
 
@@ -30,22 +27,15 @@ def observation_background(occupancy: NDArray[np.bool_], goal: Cell) -> NDArray[
 def observe(
     background: NDArray[np.float32], cells: NDArray[np.int64], shape: tuple[int, int]
 ) -> NDArray[np.float32]:
-    """Draw robots in cells (B,) into copies of backgrounds, (B, C) or (C,): (B, H, W).
-
-    This is the paper's observation.
-    """
-    count = len(cells)
-    observations = np.empty((count, background.shape[-1]), dtype=np.float32)
+    """Draw robots in cells (B,) into backgrounds (B, C) or (C,): the paper's input, (B, H, W)."""
+    observations = np.empty((len(cells), background.shape[-1]), dtype=np.float32)
     observations[:] = background
-    observations[np.arange(count), cells] = ROBOT
-    return observations.reshape(count, *shape)
+    observations[np.arange(len(cells)), cells] = ROBOT
+    return observations.reshape(-1, *shape)
 
 
 def patches(occupancy: NDArray[np.bool_], cost: NDArray[np.int8] | None) -> NDArray[np.int8]:
-    """Return the 3x3 patch around each cell, row by row: (C, 9) int8.
-
-    It holds the costs of free cells, 0 by default, and 100 where occupied or outside the map.
-    """
+    """Return each cell's 3x3 patch: costs, or 0, of free cells, 100 for all others: (C, 9) int8."""
     values = np.where(occupancy, OCCUPIED, np.int8(0) if cost is None else cost).astype(np.int8)
     padded = np.pad(values, 1, constant_values=OCCUPIED)
     windows = np.lib.stride_tricks.sliding_window_view(padded, (3, 3))

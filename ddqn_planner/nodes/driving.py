@@ -184,7 +184,7 @@ class Driving:
     def _draw(self, positions: Float64, place: MapInFrame) -> None:
         yaw = np.arctan2(*np.diff(positions, axis=0).T[::-1])
         last = quaternion(yaw[-1] if len(yaw) else 0)
-        header = self._node.header(place)
+        header = self._node.header(place.frame)
         self._node.episodes.publish(serialized_poses(positions, yaw, header, last))
 
     def _show_slowness(self) -> None:
@@ -199,7 +199,7 @@ class Driving:
         slowness = folder.experience.slowness(grid)
         percent = np.clip(100 * np.log(slowness) / np.log(SLOWEST), 0, 100).round()
         percent[grid.occupancy] = -1
-        header = self._node.header(place)
+        header = self._node.header(place.frame)
         self._slowness.publish(occupancy_message(percent, grid.resolution, grid.origin, header))
 
     # Services: each returns whether it succeeds, and a message

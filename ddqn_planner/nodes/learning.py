@@ -9,7 +9,6 @@ from typing import Any, NamedTuple
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from nav_msgs.msg import OccupancyGrid, Path
 from rclpy.timer import Timer
-from std_msgs.msg import Header
 
 from ddqn_planner.grid import GridMap
 from ddqn_planner.nodes.conversions import grid_from_message
@@ -50,10 +49,6 @@ class LearningNode(BaseNode):
             grid = grid_from_message(message, *map(self.value, OF_MAPS))
             self.map = MapInFrame(grid, message.header.frame_id)
             self.get_logger().info(f"map of {grid.width} x {grid.height} cells")
-
-    def header(self, place: MapInFrame) -> Header:
-        """Return the header of a message about now."""
-        return Header(stamp=self.get_clock().now().to_msg(), frame_id=place.frame)
 
     def fail(self, reason: str) -> None:
         """Log an error, and keep it for the diagnostics."""

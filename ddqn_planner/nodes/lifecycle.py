@@ -1,18 +1,16 @@
-"""A node that a lifecycle manager, or the node itself, configures, activates, and stops.
-
-rclpy's `LifecycleNodeMixin` ends the process on a transition that its state does not have, and
-drops the exceptions of transitions. Here both are logged, and the answer is that it failed.
-"""
+"""A node that a lifecycle manager, or the node itself, configures, activates, and stops."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partialmethod
 from typing import Any
 
 from lifecycle_msgs.srv import ChangeState
 from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.duration import Duration
 from rclpy.lifecycle import LifecycleNodeMixin, LifecycleState, TransitionCallbackReturn
+from rclpy.node import Node
 
 from ddqn_planner.nodes.runtime import BaseNode, Parameters
 
@@ -20,6 +18,18 @@ SUCCESS = TransitionCallbackReturn.SUCCESS
 
 HEARTBEAT_PERIOD, HEARTBEAT_TIMEOUT = 0.1, 4.0
 """Seconds, as Nav2's nodes and lifecycle manager have them."""
+
+ENTITIES: dict[str, Callable[[Node, Any], object]] = {
+    "publishers": Node.destroy_publisher,
+    "subscriptions": Node.destroy_subscription,
+    "clients": Node.destroy_client,
+    "services": Node.destroy_service,
+    "timers": Node.destroy_timer,
+    "guards": Node.destroy_guard_condition,
+    # Last: handlers of events end with their publisher or subscription, and action servers stay.
+    "waitables": lambda _, server: server.destroy(),
+}
+"""What a node can create, and what destroys it."""
 
 
 class ManagedNode(LifecycleNodeMixin, BaseNode):
@@ -29,6 +39,8 @@ class ManagedNode(LifecycleNodeMixin, BaseNode):
         BaseNode.__init__(self, name, parameters)
         # Reentrant: the state can be asked for while a transition waits.
         LifecycleNodeMixin.__init__(self, callback_group=ReentrantCallbackGroup())
+        # rclpy's answer ends the process on a transition that the state does not have, and drops
+        # the exceptions of transitions. Here both are logged, and the answer is that it failed.
         self.answer_with(ChangeState, self._on_change_state)
         self._is_changing = False
         self._error: Exception | None = None
@@ -64,39 +76,47 @@ class ManagedNode(LifecycleNodeMixin, BaseNode):
         return True
 
     def configure(self) -> None:
-        """Create what the node needs."""
+        """Create what the node needs, after this."""
+        self._kept = {entity for kind in ENTITIES for entity in getattr(self, kind)}
 
     def activate(self) -> None:
         """Begin to answer requests."""
 
     def deactivate(self) -> None:
-        """Stop."""
+        """Stop, and end the bond."""
+        if self._bond is not None:
+            self._bond.break_bond()
+            # Else a publisher that ends at once takes its last message with it.
+            self._bond.pub.wait_for_all_acked(Duration(seconds=0.2))
+            self._bond.shutdown()
+            # It has destroyed these, and the node still has them in its lists.
+            self.destroy_subscription(self._bond.sub)
+            self.destroy_publisher(self._bond.pub)
+            self._bond = None
 
     def cleanup(self) -> None:
-        """Free what `configure` created, also if it failed."""
+        """Destroy what was created since `configure`, also if that failed."""
+        for kind, destroy in ENTITIES.items():
+            for entity in {*getattr(self, kind)} - self._kept:
+                destroy(self, entity)
+
+    def _attempt(self, what: str, state: LifecycleState) -> TransitionCallbackReturn:
+        try:
+            getattr(self, what)()
+        except Exception as error:
+            self._error = error
+            self.get_logger().error(f"{what} failed: {str(error) or repr(error)}")
+            if what == "configure":
+                self._attempt("cleanup", state)
+            return TransitionCallbackReturn.FAILURE
+        return SUCCESS
 
     # rclpy calls these
 
-    def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Configure the node, or leave nothing behind."""
-        self._kept = {*self._entities()}
-        result = self._attempt("configure", self.configure)
-        if result is not SUCCESS:
-            self._attempt("cleanup", self._clean_up)
-        return result
-
-    def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Activate the node."""
-        return self._attempt("activate", self.activate)
-
-    def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Stop the node, and end the bond."""
-        self._break_bond()
-        return self._attempt("deactivate", self.deactivate)
-
-    def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Undo `configure`."""
-        return self._attempt("cleanup", self._clean_up)
+    on_configure = partialmethod(_attempt, "configure")
+    on_activate = partialmethod(_attempt, "activate")
+    on_deactivate = partialmethod(_attempt, "deactivate")
+    on_cleanup = partialmethod(_attempt, "cleanup")
 
     def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Stop the node and free all that it has, whatever its state is."""
@@ -104,15 +124,6 @@ class ManagedNode(LifecycleNodeMixin, BaseNode):
             self.on_deactivate(state)
         if state.label in ("active", "inactive"):
             self.on_cleanup(state)
-        return SUCCESS
-
-    def _attempt(self, what: str, function: Callable[[], None]) -> TransitionCallbackReturn:
-        try:
-            function()
-        except Exception as error:
-            self._error = error
-            self.get_logger().error(f"{what} failed: {str(error) or repr(error)}")
-            return TransitionCallbackReturn.FAILURE
         return SUCCESS
 
     async def _on_change_state(
@@ -130,8 +141,7 @@ class ManagedNode(LifecycleNodeMixin, BaseNode):
         self._is_changing = True
         try:
             if await self.prepare(label):
-                result = getattr(self, f"trigger_{label}")()
-                response.success = result is SUCCESS
+                response.success = getattr(self, f"trigger_{label}")() is SUCCESS
                 if response.success and label == "activate":
                     self._form_bond()
         except Exception as error:  # the node must survive
@@ -140,9 +150,8 @@ class ManagedNode(LifecycleNodeMixin, BaseNode):
             self._is_changing = False
         return response
 
-    # The bond, by which a lifecycle manager sees that the process lives
-
     def _form_bond(self) -> None:
+        """Let a lifecycle manager see that the process lives."""
         try:
             from bondpy.bondpy import Bond
         except ImportError:
@@ -155,38 +164,3 @@ class ManagedNode(LifecycleNodeMixin, BaseNode):
         self._bond.heartbeat_period = HEARTBEAT_PERIOD
         self._bond.heartbeat_timeout = HEARTBEAT_TIMEOUT
         self._bond.start()
-
-    def _break_bond(self) -> None:
-        if self._bond is not None:
-            self._bond.break_bond()
-            # Else a publisher that ends at once takes its last message with it.
-            self._bond.pub.wait_for_all_acked(Duration(seconds=0.2))
-            self._bond.shutdown()
-            # It has destroyed these, and the node still has them in its lists.
-            self.destroy_subscription(self._bond.sub)
-            self.destroy_publisher(self._bond.pub)
-            self._bond = None
-
-    # Entities
-
-    def _clean_up(self) -> None:
-        destroyers = (
-            self.destroy_publisher,
-            self.destroy_subscription,
-            self.destroy_client,
-            self.destroy_service,
-            self.destroy_timer,
-            self.destroy_guard_condition,
-        )
-        for entity in self._entities():
-            # Each destroys what it knows. The rest are servers of actions; the handlers of events
-            # are waitables until their publisher or subscription is destroyed.
-            is_new = entity not in self._kept and not any(destroy(entity) for destroy in destroyers)
-            if is_new and entity in {*self.waitables}:
-                entity.destroy()
-        self.cleanup()
-
-    def _entities(self) -> list[Any]:
-        """Return what the node has created."""
-        waited_for = *self.publishers, *self.subscriptions, *self.clients, *self.services
-        return [*waited_for, *self.timers, *self.guards, *self.waitables]

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import sys
 from contextlib import suppress
+from functools import partial
 from typing import Any, Final
 
 import numpy as np
 from nav_msgs.msg import OccupancyGrid
 from nav_msgs.srv import GetMap, LoadMap
 from numpy.typing import NDArray
-from std_msgs.msg import Header
 
 from ddqn_planner.grid import (
     OCCUPIED,
@@ -36,7 +36,6 @@ RESULTS: dict[type[Exception], int] = {
 
 NO_MAP = "no map is loaded; call load_map first"
 
-
 PARAMETERS: Final = {
     "yaml_filename": Declared(
         "dilemma.yaml", "Path or URL of a map file, or a shipped map's name", read_only=True
@@ -48,16 +47,12 @@ PARAMETERS: Final = {
 
 
 class MapServerNode(BaseNode):
-    """Serves one map, latched on a topic and as a service, and its directions on another topic.
-
-    ``~/scatter_obstacles`` always adds to the loaded map, so that each call is an independent draw.
-    """
+    """Serves one map, latched on a topic and as a service, and its directions on another topic."""
 
     def __init__(self) -> None:
         super().__init__("map_server", PARAMETERS)
         self._loaded: MapFile | None = None
         self._served = OccupancyGrid()
-
         self._random = np.random.default_rng(self.value("seed"))
         topic = self.value("topic_name")
         # First, so that whoever receives a map knows that its directions come too.
@@ -80,10 +75,9 @@ class MapServerNode(BaseNode):
             path = find_map(url)
             loaded = read_map_file(path)
             if not MIN_RESOLUTION < loaded.resolution < np.finfo(np.float32).max:
-                raise MapMetadataError(
-                    f"{path}: resolution is {loaded.resolution}; a map message needs more than "
-                    f"{MIN_RESOLUTION}, and no more than a float32 holds"
-                )
+                bounds = f"more than {MIN_RESOLUTION}, and no more than a float32 holds"
+                wrong = f"resolution is {loaded.resolution}; a map message needs {bounds}"
+                raise MapMetadataError(f"{path}: {wrong}")
         except Exception as error:
             # A broken file may raise anything in a library that reads it: the node must survive.
             kept = "the map before it stays" if self._loaded else "no map is served"
@@ -97,8 +91,7 @@ class MapServerNode(BaseNode):
 
     def _serve(self, values: NDArray[np.int8]) -> None:
         assert self._loaded is not None
-        header = Header(stamp=self.get_clock().now().to_msg(), frame_id=self.value("frame_id"))
-        place = self._loaded.resolution, self._loaded.origin, header
+        place = self._loaded.resolution, self._loaded.origin, self.header(self.value("frame_id"))
         self._served = occupancy_message(values, *place)
         self._directions.publish(directions_message(self._loaded.forbidden, *place))
         self._publisher.publish(self._served)
@@ -116,26 +109,24 @@ class MapServerNode(BaseNode):
         return response
 
     def _on_scatter_obstacles(self) -> tuple[bool, str]:
+        """Add to the loaded map, not to what was added before: each call is an independent draw."""
         try:
-            message = self._scatter_obstacles()
+            if self._loaded is None:
+                raise ValueError(NO_MAP)
+            grid = self._loaded.grid()
+            move_rule, path = known_path(grid, self._loaded)
+            noisy, rejected = scatter_obstacles(grid, path, move_rule, self._random)
         except ValueError as error:
             self.get_logger().error(f"no obstacles were scattered: {error}")
             return False, str(error)
-        self.get_logger().info(message)
-        return True, message
-
-    def _scatter_obstacles(self) -> str:
-        if self._loaded is None:
-            raise ValueError(NO_MAP)
-        grid = self._loaded.grid()
-        move_rule, path = known_path(grid, self._loaded)
-        noisy, rejected = scatter_obstacles(grid, path, move_rule, self._random)
         new = noisy.occupancy & ~grid.occupancy
         self._serve(np.where(new, np.int8(OCCUPIED), self._loaded.values))
         rows, columns = np.nonzero(new)
         places = zip(*grid.centres(columns, rows), strict=True)
         cells = ", ".join(f"({x:.3f}, {y:.3f})" for x, y in places)
-        return f"{len(rows)} new obstacles at {cells} m; {rejected} draws thrown away"
+        message = f"{len(rows)} new obstacles at {cells} m; {rejected} draws thrown away"
+        self.get_logger().info(message)
+        return True, message
 
     def _on_restore_map(self) -> tuple[bool, str]:
         if self._loaded is None:
@@ -159,10 +150,7 @@ def known_path(grid: GridMap, map_file: MapFile) -> tuple[MoveRule, list[Cell]]:
     raise ValueError(f"no path leads from the start {start} to the goal {goal} of the map file")
 
 
-def main() -> int:
-    """Run the map server node until SIGINT or SIGTERM."""
-    return spin_until_shutdown(MapServerNode, PARAMETERS)
-
+main = partial(spin_until_shutdown, MapServerNode, PARAMETERS)
 
 if __name__ == "__main__":
     sys.exit(main())

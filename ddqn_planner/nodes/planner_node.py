@@ -71,6 +71,7 @@ class PlannerNode(ManagedNode):
 
     def configure(self) -> None:
         """Listen to the map and to where the robot is, and create what answers requests."""
+        super().configure()
         self._display = FieldDisplay(self)
         self._plan_publisher = self.create_publisher(Path, "plan", LATCHED)
         # In a group of its own: triggers that come while it plans make it plan once more after.
@@ -107,11 +108,13 @@ class PlannerNode(ManagedNode):
 
     def deactivate(self) -> None:
         """Forget the active goal."""
+        super().deactivate()
         self._active, self._followed = ActiveGoal([], PathUnderWay()), PathUnderWay()
         self._report.change()
 
     def cleanup(self) -> None:
         """Free the map, the model and its fields."""
+        super().cleanup()
         self._forget()
         self._report.forget()
         self.after_jump_back.clear()
@@ -260,7 +263,7 @@ class PlannerNode(ManagedNode):
         frame = self._map.frame or (goals[0].header.frame_id if goals else "")
         if outcome.goal is not None:  # the map may be another one by now
             frame = outcome.goal.header.frame_id
-        return Header(stamp=self.get_clock().now().to_msg(), frame_id=frame), outcome
+        return self.header(frame), outcome
 
     # Diagnostics
 

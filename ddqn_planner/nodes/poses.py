@@ -25,9 +25,8 @@ from rclpy.time import Time
 from std_msgs.msg import Header
 
 from ddqn_planner.nodes.conversions import check_pose, quaternion
-from ddqn_planner.nodes.listening import best_effort
 from ddqn_planner.nodes.report import Refusals, RequestError
-from ddqn_planner.nodes.runtime import BaseNode
+from ddqn_planner.nodes.runtime import BaseNode, best_effort
 
 PATIENCE = 1.0
 """Seconds within which a new listener hears the first message of `odom` or TF. A pose that was

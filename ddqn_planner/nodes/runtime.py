@@ -1,4 +1,4 @@
-"""What the nodes share: parameters, services, the background worker, ``--help``, the shutdown."""
+"""What the nodes share: parameters, services, topics, the background worker, the shutdown."""
 
 from __future__ import annotations
 
@@ -9,15 +9,18 @@ import signal
 import sys
 import threading
 import weakref
-from collections.abc import Callable, Coroutine, Generator, Mapping
+from collections.abc import Callable, Coroutine, Generator, Iterator, Mapping
 from contextlib import suppress
+from copy import copy
 from inspect import isawaitable
+from itertools import product
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, NamedTuple
 
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from nav_msgs.msg import Odometry
 from rcl_interfaces.msg import (
     FloatingPointRange,
     IntegerRange,
@@ -25,8 +28,10 @@ from rcl_interfaces.msg import (
     SetParametersResult,
 )
 from rcl_interfaces.srv import SetParameters, SetParametersAtomically
-from rclpy.clock import Clock
+from rclpy.clock import Clock, JumpThreshold, TimeJump
 from rclpy.clock_type import ClockType
+from rclpy.duration import Duration
+from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.exceptions import (
     InvalidHandle,
     NameValidationException,
@@ -37,30 +42,36 @@ from rclpy.executors import SingleThreadedExecutor
 from rclpy.logging import get_logger
 from rclpy.node import Node
 from rclpy.parameter import Parameter
-from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.qos import DurabilityPolicy, QoSPolicyKind, QoSProfile, ReliabilityPolicy
+from rclpy.qos_overriding_options import QoSOverridingOptions
 from rclpy.service import Service
 from rclpy.signals import SignalHandlerOptions
+from rclpy.subscription import Subscription
 from rclpy.task import Future
+from std_msgs.msg import Header
 from std_srvs.srv import Trigger
 
-from ddqn_planner.nodes.listening import ListeningNode
-
-LATCHED = QoSProfile(
-    depth=1,
-    reliability=ReliabilityPolicy.RELIABLE,
-    durability=DurabilityPolicy.TRANSIENT_LOCAL,
-)
+LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 """Late subscribers receive the last message too: for maps, plans, saved models."""
 
 STEADY = Clock(clock_type=ClockType.STEADY_TIME)
 """For timers that must not depend on simulated time."""
 
+# The middleware drops requests that do not fit into the queue, and the node cannot see it: ROS's
+# default of ten lost half of 20 requests. Fast DDS keeps 5,000 messages by default.
 SERVICE_QUALITY = QoSProfile(depth=5000)
-"""For each service, except ROS's parameter services, whose queue is 1,000.
+"""For each service, except ROS's parameter services, whose queue is 1,000."""
 
-The middleware drops requests that do not fit into the queue, and the node cannot see it: ROS's
-default queue of ten lost half of 20 requests. Fast DDS keeps 5,000 messages by default.
-"""
+OVERRIDABLE = [QoSPolicyKind[name] for name in ("HISTORY", "DEPTH", "DURABILITY", "RELIABILITY")]
+"""What parameters may change of each subscription."""
+
+MISFITS = ("durability", "volatile", "transient_local"), ("reliability", "best_effort", "reliable")
+"""What of a publisher's quality is less than what a subscription may ask for."""
+
+
+def best_effort(depth: int) -> QoSProfile:
+    """Return the quality for sensors: reliable publishers and others are received."""
+    return QoSProfile(depth=depth, reliability=ReliabilityPolicy.BEST_EFFORT)
 
 
 class Declared(NamedTuple):
@@ -98,19 +109,25 @@ class Declared(NamedTuple):
             choices = ", ".join(choice or "''" for choice in self.allowed)
             raise ValueError(f"{name} is {value!r}; give one of {choices}")
         if self.allowed == "not empty" and not value:
-            raise ValueError(
-                f"{name} is ''; name {self.description[0].lower()}{self.description[1:]}"
-            )
+            what = self.description[0].lower() + self.description[1:]
+            raise ValueError(f"{name} is ''; name {what}")
 
 
 Parameters = Mapping[str, Declared]
 
 
-class BaseNode(ListeningNode):
-    """Node with checked parameters, whose services lose no request and survive malformed ones."""
+class BaseNode(Node):
+    """Node with checked parameters and requests that are not lost; it says what it cannot hear."""
 
     def __init__(self, name: str, parameters: Parameters) -> None:
+        self._incompatible: set[str] = set()
+        self._logged_problems: list[str] = []
+        self.after_jump_back: set[Callable[[], None]] = set()
+        """Called when a bag loops or a simulator is reset."""
         super().__init__(name)
+        # As tf2 has it. Another clock, by use_sim_time, counts as a jump, too.
+        back = JumpThreshold(min_forward=None, min_backward=Duration(seconds=-1))
+        self._jumps = self.get_clock().create_jump_callback(back, post_callback=self._on_jump)
         self._declared = parameters
         for parameter, declared in parameters.items():
             self.declare_parameter(parameter, declared.default, declared.descriptor())
@@ -120,6 +137,17 @@ class BaseNode(ListeningNode):
         self.add_on_set_parameters_callback(self._check)
         for service_type in (SetParameters, SetParametersAtomically):
             self.answer_with(service_type, self._on_set_parameters)
+
+    def _on_jump(self, jump: TimeJump) -> None:
+        seconds = jump.delta.nanoseconds / 1e9
+        what = f"jumped by {seconds:.6g} s" if seconds else "changed"
+        self.get_logger().warning(
+            f"the clock {what}: transforms and odometry from before are forgotten"
+        )
+        for forget in self.after_jump_back:
+            forget()
+
+    # Parameters
 
     def _check(self, parameters: list[Parameter]) -> SetParametersResult:
         try:
@@ -154,14 +182,15 @@ class BaseNode(ListeningNode):
         reason = "a parameter has no name; give one"
         try:
             if all(message.name for message in messages):
-                return self.set_parameters_atomically(
-                    [*map(Parameter.from_parameter_msg, messages)]
-                )
+                parameters = [*map(Parameter.from_parameter_msg, messages)]
+                return self.set_parameters_atomically(parameters)
         except ParameterNotDeclaredException as error:
             reason = str(error)
         except ValueError as error:
             reason = f"{error}; give one of rcl_interfaces/msg/ParameterType"
         return SetParametersResult(successful=False, reason=reason)
+
+    # Services and topics
 
     def answer_with(self, service_type: Any, callback: Callable[..., Any]) -> None:
         """Answer the service of a type, which rclpy has created, with another callback."""
@@ -177,33 +206,80 @@ class BaseNode(ListeningNode):
 
         async def answer(_: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
             result = handler()
-            success_and_message = await result if isawaitable(result) else result
-            response.success, response.message = success_and_message
+            response.success, response.message = await result if isawaitable(result) else result
             return response
 
         self.create_service(Trigger, name, answer, **options)
 
+    def create_subscription(
+        self, msg_type: Any, topic: str, callback: Any, qos_profile: Any, **options: Any
+    ) -> Subscription:
+        """Create a subscription with the quality that parameters may override."""
+        name = self.resolve_topic_name(topic)
+        options["qos_overriding_options"] = QoSOverridingOptions(OVERRIDABLE)
+        options["event_callbacks"] = SubscriptionEventCallbacks(
+            incompatible_qos=lambda _: self._incompatible.add(name)
+        )
+        quality = copy(qos_profile)  # rclpy writes what the parameters say into it
+        try:
+            return super().create_subscription(msg_type, topic, callback, quality, **options)
+        except RuntimeError as error:
+            raise RuntimeError(
+                f"cannot subscribe to {name} ({error}); give qos_overrides.{name}.subscription "
+                "values that ROS knows, or none"
+            ) from None
+
+    def header(self, frame: str = "") -> Header:
+        """Return the header of a message about now."""
+        return Header(stamp=self.get_clock().now().to_msg(), frame_id=frame)
+
     def diagnostics(
         self, what: str, level: bytes, message: str, values: Mapping[str, str]
     ) -> DiagnosticArray:
-        """Return a message for `/diagnostics` with one status, and what is wrong with topics."""
-        problems = self.topic_problems()
+        """Return a message for `/diagnostics`; topics' problems are in it, and logged once."""
+        problems = [*self._topic_problems()]
+        for problem in problems:
+            if problem not in self._logged_problems:
+                self.get_logger().warning(problem)
+        self._logged_problems = problems
         if problems:
             level, message = max(level, DiagnosticStatus.WARN), "; ".join([message, *problems])
         status = DiagnosticStatus(name=f"{self.get_fully_qualified_name()}: {what}")
         status.level, status.message = level, message
         status.values = [KeyValue(key=key, value=value) for key, value in values.items()]
-        array = DiagnosticArray(status=[status])
-        array.header.stamp = self.get_clock().now().to_msg()
-        return array
+        return DiagnosticArray(header=self.header(), status=[status])
+
+    def _topic_problems(self) -> Iterator[str]:
+        """Say which publishers are not received, and that odometry has several."""
+        for subscription in self.subscriptions:
+            topic = subscription.topic_name
+            # To count is cheap; to ask who they are is not.
+            several = subscription.msg_type is Odometry and self.count_publishers(topic) > 1
+            if not several and topic not in self._incompatible:
+                continue
+            publishers = [
+                (f"{each.node_namespace.rstrip('/')}/{each.node_name}", each.qos_profile)
+                for each in self.get_publishers_info_by_topic(topic)
+            ]
+            if several:
+                names = ", ".join(sorted(name for name, _ in publishers))
+                yield (
+                    f"{topic} has {len(publishers)} publishers ({names}), so the robot's place may "
+                    "jump from one's to the other's; let one publish, or remap the others"
+                )
+            for (name, offered), (policy, *misfit) in product(publishers, MISFITS):
+                both = offered, subscription.qos_profile
+                has, wanted = (getattr(quality, policy).name.lower() for quality in both)
+                if [has, wanted] == misfit:
+                    yield (
+                        f"nothing of {name} is received on {topic}: its {policy} is {has}, and "
+                        f"{wanted} is asked for; let it publish so, or start this node with the "
+                        f"parameter qos_overrides.{topic}.subscription.{policy}:={has}"
+                    )
 
 
 class Worker:
-    """Calls functions one after the other in a thread, and wakes the node's executor after each.
-
-    The thread touches nothing else of the node. The process ends without waiting for a call that is
-    under way.
-    """
+    """Calls functions one after the other in a thread, for which no end of a process waits."""
 
     def __init__(self, node: Node) -> None:
         # A future alone does not wake an executor in another thread.
@@ -277,54 +353,47 @@ qos_overrides.TOPIC.subscription.POLICY, where POLICY is history, depth, durabil
 """
 
 
-def help_text(program: str, summary: str, parameters: Parameters) -> str:
-    """Return what ``--help`` prints."""
-    lines = [HELP.format(program=program, summary=summary)]
+def _print_help(summary: str, parameters: Parameters) -> None:
+    print(HELP.format(program=Path(sys.argv[0]).name, summary=summary))
     for name, declared in parameters.items():
         default = declared.default
         kind = Parameter.Type.from_parameter_value(default).name.lower()
         value = repr(default) if isinstance(default, str) else json.dumps(default)
         words = f"{kind}, default {value}", declared.limits, "read-only" * declared.read_only
-        lines += [f"  {name}: {'; '.join(filter(None, words))}", f"      {declared.description}"]
-    return "\n".join(lines)
+        print(f"  {name}: {'; '.join(filter(None, words))}\n      {declared.description}")
 
 
 def spin_until_shutdown(make_node: Callable[[], Node], parameters: Parameters | None = None) -> int:
     """Run one node until SIGINT or SIGTERM, or print help; return 1 if it cannot start."""
     if parameters and {"-h", "--help"} & {*sys.argv[1:]}:
-        summary = (make_node.__doc__ or "").partition("\n")[0].replace("``", "")
-        print(help_text(Path(sys.argv[0]).name, summary, parameters), flush=True)
+        _print_help((make_node.__doc__ or "").partition("\n")[0].replace("``", ""), parameters)
         return 0
+    stopping = threading.Event()
     try:
         # With rclpy's handlers, nothing could be published any more when the node ends.
         rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
-    except Exception as error:  # an unknown ROS argument, a domain that is no number, no keys
-        return _cannot_start(error)
-    node, executor, stopping = None, SingleThreadedExecutor(), threading.Event()
-    # A task, not a flag: the executor wakes and returns.
-    _at_signals(lambda: executor.create_task(stopping.set))
-    try:
+        executor = SingleThreadedExecutor()
+        # A task, not a flag: the executor wakes and returns.
+        _at_signals(lambda: executor.create_task(stopping.set))
         node = make_node()
+    except (NameValidationException, ParameterException, RuntimeError) as error:  # also ROS's own
+        get_logger("ddqn_planner").fatal(f"cannot start: {error}")
+        rclpy.try_shutdown()
+        return 1
+    try:
         executor.add_node(node)
         while not stopping.is_set():
             executor.spin_once()
-    except (NameValidationException, ParameterException, RuntimeError) as error:
-        if node is not None and isinstance(error, RuntimeError):
-            raise
-        return _cannot_start(error)  # what ROS itself raises is a RuntimeError
     finally:
-        if node is not None:
-            node.destroy_node()
+        node.destroy_node()
         executor.shutdown()
         rclpy.shutdown()
     return 0
 
 
 def _at_signals(function: Callable[[], object]) -> None:
-    """Have a thread call a function at the first SIGINT or SIGTERM, whatever else the process does.
-
-    Python's handlers run in the main thread, and not while that waits for messages.
-    """
+    """Have a thread call a function at the first SIGINT or SIGTERM."""
+    # Python's handlers run in the main thread, and not while that waits for messages.
     heard, told = os.pipe()
     os.set_blocking(told, False)
     signal.set_wakeup_fd(told, warn_on_full_buffer=False)
@@ -336,8 +405,3 @@ def _at_signals(function: Callable[[], object]) -> None:
         function()
 
     threading.Thread(target=wait, daemon=True).start()
-
-
-def _cannot_start(error: Exception) -> int:
-    get_logger("ddqn_planner").fatal(f"cannot start: {error}")
-    return 1

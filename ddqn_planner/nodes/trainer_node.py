@@ -226,7 +226,7 @@ class TrainerNode(LearningNode):
             self._publish_cells(episode.cells, place)
 
     def _publish_cells(self, cells: tuple[Cell, ...], place: MapInFrame) -> None:
-        path = serialized_path(cells, place.grid, self.header(place), quaternion(0))
+        path = serialized_path(cells, place.grid, self.header(place.frame), quaternion(0))
         self.episodes.publish(path)
 
     def _publish_diagnostics(self) -> None:

@@ -18,18 +18,12 @@ from ddqn_planner.planning import kernels
 from ddqn_planner.planning.plan import Plan, PlanStatus
 from ddqn_planner.planning.repair import moved
 
-Goals: TypeAlias = tuple[Cell, ...]
-"""Different free cells, sorted: a path may end in any of them."""
-
-REPAIRED = 100
-"""Cells that a repair may take back before a new field is begun."""
-
+Goals: TypeAlias = tuple[Cell, ...]  # different free cells, sorted: a path may end in any of them
+REPAIRED = 100  # cells that a repair may take back before a new field is begun
+# Visits of a new field per cell that a repair may take back, while both take turns: to take a cell
+# back takes longer, and it is visited again. See docs/benchmarks.md.
 VISITS = 8
-"""Visits of a new field per cell that a repair may take back, while both take turns: to take a cell
-back takes longer, and it is visited again. See docs/benchmarks.md."""
-
-REPAIRED_SHARE = 0.02
-"""Share of the map's cells that a repair may take back."""
+REPAIRED_SHARE = 0.02  # of the map's cells that a repair may take back
 
 _STEPS: list[Cell] = [(int(dx), int(dy)) for dx, dy in MOVES]
 
@@ -133,19 +127,13 @@ class Known(NamedTuple):
 
     distance: NDArray[np.float64]
     state: NDArray[np.uint8]
-    opened: NDArray[np.int32]
-    """The open cells."""
+    opened: NDArray[np.int32]  # the open cells
+    # Whether closed cells have the least distances: those of a repair may be too great.
     closed_is_final: bool = True
-    """Whether the distances of closed cells are the least ones. After a repair they may be too
-    great, until the field grows to the cell."""
 
 
 class DistanceField(QField):
-    """The Q field that costs of moves give: computed where a request needs it, and repaired.
-
-    Distances to the nearest goal hold all of it. They grow from the goals until they reach a start;
-    `q`, `value` and `policy` are made of the whole map. Several threads may use one field.
-    """
+    """The Q field that costs of moves give; it grows from its goals as far as a request needs."""
 
     def __init__(self, goals: Goals, grid: GridMap, costs: MoveCosts, move_rule: MoveRule) -> None:
         self.grid, self.costs, self.move_rule = grid, costs, move_rule
@@ -165,11 +153,7 @@ class DistanceField(QField):
         return (cell[1] + 1) * self.costs.width + cell[0] + 1
 
     def _take(self) -> Known:
-        """Return what is known, and begin anew.
-
-        What changes it takes it, and gives it back when it is done. So after any exception on the
-        way, as a lack of memory, the field begins anew.
-        """
+        """Return what is known, to change it: so after any exception on the way it begins anew."""
         known = self.known
         del self.known
         return known
@@ -216,18 +200,11 @@ class DistanceField(QField):
         return self._succeeded(path, began)
 
     def take_over(
-        self,
-        old: DistanceField,
-        changed: NDArray[np.int32],
-        shift: Cell,
-        start: Cell | None = None,
+        self, old: DistanceField, changed: NDArray[np.int32], shift: Cell, start: Cell | None = None
     ) -> bool:
-        """Repair and take what an older field knows of the same place, unless to begin is quicker.
-
-        For one start, repair and new field take turns, each time with four times the limit: so the
-        quicker one wins. An older field that was taken over begins anew, else it stays as it is.
-        Return whether it was taken over; see `shift_between` and `changed_cells`.
-        """
+        """Repair and take what an older field of the place knows, unless to begin is quicker."""
+        # For one start, repair and new field take turns, each time with four times the limit: the
+        # quicker one wins. The older field then begins anew, or else stays as it is.
         most = max(REPAIRED, int(REPAIRED_SHARE * self.grid.occupancy.size))
         has_values_of_all = not vars(old).keys().isdisjoint(("q", "value", "policy"))
         limit = most if start is None or has_values_of_all else REPAIRED

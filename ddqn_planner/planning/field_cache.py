@@ -12,8 +12,7 @@ from ddqn_planner.model.move_costs import MoveCosts
 from ddqn_planner.planning.field import DistanceField, Goals, QField, network_field
 from ddqn_planner.planning.repair import changed_cells, shift_between
 
-CACHE_BYTES = 2**29
-"""Memory for the Q fields that a planner keeps: 14 of 2000 x 2000 cells, at 9 bytes per cell."""
+CACHE_BYTES = 2**29  # for a planner's Q fields: 14 of 2000 x 2000 cells, at 9 bytes per cell
 
 
 @dataclass(eq=False)
@@ -55,10 +54,7 @@ class FieldCache:
             return found
 
     def get(self, grid: GridMap, goals: Goals, rule: MoveRule, start: Cell | None = None) -> QField:
-        """Return the field of a map toward the nearest of some goals, perhaps for one start.
-
-        Only a network that gives costs knows fields toward several goals.
-        """
+        """Return the field of a map toward the nearest of some goals: several, if it has costs."""
         known = self._map(grid, rule)
         with self._lock:
             found = known.fields.get(goals)

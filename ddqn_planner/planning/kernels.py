@@ -1,15 +1,4 @@
-"""How values spread from the goal over a map, how they are repaired and read: in compiled code.
-
-A field is spread from its goal in the order of A*, so that a request visits the cells that its
-start needs and no others (resumable reverse A*, Silver 2005). Buckets hold the cells of about the
-same order (Dial 1969). After a change of the map, the distances that lose their support are taken
-back, and the cells that the change offers a path are opened (Ramalingam and Reps 1996; LPA*, Koenig
-and Likhachev 2002, is the same for one start).
-
-Cells are numbers of a padded map, see `MoveCosts`. Of each cell there is the distance to the goal,
-the least cost of a path, and its state: distance (C,) float64, state (C,) uint8. The functions
-compare distances in float64: float32 would lose the order of neighbours above some 10^6.
-"""
+"""How values spread from the goal over a map, how they are repaired and read: in compiled code."""
 
 from __future__ import annotations
 
@@ -27,29 +16,24 @@ Distances = NDArray[np.float64]
 States = NDArray[np.uint8]
 Cells = NDArray[np.int32]
 
+# Cells are numbers of a padded map, see `MoveCosts`. Distances are the least costs of paths to the
+# goal, in float64, as float32 would lose the order of neighbours above some 10^6.
+
+# States. The distance of an open cell may fall; that of a closed one is the least. Until a cell is
+# reached its distance is 0: then pages of memory that no request needs are never touched.
 UNREACHED: Final = 0
 OPEN: Final = 1
 CLOSED: Final = 2
 MARKED: Final = 4
-"""States of cells. The distance of an open cell may fall; that of a closed one is the least. Until
-a cell is reached its distance is 0: then pages of memory that no request needs are never touched.
-"""
 
-AT_GOAL: Final = 5e-324
-"""The distance of the goal: not 0, and as good as 0 in every sum."""
-
-BUCKETS: Final = 2
-"""Per unit of cost. More buckets mean fewer visits of cells that the start does not need."""
-
-SAME: Final = 1 + 1e-12
-"""Paths whose costs differ by a smaller factor cost the same: sums of floats are rounded."""
+AT_GOAL: Final = 5e-324  # the goal's distance: not 0, and as good as 0 in every sum
+BUCKETS: Final = 2  # per unit of cost; more mean fewer visits of cells that a start does not need
+SAME: Final = 1 + 1e-12  # paths cost the same up to this factor: sums of floats are rounded
 
 MOVE_X, MOVE_Y = MOVES.T.copy()
 
-FIRST: NDArray[np.int8] = np.array(
-    [0] + [(bits & -bits).bit_length() - 1 for bits in range(1, 256)], np.int8
-)
-"""The lowest bit of a byte that is set."""
+# The lowest bit of a byte that is set.
+FIRST = np.array([0] + [(bits & -bits).bit_length() - 1 for bits in range(1, 256)], np.int8)
 
 
 @compiled
@@ -88,16 +72,11 @@ def grow(
     start: int | None = None,
     limit: int = 2**62,
 ) -> tuple[Cells, bool]:
-    """Close cells in the order of A*, in place, until the distance of a start is known.
-
-    All cells that tie with those of the start's best path are closed too. So a rollout does not
-    depend on what was asked before. It gives up when it has visited more cells than the limit.
-    Without a start, each cell that a path joins to the goal gets its distance (Dijkstra). Return
-    the cells that stay open, and whether all was visited that is asked for.
-    """
+    """Close cells until a start's distance is known; return the open ones, and whether done."""
+    # In the order of A*, so that few cells are visited (resumable reverse A*, Silver 2005). Buckets
+    # hold the cells of about the same order (Dial 1969).
     if start is None:
-        # One bucket per unit: as no move costs less than 1, a cell cannot change its own. The start
-        # is on the border, which no path reaches.
+        # Dijkstra, toward a cell of the border. One bucket per unit: no move costs less than 1.
         start, bounds, buckets = 0, (0.0, 0.0), 1
     else:  # lower bounds, whatever the rounding
         bounds = costs.straight * (1 - 1e-7), costs.diagonal * (1 - 1e-7)
@@ -128,7 +107,7 @@ def _orders(
 
 @compiled
 def _remaining(x: int, y: int, bounds: tuple[float, float]) -> float:
-    """Return the least cost of moves over (x, y), given that of a straight and a diagonal one."""
+    """Return the least cost of moves over (x, y), given a straight and a diagonal one's."""
     x, y = abs(x), abs(y)
     both = min(x, y)
     return bounds[0] * (max(x, y) - both) + bounds[1] * both
@@ -163,6 +142,7 @@ def _grow(
                 done = True
                 break
             front = max(front, order[taken])
+        # Ties are closed too: so a rollout does not depend on what was asked before.
         if state[start] == CLOSED and distance[start] * (1 + 1e-6) * buckets < front:
             done = True
             break
@@ -259,7 +239,7 @@ def _still_open(
 def _least(
     distance: Any, state: Any, patch: Any, table: Any, value: Any, terms: Any, width: int, cell: int
 ) -> float:
-    """Return the least cost of a path from a cell through those around it that are not marked."""
+    """Return the least cost of a path from a cell through neighbours that are not marked."""
     least = np.inf
     for action in range(8):
         after = cell + MOVE_Y[action] * width + MOVE_X[action]
@@ -273,12 +253,9 @@ def _least(
 def take_back(
     distance: Distances, state: States, costs: MoveCosts, changed: Cells, limit: int
 ) -> tuple[Cells, bool]:
-    """Take back what changed moves no longer support, in place, and open what they offer.
-
-    The costs are those after the change; `changed` are all cells whose own moves changed, and more
-    do no harm. Return the cells that it opened, and whether no more than the limit were taken back;
-    if not, the field is as it was.
-    """
+    """Take back what changed moves no longer support; return what it opened, and if it could."""
+    # `changed` has all cells whose own moves changed (Ramalingam and Reps 1996; LPA*, Koenig and
+    # Likhachev 2002, is the same for one start). Beyond the limit, the field is as it was.
     patch, table, value, terms, width = costs[:5]
     offsets = MOVE_Y * width + MOVE_X
     # In the order of the old distances: what supports a cell is judged before it.

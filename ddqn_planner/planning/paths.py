@@ -15,19 +15,11 @@ from ddqn_planner.planning.field import Goals
 from ddqn_planner.planning.plan import PlanRequest
 from ddqn_planner.planning.search import search
 
-REACH = 5
-"""Cells along an axis that a robot may be beside its path, and still come back to it."""
-
-SAME_COST = 1 + 1e-9
-"""The relative error of a sum of costs: a path may cost this much more, and still as much."""
-
-ROUNDING = 1 + 1e-6
-"""The relative error of a distance in cells: 0.15 m in cells of 0.05 m must reach 3 cells, not
-2.9999999."""
-
+REACH = 5  # cells along an axis that a robot may be beside its path, and still come back to it
+SAME_COST = 1 + 1e-9  # a path may cost so much more, and still as much: sums are rounded
+ROUNDING = 1 + 1e-6  # so that 0.15 m in cells of 0.05 m reach 3 cells, not 2.9999999
+# Of ways out of one length, the one that ends nearer to the goal: so little its distance counts.
 NEARER_TO_GOAL = 1e-9
-"""Of ways out of the same length, the one that ends nearer to the goal is taken: so little does a
-cell of this distance count beside one of the way."""
 
 
 # The way out, and the goals that are left
@@ -39,11 +31,7 @@ def reach(request: PlanRequest) -> float:
 
 
 def way_out_and_ends(request: PlanRequest, goals: Goals) -> tuple[tuple[Cell, ...], Goals]:
-    """Return the way from the start to the first free cell, and where the path can end.
-
-    The way is the start alone where that is free, and empty where no path leads to a goal or to a
-    cell within the tolerance: connected cells say so, without a field.
-    """
+    """Return the way to the first free cell, empty if no path leads on, and where it can end."""
     grid, start, rule = request.grid, request.start, request.move_rule
     candidates = [(np.array(goals), len(goals))] if goals else []
     if reach(request) >= 1:
@@ -67,11 +55,8 @@ def can_leave(request: PlanRequest) -> bool:
 
 
 def obstacles_in_the_way(grid: GridMap, start: Cell, clearing_radius: float) -> Occupancy:
-    """Return (H, W) bool: the obstacles through which no way out of a start leads.
-
-    The robot is on its start, so an obstacle there is none: it and those within the radius do not
-    count. Beside a start that is no obstacle itself, all count.
-    """
+    """Return (H, W) bool: the obstacles that count for a start, which may be one itself."""
+    # The robot stands there, so it and those within the radius are none.
     obstacles = grid.occupancy if grid.obstacles is None else grid.obstacles
     if clearing_radius > 0 and grid.is_obstacle(start):
         x, y = _near(obstacles, start, clearing_radius * ROUNDING).T
@@ -106,11 +91,7 @@ def _near(cells: NDArray[np.bool_], centre: Cell, distance: float) -> NDArray[np
 
 
 def legal_segments(path: Cells, grid: GridMap, move_rule: MoveRule | str) -> NDArray[np.bool_]:
-    """Return which segments of a path are legal on a map: (N - 1,) bool.
-
-    A segment is a move, or joins two cells of a simplified path, see `simplify`. If it is legal,
-    both its cells are free.
-    """
+    """Return which moves or segments of a path are legal, see `simplify`: (N - 1,) bool."""
     rule, cells = MoveRule(move_rule), _array(path)
     inside = ((cells >= 0) & (cells < (grid.width, grid.height))).all(axis=1)
     free = inside.copy()
@@ -139,11 +120,7 @@ def is_path_valid(
     move_rule: MoveRule | str,
     start_clearing_radius: float = 0.0,
 ) -> bool:
-    """Return whether all of a path from its cell nearest to the robot on is free and legal.
-
-    A robot whose cell is not free may leave, see `PlanRequest.start_clearing_radius`. The path may
-    be simplified, or come from another planner. An empty one is not valid.
-    """
+    """Return whether any path is free and legal from its cell nearest to the robot on."""
     cells = _array(path)
     if not len(cells):
         return False
@@ -161,12 +138,7 @@ def is_path_valid(
 def rest_of_path(
     path: Cells, robot: Cell, grid: GridMap, move_rule: MoveRule | str
 ) -> NDArray[np.int32]:
-    """Return what is left of a path for a robot, from its cell on: (N, 2); empty if it is lost.
-
-    The robot may be up to `REACH` cells beside the path: then straight moves lead back to the
-    nearest cell of it that can be reached so. The path is lost if the robot is farther away, or if
-    a move of the rest is not legal any more.
-    """
+    """Return what is left of a path from a robot's cell on, (N, 2): empty if it is too far."""
     cells = _array(path)
     if not len(cells) or not grid.is_free(robot):
         return cells[:0]
@@ -189,12 +161,8 @@ def keep_or_switch(
     threshold: float,
     goals: Sequence[Cell] = (),
 ) -> tuple[NDArray[np.int32], float | None]:
-    """Return what is left of the path under way if it is good enough, otherwise the new path.
-
-    Both are judged move by move on the map of now. The rest may cost more than the new path by the
-    threshold, as a share, and end at the new path's end or at one of some other goals. Return too
-    how much more it costs, as a share, if it is kept; None for another path.
-    """
+    """Return the path under way's rest and its extra cost, as a share, or the new path and None."""
+    # The rest may end at the new path's end or at other goals, and cost more by the threshold.
     best = _array(new)
     x, y = best[0].tolist()
     rest = rest_of_path(under_way, (x, y), grid, move_rule)
@@ -284,11 +252,7 @@ def simplify(cells: Cells, grid: GridMap, move_rule: MoveRule | str) -> tuple[Ce
 
 
 def touched_cells(first: Cell, last: Cell, move_rule: MoveRule | str) -> NDArray[np.int64]:
-    """Return the cells that a segment between two cells' centres passes through: (N, 2) int64.
-
-    Unless the rule cuts corners, cells that it touches at a corner count too. Some cells are
-    repeated.
-    """
+    """Return the cells that a segment passes, or touches at corners that count: (N, 2) int64."""
     passed, _ = _passed_cells(first, last)
     if MoveRule(move_rule).cuts_corners:
         return passed
@@ -319,11 +283,7 @@ def is_legal_segment(first: Cell, last: Cell, grid: GridMap, move_rule: MoveRule
 def segment_cost(
     first: Cell, last: Cell, multiplier: NDArray[np.float32], move_rule: MoveRule | str
 ) -> float:
-    """Return what the segment between two cells' centres costs, as `path_cost` for a path.
-
-    Each cell's cost multiplier is weighted by the share of the segment within that cell, as half of
-    a move lies in each of its two cells.
-    """
+    """Return a segment's cost: each cell's multiplier counts by the share of the segment in it."""
     passed, share = _passed_cells(first, last)
     vector = np.subtract(last, first)
     length = segment_lengths(vector[:1], vector[1:], move_rule).item()

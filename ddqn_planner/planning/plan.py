@@ -140,11 +140,7 @@ class Plan:
 
 
 def joined(plans: Sequence[Plan]) -> Plan:
-    """Return the plan of a path through several goals: each plan starts where the last one ended.
-
-    All plans have succeeded, except perhaps the last: if it has no path, neither has the whole.
-    Where two paths meet, their common cell is there once. The costs and the times are the sums.
-    """
+    """Return the plan through several goals: each but the last succeeded, and ends at the next."""
     first, last = plans[0], plans[-1]
     if not last.path.size:
         return last

@@ -23,12 +23,10 @@ from ddqn_planner.planning.search import search
 
 T = TypeVar("T")
 
-VISITS = 2**18
-"""About how many cells a field visits in one step of a plan: some 30 ms, then comes another."""
-
+VISITS = 2**18  # about how many cells a field visits in one step of a plan: some 30 ms
+# Share of the map's cells that a request may visit before the connected cells are looked at. One
+# without a path would visit all that its goal is connected to.
 UNLABELLED_SHARE = 1 / 2
-"""Share of the map's cells that a request may visit before the connected cells are looked at. A
-request without a path would visit all that its goal is connected to."""
 
 
 class Planner:
@@ -233,11 +231,7 @@ class Planner:
         return last_step(self.steps(request))
 
     def steps(self, request: PlanRequest) -> Iterator[Plan | None]:
-        """Plan a path in steps, so that a caller can take the slow ones in another thread.
-
-        None comes before each step that may be slow (a part of a new field, a search), and last the
-        plan.
-        """
+        """Yield None before each slow step (a part of a field, a search), and last the plan."""
         found: PlanStatus | _Found | None = self._refusal(request)
         field_ms = 0.0
         if found is None:
@@ -317,11 +311,7 @@ class _Found(NamedTuple):
 
 
 def _in_parts(field: DistanceField, request: PlanRequest) -> Generator[None, None, Plan]:
-    """Return the rollout from the start; after each part that the field grows for it, yield.
-
-    Once the field has visited many cells, the connected cells say whether there is a path: most
-    requests need not look at them.
-    """
+    """Return the rollout from the start; after each part that the field grows for it, yield."""
     grid, start = request.grid, request.start
     until_labels = int(UNLABELLED_SHARE * grid.occupancy.size)
     while True:

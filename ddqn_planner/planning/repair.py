@@ -1,7 +1,4 @@
-"""What has changed between two maps of one place: what a robot sees changes some cells of millions.
-
-A field is repaired for it, see `DistanceField.take_over`.
-"""
+"""What has changed between two maps of one place: a robot sees some cells of millions."""
 
 from __future__ import annotations
 
@@ -14,23 +11,13 @@ from numpy.typing import NDArray
 
 from ddqn_planner.grid import Cell, GridMap
 
-CHANGED_SHARE = 0.02
-"""Share of the map's cells that may have changed: with more, a new field is cheaper."""
-
-LAYERS = "occupancy", "cost", "forbidden", "slowness"
-"""What a map says of each cell that moves depend on. Two maps with other layers have no shift."""
-
-SAME_PLACE = 0.01
-"""By how many cells a map may be off the grid of another one, and still count as shifted by whole
-cells: ROS messages give the resolution in float32."""
+CHANGED_SHARE = 0.02  # of the map's cells may have changed: with more, a new field is cheaper
+LAYERS = "occupancy", "cost", "forbidden", "slowness"  # of a map: what its moves depend on
+SAME_PLACE = 0.01  # cells that a shift may be off whole ones: messages' resolution is float32
 
 
 def shift_between(old: GridMap, new: GridMap) -> Cell | None:
-    """Return by how many cells a map's cells have moved in a newer one; None if not by whole ones.
-
-    None too if only one of them has costs, or one-way zones. The cell (x, y) of the old map is
-    (x + dx, y + dy) in the new one. As a map grows, mapping shifts it.
-    """
+    """Return by how many cells a map has moved in a newer one with the same layers, or None."""
     for layer in LAYERS:
         if (getattr(old, layer) is None) != (getattr(new, layer) is None):
             return None
@@ -56,10 +43,7 @@ def _overlap(old: GridMap, new: GridMap, shift: Cell) -> tuple[int, int, int, in
 
 
 def changed_cells(old: GridMap, new: GridMap, shift: Cell) -> NDArray[np.int32] | None:
-    """Return the cells whose moves may differ, as numbers of the padded new map; None for many.
-
-    Both maps have costs, or none has.
-    """
+    """Return the cells whose moves may differ, as numbers of the padded new map; None for many."""
     left, bottom, right, top = _overlap(old, new, shift)
     inside = slice(bottom, top), slice(left, right)
     before = (
@@ -92,10 +76,7 @@ def changed_cells(old: GridMap, new: GridMap, shift: Cell) -> NDArray[np.int32] 
 def moved(
     known: Sequence[NDArray[Any]], old: GridMap, new: GridMap, shift: Cell
 ) -> tuple[NDArray[Any], ...]:
-    """Return the distance, state and open cells of a field with each cell where it is in a new map.
-
-    Without a shift they are the same arrays.
-    """
+    """Return a field's distance, state and open cells with each cell where the new map has it."""
     *layers, opened = known
     if shift == (0, 0) and old.occupancy.shape == new.occupancy.shape:
         return *layers, opened

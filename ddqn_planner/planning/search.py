@@ -20,13 +20,9 @@ def search(
     move_rule: MoveRule,
     value: NDArray[np.float32] | None = None,
 ) -> tuple[Cell, ...]:
-    """Return a path from one cell to another, or to one of a mask of several; empty without one.
-
-    Only the `legal` moves, (8, H, W), are made. Cells are visited in the order of the path's cost
-    so far minus V(s): A* (Hart, Nilsson and Raphael 1968) with -V as its heuristic. A good field
-    leads straight to the end. With any field, each cell is visited at most once, so an end is found
-    if a path leads to one. Without values it is the cheapest path to the nearest end (Dijkstra).
-    """
+    """Return a path to a cell, or to the nearest of a mask, by `legal` moves; empty without one."""
+    # A* (Hart, Nilsson and Raphael 1968) with -V as its heuristic: a good field leads straight to
+    # the end, and with any, each cell is visited at most once. Without values it is Dijkstra.
     if not isinstance(end, np.ndarray):
         (x, y), end = end, np.zeros(multiplier.shape, dtype=np.bool_)
         end[y, x] = True

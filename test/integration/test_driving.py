@@ -28,8 +28,7 @@ from ddqn_planner import Experience, GridMap
 from ddqn_planner.experience.drives import read_drives
 from ddqn_planner.nodes.conversions import quaternion
 from ddqn_planner.nodes.driving import NAVIGATION
-from ddqn_planner.nodes.listening import best_effort
-from ddqn_planner.nodes.runtime import LATCHED
+from ddqn_planner.nodes.runtime import LATCHED, best_effort
 
 VALUES = np.zeros((40, 100), dtype=np.int8)
 VALUES[16:26, 15:85] = 100

@@ -17,7 +17,7 @@ from rclpy.qos import QoSProfile
 from rosgraph_msgs.msg import Clock
 
 from ddqn_planner.nodes import planner_node
-from ddqn_planner.nodes.listening import best_effort
+from ddqn_planner.nodes.runtime import best_effort
 
 
 def test_odometry_counts_while_it_comes_and_until_the_clock_jumps_back(
