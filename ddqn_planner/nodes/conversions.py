@@ -1,7 +1,4 @@
-"""Conversions between ROS messages and grid maps, cells, paths and value fields.
-
-Messages are checked as Nav2 checks them (nav2_util/validate_messages.hpp).
-"""
+"""Conversions between ROS messages, checked as Nav2 does (nav2_util), and grid maps and paths."""
 
 from __future__ import annotations
 
@@ -25,6 +22,7 @@ if TYPE_CHECKING:
     from ddqn_planner.planning import QField
 
 Message = TypeVar("Message", Point, Pose, PoseStamped)
+Origin = tuple[float, float, float]
 
 TOLERANCE = 1e-4
 """How far the norm of a quaternion may be from 1."""
@@ -56,7 +54,7 @@ def grid_from_message(
 def grid_from_values(
     values: NDArray[np.int8],
     resolution: float,
-    origin: tuple[float, float, float],
+    origin: Origin,
     occupied_threshold: int,
     allow_unknown: bool,
     use_map_costs: bool,
@@ -70,10 +68,7 @@ def grid_from_values(
 
 
 def occupancy_message(
-    values: NDArray[np.int8],
-    resolution: float,
-    origin: tuple[float, float, float],
-    header: Header,
+    values: NDArray[np.int8], resolution: float, origin: Origin, header: Header
 ) -> OccupancyGrid:
     """Make a map message of values 0..100, or -1 where unknown; see `GridMap` for the rest."""
     message = OccupancyGrid(header=header)
@@ -88,10 +83,7 @@ def occupancy_message(
 
 
 def directions_message(
-    forbidden: NDArray[np.uint8] | None,
-    resolution: float,
-    origin: tuple[float, float, float],
-    header: Header,
+    forbidden: NDArray[np.uint8] | None, resolution: float, origin: Origin, header: Header
 ) -> OccupancyGrid:
     """Make the message of a map's forbidden directions, see `GridMap`; without cells for none."""
     if forbidden is None:
@@ -112,11 +104,7 @@ def value_message(field: QField | None, grid: GridMap, header: Header) -> Occupa
 
 
 def path_message(cells: Cells, grid: GridMap, header: Header, goal_orientation: Quaternion) -> Path:
-    """Make a path message of cells, which may be none.
-
-    Each pose faces the next one, and the last has the goal's orientation. All have the same header
-    object.
-    """
+    """Make a path message; each pose faces the next, and the last has the goal's orientation."""
     path, blank = Path(header=header), PoseStamped(header=header)
     positions, yaws = _along(cells, grid)
     # Poses in the same direction share a quaternion: most of an answer's time is making messages.
@@ -135,10 +123,7 @@ def path_message(cells: Cells, grid: GridMap, header: Header, goal_orientation: 
 def serialized_path(
     cells: Cells, grid: GridMap, header: Header, goal_orientation: Quaternion
 ) -> bytes:
-    """Return what `path_message` returns in the form in which it is sent, which publishers take.
-
-    It takes a fiftieth of the time: rclpy converts a message pose by pose.
-    """
+    """Return what `path_message` does, as it is sent, in a fiftieth of the time."""
     return serialized_poses(*_along(cells, grid), header, goal_orientation)
 
 
@@ -150,16 +135,11 @@ def _along(cells: Cells, grid: GridMap) -> tuple[NDArray[np.float64], NDArray[np
 
 
 def serialized_poses(
-    positions: NDArray[np.float64],
-    yaw: NDArray[np.float64],
-    header: Header,
-    last_orientation: Quaternion,
+    positions: NDArray[np.float64], yaw: NDArray[np.float64], header: Header, last: Quaternion
 ) -> bytes:
-    """Return the path of positions (N, 2) and directions (N - 1) in the form in which it is sent.
-
-    The form is CDR (OMG DDS-XTypes, plain CDR, little-endian): numbers are aligned to their size,
-    so that a pose has the same bytes before its seven numbers each time, except for the first one.
-    """
+    """Return the path of positions (N, 2) and directions (N - 1) in CDR, the form as it is sent."""
+    # OMG DDS-XTypes, plain CDR, little-endian: numbers are aligned to their size, so that each pose
+    # has the same bytes before its seven numbers, except for the first one.
     count = len(positions)
     start = serialize_message(Path(header=header))[4:-4] + count.to_bytes(4, "little")
     start += bytes(-len(start) % 4)
@@ -172,7 +152,6 @@ def serialized_poses(
         numbers = poses["numbers"]
         numbers[:, :2] = positions
         numbers[:-1, 5], numbers[:-1, 6] = np.sin(yaw / 2), np.cos(yaw / 2)
-        last = last_orientation
         numbers[-1, 3:] = last.x, last.y, last.z, last.w
     return b"\0\1\0\0" + start + (first + poses.tobytes()[len(others) :] if count else b"")
 
@@ -206,10 +185,8 @@ def cell_from_pose(name: str, header: Header, pose: Pose, grid: GridMap, frame: 
     try:
         return grid.world_to_cell(pose.position.x, pose.position.y)
     except (OverflowError, ValueError):  # the floor of infinity, and of NaN
-        raise ValueError(
-            f"{name}'s position ({_numbers(pose.position)}) is too far from the map to have a "
-            "cell; give one on the map, in metres"
-        ) from None
+        where = f"({_numbers(pose.position)}) is too far from the map to have a cell"
+        raise ValueError(f"{name}'s position {where}; give one on the map, in metres") from None
 
 
 def check_tolerance(tolerance: float) -> float:
@@ -222,8 +199,7 @@ def check_tolerance(tolerance: float) -> float:
 def quaternion(yaw: float) -> Quaternion:
     """Return the rotation by `yaw` radians about z, counter-clockwise."""
     rotation = Quaternion()
-    rotation.z = math.sin(yaw / 2)
-    rotation.w = math.cos(yaw / 2)
+    rotation.z, rotation.w = math.sin(yaw / 2), math.cos(yaw / 2)
     return rotation
 
 
@@ -232,26 +208,20 @@ def _check_map(message: OccupancyGrid) -> None:
     if not message.header.frame_id:
         raise ValueError("the map's frame is ''; name one in header.frame_id")
     if not MIN_RESOLUTION < info.resolution < math.inf:
-        raise ValueError(
-            f"the map's resolution is {info.resolution}; "
-            f"give metres per cell, finite and above {MIN_RESOLUTION}"
-        )
-    size = f"{info.width} x {info.height} cells"
-    if info.width == 0 or info.height == 0:
+        remedy = f"give metres per cell, finite and above {MIN_RESOLUTION}"
+        raise ValueError(f"the map's resolution is {info.resolution}; {remedy}")
+    size, needs = f"{info.width} x {info.height} cells", info.width * info.height
+    if needs == 0:
         raise ValueError(f"the map has {size}; give at least one row and column")
-    if info.width * info.height > MAX_CELLS:
+    if needs > MAX_CELLS:
         raise ValueError(f"the map has {size}; give at most {MAX_CELLS}, or a coarser resolution")
-    if len(message.data) != info.width * info.height:
-        raise ValueError(
-            f"the map's data has {len(message.data)} values; its {size} need "
-            f"{info.width * info.height}"
-        )
+    has = len(message.data)
+    if has != needs:
+        raise ValueError(f"the map's data has {has} values; its {size} need {needs}")
     _check_pose("the map's origin", info.origin)
     if math.hypot(turned.x, turned.y) > TOLERANCE:
-        raise ValueError(
-            f"the map's origin is rolled or pitched ({_numbers(turned)}); "
-            "give a rotation about z alone"
-        )
+        how = f"rolled or pitched ({_numbers(turned)})"
+        raise ValueError(f"the map's origin is {how}; give a rotation about z alone")
 
 
 def _check_pose(name: str, pose: Pose) -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import numpy as np
 from action_msgs.msg import GoalStatus, GoalStatusArray
 from geometry_msgs.msg import PoseStamped
@@ -28,19 +30,12 @@ from ddqn_planner.nodes.runtime import LATCHED, STEADY
 Float64 = NDArray[np.float64]
 
 NAVIGATION = "navigate_to_pose/_action/status"
-STATUS_QUALITY = QoSProfile(depth=10, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 
 RETRY_PERIOD = 5.0
 """Seconds after which what failed for a full disk is tried again."""
 
-TF_PERIOD = 0.05
-"""Seconds between two looks at the transform of a robot whose every pose counts."""
-
 SLOWEST = 10.0
 """The slowness that ``~/slowness`` shows as 100."""
-
-REPLAYED = 5
-"""A replay draws each n-th sample."""
 
 NOT_RECORDING = "no drives are being recorded; call ~/start first"
 
@@ -52,19 +47,18 @@ class Driving:
         self._node, self._frames = node, Frames(node)
         self._recorder = DriveRecorder(self._on_drive)
         self._folder: DriveFolder | None = None
-        self._state, self._last_drive = "stopped", ""
-        self._is_disk_full = False
+        self._last_drive, self._is_disk_full = "", False
         self._aborted: set[bytes] | None = None
         self._learned = 0
-        self._shown: tuple[GridMap | None, int] = None, 0
-
+        self._shown: tuple[GridMap, int] | None = None
         self._saved = node.create_publisher(String, "~/experience_saved", LATCHED)
         self._slowness = node.create_publisher(OccupancyGrid, "~/slowness", LATCHED)
         node.create_subscription(PoseStamped, "goal_pose", self._on_goal, 10)
-        node.create_subscription(GoalStatusArray, NAVIGATION, self._on_status, STATUS_QUALITY)
+        latched = QoSProfile(depth=10, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+        node.create_subscription(GoalStatusArray, NAVIGATION, self._on_status, latched)
         if node.value("pose_source") == "tf":
             self._frames.listen()
-            node.create_timer(TF_PERIOD, self._look_up, clock=STEADY)
+            node.create_timer(0.05, self._look_up, clock=STEADY)  # every pose counts
         else:
             listen(node, "odom", 1000, node.refusals, self._on_pose)
         node.create_timer(1.0, self._publish_diagnostics, clock=STEADY)
@@ -72,39 +66,22 @@ class Driving:
         node.create_timer(RETRY_PERIOD, self._retry, clock=STEADY)
         for name in ("start", "stop", "save", "replay", "forget"):
             node.create_trigger(f"~/{name}", getattr(self, f"_on_{name}"))
-        self._begin()
-
-    def _begin(self) -> str:
-        """Open the folder and record; return why that failed."""
-        names = "nominal_speed", "robot_width"
-        try:
-            folder = DriveFolder(self._node.folder, *map(self._node.value, names))
-        except Exception as error:  # the node must survive
-            self._state, self._is_disk_full = "failed", isinstance(error, OSError)
-            self._node.refusals.refuse("output_folder", explained(error))
-            return explained(error)
-        self._folder, self._state = folder, "recording"
-        self._recorder.forget()
-        self._node.refusals.accept("output_folder")
-        self._node.get_logger().info(f"recording drives in {folder.folder}")
-        self._save(folder)
-        return ""
+        self._on_start()
 
     def _recording(self) -> DriveFolder | None:
-        return self._folder if self._state == "recording" else None
+        return self._folder if self._node.state == "recording" else None
 
     # Where the robot is
 
     def _on_pose(self, pose: PoseStamped) -> None:
         """Record a pose; a ValueError refuses it."""
-        place = self._node.map
-        if place is None:
-            return
         seconds = Time.from_msg(pose.header.stamp).nanoseconds / 1e9
+        position = self._position("the robot's pose", pose)
+        if position is None:
+            return
         if not seconds:
             raise ValueError("the robot's pose has no stamp; give it the time")
-        position = self._position("the robot's pose", pose, place)
-        if self._state == "recording":
+        if self._recording():
             self._recorder.add(seconds, *position)
 
     def _look_up(self) -> None:
@@ -119,16 +96,18 @@ class Driving:
             self._on_pose(pose)
 
     def _on_goal(self, goal: PoseStamped) -> None:
-        place = self._node.map
-        if place is None:
-            return
         with self._node.refusals.taking("goal_pose"):
-            self._recorder.set_goal(*self._position("the goal", goal, place))
+            position = self._position("the goal", goal)
+            if position is not None:
+                self._recorder.set_goal(*position)
 
-    def _position(self, name: str, pose: PoseStamped, place: MapInFrame) -> tuple[float, float]:
-        """Return a pose's position in the map's frame; ValueError if it has none."""
-        self._frames.check(name, pose.header, pose.pose, place.frame)
-        position = self._frames.to_map(name, pose, place.frame).pose.position
+    def _position(self, name: str, pose: PoseStamped) -> tuple[float, float] | None:
+        """Return a pose's position in the frame of the map, if there is one, or a ValueError."""
+        if self._node.map is None:
+            return None
+        frame = self._node.map.frame
+        self._frames.check(name, pose.header, pose.pose, frame)
+        position = self._frames.to_map(name, pose, frame).pose.position
         return position.x, position.y
 
     def _on_status(self, message: GoalStatusArray) -> None:
@@ -141,7 +120,7 @@ class Driving:
         # What failed before the node listened failed elsewhere.
         before = aborted if self._aborted is None else self._aborted
         self._aborted = before | aborted
-        if self._state == "recording" and aborted - before:
+        if self._recording() and aborted - before:
             self._recorder.abort()
 
     # Drives
@@ -157,8 +136,8 @@ class Driving:
             return
         self._last_drive = f"{drive.number}: {drive.metres:.1f} m, {outcome.value}"
         self._node.get_logger().info(f"drive {self._last_drive}")
-        if not self._node.is_replaying:
-            self._draw(positions, place)
+        if self._node.replaying is None:
+            self._draw(place, positions)
         self._tell_saved(folder)
 
     def _save(self, folder: DriveFolder) -> None:
@@ -176,12 +155,12 @@ class Driving:
         folder = self._recording()
         if folder is not None and folder.save_error:
             self._save(folder)
-        elif self._state == "failed" and self._is_disk_full:
-            self._begin()
+        elif self._node.state == "failed" and self._is_disk_full:
+            self._on_start()
 
     # What RViz shows
 
-    def _draw(self, positions: Float64, place: MapInFrame) -> None:
+    def _draw(self, place: MapInFrame, positions: Float64) -> None:
         yaw = np.arctan2(*np.diff(positions, axis=0).T[::-1])
         last = quaternion(yaw[-1] if len(yaw) else 0)
         header = self._node.header(place.frame)
@@ -191,9 +170,8 @@ class Driving:
         place, folder = self._node.map, self._recording()
         if place is None or folder is None:
             return
-        grid, (shown_on, learned) = place.grid, self._shown
-        is_old = shown_on is not grid or learned != self._learned
-        if not (is_old and self._slowness.get_subscription_count()):
+        grid = place.grid
+        if self._shown == (grid, self._learned) or not self._slowness.get_subscription_count():
             return
         self._shown = grid, self._learned
         slowness = folder.experience.slowness(grid)
@@ -205,25 +183,34 @@ class Driving:
     # Services: each returns whether it succeeds, and a message
 
     def _on_start(self) -> tuple[bool, str]:
-        if self._state == "recording":
+        if self._recording():
             return False, "drives are being recorded already; call ~/stop first"
-        error, folder = self._begin(), self._folder
-        if error or folder is None:
-            return False, error
+        names = "nominal_speed", "robot_width"
+        try:
+            folder = DriveFolder(self._node.folder, *map(self._node.value, names))
+        except Exception as error:  # the node must survive
+            self._node.state, self._is_disk_full = "failed", isinstance(error, OSError)
+            self._node.refusals.refuse("output_folder", explained(error))
+            return False, explained(error)
+        self._folder, self._node.state = folder, "recording"
+        self._recorder.forget()
+        self._node.refusals.accept("output_folder")
+        self._node.get_logger().info(f"recording drives in {folder.folder}")
+        self._save(folder)
         return True, f"recording in {folder.folder} after drive {folder.drives}"
 
     def _on_stop(self) -> tuple[bool, str]:
         replay = self._node.stop_replay()
         folder = self._recording()
         if folder is None:
-            self._state = "stopped"
+            self._node.state = "stopped"
             return True, f"no drives were being recorded{replay}"
         self._recorder.end(DriveEnd.STOPPED)
         self._save(folder)
         if folder.save_error:
             return False, folder.save_error
         folder.close()
-        self._state = "stopped"
+        self._node.state = "stopped"
         return True, f"stopped after drive {folder.drives}; ~/start continues{replay}"
 
     def _on_save(self) -> tuple[bool, str]:
@@ -254,10 +241,8 @@ class Driving:
         if place is None:
             return False, f"{NO_MAP} first"
         file = self._node.folder / RECORD
-        drives = (drive.positions[::REPLAYED] for drive in read_drives(file))
-        return self._node.replay(
-            file, drives, lambda positions: self._draw(positions, place), "drive on"
-        )
+        drives = (drive.positions[::5] for drive in read_drives(file))  # else it takes long
+        return self._node.replay(file, drives, partial(self._draw, place), "drive on")
 
     def _publish_diagnostics(self) -> None:
         values = {
@@ -272,15 +257,11 @@ class Driving:
                 "folder": str(self._folder.folder),
             }
         missing = f"{NO_MAP}, or set map_file" if self._node.map is None else ""
-        self._node.publish_diagnostics("driving", self._state, values, missing=missing)
+        self._node.publish_diagnostics("driving", values, missing=missing)
 
     def close(self) -> None:
         """Record the drive that is under way, and save."""
-        folder = self._recording()
-        if folder is not None:
-            self._recorder.end(DriveEnd.STOPPED)
-            self._save(folder)
-            folder.close()
+        self._on_stop()
 
 
 def _place_of(position: tuple[float, float] | None) -> str:

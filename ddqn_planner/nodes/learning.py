@@ -33,8 +33,8 @@ class LearningNode(BaseNode):
         super().__init__(name, parameters)
         self.map: MapInFrame | None = None
         self.refusals = Refusals(self)
-        self.error = self.save_error = ""
-        self._replay: Timer | None = None
+        self.state = self.error = self.save_error = ""
+        self.replaying: Timer | None = None
         self.episodes = self.create_publisher(Path, "~/episode", 10)
         self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
         self.create_subscription(OccupancyGrid, "map", self._on_map, LATCHED)
@@ -64,38 +64,21 @@ class LearningNode(BaseNode):
             self.get_logger().info(f"{what} saved again")
 
     def publish_diagnostics(
-        self,
-        what: str,
-        state: str,
-        values: Mapping[str, str],
-        *,
-        error: str = "",
-        missing: str = "",
+        self, what: str, values: Mapping[str, str], error: str = "", missing: str = ""
     ) -> None:
         """Publish the state, what was refused and failed, and what is still missing."""
         problems = [*self.refusals.problems(), *filter(None, [self.save_error, error])]
         level = DiagnosticStatus.WARN if missing else DiagnosticStatus.OK
         if problems:
             level = DiagnosticStatus.ERROR
-        message = "; ".join([*problems, *filter(None, [missing])]) or state
-        values = {"state": state, **values}
+        message = "; ".join(filter(None, [*problems, missing])) or self.state
+        values = {"state": self.state, **values}
         self._diagnostics.publish(self.diagnostics(what, level, message, values))
-
-    # The replay of recorded episodes, one at a time
-
-    @property
-    def is_replaying(self) -> bool:
-        """Whether episodes are being replayed."""
-        return self._replay is not None
 
     def replay(
         self, file: FilePath, episodes: Iterator[Any], draw: Callable[[Any], None], remedy: str
     ) -> tuple[bool, str]:
-        """Replay a file's episodes from now on; return whether it succeeds, and a message.
-
-        `draw` is called with the first place of an episode, its first two, and so on. The remedy is
-        for a file without episodes.
-        """
+        """Draw the first place of each episode, its first two, and so on; see `create_trigger`."""
         frames = (places[: n + 1] for places in episodes for n in range(len(places)))
         try:
             first = next(frames, None)
@@ -108,21 +91,19 @@ class LearningNode(BaseNode):
 
         def step() -> None:
             try:
-                frame = next(frames, None)
-            except OSError as error:
-                self.fail(f"the replay ends: {file.name} can no longer be read ({error})")
-                frame = None
-            if frame is None:
+                draw(next(frames))
+            except StopIteration:
                 self.stop_replay()
-            else:
-                draw(frame)
+            except OSError as error:
+                self.stop_replay()
+                self.fail(f"the replay ends: {file.name} can no longer be read ({error})")
 
-        self._replay = self.create_timer(self.value("replay_period"), step, clock=STEADY)
+        self.replaying = self.create_timer(self.value("replay_period"), step, clock=STEADY)
         return True, "replaying the recorded episodes on ~/episode"
 
     def stop_replay(self) -> str:
         """Stop a replay, and say so; return nothing if there was none."""
-        timer, self._replay = self._replay, None
+        timer, self.replaying = self.replaying, None
         if timer is None:
             return ""
         self.destroy_timer(timer)

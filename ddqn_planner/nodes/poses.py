@@ -1,7 +1,4 @@
-"""Where the robot is, and poses in the map's frame: for the planner and for the trainer.
-
-TF transforms poses in other frames than the map's, where tf2_ros is installed.
-"""
+"""Where the robot is, and poses in the map's frame, by TF where tf2_ros is installed."""
 
 from __future__ import annotations
 
@@ -28,9 +25,9 @@ from ddqn_planner.nodes.conversions import check_pose, quaternion
 from ddqn_planner.nodes.report import Refusals, RequestError
 from ddqn_planner.nodes.runtime import BaseNode, best_effort
 
+# A pose that was stamped before may be transformed by a transform that is later by so much.
 PATIENCE = 1.0
-"""Seconds within which a new listener hears the first message of `odom` or TF. A pose that was
-stamped before may be transformed by a transform that is later by so much."""
+"""Seconds within which a new listener hears the first message of `odom` or TF."""
 
 SILENCE = 2.0
 """Seconds after which odometry that comes no more does not tell where the robot is."""
@@ -55,15 +52,9 @@ def check_source(parameter: str, value: str, others: str) -> None:
 
 
 class Frames:
-    """Transforms poses to the map's frame by TF.
+    """Transforms poses to the map's frame by TF, to which it listens from the first need on."""
 
-    It listens to TF from the first pose on that needs it: a listener costs time for each message of
-    the robot's TF, and most robots give all poses in the map's frame. When the clock jumps back, it
-    forgets all transforms: tf2 takes none that is older than those it has.
-
-    `tolerance` returns how many seconds the newest transform may be old, or in the future.
-    """
-
+    # `tolerance` returns how many seconds the newest transform may be old, or in the future.
     def __init__(self, node: BaseNode, tolerance: Callable[[], float] = lambda: math.inf) -> None:
         self.available = has_tf()
         self._node, self._tolerance = node, tolerance
@@ -76,10 +67,7 @@ class Frames:
         check_pose(name, header, pose, "" if self.available else map_frame, REMEDY)
 
     def to_map(self, name: str, stamped: PoseStamped, map_frame: str) -> PoseStamped:
-        """Return a pose in the map's frame, by the transform of the pose's time.
-
-        A RequestError says why TF has no such transform, or not yet: TF_ERROR.
-        """
+        """Return a pose in the map's frame by the transform of its time; or a RequestError."""
         frame = stamped.header.frame_id
         if frame == map_frame:
             return stamped
@@ -94,13 +82,13 @@ class Frames:
             ) from None
 
     def _transform_at(self, stamped: PoseStamped, map_frame: str) -> TransformStamped:
-        stamp, frame = Time.from_msg(stamped.header.stamp), stamped.header.frame_id
+        stamp, frames = Time.from_msg(stamped.header.stamp), (map_frame, stamped.header.frame_id)
         if not stamp.nanoseconds:
-            return self._newest(map_frame, frame)
+            return self._newest(*frames)
         try:
-            return self._lookup(map_frame, frame, stamp)
+            return self._lookup(*frames, stamp)
         except ValueError:
-            newest = self._lookup(map_frame, frame)
+            newest = self._lookup(*frames)
             later = (Time.from_msg(newest.header.stamp) - stamp).nanoseconds / 1e9
             if not 0 < later <= PATIENCE:
                 raise
@@ -138,9 +126,9 @@ class Frames:
         return time.monotonic() - self._began < PATIENCE
 
     def listen(self) -> None:
-        """Listen to TF from now on."""
+        """Listen to TF from now on: most robots do not need it, and each message costs time."""
         if self._listener is None:
-            import tf2_ros  # it takes a while, and most robots do not need it
+            import tf2_ros  # it takes a while
 
             self._tf2_ros, self._buffer = tf2_ros, tf2_ros.Buffer()
             self._listener = tf2_ros.TransformListener(self._buffer, self._node)
@@ -148,7 +136,7 @@ class Frames:
             self._node.after_jump_back.add(self._forget)
 
     def _forget(self) -> None:
-        self._buffer.clear()
+        self._buffer.clear()  # tf2 takes no transform that is older than those it has
         self._began = time.monotonic()
 
     def close(self) -> None:
@@ -180,11 +168,7 @@ def _turned(rotation: Quaternion, point: Point) -> Point:
 
 
 def listen(
-    node: BaseNode,
-    topic: str,
-    depth: int,
-    refusals: Refusals,
-    take: Callable[[PoseStamped], None],
+    node: BaseNode, topic: str, depth: int, refusals: Refusals, take: Callable[[PoseStamped], None]
 ) -> Subscription:
     """Hand each pose of `odom` or `initialpose` to a function, whose ValueError refuses it."""
     is_odometry = topic == "odom"
@@ -199,11 +183,7 @@ def listen(
 
 
 class StartSource:
-    """Where the planner's robot is, by its parameter ``start_source``.
-
-    That is the last `initialpose`, the last `odom`, or TF. A malformed pose is refused, and the one
-    before it stays. `on_start` is called with each pose from which to plan at once.
-    """
+    """Where the robot is, by ``start_source``: the last `initialpose` or `odom`, or TF."""
 
     def __init__(
         self,
@@ -214,6 +194,7 @@ class StartSource:
         on_start: Callable[[], None],
     ) -> None:
         self._node, self._frames, self._refusals = node, frames, refusals
+        # What to call when there is a start from which to plan at once.
         self._map_frame, self._on_start = map_frame, on_start
         self._pose: PoseStamped | None = None
         self.source = self._topic = ""
@@ -266,17 +247,13 @@ class StartSource:
                 self._pose = self._frames.to_map("the start", self._pose, frame)
 
     def pose(self) -> PoseStamped:
-        """Return the last pose in its own frame; by TF, in the map's.
-
-        Odometry counts while it comes: its stamps may be those of another clock. A RequestError
-        says why there is no pose: NO_START.
-        """
+        """Return the last pose in its own frame, by TF in the map's; or raise a RequestError."""
         if self.source == "tf":
             return self._pose_by_tf()
         topic = self._subscription.topic_name
         if self._pose is not None and self.source == "initialpose":
             return self._pose
-        if self._pose is not None:
+        if self._pose is not None:  # its stamp may be that of another clock
             silent = (self._node.get_clock().now() - self._came).nanoseconds / 1e9
             if silent <= max(self._node.value("transform_tolerance"), SILENCE):
                 return self._pose

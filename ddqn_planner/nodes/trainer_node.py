@@ -1,9 +1,4 @@
-"""The trainer node: trains a model on the map, or learns from drives, and replays episodes.
-
-The worker trains for a tenth of a second at a time, and makes no ROS call: in between, the node
-publishes what became of it. First the worker imports torch, while the node already answers;
-``~/start`` waits for it, and the other services do not.
-"""
+"""The trainer node: trains a model on the map, or learns from drives, and replays episodes."""
 
 from __future__ import annotations
 
@@ -21,7 +16,6 @@ from rclpy.exceptions import InvalidParameterValueException
 from std_msgs.msg import Float32, Header, String
 
 from ddqn_planner.grid import Cell, MoveRule, read_map_file
-from ddqn_planner.libraries import with_remedy
 from ddqn_planner.nodes.conversions import (
     cell_from_pose,
     check_pose,
@@ -34,7 +28,7 @@ from ddqn_planner.nodes.learning import NO_MAP, LearningNode, MapInFrame, explai
 from ddqn_planner.nodes.parameters import HYPER_PARAMETERS, OF_MAPS, TRAINER_PARAMETERS
 from ddqn_planner.nodes.poses import check_source
 from ddqn_planner.nodes.runtime import LATCHED, STEADY, Worker, spin_until_shutdown
-from ddqn_planner.resources import find_map
+from ddqn_planner.resources import find_map, with_remedy
 from ddqn_planner.training.hyper_parameters import HyperParameters
 
 if TYPE_CHECKING:
@@ -42,15 +36,11 @@ if TYPE_CHECKING:
     from ddqn_planner.training.run import TrainingRun
 
 SLICE = 0.1
-"""Seconds for which the worker trains before the node has a look."""
+"""Seconds for which the worker trains before the node publishes what became of it."""
 
 
 class TrainerNode(LearningNode):
-    """Trains on the last ``map`` from the last ``initialpose`` to the last ``goal_pose``.
-
-    A training keeps the map, start and goal with which it was started. With the parameter
-    ``learn_from``, the node learns from the robot's drives instead: see `Driving`.
-    """
+    """Trains on the last ``map`` from the last ``initialpose`` to the last ``goal_pose``."""
 
     def __init__(self) -> None:
         super().__init__("trainer", TRAINER_PARAMETERS)
@@ -58,7 +48,7 @@ class TrainerNode(LearningNode):
         self._run: TrainingRun | None = None
         self._run_map: MapInFrame | None = None
         self._is_stopping = self._is_saving = False
-        self._state = "idle"
+        self.state = "idle"
         self._read_map_file()
         self._worker = Worker(self)
         self._driving: Driving | None = None
@@ -74,6 +64,7 @@ class TrainerNode(LearningNode):
         group = ReentrantCallbackGroup()  # the others are answered while ~/start waits
         for name in ("start", "stop", "save", "replay"):
             self.create_trigger(f"~/{name}", getattr(self, f"_on_{name}"), callback_group=group)
+        # While the node answers already; only ~/start waits for it.
         self._imported = self._worker.call(import_training)
 
     def check_parameters(self, new: dict[str, Any]) -> None:
@@ -127,7 +118,7 @@ class TrainerNode(LearningNode):
 
     async def _on_start(self) -> tuple[bool, str]:
         await self._imported
-        if self._state == "training":
+        if self.state == "training":
             return False, "training already; call ~/stop first"
         try:
             place, run = self._open_run()
@@ -137,7 +128,7 @@ class TrainerNode(LearningNode):
                 reason = f"training needs another library: {with_remedy(error)}"
             self.fail(f"the training cannot start: {reason}")
             return False, reason
-        self._state, self.error, self.save_error = "training", "", ""
+        self.state, self.error, self.save_error = "training", "", ""
         self._is_stopping = self._is_saving = False
         self.refusals.forget()
         self._run, self._run_map = run, place
@@ -169,13 +160,13 @@ class TrainerNode(LearningNode):
 
     def _on_stop(self) -> tuple[bool, str]:
         replay = self.stop_replay()
-        if self._state != "training":
+        if self.state != "training":
             return True, f"no training was running{replay}"
         self._is_stopping = True
         return True, f"the training saves and stops, and ~/start continues it{replay}"
 
     def _on_save(self) -> tuple[bool, str]:
-        if self._state != "training":
+        if self.state != "training":
             return False, "no training is running; it was saved when it ended"
         self._is_saving = True
         return True, "saving after this step; ~/model_saved or an error follows"
@@ -202,7 +193,10 @@ class TrainerNode(LearningNode):
             while not ends:
                 episodes, is_finished = await self._worker.call(train_for_a_slice, steps)
                 for episode in episodes:
-                    self._on_episode(episode, place)
+                    self._reward_publisher.publish(Float32(data=episode.average_reward))
+                    is_due = episode.number % self.value("episode_interval") == 0
+                    if is_due and self.replaying is None:
+                        self._publish_cells(episode.cells, place)
                 ends = "stopped" if self._is_stopping else "finished" if is_finished else ""
                 if self._is_stopping or self._is_saving:
                     self._is_saving = False
@@ -217,13 +211,8 @@ class TrainerNode(LearningNode):
             self.fail(f"the training failed: {error!r}; ~/start continues from its checkpoint")
         finally:
             run.close()
-        self._state = ends
+        self.state = ends
         self.get_logger().info(f"the training {ends}")
-
-    def _on_episode(self, episode: Episode, place: MapInFrame) -> None:
-        self._reward_publisher.publish(Float32(data=episode.average_reward))
-        if episode.number % self.value("episode_interval") == 0 and not self.is_replaying:
-            self._publish_cells(episode.cells, place)
 
     def _publish_cells(self, cells: tuple[Cell, ...], place: MapInFrame) -> None:
         path = serialized_path(cells, place.grid, self.header(place.frame), quaternion(0))
@@ -242,7 +231,7 @@ class TrainerNode(LearningNode):
                 "epsilon": f"{trainer.epsilon:.3f}",
                 "folder": str(self._run.folder),
             }
-        self.publish_diagnostics("training", self._state, values, error=self.error)
+        self.publish_diagnostics("training", values, error=self.error)
 
     def destroy_node(self) -> None:
         """Destroy the node at once, then wait for the worker and save what it trained."""
@@ -250,7 +239,7 @@ class TrainerNode(LearningNode):
             self._driving.close()
         super().destroy_node()
         self._worker.close()  # torch, half imported, may fail when the process ends
-        if self._run is not None and self._state == "training":
+        if self._run is not None and self.state == "training":
             self._run.try_to_save()
             self._run.close()
             self.note_saving("the training is", self._run.save_error)
@@ -276,10 +265,7 @@ def import_training() -> None:
         torch.optim.Adam([torch.zeros(1)])  # the first optimiser imports for a second
 
 
-def main() -> int:
-    """Run the trainer node until SIGINT or SIGTERM."""
-    return spin_until_shutdown(TrainerNode, TRAINER_PARAMETERS)
-
+main = partial(spin_until_shutdown, TrainerNode, TRAINER_PARAMETERS)
 
 if __name__ == "__main__":
     sys.exit(main())
