@@ -17,8 +17,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 from ddqn_planner.files import WorkFolder, write_csv
-from ddqn_planner.libraries import with_remedy
-from ddqn_planner.resources import find_map
+from ddqn_planner.resources import find_map, with_remedy
 
 # A command imports what it needs, and no other command's libraries.
 if TYPE_CHECKING:
@@ -158,7 +157,7 @@ def _shortest_length(grid: GridMap, plan: Plan) -> float | None:
     import numpy as np
 
     from ddqn_planner.grid import path_length
-    from ddqn_planner.planning.search import search
+    from ddqn_planner.planning.paths import search
 
     if not plan.cells or not grid.is_free(plan.cells[0]):
         return None

@@ -15,10 +15,7 @@ _importing = Lock()
 
 
 def compiled(function: Function) -> Function:
-    """Compile a function at its first call, with the functions of this kind that it calls.
-
-    The code is kept for other processes where a folder is writable.
-    """
+    """Compile a function, and the compiled ones that it calls, at its first call; keep the code."""
 
     @cache
     def dispatcher() -> Any:
@@ -44,15 +41,12 @@ def compiled(function: Function) -> Function:
 
 @cache
 def _import_numba() -> Any:
-    """Import numba without scipy.linalg, which takes 0.2 s and no function here needs.
-
-    numba imports it to check for a BLAS, and checks again when it compiles a function that needs
-    one: the first check can be left out.
-    """
+    """Import numba without scipy.linalg, which takes 0.2 s and no function here needs."""
     import numba
     from numba.core import event
     from numba.np import linalg
 
+    # numba imports it to check for a BLAS, and checks again when it compiles a function with one.
     check = linalg.ensure_blas
     linalg.ensure_blas = lambda: None
     try:
@@ -61,24 +55,23 @@ def _import_numba() -> Any:
         linalg.ensure_blas = check
 
     class Announcement(event.Listener):
+        """Logs once that a function is compiled: loaded from the cache it would take no time."""
+
+        is_due = True
+
         def on_start(self, compiling: Any) -> None:
             dispatcher = compiling.data["dispatcher"]
-            if dispatcher.py_func.__module__.startswith("ddqn_planner."):
-                _announce(bool(dispatcher.stats.cache_path))
+            if self.is_due and dispatcher.py_func.__module__.startswith("ddqn_planner."):
+                self.is_due = False
+                kept = "the result is kept for the next start"
+                lost = "set NUMBA_CACHE_DIR to a folder that can be written to keep the result"
+                logging.getLogger("ddqn_planner").warning(
+                    "ddqn_planner compiles its functions, which takes some seconds; %s",
+                    kept if dispatcher.stats.cache_path else lost,
+                )
 
         def on_end(self, compiling: Any) -> None:
             pass
 
     event.register("numba:compile", Announcement())  # type: ignore[no-untyped-call]
     return numba
-
-
-@cache
-def _announce(is_kept: bool) -> None:
-    """Log once that a function is compiled: loaded from the cache it would take no time."""
-    kept = "the result is kept for the next start"
-    lost = "set NUMBA_CACHE_DIR to a folder that can be written to keep the result"
-    logging.getLogger("ddqn_planner").warning(
-        "ddqn_planner compiles its functions, which takes some seconds; %s",
-        kept if is_kept else lost,
-    )

@@ -30,11 +30,7 @@ def as_path(path: Any, name: str = "path") -> Path:
 
 
 def write_atomically(path: Path, content: bytes) -> None:
-    """Write a temporary file beside `path` and rename it; missing folders are made.
-
-    After an OSError, an old file at `path` is unchanged. If the process is killed meanwhile, the
-    temporary file remains, in a `WorkFolder` until the next process opens it.
-    """
+    """Write a temporary file beside `path` and rename it; missing folders are made."""
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_name(f".{path.name}.{secrets.token_hex(8)}")
     try:
@@ -50,7 +46,7 @@ def write_atomically(path: Path, content: bytes) -> None:
 
 
 def write_csv(path: Path, columns: Sequence[str], rows: Iterable[Sequence[object]]) -> None:
-    """Write a table with a header row; see `write_atomically` for errors."""
+    """Write a table with a header row."""
     text = io.StringIO(newline="")
     csv.writer(text).writerows([columns, *rows])
     write_atomically(path, text.getvalue().encode())
@@ -61,23 +57,18 @@ class FolderError(ValueError):
 
 
 class WorkFolder:
-    """A folder in which one process works until `close` or its end; a missing folder is made.
+    """A folder in which one process works until `close` or its end; a missing folder is made."""
 
-    A folder with one of the files `marks` is the right one; the first is the lock. It is there from
-    the start, so that a process that was killed early can begin again in its folder. For errors,
-    `content` says what the folder should hold, `works` what a process does in it, and `after` what
-    follows a failed save. A FolderError says why the folder is the wrong one.
-    """
-
+    # A folder with one of the files `marks` is the right one; the first of them is the lock. The
+    # other arguments are words of errors: what it should hold, what is done there, what then.
     def __init__(
         self, folder: Path, marks: Sequence[str], content: str, works: str, after: str = ""
     ) -> None:
         folder.mkdir(parents=True, exist_ok=True)
         names = sorted(path.name for path in folder.iterdir())
         if names and not any((folder / name).is_file() for name in marks):
-            raise FolderError(
-                f"{folder} holds {reprlib.repr(names)} but no {content}; give a new or empty folder"
-            )
+            held = f"{folder} holds {reprlib.repr(names)} but no {content}"
+            raise FolderError(f"{held}; give a new or empty folder")
         self.folder, self._after = folder, after
         self.save_error = ""
         """Why the last save failed; empty if it did not."""
@@ -88,10 +79,8 @@ class WorkFolder:
             try:
                 fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
             except BlockingIOError:
-                raise FolderError(
-                    f"another process {works} in {folder}; wait for its end, stop it, or give "
-                    "another folder"
-                ) from None
+                remedy = "wait for its end, stop it, or give another folder"
+                raise FolderError(f"another process {works} in {folder}; {remedy}") from None
             for path in folder.iterdir():
                 if TEMPORARY.fullmatch(path.name):  # of a process that was killed
                     path.unlink()
@@ -110,11 +99,9 @@ class WorkFolder:
             yield
             self.save_error = ""
         except OSError as error:
-            # Without the error's file name: it is often that of a temporary file.
-            self.save_error = (
-                f"cannot save to {self.folder} ({error.strerror or error}); make room or allow "
-                f"writing there: {self._after}"
-            )
+            reason = error.strerror or error  # no file name: it is often that of a temporary file
+            remedy = f"make room or allow writing there: {self._after}"
+            self.save_error = f"cannot save to {self.folder} ({reason}); {remedy}"
 
     def close(self) -> None:
         """Close the files and unlock the folder, without saving."""
@@ -122,11 +109,7 @@ class WorkFolder:
 
 
 class Appender:
-    """Appends records to a file, each of them complete before the next one begins.
-
-    When the disk is full, the file may end with a part of a record. The rest is kept, with the
-    records that follow, and written first as soon as that is possible.
-    """
+    """Appends records to a file; what a full disk does not take is kept, and written first."""
 
     def __init__(self, path: Path) -> None:
         # Unbuffered: readers see every record, also after a crash.

@@ -1,19 +1,39 @@
-"""Finds the maps and models that come with the package.
-
-They lie beside its code, however it was installed; in the source tree they are links. The copies in
-``share/ddqn_planner`` are only for ROS tools.
-"""
+"""Finds the shipped maps and models, and says what to install where a library is missing."""
 
 from __future__ import annotations
 
 import os
 from pathlib import Path
+from typing import Final
 
-PACKAGE = "ddqn_planner"
+PACKAGE: Final = "ddqn_planner"
+
+ROS: Final = "install ROS 2 Jazzy and source it, or in the repository: pip install '.[ros]'"
+
+PACKAGES: Final = {
+    "gymnasium": "torch gymnasium",
+    "matplotlib": "matplotlib",
+    "mcap": "mcap-ros2-support",
+    "mcap_ros2": "mcap-ros2-support",
+    "numba": "numba",
+    "rerun": "'rerun-sdk>=0.39'",
+    "safetensors": "safetensors",
+    "torch": "torch gymnasium",
+}
+"""What to give to pip, by module."""
+
+
+def with_remedy(error: Exception) -> str:
+    """Return what an error says, and what to install if it is a missing library."""
+    library = (getattr(error, "name", None) or "").partition(".")[0]
+    if library == "rclpy" or library.endswith(("_interfaces", "_msgs", "_srvs")):
+        return f"{error}; {ROS}"
+    return f"{error}; pip install {PACKAGES[library]}" if library in PACKAGES else str(error)
 
 
 def find_resource(folder: str, name: str) -> Path:
     """Return the path of a file of ``"maps"`` or ``"models"``; a FileNotFoundError lists all."""
+    # They lie beside the code, however it was installed; those in share/ are for ROS tools.
     directory = Path(__file__).parent / folder
     if os.path.isfile(directory / name):
         return directory / name
@@ -22,26 +42,20 @@ def find_resource(folder: str, name: str) -> Path:
 
 
 def find_map(name: str) -> Path:
-    """Return the file of a map: a path, a ``file://`` or ``package://`` URL, or a shipped map.
-
-    A shipped map may be named without its ending; a file of that name in the working directory has
-    priority. A file that is not shipped may be missing: whoever reads it reports that. A
-    FileNotFoundError if there is no such shipped map or package, or if a URL leads out of it.
-    """
-    path = Path(name.removeprefix("file://"))
+    """Return the file of a path, of a ``file://`` or ``package://`` URL, or of a shipped map."""
     if name.startswith("package://"):
-        return _package_path(name.removeprefix("package://"))
+        return _package_path(name)
+    path = Path(name.removeprefix("file://"))
+    # A file in the working directory has priority. Whoever reads a file reports that it is missing.
     if path.name != name or os.path.isfile(path):
         return path
     return find_resource("maps", name if path.suffix else f"{name}.yaml")
 
 
-def _package_path(name: str) -> Path:
-    package, _, rest = name.partition("/")
+def _package_path(url: str) -> Path:
+    package, _, rest = url.removeprefix("package://").partition("/")
     if rest.startswith("/") or ".." in Path(rest).parts:
-        raise FileNotFoundError(
-            f"{'package://' + name!r} leads out of its package; give a path in it, or a plain path"
-        )
+        raise FileNotFoundError(f"{url!r} leads out of its package; give a path in it")
     if package == PACKAGE:
         return find_resource(str(Path(rest).parent), Path(rest).name)
     try:
@@ -49,6 +63,4 @@ def _package_path(name: str) -> Path:
 
         return Path(get_package_share_directory(package)) / rest
     except (ImportError, LookupError, OSError, ValueError) as error:
-        raise FileNotFoundError(
-            f"{'package://' + name!r}: there is no such package ({error}); give another, or a path"
-        ) from None
+        raise FileNotFoundError(f"{url!r}: no such package ({error}); give a path") from None

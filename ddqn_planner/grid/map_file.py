@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import re
 import reprlib
-from collections.abc import Callable
+from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -28,10 +28,10 @@ MAX_YAML_BYTES = 2**16
 YES, NO = ("1", "y", "yes", "true", "on"), ("0", "n", "no", "false", "off")
 """Values of ``negate``: whether light pixels are occupied instead of dark ones."""
 
+# In other layouts Pillow drops bits, or map_server takes the fourth byte of a pixel as its opacity.
 LAYOUTS = {"1", "1;I", "L", "L;2", "L;4", "LA", "I;16B", "P", "P;1", "P;2", "P;4"}
 LAYOUTS |= {"RGB", "RGBA", "BGR", "BGRA", "CMYK;I"}
-"""Pillow's names of the pixel layouts in files that it reads as map_server does. In other layouts
-Pillow drops bits, or map_server takes the fourth byte of a pixel as its opacity."""
+"""Pillow's names of the pixel layouts in files that it reads as map_server does."""
 
 _shortener = reprlib.Repr()
 _shortener.maxlevel = 2  # YAML aliases can nest lists that are huge when they are printed
@@ -56,14 +56,10 @@ class MapMetadataError(MapFileError):
 
 @dataclass(frozen=True, eq=False)
 class MapFile:
-    """The content of a map file; a value out of its range is a ValueError.
+    """The content of a map file; a value out of its range is a ValueError."""
 
-    `values` are occupancies in percent, 0..100, or -1 where unknown; a read-only copy is kept. Row
-    y = 0 is the bottom row of a ROS map's image, but the first row of a MovingAI file, so that x
-    and y of its scenario files are valid. `start` and `goal` are cells between which to plan. The
-    rest is as for `GridMap`.
-    """
-
+    # Percent 0..100, or -1 where unknown. Row 0 is the bottom row of a ROS map's image, but the
+    # first row of a MovingAI file, so that x and y of its scenario files are valid.
     values: NDArray[np.int8]
     resolution: float = 1.0
     origin: tuple[float, float, float] = (0.0, 0.0, 0.0)
@@ -87,11 +83,9 @@ class MapFile:
     def grid(
         self, occupied_threshold: int = 65, allow_unknown: bool = False, use_map_costs: bool = False
     ) -> GridMap:
-        """Return the grid map; the parameters are those of `GridMap.from_occupancy_values`."""
-        options = (occupied_threshold, allow_unknown, use_map_costs)
-        return GridMap.from_occupancy_values(
-            self.values, self.resolution, self.origin, *options, forbidden=self.forbidden
-        )
+        """Return the grid map; for the parameters see `GridMap.from_occupancy_values`."""
+        options = (occupied_threshold, allow_unknown, use_map_costs, self.forbidden)
+        return GridMap.from_occupancy_values(self.values, self.resolution, self.origin, *options)
 
 
 def load_map(
@@ -138,9 +132,7 @@ def read_map_file(path: str | Path) -> MapFile:
     with suppress(ValueError):  # "~" with a user name that is impossible
         path = Path(os.path.expanduser(path))
     if not os.path.isfile(path):
-        raise MapNotFoundError(
-            f"{str(path)!r}: no such file; give the path of a .yaml or .map file"
-        )
+        raise MapNotFoundError(f"{str(path)!r}: no such file; give the path of a map")
     if path.suffix.lower() not in (".yaml", ".yml", ".map"):
         raise MapMetadataError(f"{path}: ends in {path.suffix!r}; give a .yaml, .yml or .map file")
     try:
@@ -152,13 +144,7 @@ def read_map_file(path: str | Path) -> MapFile:
 
 
 def save_map(grid: GridMap | MapFile, path: str | Path) -> None:
-    """Write a ROS map: the YAML, and a PGM of the same name beside it.
-
-    A `MapFile` reads back equal. So does a `GridMap` without costs by ``load_map(path)``, and one
-    with costs by ``load_map(path, occupied_threshold=100, allow_unknown=True,
-    use_map_costs=True)``. `GridMap.obstacles` is not written. Forbidden directions are written to
-    one more PGM, ``NAME_directions.pgm``. Missing folders are made.
-    """
+    """Write a ROS map: YAML and PGM, and one for directions; `GridMap.obstacles` is left out."""
     path = Path(os.path.expanduser(path))
     if path.suffix.lower() not in (".yaml", ".yml"):
         raise MapFileError(f"{path}: ends in {path.suffix!r}; give a path that ends in .yaml")
@@ -172,6 +158,7 @@ def save_map(grid: GridMap | MapFile, path: str | Path) -> None:
     else:
         mode, grey = "raw", values
     image = path.with_suffix(".pgm")
+    write_atomically(image, _pgm(grey))  # raw -1 becomes 255
     metadata: dict[str, Any] = {
         "image": image.name,
         "mode": mode,
@@ -181,13 +168,11 @@ def save_map(grid: GridMap | MapFile, path: str | Path) -> None:
         "occupied_thresh": 0.65,
         "free_thresh": 0.196,  # grey 205 would be free at 0.25
     }
-    scenario = {"start": grid.start, "goal": grid.goal}
-    ours: dict[str, Any] = {name: list(cell) for name, cell in scenario.items() if cell is not None}
-    write_atomically(image, _pgm(grey))  # raw -1 becomes 255
+    scenario = (("start", grid.start), ("goal", grid.goal))
+    ours: dict[str, Any] = {name: list(cell) for name, cell in scenario if cell is not None}
     if grid.forbidden is not None:
-        directions = path.with_name(f"{path.stem}_directions.pgm")
-        write_atomically(directions, _pgm(grid.forbidden))
-        ours["directions"] = directions.name
+        ours["directions"] = f"{path.stem}_directions.pgm"
+        write_atomically(path.with_name(ours["directions"]), _pgm(grid.forbidden))
     if ours:
         metadata["ddqn_planner"] = ours
     text = yaml.safe_dump(metadata, sort_keys=False, allow_unicode=True, default_flow_style=None)
@@ -216,83 +201,72 @@ def _read_moving_ai(path: Path) -> MapFile:
     pattern = rb"type octile\s+height (\d{1,8})\s+width (\d{1,8})\s+map[ \t]*\r?\n"
     header = re.match(pattern, content)
     if header is None:
-        raise ValueError(
-            f"begins with {content[:40]!r}; the first four lines must be"
-            " 'type octile', 'height H', 'width W' and 'map'"
-        )
+        lines = "'type octile', 'height H', 'width W', 'map'"
+        raise ValueError(f"begins with {content[:40]!r}; the first four lines must be {lines}")
     height, width = int(header[1]), int(header[2])
     if not 1 <= height * width <= MAX_CELLS:
         raise ValueError(f"height is {height}, width is {width}; give 1 to {MAX_CELLS} cells")
     rows = content[header.end() :].replace(b"\r\n", b"\n").rstrip(b"\n") + b"\n"
     count = rows.count(b"\n")
     if count != height:
-        raise MapDataError(f"{path}: has {count} rows; give {height}, as its header says")
+        raise MapDataError(f"{path}: has {count} rows; its header says {height}")
     cells = np.frombuffer(rows, dtype=np.uint8)
     lengths = np.diff(np.flatnonzero(cells == ord("\n")), prepend=-1) - 1
     if (lengths != width).any():
         row = int(np.argmax(lengths != width))
-        raise MapDataError(
-            f"{path}: row {row} has {lengths[row]} characters; give {width}, as the header says"
-        )
+        raise MapDataError(f"{path}: row {row} has {lengths[row]} characters; give {width}")
     free = np.isin(cells.reshape(height, width + 1)[:, :-1], list(b".GS"))
     return MapFile(np.where(free, np.int8(0), np.int8(100)))
 
 
 def _read_ros(path: Path) -> MapFile:
     document = _parse_yaml(_read_bytes(path, MAX_YAML_BYTES, MapMetadataError))
-    image = _image_path(path, "image", document.get("image"))
-    mode = _text(document, "mode", "trinary")
-    percent = _percent_of_grey(document, mode)
+    grey, clear, _ = _read_image(path, document, "image", ("PPM", "PNG", "BMP", "JPEG"))
+    mode = _choice(document, "mode", ("trinary", "scale", "raw"), "trinary")
+    values = _percent_of_grey(document, mode)[grey]
+    if mode != "raw":
+        values[clear] = UNKNOWN
     resolution = _number(document.get("resolution"), "resolution")
     x, y, yaw = _numbers(document.get("origin"), "origin", "[x, y, yaw]")
     ours = document.get("ddqn_planner", {})
     if not isinstance(ours, dict) or not ours.keys() <= {"start", "goal", "directions"}:
-        raise ValueError(
-            f"ddqn_planner is {_short(ours)}; give some of {{start: , goal: , directions: }}"
-        )
-    name = ours.pop("directions", None)
-    directions = None if name is None else _image_path(path, "directions", name)
-    cells: Any = {name: _numbers(cell, name, "[x, y]") for name, cell in ours.items()}
-    grey, clear = _read_image(image, _grey, ("PPM", "PNG", "BMP", "JPEG"))
-    values: NDArray[np.int8] = percent[grey]
-    if mode != "raw":
-        values[clear] = UNKNOWN
+        keys = "{start: , goal: , directions: }"
+        raise ValueError(f"ddqn_planner is {_short(ours)}; give some of {keys}")
     forbidden = None
-    if directions is not None:
-        forbidden = _read_image(directions, _directions, ("PPM", "PNG"))[::-1]
+    if "directions" in ours:
+        forbidden, _, layout = _read_image(path, ours, "directions", ("PPM", "PNG"))
+        name = ours.pop("directions")
+        if layout != "L":
+            raise MapDataError(f"{name!r}: its pixels are stored as {layout}; save 8 bits of grey")
         if forbidden.shape != values.shape:
-            sizes = [f"{width} x {height}" for height, width in (forbidden.shape, values.shape)]
-            raise MapDataError(
-                f"{str(directions)!r}: has {sizes[0]} pixels; give {sizes[1]}, as the map's image"
-            )
+            has, right = (f"{w} x {h}" for h, w in (forbidden.shape, values.shape))
+            raise MapDataError(f"{name!r}: has {has} pixels; give {right}, as the map's image")
+        forbidden = forbidden[::-1]
+    cells: Any = {name: _numbers(cell, name, "[x, y]") for name, cell in ours.items()}
     return MapFile(values[::-1], resolution, (x, y, yaw), **cells, forbidden=forbidden)
 
 
-def _image_path(path: Path, key: str, name: object) -> Path:
+def _read_image(
+    path: Path, document: dict[str, Any], key: str, formats: tuple[str, ...]
+) -> tuple[NDArray[np.uint8], NDArray[np.bool_], str]:
+    """Return an image's grey values, which pixels are not opaque, and the layout of the pixels."""
+    name = document.get(key)
     if not isinstance(name, str) or not name:
         raise ValueError(f"{key} is {_short(name)}; give the path of an image")
-    image = path.parent / name
-    if not os.path.isfile(image):
-        raise MapDataError(f"{str(image)!r}: no such image; check {key!r} in the YAML file")
+    file = path.parent / name
+    if not os.path.isfile(file):
+        raise MapDataError(f"{str(file)!r}: no such image; check {key!r} in the YAML file")
     # In a linked colcon workspace the YAML file is itself a link: allow the folder of either.
     folders = path.parent.resolve(), path.resolve().parent
-    if not any(image.resolve().is_relative_to(folder) for folder in folders):
-        raise ValueError(
-            f"{key} is {name!r}, outside of the folder of the YAML file; put it beside the YAML"
-        )
-    return image
-
-
-def _read_image(path: Path, pixels: Callable[[Any, str], Any], formats: tuple[str, ...]) -> Any:
-    """Return what `pixels` makes of an image and the layout of its pixels in the file."""
+    if not any(file.resolve().is_relative_to(folder) for folder in folders):
+        raise ValueError(f"{key} is {name!r}, outside of the folder of the YAML; put it beside")
     try:
-        with Image.open(path, formats=formats) as image:
-            return pixels(image, _layout(image))
+        with Image.open(file, formats=formats) as image:
+            layout = _layout(image)
+            return *_grey(image), layout
     except Exception as error:  # Pillow's decoders raise many exceptions on broken bytes
-        raise MapDataError(
-            f"{str(path)!r}: not readable ({error}); give a {', '.join(formats)} image of at"
-            f" most {MAX_CELLS} pixels"
-        ) from error
+        remedy = f"give a {', '.join(formats)} image of at most {MAX_CELLS} pixels"
+        raise MapDataError(f"{str(file)!r}: not readable ({error}); {remedy}") from error
 
 
 def _layout(image: Any) -> str:
@@ -312,18 +286,8 @@ def _layout(image: Any) -> str:
     return str(layout)
 
 
-def _directions(image: Any, layout: str) -> NDArray[np.uint8]:
-    if layout != "L":
-        raise ValueError(f"its pixels are stored as {layout}; save 8 bits of grey, no alpha")
-    return np.asarray(image)
-
-
-def _grey(image: Any, _: str) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
-    """Return the grey values, and which pixels are not opaque.
-
-    They are those of map_server's GraphicsMagick, with 16 bits per channel: colours become their
-    Rec. 601 luma.
-    """
+def _grey(image: Any) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
+    """Return map_server's grey values (16-bit Rec. 601 luma), and which pixels are not opaque."""
     if image.mode.startswith("I"):
         grey = np.asarray(image) // 257
     elif image.mode in ("1", "L", "LA"):
@@ -351,10 +315,12 @@ def _parse_yaml(content: bytes) -> dict[str, Any]:
     return document
 
 
-def _text(document: dict[str, Any], key: str, default: str | None = None) -> str:
+def _choice(
+    document: dict[str, Any], key: str, choices: Sequence[str], default: str | None = None
+) -> str:
     value = document.get(key, default)
-    if not isinstance(value, str):
-        raise ValueError(f"{key} is {_short(value)}; give a single value")
+    if not isinstance(value, str) or value.lower() not in choices:
+        raise ValueError(f"{key} is {_short(value)}; give one of {', '.join(choices)}")
     return value.lower()
 
 
@@ -373,21 +339,17 @@ def _numbers(value: Any, key: str, names: str) -> list[float]:
 
 def _percent_of_grey(document: dict[str, Any], mode: str) -> NDArray[np.int8]:
     """Return (256,) int8: the occupancy of each grey value, by map_server's rules."""
-    free_thresh = _number(document.get("free_thresh"), "free_thresh")
-    occupied_thresh = _number(document.get("occupied_thresh"), "occupied_thresh")
+    keys = "free_thresh", "occupied_thresh"
+    free_thresh, occupied_thresh = (_number(document.get(key), key) for key in keys)
     if not 0 <= free_thresh <= occupied_thresh <= 1:
         raise ValueError(
             f"free_thresh is {free_thresh}, occupied_thresh is {occupied_thresh}; give"
             " 0 <= free_thresh <= occupied_thresh <= 1"
         )
-    negate = _text(document, "negate")
-    if negate not in YES + NO:
-        raise ValueError(f"negate is {_short(document['negate'])}; give 0 or 1")
+    negate = _choice(document, "negate", YES + NO)
     grey = np.arange(256)
     if mode == "raw":
         return np.where(grey <= 100, grey, -1).astype(np.int8)
-    if mode not in ("trinary", "scale"):
-        raise ValueError(f"mode is {_short(mode)}; give trinary, scale or raw")
     # map_server computes in single precision, and a grey value may equal a threshold.
     free, occupied = np.float32(free_thresh), np.float32(occupied_thresh)
     p = grey.astype(np.float32) / np.float32(255)

@@ -5,7 +5,7 @@ import sys
 from functools import partial
 from importlib import import_module
 
-from ddqn_planner.libraries import with_remedy
+from ddqn_planner.resources import with_remedy
 
 # NumPy is imported after this. The networks' products are small: more threads than one only wait
 # for each other, ten times as long on a busy machine.

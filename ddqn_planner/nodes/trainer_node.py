@@ -16,14 +16,13 @@ from rclpy.exceptions import InvalidParameterValueException
 from std_msgs.msg import Float32, Header, String
 
 from ddqn_planner.grid import Cell, MoveRule, read_map_file
-from ddqn_planner.libraries import with_remedy
 from ddqn_planner.nodes.conversions import cell_from_pose, check_pose, path_message, serialized_path
 from ddqn_planner.nodes.driving import Driving
 from ddqn_planner.nodes.learning import NO_MAP, LearningNode, MapInFrame, explained
 from ddqn_planner.nodes.parameters import HYPER_PARAMETERS, OF_MAPS, TRAINER_PARAMETERS
 from ddqn_planner.nodes.poses import check_source
 from ddqn_planner.nodes.runtime import LATCHED, STEADY, Worker, spin_until_shutdown
-from ddqn_planner.resources import find_map
+from ddqn_planner.resources import find_map, with_remedy
 from ddqn_planner.training.hyper_parameters import HyperParameters
 
 if TYPE_CHECKING:
