@@ -25,7 +25,7 @@ from ddqn_planner.training.double_dqn import ReplayBuffer, Transitions, double_d
 from ddqn_planner.training.environment import GridVectorEnvironment, Scenario
 from ddqn_planner.training.episodes import Episode, EpisodeEnd
 from ddqn_planner.training.hyper_parameters import HyperParameters
-from ddqn_planner.training.networks import MODULES, encoder_for
+from ddqn_planner.training.networks import MODULES
 
 CHECKPOINT_KEY = "ddqn_planner_checkpoint"
 DIGEST_KEY = "sha256"
@@ -63,7 +63,7 @@ class Trainer:
             known = {**asdict(parameters), "height": height, "width": width}
             self.network = module(**{name: known[name] for name in module.numpy_class.size_names})
         self._target = copy.deepcopy(self.network).requires_grad_(False)
-        self.encoder = encoder_for(self._target, self.environment)
+        self._target.settle(self.environment)
         self._weights = tuple(self.network.parameters())
         self._optimiser = torch.optim.Adam(self._weights, parameters.learning_rate, fused=FUSED)
         for weight in self._weights:  # as Adam does at its first step; a checkpoint restores it
@@ -108,7 +108,7 @@ class Trainer:
         actions = self._exploration.integers(len(MOVES), size=count)
         greedy = self._exploration.random(count) >= self.epsilon
         if greedy.any():
-            states = self.encoder.states(self.environment.scenario, self.environment.cell)
+            states = self._target.states(self.environment.scenario, self.environment.cell)
             with torch.inference_mode():
                 q_NA = self.network(states)
             actions[greedy] = q_NA.argmax(dim=1).numpy()[greedy]
@@ -118,10 +118,8 @@ class Trainer:
         """Make one Double DQN update with a batch from the replay buffer."""
         p = self.parameters
         batch = self._replay.sample(p.batch_size, self._sampling)
-        states = self.encoder.states(
-            np.tile(batch.scenario, 2), np.concatenate([batch.cell, batch.next_cell])
-        )
-        state, next_state = states.chunk(2)
+        cells = np.concatenate([batch.cell, batch.next_cell])
+        state, next_state = self._target.states(np.tile(batch.scenario, 2), cells).chunk(2)
         loss = double_dqn_loss(self.network, self._target, p.target, batch, state, next_state)
         # Unlike backward(), grad() adds to no old gradient, so there is none to set to zero.
         gradients = torch.autograd.grad(loss, self._weights)
@@ -131,7 +129,7 @@ class Trainer:
         self.updates += 1
         if self.updates % p.target_interval == 0:
             self._target.load_state_dict(self.network.state_dict())
-            self.encoder.update_target(self._target)
+            self._target.settle(self.environment)
 
     def _end_episodes(
         self, ended: NDArray[np.bool_], terminated: NDArray[np.bool_]
@@ -229,7 +227,7 @@ class Trainer:
             raise ValueError("its tensors have other names or shapes")
         for name, tensor in tensors.items():
             tensor.copy_(file.get_tensor(name))
-        self.encoder.update_target(self._target)
+        self._target.settle(self.environment)
         self._visited = description["walked"]
         for generator, state in zip(self._generators, description["generators"], strict=True):
             generator.bit_generator.state = state
