@@ -24,15 +24,12 @@ def load(model: str) -> tuple[Planner, str]:
 
 
 def load_and_warm_up(model: str) -> tuple[Planner, str]:
-    """Load a model, and the libraries and compiled functions that most plans need.
-
-    The garbage collector leaves out what is there then: a collection would stop the node for 45 ms.
-    """
+    """Load a model, and the libraries and compiled functions that most plans need."""
     planner, path = load(model)
     sizes = planner.metadata.sizes
     shape = sizes.get("height", 3), sizes.get("width", 3)
     planner.plan(GridMap(np.zeros(shape, dtype=np.bool_)), (0, 0), (shape[1] - 1, shape[0] - 1))
-    gc.freeze()
+    gc.freeze()  # a collection of all that would stop the node for 45 ms
     return planner, path
 
 
@@ -47,14 +44,9 @@ class ModelSource:
     def __init__(self, node: BaseNode, report: Report, worker: Worker) -> None:
         self.planner: Planner | None = None
         self.file = ""
-        self._node, self._report, self._worker = node, report, worker
+        self._node, self.report, self._worker = node, report, worker
+        # The first model, while it is being loaded.
         self.loading: Future | None = None
-        """The first model, while it is being loaded."""
-
-    @property
-    def refused(self) -> str:
-        """Why the last model was refused."""
-        return self._report.refused["model"]
 
     def load(self) -> None:
         """Begin to load the first model."""
@@ -69,7 +61,7 @@ class ModelSource:
             if self.loading is loading:
                 self.loading = None
                 reason = f"{str(error) or repr(error)}; or set the parameter 'model'"
-                self._report.refuse("model", reason)
+                self.report.refuse("model", reason)
             return
         if loaded is not None and self.loading is loading:
             self.use(*loaded)
@@ -78,8 +70,8 @@ class ModelSource:
         """Plan with it from now on."""
         self.planner, self.file, self.loading = planner, file, None
         planner.cache_bytes = self._node.value("field_cache_bytes")
-        self._report.accept("model")
-        self._report.change()
+        self.report.accept("model")
+        self.report.change()
         self._node.get_logger().info(f"planning with the model {file}")
 
     def set(self, name: str) -> str:
@@ -91,7 +83,7 @@ class ModelSource:
     def on_saved(self, message: String) -> None:
         """Use a model that the trainer saved."""
         if reason := self.set(message.data):
-            self._report.refuse("model", f"the trainer's model was refused: {reason}")
+            self.report.refuse("model", f"the trainer's model was refused: {reason}")
 
     def on_reload(self) -> tuple[bool, str]:
         """Load the file of the model again."""

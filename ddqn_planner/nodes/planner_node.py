@@ -17,7 +17,7 @@ from rclpy.task import Future
 from std_msgs.msg import Header, String
 
 from ddqn_planner.nodes.conversions import path_message, serialized_path
-from ddqn_planner.nodes.display import FieldDisplay
+from ddqn_planner.nodes.display import LOOK_PERIOD, FieldDisplay
 from ddqn_planner.nodes.lifecycle import ManagedNode
 from ddqn_planner.nodes.map_source import MapSource
 from ddqn_planner.nodes.model_loading import ModelSource, load
@@ -33,9 +33,6 @@ from ddqn_planner.nodes.report import (
 )
 from ddqn_planner.nodes.requests import UNCHANGED, ActiveGoal, PathUnderWay, Requests
 from ddqn_planner.nodes.runtime import LATCHED, STEADY, Unless, Worker, spin_until_shutdown
-
-LOOK_PERIOD = 0.1
-"""Seconds between two looks whether something changed: an answer does not wait for diagnostics."""
 
 
 # The executor's one thread holds all state. What takes long runs in workers: to load the model,

@@ -201,7 +201,8 @@ class Requests:
         await self.model.first()
         planner = self.model.planner
         if planner is None:
-            raise RequestError("NO_MODEL", f"no model is loaded: {self.model.refused}")
+            refused = self.model.report.refused["model"]
+            raise RequestError("NO_MODEL", f"no model is loaded: {refused}")
         return header, await inflated, planner
 
     async def _plan_one(self, planner: Planner, request: PlanRequest) -> Plan:
