@@ -72,13 +72,9 @@ class FieldDisplay:
         self._worker = Worker(node)
         self._shown: Shown | None = None
         self._shows_again = False
-        self._layers = [
-            Layer(name, node.create_publisher(message_type, f"~/{name}", LATCHED), message)
-            for name, message_type, message in (
-                ("value", OccupancyGrid, value_message),
-                ("policy", MarkerArray, policy_message),
-            )
-        ]
+        value = node.create_publisher(OccupancyGrid, "~/value", LATCHED)
+        policy = node.create_publisher(MarkerArray, "~/policy", LATCHED)
+        self._layers = Layer("value", value, value_message), Layer("policy", policy, policy_message)
         group = MutuallyExclusiveCallbackGroup()
         node.create_timer(LOOK_PERIOD, self._on_look, group, clock=STEADY)
 
