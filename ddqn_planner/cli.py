@@ -113,7 +113,7 @@ def _print_plan(options: Any, grid: api.GridMap, plan: api.Plan, seconds: float)
 
     from ddqn_planner.grid import path_length
     from ddqn_planner.pictures import MAX_TEXT_WIDTH, draw_blocks, draw_text
-    from ddqn_planner.planning.search import search
+    from ddqn_planner.planning.paths import search
 
     optimum = None
     if plan.cells and grid.is_free(plan.cells[0]):

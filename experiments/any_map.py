@@ -10,27 +10,19 @@ import goal_1
 import goal_3
 import numpy as np
 from random_maps import generate_map
-from settings import Settings
 from tables import median_and_range, table
-from trainings import MOVE_RULE, Training, rollouts, solved
+from trainings import MOVE_RULE, Settings, Training, rollouts, solved
 
-from ddqn_planner.grid import (
-    OCCUPIED,
-    UNKNOWN,
-    GridMap,
-    MoveRule,
-    legal_moves,
-    move_costs,
-    path_length,
-)
+from ddqn_planner import GridMap, MoveRule, Planner
+from ddqn_planner.grid import OCCUPIED, UNKNOWN, legal_moves, move_costs
 from ddqn_planner.grid.noise import random_costs
 from ddqn_planner.model import AnyMapQNetwork
-from ddqn_planner.planning import Planner
 from ddqn_planner.training.any_map import ANY_MAP, RULES, random_scenarios
 from ddqn_planner.training.environment import paper_scenario
 from ddqn_planner.training.evaluation import evaluate
 
 PAPERS_REWARD: Final = {"reward": "paper", "goal_reward": 10.0}
+# The changes to ANY_MAP of each variant; the number of its folder is its place.
 VARIANTS: Final[dict[str, dict[str, Any]]] = {
     "all": {},
     "DQN's target": {"target": "dqn"},
@@ -39,60 +31,45 @@ VARIANTS: Final[dict[str, dict[str, Any]]] = {
     "the paper's reward": PAPERS_REWARD,
     "plain reward (α = β = 0)": {**PAPERS_REWARD, "alpha": 0.0, "beta": 0.0},
 }
-"""The changes to `ANY_MAP` of each variant."""
-
-STEPS: Final = 256_000
-"""Environment steps of each training of the ablation."""
-
+STEPS: Final = 256_000  # of the environment, for each training of the ablation
 HELD_OUT: Final = ("maze", "rooms", "corridors", "dead_ends", "office")
 SIDE: Final = 48
-
 ABLATION = (
-    "variant",
-    "moves classified wrongly, of 4,096",
-    "error of the cost multiplier",
-    "starts solved, without action masking",
-    "mean length / optimum",
-    "mean cost / optimum, random costs",
+    "variant | moves classified wrongly, of 4,096 | error of the cost multiplier | "
+    "starts solved, without action masking | mean length / optimum | "
+    "mean cost / optimum, random costs"
 )
 
 
 def trainings(settings: Settings) -> list[Training]:
     """Return the trainings of the ablation. Each seed has maps of its own."""
-    return [
-        Training(
-            folder,
-            settings.shorten(replace(ANY_MAP, steps=STEPS, **changes)),
-            tuple(random_scenarios(seed)),
-            seed,
-            evaluation_interval=10**9,
-        )
-        for variant, changes in VARIANTS.items()
-        for seed, folder in enumerate(settings.folders(_folder(variant)))
-    ]
-
-
-def _folder(variant: str) -> str:
-    return f"any_map/{list(VARIANTS).index(variant)}"
+    parameters_of = {
+        f"any_map/{number}": replace(ANY_MAP, steps=STEPS, **changes)
+        for number, changes in enumerate(VARIANTS.values())
+    }
+    return settings.trainings(parameters_of, random_scenarios, evaluation_interval=10**9)
 
 
 def report(settings: Settings) -> str:
     """Return the shipped model's results on the paper's goals, and the table of the ablation."""
-    ablation = [[name, *_row(settings.planners(_folder(name)))] for name in VARIANTS]
-    zero_shot = table(["the shipped model, which never saw these maps", ""], _zero_shot(settings))
-    return f"{zero_shot}\n\n{table(ABLATION, ablation)}"
+    zero_shot = table("the shipped model, which never saw these maps | ", _zero_shot(settings))
+    rows = [
+        [name, *_row(settings.planners(f"any_map/{number}"))]
+        for number, name in enumerate(VARIANTS)
+    ]
+    return f"{zero_shot}\n\n{table(ABLATION, rows)}"
 
 
 def _zero_shot(settings: Settings) -> list[list[str]]:
     shipped, scenario = Planner.load("any_map"), paper_scenario()
     planner = Planner(shipped.network, replace(shipped.metadata, move_rule=MOVE_RULE))
-    cells, milliseconds = goal_1.timed_plan(planner, scenario)
+    plan, milliseconds = goal_1.timed_plan(planner, scenario)
     field = planner.q_field(scenario.grid, scenario.goal)
     # The given start, goal i, is one of the starts.
     starts = evaluate(field, scenario.grid, MOVE_RULE)
     unmasked = evaluate(field.unmasked(), scenario.grid, MOVE_RULE).solved
     rows = [
-        ["goal i, length", f"{path_length(cells):.2f}"],
+        ["goal i, length", f"{plan.length:.2f}"],
         ["planning time, ms", f"{milliseconds:.2f}"],
         ["goal ii (without action masking)", f"{starts.solved} ({unmasked}) of {starts.starts}"],
         ["goal ii, mean length / optimum", f"{starts.mean_ratio:.4f}"],
@@ -106,27 +83,20 @@ def _zero_shot(settings: Settings) -> list[list[str]]:
 
 
 def _row(planners: Sequence[Planner]) -> list[str]:
-    errors = [move_errors(planner) for planner in planners]
-    lengths = [_held_out_rollouts(planner, with_costs=False) for planner in planners]
-    costs = [_held_out_rollouts(planner, with_costs=True) for planner in planners]
-    starts = lengths[0][1]
-    return [
-        median_and_range([wrong for wrong, _ in errors]),
-        median_and_range([error for _, error in errors], 4),
-        f"{median_and_range([count for count, _, _ in lengths])} of {starts:,}",
-        median_and_range([ratio for _, _, ratio in lengths], 4),
-        median_and_range([ratio for _, _, ratio in costs], 4),
-    ]
+    wrong, errors = zip(*map(move_errors, planners), strict=True)
+    counts, starts, lengths = zip(*(_held_out(p, with_costs=False) for p in planners), strict=True)
+    _, _, costs = zip(*(_held_out(p, with_costs=True) for p in planners), strict=True)
+    solved = f"{median_and_range(counts)} of {starts[0]:,}"
+    of_costs, *ratios = (median_and_range(each, 4) for each in (errors, lengths, costs))
+    return [median_and_range(wrong), of_costs, solved, *ratios]
 
 
 def move_errors(planner: Planner) -> tuple[int, float]:
-    """Count the moves classified wrongly, and return the mean relative error of their costs.
-
-    All 256 3x3 patches with a free centre under both rules; for the costs, each with random costs.
-    """
+    """Count the moves classified wrongly, and return the mean relative error of their costs."""
     network = planner.network
     assert isinstance(network, AnyMapQNetwork)
     wrong, errors = 0, []
+    # All 256 3x3 patches with a free centre under both rules; for the costs, each with random ones.
     patches = OCCUPIED * (np.arange(2**9)[:, None] >> np.arange(9) & 1)
     patch_B9 = patches[patches[:, 4] == 0].astype(np.int8)
     random = np.random.default_rng(0).integers(UNKNOWN, OCCUPIED, patch_B9.shape)
@@ -144,11 +114,8 @@ def move_errors(planner: Planner) -> tuple[int, float]:
     return wrong, float(np.concatenate(errors).mean())
 
 
-def _held_out_rollouts(planner: Planner, with_costs: bool) -> tuple[int, int, float]:
-    """Return solved starts, all starts and mean ratio of rollouts without action masking.
-
-    The starts are all free cells of one map of each held-out kind.
-    """
+def _held_out(planner: Planner, with_costs: bool) -> tuple[int, int, float]:
+    """Return solved starts, starts and mean ratio of rollouts without masking, on held-out maps."""
     random = np.random.default_rng(0)
     count, starts, ratios = 0, 0, []
     for kind in HELD_OUT:

@@ -1,4 +1,4 @@
-"""A bare rclpy service that returns a ready path: what the planner node is compared with."""
+"""A bare rclpy service that returns a ready path of so many poses: the planner node's yardstick."""
 
 import sys
 from contextlib import suppress
@@ -9,14 +9,15 @@ from nav_msgs.msg import Path
 from nav_msgs.srv import GetPlan
 from rclpy.executors import ExternalShutdownException
 
+PATH = Path(poses=[PoseStamped() for _ in range(int(sys.argv[1]))])
+
 
 def answer(_: GetPlan.Request, response: GetPlan.Response) -> GetPlan.Response:
-    """Return a path of as many poses as the first argument says."""
+    """Return the path."""
     response.plan = PATH
     return response
 
 
-PATH = Path(poses=[PoseStamped() for _ in range(int(sys.argv[1]))])
 with suppress(KeyboardInterrupt, ExternalShutdownException):
     rclpy.init()
     node = rclpy.create_node("bare")

@@ -1,7 +1,4 @@
-"""Measures what a robot's body costs: distances to obstacles, and lengths beside the optimum.
-
-With the path of a ROS map, and the robot's radius in metres.
-"""
+"""Measures what a robot's body costs on a ROS map (a path), with the robot's radius in metres."""
 
 from __future__ import annotations
 
@@ -15,30 +12,17 @@ from numpy.typing import NDArray
 from tables import table
 
 from ddqn_planner import GridMap, MoveRule, Planner, inflate, load_map
-from ddqn_planner.grid import (
-    MOVES,
-    Cell,
-    clearance,
-    legal_moves,
-    move_costs,
-    path_length,
-    shortest_distances,
-)
+from ddqn_planner.grid import Cell, clearance, legal_moves, move_costs, shortest_distances
+from ddqn_planner.grid.moves import neighbours
 from ddqn_planner.grid.noise import random_requests
 from ddqn_planner.resources import find_map
 
 RULE = MoveRule.ROBOT_SAFE
-REQUESTS = 200
-WEIGHTS = (0.0, 1.0)
-MAX_RATIO = 1.10
+REQUESTS, WEIGHTS, MAX_RATIO = 200, (0.0, 1.0), 1.10
 BOUND_FACTORS = np.array([1.01, 1.1, 1.3, 1.6, 2.5, 5.0])
 HEADER = (
-    "clearance_weight",
-    "solved",
-    "length over the optimum, mean",
-    "worst",
-    "mean metres to an obstacle",
-    "over weight 0",
+    "clearance_weight | solved | length over the optimum, mean | worst | "
+    "mean metres to an obstacle | over weight 0"
 )
 
 
@@ -53,18 +37,17 @@ def main(arguments: Sequence[str]) -> int:
     rows, plain, lost = [], 0.0, 0
     for weight in WEIGHTS:
         body = inflate(grid, radius, weight)
-        paths = [planner.plan(body, start, goal, RULE).cells for start, goal in requests]
-        solved = [(path_length(cells), n) for n, cells in enumerate(paths) if cells]
-        ratios = np.array([length / optima[number] for length, number in solved])
-        x, y = np.transpose([cell for cells in paths for cell in cells])
+        plans = [planner.plan(body, start, goal, RULE) for start, goal in requests]
+        ratios = [p.length / least for p, least in zip(plans, optima, strict=True) if p.cells]
+        x, y = np.concatenate([plan.path for plan in plans]).T
         mean = metres[y, x].mean()
         plain = plain or mean
-        figures = ratios.mean(), ratios.max(), mean, mean / plain
-        lost += REQUESTS - len(solved)
-        rows.append([weight, len(solved), *(f"{figure:.4f}" for figure in figures)])
+        figures = np.mean(ratios), max(ratios), mean, mean / plain
+        lost += REQUESTS - len(ratios)
+        rows.append([weight, len(ratios), *(f"{figure:.4f}" for figure in figures)])
     print(f"{Path(path).stem}: {len(requests)} requests, robot_radius {radius} m")
     print(table(HEADER, rows))
-    bound = greatest_distance(inflated, metres, requests, MAX_RATIO)
+    bound = greatest_distance(inflated, metres, requests)
     print(
         f"no paths of {MAX_RATIO} times the least total length have a mean distance above "
         f"{bound:.3f} m, {bound / plain:.2f} of that of weight 0"
@@ -73,20 +56,16 @@ def main(arguments: Sequence[str]) -> int:
 
 
 def greatest_distance(
-    grid: GridMap,
-    metres: NDArray[np.float64],
-    requests: Sequence[tuple[Cell, Cell]],
-    share: float,
+    grid: GridMap, metres: NDArray[np.float64], requests: Sequence[tuple[Cell, Cell]]
 ) -> float:
-    """Return a bound of the mean distance that paths can keep, metres.
+    """Return a bound of the mean distance (metres) along paths of `MAX_RATIO` the least length L.
 
-    The mean is that along all paths, of a total length L of `share` times the least. For any c
-    above all distances d, the paths of the least integral of c - d say how great that of d can be:
-    c L less theirs (Lagrange). The least of the bounds of some c is returned.
+    For any c above all distances d, the paths of the least integral of c - d say how great that of
+    d can be: c L less theirs (Lagrange). The least of the bounds of some c is returned.
     """
     action, y, x = np.nonzero(legal_moves(grid.occupancy, RULE))
     cell = y * grid.width + x
-    next_cell = cell + MOVES[action, 1] * grid.width + MOVES[action, 0]
+    next_cell = neighbours(grid.occupancy.shape)[action, cell]
 
     def integrals(density: NDArray[np.float64]) -> float:
         costs = move_costs(density.astype(np.float32), RULE)[action, y, x]
@@ -97,7 +76,7 @@ def greatest_distance(
             total += to_goal[start[1] * grid.width + start[0]]
         return total
 
-    length = share * integrals(np.ones_like(metres))
+    length = MAX_RATIO * integrals(np.ones_like(metres))
     greatest = metres[~grid.occupancy].max()
     return float(min(c - integrals(c - metres) / length for c in greatest * BOUND_FACTORS))
 

@@ -1,7 +1,4 @@
-"""Measure how much sooner a robot arrives that remembers how long places took.
-
-It drives missions in generated worlds with many seeds. Writes tables, figures and a report.
-"""
+"""Measure how much sooner a robot arrives that remembers how long places took, in many worlds."""
 
 from __future__ import annotations
 
@@ -17,47 +14,27 @@ from typing import Final
 # Before NumPy is imported. On a busy machine, several threads are ten times as slow as one.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
+import driving_worlds as worlds
 import numpy as np
-from driving_worlds import (
-    KINDS,
-    RULE,
-    SPEED,
-    STATIONS,
-    World,
-    drive,
-    generated_world,
-    make_world,
-    path_seconds,
-    slow_zones,
-    with_faults,
-)
+from driving_worlds import KINDS, RULE, SPEED, STATIONS, Float64, World, drive, path_seconds
 from figures import draw_slowness, draw_times, save_figure
-from numpy.typing import NDArray
 from random_maps import generate_map
 from tables import median_and_range, table, write_report
 from trainings import in_parallel, make_folder, parser_of
 
+from ddqn_planner import Experience, GridMap, Planner, inflate, load_map
 from ddqn_planner.cli import exit_code
-from ddqn_planner.experience import Experience
-from ddqn_planner.grid import Cell, GridMap, inflate, load_map
+from ddqn_planner.grid import Cell
 from ddqn_planner.grid.arguments import MAX_SLOWNESS
 from ddqn_planner.grid.noise import random_requests
-from ddqn_planner.planning import Planner
-
-Float64 = NDArray[np.float64]
 
 MISSIONS: Final = 150
-MOVED_AT: Final = 100
-"""The mission before which all slow zones move."""
+MOVED_AT: Final = 100  # the mission before which all slow zones move
 QUICK_MISSIONS: Final = 60
-FAULT_EVERY: Final = 900.0
-"""Seconds of driving from one fault to the next: four per hour, one of each kind on average."""
-ROBOT_RADIUS: Final = 0.2
-"""Metres, on maps from files."""
-
+FAULT_EVERY: Final = 900.0  # seconds of driving: four faults per hour, one of each kind on average
+ROBOT_RADIUS: Final = 0.2  # metres, on maps from files
 STAGES: Final = {"1 to 20": (0, 20), "21 to 50": (20, 50), "51 to 100": (50, 100)}
-BARS: Final = ("1.08", "1.04", "1.02")
-"""What the learning planner should stay below in each stage."""
+BARS: Final = ("1.08", "1.04", "1.02")  # what the learning planner should stay below in each stage
 MOVED_STAGES: Final = {
     "91 to 100": (90, 100),
     "101 to 110": (100, 110),
@@ -65,24 +42,18 @@ MOVED_STAGES: Final = {
     "121 to 140": (120, 140),
     "141 to 150": (140, 150),
 }
-SMOOTHED: Final = 10
-"""Missions that a point of the curve averages."""
-VISITED: Final = 0.95
-"""Uncertainty of a cell below which the robot was near."""
-
-LEARNED: Final = "learned"
-SHORTEST: Final = "shortest path"
-LAST: Final = "last time per cell"
-MEAN: Final = "mean per cell"
+SMOOTHED: Final = 10  # missions that a point of the curve averages
+VISITED: Final = 0.95  # uncertainty of a cell below which the robot was near
+LEARNED, SHORTEST = "learned", "shortest path"
+LAST, MEAN = "last time per cell", "mean per cell"
 PLANNERS: Final = (LEARNED, SHORTEST, LAST, MEAN)
 
 
 @dataclass(frozen=True)
 class Job:
-    """A world and how the robot drives in it."""
+    """A world (a kind of generated map, or a map file) and how the robot drives in it."""
 
     kind: str
-    """A kind of generated map, or a map file."""
     seed: int
     missions: int
     faults: bool = False
@@ -91,22 +62,22 @@ class Job:
     def world(self) -> World:
         """Return the world, always the same."""
         if self.kind in KINDS:
-            return generated_world(self.kind, self.seed)
+            return worlds.generated_world(self.kind, self.seed)
         random = np.random.default_rng([self.seed, 1])
-        return make_world(inflate(load_map(self.kind), ROBOT_RADIUS), random)
+        return worlds.make_world(inflate(load_map(self.kind), ROBOT_RADIUS), random)
 
 
 @dataclass(frozen=True)
 class Result:
-    """The missions of a job."""
+    """The missions of a job: expected seconds of the planner that knows, (M,), and of the others.
+
+    The forecast is (M, 4): measured seconds, the expected time, and its bounds.
+    """
 
     job: Job
     best: Float64
-    """(M,): expected seconds of the planner that knows."""
     seconds: dict[str, Float64]
-    """Those of the planners."""
     forecast: Float64
-    """(M, 4): measured seconds of the learning planner's drives, the expected time, its bounds."""
 
     def ratio(self, planner: str, first: int, end: int) -> float:
         """Return the total time over that of the planner that knows, over some missions."""
@@ -146,7 +117,7 @@ def run(job: Job) -> Result:
     clock, next_fault = 0.0, FAULT_EVERY / 2
     for mission in range(job.missions):
         if mission == MOVED_AT:
-            world.always = slow_zones(grid, moved)
+            world.always = worlds.slow_zones(grid, moved)
         start, goal = (world.stations[i] for i in missions.choice(STATIONS, 2, replace=False))
         truth = world.slowness(clock)
 
@@ -160,7 +131,7 @@ def run(job: Job) -> Result:
         forecast.append((measured.duration, *experience.expected_time(grid, cells)))
         seen = measured
         if job.faults and clock >= next_fault:
-            seen, next_fault = with_faults(measured, faults), next_fault + FAULT_EVERY
+            seen, next_fault = worlds.with_faults(measured, faults), next_fault + FAULT_EVERY
         experience.record(seen.seconds, seen.positions)
         if job.baselines:
             seconds[SHORTEST].append(path_seconds(planned(grid), truth, grid))
@@ -178,50 +149,46 @@ def measured_worlds(
 ) -> tuple[list[Result], list[Result]]:
     """Run each world as it is, and with faults; return the results of both."""
     missions = QUICK_MISSIONS if options.quick else MISSIONS
-    worlds = [(kind, seed) for kind in kinds for seed in range(options.seeds)]
-    jobs = [Job(*world, missions) for world in worlds]
-    jobs += [Job(*world, min(missions, MOVED_AT), True, False) for world in worlds]
+    drawn = [(kind, seed) for kind in kinds for seed in range(options.seeds)]
+    jobs = [Job(*world, missions) for world in drawn]
+    jobs += [Job(*world, min(missions, MOVED_AT), True, False) for world in drawn]
     results = in_parallel(run, jobs, options.backend, "world")
-    return results[: len(worlds)], results[len(worlds) :]
+    return results[: len(drawn)], results[len(drawn) :]
 
 
-def report(out: Path, options: argparse.Namespace, maps: Sequence[str]) -> str:
-    """Run the experiment, write its tables, figures and ``report.md``, and return the text."""
+def measure(options: argparse.Namespace) -> int:
+    """Run the experiment, write its tables, figures and ``report.md``, and print it."""
+    maps = sorted(map(str, options.maps.rglob("*.yaml"))) if options.maps else []
+    if options.maps and not maps:
+        raise ValueError(f"{options.maps}: found no ROS map (.yaml); check the path")
+    out = make_folder(options)
     plain, faulty = measured_worlds(KINDS, options)
-    both = {"as it is": plain, "with faults": faulty}
     sections = {
         "Time over the best possible": _stages(plain, faulty),
         "From mission to mission": _curve(out / "curve.png", plain),
         "World by world": _worlds(plain),
-        "Expected times": _forecasts(both),
+        "Expected times": _forecasts({"as it is": plain, "with faults": faulty}),
         "Speed": _times(),
         "True and learned slowness": _picture(out / "map.png"),
     }
     if not options.quick:
-        sections["When all slow zones move"] = table(
-            ["missions", *MOVED_STAGES],
-            [[name, *_ratios(plain, name, MOVED_STAGES)] for name in PLANNERS],
-        )
+        rows = [[name, *_ratios(plain, name, MOVED_STAGES)] for name in PLANNERS]
+        moved = table(" | ".join(("missions", *MOVED_STAGES)), rows)
+        sections["When all slow zones move"] = moved
     if maps:
         plain, faulty = measured_worlds(maps, options)
         sections["Maps from files"] = _stages(plain, faulty)
         sections["Maps from files, world by world"] = _worlds(plain)
-    return write_report(out, sections, options.page)
-
-
-def map_files(folder: Path) -> list[str]:
-    """Return the ROS maps of a folder; a ValueError without one."""
-    files = sorted(map(str, folder.rglob("*.yaml")))
-    if not files:
-        raise ValueError(f"{folder}: found no ROS map (.yaml); check the path")
-    return files
+    print(write_report(out, sections, options.page))
+    print(f"saved {out / 'report.md'}")
+    return 0
 
 
 def _stages(plain: Sequence[Result], faulty: Sequence[Result]) -> str:
     """Return the time over that of the planner that knows: median, best and worst world."""
     rows = [[name, *_ratios(plain, name, STAGES)] for name in PLANNERS]
     rows += [["learned, with faults", *_ratios(faulty, LEARNED, STAGES)], ["bar", *BARS]]
-    return table(["missions", *STAGES], rows)
+    return table(" | ".join(("missions", *STAGES)), rows)
 
 
 def _ratios(
@@ -239,7 +206,7 @@ def _worlds(plain: Sequence[Result]) -> str:
         ratios.append(result.ratio(LEARNED, 0, MOVED_AT) / result.ratio(SHORTEST, 0, MOVED_AT))
         cells = [f"{ratio:.3f}" for ratio in ratios]
         rows.append([Path(result.job.kind).stem, result.job.seed, *cells])
-    return table(["world", "seed", *STAGES, "over the shortest path"], rows)
+    return table(" | ".join(("world", "seed", *STAGES, "over the shortest path")), rows)
 
 
 def _forecasts(both: Mapping[str, Sequence[Result]]) -> str:
@@ -252,20 +219,16 @@ def _forecasts(both: Mapping[str, Sequence[Result]]) -> str:
         inside = ((low <= measured) & (measured <= high)).mean()
         width = np.median((high - low) / expected)
         rows.append([label, len(forecast), f"{error:.1%}", f"{inside:.1%}", f"{width:.1%}"])
-    header = ["drives", "missions", "MAPE", "within the 90 % interval", "width of it, median"]
+    header = "drives | missions | MAPE | within the 90 % interval | width of it, median"
     return table(header, rows)
 
 
 def _times() -> str:
-    """Return how long it takes to learn from 1,000 poses on 1000 x 1000 cells, and to plan again.
-
-    It is the time of the processor: of `Experience.record`, of `Experience.apply`, and of
-    `Planner.plan` toward a goal of which the field of the last map is known.
-    """
+    """Return the CPU time to learn from 1,000 poses on 1000 x 1000 cells, and to plan again."""
     random = np.random.default_rng(0)
     occupancy = generate_map("office", (1000, 1000), random)
     grid, planner = GridMap(occupancy, 0.05), Planner.load("any_map")
-    world = make_world(grid, random)
+    world = worlds.make_world(grid, random)
     requests = random_requests(world.grid.occupancy, RULE, 6, random)
     goal, experience, clock = requests[0][1], Experience(SPEED), 0.0
     times = []
@@ -285,8 +248,7 @@ def _times() -> str:
         times.append([*steps, steps.sum()])
     columns = zip(("record", "apply", "plan again", "all"), np.array(times[5:]).T, strict=True)
     rows = [[name, f"{np.median(ms):.1f}", f"{ms.max():.1f}"] for name, ms in columns]
-    header = ["1,000 poses on 1000 x 1000 cells", "median [ms]", "worst [ms]"]
-    return table(header, rows)
+    return table("1,000 poses on 1000 x 1000 cells | median [ms] | worst [ms]", rows)
 
 
 def _curve(path: Path, plain: Sequence[Result]) -> str:
@@ -331,15 +293,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--maps", type=Path, metavar="FOLDER", help=words)
     options = parser.parse_args(arguments)
     return exit_code(parser.prog, lambda: measure(options))
-
-
-def measure(options: argparse.Namespace) -> int:
-    """Run the experiment, and print its report."""
-    maps = map_files(options.maps) if options.maps else []
-    out = make_folder(options)
-    print(report(out, options, maps))
-    print(f"saved {out / 'report.md'}")
-    return 0
 
 
 if __name__ == "__main__":

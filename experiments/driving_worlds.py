@@ -19,41 +19,28 @@ Routes = dict[str, Sequence[Cell]]
 RULE: Final = MoveRule.ROBOT_SAFE
 
 KINDS: Final = ("office", "rooms", "corridors")
-SIDE: Final = 96
-RESOLUTION: Final = 0.25
-SPEED: Final = 0.5
-"""Metres per second in the open."""
-
-STATIONS: Final = 6
-"""Missions lead from one of so many cells to another."""
-
+SIDE, RESOLUTION = 96, 0.25
+SPEED: Final = 0.5  # metres per second in the open
+STATIONS: Final = 6  # missions lead from one of so many cells to another
 HOUR: Final = 3600.0
-NOISE: Final = 0.3
-"""Standard deviation of the log time of each 25 cm, for each drive anew."""
-DRIVE_NOISE: Final = 0.03
-"""Standard deviation of the log time of a drive."""
-POSE_NOISE: Final = 0.02
-"""Metres."""
-RATE: Final = 10.0
-"""Poses per second."""
+# Standard deviations: of the log time of each 25 cm, for each drive anew; of the log time of a
+# drive; and of a pose, metres.
+NOISE, DRIVE_NOISE, POSE_NOISE = 0.3, 0.03, 0.02
+RATE: Final = 10.0  # poses per second
 
 
 @dataclass
 class World:
-    """A map with the slowness that nobody tells the robot."""
+    """A map, all that the robot knows, with the slowness that nobody tells it: (H, W) each."""
 
     grid: GridMap
-    """What the robot knows."""
-    always: Float64
-    """(H, W): of slow zones, of a slipping carpet, and of a door where one waits."""
-    crowds: list[Float64]
-    """(H, W) each: where crowds come and go by the hour; the first comes in the odd hours."""
+    always: Float64  # of slow zones, of a slipping carpet, and of a door where one waits
+    crowds: list[Float64]  # they come and go by the hour; the first comes in the odd hours
     stations: list[Cell]
 
     def slowness(self, seconds: float) -> Float64:
         """Return what is true at a time: (H, W)."""
-        now = self.always
-        hour = int(seconds // HOUR)
+        now, hour = self.always, int(seconds // HOUR)
         for number, crowd in enumerate(self.crowds):
             if (hour + number) % 2:
                 now = np.maximum(now, crowd)
@@ -144,18 +131,23 @@ class Drive:
     duration: float
 
 
+def _lengths(cells: Sequence[Cell]) -> Float64:
+    """Return the length of each move of a path, in cells."""
+    dx, dy = np.diff(np.asarray(cells), axis=0).T
+    return segment_lengths(dx, dy, RULE)
+
+
 def path_seconds(cells: Sequence[Cell], slowness: Float64, grid: GridMap) -> float:
     """Return how long a path takes, without noise."""
     x, y = np.asarray(cells).T
-    lengths = segment_lengths(np.diff(x), np.diff(y), RULE)
     mean = (slowness[y[1:], x[1:]] + slowness[y[:-1], x[:-1]]) / 2
-    return float((lengths * mean).sum() * grid.resolution / SPEED)
+    return float((_lengths(cells) * mean).sum() * grid.resolution / SPEED)
 
 
 def drive(cells: Sequence[Cell], world: World, clock: float, random: np.random.Generator) -> Drive:
     """Drive a path: each half of a move is as slow as its cell, with noise."""
     x, y = np.asarray(cells).T
-    lengths = segment_lengths(np.diff(x), np.diff(y), RULE)
+    lengths = _lengths(cells)
     metres = np.concatenate([[0], np.cumsum(lengths)]) * world.grid.resolution
     part = (metres / 0.25).astype(np.int64)
     noise = random.normal(0, NOISE, part[-1] + 1)[part]
@@ -182,9 +174,7 @@ def with_faults(measured: Drive, random: np.random.Generator) -> Drive:
     if fault == 0:  # a pause of 10 minutes
         standing = seconds[at] + np.arange(0, 600, 1 / RATE)
         seconds = np.concatenate([seconds[:at], standing, seconds[at:] + 600])
-        positions = np.concatenate(
-            [positions[:at], np.repeat(positions[at : at + 1], len(standing), 0), positions[at:]]
-        )
+        positions = np.insert(positions, [at] * len(standing), positions[at], axis=0)
     elif fault == 1:  # a teleport for 3 s
         positions[at : at + int(3 * RATE)] += random.uniform(-10, 10, 2)
     elif fault == 2:  # the clock jumps, back or ahead

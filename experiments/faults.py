@@ -311,7 +311,7 @@ class Faults:
                 tally.kills += 1
                 kill(tally)
         finally:
-            header = [name.replace("_", " ") for name in Tally.__annotations__]
+            header = " | ".join(Tally.__annotations__).replace("_", " ")
             print(table(header, [[*vars(tally).values()] for tally in tallies.values()]))
         return all(tally.right for tally in tallies.values())
 

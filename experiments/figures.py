@@ -21,15 +21,14 @@ from ddqn_planner.pictures import draw_obstacles
 if TYPE_CHECKING:
     from ddqn_planner.training.environment import Scenario
 
-COLOURS: Final = ("#0072B2", "#D55E00", "#009E73", "#CC79A7")
-"""Of Okabe and Ito's palette, which colour-blind readers can tell apart."""
+COLOURS: Final = ("#0072B2", "#D55E00", "#009E73", "#CC79A7")  # Okabe and Ito's palette
 STYLES: Final = ("-", "--", "-.", ":")
 ROUTE_STYLES: Final[dict[str, dict[str, str]]] = {
     "shortest": {"color": "#555555", "linestyle": ":"},
     "learned": {"color": COLOURS[0], "linestyle": "-"},
     "best possible": {"color": COLOURS[3], "linestyle": "--"},
 }
-OUTLINE: Final = [withStroke(linewidth=4, foreground="white")]
+LINE: Final = {"linewidth": 2.2, "path_effects": [withStroke(linewidth=4, foreground="white")]}
 
 
 def save_figure(figure: Any, path: Path, caption: str) -> str:
@@ -71,8 +70,7 @@ def draw_slowness(
         image = axes.imshow(values, origin="lower", cmap="YlOrRd", norm=LogNorm(1, 8))
         draw_obstacles(axes, grid)
         for name, cells in routes.items():
-            line: dict[str, Any] = {"label": name, "path_effects": OUTLINE, **ROUTE_STYLES[name]}
-            axes.plot(*np.transpose(cells), linewidth=2.2, **line)
+            axes.plot(*np.transpose(cells), label=name, **LINE, **ROUTE_STYLES[name])
         axes.scatter(*np.transpose(stations), 35, color="black", zorder=4)
         axes.set(xticks=[], yticks=[])
         axes.set_title(title, loc="left", fontsize=10)
@@ -89,9 +87,9 @@ def draw_times(
     width: int,
     banded: str,
 ) -> tuple[Any, Any]:
-    """Draw the time over the best possible from mission to mission, each mean of some missions.
+    """Draw the times of all worlds over the best, smoothed; one name as median and band.
 
-    Of each name it is the median of all worlds, and of one also a band. Return figure and axes.
+    Returns the figure and its axes; ``width`` is how many missions a point sums up.
     """
 
     def smoothed(values: NDArray[Any]) -> NDArray[Any]:
@@ -122,12 +120,5 @@ def draw_map(axes: Any, scenario: Scenario, title: str) -> None:
 def draw_path(axes: Any, cells: Sequence[Cell], number: int, label: str) -> None:
     """Draw the path of the n-th planner of a figure."""
     if cells:
-        axes.plot(
-            *np.transpose(cells),
-            STYLES[number],
-            color=COLOURS[number],
-            linewidth=2.2,
-            path_effects=OUTLINE,
-            label=label,
-            zorder=2 + number,
-        )
+        style = {"color": COLOURS[number], "linestyle": STYLES[number], "zorder": 2 + number}
+        axes.plot(*np.transpose(cells), label=label, **LINE, **style)

@@ -1,10 +1,4 @@
-"""Counts how often the path of a robot flips on noisy costmaps, and what it costs to keep it.
-
-A robot drives over maps of some kinds and plans again after each two cells. The costmap flickers
-around it: free cells are seen as obstacles, beside walls more often than elsewhere, and obstacles
-raise the costs around them. A flip is a new path that, within its next 3 m, leads more than 0.5 m
-away from what was left of the last one, although that was still legal.
-"""
+"""Counts how often the path of a robot flips on noisy costmaps, and what it costs to keep it."""
 
 from __future__ import annotations
 
@@ -18,9 +12,8 @@ from random_maps import generate_map, inflated_costs
 from tables import table
 
 from ddqn_planner import GridMap, MoveRule, Planner
-from ddqn_planner.grid import Cell, path_cost
+from ddqn_planner.grid import Cell, clearance, path_cost
 from ddqn_planner.grid.arguments import Occupancy
-from ddqn_planner.grid.body import clearance
 from ddqn_planner.grid.noise import random_requests
 from ddqn_planner.planning import PlanRequest
 from ddqn_planner.planning.paths import rest_of_path
@@ -29,23 +22,12 @@ from ddqn_planner.planning.planner import last_step
 RULE = MoveRule.ROBOT_SAFE
 THRESHOLDS = (0.0, 0.03, 0.05, 0.1)
 KINDS = ("two ways", "rooms", "office", "random_10")
-SIDE, RUNS, REPLANS = 160, 16, 100
-"""Cells of a side, and for each kind: runs, and replans of one run at most."""
-
-STRIDE = 2
-"""Cells that the robot drives between two replans: at 5 cm, 0.5 m/s and 5 Hz."""
-
-SIGHT = 80
-"""Cells: farther away than this nothing flickers."""
-
-SEEN_BESIDE_WALLS, SEEN_ELSEWHERE = 0.03, 0.001
-"""Shares of the free cells that are seen as obstacles."""
-
-INFLATION = 8.0
-"""Cells around an obstacle that cost more."""
-
-AHEAD, APART = 60, 10
-"""Cells: how far ahead a path counts, and how far from the last one it has flipped."""
+SIDE, RUNS, REPLANS = 160, 16, 100  # cells of a side; runs of a kind; replans of a run at most
+STRIDE = 2  # cells from one replan to the next: at 5 cm, 0.5 m/s and 5 Hz
+SIGHT = 80  # cells: farther away than this nothing flickers
+# The costmap flickers: such shares of the free cells are seen as obstacles, with costs around.
+SEEN_BESIDE_WALLS, SEEN_ELSEWHERE, INFLATION = 0.03, 0.001, 8.0
+AHEAD, APART = 60, 10  # cells: how far ahead a path counts, and how far apart it has flipped
 
 
 class Driven(NamedTuple):
@@ -68,8 +50,7 @@ def main(_: Sequence[str]) -> int:
             first = first or cost
             more = f"{cost / first - 1:+.2%}"
             rows.append([kind, threshold, int(replans), f"{100 * flips / replans:.1f}", more])
-    header = ["map", "switch_threshold", "replans", "flips per 100", "cost driven"]
-    print(table(header, rows))
+    print(table("map | switch_threshold | replans | flips per 100 | cost driven", rows))
     return 0
 
 
@@ -77,13 +58,15 @@ def drive(planner: Planner, kind: str, seed: int, threshold: float, side: int = 
     """Drive from a start to a goal; the seed and the kind fix the map and its noise."""
     random = np.random.default_rng([seed, KINDS.index(kind)])
     occupancy, robot, goal = scenario(kind, side, random)
-    beside_walls = clearance(occupancy) < 2
-    true_map = GridMap(occupancy, cost=inflated_costs(occupancy, INFLATION))
+    share = np.where(clearance(occupancy) < 2, SEEN_BESIDE_WALLS, SEEN_ELSEWHERE)
+    y, x = np.ogrid[: occupancy.shape[0], : occupancy.shape[1]]
     way, path, replans, flips = [robot], np.empty((0, 2), dtype=np.int32), 0, 0
     for number in range(REPLANS):
         # The noise depends on the time, not on what was drawn for another way of the robot.
-        noise = np.random.default_rng([seed, number])
-        grid = noisy(occupancy, beside_walls, robot, goal, noise)
+        noise = np.random.default_rng([seed, number]).random(occupancy.shape) < share
+        seen = occupancy | (noise & (np.hypot(x - robot[0], y - robot[1]) <= SIGHT))
+        seen[robot[::-1]] = seen[goal[::-1]] = False
+        grid = GridMap(seen, cost=inflated_costs(seen, INFLATION))
         request = PlanRequest(grid, robot, goal, RULE, under_way=path, switch_threshold=threshold)
         plan = last_step(planner.steps(request))
         if not plan.cells:  # it waits
@@ -95,7 +78,8 @@ def drive(planner: Planner, kind: str, seed: int, threshold: float, side: int = 
         robot = way[-1]
         if robot == goal:
             break
-    else:  # the best path from there, so that all drives end at the goal
+    true_map = GridMap(occupancy, cost=inflated_costs(occupancy, INFLATION))
+    if robot != goal:  # the best path from there, so that all drives end at the goal
         way += planner.plan(true_map, robot, goal, RULE).cells[1:]
     return Driven(replans, flips, path_cost(way, true_map.cost_multiplier, RULE))
 
@@ -113,25 +97,8 @@ def scenario(kind: str, side: int, random: np.random.Generator) -> tuple[Occupan
             return occupancy, start, goal
 
 
-def noisy(
-    occupancy: Occupancy,
-    beside_walls: Occupancy,
-    robot: Cell,
-    goal: Cell,
-    random: np.random.Generator,
-) -> GridMap:
-    """Return what the robot sees: more obstacles, with costs around all."""
-    y, x = np.ogrid[: occupancy.shape[0], : occupancy.shape[1]]
-    is_seen = np.hypot(x - robot[0], y - robot[1]) <= SIGHT
-    share = np.where(beside_walls, SEEN_BESIDE_WALLS, SEEN_ELSEWHERE)
-    seen = occupancy | (is_seen & (random.random(occupancy.shape) < share))
-    for free in (robot, goal):
-        seen[free[1], free[0]] = False
-    return GridMap(seen, cost=inflated_costs(seen, INFLATION))
-
-
 def is_flip(rest: NDArray[np.int32], path: NDArray[np.int32]) -> bool:
-    """Return whether a path leads away from what is left of the last one, near the robot."""
+    """Return whether the next 3 m of a path lead away from what is left of the last one."""
     if not len(rest):
         return False
     apart = np.hypot(*(path[:AHEAD, None] - rest[None]).transpose(2, 0, 1)).min(axis=1)

@@ -1,8 +1,4 @@
-"""Measure greedy rollouts of a model on maps that it never saw.
-
-Starts and goals are random, maps are generated or those of benchmarks. Costs are compared with the
-exact optimum, times with those of scipy's Dijkstra.
-"""
+"""Measure greedy rollouts of a model on maps that it never saw, against scipy's Dijkstra."""
 
 from __future__ import annotations
 
@@ -11,7 +7,8 @@ import math
 import os
 import sys
 import time
-from collections.abc import Iterable, Iterator, Sequence
+import zipfile
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import groupby
 from operator import itemgetter
@@ -22,53 +19,202 @@ from typing import Final
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import numpy as np
-from benchmark_maps import (
-    COSTS,
-    BenchmarkMap,
-    RequestSettings,
-    find_files,
-    generated_maps,
-    read_maps,
-)
 from numpy.typing import NDArray
-from random_maps import KINDS
+from random_maps import KINDS, generate_map, gradient_costs, inflated_costs
 from tables import table
 from tqdm import tqdm
 
+from ddqn_planner import GridMap, MoveRule, Planner, QField
 from ddqn_planner.cli import HelpFormatter, exit_code
-from ddqn_planner.files import write_atomically, write_csv
-from ddqn_planner.grid import (
-    MOVES,
-    Cell,
-    GridMap,
-    MoveRule,
-    legal_moves,
-    path_cost,
-    shortest_distances,
-)
-from ddqn_planner.planning import Planner, QField
+from ddqn_planner.files import write_atomically
+from ddqn_planner.grid import MOVES, Cell, legal_moves, path_cost, read_map_file, shortest_distances
+from ddqn_planner.grid.arguments import Occupancy
+from ddqn_planner.grid.noise import random_costs, random_requests, unknown_costs
 
-OPTIMAL = 1 + 1e-6
-"""A rollout of at most this ratio to the optimum counts as optimal."""
+INFLATION_RADIUS = 5.0  # cells that the cost of an obstacle reaches
+UNKNOWN_SHARE = 0.2  # of the free cells
+COSTS: Final[dict[str, Callable[[Occupancy, np.random.Generator], NDArray[np.int8] | None]]] = {
+    "none": lambda occupancy, random: None,
+    "random": random_costs,
+    "gradient": gradient_costs,
+    "inflated": lambda occupancy, random: inflated_costs(occupancy, INFLATION_RADIUS),
+    "unknown": lambda occupancy, random: unknown_costs(occupancy, UNKNOWN_SHARE, random),
+}
 
-AGREES = 1e-4
-"""Greatest relative difference from a file's optimum, beside the file's rounding."""
-
-FIRST_GROUP_END = 16
-"""Upper end of the first group of optima; each further group reaches twice as far."""
-
+GOALS = 10  # of a generated map: each needs a Q field and exact distances
+OPTIMAL = 1 + 1e-6  # ratio to the optimum up to which a rollout is optimal
+AGREES = 1e-4  # relative difference from a file's optimum, beside the file's rounding
+SUFFIXES: Final = (".map", ".scen", ".npz", ".yaml", ".yml")  # of MovingAI, MPD and ROS
 COLUMNS: Final = (
-    "maps",
-    "requests",
-    "success",
-    "without action masking",
-    "optimal",
-    "mean",
-    "worst",
-    "illegal",
-    "field ms",
-    "Dijkstra ms",
+    "maps | requests | success | without action masking | optimal | mean | worst | illegal | "
+    "field ms | Dijkstra ms"
 )
+
+
+@dataclass(frozen=True)
+class RequestSettings:
+    """How requests are drawn: so many per map, each with a path under the move rule."""
+
+    move_rule: MoveRule
+    requests: int = 200
+    costs: str = "none"  # a key of COSTS
+    seed: int = 0
+
+    def random(self, name: str) -> np.random.Generator:
+        """Return a map's random generator, which does not depend on the other maps."""
+        return np.random.default_rng([self.seed, *name.encode()])
+
+    def grid(self, occupancy: Occupancy, random: np.random.Generator) -> GridMap:
+        """Return the grid map with its costs."""
+        return GridMap(occupancy, cost=COSTS[self.costs](occupancy, random))
+
+
+@dataclass(frozen=True, eq=False)
+class BenchmarkMap:
+    """A map with requests (start and goal), and the optima that its file gives for this rule."""
+
+    set_name: str
+    name: str
+    grid: GridMap
+    requests: list[tuple[Cell, Cell]]
+    optima: Sequence[float] | None = None
+    precision: float = 0.0  # greatest rounding error of an optimum, cells
+
+
+def generated_maps(
+    kinds: Sequence[str], sizes: Sequence[int], maps: int, settings: RequestSettings
+) -> Iterator[BenchmarkMap]:
+    """Generate a number of square maps per kind and side (cells), and draw requests on each."""
+    for kind in kinds:
+        for size in sizes:
+            for number in range(maps):
+                name = f"{kind}-{size}-{number}"
+                random = settings.random(name)
+                occupancy = generate_map(kind, (size, size), random)
+                yield _with_random_requests(kind, name, occupancy, GOALS, settings, random)
+
+
+def _with_random_requests(
+    set_name: str,
+    name: str,
+    occupancy: Occupancy,
+    goals: int,
+    settings: RequestSettings,
+    random: np.random.Generator,
+) -> BenchmarkMap:
+    """Draw costs and requests for a map; the requests share a number of goals evenly."""
+    grid, rule = settings.grid(occupancy, random), settings.move_rule
+    requests: list[tuple[Cell, Cell]] = []
+    parts = np.array_split(range(settings.requests), goals)
+    drawn = random_requests(occupancy, rule, goals, random)
+    for part, (start, goal) in zip(parts, drawn, strict=True):
+        more = _random_starts(occupancy, goal, rule, max(len(part) - 1, 0), random)
+        requests += [(cell, goal) for cell in [start, *more][: len(part)]]
+    return BenchmarkMap(set_name, name, grid, requests)
+
+
+def _random_starts(
+    occupancy: Occupancy, goal: Cell, move_rule: MoveRule, count: int, random: np.random.Generator
+) -> list[Cell]:
+    """Draw cells, except the goal, from which a path leads to the goal; they may repeat."""
+    connected = GridMap(occupancy).reachable([goal], move_rule)
+    connected[goal[::-1]] = False
+    cells = np.argwhere(connected)
+    return [(x, y) for y, x in random.choice(cells, count).tolist()] if len(cells) else []
+
+
+def find_files(folder: Path) -> list[Path]:
+    """Return the benchmark files of a folder and its subfolders; a ValueError without a map."""
+    files = sorted(p for p in folder.rglob("*") if p.suffix.lower() in SUFFIXES and p.is_file())
+    if all(path.suffix.lower() == ".scen" for path in files):
+        raise ValueError(
+            f"{folder}: found no MovingAI map (.map), MPD file (.npz) or ROS map (.yaml) in this "
+            "folder; check the path"
+        )
+    return files
+
+
+def read_maps(files: Sequence[Path], settings: RequestSettings) -> Iterator[BenchmarkMap]:
+    """Read benchmark maps; report on stderr which files cannot be read, and continue."""
+    suffix_of = {path: path.suffix.lower() for path in files}
+    scenarios = {p.stem.removesuffix(".map"): p for p in files if suffix_of[p] == ".scen"}
+    for path, suffix in suffix_of.items():
+        try:
+            if suffix == ".npz":
+                yield from _mpd_maps(path, settings)
+            elif suffix == ".map" and path.stem in scenarios:
+                yield _scenario_map(path, scenarios[path.stem], settings)
+            elif suffix != ".scen":
+                name = f"{'movingai' if suffix == '.map' else 'ros'} {path.stem}"
+                occupancy, random = read_map_file(path).grid().occupancy, settings.random(path.stem)
+                goals = settings.requests
+                yield _with_random_requests(name, str(path), occupancy, goals, settings, random)
+        except (OSError, ValueError) as error:
+            known = "" if str(path) in str(error) else f"{path}: "
+            tqdm.write(f"skipped: {known}{error}", file=sys.stderr)
+
+
+def _scenario_map(path: Path, scenario: Path, settings: RequestSettings) -> BenchmarkMap:
+    """Read a MovingAI map, with requests of its scenario file: short and long paths alike."""
+    random, rule = settings.random(path.stem), settings.move_rule
+    grid = settings.grid(read_map_file(path).grid().occupancy, random)
+    labels, lines, decimals = grid.labels(rule), [], 0
+    for line in scenario.read_text(errors="replace").splitlines():
+        if not line.strip() or line.startswith("version"):
+            continue
+        try:
+            *sizes_and_ends, optimum = line.split()[-7:]
+            width, height, x, y, goal_x, goal_y = map(int, sizes_and_ends)
+            start, goal = (x, y), (goal_x, goal_y)
+            lines.append((start, goal, float(optimum)))
+        except ValueError:
+            words = "width, height, start x and y, goal x and y, optimal length"
+            raise ValueError(f"{scenario}: a line is {line!r}; give {words} at its end") from None
+        fits = (height, width) == labels.shape and grid.is_free(start) and grid.is_free(goal)
+        if not fits or labels[start[::-1]] != labels[goal[::-1]]:
+            raise ValueError(f"{scenario}: no path joins {start} and {goal} on this map")
+        decimals = max(decimals, len(optimum.partition(".")[2]))
+    if not lines:
+        raise ValueError(f"{scenario}: has no requests; give a file with some")
+    lines.sort(key=itemgetter(2))
+    # One from each of as many equal parts as requests.
+    count = min(settings.requests, len(lines))
+    edges = np.arange(count + 1) * len(lines) // count
+    drawn = [lines[index] for index in random.integers(edges[:-1], edges[1:]).tolist()]
+    requests = [(start, goal) for start, goal, _ in drawn]
+    known = rule is MoveRule.ROBOT_SAFE and grid.cost is None
+    optima = [optimum for _, _, optimum in drawn] if known else None
+    name = f"movingai {path.stem}"
+    return BenchmarkMap(name, str(path), grid, requests, optima, 0.5 * 10.0**-decimals)
+
+
+def _mpd_maps(path: Path, settings: RequestSettings) -> Iterator[BenchmarkMap]:
+    """Read the maps of an MPD file. Its optima count every move as 1, and corners may be cut."""
+    try:
+        if not zipfile.is_zipfile(path):  # NumPy would suggest to unpickle it
+            raise ValueError("it is no .npz file")
+        with np.load(path, allow_pickle=False) as arrays:
+            free, goals, distances = (
+                arrays[name].reshape(len(arrays[name]), *arrays[name].shape[-2:])
+                for name in ("arr_8", "arr_9", "arr_11")
+            )
+        if not free.shape == goals.shape == distances.shape:
+            raise ValueError("shapes differ")
+    except Exception as error:  # broken bytes make NumPy and zipfile raise many kinds of errors
+        raise ValueError(
+            f"{path}: cannot be read ({error}); give the test maps, their goals and minus the "
+            "number of moves in the arrays arr_8, arr_9 and arr_11"
+        ) from error
+    known = settings.move_rule is MoveRule.UNIT and settings.costs == "none"
+    for number, occupancy in enumerate(free == 0):
+        random = settings.random(f"{path.stem}-{number}")
+        goal_y, goal_x = np.unravel_index(goals[number].argmax(), occupancy.shape)
+        goal = int(goal_x), int(goal_y)
+        starts = _random_starts(occupancy, goal, settings.move_rule, settings.requests, random)
+        requests = [(start, goal) for start in starts]
+        optima = [-float(distances[number, y, x]) for x, y in starts] if known else None
+        grid = settings.grid(occupancy, random)
+        yield BenchmarkMap(f"mpd {path.stem}", str(number), grid, requests, optima)
 
 
 @dataclass(frozen=True)
@@ -78,19 +224,13 @@ class Rollout:
     set_name: str
     map_name: str
     size: str
-    optimum: float
-    """Exact cost of the best path; without costs its length in cells."""
-    agrees: bool | None
-    """Whether the benchmark's file gives the same optimum; None if it gives none."""
-    ratio: float
-    """Cost of the rollout over the optimum; infinite if it does not reach the goal."""
-    unmasked: bool
-    """Whether the rollout without action masking reaches the goal too."""
-    illegal: int
-    """Number of illegal moves."""
-    field_ms: float
+    optimum: float  # exact cost of the best path; without costs its length in cells
+    agrees: bool | None  # whether the benchmark's file says the same, if it says anything
+    ratio: float  # cost of the rollout over the optimum; infinite if it misses the goal
+    unmasked: bool  # whether the rollout without action masking reaches the goal too
+    illegal: int  # number of illegal moves
+    field_ms: float  # see `compare_with_dijkstra`
     dijkstra_ms: float
-    """See `compare_with_dijkstra`; requests with the same goal share both times."""
 
 
 def measure(
@@ -98,57 +238,48 @@ def measure(
 ) -> Iterator[Rollout]:
     """Make a rollout for every request of every map; a ValueError if the model has another size."""
     warm = False
-    for benchmark_map in maps:
-        grid, requests = benchmark_map.grid, benchmark_map.requests
+    for drawn in maps:
+        grid, requests = drawn.grid, drawn.requests
         legal = legal_moves(grid.occupancy, move_rule)
-        given = benchmark_map.optima or [math.nan] * len(requests)
+        given = drawn.optima or [math.nan] * len(requests)
         cases = [(goal, start, o) for (start, goal), o in zip(requests, given, strict=True)]
         for goal, of_goal in groupby(sorted(cases, key=itemgetter(0)), key=itemgetter(0)):
             if not warm:  # the first field of a process also loads compiled code
                 compare_with_dijkstra(planner, grid, goal, move_rule)
                 warm = True
-            field, field_ms, optima, dijkstra_ms = compare_with_dijkstra(
-                planner, grid, goal, move_rule
-            )
+            field, optima, *times = compare_with_dijkstra(planner, grid, goal, move_rule)
             unmasked = field.unmasked()
-            for _, start, given_optimum in of_goal:
+            for _, start, told in of_goal:
                 cells = field.rollout(start).cells
                 arrived = cells[:1] == (start,) and cells[-1:] == (goal,)
                 cost = path_cost(cells, grid.cost_multiplier, move_rule) if arrived else math.inf
-                optimum = float(optima[start[1], start[0]])
-                agrees = math.isclose(
-                    given_optimum, optimum, rel_tol=AGREES, abs_tol=benchmark_map.precision
-                )
+                optimum = float(optima[start[::-1]])
+                agrees = math.isclose(told, optimum, rel_tol=AGREES, abs_tol=drawn.precision)
                 yield Rollout(
-                    benchmark_map.set_name,
-                    benchmark_map.name,
+                    drawn.set_name,
+                    drawn.name,
                     f"{grid.width}x{grid.height}",
                     optimum,
-                    None if math.isnan(given_optimum) else agrees,
+                    None if math.isnan(told) else agrees,
                     cost / optimum if start != goal else 1.0,
                     bool(unmasked.rollout(start).cells),
                     illegal_moves(cells, legal),
-                    field_ms,
-                    dijkstra_ms,
+                    *times,
                 )
 
 
 def compare_with_dijkstra(
     planner: Planner, grid: GridMap, goal: Cell, move_rule: MoveRule
-) -> tuple[QField, float, NDArray[np.float64], float]:
-    """Return the Q field of a goal, its time, the exact distances (H, W), and their time, ms.
-
-    The field's time includes its policy, the distances' time the graph that scipy needs: from
-    either of them the path of any start can be read.
-    """
+) -> tuple[QField, NDArray[np.float64], float, float]:
+    """Return a goal's Q field and exact distances (H, W), and the times of both, milliseconds."""
     began = time.perf_counter()
     # A new planner, as one that knows the goal would look the field up.
     field = Planner(planner.network, planner.metadata).q_field(grid, goal, move_rule)
-    field.policy  # noqa: B018
+    field.policy  # noqa: B018  # from it, as from the distances, the path of any start can be read
     middle = time.perf_counter()
-    distances = shortest_distances(grid, goal, move_rule)
+    distances = shortest_distances(grid, goal, move_rule)  # with the graph that scipy needs
     ended = time.perf_counter()
-    return field, 1e3 * (middle - began), distances, 1e3 * (ended - middle)
+    return field, distances, 1e3 * (middle - began), 1e3 * (ended - middle)
 
 
 def illegal_moves(cells: Sequence[Cell], legal: NDArray[np.bool_]) -> int:
@@ -159,49 +290,19 @@ def illegal_moves(cells: Sequence[Cell], legal: NDArray[np.bool_]) -> int:
     return int(np.count_nonzero(~(is_action & legal[:, y, x].T).any(axis=1)))
 
 
-def summarise(rollouts: Sequence[Rollout]) -> tuple[list[list[str]], list[list[str]]]:
-    """Return rows by set and size, and rows by optimum, of which the last is of all.
-
-    The groups of the optimum are 0-16, 16-32, 32-64 and so on, the upper end excluded.
-    """
+def markdown(rollouts: Sequence[Rollout]) -> str:
+    """Return the report: a table by set and size, and one by optimum: 0-16, 16-32, and so on."""
     by_set: dict[tuple[str, str], list[Rollout]] = {}
     by_optimum: dict[str, list[Rollout]] = {}
     for rollout in rollouts:
         by_set.setdefault((rollout.set_name, rollout.size), []).append(rollout)
     for rollout in sorted(rollouts, key=lambda rollout: rollout.optimum):
-        doublings = max(0, math.frexp(rollout.optimum / FIRST_GROUP_END)[1])
-        upper = FIRST_GROUP_END * 2**doublings
-        group = f"{upper // 2 if doublings else 0}-{upper}"
+        upper = max(16, 2 ** math.frexp(rollout.optimum)[1])
+        group = f"{upper // 2 if upper > 16 else 0}-{upper}"
         by_optimum.setdefault(group, []).append(rollout)
     by_optimum["all"] = [*rollouts]
-    return (
-        [[*names, *_row(members)] for names, members in by_set.items()],
-        [[name, *_row(members)] for name, members in by_optimum.items()],
-    )
-
-
-def _row(rollouts: Sequence[Rollout]) -> list[str]:
-    """Return counts of requests, ratios of the solved ones (nan if none), and median times."""
-    requests = len(rollouts)
-    ratios = np.array([rollout.ratio for rollout in rollouts])
-    solved = ratios[np.isfinite(ratios)]
-    return [
-        str(len({(rollout.set_name, rollout.size, rollout.map_name) for rollout in rollouts})),
-        str(requests),
-        f"{len(solved)}/{requests}",
-        f"{sum(rollout.unmasked for rollout in rollouts)}/{requests}",
-        f"{np.count_nonzero(ratios <= OPTIMAL)}/{requests}",
-        f"{solved.mean() if len(solved) else math.nan:.4f}",
-        f"{solved.max() if len(solved) else math.nan:.4f}",
-        str(sum(rollout.illegal for rollout in rollouts)),
-        f"{np.median([rollout.field_ms for rollout in rollouts]):.2f}",
-        f"{np.median([rollout.dijkstra_ms for rollout in rollouts]):.2f}",
-    ]
-
-
-def markdown(rollouts: Sequence[Rollout]) -> str:
-    """Return the report: a table by set and size, and one by optimum."""
-    sets, optima = summarise(rollouts)
+    sets = [[*names, *_row(members)] for names, members in by_set.items()]
+    optima = [[name, *_row(members)] for name, members in by_optimum.items()]
     text = (
         "Every request has a path. Without action masking: solved too by a rollout that may choose "
         "illegal moves, which end it. Optimal, mean, worst: cost of the rollout over that of the "
@@ -209,8 +310,27 @@ def markdown(rollouts: Sequence[Rollout]) -> str:
     )
     if given := [rollout.agrees for rollout in rollouts if rollout.agrees is not None]:
         text += f"Optima given by files: the oracle agrees with {sum(given)}/{len(given)}.\n"
-    by_set = table(["set", "size", *COLUMNS], sets)
-    return f"{text}\n{by_set}\n\n{table(['optimum', *COLUMNS], optima)}\n"
+    tables = table(f"set | size | {COLUMNS}", sets), table(f"optimum | {COLUMNS}", optima)
+    return "\n\n".join((text.rstrip(), *tables)) + "\n"
+
+
+def _row(rollouts: Sequence[Rollout]) -> list[object]:
+    """Return counts of requests, ratios of the solved ones (nan if none), and median times."""
+    requests = len(rollouts)
+    ratios = np.array([rollout.ratio for rollout in rollouts])
+    solved = ratios[np.isfinite(ratios)]
+    return [
+        len({(rollout.set_name, rollout.size, rollout.map_name) for rollout in rollouts}),
+        requests,
+        f"{len(solved)}/{requests}",
+        f"{sum(rollout.unmasked for rollout in rollouts)}/{requests}",
+        f"{np.count_nonzero(ratios <= OPTIMAL)}/{requests}",
+        f"{solved.mean() if len(solved) else math.nan:.4f}",
+        f"{solved.max() if len(solved) else math.nan:.4f}",
+        sum(rollout.illegal for rollout in rollouts),
+        f"{np.median([rollout.field_ms for rollout in rollouts]):.2f}",
+        f"{np.median([rollout.dijkstra_ms for rollout in rollouts]):.2f}",
+    ]
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -230,17 +350,16 @@ def main(arguments: Sequence[str] | None = None) -> int:
     add("--requests", type=int, default=200, metavar="N", help="requests per map")
     add("--costs", choices=COSTS, default="none", help="costs of free cells")
     add("--seed", type=int, default=0, help="seed of maps and requests")
-    add("--out", type=Path, metavar="FILE", help="a .md or .csv file for the tables")
+    add("--out", type=Path, metavar="FILE", help="a file for the tables, as Markdown")
     options = parser.parse_args(arguments)
     return exit_code(parser.prog, lambda: run(options))
 
 
 def run(options: argparse.Namespace) -> int:
     """Run the program with its options; return the exit code."""
-    if options.maps < 1:
-        raise ValueError(f"--maps is {options.maps}; give at least 1")
-    if options.out and options.out.suffix.lower() not in (".csv", ".md"):
-        raise ValueError(f"--out is {options.out}; give a file that ends in .csv or .md")
+    for name, least in (("maps", 1), ("requests", 1), ("seed", 0)):
+        if getattr(options, name) < least:
+            raise ValueError(f"--{name} is {getattr(options, name)}; give at least {least}")
     rule = MoveRule(options.move_rule)
     settings = RequestSettings(rule, options.requests, options.costs, options.seed)
     planner = Planner.load(options.model)
@@ -255,6 +374,8 @@ def run(options: argparse.Namespace) -> int:
     except KeyboardInterrupt:
         interrupted = True
         print("interrupted; the tables hold the maps so far", file=sys.stderr)
+    if not rollouts and not interrupted:
+        raise ValueError(f"{options.data}: none of its files has a request; see above")
     if rollouts:
         model = planner.metadata
         text = (
@@ -263,15 +384,8 @@ def run(options: argparse.Namespace) -> int:
             f"{markdown(rollouts)}"
         )
         print(text, end="")
-        if options.out and options.out.suffix.lower() == ".csv":
-            sets, lengths = summarise(rollouts)
-            rows = [[name, size, "all", *cells] for name, size, *cells in sets]
-            rows += [["all", "all", *row] for row in lengths]
-            write_csv(options.out, ["set", "size", "optimum", *COLUMNS], rows)
-        elif options.out:
+        if options.out:
             write_atomically(options.out, text.encode())
-    elif not interrupted:
-        raise ValueError(f"{options.data}: none of its files has a request; see above")
     return 130 if interrupted else 0
 
 

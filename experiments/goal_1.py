@@ -5,32 +5,34 @@ from __future__ import annotations
 import time
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any
+from typing import Any, Final
 
 import matplotlib.pyplot as plt
 import numpy as np
 from figures import draw_curves, draw_map, draw_path, save_figure
 from numpy.typing import NDArray
-from settings import PROFILES, VARIANTS, Settings, optimal_length
 from tables import median_and_range, table
-from trainings import Evaluations, Training
+from trainings import PROFILES, Evaluations, Settings, Training, optimal_length
 
-from ddqn_planner.grid import Cell, MoveRule, path_length, shortest_path
-from ddqn_planner.planning import Planner
+from ddqn_planner import MoveRule, Plan, Planner
+from ddqn_planner.grid import Cell, path_length, shortest_path
 from ddqn_planner.training.environment import Scenario, paper_scenario
 
-TIMES = 50
-"""How often each planner is timed."""
-
-BINS = 50
-"""Intervals of the curves of the average reward."""
+# Plain Double DQN, each improvement alone, and both: what each sets.
+VARIANTS: Final[dict[str, dict[str, Any]]] = {
+    "plain": {"p_r": 0.0, "alpha": 0.0, "beta": 0.0},
+    "initialisation": {"alpha": 0.0, "beta": 0.0},
+    "reward": {"p_r": 0.0},
+    "both": {},
+}
+TIMES = 50  # how often each planner is timed
+BINS = 50  # intervals of the curves of the average reward
 
 CONVERGENCE = (
-    "seeds solved (without action masking)",
-    "steps until solved for good",
-    "steps until shortest for good",
-    "length",
+    "seeds solved (without action masking) | steps until solved for good | "
+    "steps until shortest for good | length"
 )
+COSTS = "profile | seconds until solved for good | steps/s | replay ratio | planning time, ms"
 
 
 def trainings(settings: Settings, variants: Sequence[str] = ("both",)) -> list[Training]:
@@ -44,7 +46,7 @@ def trainings(settings: Settings, variants: Sequence[str] = ("both",)) -> list[T
 
 
 def ablation_trainings(settings: Settings) -> list[Training]:
-    """Return the trainings of every variant: plain Double DQN, each improvement alone, both."""
+    """Return the trainings of every variant."""
     return trainings(settings, tuple(VARIANTS))
 
 
@@ -52,12 +54,11 @@ def convergence_row(runs: Sequence[Evaluations]) -> list[str]:
     """Return the cells of `CONVERGENCE` for the evaluations of each seed."""
     optimum, ends = optimal_length(paper_scenario()), [run[-1] for run in runs]
     solved, unmasked = (sum(int(end[key]) for end in ends) for key in ("solved", "solved_unmasked"))
+    shortest = [at_first_kept(run, "step", run["length"] <= optimum + 1e-6) for run in runs]
     return [
         f"{solved} ({unmasked}) of {len(ends)}",
         median_and_range([at_first_kept(run, "step", run["solved"] == 1) for run in runs]),
-        median_and_range(
-            [at_first_kept(run, "step", run["length"] <= optimum + 1e-6) for run in runs]
-        ),
+        median_and_range(shortest),
         median_and_range([end["length"] for end in ends if end["solved"]], 2),
     ]
 
@@ -74,22 +75,17 @@ def report(settings: Settings) -> str:
     paths: dict[str, Sequence[Cell]] = {}
     for profile, parameters in PROFILES.items():
         runs = settings.evaluations(f"{profile}/both")
-        rows.append([profile, *convergence_row(runs)])
         planned = [timed_plan(p, scenario) for p in settings.planners(f"{profile}/both")]
-        seconds = [at_first_kept(run, "seconds", run["solved"] == 1) for run in runs]
         ends = [run[-1] for run in runs]
+        seconds = [at_first_kept(run, "seconds", run["solved"] == 1) for run in runs]
+        rates = [end["step"] / end["seconds"] for end in ends]
         replayed = [parameters.batch_size * end["updates"] / end["step"] for end in ends]
-        costs.append(
-            [
-                profile,
-                median_and_range(seconds, 1),
-                median_and_range([end["step"] / end["seconds"] for end in ends]),
-                median_and_range(replayed, 1),
-                median_and_range([milliseconds for _, milliseconds in planned], 2),
-            ]
-        )
-        by_length = sorted((cells for cells, _ in planned), key=lambda c: path_length(c) or np.inf)
-        paths[f"{profile}, median seed"] = by_length[len(planned) // 2]
+        milliseconds = [took for _, took in planned]
+        columns = ((seconds, 1), (rates, 0), (replayed, 1), (milliseconds, 2))
+        rows.append([profile, *convergence_row(runs)])
+        costs.append([profile, *(median_and_range(*column) for column in columns)])
+        by_length = sorted((plan for plan, _ in planned), key=lambda p: p.length or np.inf)
+        paths[f"{profile}, median seed"] = by_length[len(planned) // 2].cells
     for rule in (MoveRule.CORNER_CUTTING, MoveRule.ROBOT_SAFE):
         shortest = shortest_path(scenario.grid, scenario.start, scenario.goal, rule)
         paths[f"shortest, {rule.value}"] = shortest
@@ -98,35 +94,29 @@ def report(settings: Settings) -> str:
         length = f"{path_length(cells):.2f} cells" if cells else "trapped"
         draw_map(axes, scenario, f"{planner}: {length}")
         draw_path(axes, cells, number, planner)
-    of_costs = ("seconds until solved for good", "steps/s", "replay ratio", "planning time, ms")
-    return "\n\n".join(
-        [
-            table(["profile", *CONVERGENCE], rows),
-            table(["profile", *of_costs], costs),
-            save_figure(figure, settings.out / "goal_1.png", "Fig. 7: the paths of goal i"),
-        ]
-    )
+    drawn = save_figure(figure, settings.out / "goal_1.png", "Fig. 7: the paths of goal i")
+    return f"{table(f'profile | {CONVERGENCE}', rows)}\n\n{table(COSTS, costs)}\n\n{drawn}"
 
 
-def timed_plan(planner: Planner, scenario: Scenario) -> tuple[Sequence[Cell], float]:
-    """Return a planner's path, and the median of its times with a new field, milliseconds."""
+def timed_plan(planner: Planner, scenario: Scenario) -> tuple[Plan, float]:
+    """Return a planner's plan, and the median of its times with a new field, milliseconds."""
     times = []
     for _ in range(TIMES):
         began = time.perf_counter()
         fresh = Planner(planner.network, planner.metadata)  # it has no Q field yet
-        cells = fresh.plan(scenario.grid, scenario.start, scenario.goal).cells
+        plan = fresh.plan(scenario.grid, scenario.start, scenario.goal)
         times.append(1e3 * (time.perf_counter() - began))
-    return cells, float(np.median(times))
+    return plan, float(np.median(times))
 
 
 def ablation_report(settings: Settings) -> str:
     """Return the table of the ablation, and write its curves."""
     rows = []
     figure, panels = plt.subplots(2, len(PROFILES), figsize=(13, 7.5), layout="constrained")
-    for (upper, lower), (profile, parameters) in zip(panels.T, PROFILES.items(), strict=True):
+    for (upper, lower), profile in zip(panels.T, PROFILES, strict=True):
         runs = {variant: settings.evaluations(f"{profile}/{variant}") for variant in VARIANTS}
         rows += [[profile, variant, *convergence_row(of)] for variant, of in runs.items()]
-        edges = np.linspace(0, settings.shorten(parameters).steps, BINS + 1)
+        edges = np.linspace(0, runs["both"][0]["step"][-1], BINS + 1)
         rewards = {v: _rewards(settings, f"{profile}/{v}", edges) for v in VARIANTS}
         middle = (edges[:-1] + edges[1:]) / 2
         draw_curves(upper, middle, rewards, "environment steps", "average reward per step")
@@ -136,7 +126,7 @@ def ablation_report(settings: Settings) -> str:
     figure.legend(handles, labels, loc="outside lower center", ncols=len(VARIANTS))
     caption = "Fig. 6: average reward per step of an episode, and solved seeds"
     drawn = save_figure(figure, settings.out / "ablation.png", caption)
-    return f"{table(['profile', 'variant', *CONVERGENCE], rows)}\n\n{drawn}"
+    return f"{table(f'profile | variant | {CONVERGENCE}', rows)}\n\n{drawn}"
 
 
 def draw_shares(axes: Any, runs: dict[str, list[Evaluations]]) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any
+from typing import Any, Final
 
 import goal_1
 import matplotlib.pyplot as plt
@@ -13,34 +13,31 @@ import torch
 from figures import draw_curves, draw_map, save_figure
 from matplotlib.colors import BoundaryNorm, ListedColormap
 from numpy.typing import NDArray
-from settings import PROFILES, START_DEAD_END, Settings
 from tables import mean_and_worst, median_and_range, table
-from trainings import MOVE_RULE, Training
+from trainings import MOVE_RULE, PROFILES, Settings, Training
 
-from ddqn_planner.grid import MOVES, legal_moves
-from ddqn_planner.planning import Planner, QField
+from ddqn_planner import Planner, QField
+from ddqn_planner.grid import MOVES, Cell, legal_moves
 from ddqn_planner.training.environment import GridVectorEnvironment, Scenario, paper_scenario
 from ddqn_planner.training.evaluation import length_ratios
 from ddqn_planner.training.networks import PropagationEncoder, PropagationModule
 
-COLUMNS = (
-    "profile",
-    "solved, of 286",
-    "without action masking",
-    "of the dilemma's 10",
-    "mean length / optimum",
-    "worst",
+# The paper's dilemma on its rebuilt map: the start and ten more cells.
+START_DEAD_END: Final[frozenset[Cell]] = frozenset(
+    {(6, 6), (4, 6), (4, 7), (4, 8), (5, 6), (5, 7), (5, 8), (6, 7), (6, 8), (7, 6), (7, 7)}
 )
-
-TARGETS = {"Double DQN": "double_dqn", "DQN": "dqn", "printed": "printed"}
-"""The paper's equation, as it is printed, leaves θ⁻ out."""
-
+# The folder and the target of each. The paper's equation, as it is printed, leaves θ⁻ out.
+TARGETS = {
+    "Double DQN": ("paper/both", "double_dqn"),  # the trainings of goal i
+    "DQN": ("paper/target_dqn", "dqn"),
+    "printed": ("paper/target_printed", "printed"),
+}
+COLUMNS = (
+    "profile | solved, of 286 | without action masking | of the dilemma's 10 | "
+    "mean length / optimum | worst"
+)
 TARGET_COLUMNS = (
-    "target",
-    "seeds solved from the start",
-    "starts solved",
-    "over-estimation, last 10 %",
-    "worst",
+    "target | seeds solved from the start | starts solved | over-estimation, last 10 % | worst"
 )
 
 
@@ -52,8 +49,7 @@ def trainings(settings: Settings) -> list[Training]:
 def free_starts(scenario: Scenario) -> NDArray[np.bool_]:
     """Return the free cells except start and end: (H, W) bool, the paper's 286."""
     starts = ~scenario.grid.occupancy
-    for x, y in (scenario.start, scenario.goal):
-        starts[y, x] = False
+    starts[scenario.start[::-1]] = starts[scenario.goal[::-1]] = False
     return starts
 
 
@@ -74,25 +70,27 @@ def trained_field(planner: Planner, scenario: Scenario) -> QField:
     return QField(scenario.goal, q_AHW, legal_moves(scenario.grid.occupancy, MOVE_RULE))
 
 
+def _fields(settings: Settings, name: str) -> list[QField]:
+    """Return each seed's Q field of the paper's map."""
+    scenario = paper_scenario()
+    return [p.q_field(scenario.grid, scenario.goal) for p in settings.planners(name)]
+
+
+def _ratios(fields: Sequence[QField]) -> list[NDArray[np.float64]]:
+    return [length_ratios(field, paper_scenario().grid, MOVE_RULE) for field in fields]
+
+
 def report(settings: Settings) -> str:
     """Return the table of goal ii, and write its figure."""
     scenario, starts = paper_scenario(), free_starts(paper_scenario())
-    fields = {
-        profile: [
-            p.q_field(scenario.grid, scenario.goal) for p in settings.planners(f"{profile}/both")
-        ]
-        for profile in PROFILES
-    }
+    fields = {profile: _fields(settings, f"{profile}/both") for profile in PROFILES}
     fields["propagation, Q as trained"] = [
         trained_field(planner, scenario) for planner in settings.planners("propagation/both")
     ]
     x, y = np.transpose(sorted(START_DEAD_END - {scenario.start}))
     rows, ratios = [], {}
     for label, of_seeds in fields.items():
-        masked, unmasked = (
-            [length_ratios(field, scenario.grid, MOVE_RULE) for field in some]
-            for some in (of_seeds, [field.unmasked() for field in of_seeds])
-        )
+        masked, unmasked = _ratios(of_seeds), _ratios([field.unmasked() for field in of_seeds])
         solved = count_solved(masked, starts), count_solved(unmasked, starts)
         lengths = mean_and_worst([ratio[starts & np.isfinite(ratio)] for ratio in masked])
         rows.append([label, *solved, count_solved(masked, (y, x)), *lengths])
@@ -126,40 +124,29 @@ def _draw(
     return save_figure(figure, settings.out / "goal_2.png", "Fig. 8: starts by outcome")
 
 
-def _target_folder(label: str) -> str:
-    # Double DQN's trainings are those of goal i.
-    return "paper/both" if label == "Double DQN" else f"paper/target_{TARGETS[label]}"
-
-
 def target_trainings(settings: Settings) -> list[Training]:
     """Return the trainings of the profile paper with each target."""
-    paper = PROFILES["paper"]
     parameters_of = {
-        _target_folder(label): replace(paper, target=TARGETS[label]) for label in TARGETS
+        folder: replace(PROFILES["paper"], target=target) for folder, target in TARGETS.values()
     }
     return settings.trainings(parameters_of, [paper_scenario()])
 
 
 def target_report(settings: Settings) -> str:
     """Return the table of the targets, and write their figure."""
-    scenario = paper_scenario()
-    starts, rows = free_starts(scenario), []
-    runs = {label: settings.evaluations(_target_folder(label)) for label in TARGETS}
+    starts, rows = free_starts(paper_scenario()), []
+    runs = {label: settings.evaluations(folder) for label, (folder, _) in TARGETS.items()}
     estimates = {label: [run["overestimation"] for run in of] for label, of in runs.items()}
     for label, errors in estimates.items():
-        planners = settings.planners(_target_folder(label))
-        fields = [planner.q_field(scenario.grid, scenario.goal) for planner in planners]
-        ratios = [length_ratios(field, scenario.grid, MOVE_RULE) for field in fields]
         late = [float(error[-max(len(error) // 10, 1) :].mean()) for error in errors]
-        rows.append(
-            [
-                label,
-                f"{sum(int(run['solved'][-1]) for run in runs[label])} of {settings.seeds}",
-                count_solved(ratios, starts),
-                median_and_range(late, 2),
-                median_and_range([error.max() for error in errors], 2),
-            ]
-        )
+        row = [
+            label,
+            f"{sum(int(run['solved'][-1]) for run in runs[label])} of {settings.seeds}",
+            count_solved(_ratios(_fields(settings, TARGETS[label][0])), starts),
+            median_and_range(late, 2),
+            median_and_range([error.max() for error in errors], 2),
+        ]
+        rows.append(row)
     figure, (left, right) = plt.subplots(1, 2, figsize=(13, 4), layout="constrained")
     steps = runs["Double DQN"][0]["step"]
     draw_curves(left, steps, estimates, "environment steps", "mean of max Q - V*")

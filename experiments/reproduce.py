@@ -1,7 +1,4 @@
-"""Train and measure the paper's experiments with many seeds.
-
-Writes tables, figures and a report. Run the same command again to resume.
-"""
+"""Train and measure the paper's experiments with many seeds. Run the same command to resume."""
 
 from __future__ import annotations
 
@@ -20,13 +17,13 @@ import goal_1
 import goal_2
 import goal_3
 import torch
-from settings import HIDDEN_UNITS, Settings
 from tables import write_report
-from trainings import Training, in_parallel, make_folder, parser_of, train
+from trainings import HIDDEN_UNITS, Settings, Training, in_parallel, make_folder, parser_of, train
 
 from ddqn_planner.cli import exit_code
 from ddqn_planner.grid import Noise
 
+# The title of each, its trainings, and the report of their results.
 EXPERIMENTS: Final[
     dict[str, tuple[str, Callable[[Settings], list[Training]], Callable[[Settings], str]]]
 ] = {
@@ -37,7 +34,6 @@ EXPERIMENTS: Final[
     "targets": ("What the printed target does", goal_2.target_trainings, goal_2.target_report),
     "any-map": ("The model for any map", any_map.trainings, any_map.report),
 }
-"""Each has a title, its trainings, and the report of their results."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -54,10 +50,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def reproduce(options: argparse.Namespace) -> int:
-    """Run experiments, and write ``report.md`` with its tables and figures.
-
-    Trainings that an earlier call finished in the same folder are not repeated.
-    """
+    """Run experiments, and write ``report.md`` with its tables and figures."""
     torch.set_num_threads(1)  # so that planning times are those of one thread
     settings = Settings(
         make_folder(options),

@@ -386,7 +386,7 @@ def main(arguments: Sequence[str]) -> int:
         for name, sampled in samples.items()
         for warm, last, grown in [growth(sampled)]
     ]
-    print(table(["node", "samples", "MB at start", "warm", "at end", "growth"], rows))
+    print(table("node | samples | MB at start | warm | at end | growth", rows))
     grows = any(growth(sampled)[2] > MAX_GROWTH for sampled in samples.values())
     return int(bool(work.lost or robot.lost or robot.stale or grows))
 

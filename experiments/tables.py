@@ -12,42 +12,40 @@ from numpy.typing import NDArray
 
 from ddqn_planner.files import write_atomically
 
+FIGURE = re.compile(r"\]\((.+\.png)\)")
 
-def table(header: Sequence[str], rows: Sequence[Sequence[object]]) -> str:
-    """Return a Markdown table."""
-    lines = [header, ["---"] * len(header), *rows]
+
+def table(header: str, rows: Sequence[Sequence[object]]) -> str:
+    """Return a Markdown table; " | " divides the names in its header."""
+    names = header.split(" | ")
+    lines = [names, ["---"] * len(names), *rows]
     return "\n".join("| " + " | ".join(map(str, line)) + " |" for line in lines)
 
 
 def write_report(out: Path, sections: Mapping[str, str], page: Path | None = None) -> str:
-    """Write the sections with their titles to ``report.md``, and return its text.
+    """Write ``report.md`` and return it; a page gets the sections that it has marks for.
 
-    A page of the docs gets each section between its marks ``<!-- title -->`` and ``<!-- end -->``,
-    and the figures into a folder of its name in ``images``.
+    The marks are ``<!-- title -->`` and ``<!-- end -->``; figures go to ``images/PAGE``.
     """
     text = "\n".join(f"## {title}\n\n{section}\n" for title, section in sections.items())
     write_atomically(out / "report.md", text.encode())
     if page is not None:
-        content = page.read_text(encoding="utf-8")
         images = page.parent / "images" / page.stem
         images.mkdir(parents=True, exist_ok=True)
-        for figure in re.findall(r"\]\((.+\.png)\)", text):
+        for figure in FIGURE.findall(text):
             shutil.copyfile(out / figure, images / figure)
+        content = page.read_text(encoding="utf-8")
         for title, section in sections.items():
-            shown = re.sub(r"\]\((.+\.png)\)", rf"](images/{page.stem}/\1)", section)
+            shown = FIGURE.sub(rf"](images/{page.stem}/\1)", section)
             before, mark, rest = content.partition(f"<!-- {title} -->\n")
             if mark:
-                end = rest.index("<!-- end -->")
-                content = f"{before}{mark}{shown}\n\n{rest[end:]}"
+                content = f"{before}{mark}{shown}\n\n{rest[rest.index('<!-- end -->') :]}"
         write_atomically(page, content.encode())
     return text
 
 
 def median_and_range(values: Sequence[float], digits: int = 0) -> str:
-    """Return the median, least and greatest value of the seeds: ``"3 (1 to 4)"``.
-
-    Infinity means never; NaN is left out.
-    """
+    """Return median, least and greatest as "3 (1 to 4)"; infinity is "never", NaN is left out."""
     values = [value for value in values if not np.isnan(value)]
     if not values:
         return "none"
@@ -59,12 +57,9 @@ def median_and_range(values: Sequence[float], digits: int = 0) -> str:
 
 
 def mean_and_worst(ratios: Sequence[Sequence[float] | NDArray[np.float64]]) -> list[str]:
-    """Return two cells: the mean and the greatest ratio of each seed; a seed may have none."""
+    """Return two cells: the mean and the greatest ratio of each seed that has one."""
     some = [of_seed for of_seed in ratios if len(of_seed)]
-    return [
-        median_and_range([float(function(of_seed)) for of_seed in some], 4)
-        for function in (np.mean, np.max)
-    ]
+    return [median_and_range([float(f(of)) for of in some], 4) for f in (np.mean, np.max)]
 
 
 def report(figure: str, value: float, unit: str, bound: float, at_most: bool = True) -> bool:

@@ -1,12 +1,12 @@
-"""Trainings with regular evaluations: many in parallel, each in a folder of its own."""
+"""The paper's trainings: two profiles, regular evaluations, many in parallel, a folder for each."""
 
 from __future__ import annotations
 
 import argparse
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import closing
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final, TypeAlias
 
@@ -14,12 +14,11 @@ import joblib
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch import Tensor
 from tqdm import tqdm
 
 from ddqn_planner.cli import HelpFormatter
 from ddqn_planner.files import write_csv
-from ddqn_planner.grid import LENGTHS, MoveRule, legal_moves, neighbours, shortest_distances
+from ddqn_planner.grid import MoveRule, Noise, neighbours, shortest_distances
 from ddqn_planner.planning import Plan, Planner
 from ddqn_planner.training.environment import GridVectorEnvironment, Scenario
 from ddqn_planner.training.hyper_parameters import HyperParameters
@@ -27,16 +26,25 @@ from ddqn_planner.training.networks import value_iteration
 from ddqn_planner.training.run import TrainingRun
 from ddqn_planner.training.trainer import Trainer
 
-MOVE_RULE: Final = MoveRule.CORNER_CUTTING
-"""The rule under which the paper's 22.97 is the shortest path (docs/reproduction.md)."""
-
-BACKENDS: Final = ("loky", "ray", "dask", "sequential")
-"""Of joblib: this machine's cores, two kinds of cluster, or one training after the other."""
+MOVE_RULE: Final = MoveRule.CORNER_CUTTING  # by it the paper's 22.97 is the shortest path
+BACKENDS: Final = ("loky", "ray", "dask", "sequential")  # of joblib: this machine, or a cluster
+HIDDEN_UNITS: Final = (0, 128)  # of the paper's network for goal iii; 0 for no hidden layer
+PROFILES: Final[dict[str, HyperParameters]] = {
+    # Its network, observation and Table 1, our choice where it is silent.
+    "paper": HyperParameters(),
+    # The same rewards and initialisation, with another network and fewer steps.
+    "propagation": HyperParameters(
+        network="propagation",
+        filters=64,
+        learning_rate=0.001,
+        batch_size=128,
+        target_interval=100,
+        steps=15_000,
+    ),
+}
 
 Evaluations: TypeAlias = NDArray[Any]
 """A table of evaluations during a training, with the columns of `evaluate_training`."""
-
-SUPERVISED_BATCH, SUPERVISED_LEARNING_RATE = 128, 0.003
 
 
 @dataclass(frozen=True)
@@ -48,6 +56,45 @@ class Training:
     scenarios: tuple[Scenario, ...]
     seed: int
     evaluation_interval: int
+
+
+@dataclass(frozen=True)
+class Settings:
+    """The options of ``reproduce.py``."""
+
+    out: Path  # folder of the trainings, tables, figures and the report
+    seeds: int  # trainings per table row, with the seeds 0, 1, and so on
+    quick: bool = False  # train too briefly to learn anything
+    noise: tuple[Noise, ...] = tuple(Noise)
+    hidden_units: tuple[int, ...] = HIDDEN_UNITS
+    backend: str = "loky"
+
+    def folders(self, name: str) -> list[Path]:
+        """Return the folders of the trainings with a name, one per seed."""
+        return [self.out / "trainings" / name / f"seed_{seed}" for seed in range(self.seeds)]
+
+    def trainings(
+        self,
+        parameters_of: Mapping[str, HyperParameters],
+        scenarios: Sequence[Scenario] | Callable[[int], Sequence[Scenario]],
+        evaluation_interval: int = 250,
+    ) -> list[Training]:
+        """Return one training per name and seed, which may have scenarios of its own."""
+        most, found = 1_000 if self.quick else 10**9, []
+        for name, parameters in parameters_of.items():
+            short = replace(parameters, steps=min(parameters.steps, most))
+            for seed, folder in enumerate(self.folders(name)):
+                drawn = tuple(scenarios(seed) if callable(scenarios) else scenarios)
+                found.append(Training(folder, short, drawn, seed, evaluation_interval))
+        return found
+
+    def evaluations(self, name: str) -> list[Evaluations]:
+        """Return the evaluations of the trainings with a name, one table per seed."""
+        return [read_evaluations(folder) for folder in self.folders(name)]
+
+    def planners(self, name: str, file: str = "model.safetensors") -> list[Planner]:
+        """Load the planners that the trainings with a name produced, one per seed."""
+        return [Planner.load(folder / file) for folder in self.folders(name)]
 
 
 def parser_of(program: str, description: str | None, out: str) -> argparse.ArgumentParser:
@@ -75,10 +122,7 @@ def make_folder(options: argparse.Namespace) -> Path:
 def in_parallel(
     job: Callable[[Any], Any], items: Sequence[Any], backend: str = "loky", unit: str = "training"
 ) -> list[Any]:
-    """Return ``job(item)`` for each item, in order: as many at a time as there are cores.
-
-    The first exception of a job is raised: running jobs are ended, and no others start.
-    """
+    """Return ``job(item)`` for each item, in order; the first exception ends all jobs."""
     if backend == "ray":
         from ray.util.joblib import register_ray
 
@@ -101,15 +145,10 @@ def _in_one_thread(job: Callable[[Any], Any], item: Any) -> Any:
 
 
 def train(training: Training) -> None:
-    """Train and evaluate, or resume an interrupted training.
-
-    The folder gets what `TrainingRun` writes, ``evaluations.csv``, and in ``kept.safetensors`` the
-    last of the networks that solved the most scenarios. Errors are those of `TrainingRun`.
-    """
-    folder = training.folder
-    with closing(
-        TrainingRun(folder, training.scenarios, MOVE_RULE, training.parameters, training.seed)
-    ) as run:
+    """Train and evaluate, or resume; keep the last network that solved the most scenarios, too."""
+    folder, parameters = training.folder, training.parameters
+    run = TrainingRun(folder, training.scenarios, MOVE_RULE, parameters, training.seed)
+    with closing(run):
         trainer = run.trainer
         before = read_evaluations(folder)
         before = before[before["step"] <= trainer.steps]
@@ -130,14 +169,11 @@ def train(training: Training) -> None:
 def evaluate_training(
     trainer: Trainer, optimum: NDArray[np.float32], seconds: float
 ) -> dict[str, float]:
-    """Return figures of the current network's rollouts from the start of each scenario.
-
-    The over-estimation is the mean of max_a Q(s, a) - V*(s) over the free cells of the first
-    scenario, V* the `optimal_value`; NaN for a network whose Q is not the return.
-    """
+    """Return figures of the current network's rollouts from the start of each scenario."""
     planner = trainer.planner()
     plans, unmasked = rollouts(planner, trainer.scenarios)
     lengths = [plan.length for plan in plans if plan.cells]
+    # The mean of max_a Q(s, a) - V*(s) over the free cells, where Q is the return.
     overestimation = np.nan
     if trainer.parameters.network == "paper":
         scenario = trainer.scenarios[0]
@@ -171,6 +207,12 @@ def solved(plans: Sequence[Plan]) -> int:
     return sum(bool(plan.cells) for plan in plans)
 
 
+def optimal_length(scenario: Scenario) -> float:
+    """Return the length of the shortest path from start to goal, cells."""
+    distances = shortest_distances(scenario.grid, scenario.goal, MOVE_RULE)
+    return float(distances[scenario.start[::-1]])
+
+
 def optimal_value(environment: GridVectorEnvironment) -> NDArray[np.float32]:
     """Return V* of the first scenario, exact by value iteration: (C,) float32."""
     legal, parameters = environment.legal[:1], environment.parameters
@@ -194,51 +236,3 @@ def read_evaluations(folder: Path) -> Evaluations:
         return np.empty(0, [("step", np.float64)])
     evaluations: Evaluations = np.genfromtxt(path, delimiter=",", names=True, ndmin=1)
     return evaluations
-
-
-def train_supervised(training: Training) -> None:
-    """Train a network by cross-entropy on the best moves, for as many updates as it has steps.
-
-    This is a yardstick and not a planner: the exact oracle gives the first moves of all shortest
-    paths from every cell of every training map. What the network fails to learn even then is a
-    limit of its architecture, not of how it learns. It writes ``model.safetensors``, and does
-    nothing if that exists.
-    """
-    path = training.folder / "model.safetensors"
-    if path.exists():
-        return
-    path.parent.mkdir(parents=True, exist_ok=True)
-    trainer = Trainer(training.scenarios, MOVE_RULE, training.parameters, training.seed)
-    best_SCA = np.stack([best_moves(scenario) for scenario in training.scenarios])
-    scenario, cell = np.nonzero(best_SCA.any(axis=2))
-    random = np.random.default_rng(training.seed)
-    optimiser = torch.optim.Adam(trainer.network.parameters(), SUPERVISED_LEARNING_RATE)
-    steps = training.parameters.steps
-    decay = torch.optim.lr_scheduler.LinearLR(optimiser, 1.0, 0.05, steps)
-    for _ in range(steps):
-        drawn = random.integers(len(cell), size=SUPERVISED_BATCH)
-        states = trainer.encoder.states(scenario[drawn], cell[drawn])
-        best_BA = torch.from_numpy(best_SCA[scenario[drawn], cell[drawn]])
-        loss = cross_entropy(trainer.network(states), best_BA)
-        optimiser.zero_grad()
-        torch.autograd.backward(loss)
-        optimiser.step()
-        decay.step()
-    trainer.save_model(path)
-
-
-def cross_entropy(q_BA: Tensor, best_BA: Tensor) -> Tensor:
-    """Return the mean of -log of the probability that softmax(Q) gives to the best moves."""
-    best_B = q_BA.masked_fill(~best_BA, -torch.inf).logsumexp(dim=1)
-    return (q_BA.logsumexp(dim=1) - best_B).mean()
-
-
-def best_moves(scenario: Scenario) -> NDArray[np.bool_]:
-    """Return the moves that begin a shortest path: (C, 8) bool, none where there is no path."""
-    occupancy = scenario.grid.occupancy
-    distance = shortest_distances(scenario.grid, scenario.goal, MOVE_RULE).ravel()
-    onward_AC = np.append(distance, np.inf)[neighbours(occupancy.shape)] + LENGTHS[:, None]
-    legal_AC = legal_moves(occupancy, MOVE_RULE).reshape(len(LENGTHS), -1)
-    through_AC = np.where(legal_AC, onward_AC, np.inf)
-    best: NDArray[np.bool_] = (np.isfinite(through_AC) & (through_AC <= distance + 1e-9)).T
-    return best

@@ -22,7 +22,7 @@ from ddqn_planner.nodes.conversions import grid_from_message, grid_from_values
 from ddqn_planner.nodes.report import Outcome, Report, RequestError, seconds
 from ddqn_planner.nodes.runtime import LATCHED, BaseNode, Worker
 from ddqn_planner.planning import Plan
-from ddqn_planner.planning.repair import offset_between
+from ddqn_planner.planning.field import offset_between
 
 try:
     from map_msgs.msg import OccupancyGridUpdate

@@ -7,7 +7,6 @@ import time
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import Any
 
 from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
@@ -42,14 +41,6 @@ class RequestError(ValueError):
     def __init__(self, status: str, reason: str, may_come: bool = False) -> None:
         super().__init__(reason)
         self.status, self.may_come = status, may_come
-
-
-def checked(status: str, function: Any, *arguments: Any) -> Any:
-    """Call a function; its ValueError becomes a `RequestError` with this status."""
-    try:
-        return function(*arguments)
-    except ValueError as error:
-        raise RequestError(status, str(error)) from None
 
 
 @dataclass(frozen=True)

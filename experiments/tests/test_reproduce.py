@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from goal_1 import convergence_row
 from goal_2 import free_starts, trained_field
-from goal_3 import fixed_path, noisy_maps
+from goal_3 import best_moves, fixed_path, noisy_maps, train_supervised
 from networks import random_network
 from PIL import Image
 from reproduce import EXPERIMENTS, main
@@ -22,13 +22,11 @@ from tables import mean_and_worst, median_and_range, table, write_report
 from trainings import (
     MOVE_RULE,
     Training,
-    best_moves,
     evaluate_training,
     in_parallel,
     optimal_value,
     read_evaluations,
     train,
-    train_supervised,
 )
 
 from ddqn_planner.grid import (
@@ -272,7 +270,7 @@ def test_statistics_say_never_for_infinity_and_leave_nan_out() -> None:
 
 def test_a_table_is_markdown_and_a_page_without_marks_stays(tmp_path: Path) -> None:
     expected = "| a | b |\n| --- | --- |\n| 1 | x |"
-    assert table(["a", "b"], [[1, "x"]]) == expected
+    assert table("a | b", [[1, "x"]]) == expected
     page = tmp_path / "page.md"
     page.write_text("nothing")
     assert write_report(tmp_path, {"Title": expected}, page) == f"## Title\n\n{expected}\n"
