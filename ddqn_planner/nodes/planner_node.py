@@ -17,25 +17,22 @@ from rclpy.task import Future
 from std_msgs.msg import Header, String
 
 from ddqn_planner.nodes.conversions import path_message, serialized_path
-from ddqn_planner.nodes.display import FieldDisplay
+from ddqn_planner.nodes.display import LOOK_PERIOD, FieldDisplay
 from ddqn_planner.nodes.lifecycle import ManagedNode
 from ddqn_planner.nodes.map_source import MapSource
-from ddqn_planner.nodes.model_loading import ModelSource, load
 from ddqn_planner.nodes.nav2 import serve_nav2
 from ddqn_planner.nodes.parameters import PLANNER_PARAMETERS
 from ddqn_planner.nodes.poses import Frames, StartSource, check_source
-from ddqn_planner.nodes.report import (
-    NOT_ACTIVE,
-    Outcome,
-    Report,
-    RequestError,
-    begins_on_obstacle,
+from ddqn_planner.nodes.report import NO_REQUEST, NOT_ACTIVE, Outcome, Report, RequestError
+from ddqn_planner.nodes.requests import (
+    UNCHANGED,
+    ActiveGoal,
+    ModelSource,
+    PathUnderWay,
+    Requests,
+    load,
 )
-from ddqn_planner.nodes.requests import UNCHANGED, ActiveGoal, PathUnderWay, Requests
 from ddqn_planner.nodes.runtime import LATCHED, STEADY, Unless, Worker, spin_until_shutdown
-
-LOOK_PERIOD = 0.1
-"""Seconds between two looks whether something changed: an answer does not wait for diagnostics."""
 
 
 # The executor's one thread holds all state. What takes long runs in workers: to load the model,
@@ -117,6 +114,7 @@ class PlannerNode(ManagedNode):
         super().cleanup()
         self._forget()
         self._report.forget()
+        self._report.note(NO_REQUEST)
         self.after_jump_back.clear()
         for name in ("_start", "_frames", "_display", "_map", "_requests"):
             vars(self).pop(name, None)  # not all are there, if `configure` failed
@@ -194,9 +192,7 @@ class PlannerNode(ManagedNode):
 
     # Planning
 
-    async def _on_get_plan(
-        self, request: GetPlan.Request, response: GetPlan.Response
-    ) -> GetPlan.Response:
+    async def _on_get_plan(self, request: Any, response: Any) -> Any:
         start = request.start if request.start.header.frame_id else None
         header, outcome = await self._answer([], start, [request.goal], request.tolerance)
         response.plan = _path(path_message, outcome, header)
@@ -215,7 +211,7 @@ class PlannerNode(ManagedNode):
             self._plan_publisher.publish(_path(serialized_path, outcome, header))
         self._waits_for_pose = outcome.status in ("NO_START", "TF_ERROR")
         # The places and lengths in the reason may differ.
-        kind = outcome.status, outcome.plan.method, begins_on_obstacle(outcome)
+        kind = outcome.status, outcome.plan.method, "start is occupied" in outcome.reason
         logged = goals, outcome.goal, *kind
         if self._logged != logged:
             self._logged = logged
