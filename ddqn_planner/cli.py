@@ -157,7 +157,7 @@ def _shortest_length(grid: GridMap, plan: Plan) -> float | None:
     import numpy as np
 
     from ddqn_planner.grid import path_length
-    from ddqn_planner.planning.search import search
+    from ddqn_planner.planning.paths import search
 
     if not plan.cells or not grid.is_free(plan.cells[0]):
         return None

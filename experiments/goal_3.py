@@ -33,7 +33,7 @@ from ddqn_planner.grid import (
     shortest_distances,
     shortest_path,
 )
-from ddqn_planner.planning.search import search
+from ddqn_planner.planning.paths import search
 from ddqn_planner.training.environment import Scenario, paper_scenario
 from ddqn_planner.training.hyper_parameters import HyperParameters
 from ddqn_planner.training.trainer import Trainer

@@ -7,9 +7,9 @@ import os
 import re
 from collections.abc import Callable, Iterator
 from contextlib import closing
-from dataclasses import dataclass
 from enum import Enum
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,15 +23,12 @@ Sample = tuple[float, float, float]
 """Seconds, and x and y in metres in the frame of the map."""
 
 RECORD, EXPERIENCE = "episodes.csv", "experience.npz"
-FORGOTTEN = "experience_forgotten.npz"
-LOCK = "driving.lock"
-"""A folder with this file belongs to a robot's drives."""
+LOCK = "driving.lock"  # a folder with this file belongs to a robot's drives
 
 HEADER = b"episode,outcome,start_time,seconds,metres,samples\r\n"
 
 NUMBER = rb"-?\d{1,18}(?:\.\d{1,9})?"
 ROW = re.compile(rb"(\d{1,18}),([a-z_]{1,20}),(%b),%b,%b,((?:%b:%b:%b ?)+)\r\n" % ((NUMBER,) * 6))
-"""A complete row."""
 
 FARTHEST = 1e12  # metres, and seconds: a pose beyond is none
 
@@ -43,9 +40,7 @@ PAUSE = 120.0  # seconds: a robot that stands for longer waits for no door and n
 SHORTEST = 0.5  # metres: a robot that went no farther away has not driven
 MOST_SAMPLES = 2000  # a drive is cut there, so that the robot learns while it drives for hours
 JUMP = 1.0  # seconds back by which a clock begins anew: a bag loops, a simulator is reset
-
-WINDOW, STEP = 0.5, 0.25
-"""A drive's length joins mean positions of so many seconds that are so many metres apart."""
+WINDOW, STEP = 0.5, 0.25  # a drive's length joins means of so many seconds, so many metres apart
 
 
 class DriveEnd(str, Enum):
@@ -55,22 +50,17 @@ class DriveEnd(str, Enum):
     NEW_GOAL = "new_goal"
     PAUSED = "paused"
     ABORTED = "aborted"
-    CUT = "cut"
-    """It had so many samples that the next drive goes on from there."""
-    STOPPED = "stopped"
-    """The recording ended, or its clock jumped back."""
+    CUT = "cut"  # it had so many samples that the next drive goes on from there
+    STOPPED = "stopped"  # the recording ended, or its clock jumped back
 
 
-@dataclass(frozen=True, eq=False)
-class Drive:
-    """A drive that has ended, the first one with number 1."""
+class Drive(NamedTuple):
+    """A drive that has ended, the first one with number 1: N samples, in the frame of the map."""
 
     number: int
     outcome: DriveEnd
     seconds: Float64
-    """(N,): the time of each sample."""
     positions: Float64
-    """(N, 2): in metres, in the frame of the map."""
 
     @property
     def metres(self) -> float:
@@ -86,11 +76,8 @@ class Drive:
         return total + math.dist(at, self.positions[-1].tolist())
 
     def teach(self, experience: Experience, grid: GridMap | None = None) -> None:
-        """Let experience learn from it; where the robot gave up, moves fail.
-
-        With a map, its time is compared with the expected one, which tells how sure that is.
-        """
-        if grid is not None:
+        """Let experience learn from it; where the robot gave up, moves fail."""
+        if grid is not None:  # its time, compared with the expected one, tells how sure that is
             experience.apply(grid)
         experience.record(self.seconds, self.positions)
         if self.outcome is DriveEnd.ABORTED:
@@ -99,12 +86,9 @@ class Drive:
     def row(self) -> bytes:
         """Return its row of ``episodes.csv``."""
         start = self.seconds[0]
-        elapsed = self.seconds - start
-        samples = " ".join(
-            f"{t:.3f}:{x:.3f}:{y:.3f}"
-            for t, (x, y) in zip(elapsed.tolist(), self.positions.tolist(), strict=True)
-        )
-        numbers = f"{start:.3f},{elapsed[-1]:.3f},{self.metres:.3f}"
+        rows = np.column_stack([self.seconds - start, self.positions]).tolist()
+        samples = " ".join(f"{t:.3f}:{x:.3f}:{y:.3f}" for t, x, y in rows)
+        numbers = f"{start:.3f},{rows[-1][0]:.3f},{self.metres:.3f}"
         return f"{self.number},{self.outcome.value},{numbers},{samples}\r\n".encode()
 
 
@@ -122,11 +106,7 @@ def read_drives(path: str | Path) -> Iterator[Drive]:
 
 
 class DriveRecorder:
-    """Divides the poses of a robot into drives, and calls `on_drive` with each: end, times, places.
-
-    A drive begins when the robot drives off. It ends when the robot stands at its goal, stands for
-    a long time, gets another goal, or gave up, and when the clock jumps back.
-    """
+    """Divides a robot's poses into drives, and calls `on_drive` with each: end, times, places."""
 
     def __init__(self, on_drive: Callable[[DriveEnd, Float64, Float64], None]) -> None:
         self._on_drive = on_drive
@@ -156,7 +136,7 @@ class DriveRecorder:
             self.forget()
         stands = self._stands
         if stands is None or math.dist(stands[1:], sample[1:]) > STAND_DISTANCE:
-            if stands is not None and self._last is not None and not self._samples:
+            if self._last is not None and not self._samples:
                 self._samples.append(self._last)
             stands = self._stands = sample
         self._last = sample
@@ -177,9 +157,8 @@ class DriveRecorder:
 
     @property
     def _is_at_goal(self) -> bool:
-        if self.goal is None or self.position is None:
-            return False
-        return math.dist(self.goal, self.position) <= ARRIVAL_DISTANCE
+        at, goal = self.position, self.goal
+        return at is not None and goal is not None and math.dist(at, goal) <= ARRIVAL_DISTANCE
 
     def set_goal(self, x: float, y: float) -> None:
         """Take a new goal; the same one again changes nothing."""
@@ -205,14 +184,7 @@ class DriveRecorder:
 
 
 class DriveFolder(WorkFolder):
-    """Records a robot's drives in a folder, and keeps there what they teach.
-
-    The folder holds ``episodes.csv``, ``experience.npz``, and ``driving.lock``, which keeps other
-    processes out until `close` or the end of the process. It must be new or empty, or belong to
-    drives, or a FolderError says so. Without ``experience.npz``, experience is learned anew from
-    ``episodes.csv``; an ExperienceFileError if it cannot be read, a ValueError if it has another
-    nominal speed or robot's width.
-    """
+    """Records a robot's drives in a folder, and keeps there what they teach."""
 
     def __init__(self, folder: str | Path, nominal_speed: float, robot_width: float) -> None:
         after = "the recording continues, and saving is tried again"
@@ -221,22 +193,34 @@ class DriveFolder(WorkFolder):
         self.experience = Experience(nominal_speed, robot_width)
         with self.opening() as files:
             self.drives = _cut_incomplete_row(self.record_path)
-            """The number of the last drive."""
             if self.experience_path.exists():
-                saved = Experience.load(self.experience_path)
-                _check_same(saved, self.experience, self.folder)
-                self.experience = saved
-            elif self.drives:
+                self._load()
+            elif self.drives:  # learn anew
                 for drive in read_drives(self.record_path):
                     drive.teach(self.experience)
             self._record = files.enter_context(closing(Appender(self.record_path)))
             if self.record_path.stat().st_size == 0:
                 self._record.append(HEADER)
 
+    def _load(self) -> None:
+        """Continue with the saved experience; a ValueError if it is another robot's."""
+        saved, now = Experience.load(self.experience_path), self.experience
+        differences = [
+            f"{name} {getattr(saved, name):g} (now {getattr(now, name):g})"
+            for name in ("nominal_speed", "robot_width")
+            if getattr(saved, name) != getattr(now, name)
+        ]
+        if differences:
+            raise ValueError(
+                f"{self.folder} holds experience with {', '.join(differences)}; give those values, "
+                f"another folder, or learn anew: ddqn-planner learn {self.folder} --map MAP"
+            )
+        self.experience = saved
+
     def add(
         self, outcome: DriveEnd, seconds: Float64, positions: Float64, grid: GridMap | None = None
     ) -> Drive:
-        """Record a drive, learn from it, and save; see `Drive.teach` for the map."""
+        """Record a drive, learn from it, and save."""
         self.drives += 1
         drive = Drive(self.drives, outcome, seconds, positions)
         self._record.append(drive.row())
@@ -248,32 +232,16 @@ class DriveFolder(WorkFolder):
         """Forget all that was learned; return the file that keeps it, if there was one."""
         kept = None
         if self.experience_path.exists():
-            kept = self.experience_path.replace(self.folder / FORGOTTEN)
+            kept = self.experience_path.replace(self.folder / "experience_forgotten.npz")
         self.experience.forget()
         self.try_to_save()
         return kept
 
     def try_to_save(self) -> None:
-        """Write the drives and the experience.
-
-        If that fails, `save_error` says why, and the next call tries again with all that is left.
-        """
+        """Write the drives and the experience; `save_error` says why if that fails."""
         with self.saving():
             self._record.flush()
             self.experience.save(self.experience_path)
-
-
-def _check_same(saved: Experience, now: Experience, folder: Path) -> None:
-    differences = [
-        f"{name} {getattr(saved, name):g} (now {getattr(now, name):g})"
-        for name in ("nominal_speed", "robot_width")
-        if getattr(saved, name) != getattr(now, name)
-    ]
-    if differences:
-        raise ValueError(
-            f"{folder} holds experience with {', '.join(differences)}; give those values, another "
-            f"folder, or learn anew: ddqn-planner learn {folder} --map MAP"
-        )
 
 
 def _cut_incomplete_row(path: Path) -> int:

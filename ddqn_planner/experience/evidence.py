@@ -199,11 +199,6 @@ class Evidence:
         self.spread = spread
         return spread
 
-    def take_over(self, older: Evidence) -> None:
-        """Take what older evidence has spread over its map, if this one has grown out of it."""
-        if list(self.number)[: older.places] == list(older.number):
-            self.spread, older.spread = older.spread, None
-
     def arrays(self) -> dict[str, Any]:
         """Return what a file keeps."""
         return {

@@ -5,7 +5,7 @@ from __future__ import annotations
 import io
 import math
 import zipfile
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from itertools import pairwise
 from pathlib import Path
 from typing import NamedTuple
@@ -73,12 +73,10 @@ class Experience:
         max_pause: float = 90.0,
     ) -> None:
         given = nominal_speed, robot_width, half_life, max_pause
-        for name, value in zip(OPTIONS, given, strict=True):
+        self.nominal_speed, self.robot_width, self.half_life, self.max_pause = (
             as_number(name, value, *POSITIVE, "more than 0, and finite")
-        self.nominal_speed = float(nominal_speed)
-        self.robot_width = float(robot_width)
-        self.half_life = float(half_life)
-        self.max_pause = float(max_pause)
+            for name, value in zip(OPTIONS, given, strict=True)
+        )
         self.forget()
 
     def forget(self) -> None:
@@ -100,8 +98,8 @@ class Experience:
         ValueError
             If the shapes or types are wrong. Values that cannot be true are left out.
         """
-        speed, side = 3 * self.nominal_speed, self.evidence.side
-        visits = visits_of(seconds, positions, side, speed, self.max_pause)
+        side, max_speed = self.evidence.side, 3 * self.nominal_speed
+        visits = visits_of(seconds, positions, side, max_speed, self.max_pause)
         if len(visits.seconds):
             self.evidence.add(visits)
 
@@ -114,8 +112,10 @@ class Experience:
 
     def take_over(self, older: Experience) -> None:
         """Use what older experience of the same robot computed for its map, which forgets it."""
-        if [getattr(self, name) for name in OPTIONS] == [getattr(older, name) for name in OPTIONS]:
-            self.evidence.take_over(older.evidence)
+        mine, its = self.evidence, older.evidence
+        of_one_robot = all(getattr(self, name) == getattr(older, name) for name in OPTIONS)
+        if of_one_robot and list(mine.number)[: its.places] == list(its.number):
+            mine.spread, its.spread = its.spread, None
 
     def apply(self, grid: GridMap) -> GridMap:
         """Return a map whose moves cost expected time, so that `Plan.cost` is in seconds.
@@ -205,14 +205,7 @@ class Experience:
 def visits_of(
     seconds: ArrayLike, positions: ArrayLike, side: float, max_speed: float, max_pause: float
 ) -> Visits:
-    """Divide a drive into places, squares of the world.
-
-    The drive is followed in steps of half a square. So noise of the pose and the rate of the
-    samples hardly matter, and waiting counts as time. Not believed are poses that are not finite,
-    clocks that go back, places that take longer than `max_pause`, and moves that are faster than
-    `max_speed`. A pose that jumps far is not believed until it jumps back to where the robot can
-    be.
-    """
+    """Divide a drive into places, squares of the world; what cannot be true is left out."""
     time = numbers("seconds", seconds).astype(np.float64)
     position = numbers("positions", positions).astype(np.float64)
     if time.ndim != 1 or position.shape != (len(time), 2):
@@ -224,68 +217,56 @@ def visits_of(
     time, position = time[possible], position[possible]
     fresh = np.diff(time, prepend=np.nan) != 0  # a repeated time adds nothing
     time, position = time[fresh], position[fresh]
-    rows: list[tuple[float, ...]] = []
-    step = side / 2
-    for first, end in _believed_parts(time, position, max_speed, max_pause):
-        rows += _steps(time[first:end].tolist(), position[first:end].tolist(), step)
-    array = np.array(rows).reshape(-1, 6)
-    array = array[(array[:, 4] <= max_pause) & (array[:, 5] <= max_speed * array[:, 4])]
-    # Where samples are rare, one step passes several places.
-    count = np.maximum(np.rint(array[:, 5] / step), 1).astype(np.int64)
-    number = np.arange(count.sum()) - np.repeat(np.cumsum(count) - count, count)
-    array = np.repeat(array, count, axis=0)
-    count = np.repeat(count, count)
-    share = ((number + 0.5) / count)[:, None]
-    middle = array[:, 0:2] * (1 - share) + array[:, 2:4] * share
-    if not len(middle):
-        return Visits(middle, array[:, 4], array[:, 5])
-    square = np.floor(middle / side)
-    begins = np.flatnonzero(np.append(True, (np.diff(square, axis=0) != 0).any(axis=1)))
-    metres = array[:, 5] / count
-    sums = np.column_stack([middle * metres[:, None], array[:, 4] / count, metres])
-    sums = np.add.reduceat(sums, begins)
+    steps: list[tuple[float, float, float, float]] = []
+    for part in _believed_parts(time, position, max_speed, max_pause):
+        drive = time[part].tolist(), position[part].tolist()
+        steps += _steps(*drive, side / 2, max_speed, max_pause)
+    rows = np.array(steps).reshape(-1, 4)
+    square = np.floor(rows[:, :2] / side)
+    is_first = np.append(len(rows) > 0, (np.diff(square, axis=0) != 0).any(axis=1))
+    rows[:, :2] *= rows[:, 3:]
+    sums = np.add.reduceat(rows, np.flatnonzero(is_first))
     return Visits(sums[:, :2] / sums[:, 3:], sums[:, 2], sums[:, 3])
 
 
 def _believed_parts(
     time: Float64, position: Float64, max_speed: float, max_pause: float
-) -> list[tuple[int, int]]:
-    """Return the first sample and the end of each part of a drive without jumps."""
+) -> Iterator[slice]:
+    """Yield the parts of a drive without jumps; after a far one, none until the pose is back."""
     elapsed = np.diff(time)
     distance = np.hypot(*np.diff(position, axis=0).T)
     reach = max_speed * np.maximum(elapsed, 0) + CORRECTION
     broken = (elapsed <= 0) | (elapsed > max_pause) | (distance > reach)
-    edges = [0, *(np.flatnonzero(broken) + 1).tolist(), len(time)]
-    parts: list[tuple[int, int]] = []
+    is_far = distance > np.minimum(reach, MEMORY * max_speed) + RELOCATION
     lost_at: int | None = None
-    farthest = np.minimum(reach, MEMORY * max_speed) + RELOCATION
-    for first, end in pairwise(edges):
-        if first and distance[first - 1] > farthest[first - 1]:
+    for first, end in pairwise([0, *(np.flatnonzero(broken) + 1).tolist(), len(time)]):
+        if first and is_far[first - 1]:
             if lost_at is None:
                 lost_at = first - 1
             else:
-                elapsed_since = np.clip(time[first] - time[lost_at], 0, MEMORY)
-                apart = math.dist(position[first], position[lost_at])
-                lost_at = None if apart <= max_speed * elapsed_since + RELOCATION else lost_at
+                way = max_speed * np.clip(time[first] - time[lost_at], 0, MEMORY) + RELOCATION
+                lost_at = lost_at if math.dist(position[first], position[lost_at]) > way else None
         if lost_at is None and end - first > 1:
-            parts.append((first, end))
-    return parts
+            yield slice(first, end)
 
 
 def _steps(
-    time: list[float], position: list[list[float]], step: float
-) -> list[tuple[float, float, float, float, float, float]]:
-    """Return x and y before and after each step, its seconds and its metres.
-
-    How long the robot stands before it drives off says nothing about the place.
-    """
+    time: list[float], position: list[list[float]], step: float, max_speed: float, max_pause: float
+) -> Iterator[tuple[float, float, float, float]]:
+    """Yield x and y of the middle of each step, its seconds and its metres."""
+    # How long the robot stands before it drives off says nothing about the place.
     away = (index for index, at in enumerate(position) if math.dist(at, position[0]) >= step / 4)
     start = max(next(away, len(time)) - 1, 0)
     began, (from_x, from_y) = time[start], position[start]
-    steps = []
     for now, (x, y) in zip(time[start:], position[start:], strict=True):
-        distance = math.hypot(x - from_x, y - from_y)
-        if distance >= step:
-            steps.append((from_x, from_y, x, y, now - began, distance))
-            began, from_x, from_y = now, x, y
-    return steps
+        seconds, metres = now - began, math.hypot(x - from_x, y - from_y)
+        if metres < step:
+            continue
+        if seconds <= max_pause and metres <= max_speed * seconds:
+            count = round(metres / step)  # where samples are rare, a step passes several places
+            for number in range(count):
+                share = (number + 0.5) / count
+                middle_x = from_x * (1 - share) + x * share
+                middle_y = from_y * (1 - share) + y * share
+                yield middle_x, middle_y, seconds / count, metres / count
+        began, from_x, from_y = now, x, y

@@ -1,15 +1,10 @@
-"""The planner node: plans on the map from the robot's pose to the goal pose.
-
-The executor's one thread holds all state, so that no lock is needed. What takes long runs in worker
-threads: loading the model and its libraries, and the Q fields, which take a second or more on a
-large map. A request that waits for a worker is a coroutine.
-"""
+"""The planner node: plans on the map from the robot's pose to the goal pose."""
 
 from __future__ import annotations
 
 import ctypes
 import sys
-from collections.abc import Callable, Coroutine
+from collections.abc import Callable
 from contextlib import suppress
 from typing import Any
 
@@ -22,33 +17,28 @@ from rclpy.task import Future
 from std_msgs.msg import Header, String
 
 from ddqn_planner.nodes.conversions import path_message, serialized_path
-from ddqn_planner.nodes.display import FieldDisplay
+from ddqn_planner.nodes.display import LOOK_PERIOD, FieldDisplay
 from ddqn_planner.nodes.lifecycle import ManagedNode
 from ddqn_planner.nodes.map_source import MapSource
-from ddqn_planner.nodes.model_loading import ModelSource, load
 from ddqn_planner.nodes.nav2 import serve_nav2
 from ddqn_planner.nodes.parameters import PLANNER_PARAMETERS
 from ddqn_planner.nodes.poses import Frames, StartSource, check_source
-from ddqn_planner.nodes.report import (
-    NOT_ACTIVE,
-    Outcome,
-    Report,
-    RequestError,
-    begins_on_obstacle,
+from ddqn_planner.nodes.report import NO_REQUEST, NOT_ACTIVE, Outcome, Report, RequestError
+from ddqn_planner.nodes.requests import (
+    UNCHANGED,
+    ActiveGoal,
+    ModelSource,
+    PathUnderWay,
+    Requests,
+    load,
 )
-from ddqn_planner.nodes.requests import UNCHANGED, ActiveGoal, PathUnderWay, Requests
 from ddqn_planner.nodes.runtime import LATCHED, STEADY, Unless, Worker, spin_until_shutdown
 
-LOOK_PERIOD = 0.1
-"""Seconds between two looks whether something changed: an answer does not wait for diagnostics."""
 
-
+# The executor's one thread holds all state. What takes long runs in workers: to load the model,
+# to inflate a map, the Q fields. A request that waits for a worker is a coroutine.
 class PlannerNode(ManagedNode):
-    """Plans from where the robot is to the active goal: ``goal_pose``, or ``goal_poses``.
-
-    A malformed map, start or model is refused, and the one before it stays. A request that cannot
-    be answered gets an empty path in the map's frame; the log and `/diagnostics` say why.
-    """
+    """Plans from where the robot is to the active goal: ``goal_pose``, or ``goal_poses``."""
 
     def __init__(self) -> None:
         super().__init__("planner", PLANNER_PARAMETERS)
@@ -72,9 +62,9 @@ class PlannerNode(ManagedNode):
         """Have no map and no goal, and refuse requests."""
         self._is_configured = self._waits_for_pose = self._lacks_map = False
         self._stopped = Future()
-        self._stop()
-        self._active, self._followed = ActiveGoal(), PathUnderWay()
+        self._stopped.set_result(NOT_ACTIVE)
         self._logged: tuple[object, ...] = ()
+        self.deactivate()
 
     def configure(self) -> None:
         """Listen to the map and to where the robot is, and create what answers requests."""
@@ -116,7 +106,7 @@ class PlannerNode(ManagedNode):
     def deactivate(self) -> None:
         """Forget the active goal."""
         super().deactivate()
-        self._active, self._followed = ActiveGoal(), PathUnderWay()
+        self._active, self._followed = ActiveGoal([], PathUnderWay()), PathUnderWay()
         self._report.change()
 
     def cleanup(self) -> None:
@@ -124,6 +114,7 @@ class PlannerNode(ManagedNode):
         super().cleanup()
         self._forget()
         self._report.forget()
+        self._report.note(NO_REQUEST)
         self.after_jump_back.clear()
         for name in ("_start", "_frames", "_display", "_map", "_requests"):
             vars(self).pop(name, None)  # not all are there, if `configure` failed
@@ -136,18 +127,13 @@ class PlannerNode(ManagedNode):
             await self._model.first()
             return self._model.planner is not None
         if transition in ("deactivate", "shutdown"):
-            self._stop()
+            self._stopped.set_result(NOT_ACTIVE)
             while self._answering:
                 await self._requests.next_look
         return True
 
     def _is_active(self) -> bool:
         return not self._stopped.done()
-
-    def _stop(self) -> None:
-        """Answer all requests that wait, and those that come from now on, that it is not active."""
-        if self._is_active():
-            self._stopped.set_result(NOT_ACTIVE)
 
     # Parameters
 
@@ -170,8 +156,7 @@ class PlannerNode(ManagedNode):
         self._start.listen()
         self._requests.settings = settings
         self._map.apply_parameters(changed)
-        self._active.restart()
-        self._replan.trigger()
+        self._plan_for(ActiveGoal(self._active.poses, PathUnderWay()))
 
     # Map, start and goal
 
@@ -182,7 +167,11 @@ class PlannerNode(ManagedNode):
         self._replan.trigger()
 
     def _on_start(self) -> None:
-        self._active.plan_at_once()
+        self._plan_for(ActiveGoal(self._active.poses, self._active.path))
+
+    def _plan_for(self, active: ActiveGoal) -> None:
+        """Plan at once, whatever was planned: the one before may have a plan under way."""
+        self._active = active
         self._replan.trigger()
 
     def _on_goal_poses(self, message: PoseArray) -> None:
@@ -198,38 +187,31 @@ class PlannerNode(ManagedNode):
             self._report.log(NOT_ACTIVE)
             return
         self._report.accept("goal_poses")
-        self._active.set(goals)
         self._display.show_again()
-        self._replan.trigger()
+        self._plan_for(ActiveGoal(goals, PathUnderWay()))
 
     # Planning
 
-    async def _on_get_plan(
-        self, request: GetPlan.Request, response: GetPlan.Response
-    ) -> GetPlan.Response:
+    async def _on_get_plan(self, request: Any, response: Any) -> Any:
         start = request.start if request.start.header.frame_id else None
-        planning = self._requests.plan(start, [request.goal], request.tolerance)
-        header, outcome = await self._answer(planning, [request.goal])
+        header, outcome = await self._answer([], start, [request.goal], request.tolerance)
         response.plan = _path(path_message, outcome, header)
         self._report.log(outcome)
         return response
 
     async def _plan_for_active_goal(self) -> None:
         await self._model.first()
-        goals = self._active.poses
+        active, goals = self._active, self._active.poses
         if not goals:
             return
-        self._active.begin(self._settings.replan_period)
-        tolerance = self._settings.tolerance
-        planning = self._requests.plan(None, goals, tolerance, followed=self._active)
-        header, outcome = await self._answer(planning, goals)
+        header, outcome = await self._answer([], None, goals, None, "", active)
         if outcome in (UNCHANGED, NOT_ACTIVE):
             return
-        if self._active.is_news(outcome, header.frame_id):
+        if active.is_news(outcome, header.frame_id):
             self._plan_publisher.publish(_path(serialized_path, outcome, header))
         self._waits_for_pose = outcome.status in ("NO_START", "TF_ERROR")
         # The places and lengths in the reason may differ.
-        kind = outcome.status, outcome.plan.method, begins_on_obstacle(outcome)
+        kind = outcome.status, outcome.plan.method, "start is occupied" in outcome.reason
         logged = goals, outcome.goal, *kind
         if self._logged != logged:
             self._logged = logged
@@ -239,11 +221,10 @@ class PlannerNode(ManagedNode):
     async def _plan_for_action(
         self, start: PoseStamped | None, goals: list[PoseStamped], planner_id: str, given_up: Future
     ) -> tuple[Path, Outcome]:
-        tolerance, followed = self._settings.tolerance, self._followed
-        planning = self._requests.plan(start, goals, tolerance, planner_id, followed)
-        header, outcome = await self._answer(planning, goals, given_up)
+        how = None, planner_id, self._followed
+        header, outcome = await self._answer([given_up], start, goals, *how)
         if outcome.request is not None and len(outcome.plan.path):
-            followed.keep(outcome.plan.every_cell, outcome.request.grid, header.frame_id)
+            self._followed.keep(outcome.plan.every_cell, outcome.request.grid, header.frame_id)
             self._plan_publisher.publish(_path(serialized_path, outcome, header))
         self._report.log(outcome)
         return _path(path_message, outcome, header), outcome
@@ -259,15 +240,13 @@ class PlannerNode(ManagedNode):
         return response
 
     async def _answer(
-        self, planning: Coroutine[None, None, Outcome], goals: list[PoseStamped], *given_up: Future
+        self, until: list[Future], start: PoseStamped | None, goals: list[PoseStamped], *how: Any
     ) -> tuple[Header, Outcome]:
-        """Return the path's header, and what became of the request; the stamp is that of now.
-
-        The request is given up as soon as the node is stopped, or one of the futures is done.
-        """
+        """Plan until the node is stopped or a future is done; return the path's header, too."""
         self._answering += 1
         try:
-            outcome = await Unless(planning, self._stopped, *given_up)
+            planning = self._requests.plan(start, goals, *how)
+            outcome = await Unless(planning, self._stopped, *until)
         except RequestError as error:
             outcome = Outcome(error.status, str(error))
         except Exception as error:  # as when no memory is left: the node must survive
@@ -302,11 +281,12 @@ class PlannerNode(ManagedNode):
         self._requests.look_again()
         self._start.transform()
         lacked, self._lacks_map = self._lacks_map, bool(self._map.missing)
-        is_due = self._active.is_look_due()
+        is_due = self._active.is_look_due(self._settings.replan_period)
         is_due |= self._lacks_map and not lacked  # a costmap stopped: its path is taken back
         if self._waits_for_pose and self._active.poses:
             with suppress(RequestError):
-                self._requests.look(self._active.poses)
+                for pose in (self._start.pose(), *self._active.poses):
+                    self._frames.to_map("the pose", pose, self._map.frame)
                 self._waits_for_pose, is_due = False, True
         if is_due:
             self._replan.trigger()

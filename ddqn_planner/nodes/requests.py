@@ -1,148 +1,210 @@
-"""From a request to its outcome: with the map, the model and the parameters of the node."""
+"""From a request to its outcome: with the map, the parameters, and the model, loaded here."""
 
 from __future__ import annotations
 
+import gc
 import time
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from types import SimpleNamespace
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 from geometry_msgs.msg import PoseStamped
 from nav_msgs.msg import Path
+from rclpy.parameter import Parameter
 from rclpy.task import Future
-from std_msgs.msg import Header
+from std_msgs.msg import Header, String
 
-from ddqn_planner.grid import Cell, GridMap
+from ddqn_planner.grid import Cell, GridMap, MoveRule
 from ddqn_planner.grid.arguments import Cells
+from ddqn_planner.model import find_model
+from ddqn_planner.model.certificate import NO_CERTIFICATE
 from ddqn_planner.nodes.conversions import cell_from_pose, check_tolerance
 from ddqn_planner.nodes.map_source import MapSource
-from ddqn_planner.nodes.model_loading import ModelSource, move_rule
 from ddqn_planner.nodes.poses import Frames, StartSource
-from ddqn_planner.nodes.report import Outcome, RequestError, checked, reason_of, seconds
-from ddqn_planner.nodes.runtime import Worker
+from ddqn_planner.nodes.report import Outcome, Report, RequestError, reason_of, seconds
+from ddqn_planner.nodes.runtime import BaseNode, Worker
 from ddqn_planner.planning import Plan, PlanMethod, Planner, PlanRequest, PlanStatus
+from ddqn_planner.planning.field import shift_between
 from ddqn_planner.planning.paths import is_path_valid, rest_of_path
 from ddqn_planner.planning.plan import joined
-from ddqn_planner.planning.repair import shift_between
 
 UNCHANGED = Outcome("UNCHANGED", "the active goal needs no new plan")
 
 T = TypeVar("T")
 
 
+@dataclass
 class PathUnderWay:
     """The last path to a goal, in cells of the map that it was planned on."""
 
-    def __init__(self) -> None:
-        self._path: Cells = ()
-        self._grid: GridMap | None = None
-        self._frame = ""
+    path: Cells = ()
+    grid: GridMap | None = None
+    frame: str = ""
 
     def keep(self, path: Cells, grid: GridMap, frame: str) -> None:
         """Take the place of the path before."""
-        self._path, self._grid, self._frame = path, grid, frame
+        self.path, self.grid, self.frame = path, grid, frame
 
-    def on(self, grid: GridMap, frame: str) -> Cells:
-        """Return it in cells of a map; empty if it has no such cells."""
-        if not len(self._path) or self._grid is None or frame != self._frame:
-            return ()
-        shift, (x, y) = shift_between(self._grid, grid), self._path[-1]
-        if shift is None or not grid.contains((int(x) + shift[0], int(y) + shift[1])):
-            return ()
-        return np.asarray(self._path, dtype=np.int32) + np.array(shift, dtype=np.int32)
-
-    def next_request(self, request: PlanRequest, frame: str, threshold: float) -> PlanRequest:
-        """Return the request for a plan that may keep the path."""
-        under_way = self.on(request.grid, frame)
-        return replace(request, under_way=under_way, switch_threshold=threshold)
+    def next_request(self, request: PlanRequest, frame: str, settings: Any) -> PlanRequest:
+        """Return the request for a plan that may keep the path, in cells of the request's map."""
+        path: Cells = ()
+        if len(self.path) and self.grid is not None and frame == self.frame:
+            shift, (x, y) = shift_between(self.grid, request.grid), self.path[-1]
+            if shift is not None and request.grid.contains((int(x) + shift[0], int(y) + shift[1])):
+                path = np.asarray(self.path, dtype=np.int32) + np.array(shift, dtype=np.int32)
+        return replace(request, under_way=path, switch_threshold=settings.switch_threshold)
 
 
 class ActiveGoal:
     """Decides when to plan again, and what to publish; the table in docs/nodes.md has the rules."""
 
-    def __init__(self) -> None:
+    def __init__(self, poses: list[PoseStamped], path: PathUnderWay) -> None:
         # The last ``goal_pose``, or the last ``goal_poses``, of which the nearest one counts.
-        self.poses: list[PoseStamped] = []
+        self.poses = poses
         # Of the paths that were published for this goal, the last one.
-        self._path = PathUnderWay()
+        self.path = path
         # What was planned last; None to plan whatever is asked.
         self._planned: tuple[GridMap, Cell] | None = None
         # The frame and the status of what was published last; None to publish whatever comes.
         self._shown: tuple[str, str] | None = None
-        self._is_new = self._is_due = self._looks = False
-        self._period = self._next_look = 0.0
+        self._looks, self._next_look = False, 0.0
 
-    def set(self, poses: list[PoseStamped]) -> None:
-        """Take a new goal."""
-        self.poses = poses
-        self.restart()
+    def is_look_due(self, replan_period: float) -> bool:
+        """Return whether it is time to look if something changed; the next plan does then."""
+        is_due = bool(self.poses) and time.monotonic() >= self._next_look
+        if is_due:
+            self._looks, self._next_look = True, time.monotonic() + replan_period
+        return is_due
 
-    def restart(self) -> None:
-        """Plan without the path under way, at once: the goal, the model or a parameter changed."""
-        self._is_new = True
-
-    def plan_at_once(self) -> None:
-        """Plan at once: somebody has set where the robot is."""
-        self._is_due = True
-
-    def is_look_due(self) -> bool:
-        """Return whether it is time to look if something changed."""
-        return bool(self.poses) and time.monotonic() >= self._next_look
-
-    def begin(self, replan_period: float) -> None:
-        """Begin to look whether to plan; `next_request` follows, and `is_news` after a plan."""
-        self._looks, self._period = self.is_look_due(), replan_period
-        if self._looks:
-            self._wait_for_next_look()
-        if self._is_new:
-            self._path = PathUnderWay()
-        if self._is_new or self._is_due:
-            self._planned = self._shown = None
-        self._is_new = self._is_due = False
-
-    def next_request(
-        self, request: PlanRequest, frame: str, threshold: float
-    ) -> PlanRequest | None:
+    def next_request(self, request: PlanRequest, frame: str, settings: Any) -> PlanRequest | None:
         """Return the request for the next plan; None while there is no reason to plan."""
-        grid, start = request.grid, request.start
-        if self._planned is not None and self._planned[0] is grid and self._planned[1] == start:
+        grid, start, period = request.grid, request.start, settings.replan_period
+        looks, self._looks = self._looks or period == 0, False
+        if self._planned == (grid, start):
             return None
-        next_request = self._path.next_request(request, frame, threshold)
-        path = next_request.under_way
-        is_followed = self._shown == (frame, PlanStatus.SUCCEEDED.name) and not self._looks
-        if is_followed and len(rest_of_path(path, start, grid, request.move_rule)):
+        request = self.path.next_request(request, frame, settings)
+        is_followed = self._shown == (frame, PlanStatus.SUCCEEDED.name) and not looks
+        if is_followed and len(rest_of_path(request.under_way, start, grid, request.move_rule)):
             return None
-        self._path.keep(path, grid, frame)
-        self._planned = grid, start
-        self._wait_for_next_look()
-        return next_request
+        self.path.keep(request.under_way, grid, frame)
+        self._planned, self._next_look = (grid, start), time.monotonic() + period
+        return request
 
     def is_news(self, outcome: Outcome, frame: str) -> bool:
         """Return whether to publish the path of an outcome, which may be empty."""
-        if outcome.request is None:
+        path, request, shown = outcome.plan.every_cell, outcome.request, (frame, outcome.status)
+        is_new_path = len(path) > 0 and outcome.plan.extra_cost is None
+        is_news, self._shown = is_new_path or shown != self._shown, shown
+        if request is None:
             self._planned = None
-        path = outcome.plan.every_cell
-        shown, self._shown = self._shown, (frame, outcome.status)
-        if shown == self._shown and (not len(path) or outcome.plan.extra_cost is not None):
-            return False
-        if len(path) and outcome.request is not None:
-            self._path.keep(path, outcome.request.grid, frame)
-        return True
+        elif is_news and len(path):
+            self.path.keep(path, request.grid, frame)
+        return is_news
 
-    def _wait_for_next_look(self) -> None:
-        self._next_look = time.monotonic() + self._period
+
+def load(model: str) -> tuple[Planner, str]:
+    """Return the planner of a model, and the model's file."""
+    path = find_model(model)
+    return Planner.load(path), str(path)
+
+
+def load_and_warm_up(model: str) -> tuple[Planner, str]:
+    """Load a model, and the libraries and compiled functions that most plans need."""
+    planner, path = load(model)
+    sizes = planner.metadata.sizes
+    shape = sizes.get("height", 3), sizes.get("width", 3)
+    planner.plan(GridMap(np.zeros(shape, dtype=np.bool_)), (0, 0), (shape[1] - 1, shape[0] - 1))
+    gc.freeze()  # a collection of all that would stop the node for 45 ms
+    return planner, path
+
+
+def move_rule(rule: str, planner: Planner) -> MoveRule:
+    """Return a rule by its name, or the rule of the model if the name is empty."""
+    return MoveRule(rule or planner.metadata.move_rule)
+
+
+class ModelSource:
+    """Has the planner with the last model that could be loaded, and its file."""
+
+    def __init__(self, node: BaseNode, report: Report, worker: Worker) -> None:
+        self.planner: Planner | None = None
+        self.file = ""
+        self._node, self.report, self._worker = node, report, worker
+        # The first model, while it is being loaded.
+        self.loading: Future | None = None
+
+    def load(self) -> None:
+        """Begin to load the first model."""
+        self.loading = self._worker.call(load_and_warm_up, self._node.value("model"))
+
+    async def first(self) -> None:
+        """Wait for the first model, and use it unless another one was set since."""
+        loading = self.loading
+        try:
+            loaded = await loading if loading is not None else None
+        except Exception as error:
+            if self.loading is loading:
+                self.loading = None
+                reason = f"{str(error) or repr(error)}; or set the parameter 'model'"
+                self.report.refuse("model", reason)
+            return
+        if loaded is not None and self.loading is loading:
+            self.use(*loaded)
+
+    def use(self, planner: Planner, file: str) -> None:
+        """Plan with it from now on."""
+        self.planner, self.file, self.loading = planner, file, None
+        planner.cache_bytes = self._node.value("field_cache_bytes")
+        self.report.accept("model")
+        self.report.change()
+        self._node.get_logger().info(f"planning with the model {file}")
+
+    def set(self, name: str) -> str:
+        """Set the node's parameter, which loads the model; return why it was refused."""
+        (result,) = self._node.set_parameters([Parameter("model", value=name)])
+        reason: str = result.reason
+        return reason
+
+    def on_saved(self, message: String) -> None:
+        """Use a model that the trainer saved."""
+        if reason := self.set(message.data):
+            self.report.refuse("model", f"the trainer's model was refused: {reason}")
+
+    def on_reload(self) -> tuple[bool, str]:
+        """Load the file of the model again."""
+        if reason := self.set(self._node.value("model")):
+            self._node.get_logger().error(f"the model was not loaded again: {reason}")
+        return not reason, reason or f"loaded {self.file}"
+
+    def describe(self, rule: str) -> dict[str, str]:
+        """Return what the diagnostics say of it, with the value of the parameter ``move_rule``."""
+        description = {"model": self._node.value("model")}
+        if self.planner is None:
+            return description
+        metadata = self.planner.metadata
+        certificate = self.planner.network.certificate(metadata.move_rule)
+        return description | {
+            "model file": self.file,
+            "move rule": move_rule(rule, self.planner).value,
+            "model move rule": metadata.move_rule.value,
+            "model sizes": ", ".join(f"{key} {size}" for key, size in metadata.sizes.items()),
+            "model training steps": str(metadata.steps),
+            "model certificate": str(certificate or NO_CERTIFICATE),
+        }
+
+    def forget(self) -> None:
+        """Free the model and its fields, with what `load_and_warm_up` kept from collection."""
+        self.planner, self.file, self.loading = None, "", None
+        gc.unfreeze()
+        gc.collect()
 
 
 @dataclass
 class Requests:
-    """Plans paths and checks them; a `RequestError` says why it cannot.
-
-    A path is planned with the map, model and parameters that are there when its method begins,
-    whatever changes while it waits.
-    """
+    """Plans paths and checks them; a `RequestError` says why it cannot."""
 
     settings: SimpleNamespace
     map: MapSource
@@ -161,41 +223,41 @@ class Requests:
         self,
         start: PoseStamped | None,
         goals: list[PoseStamped],
-        tolerance: float,
+        tolerance: float | None = None,
         planner_id: str = "",
         followed: ActiveGoal | PathUnderWay | None = None,
     ) -> Outcome:
-        """Plan from a start, or from where the robot is, through goals in their order.
-
-        For the active goal, to the nearest of them; or there is no need: UNCHANGED.
-        """
+        """Plan from a start or where the robot is, through all goals; to one if they are active."""
+        # As they are now, like the map and the model, whatever changes while it waits.
         settings, several = self.settings, len(goals) > 1
         check_request(goals, planner_id, settings.planner_id)
         names = [f"goal {n}" for n in range(1, len(goals) + 1)] if several else ["the goal"]
-        for named in zip(names, goals, strict=True):
-            self._check_pose(*named, self.map.frame)
+        for name, goal in zip(names, goals, strict=True):
+            self._check_pose(name, goal, self.map.frame)
         header, grid, planner = await self._inputs()
         frame = header.frame_id
-        start = start or await self._wait_for(self.start.pose)
-        start = await self._in_map("the start", start, frame)
-        in_map = [await self._in_map(*named, frame) for named in zip(names, goals, strict=True)]
-        first, *more = [_cell(*named, grid, frame) for named in zip(names, in_map, strict=True)]
+        asked = [start or await self._wait_for(self.start.pose), *goals]
+        named = zip(["the start", *names], asked, strict=True)
+        places = [await self._in_map(*it, grid, frame) for it in named]
+        poses, (first, second, *more) = zip(*places, strict=True)
+        given = settings.tolerance if tolerance is None else tolerance
+        metres = _checked("the tolerance", lambda _: check_tolerance(given))
         request = PlanRequest(
             grid,
-            tolerance=checked("INVALID_TOLERANCE", check_tolerance, tolerance) / grid.resolution,
-            start=_cell("the start", start, grid, frame),
-            goal=first,
+            start=first,
+            goal=second,
             move_rule=move_rule(settings.move_rule, planner),
             method=PlanMethod(settings.mode),
+            tolerance=metres / grid.resolution,
             simplified=settings.path_simplification == "line_of_sight",
             start_clearing_radius=_clearing_radius(settings, grid),
         )
         if isinstance(followed, ActiveGoal):
-            goals[:] = in_map  # there they stay, though their own frame moves
+            followed.poses[:] = poses[1:]  # there they stay, though their own frame moves
             if several:
                 request, more = replace(request, tolerance=0.0, others=tuple(more)), []
         if followed is not None and not more:
-            next_request = followed.next_request(request, frame, settings.switch_threshold)
+            next_request = followed.next_request(request, frame, settings)
             if next_request is None:
                 return UNCHANGED
             request = next_request
@@ -206,9 +268,9 @@ class Requests:
             request = replace(request, start=plans[-1].cells[-1], goal=cell)
             plans.append(await self._plan_one(planner, request))
         plan, number = joined(plans), len(plans)
-        before, goal = [start, *in_map][number - 1 : number + 1]
+        before, goal = poses[number - 1 : number + 1]
         if request.others and plan.goal in request.goals:
-            goal = in_map[request.goals.index(plan.goal)]
+            goal = poses[1 + request.goals.index(plan.goal)]
         reason = reason_of(request, plan, before, goal, settings.robot_radius)
         if more and not len(plan.path):
             reason = f"goal {number} of {len(goals)}: {reason}"
@@ -216,27 +278,17 @@ class Requests:
         return Outcome(plan.status.name, reason, planner, request, plan, goal, stamp)
 
     async def is_path_valid(self, path: Path) -> bool:
-        """Return whether a path is free on the map of now, from the pose nearest to the robot on.
-
-        Where the robot is not known, the whole path must be free.
-        """
+        """Return whether a path is free now, from the robot on, or all of it if that is unknown."""
         header, grid, planner = await self._inputs()
         frame, settings = header.frame_id, self.settings
         poses = [PoseStamped(header=path.header, pose=stamped.pose) for stamped in path.poses]
-        cells = [_cell("the path", pose, grid, frame) for pose in poses]
+        cells = [_checked("the path", cell_from_pose, pose, grid, frame) for pose in poses]
         robot = cells[0] if cells else (0, 0)
         with suppress(RequestError):
-            start = await self._in_map("the start", await self._wait_for(self.start.pose), frame)
-            robot = _cell("the start", start, grid, frame)
+            start = await self._wait_for(self.start.pose)
+            _, robot = await self._in_map("the start", start, grid, frame)
         rule = move_rule(settings.move_rule, planner)
         return is_path_valid(cells, robot, grid, rule, _clearing_radius(settings, grid))
-
-    def look(self, goals: list[PoseStamped]) -> None:
-        """Raise a RequestError while the start or a goal is not known in the map's frame."""
-        frame = self.map.frame
-        self.frames.to_map("the start", self.start.pose(), frame)
-        for goal in goals:
-            self.frames.to_map("the goal", goal, frame)
 
     async def _inputs(self) -> tuple[Header, GridMap, Planner]:
         """Return the header of the map of now, this map for the robot's body, and the planner."""
@@ -245,7 +297,8 @@ class Requests:
         await self.model.first()
         planner = self.model.planner
         if planner is None:
-            raise RequestError("NO_MODEL", f"no model is loaded: {self.model.refused}")
+            refused = self.model.report.refused["model"]
+            raise RequestError("NO_MODEL", f"no model is loaded: {refused}")
         return header, await inflated, planner
 
     async def _plan_one(self, planner: Planner, request: PlanRequest) -> Plan:
@@ -255,17 +308,17 @@ class Requests:
             plan = await self.worker.run(next, steps)
         return plan
 
-    async def _in_map(self, name: str, stamped: PoseStamped, frame: str) -> PoseStamped:
-        """Return a pose in the map's frame; wait for its transform up to transform_tolerance."""
+    async def _in_map(
+        self, name: str, stamped: PoseStamped, grid: GridMap, frame: str
+    ) -> tuple[PoseStamped, Cell]:
+        """Return a pose in the map's frame, whose transform is waited for, and its cell."""
         self._check_pose(name, stamped, frame)
         deadline = time.monotonic() + self.settings.transform_tolerance
-        return await self._wait_for(lambda: self.frames.to_map(name, stamped, frame), deadline)
+        pose = await self._wait_for(lambda: self.frames.to_map(name, stamped, frame), deadline)
+        return pose, _checked(name, cell_from_pose, pose, grid, frame)
 
     async def _wait_for(self, get: Callable[[], T], deadline: float = 0.0) -> T:
-        """Return what a function returns, as soon as it raises no RequestError, if that may come.
-
-        Until a deadline of the monotonic clock it may come in any case.
-        """
+        """Return what a function returns, as soon as it raises no RequestError that may pass."""
         while True:
             try:
                 return get()
@@ -275,8 +328,7 @@ class Requests:
             await self.next_look
 
     def _check_pose(self, name: str, stamped: PoseStamped, frame: str) -> None:
-        check = self.frames.check
-        checked(_invalid(name), check, name, stamped.header, stamped.pose, frame)
+        _checked(name, self.frames.check, stamped, frame)
 
 
 def check_request(goals: list[PoseStamped], planner_id: str, known_id: str) -> None:
@@ -284,17 +336,17 @@ def check_request(goals: list[PoseStamped], planner_id: str, known_id: str) -> N
     if not goals:
         raise RequestError("NO_GOALS", "the request has no goal; give one or more")
     if planner_id not in ("", known_id):
-        raise RequestError(
-            "INVALID_PLANNER",
-            f"there is no planner {planner_id!r}; give {known_id!r} or '' as the planner_id, or "
-            "set the parameter 'planner_id'",
-        )
+        remedy = f"give {known_id!r} or '' as the planner_id, or set the parameter 'planner_id'"
+        raise RequestError("INVALID_PLANNER", f"there is no planner {planner_id!r}; {remedy}")
 
 
-def _cell(name: str, stamped: PoseStamped, grid: GridMap, frame: str) -> Cell:
-    pose = stamped.header, stamped.pose
-    cell: Cell = checked(_invalid(name), cell_from_pose, name, *pose, grid, frame)
-    return cell
+def _checked(name: str, check: Callable[..., T], *arguments: object) -> T:
+    """Return what a check returns; its ValueError becomes a RequestError, as INVALID_START."""
+    try:
+        return check(name, *arguments)
+    except ValueError as error:
+        status = f"INVALID_{name.removeprefix('the ').split()[0].upper()}"
+        raise RequestError(status, str(error)) from None
 
 
 def _clearing_radius(settings: SimpleNamespace, grid: GridMap) -> float:
@@ -303,7 +355,3 @@ def _clearing_radius(settings: SimpleNamespace, grid: GridMap) -> float:
     if metres < 0:
         metres = max(settings.robot_radius, grid.resolution)
     return metres / grid.resolution
-
-
-def _invalid(name: str) -> str:
-    return f"INVALID_{name.removeprefix('the ').split()[0].upper()}"

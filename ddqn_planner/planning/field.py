@@ -1,7 +1,8 @@
-"""The Q field: Q(s, a) of every cell toward one goal, and greedy rollouts in it."""
+"""The Q field: Q(s, a) of every cell toward one goal, its repair, and greedy rollouts in it."""
 
 from __future__ import annotations
 
+import math
 import threading
 import time
 from functools import cached_property
@@ -16,8 +17,8 @@ from ddqn_planner.model import PropagationQNetwork, QNetwork
 from ddqn_planner.model.move_costs import MoveCosts
 from ddqn_planner.planning import kernels
 from ddqn_planner.planning.plan import Plan, PlanStatus
-from ddqn_planner.planning.repair import moved
 
+Box: TypeAlias = tuple[slice, ...]  # rows and columns
 Goals: TypeAlias = tuple[Cell, ...]  # different free cells, sorted: a path may end in any of them
 REPAIRED = 100  # cells that a repair may take back before a new field is begun
 # Visits of a new field per cell that a repair may take back, while both take turns: to take a cell
@@ -25,7 +26,9 @@ REPAIRED = 100  # cells that a repair may take back before a new field is begun
 VISITS = 8
 REPAIRED_SHARE = 0.02  # of the map's cells that a repair may take back
 
-_STEPS: list[Cell] = [(int(dx), int(dy)) for dx, dy in MOVES]
+CHANGED_SHARE = 0.02  # of the map's cells may have changed: with more, a new field is cheaper
+LAYERS = "occupancy", "cost", "forbidden", "slowness"  # of a map: what its moves depend on
+SAME_PLACE = 0.01  # cells that a shift may be off whole ones: messages' resolution is float32
 
 
 class QField:
@@ -105,12 +108,12 @@ class QField:
         ValueError
             If the start is no cell of the map.
         """
-        began, policy = time.perf_counter(), self.policy
+        began, policy, steps = time.perf_counter(), self.policy, MOVES.tolist()
         cell = cell_inside(start, policy.shape, "the start")
         cells, visited = [cell], {cell}
         while cell != self.goal:
             action = int(policy[cell[1], cell[0]])
-            cell = (cell[0] + _STEPS[action][0], cell[1] + _STEPS[action][1])
+            cell = (cell[0] + steps[action][0], cell[1] + steps[action][1])
             if action < 0 or cell in visited:
                 return Plan(PlanStatus.ROLLOUT_TRAPPED, move_rule=self.move_rule)
             visited.add(cell)
@@ -199,10 +202,11 @@ class DistanceField(QField):
             path = kernels.roll_out(self.known.distance, self.costs, self._number(start))
         return self._succeeded(path, began)
 
-    def take_over(
-        self, old: DistanceField, changed: NDArray[np.int32], shift: Cell, start: Cell | None = None
-    ) -> bool:
+    def take_over(self, old: DistanceField, shift: Cell, start: Cell | None = None) -> bool:
         """Repair and take what an older field of the place knows, unless to begin is quicker."""
+        changed = changed_cells(old.grid, self.grid, shift)
+        if changed is None:
+            return False
         # For one start, repair and new field take turns, each time with four times the limit: the
         # quicker one wins. The older field then begins anew, or else stays as it is.
         most = max(REPAIRED, int(REPAIRED_SHARE * self.grid.occupancy.size))
@@ -210,7 +214,7 @@ class DistanceField(QField):
         limit = most if start is None or has_values_of_all else REPAIRED
         with old._lock:
             taken = old._take()
-            distance, state, opened = moved(taken[:3], old.grid, self.grid, shift)
+            distance, state, opened = _moved(taken, old.grid, self.grid, shift)
             while True:
                 reopened, kept = kernels.take_back(distance, state, self.costs, changed, limit)
                 if kept:
@@ -263,9 +267,8 @@ class DistanceField(QField):
     @property
     def nbytes(self) -> int:
         """Memory, bytes: 9 per cell, and more once `q` and so on were made."""
-        made = (vars(self).get(name) for name in ("q", "legal", "value", "policy"))
-        cells = int(self.costs.patch.size)
-        return 9 * cells + sum(int(array.nbytes) for array in made if array is not None)
+        made = [array for array in vars(self).values() if isinstance(array, np.ndarray)]
+        return 9 * int(self.costs.patch.size) + sum(int(array.nbytes) for array in made)
 
 
 def network_field(network: QNetwork, grid: GridMap, goal: Cell, move_rule: MoveRule) -> QField:
@@ -276,3 +279,71 @@ def network_field(network: QNetwork, grid: GridMap, goal: Cell, move_rule: MoveR
     else:
         q = network.q_values(grid, goal, move_rule)
     return QField(goal, q, grid.legal_moves(move_rule), move_rule)
+
+
+# What has changed between two maps of one place: a robot sees some cells of millions
+
+
+def shift_between(old: GridMap, new: GridMap) -> Cell | None:
+    """Return by how many cells a map has moved in a newer one with the same layers, or None."""
+    for layer in LAYERS:
+        if (getattr(old, layer) is None) != (getattr(new, layer) is None):
+            return None
+    return offset_between(old, new)
+
+
+def offset_between(old: GridMap, new: GridMap) -> Cell | None:
+    """Return where cell (0, 0) of one map lies in another; None if their cells do not match."""
+    same = math.isclose(old.resolution, new.resolution, rel_tol=1e-6)
+    if not same or old.origin[2] != new.origin[2]:
+        return None
+    corner = old.cell_to_world((0, 0))
+    shift = new.world_to_cell(*corner)
+    apart = math.dist(corner, new.cell_to_world(shift))
+    return shift if apart < SAME_PLACE * new.resolution else None
+
+
+def _overlap(old: GridMap, new: GridMap, shift: Cell) -> tuple[Box, Box]:
+    """Return the rows and columns that both maps show, in the old map and in the new one."""
+    before, after = [], []
+    for axis, by in enumerate(reversed(shift)):
+        old_size, size = old.occupancy.shape[axis], new.occupancy.shape[axis]
+        first = min(max(by, 0), size)
+        last = max(min(by + old_size, size), first)
+        before.append(slice(first - by, last - by))
+        after.append(slice(first, last))
+    return tuple(before), tuple(after)
+
+
+def changed_cells(old: GridMap, new: GridMap, shift: Cell) -> NDArray[np.int32] | None:
+    """Return the cells whose moves may differ, as numbers of the padded new map; None for many."""
+    before, (rows, columns) = _overlap(old, new, shift)
+    padded = np.zeros((new.height + 2, new.width + 2), dtype=np.bool_)
+    with_ring = padded[rows.start : rows.stop + 2, columns.start : columns.stop + 2]
+    differs = with_ring[1:-1, 1:-1]
+    for layer in LAYERS:
+        one, other = getattr(old, layer), getattr(new, layer)
+        if one is not None and (one is not other or shift != (0, 0)):
+            differs |= one[before] != other[rows, columns]
+    if np.count_nonzero(differs) > CHANGED_SHARE * differs.size:
+        return None
+    if shift != (0, 0) or old.occupancy.shape != new.occupancy.shape:
+        # What lay beyond the border of one map is inside the other.
+        with_ring[[0, -1]] = with_ring[:, [0, -1]] = True
+    width = new.width + 2
+    around = (np.arange(-1, 2)[:, None] * width + np.arange(-1, 2)).ravel()
+    numbers = np.unique(np.flatnonzero(padded)[:, None] + around)
+    return numbers[(numbers > width) & (numbers < padded.size - width - 1)].astype(np.int32)
+
+
+def _moved(known: Known, old: GridMap, new: GridMap, shift: Cell) -> tuple[NDArray[Any], ...]:
+    """Return a field's distance, state and open cells with each cell where the new map has it."""
+    if shift == (0, 0) and old.occupancy.shape == new.occupancy.shape:
+        return known[:3]
+    before, after = _overlap(old, new, shift)
+    shape = new.height + 2, new.width + 2
+    distance, state = np.zeros(shape), np.zeros(shape, dtype=np.uint8)
+    for layer, source in ((distance, known.distance), (state, known.state)):
+        layer[1:-1, 1:-1][after] = source.reshape(-1, old.width + 2)[1:-1, 1:-1][before]
+    opened = np.flatnonzero(state == kernels.OPEN).astype(np.int32)
+    return distance.ravel(), state.ravel(), opened

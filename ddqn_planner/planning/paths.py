@@ -1,25 +1,92 @@
-"""Parts of paths: the way out of a start, what is left of a path, straight segments for moves."""
+"""Parts of paths: searches, the way out of a start, what is left of a path, straight segments."""
 
 from __future__ import annotations
 
+import heapq
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ddqn_planner.compiled import compiled
 from ddqn_planner.grid import MOVES, Cell, GridMap, MoveRule, legal_moves, path_cost, path_length
 from ddqn_planner.grid.arguments import Cells, Occupancy, cells_inside
 from ddqn_planner.grid.grid_map import check_grid
 from ddqn_planner.grid.moves import segment_lengths
 from ddqn_planner.planning.field import Goals
 from ddqn_planner.planning.plan import PlanRequest
-from ddqn_planner.planning.search import search
 
 REACH = 5  # cells along an axis that a robot may be beside its path, and still come back to it
 SAME_COST = 1 + 1e-9  # a path may cost so much more, and still as much: sums are rounded
 ROUNDING = 1 + 1e-6  # so that 0.15 m in cells of 0.05 m reach 3 cells, not 2.9999999
 # Of ways out of one length, the one that ends nearer to the goal: so little its distance counts.
 NEARER_TO_GOAL = 1e-9
+
+
+# Best-first search
+
+
+def search(
+    start: Cell,
+    end: Cell | NDArray[np.bool_],
+    legal: NDArray[np.bool_],
+    multiplier: NDArray[np.float32],
+    move_rule: MoveRule,
+    value: NDArray[np.float32] | None = None,
+) -> tuple[Cell, ...]:
+    """Return a path to a cell, or to the nearest of a mask, by `legal` moves; empty without one."""
+    # A* (Hart, Nilsson and Raphael 1968) with -V as its heuristic: a good field leads straight to
+    # the end, and with any, each cell is visited at most once. Without values it is Dijkstra.
+    if not isinstance(end, np.ndarray):
+        (x, y), end = end, np.zeros(multiplier.shape, dtype=np.bool_)
+        end[y, x] = True
+    if value is None:
+        value = np.zeros_like(multiplier)
+    entered_by, found = _search(start, end, legal, multiplier, move_rule.lengths, value, MOVES)
+    if found < 0:
+        return ()
+    width = multiplier.shape[1]
+    cells = [(found % width, found // width)]
+    while cells[-1] != start:
+        x, y = cells[-1]
+        dx, dy = MOVES[entered_by[y, x]].tolist()
+        cells.append((x - dx, y - dy))
+    return tuple(reversed(cells))
+
+
+@compiled
+def _search(
+    start: Cell, ends: Any, legal: Any, multiplier: Any, lengths: Any, value: Any, moves: Any
+) -> tuple[NDArray[np.int8], int]:
+    """Return the action by which each cell was entered, (H, W) int8, and the end's number or -1."""
+    width = ends.shape[1]
+    entered_by = np.full(ends.shape, -1, dtype=np.int8)
+    visited = np.zeros(ends.shape, dtype=np.bool_)
+    # Of each move: its order, the cost of the path with it, the cell it leads to, the action.
+    waiting = [(0.0, 0.0, start[1] * width + start[0], -1)]
+    while len(waiting) > 0:
+        _, cost, cell, entered = heapq.heappop(waiting)
+        y, x = cell // width, cell % width
+        if visited[y, x]:
+            continue
+        visited[y, x] = True
+        entered_by[y, x] = entered
+        if ends[y, x]:
+            return entered_by, cell
+        for action in range(moves.shape[0]):
+            if not legal[action, y, x]:
+                continue
+            next_x, next_y = x + moves[action, 0], y + moves[action, 1]
+            if visited[next_y, next_x]:
+                continue
+            mean_multiplier = (np.float64(multiplier[y, x]) + multiplier[next_y, next_x]) / 2
+            through = cost + lengths[action] * mean_multiplier
+            order = through - value[next_y, next_x]
+            if np.isnan(order):
+                order = np.inf
+            heapq.heappush(waiting, (order, through, next_y * width + next_x, action))
+    return entered_by, -1
 
 
 # The way out, and the goals that are left
@@ -41,17 +108,12 @@ def way_out_and_ends(request: PlanRequest, goals: Goals) -> tuple[tuple[Cell, ..
         joined_to_ends = grid.reachable(ends, rule, backward=True)
         way_out: tuple[Cell, ...] = (start,)
         if not grid.is_free(start):
-            way_out = _way_out(request, joined_to_ends)
+            way_out = find_way_out(request, joined_to_ends)
         if way_out and joined_to_ends[way_out[-1][1], way_out[-1][0]]:
             reached = grid.reachable([way_out[-1]], rule)
             reached_ends = ends[reached[ends[:, 1], ends[:, 0]]]
             return way_out, tuple((x, y) for x, y in reached_ends[:number].tolist())
     return (), goals
-
-
-def can_leave(request: PlanRequest) -> bool:
-    """Return whether a start that is not free has a way out to any free cell."""
-    return bool(_way_out(request, ~request.grid.occupancy))
 
 
 def obstacles_in_the_way(grid: GridMap, start: Cell, clearing_radius: float) -> Occupancy:
@@ -65,8 +127,8 @@ def obstacles_in_the_way(grid: GridMap, start: Cell, clearing_radius: float) -> 
     return obstacles
 
 
-def _way_out(request: PlanRequest, ends: NDArray[np.bool_]) -> tuple[Cell, ...]:
-    """Return the shortest way from a start that is not free to one of some free cells."""
+def find_way_out(request: PlanRequest, ends: NDArray[np.bool_]) -> tuple[Cell, ...]:
+    """Return the shortest way from a start that is not free to one of some free cells, or ()."""
     grid, rule, (goal_x, goal_y) = request.grid, request.move_rule, request.goal
     obstacles = obstacles_in_the_way(grid, request.start, request.start_clearing_radius)
     legal = legal_moves(~ends & (obstacles | ~grid.occupancy), rule, grid.forbidden)

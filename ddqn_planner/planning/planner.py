@@ -17,9 +17,15 @@ from ddqn_planner.grid.grid_map import check_grid
 from ddqn_planner.model import ModelMetadata, QNetwork, load_model
 from ddqn_planner.planning.field import DistanceField, Goals, QField
 from ddqn_planner.planning.field_cache import FieldCache
-from ddqn_planner.planning.paths import can_leave, keep_or_switch, reach, simplify, way_out_and_ends
+from ddqn_planner.planning.paths import (
+    find_way_out,
+    keep_or_switch,
+    reach,
+    search,
+    simplify,
+    way_out_and_ends,
+)
 from ddqn_planner.planning.plan import Plan, PlanMethod, PlanRequest, PlanStatus, joined
-from ddqn_planner.planning.search import search
 
 T = TypeVar("T")
 
@@ -85,10 +91,8 @@ class Planner:
         if not grid.is_free(goal):
             raise ValueError(f"the goal {goal} is not a free cell of the map; give another")
         if not self.network.supports((grid.height, grid.width)):
-            raise ValueError(
-                f"the model was not trained for maps of {grid.width} x {grid.height} cells; "
-                "train one on such a map"
-            )
+            problem = f"the model was not trained for maps of {grid.width} x {grid.height} cells"
+            raise ValueError(f"{problem}; train one on such a map")
         return self._fields.get(grid, (goal,), rule)
 
     def known_field(
@@ -143,9 +147,8 @@ class Planner:
             If the tolerance or the radius is negative or NaN, the start or the goal is no pair of
             whole numbers, or there is no such move rule or method.
         """
-        goals = [as_cell(goal, "the goal")]
         how = move_rule, method, tolerance, simplified, start_clearing_radius
-        return self._answer(grid, start, goals, how)
+        return self._answer(grid, start, [as_cell(goal, "the goal")], how)
 
     def plan_nearest(
         self,
@@ -214,19 +217,19 @@ class Planner:
 
     def _answer(self, grid: GridMap, start: Cell, goals: list[Cell], how: tuple[Any, ...]) -> Plan:
         """Check what a user asks for, and plan."""
-        move_rule, method, tolerance, simplified, start_clearing_radius = how
+        move_rule, method, tolerance, simplified, radius = how
         check_grid(grid)
-        goal, *others = goals
+        limits = 0, math.inf, "0 cells or more"
         request = PlanRequest(
             grid,
             as_cell(start, "the start"),
-            goal,
+            goals[0],
             self._rule(move_rule),
             PlanMethod(method),
-            _cells("the tolerance", tolerance),
+            as_number("the tolerance", tolerance, *limits),
             as_flag("simplified", simplified),
-            others=(*others,),
-            start_clearing_radius=_cells("start_clearing_radius", start_clearing_radius),
+            others=tuple(goals[1:]),
+            start_clearing_radius=as_number("start_clearing_radius", radius, *limits),
         )
         return last_step(self.steps(request))
 
@@ -239,15 +242,9 @@ class Planner:
         if isinstance(found, PlanStatus):
             yield Plan(found, move_rule=request.move_rule, field_ms=field_ms)
             return
-        plan, rollout_ms = found.plan, 0.0
-        if plan is None or not plan.path.size:
-            plan, rollout_ms = yield from _timed(_roll_out(request, found))
-        else:  # it was found with the field
-            field_ms, rollout_ms = field_ms - plan.rollout_ms, plan.rollout_ms
-        began = time.perf_counter()
-        dress = _dress(request, found, plan)
-        rollout_ms += 1e3 * (time.perf_counter() - began)
-        yield replace(plan, **dress, field_ms=field_ms, rollout_ms=rollout_ms)
+        (plan, dress), rollout_ms = yield from _timed(_roll_out(request, found))
+        known_ms = found.plan.rollout_ms if found.plan else 0.0  # it was found with the field
+        yield replace(plan, **dress, field_ms=field_ms - known_ms, rollout_ms=rollout_ms + known_ms)
 
     def _refusal(self, request: PlanRequest) -> PlanStatus | None:
         """Return why there is no path, where one look at start and goals says so."""
@@ -287,7 +284,7 @@ class Planner:
         if plan and plan.status is PlanStatus.NO_PATH and reach(request) < 1:
             return PlanStatus.NO_PATH
         way_out, ends = way_out_and_ends(request, goals)
-        if not way_out and grid.is_obstacle(start) and not can_leave(request):
+        if not way_out and grid.is_obstacle(start) and not find_way_out(request, ~grid.occupancy):
             return PlanStatus.START_OCCUPIED
         if not way_out:
             return PlanStatus.NO_PATH if goals else PlanStatus.GOAL_OCCUPIED
@@ -298,8 +295,9 @@ class Planner:
     def _nearest_alone(self, request: PlanRequest, goals: Goals) -> Goals:
         """Return the nearest of several goals, by a field toward each."""
         each = [replace(request, goal=goal, others=(), under_way=()) for goal in goals]
-        nearest = min((last_step(self.steps(one)) for one in each), key=_cost)
-        return nearest.cells[-1:] or goals[:1]
+        plans = [plan for one in each if (plan := last_step(self.steps(one))).path.size]
+        nearest = min(plans, key=lambda plan: plan.cost or plan.length, default=None)
+        return nearest.cells[-1:] if nearest else goals[:1]
 
 
 class _Found(NamedTuple):
@@ -327,22 +325,18 @@ def _in_parts(field: DistanceField, request: PlanRequest) -> Generator[None, Non
         yield
 
 
-def _roll_out(request: PlanRequest, found: _Found) -> Generator[None, None, Plan]:
-    """Return the rollout, or where it is trapped perhaps a search."""
-    start, field, rule = found.way_out[-1], found.field, request.move_rule
+def _roll_out(
+    request: PlanRequest, found: _Found
+) -> Generator[None, None, tuple[Plan, dict[str, Any]]]:
+    """Return the rollout, or if trapped perhaps a search, and what changes it to what is asked."""
+    grid, rule, way_out, field = request.grid, request.move_rule, found.way_out, found.field
+    start = way_out[-1]
     plan = found.plan or field.rollout(start)
     if not plan.path.size and request.method is PlanMethod.ASTAR_FALLBACK:
         yield
-        costs = request.grid.cost_multiplier
-        cells = search(start, field.goal, field.legal, costs, rule, field.value)
+        cells = search(start, field.goal, field.legal, grid.cost_multiplier, rule, field.value)
         plan = Plan(PlanStatus.SUCCEEDED, np.array(cells), PlanMethod.ASTAR_FALLBACK)
-    return plan
-
-
-def _dress(request: PlanRequest, found: _Found, plan: Plan) -> dict[str, Any]:
-    """Return what a plan gets: way out, what is kept of the path under way, cost, goal."""
-    grid, rule, way_out = request.grid, request.move_rule, found.way_out
-    path, cost, extra_cost, goal = plan.path, None, None, found.field.goal
+    path, cost, extra_cost, goal = plan.path, None, None, field.goal
     if path.size:
         if len(request.under_way):
             path, extra_cost = keep_or_switch(
@@ -359,7 +353,7 @@ def _dress(request: PlanRequest, found: _Found, plan: Plan) -> dict[str, Any]:
     if request.simplified:
         path = np.array(simplify(path, grid, rule), dtype=np.int32)
     dress = {"path": path, "every_cell": every_cell, "move_rule": rule}
-    return {**dress, "cost": cost, "extra_cost": extra_cost, "goal": goal}
+    return plan, {**dress, "cost": cost, "extra_cost": extra_cost, "goal": goal}
 
 
 def _timed(steps: Generator[None, None, T]) -> Generator[None, None, tuple[T, float]]:
@@ -388,13 +382,3 @@ def _cells_of_goals(goals: Sequence[Cell]) -> list[Cell]:
     if not cells:
         raise ValueError("there is no goal; give at least one cell")
     return cells
-
-
-def _cells(name: str, value: float) -> float:
-    return as_number(name, value, 0, math.inf, "0 cells or more")
-
-
-def _cost(plan: Plan) -> float:
-    if plan.status is not PlanStatus.SUCCEEDED:
-        return math.inf
-    return plan.length if plan.cost is None else plan.cost

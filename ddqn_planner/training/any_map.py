@@ -11,6 +11,8 @@ from ddqn_planner.grid.noise import random_costs, random_requests, unknown_costs
 from ddqn_planner.training.environment import Scenario
 from ddqn_planner.training.hyper_parameters import HyperParameters
 
+# Unlike the paper, every episode starts at a random free cell, a collision costs more than any
+# rollout on these maps, and the agent keeps exploring moves that it believes impossible.
 ANY_MAP: Final = HyperParameters(
     network="any_map",
     reward="path_cost",
@@ -30,29 +32,19 @@ ANY_MAP: Final = HyperParameters(
     max_episode_steps=50,
     steps=1_536_000,
 )
-"""Differences from the paper: every episode starts at a random free cell; a collision costs more
-than any rollout on these maps; and the agent keeps exploring moves it believes impossible."""
-
 MAPS: Final = 512
-SIDE: Final = 10
-"""Width and height of each map in cells."""
+SIDE: Final = 10  # cells
 
 RULES: Final = (MoveRule.ROBOT_SAFE, MoveRule.CORNER_CUTTING)
 
 
 def random_scenarios(seed: int, maps: int = MAPS) -> list[Scenario]:
-    """Draw the maps to train on. The same seed gives the same maps.
-
-    10 to 60 % of the cells are occupied, each independently: of the map types in
-    `experiments/random_maps.py`, training uses only this one. The high fill rates show 3x3
-    patches that are rare otherwise. Each move rule has half of the maps. A quarter of the maps has
-    no costs, a quarter random costs, a quarter one constant cost, a quarter unknown cells. A path
-    connects each start with its goal.
-    """
+    """Draw maps to train on, half for each move rule; a path connects each start with its goal."""
     random = np.random.default_rng(seed)
     scenarios = []
     for number in range(maps):
         rule = RULES[number % 2]
+        # High fill rates show 3x3 patches that are rare otherwise.
         occupancy = random.random((SIDE, SIDE)) < random.uniform(0.1, 0.6)
         # All four are drawn each time: the draws belong to what one seed gives.
         constant = np.full((SIDE, SIDE), random.integers(100), dtype=np.int8)

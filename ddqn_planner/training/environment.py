@@ -1,15 +1,4 @@
-"""The grid environment: N robots in NumPy, and one robot with Gymnasium's interface.
-
-Action space
-    ``Discrete(8)``: the moves of `ddqn_planner.grid.MOVES`.
-Observation space
-    ``Box(H, W) float32``: the matrix of `ddqn_planner.model.observation`.
-Rewards
-    ``obstacle_reward`` for an illegal move, after which the robot stays in its cell. For a legal
-    move that of `ddqn_planner.training.reward.move_reward`.
-End of an episode
-    Terminated at the goal or at an illegal move, truncated after ``max_episode_steps``.
-"""
+"""The grid environment: N robots in NumPy, and one robot with Gymnasium's interface."""
 
 from __future__ import annotations
 
@@ -58,13 +47,10 @@ def paper_scenario() -> Scenario:
 
 
 class GridVectorEnvironment:
-    """N robots on grid maps, all moved in one step.
+    """N robots on maps of one size, moved in one step; each episode draws one of S scenarios."""
 
-    Each episode draws one of the scenarios, on maps of one size; `move_rule` is that of those that
-    have none. Cells are numbers y * W + x. The results of all moves are looked up in tables, (S
-    scenarios, 8 actions, H * W). An ended episode keeps its last cell until `reset`, which must
-    also begin the first episodes.
-    """
+    # Cells are numbers y * W + x. The results of moves are looked up in tables (S, 8, H * W).
+    # `reset` begins the first episodes too; one that has ended keeps its last cell until then.
 
     def __init__(
         self,
@@ -83,21 +69,20 @@ class GridVectorEnvironment:
         self.random = random or np.random.default_rng()
 
         with_rules = list(zip(self.scenarios, self.move_rules, strict=True))
-        maps = [observation_background(s.grid.occupancy, s.goal) for s in self.scenarios]
+        maps = [observation_background(s.grid.occupancy, s.goal) for s in scenarios]
         legal = [s.grid.legal_moves(rule) for s, rule in with_rules]
         reward = [move_reward(s.grid, s.start, s.goal, rule, parameters) for s, rule in with_rules]
-        tables = (len(self.scenarios), len(MOVES), -1)
+        tables, to_number = (len(scenarios), len(MOVES), -1), np.array([1, self.shape[1]])
         self.background = np.stack(maps)
         self.legal = np.stack(legal).reshape(tables)
         self.free_reward = np.stack(reward).reshape(tables)
         collision = np.float32(parameters.obstacle_reward)
         self._reward = np.where(self.legal, self.free_reward, collision)
-        width = self.shape[1]
-        self._offset = MOVES[:, 1] * width + MOVES[:, 0]
+        self._offset = MOVES @ to_number
+        self.start = np.array([s.start for s in scenarios]) @ to_number
+        self.goal = np.array([s.goal for s in scenarios]) @ to_number
 
-        self.start = np.array([s.start[1] * width + s.start[0] for s in self.scenarios])
-        self.goal = np.array([s.goal[1] * width + s.goal[0] for s in self.scenarios])
-        free_SC = np.stack([~s.grid.occupancy.ravel() for s in self.scenarios])
+        free_SC = np.stack([~s.grid.occupancy.ravel() for s in scenarios])
         free_SC[np.arange(len(self.goal)), self.goal] = False
         _, self._free = np.nonzero(free_SC)
         self._free_count = free_SC.sum(axis=1)
@@ -125,7 +110,7 @@ class GridVectorEnvironment:
     def move(
         self, actions: NDArray[np.int64]
     ) -> tuple[NDArray[np.float32], NDArray[np.bool_], NDArray[np.bool_]]:
-        """Move each robot once, (N,) actions; return reward, terminated and truncated."""
+        """Move each robot once, (N,) actions; return reward, terminated, truncated: (N,) each."""
         lookup = (self.scenario, actions, self.cell)
         legal, reward = self.legal[lookup], self._reward[lookup]
         self.cell = np.where(legal, self.cell + self._offset[actions], self.cell)
@@ -140,10 +125,7 @@ class GridVectorEnvironment:
 
 
 class GridEnvironment(gymnasium.Env[Observations, np.int64]):
-    """One robot on one grid map, by default the paper's: a `GridVectorEnvironment` with N = 1.
-
-    ``gymnasium.make("ddqn_planner.training:ddqn_planner/Grid-v0")`` gives the paper's map.
-    """
+    """``ddqn_planner.training:ddqn_planner/Grid-v0``: one robot, by default on the paper's map."""
 
     metadata = {"render_modes": []}  # noqa: RUF012
 

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator
-from dataclasses import dataclass
 from enum import Enum
 from pathlib import Path
+from typing import NamedTuple
 
 from ddqn_planner.files import Appender, write_atomically
 from ddqn_planner.grid import Cell, MoveRule, path_length
@@ -25,8 +25,7 @@ class EpisodeEnd(str, Enum):
     OUT_OF_STEPS = "out_of_steps"
 
 
-@dataclass(frozen=True)
-class Episode:
+class Episode(NamedTuple):
     """An episode that has ended (the paper's round), the first one with number 1."""
 
     number: int

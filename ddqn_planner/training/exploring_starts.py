@@ -1,7 +1,4 @@
-"""Improvement 1 of the paper (section 4.1, "initialisation"): exploring starts.
-
-An episode starts at a random free cell with probability p_r, as RRT samples its cells.
-"""
+"""Improvement 1 of the paper (section 4.1, "initialisation"): exploring starts, as RRT samples."""
 
 from __future__ import annotations
 
@@ -17,10 +14,8 @@ def initial_cells(
     p_r: float,
     random: np.random.Generator,
 ) -> NDArray[np.int64]:
-    """Draw the cells in which N episodes start: random ones with probability p_r, else `start_N`.
-
-    `free_cells` are those of all maps, except the goals: `count_N` cells from place `first_N` on
-    are those of an episode's map.
-    """
+    """Draw where N episodes start: in random cells with probability p_r, else in `start_N`."""
+    # `free_cells` are those of all maps, goals left out: an episode's map has `count_N` of them,
+    # from place `first_N` on.
     at_random_N = random.random(len(start_N)) < p_r
     return np.where(at_random_N, free_cells[first_N + random.integers(count_N)], start_N)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, field, fields
+from dataclasses import dataclass, field, fields
 from typing import Any
 
 from ddqn_planner.model import NETWORKS
@@ -18,13 +18,9 @@ def _choice(*choices: str, source: str) -> Any:
 
 @dataclass(frozen=True)
 class HyperParameters:
-    """The values of the paper's Table 1, and our values where the paper gives none.
+    """The paper's Table 1, and our values where it gives none; a ValueError names a wrong one."""
 
-    ``p_r = 0`` switches off improvement 1 (initialisation), ``alpha = beta = 0`` improvement 2
-    (reward). A ValueError if a value is outside its range or not one of its choices, or the replay
-    buffer cannot hold one step of all environments.
-    """
-
+    # p_r = 0 switches off improvement 1 (initialisation), alpha = beta = 0 improvement 2 (reward).
     network: str = _choice(*NETWORKS, source="ours: the Q-network, see model/")
     target: str = _choice(
         "double_dqn", "dqn", "printed", source="ours: the target, see training/double_dqn.py"
@@ -63,13 +59,6 @@ class HyperParameters:
             low, high = entry.metadata.get("range", (value, value))
             if not low <= value <= high:
                 raise ValueError(f"{entry.name} is {value}; it must lie in {low} to {high}")
-        if self.environments > self.replay_capacity:
-            raise ValueError(
-                f"environments is {self.environments}; it must be at most replay_capacity, "
-                f"{self.replay_capacity}"
-            )
-
-    def network_sizes(self, shape: tuple[int, int]) -> dict[str, int]:
-        """Return the sizes of the network for maps of shape (H, W)."""
-        known = {**asdict(self), "height": shape[0], "width": shape[1]}
-        return {name: known[name] for name in NETWORKS[self.network].size_names}
+        count, most = self.environments, self.replay_capacity
+        if count > most:
+            raise ValueError(f"environments is {count}; give at most replay_capacity, {most}")

@@ -1,10 +1,4 @@
-"""The Q-networks as torch modules, and their states, of robots in given cells of given maps.
-
-The modules and the networks of `ddqn_planner.model.networks` have the same tensors; planning uses
-the latter, see `TrainableNetwork.to_numpy`.
-Dimensions: B = a batch, A = 8 actions, F = filters, I = inputs of the first layer, L = windows,
-S maps, C = H * W cells (cell y * W + x).
-"""
+"""The networks of `ddqn_planner.model` as torch modules, and their states on given maps."""
 
 from __future__ import annotations
 
@@ -21,11 +15,8 @@ from ddqn_planner.model import AnyMapQNetwork, PaperQNetwork, PropagationQNetwor
 from ddqn_planner.model.observation import observe, patches
 from ddqn_planner.training.environment import GridVectorEnvironment
 
-SETTLED = 1e-3
-"""Value iteration ends when no value changes by this or more."""
-
-MAX_ITERATIONS = 1000
-"""It ends in any case after this many iterations and one per cell of the map."""
+# Dimensions: B = a batch, A = 8 actions, F = filters, I = inputs of the first layer, L = windows,
+# S maps, C = H * W cells (cell y * W + x).
 
 LENGTHS_A: Final = torch.tensor(LENGTHS, dtype=torch.float32)
 
@@ -71,10 +62,8 @@ class PaperModule(TrainableNetwork):
 
     @staticmethod
     def windows(observation_BHW: Tensor) -> Tensor:
-        """Return the states for observations (B, H, W): (B, 9, L), L windows of 3x3 cells.
-
-        On windows the convolution is a matrix product, which is faster on small maps.
-        """
+        """Return the states for observations (B, H, W): (B, 9, L), L windows of 3x3 cells."""
+        # On windows the convolution is a matrix product, which is faster on small maps.
         return functional.unfold(observation_BHW.unsqueeze(1), 3, padding=1, stride=2)
 
     def forward(self, window_BKL: Tensor) -> Tensor:
@@ -92,7 +81,6 @@ class PropagationModule(TrainableNetwork):
     """The propagation network, see `PropagationQNetwork`."""
 
     numpy_class: ClassVar[type[PropagationQNetwork]] = PropagationQNetwork
-    learns_costs: ClassVar[bool] = False
 
     def __init__(self, filters: int) -> None:
         super().__init__(filters=filters)
@@ -123,7 +111,6 @@ class AnyMapModule(PropagationModule):
     """The network for any map, see `AnyMapQNetwork`."""
 
     numpy_class = AnyMapQNetwork
-    learns_costs = True
 
     def __init__(self, filters: int) -> None:
         super().__init__(filters)
@@ -164,48 +151,38 @@ class ObservationEncoder:
 
 
 class PropagationEncoder(ObservationEncoder):
-    """A propagation network observes the 3x3 patch around the robot, and the returns beyond it.
+    """A propagation network observes the 3x3 patch around the robot, and the returns beyond it."""
 
-    A state, (I + 8 + 1,), is the features of the patch, the return r + γ V(s') of each move, and
-    r_o of a collision. V is settled under the target network θ⁻ and stays the same until the next
-    target copy. No gradient flows through it: back-propagation through the iteration diverges. For
-    a network that learns the cost of a move, the return is γ V(s') alone.
-    """
+    # A state, (I + 8 + 1,): the features of the patch, the return r + γ V(s') of each move (γ V(s')
+    # where r is learned), r_o. No gradient flows through V: back-propagation through it diverges.
 
     def __init__(self, environment: GridVectorEnvironment, target: PropagationModule) -> None:
         super().__init__(environment)
         with_rules = zip(environment.scenarios, environment.move_rules, strict=True)
-        self._feature_SCI = np.stack(
-            [
-                target.numpy_class.features(patches(s.grid.occupancy, s.grid.cost), rule)
-                for s, rule in with_rules
-            ]
-        )
-        maps, cells, _ = self._feature_SCI.shape
-        self._return_SCX = np.empty((maps, cells, len(MOVES) + 1), dtype=np.float32)
+        seen = [(patches(s.grid.occupancy, s.grid.cost), rule) for s, rule in with_rules]
+        feature_SCI = np.stack([target.numpy_class.features(*of_map) for of_map in seen])
+        self._state_SCX = np.pad(feature_SCI, ((0, 0), (0, 0), (0, len(MOVES) + 1)))
         self.update_target(target)
 
     def states(self, scenario: NDArray[np.int64], cell: NDArray[np.int64]) -> Tensor:
         """Return the states of robots in `cell` (B,) on the maps `scenario` (B,): (B, I + 9)."""
-        at = (scenario, cell)
-        state_BX = np.concatenate([self._feature_SCI[at], self._return_SCX[at]], axis=1)
-        return torch.from_numpy(state_BX)
+        return torch.from_numpy(self._state_SCX[scenario, cell])
 
     def update_target(self, target: TrainableNetwork) -> None:
-        """Settle V on every map under the new target network."""
+        """Settle V on every map under the new target network, until the next target copy."""
         assert isinstance(target, PropagationModule)
-        environment, feature_SCI = self._environment, torch.from_numpy(self._feature_SCI)
+        environment, inputs = self._environment, target.numpy_class.inputs
+        feature_SCI = torch.from_numpy(self._state_SCX[..., :inputs].copy())
         gamma, collision = environment.parameters.gamma, environment.parameters.obstacle_reward
         with torch.inference_mode():
             p_SAC = target.success(feature_SCI).numpy().transpose(0, 2, 1)
             cost_SAC = target.cost(feature_SCI).numpy().transpose(0, 2, 1)
-        reward_SAC = -cost_SAC if target.learns_costs else environment.free_reward
-        near_AC = neighbours(environment.shape)
-        goal_S = environment.goal
+        reward_SAC = -cost_SAC if target.numpy_class.uses_costs else environment.free_reward
+        near_AC, goal_S = neighbours(environment.shape), environment.goal
         return_SAC = value_iteration(p_SAC, reward_SAC, goal_S, near_AC, gamma, collision)
         return_SAC += cost_SAC
-        self._return_SCX[..., :-1] = return_SAC.transpose(0, 2, 1)
-        self._return_SCX[..., -1] = collision
+        self._state_SCX[..., inputs:-1] = return_SAC.transpose(0, 2, 1)
+        self._state_SCX[..., -1] = collision
 
 
 def encoder_for(target: TrainableNetwork, environment: GridVectorEnvironment) -> ObservationEncoder:
@@ -223,13 +200,9 @@ def value_iteration(
     gamma: float,
     collision: float,
 ) -> NDArray[np.float32]:
-    """Iterate V until it settles; return r + γ V(s') of each successful move: (S, 8, C) float32.
-
-    V(s) = max_a Q(s, a) with Q(s, a) = p (r + γ V(s')) + (1 - p) r_o, from the success p of a move,
-    its reward r, and r_o of a collision, which with γ = 1 must be less than any path's return;
-    V(goal) = 0, and V = r_o outside the map. Occupied cells have no rule of their own: p says that
-    moves into them fail.
-    """
+    """Iterate V until it settles; return r + γ V(s') of each successful move: (S, 8, C) float32."""
+    # V(s) = max_a Q(s, a), Q(s, a) = p (r + γ V(s')) + (1 - p) r_o, V(goal) = 0. Off the map V is
+    # r_o, which with γ = 1 must be less than any path's return. Into occupied cells p is 0.
     maps, _, cells = success_SAC.shape
     gain_SAC = np.float32(gamma) * success_SAC
     base_SAC = success_SAC * reward_SAC + (1 - success_SAC) * np.float32(collision)
@@ -238,14 +211,14 @@ def value_iteration(
     base_SAC[np.arange(maps), :, goal_S] = 0.0
     # From below, as if every move collided: values then rise outwards from the goal.
     value_SC = np.full((maps, cells + 1), collision, dtype=np.float32)
-    for _ in range(cells + MAX_ITERATIONS):
+    for _ in range(cells + 1000):  # values that are not finite never settle
         q_SAC = value_SC.take(neighbours_AC, axis=1)
         q_SAC *= gain_SAC
         q_SAC += base_SAC
         new_SC = q_SAC.max(axis=1)
         change = np.abs(new_SC - value_SC[:, :-1]).max()
         value_SC[:, :-1] = new_SC
-        if change < SETTLED:
+        if change < 1e-3:
             break
     return_SAC: NDArray[np.float32] = reward_SAC + np.float32(gamma) * value_SC[:, neighbours_AC]
     return return_SAC

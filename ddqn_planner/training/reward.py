@@ -12,14 +12,9 @@ from ddqn_planner.training.hyper_parameters import HyperParameters
 def free_cell_reward(
     shape: tuple[int, int], start: Cell, goal: Cell, parameters: HyperParameters
 ) -> NDArray[np.float32]:
-    """Return R_t of each move onto a free cell: (8, H, W), ``[a, y, x]`` of action a in (x, y).
-
-    R_t = α (d_re(t-1) - d_re(t)) + β (d_rs(t) - d_rs(t-1) - d(t, t-1)), with d_re and d_rs the
-    Euclidean distances of the robot to the end (the goal) and to the start, and d(t, t-1) the
-    length of the move: α rewards progress toward the goal, β punishes a detour from the start. The
-    start is always the given one, also in an episode that starts elsewhere: so the reward depends
-    only on what the robot observes. With α = β = 0, as in plain DDQN, free cells have no reward.
-    """
+    """Return R_t of each move onto a free cell: (8, H, W), ``[a, y, x]`` of action a in (x, y)."""
+    # R_t = α (d_re(t-1) - d_re(t)) + β (d_rs(t) - d_rs(t-1) - d(t, t-1)): d_re is the distance to
+    # the end (the goal), d_rs that to the given start, and d(t, t-1) is the length of the move.
     y, x = np.mgrid[0 : shape[0], 0 : shape[1]]
 
     def change_of_distance(cell: Cell) -> NDArray[np.float64]:
@@ -36,13 +31,9 @@ def free_cell_reward(
 def move_reward(
     grid: GridMap, start: Cell, goal: Cell, move_rule: MoveRule, parameters: HyperParameters
 ) -> NDArray[np.float32]:
-    """Return the reward of each legal move: (8, H, W) float32.
-
-    With ``reward = "paper"`` this is ``goal_reward`` onto the goal, else `free_cell_reward`. With
-    ``"path_cost"`` it is minus the move's cost, so that the best return is the cheapest path. That
-    depends on neither start nor goal, only on the cells around the robot.
-    """
+    """Return the reward of each legal move: (8, H, W) float32."""
     if parameters.reward == "path_cost":
+        # The best return is the cheapest path. It depends on the cells around the robot alone.
         return -move_costs(grid.cost_multiplier, move_rule).astype(np.float32)
     shape = (grid.height, grid.width)
     reward = free_cell_reward(shape, start, goal, parameters)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from contextlib import closing, contextmanager
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from pathlib import Path
 
 from ddqn_planner.files import WorkFolder
@@ -22,17 +22,7 @@ MARKS = LOCK, CHECKPOINT = "training.lock", "checkpoint.safetensors"
 
 
 class TrainingRun(WorkFolder):
-    """Trains into a folder, or continues there when the folder holds a checkpoint.
-
-    The run writes ``model.safetensors``, ``checkpoint.safetensors``, ``episodes.csv``, and
-    ``training.lock``, which keeps other processes out until `close` or the end of the process. The
-    folder must be new or empty, or belong to a training.
-
-    A FolderError if it does not, or if another process trains there. A CheckpointError if the
-    checkpoint cannot be read, or is one of another move rule or seed, or of other scenarios or
-    parameters, except ``steps``. An OSError if the folder cannot be written. A MemoryError if the
-    training does not fit into the memory, also from `steps`.
-    """
+    """Trains into a folder, or continues there; an error says why it cannot, or what differs."""
 
     def __init__(
         self,
@@ -46,28 +36,40 @@ class TrainingRun(WorkFolder):
         super().__init__(Path(folder), MARKS, "training", "trains", after)
         self.model_path = self.folder / "model.safetensors"
         self.checkpoint_path = self.folder / CHECKPOINT
-        self.curves_path = self.folder / "episodes.csv"
         with self.opening() as files:
             with _memory_with_remedy():
                 if self.checkpoint_path.exists():
                     self.trainer = Trainer.load_checkpoint(self.checkpoint_path, scenarios)
-                    _check_same_training(self.trainer, move_rule, parameters, seed, self.folder)
+                    self._check_same(
+                        {**asdict(parameters), "seed": seed, "move_rule": move_rule.value}
+                    )
                     self.trainer.parameters = parameters
                 else:
                     self.trainer = Trainer(scenarios, move_rule, parameters, seed)
-            self._record = open_record(self.curves_path, self.trainer.episodes)
+            self._record = open_record(self.folder / "episodes.csv", self.trainer.episodes)
             files.enter_context(closing(self._record))
         self.saved_at = self.trainer.steps
         self.description = (
-            f"training in {self.folder} from step {self.trainer.steps} to {parameters.steps}"
+            f"training in {self.folder} from step {self.saved_at} to {parameters.steps}"
         )
 
-    def steps(self) -> Iterator[list[Episode]]:
-        """Train until ``parameters.steps``; save every `SAVE_INTERVAL` steps and at the end.
+    def _check_same(self, now: dict[str, object]) -> None:
+        """Compare the checkpoint's training with one of now, which may have other `steps`."""
+        rule, seed = self.trainer.move_rule.value, self.trainer.seed
+        saved = {**asdict(self.trainer.parameters), "seed": seed, "move_rule": rule}
+        differences = [
+            f"{name} {value} (now {now[name]})"
+            for name, value in saved.items()
+            if value != now[name] and name != "steps"
+        ]
+        if differences:
+            raise CheckpointError(
+                f"{self.folder} holds a training with {', '.join(differences)}; give those values "
+                "to continue it, or another folder"
+            )
 
-        Yield the episodes that ended with each step. If a save fails, the training continues, and
-        `save_error` says why until a save succeeds.
-        """
+    def steps(self) -> Iterator[list[Episode]]:
+        """Train to the end, and save there too; yield after each step the episodes that ended."""
         rules, until = self.trainer.environment.move_rules, self.trainer.parameters.steps
         with _memory_with_remedy():
             for finished in self.trainer.run(until):
@@ -83,8 +85,7 @@ class TrainingRun(WorkFolder):
         """Write the model, the checkpoint and the episodes; if that fails, old files stay."""
         self.saved_at = self.trainer.steps
         with self.saving():
-            # A kill between the two leaves a model that is newer than the checkpoint. Both are
-            # complete, and nothing needs them to be of the same step.
+            # A kill between the two leaves a model that is newer than the checkpoint: no harm.
             self.trainer.save_model(self.model_path)
             self.trainer.save_checkpoint(self.checkpoint_path)
             self._record.flush()
@@ -102,19 +103,3 @@ def _memory_with_remedy() -> Iterator[None]:
             "the training does not fit into the memory; take a smaller map, or smaller filters, "
             "hidden_units, batch_size, environments or replay_capacity"
         ) from error
-
-
-def _check_same_training(
-    trainer: Trainer, move_rule: MoveRule, parameters: HyperParameters, seed: int, folder: Path
-) -> None:
-    now = {**asdict(parameters), "seed": seed, "move_rule": move_rule.value}
-    saved = asdict(replace(trainer.parameters, steps=parameters.steps))
-    saved |= {"seed": trainer.seed, "move_rule": trainer.move_rule.value}
-    differences = [
-        f"{name} {value} (now {now[name]})" for name, value in saved.items() if value != now[name]
-    ]
-    if differences:
-        raise CheckpointError(
-            f"{folder} holds a training with {', '.join(differences)}; give those values to "
-            "continue it, or another folder"
-        )

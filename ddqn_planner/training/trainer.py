@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 import hashlib
 import json
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -21,12 +21,11 @@ from ddqn_planner.files import write_atomically
 from ddqn_planner.grid import MOVES, MoveRule
 from ddqn_planner.model import ModelMetadata, package_version, save_model
 from ddqn_planner.planning import Planner
-from ddqn_planner.training.double_dqn import double_dqn_loss
+from ddqn_planner.training.double_dqn import ReplayBuffer, Transitions, double_dqn_loss
 from ddqn_planner.training.environment import GridVectorEnvironment, Scenario
 from ddqn_planner.training.episodes import Episode, EpisodeEnd
 from ddqn_planner.training.hyper_parameters import HyperParameters
 from ddqn_planner.training.networks import MODULES, encoder_for
-from ddqn_planner.training.replay_buffer import ReplayBuffer, Transitions
 
 CHECKPOINT_KEY = "ddqn_planner_checkpoint"
 DIGEST_KEY = "sha256"
@@ -40,11 +39,7 @@ class CheckpointError(ValueError):
 
 
 class Trainer:
-    """Trains a Q-network by Double DQN in a `GridVectorEnvironment`; the seed is at least 0.
-
-    The same scenarios, parameters and seed give the same network, bit for bit, also when
-    `save_checkpoint` and `load_checkpoint` interrupt the training.
-    """
+    """Trains a Q-network by Double DQN; the same arguments give the same network, bit for bit."""
 
     def __init__(
         self,
@@ -57,9 +52,7 @@ class Trainer:
         self.move_rule = move_rule
         self.parameters = parameters
         self.seed = seed
-        self.steps = 0
-        self.updates = 0
-        self.episodes = 0
+        self.steps = self.updates = self.episodes = 0
 
         weights, environment, exploration, replay = np.random.SeedSequence(seed).spawn(4)
         drawing = np.random.default_rng(environment)
@@ -68,12 +61,16 @@ class Trainer:
         self._sampling = np.random.default_rng(replay)
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(int(weights.generate_state(1)[0]))
-            sizes = parameters.network_sizes(self.environment.shape)
-            self.network = MODULES[parameters.network](**sizes)
+            module, (height, width) = MODULES[parameters.network], self.environment.shape
+            known = {**asdict(parameters), "height": height, "width": width}
+            self.network = module(**{name: known[name] for name in module.numpy_class.size_names})
         self._target = copy.deepcopy(self.network).requires_grad_(False)
         self.encoder = encoder_for(self._target, self.environment)
         self._weights = tuple(self.network.parameters())
         self._optimiser = torch.optim.Adam(self._weights, parameters.learning_rate, fused=FUSED)
+        for weight in self._weights:  # as Adam does at its first step; a checkpoint restores it
+            moments = {name: torch.zeros_like(weight) for name in ("exp_avg", "exp_avg_sq")}
+            self._optimiser.state[weight] = {"step": torch.zeros(()), **moments}
         self._replay = ReplayBuffer(parameters.replay_capacity)
 
         self.environment.reset()
@@ -88,11 +85,7 @@ class Trainer:
         return p.epsilon_start + fraction * (p.epsilon_end - p.epsilon_start)
 
     def run(self, until: int) -> Iterator[list[Episode]]:
-        """Train until the trainer has made `until` environment steps in all.
-
-        Yield the episodes that ended with each step, often none. Between two steps the caller may
-        save the trainer or leave the loop.
-        """
+        """Train until step `until`; yield after each step the episodes that ended with it."""
         p = self.parameters
         while self.steps < until:
             scenario, cell = self.environment.scenario.copy(), self.environment.cell
@@ -131,16 +124,7 @@ class Trainer:
             np.tile(batch.scenario, 2), np.concatenate([batch.cell, batch.next_cell])
         )
         state, next_state = states.chunk(2)
-        loss = double_dqn_loss(
-            self.network,
-            self._target,
-            p.target,
-            state,
-            torch.from_numpy(batch.action),
-            torch.from_numpy(batch.reward),
-            next_state,
-            torch.from_numpy(batch.discount),
-        )
+        loss = double_dqn_loss(self.network, self._target, p.target, batch, state, next_state)
         # Unlike backward(), grad() adds to no old gradient, so there is none to set to zero.
         gradients = torch.autograd.grad(loss, self._weights)
         for weight, gradient in zip(self._weights, gradients, strict=True):
@@ -160,14 +144,15 @@ class Trainer:
         for index in places:
             cells, scenario = self._visited[index], int(self.environment.scenario[index])
             moves, outcome = len(cells) - 1, EpisodeEnd.OUT_OF_STEPS
-            if terminated[index] and cells[-1] == self.environment.goal[scenario]:
+            if cells[-1] == self.environment.goal[scenario]:
                 outcome = EpisodeEnd.REACHED_GOAL
             elif terminated[index]:
                 outcome, cells = EpisodeEnd.COLLIDED, cells[:-1]
             visited = tuple((cell % width, cell // width) for cell in cells)
-            number, total = self.episodes + len(episodes) + 1, float(self._total_reward[index])
-            episodes.append(Episode(number, self.steps, scenario, outcome, visited, moves, total))
-        self.episodes += len(episodes)
+            total = float(self._total_reward[index])
+            self.episodes += 1
+            ends = self.episodes, self.steps, scenario, outcome, visited, moves, total
+            episodes.append(Episode(*ends))
         self.environment.reset(ended)
         for index in places:
             self._visited[index] = [int(self.environment.cell[index])]
@@ -194,10 +179,7 @@ class Trainer:
         save_model(path, planner.network, planner.metadata)
 
     def save_checkpoint(self, path: str | Path) -> None:
-        """Write all that `load_checkpoint` needs to continue as if nothing had happened.
-
-        After an OSError, the file before it stays as it is.
-        """
+        """Write all that `load_checkpoint` needs; after an OSError, an old file is unchanged."""
         description = {  # with the names of 0.1, whose checkpoints load too
             "seed": self.seed,
             "move_rule": self.move_rule,
@@ -207,21 +189,16 @@ class Trainer:
             "walked": self._visited,
             "generators": [generator.bit_generator.state for generator in self._generators()],
         }
-        tensors = self._tensors()
-        text = json.dumps(description)
+        text, tensors = json.dumps(description), self._tensors()
         metadata = {CHECKPOINT_KEY: text, DIGEST_KEY: _digest(text, tensors)}
         write_atomically(Path(path), safetensors.torch.save(tensors, metadata))
 
     @classmethod
     def load_checkpoint(cls, path: str | Path, scenarios: Sequence[Scenario]) -> Trainer:
-        """Return the trainer that `save_checkpoint` wrote; a checkpoint holds no scenarios.
-
-        A CheckpointError if the file is missing, broken or no checkpoint, or was made with other
-        scenarios.
-        """
+        """Return the trainer of a checkpoint, made with these scenarios, or a CheckpointError."""
         try:
             with safe_open(path, framework="pt") as file:
-                metadata = file.metadata() or {}
+                metadata = file.metadata()
                 text = metadata[CHECKPOINT_KEY]
                 description = json.loads(text)
                 if description["scenarios"] != _fingerprints(scenarios):
@@ -262,28 +239,23 @@ class Trainer:
             generator.bit_generator.state = state
 
     def _tensors(self) -> dict[str, Tensor]:
-        """Return the tensors of a checkpoint. They share the trainer's memory."""
-        environment, stored = self.environment, len(self._replay)
-        tensors = {"total_reward": torch.from_numpy(self._total_reward)}
-
-        def add(group: str, parts: Mapping[str, Tensor | NDArray[Any]]) -> None:
-            for name, part in parts.items():
-                tensors[f"{group}.{name}"] = torch.as_tensor(part)
-
-        add("network", self.network.state_dict())
-        add("target", self._target.state_dict())
-        replay = self._replay.transitions._asdict()
-        add("replay", {name: values[:stored] for name, values in replay.items()})
+        """Return the tensors of a checkpoint, which share the trainer's memory."""
+        environment, replay = self.environment, self._replay.transitions._asdict()
         names = ("scenario", "cell", "steps")
-        add("environment", {name: getattr(environment, name) for name in names})
-        # Adam makes its state at the first update.
+        groups: dict[str, dict[str, Any]] = {
+            "network": self.network.state_dict(),
+            "target": self._target.state_dict(),
+            "replay": {name: values[: len(self._replay)] for name, values in replay.items()},
+            "environment": {name: getattr(environment, name) for name in names},
+        }
         for index, weight in enumerate(self._weights if self.updates else ()):
-            state = self._optimiser.state[weight]
-            if not state:
-                zeros = torch.zeros_like
-                state.update(step=torch.zeros(()), exp_avg=zeros(weight), exp_avg_sq=zeros(weight))
-            add(f"optimiser.{index}", state)
-        return tensors
+            groups[f"optimiser.{index}"] = self._optimiser.state[weight]
+        tensors = {
+            f"{group}.{name}": torch.as_tensor(part)
+            for group, parts in groups.items()
+            for name, part in parts.items()
+        }
+        return tensors | {"total_reward": torch.from_numpy(self._total_reward)}
 
     def _generators(self) -> tuple[np.random.Generator, ...]:
         return self.environment.random, self._exploration, self._sampling

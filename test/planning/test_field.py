@@ -19,7 +19,7 @@ from ddqn_planner import GridMap, MoveRule, Planner, PlanStatus
 from ddqn_planner.grid import Cell, shortest_distances
 from ddqn_planner.grid.noise import random_requests
 from ddqn_planner.planning import field as fields
-from ddqn_planner.planning import kernels, repair
+from ddqn_planner.planning import kernels
 from ddqn_planner.planning.field import DistanceField, network_field
 
 RULES = st.sampled_from(list(MoveRule))
@@ -91,7 +91,7 @@ def test_a_request_without_a_path_does_not_visit_the_whole_map() -> None:
 @pytest.fixture(autouse=True)
 def any_share(monkeypatch: pytest.MonkeyPatch) -> None:
     """Repair the small maps of these tests, however much of them changes."""
-    monkeypatch.setattr(repair, "CHANGED_SHARE", 1.0)
+    monkeypatch.setattr(fields, "CHANGED_SHARE", 1.0)
     monkeypatch.setattr(fields, "REPAIRED_SHARE", 1.0)
     monkeypatch.setattr(fields, "REPAIRED", fields.REPAIRED)  # tests change it
 
@@ -182,9 +182,7 @@ def test_a_changed_map_uses_what_is_known_of_the_one_before() -> None:
     older, field = planner.q_field(grid, goal), fresh_field(changed, goal, MoveRule.ROBOT_SAFE)
     assert isinstance(older, DistanceField)
     known = np.count_nonzero(older.known.distance)
-    cells = repair.changed_cells(grid, changed, (0, 0))
-    assert cells is not None
-    assert field.take_over(older, cells, (0, 0))
+    assert field.take_over(older, (0, 0))
     assert np.count_nonzero(field.known.distance) > 0.9 * known
     assert np.count_nonzero(older.known.distance) == 1  # it handed over its memory
     assert field.rollout(start) == fresh_field(changed, goal, MoveRule.ROBOT_SAFE).rollout(start)
@@ -243,7 +241,7 @@ def test_a_field_that_is_interrupted_anywhere_is_as_a_new_one(
 
 def run_until(line: int, step: Callable[[], object]) -> None:
     """Run a step, and fail where so many lines of the field's code were run, if it gets there."""
-    files = {module.__file__ for module in (fields, repair, kernels)}
+    files = {module.__file__ for module in (fields, kernels)}
     left = line
 
     def trace(frame: FrameType, event: str, _: object) -> Any:
@@ -269,11 +267,11 @@ def run_until(line: int, step: Callable[[], object]) -> None:
 def test_after_too_many_changes_both_fields_are_kept(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.undo()
     first, second = (GridMap(np.random.default_rng(n).random((60, 60)) < 0.2) for n in (0, 1))
-    assert repair.changed_cells(first, second, (0, 0)) is None
+    assert fields.changed_cells(first, second, (0, 0)) is None
     goal = next(cell for cell in first.free_cells() if second.is_free(cell))
     planner = Planner(NETWORK, METADATA)
-    fields = [planner.q_field(grid, goal) for grid in (first, second, first, second)]
-    assert fields[:2] == fields[2:]
+    kept = [planner.q_field(grid, goal) for grid in (first, second, first, second)]
+    assert kept[:2] == kept[2:]
 
 
 @pytest.mark.parametrize(
@@ -292,9 +290,9 @@ def test_maps_are_compared_where_one_is_the_other_shifted_by_whole_cells(
 ) -> None:
     cells = np.zeros((9, 9))
     old = GridMap(cells, 0.05)
-    assert repair.shift_between(old, GridMap(cells, resolution, origin)) == shift
+    assert fields.shift_between(old, GridMap(cells, resolution, origin)) == shift
     with_costs = GridMap(cells, resolution, origin, np.ones((9, 9), dtype=np.int8))
-    assert repair.shift_between(old, with_costs) is None
+    assert fields.shift_between(old, with_costs) is None
 
 
 def test_threads_share_a_planner_while_the_map_changes() -> None:

@@ -17,7 +17,6 @@ from ddqn_planner import GridMap, MoveRule, PlanMethod, Planner, PlanStatus
 from ddqn_planner.grid import Cell, shortest_distances
 from ddqn_planner.model import ModelMetadata
 from ddqn_planner.planning import field as fields
-from ddqn_planner.planning import repair
 from ddqn_planner.planning.field import DistanceField
 from ddqn_planner.planning.plan import PlanRequest, joined
 from ddqn_planner.planning.planner import last_step
@@ -89,7 +88,7 @@ def test_a_field_toward_several_goals_is_repaired(
     goals = data.draw(st.lists(cells_of(grid), min_size=2, max_size=4))
     planner = new_planner()
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(repair, "CHANGED_SHARE", 1.0)
+        patch.setattr(fields, "CHANGED_SHARE", 1.0)
         patch.setattr(fields, "REPAIRED", data.draw(st.sampled_from([1, 300])))
         for _ in range(3):
             plan = planner.plan_nearest(grid, start, goals, rule)

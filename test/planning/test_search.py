@@ -18,7 +18,7 @@ from ddqn_planner.grid import (
     path_cost,
     shortest_distances,
 )
-from ddqn_planner.planning.search import search
+from ddqn_planner.planning.paths import search
 
 ANY_VALUE = st.floats(width=32, allow_nan=True, allow_infinity=True)
 

@@ -4,7 +4,7 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ddqn_planner.training.replay_buffer import ReplayBuffer, Transitions
+from ddqn_planner.training.double_dqn import ReplayBuffer, Transitions
 
 
 def numbered(first: int, count: int) -> Transitions:

@@ -12,11 +12,11 @@ from safetensors import safe_open
 
 from ddqn_planner import GridMap, MoveRule, PlanStatus
 from ddqn_planner.model import load_model
+from ddqn_planner.training.double_dqn import Transitions
 from ddqn_planner.training.environment import Scenario
 from ddqn_planner.training.episodes import Episode, EpisodeEnd
 from ddqn_planner.training.evaluation import evaluate
 from ddqn_planner.training.hyper_parameters import HyperParameters
-from ddqn_planner.training.replay_buffer import Transitions
 from ddqn_planner.training.trainer import CheckpointError, Trainer
 
 QUICK = HyperParameters(
