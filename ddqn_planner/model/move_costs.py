@@ -47,15 +47,18 @@ class MoveCosts(NamedTuple):
         """Return the costs on a map, given its patches, with its directions and expected times."""
         costs = self._replace(patch=patch, width=grid.width + 2)
         if self.terms is not None:
-            costs = costs._replace(value=_cell_values(grid))
+            value = np.full((grid.height + 2, grid.width + 2), VALUES - 1, dtype=np.uint8)
+            inside = value[1:-1, 1:-1]
+            np.subtract(grid.cost, UNKNOWN, out=inside, casting="unsafe")
+            inside[grid.occupancy] = VALUES - 1
+            costs = costs._replace(value=value.ravel())
         if grid.forbidden is not None:
             patch, table = _with_directions(patch, self.table, np.pad(grid.forbidden, 1).ravel())
             costs = costs._replace(patch=patch, table=table)
         if grid.slowness is None:
             return costs
-        multiplier = grid.cost_multiplier
-        value = np.pad(multiplier, 1, constant_values=1).ravel()
-        return costs._replace(value=value, highest=costs.highest * float(multiplier.max()))
+        multiplier = np.pad(grid.cost_multiplier, 1, constant_values=1).ravel()
+        return costs._replace(value=multiplier, highest=costs.highest * float(multiplier.max()))
 
 
 def _with_directions(
@@ -80,16 +83,6 @@ def _occurring(values: NDArray[np.uint8]) -> NDArray[np.bool_]:
     for value in values:
         occurs[value] = True
     return occurs
-
-
-def _cell_values(grid: GridMap) -> NDArray[np.uint8]:
-    """Return the value of each cell of a map with costs, with a border: (C,) uint8."""
-    assert grid.cost is not None
-    value = np.full((grid.height + 2, grid.width + 2), VALUES - 1, dtype=np.uint8)
-    inside = value[1:-1, 1:-1]
-    np.subtract(grid.cost, UNKNOWN, out=inside, casting="unsafe")
-    inside[grid.occupancy] = VALUES - 1
-    return value.ravel()
 
 
 @compiled

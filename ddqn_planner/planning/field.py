@@ -74,13 +74,9 @@ class QField:
     @cached_property
     def policy(self) -> NDArray[np.int8]:
         """(H, W) int8: the legal action of the greatest Q; -1 where that is -inf."""
-        best = np.full(self.q.shape[1:], -np.inf, dtype=np.float32)
-        policy = np.full(self.q.shape[1:], -1, dtype=np.int8)
-        for action, (q, legal) in enumerate(zip(self.q, self.legal, strict=True)):
-            better = legal & (q > best)
-            np.copyto(best, q, where=better)
-            np.copyto(policy, action, where=better)
-        return policy
+        legal_q = np.where(self.legal & (self.q > -np.inf), self.q, np.float32(-np.inf))  # no NaN
+        best = np.where(legal_q.max(axis=0) > -np.inf, legal_q.argmax(axis=0), -1)
+        return best.astype(np.int8)
 
     @property
     def nbytes(self) -> int:
@@ -231,7 +227,7 @@ class DistanceField(QField):
         """Return the distance of every cell of the padded map, 0 where there is none: (C,)."""
         if not self.is_whole:
             distance, state, opened, _ = self._take()
-            opened, _ = kernels.grow(distance, state, opened, self.costs)
+            opened, _ = kernels.grow(distance, state, opened, self.costs, 0, 2**62)
             self.known = Known(distance, state, opened)
         return self.known.distance
 
@@ -239,7 +235,8 @@ class DistanceField(QField):
     def q(self) -> NDArray[np.float32]:  # type: ignore[override]
         """(8, H, W) float32: Q(s, a); -inf where no path to the goal begins with the action."""
         with self._lock:
-            return kernels.q_of(self._whole(), self.costs)
+            q = kernels.q_of(self._whole(), self.costs)
+        return q.reshape(8, -1, self.costs.width)[:, 1:-1, 1:-1]
 
     @cached_property
     def legal(self) -> NDArray[np.bool_]:  # type: ignore[override]
@@ -262,7 +259,8 @@ class DistanceField(QField):
     def policy(self) -> NDArray[np.int8]:
         """(H, W) int8: the action of a rollout in each cell; -1 without one."""
         with self._lock:
-            return kernels.policy_of(self._whole(), self.costs)
+            policy = kernels.policy_of(self._whole(), self.costs)
+        return policy.reshape(-1, self.costs.width)[1:-1, 1:-1]
 
     @property
     def nbytes(self) -> int:

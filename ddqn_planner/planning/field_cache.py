@@ -9,13 +9,7 @@ from dataclasses import dataclass, field
 from ddqn_planner.grid import Cell, GridMap, MoveRule
 from ddqn_planner.model import QNetwork
 from ddqn_planner.model.move_costs import MoveCosts
-from ddqn_planner.planning.field import (
-    DistanceField,
-    Goals,
-    QField,
-    network_field,
-    shift_between,
-)
+from ddqn_planner.planning.field import DistanceField, Goals, QField, network_field, shift_between
 
 CACHE_BYTES = 2**29  # for a planner's Q fields: 14 of 2000 x 2000 cells, at 9 bytes per cell
 
@@ -129,5 +123,5 @@ class FieldCache:
         """Put a map and its field where those lie that were used last."""
         known.fields[used.goals] = used
         known.fields.move_to_end(used.goals)
-        self._maps = [other for other in self._maps if other is not known and other.fields]
-        self._maps.append(known)
+        others = (other for other in self._maps if other is not known and other.fields)
+        self._maps = [*others, known]

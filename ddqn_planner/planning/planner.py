@@ -17,14 +17,7 @@ from ddqn_planner.grid.grid_map import check_grid
 from ddqn_planner.model import ModelMetadata, QNetwork, load_model
 from ddqn_planner.planning.field import DistanceField, Goals, QField
 from ddqn_planner.planning.field_cache import FieldCache
-from ddqn_planner.planning.paths import (
-    find_way_out,
-    keep_or_switch,
-    reach,
-    search,
-    simplify,
-    way_out_and_ends,
-)
+from ddqn_planner.planning.paths import find_way_out, keep_or_switch, search, simplify, way_and_ends
 from ddqn_planner.planning.plan import Plan, PlanMethod, PlanRequest, PlanStatus, joined
 
 T = TypeVar("T")
@@ -49,9 +42,8 @@ class Planner:
 
     def __init__(self, network: QNetwork, metadata: ModelMetadata) -> None:
         if not (hasattr(network, "move_costs") and hasattr(metadata, "move_rule")):
-            raise ValueError(
-                f"network is {network!r}, metadata is {metadata!r}; give what load_model returns"
-            )
+            given = f"network is {network!r}, metadata is {metadata!r}"
+            raise ValueError(f"{given}; give what load_model returns")
         self.network = network
         self.metadata = metadata
         self._fields = FieldCache(network)
@@ -144,8 +136,8 @@ class Planner:
         Raises
         ------
         ValueError
-            If the tolerance or the radius is negative or NaN, the start or the goal is no pair of
-            whole numbers, or there is no such move rule or method.
+            If the tolerance or the radius is negative or NaN, the start or a goal is no pair of
+            whole numbers, or there is no goal or no such move rule or method.
         """
         how = move_rule, method, tolerance, simplified, start_clearing_radius
         return self._answer(grid, start, [as_cell(goal, "the goal")], how)
@@ -171,11 +163,6 @@ class Planner:
             As for `plan`.
         goals : sequence of (x, y)
             At least one, in any order. No goal moves: there is no tolerance.
-
-        Raises
-        ------
-        ValueError
-            As for `plan`, or if there is no goal.
         """
         how = move_rule, method, 0.0, simplified, start_clearing_radius
         return self._answer(grid, start, _cells_of_goals(goals), how)
@@ -199,11 +186,6 @@ class Planner:
             As for `plan`. The tolerance holds for each goal. A simplified path keeps all goals.
         goals : sequence of (x, y)
             At least one. If one has no path, the plan's status tells why, and its goal which.
-
-        Raises
-        ------
-        ValueError
-            As for `plan`, or if there is no goal.
         """
         plans: list[Plan] = []
         how = move_rule, method, tolerance, simplified, start_clearing_radius
@@ -255,7 +237,7 @@ class Planner:
             return PlanStatus.GOAL_OUTSIDE_MAP
         if grid.is_obstacle(request.start) and request.start_clearing_radius == 0:
             return PlanStatus.START_OCCUPIED
-        if not any(grid.is_free(goal) for goal in request.goals) and reach(request) < 1:
+        if not any(grid.is_free(goal) for goal in request.goals) and request.reach < 1:
             return PlanStatus.GOAL_OCCUPIED
         if not self.network.supports((grid.height, grid.width)):
             return PlanStatus.MAP_SIZE_UNSUPPORTED
@@ -273,7 +255,7 @@ class Planner:
         if grid.is_free(start):
             field = self._fields.find(grid, goals, rule)
             plan = field.rollout_if_known(start) if field else None
-        if plan is None or (not plan.path.size and reach(request) >= 1):
+        if plan is None or (not plan.path.size and request.reach >= 1):
             yield
         if plan is None and goals and grid.is_free(start) and self._fields.has_costs(grid, rule):
             field = self._fields.get(grid, goals, rule, start)
@@ -281,9 +263,9 @@ class Planner:
             plan = yield from _in_parts(field, request)
         if field and plan and plan.path.size:
             return _Found(field, (start,), plan)
-        if plan and plan.status is PlanStatus.NO_PATH and reach(request) < 1:
+        if plan and plan.status is PlanStatus.NO_PATH and request.reach < 1:
             return PlanStatus.NO_PATH
-        way_out, ends = way_out_and_ends(request, goals)
+        way_out, ends = way_and_ends(request, goals)
         if not way_out and grid.is_obstacle(start) and not find_way_out(request, ~grid.occupancy):
             return PlanStatus.START_OCCUPIED
         if not way_out:
@@ -339,9 +321,7 @@ def _roll_out(
     path, cost, extra_cost, goal = plan.path, None, None, field.goal
     if path.size:
         if len(request.under_way):
-            path, extra_cost = keep_or_switch(
-                request.under_way, path, grid, rule, request.switch_threshold, request.goals
-            )
+            path, extra_cost = keep_or_switch(request, path)
         goal = (int(path[-1, 0]), int(path[-1, 1]))
         if len(way_out) > 1:
             path = np.concatenate([way_out[:-1], path], dtype=np.int32)
