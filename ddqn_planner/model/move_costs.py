@@ -46,7 +46,7 @@ class MoveCosts(NamedTuple):
     def on(self, grid: GridMap, patch: NDArray[Any]) -> MoveCosts:
         """Return the costs on a map, given its patches, with its directions and expected times."""
         costs = self._replace(patch=patch, width=grid.width + 2)
-        if self.terms is not None:
+        if self.terms is not None and grid.cost is not None:
             value = np.full((grid.height + 2, grid.width + 2), VALUES - 1, dtype=np.uint8)
             inside = value[1:-1, 1:-1]
             np.subtract(grid.cost, UNKNOWN, out=inside, casting="unsafe")
@@ -104,6 +104,15 @@ def patch_numbers(occupancy: NDArray[np.bool_]) -> NDArray[np.uint16]:
             bits += 32 * here[x + 1] + 64 * above[x - 1] + 128 * above[x] + 256 * above[x + 1]
             out[x] = OCCUPIED_PATCH if here[x] else bits
     return numbers.ravel()
+
+
+def patches(occupancy: NDArray[np.bool_], cost: NDArray[np.int8] | None) -> NDArray[np.int8]:
+    """Return each cell's 3x3 patch: costs, or 0, of free cells, 100 for all others: (C, 9) int8."""
+    values = np.where(occupancy, OCCUPIED, np.int8(0) if cost is None else cost).astype(np.int8)
+    padded = np.pad(values, 1, constant_values=OCCUPIED)
+    windows = np.lib.stride_tricks.sliding_window_view(padded, (3, 3))
+    patch_C9: NDArray[np.int8] = windows.reshape(-1, 9)
+    return patch_C9
 
 
 def unique_patches(

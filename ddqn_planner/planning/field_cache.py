@@ -59,8 +59,7 @@ class FieldCache:
             found = known.fields.get(goals)
         if found is None:
             if known.costs is None:
-                (goal,) = goals
-                found = network_field(self.network, grid, goal, rule)
+                found = network_field(self.network, grid, goals[0], rule)
             else:
                 found = DistanceField(goals, grid, known.costs, rule)
                 self._repair(known, found, start)
@@ -111,13 +110,10 @@ class FieldCache:
             self._use(known, used)
             size = sum(other.nbytes for other in self._maps)
             while size > self.nbytes and (len(self._maps) > 1 or len(known.fields) > 1):
-                oldest = self._maps[0]
-                size -= oldest.nbytes
-                oldest.fields.popitem(last=False)
-                if oldest.fields:
-                    size += oldest.nbytes
-                else:
-                    del self._maps[0]
+                _, forgotten = self._maps[0].fields.popitem(last=False)
+                size -= forgotten.nbytes
+                if not self._maps[0].fields:
+                    size -= self._maps.pop(0).nbytes
 
     def _use(self, known: _KnownMap, used: QField) -> None:
         """Put a map and its field where those lie that were used last."""

@@ -22,10 +22,7 @@ Bounds = tuple[float, float]
 
 # States. The distance of an open cell may fall; that of a closed one is the least. Until a cell is
 # reached its distance is 0: then pages of memory that no request needs are never touched.
-UNREACHED: Final = 0
-OPEN: Final = 1
-CLOSED: Final = 2
-MARKED: Final = 4
+UNREACHED, OPEN, CLOSED, MARKED = 0, 1, 2, 4
 
 AT_GOAL: Final = 5e-324  # the goal's distance: not 0, and as good as 0 in every sum
 BUCKETS: Final = 2  # per unit of cost; more mean fewer visits of cells that a start does not need
@@ -127,16 +124,13 @@ def _grow(
     count = np.zeros(ring, np.int64)
     through = np.empty(8)
     taken, waiting, front, visited = 0, 0, 0, 0
-    done = False
     while visited <= limit:
         if waiting == 0:
             if taken == opened.size:
-                done = True
                 break
             front = max(front, order[taken])
         # Ties are closed too: so a rollout does not depend on what was asked before.
         if state[start] == CLOSED and distance[start] * (1 + 1e-6) * buckets < front:
-            done = True
             break
         slot = front % ring
         used = 0
@@ -191,7 +185,7 @@ def _grow(
                 waiting += 1
         count[slot] = 0
         front += 1
-    return _still_open(state, opened[taken:], bucket, count), done
+    return _still_open(state, opened[taken:], bucket, count), visited <= limit
 
 
 @compiled

@@ -99,9 +99,7 @@ def way_and_ends(request: PlanRequest, goals: Goals) -> tuple[tuple[Cell, ...], 
         candidates.append((_near(~grid.occupancy, request.goal, request.reach), 1))
     for ends, number in candidates:
         joined_to_ends = grid.reachable(ends, rule, backward=True)
-        way_out: tuple[Cell, ...] = (start,)
-        if not grid.is_free(start):
-            way_out = find_way_out(request, joined_to_ends)
+        way_out = (start,) if grid.is_free(start) else find_way_out(request, joined_to_ends)
         if way_out and joined_to_ends[way_out[-1][1], way_out[-1][0]]:
             reached = grid.reachable([way_out[-1]], rule)
             reached_ends = ends[reached[ends[:, 1], ends[:, 0]]]
@@ -213,7 +211,10 @@ def keep_or_switch(request: PlanRequest, new: Path) -> tuple[Path, float | None]
         return new, None
     if np.array_equal(rest, new):
         return new, 0.0
-    cost, new_cost = _cost(rest, grid, rule), _cost(new, grid, rule)
+    if grid.has_costs:
+        cost, new_cost = (path_cost(path, grid.cost_multiplier, rule) for path in (rest, new))
+    else:  # multipliers that are all 1 would take memory
+        cost, new_cost = path_length(rest, rule), path_length(new, rule)
     if cost > (1 + request.switch_threshold) * new_cost * SAME_COST:
         return new, None
     return rest, cost / new_cost - 1
@@ -230,12 +231,6 @@ def _array(path: Cells) -> Path:
     return np.asarray(path, dtype=np.int32).reshape(-1, 2)
 
 
-def _cost(path: Path, grid: GridMap, move_rule: MoveRule | str) -> float:
-    if not grid.has_costs:
-        return path_length(path, move_rule)
-    return path_cost(path, grid.cost_multiplier, move_rule)
-
-
 # Simplification# Simplification
 
 
@@ -244,9 +239,8 @@ def simplify(cells: Cells, grid: GridMap, move_rule: MoveRule | str) -> tuple[Ce
 
     A segment is legal if all cells that it passes through are free; under `MoveRule.ROBOT_SAFE`
     also those that it touches at a corner. None of them except the last may forbid one of the two
-    actions between whose directions it lies. It must not cost more than the part of the path that
-    it replaces, so that the path keeps away from cells of high cost. The length of each segment is
-    found by doubling and halving.
+    actions between whose directions it lies. It must not cost more than what it replaces, so that
+    the path keeps away from cells of high cost.
 
     Parameters
     ----------
@@ -272,6 +266,7 @@ def simplify(cells: Cells, grid: GridMap, move_rule: MoveRule | str) -> tuple[Ce
         cost = segment_cost(path[first], path[last], multiplier, rule)
         return cost <= SAME_COST * path_cost(path[first : last + 1], multiplier, rule)
 
+    # The length of each segment is found by doubling and halving.
     kept, last = [0] if path else [], len(path) - 1
     while kept and kept[-1] < last:
         first, step, reached = kept[-1], 1, kept[-1] + 1
@@ -298,20 +293,15 @@ def touched_cells(first: Cell, last: Cell, move_rule: MoveRule | str) -> NDArray
 def is_legal_segment(first: Cell, last: Cell, grid: GridMap, move_rule: MoveRule | str) -> bool:
     """Return whether a segment between two cells of a map is legal, see `simplify`."""
     x, y = touched_cells(first, last, move_rule).T
-    if grid.occupancy[y, x].any():
-        return False
-    if grid.forbidden is None:
-        return True
+    is_free = not grid.occupancy[y, x].any()
+    if grid.forbidden is None or not is_free:
+        return is_free
     vector = np.subtract(last, first)
-    moves = [np.sign(vector)]  # as many diagonal ones as it has room for, and straight ones
-    if abs(vector[0]) != abs(vector[1]):
-        moves.append(np.where(np.abs(vector) == np.abs(vector).max(), moves[0], 0))
+    diagonal = np.sign(vector)  # as many such moves as it has room for, and straight ones
+    straight = np.where(np.abs(vector) == np.abs(vector).max(), diagonal, 0)
+    takes = (diagonal == MOVES).all(axis=1) | (straight == MOVES).all(axis=1)
     x, y = _passed_cells(first, last)[0][:-1].T
-    return not any(
-        (grid.forbidden[y, x] >> action & 1).any()
-        for move in moves
-        for action in np.flatnonzero((move == MOVES).all(axis=1))
-    )
+    return not (grid.forbidden[y, x] & np.packbits(takes, bitorder="little")).any()
 
 
 def segment_cost(

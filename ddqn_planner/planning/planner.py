@@ -46,37 +46,30 @@ class Planner:
             raise ValueError(f"{given}; give what load_model returns")
         self.network = network
         self.metadata = metadata
-        self._fields = FieldCache(network)
+        self.fields = FieldCache(network)
 
     @classmethod
     def load(cls, model: str | Path) -> Planner:
         """Load a shipped model by its name (``"any_map"``), or a model file by its path.
 
-        Raises
-        ------
-        ModelFileError
-            If there is no such model, or its file cannot be used.
+        A ModelFileError says that there is none, or why it cannot be used.
         """
         return cls(*load_model(model))
 
     @property
     def cache_bytes(self) -> int:
         """Memory for the fields that it keeps, those used last; the last one is always kept."""
-        return self._fields.nbytes
+        return self.fields.nbytes
 
     @cache_bytes.setter
     def cache_bytes(self, nbytes: int) -> None:
-        self._fields.nbytes = nbytes
+        self.fields.nbytes = nbytes
 
     def q_field(self, grid: GridMap, goal: Cell, move_rule: MoveRule | str | None = None) -> QField:
         """Return the Q field of a map toward a goal, a free cell, computed or from the cache.
 
-        The move rule is by default the one that the model was trained for.
-
-        Raises
-        ------
-        ValueError
-            If the goal is not a free cell of the map, or the model cannot plan on this size.
+        The move rule is by default the one that the model was trained for. A goal that is not free,
+        or a map of a size that the model cannot plan on, is a ValueError.
         """
         check_grid(grid)
         goal, rule = as_cell(goal, "the goal"), self._rule(move_rule)
@@ -85,13 +78,7 @@ class Planner:
         if not self.network.supports((grid.height, grid.width)):
             problem = f"the model was not trained for maps of {grid.width} x {grid.height} cells"
             raise ValueError(f"{problem}; train one on such a map")
-        return self._fields.get(grid, (goal,), rule)
-
-    def known_field(
-        self, grid: GridMap, goal: Cell, move_rule: MoveRule | str | None = None
-    ) -> QField | None:
-        """Return the Q field of a map toward a goal if it is in the cache, else None."""
-        return self._fields.find(grid, (as_cell(goal, "the goal"),), self._rule(move_rule))
+        return self.fields.get(grid, (goal,), rule)
 
     def _rule(self, move_rule: MoveRule | str | None) -> MoveRule:
         return self.metadata.move_rule if move_rule is None else MoveRule(move_rule)
@@ -123,9 +110,8 @@ class Planner:
         simplified : bool
             Whether to leave out cells, see `simplify`.
         start_clearing_radius : float
-            Where the start is an obstacle, those within so many cells of it, itself included, do
-            not count until the path has reached its first free cell, the nearest one. With 0 they
-            count.
+            Where the start is an obstacle, those within so many cells of it do not count until the
+            path has reached its first free cell, the nearest one. With 0 they count.
 
         Returns
         -------
@@ -155,7 +141,7 @@ class Planner:
         """Plan a path to the goal that the cheapest path reaches; `Plan.goal` tells which.
 
         Goals that are occupied or outside the map are left out. If all are, the status says so:
-        GOAL_OCCUPIED if any lies on the map. One field leads to all goals that are free.
+        GOAL_OCCUPIED if any lies on the map.
 
         Parameters
         ----------
@@ -247,18 +233,18 @@ class Planner:
         """Return the field that leads to a goal, or why there is no path."""
         grid, start, rule = request.grid, request.start, request.move_rule
         goals = tuple(sorted({goal for goal in request.goals if grid.is_free(goal)}))
-        if len(goals) > 1 and not self._fields.has_costs(grid, rule):
+        if len(goals) > 1 and not self.fields.has_costs(grid, rule):
             yield
             goals = self._nearest_alone(request, goals)
         field: QField | None = None
         plan: Plan | None = None
         if grid.is_free(start):
-            field = self._fields.find(grid, goals, rule)
+            field = self.fields.find(grid, goals, rule)
             plan = field.rollout_if_known(start) if field else None
         if plan is None or (not plan.path.size and request.reach >= 1):
             yield
-        if plan is None and goals and grid.is_free(start) and self._fields.has_costs(grid, rule):
-            field = self._fields.get(grid, goals, rule, start)
+        if plan is None and goals and grid.is_free(start) and self.fields.has_costs(grid, rule):
+            field = self.fields.get(grid, goals, rule, start)
             assert isinstance(field, DistanceField)
             plan = yield from _in_parts(field, request)
         if field and plan and plan.path.size:
@@ -271,7 +257,7 @@ class Planner:
         if not way_out:
             return PlanStatus.NO_PATH if goals else PlanStatus.GOAL_OCCUPIED
         if field is None or field.goals != ends:
-            field, plan = self._fields.get(grid, ends, rule, way_out[-1]), None
+            field, plan = self.fields.get(grid, ends, rule, way_out[-1]), None
         return _Found(field, way_out, plan)
 
     def _nearest_alone(self, request: PlanRequest, goals: Goals) -> Goals:
@@ -357,8 +343,8 @@ def last_step(steps: Iterator[Plan | None]) -> Plan:
 
 
 def _cells_of_goals(goals: Sequence[Cell]) -> list[Cell]:
-    goals = listed(goals, "goals")
-    cells = [as_cell(goal, f"goal {number}") for number, goal in enumerate(goals, 1)]
+    named = enumerate(listed(goals, "goals"), 1)
+    cells = [as_cell(goal, f"goal {number}") for number, goal in named]
     if not cells:
         raise ValueError("there is no goal; give at least one cell")
     return cells

@@ -79,7 +79,7 @@ def test_a_request_without_a_path_does_not_visit_the_whole_map() -> None:
     occupancy[:, 10] = 1
     grid, planner = GridMap(occupancy), Planner(NETWORK, METADATA)
     assert planner.plan(grid, (0, 0), (199, 199)).status is PlanStatus.NO_PATH
-    field = planner.known_field(grid, (199, 199))
+    field = planner.fields.find(grid, ((199, 199),), MoveRule.ROBOT_SAFE)
     assert isinstance(field, DistanceField)
     assert not field.is_whole
     assert np.count_nonzero(field.known.distance) < 0.6 * occupancy.size
@@ -119,20 +119,11 @@ def changed_maps(draw: st.DrawFn, grid: GridMap) -> GridMap:
     def cut(array: np.ndarray | None) -> Any:
         if array is None:
             return None
-        sides = ((max(below, 0), max(above, 0)), (max(left, 0), max(right, 0)))
-        padded = np.pad(array, sides, constant_values=0)
-        height, width = padded.shape
-        return padded[
-            max(-below, 0) : height - max(-above, 0), max(-left, 0) : width - max(-right, 0)
-        ]
+        height, width = array.shape
+        return np.pad(array, 3)[3 - below : 3 + height + above, 3 - left : 3 + width + right]
 
-    corner = grid.cell_to_world((-left, -below))
-    first = grid.cell_to_world((0, 0))
-    origin = (
-        grid.origin[0] + corner[0] - first[0],
-        grid.origin[1] + corner[1] - first[1],
-        grid.origin[2],
-    )
+    moved = np.subtract(grid.cell_to_world((-left, -below)), grid.cell_to_world((0, 0)))
+    origin = (*(grid.origin[:2] + moved).tolist(), grid.origin[2])
     layers = cut(grid.cost), None, cut(grid.forbidden)
     return GridMap(cut(grid.occupancy), grid.resolution, origin, *layers)
 
@@ -200,7 +191,7 @@ def test_a_repair_that_takes_too_long_leaves_the_older_field_as_it_was() -> None
     assert planner.plan(changed, start, goal) == Planner(NETWORK, METADATA).plan(
         changed, start, goal
     )
-    assert planner.known_field(grid, goal) is older
+    assert planner.fields.find(grid, (goal,), MoveRule.ROBOT_SAFE) is older
     assert older.rollout_if_known((0, 0)) == before
     assert_same(older, fresh_field(grid, goal, MoveRule.ROBOT_SAFE))
 

@@ -10,15 +10,14 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from networks import turning_network
+from networks import turning_planner
 from strategies import grids_in_parts, grids_with_costs, grids_with_free_cell
 
 from ddqn_planner import GridMap, MoveRule, PlanMethod, Planner, PlanStatus
 from ddqn_planner.grid import Cell, shortest_distances
-from ddqn_planner.model import ModelMetadata
 from ddqn_planner.planning import field as fields
 from ddqn_planner.planning.field import DistanceField
-from ddqn_planner.planning.plan import PlanRequest, joined
+from ddqn_planner.planning.plan import PlanRequest
 from ddqn_planner.planning.planner import last_step
 
 RULES = st.sampled_from(list(MoveRule))
@@ -112,12 +111,6 @@ def test_goals_that_are_not_free_are_left_out() -> None:
     assert ANY_MAP.plan_nearest(grid, (7, 0), [(0, 0)]).status is PlanStatus.START_OCCUPIED
 
 
-def turning_planner(size: int = 6) -> Planner:
-    network = turning_network(size)
-    metadata = ModelMetadata("paper", network.sizes, MoveRule.ROBOT_SAFE, 0.9, "", 1, 0, "")
-    return Planner(network, metadata)
-
-
 def test_a_network_without_costs_plans_to_each_goal() -> None:
     grid, planner, goals = GridMap(np.zeros((6, 6))), turning_planner(), [(5, 5), (0, 3)]
     found = planner.plan_nearest(grid, (0, 0), goals, method=PlanMethod.ASTAR_FALLBACK)
@@ -176,20 +169,3 @@ def test_wrong_goals_are_named() -> None:
             plan(grid, (0, 0), [])
         with pytest.raises(ValueError, match=r"goal 2 is .*; give two whole numbers"):
             plan(grid, (0, 0), [(1, 1), (0.5, 1)])  # type: ignore[list-item]
-
-
-def test_plans_through_cells_are_joined_without_a_doubled_cell() -> None:
-    grid = GridMap(np.zeros((8, 8), dtype=np.bool_))
-    planner = Planner.load("any_map")
-    cells = [(0, 0), (5, 0), (5, 0), (5, 6)]
-    plans = [planner.plan(grid, *ends) for ends in pairwise(cells)]
-    plan = joined(plans)
-    assert plan.status is PlanStatus.SUCCEEDED
-    assert plan.cells == (*((x, 0) for x in range(6)), *((5, y) for y in range(1, 7)))
-    assert np.array_equal(plan.every_cell, plan.path)
-    assert plan.goal == (5, 6)
-    assert plan.length == pytest.approx(sum(piece.length for piece in plans))
-    assert plan.field_ms == pytest.approx(sum(piece.field_ms for piece in plans))
-    assert joined([plans[0]]) == plans[0]
-    failed = planner.plan(grid, (5, 0), (9, 0))
-    assert joined([plans[0], failed]) is failed

@@ -1,7 +1,10 @@
+"""Parts of paths: segments, what is left of a path, and what is kept of it."""
+
 from __future__ import annotations
 
 import math
 from dataclasses import replace
+from fractions import Fraction
 from itertools import pairwise
 from typing import Any
 
@@ -11,20 +14,22 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from strategies import grids_with_costs, grids_with_directions, grids_with_free_cell
 
-from ddqn_planner import GridMap, MoveRule, Planner
-from ddqn_planner.grid import MOVES, Cell, path_cost, shortest_path
-from ddqn_planner.planning import Plan, PlanRequest, simplify
+from ddqn_planner import GridMap, MoveRule, Planner, simplify
+from ddqn_planner.grid import MOVES, Cell, path_cost, path_length, shortest_path
+from ddqn_planner.planning import PlanRequest
 from ddqn_planner.planning.paths import (
     REACH,
     is_path_valid,
     keep_or_switch,
     legal_segments,
     rest_of_path,
+    segment_cost,
     touched_cells,
 )
 from ddqn_planner.planning.planner import last_step
 
 RULES = st.sampled_from(list(MoveRule))
+CELLS = st.tuples(st.integers(-12, 12), st.integers(-12, 12))
 GRIDS = grids_with_free_cell() | grids_with_costs() | grids_with_directions()
 ANY_MAP = Planner.load("any_map")
 
@@ -61,6 +66,131 @@ def changed(draw: st.DrawFn, grid: GridMap) -> GridMap:
     return GridMap(occupancy, cost=cost, forbidden=forbidden)
 
 
+# Segments
+
+
+@given(CELLS, CELLS, RULES)
+def test_a_segment_touches_the_cells_that_its_points_lie_in(
+    first: Cell, last: Cell, rule: MoveRule
+) -> None:
+    touched = {(x, y) for x, y in touched_cells(first, last, rule).tolist()}
+    passed = set()
+    for part in np.linspace(0, 1, 4001):
+        x, y = (a + part * (b - a) for a, b in zip(first, last, strict=True))
+        if min(abs(x % 1 - 0.5), abs(y % 1 - 0.5)) > 1e-9:  # not on an edge
+            passed.add((round(x), round(y)))
+    assert passed <= touched
+    # None is farther off than its own half diagonal, or with corners that are touched, on it.
+    length = max(math.dist(first, last), 1e-9)
+    for x, y in touched - passed:
+        cross = (x - first[0]) * (last[1] - first[1]) - (y - first[1]) * (last[0] - first[0])
+        corner = (abs(last[0] - first[0]) + abs(last[1] - first[1])) / 2 / length
+        assert abs(cross) / length <= corner + 1e-9
+
+
+def test_corners_count_where_they_may_not_be_cut() -> None:
+    assert touched_cells((0, 0), (1, 1), MoveRule.CORNER_CUTTING).tolist() == [[0, 0], [1, 1]]
+    assert len(touched_cells((0, 0), (1, 1), MoveRule.ROBOT_SAFE)) == 4
+    assert len(touched_cells((0, 0), (-3, 3), MoveRule.ROBOT_SAFE)) == 10
+
+
+def share_within(cell: Cell, first: Cell, last: Cell) -> Fraction:
+    """Return the share of a segment that lies within a cell, exactly: the cell clips it."""
+    enters, leaves = Fraction(0), Fraction(1)
+    for centre, begin, end in zip(cell, first, last, strict=True):
+        edges = [Fraction(2 * (centre - begin) + side, 2) for side in (-1, 1)]
+        if begin == end:
+            if not edges[0] < 0 < edges[1]:
+                return Fraction(0)
+            continue
+        times = sorted(edge / (end - begin) for edge in edges)
+        enters, leaves = max(enters, times[0]), min(leaves, times[1])
+    return max(leaves - enters, Fraction(0))
+
+
+def exact_cost(first: Cell, last: Cell, multiplier: np.ndarray, rule: MoveRule) -> float:
+    vector = np.subtract(last, first)
+    length = np.abs(vector).max() if rule is MoveRule.UNIT else math.hypot(*vector)
+    columns, rows = (range(min(ends), max(ends) + 1) for ends in zip(first, last, strict=True))
+    cells = [(x, y) for x in columns for y in rows]
+    shares = [share_within(cell, first, last) for cell in cells]
+    assert sum(shares) == 1 or first == last
+    multipliers = [Fraction(float(multiplier[y, x])) for x, y in cells]
+    return float(length * float(sum(a * b for a, b in zip(shares, multipliers, strict=True))))
+
+
+@given(grids_with_costs(), RULES, st.data())
+def test_each_cell_counts_by_the_length_of_the_segment_within_it(
+    grid_and_cell: tuple[GridMap, Cell], rule: MoveRule, data: st.DataObject
+) -> None:
+    grid, first = grid_and_cell
+    last = data.draw(
+        st.tuples(st.integers(0, grid.width - 1), st.integers(0, grid.height - 1)), label="last"
+    )
+    exact = exact_cost(first, last, grid.cost_multiplier, rule)
+    assert segment_cost(first, last, grid.cost_multiplier, rule) == pytest.approx(exact)
+    if max(abs(last[0] - first[0]), abs(last[1] - first[1])) == 1:
+        assert path_cost([first, last], grid.cost_multiplier, rule) == pytest.approx(exact)
+
+
+def check_simplified(path: list[Cell], grid: GridMap, rule: MoveRule) -> tuple[Cell, ...]:
+    """Check that each segment is legal, and costs no more than what it replaces."""
+    simple = simplify(path, grid, rule)
+    assert simple[:1] + simple[-1:] == (*path[:1], *path[-1:])
+    for first, last in pairwise(simple):
+        part = path[path.index(first) : path.index(last) + 1]
+        replaced = sum(exact_cost(a, b, grid.cost_multiplier, rule) for a, b in pairwise(part))
+        assert exact_cost(first, last, grid.cost_multiplier, rule) <= replaced * (1 + 1e-8)
+        assert len(part) == 2 or is_legal(first, last, grid, rule)
+    return simple
+
+
+@settings(max_examples=300)
+@given(grids_with_free_cell() | grids_with_costs() | grids_with_directions(), RULES, st.data())
+def test_a_simplified_path_is_legal_and_costs_no_more(
+    grid_and_goal: tuple[GridMap, Cell], rule: MoveRule, data: st.DataObject
+) -> None:
+    grid, goal = grid_and_goal
+    path = shortest_path(grid, data.draw(st.sampled_from(grid.free_cells())), goal, rule)
+    simple = check_simplified(path, grid, rule)
+    assert path_length(simple) <= path_length(path) + 1e-9
+    assert path_length(simple, MoveRule.UNIT) <= path_length(path, MoveRule.UNIT)
+
+
+def test_under_the_unit_rule_diagonals_are_joined_and_no_segment_counts_more() -> None:
+    grid, path = GridMap(np.zeros((9, 12))), [(x, x) for x in range(9)]
+    assert simplify(path, grid, MoveRule.UNIT) == ((0, 0), (8, 8))
+    path += [(9, 8), (10, 8), (11, 8)]
+    simple = simplify(path, grid, MoveRule.UNIT)
+    assert len(simple) <= 3
+    assert path_length(simple, MoveRule.UNIT) == path_length(path, MoveRule.UNIT) == 11
+
+
+def test_any_pairs_of_whole_numbers_are_cells_and_come_back_as_python_ints() -> None:
+    grid = GridMap(np.zeros((3, 5)))
+    cells = np.array([(0, 0), (1, 0), (2, 0), (3, 1), (4, 2)])
+    assert repr(simplify(cells, grid, "unit")) == repr(simplify(cells.tolist(), grid, "unit"))
+    with pytest.raises(ValueError, match=r"the cell is \(0\.5, 0\)"):
+        simplify([(0.5, 0)], grid, "unit")
+
+
+def test_segments_are_as_long_as_can_be() -> None:
+    rule = MoveRule.ROBOT_SAFE
+    for length in range(2, 20):
+        occupancy = np.ones((4, length + 1), dtype=bool)
+        occupancy[0] = occupancy[:, length] = False
+        path = [(x, 0) for x in range(length + 1)] + [(length, y) for y in range(1, 4)]
+        expected = ((0, 0), (length, 0), (length, 3))
+        assert simplify(path, GridMap(occupancy), rule) == expected
+    grid = GridMap(np.zeros((40, 90)))
+    assert simplify(shortest_path(grid, (2, 5), (80, 31), rule), grid, rule) == ((2, 5), (80, 31))
+    assert simplify([], grid, rule) == ()
+    assert simplify([(1, 1)], grid, rule) == ((1, 1),)
+
+
+# The path under way
+
+
 @given(GRIDS, RULES, st.data())
 def test_legal_segments_are_those_of_legal_moves_or_through_free_cells(
     grid_and_cell: tuple[GridMap, Cell], rule: MoveRule, data: st.DataObject
@@ -91,15 +221,11 @@ def test_a_path_is_valid_if_all_of_it_from_the_cell_nearest_to_the_robot_on_is_l
     assert is_path_valid(path, robot, grid, rule)
 
 
-def test_a_path_of_which_only_an_occupied_end_is_left_is_not_valid() -> None:
+def test_a_path_of_which_only_an_occupied_end_or_nothing_is_left_is_not_valid() -> None:
     grid, path = GridMap(np.zeros((1, 9))), [(0, 0), (1, 0), (2, 0)]
     for robot in ((9, 0), (2, 5)):  # off the map, so that its own cell does not count
         assert is_path_valid(path, robot, grid, "robot_safe")
         assert not is_path_valid(path, robot, grid.with_patch([[True]], 2, 0), "robot_safe")
-
-
-def test_an_empty_path_is_not_valid_and_nothing_is_left_of_it() -> None:
-    grid = GridMap(np.zeros((3, 3)))
     assert not is_path_valid([], (0, 0), grid, "robot_safe")
     assert not len(rest_of_path([], (0, 0), grid, "robot_safe"))
 
@@ -180,44 +306,6 @@ def test_what_is_kept_is_legal_and_costs_at_most_the_threshold_more(
     else:
         assert path.tolist() == rest.tolist()
         assert cost == pytest.approx((1 + extra_cost) * best)
-
-
-def two_corridors(upper: int, lower: int) -> GridMap:
-    """Return a hall with two ways round a block, whose cells have these costs."""
-    occupancy = np.zeros((11, 40), dtype=np.bool_)
-    occupancy[3:8, 5:35] = True
-    cost = np.zeros(occupancy.shape, dtype=np.int8)
-    cost[:3, 10:30], cost[8:, 10:30] = lower, upper
-    return GridMap(occupancy, cost=cost)
-
-
-def plan(grid: GridMap, threshold: float, under_way: Any = (), simplified: bool = False) -> Plan:
-    rule = MoveRule.ROBOT_SAFE
-    request = PlanRequest(grid, (0, 5), (39, 5), rule, simplified=simplified)
-    request = replace(request, under_way=under_way, switch_threshold=threshold)
-    return last_step(ANY_MAP.steps(request))
-
-
-def is_upper(path: Plan) -> bool:
-    return max(y for _, y in path.cells) > 7
-
-
-def test_a_planner_keeps_the_path_under_way_up_to_the_threshold() -> None:
-    first = plan(two_corridors(20, 22), 0.03)
-    assert is_upper(first)
-    assert first.extra_cost is None
-    slightly, much = two_corridors(22, 20), two_corridors(60, 20)
-    kept = plan(slightly, 0.1, first.every_cell)
-    assert kept.cells == first.cells
-    assert kept.extra_cost is not None
-    best = plan(slightly, 0.1)
-    assert 0 < kept.extra_cost < 0.1
-    assert kept.cost == pytest.approx((1 + kept.extra_cost) * best.cost)
-    for other in (plan(slightly, 0.0, first.every_cell), plan(much, 0.1, first.every_cell)):
-        assert not is_upper(other)
-        assert other.extra_cost is None
-    blocked = two_corridors(20, 20).with_patch(np.ones((3, 1)), 20, 8)
-    assert not is_upper(plan(blocked, 10.0, first.every_cell))
 
 
 @given(GRIDS, RULES, st.sampled_from([0.0, 0.3, 10.0]), st.data())
