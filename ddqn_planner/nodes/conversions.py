@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import array
 import math
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 from geometry_msgs.msg import Point, Pose, PoseStamped, Quaternion
@@ -24,27 +24,17 @@ if TYPE_CHECKING:
 Message = TypeVar("Message", Point, Pose, PoseStamped)
 Origin = tuple[float, float, float]
 
-TOLERANCE = 1e-4
-"""How far the norm of a quaternion may be from 1."""
-
-MIN_RESOLUTION = 1e-6
-"""Metres per cell."""
+TOLERANCE = 1e-4  # how far the norm of a quaternion may be from 1
+MIN_RESOLUTION = 1e-6  # metres per cell
 
 
-def grid_from_message(
-    message: OccupancyGrid,
-    occupied_threshold: int = 65,
-    allow_unknown: bool = False,
-    use_map_costs: bool = False,
-    map_type: str = "map",
-) -> GridMap:
-    """Make a grid map of a map message; a ValueError says why there is none."""
+def grid_from_message(message: OccupancyGrid, *rules: Any) -> GridMap:
+    """Make a grid map of a map message by the rules of `grid_from_values`, or a ValueError."""
     _check_map(message)
     info = message.info
     values = np.frombuffer(message.data, np.int8).reshape(info.height, info.width)
     turned = info.origin.orientation
     origin = (info.origin.position.x, info.origin.position.y, 2 * math.atan2(turned.z, turned.w))
-    rules = occupied_threshold, allow_unknown, use_map_costs, map_type
     try:
         return grid_from_values(values, info.resolution, origin, *rules)
     except MemoryError:
@@ -55,10 +45,10 @@ def grid_from_values(
     values: NDArray[np.int8],
     resolution: float,
     origin: Origin,
-    occupied_threshold: int,
-    allow_unknown: bool,
-    use_map_costs: bool,
-    map_type: str,
+    occupied_threshold: int = 65,
+    allow_unknown: bool = False,
+    use_map_costs: bool = False,
+    map_type: str = "map",
 ) -> GridMap:
     """Make a grid map; a costmap has its own threshold and costs."""
     if map_type == "costmap":
@@ -164,28 +154,25 @@ def _copy(message: Message) -> Message:
     return copied
 
 
-def check_pose(
-    name: str, header: Header, pose: Pose, frame: str = "", other_remedy: str = ""
-) -> None:
+def check_pose(name: str, stamped: PoseStamped, frame: str = "", other_remedy: str = "") -> None:
     """Check a pose, which the ValueError calls by its name, and that it is in the map's frame."""
-    if not header.frame_id:
-        known = f", the map's is {frame!r}" if frame else ""
+    its, known = stamped.header.frame_id, f", the map's is {frame!r}" if frame else ""
+    if not its:
         raise ValueError(f"{name}'s frame is ''{known}; name one in header.frame_id")
-    if frame and header.frame_id != frame:
-        raise ValueError(
-            f"{name}'s frame is {header.frame_id!r}, the map's is {frame!r}; transform the pose to "
-            f"that frame (in RViz: set Fixed Frame to it){other_remedy}"
-        )
-    _check_pose(name, pose)
+    if frame and its != frame:
+        remedy = f"transform the pose to that frame (in RViz: set Fixed Frame to it){other_remedy}"
+        raise ValueError(f"{name}'s frame is {its!r}{known}; {remedy}")
+    _check_pose(name, stamped.pose)
 
 
-def cell_from_pose(name: str, header: Header, pose: Pose, grid: GridMap, frame: str) -> Cell:
+def cell_from_pose(name: str, stamped: PoseStamped, grid: GridMap, frame: str) -> Cell:
     """Return the cell of a pose, which may lie outside the map; see `check_pose` for errors."""
-    check_pose(name, header, pose, frame)
+    check_pose(name, stamped, frame)
+    position = stamped.pose.position
     try:
-        return grid.world_to_cell(pose.position.x, pose.position.y)
+        return grid.world_to_cell(position.x, position.y)
     except (OverflowError, ValueError):  # the floor of infinity, and of NaN
-        where = f"({_numbers(pose.position)}) is too far from the map to have a cell"
+        where = f"({_numbers(position)}) is too far from the map to have a cell"
         raise ValueError(f"{name}'s position {where}; give one on the map, in metres") from None
 
 

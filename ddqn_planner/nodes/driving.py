@@ -13,14 +13,7 @@ from rclpy.qos import DurabilityPolicy, QoSProfile
 from rclpy.time import Time
 from std_msgs.msg import String
 
-from ddqn_planner.experience.drives import (
-    EXPERIENCE,
-    RECORD,
-    DriveEnd,
-    DriveFolder,
-    DriveRecorder,
-    read_drives,
-)
+from ddqn_planner.experience.drives import RECORD, DriveEnd, DriveFolder, DriveRecorder, read_drives
 from ddqn_planner.grid import GridMap
 from ddqn_planner.nodes.conversions import occupancy_message, quaternion, serialized_poses
 from ddqn_planner.nodes.learning import NO_MAP, LearningNode, MapInFrame, explained
@@ -30,13 +23,8 @@ from ddqn_planner.nodes.runtime import LATCHED, STEADY
 Float64 = NDArray[np.float64]
 
 NAVIGATION = "navigate_to_pose/_action/status"
-
-RETRY_PERIOD = 5.0
-"""Seconds after which what failed for a full disk is tried again."""
-
-SLOWEST = 10.0
-"""The slowness that ``~/slowness`` shows as 100."""
-
+RETRY_PERIOD = 5.0  # seconds after which what failed for a full disk is tried again
+SLOWEST = 10.0  # the slowness that ``~/slowness`` shows as 100
 NOT_RECORDING = "no drives are being recorded; call ~/start first"
 
 
@@ -106,7 +94,7 @@ class Driving:
         if self._node.map is None:
             return None
         frame = self._node.map.frame
-        self._frames.check(name, pose.header, pose.pose, frame)
+        self._frames.check(name, pose, frame)
         position = self._frames.to_map(name, pose, frame).pose.position
         return position.x, position.y
 
@@ -229,12 +217,10 @@ class Driving:
         except OSError as error:
             return False, explained(error)
         self._tell_saved(folder)
-        if folder.save_error:
-            return False, folder.save_error
-        return True, (
-            f"forgot all but the drives. {kept} has what was known: to undo it, call ~/stop, "
-            f"rename that file to {EXPERIENCE}, and call ~/start"
-        )
+        name = folder.experience_path.name
+        undo = f"to undo it, call ~/stop, rename that file to {name}, and call ~/start"
+        done = f"forgot all but the drives. {kept} has what was known: {undo}"
+        return not folder.save_error, folder.save_error or done
 
     def _on_replay(self) -> tuple[bool, str]:
         place = self._node.map
@@ -245,11 +231,8 @@ class Driving:
         return self._node.replay(file, drives, partial(self._draw, place), "drive on")
 
     def _publish_diagnostics(self) -> None:
-        values = {
-            "robot": _place_of(self._recorder.position),
-            "goal": _place_of(self._recorder.goal),
-            "last drive": self._last_drive,
-        }
+        robot, goal = map(_place_of, (self._recorder.position, self._recorder.goal))
+        values = {"robot": robot, "goal": goal, "last drive": self._last_drive}
         if self._folder is not None:
             values |= {
                 "drives": str(self._folder.drives),

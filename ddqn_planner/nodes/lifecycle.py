@@ -16,9 +16,6 @@ from ddqn_planner.nodes.runtime import BaseNode, Parameters
 
 SUCCESS = TransitionCallbackReturn.SUCCESS
 
-HEARTBEAT_PERIOD, HEARTBEAT_TIMEOUT = 0.1, 4.0
-"""Seconds, as Nav2's nodes and lifecycle manager have them."""
-
 ENTITIES: dict[str, Callable[[Node, Any], object]] = {
     "publishers": Node.destroy_publisher,
     "subscriptions": Node.destroy_subscription,
@@ -49,8 +46,7 @@ class ManagedNode(LifecycleNodeMixin, BaseNode):
     @property
     def state(self) -> str:
         """The name of the state: unconfigured, inactive, active or finalized."""
-        label: str = self._state_machine.current_state[1]
-        return label
+        return str(self._state_machine.current_state[1])
 
     def start(self) -> None:
         """Configure and activate the node; it raises what they raise."""
@@ -161,6 +157,6 @@ class ManagedNode(LifecycleNodeMixin, BaseNode):
             )
             return
         self._bond = Bond(self, "bond", self.get_name())
-        self._bond.heartbeat_period = HEARTBEAT_PERIOD
-        self._bond.heartbeat_timeout = HEARTBEAT_TIMEOUT
+        # Seconds, as Nav2's nodes and lifecycle manager have them.
+        self._bond.heartbeat_period, self._bond.heartbeat_timeout = 0.1, 4.0
         self._bond.start()

@@ -9,29 +9,19 @@ from collections.abc import Callable
 from contextlib import suppress
 from typing import Any
 
-from geometry_msgs.msg import (
-    Pose,
-    PoseStamped,
-    PoseWithCovarianceStamped,
-    Quaternion,
-    TransformStamped,
-)
+from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped, Quaternion, TransformStamped
 from nav_msgs.msg import Odometry
+from rclpy.qos import QoSProfile
 from rclpy.subscription import Subscription
 from rclpy.time import Time
-from std_msgs.msg import Header
 
 from ddqn_planner.nodes.conversions import check_pose, quaternion
 from ddqn_planner.nodes.report import Refusals, RequestError
 from ddqn_planner.nodes.runtime import BaseNode, best_effort
 
 # A pose that was stamped before may be transformed by a transform that is later by so much.
-PATIENCE = 1.0
-"""Seconds within which a new listener hears the first message of `odom` or TF."""
-
-SILENCE = 2.0
-"""Seconds after which odometry that comes no more does not tell where the robot is."""
-
+PATIENCE = 1.0  # seconds within which a new listener hears the first message of `odom` or TF
+SILENCE = 2.0  # seconds after which odometry that comes no more does not tell where the robot is
 REMEDY = "; or install tf2_ros (apt install ros-jazzy-tf2-ros-py), which transforms it"
 
 Point = tuple[float, float, float]
@@ -62,9 +52,9 @@ class Frames:
         self._listener: Any = None
         self._began = -math.inf
 
-    def check(self, name: str, header: Header, pose: Pose, map_frame: str) -> None:
+    def check(self, name: str, stamped: PoseStamped, map_frame: str) -> None:
         """Check a pose as `check_pose` does; its frame may be any with TF."""
-        check_pose(name, header, pose, "" if self.available else map_frame, REMEDY)
+        check_pose(name, stamped, "" if self.available else map_frame, REMEDY)
 
     def to_map(self, name: str, stamped: PoseStamped, map_frame: str) -> PoseStamped:
         """Return a pose in the map's frame by the transform of its time; or a RequestError."""
@@ -74,12 +64,10 @@ class Frames:
         try:
             return transformed(stamped, self._transform_at(stamped, map_frame))
         except ValueError as error:
-            raise RequestError(
-                "TF_ERROR",
-                f"{name}'s frame is {frame!r}, and no transform leads from it to the map's, "
-                f"{map_frame!r} ({error}); publish one, or give the pose in the map's frame",
-                self.may_come,
-            ) from None
+            what = f"frame is {frame!r}, and no transform leads from it to the map's, {map_frame!r}"
+            remedy = "publish one, or give the pose in the map's frame"
+            reason = f"{name}'s {what} ({error}); {remedy}"
+            raise RequestError("TF_ERROR", reason, self.may_come) from None
 
     def _transform_at(self, stamped: PoseStamped, map_frame: str) -> TransformStamped:
         stamp, frames = Time.from_msg(stamped.header.stamp), (map_frame, stamped.header.frame_id)
@@ -172,14 +160,14 @@ def listen(
 ) -> Subscription:
     """Hand each pose of `odom` or `initialpose` to a function, whose ValueError refuses it."""
     is_odometry = topic == "odom"
+    kind = Odometry if is_odometry else PoseWithCovarianceStamped
 
     def on_message(message: Odometry | PoseWithCovarianceStamped) -> None:
         with refusals.taking(topic, often=is_odometry):
             take(PoseStamped(header=message.header, pose=message.pose.pose))
 
-    if is_odometry:
-        return node.create_subscription(Odometry, topic, on_message, best_effort(depth))
-    return node.create_subscription(PoseWithCovarianceStamped, topic, on_message, depth)
+    quality = best_effort(depth) if is_odometry else QoSProfile(depth=depth)
+    return node.create_subscription(kind, topic, on_message, quality)
 
 
 class StartSource:
@@ -232,7 +220,7 @@ class StartSource:
         self._pose, self._began = None, time.monotonic()
 
     def _take(self, pose: PoseStamped) -> None:
-        self._frames.check("the start", pose.header, pose.pose, self._map_frame())
+        self._frames.check("the start", pose, self._map_frame())
         # Odometry comes all the time: it only triggers a plan that waits for the first pose.
         is_due = self._pose is None or self.source == "initialpose"
         self._pose, self._came = pose, self._node.get_clock().now()
@@ -249,32 +237,24 @@ class StartSource:
     def pose(self) -> PoseStamped:
         """Return the last pose in its own frame, by TF in the map's; or raise a RequestError."""
         if self.source == "tf":
-            return self._pose_by_tf()
-        topic = self._subscription.topic_name
-        if self._pose is not None and self.source == "initialpose":
-            return self._pose
+            frames = self._node.value("robot_frame"), self._map_frame()
+            try:
+                return self._frames.origin_of(*frames)
+            except ValueError as error:
+                problem = "no transform leads from {!r} to {!r}".format(*frames)
+                remedy = "publish one, or set robot_frame or start_source"
+                reason = f"the start is unknown: {problem} ({error}); {remedy}"
+                raise RequestError("NO_START", reason, self._frames.may_come) from None
+        topic, is_odometry = self._subscription.topic_name, self.source == "odometry"
+        problem = f"nothing came on {topic} in the map's frame"
+        if not is_odometry:
+            problem = f"set it on {topic} (in RViz: 2D Pose Estimate)"
         if self._pose is not None:  # its stamp may be that of another clock
             silent = (self._node.get_clock().now() - self._came).nanoseconds / 1e9
-            if silent <= max(self._node.value("transform_tolerance"), SILENCE):
+            if not is_odometry or silent <= max(self._node.value("transform_tolerance"), SILENCE):
                 return self._pose
             often = "publish it more often, set transform_tolerance"
             problem = f"nothing came on {topic} for {silent:.3g} s; {often}"
-        elif self.source == "initialpose":
-            problem = f"set it on {topic} (in RViz: 2D Pose Estimate)"
-        else:
-            problem = f"nothing came on {topic} in the map's frame"
         remedy = "or set start_source, or give the request's start its frame"
-        may_come = self.source == "odometry" and time.monotonic() - self._began < PATIENCE
+        may_come = is_odometry and time.monotonic() - self._began < PATIENCE
         raise RequestError("NO_START", f"the start is unknown; {problem}; {remedy}", may_come)
-
-    def _pose_by_tf(self) -> PoseStamped:
-        robot_frame, map_frame = self._node.value("robot_frame"), self._map_frame()
-        try:
-            return self._frames.origin_of(robot_frame, map_frame)
-        except ValueError as error:
-            raise RequestError(
-                "NO_START",
-                f"the start is unknown: no transform leads from {robot_frame!r} to {map_frame!r} "
-                f"({error}); publish one, or set robot_frame or start_source",
-                self._frames.may_come,
-            ) from None

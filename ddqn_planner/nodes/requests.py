@@ -185,8 +185,8 @@ class Requests:
         """Return whether a path is free now, from the robot on, or all of it if that is unknown."""
         header, grid, planner = await self._inputs()
         frame, settings = header.frame_id, self.settings
-        poses = [(path.header, stamped.pose, grid, frame) for stamped in path.poses]
-        cells = [_checked("the path", cell_from_pose, *pose) for pose in poses]
+        poses = [PoseStamped(header=path.header, pose=stamped.pose) for stamped in path.poses]
+        cells = [_checked("the path", cell_from_pose, pose, grid, frame) for pose in poses]
         robot = cells[0] if cells else (0, 0)
         with suppress(RequestError):
             start = await self._wait_for(self.start.pose)
@@ -218,7 +218,7 @@ class Requests:
         self._check_pose(name, stamped, frame)
         deadline = time.monotonic() + self.settings.transform_tolerance
         pose = await self._wait_for(lambda: self.frames.to_map(name, stamped, frame), deadline)
-        return pose, _checked(name, cell_from_pose, pose.header, pose.pose, grid, frame)
+        return pose, _checked(name, cell_from_pose, pose, grid, frame)
 
     async def _wait_for(self, get: Callable[[], T], deadline: float = 0.0) -> T:
         """Return what a function returns, as soon as it raises no RequestError that may pass."""
@@ -231,7 +231,7 @@ class Requests:
             await self.next_look
 
     def _check_pose(self, name: str, stamped: PoseStamped, frame: str) -> None:
-        _checked(name, self.frames.check, stamped.header, stamped.pose, frame)
+        _checked(name, self.frames.check, stamped, frame)
 
 
 def check_request(goals: list[PoseStamped], planner_id: str, known_id: str) -> None:

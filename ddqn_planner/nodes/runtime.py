@@ -32,12 +32,7 @@ from rclpy.clock import Clock, JumpThreshold, TimeJump
 from rclpy.clock_type import ClockType
 from rclpy.duration import Duration
 from rclpy.event_handler import SubscriptionEventCallbacks
-from rclpy.exceptions import (
-    InvalidHandle,
-    NameValidationException,
-    ParameterException,
-    ParameterNotDeclaredException,
-)
+from rclpy.exceptions import InvalidHandle, NameValidationException, ParameterException
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.logging import get_logger
 from rclpy.node import Node
@@ -51,22 +46,18 @@ from rclpy.task import Future
 from std_msgs.msg import Header
 from std_srvs.srv import Trigger
 
+# Late subscribers receive the last message too: for maps, plans, saved models.
 LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-"""Late subscribers receive the last message too: for maps, plans, saved models."""
-
-STEADY = Clock(clock_type=ClockType.STEADY_TIME)
-"""For timers that must not depend on simulated time."""
+STEADY = Clock(clock_type=ClockType.STEADY_TIME)  # for timers, without simulated time
 
 # The middleware drops requests that do not fit into the queue, and the node cannot see it: ROS's
 # default of ten lost half of 20 requests. Fast DDS keeps 5,000 messages by default.
 SERVICE_QUALITY = QoSProfile(depth=5000)
-"""For each service, except ROS's parameter services, whose queue is 1,000."""
 
+# What parameters may change of each subscription.
 OVERRIDABLE = [QoSPolicyKind[name] for name in ("HISTORY", "DEPTH", "DURABILITY", "RELIABILITY")]
-"""What parameters may change of each subscription."""
-
+# What of a publisher's quality is less than what a subscription may ask for.
 MISFITS = ("durability", "volatile", "transient_local"), ("reliability", "best_effort", "reliable")
-"""What of a publisher's quality is less than what a subscription may ask for."""
 
 
 def best_effort(depth: int) -> QoSProfile:
@@ -135,8 +126,9 @@ class BaseNode(Node):
         if not result.successful:
             raise ParameterException("a parameter is invalid", result.reason)
         self.add_on_set_parameters_callback(self._check)
-        for service_type in (SetParameters, SetParametersAtomically):
-            self.answer_with(service_type, self._on_set_parameters)
+        # rclpy's own answer to bad parameters ends the node.
+        self.answer_with(SetParameters, self._set_one_by_one)
+        self.answer_with(SetParametersAtomically, self._set_together)
 
     def _on_jump(self, jump: TimeJump) -> None:
         seconds = jump.delta.nanoseconds / 1e9
@@ -170,13 +162,12 @@ class BaseNode(Node):
         """Return the values that all parameters have now."""
         return SimpleNamespace(**{name: self.value(name) for name in self._declared})
 
-    def _on_set_parameters(self, request: Any, response: Any) -> Any:
-        """Set parameters one by one, or together; rclpy's own answer to bad ones ends the node."""
-        if isinstance(response, SetParameters.Response):
-            response.results = [self._set([parameter]) for parameter in request.parameters]
-        else:
-            response.result = self._set(request.parameters)
-        return response
+    def _set_one_by_one(self, request: Any, _: Any) -> SetParameters.Response:
+        results = [self._set([parameter]) for parameter in request.parameters]
+        return SetParameters.Response(results=results)
+
+    def _set_together(self, request: Any, _: Any) -> SetParametersAtomically.Response:
+        return SetParametersAtomically.Response(result=self._set(request.parameters))
 
     def _set(self, messages: list[Any]) -> SetParametersResult:
         reason = "a parameter has no name; give one"
@@ -184,7 +175,7 @@ class BaseNode(Node):
             if all(message.name for message in messages):
                 parameters = [*map(Parameter.from_parameter_msg, messages)]
                 return self.set_parameters_atomically(parameters)
-        except ParameterNotDeclaredException as error:
+        except ParameterException as error:  # it is not declared
             reason = str(error)
         except ValueError as error:
             reason = f"{error}; give one of rcl_interfaces/msg/ParameterType"

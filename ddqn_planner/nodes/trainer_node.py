@@ -10,19 +10,13 @@ from contextlib import suppress
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
-from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped
+from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped, Quaternion
 from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.exceptions import InvalidParameterValueException
 from std_msgs.msg import Float32, Header, String
 
 from ddqn_planner.grid import Cell, MoveRule, read_map_file
-from ddqn_planner.nodes.conversions import (
-    cell_from_pose,
-    check_pose,
-    path_message,
-    quaternion,
-    serialized_path,
-)
+from ddqn_planner.nodes.conversions import cell_from_pose, check_pose, path_message, serialized_path
 from ddqn_planner.nodes.driving import Driving
 from ddqn_planner.nodes.learning import NO_MAP, LearningNode, MapInFrame, explained
 from ddqn_planner.nodes.parameters import HYPER_PARAMETERS, OF_MAPS, TRAINER_PARAMETERS
@@ -35,8 +29,7 @@ if TYPE_CHECKING:
     from ddqn_planner.training.episodes import Episode
     from ddqn_planner.training.run import TrainingRun
 
-SLICE = 0.1
-"""Seconds for which the worker trains before the node publishes what became of it."""
+SLICE = 0.1  # seconds for which the worker trains before the node publishes what became of it
 
 
 class TrainerNode(LearningNode):
@@ -89,17 +82,18 @@ class TrainerNode(LearningNode):
         self.map = MapInFrame(grid, "map")
         for which, cell in (("start", map_file.start), ("goal", map_file.goal)):
             if cell is not None:
-                path = path_message([cell], grid, Header(frame_id="map"), quaternion(0))
+                path = path_message([cell], grid, Header(frame_id="map"), Quaternion())
                 self._poses[which] = path.poses[0]
 
     # Start and goal
 
     def _on_pose(self, which: str, message: PoseStamped | PoseWithCovarianceStamped) -> None:
-        pose = getattr(message.pose, "pose", message.pose)
+        stamped = PoseStamped(
+            header=message.header, pose=getattr(message.pose, "pose", message.pose)
+        )
         with self.refusals.taking(which):
             # A pose may come before the map: ~/start then checks its cell.
-            check_pose(f"the {which}", message.header, pose)
-            stamped = PoseStamped(header=message.header, pose=pose)
+            check_pose(f"the {which}", stamped)
             if self.map is not None:
                 cell = self._cell(which, stamped, self.map)
                 self.get_logger().info(f"the {which} is cell {cell}")
@@ -107,11 +101,10 @@ class TrainerNode(LearningNode):
 
     def _cell(self, which: str, pose: PoseStamped, place: MapInFrame) -> Cell:
         """Return the cell of a pose; ValueError if it is not a free cell of the map."""
-        cell = cell_from_pose(f"the {which}", pose.header, pose.pose, place.grid, place.frame)
+        cell = cell_from_pose(f"the {which}", pose, place.grid, place.frame)
         if not place.grid.is_free(cell):
-            raise ValueError(
-                f"the {which}'s cell {cell} is occupied or off the map; set it on a free cell"
-            )
+            wrong = f"cell {cell} is occupied or off the map"
+            raise ValueError(f"the {which}'s {wrong}; set it on a free cell")
         return cell
 
     # Services: each returns whether it succeeds, and a message
@@ -142,21 +135,15 @@ class TrainerNode(LearningNode):
         if place is None:
             raise ValueError(f"{NO_MAP}, or set map_file")
         if self._poses.keys() < {"start", "goal"}:
-            raise ValueError(
-                "the start or the goal is unknown; publish initialpose and goal_pose, or set "
-                "map_file to a map with both"
-            )
+            remedy = "publish initialpose and goal_pose, or set map_file to a map with both"
+            raise ValueError(f"the start or the goal is unknown; {remedy}")
         start, goal = (self._cell(name, self._poses[name], place) for name in ("start", "goal"))
         from ddqn_planner.training.environment import Scenario  # these import gymnasium, torch
         from ddqn_planner.training.run import TrainingRun
 
-        return place, TrainingRun(
-            self.folder,
-            [Scenario(place.grid, start, goal)],
-            MoveRule(self.value("move_rule")),
-            self._hyper_parameters({}),
-            self.value("seed"),
-        )
+        scenarios, rule = [Scenario(place.grid, start, goal)], MoveRule(self.value("move_rule"))
+        how = self._hyper_parameters({}), self.value("seed")
+        return place, TrainingRun(self.folder, scenarios, rule, *how)
 
     def _on_stop(self) -> tuple[bool, str]:
         replay = self.stop_replay()
@@ -187,8 +174,7 @@ class TrainerNode(LearningNode):
 
     async def _train(self, run: TrainingRun, place: MapInFrame) -> None:
         """Train until the end or ~/stop."""
-        steps, announced = run.steps(), run.saved_at
-        ends = ""
+        steps, announced, ends = run.steps(), run.saved_at, ""
         try:
             while not ends:
                 episodes, is_finished = await self._worker.call(train_for_a_slice, steps)
@@ -215,7 +201,7 @@ class TrainerNode(LearningNode):
         self.get_logger().info(f"the training {ends}")
 
     def _publish_cells(self, cells: tuple[Cell, ...], place: MapInFrame) -> None:
-        path = serialized_path(cells, place.grid, self.header(place.frame), quaternion(0))
+        path = serialized_path(cells, place.grid, self.header(place.frame), Quaternion())
         self.episodes.publish(path)
 
     def _publish_diagnostics(self) -> None:

@@ -6,7 +6,7 @@ import math
 import numpy as np
 import pytest
 from builtin_interfaces.msg import Time
-from geometry_msgs.msg import Pose, Quaternion
+from geometry_msgs.msg import Pose, PoseStamped, Quaternion
 from hypothesis import given
 from hypothesis import strategies as st
 from integration.robot import changed, points_of, yaw_of
@@ -49,7 +49,7 @@ def test_a_map_survives_the_way_to_a_message_and_back(yaw: float, sign: int) -> 
     x, y, read = grid.origin
     assert (grid.resolution, x, y) == (0.5, -1.0, 2.0)
     assert (math.cos(read), math.sin(read)) == pytest.approx((math.cos(yaw), math.sin(yaw)))
-    grid = grid_from_message(message, occupied_threshold=64, allow_unknown=True)
+    grid = grid_from_message(message, 64, True)
     assert grid.occupancy.tolist() == [[False, True, False], [True, True, False]]
 
 
@@ -92,20 +92,23 @@ def test_malformed_map_is_refused_by_the_name_of_its_value(
 def test_a_pose_has_a_cell_also_off_the_map_or_is_refused_by_the_name_of_its_value(
     field: str, value: float, reason: str
 ) -> None:
-    grid, pose = GridMap(np.zeros((2, 2)), 0.5), Pose()
-    for pose.position.x, pose.position.y, cell in ((0.5, 0.99, (1, 1)), (-0.1, 1.0, (-1, 2))):
-        assert cell_from_pose("the goal", HEADER, pose, grid, "map") == cell
+    grid, stamped = GridMap(np.zeros((2, 2)), 0.5), PoseStamped(header=HEADER)
+    at = stamped.pose.position
+    for at.x, at.y, cell in ((0.5, 0.99, (1, 1)), (-0.1, 1.0, (-1, 2))):
+        assert cell_from_pose("the goal", stamped, grid, "map") == cell
     with pytest.raises(ValueError, match=reason):
-        cell_from_pose("the goal", HEADER, changed(pose, field, value), grid, "map")
+        cell_from_pose("the goal", changed(stamped, f"pose.{field}", value), grid, "map")
 
 
 def test_a_pose_needs_the_frame_of_the_map_if_there_is_one() -> None:
-    for frame in ("", "odom"):
-        with pytest.raises(ValueError, match=f"the start's frame is '{frame}', the map's is 'map'"):
-            check_pose("the start", Header(frame_id=frame), Pose(), "map")
-    check_pose("the start", Header(frame_id="odom"), Pose(orientation=Quaternion(w=1.00009)))
+    stamped = PoseStamped(pose=Pose(orientation=Quaternion(w=1.00009)))
     with pytest.raises(ValueError, match="frame is ''"):
-        check_pose("the start", Header(), Pose())
+        check_pose("the start", stamped)
+    for stamped.header.frame_id in ("", "odom"):
+        its = f"the start's frame is '{stamped.header.frame_id}', the map's is 'map'"
+        with pytest.raises(ValueError, match=its):
+            check_pose("the start", stamped, "map")
+    check_pose("the start", stamped)
 
 
 @pytest.mark.parametrize("yaw", [0.0, 0.7, -2.0])

@@ -206,12 +206,12 @@ def test_other_frames_are_refused_without_tf_and_the_remedy_names_it(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     stamped, frames = pose_at(1), listening(monkeypatch)
-    frames.check("the goal", stamped.header, stamped.pose, "map")
+    frames.check("the goal", stamped, "map")
     with pytest.raises(ValueError, match=r"frame is ''; name one in header\.frame_id$"):
-        frames.check("the goal", Header(), stamped.pose, "map")
+        frames.check("the goal", PoseStamped(), "map")
     frames.available = False
     with pytest.raises(ValueError, match=r"'odom', the map's is 'map'; transform .* tf2_ros"):
-        frames.check("the goal", stamped.header, stamped.pose, "map")
+        frames.check("the goal", stamped, "map")
     with pytest.raises(RequestError, match="tf2_ros is not installed"):
         frames.to_map("the goal", stamped, "map")
     in_map = pose_at(1, "map")
