@@ -77,12 +77,12 @@ def test_a_saved_model_comes_back_the_same(
         np.testing.assert_array_equal(loaded.tensors[key], tensor)
 
 
-def test_a_model_file_that_names_no_hidden_units_has_none(
-    tmp_path: Path, network: QNetwork
+def test_an_old_model_file_that_names_no_hidden_units_has_none(
+    model_path: Path, network: QNetwork
 ) -> None:
-    path = tmp_path / "old.safetensors"
-    save_model(path, network, replace(METADATA, sizes={"height": 4, "width": 5, "filters": 2}))
-    assert load_model(path)[1] == METADATA
+    sizes = {"height": 4, "width": 5, "filters": 2}
+    save_model(model_path, network, replace(METADATA, sizes=sizes))
+    assert load_model(model_path)[1] == METADATA
 
 
 def test_a_file_that_is_truncated_anywhere_is_refused(model_path: Path) -> None:
@@ -112,16 +112,10 @@ def test_a_file_with_one_wrong_byte_is_a_model_or_refused(model_path: Path) -> N
     assert refused > 100
 
 
-def test_a_pickle_is_not_run(tmp_path: Path) -> None:
-    class Bomb:
-        def __reduce__(self) -> tuple[object, ...]:
-            return (Path(tmp_path / "exploded").touch, ())
-
-    path = tmp_path / "model.safetensors"
-    path.write_bytes(pickle.dumps(Bomb()))
+def test_a_pickle_is_refused(model_path: Path) -> None:
+    model_path.write_bytes(pickle.dumps({"weight": np.zeros(1)}))
     with pytest.raises(ModelFileError, match="another kind"):
-        load_model(path)
-    assert not (tmp_path / "exploded").exists()
+        load_model(model_path)
 
 
 MISSING = object()
@@ -218,26 +212,22 @@ Tensors = dict[str, np.ndarray]
     ],
 )
 def test_tensors_of_another_network_are_refused(
-    tmp_path: Path, network: QNetwork, change: Callable[[Tensors], object]
+    model_path: Path, network: QNetwork, change: Callable[[Tensors], object]
 ) -> None:
-    path = tmp_path / "model.safetensors"
-    tensors = dict(network.tensors)
-    change(tensors)
-    text = json.dumps(asdict(METADATA))
-    path.write_bytes(safetensors.numpy.save(tensors, {"ddqn_planner": text}))
+    change(network.tensors)
+    save_model(model_path, network, METADATA)
     with pytest.raises(ModelFileError, match="holds tensors"):
-        load_model(path)
+        load_model(model_path)
 
 
 @pytest.mark.parametrize("weight", [np.nan, np.inf, -np.inf])
 def test_weights_that_are_not_finite_are_refused(
-    tmp_path: Path, network: QNetwork, weight: float
+    model_path: Path, network: QNetwork, weight: float
 ) -> None:
     network.tensors["fully_connected.bias"][0] = weight
-    path = tmp_path / "model.safetensors"
-    save_model(path, network, METADATA)
+    save_model(model_path, network, METADATA)
     with pytest.raises(ModelFileError, match="not all finite"):
-        load_model(path)
+        load_model(model_path)
 
 
 @same_folder

@@ -11,11 +11,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from networks import turning_planner
-from strategies import grids_in_parts, grids_with_costs, grids_with_free_cell
+from strategies import cells_of, grids_in_parts, grids_with_costs, grids_with_free_cell
 
 from ddqn_planner import GridMap, MoveRule, PlanMethod, Planner, PlanStatus
 from ddqn_planner.grid import Cell, shortest_distances
-from ddqn_planner.planning import field as fields
 from ddqn_planner.planning.field import DistanceField
 from ddqn_planner.planning.plan import PlanRequest
 from ddqn_planner.planning.planner import last_step
@@ -27,10 +26,6 @@ GRIDS = grids_with_free_cell() | grids_with_costs() | grids_in_parts()
 
 def new_planner() -> Planner:
     return Planner(ANY_MAP.network, ANY_MAP.metadata)
-
-
-def cells_of(grid: GridMap) -> st.SearchStrategy[Cell]:
-    return st.tuples(st.integers(0, grid.width - 1), st.integers(0, grid.height - 1))
 
 
 @settings(max_examples=300)
@@ -79,23 +74,6 @@ def test_a_field_toward_several_goals_is_the_best_of_their_fields(
         assert set(whole.cells) & set(goals) == {whole.cells[-1]}
 
 
-@given(GRIDS, RULES, st.data())
-def test_a_field_toward_several_goals_is_repaired(
-    grid_and_goal: tuple[GridMap, Cell], rule: MoveRule, data: st.DataObject
-) -> None:
-    grid, start = grid_and_goal
-    goals = data.draw(st.lists(cells_of(grid), min_size=2, max_size=4))
-    planner = new_planner()
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(fields, "CHANGED_SHARE", 1.0)
-        patch.setattr(fields, "REPAIRED", data.draw(st.sampled_from([1, 300])))
-        for _ in range(3):
-            plan = planner.plan_nearest(grid, start, goals, rule)
-            assert plan == new_planner().plan_nearest(grid, start, goals, rule)
-            x, y = data.draw(cells_of(grid))
-            grid = grid.with_patch([[data.draw(st.booleans())]], x, y)
-
-
 def test_goals_that_are_not_free_are_left_out() -> None:
     occupancy = np.zeros((3, 9), dtype=bool)
     occupancy[:, 7] = True
@@ -108,7 +86,6 @@ def test_goals_that_are_not_free_are_left_out() -> None:
         ([(8, 0), (8, 2)], PlanStatus.NO_PATH),
     ):
         assert ANY_MAP.plan_nearest(grid, (6, 1), goals).status is status
-    assert ANY_MAP.plan_nearest(grid, (7, 0), [(0, 0)]).status is PlanStatus.START_OCCUPIED
 
 
 def test_a_network_without_costs_plans_to_each_goal() -> None:

@@ -12,10 +12,19 @@ import numpy as np
 import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
-from strategies import grids_with_costs, grids_with_directions, grids_with_free_cell
+from hypothesis.extra import numpy as numpy_st
+from strategies import cells_of, grids_with_costs, grids_with_directions, grids_with_free_cell
 
 from ddqn_planner import GridMap, MoveRule, Planner, simplify
-from ddqn_planner.grid import MOVES, Cell, path_cost, path_length, shortest_path
+from ddqn_planner.grid import (
+    MOVES,
+    Cell,
+    legal_moves,
+    path_cost,
+    path_length,
+    shortest_distances,
+    shortest_path,
+)
 from ddqn_planner.planning import PlanRequest
 from ddqn_planner.planning.paths import (
     REACH,
@@ -23,6 +32,7 @@ from ddqn_planner.planning.paths import (
     keep_or_switch,
     legal_segments,
     rest_of_path,
+    search,
     segment_cost,
     touched_cells,
 )
@@ -53,10 +63,9 @@ def is_legal(first: Cell, last: Cell, grid: GridMap, rule: MoveRule) -> bool:
 @st.composite
 def changed(draw: st.DrawFn, grid: GridMap) -> GridMap:
     """The map with some other cells and costs."""
-    cells = st.tuples(st.integers(0, grid.width - 1), st.integers(0, grid.height - 1))
     occupancy = grid.occupancy.copy()
     cost = None if grid.cost is None else grid.cost.copy()
-    for x, y in draw(st.lists(cells, max_size=6)):
+    for x, y in draw(st.lists(cells_of(grid), max_size=6)):
         occupancy[y, x] ^= draw(st.booleans())
         if cost is not None:
             cost[y, x] = draw(st.integers(0, 99))
@@ -124,9 +133,7 @@ def test_each_cell_counts_by_the_length_of_the_segment_within_it(
     grid_and_cell: tuple[GridMap, Cell], rule: MoveRule, data: st.DataObject
 ) -> None:
     grid, first = grid_and_cell
-    last = data.draw(
-        st.tuples(st.integers(0, grid.width - 1), st.integers(0, grid.height - 1)), label="last"
-    )
+    last = data.draw(cells_of(grid), label="last")
     exact = exact_cost(first, last, grid.cost_multiplier, rule)
     assert segment_cost(first, last, grid.cost_multiplier, rule) == pytest.approx(exact)
     if max(abs(last[0] - first[0]), abs(last[1] - first[1])) == 1:
@@ -164,14 +171,6 @@ def test_under_the_unit_rule_diagonals_are_joined_and_no_segment_counts_more() -
     simple = simplify(path, grid, MoveRule.UNIT)
     assert len(simple) <= 3
     assert path_length(simple, MoveRule.UNIT) == path_length(path, MoveRule.UNIT) == 11
-
-
-def test_any_pairs_of_whole_numbers_are_cells_and_come_back_as_python_ints() -> None:
-    grid = GridMap(np.zeros((3, 5)))
-    cells = np.array([(0, 0), (1, 0), (2, 0), (3, 1), (4, 2)])
-    assert repr(simplify(cells, grid, "unit")) == repr(simplify(cells.tolist(), grid, "unit"))
-    with pytest.raises(ValueError, match=r"the cell is \(0\.5, 0\)"):
-        simplify([(0.5, 0)], grid, "unit")
 
 
 def test_segments_are_as_long_as_can_be() -> None:
@@ -337,3 +336,56 @@ def test_a_path_to_another_goal_is_kept_up_to_the_threshold_while_that_goal_is_f
         assert plan.path.tolist() == rest.tolist()
     if plan.extra_cost is None:
         assert plan == best
+
+
+# Searches
+
+
+ANY_VALUE = st.floats(width=32, allow_nan=True, allow_infinity=True)
+
+
+@given(grids_with_costs(), RULES, st.data())
+def test_a_search_finds_a_legal_path_wherever_there_is_one_whatever_the_values(
+    grid_and_goal: tuple[GridMap, Cell], rule: MoveRule, data: st.DataObject
+) -> None:
+    grid, goal = grid_and_goal
+    start = data.draw(st.sampled_from(grid.free_cells()))
+    value = data.draw(numpy_st.arrays(np.float32, grid.occupancy.shape, elements=ANY_VALUE))
+    legal = legal_moves(grid.occupancy, rule)
+    distances = shortest_distances(grid, goal, rule)
+
+    cells = search(start, goal, legal, grid.cost_multiplier, rule, value)
+    assert (cells != ()) == np.isfinite(distances[start[1], start[0]])
+    if cells:
+        assert (cells[0], cells[-1]) == (start, goal)
+        assert len(set(cells)) == len(cells)
+        for (x, y), (next_x, next_y) in pairwise(cells):
+            assert legal[MOVES.tolist().index([next_x - x, next_y - y]), y, x]
+
+    cheapest = distances[start[1], start[0]]
+    for known in (None, -distances.astype(np.float32)):  # nothing is known, or all is
+        cells = search(start, goal, legal, grid.cost_multiplier, rule, known)
+        if cells:
+            assert path_cost(cells, grid.cost_multiplier, rule) == pytest.approx(cheapest)
+
+
+def test_a_search_follows_the_values_even_on_a_detour() -> None:
+    grid, rule = GridMap(np.zeros((3, 5))), MoveRule.ROBOT_SAFE
+    detour = [(0, 0), (0, 1), (0, 2), (1, 2), (2, 2), (3, 2), (4, 2), (4, 1), (4, 0)]
+    value = np.zeros((3, 5), np.float32)
+    for x, y in detour:
+        value[y, x] = 100
+    legal = legal_moves(grid.occupancy, rule)
+    assert set(search((0, 0), (4, 0), legal, grid.cost_multiplier, rule, value)) <= set(detour)
+    assert len(search((0, 0), (4, 0), legal, grid.cost_multiplier, rule)) == 5
+
+
+def test_a_search_goes_to_the_nearest_of_several_ends() -> None:
+    grid = GridMap(np.zeros((1, 9)))
+    ends = np.zeros((1, 9), dtype=bool)
+    ends[0, [0, 8]] = True
+    rule = MoveRule.ROBOT_SAFE
+    legal = legal_moves(grid.occupancy, rule)
+    assert search((3, 0), ends, legal, grid.cost_multiplier, rule)[-1] == (0, 0)
+    assert search((5, 0), ends, legal, grid.cost_multiplier, rule)[-1] == (8, 0)
+    assert search((8, 0), ends, legal, grid.cost_multiplier, rule) == ((8, 0),)
