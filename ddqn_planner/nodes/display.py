@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, NamedTuple
@@ -24,7 +23,7 @@ from ddqn_planner.nodes.runtime import LATCHED, STEADY, Worker
 from ddqn_planner.planning import Planner, QField
 
 LOOK_PERIOD = 0.1
-"""Seconds between two looks whether there is something new to show, and somebody subscribes."""
+"""Seconds between two looks whether something is new: no answer waits for what only shows it."""
 
 MAX_ARROWS = 10_000
 """Per message: more arrows take longer to make than a plan, and are too small to see."""
@@ -73,13 +72,9 @@ class FieldDisplay:
         self._worker = Worker(node)
         self._shown: Shown | None = None
         self._shows_again = False
-        self._layers = [
-            Layer(name, node.create_publisher(message_type, f"~/{name}", LATCHED), message)
-            for name, message_type, message in (
-                ("value", OccupancyGrid, value_message),
-                ("policy", MarkerArray, policy_message),
-            )
-        ]
+        value = node.create_publisher(OccupancyGrid, "~/value", LATCHED)
+        policy = node.create_publisher(MarkerArray, "~/policy", LATCHED)
+        self._layers = Layer("value", value, value_message), Layer("policy", policy, policy_message)
         group = MutuallyExclusiveCallbackGroup()
         node.create_timer(LOOK_PERIOD, self._on_look, group, clock=STEADY)
 
@@ -128,19 +123,14 @@ def _message(layer: Layer, shown: Shown) -> Any:
 
 
 def policy_message(field: QField | None, grid: GridMap, header: Header) -> MarkerArray:
-    """Make a message with an arrow for the greedy action in each cell, as one list of lines.
-
-    The goal and cells of policy -1 have none. If there are more than `MAX_ARROWS`, the message has
-    those of each k-th row and column, k times as large. It replaces the last message; without any
-    arrow, it deletes it.
-    """
+    """Make a message with an arrow for each greedy action; without any, it deletes the last one."""
     policy = np.full(grid.occupancy.shape, -1)
     if field is not None:
         policy[:] = field.policy
         policy[field.goal[1], field.goal[0]] = -1
-    step = next(
-        k for k in itertools.count(1) if np.count_nonzero(policy[::k, ::k] >= 0) <= MAX_ARROWS
-    )
+    step = 1  # if there are too many arrows, those of each k-th row and column, k times as large
+    while np.count_nonzero(policy[::step, ::step] >= 0) > MAX_ARROWS:
+        step += 1
     rows, columns = step * np.array(np.nonzero(policy[::step, ::step] >= 0))
     centres = columns + 0.5 + 1j * (rows + 0.5)
     arrows = centres[:, None] + step * ARROW * DIRECTIONS[policy[rows, columns], None]

@@ -12,14 +12,13 @@ from nav_msgs.msg import OccupancyGrid
 from numpy.typing import NDArray
 from rclpy.qos import QoSProfile
 from rclpy.task import Future
-from rclpy.time import Time
 from std_msgs.msg import Header, String
 
 from ddqn_planner.experience import Experience
 from ddqn_planner.grid import GridMap
 from ddqn_planner.grid.body import Inflation
 from ddqn_planner.nodes.conversions import grid_from_message, grid_from_values
-from ddqn_planner.nodes.report import Outcome, Report, RequestError, seconds
+from ddqn_planner.nodes.report import NO_REQUEST, Outcome, Report, RequestError, seconds
 from ddqn_planner.nodes.runtime import LATCHED, BaseNode, Worker
 from ddqn_planner.planning import Plan
 from ddqn_planner.planning.field import offset_between
@@ -34,15 +33,15 @@ MAP_PARAMETERS = ("occupied_threshold", "allow_unknown", "use_map_costs", "map_t
 BODY_PARAMETERS = ("robot_radius", "clearance_weight")
 
 UPDATES_QUALITY = QoSProfile(depth=100)
-"""An update that is lost leaves old cells. Reliable, and volatile: the last update alone, which a
-latched topic would send, does not make an old map a new one."""
+"""Reliable, as a lost update leaves old cells; volatile, as the last one alone makes no new map."""
+
+REMEDY = "let the map's publisher send the full map"
 
 PATIENCE = 1.0
 """Seconds within which the first map is expected after the node subscribes."""
 
 CHANGED_SHARE = 0.02
-"""Share of cells that may change before experience is spread anew over the map, which takes long.
-What a robot sees on its way, as a person who stands there, changes little of what it learned."""
+"""Share of cells that may change, as by a person, before experience is spread anew, slowly."""
 
 
 @dataclass
@@ -55,18 +54,13 @@ class Received:
 
 
 class MapSource:
-    """Listens to maps and their updates, and inflates the last map for the robot's body.
-
-    A map whose directions have not come waits for them, and the map before it stays meanwhile.
-    `on_map` is called with whether the map's frame is a new one, each time when there is something
-    new to plan on. Its worker inflates, for over a second: maps must not wait for fields.
-    """
+    """The map to plan on; `on_map` is called, with whether the frame is new, when anything is."""
 
     def __init__(
         self, node: BaseNode, report: Report, worker: Worker, on_map: Callable[[bool], None]
     ) -> None:
         self._node, self._report, self._worker, self._on_map = node, report, worker, on_map
-        # The map in use and the last one, which waits for its directions if it is another one.
+        # The map in use and the last one. If that is another one, it waits for its directions.
         self._used: Received | None = None
         self._newest: Received | None = None
         self._began = time.monotonic()
@@ -74,8 +68,7 @@ class MapSource:
         self._updates = self._refused_updates = 0
         self._inflated: Future | None = None
         self._inflate, self._times = Inflation(), ExpectedTimes()
-        self._forecast_of: Outcome | None = None
-        self._computing: Future | None = None
+        self._forecast_of, self._forecast = NO_REQUEST, Future()
         # Before the subscription of the map: directions that come with a map are taken first.
         node.create_subscription(OccupancyGrid, DIRECTIONS, self._take_directions, LATCHED)
         self._directions = Directions(node)
@@ -103,12 +96,9 @@ class MapSource:
         timeout = self._node.value("map_timeout")
         is_costmap = self._node.value("map_type") == "costmap"
         if is_costmap and 0 < timeout < time.monotonic() - self._used.came:
-            raise RequestError(
-                "MAP_TIMEOUT",
-                f"nothing came on {self._topic} for longer than map_timeout, {timeout:g} s"
-                f"{because}; start the costmap again, or set map_timeout if it is published less "
-                "often",
-            )
+            silent = f"nothing came on {self._topic} for longer than map_timeout, {timeout:g} s"
+            remedy = "start the costmap again, or set map_timeout if it is published less often"
+            raise RequestError("MAP_TIMEOUT", f"{silent}{because}; {remedy}")
         return self._used.header
 
     @property
@@ -129,32 +119,22 @@ class MapSource:
         if self._updates or self._refused_updates:
             description["map updates applied"] = str(self._updates)
             description["map updates refused"] = str(self._refused_updates)
-        return description | self._forecast(outcome)
-
-    def _forecast(self, outcome: Outcome) -> dict[str, str]:
-        """Return how long a plan takes, once the worker knows it: then the report is due."""
         if outcome is not self._forecast_of:
-            self._forecast_of, self._computing = outcome, None
+            self._forecast_of, self._forecast = outcome, Future()
             request, plan = outcome.request, outcome.plan
             if request is not None and len(plan.path) and request.grid.slowness is not None:
-                self._computing = self._worker.call(self._times.describe, request.grid, plan)
-                self._computing.add_done_callback(lambda _: self._report.change())
-        if self._computing is None or not self._computing.done():
-            return {}
-        description: dict[str, str] = self._computing.result()
-        return description
+                self._forecast = self._worker.call(self._times.describe, request.grid, plan)
+                self._forecast.add_done_callback(lambda _: self._report.change())
+        return description | (self._forecast.result() or {})
 
     def inflated(self) -> Future:
         """Return the `GridMap` for the robot's body, which is computed for the first request."""
         if self._inflated is None:
             radius, weight = map(self._node.value, BODY_PARAMETERS)
             # ROS accepts a value that is above the range by a millionth.
-            body = radius, min(weight, 1.0)
-            self._inflated = self._worker.call(self._made, self._grid, *body)
+            of = self._grid, radius, min(weight, 1.0)
+            self._inflated = self._worker.call(lambda: self._times.apply(self._inflate(*of)))
         return self._inflated
-
-    def _made(self, grid: GridMap, *body: float) -> GridMap:
-        return self._times.apply(self._inflate(grid, *body))
 
     async def on_experience_saved(self, message: String) -> None:
         """Plan by what the trainer has learned from drives, or refuse its file."""
@@ -169,7 +149,7 @@ class MapSource:
     def apply_parameters(self, changed: set[str]) -> None:
         """Read and inflate the map anew if one of the parameters that changed says so."""
         if changed & {*MAP_PARAMETERS, *BODY_PARAMETERS, "require_directions"}:
-            self._read_again(self._used or self._newest)
+            self._read_again()
 
     def _read(self, message: OccupancyGrid) -> GridMap:
         return grid_from_message(message, *map(self._node.value, MAP_PARAMETERS))
@@ -187,11 +167,11 @@ class MapSource:
     def _take_directions(self, message: OccupancyGrid) -> None:
         with self._report.taking(DIRECTIONS):
             self._directions.take(message)
-            self._read_again(self._newest, self._used)
+            self._read_again()
 
-    def _read_again(self, *candidates: Received | None) -> None:
-        """Plan on the first one whose directions have come."""
-        for received in filter(None, candidates):
+    def _read_again(self) -> None:
+        """Plan on the newest map if its directions have come, else on the one in use."""
+        for received in filter(None, (self._newest, self._used)):
             if self._use(self._read(received.message), received):
                 break
 
@@ -233,10 +213,12 @@ class MapSource:
 
     def _take_update(self, update: Any) -> None:
         """Plan on the map with other values in a box from now on, or refuse the update."""
+        newest = self._newest
         try:
-            message = self._newest.message if self._newest is not None else None
-            values = updated_values(message, update)
-            if self._newest is self._used:
+            if newest is None:
+                raise ValueError(f"an update came before a map; {REMEDY}")
+            values = updated_values(newest.message, update)
+            if newest is self._used:
                 rules = map(self._node.value, MAP_PARAMETERS)
                 patch = grid_from_values(values, 1.0, (0.0, 0.0, 0.0), *rules)
                 cells = patch.occupancy, update.x, update.y, patch.cost, patch.obstacles
@@ -247,57 +229,42 @@ class MapSource:
             if count & (count - 1) == 0:  # 1, 2, 4, ...: updates come often
                 self._node.get_logger().error(f"update {count} of the map refused: {error}")
             return
-        assert self._newest is not None
         # In place, for the day when a parameter changes and the map is read anew.
-        info, (height, width) = self._newest.message.info, values.shape
-        whole = np.frombuffer(self._newest.message.data, np.int8).reshape(info.height, info.width)
+        info, (height, width) = newest.message.info, values.shape
+        whole = np.frombuffer(newest.message.data, np.int8).reshape(info.height, info.width)
         whole[update.y : update.y + height, update.x : update.x + width] = values
         self._report.accept("map_updates")
-        self._newest.header, self._newest.came = update.header, time.monotonic()
+        newest.header, newest.came = update.header, time.monotonic()
         self._updates += 1
-        if self._newest is self._used:
+        if newest is self._used:
             self._changed()
 
 
-def updated_values(message: OccupancyGrid | None, update: Any) -> NDArray[np.int8]:
+def updated_values(message: OccupancyGrid, update: Any) -> NDArray[np.int8]:
     """Return the values that an update puts into the last map, (h, w); ValueError if none fit."""
-    remedy = "let the map's publisher send the full map"
-    if message is None:
-        raise ValueError(f"an update came before a map; {remedy}")
-    if update.header.frame_id != message.header.frame_id:
-        raise ValueError(
-            f"the update's frame is {update.header.frame_id!r}, the map's is "
-            f"{message.header.frame_id!r}; publish both in one frame"
-        )
-    stamp, map_stamp = map(Time.from_msg, (update.header.stamp, message.header.stamp))
-    if 0 < stamp.nanoseconds < map_stamp.nanoseconds:
-        raise ValueError(
-            f"the map's stamp, {seconds(message.header.stamp)}, is later than the update's, "
-            f"{seconds(update.header.stamp)}; {remedy} if time was set back"
-        )
+    frame, map_frame = update.header.frame_id, message.header.frame_id
+    if frame != map_frame:
+        both = f"the update's frame is {frame!r}, the map's is {map_frame!r}"
+        raise ValueError(f"{both}; publish both in one frame")
+    stamp, map_stamp = update.header.stamp, message.header.stamp
+    if (0, 0) < (stamp.sec, stamp.nanosec) < (map_stamp.sec, map_stamp.nanosec):
+        stamps = f"{seconds(map_stamp)}, is later than the update's, {seconds(stamp)}"
+        raise ValueError(f"the map's stamp, {stamps}; {REMEDY} if time was set back")
     info, width, height = message.info, update.width, update.height
-    x, y = update.x, update.y
+    x, y, box = update.x, update.y, f"{width} x {height} cells"
     if not (0 <= x < x + width <= info.width and 0 <= y < y + height <= info.height):
-        raise ValueError(
-            f"an update of {width} x {height} cells from {(x, y)} is not inside the map of "
-            f"{info.width} x {info.height}; {remedy}"
-        )
+        place = f"is not inside the map of {info.width} x {info.height}"
+        raise ValueError(f"an update of {box} from {(x, y)} {place}; {REMEDY}")
     if len(update.data) != width * height:
-        raise ValueError(
-            f"the update's data has {len(update.data)} values; its {width} x {height} cells need "
-            f"{width * height}"
-        )
+        wrong = f"the update's data has {len(update.data)} values"
+        raise ValueError(f"{wrong}; its {box} need {width * height}")
     return np.frombuffer(update.data, np.int8).reshape(height, width)
 
 
+# A map server publishes them for each of its maps, with the map's stamp: then the next map waits
+# for its own, which may come seconds after it, or never if the map server is killed.
 class Directions:
-    """Forbidden directions: the last ones hold for each map, in the region they share.
-
-    A map server publishes them for each of its maps, with the map's stamp: an ``OccupancyGrid``
-    whose values are the bytes of `GridMap.forbidden`, and without cells where nothing is forbidden.
-    Directions and maps that have had one stamp come from one map server: then the next map waits
-    for its own, which may come seconds after it, or never if the map server is killed.
-    """
+    """Forbidden directions: the last ones hold for each map, in the region they share."""
 
     def __init__(self, node: BaseNode) -> None:
         self._node, self._topic = node, node.resolve_topic_name(DIRECTIONS)
@@ -312,32 +279,28 @@ class Directions:
         if message.info.width or message.info.height or message.data:
             place = grid_from_message(message)
             forbidden = np.frombuffer(message.data, np.uint8).reshape(place.occupancy.shape)
-            free = np.zeros(forbidden.shape, dtype=np.bool_)
-            directions = GridMap(free, place.resolution, place.origin, forbidden=forbidden)
+            directions = place.with_layers(forbidden=forbidden)
         self._last = message.header, directions
 
     def on(self, grid: GridMap, header: Header) -> GridMap:
         """Return a map with its directions; ValueError if they have not come or do not fit it."""
         # A map server creates this publisher first: whoever receives its map sees it already.
         published = self._node.count_publishers(self._topic) > 0
-        if self._last is None:
-            if published or self._node.value("require_directions"):
-                raise ValueError(
-                    f"the map's directions were not received on {self._topic} yet; let a map "
-                    "server publish them, or set require_directions to false"
-                )
-            return grid
         known = [found for found in (self._last, self.used) if found is not None]
         own = [found for found in known if found[0].stamp == header.stamp]
+        late = f"were not received on {self._topic} yet"
+        if not known and (published or self._node.value("require_directions")):
+            remedy = "let a map server publish them, or set require_directions to false"
+            raise ValueError(f"the map's directions {late}; {remedy}")
         if self._are_paired and published and not own:
-            raise ValueError(
-                f"the map's directions, with its stamp, {seconds(header.stamp)}, were not received "
-                f"on {self._topic} yet; if they do not come, load the map again"
-            )
-        of_map, directions = (own or known)[0]
+            what = f"the map's directions, with its stamp, {seconds(header.stamp)}"
+            raise ValueError(f"{what}, {late}; if they do not come, load the map again")
+        if not known:
+            return grid
+        of_map, directions = found = (own or known)[0]
         if directions is not None:
             grid = self._placed(directions, of_map.frame_id, grid, header.frame_id)
-        self.used, self._are_paired = (of_map, directions), bool(own)
+        self.used, self._are_paired = found, bool(own)
         return grid
 
     def _placed(self, directions: GridMap, frame: str, grid: GridMap, map_frame: str) -> GridMap:

@@ -1,7 +1,4 @@
-"""Nav2's planning actions and its service, for a node where nav2_msgs is installed.
-
-`PathAction` uses none of Nav2's types, so that it can be tested where these are not installed.
-"""
+"""Nav2's planning actions and its service, for a node where nav2_msgs is installed."""
 
 from __future__ import annotations
 
@@ -26,8 +23,7 @@ QUEUES: dict[str, Any] = {
 """Those of an action's services: without them, goals are lost like requests."""
 
 RESULT_TIMEOUT = 5
-"""Seconds for which a result is kept. Each status message names all goals whose results are kept:
-rclpy's 900 would slow down clients, and fill the memory."""
+"""Seconds for which a result is kept: each status message names all goals whose results are."""
 
 CANCELED = Outcome("CANCELED", "the goal was canceled")
 PREEMPTED = Outcome("PREEMPTED", "a newer goal of the same action came")
@@ -54,13 +50,11 @@ def error_code(status: str, result: Any) -> int:
     return int(getattr(result, CODES.get(status, status), result.UNKNOWN))
 
 
-Plan = Callable[
-    [PoseStamped | None, list[PoseStamped], str, Future], Awaitable[tuple[Path, Outcome]]
-]
-"""Plans from a start, or from where the robot is, through goals, with a planner's name, until the
-future has an `Outcome` with which the goal is to be given up."""
+Plan = Callable[[Any, list[PoseStamped], str, Future], Awaitable[tuple[Path, Outcome]]]
+"""Plans from a start or None through goals, by a planner's name, until a future has an outcome."""
 
 
+# Without Nav2's types, so that it can be tested where these are not installed.
 class PathAction:
     """Answers the goals of one action, of which the newest one preempts the one under way."""
 
@@ -74,16 +68,19 @@ class PathAction:
 
     def begin(self, handle: Any) -> None:
         """Give up the goals under way for a new one."""
-        for given_up in self._under_way.values():
-            _give_up(given_up, PREEMPTED)
+        self._give_up(PREEMPTED, *self._under_way)
         self._under_way[_key(handle)] = Future()
         handle.execute()
 
     def cancel(self, handle: Any) -> CancelResponse:
         """Give up a goal."""
-        if _key(handle) in self._under_way:
-            _give_up(self._under_way[_key(handle)], CANCELED)
+        self._give_up(CANCELED, _key(handle))
         return CancelResponse.ACCEPT
+
+    def _give_up(self, outcome: Outcome, *keys: bytes) -> None:
+        for key in keys:
+            if key in self._under_way and not self._under_way[key].done():
+                self._under_way[key].set_result(outcome)
 
     async def execute(self, handle: Any) -> Any:
         """Return the result of a goal, and set the state of its handle."""
@@ -94,8 +91,7 @@ class PathAction:
             path, outcome = await self._plan(start, goals, goal.planner_id, given_up)
         finally:
             del self._under_way[_key(handle)]
-        result = self._result()
-        result.path = path
+        result = self._result(path=path)
         result.planning_time = Duration(seconds=time.monotonic() - began).to_msg()
         result.error_code = error_code(outcome.status, self._result)
         if hasattr(result, "error_msg"):  # Nav2 has added it later
@@ -107,11 +103,6 @@ class PathAction:
         else:
             handle.abort()
         return result
-
-
-def _give_up(given_up: Future, outcome: Outcome) -> None:
-    if not given_up.done():
-        given_up.set_result(outcome)
 
 
 def _key(handle: Any) -> bytes:
@@ -126,9 +117,8 @@ def serve_nav2(
         from nav2_msgs.action import ComputePathThroughPoses, ComputePathToPose
         from nav2_msgs.srv import IsPathValid
     except ImportError as error:
-        node.get_logger().info(
-            f"no actions for Nav2 ({error}); to have them: apt install ros-jazzy-nav2-msgs"
-        )
+        remedy = "to have them: apt install ros-jazzy-nav2-msgs"
+        node.get_logger().info(f"no actions for Nav2 ({error}); {remedy}")
         return
     # Reentrant: the newest goal must be able to preempt another one.
     group = ReentrantCallbackGroup()

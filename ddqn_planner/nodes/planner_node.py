@@ -17,25 +17,22 @@ from rclpy.task import Future
 from std_msgs.msg import Header, String
 
 from ddqn_planner.nodes.conversions import path_message, serialized_path
-from ddqn_planner.nodes.display import FieldDisplay
+from ddqn_planner.nodes.display import LOOK_PERIOD, FieldDisplay
 from ddqn_planner.nodes.lifecycle import ManagedNode
 from ddqn_planner.nodes.map_source import MapSource
-from ddqn_planner.nodes.model_loading import ModelSource, load
 from ddqn_planner.nodes.nav2 import serve_nav2
 from ddqn_planner.nodes.parameters import PLANNER_PARAMETERS
 from ddqn_planner.nodes.poses import Frames, StartSource, check_source
-from ddqn_planner.nodes.report import (
-    NOT_ACTIVE,
-    Outcome,
-    Report,
-    RequestError,
-    begins_on_obstacle,
+from ddqn_planner.nodes.report import NO_REQUEST, NOT_ACTIVE, Outcome, Report, RequestError
+from ddqn_planner.nodes.requests import (
+    UNCHANGED,
+    ActiveGoal,
+    ModelSource,
+    PathUnderWay,
+    Requests,
+    load,
 )
-from ddqn_planner.nodes.requests import UNCHANGED, ActiveGoal, PathUnderWay, Requests
-from ddqn_planner.nodes.runtime import LATCHED, STEADY, Unless, Worker, spin_until_shutdown
-
-LOOK_PERIOD = 0.1
-"""Seconds between two looks whether something changed: an answer does not wait for diagnostics."""
+from ddqn_planner.nodes.runtime import LATCHED, STEADY, Worker, spin_until_shutdown, unless
 
 
 # The executor's one thread holds all state. What takes long runs in workers: to load the model,
@@ -117,6 +114,7 @@ class PlannerNode(ManagedNode):
         super().cleanup()
         self._forget()
         self._report.forget()
+        self._report.note(NO_REQUEST)
         self.after_jump_back.clear()
         for name in ("_start", "_frames", "_display", "_map", "_requests"):
             vars(self).pop(name, None)  # not all are there, if `configure` failed
@@ -165,7 +163,7 @@ class PlannerNode(ManagedNode):
     def _on_map(self, frame_changed: bool) -> None:
         if frame_changed:
             # What was refused for its frame may be right now.
-            self._start.accept()
+            self._report.accept(self._start.topic)
         self._replan.trigger()
 
     def _on_start(self) -> None:
@@ -194,9 +192,7 @@ class PlannerNode(ManagedNode):
 
     # Planning
 
-    async def _on_get_plan(
-        self, request: GetPlan.Request, response: GetPlan.Response
-    ) -> GetPlan.Response:
+    async def _on_get_plan(self, request: Any, response: Any) -> Any:
         start = request.start if request.start.header.frame_id else None
         header, outcome = await self._answer([], start, [request.goal], request.tolerance)
         response.plan = _path(path_message, outcome, header)
@@ -215,7 +211,7 @@ class PlannerNode(ManagedNode):
             self._plan_publisher.publish(_path(serialized_path, outcome, header))
         self._waits_for_pose = outcome.status in ("NO_START", "TF_ERROR")
         # The places and lengths in the reason may differ.
-        kind = outcome.status, outcome.plan.method, begins_on_obstacle(outcome)
+        kind = outcome.status, outcome.plan.method, "start is occupied" in outcome.reason
         logged = goals, outcome.goal, *kind
         if self._logged != logged:
             self._logged = logged
@@ -238,7 +234,7 @@ class PlannerNode(ManagedNode):
         response.is_valid = False
         try:
             checking = self._requests.is_path_valid(request.path)
-            response.is_valid = await Unless(checking, self._stopped) is True
+            response.is_valid = await unless(checking, self._stopped) is True
         except RequestError as error:
             self.get_logger().warning(f"no path to check: {error}")
         return response
@@ -250,7 +246,7 @@ class PlannerNode(ManagedNode):
         self._answering += 1
         try:
             planning = self._requests.plan(start, goals, *how)
-            outcome = await Unless(planning, self._stopped, *until)
+            outcome = await unless(planning, self._stopped, *until)
         except RequestError as error:
             outcome = Outcome(error.status, str(error))
         except Exception as error:  # as when no memory is left: the node must survive

@@ -45,19 +45,15 @@ class RequestError(ValueError):
 
 @dataclass(frozen=True)
 class Outcome:
-    """What became of a request; without a planner and a `PlanRequest` if it is not well-formed.
+    """What became of a request; without a planner and a `PlanRequest` if it is not well-formed."""
 
-    The status is the name of a `PlanStatus`, or that of a `RequestError`; the goal is in the map's
-    frame. The stamp is that of the map of the request, in seconds.
-    """
-
-    status: str
+    status: str  # the name of a `PlanStatus`, or that of a `RequestError`
     reason: str
     planner: Planner | None = None
     request: PlanRequest | None = None
     plan: Plan = NO_PLAN
-    goal: PoseStamped | None = None
-    map_stamp: str = ""
+    goal: PoseStamped | None = None  # in the map's frame
+    map_stamp: str = ""  # seconds
 
 
 NO_REQUEST = Outcome("NO_REQUEST", "no plan was asked for yet")
@@ -81,10 +77,8 @@ def reason_of(
             status = f"no path to any of {len(goals)} goals: {status}"
             remedy = remedy.removesuffix(TOLERANCE)
             to = f"goals: cells {', '.join(map(str, goals[:5]))}{', ...' * (len(goals) > 5)}"
-        reason = (
-            f"{status} (start: {_place(start, request.start)}; {to}; "
-            f"map: {grid.width} x {grid.height} cells)"
-        )
+        of_map = f"map: {grid.width} x {grid.height} cells"
+        reason = f"{status} (start: {_place(start, request.start)}; {to}; {of_map})"
         on_map = filter(grid.contains, goals)
         if plan.status is PlanStatus.GOAL_OCCUPIED and not all(map(grid.is_obstacle, on_map)):
             near = f"robot_radius, {robot_radius:g} m" if robot_radius else "the costmap allows"
@@ -93,11 +87,10 @@ def reason_of(
             reason += f", deeper than the start_clearing_radius, {cleared}"
         return f"{reason}; {remedy}"
     number = f" to goal {goals.index(plan.goal) + 1} of {len(goals)}" if request.others else ""
-    reason = f"a path of {plan.length:.2f} cells{number}, " + (
-        "by greedy steps"
-        if plan.method is PlanMethod.GREEDY
-        else "searched for in the order of the Q field: the greedy steps were trapped"
-    )
+    how = "by greedy steps"
+    if plan.method is not PlanMethod.GREEDY:
+        how = "searched for in the order of the Q field: the greedy steps were trapped"
+    reason = f"a path of {plan.length:.2f} cells{number}, {how}"
     if plan.extra_cost:
         reason += f", kept: its cost is {plan.extra_cost:+.1%} beside that of a new one"
     if plan.goal is not None and plan.goal not in goals:
@@ -107,12 +100,6 @@ def reason_of(
     if grid.is_obstacle(plan.path[0]):
         reason += f"; the start is occupied: obstacles within {cleared} of it were ignored"
     return reason
-
-
-def begins_on_obstacle(outcome: Outcome) -> bool:
-    """Return whether there is a path, and it leaves an obstacle."""
-    request, path = outcome.request, outcome.plan.path
-    return request is not None and len(path) > 0 and request.grid.is_obstacle(path[0])
 
 
 def _place(stamped: PoseStamped, cell: Cell) -> str:
@@ -139,11 +126,10 @@ class Refusals:
 
     def refuse(self, what: str, reason: str, log: bool = True) -> None:
         """Refuse something, and perhaps log it, unless the last reason was the same."""
-        repeated = self.refused.get(what) == reason
+        if log and self.refused.get(what) != reason:
+            self.node.get_logger().error(f"{what} refused: {reason}")
         self.refused[what] = reason
         self.change()
-        if log and not repeated:
-            self.node.get_logger().error(f"{what} refused: {reason}")
 
     def accept(self, what: str) -> None:
         """Forget that something was refused."""
@@ -175,11 +161,6 @@ class Report(Refusals):
     def change(self) -> None:
         """Publish soon: something about the node changed."""
         self._due = 0.0
-
-    def forget(self) -> None:
-        """Forget what was refused, and the last outcome."""
-        super().forget()
-        self.note(NO_REQUEST)
 
     def note(self, outcome: Outcome) -> None:
         """Keep the last outcome for the diagnostics."""
