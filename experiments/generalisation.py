@@ -24,7 +24,6 @@ from tqdm import tqdm
 
 from ddqn_planner import GridMap, MoveRule, Planner, QField
 from ddqn_planner.cli import HelpFormatter, exit_code
-from ddqn_planner.files import write_atomically
 from ddqn_planner.grid import MOVES, Cell, legal_moves, path_cost, read_map_file, shortest_distances
 from ddqn_planner.grid.arguments import Occupancy
 from ddqn_planner.grid.noise import random_costs, random_requests, unknown_costs
@@ -348,7 +347,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
     add("--requests", type=int, default=200, metavar="N", help="requests per map")
     add("--costs", choices=COSTS, default="none", help="costs of free cells")
     add("--seed", type=int, default=0, help="seed of maps and requests")
-    add("--out", type=Path, metavar="FILE", help="a file for the tables, as Markdown")
     options = parser.parse_args(arguments)
     return exit_code(parser.prog, lambda: run(options))
 
@@ -382,8 +380,6 @@ def run(options: argparse.Namespace) -> int:
             f"{markdown(rollouts)}"
         )
         print(text, end="")
-        if options.out:
-            write_atomically(options.out, text.encode())
     return 130 if interrupted else 0
 
 

@@ -43,11 +43,6 @@ def trainings(settings: Settings, variants: Sequence[str] = ("both",)) -> list[T
     return settings.trainings(parameters_of, [paper_scenario()])
 
 
-def ablation_trainings(settings: Settings) -> list[Training]:
-    """Return the trainings of every variant."""
-    return trainings(settings, tuple(VARIANTS))
-
-
 def convergence_row(runs: Sequence[Evaluations]) -> list[str]:
     """Return the cells of `CONVERGENCE` for the evaluations of each seed."""
     optimum, ends = optimal_length(paper_scenario()), [run[-1] for run in runs]
