@@ -14,9 +14,8 @@ from subprocess import Popen
 from typing import Any
 
 import numpy as np
-from client import TIMEOUT, Client, initial_pose, plan_request, pose, wait_for
+from client import RULE, TIMEOUT, Client, MapFixture, initial_pose, plan_request, pose, wait_for
 from diagnostic_msgs.msg import DiagnosticArray
-from map_fixture import RULE, MapFixture
 from nav_msgs.msg import OccupancyGrid
 from nav_msgs.msg import Path as PathMessage
 from nav_msgs.srv import GetPlan, LoadMap

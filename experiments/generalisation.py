@@ -18,7 +18,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import numpy as np
 from numpy.typing import NDArray
-from random_maps import KINDS, generate_map, gradient_costs, inflated_costs
+from random_maps import KINDS, Random, generate_map, gradient_costs, inflated_costs
 from tables import table
 from tqdm import tqdm
 
@@ -30,7 +30,7 @@ from ddqn_planner.grid.noise import random_costs, random_requests, unknown_costs
 
 INFLATION_RADIUS = 5.0  # cells that the cost of an obstacle reaches
 UNKNOWN_SHARE = 0.2  # of the free cells
-COSTS: Final[dict[str, Callable[[Occupancy, np.random.Generator], NDArray[np.int8] | None]]] = {
+COSTS: Final[dict[str, Callable[[Occupancy, Random], NDArray[np.int8] | None]]] = {
     "none": lambda occupancy, random: None,
     "random": random_costs,
     "gradient": gradient_costs,
@@ -57,11 +57,11 @@ class RequestSettings:
     costs: str = "none"  # a key of COSTS
     seed: int = 0
 
-    def random(self, name: str) -> np.random.Generator:
+    def random(self, name: str) -> Random:
         """Return a map's random generator, which does not depend on the other maps."""
         return np.random.default_rng([self.seed, *name.encode()])
 
-    def grid(self, occupancy: Occupancy, random: np.random.Generator) -> GridMap:
+    def grid(self, occupancy: Occupancy, random: Random) -> GridMap:
         """Return the grid map with its costs."""
         return GridMap(occupancy, cost=COSTS[self.costs](occupancy, random))
 
@@ -97,7 +97,7 @@ def _with_random_requests(
     occupancy: Occupancy,
     goals: int,
     settings: RequestSettings,
-    random: np.random.Generator,
+    random: Random,
 ) -> BenchmarkMap:
     """Draw costs and requests for a map; the requests share a number of goals evenly."""
     grid, rule = settings.grid(occupancy, random), settings.move_rule
@@ -111,7 +111,7 @@ def _with_random_requests(
 
 
 def _random_starts(
-    occupancy: Occupancy, goal: Cell, move_rule: MoveRule, count: int, random: np.random.Generator
+    occupancy: Occupancy, goal: Cell, move_rule: MoveRule, count: int, random: Random
 ) -> list[Cell]:
     """Draw cells, except the goal, from which a path leads to the goal; they may repeat."""
     connected = GridMap(occupancy).reachable([goal], move_rule)

@@ -12,19 +12,22 @@ from typing import Any
 import numpy as np
 from builtin_interfaces.msg import Time
 from client import (
+    RULE,
     SERVICE_QUALITY,
     TIMEOUT,
     Client,
+    MapFixture,
     cell_of,
+    generated_map,
     initial_pose,
     plan_request,
     pose,
+    three_maps,
     wait_for,
     wait_for_map,
 )
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseStamped
-from map_fixture import RULE, MapFixture, generated_map, three_maps
 from nav_msgs.msg import Path
 from nav_msgs.srv import GetPlan
 from processes import claim_ros_domain, memory, run_script, running_node

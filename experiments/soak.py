@@ -9,7 +9,7 @@ import tempfile
 import threading
 import time
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 from pathlib import Path
 from subprocess import Popen
@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 from builtin_interfaces.msg import Time
 from client import (
+    RULE,
     Client,
     RobotPoses,
     cell_of,
@@ -25,12 +26,12 @@ from client import (
     map_message,
     plan_request,
     pose,
+    three_maps,
     values_of,
     wait_for_map,
 )
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseStamped
-from map_fixture import RULE, three_maps
 from nav_msgs.msg import OccupancyGrid
 from nav_msgs.srv import GetPlan, LoadMap
 from processes import claim_ros_domain, memory, run_script, running_node
@@ -265,10 +266,7 @@ class SimulatedRobot(Client):
 
 
 def soak(
-    children: dict[str, Popen[bytes]],
-    work: Work,
-    minutes: float,
-    robot: SimulatedRobot | None = None,
+    children: Mapping[str, Popen[bytes]], work: Work, minutes: float, robot: Any = None
 ) -> dict[str, list[float]]:
     """Work for some minutes; return the resident memory of each node, MB, as time went by."""
     samples: dict[str, list[float]] = {name: [] for name in children}

@@ -17,7 +17,7 @@ import numpy as np
 import pyastar2d
 import torch
 from figures import COLOURS
-from random_maps import KINDS, generate_map
+from random_maps import KINDS, Random, generate_map
 from stable_baselines3 import DQN
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from tables import report
@@ -128,7 +128,7 @@ class Change(NamedTuple):
     y: int
 
 
-def flipped(occupancy: Occupancy, random: np.random.Generator, place: Cell | None = None) -> Change:
+def flipped(occupancy: Occupancy, random: Random, place: Cell | None = None) -> Change:
     """Return a change of some cells around a place, or of as many all over the map."""
     x, y = (int(np.clip(c - 2, 0, len(occupancy) - 5)) for c in place) if place else (0, 0)
     box = (slice(y, y + 5), slice(x, x + 5)) if place else (slice(None), slice(None))
@@ -151,7 +151,7 @@ def wall(occupancy: Occupancy, path: Sequence[Cell], at: int, opens: bool) -> Ch
     return Change(closed, occupancy[box], x, y)
 
 
-CHANGE_KINDS: dict[str, Callable[[Occupancy, Sequence[Cell], np.random.Generator], Change]] = {
+CHANGE_KINDS: dict[str, Callable[[Occupancy, Sequence[Cell], Random], Change]] = {
     "cells near the robot": lambda map_, path, random: flipped(map_, random, path[10]),
     "cells near the goal": lambda map_, path, random: flipped(map_, random, path[-11]),
     "cells anywhere": lambda map_, path, random: flipped(map_, random),
