@@ -32,7 +32,7 @@ from ddqn_planner.nodes.requests import (
     Requests,
     load,
 )
-from ddqn_planner.nodes.runtime import LATCHED, STEADY, Unless, Worker, spin_until_shutdown
+from ddqn_planner.nodes.runtime import LATCHED, STEADY, Worker, spin_until_shutdown, unless
 
 
 # The executor's one thread holds all state. What takes long runs in workers: to load the model,
@@ -163,7 +163,7 @@ class PlannerNode(ManagedNode):
     def _on_map(self, frame_changed: bool) -> None:
         if frame_changed:
             # What was refused for its frame may be right now.
-            self._start.accept()
+            self._report.accept(self._start.topic)
         self._replan.trigger()
 
     def _on_start(self) -> None:
@@ -234,7 +234,7 @@ class PlannerNode(ManagedNode):
         response.is_valid = False
         try:
             checking = self._requests.is_path_valid(request.path)
-            response.is_valid = await Unless(checking, self._stopped) is True
+            response.is_valid = await unless(checking, self._stopped) is True
         except RequestError as error:
             self.get_logger().warning(f"no path to check: {error}")
         return response
@@ -246,7 +246,7 @@ class PlannerNode(ManagedNode):
         self._answering += 1
         try:
             planning = self._requests.plan(start, goals, *how)
-            outcome = await Unless(planning, self._stopped, *until)
+            outcome = await unless(planning, self._stopped, *until)
         except RequestError as error:
             outcome = Outcome(error.status, str(error))
         except Exception as error:  # as when no memory is left: the node must survive

@@ -15,7 +15,7 @@ from copy import copy
 from inspect import isawaitable
 from itertools import product
 from pathlib import Path
-from types import SimpleNamespace
+from types import SimpleNamespace, coroutine
 from typing import Any, NamedTuple
 
 import rclpy
@@ -37,7 +37,7 @@ from rclpy.executors import SingleThreadedExecutor
 from rclpy.logging import get_logger
 from rclpy.node import Node
 from rclpy.parameter import Parameter
-from rclpy.qos import DurabilityPolicy, QoSPolicyKind, QoSProfile, ReliabilityPolicy
+from rclpy.qos import DurabilityPolicy, QoSPolicyKind, QoSProfile
 from rclpy.qos_overriding_options import QoSOverridingOptions
 from rclpy.service import Service
 from rclpy.signals import SignalHandlerOptions
@@ -58,11 +58,6 @@ SERVICE_QUALITY = QoSProfile(depth=5000)
 OVERRIDABLE = [QoSPolicyKind[name] for name in ("HISTORY", "DEPTH", "DURABILITY", "RELIABILITY")]
 # What of a publisher's quality is less than what a subscription may ask for.
 MISFITS = ("durability", "volatile", "transient_local"), ("reliability", "best_effort", "reliable")
-
-
-def best_effort(depth: int) -> QoSProfile:
-    """Return the quality for sensors: reliable publishers and others are received."""
-    return QoSProfile(depth=depth, reliability=ReliabilityPolicy.BEST_EFFORT)
 
 
 class Declared(NamedTuple):
@@ -317,20 +312,16 @@ def _make_calls(calls: queue.SimpleQueue[Callable[[], None] | None]) -> None:
         del call  # it holds a map
 
 
-class Unless:
+@coroutine
+def unless(calls: Coroutine[None, None, Any], *given_up: Future) -> Generator[None, None, Any]:
     """Await a coroutine; or as soon as a future is done, close it and have that future's result."""
-
-    def __init__(self, coroutine: Coroutine[None, None, Any], *given_up: Future) -> None:
-        self._coroutine, self._given_up = coroutine, given_up
-
-    def __await__(self) -> Generator[None, None, Any]:
-        while not any(future.done() for future in self._given_up):
-            try:
-                yield self._coroutine.send(None)
-            except StopIteration as end:
-                return end.value
-        self._coroutine.close()
-        return next(future.result() for future in self._given_up if future.done())
+    while not any(future.done() for future in given_up):
+        try:
+            yield calls.send(None)
+        except StopIteration as end:
+            return end.value
+    calls.close()
+    return next(future.result() for future in given_up if future.done())
 
 
 HELP = """\
@@ -344,20 +335,17 @@ qos_overrides.TOPIC.subscription.POLICY, where POLICY is history, depth, durabil
 """
 
 
-def _print_help(summary: str, parameters: Parameters) -> None:
-    print(HELP.format(program=Path(sys.argv[0]).name, summary=summary))
-    for name, declared in parameters.items():
-        default = declared.default
-        kind = Parameter.Type.from_parameter_value(default).name.lower()
-        value = repr(default) if isinstance(default, str) else json.dumps(default)
-        words = f"{kind}, default {value}", declared.limits, "read-only" * declared.read_only
-        print(f"  {name}: {'; '.join(filter(None, words))}\n      {declared.description}")
-
-
 def spin_until_shutdown(make_node: Callable[[], Node], parameters: Parameters | None = None) -> int:
     """Run one node until SIGINT or SIGTERM, or print help; return 1 if it cannot start."""
     if parameters and {"-h", "--help"} & {*sys.argv[1:]}:
-        _print_help((make_node.__doc__ or "").partition("\n")[0].replace("``", ""), parameters)
+        summary = (make_node.__doc__ or "").replace("``", "")
+        print(HELP.format(program=Path(sys.argv[0]).name, summary=summary))
+        for name, (default, description, _, read_only) in parameters.items():
+            kind = Parameter.Type.from_parameter_value(default).name.lower()
+            value = repr(default) if isinstance(default, str) else json.dumps(default)
+            limits = parameters[name].limits
+            words = filter(None, (f"{kind}, default {value}", limits, "read-only" * read_only))
+            print(f"  {name}: {'; '.join(words)}\n      {description}")
         return 0
     stopping = threading.Event()
     try:

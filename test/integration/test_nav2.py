@@ -40,7 +40,7 @@ from ddqn_planner.nodes.nav2 import PREEMPTED, PathAction, error_code
 from ddqn_planner.nodes.planner_node import PlannerNode
 from ddqn_planner.nodes.report import NOT_ACTIVE, Outcome, RequestError
 from ddqn_planner.nodes.requests import check_request
-from ddqn_planner.nodes.runtime import SERVICE_QUALITY, Unless
+from ddqn_planner.nodes.runtime import SERVICE_QUALITY, unless
 from ddqn_planner.planning import Plan, PlanStatus
 
 FOUND = Outcome("SUCCEEDED", "a path", plan=Plan(PlanStatus.SUCCEEDED, ((0, 0),)))
@@ -141,7 +141,7 @@ class Server:
         async def planning() -> Any:
             return await self.planned
 
-        return PathMessage(), await Unless(planning(), self.stopped, given_up)
+        return PathMessage(), await unless(planning(), self.stopped, given_up)
 
     def begin(self, handle: Handle) -> Coroutine[Any, Any, Any]:
         """Accept a goal, and let it wait for its plan."""
