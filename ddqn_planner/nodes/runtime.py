@@ -15,7 +15,7 @@ from copy import copy
 from inspect import isawaitable
 from itertools import product
 from pathlib import Path
-from types import SimpleNamespace
+from types import SimpleNamespace, coroutine
 from typing import Any, NamedTuple
 
 import rclpy
@@ -317,20 +317,18 @@ def _make_calls(calls: queue.SimpleQueue[Callable[[], None] | None]) -> None:
         del call  # it holds a map
 
 
-class Unless:
-    """Await a coroutine; or as soon as a future is done, close it and have that future's result."""
-
-    def __init__(self, coroutine: Coroutine[None, None, Any], *given_up: Future) -> None:
-        self._coroutine, self._given_up = coroutine, given_up
-
-    def __await__(self) -> Generator[None, None, Any]:
-        while not any(future.done() for future in self._given_up):
-            try:
-                yield self._coroutine.send(None)
-            except StopIteration as end:
-                return end.value
-        self._coroutine.close()
-        return next(future.result() for future in self._given_up if future.done())
+@coroutine
+def unless(
+    calls: Coroutine[None, None, Any], given_up: Callable[[], Any]
+) -> Generator[None, None, Any]:
+    """Await a coroutine; or as soon as a function returns something, close it and return that."""
+    while not (instead := given_up()):
+        try:
+            yield calls.send(None)
+        except StopIteration as end:
+            return end.value
+    calls.close()
+    return instead
 
 
 HELP = """\

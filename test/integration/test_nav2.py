@@ -36,11 +36,11 @@ from rclpy.utilities import try_shutdown
 
 from ddqn_planner.grid import GridMap
 from ddqn_planner.nodes import nav2
-from ddqn_planner.nodes.nav2 import PREEMPTED, PathAction, error_code
+from ddqn_planner.nodes.nav2 import PREEMPTED, GivenUp, PathAction, error_code
 from ddqn_planner.nodes.planner_node import PlannerNode
 from ddqn_planner.nodes.report import NOT_ACTIVE, Outcome, RequestError
 from ddqn_planner.nodes.requests import check_request
-from ddqn_planner.nodes.runtime import SERVICE_QUALITY, Unless
+from ddqn_planner.nodes.runtime import SERVICE_QUALITY, unless
 from ddqn_planner.planning import Plan, PlanStatus
 
 FOUND = Outcome("SUCCEEDED", "a path", plan=Plan(PlanStatus.SUCCEEDED, ((0, 0),)))
@@ -128,20 +128,19 @@ class Server:
     """An action whose plans are there when the test says so."""
 
     def __init__(self) -> None:
-        self.is_active = True
         self.asked: list[tuple[Any, Any]] = []
-        self.planned, self.stopped = Future(), Future()
-        self.action = PathAction(Result, lambda: self.is_active, self.plan)
+        self.planned, self.refusal = Future(), None
+        self.action = PathAction(Result, lambda: self.refusal, self.plan)
 
     async def plan(
-        self, start: PoseStamped | None, goals: list[PoseStamped], name: str, given_up: Future
+        self, start: PoseStamped | None, goals: list[PoseStamped], name: str, given_up: GivenUp
     ) -> tuple[PathMessage, Outcome]:
         self.asked.append((start, goals))
 
         async def planning() -> Any:
             return await self.planned
 
-        return PathMessage(), await Unless(planning(), self.stopped, given_up)
+        return PathMessage(), await unless(planning(), lambda: self.refusal or given_up())
 
     def begin(self, handle: Handle) -> Coroutine[Any, Any, Any]:
         """Accept a goal, and let it wait for its plan."""
@@ -150,10 +149,6 @@ class Server:
         execution = self.action.execute(handle)
         execution.send(None)
         return execution
-
-    def cancel(self, handle: Handle) -> None:
-        assert self.action.cancel(handle) is CancelResponse.ACCEPT
-        handle.state = "canceling"
 
 
 def end(execution: Coroutine[Any, Any, Any]) -> Any:
@@ -205,23 +200,20 @@ def test_the_newest_goal_preempts_the_one_under_way() -> None:
 def test_a_goal_is_canceled_before_it_is_planned_meanwhile_or_once_it_is_preempted() -> None:
     server, early, first, second = Server(), *map(Handle, range(3))
     server.action.begin(early)
-    server.cancel(early)
+    early.state = "canceling"
     executions = [server.action.execute(early), server.begin(first), server.begin(second)]
-    for handle in (first, second):
-        server.cancel(handle)
+    first.state = second.state = "canceling"
     for handle, execution in zip((early, first, second), executions, strict=True):
         result = end(execution)
         assert handle.state == "canceled"
         if handle is not first:  # which the second one preempted
             assert (result.error_code, result.error_msg) == (0, "")
-    server.cancel(second)  # too late: nothing to give up
 
 
 def test_goals_are_rejected_while_the_node_is_not_active_and_aborted_when_it_stops() -> None:
     server, handle = Server(), Handle(1)
     execution = server.begin(handle)
-    server.stopped.set_result(NOT_ACTIVE)
-    server.is_active = False
+    server.refusal = NOT_ACTIVE
     result = end(execution)
     assert (handle.state, result.error_code) == ("aborted", Result.UNKNOWN)
     assert server.action.accept(handle.request) is GoalResponse.REJECT
@@ -246,6 +238,7 @@ def test_the_services_of_actions_have_the_queues_of_the_others(
         for which in ("goal", "cancel", "result")
     ]
     assert depths == 6 * [SERVICE_QUALITY.depth]
+    assert all(it.arguments["cancel_callback"](None) is CancelResponse.ACCEPT for it in made)
 
 
 def test_a_path_to_one_goal_is_kept_while_it_is_nearly_as_good_as_a_new_one() -> None:
@@ -266,7 +259,7 @@ def test_a_path_to_one_goal_is_kept_while_it_is_nearly_as_good_as_a_new_one() ->
             costs = values.copy()
             costs[dear, 10:20] = 2
             node._map._take(map_message(costs, grid, next(NUMBERS)))
-            asked = ends[0], [ends[1]], "", Future()
+            asked = ends[0], [ends[1]], "", lambda: None
             answer = executor.create_task(node._plan_for_action(*asked))
             executor.spin_until_future_complete(answer, 60)
             path, outcome = answer.result()
