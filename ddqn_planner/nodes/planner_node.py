@@ -238,7 +238,7 @@ class PlannerNode(ManagedNode):
     async def _answer(
         self, given_up: GivenUp, start: PoseStamped | None, goals: list[PoseStamped], *how: Any
     ) -> tuple[Header, Outcome]:
-        """Plan unless the node is stopped or the request given up; return the path's header, too."""
+        """Plan, unless the node stops or the request is given up; return the path's header, too."""
         self._answering += 1
         try:
             planning = self._requests.plan(start, goals, *how)

@@ -105,20 +105,17 @@ class ActiveGoal:
         return is_news
 
 
-def load(model: str) -> tuple[Planner, str]:
-    """Return the planner of a model, and the model's file."""
+def load(model: str, warms_up: bool = False) -> tuple[Planner, str]:
+    """Return a model's planner and file; warm up the libraries and functions that plans need."""
     path = find_model(model)
-    return Planner.load(path), str(path)
-
-
-def load_and_warm_up(model: str) -> tuple[Planner, str]:
-    """Load a model, and the libraries and compiled functions that most plans need."""
-    planner, path = load(model)
-    sizes = planner.metadata.sizes
-    shape = sizes.get("height", 3), sizes.get("width", 3)
-    planner.plan(GridMap(np.zeros(shape, dtype=np.bool_)), (0, 0), (shape[1] - 1, shape[0] - 1))
-    gc.freeze()  # a collection of all that would stop the node for 45 ms
-    return planner, path
+    planner = Planner.load(path)
+    if warms_up:
+        sizes = planner.metadata.sizes
+        shape = sizes.get("height", 3), sizes.get("width", 3)
+        corner = shape[1] - 1, shape[0] - 1
+        planner.plan(GridMap(np.zeros(shape, dtype=np.bool_)), (0, 0), corner)
+        gc.freeze()  # a collection of all that would stop the node for 45 ms
+    return planner, str(path)
 
 
 def move_rule(rule: str, planner: Planner) -> MoveRule:
@@ -138,7 +135,7 @@ class ModelSource:
 
     def load(self) -> None:
         """Begin to load the first model."""
-        self.loading = self._worker.call(load_and_warm_up, self._node.value("model"))
+        self.loading = self._worker.call(load, self._node.value("model"), True)
 
     async def first(self) -> None:
         """Wait for the first model, and use it unless another one was set since."""
@@ -165,8 +162,7 @@ class ModelSource:
     def set(self, name: str) -> str:
         """Set the node's parameter, which loads the model; return why it was refused."""
         (result,) = self._node.set_parameters([Parameter("model", value=name)])
-        reason: str = result.reason
-        return reason
+        return str(result.reason)
 
     def on_saved(self, message: String) -> None:
         """Use a model that the trainer saved."""
@@ -196,7 +192,7 @@ class ModelSource:
         }
 
     def forget(self) -> None:
-        """Free the model and its fields, with what `load_and_warm_up` kept from collection."""
+        """Free the model and its fields, with what `load` kept from collection."""
         self.planner, self.file, self.loading = None, "", None
         gc.unfreeze()
         gc.collect()
