@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import math
 import os
 import shutil
 import signal
@@ -13,17 +14,18 @@ import time
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack, closing
 from dataclasses import fields
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Any, Final
 
+import ddqn_planner as api
 from ddqn_planner.files import WorkFolder, write_csv
 from ddqn_planner.resources import find_map, with_remedy
 
-# A command imports what it needs, and no other command's libraries.
+# A command imports what it needs, and no other command's libraries: the names of `api` do so, too.
 if TYPE_CHECKING:
     from ddqn_planner.experience.drives import Drive
-    from ddqn_planner.grid import Cell, GridMap, MapFile, MoveRule
-    from ddqn_planner.planning import Plan
+    from ddqn_planner.grid import Cell, MapFile
     from ddqn_planner.training.environment import Scenario
     from ddqn_planner.training.hyper_parameters import HyperParameters
     from ddqn_planner.training.run import TrainingRun
@@ -50,33 +52,25 @@ def plan(parser: argparse.ArgumentParser, arguments: Sequence[str]) -> int:
     """Plan a path on a map file, and print it."""
     import numpy as np
 
-    from ddqn_planner.grid import GridMap, inflate
+    from ddqn_planner.grid.arguments import as_number
     from ddqn_planner.pictures import save_picture
-    from ddqn_planner.planning import Planner
 
     _add_plan_options(parser)
     options = parser.parse_args(arguments)
-    for name in ("tolerance", "start_clearing_radius"):
-        if not getattr(options, name) >= 0:
-            option = name.replace("_", "-")
-            raise ValueError(f"--{option} is {getattr(options, name):g}; give metres, 0 or more")
     map_file, start, goal = _read_map(options)
     grid = map_file.grid(options.occupied_threshold, options.allow_unknown, options.use_map_costs)
-    grid = inflate(grid, options.robot_radius, options.clearance_weight)
-    planner = Planner.load(options.model)
+    grid = api.inflate(grid, options.robot_radius, options.clearance_weight)
+    metres = 0, math.inf, "metres, 0 or more"
+    tolerance = as_number("--tolerance", options.tolerance, *metres)
+    radius = as_number("--start-clearing-radius", options.start_clearing_radius, *metres)
+    planner = api.Planner.load(options.model)
     # A first plan loads compiled code, which the time of the second one leaves out.
     shape = tuple(planner.metadata.sizes.get(side, 3) for side in ("height", "width"))
-    planner.plan(GridMap(np.zeros(shape, dtype=np.bool_)), (0, 0), (1, 1))
+    planner.plan(api.GridMap(np.zeros(shape, dtype=np.bool_)), (0, 0), (1, 1))
+    asked = options.move_rule, options.mode, tolerance / grid.resolution
+    radius /= grid.resolution
     began = time.perf_counter()
-    plan = planner.plan(
-        grid,
-        start,
-        goal,
-        options.move_rule,
-        options.mode,
-        options.tolerance / grid.resolution,
-        start_clearing_radius=options.start_clearing_radius / grid.resolution,
-    )
+    plan = planner.plan(grid, start, goal, *asked, start_clearing_radius=radius)
     _print_plan(options, grid, plan, time.perf_counter() - began)
     if options.csv:
         rows = ((*cell, *np.round(grid.cell_to_world(cell), 6)) for cell in plan.cells)
@@ -91,12 +85,10 @@ def plan(parser: argparse.ArgumentParser, arguments: Sequence[str]) -> int:
 
 
 def _add_plan_options(parser: argparse.ArgumentParser) -> None:
-    from ddqn_planner.planning import PlanMethod
-
     add = parser.add_argument
     _add_map_options(parser, None)
     add("--model", default="any_map", help="name or file")
-    modes = [method.value for method in PlanMethod]
+    modes = [method.value for method in api.PlanMethod]
     add("--mode", choices=modes, default="greedy", help="astar_fallback: search if steps get stuck")
     occupied = "a cell of this value or more is occupied, percent"
     add("--occupied-threshold", type=int, default=65, metavar="N", help=occupied)
@@ -116,11 +108,18 @@ def _add_plan_options(parser: argparse.ArgumentParser) -> None:
     add("--picture", type=Path, metavar="FILE", help="draw map, value and path")
 
 
-def _print_plan(options: argparse.Namespace, grid: GridMap, plan: Plan, seconds: float) -> None:
+def _print_plan(options: Any, grid: api.GridMap, plan: api.Plan, seconds: float) -> None:
+    import numpy as np
+
     from ddqn_planner.grid import path_length
     from ddqn_planner.pictures import MAX_TEXT_WIDTH, draw_blocks, draw_text
+    from ddqn_planner.planning.paths import search
 
-    optimum = _shortest_length(grid, plan)
+    optimum = None
+    if plan.cells and grid.is_free(plan.cells[0]):
+        legal, no_costs = grid.legal_moves(plan.move_rule), np.ones(grid.occupancy.shape, "f4")
+        shortest = search(plan.cells[0], plan.cells[-1], legal, no_costs, plan.move_rule)
+        optimum = path_length(shortest, plan.move_rule)
     if options.json:
         answer = {
             "status": plan.status.name,
@@ -144,32 +143,14 @@ def _print_plan(options: argparse.Namespace, grid: GridMap, plan: Plan, seconds:
         print(f"start {plan.cells[0]}, goal {plan.cells[-1]}, {metres:.2f} m")
         known = "" if optimum is None else f"optimum {optimum:.2f} under {plan.move_rule.value}, "
         known += "" if plan.cost is None else f"cost {plan.cost:.2f}, "
-        print(
-            f"length {plan.length:.2f} cells, {known}{plan.method.value}, "
-            f"planned in {seconds * 1e3:.1f} ms"
-        )
+        known += f"{plan.method.value}, planned in {seconds * 1e3:.1f} ms"
+        print(f"length {plan.length:.2f} cells, {known}")
     else:
         print(f"no path: {plan.status.value}", file=sys.stderr)
 
 
-def _shortest_length(grid: GridMap, plan: Plan) -> float | None:
-    """Return the least length of a path with the plan's ends; None if there is no such path."""
-    import numpy as np
-
-    from ddqn_planner.grid import path_length
-    from ddqn_planner.planning.paths import search
-
-    if not plan.cells or not grid.is_free(plan.cells[0]):
-        return None
-    legal = grid.legal_moves(plan.move_rule)
-    without_costs = np.ones(grid.occupancy.shape, dtype=np.float32)
-    cells = search(plan.cells[0], plan.cells[-1], legal, without_costs, plan.move_rule)
-    return path_length(cells, plan.move_rule)
-
-
 def train(parser: argparse.ArgumentParser, arguments: Sequence[str]) -> int:
     """Train a model on a map file, into a folder. Run the same command again to resume."""
-    from ddqn_planner.grid import MoveRule
     from ddqn_planner.training.environment import Scenario
     from ddqn_planner.training.evaluation import evaluate
     from ddqn_planner.training.hyper_parameters import HyperParameters
@@ -178,7 +159,7 @@ def train(parser: argparse.ArgumentParser, arguments: Sequence[str]) -> int:
     _add_training_options(parser, "runs/train", HyperParameters())
     options = parser.parse_args(arguments)
     map_file, start, goal = _read_map(options)
-    scenario, rule = Scenario(map_file.grid(), start, goal), MoveRule(options.move_rule)
+    scenario, rule = Scenario(map_file.grid(), start, goal), api.MoveRule(options.move_rule)
     run = _run_training(options, lambda: [scenario], rule)
     field = run.trainer.planner().q_field(scenario.grid, goal)
     evaluation, plan = evaluate(field, scenario.grid, rule), field.rollout(start)
@@ -192,7 +173,6 @@ def train(parser: argparse.ArgumentParser, arguments: Sequence[str]) -> int:
 
 def train_any_map(parser: argparse.ArgumentParser, arguments: Sequence[str]) -> int:
     """Train a model for any map on small random maps. Run the same command again to resume."""
-    from ddqn_planner.grid import MoveRule
     from ddqn_planner.training.any_map import ANY_MAP, MAPS, random_scenarios
 
     parser.add_argument("--maps", type=int, default=MAPS, metavar="N", help="number of maps")
@@ -200,16 +180,14 @@ def train_any_map(parser: argparse.ArgumentParser, arguments: Sequence[str]) -> 
     options = parser.parse_args(arguments)
     if options.maps < 1:
         raise ValueError(f"--maps is {options.maps}; give at least 1")
-    _run_training(
-        options, lambda: random_scenarios(options.seed, options.maps), MoveRule.ROBOT_SAFE
-    )
+    draw = partial(random_scenarios, options.seed, options.maps)
+    _run_training(options, draw, api.MoveRule.ROBOT_SAFE)
     return 0
 
 
 def _add_training_options(
     parser: argparse.ArgumentParser, out: str, parameters: HyperParameters
 ) -> None:
-    """Add the folder, the seed and each hyper-parameter with its default."""
     parser.add_argument("--out", type=Path, default=Path(out), help="folder of the run")
     parser.add_argument("--seed", type=int, default=0, help="seed of the training")
     for entry in fields(parameters):
@@ -223,13 +201,12 @@ def _add_training_options(
 
 
 def _run_training(
-    options: argparse.Namespace, scenarios: Callable[[], Sequence[Scenario]], move_rule: MoveRule
+    options: Any,
+    scenarios: Callable[[], Sequence[Scenario]],
+    move_rule: api.MoveRule,
 ) -> TrainingRun:
-    """Train into ``--out`` until ``--steps`` or a signal to stop; return the closed run.
-
-    The scenarios, which may take seconds, are made once torch is known to be there.
-    """
-    import torch
+    """Train into ``--out`` until ``--steps`` or a signal to stop; return the closed run."""
+    import torch  # before the scenarios are made, which may take seconds
     from tqdm import tqdm
 
     from ddqn_planner.training.hyper_parameters import HyperParameters
@@ -284,9 +261,7 @@ def learn(parser: argparse.ArgumentParser, arguments: Sequence[str]) -> int:
     """Learn from a robot's recorded drives how long places take."""
     import numpy as np
 
-    from ddqn_planner.experience import Experience
     from ddqn_planner.experience.drives import EXPERIENCE, LOCK, RECORD
-    from ddqn_planner.grid import load_map
 
     add = parser.add_argument
     words = "a trainer's folder, a CSV file with the columns seconds, x, y, or an MCAP file"
@@ -303,8 +278,8 @@ def learn(parser: argparse.ArgumentParser, arguments: Sequence[str]) -> int:
     add("--robot-frame", default="base_link", help="MCAP: the robot's frame, for /tf")
     options = parser.parse_args(arguments)
     source: Path = options.drives
-    grid = load_map(find_map(options.map))
-    experience = Experience(options.nominal_speed, options.robot_width)
+    grid = api.load_map(find_map(options.map))
+    experience = api.Experience(options.nominal_speed, options.robot_width)
     with ExitStack() as stack:
         if source.is_dir():
             if not (source / RECORD).is_file():
@@ -330,7 +305,7 @@ def learn(parser: argparse.ArgumentParser, arguments: Sequence[str]) -> int:
     return 0
 
 
-def _read_drives(source: Path, options: argparse.Namespace) -> list[Drive]:
+def _read_drives(source: Path, options: Any) -> list[Drive]:
     """Return the drives of a folder or a file."""
     from ddqn_planner.experience.drives import RECORD, read_drives
     from ddqn_planner.experience.recordings import drives_of, read_csv, read_mcap
@@ -348,19 +323,16 @@ def _read_drives(source: Path, options: argparse.Namespace) -> list[Drive]:
 
 
 def _add_map_options(parser: argparse.ArgumentParser, move_rule: str | None) -> None:
-    """Add a map file with start and goal, see `_read_map`, and the move rule with its default."""
-    from ddqn_planner.grid import MoveRule
-
     parser.add_argument("map", help="ROS map YAML, MovingAI .map, or name of a shipped map")
     for name in ("start", "goal"):
         words = f"the {name}'s cell, by default the map file's"
         parser.add_argument(f"--{name}", type=int, nargs=2, metavar=("X", "Y"), help=words)
     words = "which diagonal moves are legal" + ("" if move_rule else ", by default as in training")
-    rules = [rule.value for rule in MoveRule]
+    rules = [rule.value for rule in api.MoveRule]
     parser.add_argument("--move-rule", choices=rules, default=move_rule, help=words)
 
 
-def _read_map(options: argparse.Namespace) -> tuple[MapFile, Cell, Cell]:
+def _read_map(options: Any) -> tuple[MapFile, Cell, Cell]:
     """Return the map file, the start and the goal that the options give."""
     from ddqn_planner.grid import read_map_file
 
@@ -382,10 +354,7 @@ COMMANDS: Final = {
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command line; return the exit code.
-
-    0 done, 1 no path or no proof, 2 bad input or a missing library, 130 interrupted.
-    """
+    """Run the command line; return 0 done, 1 no path or proof, 2 bad input or a missing library."""
     # NumPy is not yet imported. For small products one thread is as fast as several, and on a busy
     # machine several are ten times as slow.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")

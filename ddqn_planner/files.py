@@ -14,11 +14,8 @@ from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
-TEMPORARY = re.compile(r"\..+\.[0-9a-f]{16}")
-"""The name of a file that is being written."""
-
-MAX_REST = 2**24
-"""Bytes of records that are kept while a disk is full; records beyond are left out."""
+TEMPORARY = re.compile(r"\..+\.[0-9a-f]{16}")  # the name of a file that is being written
+MAX_REST = 2**24  # bytes of records that are kept while a disk is full; those beyond are left out
 
 
 def as_path(path: Any, name: str = "path") -> Path:
@@ -115,6 +112,7 @@ class Appender:
         # Unbuffered: readers see every record, also after a crash.
         self._file = path.open("ab", buffering=0)
         self._rest = bytearray()
+        self.close = self._file.close
 
     def append(self, record: bytes) -> None:
         """Append a record, now or later: `flush` says why it cannot be written."""
@@ -127,7 +125,3 @@ class Appender:
         """Write what is left of the records; an OSError if that fails."""
         while self._rest:
             del self._rest[: self._file.write(self._rest)]
-
-    def close(self) -> None:
-        """Close the file."""
-        self._file.close()

@@ -14,30 +14,19 @@ from ddqn_planner.grid import LENGTHS, MOVES, Cell, GridMap
 OBSTACLE_COLOUR, PATH_COLOUR, DIRECTION_COLOUR = "#22223b", "#d1495b", "#6c757d"
 
 VALUE_COLOURS = ("#f4f1de", "#cfe8dc", "#93cfc8", "#4fa3b5")
-"""From the worst value to the best: light to dark, so that the order shows without colours too.
-The darkest is far from the colour of obstacles."""
+"""From the worst value to the best: light to dark, so that the order shows without colours too."""
 
+# Codes of colours: outside the map, free, occupied, the path, its ends.
 TERMINAL = ("9", "8;5;255", "8;5;236", "8;5;167", "8;5;33")
-"""Codes of the colours outside the map, of free and occupied cells, of the path and its ends."""
 
-MAX_TEXT_WIDTH = 64
-"""Cells of the widest map that is worth printing as text: a cell takes two characters."""
-
-MAX_SIDE_WITH_LINES = 64
-"""Cells of the longest side of a map that is drawn with lines between its cells."""
-
-MAX_ARROWS = 48
-"""Arrows of one-way zones along the longest side of a map."""
-
-ONE_WAY = 1e-9
-"""The mean direction of a cell that is not one-way is shorter than this."""
+MAX_TEXT_WIDTH = 64  # cells of the widest map that is worth printing: two characters for each
+MAX_SIDE_WITH_LINES = 64  # cells of the longest side of a map with lines between its cells
+MAX_ARROWS = 48  # arrows of one-way zones along the longest side of a map
+ONE_WAY = 1e-9  # the mean direction of a cell that is not one-way is shorter
 
 
 def draw_text(grid: GridMap, cells: Sequence[Cell]) -> str:
-    """Return the map as text, y upwards: ``#`` occupied, ``.`` free, ``*`` path, ``S``, ``G``.
-
-    Free cells of one-way zones are ``>``, ``^``, ``<`` or ``v``, after their mean direction.
-    """
+    """Return the map as text, y upwards: # occupied, . or an arrow free, * path, S and G ends."""
     letters = np.full(grid.occupancy.shape, ".")
     if grid.forbidden is not None:
         x, y = _mean_directions(grid.forbidden)
@@ -52,11 +41,7 @@ def draw_text(grid: GridMap, cells: Sequence[Cell]) -> str:
 
 
 def draw_blocks(grid: GridMap, cells: Sequence[Cell], columns: int, lines: int) -> str:
-    """Return the map for a terminal of so many characters: two coloured squares in each.
-
-    A square with an occupied cell is dark, one with a cell of the path has the path's colour, one
-    with the start or the goal that of an end.
-    """
+    """Return the map for a terminal of so many characters, each of them two coloured squares."""
     side = max(-(-grid.width // columns), -(-grid.height // (2 * lines)))  # cells
     shown = np.where(grid.occupancy, 2, 1)
     shown[tuple(np.transpose(cells)[::-1])] = 3
@@ -81,15 +66,14 @@ def save_picture(
     value_label: str = "value: max Q(s, a)",
 ) -> None:
     """Draw the map, the value where it is finite, and the path if there is one into a file."""
-    import matplotlib
-
-    matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
     from matplotlib.colors import LinearSegmentedColormap
+    from matplotlib.figure import Figure
+    from matplotlib.patheffects import withStroke
     from matplotlib.ticker import MaxNLocator
 
     tall = min(max(grid.height / grid.width, 0.4), 1.0)
-    figure, axes = plt.subplots(figsize=(7.2, 1.5 + 5.1 * tall), dpi=120, layout="constrained")
+    figure = Figure(figsize=(7.2, 1.5 + 5.1 * tall), dpi=120, layout="constrained")
+    axes = figure.subplots()
     axes.set(facecolor="white", xlabel="x [cells]", ylabel="y [cells]", aspect="equal")
     axes.set_title(title, loc="left", fontsize=12)
     for axis in (axes.xaxis, axes.yaxis):
@@ -102,10 +86,14 @@ def save_picture(
         figure.colorbar(image, bar, label=value_label)
     draw_obstacles(axes, grid)
     if cells:
-        _draw_path(axes, cells)
+        x, y = np.transpose(cells)
+        outline = [withStroke(linewidth=5.5, foreground="white")]
+        axes.plot(x, y, color=PATH_COLOUR, linewidth=3, path_effects=outline, label="path")
+        style: Any = {"color": PATH_COLOUR, "edgecolors": "white", "linewidths": 1.5, "zorder": 3}
+        for label, end, marker, size in (("start", 0, "o", 110), ("goal", -1, "*", 300)):
+            axes.scatter(x[end], y[end], size, label=label, marker=marker, **style)
         figure.legend(loc="outside lower center", ncols=3, frameon=False)
     figure.savefig(path)
-    plt.close(figure)
 
 
 def draw_obstacles(axes: Any, grid: GridMap) -> None:
@@ -121,7 +109,14 @@ def draw_obstacles(axes: Any, grid: GridMap) -> None:
         axes.grid(which="minor", color="white", linewidth=0.8)
         axes.tick_params(which="minor", length=0)
     if grid.forbidden is not None:
-        _draw_directions(axes, grid, grid.forbidden)
+        step = -(-max(grid.width, grid.height) // MAX_ARROWS)
+        directions = _mean_directions(grid.forbidden)
+        shown = (np.hypot(*directions) > ONE_WAY) & ~grid.occupancy
+        y, x = np.nonzero(shown[::step, ::step])
+        along = directions[:, y * step, x * step]
+        along *= 0.8 * step / np.hypot(*along)
+        style = {"pivot": "middle", "angles": "xy", "scale_units": "xy", "scale": 1}
+        axes.quiver(x * step, y * step, *along, color=DIRECTION_COLOUR, width=0.002, **style)
 
 
 def _mean_directions(forbidden: NDArray[np.uint8]) -> NDArray[np.float64]:
@@ -129,25 +124,3 @@ def _mean_directions(forbidden: NDArray[np.uint8]) -> NDArray[np.float64]:
     legal = (forbidden >> np.arange(len(MOVES))[:, None, None] & 1) == 0
     directions: NDArray[np.float64] = np.tensordot((MOVES / LENGTHS[:, None]).T, legal, 1)
     return directions
-
-
-def _draw_directions(axes: Any, grid: GridMap, forbidden: NDArray[np.uint8]) -> None:
-    step = -(-max(grid.width, grid.height) // MAX_ARROWS)
-    directions = _mean_directions(forbidden)
-    shown = (np.hypot(*directions) > ONE_WAY) & ~grid.occupancy
-    y, x = np.nonzero(shown[::step, ::step])
-    along = directions[:, y * step, x * step]
-    along *= 0.8 * step / np.hypot(*along)
-    style = {"pivot": "middle", "angles": "xy", "scale_units": "xy", "scale": 1}
-    axes.quiver(x * step, y * step, *along, color=DIRECTION_COLOUR, width=0.002, **style)
-
-
-def _draw_path(axes: Any, cells: Sequence[Cell]) -> None:
-    from matplotlib.patheffects import withStroke
-
-    x, y = np.transpose(cells)
-    outline = [withStroke(linewidth=5.5, foreground="white")]
-    axes.plot(x, y, color=PATH_COLOUR, linewidth=3, path_effects=outline, label="path")
-    for label, end, marker, size in (("start", 0, "o", 110), ("goal", -1, "*", 300)):
-        ends = {"marker": marker, "s": size, "edgecolors": "white", "linewidths": 1.5, "zorder": 3}
-        axes.scatter(x[end], y[end], color=PATH_COLOUR, label=label, **ends)

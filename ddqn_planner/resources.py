@@ -7,9 +7,9 @@ from pathlib import Path
 from typing import Final
 
 PACKAGE: Final = "ddqn_planner"
-
 ROS: Final = "install ROS 2 Jazzy and source it, or in the repository: pip install '.[ros]'"
 
+# What to give to pip, by module.
 PACKAGES: Final = {
     "gymnasium": "torch gymnasium",
     "matplotlib": "matplotlib",
@@ -20,7 +20,6 @@ PACKAGES: Final = {
     "safetensors": "safetensors",
     "torch": "torch gymnasium",
 }
-"""What to give to pip, by module."""
 
 
 def with_remedy(error: Exception) -> str:

@@ -1,14 +1,10 @@
-"""Films how a plan comes about: values spread from the goal, then the path follows them.
+"""Films how values spread from the goal and the path follows them; it needs matplotlib.
 
-    python examples/animation.py office plan.gif --robot-radius 0.15 --clearance-weight 1
-
-It needs matplotlib.
+python examples/animation.py office plan.gif --robot-radius 0.15 --clearance-weight 1
 """
 
-from __future__ import annotations
-
 import argparse
-from collections.abc import Generator, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import matplotlib
@@ -27,8 +23,7 @@ from ddqn_planner.pictures import PATH_COLOUR, VALUE_COLOURS, draw_obstacles
 from ddqn_planner.resources import find_map
 
 FRAMES_PER_SECOND = 16
-LAST_FRAMES = 40
-"""Frames for which the complete path is shown."""
+LAST_FRAMES = 40  # for which the complete path is shown
 
 
 def save_film(
@@ -41,30 +36,24 @@ def save_film(
     axes.axis("off")
     finite = np.where(np.isfinite(value), value, np.nan)
     colours = LinearSegmentedColormap.from_list("value", VALUE_COLOURS)
-    limits = np.nanmin(finite), np.nanmax(finite)
-    field = axes.imshow(finite, colours, origin="lower", vmin=limits[0], vmax=limits[1])
+    least, greatest = np.nanmin(finite), np.nanmax(finite)
+    field = axes.imshow(finite, colours, origin="lower", vmin=least, vmax=greatest)
     draw_obstacles(axes, grid)
     outline = [withStroke(linewidth=9, foreground="white")]
     (line,) = axes.plot([], [], color=PATH_COLOUR, linewidth=5, path_effects=outline)
     for cell, marker, size in ((plan.cells[0], "o", 14), (plan.cells[-1], "*", 28)):
         axes.plot(*cell, marker, color=PATH_COLOUR, markersize=size, markeredgecolor="white")
-
-    def frames() -> Generator[tuple[float, int], None, None]:
-        """Yield the least value that is shown, and how many cells of the path."""
-        for share in np.linspace(0, 1, steps):
-            yield float(np.nanquantile(finite, 1 - share)), 0
-        for count in np.linspace(1, len(plan.cells), steps).astype(int):
-            yield limits[0], int(count)
-        yield from [(limits[0], len(plan.cells))] * LAST_FRAMES
+    # The least value that a frame shows, and how many cells of the path.
+    frames = [(np.nanquantile(finite, 1 - share), 0) for share in np.linspace(0, 1, steps)]
+    frames += [(least, int(count)) for count in np.linspace(1, len(plan.cells), steps)]
+    frames += [(least, len(plan.cells))] * LAST_FRAMES
 
     def draw(frame: tuple[float, int]) -> Sequence[Any]:
-        least, count = frame
-        field.set_data(np.where(finite >= least, finite, np.nan))
-        line.set_data(*np.reshape(plan.cells[:count], (-1, 2)).T)
+        field.set_data(np.where(finite >= frame[0], finite, np.nan))
+        line.set_data(*np.reshape(plan.cells[: frame[1]], (-1, 2)).T)
         return field, line
 
-    film = FuncAnimation(figure, draw, frames, cache_frame_data=False, save_count=10**6)
-    film.save(path, PillowWriter(FRAMES_PER_SECOND))
+    FuncAnimation(figure, draw, frames).save(path, PillowWriter(FRAMES_PER_SECOND))
     plt.close(figure)
 
 

@@ -1,10 +1,4 @@
-"""Starts the map server and the planner, asks for a path over ROS, and shows it, on two maps.
-
-Both nodes are processes of their own, in a ROS domain of their own. Start and goal are published
-as `ros2 topic pub` would. No process is left behind, also when this one is interrupted.
-"""
-
-from __future__ import annotations
+"""Starts the map server and the planner, asks for a path over ROS, and shows it, on two maps."""
 
 import sys
 import time
@@ -27,11 +21,11 @@ sys.path.insert(0, str(FilePath(__file__).resolve().parents[1] / "experiments"))
 from client import Client, cells_of, initial_pose, pose, values_of, wait_for
 from processes import claim_ros_domain, run_script, running_node
 
+# A map, the shipped model that plans on it, its move rule, and the picture's title and file.
 CASES = (
     ("dilemma", "dilemma", MoveRule.CORNER_CUTTING, "The paper's network", "demo.png"),
     ("office", "any_map", MoveRule.ROBOT_SAFE, "A map never seen", "demo_office.png"),
 )
-"""A map, the shipped model that plans on it and its move rule, and the picture's title and file."""
 
 
 def show_path(
@@ -42,7 +36,7 @@ def show_path(
     picture: str,
     children: Sequence[Popen[bytes]],
 ) -> None:
-    """Ask for a path; print it with its times, and draw it."""
+    """Ask for a path as `ros2 topic pub` would; print it with its times, and draw it."""
     began = time.monotonic()
     maps = client.subscribe(OccupancyGrid, "map", LATCHED)
     plans = client.subscribe(Path, "plan", LATCHED)
@@ -62,7 +56,7 @@ def show_path(
 
     cells = cells_of(grid, plan)
     length = path_length(cells, rule)
-    optimum = shortest_distances(grid, goal, rule)[start[1], start[0]]
+    optimum = shortest_distances(grid, goal, rule)[start[::-1]]
     if grid.width <= MAX_TEXT_WIDTH:
         print(draw_text(grid, cells))
         print("path: " + " ".join(f"({x}, {y})" for x, y in cells))
@@ -86,7 +80,7 @@ def show_path(
 
 
 def main(_: Sequence[str]) -> int:
-    """Show a path on each map."""
+    """Show a path on each map; no process is left behind, also when this one is interrupted."""
     with claim_ros_domain():
         for map_name, model, rule, title, picture in CASES:
             with (

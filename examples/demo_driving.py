@@ -1,12 +1,8 @@
-"""A robot learns by driving where it is slow: 40 missions, with the real nodes, in two minutes.
+"""A robot learns by driving where it is slow, with the real nodes: 40 missions, or as many as said.
 
-It starts the map server, the planner, the trainer and a simulated robot, each as a process of its
-own, in a ROS domain of their own, and sends goals. It saves a film of the missions, a picture of
-what the robot learned, and a curve of the true time of its routes over the best possible. With a
-number, so many missions.
+It saves a film of the missions, a picture of what the robot learned, and a curve of the true time
+of its routes over the best possible.
 """
-
-from __future__ import annotations
 
 import math
 import sys
@@ -23,7 +19,6 @@ import numpy as np
 from geometry_msgs.msg import PoseStamped
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from nav_msgs.msg import OccupancyGrid, Odometry, Path
-from numpy.typing import NDArray
 from PIL import Image
 
 from ddqn_planner.experience.drives import ARRIVAL_DISTANCE
@@ -34,18 +29,13 @@ from ddqn_planner.planning import Planner
 
 sys.path.insert(0, str(FilePath(__file__).resolve().parents[1] / "experiments"))
 from client import Client, Recorder, cells_of, pose, wait_for
-from driving_worlds import RULE, Routes, World, generated_world, path_seconds
+from driving_worlds import RULE, Float64, Routes, World, generated_world, path_seconds
 from figures import ROUTE_STYLES, draw_slowness, draw_times
 from processes import claim_ros_domain, run_script, running, running_node
 
 WORLD, SEED, SPEED_UP, MISSIONS = "office", 9, 40.0, 40
-LISTENERS = 3
-"""To goals: the planner, the trainer and the robot."""
-
-MEAN_OF = 8
-"""Missions that a point of the curve sums up."""
-
-Slowness = NDArray[np.float64]
+LISTENERS = 3  # to goals: the planner, the trainer and the robot
+MEAN_OF = 8  # missions that a point of the curve sums up
 
 
 @dataclass
@@ -55,8 +45,12 @@ class Mission:
     routes: Routes
     seconds: dict[str, float]
     measured: float
-    truth: Slowness
-    slowness: Slowness
+    truth: Float64
+    slowness: Float64
+
+    def ratio(self, name: str) -> float:
+        """Return the time of a route over the best possible one."""
+        return self.seconds[name] / self.seconds["best possible"]
 
 
 class Driver:
@@ -81,7 +75,7 @@ class Driver:
         stamp = self.wait("odometry", self.odometry).header.stamp
         return float(stamp.sec + stamp.nanosec / 1e9)
 
-    def known_slowness(self) -> Slowness:
+    def known_slowness(self) -> Float64:
         """Return what the trainer says: (H, W)."""
         message = self.wait("slowness", self.slowness)
         shape = self.world.grid.occupancy.shape
@@ -105,7 +99,7 @@ class Driver:
         return self.mission(cells_of(grid, path), began, measured, slowness)
 
     def mission(
-        self, learned: Sequence[Cell], now: float, measured: float, slowness: Slowness
+        self, learned: Sequence[Cell], now: float, measured: float, slowness: Float64
     ) -> Mission:
         """Return a mission with the routes of those who know nothing and all beside the learned."""
         shortest, best = self.world.routes(self.planner, learned[0], learned[-1], now).values()
@@ -137,59 +131,56 @@ def draw(world: World, mission: Mission, learned: Routes) -> Any:
     return draw_slowness(world.grid, world.stations, panels, (8.4, 4.7))
 
 
-def save_film(path: FilePath, world: World, missions: Sequence[Mission]) -> None:
+def save_film(path: str, world: World, missions: Sequence[Mission]) -> None:
     """Save a GIF with a frame per mission."""
     frames = []
     for number, mission in enumerate(missions, start=1):
-        learned = {"learned": mission.routes["learned"]}
-        figure = draw(world, mission, learned)
-        ratio = mission.seconds["learned"] / mission.seconds["best possible"]
-        figure.suptitle(f"mission {number}: {ratio:.2f} of the best possible time", fontsize=11)
+        figure = draw(world, mission, {"learned": mission.routes["learned"]})
+        title = f"mission {number}: {mission.ratio('learned'):.2f} of the best possible time"
+        figure.suptitle(title, fontsize=11)
         canvas: Any = FigureCanvasAgg(figure)
         canvas.draw()
         image = Image.fromarray(np.asarray(canvas.buffer_rgba())).convert("RGB")
         frames.append(image.quantize(64))
         plt.close(figure)
-    times = [1200 if number in (0, len(frames) - 1) else 450 for number in range(len(frames))]
+    times = [1200, *[450] * (len(frames) - 2), 1200][: len(frames)]
     frames[0].save(path, save_all=True, append_images=frames[1:], duration=times, loop=0)
 
 
 def main(arguments: Sequence[str]) -> int:
     """Drive the missions, and save what they show."""
     count = int(arguments[0]) if arguments else MISSIONS
-    world = generated_world(WORLD, SEED)
+    world, random = generated_world(WORLD, SEED), np.random.default_rng(SEED)
     robot = [sys.executable, str(FilePath(__file__).with_name("simulated_robot.py")), "--ros-args"]
     for name, value in {"world": WORLD, "seed": SEED, "speed_up": SPEED_UP}.items():
         robot += ["-p", f"{name}:={value}"]
-    random = np.random.default_rng(SEED)
+    planning = {"start_source": "odometry", "move_rule": RULE.value, "follow_trainer": True}
     with tempfile.TemporaryDirectory() as folder, claim_ros_domain():
         map_file = FilePath(folder) / "world.yaml"
         save_map(world.grid, map_file)
-        drives = f"{folder}/drives"
+        learning = {"learn_from": "driving", "output_folder": f"{folder}/drives"}
         with (
             Client() as client,
             running_node("map_server_node", yaml_filename=map_file) as server,
-            running_node(
-                "planner_node", start_source="odometry", move_rule=RULE.value, follow_trainer=True
-            ) as planner,
-            running_node("trainer_node", learn_from="driving", output_folder=drives) as trainer,
+            running_node("planner_node", **planning) as planner,
+            running_node("trainer_node", **learning) as trainer,
             running(*robot) as robot_process,
         ):
             driver = Driver(client, world, [server, planner, trainer, robot_process])
             missions: list[Mission] = []
             for number in range(1, count + 1):
                 others = [station for station in world.stations if station != driver.at]
-                missions.append(driver.drive(others[random.integers(len(others))]))
-                each = missions[-1].seconds
+                mission = driver.drive(others[random.integers(len(others))])
+                missions.append(mission)
                 print(
-                    f"mission {number:2d}: drove {missions[-1].measured:5.1f} s; its route takes "
-                    f"{each['learned'] / each['best possible']:.2f} of the best possible time, the "
-                    f"shortest {each['shortest'] / each['best possible']:.2f}",
+                    f"mission {number:2d}: drove {mission.measured:5.1f} s; its route takes "
+                    f"{mission.ratio('learned'):.2f} of the best possible time, the "
+                    f"shortest {mission.ratio('shortest'):.2f}",
                     flush=True,
                 )
             last = driver.last_mission()
     draw(world, last, last.routes).savefig("demo_driving.png", dpi=110)
-    save_film(FilePath("demo_driving.gif"), world, missions)
+    save_film("demo_driving.gif", world, missions)
     seconds = {name: [np.array([each.seconds[name] for each in missions])] for name in ROUTE_STYLES}
     best = seconds.pop("best possible")
     curve, _ = draw_times(seconds, best, min(MEAN_OF, count), banded="learned")

@@ -7,8 +7,6 @@ All is drawn in cells of the map, with y upwards. It needs `pip install rerun-sd
 shows the same topics.
 """
 
-from __future__ import annotations
-
 import argparse
 import sys
 from collections.abc import Sequence

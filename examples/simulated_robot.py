@@ -8,8 +8,6 @@ faster than the clock: the stamps are simulated.
     python examples/simulated_robot.py --ros-args -p world:=office -p seed:=1 -p speed_up:=30.0
 """
 
-from __future__ import annotations
-
 import math
 import sys
 import time

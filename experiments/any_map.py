@@ -1,7 +1,5 @@
 """The model for any map: the paper's goals on their unseen map, and what each idea contributes."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any, Final

@@ -1,7 +1,5 @@
 """Measures what a robot's body costs on a ROS map (a path), with the robot's radius in metres."""
 
-from __future__ import annotations
-
 import sys
 from collections.abc import Sequence
 from pathlib import Path

@@ -1,15 +1,13 @@
 """A client of the nodes, and the messages that scripts and tests exchange with them."""
 
-from __future__ import annotations
-
 import queue
 import threading
 import time
 from collections import deque
 from collections.abc import Callable, Iterable
-from contextlib import suppress
+from contextlib import ExitStack, suppress
 from subprocess import Popen
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 import rclpy
@@ -32,15 +30,10 @@ from ddqn_planner.grid import Cell, GridMap
 from ddqn_planner.nodes.conversions import occupancy_message, quaternion
 from ddqn_planner.nodes.report import seconds
 
-if TYPE_CHECKING:
-    from typing_extensions import Self
-
-TIMEOUT = 120.0
-"""Seconds that anything may take on a loaded machine."""
-
+TIMEOUT = 120.0  # seconds that anything may take on a loaded machine
+# With Fast DDS each client of a service hears the answers to all clients. One that is slow to read
+# them loses its own from the usual queue of ten.
 SERVICE_QUALITY = QoSProfile(depth=1000)
-"""With Fast DDS each client of a service hears the answers to all clients. One that is slow to read
-them loses its own from the usual queue of ten."""
 
 T = TypeVar("T")
 
@@ -51,10 +44,7 @@ def wait_for(
     children: Iterable[Popen[bytes]] = (),
     timeout: float = TIMEOUT,
 ) -> T:
-    """Return the first answer that is true.
-
-    RuntimeError says that one of the children has ended, TimeoutError that time is up.
-    """
+    """Return the first answer that is true; RuntimeError if a child ends, else TimeoutError."""
     deadline = time.monotonic() + timeout
     while not (found := answer()):
         for child in children:
@@ -87,10 +77,14 @@ class Recorder:
             self._messages.clear()
             self._since = time.time_ns()
 
+    def messages(self) -> list[Any]:
+        """Return what came since the last `clear`, in order."""
+        with self._arrived:
+            return [*self._messages]
+
     def find(self, predicate: Callable[[Any], Any] = lambda message: True) -> Any:
         """Return the first message for which the predicate holds, or None."""
-        with self._arrived:
-            return next((message for message in self._messages if predicate(message)), None)
+        return next(filter(predicate, self.messages()), None)
 
     def wait(
         self, predicate: Callable[[Any], Any] = lambda message: True, timeout: float = TIMEOUT
@@ -102,16 +96,23 @@ class Recorder:
                 raise TimeoutError(f"no such message; there came {[*self._messages][-3:]}")
             return found
 
-    def messages(self) -> list[Any]:
-        """Return what came since the last `clear`, in order."""
-        with self._arrived:
-            return [*self._messages]
+
+def ask(service: Any, request: Any, timeout: float = TIMEOUT) -> Any:
+    """Return the answer to a request of rclpy's client of a service, or raise TimeoutError."""
+    answers, future = queue.SimpleQueue[Any](), service.call_async(request)
+    future.add_done_callback(answers.put)
+    try:
+        return answers.get(timeout=timeout).result()
+    except queue.Empty:
+        service.remove_pending_request(future)
+        raise TimeoutError(f"no answer from {service.srv_name} within {timeout:.0f} s") from None
 
 
-class Client:
-    """A node in a context of its own, spun in the background."""
+class Client(ExitStack):
+    """A node in a context of its own, spun in the background until the stack closes."""
 
     def __init__(self, namespace: str = "", name: str = "client") -> None:
+        super().__init__()
         self._context = Context()
         self._context.init(args=[])
         self.node = rclpy.create_node(
@@ -119,28 +120,20 @@ class Client:
         )
         self._executor = SingleThreadedExecutor(context=self._context)
         self._executor.add_node(self.node)
-        self._thread = threading.Thread(target=self._spin, daemon=True)
-        self._thread.start()
         self._services: dict[str, Any] = {}
         self._publishers: dict[str, Any] = {}
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
-
-    def close(self) -> None:
-        """Stop spinning, and destroy the node."""
-        self._context.try_shutdown()
-        self._thread.join()
-        self._executor.shutdown()
-        self.node.destroy_node()
+        thread = threading.Thread(target=self._spin, daemon=True)
+        thread.start()
+        # From the last to the first, when the stack closes.
+        self.callback(self.node.destroy_node)
+        self.callback(self._executor.shutdown)
+        self.callback(thread.join)
+        self.callback(self._context.try_shutdown)
 
     def _spin(self) -> None:
         try:
             self._executor.spin()
-        except (ExternalShutdownException, RCLError):  # by `close`
+        except (ExternalShutdownException, RCLError):  # at the end
             if self._context.ok():
                 raise
 
@@ -149,26 +142,20 @@ class Client:
         return self._executor.create_task(function, *arguments)
 
     def service(self, service_type: Any, name: str) -> Any:
-        """Return rclpy's client of a service, always the same one, once node and client are ready.
-
-        The middleware drops the answer to a client that the node has not discovered yet, which a
-        busy machine delays.
-        """
+        """Return rclpy's client of a service, always the same one, once both sides are ready."""
         service = self._services.get(name) or self.node.create_client(
             service_type, name, qos_profile=SERVICE_QUALITY
         )
         wait_for(f"service {name}", service.service_is_ready)
         if name not in self._services:
+            # The middleware drops the answer to a client that the node has not discovered yet.
             self.wait_for_discovery(name.rpartition("/")[0])
             self._services[name] = service
         return service
 
     def wait_for_discovery(self, node: str) -> None:
-        """Wait until a node has discovered all that this client has created so far.
-
-        It discovers in the order of creation. So it knows all the rest when it answers a client
-        that is new, and whose question changes nothing: it may be asked again.
-        """
+        """Wait until a node has discovered all that this client has created so far."""
+        # It discovers in the order of creation, so it knows the rest when it answers a new client.
         probe = self.node.create_client(GetParameters, f"{node}/get_parameters")
         wait_for(f"parameters of {node}", probe.service_is_ready)
         answered = threading.Event()
@@ -200,14 +187,7 @@ class Client:
         self, service_type: Any, name: str, request: Any = None, timeout: float = TIMEOUT
     ) -> Any:
         """Wait for a service, call it, and return its response; or raise TimeoutError."""
-        service, answers = self.service(service_type, name), queue.SimpleQueue[Any]()
-        future = service.call_async(request or service_type.Request())
-        future.add_done_callback(answers.put)
-        try:
-            return answers.get(timeout=timeout).result()
-        except queue.Empty:
-            service.remove_pending_request(future)
-            raise TimeoutError(f"no answer from {name} within {timeout:.0f} s") from None
+        return ask(self.service(service_type, name), request or service_type.Request(), timeout)
 
     def publisher(self, message_type: Any, topic: str, qos: Any = 10, listeners: int = 1) -> Any:
         """Return a publisher, always the same one per topic, once so many listen."""
@@ -254,23 +234,21 @@ class RobotPoses:
 
     def __init__(self, node: Any) -> None:
         self._odometry = node.create_publisher(Odometry, "odom", 100)
-        self._broadcaster: Any = None
+        self._send_transform: Callable[[Any], Any] = lambda transform: None
         with suppress(ImportError):
             from tf2_ros import TransformBroadcaster
 
-            self._broadcaster = TransformBroadcaster(node)
+            self._send_transform = TransformBroadcaster(node).sendTransform
 
     def publish(self, header: Header, x: float, y: float, yaw: float = 0.0) -> None:
         """Publish a pose of `base_link` in the header's frame, in metres and radians."""
         odometry = Odometry(header=header, child_frame_id="base_link")
-        odometry.pose.pose.position.x, odometry.pose.pose.position.y = x, y
-        odometry.pose.pose.orientation = quaternion(yaw)
+        transform = TransformStamped(header=header, child_frame_id="base_link")
+        for place in (odometry.pose.pose.position, transform.transform.translation):
+            place.x, place.y = x, y
+        odometry.pose.pose.orientation = transform.transform.rotation = quaternion(yaw)
         self._odometry.publish(odometry)
-        if self._broadcaster is not None:
-            transform = TransformStamped(header=header, child_frame_id="base_link")
-            transform.transform.translation.x, transform.transform.translation.y = x, y
-            transform.transform.rotation = odometry.pose.pose.orientation
-            self._broadcaster.sendTransform(transform)
+        self._send_transform(transform)
 
 
 def pose(grid: GridMap, cell: Cell, yaw: float = 0.0, offset: float = 0.0) -> PoseStamped:

@@ -1,7 +1,5 @@
 """Measure how much sooner a robot arrives that remembers how long places took, in many worlds."""
 
-from __future__ import annotations
-
 import argparse
 import os
 import sys

@@ -1,7 +1,5 @@
 """Worlds in which driving takes longer than the map says, and a robot that drives in them."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final

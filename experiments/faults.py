@@ -1,23 +1,16 @@
-"""Kills each node in turn while it works, starts it again, and checks that nothing is broken.
-
-The planner is killed while it plans, the map server while it publishes, the trainer while it saves:
-by SIGKILL, each time at a random moment. After each kill there must be a plan within a minute, also
-while the map server is gone. `make faults` kills 50 times; an argument gives another number.
-"""
-
-from __future__ import annotations
+"""Kills each node in turn while it works, starts it again, and checks that nothing is broken."""
 
 import array
 import random
-import subprocess
 import tempfile
 import time
 from collections.abc import Callable, Sequence
-from contextlib import ExitStack, suppress
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
 from itertools import cycle, islice
 from pathlib import Path
+from subprocess import Popen
 from typing import Any
 
 import numpy as np
@@ -42,25 +35,12 @@ from ddqn_planner.training.environment import paper_scenario
 from ddqn_planner.training.trainer import Trainer
 
 KILLS = 50
-SIDE = 1000
-"""Cells: a map so large that its fields are killed in."""
-
-GOALS = 6
-"""Fields that the planner is asked for at once: a second's work."""
-
-TRY_TIME = 1.0
-"""Seconds until a question is asked again: it may have gone to the node that was killed."""
-
-START_TIME = 20.0
-"""The same for ~/start, which a second question would find started."""
-
-PLAN_TIME = 60.0
-"""Seconds within which there must be a plan after a kill, on a loaded machine."""
-
-LAST_WAIT = 0.5
-"""Seconds that a client waits after a kill until it gives up."""
-
-GET_PLAN = "planner/get_plan"
+SIDE, GOALS = 1000, 6  # cells of a map, and fields asked for at once: a second's work
+TRY_TIME = 1.0  # seconds until a question is asked again: it may have gone to a killed node
+START_TIME = 20.0  # the same for ~/start, which a second question would find started
+PLAN_TIME = 60.0  # seconds within which there must be a plan after a kill, on a loaded machine
+LAST_WAIT = 0.5  # seconds that a client waits after a kill until it gives up
+Ends = tuple[Cell, Cell]  # start and goal
 
 
 @dataclass
@@ -78,56 +58,43 @@ class Tally:
     wrong_paths: int = 0
     temporaries: int = 0
 
-    @property
-    def right(self) -> bool:
-        """Whether all restarts worked, no plan was missing, and nothing wrong came or stayed."""
-        wrong = self.without_a_plan or self.wrong_paths or self.temporaries
-        return self.restarts == self.kills and not wrong
 
+class Faults(Client):
+    """The nodes, and a client that kills them and sees what becomes of it."""
 
-class Faults:
-    """The nodes, which end with a stack, and what a client sees of them."""
-
-    def __init__(self, client: Client, folder: Path, stack: ExitStack) -> None:
-        self.client = client
-        self.maps = client.subscribe(OccupancyGrid, "map", LATCHED, keep=1)
-        self.plans = client.subscribe(PathMessage, "plan", LATCHED, keep=1)
-        self.diagnostics = client.subscribe(DiagnosticArray, "/diagnostics", keep=20)
-        self._draw, self._random = random.Random(0), np.random.default_rng(0)
+    def __init__(self, folder: Path) -> None:
+        super().__init__()
+        self.maps = self.subscribe(OccupancyGrid, "map", LATCHED, keep=1)
+        self.plans = self.subscribe(PathMessage, "plan", LATCHED, keep=1)
+        self.diagnostics = self.subscribe(DiagnosticArray, "/diagnostics", keep=20)
+        self.draw, self.random = random.Random(0), np.random.default_rng(0)
         self.map_path, self.training_folder = folder / "map.yaml", folder / "training"
-        occupancy = generate_map("office", (SIDE, SIDE), self._random)
-        (self._watched,) = random_requests(occupancy, RULE, 1, self._random)
-        map_file = MapFile(OCCUPIED * occupancy, 1.0, (0.0, 0.0, 0.0), *self._watched)
+        occupancy = generate_map("office", (SIDE, SIDE), self.random)
+        (self.watched,) = random_requests(occupancy, RULE, 1, self.random)
+        map_file = MapFile(OCCUPIED * occupancy, 1.0, (0.0, 0.0, 0.0), *self.watched)
         save_map(map_file, self.map_path)
-        self._map = MapFixture(map_file)
+        self.map = MapFixture(map_file)
         quiet, apart = ("--log-level", "fatal"), ("-r", "__ns:=/training")
         training = {"map_file": "dilemma", "steps": 10**9, "output_folder": self.training_folder}
-        self._nodes: dict[str, Callable[[], Any]] = {
-            "map_server": partial(
-                running_node, "map_server_node", *quiet, yaml_filename=self.map_path
-            ),
+        server = {"yaml_filename": self.map_path}
+        self.nodes: dict[str, Callable[[], Any]] = {
+            "map_server": partial(running_node, "map_server_node", *quiet, **server),
             "planner": partial(running_node, "planner_node", *quiet),
             "trainer": partial(running_node, "trainer_node", *quiet, *apart, **training),
             "follower": partial(running_node, "planner_node", *quiet, *apart, follow_trainer=True),
         }
-        self._stack = stack
-        self.children: dict[str, subprocess.Popen[bytes]] = {}
-        for name in self._nodes:
+        self.children: dict[str, Popen[bytes]] = {}
+        for name in self.nodes:
             self.start(name)
-
-    # Nodes
 
     def start(self, name: str) -> None:
         """Start a node."""
-        self.children[name] = self._stack.enter_context(self._nodes[name]())
+        self.children[name] = self.enter_context(self.nodes[name]())
 
     def kill(self, name: str, tally: Tally, calls: Sequence[tuple[Any, Any]]) -> list[Any]:
-        """Kill a node, as a power cut would, under calls: pairs of a service and a future.
-
-        Count the answers that came before, and the time-outs; return the answers, or None.
-        """
+        """Kill a node under calls (service and future); count and return their answers, or None."""
         child = self.children.pop(name)
-        child.kill()
+        child.kill()  # as a power cut would
         child.wait()
         time.sleep(LAST_WAIT)
         for service, future in calls:
@@ -135,8 +102,6 @@ class Faults:
             tally.time_outs += not future.done()
             service.remove_pending_request(future)
         return [future.result() for _, future in calls]
-
-    # Asking
 
     def ask(
         self,
@@ -151,7 +116,7 @@ class Faults:
 
         def answer() -> Any:
             with suppress(TimeoutError):
-                found = self.client.call(service_type, name, request, try_time)
+                found = self.call(service_type, name, request, try_time)
                 if accept(found):
                     return found
             time.sleep(0.05)
@@ -161,8 +126,7 @@ class Faults:
 
     def trigger(self, name: str, try_time: float = TRY_TIME) -> str:
         """Call a Trigger service until it succeeds; return its message."""
-        answer = self.ask(Trigger, name, None, lambda answer: answer.success, try_time)
-        return str(answer.message)
+        return str(self.ask(Trigger, name, None, lambda found: found.success, try_time).message)
 
     def parameter(self, node: str, name: str) -> Any:
         """Return a parameter's value message."""
@@ -170,36 +134,35 @@ class Faults:
         return self.ask(GetParameters, f"{node}/get_parameters", request).values[0]
 
     def ask_for_plan(
-        self, start: Cell, goal: Cell, accept: Callable[[Any], Any] = lambda found: found.plan.poses
+        self, ends: Ends, accept: Callable[[Any], Any] = lambda found: found.plan.poses
     ) -> PathMessage:
         """Ask for a plan until there is one, or an answer is accepted."""
-        request = self._request((start, goal))
-        return self.ask(GetPlan, GET_PLAN, request, accept, timeout=PLAN_TIME).plan
+        request = plan_request(self.map.grid, *ends)
+        return self.ask(GetPlan, "planner/get_plan", request, accept, timeout=PLAN_TIME).plan
 
     def plan_for_active_goal(self) -> PathMessage:
         """Give the planner a start and an active goal until it plans: it may be a new one."""
-        start, goal = (pose(self._map.grid, cell) for cell in self._watched)
+        start, goal = (pose(self.map.grid, cell) for cell in self.watched)
         self.plans.clear()
 
         def planned() -> PathMessage | None:
-            self.client.publish("initialpose", initial_pose(start))
-            self.client.publish("goal_pose", goal)
+            self.publish("initialpose", initial_pose(start))
+            self.publish("goal_pose", goal)
             time.sleep(0.2)
             found: PathMessage | None = self.plans.find(lambda plan: plan.poses)
             return found
 
         return wait_for("plan", planned, timeout=PLAN_TIME)
 
-    def check_plan(
-        self, tally: Tally, ask: Callable[[], PathMessage], cells: tuple[Cell, Cell]
-    ) -> bool:
-        """Ask for a plan; count it if it is wrong, or none comes in time; return whether one came.
+    def is_wrong(self, ends: Ends, plan: PathMessage) -> bool:
+        """Return whether a plan is wrong on the map without new obstacles."""
+        return bool(self.map.error(plan_request(self.map.grid, *ends), plan))
 
-        A plan of a map with new obstacles must be right on the map without them too.
-        """
+    def check_plan(self, tally: Tally, ends: Ends, ask: Callable[[], PathMessage]) -> bool:
+        """Return whether a plan comes in time; count one that is wrong or missing."""
         with suppress(TimeoutError):
             if (plan := ask()).poses:
-                tally.wrong_paths += bool(self._map.error(self._request(cells), plan))
+                tally.wrong_paths += self.is_wrong(ends, plan)
                 return True
         tally.without_a_plan += 1
         said = [message.status[0] for message in self.diagnostics.messages()]
@@ -207,67 +170,69 @@ class Faults:
         print(f"no plan after kill {tally.kills} of {tally.node}: {reasons[-1:]}", flush=True)
         return False
 
-    def _request(self, cells: tuple[Cell, Cell]) -> GetPlan.Request:
-        return plan_request(self._map.grid, *cells)
-
-    # Killing
-
     def kill_planner(self, tally: Tally) -> None:
         """Kill the planner while it plans toward goals that it does not know."""
-        get_plan = self.client.service(GetPlan, GET_PLAN)
-        asked = random_requests(self._map.grid.occupancy, RULE, GOALS, self._random)
-        calls = [(get_plan, get_plan.call_async(self._request(cells))) for cells in asked]
-        time.sleep(self._draw.uniform(0.0, 1.0))
-        for cells, answer in zip(asked, self.kill("planner", tally, calls), strict=True):
-            if answer is not None:  # all goals can be reached: the check refuses an empty path
-                tally.wrong_paths += bool(self._map.error(self._request(cells), answer.plan))
+        get_plan = self.service(GetPlan, "planner/get_plan")
+        asked = random_requests(self.map.grid.occupancy, RULE, GOALS, self.random)
+        requests = [plan_request(self.map.grid, *ends) for ends in asked]
+        calls = [(get_plan, get_plan.call_async(request)) for request in requests]
+        time.sleep(self.draw.uniform(0.0, 1.0))
+        for ends, answer in zip(asked, self.kill("planner", tally, calls), strict=True):
+            # All goals can be reached: the check refuses an empty path.
+            tally.wrong_paths += answer is not None and self.is_wrong(ends, answer.plan)
         self.start("planner")
-        tally.restarts += self.check_plan(tally, partial(self.ask_for_plan, *asked[0]), asked[0])
+        tally.restarts += self.check_plan(tally, asked[0], lambda: self.ask_for_plan(asked[0]))
 
     def kill_map_server(self, tally: Tally) -> None:
         """Kill the map server while it loads, scatters over and restores its map."""
         self.plan_for_active_goal()
         load = LoadMap.Request(map_url=str(self.map_path))
         requests = [
-            *[(self.client.service(Trigger, "map_server/restore_map"), Trigger.Request())] * 20,
-            *[(self.client.service(LoadMap, "map_server/load_map"), load)] * 4,
-            (self.client.service(Trigger, "map_server/scatter_obstacles"), Trigger.Request()),
+            *[(self.service(Trigger, "map_server/restore_map"), Trigger.Request())] * 20,
+            *[(self.service(LoadMap, "map_server/load_map"), load)] * 4,
+            (self.service(Trigger, "map_server/scatter_obstacles"), Trigger.Request()),
         ]
-        self._draw.shuffle(requests)
+        self.draw.shuffle(requests)
         calls = [(service, service.call_async(request)) for service, request in requests]
-        time.sleep(self._draw.uniform(0.0, 2.0))
+        time.sleep(self.draw.uniform(0.0, 2.0))
         self.kill("map_server", tally, calls)
         # The first answer must be a plan. With it, the plans of the last maps are out.
-        first_answer = partial(self.ask_for_plan, *self._watched, accept=bool)
-        self.check_plan(tally, first_answer, self._watched)
+        self.check_plan(tally, self.watched, lambda: self.ask_for_plan(self.watched, bool))
         # The map is the loaded one with at most five obstacles more.
-        values = np.frombuffer(self.maps.wait().data, np.int8).reshape(self._map.values.shape)
-        new = values[values != self._map.values]
-        whole = bool((new == OCCUPIED).all()) and len(new) <= MAX_NEW_OBSTACLES
+        values = np.frombuffer(self.maps.wait().data, np.int8).reshape(self.map.values.shape)
+        new = values[values != self.map.values]
+        intact = bool((new == OCCUPIED).all()) and len(new) <= MAX_NEW_OBSTACLES
         self.maps.clear()
         self.start("map_server")
         served = self.maps.wait()
-        self.check_plan(tally, self.plan_for_active_goal, self._watched)
-        tally.restarts += whole and served.data == array.array("b", self._map.values.tobytes())
+        self.check_plan(tally, self.watched, self.plan_for_active_goal)
+        tally.restarts += intact and served.data == array.array("b", self.map.values.tobytes())
 
     def kill_trainer(self, tally: Tally) -> None:
         """Kill the trainer while it saves after each step, soon after a save was seen to begin."""
-        save = self.client.service(Trigger, "/training/trainer/save")
-        until = time.monotonic() + self._draw.uniform(0.2, 1.2)
+        save = self.service(Trigger, "/training/trainer/save")
+        until = time.monotonic() + self.draw.uniform(0.2, 1.2)
         calls = []
         while time.monotonic() < until:
             calls.append((save, save.call_async(Trigger.Request())))
             time.sleep(0.002)
         while not self.temporaries() and time.monotonic() < until + LAST_WAIT:
             pass
-        time.sleep(self._draw.uniform(0.0, 0.002))
+        time.sleep(self.draw.uniform(0.0, 0.002))
         self.kill("trainer", tally, calls)
         tally.in_a_save += bool(self.temporaries())
-        steps = self.saved_steps()
+        # What it saved can be loaded.
+        model = self.training_folder / "model.safetensors"
+        checkpoint = self.training_folder / "checkpoint.safetensors"
+        if model.exists():
+            load_model(model)
+        steps = 0
+        if checkpoint.exists():
+            steps = Trainer.load_checkpoint(checkpoint, [paper_scenario()]).steps
         self.start("trainer")
         self.parameter("/training/trainer", "seed")
         message = self.trigger("/training/trainer/start", START_TIME)
-        self.follow()
+        self.see_that_planner_follows(str(model))
         tally.temporaries = len(self.temporaries())
         tally.restarts += f"from step {steps} " in message
 
@@ -275,30 +240,19 @@ class Faults:
         """Return what the killed trainers left of their saves."""
         return [*self.training_folder.glob(".*")]
 
-    def saved_steps(self) -> int:
-        """Load the model and the checkpoint, where there are any; return the checkpoint's steps."""
-        model = self.training_folder / "model.safetensors"
-        checkpoint = self.training_folder / "checkpoint.safetensors"
-        if model.exists():
-            load_model(model)
-        if not checkpoint.exists():
-            return 0
-        return Trainer.load_checkpoint(checkpoint, [paper_scenario()]).steps
-
-    def follow(self) -> None:
+    def see_that_planner_follows(self, saved: str) -> None:
         """Wait until the planner that follows the trainer has loaded a model of its."""
         other = Parameter("model", value="any_map").to_parameter_msg()
         request = SetParameters.Request(parameters=[other])
         name = "/training/planner/set_parameters"
         self.ask(SetParameters, name, request, lambda answer: answer.results[0].successful)
         self.trigger("/training/trainer/save")
-        saved = str(self.training_folder / "model.safetensors")
         model = partial(self.parameter, "/training/planner", "model")
         wait_for("model", lambda: model().string_value == saved)
 
     def kill_in_turn(self, kills: int) -> bool:
         """Kill so many times, and print what became of it; return whether all is right."""
-        self.ask_for_plan(*self._watched)
+        self.ask_for_plan(self.watched)
         self.trigger("/training/trainer/start", START_TIME)
         self.parameter("/training/planner", "model")
         tallies = {
@@ -313,19 +267,19 @@ class Faults:
         finally:
             header = " | ".join(Tally.__annotations__).replace("_", " ")
             print(table(header, [[*vars(tally).values()] for tally in tallies.values()]))
-        return all(tally.right for tally in tallies.values())
+        wrong = sum(t.without_a_plan + t.wrong_paths + t.temporaries for t in tallies.values())
+        return not wrong and all(t.restarts == t.kills for t in tallies.values())
 
 
 def main(arguments: Sequence[str]) -> int:
-    """Kill so many times; return 1 if anything is wrong."""
+    """Kill so many times, 50 without an argument; return 1 if anything is wrong."""
+    kills = int(arguments[0]) if arguments else KILLS
     with (
         claim_ros_domain(),
-        Client() as client,
         tempfile.TemporaryDirectory() as folder,
-        ExitStack() as stack,
+        Faults(Path(folder)) as faults,
     ):
-        faults = Faults(client, Path(folder), stack)
-        return int(not faults.kill_in_turn(int(arguments[0]) if arguments else KILLS))
+        return int(not faults.kill_in_turn(kills))
 
 
 if __name__ == "__main__":

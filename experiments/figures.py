@@ -1,7 +1,5 @@
 """What the figures have in common."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
@@ -107,7 +105,7 @@ def draw_times(
     return figure, axes
 
 
-def draw_map(axes: Any, scenario: Scenario, title: str) -> None:
+def draw_map(axes: Any, scenario: "Scenario", title: str) -> None:
     """Draw a map, its start and its goal."""
     draw_obstacles(axes, scenario.grid)
     axes.set(aspect="equal", xticks=[], yticks=[])

@@ -1,7 +1,5 @@
 """Counts how often the path of a robot flips on noisy costmaps, and what it costs to keep it."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import NamedTuple
 

@@ -1,7 +1,5 @@
 """Measure greedy rollouts of a model on maps that it never saw, against scipy's Dijkstra."""
 
-from __future__ import annotations
-
 import argparse
 import math
 import os

@@ -1,7 +1,5 @@
 """Goal i (section 5.1, Fig. 7) and the ablation (Fig. 6): from the given start to the given end."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Sequence
 from dataclasses import replace

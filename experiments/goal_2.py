@@ -1,7 +1,5 @@
 """Goal ii (section 5.2, Fig. 8): from every free cell; and what the printed target does."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any, Final

@@ -1,7 +1,5 @@
 """Goal iii (section 5.3, Fig. 9): maps with new obstacles, most of them never trained on."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any, Final

@@ -1,9 +1,5 @@
 """A map with what it takes to check a planner's answers on it."""
 
-from __future__ import annotations
-
-from collections.abc import Sequence
-
 import numpy as np
 from client import cell_of, cells_of, map_message
 from nav_msgs.msg import OccupancyGrid, Path
@@ -11,26 +7,10 @@ from nav_msgs.srv import GetPlan
 from numpy.typing import NDArray
 from random_maps import generate_map
 
-from ddqn_planner.grid import Cell, MapFile, MoveRule, read_map_file
+from ddqn_planner.grid import MapFile, MoveRule, read_map_file
 from ddqn_planner.resources import find_map
 
-RULE = MoveRule.ROBOT_SAFE
-"""The rule of the planner's default model."""
-
-
-def path_error(occupied: NDArray[np.bool_], cells: Sequence[Cell], start: Cell, goal: Cell) -> str:
-    """Say what is wrong with a path on a map for a robot that cuts no corners; "" if nothing is."""
-    if (cells[0], cells[-1]) != (start, goal):
-        return f"a path from {cells[0]} to {cells[-1]}, asked was {start} to {goal}"
-    path = np.array(cells)
-    if ((path < 0) | (path >= occupied.shape[::-1])).any():
-        return "an illegal move out of the map"
-    (x, y), (next_x, next_y) = path[:-1].T, path[1:].T
-    # A diagonal move needs both cells beside it; for a straight one these are its own two.
-    wrong = occupied[next_y, next_x] | (occupied[y, next_x] & (next_x != x))
-    wrong |= occupied[next_y, x] & (next_y != y)
-    wrong |= np.maximum(abs(next_x - x), abs(next_y - y)) != 1
-    return f"an illegal move to {path[1:][wrong][0]}" if wrong.any() else ""
+RULE = MoveRule.ROBOT_SAFE  # of the planner's default model
 
 
 class MapFixture:
@@ -47,22 +27,32 @@ class MapFixture:
         return map_message(self.values, self.grid, stamp)
 
     def error(self, request: GetPlan.Request, plan: Path) -> str:
-        """Say what is wrong with an answer; "" if nothing is."""
-        grid = self.grid
+        """Say what is wrong with an answer for a robot that cuts no corners; "" if nothing is."""
+        grid, cells = self.grid, cells_of(self.grid, plan)
         start, goal = (cell_of(grid, pose) for pose in (request.start, request.goal))
-        cells = cells_of(grid, plan)
         if not cells:
             labels = grid.labels(RULE)
             both_free = grid.is_free(start) and grid.is_free(goal)
             possible = both_free and labels[start[::-1]] == labels[goal[::-1]]
             return f"no path from {start} to {goal}, where there is one" if possible else ""
-        free = (number for number, cell in enumerate(cells) if grid.is_free(cell))
-        first = next(free, len(cells) - 1)  # a robot on an obstacle may leave it
-        y, x = np.ogrid[: grid.height, : grid.width]
-        far = np.hypot(x - start[0], y - start[1]) > 1
-        return path_error(
-            grid.occupancy & far, cells[: first + 1], start, cells[first]
-        ) or path_error(grid.occupancy, cells[first:], cells[first], goal)
+        if (cells[0], cells[-1]) != (start, goal):
+            return f"a path from {cells[0]} to {cells[-1]}, asked was {start} to {goal}"
+        path = np.array(cells)
+        if ((path < 0) | (path >= (grid.width, grid.height))).any():
+            return "an illegal move out of the map"
+        (x, y), (next_x, next_y) = path[:-1].T, path[1:].T
+        first_free = next((n for n, cell in enumerate(cells) if grid.is_free(cell)), len(x))
+
+        def is_blocked(x: NDArray[np.int64], y: NDArray[np.int64]) -> NDArray[np.bool_]:
+            # A robot on an obstacle may leave it, and what is next to it.
+            is_far = np.hypot(x - start[0], y - start[1]) > 1
+            return grid.occupancy[y, x] & (is_far | (np.arange(len(x)) >= first_free))
+
+        # A diagonal move needs both cells beside it; for a straight one these are its own two.
+        wrong = is_blocked(next_x, next_y) | (is_blocked(next_x, y) & (next_x != x))
+        wrong |= is_blocked(x, next_y) & (next_y != y)
+        wrong |= np.maximum(abs(next_x - x), abs(next_y - y)) != 1
+        return f"an illegal move to {path[1:][wrong][0]}" if wrong.any() else ""
 
 
 def generated_map(kind: str, side: int, resolution: float = 0.05) -> MapFixture:

@@ -1,10 +1,4 @@
-"""Measures the executables: how soon they are of use, how fast they answer, what they take.
-
-Part of `make bench`. With the path of a ROS map, as of turtlebot3, the planner is asked on that one
-in place of the office.
-"""
-
-from __future__ import annotations
+"""Measures the executables: how soon they are of use, how fast they answer, what they take."""
 
 import gc
 import os
@@ -13,24 +7,15 @@ import statistics
 import subprocess
 import sys
 import tempfile
-import threading
 import time
 from collections.abc import Callable, Sequence
-from contextlib import suppress
+from contextlib import AbstractContextManager, suppress
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from client import (
-    TIMEOUT,
-    Client,
-    initial_pose,
-    map_message,
-    plan_request,
-    pose,
-    wait_for,
-)
+from client import Client, ask, initial_pose, map_message, plan_request, pose, wait_for
 from map_fixture import RULE
 from nav_msgs.msg import OccupancyGrid
 from nav_msgs.msg import Path as PathMessage
@@ -57,13 +42,10 @@ from ddqn_planner.resources import find_map
 
 BARE = [sys.executable, str(Path(__file__).with_name("bare_service.py"))]
 STARTS, CALLS, GOALS, LARGE, CHANGING = 10, 200, 7, 2000, 1024
-RATE = 5
-"""Maps per second."""
-SETTLED = 0.6
-"""Seconds after which a client is known to DDS."""
-
-Usage = tuple[float, float, float]
-"""Wall time and CPU time, seconds; resident memory, MB."""
+RATE = 5  # maps per second
+SETTLED = 0.6  # seconds after which a client is known to DDS
+FREE = float("inf")
+Usage = tuple[float, float, float]  # wall time and CPU time, seconds; resident memory, MB
 
 
 def message_of(grid: GridMap) -> OccupancyGrid:
@@ -77,52 +59,49 @@ def publish_request(client: Client, grid: GridMap, start: Cell, goal: Cell) -> N
     client.publish("goal_pose", pose(grid, goal))
 
 
-def office(side: int) -> tuple[GridMap, Cell, Cell]:
-    """Return a generated office, with a start and a goal that a path joins."""
-    random = np.random.default_rng(0)
-    grid = GridMap(generate_map("office", (side, side), random))
-    ((start, goal),) = random_requests(grid.occupancy, RULE, 1, random)
-    return grid, start, goal
+def office(side: int) -> GridMap:
+    """Return a generated office."""
+    return GridMap(generate_map("office", (side, side), np.random.default_rng(0)))
 
 
-# Starts
+def usage(child: AbstractContextManager[Any], wait: Callable[[], Any]) -> Usage:
+    """Start a process; return what it takes until a wait ends."""
+    time.sleep(SETTLED)
+    began = time.monotonic()
+    with child as node:
+        wait()
+        return time.monotonic() - began, cpu_seconds(node.pid), memory(node.pid)
+
+
+# A client per start: one that has seen other nodes end is discovered more slowly.
 
 
 def start_planner() -> Usage:
     """Start the planner node; return what it takes until its first plan."""
     grid = load_map(find_map("dilemma"))
-    # A client per start: one that has seen other nodes end is discovered more slowly.
     with Client() as client:
         plans = client.subscribe(PathMessage, "plan", LATCHED)
         client.publish("map", message_of(grid), LATCHED, listeners=0)
-        time.sleep(SETTLED)
-        began = time.monotonic()
-        with running_node("planner_node", "--log-level", "error") as node:
+
+        def first_plan() -> None:
             publish_request(client, grid, (6, 6), (17, 19))
             plans.wait(lambda plan: plan.poses)
-            return time.monotonic() - began, cpu_seconds(node.pid), memory(node.pid)
+
+        return usage(running_node("planner_node", "--log-level", "error"), first_plan)
 
 
 def start_map_server() -> Usage:
     """Start the map server; return what it takes until its first map is received."""
     with Client() as client:
         maps = client.subscribe(OccupancyGrid, "map", LATCHED)
-        time.sleep(SETTLED)
-        began = time.monotonic()
-        with running_node("map_server_node", "--log-level", "error") as node:
-            maps.wait()
-            return time.monotonic() - began, cpu_seconds(node.pid), memory(node.pid)
+        return usage(running_node("map_server_node", "--log-level", "error"), maps.wait)
 
 
 def start_bare_node() -> Usage:
     """Start a node with one service; return what it takes until it is discovered."""
     with Client() as client:
-        service = client.node.create_client(GetPlan, "bare/get_plan")
-        time.sleep(SETTLED)
-        began = time.monotonic()
-        with running(*BARE, "0") as node:
-            wait_for("the bare node", service.service_is_ready)
-            return time.monotonic() - began, cpu_seconds(node.pid), memory(node.pid)
+        ready = client.node.create_client(GetPlan, "bare/get_plan").service_is_ready
+        return usage(running(*BARE, "0"), lambda: wait_for("the bare node", ready))
 
 
 def run_command(*command: str) -> Usage:
@@ -143,16 +122,14 @@ def run_command(*command: str) -> Usage:
 
 def measure_starts() -> list[bool]:
     """Print the medians of some starts beside their bounds."""
-    free, plan = float("inf"), (executable("ddqn-planner"), "plan", "dilemma")
+    imported = partial(run_command, sys.executable, "-c", "import ddqn_planner")
+    planned = partial(run_command, executable("ddqn-planner"), "plan", "dilemma")
     starts: dict[str, tuple[Callable[[], Usage], Usage]] = {
-        "a bare rclpy node, discovered": (start_bare_node, (free, free, free)),
-        "map_server_node to its first map": (start_map_server, (0.8, free, 90)),
+        "a bare rclpy node, discovered": (start_bare_node, (FREE, FREE, FREE)),
+        "map_server_node to its first map": (start_map_server, (0.8, FREE, 90)),
         "planner_node to its first plan": (start_planner, (1.5, 0.9, 210)),
-        "import ddqn_planner": (
-            partial(run_command, sys.executable, "-c", "import ddqn_planner"),
-            (free, 0.3, free),
-        ),
-        "ddqn-planner plan dilemma": (partial(run_command, *plan), (1.2, free, free)),
+        "import ddqn_planner": (imported, (FREE, 0.3, FREE)),
+        "ddqn-planner plan dilemma": (planned, (1.2, FREE, FREE)),
     }
     missed = []
     for name, (start, bounds) in starts.items():
@@ -163,17 +140,11 @@ def measure_starts() -> list[bool]:
     return missed
 
 
-# Answers
-
-
 def timed(service: Any, request: Any) -> tuple[float, Any]:
     """Call a service; return how long its answer took, milliseconds, and the answer."""
-    answered = threading.Event()
     began = time.perf_counter()
-    future = service.call_async(request)
-    future.add_done_callback(lambda _: answered.set())
-    assert answered.wait(TIMEOUT), f"no answer from {service.srv_name}"
-    return 1e3 * (time.perf_counter() - began), future.result()
+    answer = ask(service, request)
+    return 1e3 * (time.perf_counter() - began), answer
 
 
 def first_answer(client: Client, request: GetPlan.Request) -> tuple[float, int]:
@@ -203,10 +174,8 @@ def measure_requests(client: Client, map_file: Path) -> list[bool]:
             with running(*BARE, str(poses)):
                 bare = client.service(GetPlan, "bare/get_plan")
                 timed(bare, request)
-                times = [
-                    (timed(planner, request)[0], timed(bare, request)[0]) for _ in range(CALLS)
-                ]
-            ours, theirs = (statistics.median(column) for column in zip(*times, strict=True))
+                both = [[timed(s, request)[0] for s in (planner, bare)] for _ in range(CALLS)]
+            ours, theirs = (statistics.median(column) for column in zip(*both, strict=True))
             ratios.append(ours / theirs)
             print(
                 f"GetPlan of {poses} poses: first {took:.1f} ms, then {ours:.2f} ms; bare "
@@ -259,15 +228,14 @@ def measure_large_map(client: Client) -> list[bool]:
 def measure_new_maps(client: Client) -> list[bool]:
     """Measure how soon a new large map brings a path to the active goal."""
     plans, times = client.subscribe(PathMessage, "plan", LATCHED), []
-    small = message_of(GridMap(np.zeros((5, 5), dtype=np.bool_)))
-    first, *_ = office(LARGE)
+    small, first = message_of(GridMap(np.zeros((5, 5), dtype=np.bool_))), office(LARGE)
     with running_node("planner_node"):
         for turns in range(4):
             grid = GridMap(np.rot90(first.occupancy, turns))
             client.publish("map", small, LATCHED)
             random = np.random.default_rng(turns)
-            ((start, goal),) = random_requests(grid.occupancy, RULE, 1, random)
-            publish_request(client, grid, start, goal)
+            (cells,) = random_requests(grid.occupancy, RULE, 1, random)
+            publish_request(client, grid, *cells)
             time.sleep(2)  # until the node has answered that these lie outside the small map
             message = message_of(grid)
             plans.clear()
@@ -282,7 +250,9 @@ def measure_new_maps(client: Client) -> list[bool]:
 
 def measure_changing_map(client: Client) -> list[bool]:
     """Measure the planner's share of a core while a few cells of its map change."""
-    grid, start, goal = office(CHANGING)
+    random = np.random.default_rng(0)
+    grid = GridMap(generate_map("office", (CHANGING, CHANGING), random))
+    ((start, goal),) = random_requests(grid.occupancy, RULE, 1, random)
     local, random, maps = Planner.load("any_map"), np.random.default_rng(0), [grid]
     path = local.plan(grid, start, goal, RULE).cells
     while len(maps) < 12 * RATE:
@@ -306,28 +276,27 @@ def measure_changing_map(client: Client) -> list[bool]:
 def measure_trainer(client: Client) -> list[bool]:
     """Measure the trainer node while it trains: its services, and how soon a signal ends it."""
     missed: list[bool] = []
-    slowest: dict[str, float] = {}
+    slowest = dict.fromkeys(("start", "save", "replay", "stop"), 0.0)
 
     def call(name: str, times: int = 1) -> float:
         service = client.service(Trigger, f"trainer/{name}")
         return max(timed(service, Trigger.Request())[0] for _ in range(times))
 
+    options = {"map_file": "dilemma", "steps": 1_000_000}
     for number in (signal.SIGINT, signal.SIGTERM):
         with (
             tempfile.TemporaryDirectory() as folder,
-            running_node(
-                "trainer_node", output_folder=folder, map_file="dilemma", steps=1_000_000
-            ) as trainer,
+            running_node("trainer_node", output_folder=folder, **options) as trainer,
         ):
             # A service is found before its node spins: the first answer says that it does.
             print(f"trainer: first answer of the node, while it starts: {call('stop'):.0f} ms")
             print(f"trainer: first ~/start, once torch is imported: {call('start'):.0f} ms")
             call("stop")
             time.sleep(1)  # until it has saved itself
-            slowest["start"] = max(slowest.get("start", 0.0), call("start"))
+            slowest["start"] = max(slowest["start"], call("start"))
             time.sleep(10)  # thousands of steps: a checkpoint and curves of some size
-            for name in ("start", "save", "replay", "stop"):
-                slowest[name] = max(slowest.get(name, 0.0), call(name, 50))
+            for name in slowest:
+                slowest[name] = max(slowest[name], call(name, 50))
             for _ in range(20):  # until the training that was stopped has saved itself
                 call("start")
                 time.sleep(0.1)
@@ -343,7 +312,7 @@ def measure_trainer(client: Client) -> list[bool]:
 
 
 def main(arguments: Sequence[str]) -> int:
-    """Print each figure beside its bound; return 1 if one is missed."""
+    """Print each figure beside its bound, on another ROS map (a path) too; 1 if one is missed."""
     map_file = Path(arguments[0] if arguments else find_map("office"))
     with claim_ros_domain():
         missed = measure_starts()

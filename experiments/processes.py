@@ -1,7 +1,5 @@
 """Runs nodes as processes of their own, for scripts and tests."""
 
-from __future__ import annotations
-
 import os
 import signal
 import socket
@@ -13,16 +11,11 @@ from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 from typing import NoReturn
 
-STOP_TIMEOUT = 120.0
-"""Seconds that a process may take to end on a loaded machine."""
+STOP_TIMEOUT = 120.0  # seconds that a process may take to end on a loaded machine
 
 
 def claim_ros_domain() -> socket.socket:
-    """Set the environment to a ROS domain that nobody else here uses, kept to this machine.
-
-    Call it before rclpy is initialised. The socket that is returned holds the claim until it is
-    closed; no two processes can hold the same.
-    """
+    """Set a ROS domain of this machine alone, before rclpy is initialised; the socket holds it."""
     for domain in range(1, 101):
         claim = socket.socket()
         try:
@@ -50,15 +43,13 @@ def executable(name: str) -> str:
 def _signals_held_back() -> Iterator[None]:
     """Let SIGINT and SIGTERM come only after the block."""
     held: list[int] = []
+    numbers = signal.SIGINT, signal.SIGTERM
     # Handlers, not a mask: a child would inherit the mask.
-    handlers = {
-        number: signal.signal(number, lambda number, _: held.append(number))
-        for number in (signal.SIGINT, signal.SIGTERM)
-    }
+    handlers = [signal.signal(number, lambda number, _: held.append(number)) for number in numbers]
     try:
         yield
     finally:
-        for number, handler in handlers.items():
+        for number, handler in zip(numbers, handlers, strict=True):
             signal.signal(number, handler)
         if held:
             signal.raise_signal(held[0])
@@ -71,23 +62,18 @@ def running(*command: str) -> Iterator[subprocess.Popen[bytes]]:
     try:
         # A signal inside Popen would lose the child that it has just begun.
         with _signals_held_back():
-            # A session of its own: Ctrl-C in the terminal reaches the parent alone, which then
-            # tidies up.
+            # In a session of its own, it does not hear Ctrl-C: the parent does, and tidies up.
             child = subprocess.Popen(command, start_new_session=True)
         yield child
     finally:
         if child is not None:
-            _stop(child)
-
-
-def _stop(child: subprocess.Popen[bytes]) -> None:
-    child.send_signal(signal.SIGINT)
-    try:
-        child.wait(timeout=STOP_TIMEOUT)
-    except BaseException:
-        child.kill()
-        child.wait()
-        raise
+            child.send_signal(signal.SIGINT)
+            try:
+                child.wait(timeout=STOP_TIMEOUT)
+            except BaseException:
+                child.kill()
+                child.wait()
+                raise
 
 
 def running_node(

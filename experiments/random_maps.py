@@ -1,10 +1,6 @@
-"""Random maps of nine kinds and any size, and costs of their cells.
+"""Random maps of nine kinds and any size, and costs of their cells; a seed fixes them for ever."""
 
-The documented figures depend on these maps: the same seed must always give the same ones.
-"""
-
-from __future__ import annotations
-
+import itertools
 from collections.abc import Callable
 from functools import partial
 from typing import Any, Final
@@ -15,14 +11,11 @@ from numpy.typing import NDArray
 from ddqn_planner.grid.arguments import Occupancy
 from ddqn_planner.grid.body import clearance
 
-MINIMUM_SIDE = 5
-"""The shortest side of a map: a maze of two corridors between its walls."""
+MINIMUM_SIDE = 5  # of a map: a maze of two corridors between its walls
+SHORTEST_STEP = 3  # cells from one wall of a room to the next: it is at least two cells wide
+EXTRA_LINKS = 0.15  # of the links outside the spanning tree are opened too
 
-SHORTEST_STEP = 3
-"""Cells from one wall of a room to the next: a room is at least two cells wide."""
-
-EXTRA_LINKS = 0.15
-"""Share of the links outside the spanning tree that are opened too."""
+Spans = list[tuple[int, int]]  # the first cell of each corridor and the cell after its last
 
 
 def _independent(share: float, shape: tuple[int, int], random: np.random.Generator) -> Occupancy:
@@ -70,8 +63,8 @@ def _corridors(shape: tuple[int, int], random: np.random.Generator) -> Occupancy
     row, column, next_row, next_column = _links(rows, columns, EXTRA_LINKS, random)
     widths = random.integers(1, 4, len(row))
     turns = random.random(len(row)) < 0.5
-    first, second = (row, column), (next_row, next_column)
-    links = np.stack([y[first], x[first], y[second], x[second], widths, turns], axis=1)
+    ends = (y[row, column], x[row, column], y[next_row, next_column], x[next_row, next_column])
+    links = np.stack([*ends, widths, turns], axis=1)
     occupancy = np.ones(shape, dtype=np.bool_)
     for y0, x0, y1, x1, width, turn in links.tolist():
         corner_y, corner_x = (y0, x1) if turn else (y1, x0)
@@ -132,10 +125,9 @@ def _office(shape: tuple[int, int], random: np.random.Generator) -> Occupancy:
 def _links(
     rows: int, columns: int, extra: float, random: np.random.Generator
 ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
-    """Link the nodes of a lattice by a random spanning tree and a share of all other links.
+    """Link a lattice by a random tree and a share of the other links.
 
-    Returns the row and column of one end of each link, then those of the other end, which lies
-    below it or to its right.
+    Returns row and column of one end of each link, and of the other end, below it or to its right.
     """
     from scipy.sparse import coo_matrix
     from scipy.sparse.csgraph import minimum_spanning_tree
@@ -172,10 +164,7 @@ def _open_doors(
 
 
 def _stamp(occupancy: Occupancy, pattern: Occupancy, random: np.random.Generator) -> None:
-    """Occupy the cells of a pattern at a random place, if all cells in and around it are free.
-
-    The ring of free cells around the pattern keeps connected what was connected before.
-    """
+    """Occupy a pattern at a random place, if all cells in and around it are free."""
     height, width = pattern.shape
     top = int(random.integers(1, occupancy.shape[0] - height))
     left = int(random.integers(1, occupancy.shape[1] - width))
@@ -183,8 +172,8 @@ def _stamp(occupancy: Occupancy, pattern: Occupancy, random: np.random.Generator
         occupancy[top : top + height, left : left + width] = pattern
 
 
-def _corridor_spans(side: int, count: int, random: np.random.Generator) -> list[tuple[int, int]]:
-    """Return the first cell of each corridor and the cell after its last."""
+def _corridor_spans(side: int, count: int, random: np.random.Generator) -> Spans:
+    """Draw corridors along a side."""
     spans = []
     for index in range(count):
         width = int(random.integers(2, min(4, side - 2) + 1))
@@ -194,13 +183,15 @@ def _corridor_spans(side: int, count: int, random: np.random.Generator) -> list[
     return spans
 
 
-def _between(spans: list[tuple[int, int]], side: int) -> list[tuple[int, int]]:
+def _between(spans: Spans, side: int) -> Spans:
     """Return the first and last cell of each part of a side that lies between corridors."""
-    firsts = [0, *(end for _, end in spans)]
-    lasts = [*(first - 1 for first, _ in spans), side - 1]
-    return list(zip(firsts, lasts, strict=True))
+    return [
+        (end, first - 1)
+        for (_, end), (first, _) in itertools.pairwise([(0, 0), *spans, (side, side)])
+    ]
 
 
+# The function that makes each kind of map. All free cells are connected, except in random_*.
 KINDS: Final[dict[str, Callable[[tuple[int, int], np.random.Generator], Occupancy]]] = {
     "random_10": partial(_independent, 0.1),
     "random_20": partial(_independent, 0.2),
@@ -212,14 +203,10 @@ KINDS: Final[dict[str, Callable[[tuple[int, int], np.random.Generator], Occupanc
     "dead_ends": _dead_ends,
     "office": _office,
 }
-"""The function that makes each kind of map. All free cells are connected, except in random_*."""
 
 
 def generate_map(kind: str, shape: tuple[int, int], random: np.random.Generator) -> Occupancy:
-    """Make a random map, of a kind in `KINDS`, in which a path joins at least two free cells.
-
-    Its shape is (H, W) in cells, each at least `MINIMUM_SIDE`.
-    """
+    """Make a random map of a kind in `KINDS` in which a path joins at least two free cells."""
     if kind not in KINDS:
         raise ValueError(f"the kind {kind!r} is unknown; give one of {', '.join(KINDS)}")
     if min(shape) < MINIMUM_SIDE:
@@ -238,10 +225,7 @@ def gradient_costs(occupancy: Occupancy, random: np.random.Generator) -> NDArray
 
 
 def inflated_costs(occupancy: Occupancy, radius: float) -> NDArray[np.int8]:
-    """Return (H, W) costs that fall exponentially with the distance from obstacles, as in costmaps.
-
-    They are ``99 ** (1 - (d - 1) / radius)`` at a distance of d cells, and 0 beyond `radius` cells.
-    """
+    """Return (H, W) costs that fall exponentially around obstacles: 0 beyond `radius` cells."""
     distance = np.maximum(clearance(occupancy), 1)  # occupied cells do not matter
     costs = np.where(distance <= radius, np.rint(99 ** (1 - (distance - 1) / radius)), 0)
     return costs.astype(np.int8) * ~occupancy

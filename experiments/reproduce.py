@@ -1,7 +1,5 @@
 """Train and measure the paper's experiments with many seeds. Run the same command to resume."""
 
-from __future__ import annotations
-
 import argparse
 import os
 import signal

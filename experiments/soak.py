@@ -1,15 +1,4 @@
-"""Keeps the nodes at mixed work for minutes, bad input included, and watches their memory.
-
-After the first fifth of the time, in which caches fill, the memory has to stay flat: the median of
-the last tenth of what is left may lie no more than 5 % above that of its first tenth.
-
-Beside them a planner with a costmap and a trainer that records drives work for a simulated robot,
-in simulated time. Its clock jumps, its costmap and poses stop, it is set elsewhere. After each such
-event the planner must plan from where the robot is now, and the trainer must record on. While the
-costmap or the poses are silent, there must be no plan.
-"""
-
-from __future__ import annotations
+"""Keeps the nodes at mixed work for minutes, bad input included, and watches their memory."""
 
 import importlib.util
 import itertools
@@ -21,7 +10,7 @@ import threading
 import time
 from collections import Counter
 from collections.abc import Sequence
-from contextlib import ExitStack, closing, suppress
+from contextlib import ExitStack
 from pathlib import Path
 from subprocess import Popen
 from typing import Any
@@ -50,48 +39,32 @@ from std_msgs.msg import Header
 from std_srvs.srv import Trigger
 from tables import table
 
-from ddqn_planner.grid import Cell, MapFile, MoveRule, save_map
+from ddqn_planner import MoveRule, Planner
+from ddqn_planner.grid import Cell, MapFile, save_map
 from ddqn_planner.grid.noise import random_requests
 from ddqn_planner.nodes.runtime import LATCHED
-from ddqn_planner.planning import Planner
 
 MINUTES, MAX_GROWTH = 30.0, 0.05
+# Seconds between two samples of the memory, events of the robot, and pieces of work.
 PERIOD, EVENT_PERIOD, PAUSE = 5.0, 10.0, 0.02
-"""Seconds between two samples of the memory, events of the robot, and pieces of work."""
-
-STEADY_FIELDS = 8
-"""Fields that are computed before each sample."""
-
-SHARES = {
-    **dict.fromkeys(("map", "noise", "model", "parameters", "bad input"), 1),
-    **{"start": 3, "goal": 5, "plan": 8},
-}
-"""How often each kind of work is drawn."""
+STEADY_FIELDS = 8  # that are computed before each sample
+# How often each kind of work is drawn.
+SHARES = {"map": 1, "noise": 1, "model": 1, "parameters": 1, "bad input": 1}
+SHARES |= {"start": 3, "goal": 5, "plan": 8}
 
 NAMESPACE = "/robot"
-SOURCE = "tf" if importlib.util.find_spec("tf2_ros") else "odometry"
-"""Where the robot's planner and trainer get its poses."""
-
+SOURCE = "tf" if importlib.util.find_spec("tf2_ros") else "odometry"  # of the robot's poses
+# Seconds of the clock per step; simulated seconds per second; steps from costmap to costmap;
+# metres per simulated second.
 STEP, SPEED_UP, COSTMAP_PERIOD, SPEED = 0.05, 4.0, 5, 1.0
-"""Seconds of the clock per step; simulated seconds per second; steps from costmap to costmap;
-metres per simulated second."""
-
+# The planner's transform_tolerance and map_timeout, seconds; silent odometry has 2 seconds.
 TOLERANCE, MAP_TIMEOUT = 1.0, 1.0
-"""The planner's transform_tolerance and map_timeout, seconds; silent odometry has 2 seconds."""
-
+# Seconds after an event until the nodes must know of it, on a loaded machine; of silence; and
+# until all must be well again.
 GRACE, SILENCE, RECOVERY = 1.5, 5.0, 60.0
-"""Seconds after an event until the nodes must know of it, on a loaded machine; of silence; and
-until all must be well again."""
-
 JUMP_IN_SILENCE = "clock back, then no poses"
-EVENTS = (
-    "clock back",
-    "clock forward",
-    "set elsewhere",
-    "poses stop",
-    "costmap stops",
-    JUMP_IN_SILENCE,
-)
+SILENCES = ("poses stop", "costmap stops", JUMP_IN_SILENCE)
+EVENTS = ("clock back", "clock forward", "set elsewhere", *SILENCES)
 
 
 class Work:
@@ -119,10 +92,10 @@ class Work:
         """Do one piece of work; count it as lost if it has no answer."""
         (kind,) = self._draw.choices([*SHARES], [*SHARES.values()])
         self.done[kind] += 1
-        self.lost += 1
-        with suppress(TimeoutError):
+        try:
             self._do(kind)
-            self.lost -= 1
+        except TimeoutError:
+            self.lost += 1
 
     def _do(self, kind: str) -> None:
         client, draw = self._client, self._draw
@@ -157,18 +130,17 @@ class Work:
 
     def bad_input(self) -> None:
         """Give each input once as it must not be."""
-        bad = self._pose()
+        client, bad = self._client, self._pose()
         bad.pose.position.x = math.nan
         message = self._maps[0].message(1)
         message.info.width += 1
-        self._client.publish("map", message, LATCHED)
-        self._client.publish("initialpose", initial_pose(bad))
-        self._client.publish("goal_pose", bad)
-        self._client.get_plan(bad, bad)
+        client.publish("map", message, LATCHED)
+        client.publish("initialpose", initial_pose(bad))
+        client.publish("goal_pose", bad)
+        client.get_plan(bad, bad)
         self._load(self._bad_map)
-        self._client.set_parameters(
-            "planner", move_rule="flying", occupied_threshold=0, model="no_such_model"
-        )
+        wrong = {"move_rule": "flying", "occupied_threshold": 0, "model": "no_such_model"}
+        client.set_parameters("planner", **wrong)
 
     def _load(self, path: Path) -> Any:
         request = LoadMap.Request(map_url=str(path))
@@ -179,17 +151,16 @@ class Work:
         return pose(grid, (self._draw.randrange(grid.width), self._draw.randrange(grid.height)))
 
 
-class SimulatedRobot:
+class SimulatedRobot(Client):
     """Drives between random cells, and publishes clock, costmap and poses from a thread."""
 
     def __init__(self) -> None:
-        self._client = Client(NAMESPACE, "simulated_robot")
-        node = self._client.node
-        self._clock = node.create_publisher(Clock, "/clock", 10)
-        self._costmap = node.create_publisher(OccupancyGrid, "map", LATCHED)
-        self._goals = node.create_publisher(PoseStamped, "goal_pose", 10)
-        self._poses = RobotPoses(node)
-        self._diagnostics = self._client.subscribe(DiagnosticArray, "/diagnostics", keep=100)
+        super().__init__(NAMESPACE, "simulated_robot")
+        self._clock = self.node.create_publisher(Clock, "/clock", 10)
+        self._costmap = self.node.create_publisher(OccupancyGrid, "map", LATCHED)
+        self._goals = self.node.create_publisher(PoseStamped, "goal_pose", 10)
+        self._poses = RobotPoses(self.node)
+        self._diagnostics = self.subscribe(DiagnosticArray, "/diagnostics", keep=100)
         self._map = three_maps()[0]
         self._grid = self._map.grid
         self._planner = Planner.load("any_map")
@@ -205,14 +176,10 @@ class SimulatedRobot:
         self.stale = self.lost = 0
         self.done: Counter[str] = Counter()
         self._is_over = threading.Event()
-        self._thread = threading.Thread(target=self._run, daemon=True)
-        self._thread.start()
-
-    def close(self) -> None:
-        """Stop."""
-        self._is_over.set()
-        self._thread.join()
-        self._client.close()
+        thread = threading.Thread(target=self._run, daemon=True)
+        thread.start()
+        self.callback(thread.join)
+        self.callback(self._is_over.set)
 
     def _run(self) -> None:
         due = time.monotonic()
@@ -256,8 +223,7 @@ class SimulatedRobot:
         self.done[kind] += 1
         with self._lock:
             self._set_elsewhere()
-            if kind in ("poses stop", "costmap stops", JUMP_IN_SILENCE):
-                self._silent = kind
+            self._silent = kind if kind in SILENCES else ""
             if kind in ("clock back", JUMP_IN_SILENCE):
                 self._now = max(1.0, self._now - self._draw.uniform(1, 600))
             elif kind == "clock forward":
@@ -274,7 +240,7 @@ class SimulatedRobot:
         self._recover(kind, happened)
 
     def _recover(self, kind: str, happened: float) -> None:
-        """Wait for a plan from where the robot is, and for drives that began after the event."""
+        """Wait for a plan from where the robot is, and for two drives that began after that."""
         planned, drives = False, -1
         while (began := time.monotonic()) < happened + RECOVERY:
             cell = self._start_of_plan()
@@ -299,7 +265,7 @@ class SimulatedRobot:
     def _start_of_plan(self) -> Cell | None:
         """Return the start of a plan from where the planner thinks that the robot is."""
         goal = pose(self._grid, self._draw.choice(self._cells))
-        poses = self._client.get_plan(PoseStamped(), goal).poses
+        poses = self.get_plan(PoseStamped(), goal).poses
         return cell_of(self._grid, poses[0]) if poses else None
 
     def _drives(self) -> int:
@@ -335,7 +301,7 @@ def soak(
 
 
 def growth(samples: Sequence[float]) -> tuple[float, float, float]:
-    """Return the memory after the warm-up, that at the end, and its growth as a share."""
+    """Return the memory after the first fifth, that at the end, and its growth as a share."""
     steady = samples[len(samples) // 5 :]
     tenth = max(1, len(steady) // 10)
     first, last = statistics.median(steady[:tenth]), statistics.median(steady[-tenth:])
@@ -345,49 +311,41 @@ def growth(samples: Sequence[float]) -> tuple[float, float, float]:
 def main(arguments: Sequence[str]) -> int:
     """Run the nodes at work; return 1 if one grows, loses a call, or answers what is stale."""
     minutes = float(arguments[0]) if arguments else MINUTES
-    quiet, apart = (
-        ("--log-level", "fatal"),
-        ("-r", f"__ns:={NAMESPACE}", "-p", "use_sim_time:=true"),
-    )
+    quiet = ("--log-level", "fatal")
+    apart = (*quiet, "-r", f"__ns:={NAMESPACE}", "-p", "use_sim_time:=true")
+    of_planner = {"start_source": SOURCE, "transform_tolerance": TOLERANCE, "follow_trainer": True}
+    of_planner |= {"map_type": "costmap", "map_timeout": MAP_TIMEOUT}
+    of_trainer = {"learn_from": "driving", "pose_source": SOURCE}
     with (
         claim_ros_domain(),
         tempfile.TemporaryDirectory() as folder,
         ExitStack() as stack,
         Client() as client,
     ):
-        of_planner = {
-            "start_source": SOURCE,
-            "transform_tolerance": TOLERANCE,
-            "map_type": "costmap",
-            "map_timeout": MAP_TIMEOUT,
-            "follow_trainer": True,
-        }
-        of_trainer = {
-            "learn_from": "driving",
-            "pose_source": SOURCE,
-            "output_folder": f"{folder}/drives",
-        }
+        drives = f"{folder}/drives"
         nodes = {
             "map_server_node": running_node("map_server_node", *quiet),
             "planner_node": running_node("planner_node", *quiet),
-            "robot's planner": running_node("planner_node", *quiet, *apart, **of_planner),
-            "robot's trainer": running_node("trainer_node", *quiet, *apart, **of_trainer),
+            "robot's planner": running_node("planner_node", *apart, **of_planner),
+            "robot's trainer": running_node(
+                "trainer_node", *apart, **of_trainer, output_folder=drives
+            ),
         }
         children = {name: stack.enter_context(node) for name, node in nodes.items()}
-        robot = stack.enter_context(closing(SimulatedRobot()))
+        robot = stack.enter_context(SimulatedRobot())
         work = Work(client, Path(folder))
         samples = soak(children, work, minutes, robot)
     for what in (work, robot):
         done = ", ".join(f"{name} {count}" for name, count in sorted(what.done.items()))
         print(f"{minutes:g} minutes: {done}; {what.lost} lost")
     print(f"{robot.stale} stale answers; the robot's poses came by {SOURCE}")
-    rows = [
-        [name, len(sampled), f"{sampled[0]:.1f}", f"{warm:.1f}", f"{last:.1f}", f"{grown:+.1%}"]
-        for name, sampled in samples.items()
-        for warm, last, grown in [growth(sampled)]
-    ]
+    rows, grows = [], False
+    for name, sampled in samples.items():
+        warm, last, share = growth(sampled)
+        megabytes = (f"{mb:.1f}" for mb in (sampled[0], warm, last))
+        rows.append([name, len(sampled), *megabytes, f"{share:+.1%}"])
+        grows |= share > MAX_GROWTH
     print(table("node | samples | MB at start | warm | at end | growth", rows))
-    grows = any(growth(sampled)[2] > MAX_GROWTH for sampled in samples.values())
     return int(bool(work.lost or robot.lost or robot.stale or grows))
 
 

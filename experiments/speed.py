@@ -1,12 +1,4 @@
-"""Measures planning and training beside their peers: `make bench`. Needs the extra `bench`.
-
-Compared calls take turns in one run, and ratios are of their medians. Times are CPU times of this
-process, which vary less on a loaded machine; each call uses one thread. Each call plans with a
-planner that knows no map, on a `GridMap` that was made before the clock began. With `--pictures`
-it draws the cells that a request visits and the times of requests into docs/images/.
-"""
-
-from __future__ import annotations
+"""Measures planning and training beside their peers (`make bench`), in CPU time on one thread."""
 
 import gc
 import math
@@ -45,18 +37,12 @@ RULE = MoveRule.ROBOT_SAFE
 MAP_KINDS = ("random_20", "rooms", "office", "maze")
 REQUESTS, ROUNDS, FIELDS, CHANGES = 15, 3, 100, 100
 STEPS, TRAINING_ROUNDS = 3_000, 5
-FLIPPED = 10
-"""Cells that a change near a place flips, of the 25 around it."""
-WALL = 41
-"""Cells of a wall that opens or closes."""
-SHORTEST = 40
-"""Moves of the shortest path for replans: robot and goal are far from each other."""
-
+FLIPPED = 10  # cells that a change near a place flips, of the 25 around it
+WALL = 41  # cells of a wall that opens or closes
+SHORTEST = 40  # moves of the shortest path for replans: robot and goal are far from each other
 IMAGES = Path(__file__).resolve().parents[1] / "docs" / "images"
 
-Call = Callable[[], Any]
-"""What is timed. A `Callable[[], Call]` makes all that it needs."""
-
+Call = Callable[[], Any]  # what is timed; a `Callable[[], Call]` makes all that it needs
 LOADED = Planner.load("any_map")
 
 
@@ -185,14 +171,12 @@ def plan_after(change: Change, start: Cell, goal: Cell, knows_before: bool) -> C
     return partial(planner.plan, grid.with_patch(*change[1:]), start, goal, RULE)
 
 
-def draw_changes(
-    map_kind: str, side: int, change_kind: str, count: int
-) -> list[tuple[Change, Cell, Cell]]:
+def draw_changes(map_kind: str, side: int, change_kind: str) -> list[tuple[Change, Cell, Cell]]:
     """Draw changes that leave start and goal free, each with its start and goal."""
     drawn: list[tuple[Change, Cell, Cell]] = []
     random = np.random.default_rng(0)
     occupancy = generate_map(map_kind, (side, side), random)
-    while len(drawn) < count:
+    while len(drawn) < CHANGES // len(MAP_KINDS):
         ((start, goal),) = random_requests(occupancy, RULE, 1, random)
         path = new_planner().plan(GridMap(occupancy), start, goal, RULE).cells
         if len(path) <= SHORTEST:
@@ -210,7 +194,7 @@ def measure_replans(side: int) -> list[bool]:
     for change_kind in CHANGE_KINDS:
         ratios: list[tuple[float, str, float, float]] = []
         for map_kind in MAP_KINDS:
-            for drawn in draw_changes(map_kind, side, change_kind, CHANGES // len(MAP_KINDS)):
+            for drawn in draw_changes(map_kind, side, change_kind):
                 (ms, fresh_ms), (ours, fresh) = take_turns(
                     partial(plan_after, *drawn, True), partial(plan_after, *drawn, False)
                 )
@@ -223,7 +207,7 @@ def measure_replans(side: int) -> list[bool]:
     return missed
 
 
-def whole_field(grid: GridMap, goal: Cell, rule: MoveRule) -> QField:
+def all_values(grid: GridMap, goal: Cell, rule: MoveRule) -> QField:
     """Return a field whose value was asked for in every cell."""
     field = new_planner().q_field(grid, goal, rule)
     _ = field.value
@@ -244,7 +228,7 @@ def measure_whole_fields(side: int, costs: bool, bound: float) -> list[bool]:
         cost = random_costs(occupancy, random) if costs else None
         for _, goal in random_requests(occupancy, RULE, ROUNDS, random):
             took, (field, _) = take_turns(
-                partial(on_new_map, whole_field, occupancy, cost, goal),
+                partial(on_new_map, all_values, occupancy, cost, goal),
                 partial(on_new_map, shortest_distances, occupancy, cost, goal),
                 rounds=ROUNDS if side < 1000 else 1,
             )
@@ -257,8 +241,7 @@ def measure_whole_fields(side: int, costs: bool, bound: float) -> list[bool]:
     figure = f"{name}: field / Dijkstra, worst kind ({worst})"
     missed = [report(figure, 100 * ratios[worst], "%", bound)]
     if side > 32:
-        figure = f"{name}: bytes per cell of a field"
-        missed.append(report(figure, nbytes / side**2, "B", 10))
+        missed.append(report(f"{name}: bytes per cell of a field", nbytes / side**2, "B", 10))
     return missed
 
 
@@ -276,17 +259,19 @@ class PaperFeatures(BaseFeaturesExtractor):
 
 
 def measure_training() -> list[bool]:
-    """Compare our steps per second with those of Stable-Baselines3's DQN, an update a step.
-
-    Network, batch and replay ratio are the same. ε is at its last value for both from the start: a
-    random action costs no forward pass.
-    """
+    """Compare our steps per second with Stable-Baselines3's DQN: same network, an update a step."""
+    # ε is at its last value from the start: a random action costs no forward pass.
     p = HyperParameters(epsilon_start=HyperParameters().epsilon_end)
-    scenario = paper_scenario()
-    ours = Trainer([scenario], MoveRule.CORNER_CUTTING, p, seed=0)
+    scenario, rule = paper_scenario(), MoveRule.CORNER_CUTTING
+    ours = Trainer([scenario], rule, p, seed=0)
+    features = {
+        "features_extractor_class": PaperFeatures,
+        "features_extractor_kwargs": {"filters": p.filters},
+        "net_arch": [],
+    }
     theirs = DQN(
         "MlpPolicy",
-        GridEnvironment(scenario, MoveRule.CORNER_CUTTING, p),
+        GridEnvironment(scenario, rule, p),
         learning_rate=p.learning_rate,
         buffer_size=p.replay_capacity,
         learning_starts=p.learning_starts,
@@ -297,19 +282,12 @@ def measure_training() -> list[bool]:
         target_update_interval=p.target_interval,
         exploration_initial_eps=p.epsilon_start,
         exploration_final_eps=p.epsilon_end,
-        policy_kwargs={
-            "features_extractor_class": PaperFeatures,
-            "features_extractor_kwargs": {"filters": p.filters},
-            "net_arch": [],
-        },
+        policy_kwargs=features,
         seed=0,
         device="cpu",
     )
-    our_size, their_size = (
-        sum(weights.numel() for weights in network.parameters())
-        for network in (ours.network, theirs.q_net)
-    )
-    assert our_size == their_size
+    weights = [sum(w.numel() for w in net.parameters()) for net in (ours.network, theirs.q_net)]
+    assert weights[0] == weights[1]
     times: list[tuple[float, float]] = []
     for _ in range(1 + TRAINING_ROUNDS):
         began = time.perf_counter()
@@ -341,7 +319,7 @@ def draw_visited_cells() -> None:
     by_a_star = np.zeros_like(closed)
     by_a_star[tuple(history.T)] = True
     distances = shortest_distances(grid, goal, RULE)
-    by_dijkstra = distances <= distances[start[1], start[0]]
+    by_dijkstra = distances <= distances[start[::-1]]
     figure, axes = plt.subplots(1, 3, figsize=(10.5, 3.9), layout="constrained")
     panels = {"this planner": closed, "A* (nano-astar)": by_a_star, "Dijkstra": by_dijkstra}
     for axis, (name, visited) in zip(axes, panels.items(), strict=True):
@@ -376,7 +354,7 @@ def draw_times() -> None:
 
 
 def main(arguments: Sequence[str]) -> int:
-    """Print each figure beside its bound; return 1 if one is missed."""
+    """Print each figure beside its bound, or draw (--pictures); return 1 if a bound is missed."""
     torch.set_num_threads(1)
     gc.freeze()  # else this process pauses to look for garbage among what it has imported
     if "--pictures" in arguments:

@@ -1,7 +1,5 @@
 """Tables, statistics over seeds, and where they go: a report, and the pages of the docs."""
 
-from __future__ import annotations
-
 import re
 import shutil
 from collections.abc import Mapping, Sequence

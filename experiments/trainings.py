@@ -1,7 +1,5 @@
 """The paper's trainings: two profiles, regular evaluations, many in parallel, a folder for each."""
 
-from __future__ import annotations
-
 import argparse
 import time
 from collections.abc import Callable, Mapping, Sequence

@@ -152,8 +152,8 @@ def test_plan_heeds_the_robots_body(capsys: pytest.CaptureFixture[str], tmp_path
         (["--robot-radius", "-1"], "robot_radius is -1.0"),
         (["--clearance-weight", "2"], "clearance_weight is 2.0"),
         (["--tolerance", "nan"], "--tolerance is nan; give metres"),
-        (["--tolerance", "-1"], "--tolerance is -1; give metres"),
-        (["--start-clearing-radius", "-1"], "--start-clearing-radius is -1; give metres"),
+        (["--tolerance", "-1"], "--tolerance is -1.0; give metres"),
+        (["--start-clearing-radius", "-1"], "--start-clearing-radius is -1.0; give metres"),
     ):
         assert main(["plan", path, *bad]) == 2
         assert named in capsys.readouterr().err

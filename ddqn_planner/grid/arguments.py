@@ -15,23 +15,12 @@ from numpy.typing import ArrayLike, NDArray
 Cell: TypeAlias = tuple[int, int]
 """(x, y): x is the column, y is the row of ``occupancy[y, x]``."""
 
-Cells: TypeAlias = Sequence[Cell] | NDArray[np.integer[Any]]
-"""The cells of a path: pairs, or an array (N, 2)."""
+Cells: TypeAlias = Sequence[Cell] | NDArray[np.integer[Any]]  # of a path: pairs, or (N, 2)
+Occupancy: TypeAlias = NDArray[np.bool_]  # (H, W): True where a cell is occupied
 
-Occupancy: TypeAlias = NDArray[np.bool_]
-"""(H, W) bool: True where a cell is occupied."""
-
-OCCUPIED = 100
-"""The value of an occupied cell in ``nav_msgs/OccupancyGrid``."""
-
-UNKNOWN = -1
-"""The value of an unknown cell in ``nav_msgs/OccupancyGrid``."""
-
-MAX_SLOWNESS = 100.0
-"""No place may be slower: the time and memory of a field grow with the costliest move."""
-
-POSITIVE = math.ulp(0.0), sys.float_info.max
-"""The range of finite numbers above 0."""
+OCCUPIED, UNKNOWN = 100, -1  # values of ``nav_msgs/OccupancyGrid``
+MAX_SLOWNESS = 100.0  # the time and memory of a field grow with the costliest move
+POSITIVE = math.ulp(0.0), sys.float_info.max  # the range of finite numbers above 0
 
 
 class Choice(str, Enum):

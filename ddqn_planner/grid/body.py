@@ -15,11 +15,8 @@ from ddqn_planner.grid.grid_map import MAX_COST_MULTIPLIER, GridMap, check_grid,
 CLEARANCE_SCALE = 1.0
 """Metres s beyond the body over which costs fall to an eighth: as 1 / (1 + distance / s)^3."""
 
-ROUNDING = 1e-6
-"""A message has the resolution as float32: 0.2 m must be 4 cells of 0.05 m, not 3.9999999."""
-
-INSCRIBED = 99
-"""The value of a cell that is free, but so near to an obstacle that the robot would touch it."""
+ROUNDING = 1e-6  # a message has float32: 0.2 m must be 4 cells of 0.05 m, not 3.9999999
+INSCRIBED = 99  # the value of a free cell that is so near to an obstacle that the robot touches it
 
 _COSTMAP_COST = 1 + (np.arange(INSCRIBED) - 1) * 251 / 97
 """The smallest cost of a costmap, 1 to 252, that its publisher writes as each value, 1 to 98."""

@@ -24,7 +24,6 @@ from ddqn_planner.grid.arguments import (
     as_number,
     cell_inside,
     cells_inside,
-    listed,
     numbers,
     real,
 )
@@ -33,8 +32,8 @@ from ddqn_planner.grid.moves import MoveRule, component_labels, flood, legal_mov
 MAX_COST_MULTIPLIER = 5.0
 """That of a cell of value 100 or unknown; as in Nav2's NavFn planner: 50 if free, at most 253."""
 
+# (101,): the multiplier of each cost, 0 to 100
 _MULTIPLIERS = np.linspace(1, MAX_COST_MULTIPLIER, OCCUPIED + 1, dtype=np.float32)
-"""(101,) float32: the multiplier of each cost, 0 to 100."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,7 +81,10 @@ class GridMap:
     def __post_init__(self) -> None:
         occupancy = as_mask("occupancy", self.occupancy)
         metres = as_number("resolution", self.resolution, *POSITIVE, "metres per cell, > 0")
-        self._set(occupancy=occupancy, resolution=metres, origin=_origin(self.origin))
+        origin = tuple(numbers("origin", self.origin, (3,)).astype(np.float64).tolist())
+        if not all(map(math.isfinite, origin)):
+            raise ValueError(f"origin is {origin}; give three finite numbers x, y, yaw")
+        self._set(occupancy=occupancy, resolution=metres, origin=origin)
         if self.cost is not None:
             self._set(cost=_costs(self.cost, occupancy))
         if self.obstacles is not None:
@@ -175,10 +177,9 @@ class GridMap:
         left, bottom = as_cell((x, y), "the first cell of the patch")
         height, width = patch.shape
         if not (0 <= left <= self.width - width and 0 <= bottom <= self.height - height):
-            raise ValueError(
-                f"a patch of {width} x {height} cells from {(left, bottom)} is not inside the map "
-                f"of {self.width} x {self.height}; cut it to the map"
-            )
+            size = f"{self.width} x {self.height}"
+            part = f"{width} x {height} cells from {left, bottom}"
+            raise ValueError(f"a patch of {part} is not inside the map of {size}; cut it")
         box = slice(bottom, bottom + height), slice(left, left + width)
         costs = self.cost
         if costs is not None or cost is not None:
@@ -354,13 +355,6 @@ def check_grid(grid: object, name: str = "grid") -> None:
     """Raise a ValueError for anything else than a map."""
     if not isinstance(grid, GridMap):
         raise ValueError(f"{name} is {grid!r}; give a GridMap")
-
-
-def _origin(origin: Any) -> tuple[float, ...]:
-    pose = tuple(map(real, listed(origin, "origin")))
-    if len(pose) != 3 or not all(map(math.isfinite, pose)):
-        raise ValueError(f"origin is {origin!r}; give three finite numbers x, y, yaw")
-    return pose
 
 
 def _costs(cost: ArrayLike, occupancy: Occupancy) -> NDArray[np.int8]:

@@ -20,13 +20,9 @@ from ddqn_planner.files import as_path, write_atomically
 from ddqn_planner.grid.arguments import OCCUPIED, UNKNOWN, Cell, cell_inside, numbers
 from ddqn_planner.grid.grid_map import GridMap
 
-MAX_CELLS = 2**26
-"""A larger map is refused before its cells are read."""
-
+MAX_CELLS = 2**26  # a larger map is refused before its cells are read
 MAX_YAML_BYTES = 2**16
-
-YES, NO = ("1", "y", "yes", "true", "on"), ("0", "n", "no", "false", "off")
-"""Values of ``negate``: whether light pixels are occupied instead of dark ones."""
+YES, NO = ("1", "y", "yes", "true", "on"), ("0", "n", "no", "false", "off")  # for ``negate``
 
 # In other layouts Pillow drops bits, or map_server takes the fourth byte of a pixel as its opacity.
 LAYOUTS = {"1", "1;I", "L", "L;2", "L;4", "LA", "I;16B", "P", "P;1", "P;2", "P;4"}

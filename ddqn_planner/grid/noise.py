@@ -14,9 +14,7 @@ from ddqn_planner.grid.arguments import UNKNOWN, Cell, Choice, Occupancy
 from ddqn_planner.grid.grid_map import GridMap
 from ddqn_planner.grid.moves import MoveRule
 
-MAX_NEW_OBSTACLES = 5
-"""The paper adds 1 to 5 obstacles."""
-
+MAX_NEW_OBSTACLES = 5  # the paper adds 1 to 5
 MAX_TRIES = 1000
 
 
