@@ -293,30 +293,26 @@ class Directions:
         if not known:
             return grid
         of_map, directions = found = (own or known)[0]
-        if directions is not None:
-            grid = self._placed(directions, of_map.frame_id, grid, header.frame_id)
+        if directions is not None and directions.forbidden is not None:
+            try:
+                offset = offset_between(directions, grid)
+            except (OverflowError, ValueError):  # too far away to have a number of cells
+                offset = None
+            if of_map.frame_id != header.frame_id or offset is None:
+                raise ValueError(
+                    f"the directions on {self._topic} are not for this map: they have the frame "
+                    f"{of_map.frame_id!r} and {directions.resolution:.6g} m per cell, the map "
+                    f"{header.frame_id!r} and {grid.resolution:.6g} m; give both one frame, and "
+                    "cells that lie on each other"
+                )
+            forbidden, (x, y) = np.zeros(grid.occupancy.shape, dtype=np.uint8), offset
+            part = directions.forbidden[max(-y, 0) :, max(-x, 0) :]
+            target = forbidden[max(y, 0) :, max(x, 0) :]
+            height, width = (min(sides) for sides in zip(part.shape, target.shape, strict=True))
+            target[:height, :width] = part[:height, :width]
+            grid = replace(grid, forbidden=forbidden)
         self.used, self._are_paired = found, bool(own)
         return grid
-
-    def _placed(self, directions: GridMap, frame: str, grid: GridMap, map_frame: str) -> GridMap:
-        """Return a map with the directions of its cells, 0 where there are none."""
-        try:
-            offset = offset_between(directions, grid)
-        except (OverflowError, ValueError):  # too far away to have a number of cells
-            offset = None
-        if frame != map_frame or offset is None:
-            raise ValueError(
-                f"the directions on {self._topic} are not for this map: they have the frame "
-                f"{frame!r} and {directions.resolution:.6g} m per cell, the map {map_frame!r} and "
-                f"{grid.resolution:.6g} m; give both one frame, and cells that lie on each other"
-            )
-        assert directions.forbidden is not None
-        forbidden, (x, y) = np.zeros(grid.occupancy.shape, dtype=np.uint8), offset
-        part = directions.forbidden[max(-y, 0) :, max(-x, 0) :]
-        target = forbidden[max(y, 0) :, max(x, 0) :]
-        height, width = (min(sides) for sides in zip(part.shape, target.shape, strict=True))
-        target[:height, :width] = part[:height, :width]
-        return replace(grid, forbidden=forbidden)
 
 
 class ExpectedTimes:

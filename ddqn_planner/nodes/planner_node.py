@@ -23,14 +23,7 @@ from ddqn_planner.nodes.nav2 import GivenUp, serve_nav2
 from ddqn_planner.nodes.parameters import PLANNER_PARAMETERS
 from ddqn_planner.nodes.poses import Frames, StartSource, check_source
 from ddqn_planner.nodes.report import NO_REQUEST, NOT_ACTIVE, Outcome, Report, RequestError
-from ddqn_planner.nodes.requests import (
-    UNCHANGED,
-    ActiveGoal,
-    ModelSource,
-    PathUnderWay,
-    Requests,
-    load,
-)
+from ddqn_planner.nodes.requests import UNCHANGED, ActiveGoal, ModelSource, PathUnderWay, Requests
 from ddqn_planner.nodes.runtime import LATCHED, STEADY, Worker, spin_until_shutdown, unless
 
 
@@ -71,9 +64,8 @@ class PlannerNode(ManagedNode):
         self._display = FieldDisplay(self)
         self._plan_publisher = self.create_publisher(Path, "plan", LATCHED)
         # In a group of its own: triggers that come while it plans make it plan once more after.
-        self._replan = self.create_guard_condition(
-            self._plan_for_active_goal, MutuallyExclusiveCallbackGroup()
-        )
+        group = MutuallyExclusiveCallbackGroup()
+        self._replan = self.create_guard_condition(self._plan_for_active_goal, group)
         self._frames = Frames(self, lambda: float(self._settings.transform_tolerance))
         self._map = MapSource(self, self._report, self._map_worker, self._on_map)
         self._start = StartSource(
@@ -138,7 +130,7 @@ class PlannerNode(ManagedNode):
         super().check_parameters(new)
         check_source("start_source", new.get("start_source", ""), "'initialpose' or 'odometry'")
         if "model" in new and hasattr(self, "_settings"):  # a worker loads the first one
-            self._candidate = load(new["model"])
+            self._candidate = ModelSource.read(new["model"])
 
     def _apply_parameters(self, parameters: list[Parameter]) -> None:
         settings = self._settings = self.settings()
