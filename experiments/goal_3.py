@@ -117,9 +117,10 @@ def train_supervised(training: Training) -> None:
     optimiser = torch.optim.Adam(trainer.network.parameters(), SUPERVISED_LEARNING_RATE)
     steps = training.parameters.steps
     decay = torch.optim.lr_scheduler.LinearLR(optimiser, 1.0, 0.05, steps)
+    trainer.network.settle(trainer.environment)
     for _ in range(steps):
         drawn = random.integers(len(cell), size=SUPERVISED_BATCH)
-        q_BA = trainer.network(trainer.encoder.states(scenario[drawn], cell[drawn]))
+        q_BA = trainer.network(trainer.network.states(scenario[drawn], cell[drawn]))
         best_BA = torch.from_numpy(best_SCA[scenario[drawn], cell[drawn]])
         # -log of the probability that softmax(Q) gives to the best moves
         best_B = q_BA.masked_fill(~best_BA, -torch.inf).logsumexp(dim=1)

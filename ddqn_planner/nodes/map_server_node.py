@@ -35,7 +35,6 @@ RESULTS: dict[type[Exception], int] = {
 }
 
 NO_MAP = "no map is loaded; call load_map first"
-
 PARAMETERS: Final = {
     "yaml_filename": Declared(
         "dilemma.yaml", "Path or URL of a map file, or a shipped map's name", read_only=True
@@ -78,8 +77,7 @@ class MapServerNode(BaseNode):
                 bounds = f"more than {MIN_RESOLUTION}, and no more than a float32 holds"
                 wrong = f"resolution is {loaded.resolution}; a map message needs {bounds}"
                 raise MapMetadataError(f"{path}: {wrong}")
-        except Exception as error:
-            # A broken file may raise anything in a library that reads it: the node must survive.
+        except Exception as error:  # anything, of a library that reads a broken file
             kept = "the map before it stays" if self._loaded else "no map is served"
             self.get_logger().error(f"cannot load {url!r}, {kept}: {error}")
             return int(RESULTS.get(type(error), LoadMap.Response.RESULT_UNDEFINED_FAILURE))
@@ -139,10 +137,8 @@ def known_path(grid: GridMap, map_file: MapFile) -> tuple[MoveRule, list[Cell]]:
     """Return the shortest path, and the safest rule under which there is one, or a ValueError."""
     start, goal = map_file.start, map_file.goal
     if start is None or goal is None:
-        raise ValueError(
-            "the map file names no start and goal, on whose path the obstacles would lie; add "
-            f"'{PACKAGE}: {{start: [x, y], goal: [x, y]}}' in cells to its YAML"
-        )
+        remedy = f"add '{PACKAGE}: {{start: [x, y], goal: [x, y]}}' in cells to its YAML"
+        raise ValueError(f"the map file names no start and goal; {remedy}")
     for move_rule in (MoveRule.ROBOT_SAFE, MoveRule.CORNER_CUTTING):
         path = shortest_path(grid, start, goal, move_rule)
         if path:

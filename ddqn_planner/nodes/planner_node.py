@@ -151,7 +151,7 @@ class PlannerNode(ManagedNode):
     def _on_map(self, frame_changed: bool) -> None:
         if frame_changed:
             # What was refused for its frame may be right now.
-            self._start.accept()
+            self._report.accept(self._start.topic)
         self._replan.trigger()
 
     def _on_start(self) -> None:

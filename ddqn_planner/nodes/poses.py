@@ -11,13 +11,13 @@ from typing import Any
 
 from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped, Quaternion, TransformStamped
 from nav_msgs.msg import Odometry
-from rclpy.qos import QoSProfile
+from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rclpy.subscription import Subscription
 from rclpy.time import Time
 
 from ddqn_planner.nodes.conversions import check_pose, quaternion
 from ddqn_planner.nodes.report import Refusals, RequestError
-from ddqn_planner.nodes.runtime import BaseNode, best_effort
+from ddqn_planner.nodes.runtime import BaseNode
 
 # A pose that was stamped before may be transformed by a transform that is later by so much.
 PATIENCE = 1.0  # seconds within which a new listener hears the first message of `odom` or TF
@@ -35,10 +35,8 @@ def has_tf() -> bool:
 def check_source(parameter: str, value: str, others: str) -> None:
     """Raise a RuntimeError with the remedy if a parameter asks for TF without tf2_ros."""
     if value == "tf" and not has_tf():
-        raise RuntimeError(
-            f"{parameter} is 'tf', which needs tf2_ros, and that is not installed: "
-            f"apt install ros-jazzy-tf2-ros-py, or set {parameter} to {others}"
-        )
+        missing = "needs tf2_ros, and that is not installed: apt install ros-jazzy-tf2-ros-py"
+        raise RuntimeError(f"{parameter} is 'tf', which {missing}, or set {parameter} to {others}")
 
 
 class Frames:
@@ -89,13 +87,11 @@ class Frames:
     def _newest(self, target: str, source: str) -> TransformStamped:
         newest = self._lookup(target, source)
         stamp = Time.from_msg(newest.header.stamp)
-        age = (self._node.get_clock().now() - stamp).nanoseconds / 1e9
+        age, limit = (self._node.get_clock().now() - stamp).nanoseconds / 1e9, self._tolerance()
         # Static transforms have the stamp 0, and are never too old.
-        if stamp.nanoseconds and abs(age) > self._tolerance():
+        if stamp.nanoseconds and abs(age) > limit:
             when = f"{age:.3g} s old" if age > 0 else f"{-age:.3g} s in the future"
-            raise ValueError(
-                f"the newest is {when}, more than transform_tolerance, {self._tolerance():g} s"
-            )
+            raise ValueError(f"the newest is {when}, more than transform_tolerance, {limit:g} s")
         return newest
 
     def _lookup(self, target: str, source: str, stamp: Time | None = None) -> TransformStamped:
@@ -166,7 +162,9 @@ def listen(
         with refusals.taking(topic, often=is_odometry):
             take(PoseStamped(header=message.header, pose=message.pose.pose))
 
-    quality = best_effort(depth) if is_odometry else QoSProfile(depth=depth)
+    quality = QoSProfile(depth=depth)
+    if is_odometry:  # reliable publishers and others are received
+        quality.reliability = ReliabilityPolicy.BEST_EFFORT
     return node.create_subscription(kind, topic, on_message, quality)
 
 
@@ -185,7 +183,7 @@ class StartSource:
         # What to call when there is a start from which to plan at once.
         self._map_frame, self._on_start = map_frame, on_start
         self._pose: PoseStamped | None = None
-        self.source = self._topic = ""
+        self.source = self.topic = ""
         self.listen()
 
     def listen(self) -> None:
@@ -194,27 +192,23 @@ class StartSource:
         if source == self.source:
             return
         self.close()
-        self.source, self._topic = source, "odom" if source == "odometry" else source
+        self.source, self.topic = source, "odom" if source == "odometry" else source
         self._forget()
         if source == "tf":
             self._frames.listen()
             return
-        self._subscription = listen(self._node, self._topic, 10, self._refusals, self._take)
+        self._subscription = listen(self._node, self.topic, 10, self._refusals, self._take)
         if source == "odometry":
             self._node.after_jump_back.add(self._forget)
 
     def close(self) -> None:
         """Stop listening; what was refused no longer counts."""
-        self.accept()
+        self._refusals.accept(self.topic)
         if self.source == "tf":
             self._frames.close()
         elif self.source:
             self._node.after_jump_back.discard(self._forget)
             self._node.destroy_subscription(self._subscription)
-
-    def accept(self) -> None:
-        """Forget what was refused: it may be right now."""
-        self._refusals.accept(self._topic)
 
     def _forget(self) -> None:
         self._pose, self._began = None, time.monotonic()

@@ -37,7 +37,7 @@ from rclpy.executors import SingleThreadedExecutor
 from rclpy.logging import get_logger
 from rclpy.node import Node
 from rclpy.parameter import Parameter
-from rclpy.qos import DurabilityPolicy, QoSPolicyKind, QoSProfile, ReliabilityPolicy
+from rclpy.qos import DurabilityPolicy, QoSPolicyKind, QoSProfile
 from rclpy.qos_overriding_options import QoSOverridingOptions
 from rclpy.service import Service
 from rclpy.signals import SignalHandlerOptions
@@ -58,11 +58,6 @@ SERVICE_QUALITY = QoSProfile(depth=5000)
 OVERRIDABLE = [QoSPolicyKind[name] for name in ("HISTORY", "DEPTH", "DURABILITY", "RELIABILITY")]
 # What of a publisher's quality is less than what a subscription may ask for.
 MISFITS = ("durability", "volatile", "transient_local"), ("reliability", "best_effort", "reliable")
-
-
-def best_effort(depth: int) -> QoSProfile:
-    """Return the quality for sensors: reliable publishers and others are received."""
-    return QoSProfile(depth=depth, reliability=ReliabilityPolicy.BEST_EFFORT)
 
 
 class Declared(NamedTuple):
@@ -342,20 +337,17 @@ qos_overrides.TOPIC.subscription.POLICY, where POLICY is history, depth, durabil
 """
 
 
-def _print_help(summary: str, parameters: Parameters) -> None:
-    print(HELP.format(program=Path(sys.argv[0]).name, summary=summary))
-    for name, declared in parameters.items():
-        default = declared.default
-        kind = Parameter.Type.from_parameter_value(default).name.lower()
-        value = repr(default) if isinstance(default, str) else json.dumps(default)
-        words = f"{kind}, default {value}", declared.limits, "read-only" * declared.read_only
-        print(f"  {name}: {'; '.join(filter(None, words))}\n      {declared.description}")
-
-
 def spin_until_shutdown(make_node: Callable[[], Node], parameters: Parameters | None = None) -> int:
     """Run one node until SIGINT or SIGTERM, or print help; return 1 if it cannot start."""
     if parameters and {"-h", "--help"} & {*sys.argv[1:]}:
-        _print_help((make_node.__doc__ or "").partition("\n")[0].replace("``", ""), parameters)
+        summary = (make_node.__doc__ or "").replace("``", "")
+        print(HELP.format(program=Path(sys.argv[0]).name, summary=summary))
+        for name, (default, description, _, read_only) in parameters.items():
+            kind = Parameter.Type.from_parameter_value(default).name.lower()
+            value = repr(default) if isinstance(default, str) else json.dumps(default)
+            limits = parameters[name].limits
+            words = filter(None, (f"{kind}, default {value}", limits, "read-only" * read_only))
+            print(f"  {name}: {'; '.join(words)}\n      {description}")
         return 0
     stopping = threading.Event()
     try:

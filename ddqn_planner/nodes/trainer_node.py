@@ -17,8 +17,7 @@ from std_msgs.msg import Float32, Header, String
 
 from ddqn_planner.grid import Cell, MoveRule, read_map_file
 from ddqn_planner.nodes.conversions import cell_from_pose, check_pose, path_message, serialized_path
-from ddqn_planner.nodes.driving import Driving
-from ddqn_planner.nodes.learning import NO_MAP, LearningNode, MapInFrame, explained
+from ddqn_planner.nodes.driving import NO_MAP, Driving, LearningNode, MapInFrame, explained
 from ddqn_planner.nodes.parameters import HYPER_PARAMETERS, OF_MAPS, TRAINER_PARAMETERS
 from ddqn_planner.nodes.poses import check_source
 from ddqn_planner.nodes.runtime import LATCHED, STEADY, Worker, spin_until_shutdown
@@ -67,8 +66,8 @@ class TrainerNode(LearningNode):
         self._hyper_parameters(new)
 
     def _hyper_parameters(self, new: dict[str, Any]) -> HyperParameters:
-        values = {**vars(self.settings()), **new}
-        return HyperParameters(**{name: values[name] for name in HYPER_PARAMETERS})
+        values = {name: new.get(name, self.value(name)) for name in HYPER_PARAMETERS}
+        return HyperParameters(**values)
 
     def _read_map_file(self) -> None:
         name = self.value("map_file")
@@ -88,9 +87,8 @@ class TrainerNode(LearningNode):
     # Start and goal
 
     def _on_pose(self, which: str, message: PoseStamped | PoseWithCovarianceStamped) -> None:
-        stamped = PoseStamped(
-            header=message.header, pose=getattr(message.pose, "pose", message.pose)
-        )
+        pose = getattr(message.pose, "pose", message.pose)
+        stamped = PoseStamped(header=message.header, pose=pose)
         with self.refusals.taking(which):
             # A pose may come before the map: ~/start then checks its cell.
             check_pose(f"the {which}", stamped)

@@ -20,7 +20,7 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import Point, Pose, PoseStamped
 from integration.robot import changed
 from nav_msgs.msg import OccupancyGrid, Odometry, Path
-from rclpy.qos import QoSProfile
+from rclpy.qos import QoSProfile, ReliabilityPolicy
 from std_msgs.msg import Header, String
 from std_srvs.srv import Trigger
 
@@ -28,7 +28,7 @@ from ddqn_planner import Experience, GridMap
 from ddqn_planner.experience.drives import read_drives
 from ddqn_planner.nodes.conversions import quaternion
 from ddqn_planner.nodes.driving import NAVIGATION
-from ddqn_planner.nodes.runtime import LATCHED, best_effort
+from ddqn_planner.nodes.runtime import LATCHED
 
 VALUES = np.zeros((40, 100), dtype=np.int8)
 VALUES[16:26, 15:85] = 100
@@ -39,6 +39,7 @@ START, GOAL = (3, 18), (96, 18)
 LOWER = [(0.875, 4.625), (3.0, 3.5), (22.0, 3.5), (24.125, 4.625)]
 """Metres: from the start to the goal below the block."""
 
+BEST_EFFORT = QoSProfile(depth=1000, reliability=ReliabilityPolicy.BEST_EFFORT)
 NAMESPACE = "/drives"
 """Of the trainer and the planner that most tests share."""
 
@@ -60,7 +61,7 @@ class Site:
 
     def begin(self, listeners: int = 1) -> None:
         """Send the map, and wait until the trainer has it and records."""
-        self.client.publisher(Odometry, "odom", best_effort(1000))
+        self.client.publisher(Odometry, "odom", BEST_EFFORT)
         self.client.wait_for_discovery("trainer")
         self.client.publish("map", map_message(VALUES, GRID), LATCHED, listeners)
         self.wait_for_state("recording", "^recording$")
@@ -86,7 +87,7 @@ class Site:
         return message
 
     def send(self, message: Odometry) -> None:
-        self.client.publish("odom", message, best_effort(1000))
+        self.client.publish("odom", message, BEST_EFFORT)
 
     def send_goal(self, x: float, y: float) -> None:
         """Send a goal, and wait until the trainer has it: poses may overtake it."""

@@ -13,11 +13,10 @@ from diagnostic_msgs.msg import DiagnosticStatus
 from geometry_msgs.msg import PoseStamped
 from integration.robot import GOAL, START, Robot, odometry
 from nav_msgs.msg import OccupancyGrid, Odometry
-from rclpy.qos import QoSProfile
+from rclpy.qos import QoSProfile, qos_profile_sensor_data
 from rosgraph_msgs.msg import Clock
 
 from ddqn_planner.nodes import planner_node
-from ddqn_planner.nodes.runtime import best_effort
 
 
 def test_odometry_counts_while_it_comes_and_until_the_clock_jumps_back(
@@ -43,7 +42,7 @@ def test_odometry_counts_while_it_comes_and_until_the_clock_jumps_back(
     with run_node("planner_node", parameters, namespace="/listening") as node:
         client.publisher(OccupancyGrid, "map", QoSProfile(depth=1))
         robot.set_map(robot.stamped_map())
-        client.publisher(Odometry, "odom", best_effort(10))  # as many drivers publish it
+        client.publisher(Odometry, "odom", qos_profile_sensor_data)  # as many drivers publish it
         client.publisher(Clock, "/clock")
         client.wait_for_discovery("planner")
         for began in (1000, 500):

@@ -146,6 +146,7 @@ def test_reload_plans_again_with_what_the_file_holds_now(
     response = robot.client.call(Trigger, "planner/reload_model")
     assert not response.success
     assert f"{whole_model}: cannot be read as safetensors" in response.message
+    robot.clear()
     robot.get_plan(robot.pose(START), robot.pose(GOAL))
     assert values_of(robot.wait_for_reason("greedy"))["model training steps"] == "7"
     shutil.copy(find_model("any_map"), whole_model)

@@ -35,7 +35,7 @@ def about_to_update(scenarios: list[Scenario], parameters: HyperParameters) -> T
     torch.manual_seed(0)
     for weight in trainer._target.parameters():
         weight.add_(0.3 * torch.randn_like(weight))
-    trainer.encoder.update_target(trainer._target)
+    trainer._target.settle(trainer.environment)
     return trainer
 
 
