@@ -56,3 +56,8 @@ def grids_with_directions(draw: st.DrawFn) -> tuple[GridMap, tuple[int, int]]:
     elements = st.sampled_from(masks) | st.integers(0, 255)
     forbidden = draw(numpy_st.arrays(np.uint8, grid.occupancy.shape, elements=elements))
     return GridMap(grid.occupancy, cost=grid.cost, forbidden=forbidden), cell
+
+
+def cells_of(grid: GridMap) -> st.SearchStrategy[tuple[int, int]]:
+    """Any cells of a map."""
+    return st.tuples(st.integers(0, grid.width - 1), st.integers(0, grid.height - 1))
