@@ -54,7 +54,7 @@ def test_goal_pose_is_answered_by_a_plan_a_value_and_diagnostics(robot: Robot) -
     # With the goal before it the path may have another yaw.
     path = robot.wait_for_path((0, 3), GOAL, yaw=GOAL_YAW)
 
-    value = robot.value.wait()
+    value = robot.value.wait(lambda value: float(seconds(value.header.stamp)) > began)
     for message in (path, value):  # whatever the map's stamp is
         assert began < float(seconds(message.header.stamp)) < time.time()
         assert message.header.frame_id == "map"
