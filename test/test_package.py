@@ -12,17 +12,12 @@ from zipfile import ZipFile
 
 import pytest
 
-from ddqn_planner.resources import find_map, find_resource
+from ddqn_planner.resources import find_map
 
 ROOT = Path(__file__).resolve().parent.parent
-ROOMS = [
-    "grid",
-    "model",
-    "planning",
-    "experience",
-    "training",
-    "nodes",
-]
+ROOMS = ["grid", "model", "planning", "experience", "training", "nodes"]
+TRAINING = {"torch", "gymnasium"}
+PIP = [sys.executable, "-m", "pip", "--quiet"]
 
 
 @pytest.mark.parametrize("room", ROOMS)
@@ -36,11 +31,6 @@ def test_imports_run_downwards(room: str) -> None:
             for module in modules:
                 assert not module.startswith(tuple(above)), f"{path} imports {module}"
                 assert room == "nodes" or not module.startswith("rclpy"), f"{path}: {module}"
-
-
-def test_a_missing_resource_is_named_with_those_that_are_there() -> None:
-    with pytest.raises(FileNotFoundError, match=r"'nowhere\.yaml'.*dilemma\.yaml, office"):
-        find_resource("maps", "nowhere.yaml")
 
 
 @pytest.fixture(scope="module")
@@ -57,28 +47,17 @@ def wheel(source_copy: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_the_wheel_asks_for_torch_only_to_train(wheel: Path) -> None:
     with ZipFile(wheel) as archive:
         (name,) = (name for name in archive.namelist() if name.endswith("/METADATA"))
-        needed = re.findall(
-            r"^Requires-Dist: (\w+)([^;\n]*)(.*)$", archive.read(name).decode(), re.M
-        )
-    assert {"numba", "numpy", "safetensors"} <= {
-        library for library, _, extra in needed if not extra
-    }
-    of_training = {(library, extra) for library, _, extra in needed if library in TRAINING}
+        text = archive.read(name).decode()
+    needed = set(re.findall(r"^Requires-Dist: (\w+)[^;\n]*(.*)$", text, re.M))
+    assert {(library, "") for library in ("numba", "numpy", "safetensors")} <= needed
+    of_training = {entry for entry in needed if entry[0] in TRAINING}
     assert of_training == {(library, '; extra == "train"') for library in TRAINING}
 
 
 def test_the_newest_release_of_the_changelog_is_of_the_packages_version() -> None:
     version = ElementTree.parse(ROOT / "package.xml").findtext("version")
-    released = re.search(
-        r"^## (\S+) \(\d{4}-\d\d-\d\d\)$", (ROOT / "CHANGELOG.md").read_text(), re.M
-    )
-    assert released is not None
-    assert released[1] == version
-
-
-TRAINING = {"torch", "gymnasium"}
-
-PIP = [sys.executable, "-m", "pip", "--quiet"]
+    changes = (ROOT / "CHANGELOG.md").read_text()
+    assert re.findall(r"^## (\S+) \(\d{4}-\d\d-\d\d\)$", changes, re.M)[0] == version
 
 
 # --user and Debian's Python install beside another share folder than the interpreter's, as the
@@ -128,6 +107,8 @@ def package_share(prefix: Path) -> Path:
 
 
 def test_a_map_is_a_shipped_one_or_a_path() -> None:
+    with pytest.raises(FileNotFoundError, match=r"'nowhere\.yaml'.*dilemma\.yaml, office"):
+        find_map("nowhere")
     shipped = ROOT / "maps" / "dilemma.yaml"
     for name in ("dilemma", "dilemma.yaml", "package://ddqn_planner/maps/dilemma.yaml"):
         assert find_map(name).resolve() == shipped

@@ -64,24 +64,12 @@ def test_a_cell_is_any_pair_of_whole_numbers(cell: Any) -> None:
         assert (grid.is_free(cell), grid.is_obstacle(cell)) == (not occupied, occupied)
 
 
-@pytest.mark.parametrize(
-    "cell",
-    [
-        *[(0, 0, 0), (0,), (), 0, None, "00", "ab", (0.5, 0), (0, math.nan), (math.inf, 0), {0, 1}],
-        *[((0,), (0,)), ("0", "0"), np.zeros((2, 2)), {"x": 0, "y": 1}, (0, None)],
-    ],
-)
-def test_a_wrong_cell_is_named(cell: Any) -> None:
-    with pytest.raises(ValueError, match=r"(?s)the goal is .*; give two whole numbers \(x, y\)"):
-        as_cell(cell, "the goal")
-    with pytest.raises(ValueError, match="the cell is"):
-        GridMap(ZEROS).contains(cell)
-
-
 def test_cells_on_the_edges_are_inside_and_those_beyond_are_not() -> None:
     grid = GridMap(ZEROS)
     assert all(map(grid.contains, [(0, 0), (2, 1)]))
     assert not any(map(grid.contains, [(-1, 0), (0, -1), (3, 0), (0, 2)]))
+    with pytest.raises(ValueError, match=r"the cell is \(0, None\); give two whole numbers"):
+        grid.contains((0, None))
 
 
 # What it holds
@@ -238,35 +226,26 @@ def test_maps_have_the_same_cells_and_fingerprint_exactly_if_their_layers_are_eq
         assert (a.fingerprint == other.fingerprint) == equal
 
 
-@pytest.mark.parametrize(
-    ("arguments", "named"),
-    [
+def test_a_wrong_patch_is_named_and_the_remedy_too() -> None:
+    one = np.zeros((1, 1))
+    for arguments, named in (
         (
             (np.zeros((2, 2)), 2, 0),
-            r"2 x 2 cells from \(2, 0\) is not inside the map of 3 x 2; cut",
+            r"2 x 2 cells from \(2, 0\) is not inside .* 3 x 2; cut",
         ),
         ((np.zeros((2, 2)), 0, 1), r"from \(0, 1\) is not inside"),
-        ((np.zeros((1, 1)), -1, 0), r"from \(-1, 0\) is not inside"),
+        ((one, -1, 0), r"from \(-1, 0\) is not inside"),
         ((np.zeros((3, 1)), 0, 0), "1 x 3 cells .* is not inside"),
-        *(((np.zeros(shape), 0, 0), "occupancy has shape") for shape in ((0, 1), 3)),
-        ((np.zeros((1, 1)), 0.5, 0), "first cell of the patch is .*; give two whole numbers"),
-        ((np.zeros((1, 1)), 0, 0, [[1, 2]]), r"cost has shape \(1, 2\); give \(1, 1\)"),
-        ((np.zeros((1, 1)), 0, 0, [[100]]), "holds 100; give whole numbers -1 to 99"),
+        ((np.zeros((0, 1)), 0, 0), "occupancy has shape"),
+        ((one, 0.5, 0), "first cell of the patch is .*; give two whole numbers"),
+        ((one, 0, 0, [[1, 2]]), r"cost has shape \(1, 2\); give \(1, 1\)"),
+        ((one, 0, 0, [[100]]), "holds 100; give whole numbers -1 to 99"),
         ((np.ones((1, 2)), 0, 0, None, [[1]]), r"obstacles has shape \(1, 1\); give \(1, 2\)"),
         (([[100]], 0, 0), "occupancy holds 100; give True or False"),
-    ],
-)
-def test_a_wrong_patch_is_named_and_the_remedy_too(arguments: tuple, named: str) -> None:
-    for cost in (None, ZEROS):
-        with pytest.raises(ValueError, match=named):
-            GridMap(ZEROS, cost=cost).with_patch(*arguments)
-
-
-def test_a_map_computes_its_labels_once_per_kind_of_rule() -> None:
-    grid = GridMap([[0, 1], [1, 0]])
-    assert grid.labels("unit") is grid.labels("corner_cutting")
-    assert grid.with_slowness(np.ones((2, 2), np.float32), 1.0).labels("unit").max() == 1
-    assert grid.labels("robot_safe").max() == 2
+    ):
+        for cost in (None, ZEROS):
+            with pytest.raises(ValueError, match=named):
+                GridMap(ZEROS, cost=cost).with_patch(*arguments)
 
 
 def test_the_memory_of_a_field_on_the_slowest_map_is_bounded() -> None:
