@@ -6,7 +6,7 @@ import math
 import time
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
@@ -32,8 +32,6 @@ REMEDIES = {
     PlanStatus.ROLLOUT_TRAPPED: "train the model longer, or set mode to 'astar_fallback'",
 }
 
-NO_PLAN = Plan(PlanStatus.NO_PATH)
-
 
 class RequestError(ValueError):
     """There is no request for the planner; what is missing `may_come` soon in a new node."""
@@ -51,7 +49,7 @@ class Outcome:
     reason: str
     planner: Planner | None = None
     request: PlanRequest | None = None
-    plan: Plan = NO_PLAN
+    plan: Plan = field(default_factory=lambda: Plan(PlanStatus.NO_PATH))
     goal: PoseStamped | None = None  # in the map's frame
     map_stamp: str = ""  # seconds
 

@@ -335,11 +335,11 @@ def test_directions_hold_for_the_region_of_maps_of_another_node(
     assert source.forbidden() is None
     source._take(map_of(10))
     source.heard.clear()
-    for stamp, value in ((3, WEST), (20, None)):  # also older ones than the map
+    for stamp, value in ((3, WEST), (20, None), (4, WEST), (21, 0)):  # also older than the map
         source._take_directions(directions_of(stamp, value))
         assert not source.missing
-        assert source.forbidden() == (value and [[value] * 5] * 4)
-    assert source.heard == [False, False]
+        assert source.forbidden() == ([[value] * 5] * 4 if value else None)
+    assert source.heard == [False] * 4
 
 
 def test_required_directions_are_waited_for_once(
