@@ -1,7 +1,5 @@
 """The check of the planner's answers that load, soak and faults rely on."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from client import MapFixture, plan_request, pose
