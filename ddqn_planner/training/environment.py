@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ddqn_planner.grid import MOVES, Cell, GridMap, MoveRule, read_map_file
-from ddqn_planner.model.observation import GOAL, OBSTACLE, ROBOT, observation_background, observe
+from ddqn_planner.model.networks import GOAL, OBSTACLE, ROBOT, observation_background, observe
 from ddqn_planner.resources import find_resource
 from ddqn_planner.training.exploring_starts import initial_cells
 from ddqn_planner.training.hyper_parameters import HyperParameters

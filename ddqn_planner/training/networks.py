@@ -12,7 +12,8 @@ from torch.nn import functional
 
 from ddqn_planner.grid import LENGTHS, MOVES, neighbours
 from ddqn_planner.model import AnyMapQNetwork, PaperQNetwork, PropagationQNetwork, QNetwork
-from ddqn_planner.model.observation import observe, patches
+from ddqn_planner.model.move_costs import patches
+from ddqn_planner.model.networks import observe
 from ddqn_planner.training.environment import GridVectorEnvironment
 
 # Dimensions: B = a batch, A = 8 actions, F = filters, I = inputs of the first layer, L = windows,

@@ -15,7 +15,7 @@ from torch import Tensor, nn
 
 from ddqn_planner.grid import LENGTHS, MOVES, Cell, GridMap, MoveRule
 from ddqn_planner.model import AnyMapQNetwork
-from ddqn_planner.model.observation import patches
+from ddqn_planner.model.move_costs import patches
 from ddqn_planner.training.double_dqn import ReplayBuffer, Transitions
 from ddqn_planner.training.environment import Scenario
 from ddqn_planner.training.hyper_parameters import HyperParameters
