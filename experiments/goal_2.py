@@ -39,11 +39,6 @@ TARGET_COLUMNS = (
 )
 
 
-def trainings(settings: Settings) -> list[Training]:
-    """Return the trainings of goal i: goal ii asks more of the same networks."""
-    return goal_1.trainings(settings)
-
-
 def free_starts(scenario: Scenario) -> NDArray[np.bool_]:
     """Return the free cells except start and end: (H, W) bool, the paper's 286."""
     starts = ~scenario.grid.occupancy

@@ -1,7 +1,5 @@
 """The demo as `make demo` runs it, to its end and interrupted."""
 
-from __future__ import annotations
-
 import os
 import signal
 import subprocess
@@ -31,18 +29,18 @@ class Demo:
 
     def __init__(self, folder: Path) -> None:
         # The demo's nodes are in sessions of their own; they inherit its environment.
-        mark = uuid.uuid4().hex
+        mark, self._output = uuid.uuid4().hex, folder / "output.txt"
         self._entry = f"{MARK}={mark}".encode()
-        self._output = folder / "output.txt"
+        environment, redirect = {**os.environ, MARK: mark}, subprocess.STDOUT
         with self._output.open("wb") as file:
-            self.process = subprocess.Popen(
-                [sys.executable, str(DEMO)],
-                cwd=folder,
-                env={**os.environ, MARK: mark},
-                stdout=file,
-                stderr=subprocess.STDOUT,
-                start_new_session=True,
-            )
+            options: dict[str, Any] = {
+                "cwd": folder,
+                "env": environment,
+                "stdout": file,
+                "stderr": redirect,
+            }
+            command = [sys.executable, str(DEMO)]
+            self.process = subprocess.Popen(command, start_new_session=True, **options)
 
     @property
     def output(self) -> str:

@@ -1,11 +1,8 @@
 """The check of the planner's answers that load, soak and faults rely on."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
-from client import plan_request, pose
-from map_fixture import MapFixture
+from client import MapFixture, plan_request, pose
 from nav_msgs.msg import Path
 
 from ddqn_planner.grid import Cell, MapFile
