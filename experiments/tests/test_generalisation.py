@@ -186,7 +186,7 @@ def test_optima_lie_in_groups_that_double_and_a_millionth_more_is_optimal() -> N
 @pytest.mark.parametrize("costs", COSTS)
 def test_the_same_seed_draws_the_same_whichever_other_maps_there_are(costs: str) -> None:
     def drawn(kinds: list[str], seed: int) -> tuple[str, list[tuple[Cell, Cell]]]:
-        settings = RequestSettings(MoveRule.ROBOT_SAFE, 30, costs, seed)
+        settings = replace(SAFE, requests=30, costs=costs, seed=seed)
         *_, other, last = generated_maps(kinds, [20], 2, settings)
         assert other.grid.fingerprint != last.grid.fingerprint
         return last.grid.fingerprint, last.requests
@@ -195,19 +195,6 @@ def test_the_same_seed_draws_the_same_whichever_other_maps_there_are(costs: str)
     assert first == drawn(["maze", "rooms"], 1)
     assert first[0] != second[0]
     assert first[1] != second[1]
-
-
-def test_the_optima_of_a_scenario_file_hold_under_the_robot_safe_rule(tmp_path: Path) -> None:
-    lines = ["0\tc.map\t3\t3\t1\t0\t2\t1\t2", "0\tc.map\t3\t3\t0\t0\t2\t2\t2.82842712"]
-    write_moving_ai(tmp_path, "c", CORNER, lines)
-    (found,) = read(tmp_path)
-    assert found.requests == [((1, 0), (2, 1)), ((0, 0), (2, 2))]
-    rollouts = rollouts_of(PerfectNetwork(), found)
-    assert "the oracle agrees with 2/2" in markdown(rollouts)
-    assert [rollout.ratio for rollout in rollouts] == pytest.approx([1.0, 1.0])
-    for settings in (RequestSettings(MoveRule.CORNER_CUTTING), replace(SAFE, costs="random")):
-        (found,) = read(tmp_path, settings)
-        assert found.optima is None
 
 
 @pytest.mark.parametrize(
@@ -220,14 +207,16 @@ def test_the_optima_of_a_scenario_file_hold_under_the_robot_safe_rule(tmp_path: 
         (("2", "2", "3"), 0),
     ],
 )
-def test_a_rounded_optimum_agrees_within_what_its_file_gives(
+def test_optima_of_a_file_hold_under_the_robot_safe_rule_within_their_rounding(
     tmp_path: Path, optima: tuple[str, ...], agree: int
 ) -> None:
-    goals = ("1 1", "2 2", "0 2")
-    lines = [f"0 c.map 3 3 0 0 {goal} {o}" for goal, o in zip(goals, optima, strict=True)]
-    write_moving_ai(tmp_path, "c", ["...", "...", "..."], lines)
+    ends = ("0 0 1 1", "0 0 2 2", "1 0 2 1")
+    lines = [f"0 c.map 3 3 {both} {o}" for both, o in zip(ends, optima, strict=True)]
+    write_moving_ai(tmp_path, "c", CORNER, lines)
     rollouts = rollouts_of(PerfectNetwork(), *read(tmp_path))
     assert f"the oracle agrees with {agree}/3." in markdown(rollouts)
+    for settings in (RequestSettings(MoveRule.CORNER_CUTTING), replace(SAFE, costs="random")):
+        assert read(tmp_path, settings)[0].optima is None
 
 
 def test_a_sample_of_a_scenario_file_has_short_and_long_paths_alike(tmp_path: Path) -> None:
@@ -238,9 +227,7 @@ def test_a_sample_of_a_scenario_file_has_short_and_long_paths_alike(tmp_path: Pa
     (tmp_path / "scenarios" / "long.map.scen").write_text("\n".join(lines))
 
     def lengths(requests: int, seed: int = 0) -> list[float]:
-        settings = RequestSettings(MoveRule.ROBOT_SAFE, requests, seed=seed)
-        (found,) = read(tmp_path, settings)
-        return list(found.optima or [])
+        return list(read(tmp_path, replace(SAFE, requests=requests, seed=seed))[0].optima or [])
 
     assert [int(length - 1) // 9 for length in lengths(11)] == [*range(11)]
     assert lengths(11) == lengths(11) != lengths(11, seed=1)
@@ -310,7 +297,6 @@ def test_the_program_prints_its_tables(capsys: pytest.CaptureFixture[str], model
     ("arguments", "named"),
     [
         (["--maps", "0"], "--maps is 0; give at least 1"),
-        (["--requests", "0"], "requests is 0; give at least 1"),
         (["--seed", "-1"], "seed is -1; give at least 0"),
         (["--sizes", "4"], "H, W >= 5"),
         (["--data", "no_such_folder"], "no_such_folder: .*check the path"),
