@@ -40,21 +40,29 @@ def loaded(code: str) -> set[str]:
     return set(printed.split())
 
 
-@pytest.mark.parametrize(
-    "code",
-    [
-        "import ddqn_planner",
-        "import ddqn_planner.grid",
-        "import ddqn_planner.model",
-        "import ddqn_planner.planning",
-        GRID,
-        "from ddqn_planner import Experience; Experience(nominal_speed=0.5)",
-        "from ddqn_planner import Planner; Planner.load('any_map')",
-    ],
-)
-def test_no_import_of_the_core_loads_a_large_library(code: str) -> None:
-    large = {"torch", "numba", "scipy", "matplotlib", "gymnasium", "rclpy"}
-    assert not loaded(code) & (large | ({"numpy"} if code == "import ddqn_planner" else set()))
+COMMAND = """
+import contextlib
+from ddqn_planner.cli import main
+with contextlib.suppress(SystemExit):
+    main("{}".split())
+"""
+LARGE = {"torch", "numba", "scipy", "matplotlib", "gymnasium", "rclpy"}
+UNUSED = {
+    "import ddqn_planner": LARGE | {"numpy"},
+    "import ddqn_planner.grid, ddqn_planner.model, ddqn_planner.planning": LARGE,
+    GRID: LARGE,
+    "from ddqn_planner import Experience; Experience(nominal_speed=0.5)": LARGE,
+    "from ddqn_planner import Planner; Planner.load('any_map')": LARGE,
+    COMMAND.format("--help"): {"numpy"},
+    COMMAND.format("plan --help"): {"rclpy", "matplotlib"},
+    COMMAND.format("plan dilemma"): {"torch", "matplotlib", "gymnasium", "tqdm"},
+    COMMAND.format("certify"): {"torch", "numba", "scipy"},
+}
+
+
+@pytest.mark.parametrize("code", UNUSED)
+def test_no_import_and_no_command_loads_a_library_that_it_does_not_need(code: str) -> None:
+    assert not loaded(code) & UNUSED[code]
 
 
 def test_a_plan_needs_numba_alone() -> None:
@@ -63,21 +71,6 @@ def test_a_plan_needs_numba_alone() -> None:
     packages = loaded(code)
     assert "numba" in packages
     assert not packages & {"torch", "matplotlib", "gymnasium", "rclpy"}
-
-
-@pytest.mark.parametrize(
-    ("arguments", "unused"),
-    [
-        (["--help"], {"numpy"}),
-        (["plan", "--help"], {"rclpy", "matplotlib"}),
-        (["plan", "dilemma"], {"torch", "matplotlib", "gymnasium", "tqdm"}),
-        (["certify"], {"torch", "numba", "scipy"}),
-    ],
-)
-def test_a_command_loads_only_what_it_needs(arguments: list[str], unused: set[str]) -> None:
-    code = "import contextlib; from ddqn_planner.cli import main\n"
-    code += f"with contextlib.suppress(SystemExit): main({arguments})"
-    assert not loaded(code) & unused
 
 
 def test_the_public_names_are_known_before_they_are_loaded() -> None:

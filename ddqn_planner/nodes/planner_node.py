@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ctypes
 import sys
+import time
 from collections.abc import Callable
 from contextlib import suppress
 from typing import Any
@@ -255,7 +256,7 @@ class PlannerNode(ManagedNode):
         self._report.log_paths()
         if self._is_configured:
             self._look_for_news()
-        if self._report.is_due:
+        if time.monotonic() >= self._report.due:
             missing = [self._refusal.reason] if self._refusal is not None else []
             missing += [self._map.missing] if self._is_configured else []
             missing += ["the model is being loaded"] if self._model.loading else []

@@ -154,11 +154,11 @@ class Report(Refusals):
         self.outcome = NO_REQUEST
         self._publisher = node.create_publisher(DiagnosticArray, "/diagnostics", 10)
         self._to_be_logged: list[str] = []
-        self._due = 0.0
+        self.due = 0.0  # when to publish: something changed, or `PERIOD` has passed
 
     def change(self) -> None:
         """Publish soon: something about the node changed."""
-        self._due = 0.0
+        self.due = 0.0
 
     def note(self, outcome: Outcome) -> None:
         """Keep the last outcome for the diagnostics."""
@@ -179,14 +179,9 @@ class Report(Refusals):
             self.node.get_logger().info(reason)
         self._to_be_logged.clear()
 
-    @property
-    def is_due(self) -> bool:
-        """Whether to publish: something changed, or `PERIOD` has passed."""
-        return time.monotonic() >= self._due
-
     def publish(self, fatal: bool, missing: str, more: Mapping[str, str]) -> None:
         """Publish the diagnostics; `fatal` if the node cannot plan until its user helps."""
-        self._due = time.monotonic() + PERIOD
+        self.due = time.monotonic() + PERIOD
         outcome, plan, problems = self.outcome, self.outcome.plan, self.problems()
         if missing and missing != outcome.reason:
             problems.append(missing)

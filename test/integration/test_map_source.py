@@ -126,9 +126,8 @@ def test_an_update_is_taken_if_all_its_cells_are_inside_and_have_values(
     fits = width * height > 0 and 0 <= x <= 5 - width and 0 <= y <= 4 - height
     sent = update(x=x, y=y, width=width, height=height, data=data)
     if fits and surplus == 0:
-        assert (
-            updated_values(map_of(5), sent).tolist() == np.reshape(data, (height, width)).tolist()
-        )
+        expected = np.reshape(data, (height, width))
+        np.testing.assert_array_equal(updated_values(map_of(5), sent), expected)
     else:
         reason = "is not inside the map of 5 x 4" if not fits else f"need {width * height}"
         with pytest.raises(ValueError, match=reason):

@@ -33,9 +33,7 @@ from integration.robot import (
 from integration.test_startup import ask_for_plan
 from nav_msgs.msg import OccupancyGrid, Path
 from nav_msgs.srv import GetPlan
-from rcl_interfaces.msg import SetParametersResult
-from rcl_interfaces.srv import DescribeParameters, ListParameters, SetParametersAtomically
-from rclpy.parameter import Parameter
+from rcl_interfaces.srv import DescribeParameters, ListParameters
 from rclpy.qos import QoSProfile
 from std_msgs.msg import String
 from std_srvs.srv import Trigger
@@ -195,40 +193,29 @@ def test_a_model_of_another_size_says_so_and_a_trapped_one_may_search(
 # Parameters
 
 
-def test_parameters_that_come_together_are_set_together_or_not_at_all(
+def test_a_bad_parameter_is_refused_with_a_reason_and_a_good_one_holds(
     robot: Robot, tmp_path: FilePath
 ) -> None:
-    def set_together(**values: Any) -> SetParametersResult:
-        messages = [Parameter(name, value=v).to_parameter_msg() for name, v in values.items()]
-        request = SetParametersAtomically.Request(parameters=messages)
-        name = "planner/set_parameters_atomically"
-        return robot.client.call(SetParametersAtomically, name, request).result
-
-    good = {"robot_radius": 0.4, "mode": "astar_fallback", "move_rule": "corner_cutting"}
-    before = {name: robot.client.get_parameter("planner", name) for name in good}
-    broken = tmp_path / "broken.safetensors"
+    broken, missing = tmp_path / "broken.safetensors", tmp_path / "missing.safetensors"
     broken.write_bytes(b"a model")
-    for bad, reason in (
-        ({"clearance_weight": 1.5}, "out of range"),
-        ({"tolerance": math.nan}, "out of range"),
-        ({"mode": "best"}, "mode is 'best'; give one of greedy, astar_fallback"),
-        ({"start_source": "gps"}, "start_source is 'gps'; give one of"),
-        ({"robot_frame": ""}, "robot_frame is ''; name"),
-        ({"follow_trainer": False}, "read-only"),
-        ({"model": "no_such_model"}, "there is no shipped model 'no_such_model'"),
-        ({"model": str(tmp_path / "missing.safetensors")}, "there is no model file"),
-        ({"model": str(broken)}, "cannot be read as safetensors"),
+    for name, bad, reason in (
+        ("clearance_weight", 1.5, "out of range"),
+        ("tolerance", math.nan, "out of range"),
+        ("mode", "best", "mode is 'best'; give one of greedy, astar_fallback"),
+        ("start_source", "gps", "start_source is 'gps'; give one of"),
+        ("robot_frame", "", "robot_frame is ''; name"),
+        ("follow_trainer", False, "read-only"),
+        ("model", "no_such_model", "there is no shipped model 'no_such_model'"),
+        ("model", str(missing), "there is no model file"),
+        ("model", str(broken), "cannot be read as safetensors"),
     ):
-        result = set_together(**{**good, **bad})
-        assert not result.successful
-        assert reason in result.reason
-        for name, value in before.items():
-            assert robot.client.get_parameter("planner", name) == value
+        before = robot.client.get_parameter("planner", name)
+        assert reason in robot.refuse(**{name: bad})
+        assert robot.client.get_parameter("planner", name) == before
     robot.assert_works()
-    assert set_together(**good).successful
+    robot.set(move_rule="corner_cutting")
     values = {"move rule": "corner_cutting", "model move rule": "robot_safe"}
     robot.wait_for_reason(".", values)
-    assert robot.client.get_parameter("planner", "robot_radius") == 0.4
 
 
 # Bad input. After each, a good request has its plan.
