@@ -9,14 +9,13 @@ import sys
 import uuid
 from collections.abc import Iterator
 from contextlib import suppress
+from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 from client import wait_for
 from PIL import Image
-from processes import running
 
 pytestmark = pytest.mark.slow
 
@@ -48,6 +47,9 @@ class Demo:
     def output(self) -> str:
         return self._output.read_text(encoding="utf-8", errors="replace")
 
+    def runs(self, node: str) -> bool:
+        return any(node in command for command in self.commands().values())
+
     def commands(self) -> dict[int, str]:
         """Return the command lines of the demo's living processes, by process id."""
         found = {}
@@ -56,10 +58,6 @@ class Demo:
                 if self._entry in (folder / "environ").read_bytes().split(b"\0"):
                     found[int(folder.name)] = (folder / "cmdline").read_text().replace("\0", " ")
         return found
-
-    def has_nodes(self) -> bool:
-        running = " ".join(self.commands().values())
-        return "map_server_node" in running and "planner_node" in running
 
 
 @pytest.fixture
@@ -88,27 +86,9 @@ def test_demo_finds_the_shortest_paths_and_draws_them(demo: Demo, tmp_path: Path
 
 
 @pytest.mark.parametrize(("signal_number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
-def test_interrupted_demo_leaves_no_process_behind(
-    demo: Demo, signal_number: int, code: int
-) -> None:
-    wait_for("nodes", demo.has_nodes, [demo.process])
+def test_no_process_outlives_the_demo(demo: Demo, signal_number: int, code: int) -> None:
+    for node in ("map_server_node", "planner_node"):
+        wait_for(node, partial(demo.runs, node), [demo.process])
     demo.process.send_signal(signal_number)
     assert demo.process.wait(TIMEOUT) == code, demo.output
     assert demo.commands() == {}
-
-
-def test_signal_while_a_node_is_started_does_not_lose_the_node(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    children = []
-
-    def start(*arguments: Any, **options: Any) -> subprocess.Popen[bytes]:
-        children.append(popen(*arguments, **options))
-        signal.raise_signal(signal.SIGINT)
-        return children[0]
-
-    popen = subprocess.Popen
-    monkeypatch.setattr(subprocess, "Popen", start)
-    with pytest.raises(KeyboardInterrupt), running("sleep", "60"):
-        pass
-    assert children[0].returncode == -signal.SIGINT
