@@ -307,8 +307,7 @@ def learn(parser: argparse.ArgumentParser, arguments: Sequence[str]) -> int:
 
 def _read_drives(source: Path, options: Any) -> list[Drive]:
     """Return the drives of a folder or a file."""
-    from ddqn_planner.experience.drives import RECORD, read_drives
-    from ddqn_planner.experience.recordings import drives_of, read_csv, read_mcap
+    from ddqn_planner.experience.drives import RECORD, drives_of, read_csv, read_drives, read_mcap
 
     if source.is_dir():
         return list(read_drives(source / RECORD))

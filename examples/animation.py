@@ -26,9 +26,7 @@ FRAMES_PER_SECOND = 16
 LAST_FRAMES = 40  # for which the complete path is shown
 
 
-def save_film(
-    path: str, grid: GridMap, plan: Plan, value: NDArray[np.float32], steps: int = 40
-) -> None:
+def save_film(path: str, grid: GridMap, plan: Plan, value: NDArray[Any], steps: int = 40) -> None:
     """Save a GIF: the cells appear from the best value to the worst, then the path grows."""
     height, width = np.array(value.shape) / max(value.shape) * 6
     figure, axes = plt.subplots(figsize=(width, height), dpi=100)

@@ -22,22 +22,16 @@ from client import Client, cells_of, initial_pose, pose, values_of, wait_for
 from processes import claim_ros_domain, run_script, running_node
 
 # A map, the shipped model that plans on it, its move rule, and the picture's title and file.
-CASES = (
+Case = tuple[str, str, MoveRule, str, str]
+CASES: tuple[Case, ...] = (
     ("dilemma", "dilemma", MoveRule.CORNER_CUTTING, "The paper's network", "demo.png"),
     ("office", "any_map", MoveRule.ROBOT_SAFE, "A map never seen", "demo_office.png"),
 )
 
 
-def show_path(
-    client: Client,
-    map_name: str,
-    rule: MoveRule,
-    title: str,
-    picture: str,
-    children: Sequence[Popen[bytes]],
-) -> None:
+def show_path(client: Client, case: Case, children: Sequence[Popen[bytes]]) -> None:
     """Ask for a path as `ros2 topic pub` would; print it with its times, and draw it."""
-    began = time.monotonic()
+    began, (map_name, _, rule, title, picture) = time.monotonic(), case
     maps = client.subscribe(OccupancyGrid, "map", LATCHED)
     plans = client.subscribe(Path, "plan", LATCHED)
     fields = client.subscribe(OccupancyGrid, "planner/value", LATCHED)
@@ -82,13 +76,13 @@ def show_path(
 def main(_: Sequence[str]) -> int:
     """Show a path on each map; no process is left behind, also when this one is interrupted."""
     with claim_ros_domain():
-        for map_name, model, rule, title, picture in CASES:
+        for case in CASES:
             with (
-                running_node("map_server_node", yaml_filename=f"{map_name}.yaml") as server,
-                running_node("planner_node", model=model) as planner,
+                running_node("map_server_node", yaml_filename=f"{case[0]}.yaml") as server,
+                running_node("planner_node", model=case[1]) as planner,
                 Client() as client,
             ):
-                show_path(client, map_name, rule, title, picture, [server, planner])
+                show_path(client, case, [server, planner])
     return 0
 
 

@@ -1,11 +1,6 @@
-"""A simulated robot as a ROS node, in a world whose slowness nobody tells.
+"""A simulated robot that follows the last `plan`, in a world whose slowness nobody tells.
 
-It follows the last `plan`, and publishes `odom` and, where tf2_ros is installed, a transform. Slow
-zones, a carpet on which wheels slip, a door, and crowds that come and go by the hour slow it down.
-Where it stands without a path that it can join, it sends the last `goal_pose` again. Its time runs
-faster than the clock: the stamps are simulated.
-
-    python examples/simulated_robot.py --ros-args -p world:=office -p seed:=1 -p speed_up:=30.0
+python examples/simulated_robot.py --ros-args -p world:=office -p seed:=1 -p speed_up:=30.0
 """
 
 import math
@@ -28,24 +23,14 @@ sys.path.insert(0, str(FilePath(__file__).resolve().parents[1] / "experiments"))
 from client import RobotPoses
 from driving_worlds import NOISE, SPEED, World, generated_world
 
-STEP = 0.2
-"""Simulated seconds from one pose to the next."""
-
-MORNING = 3000.0
-"""When the simulated time begins, seconds: ten minutes later the first crowd goes."""
-
-JOIN_DISTANCE = 2.0
-"""Metres from which the robot drives to the nearest point of a new path."""
-
-SIGHT = 0.005
-"""Metres between the points at which a straight line is looked at for obstacles."""
-
+STEP = 0.2  # simulated seconds from one pose to the next
+MORNING = 3000.0  # when the simulated time begins, seconds: ten minutes later the first crowd goes
+JOIN_DISTANCE = 2.0  # metres from which the robot drives to the nearest point of a new path
+SIGHT = 0.005  # metres between the points at which a straight line is looked at for obstacles
+# Simulated seconds that a process which was stalled catches up. A robot that was away for longer
+# would have left the path that is planned for it.
 MOST_BEHIND = 5.0
-"""Simulated seconds that a process which was stalled catches up. A robot that was away for longer
-would have left the path that is planned for it."""
-
-PATIENCE = 2.0
-"""Seconds that the robot stands before it asks for a path again."""
+PATIENCE = 2.0  # seconds that the robot stands before it asks for a path again
 
 
 class Robot:
@@ -77,39 +62,29 @@ class Robot:
         self.now += STEP
         left = STEP
         while left > 1e-9 and self.is_driving:
-            left -= self._move(left)
+            ahead = self._path[0] - (self.x, self.y)
+            away, speed = math.hypot(*ahead), self._speed()
+            metres = min(away, speed * min(left, 0.05))
+            if metres < away:
+                self.x, self.y = np.array([self.x, self.y]) + metres / away * ahead
+            else:
+                (self.x, self.y), self._path = self._path[0], self._path[1:]
+            if away:
+                self.yaw = math.atan2(ahead[1], ahead[0])
+            left -= metres / speed
 
     def _sees(self, points: NDArray[np.float64]) -> NDArray[np.bool_]:
         """Return whether a straight line leads to each point without an obstacle: (N,) bool."""
-        here = np.array([self.x, self.y])
+        grid, here = self.world.grid, np.array([self.x, self.y])
         metres = np.hypot(*(points - here).T).max(initial=0)
         share = np.linspace(0, 1, int(metres / SIGHT) + 2)[:, None, None]
-        cells = self._cells(here + share * (points - here))
-        height, width = self.world.grid.occupancy.shape
-        inside = ((cells >= 0) & (cells < (width, height))).all(axis=-1)
-        x, y = np.moveaxis(cells.clip(0, (width - 1, height - 1)), -1, 0)
+        cells = np.floor((here + share * (points - here) - grid.origin[:2]) / grid.resolution)
+        inside = ((cells >= 0) & (cells < (grid.width, grid.height))).all(axis=-1)
+        x, y = np.moveaxis(cells.clip(0, (grid.width - 1, grid.height - 1)).astype(int), -1, 0)
         # A robot on an obstacle may leave.
-        is_own = (cells == self._cells(here)).all(axis=-1)
-        sees: NDArray[np.bool_] = (inside & ~self.world.grid.occupancy[y, x] | is_own).all(axis=0)
+        is_own = (cells == grid.world_to_cell(self.x, self.y)).all(axis=-1)
+        sees: NDArray[np.bool_] = (inside & ~grid.occupancy[y, x] | is_own).all(axis=0)
         return sees
-
-    def _cells(self, points: NDArray[np.float64]) -> NDArray[np.int64]:
-        """Return the cells of points (..., 2)."""
-        grid = self.world.grid
-        return np.floor((points - grid.origin[:2]) / grid.resolution).astype(np.int64)
-
-    def _move(self, seconds: float) -> float:
-        """Drive toward the next point of the path; return how long it took."""
-        ahead = self._path[0] - (self.x, self.y)
-        away, speed = math.hypot(*ahead), self._speed()
-        metres = min(away, speed * min(seconds, 0.05))
-        if metres < away:
-            self.x, self.y = np.array([self.x, self.y]) + metres / away * ahead
-        else:
-            (self.x, self.y), self._path = self._path[0], self._path[1:]
-        if away:
-            self.yaw = math.atan2(ahead[1], ahead[0])
-        return metres / speed
 
     def _speed(self) -> float:
         grid = self.world.grid
@@ -119,11 +94,11 @@ class Robot:
             self._noise = math.exp(self._random.normal(0, NOISE) - NOISE**2 / 2)
         if not grid.is_free(cell):
             return SPEED
-        return SPEED / (float(self.world.slowness(self.now)[cell[1], cell[0]]) * self._noise)
+        return SPEED / (float(self.world.slowness(self.now)[cell[::-1]]) * self._noise)
 
 
 class RobotNode(Node):
-    """The robot's topics."""
+    """The robot's topics: `plan` in, `odom` and where tf2_ros is installed a transform out."""
 
     def __init__(self) -> None:
         super().__init__("robot")
@@ -133,10 +108,9 @@ class RobotNode(Node):
         )
         self._robot = Robot(generated_world(str(world), int(seed)), int(seed))
         self._speed_up = float(speed_up)
-        self._began = time.monotonic()
+        self._began = self._waits_since = time.monotonic()
         self._poses = RobotPoses(self)
         self._goal: PoseStamped | None = None
-        self._waits_since = time.monotonic()
         self._goals = self.create_publisher(PoseStamped, "goal_pose", 10)
         self.create_subscription(PoseStamped, "goal_pose", self._on_goal, 10)
         self.create_subscription(Path, "plan", self._on_plan, LATCHED)
@@ -150,26 +124,20 @@ class RobotNode(Node):
         self._goal, self._waits_since = message, time.monotonic()
 
     def _on_timer(self) -> None:
-        until = MORNING + (time.monotonic() - self._began) * self._speed_up
-        behind = until - self._robot.now - MOST_BEHIND
-        if behind > 0:
-            self._began += behind / self._speed_up
-            until -= behind
-        while self._robot.now + STEP <= until:
-            self._robot.step()
-            stamp = Time(sec=int(self._robot.now), nanosec=int(self._robot.now % 1 * 1e9))
-            header = Header(stamp=stamp, frame_id="map")
-            self._poses.publish(header, self._robot.x, self._robot.y, self._robot.yaw)
-        self._ask_again()
-
-    def _ask_again(self) -> None:
-        """Send the goal again where the robot stands away from it."""
-        now = time.monotonic()
-        if self._goal is None or self._robot.is_driving:
+        robot, now = self._robot, time.monotonic()
+        behind = MORNING + (now - self._began) * self._speed_up - robot.now
+        self._began += max(0.0, behind - MOST_BEHIND) / self._speed_up
+        until = robot.now + min(behind, MOST_BEHIND)
+        while robot.now + STEP <= until:  # the stamps are simulated: they run faster than the clock
+            robot.step()
+            stamp = Time(sec=int(robot.now), nanosec=int(robot.now % 1 * 1e9))
+            self._poses.publish(Header(stamp=stamp, frame_id="map"), robot.x, robot.y, robot.yaw)
+        # Where it stands without a path that it can join, it sends the goal again.
+        if self._goal is None or robot.is_driving:
             self._waits_since = now
         elif now - self._waits_since > PATIENCE:
             self._waits_since = now
-            goal, robot = self._goal.pose.position, self._robot
+            goal = self._goal.pose.position
             metres = math.dist((goal.x, goal.y), (robot.x, robot.y))
             if metres > ARRIVAL_DISTANCE:
                 self.get_logger().warning(

@@ -17,6 +17,7 @@ from ddqn_planner.resources import find_map
 
 RULE = MoveRule.ROBOT_SAFE
 REQUESTS, WEIGHTS, MAX_RATIO = 200, (0.0, 1.0), 1.10
+Metres = NDArray[np.float64]
 BOUND_FACTORS = np.array([1.01, 1.1, 1.3, 1.6, 2.5, 5.0])
 HEADER = (
     "clearance_weight | solved | length over the optimum, mean | worst | "
@@ -54,7 +55,7 @@ def main(arguments: Sequence[str]) -> int:
 
 
 def greatest_distance(
-    grid: GridMap, metres: NDArray[np.float64], requests: Sequence[tuple[Cell, Cell]]
+    grid: GridMap, metres: Metres, requests: Sequence[tuple[Cell, Cell]]
 ) -> float:
     """Return a bound of the mean distance (metres) along paths of `MAX_RATIO` the least length L.
 
@@ -65,7 +66,7 @@ def greatest_distance(
     cell = y * grid.width + x
     next_cell = neighbours(grid.occupancy.shape)[action, cell]
 
-    def integrals(density: NDArray[np.float64]) -> float:
+    def integrals(density: Metres) -> float:
         costs = move_costs(density.astype(np.float32), RULE)[action, y, x]
         graph = scipy.sparse.csr_array((costs, (cell, next_cell)), shape=(metres.size,) * 2)
         total = 0.0

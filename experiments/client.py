@@ -1,4 +1,4 @@
-"""A client of the nodes, and the messages that scripts and tests exchange with them."""
+"""A client of the nodes, the messages to them, and the check of a planner's answers."""
 
 import queue
 import threading
@@ -17,6 +17,7 @@ from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped, TransformS
 from nav_msgs.msg import OccupancyGrid, Odometry, Path
 from nav_msgs.srv import GetPlan
 from numpy.typing import NDArray
+from random_maps import generate_map
 from rcl_interfaces.srv import GetParameters, SetParameters
 from rclpy._rclpy_pybind11 import RCLError
 from rclpy.context import Context
@@ -26,10 +27,12 @@ from rclpy.parameter import Parameter, parameter_value_to_python
 from rclpy.qos import QoSProfile
 from std_msgs.msg import Header
 
-from ddqn_planner.grid import Cell, GridMap
+from ddqn_planner.grid import Cell, GridMap, MapFile, MoveRule, read_map_file
 from ddqn_planner.nodes.conversions import occupancy_message, quaternion
 from ddqn_planner.nodes.report import seconds
+from ddqn_planner.resources import find_map
 
+RULE = MoveRule.ROBOT_SAFE  # of the planner's default model
 TIMEOUT = 120.0  # seconds that anything may take on a loaded machine
 # With Fast DDS each client of a service hears the answers to all clients. One that is slow to read
 # them loses its own from the usual queue of ten.
@@ -183,11 +186,9 @@ class Client(ExitStack):
             }
         return set()
 
-    def call(
-        self, service_type: Any, name: str, request: Any = None, timeout: float = TIMEOUT
-    ) -> Any:
+    def call(self, kind: Any, name: str, request: Any = None, timeout: float = TIMEOUT) -> Any:
         """Wait for a service, call it, and return its response; or raise TimeoutError."""
-        return ask(self.service(service_type, name), request or service_type.Request(), timeout)
+        return ask(self.service(kind, name), request or kind.Request(), timeout)
 
     def publisher(self, message_type: Any, topic: str, qos: Any = 10, listeners: int = 1) -> Any:
         """Return a publisher, always the same one per topic, once so many listen."""
@@ -201,13 +202,11 @@ class Client(ExitStack):
         """Publish a message once so many listen."""
         self.publisher(type(message), topic, qos, listeners).publish(message)
 
-    def subscribe(
-        self, message_type: Any, topic: str, qos: Any = 10, keep: int | None = None
-    ) -> Recorder:
+    def subscribe(self, kind: Any, topic: str, qos: Any = 10, keep: int | None = None) -> Recorder:
         """Return what a topic brings from now on."""
         recorder = Recorder(keep)
         add: Any = recorder.add  # rclpy takes callbacks of two arguments, and does not say so
-        self.node.create_subscription(message_type, topic, add, qos)
+        self.node.create_subscription(kind, topic, add, qos)
         return recorder
 
     def get_plan(self, start: PoseStamped, goal: PoseStamped) -> Path:
@@ -302,3 +301,57 @@ def wait_for_map(diagnostics: Recorder, stamp: Time, node: str = "/planner") -> 
         return status.name == f"{node}: plan" and found == seconds(stamp)
 
     diagnostics.wait(has_map)
+
+
+class MapFixture:
+    """A map, its message, and the check of an answer."""
+
+    def __init__(self, map_file: MapFile) -> None:
+        # A message holds the resolution in single precision.
+        resolution = float(np.float32(map_file.resolution))
+        self.values = map_file.values
+        self.grid = MapFile(map_file.values, resolution, map_file.origin).grid()
+
+    def message(self, stamp: int = 0) -> OccupancyGrid:
+        """Return the map message, stamped with a number of seconds."""
+        return map_message(self.values, self.grid, stamp)
+
+    def error(self, request: GetPlan.Request, plan: Path) -> str:
+        """Say what is wrong with an answer for a robot that cuts no corners; "" if nothing is."""
+        grid, cells = self.grid, cells_of(self.grid, plan)
+        start, goal = (cell_of(grid, pose) for pose in (request.start, request.goal))
+        if not cells:
+            labels = grid.labels(RULE)
+            both_free = grid.is_free(start) and grid.is_free(goal)
+            possible = both_free and labels[start[::-1]] == labels[goal[::-1]]
+            return f"no path from {start} to {goal}, where there is one" if possible else ""
+        if (cells[0], cells[-1]) != (start, goal):
+            return f"a path from {cells[0]} to {cells[-1]}, asked was {start} to {goal}"
+        path = np.array(cells)
+        if ((path < 0) | (path >= (grid.width, grid.height))).any():
+            return "an illegal move out of the map"
+        (x, y), (next_x, next_y) = path[:-1].T, path[1:].T
+        first_free = next((n for n, cell in enumerate(cells) if grid.is_free(cell)), len(x))
+
+        def is_blocked(x: NDArray[np.int64], y: NDArray[np.int64]) -> NDArray[np.bool_]:
+            # A robot on an obstacle may leave it, and what is next to it.
+            is_far = np.hypot(x - start[0], y - start[1]) > 1
+            return grid.occupancy[y, x] & (is_far | (np.arange(len(x)) >= first_free))
+
+        # A diagonal move needs both cells beside it; for a straight one these are its own two.
+        wrong = is_blocked(next_x, next_y) | (is_blocked(next_x, y) & (next_x != x))
+        wrong |= is_blocked(x, next_y) & (next_y != y)
+        wrong |= np.maximum(abs(next_x - x), abs(next_y - y)) != 1
+        return f"an illegal move to {path[1:][wrong][0]}" if wrong.any() else ""
+
+
+def generated_map(kind: str, side: int, resolution: float = 0.05) -> MapFixture:
+    """Return a square map of a kind, always the same one."""
+    occupancy = generate_map(kind, (side, side), np.random.default_rng(0))
+    return MapFixture(MapFile(100 * occupancy, resolution))
+
+
+def three_maps() -> list[MapFixture]:
+    """Return the maps that take turns; they are the same in each process."""
+    dilemma, office = (MapFixture(read_map_file(find_map(name))) for name in ("dilemma", "office"))
+    return [dilemma, generated_map("rooms", 200), office]

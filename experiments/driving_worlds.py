@@ -6,13 +6,14 @@ from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
-from random_maps import generate_map
+from random_maps import Random, generate_map
 
 from ddqn_planner.grid import Cell, GridMap, MoveRule
 from ddqn_planner.grid.moves import segment_lengths
 from ddqn_planner.planning import Planner
 
 Float64 = NDArray[np.float64]
+Range = tuple[float, float]
 Routes = dict[str, Sequence[Cell]]
 RULE: Final = MoveRule.ROBOT_SAFE
 
@@ -70,13 +71,7 @@ class World:
         return max(((a, b) for a in self.stations for b in self.stations if a < b), key=saved)
 
 
-def _discs(
-    grid: GridMap,
-    count: int,
-    radius: tuple[float, float],
-    factor: tuple[float, float],
-    random: np.random.Generator,
-) -> Float64:
+def _discs(grid: GridMap, count: int, radius: Range, factor: Range, random: Random) -> Float64:
     """Draw discs of some radius (metres) and slowness around free cells: (H, W)."""
     free = np.argwhere(~grid.occupancy)
     y, x = np.ogrid[: grid.height, : grid.width]
@@ -89,12 +84,12 @@ def _discs(
     return slowness
 
 
-def slow_zones(grid: GridMap, random: np.random.Generator) -> Float64:
+def slow_zones(grid: GridMap, random: Random) -> Float64:
     """Draw six slow zones, 2 to 5 m wide and 2 to 6 times as slow: (H, W)."""
     return _discs(grid, 6, (1, 2.5), (2, 6), random)
 
 
-def make_world(grid: GridMap, random: np.random.Generator) -> World:
+def make_world(grid: GridMap, random: Random) -> World:
     """Draw what is slow on a map, and stations; all in its largest part that is connected."""
     labels = grid.labels(RULE)
     occupancy = labels != np.bincount(labels[labels > 0]).argmax()
@@ -142,7 +137,7 @@ def path_seconds(cells: Sequence[Cell], slowness: Float64, grid: GridMap) -> flo
     return float((_lengths(cells) * mean).sum() * grid.resolution / SPEED)
 
 
-def drive(cells: Sequence[Cell], world: World, clock: float, random: np.random.Generator) -> Drive:
+def drive(cells: Sequence[Cell], world: World, clock: float, random: Random) -> Drive:
     """Drive a path: each half of a move is as slow as its cell, with noise."""
     x, y = np.asarray(cells).T
     lengths = _lengths(cells)
@@ -164,7 +159,7 @@ def drive(cells: Sequence[Cell], world: World, clock: float, random: np.random.G
     return Drive(seconds + clock, positions, shown, float(at[-1]))
 
 
-def with_faults(measured: Drive, random: np.random.Generator) -> Drive:
+def with_faults(measured: Drive, random: Random) -> Drive:
     """Return the drive with a fault: a pause, a teleport, a clock jump or an odometry reset."""
     seconds, positions = measured.seconds.copy(), measured.positions.copy()
     at = int(random.integers(len(seconds) // 4, 3 * len(seconds) // 4 + 1))

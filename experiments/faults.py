@@ -4,9 +4,9 @@ import array
 import random
 import tempfile
 import time
+from collections import Counter
 from collections.abc import Callable, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
 from functools import partial
 from itertools import cycle, islice
 from pathlib import Path
@@ -14,16 +14,14 @@ from subprocess import Popen
 from typing import Any
 
 import numpy as np
-from client import TIMEOUT, Client, initial_pose, plan_request, pose, wait_for
+from client import RULE, TIMEOUT, Client, MapFixture, initial_pose, plan_request, pose, wait_for
 from diagnostic_msgs.msg import DiagnosticArray
-from map_fixture import RULE, MapFixture
 from nav_msgs.msg import OccupancyGrid
 from nav_msgs.msg import Path as PathMessage
 from nav_msgs.srv import GetPlan, LoadMap
 from processes import claim_ros_domain, run_script, running_node
 from random_maps import generate_map
-from rcl_interfaces.srv import GetParameters, SetParameters
-from rclpy.parameter import Parameter
+from rcl_interfaces.srv import GetParameters
 from std_srvs.srv import Trigger
 from tables import table
 
@@ -43,20 +41,13 @@ LAST_WAIT = 0.5  # seconds that a client waits after a kill until it gives up
 Ends = tuple[Cell, Cell]  # start and goal
 
 
-@dataclass
-class Tally:
-    """What became of the kills of one node: a row of the table."""
+COUNTS = (
+    "kills | in a save | restarts | answers | time-outs | without a plan | wrong paths | "
+    "temporaries"
+)
 
-    node: str
-    killed_while: str
-    kills: int = 0
-    in_a_save: int = 0
-    restarts: int = 0
-    answers: int = 0
-    time_outs: int = 0
-    without_a_plan: int = 0
-    wrong_paths: int = 0
-    temporaries: int = 0
+
+Tally = Counter[str]  # the counts of COUNTS: what became of the kills of one node
 
 
 class Faults(Client):
@@ -98,8 +89,7 @@ class Faults(Client):
         child.wait()
         time.sleep(LAST_WAIT)
         for service, future in calls:
-            tally.answers += future.done()
-            tally.time_outs += not future.done()
+            tally["answers" if future.done() else "time-outs"] += 1
             service.remove_pending_request(future)
         return [future.result() for _, future in calls]
 
@@ -127,11 +117,6 @@ class Faults(Client):
     def trigger(self, name: str, try_time: float = TRY_TIME) -> str:
         """Call a Trigger service until it succeeds; return its message."""
         return str(self.ask(Trigger, name, None, lambda found: found.success, try_time).message)
-
-    def parameter(self, node: str, name: str) -> Any:
-        """Return a parameter's value message."""
-        request = GetParameters.Request(names=[name])
-        return self.ask(GetParameters, f"{node}/get_parameters", request).values[0]
 
     def ask_for_plan(
         self, ends: Ends, accept: Callable[[Any], Any] = lambda found: found.plan.poses
@@ -162,12 +147,12 @@ class Faults(Client):
         """Return whether a plan comes in time; count one that is wrong or missing."""
         with suppress(TimeoutError):
             if (plan := ask()).poses:
-                tally.wrong_paths += self.is_wrong(ends, plan)
+                tally["wrong paths"] += self.is_wrong(ends, plan)
                 return True
-        tally.without_a_plan += 1
+        tally["without a plan"] += 1
         said = [message.status[0] for message in self.diagnostics.messages()]
         reasons = [status.message for status in said if status.name == "/planner: plan"]
-        print(f"no plan after kill {tally.kills} of {tally.node}: {reasons[-1:]}", flush=True)
+        print(f"no plan after kill {tally['kills']}: {reasons[-1:]}", flush=True)
         return False
 
     def kill_planner(self, tally: Tally) -> None:
@@ -179,9 +164,10 @@ class Faults(Client):
         time.sleep(self.draw.uniform(0.0, 1.0))
         for ends, answer in zip(asked, self.kill("planner", tally, calls), strict=True):
             # All goals can be reached: the check refuses an empty path.
-            tally.wrong_paths += answer is not None and self.is_wrong(ends, answer.plan)
+            tally["wrong paths"] += answer is not None and self.is_wrong(ends, answer.plan)
         self.start("planner")
-        tally.restarts += self.check_plan(tally, asked[0], lambda: self.ask_for_plan(asked[0]))
+        has_plan = self.check_plan(tally, asked[0], lambda: self.ask_for_plan(asked[0]))
+        tally["restarts"] += has_plan
 
     def kill_map_server(self, tally: Tally) -> None:
         """Kill the map server while it loads, scatters over and restores its map."""
@@ -206,7 +192,7 @@ class Faults(Client):
         self.start("map_server")
         served = self.maps.wait()
         self.check_plan(tally, self.watched, self.plan_for_active_goal)
-        tally.restarts += intact and served.data == array.array("b", self.map.values.tobytes())
+        tally["restarts"] += intact and served.data == array.array("b", self.map.values.tobytes())
 
     def kill_trainer(self, tally: Tally) -> None:
         """Kill the trainer while it saves after each step, soon after a save was seen to begin."""
@@ -220,7 +206,7 @@ class Faults(Client):
             pass
         time.sleep(self.draw.uniform(0.0, 0.002))
         self.kill("trainer", tally, calls)
-        tally.in_a_save += bool(self.temporaries())
+        tally["in a save"] += bool(self.temporaries())
         # What it saved can be loaded.
         model = self.training_folder / "model.safetensors"
         checkpoint = self.training_folder / "checkpoint.safetensors"
@@ -230,45 +216,41 @@ class Faults(Client):
         if checkpoint.exists():
             steps = Trainer.load_checkpoint(checkpoint, [paper_scenario()]).steps
         self.start("trainer")
-        self.parameter("/training/trainer", "seed")
+        self.ask(GetParameters, "/training/trainer/get_parameters")
         message = self.trigger("/training/trainer/start", START_TIME)
-        self.see_that_planner_follows(str(model))
-        tally.temporaries = len(self.temporaries())
-        tally.restarts += f"from step {steps} " in message
+        # The planner that follows the trainer loads a model of its.
+        self.set_parameters("/training/planner", model="any_map")
+        self.trigger("/training/trainer/save")
+        wait_for("model", lambda: self.get_parameter("/training/planner", "model") == str(model))
+        tally["temporaries"] = len(self.temporaries())
+        tally["restarts"] += f"from step {steps} " in message
 
     def temporaries(self) -> list[Path]:
         """Return what the killed trainers left of their saves."""
         return [*self.training_folder.glob(".*")]
 
-    def see_that_planner_follows(self, saved: str) -> None:
-        """Wait until the planner that follows the trainer has loaded a model of its."""
-        other = Parameter("model", value="any_map").to_parameter_msg()
-        request = SetParameters.Request(parameters=[other])
-        name = "/training/planner/set_parameters"
-        self.ask(SetParameters, name, request, lambda answer: answer.results[0].successful)
-        self.trigger("/training/trainer/save")
-        model = partial(self.parameter, "/training/planner", "model")
-        wait_for("model", lambda: model().string_value == saved)
-
     def kill_in_turn(self, kills: int) -> bool:
         """Kill so many times, and print what became of it; return whether all is right."""
         self.ask_for_plan(self.watched)
         self.trigger("/training/trainer/start", START_TIME)
-        self.parameter("/training/planner", "model")
-        tallies = {
-            self.kill_planner: Tally("planner_node", "planning"),
-            self.kill_map_server: Tally("map_server_node", "publishing"),
-            self.kill_trainer: Tally("trainer_node", "saving"),
+        self.get_parameter("/training/planner", "model")
+        kinds = {
+            "planner_node": ("planning", self.kill_planner),
+            "map_server_node": ("publishing", self.kill_map_server),
+            "trainer_node": ("saving", self.kill_trainer),
         }
+        tallies = {node: Tally() for node in kinds}
         try:
-            for kill, tally in islice(cycle(tallies.items()), kills):
-                tally.kills += 1
-                kill(tally)
+            for node, (_, kill) in islice(cycle(kinds.items()), kills):
+                tallies[node]["kills"] += 1
+                kill(tallies[node])
         finally:
-            header = " | ".join(Tally.__annotations__).replace("_", " ")
-            print(table(header, [[*vars(tally).values()] for tally in tallies.values()]))
-        wrong = sum(t.without_a_plan + t.wrong_paths + t.temporaries for t in tallies.values())
-        return not wrong and all(t.restarts == t.kills for t in tallies.values())
+            names = COUNTS.split(" | ")
+            rows = [[node, kinds[node][0], *(t[n] for n in names)] for node, t in tallies.items()]
+            print(table(f"node | killed while | {COUNTS}", rows))
+        total = sum(tallies.values(), Tally())
+        wrong = total["without a plan"] + total["wrong paths"] + total["temporaries"]
+        return not wrong and total["restarts"] == total["kills"]
 
 
 def main(arguments: Sequence[str]) -> int:

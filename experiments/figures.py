@@ -19,6 +19,7 @@ from ddqn_planner.pictures import draw_obstacles
 if TYPE_CHECKING:
     from ddqn_planner.training.environment import Scenario
 
+Array = NDArray[Any]
 COLOURS: Final = ("#0072B2", "#D55E00", "#009E73", "#CC79A7")  # Okabe and Ito's palette
 STYLES: Final = ("-", "--", "-.", ":")
 ROUTE_STYLES: Final[dict[str, dict[str, str]]] = {
@@ -37,11 +38,7 @@ def save_figure(figure: Any, path: Path, caption: str) -> str:
 
 
 def draw_curves(
-    axes: Any,
-    x: NDArray[Any],
-    curves: Mapping[str, Sequence[NDArray[Any]]],
-    xlabel: str,
-    ylabel: str,
+    axes: Any, x: Array, curves: Mapping[str, Sequence[Array]], xlabel: str, ylabel: str
 ) -> None:
     """Draw the median over the seeds of each curve, and a band from the least to the greatest."""
     lines = zip(curves.items(), COLOURS, STYLES, strict=False)
@@ -57,7 +54,7 @@ def draw_curves(
 def draw_slowness(
     grid: GridMap,
     stations: Sequence[Cell],
-    panels: Mapping[str, tuple[NDArray[Any], Mapping[str, Sequence[Cell]]]],
+    panels: Mapping[str, tuple[Array, Mapping[str, Sequence[Cell]]]],
     size: tuple[float, float],
 ) -> Any:
     """Return a figure of slowness (H, W), with routes that `ROUTE_STYLES` names, by its title."""
@@ -80,20 +77,17 @@ def draw_slowness(
 
 
 def draw_times(
-    seconds: Mapping[str, Sequence[NDArray[Any]]],
-    best: Sequence[NDArray[Any]],
-    width: int,
-    banded: str,
+    seconds: Mapping[str, Sequence[Array]], best: Sequence[Array], width: int, banded: str
 ) -> tuple[Any, Any]:
     """Draw the times of all worlds over the best, smoothed; one name as median and band.
 
     Returns the figure and its axes; ``width`` is how many missions a point sums up.
     """
 
-    def smoothed(values: NDArray[Any]) -> NDArray[Any]:
+    def smoothed(values: Array) -> Array:
         return np.convolve(values, np.ones(width), mode="valid")
 
-    curves: dict[str, Sequence[NDArray[Any]]] = {}
+    curves: dict[str, Sequence[Array]] = {}
     for name, of_worlds in seconds.items():
         ratios = [smoothed(s) / smoothed(b) for s, b in zip(of_worlds, best, strict=True)]
         curves[name] = ratios if name == banded else [np.median(ratios, axis=0)]

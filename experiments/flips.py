@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 from processes import run_script
-from random_maps import generate_map, inflated_costs
+from random_maps import Random, generate_map, inflated_costs
 from tables import table
 
 from ddqn_planner import GridMap, MoveRule, Planner
@@ -82,7 +82,7 @@ def drive(planner: Planner, kind: str, seed: int, threshold: float, side: int = 
     return Driven(replans, flips, path_cost(way, true_map.cost_multiplier, RULE))
 
 
-def scenario(kind: str, side: int, random: np.random.Generator) -> tuple[Occupancy, Cell, Cell]:
+def scenario(kind: str, side: int, random: Random) -> tuple[Occupancy, Cell, Cell]:
     """Return a map, a start and a goal at least half a side away."""
     if kind == "two ways":
         occupancy = np.zeros((side // 2, side), dtype=np.bool_)

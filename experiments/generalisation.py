@@ -18,20 +18,19 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import numpy as np
 from numpy.typing import NDArray
-from random_maps import KINDS, generate_map, gradient_costs, inflated_costs
+from random_maps import KINDS, Random, generate_map, gradient_costs, inflated_costs
 from tables import table
 from tqdm import tqdm
 
 from ddqn_planner import GridMap, MoveRule, Planner, QField
 from ddqn_planner.cli import HelpFormatter, exit_code
-from ddqn_planner.files import write_atomically
 from ddqn_planner.grid import MOVES, Cell, legal_moves, path_cost, read_map_file, shortest_distances
 from ddqn_planner.grid.arguments import Occupancy
 from ddqn_planner.grid.noise import random_costs, random_requests, unknown_costs
 
 INFLATION_RADIUS = 5.0  # cells that the cost of an obstacle reaches
 UNKNOWN_SHARE = 0.2  # of the free cells
-COSTS: Final[dict[str, Callable[[Occupancy, np.random.Generator], NDArray[np.int8] | None]]] = {
+COSTS: Final[dict[str, Callable[[Occupancy, Random], NDArray[np.int8] | None]]] = {
     "none": lambda occupancy, random: None,
     "random": random_costs,
     "gradient": gradient_costs,
@@ -49,6 +48,9 @@ COLUMNS: Final = (
 )
 
 
+Drawn = tuple[GridMap, list[tuple[Cell, Cell]]]  # requests: start and goal
+
+
 @dataclass(frozen=True)
 class RequestSettings:
     """How requests are drawn: so many per map, each with a path under the move rule."""
@@ -58,11 +60,11 @@ class RequestSettings:
     costs: str = "none"  # a key of COSTS
     seed: int = 0
 
-    def random(self, name: str) -> np.random.Generator:
+    def random(self, name: str) -> Random:
         """Return a map's random generator, which does not depend on the other maps."""
         return np.random.default_rng([self.seed, *name.encode()])
 
-    def grid(self, occupancy: Occupancy, random: np.random.Generator) -> GridMap:
+    def grid(self, occupancy: Occupancy, random: Random) -> GridMap:
         """Return the grid map with its costs."""
         return GridMap(occupancy, cost=COSTS[self.costs](occupancy, random))
 
@@ -89,33 +91,25 @@ def generated_maps(
                 name = f"{kind}-{size}-{number}"
                 random = settings.random(name)
                 occupancy = generate_map(kind, (size, size), random)
-                yield _with_random_requests(kind, name, occupancy, GOALS, settings, random)
+                yield BenchmarkMap(kind, name, *_draw(occupancy, GOALS, settings, random))
 
 
-def _with_random_requests(
-    set_name: str,
-    name: str,
-    occupancy: Occupancy,
-    goals: int,
-    settings: RequestSettings,
-    random: np.random.Generator,
-) -> BenchmarkMap:
+def _draw(occupancy: Occupancy, goals: int, settings: RequestSettings, random: Random) -> Drawn:
     """Draw costs and requests for a map; the requests share a number of goals evenly."""
-    grid, rule = settings.grid(occupancy, random), settings.move_rule
-    requests: list[tuple[Cell, Cell]] = []
+    grid, requests = settings.grid(occupancy, random), []
     parts = np.array_split(range(settings.requests), goals)
-    drawn = random_requests(occupancy, rule, goals, random)
+    drawn = random_requests(occupancy, settings.move_rule, goals, random)
     for part, (start, goal) in zip(parts, drawn, strict=True):
-        more = _random_starts(occupancy, goal, rule, max(len(part) - 1, 0), random)
+        more = _random_starts(occupancy, goal, settings, max(len(part) - 1, 0), random)
         requests += [(cell, goal) for cell in [start, *more][: len(part)]]
-    return BenchmarkMap(set_name, name, grid, requests)
+    return grid, requests
 
 
 def _random_starts(
-    occupancy: Occupancy, goal: Cell, move_rule: MoveRule, count: int, random: np.random.Generator
+    occupancy: Occupancy, goal: Cell, settings: RequestSettings, count: int, random: Random
 ) -> list[Cell]:
     """Draw cells, except the goal, from which a path leads to the goal; they may repeat."""
-    connected = GridMap(occupancy).reachable([goal], move_rule)
+    connected = GridMap(occupancy).reachable([goal], settings.move_rule)
     connected[goal[::-1]] = False
     cells = np.argwhere(connected)
     return [(x, y) for y, x in random.choice(cells, count).tolist()] if len(cells) else []
@@ -145,8 +139,8 @@ def read_maps(files: Sequence[Path], settings: RequestSettings) -> Iterator[Benc
             elif suffix != ".scen":
                 name = f"{'movingai' if suffix == '.map' else 'ros'} {path.stem}"
                 occupancy, random = read_map_file(path).grid().occupancy, settings.random(path.stem)
-                goals = settings.requests
-                yield _with_random_requests(name, str(path), occupancy, goals, settings, random)
+                drawn = _draw(occupancy, settings.requests, settings, random)
+                yield BenchmarkMap(name, str(path), *drawn)
         except (OSError, ValueError) as error:
             known = "" if str(path) in str(error) else f"{path}: "
             tqdm.write(f"skipped: {known}{error}", file=sys.stderr)
@@ -208,7 +202,7 @@ def _mpd_maps(path: Path, settings: RequestSettings) -> Iterator[BenchmarkMap]:
         random = settings.random(f"{path.stem}-{number}")
         goal_y, goal_x = np.unravel_index(goals[number].argmax(), occupancy.shape)
         goal = int(goal_x), int(goal_y)
-        starts = _random_starts(occupancy, goal, settings.move_rule, settings.requests, random)
+        starts = _random_starts(occupancy, goal, settings, settings.requests, random)
         requests = [(start, goal) for start in starts]
         optima = [-float(distances[number, y, x]) for x, y in starts] if known else None
         grid = settings.grid(occupancy, random)
@@ -348,7 +342,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
     add("--requests", type=int, default=200, metavar="N", help="requests per map")
     add("--costs", choices=COSTS, default="none", help="costs of free cells")
     add("--seed", type=int, default=0, help="seed of maps and requests")
-    add("--out", type=Path, metavar="FILE", help="a file for the tables, as Markdown")
     options = parser.parse_args(arguments)
     return exit_code(parser.prog, lambda: run(options))
 
@@ -382,8 +375,6 @@ def run(options: argparse.Namespace) -> int:
             f"{markdown(rollouts)}"
         )
         print(text, end="")
-        if options.out:
-            write_atomically(options.out, text.encode())
     return 130 if interrupted else 0
 
 

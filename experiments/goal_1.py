@@ -3,6 +3,7 @@
 import time
 from collections.abc import Sequence
 from dataclasses import replace
+from pathlib import Path
 from typing import Any, Final
 
 import matplotlib.pyplot as plt
@@ -10,7 +11,7 @@ import numpy as np
 from figures import draw_curves, draw_map, draw_path, save_figure
 from numpy.typing import NDArray
 from tables import median_and_range, table
-from trainings import PROFILES, Evaluations, Settings, Training, optimal_length
+from trainings import PROFILES, Evaluations, Settings, Training, optimal_length, read_csv
 
 from ddqn_planner import MoveRule, Plan, Planner
 from ddqn_planner.grid import Cell, path_length, shortest_path
@@ -41,11 +42,6 @@ def trainings(settings: Settings, variants: Sequence[str] = ("both",)) -> list[T
         for name in variants
     }
     return settings.trainings(parameters_of, [paper_scenario()])
-
-
-def ablation_trainings(settings: Settings) -> list[Training]:
-    """Return the trainings of every variant."""
-    return trainings(settings, tuple(VARIANTS))
 
 
 def convergence_row(runs: Sequence[Evaluations]) -> list[str]:
@@ -115,7 +111,7 @@ def ablation_report(settings: Settings) -> str:
         runs = {variant: settings.evaluations(f"{profile}/{variant}") for variant in VARIANTS}
         rows += [[profile, variant, *convergence_row(of)] for variant, of in runs.items()]
         edges = np.linspace(0, runs["both"][0]["step"][-1], BINS + 1)
-        rewards = {v: _rewards(settings, f"{profile}/{v}", edges) for v in VARIANTS}
+        rewards = {v: _rewards(settings.folders(f"{profile}/{v}"), edges) for v in VARIANTS}
         middle = (edges[:-1] + edges[1:]) / 2
         draw_curves(upper, middle, rewards, "environment steps", "average reward per step")
         draw_shares(lower, runs)
@@ -135,14 +131,11 @@ def draw_shares(axes: Any, runs: dict[str, list[Evaluations]]) -> None:
     axes.set_ylim(-0.05, 1.05)
 
 
-def _rewards(
-    settings: Settings, name: str, edges: NDArray[np.float64]
-) -> list[NDArray[np.float64]]:
+def _rewards(folders: Sequence[Path], edges: NDArray[Any]) -> list[NDArray[Any]]:
     """Return each seed's mean reward of the episodes that ended in each interval."""
     seeds = []
-    for folder in settings.folders(name):
-        path = folder / "episodes.csv"
-        rows = np.genfromtxt(path, delimiter=",", names=True, ndmin=1, encoding="utf-8")
+    for folder in folders:
+        rows = read_csv(folder / "episodes.csv")
         total, _ = np.histogram(rows["step"], edges, weights=rows["average_reward"])
         count, _ = np.histogram(rows["step"], edges)
         seeds.append(np.where(count > 0, total / np.maximum(count, 1), np.nan))

@@ -18,7 +18,7 @@ from ddqn_planner import Planner, QField
 from ddqn_planner.grid import MOVES, Cell, legal_moves
 from ddqn_planner.training.environment import GridVectorEnvironment, Scenario, paper_scenario
 from ddqn_planner.training.evaluation import length_ratios
-from ddqn_planner.training.networks import PropagationEncoder, PropagationModule
+from ddqn_planner.training.networks import PropagationModule
 
 # The paper's dilemma on its rebuilt map: the start and ten more cells.
 START_DEAD_END: Final[frozenset[Cell]] = frozenset(
@@ -39,11 +39,6 @@ TARGET_COLUMNS = (
 )
 
 
-def trainings(settings: Settings) -> list[Training]:
-    """Return the trainings of goal i: goal ii asks more of the same networks."""
-    return goal_1.trainings(settings)
-
-
 def free_starts(scenario: Scenario) -> NDArray[np.bool_]:
     """Return the free cells except start and end: (H, W) bool, the paper's 286."""
     starts = ~scenario.grid.occupancy
@@ -61,9 +56,9 @@ def trained_field(planner: Planner, scenario: Scenario) -> QField:
     environment = GridVectorEnvironment([scenario], MOVE_RULE, PROFILES["propagation"])
     module = PropagationModule.from_numpy(planner.network)
     cells = np.arange(scenario.grid.occupancy.size)
-    states = PropagationEncoder(environment, module).states(np.zeros_like(cells), cells)
+    module.settle(environment)
     with torch.inference_mode():
-        q_CA = module(states)
+        q_CA = module(module.states(np.zeros_like(cells), cells))
     q_AHW = q_CA.T.reshape(len(MOVES), *scenario.grid.occupancy.shape).numpy()
     return QField(scenario.goal, q_AHW, legal_moves(scenario.grid.occupancy, MOVE_RULE))
 

@@ -87,19 +87,6 @@ def trainings(settings: Settings) -> list[Training]:
     return found
 
 
-def supervised_trainings(settings: Settings) -> list[Training]:
-    """Return the trainings for `train_supervised`: the paper's networks on maps near the path."""
-    # Obstacles on the path alone can be avoided by one fixed path.
-    if Noise.NEAR_PATH not in settings.noise:
-        return []
-    parameters_of = {
-        f"near_path/{folder}/supervised": replace(parameters, steps=SUPERVISED_UPDATES)
-        for folder, parameters in networks(settings).values()
-        if parameters.network == "paper"
-    }
-    return settings.trainings(parameters_of, drawn_maps(settings, Noise.NEAR_PATH)[0])
-
-
 def train_supervised(training: Training) -> None:
     """Train a network by cross-entropy on the moves of all shortest paths, unless it was trained.
 
@@ -117,9 +104,10 @@ def train_supervised(training: Training) -> None:
     optimiser = torch.optim.Adam(trainer.network.parameters(), SUPERVISED_LEARNING_RATE)
     steps = training.parameters.steps
     decay = torch.optim.lr_scheduler.LinearLR(optimiser, 1.0, 0.05, steps)
+    trainer.network.settle(trainer.environment)
     for _ in range(steps):
         drawn = random.integers(len(cell), size=SUPERVISED_BATCH)
-        q_BA = trainer.network(trainer.encoder.states(scenario[drawn], cell[drawn]))
+        q_BA = trainer.network(trainer.network.states(scenario[drawn], cell[drawn]))
         best_BA = torch.from_numpy(best_SCA[scenario[drawn], cell[drawn]])
         # -log of the probability that softmax(Q) gives to the best moves
         best_B = q_BA.masked_fill(~best_BA, -torch.inf).logsumexp(dim=1)
@@ -155,7 +143,6 @@ def fixed_path(maps: Sequence[Scenario]) -> tuple[Cell, ...]:
 
 def report(settings: Settings) -> str:
     """Return the table of goal iii, and write its figure."""
-    in_parallel(train_supervised, supervised_trainings(settings), settings.backend)
     rows = []
     for noise in settings.noise:
         training, test = drawn_maps(settings, noise)
@@ -163,8 +150,12 @@ def report(settings: Settings) -> str:
         for label, (folder, parameters) in networks(settings).items():
             name = f"{noise.value}/{folder}"
             models[label] = settings.planners(name, KEPT)
+            # Obstacles on the path alone can be avoided by one fixed path.
             if parameters.network == "paper" and noise is Noise.NEAR_PATH:
-                models[f"{label}, supervised"] = settings.planners(f"{name}/supervised")
+                taught = {f"{name}/supervised": replace(parameters, steps=SUPERVISED_UPDATES)}
+                jobs = settings.trainings(taught, training)
+                in_parallel(train_supervised, jobs, settings.backend)
+                models[f"{label}, supervised"] = settings.planners(*taught)
         for label, planners in models.items():
             plans = [rollouts(planner, [*training, *test]) for planner in planners]
             rows.append([noise.value, label, *_columns(plans, test)])

@@ -6,25 +6,28 @@ import signal
 import time
 from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 from builtin_interfaces.msg import Time
 from client import (
+    RULE,
     SERVICE_QUALITY,
     TIMEOUT,
     Client,
+    MapFixture,
     cell_of,
+    generated_map,
     initial_pose,
     plan_request,
     pose,
+    three_maps,
     wait_for,
     wait_for_map,
 )
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseStamped
-from map_fixture import RULE, MapFixture, generated_map, three_maps
 from nav_msgs.msg import Path
 from nav_msgs.srv import GetPlan
 from processes import claim_ros_domain, memory, run_script, running_node
@@ -45,19 +48,8 @@ BURST_GOALS = 2  # as many as the fields of the greatest map that the planner ke
 REACH = 30  # cells from start to goal along an axis at most: short answers come fast
 
 
-@dataclass
-class Shared:
-    """What the processes tell each other."""
-
-    ready: Any  # a barrier
-    done: Any  # how many requests were answered or lost
-    confirmed: Any  # the number of the last map that the planner is known to have
-    published: Any  # the number of the last map that was published
-    results: Any  # of each process: milliseconds of its answers, empty ones, and errors
-
-
-def ask(seed: int, count: int, shared: Shared) -> None:
-    """Ask for plans and check each answer: the work of one process."""
+def ask(seed: int, count: int, shared: SimpleNamespace) -> None:
+    """Ask, and check each answer; the result is milliseconds, the number of empty ones, errors."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # it ends with its parent
     random, maps = np.random.default_rng(seed), three_maps()
     milliseconds: list[float] = []
@@ -99,8 +91,10 @@ def load_requests(planner: int, requests: int, clients: int) -> bool:
     """Ask a planner (a process with no other map yet) while maps change; return if all is right."""
     context, maps = multiprocessing.get_context("spawn"), three_maps()
     number = len(maps)
-    numbers = (context.Value("i"), context.Value("i", number), context.Value("i", number))
-    shared = Shared(context.Barrier(clients + 1), *numbers, context.Queue())
+    # Of the last map: its number where the planner is known to have it, and where it was published.
+    confirmed, published = context.Value("i", number), context.Value("i", number)
+    shared = SimpleNamespace(confirmed=confirmed, published=published, done=context.Value("i"))
+    shared.ready, shared.results = context.Barrier(clients + 1), context.Queue()
     processes = [
         context.Process(target=ask, args=(n, len(range(n, requests, clients)), shared), daemon=True)
         for n in range(clients)

@@ -15,8 +15,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from client import Client, ask, initial_pose, map_message, plan_request, pose, wait_for
-from map_fixture import RULE
+from client import RULE, Client, ask, initial_pose, map_message, plan_request, pose, wait_for
 from nav_msgs.msg import OccupancyGrid
 from nav_msgs.msg import Path as PathMessage
 from nav_msgs.srv import GetPlan

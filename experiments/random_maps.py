@@ -16,9 +16,11 @@ SHORTEST_STEP = 3  # cells from one wall of a room to the next: it is at least t
 EXTRA_LINKS = 0.15  # of the links outside the spanning tree are opened too
 
 Spans = list[tuple[int, int]]  # the first cell of each corridor and the cell after its last
+Random = np.random.Generator
+Integers = NDArray[np.int64]
 
 
-def _independent(share: float, shape: tuple[int, int], random: np.random.Generator) -> Occupancy:
+def _independent(share: float, shape: tuple[int, int], random: Random) -> Occupancy:
     """Occupy each cell with the same probability."""
     while True:  # a small map may have no two free cells side by side
         occupancy = random.random(shape) < share
@@ -26,7 +28,7 @@ def _independent(share: float, shape: tuple[int, int], random: np.random.Generat
             return occupancy
 
 
-def _maze(shape: tuple[int, int], random: np.random.Generator) -> Occupancy:
+def _maze(shape: tuple[int, int], random: Random) -> Occupancy:
     """Dig a tree of corridors, one cell wide, that reaches every cell of odd x and y."""
     occupancy = np.ones(shape, dtype=np.bool_)
     rows, columns = (shape[0] - 1) // 2, (shape[1] - 1) // 2
@@ -36,7 +38,7 @@ def _maze(shape: tuple[int, int], random: np.random.Generator) -> Occupancy:
     return occupancy
 
 
-def _rooms(shape: tuple[int, int], random: np.random.Generator) -> Occupancy:
+def _rooms(shape: tuple[int, int], random: Random) -> Occupancy:
     """Divide the map into rooms by walls one cell thick, with doors so that all are connected."""
     longest = int(random.integers(SHORTEST_STEP, np.clip(min(shape) // 3, SHORTEST_STEP, 15) + 1))
     y, x = (_wall_lines(0, side - 1, longest, random) for side in shape)
@@ -51,7 +53,7 @@ def _rooms(shape: tuple[int, int], random: np.random.Generator) -> Occupancy:
     return occupancy
 
 
-def _corridors(shape: tuple[int, int], random: np.random.Generator) -> Occupancy:
+def _corridors(shape: tuple[int, int], random: Random) -> Occupancy:
     """Dig L-shaped corridors, one to three cells wide, between random points of a solid block."""
     # One point in each part of the map, and links only between neighbours, keep most of it solid.
     spacing = int(random.integers(5, 11))
@@ -74,7 +76,7 @@ def _corridors(shape: tuple[int, int], random: np.random.Generator) -> Occupancy
     return occupancy
 
 
-def _dead_ends(shape: tuple[int, int], random: np.random.Generator) -> Occupancy:
+def _dead_ends(shape: tuple[int, int], random: Random) -> Occupancy:
     """Scatter U-shaped walls, each open to one of the four sides, in free space."""
     occupancy = np.zeros(shape, dtype=np.bool_)
     longest = int(np.clip(min(shape) // 3, 3, 25))
@@ -87,7 +89,7 @@ def _dead_ends(shape: tuple[int, int], random: np.random.Generator) -> Occupancy
     return occupancy
 
 
-def _office(shape: tuple[int, int], random: np.random.Generator) -> Occupancy:
+def _office(shape: tuple[int, int], random: Random) -> Occupancy:
     """Draw the plan of a building: a net of corridors, rooms along them, desks in the rooms."""
     along_x = random.random() < 0.5
     height, width = shape if along_x else shape[::-1]
@@ -123,8 +125,8 @@ def _office(shape: tuple[int, int], random: np.random.Generator) -> Occupancy:
 
 
 def _links(
-    rows: int, columns: int, extra: float, random: np.random.Generator
-) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
+    rows: int, columns: int, extra: float, random: Random
+) -> tuple[Integers, Integers, Integers, Integers]:
     """Link a lattice by a random tree and a share of the other links.
 
     Returns row and column of one end of each link, and of the other end, below it or to its right.
@@ -145,9 +147,7 @@ def _links(
     return *np.divmod(first[linked], columns), *np.divmod(second[linked], columns)
 
 
-def _wall_lines(
-    first: int, last: int, longest: int, random: np.random.Generator
-) -> NDArray[np.int64]:
+def _wall_lines(first: int, last: int, longest: int, random: Random) -> Integers:
     """Return where walls stand from the first to the last one, random steps apart."""
     steps = random.integers(SHORTEST_STEP, longest + 1, (last - first) // SHORTEST_STEP + 1)
     lines = first + np.cumsum(steps)
@@ -155,7 +155,7 @@ def _wall_lines(
 
 
 def _open_doors(
-    occupancy: Occupancy, columns: Any, tops: Any, bottoms: Any, random: np.random.Generator
+    occupancy: Occupancy, columns: Any, tops: Any, bottoms: Any, random: Random
 ) -> None:
     """Open a door of one or two cells in walls along columns, between their top and bottom rows."""
     first = random.integers(tops + 1, bottoms)
@@ -163,7 +163,7 @@ def _open_doors(
     occupancy[first, columns] = occupancy[last, columns] = False
 
 
-def _stamp(occupancy: Occupancy, pattern: Occupancy, random: np.random.Generator) -> None:
+def _stamp(occupancy: Occupancy, pattern: Occupancy, random: Random) -> None:
     """Occupy a pattern at a random place, if all cells in and around it are free."""
     height, width = pattern.shape
     top = int(random.integers(1, occupancy.shape[0] - height))
@@ -172,7 +172,7 @@ def _stamp(occupancy: Occupancy, pattern: Occupancy, random: np.random.Generator
         occupancy[top : top + height, left : left + width] = pattern
 
 
-def _corridor_spans(side: int, count: int, random: np.random.Generator) -> Spans:
+def _corridor_spans(side: int, count: int, random: Random) -> Spans:
     """Draw corridors along a side."""
     spans = []
     for index in range(count):
@@ -192,7 +192,7 @@ def _between(spans: Spans, side: int) -> Spans:
 
 
 # The function that makes each kind of map. All free cells are connected, except in random_*.
-KINDS: Final[dict[str, Callable[[tuple[int, int], np.random.Generator], Occupancy]]] = {
+KINDS: Final[dict[str, Callable[[tuple[int, int], Random], Occupancy]]] = {
     "random_10": partial(_independent, 0.1),
     "random_20": partial(_independent, 0.2),
     "random_30": partial(_independent, 0.3),
@@ -205,7 +205,7 @@ KINDS: Final[dict[str, Callable[[tuple[int, int], np.random.Generator], Occupanc
 }
 
 
-def generate_map(kind: str, shape: tuple[int, int], random: np.random.Generator) -> Occupancy:
+def generate_map(kind: str, shape: tuple[int, int], random: Random) -> Occupancy:
     """Make a random map of a kind in `KINDS` in which a path joins at least two free cells."""
     if kind not in KINDS:
         raise ValueError(f"the kind {kind!r} is unknown; give one of {', '.join(KINDS)}")
@@ -214,7 +214,7 @@ def generate_map(kind: str, shape: tuple[int, int], random: np.random.Generator)
     return KINDS[kind](shape, random)
 
 
-def gradient_costs(occupancy: Occupancy, random: np.random.Generator) -> NDArray[np.int8]:
+def gradient_costs(occupancy: Occupancy, random: Random) -> NDArray[np.int8]:
     """Return (H, W) costs that rise linearly over the map in a random direction, from 0 to 99."""
     angle = random.uniform(0, 2 * np.pi)
     y, x = np.ogrid[: occupancy.shape[0], : occupancy.shape[1]]

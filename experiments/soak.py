@@ -9,7 +9,7 @@ import tempfile
 import threading
 import time
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 from pathlib import Path
 from subprocess import Popen
@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 from builtin_interfaces.msg import Time
 from client import (
+    RULE,
     Client,
     RobotPoses,
     cell_of,
@@ -25,12 +26,12 @@ from client import (
     map_message,
     plan_request,
     pose,
+    three_maps,
     values_of,
     wait_for_map,
 )
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseStamped
-from map_fixture import RULE, three_maps
 from nav_msgs.msg import OccupancyGrid
 from nav_msgs.srv import GetPlan, LoadMap
 from processes import claim_ros_domain, memory, run_script, running_node
@@ -48,10 +49,6 @@ MINUTES, MAX_GROWTH = 30.0, 0.05
 # Seconds between two samples of the memory, events of the robot, and pieces of work.
 PERIOD, EVENT_PERIOD, PAUSE = 5.0, 10.0, 0.02
 STEADY_FIELDS = 8  # that are computed before each sample
-# How often each kind of work is drawn.
-SHARES = {"map": 1, "noise": 1, "model": 1, "parameters": 1, "bad input": 1}
-SHARES |= {"start": 3, "goal": 5, "plan": 8}
-
 NAMESPACE = "/robot"
 SOURCE = "tf" if importlib.util.find_spec("tf2_ros") else "odometry"  # of the robot's poses
 # Seconds of the clock per step; simulated seconds per second; steps from costmap to costmap;
@@ -90,39 +87,32 @@ class Work:
 
     def __call__(self) -> None:
         """Do one piece of work; count it as lost if it has no answer."""
-        (kind,) = self._draw.choices([*SHARES], [*SHARES.values()])
+        client, draw, noise = self._client, self._draw, ("scatter_obstacles", "restore_map")
+        # How often each kind of work is drawn, and what it does.
+        work: dict[str, tuple[int, Callable[[], Any]]] = {
+            "map": (1, lambda: self._load(draw.choice(self._paths))),
+            "noise": (1, lambda: client.call(Trigger, f"map_server/{draw.choice(noise)}")),
+            "model": (1, lambda: client.call(Trigger, "planner/reload_model")),
+            "parameters": (1, lambda: self._set(draw.choice([*MoveRule]), draw.randint(1, 100))),
+            "bad input": (1, self.bad_input),
+            "start": (3, lambda: client.publish("initialpose", initial_pose(self._pose()))),
+            "goal": (5, lambda: client.publish("goal_pose", self._pose())),
+            "plan": (8, lambda: client.get_plan(self._pose(), self._pose())),
+        }
+        (kind,) = draw.choices([*work], [share for share, _ in work.values()])
         self.done[kind] += 1
         try:
-            self._do(kind)
+            work[kind][1]()
         except TimeoutError:
             self.lost += 1
 
-    def _do(self, kind: str) -> None:
-        client, draw = self._client, self._draw
-        match kind:
-            case "map":
-                self._load(draw.choice(self._paths))
-            case "noise":
-                name = draw.choice(("scatter_obstacles", "restore_map"))
-                client.call(Trigger, f"map_server/{name}")
-            case "model":
-                client.call(Trigger, "planner/reload_model")
-            case "parameters":
-                rule, threshold = draw.choice([*MoveRule]).value, draw.randint(1, 100)
-                client.set_parameters("planner", move_rule=rule, occupied_threshold=threshold)
-            case "bad input":
-                self.bad_input()
-            case "start":
-                client.publish("initialpose", initial_pose(self._pose()))
-            case "goal":
-                client.publish("goal_pose", self._pose())
-            case "plan":
-                client.get_plan(self._pose(), self._pose())
+    def _set(self, rule: str, threshold: int) -> None:
+        self._client.set_parameters("planner", move_rule=rule, occupied_threshold=threshold)
 
     def settle(self) -> None:
         """Bring the nodes to the same state: the memory depends on the fields that are kept."""
-        self._client.set_parameters("planner", move_rule="", occupied_threshold=65)
-        self._do("model")  # loaded again, it forgets all fields
+        self._set("", 65)
+        self._client.call(Trigger, "planner/reload_model")  # loaded again, it forgets all fields
         loaded = self._load(self._paths[-1])
         wait_for_map(self._diagnostics, loaded.map.header.stamp)
         for steady in self._steady:
@@ -276,10 +266,7 @@ class SimulatedRobot(Client):
 
 
 def soak(
-    children: dict[str, Popen[bytes]],
-    work: Work,
-    minutes: float,
-    robot: SimulatedRobot | None = None,
+    children: Mapping[str, Popen[bytes]], work: Work, minutes: float, robot: Any = None
 ) -> dict[str, list[float]]:
     """Work for some minutes; return the resident memory of each node, MB, as time went by."""
     samples: dict[str, list[float]] = {name: [] for name in children}

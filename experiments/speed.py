@@ -5,10 +5,10 @@ import math
 import statistics
 import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import gymnasium
 import matplotlib.pyplot as plt
@@ -17,7 +17,7 @@ import numpy as np
 import pyastar2d
 import torch
 from figures import COLOURS
-from random_maps import KINDS, generate_map
+from random_maps import KINDS, Random, generate_map
 from stable_baselines3 import DQN
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from tables import report
@@ -119,90 +119,79 @@ def measure_requests(side: int) -> list[bool]:
     return missed
 
 
-class Change(NamedTuple):
-    """A map, and a patch of it that replaces some of its cells."""
-
-    occupancy: Occupancy
-    patch: Occupancy
-    x: int
-    y: int
-
-
-def flipped(occupancy: Occupancy, random: np.random.Generator, place: Cell | None = None) -> Change:
-    """Return a change of some cells around a place, or of as many all over the map."""
-    x, y = (int(np.clip(c - 2, 0, len(occupancy) - 5)) for c in place) if place else (0, 0)
-    box = (slice(y, y + 5), slice(x, x + 5)) if place else (slice(None), slice(None))
-    patch = occupancy[box].copy()
-    patch.flat[random.choice(patch.size, FLIPPED, replace=False)] ^= True
-    return Change(occupancy, patch, x, y)
+CHANGE_KINDS = (
+    "cells near the robot",
+    "cells near the goal",
+    "cells anywhere",
+    "a wall opens",
+    "a wall closes",
+    "a wall beside the goal",
+)
+Change = tuple[Occupancy, Occupancy, int, int]  # a map, and a patch of it with its x and y
 
 
-def wall(occupancy: Occupancy, path: Sequence[Cell], at: int, opens: bool) -> Change:
-    """Return the change that a wall across a path opens or closes."""
+def draw_change(kind: str, occupancy: Occupancy, path: Sequence[Cell], random: Random) -> Change:
+    """Draw a change of some cells around a place or anywhere, or of a wall across a path."""
+    if "wall" not in kind:
+        side, x, y = len(occupancy), 0, 0
+        if kind != "cells anywhere":
+            place = path[10 if "robot" in kind else -11]
+            x, y = (int(np.clip(c - 2, 0, side - 5)) for c in place)
+            side = 5
+        patch = occupancy[y : y + side, x : x + side].copy()
+        patch.flat[random.choice(patch.size, FLIPPED, replace=False)] ^= True
+        return occupancy, patch, x, y
+    at, opens = len(path) // 2, kind == "a wall opens"
+    if kind == "a wall beside the goal":
+        at, opens = len(path) - 3, random.random() < 0.5
     (x0, y0), (x, y), (x1, y1) = path[at - 2], path[at], path[at + 2]
     along_x = abs(y1 - y0) > abs(x1 - x0)
     x, y = (max(x - WALL // 2, 0), y) if along_x else (x, max(y - WALL // 2, 0))
     height, width = (1, WALL) if along_x else (WALL, 1)
-    box = slice(y, y + height), slice(x, x + width)
-    if not opens:
-        return Change(occupancy, np.ones_like(occupancy[box]), x, y)
     closed = occupancy.copy()
-    closed[box] = True
-    return Change(closed, occupancy[box], x, y)
-
-
-CHANGE_KINDS: dict[str, Callable[[Occupancy, Sequence[Cell], np.random.Generator], Change]] = {
-    "cells near the robot": lambda map_, path, random: flipped(map_, random, path[10]),
-    "cells near the goal": lambda map_, path, random: flipped(map_, random, path[-11]),
-    "cells anywhere": lambda map_, path, random: flipped(map_, random),
-    "a wall opens": lambda map_, path, random: wall(map_, path, len(path) // 2, True),
-    "a wall closes": lambda map_, path, random: wall(map_, path, len(path) // 2, False),
-    "a wall beside the goal": lambda map_, path, random: wall(
-        map_, path, len(path) - 3, random.random() < 0.5
-    ),
-}
+    closed[y : y + height, x : x + width] = True
+    before, after = (closed, occupancy) if opens else (occupancy, closed)
+    return before, after[y : y + height, x : x + width], x, y
 
 
 def plan_after(change: Change, start: Cell, goal: Cell, knows_before: bool) -> Call:
     """Return the call that plans after a change, with the plan before it or without."""
-    planner, grid = new_planner(), GridMap(change.occupancy)
+    planner, grid = new_planner(), GridMap(change[0])
     if knows_before:
         planner.plan(grid, start, goal, RULE)
     return partial(planner.plan, grid.with_patch(*change[1:]), start, goal, RULE)
 
 
-def draw_changes(map_kind: str, side: int, change_kind: str) -> list[tuple[Change, Cell, Cell]]:
+def draw_changes(map_kind: str, side: int, kind: str) -> Iterator[tuple[Change, Cell, Cell]]:
     """Draw changes that leave start and goal free, each with its start and goal."""
-    drawn: list[tuple[Change, Cell, Cell]] = []
-    random = np.random.default_rng(0)
+    random, drawn = np.random.default_rng(0), 0
     occupancy = generate_map(map_kind, (side, side), random)
-    while len(drawn) < CHANGES // len(MAP_KINDS):
+    while drawn < CHANGES // len(MAP_KINDS):
         ((start, goal),) = random_requests(occupancy, RULE, 1, random)
         path = new_planner().plan(GridMap(occupancy), start, goal, RULE).cells
-        if len(path) <= SHORTEST:
-            continue
-        change = CHANGE_KINDS[change_kind](occupancy, path, random)
-        after = GridMap(change.occupancy).with_patch(*change[1:])
-        if after.is_free(start) and after.is_free(goal):
-            drawn.append((change, start, goal))
-    return drawn
+        if len(path) > SHORTEST:
+            change = draw_change(kind, occupancy, path, random)
+            after = GridMap(change[0]).with_patch(*change[1:])
+            if after.is_free(start) and after.is_free(goal):
+                drawn += 1
+                yield change, start, goal
 
 
 def measure_replans(side: int) -> list[bool]:
     """Compare replans with a new field on the changed map, which must give the same path."""
     missed = []
-    for change_kind in CHANGE_KINDS:
+    for kind in CHANGE_KINDS:
         ratios: list[tuple[float, str, float, float]] = []
         for map_kind in MAP_KINDS:
-            for drawn in draw_changes(map_kind, side, change_kind):
+            for drawn in draw_changes(map_kind, side, kind):
                 (ms, fresh_ms), (ours, fresh) = take_turns(
                     partial(plan_after, *drawn, True), partial(plan_after, *drawn, False)
                 )
                 assert ours.cells == fresh.cells, drawn[1:]
                 ratios.append((ms / fresh_ms, map_kind, ms, fresh_ms))
-        typical, (worst, kind, ms, fresh_ms) = statistics.median(r[0] for r in ratios), max(ratios)
-        print(f"worst: {kind}, {ms:.1f} ms; new field {fresh_ms:.1f} ms")
-        figure = f"{side}x{side}, {change_kind}: replan / new, median {typical:.3f}; worst"
+        typical, (worst, on, ms, fresh_ms) = statistics.median(r[0] for r in ratios), max(ratios)
+        print(f"worst: {on}, {ms:.1f} ms; new field {fresh_ms:.1f} ms")
+        figure = f"{side}x{side}, {kind}: replan / new, median {typical:.3f}; worst"
         missed.append(report(figure, worst, "x", 2.0))
     return missed
 

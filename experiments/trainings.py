@@ -227,10 +227,12 @@ def optimal_value(environment: GridVectorEnvironment) -> NDArray[np.float32]:
     return value_C
 
 
+def read_csv(path: Path) -> NDArray[Any]:
+    """Return the columns of a file by their names."""
+    return np.genfromtxt(path, delimiter=",", names=True, ndmin=1, encoding="utf-8")
+
+
 def read_evaluations(folder: Path) -> Evaluations:
     """Read ``evaluations.csv`` of a training's folder; empty if there is none."""
     path = folder / "evaluations.csv"
-    if not path.exists():
-        return np.empty(0, [("step", np.float64)])
-    evaluations: Evaluations = np.genfromtxt(path, delimiter=",", names=True, ndmin=1)
-    return evaluations
+    return read_csv(path) if path.exists() else np.empty(0, [("step", np.float64)])

@@ -20,15 +20,9 @@ from shared import paper as paper
 from shared import small as small
 
 ROOT = Path(__file__).resolve().parent.parent
-
-
 NOBODY = 65534
-
 NOT_SOURCE = (".*", "__pycache__", "*.egg-info", "build", "dist", "install", "log", "runs")
-
-
-ANY_WORKER = {"test_cli.py", "test_demo.py"}
-"""Files whose tests take long and share nothing; the tests of another file share a worker."""
+ANY_WORKER = {"test_cli.py", "test_demo.py"}  # their tests take long, and share nothing
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from ddqn_planner.model import NETWORKS, QNetwork
+from ddqn_planner.grid import MoveRule
+from ddqn_planner.model import NETWORKS, ModelMetadata, QNetwork
+from ddqn_planner.planning import Planner
 
 
 def random_network(name: str, seed: int = 0, scale: float = 0.5, **sizes: int) -> QNetwork:
@@ -21,3 +23,10 @@ def turning_network(size: int) -> QNetwork:
     network.tensors["fully_connected.weight"][:] = 0
     network.tensors["fully_connected.bias"][:] = [1, 0, 0, 0, 2, 0, 0, 0]
     return network
+
+
+def turning_planner(size: int = 6) -> Planner:
+    """A planner with this network: its greedy steps are trapped."""
+    network = turning_network(size)
+    metadata = ModelMetadata("paper", network.sizes, MoveRule.ROBOT_SAFE, 0.9, "", 1, 0, "")
+    return Planner(network, metadata)

@@ -28,13 +28,12 @@ def grids_with_free_cell(draw: st.DrawFn) -> tuple[GridMap, tuple[int, int]]:
 @st.composite
 def grids_in_parts(draw: st.DrawFn) -> tuple[GridMap, tuple[int, int]]:
     """A map that walls and obstacles cut into parts, and one of its free cells."""
-    occupancy = draw(occupancies)
-    for column in draw(st.lists(st.integers(0, occupancy.shape[1] - 1), max_size=2)):
+    grid, (x, y) = draw(grids_with_free_cell())
+    occupancy = grid.occupancy.copy()
+    for column in draw(st.lists(st.integers(0, grid.width - 1), max_size=2)):
         occupancy[:, column] = True
-    for row in draw(st.lists(st.integers(0, occupancy.shape[0] - 1), max_size=1)):
+    for row in draw(st.lists(st.integers(0, grid.height - 1), max_size=1)):
         occupancy[row] = True
-    y = draw(st.integers(0, occupancy.shape[0] - 1))
-    x = draw(st.integers(0, occupancy.shape[1] - 1))
     occupancy[y, x] = False
     return GridMap(occupancy), (x, y)
 
@@ -56,3 +55,8 @@ def grids_with_directions(draw: st.DrawFn) -> tuple[GridMap, tuple[int, int]]:
     elements = st.sampled_from(masks) | st.integers(0, 255)
     forbidden = draw(numpy_st.arrays(np.uint8, grid.occupancy.shape, elements=elements))
     return GridMap(grid.occupancy, cost=grid.cost, forbidden=forbidden), cell
+
+
+def cells_of(grid: GridMap) -> st.SearchStrategy[tuple[int, int]]:
+    """Any cells of a map."""
+    return st.tuples(st.integers(0, grid.width - 1), st.integers(0, grid.height - 1))

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from contextlib import suppress
 from fractions import Fraction
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -104,8 +105,8 @@ def test_a_wrong_argument_is_a_value_error_that_names_it(
     call(**right)
     monkeypatch.chdir(tmp_path)
     # With an array, an enum does not get as far as its own message.
-    names = {"move_rule": "MoveRule|truth", "method": "PlanMethod|truth", "x": "first cell|point"}
-    names |= {"status": "PlanStatus|truth", "y": "first cell|point"}
+    names = dict.fromkeys(("move_rule", "method", "status"), "MoveRule|PlanMethod|PlanStatus|truth")
+    names |= dict.fromkeys("xy", "first cell|point")
     for wrong in WRONG:
         with pytest.raises(ValueError, match=f"(?s){names.get(name, name.removesuffix('s'))}"):
             call(**{**right, name: wrong})
@@ -116,14 +117,13 @@ def test_a_wrong_argument_is_a_value_error_that_names_it(
 
 @pytest.mark.parametrize(("call", "name"), ARGUMENTS)
 def test_numpy_scalars_are_numbers(call: Callable[..., Any], name: str) -> None:
-    right = CALLS[call][name]
-    values: list[Any] = []
+    right, values = CALLS[call][name], []
     if isinstance(right, bool):
         values = [np.bool_(right)]
-    elif isinstance(right, str):
-        values = [np.str_(right) if type(right) is str else right]
+    elif type(right) is str:
+        values = [np.str_(right)]
     elif isinstance(right, int | float):
-        values = [np.float32(right), np.float64(right), np.int64(right), np.uint8(right)]
+        values = [kind(right) for kind in (np.float32, np.float64, np.int64, np.uint8)]
     elif isinstance(right, tuple):
         values = [tuple(map(np.int32, right)), np.array(right), [*map(np.float32, right)]]
     for value in values:
@@ -131,11 +131,9 @@ def test_numpy_scalars_are_numbers(call: Callable[..., Any], name: str) -> None:
 
 
 def test_a_path_for_experience_is_a_path() -> None:
-    for wrong in (3, None, b"x", ["x"]):
-        calls: list[Callable[[Any], object]] = [EXPERIENCE.save, Experience.load]
-        for call in calls:
-            with pytest.raises(ValueError, match="path is"):
-                call(wrong)
+    for wrong, call in product((3, None, b"x", ["x"]), (EXPERIENCE.save, Experience.load)):
+        with pytest.raises(ValueError, match="path is"):
+            call(wrong)
 
 
 @pytest.mark.parametrize("cell", [(-1, 0), (0, -1), (7, 0), (0, 5), (10**30, 0), (0.5, 0)])

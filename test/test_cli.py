@@ -17,6 +17,7 @@ import pytest
 from PIL import Image
 from processes import executable
 
+from ddqn_planner import Planner, inflate
 from ddqn_planner.cli import main
 from ddqn_planner.grid import GridMap, MapFile, save_map
 from ddqn_planner.model import load_model
@@ -44,8 +45,7 @@ def test_plan_prints_the_papers_path_and_counts_by_its_rule(
     assert main(["plan", "dilemma", "--model", "dilemma"]) == 0
     printed = capsys.readouterr().out
     assert "length 22.97 cells, optimum 22.97 under corner_cutting" in printed
-    assert printed.count("*") == 17
-    assert printed.count("S") == printed.count("G") == 1
+    assert [printed.count(letter) for letter in "*SG"] == [17, 1, 1]
     assert main(["plan", "dilemma", "--move-rule", "unit"]) == 0
     printed = capsys.readouterr().out
     assert "length 18.00 cells, optimum 18.00 under unit" in printed
@@ -54,32 +54,46 @@ def test_plan_prints_the_papers_path_and_counts_by_its_rule(
     assert "the start is occupied" in capsys.readouterr().err
 
 
-def test_tolerance_and_clearing_radius_are_metres(
+# Options, and what they are for the library: of the map's values, of the body, of the plan.
+ASKED: dict[str, tuple[dict[str, Any], tuple[float, float], dict[str, Any]]] = {
+    "": ({}, (0, 0), {}),
+    "--occupied-threshold 60": ({"occupied_threshold": 60}, (0, 0), {}),
+    "--allow-unknown": ({"allow_unknown": True}, (0, 0), {}),
+    "--use-map-costs": ({"use_map_costs": True}, (0, 0), {}),
+    "--allow-unknown --use-map-costs": ({"allow_unknown": True, "use_map_costs": True}, (0, 0), {}),
+    "--robot-radius 0.1": ({}, (0.1, 0), {}),
+    "--clearance-weight 1": ({}, (0, 1), {}),
+    "--move-rule unit": ({}, (0, 0), {"move_rule": "unit"}),
+    "--goal 26 29 --tolerance 0.1": ({}, (0, 0), {"goal": (26, 29), "tolerance": 2}),
+    "--start 5 0": ({}, (0, 0), {"start": (5, 0)}),
+}
+
+
+CLEARED = {"start": (5, 0), "start_clearing_radius": 2}
+ASKED["--start 5 0 --start-clearing-radius 0.1"] = {}, (0, 0), CLEARED
+
+
+def test_plan_gives_what_the_library_gives_with_the_same_options(
     capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
-    path = str(tmp_path / "row.yaml")
-    for occupied, option, metres, first, last in (
-        (slice(6, 9), "--tolerance", "0.15", 0, 5),
-        (slice(0, 3), "--start-clearing-radius", "0.1", 0, 8),
-        (slice(0, 3), "--start-clearing-radius", "0.05", None, None),
-    ):
-        values = np.zeros((1, 9), dtype=np.int8)
-        values[0, occupied] = 100
-        save_map(MapFile(values, 0.05, start=(0, 0), goal=(8, 0)), path)
-        assert main(["plan", path, "--json", option, metres]) == (first is None)
-        cells = [x for x, _ in json.loads(capsys.readouterr().out)["cells"]]
-        assert (cells[:1], cells[-1:]) == (([first], [last]) if cells else ([], []))
-        assert bool(cells) == (first is not None)
-
-
-def test_plan_takes_the_model_for_any_map_and_prints_no_wide_map(
-    capsys: pytest.CaptureFixture[str],
-) -> None:
-    assert main(["plan", "office"]) == 0
-    printed = capsys.readouterr().out
-    start, length = printed.splitlines()
-    assert start == "start (15, 15), goal (550, 330), 39.50 m"
-    assert length.startswith("length 789.95 cells, optimum 789.95 under robot_safe, greedy, ")
+    random, planner, seen = np.random.default_rng(12), Planner.load("any_map"), set()
+    values = random.choice([0, 60, -1, 100], (30, 30), p=[0.8, 0.08, 0.06, 0.06])
+    values[0, 0], values[-1, -1], values[0, 5], values[-1, -4] = 0, 0, 100, 100
+    map_file = MapFile(values, 0.05, start=(0, 0), goal=(29, 29))
+    save_map(map_file, tmp_path / "map.yaml")
+    for options, (rules, body, asked) in ASKED.items():
+        grid = inflate(map_file.grid(**rules), *body)
+        plan = planner.plan(grid, **{"start": (0, 0), "goal": (29, 29), **asked})
+        command = ["plan", str(tmp_path / "map.yaml"), "--json", *options.split()]
+        assert main(command) == (0 if plan.cells else 1)
+        answer = json.loads(capsys.readouterr().out)
+        assert answer["cells"] == [list(cell) for cell in plan.cells]
+        assert (answer["status"], answer["length"]) == (plan.status.name, plan.length)
+        if plan.cells:
+            assert (answer["optimum"] is None) == (not grid.is_free(plan.cells[0]))
+            assert (answer["optimum"] or 0) <= plan.length + 1e-9
+        seen.add(plan.cells)
+    assert len(seen) == len(ASKED)  # each option counts
 
 
 def test_plan_draws_a_wide_map_for_a_terminal(
@@ -95,12 +109,14 @@ def test_plan_draws_a_wide_map_for_a_terminal(
     assert re.search(r"cost \d{4}\.\d\d, greedy", length)
 
 
-def test_plan_gives_every_cell_that_is_asked_for(
+def test_plan_gives_every_cell_that_is_asked_for_and_prints_no_wide_map(
     capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
     file = tmp_path / "path.csv"
     assert main(["plan", "office", "--cells", "--csv", str(file)]) == 0
-    *cells, _, _ = capsys.readouterr().out.splitlines()
+    *cells, start, length = capsys.readouterr().out.splitlines()
+    assert start == "start (15, 15), goal (550, 330), 39.50 m"
+    assert length.startswith("length 789.95 cells, optimum 789.95 under robot_safe, greedy, ")
     assert (cells[0], cells[-1]) == ("15 15", "550 330")
     header, *rows = file.read_text().splitlines()
     assert (header, rows[0]) == ("x,y,x_metres,y_metres", "15,15,0.775,0.775")
@@ -110,77 +126,20 @@ def test_plan_gives_every_cell_that_is_asked_for(
 
 
 def test_plan_writes_json_and_a_picture(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
-    assert main(["plan", "dilemma", "--json", "--picture", str(tmp_path / "plan.png")]) == 0
-    answer = json.loads(capsys.readouterr().out)
-    assert answer["status"] == "SUCCEEDED"
-    assert answer["cells"][0] == [6, 6]
-    assert answer["cells"][-1] == [17, 19]
-    assert answer["length"] == pytest.approx(answer["optimum"])
+    def plan(picture: str, *goal: Any) -> Any:
+        command = ["plan", "dilemma", "--json", "--picture", str(tmp_path / picture)]
+        assert main([*command, *map(str, goal)]) == 0
+        return json.loads(capsys.readouterr().out)
+
+    answer = plan("plan.png")
+    assert (answer["cells"][0], answer["cells"][-1]) == ([6, 6], [17, 19])
+    assert (answer["status"], answer["length"]) == ("SUCCEEDED", pytest.approx(answer["optimum"]))
     with Image.open(tmp_path / "plan.png") as picture:
-        colours = picture.convert("RGB").getcolors(picture.width * picture.height)
-        assert len(colours) > 100
-
-
-def test_plan_heeds_the_robots_body(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
-    values = np.zeros((11, 11), dtype=np.int8)
-    values[:7, 5] = 100
-    path = str(tmp_path / "wall.yaml")
-    save_map(MapFile(values, resolution=0.1, start=(0, 0), goal=(10, 0)), path)
-
-    def plan(*arguments: str) -> dict[str, Any]:
-        assert main(["plan", path, "--json", *arguments]) == 0
-        answer: dict[str, Any] = json.loads(capsys.readouterr().out)
-        return answer
-
-    point, body = plan(), plan("--robot-radius", "0.3")
-    assert point["length"] < body["length"] == pytest.approx(body["optimum"])
-    assert body["method"] == "greedy"
-    beside = ["--start", "4", "0", "--goal", "6", "0"]
-    near_wall, clear = plan(*beside), plan("--clearance-weight", "1", *beside)
-    assert clear["length"] > near_wall["length"]
-    assert clear["optimum"] == near_wall["optimum"]  # both are lengths
-    near = plan("--robot-radius", "0.3", "--start", "4", "3")
-    assert near["cells"][0] == [4, 3]
-    assert near["optimum"] is None
-    body_to = ["--robot-radius", "0.3", "--goal"]
-    pictures = [tmp_path / "moved.png", tmp_path / "there.png"]
-    moved = plan(*body_to, "6", "3", "--tolerance", "0.2", "--picture", str(pictures[0]))
-    assert moved["cells"][-1] == [8, 3]
-    plan(*body_to, "8", "3", "--picture", str(pictures[1]))
-    assert pictures[0].read_bytes() == pictures[1].read_bytes()  # the value is that of the end
-    for bad, named in (
-        (["--robot-radius", "-1"], "robot_radius is -1.0"),
-        (["--clearance-weight", "2"], "clearance_weight is 2.0"),
-        (["--tolerance", "nan"], "--tolerance is nan; give metres"),
-        (["--tolerance", "-1"], "--tolerance is -1.0; give metres"),
-        (["--start-clearing-radius", "-1"], "--start-clearing-radius is -1.0; give metres"),
-    ):
-        assert main(["plan", path, *bad]) == 2
-        assert named in capsys.readouterr().err
-
-
-def test_plan_reads_a_maps_values_as_the_node_does(
-    capsys: pytest.CaptureFixture[str], tmp_path: Path
-) -> None:
-    values = np.zeros((5, 5), dtype=np.int8)
-    values[:3, 1] = 60  # free below the usual threshold, and then expensive
-    values[:4, 3] = -1
-    path = str(tmp_path / "values.yaml")
-    save_map(MapFile(values), path)
-
-    def crossed(start: str, goal: str, *arguments: str) -> int:
-        """The row in which the path goes through the column between start and goal in row 2."""
-        main(["plan", path, "--json", "--start", start, "2", "--goal", goal, "2", *arguments])
-        rows: dict[int, int] = dict(json.loads(capsys.readouterr().out)["cells"])
-        return rows[int(start) + 1]
-
-    assert crossed("0", "2") == 2
-    assert crossed("0", "2", "--occupied-threshold", "61") == 2
-    assert crossed("0", "2", "--occupied-threshold", "60") == 3
-    assert crossed("0", "2", "--use-map-costs") == 3
-    assert crossed("2", "4") == 4
-    assert crossed("2", "4", "--allow-unknown") == 2
-    assert crossed("2", "4", "--allow-unknown", "--use-map-costs") == 4
+        assert len(np.unique(np.asarray(picture.convert("RGB")).reshape(-1, 3), axis=0)) > 100
+    moved = plan("moved.png", "--goal", 1, 19, "--tolerance", 9)
+    assert moved["cells"][-1] != [1, 19]
+    plan("there.png", "--goal", *moved["cells"][-1])  # the value is that of the end
+    assert (tmp_path / "moved.png").read_bytes() == (tmp_path / "there.png").read_bytes()
 
 
 def test_plan_searches_in_fallback_mode(capsys: pytest.CaptureFixture[str]) -> None:
@@ -231,20 +190,14 @@ def without(tmp_path: Path) -> Callable[..., subprocess.CompletedProcess[str]]:
     return run
 
 
-@pytest.mark.parametrize(
-    ("library", "command"),
-    [
-        ("torch", ["train", "dilemma"]),
-        ("gymnasium", ["train", "dilemma"]),
-        ("torch", ["train-any-map"]),
-    ],
-)
+@pytest.mark.parametrize("library", ["torch", "gymnasium"])
 def test_training_says_in_one_line_what_it_needs(
-    without: Any, tmp_path: Path, library: str, command: list[str]
+    without: Any, tmp_path: Path, library: str
 ) -> None:
-    done = without([library], "ddqn-planner", *command, "--out", str(tmp_path / "run"))
-    expected = f"ddqn-planner: No module named '{library}'; pip install torch gymnasium\n"
-    assert (done.stderr, done.returncode) == (expected, 2)
+    for command in (["train", "dilemma"], ["train-any-map"])[: 1 + (library == "torch")]:
+        done = without([library], "ddqn-planner", *command, "--out", str(tmp_path / "run"))
+        expected = f"ddqn-planner: No module named '{library}'; pip install torch gymnasium\n"
+        assert (done.stderr, done.returncode) == (expected, 2)
 
 
 @pytest.mark.parametrize("node", ["map_server_node", "planner_node", "trainer_node"])
@@ -255,29 +208,26 @@ def test_a_node_without_ros_says_in_one_line_how_to_get_it(without: Any, node: s
     assert done.returncode == 1
 
 
-@pytest.mark.parametrize(
-    ("arguments", "named"),
-    [
-        (["plan", "no_such_map.yaml"], "no_such_map.yaml"),
-        (["plan", "bare.yaml"], "bare.yaml names no start and goal; give --start X Y"),
-        (["plan", "dilemma", "--model", "no_such_model"], "no_such_model"),
-        (["train", "dilemma", "--gamma", "2"], r"gamma is 2\.0"),
-        (["train", "dilemma", "--start", "1", "19"], r"start \(1, 19\)"),
-    ],
-)
 def test_bad_input_ends_with_2_and_its_name(
-    capsys: pytest.CaptureFixture[str],
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    arguments: list[str],
-    named: str,
+    capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
     save_map(GridMap(np.zeros((2, 2))), "bare.yaml")
-    assert main(arguments) == 2
-    error = capsys.readouterr().err
-    assert re.search(named, error)
-    assert "Traceback" not in error
+    for command, named in (
+        ("plan no_such_map.yaml", "no_such_map.yaml"),
+        ("plan bare.yaml", "bare.yaml names no start and goal; give --start X Y"),
+        ("plan dilemma --model no_such_model", "no_such_model"),
+        ("plan dilemma --robot-radius -1", r"robot_radius is -1\.0"),
+        ("plan dilemma --clearance-weight 2", r"clearance_weight is 2\.0"),
+        ("plan dilemma --tolerance nan", "--tolerance is nan; give metres"),
+        ("plan dilemma --tolerance -1", r"--tolerance is -1\.0; give metres"),
+        ("plan dilemma --start-clearing-radius -1", r"--start-clearing-radius is -1\.0; give met"),
+        ("train dilemma --gamma 2", r"gamma is 2\.0"),
+        ("train dilemma --start 1 19", r"start \(1, 19\)"),
+    ):
+        assert main(command.split()) == 2
+        assert re.search(named, error := capsys.readouterr().err)
+        assert "Traceback" not in error
 
 
 def test_a_trained_model_plans(
@@ -309,10 +259,8 @@ def test_every_hyper_parameter_and_the_seed_can_be_given(
     assert main(["train", small_map, "--out", out, "--seed", "5", *arguments]) == 0
     trainer = Trainer.load_checkpoint(tmp_path / "run" / "checkpoint.safetensors", [small])
     assert trainer.parameters == HyperParameters(**given)
-    assert all(
-        getattr(trainer.parameters, entry.name) != entry.default
-        for entry in fields(HyperParameters)
-    )
+    defaults = {entry.name: entry.default for entry in fields(HyperParameters)}
+    assert not given.items() & defaults.items()
     assert trainer.seed == load_model(tmp_path / "run" / "model.safetensors")[1].seed == 5
 
 

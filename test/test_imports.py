@@ -40,52 +40,37 @@ def loaded(code: str) -> set[str]:
     return set(printed.split())
 
 
-@pytest.mark.parametrize(
-    "code",
-    [
-        "import ddqn_planner",
-        "import ddqn_planner.grid",
-        "import ddqn_planner.model",
-        "import ddqn_planner.planning",
-        GRID,
-        "from ddqn_planner import Experience; Experience(nominal_speed=0.5)",
-        "from ddqn_planner import Planner; Planner.load('any_map')",
-    ],
-)
-def test_no_import_of_the_core_loads_a_large_library(code: str) -> None:
-    assert not loaded(code) & {"torch", "numba", "scipy", "matplotlib", "gymnasium", "rclpy"}
+COMMAND = """
+import contextlib
+from ddqn_planner.cli import main
+with contextlib.suppress(SystemExit):
+    main("{}".split())
+"""
+LARGE = {"torch", "numba", "scipy", "matplotlib", "gymnasium", "rclpy"}
+UNUSED = {
+    "import ddqn_planner": LARGE | {"numpy"},
+    "import ddqn_planner.grid, ddqn_planner.model, ddqn_planner.planning": LARGE,
+    GRID: LARGE,
+    "from ddqn_planner import Experience; Experience(nominal_speed=0.5)": LARGE,
+    "from ddqn_planner import Planner; Planner.load('any_map')": LARGE,
+    COMMAND.format("--help"): {"numpy"},
+    COMMAND.format("plan --help"): {"rclpy", "matplotlib"},
+    COMMAND.format("plan dilemma"): {"torch", "matplotlib", "gymnasium", "tqdm"},
+    COMMAND.format("certify"): {"torch", "numba", "scipy"},
+}
 
 
-def test_the_package_itself_loads_nothing() -> None:
-    assert "numpy" not in loaded("import ddqn_planner")
+@pytest.mark.parametrize("code", UNUSED)
+def test_no_import_and_no_command_loads_a_library_that_it_does_not_need(code: str) -> None:
+    assert not loaded(code) & UNUSED[code]
 
 
 def test_a_plan_needs_numba_alone() -> None:
-    packages = loaded(PLAN)
-    assert "numba" in packages
-    assert not packages & {"torch", "matplotlib", "gymnasium", "rclpy"}
     # numba reads scipy's version, which is light.
     code = PLAN + "\nimport sys\nassert not {'scipy.ndimage', 'scipy.linalg'} & sys.modules.keys()"
-    loaded(code)
-
-
-@pytest.mark.parametrize(
-    ("arguments", "unused"),
-    [
-        (["--help"], {"numpy"}),
-        (["plan", "--help"], {"rclpy", "matplotlib"}),
-        (["plan", "dilemma"], {"torch", "matplotlib", "gymnasium", "tqdm"}),
-        (["certify"], {"torch", "numba", "scipy"}),
-    ],
-)
-def test_a_command_loads_only_what_it_needs(arguments: list[str], unused: set[str]) -> None:
-    code = "import contextlib; from ddqn_planner.cli import main\n"
-    code += f"with contextlib.suppress(SystemExit): main({arguments})"
-    assert not loaded(code) & unused
-
-
-def test_where_torch_is_missing_a_plan_is_made() -> None:
-    loaded("import sys; sys.modules['torch'] = None\n" + PLAN)
+    packages = loaded(code)
+    assert "numba" in packages
+    assert not packages & {"torch", "matplotlib", "gymnasium", "rclpy"}
 
 
 def test_the_public_names_are_known_before_they_are_loaded() -> None:
@@ -113,9 +98,7 @@ def test_compiling_is_announced_once_and_a_load_from_the_cache_is_not(tmp_path: 
     """
     environment = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path)}
     command = [sys.executable, "-c", code]
-    printed = [
-        subprocess.run(command, env=environment, check=True, stderr=subprocess.PIPE, text=True)
-        for _ in range(2)
-    ]
     words = "ddqn_planner compiles its functions, which takes some seconds; the result is kept for "
-    assert [done.stderr for done in printed] == [f"{words}the next start\n", ""]
+    for expected in (f"{words}the next start\n", ""):
+        done = subprocess.run(command, env=environment, check=True, capture_output=True, text=True)
+        assert done.stderr == expected

@@ -12,17 +12,12 @@ from zipfile import ZipFile
 
 import pytest
 
-from ddqn_planner.resources import find_map, find_resource
+from ddqn_planner.resources import find_map
 
 ROOT = Path(__file__).resolve().parent.parent
-ROOMS = [
-    "grid",
-    "model",
-    "planning",
-    "experience",
-    "training",
-    "nodes",
-]
+ROOMS = ["grid", "model", "planning", "experience", "training", "nodes"]
+TRAINING = {"torch", "gymnasium"}
+PIP = [sys.executable, "-m", "pip", "--quiet"]
 
 
 @pytest.mark.parametrize("room", ROOMS)
@@ -36,11 +31,6 @@ def test_imports_run_downwards(room: str) -> None:
             for module in modules:
                 assert not module.startswith(tuple(above)), f"{path} imports {module}"
                 assert room == "nodes" or not module.startswith("rclpy"), f"{path}: {module}"
-
-
-def test_a_missing_resource_is_named_with_those_that_are_there() -> None:
-    with pytest.raises(FileNotFoundError, match=r"'nowhere\.yaml'.*dilemma\.yaml, office"):
-        find_resource("maps", "nowhere.yaml")
 
 
 @pytest.fixture(scope="module")
@@ -57,28 +47,25 @@ def wheel(source_copy: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_the_wheel_asks_for_torch_only_to_train(wheel: Path) -> None:
     with ZipFile(wheel) as archive:
         (name,) = (name for name in archive.namelist() if name.endswith("/METADATA"))
-        needed = re.findall(
-            r"^Requires-Dist: (\w+)([^;\n]*)(.*)$", archive.read(name).decode(), re.M
-        )
-    assert {"numba", "numpy", "safetensors"} <= {
-        library for library, _, extra in needed if not extra
-    }
-    of_training = {(library, extra) for library, _, extra in needed if library in TRAINING}
+        text = archive.read(name).decode()
+    needed = set(re.findall(r"^Requires-Dist: (\w+)[^;\n]*(.*)$", text, re.M))
+    assert {(library, "") for library in ("numba", "numpy", "safetensors")} <= needed
+    of_training = {entry for entry in needed if entry[0] in TRAINING}
     assert of_training == {(library, '; extra == "train"') for library in TRAINING}
 
 
 def test_the_newest_release_of_the_changelog_is_of_the_packages_version() -> None:
     version = ElementTree.parse(ROOT / "package.xml").findtext("version")
-    released = re.search(
-        r"^## (\S+) \(\d{4}-\d\d-\d\d\)$", (ROOT / "CHANGELOG.md").read_text(), re.M
-    )
-    assert released is not None
-    assert released[1] == version
+    changes = (ROOT / "CHANGELOG.md").read_text()
+    assert re.findall(r"^## (\S+) \(\d{4}-\d\d-\d\d\)$", changes, re.M)[0] == version
 
 
-TRAINING = {"torch", "gymnasium"}
-
-PIP = [sys.executable, "-m", "pip", "--quiet"]
+WHERE = """
+import ddqn_planner
+from ddqn_planner.model import find_model
+from ddqn_planner.resources import find_map
+print(ddqn_planner.__file__, find_map("dilemma"), find_model("dilemma"))
+"""
 
 
 # --user and Debian's Python install beside another share folder than the interpreter's, as the
@@ -97,11 +84,6 @@ def test_maps_and_models_come_along_wherever_pip_installs(
         into = [option, folder]
     subprocess.run([*PIP, "--python", python, "install", "--no-deps", *into, wheel], check=True)
     (package,) = folder.glob("**/ddqn_planner/__init__.py")
-    code = (
-        "import ddqn_planner; from ddqn_planner.resources import find_map\n"
-        "from ddqn_planner.model import find_model\n"
-        "print(ddqn_planner.__file__, find_map('dilemma'), find_model('dilemma'))"
-    )
     # The libraries of this environment; its editable install of the package is not among them.
     path = [str(package.parents[1]), sysconfig.get_path("purelib")]
     environ = {**os.environ, "PYTHONPATH": os.pathsep.join(path)}
@@ -110,21 +92,16 @@ def test_maps_and_models_come_along_wherever_pip_installs(
         command = [python, *arguments]
         return subprocess.check_output(command, env=environ, cwd=tmp_path, text=True)
 
-    assert all(Path(path).is_relative_to(folder) for path in run("-c", code).split())
+    assert all(Path(path).is_relative_to(folder) for path in run("-c", WHERE).split())
     (program,) = folder.rglob("bin/ddqn-planner")
     assert "4,096" in run(program, "certify")
     for name in ("map_server_node", "planner_node", "trainer_node"):
         assert (program.parent / name).is_file()
     for name in ("maps", "models"):
         shipped = {path.name: path.read_bytes() for path in (ROOT / name).iterdir()}
-        for copy in (package.parent / name, package_share(folder) / name):
+        (marker,) = folder.glob("**/resource_index/packages/ddqn_planner")  # where ROS looks
+        for copy in (package.parent / name, marker.parents[3] / "ddqn_planner" / name):
             assert {path.name: path.read_bytes() for path in copy.iterdir()} == shipped
-
-
-def package_share(prefix: Path) -> Path:
-    """The folder in which the tools of ROS look."""
-    (marker,) = prefix.glob("**/resource_index/packages/ddqn_planner")
-    return marker.parents[3] / "ddqn_planner"
 
 
 def test_a_map_is_a_shipped_one_or_a_path() -> None:
@@ -132,8 +109,8 @@ def test_a_map_is_a_shipped_one_or_a_path() -> None:
     for name in ("dilemma", "dilemma.yaml", "package://ddqn_planner/maps/dilemma.yaml"):
         assert find_map(name).resolve() == shipped
     assert find_map("file:///somewhere/map.yaml") == Path("/somewhere/map.yaml")
-    for name in ("no_such", "package://no_such/map.yaml"):
-        with pytest.raises(FileNotFoundError, match="no_such"):
+    for name, named in (("no_such", "dilemma.yaml, office"), ("package://no_such/map.yaml", "")):
+        with pytest.raises(FileNotFoundError, match=f"no_such.*{named}"):
             find_map(name)
 
 

@@ -1,14 +1,10 @@
-"""What visits tell of places of the world: log slowness, how sure it is, and both on a map.
-
-The log slowness of a place has a normal posterior, whose prior is a nominal place. A visit tells of
-the places around it too, as far as `REACH`, along paths and not through walls.
-"""
+"""What visits tell of places of the world: log slowness, how sure it is, and both on a map."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from typing import Any, Final, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -41,20 +37,17 @@ TAIL = 0.04  # share of errors beyond each bound: not 5 %, as successive drives 
 PARTS = 256  # of a path, between which it is computed what they have in common
 CORRELATED = 5.0  # places so many sides apart have a third of their error in common
 
-STRAIGHT: Final = 5
-DIAGONAL: Final = 7
-"""Lengths of moves in whole numbers: within 4 % of the true ones."""
+STRAIGHT, DIAGONAL = 5, 7  # lengths of moves in whole numbers: within 4 % of the true ones
 
-COLUMNS: Final = ("weight", "log", "failures", "x", "y", "time")
-"""Of each place: the weight of its visits, that times their log slowness, the weight of failures,
-where it was visited first, and the driven time when the weights were last faded."""
+# Of each place: the weight of its visits, that times their log slowness, the weight of failures,
+# where it was visited first, and the driven time when the weights were last faded.
+COLUMNS = "weight", "log", "failures", "x", "y", "time"
 
 
 class Visits(NamedTuple):
-    """The places of a drive, one after the other: V of them."""
+    """The V places of a drive, one after the other: where (V, 2), and for how long (V,)."""
 
     position: Float64
-    """(V, 2): the middle of each place, metres."""
     seconds: Float64
     metres: Float64
 
@@ -69,10 +62,8 @@ class Evidence:
         self.number: dict[tuple[int, int], int] = {}
         self.table = np.zeros((0, len(COLUMNS)))
         self.noise_sums = NOISY_VISITS * NOISE, NOISY_VISITS
-        self.errors: list[float] = []
-        """Of the log times of the last drives, in standard deviations."""
-        self.spread: Spread | None = None
-        """That over the last map."""
+        self.errors: list[float] = []  # of the last drives' log times, in standard deviations
+        self.spread: Spread | None = None  # over the last map
 
     @property
     def places(self) -> int:
@@ -96,7 +87,11 @@ class Evidence:
         most = OUTLIER * np.sqrt(noise + variance)
         believed = np.clip(surprise, -most, most)
         known = weight >= 1
-        self._learn_noise(believed[known], variance[known] / noise)
+        total, count = self.noise_sums
+        total += float((believed**2 / (1 + variance / noise))[known].sum())
+        count += int(known.sum())
+        surplus = max(count / OLD_VISITS, 1)
+        self.noise_sums = total / surplus, count / surplus
         if self.spread is not None:
             self._compare(visits, self.spread)
         self.driven += float(visits.seconds.sum())
@@ -117,10 +112,11 @@ class Evidence:
         before = self.places
         keys = map(tuple, np.floor(position / self.side).astype(np.int64).tolist())
         rows = np.array([self.number.setdefault(key, len(self.number)) for key in keys])
-        self.table = with_rows(self.table, self.places)
-        fresh, first = np.unique(rows, return_index=True)
-        first = first[fresh >= before]
-        self.table[rows[first], 3:5] = position[first]
+        visited, first = np.unique(rows, return_index=True)
+        first = first[visited >= before]
+        fresh = np.zeros((len(first), len(COLUMNS)))
+        fresh[:, 3:5] = position[first]
+        self.table = np.concatenate([self.table, fresh])
         return rows
 
     def share_left(self, seconds: Any) -> Any:
@@ -139,14 +135,6 @@ class Evidence:
         self.table[places, 5] = self.driven
         return places
 
-    def _learn_noise(self, surprise: Float64, relative: Float64) -> None:
-        """Learn from log slowness minus that expected, of a variance relative to the noise."""
-        total, visits = self.noise_sums
-        total += float((surprise**2 / (1 + relative)).sum())
-        visits += len(surprise)
-        surplus = max(visits / OLD_VISITS, 1)
-        self.noise_sums = total / surplus, visits / surplus
-
     def _compare(self, visits: Visits, spread: Spread) -> None:
         """Compare the time of a drive with the one expected on the last map."""
         cells, free = cells_of(visits.position, spread.grid)
@@ -160,11 +148,8 @@ class Evidence:
         self.errors = [*self.errors, error][-KEPT:]
 
     def deviation(self, seconds: Float64, metres: Float64, variance: Float64) -> float:
-        """Return the standard deviation of the log time of a drive, from those of its parts.
-
-        Each place has a noise of its own; the log slowness of near places, whose variance is given,
-        is wrong in the same way.
-        """
+        """Return the standard deviation of the log time of a drive, from those of its parts."""
+        # Each place has a noise of its own; the log slowness of near ones is wrong in the same way.
         share = seconds / seconds.sum()
         of_visits = self.noise * (share**2 * np.maximum(self.side / metres, 1)).sum()
         weighted, at = share * np.sqrt(variance), np.cumsum(metres)
@@ -199,18 +184,8 @@ class Evidence:
         self.spread = spread
         return spread
 
-    def arrays(self) -> dict[str, Any]:
-        """Return what a file keeps."""
-        return {
-            "places": np.array(list(self.number), dtype=np.int64).reshape(-1, 2),
-            "evidence": self.table,
-            "driven": self.driven,
-            "noise": self.noise_sums,
-            "errors": np.array(self.errors),
-        }
-
     def restore(self, arrays: Mapping[str, NDArray[Any]]) -> None:
-        """Take what `arrays` gave; a ValueError if it cannot be true."""
+        """Take what a file keeps; a ValueError if it cannot be true."""
         names = ("places", "evidence", "driven", "noise", "errors")
         places, table, driven, noise, errors = given = [arrays[name] for name in names]
         if not all(array.dtype.kind in "if" and np.isfinite(array).all() for array in given):
@@ -220,37 +195,33 @@ class Evidence:
         fitting = (len(number), 2), (len(number), len(COLUMNS)), (), (2,), (errors.size,)
         if shapes != fitting or places.dtype.kind != "i":
             raise ValueError(f"its arrays do not fit: they have the shapes {shapes}")
-        far = np.abs(table[:, 3:5]) > FARTHEST
-        if (table[:, [0, 2]] < 0).any() or far.any() or (table[:, 5] > driven).any():
-            raise ValueError("its evidence cannot be true")
         total, visits = noise.tolist()
-        if total < 0 or visits <= 0:
-            raise ValueError("its noise cannot be true")
+        wrong = (table[:, [0, 2]] < 0).any() or (np.abs(table[:, 3:5]) > FARTHEST).any()
+        if wrong or (table[:, 5] > driven).any() or total < 0 or visits <= 0:
+            raise ValueError("its evidence cannot be true")
         self.number, self.table, self.driven = number, table, float(driven)
         self.noise_sums, self.errors = (total, visits), errors.tolist()
 
 
 class Spread:
-    """Evidence spread over the cells of a map.
+    """Evidence spread over the cells of a map."""
 
-    The weights of the sums are faded to the driven time `since`. All fade further by one factor, so
-    they are not spread again for it.
-    """
+    # The sums are those at the driven time `since`: they all fade further by one factor, `faded`.
 
     def __init__(self, grid: GridMap, since: float) -> None:
         shape = grid.occupancy.shape
         self.grid, self.since, self.driven = grid, since, since
         self.faded, self.noise = 1.0, NOISE
+        # Of weights of visits, of these times log slowness, and of failures.
         self.sums = np.zeros((*shape, 3), dtype=np.float32)
-        """Of weights of visits, of these times log slowness, and of failures."""
         self.slowness = np.ones(shape, dtype=np.float32)
         self.touched = np.zeros(shape, dtype=np.bool_)
-        self.table = np.zeros((0, len(COLUMNS)))
-        """What was spread of `Evidence.table`."""
+        self.table = np.zeros((0, len(COLUMNS)))  # what was spread of `Evidence.table`
 
     def update(self, evidence: Evidence, driven: float) -> None:
         """Spread what changed, less what was spread of the same places before."""
-        before = with_rows(self.table, evidence.places)
+        before = np.zeros_like(evidence.table)
+        before[: len(self.table)] = self.table
         changed = (evidence.table != before).any(axis=1)
         if changed.any():
             before, now = before[changed], evidence.table[changed]
@@ -275,11 +246,6 @@ class Spread:
         weight = np.maximum(self.sums[y, x, 0].astype(np.float64), 0) * self.faded
         variance: Float64 = 1 / (weight / self.noise + 1 / PRIOR)
         return variance
-
-
-def with_rows(table: Float64, rows: int) -> Float64:
-    """Return a table with so many rows, new ones of zeros."""
-    return table if len(table) == rows else np.pad(table, ((0, rows - len(table)), (0, 0)))
 
 
 def cells_of(position: Float64, grid: GridMap) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
@@ -321,10 +287,8 @@ def spread_evidence(
     sums: NDArray[np.float32],
     touched: NDArray[np.bool_],
 ) -> None:
-    """Add evidence (B, 3) of free cells (B, 2) to sums (H, W, 3) around them; set touched (H, W).
-
-    It becomes less with the length d of a path, not through walls: (1 - (d / reach)^2)^3.
-    """
+    """Add amounts (B, 3) of cells (B, 2) to sums (H, W, 3) around them; mark touched (H, W)."""
+    # An amount becomes less with the length d of a path, not through walls: (1 - (d / reach)^2)^3.
     height, width = occupancy.shape
     middle = int(reach) + 1  # no path within reach leads to the border
     size = 2 * middle + 1
@@ -335,16 +299,15 @@ def spread_evidence(
     best = np.empty((size, size), np.int64)
     waits = np.zeros((size, size), np.bool_)
     queue = np.empty((size * size, 2), np.int64)
-    reached = np.empty((size * size, 2), np.int64)
     for number in range(cells.shape[0]):
         left, bottom = cells[number, 0] - middle, cells[number, 1] - middle
         best[:] = furthest + 1
         best[middle, middle] = 0
-        queue[0] = reached[0] = middle
-        first, end, count = 0, 1, 1
+        queue[0] = middle
+        first, end = 0, 1
         while first != end:
-            x, y = queue[first, 0], queue[first, 1]
-            first = first + 1 if first + 1 < len(queue) else 0
+            x, y = queue[first]
+            first = (first + 1) % len(queue)
             waits[y, x] = False
             row, column = bottom + y, left + x
             for dy in range(-1, 2):
@@ -358,20 +321,18 @@ def spread_evidence(
                     corner = occupancy[row, to_column] or occupancy[to_row, column]
                     if corner or occupancy[to_row, to_column]:
                         continue
-                    if best[y + dy, x + dx] > furthest:
-                        reached[count, 0], reached[count, 1] = x + dx, y + dy
-                        count += 1
                     best[y + dy, x + dx] = length
                     if not waits[y + dy, x + dx]:
                         waits[y + dy, x + dx] = True
                         queue[end, 0], queue[end, 1] = x + dx, y + dy
-                        end = end + 1 if end + 1 < len(queue) else 0
-        for index in range(count):
-            x, y = reached[index, 0], reached[index, 1]
-            touched[bottom + y, left + x] = True
-            for kind in range(3):
-                part = share[best[y, x]] * amounts[number, kind]
-                sums[bottom + y, left + x, kind] += part
+                        end = (end + 1) % len(queue)
+        for y in range(size):
+            for x in range(size):
+                if best[y, x] <= furthest:
+                    touched[bottom + y, left + x] = True
+                    for kind in range(3):
+                        part = share[best[y, x]] * amounts[number, kind]
+                        sums[bottom + y, left + x, kind] += part
 
 
 @compiled
@@ -382,10 +343,7 @@ def refresh(
     noise: float,
     slowness: NDArray[np.float32],
 ) -> None:
-    """Compute the slowness of the touched cells; then none is touched.
-
-    Half of the noise is added, as the mean of its exponential is more than 1.
-    """
+    """Compute the slowness of the touched cells; then none is touched."""
     scale = np.log(1 + STEP)
     for y in range(touched.shape[0]):
         for x in range(touched.shape[1]):
@@ -396,6 +354,7 @@ def refresh(
             # Differences of sums may leave a rest below 0.
             weight = max(weight, np.float32(0)) * faded
             failures = max(failures, np.float32(0)) * faded
+            # Half of the noise is added, as the mean of its exponential is more than 1.
             mean = (sum_of_log * faded / noise + weight / 2) / (weight / noise + 1 / PRIOR)
             tries = (PRIOR_SUCCESSES + weight + failures) / (PRIOR_SUCCESSES + weight)
             steps = np.rint((max(mean, 0.0) + np.log(tries)) / scale)

@@ -98,10 +98,28 @@ class Experience:
         ValueError
             If the shapes or types are wrong. Values that cannot be true are left out.
         """
-        side, max_speed = self.evidence.side, 3 * self.nominal_speed
-        visits = visits_of(seconds, positions, side, max_speed, self.max_pause)
-        if len(visits.seconds):
-            self.evidence.add(visits)
+        time = numbers("seconds", seconds).astype(np.float64)
+        position = numbers("positions", positions).astype(np.float64)
+        if time.ndim != 1 or position.shape != (len(time), 2):
+            shapes = f"seconds have shape {time.shape} and positions {position.shape}"
+            raise ValueError(f"{shapes}; give (N,) and (N, 2)")
+        # Comparisons with NaN are false.
+        possible = (np.abs(time) < LATEST) & (np.abs(position) < FARTHEST).all(axis=1)
+        time, position = time[possible], position[possible]
+        fresh = np.diff(time, prepend=np.nan) != 0  # a repeated time adds nothing
+        time, position = time[fresh], position[fresh]
+        side, limits = self.evidence.side, (3 * self.nominal_speed, self.max_pause)
+        steps: list[tuple[float, float, float, float]] = []
+        for part in _believed_parts(time, position, *limits):
+            steps += _steps(time[part].tolist(), position[part].tolist(), side / 2, *limits)
+        if not steps:
+            return
+        rows = np.array(steps)
+        square = np.floor(rows[:, :2] / side)
+        begins = np.flatnonzero(np.append(True, (np.diff(square, axis=0) != 0).any(axis=1)))
+        rows[:, :2] *= rows[:, 3:]
+        sums = np.add.reduceat(rows, begins)
+        self.evidence.add(Visits(sums[:, :2] / sums[:, 3:], sums[:, 2], sums[:, 3]))
 
     def record_failure(self, position: Sequence[float]) -> None:
         """Learn that the robot failed at a place: it got stuck, was sent back, or gave up."""
@@ -167,9 +185,17 @@ class Experience:
 
     def save(self, path: str | Path) -> None:
         """Save to a file, atomically; an OSError leaves an old file unchanged."""
-        content = io.BytesIO()
-        options = [getattr(self, name) for name in OPTIONS]
-        np.savez(content, version=VERSION, options=options, **self.evidence.arrays())
+        content, evidence = io.BytesIO(), self.evidence
+        np.savez(
+            content,
+            version=VERSION,
+            options=[getattr(self, name) for name in OPTIONS],
+            places=np.array(list(evidence.number), dtype=np.int64).reshape(-1, 2),
+            evidence=evidence.table,
+            driven=evidence.driven,
+            noise=evidence.noise_sums,
+            errors=evidence.errors,
+        )
         write_atomically(as_path(path), content.getvalue())
 
     @classmethod
@@ -200,33 +226,6 @@ class Experience:
                 "delete it to begin anew"
             ) from error
         return experience
-
-
-def visits_of(
-    seconds: ArrayLike, positions: ArrayLike, side: float, max_speed: float, max_pause: float
-) -> Visits:
-    """Divide a drive into places, squares of the world; what cannot be true is left out."""
-    time = numbers("seconds", seconds).astype(np.float64)
-    position = numbers("positions", positions).astype(np.float64)
-    if time.ndim != 1 or position.shape != (len(time), 2):
-        raise ValueError(
-            f"seconds have shape {time.shape} and positions {position.shape}; give (N,) and (N, 2)"
-        )
-    # Comparisons with NaN are false.
-    possible = (np.abs(time) < LATEST) & (np.abs(position) < FARTHEST).all(axis=1)
-    time, position = time[possible], position[possible]
-    fresh = np.diff(time, prepend=np.nan) != 0  # a repeated time adds nothing
-    time, position = time[fresh], position[fresh]
-    steps: list[tuple[float, float, float, float]] = []
-    for part in _believed_parts(time, position, max_speed, max_pause):
-        drive = time[part].tolist(), position[part].tolist()
-        steps += _steps(*drive, side / 2, max_speed, max_pause)
-    rows = np.array(steps).reshape(-1, 4)
-    square = np.floor(rows[:, :2] / side)
-    is_first = np.append(len(rows) > 0, (np.diff(square, axis=0) != 0).any(axis=1))
-    rows[:, :2] *= rows[:, 3:]
-    sums = np.add.reduceat(rows, np.flatnonzero(is_first))
-    return Visits(sums[:, :2] / sums[:, 3:], sums[:, 2], sums[:, 3])
 
 
 def _believed_parts(

@@ -60,9 +60,8 @@ class GridMap:
     forbidden : (H, W) array of whole numbers 0..255, optional
         One-way zones: action a must not leave a cell where bit a is set, ``forbidden >> a & 1``.
         The actions are those of `MOVES`, in the directions of the map's own x and y. A cell may
-        always be entered, so 0b00111000 = 56 in each cell of an aisle (bits 3, 4 and 5: all moves
-        with dx = -1) lets a robot drive through it toward greater x, and not back. Directions
-        belong to the place: they stay where a cell becomes occupied or free.
+        always be entered: with 56 (bits 3, 4 and 5: all moves with dx = -1) in each cell of an
+        aisle, a robot drives through it toward greater x only. Patches keep directions.
     slowness : (H, W) float32, optional
         The expected time in each cell over that at nominal speed, 1 to 100; it multiplies the cost.
     seconds_per_cell : float, optional
@@ -155,10 +154,7 @@ class GridMap:
         cost: ArrayLike | None = None,
         obstacles: ArrayLike | None = None,
     ) -> GridMap:
-        """Return the same map with other cells from (x, y) on; this map stays as it is.
-
-        On a map that `inflate` made, the cells around the patch are not inflated: better patch the
-        map of the obstacles, and inflate it again.
+        """Return the same map with other cells from (x, y) on; patch a map before you inflate it.
 
         Parameters
         ----------
@@ -225,11 +221,7 @@ class GridMap:
 
     @cached_property
     def cost_multiplier(self) -> NDArray[np.float32]:
-        """(H, W) float32: cost of a path in each cell per cell of its length, see `move_costs`.
-
-        It grows linearly from 1 for cost 0, or without costs, to `MAX_COST_MULTIPLIER`, times the
-        slowness of the cell.
-        """
+        """(H, W) float32: what a path costs per cell of its length: 1 to 5, times the slowness."""
         if self.cost is None:
             if self.slowness is not None:
                 return self.slowness
@@ -238,11 +230,7 @@ class GridMap:
         return multiplier if self.slowness is None else multiplier * self.slowness
 
     def labels(self, move_rule: MoveRule | str) -> NDArray[np.int32]:
-        """Return the connected component of each free cell, 0 in occupied ones; it is remembered.
-
-        Two cells are in one component if a path joins them that may go against forbidden
-        directions. Components are numbered from 1, in the order of their first cells.
-        """
+        """Return (H, W) int32: each free cell's component, from 1 on, whatever is forbidden."""
         # If a diagonal move needs both side cells free, two straight moves can replace it.
         reach = int(MoveRule(move_rule).cuts_corners)
         if reach not in self._labels:
@@ -258,10 +246,7 @@ class GridMap:
     def reachable(
         self, cells: ArrayLike, move_rule: MoveRule | str, backward: bool = False
     ) -> NDArray[np.bool_]:
-        """Return (H, W) bool: some free cells (N, 2), and where paths lead that start in them.
-
-        With `backward`, they end there. A cell outside the map is a ValueError.
-        """
+        """Return (H, W) bool: where paths from some free cells (N, 2) lead, or backward, begin."""
         array, backward = cells_inside(cells, self.occupancy.shape), as_flag("backward", backward)
         if self.forbidden is None:
             labels = self.labels(move_rule)
@@ -324,11 +309,7 @@ class GridMap:
         return list(zip(columns.tolist(), rows.tolist(), strict=True))
 
     def world_to_cell(self, x: float, y: float) -> Cell:
-        """Return the cell of a point of the map frame; x and y are finite, in metres.
-
-        The lower edges of a cell belong to it, as in Nav2's costmap. The cell may lie outside the
-        map: see `contains`.
-        """
+        """Return the cell of a point, in metres; it owns its lower edges, and may lie outside."""
         origin_x, origin_y, yaw = self.origin
         dx, dy = real(x) - origin_x, real(y) - origin_y
         column = (math.cos(yaw) * dx + math.sin(yaw) * dy) / self.resolution

@@ -35,7 +35,7 @@ _short = _shortener.repr
 
 
 class MapFileError(ValueError):
-    """A map file cannot be read; the message names the wrong value and what would be right."""
+    """A map file cannot be read."""
 
 
 class MapNotFoundError(MapFileError):
@@ -99,9 +99,9 @@ def load_map(
       channel, and PNG with a transparent colour outside a palette.
     - The image must lie in the folder of the YAML file or below it, so that a map from elsewhere
       cannot name any file of this machine.
-    - The YAML may hold ``ddqn_planner: {start: [x, y], goal: [x, y], directions: FILE}``, which
-      map_server ignores: the cells of a scenario, and an image of the same size in 8-bit grey (PGM
-      or PNG), whose values are those of `GridMap.forbidden`: 0, black, where all moves are legal.
+    - The YAML may hold ``ddqn_planner: {start: [x, y], goal: [x, y], directions: FILE}``: the cells
+      of a scenario, and an image of the same size in 8-bit grey (PGM or PNG), whose values are
+      those of `GridMap.forbidden`: 0, black, where all moves are legal. map_server ignores it.
 
     Parameters
     ----------
@@ -216,7 +216,15 @@ def _read_moving_ai(path: Path) -> MapFile:
 
 
 def _read_ros(path: Path) -> MapFile:
-    document = _parse_yaml(_read_bytes(path, MAX_YAML_BYTES, MapMetadataError))
+    # BaseLoader returns each scalar as text and knows no tags and no merge keys: nothing in the
+    # file can run, or grow, when it is read. map_server converts scalars by their key too.
+    try:
+        content = _read_bytes(path, MAX_YAML_BYTES, MapMetadataError)
+        document = yaml.load(content, Loader=yaml.BaseLoader)
+    except (yaml.YAMLError, OverflowError, RecursionError) as error:
+        raise ValueError(f"not a YAML file ({' '.join(str(error).split())})") from error
+    if not isinstance(document, dict):
+        raise ValueError("not a YAML mapping; give 'key: value' lines: image, resolution, ...")
     grey, clear, _ = _read_image(path, document, "image", ("PPM", "PNG", "BMP", "JPEG"))
     mode = _choice(document, "mode", ("trinary", "scale", "raw"), "trinary")
     values = _percent_of_grey(document, mode)[grey]
@@ -297,18 +305,6 @@ def _grey(image: Any) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
     if "A" in image.getbands() or "transparency" in image.info:
         clear = np.asarray(image.convert("RGBA").getchannel("A")) < 255
     return grey.astype(np.uint8, copy=False), clear
-
-
-def _parse_yaml(content: bytes) -> dict[str, Any]:
-    # BaseLoader returns each scalar as text and knows no tags and no merge keys: nothing in the
-    # file can run, or grow, when it is read. map_server converts scalars by their key too.
-    try:
-        document = yaml.load(content, Loader=yaml.BaseLoader)
-    except (yaml.YAMLError, ValueError, OverflowError, RecursionError) as error:
-        raise ValueError(f"not a YAML file ({' '.join(str(error).split())})") from error
-    if not isinstance(document, dict):
-        raise ValueError("not a YAML mapping; give 'key: value' lines: image, resolution, ...")
-    return document
 
 
 def _choice(

@@ -9,12 +9,7 @@ from ddqn_planner.model.model_file import (
     package_version,
     save_model,
 )
-from ddqn_planner.model.networks import (
-    AnyMapQNetwork,
-    PaperQNetwork,
-    PropagationQNetwork,
-    QNetwork,
-)
+from ddqn_planner.model.networks import AnyMapQNetwork, PaperQNetwork, PropagationQNetwork, QNetwork
 
 __all__ = [
     "NETWORKS",

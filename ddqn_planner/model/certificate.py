@@ -63,12 +63,10 @@ class Certificate:
             text = f"not proved: {self.undecided:,} of {self.decisions:,} decisions are open, "
             return f"{text}{self.wrong:,} are wrong"
         text = f"proved: all {self.decisions:,} decisions, margin {self.margin:.1f}"
-        if math.isfinite(self.path_error):
-            text += (
-                f"; costs within {_percent(self.cost_error)}, "
-                f"so paths within {_percent(self.path_error)} of the optimum"
-            )
-        return text
+        if math.isinf(self.path_error):
+            return text
+        costs, paths = _percent(self.cost_error), _percent(self.path_error)
+        return f"{text}; costs within {costs}, so paths within {paths} of the optimum"
 
 
 def _percent(error: float) -> str:
@@ -94,7 +92,11 @@ def certify(
             right_PA = margin_PA > 0  # False for NaN
             least = min(least, float(margin_PA[right_PA].min(initial=math.inf)))
             pattern, action = np.nonzero(~right_PA)
-            example_B9 = _worst_costs(weight_CPA[:, pattern, action].T, patch_P9[pattern])
+            # The costs that make their bounded function least: for each free cell 0, 99 or unknown.
+            gain_K9B = weight_CPA.reshape(-1, 9, *legal_PA.shape)[:, :, pattern, action]
+            gain_K9B = np.pad(gain_K9B, ((1, 0), (0, 0), (0, 0)))
+            worst_B9 = np.array([0, OCCUPIED - 1, UNKNOWN], np.int8)[gain_K9B.argmin(axis=0)].T
+            example_B9 = np.where(patch_P9[pattern] == OCCUPIED, OCCUPIED, worst_B9)
             p_BA = network.success(network.features(example_B9, rule))
             possible = p_BA[np.arange(len(action)), action] > 0.5
             found = int(np.count_nonzero(possible != legal_PA[pattern, action]))
@@ -104,8 +106,8 @@ def certify(
             # Of all patches at once, as the planner does it: the same floats.
             tries_PA = network.tries(network.features(every_P9, rule))
             tries = max(tries, float(tries_PA[legal_in_patches(every_P9, rule)].max()))
-    least = least if least < math.inf else 0.0
-    return Certificate(decisions, undecided, wrong, least, error, tries)
+    margin = least if least < math.inf else 0.0
+    return Certificate(decisions, undecided, wrong, margin, error, tries)
 
 
 def _margins(
@@ -173,14 +175,6 @@ def _extremes(
         low_PU = low_PU + choice_2PU.min(axis=0, initial=0)
         high_PU = high_PU + choice_2PU.max(axis=0, initial=0)
     return low_PU, high_PU
-
-
-def _worst_costs(weight_BC: Float64, patch_B9: NDArray[np.int8]) -> NDArray[np.int8]:
-    """Give the free cells of patches the costs that make a weighted sum least."""
-    choice_BK9 = weight_BC.reshape(len(weight_BC), weight_BC.shape[1] // 9, 9)
-    choice_BK9 = np.concatenate([np.zeros((len(weight_BC), 1, 9)), choice_BK9], axis=1)
-    value_B9 = np.array([0, OCCUPIED - 1, UNKNOWN], dtype=np.int8)[choice_BK9.argmin(axis=1)]
-    return np.where(patch_B9 == OCCUPIED, patch_B9, value_B9)
 
 
 def _multiplier_error(

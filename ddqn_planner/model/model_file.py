@@ -88,39 +88,40 @@ def load_model(name: str | Path) -> tuple[QNetwork, ModelMetadata]:
         with path.open("rb"):  # safetensors reports an unreadable file as missing
             return _load(path)
     except OSError as error:
-        raise ModelFileError(f"{path}: cannot be read ({error}); check its rights") from None
+        problem = f"cannot be read ({error}); check its rights"
     except SafetensorError as error:
-        problem = f"cannot be read as safetensors ({error}); it is truncated or of another kind"
-        raise ModelFileError(f"{path}: {problem}: save or copy it again") from None
+        problem = f"cannot be read as safetensors ({error}); it is truncated or of another kind: "
+        problem += "save or copy it again"
+    except ValueError as error:
+        problem = str(error)
+    raise ModelFileError(f"{path}: {problem}")
 
 
 def _load(path: Path) -> tuple[QNetwork, ModelMetadata]:
     size = os.path.getsize(path)
     if size > MAX_FILE_BYTES:
-        raise ModelFileError(f"{path}: has {size} bytes; give a model of at most {MAX_FILE_BYTES}")
+        raise ValueError(f"has {size} bytes; give a model of at most {MAX_FILE_BYTES}")
     with safe_open(path, framework="np") as file:
         text = (file.metadata() or {}).get(METADATA_KEY)
         if text is None:
-            raise ModelFileError(
-                f"{path}: is safetensors, but no model of {PACKAGE} (it has no metadata "
-                f"{METADATA_KEY!r}); give a file that ddqn-planner or trainer_node saved"
+            found = (
+                f"is safetensors, but no model of {PACKAGE} (it has no metadata {METADATA_KEY!r})"
             )
+            raise ValueError(f"{found}; give a file that ddqn-planner or trainer_node saved")
         try:
             description = _parse(json.loads(text))
         except (ValueError, RecursionError) as error:
-            problem = f"its metadata is wrong ({error})"
-            raise ModelFileError(f"{path}: {problem}; train the model again") from None
+            raise ValueError(f"its metadata is wrong ({error}); train the model again") from None
         network_class, sizes = NETWORKS[description.network], description.sizes
         shapes = network_class.shapes(sizes)
         expected = {key: ("F32", [*shape]) for key, shape in shapes.items()}
         slices = {key: file.get_slice(key) for key in file.keys()}  # noqa: SIM118
-        found = {key: (part.get_dtype(), part.get_shape()) for key, part in slices.items()}
-        if expected != found:
-            problem = f"holds tensors {reprlib.repr(found)}, not {expected}"
-            raise ModelFileError(f"{path}: {problem}; train it again")
-        tensors = {key: file.get_tensor(key) for key in found}
+        held = {key: (part.get_dtype(), part.get_shape()) for key, part in slices.items()}
+        if expected != held:
+            raise ValueError(f"holds tensors {reprlib.repr(held)}, not {expected}; train it again")
+        tensors = {key: file.get_tensor(key) for key in held}
     if not all(np.isfinite(tensor).all() for tensor in tensors.values()):
-        raise ModelFileError(f"{path}: its weights are not all finite; train it again")
+        raise ValueError("its weights are not all finite; train it again")
     return network_class(sizes, tensors), description
 
 

@@ -46,16 +46,19 @@ class MoveCosts(NamedTuple):
     def on(self, grid: GridMap, patch: NDArray[Any]) -> MoveCosts:
         """Return the costs on a map, given its patches, with its directions and expected times."""
         costs = self._replace(patch=patch, width=grid.width + 2)
-        if self.terms is not None:
-            costs = costs._replace(value=_cell_values(grid))
+        if self.terms is not None and grid.cost is not None:
+            value = np.full((grid.height + 2, grid.width + 2), VALUES - 1, dtype=np.uint8)
+            inside = value[1:-1, 1:-1]
+            np.subtract(grid.cost, UNKNOWN, out=inside, casting="unsafe")
+            inside[grid.occupancy] = VALUES - 1
+            costs = costs._replace(value=value.ravel())
         if grid.forbidden is not None:
             patch, table = _with_directions(patch, self.table, np.pad(grid.forbidden, 1).ravel())
             costs = costs._replace(patch=patch, table=table)
         if grid.slowness is None:
             return costs
-        multiplier = grid.cost_multiplier
-        value = np.pad(multiplier, 1, constant_values=1).ravel()
-        return costs._replace(value=value, highest=costs.highest * float(multiplier.max()))
+        multiplier = np.pad(grid.cost_multiplier, 1, constant_values=1).ravel()
+        return costs._replace(value=multiplier, highest=costs.highest * float(multiplier.max()))
 
 
 def _with_directions(
@@ -82,16 +85,6 @@ def _occurring(values: NDArray[np.uint8]) -> NDArray[np.bool_]:
     return occurs
 
 
-def _cell_values(grid: GridMap) -> NDArray[np.uint8]:
-    """Return the value of each cell of a map with costs, with a border: (C,) uint8."""
-    assert grid.cost is not None
-    value = np.full((grid.height + 2, grid.width + 2), VALUES - 1, dtype=np.uint8)
-    inside = value[1:-1, 1:-1]
-    np.subtract(grid.cost, UNKNOWN, out=inside, casting="unsafe")
-    inside[grid.occupancy] = VALUES - 1
-    return value.ravel()
-
-
 @compiled
 def patch_numbers(occupancy: NDArray[np.bool_]) -> NDArray[np.uint16]:
     """Return each cell's patch: (C,) uint16, with bit 3 y + x where its cell (x, y) is occupied."""
@@ -111,6 +104,15 @@ def patch_numbers(occupancy: NDArray[np.bool_]) -> NDArray[np.uint16]:
             bits += 32 * here[x + 1] + 64 * above[x - 1] + 128 * above[x] + 256 * above[x + 1]
             out[x] = OCCUPIED_PATCH if here[x] else bits
     return numbers.ravel()
+
+
+def patches(occupancy: NDArray[np.bool_], cost: NDArray[np.int8] | None) -> NDArray[np.int8]:
+    """Return each cell's 3x3 patch: costs, or 0, of free cells, 100 for all others: (C, 9) int8."""
+    values = np.where(occupancy, OCCUPIED, np.int8(0) if cost is None else cost).astype(np.int8)
+    padded = np.pad(values, 1, constant_values=OCCUPIED)
+    windows = np.lib.stride_tricks.sliding_window_view(padded, (3, 3))
+    patch_C9: NDArray[np.int8] = windows.reshape(-1, 9)
+    return patch_C9
 
 
 def unique_patches(

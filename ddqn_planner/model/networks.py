@@ -20,7 +20,6 @@ from ddqn_planner.model.move_costs import (
     patch_numbers,
     unique_patches,
 )
-from ddqn_planner.model.observation import ROBOT, observation_background
 
 Array: TypeAlias = NDArray[np.float32]
 
@@ -31,6 +30,10 @@ Array: TypeAlias = NDArray[np.float32]
 # reaches 1, and its rest must not decide between paths.
 CERTAIN = 0.99
 BATCH = 2**12  # patches per evaluation: the layers' outputs then fit into a cache
+
+# The paper (section 4) uses four values and does not give them. With ours the robot stands out.
+# With a smaller value for the robot, the many obstacles outweigh it and training is less stable.
+FREE, OBSTACLE, GOAL, ROBOT = 0.0, -0.1, 1.0, 3.0
 
 
 class QNetwork(ABC):
@@ -70,6 +73,23 @@ class QNetwork(ABC):
             output_BO: Array = input_BI @ self.tensors[f"{name}.weight"].T
             output_BO += self.tensors[f"{name}.bias"]
         return output_BO
+
+
+def observation_background(occupancy: NDArray[np.bool_], goal: Cell) -> NDArray[np.float32]:
+    """Return the part of the observation that stays the same while the robot moves: (C,)."""
+    background = np.where(occupancy, OBSTACLE, FREE).astype(np.float32)
+    background[goal[1], goal[0]] = GOAL
+    return background.ravel()
+
+
+def observe(
+    background: NDArray[np.float32], cells: NDArray[np.int64], shape: tuple[int, int]
+) -> NDArray[np.float32]:
+    """Draw robots in cells (B,) into backgrounds (B, C) or (C,): the paper's input, (B, H, W)."""
+    observations = np.empty((len(cells), background.shape[-1]), dtype=np.float32)
+    observations[:] = background
+    observations[np.arange(len(cells)), cells] = ROBOT
+    return observations.reshape(-1, *shape)
 
 
 class PaperQNetwork(QNetwork):
@@ -253,7 +273,6 @@ class AnyMapQNetwork(PropagationQNetwork):
         return multiplier_BA
 
     def _proved_costs(self, move_rule: MoveRule, with_costs: bool, timed: bool) -> MoveCosts | None:
-        """Return the costs of moves without what depends on the map."""
         if not with_costs:
             return super()._proved_costs(move_rule, with_costs, timed)
         if not self.certificate(move_rule).proved:

@@ -28,17 +28,13 @@ LOOK_PERIOD = 0.1
 MAX_ARROWS = 10_000
 """Per message: more arrows take longer to make than a plan, and are too small to see."""
 
-LINE_WIDTH = 0.06
-"""In cells; larger arrows have wider lines."""
-
-HEIGHT = 0.01
-"""Metres above the map, so that the map does not hide the arrows."""
-
+LINE_WIDTH = 0.06  # in cells; larger arrows have wider lines
+HEIGHT = 0.01  # metres above the map, so that the map does not hide the arrows
 COLOUR = ColorRGBA(r=0.13, g=0.13, b=0.23, a=0.9)
 
-# Complex numbers as points, in cells: to turn is to multiply.
+# Tail, tip and the ends of the two barbs of an arrow toward +x, in cells: complex numbers as
+# points, since to turn is to multiply.
 ARROW = np.array([-0.35, 0.35, 0.1 + 0.175j, 0.1 - 0.175j])
-"""Tail, tip and the ends of the two barbs, of an arrow toward +x."""
 DIRECTIONS = np.exp(1j * np.arctan2(MOVES[:, 1], MOVES[:, 0]))
 
 
@@ -61,6 +57,12 @@ class Layer:
     message: Callable[..., Any]
     is_due: bool = False
     has_field: bool = False
+
+    def make(self, shown: Shown) -> Any:
+        """Make a message, for which the field is computed."""
+        planner, grid, goal, move_rule, header = shown
+        field = planner and planner.q_field(grid, goal, move_rule)
+        return self.message(field, grid, header)
 
 
 class FieldDisplay:
@@ -108,18 +110,12 @@ class FieldDisplay:
                 continue
             layer.is_due, layer.has_field = False, has_field
             try:
-                layer.publisher.publish(await self._worker.call(_message, layer, shown))
+                layer.publisher.publish(await self._worker.call(layer.make, shown))
             except InvalidHandle:  # cleaned up meanwhile
                 return
             except Exception as error:  # as when no memory is left: the node must survive
                 reason = f"({error!r}); give a smaller map"
                 self._logger.error(f"the {layer.name} cannot be shown {reason}")
-
-
-def _message(layer: Layer, shown: Shown) -> Any:
-    planner, grid, goal, move_rule, header = shown
-    field = planner and planner.q_field(grid, goal, move_rule)
-    return layer.message(field, grid, header)
 
 
 def policy_message(field: QField | None, grid: GridMap, header: Header) -> MarkerArray:

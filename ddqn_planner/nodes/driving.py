@@ -225,7 +225,6 @@ class Driving:
         self._tell_saved(folder)
 
     def _tell_saved(self, folder: DriveFolder) -> None:
-        """Say where the experience is, or why it could not be saved."""
         self._shown = None
         self._node.note_saving("the drives are", folder.save_error)
         if not folder.save_error:

@@ -75,9 +75,8 @@ class MapSource:
         self._topic = node.create_subscription(OccupancyGrid, "map", self._take, LATCHED).topic_name
         self._updates_topic = f"{self._topic}_updates"
         if OccupancyGridUpdate is not None:
-            node.create_subscription(
-                OccupancyGridUpdate, self._updates_topic, self._take_update, UPDATES_QUALITY
-            )
+            kind, topic = OccupancyGridUpdate, self._updates_topic
+            node.create_subscription(kind, topic, self._take_update, UPDATES_QUALITY)
         node.get_logger().info(f"waiting for a map on {self._topic}")
 
     @property
@@ -151,12 +150,9 @@ class MapSource:
         if changed & {*MAP_PARAMETERS, *BODY_PARAMETERS, "require_directions"}:
             self._read_again()
 
-    def _read(self, message: OccupancyGrid) -> GridMap:
-        return grid_from_message(message, *map(self._node.value, MAP_PARAMETERS))
-
     def _take(self, message: OccupancyGrid) -> None:
         try:
-            grid = self._read(message)
+            grid = grid_from_message(message, *map(self._node.value, MAP_PARAMETERS))
         except ValueError as error:
             self._report.refuse("map", str(error))
             return
@@ -172,7 +168,8 @@ class MapSource:
     def _read_again(self) -> None:
         """Plan on the newest map if its directions have come, else on the one in use."""
         for received in filter(None, (self._newest, self._used)):
-            if self._use(self._read(received.message), received):
+            grid = grid_from_message(received.message, *map(self._node.value, MAP_PARAMETERS))
+            if self._use(grid, received):
                 break
 
     def _use(self, grid: GridMap, received: Received) -> bool:
@@ -196,11 +193,9 @@ class MapSource:
             self._described = described
             self._node.get_logger().info(f"map of {described}")
         if OccupancyGridUpdate is None and self._node.count_publishers(self._updates_topic):
-            self._node.get_logger().warning(
-                f"{self._updates_topic} is not read: map_msgs is not installed; apt install "
-                "ros-jazzy-map-msgs, or let the map's publisher always send the full map",
-                once=True,
-            )
+            missing = "is not read: map_msgs is not installed; apt install ros-jazzy-map-msgs, or"
+            warning = f"{self._updates_topic} {missing} {REMEDY}"
+            self._node.get_logger().warning(warning, once=True)
         self._changed(frame_changed)
         return True
 
@@ -298,30 +293,26 @@ class Directions:
         if not known:
             return grid
         of_map, directions = found = (own or known)[0]
-        if directions is not None:
-            grid = self._placed(directions, of_map.frame_id, grid, header.frame_id)
+        if directions is not None and directions.forbidden is not None:
+            try:
+                offset = offset_between(directions, grid)
+            except (OverflowError, ValueError):  # too far away to have a number of cells
+                offset = None
+            if of_map.frame_id != header.frame_id or offset is None:
+                raise ValueError(
+                    f"the directions on {self._topic} are not for this map: they have the frame "
+                    f"{of_map.frame_id!r} and {directions.resolution:.6g} m per cell, the map "
+                    f"{header.frame_id!r} and {grid.resolution:.6g} m; give both one frame, and "
+                    "cells that lie on each other"
+                )
+            forbidden, (x, y) = np.zeros(grid.occupancy.shape, dtype=np.uint8), offset
+            part = directions.forbidden[max(-y, 0) :, max(-x, 0) :]
+            target = forbidden[max(y, 0) :, max(x, 0) :]
+            height, width = (min(sides) for sides in zip(part.shape, target.shape, strict=True))
+            target[:height, :width] = part[:height, :width]
+            grid = replace(grid, forbidden=forbidden)
         self.used, self._are_paired = found, bool(own)
         return grid
-
-    def _placed(self, directions: GridMap, frame: str, grid: GridMap, map_frame: str) -> GridMap:
-        """Return a map with the directions of its cells, 0 where there are none."""
-        try:
-            offset = offset_between(directions, grid)
-        except (OverflowError, ValueError):  # too far away to have a number of cells
-            offset = None
-        if frame != map_frame or offset is None:
-            raise ValueError(
-                f"the directions on {self._topic} are not for this map: they have the frame "
-                f"{frame!r} and {directions.resolution:.6g} m per cell, the map {map_frame!r} and "
-                f"{grid.resolution:.6g} m; give both one frame, and cells that lie on each other"
-            )
-        assert directions.forbidden is not None
-        forbidden, (x, y) = np.zeros(grid.occupancy.shape, dtype=np.uint8), offset
-        part = directions.forbidden[max(-y, 0) :, max(-x, 0) :]
-        target = forbidden[max(y, 0) :, max(x, 0) :]
-        height, width = (min(sides) for sides in zip(part.shape, target.shape, strict=True))
-        target[:height, :width] = part[:height, :width]
-        return replace(grid, forbidden=forbidden)
 
 
 class ExpectedTimes:

@@ -11,7 +11,6 @@ from nav_msgs.msg import Path
 from rclpy.action.server import ActionServer, CancelResponse, GoalResponse
 from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.duration import Duration
-from rclpy.task import Future
 
 from ddqn_planner.nodes.report import Outcome
 from ddqn_planner.nodes.runtime import SERVICE_QUALITY, BaseNode
@@ -50,47 +49,42 @@ def error_code(status: str, result: Any) -> int:
     return int(getattr(result, CODES.get(status, status), result.UNKNOWN))
 
 
-Plan = Callable[[Any, list[PoseStamped], str, Future], Awaitable[tuple[Path, Outcome]]]
-"""Plans from a start or None through goals, by a planner's name, until a future has an outcome."""
+GivenUp = Callable[[], Outcome | None]
+"""Returns with what outcome a request is given up now, or None."""
+
+Plan = Callable[[Any, list[PoseStamped], str, GivenUp], Awaitable[tuple[Path, Outcome]]]
+"""Plans from a start, or None, through goals, by a planner's name."""
 
 
 # Without Nav2's types, so that it can be tested where these are not installed.
 class PathAction:
     """Answers the goals of one action, of which the newest one preempts the one under way."""
 
-    def __init__(self, result: Any, is_active: Callable[[], bool], plan: Plan) -> None:
-        self._result, self._is_active, self._plan = result, is_active, plan
-        self._under_way: dict[bytes, Future] = {}
+    def __init__(self, result: Any, refusal: GivenUp, plan: Plan) -> None:
+        self._result, self._refusal, self._plan = result, refusal, plan
+        self._newest: Any = None
 
     def accept(self, goal: Any) -> GoalResponse:
-        """Reject goals while the node is not active."""
-        return GoalResponse.ACCEPT if self._is_active() else GoalResponse.REJECT
+        """Reject goals while the node refuses them."""
+        return GoalResponse.REJECT if self._refusal() else GoalResponse.ACCEPT
 
     def begin(self, handle: Any) -> None:
-        """Give up the goals under way for a new one."""
-        self._give_up(PREEMPTED, *self._under_way)
-        self._under_way[_key(handle)] = Future()
+        """Let a goal preempt the one before."""
+        self._newest = handle
         handle.execute()
-
-    def cancel(self, handle: Any) -> CancelResponse:
-        """Give up a goal."""
-        self._give_up(CANCELED, _key(handle))
-        return CancelResponse.ACCEPT
-
-    def _give_up(self, outcome: Outcome, *keys: bytes) -> None:
-        for key in keys:
-            if key in self._under_way and not self._under_way[key].done():
-                self._under_way[key].set_result(outcome)
 
     async def execute(self, handle: Any) -> Any:
         """Return the result of a goal, and set the state of its handle."""
-        began, goal, given_up = time.monotonic(), handle.request, self._under_way[_key(handle)]
+
+        def given_up() -> Outcome | None:
+            if handle.is_cancel_requested:
+                return CANCELED
+            return None if handle is self._newest else PREEMPTED
+
+        began, goal = time.monotonic(), handle.request
         start = goal.start if goal.use_start else None
         goals = [*goal.goals] if hasattr(goal, "goals") else [goal.goal]
-        try:
-            path, outcome = await self._plan(start, goals, goal.planner_id, given_up)
-        finally:
-            del self._under_way[_key(handle)]
+        path, outcome = await self._plan(start, goals, goal.planner_id, given_up)
         result = self._result(path=path)
         result.planning_time = Duration(seconds=time.monotonic() - began).to_msg()
         result.error_code = error_code(outcome.status, self._result)
@@ -105,12 +99,8 @@ class PathAction:
         return result
 
 
-def _key(handle: Any) -> bytes:
-    return bytes(handle.goal_id.uuid)
-
-
 def serve_nav2(
-    node: BaseNode, is_active: Callable[[], bool], plan: Plan, on_is_path_valid: Callable[..., Any]
+    node: BaseNode, refusal: GivenUp, plan: Plan, on_is_path_valid: Callable[..., Any]
 ) -> None:
     """Create Nav2's actions and service, or log what is missing."""
     try:
@@ -126,7 +116,7 @@ def serve_nav2(
         ("compute_path_to_pose", ComputePathToPose),
         ("compute_path_through_poses", ComputePathThroughPoses),
     ):
-        action = PathAction(kind.Result, is_active, plan)
+        action = PathAction(kind.Result, refusal, plan)
         ActionServer(
             node,
             kind,
@@ -135,7 +125,7 @@ def serve_nav2(
             callback_group=group,
             goal_callback=action.accept,
             handle_accepted_callback=action.begin,
-            cancel_callback=action.cancel,
+            cancel_callback=lambda _: CancelResponse.ACCEPT,
             result_timeout=RESULT_TIMEOUT,
             **QUEUES,
         )

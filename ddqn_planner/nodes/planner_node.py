@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ctypes
 import sys
+import time
 from collections.abc import Callable
 from contextlib import suppress
 from typing import Any
@@ -13,25 +14,17 @@ from nav_msgs.msg import Path
 from nav_msgs.srv import GetPlan
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup, ReentrantCallbackGroup
 from rclpy.parameter import Parameter
-from rclpy.task import Future
 from std_msgs.msg import Header, String
 
 from ddqn_planner.nodes.conversions import path_message, serialized_path
 from ddqn_planner.nodes.display import LOOK_PERIOD, FieldDisplay
 from ddqn_planner.nodes.lifecycle import ManagedNode
 from ddqn_planner.nodes.map_source import MapSource
-from ddqn_planner.nodes.nav2 import serve_nav2
+from ddqn_planner.nodes.nav2 import GivenUp, serve_nav2
 from ddqn_planner.nodes.parameters import PLANNER_PARAMETERS
 from ddqn_planner.nodes.poses import Frames, StartSource, check_source
 from ddqn_planner.nodes.report import NO_REQUEST, NOT_ACTIVE, Outcome, Report, RequestError
-from ddqn_planner.nodes.requests import (
-    UNCHANGED,
-    ActiveGoal,
-    ModelSource,
-    PathUnderWay,
-    Requests,
-    load,
-)
+from ddqn_planner.nodes.requests import UNCHANGED, ActiveGoal, ModelSource, PathUnderWay, Requests
 from ddqn_planner.nodes.runtime import LATCHED, STEADY, Worker, spin_until_shutdown, unless
 
 
@@ -61,8 +54,8 @@ class PlannerNode(ManagedNode):
     def _forget(self) -> None:
         """Have no map and no goal, and refuse requests."""
         self._is_configured = self._waits_for_pose = self._lacks_map = False
-        self._stopped = Future()
-        self._stopped.set_result(NOT_ACTIVE)
+        # What requests are answered, also those under way; None while the node is active.
+        self._refusal: Outcome | None = NOT_ACTIVE
         self._logged: tuple[object, ...] = ()
         self.deactivate()
 
@@ -72,9 +65,8 @@ class PlannerNode(ManagedNode):
         self._display = FieldDisplay(self)
         self._plan_publisher = self.create_publisher(Path, "plan", LATCHED)
         # In a group of its own: triggers that come while it plans make it plan once more after.
-        self._replan = self.create_guard_condition(
-            self._plan_for_active_goal, MutuallyExclusiveCallbackGroup()
-        )
+        group = MutuallyExclusiveCallbackGroup()
+        self._replan = self.create_guard_condition(self._plan_for_active_goal, group)
         self._frames = Frames(self, lambda: float(self._settings.transform_tolerance))
         self._map = MapSource(self, self._report, self._map_worker, self._on_map)
         self._start = StartSource(
@@ -94,12 +86,12 @@ class PlannerNode(ManagedNode):
         reentrant = ReentrantCallbackGroup()
         self.create_service(GetPlan, "~/get_plan", self._on_get_plan, callback_group=reentrant)
         self.create_trigger("~/reload_model", self._model.on_reload)
-        serve_nav2(self, self._is_active, self._plan_for_action, self._on_is_path_valid)
+        serve_nav2(self, lambda: self._refusal, self._plan_for_action, self._on_is_path_valid)
         self._is_configured = True
 
     def activate(self) -> None:
         """Answer requests from now on."""
-        self._stopped = Future()
+        self._refusal = None
         self._report.change()
         self._replan.trigger()
 
@@ -127,13 +119,10 @@ class PlannerNode(ManagedNode):
             await self._model.first()
             return self._model.planner is not None
         if transition in ("deactivate", "shutdown"):
-            self._stopped.set_result(NOT_ACTIVE)
+            self._refusal = NOT_ACTIVE
             while self._answering:
                 await self._requests.next_look
         return True
-
-    def _is_active(self) -> bool:
-        return not self._stopped.done()
 
     # Parameters
 
@@ -142,7 +131,7 @@ class PlannerNode(ManagedNode):
         super().check_parameters(new)
         check_source("start_source", new.get("start_source", ""), "'initialpose' or 'odometry'")
         if "model" in new and hasattr(self, "_settings"):  # a worker loads the first one
-            self._candidate = load(new["model"])
+            self._candidate = ModelSource.read(new["model"])
 
     def _apply_parameters(self, parameters: list[Parameter]) -> None:
         settings = self._settings = self.settings()
@@ -182,9 +171,9 @@ class PlannerNode(ManagedNode):
             self._report.refuse("goal_poses", "the array has no pose; give one or more")
 
     def _on_goals(self, goals: list[PoseStamped]) -> None:
-        if not self._is_active():
-            self._report.note(NOT_ACTIVE)
-            self._report.log(NOT_ACTIVE)
+        if self._refusal is not None:
+            self._report.note(self._refusal)
+            self._report.log(self._refusal)
             return
         self._report.accept("goal_poses")
         self._display.show_again()
@@ -194,7 +183,7 @@ class PlannerNode(ManagedNode):
 
     async def _on_get_plan(self, request: Any, response: Any) -> Any:
         start = request.start if request.start.header.frame_id else None
-        header, outcome = await self._answer([], start, [request.goal], request.tolerance)
+        header, outcome = await self._answer(lambda: None, start, [request.goal], request.tolerance)
         response.plan = _path(path_message, outcome, header)
         self._report.log(outcome)
         return response
@@ -204,7 +193,7 @@ class PlannerNode(ManagedNode):
         active, goals = self._active, self._active.poses
         if not goals:
             return
-        header, outcome = await self._answer([], None, goals, None, "", active)
+        header, outcome = await self._answer(lambda: None, None, goals, None, "", active)
         if outcome in (UNCHANGED, NOT_ACTIVE):
             return
         if active.is_news(outcome, header.frame_id):
@@ -219,10 +208,10 @@ class PlannerNode(ManagedNode):
         self._display.show(outcome, header)
 
     async def _plan_for_action(
-        self, start: PoseStamped | None, goals: list[PoseStamped], planner_id: str, given_up: Future
+        self, start: PoseStamped | None, goals: list[PoseStamped], name: str, given_up: GivenUp
     ) -> tuple[Path, Outcome]:
-        how = None, planner_id, self._followed
-        header, outcome = await self._answer([given_up], start, goals, *how)
+        how = start, goals, None, name, self._followed
+        header, outcome = await self._answer(given_up, *how)
         if outcome.request is not None and len(outcome.plan.path):
             self._followed.keep(outcome.plan.every_cell, outcome.request.grid, header.frame_id)
             self._plan_publisher.publish(_path(serialized_path, outcome, header))
@@ -234,19 +223,19 @@ class PlannerNode(ManagedNode):
         response.is_valid = False
         try:
             checking = self._requests.is_path_valid(request.path)
-            response.is_valid = await unless(checking, self._stopped) is True
+            response.is_valid = await unless(checking, lambda: self._refusal) is True
         except RequestError as error:
             self.get_logger().warning(f"no path to check: {error}")
         return response
 
     async def _answer(
-        self, until: list[Future], start: PoseStamped | None, goals: list[PoseStamped], *how: Any
+        self, given_up: GivenUp, start: PoseStamped | None, goals: list[PoseStamped], *how: Any
     ) -> tuple[Header, Outcome]:
-        """Plan until the node is stopped or a future is done; return the path's header, too."""
+        """Plan, unless the node stops or the request is given up; return the path's header, too."""
         self._answering += 1
         try:
             planning = self._requests.plan(start, goals, *how)
-            outcome = await unless(planning, self._stopped, *until)
+            outcome = await unless(planning, lambda: self._refusal or given_up())
         except RequestError as error:
             outcome = Outcome(error.status, str(error))
         except Exception as error:  # as when no memory is left: the node must survive
@@ -267,8 +256,8 @@ class PlannerNode(ManagedNode):
         self._report.log_paths()
         if self._is_configured:
             self._look_for_news()
-        if self._report.is_due:
-            missing = [NOT_ACTIVE.reason] if not self._is_active() else []
+        if time.monotonic() >= self._report.due:
+            missing = [self._refusal.reason] if self._refusal is not None else []
             missing += [self._map.missing] if self._is_configured else []
             missing += ["the model is being loaded"] if self._model.loading else []
             fatal = self._model.planner is None and "model" in self._report.refused

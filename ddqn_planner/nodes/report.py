@@ -6,7 +6,7 @@ import math
 import time
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
@@ -32,8 +32,6 @@ REMEDIES = {
     PlanStatus.ROLLOUT_TRAPPED: "train the model longer, or set mode to 'astar_fallback'",
 }
 
-NO_PLAN = Plan(PlanStatus.NO_PATH)
-
 
 class RequestError(ValueError):
     """There is no request for the planner; what is missing `may_come` soon in a new node."""
@@ -51,7 +49,7 @@ class Outcome:
     reason: str
     planner: Planner | None = None
     request: PlanRequest | None = None
-    plan: Plan = NO_PLAN
+    plan: Plan = field(default_factory=lambda: Plan(PlanStatus.NO_PATH))
     goal: PoseStamped | None = None  # in the map's frame
     map_stamp: str = ""  # seconds
 
@@ -156,11 +154,11 @@ class Report(Refusals):
         self.outcome = NO_REQUEST
         self._publisher = node.create_publisher(DiagnosticArray, "/diagnostics", 10)
         self._to_be_logged: list[str] = []
-        self._due = 0.0
+        self.due = 0.0  # when to publish: something changed, or `PERIOD` has passed
 
     def change(self) -> None:
         """Publish soon: something about the node changed."""
-        self._due = 0.0
+        self.due = 0.0
 
     def note(self, outcome: Outcome) -> None:
         """Keep the last outcome for the diagnostics."""
@@ -181,14 +179,9 @@ class Report(Refusals):
             self.node.get_logger().info(reason)
         self._to_be_logged.clear()
 
-    @property
-    def is_due(self) -> bool:
-        """Whether to publish: something changed, or `PERIOD` has passed."""
-        return time.monotonic() >= self._due
-
     def publish(self, fatal: bool, missing: str, more: Mapping[str, str]) -> None:
         """Publish the diagnostics; `fatal` if the node cannot plan until its user helps."""
-        self._due = time.monotonic() + PERIOD
+        self.due = time.monotonic() + PERIOD
         outcome, plan, problems = self.outcome, self.outcome.plan, self.problems()
         if missing and missing != outcome.reason:
             problems.append(missing)

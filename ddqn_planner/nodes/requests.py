@@ -34,6 +34,7 @@ from ddqn_planner.planning.plan import joined
 UNCHANGED = Outcome("UNCHANGED", "the active goal needs no new plan")
 
 T = TypeVar("T")
+Place = tuple[PoseStamped, Cell]
 
 
 @dataclass
@@ -105,22 +106,6 @@ class ActiveGoal:
         return is_news
 
 
-def load(model: str) -> tuple[Planner, str]:
-    """Return the planner of a model, and the model's file."""
-    path = find_model(model)
-    return Planner.load(path), str(path)
-
-
-def load_and_warm_up(model: str) -> tuple[Planner, str]:
-    """Load a model, and the libraries and compiled functions that most plans need."""
-    planner, path = load(model)
-    sizes = planner.metadata.sizes
-    shape = sizes.get("height", 3), sizes.get("width", 3)
-    planner.plan(GridMap(np.zeros(shape, dtype=np.bool_)), (0, 0), (shape[1] - 1, shape[0] - 1))
-    gc.freeze()  # a collection of all that would stop the node for 45 ms
-    return planner, path
-
-
 def move_rule(rule: str, planner: Planner) -> MoveRule:
     """Return a rule by its name, or the rule of the model if the name is empty."""
     return MoveRule(rule or planner.metadata.move_rule)
@@ -136,9 +121,22 @@ class ModelSource:
         # The first model, while it is being loaded.
         self.loading: Future | None = None
 
+    @staticmethod
+    def read(model: str, warms_up: bool = False) -> tuple[Planner, str]:
+        """Return a model's planner and file; warm up the libraries and functions of plans."""
+        path = find_model(model)
+        planner = Planner.load(path)
+        if warms_up:
+            sizes = planner.metadata.sizes
+            shape = sizes.get("height", 3), sizes.get("width", 3)
+            corner = shape[1] - 1, shape[0] - 1
+            planner.plan(GridMap(np.zeros(shape, dtype=np.bool_)), (0, 0), corner)
+            gc.freeze()  # a collection of all that would stop the node for 45 ms
+        return planner, str(path)
+
     def load(self) -> None:
         """Begin to load the first model."""
-        self.loading = self._worker.call(load_and_warm_up, self._node.value("model"))
+        self.loading = self._worker.call(self.read, self._node.value("model"), True)
 
     async def first(self) -> None:
         """Wait for the first model, and use it unless another one was set since."""
@@ -165,8 +163,7 @@ class ModelSource:
     def set(self, name: str) -> str:
         """Set the node's parameter, which loads the model; return why it was refused."""
         (result,) = self._node.set_parameters([Parameter("model", value=name)])
-        reason: str = result.reason
-        return reason
+        return str(result.reason)
 
     def on_saved(self, message: String) -> None:
         """Use a model that the trainer saved."""
@@ -196,7 +193,7 @@ class ModelSource:
         }
 
     def forget(self) -> None:
-        """Free the model and its fields, with what `load_and_warm_up` kept from collection."""
+        """Free the model and its fields, with what `read` kept from collection."""
         self.planner, self.file, self.loading = None, "", None
         gc.unfreeze()
         gc.collect()
@@ -261,12 +258,17 @@ class Requests:
             if next_request is None:
                 return UNCHANGED
             request = next_request
-        plans = [await self._plan_one(planner, request)]
-        for cell in more:
-            if not len(plans[-1].path):
+        plans: list[Plan] = []
+        for cell in (request.goal, *more):
+            if plans:
+                request = replace(request, start=plans[-1].cells[-1], goal=cell)
+            steps = planner.steps(request)
+            plan = next(steps)
+            while plan is None:  # a slow step follows; between two of them others have a turn
+                plan = await self.worker.run(next, steps)
+            plans.append(plan)
+            if not len(plan.path):
                 break
-            request = replace(request, start=plans[-1].cells[-1], goal=cell)
-            plans.append(await self._plan_one(planner, request))
         plan, number = joined(plans), len(plans)
         before, goal = poses[number - 1 : number + 1]
         if request.others and plan.goal in request.goals:
@@ -301,16 +303,7 @@ class Requests:
             raise RequestError("NO_MODEL", f"no model is loaded: {refused}")
         return header, await inflated, planner
 
-    async def _plan_one(self, planner: Planner, request: PlanRequest) -> Plan:
-        steps = planner.steps(request)
-        plan = next(steps)
-        while plan is None:  # a slow step follows; between two of them others have a turn
-            plan = await self.worker.run(next, steps)
-        return plan
-
-    async def _in_map(
-        self, name: str, stamped: PoseStamped, grid: GridMap, frame: str
-    ) -> tuple[PoseStamped, Cell]:
+    async def _in_map(self, name: str, stamped: PoseStamped, grid: GridMap, frame: str) -> Place:
         """Return a pose in the map's frame, whose transform is waited for, and its cell."""
         self._check_pose(name, stamped, frame)
         deadline = time.monotonic() + self.settings.transform_tolerance

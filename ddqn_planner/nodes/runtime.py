@@ -229,7 +229,6 @@ class BaseNode(Node):
         return DiagnosticArray(header=self.header(), status=[status])
 
     def _topic_problems(self) -> Iterator[str]:
-        """Say which publishers are not received, and that odometry has several."""
         for subscription in self.subscriptions:
             topic = subscription.topic_name
             # To count is cheap; to ask who they are is not.
@@ -306,15 +305,17 @@ def _make_calls(calls: queue.SimpleQueue[Callable[[], None] | None]) -> None:
 
 
 @coroutine
-def unless(calls: Coroutine[None, None, Any], *given_up: Future) -> Generator[None, None, Any]:
-    """Await a coroutine; or as soon as a future is done, close it and have that future's result."""
-    while not any(future.done() for future in given_up):
+def unless(
+    calls: Coroutine[None, None, Any], given_up: Callable[[], Any]
+) -> Generator[None, None, Any]:
+    """Await a coroutine; or as soon as a function returns something, close it and return that."""
+    while not (instead := given_up()):
         try:
             yield calls.send(None)
         except StopIteration as end:
             return end.value
     calls.close()
-    return next(future.result() for future in given_up if future.done())
+    return instead
 
 
 HELP = """\

@@ -64,9 +64,8 @@ class TrainerNode(LearningNode):
         self._hyper_parameters(new)
 
     def _hyper_parameters(self, new: dict[str, Any]) -> HyperParameters:
-        return HyperParameters(
-            **{name: new.get(name, self.value(name)) for name in HYPER_PARAMETERS}
-        )
+        values = {name: new.get(name, self.value(name)) for name in HYPER_PARAMETERS}
+        return HyperParameters(**values)
 
     def _read_map_file(self) -> None:
         name = self.value("map_file")
@@ -162,7 +161,6 @@ class TrainerNode(LearningNode):
         return self.replay(file, episodes, partial(self._publish_cells, place=place), "train on")
 
     async def _train(self, run: TrainingRun, place: MapInFrame) -> None:
-        """Train until the end or ~/stop."""
         steps, announced, ends = run.steps(), run.saved_at, ""
         try:
             while not ends:

@@ -2,7 +2,7 @@
 
 from ddqn_planner.planning.field import QField
 from ddqn_planner.planning.paths import simplify
-from ddqn_planner.planning.plan import Plan, PlanMethod, PlanRequest, PlanStatus, joined
+from ddqn_planner.planning.plan import Plan, PlanMethod, PlanRequest, PlanStatus
 from ddqn_planner.planning.planner import Planner
 
 __all__ = [
@@ -12,6 +12,5 @@ __all__ = [
     "PlanStatus",
     "Planner",
     "QField",
-    "joined",
     "simplify",
 ]

@@ -25,7 +25,6 @@ REPAIRED = 100  # cells that a repair may take back before a new field is begun
 # back takes longer, and it is visited again. See docs/benchmarks.md.
 VISITS = 8
 REPAIRED_SHARE = 0.02  # of the map's cells that a repair may take back
-
 CHANGED_SHARE = 0.02  # of the map's cells may have changed: with more, a new field is cheaper
 LAYERS = "occupancy", "cost", "forbidden", "slowness"  # of a map: what its moves depend on
 SAME_PLACE = 0.01  # cells that a shift may be off whole ones: messages' resolution is float32
@@ -46,9 +45,6 @@ class QField:
         The rule by which they are legal.
     """
 
-    q: NDArray[np.float32]
-    legal: NDArray[np.bool_]
-
     def __init__(
         self,
         goal: Cell,
@@ -56,10 +52,11 @@ class QField:
         legal: NDArray[np.bool_],
         move_rule: MoveRule = MoveRule.ROBOT_SAFE,
     ) -> None:
-        self.q = numbers("q", q)
+        self.q: NDArray[np.float32] = numbers("q", q)
         if self.q.ndim != 3 or len(self.q) != len(MOVES) or not self.q.size:
             raise ValueError(f"q has shape {self.q.shape}; give (8, H, W)")
-        self.legal, self.move_rule = numbers("legal", legal, self.q.shape, "b"), MoveRule(move_rule)
+        self.legal: NDArray[np.bool_] = numbers("legal", legal, self.q.shape, "b")
+        self.move_rule = MoveRule(move_rule)
         self.goal = cell_inside(goal, self.q.shape[1:], "the goal")
         self.goals: Goals = (self.goal,)
 
@@ -74,13 +71,9 @@ class QField:
     @cached_property
     def policy(self) -> NDArray[np.int8]:
         """(H, W) int8: the legal action of the greatest Q; -1 where that is -inf."""
-        best = np.full(self.q.shape[1:], -np.inf, dtype=np.float32)
-        policy = np.full(self.q.shape[1:], -1, dtype=np.int8)
-        for action, (q, legal) in enumerate(zip(self.q, self.legal, strict=True)):
-            better = legal & (q > best)
-            np.copyto(best, q, where=better)
-            np.copyto(policy, action, where=better)
-        return policy
+        legal_q = np.where(self.legal & (self.q > -np.inf), self.q, np.float32(-np.inf))  # no NaN
+        best = np.where(legal_q.max(axis=0) > -np.inf, legal_q.argmax(axis=0), -1)
+        return best.astype(np.int8)
 
     @property
     def nbytes(self) -> int:
@@ -101,12 +94,8 @@ class QField:
     def rollout(self, start: Cell) -> Plan:
         """Take greedy steps from a free cell until the goal, and return the path.
 
-        The plan is ROLLOUT_TRAPPED as soon as a cell is entered again: the steps would repeat.
-
-        Raises
-        ------
-        ValueError
-            If the start is no cell of the map.
+        The plan is ROLLOUT_TRAPPED as soon as a cell is entered again: the steps would repeat. A
+        start that is no cell of the map is a ValueError.
         """
         began, policy, steps = time.perf_counter(), self.policy, MOVES.tolist()
         cell = cell_inside(start, policy.shape, "the start")
@@ -118,11 +107,8 @@ class QField:
                 return Plan(PlanStatus.ROLLOUT_TRAPPED, move_rule=self.move_rule)
             visited.add(cell)
             cells.append(cell)
-        return self._succeeded(np.array(cells), began)
-
-    def _succeeded(self, path: NDArray[Any], began: float) -> Plan:
         ms = 1e3 * (time.perf_counter() - began)
-        return Plan(PlanStatus.SUCCEEDED, path, move_rule=self.move_rule, rollout_ms=ms)
+        return Plan(PlanStatus.SUCCEEDED, np.array(cells), move_rule=self.move_rule, rollout_ms=ms)
 
 
 class Known(NamedTuple):
@@ -200,7 +186,8 @@ class DistanceField(QField):
                 return Plan(status, move_rule=self.move_rule)
             began = time.perf_counter()
             path = kernels.roll_out(self.known.distance, self.costs, self._number(start))
-        return self._succeeded(path, began)
+        ms = 1e3 * (time.perf_counter() - began)
+        return Plan(PlanStatus.SUCCEEDED, path, move_rule=self.move_rule, rollout_ms=ms)
 
     def take_over(self, old: DistanceField, shift: Cell, start: Cell | None = None) -> bool:
         """Repair and take what an older field of the place knows, unless to begin is quicker."""
@@ -231,7 +218,7 @@ class DistanceField(QField):
         """Return the distance of every cell of the padded map, 0 where there is none: (C,)."""
         if not self.is_whole:
             distance, state, opened, _ = self._take()
-            opened, _ = kernels.grow(distance, state, opened, self.costs)
+            opened, _ = kernels.grow(distance, state, opened, self.costs, 0, 2**62)
             self.known = Known(distance, state, opened)
         return self.known.distance
 
@@ -239,7 +226,8 @@ class DistanceField(QField):
     def q(self) -> NDArray[np.float32]:  # type: ignore[override]
         """(8, H, W) float32: Q(s, a); -inf where no path to the goal begins with the action."""
         with self._lock:
-            return kernels.q_of(self._whole(), self.costs)
+            q = kernels.q_of(self._whole(), self.costs)
+        return q.reshape(8, -1, self.costs.width)[:, 1:-1, 1:-1]
 
     @cached_property
     def legal(self) -> NDArray[np.bool_]:  # type: ignore[override]
@@ -262,7 +250,8 @@ class DistanceField(QField):
     def policy(self) -> NDArray[np.int8]:
         """(H, W) int8: the action of a rollout in each cell; -1 without one."""
         with self._lock:
-            return kernels.policy_of(self._whole(), self.costs)
+            policy = kernels.policy_of(self._whole(), self.costs)
+        return policy.reshape(-1, self.costs.width)[1:-1, 1:-1]
 
     @property
     def nbytes(self) -> int:
@@ -286,9 +275,8 @@ def network_field(network: QNetwork, grid: GridMap, goal: Cell, move_rule: MoveR
 
 def shift_between(old: GridMap, new: GridMap) -> Cell | None:
     """Return by how many cells a map has moved in a newer one with the same layers, or None."""
-    for layer in LAYERS:
-        if (getattr(old, layer) is None) != (getattr(new, layer) is None):
-            return None
+    if any((getattr(old, layer) is None) != (getattr(new, layer) is None) for layer in LAYERS):
+        return None
     return offset_between(old, new)
 
 

@@ -9,13 +9,7 @@ from dataclasses import dataclass, field
 from ddqn_planner.grid import Cell, GridMap, MoveRule
 from ddqn_planner.model import QNetwork
 from ddqn_planner.model.move_costs import MoveCosts
-from ddqn_planner.planning.field import (
-    DistanceField,
-    Goals,
-    QField,
-    network_field,
-    shift_between,
-)
+from ddqn_planner.planning.field import DistanceField, Goals, QField, network_field, shift_between
 
 CACHE_BYTES = 2**29  # for a planner's Q fields: 14 of 2000 x 2000 cells, at 9 bytes per cell
 
@@ -65,8 +59,7 @@ class FieldCache:
             found = known.fields.get(goals)
         if found is None:
             if known.costs is None:
-                (goal,) = goals
-                found = network_field(self.network, grid, goal, rule)
+                found = network_field(self.network, grid, goals[0], rule)
             else:
                 found = DistanceField(goals, grid, known.costs, rule)
                 self._repair(known, found, start)
@@ -117,17 +110,14 @@ class FieldCache:
             self._use(known, used)
             size = sum(other.nbytes for other in self._maps)
             while size > self.nbytes and (len(self._maps) > 1 or len(known.fields) > 1):
-                oldest = self._maps[0]
-                size -= oldest.nbytes
-                oldest.fields.popitem(last=False)
-                if oldest.fields:
-                    size += oldest.nbytes
-                else:
-                    del self._maps[0]
+                _, forgotten = self._maps[0].fields.popitem(last=False)
+                size -= forgotten.nbytes
+                if not self._maps[0].fields:
+                    size -= self._maps.pop(0).nbytes
 
     def _use(self, known: _KnownMap, used: QField) -> None:
         """Put a map and its field where those lie that were used last."""
         known.fields[used.goals] = used
         known.fields.move_to_end(used.goals)
-        self._maps = [other for other in self._maps if other is not known and other.fields]
-        self._maps.append(known)
+        others = (other for other in self._maps if other is not known and other.fields)
+        self._maps = [*others, known]

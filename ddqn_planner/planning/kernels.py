@@ -15,16 +15,14 @@ from ddqn_planner.model.move_costs import MAX_MULTIPLIER, MoveCosts
 Distances = NDArray[np.float64]
 States = NDArray[np.uint8]
 Cells = NDArray[np.int32]
+Bounds = tuple[float, float]
 
 # Cells are numbers of a padded map, see `MoveCosts`. Distances are the least costs of paths to the
 # goal, in float64, as float32 would lose the order of neighbours above some 10^6.
 
 # States. The distance of an open cell may fall; that of a closed one is the least. Until a cell is
 # reached its distance is 0: then pages of memory that no request needs are never touched.
-UNREACHED: Final = 0
-OPEN: Final = 1
-CLOSED: Final = 2
-MARKED: Final = 4
+UNREACHED, OPEN, CLOSED, MARKED = 0, 1, 2, 4
 
 AT_GOAL: Final = 5e-324  # the goal's distance: not 0, and as good as 0 in every sum
 BUCKETS: Final = 2  # per unit of cost; more mean fewer visits of cells that a start does not need
@@ -65,19 +63,15 @@ def cost_of(
 
 
 def grow(
-    distance: Distances,
-    state: States,
-    opened: Cells,
-    costs: MoveCosts,
-    start: int | None = None,
-    limit: int = 2**62,
+    distance: Distances, state: States, opened: Cells, costs: MoveCosts, start: int, limit: int
 ) -> tuple[Cells, bool]:
     """Close cells until a start's distance is known; return the open ones, and whether done."""
     # In the order of A*, so that few cells are visited (resumable reverse A*, Silver 2005). Buckets
     # hold the cells of about the same order (Dial 1969).
-    if start is None:
-        # Dijkstra, toward a cell of the border. One bucket per unit: no move costs less than 1.
-        start, bounds, buckets = 0, (0.0, 0.0), 1
+    if start == 0:
+        # All of the map (Dijkstra), as no path reaches this cell of the border. One bucket per unit
+        # is enough: no move costs less than 1.
+        bounds, buckets = (0.0, 0.0), 1
     else:  # lower bounds, whatever the rounding
         bounds = costs.straight * (1 - 1e-7), costs.diagonal * (1 - 1e-7)
         buckets = BUCKETS
@@ -89,12 +83,7 @@ def grow(
 
 @compiled
 def _orders(
-    distance: Distances,
-    opened: Cells,
-    width: int,
-    start: int,
-    bounds: tuple[float, float],
-    buckets: int,
+    distance: Distances, opened: Cells, width: int, start: int, bounds: Bounds, buckets: int
 ) -> NDArray[np.int64]:
     """Return the bucket of each open cell, in the order of A*."""
     order = np.empty(opened.size, np.int64)
@@ -106,7 +95,7 @@ def _orders(
 
 
 @compiled
-def _remaining(x: int, y: int, bounds: tuple[float, float]) -> float:
+def _remaining(x: int, y: int, bounds: Bounds) -> float:
     """Return the least cost of moves over (x, y), given a straight and a diagonal one's."""
     x, y = abs(x), abs(y)
     both = min(x, y)
@@ -121,7 +110,7 @@ def _grow(
     order: NDArray[np.int64],
     costs: MoveCosts,
     start: int,
-    bounds: tuple[float, float],
+    bounds: Bounds,
     buckets: int,
     limit: int,
 ) -> tuple[Cells, bool]:
@@ -135,16 +124,13 @@ def _grow(
     count = np.zeros(ring, np.int64)
     through = np.empty(8)
     taken, waiting, front, visited = 0, 0, 0, 0
-    done = False
     while visited <= limit:
         if waiting == 0:
             if taken == opened.size:
-                done = True
                 break
             front = max(front, order[taken])
         # Ties are closed too: so a rollout does not depend on what was asked before.
         if state[start] == CLOSED and distance[start] * (1 + 1e-6) * buckets < front:
-            done = True
             break
         slot = front % ring
         used = 0
@@ -199,7 +185,7 @@ def _grow(
                 waiting += 1
         count[slot] = 0
         front += 1
-    return _still_open(state, opened[taken:], bucket, count), done
+    return _still_open(state, opened[taken:], bucket, count), visited <= limit
 
 
 @compiled
@@ -337,27 +323,23 @@ def roll_out(distance: Distances, costs: MoveCosts, start: int) -> Cells:
 
 @compiled
 def policy_of(distance: Distances, costs: MoveCosts) -> NDArray[np.int8]:
-    """Return the greedy action of each cell of a whole field, -1 without one: (H, W) int8."""
+    """Return the greedy action of each cell of a whole field, -1 without one: (C,) int8."""
     patch, table, value, terms, width = costs[:5]
-    policy = np.full((distance.size // width - 2, width - 2), -1, np.int8)
-    for y in range(policy.shape[0]):
-        for x in range(policy.shape[1]):
-            cell = (y + 1) * width + x + 1
-            policy[y, x] = _next_action(distance, patch, table, value, terms, width, cell)
+    policy = np.full(distance.size, -1, np.int8)
+    for cell in range(width + 1, distance.size - width - 1):
+        policy[cell] = _next_action(distance, patch, table, value, terms, width, cell)
     return policy
 
 
 @compiled
 def q_of(distance: Distances, costs: MoveCosts) -> NDArray[np.float32]:
-    """Return minus the cost of the best path through each action: (8, H, W) float32."""
+    """Return minus the cost of the best path through each action: (8, C) float32."""
     patch, table, value, terms, width = costs[:5]
-    q = np.full((8, distance.size // width - 2, width - 2), -np.inf, np.float32)
+    q = np.full((8, distance.size), -np.inf, np.float32)
     for action in range(8):
-        for y in range(q.shape[1]):
-            for x in range(q.shape[2]):
-                cell = (y + 1) * width + x + 1
-                after = distance[cell + MOVE_Y[action] * width + MOVE_X[action]]
-                if after > 0:
-                    cost = cost_of(patch, table, value, terms, width, cell, action)
-                    q[action, y, x] = -(cost + after)
+        for cell in range(width + 1, distance.size - width - 1):
+            after = distance[cell + MOVE_Y[action] * width + MOVE_X[action]]
+            if after > 0:
+                cost = cost_of(patch, table, value, terms, width, cell, action)
+                q[action, cell] = -(cost + after)
     return q

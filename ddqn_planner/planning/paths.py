@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import heapq
-from collections.abc import Sequence
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,11 +14,11 @@ from ddqn_planner.grid.arguments import Cells, Occupancy, cells_inside
 from ddqn_planner.grid.grid_map import check_grid
 from ddqn_planner.grid.moves import segment_lengths
 from ddqn_planner.planning.field import Goals
-from ddqn_planner.planning.plan import PlanRequest
+from ddqn_planner.planning.plan import ROUNDING, PlanRequest
 
+Path: TypeAlias = NDArray[np.int32]  # (N, 2): the cells of a path
 REACH = 5  # cells along an axis that a robot may be beside its path, and still come back to it
 SAME_COST = 1 + 1e-9  # a path may cost so much more, and still as much: sums are rounded
-ROUNDING = 1 + 1e-6  # so that 0.15 m in cells of 0.05 m reach 3 cells, not 2.9999999
 # Of ways out of one length, the one that ends nearer to the goal: so little its distance counts.
 NEARER_TO_GOAL = 1e-9
 
@@ -92,23 +91,15 @@ def _search(
 # The way out, and the goals that are left
 
 
-def reach(request: PlanRequest) -> float:
-    """Return how far a goal may move, cells."""
-    return request.tolerance * ROUNDING
-
-
-def way_out_and_ends(request: PlanRequest, goals: Goals) -> tuple[tuple[Cell, ...], Goals]:
+def way_and_ends(request: PlanRequest, goals: Goals) -> tuple[tuple[Cell, ...], Goals]:
     """Return the way to the first free cell, empty if no path leads on, and where it can end."""
     grid, start, rule = request.grid, request.start, request.move_rule
     candidates = [(np.array(goals), len(goals))] if goals else []
-    if reach(request) >= 1:
-        free_cells = _near(~grid.occupancy, request.goal, reach(request))
-        candidates.append((free_cells, 1))
+    if request.reach >= 1:
+        candidates.append((_near(~grid.occupancy, request.goal, request.reach), 1))
     for ends, number in candidates:
         joined_to_ends = grid.reachable(ends, rule, backward=True)
-        way_out: tuple[Cell, ...] = (start,)
-        if not grid.is_free(start):
-            way_out = find_way_out(request, joined_to_ends)
+        way_out = (start,) if grid.is_free(start) else find_way_out(request, joined_to_ends)
         if way_out and joined_to_ends[way_out[-1][1], way_out[-1][0]]:
             reached = grid.reachable([way_out[-1]], rule)
             reached_ends = ends[reached[ends[:, 1], ends[:, 0]]]
@@ -176,11 +167,7 @@ def legal_segments(path: Cells, grid: GridMap, move_rule: MoveRule | str) -> NDA
 
 
 def is_path_valid(
-    path: Cells,
-    robot: Cell,
-    grid: GridMap,
-    move_rule: MoveRule | str,
-    start_clearing_radius: float = 0.0,
+    path: Cells, robot: Cell, grid: GridMap, move_rule: MoveRule | str, radius: float = 0.0
 ) -> bool:
     """Return whether any path is free and legal from its cell nearest to the robot on."""
     cells = _array(path)
@@ -189,7 +176,7 @@ def is_path_valid(
     rest = cells[np.hypot(*(cells - np.array(robot, dtype=np.float64)).T).argmin() :]
     if grid.contains(robot) and not grid.is_free(robot):
         out = next((index for index, (x, y) in enumerate(rest) if grid.is_free((x, y))), len(rest))
-        obstacles = obstacles_in_the_way(grid, robot, start_clearing_radius)
+        obstacles = obstacles_in_the_way(grid, robot, radius)
         leaving = GridMap(obstacles, forbidden=grid.forbidden)
         if not legal_segments(rest[: out + 1], leaving, move_rule).all():
             return False
@@ -197,9 +184,7 @@ def is_path_valid(
     return len(rest) > 0 and _legal_from(rest, grid, move_rule) == 0
 
 
-def rest_of_path(
-    path: Cells, robot: Cell, grid: GridMap, move_rule: MoveRule | str
-) -> NDArray[np.int32]:
+def rest_of_path(path: Cells, robot: Cell, grid: GridMap, move_rule: MoveRule | str) -> Path:
     """Return what is left of a path from a robot's cell on, (N, 2): empty if it is too far."""
     cells = _array(path)
     if not len(cells) or not grid.is_free(robot):
@@ -209,62 +194,44 @@ def rest_of_path(
     near = first + np.flatnonzero(distances[first:] <= REACH)
     # The nearest first, and of those the farthest along the path.
     for index in near[np.lexsort((-near, distances[near]))].tolist():
-        way = _straight_moves(robot, cells[index])
+        vector = cells[index] - robot
+        steps = np.arange(distances[index] + 1, dtype=np.int32)[:, None]
+        way = robot + np.sign(vector) * np.minimum(steps, np.abs(vector))  # diagonal moves first
         if legal_segments(way, grid, move_rule).all():
             return np.concatenate([way[:-1], cells[index:]], dtype=np.int32)
     return cells[:0]
 
 
-def keep_or_switch(
-    under_way: Cells,
-    new: Cells,
-    grid: GridMap,
-    move_rule: MoveRule | str,
-    threshold: float,
-    goals: Sequence[Cell] = (),
-) -> tuple[NDArray[np.int32], float | None]:
+def keep_or_switch(request: PlanRequest, new: Path) -> tuple[Path, float | None]:
     """Return the path under way's rest and its extra cost, as a share, or the new path and None."""
     # The rest may end at the new path's end or at other goals, and cost more by the threshold.
-    best = _array(new)
-    x, y = best[0].tolist()
-    rest = rest_of_path(under_way, (x, y), grid, move_rule)
-    if not len(rest) or rest[-1].tolist() not in [best[-1].tolist(), *map(list, goals)]:
-        return best, None
-    if np.array_equal(rest, best):
-        return best, 0.0
-    cost, best_cost = _cost(rest, grid, move_rule), _cost(best, grid, move_rule)
-    if cost > (1 + threshold) * best_cost * SAME_COST:
-        return best, None
-    return rest, cost / best_cost - 1
+    grid, rule, (x, y) = request.grid, request.move_rule, new[0].tolist()
+    rest = rest_of_path(request.under_way, (x, y), grid, rule)
+    if not len(rest) or rest[-1].tolist() not in [new[-1].tolist(), *map(list, request.goals)]:
+        return new, None
+    if np.array_equal(rest, new):
+        return new, 0.0
+    if grid.has_costs:
+        cost, new_cost = (path_cost(path, grid.cost_multiplier, rule) for path in (rest, new))
+    else:  # multipliers that are all 1 would take memory
+        cost, new_cost = path_length(rest, rule), path_length(new, rule)
+    if cost > (1 + request.switch_threshold) * new_cost * SAME_COST:
+        return new, None
+    return rest, cost / new_cost - 1
 
 
-def _legal_from(cells: NDArray[np.int32], grid: GridMap, move_rule: MoveRule | str) -> int:
+def _legal_from(cells: Path, grid: GridMap, move_rule: MoveRule | str) -> int:
     """Return the first cell of a path from which on all of it is legal; N if its end is not."""
     # As a segment of no length the last cell has to be free too.
     legal = legal_segments(np.concatenate([cells, cells[-1:]]), grid, move_rule)
     return int(np.flatnonzero(~legal).max(initial=-1)) + 1
 
 
-def _array(path: Cells) -> NDArray[np.int32]:
+def _array(path: Cells) -> Path:
     return np.asarray(path, dtype=np.int32).reshape(-1, 2)
 
 
-def _cost(path: NDArray[np.int32], grid: GridMap, move_rule: MoveRule | str) -> float:
-    if not grid.has_costs:
-        return path_length(path, move_rule)
-    return path_cost(path, grid.cost_multiplier, move_rule)
-
-
-def _straight_moves(first: Cell, last: NDArray[np.int32]) -> NDArray[np.int32]:
-    """Return the cells of the fewest moves between two cells, the diagonal ones first."""
-    cell = np.array(first, dtype=np.int32)
-    vector = last - cell
-    steps = np.arange(np.abs(vector).max() + 1, dtype=np.int32)[:, None]
-    moves: NDArray[np.int32] = cell + np.sign(vector) * np.minimum(steps, np.abs(vector))
-    return moves
-
-
-# Simplification
+# Simplification# Simplification
 
 
 def simplify(cells: Cells, grid: GridMap, move_rule: MoveRule | str) -> tuple[Cell, ...]:
@@ -272,9 +239,8 @@ def simplify(cells: Cells, grid: GridMap, move_rule: MoveRule | str) -> tuple[Ce
 
     A segment is legal if all cells that it passes through are free; under `MoveRule.ROBOT_SAFE`
     also those that it touches at a corner. None of them except the last may forbid one of the two
-    actions between whose directions it lies. It must not cost more than the part of the path that
-    it replaces, so that the path keeps away from cells of high cost. The length of each segment is
-    found by doubling and halving.
+    actions between whose directions it lies. It must not cost more than what it replaces, so that
+    the path keeps away from cells of high cost.
 
     Parameters
     ----------
@@ -300,6 +266,7 @@ def simplify(cells: Cells, grid: GridMap, move_rule: MoveRule | str) -> tuple[Ce
         cost = segment_cost(path[first], path[last], multiplier, rule)
         return cost <= SAME_COST * path_cost(path[first : last + 1], multiplier, rule)
 
+    # The length of each segment is found by doubling and halving.
     kept, last = [0] if path else [], len(path) - 1
     while kept and kept[-1] < last:
         first, step, reached = kept[-1], 1, kept[-1] + 1
@@ -326,20 +293,15 @@ def touched_cells(first: Cell, last: Cell, move_rule: MoveRule | str) -> NDArray
 def is_legal_segment(first: Cell, last: Cell, grid: GridMap, move_rule: MoveRule | str) -> bool:
     """Return whether a segment between two cells of a map is legal, see `simplify`."""
     x, y = touched_cells(first, last, move_rule).T
-    if grid.occupancy[y, x].any():
-        return False
-    if grid.forbidden is None:
-        return True
+    is_free = not grid.occupancy[y, x].any()
+    if grid.forbidden is None or not is_free:
+        return is_free
     vector = np.subtract(last, first)
-    moves = [np.sign(vector)]  # as many diagonal ones as it has room for, and straight ones
-    if abs(vector[0]) != abs(vector[1]):
-        moves.append(np.where(np.abs(vector) == np.abs(vector).max(), moves[0], 0))
+    diagonal = np.sign(vector)  # as many such moves as it has room for, and straight ones
+    straight = np.where(np.abs(vector) == np.abs(vector).max(), diagonal, 0)
+    takes = (diagonal == MOVES).all(axis=1) | (straight == MOVES).all(axis=1)
     x, y = _passed_cells(first, last)[0][:-1].T
-    return not any(
-        (grid.forbidden[y, x] >> action & 1).any()
-        for move in moves
-        for action in np.flatnonzero((move == MOVES).all(axis=1))
-    )
+    return not (grid.forbidden[y, x] & np.packbits(takes, bitorder="little")).any()
 
 
 def segment_cost(

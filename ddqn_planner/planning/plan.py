@@ -12,6 +12,8 @@ from numpy.typing import NDArray
 from ddqn_planner.grid import Cell, GridMap, MoveRule, path_length
 from ddqn_planner.grid.arguments import Cells, Choice, numbers
 
+ROUNDING = 1 + 1e-6  # so that 0.15 m in cells of 0.05 m reach 3 cells, not 2.9999999
+
 
 class PlanStatus(Choice):
     """The outcome of a request, each with the sentence that a user reads."""
@@ -46,14 +48,15 @@ class PlanRequest:
     method: PlanMethod = PlanMethod.GREEDY
     tolerance: float = 0.0
     simplified: bool = False
-    # The path that the robot follows, move by move, and how much more its rest may cost than the
-    # new path, as a share, see `keep_or_switch`.
-    under_way: Cells = field(default=(), compare=False)
-    switch_threshold: float = 0.0
-    # Goals that do as well: the path leads to the nearest of all that are free. They do not go
-    # together with a tolerance.
-    others: tuple[Cell, ...] = ()
+    under_way: Cells = field(default=(), compare=False)  # what the robot follows, move by move
+    switch_threshold: float = 0.0  # the share by which the rest of it may cost more than a new path
+    others: tuple[Cell, ...] = ()  # goals that do as well: the nearest one counts; no tolerance
     start_clearing_radius: float = 0.0
+
+    @property
+    def reach(self) -> float:
+        """How far the goal may move, in cells."""
+        return self.tolerance * ROUNDING
 
     @property
     def goals(self) -> tuple[Cell, ...]:
@@ -63,16 +66,14 @@ class PlanRequest:
 
 @dataclass(frozen=True, eq=False)
 class Plan:
-    """A path, or the reason why there is none.
-
-    Two plans are equal if all but their times is equal.
+    """A path, or the reason why there is none. Equal plans may have taken different times.
 
     Parameters
     ----------
     status : PlanStatus
     path : (N, 2) int32
-        The cells from start to goal, every move legal, or every segment if the path was simplified;
-        empty unless the status is SUCCEEDED. It cannot be written to.
+        The cells from start to goal, every move or simplified segment legal; empty unless the
+        status is SUCCEEDED. It cannot be written to.
     method : PlanMethod
         ASTAR_FALLBACK if it was searched for because the greedy steps were trapped.
     move_rule : MoveRule
@@ -82,16 +83,13 @@ class Plan:
         planner made the plan. On a map of expected times it is in seconds.
     goal : (x, y), optional
         Where the path ends, or would end: the goal asked for, the nearest of several, or the cell
-        to which it moved. None if no Q field is needed to say that there is no path, or for a
-        rollout.
+        to which it moved. None for a rollout, or if no Q field was needed.
     every_cell : (N, 2) int32
         The path move by move, before it was simplified, if a planner made the plan.
     extra_cost : float, optional
-        How much more the path costs than a new one, as a share, if it is the rest of the one under
-        way; None for a new path.
+        The share by which the rest of the path under way costs more than a new one, if it is kept.
     field_ms, rollout_ms : float
-        How long it took to get the Q field, and the path from it, in milliseconds. Where the field
-        had to grow for the start, its time includes the path.
+        How long it took to get the Q field, and the path from it, in milliseconds.
     """
 
     status: PlanStatus

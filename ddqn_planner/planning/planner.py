@@ -17,14 +17,7 @@ from ddqn_planner.grid.grid_map import check_grid
 from ddqn_planner.model import ModelMetadata, QNetwork, load_model
 from ddqn_planner.planning.field import DistanceField, Goals, QField
 from ddqn_planner.planning.field_cache import FieldCache
-from ddqn_planner.planning.paths import (
-    find_way_out,
-    keep_or_switch,
-    reach,
-    search,
-    simplify,
-    way_out_and_ends,
-)
+from ddqn_planner.planning.paths import find_way_out, keep_or_switch, search, simplify, way_and_ends
 from ddqn_planner.planning.plan import Plan, PlanMethod, PlanRequest, PlanStatus, joined
 
 T = TypeVar("T")
@@ -49,42 +42,34 @@ class Planner:
 
     def __init__(self, network: QNetwork, metadata: ModelMetadata) -> None:
         if not (hasattr(network, "move_costs") and hasattr(metadata, "move_rule")):
-            raise ValueError(
-                f"network is {network!r}, metadata is {metadata!r}; give what load_model returns"
-            )
+            given = f"network is {network!r}, metadata is {metadata!r}"
+            raise ValueError(f"{given}; give what load_model returns")
         self.network = network
         self.metadata = metadata
-        self._fields = FieldCache(network)
+        self.fields = FieldCache(network)
 
     @classmethod
     def load(cls, model: str | Path) -> Planner:
         """Load a shipped model by its name (``"any_map"``), or a model file by its path.
 
-        Raises
-        ------
-        ModelFileError
-            If there is no such model, or its file cannot be used.
+        A ModelFileError says that there is none, or why it cannot be used.
         """
         return cls(*load_model(model))
 
     @property
     def cache_bytes(self) -> int:
         """Memory for the fields that it keeps, those used last; the last one is always kept."""
-        return self._fields.nbytes
+        return self.fields.nbytes
 
     @cache_bytes.setter
     def cache_bytes(self, nbytes: int) -> None:
-        self._fields.nbytes = nbytes
+        self.fields.nbytes = nbytes
 
     def q_field(self, grid: GridMap, goal: Cell, move_rule: MoveRule | str | None = None) -> QField:
         """Return the Q field of a map toward a goal, a free cell, computed or from the cache.
 
-        The move rule is by default the one that the model was trained for.
-
-        Raises
-        ------
-        ValueError
-            If the goal is not a free cell of the map, or the model cannot plan on this size.
+        The move rule is by default the one that the model was trained for. A goal that is not free,
+        or a map of a size that the model cannot plan on, is a ValueError.
         """
         check_grid(grid)
         goal, rule = as_cell(goal, "the goal"), self._rule(move_rule)
@@ -93,13 +78,7 @@ class Planner:
         if not self.network.supports((grid.height, grid.width)):
             problem = f"the model was not trained for maps of {grid.width} x {grid.height} cells"
             raise ValueError(f"{problem}; train one on such a map")
-        return self._fields.get(grid, (goal,), rule)
-
-    def known_field(
-        self, grid: GridMap, goal: Cell, move_rule: MoveRule | str | None = None
-    ) -> QField | None:
-        """Return the Q field of a map toward a goal if it is in the cache, else None."""
-        return self._fields.find(grid, (as_cell(goal, "the goal"),), self._rule(move_rule))
+        return self.fields.get(grid, (goal,), rule)
 
     def _rule(self, move_rule: MoveRule | str | None) -> MoveRule:
         return self.metadata.move_rule if move_rule is None else MoveRule(move_rule)
@@ -131,9 +110,8 @@ class Planner:
         simplified : bool
             Whether to leave out cells, see `simplify`.
         start_clearing_radius : float
-            Where the start is an obstacle, those within so many cells of it, itself included, do
-            not count until the path has reached its first free cell, the nearest one. With 0 they
-            count.
+            Where the start is an obstacle, those within so many cells of it do not count until the
+            path has reached its first free cell, the nearest one. With 0 they count.
 
         Returns
         -------
@@ -144,8 +122,8 @@ class Planner:
         Raises
         ------
         ValueError
-            If the tolerance or the radius is negative or NaN, the start or the goal is no pair of
-            whole numbers, or there is no such move rule or method.
+            If the tolerance or the radius is negative or NaN, the start or a goal is no pair of
+            whole numbers, or there is no goal or no such move rule or method.
         """
         how = move_rule, method, tolerance, simplified, start_clearing_radius
         return self._answer(grid, start, [as_cell(goal, "the goal")], how)
@@ -163,7 +141,7 @@ class Planner:
         """Plan a path to the goal that the cheapest path reaches; `Plan.goal` tells which.
 
         Goals that are occupied or outside the map are left out. If all are, the status says so:
-        GOAL_OCCUPIED if any lies on the map. One field leads to all goals that are free.
+        GOAL_OCCUPIED if any lies on the map.
 
         Parameters
         ----------
@@ -171,11 +149,6 @@ class Planner:
             As for `plan`.
         goals : sequence of (x, y)
             At least one, in any order. No goal moves: there is no tolerance.
-
-        Raises
-        ------
-        ValueError
-            As for `plan`, or if there is no goal.
         """
         how = move_rule, method, 0.0, simplified, start_clearing_radius
         return self._answer(grid, start, _cells_of_goals(goals), how)
@@ -199,11 +172,6 @@ class Planner:
             As for `plan`. The tolerance holds for each goal. A simplified path keeps all goals.
         goals : sequence of (x, y)
             At least one. If one has no path, the plan's status tells why, and its goal which.
-
-        Raises
-        ------
-        ValueError
-            As for `plan`, or if there is no goal.
         """
         plans: list[Plan] = []
         how = move_rule, method, tolerance, simplified, start_clearing_radius
@@ -255,7 +223,7 @@ class Planner:
             return PlanStatus.GOAL_OUTSIDE_MAP
         if grid.is_obstacle(request.start) and request.start_clearing_radius == 0:
             return PlanStatus.START_OCCUPIED
-        if not any(grid.is_free(goal) for goal in request.goals) and reach(request) < 1:
+        if not any(grid.is_free(goal) for goal in request.goals) and request.reach < 1:
             return PlanStatus.GOAL_OCCUPIED
         if not self.network.supports((grid.height, grid.width)):
             return PlanStatus.MAP_SIZE_UNSUPPORTED
@@ -265,31 +233,31 @@ class Planner:
         """Return the field that leads to a goal, or why there is no path."""
         grid, start, rule = request.grid, request.start, request.move_rule
         goals = tuple(sorted({goal for goal in request.goals if grid.is_free(goal)}))
-        if len(goals) > 1 and not self._fields.has_costs(grid, rule):
+        if len(goals) > 1 and not self.fields.has_costs(grid, rule):
             yield
             goals = self._nearest_alone(request, goals)
         field: QField | None = None
         plan: Plan | None = None
         if grid.is_free(start):
-            field = self._fields.find(grid, goals, rule)
+            field = self.fields.find(grid, goals, rule)
             plan = field.rollout_if_known(start) if field else None
-        if plan is None or (not plan.path.size and reach(request) >= 1):
+        if plan is None or (not plan.path.size and request.reach >= 1):
             yield
-        if plan is None and goals and grid.is_free(start) and self._fields.has_costs(grid, rule):
-            field = self._fields.get(grid, goals, rule, start)
+        if plan is None and goals and grid.is_free(start) and self.fields.has_costs(grid, rule):
+            field = self.fields.get(grid, goals, rule, start)
             assert isinstance(field, DistanceField)
             plan = yield from _in_parts(field, request)
         if field and plan and plan.path.size:
             return _Found(field, (start,), plan)
-        if plan and plan.status is PlanStatus.NO_PATH and reach(request) < 1:
+        if plan and plan.status is PlanStatus.NO_PATH and request.reach < 1:
             return PlanStatus.NO_PATH
-        way_out, ends = way_out_and_ends(request, goals)
+        way_out, ends = way_and_ends(request, goals)
         if not way_out and grid.is_obstacle(start) and not find_way_out(request, ~grid.occupancy):
             return PlanStatus.START_OCCUPIED
         if not way_out:
             return PlanStatus.NO_PATH if goals else PlanStatus.GOAL_OCCUPIED
         if field is None or field.goals != ends:
-            field, plan = self._fields.get(grid, ends, rule, way_out[-1]), None
+            field, plan = self.fields.get(grid, ends, rule, way_out[-1]), None
         return _Found(field, way_out, plan)
 
     def _nearest_alone(self, request: PlanRequest, goals: Goals) -> Goals:
@@ -339,9 +307,7 @@ def _roll_out(
     path, cost, extra_cost, goal = plan.path, None, None, field.goal
     if path.size:
         if len(request.under_way):
-            path, extra_cost = keep_or_switch(
-                request.under_way, path, grid, rule, request.switch_threshold, request.goals
-            )
+            path, extra_cost = keep_or_switch(request, path)
         goal = (int(path[-1, 0]), int(path[-1, 1]))
         if len(way_out) > 1:
             path = np.concatenate([way_out[:-1], path], dtype=np.int32)
@@ -377,8 +343,8 @@ def last_step(steps: Iterator[Plan | None]) -> Plan:
 
 
 def _cells_of_goals(goals: Sequence[Cell]) -> list[Cell]:
-    goals = listed(goals, "goals")
-    cells = [as_cell(goal, f"goal {number}") for number, goal in enumerate(goals, 1)]
+    named = enumerate(listed(goals, "goals"), 1)
+    cells = [as_cell(goal, f"goal {number}") for number, goal in named]
     if not cells:
         raise ValueError("there is no goal; give at least one cell")
     return cells

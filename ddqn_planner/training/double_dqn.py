@@ -2,19 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch import Tensor
+from torch import Tensor, nn
 from torch.nn import functional
 
 # Dimensions: B = a batch, A = 8 actions.
-
-Network = Callable[[Tensor], Tensor]
-"""From states (B, ...) to Q (B, 8)."""
 
 
 class Transitions(NamedTuple):
@@ -57,17 +53,16 @@ class ReplayBuffer:
 
 
 def double_dqn_loss(
-    online: Network,
-    target: Network,
+    online: nn.Module,
+    target: nn.Module,
     kind: str,
     batch: Transitions,
     state_B: Tensor,
     next_state_B: Tensor,
 ) -> Tensor:
     """Return the mean squared temporal-difference error of a batch, a scalar."""
-    action_B, reward_B, discount_B = map(
-        torch.from_numpy, (batch.action, batch.reward, batch.discount)
-    )
+    numbers = batch.action, batch.reward, batch.discount
+    action_B, reward_B, discount_B = map(torch.from_numpy, numbers)
     # Double DQN (van Hasselt et al. 2016, equation 4) selects the next action with θ and evaluates
     # it with θ⁻. DQN (Mnih et al. 2015) does both with θ⁻, the paper's target as printed with θ.
     selection = target if kind == "dqn" else online

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ddqn_planner.grid import MOVES, Cell, GridMap, MoveRule, read_map_file
-from ddqn_planner.model.observation import GOAL, OBSTACLE, ROBOT, observation_background, observe
+from ddqn_planner.model.networks import GOAL, OBSTACLE, ROBOT, observation_background, observe
 from ddqn_planner.resources import find_resource
 from ddqn_planner.training.exploring_starts import initial_cells
 from ddqn_planner.training.hyper_parameters import HyperParameters
@@ -97,14 +97,9 @@ class GridVectorEnvironment:
         mask = np.ones(len(self.cell), dtype=np.bool_) if mask is None else mask
         scenario = self.random.integers(len(self.start), size=int(mask.sum()))
         self.scenario[mask] = scenario
-        self.cell[mask] = initial_cells(
-            self.start[scenario],
-            self._free,
-            self._free_first[scenario],
-            self._free_count[scenario],
-            self.parameters.p_r,
-            self.random,
-        )
+        free = self._free, self._free_first[scenario], self._free_count[scenario]
+        start, p_r = self.start[scenario], self.parameters.p_r
+        self.cell[mask] = initial_cells(start, *free, p_r, self.random)
         self.steps[mask] = 0
 
     def move(

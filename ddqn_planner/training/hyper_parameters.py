@@ -8,7 +8,7 @@ from typing import Any
 from ddqn_planner.model import NETWORKS
 
 
-def _parameter(default: Any, source: str, low: float, high: float) -> Any:
+def _number(default: Any, source: str, low: float, high: float) -> Any:
     return field(default=default, metadata={"source": source, "range": (low, high)})
 
 
@@ -26,30 +26,28 @@ class HyperParameters:
         "double_dqn", "dqn", "printed", source="ours: the target, see training/double_dqn.py"
     )
     reward: str = _choice("paper", "path_cost", source="ours: the reward, see training/reward.py")
-    learning_rate: float = _parameter(
-        0.01, "section on the network: Adam's learning rate", 1e-6, 1.0
-    )
-    batch_size: int = _parameter(32, "Table 1: transitions in a mini-batch", 1, 4096)
-    gamma: float = _parameter(0.95, "Table 1: discount γ", 0.0, 1.0)
-    obstacle_reward: float = _parameter(-10.0, "Table 1: reward of a collision", -1e3, 0.0)
-    goal_reward: float = _parameter(10.0, "Table 1: reward of the end", 0.0, 1e3)
-    p_r: float = _parameter(0.5, "section 4.1: probability of a random initial cell", 0.0, 1.0)
-    alpha: float = _parameter(0.6, "section 4.2: weight α of the progress to the end", 0.0, 10.0)
-    beta: float = _parameter(0.4, "section 4.2: weight β of the detour from the start", 0.0, 10.0)
-    steps: int = _parameter(50_000, "section 5.1: environment steps of goal i", 1, 10**9)
-    filters: int = _parameter(16, "ours: filters of the convolution", 1, 1024)
-    hidden_units: int = _parameter(
+    learning_rate: float = _number(0.01, "section on the network: Adam's learning rate", 1e-6, 1.0)
+    batch_size: int = _number(32, "Table 1: transitions in a mini-batch", 1, 4096)
+    gamma: float = _number(0.95, "Table 1: discount γ", 0.0, 1.0)
+    obstacle_reward: float = _number(-10.0, "Table 1: reward of a collision", -1e3, 0.0)
+    goal_reward: float = _number(10.0, "Table 1: reward of the end", 0.0, 1e3)
+    p_r: float = _number(0.5, "section 4.1: probability of a random initial cell", 0.0, 1.0)
+    alpha: float = _number(0.6, "section 4.2: weight α of the progress to the end", 0.0, 10.0)
+    beta: float = _number(0.4, "section 4.2: weight β of the detour from the start", 0.0, 10.0)
+    steps: int = _number(50_000, "section 5.1: environment steps of goal i", 1, 10**9)
+    filters: int = _number(16, "ours: filters of the convolution", 1, 1024)
+    hidden_units: int = _number(
         0, "ours: units of a hidden layer after the convolution; 0 for none", 0, 4096
     )
-    replay_capacity: int = _parameter(50_000, "ours: transitions in the replay buffer", 1, 10**7)
-    learning_starts: int = _parameter(500, "ours: environment steps before learning", 0, 10**6)
-    update_interval: int = _parameter(1, "ours: environment steps per update", 1, 10**4)
-    target_interval: int = _parameter(500, "ours: updates per target copy (N)", 1, 10**6)
-    epsilon_start: float = _parameter(1.0, "ours: ε at the first step", 0.0, 1.0)
-    epsilon_end: float = _parameter(0.1, "ours: ε after the decline", 0.0, 1.0)
-    epsilon_steps: int = _parameter(10_000, "ours: steps of ε's linear decline", 1, 10**9)
-    max_episode_steps: int = _parameter(200, "ours: steps that end an episode", 1, 10**6)
-    environments: int = _parameter(1, "ours: environments stepped at once", 1, 4096)
+    replay_capacity: int = _number(50_000, "ours: transitions in the replay buffer", 1, 10**7)
+    learning_starts: int = _number(500, "ours: environment steps before learning", 0, 10**6)
+    update_interval: int = _number(1, "ours: environment steps per update", 1, 10**4)
+    target_interval: int = _number(500, "ours: updates per target copy (N)", 1, 10**6)
+    epsilon_start: float = _number(1.0, "ours: ε at the first step", 0.0, 1.0)
+    epsilon_end: float = _number(0.1, "ours: ε after the decline", 0.0, 1.0)
+    epsilon_steps: int = _number(10_000, "ours: steps of ε's linear decline", 1, 10**9)
+    max_episode_steps: int = _number(200, "ours: steps that end an episode", 1, 10**6)
+    environments: int = _number(1, "ours: environments stepped at once", 1, 4096)
 
     def __post_init__(self) -> None:
         for entry in fields(self):

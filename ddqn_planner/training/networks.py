@@ -12,7 +12,8 @@ from torch.nn import functional
 
 from ddqn_planner.grid import LENGTHS, MOVES, neighbours
 from ddqn_planner.model import AnyMapQNetwork, PaperQNetwork, PropagationQNetwork, QNetwork
-from ddqn_planner.model.observation import observe, patches
+from ddqn_planner.model.move_costs import patches
+from ddqn_planner.model.networks import observe
 from ddqn_planner.training.environment import GridVectorEnvironment
 
 # Dimensions: B = a batch, A = 8 actions, F = filters, I = inputs of the first layer, L = windows,
@@ -28,10 +29,19 @@ class TrainableNetwork(nn.Module):
 
     numpy_class: ClassVar[type[QNetwork]]
     """The same network for planning, whose `size_names` a module takes as arguments."""
+    environment: GridVectorEnvironment
 
     def __init__(self, **sizes: int) -> None:
         super().__init__()
         self.sizes = sizes
+
+    def settle(self, environment: GridVectorEnvironment) -> None:
+        """As the target network θ⁻, prepare the `states` of an environment, until the next copy."""
+        self.environment = environment
+
+    def states(self, scenario: NDArray[np.int64], cell: NDArray[np.int64]) -> Tensor:
+        """Return the states of robots in `cell` (B,) on the maps `scenario` (B,): (B, ...)."""
+        raise NotImplementedError
 
     def to_numpy(self) -> QNetwork:
         """Return the network for planning, with a copy of the weights as they are now."""
@@ -66,6 +76,11 @@ class PaperModule(TrainableNetwork):
         # On windows the convolution is a matrix product, which is faster on small maps.
         return functional.unfold(observation_BHW.unsqueeze(1), 3, padding=1, stride=2)
 
+    def states(self, scenario: NDArray[np.int64], cell: NDArray[np.int64]) -> Tensor:
+        """Return the windows of the whole map with the robot in it: (B, 9, L)."""
+        background, shape = self.environment.background[scenario], self.environment.shape
+        return self.windows(torch.from_numpy(observe(background, cell, shape)))
+
     def forward(self, window_BKL: Tensor) -> Tensor:
         """Return Q(s, a): (B, 8) for the windows of observations (B, 9, L)."""
         weight_BFK = self.convolution.weight.flatten(1).expand(len(window_BKL), -1, -1)
@@ -73,8 +88,7 @@ class PaperModule(TrainableNetwork):
         feature_BF = torch.baddbmm(bias_F1, weight_BFK, window_BKL).relu_().flatten(1)
         if self.hidden is not None:
             feature_BF = self.hidden(feature_BF).relu_()
-        q_BA: Tensor = self.fully_connected(feature_BF)
-        return q_BA
+        return cast(Tensor, self.fully_connected(feature_BF))
 
 
 class PropagationModule(TrainableNetwork):
@@ -88,10 +102,34 @@ class PropagationModule(TrainableNetwork):
         self.hidden = nn.Linear(filters, filters)
         self.moves = nn.Linear(filters, len(MOVES))
 
+    # A state, (I + 8 + 1,): the features of the robot's 3x3 patch, the return r + γ V(s') of each
+    # move (γ V(s') where r is learned), r_o. A gradient through V would diverge: none flows.
+
+    def settle(self, environment: GridVectorEnvironment) -> None:
+        """Settle V on every map."""
+        with_rules = zip(environment.scenarios, environment.move_rules, strict=True)
+        seen = [(patches(s.grid.occupancy, s.grid.cost), rule) for s, rule in with_rules]
+        features = np.stack([self.numpy_class.features(*of_map) for of_map in seen])
+        feature_SCI = torch.from_numpy(features)
+        gamma, collision = environment.parameters.gamma, environment.parameters.obstacle_reward
+        with torch.inference_mode():
+            p_SAC = self.success(feature_SCI).numpy().transpose(0, 2, 1)
+            cost_SAC = self.cost(feature_SCI).numpy().transpose(0, 2, 1)
+        reward_SAC = -cost_SAC if self.numpy_class.uses_costs else environment.free_reward
+        near_AC, goal_S = neighbours(environment.shape), environment.goal
+        return_SAC = value_iteration(p_SAC, reward_SAC, goal_S, near_AC, gamma, collision)
+        return_SCA = (return_SAC + cost_SAC).transpose(0, 2, 1)
+        collision_SC1 = np.full_like(return_SCA[..., :1], collision)
+        self._state_SCX = np.concatenate([features, return_SCA, collision_SC1], axis=2)
+
+    def states(self, scenario: NDArray[np.int64], cell: NDArray[np.int64]) -> Tensor:
+        """Return the states of robots in `cell` (B,) on the maps `scenario` (B,): (B, I + 9)."""
+        return torch.from_numpy(self._state_SCX[scenario, cell])
+
     def forward(self, state_BX: Tensor) -> Tensor:
-        """Return Q(s, a) = p (r + γ V(s')) + (1 - p) r_o: (B, 8), see `PropagationEncoder`."""
+        """Return Q(s, a) = p (r + γ V(s')) + (1 - p) r_o: (B, 8)."""
         inputs = self.numpy_class.inputs
-        # Contiguous as in `update_target`, since how a layer rounds depends on the layout.
+        # Contiguous as in `settle`, since how a layer rounds depends on the layout.
         feature_BI, collision_B1 = state_BX[:, :inputs].contiguous(), state_BX[:, -1:]
         gain_BA = state_BX[:, inputs:-1] - self.cost(feature_BI) - collision_B1
         return collision_B1 + self.success(feature_BI) * gain_BA
@@ -99,8 +137,7 @@ class PropagationModule(TrainableNetwork):
     def success(self, feature_BI: Tensor) -> Tensor:
         """Return p(s, a) in 0..1: (B, 8), for the features of patches (B, I)."""
         hidden_BF = self.hidden(self.convolution(feature_BI).relu()).relu()
-        p_BA: Tensor = self.moves(hidden_BF).sigmoid()
-        return p_BA
+        return cast(Tensor, self.moves(hidden_BF).sigmoid())
 
     def cost(self, feature_BI: Tensor) -> Tensor:
         """Return the learned cost of each move: (B, 8); 0 where the reward is given."""
@@ -120,8 +157,7 @@ class AnyMapModule(PropagationModule):
 
     def multiplier(self, feature_BI: Tensor) -> Tensor:
         """Return the cost multiplier of each move, at least 1: (B, 8)."""
-        multiplier_BA: Tensor = 1 + self.prices(feature_BI).relu()
-        return multiplier_BA
+        return cast(Tensor, 1 + self.prices(feature_BI).relu())
 
     def cost(self, feature_BI: Tensor) -> Tensor:
         """Return length times cost multiplier of each move: (B, 8)."""
@@ -132,64 +168,6 @@ MODULES: Final[dict[str, type[TrainableNetwork]]] = {
     module.numpy_class.name: module for module in (PaperModule, PropagationModule, AnyMapModule)
 }
 """By the hyper-parameter ``network``."""
-
-
-class ObservationEncoder:
-    """The paper's network observes the whole map with the robot in it."""
-
-    def __init__(self, environment: GridVectorEnvironment) -> None:
-        self._environment = environment
-
-    def states(self, scenario: NDArray[np.int64], cell: NDArray[np.int64]) -> Tensor:
-        """Return the states of robots in `cell` (B,) on the maps `scenario` (B,): (B, ...)."""
-        background = self._environment.background[scenario]
-        observation = observe(background, cell, self._environment.shape)
-        return PaperModule.windows(torch.from_numpy(observation))
-
-    def update_target(self, target: TrainableNetwork) -> None:
-        """Use a new target network θ⁻, where the states depend on it."""
-
-
-class PropagationEncoder(ObservationEncoder):
-    """A propagation network observes the 3x3 patch around the robot, and the returns beyond it."""
-
-    # A state, (I + 8 + 1,): the features of the patch, the return r + γ V(s') of each move (γ V(s')
-    # where r is learned), r_o. No gradient flows through V: back-propagation through it diverges.
-
-    def __init__(self, environment: GridVectorEnvironment, target: PropagationModule) -> None:
-        super().__init__(environment)
-        with_rules = zip(environment.scenarios, environment.move_rules, strict=True)
-        seen = [(patches(s.grid.occupancy, s.grid.cost), rule) for s, rule in with_rules]
-        feature_SCI = np.stack([target.numpy_class.features(*of_map) for of_map in seen])
-        self._state_SCX = np.pad(feature_SCI, ((0, 0), (0, 0), (0, len(MOVES) + 1)))
-        self.update_target(target)
-
-    def states(self, scenario: NDArray[np.int64], cell: NDArray[np.int64]) -> Tensor:
-        """Return the states of robots in `cell` (B,) on the maps `scenario` (B,): (B, I + 9)."""
-        return torch.from_numpy(self._state_SCX[scenario, cell])
-
-    def update_target(self, target: TrainableNetwork) -> None:
-        """Settle V on every map under the new target network, until the next target copy."""
-        assert isinstance(target, PropagationModule)
-        environment, inputs = self._environment, target.numpy_class.inputs
-        feature_SCI = torch.from_numpy(self._state_SCX[..., :inputs].copy())
-        gamma, collision = environment.parameters.gamma, environment.parameters.obstacle_reward
-        with torch.inference_mode():
-            p_SAC = target.success(feature_SCI).numpy().transpose(0, 2, 1)
-            cost_SAC = target.cost(feature_SCI).numpy().transpose(0, 2, 1)
-        reward_SAC = -cost_SAC if target.numpy_class.uses_costs else environment.free_reward
-        near_AC, goal_S = neighbours(environment.shape), environment.goal
-        return_SAC = value_iteration(p_SAC, reward_SAC, goal_S, near_AC, gamma, collision)
-        return_SAC += cost_SAC
-        self._state_SCX[..., inputs:-1] = return_SAC.transpose(0, 2, 1)
-        self._state_SCX[..., -1] = collision
-
-
-def encoder_for(target: TrainableNetwork, environment: GridVectorEnvironment) -> ObservationEncoder:
-    """Return the encoder for a network, with its copy θ⁻."""
-    if isinstance(target, PropagationModule):
-        return PropagationEncoder(environment, target)
-    return ObservationEncoder(environment)
 
 
 def value_iteration(

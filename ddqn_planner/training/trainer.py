@@ -25,13 +25,12 @@ from ddqn_planner.training.double_dqn import ReplayBuffer, Transitions, double_d
 from ddqn_planner.training.environment import GridVectorEnvironment, Scenario
 from ddqn_planner.training.episodes import Episode, EpisodeEnd
 from ddqn_planner.training.hyper_parameters import HyperParameters
-from ddqn_planner.training.networks import MODULES, encoder_for
+from ddqn_planner.training.networks import MODULES
 
 CHECKPOINT_KEY = "ddqn_planner_checkpoint"
 DIGEST_KEY = "sha256"
 
-FUSED = tuple(map(int, torch.__version__.split(".")[:2])) >= (2, 4)
-"""Whether torch has the fused Adam also for the CPU."""
+FUSED = tuple(map(int, torch.__version__.split(".")[:2])) >= (2, 4)  # Adam, on the CPU too
 
 
 class CheckpointError(ValueError):
@@ -54,18 +53,17 @@ class Trainer:
         self.seed = seed
         self.steps = self.updates = self.episodes = 0
 
-        weights, environment, exploration, replay = np.random.SeedSequence(seed).spawn(4)
-        drawing = np.random.default_rng(environment)
-        self.environment = GridVectorEnvironment(self.scenarios, move_rule, parameters, drawing)
-        self._exploration = np.random.default_rng(exploration)
-        self._sampling = np.random.default_rng(replay)
+        weights, *others = np.random.SeedSequence(seed).spawn(4)
+        self._generators = [np.random.default_rng(sequence) for sequence in others]
+        initial, self._exploration, self._sampling = self._generators
+        self.environment = GridVectorEnvironment(self.scenarios, move_rule, parameters, initial)
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(int(weights.generate_state(1)[0]))
             module, (height, width) = MODULES[parameters.network], self.environment.shape
             known = {**asdict(parameters), "height": height, "width": width}
             self.network = module(**{name: known[name] for name in module.numpy_class.size_names})
         self._target = copy.deepcopy(self.network).requires_grad_(False)
-        self.encoder = encoder_for(self._target, self.environment)
+        self._target.settle(self.environment)
         self._weights = tuple(self.network.parameters())
         self._optimiser = torch.optim.Adam(self._weights, parameters.learning_rate, fused=FUSED)
         for weight in self._weights:  # as Adam does at its first step; a checkpoint restores it
@@ -110,7 +108,7 @@ class Trainer:
         actions = self._exploration.integers(len(MOVES), size=count)
         greedy = self._exploration.random(count) >= self.epsilon
         if greedy.any():
-            states = self.encoder.states(self.environment.scenario, self.environment.cell)
+            states = self._target.states(self.environment.scenario, self.environment.cell)
             with torch.inference_mode():
                 q_NA = self.network(states)
             actions[greedy] = q_NA.argmax(dim=1).numpy()[greedy]
@@ -120,10 +118,8 @@ class Trainer:
         """Make one Double DQN update with a batch from the replay buffer."""
         p = self.parameters
         batch = self._replay.sample(p.batch_size, self._sampling)
-        states = self.encoder.states(
-            np.tile(batch.scenario, 2), np.concatenate([batch.cell, batch.next_cell])
-        )
-        state, next_state = states.chunk(2)
+        cells = np.concatenate([batch.cell, batch.next_cell])
+        state, next_state = self._target.states(np.tile(batch.scenario, 2), cells).chunk(2)
         loss = double_dqn_loss(self.network, self._target, p.target, batch, state, next_state)
         # Unlike backward(), grad() adds to no old gradient, so there is none to set to zero.
         gradients = torch.autograd.grad(loss, self._weights)
@@ -133,7 +129,7 @@ class Trainer:
         self.updates += 1
         if self.updates % p.target_interval == 0:
             self._target.load_state_dict(self.network.state_dict())
-            self.encoder.update_target(self._target)
+            self._target.settle(self.environment)
 
     def _end_episodes(
         self, ended: NDArray[np.bool_], terminated: NDArray[np.bool_]
@@ -187,7 +183,7 @@ class Trainer:
             "scenarios": _fingerprints(self.scenarios),
             "counters": [self.steps, self.updates, self.episodes, self._replay.added],
             "walked": self._visited,
-            "generators": [generator.bit_generator.state for generator in self._generators()],
+            "generators": [generator.bit_generator.state for generator in self._generators],
         }
         text, tensors = json.dumps(description), self._tensors()
         metadata = {CHECKPOINT_KEY: text, DIGEST_KEY: _digest(text, tensors)}
@@ -209,7 +205,9 @@ class Trainer:
                 parameters = HyperParameters(**description["parameters"])
                 rule = MoveRule(description["move_rule"])
                 trainer = cls(scenarios, rule, parameters, description["seed"])
-                trainer._restore(description, file, metadata[DIGEST_KEY], text)
+                trainer._continue(description, file)
+                if metadata[DIGEST_KEY] != _digest(text, trainer._tensors()):
+                    raise ValueError("its digest is another")
         except (CheckpointError, MemoryError):
             raise
         except Exception as error:  # a broken file can raise any error in the libraries
@@ -219,23 +217,19 @@ class Trainer:
             ) from error
         return trainer
 
-    def _restore(self, description: Any, file: Any, digest: str, text: str) -> None:
+    def _continue(self, description: Any, file: Any) -> None:
         """Continue where a checkpoint was made; a ValueError if its tensors are not those."""
         self.steps, self.updates, self.episodes, self._replay.added = description["counters"]
         tensors = self._tensors()
-        expected = {name: [*tensor.shape] for name, tensor in tensors.items()}
+        shapes = {name: [*tensor.shape] for name, tensor in tensors.items()}
         # Before any is read: a small sparse file can claim tensors of any size.
-        if {name: file.get_slice(name).get_shape() for name in file.keys()} != expected:  # noqa: SIM118
+        if {name: file.get_slice(name).get_shape() for name in file.keys()} != shapes:  # noqa: SIM118
             raise ValueError("its tensors have other names or shapes")
-        saved = {name: file.get_tensor(name) for name in expected}
-        if digest != _digest(text, saved):
-            raise ValueError("its digest is another")
         for name, tensor in tensors.items():
-            tensor.copy_(saved[name])
-        self.encoder.update_target(self._target)
+            tensor.copy_(file.get_tensor(name))
+        self._target.settle(self.environment)
         self._visited = description["walked"]
-        states = description["generators"]
-        for generator, state in zip(self._generators(), states, strict=True):
+        for generator, state in zip(self._generators, description["generators"], strict=True):
             generator.bit_generator.state = state
 
     def _tensors(self) -> dict[str, Tensor]:
@@ -256,9 +250,6 @@ class Trainer:
             for name, part in parts.items()
         }
         return tensors | {"total_reward": torch.from_numpy(self._total_reward)}
-
-    def _generators(self) -> tuple[np.random.Generator, ...]:
-        return self.environment.random, self._exploration, self._sampling
 
 
 def _fingerprints(scenarios: Sequence[Scenario]) -> list[list[object]]:

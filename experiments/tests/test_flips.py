@@ -1,7 +1,5 @@
 """The script of docs/benchmarks.md that counts flips, at a small scale."""
 
-from __future__ import annotations
-
 import numpy as np
 from flips import APART, drive, is_flip
 

@@ -1,5 +1,3 @@
-from __future__ import annotations
-
 import math
 import re
 from collections.abc import Iterator
@@ -31,7 +29,14 @@ from networks import random_network
 from random_maps import KINDS
 
 from ddqn_planner import GridMap, MoveRule, Planner
-from ddqn_planner.grid import MOVES, Cell, legal_moves, move_costs, save_map, shortest_distances
+from ddqn_planner.grid import (
+    Cell,
+    legal_moves,
+    move_costs,
+    neighbours,
+    save_map,
+    shortest_distances,
+)
 from ddqn_planner.model import ModelMetadata, QNetwork
 from ddqn_planner.model.model_file import save_model
 
@@ -51,10 +56,9 @@ class PerfectNetwork:
     supports, move_costs = QNetwork.supports, QNetwork.move_costs
 
     def q_values(self, grid: GridMap, goal: Cell, move_rule: MoveRule) -> np.ndarray:
-        distance = np.pad(shortest_distances(grid, goal, move_rule), 1, constant_values=np.inf)
-        height, width = grid.occupancy.shape
-        onward = [distance[1 + dy : 1 + dy + height, 1 + dx : 1 + dx + width] for dx, dy in MOVES]
-        q = -move_costs(grid.cost_multiplier, move_rule) - np.array(onward)
+        distance = np.append(shortest_distances(grid, goal, move_rule), np.inf)
+        onward = distance[neighbours(grid.occupancy.shape)].reshape(-1, *grid.occupancy.shape)
+        q = -move_costs(grid.cost_multiplier, move_rule) - onward
         return np.where(legal_moves(grid.occupancy, move_rule), q, self.bonus).astype(np.float32)
 
 
@@ -65,8 +69,7 @@ class StubbornNetwork(PerfectNetwork):
         self.action_of_cell = np.array(action_of_cell)
 
     def q_values(self, grid: GridMap, goal: Cell, move_rule: MoveRule) -> np.ndarray:
-        actions = np.arange(len(MOVES)).reshape(-1, 1, 1)
-        return (self.action_of_cell == actions).astype(np.float32)
+        return np.float32([self.action_of_cell == action for action in range(8)])
 
 
 def rollouts_of(
@@ -83,9 +86,12 @@ def rows(rollouts: list[Rollout]) -> list[list[str]]:
 
 def total(rollouts: list[Rollout], *columns: str) -> list[str]:
     """Cells of the last row, which counts all rollouts."""
-    names = ["all", *COLUMNS.split(" | ")]
-    row = dict(zip(names, rows(rollouts)[-1], strict=True))
+    row = dict(zip(["all", *COLUMNS.split(" | ")], rows(rollouts)[-1], strict=True))
     return [row[column] for column in columns]
+
+
+def read(folder: Path, settings: RequestSettings = SAFE) -> list[BenchmarkMap]:
+    return list(read_maps(find_files(folder), settings))
 
 
 def free_map(*requests: tuple[Cell, Cell]) -> BenchmarkMap:
@@ -194,14 +200,14 @@ def test_the_same_seed_draws_the_same_whichever_other_maps_there_are(costs: str)
 def test_the_optima_of_a_scenario_file_hold_under_the_robot_safe_rule(tmp_path: Path) -> None:
     lines = ["0\tc.map\t3\t3\t1\t0\t2\t1\t2", "0\tc.map\t3\t3\t0\t0\t2\t2\t2.82842712"]
     write_moving_ai(tmp_path, "c", CORNER, lines)
-    (read,) = read_maps(find_files(tmp_path), SAFE)
-    assert read.requests == [((1, 0), (2, 1)), ((0, 0), (2, 2))]
-    rollouts = rollouts_of(PerfectNetwork(), read)
+    (found,) = read(tmp_path)
+    assert found.requests == [((1, 0), (2, 1)), ((0, 0), (2, 2))]
+    rollouts = rollouts_of(PerfectNetwork(), found)
     assert "the oracle agrees with 2/2" in markdown(rollouts)
     assert [rollout.ratio for rollout in rollouts] == pytest.approx([1.0, 1.0])
     for settings in (RequestSettings(MoveRule.CORNER_CUTTING), replace(SAFE, costs="random")):
-        (read,) = read_maps(find_files(tmp_path), settings)
-        assert read.optima is None
+        (found,) = read(tmp_path, settings)
+        assert found.optima is None
 
 
 @pytest.mark.parametrize(
@@ -220,7 +226,7 @@ def test_a_rounded_optimum_agrees_within_what_its_file_gives(
     goals = ("1 1", "2 2", "0 2")
     lines = [f"0 c.map 3 3 0 0 {goal} {o}" for goal, o in zip(goals, optima, strict=True)]
     write_moving_ai(tmp_path, "c", ["...", "...", "..."], lines)
-    rollouts = rollouts_of(PerfectNetwork(), *read_maps(find_files(tmp_path), SAFE))
+    rollouts = rollouts_of(PerfectNetwork(), *read(tmp_path))
     assert f"the oracle agrees with {agree}/3." in markdown(rollouts)
 
 
@@ -233,8 +239,8 @@ def test_a_sample_of_a_scenario_file_has_short_and_long_paths_alike(tmp_path: Pa
 
     def lengths(requests: int, seed: int = 0) -> list[float]:
         settings = RequestSettings(MoveRule.ROBOT_SAFE, requests, seed=seed)
-        (read,) = read_maps(find_files(tmp_path), settings)
-        return list(read.optima or [])
+        (found,) = read(tmp_path, settings)
+        return list(found.optima or [])
 
     assert [int(length - 1) // 9 for length in lengths(11)] == [*range(11)]
     assert lengths(11) == lengths(11) != lengths(11, seed=1)
@@ -247,12 +253,12 @@ def test_mpd_maps_keep_their_goal_and_give_the_optimum_under_their_rule(
 ) -> None:
     path = tmp_path_factory.mktemp("mpd") / "m.npz"
     occupancies = write_mpd(path)
-    read = list(read_maps([path], RequestSettings(rule, 4, "none", seed)))
-    for benchmark_map, occupancy in zip(read, occupancies, strict=True):
+    drawn = list(read_maps([path], RequestSettings(rule, 4, "none", seed)))
+    for benchmark_map, occupancy in zip(drawn, occupancies, strict=True):
         np.testing.assert_array_equal(benchmark_map.grid.occupancy, occupancy)
         assert len(benchmark_map.requests) == 4
         assert {goal for _, goal in benchmark_map.requests} == {(4, 2)}
-    rollouts = rollouts_of(PerfectNetwork(), *read, rule=rule)
+    rollouts = rollouts_of(PerfectNetwork(), *drawn, rule=rule)
     agrees = "the oracle agrees with 12/12" in markdown(rollouts)
     assert agrees == (rule is MoveRule.UNIT)
     assert all(rollout.ratio == pytest.approx(1.0) for rollout in rollouts)
@@ -277,7 +283,7 @@ def test_a_file_that_cannot_be_used_is_named_and_the_others_go_on(
     save_map(GridMap(np.zeros((4, 5))), tmp_path / "hall.yaml")
     write_mpd(tmp_path / "z.npz", maps=1)
     (tmp_path / name).write_text(content)
-    sets = [read.set_name for read in read_maps(find_files(tmp_path), SAFE)]
+    sets = [drawn.set_name for drawn in read(tmp_path)]
     others = ["ros hall", "mpd z"]
     assert sets == (others if name == "c.scen" else ["movingai c", *others])
     (line,) = capsys.readouterr().err.splitlines()
@@ -291,15 +297,11 @@ def model(tmp_path_factory: pytest.TempPathFactory) -> str:
     return str(path)
 
 
-def test_the_program_prints_and_writes_its_tables(
-    capsys: pytest.CaptureFixture[str], tmp_path: Path, model: str
-) -> None:
-    out = tmp_path / "tables.md"
+def test_the_program_prints_its_tables(capsys: pytest.CaptureFixture[str], model: str) -> None:
     command = ["--model", model, "--kinds", "maze", "random_10", "--sizes", "8", "16"]
-    assert main([*command, "--maps", "2", "--requests", "12", "--out", str(out)]) == 0
+    assert main([*command, "--maps", "2", "--requests", "12"]) == 0
     printed = capsys.readouterr().out
     assert "move rule robot_safe, costs none, requests of seed 0." in printed
-    assert out.read_text() == printed
     for row in ("maze | 8x8", "maze | 16x16", "random_10 | 8x8", "random_10 | 16x16"):
         assert f"| {row} | 2 | 24 |" in printed
 

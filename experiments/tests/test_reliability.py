@@ -1,7 +1,5 @@
 """`make faults`, `load`, `soak` and the driving demo, at a small scale."""
 
-from __future__ import annotations
-
 import os
 import re
 import subprocess

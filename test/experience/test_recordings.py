@@ -9,8 +9,7 @@ import pytest
 
 from ddqn_planner import Experience, GridMap
 from ddqn_planner.cli import main
-from ddqn_planner.experience.drives import DriveEnd, DriveFolder
-from ddqn_planner.experience.recordings import drives_of, read_mcap
+from ddqn_planner.experience.drives import DriveEnd, DriveFolder, drives_of, read_mcap
 from ddqn_planner.grid import save_map
 
 GRID = GridMap(np.zeros((40, 120), dtype=np.bool_), resolution=0.25)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import math
 import os
@@ -31,15 +32,8 @@ from ddqn_planner.grid.map_file import (
 )
 from ddqn_planner.resources import find_map
 
-VALID: dict[str, Any] = {
-    "image": "map.png",
-    "mode": "trinary",
-    "resolution": 0.05,
-    "origin": [1.0, -2.0, 0.5],
-    "negate": 0,
-    "occupied_thresh": 0.65,
-    "free_thresh": 0.25,
-}
+VALID: dict[str, Any] = {"image": "map.png", "mode": "trinary", "resolution": 0.05, "negate": 0}
+VALID |= {"origin": [1.0, -2.0, 0.5], "occupied_thresh": 0.65, "free_thresh": 0.25}
 PIXELS = np.zeros((2, 2), dtype=np.uint8)
 
 # The examples can share a folder: each writes the same files again.
@@ -47,14 +41,16 @@ same_folder = settings(suppress_health_check=[HealthCheck.function_scoped_fixtur
 shapes = numpy_st.array_shapes(min_dims=2, max_dims=2, min_side=1, max_side=7)
 
 
-def write(folder: Path, pixels: np.ndarray | Image.Image | bytes, /, **changes: Any) -> Path:
-    """Write an image and a YAML; a key with the value None is left out."""
-    if isinstance(pixels, bytes):
-        (folder / "map.png").write_bytes(pixels)
+def put(path: Path, image: np.ndarray | Image.Image | bytes) -> None:
+    if isinstance(image, bytes):
+        path.write_bytes(image)
     else:
-        (Image.fromarray(pixels) if isinstance(pixels, np.ndarray) else pixels).save(
-            folder / "map.png"
-        )
+        (Image.fromarray(image) if isinstance(image, np.ndarray) else image).save(path)
+
+
+def write(folder: Path, image: np.ndarray | Image.Image | bytes, /, **changes: Any) -> Path:
+    """Write an image and a YAML; a key with the value None is left out."""
+    put(folder / "map.png", image)
     entries = {key: value for key, value in {**VALID, **changes}.items() if value is not None}
     (folder / "map.yaml").write_text(yaml.safe_dump(entries))
     return folder / "map.yaml"
@@ -197,21 +193,16 @@ def test_a_moving_ai_map_keeps_the_benchmarks_rows_and_columns(tmp_path: Path) -
 # What is saved
 
 
-@same_folder
-@given(
-    st.sampled_from([st.integers(-1, 100), st.sampled_from([-1, 0, 100])]).flatmap(
-        lambda elements: numpy_st.arrays(np.int8, shapes, elements=elements)
-    ),
-    st.floats(0.01, 10),
-    st.tuples(*3 * [st.floats(-100, 100)]),
-    st.data(),
+percent = st.sampled_from([st.integers(-1, 100), st.sampled_from([-1, 0, 100])]).flatmap(
+    lambda elements: numpy_st.arrays(np.int8, shapes, elements=elements)
 )
+origins = st.tuples(*3 * [st.floats(-100, 100)])
+
+
+@same_folder
+@given(percent, st.floats(0.01, 10), origins, st.data())
 def test_a_saved_map_file_comes_back_the_same(
-    tmp_path: Path,
-    values: np.ndarray,
-    resolution: float,
-    origin: tuple[float, float, float],
-    data: st.DataObject,
+    tmp_path: Path, values: np.ndarray, resolution: float, origin: Any, data: st.DataObject
 ) -> None:
     cells = [st.integers(0, side - 1) for side in values.shape[::-1]]
     start, goal = (data.draw(st.none() | st.tuples(*cells)) for _ in range(2))
@@ -239,10 +230,10 @@ def test_a_saved_grid_comes_back_with_its_directions_and_on_request_its_costs(
     np.testing.assert_array_equal(load_map(path).occupancy, closed)
 
 
-@pytest.mark.parametrize("name", ["saved.pgm", "saved.map", "saved"])
-def test_a_map_is_saved_as_yaml_alone(tmp_path: Path, name: str) -> None:
-    with pytest.raises(MapFileError, match=r"\.yaml"):
-        save_map(GridMap(PIXELS), tmp_path / name)
+def test_a_map_is_saved_as_yaml_alone(tmp_path: Path) -> None:
+    for name in ("saved.pgm", "saved.map", "saved"):
+        with pytest.raises(MapFileError, match=r"\.yaml"):
+            save_map(GridMap(PIXELS), tmp_path / name)
     assert not list(tmp_path.iterdir())
 
 
@@ -323,28 +314,20 @@ def test_an_unreadable_file_is_refused(plain_folder: Path) -> None:
             read_map_file(path)
 
 
-@pytest.mark.parametrize(
-    ("content", "error"),
-    [
-        *(
-            (f"type octile\nheight {height}\nwidth 2\nmap\n..\n", MapMetadataError)
-            for height in "x0"
-        ),
-        *(("", MapMetadataError), ("type quad\nheight 1\nwidth 2\nmap\n..\n", MapMetadataError)),
-        ("type octile\nwidth 1\nheight 2\nmap\n.@\n", MapMetadataError),
-        ("type octile\nheight 2\nwidth 2\nmap\n..\n", MapDataError),
-        *(
-            (f"type octile\nheight 1\nwidth 2\nmap\n..{more}\n", MapDataError)
-            for more in (".", "\n..")
-        ),
-    ],
-)
-def test_a_broken_moving_ai_map_is_refused(
-    tmp_path: Path, content: str, error: type[MapFileError]
-) -> None:
-    (tmp_path / "broken.map").write_text(content)
-    with pytest.raises(error, match=r"broken\.map"):
-        read_map_file(tmp_path / "broken.map")
+def test_a_broken_moving_ai_map_is_refused(tmp_path: Path) -> None:
+    header, path = "type octile\nheight {}\nwidth {}\nmap\n", tmp_path / "broken.map"
+    broken = {
+        MapMetadataError: ["", "type quad\nheight 1\nwidth 2\nmap\n..\n"],
+        MapDataError: [header.format(2, 2) + "..\n", header.format(1, 2) + "..\n..\n"],
+    }
+    broken[MapMetadataError] += [header.format(height, 2) + "..\n" for height in "x0"]
+    broken[MapMetadataError] += ["type octile\nwidth 1\nheight 2\nmap\n.@\n"]
+    broken[MapDataError] += [header.format(1, 2) + "...\n"]
+    for error, contents in broken.items():
+        for content in contents:
+            path.write_text(content)
+            with pytest.raises(error, match=r"broken\.map"):
+                read_map_file(path)
 
 
 # Directions
@@ -353,22 +336,19 @@ GREY = Image.fromarray(np.array([[1, 2, 3], [4, 5, 255]], dtype=np.uint8))
 
 
 def with_directions(folder: Path, image: Image.Image | bytes, name: str) -> Path:
-    if isinstance(image, bytes):
-        (folder / name).write_bytes(image)
-    else:
-        image.save(folder / name)
+    put(folder / name, image)
     white = np.full((2, 3), 254, dtype=np.uint8)
     return write(folder, white, ddqn_planner={"directions": name})
 
 
-@pytest.mark.parametrize("name", ["d.png", "d.pgm"])
-def test_the_bottom_row_of_the_image_of_directions_is_row_0(tmp_path: Path, name: str) -> None:
-    forbidden = load_map(with_directions(tmp_path, GREY, name)).forbidden
-    assert forbidden is not None
-    assert forbidden.tolist() == [[4, 5, 255], [1, 2, 3]]
-    assert not forbidden.flags.writeable
+def test_the_bottom_row_of_the_image_of_directions_is_row_0(tmp_path: Path) -> None:
     black = Image.fromarray(np.zeros((2, 3), dtype=np.uint8))
-    assert load_map(with_directions(tmp_path, black, name)).forbidden is None
+    for name in ("d.png", "d.pgm"):
+        forbidden = load_map(with_directions(tmp_path, GREY, name)).forbidden
+        assert forbidden is not None
+        assert forbidden.tolist() == [[4, 5, 255], [1, 2, 3]]
+        assert not forbidden.flags.writeable
+        assert load_map(with_directions(tmp_path, black, name)).forbidden is None
 
 
 @pytest.mark.parametrize(
@@ -405,43 +385,38 @@ def folder(tmp_path: Path) -> Path:
     return folder
 
 
-@pytest.mark.parametrize("image", ["../good.pgm", "{}/good.pgm", "outside.pgm", "above/good.pgm"])
-def test_an_image_outside_of_the_yamls_folder_is_refused(folder: Path, image: str) -> None:
-    name = image.format(folder.parent)
-    for changes in ({"image": name}, {"ddqn_planner": {"directions": name}}):
+def test_an_image_lies_in_the_yamls_folder_named_in_any_way(folder: Path) -> None:
+    for inside in ("./good.pgm", f"{folder}/good.pgm", "below/good.pgm", "link.pgm"):
+        assert read_map_file(write(folder, PIXELS, image=inside)).values.shape == (3, 3)
+    outside = ["../good.pgm", f"{folder.parent}/good.pgm", "outside.pgm", "above/good.pgm"]
+    for name, key in itertools.product(outside, ("image", "directions")):
+        changes = {"ddqn_planner": {key: name}} if key == "directions" else {key: name}
         path = write(folder, np.zeros((3, 3), dtype=np.uint8), **changes)
         with pytest.raises(MapMetadataError, match=r"outside of the folder .* put it beside"):
             read_map_file(path)
 
 
-@pytest.mark.parametrize("image", ["./good.pgm", "{}/good.pgm", "below/good.pgm", "link.pgm"])
-def test_an_image_in_the_yamls_folder_may_be_named_in_any_way(folder: Path, image: str) -> None:
-    path = write(folder, PIXELS, image=image.format(folder))
-    assert read_map_file(path).values.shape == (3, 3)
-
-
-@pytest.mark.parametrize("image_is_a_link", [True, False])
 def test_a_yaml_that_is_a_link_reads_the_image_beside_it_or_beside_what_it_links_to(
-    folder: Path, image_is_a_link: bool
+    folder: Path,
 ) -> None:
     linked, target = folder / "linked", folder / "below"
     linked.mkdir()
     (linked / "good.yaml").symlink_to(target / "good.yaml")
-    if image_is_a_link:
-        (linked / "good.pgm").symlink_to(target / "good.pgm")
-    else:
-        (folder / "good.pgm").rename(linked / "good.pgm")
+    (linked / "good.pgm").symlink_to(target / "good.pgm")
+    assert read_map_file(linked / "good.yaml").values.shape == (3, 3)
+    (linked / "good.pgm").unlink()
+    (folder / "good.pgm").rename(linked / "good.pgm")
     assert read_map_file(linked / "good.yaml").values.shape == (3, 3)
 
 
-@pytest.mark.parametrize("image", ["/dev/zero", "/proc/self/mem", "pipe", ".", "nul\0", "\ud800"])
-def test_an_image_that_is_no_regular_file_is_refused(folder: Path, image: str) -> None:
+def test_an_image_that_is_no_regular_file_is_refused(folder: Path) -> None:
     os.mkfifo(folder / "pipe")
-    path = folder / "map.yaml"
-    path.write_text(json.dumps({**VALID, "image": image}))  # with escapes, for the last two
-    with pytest.raises(MapFileError) as caught:
-        read_map_file(path)
-    str(caught.value).encode()  # a name that is no text must not break the log
+    for image in ("/dev/zero", "/proc/self/mem", "pipe", ".", "nul\0", "\ud800"):
+        # With escapes, for the last two.
+        (folder / "map.yaml").write_text(json.dumps({**VALID, "image": image}))
+        with pytest.raises(MapFileError) as caught:
+            read_map_file(folder / "map.yaml")
+        str(caught.value).encode()  # a name that is no text must not break the log
 
 
 NAMES = st.text() | st.sampled_from(
@@ -456,26 +431,21 @@ def test_any_name_of_a_map_is_a_path_or_refused(prefix: str, name: str) -> None:
         assert name in ("dilemma.yaml", "office")
 
 
-@pytest.mark.parametrize(
-    "rest",
-    [
-        *("ddqn_planner/../setup.py", "ddqn_planner/maps/../../x.yaml", "other//etc/x.yaml"),
-        *("ddqn_planner//etc/passwd", "other/../x.yaml"),
-    ],
-)
-def test_a_package_url_does_not_lead_out_of_its_package(rest: str) -> None:
-    with pytest.raises(FileNotFoundError, match="leads out of its package"):
-        find_map(f"package://{rest}")
+NOT_IN_A_PACKAGE = ["ddqn_planner/../setup.py", "ddqn_planner/maps/../../x.yaml", "other/../x.yaml"]
+NOT_IN_A_PACKAGE += ["other//etc/x.yaml", "ddqn_planner//etc/passwd"]
 
 
-@pytest.mark.parametrize("package", ["", "no", "nul\0", "\ud800", "..", "x" * 5000])
-def test_a_package_that_is_not_there_is_refused(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, package: str
+def test_a_package_url_names_a_file_of_a_package_that_is_there(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    for rest in NOT_IN_A_PACKAGE:
+        with pytest.raises(FileNotFoundError, match="leads out of its package"):
+            find_map(f"package://{rest}")
     pytest.importorskip("ament_index_python")
     monkeypatch.setenv("AMENT_PREFIX_PATH", str(tmp_path))
-    with pytest.raises(FileNotFoundError, match="no such package"):
-        find_map(f"package://{package}/map.yaml")
+    for package in ("", "no", "nul\0", "\ud800", "..", "x" * 5000):
+        with pytest.raises(FileNotFoundError, match="no such package"):
+            find_map(f"package://{package}/map.yaml")
 
 
 # Anything else
@@ -559,25 +529,20 @@ def test_nothing_in_a_yaml_grows_or_runs_when_it_is_read(
     assert not (tmp_path / "exploded").exists()
 
 
+SCALARS = st.none() | st.booleans() | st.integers(-(10**400), 10**400) | st.floats() | st.text()
 YAML_VALUES = st.recursive(
-    st.none()
-    | st.booleans()
-    | st.integers(-(10**400), 10**400)
-    | st.floats()
-    | st.text()
-    | st.binary()
-    | st.dates(),
+    SCALARS | st.binary() | st.dates(),
     lambda values: st.lists(values) | st.dictionaries(st.text(), values),
     max_leaves=8,
 )
-
-
-def changed(keys: list[str]) -> st.SearchStrategy[dict[str, Any]]:
-    return st.dictionaries(st.sampled_from(keys), YAML_VALUES, min_size=1)
+CHANGES, SCENARIOS = (
+    st.dictionaries(st.sampled_from(keys), YAML_VALUES, min_size=1)
+    for keys in ([*VALID], ["start", "goal", "directions"])
+)
 
 
 @same_folder
-@given(changed([*VALID]), changed(["start", "goal", "directions"]) | YAML_VALUES, st.booleans())
+@given(CHANGES, SCENARIOS | YAML_VALUES, st.booleans())
 def test_any_value_of_any_key_is_read_or_refused(
     tmp_path: Path, changes: dict[str, Any], scenario: Any, only_scenario: bool
 ) -> None:
@@ -591,13 +556,11 @@ def test_any_value_of_any_key_is_read_or_refused(
             assert cell is None or map_file.grid().contains(cell)
 
 
-@pytest.mark.parametrize("suffix", [".png", ".bmp", ".jpg", ".ppm"])
-def test_an_image_that_is_cut_off_anywhere_is_complete_or_refused(
-    tmp_path: Path, suffix: str
-) -> None:
-    Image.fromarray(np.zeros((9, 9), dtype=np.uint8)).save(tmp_path / f"whole{suffix}")
-    content = (tmp_path / f"whole{suffix}").read_bytes()
-    for length in range(0, len(content), max(1, len(content) // 50)):
-        path = write(tmp_path, content[:length], mode="raw")
-        with suppress(MapDataError):
-            assert not read_map_file(path).values.any()
+def test_an_image_that_is_cut_off_anywhere_is_complete_or_refused(tmp_path: Path) -> None:
+    for suffix in (".png", ".bmp", ".jpg", ".ppm"):
+        Image.fromarray(np.zeros((9, 9), dtype=np.uint8)).save(tmp_path / f"whole{suffix}")
+        content = (tmp_path / f"whole{suffix}").read_bytes()
+        for length in range(0, len(content), max(1, len(content) // 50)):
+            path = write(tmp_path, content[:length], mode="raw")
+            with suppress(MapDataError):
+                assert not read_map_file(path).values.any()

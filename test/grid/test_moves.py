@@ -8,7 +8,7 @@ import pytest
 import scipy.ndimage
 from hypothesis import given
 from hypothesis import strategies as st
-from strategies import grids_with_costs, grids_with_directions, occupancies
+from strategies import grids_with_costs, grids_with_directions
 
 from ddqn_planner.grid import (
     LENGTHS,
@@ -97,20 +97,13 @@ def test_a_length_counts_moves_under_the_unit_rule_and_along_straight_segments()
     assert path_length([], "unit") == path_length([(1, 1)]) == 0
 
 
-def check_labels(occupancy: np.ndarray, rule: MoveRule) -> None:
+@given(st.integers(0, 2**32 - 1), st.sampled_from([0.1, 0.4, 0.5, 0.6, 1.0]), RULES)
+def test_the_labels_are_those_of_scipy(seed: int, share: float, rule: MoveRule) -> None:
+    random = np.random.default_rng(seed)
+    occupancy = random.random(random.integers(1, 90, 2)) < share
     structure = scipy.ndimage.generate_binary_structure(2, 2 if rule.cuts_corners else 1)
     expected = scipy.ndimage.label(~occupancy, structure)[0]
     np.testing.assert_array_equal(GridMap(occupancy).labels(rule), expected)
-
-
-@given(occupancies, RULES)
-def test_the_labels_are_those_of_scipy(occupancy: np.ndarray, rule: MoveRule) -> None:
-    check_labels(occupancy, rule)
-
-
-@pytest.mark.parametrize(("rule", "share"), list(product(MoveRule, (0.4, 0.5, 0.6))))
-def test_the_labels_of_large_maps_are_those_of_scipy(rule: MoveRule, share: float) -> None:
-    check_labels(np.random.default_rng(0).random((150, 211)) < share, rule)
 
 
 @given(grids_with_directions(), RULES)

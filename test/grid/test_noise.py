@@ -43,21 +43,12 @@ def test_one_to_five_new_obstacles_lie_where_the_noise_says_and_leave_a_path(
     assert distances == ({0} if noise is Noise.ON_PATH else {0, 1})
 
 
-def test_a_corridor_that_any_obstacle_closes_is_refused() -> None:
-    path = [(x, 0) for x in range(4)]
-    with pytest.raises(ValueError, match="left a path"):
-        scatter_obstacles(
-            GridMap(np.zeros((1, 4))), path, MoveRule.ROBOT_SAFE, np.random.default_rng(0)
-        )
-
-
-@pytest.mark.parametrize(("noise", "where"), [("on_path", "on"), ("near_path", "on or next to")])
-def test_a_path_with_no_cell_to_occupy_is_refused(noise: str, where: str) -> None:
-    grid = GridMap(np.zeros((1, 2)))
-    with pytest.raises(ValueError, match=f"lies {where} the path"):
-        scatter_obstacles(
-            grid, [(0, 0), (1, 0)], MoveRule.UNIT, np.random.default_rng(0), Noise(noise)
-        )
+def test_a_path_that_leaves_no_obstacle_a_place_is_refused() -> None:
+    cases = ((4, Noise.NEAR_PATH, "left a path"), (2, Noise.ON_PATH, "lies on the path"))
+    for width, noise, named in (*cases, (2, Noise.NEAR_PATH, "lies on or next to the path")):
+        grid, path = GridMap(np.zeros((1, width))), [(x, 0) for x in range(width)]
+        with pytest.raises(ValueError, match=named):
+            scatter_obstacles(grid, path, MoveRule.ROBOT_SAFE, np.random.default_rng(0), noise)
 
 
 @given(occupancies, st.sampled_from(list(MoveRule)), st.integers(0, 2**32 - 1))

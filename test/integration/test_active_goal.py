@@ -15,7 +15,6 @@ from nav_msgs.msg import OccupancyGrid, Odometry, Path
 from std_msgs.msg import Header
 
 from ddqn_planner.grid import Cell
-from ddqn_planner.nodes.poses import has_tf
 from ddqn_planner.nodes.report import seconds
 from ddqn_planner.nodes.runtime import LATCHED
 
@@ -266,14 +265,6 @@ def test_bad_goals_are_named_and_an_empty_array_leaves_the_goal(docks: Robot) ->
         "^goal 2's orientation is .*; give one of norm 1", {"status": "INVALID_GOAL"}
     )
     assert docks.plans.wait(lambda path: not path.poses)
-
-
-@pytest.mark.skipif(has_tf(), reason="tf2_ros is installed")
-def test_goals_in_another_frame_are_refused_without_tf(docks: Robot) -> None:
-    send_goals(docks, LEFT, RIGHT, frame="odom")
-    docks.wait_for_reason(
-        "^goal 1's frame is 'odom', the map's is 'map'", {"status": "INVALID_GOAL"}
-    )
 
 
 def test_goals_and_a_single_goal_replace_each_other(docks: Robot) -> None:

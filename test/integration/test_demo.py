@@ -1,7 +1,5 @@
 """The demo as `make demo` runs it, to its end and interrupted."""
 
-from __future__ import annotations
-
 import os
 import signal
 import subprocess
@@ -11,11 +9,13 @@ from collections.abc import Iterator
 from contextlib import suppress
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from client import wait_for
 from PIL import Image
+from processes import running
 
 pytestmark = pytest.mark.slow
 
@@ -30,18 +30,18 @@ class Demo:
 
     def __init__(self, folder: Path) -> None:
         # The demo's nodes are in sessions of their own; they inherit its environment.
-        mark = uuid.uuid4().hex
+        mark, self._output = uuid.uuid4().hex, folder / "output.txt"
         self._entry = f"{MARK}={mark}".encode()
-        self._output = folder / "output.txt"
+        environment, redirect = {**os.environ, MARK: mark}, subprocess.STDOUT
         with self._output.open("wb") as file:
-            self.process = subprocess.Popen(
-                [sys.executable, str(DEMO)],
-                cwd=folder,
-                env={**os.environ, MARK: mark},
-                stdout=file,
-                stderr=subprocess.STDOUT,
-                start_new_session=True,
-            )
+            options: dict[str, Any] = {
+                "cwd": folder,
+                "env": environment,
+                "stdout": file,
+                "stderr": redirect,
+            }
+            command = [sys.executable, str(DEMO)]
+            self.process = subprocess.Popen(command, start_new_session=True, **options)
 
     @property
     def output(self) -> str:
@@ -92,3 +92,18 @@ def test_no_process_outlives_the_demo(demo: Demo, signal_number: int, code: int)
     demo.process.send_signal(signal_number)
     assert demo.process.wait(TIMEOUT) == code, demo.output
     assert demo.commands() == {}
+
+
+def test_a_signal_while_a_node_is_started_ends_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    children = []
+
+    def start(*arguments: Any, **options: Any) -> subprocess.Popen[bytes]:
+        children.append(popen(*arguments, **options))
+        signal.raise_signal(signal.SIGINT)
+        return children[0]
+
+    popen = subprocess.Popen
+    monkeypatch.setattr(subprocess, "Popen", start)
+    with pytest.raises(KeyboardInterrupt), running("sleep", "60"):
+        pass
+    assert children[0].returncode == -signal.SIGINT

@@ -61,8 +61,8 @@ def test_paths_there_and_back_obey_the_served_directions(client: Any) -> None:
 
 
 def test_the_directions_come_with_the_stamp_and_the_place_of_the_map(client: Any) -> None:
-    directions = client.subscribe(OccupancyGrid, "map_directions", LATCHED)
-    maps = client.subscribe(OccupancyGrid, "map", LATCHED)
+    topics = "map_directions", "map"
+    directions, maps = (client.subscribe(OccupancyGrid, topic, LATCHED) for topic in topics)
     for _ in range(2):
         served = client.call(GetMap, "map_server/map").map
         maps.wait(lambda message, served=served: message == served)

@@ -14,13 +14,12 @@ from typing import Any
 
 import pytest
 import rclpy
-from client import initial_pose, plan_request, wait_for
+from client import generated_map, initial_pose, plan_request, wait_for
 from diagnostic_msgs.msg import DiagnosticStatus
 from integration.robot import GOAL, NUMBERS, START, Manager, Robot
 from integration.test_startup import ask_for_plan
 from integration.test_startup import load_gate as load_gate
 from lifecycle_msgs.msg import Transition
-from map_fixture import generated_map
 from nav_msgs.srv import GetPlan
 from processes import cpu_seconds
 

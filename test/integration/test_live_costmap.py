@@ -14,7 +14,7 @@ from builtin_interfaces.msg import Time
 from client import cells_of
 from diagnostic_msgs.msg import DiagnosticStatus
 from geometry_msgs.msg import PoseStamped, TransformStamped
-from integration.robot import TIMEOUT, Robot, values_of
+from integration.robot import Robot, values_of
 from std_msgs.msg import Header
 
 from ddqn_planner.grid import GridMap
@@ -72,27 +72,24 @@ def test_a_costmap_is_planned_on_where_the_same_values_as_a_map_leave_no_path(
     assert "give one of map, costmap" in robot.refuse(map_type="octree")
 
 
+def stamp(path: Any) -> tuple[int, int]:
+    return path.header.stamp.sec, path.header.stamp.nanosec
+
+
 def test_a_costmap_that_stops_takes_its_path_back_until_it_comes_again(robot: Robot) -> None:
+    # Nobody sets a parameter or asks while it is away, and it is not time to plan again.
+    robot.set(map_timeout=1.5, replan_period=3600.0)
     robot.send_goal(robot.pose((35, 5)))
-    robot.wait_for_path((5, 5), (35, 5))
-    robot.clear()
-    robot.set(map_timeout=0.2)
-    assert robot.plans.wait(lambda path: not path.poses).header.frame_id == "map"
+    for _ in range(2):
+        robot.clear()
+        robot.client.publish("global_costmap/costmap", robot.stamped_map(), LATCHED)
+        shown = stamp(robot.wait_for_path((5, 5), (35, 5)))
+        empty = robot.plans.wait(lambda path, at=shown: not path.poses and stamp(path) > at)
+        assert empty.header.frame_id == "map"
     assert robot.get_plan(robot.pose((5, 5)), robot.pose((9, 9))).poses == []
     status = robot.wait_for_reason("nothing came on /live/global_costmap/costmap for longer than")
     assert status.level == DiagnosticStatus.WARN
     assert values_of(status)["status"] == "MAP_TIMEOUT"
-    robot.clear()
-    robot.set(map_timeout=TIMEOUT)
-    robot.client.publish("global_costmap/costmap", robot.stamped_map(), LATCHED)
-    robot.wait_for_path((5, 5), (35, 5))
-    # It stops by itself: nobody sets a parameter or asks, and it is not time to plan again.
-    robot.set(map_timeout=1.5, replan_period=3600.0)
-    robot.clear()
-    robot.client.publish("global_costmap/costmap", robot.stamped_map(), LATCHED)
-    robot.plans.wait(lambda path: not path.poses)
-    robot.client.publish("global_costmap/costmap", robot.stamped_map(), LATCHED)
-    robot.plans.wait(lambda path: path.poses)
     robot.set(map_timeout=0.0, replan_period=1.0)
 
 
@@ -133,7 +130,6 @@ def test_poses_in_other_frames_are_transformed(robot: Robot) -> None:
     from tf2_msgs.msg import TFMessage
 
     client, clock = robot.client, robot.client.node.get_clock()
-    robot_is_at = [0.0]
 
     def in_frame(frame: str, x: float, y: float) -> PoseStamped:
         stamped = PoseStamped(header=Header(frame_id=frame, stamp=clock.now().to_msg()))
@@ -142,35 +138,21 @@ def test_poses_in_other_frames_are_transformed(robot: Robot) -> None:
 
     def send_transforms() -> None:
         message = TFMessage()
-        for parent, child, x, y in (("map", "odom", 5.0, 4.0), ("odom", "base", *robot_is_at, 0.0)):
+        for parent, child, x, y in (("map", "odom", 5.0, 4.0), ("odom", "base", 0.0, 0.0)):
             of_frame = TransformStamped(child_frame_id=child)
             of_frame.header = in_frame(parent, 0.0, 0.0).header
             of_frame.transform.translation.x, of_frame.transform.translation.y = x, y
             message.transforms.append(of_frame)
         client.publish("/tf", message, listeners=0)
 
-    def ends(path: Any) -> list[tuple[int, int]]:
-        cells = cells_of(robot.grid, path)
-        return [cells[0], cells[-1]]
-
     robot.set(transform_tolerance=60.0)
     timer = client.node.create_timer(0.02, send_transforms)
     try:
         path = robot.get_plan(in_frame("odom", 0.1, 0.1), in_frame("base", 3.1, 2.1))
+        cells = cells_of(robot.grid, path)
         expected = [robot.grid.world_to_cell(*point) for point in ((5.1, 4.1), (8.1, 6.1))]
         assert path.header.frame_id == "map"
-        assert ends(path) == expected
-        # A goal stays where it was when the robot's frame moves on.
-        robot.clear()
-        robot.send_start(in_frame("odom", 0.1, 0.1))
-        robot.send_goal(in_frame("base", 3.1, 2.1))
-        robot.plans.wait(lambda path: len(path.poses) > 1 and ends(path) == expected)
-        robot_is_at[0] = 2.0
-        robot.set(transform_tolerance=1.0)
-        robot.clear()
-        robot.send_start(robot.pose((3, 3)))
-        path = robot.plans.wait(lambda path: len(path.poses) > 1 and ends(path)[0] == (3, 3))
-        assert ends(path)[1] == expected[1]
+        assert [cells[0], cells[-1]] == expected
     finally:
         client.node.destroy_timer(timer)
     assert robot.get_plan(robot.pose((3, 3)), in_frame("moon", 0.0, 0.0)).poses == []

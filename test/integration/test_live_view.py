@@ -1,7 +1,5 @@
 """The live view of examples/, into a recording."""
 
-from __future__ import annotations
-
 import sys
 import time
 from collections.abc import Callable

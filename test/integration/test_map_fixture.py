@@ -1,10 +1,7 @@
 """The check of the planner's answers that load, soak and faults rely on."""
 
-from __future__ import annotations
-
 import numpy as np
-from client import plan_request, pose
-from map_fixture import MapFixture
+from client import MapFixture, plan_request, pose
 from nav_msgs.msg import Path
 
 from ddqn_planner.grid import Cell, MapFile

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import inspect
 import sys
 import threading
 from collections.abc import Callable, Coroutine, Iterator
+from functools import partialmethod
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
@@ -15,20 +15,11 @@ import pytest
 import rclpy
 from client import map_message, pose, wait_for
 from geometry_msgs.msg import PoseStamped
-from integration.robot import (
-    GOAL,
-    NUMBERS,
-    START,
-    Manager,
-    Robot,
-    changed,
-    check_path,
-    points_of,
-)
+from integration.robot import GOAL, NUMBERS, START, Manager, Robot, changed, check_path, points_of
 from integration.test_startup import load_gate as load_gate
 from nav_msgs.msg import Path as PathMessage
 from rclpy.action.client import ActionClient
-from rclpy.action.server import ActionServer, CancelResponse, GoalResponse
+from rclpy.action.server import CancelResponse, GoalResponse
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.parameter import Parameter
 from rclpy.task import Future
@@ -36,7 +27,7 @@ from rclpy.utilities import try_shutdown
 
 from ddqn_planner.grid import GridMap
 from ddqn_planner.nodes import nav2
-from ddqn_planner.nodes.nav2 import PREEMPTED, PathAction, error_code
+from ddqn_planner.nodes.nav2 import PREEMPTED, GivenUp, PathAction, error_code
 from ddqn_planner.nodes.planner_node import PlannerNode
 from ddqn_planner.nodes.report import NOT_ACTIVE, Outcome, RequestError
 from ddqn_planner.nodes.requests import check_request
@@ -82,22 +73,22 @@ def test_codes_are_nav2s(name: str) -> None:
     assert [error_code(status, result) for status in ("SUCCEEDED", "CANCELED")] == [0, 0]
 
 
-@pytest.mark.parametrize("name", ["", "GridBased"])
-def test_the_planner_is_named_by_its_id_or_not_at_all(name: str) -> None:
-    check_request([1], name, "GridBased")
-    with pytest.raises(RequestError, match="no planner 'Smac'; give 'GridBased' or ''") as error:
-        check_request([1], "Smac", "GridBased")
-    assert error.value.status == "INVALID_PLANNER"
-    with pytest.raises(RequestError, match="no goal; give one or more") as error:
-        check_request([], name, "GridBased")
-    assert error.value.status == "NO_GOALS"
+def test_a_request_has_a_goal_and_names_the_planner_or_none() -> None:
+    for name in ("", "GridBased"):
+        check_request([1], name, "GridBased")
+    for goals, name, status, reason in (
+        ([1], "Smac", "INVALID_PLANNER", "no planner 'Smac'; give 'GridBased' or ''"),
+        ([], "", "NO_GOALS", "no goal; give one or more"),
+    ):
+        with pytest.raises(RequestError, match=reason) as error:
+            check_request(goals, name, "GridBased")
+        assert error.value.status == status
 
 
 class Handle:
     """What rclpy's handle of a goal has, with the transitions that it allows."""
 
-    def __init__(self, number: int, goals: int | None = None, use_start: bool = True) -> None:
-        self.goal_id = SimpleNamespace(uuid=[number] * 16)
+    def __init__(self, goals: int | None = None, use_start: bool = True) -> None:
         start, goal = (PoseStamped() for _ in range(2))
         named = {"goal": goal} if goals is None else {"goals": [goal] * goals}
         self.request = SimpleNamespace(start=start, use_start=use_start, planner_id="", **named)
@@ -111,37 +102,32 @@ class Handle:
         if self.state != "canceling":
             self.state = "executing"
 
-    def succeed(self) -> None:
-        assert self.state in ("executing", "canceling")
-        self.state = "succeeded"
+    def _end(self, state: str, *before: str) -> None:
+        assert self.state in before
+        self.state = state
 
-    def abort(self) -> None:
-        assert self.state in ("executing", "canceling")
-        self.state = "aborted"
-
-    def canceled(self) -> None:
-        assert self.state == "canceling"
-        self.state = "canceled"
+    succeed = partialmethod(_end, "succeeded", "executing", "canceling")
+    abort = partialmethod(_end, "aborted", "executing", "canceling")
+    canceled = partialmethod(_end, "canceled", "canceling")
 
 
 class Server:
     """An action whose plans are there when the test says so."""
 
     def __init__(self) -> None:
-        self.is_active = True
         self.asked: list[tuple[Any, Any]] = []
-        self.planned, self.stopped = Future(), Future()
-        self.action = PathAction(Result, lambda: self.is_active, self.plan)
+        self.planned, self.refusal = Future(), None
+        self.action = PathAction(Result, lambda: self.refusal, self.plan)
 
     async def plan(
-        self, start: PoseStamped | None, goals: list[PoseStamped], name: str, given_up: Future
+        self, start: PoseStamped | None, goals: list[PoseStamped], name: str, given_up: GivenUp
     ) -> tuple[PathMessage, Outcome]:
         self.asked.append((start, goals))
 
         async def planning() -> Any:
             return await self.planned
 
-        return PathMessage(), await unless(planning(), self.stopped, given_up)
+        return PathMessage(), await unless(planning(), lambda: self.refusal or given_up())
 
     def begin(self, handle: Handle) -> Coroutine[Any, Any, Any]:
         """Accept a goal, and let it wait for its plan."""
@@ -150,10 +136,6 @@ class Server:
         execution = self.action.execute(handle)
         execution.send(None)
         return execution
-
-    def cancel(self, handle: Handle) -> None:
-        assert self.action.cancel(handle) is CancelResponse.ACCEPT
-        handle.state = "canceling"
 
 
 def end(execution: Coroutine[Any, Any, Any]) -> Any:
@@ -166,36 +148,28 @@ def end(execution: Coroutine[Any, Any, Any]) -> Any:
 @pytest.mark.parametrize(
     ("outcome", "state", "code"), [(FOUND, "succeeded", 0), (NO_PATH, "aborted", 308)]
 )
-def test_a_goal_ends_with_its_outcome(outcome: Outcome, state: str, code: int) -> None:
-    server, handle = Server(), Handle(1)
-    execution = server.begin(handle)
+def test_a_goal_is_planned_as_asked_and_ends_with_its_outcome(
+    outcome: Outcome, state: str, code: int
+) -> None:
+    server, first, second = Server(), Handle(use_start=False), Handle(goals=3)
+    server.begin(first).close()
+    execution = server.begin(second)
+    request = second.request
+    assert server.asked == [(None, [first.request.goal]), (request.start, request.goals)]
     server.planned.set_result(outcome)
     result = end(execution)
-    assert (handle.state, result.error_code) == (state, code)
+    assert (second.state, result.error_code) == (state, code)
     assert result.error_msg == ("" if code == 0 else "no path leads there")
     assert result.planning_time.sec == 0
     assert result.planning_time.nanosec > 0
 
 
-def test_the_start_and_the_goals_are_those_of_the_request() -> None:
-    server = Server()
-    first, second = Handle(1, use_start=False), Handle(2, goals=3)
-    executions = [server.begin(handle) for handle in (first, second)]
-    request = second.request
-    assert server.asked == [(None, [first.request.goal]), (request.start, request.goals)]
-    for execution in executions:
-        execution.close()
-
-
 def test_the_newest_goal_preempts_the_one_under_way() -> None:
-    server, first, second = Server(), Handle(1), Handle(2)
+    server, first, second = Server(), Handle(), Handle()
     executions = [server.begin(first), server.begin(second)]
     result = end(executions[0])
-    assert (first.state, result.error_code, result.error_msg) == (
-        "aborted",
-        Result.UNKNOWN,
-        PREEMPTED.reason,
-    )
+    assert (first.state, result.error_code) == ("aborted", Result.UNKNOWN)
+    assert result.error_msg == PREEMPTED.reason
     assert second.state == "executing"
     server.planned.set_result(FOUND)
     end(executions[1])
@@ -203,25 +177,20 @@ def test_the_newest_goal_preempts_the_one_under_way() -> None:
 
 
 def test_a_goal_is_canceled_before_it_is_planned_meanwhile_or_once_it_is_preempted() -> None:
-    server, early, first, second = Server(), *map(Handle, range(3))
+    server, early, first, second = Server(), *(Handle() for _ in range(3))
     server.action.begin(early)
-    server.cancel(early)
+    early.state = "canceling"
     executions = [server.action.execute(early), server.begin(first), server.begin(second)]
-    for handle in (first, second):
-        server.cancel(handle)
+    first.state = second.state = "canceling"
     for handle, execution in zip((early, first, second), executions, strict=True):
         result = end(execution)
-        assert handle.state == "canceled"
-        if handle is not first:  # which the second one preempted
-            assert (result.error_code, result.error_msg) == (0, "")
-    server.cancel(second)  # too late: nothing to give up
+        assert (handle.state, result.error_code, result.error_msg) == ("canceled", 0, "")
 
 
 def test_goals_are_rejected_while_the_node_is_not_active_and_aborted_when_it_stops() -> None:
-    server, handle = Server(), Handle(1)
+    server, handle = Server(), Handle()
     execution = server.begin(handle)
-    server.stopped.set_result(NOT_ACTIVE)
-    server.is_active = False
+    server.refusal = NOT_ACTIVE
     result = end(execution)
     assert (handle.state, result.error_code) == ("aborted", Result.UNKNOWN)
     assert server.action.accept(handle.request) is GoalResponse.REJECT
@@ -234,24 +203,19 @@ def test_the_services_of_actions_have_the_queues_of_the_others(
     types = {"ComputePathThroughPoses": kind, "ComputePathToPose": kind, "IsPathValid": None}
     for module in ("nav2_msgs", "nav2_msgs.action", "nav2_msgs.srv"):
         monkeypatch.setitem(sys.modules, module, SimpleNamespace(**types))
-    made: list[inspect.BoundArguments] = []
-    signature = inspect.signature(ActionServer)
-    record = lambda *given, **named: made.append(signature.bind(*given, **named))  # noqa: E731
-    monkeypatch.setattr(nav2, "ActionServer", record)
+    made: list[dict[str, Any]] = []
+    monkeypatch.setattr(nav2, "ActionServer", lambda *_, **options: made.append(options))
     node = SimpleNamespace(create_service=lambda *given, **named: None)
     nav2.serve_nav2(cast("Any", node), bool, cast("Any", None), print)
-    depths = [
-        made[n].arguments[f"{which}_service_qos_profile"].depth
-        for n in range(2)
-        for which in ("goal", "cancel", "result")
-    ]
+    services = [f"{which}_service_qos_profile" for which in ("goal", "cancel", "result")]
+    depths = [options[service].depth for options in made for service in services]
     assert depths == 6 * [SERVICE_QUALITY.depth]
+    assert all(options["cancel_callback"](None) is CancelResponse.ACCEPT for options in made)
 
 
 def test_a_path_to_one_goal_is_kept_while_it_is_nearly_as_good_as_a_new_one() -> None:
     """The node is asked as its actions ask it, which need nav2_msgs."""
-    parameters = "use_map_costs:=true", "field_cache_bytes:=0"
-    rclpy.init(args=["--ros-args", *(word for it in parameters for word in ("-p", it))])
+    rclpy.init(args=["--ros-args", "-p", "use_map_costs:=true", "-p", "field_cache_bytes:=0"])
     node, executor = PlannerNode(), SingleThreadedExecutor()
     try:
         executor.add_node(node)
@@ -266,7 +230,7 @@ def test_a_path_to_one_goal_is_kept_while_it_is_nearly_as_good_as_a_new_one() ->
             costs = values.copy()
             costs[dear, 10:20] = 2
             node._map._take(map_message(costs, grid, next(NUMBERS)))
-            asked = ends[0], [ends[1]], "", Future()
+            asked = ends[0], [ends[1]], "", lambda: None
             answer = executor.create_task(node._plan_for_action(*asked))
             executor.spin_until_future_complete(answer, 60)
             path, outcome = answer.result()

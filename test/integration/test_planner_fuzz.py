@@ -6,18 +6,16 @@ from typing import Any
 
 import pytest
 from geometry_msgs.msg import PoseArray, PoseStamped, PoseWithCovarianceStamped
-from hypothesis import HealthCheck, assume, given, settings
+from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from integration.messages import NUMBERS_32, STAMPED_POSES, TEXTS, maps, some_parameters
+from integration.messages import NUMBERS_32, STAMPED_POSES, maps, some_parameters
 from integration.robot import GOAL, NUMBERS, Robot, check_path
 from nav_msgs.msg import OccupancyGrid, Odometry
 from nav_msgs.srv import GetPlan
 from rcl_interfaces.srv import GetParameters, SetParameters, SetParametersAtomically
 from rclpy.parameter import Parameter
 from std_msgs.msg import String
-from std_srvs.srv import Trigger
 
-from ddqn_planner.model import find_model
 from ddqn_planner.nodes.conversions import check_tolerance, grid_from_message
 from ddqn_planner.nodes.parameters import PLANNER_PARAMETERS
 from ddqn_planner.nodes.runtime import LATCHED
@@ -93,27 +91,6 @@ def test_any_pose_is_taken_or_refused(unharmed: Robot, message: PoseStamped, top
     source = "odometry" if topic == "odom" else "initialpose"
     robot.set(start_source=source)
     robot.client.publish(topic, pose_message)
-    robot.assert_works()
-
-
-def names_a_model(name: str) -> bool:
-    """Whether there is such a model: hypothesis takes texts from the code too."""
-    try:
-        return find_model(name).is_file()
-    except (OSError, ValueError):
-        return False
-
-
-@fuzz
-@given(name=TEXTS)
-def test_any_name_of_no_model_is_refused(unharmed: Robot, name: str) -> None:
-    assume(not names_a_model(name))
-    robot = unharmed
-    before = robot.client.get_parameter("planner", "model")
-    robot.client.publish("trainer/model_saved", String(data=name), LATCHED)
-    assert robot.refuse(model=name)
-    assert robot.client.get_parameter("planner", "model") == before
-    assert robot.client.call(Trigger, "planner/reload_model").success
     robot.assert_works()
 
 

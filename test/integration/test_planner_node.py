@@ -6,20 +6,19 @@ import math
 import os
 import shutil
 import signal
-import threading
+import time
 from collections.abc import Callable, Iterator
 from pathlib import Path as FilePath
 from typing import Any
 
 import numpy as np
 import pytest
-from client import TIMEOUT, map_message
+from client import TIMEOUT
 from diagnostic_msgs.msg import DiagnosticStatus
 from geometry_msgs.msg import PoseStamped, Quaternion
 from integration.robot import (
     GOAL,
     GOAL_YAW,
-    NUMBERS,
     RESOLUTION,
     START,
     Robot,
@@ -31,29 +30,32 @@ from integration.robot import (
     values_of,
     yaw_of,
 )
+from integration.test_startup import ask_for_plan
 from nav_msgs.msg import OccupancyGrid, Path
 from nav_msgs.srv import GetPlan
-from rcl_interfaces.msg import SetParametersResult
-from rcl_interfaces.srv import DescribeParameters, ListParameters, SetParametersAtomically
-from rclpy.parameter import Parameter
+from rcl_interfaces.srv import DescribeParameters, ListParameters
 from rclpy.qos import QoSProfile
 from std_msgs.msg import String
 from std_srvs.srv import Trigger
 
 from ddqn_planner.model import find_model
+from ddqn_planner.nodes.report import seconds
 from ddqn_planner.nodes.runtime import LATCHED
 
 # What it is for
 
 
 def test_goal_pose_is_answered_by_a_plan_a_value_and_diagnostics(robot: Robot) -> None:
+    began = time.time()
     robot.send_start(robot.pose((0, 3)))
     robot.send_goal(robot.pose(GOAL, GOAL_YAW))
     # With the goal before it the path may have another yaw.
     path = robot.wait_for_path((0, 3), GOAL, yaw=GOAL_YAW)
 
-    value = robot.value.wait()
-    assert value.header.frame_id == "map"
+    value = robot.value.wait(lambda value: float(seconds(value.header.stamp)) > began)
+    for message in (path, value):  # whatever the map's stamp is
+        assert began < float(seconds(message.header.stamp)) < time.time()
+        assert message.header.frame_id == "map"
     assert value.info.origin == robot.map_message().info.origin
     percent = np.array(value.data).reshape(robot.values.shape)
     assert ((percent == -1) == (robot.values > 0)).all()
@@ -70,6 +72,7 @@ def test_goal_pose_is_answered_by_a_plan_a_value_and_diagnostics(robot: Robot) -
     assert values["model move rule"] == values["move rule"] == "robot_safe"
     assert values["model training steps"] == "1536000"
     assert values["model certificate"]
+    assert values["map"] == "6 x 6 cells of 0.5 m in frame 'map'"
     for _ in range(2):  # they come though nothing changes
         robot.diagnostics.clear()
         robot.wait_for_reason("^a path of ")
@@ -112,15 +115,6 @@ def test_plans_again_when_the_map_or_how_it_is_read_changes(robot: Robot) -> Non
         robot.set(**{name: before})
         robot.wait_for_path(START, GOAL)
 
-    grid = robot.grid_of(robot.values, (10.0, 0.0, 0.0))
-    robot.clear()
-    robot.send_start(robot.pose(START, grid=grid))
-    robot.wait_for_reason("the start lies outside the map")
-    robot.send_map(map_message(robot.values, grid, next(NUMBERS)))
-    robot.wait_for_reason("the goal lies outside the map")
-    robot.send_goal(robot.pose(GOAL, grid=grid))
-    robot.wait_for_path(START, GOAL, grid)
-
 
 # Models
 
@@ -150,6 +144,7 @@ def test_reload_plans_again_with_what_the_file_holds_now(
     response = robot.client.call(Trigger, "planner/reload_model")
     assert not response.success
     assert f"{whole_model}: cannot be read as safetensors" in response.message
+    robot.clear()
     robot.get_plan(robot.pose(START), robot.pose(GOAL))
     assert values_of(robot.wait_for_reason("greedy"))["model training steps"] == "7"
     shutil.copy(find_model("any_map"), whole_model)
@@ -198,40 +193,29 @@ def test_a_model_of_another_size_says_so_and_a_trapped_one_may_search(
 # Parameters
 
 
-def test_parameters_that_come_together_are_set_together_or_not_at_all(
+def test_a_bad_parameter_is_refused_with_a_reason_and_a_good_one_holds(
     robot: Robot, tmp_path: FilePath
 ) -> None:
-    def set_together(**values: Any) -> SetParametersResult:
-        messages = [Parameter(name, value=v).to_parameter_msg() for name, v in values.items()]
-        request = SetParametersAtomically.Request(parameters=messages)
-        name = "planner/set_parameters_atomically"
-        return robot.client.call(SetParametersAtomically, name, request).result
-
-    good = {"robot_radius": 0.4, "mode": "astar_fallback", "move_rule": "corner_cutting"}
-    before = {name: robot.client.get_parameter("planner", name) for name in good}
-    broken = tmp_path / "broken.safetensors"
+    broken, missing = tmp_path / "broken.safetensors", tmp_path / "missing.safetensors"
     broken.write_bytes(b"a model")
-    for bad, reason in (
-        ({"clearance_weight": 1.5}, "out of range"),
-        ({"tolerance": math.nan}, "out of range"),
-        ({"mode": "best"}, "mode is 'best'; give one of greedy, astar_fallback"),
-        ({"start_source": "gps"}, "start_source is 'gps'; give one of"),
-        ({"robot_frame": ""}, "robot_frame is ''; name"),
-        ({"follow_trainer": False}, "read-only"),
-        ({"model": "no_such_model"}, "there is no shipped model 'no_such_model'"),
-        ({"model": str(tmp_path / "missing.safetensors")}, "there is no model file"),
-        ({"model": str(broken)}, "cannot be read as safetensors"),
+    for name, bad, reason in (
+        ("clearance_weight", 1.5, "out of range"),
+        ("tolerance", math.nan, "out of range"),
+        ("mode", "best", "mode is 'best'; give one of greedy, astar_fallback"),
+        ("start_source", "gps", "start_source is 'gps'; give one of"),
+        ("robot_frame", "", "robot_frame is ''; name"),
+        ("follow_trainer", False, "read-only"),
+        ("model", "no_such_model", "there is no shipped model 'no_such_model'"),
+        ("model", str(missing), "there is no model file"),
+        ("model", str(broken), "cannot be read as safetensors"),
     ):
-        result = set_together(**{**good, **bad})
-        assert not result.successful
-        assert reason in result.reason
-        for name, value in before.items():
-            assert robot.client.get_parameter("planner", name) == value
+        before = robot.client.get_parameter("planner", name)
+        assert reason in robot.refuse(**{name: bad})
+        assert robot.client.get_parameter("planner", name) == before
     robot.assert_works()
-    assert set_together(**good).successful
+    robot.set(move_rule="corner_cutting")
     values = {"move rule": "corner_cutting", "model move rule": "robot_safe"}
     robot.wait_for_reason(".", values)
-    assert robot.client.get_parameter("planner", "robot_radius") == 0.4
 
 
 # Bad input. After each, a good request has its plan.
@@ -293,17 +277,7 @@ def test_a_bad_request_has_an_empty_plan_and_a_reason(
     robot.assert_works()
 
 
-def test_a_goal_without_a_path_has_an_empty_plan_until_the_map_opens(robot: Robot) -> None:
-    values = robot.values.copy()
-    values[4:, 4] = values[4, 4:] = 100
-    robot.send_map(robot.stamped_map(values))
-    robot.plans.wait(lambda path: not path.poses)
-    status = robot.wait_for_reason(r"no path leads from .*cell \(0, 0\).*cell \(5, 5\)")
-    assert values_of(status)["status"] == "NO_PATH"
-    robot.clear()
-    robot.send_map()
-    robot.wait_for_path(START, GOAL)
-    robot.clear()
+def test_a_map_in_another_frame_than_the_goal_has_an_empty_plan_in_its_frame(robot: Robot) -> None:
     other = robot.map_message()
     other.header.frame_id = "upstairs"
     robot.send_map(other)
@@ -413,10 +387,7 @@ def test_all_else_is_answered_while_a_plan_takes_long(
     gated: tuple[Robot, Any, FilePath], gate: FilePath
 ) -> None:
     robot, node, _ = gated
-    client, answered = robot.client, threading.Event()
-    service = client.service(GetPlan, "planner/get_plan")
-    plan = service.call_async(GetPlan.Request(start=robot.pose(START), goal=robot.pose(GOAL)))
-    plan.add_done_callback(lambda _: answered.set())
+    client, (plan, answered) = robot.client, ask_for_plan(robot)
     node.wait_for_log("a plan waits")
     assert len(robot.get_plan(robot.pose(START), robot.pose(START)).poses) == 1
     outside = changed(robot.pose(START), "pose.position.x", 50.0)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import time
 from collections.abc import Callable, Iterator
 from itertools import pairwise
 from pathlib import Path as FilePath
@@ -101,18 +100,6 @@ def test_a_start_beside_an_obstacle_or_on_one_leaves(robot: Robot, hall: np.ndar
     assert get_cells((10, 4))[:4] == [(10, 4), (9, 4), (8, 4), (7, 4)]
 
 
-def test_specks_on_the_robot_do_not_stop_it(robot: Robot, hall: np.ndarray) -> None:
-    specks = hall.copy()
-    specks[0, 0] = specks[0, 1] = 100
-    robot.set_map(robot.stamped_map(specks))
-    robot.wait_for_reason("obstacles within 0.5 m of it were ignored")
-    specks[:2, :3] = 100  # now the path has to go another way
-    robot.set_map(robot.stamped_map(specks))
-    path = robot.plans.wait(lambda path: cells_of(robot.grid, path)[2:3] == [(0, 2)])
-    assert cells_of(robot.grid, path)[-1] == (19, 0)
-    assert all(path.poses for path in robot.plans.messages())
-
-
 def test_costs_of_the_map_and_near_obstacles_keep_the_path_away_from_them(robot: Robot) -> None:
     asked = robot.pose((9, 0)), robot.pose((11, 0))
     plain = robot.get_plan(*asked)
@@ -190,17 +177,17 @@ def test_simplified_paths_have_fewer_poses_and_no_illegal_segment(robot: Robot) 
 
 
 def test_the_start_comes_from_odometry(robot: Robot) -> None:
+    def wait_until_unknown(refused: str, remedy: str) -> None:
+        """What was refused of one source is forgotten with it."""
+        other = rf"((?!{refused} refused).)*"
+        robot.wait_for_reason(f"^{other}start is unknown; {remedy}{other}$")
+
     robot.send_goal(robot.pose((19, 14)))
-    nowhere = PoseWithCovarianceStamped(header=Header())
-    robot.client.publish("initialpose", nowhere)
+    robot.client.publish("initialpose", PoseWithCovarianceStamped(header=Header()))
     robot.wait_for_reason("initialpose refused")
     robot.change(start_source="odometry", replan_period=3600.0, transform_tolerance=1000.0)
     robot.clear()
-    # What was refused of one source is forgotten with it.
-    robot.wait_for_reason(
-        "^((?!initialpose refused).)*start is unknown; nothing came on /robot/odom in the map's "
-        "frame((?!initialpose refused).)*$"
-    )
+    wait_until_unknown("initialpose", "nothing came on /robot/odom in the map's frame")
     robot.client.publisher(Odometry, "odom")
     robot.client.wait_for_discovery("planner")
     robot.client.publish("odom", odometry(robot, (2, 2)))
@@ -212,17 +199,12 @@ def test_the_start_comes_from_odometry(robot: Robot) -> None:
     status = robot.wait_for_reason("odom refused: the start's frame is ''")
     assert status.level == DiagnosticStatus.WARN
     assert robot.plans.messages() == []
-    robot.client.publish("odom", odometry(robot, (3, 2)))
-    robot.wait_for_reason("^a path of [^;]*$")
     robot.send_goal(robot.pose((0, 14)))
     robot.wait_for_path((3, 2), (0, 14))
-    robot.client.publish("odom", odometry(robot, (4, 2), frame=""))
     robot.wait_for_reason("odom refused")
     robot.clear()
     robot.set(start_source="initialpose")
-    robot.wait_for_reason(
-        "^((?!odom refused).)*start is unknown; set it on /robot/initialpose((?!odom refused).)*$"
-    )
+    wait_until_unknown("odom", "set it on /robot/initialpose")
     robot.send_start(robot.pose((5, 5)))
     robot.wait_for_path((5, 5), (0, 14))
 
@@ -364,27 +346,3 @@ def test_a_new_listener_to_transforms_has_no_empty_plan(transformed: Robot) -> N
     finally:
         client.node.destroy_timer(timer)
     assert all(plan.poses for plan in robot.plans.messages())
-
-
-def test_plan_and_value_are_stamped_when_answered_and_the_diagnostics_name_the_map(
-    robot: Robot,
-) -> None:
-    def is_new(message: Any) -> bool:
-        stamp = message.header.stamp
-        return bool(began <= stamp.sec + stamp.nanosec / 1e9 <= time.time())
-
-    robot.set(replan_period=0.0)
-    for y in (5, 9):
-        message = robot.stamped_map()
-        robot.send_map(message)
-        planned_on = {"planned on the map of (s)": f"{message.header.stamp.sec}.000000000"}
-        robot.wait_for_reason("^a path of ", planned_on)
-        began = time.time()
-        robot.clear()
-        robot.send_start(robot.pose((1, y)))
-        robot.send_goal(robot.pose((3, y)))
-        assert is_new(robot.wait_for_path((1, y), (3, y)))
-        assert is_new(robot.value.wait(lambda value, at=y * 20 + 3: value.data[at] == 100))
-        assert is_new(robot.get_plan(robot.pose((1, 0)), robot.pose((3, 3))))
-        values = values_of(robot.wait_for_reason("^a path of ", planned_on))
-        assert values["map"] == "20 x 15 cells of 0.5 m in frame 'map'"

@@ -1,7 +1,5 @@
 """The simulated robot of the driving demo: it follows paths, and asks again where it cannot."""
 
-from __future__ import annotations
-
 import sys
 from collections.abc import Callable
 

@@ -8,13 +8,21 @@ from hypothesis import strategies as st
 from networks import random_network
 from strategies import grids_with_costs, grids_with_free_cell
 
-from ddqn_planner.grid import Cell, GridMap, MoveRule
+from ddqn_planner.grid import MOVES, OCCUPIED, Cell, GridMap, MoveRule, neighbours
 from ddqn_planner.model import NETWORKS, networks
-from ddqn_planner.model.move_costs import MAX_MULTIPLIER
-from ddqn_planner.model.networks import AnyMapQNetwork, PropagationQNetwork
-from ddqn_planner.model.observation import observation_background, observe, patches
+from ddqn_planner.model.move_costs import patches, unique_patches
+from ddqn_planner.model.networks import (
+    FREE,
+    GOAL,
+    OBSTACLE,
+    ROBOT,
+    AnyMapQNetwork,
+    PropagationQNetwork,
+    observation_background,
+    observe,
+)
 from ddqn_planner.planning.field import network_field
-from ddqn_planner.training.networks import MODULES, AnyMapModule, PaperModule, PropagationModule
+from ddqn_planner.training.networks import MODULES, AnyMapModule, PaperModule
 
 SIZES = {
     "paper": {"height": 5, "width": 8, "filters": 3, "hidden_units": 6},
@@ -28,10 +36,8 @@ SIZES = {
 
 @pytest.mark.parametrize("name", NETWORKS)
 def test_a_module_has_the_tensors_of_its_network(name: str) -> None:
-    module = MODULES[name](**SIZES[name])
-    assert {key: tuple(t.shape) for key, t in module.state_dict().items()} == NETWORKS[name].shapes(
-        SIZES[name]
-    )
+    module, shapes = MODULES[name](**SIZES[name]), NETWORKS[name].shapes(SIZES[name])
+    assert {key: tuple(t.shape) for key, t in module.state_dict().items()} == shapes
     network = module.to_numpy()
     assert type(network) is NETWORKS[name]
     again = type(module).from_numpy(network)
@@ -66,44 +72,89 @@ def test_the_propagation_networks_answer_on_each_patch_as_their_modules(
 ) -> None:
     grid, _ = grid_and_goal
     features = AnyMapQNetwork.features(patches(grid.occupancy, grid.cost), rule)
-    any_map = random_network("any_map", seed, filters=5)
-    propagation = random_network("propagation", seed, filters=5)
-    assert isinstance(any_map, AnyMapQNetwork)
-    assert isinstance(propagation, PropagationQNetwork)
-    module = AnyMapModule.from_numpy(any_map)
-    with torch.inference_mode():
-        for answer, expected in (
-            (any_map.success(features), module.success(torch.from_numpy(features))),
-            (any_map.multiplier(features), module.multiplier(torch.from_numpy(features))),
-            (
-                propagation.success(features[:, :9]),
-                PropagationModule.from_numpy(propagation).success(
-                    torch.from_numpy(features[:, :9])
-                ),
-            ),
-        ):
-            np.testing.assert_allclose(answer, expected.numpy(), rtol=1e-5, atol=1e-5)
+    for name, inputs in (("any_map", features), ("propagation", features[:, :9])):
+        network = random_network(name, seed, filters=5)
+        assert isinstance(network, PropagationQNetwork)
+        module = MODULES[name].from_numpy(network)
+        for method in ("success", "multiplier")[: 2 if name == "any_map" else 1]:
+            with torch.inference_mode():
+                expected = getattr(module, method)(torch.from_numpy(inputs)).numpy()
+            answer = getattr(network, method)(inputs)
+            np.testing.assert_allclose(answer, expected, rtol=1e-5, atol=1e-5)
+
+
+# What they observe
+
+
+@given(grids_with_free_cell())
+def test_the_observation_shows_four_kinds_of_cell(grid_and_goal: tuple[GridMap, Cell]) -> None:
+    grid, goal = grid_and_goal
+    background = observation_background(grid.occupancy, goal)
+    for number, observation in enumerate(
+        observe(background, np.arange(grid.occupancy.size), grid.occupancy.shape)
+    ):
+        robot = (number % grid.width, number // grid.width)
+        for y in range(grid.height):
+            for x in range(grid.width):
+                kind = FREE if grid.is_free((x, y)) else OBSTACLE
+                kind = GOAL if (x, y) == goal else kind
+                assert observation[y, x] == (ROBOT if (x, y) == robot else kind)
+    assert len({FREE, GOAL, OBSTACLE, ROBOT}) == 4
+
+
+@given(grids_with_free_cell())
+def test_a_patch_is_the_3x3_cells_and_outside_is_occupied(
+    grid_and_goal: tuple[GridMap, Cell],
+) -> None:
+    grid, _ = grid_and_goal
+    patch = patches(grid.occupancy, None).reshape(grid.height, grid.width, 3, 3)
+    next_cells = neighbours(grid.occupancy.shape).reshape(8, grid.height, grid.width)
+    for y in range(grid.height):
+        for x in range(grid.width):
+            for action, (dx, dy) in enumerate(MOVES.tolist()):
+                neighbour = (x + dx, y + dy)
+                assert patch[y, x, 1 + dy, 1 + dx] == (0 if grid.is_free(neighbour) else OCCUPIED)
+                inside = neighbour[1] * grid.width + neighbour[0]
+                expected = inside if grid.contains(neighbour) else grid.occupancy.size
+                assert next_cells[action, y, x] == expected
+
+
+@given(grids_with_costs())
+def test_cells_with_one_patch_id_have_the_same_patch(
+    grid_and_goal: tuple[GridMap, Cell],
+) -> None:
+    grid, _ = grid_and_goal
+    for cost in (None, grid.cost):
+        patch_id, unique = unique_patches(grid.occupancy, cost)
+        np.testing.assert_array_equal(unique[patch_id.ravel()], patches(grid.occupancy, cost))
+        assert len(np.unique(unique, axis=0)) == len(unique)
+
+
+def test_the_features_tell_obstacles_costs_unknown_cells_and_the_rule_apart() -> None:
+    patch = np.array([[-1, 0, 50, 99, 100, 0, 0, 0, 0]], dtype=np.int8)
+    (features,) = AnyMapQNetwork.features(patch, MoveRule.ROBOT_SAFE)
+    assert features.dtype == np.float32
+    assert features[:9].tolist() == [0, 0, 0, 0, 1, 0, 0, 0, 0]
+    assert features[9:18] == pytest.approx([0, 0, 0.5, 0.99, 0, 0, 0, 0, 0])
+    assert features[18:27].tolist() == [1, 0, 0, 0, 0, 0, 0, 0, 0]
+    assert features[27] == 0
+    assert AnyMapQNetwork.features(patch, MoveRule.CORNER_CUTTING)[0, 27] == 1
 
 
 # The paper's network
 
 
-def test_the_network_is_the_papers_convolution_relu_and_fully_connected_layer() -> None:
-    module = PaperModule(7, 10, filters=5)
+@pytest.mark.parametrize("hidden_units", [0, 6])
+def test_the_network_is_the_papers_convolution_relu_and_fully_connected_layers(
+    hidden_units: int,
+) -> None:
+    module = PaperModule(7, 10, filters=5, hidden_units=hidden_units)
     observations = torch.randn(6, 7, 10)
     features = module.convolution(observations.unsqueeze(1)).relu().flatten(1)
-    torch.testing.assert_close(
-        module(module.windows(observations)), module.fully_connected(features)
-    )
-
-
-def test_a_hidden_layer_with_relu_lies_between_the_two() -> None:
-    module = PaperModule(7, 10, filters=5, hidden_units=6)
-    assert module.hidden is not None
-    observations = torch.randn(6, 7, 10)
-    features = module.convolution(observations.unsqueeze(1)).relu().flatten(1)
-    hidden = module.hidden(features).relu()
-    torch.testing.assert_close(module(module.windows(observations)), module.fully_connected(hidden))
+    if module.hidden is not None:
+        features = module.hidden(features).relu()
+    answer = module(module.windows(observations))
+    torch.testing.assert_close(answer, module.fully_connected(features))
 
 
 # The networks for maps of any size
@@ -136,17 +187,6 @@ def test_many_unique_patches_are_evaluated_in_batches(monkeypatch: pytest.Monkey
 
 
 @pytest.mark.parametrize("name", ["propagation", "any_map"])
-def test_a_field_has_one_q_per_action_and_cell_of_a_map_of_any_shape(name: str) -> None:
-    network = random_network(name, filters=4)
-    for shape in ((1, 1), (3, 7), (9, 2)):
-        q = q_values(network, GridMap(np.zeros(shape)), (0, 0))
-        assert network.supports(shape)
-        assert q.shape == (8, *shape)
-        assert q.dtype == np.float32
-        assert not np.isnan(q).any()
-
-
-@pytest.mark.parametrize("name", ["propagation", "any_map"])
 def test_a_move_is_tried_until_it_succeeds_if_it_does_more_often_than_not(name: str) -> None:
     for success, cost in ((0.995, 1), (0.9, 1 / 0.9), (0.55, 1 / 0.55), (0.45, np.inf)):
         network = answering(name, success)
@@ -160,10 +200,7 @@ def test_a_move_is_tried_until_it_succeeds_if_it_does_more_often_than_not(name: 
 
 def test_a_cost_above_the_upper_bound_counts_as_the_bound() -> None:
     grid = GridMap(np.zeros((1, 2)))
-    for multiplier, used in (
-        (MAX_MULTIPLIER - 1, MAX_MULTIPLIER - 1),
-        (1e4, 100.0),
-    ):
+    for multiplier, used in ((99.0, 99.0), (1e4, 100.0)):
         network = answering("any_map", 0.9, multiplier)
         q = q_values(network, grid, (1, 0))
         assert q[0, 0, 0] == pytest.approx(-used / 0.9)

@@ -13,7 +13,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from random_maps import generate_map
-from strategies import grids_with_costs, grids_with_directions, grids_with_free_cell
+from strategies import cells_of, grids_with_costs, grids_with_directions, grids_with_free_cell
 
 from ddqn_planner import GridMap, MoveRule, Planner, PlanStatus
 from ddqn_planner.grid import Cell, shortest_distances
@@ -27,8 +27,12 @@ NETWORK, METADATA = (lambda planner: (planner.network, planner.metadata))(Planne
 GRIDS = grids_with_free_cell() | grids_with_costs() | grids_with_directions()
 
 
+def new_planner() -> Planner:
+    return Planner(NETWORK, METADATA)
+
+
 def fresh_field(grid: GridMap, goal: Cell, rule: MoveRule) -> DistanceField:
-    field = Planner(NETWORK, METADATA).q_field(grid, goal, rule)
+    field = new_planner().q_field(grid, goal, rule)
     assert isinstance(field, DistanceField)
     return field
 
@@ -77,9 +81,9 @@ def test_a_request_visits_few_cells_of_a_large_map() -> None:
 def test_a_request_without_a_path_does_not_visit_the_whole_map() -> None:
     occupancy = np.zeros((200, 200))
     occupancy[:, 10] = 1
-    grid, planner = GridMap(occupancy), Planner(NETWORK, METADATA)
+    grid, planner = GridMap(occupancy), new_planner()
     assert planner.plan(grid, (0, 0), (199, 199)).status is PlanStatus.NO_PATH
-    field = planner.known_field(grid, (199, 199))
+    field = planner.fields.find(grid, ((199, 199),), MoveRule.ROBOT_SAFE)
     assert isinstance(field, DistanceField)
     assert not field.is_whole
     assert np.count_nonzero(field.known.distance) < 0.6 * occupancy.size
@@ -101,7 +105,7 @@ def changed_maps(draw: st.DrawFn, grid: GridMap) -> GridMap:
     """Draw a map of the same place: other cells or directions in a box, or another cut of it."""
     if grid.forbidden is not None and draw(st.booleans()):
         forbidden = grid.forbidden.copy()
-        x, y = draw(st.integers(0, grid.width - 1)), draw(st.integers(0, grid.height - 1))
+        x, y = draw(cells_of(grid))
         forbidden[y, x] = draw(st.integers(0, 255))
         return replace(grid, forbidden=forbidden)
     if draw(st.booleans()):
@@ -119,26 +123,13 @@ def changed_maps(draw: st.DrawFn, grid: GridMap) -> GridMap:
     def cut(array: np.ndarray | None) -> Any:
         if array is None:
             return None
-        sides = ((max(below, 0), max(above, 0)), (max(left, 0), max(right, 0)))
-        padded = np.pad(array, sides, constant_values=0)
-        height, width = padded.shape
-        return padded[
-            max(-below, 0) : height - max(-above, 0), max(-left, 0) : width - max(-right, 0)
-        ]
+        height, width = array.shape
+        return np.pad(array, 3)[3 - below : 3 + height + above, 3 - left : 3 + width + right]
 
-    corner = grid.cell_to_world((-left, -below))
-    first = grid.cell_to_world((0, 0))
-    origin = (
-        grid.origin[0] + corner[0] - first[0],
-        grid.origin[1] + corner[1] - first[1],
-        grid.origin[2],
-    )
+    moved = np.subtract(grid.cell_to_world((-left, -below)), grid.cell_to_world((0, 0)))
+    origin = (*(grid.origin[:2] + moved).tolist(), grid.origin[2])
     layers = cut(grid.cost), None, cut(grid.forbidden)
     return GridMap(cut(grid.occupancy), grid.resolution, origin, *layers)
-
-
-def place_of(cell: Cell, old: GridMap, new: GridMap) -> Cell:
-    return new.world_to_cell(*old.cell_to_world(cell))
 
 
 @settings(max_examples=400)
@@ -151,22 +142,23 @@ def test_a_repaired_field_is_a_fresh_one_bit_for_bit(
     data: st.DataObject,
 ) -> None:
     plain, goal = grid_and_goal
+    goals = [goal, *data.draw(st.lists(st.sampled_from(plain.free_cells()), max_size=2))]
     grid = replace(plain, resolution=0.05, origin=(1.25, -3.0, yaw))
     fields.REPAIRED = data.draw(st.sampled_from([1, 3, 300]), label="limit of a repair")
-    planner = Planner(NETWORK, METADATA)
+    planner = new_planner()
     if data.draw(st.booleans(), label="whole"):
         _ = planner.q_field(grid, goal, rule).value
     for _ in range(changes):
         start = data.draw(st.sampled_from(grid.free_cells()))
-        planner.plan(grid, start, goal, rule)
+        planner.plan_nearest(grid, start, goals, rule)
         changed = data.draw(changed_maps(grid))
-        goal = place_of(goal, grid, changed)
-        if not changed.is_free(goal):
+        goals = [changed.world_to_cell(*grid.cell_to_world(cell)) for cell in goals]
+        grid, goal = changed, goals[0]
+        if not grid.is_free(goal):
             return
-        grid = changed
         start = data.draw(st.sampled_from(grid.free_cells()))
-        fresh = Planner(NETWORK, METADATA)
-        assert planner.plan(grid, start, goal, rule) == fresh.plan(grid, start, goal, rule)
+        plans = [one.plan_nearest(grid, start, goals, rule) for one in (planner, new_planner())]
+        assert plans[0] == plans[1]
         if data.draw(st.booleans(), label="compare"):
             assert_same(planner.q_field(grid, goal, rule), fresh_field(grid, goal, rule))
 
@@ -175,7 +167,7 @@ def test_a_changed_map_uses_what_is_known_of_the_one_before() -> None:
     random = np.random.default_rng(0)
     grid = GridMap(generate_map("office", (200, 200), random))
     ((start, goal),) = random_requests(grid.occupancy, MoveRule.ROBOT_SAFE, 1, random)
-    planner = Planner(NETWORK, METADATA)
+    planner = new_planner()
     before = planner.plan(grid, start, goal)
     x, y = before.cells[3]
     changed = grid.with_patch(np.ones((1, 1)), x, y)
@@ -192,15 +184,13 @@ def test_a_changed_map_uses_what_is_known_of_the_one_before() -> None:
 def test_a_repair_that_takes_too_long_leaves_the_older_field_as_it_was() -> None:
     fields.REPAIRED = 5
     grid, goal = GridMap(np.zeros((60, 60))), (30, 30)
-    planner = Planner(NETWORK, METADATA)
+    planner = new_planner()
     older = planner.q_field(grid, goal)
     before = older.rollout((0, 0))
     changed = grid.with_patch(np.ones((1, 12)), 20, 29)  # a wall beside the goal
     start = (30, 32)
-    assert planner.plan(changed, start, goal) == Planner(NETWORK, METADATA).plan(
-        changed, start, goal
-    )
-    assert planner.known_field(grid, goal) is older
+    assert planner.plan(changed, start, goal) == new_planner().plan(changed, start, goal)
+    assert planner.fields.find(grid, (goal,), MoveRule.ROBOT_SAFE) is older
     assert older.rollout_if_known((0, 0)) == before
     assert_same(older, fresh_field(grid, goal, MoveRule.ROBOT_SAFE))
 
@@ -216,7 +206,7 @@ def test_a_field_that_is_interrupted_anywhere_is_as_a_new_one(
     data: st.DataObject,
 ) -> None:
     grid, goal = grid_and_goal
-    planner, start = Planner(NETWORK, METADATA), data.draw(st.sampled_from(grid.free_cells()))
+    planner, start = new_planner(), data.draw(st.sampled_from(grid.free_cells()))
     x, y = data.draw(st.sampled_from(grid.free_cells()))
     changed = grid.with_patch([[(x, y) != goal]], x, y)
     older = planner.q_field(grid, goal, rule)
@@ -230,9 +220,7 @@ def test_a_field_that_is_interrupted_anywhere_is_as_a_new_one(
             run_until(line, step)
         step()
     for each in (grid, changed):
-        assert planner.plan(each, start, goal, rule) == Planner(NETWORK, METADATA).plan(
-            each, start, goal, rule
-        )
+        assert planner.plan(each, start, goal, rule) == new_planner().plan(each, start, goal, rule)
     fresh = fresh_field(grid, goal, rule)
     assert older.rollout(start) == fresh.rollout(start)
     assert_same(older, fresh)
@@ -269,7 +257,7 @@ def test_after_too_many_changes_both_fields_are_kept(monkeypatch: pytest.MonkeyP
     first, second = (GridMap(np.random.default_rng(n).random((60, 60)) < 0.2) for n in (0, 1))
     assert fields.changed_cells(first, second, (0, 0)) is None
     goal = next(cell for cell in first.free_cells() if second.is_free(cell))
-    planner = Planner(NETWORK, METADATA)
+    planner = new_planner()
     kept = [planner.q_field(grid, goal) for grid in (first, second, first, second)]
     assert kept[:2] == kept[2:]
 
@@ -304,11 +292,11 @@ def test_threads_share_a_planner_while_the_map_changes() -> None:
         x, y = random.integers(0, 58, 2).tolist()
         maps.append(maps[-1].with_patch(random.random((2, 2)) < 0.5, x, y))
     expected = {
-        (number, request): Planner(NETWORK, METADATA).plan(changed, *request)
+        (number, request): new_planner().plan(changed, *request)
         for number, changed in enumerate(maps)
         for request in requests
     }
-    planner = Planner(NETWORK, METADATA)
+    planner = new_planner()
 
     def count_wrong(seed: int) -> int:
         order, wrong = np.random.default_rng(seed), 0

@@ -10,15 +10,13 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from networks import turning_network
-from strategies import grids_in_parts, grids_with_costs, grids_with_free_cell
+from networks import turning_planner
+from strategies import cells_of, grids_in_parts, grids_with_costs, grids_with_free_cell
 
 from ddqn_planner import GridMap, MoveRule, PlanMethod, Planner, PlanStatus
 from ddqn_planner.grid import Cell, shortest_distances
-from ddqn_planner.model import ModelMetadata
-from ddqn_planner.planning import field as fields
 from ddqn_planner.planning.field import DistanceField
-from ddqn_planner.planning.plan import PlanRequest, joined
+from ddqn_planner.planning.plan import PlanRequest
 from ddqn_planner.planning.planner import last_step
 
 RULES = st.sampled_from(list(MoveRule))
@@ -28,10 +26,6 @@ GRIDS = grids_with_free_cell() | grids_with_costs() | grids_in_parts()
 
 def new_planner() -> Planner:
     return Planner(ANY_MAP.network, ANY_MAP.metadata)
-
-
-def cells_of(grid: GridMap) -> st.SearchStrategy[Cell]:
-    return st.tuples(st.integers(0, grid.width - 1), st.integers(0, grid.height - 1))
 
 
 @settings(max_examples=300)
@@ -80,23 +74,6 @@ def test_a_field_toward_several_goals_is_the_best_of_their_fields(
         assert set(whole.cells) & set(goals) == {whole.cells[-1]}
 
 
-@given(GRIDS, RULES, st.data())
-def test_a_field_toward_several_goals_is_repaired(
-    grid_and_goal: tuple[GridMap, Cell], rule: MoveRule, data: st.DataObject
-) -> None:
-    grid, start = grid_and_goal
-    goals = data.draw(st.lists(cells_of(grid), min_size=2, max_size=4))
-    planner = new_planner()
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(fields, "CHANGED_SHARE", 1.0)
-        patch.setattr(fields, "REPAIRED", data.draw(st.sampled_from([1, 300])))
-        for _ in range(3):
-            plan = planner.plan_nearest(grid, start, goals, rule)
-            assert plan == new_planner().plan_nearest(grid, start, goals, rule)
-            x, y = data.draw(cells_of(grid))
-            grid = grid.with_patch([[data.draw(st.booleans())]], x, y)
-
-
 def test_goals_that_are_not_free_are_left_out() -> None:
     occupancy = np.zeros((3, 9), dtype=bool)
     occupancy[:, 7] = True
@@ -109,13 +86,6 @@ def test_goals_that_are_not_free_are_left_out() -> None:
         ([(8, 0), (8, 2)], PlanStatus.NO_PATH),
     ):
         assert ANY_MAP.plan_nearest(grid, (6, 1), goals).status is status
-    assert ANY_MAP.plan_nearest(grid, (7, 0), [(0, 0)]).status is PlanStatus.START_OCCUPIED
-
-
-def turning_planner(size: int = 6) -> Planner:
-    network = turning_network(size)
-    metadata = ModelMetadata("paper", network.sizes, MoveRule.ROBOT_SAFE, 0.9, "", 1, 0, "")
-    return Planner(network, metadata)
 
 
 def test_a_network_without_costs_plans_to_each_goal() -> None:
@@ -176,20 +146,3 @@ def test_wrong_goals_are_named() -> None:
             plan(grid, (0, 0), [])
         with pytest.raises(ValueError, match=r"goal 2 is .*; give two whole numbers"):
             plan(grid, (0, 0), [(1, 1), (0.5, 1)])  # type: ignore[list-item]
-
-
-def test_plans_through_cells_are_joined_without_a_doubled_cell() -> None:
-    grid = GridMap(np.zeros((8, 8), dtype=np.bool_))
-    planner = Planner.load("any_map")
-    cells = [(0, 0), (5, 0), (5, 0), (5, 6)]
-    plans = [planner.plan(grid, *ends) for ends in pairwise(cells)]
-    plan = joined(plans)
-    assert plan.status is PlanStatus.SUCCEEDED
-    assert plan.cells == (*((x, 0) for x in range(6)), *((5, y) for y in range(1, 7)))
-    assert np.array_equal(plan.every_cell, plan.path)
-    assert plan.goal == (5, 6)
-    assert plan.length == pytest.approx(sum(piece.length for piece in plans))
-    assert plan.field_ms == pytest.approx(sum(piece.field_ms for piece in plans))
-    assert joined([plans[0]]) == plans[0]
-    failed = planner.plan(grid, (5, 0), (9, 0))
-    assert joined([plans[0], failed]) is failed

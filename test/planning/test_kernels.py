@@ -1,20 +1,27 @@
+"""Values against oracles: whatever the costs, at any distance, and with forbidden directions."""
+
 from __future__ import annotations
+
+from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as numpy_st
-from strategies import grids_with_costs
+from strategies import cells_of, grids_with_directions
 
+from ddqn_planner import Planner
 from ddqn_planner.compiled import compiled
 from ddqn_planner.grid import (
     MOVES,
     Cell,
     GridMap,
     MoveRule,
+    Noise,
     legal_moves,
-    move_costs,
+    path_cost,
+    scatter_obstacles,
     shortest_distances,
 )
 from ddqn_planner.model.move_costs import MoveCosts
@@ -30,29 +37,16 @@ COSTS = numpy_st.arrays(
 )
 
 
+RULES = st.sampled_from(list(MoveRule))
+ONLY_EAST, ONLY_WEST = 0b00111000, 0b10000011
+
+
 def propagate_values(patch_id: np.ndarray, cost_PA: np.ndarray, goal: Cell) -> np.ndarray:
     """Return Q(s, a) toward a goal, given the costs of each patch: (8, H, W)."""
-    grid, patch_C = (
-        GridMap(np.zeros(patch_id.shape)),
-        np.pad(patch_id, 1, constant_values=len(cost_PA)),
-    )
-    costs = MoveCosts.of_table(cost_PA).on(grid, patch_C.ravel())
+    grid = GridMap(np.zeros(patch_id.shape))
+    patch_C = np.pad(patch_id, 1, constant_values=len(cost_PA)).ravel()
+    costs = MoveCosts.of_table(cost_PA).on(grid, patch_C)
     return DistanceField((goal,), grid, costs, MoveRule.ROBOT_SAFE).q
-
-
-@given(grids_with_costs(), st.sampled_from(MoveRule))
-def test_with_true_costs_the_greatest_q_is_minus_the_exact_cost_of_the_cheapest_path(
-    grid_and_goal: tuple[GridMap, Cell], rule: MoveRule
-) -> None:
-    grid, goal = grid_and_goal
-    legal = legal_moves(grid.occupancy, rule)
-    cost = np.where(legal, move_costs(grid.cost_multiplier, rule), np.inf).astype(np.float32)
-    patch_id = np.arange(grid.occupancy.size, dtype=np.int32).reshape(grid.occupancy.shape)
-    q = propagate_values(patch_id, cost.reshape(8, -1).T, goal)
-    optimum = shortest_distances(grid, goal, rule)
-    best = -q.max(axis=0)
-    best[goal[1], goal[0]] = 0
-    np.testing.assert_allclose(best, optimum, rtol=1e-6)
 
 
 @given(PATCH_IDS, COSTS, st.data())
@@ -60,16 +54,14 @@ def test_q_meets_bellmans_equation_whatever_the_costs(
     patch_id: np.ndarray, cost: np.ndarray, data: st.DataObject
 ) -> None:
     height, width = patch_id.shape
-    goal = data.draw(st.tuples(st.integers(0, width - 1), st.integers(0, height - 1)))
+    goal = data.draw(cells_of(GridMap(np.zeros(patch_id.shape))))
     q = propagate_values(patch_id, cost, goal)
     value = q.max(axis=0)
     value[goal[1], goal[0]] = 0
     beyond = np.pad(value, 1, constant_values=-np.inf)
     for action, (dx, dy) in enumerate(MOVES.tolist()):
-        expected = (
-            beyond[1 + dy : 1 + dy + height, 1 + dx : 1 + dx + width] - cost[patch_id, action]
-        )
-        np.testing.assert_allclose(q[action], expected, rtol=1e-5)
+        after = beyond[1 + dy : 1 + dy + height, 1 + dx : 1 + dx + width]
+        np.testing.assert_allclose(q[action], after - cost[patch_id, action], rtol=1e-5)
 
 
 def test_values_keep_their_sense_at_any_distance() -> None:
@@ -97,3 +89,74 @@ def test_where_no_folder_may_be_written_code_is_compiled_all_the_same(
 
     monkeypatch.setattr("numba.core.dispatcher.Dispatcher.enable_caching", nowhere)
     assert compiled(lambda x: x + 1)(1) == 2
+
+
+# With forbidden directions
+
+
+def directed_distances(grid: GridMap, goal: Cell, rule: MoveRule) -> np.ndarray:
+    """Return the cost of the cheapest path from each cell, by Bellman and Ford: cell by cell."""
+    distance = np.full(grid.occupancy.shape, np.inf)
+    distance[goal[1], goal[0]] = 0
+    legal = legal_moves(grid.occupancy, rule)
+    for _ in range(grid.occupancy.size):
+        before = distance.copy()
+        for action, y, x in np.argwhere(legal):
+            if grid.forbidden is None or not grid.forbidden[y, x] >> action & 1:
+                after = (x + MOVES[action, 0], y + MOVES[action, 1])
+                cost = path_cost([(x, y), after], grid.cost_multiplier, rule)
+                distance[y, x] = min(distance[y, x], cost + distance[after[1], after[0]])
+        if np.array_equal(before, distance):
+            break
+    return distance
+
+
+@settings(max_examples=60)
+@given(grids_with_directions(), RULES)
+def test_the_oracle_is_exact_where_directions_are_forbidden(
+    grid_and_goal: tuple[GridMap, Cell], rule: MoveRule
+) -> None:
+    grid, goal = grid_and_goal
+    expected = directed_distances(grid, goal, rule)
+    np.testing.assert_allclose(shortest_distances(grid, goal, rule), expected)
+
+
+@given(grids_with_directions(), RULES, st.data())
+def test_cells_are_reachable_where_the_oracle_has_a_path(
+    grid_and_cell: tuple[GridMap, Cell], rule: MoveRule, data: st.DataObject
+) -> None:
+    grid, _ = grid_and_cell
+    if data.draw(st.booleans()):
+        grid = replace(grid, forbidden=None)
+    cells = data.draw(st.lists(st.sampled_from(grid.free_cells()), min_size=1, max_size=3))
+    distances = [shortest_distances(grid, cell, rule) for cell in cells]
+    backward = grid.reachable(cells, rule, backward=True)
+    np.testing.assert_array_equal(backward, np.isfinite(distances).any(axis=0))
+    forward = grid.reachable(cells, rule)
+    x, y = data.draw(st.sampled_from(grid.free_cells()))
+    back = shortest_distances(grid, (x, y), rule)
+    assert forward[y, x] == any(np.isfinite(back[cell[::-1]]) for cell in cells)
+
+
+@pytest.mark.parametrize("classes", [1, 100, 256])
+def test_a_map_may_hold_all_sets_of_directions(classes: int) -> None:
+    random = np.random.default_rng(classes)
+    forbidden = np.arange(1024).reshape(32, 32) % classes + (classes == 1)
+    grid = GridMap(random.random((32, 32)) < 0.1, forbidden=random.permuted(forbidden))
+    goal = grid.free_cells()[0]
+    exact = shortest_distances(grid, goal, MoveRule.ROBOT_SAFE)
+    value = Planner.load("any_map").q_field(grid, goal).value.copy()
+    value[goal[::-1]] = 0
+    np.testing.assert_allclose(-value, exact, rtol=1e-2)
+
+
+def test_new_obstacles_leave_a_path_that_obeys() -> None:
+    # A ring in which one drives counter-clockwise: the short way back is closed by one obstacle.
+    occupancy = np.zeros((3, 5), dtype=bool)
+    occupancy[1, 1:4] = True
+    forbidden = np.zeros((3, 5), dtype=np.uint8)
+    forbidden[0], forbidden[2] = ONLY_EAST, ONLY_WEST
+    grid = GridMap(occupancy, forbidden=forbidden)
+    path = [(0, 0), (1, 0), (2, 0), (3, 0), (4, 0)]
+    with pytest.raises(ValueError, match="none of 1000 draws"):
+        scatter_obstacles(grid, path, MoveRule.ROBOT_SAFE, np.random.default_rng(0), Noise.ON_PATH)

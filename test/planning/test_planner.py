@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import gc
-import json
 import time
 import weakref
+from collections import Counter
 from itertools import pairwise
 from typing import Any
 
@@ -13,24 +13,33 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from networks import random_network
+from networks import random_network, turning_planner
 from strategies import (
+    cells_of,
     grids_in_parts,
     grids_with_costs,
     grids_with_directions,
     grids_with_free_cell,
 )
 
-from ddqn_planner import GridMap, MoveRule, PlanMethod, Planner, PlanStatus, QField, inflate
+from ddqn_planner import GridMap, MoveRule, Plan, PlanMethod, Planner, PlanStatus, QField, inflate
 from ddqn_planner import simplify as simplified
-from ddqn_planner.grid import LENGTHS, MOVES, Cell, legal_moves, path_cost, shortest_distances
-from ddqn_planner.model import ModelMetadata
+from ddqn_planner.grid import (
+    LENGTHS,
+    MOVES,
+    Cell,
+    legal_moves,
+    path_cost,
+    path_length,
+    shortest_distances,
+)
+from ddqn_planner.model import AnyMapQNetwork, ModelMetadata
 from ddqn_planner.planning import PlanRequest
+from ddqn_planner.planning.planner import last_step
 
 RULES = st.sampled_from(list(MoveRule))
 GRIDS = grids_with_free_cell() | grids_with_costs() | grids_in_parts() | grids_with_directions()
 ANY_MAP = Planner.load("any_map")
-ONLY_EAST, ONLY_WEST = 0b00111000, 0b10000011
 
 
 def new_planner() -> Planner:
@@ -45,8 +54,8 @@ def random_planner(height: int, width: int, seed: int) -> Planner:
     )
 
 
-def cells_of(grid: GridMap) -> st.SearchStrategy[Cell]:
-    return st.tuples(st.integers(0, grid.width - 1), st.integers(0, grid.height - 1))
+def known_field(planner: Planner, grid: GridMap, goal: Cell, rule: MoveRule) -> QField | None:
+    return planner.fields.find(grid, (goal,), rule)
 
 
 def is_answered_at_once(planner: Planner, *request: Any, **more: Any) -> bool:
@@ -109,7 +118,7 @@ def test_a_plan_of_the_shipped_model_is_a_cheapest_path(
     exact, planner = shortest_distances(grid, goal, rule), new_planner()
     for start in data.draw(st.lists(st.sampled_from(grid.free_cells()), min_size=1, max_size=4)):
         plan = planner.plan(grid, start, goal, rule, method)
-        assert plan.method is PlanMethod.GREEDY
+        assert (plan.method, plan.move_rule) == (PlanMethod.GREEDY, rule)
         assert (plan.cost is None) == (grid.cost is None or not plan.cells)
         if np.isinf(exact[start[::-1]]):
             assert plan.status is PlanStatus.NO_PATH
@@ -119,6 +128,7 @@ def test_a_plan_of_the_shipped_model_is_a_cheapest_path(
         cost = path_cost(plan.cells, grid.cost_multiplier, rule)
         assert cost == pytest.approx(exact[start[::-1]], rel=2e-2)
         assert plan.cost in (None, cost)
+        assert plan.length == path_length(plan.cells, rule)
         simple = planner.plan(grid, start, goal, rule, method, simplified=True)
         assert simple.cells == simplified(plan.cells, grid, rule)
         assert simple.cost == plan.cost
@@ -160,27 +170,16 @@ def test_the_shipped_model_finds_the_papers_path(paper) -> None:  # type: ignore
     assert planner.metadata.map_fingerprint == paper.grid.fingerprint
 
 
-def test_a_start_on_the_goal_is_a_path_of_one_cell() -> None:
-    plan = random_planner(3, 3, 0).plan(GridMap(np.zeros((3, 3))), (1, 1), (1, 1))
-    assert (plan.cells, plan.length) == (((1, 1),), 0)
-
-
-@pytest.mark.parametrize(
-    ("start", "goal", "status"),
-    [
+def test_a_request_off_the_free_cells_is_told_apart() -> None:
+    planner, grid = random_planner(3, 3, 0), GridMap(np.array([[0, 0, 0], [0, 1, 0], [0, 0, 0]]))
+    for start, goal, status in (
         ((-1, 0), (2, 2), PlanStatus.START_OUTSIDE_MAP),
         ((0, 0), (0, 3), PlanStatus.GOAL_OUTSIDE_MAP),
         ((1, 1), (2, 2), PlanStatus.START_OCCUPIED),
         ((0, 0), (1, 1), PlanStatus.GOAL_OCCUPIED),
-    ],
-)
-def test_a_request_off_the_free_cells_is_told_apart(
-    start: Cell, goal: Cell, status: PlanStatus
-) -> None:
-    occupancy = np.zeros((3, 3), dtype=bool)
-    occupancy[1, 1] = True
-    plan = random_planner(3, 3, 0).plan(GridMap(occupancy), start, goal, "unit")
-    assert (plan.status, plan.goal, plan.move_rule) == (status, None, MoveRule.UNIT)
+    ):
+        plan = planner.plan(grid, start, goal, "unit")
+        assert (plan.status, plan.goal, plan.move_rule) == (status, None, MoveRule.UNIT)
 
 
 def test_a_map_of_another_size_is_refused() -> None:
@@ -190,39 +189,82 @@ def test_a_map_of_another_size_is_refused() -> None:
         planner.q_field(grid, (1, 1))
 
 
-def test_where_only_the_wrong_way_is_open_there_is_no_path() -> None:
-    grid = GridMap(np.zeros((1, 6)), forbidden=np.full((1, 6), ONLY_EAST))
-    assert ANY_MAP.plan(grid, (0, 0), (5, 0)).length == 5
-    for method in PlanMethod:
-        assert ANY_MAP.plan(grid, (5, 0), (0, 0), method=method).status is PlanStatus.NO_PATH
-    assert ANY_MAP.plan(grid, (3, 0), (0, 0), tolerance=4).cells == ((3, 0),)
+def test_a_plan_tells_how_long_field_and_rollout_took(monkeypatch: pytest.MonkeyPatch) -> None:
+    def slow(*arguments: Any) -> Any:
+        time.sleep(0.05)
+        return move_costs(*arguments)
 
-
-def test_a_plan_knows_its_rule_and_counts_by_it() -> None:
-    grid = GridMap(np.zeros((4, 6)))
-    for rule, length in ((MoveRule.UNIT, 5), (MoveRule.ROBOT_SAFE, 2 + 3 * 2**0.5)):
-        field = ANY_MAP.q_field(grid, (5, 3), rule)
-        for plan in (ANY_MAP.plan(grid, (0, 0), (5, 3), rule), field.rollout((0, 0))):
-            assert (plan.move_rule, plan.length) == (rule, pytest.approx(length))
-
-
-def test_a_plan_tells_how_long_field_and_rollout_took() -> None:
-    class SlowNetwork:
-        def __getattr__(self, name: str) -> Any:
-            return getattr(ANY_MAP.network, name)
-
-        def move_costs(self, *arguments: Any) -> Any:
-            time.sleep(0.05)
-            return ANY_MAP.network.move_costs(*arguments)
-
-    planner, grid = Planner(SlowNetwork(), ANY_MAP.metadata), GridMap(np.zeros((5, 5)))  # type: ignore[arg-type]
+    move_costs = AnyMapQNetwork.move_costs
+    monkeypatch.setattr(AnyMapQNetwork, "move_costs", slow)
+    planner, grid = new_planner(), GridMap(np.zeros((5, 5)))
     ANY_MAP.plan(GridMap(np.zeros((2, 2))), (0, 0), (1, 1))
-    plan = planner.plan(grid, (0, 0), (4, 2), MoveRule.UNIT, simplified=True)
-    assert plan.field_ms >= 50
+    plan, again = (planner.plan(grid, (0, 0), (4, 2), simplified=True) for _ in range(2))
+    assert plan == again
+    assert again.field_ms < 50 <= plan.field_ms
     assert plan.rollout_ms > 0
-    again = planner.plan(grid, (0, 0), (4, 2), MoveRule.UNIT, simplified=True)
-    assert again == plan
-    assert again.field_ms < 50
+
+
+# In steps
+
+
+@pytest.mark.parametrize("method", PlanMethod)
+@pytest.mark.parametrize("tolerance", [0.0, 3.0])
+@pytest.mark.parametrize("known", [False, True])
+@pytest.mark.parametrize("goal", [(5, 5), (5, 0)])
+def test_no_path_is_rolled_out_twice(
+    method: PlanMethod, tolerance: float, known: bool, goal: Cell, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    planner, grid = turning_planner(), GridMap(np.zeros((6, 6)))
+    if known:
+        planner.q_field(grid, goal)
+    rollout, rollouts = QField.rollout, Counter[Cell]()
+
+    def counted(field: QField, start: Cell) -> Plan:
+        rollouts[field.goal] += 1
+        return rollout(field, start)
+
+    monkeypatch.setattr(QField, "rollout", counted)
+    planner.plan(grid, (0, 0), goal, method=method, tolerance=tolerance)
+    assert rollouts == {goal: 1}
+
+
+def test_the_time_between_two_steps_does_not_count() -> None:
+    planner, grid = turning_planner(), GridMap(np.zeros((6, 6)))
+    steps = planner.steps(
+        PlanRequest(grid, (0, 0), (5, 5), MoveRule.ROBOT_SAFE, PlanMethod.ASTAR_FALLBACK)
+    )
+    began = time.perf_counter()
+    for _ in range(2):
+        assert next(steps) is None
+        time.sleep(0.2)
+    plan = last_step(steps)
+    waited = 1e3 * (time.perf_counter() - began)
+    assert plan.field_ms + plan.rollout_ms < waited - 400
+
+
+def test_a_field_grows_in_steps_between_which_others_are_answered(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    occupancy = np.zeros((40, 40), dtype=np.bool_)
+    occupancy[20, :39] = True
+    grid, planner = GridMap(occupancy), Planner.load("any_map")
+    whole = planner.plan(grid, (0, 0), (0, 39))
+    closed = occupancy.copy()
+    closed[20] = True
+    monkeypatch.setattr("ddqn_planner.planning.planner.VISITS", 20)
+    planner = Planner.load("any_map")
+    steps = planner.steps(PlanRequest(grid, (0, 0), (0, 39), MoveRule.ROBOT_SAFE))
+    waited = 0
+    for plan in steps:
+        waited += plan is None
+        assert planner.plan(grid, (waited % 40, 0), (5, 5)).status is PlanStatus.SUCCEEDED
+    assert waited > 10
+    assert plan == whole
+    given_up = planner.steps(PlanRequest(grid, (0, 0), (1, 39), MoveRule.ROBOT_SAFE))
+    assert next(given_up) is next(given_up) is None
+    given_up.close()  # type: ignore[attr-defined]
+    assert planner.plan(grid, (0, 0), (1, 39)).status is PlanStatus.SUCCEEDED
+    assert planner.plan(GridMap(closed), (0, 0), (0, 39)).status is PlanStatus.NO_PATH
 
 
 # Fields that are kept
@@ -242,7 +284,7 @@ def test_where_no_path_leads_no_field_is_computed_to_say_so() -> None:
     rule = planner.metadata.move_rule
     assert not is_answered_at_once(planner, grid, (0, 0), (2, 2), rule)
     assert planner.plan(grid, (0, 0), (2, 2)).status is PlanStatus.NO_PATH
-    assert planner.known_field(grid, (2, 2)) is None
+    assert known_field(planner, grid, (2, 2), rule) is None
     planner.q_field(grid, (2, 2))
     for method in PlanMethod:
         assert is_answered_at_once(planner, grid, (0, 0), (2, 2), rule, method)
@@ -259,13 +301,14 @@ def test_the_memory_for_fields_is_bounded_and_those_used_last_are_kept() -> None
     for goal in goals:
         planner.q_field(grid, goal)
         planner.q_field(grid, first)
-    known = [goal for goal in grid.free_cells() if planner.known_field(grid, goal)]
+    rule = planner.metadata.move_rule
+    known = [goal for goal in grid.free_cells() if known_field(planner, grid, goal, rule)]
     assert known == [first, *goals[-3:]]
     planner.cache_bytes = 1
     last = GridMap(np.zeros((3, 3)), cost=np.ones((3, 3), np.int8))
     planner.q_field(last, (0, 0))
-    assert planner.known_field(last, (0, 0)) is not None  # whatever its size
-    assert not any(planner.known_field(grid, goal) for goal in grid.free_cells())
+    assert known_field(planner, last, (0, 0), rule) is not None  # whatever its size
+    assert not any(known_field(planner, grid, goal, rule) for goal in grid.free_cells())
 
 
 def test_maps_on_which_there_was_no_path_are_not_kept() -> None:
@@ -282,40 +325,12 @@ def test_maps_on_which_there_was_no_path_are_not_kept() -> None:
 # What users give
 
 
-def test_choices_are_members_or_their_values_and_else_refused_with_a_list() -> None:
+def test_unknown_choices_are_refused_with_a_list() -> None:
     planner, grid = random_planner(3, 3, 1), GridMap(np.zeros((3, 3)))
-    start, goal = (0, 0), (2, 2)
-    for rule in MoveRule:
-        assert planner.plan(grid, start, goal, rule.value) == planner.plan(grid, start, goal, rule)
-        assert planner.q_field(grid, goal, rule.value) is planner.known_field(grid, goal, rule)
-    for method in PlanMethod:
-        by_value = planner.plan(grid, start, goal, method=method.value)
-        assert by_value == planner.plan(grid, start, goal, method=method)
-    for refused in (planner.q_field, planner.known_field):
-        with pytest.raises(ValueError, match="'nope' is unknown; give one of robot_safe, "):
-            refused(grid, goal, "nope")
+    with pytest.raises(ValueError, match="'nope' is unknown; give one of robot_safe, "):
+        planner.q_field(grid, (2, 2), "nope")
     with pytest.raises(ValueError, match="'nope' is unknown; give one of greedy, astar_fallback"):
-        planner.plan(grid, start, (9, 9), method="nope")
-
-
-def test_any_pair_of_whole_numbers_is_a_start_and_a_goal() -> None:
-    grid, planner = GridMap(np.zeros((3, 4))), new_planner()
-    for start, goal in (
-        ([0, 0], [3, 1]),
-        (np.array([0, 0]), np.array([3, 1])),
-        ((np.int64(0), np.int64(0)), (3.0, 1.0)),
-    ):
-        plan = planner.plan(grid, start, goal)
-        assert json.loads(json.dumps([plan.cells[0], plan.goal])) == [[0, 0], [3, 1]]
-        assert planner.q_field(grid, goal) is planner.q_field(grid, (3, 1))
-        assert planner.q_field(grid, goal).rollout(start).cells == plan.cells
-    for wrong in ((0.5, 0), (0, 0, 0), "00", None, (0, np.nan)):
-        for arguments, name in (((wrong, (0, 0)), "start"), (((0, 0), wrong), "goal")):
-            with pytest.raises(ValueError, match=f"the {name} is .*; give two whole numbers"):
-                planner.plan(grid, *arguments)
-        for function in (planner.q_field, planner.known_field):
-            with pytest.raises(ValueError, match="the goal is "):
-                function(grid, wrong)
+        planner.plan(grid, (0, 0), (9, 9), method="nope")
 
 
 # A tolerance

@@ -117,23 +117,18 @@ def test_a_start_that_is_not_free_is_left_by_the_shortest_way(
         assert several.cells == plan.cells
 
 
-def wall(thickness: int) -> GridMap:
-    """A wall across a hall of 21 x 5 cells, from x = 8 on."""
-    occupancy = np.zeros((5, 21), dtype=bool)
-    occupancy[:, 8 : 8 + thickness] = True
-    return GridMap(occupancy)
-
-
 def test_a_start_deeper_in_a_wall_than_the_radius_stays_occupied() -> None:
-    grid = wall(5)
-    for radius, status in ((0, "START_OCCUPIED"), (1.9, "START_OCCUPIED"), (2, "SUCCEEDED")):
-        plan = ANY_MAP.plan(grid, (10, 2), (0, 2), start_clearing_radius=radius)
-        assert plan.status.name == status
-    # The wall's far side is no way to a goal on this one, however near it is.
-    plan = ANY_MAP.plan(grid, (11, 2), (0, 2), start_clearing_radius=2)
-    assert plan.status is PlanStatus.NO_PATH
+    occupancy = np.zeros((5, 21), dtype=bool)
+    occupancy[:, 8:13] = True
+    grid, goal = GridMap(occupancy), (0, 2)
+    for start, radius, status in (
+        ((10, 2), 1.9, PlanStatus.START_OCCUPIED),
+        ((10, 2), 2, PlanStatus.SUCCEEDED),
+        ((11, 2), 2, PlanStatus.NO_PATH),  # the far side is no way, however near it is
+    ):
+        assert ANY_MAP.plan(grid, start, goal, start_clearing_radius=radius).status is status
     with pytest.raises(ValueError, match="start_clearing_radius is nan"):
-        ANY_MAP.plan(grid, (10, 2), (0, 2), start_clearing_radius=math.nan)
+        ANY_MAP.plan(grid, (10, 2), goal, start_clearing_radius=math.nan)
 
 
 def test_a_path_that_leaves_is_valid_until_another_obstacle_lies_on_it() -> None:
@@ -151,8 +146,8 @@ def test_a_path_that_leaves_is_valid_until_another_obstacle_lies_on_it() -> None
     one_way = GridMap(occupancy, forbidden=only_west)
     assert not is_path_valid(path, (4, 2), one_way, "robot_safe", 1)
     assert is_path_valid([(2, 2), (1, 2)], (2, 2), one_way, "robot_safe", 1)
-    for robot in ((1, 2), (-9, 2)):  # a robot beside the obstacle has to go round it
-        assert not is_path_valid(path, robot, grid, "robot_safe", 2)
+    # A robot beside the obstacle has to go round it.
+    assert not is_path_valid(path, (1, 2), grid, "robot_safe", 2)
 
 
 @pytest.mark.parametrize(
@@ -182,13 +177,3 @@ def test_a_path_under_way_is_kept_if_the_way_out_lies_on_it(
     plan = last_step(ANY_MAP.steps(request))
     assert plan.cells == (*begin, *under_way[6:])
     assert (plan.extra_cost is not None) == is_kept
-
-
-def test_the_corners_of_the_square_around_a_start_lie_beyond_a_radius_of_one_cell() -> None:
-    occupancy = np.ones((5, 5), dtype=bool)
-    occupancy[::4, ::4] = False  # the only way out leads over the corners
-    for radius, status in ((1.0, PlanStatus.START_OCCUPIED), (1.5, PlanStatus.SUCCEEDED)):
-        plan = ANY_MAP.plan(
-            GridMap(occupancy), (2, 2), (4, 4), "corner_cutting", start_clearing_radius=radius
-        )
-        assert plan.status is status

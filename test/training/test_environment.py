@@ -11,7 +11,7 @@ from gymnasium.utils.env_checker import check_env
 from gymnasium.utils.seeding import np_random
 
 from ddqn_planner.grid import MOVES, Cell, GridMap, MoveRule
-from ddqn_planner.model.observation import ROBOT, observation_background
+from ddqn_planner.model.networks import ROBOT, observation_background
 from ddqn_planner.training.environment import GridEnvironment, GridVectorEnvironment, Scenario
 from ddqn_planner.training.exploring_starts import initial_cells
 from ddqn_planner.training.hyper_parameters import HyperParameters

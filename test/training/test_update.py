@@ -13,7 +13,7 @@ from torch import Tensor, nn
 
 from ddqn_planner.grid import LENGTHS, MOVES, Cell, GridMap, MoveRule
 from ddqn_planner.model import AnyMapQNetwork
-from ddqn_planner.model.observation import patches
+from ddqn_planner.model.move_costs import patches
 from ddqn_planner.training.double_dqn import Transitions
 from ddqn_planner.training.environment import Scenario
 from ddqn_planner.training.hyper_parameters import HyperParameters
@@ -35,7 +35,7 @@ def about_to_update(scenarios: list[Scenario], parameters: HyperParameters) -> T
     torch.manual_seed(0)
     for weight in trainer._target.parameters():
         weight.add_(0.3 * torch.randn_like(weight))
-    trainer.encoder.update_target(trainer._target)
+    trainer._target.settle(trainer.environment)
     return trainer
 
 

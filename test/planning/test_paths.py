@@ -1,7 +1,10 @@
+"""Parts of paths: segments, what is left of a path, and what is kept of it."""
+
 from __future__ import annotations
 
 import math
 from dataclasses import replace
+from fractions import Fraction
 from itertools import pairwise
 from typing import Any
 
@@ -9,22 +12,34 @@ import numpy as np
 import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
-from strategies import grids_with_costs, grids_with_directions, grids_with_free_cell
+from hypothesis.extra import numpy as numpy_st
+from strategies import cells_of, grids_with_costs, grids_with_directions, grids_with_free_cell
 
-from ddqn_planner import GridMap, MoveRule, Planner
-from ddqn_planner.grid import MOVES, Cell, path_cost, shortest_path
-from ddqn_planner.planning import Plan, PlanRequest, simplify
+from ddqn_planner import GridMap, MoveRule, Planner, simplify
+from ddqn_planner.grid import (
+    MOVES,
+    Cell,
+    legal_moves,
+    path_cost,
+    path_length,
+    shortest_distances,
+    shortest_path,
+)
+from ddqn_planner.planning import PlanRequest
 from ddqn_planner.planning.paths import (
     REACH,
     is_path_valid,
     keep_or_switch,
     legal_segments,
     rest_of_path,
+    search,
+    segment_cost,
     touched_cells,
 )
 from ddqn_planner.planning.planner import last_step
 
 RULES = st.sampled_from(list(MoveRule))
+CELLS = st.tuples(st.integers(-12, 12), st.integers(-12, 12))
 GRIDS = grids_with_free_cell() | grids_with_costs() | grids_with_directions()
 ANY_MAP = Planner.load("any_map")
 
@@ -48,10 +63,9 @@ def is_legal(first: Cell, last: Cell, grid: GridMap, rule: MoveRule) -> bool:
 @st.composite
 def changed(draw: st.DrawFn, grid: GridMap) -> GridMap:
     """The map with some other cells and costs."""
-    cells = st.tuples(st.integers(0, grid.width - 1), st.integers(0, grid.height - 1))
     occupancy = grid.occupancy.copy()
     cost = None if grid.cost is None else grid.cost.copy()
-    for x, y in draw(st.lists(cells, max_size=6)):
+    for x, y in draw(st.lists(cells_of(grid), max_size=6)):
         occupancy[y, x] ^= draw(st.booleans())
         if cost is not None:
             cost[y, x] = draw(st.integers(0, 99))
@@ -59,6 +73,121 @@ def changed(draw: st.DrawFn, grid: GridMap) -> GridMap:
     if forbidden is not None and draw(st.booleans()):
         forbidden = np.roll(forbidden, 1, axis=0)
     return GridMap(occupancy, cost=cost, forbidden=forbidden)
+
+
+# Segments
+
+
+@given(CELLS, CELLS, RULES)
+def test_a_segment_touches_the_cells_that_its_points_lie_in(
+    first: Cell, last: Cell, rule: MoveRule
+) -> None:
+    touched = {(x, y) for x, y in touched_cells(first, last, rule).tolist()}
+    passed = set()
+    for part in np.linspace(0, 1, 4001):
+        x, y = (a + part * (b - a) for a, b in zip(first, last, strict=True))
+        if min(abs(x % 1 - 0.5), abs(y % 1 - 0.5)) > 1e-9:  # not on an edge
+            passed.add((round(x), round(y)))
+    assert passed <= touched
+    # None is farther off than its own half diagonal, or with corners that are touched, on it.
+    length = max(math.dist(first, last), 1e-9)
+    for x, y in touched - passed:
+        cross = (x - first[0]) * (last[1] - first[1]) - (y - first[1]) * (last[0] - first[0])
+        corner = (abs(last[0] - first[0]) + abs(last[1] - first[1])) / 2 / length
+        assert abs(cross) / length <= corner + 1e-9
+
+
+def test_corners_count_where_they_may_not_be_cut() -> None:
+    assert touched_cells((0, 0), (1, 1), MoveRule.CORNER_CUTTING).tolist() == [[0, 0], [1, 1]]
+    assert len(touched_cells((0, 0), (1, 1), MoveRule.ROBOT_SAFE)) == 4
+    assert len(touched_cells((0, 0), (-3, 3), MoveRule.ROBOT_SAFE)) == 10
+
+
+def share_within(cell: Cell, first: Cell, last: Cell) -> Fraction:
+    """Return the share of a segment that lies within a cell, exactly: the cell clips it."""
+    enters, leaves = Fraction(0), Fraction(1)
+    for centre, begin, end in zip(cell, first, last, strict=True):
+        edges = [Fraction(2 * (centre - begin) + side, 2) for side in (-1, 1)]
+        if begin == end:
+            if not edges[0] < 0 < edges[1]:
+                return Fraction(0)
+            continue
+        times = sorted(edge / (end - begin) for edge in edges)
+        enters, leaves = max(enters, times[0]), min(leaves, times[1])
+    return max(leaves - enters, Fraction(0))
+
+
+def exact_cost(first: Cell, last: Cell, multiplier: np.ndarray, rule: MoveRule) -> float:
+    vector = np.subtract(last, first)
+    length = np.abs(vector).max() if rule is MoveRule.UNIT else math.hypot(*vector)
+    columns, rows = (range(min(ends), max(ends) + 1) for ends in zip(first, last, strict=True))
+    cells = [(x, y) for x in columns for y in rows]
+    shares = [share_within(cell, first, last) for cell in cells]
+    assert sum(shares) == 1 or first == last
+    multipliers = [Fraction(float(multiplier[y, x])) for x, y in cells]
+    return float(length * float(sum(a * b for a, b in zip(shares, multipliers, strict=True))))
+
+
+@given(grids_with_costs(), RULES, st.data())
+def test_each_cell_counts_by_the_length_of_the_segment_within_it(
+    grid_and_cell: tuple[GridMap, Cell], rule: MoveRule, data: st.DataObject
+) -> None:
+    grid, first = grid_and_cell
+    last = data.draw(cells_of(grid), label="last")
+    exact = exact_cost(first, last, grid.cost_multiplier, rule)
+    assert segment_cost(first, last, grid.cost_multiplier, rule) == pytest.approx(exact)
+    if max(abs(last[0] - first[0]), abs(last[1] - first[1])) == 1:
+        assert path_cost([first, last], grid.cost_multiplier, rule) == pytest.approx(exact)
+
+
+def check_simplified(path: list[Cell], grid: GridMap, rule: MoveRule) -> tuple[Cell, ...]:
+    """Check that each segment is legal, and costs no more than what it replaces."""
+    simple = simplify(path, grid, rule)
+    assert simple[:1] + simple[-1:] == (*path[:1], *path[-1:])
+    for first, last in pairwise(simple):
+        part = path[path.index(first) : path.index(last) + 1]
+        replaced = sum(exact_cost(a, b, grid.cost_multiplier, rule) for a, b in pairwise(part))
+        assert exact_cost(first, last, grid.cost_multiplier, rule) <= replaced * (1 + 1e-8)
+        assert len(part) == 2 or is_legal(first, last, grid, rule)
+    return simple
+
+
+@settings(max_examples=300)
+@given(grids_with_free_cell() | grids_with_costs() | grids_with_directions(), RULES, st.data())
+def test_a_simplified_path_is_legal_and_costs_no_more(
+    grid_and_goal: tuple[GridMap, Cell], rule: MoveRule, data: st.DataObject
+) -> None:
+    grid, goal = grid_and_goal
+    path = shortest_path(grid, data.draw(st.sampled_from(grid.free_cells())), goal, rule)
+    simple = check_simplified(path, grid, rule)
+    assert path_length(simple) <= path_length(path) + 1e-9
+    assert path_length(simple, MoveRule.UNIT) <= path_length(path, MoveRule.UNIT)
+
+
+def test_under_the_unit_rule_diagonals_are_joined_and_no_segment_counts_more() -> None:
+    grid, path = GridMap(np.zeros((9, 12))), [(x, x) for x in range(9)]
+    assert simplify(path, grid, MoveRule.UNIT) == ((0, 0), (8, 8))
+    path += [(9, 8), (10, 8), (11, 8)]
+    simple = simplify(path, grid, MoveRule.UNIT)
+    assert len(simple) <= 3
+    assert path_length(simple, MoveRule.UNIT) == path_length(path, MoveRule.UNIT) == 11
+
+
+def test_segments_are_as_long_as_can_be() -> None:
+    rule = MoveRule.ROBOT_SAFE
+    for length in range(2, 20):
+        occupancy = np.ones((4, length + 1), dtype=bool)
+        occupancy[0] = occupancy[:, length] = False
+        path = [(x, 0) for x in range(length + 1)] + [(length, y) for y in range(1, 4)]
+        expected = ((0, 0), (length, 0), (length, 3))
+        assert simplify(path, GridMap(occupancy), rule) == expected
+    grid = GridMap(np.zeros((40, 90)))
+    assert simplify(shortest_path(grid, (2, 5), (80, 31), rule), grid, rule) == ((2, 5), (80, 31))
+    assert simplify([], grid, rule) == ()
+    assert simplify([(1, 1)], grid, rule) == ((1, 1),)
+
+
+# The path under way
 
 
 @given(GRIDS, RULES, st.data())
@@ -91,15 +220,11 @@ def test_a_path_is_valid_if_all_of_it_from_the_cell_nearest_to_the_robot_on_is_l
     assert is_path_valid(path, robot, grid, rule)
 
 
-def test_a_path_of_which_only_an_occupied_end_is_left_is_not_valid() -> None:
+def test_a_path_of_which_only_an_occupied_end_or_nothing_is_left_is_not_valid() -> None:
     grid, path = GridMap(np.zeros((1, 9))), [(0, 0), (1, 0), (2, 0)]
     for robot in ((9, 0), (2, 5)):  # off the map, so that its own cell does not count
         assert is_path_valid(path, robot, grid, "robot_safe")
         assert not is_path_valid(path, robot, grid.with_patch([[True]], 2, 0), "robot_safe")
-
-
-def test_an_empty_path_is_not_valid_and_nothing_is_left_of_it() -> None:
-    grid = GridMap(np.zeros((3, 3)))
     assert not is_path_valid([], (0, 0), grid, "robot_safe")
     assert not len(rest_of_path([], (0, 0), grid, "robot_safe"))
 
@@ -165,7 +290,8 @@ def test_what_is_kept_is_legal_and_costs_at_most_the_threshold_more(
     robot = data.draw(st.sampled_from([*filter(after.is_free, under_way), *after.free_cells()]))
     new = shortest_path(after, robot, goal, rule)
     assume(new)
-    path, extra_cost = keep_or_switch(under_way, new, after, rule, threshold)
+    request = PlanRequest(after, robot, goal, rule, under_way=under_way, switch_threshold=threshold)
+    path, extra_cost = keep_or_switch(request, np.array(new, dtype=np.int32))
     assert (tuple(path[0]), tuple(path[-1])) == (robot, goal)
     assert legal_segments(path, after, rule).all()
     cost, best = cost_of(path, after, rule), cost_of(new, after, rule)
@@ -179,44 +305,6 @@ def test_what_is_kept_is_legal_and_costs_at_most_the_threshold_more(
     else:
         assert path.tolist() == rest.tolist()
         assert cost == pytest.approx((1 + extra_cost) * best)
-
-
-def two_corridors(upper: int, lower: int) -> GridMap:
-    """Return a hall with two ways round a block, whose cells have these costs."""
-    occupancy = np.zeros((11, 40), dtype=np.bool_)
-    occupancy[3:8, 5:35] = True
-    cost = np.zeros(occupancy.shape, dtype=np.int8)
-    cost[:3, 10:30], cost[8:, 10:30] = lower, upper
-    return GridMap(occupancy, cost=cost)
-
-
-def plan(grid: GridMap, threshold: float, under_way: Any = (), simplified: bool = False) -> Plan:
-    rule = MoveRule.ROBOT_SAFE
-    request = PlanRequest(grid, (0, 5), (39, 5), rule, simplified=simplified)
-    request = replace(request, under_way=under_way, switch_threshold=threshold)
-    return last_step(ANY_MAP.steps(request))
-
-
-def is_upper(path: Plan) -> bool:
-    return max(y for _, y in path.cells) > 7
-
-
-def test_a_planner_keeps_the_path_under_way_up_to_the_threshold() -> None:
-    first = plan(two_corridors(20, 22), 0.03)
-    assert is_upper(first)
-    assert first.extra_cost is None
-    slightly, much = two_corridors(22, 20), two_corridors(60, 20)
-    kept = plan(slightly, 0.1, first.every_cell)
-    assert kept.cells == first.cells
-    assert kept.extra_cost is not None
-    best = plan(slightly, 0.1)
-    assert 0 < kept.extra_cost < 0.1
-    assert kept.cost == pytest.approx((1 + kept.extra_cost) * best.cost)
-    for other in (plan(slightly, 0.0, first.every_cell), plan(much, 0.1, first.every_cell)):
-        assert not is_upper(other)
-        assert other.extra_cost is None
-    blocked = two_corridors(20, 20).with_patch(np.ones((3, 1)), 20, 8)
-    assert not is_upper(plan(blocked, 10.0, first.every_cell))
 
 
 @given(GRIDS, RULES, st.sampled_from([0.0, 0.3, 10.0]), st.data())
@@ -248,3 +336,56 @@ def test_a_path_to_another_goal_is_kept_up_to_the_threshold_while_that_goal_is_f
         assert plan.path.tolist() == rest.tolist()
     if plan.extra_cost is None:
         assert plan == best
+
+
+# Searches
+
+
+ANY_VALUE = st.floats(width=32, allow_nan=True, allow_infinity=True)
+
+
+@given(grids_with_costs(), RULES, st.data())
+def test_a_search_finds_a_legal_path_wherever_there_is_one_whatever_the_values(
+    grid_and_goal: tuple[GridMap, Cell], rule: MoveRule, data: st.DataObject
+) -> None:
+    grid, goal = grid_and_goal
+    start = data.draw(st.sampled_from(grid.free_cells()))
+    value = data.draw(numpy_st.arrays(np.float32, grid.occupancy.shape, elements=ANY_VALUE))
+    legal = legal_moves(grid.occupancy, rule)
+    distances = shortest_distances(grid, goal, rule)
+
+    cells = search(start, goal, legal, grid.cost_multiplier, rule, value)
+    assert (cells != ()) == np.isfinite(distances[start[1], start[0]])
+    if cells:
+        assert (cells[0], cells[-1]) == (start, goal)
+        assert len(set(cells)) == len(cells)
+        for (x, y), (next_x, next_y) in pairwise(cells):
+            assert legal[MOVES.tolist().index([next_x - x, next_y - y]), y, x]
+
+    cheapest = distances[start[1], start[0]]
+    for known in (None, -distances.astype(np.float32)):  # nothing is known, or all is
+        cells = search(start, goal, legal, grid.cost_multiplier, rule, known)
+        if cells:
+            assert path_cost(cells, grid.cost_multiplier, rule) == pytest.approx(cheapest)
+
+
+def test_a_search_follows_the_values_even_on_a_detour() -> None:
+    grid, rule = GridMap(np.zeros((3, 5))), MoveRule.ROBOT_SAFE
+    detour = [(0, 0), (0, 1), (0, 2), (1, 2), (2, 2), (3, 2), (4, 2), (4, 1), (4, 0)]
+    value = np.zeros((3, 5), np.float32)
+    for x, y in detour:
+        value[y, x] = 100
+    legal = legal_moves(grid.occupancy, rule)
+    assert set(search((0, 0), (4, 0), legal, grid.cost_multiplier, rule, value)) <= set(detour)
+    assert len(search((0, 0), (4, 0), legal, grid.cost_multiplier, rule)) == 5
+
+
+def test_a_search_goes_to_the_nearest_of_several_ends() -> None:
+    grid = GridMap(np.zeros((1, 9)))
+    ends = np.zeros((1, 9), dtype=bool)
+    ends[0, [0, 8]] = True
+    rule = MoveRule.ROBOT_SAFE
+    legal = legal_moves(grid.occupancy, rule)
+    assert search((3, 0), ends, legal, grid.cost_multiplier, rule)[-1] == (0, 0)
+    assert search((5, 0), ends, legal, grid.cost_multiplier, rule)[-1] == (8, 0)
+    assert search((8, 0), ends, legal, grid.cost_multiplier, rule) == ((8, 0),)
