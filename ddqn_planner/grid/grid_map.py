@@ -295,7 +295,8 @@ class GridMap:
     def is_free(self, cell: Cell) -> bool:
         """Return whether a cell lies inside the map and is not occupied."""
         x, y = as_cell(cell)
-        return self.contains((x, y)) and not self.occupancy[y, x]
+        height, width = self.occupancy.shape
+        return bool(0 <= x < width and 0 <= y < height and not self.occupancy[y, x])
 
     def is_obstacle(self, cell: Cell) -> bool:
         """Return whether a cell is an obstacle, not just too near to one; ValueError if outside."""

@@ -270,11 +270,11 @@ def test_bad_goals_are_named_and_an_empty_array_leaves_the_goal(docks: Robot) ->
 def test_goals_and_a_single_goal_replace_each_other(docks: Robot) -> None:
     send_goals(docks, LEFT, RIGHT)
     wait_for_dock(docks, LEFT, "to goal 1 of 2")
-    docks.clear()
-    docks.send_goal(docks.pose(RIGHT, 0.5))
-    docks.wait_for_path(DOCKED, RIGHT, yaw=0.5)
-    docks.wait_for_reason("^a path of [0-9.]+ cells, by greedy steps$")
-    docks.clear()
-    send_goals(docks, RIGHT)
-    docks.wait_for_path(DOCKED, RIGHT, yaw=YAWS[RIGHT])
-    docks.wait_for_reason("^a path of [0-9.]+ cells, by greedy steps$")
+    for yaw, send in (
+        (0.5, lambda: docks.send_goal(docks.pose(RIGHT, 0.5))),
+        (YAWS[RIGHT], lambda: send_goals(docks, RIGHT)),
+    ):
+        docks.clear()
+        send()
+        docks.wait_for_path(DOCKED, RIGHT, yaw=yaw)
+        docks.wait_for_reason("^a path of [0-9.]+ cells, by greedy steps$")

@@ -21,9 +21,7 @@ def test_each_request_of_a_burst_has_its_plan(robot: Any, clients: int) -> None:
     assert all(answer is not None and answer.plan.poses for answer in answers)
 
 
-def test_each_request_of_a_burst_has_its_map(
-    run_node: Callable[..., Any],
-) -> None:
+def test_each_request_of_a_burst_has_its_map(run_node: Callable[..., Any]) -> None:
     with (
         run_node("map_server_node", {}, namespace="/burst"),
         BurstClients(1, GetMap, "/burst/map_server/map") as asking,
