@@ -30,18 +30,18 @@ class Demo:
 
     def __init__(self, folder: Path) -> None:
         # The demo's nodes are in sessions of their own; they inherit its environment.
-        mark, self._output = uuid.uuid4().hex, folder / "output.txt"
+        mark = uuid.uuid4().hex
         self._entry = f"{MARK}={mark}".encode()
-        environment, redirect = {**os.environ, MARK: mark}, subprocess.STDOUT
+        self._output = folder / "output.txt"
         with self._output.open("wb") as file:
-            options: dict[str, Any] = {
-                "cwd": folder,
-                "env": environment,
-                "stdout": file,
-                "stderr": redirect,
-            }
-            command = [sys.executable, str(DEMO)]
-            self.process = subprocess.Popen(command, start_new_session=True, **options)
+            self.process = subprocess.Popen(
+                [sys.executable, str(DEMO)],
+                cwd=folder,
+                env={**os.environ, MARK: mark},
+                stdout=file,
+                stderr=subprocess.STDOUT,
+                start_new_session=True,
+            )
 
     @property
     def output(self) -> str:
