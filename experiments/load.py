@@ -9,23 +9,9 @@ from contextlib import suppress
 from types import SimpleNamespace
 from typing import Any
 
+import client as ros
 import numpy as np
 from builtin_interfaces.msg import Time
-from client import (
-    RULE,
-    SERVICE_QUALITY,
-    TIMEOUT,
-    Client,
-    MapFixture,
-    cell_of,
-    generated_map,
-    initial_pose,
-    plan_request,
-    pose,
-    three_maps,
-    wait_for,
-    wait_for_map,
-)
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseStamped
 from nav_msgs.msg import Path
@@ -51,24 +37,24 @@ REACH = 30  # cells from start to goal along an axis at most: short answers come
 def ask(seed: int, count: int, shared: SimpleNamespace) -> None:
     """Ask, and check each answer; the result is milliseconds, the number of empty ones, errors."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # it ends with its parent
-    random, maps = np.random.default_rng(seed), three_maps()
+    random, maps = np.random.default_rng(seed), ros.three_maps()
     milliseconds: list[float] = []
     errors: list[str] = []
     empty = 0
     goals = [
-        [goal for _, goal in random_requests(m.grid.occupancy, RULE, GOALS_PER_MAP, random)]
+        [goal for _, goal in random_requests(m.grid.occupancy, ros.RULE, GOALS_PER_MAP, random)]
         for m in maps
     ]
     starts = [m.grid.free_cells() for m in maps]
-    with Client() as client:
+    with ros.Client() as client:
         client.call(GetPlan, "planner/get_plan")  # not measured: it waits for the service
-        shared.ready.wait(TIMEOUT)
+        shared.ready.wait(ros.TIMEOUT)
         for _ in range(count):
             first = shared.confirmed.value
             current = first % len(maps)
             start = starts[current][random.integers(len(starts[current]))]
             goal = goals[current][random.integers(GOALS_PER_MAP)]
-            request = plan_request(maps[current].grid, start, goal)
+            request = ros.plan_request(maps[current].grid, start, goal)
             began = time.perf_counter()
             try:
                 plan = client.call(GetPlan, "planner/get_plan", request).plan
@@ -89,7 +75,7 @@ def ask(seed: int, count: int, shared: SimpleNamespace) -> None:
 
 def load_requests(planner: int, requests: int, clients: int) -> bool:
     """Ask a planner (a process with no other map yet) while maps change; return if all is right."""
-    context, maps = multiprocessing.get_context("spawn"), three_maps()
+    context, maps = multiprocessing.get_context("spawn"), ros.three_maps()
     number = len(maps)
     # Of the last map: its number where the planner is known to have it, and where it was published.
     confirmed, published = context.Value("i", number), context.Value("i", number)
@@ -99,17 +85,17 @@ def load_requests(planner: int, requests: int, clients: int) -> bool:
         context.Process(target=ask, args=(n, len(range(n, requests, clients)), shared), daemon=True)
         for n in range(clients)
     ]
-    with Client() as client:
+    with ros.Client() as client:
         diagnostics = client.subscribe(DiagnosticArray, "/diagnostics", keep=1)
 
         def send_map(number: int) -> None:
             client.publish("map", maps[number % len(maps)].message(number), LATCHED)
-            wait_for_map(diagnostics, Time(sec=number))
+            ros.wait_for_map(diagnostics, Time(sec=number))
 
         send_map(number)
         for process in processes:
             process.start()
-        shared.ready.wait(TIMEOUT)
+        shared.ready.wait(ros.TIMEOUT)
         began, first_memory = time.monotonic(), 0.0
         while shared.done.value < requests and any(process.is_alive() for process in processes):
             if shared.done.value >= (number - 2) * requests / CHANGES:
@@ -122,7 +108,7 @@ def load_requests(planner: int, requests: int, clients: int) -> bool:
             time.sleep(0.005)
         seconds, last_memory = time.monotonic() - began, memory(planner)
     # It fails if a process did.
-    results = [shared.results.get(timeout=TIMEOUT) for _ in processes]
+    results = [shared.results.get(timeout=ros.TIMEOUT) for _ in processes]
     times, empty, errors = zip(*results, strict=True)
     milliseconds, wrong_or_lost = np.concatenate(times), list(itertools.chain(*errors))
     lost = requests - len(milliseconds)
@@ -144,35 +130,35 @@ def load_requests(planner: int, requests: int, clients: int) -> bool:
 
 def load_goals(goals: int) -> bool:
     """Send goals at 200 Hz; return whether plans follow in order, the last for the last goal."""
-    office, random = three_maps()[2], np.random.default_rng(0)
+    office, random = ros.three_maps()[2], np.random.default_rng(0)
     grid = office.grid
-    ((start, _),) = random_requests(grid.occupancy, RULE, 1, random)
-    reachable = np.argwhere(grid.reachable([start], RULE))[:, ::-1]
+    ((start, _),) = random_requests(grid.occupancy, ros.RULE, 1, random)
+    reachable = np.argwhere(grid.reachable([start], ros.RULE))[:, ::-1]
     cells = [(int(x), int(y)) for x, y in random.permutation(reachable)[:goals]]
     numbers = {cell: number for number, cell in enumerate(cells)}
-    with Client() as client:
+    with ros.Client() as client:
         diagnostics = client.subscribe(DiagnosticArray, "/diagnostics", keep=1)
         message = office.message(2**20)
         client.publish("map", message, LATCHED)
-        wait_for_map(diagnostics, message.header.stamp)
-        from_start = pose(grid, start)
-        client.publish("initialpose", initial_pose(from_start))
-        wait_for("start", lambda: client.get_plan(PoseStamped(), from_start).poses)
+        ros.wait_for_map(diagnostics, message.header.stamp)
+        from_start = ros.pose(grid, start)
+        client.publish("initialpose", ros.initial_pose(from_start))
+        ros.wait_for("start", lambda: client.get_plan(PoseStamped(), from_start).poses)
         everything = QoSProfile(depth=goals, durability=DurabilityPolicy.VOLATILE)
         plans = client.subscribe(Path, "plan", everything)
-        wait_for("publisher of plan", lambda: client.node.count_publishers("plan"))
+        ros.wait_for("publisher of plan", lambda: client.node.count_publishers("plan"))
         publisher = client.publisher(PoseStamped, "goal_pose")
 
         def heard() -> list[int]:
             ends = [plan.poses[-1:] for plan in plans.messages()]
-            return [numbers.get(cell_of(grid, end[0]), -1) if end else -1 for end in ends]
+            return [numbers.get(ros.cell_of(grid, end[0]), -1) if end else -1 for end in ends]
 
         began = time.monotonic()
         for sent, cell in enumerate(cells):
             time.sleep(max(0.0, began + sent * GOALS_PERIOD - time.monotonic()))
-            publisher.publish(pose(grid, cell))
+            publisher.publish(ros.pose(grid, cell))
         seconds = time.monotonic() - began
-        wait_for("plan to the last goal", lambda: goals - 1 in heard())
+        ros.wait_for("plan to the last goal", lambda: goals - 1 in heard())
         time.sleep(2)  # a plan for an older goal would come now
         order = heard()
     late = sum(later < earlier for earlier, later in itertools.pairwise(order))
@@ -185,7 +171,7 @@ def load_goals(goals: int) -> bool:
     return right
 
 
-class BurstClients(Client):
+class BurstClients(ros.Client):
     """Clients of one service in one process."""
 
     def __init__(
@@ -193,26 +179,26 @@ class BurstClients(Client):
     ) -> None:
         super().__init__(name="bursts")
         self._clients = [
-            self.node.create_client(service_type, service, qos_profile=SERVICE_QUALITY)
+            self.node.create_client(service_type, service, qos_profile=ros.SERVICE_QUALITY)
             for _ in range(clients)
         ]
         # Made after them: the node knows them all when it knows this one.
         self.service(service_type, service)
         for client in self._clients:
-            client.wait_for_service(TIMEOUT)
+            client.wait_for_service(ros.TIMEOUT)
 
     def burst(self, requests: Sequence[Any]) -> list[Any]:
         """Send all requests, the clients in turn; return the answers, None where it is lost."""
         asked = zip(itertools.cycle(self._clients), requests, strict=False)
         pending = [(client, client.call_async(request)) for client, request in asked]
         with suppress(TimeoutError):
-            wait_for("answers", lambda: all(future.done() for _, future in pending))
+            ros.wait_for("answers", lambda: all(future.done() for _, future in pending))
         for client, future in pending:
             client.remove_pending_request(future)
         return [future.result() for _, future in pending]
 
 
-class GoalBursts(Client):
+class GoalBursts(ros.Client):
     """A client of Nav2's action `compute_path_to_pose`; it needs nav2_msgs."""
 
     def __init__(self, action: str = "compute_path_to_pose", node: str = "planner") -> None:
@@ -221,7 +207,7 @@ class GoalBursts(Client):
         super().__init__(name="goal_bursts")
         self._type = ComputePathToPose.Goal
         self._client = ActionClient(self.node, ComputePathToPose, action, **QUEUES)
-        wait_for(action, self._client.server_is_ready)
+        ros.wait_for(action, self._client.server_is_ready)
         self.wait_for_discovery(node)
 
     def burst(self, requests: Sequence[GetPlan.Request]) -> tuple[int, int]:
@@ -240,7 +226,7 @@ class GoalBursts(Client):
 
         self.run(send)  # rclpy loses answers that come before it has noted a goal
         with suppress(TimeoutError):
-            wait_for("results", lambda: len(results) == len(requests))
+            ros.wait_for("results", lambda: len(results) == len(requests))
         return len(handles), len(results)
 
 
@@ -255,12 +241,12 @@ def burst_requests(
             return requests
         x, y = (np.array(goal) + random.integers(-REACH, REACH + 1, 2)).tolist()
         if grid.is_free((x, y)):
-            requests.append(plan_request(grid, (x, y), goal))
+            requests.append(ros.plan_request(grid, (x, y), goal))
     return requests
 
 
 def count_right(
-    fixture: MapFixture, requests: Sequence[GetPlan.Request], answers: Sequence[Any]
+    fixture: ros.MapFixture, requests: Sequence[GetPlan.Request], answers: Sequence[Any]
 ) -> int:
     """Return how many answers are a path, or empty because there is none."""
     pairs = zip(requests, answers, strict=True)
@@ -279,14 +265,14 @@ def load_bursts(
         print(f"bursts: {bursts} of {count} {what}: right {right} of {bursts * count}", flush=True)
 
     for size in sizes:
-        fixture = generated_map("rooms", size, resolution=0.5)
+        fixture = ros.generated_map("rooms", size, resolution=0.5)
         free = fixture.grid.free_cells()
         goals = [free[i] for i in np.random.default_rng(1).integers(len(free), size=BURST_GOALS)]
         sent = {
             count: [burst_requests(fixture.grid, goals, count, seed) for seed in range(bursts)]
             for count in counts
         }
-        all_pairs = [plan_request(fixture.grid, a, b) for a in goals for b in goals]
+        all_pairs = [ros.plan_request(fixture.grid, a, b) for a in goals for b in goals]
         with BurstClients(1) as one:
             one.publish("map", fixture.message(), LATCHED)
             # Until it plans on this map, and knows the fields, whose times do not count here.

@@ -15,20 +15,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import processes
 from client import RULE, Client, ask, initial_pose, map_message, plan_request, pose, wait_for
 from nav_msgs.msg import OccupancyGrid
 from nav_msgs.msg import Path as PathMessage
 from nav_msgs.srv import GetPlan
-from processes import (
-    claim_ros_domain,
-    cpu_seconds,
-    executable,
-    memory,
-    run_script,
-    running,
-    running_node,
-)
-from random_maps import generate_map
+from random_maps import Random, generate_map
 from rcl_interfaces.srv import GetParameters, ListParameters
 from std_srvs.srv import Trigger
 from tables import report
@@ -58,9 +50,10 @@ def publish_request(client: Client, grid: GridMap, start: Cell, goal: Cell) -> N
     client.publish("goal_pose", pose(grid, goal))
 
 
-def office(side: int) -> GridMap:
-    """Return a generated office."""
-    return GridMap(generate_map("office", (side, side), np.random.default_rng(0)))
+def office(side: int) -> tuple[GridMap, Random]:
+    """Return a generated office, and the generator that drew it."""
+    random = np.random.default_rng(0)
+    return GridMap(generate_map("office", (side, side), random)), random
 
 
 def usage(child: AbstractContextManager[Any], wait: Callable[[], Any]) -> Usage:
@@ -69,7 +62,7 @@ def usage(child: AbstractContextManager[Any], wait: Callable[[], Any]) -> Usage:
     began = time.monotonic()
     with child as node:
         wait()
-        return time.monotonic() - began, cpu_seconds(node.pid), memory(node.pid)
+        return time.monotonic() - began, processes.cpu_seconds(node.pid), processes.memory(node.pid)
 
 
 # A client per start: one that has seen other nodes end is discovered more slowly.
@@ -86,21 +79,21 @@ def start_planner() -> Usage:
             publish_request(client, grid, (6, 6), (17, 19))
             plans.wait(lambda plan: plan.poses)
 
-        return usage(running_node("planner_node", "--log-level", "error"), first_plan)
+        return usage(processes.running_node("planner_node", "--log-level", "error"), first_plan)
 
 
 def start_map_server() -> Usage:
     """Start the map server; return what it takes until its first map is received."""
     with Client() as client:
         maps = client.subscribe(OccupancyGrid, "map", LATCHED)
-        return usage(running_node("map_server_node", "--log-level", "error"), maps.wait)
+        return usage(processes.running_node("map_server_node", "--log-level", "error"), maps.wait)
 
 
 def start_bare_node() -> Usage:
     """Start a node with one service; return what it takes until it is discovered."""
     with Client() as client:
         ready = client.node.create_client(GetPlan, "bare/get_plan").service_is_ready
-        return usage(running(*BARE, "0"), lambda: wait_for("the bare node", ready))
+        return usage(processes.running(*BARE, "0"), lambda: wait_for("the bare node", ready))
 
 
 def run_command(*command: str) -> Usage:
@@ -110,7 +103,7 @@ def run_command(*command: str) -> Usage:
     while not ended:
         # Not ru_maxrss: that begins with the memory of this process.
         with suppress(IndexError, OSError):
-            peak = memory(child.pid, "VmHWM")
+            peak = processes.memory(child.pid, "VmHWM")
         time.sleep(0.002)
         ended, status, used = os.wait4(child.pid, os.WNOHANG)
     seconds = time.monotonic() - began
@@ -122,7 +115,7 @@ def run_command(*command: str) -> Usage:
 def measure_starts() -> list[bool]:
     """Print the medians of some starts beside their bounds."""
     imported = partial(run_command, sys.executable, "-c", "import ddqn_planner")
-    planned = partial(run_command, executable("ddqn-planner"), "plan", "dilemma")
+    planned = partial(run_command, processes.executable("ddqn-planner"), "plan", "dilemma")
     starts: dict[str, tuple[Callable[[], Usage], Usage]] = {
         "a bare rclpy node, discovered": (start_bare_node, (FREE, FREE, FREE)),
         "map_server_node to its first map": (start_map_server, (0.8, FREE, 90)),
@@ -163,14 +156,14 @@ def measure_requests(client: Client, map_file: Path) -> list[bool]:
     pairs = random_requests(grid.occupancy, RULE, GOALS, np.random.default_rng(0))
     requests = [plan_request(grid, *cells) for cells in pairs]
     first, ratios = [], []
-    server = running_node("map_server_node", yaml_filename=map_file.resolve())
-    with server, running_node("planner_node"):
+    server = processes.running_node("map_server_node", yaml_filename=map_file.resolve())
+    with server, processes.running_node("planner_node"):
         planner = client.service(GetPlan, "planner/get_plan")
         starting, _ = first_answer(client, requests[0])
         for request in requests[1:]:
             took, poses = first_answer(client, request)
             first.append(took)
-            with running(*BARE, str(poses)):
+            with processes.running(*BARE, str(poses)):
                 bare = client.service(GetPlan, "bare/get_plan")
                 timed(bare, request)
                 both = [[timed(s, request)[0] for s in (planner, bare)] for _ in range(CALLS)]
@@ -191,8 +184,7 @@ def measure_requests(client: Client, map_file: Path) -> list[bool]:
 
 def measure_large_map(client: Client) -> list[bool]:
     """Measure memory, and what other services take while a large field is computed."""
-    random = np.random.default_rng(0)
-    grid = GridMap(generate_map("office", (LARGE, LARGE), random))
+    grid, random = office(LARGE)
     cells = random_requests(grid.occupancy, RULE, GOALS + 1, random)
     new = [plan_request(grid, *both) for both in cells[1:]]
     # Of one pose: a long path takes its own time.
@@ -204,7 +196,7 @@ def measure_large_map(client: Client) -> list[bool]:
         "reload_model": (Trigger, Trigger.Request()),
     }
     missed, waited = [], []
-    with running_node("planner_node") as planner:
+    with processes.running_node("planner_node") as planner:
         client.publish("map", message_of(grid), LATCHED)
         first_answer(client, known)
         get_plan = client.service(GetPlan, "planner/get_plan")
@@ -219,7 +211,7 @@ def measure_large_map(client: Client) -> list[bool]:
                 waited.append(1e3 * (time.perf_counter() - began))
             figure = f"{LARGE}x{LARGE}, field under way: {name}, slowest of {len(times)}"
             missed.append(report(figure, max(times), "ms", 100))
-        peak = memory(planner.pid, "VmHWM")
+        peak = processes.memory(planner.pid, "VmHWM")
     print(f"{LARGE}x{LARGE}: GetPlan with a new field, median {statistics.median(waited):.0f} ms")
     return [*missed, report(f"{LARGE}x{LARGE}: planner node, greatest memory", peak, "MB", 2000)]
 
@@ -227,8 +219,8 @@ def measure_large_map(client: Client) -> list[bool]:
 def measure_new_maps(client: Client) -> list[bool]:
     """Measure how soon a new large map brings a path to the active goal."""
     plans, times = client.subscribe(PathMessage, "plan", LATCHED), []
-    small, first = message_of(GridMap(np.zeros((5, 5), dtype=np.bool_))), office(LARGE)
-    with running_node("planner_node"):
+    small, (first, _) = message_of(GridMap(np.zeros((5, 5), dtype=np.bool_))), office(LARGE)
+    with processes.running_node("planner_node"):
         for turns in range(4):
             grid = GridMap(np.rot90(first.occupancy, turns))
             client.publish("map", small, LATCHED)
@@ -249,8 +241,7 @@ def measure_new_maps(client: Client) -> list[bool]:
 
 def measure_changing_map(client: Client) -> list[bool]:
     """Measure the planner's share of a core while a few cells of its map change."""
-    random = np.random.default_rng(0)
-    grid = GridMap(generate_map("office", (CHANGING, CHANGING), random))
+    grid, random = office(CHANGING)
     ((start, goal),) = random_requests(grid.occupancy, RULE, 1, random)
     local, random, maps = Planner.load("any_map"), np.random.default_rng(0), [grid]
     path = local.plan(grid, start, goal, RULE).cells
@@ -260,14 +251,14 @@ def measure_changing_map(client: Client) -> list[bool]:
         if local.plan(changed, start, goal, RULE).cells:
             maps.append(changed)
     messages = [message_of(changed) for changed in maps]
-    with running_node("planner_node") as planner:
+    with processes.running_node("planner_node") as planner:
         publish_request(client, grid, start, goal)
         for number, message in enumerate(messages):
             if number == 2 * RATE:  # the node is warm
-                began, computed = time.monotonic(), cpu_seconds(planner.pid)
+                began, computed = time.monotonic(), processes.cpu_seconds(planner.pid)
             client.publish("map", message, LATCHED)
             time.sleep(1 / RATE)
-        seconds, computed = time.monotonic() - began, cpu_seconds(planner.pid) - computed
+        seconds, computed = time.monotonic() - began, processes.cpu_seconds(planner.pid) - computed
     name = f"{CHANGING}x{CHANGING}: a few cells change, {RATE} Hz: share of a core"
     return [report(name, 100 * computed / seconds, "%", 10)]
 
@@ -285,7 +276,7 @@ def measure_trainer(client: Client) -> list[bool]:
     for number in (signal.SIGINT, signal.SIGTERM):
         with (
             tempfile.TemporaryDirectory() as folder,
-            running_node("trainer_node", output_folder=folder, **options) as trainer,
+            processes.running_node("trainer_node", output_folder=folder, **options) as trainer,
         ):
             # A service is found before its node spins: the first answer says that it does.
             print(f"trainer: first answer of the node, while it starts: {call('stop'):.0f} ms")
@@ -313,7 +304,7 @@ def measure_trainer(client: Client) -> list[bool]:
 def main(arguments: Sequence[str]) -> int:
     """Print each figure beside its bound, on another ROS map (a path) too; 1 if one is missed."""
     map_file = Path(arguments[0] if arguments else find_map("office"))
-    with claim_ros_domain():
+    with processes.claim_ros_domain():
         missed = measure_starts()
         gc.freeze()  # else this process pauses to look for garbage among what it has imported
         for measure in (
@@ -330,4 +321,4 @@ def main(arguments: Sequence[str]) -> int:
 
 
 if __name__ == "__main__":
-    run_script(main)
+    processes.run_script(main)

@@ -15,21 +15,9 @@ from pathlib import Path
 from subprocess import Popen
 from typing import Any
 
+import client as ros
 import numpy as np
 from builtin_interfaces.msg import Time
-from client import (
-    RULE,
-    Client,
-    RobotPoses,
-    cell_of,
-    initial_pose,
-    map_message,
-    plan_request,
-    pose,
-    three_maps,
-    values_of,
-    wait_for_map,
-)
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseStamped
 from nav_msgs.msg import OccupancyGrid
@@ -67,19 +55,19 @@ EVENTS = ("clock back", "clock forward", "set elsewhere", *SILENCES)
 class Work:
     """One piece of work per call, drawn at random; it writes its maps into a folder."""
 
-    def __init__(self, client: Client, folder: Path) -> None:
+    def __init__(self, client: ros.Client, folder: Path) -> None:
         self._client = client
         self._diagnostics = client.subscribe(DiagnosticArray, "/diagnostics", keep=1)
         self._draw = random.Random(0)
-        self._maps = three_maps()
+        self._maps = ros.three_maps()
         self._paths = [folder / f"{number}.yaml" for number in range(len(self._maps))]
         for path, fixture in zip(self._paths, self._maps, strict=True):
             grid = fixture.grid
             start, goal, *_ = grid.free_cells()
             save_map(MapFile(fixture.values, grid.resolution, grid.origin, start, goal), path)
         grid = self._maps[-1].grid
-        cells = random_requests(grid.occupancy, RULE, STEADY_FIELDS, np.random.default_rng(0))
-        self._steady = [plan_request(grid, *both) for both in cells]
+        cells = random_requests(grid.occupancy, ros.RULE, STEADY_FIELDS, np.random.default_rng(0))
+        self._steady = [ros.plan_request(grid, *both) for both in cells]
         self._bad_map = folder / "bad.yaml"
         self._bad_map.write_text("image: [", encoding="utf-8")
         self.lost = 0
@@ -95,7 +83,7 @@ class Work:
             "model": (1, lambda: client.call(Trigger, "planner/reload_model")),
             "parameters": (1, lambda: self._set(draw.choice([*MoveRule]), draw.randint(1, 100))),
             "bad input": (1, self.bad_input),
-            "start": (3, lambda: client.publish("initialpose", initial_pose(self._pose()))),
+            "start": (3, lambda: client.publish("initialpose", ros.initial_pose(self._pose()))),
             "goal": (5, lambda: client.publish("goal_pose", self._pose())),
             "plan": (8, lambda: client.get_plan(self._pose(), self._pose())),
         }
@@ -114,7 +102,7 @@ class Work:
         self._set("", 65)
         self._client.call(Trigger, "planner/reload_model")  # loaded again, it forgets all fields
         loaded = self._load(self._paths[-1])
-        wait_for_map(self._diagnostics, loaded.map.header.stamp)
+        ros.wait_for_map(self._diagnostics, loaded.map.header.stamp)
         for steady in self._steady:
             self._client.call(GetPlan, "planner/get_plan", steady)
 
@@ -125,7 +113,7 @@ class Work:
         message = self._maps[0].message(1)
         message.info.width += 1
         client.publish("map", message, LATCHED)
-        client.publish("initialpose", initial_pose(bad))
+        client.publish("initialpose", ros.initial_pose(bad))
         client.publish("goal_pose", bad)
         client.get_plan(bad, bad)
         self._load(self._bad_map)
@@ -138,10 +126,10 @@ class Work:
 
     def _pose(self) -> PoseStamped:
         grid = self._draw.choice(self._maps).grid
-        return pose(grid, (self._draw.randrange(grid.width), self._draw.randrange(grid.height)))
+        return ros.pose(grid, (self._draw.randrange(grid.width), self._draw.randrange(grid.height)))
 
 
-class SimulatedRobot(Client):
+class SimulatedRobot(ros.Client):
     """Drives between random cells, and publishes clock, costmap and poses from a thread."""
 
     def __init__(self) -> None:
@@ -149,13 +137,13 @@ class SimulatedRobot(Client):
         self._clock = self.node.create_publisher(Clock, "/clock", 10)
         self._costmap = self.node.create_publisher(OccupancyGrid, "map", LATCHED)
         self._goals = self.node.create_publisher(PoseStamped, "goal_pose", 10)
-        self._poses = RobotPoses(self.node)
+        self._poses = ros.RobotPoses(self.node)
         self._diagnostics = self.subscribe(DiagnosticArray, "/diagnostics", keep=100)
-        self._map = three_maps()[0]
+        self._map = ros.three_maps()[0]
         self._grid = self._map.grid
         self._planner = Planner.load("any_map")
         self._draw = random.Random(0)
-        requests = random_requests(self._grid.occupancy, RULE, 50, np.random.default_rng(0))
+        requests = random_requests(self._grid.occupancy, ros.RULE, 50, np.random.default_rng(0))
         self._cells = [start for start, _ in requests]
         self._lock = threading.Lock()
         self._now, self._steps, self._along = 1000.0, 0, 0.0
@@ -185,7 +173,7 @@ class SimulatedRobot(Client):
         stamp = Time(sec=int(self._now), nanosec=int(self._now % 1 * 1e9))
         self._clock.publish(Clock(clock=stamp))
         if self._silent != "costmap stops" and self._steps % COSTMAP_PERIOD == 0:
-            message = map_message(self._map.values, self._grid)
+            message = ros.map_message(self._map.values, self._grid)
             message.header.stamp = stamp
             self._costmap.publish(message)
         self._along += STEP * SPEED_UP * SPEED / self._grid.resolution
@@ -200,7 +188,7 @@ class SimulatedRobot(Client):
     def _drive_on(self, start: Cell) -> None:
         goal = self._draw.choice([cell for cell in self._cells if math.dist(cell, start) > 5])
         self._path, self._along = list(self._planner.plan(self._grid, start, goal).cells), 0.0
-        self._goals.publish(pose(self._grid, goal))
+        self._goals.publish(ros.pose(self._grid, goal))
 
     def _set_elsewhere(self) -> None:
         """Put the robot on a cell where it has not been since it was put down last."""
@@ -254,15 +242,15 @@ class SimulatedRobot(Client):
 
     def _start_of_plan(self) -> Cell | None:
         """Return the start of a plan from where the planner thinks that the robot is."""
-        goal = pose(self._grid, self._draw.choice(self._cells))
+        goal = ros.pose(self._grid, self._draw.choice(self._cells))
         poses = self.get_plan(PoseStamped(), goal).poses
-        return cell_of(self._grid, poses[0]) if poses else None
+        return ros.cell_of(self._grid, poses[0]) if poses else None
 
     def _drives(self) -> int:
         """Return how many drives the trainer has recorded."""
         statuses = [status for m in self._diagnostics.messages() for status in m.status]
         of_trainer = [s for s in statuses if s.name == f"{NAMESPACE}/trainer: driving"]
-        return int(values_of(of_trainer[-1])["drives"]) if of_trainer else 0
+        return int(ros.values_of(of_trainer[-1])["drives"]) if of_trainer else 0
 
 
 def soak(
@@ -307,7 +295,7 @@ def main(arguments: Sequence[str]) -> int:
         claim_ros_domain(),
         tempfile.TemporaryDirectory() as folder,
         ExitStack() as stack,
-        Client() as client,
+        ros.Client() as client,
     ):
         drives = f"{folder}/drives"
         nodes = {

@@ -96,6 +96,17 @@ ANY = [
 """Right for some arguments."""
 
 
+def in_numpy(value: Any) -> list[Any]:
+    """The same flag, text, number or tuple, of other types."""
+    if isinstance(value, bool):
+        return [np.bool_(value)]
+    if isinstance(value, int | float):
+        return [kind(value) for kind in (np.float32, np.float64, np.int64, np.uint8)]
+    if isinstance(value, tuple):
+        return [tuple(map(np.int32, value)), np.array(value), [*map(np.float32, value)]]
+    return [np.str_(value)] if type(value) is str else []
+
+
 @pytest.mark.filterwarnings("error")
 @pytest.mark.parametrize(("call", "name"), ARGUMENTS)
 def test_a_wrong_argument_is_a_value_error_that_names_it(
@@ -113,21 +124,8 @@ def test_a_wrong_argument_is_a_value_error_that_names_it(
     for value in ANY:
         with suppress(ValueError):
             call(**{**right, name: value})
-
-
-@pytest.mark.parametrize(("call", "name"), ARGUMENTS)
-def test_numpy_scalars_are_numbers(call: Callable[..., Any], name: str) -> None:
-    right, values = CALLS[call][name], []
-    if isinstance(right, bool):
-        values = [np.bool_(right)]
-    elif type(right) is str:
-        values = [np.str_(right)]
-    elif isinstance(right, int | float):
-        values = [kind(right) for kind in (np.float32, np.float64, np.int64, np.uint8)]
-    elif isinstance(right, tuple):
-        values = [tuple(map(np.int32, right)), np.array(right), [*map(np.float32, right)]]
-    for value in values:
-        call(**{**CALLS[call], name: value})
+    for value in in_numpy(right[name]):
+        call(**{**right, name: value})
 
 
 def test_a_path_for_experience_is_a_path() -> None:

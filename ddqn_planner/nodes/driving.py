@@ -25,9 +25,9 @@ from ddqn_planner.nodes.parameters import OF_MAPS
 from ddqn_planner.nodes.poses import Frames, listen
 from ddqn_planner.nodes.report import Refusals
 from ddqn_planner.nodes.runtime import LATCHED, STEADY, BaseNode, Parameters
+from ddqn_planner.resources import with_remedy
 
 Float64 = NDArray[np.float64]
-
 NAVIGATION = "navigate_to_pose/_action/status"
 RETRY_PERIOD = 5.0  # seconds after which what failed for a full disk is tried again
 SLOWEST = 10.0  # the slowness that ``~/slowness`` shows as 100
@@ -134,8 +134,7 @@ class Driving:
         self._folder: DriveFolder | None = None
         self._last_drive, self._is_disk_full = "", False
         self._aborted: set[bytes] | None = None
-        self._learned = 0
-        self._shown: tuple[GridMap, int] | None = None
+        self._shown: GridMap | None = None
         self._saved = node.create_publisher(String, "~/experience_saved", LATCHED)
         self._slowness = node.create_publisher(OccupancyGrid, "~/slowness", LATCHED)
         node.create_subscription(PoseStamped, "goal_pose", self._on_goal, 10)
@@ -155,8 +154,6 @@ class Driving:
 
     def _recording(self) -> DriveFolder | None:
         return self._folder if self._node.state == "recording" else None
-
-    # Where the robot is
 
     def _on_pose(self, pose: PoseStamped) -> None:
         """Record a pose; a ValueError refuses it."""
@@ -208,8 +205,6 @@ class Driving:
         if self._recording() and aborted - before:
             self._recorder.abort()
 
-    # Drives
-
     def _on_drive(self, outcome: DriveEnd, seconds: Float64, positions: Float64) -> None:
         place, folder = self._node.map, self._recording()
         if place is None or folder is None:
@@ -230,8 +225,7 @@ class Driving:
         self._tell_saved(folder)
 
     def _tell_saved(self, folder: DriveFolder) -> None:
-        """Say where the experience is, or why it could not be saved."""
-        self._learned += 1
+        self._shown = None
         self._node.note_saving("the drives are", folder.save_error)
         if not folder.save_error:
             self._saved.publish(String(data=str(folder.experience_path)))
@@ -243,8 +237,6 @@ class Driving:
         elif self._node.state == "failed" and self._is_disk_full:
             self._on_start()
 
-    # What RViz shows
-
     def _draw(self, place: MapInFrame, positions: Float64) -> None:
         yaw = np.arctan2(*np.diff(positions, axis=0).T[::-1])
         yaw = np.append(yaw, yaw[-1] if len(yaw) else 0.0)
@@ -255,16 +247,14 @@ class Driving:
         if place is None or folder is None:
             return
         grid = place.grid
-        if self._shown == (grid, self._learned) or not self._slowness.get_subscription_count():
+        if self._shown is grid or not self._slowness.get_subscription_count():
             return
-        self._shown = grid, self._learned
+        self._shown = grid
         slowness = folder.experience.slowness(grid)
         percent = np.clip(100 * np.log(slowness) / np.log(SLOWEST), 0, 100).round()
         percent[grid.occupancy] = -1
         header = self._node.header(place.frame)
         self._slowness.publish(occupancy_message(percent, grid.resolution, grid.origin, header))
-
-    # Services: each returns whether it succeeds, and a message
 
     def _on_start(self) -> tuple[bool, str]:
         if self._recording():
@@ -348,7 +338,9 @@ def _place_of(position: tuple[float, float] | None) -> str:
 
 
 def explained(error: Exception) -> str:
-    """Return what an error says; for one of the disk, also what to do."""
+    """Return what an error says, with a remedy for the disk and for libraries."""
+    if isinstance(error, ImportError):
+        return f"training needs another library: {with_remedy(error)}"
     if isinstance(error, OSError):
         return f"{error}; set output_folder to a folder that can be written"
     is_clear = isinstance(error, (ValueError, MemoryError)) and str(error)

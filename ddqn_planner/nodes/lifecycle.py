@@ -65,8 +65,6 @@ class ManagedNode(LifecycleNodeMixin, BaseNode):
             self.on_shutdown(last_state)
         super().destroy_node()
 
-    # What a node does in its transitions
-
     async def prepare(self, transition: str) -> bool:
         """Do what takes long before a transition that was asked for; False to refuse it."""
         return True
@@ -122,9 +120,7 @@ class ManagedNode(LifecycleNodeMixin, BaseNode):
             self.on_cleanup(state)
         return SUCCESS
 
-    async def _on_change_state(
-        self, request: ChangeState.Request, response: ChangeState.Response
-    ) -> ChangeState.Response:
+    async def _on_change_state(self, request: Any, response: Any) -> Any:
         asked = request.transition
         known = {number: label for number, label, *_ in self._state_machine.available_transitions}
         label = asked.label or known.get(asked.id, "")
@@ -151,10 +147,8 @@ class ManagedNode(LifecycleNodeMixin, BaseNode):
         try:
             from bondpy.bondpy import Bond
         except ImportError:
-            self.get_logger().info(
-                "no bond: bondpy is not installed; apt install ros-jazzy-bondpy, or set "
-                "bond_timeout to 0.0 in the lifecycle manager"
-            )
+            remedy = "apt install ros-jazzy-bondpy, or set bond_timeout to 0.0 in its manager"
+            self.get_logger().info(f"no bond: bondpy is not installed; {remedy}")
             return
         self._bond = Bond(self, "bond", self.get_name())
         # Seconds, as Nav2's nodes and lifecycle manager have them.

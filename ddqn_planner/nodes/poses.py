@@ -24,8 +24,6 @@ PATIENCE = 1.0  # seconds within which a new listener hears the first message of
 SILENCE = 2.0  # seconds after which odometry that comes no more does not tell where the robot is
 REMEDY = "; or install tf2_ros (apt install ros-jazzy-tf2-ros-py), which transforms it"
 
-Point = tuple[float, float, float]
-
 
 def has_tf() -> bool:
     """Return whether tf2_ros is installed, without importing it; PyPI does not have it."""
@@ -143,7 +141,7 @@ def transformed(stamped: PoseStamped, transform: TransformStamped) -> PoseStampe
     return result
 
 
-def _turned(rotation: Quaternion, point: Point) -> Point:
+def _turned(rotation: Quaternion, point: tuple[float, ...]) -> tuple[float, ...]:
     """Return p + 2 r × (r × p + w p), where r is the quaternion's vector and w its real part."""
     x, y, z, w = rotation.x, rotation.y, rotation.z, rotation.w
     px, py, pz = point

@@ -128,13 +128,10 @@ class BaseNode(Node):
     def _on_jump(self, jump: TimeJump) -> None:
         seconds = jump.delta.nanoseconds / 1e9
         what = f"jumped by {seconds:.6g} s" if seconds else "changed"
-        self.get_logger().warning(
-            f"the clock {what}: transforms and odometry from before are forgotten"
-        )
+        forgotten = "transforms and odometry from before are forgotten"
+        self.get_logger().warning(f"the clock {what}: {forgotten}")
         for forget in self.after_jump_back:
             forget()
-
-    # Parameters
 
     def _check(self, parameters: list[Parameter]) -> SetParametersResult:
         try:
@@ -176,8 +173,6 @@ class BaseNode(Node):
             reason = f"{error}; give one of rcl_interfaces/msg/ParameterType"
         return SetParametersResult(successful=False, reason=reason)
 
-    # Services and topics
-
     def answer_with(self, service_type: Any, callback: Callable[..., Any]) -> None:
         """Answer the service of a type, which rclpy has created, with another callback."""
         (service,) = [each for each in self.services if each.srv_type is service_type]
@@ -210,10 +205,8 @@ class BaseNode(Node):
         try:
             return super().create_subscription(msg_type, topic, callback, quality, **options)
         except RuntimeError as error:
-            raise RuntimeError(
-                f"cannot subscribe to {name} ({error}); give qos_overrides.{name}.subscription "
-                "values that ROS knows, or none"
-            ) from None
+            remedy = f"give qos_overrides.{name}.subscription values that ROS knows, or none"
+            raise RuntimeError(f"cannot subscribe to {name} ({error}); {remedy}") from None
 
     def header(self, frame: str = "") -> Header:
         """Return the header of a message about now."""
@@ -236,7 +229,6 @@ class BaseNode(Node):
         return DiagnosticArray(header=self.header(), status=[status])
 
     def _topic_problems(self) -> Iterator[str]:
-        """Say which publishers are not received, and that odometry has several."""
         for subscription in self.subscriptions:
             topic = subscription.topic_name
             # To count is cheap; to ask who they are is not.

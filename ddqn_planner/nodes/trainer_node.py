@@ -21,7 +21,7 @@ from ddqn_planner.nodes.driving import NO_MAP, Driving, LearningNode, MapInFrame
 from ddqn_planner.nodes.parameters import HYPER_PARAMETERS, OF_MAPS, TRAINER_PARAMETERS
 from ddqn_planner.nodes.poses import check_source
 from ddqn_planner.nodes.runtime import LATCHED, STEADY, Worker, spin_until_shutdown
-from ddqn_planner.resources import find_map, with_remedy
+from ddqn_planner.resources import find_map
 from ddqn_planner.training.hyper_parameters import HyperParameters
 
 if TYPE_CHECKING:
@@ -38,8 +38,6 @@ class TrainerNode(LearningNode):
         super().__init__("trainer", TRAINER_PARAMETERS)
         self._poses: dict[str, PoseStamped] = {}
         self._run: TrainingRun | None = None
-        self._run_map: MapInFrame | None = None
-        self._is_stopping = self._is_saving = False
         self.state = "idle"
         self._read_map_file()
         self._worker = Worker(self)
@@ -84,8 +82,6 @@ class TrainerNode(LearningNode):
                 path = path_message([cell], grid, Header(frame_id="map"), Quaternion())
                 self._poses[which] = path.poses[0]
 
-    # Start and goal
-
     def _on_pose(self, which: str, message: PoseStamped | PoseWithCovarianceStamped) -> None:
         pose = getattr(message.pose, "pose", message.pose)
         stamped = PoseStamped(header=message.header, pose=pose)
@@ -114,11 +110,8 @@ class TrainerNode(LearningNode):
         try:
             place, run = self._open_run()
         except Exception as error:  # the node must survive any error
-            reason = explained(error)
-            if isinstance(error, ImportError):
-                reason = f"training needs another library: {with_remedy(error)}"
-            self.fail(f"the training cannot start: {reason}")
-            return False, reason
+            self.fail(f"the training cannot start: {explained(error)}")
+            return False, explained(error)
         self.state, self.error, self.save_error = "training", "", ""
         self._is_stopping = self._is_saving = False
         self.refusals.forget()
@@ -165,13 +158,9 @@ class TrainerNode(LearningNode):
         if place is None:
             return False, f"{NO_MAP} first"
         episodes = read_cells(file, self.value("episode_interval"))
-        draw = partial(self._publish_cells, place=place)
-        return self.replay(file, episodes, draw, "train on")
-
-    # Training
+        return self.replay(file, episodes, partial(self._publish_cells, place=place), "train on")
 
     async def _train(self, run: TrainingRun, place: MapInFrame) -> None:
-        """Train until the end or ~/stop."""
         steps, announced, ends = run.steps(), run.saved_at, ""
         try:
             while not ends:
@@ -203,10 +192,8 @@ class TrainerNode(LearningNode):
         self.episodes.publish(path)
 
     def _publish_diagnostics(self) -> None:
-        values = {}
-        for which, pose in self._poses.items():
-            position = pose.pose.position
-            values[which] = f"({position.x:.6g}, {position.y:.6g})"
+        places = {which: pose.pose.position for which, pose in self._poses.items()}
+        values = {which: f"({at.x:.6g}, {at.y:.6g})" for which, at in places.items()}
         if self._run is not None:
             trainer = self._run.trainer
             values |= {

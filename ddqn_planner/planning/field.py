@@ -313,7 +313,7 @@ def changed_cells(old: GridMap, new: GridMap, shift: Cell) -> NDArray[np.int32] 
         one, other = getattr(old, layer), getattr(new, layer)
         if one is not None and (one is not other or shift != (0, 0)):
             differs |= one[before] != other[rows, columns]
-    if np.count_nonzero(differs) > CHANGED_SHARE * differs.size:
+    if np.count_nonzero(padded) > CHANGED_SHARE * differs.size:
         return None
     if shift != (0, 0) or old.occupancy.shape != new.occupancy.shape:
         # What lay beyond the border of one map is inside the other.

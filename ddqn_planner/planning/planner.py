@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Generator, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterator, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
@@ -210,9 +211,9 @@ class Planner:
         if isinstance(found, PlanStatus):
             yield Plan(found, move_rule=request.move_rule, field_ms=field_ms)
             return
-        (plan, dress), rollout_ms = yield from _timed(_roll_out(request, found))
+        plan, rollout_ms = yield from _timed(_roll_out(request, found))
         known_ms = found.plan.rollout_ms if found.plan else 0.0  # it was found with the field
-        yield replace(plan, **dress, field_ms=field_ms - known_ms, rollout_ms=rollout_ms + known_ms)
+        yield plan(field_ms=field_ms - known_ms, rollout_ms=rollout_ms + known_ms)
 
     def _refusal(self, request: PlanRequest) -> PlanStatus | None:
         """Return why there is no path, where one look at start and goals says so."""
@@ -293,10 +294,8 @@ def _in_parts(field: DistanceField, request: PlanRequest) -> Generator[None, Non
         yield
 
 
-def _roll_out(
-    request: PlanRequest, found: _Found
-) -> Generator[None, None, tuple[Plan, dict[str, Any]]]:
-    """Return the rollout, or if trapped perhaps a search, and what changes it to what is asked."""
+def _roll_out(request: PlanRequest, found: _Found) -> Generator[None, None, Callable[..., Plan]]:
+    """Return the plan that is asked for, but for its times: a rollout, or perhaps a search."""
     grid, rule, way_out, field = request.grid, request.move_rule, found.way_out, found.field
     start = way_out[-1]
     plan = found.plan or field.rollout(start)
@@ -318,8 +317,7 @@ def _roll_out(
     every_cell = path
     if request.simplified:
         path = np.array(simplify(path, grid, rule), dtype=np.int32)
-    dress = {"path": path, "every_cell": every_cell, "move_rule": rule}
-    return plan, {**dress, "cost": cost, "extra_cost": extra_cost, "goal": goal}
+    return partial(Plan, plan.status, path, plan.method, rule, cost, goal, every_cell, extra_cost)
 
 
 def _timed(steps: Generator[None, None, T]) -> Generator[None, None, tuple[T, float]]:

@@ -1,46 +1,36 @@
 from pathlib import Path
 
+import driving_worlds as worlds
 import numpy as np
 import pytest
 from driving import LAST, LEARNED, MEAN, PLANNERS, CellTimes, Job, main, run
-from driving_worlds import (
-    HOUR,
-    KINDS,
-    NOISE,
-    SPEED,
-    Drive,
-    drive,
-    generated_world,
-    path_seconds,
-    with_faults,
-)
 
 from ddqn_planner.grid import GridMap, MoveRule
 from ddqn_planner.planning import Planner
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", worlds.KINDS)
 def test_a_world_is_always_the_same_and_its_crowds_come_and_go(kind: str) -> None:
-    world, again = generated_world(kind, 3), generated_world(kind, 3)
+    world, again = worlds.generated_world(kind, 3), worlds.generated_world(kind, 3)
     np.testing.assert_array_equal(world.slowness(0), again.slowness(0))
     assert world.stations == again.stations
     assert all(world.grid.is_free(station) for station in world.stations)
-    assert (world.slowness(0) != world.slowness(HOUR)).any()
-    np.testing.assert_array_equal(world.slowness(0), world.slowness(2 * HOUR))
+    assert (world.slowness(0) != world.slowness(worlds.HOUR)).any()
+    np.testing.assert_array_equal(world.slowness(0), world.slowness(2 * worlds.HOUR))
     assert world.slowness(0).min() == 1
 
 
 def test_a_drive_takes_the_time_of_its_path() -> None:
-    world, random = generated_world("office", 0), np.random.default_rng(0)
+    world, random = worlds.generated_world("office", 0), np.random.default_rng(0)
     path = Planner.load("any_map").plan(
         world.known(0), world.stations[0], world.stations[1], MoveRule.ROBOT_SAFE
     )
-    expected = path_seconds(path.cells, world.slowness(0), world.grid)
+    expected = worlds.path_seconds(path.cells, world.slowness(0), world.grid)
     assert path.cost == pytest.approx(expected)
-    drives = [drive(path.cells, world, 100.0, random) for _ in range(200)]
+    drives = [worlds.drive(path.cells, world, 100.0, random) for _ in range(200)]
     assert np.mean([measured.duration for measured in drives]) == pytest.approx(expected, rel=0.03)
     noise = np.std([np.log(measured.slowness) for measured in drives], axis=0)
-    assert noise.mean() == pytest.approx(NOISE, rel=0.1)
+    assert noise.mean() == pytest.approx(worlds.NOISE, rel=0.1)
     seconds, positions = drives[0].seconds, drives[0].positions
     assert seconds[0] == 100
     assert seconds[-1] == pytest.approx(100 + drives[0].duration, abs=0.2)
@@ -50,11 +40,11 @@ def test_a_drive_takes_the_time_of_its_path() -> None:
 
 def test_every_fault_occurs() -> None:
     seconds = np.arange(0, 60, 0.1)
-    positions = np.column_stack([seconds * SPEED, np.zeros_like(seconds)])
-    measured = Drive(seconds, positions, np.ones(1), 60.0)
+    positions = np.column_stack([seconds * worlds.SPEED, np.zeros_like(seconds)])
+    measured = worlds.Drive(seconds, positions, np.ones(1), 60.0)
     seen = set()
     for seed in range(30):
-        faulty = with_faults(measured, np.random.default_rng(seed))
+        faulty = worlds.with_faults(measured, np.random.default_rng(seed))
         pause = len(faulty.seconds) > len(seconds)
         clock_jumps = bool((np.abs(np.diff(faulty.seconds)) > 1).any())
         jumps = int((np.hypot(*np.diff(faulty.positions, axis=0).T) > 0.5).sum())

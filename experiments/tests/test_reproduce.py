@@ -10,6 +10,7 @@ from pathlib import Path
 import any_map
 import numpy as np
 import pytest
+import trainings
 from goal_1 import convergence_row
 from goal_2 import free_starts, trained_field
 from goal_3 import best_moves, fixed_path, noisy_maps, train_supervised
@@ -17,15 +18,6 @@ from networks import random_network
 from PIL import Image
 from reproduce import EXPERIMENTS, main
 from tables import mean_and_worst, median_and_range
-from trainings import (
-    MOVE_RULE,
-    Training,
-    evaluate_training,
-    in_parallel,
-    optimal_value,
-    read_evaluations,
-    train,
-)
 
 from ddqn_planner.grid import MOVES, Noise, path_length, shortest_distances, shortest_path
 from ddqn_planner.model import ModelMetadata, load_model
@@ -100,11 +92,11 @@ def test_a_training_that_was_cut_off_ends_as_if_it_had_not_been(
     small: Scenario, tmp_path: Path
 ) -> None:
     folders = [tmp_path / name for name in ("whole", "cut")]
-    whole, cut = (Training(folder, QUICK, (small,), 1, 300) for folder in folders)
-    train(whole)
-    train(replace(cut, parameters=replace(QUICK, steps=600)))
-    in_parallel(train, [cut])
-    runs = [read_evaluations(folder) for folder in folders]
+    whole, cut = (trainings.Training(folder, QUICK, (small,), 1, 300) for folder in folders)
+    trainings.train(whole)
+    trainings.train(replace(cut, parameters=replace(QUICK, steps=600)))
+    trainings.in_parallel(trainings.train, [cut])
+    runs = [trainings.read_evaluations(folder) for folder in folders]
     assert runs[0]["step"].tolist() == [300, 600, 900]
     for name in set(runs[0].dtype.names or ()) - {"seconds"}:
         np.testing.assert_array_equal(runs[0][name], runs[1][name])
@@ -113,21 +105,21 @@ def test_a_training_that_was_cut_off_ends_as_if_it_had_not_been(
     assert models[0].read_bytes() == models[1].read_bytes()
     other = replace(cut, parameters=replace(QUICK, gamma=0.5))
     with pytest.raises(ValueError, match=r"gamma 0\.95"):
-        in_parallel(train, [other])
+        trainings.in_parallel(trainings.train, [other])
 
 
 def test_the_last_of_the_networks_that_solve_the_most_is_kept(
     small: Scenario, tmp_path: Path
 ) -> None:
-    train(Training(tmp_path, QUICK, (small,), seed=1, evaluation_interval=50))
-    solved = np.flatnonzero(read_evaluations(tmp_path)["solved"] == 1)
+    trainings.train(trainings.Training(tmp_path, QUICK, (small,), seed=1, evaluation_interval=50))
+    solved = np.flatnonzero(trainings.read_evaluations(tmp_path)["solved"] == 1)
     assert len(solved) > 1
     assert load_model(tmp_path / "kept.safetensors")[1].steps == 50 * (solved[-1] + 1)
 
 
 def test_the_over_estimation_is_that_of_the_free_cells_but_the_goal(small: Scenario) -> None:
-    trainer = Trainer([small], MOVE_RULE, QUICK, seed=0)
-    found = evaluate_training(trainer, np.full(20, -2.0, dtype=np.float32), seconds=1.0)
+    trainer = Trainer([small], trainings.MOVE_RULE, QUICK, seed=0)
+    found = trainings.evaluate_training(trainer, np.full(20, -2.0, dtype=np.float32), seconds=1.0)
     value = trainer.planner().q_field(small.grid, small.goal).q.max(axis=0)
     cells = [cell for cell in small.grid.free_cells() if cell != small.goal]
     expected = np.mean([value[y, x] + 2.0 for x, y in cells])
@@ -137,8 +129,8 @@ def test_the_over_estimation_is_that_of_the_free_cells_but_the_goal(small: Scena
 @pytest.mark.parametrize("alpha", [0.0, 0.6])
 def test_the_optimal_value_is_what_the_best_policy_earns(small: Scenario, alpha: float) -> None:
     parameters = replace(QUICK, alpha=alpha)
-    environment = GridVectorEnvironment([small], MOVE_RULE, parameters)
-    value = optimal_value(environment)
+    environment = GridVectorEnvironment([small], trainings.MOVE_RULE, parameters)
+    value = trainings.optimal_value(environment)
     # Bellman's equation, with what the environment itself does.
     for x, y in small.grid.free_cells():
         returns = []
@@ -153,13 +145,13 @@ def test_the_optimal_value_is_what_the_best_policy_earns(small: Scenario, alpha:
 
 def test_a_supervised_network_learns_the_best_moves(small: Scenario, tmp_path: Path) -> None:
     best = best_moves(small).reshape(4, 5, 8)
-    distance = shortest_distances(small.grid, small.goal, MOVE_RULE)
+    distance = shortest_distances(small.grid, small.goal, trainings.MOVE_RULE)
     assert not best[small.grid.occupancy].any()
     assert not best[small.goal[::-1]].any()
     for y, x, action in np.argwhere(best):
         dx, dy = MOVES[action]
         assert distance[y, x] - distance[y + dy, x + dx] == pytest.approx(np.hypot(dx, dy))
-    training = Training(tmp_path, replace(QUICK, steps=300), (small,), 0, 300)
+    training = trainings.Training(tmp_path, replace(QUICK, steps=300), (small,), 0, 300)
     train_supervised(training)
     planner = Planner.load(tmp_path / "model.safetensors")
     plan = planner.plan(small.grid, small.start, small.goal)
@@ -190,27 +182,24 @@ def test_a_row_tells_from_when_on_a_path_is_found_and_is_the_shortest() -> None:
     assert convergence_row([always]) == ["1 (0) of 1", "0", "0", "22.97"]
 
 
-@pytest.mark.parametrize(("possible", "wrong"), [(True, False), (False, True)])
-def test_moves_count_as_wrong_that_are_legal_and_predicted_to_fail_or_the_other_way_round(
-    possible: bool, wrong: bool
-) -> None:
+def test_moves_count_as_wrong_that_are_legal_and_predicted_to_fail_or_the_other_way() -> None:
     network = random_network("any_map", filters=2)
-    network.tensors["moves.bias"].fill(100.0 if possible else -100.0)
-    metadata = ModelMetadata("any_map", {"filters": 2}, MOVE_RULE, 0.95, "", 0, 0, "")
-    found, _ = any_map.move_errors(Planner(network, metadata))
+    metadata = ModelMetadata("any_map", {"filters": 2}, trainings.MOVE_RULE, 0.95, "", 0, 0, "")
     # A straight move is legal in half of the 256 patches with a free centre. A diagonal one too
     # if corners may be cut, else in an eighth.
     legal = 4 * (128 + 128 + 128 + 32)
-    assert found == (legal if wrong else 4096 - legal)
+    for bias, wrong in ((100.0, 4096 - legal), (-100.0, legal)):
+        network.tensors["moves.bias"].fill(bias)
+        assert any_map.move_errors(Planner(network, metadata))[0] == wrong
 
 
 def test_the_q_that_the_loss_trains_adds_up_the_papers_rewards(paper: Scenario) -> None:
-    metadata = ModelMetadata("propagation", {"filters": 2}, MOVE_RULE, 0.95, "", 0, 0, "")
+    metadata = ModelMetadata("propagation", {"filters": 2}, trainings.MOVE_RULE, 0.95, "", 0, 0, "")
     network = random_network("propagation", filters=2)
     # Told that every move succeeds: its rollouts go straight to the goal, and are trapped by walls.
     network.tensors["moves.bias"].fill(100.0)
     planner = Planner(network, metadata)
-    ratios = length_ratios(planner.q_field(paper.grid, paper.goal), paper.grid, MOVE_RULE)
+    ratios = length_ratios(planner.q_field(paper.grid, paper.goal), paper.grid, trainings.MOVE_RULE)
     assert free_starts(paper).sum() == 286
     assert 0 < np.isfinite(ratios)[free_starts(paper)].sum() < 286
     field = trained_field(planner, paper)
@@ -227,16 +216,14 @@ def test_noisy_maps_differ_and_more_test_maps_leave_the_training_maps(
     paper: Scenario, noise: Noise
 ) -> None:
     training, test = noisy_maps(30, 30, noise)
-    assert (len(training), len(test)) == (30, 30)
     scenarios = [*training, *test]
-    assert len({scenario.grid.fingerprint for scenario in scenarios}) == 60
-    for scenario, same in zip(training, noisy_maps(30, 31, noise)[0], strict=True):
-        assert scenario.grid.fingerprint == same.grid.fingerprint
+    prints = [scenario.grid.fingerprint for scenario in scenarios]
+    assert (len(training), len(set(prints))) == (30, 60)
+    assert prints[:30] == [s.grid.fingerprint for s in noisy_maps(30, 31, noise)[0]]
     path = fixed_path(training)
     assert (path[0], path[-1]) == (paper.start, paper.goal)
-    assert path_length(path) > path_length(
-        shortest_path(paper.grid, paper.start, paper.goal, MOVE_RULE)
-    )
+    shortest = shortest_path(paper.grid, paper.start, paper.goal, trainings.MOVE_RULE)
+    assert path_length(path) > path_length(shortest)
     if noise is Noise.ON_PATH:  # every inner cell of the path can be avoided at once
         assert all(scenario.grid.is_free(cell) for scenario in scenarios for cell in path)
 

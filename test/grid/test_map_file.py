@@ -237,18 +237,19 @@ def test_a_map_is_saved_as_yaml_alone(tmp_path: Path) -> None:
     assert not list(tmp_path.iterdir())
 
 
-@pytest.mark.parametrize(
-    "wrong",
-    [
-        *({"values": value} for value in (np.zeros(3), *(np.full((2, 2), n) for n in (101, -2)))),
-        *({"values": np.full((2, 2), 0.5)}, {"resolution": 0.0}, {"origin": (0.0, math.nan, 0.0)}),
-        *({"goal": (2, 0)}, {"goal": (0.5, 0)}, {"start": (0, 0, 0)}),
-        *({"forbidden": np.zeros((2, 3))}, {"forbidden": np.full((2, 2), 256)}),
-    ],
-)
-def test_an_impossible_map_file_cannot_be_made(wrong: dict[str, Any]) -> None:
-    with pytest.raises(ValueError, match="give"):
-        MapFile(**{"values": np.zeros((2, 2)), **wrong})
+IMPOSSIBLE: list[dict[str, Any]] = [
+    *({"values": np.zeros(3)}, {"values": np.full((2, 2), 0.5)}),
+    *({"values": np.full((2, 2), n)} for n in (101, -2)),
+    *({"resolution": 0.0}, {"origin": (0.0, math.nan, 0.0)}),
+    *({"goal": (2, 0)}, {"goal": (0.5, 0)}, {"start": (0, 0, 0)}),
+    *({"forbidden": np.zeros((2, 3))}, {"forbidden": np.full((2, 2), 256)}),
+]
+
+
+def test_an_impossible_map_file_cannot_be_made() -> None:
+    for wrong in IMPOSSIBLE:
+        with pytest.raises(ValueError, match="give"):
+            MapFile(**{"values": np.zeros((2, 2)), **wrong})
 
 
 # What is refused, by name
@@ -351,22 +352,17 @@ def test_the_bottom_row_of_the_image_of_directions_is_row_0(tmp_path: Path) -> N
         assert load_map(with_directions(tmp_path, black, name)).forbidden is None
 
 
-@pytest.mark.parametrize(
-    ("image", "name", "named"),
-    [
+def test_an_image_that_holds_no_directions_is_refused(tmp_path: Path) -> None:
+    for image, name, named in (
         (GREY.resize((2, 3)), "d.png", "has 2 x 3 pixels; give 3 x 2, as the map's image"),
         (GREY.convert("RGB"), "d.png", "stored as RGB; save 8 bits of grey"),
         *((GREY.convert(mode), "d.png", f"stored as {mode}") for mode in ("LA", "P", "1", "I;16")),
         (GREY, "d.jpg", "not readable .* give a PPM, PNG image"),
         (b"P5\n3 2\n100\n" + bytes(6), "d.pgm", "save an 8-bit PNG"),
         (b"P5\n3 2\n255\n" + bytes(5), "d.pgm", "not readable"),
-    ],
-)
-def test_an_image_that_holds_no_directions_is_refused(
-    tmp_path: Path, image: Image.Image | bytes, name: str, named: str
-) -> None:
-    with pytest.raises(MapDataError, match=rf"{name}'.*{named}"):
-        read_map_file(with_directions(tmp_path, image, name))
+    ):
+        with pytest.raises(MapDataError, match=rf"{name}'.*{named}"):
+            read_map_file(with_directions(tmp_path, image, name))
 
 
 # Where the images are

@@ -34,13 +34,8 @@ if importlib.util.find_spec("rclpy") is None:
 _claim = claim_ros_domain()
 
 
-HEAVY = {
-    "matplotlib": "/matplotlib/",
-    "numba": "/llvmlite/",
-    "scipy": "/scipy/",
-    "torch": "/torch/",
-}
-"""The folder of each library's shared objects."""
+# The folder of each library's shared objects.
+HEAVY = {"matplotlib": "matplotlib", "numba": "llvmlite", "scipy": "scipy", "torch": "torch"}
 
 
 class NodeProcess:
@@ -65,7 +60,7 @@ class NodeProcess:
     def heavy_libraries(self) -> set[str]:
         """The large libraries that the process has loaded."""
         maps = Path(f"/proc/{self.process.pid}/maps").read_text()
-        return {name for name, folder in HEAVY.items() if folder in maps}
+        return {name for name, folder in HEAVY.items() if f"/{folder}/" in maps}
 
     def forget_log(self) -> None:
         os.truncate(self.log_path, 0)
@@ -109,16 +104,9 @@ def parameter_arguments(parameters: dict[str, Any] | None, file: Path) -> list[s
 def log_of_refused_start(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> Callable[..., str]:
-    """Return a function that sees a node refuse to start with parameters, and returns its log.
+    """Return a function that sees a node in this process refuse to start, and returns its log."""
 
-    The node is in this process: to start one that imports torch takes seconds.
-    """
-
-    def start(
-        main: Callable[[], int],
-        parameters: dict[str, Any] | None = None,
-        arguments: Sequence[str] = (),
-    ) -> str:
+    def start(main: Any, parameters: Any = None, arguments: Sequence[str] = ()) -> str:
         given = parameter_arguments(parameters, tmp_path / "parameters.yaml")
         monkeypatch.setattr(sys, "argv", ["node", "--ros-args", *given, *arguments])
         # Signals are pytest's here.
@@ -131,10 +119,7 @@ def log_of_refused_start(
 
 @pytest.fixture(scope="session")
 def run_node(tmp_path_factory: pytest.TempPathFactory) -> RunNode:
-    """Return a context manager that runs an executable, stops it by SIGINT and sees it exit with 0.
-
-    ``with run_node("planner_node", {"model": path}, ["map:=other"], namespace="/robot") as node``
-    """
+    """Return a context manager that runs an executable, stops it by SIGINT and sees it exit."""
     logs = tmp_path_factory.mktemp("logs")
     numbers = itertools.count()
 
@@ -190,28 +175,16 @@ def make_client() -> Iterator[Callable[[str], Any]]:
     from client import Client
 
     with ExitStack() as clients:
-
-        def make(namespace: str = "") -> Client:
-            return clients.enter_context(Client(namespace))
-
-        yield make
+        yield lambda namespace="": clients.enter_context(Client(namespace))
 
 
-SMALL_MAP = """
-......
-.##...
-..#.#.
-....#.
-.#....
-......
-"""
-"""Row 0 of the text is y = 0."""
+SMALL_MAP = "...... .##... ..#.#. ....#. .#.... ......"
 
 
 @pytest.fixture(scope="session")
 def small_values() -> np.ndarray:
-    """(6, 6) int8: occupancy of a map."""
-    rows = [[100 if c == "#" else 0 for c in line] for line in SMALL_MAP.split()]
+    """(6, 6) int8: occupancy of a map, y = 0 first."""
+    rows = [[100 * (cell == "#") for cell in row] for row in SMALL_MAP.split()]
     return np.array(rows, dtype=np.int8)
 
 
@@ -232,12 +205,16 @@ def planner(run_node: RunNode, model: Path) -> Iterator[Any]:
 
 
 @pytest.fixture(scope="module")
-def running_robot(
-    planner: Any, make_client: Callable[[str], Any], small_values: np.ndarray, model: Path
-) -> Any:
+def make_robot(make_client: Any, small_values: np.ndarray, model: Path) -> Callable[[str], Any]:
+    """Return what makes the user of a planner in a namespace."""
     from integration.robot import Robot
 
-    return Robot(make_client("/robot"), small_values, model)
+    return lambda space: Robot(make_client(space), small_values, model, f"{space}/planner")
+
+
+@pytest.fixture(scope="module")
+def running_robot(planner: Any, make_robot: Any) -> Any:
+    return make_robot("/robot")
 
 
 @pytest.fixture

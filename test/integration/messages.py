@@ -15,17 +15,10 @@ from ddqn_planner.nodes.conversions import quaternion
 
 # A string of a message ends at its first NUL, and is UTF-8.
 TEXTS = st.text(st.characters(exclude_categories=["Cs"], exclude_characters="\0"), max_size=30)
-NUMBERS = (
-    st.floats()
-    | st.floats(-10, 10)
-    | st.sampled_from([math.nan, math.inf, -math.inf, 1e300, -1e300, 5e-324, 1e38])
-)
+ODD = st.sampled_from([math.nan, math.inf, -math.inf])
+NUMBERS = st.floats() | st.floats(-10, 10) | st.sampled_from([1e300, -1e300, 5e-324, 1e38]) | ODD
 # The checks of messages refuse the greatest float32.
-NUMBERS_32 = (
-    st.floats(-(2.0**127), 2.0**127, width=32)
-    | st.floats(-2, 2, width=32)
-    | st.sampled_from([math.nan, math.inf, -math.inf])
-)
+NUMBERS_32 = st.floats(-(2.0**127), 2.0**127, width=32) | st.floats(-2, 2, width=32) | ODD
 INTEGERS = st.integers(-(2**63), 2**63 - 1) | st.integers(-1, 101)
 FRAMES = st.sampled_from(["map", "map", "map", "", "odom", "/map", "ma" * 500]) | TEXTS
 HEADERS = st.builds(lambda frame: Header(frame_id=frame), FRAMES)

@@ -34,12 +34,6 @@ pytestmark = [
 ]
 
 
-@pytest.fixture(scope="module")
-def install(source_copy: Path) -> Path:
-    """Build a copy of the source in a workspace; return the workspace's install folder."""
-    return build(source_copy.parents[1])
-
-
 def build(workspace: Path, *options: str) -> Path:
     command = [str(COLCON), "build", "--base-paths", "src", "--event-handlers", "console_direct+"]
     built = subprocess.run(
@@ -53,6 +47,12 @@ def build(workspace: Path, *options: str) -> Path:
     )
     assert built.returncode == 0, built.stdout
     return workspace / "install"
+
+
+@pytest.fixture(scope="module")
+def install(source_copy: Path) -> Path:
+    """The install folder of a workspace with a copy of the source."""
+    return build(source_copy.parents[1])
 
 
 def sourced(install: Path, *command: object) -> list[str]:
@@ -74,29 +74,7 @@ def test_colcon_puts_everything_where_ros_looks_for_it(install: Path) -> None:
         assert {path.name: path.read_bytes() for path in (share / folder).iterdir()} == shipped
 
 
-def output(install: Path, *command: object) -> list[str]:
-    """Return the words that a command prints in the workspace's environment."""
-    # In the workspace: from the repository's folder Python would import the source.
-    words = subprocess.run(
-        sourced(install, *command), cwd=install, capture_output=True, text=True, check=True
-    )
-    return words.stdout.split()
-
-
-def test_tests_that_colcon_runs_find_the_executables(install: Path, tmp_path: Path) -> None:
-    # A Python into which pip has not installed the package, as that of ROS is.
-    subprocess.run([sys.executable, "-m", "venv", "--without-pip", tmp_path], check=True)
-    paths = os.pathsep.join([str(ROOT / "experiments"), sysconfig.get_path("purelib")])
-    look = "import processes; print(processes.executable('planner_node'))"
-    python = tmp_path / "bin" / "python"
-    (found,) = output(install, "env", f"PYTHONPATH={paths}", python, "-c", look)
-    expected = install / "ddqn_planner" / "lib" / "ddqn_planner" / "planner_node"
-    assert Path(found) == expected
-
-
-def test_linked_workspace_finds_maps_and_models(
-    source_copy: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_linked_workspace(source_copy: Path, tmp_path: Path, monkeypatch: Any) -> None:
     (tmp_path / "src").symlink_to(source_copy.parent)
     install = build(tmp_path, "--symlink-install")
     look = (
@@ -104,10 +82,11 @@ def test_linked_workspace_finds_maps_and_models(
         "print(find_map('dilemma').resolve(), find_model('any_map').resolve())"
     )
     monkeypatch.delenv("PYTHONPATH", raising=False)  # else the tests' own source may come first
-    found = output(install, sys.executable, "-c", look)
-    names = ("maps/dilemma.yaml", "models/any_map.safetensors")
-    shipped = [str(source_copy / name) for name in names]
-    assert found == shipped
+    shipped = [source_copy / "maps/dilemma.yaml", source_copy / "models/any_map.safetensors"]
+    # In the workspace: from the repository's folder Python would import the source.
+    command = sourced(install, sys.executable, "-c", look)
+    found = subprocess.run(command, cwd=install, capture_output=True, text=True, check=True)
+    assert found.stdout.split() == [*map(str, shipped)]
 
 
 def take_compiled(source: Path, package: Path) -> None:
@@ -156,12 +135,9 @@ def test_nodes_of_the_workspace_plan_with_its_model_on_its_map(
         client.publish("goal_pose", pose(grid, paper.goal))
         plan = plans.wait(lambda message: message.poses)
 
-    cells = cells_of(grid, plan)
-    assert (cells[0], cells[-1]) == (paper.start, paper.goal)
     # The optimum of the default model's rule, which does not cut corners.
-    assert path_length(cells) == pytest.approx(14 + 8 * 2**0.5)
+    assert path_length(cells_of(grid, plan)) == pytest.approx(14 + 8 * 2**0.5)
     assert (map_server.returncode, planner.returncode) == (0, 0)
-
     model = package / "models" / "any_map.safetensors"
     assert values_of(diagnosis)["model file"] == str(model)
     assert f"serving {package / 'maps' / 'dilemma.yaml'}" in capfd.readouterr().err

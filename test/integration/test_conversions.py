@@ -36,8 +36,7 @@ def map_message(yaw: float = 0.3) -> OccupancyGrid:
     return occupancy_message(values, 0.5, (-1.0, 2.0, yaw), Header(frame_id="map"))
 
 
-@pytest.mark.parametrize("yaw", [0.0, 1.0, -1.0, 3.0, -3.0, math.pi])
-@pytest.mark.parametrize("sign", [1, -1])
+@pytest.mark.parametrize(("yaw", "sign"), [(0.0, 1), (1.0, -1), (-3.0, 1), (math.pi, -1)])
 def test_a_map_survives_the_way_to_a_message_and_back(yaw: float, sign: int) -> None:
     message = map_message(yaw)
     assert (message.info.width, message.info.height) == (3, 2)
@@ -60,44 +59,35 @@ def test_a_map_survives_the_way_to_a_message_and_back(yaw: float, sign: int) -> 
         ("info.resolution", 0.0, "resolution is 0.0"),
         ("info.resolution", math.nan, "resolution is nan"),
         ("info.resolution", math.inf, "resolution is inf"),
-        ("info.resolution", -0.5, "resolution is -0.5"),
         ("info.width", 0, "0 x 2 cells"),
         ("info.height", 0, "3 x 0 cells"),
         ("info.width", 2**31, "give at most"),
         ("info.width", 4, "data has 6 values; its 4 x 2 cells need 8"),
-        ("data", array.array("b"), "data has 0 values; its 3 x 2 cells need 6"),
         ("info.origin.position.x", math.nan, "position is .x = nan"),
         ("info.origin.position.z", math.inf, "z = inf"),
-        ("info.origin.orientation", Quaternion(w=0.0), "quaternion of norm 0"),
         ("info.origin.orientation", Quaternion(w=1.001), "quaternion of norm 1.001"),
         ("info.origin.orientation", Quaternion(x=math.nan), "quaternion of norm nan"),
         ("info.origin.orientation", Quaternion(x=math.sin(0.1), w=math.cos(0.1)), "rolled or pitc"),
     ],
 )
-def test_malformed_map_is_refused_by_the_name_of_its_value(
-    field: str, value: object, reason: str
-) -> None:
+def test_a_malformed_map_is_refused(field: str, value: object, reason: str) -> None:
     with pytest.raises(ValueError, match=reason):
         grid_from_message(changed(map_message(), field, value))
 
 
-@pytest.mark.parametrize(
-    ("field", "value", "reason"),
-    [
-        ("position.y", -math.inf, "the goal's position is .*y = -inf"),
-        ("orientation.w", 1e200, "the goal's orientation is .*quaternion of norm 1e[+]200"),
-        ("position.x", 1e308, "x = 1e[+]308.* too far"),
-    ],
-)
-def test_a_pose_has_a_cell_also_off_the_map_or_is_refused_by_the_name_of_its_value(
-    field: str, value: float, reason: str
-) -> None:
+def test_a_pose_has_a_cell_also_off_the_map_or_is_refused_by_the_name_of_its_value() -> None:
     grid, stamped = GridMap(np.zeros((2, 2)), 0.5), PoseStamped(header=HEADER)
     at = stamped.pose.position
     for at.x, at.y, cell in ((0.5, 0.99, (1, 1)), (-0.1, 1.0, (-1, 2))):
         assert cell_from_pose("the goal", stamped, grid, "map") == cell
-    with pytest.raises(ValueError, match=reason):
-        cell_from_pose("the goal", changed(stamped, f"pose.{field}", value), grid, "map")
+    for field, value, reason in (
+        ("position.y", -math.inf, "the goal's position is .*y = -inf"),
+        ("orientation.w", 1e200, "the goal's orientation is .*quaternion of norm 1e[+]200"),
+        ("position.x", 1e308, "x = 1e[+]308.* too far"),
+    ):
+        bad = changed(PoseStamped(header=HEADER), f"pose.{field}", value)
+        with pytest.raises(ValueError, match=reason):
+            cell_from_pose("the goal", bad, grid, "map")
 
 
 def test_a_pose_needs_the_frame_of_the_map_if_there_is_one() -> None:
@@ -111,11 +101,8 @@ def test_a_pose_needs_the_frame_of_the_map_if_there_is_one() -> None:
     check_pose("the start", stamped)
 
 
-@pytest.mark.parametrize("yaw", [0.0, 0.7, -2.0])
-@pytest.mark.parametrize("count", [0, 1, 9])
-def test_path_goes_through_cell_centres_looks_ahead_and_ends_as_the_goal(
-    yaw: float, count: int
-) -> None:
+@pytest.mark.parametrize(("yaw", "count"), [(0.0, 0), (-2.0, 1), (0.7, 9)])
+def test_a_path_looks_ahead_and_ends_as_the_goal(yaw: float, count: int) -> None:
     grid = GridMap(np.zeros((9, 9)), 0.5, (-1.0, 2.0, yaw))
     cells = np.cumsum([(4, 4), *MOVES.tolist()], axis=0)[:count].tolist()
     path = path_message(cells, grid, HEADER, quaternion(1.5))
@@ -137,9 +124,7 @@ def test_path_goes_through_cell_centres_looks_ahead_and_ends_as_the_goal(
         ([np.nan, np.nan], [-1, -1]),
     ],
 )
-def test_value_is_rounded_to_percent_of_any_span_and_unknown_where_there_is_none(
-    values: list[float], percent: list[int]
-) -> None:
+def test_values_are_percent_or_unknown(values: list[float], percent: list[int]) -> None:
     # Behind them an occupied cell, and one without a move.
     q = np.tile(np.array([*values, values[0], 9], np.float32), (8, 1, 1))
     legal = np.ones(q.shape, dtype=np.bool_)
@@ -154,7 +139,7 @@ def test_value_is_rounded_to_percent_of_any_span_and_unknown_where_there_is_none
 
 
 def test_a_tolerance_is_a_finite_number_of_metres() -> None:
-    assert [check_tolerance(good) for good in (0.0, 0.7)] == [0.0, 0.7]
+    assert check_tolerance(0.0) == 0.0
     for bad in (-1e-9, math.nan, math.inf):
         with pytest.raises(ValueError, match=f"the tolerance is {bad}; give metres"):
             check_tolerance(bad)
@@ -165,9 +150,7 @@ def test_a_tolerance_is_a_finite_number_of_metres() -> None:
     st.text(st.characters(min_codepoint=1, codec="utf-8"), max_size=12),
     st.floats(-4, 4),
 )
-def test_a_serialized_path_is_the_path_message(
-    cells: list[tuple[int, int]], frame: str, yaw: float
-) -> None:
+def test_serialized_paths(cells: list[tuple[int, int]], frame: str, yaw: float) -> None:
     grid = GridMap(np.zeros((2, 2)), 0.05, (1.5, -20.25, yaw))
     header = Header(frame_id=frame, stamp=Time(sec=5, nanosec=77))
     path = path_message(cells, grid, header, quaternion(0.7))

@@ -16,13 +16,12 @@ import pytest
 from action_msgs.msg import GoalStatus, GoalStatusArray
 from builtin_interfaces.msg import Time
 from client import Client, initial_pose, map_message, pose, values_of, wait_for
-from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import Point, Pose, PoseStamped
 from integration.robot import changed
+from integration.user import User, limited
 from nav_msgs.msg import OccupancyGrid, Odometry, Path
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from std_msgs.msg import Header, String
-from std_srvs.srv import Trigger
 
 from ddqn_planner import Experience, GridMap
 from ddqn_planner.experience.drives import read_drives
@@ -40,48 +39,30 @@ LOWER = [(0.875, 4.625), (3.0, 3.5), (22.0, 3.5), (24.125, 4.625)]
 """Metres: from the start to the goal below the block."""
 
 BEST_EFFORT = QoSProfile(depth=1000, reliability=ReliabilityPolicy.BEST_EFFORT)
-NAMESPACE = "/drives"
-"""Of the trainer and the planner that most tests share."""
+NAMESPACE = "/drives"  # of the trainer and the planner that most tests share
 
 
 def pose_at(x: float, y: float) -> Pose:
     return Pose(position=Point(x=x, y=y), orientation=quaternion(0.0))
 
 
-class Site:
-    """A trainer's user: it says where the robot is, and sees what the trainer says."""
+class Site(User):
+    """The user of a trainer that learns from driving: it says where the robot is."""
 
     def __init__(self, client: Client, folder: FilePath) -> None:
-        self.client, self.folder = client, folder
-        self.now, self.at = time.monotonic(), LOWER[0]
-        self.episodes = client.subscribe(Path, "trainer/episode", QoSProfile(depth=1000))
-        self.saved = client.subscribe(String, "trainer/experience_saved", LATCHED)
+        super().__init__(client, "driving", "trainer/experience_saved")
+        self.folder, self.now, self.at = folder, time.monotonic(), LOWER[0]
         self.slowness = client.subscribe(OccupancyGrid, "trainer/slowness", LATCHED)
-        self.diagnostics = client.subscribe(DiagnosticArray, "/diagnostics")
 
     def begin(self, listeners: int = 1) -> None:
         """Send the map, and wait until the trainer has it and records."""
         self.client.publisher(Odometry, "odom", BEST_EFFORT)
         self.client.wait_for_discovery("trainer")
         self.client.publish("map", map_message(VALUES, GRID), LATCHED, listeners)
-        self.wait_for_state("recording", "^recording$")
-
-    def wait_for_state(self, state: str, message: str) -> None:
-        self.diagnostics.clear()
-
-        def says(status: DiagnosticStatus) -> bool:
-            return values_of(status)["state"] == state and bool(re.search(message, status.message))
-
-        self._wait_until(says)
-
-    def _wait_until(self, says: Callable[[DiagnosticStatus], bool]) -> None:
-        """Wait for diagnostics of this site's trainer: those of all nodes come on one topic."""
-        mine = f"{self.client.node.get_namespace()}/trainer: driving"
-        self.diagnostics.wait(lambda array: array.status[0].name == mine and says(array.status[0]))
+        self.state(state="recording", message="^recording$")
 
     def odometry(self, x: float, y: float) -> Odometry:
-        whole = int(self.now)
-        stamp = Time(sec=whole, nanosec=int(1e9 * (self.now - whole)))
+        stamp = Time(sec=int(self.now), nanosec=int(1e9 * (self.now % 1)))
         message = Odometry(header=Header(stamp=stamp, frame_id="map"))
         message.pose.pose = pose_at(x, y)
         return message
@@ -91,29 +72,21 @@ class Site:
 
     def send_goal(self, x: float, y: float) -> None:
         """Send a goal, and wait until the trainer has it: poses may overtake it."""
-        self.diagnostics.clear()
         goal = PoseStamped(header=Header(frame_id="map"), pose=pose_at(x, y))
         self.client.publish("goal_pose", goal)
-        self.wait_for_place("goal", (x, y))
-
-    def wait_for_place(self, which: str, place: tuple[float, float]) -> None:
-        text = f"({place[0]:.6g}, {place[1]:.6g})"
-        self._wait_until(lambda status: values_of(status)[which] == text)
+        self.state(goal=re.escape(f"({x:.6g}, {y:.6g})"))
 
     def move(self, points: list[tuple[float, float]], speed: float) -> None:
         """Drive along a line in steps of 0.1 m."""
-        self.diagnostics.clear()
         self.send(self.odometry(*self.at))
-        for x, y in points:
-            distance = math.dist(self.at, (x, y))
+        for point in points:
+            distance = math.dist(self.at, point)
             steps = max(round(distance / 0.1), 1)
-            for share in np.linspace(0, 1, steps + 1)[1:].tolist():
+            for there in np.linspace(self.at, point, steps + 1)[1:].tolist():
                 self.now += distance / steps / speed
-                from_x, from_y = self.at
-                there = from_x + share * (x - from_x), from_y + share * (y - from_y)
                 self.send(self.odometry(*there))
-            self.at = x, y
-        self.wait_for_place("robot", self.at)
+            self.at = point
+        self.state(robot=re.escape("({:.6g}, {:.6g})".format(*self.at)))
 
     def drive(
         self, points: list[tuple[float, float]], speed: float, then: Any = lambda: None
@@ -134,12 +107,6 @@ class Site:
         episode = wait_for("episode", ends)
         self.saved.wait()
         return episode
-
-    def call(self, service: str, succeeds: bool = True) -> str:
-        """Call a service that has to succeed, or not to; return its message."""
-        answer = self.client.call(Trigger, f"trainer/{service}")
-        assert answer.success == succeeds, answer.message
-        return str(answer.message)
 
     def record_in(self, folder: FilePath) -> None:
         self.client.set_parameters("trainer", output_folder=str(folder))
@@ -212,11 +179,10 @@ def test_the_robot_goes_round_what_was_slow_until_it_forgets(planner: Any, site:
     assert (first.x, first.y) == pytest.approx(LOWER[0], abs=0.2)
     assert (last.x, last.y) == pytest.approx(LOWER[-1], abs=0.1)
     (drive,) = read_drives(site.folder / "episodes.csv")
-    assert drive.outcome.value == "arrived"
     assert drive.metres == pytest.approx(23.8, abs=0.5)
     assert drive.seconds[-1] - drive.seconds[0] == pytest.approx(238, abs=10)
 
-    assert FilePath(site.saved.wait().data) == site.folder / "experience.npz"
+    assert site.saved.wait().data == str(site.folder / "experience.npz")
     slowness = site.learned()
     assert slowness[14, 50] > 2
     shown = site.slowness.wait(lambda message: max(message.data) > 0)
@@ -252,7 +218,7 @@ def test_the_robot_goes_round_what_was_slow_until_it_forgets(planner: Any, site:
 
 
 def test_recording_stops_and_continues_unless_the_experience_is_broken(site: Site) -> None:
-    assert "call ~/stop first" in site.call("start", succeeds=False)
+    assert "call ~/stop first" in site.refusal()
     site.move(LOWER[1:2], 0.1)
     assert "stopped after drive 1" in site.call("stop")
     for service in ("save", "forget"):
@@ -260,8 +226,8 @@ def test_recording_stops_and_continues_unless_the_experience_is_broken(site: Sit
     assert "no drives were being recorded" in site.call("stop")
     file = site.folder / "experience.npz"
     file.write_bytes(broken := file.read_bytes()[:-20])
-    assert "experience.npz: cannot be read" in site.call("start", succeeds=False)
-    site.wait_for_state("failed", "experience.npz: cannot be read")
+    assert "experience.npz: cannot be read" in site.refusal()
+    site.state(state="failed", message="experience.npz: cannot be read")
     assert file.read_bytes() == broken
     file.unlink()
     assert "after drive 1" in site.call("start")
@@ -272,19 +238,16 @@ def test_recording_stops_and_continues_unless_the_experience_is_broken(site: Sit
 
 
 def test_who_gives_up_ends_the_drive_and_moves_fail_there(site: Site) -> None:
-    def send(number: int, status: int) -> None:
-        message = GoalStatusArray(status_list=[GoalStatus(status=status)])
-        message.status_list[0].goal_info.goal_id.uuid = [number] * 16
-        site.client.publish(NAVIGATION, message, LATCHED)
-
-    def aborts() -> None:
-        send(1, GoalStatus.STATUS_ABORTED)
-        send(2, GoalStatus.STATUS_ABORTED)
+    def send(*numbers: int) -> None:
+        for number in numbers:
+            message = GoalStatusArray(status_list=[GoalStatus(status=GoalStatus.STATUS_ABORTED)])
+            message.status_list[0].goal_info.goal_id.uuid = [number] * 16
+            site.client.publish(NAVIGATION, message, LATCHED)
 
     site.move(LOWER[:1], 0.5)
-    send(1, GoalStatus.STATUS_ABORTED)  # before: nobody knows where
+    send(1)  # before: nobody knows where
     site.send_goal(*LOWER[3])
-    site.drive(LOWER[1:3], 0.5, then=aborts)
+    site.drive(LOWER[1:3], 0.5, then=lambda: send(1, 2))
     assert site.outcomes == ["aborted"]
     slowness = site.learned()
     assert slowness[14, 87] > slowness[14, 50]
@@ -300,26 +263,23 @@ def test_malformed_odometry_is_refused_and_the_next_is_taken(site: Site, trainer
         trainer.forget_log()
         for _ in range(5):
             site.send(changed(site.odometry(1.0, 1.0), field, value))
-        site.wait_for_state("recording", f"odom refused: .*({reason})")
+        site.state(state="recording", message=f"odom refused: .*({reason})")
         assert trainer.log.count("odom refused") == 1
         site.move(LOWER[1:2], 0.5)
-        site.wait_for_state("recording", "^recording$")
+        site.state(state="recording", message="^recording$")
     site.call("stop")
     assert site.outcomes == ["stopped"]
 
 
 def test_nothing_is_lost_while_the_disk_is_full(site: Site, trainer: Any) -> None:
     site.drive(LOWER[:2], 0.1)
-    process = trainer.process.pid
-    limits = resource.prlimit(process, resource.RLIMIT_FSIZE)
     size = (site.folder / "episodes.csv").stat().st_size + 10
-    resource.prlimit(process, resource.RLIMIT_FSIZE, (size, limits[1]))
-    site.move(LOWER[2:], 0.1)
-    site.send_goal(9.0, 9.0)
-    site.wait_for_state("recording", "cannot save to .*; make room")
-    assert site.outcomes == ["arrived"]
-    site.call("stop", succeeds=False)  # it would lose the drive
-    resource.prlimit(process, resource.RLIMIT_FSIZE, limits)
+    with limited(trainer.process, resource.RLIMIT_FSIZE, size):
+        site.move(LOWER[2:], 0.1)
+        site.send_goal(9.0, 9.0)
+        site.state(state="recording", message="cannot save to .*; make room")
+        assert site.outcomes == ["arrived"]
+        site.call("stop", succeeds=False)  # it would lose the drive
     trainer.wait_for_log("the drives are saved again")
     assert trainer.log.count("make room") == 1
     assert site.outcomes == ["arrived", "new_goal"]

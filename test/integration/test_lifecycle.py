@@ -12,15 +12,13 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 import rclpy
 from client import generated_map, initial_pose, plan_request, wait_for
 from diagnostic_msgs.msg import DiagnosticStatus
 from integration.robot import GOAL, NUMBERS, START, Manager, Robot
-from integration.test_startup import MakeRobot, ask_for_plan
+from integration.test_startup import ask_for_plan
 from integration.test_startup import load_gate as load_gate
-from integration.test_startup import make_robot as make_robot
 from lifecycle_msgs.msg import Transition
 from nav_msgs.srv import GetPlan
 from processes import cpu_seconds
@@ -30,10 +28,21 @@ from ddqn_planner.nodes.planner_node import PlannerNode
 OF_CONFIGURED = {"planner/get_plan", "planner/reload_model", "plan", "map", "goal_pose"}
 
 
-def created(robot: Robot) -> set[str]:
-    """Return which of the topics and services of a configured planner it has."""
-    entities = wait_for("discovery of the planner", lambda: robot.client.entities("planner"))
-    return {name for _, name, _ in entities} & OF_CONFIGURED
+def start(robot: Robot) -> None:
+    """Configure and activate the planner, which works then."""
+    Manager(robot.client).start()
+    robot.set_map(robot.stamped_map())
+    robot.assert_works()
+
+
+def wait_for_created(robot: Robot, expected: set[str]) -> None:
+    """Wait until the planner has these of the topics and services of a configured one."""
+
+    def created() -> bool:
+        entities = robot.client.entities("planner")
+        return bool(entities) and {name for _, name, _ in entities} & OF_CONFIGURED == expected
+
+    wait_for("what a planner in its state has", created)
 
 
 @pytest.fixture(scope="module")
@@ -45,8 +54,8 @@ def managed(run_node: Any, model: Path) -> Iterator[Any]:
 
 
 @pytest.fixture(scope="module")
-def shared_robot(managed: Any, make_client: Any, small_values: np.ndarray, model: Path) -> Robot:
-    return Robot(make_client("/managed"), small_values, model, "/managed/planner")
+def shared_robot(managed: Any, make_robot: Any) -> Robot:
+    return make_robot("/managed")
 
 
 @pytest.fixture
@@ -75,12 +84,12 @@ def test_each_transition_creates_enables_stops_and_frees(robot: Robot, managed: 
         assert robot.plans.messages() == []
 
     for _ in range(2):
-        wait_for("only what is always there", lambda: not created(robot))
+        wait_for_created(robot, set())
         status = robot.wait_for_reason("the node is not active; configure and activate it")
         assert status.level == DiagnosticStatus.WARN
         assert manager.change("configure")
         assert manager.state == "inactive"
-        wait_for("what configure creates", lambda: created(robot) == OF_CONFIGURED)
+        wait_for_created(robot, OF_CONFIGURED)
         robot.set_map(robot.stamped_map())  # a map is taken, requests are not
         robot.send_start(robot.pose(START))
         assert_not_active()
@@ -98,27 +107,24 @@ def test_each_transition_creates_enables_stops_and_frees(robot: Robot, managed: 
         assert_works_without_a_goal()  # it was dropped
         assert manager.change("deactivate")
         assert manager.change("cleanup")
-        robot.clear()
         managed.forget_log()
 
 
 def test_no_request_for_a_transition_ends_the_planner(robot: Robot, managed: Any) -> None:
     manager = Manager(robot.client)
-    manager.start()
-    for label in ("configure", "activate", "cleanup", "no_such", "transition_error", "ü" * 99):
-        assert not manager.change(label)
-    for number in (0, 1, 2, 3, 5, 6, 8, 10, 60, 62, 77, 255):
-        assert not manager.change(number=number)
+    start(robot)
+    labels = "configure", "activate", "cleanup", "no_such", "transition_error", "ü" * 99
+    assert not any(map(manager.change, labels))
+    assert not any(manager.change(number=n) for n in (0, 1, 2, 3, 5, 6, 8, 10, 60, 62, 77, 255))
     managed.wait_for_log("'configure' refused: the node has deactivate, shutdown when active")
     managed.wait_for_log("transition 255 refused")
     assert manager.state == "active"
-    robot.set_map(robot.stamped_map())
     robot.assert_works()
     assert manager.change(number=Transition.TRANSITION_DEACTIVATE)
     assert manager.state == "inactive"
 
 
-def test_the_parameters_of_an_unconfigured_planner_are_checked_and_used(
+def test_an_unconfigured_planner_checks_parameters(
     robot: Robot, managed: Any, tmp_path: Path
 ) -> None:
     client, manager, model = robot.client, Manager(robot.client), tmp_path / "model.safetensors"
@@ -133,26 +139,22 @@ def test_the_parameters_of_an_unconfigured_planner_are_checked_and_used(
         managed.wait_for_log(f"model refused: .*{reason}.*; or set the parameter 'model'")
         status = robot.wait_for_reason(f"model refused: .*{reason}")
         assert status.level == DiagnosticStatus.ERROR
-        wait_for("only what is always there", lambda: not created(robot))
+        wait_for_created(robot, set())
         model.write_text("a model")
     shutil.copy(robot.model, model)
-    manager.start()
+    start(robot)
     robot.wait_for_reason("", {"model file": str(model), "state": "active"})
-    robot.set_map(robot.stamped_map())
-    robot.assert_works()
     assert client.set_parameters("planner", start_source="initialpose")[0].successful
 
 
 def test_the_planner_survives_transitions_among_requests(robot: Robot) -> None:
     manager, node = Manager(robot.client), robot.client.node
     plans = node.create_client(GetPlan, "planner/get_plan")
+    messages = {"map": robot.map_message(), "goal_pose": robot.pose(GOAL)}
+    messages["initialpose"] = initial_pose(robot.pose(START))
     publishers = [
         (node.create_publisher(type(message), topic, 10), message)
-        for topic, message in (
-            ("map", robot.map_message()),
-            ("goal_pose", robot.pose(GOAL)),
-            ("initialpose", initial_pose(robot.pose(START))),
-        )
+        for topic, message in messages.items()
     ]
     request = GetPlan.Request(start=robot.pose(START), goal=robot.pose(GOAL))
     for label in ["configure", "activate", "deactivate", "cleanup"] * 3:
@@ -162,32 +164,23 @@ def test_the_planner_survives_transitions_among_requests(robot: Robot) -> None:
                 publisher.publish(message)
         assert manager.change(label)
     assert manager.state == "unconfigured"
-    manager.start()
-    robot.set_map(robot.stamped_map())
-    robot.assert_works()
+    start(robot)
 
 
-def test_requests_that_wait_are_answered_when_the_planner_is_stopped(
-    run_node: Any, make_robot: MakeRobot, load_gate: Path
-) -> None:
+def test_a_stop_answers_what_waits(run_node: Any, make_robot: Any, load_gate: Path) -> None:
     with run_node("planner_node", {}, namespace="/stopped") as node:
         robot = make_robot("/stopped")
         manager = Manager(robot.client)
         robot.set_map(robot.stamped_map())
-        robot.send_start(robot.pose(START))
-        robot.send_goal(robot.pose(GOAL))
         node.wait_for_log("a model waits")
         plan, answered = ask_for_plan(robot)
         robot.wait_for_reason("the model is being loaded")
         assert manager.change("deactivate")
         assert answered.wait(60)
         assert plan.result().plan.poses == []
-        robot.wait_for_reason("the node is not active", {"status": "NOT_ACTIVE"})
         assert manager.change("cleanup")
         load_gate.touch()
-        manager.start()
-        robot.set_map(robot.stamped_map())
-        robot.assert_works()
+        start(robot)
         assert robot.plans.messages() == []
         assert manager.change("shutdown")
         assert manager.state == "finalized"
@@ -195,9 +188,7 @@ def test_requests_that_wait_are_answered_when_the_planner_is_stopped(
         assert not any(map(manager.change, labels))
 
 
-def test_the_bond_breaks_when_the_planner_is_stopped(
-    run_node: Any, make_robot: MakeRobot, model: Path
-) -> None:
+def test_a_stop_breaks_the_bond(run_node: Any, make_robot: Any, model: Path) -> None:
     pytest.importorskip("bondpy", reason="bondpy is not on PyPI")
     status = pytest.importorskip("bond.msg").Status
     parameters = {"autostart": False, "model": str(model)}
@@ -212,7 +203,7 @@ def test_the_bond_breaks_when_the_planner_is_stopped(
         assert node.log == ""
 
 
-def test_cleanup_frees_map_model_and_fields(make_robot: MakeRobot, model: Path) -> None:
+def test_cleanup_frees_map_model_and_fields(make_robot: Any, model: Path) -> None:
     rclpy.init(args=["--ros-args", "-p", f"model:={model}", "-r", "__ns:=/freed"])
     node = PlannerNode()
     spinning = threading.Thread(target=rclpy.spin, args=[node])
@@ -235,9 +226,7 @@ def test_cleanup_frees_map_model_and_fields(make_robot: MakeRobot, model: Path) 
         node.destroy_node()
 
 
-def test_a_planner_that_is_stopped_while_it_plans_leaves_the_graph_at_once(
-    robot: Robot, managed: Any
-) -> None:
+def test_a_planner_that_plans_leaves_the_graph_at_once(robot: Robot, managed: Any) -> None:
     """The last test, as it ends the planner of the others."""
     Manager(robot.client).start()
     rooms = generated_map("rooms", 500)

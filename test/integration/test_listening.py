@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from builtin_interfaces.msg import Time
 from client import wait_for
 from diagnostic_msgs.msg import DiagnosticStatus
 from geometry_msgs.msg import PoseStamped
-from integration.robot import GOAL, START, Robot, odometry
+from integration.robot import GOAL, START, odometry
 from nav_msgs.msg import OccupancyGrid, Odometry
 from rclpy.qos import QoSProfile, qos_profile_sensor_data
 from rosgraph_msgs.msg import Clock
@@ -19,10 +17,8 @@ from rosgraph_msgs.msg import Clock
 from ddqn_planner.nodes import planner_node
 
 
-def test_odometry_counts_while_it_comes_and_until_the_clock_jumps_back(
-    run_node: Any, make_client: Callable[[str], Any], small_values: np.ndarray, model: Path
-) -> None:
-    robot = Robot(make_client("/listening"), small_values, model, "/listening/planner")
+def test_odometry_counts_while_it_comes(run_node: Any, make_robot: Any, model: Path) -> None:
+    robot = make_robot("/listening")
     client = robot.client
 
     def set_clock(seconds: int) -> None:

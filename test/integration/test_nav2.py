@@ -16,9 +16,7 @@ import rclpy
 from client import map_message, pose, wait_for
 from geometry_msgs.msg import PoseStamped
 from integration.robot import GOAL, NUMBERS, START, Manager, Robot, changed, check_path, points_of
-from integration.test_startup import MakeRobot
 from integration.test_startup import load_gate as load_gate
-from integration.test_startup import make_robot as make_robot
 from nav_msgs.msg import Path as PathMessage
 from rclpy.action.client import ActionClient
 from rclpy.action.server import CancelResponse, GoalResponse
@@ -408,7 +406,7 @@ def test_a_path_is_valid_while_it_is_free(navigator: Navigator) -> None:
 
 
 def test_goals_that_wait_are_canceled_preempted_and_stopped(
-    run_node: Any, make_robot: MakeRobot, load_gate: Path
+    run_node: Any, make_robot: Any, load_gate: Path
 ) -> None:
     pytest.importorskip("nav2_msgs.action", reason=REASON)
     # Plans wait for the planner's model, as they wait for a field.

@@ -7,6 +7,7 @@ import re
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import suppress
+from dataclasses import dataclass
 from importlib import import_module
 from itertools import product
 from pathlib import Path
@@ -14,15 +15,11 @@ from typing import Any
 
 import pytest
 from client import Client, wait_for
+from rcl_interfaces import srv
 from rcl_interfaces.msg import Parameter, ParameterDescriptor, ParameterType, ParameterValue
-from rcl_interfaces.srv import (
-    DescribeParameters,
-    GetParameters,
-    GetParameterTypes,
-    ListParameters,
-    SetParameters,
-    SetParametersAtomically,
-)
+
+from ddqn_planner.nodes import map_server_node
+from ddqn_planner.nodes.driving import NAVIGATION
 
 DOCS = (Path(__file__).resolve().parents[2] / "docs" / "nodes.md").read_text(encoding="utf-8")
 NODES = ["map_server", "planner", "trainer"]
@@ -34,18 +31,20 @@ TYPES = {
     ParameterType.PARAMETER_STRING: "string",
 }
 OF_EVERY_NODE = {"/rosout", "/parameter_events", "use_sim_time", "start_type_description_service"}
-OF_DRIVING = {"~/experience_saved", "~/slowness", "~/forget"}
-OF_DRIVING |= {"odom", "navigate_to_pose/_action/status"}
+OF_DRIVING = {"~/experience_saved", "~/slowness", "~/forget", "odom", NAVIGATION}
 """What the trainer has only where it learns from driving."""
 
 
+@dataclass
 class Running:
     """A node that runs, and its client."""
 
-    def __init__(self, name: str, client: Client, node: Any) -> None:
-        self.name, self.client, self.node = name, client, node
+    name: str
+    client: Client
+    node: Any
 
-    def call(self, service: Any, kind: str, **request: Any) -> Any:
+    def call(self, kind: str, **request: Any) -> Any:
+        service = getattr(srv, kind.title().replace("_", ""))
         return self.client.call(service, f"{self.name}/{kind}", service.Request(**request))
 
     def topics(self) -> set[tuple[str, str, str]]:
@@ -60,9 +59,7 @@ class Running:
 
 
 @pytest.fixture(scope="module", params=NODES)
-def running(
-    request: pytest.FixtureRequest, run_node: Any, make_client: Callable[[str], Client]
-) -> Iterator[Running]:
+def running(request: pytest.FixtureRequest, run_node: Any, make_client: Any) -> Iterator[Running]:
     name, namespace = request.param, f"/described/{request.param}"
     parameters = {"follow_trainer": True} if name == "planner" else {}
     with run_node(f"{name}_node", parameters, namespace=namespace) as node:
@@ -101,14 +98,14 @@ def documented_topics(node: str) -> set[tuple[str, str, str]]:
 def range_of(entry: ParameterDescriptor) -> str:
     parts = [f"{r.from_value:g} to {r.to_value:g}" for r in entry.floating_point_range]
     parts += [f"{r.from_value} to {r.to_value}" for r in entry.integer_range]
-    parts += [entry.additional_constraints] if entry.additional_constraints else []
-    return "; ".join([*parts, *(["read-only"] if entry.read_only else [])])
+    parts += [entry.additional_constraints, "read-only" * entry.read_only]
+    return "; ".join(filter(None, parts))
 
 
 def test_each_parameter_is_documented_as_it_is(running: Running) -> None:
-    names = running.call(ListParameters, "list_parameters").result.names
+    names = running.call("list_parameters").result.names
     names = [name for name in names if name not in OF_EVERY_NODE and "qos_over" not in name]
-    described = running.call(DescribeParameters, "describe_parameters", names=names)
+    described = running.call("describe_parameters", names=names)
     found = {}
     for entry in described.descriptors:
         assert entry.description
@@ -129,7 +126,7 @@ def test_each_topic_and_service_is_documented_as_it_is(
         parameters = {"learn_from": "driving", "output_folder": str(tmp_path / "drives")}
         with run_node("trainer_node", parameters, namespace="/driving") as node:
             driving = Running("trainer", make_client("/driving"), node)
-            driving.call(ListParameters, "list_parameters")
+            driving.call("list_parameters")
             expected = {row for row in documented if row[1] in OF_DRIVING}
             wait_for("topics of driving", lambda: driving.topics() >= expected)
             more = driving.topics()
@@ -140,7 +137,6 @@ def test_each_topic_and_service_is_documented_as_it_is(
 
 
 def test_no_request_for_parameters_ends_a_node(running: Running) -> None:
-    together = SetParametersAtomically, "set_parameters_atomically"
     unknown_type = Parameter(name="use_sim_time", value=ParameterValue(type=77))
     for bad, reason in (
         (unknown_type, "77.*ParameterType"),
@@ -148,21 +144,21 @@ def test_no_request_for_parameters_ends_a_node(running: Running) -> None:
         (Parameter(name="use_sim_time"), "."),
         (Parameter(name="no_such", value=ParameterValue(type=1)), "undeclared"),
     ):
-        (result,) = running.call(SetParameters, "set_parameters", parameters=[bad]).results
-        for refused in (result, running.call(*together, parameters=[bad]).result):
+        (result,) = running.call("set_parameters", parameters=[bad]).results
+        for refused in (result, running.call("set_parameters_atomically", parameters=[bad]).result):
             assert not refused.successful
             assert re.search(reason, refused.reason)
     good = Parameter(name="use_sim_time", value=ParameterValue(type=1))
-    results = running.call(SetParameters, "set_parameters", parameters=[unknown_type, good]).results
+    results = running.call("set_parameters", parameters=[unknown_type, good]).results
     assert [result.successful for result in results] == [False, True]
-    assert running.call(SetParameters, "set_parameters").results == []
-    assert running.call(*together).result.successful
-    running.call(ListParameters, "list_parameters", prefixes=NAMES, depth=2**64 - 1)
-    running.call(DescribeParameters, "describe_parameters", names=NAMES)
-    running.call(GetParameterTypes, "get_parameter_types", names=NAMES)
-    running.call(GetParameters, "get_parameters", names=NAMES)
-    names = running.call(ListParameters, "list_parameters").result.names
-    values = running.call(GetParameters, "get_parameters", names=names).values
+    assert running.call("set_parameters").results == []
+    assert running.call("set_parameters_atomically").result.successful
+    running.call("list_parameters", prefixes=NAMES, depth=2**64 - 1)
+    running.call("describe_parameters", names=NAMES)
+    running.call("get_parameter_types", names=NAMES)
+    running.call("get_parameters", names=NAMES)
+    names = running.call("list_parameters").result.names
+    values = running.call("get_parameters", names=names).values
     assert len(values) == len(names) > 3
     assert "Traceback" not in running.node.log
 
@@ -189,32 +185,20 @@ def test_help_says_of_each_parameter_what_the_docs_say_and_starts_no_node(
     assert dict(printed) == expected
 
 
-SECURITY = {
-    "ROS_SECURITY_ENABLE": "true",
-    "ROS_SECURITY_STRATEGY": "Enforce",
-    "ROS_SECURITY_KEYSTORE": "/no/such/keystore",
-}
+SECURITY = {"ROS_SECURITY_ENABLE": "true", "ROS_SECURITY_STRATEGY": "Enforce"}
+SECURITY |= {"ROS_SECURITY_KEYSTORE": "/no/such/keystore"}
 
 
-@pytest.mark.parametrize(
-    ("arguments", "environment", "reason"),
-    [
+def test_what_ros_cannot_start_with_is_said_and_ends_with_1(log_of_refused_start: Any) -> None:
+    for arguments, environment, reason in (
         (["-p", "model"], {}, "model"),
         (["--params-file", "/no/such.yaml"], {}, "such.yaml"),
         ([], {"ROS_DOMAIN_ID": "abc"}, "ROS_DOMAIN_ID"),
         (["--enclave", "/nobody"], SECURITY, "SECURITY|security|keystore|enclave"),
-    ],
-)
-def test_what_ros_cannot_start_with_is_said_and_ends_with_1(
-    log_of_refused_start: Any,
-    monkeypatch: pytest.MonkeyPatch,
-    arguments: list[str],
-    environment: dict[str, str],
-    reason: str,
-) -> None:
-    for variable, value in environment.items():
-        monkeypatch.setenv(variable, value)
-    main = import_module("ddqn_planner.nodes.map_server_node").main
-    log = log_of_refused_start(main, arguments=arguments)
-    assert re.search(f"cannot start: .*({reason})", log)
-    assert "Traceback" not in log
+    ):
+        with pytest.MonkeyPatch.context() as patch:
+            for variable, value in environment.items():
+                patch.setenv(variable, value)
+            log = log_of_refused_start(map_server_node.main, arguments=arguments)
+        assert re.search(f"cannot start: .*({reason})", log)
+        assert "Traceback" not in log

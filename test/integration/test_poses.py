@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
-import math
+import re
 import sys
+from collections.abc import Callable
+from functools import partial
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -13,39 +16,24 @@ from hypothesis import given
 from hypothesis import strategies as st
 from rclpy.clock_type import ClockType
 from rclpy.time import Time
+from scipy.spatial.transform import Rotation
 from std_msgs.msg import Header
 
 from ddqn_planner.nodes.poses import Frames, StartSource, transformed
 from ddqn_planner.nodes.report import Refusals, RequestError
 
 
-def matrix(q: Quaternion) -> np.ndarray:
-    """Return the rotation matrix of a quaternion, by the textbook's formula."""
-    x, y, z, w = q.x, q.y, q.z, q.w
-    return np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
-            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
-            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
-        ]
-    )
+def unit_quaternion(values: list[float]) -> Quaternion:
+    x, y, z, w = (np.array(values) / np.linalg.norm(values)).tolist()
+    return Quaternion(x=x, y=y, z=z, w=w)
 
 
-def unit_quaternion(values: tuple[float, ...]) -> Quaternion:
-    x, y, z, w = np.array(values) / np.linalg.norm(values)
-    return Quaternion(x=float(x), y=float(y), z=float(z), w=float(w))
+POINTS = st.tuples(*3 * [st.floats(-100, 100)])
+NUMBERS = st.lists(st.floats(-1, 1), min_size=4, max_size=4)
+QUATERNIONS = NUMBERS.filter(lambda values: np.linalg.norm(values) > 0.1).map(unit_quaternion)
 
 
-METRES = st.floats(-100, 100)
-POINTS = st.tuples(METRES, METRES, METRES)
-QUATERNIONS = (
-    st.tuples(*4 * [st.floats(-1, 1)])
-    .filter(lambda values: np.linalg.norm(values) > 0.1)
-    .map(unit_quaternion)
-)
-
-
-def stamped_pose(point: tuple[float, float, float], rotation: Quaternion) -> PoseStamped:
+def stamped_pose(point: tuple[float, ...], rotation: Quaternion) -> PoseStamped:
     stamped = PoseStamped(header=Header(frame_id="odom"))
     position = stamped.pose.position
     position.x, position.y, position.z = point
@@ -53,7 +41,7 @@ def stamped_pose(point: tuple[float, float, float], rotation: Quaternion) -> Pos
     return stamped
 
 
-def transform(shift: tuple[float, float, float], rotation: Quaternion) -> TransformStamped:
+def transform(shift: tuple[float, ...], rotation: Quaternion) -> TransformStamped:
     message = TransformStamped(header=Header(frame_id="map"), child_frame_id="odom")
     translation = message.transform.translation
     translation.x, translation.y, translation.z = shift
@@ -63,23 +51,19 @@ def transform(shift: tuple[float, float, float], rotation: Quaternion) -> Transf
 
 @given(POINTS, QUATERNIONS, POINTS, QUATERNIONS)
 def test_a_pose_is_turned_and_moved_in_space_and_projected_to_the_plane(
-    point: tuple[float, float, float],
-    facing: Quaternion,
-    shift: tuple[float, float, float],
-    turn: Quaternion,
+    point: tuple[float, ...], facing: Quaternion, shift: tuple[float, ...], turn: Quaternion
 ) -> None:
     found = transformed(stamped_pose(point, facing), transform(shift, turn))
-    x, y, _ = matrix(turn) @ point + shift
     position, rotation = found.pose.position, found.pose.orientation
-    assert (position.x, position.y) == pytest.approx((x, y), abs=1e-9)
+    in_map = Rotation.from_quat([turn.x, turn.y, turn.z, turn.w])
+    expected = (in_map.apply(point) + shift)[:2]
+    assert (position.x, position.y) == pytest.approx(tuple(expected), abs=1e-9)
     assert (position.z, rotation.x, rotation.y) == (0, 0, 0)
     assert found.header.frame_id == "map"
-    ahead = (matrix(turn) @ matrix(facing) @ (1, 0, 0))[:2]
-    if math.hypot(*ahead) > 1e-3:  # else it looks up or down
-        yaw = 2 * math.atan2(rotation.z, rotation.w)
-        assert (math.cos(yaw), math.sin(yaw)) == pytest.approx(
-            tuple(ahead / math.hypot(*ahead)), abs=1e-6
-        )
+    looks = in_map * Rotation.from_quat([facing.x, facing.y, facing.z, facing.w])
+    ahead = complex(*looks.apply((1, 0, 0))[:2])
+    if abs(ahead) > 1e-3:  # else it looks up or down
+        assert complex(rotation.w, rotation.z) ** 2 == pytest.approx(ahead / abs(ahead), abs=1e-6)
 
 
 class Buffer:
@@ -102,8 +86,7 @@ class Buffer:
         return found
 
 
-NOW = 111
-"""Seconds of the node's clock."""
+NOW = 111  # seconds of the node's clock
 
 
 class Node:
@@ -117,15 +100,19 @@ class Node:
         return SimpleNamespace(now=lambda: Time(seconds=NOW, clock_type=ClockType.ROS_TIME))
 
 
-def listening(monkeypatch: pytest.MonkeyPatch, *seconds: int, tolerance: float = 20.0) -> Frames:
-    """Return frames that know the transforms of some seconds."""
-    listener = SimpleNamespace(unregister=lambda: None)
-    fields = {"TransformListener": lambda *_: listener, "TransformException": KeyError}
-    tf2_ros = SimpleNamespace(Buffer=lambda: Buffer(*seconds), **fields)
-    frames = Frames(Node(), lambda: tolerance)
-    frames.available = True
-    monkeypatch.setitem(sys.modules, "tf2_ros", tf2_ros)
-    return frames
+@pytest.fixture
+def listening(monkeypatch: pytest.MonkeyPatch) -> Callable[..., Frames]:
+    """Return what makes frames that know the transforms of some seconds."""
+
+    def make(*seconds: int, tolerance: float = 20.0) -> Frames:
+        listener = SimpleNamespace(unregister=lambda: None)
+        fields = {"TransformListener": lambda *_: listener, "TransformException": KeyError}
+        fields["__spec__"] = object  # it is installed
+        tf2_ros = SimpleNamespace(Buffer=lambda: Buffer(*seconds), **fields)
+        monkeypatch.setitem(sys.modules, "tf2_ros", tf2_ros)
+        return Frames(Node(), lambda: tolerance)
+
+    return make
 
 
 def pose_at(seconds: float, frame: str = "odom") -> PoseStamped:
@@ -134,62 +121,57 @@ def pose_at(seconds: float, frame: str = "odom") -> PoseStamped:
     return stamped
 
 
-@pytest.mark.parametrize(
-    ("asked", "frame", "known", "found"),
-    [
-        (100, "odom", (100, 110), 100),
-        (105, "odom", (100, 110), 105),
-        (0, "odom", (100, 110), 110),  # a pose without a time
-        (99.5, "odom", (100,), 100),  # from just before the node listened
-        (98.9, "odom", (100, 110), r"the goal's frame is 'odom'.*extrapol.*; publish"),
-        (110.5, "odom", (100, 110), r"the goal's frame is 'odom'.*extrapol.*; publish"),
-        (100, "moon", (100, 110), r"the map's, 'map' .*moon does not exist"),
-    ],
-)
-def test_a_pose_is_transformed_by_the_transform_of_its_time_or_refused(
-    monkeypatch: pytest.MonkeyPatch,
-    asked: float,
-    frame: str,
-    known: tuple[int, ...],
-    found: int | str,
-) -> None:
-    frames, pose = listening(monkeypatch, *known), pose_at(asked, frame)
-    if isinstance(found, int):
-        in_map = frames.to_map("the goal", pose, "map")
+def refusal(status: str, get: Callable[[], object]) -> str:
+    """Return why there is no pose."""
+    with pytest.raises(RequestError) as error:
+        get()
+    assert error.value.status == status
+    return str(error.value)
+
+
+def test_a_pose_is_transformed_by_the_transform_of_its_time_or_refused(listening: Any) -> None:
+    for asked, known, found in (
+        (100, (100, 110), 100),
+        (105, (100, 110), 105),
+        (0, (100, 110), 110),  # a pose without a time
+        (99.5, (100,), 100),  # from just before the node listened
+    ):
+        in_map = listening(*known).to_map("the goal", pose_at(asked), "map")
         assert in_map.header.stamp.sec == found
         assert in_map.pose.position.x == 3.0
-    else:
-        with pytest.raises(RequestError, match=found) as error:
-            frames.to_map("the goal", pose, "map")
-        assert error.value.status == "TF_ERROR"
+    frames = listening(100, 110)
+    for pose, reason in (
+        (pose_at(98.9), r"the goal's frame is 'odom'.*extrapol.*; publish"),
+        (pose_at(110.5), r"the goal's frame is 'odom'.*extrapol.*; publish"),
+        (pose_at(100, "moon"), r"the map's, 'map' .*moon does not exist"),
+    ):
+        assert re.search(
+            reason, refusal("TF_ERROR", partial(frames.to_map, "the goal", pose, "map"))
+        )
 
 
-@pytest.mark.parametrize(
-    ("stamp", "words"),
-    [(NOW - 6, "6 s old"), (NOW + 6, "6 s in the future"), (NOW - 2, ""), (NOW + 2, ""), (0, "")],
-)
-def test_the_newest_transform_is_not_used_when_its_age_is_beyond_the_tolerance(
-    monkeypatch: pytest.MonkeyPatch, stamp: int, words: str
-) -> None:
-    frames = listening(monkeypatch, stamp, tolerance=5.0)
-    start = StartSource(Node(), frames, Refusals(None), lambda: "map", lambda: None)
-    if not words:
-        assert start.pose().pose.position.x == 1.0
-        assert frames.to_map("the goal", pose_at(0), "map").header.stamp.sec == stamp
-        return
-    expected = rf"'odom' to 'map' \(the newest is {words}, more than transform_tolerance, 5 s\)"
-    with pytest.raises(RequestError, match=expected) as error:
-        start.pose()
-    assert error.value.status == "NO_START"
-    with pytest.raises(RequestError, match=f"the newest is {words}") as error:
-        frames.to_map("the goal", pose_at(0), "map")
-    assert error.value.status == "TF_ERROR"
+def test_a_newest_transform_beyond_the_tolerance_is_not_used(listening: Any) -> None:
+    for stamp, words in (
+        (NOW - 6, "6 s old"),
+        (NOW + 6, "6 s in the future"),
+        (NOW - 2, ""),
+        (NOW + 2, ""),
+        (0, ""),
+    ):
+        frames = listening(stamp, tolerance=5.0)
+        start = StartSource(Node(), frames, Refusals(None), lambda: "map", lambda: None)
+        goal_in_map = partial(frames.to_map, "the goal", pose_at(0), "map")
+        if words:
+            why = f"(the newest is {words}, more than transform_tolerance, 5 s)"
+            assert f"'odom' to 'map' {why}" in refusal("NO_START", start.pose)
+            assert why in refusal("TF_ERROR", goal_in_map)
+        else:
+            assert start.pose().pose.position.x == 1.0
+            assert goal_in_map().header.stamp.sec == stamp
 
 
-def test_transforms_from_before_the_clock_jumped_back_are_forgotten(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    frames = listening(monkeypatch, 100)
+def test_transforms_from_before_the_clock_jumped_back_are_forgotten(listening: Any) -> None:
+    frames = listening(100)
     assert not frames.may_come
     assert frames.origin_of("odom", "map").pose.position.x == 1.0
     forgets = frames._node.after_jump_back
@@ -202,10 +184,8 @@ def test_transforms_from_before_the_clock_jumped_back_are_forgotten(
     assert not forgets
 
 
-def test_other_frames_are_refused_without_tf_and_the_remedy_names_it(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    stamped, frames = pose_at(1), listening(monkeypatch)
+def test_other_frames_are_refused_without_tf_and_the_remedy_names_it(listening: Any) -> None:
+    stamped, frames = pose_at(1), listening()
     frames.check("the goal", stamped, "map")
     with pytest.raises(ValueError, match=r"frame is ''; name one in header\.frame_id$"):
         frames.check("the goal", PoseStamped(), "map")

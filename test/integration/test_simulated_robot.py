@@ -57,9 +57,7 @@ def test_a_robot_stands_rather_than_to_follow_a_path_beyond_a_wall() -> None:
         assert robot.is_driving is is_followed
 
 
-def test_a_robot_that_has_no_path_sends_its_goal_again(
-    make_client: Callable[[str], Client],
-) -> None:
+def test_a_robot_without_a_path_asks_again(make_client: Callable[[str], Client]) -> None:
     client = make_client("/stranded")
     goals = client.subscribe(PoseStamped, "goal_pose")
     odometry = client.subscribe(Odometry, "odom", keep=1)

@@ -4,11 +4,9 @@ from __future__ import annotations
 
 import os
 import threading
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 from diagnostic_msgs.msg import DiagnosticStatus
 from integration.robot import GOAL, START, TIMEOUT, Robot, values_of
@@ -43,7 +41,9 @@ def load_gate(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def ask_for_plan(robot: Robot) -> tuple[Any, threading.Event]:
-    """Return the future of a plan from START to GOAL, and the event that it is there."""
+    """Set an active goal; return the future of another plan, and the event that it is there."""
+    robot.send_start(robot.pose(START))
+    robot.send_goal(robot.pose(GOAL))
     plans = robot.client.service(GetPlan, "planner/get_plan")
     answered = threading.Event()
     plan = plans.call_async(GetPlan.Request(start=robot.pose(START), goal=robot.pose(GOAL)))
@@ -51,29 +51,12 @@ def ask_for_plan(robot: Robot) -> tuple[Any, threading.Event]:
     return plan, answered
 
 
-MakeRobot = Callable[[str], Robot]
-
-
-@pytest.fixture
-def make_robot(
-    make_client: Callable[[str], Any], small_values: np.ndarray, model: Path
-) -> MakeRobot:
-    """Return what makes the user of a planner in a namespace."""
-
-    def make(namespace: str) -> Robot:
-        return Robot(make_client(namespace), small_values, model, f"{namespace}/planner")
-
-    return make
-
-
 def test_requests_wait_for_the_first_map_and_need_no_torch(
-    run_node: Any, make_robot: MakeRobot, load_gate: Path, model: Path
+    run_node: Any, make_robot: Any, load_gate: Path, model: Path
 ) -> None:
     load_gate.touch()
     with run_node("planner_node", {}, namespace="/early") as node:
         robot = make_robot("/early")
-        robot.send_start(robot.pose(START))
-        robot.send_goal(robot.pose(GOAL))
         plan, answered = ask_for_plan(robot)
         node.wait_for_log("planning with the model")
         assert not plan.done()
@@ -90,13 +73,11 @@ def test_requests_wait_for_the_first_map_and_need_no_torch(
 
 @pytest.mark.parametrize("other", [False, True])
 def test_requests_wait_for_the_first_model_and_another_one_that_is_set_meanwhile_stays(
-    run_node: Any, make_robot: MakeRobot, model: Path, load_gate: Path, other: bool
+    run_node: Any, make_robot: Any, model: Path, load_gate: Path, other: bool
 ) -> None:
     with run_node("planner_node", {}, namespace=f"/waiting_{other}") as node:
         robot = make_robot(f"/waiting_{other}")
         robot.set_map(robot.map_message())
-        robot.send_start(robot.pose(START))
-        robot.send_goal(robot.pose(GOAL))
         plan, answered = ask_for_plan(robot)
         status = robot.wait_for_reason("the model is being loaded")
         assert (status.level, values_of(status)["model"]) == (DiagnosticStatus.WARN, "any_map")
@@ -116,7 +97,7 @@ def test_requests_wait_for_the_first_model_and_another_one_that_is_set_meanwhile
 
 
 def test_a_first_model_that_cannot_be_loaded_answers_the_requests_that_waited(
-    run_node: Any, make_robot: MakeRobot, tmp_path: Path, load_gate: Path
+    run_node: Any, make_robot: Any, tmp_path: Path, load_gate: Path
 ) -> None:
     broken = tmp_path / "any_map.safetensors"
     broken.write_text("a model")

@@ -201,8 +201,7 @@ def test_a_move_is_tried_until_it_succeeds_if_it_does_more_often_than_not(name: 
 def test_a_cost_above_the_upper_bound_counts_as_the_bound() -> None:
     grid = GridMap(np.zeros((1, 2)))
     for multiplier, used in ((99.0, 99.0), (1e4, 100.0)):
-        network = answering("any_map", 0.9, multiplier)
-        q = q_values(network, grid, (1, 0))
+        q = q_values(answering("any_map", 0.9, multiplier), grid, (1, 0))
         assert q[0, 0, 0] == pytest.approx(-used / 0.9)
 
 

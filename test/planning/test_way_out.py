@@ -177,3 +177,9 @@ def test_a_path_under_way_is_kept_if_the_way_out_lies_on_it(
     plan = last_step(ANY_MAP.steps(request))
     assert plan.cells == (*begin, *under_way[6:])
     assert (plan.extra_cost is not None) == is_kept
+
+
+def test_a_way_out_does_not_cross_free_cells_from_which_no_path_leads_on() -> None:
+    grid = GridMap(np.array([[0, 1, 0, 1]]), obstacles=np.zeros((1, 4), dtype=bool))
+    assert ANY_MAP.plan(grid, (3, 0), (0, 0)).status is PlanStatus.NO_PATH
+    assert ANY_MAP.plan(grid, (3, 0), (2, 0)).cells == ((3, 0), (2, 0))
