@@ -28,7 +28,6 @@ RECORD, EXPERIENCE = "episodes.csv", "experience.npz"
 LOCK = "driving.lock"  # a folder with this file belongs to a robot's drives
 
 HEADER = b"episode,outcome,start_time,seconds,metres,samples\r\n"
-
 NUMBER = rb"-?\d{1,18}(?:\.\d{1,9})?"
 ROW = re.compile(rb"(\d{1,18}),([a-z_]{1,20}),(%b),%b,%b,((?:%b:%b:%b ?)+)\r\n" % ((NUMBER,) * 6))
 

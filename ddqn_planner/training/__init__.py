@@ -5,7 +5,4 @@ from contextlib import suppress
 with suppress(ImportError):  # the trainer node must start without it, and say that it is missing
     import gymnasium
 
-    gymnasium.register(
-        id="ddqn_planner/Grid-v0",
-        entry_point="ddqn_planner.training.environment:GridEnvironment",
-    )
+    gymnasium.register("ddqn_planner/Grid-v0", "ddqn_planner.training.environment:GridEnvironment")

@@ -33,7 +33,6 @@ ANY_MAP: Final = HyperParameters(
     steps=1_536_000,
 )
 MAPS: Final = 512
-SIDE: Final = 10  # cells
 RULES: Final = (MoveRule.ROBOT_SAFE, MoveRule.CORNER_CUTTING)
 
 
@@ -44,9 +43,9 @@ def random_scenarios(seed: int, maps: int = MAPS) -> list[Scenario]:
     for number in range(maps):
         rule = RULES[number % 2]
         # High fill rates show 3x3 patches that are rare otherwise.
-        occupancy = random.random((SIDE, SIDE)) < random.uniform(0.1, 0.6)
+        occupancy = random.random((10, 10)) < random.uniform(0.1, 0.6)
         # All four are drawn each time: the draws belong to what one seed gives.
-        constant = np.full((SIDE, SIDE), random.integers(100), dtype=np.int8)
+        constant = np.full(occupancy.shape, random.integers(100), dtype=np.int8)
         unknown = unknown_costs(occupancy, 0.3, random)
         costs = (None, random_costs(occupancy, random), constant, unknown)
         grid = GridMap(occupancy, cost=costs[random.integers(len(costs))])

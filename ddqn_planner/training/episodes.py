@@ -12,7 +12,6 @@ from ddqn_planner.files import Appender, write_atomically
 from ddqn_planner.grid import Cell, MoveRule, path_length
 
 HEADER = b"episode,step,scenario,outcome,moves,length,total_reward,average_reward,cells\r\n"
-
 # A complete row: the number of the episode, and its cells.
 ROW = re.compile(rb"(\d{1,18})(?:,[^,]*){7},(\d{1,9}:\d{1,9}(?: \d{1,9}:\d{1,9})*)\r\n")
 

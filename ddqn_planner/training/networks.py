@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import ClassVar, Final, TypeVar, cast
+from typing import Any, ClassVar, Final, cast
 
 import numpy as np
 import torch
@@ -20,8 +20,6 @@ from ddqn_planner.training.environment import GridVectorEnvironment
 # S maps, C = H * W cells (cell y * W + x).
 
 LENGTHS_A: Final = torch.tensor(LENGTHS, dtype=torch.float32)
-
-Module = TypeVar("Module", bound="TrainableNetwork")
 
 
 class TrainableNetwork(nn.Module):
@@ -49,7 +47,7 @@ class TrainableNetwork(nn.Module):
         return self.numpy_class(self.sizes, tensors)
 
     @classmethod
-    def from_numpy(cls: type[Module], network: QNetwork) -> Module:
+    def from_numpy(cls, network: QNetwork) -> Any:
         """Return a module with a copy of the weights of a network for planning."""
         module = cls(**network.sizes)
         tensors = {name: torch.from_numpy(tensor) for name, tensor in network.tensors.items()}

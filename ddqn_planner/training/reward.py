@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -23,13 +21,14 @@ def move_reward(
     y, x = np.mgrid[0 : grid.height, 0 : grid.width]
     dx, dy = MOVES.T[:, :, None, None]
 
-    def change_of_distance(cell: Cell) -> Any:
+    def change_of_distance(cell: Cell) -> NDArray[np.float64]:
         from_x, from_y = x - cell[0], y - cell[1]
-        return np.hypot(from_x + dx, from_y + dy) - np.hypot(from_x, from_y)
+        after = np.hypot(from_x + dx, from_y + dy)
+        change: NDArray[np.float64] = after - np.hypot(from_x, from_y)
+        return change
 
     progress = -change_of_distance(goal)
     detour = change_of_distance(start) - LENGTHS[:, None, None]
-    reward: NDArray[np.float32]
     reward = (parameters.alpha * progress + parameters.beta * detour).astype(np.float32)
     to_goal = neighbours(grid.occupancy.shape) == goal[1] * grid.width + goal[0]
     reward[to_goal.reshape(reward.shape)] = parameters.goal_reward

@@ -15,7 +15,6 @@ from ddqn_planner.training.hyper_parameters import HyperParameters
 from ddqn_planner.training.trainer import CheckpointError, Trainer
 
 SAVE_INTERVAL = 5_000  # environment steps between two checkpoints
-
 # A folder with one of these files belongs to a training.
 MARKS = LOCK, CHECKPOINT = "training.lock", "checkpoint.safetensors"
 
