@@ -9,7 +9,7 @@ import os
 import re
 import reprlib
 import secrets
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import Any
@@ -47,6 +47,12 @@ def write_csv(path: Path, columns: Sequence[str], rows: Iterable[Sequence[object
     text = io.StringIO(newline="")
     csv.writer(text).writerows([columns, *rows])
     write_atomically(path, text.getvalue().encode())
+
+
+def differences(saved: Mapping[str, object], now: Mapping[str, object]) -> str:
+    """Return which values of the same names differ, for an error; empty if none does."""
+    pairs = [(name, value, now[name]) for name, value in saved.items()]
+    return ", ".join(f"{name} {value} (now {new})" for name, value, new in pairs if value != new)
 
 
 class FolderError(ValueError):

@@ -18,12 +18,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ddqn_planner.experience.experience import Experience
-from ddqn_planner.files import Appender, WorkFolder
+from ddqn_planner.files import Appender, WorkFolder, differences
 from ddqn_planner.grid import GridMap
 
 Float64 = NDArray[np.float64]
-Sample = tuple[float, float, float]
-"""Seconds, and x and y in metres in the frame of the map."""
+Sample = tuple[float, float, float]  # seconds, and x and y in metres in the frame of the map
 
 RECORD, EXPERIENCE = "episodes.csv", "experience.npz"
 LOCK = "driving.lock"  # a folder with this file belongs to a robot's drives
@@ -52,8 +51,8 @@ POSES = (
 )
 TF = "/tf"  # what the poses of transforms count as: they come from more than one topic
 
+# Of each frame: its parent, and where it is there, shifted and turned in the complex plane.
 Transforms = dict[str, tuple[str, complex, complex]]
-"""Of each frame: its parent, and where it is there, shifted and turned in the complex plane."""
 
 
 class DriveEnd(str, Enum):
@@ -207,28 +206,21 @@ class DriveFolder(WorkFolder):
         with self.opening() as files:
             self.drives = _cut_incomplete_row(self.record_path)
             if self.experience_path.exists():
-                self._load()
+                saved, now = Experience.load(self.experience_path), self.experience
+                names = "nominal_speed", "robot_width"
+                values = ({name: getattr(one, name) for name in names} for one in (saved, now))
+                if changed := differences(*values):
+                    raise ValueError(
+                        f"{folder} holds experience with {changed}; give those values, another "
+                        f"folder, or learn anew: ddqn-planner learn {folder} --map MAP"
+                    )
+                self.experience = saved
             elif self.drives:  # learn anew
                 for drive in read_drives(self.record_path):
                     drive.teach(self.experience)
             self._record = files.enter_context(closing(Appender(self.record_path)))
             if self.record_path.stat().st_size == 0:
                 self._record.append(HEADER)
-
-    def _load(self) -> None:
-        """Continue with the saved experience; a ValueError if it is another robot's."""
-        saved, now = Experience.load(self.experience_path), self.experience
-        differences = [
-            f"{name} {getattr(saved, name):g} (now {getattr(now, name):g})"
-            for name in ("nominal_speed", "robot_width")
-            if getattr(saved, name) != getattr(now, name)
-        ]
-        if differences:
-            raise ValueError(
-                f"{self.folder} holds experience with {', '.join(differences)}; give those values, "
-                f"another folder, or learn anew: ddqn-planner learn {self.folder} --map MAP"
-            )
-        self.experience = saved
 
     def add(
         self, outcome: DriveEnd, seconds: Float64, positions: Float64, grid: GridMap | None = None

@@ -28,6 +28,7 @@ MOST = 4.0  # weight of visits that a place keeps: a new visit then counts a fif
 
 STEP = 0.02  # slowness is told in steps of this share: fields need no repair for less
 FADING_STEPS = 4  # so often per half-life all evidence fades: few changes of a map come at once
+MOST_AT_ONCE = 2**13  # cells whose slowness is computed at once
 REBASE = 2.0**16  # evidence is spread anew when weights have grown so much against the oldest
 
 SHORTEST = 8  # a drive through fewer places says little about how sure expected times are
@@ -59,16 +60,11 @@ class Evidence:
         self.nominal_speed, self.half_life = nominal_speed, half_life
         self.side, self.reach = robot_width / 2, REACH * robot_width
         self.driven = 0.0
-        self.number: dict[tuple[int, int], int] = {}
+        self.places: dict[tuple[int, int], int] = {}  # the row of each in the table
         self.table = np.zeros((0, len(COLUMNS)))
         self.noise_sums = NOISY_VISITS * NOISE, NOISY_VISITS
         self.errors: list[float] = []  # of the last drives' log times, in standard deviations
         self.spread: Spread | None = None  # over the last map
-
-    @property
-    def places(self) -> int:
-        """How many places there are."""
-        return len(self.number)
 
     @property
     def noise(self) -> float:
@@ -109,9 +105,9 @@ class Evidence:
 
     def _rows(self, position: Float64) -> NDArray[np.int64]:
         """Return the row of each position; new places get one."""
-        before = self.places
+        before = len(self.places)
         keys = map(tuple, np.floor(position / self.side).astype(np.int64).tolist())
-        rows = np.array([self.number.setdefault(key, len(self.number)) for key in keys])
+        rows = np.array([self.places.setdefault(key, len(self.places)) for key in keys])
         visited, first = np.unique(rows, return_index=True)
         first = first[visited >= before]
         fresh = np.zeros((len(first), len(COLUMNS)))
@@ -199,7 +195,7 @@ class Evidence:
         wrong = (table[:, [0, 2]] < 0).any() or (np.abs(table[:, 3:5]) > FARTHEST).any()
         if wrong or (table[:, 5] > driven).any() or total < 0 or visits <= 0:
             raise ValueError("its evidence cannot be true")
-        self.number, self.table, self.driven = number, table, float(driven)
+        self.places, self.table, self.driven = number, table, float(driven)
         self.noise_sums, self.errors = (total, visits), errors.tolist()
 
 
@@ -214,7 +210,7 @@ class Spread:
         self.faded, self.noise = 1.0, NOISE
         # Of weights of visits, of these times log slowness, and of failures.
         self.sums = np.zeros((*shape, 3), dtype=np.float32)
-        self.slowness = np.ones(shape, dtype=np.float32)
+        self.slowness: NDArray[np.float32] = np.ones(shape, dtype=np.float32)
         self.touched = np.zeros(shape, dtype=np.bool_)
         self.table = np.zeros((0, len(COLUMNS)))  # what was spread of `Evidence.table`
 
@@ -237,9 +233,21 @@ class Spread:
             self.driven, self.noise = driven, evidence.noise
             self.faded = evidence.share_left(driven - self.since)
             self.touched |= self.sums[..., 0] > 0
-        if self.touched.any():
-            self.slowness = self.slowness.copy()  # maps have the old one
-            refresh(self.sums, self.touched, self.faded, self.noise, self.slowness)
+        touched, scale = np.flatnonzero(self.touched), np.log(1 + STEP)
+        if not len(touched):
+            return
+        self.slowness = self.slowness.copy()  # maps have the old one
+        for cells in np.array_split(touched, 1 + len(touched) // MOST_AT_ONCE):
+            sums = self.sums.reshape(-1, 3).take(cells, axis=0).T
+            weight, sum_of_log, failures = np.ascontiguousarray(sums, dtype=np.float64) * self.faded
+            # Differences of sums may leave a rest below 0.
+            weight, failures = np.maximum(weight, 0), np.maximum(failures, 0)
+            # Half of the noise is added, as the mean of its exponential is more than 1.
+            mean = (sum_of_log / self.noise + weight / 2) / (weight / self.noise + 1 / PRIOR)
+            tries = (PRIOR_SUCCESSES + weight + failures) / (PRIOR_SUCCESSES + weight)
+            steps = np.rint((np.maximum(mean, 0) + np.log(tries)) / scale)
+            np.put(self.slowness, cells, np.minimum(np.exp(steps * scale), MAX_SLOWNESS))
+        np.put(self.touched, touched, False)
 
     def variance(self, x: Any, y: Any) -> Float64:
         """Return the variance of the log slowness of some cells."""
@@ -296,9 +304,9 @@ def spread_evidence(
     share = np.empty(furthest + 1, np.float32)
     for distance in range(furthest + 1):
         share[distance] = (1 - (distance / (STRAIGHT * reach)) ** 2) ** 3
-    best = np.empty((size, size), np.int64)
+    best = np.empty((size, size), np.int32)
     waits = np.zeros((size, size), np.bool_)
-    queue = np.empty((size * size, 2), np.int64)
+    queue = np.empty((size * size, 2), np.int32)
     for number in range(cells.shape[0]):
         left, bottom = cells[number, 0] - middle, cells[number, 1] - middle
         best[:] = furthest + 1
@@ -306,13 +314,13 @@ def spread_evidence(
         queue[0] = middle
         first, end = 0, 1
         while first != end:
-            x, y = queue[first]
-            first = (first + 1) % len(queue)
+            x, y = queue[first, 0], queue[first, 1]
+            first = first + 1 if first + 1 < len(queue) else 0
             waits[y, x] = False
-            row, column = bottom + y, left + x
+            row, column, way = bottom + y, left + x, best[y, x]
             for dy in range(-1, 2):
                 for dx in range(-1, 2):
-                    length = best[y, x] + (DIAGONAL if dx != 0 and dy != 0 else STRAIGHT)
+                    length = way + (DIAGONAL if dx != 0 and dy != 0 else STRAIGHT)
                     if length >= best[y + dy, x + dx]:
                         continue
                     to_row, to_column = row + dy, column + dx
@@ -325,7 +333,7 @@ def spread_evidence(
                     if not waits[y + dy, x + dx]:
                         waits[y + dy, x + dx] = True
                         queue[end, 0], queue[end, 1] = x + dx, y + dy
-                        end = (end + 1) % len(queue)
+                        end = end + 1 if end + 1 < len(queue) else 0
         for y in range(size):
             for x in range(size):
                 if best[y, x] <= furthest:
@@ -333,29 +341,3 @@ def spread_evidence(
                     for kind in range(3):
                         part = share[best[y, x]] * amounts[number, kind]
                         sums[bottom + y, left + x, kind] += part
-
-
-@compiled
-def refresh(
-    sums: NDArray[np.float32],
-    touched: NDArray[np.bool_],
-    faded: float,
-    noise: float,
-    slowness: NDArray[np.float32],
-) -> None:
-    """Compute the slowness of the touched cells; then none is touched."""
-    scale = np.log(1 + STEP)
-    for y in range(touched.shape[0]):
-        for x in range(touched.shape[1]):
-            if not touched[y, x]:
-                continue
-            touched[y, x] = False
-            weight, sum_of_log, failures = sums[y, x]
-            # Differences of sums may leave a rest below 0.
-            weight = max(weight, np.float32(0)) * faded
-            failures = max(failures, np.float32(0)) * faded
-            # Half of the noise is added, as the mean of its exponential is more than 1.
-            mean = (sum_of_log * faded / noise + weight / 2) / (weight / noise + 1 / PRIOR)
-            tries = (PRIOR_SUCCESSES + weight + failures) / (PRIOR_SUCCESSES + weight)
-            steps = np.rint((max(mean, 0.0) + np.log(tries)) / scale)
-            slowness[y, x] = min(np.exp(steps * scale), MAX_SLOWNESS)

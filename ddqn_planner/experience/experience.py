@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import io
 import math
-import zipfile
 from collections.abc import Iterator, Sequence
 from itertools import pairwise
 from pathlib import Path
@@ -23,7 +22,6 @@ Float64 = NDArray[np.float64]
 
 VERSION = 1
 OPTIONS = ("nominal_speed", "robot_width", "half_life", "max_pause")
-"""Of a file."""
 
 LATEST = 1e12  # seconds of a clock: a pose of a later time is not believed
 CORRECTION = 0.25  # metres by which a localisation may move a pose at once: the drive goes on
@@ -132,7 +130,7 @@ class Experience:
         """Use what older experience of the same robot computed for its map, which forgets it."""
         mine, its = self.evidence, older.evidence
         of_one_robot = all(getattr(self, name) == getattr(older, name) for name in OPTIONS)
-        if of_one_robot and list(mine.number)[: its.places] == list(its.number):
+        if of_one_robot and list(mine.places)[: len(its.places)] == list(its.places):
             mine.spread, its.spread = its.spread, None
 
     def apply(self, grid: GridMap) -> GridMap:
@@ -147,8 +145,7 @@ class Experience:
 
     def slowness(self, grid: GridMap) -> Float32:
         """Return (H, W) float32: expected seconds over those at nominal speed, 1 or more."""
-        slowness: Float32 = self.evidence.over(grid).slowness.copy()
-        return slowness
+        return np.array(self.evidence.over(grid).slowness)
 
     def uncertainty(self, grid: GridMap) -> Float32:
         """Return (H, W) float32: the standard deviation of the log slowness."""
@@ -190,7 +187,7 @@ class Experience:
             content,
             version=VERSION,
             options=[getattr(self, name) for name in OPTIONS],
-            places=np.array(list(evidence.number), dtype=np.int64).reshape(-1, 2),
+            places=np.array(list(evidence.places), dtype=np.int64).reshape(-1, 2),
             evidence=evidence.table,
             driven=evidence.driven,
             noise=evidence.noise_sums,
@@ -209,12 +206,8 @@ class Experience:
         """
         path = as_path(path)
         try:
-            with zipfile.ZipFile(path) as archive:
-                broken = archive.testzip()
-            if broken is not None:
-                raise ValueError(f"{broken} is damaged")
             with np.load(path, allow_pickle=False) as file:
-                arrays = dict(file)
+                arrays = dict(file)  # whose checksums are checked
             if int(arrays["version"]) != VERSION:
                 raise ValueError(f"it has version {arrays['version']}, not {VERSION}")
             options = dict(zip(OPTIONS, arrays["options"].tolist(), strict=True))

@@ -322,7 +322,7 @@ class Driving:
         if self._folder is not None:
             values |= {
                 "drives": str(self._folder.drives),
-                "places": str(self._folder.experience.evidence.places),
+                "places": str(len(self._folder.experience.evidence.places)),
                 "folder": str(self._folder.folder),
             }
         missing = f"{NO_MAP}, or set map_file" if self._node.map is None else ""

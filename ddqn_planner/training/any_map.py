@@ -34,7 +34,6 @@ ANY_MAP: Final = HyperParameters(
 )
 MAPS: Final = 512
 SIDE: Final = 10  # cells
-
 RULES: Final = (MoveRule.ROBOT_SAFE, MoveRule.CORNER_CUTTING)
 
 

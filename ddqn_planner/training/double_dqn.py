@@ -21,8 +21,7 @@ class Transitions(NamedTuple):
     action: NDArray[np.int64]
     reward: NDArray[np.float32]
     next_cell: NDArray[np.int64]
-    discount: NDArray[np.float32]
-    """γ, or 0 where the move terminated the episode; a truncated episode keeps γ."""
+    discount: NDArray[np.float32]  # γ, or 0 where the move terminated the episode
 
 
 class ReplayBuffer:

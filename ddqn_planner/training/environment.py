@@ -27,8 +27,7 @@ class Scenario:
     grid: GridMap
     start: Cell
     goal: Cell
-    move_rule: MoveRule | None = None
-    """By default the rule of its environment."""
+    move_rule: MoveRule | None = None  # by default that of its environment
 
     def __post_init__(self) -> None:
         for name, cell in (("start", self.start), ("goal", self.goal)):

@@ -13,8 +13,8 @@ from ddqn_planner.grid import Cell, MoveRule, path_length
 
 HEADER = b"episode,step,scenario,outcome,moves,length,total_reward,average_reward,cells\r\n"
 
+# A complete row: the number of the episode, and its cells.
 ROW = re.compile(rb"(\d{1,18})(?:,[^,]*){7},(\d{1,9}:\d{1,9}(?: \d{1,9}:\d{1,9})*)\r\n")
-"""A complete row: the number of the episode, and its cells."""
 
 
 class EpisodeEnd(str, Enum):
@@ -29,14 +29,11 @@ class Episode(NamedTuple):
     """An episode that has ended (the paper's round), the first one with number 1."""
 
     number: int
-    step: int
-    """Environment steps of the training when it ended."""
+    step: int  # environment steps of the training when it ended
     scenario: int
     outcome: EpisodeEnd
-    cells: tuple[Cell, ...]
-    """The visited cells in order, with the initial one."""
-    moves: int
-    """Moves made, with an illegal last one."""
+    cells: tuple[Cell, ...]  # in order, with the initial one
+    moves: int  # with an illegal last one
     total_reward: float
 
     @property

@@ -38,5 +38,4 @@ def evaluate(field: QField, grid: GridMap, move_rule: MoveRule) -> Evaluation:
     ratios = length_ratios(field, grid, move_rule)
     solved = ratios[np.isfinite(ratios)]
     mean, worst = (solved.mean(), solved.max()) if len(solved) else (np.nan, np.nan)
-    starts = np.count_nonzero(~np.isnan(ratios))
-    return Evaluation(int(starts), len(solved), float(mean), float(worst))
+    return Evaluation(int((~np.isnan(ratios)).sum()), len(solved), float(mean), float(worst))

@@ -27,8 +27,7 @@ Module = TypeVar("Module", bound="TrainableNetwork")
 class TrainableNetwork(nn.Module):
     """A Q-network that torch can train: from states (B, ...) to Q(s, a), (B, 8)."""
 
-    numpy_class: ClassVar[type[QNetwork]]
-    """The same network for planning, whose `size_names` a module takes as arguments."""
+    numpy_class: ClassVar[type[QNetwork]]  # for planning; its `size_names` are the arguments
     environment: GridVectorEnvironment
 
     def __init__(self, **sizes: int) -> None:
@@ -167,7 +166,6 @@ class AnyMapModule(PropagationModule):
 MODULES: Final[dict[str, type[TrainableNetwork]]] = {
     module.numpy_class.name: module for module in (PaperModule, PropagationModule, AnyMapModule)
 }
-"""By the hyper-parameter ``network``."""
 
 
 def value_iteration(

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -19,15 +21,15 @@ def move_reward(
     # R_t = α (d_re(t-1) - d_re(t)) + β (d_rs(t) - d_rs(t-1) - d(t, t-1)): d_re is the distance to
     # the end (the goal), d_rs that to the given start, and d(t, t-1) is the length of the move.
     y, x = np.mgrid[0 : grid.height, 0 : grid.width]
+    dx, dy = MOVES.T[:, :, None, None]
 
-    def change_of_distance(cell: Cell) -> NDArray[np.float64]:
-        before = np.hypot(x - cell[0], y - cell[1])
-        after = np.stack([np.hypot(x + dx - cell[0], y + dy - cell[1]) for dx, dy in MOVES])
-        change: NDArray[np.float64] = after - before
-        return change
+    def change_of_distance(cell: Cell) -> Any:
+        from_x, from_y = x - cell[0], y - cell[1]
+        return np.hypot(from_x + dx, from_y + dy) - np.hypot(from_x, from_y)
 
     progress = -change_of_distance(goal)
     detour = change_of_distance(start) - LENGTHS[:, None, None]
+    reward: NDArray[np.float32]
     reward = (parameters.alpha * progress + parameters.beta * detour).astype(np.float32)
     to_goal = neighbours(grid.occupancy.shape) == goal[1] * grid.width + goal[0]
     reward[to_goal.reshape(reward.shape)] = parameters.goal_reward

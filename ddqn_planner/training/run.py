@@ -7,18 +7,17 @@ from contextlib import closing, contextmanager
 from dataclasses import asdict
 from pathlib import Path
 
-from ddqn_planner.files import WorkFolder
+from ddqn_planner.files import WorkFolder, differences
 from ddqn_planner.grid import MoveRule
 from ddqn_planner.training.environment import Scenario
 from ddqn_planner.training.episodes import Episode, open_record, record
 from ddqn_planner.training.hyper_parameters import HyperParameters
 from ddqn_planner.training.trainer import CheckpointError, Trainer
 
-SAVE_INTERVAL = 5_000
-"""Environment steps between two checkpoints."""
+SAVE_INTERVAL = 5_000  # environment steps between two checkpoints
 
+# A folder with one of these files belongs to a training.
 MARKS = LOCK, CHECKPOINT = "training.lock", "checkpoint.safetensors"
-"""A folder with one of these files belongs to a training."""
 
 
 class TrainingRun(WorkFolder):
@@ -39,34 +38,24 @@ class TrainingRun(WorkFolder):
         with self.opening() as files:
             with _memory_with_remedy():
                 if self.checkpoint_path.exists():
-                    self.trainer = Trainer.load_checkpoint(self.checkpoint_path, scenarios)
-                    self._check_same(
-                        {**asdict(parameters), "seed": seed, "move_rule": move_rule.value}
+                    self.trainer = trainer = Trainer.load_checkpoint(
+                        self.checkpoint_path, scenarios
                     )
-                    self.trainer.parameters = parameters
+                    now = {**asdict(parameters), "seed": seed, "move_rule": move_rule.value}
+                    saved = {**asdict(trainer.parameters), "steps": parameters.steps}
+                    saved |= {"seed": trainer.seed, "move_rule": trainer.move_rule.value}
+                    if changed := differences(saved, now):
+                        raise CheckpointError(
+                            f"{self.folder} holds a training with {changed}; give those values to "
+                            "continue it, or another folder"
+                        )
+                    trainer.parameters = parameters
                 else:
                     self.trainer = Trainer(scenarios, move_rule, parameters, seed)
             self._record = open_record(self.folder / "episodes.csv", self.trainer.episodes)
             files.enter_context(closing(self._record))
-        self.saved_at = self.trainer.steps
-        self.description = (
-            f"training in {self.folder} from step {self.saved_at} to {parameters.steps}"
-        )
-
-    def _check_same(self, now: dict[str, object]) -> None:
-        """Compare the checkpoint's training with one of now, which may have other `steps`."""
-        rule, seed = self.trainer.move_rule.value, self.trainer.seed
-        saved = {**asdict(self.trainer.parameters), "seed": seed, "move_rule": rule}
-        differences = [
-            f"{name} {value} (now {now[name]})"
-            for name, value in saved.items()
-            if value != now[name] and name != "steps"
-        ]
-        if differences:
-            raise CheckpointError(
-                f"{self.folder} holds a training with {', '.join(differences)}; give those values "
-                "to continue it, or another folder"
-            )
+        first = self.saved_at = self.trainer.steps
+        self.description = f"training in {self.folder} from step {first} to {parameters.steps}"
 
     def steps(self) -> Iterator[list[Episode]]:
         """Train to the end, and save there too; yield after each step the episodes that ended."""

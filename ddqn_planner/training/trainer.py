@@ -27,9 +27,7 @@ from ddqn_planner.training.episodes import Episode, EpisodeEnd
 from ddqn_planner.training.hyper_parameters import HyperParameters
 from ddqn_planner.training.networks import MODULES
 
-CHECKPOINT_KEY = "ddqn_planner_checkpoint"
-DIGEST_KEY = "sha256"
-
+CHECKPOINT_KEY, DIGEST_KEY = "ddqn_planner_checkpoint", "sha256"
 FUSED = tuple(map(int, torch.__version__.split(".")[:2])) >= (2, 4)  # Adam, on the CPU too
 
 
@@ -121,10 +119,8 @@ class Trainer:
         cells = np.concatenate([batch.cell, batch.next_cell])
         state, next_state = self._target.states(np.tile(batch.scenario, 2), cells).chunk(2)
         loss = double_dqn_loss(self.network, self._target, p.target, batch, state, next_state)
-        # Unlike backward(), grad() adds to no old gradient, so there is none to set to zero.
-        gradients = torch.autograd.grad(loss, self._weights)
-        for weight, gradient in zip(self._weights, gradients, strict=True):
-            weight.grad = gradient
+        self._optimiser.zero_grad()
+        torch.autograd.backward(loss)
         self._optimiser.step()
         self.updates += 1
         if self.updates % p.target_interval == 0:

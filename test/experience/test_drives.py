@@ -69,6 +69,9 @@ def test_a_drive_ends_when_the_robot_stands_at_its_goal(robot: Robot) -> None:
     assert positions[0] == pytest.approx([0.1, 2], abs=0.05)
     assert positions[-1] == pytest.approx([5, 2], abs=0.05)
     assert seconds[-1] - seconds[0] == pytest.approx(11.8, abs=0.5)
+    steps, times = np.hypot(*np.diff(positions, axis=0).T), np.diff(seconds)
+    assert ((steps >= 0.05 - 1e-9) | (times >= 0.5 - 1e-9)).all()  # samples are thinned
+    assert times.max() < 0.6
     robot.stand(200)
     assert len(robot.drives) == 1  # who stands drives nowhere
 
@@ -81,17 +84,6 @@ def test_a_wait_on_the_way_belongs_to_the_drive(robot: Robot) -> None:
     robot.stand(3)
     (drive,) = robot.drives
     assert drive[1][-1] - drive[1][0] == pytest.approx(72, abs=1)
-
-
-def test_samples_are_thinned(robot: Robot) -> None:
-    robot.move(2, speed=0.1)
-    robot.stand(30)
-    robot.recorder.end(DriveEnd.STOPPED)
-    _, seconds, positions = robot.drives[0]
-    steps = np.hypot(*np.diff(positions, axis=0).T)
-    times = np.diff(seconds)
-    assert ((steps >= 0.05 - 1e-9) | (times >= 0.5 - 1e-9)).all()
-    assert times.max() < 0.6
 
 
 @pytest.mark.parametrize(("end", "outcome"), [(2.2, "arrived"), (1.0, "new_goal")])
@@ -152,19 +144,11 @@ def test_a_clock_that_jumps_back_ends_the_drive_and_the_next_has_its_times(
         assert positions[-1] == pytest.approx([2, 2], abs=0.1)
 
 
-def test_noise_of_the_pose_is_no_drive(robot: Robot) -> None:
-    random = np.random.default_rng(1)
-    for now in np.arange(200, 400, 0.05):
-        robot.recorder.add(now, *random.normal([0, 2], 0.07))
-    robot.recorder.end(DriveEnd.STOPPED)
-    assert robot.drives == []
-
-
 @pytest.mark.parametrize("wrong", [math.nan, math.inf, 1e300])
 def test_numbers_that_name_no_place_are_refused(robot: Robot, wrong: float) -> None:
-    for numbers in ((wrong, 0.0, 0.0), (0.0, wrong, 0.0), (0.0, 0.0, wrong)):
+    for place in range(3):
         with pytest.raises(ValueError, match="give finite numbers"):
-            robot.recorder.add(*numbers)
+            robot.recorder.add(*np.roll([wrong, 0.0, 0.0], place).tolist())
     robot.move(1)
     robot.recorder.end(DriveEnd.STOPPED)
     assert robot.outcomes == ["stopped"]
@@ -255,13 +239,6 @@ def test_a_row_of_something_else_is_left_out(tmp_path: Path, row: bytes) -> None
     assert numbers(tmp_path) == [1, 4, 5]
 
 
-def test_a_folder_of_something_else_is_refused_and_left_as_it_is(tmp_path: Path) -> None:
-    (tmp_path / "training.lock").touch()
-    with pytest.raises(FolderError, match=r"training.lock.* no drives; give a new or empty"):
-        opened(tmp_path)
-    assert [path.name for path in tmp_path.iterdir()] == ["training.lock"]
-
-
 def test_experience_that_is_broken_or_of_another_robot_is_refused(tmp_path: Path) -> None:
     path = record(tmp_path, 1).experience_path
     with pytest.raises(ValueError, match=r"nominal_speed 0.5 \(now 0.8\); give those values"):
@@ -278,6 +255,9 @@ def test_a_folder_is_locked_and_keeps_forgotten_experience(tmp_path: Path) -> No
     folder = opened(tmp_path)
     with pytest.raises(FolderError, match="another process records in"):
         opened(tmp_path)
+    (tmp_path / "of" / "a_training").mkdir(parents=True)
+    with pytest.raises(FolderError, match=r"a_training.* no drives; give a new or empty"):
+        opened(tmp_path / "of")
     assert folder.forget() is None
     folder.add(DriveEnd.ARRIVED, *SLOW)
     before = slowness(tmp_path)
@@ -321,3 +301,8 @@ def test_a_drive_knows_how_far_it_was_and_counts_no_noise() -> None:
     x = np.minimum(seconds * 0.5, 20)  # and a stand of 20 s
     noisy = np.random.default_rng(1).normal(np.column_stack([x, 0 * x]), 0.05)
     assert Drive(1, DriveEnd.CUT, seconds, noisy).metres == pytest.approx(20, rel=0.02)
+    robot = Robot()
+    for now, at in zip(seconds, noisy[-400:].repeat(3, axis=0), strict=True):
+        robot.recorder.add(now, *at)
+    robot.recorder.end(DriveEnd.STOPPED)
+    assert robot.drives == []

@@ -26,11 +26,11 @@ def test_without_drives_every_place_takes_its_nominal_time() -> None:
         assert experience.expected_time(HALL, [(0, 0)]).seconds == 0
 
 
-@given(st.floats(1.5, 10), st.sampled_from([1.0, 5.0, 10.0, 50.0]))
-def test_a_place_is_as_slow_as_its_drives_at_any_rate_of_samples(
-    slowness: float, rate: float
+@given(st.floats(1.5, 10), st.sampled_from([1, 5, 10, 50]), st.sampled_from([0, 1.75e9]))
+def test_a_place_is_as_slow_as_its_drives_at_any_rate_of_samples_and_time_of_the_clock(
+    slowness: float, rate: float, began: float
 ) -> None:
-    experience = driven(*[straight((2, 5), (12, 5), slowness, rate)] * 4)
+    experience = driven(*[straight((2, 5), (12, 5), slowness, rate, began)] * 4)
     assert at(HALL, experience.slowness(HALL), 7, 5) == pytest.approx(slowness, rel=0.15)
     assert at(HALL, experience.uncertainty(HALL), 7, 5) < 0.2
     assert at(HALL, experience.slowness(HALL), 7, 8) == 1
@@ -56,12 +56,6 @@ def test_waiting_counts_as_time_and_standing_before_a_drive_does_not() -> None:
     slowness = driven((seconds, positions)).slowness(HALL)
     assert at(HALL, slowness, 7, 5) > 2
     assert at(HALL, slowness, 2, 5) == at(HALL, slowness, 10, 5) < 1.06
-
-
-def test_the_clock_of_a_drive_does_not_matter() -> None:
-    experiences = [driven(straight((2, 5), (12, 5), 3, began=began)) for began in (0.0, 1.75e9)]
-    first, later = (experience.slowness(HALL) for experience in experiences)
-    np.testing.assert_allclose(first, later, rtol=0.021)
 
 
 def faulty(fault: str) -> Poses:
@@ -91,19 +85,10 @@ def faulty(fault: str) -> Poses:
     return seconds, positions
 
 
-@pytest.mark.parametrize(
-    "fault",
-    [
-        "pause",
-        "pause with samples",
-        "teleport",
-        "clock ahead",
-        "clock back",
-        "clock stands",
-        "odometry reset",
-        "not finite",
-    ],
-)
+FAULTS = "pause", "pause with samples", "teleport", "odometry reset", "not finite"
+
+
+@pytest.mark.parametrize("fault", [*FAULTS, "clock ahead", "clock back", "clock stands"])
 def test_what_cannot_be_true_is_not_believed(fault: str) -> None:
     experience = driven(faulty(fault))
     slowness = experience.slowness(HALL)
@@ -151,13 +136,10 @@ def test_the_cost_of_a_plan_is_its_expected_time_and_no_path_is_faster(seed: int
 def test_a_wrong_option_is_named(name: str, value: float) -> None:
     with pytest.raises(ValueError, match=name):
         Experience(**{"nominal_speed": SPEED, name: value})
-
-
-def test_a_wrong_shape_is_refused() -> None:
+    with pytest.raises(ValueError, match="position"):
+        Experience(SPEED).record_failure((value or math.nan, math.inf))
     with pytest.raises(ValueError, match=r"\(3,\).*\(2, 2\)"):
         Experience(SPEED).record(np.zeros(3), np.zeros((2, 2)))
-    with pytest.raises(ValueError, match="position"):
-        Experience(SPEED).record_failure((math.nan, 0))
 
 
 # Files
@@ -204,7 +186,7 @@ def test_every_broken_file_is_named(path: Path) -> None:
             Experience.load(path)
         except ExperienceFileError as error:
             assert str(path) in str(error)  # noqa: PT017 - some bytes mean nothing
-    path.write_bytes(b"")
+    path.write_bytes(pickle.dumps(1.0))
     for wrong in (path, path.parent, path.with_name("none.npz")):
         with pytest.raises(ExperienceFileError, match=rf"{wrong.name}.*begin anew"):
             Experience.load(wrong)
@@ -225,22 +207,12 @@ def test_every_broken_file_is_named(path: Path) -> None:
         ("places", np.zeros((39, 2), dtype=np.int64)),
         ("places", np.arange(78.0).reshape(39, 2)),
         ("evidence", np.full((39, 6), 1e9)),
+        ("errors", np.array([print], dtype=object)),  # nothing is unpickled
     ],
 )
 def test_a_wrong_value_is_refused(path: Path, name: str, value: object) -> None:
     with np.load(path) as arrays:
         values = dict(arrays)
-    np.savez(path, **{**values, name: value})
-    with pytest.raises(ExperienceFileError):
-        Experience.load(path)
-
-
-def test_nothing_is_unpickled(path: Path) -> None:
-    with np.load(path) as arrays:
-        values = dict(arrays)
-    np.savez(path, **{**values, "errors": np.array([print], dtype=object)}, allow_pickle=True)
-    with pytest.raises(ExperienceFileError):
-        Experience.load(path)
-    path.write_bytes(pickle.dumps(1.0))
+    np.savez(path, **{**values, name: value}, allow_pickle=True)
     with pytest.raises(ExperienceFileError):
         Experience.load(path)

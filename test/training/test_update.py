@@ -1,4 +1,4 @@
-"""One update of each network, compared with the same written down from the equations."""
+"""The replay buffer, and one update of each network beside the same written down from equations."""
 
 from __future__ import annotations
 
@@ -9,12 +9,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from hypothesis import given
+from hypothesis import strategies as st
 from torch import Tensor, nn
 
 from ddqn_planner.grid import LENGTHS, MOVES, Cell, GridMap, MoveRule
 from ddqn_planner.model import AnyMapQNetwork
 from ddqn_planner.model.move_costs import patches
-from ddqn_planner.training.double_dqn import Transitions
+from ddqn_planner.training.double_dqn import ReplayBuffer, Transitions
 from ddqn_planner.training.environment import Scenario
 from ddqn_planner.training.hyper_parameters import HyperParameters
 from ddqn_planner.training.networks import AnyMapModule, PaperModule
@@ -23,14 +25,27 @@ from ddqn_planner.training.trainer import Trainer
 Q = Callable[[Scenario, Cell], Tensor]
 """Q(s, a) of all actions, (8,), for the robot in a cell of a scenario's map."""
 
-STEPS = 60
+
+@given(st.integers(1, 8), st.lists(st.integers(1, 8), max_size=12))
+def test_the_buffer_holds_the_last_transitions_whole(capacity: int, batches: list[int]) -> None:
+    buffer, added = ReplayBuffer(capacity), 0
+    for count in batches:
+        numbers = np.arange(added, added + min(count, capacity))
+        buffer.add(Transitions(*[numbers] * 6))
+        added += len(numbers)
+    assert len(buffer) == min(added, capacity)
+    if added:
+        sample = buffer.sample(100 * capacity, np.random.default_rng(0))
+        assert set(sample.cell) == set(range(max(0, added - capacity), added))
+        for values in sample:
+            np.testing.assert_array_equal(values, sample.cell)
 
 
 def about_to_update(scenarios: list[Scenario], parameters: HyperParameters) -> Trainer:
     """A trainer that has seen some steps; its two networks differ, it made no update yet."""
     parameters = replace(parameters, learning_starts=10**6, environments=5, max_episode_steps=7)
     trainer = Trainer(scenarios, MoveRule.CORNER_CUTTING, parameters, seed=1)
-    for _ in trainer.run(STEPS):
+    for _ in trainer.run(60):
         pass
     torch.manual_seed(0)
     for weight in trainer._target.parameters():
@@ -48,7 +63,7 @@ def next_batch(trainer: Trainer) -> Transitions:
 def mean_squared_error(
     trainer: Trainer, batch: Transitions, online: Q, selection: Q, evaluation: Q
 ) -> Tensor:
-    """Mean of (y - Q(s, a; online))², y of `double_dqn_target`, and γ = 0 at an end."""
+    """Mean of (y - Q(s, a; online))², y of the target, and γ = 0 at an end."""
     width = trainer.environment.shape[1]
     errors = []
     for number, cell, action, reward, next_cell, discount in zip(*batch, strict=True):
