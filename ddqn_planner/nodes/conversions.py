@@ -170,11 +170,13 @@ def _copy(message: Any) -> Any:
 
 def check_pose(name: str, stamped: PoseStamped, frame: str = "", other_remedy: str = "") -> None:
     """Check a pose, which the ValueError calls by its name, and that it is in the map's frame."""
-    its, known = stamped.header.frame_id, f", the map's is {frame!r}" if frame else ""
-    if not its:
-        raise ValueError(f"{name}'s frame is ''{known}; name one in header.frame_id")
-    if frame and its != frame:
-        remedy = f"transform the pose to that frame (in RViz: set Fixed Frame to it){other_remedy}"
+    its = stamped.header.frame_id
+    if not its or (frame and its != frame):
+        known = f", the map's is {frame!r}" if frame else ""
+        remedy = "name one in header.frame_id"
+        if its:
+            in_rviz = "(in RViz: set Fixed Frame to it)"
+            remedy = f"transform the pose to that frame {in_rviz}{other_remedy}"
         raise ValueError(f"{name}'s frame is {its!r}{known}; {remedy}")
     _check_pose(name, stamped.pose)
 
