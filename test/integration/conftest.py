@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 import importlib.util
-import itertools
 import os
 import re
 import shutil
 import signal
 import subprocess
-import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -41,11 +40,13 @@ HEAVY = {"matplotlib": "matplotlib", "numba": "llvmlite", "scipy": "scipy", "tor
 class NodeProcess:
     """One executable in a process group of its own."""
 
-    def __init__(self, name: str, arguments: list[str], log: Path) -> None:
-        self.log_path = log
-        with log.open("ab") as file:
+    def __init__(self, name: str, arguments: list[str], folder: Path) -> None:
+        self.log_path = folder / "log"
+        path = filter(None, [str(folder), os.environ.get("PYTHONPATH")])
+        with self.log_path.open("ab") as file:
             self.process = subprocess.Popen(
                 [executable(name), *arguments],
+                env={**os.environ, "PYTHONPATH": os.pathsep.join(path)},
                 stdout=file,
                 stderr=subprocess.STDOUT,
                 start_new_session=True,
@@ -72,10 +73,6 @@ class NodeProcess:
             assert time.monotonic() < deadline, f"no {pattern!r} in the log:\n{self.log}"
             time.sleep(0.02)
 
-    def wait_for_end(self) -> int:
-        """Return the exit code of a process that ends by itself."""
-        return self.process.wait(TIMEOUT)
-
     def stop(self, signal_number: int = signal.SIGINT) -> int:
         """Send a signal to the process, and return its exit code."""
         if self.process.poll() is None:
@@ -91,51 +88,30 @@ class NodeProcess:
 RunNode = Callable[..., Any]
 
 
-def parameter_arguments(parameters: dict[str, Any] | None, file: Path) -> list[str]:
-    """Return the ROS arguments that set parameters, which are written to a file."""
-    if not parameters:
-        return []
-    # As a file: on the command line a YAML parser guesses the types of strings.
-    file.write_text(yaml.safe_dump({"/**": {"ros__parameters": parameters}}))
-    return ["--params-file", str(file)]
-
-
-@pytest.fixture
-def log_of_refused_start(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
-) -> Callable[..., str]:
-    """Return a function that sees a node in this process refuse to start, and returns its log."""
-
-    def start(main: Any, parameters: Any = None, arguments: Sequence[str] = ()) -> str:
-        given = parameter_arguments(parameters, tmp_path / "parameters.yaml")
-        monkeypatch.setattr(sys, "argv", ["node", "--ros-args", *given, *arguments])
-        # Signals are pytest's here.
-        monkeypatch.setattr("ddqn_planner.nodes.runtime._at_signals", lambda _: None)
-        assert main() == 1
-        return capfd.readouterr().err
-
-    return start
-
-
 @pytest.fixture(scope="session")
 def run_node(tmp_path_factory: pytest.TempPathFactory) -> RunNode:
     """Return a context manager that runs an executable, stops it by SIGINT and sees it exit."""
-    logs = tmp_path_factory.mktemp("logs")
-    numbers = itertools.count()
 
     @contextmanager
     def run(
         name: str,
         parameters: dict[str, Any] | None = None,
-        remaps: list[str] | None = None,
+        remaps: Sequence[str] = (),
         namespace: str = "",
         exit_code: int = 0,
+        **modules: str,
     ) -> Iterator[NodeProcess]:
-        number = next(numbers)
-        arguments = ["--ros-args", *parameter_arguments(parameters, logs / f"{number}.yaml")]
-        for remap in [*(remaps or []), *([f"__ns:={namespace}"] if namespace else [])]:
+        """The node finds some modules before installed ones: ``sitecustomize`` runs first."""
+        folder = tmp_path_factory.mktemp(name)
+        for module, text in modules.items():
+            (folder / f"{module}.py").write_text(text)
+        # As a file: on the command line a YAML parser guesses the types of strings.
+        file = folder / "parameters.yaml"
+        file.write_text(yaml.safe_dump({"/**": {"ros__parameters": parameters or {}}}))
+        arguments = ["--ros-args", *(["--params-file", str(file)] if parameters else [])]
+        for remap in [*remaps, *([f"__ns:={namespace}"] if namespace else [])]:
             arguments += ["-r", remap]
-        process = NodeProcess(name, arguments, logs / f"{number}.{name}.log")
+        process = NodeProcess(name, arguments, folder)
         try:
             yield process
         finally:
@@ -143,30 +119,6 @@ def run_node(tmp_path_factory: pytest.TempPathFactory) -> RunNode:
         assert ended_with == exit_code, process.log
 
     return run
-
-
-SOON = """
-import rclpy.node
-from ddqn_planner.nodes import driving
-
-driving.RETRY_PERIOD, create_timer = 0.2, rclpy.node.Node.create_timer
-
-def create_fast_timer(node, period, *arguments, **options):
-    return create_timer(node, min(period, 0.1), *arguments, **options)
-
-rclpy.node.Node.create_timer = create_fast_timer
-"""
-"""What a trainer runs first (as its ``sitecustomize``): the tests wait for many diagnostics."""
-
-
-@pytest.fixture(scope="module")
-def fast_timers(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
-    """Let the nodes of the module look and speak ten times a second."""
-    folder = tmp_path_factory.mktemp("soon")
-    (folder / "sitecustomize.py").write_text(SOON)
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("PYTHONPATH", str(folder), prepend=os.pathsep)
-        yield
 
 
 @pytest.fixture(scope="module")
@@ -205,16 +157,62 @@ def planner(run_node: RunNode, model: Path) -> Iterator[Any]:
 
 
 @pytest.fixture(scope="module")
-def make_robot(make_client: Any, small_values: np.ndarray, model: Path) -> Callable[[str], Any]:
-    """Return what makes the user of a planner in a namespace."""
+def make_robot(make_client: Any, small_values: np.ndarray, model: Path) -> Callable[..., Any]:
+    """Return what makes the user of a planner in a namespace, with a map of some values."""
     from integration.robot import Robot
 
-    return lambda space: Robot(make_client(space), small_values, model, f"{space}/planner")
+    def make(space: str, node: Any = None, values: np.ndarray = small_values) -> Any:
+        return Robot(make_client(space), values, model, node)
+
+    return make
+
+
+@pytest.fixture(scope="module")
+def run_robot(run_node: RunNode, make_robot: Any, small_values: np.ndarray) -> Callable[..., Any]:
+    """Return a context manager that runs a planner in a namespace, and gives its user."""
+
+    @contextmanager
+    def run(
+        space: str, parameters: Any = None, values: np.ndarray = small_values, **options: Any
+    ) -> Iterator[Any]:
+        with run_node("planner_node", parameters, namespace=space, **options) as node:
+            yield make_robot(space, node, values)
+
+    return run
+
+
+WAITING = """
+import os, time
+from ddqn_planner.nodes import map_source
+from ddqn_planner.planning import Planner
+
+load, map_source.PATIENCE = Planner.load, {patience}
+
+def wait_and_load(path):
+    while os.path.basename(path) == "any_map.safetensors" and not os.path.exists({gate!r}):
+        print("a model waits", flush=True)
+        time.sleep(0.01)
+    return load(path)
+
+Planner.load = wait_and_load
+"""
+
+
+@pytest.fixture
+def load_gate(tmp_path: Path) -> Path:
+    return tmp_path / "gate"
+
+
+@pytest.fixture
+def run_waiting(run_robot: Any, load_gate: Path) -> Callable[..., Any]:
+    """Return a `run_robot` whose planner waits for `load_gate` before it loads any_map."""
+    waiting = WAITING.format(gate=str(load_gate), patience=TIMEOUT)
+    return partial(run_robot, sitecustomize=waiting)
 
 
 @pytest.fixture(scope="module")
 def running_robot(planner: Any, make_robot: Any) -> Any:
-    return make_robot("/robot")
+    return make_robot("/robot", planner)
 
 
 @pytest.fixture

@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import math
 import re
+import threading
 from collections.abc import Mapping
 from itertools import pairwise
 from pathlib import Path as FilePath
@@ -21,6 +22,7 @@ from geometry_msgs.msg import PoseStamped, Quaternion
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState, GetState
 from nav_msgs.msg import OccupancyGrid, Odometry, Path
+from nav_msgs.srv import GetPlan
 from networks import turning_network
 from rcl_interfaces.srv import GetParameters
 from rclpy.parameter import parameter_value_to_python
@@ -48,12 +50,10 @@ class Robot:
     """A planner node and what its user sees and does."""
 
     def __init__(
-        self, client: Client, values: np.ndarray, model: FilePath, name: str = "/robot/planner"
+        self, client: Client, values: np.ndarray, model: FilePath, node: Any = None
     ) -> None:
-        self.client = client
-        self.name = name
-        self.values = values
-        self.model = model
+        self.client, self.values, self.model, self.node = client, values, model, node
+        self.name = f"{client.node.get_namespace().rstrip('/')}/planner"
         self.plans = client.subscribe(Path, "plan", ALL)
         self.value = client.subscribe(OccupancyGrid, "planner/value", ALL)
         self.diagnostics = client.subscribe(DiagnosticArray, "/diagnostics")
@@ -109,6 +109,11 @@ class Robot:
     def get_plan(self, start: PoseStamped, goal: PoseStamped) -> Path:
         return self.client.get_plan(start, goal)
 
+    def last_plan(self) -> Path:
+        """Return the plan that was published last, which the topic keeps for late subscribers."""
+        self.get_plan(self.pose(START), self.pose(START))  # what came before it is done
+        return self.client.subscribe(Path, "plan", LATCHED).wait()
+
     def wait_for_path(
         self, start: Cell, goal: Cell, grid: GridMap | None = None, yaw: float | None = None
     ) -> Path:
@@ -149,6 +154,10 @@ class Robot:
         check_path(path, self.grid)
         assert points_of(path)[0] == pytest.approx(self.grid.cell_to_world(START))
 
+    def wait_until_received(self) -> None:
+        """Wait until what was sent has come: the answer to a request comes after it."""
+        self.client.get_parameter("planner", "use_sim_time")
+
     def wait_for_map(self, message: OccupancyGrid) -> None:
         """Wait until the planner has a map: its diagnostics name its stamp."""
         wait_for_map(self.diagnostics, message.header.stamp, self.name)
@@ -169,35 +178,40 @@ class Robot:
         # Else an earlier map may have the plan: no topic waits for another.
         self.set_map(message)
         self.send_start(self.pose(start))
+        self.wait_until_received()  # else it may come after the goal, and have a plan of its own
         self.send_goal(self.pose(goal, yaw))
         self.wait_for_path(start, goal, yaw=yaw)
         planned_on = seconds(message.header.stamp)
         self.wait_for_reason("^a path of [^;]*$", {"planned on the map of (s)": planned_on})
         self.clear()
 
+    def transition(self, label: str = "", number: int = 0) -> bool:
+        """Do what a lifecycle manager does; return whether the planner did it."""
+        request = ChangeState.Request(transition=Transition(id=number, label=label))
+        return self.client.call(ChangeState, "planner/change_state", request).success
+
+    def start(self) -> None:
+        assert all(map(self.transition, ("configure", "activate")))
+
+    @property
+    def state(self) -> str:
+        return self.client.call(GetState, "planner/get_state").current_state.label
+
     def clear(self) -> None:
         for recorder in (self.plans, self.value, self.diagnostics):
             recorder.clear()
 
 
-class Manager:
-    """What a lifecycle manager does with the planner."""
-
-    def __init__(self, client: Client) -> None:
-        self.client = client
-
-    def change(self, label: str = "", number: int = 0) -> bool:
-        request = ChangeState.Request(transition=Transition(id=number, label=label))
-        answer: bool = self.client.call(ChangeState, "planner/change_state", request).success
-        return answer
-
-    def start(self) -> None:
-        assert all(map(self.change, ("configure", "activate")))
-
-    @property
-    def state(self) -> str:
-        label: str = self.client.call(GetState, "planner/get_state").current_state.label
-        return label
+def ask_for_plan(robot: Robot) -> tuple[Any, threading.Event]:
+    """Set an active goal; return the future of another plan, and the event that it is there."""
+    robot.send_start(robot.pose(START))
+    robot.send_goal(robot.pose(GOAL))
+    plans = robot.client.service(GetPlan, "planner/get_plan")
+    answered = threading.Event()
+    plan = plans.call_async(GetPlan.Request(start=robot.pose(START), goal=robot.pose(GOAL)))
+    plan.add_done_callback(lambda _: answered.set())
+    robot.wait_until_received()
+    return plan, answered
 
 
 def points_of(path: Path) -> list[tuple[float, float]]:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from pathlib import Path as FilePath
 from typing import Any
 
 import numpy as np
@@ -11,24 +9,23 @@ import pytest
 from client import cell_of, cells_of, map_message
 from geometry_msgs.msg import PoseArray
 from integration.robot import NUMBERS, Robot, check_path, odometry
-from nav_msgs.msg import OccupancyGrid, Odometry, Path
+from nav_msgs.msg import OccupancyGrid, Odometry
 from std_msgs.msg import Header
 
 from ddqn_planner.grid import Cell
 from ddqn_planner.nodes.report import seconds
-from ddqn_planner.nodes.runtime import LATCHED
 
 START, GOAL = (0, 5), (29, 5)
 NEVER, SOON = 3600.0, 0.05
 
 
 @pytest.fixture(scope="module")
-def hall_robot(planner: Any, make_client: Callable[[str], Any], model: FilePath) -> Robot:
+def hall_robot(planner: Any, make_robot: Any) -> Robot:
     """A hall with two ways round a block; the lower one costs a little more."""
     values = np.zeros((11, 30), dtype=np.int8)
     values[3:8, 4:26] = 100
     values[:3, 10:20] = 2
-    return Robot(make_client("/robot"), values, model)
+    return make_robot("/robot", planner, values)
 
 
 @pytest.fixture
@@ -41,17 +38,12 @@ def robot(hall_robot: Robot) -> Robot:
 def set_and_settle(robot: Robot, **values: Any) -> None:
     """Set parameters, and wait until their plans are out; then forget those."""
     robot.change(**values)
-    robot.get_plan(robot.pose(START), robot.pose(START))  # what came before it is done
+    robot.last_plan()
     robot.clear()
 
 
-def last_plan(robot: Robot) -> Path:
-    """Return the plan that was published last, which the topic keeps for late subscribers."""
-    return robot.client.subscribe(Path, "plan", LATCHED).wait()
-
-
 def way(robot: Robot) -> list[Cell]:
-    return cells_of(robot.grid, last_plan(robot))
+    return cells_of(robot.grid, robot.last_plan())
 
 
 def plan_on(robot: Robot, message: OccupancyGrid, reason: str = "^a path of ") -> None:
@@ -77,7 +69,7 @@ def test_the_plan_stays_quiet_while_the_map_changes_elsewhere_or_grows(
 ) -> None:
     set_and_settle(robot, replan_period=period)
     plan_on(robot, robot.stamped_map())
-    first = last_plan(robot)
+    first = robot.last_plan()
     for x in (10, 13, 16):
         plan_on(robot, with_values(robot, (1, x), 100))
     values = np.pad(robot.values, ((4, 0), (6, 2)), constant_values=100)
@@ -85,7 +77,7 @@ def test_the_plan_stays_quiet_while_the_map_changes_elsewhere_or_grows(
     x, y, yaw = robot.grid.origin
     grid = robot.grid_of(values, (x + shift[0], y + shift[1], yaw))
     plan_on(robot, map_message(values, grid, next(NUMBERS)))
-    assert last_plan(robot).header.stamp == first.header.stamp
+    assert robot.last_plan().header.stamp == first.header.stamp
 
 
 def test_a_blocked_path_is_planned_again_at_once_and_no_other_one(robot: Robot) -> None:
@@ -119,21 +111,21 @@ def test_a_shortcut_that_opens_is_taken(robot: Robot) -> None:
 def test_a_path_is_planned_at_once_where_there_was_none(robot: Robot) -> None:
     set_and_settle(robot, replan_period=NEVER)
     plan_on(robot, with_values(robot, (slice(None), 27), 100), "no path leads")
-    empty = last_plan(robot)
+    empty = robot.last_plan()
     assert empty.poses == []
     plan_on(robot, with_values(robot, (slice(None), 28), 100), "no path leads")
-    assert last_plan(robot).header.stamp == empty.header.stamp
+    assert robot.last_plan().header.stamp == empty.header.stamp
     robot.send_map()
     robot.wait_for_path(START, GOAL)
 
 
 def test_the_path_under_way_is_kept_up_to_the_threshold(robot: Robot) -> None:
     plan_on(robot, robot.stamped_map())
-    first = last_plan(robot)
+    first = robot.last_plan()
     other_way_round = robot.values.copy()
     other_way_round[:3, 10:20], other_way_round[8:, 10:20] = 0, 2
     plan_on(robot, robot.stamped_map(other_way_round), r"kept: its cost is \+\d\.\d%")
-    assert last_plan(robot).header.stamp == first.header.stamp
+    assert robot.last_plan().header.stamp == first.header.stamp
     best = robot.get_plan(robot.pose(START), robot.pose(GOAL))
     assert min(y for _, y in cells_of(robot.grid, best)) < 3
     robot.clear()
@@ -162,13 +154,12 @@ def test_the_path_of_a_moving_robot_is_published_only_where_it_leaves_it(robot: 
     robot.client.wait_for_discovery("planner")
     robot.client.publish("odom", odometry(robot, START))
     path = cells_of(robot.grid, robot.wait_for_path(START, GOAL))
-    robot.get_plan(robot.pose(START), robot.pose(START))  # what came before it is done
-    first = last_plan(robot)
+    first = robot.last_plan()
     for index in (1, 4, 10):
         robot.client.publish("odom", odometry(robot, path[index]))
         length = np.hypot(*np.diff(path[index:], axis=0).T).sum()
         robot.wait_for_reason("^a path of ", {"path length (cells)": f"{length:.3f}"})
-        assert last_plan(robot).header.stamp == first.header.stamp
+        assert robot.last_plan().header.stamp == first.header.stamp
     x, y = path[10]
     robot.client.publish("odom", odometry(robot, (x, y - 8)))
     robot.wait_for_path((x, y - 8), GOAL)
@@ -187,7 +178,7 @@ def dock_robot(hall_robot: Robot) -> Robot:
     """An empty hall, of which the top row is a wall."""
     values = np.zeros((11, 31), dtype=np.int8)
     values[10] = 100
-    return Robot(hall_robot.client, values, hall_robot.model)
+    return Robot(hall_robot.client, values, hall_robot.model, hall_robot.node)
 
 
 @pytest.fixture
@@ -207,7 +198,7 @@ def wait_for_dock(docks: Robot, dock: Cell, reason: str, start: Cell = DOCKED) -
     docks.wait_for_reason(f"^a path of .* cells {reason}, by greedy steps")
 
 
-def test_the_path_leads_to_the_nearest_free_dock_of_the_map_of_now(docks: Robot) -> None:
+def test_the_nearest_free_dock_is_taken_and_kept_up_to_the_threshold(docks: Robot) -> None:
     send_goals(docks, WALL, LEFT, OUTSIDE, RIGHT)
     wait_for_dock(docks, LEFT, "to goal 2 of 4")
     taken = docks.values.copy()
@@ -218,18 +209,14 @@ def test_the_path_leads_to_the_nearest_free_dock_of_the_map_of_now(docks: Robot)
     docks.clear()
     docks.send_map(docks.stamped_map())
     wait_for_dock(docks, LEFT, "to goal 2 of 4")
-
-
-def test_a_robot_between_two_docks_keeps_to_one_up_to_the_threshold(docks: Robot) -> None:
+    # Between two docks it keeps to one, up to the threshold.
     docks.set(switch_threshold=0.3)
-    send_goals(docks, LEFT, RIGHT)
-    wait_for_dock(docks, LEFT, "to goal 1 of 2")
     docks.clear()
     docks.send_start(docks.pose((16, 5)))  # 15 cells from the left dock, 13 from the right one
     docks.wait_for_path((16, 5), LEFT, yaw=YAWS[LEFT])
-    docks.wait_for_reason(r"to goal 1 of 2, by greedy steps, kept: its cost is \+15.4%")
+    docks.wait_for_reason(r"to goal 2 of 4, by greedy steps, kept: its cost is \+15.4%")
     docks.set(switch_threshold=0.1)
-    wait_for_dock(docks, RIGHT, "to goal 2 of 2", (16, 5))
+    wait_for_dock(docks, RIGHT, "to goal 4 of 4", (16, 5))
 
 
 def test_goals_none_of_which_can_be_reached_have_an_empty_plan(docks: Robot) -> None:
@@ -254,7 +241,7 @@ def test_goals_none_of_which_can_be_reached_have_an_empty_plan(docks: Robot) -> 
 def test_bad_goals_are_named_and_an_empty_array_leaves_the_goal(docks: Robot) -> None:
     send_goals(docks)
     docks.wait_for_reason("; goal_poses refused: the array has no pose; give one or more")
-    assert cell_of(docks.grid, last_plan(docks).poses[-1]) == RIGHT
+    assert cell_of(docks.grid, docks.last_plan().poses[-1]) == RIGHT
     docks.clear()
     send_goals(docks, LEFT)
     docks.wait_for_reason("^a path of [^;]*$")

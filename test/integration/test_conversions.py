@@ -14,7 +14,7 @@ from nav_msgs.msg import OccupancyGrid, Path
 from rclpy.serialization import deserialize_message, serialize_message
 from std_msgs.msg import Header
 
-from ddqn_planner.grid import MOVES, GridMap
+from ddqn_planner.grid import GridMap
 from ddqn_planner.nodes.conversions import (
     cell_from_pose,
     check_pose,
@@ -101,20 +101,6 @@ def test_a_pose_needs_the_frame_of_the_map_if_there_is_one() -> None:
     check_pose("the start", stamped)
 
 
-@pytest.mark.parametrize(("yaw", "count"), [(0.0, 0), (-2.0, 1), (0.7, 9)])
-def test_a_path_looks_ahead_and_ends_as_the_goal(yaw: float, count: int) -> None:
-    grid = GridMap(np.zeros((9, 9)), 0.5, (-1.0, 2.0, yaw))
-    cells = np.cumsum([(4, 4), *MOVES.tolist()], axis=0)[:count].tolist()
-    path = path_message(cells, grid, HEADER, quaternion(1.5))
-    assert all(each.header is HEADER for each in [path, *path.poses])
-    points = points_of(path)
-    assert points == [grid.cell_to_world(tuple(cell)) for cell in cells]
-    for pose, (x, y), (next_x, next_y) in zip(path.poses, points, points[1:], strict=False):
-        ahead = math.atan2(next_y - y, next_x - x)
-        assert math.cos(yaw_of(pose.pose.orientation) - ahead) == pytest.approx(1.0)
-    assert all(pose.pose.orientation == quaternion(1.5) for pose in path.poses[-1:])
-
-
 @pytest.mark.parametrize(
     ("values", "percent"),
     [
@@ -150,10 +136,21 @@ def test_a_tolerance_is_a_finite_number_of_metres() -> None:
     st.text(st.characters(min_codepoint=1, codec="utf-8"), max_size=12),
     st.floats(-4, 4),
 )
-def test_serialized_paths(cells: list[tuple[int, int]], frame: str, yaw: float) -> None:
+def test_a_path_looks_ahead_and_ends_as_the_goal_and_is_the_same_serialized(
+    cells: list[tuple[int, int]], frame: str, yaw: float
+) -> None:
     grid = GridMap(np.zeros((2, 2)), 0.05, (1.5, -20.25, yaw))
     header = Header(frame_id=frame, stamp=Time(sec=5, nanosec=77))
     path = path_message(cells, grid, header, quaternion(0.7))
+    assert all(each.header is header for each in [path, *path.poses])
+    points = points_of(path)
+    expected = [grid.cell_to_world(cell) for cell in cells]
+    np.testing.assert_allclose(points, expected, atol=1e-9)
+    for pose, here, there in zip(path.poses, points, points[1:], strict=False):
+        ahead = math.atan2(there[1] - here[1], there[0] - here[0])
+        looks = yaw_of(pose.pose.orientation)
+        assert math.cos(looks - ahead) == pytest.approx(1.0) or here == there
+    assert all(pose.pose.orientation == quaternion(0.7) for pose in path.poses[-1:])
     sent = deserialize_message(serialized_path(cells, grid, header, quaternion(0.7)), Path)
     assert [sent.header, *(pose.header for pose in sent.poses)] == [header] * (1 + len(cells))
     for name, axes in (("position", "xyz"), ("orientation", "xyzw")):

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -17,14 +16,12 @@ from nav_msgs.srv import GetMap, LoadMap
 from std_srvs.srv import Trigger
 
 from ddqn_planner import Planner
-from ddqn_planner.grid import MOVES, GridMap, MapFile, read_map_file, save_map
+from ddqn_planner.grid import GridMap, MapFile, read_map_file, save_map
 from ddqn_planner.nodes.runtime import LATCHED
 from ddqn_planner.resources import find_map
 
 EAST, WEST = 0b00111000, 0b10000011
 """What lanes to the east and to the west forbid."""
-
-# Over DDS
 
 
 @pytest.fixture(scope="module")
@@ -50,14 +47,10 @@ def wait_until_planned(client: Any, ends: tuple[Any, Any]) -> PathMessage:
 def test_paths_there_and_back_obey_the_served_directions(client: Any) -> None:
     map_file = read_map_file(find_map("warehouse"))
     grid, planner = map_file.grid(), Planner.load("any_map")
-    legal, moves = grid.legal_moves("robot_safe"), MOVES.tolist()
     there = map_file.start, map_file.goal
     for ends in (there, there[::-1]):
         path = wait_until_planned(client, tuple(pose(grid, cell) for cell in ends))
-        cells = cells_of(grid, path)
-        assert tuple(cells) == planner.plan(grid, *ends).cells
-        for (x, y), (next_x, next_y) in pairwise(cells):
-            assert legal[moves.index([next_x - x, next_y - y]), y, x]
+        assert cells_of(grid, path) == [*planner.plan(grid, *ends).cells]
 
 
 def test_the_directions_come_with_the_stamp_and_the_place_of_the_map(client: Any) -> None:

@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
 from pathlib import Path as FilePath
 from typing import Any
 
 import numpy as np
 import pytest
-from integration.robot import Robot
 from nav_msgs.msg import OccupancyGrid
 from rclpy.serialization import serialize_message
 from std_msgs.msg import Header
@@ -114,23 +112,15 @@ Inflation.__call__ = told("a map is inflated", Inflation.__call__)
 display.value_message = told("a value is shown", display.value_message)
 display.policy_message = told("a policy is shown", display.policy_message)
 """
-"""What a planner runs first (as its ``sitecustomize``): it says what it computes, and while there
-is a file it fails."""
+"""What a planner runs first: it says what it computes, and while there is a file it fails."""
 
 
 def test_what_nobody_asks_for_is_not_computed_and_what_somebody_sees_is_of_the_goal(
-    run_node: Any,
-    make_client: Callable[[str], Any],
-    hall: np.ndarray,
-    model: FilePath,
-    tmp_path: FilePath,
-    monkeypatch: pytest.MonkeyPatch,
+    run_robot: Any, hall: np.ndarray, tmp_path: FilePath
 ) -> None:
-    client, gap = make_client("/seen"), tmp_path / "gap"
-    (tmp_path / "sitecustomize.py").write_text(TOLD.format(gap=str(gap)))
-    monkeypatch.setenv("PYTHONPATH", str(tmp_path), prepend=":")
-    with run_node("planner_node", {}, namespace="/seen") as node:
-        robot = Robot(client, hall, model, "/seen/planner")
+    gap = tmp_path / "gap"
+    with run_robot("/seen", {}, hall, sitecustomize=TOLD.format(gap=str(gap))) as robot:
+        client, node = robot.client, robot.node
         client.node.destroy_subscription(
             next(it for it in client.node.subscriptions if it.topic_name == "/seen/planner/value")
         )

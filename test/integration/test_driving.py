@@ -18,7 +18,7 @@ from builtin_interfaces.msg import Time
 from client import Client, initial_pose, map_message, pose, values_of, wait_for
 from geometry_msgs.msg import Point, Pose, PoseStamped
 from integration.robot import changed
-from integration.user import User, limited
+from integration.user import SOON, User, limited
 from nav_msgs.msg import OccupancyGrid, Odometry, Path
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from std_msgs.msg import Header, String
@@ -120,20 +120,17 @@ class Site(User):
         return Experience.load(self.folder / "experience.npz").slowness(GRID)
 
 
-RunTrainer = Callable[..., Any]
-
-
 @pytest.fixture(scope="module")
-def run_trainer(run_node: Any, fast_timers: None) -> RunTrainer:
+def run_trainer(run_node: Any) -> Callable[..., Any]:
     def run(folder: FilePath, namespace: str, exit_code: int = 0) -> Any:
         given = {"learn_from": "driving", "output_folder": str(folder), "replay_period": 0.002}
-        return run_node("trainer_node", given, namespace=namespace, exit_code=exit_code)
+        return run_node("trainer_node", given, (), namespace, exit_code, sitecustomize=SOON)
 
     return run
 
 
 @pytest.fixture(scope="module")
-def trainer(run_trainer: RunTrainer, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
+def trainer(run_trainer: Any, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
     with run_trainer(tmp_path_factory.mktemp("first") / "drives", NAMESPACE) as node:
         yield node
 
@@ -246,6 +243,8 @@ def test_who_gives_up_ends_the_drive_and_moves_fail_there(site: Site) -> None:
 
     site.move(LOWER[:1], 0.5)
     send(1)  # before: nobody knows where
+    site.client.wait_for_discovery("trainer")
+    site.call("save")  # what came before it is done: the goal may not overtake the status
     site.send_goal(*LOWER[3])
     site.drive(LOWER[1:3], 0.5, then=lambda: send(1, 2))
     assert site.outcomes == ["aborted"]
@@ -286,7 +285,7 @@ def test_nothing_is_lost_while_the_disk_is_full(site: Site, trainer: Any) -> Non
 
 
 def test_a_kill_loses_nothing_but_the_drive_under_way_and_an_end_not_even_that(
-    site: Site, trainer: Any, run_trainer: RunTrainer, make_client: Any, tmp_path: FilePath
+    site: Site, trainer: Any, run_trainer: Any, make_client: Any, tmp_path: FilePath
 ) -> None:
     """The last test, as it ends the trainer of the others."""
     killed = Site(make_client("/killed"), tmp_path / "killed")

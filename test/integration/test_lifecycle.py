@@ -16,9 +16,7 @@ import pytest
 import rclpy
 from client import generated_map, initial_pose, plan_request, wait_for
 from diagnostic_msgs.msg import DiagnosticStatus
-from integration.robot import GOAL, NUMBERS, START, Manager, Robot
-from integration.test_startup import ask_for_plan
-from integration.test_startup import load_gate as load_gate
+from integration.robot import GOAL, NUMBERS, START, Robot, ask_for_plan
 from lifecycle_msgs.msg import Transition
 from nav_msgs.srv import GetPlan
 from processes import cpu_seconds
@@ -30,7 +28,7 @@ OF_CONFIGURED = {"planner/get_plan", "planner/reload_model", "plan", "map", "goa
 
 def start(robot: Robot) -> None:
     """Configure and activate the planner, which works then."""
-    Manager(robot.client).start()
+    robot.start()
     robot.set_map(robot.stamped_map())
     robot.assert_works()
 
@@ -46,32 +44,25 @@ def wait_for_created(robot: Robot, expected: set[str]) -> None:
 
 
 @pytest.fixture(scope="module")
-def managed(run_node: Any, model: Path) -> Iterator[Any]:
-    """A planner that most tests share."""
-    parameters = {"autostart": False, "model": str(model)}
-    with run_node("planner_node", parameters, namespace="/managed") as node:
-        yield node
-
-
-@pytest.fixture(scope="module")
-def shared_robot(managed: Any, make_robot: Any) -> Robot:
-    return make_robot("/managed")
+def managed(run_robot: Any, model: Path) -> Iterator[Robot]:
+    """The user of a planner that most tests share."""
+    with run_robot("/managed", {"autostart": False, "model": str(model)}) as robot:
+        yield robot
 
 
 @pytest.fixture
-def robot(managed: Any, shared_robot: Robot) -> Robot:
+def robot(managed: Robot) -> Robot:
     """The user of the shared planner, which is unconfigured."""
-    manager = Manager(shared_robot.client)
     for label in ("deactivate", "cleanup"):
-        manager.change(label)
-    managed.forget_log()
-    shared_robot.clear()
-    assert manager.state == "unconfigured"
-    return shared_robot
+        managed.transition(label)
+    managed.node.forget_log()
+    managed.clear()
+    assert managed.state == "unconfigured"
+    return managed
 
 
-def test_each_transition_creates_enables_stops_and_frees(robot: Robot, managed: Any) -> None:
-    manager = Manager(robot.client)
+def test_each_transition_creates_enables_stops_and_frees(robot: Robot) -> None:
+    node = robot.node
 
     def assert_not_active() -> None:
         robot.clear()
@@ -79,7 +70,7 @@ def test_each_transition_creates_enables_stops_and_frees(robot: Robot, managed: 
         robot.wait_for_reason("the node is not active", {"status": "NOT_ACTIVE"})
 
     def assert_works_without_a_goal() -> None:
-        assert manager.change("activate")
+        assert robot.transition("activate")
         robot.assert_works()
         assert robot.plans.messages() == []
 
@@ -87,56 +78,52 @@ def test_each_transition_creates_enables_stops_and_frees(robot: Robot, managed: 
         wait_for_created(robot, set())
         status = robot.wait_for_reason("the node is not active; configure and activate it")
         assert status.level == DiagnosticStatus.WARN
-        assert manager.change("configure")
-        assert manager.state == "inactive"
+        assert robot.transition("configure")
+        assert robot.state == "inactive"
         wait_for_created(robot, OF_CONFIGURED)
         robot.set_map(robot.stamped_map())  # a map is taken, requests are not
         robot.send_start(robot.pose(START))
         assert_not_active()
-        managed.wait_for_log("no plan: the node is not active")
-        robot.diagnostics.clear()
+        node.wait_for_log("no plan: the node is not active")  # for the request
+        node.forget_log()
         robot.send_goal(robot.pose(GOAL))
-        robot.wait_for_reason("the node is not active", {"status": "NOT_ACTIVE"})
+        node.wait_for_log("no plan: the node is not active")  # so the goal has come
         assert_works_without_a_goal()  # it was refused
-        assert manager.state == "active"
+        assert robot.state == "active"
         robot.begin()
-        assert manager.change("deactivate")
+        assert robot.transition("deactivate")
         robot.send_start(robot.pose((1, 0)))
         robot.set_map(robot.stamped_map())
         assert_not_active()
         assert_works_without_a_goal()  # it was dropped
-        assert manager.change("deactivate")
-        assert manager.change("cleanup")
-        managed.forget_log()
+        assert robot.transition("deactivate")
+        assert robot.transition("cleanup")
+        node.forget_log()
 
 
-def test_no_request_for_a_transition_ends_the_planner(robot: Robot, managed: Any) -> None:
-    manager = Manager(robot.client)
+def test_no_request_for_a_transition_ends_the_planner(robot: Robot) -> None:
     start(robot)
     labels = "configure", "activate", "cleanup", "no_such", "transition_error", "ü" * 99
-    assert not any(map(manager.change, labels))
-    assert not any(manager.change(number=n) for n in (0, 1, 2, 3, 5, 6, 8, 10, 60, 62, 77, 255))
-    managed.wait_for_log("'configure' refused: the node has deactivate, shutdown when active")
-    managed.wait_for_log("transition 255 refused")
-    assert manager.state == "active"
+    assert not any(map(robot.transition, labels))
+    assert not any(robot.transition(number=n) for n in (0, 1, 2, 3, 5, 6, 8, 10, 60, 62, 77, 255))
+    robot.node.wait_for_log("'configure' refused: the node has deactivate, shutdown when active")
+    robot.node.wait_for_log("transition 255 refused")
+    assert robot.state == "active"
     robot.assert_works()
-    assert manager.change(number=Transition.TRANSITION_DEACTIVATE)
-    assert manager.state == "inactive"
+    assert robot.transition(number=Transition.TRANSITION_DEACTIVATE)
+    assert robot.state == "inactive"
 
 
-def test_an_unconfigured_planner_checks_parameters(
-    robot: Robot, managed: Any, tmp_path: Path
-) -> None:
-    client, manager, model = robot.client, Manager(robot.client), tmp_path / "model.safetensors"
+def test_an_unconfigured_planner_checks_parameters(robot: Robot, tmp_path: Path) -> None:
+    model = tmp_path / "model.safetensors"
     shutil.copy(robot.model, model)
-    assert not client.set_parameters("planner", model="no_such_model")[0].successful
-    results = client.set_parameters("planner", model=str(model), start_source="odometry")
-    assert all(result.successful for result in results)
+    assert robot.refuse(model="no_such_model")
+    robot.set(model=str(model), start_source="odometry")
     model.unlink()
     for reason in ("no model", "cannot be read as safetensors"):
-        assert not manager.change("configure")
-        assert manager.state == "unconfigured"
-        managed.wait_for_log(f"model refused: .*{reason}.*; or set the parameter 'model'")
+        assert not robot.transition("configure")
+        assert robot.state == "unconfigured"
+        robot.node.wait_for_log(f"model refused: .*{reason}.*; or set the parameter 'model'")
         status = robot.wait_for_reason(f"model refused: .*{reason}")
         assert status.level == DiagnosticStatus.ERROR
         wait_for_created(robot, set())
@@ -144,11 +131,11 @@ def test_an_unconfigured_planner_checks_parameters(
     shutil.copy(robot.model, model)
     start(robot)
     robot.wait_for_reason("", {"model file": str(model), "state": "active"})
-    assert client.set_parameters("planner", start_source="initialpose")[0].successful
+    robot.set(start_source="initialpose")
 
 
 def test_the_planner_survives_transitions_among_requests(robot: Robot) -> None:
-    manager, node = Manager(robot.client), robot.client.node
+    node = robot.client.node
     plans = node.create_client(GetPlan, "planner/get_plan")
     messages = {"map": robot.map_message(), "goal_pose": robot.pose(GOAL)}
     messages["initialpose"] = initial_pose(robot.pose(START))
@@ -162,45 +149,41 @@ def test_the_planner_survives_transitions_among_requests(robot: Robot) -> None:
             plans.call_async(request)
             for publisher, message in publishers:
                 publisher.publish(message)
-        assert manager.change(label)
-    assert manager.state == "unconfigured"
+        assert robot.transition(label)
+    assert robot.state == "unconfigured"
     start(robot)
 
 
-def test_a_stop_answers_what_waits(run_node: Any, make_robot: Any, load_gate: Path) -> None:
-    with run_node("planner_node", {}, namespace="/stopped") as node:
-        robot = make_robot("/stopped")
-        manager = Manager(robot.client)
+def test_a_stop_answers_what_waits(run_waiting: Any, load_gate: Path) -> None:
+    with run_waiting("/stopped") as robot:
         robot.set_map(robot.stamped_map())
-        node.wait_for_log("a model waits")
+        robot.node.wait_for_log("a model waits")
         plan, answered = ask_for_plan(robot)
         robot.wait_for_reason("the model is being loaded")
-        assert manager.change("deactivate")
+        assert robot.transition("deactivate")
         assert answered.wait(60)
         assert plan.result().plan.poses == []
-        assert manager.change("cleanup")
+        assert robot.transition("cleanup")
         load_gate.touch()
         start(robot)
         assert robot.plans.messages() == []
-        assert manager.change("shutdown")
-        assert manager.state == "finalized"
+        assert robot.transition("shutdown")
+        assert robot.state == "finalized"
         labels = "configure", "activate", "deactivate", "cleanup", "shutdown"
-        assert not any(map(manager.change, labels))
+        assert not any(map(robot.transition, labels))
 
 
-def test_a_stop_breaks_the_bond(run_node: Any, make_robot: Any, model: Path) -> None:
+def test_a_stop_breaks_the_bond(run_robot: Any, model: Path) -> None:
     pytest.importorskip("bondpy", reason="bondpy is not on PyPI")
     status = pytest.importorskip("bond.msg").Status
-    parameters = {"autostart": False, "model": str(model)}
-    with run_node("planner_node", parameters, namespace="/bonded") as node:
-        manager = Manager(make_robot("/bonded").client)
-        bond = manager.client.subscribe(status, "bond")
-        manager.start()
+    with run_robot("/bonded", {"autostart": False, "model": str(model)}) as robot:
+        bond = robot.client.subscribe(status, "bond")
+        robot.start()
         bond.wait(lambda message: message.active)
-        node.forget_log()
-        assert node.stop(signal.SIGTERM) == 0
+        robot.node.forget_log()
+        assert robot.node.stop(signal.SIGTERM) == 0
         bond.wait(lambda message: not message.active)
-        assert node.log == ""
+        assert robot.node.log == ""
 
 
 def test_cleanup_frees_map_model_and_fields(make_robot: Any, model: Path) -> None:
@@ -210,15 +193,14 @@ def test_cleanup_frees_map_model_and_fields(make_robot: Any, model: Path) -> Non
     spinning.start()
     try:
         robot = make_robot("/freed")
-        manager = Manager(robot.client)
         robot.begin()
         planner, grid = node._model.planner, node._map._grid
         assert planner is not None
         freed = [weakref.ref(it) for it in (planner, grid, planner.q_field(grid, GOAL))]
         del planner, grid
-        assert manager.change("deactivate")
+        assert robot.transition("deactivate")
         assert all(reference() for reference in freed)
-        assert manager.change("cleanup")
+        assert robot.transition("cleanup")
         wait_for("free memory", lambda: gc.collect() >= 0 and not any(it() for it in freed))
     finally:
         rclpy.shutdown()
@@ -226,19 +208,19 @@ def test_cleanup_frees_map_model_and_fields(make_robot: Any, model: Path) -> Non
         node.destroy_node()
 
 
-def test_a_planner_that_plans_leaves_the_graph_at_once(robot: Robot, managed: Any) -> None:
+def test_a_planner_that_plans_leaves_the_graph_at_once(robot: Robot) -> None:
     """The last test, as it ends the planner of the others."""
-    Manager(robot.client).start()
+    robot.start()
     rooms = generated_map("rooms", 500)
     robot.set_map(rooms.message(next(NUMBERS)))
     start, *goals = rooms.grid.free_cells()
     plans = robot.client.service(GetPlan, "planner/get_plan")
     requests = [plan_request(rooms.grid, start, goal) for goal in goals[-100:]]
-    before = cpu_seconds(managed.process.pid)
+    before = cpu_seconds(robot.node.process.pid)
     answers = [plans.call_async(request) for request in requests]
-    wait_for("fields under way", lambda: cpu_seconds(managed.process.pid) > before + 0.2)
-    assert managed.stop(signal.SIGTERM) == 0
-    assert not re.search("ERROR|Traceback", managed.log)
+    wait_for("fields under way", lambda: cpu_seconds(robot.node.process.pid) > before + 0.2)
+    assert robot.node.stop(signal.SIGTERM) == 0
+    assert not re.search("ERROR|Traceback", robot.node.log)
     name, graph = ("planner", "/managed"), robot.client.node
     wait_for("farewell", lambda: name not in graph.get_node_names_and_namespaces(), timeout=10)
     assert not all(answer.done() for answer in answers)

@@ -14,13 +14,8 @@ from nav_msgs.msg import OccupancyGrid, Odometry
 from rclpy.qos import QoSProfile, qos_profile_sensor_data
 from rosgraph_msgs.msg import Clock
 
-from ddqn_planner.nodes import planner_node
 
-
-def test_odometry_counts_while_it_comes(run_node: Any, make_robot: Any, model: Path) -> None:
-    robot = make_robot("/listening")
-    client = robot.client
-
+def test_odometry_counts_while_it_comes(run_robot: Any, model: Path) -> None:
     def set_clock(seconds: int) -> None:
         robot.clear()
         client.publish("/clock", Clock(clock=Time(sec=seconds)))
@@ -35,7 +30,8 @@ def test_odometry_counts_while_it_comes(run_node: Any, make_robot: Any, model: P
         "use_sim_time": True,
         "qos_overrides./listening/map.subscription.durability": "volatile",
     }
-    with run_node("planner_node", parameters, namespace="/listening") as node:
+    with run_robot("/listening", parameters) as robot:
+        client, node = robot.client, robot.node
         client.publisher(OccupancyGrid, "map", QoSProfile(depth=1))
         robot.set_map(robot.stamped_map())
         client.publisher(Odometry, "odom", qos_profile_sensor_data)  # as many drivers publish it
@@ -64,10 +60,3 @@ def test_odometry_counts_while_it_comes(run_node: Any, make_robot: Any, model: P
         client.node.destroy_publisher(second)
         robot.clear()
         robot.wait_for_reason("^((?!publishers).)*$")
-
-
-def test_a_quality_that_ros_does_not_know_is_named(log_of_refused_start: Any) -> None:
-    bad = {"qos_overrides./map.subscription.durability": "flighty"}
-    log = log_of_refused_start(planner_node.main, bad)
-    assert "cannot start: cannot subscribe to /map (" in log
-    assert "`flighty`" in log

@@ -5,7 +5,6 @@ from __future__ import annotations
 import array
 import itertools
 from collections.abc import Callable, Iterator
-from pathlib import Path as FilePath
 from typing import Any
 
 import numpy as np
@@ -37,22 +36,12 @@ def costmap() -> np.ndarray:
     return values
 
 
-class CostmapRobot(Robot):
-    @staticmethod
-    def grid_of(values: np.ndarray, origin: tuple[float, float, float] = (-1.0, 2.0, 0.0)) -> Any:
-        return GridMap(values >= 99, 0.5, origin)
-
-
 @pytest.fixture(scope="module")
-def robot(
-    run_node: Any, make_client: Callable[[str], Any], costmap: np.ndarray, model: FilePath
-) -> Iterator[Robot]:
-    client = make_client("/live")
+def robot(run_robot: Any, costmap: np.ndarray) -> Iterator[Robot]:
     parameters = {"map_type": "costmap", "map_timeout": 0.0}
-    remaps = ["map:=global_costmap/costmap"]
-    with run_node("planner_node", parameters, remaps, namespace="/live"):
-        robot = CostmapRobot(client, costmap, model, "/live/planner")
-        client.publish("global_costmap/costmap", robot.stamped_map(), LATCHED)
+    with run_robot("/live", parameters, costmap, remaps=["map:=global_costmap/costmap"]) as robot:
+        robot.grid = GridMap(costmap >= 99, 0.5, (-1.0, 2.0, 0.0))
+        robot.client.publish("global_costmap/costmap", robot.stamped_map(), LATCHED)
         robot.send_start(robot.pose((5, 5)))
         yield robot
 

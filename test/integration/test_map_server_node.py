@@ -14,7 +14,6 @@ from nav_msgs.msg import OccupancyGrid
 from nav_msgs.srv import GetMap, LoadMap
 
 from ddqn_planner.grid import MapFile, read_map_file, save_map, scatter_obstacles
-from ddqn_planner.nodes import map_server_node
 from ddqn_planner.nodes.conversions import grid_from_message
 from ddqn_planner.nodes.map_server_node import known_path
 from ddqn_planner.nodes.runtime import LATCHED
@@ -188,14 +187,3 @@ def test_by_default_numpy_alone_serves_a_map(run_node: Any, make_client: Any) ->
         assert ((values_of(served_map(client)) == 100) == next(draws(0, SHIPPED))).all()
         assert node.heavy_libraries <= {"numba", "scipy"}
         assert node.stop(signal.SIGTERM) == 0
-
-
-def test_what_the_node_cannot_start_with_is_one_clear_line(log_of_refused_start: Any) -> None:
-    for parameter, value, reason in (
-        ("frame_id", "", "name the map's frame"),
-        ("topic_name", "a b", "topic name"),
-        ("seed", -1, "seed out of range"),
-    ):
-        log = log_of_refused_start(map_server_node.main, {parameter: value})
-        assert re.search(f"cannot start: .*{reason}", log)
-        assert "Traceback" not in log

@@ -15,8 +15,7 @@ import pytest
 import rclpy
 from client import map_message, pose, wait_for
 from geometry_msgs.msg import PoseStamped
-from integration.robot import GOAL, NUMBERS, START, Manager, Robot, changed, check_path, points_of
-from integration.test_startup import load_gate as load_gate
+from integration.robot import GOAL, NUMBERS, START, Robot, changed, check_path, points_of
 from nav_msgs.msg import Path as PathMessage
 from rclpy.action.client import ActionClient
 from rclpy.action.server import CancelResponse, GoalResponse
@@ -304,12 +303,9 @@ def done(future: Any, timeout: float = 60.0) -> Any:
 
 
 @pytest.fixture(scope="module")
-def of_any_map(
-    run_node: Any, make_client: Callable[[str], Any], small_values: np.ndarray, model: Path
-) -> Iterator[Navigator]:
+def of_any_map(run_robot: Any) -> Iterator[Navigator]:
     pytest.importorskip("nav2_msgs.action", reason=REASON)
-    with run_node("planner_node", {}, namespace="/nav2"):
-        robot = Robot(make_client("/nav2"), small_values, model, "/nav2/planner")
+    with run_robot("/nav2") as robot:
         yield Navigator(robot)
 
 
@@ -406,15 +402,14 @@ def test_a_path_is_valid_while_it_is_free(navigator: Navigator) -> None:
 
 
 def test_goals_that_wait_are_canceled_preempted_and_stopped(
-    run_node: Any, make_robot: Any, load_gate: Path
+    run_waiting: Any, load_gate: Path
 ) -> None:
     pytest.importorskip("nav2_msgs.action", reason=REASON)
     # Plans wait for the planner's model, as they wait for a field.
-    with run_node("planner_node", {}, namespace="/waiting") as node:
-        robot = make_robot("/waiting")
+    with run_waiting("/waiting") as robot:
         robot.set_map(robot.stamped_map())
-        node.wait_for_log("a model waits")
-        waiting, manager = Navigator(robot), Manager(robot.client)
+        robot.node.wait_for_log("a model waits")
+        waiting = Navigator(robot)
         goal, fields = robot.pose(GOAL), {"start": robot.pose(START), "use_start": True}
 
         canceled = waiting.send([goal], **fields)
@@ -427,15 +422,15 @@ def test_goals_that_wait_are_canceled_preempted_and_stopped(
         assert (answer.status, answer.result.error_code) == (ABORTED, 200)
         assert answer.result.error_msg == "a newer goal of the same action came"
 
-        assert manager.change("deactivate")
+        assert robot.transition("deactivate")
         answer = done(waiting.ask(second.get_result_async))
         assert (answer.status, answer.result.error_code) == (ABORTED, 200)
         assert not waiting.send(goal, **fields).accepted
 
         load_gate.touch()
-        assert manager.change("activate")
+        assert robot.transition("activate")
         answer = waiting.plan(goal, **fields)
         assert answer.status == SUCCEEDED
         check_path(answer.result.path, robot.grid)
-        assert manager.change("deactivate")
-        assert manager.change("cleanup")
+        assert robot.transition("deactivate")
+        assert robot.transition("cleanup")

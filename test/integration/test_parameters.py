@@ -1,4 +1,4 @@
-"""The nodes as docs/nodes.md tells of them, and their parameters: no request ends a node."""
+"""The nodes and RViz as docs/nodes.md tells of them; no request for parameters ends a node."""
 
 from __future__ import annotations
 
@@ -14,14 +14,16 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import yaml
 from client import Client, wait_for
 from rcl_interfaces import srv
 from rcl_interfaces.msg import Parameter, ParameterDescriptor, ParameterType, ParameterValue
 
-from ddqn_planner.nodes import map_server_node
 from ddqn_planner.nodes.driving import NAVIGATION
+from ddqn_planner.nodes.poses import has_tf
 
-DOCS = (Path(__file__).resolve().parents[2] / "docs" / "nodes.md").read_text(encoding="utf-8")
+ROOT = Path(__file__).resolve().parents[2]
+DOCS = (ROOT / "docs" / "nodes.md").read_text(encoding="utf-8")
 NODES = ["map_server", "planner", "trainer"]
 NAMES = ["", "no_such", "a.b", "/", "ü" * 300]
 TYPES = {
@@ -154,9 +156,8 @@ def test_no_request_for_parameters_ends_a_node(running: Running) -> None:
     assert running.call("set_parameters").results == []
     assert running.call("set_parameters_atomically").result.successful
     running.call("list_parameters", prefixes=NAMES, depth=2**64 - 1)
-    running.call("describe_parameters", names=NAMES)
-    running.call("get_parameter_types", names=NAMES)
-    running.call("get_parameters", names=NAMES)
+    for kind in ("describe_parameters", "get_parameter_types", "get_parameters"):
+        running.call(kind, names=NAMES)
     names = running.call("list_parameters").result.names
     values = running.call("get_parameters", names=names).values
     assert len(values) == len(names) > 3
@@ -187,18 +188,84 @@ def test_help_says_of_each_parameter_what_the_docs_say_and_starts_no_node(
 
 SECURITY = {"ROS_SECURITY_ENABLE": "true", "ROS_SECURITY_STRATEGY": "Enforce"}
 SECURITY |= {"ROS_SECURITY_KEYSTORE": "/no/such/keystore"}
+FLIGHTY = {"qos_overrides./map.subscription.durability": "flighty"}
+BY_TF = {"learn_from": "driving", "pose_source": "tf"}
+NEEDS_TF = "is 'tf', which needs tf2_ros, and that is not installed: apt install ros-jazzy-tf2"
 
 
-def test_what_ros_cannot_start_with_is_said_and_ends_with_1(log_of_refused_start: Any) -> None:
-    for arguments, environment, reason in (
-        (["-p", "model"], {}, "model"),
-        (["--params-file", "/no/such.yaml"], {}, "such.yaml"),
-        ([], {"ROS_DOMAIN_ID": "abc"}, "ROS_DOMAIN_ID"),
-        (["--enclave", "/nobody"], SECURITY, "SECURITY|security|keystore|enclave"),
-    ):
-        with pytest.MonkeyPatch.context() as patch:
-            for variable, value in environment.items():
-                patch.setenv(variable, value)
-            log = log_of_refused_start(map_server_node.main, arguments=arguments)
-        assert re.search(f"cannot start: .*({reason})", log)
-        assert "Traceback" not in log
+@pytest.mark.parametrize(
+    "case",
+    [
+        ("map_server", {}, ["-p", "model"], {}, "model"),
+        ("map_server", {}, ["--params-file", "/no/such.yaml"], {}, "such.yaml"),
+        ("map_server", {}, [], {"ROS_DOMAIN_ID": "abc"}, "ROS_DOMAIN_ID"),
+        ("map_server", {}, ["--enclave", "/a"], SECURITY, "SECURITY|security|keystore|enclave"),
+        ("map_server", {"frame_id": ""}, [], {}, "name the map's frame"),
+        ("map_server", {"topic_name": "a b"}, [], {}, "topic name"),
+        ("map_server", {"seed": -1}, [], {}, "seed out of range"),
+        ("planner", FLIGHTY, [], {}, r"cannot subscribe to /map \(.*`flighty`"),
+        ("planner", {"start_source": "tf"}, [], {}, NEEDS_TF),
+        ("trainer", BY_TF, [], {}, NEEDS_TF),
+        ("trainer", {"network": "perceptron"}, [], {}, "'perceptron'; give one of paper, prop"),
+        ("trainer", {"environments": 8, "replay_capacity": 4}, [], {}, "is 8; .* at most .* 4"),
+        ("trainer", {"map_file": "no_such_map.yaml"}, [], {}, "no_such_map"),
+    ],
+)
+def test_what_a_node_cannot_start_with_is_said_and_ends_with_1(
+    case: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: Any
+) -> None:
+    name, parameters, arguments, environment, reason = case
+    if reason is NEEDS_TF and has_tf():
+        pytest.skip("tf2_ros is installed")
+    file = tmp_path / "parameters.yaml"
+    file.write_text(yaml.safe_dump({"/**": {"ros__parameters": parameters}}))
+    given = ["--params-file", str(file)] if parameters else []
+    monkeypatch.setattr(sys, "argv", ["node", "--ros-args", *given, *arguments])
+    for variable, value in environment.items():
+        monkeypatch.setenv(variable, value)
+    # Signals are pytest's here.
+    monkeypatch.setattr("ddqn_planner.nodes.runtime._at_signals", lambda _: None)
+    assert import_module(f"ddqn_planner.nodes.{name}_node").main() == 1
+    log = capfd.readouterr().err
+    assert re.search(f"cannot start: .*({reason})", log)
+    assert "Traceback" not in log
+
+
+# RViz
+
+MESSAGES = {
+    "rviz_default_plugins/Map": "nav_msgs/OccupancyGrid",
+    "rviz_default_plugins/MarkerArray": "visualization_msgs/MarkerArray",
+    "rviz_default_plugins/Path": "nav_msgs/Path",
+    "rviz_default_plugins/SetGoal": "geometry_msgs/PoseStamped",
+    "rviz_default_plugins/SetInitialPose": "geometry_msgs/PoseWithCovarianceStamped",
+}
+SHOWN = {"/map", "/plan", "/planner/value", "/planner/policy", "/trainer/episode"}
+SET = {"/initialpose", "/goal_pose"}
+
+
+def test_each_display_and_tool_has_a_topic_of_the_nodes() -> None:
+    documented = {
+        (row[0], "/" + row[1].strip("`").replace("~", node).lstrip("/")): row[2]
+        for node in NODES
+        for row in rows_of(node)
+    }
+    text = (ROOT / "rviz" / "ddqn_planner.rviz").read_text()
+    manager: dict[str, Any] = yaml.safe_load(text)["Visualization Manager"]
+    displays = {display["Topic"]["Value"]: display for display in manager["Displays"]}
+    tools = {tool["Topic"]["Value"]: tool for tool in manager["Tools"] if "Topic" in tool}
+    assert (set(displays), set(tools)) == (SHOWN, SET)
+    for way, entries in (("publishes", displays), ("subscribes", tools)):
+        for name, entry in entries.items():
+            message_type, _, latched = documented[way, name].partition(", ")
+            assert MESSAGES[entry["Class"]] == message_type
+            durability = "Transient Local" if latched == "latched" else "Volatile"
+            assert entry["Topic"]["Durability Policy"] == durability
+            assert entry["Topic"]["Reliability Policy"] == "Reliable"
+    assert all(display["Enabled"] for display in displays.values())
+    assert displays["/map"]["Draw Behind"]
+    value = displays["/planner/value"]
+    assert (value["Color Scheme"], value["Draw Behind"]) == ("costmap", False)
+    assert 0 < value["Alpha"] < 1
+    assert manager["Global Options"]["Fixed Frame"] == "map"
+    assert manager["Views"]["Current"]["Class"] == "rviz_default_plugins/TopDownOrtho"

@@ -24,7 +24,7 @@ fuzz = settings(suppress_health_check=[HealthCheck.function_scoped_fixture])
 
 
 @pytest.fixture
-def unharmed(planner: Any, robot: Robot) -> Any:
+def unharmed(robot: Robot) -> Any:
     """See afterwards that nothing was raised out of a callback."""
     # Else a message may come after the answer to a later request.
     robot.client.publisher(String, "trainer/model_saved", LATCHED)
@@ -32,8 +32,8 @@ def unharmed(planner: Any, robot: Robot) -> Any:
     yield robot
     robot.reset()
     robot.begin()
-    assert planner.process.poll() is None
-    assert "Traceback" not in planner.log
+    assert robot.node.process.poll() is None
+    assert "Traceback" not in robot.node.log
 
 
 @fuzz

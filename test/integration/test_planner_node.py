@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import math
-import os
 import shutil
 import signal
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path as FilePath
 from typing import Any
 
@@ -22,6 +21,7 @@ from integration.robot import (
     RESOLUTION,
     START,
     Robot,
+    ask_for_plan,
     changed,
     check_path,
     constant_model,
@@ -30,7 +30,6 @@ from integration.robot import (
     values_of,
     yaw_of,
 )
-from integration.test_startup import ask_for_plan
 from nav_msgs.msg import OccupancyGrid, Path
 from nav_msgs.srv import GetPlan
 from rcl_interfaces.srv import DescribeParameters, ListParameters
@@ -77,8 +76,7 @@ def test_goal_pose_is_answered_by_a_plan_a_value_and_diagnostics(robot: Robot) -
         robot.diagnostics.clear()
         robot.wait_for_reason("^a path of ")
     # Who subscribes late has the last plan and value.
-    robot.plans = robot.client.subscribe(Path, "plan", LATCHED)
-    robot.wait_for_path((0, 3), GOAL)
+    assert points_of(robot.last_plan()) == points_of(path)
     robot.client.subscribe(OccupancyGrid, "planner/value", LATCHED).wait()
 
 
@@ -96,24 +94,16 @@ def test_get_plan_answers_and_does_not_change_the_active_goal(robot: Robot) -> N
     robot.wait_for_path((3, 3), GOAL)
 
 
-def test_plans_again_when_the_map_or_how_it_is_read_changes(robot: Robot) -> None:
-    for value, reading, before in (
-        (50, {"occupied_threshold": 50}, 65),
-        (-1, {"allow_unknown": False}, True),
-    ):
-        ((name, _),) = reading.items()
-        values = robot.values.copy()
-        values[GOAL[1], GOAL[0]] = value
-        robot.set(**{name: before})
-        robot.set_map(robot.stamped_map(values))
-        robot.wait_for_reason("^a path of ")
-        robot.clear()
-        robot.set(**reading)
-        robot.plans.wait(lambda path: not path.poses)
-        robot.wait_for_reason("the goal is occupied")
-        robot.clear()
-        robot.set(**{name: before})
-        robot.wait_for_path(START, GOAL)
+def test_plans_again_when_how_the_map_is_read_changes(robot: Robot) -> None:
+    values = robot.values.copy()
+    values[GOAL[1], GOAL[0]] = 50
+    robot.set_map(robot.stamped_map(values))
+    robot.set(occupied_threshold=50)
+    robot.plans.wait(lambda path: not path.poses)
+    robot.wait_for_reason("the goal is occupied")
+    robot.clear()
+    robot.set(occupied_threshold=65)
+    robot.wait_for_path(START, GOAL)
 
 
 # Models
@@ -166,7 +156,7 @@ def test_follows_the_trainer(robot: Robot, whole_model: FilePath, tmp_path: File
 
 
 def test_a_model_of_another_size_says_so_and_a_trapped_one_may_search(
-    robot: Robot, planner: Any, whole_model: FilePath, tmp_path: FilePath
+    robot: Robot, whole_model: FilePath, tmp_path: FilePath
 ) -> None:
     for size, reason in (
         (7, "not trained for maps of this size.*6 x 6 cells"),
@@ -182,7 +172,7 @@ def test_a_model_of_another_size_says_so_and_a_trapped_one_may_search(
     status = robot.wait_for_reason("searched for in the order of the Q field")
     assert values_of(status)["method"] == "astar_fallback"
     assert status.level == DiagnosticStatus.OK
-    planner.wait_for_log("a path of .* searched for in the order of the Q field")
+    robot.node.wait_for_log("a path of .* searched for in the order of the Q field")
     # Of the two moves that the model knows one leads there.
     robot.get_plan(robot.pose((2, 0)), robot.pose((0, 0)))
     assert values_of(robot.wait_for_reason("^a path of 2.00 cells, by greedy steps"))["method"] == (
@@ -222,7 +212,7 @@ def test_a_bad_parameter_is_refused_with_a_reason_and_a_good_one_holds(
 
 
 def test_a_malformed_map_or_start_leaves_the_old_one_and_a_goal_has_an_empty_plan(
-    robot: Robot, planner: Any
+    robot: Robot,
 ) -> None:
     robot.send_map(changed(robot.map_message(), "info.width", 0))
     robot.send_start(changed(robot.pose((3, 3)), "pose.orientation", Quaternion(w=0.0)))
@@ -231,7 +221,7 @@ def test_a_malformed_map_or_start_leaves_the_old_one_and_a_goal_has_an_empty_pla
         "initialpose refused: the start's orientation is .* a quaternion of norm 0",
     ):
         assert robot.wait_for_reason(reason).level == DiagnosticStatus.WARN
-        planner.wait_for_log(reason)
+        robot.node.wait_for_log(reason)
     robot.assert_works()
     robot.clear()
     robot.send_goal(robot.pose(GOAL, GOAL_YAW))
@@ -243,7 +233,7 @@ def test_a_malformed_map_or_start_leaves_the_old_one_and_a_goal_has_an_empty_pla
     assert robot.plans.wait(lambda path: not path.poses).header.frame_id == "map"
     status = robot.wait_for_reason(reason, {"status": "INVALID_GOAL"})
     assert status.level == DiagnosticStatus.WARN
-    planner.wait_for_log(f"no plan: {reason}")
+    robot.node.wait_for_log(f"no plan: {reason}")
     robot.clear()
     robot.send_start(robot.pose((3, 3)))
     robot.plans.wait()
@@ -252,9 +242,7 @@ def test_a_malformed_map_or_start_leaves_the_old_one_and_a_goal_has_an_empty_pla
 
 
 @pytest.mark.parametrize("name", ["start", "goal"])
-def test_a_bad_request_has_an_empty_plan_and_a_reason(
-    robot: Robot, planner: Any, name: str
-) -> None:
+def test_a_bad_request_has_an_empty_plan_and_a_reason(robot: Robot, name: str) -> None:
     robot.change(start_clearing_radius=0.0)
     for field, value, reason in (
         ("pose.orientation", Quaternion(w=1.01), "quaternion of norm 1.01"),
@@ -271,7 +259,7 @@ def test_a_bad_request_has_an_empty_plan_and_a_reason(
         assert (path.poses, path.header.frame_id) == ([], "map")
         status = robot.wait_for_reason(f"the {name}.*{reason}")
         assert values_of(status)["reason"] == status.message
-        planner.wait_for_log(f"no plan: the {name}.*{reason}")
+        robot.node.wait_for_log(f"no plan: the {name}.*{reason}")
     assert values_of(status)["status"] == f"{name.upper()}_OCCUPIED"
     robot.set(start_clearing_radius=-1.0)
     robot.assert_works()
@@ -290,7 +278,7 @@ def test_a_map_in_another_frame_than_the_goal_has_an_empty_plan_in_its_frame(rob
     robot.wait_for_reason("^a path of [^;]*$")
 
 
-def test_the_log_says_once_what_stays_the_same(robot: Robot, planner: Any) -> None:
+def test_the_log_says_once_what_stays_the_same(robot: Robot) -> None:
     def send_maps(frame: str = "map") -> None:
         """Send three maps, one after the other is planned on."""
         for _ in range(3):
@@ -304,7 +292,7 @@ def test_the_log_says_once_what_stays_the_same(robot: Robot, planner: Any) -> No
             robot.set(robot_radius=radius)
             robot.plans.wait()
 
-    planner.forget_log()
+    robot.node.forget_log()
     send_maps()
     robot.send_goal(robot.pose((3, 3)))
     robot.wait_for_path(START, (3, 3))
@@ -317,10 +305,10 @@ def test_the_log_says_once_what_stays_the_same(robot: Robot, planner: Any) -> No
     for frame in ("", "", ""):
         robot.send_start(changed(robot.pose(START), "header.frame_id", frame))
     robot.send_start(changed(robot.pose(START), "pose.position.x", math.nan))
-    planner.wait_for_log("the start's position is .x = nan")
+    robot.node.wait_for_log("the start's position is .x = nan")
     send_maps("upstairs")
-    planner.wait_for_log("no plan: the goal's frame")
-    assert "map of 6 x 6 cells of 0.5 m in frame 'map'" not in planner.log  # it was known
+    robot.node.wait_for_log("no plan: the goal's frame")
+    assert "map of 6 x 6 cells of 0.5 m in frame 'map'" not in robot.node.log  # it was known
     for line in (
         "map of 6 x 6 cells of 0.5 m in frame 'upstairs'",
         "a path of ",
@@ -328,7 +316,7 @@ def test_the_log_says_once_what_stays_the_same(robot: Robot, planner: Any) -> No
         "no plan: the goal's frame",
         "initialpose refused: the start's frame is ''",
     ):
-        assert planner.log.count(line) == 1, planner.log
+        assert robot.node.log.count(line) == 1, robot.node.log
 
 
 # While a plan takes long
@@ -353,42 +341,32 @@ Planner.steps = gated
 
 
 @pytest.fixture(scope="module")
-def gated(
-    run_node: Any,
-    make_client: Callable[[str], Any],
-    small_values: np.ndarray,
-    model: FilePath,
-    tmp_path_factory: pytest.TempPathFactory,
-) -> Iterator[tuple[Robot, Any, FilePath]]:
-    """Run a planner that makes no plan which takes long without a file."""
-    folder, client = tmp_path_factory.mktemp("gate"), make_client("/gated")
-    (folder / "gate").touch()
-    (folder / "sitecustomize.py").write_text(GATE.format(gate=str(folder / "gate")))
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("PYTHONPATH", str(folder), prepend=os.pathsep)
-        with run_node("planner_node", {"model": str(model)}, namespace="/gated") as node:
-            yield Robot(client, small_values, model, "/gated/planner"), node, folder / "gate"
-            assert "Traceback" not in node.log
+def gated(run_robot: Any, tmp_path_factory: Any, model: FilePath) -> Iterator[Any]:
+    """Run a planner that makes no plan which takes long without a file, its gate."""
+    gate = tmp_path_factory.mktemp("gate") / "gate"
+    gate.touch()
+    first = GATE.format(gate=str(gate))
+    with run_robot("/gated", {"model": str(model)}, sitecustomize=first) as robot:
+        robot.gate = gate
+        yield robot
+        assert "Traceback" not in robot.node.log
 
 
 @pytest.fixture
-def gate(gated: tuple[Robot, Any, FilePath]) -> Iterator[FilePath]:
+def slow_robot(gated: Any) -> Iterator[Any]:
     """Close the gate of a planner that knows the field toward START, its active goal."""
-    robot, node, gate = gated
-    robot.reset()
-    robot.begin(START, START)
-    gate.unlink()
-    node.forget_log()
-    yield gate
-    gate.touch()
+    gated.reset()
+    gated.begin(START, START)
+    gated.gate.unlink()
+    gated.node.forget_log()
+    yield gated
+    gated.gate.touch()
 
 
-def test_all_else_is_answered_while_a_plan_takes_long(
-    gated: tuple[Robot, Any, FilePath], gate: FilePath
-) -> None:
-    robot, node, _ = gated
-    client, (plan, answered) = robot.client, ask_for_plan(robot)
-    node.wait_for_log("a plan waits")
+def test_all_else_is_answered_while_a_plan_takes_long(slow_robot: Any) -> None:
+    robot, client = slow_robot, slow_robot.client
+    plan, answered = ask_for_plan(robot)
+    robot.node.wait_for_log("a plan waits")
     assert len(robot.get_plan(robot.pose(START), robot.pose(START)).poses) == 1
     outside = changed(robot.pose(START), "pose.position.x", 50.0)
     assert robot.get_plan(outside, robot.pose((0, 5))).poses == []
@@ -396,65 +374,50 @@ def test_all_else_is_answered_while_a_plan_takes_long(
     names = client.call(ListParameters, "planner/list_parameters").result.names
     request = DescribeParameters.Request(names=names)
     assert client.call(DescribeParameters, "planner/describe_parameters", request).descriptors
-    assert not client.set_parameters("planner", model="no_model")[0].successful
+    assert robot.refuse(model="no_model")
     assert client.call(Trigger, "planner/reload_model").success
     # The map grows by the robot's body, in another thread than that of the plan.
     robot.set(robot_radius=0.6)
     assert robot.get_plan(outside, robot.pose((0, 5))).poses == []
     assert not plan.done()
-    gate.touch()
+    robot.gate.touch()
     assert answered.wait(TIMEOUT)
     check_path(plan.result().plan, robot.grid)
     assert points_of(plan.result().plan)[-1] == pytest.approx(robot.grid.cell_to_world(GOAL))
 
 
-def test_what_comes_while_a_plan_takes_long_has_the_last_plan(
-    gated: tuple[Robot, Any, FilePath], gate: FilePath
-) -> None:
-    robot, node, _ = gated
-
-    def last_plan() -> Path:
-        robot.get_plan(robot.pose(START), robot.pose(START))  # what came before it is done
-        return robot.client.subscribe(Path, "plan", LATCHED).wait()
-
+def test_what_comes_while_a_plan_takes_long_has_the_last_plan(slow_robot: Any) -> None:
+    robot = slow_robot
     robot.send_goal(robot.pose((0, 5)))
-    node.wait_for_log("a plan waits")
+    robot.node.wait_for_log("a plan waits")
     robot.send_goal(robot.pose(GOAL))
     robot.send_start(robot.pose((3, 3)))
-    gate.touch()
+    robot.gate.touch()
     path = robot.wait_for_path((3, 3), GOAL)
-    assert points_of(last_plan()) == points_of(path)
-    gate.unlink()
+    assert points_of(robot.last_plan()) == points_of(path)
+    robot.gate.unlink()
     robot.send_goal(robot.pose((5, 0)))
     robot.send_goal(changed(robot.pose(GOAL), "header.frame_id", ""))
-    gate.touch()
-    node.wait_for_log("no plan: the goal's frame is ''")
-    assert last_plan().poses == []
+    robot.gate.touch()
+    robot.node.wait_for_log("no plan: the goal's frame is ''")
+    assert robot.last_plan().poses == []
 
 
-def test_a_signal_ends_the_node_while_a_plan_takes_long(
-    gated: tuple[Robot, Any, FilePath], gate: FilePath
-) -> None:
-    robot, node, _ = gated
-    robot.send_goal(robot.pose((5, 2)))  # whose field no test before needed
-    node.wait_for_log("a plan waits")
-    assert node.stop(signal.SIGTERM) == 0
+def test_a_signal_ends_the_node_while_a_plan_takes_long(slow_robot: Any) -> None:
+    slow_robot.send_goal(slow_robot.pose((5, 2)))  # whose field no test before needed
+    slow_robot.node.wait_for_log("a plan waits")
+    assert slow_robot.node.stop(signal.SIGTERM) == 0
 
 
 # A process of its own
 
 
 def test_says_what_it_waits_for_and_plans_once_it_is_there(
-    run_node: Any,
-    make_client: Callable[[str], Any],
-    small_values: np.ndarray,
-    model: FilePath,
-    tmp_path: FilePath,
+    run_robot: Any, model: FilePath, tmp_path: FilePath
 ) -> None:
     path, remaps = tmp_path / "model.safetensors", ["map:=plant", "plan:=route", "__node:=router"]
-    with run_node("planner_node", {"model": str(path)}, remaps) as node:
-        client = make_client("")
-        robot = Robot(client, small_values, path, "/router")
+    with run_robot("", {"model": str(path)}, remaps=remaps) as robot:
+        client, node, robot.name = robot.client, robot.node, "/router"
         plans = client.subscribe(Path, "route", LATCHED)
         node.wait_for_log("waiting for a map on /plant")
         unheard = client.node.create_publisher(OccupancyGrid, "plant", QoSProfile(depth=1))
@@ -475,18 +438,12 @@ def test_says_what_it_waits_for_and_plans_once_it_is_there(
         assert plans.wait().header.frame_id == "map"
         robot.wait_for_reason(missing)
         node.wait_for_log(f"no plan: {missing}")
-        malformed = changed(robot.map_message(), "info.resolution", 0.0)
-        client.publish("plant", malformed, LATCHED)
-        robot.wait_for_reason("map refused: the map's resolution is 0.0")
 
         client.publish("plant", robot.map_message(), LATCHED)
         no_model = "there is no model file"
         status = robot.wait_for_reason(f"no model is loaded: .*{no_model}")
         assert status.level == DiagnosticStatus.ERROR
         node.wait_for_log(f"model refused: .*{no_model}")
-        response = client.call(Trigger, "router/reload_model")
-        assert not response.success
-        assert no_model in response.message
         shutil.copy(model, path)
         assert client.call(Trigger, "router/reload_model").success
 

@@ -2,7 +2,6 @@ from __future__ import annotations
 
 import itertools
 import math
-import os
 import re
 import resource
 import signal
@@ -17,7 +16,7 @@ from geometry_msgs.msg import PoseStamped
 from hypothesis import given
 from integration.messages import STAMPED_POSES, maps, some_parameters
 from integration.robot import changed
-from integration.user import User, limited
+from integration.user import SOON, User, limited
 from nav_msgs.msg import OccupancyGrid
 from rcl_interfaces.srv import ListParameters, SetParameters, SetParametersAtomically
 from rclpy.parameter import Parameter
@@ -26,9 +25,7 @@ from std_srvs.srv import Trigger
 
 from ddqn_planner.grid import MOVES, GridMap, MapFile, MoveRule, legal_moves, save_map
 from ddqn_planner.model import load_model
-from ddqn_planner.nodes import trainer_node
 from ddqn_planner.nodes.parameters import TRAINER_PARAMETERS
-from ddqn_planner.nodes.poses import has_tf
 from ddqn_planner.nodes.runtime import LATCHED
 
 ENDLESS = {"steps": 10**9, "filters": 4, "learning_starts": 100}
@@ -87,11 +84,9 @@ def message_of(name: str, value: Any) -> Any:
 
 
 @pytest.fixture(scope="module")
-def shared_user(
-    run_node: Any, make_client: Any, small_values: np.ndarray, fast_timers: None
-) -> Iterator[Trainee]:
+def shared_user(run_node: Any, make_client: Any, small_values: np.ndarray) -> Iterator[Trainee]:
     """The user of a trainer that most tests share: to start one takes seconds."""
-    with run_node("trainer_node", {}, namespace=NAMESPACE) as node:
+    with run_node("trainer_node", {}, namespace=NAMESPACE, sitecustomize=SOON) as node:
         user = Trainee(make_client(NAMESPACE), node, small_values)
         assert "no map" in user.refusal()
         yield user
@@ -203,19 +198,6 @@ def test_bad_input_is_refused_by_name(user: Trainee, tmp_path: FilePath) -> None
     user.train_on(state="training", message="the map's")
 
 
-def test_a_node_does_not_start_with_an_invalid_parameter(log_of_refused_start: Any) -> None:
-    no_tf = {"learn_from": "driving", "pose_source": "tf"}
-    for parameters, reason in (
-        ({"network": "perceptron"}, "network is 'perceptron'; give one of paper, propagation"),
-        ({"environments": 8, "replay_capacity": 4}, "environments is 8; .* at most .* 4"),
-        ({"map_file": "no_such_map.yaml"}, "no_such_map"),
-        *([] if has_tf() else [(no_tf, "apt install ros-jazzy-tf2-ros-py")]),
-    ):
-        log = log_of_refused_start(trainer_node.main, parameters)
-        assert re.search(reason, log)
-        assert "Traceback" not in log
-
-
 def test_an_invalid_value_is_refused_with_its_reason_and_nothing_is_half_set(user: Trainee) -> None:
     good = message_of("replay_capacity", 3000), message_of("epsilon_end", 0.2)
     assert user.try_to_set(*good).successful
@@ -284,13 +266,12 @@ def test_what_cannot_be_started_has_a_remedy(user: Trainee, tmp_path: FilePath) 
 
 
 def test_without_its_libraries_a_start_is_refused_and_the_node_lives(
-    run_node: Any, make_client: Any, tmp_path: FilePath, monkeypatch: pytest.MonkeyPatch
+    run_node: Any, make_client: Any, tmp_path: FilePath
 ) -> None:
     missing = "No module named 'torch'"
-    (tmp_path / "torch.py").write_text(f'raise ModuleNotFoundError("{missing}", name="torch")')
-    monkeypatch.setenv("PYTHONPATH", str(tmp_path), prepend=os.pathsep)
+    torch = f'raise ModuleNotFoundError("{missing}", name="torch")'
     parameters = {"map_file": "dilemma", "output_folder": str(tmp_path / "run")}
-    with run_node("trainer_node", parameters, namespace="/without") as node:
+    with run_node("trainer_node", parameters, namespace="/without", torch=torch) as node:
         user = Trainee(make_client("/without"), node, np.zeros((1, 1), np.int8))
         assert f"needs another library: {missing}; pip install torch gymnasium" in user.refusal()
         assert "call ~/start first" in user.call("replay", succeeds=False)

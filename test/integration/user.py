@@ -16,6 +16,19 @@ from std_srvs.srv import Trigger
 
 from ddqn_planner.nodes.runtime import LATCHED
 
+SOON = """
+import rclpy.node
+from ddqn_planner.nodes import driving
+
+driving.RETRY_PERIOD, create_timer = 0.2, rclpy.node.Node.create_timer
+
+def create_fast_timer(node, period, *arguments, **options):
+    return create_timer(node, min(period, 0.1), *arguments, **options)
+
+rclpy.node.Node.create_timer = create_fast_timer
+"""
+"""What a trainer runs first: the tests wait for many diagnostics, which come ten times a second."""
+
 
 def trigger(client: Client, service: str, succeeds: bool = True) -> str:
     """Call a service that has to succeed, or not to; return its message."""
