@@ -9,6 +9,8 @@ from pathlib import Path
 
 import pytest
 
+from ddqn_planner.compiled import compiled
+
 PLAN = """
 import numpy as np
 from ddqn_planner import GridMap, Planner, load_map
@@ -102,3 +104,13 @@ def test_compiling_is_announced_once_and_a_load_from_the_cache_is_not(tmp_path: 
     for expected in (f"{words}the next start\n", ""):
         done = subprocess.run(command, env=environment, check=True, capture_output=True, text=True)
         assert done.stderr == expected
+
+
+def test_where_no_folder_may_be_written_code_is_compiled_all_the_same(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def nowhere(*_: object) -> None:
+        raise RuntimeError("cannot cache function: no locator available")
+
+    monkeypatch.setattr("numba.core.dispatcher.Dispatcher.enable_caching", nowhere)
+    assert compiled(lambda x: x + 1)(1) == 2
