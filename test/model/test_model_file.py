@@ -4,7 +4,6 @@ import json
 import os
 import pickle
 import random
-from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -109,12 +108,6 @@ def test_a_file_with_one_wrong_byte_is_a_model_or_refused(model_path: Path) -> N
     assert refused > 100
 
 
-def test_a_pickle_is_refused(model_path: Path) -> None:
-    model_path.write_bytes(pickle.dumps({"weight": np.zeros(1)}))
-    with pytest.raises(ModelFileError, match="another kind"):
-        load_model(model_path)
-
-
 MISSING = object()
 
 
@@ -179,52 +172,35 @@ def test_metadata_of_any_json_is_a_models_or_refused(
     assert json.loads(json.dumps(asdict(read))) == {**asdict(METADATA), **changes}
 
 
-NO_OBJECTS = ["", "null", "[1, 2", "[" * 10**5, "7", "{}", "1" * 5000]
+def test_a_file_of_something_else_is_refused(tmp_path: Path) -> None:
+    path, tensors = tmp_path / "model.safetensors", {"x": np.zeros(1)}
+    files = [
+        (pickle.dumps(tensors), "another kind"),
+        (safetensors.numpy.save(tensors), "no model of ddqn_planner"),
+    ]
+    for text in ("", "null", "[1, 2", "[" * 10**5, "7", "{}", "1" * 5000):
+        content = safetensors.numpy.save(tensors, {"ddqn_planner": text})
+        files.append((content, "metadata is wrong"))
+    for content, refusal in files:
+        path.write_bytes(content)
+        with pytest.raises(ModelFileError, match=refusal):
+            load_model(path)
 
 
-@pytest.mark.parametrize("text", [None, *NO_OBJECTS])
-def test_safetensors_without_the_metadata_of_a_model_are_refused(
-    tmp_path: Path, text: str | None
+def test_tensors_of_another_network_and_wrong_weights_are_refused(
+    model_path: Path, network: QNetwork
 ) -> None:
-    path = tmp_path / "model.safetensors"
-    metadata = None if text is None else {"ddqn_planner": text}
-    path.write_bytes(safetensors.numpy.save({"x": np.zeros(1)}, metadata))
-    refusal = "no model of ddqn_planner" if text is None else "metadata is wrong"
-    with pytest.raises(ModelFileError, match=refusal):
-        load_model(path)
-
-
-Tensors = dict[str, np.ndarray]
-
-
-@pytest.mark.parametrize(
-    "change",
-    [
-        lambda tensors: tensors.update(more=np.zeros(1, np.float32)),
-        lambda tensors: tensors.pop("convolution.bias"),
-        lambda tensors: tensors.update({"convolution.bias": np.zeros(3, np.float32)}),
-        lambda tensors: tensors.update({"convolution.bias": np.zeros((1, 2), np.float32)}),
-        lambda tensors: tensors.update({"convolution.bias": np.zeros(2, dtype=np.float64)}),
-        lambda tensors: tensors.clear(),
-    ],
-)
-def test_tensors_of_another_network_are_refused(
-    model_path: Path, network: QNetwork, change: Callable[[Tensors], object]
-) -> None:
-    change(network.tensors)
-    save_model(model_path, network, METADATA)
-    with pytest.raises(ModelFileError, match="holds tensors"):
-        load_model(model_path)
-
-
-@pytest.mark.parametrize("weight", [np.nan, np.inf, -np.inf])
-def test_weights_that_are_not_finite_are_refused(
-    model_path: Path, network: QNetwork, weight: float
-) -> None:
-    network.tensors["fully_connected.bias"][0] = weight
-    save_model(model_path, network, METADATA)
-    with pytest.raises(ModelFileError, match="not all finite"):
-        load_model(model_path)
+    right, bias = network.tensors, "convolution.bias"
+    others: list[dict[str, Any]] = [{"more": right[bias]}, dict.fromkeys(right), {bias: None}]
+    others += [{bias: np.zeros(2)}, *({bias: np.zeros(n, np.float32)} for n in (3, (1, 2)))]
+    broken = [{bias: np.float32([0, n])} for n in (np.nan, np.inf, -np.inf)]
+    for refusal, changes in (("holds tensors", others), ("not all finite", broken)):
+        for change in changes:
+            tensors = {**right, **change}
+            network.tensors = {key: tensor for key, tensor in tensors.items() if tensor is not None}
+            save_model(model_path, network, METADATA)
+            with pytest.raises(ModelFileError, match=refusal):
+                load_model(model_path)
 
 
 @same_folder
