@@ -13,26 +13,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from networks import ANY_MAP, new_planner, random_network, turning_planner
-from strategies import (
-    GRIDS,
-    RULES,
-    cells_of,
-    grids_in_parts,
-    grids_with_directions,
-    grids_with_free_cell,
-)
+from strategies import GRIDS, RULES, cells_of
 
 from ddqn_planner import GridMap, MoveRule, PlanMethod, Planner, PlanStatus, QField, inflate
 from ddqn_planner import simplify as simplified
-from ddqn_planner.grid import (
-    LENGTHS,
-    MOVES,
-    Cell,
-    legal_moves,
-    path_cost,
-    path_length,
-    shortest_distances,
-)
+from ddqn_planner.grid import MOVES, Cell, legal_moves, path_cost, path_length, shortest_distances
 from ddqn_planner.model import AnyMapQNetwork, ModelMetadata
 from ddqn_planner.planning import PlanRequest
 from ddqn_planner.planning.planner import last_step
@@ -64,26 +49,6 @@ def check_legal(cells: tuple[Cell, ...], grid: GridMap, rule: MoveRule) -> None:
 # Rollouts of a field
 
 
-@given(grids_with_free_cell(), RULES)
-def test_rollouts_of_a_perfect_field_are_shortest_paths(
-    grid_and_goal: tuple[GridMap, Cell], rule: MoveRule
-) -> None:
-    grid, goal = grid_and_goal
-    optimum = shortest_distances(grid, goal, rule)
-    distance = np.pad(optimum, 1, constant_values=np.inf)
-    height, width = grid.occupancy.shape
-    q = [
-        -length - distance[1 + dy : 1 + dy + height, 1 + dx : 1 + dx + width]
-        for (dx, dy), length in zip(MOVES, LENGTHS, strict=True)
-    ]
-    field = QField(goal, np.array(q, dtype=np.float32), legal_moves(grid.occupancy, rule))
-    for x, y in grid.free_cells():
-        plan = field.rollout((x, y))
-        assert bool(plan.cells) == np.isfinite(optimum[y, x])
-        if plan.cells and rule is not MoveRule.UNIT:
-            assert plan.length == pytest.approx(optimum[y, x])
-
-
 def test_the_unmasked_rollout_is_trapped_by_the_first_illegal_move_that_it_prefers() -> None:
     grid = GridMap(np.array([[0, 0, 0], [0, 0, 0]]))
     q = np.zeros((8, 2, 3), dtype=np.float32)
@@ -93,9 +58,6 @@ def test_the_unmasked_rollout_is_trapped_by_the_first_illegal_move_that_it_prefe
     assert field.rollout((0, 0)).cells == ((0, 0), (1, 0), (2, 0))
     assert field.unmasked().rollout((0, 0)).status is PlanStatus.ROLLOUT_TRAPPED
     assert field.value.max() == 1  # what is illegal does not count
-    for start in ((3, 0), (0, 2), (-1, 0), (0, -1)):
-        with pytest.raises(ValueError, match="outside the map of 3 x 2 cells"):
-            field.rollout(start)
 
 
 # Plans
@@ -302,7 +264,7 @@ def test_unknown_choices_are_refused_with_a_list() -> None:
 
 @settings(max_examples=400)
 @given(
-    grids_in_parts() | grids_with_directions(),
+    GRIDS,
     RULES,
     # Distances between cells are drawn as often as what lies between.
     st.floats(0, 6) | st.integers(0, 36).map(np.sqrt),
