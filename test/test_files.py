@@ -6,7 +6,7 @@ import sys
 from pathlib import Path
 
 import pytest
-from damage import files_no_longer_than
+from limits import files_no_longer_than
 
 from ddqn_planner.files import WorkFolder, write_atomically
 

@@ -8,8 +8,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from damage import files_no_longer_than
 from experience.straight_drives import straight
+from limits import files_no_longer_than
 
 from ddqn_planner import Experience, GridMap
 from ddqn_planner.experience import ExperienceFileError

@@ -15,10 +15,10 @@ from typing import Any
 import numpy as np
 import pytest
 import yaml
-from damage import memory_grows_less_than
 from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as numpy_st
+from limits import memory_grows_less_than
 from PIL import Image
 from strategies import grids_with_directions
 

@@ -12,9 +12,9 @@ from typing import Any
 import numpy as np
 import pytest
 import safetensors.numpy
-from damage import memory_grows_less_than
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from limits import memory_grows_less_than
 from networks import random_network
 from strategies import grids_with_costs
 

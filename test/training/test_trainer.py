@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from damage import memory_grows_less_than
+from limits import memory_grows_less_than
 from safetensors import safe_open
 
 from ddqn_planner import GridMap, MoveRule, PlanStatus

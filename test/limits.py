@@ -1,4 +1,4 @@
-"""Full disks, and how much memory a file takes to read."""
+"""Limits to the files and the memory of a test."""
 
 from __future__ import annotations
 
