@@ -7,16 +7,13 @@ import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import gymnasium
-import matplotlib.pyplot as plt
 import nano_astar
 import numpy as np
 import pyastar2d
 import torch
-from figures import COLOURS
 from random_maps import KINDS, Random, generate_map
 from stable_baselines3 import DQN
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
@@ -27,8 +24,6 @@ from ddqn_planner import GridMap, MoveRule, Planner, QField
 from ddqn_planner.grid import Cell, shortest_distances
 from ddqn_planner.grid.arguments import Occupancy
 from ddqn_planner.grid.noise import random_costs, random_requests
-from ddqn_planner.planning.field import DistanceField
-from ddqn_planner.planning.kernels import CLOSED
 from ddqn_planner.training.environment import GridEnvironment, paper_scenario
 from ddqn_planner.training.hyper_parameters import HyperParameters
 from ddqn_planner.training.trainer import Trainer
@@ -40,7 +35,6 @@ STEPS, TRAINING_ROUNDS = 3_000, 5
 FLIPPED = 10  # cells that a change near a place flips, of the 25 around it
 WALL = 41  # cells of a wall that opens or closes
 SHORTEST = 40  # moves of the shortest path for replans: robot and goal are far from each other
-IMAGES = Path(__file__).resolve().parents[1] / "docs" / "images"
 
 Call = Callable[[], Any]  # what is timed; a `Callable[[], Call]` makes all that it needs
 LOADED = Planner.load("any_map")
@@ -292,64 +286,10 @@ def measure_training() -> list[bool]:
     return [report(figure, ratio, "x", 1.5, at_most=False)]
 
 
-def draw_visited_cells() -> None:
-    """Draw what one request visits, beside A* and Dijkstra's algorithm."""
-    random = np.random.default_rng(1)
-    grid = GridMap(generate_map("office", (160, 160), random))
-    requests = random_requests(grid.occupancy, RULE, 30, random)
-    start, goal = max(requests, key=lambda cells: math.dist(*cells))
-    planner = new_planner()
-    plan = planner.plan(grid, start, goal, RULE)
-    field = planner.q_field(grid, goal, RULE)
-    assert isinstance(field, DistanceField)
-    closed = field.known.state.reshape(grid.height + 2, -1)[1:-1, 1:-1] == CLOSED
-    cells = start[::-1], goal[::-1]
-    _, _, history = nano_astar.astar(grid.occupancy.astype(np.uint8), *cells, return_history=True)
-    by_a_star = np.zeros_like(closed)
-    by_a_star[tuple(history.T)] = True
-    distances = shortest_distances(grid, goal, RULE)
-    by_dijkstra = distances <= distances[start[::-1]]
-    figure, axes = plt.subplots(1, 3, figsize=(10.5, 3.9), layout="constrained")
-    panels = {"this planner": closed, "A* (nano-astar)": by_a_star, "Dijkstra": by_dijkstra}
-    for axis, (name, visited) in zip(axes, panels.items(), strict=True):
-        colours = np.full((*visited.shape, 3), 1.0)
-        colours[visited] = (0.68, 0.83, 0.93)
-        colours[grid.occupancy] = (0.35, 0.35, 0.35)
-        axis.imshow(colours, origin="lower", interpolation="nearest")
-        axis.plot(*np.transpose(plan.cells), color="#D55E00", linewidth=1.5)
-        axis.plot(*start, "o", *goal, "*", color="black", markersize=7)
-        axis.set(xticks=[], yticks=[], title=f"{name}: {np.count_nonzero(visited):,} cells")
-    figure.savefig(IMAGES / "visited_cells.png", dpi=120)
-
-
-def draw_times() -> None:
-    """Draw the time of a request on a new map against the length of its path."""
-    sides = (256, 512, 1024, 2000)
-    shared: dict[str, Any] = {"sharex": True, "sharey": True, "layout": "constrained"}
-    figure, axes = plt.subplots(1, len(sides), figsize=(10.5, 3.2), **shared)
-    for axis, side in zip(axes, sides, strict=True):
-        for kind, colour in zip(MAP_KINDS, COLOURS, strict=True):
-            random, points = np.random.default_rng(0), []
-            occupancy = generate_map(kind, (side, side), random)
-            for cells in random_requests(occupancy, RULE, 2 * REQUESTS, random):
-                ((took,), (plan,)) = take_turns(partial(new_request, occupancy, *cells))
-                points.append((plan.length, took))
-            axis.loglog(*np.transpose(points), ".", color=colour, label=kind)
-        axis.set(title=f"{side} x {side}", xlabel="length of the path, cells")
-        axis.grid(alpha=0.3)
-    axes[0].set_ylabel("CPU time, ms")
-    axes[0].legend(fontsize=8)
-    figure.savefig(IMAGES / "request_times.png", dpi=120)
-
-
-def main(arguments: Sequence[str]) -> int:
-    """Print each figure beside its bound, or draw (--pictures); return 1 if a bound is missed."""
+def main() -> int:
+    """Print each figure beside its bound; return 1 if one is missed."""
     torch.set_num_threads(1)
     gc.freeze()  # else this process pauses to look for garbage among what it has imported
-    if "--pictures" in arguments:
-        draw_visited_cells()
-        draw_times()
-        return 0
     missed = measure_paper_map() + measure_training()
     for side in (256, 1024):
         missed += measure_requests(side)
@@ -361,4 +301,4 @@ def main(arguments: Sequence[str]) -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]))
+    sys.exit(main())
