@@ -64,9 +64,7 @@ class Work:
             grid = fixture.grid
             start, goal, *_ = grid.free_cells()
             save_map(MapFile(fixture.values, grid.resolution, grid.origin, start, goal), path)
-        grid = self._maps[-1].grid
-        cells = random_requests(grid.occupancy, ros.RULE, STEADY_FIELDS, np.random.default_rng(0))
-        self._steady = [ros.plan_request(grid, *both) for both in cells]
+        self._steady = self._maps[-1].requests(STEADY_FIELDS, np.random.default_rng(0))
         self._bad_map = folder / "bad.yaml"
         self._bad_map.write_text("image: [", encoding="utf-8")
         self.lost = 0
