@@ -11,28 +11,20 @@ from figures import draw_map, draw_path, save_figure
 from matplotlib.patches import Rectangle
 from numpy.typing import NDArray
 from tables import mean_and_worst, median_and_range, table
-from trainings import (
-    MOVE_RULE,
-    PROFILES,
-    Settings,
-    Training,
-    in_parallel,
-    optimal_length,
-    rollouts,
-    solved,
-)
+from trainings import MOVE_RULE, PROFILES, Settings, Training, in_parallel, optimal_length, rollouts
 
-from ddqn_planner import Plan, PlanStatus
 from ddqn_planner.grid import (
     LENGTHS,
     Cell,
     Noise,
     legal_moves,
     neighbours,
+    path_length,
     scatter_obstacles,
     shortest_distances,
     shortest_path,
 )
+from ddqn_planner.planning import Planner
 from ddqn_planner.planning.paths import search
 from ddqn_planner.training.environment import Scenario, paper_scenario
 from ddqn_planner.training.hyper_parameters import HyperParameters
@@ -45,8 +37,7 @@ EVALUATION_INTERVAL = 1_000
 SUPERVISED_UPDATES, SUPERVISED_BATCH, SUPERVISED_LEARNING_RATE = 10_000, 128, 0.003
 KEPT = "kept.safetensors"
 COLUMNS = (
-    "new obstacles | planner | training maps solved | test maps solved | without action masking | "
-    "mean length / optimum | worst"
+    "new obstacles | planner | training maps solved | test maps solved | mean length / optimum"
 )
 
 
@@ -146,42 +137,33 @@ def report(settings: Settings) -> str:
     rows = []
     for noise in settings.noise:
         training, test = drawn_maps(settings, noise)
-        models = {}
+        maps, lengths = [*training, *test], {}
         for label, (folder, parameters) in networks(settings).items():
             name = f"{noise.value}/{folder}"
-            models[label] = settings.planners(name, KEPT)
+            lengths[label] = _lengths(settings.planners(name, KEPT), maps)
             # Obstacles on the path alone can be avoided by one fixed path.
             if parameters.network == "paper" and noise is Noise.NEAR_PATH:
                 taught = {f"{name}/supervised": replace(parameters, steps=SUPERVISED_UPDATES)}
                 jobs = settings.trainings(taught, training)
                 in_parallel(train_supervised, jobs, settings.backend)
-                models[f"{label}, supervised"] = settings.planners(*taught)
-        for label, planners in models.items():
-            plans = [rollouts(planner, [*training, *test]) for planner in planners]
-            rows.append([noise.value, label, *_columns(plans, test)])
+                lengths[f"{label}, supervised"] = _lengths(settings.planners(*taught), maps)
         path = fixed_path(training)
-        succeeded = Plan(PlanStatus.SUCCEEDED, np.array(path)), Plan(PlanStatus.ROLLOUT_TRAPPED)
-        fixed = [succeeded[not all(map(s.grid.is_free, path))] for s in [*training, *test]]
-        rows.append([noise.value, "one fixed path", *_columns([(fixed, fixed)], test)])
-    return f"{table(COLUMNS, rows)}\n\n{_draw(settings)}"
+        is_free = [all(map(scenario.grid.is_free, path)) for scenario in maps]
+        lengths["one fixed path"] = np.where([is_free], path_length(path, MOVE_RULE), np.nan)
+        optimum = np.array([optimal_length(scenario) for scenario in test])
+        for label, of_seeds in lengths.items():
+            parts = np.split(np.isfinite(of_seeds), [len(training)], axis=1)
+            counts = [median_and_range(part.sum(axis=1).tolist()) for part in parts]
+            ratios = [ratio[np.isfinite(ratio)] for ratio in of_seeds[:, len(training) :] / optimum]
+            rows.append([noise.value, label, *counts, mean_and_worst(ratios)[0]])
+    drawn = table(f"new obstacles | planner | {COLUMNS}", rows), _draw(settings)
+    return "\n\n".join(drawn)
 
 
-def _columns(
-    of_seeds: Sequence[tuple[list[Plan], list[Plan]]], test: Sequence[Scenario]
-) -> list[str]:
-    """Return cells of the table for each seed's `rollouts`: the last are those on the test maps."""
-    optimum = [optimal_length(scenario) for scenario in test]
-    on_test = [(masked[-len(test) :], unmasked[-len(test) :]) for masked, unmasked in of_seeds]
-    ratios = [
-        [plan.length / least for plan, least in zip(plans, optimum, strict=True) if plan.cells]
-        for plans, _ in on_test
-    ]
-    return [
-        median_and_range([solved(masked[: -len(test)]) for masked, _ in of_seeds]),
-        median_and_range([solved(masked) for masked, _ in on_test]),
-        median_and_range([solved(unmasked) for _, unmasked in on_test]),
-        *mean_and_worst(ratios),
-    ]
+def _lengths(planners: Sequence[Planner], maps: Sequence[Scenario]) -> NDArray[np.float64]:
+    """Return the length of each planner's path on each map, (P, M), NaN without one."""
+    plans = [rollouts(planner, maps)[0] for planner in planners]
+    return np.array([[p.length if p.cells else np.nan for p in of_planner] for of_planner in plans])
 
 
 def _draw(settings: Settings) -> str:

@@ -16,16 +16,7 @@ from typing import Any
 
 import numpy as np
 import processes
-from client import (
-    RULE,
-    Client,
-    MapFixture,
-    ask,
-    generated_map,
-    map_message,
-    plan_request,
-    wait_for,
-)
+from client import RULE, Client, MapFixture, ask, generated_map, map_message, plan_request, wait_for
 from nav_msgs.msg import OccupancyGrid
 from nav_msgs.msg import Path as PathMessage
 from nav_msgs.srv import GetPlan
