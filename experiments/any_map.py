@@ -9,14 +9,13 @@ import goal_3
 import numpy as np
 from random_maps import generate_map
 from tables import median_and_range, table
-from trainings import MOVE_RULE, Settings, Training, rollouts, solved
+from trainings import MOVE_RULE, SCENARIO, Settings, Training, rollouts, solved
 
 from ddqn_planner import GridMap, MoveRule, Planner
 from ddqn_planner.grid import OCCUPIED, UNKNOWN, legal_moves, move_costs
 from ddqn_planner.grid.noise import random_costs
 from ddqn_planner.model import AnyMapQNetwork
 from ddqn_planner.training.any_map import ANY_MAP, RULES, random_scenarios
-from ddqn_planner.training.environment import paper_scenario
 from ddqn_planner.training.evaluation import evaluate
 
 PAPERS_REWARD: Final = {"reward": "paper", "goal_reward": 10.0}
@@ -59,13 +58,13 @@ def report(settings: Settings) -> str:
 
 
 def _zero_shot(settings: Settings) -> list[list[str]]:
-    shipped, scenario = Planner.load("any_map"), paper_scenario()
+    shipped = Planner.load("any_map")
     planner = Planner(shipped.network, replace(shipped.metadata, move_rule=MOVE_RULE))
-    plan, milliseconds = goal_1.timed_plan(planner, scenario)
-    field = planner.q_field(scenario.grid, scenario.goal)
+    plan, milliseconds = goal_1.timed_plan(planner)
+    field = planner.q_field(SCENARIO.grid, SCENARIO.goal)
     # The given start, goal i, is one of the starts.
-    starts = evaluate(field, scenario.grid, MOVE_RULE)
-    unmasked = evaluate(field.unmasked(), scenario.grid, MOVE_RULE).solved
+    starts = evaluate(field, SCENARIO.grid, MOVE_RULE)
+    unmasked = evaluate(field.unmasked(), SCENARIO.grid, MOVE_RULE).solved
     rows = [
         ["goal i, length", f"{plan.length:.2f}"],
         ["planning time, ms", f"{milliseconds:.2f}"],

@@ -11,7 +11,7 @@ from figures import draw_map, draw_path, save_figure
 from matplotlib.patches import Rectangle
 from numpy.typing import NDArray
 from tables import mean_and_worst, median_and_range, table
-from trainings import MOVE_RULE, PROFILES, Settings, Training, in_parallel, optimal_length, rollouts
+from trainings import MOVE_RULE, PROFILES, SCENARIO, Settings, Training, in_parallel, rollouts
 
 from ddqn_planner.grid import (
     LENGTHS,
@@ -26,7 +26,7 @@ from ddqn_planner.grid import (
 )
 from ddqn_planner.planning import Planner
 from ddqn_planner.planning.paths import search
-from ddqn_planner.training.environment import Scenario, paper_scenario
+from ddqn_planner.training.environment import Scenario
 from ddqn_planner.training.hyper_parameters import HyperParameters
 from ddqn_planner.training.trainer import Trainer
 
@@ -43,13 +43,12 @@ COLUMNS = (
 
 def noisy_maps(training: int, test: int, noise: Noise) -> tuple[list[Scenario], list[Scenario]]:
     """Draw training and test maps, all different, with new obstacles on or near goal i's path."""
-    scenario = paper_scenario()
-    path = shortest_path(scenario.grid, scenario.start, scenario.goal, MOVE_RULE)
+    path = shortest_path(SCENARIO.grid, SCENARIO.start, SCENARIO.goal, MOVE_RULE)
     random = np.random.default_rng(NOISE_SEED)
     scenarios: dict[str, Scenario] = {}
     while len(scenarios) < training + test:
-        grid, _ = scatter_obstacles(scenario.grid, path, MOVE_RULE, random, noise)
-        scenarios.setdefault(grid.fingerprint, replace(scenario, grid=grid))
+        grid, _ = scatter_obstacles(SCENARIO.grid, path, MOVE_RULE, random, noise)
+        scenarios.setdefault(grid.fingerprint, replace(SCENARIO, grid=grid))
     drawn = list(scenarios.values())
     return drawn[:training], drawn[training:]
 
@@ -126,10 +125,9 @@ def fixed_path(maps: Sequence[Scenario]) -> tuple[Cell, ...]:
 
     It does not depend on the map at hand: a network that sees the map must do better.
     """
-    paper = paper_scenario()
     occupied = sum(scenario.grid.occupancy.astype(np.float32) for scenario in maps)
-    legal = legal_moves(paper.grid.occupancy, MOVE_RULE)
-    return search(paper.start, paper.goal, legal, np.float32(1) + occupied, MOVE_RULE)
+    legal = legal_moves(SCENARIO.grid.occupancy, MOVE_RULE)
+    return search(SCENARIO.start, SCENARIO.goal, legal, np.float32(1) + occupied, MOVE_RULE)
 
 
 def report(settings: Settings) -> str:
@@ -150,7 +148,8 @@ def report(settings: Settings) -> str:
         path = fixed_path(training)
         is_free = [all(map(scenario.grid.is_free, path)) for scenario in maps]
         lengths["one fixed path"] = np.where([is_free], path_length(path, MOVE_RULE), np.nan)
-        optimum = np.array([optimal_length(scenario) for scenario in test])
+        distances = (shortest_distances(s.grid, s.goal, MOVE_RULE) for s in test)
+        optimum = np.array([d[SCENARIO.start[::-1]] for d in distances])
         for label, of_seeds in lengths.items():
             parts = np.split(np.isfinite(of_seeds), [len(training)], axis=1)
             counts = [median_and_range(part.sum(axis=1).tolist()) for part in parts]
@@ -172,7 +171,7 @@ def _draw(settings: Settings) -> str:
     figure, panels = plt.subplots(
         count, 3, figsize=(12, 4.2 * count), layout="constrained", squeeze=False
     )
-    before, legend = paper_scenario().grid.occupancy, dict[str, Any]()
+    before, legend = SCENARIO.grid.occupancy, dict[str, Any]()
     for noise, row in zip(settings.noise, panels, strict=True):
         planners = {
             label: settings.planners(f"{noise.value}/{folder}", KEPT)[0]

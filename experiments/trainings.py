@@ -16,14 +16,15 @@ from tqdm import tqdm
 
 from ddqn_planner.cli import HelpFormatter
 from ddqn_planner.files import write_csv
-from ddqn_planner.grid import MoveRule, Noise, neighbours, shortest_distances
+from ddqn_planner.grid import MoveRule, Noise, neighbours
 from ddqn_planner.planning import Plan, Planner
-from ddqn_planner.training.environment import GridVectorEnvironment, Scenario
+from ddqn_planner.training.environment import GridVectorEnvironment, Scenario, paper_scenario
 from ddqn_planner.training.hyper_parameters import HyperParameters
 from ddqn_planner.training.networks import value_iteration
 from ddqn_planner.training.run import TrainingRun
 from ddqn_planner.training.trainer import Trainer
 
+SCENARIO: Final = paper_scenario()
 MOVE_RULE: Final = MoveRule.CORNER_CUTTING  # by it the paper's 22.97 is the shortest path
 BACKENDS: Final = ("loky", "ray", "dask", "sequential")  # of joblib: this machine, or a cluster
 HIDDEN_UNITS: Final = (0, 128)  # of the paper's network for goal iii; 0 for no hidden layer
@@ -203,12 +204,6 @@ def rollouts(planner: Planner, scenarios: Sequence[Scenario]) -> tuple[list[Plan
 def solved(plans: Sequence[Plan]) -> int:
     """Count the plans that reach the end."""
     return sum(bool(plan.cells) for plan in plans)
-
-
-def optimal_length(scenario: Scenario) -> float:
-    """Return the length of the shortest path from start to goal, cells."""
-    distances = shortest_distances(scenario.grid, scenario.goal, MOVE_RULE)
-    return float(distances[scenario.start[::-1]])
 
 
 def optimal_value(environment: GridVectorEnvironment) -> NDArray[np.float32]:

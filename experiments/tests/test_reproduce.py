@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 import trainings
 from goal_1 import convergence_row
-from goal_2 import free_starts, trained_field
+from goal_2 import STARTS, trained_field
 from goal_3 import best_moves, fixed_path, noisy_maps, train_supervised
 from networks import random_network
 from PIL import Image
@@ -200,9 +200,9 @@ def test_the_q_that_the_loss_trains_adds_up_the_papers_rewards(paper: Scenario) 
     network.tensors["moves.bias"].fill(100.0)
     planner = Planner(network, metadata)
     ratios = length_ratios(planner.q_field(paper.grid, paper.goal), paper.grid, trainings.MOVE_RULE)
-    assert free_starts(paper).sum() == 286
-    assert 0 < np.isfinite(ratios)[free_starts(paper)].sum() < 286
-    field = trained_field(planner, paper)
+    assert STARTS.sum() == 286
+    assert 0 < np.isfinite(ratios)[STARTS].sum() < 286
+    field = trained_field(planner)
     goal_x, goal_y = paper.goal
     assert field.q[0, goal_y, goal_x - 1] == pytest.approx(10.0, abs=1e-3)
     # Two moves before the end: Section 4.2's reward of one, and the end's, discounted.
