@@ -1,7 +1,6 @@
 """Kills each node in turn while it works, starts it again, and checks that nothing is broken."""
 
 import array
-import random
 import tempfile
 import time
 from collections import Counter
@@ -52,7 +51,7 @@ class Faults(Client):
         self.maps = self.subscribe(OccupancyGrid, "map", LATCHED, keep=1)
         self.plans = self.subscribe(PathMessage, "plan", LATCHED, keep=1)
         self.diagnostics = self.subscribe(DiagnosticArray, "/diagnostics", keep=20)
-        self.draw, self.random = random.Random(0), np.random.default_rng(0)
+        self.random = np.random.default_rng(0)
         self.map_path, self.training_folder = folder / "map.yaml", folder / "training"
         occupancy = generate_map("office", (SIDE, SIDE), self.random)
         (ends,) = random_requests(occupancy, RULE, 1, self.random)
@@ -88,19 +87,12 @@ class Faults(Client):
             service.remove_pending_request(future)
         return [future.result() for _, future in calls]
 
-    def ask(
-        self,
-        service_type: Any,
-        name: str,
-        request: Any = None,
-        accept: Callable[[Any], Any] = bool,
-        try_time: float = TRY_TIME,
-    ) -> Any:
+    def ask(self, kind: Any, name: str, request: Any, accept: Any, wait: float = TRY_TIME) -> Any:
         """Ask until an answer is accepted; return it."""
 
         def answer() -> Any:
             with suppress(TimeoutError):
-                found = self.call(service_type, name, request, try_time)
+                found = self.call(kind, name, request, wait)
                 if accept(found):
                     return found
             time.sleep(0.05)
@@ -113,11 +105,7 @@ class Faults(Client):
         name = f"/training/trainer/{name}"
         return str(self.ask(Trigger, name, None, lambda it: it.success, START_TIME).message)
 
-    def ask_for_plan(
-        self,
-        request: GetPlan.Request,
-        accept: Callable[[Any], Any] = lambda it: it.plan.poses,
-    ) -> PathMessage:
+    def ask_for_plan(self, request: Any, accept: Any = lambda it: it.plan.poses) -> PathMessage:
         """Ask for a plan until there is one, or an answer is accepted."""
         return self.ask(GetPlan, "planner/get_plan", request, accept).plan
 
@@ -151,7 +139,7 @@ class Faults(Client):
         get_plan = self.service(GetPlan, "planner/get_plan")
         requests = self.map.requests(GOALS, self.random)
         calls = [(get_plan, get_plan.call_async(request)) for request in requests]
-        time.sleep(self.draw.uniform(0.0, 1.0))
+        time.sleep(self.random.uniform(0.0, 1.0))
         for request, answer in zip(requests, self.kill("planner", tally, calls), strict=True):
             # All goals can be reached: the check refuses an empty path.
             tally["wrong paths"] += bool(answer and self.map.error(request, answer.plan))
@@ -167,9 +155,9 @@ class Faults(Client):
             *[(self.service(LoadMap, "map_server/load_map"), load)] * 4,
             (self.service(Trigger, "map_server/scatter_obstacles"), Trigger.Request()),
         ]
-        self.draw.shuffle(requests)
+        self.random.shuffle(requests)
         calls = [(service, service.call_async(request)) for service, request in requests]
-        time.sleep(self.draw.uniform(0.0, 2.0))
+        time.sleep(self.random.uniform(0.0, 2.0))
         self.kill("map_server", tally, calls)
         # The first answer must be a plan. With it, the plans of the last maps are out.
         self.check_plan(tally, self.watched, self.ask_for_plan, bool)
@@ -186,14 +174,14 @@ class Faults(Client):
     def kill_trainer(self, tally: Tally) -> None:
         """Kill the trainer while it saves after each step, soon after a save was seen to begin."""
         save = self.service(Trigger, "/training/trainer/save")
-        until = time.monotonic() + self.draw.uniform(0.2, 1.2)
+        until = time.monotonic() + self.random.uniform(0.2, 1.2)
         calls = []
         while time.monotonic() < until:
             calls.append((save, save.call_async(Trigger.Request())))
             time.sleep(0.002)
         while not self.temporaries() and time.monotonic() < until + LAST_WAIT:
             pass
-        time.sleep(self.draw.uniform(0.0, 0.002))
+        time.sleep(self.random.uniform(0.0, 0.002))
         self.kill("trainer", tally, calls)
         tally["in a save"] += bool(self.temporaries())
         # What it saved can be loaded.
@@ -203,7 +191,7 @@ class Faults(Client):
         if (checkpoint := model.with_name("checkpoint.safetensors")).exists():
             steps = Trainer.load_checkpoint(checkpoint, [paper_scenario()]).steps
         self.start("trainer")
-        self.ask(GetParameters, "/training/trainer/get_parameters")
+        self.ask(GetParameters, "/training/trainer/get_parameters", None, bool)
         message = self.trigger("start")
         # The planner that follows the trainer loads a model of its.
         self.set_parameters("/training/planner", model="any_map")

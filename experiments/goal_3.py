@@ -78,11 +78,8 @@ def trainings(settings: Settings) -> list[Training]:
 
 
 def train_supervised(training: Training) -> None:
-    """Train a network by cross-entropy on the moves of all shortest paths, unless it was trained.
-
-    This is a yardstick and not a planner: what the network fails to learn even then is a limit of
-    its architecture, not of how it learns.
-    """
+    """Train a network by cross-entropy on the moves of all shortest paths, unless it was before."""
+    # What it fails to learn even then is a limit of the network, not of how it learns.
     path = training.folder / "model.safetensors"
     if path.exists():
         return
@@ -121,10 +118,7 @@ def best_moves(scenario: Scenario) -> NDArray[np.bool_]:
 
 
 def fixed_path(maps: Sequence[Scenario]) -> tuple[Cell, ...]:
-    """Return the cheapest path if a cell costs 1, and 1 more for each map where it is occupied.
-
-    It does not depend on the map at hand: a network that sees the map must do better.
-    """
+    """Return the cheapest path if a cell costs 1, and 1 more for each map where it is occupied."""
     occupied = sum(scenario.grid.occupancy.astype(np.float32) for scenario in maps)
     legal = legal_moves(SCENARIO.grid.occupancy, MOVE_RULE)
     return search(SCENARIO.start, SCENARIO.goal, legal, np.float32(1) + occupied, MOVE_RULE)

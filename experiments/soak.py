@@ -25,7 +25,7 @@ from nav_msgs.srv import GetPlan, LoadMap
 from processes import claim_ros_domain, memory, run_script, running_node
 from rosgraph_msgs.msg import Clock
 from std_srvs.srv import Trigger
-from tables import table
+from tables import report
 
 from ddqn_planner import MoveRule, Planner
 from ddqn_planner.grid import Cell, MapFile, save_map
@@ -35,7 +35,7 @@ from ddqn_planner.nodes.runtime import LATCHED
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "examples"))
 from simulated_robot import STEP, Robot
 
-MINUTES, MAX_GROWTH = 30.0, 0.05
+MINUTES, MAX_GROWTH = 30.0, 5.0  # percent
 # Seconds between two samples of the memory, events of the robot, and pieces of work.
 PERIOD, EVENT_PERIOD, PAUSE = 5.0, 10.0, 0.02
 STEADY_FIELDS = 8  # that are computed before each sample
@@ -265,31 +265,26 @@ def main(arguments: Sequence[str]) -> int:
         ExitStack() as stack,
         ros.Client() as client,
     ):
-        drives = f"{folder}/drives"
+        of_trainer["output_folder"] = f"{folder}/drives"
         nodes = {
             "map_server_node": running_node("map_server_node", *quiet),
             "planner_node": running_node("planner_node", *quiet),
             "robot's planner": running_node("planner_node", *apart, **of_planner),
-            "robot's trainer": running_node(
-                "trainer_node", *apart, **of_trainer, output_folder=drives
-            ),
+            "robot's trainer": running_node("trainer_node", *apart, **of_trainer),
         }
         children = {name: stack.enter_context(node) for name, node in nodes.items()}
         robot = stack.enter_context(DrivenRobot())
         work = Work(client, Path(folder))
         samples = soak(children, work, minutes, robot)
-    for what in (work, robot):
-        done = ", ".join(f"{name} {count}" for name, count in sorted(what.done.items()))
-        print(f"{minutes:g} minutes: {done}; {what.lost} lost")
-    print(f"{robot.stale} stale answers; the robot's poses came by {SOURCE}")
-    rows, grows = [], False
+    done = ", ".join(f"{name} {count}" for name, count in sorted((work.done + robot.done).items()))
+    print(f"{minutes:g} minutes: {done}; the robot's poses came by {SOURCE}")
+    missed = [report("without an answer, or not recovered", work.lost + robot.lost, "", 0)]
+    missed.append(report("stale answers", robot.stale, "", 0))
     for name, sampled in samples.items():
         warm, last, share = growth(sampled)
-        megabytes = (f"{mb:.1f}" for mb in (sampled[0], warm, last))
-        rows.append([name, len(sampled), *megabytes, f"{share:+.1%}"])
-        grows |= share > MAX_GROWTH
-    print(table("node | samples | MB at start | warm | at end | growth", rows))
-    return int(bool(work.lost or robot.lost or robot.stale or grows))
+        figure = f"{name}: {warm:.1f} MB when warm, {last:.1f} MB at the end; growth"
+        missed.append(report(figure, 100 * share, "%", MAX_GROWTH))
+    return int(any(missed))
 
 
 if __name__ == "__main__":

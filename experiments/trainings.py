@@ -89,7 +89,7 @@ class Settings:
 
     def evaluations(self, name: str) -> list[Evaluations]:
         """Return the evaluations of the trainings with a name, one table per seed."""
-        return [read_evaluations(folder) for folder in self.folders(name)]
+        return [read_csv(folder / "evaluations.csv") for folder in self.folders(name)]
 
     def planners(self, name: str, file: str = "model.safetensors") -> list[Planner]:
         """Load the planners that the trainings with a name produced, one per seed."""
@@ -145,11 +145,11 @@ def _in_one_thread(job: Callable[[Any], Any], item: Any) -> Any:
 
 def train(training: Training) -> None:
     """Train and evaluate, or resume; keep the last network that solved the most scenarios, too."""
-    folder, parameters = training.folder, training.parameters
-    run = TrainingRun(folder, training.scenarios, MOVE_RULE, parameters, training.seed)
+    folder = training.folder
+    run = TrainingRun(folder, training.scenarios, MOVE_RULE, training.parameters, training.seed)
     with closing(run):
         trainer = run.trainer
-        before = read_evaluations(folder)
+        before = read_csv(folder / "evaluations.csv")
         before = before[before["step"] <= trainer.steps]
         rows = [dict(zip(before.dtype.names or (), row, strict=True)) for row in before.tolist()]
         optimum = optimal_value(trainer.environment)
@@ -186,7 +186,7 @@ def evaluate_training(
         "episodes": trainer.episodes,
         "seconds": round(seconds, 3),
         "solved": len(lengths),
-        "solved_unmasked": solved(unmasked),
+        "solved_unmasked": sum(bool(plan.cells) for plan in unmasked),
         "length": float(np.mean(lengths)) if lengths else np.nan,
         "overestimation": overestimation,
     }
@@ -199,11 +199,6 @@ def rollouts(planner: Planner, scenarios: Sequence[Scenario]) -> tuple[list[Plan
         [field.rollout(start) for field, start in fields],
         [field.unmasked().rollout(start) for field, start in fields],
     )
-
-
-def solved(plans: Sequence[Plan]) -> int:
-    """Count the plans that reach the end."""
-    return sum(bool(plan.cells) for plan in plans)
 
 
 def optimal_value(environment: GridVectorEnvironment) -> NDArray[np.float32]:
@@ -223,11 +218,7 @@ def optimal_value(environment: GridVectorEnvironment) -> NDArray[np.float32]:
 
 
 def read_csv(path: Path) -> NDArray[Any]:
-    """Return the columns of a file by their names."""
+    """Return the columns of a file by their names; none if there is no file."""
+    if not path.exists():
+        return np.empty(0, [("step", np.float64)])
     return np.genfromtxt(path, delimiter=",", names=True, ndmin=1, encoding="utf-8")
-
-
-def read_evaluations(folder: Path) -> Evaluations:
-    """Read ``evaluations.csv`` of a training's folder; empty if there is none."""
-    path = folder / "evaluations.csv"
-    return read_csv(path) if path.exists() else np.empty(0, [("step", np.float64)])

@@ -96,7 +96,7 @@ def test_a_training_that_was_cut_off_ends_as_if_it_had_not_been(
     trainings.train(whole)
     trainings.train(replace(cut, parameters=replace(QUICK, steps=600)))
     trainings.in_parallel(trainings.train, [cut])
-    runs = [trainings.read_evaluations(folder) for folder in folders]
+    runs = [trainings.read_csv(folder / "evaluations.csv") for folder in folders]
     assert runs[0]["step"].tolist() == [300, 600, 900]
     for name in set(runs[0].dtype.names or ()) - {"seconds"}:
         np.testing.assert_array_equal(runs[0][name], runs[1][name])
@@ -112,7 +112,7 @@ def test_the_last_of_the_networks_that_solve_the_most_is_kept(
     small: Scenario, tmp_path: Path
 ) -> None:
     trainings.train(trainings.Training(tmp_path, QUICK, (small,), seed=1, evaluation_interval=50))
-    solved = np.flatnonzero(trainings.read_evaluations(tmp_path)["solved"] == 1)
+    solved = np.flatnonzero(trainings.read_csv(tmp_path / "evaluations.csv")["solved"] == 1)
     assert len(solved) > 1
     assert load_model(tmp_path / "kept.safetensors")[1].steps == 50 * (solved[-1] + 1)
 
