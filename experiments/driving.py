@@ -52,8 +52,7 @@ class Job:
     kind: str
     seed: int
     missions: int
-    faults: bool = False
-    baselines: bool = True
+    faults: bool = False  # then without the baselines
 
     def world(self) -> World:
         """Return the world, always the same."""
@@ -126,7 +125,7 @@ def run(job: Job) -> Result:
         if job.faults and clock >= next_fault:
             seen, next_fault = worlds.with_faults(measured, faults), next_fault + FAULT_EVERY
         experience.record(seen.seconds, seen.positions)
-        if job.baselines:
+        if not job.faults:
             seconds[SHORTEST].append(path_seconds(planned(grid), truth, grid))
             for name, memory in memories.items():
                 cells = planned(memory.apply())
@@ -144,7 +143,7 @@ def measured_worlds(
     missions = QUICK_MISSIONS if options.quick else MISSIONS
     drawn = [(kind, seed) for kind in kinds for seed in range(options.seeds)]
     jobs = [Job(*world, missions) for world in drawn]
-    jobs += [Job(*world, min(missions, MOVED_AT), True, False) for world in drawn]
+    jobs += [Job(*world, min(missions, MOVED_AT), True) for world in drawn]
     results = in_parallel(run, jobs, options.backend, "world")
     return results[: len(drawn)], results[len(drawn) :]
 
