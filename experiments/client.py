@@ -362,7 +362,6 @@ def generated_map(kind: str, side: int, resolution: float = 0.05, seed: Any = 0)
     return MapFixture(MapFile(OCCUPIED * occupancy, resolution))
 
 
-def three_maps() -> list[MapFixture]:
-    """Return the maps that take turns; they are the same in each process."""
-    dilemma, office = (MapFixture(read_map_file(find_map(name))) for name in ("dilemma", "office"))
-    return [dilemma, generated_map("rooms", 200), office]
+def shipped_maps() -> dict[str, MapFixture]:
+    """Return two shipped maps, a small one and a large one."""
+    return {name: MapFixture(read_map_file(find_map(name))) for name in ("dilemma", "office")}

@@ -35,10 +35,16 @@ BURST_GOALS = 2  # as many as the fields of the greatest map that the planner ke
 REACH = 30  # cells from start to goal along an axis at most: short answers come fast
 
 
+def three_maps() -> list[ros.MapFixture]:
+    """Return the maps that take turns; they are the same in each process."""
+    dilemma, office = ros.shipped_maps().values()
+    return [dilemma, ros.generated_map("rooms", 200), office]
+
+
 def ask(seed: int, count: int, shared: SimpleNamespace) -> None:
     """Ask, and check each answer; the result is milliseconds, the number of empty ones, errors."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # it ends with its parent
-    random, maps = np.random.default_rng(seed), ros.three_maps()
+    random, maps = np.random.default_rng(seed), three_maps()
     milliseconds: list[float] = []
     errors: list[str] = []
     empty = 0
@@ -73,7 +79,7 @@ def ask(seed: int, count: int, shared: SimpleNamespace) -> None:
 
 def load_requests(planner: int, requests: int, clients: int) -> bool:
     """Ask a planner (a process with no other map yet) while maps change; return if it failed."""
-    context, maps = multiprocessing.get_context("spawn"), ros.three_maps()
+    context, maps = multiprocessing.get_context("spawn"), three_maps()
     number = len(maps)
     # Of the last map: its number where the planner is known to have it, and where it was published.
     confirmed, published = context.Value("i", number), context.Value("i", number)
@@ -125,7 +131,7 @@ def load_requests(planner: int, requests: int, clients: int) -> bool:
 
 def load_goals(goals: int) -> bool:
     """Send goals at 200 Hz; return whether a plan for an older goal followed a newer one's."""
-    office, random = ros.three_maps()[2], np.random.default_rng(0)
+    office, random = ros.shipped_maps()["office"], np.random.default_rng(0)
     grid = office.grid
     ((start, _),) = random_requests(grid.occupancy, ros.RULE, 1, random)
     reachable = np.argwhere(grid.reachable([start], ros.RULE))[:, ::-1]

@@ -28,7 +28,7 @@ from std_srvs.srv import Trigger
 from tables import report
 
 from ddqn_planner import MoveRule, Planner
-from ddqn_planner.grid import Cell, MapFile, save_map
+from ddqn_planner.grid import Cell
 from ddqn_planner.grid.noise import random_requests
 from ddqn_planner.nodes.runtime import LATCHED
 
@@ -52,21 +52,14 @@ EVENTS = ("clock back", "clock forward", "set elsewhere", *SILENCES)
 
 
 class Work:
-    """One piece of work per call, drawn at random; it writes its maps into a folder."""
+    """One piece of work per call, drawn at random."""
 
-    def __init__(self, client: ros.Client, folder: Path) -> None:
+    def __init__(self, client: ros.Client) -> None:
         self._client = client
         self._diagnostics = client.subscribe(DiagnosticArray, "/diagnostics", keep=1)
         self._draw = random.Random(0)
-        self._maps = ros.three_maps()
-        self._paths = [folder / f"{number}.yaml" for number in range(len(self._maps))]
-        for path, fixture in zip(self._paths, self._maps, strict=True):
-            grid = fixture.grid
-            start, goal, *_ = grid.free_cells()
-            save_map(MapFile(fixture.values, grid.resolution, grid.origin, start, goal), path)
-        self._steady = self._maps[-1].requests(STEADY_FIELDS, np.random.default_rng(0))
-        self._bad_map = folder / "bad.yaml"
-        self._bad_map.write_text("image: [", encoding="utf-8")
+        self._maps = ros.shipped_maps()
+        self._steady = self._maps["office"].requests(STEADY_FIELDS, np.random.default_rng(0))
         self.lost = 0
         self.done: Counter[str] = Counter()
 
@@ -75,7 +68,7 @@ class Work:
         client, draw, noise = self._client, self._draw, ("scatter_obstacles", "restore_map")
         # How often each kind of work is drawn, and what it does.
         work: dict[str, tuple[int, Callable[[], Any]]] = {
-            "map": (1, lambda: self._load(draw.choice(self._paths))),
+            "map": (1, lambda: self._load(draw.choice([*self._maps]))),
             "noise": (1, lambda: client.call(Trigger, f"map_server/{draw.choice(noise)}")),
             "model": (1, lambda: client.call(Trigger, "planner/reload_model")),
             "parameters": (1, lambda: self._set(draw.choice([*MoveRule]), draw.randint(1, 100))),
@@ -98,7 +91,7 @@ class Work:
         """Bring the nodes to the same state: the memory depends on the fields that are kept."""
         self._set("", 65)
         self._client.call(Trigger, "planner/reload_model")  # loaded again, it forgets all fields
-        loaded = self._load(self._paths[-1])
+        loaded = self._load("office")
         ros.wait_for_map(self._diagnostics, loaded.map.header.stamp)
         for steady in self._steady:
             self._client.call(GetPlan, "planner/get_plan", steady)
@@ -107,22 +100,22 @@ class Work:
         """Give each input once as it must not be."""
         client, bad = self._client, self._pose()
         bad.pose.position.x = math.nan
-        message = self._maps[0].message(1)
+        message = self._maps["dilemma"].message(1)
         message.info.width += 1
         client.publish("map", message, LATCHED)
         client.publish("initialpose", ros.initial_pose(bad))
         client.publish("goal_pose", bad)
         client.get_plan(bad, bad)
-        self._load(self._bad_map)
+        self._load("no_such_map")
         wrong = {"move_rule": "flying", "occupied_threshold": 0, "model": "no_such_model"}
         client.set_parameters("planner", **wrong)
 
-    def _load(self, path: Path) -> Any:
-        request = LoadMap.Request(map_url=str(path))
+    def _load(self, name: str) -> Any:
+        request = LoadMap.Request(map_url=f"{name}.yaml")
         return self._client.call(LoadMap, "map_server/load_map", request)
 
     def _pose(self) -> PoseStamped:
-        grid = self._draw.choice(self._maps).grid
+        grid = self._draw.choice([*self._maps.values()]).grid
         return ros.pose(grid, (self._draw.randrange(grid.width), self._draw.randrange(grid.height)))
 
 
@@ -136,7 +129,7 @@ class DrivenRobot(ros.Client):
         self._goals = self.node.create_publisher(PoseStamped, "goal_pose", 10)
         self._poses = ros.RobotPoses(self.node)
         self._diagnostics = self.subscribe(DiagnosticArray, "/diagnostics", keep=100)
-        self._map, self._planner = ros.three_maps()[0], Planner.load("any_map")
+        self._map, self._planner = ros.shipped_maps()["dilemma"], Planner.load("any_map")
         self._grid, self._draw = self._map.grid, random.Random(0)
         requests = random_requests(self._grid.occupancy, ros.RULE, 50, np.random.default_rng(0))
         self._cells = [start for start, _ in requests]
@@ -274,7 +267,7 @@ def main(arguments: Sequence[str]) -> int:
         }
         children = {name: stack.enter_context(node) for name, node in nodes.items()}
         robot = stack.enter_context(DrivenRobot())
-        work = Work(client, Path(folder))
+        work = Work(client)
         samples = soak(children, work, minutes, robot)
     done = ", ".join(f"{name} {count}" for name, count in sorted((work.done + robot.done).items()))
     print(f"{minutes:g} minutes: {done}; the robot's poses came by {SOURCE}")

@@ -47,14 +47,14 @@ def test_every_answer_is_right_while_the_map_changes_and_goals_are_planned_in_or
 
 
 def test_mixed_work_with_bad_input_is_answered_and_sampled(
-    tmp_path: Path, capfd: pytest.CaptureFixture[str]
+    capfd: pytest.CaptureFixture[str],
 ) -> None:
     with (
         running_node("map_server_node") as server,
         running_node("planner_node") as planner,
         Client() as client,
     ):
-        work = Work(client, tmp_path)
+        work = Work(client)
         work.bad_input()
         children = {"map_server_node": server, "planner_node": planner}
         samples = soak(children, work, minutes=0.05)
