@@ -39,7 +39,7 @@ COSTS: Final[dict[str, Callable[[Occupancy, Random], NDArray[np.int8] | None]]] 
 
 GOALS = 10  # of a generated map: each needs a Q field and exact distances
 OPTIMAL = 1 + 1e-6  # ratio to the optimum up to which a rollout is optimal
-AGREES = 1e-4  # relative difference from a file's optimum, beside the file's rounding
+AGREES = 1e-4  # relative difference from a file's optimum, which is rounded
 SUFFIXES: Final = (".map", ".scen", ".yaml", ".yml")  # of MovingAI and ROS
 COLUMNS: Final = (
     "maps | requests | success | without action masking | optimal | mean | worst | illegal | "
@@ -77,7 +77,6 @@ class BenchmarkMap:
     grid: GridMap
     requests: list[tuple[Cell, Cell]]
     optima: Sequence[float] | None = None
-    precision: float = 0.0  # greatest rounding error of an optimum, cells
 
 
 def generated_maps(
@@ -137,34 +136,28 @@ def _scenario_map(path: Path, scenario: Path, settings: RequestSettings) -> Benc
     """Read a MovingAI map, with requests of its scenario file: short and long paths alike."""
     random, rule = settings.random(path.stem), settings.move_rule
     grid = settings.grid(read_map_file(path).grid().occupancy, random)
-    labels, lines, decimals = grid.labels(rule), [], 0
-    for line in scenario.read_text(errors="replace").splitlines():
-        if not line.strip() or line.startswith("version"):
-            continue
-        try:
-            *sizes_and_ends, optimum = line.split()[-7:]
-            _, _, x, y, goal_x, goal_y = map(int, sizes_and_ends)
-            start, goal = (x, y), (goal_x, goal_y)
-            lines.append((start, goal, float(optimum)))
-        except ValueError:
-            words = "width, height, start x and y, goal x and y, optimal length"
-            raise ValueError(f"{scenario}: a line is {line!r}; give {words} at its end") from None
-        both_free = grid.is_free(start) and grid.is_free(goal)
-        if not both_free or labels[start[::-1]] != labels[goal[::-1]]:
-            raise ValueError(f"{scenario}: no path joins {start} and {goal} on this map")
-        decimals = max(decimals, len(optimum.partition(".")[2]))
-    if not lines:
+    try:
+        lines = np.loadtxt(scenario, usecols=range(-7, 0), comments="version", ndmin=2)
+    except ValueError as error:
+        words = "end each line with width, height, start x and y, goal x and y, optimal length"
+        raise ValueError(f"{scenario}: {error}; {words}") from None
+    if not len(lines):
         raise ValueError(f"{scenario}: has no requests; give a file with some")
-    lines.sort(key=itemgetter(2))
+    lines = lines[lines[:, -1].argsort(kind="stable")]
     # One from each of as many equal parts as requests.
     count = min(settings.requests, len(lines))
     edges = np.arange(count + 1) * len(lines) // count
-    drawn = [lines[index] for index in random.integers(edges[:-1], edges[1:]).tolist()]
-    requests = [(start, goal) for start, goal, _ in drawn]
+    drawn = lines[random.integers(edges[:-1], edges[1:])]
+    ends = drawn[:, 2:-1].astype(np.int64).tolist()
+    requests = [((x, y), (goal_x, goal_y)) for x, y, goal_x, goal_y in ends]
+    labels = grid.labels(rule)
+    for start, goal in requests:
+        both_free = grid.is_free(start) and grid.is_free(goal)
+        if not both_free or labels[start[::-1]] != labels[goal[::-1]]:
+            raise ValueError(f"{scenario}: no path joins {start} and {goal} on this map")
     known = rule is MoveRule.ROBOT_SAFE and grid.cost is None
-    optima = [optimum for _, _, optimum in drawn] if known else None
-    name = f"movingai {path.stem}"
-    return BenchmarkMap(name, str(path), grid, requests, optima, 0.5 * 10.0**-decimals)
+    optima = drawn[:, -1].tolist() if known else None
+    return BenchmarkMap(f"movingai {path.stem}", str(path), grid, requests, optima)
 
 
 @dataclass(frozen=True)
@@ -204,7 +197,7 @@ def measure(
                 arrived = cells[:1] == (start,) and cells[-1:] == (goal,)
                 cost = path_cost(cells, grid.cost_multiplier, move_rule) if arrived else math.inf
                 optimum = float(optima[start[::-1]])
-                agrees = math.isclose(told, optimum, rel_tol=AGREES, abs_tol=drawn.precision)
+                agrees = math.isclose(told, optimum, rel_tol=AGREES)
                 yield Rollout(
                     drawn.set_name,
                     drawn.name,

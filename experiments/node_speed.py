@@ -198,7 +198,8 @@ def measure_large_map(client: Client) -> Iterator[bool]:
 def measure_new_maps(client: Client) -> Iterator[bool]:
     """Measure how soon a new large map brings a path to the active goal."""
     plans, times = client.subscribe(PathMessage, "plan", LATCHED), []
-    small, office = message_of(GridMap(np.zeros((5, 5)))), generated_map("office", LARGE)
+    small = message_of(GridMap(np.zeros((5, 5), dtype=np.bool_)))
+    office = generated_map("office", LARGE)
     with processes.running_node("planner_node"):
         for turns in range(4):
             turned = MapFixture(MapFile(np.rot90(office.values, turns), 1.0))
