@@ -370,7 +370,3 @@ def main(arguments: Sequence[str] | None = None) -> int:
         parser.parse_args(arguments)  # ends with the help, or an error
     name, *others = arguments
     return exit_code(parser.prog, lambda: COMMANDS[name][1](parsers[name], others))
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -73,8 +73,7 @@ class WorkFolder:
             held = f"{folder} holds {reprlib.repr(names)} but no {content}"
             raise FolderError(f"{held}; give a new or empty folder")
         self.folder, self._after = folder, after
-        self.save_error = ""
-        """Why the last save failed; empty if it did not."""
+        self.save_error = ""  # why the last save failed; empty if it did not
         self._open_files = ExitStack()
         with self.opening() as files:
             # The system closes the file, and so unlocks it, when the process ends.

@@ -10,17 +10,3 @@ from ddqn_planner.model.model_file import (
     save_model,
 )
 from ddqn_planner.model.networks import AnyMapQNetwork, PaperQNetwork, PropagationQNetwork, QNetwork
-
-__all__ = [
-    "NETWORKS",
-    "AnyMapQNetwork",
-    "ModelFileError",
-    "ModelMetadata",
-    "PaperQNetwork",
-    "PropagationQNetwork",
-    "QNetwork",
-    "find_model",
-    "load_model",
-    "package_version",
-    "save_model",
-]

@@ -22,12 +22,8 @@ from ddqn_planner.nodes.report import Outcome
 from ddqn_planner.nodes.runtime import LATCHED, STEADY, Worker
 from ddqn_planner.planning import Planner, QField
 
-LOOK_PERIOD = 0.1
-"""Seconds between two looks whether something is new: no answer waits for what only shows it."""
-
-MAX_ARROWS = 10_000
-"""Per message: more arrows take longer to make than a plan, and are too small to see."""
-
+LOOK_PERIOD = 0.1  # seconds between two looks: no answer waits for what only shows it
+MAX_ARROWS = 10_000  # more take longer to make than a plan, and are too small to see
 LINE_WIDTH = 0.06  # in cells; larger arrows have wider lines
 HEIGHT = 0.01  # metres above the map, so that the map does not hide the arrows
 COLOUR = ColorRGBA(r=0.13, g=0.13, b=0.23, a=0.9)

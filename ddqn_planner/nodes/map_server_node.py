@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from contextlib import suppress
 from functools import partial
 from typing import Any, Final
@@ -147,6 +146,3 @@ def known_path(grid: GridMap, map_file: MapFile) -> tuple[MoveRule, list[Cell]]:
 
 
 main = partial(spin_until_shutdown, MapServerNode, PARAMETERS)
-
-if __name__ == "__main__":
-    sys.exit(main())

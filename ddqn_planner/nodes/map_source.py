@@ -37,11 +37,8 @@ UPDATES_QUALITY = QoSProfile(depth=100)
 
 REMEDY = "let the map's publisher send the full map"
 
-PATIENCE = 1.0
-"""Seconds within which the first map is expected after the node subscribes."""
-
-CHANGED_SHARE = 0.02
-"""Share of cells that may change, as by a person, before experience is spread anew, slowly."""
+PATIENCE = 1.0  # seconds within which the first map is expected after the node subscribes
+CHANGED_SHARE = 0.02  # of cells: with more, experience is spread anew over the map, slowly
 
 
 @dataclass

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import ctypes
-import sys
 import time
 from collections.abc import Callable
 from contextlib import suppress
@@ -105,7 +104,7 @@ class PlannerNode(ManagedNode):
         """Free the map, the model and its fields."""
         super().cleanup()
         self._forget()
-        self._report.forget()
+        self._report.refused.clear()
         self._report.note(NO_REQUEST)
         self.after_jump_back.clear()
         for name in ("_start", "_frames", "_display", "_map", "_requests"):
@@ -296,7 +295,3 @@ def main() -> int:
         for option in (-1, -3):  # M_TRIM_THRESHOLD, M_MMAP_THRESHOLD
             ctypes.CDLL(None).mallopt(option, 2**24)
     return spin_until_shutdown(PlannerNode, PLANNER_PARAMETERS)
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -16,8 +16,7 @@ from ddqn_planner.grid import Cell
 from ddqn_planner.nodes.runtime import BaseNode
 from ddqn_planner.planning import Plan, PlanMethod, Planner, PlanRequest, PlanStatus
 
-PERIOD = 1.0
-"""Seconds between two diagnostics when nothing changes."""
+PERIOD = 1.0  # seconds between two diagnostics when nothing changes
 
 TOLERANCE = ", or a greater tolerance"
 """The part of a remedy that does not help with several goals: none of them moves."""
@@ -55,11 +54,8 @@ class Outcome:
 
 
 NO_REQUEST = Outcome("NO_REQUEST", "no plan was asked for yet")
-NOT_ACTIVE = Outcome(
-    "NOT_ACTIVE",
-    "the node is not active; configure and activate it, with a lifecycle manager or "
-    "`ros2 lifecycle set`",
-)
+WAYS = "with a lifecycle manager or `ros2 lifecycle set`"
+NOT_ACTIVE = Outcome("NOT_ACTIVE", f"the node is not active; configure and activate it, {WAYS}")
 
 
 def reason_of(
@@ -136,10 +132,6 @@ class Refusals:
 
     def change(self) -> None:
         """Be told that something was refused or accepted."""
-
-    def forget(self) -> None:
-        """Forget all that was refused."""
-        self.refused.clear()
 
     def problems(self) -> list[str]:
         """Return what a user reads of all that is refused."""

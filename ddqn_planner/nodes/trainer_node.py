@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import importlib
-import sys
 import time
 from collections.abc import Iterator
 from contextlib import suppress
@@ -114,7 +113,7 @@ class TrainerNode(LearningNode):
             return False, explained(error)
         self.state, self.error, self.save_error = "training", "", ""
         self._is_stopping = self._is_saving = False
-        self.refusals.forget()
+        self.refusals.refused.clear()
         self._run, self._run_map = run, place
         self.get_logger().info(run.description)
         executor: Any = self.executor
@@ -237,6 +236,3 @@ def import_training() -> None:
 
 
 main = partial(spin_until_shutdown, TrainerNode, TRAINER_PARAMETERS)
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -4,13 +4,3 @@ from ddqn_planner.planning.field import QField
 from ddqn_planner.planning.paths import simplify
 from ddqn_planner.planning.plan import Plan, PlanMethod, PlanRequest, PlanStatus
 from ddqn_planner.planning.planner import Planner
-
-__all__ = [
-    "Plan",
-    "PlanMethod",
-    "PlanRequest",
-    "PlanStatus",
-    "Planner",
-    "QField",
-    "simplify",
-]

@@ -46,12 +46,14 @@ def test_what_is_kept_gives_what_is_computed_anew(
         )
 
 
-@pytest.mark.parametrize("is_of_the_same_robot", [True, False])
-def test_experience_that_was_forgotten_is_not_taken_over(is_of_the_same_robot: bool) -> None:
-    width = 0.5 if is_of_the_same_robot else 0.4
+@pytest.mark.parametrize("half_life", [900.0, 40.0])
+def test_experience_that_was_forgotten_or_fades_otherwise_is_not_taken_over(
+    half_life: float,
+) -> None:
     older = driven(straight((2, 3), (12, 3), 4))
     older.apply(HALL)
-    newer, again = (driven(straight((2, 8), (12, 8), 4), robot_width=width) for _ in range(2))
+    drive = straight((2, 8), (12, 8), 4) if half_life == 900 else straight((2, 3), (12, 3), 4)
+    newer, again = (driven(drive, half_life=half_life) for _ in range(2))
     newer.take_over(older)
     np.testing.assert_array_equal(newer.slowness(HALL), again.slowness(HALL))
     assert at(HALL, older.slowness(HALL), 7, 3) > 2
@@ -151,6 +153,9 @@ def test_failures_make_a_place_expensive_by_the_tries_that_it_takes() -> None:
     slowness = experience.slowness(HALL)
     assert at(HALL, slowness, 7, 5) > 1.5
     assert at(HALL, slowness, 3, 5) < 1.06
+    for _ in range(12):  # who succeeds there again and again forgets the failures
+        experience.record(*straight((2, 5), (12, 5)))
+    assert at(HALL, experience.slowness(HALL), 7, 5) < 1.1
     never_driven = Experience(SPEED)
     never_driven.record_failure((7, 5))
     # Two successes are assumed, so p = 2 / 3.
