@@ -30,3 +30,11 @@ def turning_planner(size: int = 6) -> Planner:
     network = turning_network(size)
     metadata = ModelMetadata("paper", network.sizes, MoveRule.ROBOT_SAFE, 0.9, "", 1, 0, "")
     return Planner(network, metadata)
+
+
+ANY_MAP = Planner.load("any_map")
+
+
+def new_planner() -> Planner:
+    """The shipped planner for any map, which knows no field."""
+    return Planner(ANY_MAP.network, ANY_MAP.metadata)

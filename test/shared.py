@@ -27,7 +27,7 @@ def paper() -> Scenario:
     return paper_scenario()
 
 
-@pytest.fixture
+@pytest.fixture(scope="session")
 def small() -> Scenario:
     """A 5x4 map with a wall that is open at its top."""
     occupancy = np.zeros((4, 5), dtype=bool)

@@ -6,8 +6,9 @@ import numpy as np
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as numpy_st
 
-from ddqn_planner.grid import GridMap
+from ddqn_planner.grid import GridMap, MoveRule
 
+RULES = st.sampled_from(list(MoveRule))
 occupancies = numpy_st.arrays(
     np.bool_,
     numpy_st.array_shapes(min_dims=2, max_dims=2, min_side=1, max_side=9),
@@ -60,3 +61,6 @@ def grids_with_directions(draw: st.DrawFn) -> tuple[GridMap, tuple[int, int]]:
 def cells_of(grid: GridMap) -> st.SearchStrategy[tuple[int, int]]:
     """Any cells of a map."""
     return st.tuples(st.integers(0, grid.width - 1), st.integers(0, grid.height - 1))
+
+
+GRIDS = grids_with_free_cell() | grids_with_costs() | grids_in_parts() | grids_with_directions()

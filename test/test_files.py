@@ -1,27 +1,14 @@
 from __future__ import annotations
 
-import resource
 import signal
 import subprocess
 import sys
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
+from limits import files_no_longer_than
 
-from ddqn_planner.files import Appender, WorkFolder, write_atomically
-
-
-@contextmanager
-def files_no_longer_than(size: int) -> Iterator[None]:
-    """Let a write fail in its middle, for any user, as on a full disk."""
-    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (size, hard))
-    try:
-        yield
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+from ddqn_planner.files import WorkFolder, write_atomically
 
 
 def test_a_write_that_fails_leaves_the_old_file_and_nothing_else(tmp_path: Path) -> None:
@@ -63,18 +50,3 @@ def test_a_kill_leaves_a_complete_file_and_a_temporary_that_can_be_removed(tmp_p
         other.touch()
     WorkFolder(tmp_path, ["file"], "files", "writes").close()
     assert sorted(tmp_path.iterdir()) == sorted([*others, path])
-
-
-def test_records_stay_complete_while_the_disk_is_full_for_a_time(tmp_path: Path) -> None:
-    path = tmp_path / "records"
-    records = Appender(path)
-    records.append(b"first\n")
-    with files_no_longer_than(10):
-        for record in (b"second\n", b"third\n"):
-            records.append(record)
-            with pytest.raises(OSError, match="too large"):
-                records.flush()
-        assert path.read_bytes() == b"first\nseco"
-    records.append(b"fourth\n")
-    records.close()
-    assert path.read_bytes() == b"first\nsecond\nthird\nfourth\n"

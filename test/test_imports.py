@@ -9,6 +9,8 @@ from pathlib import Path
 
 import pytest
 
+from ddqn_planner.compiled import compiled
+
 PLAN = """
 import numpy as np
 from ddqn_planner import GridMap, Planner, load_map
@@ -19,6 +21,9 @@ costs = np.arange(36).reshape(6, 6)
 for grid in (load_map(find_map("dilemma")), GridMap(np.zeros((6, 6), dtype=bool), cost=costs)):
     assert planner.plan(grid, grid.free_cells()[0], grid.free_cells()[-1]).cells
 assert Planner.load("dilemma").plan(load_map(find_map("dilemma")), (1, 1), (10, 12)).status
+# numba reads scipy's version, which is light.
+import sys
+assert not {"scipy.ndimage", "scipy.linalg"} & sys.modules.keys()
 """
 
 
@@ -51,6 +56,7 @@ UNUSED = {
     "import ddqn_planner": LARGE | {"numpy"},
     "import ddqn_planner.grid, ddqn_planner.model, ddqn_planner.planning": LARGE,
     GRID: LARGE,
+    PLAN: LARGE - {"numba", "scipy"},
     "from ddqn_planner import Experience; Experience(nominal_speed=0.5)": LARGE,
     "from ddqn_planner import Planner; Planner.load('any_map')": LARGE,
     COMMAND.format("--help"): {"numpy"},
@@ -63,14 +69,6 @@ UNUSED = {
 @pytest.mark.parametrize("code", UNUSED)
 def test_no_import_and_no_command_loads_a_library_that_it_does_not_need(code: str) -> None:
     assert not loaded(code) & UNUSED[code]
-
-
-def test_a_plan_needs_numba_alone() -> None:
-    # numba reads scipy's version, which is light.
-    code = PLAN + "\nimport sys\nassert not {'scipy.ndimage', 'scipy.linalg'} & sys.modules.keys()"
-    packages = loaded(code)
-    assert "numba" in packages
-    assert not packages & {"torch", "matplotlib", "gymnasium", "rclpy"}
 
 
 def test_the_public_names_are_known_before_they_are_loaded() -> None:
@@ -102,3 +100,13 @@ def test_compiling_is_announced_once_and_a_load_from_the_cache_is_not(tmp_path: 
     for expected in (f"{words}the next start\n", ""):
         done = subprocess.run(command, env=environment, check=True, capture_output=True, text=True)
         assert done.stderr == expected
+
+
+def test_where_no_folder_may_be_written_code_is_compiled_all_the_same(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def nowhere(*_: object) -> None:
+        raise RuntimeError("cannot cache function: no locator available")
+
+    monkeypatch.setattr("numba.core.dispatcher.Dispatcher.enable_caching", nowhere)
+    assert compiled(lambda x: x + 1)(1) == 2

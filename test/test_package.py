@@ -104,14 +104,22 @@ def test_maps_and_models_come_along_wherever_pip_installs(
             assert {path.name: path.read_bytes() for path in copy.iterdir()} == shipped
 
 
-def test_a_map_is_a_shipped_one_or_a_path() -> None:
+def test_a_map_is_a_shipped_one_or_a_path_or_a_file_of_a_package(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     shipped = ROOT / "maps" / "dilemma.yaml"
     for name in ("dilemma", "dilemma.yaml", "package://ddqn_planner/maps/dilemma.yaml"):
         assert find_map(name).resolve() == shipped
     assert find_map("file:///somewhere/map.yaml") == Path("/somewhere/map.yaml")
-    for name, named in (("no_such", "dilemma.yaml, office"), ("package://no_such/map.yaml", "")):
-        with pytest.raises(FileNotFoundError, match=f"no_such.*{named}"):
-            find_map(name)
+    with pytest.raises(FileNotFoundError, match=r"no_such.*dilemma\.yaml, office"):
+        find_map("no_such")
+    for name in ("ddqn_planner/maps/../../x", "ddqn_planner//etc/x", "no/../x", "no//etc/x"):
+        with pytest.raises(FileNotFoundError, match="leads out of its package"):
+            find_map(f"package://{name}")
+    monkeypatch.setenv("AMENT_PREFIX_PATH", str(tmp_path))
+    for name in ("", "no_such", "nul\0", "\ud800", "..", "x" * 5000):
+        with pytest.raises(FileNotFoundError, match="no such package"):
+            find_map(f"package://{name}/map.yaml")
 
 
 def test_a_file_hides_a_shipped_map_but_a_folder_does_not(

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import math
 import os
-import resource
-import signal
 from pathlib import Path
 
 import numpy as np
 import pytest
 from experience.straight_drives import straight
+from limits import files_no_longer_than
 
 from ddqn_planner import Experience, GridMap
 from ddqn_planner.experience import ExperienceFileError
@@ -274,17 +273,11 @@ def test_a_folder_is_locked_and_keeps_forgotten_experience(tmp_path: Path) -> No
 def test_nothing_is_lost_while_the_disk_is_full(tmp_path: Path) -> None:
     folder = opened(tmp_path)
     folder.add(DriveEnd.ARRIVED, *SLOW)
-    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
-    size = folder.record_path.stat().st_size
-    signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (size + 10, limits[1]))
-    try:
+    with files_no_longer_than(folder.record_path.stat().st_size + 10):
         for _ in range(3):
             folder.add(DriveEnd.ARRIVED, *SLOW)
             assert "make room" in folder.save_error
         assert numbers(tmp_path) == [1]
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
     folder.try_to_save()
     assert folder.save_error == ""
     folder.close()

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from itertools import product
 
 import numpy as np
@@ -8,7 +9,7 @@ import pytest
 import scipy.ndimage
 from hypothesis import given
 from hypothesis import strategies as st
-from strategies import grids_with_costs, grids_with_directions
+from strategies import RULES, grids_with_costs, grids_with_directions
 
 from ddqn_planner.grid import (
     LENGTHS,
@@ -25,8 +26,6 @@ from ddqn_planner.grid import (
     shortest_distances,
     shortest_path,
 )
-
-RULES = st.sampled_from(list(MoveRule))
 
 
 def test_a_rule_is_a_member_or_its_value() -> None:
@@ -106,16 +105,20 @@ def test_the_labels_are_those_of_scipy(seed: int, share: float, rule: MoveRule) 
     np.testing.assert_array_equal(GridMap(occupancy).labels(rule), expected)
 
 
-@given(grids_with_directions(), RULES)
-def test_reachable_cells_are_those_between_which_and_the_cell_a_path_leads(
-    grid_and_cell: tuple[GridMap, Cell], rule: MoveRule
+@given(grids_with_directions(), RULES, st.booleans(), st.data())
+def test_reachable_cells_are_those_that_a_path_joins_to_some_cells(
+    grid_and_cell: tuple[GridMap, Cell], rule: MoveRule, has_directions: bool, data: st.DataObject
 ) -> None:
-    grid, cell = grid_and_cell
-    from_there = np.isfinite(shortest_distances(grid, cell, rule))
-    np.testing.assert_array_equal(grid.reachable([cell], rule, backward=True), from_there)
-    reached = {other for other in grid.free_cells() if shortest_path(grid, cell, other, rule)}
-    found = {(x, y) for y, x in np.argwhere(grid.reachable([cell], rule)).tolist()}
-    assert found == reached
+    grid = grid_and_cell[0] if has_directions else replace(grid_and_cell[0], forbidden=None)
+    cells = data.draw(st.lists(st.sampled_from(grid.free_cells()), min_size=1, max_size=3))
+    distances = [shortest_distances(grid, cell, rule) for cell in cells]
+    backward = grid.reachable(cells, rule, backward=True)
+    np.testing.assert_array_equal(backward, np.isfinite(distances).any(axis=0))
+    forward = grid.reachable(cells, rule)
+    assert not forward[grid.occupancy].any()
+    for x, y in grid.free_cells():
+        distance = shortest_distances(grid, (x, y), rule)
+        assert forward[y, x] == any(np.isfinite(distance[cell[::-1]]) for cell in cells)
 
 
 @given(grids_with_directions(), RULES, st.data())

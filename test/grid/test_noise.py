@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from strategies import occupancies
+from strategies import RULES, occupancies
 
 from ddqn_planner.grid import (
     UNKNOWN,
@@ -44,14 +44,22 @@ def test_one_to_five_new_obstacles_lie_where_the_noise_says_and_leave_a_path(
 
 
 def test_a_path_that_leaves_no_obstacle_a_place_is_refused() -> None:
-    cases = ((4, Noise.NEAR_PATH, "left a path"), (2, Noise.ON_PATH, "lies on the path"))
-    for width, noise, named in (*cases, (2, Noise.NEAR_PATH, "lies on or next to the path")):
-        grid, path = GridMap(np.zeros((1, width))), [(x, 0) for x in range(width)]
+    corridor, short = (GridMap(np.zeros((1, width))) for width in (4, 2))
+    # In a ring one drives counter-clockwise, so the obstacle closes the short way back.
+    east, west = [0b00111000] * 5, [0b10000011] * 5
+    ring = GridMap([[0] * 5, [0, 1, 1, 1, 0], [0] * 5], forbidden=[east, [0] * 5, west])
+    for grid, noise, named in (
+        (corridor, Noise.NEAR_PATH, "left a path"),
+        (ring, Noise.ON_PATH, "left a path"),
+        (short, Noise.ON_PATH, "lies on the path"),
+        (short, Noise.NEAR_PATH, "lies on or next to the path"),
+    ):
+        path = [(x, 0) for x in range(grid.width)]
         with pytest.raises(ValueError, match=named):
             scatter_obstacles(grid, path, MoveRule.ROBOT_SAFE, np.random.default_rng(0), noise)
 
 
-@given(occupancies, st.sampled_from(list(MoveRule)), st.integers(0, 2**32 - 1))
+@given(occupancies, RULES, st.integers(0, 2**32 - 1))
 def test_a_path_joins_start_and_goal_of_each_request(
     occupancy: np.ndarray, rule: MoveRule, seed: int
 ) -> None:

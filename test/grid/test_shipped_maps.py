@@ -57,6 +57,8 @@ def greedy_neighbour_walk(paper: Scenario, start: Cell, rule: MoveRule) -> set[C
 
 def test_the_start_lies_in_a_dead_end_that_opens_away_from_the_end(paper: Scenario) -> None:
     assert paper.grid.occupancy.shape == (20, 20)
+    # Checkpoints name their maps so, and older ones still load.
+    assert Planner.load("dilemma").metadata.map_fingerprint == paper.grid.fingerprint
     assert len(set(paper.grid.free_cells()) - {paper.start, paper.goal}) == 286
     assert paper.start in START_DEAD_END
     assert len(START_DEAD_END - {paper.start}) == 10

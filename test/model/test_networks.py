@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from networks import random_network
 from strategies import grids_with_costs, grids_with_free_cell
 
-from ddqn_planner.grid import MOVES, OCCUPIED, Cell, GridMap, MoveRule, neighbours
+from ddqn_planner.grid import OCCUPIED, Cell, GridMap, MoveRule
 from ddqn_planner.model import NETWORKS, networks
 from ddqn_planner.model.move_costs import patches, unique_patches
 from ddqn_planner.model.networks import (
@@ -90,43 +90,29 @@ def test_the_propagation_networks_answer_on_each_patch_as_their_modules(
 def test_the_observation_shows_four_kinds_of_cell(grid_and_goal: tuple[GridMap, Cell]) -> None:
     grid, goal = grid_and_goal
     background = observation_background(grid.occupancy, goal)
-    for number, observation in enumerate(
-        observe(background, np.arange(grid.occupancy.size), grid.occupancy.shape)
-    ):
-        robot = (number % grid.width, number // grid.width)
-        for y in range(grid.height):
-            for x in range(grid.width):
-                kind = FREE if grid.is_free((x, y)) else OBSTACLE
-                kind = GOAL if (x, y) == goal else kind
-                assert observation[y, x] == (ROBOT if (x, y) == robot else kind)
+    shape = grid.occupancy.shape
+    observations = observe(background, np.arange(grid.occupancy.size), shape)
+    for robot, observation in zip(np.ndindex(shape), observations, strict=True):
+        expected = np.where(grid.occupancy, OBSTACLE, FREE).astype(np.float32)
+        expected[goal[::-1]] = GOAL
+        expected[robot] = ROBOT
+        np.testing.assert_array_equal(observation, expected)
     assert len({FREE, GOAL, OBSTACLE, ROBOT}) == 4
 
 
-@given(grids_with_free_cell())
+@given(grids_with_costs())
 def test_a_patch_is_the_3x3_cells_and_outside_is_occupied(
     grid_and_goal: tuple[GridMap, Cell],
 ) -> None:
     grid, _ = grid_and_goal
-    patch = patches(grid.occupancy, None).reshape(grid.height, grid.width, 3, 3)
-    next_cells = neighbours(grid.occupancy.shape).reshape(8, grid.height, grid.width)
-    for y in range(grid.height):
-        for x in range(grid.width):
-            for action, (dx, dy) in enumerate(MOVES.tolist()):
-                neighbour = (x + dx, y + dy)
-                assert patch[y, x, 1 + dy, 1 + dx] == (0 if grid.is_free(neighbour) else OCCUPIED)
-                inside = neighbour[1] * grid.width + neighbour[0]
-                expected = inside if grid.contains(neighbour) else grid.occupancy.size
-                assert next_cells[action, y, x] == expected
-
-
-@given(grids_with_costs())
-def test_cells_with_one_patch_id_have_the_same_patch(
-    grid_and_goal: tuple[GridMap, Cell],
-) -> None:
-    grid, _ = grid_and_goal
     for cost in (None, grid.cost):
+        cells = np.where(grid.occupancy, OCCUPIED, 0 if cost is None else cost)
+        padded = np.pad(cells, 1, constant_values=OCCUPIED)
+        found = patches(grid.occupancy, cost)
+        for (y, x), patch in zip(np.ndindex(cells.shape), found, strict=True):
+            np.testing.assert_array_equal(patch.reshape(3, 3), padded[y : y + 3, x : x + 3])
         patch_id, unique = unique_patches(grid.occupancy, cost)
-        np.testing.assert_array_equal(unique[patch_id.ravel()], patches(grid.occupancy, cost))
+        np.testing.assert_array_equal(unique[patch_id.ravel()], found)
         assert len(np.unique(unique, axis=0)) == len(unique)
 
 

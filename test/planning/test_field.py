@@ -12,23 +12,18 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from hypothesis.extra import numpy as numpy_st
+from networks import ANY_MAP, new_planner
 from random_maps import generate_map
-from strategies import cells_of, grids_with_costs, grids_with_directions, grids_with_free_cell
+from strategies import GRIDS, RULES, cells_of
 
-from ddqn_planner import GridMap, MoveRule, Planner, PlanStatus
-from ddqn_planner.grid import Cell, shortest_distances
+from ddqn_planner import GridMap, MoveRule, PlanStatus
+from ddqn_planner.grid import MOVES, Cell, legal_moves, shortest_distances
 from ddqn_planner.grid.noise import random_requests
+from ddqn_planner.model.move_costs import MoveCosts
 from ddqn_planner.planning import field as fields
 from ddqn_planner.planning import kernels
 from ddqn_planner.planning.field import DistanceField, network_field
-
-RULES = st.sampled_from(list(MoveRule))
-NETWORK, METADATA = (lambda planner: (planner.network, planner.metadata))(Planner.load("any_map"))
-GRIDS = grids_with_free_cell() | grids_with_costs() | grids_with_directions()
-
-
-def new_planner() -> Planner:
-    return Planner(NETWORK, METADATA)
 
 
 def fresh_field(grid: GridMap, goal: Cell, rule: MoveRule) -> DistanceField:
@@ -65,7 +60,7 @@ def test_the_whole_field_is_that_of_the_network(
     grid_and_goal: tuple[GridMap, Cell], rule: MoveRule
 ) -> None:
     grid, goal = grid_and_goal
-    field, q = fresh_field(grid, goal, rule), network_field(NETWORK, grid, goal, rule).q
+    field, q = fresh_field(grid, goal, rule), network_field(ANY_MAP.network, grid, goal, rule).q
     np.testing.assert_array_equal(field.legal, grid.legal_moves(rule))
     np.testing.assert_allclose(field.q, np.where(field.legal, q, -np.inf), rtol=1e-5)
 
@@ -89,6 +84,71 @@ def test_a_request_without_a_path_does_not_visit_the_whole_map() -> None:
     assert isinstance(field, DistanceField)
     assert not field.is_whole
     assert np.count_nonzero(field.known.distance) < 0.6 * occupancy.size
+
+
+# Values, against oracles
+
+
+PATCH_IDS = numpy_st.arrays(
+    np.int32,
+    numpy_st.array_shapes(min_dims=2, max_dims=2, min_side=1, max_side=9),
+    elements=st.integers(0, 3),
+)
+COSTS = numpy_st.arrays(
+    np.float32, (4, 8), elements=st.floats(1, 20, width=32) | st.just(float("inf"))
+)
+
+
+def propagate_values(patch_id: np.ndarray, cost_PA: np.ndarray, goal: Cell) -> np.ndarray:
+    """Return Q(s, a) toward a goal, given the costs of each patch: (8, H, W)."""
+    grid = GridMap(np.zeros(patch_id.shape))
+    patch_C = np.pad(patch_id, 1, constant_values=len(cost_PA)).ravel()
+    costs = MoveCosts.of_table(cost_PA).on(grid, patch_C)
+    return DistanceField((goal,), grid, costs, MoveRule.ROBOT_SAFE).q
+
+
+@given(PATCH_IDS, COSTS, st.data())
+def test_q_meets_bellmans_equation_whatever_the_costs(
+    patch_id: np.ndarray, cost: np.ndarray, data: st.DataObject
+) -> None:
+    height, width = patch_id.shape
+    goal = data.draw(cells_of(GridMap(np.zeros(patch_id.shape))))
+    q = propagate_values(patch_id, cost, goal)
+    value = q.max(axis=0)
+    value[goal[1], goal[0]] = 0
+    beyond = np.pad(value, 1, constant_values=-np.inf)
+    for action, (dx, dy) in enumerate(MOVES.tolist()):
+        after = beyond[1 + dy : 1 + dy + height, 1 + dx : 1 + dx + width]
+        np.testing.assert_allclose(q[action], after - cost[patch_id, action], rtol=1e-5)
+
+
+def test_values_keep_their_sense_at_any_distance() -> None:
+    # One corridor that winds through the whole map, over 100,000 moves long.
+    occupancy = np.zeros((501, 401), dtype=bool)
+    occupancy[1::4, 1:] = occupancy[3::4, :-1] = True
+    legal = legal_moves(occupancy, MoveRule.ROBOT_SAFE)
+    cost = np.where(legal, MoveRule.ROBOT_SAFE.lengths[:, None, None], np.inf)
+    patch_id = np.arange(occupancy.size, dtype=np.int32).reshape(occupancy.shape)
+    q = propagate_values(patch_id, cost.reshape(8, -1).T.astype(np.float32), (0, 500))
+    optimum = shortest_distances(GridMap(occupancy), (0, 500), MoveRule.ROBOT_SAFE)
+    assert optimum[0, 0] > 100_000
+    assert -q[:, 0, 0].max() == pytest.approx(optimum[0, 0])
+    # In a corridor each cell but the ends has one best neighbour, and the values tell which.
+    free = ~occupancy
+    free[500, 0] = False
+    assert (np.sort(q[:, free], axis=0)[-1] > np.sort(q[:, free], axis=0)[-2] + 0.5).all()
+
+
+@pytest.mark.parametrize("classes", [1, 100, 256])
+def test_a_map_may_hold_all_sets_of_directions(classes: int) -> None:
+    random = np.random.default_rng(classes)
+    forbidden = np.arange(1024).reshape(32, 32) % classes + (classes == 1)
+    grid = GridMap(random.random((32, 32)) < 0.1, forbidden=random.permuted(forbidden))
+    goal = grid.free_cells()[0]
+    exact = shortest_distances(grid, goal, MoveRule.ROBOT_SAFE)
+    value = new_planner().q_field(grid, goal).value.copy()
+    value[goal[::-1]] = 0
+    np.testing.assert_allclose(-value, exact, rtol=1e-2)
 
 
 # Repair

@@ -10,16 +10,15 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from strategies import grids_with_directions, grids_with_free_cell
+from networks import ANY_MAP
+from strategies import RULES, grids_with_directions, grids_with_free_cell
 
-from ddqn_planner import GridMap, MoveRule, Planner, PlanStatus, inflate
+from ddqn_planner import GridMap, MoveRule, PlanStatus, inflate
 from ddqn_planner.grid import Cell, path_length
 from ddqn_planner.planning import PlanRequest
 from ddqn_planner.planning.paths import is_path_valid
 from ddqn_planner.planning.planner import last_step
 
-RULES = st.sampled_from(list(MoveRule))
-ANY_MAP = Planner.load("any_map")
 ACTIONS = [(1, 0), (1, 1), (0, 1), (-1, 1), (-1, 0), (-1, -1), (0, -1), (1, -1)]
 RADII = [0, 0.5, 1, 1.5, 2, 3, math.inf]
 Cells = set[Cell]
@@ -115,20 +114,6 @@ def test_a_start_that_is_not_free_is_left_by_the_shortest_way(
         assert not is_path_valid(plan.cells, start, grid, rule)
         several = ANY_MAP.plan_nearest(grid, start, [goal], rule, "greedy", False, clearing_radius)
         assert several.cells == plan.cells
-
-
-def test_a_start_deeper_in_a_wall_than_the_radius_stays_occupied() -> None:
-    occupancy = np.zeros((5, 21), dtype=bool)
-    occupancy[:, 8:13] = True
-    grid, goal = GridMap(occupancy), (0, 2)
-    for start, radius, status in (
-        ((10, 2), 1.9, PlanStatus.START_OCCUPIED),
-        ((10, 2), 2, PlanStatus.SUCCEEDED),
-        ((11, 2), 2, PlanStatus.NO_PATH),  # the far side is no way, however near it is
-    ):
-        assert ANY_MAP.plan(grid, start, goal, start_clearing_radius=radius).status is status
-    with pytest.raises(ValueError, match="start_clearing_radius is nan"):
-        ANY_MAP.plan(grid, (10, 2), goal, start_clearing_radius=math.nan)
 
 
 def test_a_path_that_leaves_is_valid_until_another_obstacle_lies_on_it() -> None:
