@@ -1,8 +1,4 @@
-"""A robot learns by driving where it is slow, with the real nodes: 40 missions, or as many as said.
-
-It saves a film of the missions, a picture of what the robot learned, and a curve of the true time
-of its routes over the best possible.
-"""
+"""A robot learns by driving where it is slow, with the real nodes: in 40 missions, or so many."""
 
 import math
 import sys
@@ -77,9 +73,8 @@ class Driver:
 
     def known_slowness(self) -> Float64:
         """Return what the trainer says: (H, W)."""
-        message = self.wait("slowness", self.slowness)
-        shape = self.world.grid.occupancy.shape
-        return np.asarray(SLOWEST ** (np.array(message.data).reshape(shape).clip(0) / 100))
+        values = np.array(self.wait("slowness", self.slowness).data).clip(0)
+        return np.asarray(SLOWEST ** (values.reshape(self.world.grid.occupancy.shape) / 100))
 
     def drive(self, goal: Cell) -> Mission:
         """Drive to a station, and wait until the planner knows what that taught."""
@@ -98,9 +93,7 @@ class Driver:
         self.at = goal
         return self.mission(cells_of(grid, path), began, measured, slowness)
 
-    def mission(
-        self, learned: Sequence[Cell], now: float, measured: float, slowness: Float64
-    ) -> Mission:
+    def mission(self, learned: Any, now: float, measured: float, slowness: Float64) -> Mission:
         """Return a mission with the routes of those who know nothing and all beside the learned."""
         shortest, best = self.world.routes(self.planner, learned[0], learned[-1], now).values()
         routes = {"shortest": shortest, "learned": learned, "best possible": best}
@@ -167,7 +160,7 @@ def main(arguments: Sequence[str]) -> int:
             running(*robot) as robot_process,
         ):
             driver = Driver(client, world, [server, planner, trainer, robot_process])
-            missions: list[Mission] = []
+            missions = list[Mission]()
             for number in range(1, count + 1):
                 others = [station for station in world.stations if station != driver.at]
                 mission = driver.drive(others[random.integers(len(others))])

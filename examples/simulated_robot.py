@@ -50,6 +50,11 @@ class Robot:
         """Whether it has a path that it can follow."""
         return len(self._path) > 0
 
+    def header(self) -> Header:
+        """Return the header of its pose."""
+        stamp = Time(sec=int(self.now), nanosec=int(self.now % 1 * 1e9))
+        return Header(stamp=stamp, frame_id="map")
+
     def follow(self, path: NDArray[np.float64]) -> None:
         """Follow a path from now on, (N, 2) in metres; an empty one stops the robot."""
         away = np.hypot(*(path - (self.x, self.y)).T)
@@ -130,8 +135,7 @@ class RobotNode(Node):
         until = robot.now + min(behind, MOST_BEHIND)
         while robot.now + STEP <= until:  # the stamps are simulated: they run faster than the clock
             robot.step()
-            stamp = Time(sec=int(robot.now), nanosec=int(robot.now % 1 * 1e9))
-            self._poses.publish(Header(stamp=stamp, frame_id="map"), robot.x, robot.y, robot.yaw)
+            self._poses.publish(robot.header(), robot.x, robot.y, robot.yaw)
         # Where it stands without a path that it can join, it sends the goal again.
         if self._goal is None or robot.is_driving:
             self._waits_since = now

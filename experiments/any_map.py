@@ -1,6 +1,5 @@
 """The model for any map: the paper's goals on their unseen map, and what each idea contributes."""
 
-from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any, Final
 
@@ -9,14 +8,13 @@ import goal_3
 import numpy as np
 from random_maps import generate_map
 from tables import median_and_range, table
-from trainings import MOVE_RULE, Settings, Training, rollouts, solved
+from trainings import MOVE_RULE, SCENARIO, Settings, Training, rollouts
 
 from ddqn_planner import GridMap, MoveRule, Planner
 from ddqn_planner.grid import OCCUPIED, UNKNOWN, legal_moves, move_costs
 from ddqn_planner.grid.noise import random_costs
 from ddqn_planner.model import AnyMapQNetwork
 from ddqn_planner.training.any_map import ANY_MAP, RULES, random_scenarios
-from ddqn_planner.training.environment import paper_scenario
 from ddqn_planner.training.evaluation import evaluate
 
 PAPERS_REWARD: Final = {"reward": "paper", "goal_reward": 10.0}
@@ -51,21 +49,26 @@ def trainings(settings: Settings) -> list[Training]:
 def report(settings: Settings) -> str:
     """Return the shipped model's results on the paper's goals, and the table of the ablation."""
     zero_shot = table("the shipped model, which never saw these maps | ", _zero_shot(settings))
-    rows = [
-        [name, *_row(settings.planners(f"any_map/{number}"))]
-        for number, name in enumerate(VARIANTS)
-    ]
+    rows = []
+    for number, name in enumerate(VARIANTS):
+        planners = settings.planners(f"any_map/{number}")
+        wrong, errors = zip(*map(move_errors, planners), strict=True)
+        counts, starts, lengths = zip(*(_held_out(p, False) for p in planners), strict=True)
+        _, _, costs = zip(*(_held_out(p, True) for p in planners), strict=True)
+        found = f"{median_and_range(counts)} of {starts[0]:,}"
+        of_costs, *ratios = (median_and_range(each, 4) for each in (errors, lengths, costs))
+        rows.append([name, median_and_range(wrong), of_costs, found, *ratios])
     return f"{zero_shot}\n\n{table(ABLATION, rows)}"
 
 
 def _zero_shot(settings: Settings) -> list[list[str]]:
-    shipped, scenario = Planner.load("any_map"), paper_scenario()
+    shipped = Planner.load("any_map")
     planner = Planner(shipped.network, replace(shipped.metadata, move_rule=MOVE_RULE))
-    plan, milliseconds = goal_1.timed_plan(planner, scenario)
-    field = planner.q_field(scenario.grid, scenario.goal)
+    plan, milliseconds = goal_1.timed_plan(planner)
+    field = planner.q_field(SCENARIO.grid, SCENARIO.goal)
     # The given start, goal i, is one of the starts.
-    starts = evaluate(field, scenario.grid, MOVE_RULE)
-    unmasked = evaluate(field.unmasked(), scenario.grid, MOVE_RULE).solved
+    starts = evaluate(field, SCENARIO.grid, MOVE_RULE)
+    unmasked = evaluate(field.unmasked(), SCENARIO.grid, MOVE_RULE).solved
     rows = [
         ["goal i, length", f"{plan.length:.2f}"],
         ["planning time, ms", f"{milliseconds:.2f}"],
@@ -74,19 +77,11 @@ def _zero_shot(settings: Settings) -> list[list[str]]:
     ]
     for noise in settings.noise:
         training, test = goal_3.drawn_maps(settings, noise)
-        plans, without_masking = rollouts(planner, [*training, *test])
-        counts = f"{solved(plans)} ({solved(without_masking)}) of {len(plans)}"
+        both = rollouts(planner, [*training, *test])
+        solved, unmasked = (sum(bool(plan.cells) for plan in plans) for plans in both)
+        counts = f"{solved} ({unmasked}) of {len(both[0])}"
         rows.append([f"goal iii, {noise.value} (without action masking)", counts])
     return rows
-
-
-def _row(planners: Sequence[Planner]) -> list[str]:
-    wrong, errors = zip(*map(move_errors, planners), strict=True)
-    counts, starts, lengths = zip(*(_held_out(p, with_costs=False) for p in planners), strict=True)
-    _, _, costs = zip(*(_held_out(p, with_costs=True) for p in planners), strict=True)
-    solved = f"{median_and_range(counts)} of {starts[0]:,}"
-    of_costs, *ratios = (median_and_range(each, 4) for each in (errors, lengths, costs))
-    return [median_and_range(wrong), of_costs, solved, *ratios]
 
 
 def move_errors(planner: Planner) -> tuple[int, float]:

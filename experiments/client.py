@@ -17,7 +17,7 @@ from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped, TransformS
 from nav_msgs.msg import OccupancyGrid, Odometry, Path
 from nav_msgs.srv import GetPlan
 from numpy.typing import NDArray
-from random_maps import generate_map
+from random_maps import Random, generate_map
 from rcl_interfaces.srv import GetParameters, SetParameters
 from rclpy._rclpy_pybind11 import RCLError
 from rclpy.context import Context
@@ -27,7 +27,8 @@ from rclpy.parameter import Parameter, parameter_value_to_python
 from rclpy.qos import QoSProfile
 from std_msgs.msg import Header
 
-from ddqn_planner.grid import Cell, GridMap, MapFile, MoveRule, read_map_file
+from ddqn_planner.grid import OCCUPIED, Cell, GridMap, MapFile, MoveRule, read_map_file
+from ddqn_planner.grid.noise import random_requests
 from ddqn_planner.nodes.conversions import occupancy_message, quaternion
 from ddqn_planner.nodes.report import seconds
 from ddqn_planner.resources import find_map
@@ -202,6 +203,11 @@ class Client(ExitStack):
         """Publish a message once so many listen."""
         self.publisher(type(message), topic, qos, listeners).publish(message)
 
+    def publish_ends(self, request: GetPlan.Request) -> None:
+        """Publish the start and the goal of a request."""
+        self.publish("initialpose", initial_pose(request.start))
+        self.publish("goal_pose", request.goal)
+
     def subscribe(self, kind: Any, topic: str, qos: Any = 10, keep: int | None = None) -> Recorder:
         """Return what a topic brings from now on."""
         recorder = Recorder(keep)
@@ -316,6 +322,11 @@ class MapFixture:
         """Return the map message, stamped with a number of seconds."""
         return map_message(self.values, self.grid, stamp)
 
+    def requests(self, count: int, random: Random) -> list[GetPlan.Request]:
+        """Draw requests with a path."""
+        drawn = random_requests(self.grid.occupancy, RULE, count, random)
+        return [plan_request(self.grid, *cells) for cells in drawn]
+
     def error(self, request: GetPlan.Request, plan: Path) -> str:
         """Say what is wrong with an answer for a robot that cuts no corners; "" if nothing is."""
         grid, cells = self.grid, cells_of(self.grid, plan)
@@ -345,13 +356,12 @@ class MapFixture:
         return f"an illegal move to {path[1:][wrong][0]}" if wrong.any() else ""
 
 
-def generated_map(kind: str, side: int, resolution: float = 0.05) -> MapFixture:
-    """Return a square map of a kind, always the same one."""
-    occupancy = generate_map(kind, (side, side), np.random.default_rng(0))
-    return MapFixture(MapFile(100 * occupancy, resolution))
+def generated_map(kind: str, side: int, resolution: float = 0.05, seed: Any = 0) -> MapFixture:
+    """Return a square map of a kind, always the same one; a generator as a seed moves on."""
+    occupancy = generate_map(kind, (side, side), np.random.default_rng(seed))
+    return MapFixture(MapFile(OCCUPIED * occupancy, resolution))
 
 
-def three_maps() -> list[MapFixture]:
-    """Return the maps that take turns; they are the same in each process."""
-    dilemma, office = (MapFixture(read_map_file(find_map(name))) for name in ("dilemma", "office"))
-    return [dilemma, generated_map("rooms", 200), office]
+def shipped_maps() -> dict[str, MapFixture]:
+    """Return two shipped maps, a small one and a large one."""
+    return {name: MapFixture(read_map_file(find_map(name))) for name in ("dilemma", "office")}

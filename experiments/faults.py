@@ -1,7 +1,6 @@
 """Kills each node in turn while it works, starts it again, and checks that nothing is broken."""
 
 import array
-import random
 import tempfile
 import time
 from collections import Counter
@@ -14,7 +13,7 @@ from subprocess import Popen
 from typing import Any
 
 import numpy as np
-from client import RULE, TIMEOUT, Client, MapFixture, initial_pose, plan_request, pose, wait_for
+from client import RULE, Client, MapFixture, plan_request, wait_for
 from diagnostic_msgs.msg import DiagnosticArray
 from nav_msgs.msg import OccupancyGrid
 from nav_msgs.msg import Path as PathMessage
@@ -25,7 +24,7 @@ from rcl_interfaces.srv import GetParameters
 from std_srvs.srv import Trigger
 from tables import table
 
-from ddqn_planner.grid import OCCUPIED, Cell, MapFile, save_map
+from ddqn_planner.grid import OCCUPIED, MapFile, save_map
 from ddqn_planner.grid.noise import MAX_NEW_OBSTACLES, random_requests
 from ddqn_planner.model import load_model
 from ddqn_planner.nodes.runtime import LATCHED
@@ -36,17 +35,11 @@ KILLS = 50
 SIDE, GOALS = 1000, 6  # cells of a map, and fields asked for at once: a second's work
 TRY_TIME = 1.0  # seconds until a question is asked again: it may have gone to a killed node
 START_TIME = 20.0  # the same for ~/start, which a second question would find started
-PLAN_TIME = 60.0  # seconds within which there must be a plan after a kill, on a loaded machine
 LAST_WAIT = 0.5  # seconds that a client waits after a kill until it gives up
-Ends = tuple[Cell, Cell]  # start and goal
-
-
 COUNTS = (
     "kills | in a save | restarts | answers | time-outs | without a plan | wrong paths | "
     "temporaries"
 )
-
-
 Tally = Counter[str]  # the counts of COUNTS: what became of the kills of one node
 
 
@@ -58,13 +51,14 @@ class Faults(Client):
         self.maps = self.subscribe(OccupancyGrid, "map", LATCHED, keep=1)
         self.plans = self.subscribe(PathMessage, "plan", LATCHED, keep=1)
         self.diagnostics = self.subscribe(DiagnosticArray, "/diagnostics", keep=20)
-        self.draw, self.random = random.Random(0), np.random.default_rng(0)
+        self.random = np.random.default_rng(0)
         self.map_path, self.training_folder = folder / "map.yaml", folder / "training"
         occupancy = generate_map("office", (SIDE, SIDE), self.random)
-        (self.watched,) = random_requests(occupancy, RULE, 1, self.random)
-        map_file = MapFile(OCCUPIED * occupancy, 1.0, (0.0, 0.0, 0.0), *self.watched)
+        (ends,) = random_requests(occupancy, RULE, 1, self.random)
+        map_file = MapFile(OCCUPIED * occupancy, 1.0, (0.0, 0.0, 0.0), *ends)
         save_map(map_file, self.map_path)
         self.map = MapFixture(map_file)
+        self.watched = plan_request(self.map.grid, *ends)
         quiet, apart = ("--log-level", "fatal"), ("-r", "__ns:=/training")
         training = {"map_file": "dilemma", "steps": 10**9, "output_folder": self.training_folder}
         server = {"yaml_filename": self.map_path}
@@ -93,61 +87,46 @@ class Faults(Client):
             service.remove_pending_request(future)
         return [future.result() for _, future in calls]
 
-    def ask(
-        self,
-        service_type: Any,
-        name: str,
-        request: Any = None,
-        accept: Callable[[Any], Any] = bool,
-        try_time: float = TRY_TIME,
-        timeout: float = TIMEOUT,
-    ) -> Any:
+    def ask(self, kind: Any, name: str, request: Any, accept: Any, wait: float = TRY_TIME) -> Any:
         """Ask until an answer is accepted; return it."""
 
         def answer() -> Any:
             with suppress(TimeoutError):
-                found = self.call(service_type, name, request, try_time)
+                found = self.call(kind, name, request, wait)
                 if accept(found):
                     return found
             time.sleep(0.05)
             return None
 
-        return wait_for(f"answer from {name}", answer, self.children.values(), timeout)
+        return wait_for(f"answer from {name}", answer, self.children.values())
 
-    def trigger(self, name: str, try_time: float = TRY_TIME) -> str:
-        """Call a Trigger service until it succeeds; return its message."""
-        return str(self.ask(Trigger, name, None, lambda found: found.success, try_time).message)
+    def trigger(self, name: str) -> str:
+        """Call a Trigger service of the trainer until it succeeds; return its message."""
+        name = f"/training/trainer/{name}"
+        return str(self.ask(Trigger, name, None, lambda it: it.success, START_TIME).message)
 
-    def ask_for_plan(
-        self, ends: Ends, accept: Callable[[Any], Any] = lambda found: found.plan.poses
-    ) -> PathMessage:
+    def ask_for_plan(self, request: Any, accept: Any = lambda it: it.plan.poses) -> PathMessage:
         """Ask for a plan until there is one, or an answer is accepted."""
-        request = plan_request(self.map.grid, *ends)
-        return self.ask(GetPlan, "planner/get_plan", request, accept, timeout=PLAN_TIME).plan
+        return self.ask(GetPlan, "planner/get_plan", request, accept).plan
 
-    def plan_for_active_goal(self) -> PathMessage:
+    def plan_for_active_goal(self, request: GetPlan.Request) -> PathMessage:
         """Give the planner a start and an active goal until it plans: it may be a new one."""
-        start, goal = (pose(self.map.grid, cell) for cell in self.watched)
         self.plans.clear()
 
-        def planned() -> PathMessage | None:
-            self.publish("initialpose", initial_pose(start))
-            self.publish("goal_pose", goal)
+        def planned() -> Any:
+            self.publish_ends(request)
             time.sleep(0.2)
-            found: PathMessage | None = self.plans.find(lambda plan: plan.poses)
-            return found
+            return self.plans.find(lambda plan: plan.poses)
 
-        return wait_for("plan", planned, timeout=PLAN_TIME)
+        return wait_for("plan", planned)
 
-    def is_wrong(self, ends: Ends, plan: PathMessage) -> bool:
-        """Return whether a plan is wrong on the map without new obstacles."""
-        return bool(self.map.error(plan_request(self.map.grid, *ends), plan))
-
-    def check_plan(self, tally: Tally, ends: Ends, ask: Callable[[], PathMessage]) -> bool:
+    def check_plan(
+        self, tally: Tally, request: GetPlan.Request, ask: Callable[..., PathMessage], *how: Any
+    ) -> bool:
         """Return whether a plan comes in time; count one that is wrong or missing."""
         with suppress(TimeoutError):
-            if (plan := ask()).poses:
-                tally["wrong paths"] += self.is_wrong(ends, plan)
+            if (plan := ask(request, *how)).poses:
+                tally["wrong paths"] += bool(self.map.error(request, plan))
                 return True
         tally["without a plan"] += 1
         said = [message.status[0] for message in self.diagnostics.messages()]
@@ -158,32 +137,30 @@ class Faults(Client):
     def kill_planner(self, tally: Tally) -> None:
         """Kill the planner while it plans toward goals that it does not know."""
         get_plan = self.service(GetPlan, "planner/get_plan")
-        asked = random_requests(self.map.grid.occupancy, RULE, GOALS, self.random)
-        requests = [plan_request(self.map.grid, *ends) for ends in asked]
+        requests = self.map.requests(GOALS, self.random)
         calls = [(get_plan, get_plan.call_async(request)) for request in requests]
-        time.sleep(self.draw.uniform(0.0, 1.0))
-        for ends, answer in zip(asked, self.kill("planner", tally, calls), strict=True):
+        time.sleep(self.random.uniform(0.0, 1.0))
+        for request, answer in zip(requests, self.kill("planner", tally, calls), strict=True):
             # All goals can be reached: the check refuses an empty path.
-            tally["wrong paths"] += answer is not None and self.is_wrong(ends, answer.plan)
+            tally["wrong paths"] += bool(answer and self.map.error(request, answer.plan))
         self.start("planner")
-        has_plan = self.check_plan(tally, asked[0], lambda: self.ask_for_plan(asked[0]))
-        tally["restarts"] += has_plan
+        tally["restarts"] += self.check_plan(tally, requests[0], self.ask_for_plan)
 
     def kill_map_server(self, tally: Tally) -> None:
         """Kill the map server while it loads, scatters over and restores its map."""
-        self.plan_for_active_goal()
+        self.plan_for_active_goal(self.watched)
         load = LoadMap.Request(map_url=str(self.map_path))
         requests = [
             *[(self.service(Trigger, "map_server/restore_map"), Trigger.Request())] * 20,
             *[(self.service(LoadMap, "map_server/load_map"), load)] * 4,
             (self.service(Trigger, "map_server/scatter_obstacles"), Trigger.Request()),
         ]
-        self.draw.shuffle(requests)
+        self.random.shuffle(requests)
         calls = [(service, service.call_async(request)) for service, request in requests]
-        time.sleep(self.draw.uniform(0.0, 2.0))
+        time.sleep(self.random.uniform(0.0, 2.0))
         self.kill("map_server", tally, calls)
         # The first answer must be a plan. With it, the plans of the last maps are out.
-        self.check_plan(tally, self.watched, lambda: self.ask_for_plan(self.watched, bool))
+        self.check_plan(tally, self.watched, self.ask_for_plan, bool)
         # The map is the loaded one with at most five obstacles more.
         values = np.frombuffer(self.maps.wait().data, np.int8).reshape(self.map.values.shape)
         new = values[values != self.map.values]
@@ -197,30 +174,28 @@ class Faults(Client):
     def kill_trainer(self, tally: Tally) -> None:
         """Kill the trainer while it saves after each step, soon after a save was seen to begin."""
         save = self.service(Trigger, "/training/trainer/save")
-        until = time.monotonic() + self.draw.uniform(0.2, 1.2)
+        until = time.monotonic() + self.random.uniform(0.2, 1.2)
         calls = []
         while time.monotonic() < until:
             calls.append((save, save.call_async(Trigger.Request())))
             time.sleep(0.002)
         while not self.temporaries() and time.monotonic() < until + LAST_WAIT:
             pass
-        time.sleep(self.draw.uniform(0.0, 0.002))
+        time.sleep(self.random.uniform(0.0, 0.002))
         self.kill("trainer", tally, calls)
         tally["in a save"] += bool(self.temporaries())
         # What it saved can be loaded.
-        model = self.training_folder / "model.safetensors"
-        checkpoint = self.training_folder / "checkpoint.safetensors"
+        model, steps = self.training_folder / "model.safetensors", 0
         if model.exists():
             load_model(model)
-        steps = 0
-        if checkpoint.exists():
+        if (checkpoint := model.with_name("checkpoint.safetensors")).exists():
             steps = Trainer.load_checkpoint(checkpoint, [paper_scenario()]).steps
         self.start("trainer")
-        self.ask(GetParameters, "/training/trainer/get_parameters")
-        message = self.trigger("/training/trainer/start", START_TIME)
+        self.ask(GetParameters, "/training/trainer/get_parameters", None, bool)
+        message = self.trigger("start")
         # The planner that follows the trainer loads a model of its.
         self.set_parameters("/training/planner", model="any_map")
-        self.trigger("/training/trainer/save")
+        self.trigger("save")
         wait_for("model", lambda: self.get_parameter("/training/planner", "model") == str(model))
         tally["temporaries"] = len(self.temporaries())
         tally["restarts"] += f"from step {steps} " in message
@@ -232,21 +207,21 @@ class Faults(Client):
     def kill_in_turn(self, kills: int) -> bool:
         """Kill so many times, and print what became of it; return whether all is right."""
         self.ask_for_plan(self.watched)
-        self.trigger("/training/trainer/start", START_TIME)
+        self.trigger("start")
         self.get_parameter("/training/planner", "model")
         kinds = {
-            "planner_node": ("planning", self.kill_planner),
-            "map_server_node": ("publishing", self.kill_map_server),
-            "trainer_node": ("saving", self.kill_trainer),
+            "planner_node | planning": self.kill_planner,
+            "map_server_node | publishing": self.kill_map_server,
+            "trainer_node | saving": self.kill_trainer,
         }
         tallies = {node: Tally() for node in kinds}
         try:
-            for node, (_, kill) in islice(cycle(kinds.items()), kills):
+            for node, kill in islice(cycle(kinds.items()), kills):
                 tallies[node]["kills"] += 1
                 kill(tallies[node])
         finally:
             names = COUNTS.split(" | ")
-            rows = [[node, kinds[node][0], *(t[n] for n in names)] for node, t in tallies.items()]
+            rows = [[node, *(tally[name] for name in names)] for node, tally in tallies.items()]
             print(table(f"node | killed while | {COUNTS}", rows))
         total = sum(tallies.values(), Tally())
         wrong = total["without a plan"] + total["wrong paths"] + total["temporaries"]

@@ -79,17 +79,12 @@ def draw_slowness(
 def draw_times(
     seconds: Mapping[str, Sequence[Array]], best: Sequence[Array], width: int, banded: str
 ) -> tuple[Any, Any]:
-    """Draw the times of all worlds over the best, smoothed; one name as median and band.
-
-    Returns the figure and its axes; ``width`` is how many missions a point sums up.
-    """
-
-    def smoothed(values: Array) -> Array:
-        return np.convolve(values, np.ones(width), mode="valid")
-
-    curves: dict[str, Sequence[Array]] = {}
+    """Draw the times over the best of `width` missions each, one name as median and band."""
+    window, curves = np.ones(width), dict[str, Sequence[Array]]()
+    least = [np.convolve(of_world, window, "valid") for of_world in best]
     for name, of_worlds in seconds.items():
-        ratios = [smoothed(s) / smoothed(b) for s, b in zip(of_worlds, best, strict=True)]
+        sums = [np.convolve(of_world, window, "valid") for of_world in of_worlds]
+        ratios = [of_world / b for of_world, b in zip(sums, least, strict=True)]
         curves[name] = ratios if name == banded else [np.median(ratios, axis=0)]
     figure, axes = plt.subplots(figsize=(7.2, 3.6), layout="constrained")
     missions = np.arange(len(curves[banded][0])) + width

@@ -5,7 +5,6 @@ import math
 import os
 import sys
 import time
-import zipfile
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import groupby
@@ -40,8 +39,8 @@ COSTS: Final[dict[str, Callable[[Occupancy, Random], NDArray[np.int8] | None]]] 
 
 GOALS = 10  # of a generated map: each needs a Q field and exact distances
 OPTIMAL = 1 + 1e-6  # ratio to the optimum up to which a rollout is optimal
-AGREES = 1e-4  # relative difference from a file's optimum, beside the file's rounding
-SUFFIXES: Final = (".map", ".scen", ".npz", ".yaml", ".yml")  # of MovingAI, MPD and ROS
+AGREES = 1e-4  # relative difference from a file's optimum, which is rounded
+SUFFIXES: Final = (".map", ".scen", ".yaml", ".yml")  # of MovingAI and ROS
 COLUMNS: Final = (
     "maps | requests | success | without action masking | optimal | mean | worst | illegal | "
     "field ms | Dijkstra ms"
@@ -78,7 +77,6 @@ class BenchmarkMap:
     grid: GridMap
     requests: list[tuple[Cell, Cell]]
     optima: Sequence[float] | None = None
-    precision: float = 0.0  # greatest rounding error of an optimum, cells
 
 
 def generated_maps(
@@ -100,29 +98,19 @@ def _draw(occupancy: Occupancy, goals: int, settings: RequestSettings, random: R
     parts = np.array_split(range(settings.requests), goals)
     drawn = random_requests(occupancy, settings.move_rule, goals, random)
     for part, (start, goal) in zip(parts, drawn, strict=True):
-        more = _random_starts(occupancy, goal, settings, max(len(part) - 1, 0), random)
-        requests += [(cell, goal) for cell in [start, *more][: len(part)]]
+        connected = GridMap(occupancy).reachable([goal], settings.move_rule)
+        connected[goal[::-1]] = False
+        more = random.choice(np.argwhere(connected), max(len(part) - 1, 0)).tolist()
+        starts = [start, *((x, y) for y, x in more)]
+        requests += [(cell, goal) for cell in starts[: len(part)]]
     return grid, requests
-
-
-def _random_starts(
-    occupancy: Occupancy, goal: Cell, settings: RequestSettings, count: int, random: Random
-) -> list[Cell]:
-    """Draw cells, except the goal, from which a path leads to the goal; they may repeat."""
-    connected = GridMap(occupancy).reachable([goal], settings.move_rule)
-    connected[goal[::-1]] = False
-    cells = np.argwhere(connected)
-    return [(x, y) for y, x in random.choice(cells, count).tolist()] if len(cells) else []
 
 
 def find_files(folder: Path) -> list[Path]:
     """Return the benchmark files of a folder and its subfolders; a ValueError without a map."""
     files = sorted(p for p in folder.rglob("*") if p.suffix.lower() in SUFFIXES and p.is_file())
     if all(path.suffix.lower() == ".scen" for path in files):
-        raise ValueError(
-            f"{folder}: found no MovingAI map (.map), MPD file (.npz) or ROS map (.yaml) in this "
-            "folder; check the path"
-        )
+        raise ValueError(f"{folder}: no MovingAI map (.map) or ROS map (.yaml); check the path")
     return files
 
 
@@ -132,9 +120,7 @@ def read_maps(files: Sequence[Path], settings: RequestSettings) -> Iterator[Benc
     scenarios = {p.stem.removesuffix(".map"): p for p in files if suffix_of[p] == ".scen"}
     for path, suffix in suffix_of.items():
         try:
-            if suffix == ".npz":
-                yield from _mpd_maps(path, settings)
-            elif suffix == ".map" and path.stem in scenarios:
+            if suffix == ".map" and path.stem in scenarios:
                 yield _scenario_map(path, scenarios[path.stem], settings)
             elif suffix != ".scen":
                 name = f"{'movingai' if suffix == '.map' else 'ros'} {path.stem}"
@@ -150,63 +136,28 @@ def _scenario_map(path: Path, scenario: Path, settings: RequestSettings) -> Benc
     """Read a MovingAI map, with requests of its scenario file: short and long paths alike."""
     random, rule = settings.random(path.stem), settings.move_rule
     grid = settings.grid(read_map_file(path).grid().occupancy, random)
-    labels, lines, decimals = grid.labels(rule), [], 0
-    for line in scenario.read_text(errors="replace").splitlines():
-        if not line.strip() or line.startswith("version"):
-            continue
-        try:
-            *sizes_and_ends, optimum = line.split()[-7:]
-            width, height, x, y, goal_x, goal_y = map(int, sizes_and_ends)
-            start, goal = (x, y), (goal_x, goal_y)
-            lines.append((start, goal, float(optimum)))
-        except ValueError:
-            words = "width, height, start x and y, goal x and y, optimal length"
-            raise ValueError(f"{scenario}: a line is {line!r}; give {words} at its end") from None
-        fits = (height, width) == labels.shape and grid.is_free(start) and grid.is_free(goal)
-        if not fits or labels[start[::-1]] != labels[goal[::-1]]:
-            raise ValueError(f"{scenario}: no path joins {start} and {goal} on this map")
-        decimals = max(decimals, len(optimum.partition(".")[2]))
-    if not lines:
+    try:
+        lines = np.loadtxt(scenario, usecols=range(-7, 0), comments="version", ndmin=2)
+    except ValueError as error:
+        words = "end each line with width, height, start x and y, goal x and y, optimal length"
+        raise ValueError(f"{scenario}: {error}; {words}") from None
+    if not len(lines):
         raise ValueError(f"{scenario}: has no requests; give a file with some")
-    lines.sort(key=itemgetter(2))
+    lines = lines[lines[:, -1].argsort(kind="stable")]
     # One from each of as many equal parts as requests.
     count = min(settings.requests, len(lines))
     edges = np.arange(count + 1) * len(lines) // count
-    drawn = [lines[index] for index in random.integers(edges[:-1], edges[1:]).tolist()]
-    requests = [(start, goal) for start, goal, _ in drawn]
+    drawn = lines[random.integers(edges[:-1], edges[1:])]
+    ends = drawn[:, 2:-1].astype(np.int64).tolist()
+    requests = [((x, y), (goal_x, goal_y)) for x, y, goal_x, goal_y in ends]
+    labels = grid.labels(rule)
+    for start, goal in requests:
+        both_free = grid.is_free(start) and grid.is_free(goal)
+        if not both_free or labels[start[::-1]] != labels[goal[::-1]]:
+            raise ValueError(f"{scenario}: no path joins {start} and {goal} on this map")
     known = rule is MoveRule.ROBOT_SAFE and grid.cost is None
-    optima = [optimum for _, _, optimum in drawn] if known else None
-    name = f"movingai {path.stem}"
-    return BenchmarkMap(name, str(path), grid, requests, optima, 0.5 * 10.0**-decimals)
-
-
-def _mpd_maps(path: Path, settings: RequestSettings) -> Iterator[BenchmarkMap]:
-    """Read the maps of an MPD file. Its optima count every move as 1, and corners may be cut."""
-    try:
-        if not zipfile.is_zipfile(path):  # NumPy would suggest to unpickle it
-            raise ValueError("it is no .npz file")
-        with np.load(path, allow_pickle=False) as arrays:
-            free, goals, distances = (
-                arrays[name].reshape(len(arrays[name]), *arrays[name].shape[-2:])
-                for name in ("arr_8", "arr_9", "arr_11")
-            )
-        if not free.shape == goals.shape == distances.shape:
-            raise ValueError("shapes differ")
-    except Exception as error:  # broken bytes make NumPy and zipfile raise many kinds of errors
-        raise ValueError(
-            f"{path}: cannot be read ({error}); give the test maps, their goals and minus the "
-            "number of moves in the arrays arr_8, arr_9 and arr_11"
-        ) from error
-    known = settings.move_rule is MoveRule.UNIT and settings.costs == "none"
-    for number, occupancy in enumerate(free == 0):
-        random = settings.random(f"{path.stem}-{number}")
-        goal_y, goal_x = np.unravel_index(goals[number].argmax(), occupancy.shape)
-        goal = int(goal_x), int(goal_y)
-        starts = _random_starts(occupancy, goal, settings, settings.requests, random)
-        requests = [(start, goal) for start in starts]
-        optima = [-float(distances[number, y, x]) for x, y in starts] if known else None
-        grid = settings.grid(occupancy, random)
-        yield BenchmarkMap(f"mpd {path.stem}", str(number), grid, requests, optima)
+    optima = drawn[:, -1].tolist() if known else None
+    return BenchmarkMap(f"movingai {path.stem}", str(path), grid, requests, optima)
 
 
 @dataclass(frozen=True)
@@ -246,7 +197,7 @@ def measure(
                 arrived = cells[:1] == (start,) and cells[-1:] == (goal,)
                 cost = path_cost(cells, grid.cost_multiplier, move_rule) if arrived else math.inf
                 optimum = float(optima[start[::-1]])
-                agrees = math.isclose(told, optimum, rel_tol=AGREES, abs_tol=drawn.precision)
+                agrees = math.isclose(told, optimum, rel_tol=AGREES)
                 yield Rollout(
                     drawn.set_name,
                     drawn.name,
@@ -298,12 +249,12 @@ def markdown(rollouts: Sequence[Rollout]) -> str:
     text = (
         "Every request has a path. Without action masking: solved too by a rollout that may choose "
         "illegal moves, which end it. Optimal, mean, worst: cost of the rollout over that of the "
-        "best path. Times are medians; Dijkstra's includes its graph.\n"
+        "best path. Times are medians; Dijkstra's includes its graph."
     )
     if given := [rollout.agrees for rollout in rollouts if rollout.agrees is not None]:
-        text += f"Optima given by files: the oracle agrees with {sum(given)}/{len(given)}.\n"
+        text += f"\nOptima given by files: the oracle agrees with {sum(given)}/{len(given)}."
     tables = table(f"set | size | {COLUMNS}", sets), table(f"optimum | {COLUMNS}", optima)
-    return "\n\n".join((text.rstrip(), *tables)) + "\n"
+    return "\n\n".join((text, *tables))
 
 
 def _row(rollouts: Sequence[Rollout]) -> list[object]:
@@ -334,7 +285,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     add("--model", default="any_map", help="name or file")
     rules = [rule.value for rule in MoveRule]
     add("--move-rule", choices=rules, default="robot_safe", help="which diagonal moves are legal")
-    data = "MovingAI .map and .scen, MPD .npz, ROS .yaml instead of generated maps"
+    data = "MovingAI .map and .scen, ROS .yaml instead of generated maps"
     add("--data", type=Path, metavar="FOLDER", help=data)
     add("--kinds", nargs="+", choices=KINDS, default=[*KINDS], help="kinds of generated maps")
     add("--sizes", nargs="+", type=int, default=[32, 64, 128, 256], help="sides of maps, cells")
@@ -347,7 +298,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def run(options: argparse.Namespace) -> int:
-    """Run the program with its options; return the exit code."""
+    """Print the tables of the maps that the options ask for; return the exit code."""
     for name, least in (("maps", 1), ("requests", 1), ("seed", 0)):
         if getattr(options, name) < least:
             raise ValueError(f"--{name} is {getattr(options, name)}; give at least {least}")
@@ -358,24 +309,21 @@ def run(options: argparse.Namespace) -> int:
     if options.data:
         maps = read_maps(find_files(options.data), settings)
     rollouts: list[Rollout] = []
-    interrupted = False
+    code, model = 0, planner.metadata
     try:
-        for rollout in measure(planner, tqdm(maps, unit="map", disable=None), rule):
-            rollouts.append(rollout)
+        rollouts.extend(measure(planner, tqdm(maps, unit="map", disable=None), rule))
     except KeyboardInterrupt:
-        interrupted = True
+        code = 130
         print("interrupted; the tables hold the maps so far", file=sys.stderr)
-    if not rollouts and not interrupted:
+    if not rollouts and not code:
         raise ValueError(f"{options.data}: none of its files has a request; see above")
     if rollouts:
-        model = planner.metadata
-        text = (
+        print(
             f"Model {options.model} ({model.network}, {model.steps:,} steps, seed {model.seed}), "
             f"move rule {rule.value}, costs {options.costs}, requests of seed {options.seed}.\n\n"
             f"{markdown(rollouts)}"
         )
-        print(text, end="")
-    return 130 if interrupted else 0
+    return code
 
 
 if __name__ == "__main__":

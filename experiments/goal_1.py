@@ -11,11 +11,10 @@ import numpy as np
 from figures import draw_curves, draw_map, draw_path, save_figure
 from numpy.typing import NDArray
 from tables import median_and_range, table
-from trainings import PROFILES, Evaluations, Settings, Training, optimal_length, read_csv
+from trainings import MOVE_RULE, PROFILES, SCENARIO, Evaluations, Settings, Training, read_csv
 
 from ddqn_planner import MoveRule, Plan, Planner
 from ddqn_planner.grid import Cell, path_length, shortest_path
-from ddqn_planner.training.environment import Scenario, paper_scenario
 
 # Plain Double DQN, each improvement alone, and both: what each sets.
 VARIANTS: Final[dict[str, dict[str, Any]]] = {
@@ -41,12 +40,13 @@ def trainings(settings: Settings, variants: Sequence[str] = ("both",)) -> list[T
         for profile, parameters in PROFILES.items()
         for name in variants
     }
-    return settings.trainings(parameters_of, [paper_scenario()])
+    return settings.trainings(parameters_of, [SCENARIO])
 
 
 def convergence_row(runs: Sequence[Evaluations]) -> list[str]:
     """Return the cells of `CONVERGENCE` for the evaluations of each seed."""
-    optimum, ends = optimal_length(paper_scenario()), [run[-1] for run in runs]
+    shortest_one = shortest_path(SCENARIO.grid, SCENARIO.start, SCENARIO.goal, MOVE_RULE)
+    optimum, ends = path_length(shortest_one), [run[-1] for run in runs]
     solved, unmasked = (sum(int(end[key]) for end in ends) for key in ("solved", "solved_unmasked"))
     shortest = [at_first_kept(run, "step", run["length"] <= optimum + 1e-6) for run in runs]
     return [
@@ -65,11 +65,11 @@ def at_first_kept(run: Evaluations, column: str, holds: NDArray[np.bool_]) -> fl
 
 def report(settings: Settings) -> str:
     """Return the tables of goal i, and write its figure."""
-    scenario, rows, costs = paper_scenario(), [], []
+    rows, costs = [], []
     paths: dict[str, Sequence[Cell]] = {}
     for profile, parameters in PROFILES.items():
         runs = settings.evaluations(f"{profile}/both")
-        planned = [timed_plan(p, scenario) for p in settings.planners(f"{profile}/both")]
+        planned = [timed_plan(p) for p in settings.planners(f"{profile}/both")]
         ends = [run[-1] for run in runs]
         seconds = [at_first_kept(run, "seconds", run["solved"] == 1) for run in runs]
         rates = [end["step"] / end["seconds"] for end in ends]
@@ -81,24 +81,24 @@ def report(settings: Settings) -> str:
         by_length = sorted((plan for plan, _ in planned), key=lambda p: p.length or np.inf)
         paths[f"{profile}, median seed"] = by_length[len(planned) // 2].cells
     for rule in (MoveRule.CORNER_CUTTING, MoveRule.ROBOT_SAFE):
-        shortest = shortest_path(scenario.grid, scenario.start, scenario.goal, rule)
+        shortest = shortest_path(SCENARIO.grid, SCENARIO.start, SCENARIO.goal, rule)
         paths[f"shortest, {rule.value}"] = shortest
     figure, panels = plt.subplots(1, len(paths), figsize=(15, 4.2), layout="constrained")
     for number, (axes, (planner, cells)) in enumerate(zip(panels, paths.items(), strict=True)):
         length = f"{path_length(cells):.2f} cells" if cells else "trapped"
-        draw_map(axes, scenario, f"{planner}: {length}")
+        draw_map(axes, SCENARIO, f"{planner}: {length}")
         draw_path(axes, cells, number, planner)
     drawn = save_figure(figure, settings.out / "goal_1.png", "Fig. 7: the paths of goal i")
     return f"{table(f'profile | {CONVERGENCE}', rows)}\n\n{table(COSTS, costs)}\n\n{drawn}"
 
 
-def timed_plan(planner: Planner, scenario: Scenario) -> tuple[Plan, float]:
+def timed_plan(planner: Planner) -> tuple[Plan, float]:
     """Return a planner's plan, and the median of its times with a new field, milliseconds."""
     times = []
     for _ in range(TIMES):
         began = time.perf_counter()
         fresh = Planner(planner.network, planner.metadata)  # it has no Q field yet
-        plan = fresh.plan(scenario.grid, scenario.start, scenario.goal)
+        plan = fresh.plan(SCENARIO.grid, SCENARIO.start, SCENARIO.goal)
         times.append(1e3 * (time.perf_counter() - began))
     return plan, float(np.median(times))
 

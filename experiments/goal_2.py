@@ -12,11 +12,11 @@ from figures import draw_curves, draw_map, save_figure
 from matplotlib.colors import BoundaryNorm, ListedColormap
 from numpy.typing import NDArray
 from tables import mean_and_worst, median_and_range, table
-from trainings import MOVE_RULE, PROFILES, Settings, Training
+from trainings import MOVE_RULE, PROFILES, SCENARIO, Settings, Training
 
 from ddqn_planner import Planner, QField
 from ddqn_planner.grid import MOVES, Cell, legal_moves
-from ddqn_planner.training.environment import GridVectorEnvironment, Scenario, paper_scenario
+from ddqn_planner.training.environment import GridVectorEnvironment
 from ddqn_planner.training.evaluation import length_ratios
 from ddqn_planner.training.networks import PropagationModule
 
@@ -37,13 +37,9 @@ COLUMNS = (
 TARGET_COLUMNS = (
     "target | seeds solved from the start | starts solved | over-estimation, last 10 % | worst"
 )
-
-
-def free_starts(scenario: Scenario) -> NDArray[np.bool_]:
-    """Return the free cells except start and end: (H, W) bool, the paper's 286."""
-    starts = ~scenario.grid.occupancy
-    starts[scenario.start[::-1]] = starts[scenario.goal[::-1]] = False
-    return starts
+# The free cells except start and end: (H, W) bool, the paper's 286.
+STARTS = ~SCENARIO.grid.occupancy
+STARTS[SCENARIO.start[::-1]] = STARTS[SCENARIO.goal[::-1]] = False
 
 
 def count_solved(ratios: Sequence[NDArray[np.float64]], starts: Any) -> str:
@@ -51,61 +47,56 @@ def count_solved(ratios: Sequence[NDArray[np.float64]], starts: Any) -> str:
     return median_and_range([int(np.isfinite(ratio[starts]).sum()) for ratio in ratios])
 
 
-def trained_field(planner: Planner, scenario: Scenario) -> QField:
+def trained_field(planner: Planner) -> QField:
     """Return the Q field of a propagation network as the loss trained it: with reward and γ."""
-    environment = GridVectorEnvironment([scenario], MOVE_RULE, PROFILES["propagation"])
-    module = PropagationModule.from_numpy(planner.network)
-    cells = np.arange(scenario.grid.occupancy.size)
+    occupancy = SCENARIO.grid.occupancy
+    environment = GridVectorEnvironment([SCENARIO], MOVE_RULE, PROFILES["propagation"])
+    module, cells = PropagationModule.from_numpy(planner.network), np.arange(occupancy.size)
     module.settle(environment)
     with torch.inference_mode():
         q_CA = module(module.states(np.zeros_like(cells), cells))
-    q_AHW = q_CA.T.reshape(len(MOVES), *scenario.grid.occupancy.shape).numpy()
-    return QField(scenario.goal, q_AHW, legal_moves(scenario.grid.occupancy, MOVE_RULE))
+    q_AHW = q_CA.T.reshape(len(MOVES), *occupancy.shape).numpy()
+    return QField(SCENARIO.goal, q_AHW, legal_moves(occupancy, MOVE_RULE))
 
 
 def _fields(settings: Settings, name: str) -> list[QField]:
     """Return each seed's Q field of the paper's map."""
-    scenario = paper_scenario()
-    return [p.q_field(scenario.grid, scenario.goal) for p in settings.planners(name)]
+    return [p.q_field(SCENARIO.grid, SCENARIO.goal) for p in settings.planners(name)]
 
 
 def _ratios(fields: Sequence[QField]) -> list[NDArray[np.float64]]:
-    return [length_ratios(field, paper_scenario().grid, MOVE_RULE) for field in fields]
+    return [length_ratios(field, SCENARIO.grid, MOVE_RULE) for field in fields]
 
 
 def report(settings: Settings) -> str:
     """Return the table of goal ii, and write its figure."""
-    scenario, starts = paper_scenario(), free_starts(paper_scenario())
     fields = {profile: _fields(settings, f"{profile}/both") for profile in PROFILES}
-    fields["propagation, Q as trained"] = [
-        trained_field(planner, scenario) for planner in settings.planners("propagation/both")
-    ]
-    x, y = np.transpose(sorted(START_DEAD_END - {scenario.start}))
+    trained = [*map(trained_field, settings.planners("propagation/both"))]
+    fields["propagation, Q as trained"] = trained
+    x, y = np.transpose(sorted(START_DEAD_END - {SCENARIO.start}))
     rows, ratios = [], {}
     for label, of_seeds in fields.items():
         masked, unmasked = _ratios(of_seeds), _ratios([field.unmasked() for field in of_seeds])
-        solved = count_solved(masked, starts), count_solved(unmasked, starts)
-        lengths = mean_and_worst([ratio[starts & np.isfinite(ratio)] for ratio in masked])
+        solved = count_solved(masked, STARTS), count_solved(unmasked, STARTS)
+        lengths = mean_and_worst([ratio[STARTS & np.isfinite(ratio)] for ratio in masked])
         rows.append([label, *solved, count_solved(masked, (y, x)), *lengths])
         ratios[label] = masked
-    return f"{table(COLUMNS, rows)}\n\n{_draw(settings, scenario, ratios)}"
+    return f"{table(COLUMNS, rows)}\n\n{_draw(settings, ratios)}"
 
 
-def _draw(
-    settings: Settings, scenario: Scenario, ratios: dict[str, list[NDArray[np.float64]]]
-) -> str:
+def _draw(settings: Settings, ratios: dict[str, list[NDArray[np.float64]]]) -> str:
     """Colour each cell by the number of seeds that solve it."""
     figure, panels = plt.subplots(1, len(PROFILES), figsize=(11, 5), layout="constrained")
     seeds = settings.seeds
     colours = ListedColormap(plt.get_cmap("RdYlBu")(np.linspace(0.08, 0.92, seeds + 1)))
     norm = BoundaryNorm(np.arange(seeds + 2) - 0.5, seeds + 1)
-    free = ~scenario.grid.occupancy
-    free[scenario.goal[::-1]] = False
+    free = ~SCENARIO.grid.occupancy
+    free[SCENARIO.goal[::-1]] = False
     border = {"color": "black", "linewidth": 2.5, "zorder": 3}
     for axes, profile in zip(panels, PROFILES, strict=True):
         solved = np.sum([np.isfinite(ratio) for ratio in ratios[profile]], axis=0)
         image = axes.imshow(np.where(free, solved, np.nan), cmap=colours, norm=norm, origin="lower")
-        draw_map(axes, scenario, f"profile {profile}")
+        draw_map(axes, SCENARIO, f"profile {profile}")
         for x, y in START_DEAD_END:
             for side in (-1, 1):
                 if (x + side, y) not in START_DEAD_END:
@@ -122,12 +113,12 @@ def target_trainings(settings: Settings) -> list[Training]:
     parameters_of = {
         folder: replace(PROFILES["paper"], target=target) for folder, target in TARGETS.values()
     }
-    return settings.trainings(parameters_of, [paper_scenario()])
+    return settings.trainings(parameters_of, [SCENARIO])
 
 
 def target_report(settings: Settings) -> str:
     """Return the table of the targets, and write their figure."""
-    starts, rows = free_starts(paper_scenario()), []
+    rows = []
     runs = {label: settings.evaluations(folder) for label, (folder, _) in TARGETS.items()}
     estimates = {label: [run["overestimation"] for run in of] for label, of in runs.items()}
     for label, errors in estimates.items():
@@ -135,7 +126,7 @@ def target_report(settings: Settings) -> str:
         row = [
             label,
             f"{sum(int(run['solved'][-1]) for run in runs[label])} of {settings.seeds}",
-            count_solved(_ratios(_fields(settings, TARGETS[label][0])), starts),
+            count_solved(_ratios(_fields(settings, TARGETS[label][0])), STARTS),
             median_and_range(late, 2),
             median_and_range([error.max() for error in errors], 2),
         ]

@@ -11,30 +11,22 @@ from figures import draw_map, draw_path, save_figure
 from matplotlib.patches import Rectangle
 from numpy.typing import NDArray
 from tables import mean_and_worst, median_and_range, table
-from trainings import (
-    MOVE_RULE,
-    PROFILES,
-    Settings,
-    Training,
-    in_parallel,
-    optimal_length,
-    rollouts,
-    solved,
-)
+from trainings import MOVE_RULE, PROFILES, SCENARIO, Settings, Training, in_parallel, rollouts
 
-from ddqn_planner import Plan, PlanStatus
 from ddqn_planner.grid import (
     LENGTHS,
     Cell,
     Noise,
     legal_moves,
     neighbours,
+    path_length,
     scatter_obstacles,
     shortest_distances,
     shortest_path,
 )
+from ddqn_planner.planning import Planner
 from ddqn_planner.planning.paths import search
-from ddqn_planner.training.environment import Scenario, paper_scenario
+from ddqn_planner.training.environment import Scenario
 from ddqn_planner.training.hyper_parameters import HyperParameters
 from ddqn_planner.training.trainer import Trainer
 
@@ -45,20 +37,18 @@ EVALUATION_INTERVAL = 1_000
 SUPERVISED_UPDATES, SUPERVISED_BATCH, SUPERVISED_LEARNING_RATE = 10_000, 128, 0.003
 KEPT = "kept.safetensors"
 COLUMNS = (
-    "new obstacles | planner | training maps solved | test maps solved | without action masking | "
-    "mean length / optimum | worst"
+    "new obstacles | planner | training maps solved | test maps solved | mean length / optimum"
 )
 
 
 def noisy_maps(training: int, test: int, noise: Noise) -> tuple[list[Scenario], list[Scenario]]:
     """Draw training and test maps, all different, with new obstacles on or near goal i's path."""
-    scenario = paper_scenario()
-    path = shortest_path(scenario.grid, scenario.start, scenario.goal, MOVE_RULE)
+    path = shortest_path(SCENARIO.grid, SCENARIO.start, SCENARIO.goal, MOVE_RULE)
     random = np.random.default_rng(NOISE_SEED)
     scenarios: dict[str, Scenario] = {}
     while len(scenarios) < training + test:
-        grid, _ = scatter_obstacles(scenario.grid, path, MOVE_RULE, random, noise)
-        scenarios.setdefault(grid.fingerprint, replace(scenario, grid=grid))
+        grid, _ = scatter_obstacles(SCENARIO.grid, path, MOVE_RULE, random, noise)
+        scenarios.setdefault(grid.fingerprint, replace(SCENARIO, grid=grid))
     drawn = list(scenarios.values())
     return drawn[:training], drawn[training:]
 
@@ -88,11 +78,8 @@ def trainings(settings: Settings) -> list[Training]:
 
 
 def train_supervised(training: Training) -> None:
-    """Train a network by cross-entropy on the moves of all shortest paths, unless it was trained.
-
-    This is a yardstick and not a planner: what the network fails to learn even then is a limit of
-    its architecture, not of how it learns.
-    """
+    """Train a network by cross-entropy on the moves of all shortest paths, unless it was before."""
+    # What it fails to learn even then is a limit of the network, not of how it learns.
     path = training.folder / "model.safetensors"
     if path.exists():
         return
@@ -131,14 +118,10 @@ def best_moves(scenario: Scenario) -> NDArray[np.bool_]:
 
 
 def fixed_path(maps: Sequence[Scenario]) -> tuple[Cell, ...]:
-    """Return the cheapest path if a cell costs 1, and 1 more for each map where it is occupied.
-
-    It does not depend on the map at hand: a network that sees the map must do better.
-    """
-    paper = paper_scenario()
+    """Return the cheapest path if a cell costs 1, and 1 more for each map where it is occupied."""
     occupied = sum(scenario.grid.occupancy.astype(np.float32) for scenario in maps)
-    legal = legal_moves(paper.grid.occupancy, MOVE_RULE)
-    return search(paper.start, paper.goal, legal, np.float32(1) + occupied, MOVE_RULE)
+    legal = legal_moves(SCENARIO.grid.occupancy, MOVE_RULE)
+    return search(SCENARIO.start, SCENARIO.goal, legal, np.float32(1) + occupied, MOVE_RULE)
 
 
 def report(settings: Settings) -> str:
@@ -146,42 +129,34 @@ def report(settings: Settings) -> str:
     rows = []
     for noise in settings.noise:
         training, test = drawn_maps(settings, noise)
-        models = {}
+        maps, lengths = [*training, *test], {}
         for label, (folder, parameters) in networks(settings).items():
             name = f"{noise.value}/{folder}"
-            models[label] = settings.planners(name, KEPT)
+            lengths[label] = _lengths(settings.planners(name, KEPT), maps)
             # Obstacles on the path alone can be avoided by one fixed path.
             if parameters.network == "paper" and noise is Noise.NEAR_PATH:
                 taught = {f"{name}/supervised": replace(parameters, steps=SUPERVISED_UPDATES)}
                 jobs = settings.trainings(taught, training)
                 in_parallel(train_supervised, jobs, settings.backend)
-                models[f"{label}, supervised"] = settings.planners(*taught)
-        for label, planners in models.items():
-            plans = [rollouts(planner, [*training, *test]) for planner in planners]
-            rows.append([noise.value, label, *_columns(plans, test)])
+                lengths[f"{label}, supervised"] = _lengths(settings.planners(*taught), maps)
         path = fixed_path(training)
-        succeeded = Plan(PlanStatus.SUCCEEDED, np.array(path)), Plan(PlanStatus.ROLLOUT_TRAPPED)
-        fixed = [succeeded[not all(map(s.grid.is_free, path))] for s in [*training, *test]]
-        rows.append([noise.value, "one fixed path", *_columns([(fixed, fixed)], test)])
-    return f"{table(COLUMNS, rows)}\n\n{_draw(settings)}"
+        is_free = [all(map(scenario.grid.is_free, path)) for scenario in maps]
+        lengths["one fixed path"] = np.where([is_free], path_length(path, MOVE_RULE), np.nan)
+        distances = (shortest_distances(s.grid, s.goal, MOVE_RULE) for s in test)
+        optimum = np.array([d[SCENARIO.start[::-1]] for d in distances])
+        for label, of_seeds in lengths.items():
+            parts = np.split(np.isfinite(of_seeds), [len(training)], axis=1)
+            counts = [median_and_range(part.sum(axis=1).tolist()) for part in parts]
+            ratios = [ratio[np.isfinite(ratio)] for ratio in of_seeds[:, len(training) :] / optimum]
+            rows.append([noise.value, label, *counts, mean_and_worst(ratios)[0]])
+    drawn = table(f"new obstacles | planner | {COLUMNS}", rows), _draw(settings)
+    return "\n\n".join(drawn)
 
 
-def _columns(
-    of_seeds: Sequence[tuple[list[Plan], list[Plan]]], test: Sequence[Scenario]
-) -> list[str]:
-    """Return cells of the table for each seed's `rollouts`: the last are those on the test maps."""
-    optimum = [optimal_length(scenario) for scenario in test]
-    on_test = [(masked[-len(test) :], unmasked[-len(test) :]) for masked, unmasked in of_seeds]
-    ratios = [
-        [plan.length / least for plan, least in zip(plans, optimum, strict=True) if plan.cells]
-        for plans, _ in on_test
-    ]
-    return [
-        median_and_range([solved(masked[: -len(test)]) for masked, _ in of_seeds]),
-        median_and_range([solved(masked) for masked, _ in on_test]),
-        median_and_range([solved(unmasked) for _, unmasked in on_test]),
-        *mean_and_worst(ratios),
-    ]
+def _lengths(planners: Sequence[Planner], maps: Sequence[Scenario]) -> NDArray[np.float64]:
+    """Return the length of each planner's path on each map, (P, M), NaN without one."""
+    plans = [rollouts(planner, maps)[0] for planner in planners]
+    return np.array([[p.length if p.cells else np.nan for p in of_planner] for of_planner in plans])
 
 
 def _draw(settings: Settings) -> str:
@@ -190,7 +165,7 @@ def _draw(settings: Settings) -> str:
     figure, panels = plt.subplots(
         count, 3, figsize=(12, 4.2 * count), layout="constrained", squeeze=False
     )
-    before, legend = paper_scenario().grid.occupancy, dict[str, Any]()
+    before, legend = SCENARIO.grid.occupancy, dict[str, Any]()
     for noise, row in zip(settings.noise, panels, strict=True):
         planners = {
             label: settings.planners(f"{noise.value}/{folder}", KEPT)[0]

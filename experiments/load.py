@@ -4,7 +4,7 @@ import itertools
 import multiprocessing
 import signal
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from types import SimpleNamespace
 from typing import Any
@@ -20,6 +20,7 @@ from processes import claim_ros_domain, memory, run_script, running_node
 from rclpy.action.client import ActionClient
 from rclpy.qos import DurabilityPolicy, QoSProfile
 from rclpy.task import Future
+from tables import report
 
 from ddqn_planner.grid import Cell, GridMap
 from ddqn_planner.grid.noise import random_requests
@@ -34,32 +35,35 @@ BURST_GOALS = 2  # as many as the fields of the greatest map that the planner ke
 REACH = 30  # cells from start to goal along an axis at most: short answers come fast
 
 
+def three_maps() -> list[ros.MapFixture]:
+    """Return the maps that take turns; they are the same in each process."""
+    dilemma, office = ros.shipped_maps().values()
+    return [dilemma, ros.generated_map("rooms", 200), office]
+
+
 def ask(seed: int, count: int, shared: SimpleNamespace) -> None:
     """Ask, and check each answer; the result is milliseconds, the number of empty ones, errors."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # it ends with its parent
-    random, maps = np.random.default_rng(seed), ros.three_maps()
+    random, maps = np.random.default_rng(seed), three_maps()
     milliseconds: list[float] = []
     errors: list[str] = []
     empty = 0
-    goals = [
-        [goal for _, goal in random_requests(m.grid.occupancy, ros.RULE, GOALS_PER_MAP, random)]
-        for m in maps
-    ]
-    starts = [m.grid.free_cells() for m in maps]
+    asked = [fixture.requests(GOALS_PER_MAP, random) for fixture in maps]
+    starts = [fixture.grid.free_cells() for fixture in maps]
     with ros.Client() as client:
         client.call(GetPlan, "planner/get_plan")  # not measured: it waits for the service
         shared.ready.wait(ros.TIMEOUT)
         for _ in range(count):
             first = shared.confirmed.value
             current = first % len(maps)
+            request = asked[current][random.integers(GOALS_PER_MAP)]
             start = starts[current][random.integers(len(starts[current]))]
-            goal = goals[current][random.integers(GOALS_PER_MAP)]
-            request = ros.plan_request(maps[current].grid, start, goal)
+            request.start = ros.pose(maps[current].grid, start)
             began = time.perf_counter()
             try:
-                plan = client.call(GetPlan, "planner/get_plan", request).plan
+                plan = client.get_plan(request.start, request.goal)
             except TimeoutError as error:
-                errors.append(f"{start} to {goal} on map {current}: {error}")
+                errors.append(f"from {start} on map {first}: {error}")
             else:
                 milliseconds.append(1e3 * (time.perf_counter() - began))
                 empty += not plan.poses
@@ -74,8 +78,8 @@ def ask(seed: int, count: int, shared: SimpleNamespace) -> None:
 
 
 def load_requests(planner: int, requests: int, clients: int) -> bool:
-    """Ask a planner (a process with no other map yet) while maps change; return if all is right."""
-    context, maps = multiprocessing.get_context("spawn"), ros.three_maps()
+    """Ask a planner (a process with no other map yet) while maps change; return if it failed."""
+    context, maps = multiprocessing.get_context("spawn"), three_maps()
     number = len(maps)
     # Of the last map: its number where the planner is known to have it, and where it was published.
     confirmed, published = context.Value("i", number), context.Value("i", number)
@@ -109,28 +113,25 @@ def load_requests(planner: int, requests: int, clients: int) -> bool:
         seconds, last_memory = time.monotonic() - began, memory(planner)
     # It fails if a process did.
     results = [shared.results.get(timeout=ros.TIMEOUT) for _ in processes]
-    times, empty, errors = zip(*results, strict=True)
-    milliseconds, wrong_or_lost = np.concatenate(times), list(itertools.chain(*errors))
-    lost = requests - len(milliseconds)
+    times, empty, of_processes = zip(*results, strict=True)
+    milliseconds, errors = np.concatenate(times), list(itertools.chain(*of_processes))
     median, slow = np.percentile(milliseconds, (50, 99))
     print(
-        *wrong_or_lost[:10],
+        *errors[:10],
         f"GetPlan: {requests} requests of {clients} processes in {seconds:.0f} s, "
         f"{number - len(maps)} changes of the map",
-        f"  answered {len(milliseconds)}, lost {lost}, wrong {len(wrong_or_lost) - lost}",
         f"  paths {len(milliseconds) - sum(empty)}, empty answers {sum(empty)}",
         f"  latency median {median:.1f} ms, 99 % {slow:.1f} ms",
         f"  planner's resident memory {first_memory:.0f} MB after {WARM_UP:.0%} of them, "
         f"{last_memory:.0f} MB at the end: {last_memory / first_memory - 1:+.1%}",
         sep="\n",
-        flush=True,
     )
-    return not wrong_or_lost
+    return report("  lost or wrong answers", len(errors), "", 0)
 
 
 def load_goals(goals: int) -> bool:
-    """Send goals at 200 Hz; return whether plans follow in order, the last for the last goal."""
-    office, random = ros.three_maps()[2], np.random.default_rng(0)
+    """Send goals at 200 Hz; return whether a plan for an older goal followed a newer one's."""
+    office, random = ros.shipped_maps()["office"], np.random.default_rng(0)
     grid = office.grid
     ((start, _),) = random_requests(grid.occupancy, ros.RULE, 1, random)
     reachable = np.argwhere(grid.reachable([start], ros.RULE))[:, ::-1]
@@ -147,7 +148,6 @@ def load_goals(goals: int) -> bool:
         everything = QoSProfile(depth=goals, durability=DurabilityPolicy.VOLATILE)
         plans = client.subscribe(Path, "plan", everything)
         ros.wait_for("publisher of plan", lambda: client.node.count_publishers("plan"))
-        publisher = client.publisher(PoseStamped, "goal_pose")
 
         def heard() -> list[int]:
             ends = [plan.poses[-1:] for plan in plans.messages()]
@@ -156,19 +156,14 @@ def load_goals(goals: int) -> bool:
         began = time.monotonic()
         for sent, cell in enumerate(cells):
             time.sleep(max(0.0, began + sent * GOALS_PERIOD - time.monotonic()))
-            publisher.publish(ros.pose(grid, cell))
+            client.publish("goal_pose", ros.pose(grid, cell))
         seconds = time.monotonic() - began
         ros.wait_for("plan to the last goal", lambda: goals - 1 in heard())
         time.sleep(2)  # a plan for an older goal would come now
         order = heard()
+    print(f"goal_pose: {goals} goals in {seconds:.1f} s, {len(order)} plans published")
     late = sum(later < earlier for earlier, later in itertools.pairwise(order))
-    right = order[-1] == goals - 1 and not late
-    print(
-        f"goal_pose: {goals} goals in {seconds:.1f} s, {len(order)} plans published, "
-        f"{late} late; the last is {'' if right else 'not '}the last goal's",
-        flush=True,
-    )
-    return right
+    return report("  plans for a goal before the last one's", late, "", 0)
 
 
 class BurstClients(ros.Client):
@@ -245,25 +240,10 @@ def burst_requests(
     return requests
 
 
-def count_right(
-    fixture: ros.MapFixture, requests: Sequence[GetPlan.Request], answers: Sequence[Any]
-) -> int:
-    """Return how many answers are a path, or empty because there is none."""
-    pairs = zip(requests, answers, strict=True)
-    return sum(bool(answer) and not fixture.error(asked, answer.plan) for asked, answer in pairs)
-
-
 def load_bursts(
     sizes: Sequence[int] = SIZES, counts: Sequence[int] = COUNTS, bursts: int = BURSTS
-) -> bool:
-    """Send bursts to a running planner; return whether each request has its right answer."""
-    fine = True
-
-    def note(what: str, right: int, count: int) -> None:
-        nonlocal fine
-        fine &= right == bursts * count
-        print(f"bursts: {bursts} of {count} {what}: right {right} of {bursts * count}", flush=True)
-
+) -> Iterator[bool]:
+    """Send bursts to a running planner; yield whether a request of some has no right answer."""
     for size in sizes:
         fixture = ros.generated_map("rooms", size, resolution=0.5)
         free = fixture.grid.free_cells()
@@ -272,29 +252,35 @@ def load_bursts(
             count: [burst_requests(fixture.grid, goals, count, seed) for seed in range(bursts)]
             for count in counts
         }
-        all_pairs = [ros.plan_request(fixture.grid, a, b) for a in goals for b in goals]
+
+        def wrong(asking: BurstClients, asked: Sequence[Any], fixture: Any = fixture) -> int:
+            """Send a burst; count the answers that are lost, or no path where there is one."""
+            answers = zip(asked, asking.burst(asked), strict=True)
+            return sum(not it or bool(fixture.error(request, it.plan)) for request, it in answers)
+
         with BurstClients(1) as one:
             one.publish("map", fixture.message(), LATCHED)
             # Until it plans on this map, and knows the fields, whose times do not count here.
-            while count_right(fixture, all_pairs, one.burst(all_pairs)) < len(all_pairs):
+            pairs = [ros.plan_request(fixture.grid, a, b) for a in goals for b in goals]
+            while wrong(one, pairs):
                 pass
             for count, clients in itertools.product(counts, BURST_CLIENTS):
                 with BurstClients(clients) as asking:
-                    right = sum(count_right(fixture, r, asking.burst(r)) for r in sent[count])
-                note(f"requests, {size} x {size} cells, {clients} clients", right, count)
+                    missing = sum(wrong(asking, requests) for requests in sent[count])
+                what = f"{bursts} bursts of {count} from {clients} clients, {size} x {size} cells"
+                yield report(f"{what}: lost or wrong", missing, "", 0)
     with suppress(ModuleNotFoundError), GoalBursts() as action:
         for count in counts:
-            right = sum(min(action.burst(requests)) for requests in sent[count])
-            note("goals of compute_path_to_pose with a result", right, count)
-    return fine
+            missing = sum(count - min(action.burst(requests)) for requests in sent[count])
+            yield report(f"{bursts} bursts of {count} actions: without a result", missing, "", 0)
 
 
 def main(arguments: Sequence[str]) -> int:
     """Load a planner node with requests and with goals; return 1 if anything is lost or wrong."""
     requests = int(arguments[0]) if arguments else REQUESTS
     with claim_ros_domain(), running_node("planner_node", "--log-level", "error") as planner:
-        fine = [load_requests(planner.pid, requests, CLIENTS), load_goals(GOALS), load_bursts()]
-    return int(not all(fine))
+        failed = [load_requests(planner.pid, requests, CLIENTS), load_goals(GOALS), *load_bursts()]
+    return int(any(failed))
 
 
 if __name__ == "__main__":

@@ -8,7 +8,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, suppress
 from functools import partial
 from pathlib import Path
@@ -16,17 +16,16 @@ from typing import Any
 
 import numpy as np
 import processes
-from client import RULE, Client, ask, initial_pose, map_message, plan_request, pose, wait_for
+from client import RULE, Client, MapFixture, ask, generated_map, map_message, plan_request, wait_for
 from nav_msgs.msg import OccupancyGrid
 from nav_msgs.msg import Path as PathMessage
 from nav_msgs.srv import GetPlan
-from random_maps import Random, generate_map
 from rcl_interfaces.srv import GetParameters, ListParameters
 from std_srvs.srv import Trigger
 from tables import report
 
 from ddqn_planner import GridMap, Planner, load_map
-from ddqn_planner.grid import OCCUPIED, Cell
+from ddqn_planner.grid import OCCUPIED, MapFile, read_map_file
 from ddqn_planner.grid.noise import random_requests
 from ddqn_planner.nodes.runtime import LATCHED
 from ddqn_planner.resources import find_map
@@ -44,18 +43,6 @@ def message_of(grid: GridMap) -> OccupancyGrid:
     return map_message(OCCUPIED * grid.occupancy.astype(np.int8), grid)
 
 
-def publish_request(client: Client, grid: GridMap, start: Cell, goal: Cell) -> None:
-    """Publish the start and the goal."""
-    client.publish("initialpose", initial_pose(pose(grid, start)))
-    client.publish("goal_pose", pose(grid, goal))
-
-
-def office(side: int) -> tuple[GridMap, Random]:
-    """Return a generated office, and the generator that drew it."""
-    random = np.random.default_rng(0)
-    return GridMap(generate_map("office", (side, side), random)), random
-
-
 def usage(child: AbstractContextManager[Any], wait: Callable[[], Any]) -> Usage:
     """Start a process; return what it takes until a wait ends."""
     time.sleep(SETTLED)
@@ -71,12 +58,13 @@ def usage(child: AbstractContextManager[Any], wait: Callable[[], Any]) -> Usage:
 def start_planner() -> Usage:
     """Start the planner node; return what it takes until its first plan."""
     grid = load_map(find_map("dilemma"))
+    request = plan_request(grid, (6, 6), (17, 19))
     with Client() as client:
         plans = client.subscribe(PathMessage, "plan", LATCHED)
         client.publish("map", message_of(grid), LATCHED, listeners=0)
 
         def first_plan() -> None:
-            publish_request(client, grid, (6, 6), (17, 19))
+            client.publish_ends(request)
             plans.wait(lambda plan: plan.poses)
 
         return usage(processes.running_node("planner_node", "--log-level", "error"), first_plan)
@@ -112,7 +100,7 @@ def run_command(*command: str) -> Usage:
     return seconds, used.ru_utime + used.ru_stime, peak
 
 
-def measure_starts() -> list[bool]:
+def measure_starts() -> Iterator[bool]:
     """Print the medians of some starts beside their bounds."""
     imported = partial(run_command, sys.executable, "-c", "import ddqn_planner")
     planned = partial(run_command, processes.executable("ddqn-planner"), "plan", "dilemma")
@@ -123,13 +111,11 @@ def measure_starts() -> list[bool]:
         "import ddqn_planner": (imported, (FREE, 0.3, FREE)),
         "ddqn-planner plan dilemma": (planned, (1.2, FREE, FREE)),
     }
-    missed = []
     for name, (start, bounds) in starts.items():
         columns = list(zip(*(start() for _ in range(STARTS)), strict=True))
         name = f"{name} (slowest {max(columns[0]):.2f} s)"
         for column, unit, bound in zip(columns, ("s", "CPU", "MB"), bounds, strict=True):
-            missed.append(report(name, statistics.median(column), unit, bound))
-    return missed
+            yield report(name, statistics.median(column), unit, bound)
 
 
 def timed(service: Any, request: Any) -> tuple[float, Any]:
@@ -150,16 +136,15 @@ def first_answer(client: Client, request: GetPlan.Request) -> tuple[float, int]:
     return wait_for("plan", answer)
 
 
-def measure_requests(client: Client, map_file: Path) -> list[bool]:
+def measure_requests(client: Client, map_file: Path) -> Iterator[bool]:
     """Measure the first and the later answers of the planner node on a map."""
-    grid = load_map(map_file)
-    pairs = random_requests(grid.occupancy, RULE, GOALS, np.random.default_rng(0))
-    requests = [plan_request(grid, *cells) for cells in pairs]
+    fixture = MapFixture(read_map_file(map_file))
+    requests = fixture.requests(GOALS, np.random.default_rng(0))
     first, ratios = [], []
     server = processes.running_node("map_server_node", yaml_filename=map_file.resolve())
     with server, processes.running_node("planner_node"):
         planner = client.service(GetPlan, "planner/get_plan")
-        starting, _ = first_answer(client, requests[0])
+        first_answer(client, requests[0])
         for request in requests[1:]:
             took, poses = first_answer(client, request)
             first.append(took)
@@ -173,31 +158,25 @@ def measure_requests(client: Client, map_file: Path) -> list[bool]:
                 f"GetPlan of {poses} poses: first {took:.1f} ms, then {ours:.2f} ms; bare "
                 f"service {theirs:.2f} ms"
             )
-    name = f"{map_file.stem}, {grid.width}x{grid.height}"
-    # The node answers before its model is loaded: the first request waits for it.
-    print(f"{name}: first GetPlan of a node that is starting {starting:.1f} ms")
-    return [
-        report(f"{name}: GetPlan to a new goal, slowest", max(first), "ms", 100),
-        report(f"{name}: GetPlan again / bare service, worst", max(ratios), "x", 1.5),
-    ]
+    name = f"{map_file.stem}, {fixture.grid.width}x{fixture.grid.height}"
+    yield report(f"{name}: GetPlan to a new goal, slowest", max(first), "ms", 100)
+    yield report(f"{name}: GetPlan again / bare service, worst", max(ratios), "x", 1.5)
 
 
-def measure_large_map(client: Client) -> list[bool]:
+def measure_large_map(client: Client) -> Iterator[bool]:
     """Measure memory, and what other services take while a large field is computed."""
-    grid, random = office(LARGE)
-    cells = random_requests(grid.occupancy, RULE, GOALS + 1, random)
-    new = [plan_request(grid, *both) for both in cells[1:]]
-    # Of one pose: a long path takes its own time.
-    known = plan_request(grid, cells[0][0], cells[0][0])
+    random, waited = np.random.default_rng(0), []
+    fixture = generated_map("office", LARGE, seed=random)
+    known, *new = fixture.requests(GOALS + 1, random)
+    known.goal = known.start  # a long path would take its own time
     questions = {
         "get_parameters": (GetParameters, GetParameters.Request(names=["model"])),
         "list_parameters": (ListParameters, ListParameters.Request()),
         "get_plan": (GetPlan, known),
         "reload_model": (Trigger, Trigger.Request()),
     }
-    missed, waited = [], []
     with processes.running_node("planner_node") as planner:
-        client.publish("map", message_of(grid), LATCHED)
+        client.publish("map", fixture.message(), LATCHED)
         first_answer(client, known)
         get_plan = client.service(GetPlan, "planner/get_plan")
         for name, (service_type, question) in questions.items():
@@ -210,25 +189,24 @@ def measure_large_map(client: Client) -> list[bool]:
                     times.append(timed(service, question)[0])
                 waited.append(1e3 * (time.perf_counter() - began))
             figure = f"{LARGE}x{LARGE}, field under way: {name}, slowest of {len(times)}"
-            missed.append(report(figure, max(times), "ms", 100))
+            yield report(figure, max(times), "ms", 100)
         peak = processes.memory(planner.pid, "VmHWM")
     print(f"{LARGE}x{LARGE}: GetPlan with a new field, median {statistics.median(waited):.0f} ms")
-    return [*missed, report(f"{LARGE}x{LARGE}: planner node, greatest memory", peak, "MB", 2000)]
+    yield report(f"{LARGE}x{LARGE}: planner node, greatest memory", peak, "MB", 2000)
 
 
-def measure_new_maps(client: Client) -> list[bool]:
+def measure_new_maps(client: Client) -> Iterator[bool]:
     """Measure how soon a new large map brings a path to the active goal."""
     plans, times = client.subscribe(PathMessage, "plan", LATCHED), []
-    small, (first, _) = message_of(GridMap(np.zeros((5, 5), dtype=np.bool_))), office(LARGE)
+    small = message_of(GridMap(np.zeros((5, 5), dtype=np.bool_)))
+    office = generated_map("office", LARGE)
     with processes.running_node("planner_node"):
         for turns in range(4):
-            grid = GridMap(np.rot90(first.occupancy, turns))
+            turned = MapFixture(MapFile(np.rot90(office.values, turns), 1.0))
             client.publish("map", small, LATCHED)
-            random = np.random.default_rng(turns)
-            (cells,) = random_requests(grid.occupancy, RULE, 1, random)
-            publish_request(client, grid, *cells)
+            client.publish_ends(*turned.requests(1, np.random.default_rng(turns)))
             time.sleep(2)  # until the node has answered that these lie outside the small map
-            message = message_of(grid)
+            message = turned.message()
             plans.clear()
             began = time.monotonic()
             client.publish("map", message, LATCHED)
@@ -236,12 +214,13 @@ def measure_new_maps(client: Client) -> list[bool]:
             times.append(time.monotonic() - began)
     print(f"{LARGE}x{LARGE}: new map to path, first of the node {times[0]:.2f} s")
     seconds = statistics.median(times[1:])
-    return [report(f"{LARGE}x{LARGE}: new map to path, median", seconds, "s", 0.3)]
+    yield report(f"{LARGE}x{LARGE}: new map to path, median", seconds, "s", 0.3)
 
 
-def measure_changing_map(client: Client) -> list[bool]:
+def measure_changing_map(client: Client) -> Iterator[bool]:
     """Measure the planner's share of a core while a few cells of its map change."""
-    grid, random = office(CHANGING)
+    random = np.random.default_rng(0)
+    grid = generated_map("office", CHANGING, seed=random).grid
     ((start, goal),) = random_requests(grid.occupancy, RULE, 1, random)
     local, random, maps = Planner.load("any_map"), np.random.default_rng(0), [grid]
     path = local.plan(grid, start, goal, RULE).cells
@@ -252,7 +231,7 @@ def measure_changing_map(client: Client) -> list[bool]:
             maps.append(changed)
     messages = [message_of(changed) for changed in maps]
     with processes.running_node("planner_node") as planner:
-        publish_request(client, grid, start, goal)
+        client.publish_ends(plan_request(grid, start, goal))
         for number, message in enumerate(messages):
             if number == 2 * RATE:  # the node is warm
                 began, computed = time.monotonic(), processes.cpu_seconds(planner.pid)
@@ -260,12 +239,11 @@ def measure_changing_map(client: Client) -> list[bool]:
             time.sleep(1 / RATE)
         seconds, computed = time.monotonic() - began, processes.cpu_seconds(planner.pid) - computed
     name = f"{CHANGING}x{CHANGING}: a few cells change, {RATE} Hz: share of a core"
-    return [report(name, 100 * computed / seconds, "%", 10)]
+    yield report(name, 100 * computed / seconds, "%", 10)
 
 
-def measure_trainer(client: Client) -> list[bool]:
+def measure_trainer(client: Client) -> Iterator[bool]:
     """Measure the trainer node while it trains: its services, and how soon a signal ends it."""
-    missed: list[bool] = []
     slowest = dict.fromkeys(("start", "save", "replay", "stop"), 0.0)
 
     def call(name: str, times: int = 1) -> float:
@@ -278,8 +256,7 @@ def measure_trainer(client: Client) -> list[bool]:
             tempfile.TemporaryDirectory() as folder,
             processes.running_node("trainer_node", output_folder=folder, **options) as trainer,
         ):
-            # A service is found before its node spins: the first answer says that it does.
-            print(f"trainer: first answer of the node, while it starts: {call('stop'):.0f} ms")
+            call("stop")  # a service is found before its node spins
             print(f"trainer: first ~/start, once torch is imported: {call('start'):.0f} ms")
             call("stop")
             time.sleep(1)  # until it has saved itself
@@ -294,18 +271,16 @@ def measure_trainer(client: Client) -> list[bool]:
             trainer.send_signal(number)
             assert trainer.wait() == 0, f"{number.name} ended it with {trainer.returncode}"
             seconds = time.monotonic() - began
-        missed.append(report(f"trainer: {number.name} to exit", seconds, "s", 3))
-    return missed + [
-        report(f"trainer: ~/{name} while it trains, slowest of 100", ms, "ms", 100)
-        for name, ms in slowest.items()
-    ]
+        yield report(f"trainer: {number.name} to exit", seconds, "s", 3)
+    for name, ms in slowest.items():
+        yield report(f"trainer: ~/{name} while it trains, slowest of 100", ms, "ms", 100)
 
 
 def main(arguments: Sequence[str]) -> int:
     """Print each figure beside its bound, on another ROS map (a path) too; 1 if one is missed."""
     map_file = Path(arguments[0] if arguments else find_map("office"))
     with processes.claim_ros_domain():
-        missed = measure_starts()
+        missed = [*measure_starts()]
         gc.freeze()  # else this process pauses to look for garbage among what it has imported
         for measure in (
             partial(measure_requests, map_file=find_map("dilemma")),

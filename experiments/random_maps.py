@@ -65,10 +65,9 @@ def _corridors(shape: tuple[int, int], random: Random) -> Occupancy:
     row, column, next_row, next_column = _links(rows, columns, EXTRA_LINKS, random)
     widths = random.integers(1, 4, len(row))
     turns = random.random(len(row)) < 0.5
-    ends = (y[row, column], x[row, column], y[next_row, next_column], x[next_row, next_column])
-    links = np.stack([*ends, widths, turns], axis=1)
+    (y0s, y1s), (x0s, x1s) = ((of[row, column], of[next_row, next_column]) for of in (y, x))
     occupancy = np.ones(shape, dtype=np.bool_)
-    for y0, x0, y1, x1, width, turn in links.tolist():
+    for y0, x0, y1, x1, width, turn in zip(y0s, x0s, y1s, x1s, widths, turns, strict=True):
         corner_y, corner_x = (y0, x1) if turn else (y1, x0)
         occupancy[min(y0, y1) : max(y0, y1) + width, corner_x : corner_x + width] = False
         occupancy[corner_y : corner_y + width, min(x0, x1) : max(x0, x1) + width] = False
@@ -127,10 +126,7 @@ def _office(shape: tuple[int, int], random: Random) -> Occupancy:
 def _links(
     rows: int, columns: int, extra: float, random: Random
 ) -> tuple[Integers, Integers, Integers, Integers]:
-    """Link a lattice by a random tree and a share of the other links.
-
-    Returns row and column of one end of each link, and of the other end, below it or to its right.
-    """
+    """Link a lattice by a random tree and more; return both ends' rows and columns, as drawn."""
     from scipy.sparse import coo_matrix
     from scipy.sparse.csgraph import minimum_spanning_tree
 
@@ -193,10 +189,7 @@ def _between(spans: Spans, side: int) -> Spans:
 
 # The function that makes each kind of map. All free cells are connected, except in random_*.
 KINDS: Final[dict[str, Callable[[tuple[int, int], Random], Occupancy]]] = {
-    "random_10": partial(_independent, 0.1),
-    "random_20": partial(_independent, 0.2),
-    "random_30": partial(_independent, 0.3),
-    "random_40": partial(_independent, 0.4),
+    **{f"random_{percent}": partial(_independent, percent / 100) for percent in (10, 20, 30, 40)},
     "maze": _maze,
     "rooms": _rooms,
     "corridors": _corridors,

@@ -5,8 +5,8 @@ import itertools
 import math
 import random
 import statistics
+import sys
 import tempfile
-import threading
 import time
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
@@ -17,59 +17,49 @@ from typing import Any
 
 import client as ros
 import numpy as np
-from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticArray
+from driving_worlds import World
 from geometry_msgs.msg import PoseStamped
 from nav_msgs.msg import OccupancyGrid
 from nav_msgs.srv import GetPlan, LoadMap
 from processes import claim_ros_domain, memory, run_script, running_node
 from rosgraph_msgs.msg import Clock
-from std_msgs.msg import Header
 from std_srvs.srv import Trigger
-from tables import table
+from tables import report
 
 from ddqn_planner import MoveRule, Planner
-from ddqn_planner.grid import Cell, MapFile, save_map
+from ddqn_planner.grid import Cell
 from ddqn_planner.grid.noise import random_requests
 from ddqn_planner.nodes.runtime import LATCHED
 
-MINUTES, MAX_GROWTH = 30.0, 0.05
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "examples"))
+from simulated_robot import STEP, Robot
+
+MINUTES, MAX_GROWTH = 30.0, 5.0  # percent
 # Seconds between two samples of the memory, events of the robot, and pieces of work.
 PERIOD, EVENT_PERIOD, PAUSE = 5.0, 10.0, 0.02
 STEADY_FIELDS = 8  # that are computed before each sample
 NAMESPACE = "/robot"
 SOURCE = "tf" if importlib.util.find_spec("tf2_ros") else "odometry"  # of the robot's poses
-# Seconds of the clock per step; simulated seconds per second; steps from costmap to costmap;
-# metres per simulated second.
-STEP, SPEED_UP, COSTMAP_PERIOD, SPEED = 0.05, 4.0, 5, 1.0
+SPEED_UP, SLOWNESS = 4.0, 0.5  # the robot is twice as fast as at nominal speed
 # The planner's transform_tolerance and map_timeout, seconds; silent odometry has 2 seconds.
 TOLERANCE, MAP_TIMEOUT = 1.0, 1.0
 # Seconds after an event until the nodes must know of it, on a loaded machine; of silence; and
 # until all must be well again.
 GRACE, SILENCE, RECOVERY = 1.5, 5.0, 60.0
-JUMP_IN_SILENCE = "clock back, then no poses"
-SILENCES = ("poses stop", "costmap stops", JUMP_IN_SILENCE)
+SILENCES = ("poses stop", "costmap stops", "clock back, then no poses")
 EVENTS = ("clock back", "clock forward", "set elsewhere", *SILENCES)
 
 
 class Work:
-    """One piece of work per call, drawn at random; it writes its maps into a folder."""
+    """One piece of work per call, drawn at random."""
 
-    def __init__(self, client: ros.Client, folder: Path) -> None:
+    def __init__(self, client: ros.Client) -> None:
         self._client = client
         self._diagnostics = client.subscribe(DiagnosticArray, "/diagnostics", keep=1)
         self._draw = random.Random(0)
-        self._maps = ros.three_maps()
-        self._paths = [folder / f"{number}.yaml" for number in range(len(self._maps))]
-        for path, fixture in zip(self._paths, self._maps, strict=True):
-            grid = fixture.grid
-            start, goal, *_ = grid.free_cells()
-            save_map(MapFile(fixture.values, grid.resolution, grid.origin, start, goal), path)
-        grid = self._maps[-1].grid
-        cells = random_requests(grid.occupancy, ros.RULE, STEADY_FIELDS, np.random.default_rng(0))
-        self._steady = [ros.plan_request(grid, *both) for both in cells]
-        self._bad_map = folder / "bad.yaml"
-        self._bad_map.write_text("image: [", encoding="utf-8")
+        self._maps = ros.shipped_maps()
+        self._steady = self._maps["office"].requests(STEADY_FIELDS, np.random.default_rng(0))
         self.lost = 0
         self.done: Counter[str] = Counter()
 
@@ -78,7 +68,7 @@ class Work:
         client, draw, noise = self._client, self._draw, ("scatter_obstacles", "restore_map")
         # How often each kind of work is drawn, and what it does.
         work: dict[str, tuple[int, Callable[[], Any]]] = {
-            "map": (1, lambda: self._load(draw.choice(self._paths))),
+            "map": (1, lambda: self._load(draw.choice([*self._maps]))),
             "noise": (1, lambda: client.call(Trigger, f"map_server/{draw.choice(noise)}")),
             "model": (1, lambda: client.call(Trigger, "planner/reload_model")),
             "parameters": (1, lambda: self._set(draw.choice([*MoveRule]), draw.randint(1, 100))),
@@ -101,7 +91,7 @@ class Work:
         """Bring the nodes to the same state: the memory depends on the fields that are kept."""
         self._set("", 65)
         self._client.call(Trigger, "planner/reload_model")  # loaded again, it forgets all fields
-        loaded = self._load(self._paths[-1])
+        loaded = self._load("office")
         ros.wait_for_map(self._diagnostics, loaded.map.header.stamp)
         for steady in self._steady:
             self._client.call(GetPlan, "planner/get_plan", steady)
@@ -110,27 +100,27 @@ class Work:
         """Give each input once as it must not be."""
         client, bad = self._client, self._pose()
         bad.pose.position.x = math.nan
-        message = self._maps[0].message(1)
+        message = self._maps["dilemma"].message(1)
         message.info.width += 1
         client.publish("map", message, LATCHED)
         client.publish("initialpose", ros.initial_pose(bad))
         client.publish("goal_pose", bad)
         client.get_plan(bad, bad)
-        self._load(self._bad_map)
+        self._load("no_such_map")
         wrong = {"move_rule": "flying", "occupied_threshold": 0, "model": "no_such_model"}
         client.set_parameters("planner", **wrong)
 
-    def _load(self, path: Path) -> Any:
-        request = LoadMap.Request(map_url=str(path))
+    def _load(self, name: str) -> Any:
+        request = LoadMap.Request(map_url=f"{name}.yaml")
         return self._client.call(LoadMap, "map_server/load_map", request)
 
     def _pose(self) -> PoseStamped:
-        grid = self._draw.choice(self._maps).grid
+        grid = self._draw.choice([*self._maps.values()]).grid
         return ros.pose(grid, (self._draw.randrange(grid.width), self._draw.randrange(grid.height)))
 
 
-class SimulatedRobot(ros.Client):
-    """Drives between random cells, and publishes clock, costmap and poses from a thread."""
+class DrivenRobot(ros.Client):
+    """Drives the simulated robot between random cells, with its clock, costmap and poses."""
 
     def __init__(self) -> None:
         super().__init__(NAMESPACE, "simulated_robot")
@@ -139,112 +129,83 @@ class SimulatedRobot(ros.Client):
         self._goals = self.node.create_publisher(PoseStamped, "goal_pose", 10)
         self._poses = ros.RobotPoses(self.node)
         self._diagnostics = self.subscribe(DiagnosticArray, "/diagnostics", keep=100)
-        self._map = ros.three_maps()[0]
-        self._grid = self._map.grid
-        self._planner = Planner.load("any_map")
-        self._draw = random.Random(0)
+        self._map, self._planner = ros.shipped_maps()["dilemma"], Planner.load("any_map")
+        self._grid, self._draw = self._map.grid, random.Random(0)
         requests = random_requests(self._grid.occupancy, ros.RULE, 50, np.random.default_rng(0))
         self._cells = [start for start, _ in requests]
-        self._lock = threading.Lock()
-        self._now, self._steps, self._along = 1000.0, 0, 0.0
+        slowness = np.full(self._grid.occupancy.shape, SLOWNESS)
+        self._robot = Robot(World(self._grid, slowness, [], self._cells), seed=0)
         self._silent = ""  # the event that made the costmap or the poses stop
-        self._path: list[Cell] = []
         self._visited: set[Cell] = set()
         self._set_elsewhere()
         self.stale = self.lost = 0
         self.done: Counter[str] = Counter()
-        self._is_over = threading.Event()
-        thread = threading.Thread(target=self._run, daemon=True)
-        thread.start()
-        self.callback(thread.join)
-        self.callback(self._is_over.set)
-
-    def _run(self) -> None:
-        due = time.monotonic()
-        while not self._is_over.is_set():
-            with self._lock:
-                self._step()
-            due = max(due + STEP, time.monotonic() - 1.0)
-            time.sleep(max(0.0, due - time.monotonic()))
+        self.node.create_timer(STEP / SPEED_UP, self._step)
 
     def _step(self) -> None:
-        self._now += STEP * SPEED_UP
-        self._steps += 1
-        stamp = Time(sec=int(self._now), nanosec=int(self._now % 1 * 1e9))
-        self._clock.publish(Clock(clock=stamp))
-        if self._silent != "costmap stops" and self._steps % COSTMAP_PERIOD == 0:
-            message = ros.map_message(self._map.values, self._grid)
-            message.header.stamp = stamp
-            self._costmap.publish(message)
-        self._along += STEP * SPEED_UP * SPEED / self._grid.resolution
-        if self._along >= len(self._path) - 1:
-            self._drive_on(self._path[-1])
-        cell = self._path[int(self._along)]
+        robot = self._robot
+        robot.step()
+        cell = self._grid.world_to_cell(robot.x, robot.y)
         self._visited.add(cell)
-        if self._silent not in ("poses stop", JUMP_IN_SILENCE):
-            header = Header(stamp=stamp, frame_id="map")
-            self._poses.publish(header, *self._grid.cell_to_world(cell))
+        header = robot.header()
+        self._clock.publish(Clock(clock=header.stamp))
+        if self._silent != "costmap stops" and robot.now % 1 < STEP:
+            message = self._map.message()
+            message.header.stamp = header.stamp
+            self._costmap.publish(message)
+        if "poses" not in self._silent:
+            self._poses.publish(header, robot.x, robot.y, robot.yaw)
+        if not robot.is_driving:
+            self._drive_on(cell)
 
     def _drive_on(self, start: Cell) -> None:
         goal = self._draw.choice([cell for cell in self._cells if math.dist(cell, start) > 5])
-        self._path, self._along = list(self._planner.plan(self._grid, start, goal).cells), 0.0
+        cells = self._planner.plan(self._grid, start, goal).cells
+        self._robot.follow(np.array([self._grid.cell_to_world(cell) for cell in cells]))
         self._goals.publish(ros.pose(self._grid, goal))
 
     def _set_elsewhere(self) -> None:
         """Put the robot on a cell where it has not been since it was put down last."""
         far = [cell for cell in self._cells if cell not in self._visited]
-        self._drive_on(self._draw.choice(far or self._cells))
-        self._visited = {self._path[0]}
+        start = self._draw.choice(far or self._cells)
+        self._robot.x, self._robot.y = self._grid.cell_to_world(start)
+        self._visited = {start}
+        self._drive_on(start)
+
+    def _happen(self, kind: str) -> None:
+        self._set_elsewhere()
+        self._silent = kind if kind in SILENCES else ""
+        if "clock back" in kind:
+            self._robot.now = max(1.0, self._robot.now - self._draw.uniform(1, 600))
+        elif kind == "clock forward":
+            self._robot.now += self._draw.uniform(20, 600)
 
     def event(self, kind: str) -> None:
-        """Let something happen, and see that all is well after it."""
+        """Let something happen; see no plan in a silence, then plans from there and two drives."""
         self.done[kind] += 1
-        with self._lock:
-            self._set_elsewhere()
-            self._silent = kind if kind in SILENCES else ""
-            if kind in ("clock back", JUMP_IN_SILENCE):
-                self._now = max(1.0, self._now - self._draw.uniform(1, 600))
-            elif kind == "clock forward":
-                self._now += self._draw.uniform(20, 600)
-        happened = time.monotonic()
-        if self._silent:
-            while (began := time.monotonic()) < happened + SILENCE:
-                time.sleep(0.1)
-                if self._start_of_plan() and began > happened + MAP_TIMEOUT + GRACE:
-                    self._note_stale(kind, "a plan in the silence")
-            with self._lock:
-                self._silent = ""
-            happened = time.monotonic()
-        self._recover(kind, happened)
-
-    def _recover(self, kind: str, happened: float) -> None:
-        """Wait for a plan from where the robot is, and for two drives that began after that."""
-        planned, drives = False, -1
+        ros.wait_for(kind, self.run(self._happen, kind).done)
+        happened, planned, drives = time.monotonic(), False, -1
         while (began := time.monotonic()) < happened + RECOVERY:
-            cell = self._start_of_plan()
-            with self._lock:
-                is_right = cell in self._visited
+            if self._silent and began > happened + SILENCE:
+                self._silent, happened, drives = "", began, -1
+            # Where the planner thinks that the robot is.
+            poses = self.get_plan(PoseStamped(), ros.pose(self._grid, self._cells[0])).poses
+            start = ros.cell_of(self._grid, poses[0]) if poses else None
+            is_right = start in self._visited and not self._silent
             planned |= is_right
-            if began > happened + GRACE:
-                if cell is not None and not is_right:
-                    self._note_stale(kind, f"a plan from {cell}")
-                drives = self._drives() if drives < 0 else drives
+            if began > happened + GRACE + (MAP_TIMEOUT if self._silent else 0):
+                if poses and not is_right:
+                    self.stale += 1
+                    print(
+                        f"after {kind}: a plan from {start}, silent: {self._silent!r}", flush=True
+                    )
+                drives = self._drives() if self._silent or drives < 0 else drives
                 if planned and self._drives() >= drives + 2:
                     return
             time.sleep(0.1)
         self.lost += 1
         what = "no new drive" if planned else "no plan"
         print(f"after {kind}: {what} in {RECOVERY:g} s", flush=True)
-
-    def _note_stale(self, kind: str, what: str) -> None:
-        self.stale += 1
-        print(f"after {kind}: {what}", flush=True)
-
-    def _start_of_plan(self) -> Cell | None:
-        """Return the start of a plan from where the planner thinks that the robot is."""
-        goal = ros.pose(self._grid, self._draw.choice(self._cells))
-        poses = self.get_plan(PoseStamped(), goal).poses
-        return ros.cell_of(self._grid, poses[0]) if poses else None
 
     def _drives(self) -> int:
         """Return how many drives the trainer has recorded."""
@@ -297,31 +258,26 @@ def main(arguments: Sequence[str]) -> int:
         ExitStack() as stack,
         ros.Client() as client,
     ):
-        drives = f"{folder}/drives"
+        of_trainer["output_folder"] = f"{folder}/drives"
         nodes = {
             "map_server_node": running_node("map_server_node", *quiet),
             "planner_node": running_node("planner_node", *quiet),
             "robot's planner": running_node("planner_node", *apart, **of_planner),
-            "robot's trainer": running_node(
-                "trainer_node", *apart, **of_trainer, output_folder=drives
-            ),
+            "robot's trainer": running_node("trainer_node", *apart, **of_trainer),
         }
         children = {name: stack.enter_context(node) for name, node in nodes.items()}
-        robot = stack.enter_context(SimulatedRobot())
-        work = Work(client, Path(folder))
+        robot = stack.enter_context(DrivenRobot())
+        work = Work(client)
         samples = soak(children, work, minutes, robot)
-    for what in (work, robot):
-        done = ", ".join(f"{name} {count}" for name, count in sorted(what.done.items()))
-        print(f"{minutes:g} minutes: {done}; {what.lost} lost")
-    print(f"{robot.stale} stale answers; the robot's poses came by {SOURCE}")
-    rows, grows = [], False
+    done = ", ".join(f"{name} {count}" for name, count in sorted((work.done + robot.done).items()))
+    print(f"{minutes:g} minutes: {done}; the robot's poses came by {SOURCE}")
+    missed = [report("without an answer, or not recovered", work.lost + robot.lost, "", 0)]
+    missed.append(report("stale answers", robot.stale, "", 0))
     for name, sampled in samples.items():
         warm, last, share = growth(sampled)
-        megabytes = (f"{mb:.1f}" for mb in (sampled[0], warm, last))
-        rows.append([name, len(sampled), *megabytes, f"{share:+.1%}"])
-        grows |= share > MAX_GROWTH
-    print(table("node | samples | MB at start | warm | at end | growth", rows))
-    return int(bool(work.lost or robot.lost or robot.stale or grows))
+        figure = f"{name}: {warm:.1f} MB when warm, {last:.1f} MB at the end; growth"
+        missed.append(report(figure, 100 * share, "%", MAX_GROWTH))
+    return int(any(missed))
 
 
 if __name__ == "__main__":

@@ -7,16 +7,13 @@ import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import gymnasium
-import matplotlib.pyplot as plt
 import nano_astar
 import numpy as np
 import pyastar2d
 import torch
-from figures import COLOURS
 from random_maps import KINDS, Random, generate_map
 from stable_baselines3 import DQN
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
@@ -27,8 +24,6 @@ from ddqn_planner import GridMap, MoveRule, Planner, QField
 from ddqn_planner.grid import Cell, shortest_distances
 from ddqn_planner.grid.arguments import Occupancy
 from ddqn_planner.grid.noise import random_costs, random_requests
-from ddqn_planner.planning.field import DistanceField
-from ddqn_planner.planning.kernels import CLOSED
 from ddqn_planner.training.environment import GridEnvironment, paper_scenario
 from ddqn_planner.training.hyper_parameters import HyperParameters
 from ddqn_planner.training.trainer import Trainer
@@ -40,7 +35,6 @@ STEPS, TRAINING_ROUNDS = 3_000, 5
 FLIPPED = 10  # cells that a change near a place flips, of the 25 around it
 WALL = 41  # cells of a wall that opens or closes
 SHORTEST = 40  # moves of the shortest path for replans: robot and goal are far from each other
-IMAGES = Path(__file__).resolve().parents[1] / "docs" / "images"
 
 Call = Callable[[], Any]  # what is timed; a `Callable[[], Call]` makes all that it needs
 LOADED = Planner.load("any_map")
@@ -54,6 +48,11 @@ def new_planner() -> Planner:
 def new_request(occupancy: Occupancy, start: Cell, goal: Cell) -> Call:
     """Return the call that plans on a new map."""
     return partial(new_planner().plan, GridMap(occupancy), start, goal, RULE)
+
+
+def on_new_map(function: Callable[..., Any], occupancy: Occupancy, cost: Any, goal: Cell) -> Call:
+    """Return the call of a function of a map that it does not know."""
+    return partial(function, GridMap(occupancy, cost=cost), goal, RULE)
 
 
 def ready(function: Callable[..., Any], *arguments: Any, **options: Any) -> Callable[[], Call]:
@@ -79,18 +78,17 @@ def medians(times: Sequence[Sequence[float]]) -> list[float]:
     return [statistics.median(column) for column in zip(*times, strict=True)]
 
 
-def measure_paper_map() -> list[bool]:
+def measure_paper_map() -> Iterator[bool]:
     """Time the Q field of the paper's map, computed anew each time."""
     planner, scenario = Planner.load("dilemma"), paper_scenario()
     rule = planner.metadata.move_rule
     field = ready(planner.network.q_values, scenario.grid, scenario.goal, rule)
     ((took,), _) = take_turns(field, rounds=FIELDS)
-    return [report("Q field of the 20x20 map", took, "ms", 20)]
+    yield report("Q field of the 20x20 map", took, "ms", 20)
 
 
-def measure_requests(side: int) -> list[bool]:
+def measure_requests(side: int) -> Iterator[bool]:
     """Compare a request on a new map with A* in C++, and time one to a goal that is known."""
-    missed = []
     for kind in MAP_KINDS:
         random, times = np.random.default_rng(0), []
         occupancy = generate_map(kind, (side, side), random)
@@ -110,13 +108,10 @@ def measure_requests(side: int) -> list[bool]:
             times.append((*took, known, len(plan.cells)))
         our_ms, nano_ms, pyastar_ms, known_ms, moves = medians(times)
         name = f"{side}x{side} {kind}: request {our_ms:.2f} ms"
-        missed += [
-            report(f"{name}, nano-astar {nano_ms:.2f}; ratio", our_ms / nano_ms, "x", 1.0),
-            report(f"{name}, pyastar2d* {pyastar_ms:.2f}; ratio", our_ms / pyastar_ms, "x", 1.3),
-            report(f"{side}x{side} {kind}: known goal, {moves:.0f} cells", known_ms, "ms", 0.1),
-        ]
+        yield report(f"{name}, nano-astar {nano_ms:.2f}; ratio", our_ms / nano_ms, "x", 1.0)
+        yield report(f"{name}, pyastar2d* {pyastar_ms:.2f}; ratio", our_ms / pyastar_ms, "x", 1.3)
+        yield report(f"{side}x{side} {kind}: known goal, {moves:.0f} cells", known_ms, "ms", 0.1)
     print("* cuts corners, and a diagonal counts 1: its paths are no paths under our rule")
-    return missed
 
 
 CHANGE_KINDS = (
@@ -177,9 +172,8 @@ def draw_changes(map_kind: str, side: int, kind: str) -> Iterator[tuple[Change, 
                 yield change, start, goal
 
 
-def measure_replans(side: int) -> list[bool]:
+def measure_replans(side: int) -> Iterator[bool]:
     """Compare replans with a new field on the changed map, which must give the same path."""
-    missed = []
     for kind in CHANGE_KINDS:
         ratios: list[tuple[float, str, float, float]] = []
         for map_kind in MAP_KINDS:
@@ -192,8 +186,7 @@ def measure_replans(side: int) -> list[bool]:
         typical, (worst, on, ms, fresh_ms) = statistics.median(r[0] for r in ratios), max(ratios)
         print(f"worst: {on}, {ms:.1f} ms; new field {fresh_ms:.1f} ms")
         figure = f"{side}x{side}, {kind}: replan / new, median {typical:.3f}; worst"
-        missed.append(report(figure, worst, "x", 2.0))
-    return missed
+        yield report(figure, worst, "x", 2.0)
 
 
 def all_values(grid: GridMap, goal: Cell, rule: MoveRule) -> QField:
@@ -203,12 +196,7 @@ def all_values(grid: GridMap, goal: Cell, rule: MoveRule) -> QField:
     return field
 
 
-def on_new_map(function: Callable[..., Any], occupancy: Occupancy, cost: Any, goal: Cell) -> Call:
-    """Return the call of a function of a map that it does not know."""
-    return partial(function, GridMap(occupancy, cost=cost), goal, RULE)
-
-
-def measure_whole_fields(side: int, costs: bool, bound: float) -> list[bool]:
+def measure_whole_fields(side: int, costs: bool, bound: float) -> Iterator[bool]:
     """Compare the value of every cell with scipy's Dijkstra, graph included, on each kind."""
     ratios, nbytes, name = {}, 0, f"{side}x{side}{', random costs' if costs else ''}"
     for kind in KINDS:
@@ -228,10 +216,8 @@ def measure_whole_fields(side: int, costs: bool, bound: float) -> list[bool]:
         print(f"{name}, {kind}: field {ours:.1f} ms, Dijkstra {dijkstra:.1f} ms", flush=True)
     worst = max(ratios, key=lambda kind: ratios[kind])
     figure = f"{name}: field / Dijkstra, worst kind ({worst})"
-    missed = [report(figure, 100 * ratios[worst], "%", bound)]
-    if side > 32:
-        missed.append(report(f"{name}: bytes per cell of a field", nbytes / side**2, "B", 10))
-    return missed
+    yield report(figure, 100 * ratios[worst], "%", bound)
+    yield report(f"{name}: bytes per cell of a field", nbytes / side**2, "B", 10)
 
 
 class PaperFeatures(BaseFeaturesExtractor):
@@ -247,7 +233,7 @@ class PaperFeatures(BaseFeaturesExtractor):
         return torch.relu(self.convolution(observations.unsqueeze(1))).flatten(1)
 
 
-def measure_training() -> list[bool]:
+def measure_training() -> Iterator[bool]:
     """Compare our steps per second with Stable-Baselines3's DQN: same network, an update a step."""
     # ε is at its last value from the start: a random action costs no forward pass.
     p = HyperParameters(epsilon_start=HyperParameters().epsilon_end)
@@ -289,76 +275,21 @@ def measure_training() -> list[bool]:
     our_rate, their_rate = (STEPS / seconds for seconds in medians(times))
     ratio = statistics.median(theirs / ours for ours, theirs in times)
     figure = f"training: {our_rate:.0f} steps/s; Stable-Baselines3 {their_rate:.0f}; ratio"
-    return [report(figure, ratio, "x", 1.5, at_most=False)]
+    yield report(figure, ratio, "x", 1.5, at_most=False)
 
 
-def draw_visited_cells() -> None:
-    """Draw what one request visits, beside A* and Dijkstra's algorithm."""
-    random = np.random.default_rng(1)
-    grid = GridMap(generate_map("office", (160, 160), random))
-    requests = random_requests(grid.occupancy, RULE, 30, random)
-    start, goal = max(requests, key=lambda cells: math.dist(*cells))
-    planner = new_planner()
-    plan = planner.plan(grid, start, goal, RULE)
-    field = planner.q_field(grid, goal, RULE)
-    assert isinstance(field, DistanceField)
-    closed = field.known.state.reshape(grid.height + 2, -1)[1:-1, 1:-1] == CLOSED
-    cells = start[::-1], goal[::-1]
-    _, _, history = nano_astar.astar(grid.occupancy.astype(np.uint8), *cells, return_history=True)
-    by_a_star = np.zeros_like(closed)
-    by_a_star[tuple(history.T)] = True
-    distances = shortest_distances(grid, goal, RULE)
-    by_dijkstra = distances <= distances[start[::-1]]
-    figure, axes = plt.subplots(1, 3, figsize=(10.5, 3.9), layout="constrained")
-    panels = {"this planner": closed, "A* (nano-astar)": by_a_star, "Dijkstra": by_dijkstra}
-    for axis, (name, visited) in zip(axes, panels.items(), strict=True):
-        colours = np.full((*visited.shape, 3), 1.0)
-        colours[visited] = (0.68, 0.83, 0.93)
-        colours[grid.occupancy] = (0.35, 0.35, 0.35)
-        axis.imshow(colours, origin="lower", interpolation="nearest")
-        axis.plot(*np.transpose(plan.cells), color="#D55E00", linewidth=1.5)
-        axis.plot(*start, "o", *goal, "*", color="black", markersize=7)
-        axis.set(xticks=[], yticks=[], title=f"{name}: {np.count_nonzero(visited):,} cells")
-    figure.savefig(IMAGES / "visited_cells.png", dpi=120)
-
-
-def draw_times() -> None:
-    """Draw the time of a request on a new map against the length of its path."""
-    sides = (256, 512, 1024, 2000)
-    shared: dict[str, Any] = {"sharex": True, "sharey": True, "layout": "constrained"}
-    figure, axes = plt.subplots(1, len(sides), figsize=(10.5, 3.2), **shared)
-    for axis, side in zip(axes, sides, strict=True):
-        for kind, colour in zip(MAP_KINDS, COLOURS, strict=True):
-            random, points = np.random.default_rng(0), []
-            occupancy = generate_map(kind, (side, side), random)
-            for cells in random_requests(occupancy, RULE, 2 * REQUESTS, random):
-                ((took,), (plan,)) = take_turns(partial(new_request, occupancy, *cells))
-                points.append((plan.length, took))
-            axis.loglog(*np.transpose(points), ".", color=colour, label=kind)
-        axis.set(title=f"{side} x {side}", xlabel="length of the path, cells")
-        axis.grid(alpha=0.3)
-    axes[0].set_ylabel("CPU time, ms")
-    axes[0].legend(fontsize=8)
-    figure.savefig(IMAGES / "request_times.png", dpi=120)
-
-
-def main(arguments: Sequence[str]) -> int:
-    """Print each figure beside its bound, or draw (--pictures); return 1 if a bound is missed."""
+def main() -> int:
+    """Print each figure beside its bound; return 1 if one is missed."""
     torch.set_num_threads(1)
     gc.freeze()  # else this process pauses to look for garbage among what it has imported
-    if "--pictures" in arguments:
-        draw_visited_cells()
-        draw_times()
-        return 0
-    missed = measure_paper_map() + measure_training()
+    missed = [*measure_paper_map(), *measure_training()]
     for side in (256, 1024):
         missed += measure_requests(side)
     missed += measure_replans(1024)
-    missed += measure_whole_fields(32, False, 50)
     for side in (256, 1024, 2000):
-        missed += measure_whole_fields(side, False, 20) + measure_whole_fields(side, True, 25)
+        missed += [*measure_whole_fields(side, False, 20), *measure_whole_fields(side, True, 25)]
     return int(any(missed))
 
 
 if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]))
+    sys.exit(main())

@@ -21,10 +21,7 @@ def table(header: str, rows: Sequence[Sequence[object]]) -> str:
 
 
 def write_report(out: Path, sections: Mapping[str, str], page: Path | None = None) -> str:
-    """Write ``report.md`` and return it; a page gets the sections that it has marks for.
-
-    The marks are ``<!-- title -->`` and ``<!-- end -->``; figures go to ``images/PAGE``.
-    """
+    """Write ``report.md`` and return it; a page gets the sections that it has marks for."""
     text = "\n".join(f"## {title}\n\n{section}\n" for title, section in sections.items())
     write_atomically(out / "report.md", text.encode())
     if page is not None:

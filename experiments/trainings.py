@@ -16,14 +16,15 @@ from tqdm import tqdm
 
 from ddqn_planner.cli import HelpFormatter
 from ddqn_planner.files import write_csv
-from ddqn_planner.grid import MoveRule, Noise, neighbours, shortest_distances
+from ddqn_planner.grid import MoveRule, Noise, neighbours
 from ddqn_planner.planning import Plan, Planner
-from ddqn_planner.training.environment import GridVectorEnvironment, Scenario
+from ddqn_planner.training.environment import GridVectorEnvironment, Scenario, paper_scenario
 from ddqn_planner.training.hyper_parameters import HyperParameters
 from ddqn_planner.training.networks import value_iteration
 from ddqn_planner.training.run import TrainingRun
 from ddqn_planner.training.trainer import Trainer
 
+SCENARIO: Final = paper_scenario()
 MOVE_RULE: Final = MoveRule.CORNER_CUTTING  # by it the paper's 22.97 is the shortest path
 BACKENDS: Final = ("loky", "ray", "dask", "sequential")  # of joblib: this machine, or a cluster
 HIDDEN_UNITS: Final = (0, 128)  # of the paper's network for goal iii; 0 for no hidden layer
@@ -88,7 +89,7 @@ class Settings:
 
     def evaluations(self, name: str) -> list[Evaluations]:
         """Return the evaluations of the trainings with a name, one table per seed."""
-        return [read_evaluations(folder) for folder in self.folders(name)]
+        return [read_csv(folder / "evaluations.csv") for folder in self.folders(name)]
 
     def planners(self, name: str, file: str = "model.safetensors") -> list[Planner]:
         """Load the planners that the trainings with a name produced, one per seed."""
@@ -144,11 +145,11 @@ def _in_one_thread(job: Callable[[Any], Any], item: Any) -> Any:
 
 def train(training: Training) -> None:
     """Train and evaluate, or resume; keep the last network that solved the most scenarios, too."""
-    folder, parameters = training.folder, training.parameters
-    run = TrainingRun(folder, training.scenarios, MOVE_RULE, parameters, training.seed)
+    folder = training.folder
+    run = TrainingRun(folder, training.scenarios, MOVE_RULE, training.parameters, training.seed)
     with closing(run):
         trainer = run.trainer
-        before = read_evaluations(folder)
+        before = read_csv(folder / "evaluations.csv")
         before = before[before["step"] <= trainer.steps]
         rows = [dict(zip(before.dtype.names or (), row, strict=True)) for row in before.tolist()]
         optimum = optimal_value(trainer.environment)
@@ -185,7 +186,7 @@ def evaluate_training(
         "episodes": trainer.episodes,
         "seconds": round(seconds, 3),
         "solved": len(lengths),
-        "solved_unmasked": solved(unmasked),
+        "solved_unmasked": sum(bool(plan.cells) for plan in unmasked),
         "length": float(np.mean(lengths)) if lengths else np.nan,
         "overestimation": overestimation,
     }
@@ -198,17 +199,6 @@ def rollouts(planner: Planner, scenarios: Sequence[Scenario]) -> tuple[list[Plan
         [field.rollout(start) for field, start in fields],
         [field.unmasked().rollout(start) for field, start in fields],
     )
-
-
-def solved(plans: Sequence[Plan]) -> int:
-    """Count the plans that reach the end."""
-    return sum(bool(plan.cells) for plan in plans)
-
-
-def optimal_length(scenario: Scenario) -> float:
-    """Return the length of the shortest path from start to goal, cells."""
-    distances = shortest_distances(scenario.grid, scenario.goal, MOVE_RULE)
-    return float(distances[scenario.start[::-1]])
 
 
 def optimal_value(environment: GridVectorEnvironment) -> NDArray[np.float32]:
@@ -228,11 +218,7 @@ def optimal_value(environment: GridVectorEnvironment) -> NDArray[np.float32]:
 
 
 def read_csv(path: Path) -> NDArray[Any]:
-    """Return the columns of a file by their names."""
+    """Return the columns of a file by their names; none if there is no file."""
+    if not path.exists():
+        return np.empty(0, [("step", np.float64)])
     return np.genfromtxt(path, delimiter=",", names=True, ndmin=1, encoding="utf-8")
-
-
-def read_evaluations(folder: Path) -> Evaluations:
-    """Read ``evaluations.csv`` of a training's folder; empty if there is none."""
-    path = folder / "evaluations.csv"
-    return read_csv(path) if path.exists() else np.empty(0, [("step", np.float64)])

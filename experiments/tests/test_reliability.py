@@ -38,23 +38,23 @@ def test_every_answer_is_right_while_the_map_changes_and_goals_are_planned_in_or
     capfd: pytest.CaptureFixture[str],
 ) -> None:
     with running_node("planner_node") as planner:
-        fine = load_requests(planner.pid, requests=200, clients=4)
-        fine &= load_goals(200) and load_bursts((20, 50), (20,), 2)
+        failed = [load_requests(planner.pid, requests=200, clients=4), load_goals(200)]
+        failed += load_bursts((20, 50), (20,), 2)
         assert planner.poll() is None
     printed = "".join(capfd.readouterr())
-    assert fine, printed
+    assert not any(failed), printed
     assert "Traceback" not in printed
 
 
 def test_mixed_work_with_bad_input_is_answered_and_sampled(
-    tmp_path: Path, capfd: pytest.CaptureFixture[str]
+    capfd: pytest.CaptureFixture[str],
 ) -> None:
     with (
         running_node("map_server_node") as server,
         running_node("planner_node") as planner,
         Client() as client,
     ):
-        work = Work(client, tmp_path)
+        work = Work(client)
         work.bad_input()
         children = {"map_server_node": server, "planner_node": planner}
         samples = soak(children, work, minutes=0.05)

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 import trainings
 from goal_1 import convergence_row
-from goal_2 import free_starts, trained_field
+from goal_2 import STARTS, trained_field
 from goal_3 import best_moves, fixed_path, noisy_maps, train_supervised
 from networks import random_network
 from PIL import Image
@@ -96,7 +96,7 @@ def test_a_training_that_was_cut_off_ends_as_if_it_had_not_been(
     trainings.train(whole)
     trainings.train(replace(cut, parameters=replace(QUICK, steps=600)))
     trainings.in_parallel(trainings.train, [cut])
-    runs = [trainings.read_evaluations(folder) for folder in folders]
+    runs = [trainings.read_csv(folder / "evaluations.csv") for folder in folders]
     assert runs[0]["step"].tolist() == [300, 600, 900]
     for name in set(runs[0].dtype.names or ()) - {"seconds"}:
         np.testing.assert_array_equal(runs[0][name], runs[1][name])
@@ -112,7 +112,7 @@ def test_the_last_of_the_networks_that_solve_the_most_is_kept(
     small: Scenario, tmp_path: Path
 ) -> None:
     trainings.train(trainings.Training(tmp_path, QUICK, (small,), seed=1, evaluation_interval=50))
-    solved = np.flatnonzero(trainings.read_evaluations(tmp_path)["solved"] == 1)
+    solved = np.flatnonzero(trainings.read_csv(tmp_path / "evaluations.csv")["solved"] == 1)
     assert len(solved) > 1
     assert load_model(tmp_path / "kept.safetensors")[1].steps == 50 * (solved[-1] + 1)
 
@@ -200,9 +200,9 @@ def test_the_q_that_the_loss_trains_adds_up_the_papers_rewards(paper: Scenario) 
     network.tensors["moves.bias"].fill(100.0)
     planner = Planner(network, metadata)
     ratios = length_ratios(planner.q_field(paper.grid, paper.goal), paper.grid, trainings.MOVE_RULE)
-    assert free_starts(paper).sum() == 286
-    assert 0 < np.isfinite(ratios)[free_starts(paper)].sum() < 286
-    field = trained_field(planner, paper)
+    assert STARTS.sum() == 286
+    assert 0 < np.isfinite(ratios)[STARTS].sum() < 286
+    field = trained_field(planner)
     goal_x, goal_y = paper.goal
     assert field.q[0, goal_y, goal_x - 1] == pytest.approx(10.0, abs=1e-3)
     # Two moves before the end: Section 4.2's reward of one, and the end's, discounted.
