@@ -171,14 +171,13 @@ def _copy(message: Any) -> Any:
 def check_pose(name: str, stamped: PoseStamped, frame: str = "", other_remedy: str = "") -> None:
     """Check a pose, which the ValueError calls by its name, and that it is in the map's frame."""
     its = stamped.header.frame_id
-    if not its or (frame and its != frame):
-        known = f", the map's is {frame!r}" if frame else ""
-        remedy = "name one in header.frame_id"
-        if its:
-            in_rviz = "(in RViz: set Fixed Frame to it)"
-            remedy = f"transform the pose to that frame {in_rviz}{other_remedy}"
-        raise ValueError(f"{name}'s frame is {its!r}{known}; {remedy}")
-    _check_pose(name, stamped.pose)
+    if its and frame in ("", its):
+        return _check_pose(name, stamped.pose)
+    known = f", the map's is {frame!r}" if frame else ""
+    remedy = "name one in header.frame_id"
+    if its:
+        remedy = f"transform the pose to that frame (in RViz: set Fixed Frame to it){other_remedy}"
+    raise ValueError(f"{name}'s frame is {its!r}{known}; {remedy}")
 
 
 def cell_from_pose(name: str, stamped: PoseStamped, grid: GridMap, frame: str) -> Cell:
@@ -213,10 +212,9 @@ def _check_pose(name: str, pose: Pose) -> None:
     # A comparison that NaN fails.
     norm = math.hypot(rotation.x, rotation.y, rotation.z, rotation.w)
     if not abs(norm - 1) <= TOLERANCE:
-        raise ValueError(
-            f"{name}'s orientation is ({_numbers(rotation)}), a quaternion of norm {norm:.6g}; "
-            "give one of norm 1 (w = 1 and the rest 0 means no rotation)"
-        )
+        wrong = f"orientation is ({_numbers(rotation)}), a quaternion of norm {norm:.6g}"
+        remedy = "give one of norm 1 (w = 1 and the rest 0 means no rotation)"
+        raise ValueError(f"{name}'s {wrong}; {remedy}")
 
 
 def _numbers(message: Point | Quaternion) -> str:
