@@ -198,9 +198,10 @@ class PlannerNode(ManagedNode):
         if active.is_news(outcome, header.frame_id):
             self._plan_publisher.publish(_path(serialized_path, outcome, header))
         self._waits_for_pose = outcome.status in ("NO_START", "TF_ERROR")
-        # The places and lengths in the reason may differ.
-        kind = outcome.status, outcome.plan.method, "start is occupied" in outcome.reason
-        logged = goals, outcome.goal, *kind
+        path, request = outcome.plan.path, outcome.request
+        leaves = request is not None and len(path) > 0 and request.grid.is_obstacle(path[0])
+        # Not the reason: its places and lengths may differ.
+        logged = goals, outcome.goal, outcome.status, outcome.plan.method, leaves
         if self._logged != logged:
             self._logged = logged
             self._report.log(outcome)
@@ -209,8 +210,7 @@ class PlannerNode(ManagedNode):
     async def _plan_for_action(
         self, start: PoseStamped | None, goals: list[PoseStamped], name: str, given_up: GivenUp
     ) -> tuple[Path, Outcome]:
-        how = start, goals, None, name, self._followed
-        header, outcome = await self._answer(given_up, *how)
+        header, outcome = await self._answer(given_up, start, goals, None, name, self._followed)
         if outcome.request is not None and len(outcome.plan.path):
             self._followed.keep(outcome.plan.every_cell, outcome.request.grid, header.frame_id)
             self._plan_publisher.publish(_path(serialized_path, outcome, header))

@@ -231,7 +231,7 @@ def _array(path: Cells) -> Path:
     return np.asarray(path, dtype=np.int32).reshape(-1, 2)
 
 
-# Simplification# Simplification
+# Simplification
 
 
 def simplify(cells: Cells, grid: GridMap, move_rule: MoveRule | str) -> tuple[Cell, ...]:

@@ -178,6 +178,13 @@ def test_segments_are_as_long_as_can_be() -> None:
 # The path under way
 
 
+def drawn_path(data: st.DataObject, grid: GridMap, goal: Cell, rule: MoveRule) -> list[Cell]:
+    """A shortest path from one of the cells that have one."""
+    path = list(shortest_path(grid, data.draw(st.sampled_from(grid.free_cells())), goal, rule))
+    assume(path)
+    return path
+
+
 @given(GRIDS, RULES, st.data())
 def test_legal_segments_are_those_of_legal_moves_or_through_free_cells(
     grid_and_cell: tuple[GridMap, Cell], rule: MoveRule, data: st.DataObject
@@ -196,8 +203,7 @@ def test_a_path_is_valid_if_all_of_it_from_the_cell_nearest_to_the_robot_on_is_l
     grid_and_cell: tuple[GridMap, Cell], rule: MoveRule, data: st.DataObject
 ) -> None:
     grid, goal = grid_and_cell
-    path = list(shortest_path(grid, data.draw(st.sampled_from(grid.free_cells())), goal, rule))
-    assume(path)
+    path = drawn_path(data, grid, goal, rule)
     path = data.draw(st.sampled_from([path, [*simplify(path, grid, rule)]]))
     robot = data.draw(st.tuples(st.integers(-99, 99), st.integers(-99, 99)))
     after = data.draw(changed(grid))
@@ -222,8 +228,7 @@ def test_what_is_left_of_a_path_leads_from_the_robot_onto_it_by_legal_moves(
     grid_and_cell: tuple[GridMap, Cell], rule: MoveRule, data: st.DataObject
 ) -> None:
     grid, goal = grid_and_cell
-    path = list(shortest_path(grid, data.draw(st.sampled_from(grid.free_cells())), goal, rule))
-    assume(path)
+    path = drawn_path(data, grid, goal, rule)
     after = data.draw(changed(grid))
     robot = data.draw(st.tuples(st.integers(-1, 9), st.integers(-1, 9)) | st.sampled_from(path))
     rest = list(map(tuple, rest_of_path(path, robot, after, rule).tolist()))
