@@ -1,6 +1,7 @@
 """Asks one planner node from many processes while its map changes, and checks every answer."""
 
 import itertools
+import math
 import multiprocessing
 import signal
 import time
@@ -23,7 +24,6 @@ from rclpy.task import Future
 from tables import report
 
 from ddqn_planner.grid import Cell, GridMap
-from ddqn_planner.grid.noise import random_requests
 from ddqn_planner.nodes.nav2 import QUEUES
 from ddqn_planner.nodes.runtime import LATCHED
 
@@ -42,12 +42,9 @@ def three_maps() -> list[ros.MapFixture]:
 
 
 def ask(seed: int, count: int, shared: SimpleNamespace) -> None:
-    """Ask, and check each answer; the result is milliseconds, the number of empty ones, errors."""
+    """Ask; for each answer put its milliseconds, how many poses it has, and what is wrong."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # it ends with its parent
     random, maps = np.random.default_rng(seed), three_maps()
-    milliseconds: list[float] = []
-    errors: list[str] = []
-    empty = 0
     asked = [fixture.requests(GOALS_PER_MAP, random) for fixture in maps]
     starts = [fixture.grid.free_cells() for fixture in maps]
     with ros.Client() as client:
@@ -61,20 +58,15 @@ def ask(seed: int, count: int, shared: SimpleNamespace) -> None:
             request.start = ros.pose(maps[current].grid, start)
             began = time.perf_counter()
             try:
-                plan = client.get_plan(request.start, request.goal)
+                plan, lost = client.get_plan(request.start, request.goal), ""
             except TimeoutError as error:
-                errors.append(f"from {start} on map {first}: {error}")
-            else:
-                milliseconds.append(1e3 * (time.perf_counter() - began))
-                empty += not plan.poses
-                # The maps that it had between request and answer, mostly one.
-                possible = {n % len(maps) for n in range(first, shared.published.value + 1)}
-                wrong = [maps[number].error(request, plan) for number in possible]
-                if all(wrong):
-                    errors.append(f"on map {first} or later: {wrong[0]}")
-            with shared.done.get_lock():
-                shared.done.value += 1
-    shared.results.put((milliseconds, empty, errors))
+                plan, lost = Path(), f"from {start}: {error}"
+            milliseconds = 1e3 * (time.perf_counter() - began)
+            # The maps that it had between request and answer, mostly one.
+            possible = {n % len(maps) for n in range(first, shared.published.value + 1)}
+            wrong = [lost or maps[number].error(request, plan) for number in possible]
+            said = f"on map {first} or later: {wrong[0]}" if all(wrong) else ""
+            shared.answers.put((milliseconds, len(plan.poses), said))
 
 
 def load_requests(planner: int, requests: int, clients: int) -> bool:
@@ -83,12 +75,9 @@ def load_requests(planner: int, requests: int, clients: int) -> bool:
     number = len(maps)
     # Of the last map: its number where the planner is known to have it, and where it was published.
     confirmed, published = context.Value("i", number), context.Value("i", number)
-    shared = SimpleNamespace(confirmed=confirmed, published=published, done=context.Value("i"))
-    shared.ready, shared.results = context.Barrier(clients + 1), context.Queue()
-    processes = [
-        context.Process(target=ask, args=(n, len(range(n, requests, clients)), shared), daemon=True)
-        for n in range(clients)
-    ]
+    shared = SimpleNamespace(confirmed=confirmed, published=published)
+    shared.ready, shared.answers = context.Barrier(clients + 1), context.Queue()
+    answers: list[tuple[float, int, str]] = []
     with ros.Client() as client:
         diagnostics = client.subscribe(DiagnosticArray, "/diagnostics", keep=1)
 
@@ -97,30 +86,28 @@ def load_requests(planner: int, requests: int, clients: int) -> bool:
             ros.wait_for_map(diagnostics, Time(sec=number))
 
         send_map(number)
-        for process in processes:
-            process.start()
+        for n in range(clients):
+            share = len(range(n, requests, clients))
+            context.Process(target=ask, args=(n, share, shared), daemon=True).start()
         shared.ready.wait(ros.TIMEOUT)
-        began, first_memory = time.monotonic(), 0.0
-        while shared.done.value < requests and any(process.is_alive() for process in processes):
-            if shared.done.value >= (number - 2) * requests / CHANGES:
+        while len(answers) < requests:
+            if len(answers) >= (number - 2) * requests / CHANGES:
                 number += 1
                 shared.published.value = number
                 send_map(number)
                 shared.confirmed.value = number
-            if not first_memory and shared.done.value >= WARM_UP * requests:
+            answers.append(shared.answers.get(timeout=2 * ros.TIMEOUT))  # Empty if a process failed
+            if len(answers) == math.ceil(WARM_UP * requests):
                 first_memory = memory(planner)
-            time.sleep(0.005)
-        seconds, last_memory = time.monotonic() - began, memory(planner)
-    # It fails if a process did.
-    results = [shared.results.get(timeout=ros.TIMEOUT) for _ in processes]
-    times, empty, of_processes = zip(*results, strict=True)
-    milliseconds, errors = np.concatenate(times), list(itertools.chain(*of_processes))
+        last_memory = memory(planner)
+    milliseconds, poses, of_answers = zip(*answers, strict=True)
     median, slow = np.percentile(milliseconds, (50, 99))
+    errors = [error for error in of_answers if error]
     print(
         *errors[:10],
-        f"GetPlan: {requests} requests of {clients} processes in {seconds:.0f} s, "
+        f"GetPlan: {requests} requests of {clients} processes, "
         f"{number - len(maps)} changes of the map",
-        f"  paths {len(milliseconds) - sum(empty)}, empty answers {sum(empty)}",
+        f"  paths {np.count_nonzero(poses)}, empty answers {poses.count(0)}",
         f"  latency median {median:.1f} ms, 99 % {slow:.1f} ms",
         f"  planner's resident memory {first_memory:.0f} MB after {WARM_UP:.0%} of them, "
         f"{last_memory:.0f} MB at the end: {last_memory / first_memory - 1:+.1%}",
@@ -132,17 +119,15 @@ def load_requests(planner: int, requests: int, clients: int) -> bool:
 def load_goals(goals: int) -> bool:
     """Send goals at 200 Hz; return whether a plan for an older goal followed a newer one's."""
     office, random = ros.shipped_maps()["office"], np.random.default_rng(0)
-    grid = office.grid
-    ((start, _),) = random_requests(grid.occupancy, ros.RULE, 1, random)
-    reachable = np.argwhere(grid.reachable([start], ros.RULE))[:, ::-1]
-    cells = [(int(x), int(y)) for x, y in random.permutation(reachable)[:goals]]
-    numbers = {cell: number for number, cell in enumerate(cells)}
+    grid, message = office.grid, office.message(2**20)
+    # All free cells are joined.
+    cells = random.permutation(grid.free_cells())[: goals + 1].tolist()
+    from_start, *poses = (ros.pose(grid, (x, y)) for x, y in cells)
+    numbers = {ros.cell_of(grid, stamped): number for number, stamped in enumerate(poses)}
     with ros.Client() as client:
         diagnostics = client.subscribe(DiagnosticArray, "/diagnostics", keep=1)
-        message = office.message(2**20)
         client.publish("map", message, LATCHED)
         ros.wait_for_map(diagnostics, message.header.stamp)
-        from_start = ros.pose(grid, start)
         client.publish("initialpose", ros.initial_pose(from_start))
         ros.wait_for("start", lambda: client.get_plan(PoseStamped(), from_start).poses)
         everything = QoSProfile(depth=goals, durability=DurabilityPolicy.VOLATILE)
@@ -154,9 +139,9 @@ def load_goals(goals: int) -> bool:
             return [numbers.get(ros.cell_of(grid, end[0]), -1) if end else -1 for end in ends]
 
         began = time.monotonic()
-        for sent, cell in enumerate(cells):
+        for sent, stamped in enumerate(poses):
             time.sleep(max(0.0, began + sent * GOALS_PERIOD - time.monotonic()))
-            client.publish("goal_pose", ros.pose(grid, cell))
+            client.publish("goal_pose", stamped)
         seconds = time.monotonic() - began
         ros.wait_for("plan to the last goal", lambda: goals - 1 in heard())
         time.sleep(2)  # a plan for an older goal would come now
@@ -229,12 +214,10 @@ def burst_requests(
     grid: GridMap, goals: Sequence[Cell], count: int, seed: int = 0
 ) -> list[GetPlan.Request]:
     """Return requests from random free cells within `REACH` of the goals, which take turns."""
-    random = np.random.default_rng(seed)
-    requests: list[GetPlan.Request] = []
-    for goal in itertools.cycle(goals):
-        if len(requests) == count:
-            return requests
-        x, y = (np.array(goal) + random.integers(-REACH, REACH + 1, 2)).tolist()
+    random, requests = np.random.default_rng(seed), list[GetPlan.Request]()
+    while len(requests) < count:
+        goal = goals[len(requests) % len(goals)]
+        x, y = (goal + random.integers(-REACH, REACH + 1, 2)).tolist()
         if grid.is_free((x, y)):
             requests.append(ros.plan_request(grid, (x, y), goal))
     return requests
