@@ -225,8 +225,7 @@ class Client(ExitStack):
         """Set parameters of a node one by one; return a SetParametersResult for each."""
         messages = [Parameter(name, value=v).to_parameter_msg() for name, v in values.items()]
         request = SetParameters.Request(parameters=messages)
-        results: list[Any] = self.call(SetParameters, f"{node}/set_parameters", request).results
-        return results
+        return list(self.call(SetParameters, f"{node}/set_parameters", request).results)
 
     def get_parameter(self, node: str, name: str) -> Any:
         """Return a parameter's value."""
@@ -333,9 +332,8 @@ class MapFixture:
         grid, cells = self.grid, cells_of(self.grid, plan)
         start, goal = (cell_of(grid, pose) for pose in (request.start, request.goal))
         if not cells:
-            labels = grid.labels(RULE)
             both_free = grid.is_free(start) and grid.is_free(goal)
-            possible = both_free and labels[start[::-1]] == labels[goal[::-1]]
+            possible = both_free and grid.reachable([start], RULE)[goal[::-1]]
             return f"no path from {start} to {goal}, where there is one" if possible else ""
         if (cells[0], cells[-1]) != (start, goal):
             return f"a path from {cells[0]} to {cells[-1]}, asked was {start} to {goal}"
