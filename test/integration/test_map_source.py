@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import array
 import re
+import threading
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import replace
@@ -401,6 +402,18 @@ def test_malformed_directions_are_refused_and_those_before_them_stay(
     assert not source.missing
     source._take_directions(directions_of(1))
     assert "map_directions" not in source.report.refused
+
+
+def test_a_worker_leaves_out_what_was_given_up_before_its_turn(node: BaseNode) -> None:
+    worker, gate, made = Worker(node), threading.Event(), list[int]()
+    worker.call(gate.wait)
+    given_up = worker.run(made.append, 1)
+    given_up.send(None)
+    given_up.close()
+    worker.call(made.append, 2)
+    gate.set()
+    worker.close()
+    assert made == [2]
 
 
 # Expected times
