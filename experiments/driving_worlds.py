@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from random_maps import Random, generate_map
 
-from ddqn_planner.grid import Cell, GridMap, MoveRule
+from ddqn_planner.grid import Cell, GridMap, MoveRule, path_cost
 from ddqn_planner.grid.moves import segment_lengths
 from ddqn_planner.planning import Planner
 
@@ -124,23 +124,15 @@ class Drive:
     duration: float
 
 
-def _lengths(cells: Sequence[Cell]) -> Float64:
-    """Return the length of each move of a path, in cells."""
-    dx, dy = np.diff(np.asarray(cells), axis=0).T
-    return segment_lengths(dx, dy, RULE)
-
-
 def path_seconds(cells: Sequence[Cell], slowness: Float64, grid: GridMap) -> float:
     """Return how long a path takes, without noise."""
-    x, y = np.asarray(cells).T
-    mean = (slowness[y[1:], x[1:]] + slowness[y[:-1], x[:-1]]) / 2
-    return float((_lengths(cells) * mean).sum() * grid.resolution / SPEED)
+    return path_cost(cells, slowness.astype(np.float32), RULE) * grid.resolution / SPEED
 
 
 def drive(cells: Sequence[Cell], world: World, clock: float, random: Random) -> Drive:
     """Drive a path: each half of a move is as slow as its cell, with noise."""
     x, y = np.asarray(cells).T
-    lengths = _lengths(cells)
+    lengths = segment_lengths(np.diff(x), np.diff(y), RULE)
     metres = np.concatenate([[0], np.cumsum(lengths)]) * world.grid.resolution
     part = (metres / 0.25).astype(np.int64)
     noise = random.normal(0, NOISE, part[-1] + 1)[part]
