@@ -201,9 +201,7 @@ def _add_training_options(
 
 
 def _run_training(
-    options: Any,
-    scenarios: Callable[[], Sequence[Scenario]],
-    move_rule: api.MoveRule,
+    options: Any, scenarios: Callable[[], Sequence[Scenario]], move_rule: api.MoveRule
 ) -> TrainingRun:
     """Train into ``--out`` until ``--steps`` or a signal to stop; return the closed run."""
     import torch  # before the scenarios are made, which may take seconds

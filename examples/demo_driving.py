@@ -12,8 +12,8 @@ from typing import Any
 
 import matplotlib.pyplot as plt
 import numpy as np
+import simulated_robot
 from geometry_msgs.msg import PoseStamped
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from nav_msgs.msg import OccupancyGrid, Odometry, Path
 from PIL import Image
 
@@ -29,14 +29,14 @@ from driving_worlds import RULE, Float64, Routes, World, generated_world, path_s
 from figures import ROUTE_STYLES, draw_slowness, draw_times
 from processes import claim_ros_domain, run_script, running, running_node
 
-WORLD, SEED, SPEED_UP, MISSIONS = "office", 9, 40.0, 40
+MISSIONS = 40
 LISTENERS = 3  # to goals: the planner, the trainer and the robot
 MEAN_OF = 8  # missions that a point of the curve sums up
 
 
 @dataclass
 class Mission:
-    """The routes of a mission, their true seconds, and what the trainer knew before."""
+    """The routes of a mission with their true seconds, and the slowness: true, and learned."""
 
     routes: Routes
     seconds: dict[str, float]
@@ -90,23 +90,12 @@ class Driver:
         self.wait("drive", self.drives, lambda path: _is_at(path.poses[-1], stamped, 2))
         measured = self.now() - began
         time.sleep(0.3)  # the planner loads it
+        learned, truth = cells_of(grid, path), self.world.slowness(began)
+        shortest, best = self.world.routes(self.planner, learned[0], goal, began).values()
         self.at = goal
-        return self.mission(cells_of(grid, path), began, measured, slowness)
-
-    def mission(self, learned: Any, now: float, measured: float, slowness: Float64) -> Mission:
-        """Return a mission with the routes of those who know nothing and all beside the learned."""
-        shortest, best = self.world.routes(self.planner, learned[0], learned[-1], now).values()
         routes = {"shortest": shortest, "learned": learned, "best possible": best}
-        truth = self.world.slowness(now)
-        seconds = {name: path_seconds(of, truth, self.world.grid) for name, of in routes.items()}
+        seconds = {name: path_seconds(of, truth, grid) for name, of in routes.items()}
         return Mission(routes, seconds, measured, truth, slowness)
-
-    def last_mission(self) -> Mission:
-        """Return the mission between the two stations where knowing matters most, not driven."""
-        now, grid = self.now(), self.world.grid
-        start, goal = (pose(grid, cell) for cell in self.world.worst_pair(self.planner, now))
-        learned = cells_of(grid, self.client.get_plan(start, goal))
-        return self.mission(learned, now, math.nan, self.known_slowness())
 
 
 def _is_at(stamped: Any, goal: PoseStamped, factor: float = 1) -> bool:
@@ -115,38 +104,38 @@ def _is_at(stamped: Any, goal: PoseStamped, factor: float = 1) -> bool:
     return math.dist((at.x, at.y), (there.x, there.y)) <= factor * ARRIVAL_DISTANCE
 
 
-def draw(world: World, mission: Mission, learned: Routes) -> Any:
-    """Return a figure of true and learned slowness, with all routes, and those learned."""
-    panels = {
-        "what nobody told the robot": (mission.truth, mission.routes),
-        "what it has learned": (mission.slowness, learned),
-    }
-    return draw_slowness(world.grid, world.stations, panels, (8.4, 4.7))
-
-
-def save_film(path: str, world: World, missions: Sequence[Mission]) -> None:
-    """Save a GIF with a frame per mission."""
+def save_pictures(world: World, missions: Sequence[Mission]) -> None:
+    """Save a GIF with a frame per mission, the best of the last ones as a picture, and a curve."""
+    width = min(MEAN_OF, len(missions))
+    best = min(missions[-width:], key=lambda each: each.ratio("learned") - each.ratio("shortest"))
     frames = []
     for number, mission in enumerate(missions, start=1):
-        figure = draw(world, mission, {"learned": mission.routes["learned"]})
+        panels = {
+            "what nobody told the robot": (mission.truth, mission.routes),
+            "what it has learned": (mission.slowness, {"learned": mission.routes["learned"]}),
+        }
+        figure: Any = draw_slowness(world.grid, world.stations, panels, (8.4, 4.7))
         title = f"mission {number}: {mission.ratio('learned'):.2f} of the best possible time"
         figure.suptitle(title, fontsize=11)
-        canvas: Any = FigureCanvasAgg(figure)
-        canvas.draw()
-        image = Image.fromarray(np.asarray(canvas.buffer_rgba())).convert("RGB")
+        figure.canvas.draw()
+        image = Image.fromarray(np.asarray(figure.canvas.buffer_rgba())).convert("RGB")
         frames.append(image.quantize(64))
+        if mission is best:
+            image.save("demo_driving.png")
         plt.close(figure)
-    times = [1200, *[450] * (len(frames) - 2), 1200][: len(frames)]
-    frames[0].save(path, save_all=True, append_images=frames[1:], duration=times, loop=0)
+    frames[0].save(
+        "demo_driving.gif", save_all=True, append_images=frames[1:], duration=450, loop=0
+    )
+    seconds = {name: [np.array([each.seconds[name] for each in missions])] for name in ROUTE_STYLES}
+    curve, _ = draw_times(seconds, seconds.pop("best possible"), width, banded="learned")
+    curve.savefig("demo_driving_curve.png", dpi=110)
 
 
 def main(arguments: Sequence[str]) -> int:
     """Drive the missions, and save what they show."""
     count = int(arguments[0]) if arguments else MISSIONS
-    world, random = generated_world(WORLD, SEED), np.random.default_rng(SEED)
-    robot = [sys.executable, str(FilePath(__file__).with_name("simulated_robot.py")), "--ros-args"]
-    for name, value in {"world": WORLD, "seed": SEED, "speed_up": SPEED_UP}.items():
-        robot += ["-p", f"{name}:={value}"]
+    seed = simulated_robot.SEED
+    world, random = generated_world(simulated_robot.WORLD, seed), np.random.default_rng(seed)
     planning = {"start_source": "odometry", "move_rule": RULE.value, "follow_trainer": True}
     with tempfile.TemporaryDirectory() as folder, claim_ros_domain():
         map_file = FilePath(folder) / "world.yaml"
@@ -157,27 +146,21 @@ def main(arguments: Sequence[str]) -> int:
             running_node("map_server_node", yaml_filename=map_file) as server,
             running_node("planner_node", **planning) as planner,
             running_node("trainer_node", **learning) as trainer,
-            running(*robot) as robot_process,
+            running(sys.executable, simulated_robot.__file__) as robot,
         ):
-            driver = Driver(client, world, [server, planner, trainer, robot_process])
+            driver = Driver(client, world, [server, planner, trainer, robot])
             missions = list[Mission]()
             for number in range(1, count + 1):
                 others = [station for station in world.stations if station != driver.at]
                 mission = driver.drive(others[random.integers(len(others))])
                 missions.append(mission)
+                learned, shortest = (mission.ratio(name) for name in ("learned", "shortest"))
                 print(
                     f"mission {number:2d}: drove {mission.measured:5.1f} s; its route takes "
-                    f"{mission.ratio('learned'):.2f} of the best possible time, the "
-                    f"shortest {mission.ratio('shortest'):.2f}",
+                    f"{learned:.2f} of the best possible time, the shortest {shortest:.2f}",
                     flush=True,
                 )
-            last = driver.last_mission()
-    draw(world, last, last.routes).savefig("demo_driving.png", dpi=110)
-    save_film("demo_driving.gif", world, missions)
-    seconds = {name: [np.array([each.seconds[name] for each in missions])] for name in ROUTE_STYLES}
-    best = seconds.pop("best possible")
-    curve, _ = draw_times(seconds, best, min(MEAN_OF, count), banded="learned")
-    curve.savefig("demo_driving_curve.png", dpi=110)
+    save_pictures(world, missions)
     print("saved demo_driving.gif, demo_driving.png and demo_driving_curve.png")
     return 0
 

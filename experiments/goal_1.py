@@ -30,7 +30,6 @@ CONVERGENCE = (
     "seeds solved (without action masking) | steps until solved for good | "
     "steps until shortest for good | length"
 )
-COSTS = "profile | seconds until solved for good | steps/s | replay ratio | planning time, ms"
 
 
 def trainings(settings: Settings, variants: Sequence[str] = ("both",)) -> list[Training]:
@@ -65,19 +64,14 @@ def at_first_kept(run: Evaluations, column: str, holds: NDArray[np.bool_]) -> fl
 
 def report(settings: Settings) -> str:
     """Return the tables of goal i, and write its figure."""
-    rows, costs = [], []
+    rows = []
     paths: dict[str, Sequence[Cell]] = {}
-    for profile, parameters in PROFILES.items():
+    for profile in PROFILES:
         runs = settings.evaluations(f"{profile}/both")
         planned = [timed_plan(p) for p in settings.planners(f"{profile}/both")]
-        ends = [run[-1] for run in runs]
         seconds = [at_first_kept(run, "seconds", run["solved"] == 1) for run in runs]
-        rates = [end["step"] / end["seconds"] for end in ends]
-        replayed = [parameters.batch_size * end["updates"] / end["step"] for end in ends]
-        milliseconds = [took for _, took in planned]
-        columns = ((seconds, 1), (rates, 0), (replayed, 1), (milliseconds, 2))
-        rows.append([profile, *convergence_row(runs)])
-        costs.append([profile, *(median_and_range(*column) for column in columns)])
+        milliseconds = median_and_range([took for _, took in planned], 1)
+        rows.append([profile, *convergence_row(runs), median_and_range(seconds), milliseconds])
         by_length = sorted((plan for plan, _ in planned), key=lambda p: p.length or np.inf)
         paths[f"{profile}, median seed"] = by_length[len(planned) // 2].cells
     for rule in (MoveRule.CORNER_CUTTING, MoveRule.ROBOT_SAFE):
@@ -89,7 +83,8 @@ def report(settings: Settings) -> str:
         draw_map(axes, SCENARIO, f"{planner}: {length}")
         draw_path(axes, cells, number, planner)
     drawn = save_figure(figure, settings.out / "goal_1.png", "Fig. 7: the paths of goal i")
-    return f"{table(f'profile | {CONVERGENCE}', rows)}\n\n{table(COSTS, costs)}\n\n{drawn}"
+    header = f"profile | {CONVERGENCE} | seconds until solved for good | planning, ms"
+    return f"{table(header, rows)}\n\n{drawn}"
 
 
 def timed_plan(planner: Planner) -> tuple[Plan, float]:

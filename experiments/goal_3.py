@@ -149,7 +149,7 @@ def report(settings: Settings) -> str:
             counts = [median_and_range(part.sum(axis=1).tolist()) for part in parts]
             ratios = [ratio[np.isfinite(ratio)] for ratio in of_seeds[:, len(training) :] / optimum]
             rows.append([noise.value, label, *counts, mean_and_worst(ratios)[0]])
-    drawn = table(f"new obstacles | planner | {COLUMNS}", rows), _draw(settings)
+    drawn = table(COLUMNS, rows), _draw(settings)
     return "\n\n".join(drawn)
 
 

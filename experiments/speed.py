@@ -6,7 +6,6 @@ import statistics
 import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
-from functools import partial
 from typing import Any
 
 import gymnasium
@@ -20,7 +19,7 @@ from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from tables import report
 from torch import nn
 
-from ddqn_planner import GridMap, MoveRule, Planner, QField
+from ddqn_planner import GridMap, MoveRule, Plan, Planner, QField
 from ddqn_planner.grid import Cell, shortest_distances
 from ddqn_planner.grid.arguments import Occupancy
 from ddqn_planner.grid.noise import random_costs, random_requests
@@ -36,7 +35,16 @@ FLIPPED = 10  # cells that a change near a place flips, of the 25 around it
 WALL = 41  # cells of a wall that opens or closes
 SHORTEST = 40  # moves of the shortest path for replans: robot and goal are far from each other
 
-Call = Callable[[], Any]  # what is timed; a `Callable[[], Call]` makes all that it needs
+# The kinds of changes, and where on the path: a number of moves from its ends, or 0 for its middle.
+CHANGE_KINDS = {
+    "cells near the robot": 10,
+    "cells near the goal": -11,
+    "cells anywhere": 0,
+    "a wall opens": 0,
+    "a wall closes": 0,
+    "a wall beside the goal": -3,
+}
+Change = tuple[Occupancy, Occupancy, int, int]  # a map, and a patch of it with its x and y
 LOADED = Planner.load("any_map")
 
 
@@ -45,32 +53,11 @@ def new_planner() -> Planner:
     return Planner(LOADED.network, LOADED.metadata)
 
 
-def new_request(occupancy: Occupancy, start: Cell, goal: Cell) -> Call:
-    """Return the call that plans on a new map."""
-    return partial(new_planner().plan, GridMap(occupancy), start, goal, RULE)
-
-
-def on_new_map(function: Callable[..., Any], occupancy: Occupancy, cost: Any, goal: Cell) -> Call:
-    """Return the call of a function of a map that it does not know."""
-    return partial(function, GridMap(occupancy, cost=cost), goal, RULE)
-
-
-def ready(function: Callable[..., Any], *arguments: Any, **options: Any) -> Callable[[], Call]:
-    """Return the preparation of a call that needs none."""
-    return lambda: partial(function, *arguments, **options)
-
-
-def take_turns(*prepare: Callable[[], Call], rounds: int = ROUNDS) -> tuple[list[float], list[Any]]:
-    """Prepare and time each call in turn; return their median milliseconds and last answers."""
-    times: list[list[float]] = [[] for _ in prepare]
-    answers: list[Any] = [None for _ in prepare]
-    for _ in range(rounds):
-        for number, make in enumerate(prepare):
-            call = make()
-            began = time.process_time()
-            answers[number] = call()
-            times[number].append(1e3 * (time.process_time() - began))
-    return [statistics.median(of_call) for of_call in times], answers
+def timed(function: Callable[..., Any], *arguments: Any, **options: Any) -> tuple[float, Any]:
+    """Call a function; return how long it computed, milliseconds, and its answer."""
+    began = time.process_time()
+    answer = function(*arguments, **options)
+    return 1e3 * (time.process_time() - began), answer
 
 
 def medians(times: Sequence[Sequence[float]]) -> list[float]:
@@ -81,80 +68,56 @@ def medians(times: Sequence[Sequence[float]]) -> list[float]:
 def measure_paper_map() -> Iterator[bool]:
     """Time the Q field of the paper's map, computed anew each time."""
     planner, scenario = Planner.load("dilemma"), paper_scenario()
-    rule = planner.metadata.move_rule
-    field = ready(planner.network.q_values, scenario.grid, scenario.goal, rule)
-    ((took,), _) = take_turns(field, rounds=FIELDS)
-    yield report("Q field of the 20x20 map", took, "ms", 20)
+    of_map = scenario.grid, scenario.goal, planner.metadata.move_rule
+    times = [timed(planner.network.q_values, *of_map)[0] for _ in range(FIELDS)]
+    yield report("Q field of the 20x20 map", statistics.median(times), "ms", 20)
 
 
 def measure_requests(side: int) -> Iterator[bool]:
     """Compare a request on a new map with A* in C++, and time one to a goal that is known."""
     for kind in MAP_KINDS:
-        random, times = np.random.default_rng(0), []
+        random, of_requests = np.random.default_rng(0), []
         occupancy = generate_map(kind, (side, side), random)
         of_nano = occupancy.astype(np.uint8)
         weights = np.where(occupancy, np.inf, 1).astype(np.float32)
         for start, goal in random_requests(occupancy, RULE, REQUESTS, random):
-            cells = start[::-1], goal[::-1]
-            took, (plan, (_, length), _) = take_turns(
-                partial(new_request, occupancy, start, goal),
-                ready(nano_astar.astar, of_nano, *cells),
-                ready(pyastar2d.astar_path, weights, *cells, allow_diagonal=True),
-            )
+            cells, times = (start[::-1], goal[::-1]), []
+            for _ in range(ROUNDS):
+                planner, grid = new_planner(), GridMap(occupancy)
+                ms, plan = timed(planner.plan, grid, start, goal, RULE)
+                known_ms, _ = timed(planner.plan, grid, plan.cells[1], goal, RULE)
+                nano_ms, (_, length) = timed(nano_astar.astar, of_nano, *cells)
+                pyastar_ms, _ = timed(pyastar2d.astar_path, weights, *cells, allow_diagonal=True)
+                times.append((ms, nano_ms, pyastar_ms, known_ms))
             assert math.isclose(plan.length, length, rel_tol=1e-6), (plan.length, length)
-            planner, grid = new_planner(), GridMap(occupancy)
-            moved = planner.plan(grid, start, goal, RULE).cells[1]
-            ((known,), _) = take_turns(ready(planner.plan, grid, moved, goal, RULE), rounds=1)
-            times.append((*took, known, len(plan.cells)))
-        our_ms, nano_ms, pyastar_ms, known_ms, moves = medians(times)
-        name = f"{side}x{side} {kind}: request {our_ms:.2f} ms"
-        yield report(f"{name}, nano-astar {nano_ms:.2f}; ratio", our_ms / nano_ms, "x", 1.0)
-        yield report(f"{name}, pyastar2d* {pyastar_ms:.2f}; ratio", our_ms / pyastar_ms, "x", 1.3)
+            of_requests.append((*medians(times), len(plan.cells)))
+        ms, nano_ms, pyastar_ms, known_ms, moves = medians(of_requests)
+        name = f"{side}x{side} {kind}: request {ms:.2f} ms"
+        yield report(f"{name}, nano-astar {nano_ms:.2f}; ratio", ms / nano_ms, "x", 1.0)
+        yield report(f"{name}, pyastar2d* {pyastar_ms:.2f}; ratio", ms / pyastar_ms, "x", 1.3)
         yield report(f"{side}x{side} {kind}: known goal, {moves:.0f} cells", known_ms, "ms", 0.1)
     print("* cuts corners, and a diagonal counts 1: its paths are no paths under our rule")
 
 
-CHANGE_KINDS = (
-    "cells near the robot",
-    "cells near the goal",
-    "cells anywhere",
-    "a wall opens",
-    "a wall closes",
-    "a wall beside the goal",
-)
-Change = tuple[Occupancy, Occupancy, int, int]  # a map, and a patch of it with its x and y
-
-
 def draw_change(kind: str, occupancy: Occupancy, path: Sequence[Cell], random: Random) -> Change:
     """Draw a change of some cells around a place or anywhere, or of a wall across a path."""
-    if "wall" not in kind:
-        side, x, y = len(occupancy), 0, 0
-        if kind != "cells anywhere":
-            place = path[10 if "robot" in kind else -11]
-            x, y = (int(np.clip(c - 2, 0, side - 5)) for c in place)
-            side = 5
-        patch = occupancy[y : y + side, x : x + side].copy()
-        patch.flat[random.choice(patch.size, FLIPPED, replace=False)] ^= True
-        return occupancy, patch, x, y
-    at, opens = len(path) // 2, kind == "a wall opens"
-    if kind == "a wall beside the goal":
-        at, opens = len(path) - 3, random.random() < 0.5
+    side, at = len(occupancy), CHANGE_KINDS[kind] or len(path) // 2
     (x0, y0), (x, y), (x1, y1) = path[at - 2], path[at], path[at + 2]
-    along_x = abs(y1 - y0) > abs(x1 - x0)
-    x, y = (max(x - WALL // 2, 0), y) if along_x else (x, max(y - WALL // 2, 0))
-    height, width = (1, WALL) if along_x else (WALL, 1)
-    closed = occupancy.copy()
-    closed[y : y + height, x : x + width] = True
-    before, after = (closed, occupancy) if opens else (occupancy, closed)
-    return before, after[y : y + height, x : x + width], x, y
-
-
-def plan_after(change: Change, start: Cell, goal: Cell, knows_before: bool) -> Call:
-    """Return the call that plans after a change, with the plan before it or without."""
-    planner, grid = new_planner(), GridMap(change[0])
-    if knows_before:
-        planner.plan(grid, start, goal, RULE)
-    return partial(planner.plan, grid.with_patch(*change[1:]), start, goal, RULE)
+    width = height = side if kind == "cells anywhere" else 5
+    if "wall" in kind:
+        width, height = (WALL, 1) if abs(y1 - y0) > abs(x1 - x0) else (1, WALL)
+    x = int(np.clip(x - width // 2, 0, side - width))
+    y = int(np.clip(y - height // 2, 0, side - height))
+    now = occupancy[y : y + height, x : x + width]
+    other = np.ones_like(now)
+    if "wall" not in kind:
+        other = now.copy()
+        other.flat[random.choice(now.size, FLIPPED, replace=False)] ^= True
+    elif kind == "a wall opens" or ("beside" in kind and random.random() < 0.5):
+        before = occupancy.copy()
+        before[y : y + height, x : x + width] = True
+        return before, now, x, y
+    return occupancy, other, x, y
 
 
 def draw_changes(map_kind: str, side: int, kind: str) -> Iterator[tuple[Change, Cell, Cell]]:
@@ -172,16 +135,26 @@ def draw_changes(map_kind: str, side: int, kind: str) -> Iterator[tuple[Change, 
                 yield change, start, goal
 
 
+def replan(change: Change, start: Cell, goal: Cell, knows_before: bool) -> tuple[float, Plan]:
+    """Time a plan after a change, with the plan before it or without."""
+    planner, before = new_planner(), GridMap(change[0])
+    if knows_before:
+        planner.plan(before, start, goal, RULE)
+    return timed(planner.plan, before.with_patch(*change[1:]), start, goal, RULE)
+
+
 def measure_replans(side: int) -> Iterator[bool]:
     """Compare replans with a new field on the changed map, which must give the same path."""
     for kind in CHANGE_KINDS:
         ratios: list[tuple[float, str, float, float]] = []
         for map_kind in MAP_KINDS:
             for drawn in draw_changes(map_kind, side, kind):
-                (ms, fresh_ms), (ours, fresh) = take_turns(
-                    partial(plan_after, *drawn, True), partial(plan_after, *drawn, False)
-                )
-                assert ours.cells == fresh.cells, drawn[1:]
+                times = []
+                for _ in range(ROUNDS):
+                    (ms, plan), (fresh_ms, fresh) = (replan(*drawn, it) for it in (True, False))
+                    assert plan.cells == fresh.cells, drawn[1:]
+                    times.append((ms, fresh_ms))
+                ms, fresh_ms = medians(times)
                 ratios.append((ms / fresh_ms, map_kind, ms, fresh_ms))
         typical, (worst, on, ms, fresh_ms) = statistics.median(r[0] for r in ratios), max(ratios)
         print(f"worst: {on}, {ms:.1f} ms; new field {fresh_ms:.1f} ms")
@@ -189,9 +162,9 @@ def measure_replans(side: int) -> Iterator[bool]:
         yield report(figure, worst, "x", 2.0)
 
 
-def all_values(grid: GridMap, goal: Cell, rule: MoveRule) -> QField:
+def all_values(grid: GridMap, goal: Cell) -> QField:
     """Return a field whose value was asked for in every cell."""
-    field = new_planner().q_field(grid, goal, rule)
+    field = new_planner().q_field(grid, goal, RULE)
     _ = field.value
     return field
 
@@ -204,12 +177,10 @@ def measure_whole_fields(side: int, costs: bool, bound: float) -> Iterator[bool]
         occupancy = generate_map(kind, (side, side), random)
         cost = random_costs(occupancy, random) if costs else None
         for _, goal in random_requests(occupancy, RULE, ROUNDS, random):
-            took, (field, _) = take_turns(
-                partial(on_new_map, all_values, occupancy, cost, goal),
-                partial(on_new_map, shortest_distances, occupancy, cost, goal),
-                rounds=ROUNDS if side < 1000 else 1,
-            )
-            times.append(took)
+            for _ in range(ROUNDS if side < 1000 else 1):
+                ms, field = timed(all_values, GridMap(occupancy, cost=cost), goal)
+                new_map = GridMap(occupancy, cost=cost)
+                times.append((ms, timed(shortest_distances, new_map, goal, RULE)[0]))
             nbytes = max(nbytes, field.nbytes - field.value.nbytes)
         ours, dijkstra = medians(times)
         ratios[kind] = ours / dijkstra
@@ -265,14 +236,10 @@ def measure_training() -> Iterator[bool]:
     assert weights[0] == weights[1]
     times: list[tuple[float, float]] = []
     for _ in range(1 + TRAINING_ROUNDS):
-        began = time.perf_counter()
-        for _ in ours.run(ours.steps + STEPS):
-            pass
-        middle = time.perf_counter()
-        theirs.learn(STEPS, reset_num_timesteps=False)
-        times.append((middle - began, time.perf_counter() - middle))
+        our_ms, _ = timed(list, ours.run(ours.steps + STEPS))
+        times.append((our_ms, timed(theirs.learn, STEPS, reset_num_timesteps=False)[0]))
     del times[0]  # both past `learning_starts`, and warm
-    our_rate, their_rate = (STEPS / seconds for seconds in medians(times))
+    our_rate, their_rate = (1e3 * STEPS / ms for ms in medians(times))
     ratio = statistics.median(theirs / ours for ours, theirs in times)
     figure = f"training: {our_rate:.0f} steps/s; Stable-Baselines3 {their_rate:.0f}; ratio"
     yield report(figure, ratio, "x", 1.5, at_most=False)

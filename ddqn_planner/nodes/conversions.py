@@ -191,13 +191,6 @@ def cell_from_pose(name: str, stamped: PoseStamped, grid: GridMap, frame: str) -
         raise ValueError(f"{name}'s position {where}; give one on the map, in metres") from None
 
 
-def check_tolerance(tolerance: float) -> float:
-    """Return a tolerance in metres; ValueError if it is not finite and 0 or more."""
-    if not 0 <= tolerance < math.inf:
-        raise ValueError(f"the tolerance is {tolerance}; give metres, finite and 0 or more")
-    return tolerance
-
-
 def quaternion(yaw: float) -> Quaternion:
     """Return the rotation by `yaw` radians about z, counter-clockwise."""
     rotation = Quaternion()

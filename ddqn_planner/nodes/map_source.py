@@ -12,15 +12,13 @@ from nav_msgs.msg import OccupancyGrid
 from numpy.typing import NDArray
 from rclpy.qos import QoSProfile
 from rclpy.task import Future
-from std_msgs.msg import Header, String
+from std_msgs.msg import Header
 
-from ddqn_planner.experience import Experience
 from ddqn_planner.grid import GridMap
 from ddqn_planner.grid.body import Inflation
 from ddqn_planner.nodes.conversions import grid_from_message, grid_from_values
-from ddqn_planner.nodes.report import NO_REQUEST, Outcome, Report, RequestError, seconds
+from ddqn_planner.nodes.report import Report, RequestError, seconds
 from ddqn_planner.nodes.runtime import LATCHED, BaseNode, Worker
-from ddqn_planner.planning import Plan
 from ddqn_planner.planning.field import offset_between
 
 try:
@@ -38,7 +36,6 @@ UPDATES_QUALITY = QoSProfile(depth=100)
 REMEDY = "let the map's publisher send the full map"
 
 PATIENCE = 1.0  # seconds within which the first map is expected after the node subscribes
-CHANGED_SHARE = 0.02  # of cells: with more, experience is spread anew over the map, slowly
 
 
 @dataclass
@@ -64,8 +61,7 @@ class MapSource:
         self._described = ""
         self._updates = self._refused_updates = 0
         self._inflated: Future | None = None
-        self._inflate, self._times = Inflation(), ExpectedTimes()
-        self._forecast_of, self._forecast = NO_REQUEST, Future()
+        self._inflate = Inflation()
         # Before the subscription of the map: directions that come with a map are taken first.
         node.create_subscription(OccupancyGrid, DIRECTIONS, self._take_directions, LATCHED)
         self._directions = Directions(node)
@@ -106,8 +102,8 @@ class MapSource:
             return str(error)
         return ""
 
-    def describe(self, outcome: Outcome) -> dict[str, str]:
-        """Return what the diagnostics say of the map, and of the time of a plan on it."""
+    def describe(self) -> dict[str, str]:
+        """Return what the diagnostics say of the map."""
         description = {}
         if self._used is not None:
             description["map"] = self._described
@@ -115,13 +111,7 @@ class MapSource:
         if self._updates or self._refused_updates:
             description["map updates applied"] = str(self._updates)
             description["map updates refused"] = str(self._refused_updates)
-        if outcome is not self._forecast_of:
-            self._forecast_of, self._forecast = outcome, Future()
-            request, plan = outcome.request, outcome.plan
-            if request is not None and len(plan.path) and request.grid.slowness is not None:
-                self._forecast = self._worker.call(self._times.describe, request.grid, plan)
-                self._forecast.add_done_callback(lambda _: self._report.change())
-        return description | (self._forecast.result() or {})
+        return description
 
     def inflated(self) -> Future:
         """Return the `GridMap` for the robot's body, which is computed for the first request."""
@@ -129,18 +119,8 @@ class MapSource:
             radius, weight = map(self._node.value, BODY_PARAMETERS)
             # ROS accepts a value that is above the range by a millionth.
             of = self._grid, radius, min(weight, 1.0)
-            self._inflated = self._worker.call(lambda: self._times.apply(self._inflate(*of)))
+            self._inflated = self._worker.call(self._inflate, *of)
         return self._inflated
-
-    async def on_experience_saved(self, message: String) -> None:
-        """Plan by what the trainer has learned from drives, or refuse its file."""
-        try:
-            await self._worker.call(self._times.load, message.data)
-        except Exception as error:  # what was learned before stays
-            self._report.refuse("experience", str(error) or repr(error))
-            return
-        self._report.accept("experience")
-        self._changed()
 
     def apply_parameters(self, changed: set[str]) -> None:
         """Read and inflate the map anew if one of the parameters that changed says so."""
@@ -200,8 +180,7 @@ class MapSource:
         """Plan on what is new."""
         self._inflated = None
         self._report.change()
-        if self._used is not None:
-            self._on_map(frame_changed)
+        self._on_map(frame_changed)
 
     def _take_update(self, update: Any) -> None:
         """Plan on the map with other values in a box from now on, or refuse the update."""
@@ -310,50 +289,3 @@ class Directions:
             grid = replace(grid, forbidden=forbidden)
         self.used, self._are_paired = found, bool(own)
         return grid
-
-
-class ExpectedTimes:
-    """Puts on maps what the trainer has learned of the robot's drives. One worker uses it."""
-
-    def __init__(self) -> None:
-        self._experience: Experience | None = None
-        self._spread_on: GridMap | None = None
-
-    def load(self, path: str) -> None:
-        """Use a file of the trainer from now on; after an error, what was used before stays."""
-        newer = Experience.load(path)
-        if self._experience is not None:
-            newer.take_over(self._experience)
-        self._experience = newer
-
-    def apply(self, grid: GridMap) -> GridMap:
-        """Return a map whose moves cost expected time, or the same map before a drive."""
-        if self._experience is None or not self._experience.evidence.places:
-            return grid
-        if self._spread_on is None or not _is_like(grid, self._spread_on):
-            self._spread_on = grid
-        timed = self._experience.apply(self._spread_on)
-        return grid.with_layers(slowness=timed.slowness, seconds_per_cell=timed.seconds_per_cell)
-
-    def describe(self, grid: GridMap, plan: Plan) -> dict[str, str]:
-        """Return how long a plan takes; nothing if its map is an old one, or no memory is left."""
-        map_of_now = self._spread_on
-        if self._experience is None or map_of_now is None or not _is_like(grid, map_of_now):
-            return {}
-        try:
-            seconds, low, high = self._experience.expected_time(map_of_now, plan.every_cell)
-        except MemoryError:
-            return {}
-        return {
-            "expected time (s)": f"{seconds:.1f}",
-            "expected time, 90 % interval (s)": f"{low:.1f} to {high:.1f}",
-        }
-
-
-def _is_like(grid: GridMap, other: GridMap) -> bool:
-    return (
-        grid.occupancy.shape == other.occupancy.shape
-        and grid.resolution == other.resolution
-        and grid.origin == other.origin
-        and np.mean(grid.occupancy != other.occupancy) <= CHANGED_SHARE
-    )

@@ -8,13 +8,17 @@ from collections.abc import Callable
 from contextlib import suppress
 from typing import Any
 
+import numpy as np
 from geometry_msgs.msg import PoseArray, PoseStamped
 from nav_msgs.msg import Path
 from nav_msgs.srv import GetPlan
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup, ReentrantCallbackGroup
 from rclpy.parameter import Parameter
+from rclpy.task import Future
 from std_msgs.msg import Header, String
 
+from ddqn_planner.experience import Experience
+from ddqn_planner.grid import GridMap
 from ddqn_planner.nodes.conversions import path_message, serialized_path
 from ddqn_planner.nodes.display import LOOK_PERIOD, FieldDisplay
 from ddqn_planner.nodes.lifecycle import ManagedNode
@@ -25,6 +29,8 @@ from ddqn_planner.nodes.poses import Frames, StartSource, check_source
 from ddqn_planner.nodes.report import NO_REQUEST, NOT_ACTIVE, Outcome, Report, RequestError
 from ddqn_planner.nodes.requests import UNCHANGED, ActiveGoal, ModelSource, PathUnderWay, Requests
 from ddqn_planner.nodes.runtime import LATCHED, STEADY, Worker, spin_until_shutdown, unless
+
+CHANGED_SHARE = 0.02  # of cells: with more, experience is spread anew over the map, slowly
 
 
 # The executor's one thread holds all state. What takes long runs in workers: to load the model,
@@ -71,14 +77,14 @@ class PlannerNode(ManagedNode):
         self._start = StartSource(
             self, self._frames, self._report, lambda: self._map.frame, self._on_start
         )
-        self._requests = Requests(
-            self._settings, self._map, self._start, self._frames, self._model, self._worker
-        )
+        self._times = ExpectedTimes(self._report, self._map_worker, self._replan.trigger)
+        inputs = self._map, self._times.on, self._start, self._frames, self._model
+        self._requests = Requests(self._settings, *inputs, self._worker)
         self.create_subscription(PoseStamped, "goal_pose", lambda goal: self._on_goals([goal]), 10)
         self.create_subscription(PoseArray, "goal_poses", self._on_goal_poses, 10)
         if self._settings.follow_trainer:
             self.create_subscription(String, "trainer/model_saved", self._model.on_saved, LATCHED)
-            on_saved, topic = self._map.on_experience_saved, "trainer/experience_saved"
+            on_saved, topic = self._times.on_saved, "trainer/experience_saved"
             group = MutuallyExclusiveCallbackGroup()  # it waits for a worker
             self.create_subscription(String, topic, on_saved, LATCHED, callback_group=group)
         # Reentrant: a request that waits for its field does not keep out the others.
@@ -107,7 +113,7 @@ class PlannerNode(ManagedNode):
         self._report.refused.clear()
         self._report.note(NO_REQUEST)
         self.after_jump_back.clear()
-        for name in ("_start", "_frames", "_display", "_map", "_requests"):
+        for name in ("_start", "_frames", "_display", "_map", "_times", "_requests"):
             vars(self).pop(name, None)  # not all are there, if `configure` failed
         self._model.forget()
 
@@ -262,7 +268,7 @@ class PlannerNode(ManagedNode):
             fatal = self._model.planner is None and "model" in self._report.refused
             values = {"state": self.state, **self._model.describe(self._settings.move_rule)}
             if self._is_configured:
-                values |= self._map.describe(self._report.outcome)
+                values |= self._map.describe() | self._times.told(self._report.outcome)
             self._report.publish(fatal, "; ".join(filter(None, missing)), values)
 
     def _look_for_news(self) -> None:
@@ -278,6 +284,78 @@ class PlannerNode(ManagedNode):
                 self._waits_for_pose, is_due = False, True
         if is_due:
             self._replan.trigger()
+
+
+class ExpectedTimes:
+    """Puts on maps what the trainer has learned of the robot's drives."""
+
+    def __init__(self, report: Report, worker: Worker, on_change: Callable[[], None]) -> None:
+        self._report, self._worker, self._on_change = report, worker, on_change
+        self._experience: Experience | None = None
+        self._spread_on: GridMap | None = None
+        # What the worker was asked last, and its answers.
+        self._grid: GridMap | None = None
+        self._outcome = NO_REQUEST
+        self._timed = self._forecast = Future()
+
+    async def on_saved(self, message: String) -> None:
+        """Plan by what the trainer has learned from drives, or refuse its file."""
+        try:
+            await self._worker.call(self.load, message.data)
+        except Exception as error:
+            self._report.refuse("experience", str(error) or repr(error))
+            return
+        self._report.accept("experience")
+        self._grid = None
+        self._on_change()
+
+    async def on(self, grid: GridMap) -> GridMap:
+        """Return what `apply` does, which is computed for the first request."""
+        if self._experience is None:
+            return grid
+        if grid is not self._grid:
+            self._grid, self._timed = grid, self._worker.call(self.apply, grid)
+        timed: GridMap = await self._timed
+        return timed
+
+    def told(self, outcome: Outcome) -> dict[str, str]:
+        """Return what `describe` returns, once the worker has computed it."""
+        if self._experience is not None and outcome is not self._outcome:
+            self._outcome, self._forecast = outcome, self._worker.call(self.describe, outcome)
+            self._forecast.add_done_callback(lambda _: self._report.change())
+        return self._forecast.result() or {}
+
+    def load(self, path: str) -> None:
+        """Use a file of the trainer from now on; an error leaves what was used before."""
+        newer = Experience.load(path)
+        if self._experience is not None:
+            newer.take_over(self._experience)
+        self._experience = newer
+
+    def apply(self, grid: GridMap) -> GridMap:
+        """Return a map whose moves cost expected time, or the same map before a drive."""
+        if self._experience is None or not self._experience.evidence.places:
+            return grid
+        if self._spread_on is None or not _is_like(grid, self._spread_on):
+            self._spread_on = grid
+        timed = self._experience.apply(self._spread_on)
+        return grid.with_layers(slowness=timed.slowness, seconds_per_cell=timed.seconds_per_cell)
+
+    def describe(self, outcome: Outcome) -> dict[str, str]:
+        """Return how long a plan takes; nothing if its map is an old one, or no memory is left."""
+        now, request, path = self._spread_on, outcome.request, outcome.plan.every_cell
+        told: dict[str, str] = {}
+        if self._experience and now and request and len(path) and _is_like(request.grid, now):
+            with suppress(MemoryError):
+                seconds, low, high = self._experience.expected_time(now, path)
+                told["expected time (s)"] = f"{seconds:.1f}"
+                told["expected time, 90 % interval (s)"] = f"{low:.1f} to {high:.1f}"
+        return told
+
+
+def _is_like(grid: GridMap, other: GridMap) -> bool:
+    mine, its = ((each.occupancy.shape, each.resolution, each.origin) for each in (grid, other))
+    return mine == its and bool(np.mean(grid.occupancy != other.occupancy) <= CHANGED_SHARE)
 
 
 def _path(make: Callable[..., Any], outcome: Outcome, header: Header) -> Any:

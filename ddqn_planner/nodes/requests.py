@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import gc
+import math
 import time
-from collections.abc import Callable
+from collections.abc import Awaitable, Callable
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from types import SimpleNamespace
@@ -21,7 +22,7 @@ from ddqn_planner.grid import Cell, GridMap, MoveRule
 from ddqn_planner.grid.arguments import Cells
 from ddqn_planner.model import find_model
 from ddqn_planner.model.certificate import NO_CERTIFICATE
-from ddqn_planner.nodes.conversions import cell_from_pose, check_tolerance
+from ddqn_planner.nodes.conversions import cell_from_pose
 from ddqn_planner.nodes.map_source import MapSource
 from ddqn_planner.nodes.poses import Frames, StartSource
 from ddqn_planner.nodes.report import Outcome, Report, RequestError, reason_of, seconds
@@ -205,6 +206,7 @@ class Requests:
 
     settings: SimpleNamespace
     map: MapSource
+    timed: Callable[[GridMap], Awaitable[GridMap]]
     start: StartSource
     frames: Frames
     model: ModelSource
@@ -230,15 +232,17 @@ class Requests:
         check_request(goals, planner_id, settings.planner_id)
         names = [f"goal {n}" for n in range(1, len(goals) + 1)] if several else ["the goal"]
         for name, goal in zip(names, goals, strict=True):
-            self._check_pose(name, goal, self.map.frame)
+            _checked(name, self.frames.check, goal, self.map.frame)
         header, grid, planner = await self._inputs()
         frame = header.frame_id
         asked = [start or await self._wait_for(self.start.pose), *goals]
         named = zip(["the start", *names], asked, strict=True)
         places = [await self._in_map(*it, grid, frame) for it in named]
         poses, (first, second, *more) = zip(*places, strict=True)
-        given = settings.tolerance if tolerance is None else tolerance
-        metres = _checked("the tolerance", lambda _: check_tolerance(given))
+        metres: float = settings.tolerance if tolerance is None else tolerance
+        if not 0 <= metres < math.inf:
+            wrong = f"the tolerance is {metres}; give metres, finite and 0 or more"
+            raise RequestError("INVALID_TOLERANCE", wrong)
         request = PlanRequest(
             grid,
             start=first,
@@ -301,11 +305,11 @@ class Requests:
         if planner is None:
             refused = self.model.report.refused["model"]
             raise RequestError("NO_MODEL", f"no model is loaded: {refused}")
-        return header, await inflated, planner
+        return header, await self.timed(await inflated), planner
 
     async def _in_map(self, name: str, stamped: PoseStamped, grid: GridMap, frame: str) -> Place:
         """Return a pose in the map's frame, whose transform is waited for, and its cell."""
-        self._check_pose(name, stamped, frame)
+        _checked(name, self.frames.check, stamped, frame)
         deadline = time.monotonic() + self.settings.transform_tolerance
         pose = await self._wait_for(lambda: self.frames.to_map(name, stamped, frame), deadline)
         return pose, _checked(name, cell_from_pose, pose, grid, frame)
@@ -319,9 +323,6 @@ class Requests:
                 if not error.may_come and time.monotonic() >= deadline:
                     raise
             await self.next_look
-
-    def _check_pose(self, name: str, stamped: PoseStamped, frame: str) -> None:
-        _checked(name, self.frames.check, stamped, frame)
 
 
 def check_request(goals: list[PoseStamped], planner_id: str, known_id: str) -> None:

@@ -155,8 +155,7 @@ class BaseNode(Node):
         return SimpleNamespace(**{name: self.value(name) for name in self._declared})
 
     def _set_one_by_one(self, request: Any, _: Any) -> SetParameters.Response:
-        results = [self._set([parameter]) for parameter in request.parameters]
-        return SetParameters.Response(results=results)
+        return SetParameters.Response(results=[self._set([each]) for each in request.parameters])
 
     def _set_together(self, request: Any, _: Any) -> SetParametersAtomically.Response:
         return SetParametersAtomically.Response(result=self._set(request.parameters))

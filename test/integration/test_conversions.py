@@ -18,7 +18,6 @@ from ddqn_planner.grid import GridMap
 from ddqn_planner.nodes.conversions import (
     cell_from_pose,
     check_pose,
-    check_tolerance,
     grid_from_message,
     occupancy_message,
     path_message,
@@ -122,13 +121,6 @@ def test_values_are_percent_or_unknown(values: list[float], percent: list[int]) 
     assert message.data.tolist() == [*percent, -1, -1]
     assert message.info.resolution == 0.5
     assert message.header.frame_id == "map"
-
-
-def test_a_tolerance_is_a_finite_number_of_metres() -> None:
-    assert check_tolerance(0.0) == 0.0
-    for bad in (-1e-9, math.nan, math.inf):
-        with pytest.raises(ValueError, match=f"the tolerance is {bad}; give metres"):
-            check_tolerance(bad)
 
 
 @given(

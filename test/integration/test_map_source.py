@@ -7,8 +7,10 @@ from __future__ import annotations
 
 import array
 import re
+import threading
 import time
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -25,13 +27,15 @@ from rclpy.parameter import Parameter
 from rclpy.utilities import try_shutdown
 from std_msgs.msg import Header
 
-from ddqn_planner import Experience, GridMap, Planner
+from ddqn_planner import Experience, GridMap, MoveRule, Planner
 from ddqn_planner.experience import ExperienceFileError
 from ddqn_planner.nodes.conversions import directions_message, occupancy_message
-from ddqn_planner.nodes.map_source import ExpectedTimes, MapSource, updated_values
+from ddqn_planner.nodes.map_source import MapSource, updated_values
 from ddqn_planner.nodes.parameters import PLANNER_PARAMETERS
-from ddqn_planner.nodes.report import Report, RequestError
+from ddqn_planner.nodes.planner_node import ExpectedTimes
+from ddqn_planner.nodes.report import Outcome, Report, RequestError
 from ddqn_planner.nodes.runtime import LATCHED, BaseNode, Worker
+from ddqn_planner.planning import PlanRequest
 
 EAST, WEST = 0b00111000, 0b10000011
 """What lanes to the east and to the west forbid."""
@@ -54,7 +58,8 @@ class Source(MapSource):
     def __init__(self, node: BaseNode) -> None:
         self.heard: list[bool] = []
         self.report = Report(node)
-        super().__init__(node, self.report, Worker(node), self.heard.append)
+        self.worker = Worker(node)
+        super().__init__(node, self.report, self.worker, self.heard.append)
 
     def grid(self) -> GridMap:
         future, deadline = self.inflated(), time.monotonic() + TIMEOUT
@@ -181,14 +186,14 @@ def test_after_updates_the_map_is_as_if_it_came_whole(
         assert source.check() == header
         set_parameters(allow_unknown=parameters.get("allow_unknown", False))  # it reads anew
         assert source.grid().same_cells(expected)
-    said = source.describe(source.report.outcome)
+    said = source.describe()
     assert said["map stamp (s)"] == "11.000000000"
     assert said["map updates applied"] == "10"
 
 
 def test_refused_updates_are_counted_and_change_nothing(source: Source) -> None:
     def said() -> Any:
-        return source.describe(source.report.outcome)["map updates refused"]
+        return source.describe()["map updates refused"]
 
     refused = source.report.refused
     source._take_update(update())
@@ -399,27 +404,43 @@ def test_malformed_directions_are_refused_and_those_before_them_stay(
     assert "map_directions" not in source.report.refused
 
 
+def test_a_worker_leaves_out_what_was_given_up_before_its_turn(node: BaseNode) -> None:
+    worker, gate, made = Worker(node), threading.Event(), list[int]()
+    worker.call(gate.wait)
+    given_up = worker.run(made.append, 1)
+    given_up.send(None)
+    given_up.close()
+    worker.call(made.append, 2)
+    gate.set()
+    worker.close()
+    assert made == [2]
+
+
 # Expected times
 
 GRID = GridMap(np.zeros((40, 120), dtype=np.bool_), resolution=0.25)
 
 
+def new_times(source: Source) -> ExpectedTimes:
+    return ExpectedTimes(source.report, source.worker, lambda: None)
+
+
 @pytest.fixture
-def times(tmp_path: Path) -> ExpectedTimes:
+def times(source: Source, tmp_path: Path) -> ExpectedTimes:
     """Times after a drive of 20 m along x, at a fifth of the nominal speed."""
     experience, speed = Experience(0.5), 0.1
     time = np.linspace(0, 20 / speed, 201)
     experience.record(time, np.column_stack([5 + speed * time, np.full(201, 5.0)]))
     experience.save(tmp_path / "experience.npz")
-    times = ExpectedTimes()
+    times = new_times(source)
     times.load(str(tmp_path / "experience.npz"))
     return times
 
 
 def test_a_map_has_expected_times_once_there_are_drives(
-    times: ExpectedTimes, tmp_path: Path
+    source: Source, times: ExpectedTimes, tmp_path: Path
 ) -> None:
-    assert ExpectedTimes().apply(GRID) is GRID
+    assert new_times(source).apply(GRID) is GRID
     slowness = times.apply(GRID).slowness
     assert slowness is not None
     assert slowness[20, 60] > 2
@@ -453,7 +474,8 @@ def test_the_plan_goes_round_and_its_time_is_told(times: ExpectedTimes) -> None:
     planner = Planner.load("any_map")
     timed = times.apply(GRID)
     plan = planner.plan(timed, (22, 20), (98, 20))
-    told = times.describe(timed, plan)
+    request = PlanRequest(timed, (22, 20), (98, 20), MoveRule.ROBOT_SAFE)
+    told = times.describe(Outcome("SUCCEEDED", "", planner, request, plan))
     seconds = float(told["expected time (s)"])
     low, high = map(float, told["expected time, 90 % interval (s)"].split(" to "))
     assert plan.cost is not None
@@ -463,4 +485,5 @@ def test_the_plan_goes_round_and_its_time_is_told(times: ExpectedTimes) -> None:
     other = GridMap(np.zeros((10, 10), dtype=np.bool_)).with_slowness(
         np.ones((10, 10), dtype=np.float32), 1.0
     )
-    assert times.describe(other, plan) == {}  # an old map
+    of_old_map = Outcome("SUCCEEDED", "", planner, replace(request, grid=other), plan)
+    assert times.describe(of_old_map) == {}
