@@ -28,7 +28,6 @@ from tables import report
 
 from ddqn_planner import MoveRule, Planner
 from ddqn_planner.grid import Cell
-from ddqn_planner.grid.noise import random_requests
 from ddqn_planner.nodes.runtime import LATCHED
 
 sys.path.insert(0, str(FilePath(__file__).resolve().parents[1] / "examples"))
@@ -127,8 +126,7 @@ class DrivenRobot(ros.Client):
         self._drives = self.subscribe(Path, "trainer/episode")
         self._map, self._planner = ros.shipped_maps()["dilemma"], Planner.load("any_map")
         self._grid, self._draw = self._map.grid, random.Random(0)
-        requests = random_requests(self._grid.occupancy, ros.RULE, 50, np.random.default_rng(0))
-        self._cells = [start for start, _ in requests]
+        self._cells = self._grid.free_cells()
         slowness = np.full(self._grid.occupancy.shape, SLOWNESS)
         self._robot = Robot(World(self._grid, slowness, [], self._cells), seed=0)
         self._silent = ""  # the event that made the costmap or the poses stop
