@@ -28,6 +28,7 @@ from client import Client, Recorder, cells_of, pose, wait_for
 from driving_worlds import RULE, Float64, Routes, World, generated_world, path_seconds
 from figures import ROUTE_STYLES, draw_slowness, draw_times
 from processes import claim_ros_domain, run_script, running, running_node
+from simulated_robot import SEED, WORLD
 
 MISSIONS = 40
 LISTENERS = 3  # to goals: the planner, the trainer and the robot
@@ -60,7 +61,6 @@ class Driver:
         # The last one: once its latched message comes, the others are connected, too.
         self.slowness = client.subscribe(OccupancyGrid, "trainer/slowness", LATCHED, keep=1)
         self.planner = Planner.load("any_map")
-        self.at = world.stations[0]
 
     def wait(self, what: str, recorder: Recorder, is_right: Any = lambda _: True) -> Any:
         """Return the first message that is right."""
@@ -92,7 +92,6 @@ class Driver:
         time.sleep(0.3)  # the planner loads it
         learned, truth = cells_of(grid, path), self.world.slowness(began)
         shortest, best = self.world.routes(self.planner, learned[0], goal, began).values()
-        self.at = goal
         routes = {"shortest": shortest, "learned": learned, "best possible": best}
         seconds = {name: path_seconds(of, truth, grid) for name, of in routes.items()}
         return Mission(routes, seconds, measured, truth, slowness)
@@ -134,8 +133,7 @@ def save_pictures(world: World, missions: Sequence[Mission]) -> None:
 def main(arguments: Sequence[str]) -> int:
     """Drive the missions, and save what they show."""
     count = int(arguments[0]) if arguments else MISSIONS
-    seed = simulated_robot.SEED
-    world, random = generated_world(simulated_robot.WORLD, seed), np.random.default_rng(seed)
+    world, random = generated_world(WORLD, SEED), np.random.default_rng(SEED)
     planning = {"start_source": "odometry", "move_rule": RULE.value, "follow_trainer": True}
     with tempfile.TemporaryDirectory() as folder, claim_ros_domain():
         map_file = FilePath(folder) / "world.yaml"
@@ -149,10 +147,11 @@ def main(arguments: Sequence[str]) -> int:
             running(sys.executable, simulated_robot.__file__) as robot,
         ):
             driver = Driver(client, world, [server, planner, trainer, robot])
-            missions = list[Mission]()
+            goal, missions = world.stations[0], list[Mission]()
             for number in range(1, count + 1):
-                others = [station for station in world.stations if station != driver.at]
-                mission = driver.drive(others[random.integers(len(others))])
+                others = [station for station in world.stations if station != goal]
+                goal = others[random.integers(len(others))]
+                mission = driver.drive(goal)
                 missions.append(mission)
                 learned, shortest = (mission.ratio(name) for name in ("learned", "shortest"))
                 print(

@@ -8,27 +8,30 @@ It needs `pip install rerun-sdk matplotlib`; RViz shows the same topics.
 
 import argparse
 import sys
-from collections.abc import Sequence
 from functools import partial
 from typing import Any
 
 import numpy as np
-import rclpy
 import rerun as rr
 from matplotlib.colors import LinearSegmentedColormap
 from nav_msgs.msg import OccupancyGrid, Path
 from PIL import ImageColor
-from rclpy.executors import ExternalShutdownException
 from rclpy.node import Node
-from rclpy.qos import DurabilityPolicy, QoSProfile
 from rclpy.utilities import remove_ros_args
 from std_msgs.msg import Float32
 
+from ddqn_planner.nodes.runtime import LATCHED, spin_until_shutdown
 from ddqn_planner.pictures import PATH_COLOUR, VALUE_COLOURS
 
-LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 COLOURS = LinearSegmentedColormap.from_list("value", VALUE_COLOURS)
-LAYERS = ("map", "value", "plan", "episode")  # from bottom to top, in cells, y upwards
+# From bottom to top, in cells, y upwards: the type, the topic and its quality.
+LAYERS: dict[str, tuple[Any, str, Any]] = {
+    "map": (OccupancyGrid, "map", LATCHED),
+    "value": (OccupancyGrid, "planner/value", LATCHED),
+    "plan": (Path, "plan", LATCHED),
+    "episode": (Path, "trainer/episode", 10),
+}
+ORDER = {name: number for number, name in enumerate(LAYERS)}
 LINES = {"plan": (PATH_COLOUR, 4), "episode": ("#edae49", 2)}  # colour and radius
 
 
@@ -38,12 +41,7 @@ class LiveView(Node):
     def __init__(self) -> None:
         super().__init__("live_view")
         self._last: dict[str, Any] = {"map": OccupancyGrid()}
-        for layer, kind, topic, qos in (
-            ("map", OccupancyGrid, "map", LATCHED),
-            ("value", OccupancyGrid, "planner/value", LATCHED),
-            ("plan", Path, "plan", LATCHED),
-            ("episode", Path, "trainer/episode", 10),
-        ):
+        for layer, (kind, topic, qos) in LAYERS.items():
             self.create_subscription(kind, topic, partial(self._on_message, layer), qos)
         self.create_subscription(Float32, "trainer/average_reward", self._on_reward, 100)
 
@@ -67,7 +65,7 @@ class LiveView(Node):
             image = shades[..., None].repeat(3, axis=-1).astype(np.uint8)
         else:  # cells without a value show the map
             image = COLOURS(np.ma.masked_less(values, 0) / 100, bytes=True)
-        rr.log(f"map/{name}", rr.Image(image, draw_order=LAYERS.index(name)))
+        rr.log(f"map/{name}", rr.Image(image, draw_order=ORDER[name]))
 
     def _draw_path(self, name: str, message: Path) -> None:
         info, (colour, radius) = self._last["map"].info, LINES[name]
@@ -77,29 +75,21 @@ class LiveView(Node):
         metres = np.array([complex(p.x - origin.x, p.y - origin.y) for p in points])
         cells = metres * complex(rotation.w, -rotation.z) ** 2 / (info.resolution or 1.0)
         strip = np.stack([cells.real, info.height - cells.imag], axis=1)
-        lines = rr.LineStrips2D(
-            [strip] if points else [],
-            radii=rr.Radius.ui_points(radius),
-            colors=ImageColor.getrgb(colour),
-            draw_order=LAYERS.index(name),
-        )
+        style: Any = {"radii": rr.Radius.ui_points(radius), "colors": ImageColor.getrgb(colour)}
+        lines = rr.LineStrips2D([strip] if points else [], **style, draw_order=ORDER[name])
         rr.log(f"map/{name}", lines)
 
 
-def main(arguments: Sequence[str]) -> None:
+def main() -> int:
     """Show what comes until a signal."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     rr.script_add_args(parser)
-    options = parser.parse_args(remove_ros_args(arguments)[1:])
-    rclpy.init(args=[*arguments])
-    rr.script_setup(options, "ddqn_planner")
+    rr.script_setup(parser.parse_args(remove_ros_args(sys.argv)[1:]), "ddqn_planner")
     try:
-        rclpy.spin(LiveView())
-    except (KeyboardInterrupt, ExternalShutdownException):
-        pass
+        return spin_until_shutdown(LiveView)
     finally:
         rr.disconnect()
 
 
 if __name__ == "__main__":
-    main(sys.argv)
+    sys.exit(main())

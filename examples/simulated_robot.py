@@ -1,7 +1,4 @@
-"""A simulated robot that follows the last `plan`, in a world whose slowness nobody tells.
-
-python examples/simulated_robot.py --ros-args -p world:=rooms -p seed:=1 -p speed_up:=30.0
-"""
+"""A simulated robot that follows the last `plan`, in a world whose slowness nobody tells."""
 
 import math
 import sys
@@ -22,7 +19,7 @@ sys.path.insert(0, str(FilePath(__file__).resolve().parents[1] / "experiments"))
 from client import RobotPoses
 from driving_worlds import NOISE, SPEED, World, generated_world
 
-WORLD, SEED = "office", 9  # of the driving demo
+WORLD, SEED, SPEED_UP = "office", 9, 40.0
 STEP = 0.2  # simulated seconds from one pose to the next
 MORNING = 3000.0  # when the simulated time begins, seconds: ten minutes later the first crowd goes
 JOIN_DISTANCE = 2.0  # metres from which the robot drives to the nearest point of a new path
@@ -67,7 +64,7 @@ class Robot:
             away, speed = math.hypot(*ahead), self._speed()
             metres = min(away, speed * min(left, 0.05))
             if metres < away:
-                self.x, self.y = np.array([self.x, self.y]) + metres / away * ahead
+                self.x, self.y = (self.x, self.y) + metres / away * ahead
             else:
                 (self.x, self.y), self._path = self._path[0], self._path[1:]
             if away:
@@ -95,18 +92,14 @@ class RobotNode(Node):
 
     def __init__(self) -> None:
         super().__init__("robot")
-        defaults = {"world": WORLD, "seed": SEED, "speed_up": 40.0}
-        world, seed, speed_up = (
-            self.declare_parameter(name, default).value for name, default in defaults.items()
-        )
-        self._robot = Robot(generated_world(str(world), int(seed)), int(seed))
+        self._robot = Robot(generated_world(WORLD, SEED), SEED)
         self._poses = RobotPoses(self)
         self._goal: PoseStamped | None = None
         self._stood = 0.0  # simulated seconds without a path
         self._goals = self.create_publisher(PoseStamped, "goal_pose", 10)
         self.create_subscription(PoseStamped, "goal_pose", self._on_goal, 10)
         self.create_subscription(Path, "plan", self._on_plan, LATCHED)
-        self.create_timer(STEP / float(speed_up), self._step, clock=STEADY)
+        self.create_timer(STEP / SPEED_UP, self._step, clock=STEADY)
 
     def _on_plan(self, message: Path) -> None:
         positions = [(it.pose.position.x, it.pose.position.y) for it in message.poses]

@@ -14,9 +14,9 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import client as ros
 import numpy as np
 import processes
-from client import RULE, Client, MapFixture, ask, generated_map, map_message, plan_request, wait_for
 from nav_msgs.msg import OccupancyGrid
 from nav_msgs.msg import Path as PathMessage
 from nav_msgs.srv import GetPlan
@@ -24,7 +24,7 @@ from rcl_interfaces.srv import GetParameters, ListParameters
 from std_srvs.srv import Trigger
 from tables import report
 
-from ddqn_planner import GridMap, Planner, load_map
+from ddqn_planner import Planner
 from ddqn_planner.grid import OCCUPIED, MapFile, read_map_file
 from ddqn_planner.grid.noise import random_requests
 from ddqn_planner.nodes.runtime import LATCHED
@@ -36,11 +36,6 @@ RATE = 5  # maps per second
 SETTLED = 0.6  # seconds after which a client is known to DDS
 FREE = float("inf")
 Usage = tuple[float, float, float]  # wall time and CPU time, seconds; resident memory, MB
-
-
-def message_of(grid: GridMap) -> OccupancyGrid:
-    """Return the message of a map."""
-    return map_message(OCCUPIED * grid.occupancy.astype(np.int8), grid)
 
 
 def usage(child: AbstractContextManager[Any], wait: Callable[[], Any]) -> Usage:
@@ -57,11 +52,11 @@ def usage(child: AbstractContextManager[Any], wait: Callable[[], Any]) -> Usage:
 
 def start_planner() -> Usage:
     """Start the planner node; return what it takes until its first plan."""
-    grid = load_map(find_map("dilemma"))
-    request = plan_request(grid, (6, 6), (17, 19))
-    with Client() as client:
+    fixture = ros.shipped_maps()["dilemma"]
+    (request,) = fixture.requests(1, np.random.default_rng(0))
+    with ros.Client() as client:
         plans = client.subscribe(PathMessage, "plan", LATCHED)
-        client.publish("map", message_of(grid), LATCHED, listeners=0)
+        client.publish("map", fixture.message(), LATCHED, listeners=0)
 
         def first_plan() -> None:
             client.publish_ends(request)
@@ -72,16 +67,16 @@ def start_planner() -> Usage:
 
 def start_map_server() -> Usage:
     """Start the map server; return what it takes until its first map is received."""
-    with Client() as client:
+    with ros.Client() as client:
         maps = client.subscribe(OccupancyGrid, "map", LATCHED)
         return usage(processes.running_node("map_server_node", "--log-level", "error"), maps.wait)
 
 
 def start_bare_node() -> Usage:
     """Start a node with one service; return what it takes until it is discovered."""
-    with Client() as client:
+    with ros.Client() as client:
         ready = client.node.create_client(GetPlan, "bare/get_plan").service_is_ready
-        return usage(processes.running(*BARE, "0"), lambda: wait_for("the bare node", ready))
+        return usage(processes.running(*BARE, "0"), lambda: ros.wait_for("the bare node", ready))
 
 
 def run_command(*command: str) -> Usage:
@@ -121,32 +116,22 @@ def measure_starts() -> Iterator[bool]:
 def timed(service: Any, request: Any) -> tuple[float, Any]:
     """Call a service; return how long its answer took, milliseconds, and the answer."""
     began = time.perf_counter()
-    answer = ask(service, request)
+    answer = ros.ask(service, request)
     return 1e3 * (time.perf_counter() - began), answer
 
 
-def first_answer(client: Client, request: GetPlan.Request) -> tuple[float, int]:
-    """Ask the planner until it has its map; return its first plan's milliseconds and poses."""
-    service = client.service(GetPlan, "planner/get_plan")
-
-    def answer() -> tuple[float, int] | None:
-        took, response = timed(service, request)
-        return (took, len(response.plan.poses)) if response.plan.poses else None
-
-    return wait_for("plan", answer)
-
-
-def measure_requests(client: Client, map_file: Path) -> Iterator[bool]:
+def measure_requests(client: ros.Client, map_file: Path) -> Iterator[bool]:
     """Measure the first and the later answers of the planner node on a map."""
-    fixture = MapFixture(read_map_file(map_file))
+    fixture = ros.MapFixture(read_map_file(map_file))
     requests = fixture.requests(GOALS, np.random.default_rng(0))
     first, ratios = [], []
     server = processes.running_node("map_server_node", yaml_filename=map_file.resolve())
     with server, processes.running_node("planner_node"):
         planner = client.service(GetPlan, "planner/get_plan")
-        first_answer(client, requests[0])
+        ros.wait_for("plan", lambda: ros.ask(planner, requests[0]).plan.poses)
         for request in requests[1:]:
-            took, poses = first_answer(client, request)
+            took, answer = timed(planner, request)
+            poses = len(answer.plan.poses)
             first.append(took)
             with processes.running(*BARE, str(poses)):
                 bare = client.service(GetPlan, "bare/get_plan")
@@ -163,10 +148,10 @@ def measure_requests(client: Client, map_file: Path) -> Iterator[bool]:
     yield report(f"{name}: GetPlan again / bare service, worst", max(ratios), "x", 1.5)
 
 
-def measure_large_map(client: Client) -> Iterator[bool]:
-    """Measure memory, and what other services take while a large field is computed."""
+def measure_large_map(client: ros.Client) -> Iterator[bool]:
+    """Measure services while a large field is computed, memory, and paths on new large maps."""
     random, waited = np.random.default_rng(0), []
-    fixture = generated_map("office", LARGE, seed=random)
+    fixture = ros.generated_map("office", LARGE, seed=random)
     known, *new = fixture.requests(GOALS + 1, random)
     known.goal = known.start  # a long path would take its own time
     questions = {
@@ -177,8 +162,8 @@ def measure_large_map(client: Client) -> Iterator[bool]:
     }
     with processes.running_node("planner_node") as planner:
         client.publish("map", fixture.message(), LATCHED)
-        first_answer(client, known)
         get_plan = client.service(GetPlan, "planner/get_plan")
+        ros.wait_for("plan", lambda: ros.ask(get_plan, known).plan.poses)
         for name, (service_type, question) in questions.items():
             service, times = client.service(service_type, f"planner/{name}"), []
             for request in new:
@@ -190,48 +175,40 @@ def measure_large_map(client: Client) -> Iterator[bool]:
                 waited.append(1e3 * (time.perf_counter() - began))
             figure = f"{LARGE}x{LARGE}, field under way: {name}, slowest of {len(times)}"
             yield report(figure, max(times), "ms", 100)
+        print(f"{LARGE}x{LARGE}: GetPlan with a new field, {statistics.median(waited):.0f} ms")
         peak = processes.memory(planner.pid, "VmHWM")
-    print(f"{LARGE}x{LARGE}: GetPlan with a new field, median {statistics.median(waited):.0f} ms")
-    yield report(f"{LARGE}x{LARGE}: planner node, greatest memory", peak, "MB", 2000)
-
-
-def measure_new_maps(client: Client) -> Iterator[bool]:
-    """Measure how soon a new large map brings a path to the active goal."""
-    plans, times = client.subscribe(PathMessage, "plan", LATCHED), []
-    small = message_of(GridMap(np.zeros((5, 5), dtype=np.bool_)))
-    office = generated_map("office", LARGE)
-    with processes.running_node("planner_node"):
-        for turns in range(4):
-            turned = MapFixture(MapFile(np.rot90(office.values, turns), 1.0))
-            client.publish("map", small, LATCHED)
-            client.publish_ends(*turned.requests(1, np.random.default_rng(turns)))
-            time.sleep(2)  # until the node has answered that these lie outside the small map
+        yield report(f"{LARGE}x{LARGE}: planner node, greatest memory", peak, "MB", 2000)
+        plans, seconds = client.subscribe(PathMessage, "plan", LATCHED), []
+        for turns in (1, 2, 3):
+            origin = LARGE * turns, 0.0, 0.0
+            turned = ros.MapFixture(MapFile(np.rot90(fixture.values, turns), 1.0, origin))
+            client.publish_ends(*turned.requests(1, random))
+            time.sleep(2)  # until the node has answered that these lie outside the map before
             message = turned.message()
             plans.clear()
             began = time.monotonic()
             client.publish("map", message, LATCHED)
             plans.wait(lambda plan: plan.poses)
-            times.append(time.monotonic() - began)
-    print(f"{LARGE}x{LARGE}: new map to path, first of the node {times[0]:.2f} s")
-    seconds = statistics.median(times[1:])
-    yield report(f"{LARGE}x{LARGE}: new map to path, median", seconds, "s", 0.3)
+            seconds.append(time.monotonic() - began)
+    yield report(f"{LARGE}x{LARGE}: new map to path", statistics.median(seconds), "s", 0.3)
 
 
-def measure_changing_map(client: Client) -> Iterator[bool]:
+def measure_changing_map(client: ros.Client) -> Iterator[bool]:
     """Measure the planner's share of a core while a few cells of its map change."""
     random = np.random.default_rng(0)
-    grid = generated_map("office", CHANGING, seed=random).grid
-    ((start, goal),) = random_requests(grid.occupancy, RULE, 1, random)
-    local, random, maps = Planner.load("any_map"), np.random.default_rng(0), [grid]
-    path = local.plan(grid, start, goal, RULE).cells
-    while len(maps) < 12 * RATE:
+    fixture = ros.generated_map("office", CHANGING, seed=random)
+    grid = fixture.grid
+    ((start, goal),) = random_requests(grid.occupancy, ros.RULE, 1, random)
+    local, messages = Planner.load("any_map"), [fixture.message()]
+    path = local.plan(grid, start, goal, ros.RULE).cells
+    while len(messages) < 12 * RATE:
         x, y = random.choice(path[3:-3])
         changed = grid.with_patch(~grid.occupancy[y : y + 2, x : x + 2], x, y)
-        if local.plan(changed, start, goal, RULE).cells:
-            maps.append(changed)
-    messages = [message_of(changed) for changed in maps]
+        if local.plan(changed, start, goal, ros.RULE).cells:
+            values = OCCUPIED * changed.occupancy.astype(np.int8)
+            messages.append(ros.map_message(values, changed))
     with processes.running_node("planner_node") as planner:
-        client.publish_ends(plan_request(grid, start, goal))
+        client.publish_ends(ros.plan_request(grid, start, goal))
         for number, message in enumerate(messages):
             if number == 2 * RATE:  # the node is warm
                 began, computed = time.monotonic(), processes.cpu_seconds(planner.pid)
@@ -242,7 +219,7 @@ def measure_changing_map(client: Client) -> Iterator[bool]:
     yield report(name, 100 * computed / seconds, "%", 10)
 
 
-def measure_trainer(client: Client) -> Iterator[bool]:
+def measure_trainer(client: ros.Client) -> Iterator[bool]:
     """Measure the trainer node while it trains: its services, and how soon a signal ends it."""
     slowest = dict.fromkeys(("start", "save", "replay", "stop"), 0.0)
 
@@ -256,16 +233,12 @@ def measure_trainer(client: Client) -> Iterator[bool]:
             tempfile.TemporaryDirectory() as folder,
             processes.running_node("trainer_node", output_folder=folder, **options) as trainer,
         ):
-            call("stop")  # a service is found before its node spins
             print(f"trainer: first ~/start, once torch is imported: {call('start'):.0f} ms")
-            call("stop")
-            time.sleep(1)  # until it has saved itself
-            slowest["start"] = max(slowest["start"], call("start"))
             time.sleep(10)  # thousands of steps: a checkpoint and curves of some size
             for name in slowest:
                 slowest[name] = max(slowest[name], call(name, 50))
             for _ in range(20):  # until the training that was stopped has saved itself
-                call("start")
+                slowest["start"] = max(slowest["start"], call("start"))
                 time.sleep(0.1)
             began = time.monotonic()
             trainer.send_signal(number)
@@ -286,11 +259,10 @@ def main(arguments: Sequence[str]) -> int:
             partial(measure_requests, map_file=find_map("dilemma")),
             partial(measure_requests, map_file=map_file),
             measure_large_map,
-            measure_new_maps,
             measure_changing_map,
             measure_trainer,
         ):
-            with Client() as client:  # else its last map would reach the next node
+            with ros.Client() as client:  # else its last map would reach the next node
                 missed += measure(client)
     return int(any(missed))
 

@@ -7,7 +7,7 @@ import subprocess
 import sys
 import sysconfig
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import AbstractContextManager, contextmanager, suppress
 from pathlib import Path
 from typing import NoReturn
 
@@ -18,25 +18,23 @@ def claim_ros_domain() -> socket.socket:
     """Set a ROS domain of this machine alone, before rclpy is initialised; the socket holds it."""
     for domain in range(1, 101):
         claim = socket.socket()
-        try:
+        with suppress(OSError):
             claim.bind(("127.0.0.1", 32768 + domain))
-        except OSError:
-            claim.close()
-        else:
             os.environ["ROS_DOMAIN_ID"] = str(domain)
             os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
             return claim
+        claim.close()
     raise RuntimeError("all ROS domains from 1 to 100 are in use; end a demo or a test first")
 
 
 def executable(name: str) -> str:
     """Return the path of an executable of the package: pip's, else that of a colcon workspace."""
-    installed = Path(sysconfig.get_path("scripts")) / name
-    if not installed.exists():
+    folder = Path(sysconfig.get_path("scripts"))
+    if not (folder / name).exists():
         from ament_index_python.packages import get_package_prefix
 
-        installed = Path(get_package_prefix("ddqn_planner")) / "lib" / "ddqn_planner" / name
-    return str(installed)
+        folder = Path(get_package_prefix("ddqn_planner"), "lib", "ddqn_planner")
+    return str(folder / name)
 
 
 @contextmanager
