@@ -128,19 +128,14 @@ def load_goals(goals: int) -> bool:
         ros.wait_for("start", lambda: client.get_plan(PoseStamped(), from_start).poses)
         plans = client.subscribe(Path, "plan", goals)
         ros.wait_for("publisher of plan", lambda: client.node.count_publishers("plan"))
-
-        def heard() -> list[int]:
-            ends = [plan.poses[-1:] for plan in plans.messages()]
-            return [numbers.get(ros.cell_of(grid, end[0]), -1) if end else -1 for end in ends]
-
         began = time.monotonic()
         for sent, stamped in enumerate(poses):
             time.sleep(max(0.0, began + sent * GOALS_PERIOD - time.monotonic()))
             client.publish("goal_pose", stamped)
         seconds = time.monotonic() - began
-        ros.wait_for("plan to the last goal", lambda: goals - 1 in heard())
+        plans.wait(lambda plan: numbers[ros.cell_of(grid, plan.poses[-1])] == goals - 1)
         time.sleep(2)  # a plan for an older goal would come now
-        order = heard()
+        order = [numbers[ros.cell_of(grid, plan.poses[-1])] for plan in plans.messages()]
     print(f"goal_pose: {goals} goals in {seconds:.1f} s, {len(order)} plans published")
     late = sum(later < earlier for earlier, later in itertools.pairwise(order))
     return report("  plans for a goal before the last one's", late, "", 0)

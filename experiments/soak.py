@@ -58,11 +58,10 @@ class Work:
         self._draw = random.Random(0)
         self._maps = ros.shipped_maps()
         self._steady = self._maps["office"].requests(STEADY_FIELDS, np.random.default_rng(0))
-        self.lost = 0
         self.done: Counter[str] = Counter()
 
     def __call__(self) -> None:
-        """Do one piece of work; count it as lost if it has no answer."""
+        """Do one piece of work; count it, and as lost if it has no answer."""
         client, draw, noise = self._client, self._draw, ("scatter_obstacles", "restore_map")
         # How often each kind of work is drawn, and what it does.
         work: dict[str, tuple[int, Callable[[], Any]]] = {
@@ -80,7 +79,7 @@ class Work:
         try:
             work[kind][1]()
         except TimeoutError:
-            self.lost += 1
+            self.done["lost"] += 1
 
     def _set(self, rule: str, threshold: int) -> None:
         self._client.set_parameters("planner", move_rule=rule, occupied_threshold=threshold)
@@ -132,7 +131,6 @@ class DrivenRobot(ros.Client):
         self._silent = ""  # the event that made the costmap or the poses stop
         self._visited: set[Cell] = set()
         self._set_elsewhere()
-        self.stale = self.lost = 0
         self.done: Counter[str] = Counter()
         self.node.create_timer(STEP / SPEED_UP, self._step)
 
@@ -182,7 +180,7 @@ class DrivenRobot(ros.Client):
             self._is_well(kind, SILENCE)
             self._silent = ""
         if not self._is_well(kind, RECOVERY):
-            self.lost += 1
+            self.done["lost"] += 1
             print(f"after {kind}: no plan, or no new drive, in {RECOVERY:g} s", flush=True)
 
     def _is_well(self, kind: str, seconds: float) -> bool:
@@ -197,7 +195,7 @@ class DrivenRobot(ros.Client):
             is_right = start in self._visited and not self._silent
             planned |= is_right
             if poses and not is_right:
-                self.stale += 1
+                self.done["stale"] += 1
                 print(f"after {kind}: a plan from {start}, silent: {self._silent!r}", flush=True)
             if planned and len(self._drives.messages()) >= 2:
                 return True
@@ -255,10 +253,11 @@ def main(arguments: Sequence[str]) -> int:
         robot = client.enter_context(DrivenRobot())
         work = Work(client)
         samples = soak(children, work, minutes, robot)
-    done = ", ".join(f"{name} {count}" for name, count in sorted((work.done + robot.done).items()))
-    print(f"{minutes:g} minutes: {done}; the robot's poses came by {SOURCE}")
-    missed = [report("without an answer, or not recovered", work.lost + robot.lost, "", 0)]
-    missed.append(report("stale answers", robot.stale, "", 0))
+    done = work.done + robot.done
+    counts = ", ".join(f"{name} {count}" for name, count in sorted(done.items()))
+    print(f"{minutes:g} minutes: {counts}; the robot's poses came by {SOURCE}")
+    missed = [report("without an answer, or not recovered", done["lost"], "", 0)]
+    missed.append(report("stale answers", done["stale"], "", 0))
     for name, sampled in samples.items():
         warm, last, share = growth(sampled)
         figure = f"{name}: {warm:.1f} MB when warm, {last:.1f} MB at the end; growth"

@@ -58,7 +58,7 @@ def test_mixed_work_with_bad_input_is_answered_and_sampled(
         work.bad_input()
         children = {"map_server_node": server, "planner_node": planner}
         samples = soak(children, work, minutes=0.05)
-    assert work.lost == 0
+    assert work.done["lost"] == 0
     assert work.done.total() > 0
     assert all(memory and min(memory) > 0 for memory in samples.values())
     assert "Traceback" not in "".join(capfd.readouterr())
