@@ -31,6 +31,7 @@ from ddqn_planner.grid import OCCUPIED, Cell, GridMap, MapFile, MoveRule, read_m
 from ddqn_planner.grid.noise import random_requests
 from ddqn_planner.nodes.conversions import occupancy_message, quaternion
 from ddqn_planner.nodes.report import seconds
+from ddqn_planner.planning.paths import is_path_valid
 from ddqn_planner.resources import find_map
 
 RULE = MoveRule.ROBOT_SAFE  # of the planner's default model
@@ -224,8 +225,7 @@ class Client(ExitStack):
         """Set parameters of a node one by one; return a SetParametersResult for each."""
         messages = [Parameter(name, value=v).to_parameter_msg() for name, v in values.items()]
         request = SetParameters.Request(parameters=messages)
-        results: list[Any] = self.call(SetParameters, f"{node}/set_parameters", request).results
-        return results
+        return list(self.call(SetParameters, f"{node}/set_parameters", request).results)
 
     def get_parameter(self, node: str, name: str) -> Any:
         """Return a parameter's value."""
@@ -332,28 +332,15 @@ class MapFixture:
         grid, cells = self.grid, cells_of(self.grid, plan)
         start, goal = (cell_of(grid, pose) for pose in (request.start, request.goal))
         if not cells:
-            labels = grid.labels(RULE)
             both_free = grid.is_free(start) and grid.is_free(goal)
-            possible = both_free and labels[start[::-1]] == labels[goal[::-1]]
+            possible = both_free and grid.reachable([start], RULE)[goal[::-1]]
             return f"no path from {start} to {goal}, where there is one" if possible else ""
         if (cells[0], cells[-1]) != (start, goal):
             return f"a path from {cells[0]} to {cells[-1]}, asked was {start} to {goal}"
-        path = np.array(cells)
-        if ((path < 0) | (path >= (grid.width, grid.height))).any():
-            return "an illegal move out of the map"
-        (x, y), (next_x, next_y) = path[:-1].T, path[1:].T
-        first_free = next((n for n, cell in enumerate(cells) if grid.is_free(cell)), len(x))
-
-        def is_blocked(x: NDArray[np.int64], y: NDArray[np.int64]) -> NDArray[np.bool_]:
-            # A robot on an obstacle may leave it, and what is next to it.
-            is_far = np.hypot(x - start[0], y - start[1]) > 1
-            return grid.occupancy[y, x] & (is_far | (np.arange(len(x)) >= first_free))
-
-        # A diagonal move needs both cells beside it; for a straight one these are its own two.
-        wrong = is_blocked(next_x, next_y) | (is_blocked(next_x, y) & (next_x != x))
-        wrong |= is_blocked(x, next_y) & (next_y != y)
-        wrong |= np.maximum(abs(next_x - x), abs(next_y - y)) != 1
-        return f"an illegal move to {path[1:][wrong][0]}" if wrong.any() else ""
+        are_moves = (abs(np.diff(cells, axis=0)).max(axis=1) == 1).all()
+        # A robot on an obstacle may leave it, and what is next to it.
+        legal = are_moves and is_path_valid(cells, start, grid, RULE, radius=1)
+        return "" if legal else f"an illegal move in {cells}"
 
 
 def generated_map(kind: str, side: int, resolution: float = 0.05, seed: Any = 0) -> MapFixture:

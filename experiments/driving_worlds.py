@@ -59,17 +59,6 @@ class World:
             for name, grid in maps.items()
         }
 
-    def worst_pair(self, planner: Planner, seconds: float) -> tuple[Cell, Cell]:
-        """Return the two stations between which knowing saves most."""
-        truth = self.slowness(seconds)
-
-        def saved(ends: tuple[Cell, Cell]) -> float:
-            routes = self.routes(planner, *ends, seconds)
-            shortest, best = (path_seconds(cells, truth, self.grid) for cells in routes.values())
-            return shortest - best
-
-        return max(((a, b) for a in self.stations for b in self.stations if a < b), key=saved)
-
 
 def _discs(grid: GridMap, count: int, radius: Range, factor: Range, random: Random) -> Float64:
     """Draw discs of some radius (metres) and slowness around free cells: (H, W)."""

@@ -4,7 +4,7 @@ import array
 import tempfile
 import time
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from contextlib import suppress
 from functools import partial
 from itertools import cycle, islice
@@ -14,7 +14,6 @@ from typing import Any
 
 import numpy as np
 from client import RULE, Client, MapFixture, plan_request, wait_for
-from diagnostic_msgs.msg import DiagnosticArray
 from nav_msgs.msg import OccupancyGrid
 from nav_msgs.msg import Path as PathMessage
 from nav_msgs.srv import GetPlan, LoadMap
@@ -36,10 +35,7 @@ SIDE, GOALS = 1000, 6  # cells of a map, and fields asked for at once: a second'
 TRY_TIME = 1.0  # seconds until a question is asked again: it may have gone to a killed node
 START_TIME = 20.0  # the same for ~/start, which a second question would find started
 LAST_WAIT = 0.5  # seconds that a client waits after a kill until it gives up
-COUNTS = (
-    "kills | in a save | restarts | answers | time-outs | without a plan | wrong paths | "
-    "temporaries"
-)
+COUNTS = "kills | in a save | restarts | answers | time-outs | wrong paths | temporaries"
 Tally = Counter[str]  # the counts of COUNTS: what became of the kills of one node
 
 
@@ -50,7 +46,6 @@ class Faults(Client):
         super().__init__()
         self.maps = self.subscribe(OccupancyGrid, "map", LATCHED, keep=1)
         self.plans = self.subscribe(PathMessage, "plan", LATCHED, keep=1)
-        self.diagnostics = self.subscribe(DiagnosticArray, "/diagnostics", keep=20)
         self.random = np.random.default_rng(0)
         self.map_path, self.training_folder = folder / "map.yaml", folder / "training"
         occupancy = generate_map("office", (SIDE, SIDE), self.random)
@@ -62,7 +57,7 @@ class Faults(Client):
         quiet, apart = ("--log-level", "fatal"), ("-r", "__ns:=/training")
         training = {"map_file": "dilemma", "steps": 10**9, "output_folder": self.training_folder}
         server = {"yaml_filename": self.map_path}
-        self.nodes: dict[str, Callable[[], Any]] = {
+        self.nodes = {
             "map_server": partial(running_node, "map_server_node", *quiet, **server),
             "planner": partial(running_node, "planner_node", *quiet),
             "trainer": partial(running_node, "trainer_node", *quiet, *apart, **training),
@@ -105,34 +100,24 @@ class Faults(Client):
         name = f"/training/trainer/{name}"
         return str(self.ask(Trigger, name, None, lambda it: it.success, START_TIME).message)
 
-    def ask_for_plan(self, request: Any, accept: Any = lambda it: it.plan.poses) -> PathMessage:
-        """Ask for a plan until there is one, or an answer is accepted."""
-        return self.ask(GetPlan, "planner/get_plan", request, accept).plan
+    def ask_for_plan(
+        self, tally: Tally, request: Any, accept: Any = lambda it: it.plan.poses
+    ) -> None:
+        """Ask for a plan until there is one, or an answer is accepted; count it if it is wrong."""
+        plan = self.ask(GetPlan, "planner/get_plan", request, accept).plan
+        # All goals can be reached: the check refuses an empty path.
+        tally["wrong paths"] += bool(self.map.error(request, plan))
 
-    def plan_for_active_goal(self, request: GetPlan.Request) -> PathMessage:
+    def plan_for_active_goal(self, tally: Tally) -> None:
         """Give the planner a start and an active goal until it plans: it may be a new one."""
         self.plans.clear()
 
         def planned() -> Any:
-            self.publish_ends(request)
+            self.publish_ends(self.watched)
             time.sleep(0.2)
             return self.plans.find(lambda plan: plan.poses)
 
-        return wait_for("plan", planned)
-
-    def check_plan(
-        self, tally: Tally, request: GetPlan.Request, ask: Callable[..., PathMessage], *how: Any
-    ) -> bool:
-        """Return whether a plan comes in time; count one that is wrong or missing."""
-        with suppress(TimeoutError):
-            if (plan := ask(request, *how)).poses:
-                tally["wrong paths"] += bool(self.map.error(request, plan))
-                return True
-        tally["without a plan"] += 1
-        said = [message.status[0] for message in self.diagnostics.messages()]
-        reasons = [status.message for status in said if status.name == "/planner: plan"]
-        print(f"no plan after kill {tally['kills']}: {reasons[-1:]}", flush=True)
-        return False
+        tally["wrong paths"] += bool(self.map.error(self.watched, wait_for("plan", planned)))
 
     def kill_planner(self, tally: Tally) -> None:
         """Kill the planner while it plans toward goals that it does not know."""
@@ -141,14 +126,14 @@ class Faults(Client):
         calls = [(get_plan, get_plan.call_async(request)) for request in requests]
         time.sleep(self.random.uniform(0.0, 1.0))
         for request, answer in zip(requests, self.kill("planner", tally, calls), strict=True):
-            # All goals can be reached: the check refuses an empty path.
             tally["wrong paths"] += bool(answer and self.map.error(request, answer.plan))
         self.start("planner")
-        tally["restarts"] += self.check_plan(tally, requests[0], self.ask_for_plan)
+        self.ask_for_plan(tally, requests[0])
+        tally["restarts"] += 1
 
     def kill_map_server(self, tally: Tally) -> None:
         """Kill the map server while it loads, scatters over and restores its map."""
-        self.plan_for_active_goal(self.watched)
+        self.plan_for_active_goal(tally)
         load = LoadMap.Request(map_url=str(self.map_path))
         requests = [
             *[(self.service(Trigger, "map_server/restore_map"), Trigger.Request())] * 20,
@@ -160,7 +145,7 @@ class Faults(Client):
         time.sleep(self.random.uniform(0.0, 2.0))
         self.kill("map_server", tally, calls)
         # The first answer must be a plan. With it, the plans of the last maps are out.
-        self.check_plan(tally, self.watched, self.ask_for_plan, bool)
+        self.ask_for_plan(tally, self.watched, bool)
         # The map is the loaded one with at most five obstacles more.
         values = np.frombuffer(self.maps.wait().data, np.int8).reshape(self.map.values.shape)
         new = values[values != self.map.values]
@@ -168,22 +153,23 @@ class Faults(Client):
         self.maps.clear()
         self.start("map_server")
         served = self.maps.wait()
-        self.check_plan(tally, self.watched, self.plan_for_active_goal)
+        self.plan_for_active_goal(tally)
         tally["restarts"] += intact and served.data == array.array("b", self.map.values.tobytes())
 
     def kill_trainer(self, tally: Tally) -> None:
         """Kill the trainer while it saves after each step, soon after a save was seen to begin."""
         save = self.service(Trigger, "/training/trainer/save")
+        temporaries = partial(self.training_folder.glob, ".*")  # what a killed save leaves
         until = time.monotonic() + self.random.uniform(0.2, 1.2)
         calls = []
         while time.monotonic() < until:
             calls.append((save, save.call_async(Trigger.Request())))
             time.sleep(0.002)
-        while not self.temporaries() and time.monotonic() < until + LAST_WAIT:
+        while not any(temporaries()) and time.monotonic() < until + LAST_WAIT:
             pass
         time.sleep(self.random.uniform(0.0, 0.002))
         self.kill("trainer", tally, calls)
-        tally["in a save"] += bool(self.temporaries())
+        tally["in a save"] += any(temporaries())
         # What it saved can be loaded.
         model, steps = self.training_folder / "model.safetensors", 0
         if model.exists():
@@ -197,22 +183,25 @@ class Faults(Client):
         self.set_parameters("/training/planner", model="any_map")
         self.trigger("save")
         wait_for("model", lambda: self.get_parameter("/training/planner", "model") == str(model))
-        tally["temporaries"] = len(self.temporaries())
+        tally["temporaries"] = len([*temporaries()])
         tally["restarts"] += f"from step {steps} " in message
 
-    def temporaries(self) -> list[Path]:
-        """Return what the killed trainers left of their saves."""
-        return [*self.training_folder.glob(".*")]
 
-    def kill_in_turn(self, kills: int) -> bool:
-        """Kill so many times, and print what became of it; return whether all is right."""
-        self.ask_for_plan(self.watched)
-        self.trigger("start")
-        self.get_parameter("/training/planner", "model")
+def main(arguments: Sequence[str]) -> int:
+    """Kill nodes in turn, 50 times or so many; return 1 if anything is wrong."""
+    kills = int(arguments[0]) if arguments else KILLS
+    with (
+        claim_ros_domain(),
+        tempfile.TemporaryDirectory() as folder,
+        Faults(Path(folder)) as faults,
+    ):
+        faults.ask_for_plan(Tally(), faults.watched)
+        faults.trigger("start")
+        faults.get_parameter("/training/planner", "model")
         kinds = {
-            "planner_node | planning": self.kill_planner,
-            "map_server_node | publishing": self.kill_map_server,
-            "trainer_node | saving": self.kill_trainer,
+            "planner_node | planning": faults.kill_planner,
+            "map_server_node | publishing": faults.kill_map_server,
+            "trainer_node | saving": faults.kill_trainer,
         }
         tallies = {node: Tally() for node in kinds}
         try:
@@ -223,20 +212,9 @@ class Faults(Client):
             names = COUNTS.split(" | ")
             rows = [[node, *(tally[name] for name in names)] for node, tally in tallies.items()]
             print(table(f"node | killed while | {COUNTS}", rows))
-        total = sum(tallies.values(), Tally())
-        wrong = total["without a plan"] + total["wrong paths"] + total["temporaries"]
-        return not wrong and total["restarts"] == total["kills"]
-
-
-def main(arguments: Sequence[str]) -> int:
-    """Kill so many times, 50 without an argument; return 1 if anything is wrong."""
-    kills = int(arguments[0]) if arguments else KILLS
-    with (
-        claim_ros_domain(),
-        tempfile.TemporaryDirectory() as folder,
-        Faults(Path(folder)) as faults,
-    ):
-        return int(not faults.kill_in_turn(kills))
+    total = sum(tallies.values(), Tally())
+    restarted = total["restarts"] == total["kills"]
+    return int(total["wrong paths"] + total["temporaries"] > 0 or not restarted)
 
 
 if __name__ == "__main__":

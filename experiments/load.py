@@ -1,6 +1,7 @@
 """Asks one planner node from many processes while its map changes, and checks every answer."""
 
 import itertools
+import math
 import multiprocessing
 import signal
 import time
@@ -18,12 +19,10 @@ from nav_msgs.msg import Path
 from nav_msgs.srv import GetPlan
 from processes import claim_ros_domain, memory, run_script, running_node
 from rclpy.action.client import ActionClient
-from rclpy.qos import DurabilityPolicy, QoSProfile
 from rclpy.task import Future
 from tables import report
 
 from ddqn_planner.grid import Cell, GridMap
-from ddqn_planner.grid.noise import random_requests
 from ddqn_planner.nodes.nav2 import QUEUES
 from ddqn_planner.nodes.runtime import LATCHED
 
@@ -37,44 +36,33 @@ REACH = 30  # cells from start to goal along an axis at most: short answers come
 
 def three_maps() -> list[ros.MapFixture]:
     """Return the maps that take turns; they are the same in each process."""
-    dilemma, office = ros.shipped_maps().values()
-    return [dilemma, ros.generated_map("rooms", 200), office]
+    return [*ros.shipped_maps().values(), ros.generated_map("rooms", 200)]
 
 
 def ask(seed: int, count: int, shared: SimpleNamespace) -> None:
-    """Ask, and check each answer; the result is milliseconds, the number of empty ones, errors."""
+    """Ask; for each answer put its milliseconds, how many poses it has, and what is wrong."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # it ends with its parent
     random, maps = np.random.default_rng(seed), three_maps()
-    milliseconds: list[float] = []
-    errors: list[str] = []
-    empty = 0
     asked = [fixture.requests(GOALS_PER_MAP, random) for fixture in maps]
-    starts = [fixture.grid.free_cells() for fixture in maps]
     with ros.Client() as client:
         client.call(GetPlan, "planner/get_plan")  # not measured: it waits for the service
         shared.ready.wait(ros.TIMEOUT)
         for _ in range(count):
             first = shared.confirmed.value
             current = first % len(maps)
-            request = asked[current][random.integers(GOALS_PER_MAP)]
-            start = starts[current][random.integers(len(starts[current]))]
-            request.start = ros.pose(maps[current].grid, start)
+            one, other = (asked[current][i] for i in random.integers(GOALS_PER_MAP, size=2))
+            request = GetPlan.Request(start=one.start, goal=other.goal)
             began = time.perf_counter()
             try:
-                plan = client.get_plan(request.start, request.goal)
+                plan, lost = client.get_plan(request.start, request.goal), ""
             except TimeoutError as error:
-                errors.append(f"from {start} on map {first}: {error}")
-            else:
-                milliseconds.append(1e3 * (time.perf_counter() - began))
-                empty += not plan.poses
-                # The maps that it had between request and answer, mostly one.
-                possible = {n % len(maps) for n in range(first, shared.published.value + 1)}
-                wrong = [maps[number].error(request, plan) for number in possible]
-                if all(wrong):
-                    errors.append(f"on map {first} or later: {wrong[0]}")
-            with shared.done.get_lock():
-                shared.done.value += 1
-    shared.results.put((milliseconds, empty, errors))
+                plan, lost = Path(), str(error)
+            milliseconds = 1e3 * (time.perf_counter() - began)
+            # The maps that it had between request and answer, mostly one.
+            possible = {n % len(maps) for n in range(first, shared.published.value + 1)}
+            wrong = [lost or maps[number].error(request, plan) for number in possible]
+            said = f"on map {first} or later: {wrong[0]}" if all(wrong) else ""
+            shared.answers.put((milliseconds, len(plan.poses), said))
 
 
 def load_requests(planner: int, requests: int, clients: int) -> bool:
@@ -83,12 +71,9 @@ def load_requests(planner: int, requests: int, clients: int) -> bool:
     number = len(maps)
     # Of the last map: its number where the planner is known to have it, and where it was published.
     confirmed, published = context.Value("i", number), context.Value("i", number)
-    shared = SimpleNamespace(confirmed=confirmed, published=published, done=context.Value("i"))
-    shared.ready, shared.results = context.Barrier(clients + 1), context.Queue()
-    processes = [
-        context.Process(target=ask, args=(n, len(range(n, requests, clients)), shared), daemon=True)
-        for n in range(clients)
-    ]
+    shared = SimpleNamespace(confirmed=confirmed, published=published)
+    shared.ready, shared.answers = context.Barrier(clients + 1), context.Queue()
+    answers: list[tuple[float, int, str]] = []
     with ros.Client() as client:
         diagnostics = client.subscribe(DiagnosticArray, "/diagnostics", keep=1)
 
@@ -97,30 +82,28 @@ def load_requests(planner: int, requests: int, clients: int) -> bool:
             ros.wait_for_map(diagnostics, Time(sec=number))
 
         send_map(number)
-        for process in processes:
-            process.start()
+        for n in range(clients):
+            share = len(range(n, requests, clients))
+            context.Process(target=ask, args=(n, share, shared), daemon=True).start()
         shared.ready.wait(ros.TIMEOUT)
-        began, first_memory = time.monotonic(), 0.0
-        while shared.done.value < requests and any(process.is_alive() for process in processes):
-            if shared.done.value >= (number - 2) * requests / CHANGES:
+        while len(answers) < requests:
+            if len(answers) >= (number - 2) * requests / CHANGES:
                 number += 1
                 shared.published.value = number
                 send_map(number)
                 shared.confirmed.value = number
-            if not first_memory and shared.done.value >= WARM_UP * requests:
+            answers.append(shared.answers.get(timeout=2 * ros.TIMEOUT))  # Empty if a process failed
+            if len(answers) == math.ceil(WARM_UP * requests):
                 first_memory = memory(planner)
-            time.sleep(0.005)
-        seconds, last_memory = time.monotonic() - began, memory(planner)
-    # It fails if a process did.
-    results = [shared.results.get(timeout=ros.TIMEOUT) for _ in processes]
-    times, empty, of_processes = zip(*results, strict=True)
-    milliseconds, errors = np.concatenate(times), list(itertools.chain(*of_processes))
+        last_memory = memory(planner)
+    milliseconds, poses, of_answers = zip(*answers, strict=True)
     median, slow = np.percentile(milliseconds, (50, 99))
+    errors = [error for error in of_answers if error]
     print(
         *errors[:10],
-        f"GetPlan: {requests} requests of {clients} processes in {seconds:.0f} s, "
+        f"GetPlan: {requests} requests of {clients} processes, "
         f"{number - len(maps)} changes of the map",
-        f"  paths {len(milliseconds) - sum(empty)}, empty answers {sum(empty)}",
+        f"  paths {np.count_nonzero(poses)}, empty answers {poses.count(0)}",
         f"  latency median {median:.1f} ms, 99 % {slow:.1f} ms",
         f"  planner's resident memory {first_memory:.0f} MB after {WARM_UP:.0%} of them, "
         f"{last_memory:.0f} MB at the end: {last_memory / first_memory - 1:+.1%}",
@@ -132,21 +115,18 @@ def load_requests(planner: int, requests: int, clients: int) -> bool:
 def load_goals(goals: int) -> bool:
     """Send goals at 200 Hz; return whether a plan for an older goal followed a newer one's."""
     office, random = ros.shipped_maps()["office"], np.random.default_rng(0)
-    grid = office.grid
-    ((start, _),) = random_requests(grid.occupancy, ros.RULE, 1, random)
-    reachable = np.argwhere(grid.reachable([start], ros.RULE))[:, ::-1]
-    cells = [(int(x), int(y)) for x, y in random.permutation(reachable)[:goals]]
-    numbers = {cell: number for number, cell in enumerate(cells)}
+    grid, message = office.grid, office.message(2**20)
+    # All free cells are joined.
+    cells = random.permutation(grid.free_cells())[: goals + 1].tolist()
+    from_start, *poses = (ros.pose(grid, (x, y)) for x, y in cells)
+    numbers = {ros.cell_of(grid, stamped): number for number, stamped in enumerate(poses)}
     with ros.Client() as client:
         diagnostics = client.subscribe(DiagnosticArray, "/diagnostics", keep=1)
-        message = office.message(2**20)
         client.publish("map", message, LATCHED)
         ros.wait_for_map(diagnostics, message.header.stamp)
-        from_start = ros.pose(grid, start)
         client.publish("initialpose", ros.initial_pose(from_start))
         ros.wait_for("start", lambda: client.get_plan(PoseStamped(), from_start).poses)
-        everything = QoSProfile(depth=goals, durability=DurabilityPolicy.VOLATILE)
-        plans = client.subscribe(Path, "plan", everything)
+        plans = client.subscribe(Path, "plan", goals)
         ros.wait_for("publisher of plan", lambda: client.node.count_publishers("plan"))
 
         def heard() -> list[int]:
@@ -154,9 +134,9 @@ def load_goals(goals: int) -> bool:
             return [numbers.get(ros.cell_of(grid, end[0]), -1) if end else -1 for end in ends]
 
         began = time.monotonic()
-        for sent, cell in enumerate(cells):
+        for sent, stamped in enumerate(poses):
             time.sleep(max(0.0, began + sent * GOALS_PERIOD - time.monotonic()))
-            client.publish("goal_pose", ros.pose(grid, cell))
+            client.publish("goal_pose", stamped)
         seconds = time.monotonic() - began
         ros.wait_for("plan to the last goal", lambda: goals - 1 in heard())
         time.sleep(2)  # a plan for an older goal would come now
@@ -177,10 +157,9 @@ class BurstClients(ros.Client):
             self.node.create_client(service_type, service, qos_profile=ros.SERVICE_QUALITY)
             for _ in range(clients)
         ]
-        # Made after them: the node knows them all when it knows this one.
-        self.service(service_type, service)
         for client in self._clients:
             client.wait_for_service(ros.TIMEOUT)
+        self.wait_for_discovery(service.rpartition("/")[0])
 
     def burst(self, requests: Sequence[Any]) -> list[Any]:
         """Send all requests, the clients in turn; return the answers, None where it is lost."""
@@ -205,36 +184,32 @@ class GoalBursts(ros.Client):
         ros.wait_for(action, self._client.server_is_ready)
         self.wait_for_discovery(node)
 
-    def burst(self, requests: Sequence[GetPlan.Request]) -> tuple[int, int]:
-        """Send all requests as goals; return how many were acknowledged, and have a result."""
-        handles: list[Any] = []
+    def burst(self, requests: Sequence[GetPlan.Request]) -> int:
+        """Send all requests as goals; return how many have a result."""
         results: list[Future] = []
 
-        def acknowledge(future: Future) -> None:
-            handles.append(future.result())
-            handles[-1].get_result_async().add_done_callback(results.append)
+        def acknowledged(future: Future) -> None:
+            future.result().get_result_async().add_done_callback(results.append)
 
         def send() -> None:
             for asked in requests:
                 goal = self._type(start=asked.start, goal=asked.goal, use_start=True)
-                self._client.send_goal_async(goal).add_done_callback(acknowledge)
+                self._client.send_goal_async(goal).add_done_callback(acknowledged)
 
         self.run(send)  # rclpy loses answers that come before it has noted a goal
         with suppress(TimeoutError):
             ros.wait_for("results", lambda: len(results) == len(requests))
-        return len(handles), len(results)
+        return len(results)
 
 
 def burst_requests(
     grid: GridMap, goals: Sequence[Cell], count: int, seed: int = 0
 ) -> list[GetPlan.Request]:
     """Return requests from random free cells within `REACH` of the goals, which take turns."""
-    random = np.random.default_rng(seed)
-    requests: list[GetPlan.Request] = []
-    for goal in itertools.cycle(goals):
-        if len(requests) == count:
-            return requests
-        x, y = (np.array(goal) + random.integers(-REACH, REACH + 1, 2)).tolist()
+    random, requests = np.random.default_rng(seed), list[GetPlan.Request]()
+    while len(requests) < count:
+        goal = goals[len(requests) % len(goals)]
+        x, y = (goal + random.integers(-REACH, REACH + 1, 2)).tolist()
         if grid.is_free((x, y)):
             requests.append(ros.plan_request(grid, (x, y), goal))
     return requests
@@ -271,7 +246,7 @@ def load_bursts(
                 yield report(f"{what}: lost or wrong", missing, "", 0)
     with suppress(ModuleNotFoundError), GoalBursts() as action:
         for count in counts:
-            missing = sum(count - min(action.burst(requests)) for requests in sent[count])
+            missing = sum(count - action.burst(requests) for requests in sent[count])
             yield report(f"{bursts} bursts of {count} actions: without a result", missing, "", 0)
 
 

@@ -10,8 +10,7 @@ import tempfile
 import time
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import ExitStack
-from pathlib import Path
+from pathlib import Path as FilePath
 from subprocess import Popen
 from typing import Any
 
@@ -20,7 +19,7 @@ import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray
 from driving_worlds import World
 from geometry_msgs.msg import PoseStamped
-from nav_msgs.msg import OccupancyGrid
+from nav_msgs.msg import Path
 from nav_msgs.srv import GetPlan, LoadMap
 from processes import claim_ros_domain, memory, run_script, running_node
 from rosgraph_msgs.msg import Clock
@@ -29,10 +28,9 @@ from tables import report
 
 from ddqn_planner import MoveRule, Planner
 from ddqn_planner.grid import Cell
-from ddqn_planner.grid.noise import random_requests
 from ddqn_planner.nodes.runtime import LATCHED
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "examples"))
+sys.path.insert(0, str(FilePath(__file__).resolve().parents[1] / "examples"))
 from simulated_robot import STEP, Robot
 
 MINUTES, MAX_GROWTH = 30.0, 5.0  # percent
@@ -124,15 +122,11 @@ class DrivenRobot(ros.Client):
 
     def __init__(self) -> None:
         super().__init__(NAMESPACE, "simulated_robot")
-        self._clock = self.node.create_publisher(Clock, "/clock", 10)
-        self._costmap = self.node.create_publisher(OccupancyGrid, "map", LATCHED)
-        self._goals = self.node.create_publisher(PoseStamped, "goal_pose", 10)
         self._poses = ros.RobotPoses(self.node)
-        self._diagnostics = self.subscribe(DiagnosticArray, "/diagnostics", keep=100)
+        self._drives = self.subscribe(Path, "trainer/episode")
         self._map, self._planner = ros.shipped_maps()["dilemma"], Planner.load("any_map")
         self._grid, self._draw = self._map.grid, random.Random(0)
-        requests = random_requests(self._grid.occupancy, ros.RULE, 50, np.random.default_rng(0))
-        self._cells = [start for start, _ in requests]
+        self._cells = self._grid.free_cells()
         slowness = np.full(self._grid.occupancy.shape, SLOWNESS)
         self._robot = Robot(World(self._grid, slowness, [], self._cells), seed=0)
         self._silent = ""  # the event that made the costmap or the poses stop
@@ -148,11 +142,11 @@ class DrivenRobot(ros.Client):
         cell = self._grid.world_to_cell(robot.x, robot.y)
         self._visited.add(cell)
         header = robot.header()
-        self._clock.publish(Clock(clock=header.stamp))
+        self.publish("/clock", Clock(clock=header.stamp), listeners=0)
         if self._silent != "costmap stops" and robot.now % 1 < STEP:
             message = self._map.message()
             message.header.stamp = header.stamp
-            self._costmap.publish(message)
+            self.publish("map", message, LATCHED, listeners=0)
         if "poses" not in self._silent:
             self._poses.publish(header, robot.x, robot.y, robot.yaw)
         if not robot.is_driving:
@@ -162,7 +156,7 @@ class DrivenRobot(ros.Client):
         goal = self._draw.choice([cell for cell in self._cells if math.dist(cell, start) > 5])
         cells = self._planner.plan(self._grid, start, goal).cells
         self._robot.follow(np.array([self._grid.cell_to_world(cell) for cell in cells]))
-        self._goals.publish(ros.pose(self._grid, goal))
+        self.publish("goal_pose", ros.pose(self._grid, goal), listeners=0)
 
     def _set_elsewhere(self) -> None:
         """Put the robot on a cell where it has not been since it was put down last."""
@@ -184,34 +178,31 @@ class DrivenRobot(ros.Client):
         """Let something happen; see no plan in a silence, then plans from there and two drives."""
         self.done[kind] += 1
         ros.wait_for(kind, self.run(self._happen, kind).done)
-        happened, planned, drives = time.monotonic(), False, -1
-        while (began := time.monotonic()) < happened + RECOVERY:
-            if self._silent and began > happened + SILENCE:
-                self._silent, happened, drives = "", began, -1
+        if self._silent:
+            self._is_well(kind, SILENCE)
+            self._silent = ""
+        if not self._is_well(kind, RECOVERY):
+            self.lost += 1
+            print(f"after {kind}: no plan, or no new drive, in {RECOVERY:g} s", flush=True)
+
+    def _is_well(self, kind: str, seconds: float) -> bool:
+        """Ask for plans, count stale ones; return whether a right one and two drives came."""
+        until, planned = time.monotonic() + seconds, False
+        time.sleep(GRACE + (MAP_TIMEOUT if self._silent else 0))
+        self._drives.clear()
+        while time.monotonic() < until:
             # Where the planner thinks that the robot is.
             poses = self.get_plan(PoseStamped(), ros.pose(self._grid, self._cells[0])).poses
             start = ros.cell_of(self._grid, poses[0]) if poses else None
             is_right = start in self._visited and not self._silent
             planned |= is_right
-            if began > happened + GRACE + (MAP_TIMEOUT if self._silent else 0):
-                if poses and not is_right:
-                    self.stale += 1
-                    print(
-                        f"after {kind}: a plan from {start}, silent: {self._silent!r}", flush=True
-                    )
-                drives = self._drives() if self._silent or drives < 0 else drives
-                if planned and self._drives() >= drives + 2:
-                    return
+            if poses and not is_right:
+                self.stale += 1
+                print(f"after {kind}: a plan from {start}, silent: {self._silent!r}", flush=True)
+            if planned and len(self._drives.messages()) >= 2:
+                return True
             time.sleep(0.1)
-        self.lost += 1
-        what = "no new drive" if planned else "no plan"
-        print(f"after {kind}: {what} in {RECOVERY:g} s", flush=True)
-
-    def _drives(self) -> int:
-        """Return how many drives the trainer has recorded."""
-        statuses = [status for m in self._diagnostics.messages() for status in m.status]
-        of_trainer = [s for s in statuses if s.name == f"{NAMESPACE}/trainer: driving"]
-        return int(ros.values_of(of_trainer[-1])["drives"]) if of_trainer else 0
+        return False
 
 
 def soak(
@@ -252,12 +243,7 @@ def main(arguments: Sequence[str]) -> int:
     of_planner = {"start_source": SOURCE, "transform_tolerance": TOLERANCE, "follow_trainer": True}
     of_planner |= {"map_type": "costmap", "map_timeout": MAP_TIMEOUT}
     of_trainer = {"learn_from": "driving", "pose_source": SOURCE}
-    with (
-        claim_ros_domain(),
-        tempfile.TemporaryDirectory() as folder,
-        ExitStack() as stack,
-        ros.Client() as client,
-    ):
+    with claim_ros_domain(), tempfile.TemporaryDirectory() as folder, ros.Client() as client:
         of_trainer["output_folder"] = f"{folder}/drives"
         nodes = {
             "map_server_node": running_node("map_server_node", *quiet),
@@ -265,8 +251,8 @@ def main(arguments: Sequence[str]) -> int:
             "robot's planner": running_node("planner_node", *apart, **of_planner),
             "robot's trainer": running_node("trainer_node", *apart, **of_trainer),
         }
-        children = {name: stack.enter_context(node) for name, node in nodes.items()}
-        robot = stack.enter_context(DrivenRobot())
+        children = {name: client.enter_context(node) for name, node in nodes.items()}
+        robot = client.enter_context(DrivenRobot())
         work = Work(client)
         samples = soak(children, work, minutes, robot)
     done = ", ".join(f"{name} {count}" for name, count in sorted((work.done + robot.done).items()))
