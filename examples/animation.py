@@ -29,13 +29,12 @@ LAST_FRAMES = 40  # for which the complete path is shown
 def save_film(path: str, grid: GridMap, plan: Plan, value: NDArray[Any], steps: int = 40) -> None:
     """Save a GIF: the cells appear from the best value to the worst, then the path grows."""
     height, width = np.array(value.shape) / max(value.shape) * 6
-    figure, axes = plt.subplots(figsize=(width, height), dpi=100)
-    figure.subplots_adjust(0, 0, 1, 1)
+    figure = plt.figure(figsize=(width, height))
+    axes = figure.add_axes((0, 0, 1, 1))
     axes.axis("off")
     finite = np.where(np.isfinite(value), value, np.nan)
     colours = LinearSegmentedColormap.from_list("value", VALUE_COLOURS)
-    least, greatest = np.nanmin(finite), np.nanmax(finite)
-    field = axes.imshow(finite, colours, origin="lower", vmin=least, vmax=greatest)
+    field = axes.imshow(finite, colours, origin="lower")
     draw_obstacles(axes, grid)
     outline = [withStroke(linewidth=9, foreground="white")]
     (line,) = axes.plot([], [], color=PATH_COLOUR, linewidth=5, path_effects=outline)
@@ -43,8 +42,8 @@ def save_film(path: str, grid: GridMap, plan: Plan, value: NDArray[Any], steps: 
         axes.plot(*cell, marker, color=PATH_COLOUR, markersize=size, markeredgecolor="white")
     # The least value that a frame shows, and how many cells of the path.
     frames = [(np.nanquantile(finite, 1 - share), 0) for share in np.linspace(0, 1, steps)]
-    frames += [(least, int(count)) for count in np.linspace(1, len(plan.cells), steps)]
-    frames += [(least, len(plan.cells))] * LAST_FRAMES
+    frames += [(-np.inf, int(count)) for count in np.linspace(1, len(plan.cells), steps)]
+    frames += frames[-1:] * LAST_FRAMES
 
     def draw(frame: tuple[float, int]) -> Sequence[Any]:
         field.set_data(np.where(finite >= frame[0], finite, np.nan))
