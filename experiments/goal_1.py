@@ -47,19 +47,19 @@ def convergence_row(runs: Sequence[Evaluations]) -> list[str]:
     shortest_one = shortest_path(SCENARIO.grid, SCENARIO.start, SCENARIO.goal, MOVE_RULE)
     optimum, ends = path_length(shortest_one), [run[-1] for run in runs]
     solved, unmasked = (sum(int(end[key]) for end in ends) for key in ("solved", "solved_unmasked"))
-    shortest = [at_first_kept(run, "step", run["length"] <= optimum + 1e-6) for run in runs]
+    shortest = [first_kept(run, run["length"] <= optimum + 1e-6) for run in runs]
     return [
         f"{solved} ({unmasked}) of {len(ends)}",
-        median_and_range([at_first_kept(run, "step", run["solved"] == 1) for run in runs]),
+        median_and_range([first_kept(run, run["solved"] == 1) for run in runs]),
         median_and_range(shortest),
         median_and_range([end["length"] for end in ends if end["solved"]], 2),
     ]
 
 
-def at_first_kept(run: Evaluations, column: str, holds: NDArray[np.bool_]) -> float:
-    """Return a column where a condition begins to hold to the end; infinity if it does not."""
+def first_kept(run: Evaluations, holds: NDArray[np.bool_]) -> float:
+    """Return the step from which on a condition holds to the end; infinity if it does not."""
     first = int(np.flatnonzero(~holds)[-1]) + 1 if not holds.all() else 0
-    return float(run[column][first]) if first < len(holds) else np.inf
+    return float(run["step"][first]) if first < len(holds) else np.inf
 
 
 def report(settings: Settings) -> str:
@@ -69,9 +69,8 @@ def report(settings: Settings) -> str:
     for profile in PROFILES:
         runs = settings.evaluations(f"{profile}/both")
         planned = [timed_plan(p) for p in settings.planners(f"{profile}/both")]
-        seconds = [at_first_kept(run, "seconds", run["solved"] == 1) for run in runs]
         milliseconds = median_and_range([took for _, took in planned], 1)
-        rows.append([profile, *convergence_row(runs), median_and_range(seconds), milliseconds])
+        rows.append([profile, *convergence_row(runs), milliseconds])
         by_length = sorted((plan for plan, _ in planned), key=lambda p: p.length or np.inf)
         paths[f"{profile}, median seed"] = by_length[len(planned) // 2].cells
     for rule in (MoveRule.CORNER_CUTTING, MoveRule.ROBOT_SAFE):
@@ -82,9 +81,10 @@ def report(settings: Settings) -> str:
         length = f"{path_length(cells):.2f} cells" if cells else "trapped"
         draw_map(axes, SCENARIO, f"{planner}: {length}")
         draw_path(axes, cells, number, planner)
-    drawn = save_figure(figure, settings.out / "goal_1.png", "Fig. 7: the paths of goal i")
-    header = f"profile | {CONVERGENCE} | seconds until solved for good | planning, ms"
-    return f"{table(header, rows)}\n\n{drawn}"
+    drawn = save_figure(
+        figure, settings.out / "goal_1.png", "As the paper's Fig. 7: the paths of goal i"
+    )
+    return f"{table(f'profile | {CONVERGENCE} | planning, ms', rows)}\n\n{drawn}"
 
 
 def timed_plan(planner: Planner) -> tuple[Plan, float]:
@@ -113,7 +113,7 @@ def ablation_report(settings: Settings) -> str:
         upper.set_title(f"profile {profile}", loc="left")
     handles, labels = panels[0, 0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside lower center", ncols=len(VARIANTS))
-    caption = "Fig. 6: average reward per step of an episode, and solved seeds"
+    caption = "As the paper's Fig. 6: average reward per step, and solved seeds"
     drawn = save_figure(figure, settings.out / "ablation.png", caption)
     return f"{table(f'profile | variant | {CONVERGENCE}', rows)}\n\n{drawn}"
 

@@ -105,7 +105,9 @@ def _draw(settings: Settings, ratios: dict[str, list[NDArray[np.float64]]]) -> s
                     axes.hlines(y + side / 2, x - 0.5, x + 0.5, **border)
     label = "seeds that solve the start"
     figure.colorbar(image, ax=panels, label=label, ticks=range(seeds + 1), shrink=0.8)
-    return save_figure(figure, settings.out / "goal_2.png", "Fig. 8: starts by outcome")
+    return save_figure(
+        figure, settings.out / "goal_2.png", "As the paper's Fig. 8: starts by outcome"
+    )
 
 
 def target_trainings(settings: Settings) -> list[Training]:

@@ -182,5 +182,5 @@ def _draw(settings: Settings) -> str:
             handles, labels = axes.get_legend_handles_labels()
             legend |= dict(zip(labels, handles, strict=True))
     figure.legend([*legend.values()], [*legend], loc="outside lower center", ncols=len(legend))
-    caption = "Fig. 9: the first three test maps of each reading"
+    caption = "As the paper's Fig. 9: the first three test maps of each reading"
     return save_figure(figure, settings.out / "goal_3.png", caption)

@@ -16,8 +16,8 @@ FIGURE = re.compile(r"\]\((.+\.png)\)")
 def table(header: str, rows: Sequence[Sequence[object]]) -> str:
     """Return a Markdown table; " | " divides the names in its header."""
     names = header.split(" | ")
-    lines = [names, ["---"] * len(names), *rows]
-    return "\n".join("| " + " | ".join(map(str, line)) + " |" for line in lines)
+    lines = ["| " + " | ".join(map(str, line)) + " |" for line in (names, *rows)]
+    return "\n".join([lines[0], "|---" * len(names) + "|", *lines[1:]])
 
 
 def write_report(out: Path, sections: Mapping[str, str], page: Path | None = None) -> str:

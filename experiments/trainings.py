@@ -1,7 +1,6 @@
 """The paper's trainings: two profiles, regular evaluations, many in parallel, a folder for each."""
 
 import argparse
-import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass, replace
@@ -153,11 +152,10 @@ def train(training: Training) -> None:
         before = before[before["step"] <= trainer.steps]
         rows = [dict(zip(before.dtype.names or (), row, strict=True)) for row in before.tolist()]
         optimum = optimal_value(trainer.environment)
-        began = time.perf_counter() - (rows[-1]["seconds"] if rows else 0.0)
         for _ in run.steps():
             if trainer.steps // training.evaluation_interval > len(rows):
                 best = max((row["solved"] for row in rows), default=-1)
-                rows.append(evaluate_training(trainer, optimum, time.perf_counter() - began))
+                rows.append(evaluate_training(trainer, optimum))
                 write_csv(folder / "evaluations.csv", [*rows[0]], [[*row.values()] for row in rows])
                 if rows[-1]["solved"] >= best:
                     trainer.save_model(folder / "kept.safetensors")
@@ -165,9 +163,7 @@ def train(training: Training) -> None:
         raise OSError(run.save_error)
 
 
-def evaluate_training(
-    trainer: Trainer, optimum: NDArray[np.float32], seconds: float
-) -> dict[str, float]:
+def evaluate_training(trainer: Trainer, optimum: NDArray[np.float32]) -> dict[str, float]:
     """Return figures of the current network's rollouts from the start of each scenario."""
     planner = trainer.planner()
     plans, unmasked = rollouts(planner, trainer.scenarios)
@@ -184,7 +180,6 @@ def evaluate_training(
         "step": trainer.steps,
         "updates": trainer.updates,
         "episodes": trainer.episodes,
-        "seconds": round(seconds, 3),
         "solved": len(lengths),
         "solved_unmasked": sum(bool(plan.cells) for plan in unmasked),
         "length": float(np.mean(lengths)) if lengths else np.nan,
