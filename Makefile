@@ -67,8 +67,7 @@ types: setup
 
 bench: setup
 	$(BIN)/pip install --quiet --editable ".[$(EXTRAS),bench]"
-	$(BIN)/python experiments/speed.py
-	$(BIN)/python experiments/node_speed.py $(MAP)
+	$(BIN)/python experiments/speed.py; missed=$$?; $(BIN)/python experiments/node_speed.py $(MAP) && exit $$missed
 
 # What a robot's body costs, on MAP (the office by default) and with RADIUS, metres.
 body: setup
