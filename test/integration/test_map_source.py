@@ -9,7 +9,7 @@ import array
 import re
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Coroutine, Iterator
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -25,7 +25,7 @@ from hypothesis import strategies as st
 from nav_msgs.msg import OccupancyGrid
 from rclpy.parameter import Parameter
 from rclpy.utilities import try_shutdown
-from std_msgs.msg import Header
+from std_msgs.msg import Header, String
 
 from ddqn_planner import Experience, GridMap, MoveRule, Planner
 from ddqn_planner.experience import ExperienceFileError
@@ -453,6 +453,37 @@ def test_a_map_has_expected_times_once_there_are_drives(
     Experience(0.5).save(tmp_path / "empty.npz")
     times.load(str(tmp_path / "empty.npz"))  # it was forgotten
     assert times.apply(GRID) is GRID
+
+
+def test_what_a_drive_taught_is_planned_with_at_once(
+    source: Source, times: ExpectedTimes, tmp_path: Path
+) -> None:
+    changes: list[int] = []
+    learned = ExpectedTimes(source.report, source.worker, lambda: changes.append(1))
+    assert finished(learned.on(GRID)) is GRID
+    path = str(tmp_path / "experience.npz")
+    finished(learned.on_saved(String(data=path)))
+    assert len(changes) == 1
+    timed = finished(learned.on(GRID))
+    assert finished(learned.on(GRID)) is timed
+    np.testing.assert_array_equal(timed.slowness, times.apply(GRID).slowness)
+    Experience(0.5).save(path)
+    finished(learned.on_saved(String(data=path)))
+    assert len(changes) == 2
+    assert finished(learned.on(GRID)) is GRID  # it was forgotten
+    finished(learned.on_saved(String(data="missing")))
+    assert len(changes) == 2
+    assert "missing" in source.report.refused["experience"]
+
+
+def finished(coroutine: Coroutine[None, None, Any]) -> Any:
+    """Return what a coroutine returns that waits for a worker alone."""
+    while True:
+        try:
+            coroutine.send(None)
+        except StopIteration as end:
+            return end.value
+        time.sleep(0.001)
 
 
 def test_a_map_with_a_person_has_the_same_times_and_one_that_grows_those_of_its_places(
