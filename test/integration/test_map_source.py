@@ -465,7 +465,7 @@ def test_what_a_drive_taught_is_planned_with_at_once(
     finished(learned.on_saved(String(data=path)))
     assert len(changes) == 1
     closed = GRID.with_patch(np.ones((3, 3), dtype=np.bool_), 60, 19)
-    for grid in (closed, GRID):
+    for grid in (GRID, closed, GRID):
         timed = finished(learned.on(grid))
         assert finished(learned.on(grid)) is timed
         np.testing.assert_array_equal(timed.occupancy, grid.occupancy)
