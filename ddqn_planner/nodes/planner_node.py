@@ -293,10 +293,9 @@ class ExpectedTimes:
         self._report, self._worker, self._on_change = report, worker, on_change
         self._experience: Experience | None = None
         self._spread_on: GridMap | None = None
-        # What the worker was asked last, and its answers.
         self._grid: GridMap | None = None
-        self._outcome = NO_REQUEST
-        self._timed = self._forecast = Future()
+        self._timed = Future()  # of the last grid, as the forecast is of the last outcome
+        self._outcome, self._forecast = NO_REQUEST, Future()
 
     async def on_saved(self, message: String) -> None:
         """Plan by what the trainer has learned from drives, or refuse its file."""
@@ -310,7 +309,7 @@ class ExpectedTimes:
         self._on_change()
 
     async def on(self, grid: GridMap) -> GridMap:
-        """Return what `apply` does, which is computed for the first request."""
+        """Return what `apply` returns; the worker computes it once for a map."""
         if self._experience is None:
             return grid
         if grid is not self._grid:
@@ -342,10 +341,11 @@ class ExpectedTimes:
         return grid.with_layers(slowness=timed.slowness, seconds_per_cell=timed.seconds_per_cell)
 
     def describe(self, outcome: Outcome) -> dict[str, str]:
-        """Return how long a plan takes; nothing if its map is an old one, or no memory is left."""
+        """Return how long a plan takes, unless its map is old or untimed, or no memory is left."""
         now, request, path = self._spread_on, outcome.request, outcome.plan.every_cell
         told: dict[str, str] = {}
-        if self._experience and now and request and len(path) and _is_like(request.grid, now):
+        is_timed = request is not None and request.grid.slowness is not None and len(path) > 0
+        if self._experience and now and request and is_timed and _is_like(request.grid, now):
             with suppress(MemoryError):
                 seconds, low, high = self._experience.expected_time(now, path)
                 told["expected time (s)"] = f"{seconds:.1f}"

@@ -521,3 +521,5 @@ def test_the_plan_goes_round_and_its_time_is_told(times: ExpectedTimes) -> None:
     )
     of_old_map = Outcome("SUCCEEDED", "", planner, replace(request, grid=other), plan)
     assert times.describe(of_old_map) == {}
+    before_a_drive = Outcome("SUCCEEDED", "", planner, replace(request, grid=GRID), plan)
+    assert times.describe(before_a_drive) == {}
