@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import zlib
 from collections.abc import Callable
 from functools import cache, wraps
 from threading import Lock
@@ -14,22 +15,26 @@ Function = TypeVar("Function", bound=Callable[..., Any])
 _importing = Lock()
 
 
-def compiled(function: Function) -> Function:
+def compiled(function: Function, **options: Any) -> Function:
     """Compile a function, and the compiled ones that it calls, at its first call; keep the code."""
 
     @cache
     def dispatcher() -> Any:
         scope = dict(function.__globals__)
-        for name in function.__code__.co_names:
-            if hasattr(scope.get(name), "dispatcher"):
-                scope[name] = scope[name].dispatcher()
+        names = function.__code__.co_names
+        calls = [name for name in names if hasattr(scope.get(name), "dispatcher")]
+        scope |= {name: scope[name].dispatcher() for name in calls}
         to_compile = FunctionType(function.__code__, scope)
+        # numba looks at the file of a function alone to see whether the code it has kept is old.
+        called = "".join(scope[name].py_func.__qualname__ for name in calls).encode()
+        digest = zlib.crc32(function.__code__.co_code + called)
+        to_compile.__qualname__ = f"{function.__name__}_{digest:08x}"
         with _importing:
             numba = _import_numba()
         try:
-            return numba.njit(cache=True, nogil=True)(to_compile)
+            return numba.njit(cache=True, nogil=True, **options)(to_compile)
         except RuntimeError:  # no folder is writable: each process compiles again
-            return numba.njit(nogil=True)(to_compile)
+            return numba.njit(nogil=True, **options)(to_compile)
 
     @wraps(function)
     def call(*arguments: Any) -> Any:

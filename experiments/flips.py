@@ -79,7 +79,7 @@ def drive(planner: Planner, kind: str, seed: int, threshold: float, side: int = 
     true_map = GridMap(occupancy, cost=inflated_costs(occupancy, INFLATION))
     if robot != goal:  # the best path from there, so that all drives end at the goal
         way += planner.plan(true_map, robot, goal, RULE).cells[1:]
-    return Driven(replans, flips, path_cost(way, true_map.cost_multiplier, RULE))
+    return Driven(replans, flips, path_cost(way, true_map.multipliers(way), RULE))
 
 
 def scenario(kind: str, side: int, random: Random) -> tuple[Occupancy, Cell, Cell]:

@@ -9,7 +9,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ddqn_planner.grid.arguments import OCCUPIED, UNKNOWN, Occupancy, as_number
-from ddqn_planner.grid.grid_map import MAX_COST_MULTIPLIER, GridMap, check_grid, replaced
+from ddqn_planner.grid.copies import WHOLE, wider, within
+from ddqn_planner.grid.grid_map import MAX_COST_MULTIPLIER, GridMap, check_grid
 
 # Linear and exponential costs, with paths as long, kept no clearly greater distances.
 CLEARANCE_SCALE = 1.0
@@ -99,28 +100,31 @@ def _inflate_changed(
     grid: GridMap, before: GridMap, inflated: GridMap, body: tuple[float, float]
 ) -> GridMap:
     """Return what `inflate` returns, given what it returned for a map that has other cells."""
-    differs = before.occupancy != grid.occupancy
-    if before.cost is not None and grid.cost is not None:
-        differs |= before.cost != grid.cost
-    occupancy, cost = inflated.occupancy, inflated.cost
-    if differs.any():
-        # Farther away than this, an obstacle has no effect: the cost that it adds is rounded to 0.
-        reach = body[0] + max(np.cbrt(2 * (OCCUPIED - 1) * body[1]) - 1, 0) * CLEARANCE_SCALE
-        cells = int(reach / grid.resolution) + 2
-        near, window = _around(differs, cells), _around(differs, 2 * cells)
+    boxes = grid.patches_since(before)
+    if boxes is None:
+        differs = grid.differs(before, WHOLE, WHOLE)
+        ends = (
+            [np.flatnonzero(differs.any(axis=axis))[[0, -1]] for axis in (1, 0)]
+            if differs.any()
+            else []
+        )
+        boxes = [tuple(slice(first, last + 1) for first, last in ends)] if ends else []
+        layers = {"occupancy": inflated.occupancy, "cost": inflated.cost}
+        inflated = grid.with_layers(**layers, obstacles=inflated.obstacles)
+    # Farther away than this, an obstacle has no effect: the cost that it adds is rounded to 0.
+    reach = body[0] + max(np.cbrt(2 * (OCCUPIED - 1) * body[1]) - 1, 0) * CLEARANCE_SCALE
+    cells, shape = int(reach / grid.resolution) + 2, grid.occupancy.shape
+    for box in boxes:
+        near, window = wider(box, cells, shape), wider(box, 2 * cells, shape)
         given = None if grid.cost is None else grid.cost[window]
         part = inflate(GridMap(grid.occupancy[window], grid.resolution, cost=given), *body)
-        in_part = _around(differs[window], cells)
-        occupancy = replaced(occupancy, near, part.occupancy[in_part])
-        if part.cost is not None:
-            cost = replaced(cost, near, part.cost[in_part])
-    return grid.with_layers(occupancy=occupancy, cost=cost, obstacles=grid.occupancy)
-
-
-def _around(cells: NDArray[np.bool_], margin: int) -> tuple[slice, ...]:
-    """Return the box of some cells, with a margin."""
-    ends = [np.flatnonzero(cells.any(axis=axis))[[0, -1]] for axis in (1, 0)]
-    return tuple(slice(max(first - margin, 0), last + margin + 1) for first, last in ends)
+        in_part = within(near, window)
+        cost = None if part.cost is None else part.cost[in_part]
+        corner = near[1].start, near[0].start
+        inflated = inflated.with_patch(
+            part.occupancy[in_part], *corner, cost, obstacles=grid.occupancy[near]
+        )
+    return inflated
 
 
 def grid_from_costmap(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
@@ -17,6 +18,7 @@ from ddqn_planner.grid.arguments import (
     POSITIVE,
     UNKNOWN,
     Cell,
+    Cells,
     Occupancy,
     as_cell,
     as_flag,
@@ -27,13 +29,17 @@ from ddqn_planner.grid.arguments import (
     numbers,
     real,
 )
+from ddqn_planner.grid.copies import Box, replaced
 from ddqn_planner.grid.moves import MoveRule, component_labels, flood, legal_moves
 
 MAX_COST_MULTIPLIER = 5.0
 """That of a cell of value 100 or unknown; as in Nav2's NavFn planner: 50 if free, at most 253."""
 
+LAYERS = "occupancy", "cost", "forbidden", "slowness"  # what its moves depend on
+MAX_PATCHES = 512  # so many are known of a map, one after the other
+
 # (101,): the multiplier of each cost, 0 to 100
-_MULTIPLIERS = np.linspace(1, MAX_COST_MULTIPLIER, OCCUPIED + 1, dtype=np.float32)
+MULTIPLIERS = np.linspace(1, MAX_COST_MULTIPLIER, OCCUPIED + 1, dtype=np.float32)
 
 
 @dataclass(frozen=True, eq=False)
@@ -184,11 +190,34 @@ class GridMap:
         closed = patch
         if obstacles is not None:
             closed = patch & as_mask("obstacles", obstacles, patch.shape)
-        return self.with_layers(
+        patched = self.with_layers(
             occupancy=replaced(self.occupancy, box, patch),
             cost=costs,
             obstacles=replaced(self.obstacles, box, closed),
         )
+        patched._set(_patches=(*self._patches[1 - MAX_PATCHES :], (self._version, box)))
+        return patched
+
+    def with_boxes_of(self, other: GridMap, boxes: Sequence[Box]) -> GridMap:
+        """Return this map with the cells that another one of its size has in some boxes."""
+        result = self
+        for box in boxes:
+            cost, obstacles = (
+                None if layer is None else layer[box] for layer in (other.cost, other.obstacles)
+            )
+            corner = box[1].start, box[0].start
+            result = result.with_patch(other.occupancy[box], *corner, cost, obstacles)
+        return result
+
+    def patches_since(self, older: GridMap) -> list[Box] | None:
+        """Return the boxes, rows and columns, that `with_patch` replaced since an older map."""
+        # None if it is no such map, or there were more than `MAX_PATCHES`.
+        if older._version is self._version:
+            return []
+        versions = [version for version, _ in self._patches]
+        if older._version not in versions:
+            return None
+        return [box for _, box in self._patches[versions.index(older._version) :]]
 
     def with_slowness(self, slowness: NDArray[np.float32], seconds_per_cell: float) -> GridMap:
         """Return the same map with other expected times."""
@@ -196,7 +225,7 @@ class GridMap:
 
     def with_layers(self, **layers: Any) -> GridMap:
         """Return the same map with other layers, which are neither checked nor copied."""
-        stale = {"cost_multiplier", "fingerprint"}
+        stale = {"cost_multiplier", "fingerprint", "_version", "_patches"}
         if "occupancy" in layers:
             stale |= {"_labels", "_checksum"}
         kept = {name: value for name, value in vars(self).items() if name not in stale}
@@ -222,12 +251,23 @@ class GridMap:
     @cached_property
     def cost_multiplier(self) -> NDArray[np.float32]:
         """(H, W) float32: what a path costs per cell of its length: 1 to 5, times the slowness."""
+        return self.multipliers_in(...)
+
+    def multipliers(self, cells: Cells) -> NDArray[np.float32]:
+        """Return (N,) float32: the cost multiplier of some cells (N, 2) of the map."""
+        x, y = np.asarray(cells, dtype=np.int64).reshape(-1, 2).T
+        return self.multipliers_in((y, x))
+
+    def multipliers_in(self, where: Any) -> NDArray[np.float32]:
+        """Return the cost multipliers that an index of NumPy names."""
+        slowness: NDArray[np.float32] | None
+        slowness = None if self.slowness is None else self.slowness[where]
         if self.cost is None:
-            if self.slowness is not None:
-                return self.slowness
-            return np.ones(self.occupancy.shape, dtype=np.float32)
-        multiplier = _MULTIPLIERS.take(self.cost, mode="wrap")  # -1 finds the last one
-        return multiplier if self.slowness is None else multiplier * self.slowness
+            ones = np.ones(self.occupancy[where].shape, dtype=np.float32)
+            return ones if slowness is None else slowness
+        multiplier: NDArray[np.float32]
+        multiplier = MULTIPLIERS.take(self.cost[where], mode="wrap")  # -1 finds the last one
+        return multiplier if slowness is None else multiplier * slowness
 
     def labels(self, move_rule: MoveRule | str) -> NDArray[np.int32]:
         """Return (H, W) int32: each free cell's component, from 1 on, whatever is forbidden."""
@@ -257,6 +297,15 @@ class GridMap:
         return reached
 
     @cached_property
+    def _version(self) -> object:
+        return object()
+
+    @cached_property
+    def _patches(self) -> tuple[tuple[object, Box], ...]:
+        """The last patches: the version of the map before each, and its rows and columns."""
+        return ()
+
+    @cached_property
     def _labels(self) -> dict[int, NDArray[np.int32]]:
         return {}
 
@@ -280,11 +329,21 @@ class GridMap:
     def same_cells(self, other: GridMap) -> bool:
         """Return whether all cells of two maps are equal, wherever the maps lie."""
         check_grid(other, "other")
-        names = "occupancy", "cost", "forbidden", "slowness"
-        return self is other or (
-            self._checksum == other._checksum
-            and all(equal(getattr(self, name), getattr(other, name)) for name in names)
+        boxes = self.patches_since(other)
+        if boxes is not None:
+            return not any(self.differs(other, box, box).any() for box in boxes)
+        return self._checksum == other._checksum and all(
+            equal(getattr(self, name), getattr(other, name)) for name in LAYERS
         )
+
+    def differs(self, other: GridMap, box: Box, others_box: Box) -> NDArray[np.bool_]:
+        """Return which cells of boxes of two maps with the same layers differ."""
+        differs: NDArray[np.bool_] = self.occupancy[box] != other.occupancy[others_box]
+        for layer in LAYERS[1:]:
+            mine, its = getattr(self, layer), getattr(other, layer)
+            if mine is not None and (mine is not its or box != others_box):
+                differs |= mine[box] != its[others_box]
+        return differs
 
     def contains(self, cell: Cell) -> bool:
         """Return whether a cell lies inside the map."""
@@ -348,14 +407,6 @@ def _costs(cost: ArrayLike, occupancy: Occupancy) -> NDArray[np.int8]:
         of_free[occupancy] = 0
     numbers("cost", of_free, between=(UNKNOWN, OCCUPIED - 1))
     return of_free.astype(np.int8, copy=False)
-
-
-def replaced(array: NDArray[Any] | None, box: tuple[slice, ...], values: NDArray[Any]) -> Any:
-    """Return a copy with other values in a box."""
-    if array is not None:
-        array = array.copy()
-        array[box] = values
-    return array
 
 
 def equal(some: NDArray[Any] | None, others: NDArray[Any] | None) -> bool:

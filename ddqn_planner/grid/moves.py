@@ -87,11 +87,11 @@ def path_length(cells: Cells, move_rule: MoveRule | str = MoveRule.ROBOT_SAFE) -
     return float(segment_lengths(np.diff(x), np.diff(y), move_rule).sum())
 
 
-def path_cost(cells: Cells, multiplier: NDArray[np.float32], move_rule: MoveRule | str) -> float:
-    """Return the cost of a path of neighbouring cells: the sum of its moves, see `move_costs`."""
+def path_cost(cells: Cells, multipliers: NDArray[np.float32], move_rule: MoveRule | str) -> float:
+    """Return the cost of a path, given the multipliers of its N cells: see `move_costs`."""
     x, y = np.asarray(cells, dtype=np.int64).reshape(-1, 2).T
     lengths = segment_lengths(np.diff(x), np.diff(y), move_rule)
-    multipliers = multiplier[y, x].astype(np.float64)
+    multipliers = multipliers.astype(np.float64)
     return float((lengths * (multipliers[1:] + multipliers[:-1]) / 2).sum())
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -9,6 +10,7 @@ from numpy.typing import NDArray
 
 from ddqn_planner.compiled import compiled
 from ddqn_planner.grid import MAX_COST_MULTIPLIER, OCCUPIED, UNKNOWN, GridMap, MoveRule, legal_moves
+from ddqn_planner.grid.copies import ORIGIN, Box, replaced, wider, within
 
 # Shapes: C = cells of the padded map, P = patches, S = sets of actions, A = 8 actions, L = the 102
 # values of a cell: 0 for unknown, 1 to 100 for the costs 0 to 99, 101 for occupied.
@@ -43,15 +45,35 @@ class MoveCosts(NamedTuple):
         nowhere = np.empty(0, dtype=np.uint16)
         return cls(nowhere, table_PA, None, None, 0, highest, straight, diagonal)
 
+    def after(self, grid: GridMap, boxes: Sequence[Box]) -> MoveCosts | None:
+        """Return the costs on a map that differs from theirs in boxes; None to look at it all."""
+        if grid.forbidden is not None:  # its patches are others
+            return None
+        shape = grid.height + 2, grid.width + 2
+        patch, value, highest = self.patch.reshape(shape), self.value, self.highest
+        for box in boxes:
+            # The patches of the cells around see the box, too.
+            around, seen = (wider(box, by, grid.occupancy.shape) for by in (1, 2))
+            window = np.ascontiguousarray(grid.occupancy[seen])
+            numbers = patch_numbers(window).reshape(window.shape[0] + 2, -1)
+            patch = replaced(patch, within(around, ORIGIN, 1), numbers[within(around, seen, 1)])
+            if value is None:
+                continue
+            if self.terms is None:
+                values: NDArray[Any] = grid.multipliers_in(box)
+                greatest = self.table.max(where=np.isfinite(self.table), initial=1)
+                highest = max(highest, float(greatest * values.max()))
+            elif grid.cost is not None:
+                values = np.where(grid.occupancy[box], VALUES - 1, grid.cost[box] - UNKNOWN)
+            value = replaced(value.reshape(shape), within(box, ORIGIN, 1), values)
+        value = None if value is None else value.ravel()
+        return self._replace(patch=patch.ravel(), value=value, highest=highest)
+
     def on(self, grid: GridMap, patch: NDArray[Any]) -> MoveCosts:
         """Return the costs on a map, given its patches, with its directions and expected times."""
         costs = self._replace(patch=patch, width=grid.width + 2)
         if self.terms is not None and grid.cost is not None:
-            value = np.full((grid.height + 2, grid.width + 2), VALUES - 1, dtype=np.uint8)
-            inside = value[1:-1, 1:-1]
-            np.subtract(grid.cost, UNKNOWN, out=inside, casting="unsafe")
-            inside[grid.occupancy] = VALUES - 1
-            costs = costs._replace(value=value.ravel())
+            costs = costs._replace(value=cell_values(grid.occupancy, grid.cost))
         if grid.forbidden is not None:
             patch, table = _with_directions(patch, self.table, np.pad(grid.forbidden, 1).ravel())
             costs = costs._replace(patch=patch, table=table)
@@ -83,6 +105,20 @@ def _occurring(values: NDArray[np.uint8]) -> NDArray[np.bool_]:
     for value in values:
         occurs[value] = True
     return occurs
+
+
+@compiled
+def cell_values(occupancy: NDArray[np.bool_], cost: NDArray[np.int8]) -> NDArray[np.uint8]:
+    """Return the value of each cell, see `VALUES`: (C,) uint8."""
+    height, width = occupancy.shape
+    values = np.empty((height + 2, width + 2), np.uint8)
+    values[0], values[height + 1] = VALUES - 1, VALUES - 1
+    for y in range(height):
+        here = values[y + 1]
+        here[0], here[width + 1] = VALUES - 1, VALUES - 1
+        for x in range(width):
+            here[x + 1] = VALUES - 1 if occupancy[y, x] else cost[y, x] - UNKNOWN
+    return values.ravel()
 
 
 @compiled

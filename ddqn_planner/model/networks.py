@@ -20,6 +20,7 @@ from ddqn_planner.model.move_costs import (
     patch_numbers,
     unique_patches,
 )
+from ddqn_planner.model.shared_background import network_of, q_of_cells, windows_of
 
 Array: TypeAlias = NDArray[np.float32]
 
@@ -115,39 +116,15 @@ class PaperQNetwork(QNetwork):
 
     def q_values(self, grid: GridMap, goal: Cell, move_rule: MoveRule) -> Array:
         """Evaluate a robot in each cell: Q(s, a) toward one goal, (8, H, W), whatever the rule."""
-        # The robot changes at most 2 x 2 outputs of the convolution. These alone are evaluated
-        # again for each cell, one row of the map at once, and all else once for the map.
         # In double precision: differences of large sums stay exact enough, and do not overflow.
-        tensors = {name: tensor.astype(np.float64) for name, tensor in self.tensors.items()}
-        first, *last = ["hidden", "fully_connected"][not self.sizes["hidden_units"] :]
-        kernel_33F = np.moveaxis(tensors["convolution.weight"][:, 0], 0, 2)
-        background = observation_background(grid.occupancy, goal).reshape(grid.occupancy.shape)
-        windows = np.lib.stride_tricks.sliding_window_view(np.pad(background, 1), (3, 3))[::2, ::2]
-        input_RLF = np.tensordot(windows, kernel_33F, 2) + tensors["convolution.bias"]
-        feature_RLF = np.maximum(input_RLF, 0)
-        rows, columns, filters = feature_RLF.shape
-        weight_UFRL = tensors[f"{first}.weight"].reshape(-1, filters, rows, columns)
-        weight_RLFU = np.ascontiguousarray(weight_UFRL.transpose(2, 3, 1, 0))
-        without_robot_U = np.tensordot(feature_RLF, weight_RLFU, 3) + tensors[f"{first}.bias"]
-        height, width = grid.occupancy.shape
-        q = np.empty((len(MOVES), height, width), dtype=np.float32)
-        for y in range(height):
-            output_WU = np.tile(without_robot_U, (width, 1))
-            for row in {y // 2, (y + 1) // 2} - {rows}:
-                for shift in (0, 1):  # to the outputs at x // 2, and of odd x at (x + 1) // 2
-                    x = np.arange(shift, width - shift, 1 + shift)
-                    at = row, (x + shift) // 2
-                    kernel_XF = kernel_33F[y + 1 - 2 * row, x + 1 - 2 * at[1]]
-                    robot_X1 = (ROBOT - background[y, x])[:, None]
-                    change_XF = np.maximum(input_RLF[at] + robot_X1 * kernel_XF, 0)
-                    change_XF -= feature_RLF[at]
-                    output_WU[x] += (change_XF[:, None] @ weight_RLFU[at])[:, 0]
-            for name in last:
-                output_WU = np.maximum(output_WU, 0) @ tensors[f"{name}.weight"].T
-                output_WU += tensors[f"{name}.bias"]
-            with np.errstate(over="ignore"):
-                q[:, y] = output_WU.T
-        return q
+        arrays = [self.tensors[name].astype(np.float64) for name in self.shapes(self.sizes)]
+        arrays[2] = np.asfortranarray(arrays[2])
+        background = observation_background(grid.occupancy, goal).astype(np.float64)
+        windows = windows_of(background[None], grid.occupancy.shape, ROBOT)
+        q = np.empty((len(MOVES), grid.occupancy.size))
+        q_of_cells(network_of(arrays, len(windows.common)), windows, 0, q)
+        with np.errstate(over="ignore"):
+            return q.reshape(-1, *grid.occupancy.shape).astype(np.float32)
 
 
 class PropagationQNetwork(QNetwork):

@@ -10,6 +10,7 @@ import numpy as np
 from geometry_msgs.msg import Point
 from nav_msgs.msg import OccupancyGrid
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
+from rclpy.event_handler import PublisherEventCallbacks
 from rclpy.exceptions import InvalidHandle
 from rclpy.node import Node
 from rclpy.publisher import Publisher
@@ -19,10 +20,9 @@ from visualization_msgs.msg import Marker, MarkerArray
 from ddqn_planner.grid import MOVES, Cell, GridMap, MoveRule
 from ddqn_planner.nodes.conversions import value_message
 from ddqn_planner.nodes.report import Outcome
-from ddqn_planner.nodes.runtime import LATCHED, STEADY, Worker
+from ddqn_planner.nodes.runtime import LATCHED, Worker
 from ddqn_planner.planning import Planner, QField
 
-LOOK_PERIOD = 0.1  # seconds between two looks: no answer waits for what only shows it
 MAX_ARROWS = 10_000  # more take longer to make than a plan, and are too small to see
 LINE_WIDTH = 0.06  # in cells; larger arrows have wider lines
 HEIGHT = 0.01  # metres above the map, so that the map does not hide the arrows
@@ -70,11 +70,14 @@ class FieldDisplay:
         self._worker = Worker(node)
         self._shown: Shown | None = None
         self._shows_again = False
-        value = node.create_publisher(OccupancyGrid, "~/value", LATCHED)
-        policy = node.create_publisher(MarkerArray, "~/policy", LATCHED)
-        self._layers = Layer("value", value, value_message), Layer("policy", policy, policy_message)
         group = MutuallyExclusiveCallbackGroup()
-        node.create_timer(LOOK_PERIOD, self._on_look, group, clock=STEADY)
+        self._look = node.create_guard_condition(self._on_look, group)
+        matched = PublisherEventCallbacks(matched=lambda _: self._look.trigger())
+        value, policy = (
+            node.create_publisher(kind, topic, LATCHED, event_callbacks=matched)
+            for kind, topic in ((OccupancyGrid, "~/value"), (MarkerArray, "~/policy"))
+        )
+        self._layers = Layer("value", value, value_message), Layer("policy", policy, policy_message)
 
     def show_again(self) -> None:
         """Publish the next field even if it is shown already."""
@@ -94,6 +97,7 @@ class FieldDisplay:
             self._shown, self._shows_again = shown, False
             for layer in self._layers:
                 layer.is_due = True
+            self._look.trigger()
 
     async def _on_look(self) -> None:
         for layer in self._layers:

@@ -19,8 +19,9 @@ from std_msgs.msg import Header, String
 
 from ddqn_planner.experience import Experience
 from ddqn_planner.grid import GridMap
+from ddqn_planner.grid.copies import WHOLE
 from ddqn_planner.nodes.conversions import path_message, serialized_path
-from ddqn_planner.nodes.display import LOOK_PERIOD, FieldDisplay
+from ddqn_planner.nodes.display import FieldDisplay
 from ddqn_planner.nodes.lifecycle import ManagedNode
 from ddqn_planner.nodes.map_source import MapSource
 from ddqn_planner.nodes.nav2 import GivenUp, serve_nav2
@@ -30,6 +31,8 @@ from ddqn_planner.nodes.report import NO_REQUEST, NOT_ACTIVE, Outcome, Report, R
 from ddqn_planner.nodes.requests import UNCHANGED, ActiveGoal, ModelSource, PathUnderWay, Requests
 from ddqn_planner.nodes.runtime import LATCHED, STEADY, Worker, spin_until_shutdown, unless
 
+LOOK_PERIOD, IDLE_PERIOD = 0.1, 1.0  # seconds until the next look: after a change, and else
+NO_MAP = GridMap(np.zeros((1, 1), dtype=np.bool_))
 CHANGED_SHARE = 0.02  # of cells: with more, experience is spread anew over the map, slowly
 
 
@@ -41,7 +44,9 @@ class PlannerNode(ManagedNode):
     def __init__(self) -> None:
         super().__init__("planner", PLANNER_PARAMETERS)
         self._settings = self.settings()
-        self._report = Report(self)
+        self._looks = self.create_timer(LOOK_PERIOD, self._on_look, clock=STEADY)
+        self._is_look_near = True
+        self._report = Report(self, self._look_soon)
         self._worker, self._map_worker = Worker(self), Worker(self)
         self._model = ModelSource(self, self._report, self._worker)
         if self._settings.autostart:
@@ -49,7 +54,6 @@ class PlannerNode(ManagedNode):
             self._model.load()
         self._answering = 0
         self._forget()
-        self.create_timer(LOOK_PERIOD, self._on_look, clock=STEADY)
         self.add_post_set_parameters_callback(self._apply_parameters)
         if self._settings.autostart:
             self.start()
@@ -79,7 +83,7 @@ class PlannerNode(ManagedNode):
         )
         self._times = ExpectedTimes(self._report, self._map_worker, self._replan.trigger)
         inputs = self._map, self._times.on, self._start, self._frames, self._model
-        self._requests = Requests(self._settings, *inputs, self._worker)
+        self._requests = Requests(self._settings, *inputs, self._worker, self._look_soon)
         self.create_subscription(PoseStamped, "goal_pose", lambda goal: self._on_goals([goal]), 10)
         self.create_subscription(PoseArray, "goal_poses", self._on_goal_poses, 10)
         if self._settings.follow_trainer:
@@ -257,7 +261,17 @@ class PlannerNode(ManagedNode):
 
     # Diagnostics
 
+    def _look_soon(self) -> None:
+        """Look at what changed, or may have come, in `LOOK_PERIOD`."""
+        if not self._is_look_near:
+            self._is_look_near, self._looks.timer_period_ns = True, 1e9 * LOOK_PERIOD
+            self._looks.reset()
+
     def _on_look(self) -> None:
+        self._is_look_near, self._looks.timer_period_ns = False, 1e9 * IDLE_PERIOD
+        self._looks.reset()
+        if self._waits_for_pose or (self._active.poses and self._settings.replan_period < 1):
+            self._look_soon()
         self._report.log_paths()
         if self._is_configured:
             self._look_for_news()
@@ -292,6 +306,8 @@ class ExpectedTimes:
         self._report, self._worker, self._on_change = report, worker, on_change
         self._experience: Experience | None = None
         self._spread_on: GridMap | None = None
+        self._applied = (NO_MAP, NO_MAP)  # the last map, without times and with them
+        # What the worker was asked last, and its answers.
         self._grid: GridMap | None = None
         self._timed = Future()  # of the last grid, as the forecast is of the last outcome
         self._outcome, self._forecast = NO_REQUEST, Future()
@@ -336,8 +352,15 @@ class ExpectedTimes:
             return grid
         if self._spread_on is None or not _is_like(grid, self._spread_on):
             self._spread_on = grid
-        timed = self._experience.apply(self._spread_on)
-        return grid.with_layers(slowness=timed.slowness, seconds_per_cell=timed.seconds_per_cell)
+        of_places, (before, timed) = self._experience.apply(self._spread_on), self._applied
+        boxes = grid.patches_since(before)
+        if boxes is None or timed.slowness is not of_places.slowness:
+            seconds = of_places.seconds_per_cell
+            timed = grid.with_layers(slowness=of_places.slowness, seconds_per_cell=seconds)
+        else:
+            timed = timed.with_boxes_of(grid, boxes)
+        self._applied = grid, timed
+        return timed
 
     def describe(self, outcome: Outcome) -> dict[str, str]:
         """Return how long a plan takes, unless its map is old or untimed, or no memory is left."""
@@ -354,7 +377,12 @@ class ExpectedTimes:
 
 def _is_like(grid: GridMap, other: GridMap) -> bool:
     mine, its = ((each.occupancy.shape, each.resolution, each.origin) for each in (grid, other))
-    return mine == its and bool(np.mean(grid.occupancy != other.occupancy) <= CHANGED_SHARE)
+    if mine != its:
+        return False
+    boxes = grid.patches_since(other)
+    boxes = [WHOLE] if boxes is None else boxes
+    changed = sum(np.count_nonzero(grid.occupancy[box] != other.occupancy[box]) for box in boxes)
+    return bool(changed <= CHANGED_SHARE * grid.occupancy.size)
 
 
 def _path(make: Callable[..., Any], outcome: Outcome, header: Header) -> Any:

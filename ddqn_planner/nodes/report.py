@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 
@@ -141,9 +141,9 @@ class Refusals:
 class Report(Refusals):
     """Logs what the planner node does, and publishes the last outcome with what was refused."""
 
-    def __init__(self, node: BaseNode) -> None:
+    def __init__(self, node: BaseNode, on_change: Callable[[], None] = lambda: None) -> None:
         super().__init__(node)
-        self.outcome = NO_REQUEST
+        self.outcome, self._on_change = NO_REQUEST, on_change
         self._publisher = node.create_publisher(DiagnosticArray, "/diagnostics", 10)
         self._to_be_logged: list[str] = []
         self.due = 0.0  # when to publish: something changed, or `PERIOD` has passed
@@ -151,6 +151,7 @@ class Report(Refusals):
     def change(self) -> None:
         """Publish soon: something about the node changed."""
         self.due = 0.0
+        self._on_change()
 
     def note(self, outcome: Outcome) -> None:
         """Keep the last outcome for the diagnostics."""

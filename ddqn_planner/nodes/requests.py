@@ -212,6 +212,7 @@ class Requests:
     frames: Frames
     model: ModelSource
     worker: Worker
+    look_soon: Callable[[], None]
     next_look: Future = field(default_factory=Future)
 
     def look_again(self) -> None:
@@ -323,6 +324,7 @@ class Requests:
             except RequestError as error:
                 if not error.may_come and time.monotonic() >= deadline:
                     raise
+            self.look_soon()
             await self.next_look
 
 

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from ddqn_planner.grid import MOVES, Cell, GridMap, MoveRule
 from ddqn_planner.grid.arguments import cell_inside, numbers
+from ddqn_planner.grid.grid_map import LAYERS
 from ddqn_planner.model import PropagationQNetwork, QNetwork
 from ddqn_planner.model.move_costs import MoveCosts
 from ddqn_planner.planning import kernels
@@ -26,7 +27,6 @@ REPAIRED = 100  # cells that a repair may take back before a new field is begun
 VISITS = 8
 REPAIRED_SHARE = 0.02  # of the map's cells that a repair may take back
 CHANGED_SHARE = 0.02  # of the map's cells may have changed: with more, a new field is cheaper
-LAYERS = "occupancy", "cost", "forbidden", "slowness"  # of a map: what its moves depend on
 SAME_PLACE = 0.01  # cells that a shift may be off whole ones: messages' resolution is float32
 
 
@@ -305,23 +305,24 @@ def _overlap(old: GridMap, new: GridMap, shift: Cell) -> tuple[Box, Box]:
 
 def changed_cells(old: GridMap, new: GridMap, shift: Cell) -> NDArray[np.int32] | None:
     """Return the cells whose moves may differ, as numbers of the padded new map; None for many."""
-    before, (rows, columns) = _overlap(old, new, shift)
-    padded = np.zeros((new.height + 2, new.width + 2), dtype=np.bool_)
-    with_ring = padded[rows.start : rows.stop + 2, columns.start : columns.stop + 2]
-    differs = with_ring[1:-1, 1:-1]
-    for layer in LAYERS:
-        one, other = getattr(old, layer), getattr(new, layer)
-        if one is not None and (one is not other or shift != (0, 0)):
-            differs |= one[before] != other[rows, columns]
-    if np.count_nonzero(padded) > CHANGED_SHARE * differs.size:
+    width, patches = new.width + 2, new.patches_since(old)
+    boxes = [_overlap(old, new, shift)] if patches is None else [(box, box) for box in patches]
+    found = [np.empty(0, np.int64)]
+    for before, (rows, columns) in boxes:
+        y, x = np.nonzero(new.differs(old, (rows, columns), before))
+        found.append((y + rows.start + 1) * width + x + columns.start + 1)
+    if sum(map(len, found)) > CHANGED_SHARE * new.occupancy.size:
         return None
     if shift != (0, 0) or old.occupancy.shape != new.occupancy.shape:
         # What lay beyond the border of one map is inside the other.
-        with_ring[[0, -1]] = with_ring[:, [0, -1]] = True
-    width = new.width + 2
+        _, (rows, columns) = boxes[0]
+        y, x = np.arange(rows.start, rows.stop + 2), np.arange(columns.start, columns.stop + 2)
+        found += [x + width * row for row in (rows.start, rows.stop + 1)]
+        found += [width * y + column for column in (columns.start, columns.stop + 1)]
     around = (np.arange(-1, 2)[:, None] * width + np.arange(-1, 2)).ravel()
-    numbers = np.unique(np.flatnonzero(padded)[:, None] + around)
-    return numbers[(numbers > width) & (numbers < padded.size - width - 1)].astype(np.int32)
+    numbers = np.unique(np.concatenate(found)[:, None] + around)
+    last = (new.height + 1) * width - 1
+    return numbers[(numbers > width) & (numbers < last)].astype(np.int32)
 
 
 def _moved(known: Known, old: GridMap, new: GridMap, shift: Cell) -> tuple[NDArray[Any], ...]:

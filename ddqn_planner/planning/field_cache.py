@@ -68,8 +68,11 @@ class FieldCache:
 
     def _known_map(self, grid: GridMap, rule: MoveRule) -> _KnownMap | None:
         """Return what is known of an equal map."""
-        for known in reversed(self._maps):
-            if known.move_rule is rule and known.grid.same_cells(grid):
+        maps = [known for known in reversed(self._maps) if known.move_rule is rule]
+        # To compare a map with those that it is a patch of is quick, and enough.
+        earlier = [known for known in maps if grid.patches_since(known.grid) is not None]
+        for known in earlier or maps:
+            if grid.same_cells(known.grid):
                 known.grid = grid  # which may lie elsewhere
                 return known
         return None
@@ -80,13 +83,23 @@ class FieldCache:
             known = self._known_map(grid, rule)
         if known is not None:
             return known
-        new = _KnownMap(grid, rule, self.network.move_costs(grid, rule))
+        new = _KnownMap(grid, rule, self._costs(grid, rule))
         with self._lock:
             known = self._known_map(grid, rule)  # another thread may have been faster
             if known is None:
                 # A map on which no goal got a field is not kept.
                 self._maps = [*(other for other in self._maps if other.fields), new]
         return known or new
+
+    def _costs(self, grid: GridMap, rule: MoveRule) -> MoveCosts | None:
+        """Return the costs of a map's moves, from those of the map that it is a patch of."""
+        for known in reversed(self._maps):
+            boxes = grid.patches_since(known.grid)
+            if boxes is not None and known.move_rule is rule and known.costs is not None:
+                after = known.costs.after(grid, boxes)
+                if after is not None:
+                    return after
+        return self.network.move_costs(grid, rule)
 
     def _repair(self, known: _KnownMap, new: DistanceField, start: Cell | None) -> None:
         """Give a new field what a field of an older map knows, if there is one."""

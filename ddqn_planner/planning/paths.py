@@ -10,15 +10,13 @@ from numpy.typing import NDArray
 
 from ddqn_planner.compiled import compiled
 from ddqn_planner.grid import MOVES, Cell, GridMap, MoveRule, legal_moves, path_cost, path_length
-from ddqn_planner.grid.arguments import Cells, Occupancy, cells_inside
-from ddqn_planner.grid.grid_map import check_grid
-from ddqn_planner.grid.moves import segment_lengths
+from ddqn_planner.grid.arguments import Cells, Occupancy
 from ddqn_planner.planning.field import Goals
 from ddqn_planner.planning.plan import ROUNDING, PlanRequest
+from ddqn_planner.planning.segments import SAME_COST, segment_cost
 
 Path: TypeAlias = NDArray[np.int32]  # (N, 2): the cells of a path
 REACH = 5  # cells along an axis that a robot may be beside its path, and still come back to it
-SAME_COST = 1 + 1e-9  # a path may cost so much more, and still as much: sums are rounded
 # Of ways out of one length, the one that ends nearer to the goal: so little its distance counts.
 NEARER_TO_GOAL = 1e-9
 
@@ -161,8 +159,7 @@ def legal_segments(path: Cells, grid: GridMap, move_rule: MoveRule | str) -> NDA
         actions = np.rint(np.arctan2(dy, dx) / (np.pi / 4)).astype(np.int64) % len(MOVES)
         legal[moves] = (grid.forbidden[y, x] >> actions & 1) == 0
     for index in np.flatnonzero(legal & (sides.max(axis=1) > 1)).tolist():
-        first, last = cells[index : index + 2].tolist()
-        legal[index] = is_legal_segment(first, last, grid, rule)
+        legal[index] = segment_cost(cells[index], cells[index + 1], grid, rule) < np.inf
     return legal
 
 
@@ -212,7 +209,7 @@ def keep_or_switch(request: PlanRequest, new: Path) -> tuple[Path, float | None]
     if np.array_equal(rest, new):
         return new, 0.0
     if grid.has_costs:
-        cost, new_cost = (path_cost(path, grid.cost_multiplier, rule) for path in (rest, new))
+        cost, new_cost = (path_cost(path, grid.multipliers(path), rule) for path in (rest, new))
     else:  # multipliers that are all 1 would take memory
         cost, new_cost = path_length(rest, rule), path_length(new, rule)
     if cost > (1 + request.switch_threshold) * new_cost * SAME_COST:
@@ -229,100 +226,3 @@ def _legal_from(cells: Path, grid: GridMap, move_rule: MoveRule | str) -> int:
 
 def _array(path: Cells) -> Path:
     return np.asarray(path, dtype=np.int32).reshape(-1, 2)
-
-
-# Simplification
-
-
-def simplify(cells: Cells, grid: GridMap, move_rule: MoveRule | str) -> tuple[Cell, ...]:
-    """Return some of a path's cells, the first and the last included, joined by legal segments.
-
-    A segment is legal if all cells that it passes through are free; under `MoveRule.ROBOT_SAFE`
-    also those that it touches at a corner. None of them except the last may forbid one of the two
-    actions between whose directions it lies. It must not cost more than what it replaces, so that
-    the path keeps away from cells of high cost.
-
-    Parameters
-    ----------
-    cells : sequence of (x, y)
-        Each cell is a neighbour of the one before it.
-    grid : GridMap
-    move_rule : MoveRule
-
-    Raises
-    ------
-    ValueError
-        If a cell is no cell of the map, or there is no such move rule.
-    """
-    check_grid(grid)
-    rule, multiplier = MoveRule(move_rule), grid.cost_multiplier
-    path = [(x, y) for x, y in cells_inside(cells, grid.occupancy.shape).tolist()]
-
-    def joins(first: int, last: int) -> bool:
-        if last - first == 1:  # a move of the path itself
-            return True
-        if not is_legal_segment(path[first], path[last], grid, rule):
-            return False
-        cost = segment_cost(path[first], path[last], multiplier, rule)
-        return cost <= SAME_COST * path_cost(path[first : last + 1], multiplier, rule)
-
-    # The length of each segment is found by doubling and halving.
-    kept, last = [0] if path else [], len(path) - 1
-    while kept and kept[-1] < last:
-        first, step, reached = kept[-1], 1, kept[-1] + 1
-        while reached < last and joins(first, min(reached + step, last)):
-            reached, step = min(reached + step, last), 2 * step
-        while step > 1:
-            step //= 2
-            if reached + step <= last and joins(first, reached + step):
-                reached += step
-        kept.append(reached)
-    return tuple(path[index] for index in kept)
-
-
-def touched_cells(first: Cell, last: Cell, move_rule: MoveRule | str) -> NDArray[np.int64]:
-    """Return the cells that a segment passes, or touches at corners that count: (N, 2) int64."""
-    passed, _ = _passed_cells(first, last)
-    if MoveRule(move_rule).cuts_corners:
-        return passed
-    # Between two cells that share only a corner, two more are touched; else the same two again.
-    (x, y), (next_x, next_y) = passed[:-1].T, passed[1:].T
-    return np.concatenate([passed, np.stack([x, next_y], 1), np.stack([next_x, y], 1)])
-
-
-def is_legal_segment(first: Cell, last: Cell, grid: GridMap, move_rule: MoveRule | str) -> bool:
-    """Return whether a segment between two cells of a map is legal, see `simplify`."""
-    x, y = touched_cells(first, last, move_rule).T
-    is_free = not grid.occupancy[y, x].any()
-    if grid.forbidden is None or not is_free:
-        return is_free
-    vector = np.subtract(last, first)
-    diagonal = np.sign(vector)  # as many such moves as it has room for, and straight ones
-    straight = np.where(np.abs(vector) == np.abs(vector).max(), diagonal, 0)
-    takes = (diagonal == MOVES).all(axis=1) | (straight == MOVES).all(axis=1)
-    x, y = _passed_cells(first, last)[0][:-1].T
-    return not (grid.forbidden[y, x] & np.packbits(takes, bitorder="little")).any()
-
-
-def segment_cost(
-    first: Cell, last: Cell, multiplier: NDArray[np.float32], move_rule: MoveRule | str
-) -> float:
-    """Return a segment's cost: each cell's multiplier counts by the share of the segment in it."""
-    passed, share = _passed_cells(first, last)
-    vector = np.subtract(last, first)
-    length = segment_lengths(vector[:1], vector[1:], move_rule).item()
-    return length * float(share @ multiplier[passed[:, 1], passed[:, 0]].astype(np.float64))
-
-
-def _passed_cells(first: Cell, last: Cell) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Return the cells of a segment in order, (N, 2), and the share within each, (N,) float64."""
-    vector = np.subtract(last, first)
-    width, height = np.maximum(np.abs(vector), 1).tolist()
-    # Positions on the segment count from 0 at its first point to `unit` at its last one: then all
-    # crossings of edges of cells are whole numbers.
-    unit = 2 * width * height
-    columns, rows = (np.arange(1, 2 * abs(side), 2) for side in vector.tolist())
-    crossings = np.unique(np.concatenate([[0, unit], height * columns, width * rows]))
-    middle = crossings[:-1] + crossings[1:]  # twice the middle of each part
-    cells = np.asarray(first) + (middle[:, None] * vector + unit) // (2 * unit)
-    return cells, np.diff(crossings) / unit

@@ -18,8 +18,9 @@ from ddqn_planner.grid.grid_map import check_grid
 from ddqn_planner.model import ModelMetadata, QNetwork, load_model
 from ddqn_planner.planning.field import DistanceField, Goals, QField
 from ddqn_planner.planning.field_cache import FieldCache
-from ddqn_planner.planning.paths import find_way_out, keep_or_switch, search, simplify, way_and_ends
+from ddqn_planner.planning.paths import find_way_out, keep_or_switch, search, way_and_ends
 from ddqn_planner.planning.plan import Plan, PlanMethod, PlanRequest, PlanStatus, joined
+from ddqn_planner.planning.segments import simplify
 
 T = TypeVar("T")
 
@@ -313,7 +314,7 @@ def _roll_out(request: PlanRequest, found: _Found) -> Generator[None, None, Call
             if not np.array_equal(path, np.asarray(request.under_way)[-len(path) :]):
                 extra_cost = None  # only from the first free cell on it is the one kept
         if grid.has_costs:
-            cost = path_cost(path, grid.cost_multiplier, rule) * (grid.seconds_per_cell or 1.0)
+            cost = path_cost(path, grid.multipliers(path), rule) * (grid.seconds_per_cell or 1.0)
     every_cell = path
     if request.simplified:
         path = np.array(simplify(path, grid, rule), dtype=np.int32)

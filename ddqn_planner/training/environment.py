@@ -76,8 +76,8 @@ class GridVectorEnvironment:
         self.legal = np.stack(legal).reshape(tables)
         self.free_reward = np.stack(reward).reshape(tables)
         collision = np.float32(parameters.obstacle_reward)
-        self._reward = np.where(self.legal, self.free_reward, collision)
-        self._offset = MOVES @ to_number
+        self.rewards = np.where(self.legal, self.free_reward, collision)
+        self.offset = MOVES @ to_number
         self.start = np.array([s.start for s in scenarios]) @ to_number
         self.goal = np.array([s.goal for s in scenarios]) @ to_number
 
@@ -106,8 +106,8 @@ class GridVectorEnvironment:
     ) -> tuple[NDArray[np.float32], NDArray[np.bool_], NDArray[np.bool_]]:
         """Move each robot once, (N,) actions; return reward, terminated, truncated: (N,) each."""
         lookup = (self.scenario, actions, self.cell)
-        legal, reward = self.legal[lookup], self._reward[lookup]
-        self.cell = np.where(legal, self.cell + self._offset[actions], self.cell)
+        legal, reward = self.legal[lookup], self.rewards[lookup]
+        self.cell = np.where(legal, self.cell + self.offset[actions], self.cell)
         self.steps += 1
         terminated = ~legal | (self.cell == self.goal[self.scenario])
         truncated = ~terminated & (self.steps >= self.parameters.max_episode_steps)

@@ -24,11 +24,15 @@ def length_ratios(field: QField, grid: GridMap, move_rule: MoveRule) -> NDArray[
     """Return the cost of the greedy rollout from each cell over that of the best path: (H, W)."""
     # Infinite where the rollout is trapped, NaN at the goal and in cells without a path.
     optimum = shortest_distances(grid, field.goal, move_rule)
-    ratios, multiplier = np.full(optimum.shape, np.nan), grid.cost_multiplier
+    ratios = np.full(optimum.shape, np.nan)
     for x, y in grid.free_cells():
         if np.isfinite(optimum[y, x]) and (x, y) != field.goal:
             plan = field.rollout((x, y))
-            cost = path_cost(plan.cells, multiplier, move_rule) if plan.cells else np.inf
+            cost = (
+                path_cost(plan.cells, grid.multipliers(plan.cells), move_rule)
+                if plan.cells
+                else np.inf
+            )
             ratios[y, x] = cost / optimum[y, x]
     return ratios
 

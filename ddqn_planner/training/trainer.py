@@ -25,7 +25,8 @@ from ddqn_planner.training.double_dqn import ReplayBuffer, Transitions, double_d
 from ddqn_planner.training.environment import GridVectorEnvironment, Scenario
 from ddqn_planner.training.episodes import Episode, EpisodeEnd
 from ddqn_planner.training.hyper_parameters import HyperParameters
-from ddqn_planner.training.networks import MODULES
+from ddqn_planner.training.networks import MODULES, PaperModule
+from ddqn_planner.training.shared_background import player
 
 CHECKPOINT_KEY, DIGEST_KEY = "ddqn_planner_checkpoint", "sha256"
 FUSED = tuple(map(int, torch.__version__.split(".")[:2])) >= (2, 4)  # Adam, on the CPU too
@@ -72,6 +73,12 @@ class Trainer:
         self.environment.reset()
         self._visited: list[list[int]] = [[int(cell)] for cell in self.environment.cell]
         self._total_reward = np.zeros(parameters.environments)
+        self._player: Any = None  # without it the paper's network is trained by torch, as others
+        if isinstance(self.network, PaperModule) and isinstance(self._target, PaperModule):
+            networks = self.network, self._target, self._optimiser.state
+            self._player = player(
+                *networks, self.environment, self._replay, self._total_reward, parameters
+            )
 
     @property
     def epsilon(self) -> float:
@@ -81,24 +88,37 @@ class Trainer:
         return p.epsilon_start + fraction * (p.epsilon_end - p.epsilon_start)
 
     def run(self, until: int) -> Iterator[list[Episode]]:
-        """Train until step `until`; yield after each step the episodes that ended with it."""
-        p = self.parameters
+        """Train until step `until`; yield, often, the episodes that ended since."""
         while self.steps < until:
-            scenario, cell = self.environment.scenario.copy(), self.environment.cell
-            actions = self._choose_actions()
-            reward, terminated, truncated = self.environment.move(actions)
-            next_cell = self.environment.cell
-            discount = np.where(terminated, 0.0, p.gamma).astype(np.float32)
-            self._replay.add(Transitions(scenario, cell, actions, reward, next_cell, discount))
-            before, self.steps = self.steps, self.steps + p.environments
-            if self.steps > p.learning_starts:
-                for _ in range(self.steps // p.update_interval - before // p.update_interval):
-                    self._update()
-            self._total_reward += reward
-            for visited, entered in zip(self._visited, next_cell.tolist(), strict=True):
-                visited.append(entered)
+            cells, terminated, truncated = self._play(until) if self._player else self._step()
+            for visited, entered in zip(self._visited, cells.T.tolist(), strict=True):
+                visited += entered
             ended = terminated | truncated
             yield self._end_episodes(ended, terminated) if ended.any() else []
+
+    def _play(self, until: int) -> tuple[NDArray[np.int64], NDArray[np.bool_], NDArray[np.bool_]]:
+        """Make some steps in compiled code; return what `_step` returns."""
+        robots, play = self._player
+        counters = np.array([self.steps, self.updates, self._replay.added])
+        made = play(self._exploration, self._sampling, counters, until)
+        self.steps, self.updates, self._replay.added = counters.tolist()
+        return robots.trail[:made], robots.terminated, robots.truncated
+
+    def _step(self) -> tuple[NDArray[np.int64], NDArray[np.bool_], NDArray[np.bool_]]:
+        """Make a step, with torch; return the entered cells (1, N), and which episodes ended."""
+        p = self.parameters
+        scenario, cell = self.environment.scenario.copy(), self.environment.cell
+        actions = self._choose_actions()
+        reward, terminated, truncated = self.environment.move(actions)
+        next_cell = self.environment.cell
+        discount = np.where(terminated, 0.0, p.gamma).astype(np.float32)
+        self._replay.add(Transitions(scenario, cell, actions, reward, next_cell, discount))
+        before, self.steps = self.steps, self.steps + p.environments
+        if self.steps > p.learning_starts:
+            for _ in range(self.steps // p.update_interval - before // p.update_interval):
+                self._update()
+        self._total_reward += reward
+        return next_cell[None], terminated, truncated
 
     def _choose_actions(self) -> NDArray[np.int64]:
         """Draw ε-greedy actions, independently for each environment."""
@@ -181,7 +201,8 @@ class Trainer:
             "walked": self._visited,
             "generators": [generator.bit_generator.state for generator in self._generators],
         }
-        text, tensors = json.dumps(description), self._tensors()
+        tensors = {name: tensor.contiguous() for name, tensor in self._tensors().items()}
+        text = json.dumps(description)
         metadata = {CHECKPOINT_KEY: text, DIGEST_KEY: _digest(text, tensors)}
         write_atomically(Path(path), safetensors.torch.save(tensors, metadata))
 
@@ -240,6 +261,7 @@ class Trainer:
         }
         for index, weight in enumerate(self._weights if self.updates else ()):
             groups[f"optimiser.{index}"] = self._optimiser.state[weight]
+            self._optimiser.state[weight]["step"].fill_(self.updates)
         tensors = {
             f"{group}.{name}": torch.as_tensor(part)
             for group, parts in groups.items()

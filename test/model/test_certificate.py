@@ -180,7 +180,7 @@ def test_no_path_costs_more_than_certified(
         plan = field.rollout(start)
         assert bool(plan.cells) == math.isfinite(optimum[start[1], start[0]])
         if plan.cells:
-            cost = path_cost(plan.cells, grid.cost_multiplier, rule)
+            cost = path_cost(plan.cells, grid.multipliers(plan.cells), rule)
             bound = (1 + certificate.path_error) * optimum[start[1], start[0]]
             assert cost <= bound * (1 + 1e-6)
 

@@ -1,14 +1,14 @@
-"""Parts of paths: segments, what is left of a path, and what is kept of it."""
+"""Parts of paths: what is left of a path, and what is kept of it."""
 
 from __future__ import annotations
 
 import math
-from fractions import Fraction
 from itertools import pairwise
 from typing import Any
 
 import numpy as np
 import pytest
+from exact_segments import is_legal
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as numpy_st
@@ -20,7 +20,6 @@ from ddqn_planner.grid import (
     Cell,
     legal_moves,
     path_cost,
-    path_length,
     shortest_distances,
     shortest_path,
 )
@@ -32,27 +31,7 @@ from ddqn_planner.planning.paths import (
     legal_segments,
     rest_of_path,
     search,
-    segment_cost,
-    touched_cells,
 )
-
-CELLS = st.tuples(st.integers(-12, 12), st.integers(-12, 12))
-
-
-def is_legal(first: Cell, last: Cell, grid: GridMap, rule: MoveRule) -> bool:
-    """Say whether a segment is legal, from the whole map's moves or from all cells it touches."""
-    if not (grid.is_free(first) and grid.is_free(last)):
-        return False
-    step = [last[0] - first[0], last[1] - first[1]]
-    if step in MOVES.tolist():
-        return bool(grid.legal_moves(rule)[MOVES.tolist().index(step), first[1], first[0]])
-    if not all(grid.is_free(cell) for cell in touched_cells(first, last, rule).tolist()):
-        return False
-    angle = np.arctan2(step[1], step[0]) / (np.pi / 4)
-    actions = {int(np.floor(angle + 1e-9)) % 8, int(np.ceil(angle - 1e-9)) % 8}
-    passed = {(x, y) for x, y in touched_cells(first, last, MoveRule.UNIT).tolist()} - {last}
-    forbidden = np.zeros(grid.occupancy.shape, int) if grid.forbidden is None else grid.forbidden
-    return not any(forbidden[y, x] >> action & 1 for x, y in passed for action in actions)
 
 
 @st.composite
@@ -68,111 +47,6 @@ def changed(draw: st.DrawFn, grid: GridMap) -> GridMap:
     if forbidden is not None and draw(st.booleans()):
         forbidden = np.roll(forbidden, 1, axis=0)
     return GridMap(occupancy, cost=cost, forbidden=forbidden)
-
-
-# Segments
-
-
-@given(CELLS, CELLS, RULES)
-def test_a_segment_touches_the_cells_that_its_points_lie_in(
-    first: Cell, last: Cell, rule: MoveRule
-) -> None:
-    touched = {(x, y) for x, y in touched_cells(first, last, rule).tolist()}
-    passed = set()
-    for part in np.linspace(0, 1, 4001):
-        x, y = (a + part * (b - a) for a, b in zip(first, last, strict=True))
-        if min(abs(x % 1 - 0.5), abs(y % 1 - 0.5)) > 1e-9:  # not on an edge
-            passed.add((round(x), round(y)))
-    assert passed <= touched
-    # None is farther off than its own half diagonal, or with corners that are touched, on it.
-    length = max(math.dist(first, last), 1e-9)
-    for x, y in touched - passed:
-        cross = (x - first[0]) * (last[1] - first[1]) - (y - first[1]) * (last[0] - first[0])
-        corner = (abs(last[0] - first[0]) + abs(last[1] - first[1])) / 2 / length
-        assert abs(cross) / length <= corner + 1e-9
-
-
-def test_corners_count_where_they_may_not_be_cut() -> None:
-    assert touched_cells((0, 0), (1, 1), MoveRule.CORNER_CUTTING).tolist() == [[0, 0], [1, 1]]
-    assert len(touched_cells((0, 0), (1, 1), MoveRule.ROBOT_SAFE)) == 4
-    assert len(touched_cells((0, 0), (-3, 3), MoveRule.ROBOT_SAFE)) == 10
-
-
-def share_within(cell: Cell, first: Cell, last: Cell) -> Fraction:
-    """Return the share of a segment that lies within a cell, exactly: the cell clips it."""
-    enters, leaves = Fraction(0), Fraction(1)
-    for centre, begin, end in zip(cell, first, last, strict=True):
-        edges = [Fraction(2 * (centre - begin) + side, 2) for side in (-1, 1)]
-        if begin == end:
-            if not edges[0] < 0 < edges[1]:
-                return Fraction(0)
-            continue
-        times = sorted(edge / (end - begin) for edge in edges)
-        enters, leaves = max(enters, times[0]), min(leaves, times[1])
-    return max(leaves - enters, Fraction(0))
-
-
-def exact_cost(first: Cell, last: Cell, multiplier: np.ndarray, rule: MoveRule) -> float:
-    vector = np.subtract(last, first)
-    length = np.abs(vector).max() if rule is MoveRule.UNIT else math.hypot(*vector)
-    columns, rows = (range(min(ends), max(ends) + 1) for ends in zip(first, last, strict=True))
-    cells = [(x, y) for x in columns for y in rows]
-    shares = [share_within(cell, first, last) for cell in cells]
-    assert sum(shares) == 1 or first == last
-    multipliers = [Fraction(float(multiplier[y, x])) for x, y in cells]
-    return float(length * float(sum(a * b for a, b in zip(shares, multipliers, strict=True))))
-
-
-@given(grids_with_costs(), RULES, st.data())
-def test_each_cell_counts_by_the_length_of_the_segment_within_it(
-    grid_and_cell: tuple[GridMap, Cell], rule: MoveRule, data: st.DataObject
-) -> None:
-    grid, first = grid_and_cell
-    last = data.draw(cells_of(grid), label="last")
-    exact = exact_cost(first, last, grid.cost_multiplier, rule)
-    assert segment_cost(first, last, grid.cost_multiplier, rule) == pytest.approx(exact)
-    if max(abs(last[0] - first[0]), abs(last[1] - first[1])) == 1:
-        assert path_cost([first, last], grid.cost_multiplier, rule) == pytest.approx(exact)
-
-
-def check_simplified(path: list[Cell], grid: GridMap, rule: MoveRule) -> tuple[Cell, ...]:
-    """Check that each segment is legal, and costs no more than what it replaces."""
-    simple = simplify(path, grid, rule)
-    assert simple[:1] + simple[-1:] == (*path[:1], *path[-1:])
-    for first, last in pairwise(simple):
-        part = path[path.index(first) : path.index(last) + 1]
-        replaced = sum(exact_cost(a, b, grid.cost_multiplier, rule) for a, b in pairwise(part))
-        assert exact_cost(first, last, grid.cost_multiplier, rule) <= replaced * (1 + 1e-8)
-        assert len(part) == 2 or is_legal(first, last, grid, rule)
-    return simple
-
-
-@settings(max_examples=300)
-@given(GRIDS, RULES, st.data())
-def test_a_simplified_path_is_legal_and_costs_no_more(
-    grid_and_goal: tuple[GridMap, Cell], rule: MoveRule, data: st.DataObject
-) -> None:
-    grid, goal = grid_and_goal
-    path = shortest_path(grid, data.draw(st.sampled_from(grid.free_cells())), goal, rule)
-    simple = check_simplified(path, grid, rule)
-    assert path_length(simple) <= path_length(path) + 1e-9
-    assert path_length(simple, MoveRule.UNIT) <= path_length(path, MoveRule.UNIT)
-
-
-def test_segments_are_as_long_as_can_be() -> None:
-    rule = MoveRule.ROBOT_SAFE
-    for length in range(2, 20):
-        occupancy = np.ones((4, length + 1), dtype=bool)
-        occupancy[0] = occupancy[:, length] = False
-        path = [(x, 0) for x in range(length + 1)] + [(length, y) for y in range(1, 4)]
-        expected = ((0, 0), (length, 0), (length, 3))
-        assert simplify(path, GridMap(occupancy), rule) == expected
-    grid = GridMap(np.zeros((40, 90)))
-    assert simplify(shortest_path(grid, (2, 5), (80, 31), rule), grid, rule) == ((2, 5), (80, 31))
-    assert simplify([], grid, rule) == ()
-    assert simplify([(1, 1)], grid, rule) == ((1, 1),)
-    diagonal = [(x, x) for x in range(9)]
-    assert simplify(diagonal, grid, MoveRule.UNIT) == ((0, 0), (8, 8))
 
 
 # The path under way
@@ -265,7 +139,7 @@ def test_a_robot_beside_its_path_comes_back_to_it_and_a_far_one_has_lost_it() ->
 
 
 def cost_of(path: Any, grid: GridMap, rule: MoveRule) -> float:
-    return path_cost(np.asarray(path), grid.cost_multiplier, rule)
+    return path_cost(path, grid.multipliers(path), rule)
 
 
 @settings(max_examples=300)
@@ -325,7 +199,7 @@ def test_a_search_finds_a_legal_path_wherever_there_is_one_whatever_the_values(
     for known in (None, -distances.astype(np.float32)):  # nothing is known, or all is
         cells = search(start, goal, legal, grid.cost_multiplier, rule, known)
         if cells:
-            assert path_cost(cells, grid.cost_multiplier, rule) == pytest.approx(cheapest)
+            assert path_cost(cells, grid.multipliers(cells), rule) == pytest.approx(cheapest)
 
 
 def test_a_search_follows_the_values_even_on_a_detour() -> None:

@@ -79,7 +79,7 @@ def test_a_plan_of_the_shipped_model_is_a_cheapest_path(
             continue
         assert (plan.cells[0], plan.cells[-1]) == (start, goal)
         check_legal(plan.cells, grid, rule)
-        cost = path_cost(plan.cells, grid.cost_multiplier, rule)
+        cost = path_cost(plan.cells, grid.multipliers(plan.cells), rule)
         assert cost == pytest.approx(exact[start[::-1]], rel=2e-2)
         assert plan.cost in (None, cost)
         assert plan.length == path_length(plan.cells, rule)
@@ -87,7 +87,9 @@ def test_a_plan_of_the_shipped_model_is_a_cheapest_path(
         assert simple.cells == simplified(plan.cells, grid, rule)
         assert simple.cost == plan.cost
         unmasked = planner.q_field(grid, goal, rule).unmasked().rollout(start)
-        assert path_cost(unmasked.cells, grid.cost_multiplier, rule) == pytest.approx(cost)
+        assert path_cost(unmasked.cells, grid.multipliers(unmasked.cells), rule) == pytest.approx(
+            cost
+        )
 
 
 @settings(max_examples=200)

@@ -119,6 +119,36 @@ def test_an_update_of_the_papers_network_is_that_of_the_equations(
     check_update(trainer, loss, list(network.parameters()), tolerance=1e-4)
 
 
+@pytest.mark.parametrize("units", [0, 6])
+@pytest.mark.parametrize("target", ["double_dqn", "dqn", "printed"])
+def test_a_compiled_training_is_that_of_torch(small: Scenario, target: str, units: int) -> None:
+    walls = small.grid.occupancy
+    scenarios = [replace(small, grid=GridMap(other)) for other in (walls, walls[::-1], walls & 0)]
+    parameters = HyperParameters(
+        target=target,
+        filters=4,
+        hidden_units=units,
+        learning_rate=0.001,
+        learning_starts=20,
+        target_interval=10,
+        epsilon_steps=60,
+        environments=3,
+        max_episode_steps=7,
+    )
+    compiled, in_torch = (
+        Trainer(scenarios, MoveRule.ROBOT_SAFE, parameters, seed=2) for _ in range(2)
+    )
+    in_torch._player = None
+    one, other = ([e for ended in t.run(90) for e in ended] for t in (compiled, in_torch))
+    assert one == other
+    assert compiled.updates == in_torch.updates > 60
+    expected = in_torch._tensors()
+    for name, tensor in compiled._tensors().items():
+        # The mean: Adam makes much of the rounding of a gradient that is nearly 0.
+        error = (tensor.double() - expected[name].double()).abs().mean()
+        assert error <= 1e-3 * expected[name].double().abs().mean(), name
+
+
 def test_an_update_of_the_network_for_any_map_counts_each_reward_once(small: Scenario) -> None:
     # Q(s, a) = p (r + γ V(s')) + (1 - p) r_o, r = -length * cost multiplier, V = max Q under θ⁻.
     cost = np.arange(20, dtype=np.int8).reshape(4, 5)

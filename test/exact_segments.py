@@ -1,0 +1,64 @@
+"""Which cells a segment passes, in exact numbers: what is legal, and what it costs."""
+
+from __future__ import annotations
+
+import math
+from fractions import Fraction
+from itertools import pairwise
+
+import numpy as np
+
+from ddqn_planner import GridMap, MoveRule
+from ddqn_planner.grid import MOVES, Cell
+
+
+def shares(first: Cell, last: Cell) -> dict[Cell, Fraction]:
+    """Return the share of a segment that lies within each cell that it passes, in their order."""
+    columns, rows = (range(min(ends), max(ends) + 1) for ends in zip(first, last, strict=True))
+    found = {(x, y): share_within((x, y), first, last) for x in columns for y in rows}
+    passed = sorted((cell for cell in found if found[cell]), key=lambda c: math.dist(c, first))
+    return {cell: found[cell] for cell in passed} if first != last else {first: Fraction(1)}
+
+
+def share_within(cell: Cell, first: Cell, last: Cell) -> Fraction:
+    """Return the share of a segment that lies within a cell: the cell clips it."""
+    enters, leaves = Fraction(0), Fraction(1)
+    for centre, begin, end in zip(cell, first, last, strict=True):
+        edges = [Fraction(2 * (centre - begin) + side, 2) for side in (-1, 1)]
+        if begin == end:
+            if not edges[0] < 0 < edges[1]:
+                return Fraction(0)
+            continue
+        times = sorted(edge / (end - begin) for edge in edges)
+        enters, leaves = max(enters, times[0]), min(leaves, times[1])
+    return max(leaves - enters, Fraction(0))
+
+
+def exact_cost(first: Cell, last: Cell, grid: GridMap, rule: MoveRule) -> float:
+    """Return what a segment costs, legal or not."""
+    vector = np.subtract(last, first)
+    length = np.abs(vector).max() if rule is MoveRule.UNIT else math.hypot(*vector)
+    found = shares(first, last)
+    assert sum(found.values()) == 1
+    multipliers = grid.multipliers([*found]).tolist()
+    mean = sum(share * Fraction(m) for share, m in zip(found.values(), multipliers, strict=True))
+    return float(length * float(mean))
+
+
+def is_legal(first: Cell, last: Cell, grid: GridMap, rule: MoveRule) -> bool:
+    """Say whether a segment is legal, from the whole map's moves or from all cells it touches."""
+    if not (grid.is_free(first) and grid.is_free(last)):
+        return False
+    step = [last[0] - first[0], last[1] - first[1]]
+    if step in MOVES.tolist():
+        return bool(grid.legal_moves(rule)[MOVES.tolist().index(step), first[1], first[0]])
+    passed = [*shares(first, last)]
+    touched = {*passed}
+    if not rule.cuts_corners:
+        touched |= {cell for (x, y), (u, v) in pairwise(passed) for cell in ((x, v), (u, y))}
+    if not all(map(grid.is_free, touched)):
+        return False
+    angle = np.arctan2(step[1], step[0]) / (np.pi / 4)
+    actions = {int(np.floor(angle + 1e-9)) % 8, int(np.ceil(angle - 1e-9)) % 8}
+    forbidden = np.zeros(grid.occupancy.shape, int) if grid.forbidden is None else grid.forbidden
+    return not any(forbidden[y, x] >> a & 1 for x, y in passed if (x, y) != last for a in actions)
