@@ -52,8 +52,10 @@ def in_place(function: Function) -> Function:
 
 
 def inlined(function: Function) -> Function:
-    """Compile a function that functions which are `in_place` alone call."""
-    return compiled(function, _nrt=False, forceinline=True, no_cpython_wrapper=True)
+    """Let functions which are `in_place` call a function compiled; Python calls it as it is."""
+    options = {"_nrt": False, "forceinline": True, "no_cpython_wrapper": True}
+    function.dispatcher = compiled(function, **options).dispatcher  # type: ignore[attr-defined]
+    return function
 
 
 @cache
