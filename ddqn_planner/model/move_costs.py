@@ -34,23 +34,34 @@ class MoveCosts(NamedTuple):
     highest: float  # no possible move costs more
     straight: float  # no straight move costs less
     diagonal: float  # no diagonal move costs less
+    into: NDArray[np.uint8]  # (P,): as bits, the actions by which moves may lead into a cell
+    low: Any  # (L,) float32, with terms: half of a move's multiplier is no less, for each cell
+    least: float = 1.0  # no multiplier on the map is less
 
     @classmethod
-    def of_table(cls, table_PA: Array) -> MoveCosts:
+    def of_table(cls, table_PA: Array, legal_PA: NDArray[np.bool_] | None = None) -> MoveCosts:
         """Return the costs that a table gives, and one more patch without moves; for no map yet."""
+        into = np.full(len(table_PA) + 1, 255, np.uint8)
+        if legal_PA is not None:  # where a move is legal, so is the one back
+            into[:-1] = np.packbits(np.roll(legal_PA, 4, axis=1), axis=1, bitorder="little")[:, 0]
         table_PA = np.pad(table_PA, ((0, 1), (0, 0)), constant_values=np.inf)
         highest = float(table_PA.max(where=np.isfinite(table_PA), initial=1))
         straight = float(table_PA[:, 0::2].min(initial=highest))
         diagonal = float(table_PA[:, 1::2].min(initial=2 * straight))
         nowhere = np.empty(0, dtype=np.uint16)
-        return cls(nowhere, table_PA, None, None, 0, highest, straight, diagonal)
+        return cls(nowhere, table_PA, None, None, 0, highest, straight, diagonal, into, None)
 
     def after(self, grid: GridMap, boxes: Sequence[Box]) -> MoveCosts | None:
         """Return the costs on a map that differs from theirs in boxes; None to look at it all."""
         if grid.forbidden is not None:  # its patches are others
             return None
         shape = grid.height + 2, grid.width + 2
-        patch, value, highest = self.patch.reshape(shape), self.value, self.highest
+        patch, value, highest, least = (
+            self.patch.reshape(shape),
+            self.value,
+            self.highest,
+            self.least,
+        )
         for box in boxes:
             # The patches of the cells around see the box, too.
             around, seen = (wider(box, by, grid.occupancy.shape) for by in (1, 2))
@@ -63,24 +74,34 @@ class MoveCosts(NamedTuple):
                 values: NDArray[Any] = grid.multipliers_in(box)
                 greatest = self.table.max(where=np.isfinite(self.table), initial=1)
                 highest = max(highest, float(greatest * values.max()))
+                least = min(least, float(values.min()))
             elif grid.cost is not None:
                 values = np.where(grid.occupancy[box], VALUES - 1, grid.cost[box] - UNKNOWN)
+                least = min(least, self._least(values.astype(np.uint8)))
             value = replaced(value.reshape(shape), within(box, ORIGIN, 1), values)
         value = None if value is None else value.ravel()
-        return self._replace(patch=patch.ravel(), value=value, highest=highest)
+        return self._replace(patch=patch.ravel(), value=value, highest=highest, least=least)
+
+    def _least(self, value: NDArray[np.uint8]) -> float:
+        """Return a multiplier that none on free cells is less than, given cells' values."""
+        cost = int((value - np.uint8(1)).min())  # that of an unknown cell is 255 here
+        return float(2 * self.low[min(cost, OCCUPIED) + 1])
 
     def on(self, grid: GridMap, patch: NDArray[Any]) -> MoveCosts:
         """Return the costs on a map, given its patches, with its directions and expected times."""
         costs = self._replace(patch=patch, width=grid.width + 2)
         if self.terms is not None and grid.cost is not None:
-            costs = costs._replace(value=cell_values(grid.occupancy, grid.cost))
+            value = cell_values(grid.occupancy, grid.cost)
+            costs = costs._replace(value=value, least=self._least(value))
         if grid.forbidden is not None:
             patch, table = _with_directions(patch, self.table, np.pad(grid.forbidden, 1).ravel())
-            costs = costs._replace(patch=patch, table=table)
+            into = np.tile(self.into, len(table) // len(self.into))
+            costs = costs._replace(patch=patch, table=table, into=into)
         if grid.slowness is None:
             return costs
         multiplier = np.pad(grid.cost_multiplier, 1, constant_values=1).ravel()
-        return costs._replace(value=multiplier, highest=costs.highest * float(multiplier.max()))
+        highest, least = costs.highest * float(multiplier.max()), float(grid.cost_multiplier.min())
+        return costs._replace(value=multiplier, highest=highest, least=least)
 
 
 def _with_directions(

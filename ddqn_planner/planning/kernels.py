@@ -30,8 +30,9 @@ SAME: Final = 1 + 1e-12  # paths cost the same up to this factor: sums of floats
 
 MOVE_X, MOVE_Y = MOVES.T.copy()
 
-# The lowest bit of a byte that is set.
-FIRST = np.array([0] + [(bits & -bits).bit_length() - 1 for bits in range(1, 256)], np.int8)
+# The lowest bit of a byte that is set. Where an index is unsigned, numba does not look whether it
+# counts from the end.
+FIRST = np.array([0] + [(bits & -bits).bit_length() - 1 for bits in range(1, 256)], np.uint64)
 
 
 @compiled
@@ -43,20 +44,31 @@ def cost_of(
     if terms is None:
         if value is None:
             return cost
-        after = cell + MOVE_Y[action] * width + MOVE_X[action]
+        after = np.int64(cell) + MOVE_Y[action] * width + MOVE_X[action]
         return cost * (np.float64(value[cell]) + value[after]) / 2
     if cost == np.inf:
         return cost
     total = np.float32(0)
+    middle, one = np.uint64(cell) - np.uint64(width), np.uint64(1)
     for row in range(3):
-        middle = cell + (row - 1) * width
         total += (
-            terms[3 * row, value[middle - 1], action]
+            terms[3 * row, value[middle - one], action]
             + terms[3 * row + 1, value[middle], action]
-            + terms[3 * row + 2, value[middle + 1], action]
+            + terms[3 * row + 2, value[middle + one], action]
         )
+        middle += np.uint64(width)
     multiplier = np.float32(1) + max(total, np.float32(0))
     return cost * min(multiplier, np.float32(MAX_MULTIPLIER))
+
+
+@compiled
+def _at_least(
+    patch: Any, table: Any, value: Any, low: Any, width: int, cell: int, after: int, action: int
+) -> Any:
+    """Return a lower bound of the cost of a move, or the cost where that takes no longer."""
+    if low is None:
+        return cost_of(patch, table, value, None, width, cell, action)
+    return table[patch[cell], action] * (low[value[cell]] + low[value[after]])
 
 
 # The wavefront
@@ -73,7 +85,8 @@ def grow(
         # is enough: no move costs less than 1.
         bounds, buckets = (0.0, 0.0), 1
     else:  # lower bounds, whatever the rounding
-        bounds = costs.straight * (1 - 1e-7), costs.diagonal * (1 - 1e-7)
+        least = costs.least * (1 - 1e-7)
+        bounds = costs.straight * least, costs.diagonal * least
         buckets = BUCKETS
     order = _orders(distance, opened, costs.width, start, bounds, buckets)
     first = np.argsort(order)
@@ -118,11 +131,12 @@ def _grow(
     patch, table, value, terms, width = costs[:5]
     offsets = MOVE_Y * width + MOVE_X
     start_y, start_x = start // width, start % width
-    ring = int((costs.highest + bounds[1]) * buckets) + 3
+    ring = 4
+    while ring < (costs.highest + bounds[1]) * buckets + 3:
+        ring *= 2  # so a slot takes no division
     capacity = 256
     bucket = np.empty((ring, capacity), np.int32)
     count = np.zeros(ring, np.int64)
-    through = np.empty(8)
     taken, waiting, front, visited = 0, 0, 0, 0
     while visited <= limit:
         if waiting == 0:
@@ -132,7 +146,7 @@ def _grow(
         # Ties are closed too: so a rollout does not depend on what was asked before.
         if state[start] == CLOSED and distance[start] * (1 + 1e-6) * buckets < front:
             break
-        slot = front % ring
+        slot = front & (ring - 1)
         used = 0
         while True:
             if taken < opened.size and order[taken] <= front:
@@ -149,39 +163,31 @@ def _grow(
             state[cell] = CLOSED
             visited += 1
             here = distance[cell]
-            # With values, the table has lower bounds: few moves need more than that.
-            better = 0
-            for action in range(8):
-                previous = cell - offsets[action]
-                through[action] = here + table[patch[previous], action]
-                known = distance[previous]
-                is_better = (through[action] < known) | ((known == 0) & (through[action] < np.inf))
-                better |= int(is_better) << action
-            y = cell // width
-            x = cell - y * width
+            # Without branches that depend on distances: most would be mispredicted.
+            better, legal = 0, costs.into[patch[cell]]
+            while legal:
+                action = FIRST[legal]
+                legal &= legal - 1
+                previous = np.uint64(cell - offsets[action])
+                known = distance[previous] if distance[previous] > 0 else np.inf
+                cost = _at_least(patch, table, value, costs.low, width, previous, cell, action)
+                better |= int(here + cost < known) << action
             while better:
                 action = FIRST[better]
                 better &= better - 1
-                previous = cell - offsets[action]
-                known, cost = distance[previous], through[action]
-                if value is not None:
-                    cost = here + cost_of(patch, table, value, terms, width, previous, action)
-                    if cost >= known > 0:
-                        continue
-                remaining = _remaining(
-                    x - MOVE_X[action] - start_x, y - MOVE_Y[action] - start_y, bounds
-                )
-                new = max(int((cost + remaining) * buckets), front)
-                old = max(int((known + remaining) * buckets), front)
-                distance[previous] = cost
-                if state[previous] == OPEN and old == new:
+                previous = np.uint64(cell - offsets[action])
+                known = distance[previous] if distance[previous] > 0 else np.inf
+                cost = here + cost_of(patch, table, value, terms, width, previous, action)
+                if cost >= known:
                     continue
-                state[previous] = OPEN
-                slot_of_new = new % ring
-                if count[slot_of_new] == capacity:
+                distance[previous], state[previous] = cost, OPEN
+                x, y = (cell - offsets[action]) % width, (cell - offsets[action]) // width
+                its_order = (cost + _remaining(x - start_x, y - start_y, bounds)) * buckets
+                its_slot = max(int(its_order), front) & (ring - 1)
+                if count[its_slot] == capacity:
                     bucket, capacity = _wider(bucket), 2 * capacity
-                bucket[slot_of_new, count[slot_of_new]] = previous
-                count[slot_of_new] += 1
+                bucket[its_slot, count[its_slot]] = previous
+                count[its_slot] += 1
                 waiting += 1
         count[slot] = 0
         front += 1
