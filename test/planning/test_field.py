@@ -243,6 +243,20 @@ def test_a_changed_map_uses_what_is_known_of_the_one_before() -> None:
     assert older.rollout(start).cells == before.cells  # and begins anew
 
 
+@pytest.mark.parametrize("slowness", [None, np.full((31, 31), 3)])
+def test_the_least_cost_on_a_map_is_that_of_its_patches_too(slowness: np.ndarray | None) -> None:
+    # Straight ahead each cell costs as much; around, three patches cost nothing.
+    grid = GridMap(np.zeros((31, 31)), cost=np.full((31, 31), 33), slowness=slowness)
+    planner, ends = new_planner(), ((0, 15), (30, 15))
+    assert len(planner.plan(grid, *ends).cells) == 31
+    for x, y, shape in ((0, 0, (31, 1)), (0, 0, (1, 31)), (30, 0, (31, 1))):
+        grid = grid.with_patch(np.zeros(shape), x, y, np.zeros(shape))
+    around = new_planner().plan(grid, *ends)
+    exact = shortest_distances(grid, ends[1], MoveRule.ROBOT_SAFE)[15, 0]
+    assert around.cost == pytest.approx(exact, rel=1e-3)
+    assert planner.plan(grid, *ends) == around
+
+
 def test_a_repair_that_takes_too_long_leaves_the_older_field_as_it_was() -> None:
     fields.REPAIRED = 5
     grid, goal = GridMap(np.zeros((60, 60))), (30, 30)
