@@ -238,7 +238,9 @@ def test_a_changed_map_uses_what_is_known_of_the_one_before() -> None:
     older, field = planner.q_field(grid, goal), fresh_field(changed, goal, MoveRule.ROBOT_SAFE)
     assert isinstance(older, DistanceField)
     known = np.count_nonzero(older.known.distance)
-    assert field.take_over(older, (0, 0))
+    changed_cells = fields.changed_cells(grid, changed, (0, 0))
+    assert changed_cells is not None
+    field.take_over(older, (0, 0), changed_cells)
     assert np.count_nonzero(field.known.distance) > 0.9 * known
     assert np.count_nonzero(older.known.distance) == 1  # it handed over its memory
     assert field.rollout(start) == fresh_field(changed, goal, MoveRule.ROBOT_SAFE).rollout(start)
@@ -268,7 +270,7 @@ def test_a_repair_that_takes_too_long_leaves_the_older_field_as_it_was() -> None
     changed = grid.with_patch(np.ones((1, 12)), 20, 29)  # a wall beside the goal
     start = (30, 32)
     assert planner.plan(changed, start, goal) == new_planner().plan(changed, start, goal)
-    assert planner.fields.find(grid, (goal,), MoveRule.ROBOT_SAFE) is older
+    assert planner.fields.find(grid, (goal,), MoveRule.ROBOT_SAFE) is None  # the place has changed
     assert older.rollout_if_known((0, 0)) == before
     assert_same(older, fresh_field(grid, goal, MoveRule.ROBOT_SAFE))
 
