@@ -13,6 +13,10 @@ from ddqn_planner.grid.arguments import Cells, cells_inside
 from ddqn_planner.grid.grid_map import MULTIPLIERS, check_grid
 from ddqn_planner.planning.kernels import MOVE_X, MOVE_Y
 
+MISSING = [np.empty((0, 0), kind) for kind in (np.uint8, np.int8, np.float32)]
+for missing in MISSING:  # numba compiles again for arrays that can be written to
+    missing.flags.writeable = False
+
 SAME_COST = 1 + 1e-9  # a path may cost so much more, and still as much: sums are rounded
 
 
@@ -44,15 +48,15 @@ def simplify(cells: Cells, grid: GridMap, move_rule: MoveRule | str) -> tuple[Ce
 
 def segment_cost(first: Cell, last: Cell, grid: GridMap, move_rule: MoveRule | str) -> float:
     """Return a legal segment's cost, see `simplify`, else infinity: as each cell's share in it."""
-    return float(_cost(*first, *last, *_layers(grid, MoveRule(move_rule))))
+    x, y, last_x, last_y = map(int, (*first, *last))
+    return float(_cost(x, y, last_x, last_y, *_layers(grid, MoveRule(move_rule))))
 
 
 def _layers(grid: GridMap, rule: MoveRule) -> tuple[Any, ...]:
     """Return what decides of a segment; empty arrays for missing layers, so that one code does."""
-    forbidden = np.empty((0, 0), np.uint8) if grid.forbidden is None else grid.forbidden
-    cost = np.empty((0, 0), np.int8) if grid.cost is None else grid.cost
-    slowness = np.empty((0, 0), np.float32) if grid.slowness is None else grid.slowness
-    return grid.occupancy, forbidden, cost, slowness, rule.cuts_corners, rule is MoveRule.UNIT
+    given = grid.forbidden, grid.cost, grid.slowness
+    layers = (none if one is None else one for none, one in zip(MISSING, given, strict=True))
+    return grid.occupancy, *layers, rule.cuts_corners, rule is MoveRule.UNIT
 
 
 @compiled
