@@ -6,8 +6,8 @@ import math
 import mmap
 import os
 from contextlib import suppress
-from typing import IO, Any
-from weakref import WeakSet
+from typing import Any
+from weakref import WeakSet, finalize
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,15 +22,24 @@ APART = 16  # rows or columns between what gets boxes of its own
 FEW = 8  # boxes: each takes as long as some thousand cells
 MOST = 32  # boxes by which a copy may differ from the array whose memory it shares
 LARGE = 64  # a box of more than one in so many of the cells is not shared
+NEAR = 2**10  # cells of a box that may hold two
 MOST_ALIVE = 128  # copies that share memory: each takes one or two of a process's open files
 
 
-class _Pages(mmap.mmap):
-    """An array in a file in memory; pages that are written are copied, and the file stays."""
+class _File:
+    """An array in a file in memory, and pages of it that are used no more."""
 
-    shape: tuple[int, ...]
-    file: IO[bytes]
-    written: tuple[tuple[Box, NDArray[Any]], ...]  # what differs from the file
+    def __init__(self, array: NDArray[Any]) -> None:
+        self.io = os.fdopen(os.memfd_create("array"), "r+b", buffering=0)
+        array.tofile(self.io)
+        self.shape, self.unused = array.shape, list[_Pages]()
+
+
+class _Pages(mmap.mmap):
+    """All of a file in memory; pages that are written are copied, and the file stays."""
+
+    file: _File
+    written: list[Box]  # where they differ from the file
 
 
 _alive: WeakSet[_Pages] = WeakSet()
@@ -42,7 +51,7 @@ def replaced(array: NDArray[Any] | None, box: Box, values: NDArray[Any]) -> Any:
         return None
     if array.nbytes > SMALL and len(_alive) < MOST_ALIVE and cells_in(box) * LARGE < array.size:
         with suppress(OSError):  # too many files are open
-            return _replaced_pages(array, box, np.array(values, dtype=array.dtype))
+            return _replaced_pages(array, box, values)
     array = array.copy()
     array[box] = values
     return array
@@ -52,18 +61,45 @@ def _replaced_pages(array: NDArray[Any], box: Box, values: NDArray[Any]) -> NDAr
     # Another view of all of it, as one of another shape, has it as its base.
     owner = array.base if isinstance(array.base, np.ndarray) else array
     before = owner.base if owner.size == array.size else None
-    if isinstance(before, _Pages) and before.shape == array.shape and len(before.written) < MOST:
-        file, written = before.file, (*before.written, (box, values))
+    written: list[Box] = []
+    if (
+        isinstance(before, _Pages)
+        and before.file.shape == array.shape
+        and len(before.written) < MOST
+    ):
+        file, written = before.file, before.written
     else:
-        file, written = os.fdopen(os.memfd_create("array"), "r+b", buffering=0), ((box, values),)
-        array.tofile(file)
-    pages = _Pages(file.fileno(), array.nbytes, mmap.MAP_PRIVATE, mmap.PROT_READ | mmap.PROT_WRITE)
-    pages.shape, pages.file, pages.written = array.shape, file, written
-    _alive.add(pages)
+        file = _File(array)
+    try:  # to map and unmap them takes longer than the copy
+        pages = file.unused.pop()
+    except IndexError:
+        access = mmap.PROT_READ | mmap.PROT_WRITE
+        pages = _Pages(file.io.fileno(), array.nbytes, mmap.MAP_PRIVATE, access)
+        pages.written = []
+        _alive.add(pages)
     copied: NDArray[Any] = np.ndarray(array.shape, array.dtype, pages)
-    for where, what in written:
-        copied[where] = what
+    for where in (*pages.written, *written):
+        copied[where] = array[where]
+    copied[box] = values
+    pages.file, pages.written = file, _with(written, box)
+    finalize(copied, _give_back, pages).atexit = False  # a view of the copy keeps it
     return copied
+
+
+def _give_back(pages: _Pages) -> None:
+    """Keep the pages of an array that nobody has any more for the next copy."""
+    file = pages.file
+    del pages.file  # else both would keep each other
+    file.unused.append(pages)
+
+
+def _with(boxes: list[Box], box: Box) -> list[Box]:
+    """Return boxes and one more, which may be one with a box near it."""
+    for number, other in enumerate(boxes):
+        both = hull([other, box])
+        if cells_in(both) <= 2 * (cells_in(other) + cells_in(box)) + NEAR:
+            return [*boxes[:number], *boxes[number + 1 :], both]
+    return [*boxes, box]
 
 
 def boxes_of(is_set: NDArray[np.bool_], apart: int = APART) -> list[Box]:

@@ -43,6 +43,18 @@ def test_each_copy_keeps_what_it_was_given_whatever_comes_after(
     np.testing.assert_array_equal(copied, expected)
 
 
+def test_a_view_keeps_its_copy() -> None:
+    array, views = np.zeros((10, 10)), []
+    for number in range(1, 200):
+        array = replaced(array, (slice(number % 10, number % 10 + 1), slice(3, 5)), number)
+        views.append((array.ravel()[5:], array.copy().ravel()[5:], array.T[:2], array.T[:2].copy()))
+        if number % 3:
+            del views[number * 7 % len(views)]
+    for flat, flat_before, turned, turned_before in views:
+        np.testing.assert_array_equal(flat, flat_before)
+        np.testing.assert_array_equal(turned, turned_before)
+
+
 def open_files() -> int:
     gc.collect()
     return len(os.listdir("/proc/self/fd"))
