@@ -5,9 +5,10 @@ from __future__ import annotations
 import math
 import mmap
 import os
+from collections.abc import Sequence
 from contextlib import suppress
 from typing import Any
-from weakref import WeakSet, finalize
+from weakref import ReferenceType, WeakSet, finalize
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,26 +21,25 @@ ORIGIN: Box = (slice(0, 0), slice(0, 0))
 SMALL = 2**22  # bytes of an array that is copied as fast, and read faster
 APART = 16  # rows or columns between what gets boxes of its own
 FEW = 8  # boxes: each takes as long as some thousand cells
-MOST = 32  # boxes by which a copy may differ from the array whose memory it shares
-LARGE = 64  # a box of more than one in so many of the cells is not shared
-NEAR = 2**10  # cells of a box that may hold two
+BOX = 2**13  # cells that are copied as fast as a box is begun
+LARGE = 64  # copies share memory if they differ in less than one cell in so many
 MOST_ALIVE = 128  # copies that share memory: each takes one or two of a process's open files
 
 
-class _File:
-    """An array in a file in memory, and pages of it that are used no more."""
+class _File(list["_Pages"]):
+    """An array in a file in memory, and its pages that are used no more."""
 
     def __init__(self, array: NDArray[Any]) -> None:
-        self.io = os.fdopen(os.memfd_create("array"), "r+b", buffering=0)
+        super().__init__()
+        self.io, self.shape = os.fdopen(os.memfd_create("array"), "r+b", buffering=0), array.shape
         array.tofile(self.io)
-        self.shape, self.unused = array.shape, list[_Pages]()
 
 
 class _Pages(mmap.mmap):
     """All of a file in memory; pages that are written are copied, and the file stays."""
 
-    file: _File
-    written: list[Box]  # where they differ from the file
+    file: ReferenceType[_File]
+    written: tuple[Box, ...] = ()  # where they differ from the file
 
 
 _alive: WeakSet[_Pages] = WeakSet()
@@ -49,7 +49,7 @@ def replaced(array: NDArray[Any] | None, box: Box, values: NDArray[Any]) -> Any:
     """Return a copy with other values in a box."""
     if array is None:
         return None
-    if array.nbytes > SMALL and len(_alive) < MOST_ALIVE and cells_in(box) * LARGE < array.size:
+    if array.nbytes > SMALL and len(_alive) < MOST_ALIVE and _effort([box]) * LARGE < array.size:
         with suppress(OSError):  # too many files are open
             return _replaced_pages(array, box, values)
     array = array.copy()
@@ -60,46 +60,36 @@ def replaced(array: NDArray[Any] | None, box: Box, values: NDArray[Any]) -> Any:
 def _replaced_pages(array: NDArray[Any], box: Box, values: NDArray[Any]) -> NDArray[Any]:
     # Another view of all of it, as one of another shape, has it as its base.
     owner = array.base if isinstance(array.base, np.ndarray) else array
-    before = owner.base if owner.size == array.size else None
-    written: list[Box] = []
-    if (
-        isinstance(before, _Pages)
-        and before.file.shape == array.shape
-        and len(before.written) < MOST
-    ):
-        file, written = before.file, before.written
-    else:
-        file = _File(array)
+    before: Any = owner.base if owner.size == array.size else None
+    file, written = None, tuple[Box, ...]()
+    if isinstance(before, _Pages) and _effort(before.written) * LARGE < array.size:
+        file, written = before.file(), before.written
+    if file is None or file.shape != array.shape:
+        file, written = _File(array), ()
     try:  # to map and unmap them takes longer than the copy
-        pages = file.unused.pop()
+        pages = file.pop()
     except IndexError:
-        access = mmap.PROT_READ | mmap.PROT_WRITE
-        pages = _Pages(file.io.fileno(), array.nbytes, mmap.MAP_PRIVATE, access)
-        pages.written = []
+        pages = _Pages(file.io.fileno(), array.nbytes, access=mmap.ACCESS_COPY)
         _alive.add(pages)
     copied: NDArray[Any] = np.ndarray(array.shape, array.dtype, pages)
     for where in (*pages.written, *written):
         copied[where] = array[where]
     copied[box] = values
-    pages.file, pages.written = file, _with(written, box)
-    finalize(copied, _give_back, pages).atexit = False  # a view of the copy keeps it
+    pages.file, pages.written = ReferenceType(file), _with(written, box)
+    finalize(copied, file.append, pages).atexit = False  # a view of the copy keeps it
     return copied
 
 
-def _give_back(pages: _Pages) -> None:
-    """Keep the pages of an array that nobody has any more for the next copy."""
-    file = pages.file
-    del pages.file  # else both would keep each other
-    file.unused.append(pages)
-
-
-def _with(boxes: list[Box], box: Box) -> list[Box]:
-    """Return boxes and one more, which may be one with a box near it."""
+def _with(boxes: tuple[Box, ...], box: Box) -> tuple[Box, ...]:
+    """Return boxes and one more, or one of them and it in a larger one."""
     for number, other in enumerate(boxes):
-        both = hull([other, box])
-        if cells_in(both) <= 2 * (cells_in(other) + cells_in(box)) + NEAR:
-            return [*boxes[:number], *boxes[number + 1 :], both]
-    return [*boxes, box]
+        if _effort([both := hull([other, box])]) <= _effort([other, box]):
+            return *boxes[:number], *boxes[number + 1 :], both
+    return *boxes, box
+
+
+def _effort(boxes: Sequence[Box]) -> int:
+    return sum(BOX + cells_in(box) for box in boxes)
 
 
 def boxes_of(is_set: NDArray[np.bool_], apart: int = APART) -> list[Box]:

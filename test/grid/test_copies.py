@@ -20,7 +20,8 @@ from ddqn_planner.grid.copies import boxes_of, cells_in, replaced
 def shared(monkeypatch: pytest.MonkeyPatch) -> None:
     """Let small arrays share their memory, too."""
     monkeypatch.setattr(copies, "SMALL", 0)
-    monkeypatch.setattr(copies, "LARGE", 0)
+    monkeypatch.setattr(copies, "LARGE", 1)
+    monkeypatch.setattr(copies, "BOX", 1)
 
 
 BOXES = st.tuples(st.integers(0, 9), st.integers(1, 10), st.integers(0, 9), st.integers(1, 10))
