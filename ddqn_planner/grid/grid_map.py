@@ -195,8 +195,7 @@ class GridMap:
             cost=costs,
             obstacles=replaced(self.obstacles, box, closed),
         )
-        occupied = self._occupied + np.count_nonzero(patch)
-        occupied -= np.count_nonzero(self.occupancy[box])
+        occupied = self._occupied + int(patch.sum()) - int(self.occupancy[box].sum())
         patches = *self._patches[1 - MAX_PATCHES :], (self._version, box)
         patched._set(_occupied=occupied, _patches=patches)
         return patched
