@@ -305,7 +305,7 @@ def main() -> int:
     missed += measure_replans(1024)
     missed += measure_whole_fields(64, True, 30)
     for side in (256, 1024, 2000):
-        missed += [*measure_whole_fields(side, False, 20), *measure_whole_fields(side, True, 35)]
+        missed += [*measure_whole_fields(side, False, 20), *measure_whole_fields(side, True, 25)]
     return int(any(missed))
 
 
