@@ -222,7 +222,7 @@ class PlannerNode(ManagedNode):
     ) -> tuple[Path, Outcome]:
         header, outcome = await self._answer(given_up, start, goals, None, name, self._followed)
         if outcome.request is not None and len(outcome.plan.path):
-            self._followed.keep(outcome.plan.every_cell, outcome.request.grid, header.frame_id)
+            self._followed.keep(outcome.plan.path, outcome.request.grid, header.frame_id)
             self._plan_publisher.publish(_path(serialized_path, outcome, header))
         self._report.log(outcome)
         return _path(path_message, outcome, header), outcome
@@ -365,7 +365,7 @@ class ExpectedTimes:
 
     def describe(self, outcome: Outcome) -> dict[str, str]:
         """Return how long a plan takes, unless its map is old or untimed, or no memory is left."""
-        now, request, path = self._spread_on, outcome.request, outcome.plan.every_cell
+        now, request, path = self._spread_on, outcome.request, outcome.plan.path
         told: dict[str, str] = {}
         is_timed = request is not None and request.grid.slowness is not None and len(path) > 0
         if self._experience and now and request and is_timed and _is_like(request.grid, now):

@@ -97,7 +97,7 @@ class ActiveGoal:
 
     def is_news(self, outcome: Outcome, frame: str) -> bool:
         """Return whether to publish the path of an outcome, which may be empty."""
-        path, request, shown = outcome.plan.every_cell, outcome.request, (frame, outcome.status)
+        path, request, shown = outcome.plan.path, outcome.request, (frame, outcome.status)
         is_new_path = len(path) > 0 and outcome.plan.extra_cost is None
         is_news, self._shown = is_new_path or shown != self._shown, shown
         if request is None:

@@ -125,7 +125,7 @@ def test_the_cost_of_a_plan_is_its_expected_time_and_no_path_is_faster(seed: int
         if plan.cells:
             assert plan.cost == pytest.approx(seconds[start[1], start[0]], rel=1e-6, abs=1e-6)
             if grid.cost is None:
-                told = experience.expected_time(grid, plan.every_cell)
+                told = experience.expected_time(grid, plan.path)
                 assert told.seconds == pytest.approx(plan.cost, rel=1e-4)
         else:
             assert np.isinf(seconds[start[1], start[0]])
