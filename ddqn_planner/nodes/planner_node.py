@@ -62,7 +62,7 @@ class PlannerNode(ManagedNode):
 
     def _forget(self) -> None:
         """Have no map and no goal, and refuse requests."""
-        self._is_configured = self._waits_for_pose = self._lacks_map = False
+        self._is_configured = self._waits_for_pose = False
         # What requests are answered, also those under way; None while the node is active.
         self._refusal: Outcome | None = NOT_ACTIVE
         self._logged: tuple[object, ...] = ()
@@ -288,9 +288,8 @@ class PlannerNode(ManagedNode):
     def _look_for_news(self) -> None:
         self._requests.look_again()
         self._start.transform()
-        lacked, self._lacks_map = self._lacks_map, bool(self._map.missing)
-        is_due = self._active.is_look_due(self._settings.replan_period)
-        is_due |= self._lacks_map and not lacked  # a costmap stopped: its path is taken back
+        period, lacks_map = self._settings.replan_period, bool(self._map.missing)
+        is_due = self._active.is_look_due(period, lacks_map)
         if self._waits_for_pose and self._active.poses:
             with suppress(RequestError):
                 for pose in (self._start.pose(), *self._active.poses):

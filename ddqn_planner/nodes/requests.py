@@ -74,9 +74,10 @@ class ActiveGoal:
         self._shown: tuple[str, str] | None = None
         self._looks, self._next_look = False, 0.0
 
-    def is_look_due(self, replan_period: float) -> bool:
+    def is_look_due(self, replan_period: float, lacks_map: bool) -> bool:
         """Return whether it is time to look if something changed; the next plan does then."""
-        is_due = bool(self.poses) and time.monotonic() >= self._next_look
+        stopped = lacks_map and self._planned is not None  # a costmap: its path is taken back
+        is_due = bool(self.poses) and (stopped or time.monotonic() >= self._next_look)
         if is_due:
             self._looks, self._next_look = True, time.monotonic() + replan_period
         return is_due
