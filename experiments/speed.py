@@ -16,6 +16,7 @@ import torch
 from random_maps import KINDS, Random, generate_map
 from stable_baselines3 import DQN
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
+from straight_paths import measure_straight_paths
 from tables import report
 from torch import nn
 
@@ -249,6 +250,8 @@ def main() -> int:
     for side in (256, 1024):
         missed += measure_requests(side)
     missed += measure_replans(1024)
+    for side in (256, 1024, 2048):
+        missed += measure_straight_paths(side, MAP_KINDS)
     for side in (256, 1024, 2000):
         missed += [*measure_whole_fields(side, False, 20), *measure_whole_fields(side, True, 25)]
     return int(any(missed))

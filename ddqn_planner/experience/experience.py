@@ -16,6 +16,7 @@ from ddqn_planner.experience.evidence import FARTHEST, Evidence, Visits
 from ddqn_planner.files import as_path, write_atomically
 from ddqn_planner.grid import GridMap
 from ddqn_planner.grid.arguments import POSITIVE, Cells, as_number, cells_inside, numbers
+from ddqn_planner.grid.moves import cells_along
 
 Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
@@ -162,7 +163,7 @@ class Experience:
         Raises
         ------
         ValueError
-            If the cells are no path in the map.
+            If a cell is no cell of the map.
         """
         spread = self.evidence.over(grid)
         corners = cells_inside(cells, grid.occupancy.shape)

@@ -115,7 +115,7 @@ def positions(parts: NDArray[np.int64]) -> NDArray[np.float64]:
     return np.append(number + within / parts[number], float(len(parts)))
 
 
-def cells_along(path: NDArray[np.int32]) -> tuple[NDArray[np.int32], NDArray[np.float64]]:
+def cells_along(path: NDArray[Any]) -> tuple[NDArray[np.int32], NDArray[np.float64]]:
     """Return cells side by side that a path of segments passes, and their positions on it."""
     vectors = np.append(np.diff(path, axis=0), [[0, 0]], axis=0)
     position = positions(np.abs(vectors[:-1]).max(axis=1))

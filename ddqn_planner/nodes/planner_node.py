@@ -154,6 +154,8 @@ class PlannerNode(ManagedNode):
         self._start.listen()
         self._requests.settings = settings
         self._map.apply_parameters(changed)
+        if "path_simplification" in changed:
+            self._followed = PathUnderWay()
         self._plan_for(ActiveGoal(self._active.poses, PathUnderWay()))
 
     # Map, start and goal
@@ -389,7 +391,8 @@ def _path(make: Callable[..., Any], outcome: Outcome, header: Header) -> Any:
     """Return the path of an outcome, or an empty one, made by a function of `conversions`."""
     if outcome.request is None or outcome.goal is None:
         return Path(header=header)
-    return make(outcome.plan.path, outcome.request.grid, header, outcome.goal.pose.orientation)
+    goal, grid = outcome.goal.pose.orientation, outcome.request.grid
+    return make(outcome.plan.path, grid, header, goal, outcome.is_dense)
 
 
 def main() -> int:

@@ -22,7 +22,7 @@ from ddqn_planner.grid import Cell, GridMap, MoveRule
 from ddqn_planner.grid.arguments import Cells
 from ddqn_planner.model import find_model
 from ddqn_planner.model.certificate import NO_CERTIFICATE
-from ddqn_planner.nodes.conversions import cell_from_pose
+from ddqn_planner.nodes.conversions import cell_from_pose, turns
 from ddqn_planner.nodes.map_source import MapSource
 from ddqn_planner.nodes.poses import Frames, StartSource
 from ddqn_planner.nodes.report import Outcome, Report, RequestError, reason_of, seconds
@@ -132,7 +132,7 @@ class ModelSource:
             sizes = planner.metadata.sizes
             shape = sizes.get("height", 3), sizes.get("width", 3)
             corner = shape[1] - 1, shape[0] - 1
-            planner.plan(GridMap(np.zeros(shape, dtype=np.bool_)), (0, 0), corner)
+            planner.plan(GridMap(np.zeros(shape, dtype=np.bool_)), (0, 0), corner, simplified=True)
             gc.freeze()  # a collection of all that would stop the node for 45 ms
         return planner, str(path)
 
@@ -252,7 +252,7 @@ class Requests:
             move_rule=move_rule(settings.move_rule, planner),
             method=PlanMethod(settings.mode),
             tolerance=metres / grid.resolution,
-            simplified=settings.path_simplification == "line_of_sight",
+            simplified=settings.path_simplification != "none",
             start_clearing_radius=_clearing_radius(settings, grid),
         )
         if isinstance(followed, ActiveGoal):
@@ -283,14 +283,16 @@ class Requests:
         if more and not len(plan.path):
             reason = f"goal {number} of {len(goals)}: {reason}"
         stamp = seconds(header.stamp)
-        return Outcome(plan.status.name, reason, planner, request, plan, goal, stamp)
+        is_dense = settings.path_simplification == "straight"
+        return Outcome(plan.status.name, reason, planner, request, plan, goal, stamp, is_dense)
 
     async def is_path_valid(self, path: Path) -> bool:
         """Return whether a path is free now, from the robot on, or all of it if that is unknown."""
         header, grid, planner = await self._inputs()
         frame, settings = header.frame_id, self.settings
         poses = [PoseStamped(header=path.header, pose=stamped.pose) for stamped in path.poses]
-        cells = [_checked("the path", cell_from_pose, pose, grid, frame) for pose in poses]
+        # What a straight path passes between its turns is known exactly, between its poses not.
+        cells = [_checked("the path", cell_from_pose, pose, grid, frame) for pose in turns(poses)]
         robot = cells[0] if cells else (0, 0)
         with suppress(RequestError):
             start = await self._wait_for(self.start.pose)

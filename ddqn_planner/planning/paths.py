@@ -183,11 +183,17 @@ def rest_of_path(path: Cells, robot: Cell, grid: GridMap, move_rule: MoveRule | 
     # The nearest first, and of those the farthest along the path.
     for index in near[np.lexsort((-near, distances[near]))].tolist():
         vector = passed[index] - robot
-        steps = np.arange(distances[index] + 1, dtype=np.int32)[:, None]
-        way = robot + np.sign(vector) * np.minimum(steps, np.abs(vector))  # diagonal moves first
-        rest = np.concatenate([way, cells[following[index] :]], dtype=np.int32)
-        if legal_segments(rest[: len(way) + 1], grid, move_rule).all():
-            return rest
+        dx, dy = np.abs(vector)
+        steps = np.arange(dx + dy + 1)
+        ways = [np.minimum(steps[: max(dx, dy) + 1, None], (dx, dy))]  # diagonal moves first
+        if dx + dy <= REACH:  # past a corner that the path's segment grazes
+            ways.append(np.stack([np.minimum(steps, dx), np.maximum(steps - dx, 0)], axis=1))
+            ways.append(np.stack([np.maximum(steps - dy, 0), np.minimum(steps, dy)], axis=1))
+        for way in ways:
+            leaving = robot + np.sign(vector) * way, cells[following[index] :]
+            rest = np.concatenate(leaving, dtype=np.int32)
+            if legal_segments(rest[: len(way) + 1], grid, move_rule).all():
+                return rest
     return cells[:0]
 
 

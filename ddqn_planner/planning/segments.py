@@ -11,7 +11,6 @@ from ddqn_planner.compiled import compiled
 from ddqn_planner.grid import Cell, GridMap, MoveRule
 from ddqn_planner.grid.arguments import Cells, cells_inside
 from ddqn_planner.grid.grid_map import MULTIPLIERS, check_grid
-from ddqn_planner.planning.kernels import MOVE_X, MOVE_Y
 
 Path: TypeAlias = NDArray[np.int32]  # (N, 2): cells, joined by moves or by segments
 SAME_COST = 1 + 1e-9  # a path may cost so much more, and still as much: sums are rounded
@@ -71,24 +70,13 @@ def _layers(grid: GridMap, move_rule: MoveRule | str) -> tuple[Any, ...]:
 
 
 @compiled
-def _takes(dx: int, dy: int) -> int:
-    """Return the actions between which a segment lies, as bits."""
-    takes = 0
-    for action in range(8):
-        diagonal = MOVE_X[action] == np.sign(dx) and MOVE_Y[action] == np.sign(dy)
-        straight_x = MOVE_X[action] == (np.sign(dx) if abs(dx) >= abs(dy) else 0)
-        straight_y = MOVE_Y[action] == (np.sign(dy) if abs(dy) >= abs(dx) else 0)
-        takes |= int(diagonal or (straight_x and straight_y)) << action
-    return takes
-
-
-@compiled
 def _cost(x: int, y: int, last_x: int, last_y: int, begin: float, layers: Any) -> float:
     """Return the cost of a segment, infinity if it is not legal from a share of it on."""
     occupancy, forbidden, cost, slowness, cuts_corners, is_unit = layers
     dx, dy = last_x - x, last_y - y
     step_x, step_y = np.sign(dx), np.sign(dy)
-    takes = _takes(dx, dy) if forbidden.size else 0
+    angle = np.arctan2(dy, dx) * 4 / np.pi if forbidden.size else 0.0
+    takes = 1 << int(np.floor(angle + 1e-6)) % 8 | 1 << int(np.ceil(angle - 1e-6)) % 8
     # Positions on the segment count from 0 at its first point to `whole` at its last one: then all
     # crossings of edges of cells are whole numbers.
     width, height = max(abs(dx), 1), max(abs(dy), 1)
@@ -99,7 +87,7 @@ def _cost(x: int, y: int, last_x: int, last_y: int, begin: float, layers: Any) -
     while at < whole and legal:
         until = min(at_column, at_row, whole)
         blocked = occupancy[y, x]
-        if takes and until < whole:
+        if forbidden.size and until < whole:
             blocked |= (forbidden[y, x] & takes) != 0
         if at_column == at_row and until < whole and not cuts_corners:
             blocked |= occupancy[y, x + step_x] | occupancy[y + step_y, x]
