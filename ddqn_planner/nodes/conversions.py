@@ -112,15 +112,12 @@ def value_message(field: QField | None, grid: GridMap, header: Header) -> Occupa
     return occupancy_message(percent, grid.resolution, grid.origin, header)
 
 
-def path_message(
-    cells: Cells, grid: GridMap, header: Header, goal: Quaternion, is_dense: bool = False
-) -> Path:
-    """Make a path message, each pose facing the next, the last one as the goal; see `_along`."""
+def path_message(centres: Float64, yaws: Float64, header: Header, last: Quaternion) -> Path:
+    """Make a path message of what `along` returns; the last pose has an orientation of its own."""
     path, blank = Path(header=header), PoseStamped(header=header)
-    centres, yaws = _along(cells, grid, is_dense)
     # Poses in the same direction share a quaternion: most of an answer's time is making messages.
     towards = {yaw: quaternion(yaw) for yaw in {*yaws.tolist()}}
-    orientations = [*map(towards.get, yaws.tolist()), goal]
+    orientations = [*map(towards.get, yaws.tolist()), last]
     for (x, y), orientation in zip(centres.tolist(), orientations, strict=False):
         stamped = _copy(blank)
         stamped.pose = pose = _copy(blank.pose)
@@ -131,14 +128,7 @@ def path_message(
     return path
 
 
-def serialized_path(
-    cells: Cells, grid: GridMap, header: Header, goal: Quaternion, is_dense: bool = False
-) -> bytes:
-    """Return what `path_message` does, as it is sent, in a fiftieth of the time."""
-    return path_bytes(*_along(cells, grid, is_dense), header, goal)
-
-
-def _along(cells: Cells, grid: GridMap, is_dense: bool) -> tuple[Float64, Float64]:
+def along(cells: Cells, grid: GridMap, is_dense: bool = False) -> tuple[Float64, Float64]:
     """Return positions on a path (N, 2), at most a cell apart if dense, and headings (N - 1)."""
     x, y = np.asarray(cells, dtype=np.float64).reshape(-1, 2).T
     yaws = grid.origin[2] + np.arctan2(np.diff(y), np.diff(x))

@@ -17,13 +17,14 @@ from std_msgs.msg import Header
 
 from ddqn_planner.grid import GridMap
 from ddqn_planner.nodes.conversions import (
+    along,
     cell_from_pose,
     check_pose,
     grid_from_message,
     occupancy_message,
+    path_bytes,
     path_message,
     quaternion,
-    serialized_path,
     turns,
     value_message,
 )
@@ -141,7 +142,7 @@ def test_a_path_looks_ahead_and_ends_as_the_goal_and_is_the_same_serialized(
 ) -> None:
     grid = GridMap(np.zeros((2, 2)), 0.05, (1.5, -20.25, yaw))
     header = Header(frame_id=frame, stamp=Time(sec=5, nanosec=77))
-    path = path_message(cells, grid, header, quaternion(0.7), is_dense)
+    path = path_message(*along(cells, grid, is_dense), header, quaternion(0.7))
     assert all(each.header is header for each in [path, *path.poses])
     points = points_of(path)
     if is_dense:
@@ -158,8 +159,8 @@ def test_a_path_looks_ahead_and_ends_as_the_goal_and_is_the_same_serialized(
         looks = yaw_of(pose.pose.orientation)
         assert math.cos(looks - ahead) == pytest.approx(1.0) or here == there
     assert all(pose.pose.orientation == quaternion(0.7) for pose in path.poses[-1:])
-    how = cells, grid, header, quaternion(0.7), is_dense
-    sent = deserialize_message(serialized_path(*how), Path)
+    sent = path_bytes(*along(cells, grid, is_dense), header, quaternion(0.7))
+    sent = deserialize_message(sent, Path)
     assert [sent.header, *(pose.header for pose in sent.poses)] == [header] * (1 + len(points))
     for name, axes in (("position", "xyz"), ("orientation", "xyzw")):
         values, expected = (
