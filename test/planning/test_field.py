@@ -48,8 +48,10 @@ def test_the_path_is_the_same_whatever_was_asked_before(
     exact = shortest_distances(grid, goal, rule)
     for start in data.draw(st.lists(st.sampled_from(grid.free_cells()), min_size=1, max_size=5)):
         limit = data.draw(st.integers(0, 30))
-        while (plan := grown.rollout(start, limit)).status is PlanStatus.ROLLOUT_TRAPPED:
-            pass  # each call visits more cells
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(kernels, "CAPACITY", data.draw(st.sampled_from((9, kernels.CAPACITY))))
+            while (plan := grown.rollout(start, limit)).status is PlanStatus.ROLLOUT_TRAPPED:
+                pass  # each call visits more cells
         assert plan == whole.rollout(start) == fresh_field(grid, goal, rule).rollout(start)
         assert (plan.status is PlanStatus.NO_PATH) == np.isinf(exact[start[::-1]])
     assert_same(grown, whole)
@@ -305,7 +307,7 @@ def run_until(line: int, step: Callable[[], object]) -> None:
 
     before = sys.gettrace()
     with pytest.MonkeyPatch.context() as patch, suppress(MemoryError):
-        for name in ("_grow", "_wider", "take_back"):
+        for name in ("_grow", "_still_open", "_take_back"):
             patch.setattr(kernels, name, getattr(kernels, name).__wrapped__)
         sys.settrace(trace)
         try:
