@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import math
 import mmap
 import os
 from contextlib import suppress
 from typing import IO, Any
+from weakref import WeakSet
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,8 +17,12 @@ Box = tuple[slice, ...]  # rows and columns
 WHOLE: Box = (slice(None), slice(None))
 ORIGIN: Box = (slice(0, 0), slice(0, 0))
 
-SMALL = 2**18  # bytes of an array that is copied as fast
+SMALL = 2**22  # bytes of an array that is copied as fast, and read faster
+APART = 16  # rows or columns between what gets boxes of its own
+FEW = 8  # boxes: each takes as long as some thousand cells
 MOST = 32  # boxes by which a copy may differ from the array whose memory it shares
+LARGE = 64  # a box of more than one in so many of the cells is not shared
+MOST_ALIVE = 128  # copies that share memory: each takes one or two of a process's open files
 
 
 class _Pages(mmap.mmap):
@@ -27,11 +33,14 @@ class _Pages(mmap.mmap):
     written: tuple[tuple[Box, NDArray[Any]], ...]  # what differs from the file
 
 
+_alive: WeakSet[_Pages] = WeakSet()
+
+
 def replaced(array: NDArray[Any] | None, box: Box, values: NDArray[Any]) -> Any:
     """Return a copy with other values in a box."""
     if array is None:
         return None
-    if array.nbytes > SMALL:
+    if array.nbytes > SMALL and len(_alive) < MOST_ALIVE and cells_in(box) * LARGE < array.size:
         with suppress(OSError):  # too many files are open
             return _replaced_pages(array, box, np.array(values, dtype=array.dtype))
     array = array.copy()
@@ -50,10 +59,39 @@ def _replaced_pages(array: NDArray[Any], box: Box, values: NDArray[Any]) -> NDAr
         array.tofile(file)
     pages = _Pages(file.fileno(), array.nbytes, mmap.MAP_PRIVATE, mmap.PROT_READ | mmap.PROT_WRITE)
     pages.shape, pages.file, pages.written = array.shape, file, written
+    _alive.add(pages)
     copied: NDArray[Any] = np.ndarray(array.shape, array.dtype, pages)
     for where, what in written:
         copied[where] = what
     return copied
+
+
+def boxes_of(is_set: NDArray[np.bool_], apart: int = APART) -> list[Box]:
+    """Return at most `FEW` boxes that hold all that is True, and little else."""
+    boxes: list[Box] = [
+        (rows, columns)
+        for rows in _runs(np.any(is_set, axis=1), apart)
+        for columns in _runs(np.any(is_set[rows], axis=0), apart)
+    ]
+    return boxes if len(boxes) <= FEW else boxes_of(is_set, is_set.size)
+
+
+def _runs(is_set: NDArray[np.bool_], apart: int) -> list[slice]:
+    """Return where something is True, with gaps of so many others at most."""
+    places = np.flatnonzero(is_set)
+    runs = np.split(places, np.flatnonzero(np.diff(places) > apart) + 1)
+    return [slice(int(run[0]), int(run[-1]) + 1) for run in runs if run.size]
+
+
+def hull(boxes: list[Box]) -> Box:
+    """Return the least box that holds some."""
+    sides = zip(*boxes, strict=True)
+    return tuple(slice(min(s.start for s in of), max(s.stop for s in of)) for of in sides)
+
+
+def cells_in(box: Box) -> int:
+    """Return how many cells a box has."""
+    return math.prod(side.stop - side.start for side in box)
 
 
 def wider(box: Box, by: int, shape: tuple[int, ...]) -> Box:

@@ -35,10 +35,16 @@ class MoveCosts(NamedTuple):
     highest: float  # no possible move costs more
     straight: float  # no straight move costs less
     diagonal: float  # no diagonal move costs less
+    into: NDArray[np.uint8]  # (P,): as bits, the actions by which moves may lead into a cell
+    low: Array  # (L,): with terms, half of a move's multiplier is no less, for each cell; or empty
+    least: float = 1.0  # no multiplier on the map is less
 
     @classmethod
-    def of_table(cls, table_PA: Array) -> MoveCosts:
+    def of_table(cls, table_PA: Array, legal_PA: NDArray[np.bool_] | None = None) -> MoveCosts:
         """Return the costs that a table gives, and one more patch without moves; for no map yet."""
+        into = np.full(len(table_PA) + 1, 255, np.uint8)
+        if legal_PA is not None:  # where a move is legal, so is the one back
+            into[:-1] = np.packbits(np.roll(legal_PA, 4, axis=1), axis=1, bitorder="little")[:, 0]
         table_PA = np.pad(table_PA, ((0, 1), (0, 0)), constant_values=np.inf)
         highest = float(table_PA.max(where=np.isfinite(table_PA), initial=1))
         straight = float(table_PA[:, 0::2].min(initial=highest))
@@ -46,7 +52,7 @@ class MoveCosts(NamedTuple):
         table_PA = np.ascontiguousarray(table_PA)  # numba compiles again for another layout
         nowhere, none = np.empty(0, np.uint16), np.empty(0, np.float32)
         empty = nowhere, table_PA, np.empty(0, np.uint8), none.reshape(0, 0, 0), none
-        return cls(*empty, 0, highest, straight, diagonal)
+        return cls(*empty, 0, highest, straight, diagonal, into, none)
 
     def after(self, grid: GridMap, boxes: Sequence[Box]) -> MoveCosts | None:
         """Return the costs on a map that differs from theirs in boxes; None to look at it all."""
@@ -54,7 +60,7 @@ class MoveCosts(NamedTuple):
             return None
         shape = grid.height + 2, grid.width + 2
         patch, value, multiplier = self.patch.reshape(shape), self.value, self.multiplier
-        highest = self.highest
+        highest, least = self.highest, self.least
         for box in boxes:
             # The patches of the cells around see the box, too.
             around, seen = (wider(box, by, grid.occupancy.shape) for by in (1, 2))
@@ -66,27 +72,35 @@ class MoveCosts(NamedTuple):
                 multipliers = grid.multipliers_in(box)
                 greatest = self.table.max(where=np.isfinite(self.table), initial=1)
                 highest = max(highest, float(greatest * multipliers.max()))
+                least = min(least, float(multipliers.min()))
                 multiplier = replaced(multiplier.reshape(shape), inner, multipliers)
             if value.size and grid.cost is not None:
                 values = np.where(grid.occupancy[box], VALUES - 1, grid.cost[box] - UNKNOWN)
+                least = min(least, self._least(values.astype(np.uint8)))
                 value = replaced(value.reshape(shape), inner, values)
         cells = patch.ravel(), self.table, value.ravel(), self.terms, multiplier.ravel()
-        return MoveCosts(*cells, self.width, highest, *self[-2:])
+        return MoveCosts(*cells, self.width, highest, *self[-5:-1], least)
+
+    def _least(self, value: NDArray[np.uint8]) -> float:
+        """Return a multiplier that none on free cells is less than, given cells' values."""
+        cost = int((value - np.uint8(1)).min())  # that of an unknown cell is 255 here
+        return float(2 * self.low[min(cost, OCCUPIED) + 1])
 
     def on(self, grid: GridMap, patch: NDArray[Any]) -> MoveCosts:
         """Return the costs on a map, given its patches, with its directions and expected times."""
         costs = self._replace(patch=patch, width=grid.width + 2)
         if self.terms.size and grid.cost is not None:
-            costs = costs._replace(value=cell_values(grid.occupancy, grid.cost))
+            value = cell_values(grid.occupancy, grid.cost)
+            costs = costs._replace(value=value, least=self._least(value))
         if grid.forbidden is not None:
             patch, table = _with_directions(patch, self.table, np.pad(grid.forbidden, 1).ravel())
-            costs = costs._replace(patch=patch, table=table)
+            into = np.tile(self.into, len(table) // len(self.into))
+            costs = costs._replace(patch=patch, table=table, into=into)
         if grid.slowness is None:
             return costs
         multiplier = np.pad(grid.cost_multiplier, 1, constant_values=1).ravel()
-        return costs._replace(
-            multiplier=multiplier, highest=costs.highest * float(multiplier.max())
-        )
+        highest, least = costs.highest * float(multiplier.max()), float(grid.cost_multiplier.min())
+        return costs._replace(multiplier=multiplier, highest=highest, least=least)
 
 
 def _with_directions(

@@ -35,6 +35,7 @@ MOVE_X, MOVE_Y = MOVES.T.copy()
 
 # The lowest bit of a byte that is set.
 FIRST = np.array([0] + [(bits & -bits).bit_length() - 1 for bits in range(1, 256)], np.int8)
+ONE: Final = np.uint64(1)  # numba does not look whether an unsigned index counts from the end
 
 
 # What it takes of `MoveCosts`, their first fields, kernels take last: `*costs`.
@@ -52,18 +53,19 @@ def cost_of(
     """Return the cost of a move, infinite if it is not possible. See `MoveCosts`."""
     cost = table[patch[cell], action]
     if multiplier.size > 0:
-        after = cell + MOVE_Y[action] * width + MOVE_X[action]
+        after = np.int64(cell) + MOVE_Y[action] * width + MOVE_X[action]
         return cost * (np.float64(multiplier[cell]) + multiplier[after]) / 2
     if terms.size == 0 or cost == np.inf:
         return np.float64(cost)
     total = np.float32(0)
+    middle = np.uint64(cell) - np.uint64(width)
     for row in range(3):
-        middle = cell + (row - 1) * width
         total += (
-            terms[3 * row, value[middle - 1], action]
+            terms[3 * row, value[middle - ONE], action]
             + terms[3 * row + 1, value[middle], action]
-            + terms[3 * row + 2, value[middle + 1], action]
+            + terms[3 * row + 2, value[middle + ONE], action]
         )
+        middle += np.uint64(width)
     factor = np.float32(1) + total if total > 0 else np.float32(1)
     return np.float64(cost * (factor if factor < MAX_MULTIPLIER else np.float32(MAX_MULTIPLIER)))
 
@@ -82,9 +84,10 @@ def grow(
         # is enough: no move costs less than 1.
         bounds, buckets = (0.0, 0.0), 1
     else:  # lower bounds, whatever the rounding
-        bounds = costs.straight * (1 - 1e-7), costs.diagonal * (1 - 1e-7)
-        buckets = BUCKETS
-    ring, capacity = int((costs.highest + bounds[1]) * buckets) + 3, CAPACITY
+        least = costs.least * (1 - 1e-7)
+        bounds, buckets = (costs.straight * least, costs.diagonal * least), BUCKETS
+    # A power of 2, so that a slot takes no division.
+    ring, capacity = 1 << int((costs.highest + bounds[1]) * buckets + 2).bit_length(), CAPACITY
     how = start, bounds, buckets
     while True:
         order = np.empty(opened.size, np.int64)
@@ -92,7 +95,7 @@ def grow(
         first = np.argsort(order)
         order, opened = order[first], opened[first]
         bucket, count = np.empty((ring, capacity), np.int32), np.zeros(ring, np.int64)
-        places = opened, order, bucket, count, np.empty(8)
+        places = opened, order, bucket, count, costs.into, costs.low
         taken, visited, is_full = _grow(distance, state, *places, *how, limit, *costs[:6])
         limit, capacity = limit - visited, 4 * capacity
         found = np.empty(opened.size - taken + int(count.sum()), np.int32)
@@ -135,7 +138,8 @@ def _grow(
     order: NDArray[np.int64],
     bucket: NDArray[np.int32],
     count: NDArray[np.int64],
-    through: Distances,
+    into: NDArray[np.uint8],
+    low: NDArray[np.float32],
     start: int,
     bounds: Bounds,
     buckets: int,
@@ -143,8 +147,7 @@ def _grow(
     *costs: Any,
 ) -> tuple[int, int, bool]:
     """Do the work of `grow`, with the open cells in their order, until a bucket may be full."""
-    patch, table, _, terms, multiplier, width = costs
-    has_values = terms.size + multiplier.size > 0
+    patch, table, value, _, _, width = costs
     start_y, start_x = start // width, start % width
     ring, most = bucket.shape[0], bucket.shape[1] - 8
     taken, waiting, front, visited, is_full = 0, 0, 0, 0, False
@@ -156,7 +159,7 @@ def _grow(
         # Ties are closed too: so a rollout does not depend on what was asked before.
         if state[start] == CLOSED and distance[start] * (1 + 1e-6) * buckets < front:
             break
-        slot = front % ring
+        slot = front & (ring - 1)
         used = 0
         while not is_full:
             if taken < opened.size and order[taken] <= front:
@@ -174,40 +177,33 @@ def _grow(
             state[cell] = CLOSED
             visited += 1
             here = distance[cell]
-            # With values, the table has lower bounds: few moves need more than that.
-            better = 0
-            for action in range(8):
-                previous = cell - MOVE_Y[action] * width - MOVE_X[action]
-                through[action] = here + table[patch[previous], action]
-                known = distance[previous]
-                is_better = (through[action] < known) | ((known == 0) & (through[action] < np.inf))
-                better |= np.int64(is_better) << action
-            y = cell // width
-            x = cell - y * width
+            # With values, these are lower bounds: few moves need more than that.
+            better, legal = 0, into[patch[cell]]
+            while legal:
+                action = np.uint64(FIRST[legal])
+                legal &= legal - 1
+                previous = np.uint64(cell - MOVE_Y[action] * width - MOVE_X[action])
+                cost = table[patch[previous], action]
+                if low.size > 0:
+                    cost *= low[value[previous]] + low[value[cell]]
+                known = distance[previous] if distance[previous] > 0 else np.inf
+                better |= np.int64(here + cost < known) << np.int64(action)
             while better:
-                action = np.int64(FIRST[better])
+                action = np.uint64(FIRST[better])
                 better &= better - 1
-                previous = cell - MOVE_Y[action] * width - MOVE_X[action]
-                known, cost = distance[previous], through[action]
-                if has_values:
-                    cost = here + cost_of(previous, action, *costs)
-                    if cost >= known > 0:
-                        continue
-                remaining = _remaining(
-                    x - MOVE_X[action] - start_x, y - MOVE_Y[action] - start_y, bounds
-                )
-                new = np.int64((cost + remaining) * buckets)
-                old = np.int64((known + remaining) * buckets)
-                new = new if new > front else front
-                old = old if old > front else front
-                distance[previous] = cost
-                if state[previous] == OPEN and old == new:
+                number = cell - MOVE_Y[action] * width - MOVE_X[action]
+                previous = np.uint64(number)
+                known = distance[previous] if distance[previous] > 0 else np.inf
+                cost = here + cost_of(previous, action, *costs)
+                if cost >= known:
                     continue
-                state[previous] = OPEN
-                slot_of_new = new % ring
-                bucket[slot_of_new, count[slot_of_new]] = previous
-                count[slot_of_new] += 1
-                is_full |= count[slot_of_new] > most
+                distance[previous], state[previous] = cost, OPEN
+                x, y = number % width - start_x, number // width - start_y
+                new = np.int64((cost + _remaining(x, y, bounds)) * buckets)
+                new = (new if new > front else front) & (ring - 1)
+                bucket[new, count[new]] = previous
+                count[new] += 1
+                is_full |= count[new] > most
                 waiting += 1
         front += 1
     return taken, visited, is_full

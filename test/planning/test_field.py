@@ -238,11 +238,27 @@ def test_a_changed_map_uses_what_is_known_of_the_one_before() -> None:
     older, field = planner.q_field(grid, goal), fresh_field(changed, goal, MoveRule.ROBOT_SAFE)
     assert isinstance(older, DistanceField)
     known = np.count_nonzero(older.known.distance)
-    assert field.take_over(older, (0, 0))
+    changed_cells = fields.changed_cells(grid, changed, (0, 0))
+    assert changed_cells is not None
+    field.take_over(older, (0, 0), changed_cells)
     assert np.count_nonzero(field.known.distance) > 0.9 * known
     assert np.count_nonzero(older.known.distance) == 1  # it handed over its memory
     assert field.rollout(start) == fresh_field(changed, goal, MoveRule.ROBOT_SAFE).rollout(start)
     assert older.rollout(start).cells == before.cells  # and begins anew
+
+
+@pytest.mark.parametrize("slowness", [None, np.full((31, 31), 3)])
+def test_the_least_cost_on_a_map_is_that_of_its_patches_too(slowness: np.ndarray | None) -> None:
+    # Straight ahead each cell costs as much; around, three patches cost nothing.
+    grid = GridMap(np.zeros((31, 31)), cost=np.full((31, 31), 33), slowness=slowness)
+    planner, ends = new_planner(), ((0, 15), (30, 15))
+    assert len(planner.plan(grid, *ends).cells) == 31
+    for x, y, shape in ((0, 0, (31, 1)), (0, 0, (1, 31)), (30, 0, (31, 1))):
+        grid = grid.with_patch(np.zeros(shape), x, y, np.zeros(shape))
+    around = new_planner().plan(grid, *ends)
+    exact = shortest_distances(grid, ends[1], MoveRule.ROBOT_SAFE)[15, 0]
+    assert around.cost == pytest.approx(exact, rel=1e-3)
+    assert planner.plan(grid, *ends) == around
 
 
 def test_a_repair_that_takes_too_long_leaves_the_older_field_as_it_was() -> None:
@@ -254,7 +270,7 @@ def test_a_repair_that_takes_too_long_leaves_the_older_field_as_it_was() -> None
     changed = grid.with_patch(np.ones((1, 12)), 20, 29)  # a wall beside the goal
     start = (30, 32)
     assert planner.plan(changed, start, goal) == new_planner().plan(changed, start, goal)
-    assert planner.fields.find(grid, (goal,), MoveRule.ROBOT_SAFE) is older
+    assert planner.fields.find(grid, (goal,), MoveRule.ROBOT_SAFE) is None  # the place has changed
     assert older.rollout_if_known((0, 0)) == before
     assert_same(older, fresh_field(grid, goal, MoveRule.ROBOT_SAFE))
 
