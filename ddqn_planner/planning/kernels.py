@@ -34,8 +34,8 @@ SAME: Final = 1 + 1e-12  # paths cost the same up to this factor: sums of floats
 MOVE_X, MOVE_Y = MOVES.T.copy()
 
 # The lowest bit of a byte that is set.
-FIRST = np.array([0] + [(bits & -bits).bit_length() - 1 for bits in range(1, 256)], np.int8)
-ONE: Final = np.uint64(1)  # numba does not look whether an unsigned index counts from the end
+FIRST = np.array([0] + [(bits & -bits).bit_length() - 1 for bits in range(1, 256)], np.uint64)
+ONE: Final = np.uint64(1)  # unsigned, as numba then looks for no index that counts from the end
 
 
 # What it takes of `MoveCosts`, their first fields, kernels take last: `*costs`.
@@ -53,7 +53,7 @@ def cost_of(
     """Return the cost of a move, infinite if it is not possible. See `MoveCosts`."""
     cost = table[patch[cell], action]
     if multiplier.size > 0:
-        after = np.int64(cell) + MOVE_Y[action] * width + MOVE_X[action]
+        after = cell + MOVE_Y[action] * width + MOVE_X[action]
         return cost * (np.float64(multiplier[cell]) + multiplier[after]) / 2
     if terms.size == 0 or cost == np.inf:
         return np.float64(cost)
@@ -88,6 +88,7 @@ def grow(
         bounds, buckets = (costs.straight * least, costs.diagonal * least), BUCKETS
     # A power of 2, so that a slot takes no division.
     ring, capacity = 1 << int((costs.highest + bounds[1]) * buckets + 2).bit_length(), CAPACITY
+    offsets = (MOVE_Y * costs.width + MOVE_X).astype(np.uint64)
     how = start, bounds, buckets
     while True:
         order = np.empty(opened.size, np.int64)
@@ -95,7 +96,7 @@ def grow(
         first = np.argsort(order)
         order, opened = order[first], opened[first]
         bucket, count = np.empty((ring, capacity), np.int32), np.zeros(ring, np.int64)
-        places = opened, order, bucket, count, costs.into, costs.low
+        places = opened, order, bucket, count, costs.into, costs.low, offsets
         taken, visited, is_full = _grow(distance, state, *places, *how, limit, *costs[:6])
         limit, capacity = limit - visited, 4 * capacity
         found = np.empty(opened.size - taken + int(count.sum()), np.int32)
@@ -140,6 +141,7 @@ def _grow(
     count: NDArray[np.int64],
     into: NDArray[np.uint8],
     low: NDArray[np.float32],
+    offsets: NDArray[np.uint64],
     start: int,
     bounds: Bounds,
     buckets: int,
@@ -159,14 +161,14 @@ def _grow(
         # Ties are closed too: so a rollout does not depend on what was asked before.
         if state[start] == CLOSED and distance[start] * (1 + 1e-6) * buckets < front:
             break
-        slot = front & (ring - 1)
+        slot = np.uint64(front & (ring - 1))
         used = 0
         while not is_full:
             if taken < opened.size and order[taken] <= front:
-                cell = np.int64(opened[taken])
+                cell = np.uint64(opened[taken])
                 taken += 1
             elif used < count[slot]:
-                cell = np.int64(bucket[slot, used])
+                cell = np.uint64(bucket[slot, np.uint64(used)])
                 used += 1
                 waiting -= 1
             else:
@@ -178,30 +180,30 @@ def _grow(
             visited += 1
             here = distance[cell]
             # With values, these are lower bounds: few moves need more than that.
-            better, legal = 0, into[patch[cell]]
+            better, legal = np.uint64(0), np.uint64(into[patch[cell]])
             while legal:
-                action = np.uint64(FIRST[legal])
-                legal &= legal - 1
-                previous = np.uint64(cell - MOVE_Y[action] * width - MOVE_X[action])
+                action = FIRST[legal]
+                legal &= legal - ONE
+                previous = cell - offsets[action]
                 cost = table[patch[previous], action]
                 if low.size > 0:
                     cost *= low[value[previous]] + low[value[cell]]
                 known = distance[previous] if distance[previous] > 0 else np.inf
-                better |= np.int64(here + cost < known) << np.int64(action)
+                better |= np.uint64(here + cost < known) << action
+            x, y = np.int64(cell) % width - start_x, np.int64(cell) // width - start_y
             while better:
-                action = np.uint64(FIRST[better])
-                better &= better - 1
-                number = cell - MOVE_Y[action] * width - MOVE_X[action]
-                previous = np.uint64(number)
+                action = FIRST[better]
+                better &= better - ONE
+                previous = cell - offsets[action]
                 known = distance[previous] if distance[previous] > 0 else np.inf
-                cost = here + cost_of(previous, action, *costs)
+                cost = here + cost_of(np.int64(previous), np.int64(action), *costs)
                 if cost >= known:
                     continue
                 distance[previous], state[previous] = cost, OPEN
-                x, y = number % width - start_x, number // width - start_y
-                new = np.int64((cost + _remaining(x, y, bounds)) * buckets)
-                new = (new if new > front else front) & (ring - 1)
-                bucket[new, count[new]] = previous
+                remaining = _remaining(x - MOVE_X[action], y - MOVE_Y[action], bounds)
+                new = np.int64((cost + remaining) * buckets)
+                new = np.uint64((new if new > front else front) & (ring - 1))
+                bucket[new, np.uint64(count[new])] = previous
                 count[new] += 1
                 is_full |= count[new] > most
                 waiting += 1

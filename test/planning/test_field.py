@@ -275,6 +275,7 @@ def test_a_repair_that_takes_too_long_leaves_the_older_field_as_it_was() -> None
     assert_same(older, fresh_field(grid, goal, MoveRule.ROBOT_SAFE))
 
 
+@pytest.mark.filterwarnings("ignore:overflow encountered in scalar subtract")  # not where compiled
 @settings(max_examples=150)
 @given(GRIDS, RULES, st.booleans(), st.integers(0, 2), st.integers(1, 1500), st.data())
 def test_a_field_that_is_interrupted_anywhere_is_as_a_new_one(
