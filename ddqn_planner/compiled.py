@@ -82,11 +82,11 @@ def _import_numba() -> Any:
             dispatcher = compiling.data["dispatcher"]
             if self.is_due and dispatcher.py_func.__module__.startswith("ddqn_planner."):
                 self.is_due = False
-                kept = "the result is kept for the next start"
+                folder = dispatcher.stats.cache_path
                 lost = "set NUMBA_CACHE_DIR to a folder that can be written to keep the result"
                 logging.getLogger("ddqn_planner").warning(
-                    "ddqn_planner compiles its functions, which takes some seconds; %s",
-                    kept if dispatcher.stats.cache_path else lost,
+                    "ddqn_planner compiles its functions, %s",
+                    f"once, and keeps them in {folder}" if folder else f"at each start; {lost}",
                 )
 
         def on_end(self, compiling: Any) -> None:

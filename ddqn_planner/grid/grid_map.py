@@ -195,8 +195,7 @@ class GridMap:
             cost=costs,
             obstacles=replaced(self.obstacles, box, closed),
         )
-        occupied = self._occupied + np.count_nonzero(patch)
-        occupied -= np.count_nonzero(self.occupancy[box])
+        occupied = self._occupied + int(patch.sum()) - int(self.occupancy[box].sum())
         patches = *self._patches[1 - MAX_PATCHES :], (self._version, box)
         patched._set(_occupied=occupied, _patches=patches)
         return patched
@@ -277,9 +276,7 @@ class GridMap:
         # If a diagonal move needs both side cells free, two straight moves can replace it.
         reach = int(MoveRule(move_rule).cuts_corners)
         if reach not in self._labels:
-            # One layout, and a fresh array: numba compiles again for others and read-only ones.
-            free = np.logical_not(self.occupancy, order="C")
-            self._labels[reach] = component_labels(free, reach)
+            self._labels[reach] = component_labels(self.occupancy, reach)
         return self._labels[reach]
 
     def legal_moves(self, move_rule: MoveRule | str) -> NDArray[np.bool_]:
@@ -296,7 +293,9 @@ class GridMap:
             return np.isin(labels, labels[array[:, 1], array[:, 0]])
         reached = np.zeros(self.occupancy.shape, dtype=np.bool_)
         reached[array[:, 1], array[:, 0]] = True
-        flood(self.legal_moves(move_rule), reached, np.flatnonzero(reached), backward)
+        waiting, cells = np.empty(reached.size, np.int64), np.flatnonzero(reached)
+        waiting[: cells.size] = cells  # each cell waits at most once
+        flood(self.legal_moves(move_rule), reached, waiting, cells.size, backward)
         return reached
 
     @cached_property

@@ -68,6 +68,12 @@ class PlannerNode(ManagedNode):
         self._logged: tuple[object, ...] = ()
         self.deactivate()
 
+    def start(self) -> None:
+        """Configure the node; what is asked before the model is loaded waits for it."""
+        super().start()
+        self._refusal = None
+        self._replan.trigger()
+
     def configure(self) -> None:
         """Listen to the map and to where the robot is, and create what answers requests."""
         super().configure()
@@ -127,7 +133,7 @@ class PlannerNode(ManagedNode):
             self._model.load()
             await self._model.first()
             return self._model.planner is not None
-        if transition in ("deactivate", "shutdown"):
+        if transition != "activate":
             self._refusal = NOT_ACTIVE
             while self._answering:
                 await self._requests.next_look
@@ -201,6 +207,8 @@ class PlannerNode(ManagedNode):
 
     async def _plan_for_active_goal(self) -> None:
         await self._model.first()
+        if self._refusal is None and self.state == "inactive":
+            self.trigger_activate()
         active, goals = self._active, self._active.poses
         if not goals:
             return

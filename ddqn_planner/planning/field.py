@@ -189,10 +189,11 @@ class DistanceField(QField):
         ms = 1e3 * (time.perf_counter() - began)
         return Plan(PlanStatus.SUCCEEDED, path, move_rule=self.move_rule, rollout_ms=ms)
 
-    def take_over(
-        self, old: DistanceField, shift: Cell, changed: NDArray[np.int32], start: Cell | None = None
-    ) -> None:
-        """Repair and take what an older field of the place knows, unless to begin is quicker."""
+    def take_over(self, old: DistanceField, shift: Cell, start: Cell | None = None) -> bool:
+        """Repair and take what an older field knows, or begin if quicker; False for other maps."""
+        changed = changed_cells(old.grid, self.grid, shift)
+        if changed is None:
+            return False
         # For one start, repair and new field take turns, each time with four times the limit: the
         # quicker one wins. The older field then begins anew, or else stays as it is.
         most = max(REPAIRED, int(REPAIRED_SHARE * self.grid.occupancy.size))
@@ -206,12 +207,12 @@ class DistanceField(QField):
                 if kept:
                     opened = np.concatenate([opened, reopened])
                     self.known = Known(distance, state, opened, closed_is_final=False)
-                    return
+                    return True
                 limit *= 4
                 quicker = start is None or limit > most or self._reach(start, VISITS * limit)
                 if quicker or self.is_whole:
                     old.known = taken
-                    return
+                    return True
 
     def _whole(self) -> NDArray[np.float64]:
         """Return the distance of every cell of the padded map, 0 where there is none: (C,)."""

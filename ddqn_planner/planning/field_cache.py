@@ -9,14 +9,7 @@ from dataclasses import dataclass, field
 from ddqn_planner.grid import Cell, GridMap, MoveRule
 from ddqn_planner.model import QNetwork
 from ddqn_planner.model.move_costs import MoveCosts
-from ddqn_planner.planning.field import (
-    DistanceField,
-    Goals,
-    QField,
-    changed_cells,
-    network_field,
-    shift_between,
-)
+from ddqn_planner.planning.field import DistanceField, Goals, QField, network_field, shift_between
 
 CACHE_BYTES = 2**29  # for a planner's Q fields: 14 of 2000 x 2000 cells, at 9 bytes per cell
 ALWAYS_KEPT = 2  # fields, whatever their size: on a large map, too, a robot drives to and fro
@@ -117,9 +110,7 @@ class FieldCache:
             old_goals = tuple((x - shift[0], y - shift[1]) for x, y in new.goals)
             old = older.fields.get(old_goals)
             if isinstance(old, DistanceField):
-                changed = changed_cells(old.grid, new.grid, shift)
-                if changed is not None:
-                    new.take_over(old, shift, changed, start)
+                if new.take_over(old, shift, start):
                     with self._lock:  # the place will hardly be again what it was
                         older.fields.pop(old_goals, None)
                 return

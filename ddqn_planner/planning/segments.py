@@ -63,10 +63,12 @@ def legal_segments(
 def _layers(grid: GridMap, move_rule: MoveRule | str) -> tuple[Any, ...]:
     """Return what decides of a segment; empty arrays for missing layers, so that one code does."""
     rule = MoveRule(move_rule)
-    forbidden = np.empty((0, 0), np.uint8) if grid.forbidden is None else grid.forbidden
-    cost = np.empty((0, 0), np.int8) if grid.cost is None else grid.cost
-    slowness = np.empty((0, 0), np.float32) if grid.slowness is None else grid.slowness
-    return grid.occupancy, forbidden, cost, slowness, rule.cuts_corners, rule is MoveRule.UNIT
+    layers: list[Any] = [grid.forbidden, grid.cost, grid.slowness]
+    for index, kind in enumerate((np.uint8, np.int8, np.float32)):
+        if layers[index] is None:
+            layers[index] = np.empty((0, 0), kind)
+            layers[index].flags.writeable = False  # as those of maps
+    return grid.occupancy, *layers, rule.cuts_corners, rule is MoveRule.UNIT
 
 
 @compiled

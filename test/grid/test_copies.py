@@ -20,7 +20,8 @@ from ddqn_planner.grid.copies import boxes_of, cells_in, replaced
 def shared(monkeypatch: pytest.MonkeyPatch) -> None:
     """Let small arrays share their memory, too."""
     monkeypatch.setattr(copies, "SMALL", 0)
-    monkeypatch.setattr(copies, "LARGE", 0)
+    monkeypatch.setattr(copies, "LARGE", 1)
+    monkeypatch.setattr(copies, "BOX", 1)
 
 
 BOXES = st.tuples(st.integers(0, 9), st.integers(1, 10), st.integers(0, 9), st.integers(1, 10))
@@ -41,6 +42,18 @@ def test_each_copy_keeps_what_it_was_given_whatever_comes_after(
         expected.append(expected[before].copy())
         expected[-1][box] = values
     np.testing.assert_array_equal(copied, expected)
+
+
+def test_a_view_keeps_its_copy() -> None:
+    array, views = np.zeros((10, 10)), []
+    for number in range(1, 200):
+        array = replaced(array, (slice(number % 10, number % 10 + 1), slice(3, 5)), number)
+        views.append((array.ravel()[5:], array.copy().ravel()[5:], array.T[:2], array.T[:2].copy()))
+        if number % 3:
+            del views[number * 7 % len(views)]
+    for flat, flat_before, turned, turned_before in views:
+        np.testing.assert_array_equal(flat, flat_before)
+        np.testing.assert_array_equal(turned, turned_before)
 
 
 def open_files() -> int:
