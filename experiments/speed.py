@@ -162,6 +162,44 @@ def measure_replans(side: int) -> Iterator[bool]:
         yield report(figure, max(ratios), "x", 2.0)
 
 
+def measure_short_requests(side: int) -> Iterator[bool]:
+    """Compare a request of 15 cells on a new map of random costs with one on a map without."""
+    random, times = np.random.default_rng(0), []
+    occupancy = random.random((side, side)) < 0.2
+    occupancy[3:30, 3:30] = False
+    costs = None, random_costs(occupancy, random)
+    for _ in range(CHANGES):
+        maps = [GridMap(occupancy, cost=cost) for cost in costs]
+        times.append([timed(new_planner().plan, it, (5, 5), (20, 20), RULE)[0] for it in maps])
+    without, with_costs = medians(times)
+    name = f"{side}x{side}, 15 cells: {without:.2f} ms; with costs {with_costs:.2f}; ratio"
+    yield report(name, with_costs / without, "x", 2.0)
+
+
+def measure_repairs(sides: tuple[int, int], with_costs: bool) -> Iterator[bool]:
+    """Compare replans near the robot, patches included, on a large map with those on a small."""
+    known: list[list[Any]] = []
+    for side in sides:
+        random = np.random.default_rng(0)
+        occupancy = random.random((side, side)) < 0.2
+        occupancy[100:140, 100:140] = occupancy[500:503, 500:503] = False
+        grid = GridMap(occupancy, cost=random_costs(occupancy, random) if with_costs else None)
+        known.append([random, new_planner(), grid])
+        known[-1][1].plan(grid, (110, 110), (501, 501), RULE)
+
+    def repair(of_side: list[Any]) -> None:
+        random, planner, grid = of_side
+        (x, y), flipped = random.integers(112, 130, 2), random.choice(25, FLIPPED, replace=False)
+        patch = grid.occupancy[y : y + 5, x : x + 5].copy()
+        patch.flat[flipped] ^= True
+        of_side[2] = grid.with_patch(patch, x, y)
+        assert planner.plan(of_side[2], (110, 110), (501, 501), RULE).cells
+
+    small, large = medians([[timed(repair, it)[0] for it in known] for _ in range(CHANGES)])
+    name = f"{FLIPPED} cells near the robot{', costs' if with_costs else ''}: {small:.2f} ms"
+    yield report(f"{name} at {sides[0]}, {large:.2f} at {sides[1]}; ratio", large / small, "x", 1.5)
+
+
 def all_values(grid: GridMap, goal: Cell) -> QField:
     """Return a field whose value was asked for in every cell."""
     field = new_planner().q_field(grid, goal, RULE)
@@ -249,7 +287,9 @@ def main() -> int:
     missed = [*measure_paper_map(), *measure_training()]
     for side in (256, 1024):
         missed += measure_requests(side)
-    missed += measure_replans(1024)
+    missed += [*measure_short_requests(1024), *measure_replans(1024)]
+    for with_costs in (False, True):
+        missed += measure_repairs((1024, 4096), with_costs)
     for side in (256, 1024, 2048):
         missed += measure_straight_paths(side, MAP_KINDS)
     for side in (256, 1024, 2000):
