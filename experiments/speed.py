@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from random_maps import KINDS, Random, generate_map
 from stable_baselines3 import DQN
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
+from straight_paths import measure_straight_paths
 from tables import report
 from torch import nn
 
@@ -344,6 +345,8 @@ def main() -> int:
     for with_costs in (False, True):
         missed += measure_repairs((1024, 4096), with_costs)
     missed += measure_whole_fields(64, True, 30)
+    for side in (256, 1024, 2048):
+        missed += measure_straight_paths(side, MAP_KINDS)
     for side in (256, 1024, 2000):
         missed += [*measure_whole_fields(side, False, 20), *measure_whole_fields(side, True, 25)]
     return int(any(missed))
