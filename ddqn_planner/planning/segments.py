@@ -44,20 +44,20 @@ def simplify(cells: Cells, grid: GridMap, move_rule: MoveRule | str) -> tuple[Ce
 
 def straightened(path: Cells, grid: GridMap, move_rule: MoveRule | str) -> Path:
     """Do the work of `simplify` for a path of one cell or more."""
-    simple: Path = _straightened(np.array(path, np.int32), _layers(grid, move_rule))
-    return simple
+    # With 64 bits, whatever is computed with a cell has its type, and numba compiles once for it.
+    return _straightened(np.array(path, np.int64), _layers(grid, move_rule)).astype(np.int32)
 
 
 def cost_along(path: Cells, grid: GridMap, move_rule: MoveRule | str) -> float:
     """Return what a path of segments costs, legal or not: each cell counts by its share of it."""
-    return float(_cost_until(np.array(path, np.int32), _layers(grid, move_rule))[-1])
+    return float(_cost_until(np.array(path, np.int64), _layers(grid, move_rule))[-1])
 
 
 def legal_segments(
     path: Cells, grid: GridMap, move_rule: MoveRule | str, begin: float = 0.0
 ) -> NDArray[np.bool_]:
     """Return which segments are legal, see `simplify`, the first one from a share of it on."""
-    return _legal(np.array(path, np.int32), begin, _layers(grid, move_rule))
+    return _legal(np.array(path, np.int64), begin, _layers(grid, move_rule))
 
 
 def _layers(grid: GridMap, move_rule: MoveRule | str) -> tuple[Any, ...]:
