@@ -24,6 +24,7 @@ from ddqn_planner.grid import (
     shortest_distances,
     shortest_path,
 )
+from ddqn_planner.grid.moves import cells_along
 from ddqn_planner.planning import PlanRequest
 from ddqn_planner.planning.paths import (
     REACH,
@@ -98,12 +99,21 @@ def test_a_path_is_valid_if_all_of_it_from_the_cell_nearest_to_the_robot_on_is_l
     robot = data.draw(st.tuples(st.integers(-99, 99), st.integers(-99, 99)))
     after = data.draw(changed(grid))
     passed = cells_with_positions(path)
+    assert cells_along(np.array(path))[0].tolist() == [[*cell] for cell, _ in passed]
     _, position = min(passed, key=lambda entry: math.dist(entry[0], robot))
     segments = [*pairwise([*path, path[-1]])][int(position) :]
     expected = is_legal(*segments[0], after, rule, position % 1)
     expected &= all(is_legal(*segment, after, rule) for segment in segments[1:])
     assert is_path_valid(path, robot, after, rule) == expected
     assert is_path_valid(path, robot, grid, rule)
+
+
+def test_what_lies_behind_a_robot_on_a_segment_does_not_count() -> None:
+    grid, path, rule = GridMap(np.zeros((9, 31))), [(0, 2), (15, 5), (30, 7)], "robot_safe"
+    for blocked, is_free in (((2, 2), True), ((12, 4), False), ((24, 6), False)):
+        after = grid.with_patch([[True]], *blocked)
+        assert is_path_valid(path, (5, 3), after, rule) == is_free
+        assert (len(rest_of_path(path, (5, 3), after, rule)) > 0) == is_free
 
 
 def test_a_path_of_which_only_an_occupied_end_or_nothing_is_left_is_not_valid() -> None:

@@ -21,7 +21,9 @@ def test_a_segment_is_legal_and_costs_what_the_cells_are_in_which_it_lies(
     grid_and_cell: tuple[GridMap, Cell], rule: MoveRule, data: st.DataObject
 ) -> None:
     grid, first = grid_and_cell
-    last = data.draw(cells_of(grid), label="last")
+    far = min(grid.width - first[0], grid.height - first[1]) - 1
+    diagonal = st.integers(0, far).map(lambda by: (first[0] + by, first[1] + by))
+    last = data.draw(cells_of(grid) | diagonal, label="last")
     begin = data.draw(st.sampled_from([0.0, 0.0, 0.25, 0.625]), label="begin")
     (legal,) = legal_segments(np.array([first, last]), grid, rule, begin)
     assert legal == is_legal(first, last, grid, rule, Fraction(begin))
