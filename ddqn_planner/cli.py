@@ -319,6 +319,18 @@ def _read_drives(source: Path, options: Any) -> list[Drive]:
     raise ValueError(f"{source} is no folder, and ends in neither .csv nor .mcap; give one of them")
 
 
+def warm_up(parser: argparse.ArgumentParser, arguments: Sequence[str]) -> int:
+    """Compile all that plans need, so that no node compiles it. Run it where the nodes run."""
+    from ddqn_planner.warm_up import warm_up as stages
+
+    parser.add_argument("model", nargs="?", default="any_map", help="name or file")
+    planner, began = api.Planner.load(parser.parse_args(arguments).model), time.perf_counter()
+    for _ in stages(planner, learns=True):
+        pass
+    print(f"compiled, or loaded, in {time.perf_counter() - began:.1f} s")
+    return 0
+
+
 def _add_map_options(parser: argparse.ArgumentParser, move_rule: str | None) -> None:
     parser.add_argument("map", help="ROS map YAML, MovingAI .map, or name of a shipped map")
     for name in ("start", "goal"):
@@ -346,6 +358,7 @@ COMMANDS: Final = {
     "train": ("train a model on a map file", train),
     "train-any-map": ("train a model for any map on random maps", train_any_map),
     "certify": ("prove which moves a model takes for possible", certify),
+    "warm-up": ("compile what plans need, once after an installation", warm_up),
     "learn": ("learn from recorded drives how long places take", learn),
 }
 

@@ -115,7 +115,8 @@ class Drive:
 
 def path_seconds(cells: Sequence[Cell], slowness: Float64, grid: GridMap) -> float:
     """Return how long a path takes, without noise."""
-    return path_cost(cells, slowness.astype(np.float32), RULE) * grid.resolution / SPEED
+    x, y = np.transpose(cells)
+    return path_cost(cells, slowness[y, x], RULE) * grid.resolution / SPEED
 
 
 def drive(cells: Sequence[Cell], world: World, clock: float, random: Random) -> Drive:

@@ -55,7 +55,7 @@ def _signals_held_back() -> Iterator[None]:
 
 @contextmanager
 def running(*command: str) -> Iterator[subprocess.Popen[bytes]]:
-    """Run a command; at the end stop it as Ctrl-C would. To be used in the main thread."""
+    """Run a command; at the end ask it to stop. To be used in the main thread."""
     child = None
     try:
         # A signal inside Popen would lose the child that it has just begun.
@@ -65,7 +65,7 @@ def running(*command: str) -> Iterator[subprocess.Popen[bytes]]:
         yield child
     finally:
         if child is not None:
-            child.send_signal(signal.SIGINT)
+            child.terminate()  # not SIGINT: Python may drop that one while it imports modules
             try:
                 child.wait(timeout=STOP_TIMEOUT)
             except BaseException:

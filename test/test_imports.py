@@ -96,10 +96,10 @@ def test_compiling_is_announced_once_and_a_load_from_the_cache_is_not(tmp_path: 
     """
     environment = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path)}
     command = [sys.executable, "-c", code]
-    words = "ddqn_planner compiles its functions, which takes some seconds; the result is kept for "
-    for expected in (f"{words}the next start\n", ""):
+    for words in (f"ddqn_planner compiles its functions, once, and keeps them in {tmp_path}/", ""):
         done = subprocess.run(command, env=environment, check=True, capture_output=True, text=True)
-        assert done.stderr == expected
+        assert done.stderr.startswith(words)
+        assert done.stderr.count("\n") == bool(words)
 
 
 def test_where_no_folder_may_be_written_code_is_compiled_all_the_same(

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ddqn_planner.grid.arguments import OCCUPIED, UNKNOWN, Occupancy, as_number
-from ddqn_planner.grid.copies import WHOLE, wider, within
+from ddqn_planner.grid.copies import WHOLE, boxes_of, cells_in, hull, wider, within
 from ddqn_planner.grid.grid_map import MAX_COST_MULTIPLIER, GridMap, check_grid
 
 # Linear and exponential costs, with paths as long, kept no clearly greater distances.
@@ -102,18 +102,15 @@ def _inflate_changed(
     """Return what `inflate` returns, given what it returned for a map that has other cells."""
     boxes = grid.patches_since(before)
     if boxes is None:
-        differs = grid.differs(before, WHOLE, WHOLE)
-        ends = (
-            [np.flatnonzero(differs.any(axis=axis))[[0, -1]] for axis in (1, 0)]
-            if differs.any()
-            else []
-        )
-        boxes = [tuple(slice(first, last + 1) for first, last in ends)] if ends else []
+        boxes = boxes_of(grid.differs(before, WHOLE, WHOLE))
         layers = {"occupancy": inflated.occupancy, "cost": inflated.cost}
         inflated = grid.with_layers(**layers, obstacles=inflated.obstacles)
     # Farther away than this, an obstacle has no effect: the cost that it adds is rounded to 0.
     reach = body[0] + max(np.cbrt(2 * (OCCUPIED - 1) * body[1]) - 1, 0) * CLEARANCE_SCALE
     cells, shape = int(reach / grid.resolution) + 2, grid.occupancy.shape
+    windows = sum(cells_in(wider(box, 2 * cells, shape)) for box in boxes)
+    if boxes and windows > cells_in(wider(hull(boxes), 2 * cells, shape)):
+        boxes = [hull(boxes)]
     for box in boxes:
         near, window = wider(box, cells, shape), wider(box, 2 * cells, shape)
         given = None if grid.cost is None else grid.cost[window]

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import math
 import mmap
 import os
+from collections.abc import Sequence
 from contextlib import suppress
-from typing import IO, Any
+from typing import Any
+from weakref import ReferenceType, WeakSet, finalize
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,25 +18,40 @@ Box = tuple[slice, ...]  # rows and columns
 WHOLE: Box = (slice(None), slice(None))
 ORIGIN: Box = (slice(0, 0), slice(0, 0))
 
-SMALL = 2**18  # bytes of an array that is copied as fast
-MOST = 32  # boxes by which a copy may differ from the array whose memory it shares
+SMALL = 2**22  # bytes of an array that is copied as fast, and read faster
+APART = 16  # rows or columns between what gets boxes of its own
+FEW = 8  # boxes: each takes as long as some thousand cells
+BOX = 2**13  # cells that are copied as fast as a box is begun
+LARGE = 64  # copies share memory if they differ in less than one cell in so many
+MOST_ALIVE = 128  # copies that share memory: each takes one or two of a process's open files
+
+
+class _File(list["_Pages"]):
+    """An array in a file in memory, and its pages that are used no more."""
+
+    def __init__(self, array: NDArray[Any]) -> None:
+        super().__init__()
+        self.io, self.shape = os.fdopen(os.memfd_create("array"), "r+b", buffering=0), array.shape
+        array.tofile(self.io)
 
 
 class _Pages(mmap.mmap):
-    """An array in a file in memory; pages that are written are copied, and the file stays."""
+    """All of a file in memory; pages that are written are copied, and the file stays."""
 
-    shape: tuple[int, ...]
-    file: IO[bytes]
-    written: tuple[tuple[Box, NDArray[Any]], ...]  # what differs from the file
+    file: ReferenceType[_File]
+    written: tuple[Box, ...] = ()  # where they differ from the file
+
+
+_alive: WeakSet[_Pages] = WeakSet()
 
 
 def replaced(array: NDArray[Any] | None, box: Box, values: NDArray[Any]) -> Any:
     """Return a copy with other values in a box."""
     if array is None:
         return None
-    if array.nbytes > SMALL:
+    if array.nbytes > SMALL and len(_alive) < MOST_ALIVE and _effort([box]) * LARGE < array.size:
         with suppress(OSError):  # too many files are open
-            return _replaced_pages(array, box, np.array(values, dtype=array.dtype))
+            return _replaced_pages(array, box, values)
     array = array.copy()
     array[box] = values
     return array
@@ -42,18 +60,64 @@ def replaced(array: NDArray[Any] | None, box: Box, values: NDArray[Any]) -> Any:
 def _replaced_pages(array: NDArray[Any], box: Box, values: NDArray[Any]) -> NDArray[Any]:
     # Another view of all of it, as one of another shape, has it as its base.
     owner = array.base if isinstance(array.base, np.ndarray) else array
-    before = owner.base if owner.size == array.size else None
-    if isinstance(before, _Pages) and before.shape == array.shape and len(before.written) < MOST:
-        file, written = before.file, (*before.written, (box, values))
-    else:
-        file, written = os.fdopen(os.memfd_create("array"), "r+b", buffering=0), ((box, values),)
-        array.tofile(file)
-    pages = _Pages(file.fileno(), array.nbytes, mmap.MAP_PRIVATE, mmap.PROT_READ | mmap.PROT_WRITE)
-    pages.shape, pages.file, pages.written = array.shape, file, written
+    before: Any = owner.base if owner.size == array.size else None
+    file, written = None, tuple[Box, ...]()
+    if isinstance(before, _Pages) and _effort(before.written) * LARGE < array.size:
+        file, written = before.file(), before.written
+    if file is None or file.shape != array.shape:
+        file, written = _File(array), ()
+    try:  # to map and unmap them takes longer than the copy
+        pages = file.pop()
+    except IndexError:
+        pages = _Pages(file.io.fileno(), array.nbytes, access=mmap.ACCESS_COPY)
+        _alive.add(pages)
     copied: NDArray[Any] = np.ndarray(array.shape, array.dtype, pages)
-    for where, what in written:
-        copied[where] = what
+    for where in (*pages.written, *written):
+        copied[where] = array[where]
+    copied[box] = values
+    pages.file, pages.written = ReferenceType(file), _with(written, box)
+    finalize(copied, file.append, pages).atexit = False  # a view of the copy keeps it
     return copied
+
+
+def _with(boxes: tuple[Box, ...], box: Box) -> tuple[Box, ...]:
+    """Return boxes and one more, or one of them and it in a larger one."""
+    for number, other in enumerate(boxes):
+        if _effort([both := hull([other, box])]) <= _effort([other, box]):
+            return *boxes[:number], *boxes[number + 1 :], both
+    return *boxes, box
+
+
+def _effort(boxes: Sequence[Box]) -> int:
+    return sum(BOX + cells_in(box) for box in boxes)
+
+
+def boxes_of(is_set: NDArray[np.bool_], apart: int = APART) -> list[Box]:
+    """Return at most `FEW` boxes that hold all that is True, and little else."""
+    boxes: list[Box] = [
+        (rows, columns)
+        for rows in _runs(np.any(is_set, axis=1), apart)
+        for columns in _runs(np.any(is_set[rows], axis=0), apart)
+    ]
+    return boxes if len(boxes) <= FEW else boxes_of(is_set, is_set.size)
+
+
+def _runs(is_set: NDArray[np.bool_], apart: int) -> list[slice]:
+    """Return where something is True, with gaps of so many others at most."""
+    places = np.flatnonzero(is_set)
+    runs = np.split(places, np.flatnonzero(np.diff(places) > apart) + 1)
+    return [slice(int(run[0]), int(run[-1]) + 1) for run in runs if run.size]
+
+
+def hull(boxes: list[Box]) -> Box:
+    """Return the least box that holds some."""
+    sides = zip(*boxes, strict=True)
+    return tuple(slice(min(s.start for s in of), max(s.stop for s in of)) for of in sides)
+
+
+def cells_in(box: Box) -> int:
+    """Return how many cells a box has."""
+    return math.prod(side.stop - side.start for side in box)
 
 
 def wider(box: Box, by: int, shape: tuple[int, ...]) -> Box:

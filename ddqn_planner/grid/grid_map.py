@@ -195,7 +195,9 @@ class GridMap:
             cost=costs,
             obstacles=replaced(self.obstacles, box, closed),
         )
-        patched._set(_patches=(*self._patches[1 - MAX_PATCHES :], (self._version, box)))
+        occupied = self._occupied + int(patch.sum()) - int(self.occupancy[box].sum())
+        patches = *self._patches[1 - MAX_PATCHES :], (self._version, box)
+        patched._set(_occupied=occupied, _patches=patches)
         return patched
 
     def with_boxes_of(self, other: GridMap, boxes: Sequence[Box]) -> GridMap:
@@ -227,7 +229,7 @@ class GridMap:
         """Return the same map with other layers, which are neither checked nor copied."""
         stale = {"cost_multiplier", "fingerprint", "_version", "_patches"}
         if "occupancy" in layers:
-            stale |= {"_labels", "_checksum"}
+            stale |= {"_labels", "_occupied"}
         kept = {name: value for name, value in vars(self).items() if name not in stale}
         changed = object.__new__(GridMap)
         changed._set(**{**kept, **layers})
@@ -274,9 +276,7 @@ class GridMap:
         # If a diagonal move needs both side cells free, two straight moves can replace it.
         reach = int(MoveRule(move_rule).cuts_corners)
         if reach not in self._labels:
-            # One layout, and a fresh array: numba compiles again for others and read-only ones.
-            free = np.logical_not(self.occupancy, order="C")
-            self._labels[reach] = component_labels(free, reach)
+            self._labels[reach] = component_labels(self.occupancy, reach)
         return self._labels[reach]
 
     def legal_moves(self, move_rule: MoveRule | str) -> NDArray[np.bool_]:
@@ -293,7 +293,9 @@ class GridMap:
             return np.isin(labels, labels[array[:, 1], array[:, 0]])
         reached = np.zeros(self.occupancy.shape, dtype=np.bool_)
         reached[array[:, 1], array[:, 0]] = True
-        flood(self.legal_moves(move_rule), reached, np.flatnonzero(reached), backward)
+        waiting, cells = np.empty(reached.size, np.int64), np.flatnonzero(reached)
+        waiting[: cells.size] = cells  # each cell waits at most once
+        flood(self.legal_moves(move_rule), reached, waiting, cells.size, backward)
         return reached
 
     @cached_property
@@ -321,20 +323,19 @@ class GridMap:
         return digest.hexdigest()[:16]
 
     @cached_property
-    def _checksum(self) -> int:
-        """A sum that differs between most maps, and is quicker than to compare them."""
-        words = self.occupancy.ravel()[: self.occupancy.size // 8 * 8].view(np.uint64)
-        return int(words.sum())
+    def _occupied(self) -> int:
+        """How many cells are: other in most maps, and quicker than to compare them."""
+        return int(np.count_nonzero(self.occupancy))
 
     def same_cells(self, other: GridMap) -> bool:
         """Return whether all cells of two maps are equal, wherever the maps lie."""
         check_grid(other, "other")
+        if self._occupied != other._occupied:
+            return False
         boxes = self.patches_since(other)
         if boxes is not None:
-            return not any(self.differs(other, box, box).any() for box in boxes)
-        return self._checksum == other._checksum and all(
-            equal(getattr(self, name), getattr(other, name)) for name in LAYERS
-        )
+            return not any(self.differs(other, box, box).any() for box in reversed(boxes))
+        return all(equal(getattr(self, name), getattr(other, name)) for name in LAYERS)
 
     def differs(self, other: GridMap, box: Box, others_box: Box) -> NDArray[np.bool_]:
         """Return which cells of boxes of two maps with the same layers differ."""

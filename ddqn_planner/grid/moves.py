@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ddqn_planner.compiled import compiled
+from ddqn_planner.compiled import in_place
 from ddqn_planner.grid.arguments import Cell, Cells, Choice, Occupancy, cell_inside
 
 if TYPE_CHECKING:
@@ -143,23 +143,36 @@ def _dijkstra(grid: GridMap, goal: Cell, move_rule: MoveRule | str) -> Any:
     return dijkstra(graph, indices=y * grid.width + x, return_predecessors=True)
 
 
-@compiled
-def component_labels(free: Any, reach: int) -> Any:  # pragma: no cover
-    """Return (H, W) int32 labels, see `GridMap.labels`, by union-find over runs of free cells."""
+def component_labels(occupancy: Any, reach: int) -> Any:
+    """Return (H, W) int32 labels, see `GridMap.labels`."""
+    height, width = occupancy.shape
+    labels, edges = (
+        np.zeros((height, width), np.int32),
+        np.empty(height * (width + 1) + 1, np.int32),
+    )
+    parent, label_of_run = np.empty((2, edges.size // 2), np.int32)
+    ends = np.empty(height, np.int32)
+    _label(np.ascontiguousarray(occupancy), reach, labels, edges, parent, label_of_run, ends)
+    return labels
+
+
+@in_place
+def _label(
+    occupancy: Any, reach: int, labels: Any, edges: Any, parent: Any, label_of_run: Any, ends: Any
+) -> None:  # pragma: no cover
+    """Label free cells by union-find over runs of them."""
     # Run r of a row is from edges[2 * r] to before edges[2 * r + 1]. Runs of neighbouring rows are
-    # connected if they overlap when one of them is `reach` cells longer at both ends.
-    height, width = free.shape
-    edges = np.empty(height * (width + 1) + 1, dtype=np.int32)
+    # connected if they overlap when one of them is `reach` cells longer at both ends. `parent` is
+    # in a run's component, never after the run; `ends` has the first run after each row.
+    height, width = occupancy.shape
     edge_count = above = first = 0
-    parent = np.empty(len(edges) // 2, dtype=np.int32)  # in its component, never after the run
-    ends = np.empty(height, dtype=np.int32)  # of each row: the first run after it
     for y in range(height):
-        previous = False
+        previous = True
         for x in range(width):  # without a branch: on a random map, most would be mispredicted
             edges[edge_count] = x
-            edge_count += free[y, x] != previous
-            previous = free[y, x]
-        if previous:
+            edge_count += occupancy[y, x] != previous
+            previous = occupancy[y, x]
+        if not previous:
             edges[edge_count] = width
             edge_count += 1
         ends[y] = edge_count // 2
@@ -173,13 +186,14 @@ def component_labels(free: Any, reach: int) -> Any:  # pragma: no cover
                 while parent[other] != other:
                     parent[other] = parent[parent[other]]
                     other = parent[other]
-                parent[max(root, other)] = root = min(root, other)
+                if other < root:
+                    parent[root] = root = other
+                else:
+                    parent[other] = root
                 if edges[2 * above + 1] >= right:  # it may be connected to the next run too
                     break
                 above += 1
         above, first = first, ends[y]
-    labels = np.zeros((height, width), dtype=np.int32)
-    label_of_run = np.empty(first, dtype=np.int32)
     count = first = 0
     for y in range(height):
         for run in range(first, ends[y]):
@@ -188,18 +202,17 @@ def component_labels(free: Any, reach: int) -> Any:  # pragma: no cover
                 label_of_run[run] = count
             else:
                 label_of_run[run] = label_of_run[parent[run]]
-            labels[y, edges[2 * run] : edges[2 * run + 1]] = label_of_run[run]
+            for x in range(edges[2 * run], edges[2 * run + 1]):
+                labels[y, x] = label_of_run[run]
         first = ends[y]
-    return labels
 
 
-@compiled
-def flood(legal: Any, reached: Any, cells: Any, backward: bool) -> None:  # pragma: no cover
-    """Mark all cells to which legal moves lead from `cells` (numbers), or backward, from which."""
+@in_place
+def flood(
+    legal: Any, reached: Any, waiting: Any, count: int, backward: bool
+) -> None:  # pragma: no cover
+    """Mark all cells to which legal moves lead from those that wait, or backward, from which."""
     height, width = reached.shape
-    waiting = np.empty(height * width, dtype=np.int64)  # each cell waits at most once
-    count = cells.size
-    waiting[:count] = cells
     while count > 0:
         count -= 1
         y, x = waiting[count] // width, waiting[count] % width

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ddqn_planner.compiled import compiled
+from ddqn_planner.compiled import in_place
 from ddqn_planner.grid import MAX_COST_MULTIPLIER, OCCUPIED, UNKNOWN, GridMap, MoveRule, legal_moves
 from ddqn_planner.grid.copies import ORIGIN, Box, replaced, wider, within
 
@@ -25,69 +25,90 @@ class MoveCosts(NamedTuple):
     """The cost of each move of each cell, on a map with a border of one cell."""
 
     # It is table[patch[cell], action]. With terms, that is a length, times 1 + max(0, sum of them),
-    # at most MAX_MULTIPLIER; with values alone, it is multiplied by the mean of its two cells'.
+    # at most MAX_MULTIPLIER; with multipliers, it is multiplied by the mean of its two cells'.
     patch: NDArray[Any]  # (C,) uint16 or int32: the number of each cell's patch
     table: Array  # (P, 8) float32: at least 1; infinite where a move is not possible
-    value: Any  # (C,) uint8 for the terms, or float32 of 1 or more, or None
-    terms: Any  # (9, L, 8) float32: what each value of each cell of a patch adds, or None
+    value: NDArray[np.uint8]  # (C,), for the terms, or empty
+    terms: Array  # (9, L, 8) float32: what each value of each cell of a patch adds, or empty
+    multiplier: Array  # (C,) float32: 1 or more, or empty
     width: int  # columns of the padded map
     highest: float  # no possible move costs more
     straight: float  # no straight move costs less
     diagonal: float  # no diagonal move costs less
+    into: NDArray[np.uint8]  # (P,): as bits, the actions by which moves may lead into a cell
+    low: Array  # (L,): with terms, half of a move's multiplier is no less, for each cell; or empty
+    least: float = 1.0  # no multiplier on the map is less
 
     @classmethod
-    def of_table(cls, table_PA: Array) -> MoveCosts:
+    def of_table(cls, table_PA: Array, legal_PA: NDArray[np.bool_] | None = None) -> MoveCosts:
         """Return the costs that a table gives, and one more patch without moves; for no map yet."""
+        into = np.full(len(table_PA) + 1, 255, np.uint8)
+        if legal_PA is not None:  # where a move is legal, so is the one back
+            into[:-1] = np.packbits(np.roll(legal_PA, 4, axis=1), axis=1, bitorder="little")[:, 0]
         table_PA = np.pad(table_PA, ((0, 1), (0, 0)), constant_values=np.inf)
         highest = float(table_PA.max(where=np.isfinite(table_PA), initial=1))
         straight = float(table_PA[:, 0::2].min(initial=highest))
         diagonal = float(table_PA[:, 1::2].min(initial=2 * straight))
-        nowhere = np.empty(0, dtype=np.uint16)
-        return cls(nowhere, table_PA, None, None, 0, highest, straight, diagonal)
+        table_PA = np.ascontiguousarray(table_PA)  # numba compiles again for another layout
+        nowhere, none = np.empty(0, np.uint16), np.empty(0, np.float32)
+        empty = nowhere, table_PA, np.empty(0, np.uint8), none.reshape(0, 0, 0), none
+        return cls(*empty, 0, highest, straight, diagonal, into, none)
 
     def after(self, grid: GridMap, boxes: Sequence[Box]) -> MoveCosts | None:
         """Return the costs on a map that differs from theirs in boxes; None to look at it all."""
         if grid.forbidden is not None:  # its patches are others
             return None
         shape = grid.height + 2, grid.width + 2
-        patch, value, highest = self.patch.reshape(shape), self.value, self.highest
+        patch, value, multiplier = self.patch.reshape(shape), self.value, self.multiplier
+        highest, least = self.highest, self.least
         for box in boxes:
             # The patches of the cells around see the box, too.
             around, seen = (wider(box, by, grid.occupancy.shape) for by in (1, 2))
-            window = np.ascontiguousarray(grid.occupancy[seen])
+            window = grid.occupancy[seen]
             numbers = patch_numbers(window).reshape(window.shape[0] + 2, -1)
             patch = replaced(patch, within(around, ORIGIN, 1), numbers[within(around, seen, 1)])
-            if value is None:
-                continue
-            if self.terms is None:
-                values: NDArray[Any] = grid.multipliers_in(box)
+            inner = within(box, ORIGIN, 1)
+            if multiplier.size:
+                multipliers = grid.multipliers_in(box)
                 greatest = self.table.max(where=np.isfinite(self.table), initial=1)
-                highest = max(highest, float(greatest * values.max()))
-            elif grid.cost is not None:
+                highest = max(highest, float(greatest * multipliers.max()))
+                least = min(least, float(multipliers.min()))
+                multiplier = replaced(multiplier.reshape(shape), inner, multipliers)
+            if value.size and grid.cost is not None:
                 values = np.where(grid.occupancy[box], VALUES - 1, grid.cost[box] - UNKNOWN)
-            value = replaced(value.reshape(shape), within(box, ORIGIN, 1), values)
-        value = None if value is None else value.ravel()
-        return self._replace(patch=patch.ravel(), value=value, highest=highest)
+                least = min(least, self._least(values.astype(np.uint8)))
+                value = replaced(value.reshape(shape), inner, values)
+        cells = patch.ravel(), self.table, value.ravel(), self.terms, multiplier.ravel()
+        return MoveCosts(*cells, self.width, highest, *self[-5:-1], least)
+
+    def _least(self, value: NDArray[np.uint8]) -> float:
+        """Return a multiplier that none on free cells is less than, given cells' values."""
+        cost = int((value - np.uint8(1)).min())  # that of an unknown cell is 255 here
+        return float(2 * self.low[min(cost, OCCUPIED) + 1])
 
     def on(self, grid: GridMap, patch: NDArray[Any]) -> MoveCosts:
         """Return the costs on a map, given its patches, with its directions and expected times."""
         costs = self._replace(patch=patch, width=grid.width + 2)
-        if self.terms is not None and grid.cost is not None:
-            costs = costs._replace(value=cell_values(grid.occupancy, grid.cost))
+        if self.terms.size and grid.cost is not None:
+            value = cell_values(grid.occupancy, grid.cost)
+            costs = costs._replace(value=value, least=self._least(value))
         if grid.forbidden is not None:
             patch, table = _with_directions(patch, self.table, np.pad(grid.forbidden, 1).ravel())
-            costs = costs._replace(patch=patch, table=table)
+            into = np.tile(self.into, len(table) // len(self.into))
+            costs = costs._replace(patch=patch, table=table, into=into)
         if grid.slowness is None:
             return costs
         multiplier = np.pad(grid.cost_multiplier, 1, constant_values=1).ravel()
-        return costs._replace(value=multiplier, highest=costs.highest * float(multiplier.max()))
+        highest, least = costs.highest * float(multiplier.max()), float(grid.cost_multiplier.min())
+        return costs._replace(multiplier=multiplier, highest=highest, least=least)
 
 
 def _with_directions(
     patch_C: NDArray[Any], table_PA: Array, forbidden_C: NDArray[np.uint8]
 ) -> tuple[NDArray[Any], Array]:
     """Return patches and costs without forbidden moves: a copy of the table per set that occurs."""
-    occurs = _occurring(forbidden_C)
+    occurs = np.zeros(256, np.bool_)
+    _occurring(forbidden_C, occurs)
     sets = np.flatnonzero(occurs)
     is_forbidden_SA = (sets[:, None] >> np.arange(table_PA.shape[1]) & 1).astype(np.bool_)
     tables_SPA = np.where(is_forbidden_SA[:, None], np.float32(np.inf), table_PA)
@@ -98,48 +119,64 @@ def _with_directions(
     return rows_C, tables_SPA.reshape(-1, table_PA.shape[1])
 
 
-@compiled
-def _occurring(values: NDArray[np.uint8]) -> NDArray[np.bool_]:
-    """Return which values occur: (256,) bool."""
-    occurs = np.zeros(256, np.bool_)
+@in_place
+def _occurring(values: NDArray[np.uint8], occurs: NDArray[np.bool_]) -> None:
+    """Mark which values occur: (256,) bool."""
     for value in values:
         occurs[value] = True
-    return occurs
 
 
-@compiled
 def cell_values(occupancy: NDArray[np.bool_], cost: NDArray[np.int8]) -> NDArray[np.uint8]:
     """Return the value of each cell, see `VALUES`: (C,) uint8."""
-    height, width = occupancy.shape
-    values = np.empty((height + 2, width + 2), np.uint8)
-    values[0], values[height + 1] = VALUES - 1, VALUES - 1
-    for y in range(height):
-        here = values[y + 1]
-        here[0], here[width + 1] = VALUES - 1, VALUES - 1
-        for x in range(width):
-            here[x + 1] = VALUES - 1 if occupancy[y, x] else cost[y, x] - UNKNOWN
+    values = _with_border(occupancy, np.uint8, VALUES - 1)
+    _cell_values(occupancy, cost, values)
     return values.ravel()
 
 
-@compiled
+@in_place
+def _cell_values(
+    occupancy: NDArray[np.bool_], cost: NDArray[np.int8], values: NDArray[np.uint8]
+) -> None:
+    """Write the value of each cell inside the border."""
+    for y in range(occupancy.shape[0]):
+        for x in range(occupancy.shape[1]):
+            values[y + 1, x + 1] = VALUES - 1 if occupancy[y, x] else cost[y, x] - UNKNOWN
+
+
 def patch_numbers(occupancy: NDArray[np.bool_]) -> NDArray[np.uint16]:
     """Return each cell's patch: (C,) uint16, with bit 3 y + x where its cell (x, y) is occupied."""
+    numbers = _with_border(occupancy, np.uint16, OCCUPIED_PATCH)
+    rows = np.ones((3, numbers.shape[1]), np.uint8)  # all rows would be memory to fetch
+    occupancy = np.ascontiguousarray(occupancy).view()
+    occupancy.flags.writeable = False  # numba compiles again for one that can be written to
+    _patch_numbers(occupancy, rows, numbers)
+    return numbers.ravel()
+
+
+def _with_border(inside: NDArray[Any], kind: type, value: int) -> NDArray[Any]:
+    """Return an array with one more cell on each side, and a value in these alone."""
+    array = np.empty((inside.shape[0] + 2, inside.shape[1] + 2), kind)
+    array[0] = array[-1] = array[:, 0] = array[:, -1] = value
+    return array
+
+
+@in_place
+def _patch_numbers(
+    occupancy: NDArray[np.bool_], rows: NDArray[np.uint8], numbers: NDArray[np.uint16]
+) -> None:
+    """Write the number of each cell inside the border; three rows are known at a time."""
     height, width = occupancy.shape
-    rows = np.ones((3, width + 2), np.uint8)  # all rows would be memory to fetch
-    numbers = np.empty((height + 2, width + 2), np.uint16)
-    numbers[0], numbers[height + 1] = OCCUPIED_PATCH, OCCUPIED_PATCH
     for y in range(height + 1):
-        below, here, above, out = rows[(y + 2) % 3], rows[y % 3], rows[(y + 1) % 3], numbers[y]
+        below, here, above = (y + 2) % 3, y % 3, (y + 1) % 3
         for x in range(width):
-            above[x + 1] = occupancy[y, x] if y < height else 1
+            rows[above, x + 1] = occupancy[y, x] if y < height else 1
         if y == 0:
             continue
-        out[0], out[width + 1] = OCCUPIED_PATCH, OCCUPIED_PATCH
-        for x in range(1, width + 1):
-            bits = below[x - 1] + 2 * below[x] + 4 * below[x + 1] + 8 * here[x - 1]
-            bits += 32 * here[x + 1] + 64 * above[x - 1] + 128 * above[x] + 256 * above[x + 1]
-            out[x] = OCCUPIED_PATCH if here[x] else bits
-    return numbers.ravel()
+        for x in range(width):
+            bits = rows[below, x] + 2 * rows[below, x + 1] + 4 * rows[below, x + 2]
+            bits += 8 * rows[here, x] + 32 * rows[here, x + 2]
+            bits += 64 * rows[above, x] + 128 * rows[above, x + 1] + 256 * rows[above, x + 2]
+            numbers[y, x + 1] = OCCUPIED_PATCH if rows[here, x + 1] else bits
 
 
 def patches(occupancy: NDArray[np.bool_], cost: NDArray[np.int8] | None) -> NDArray[np.int8]:

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ddqn_planner.grid import MOVES, OCCUPIED, UNKNOWN, Cell, GridMap, MoveRule
+from ddqn_planner.grid.grid_map import MULTIPLIERS
 from ddqn_planner.model.certificate import MOVE_RULES, Certificate, certify
 from ddqn_planner.model.move_costs import (
     MAX_MULTIPLIER,
@@ -200,9 +201,10 @@ class PropagationQNetwork(QNetwork):
         patch_P9 = every_patch()
         table_PA = self._costs_of(patch_P9, move_rule, timed)
         table_PA[patch_P9[:, 4] == OCCUPIED] = np.inf
-        if not np.array_equal(np.isfinite(table_PA), legal_in_patches(patch_P9, move_rule)):
+        legal_PA = legal_in_patches(patch_P9, move_rule)
+        if not np.array_equal(np.isfinite(table_PA), legal_PA):
             return None
-        return MoveCosts.of_table(table_PA)
+        return MoveCosts.of_table(table_PA, legal_PA)
 
     def believed_costs(self, grid: GridMap, move_rule: MoveRule) -> MoveCosts:
         """Return the costs of a map's moves, right or not: Q is minus the cheapest path's cost."""
@@ -256,11 +258,12 @@ class AnyMapQNetwork(PropagationQNetwork):
     def _proved_costs(self, move_rule: MoveRule, with_costs: bool, timed: bool) -> MoveCosts | None:
         if not with_costs:
             return super()._proved_costs(move_rule, with_costs, timed)
-        if not self.certificate(move_rule).proved:
+        certificate = self.certificate(move_rule)
+        if not certificate.proved:
             return None
         legal_PA = legal_in_patches(every_patch(), move_rule)
         lengths_PA = np.where(legal_PA, move_rule.lengths, np.inf).astype(np.float32)
-        costs = MoveCosts.of_table(lengths_PA)
+        costs = MoveCosts.of_table(lengths_PA, legal_PA)
         # The layer is linear, so that its output is a sum over the patch's cells.
         weight_AI, bias_A = self.tensors["prices.weight"], self.tensors["prices.bias"]
         occupied_9A, cost_9A, unknown_9A = weight_AI[:, :27].T.reshape(3, 9, -1)
@@ -270,7 +273,10 @@ class AnyMapQNetwork(PropagationQNetwork):
         terms_9LA[4] += bias_A + weight_AI[:, 27] * move_rule.cuts_corners
         greatest = 1 + max(0.0, float(terms_9LA.max(axis=1).sum(axis=0).max()))
         highest = costs.highest * min(greatest, MAX_MULTIPLIER)
-        return costs._replace(terms=terms_9LA, highest=highest)
+        # What is proved of the sums bounds them from below by two values; they need no more often.
+        share = 1 - certificate.multiplier_error - 1e-5  # the sums are rounded
+        low_L = MULTIPLIERS.take(np.arange(UNKNOWN, OCCUPIED + 1), mode="wrap") * np.float32(share)
+        return costs._replace(terms=terms_9LA, highest=highest, low=np.maximum(low_L, 1) / 2)
 
 
 def _with_biases(weights: Mapping[str, tuple[int, ...]]) -> dict[str, tuple[int, ...]]:

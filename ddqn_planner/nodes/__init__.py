@@ -1,6 +1,7 @@
 """The three ROS 2 nodes and the message conversions; nothing else of the package imports rclpy."""
 
 import os
+import signal
 import sys
 from functools import partial
 from importlib import import_module
@@ -14,6 +15,9 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 def run(name: str) -> int:
     """Run a node; return its exit code, which is 1 if a library is missing."""
+    # Until the node listens to it, Ctrl-C ends the process: Python drops exceptions that a signal
+    # raises inside a callback of the import system, and then the node would start all the same.
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
     try:
         module = import_module(f"{__name__}.{name}")
     except ImportError as error:

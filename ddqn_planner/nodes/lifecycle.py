@@ -49,10 +49,9 @@ class ManagedNode(LifecycleNodeMixin, BaseNode):
         return str(self._state_machine.current_state[1])
 
     def start(self) -> None:
-        """Configure and activate the node; it raises what they raise."""
-        for trigger in (self.trigger_configure, self.trigger_activate):
-            if trigger() is not SUCCESS and self._error is not None:
-                raise self._error
+        """Configure the node; it raises what that raises."""
+        if self.trigger_configure() is not SUCCESS and self._error is not None:
+            raise self._error
 
     def destroy_node(self) -> None:
         """Free all that the node has, and destroy it, so that it leaves the graph at once."""

@@ -16,6 +16,7 @@ from std_msgs.msg import Header
 
 from ddqn_planner.grid import GridMap
 from ddqn_planner.grid.body import Inflation
+from ddqn_planner.grid.copies import boxes_of
 from ddqn_planner.nodes.conversions import grid_from_message, grid_from_values
 from ddqn_planner.nodes.report import Report, RequestError, seconds
 from ddqn_planner.nodes.runtime import LATCHED, BaseNode, Worker
@@ -129,13 +130,33 @@ class MapSource:
 
     def _take(self, message: OccupancyGrid) -> None:
         try:
-            grid = grid_from_message(message, *map(self._node.value, MAP_PARAMETERS))
+            grid = self._changed_map(message)
+            grid = grid or grid_from_message(message, *map(self._node.value, MAP_PARAMETERS))
         except ValueError as error:
             self._report.refuse("map", str(error))
             return
         self._newest = Received(message, message.header, time.monotonic())
         self._report.accept("map_updates")
         self._use(grid, self._newest)
+
+    def _changed_map(self, message: OccupancyGrid) -> GridMap | None:
+        """Return the map in use with what a message of the same place has else; None for others."""
+        last = self._newest
+        if last is None or last is not self._used or self._grid.forbidden is not None:
+            return None
+        if _place(message) != _place(last.message):
+            return None
+        grid, shape = self._grid, self._grid.occupancy.shape
+        both = message.data, last.message.data
+        new, old = (np.frombuffer(data, np.int8).reshape(shape) for data in both)
+        for box in boxes_of(new != old):
+            grid = self._patched(grid, new[box], box[1].start, box[0].start)
+        return grid
+
+    def _patched(self, grid: GridMap, values: NDArray[np.int8], x: int, y: int) -> GridMap:
+        rules = map(self._node.value, MAP_PARAMETERS)
+        patch = grid_from_values(values, 1.0, (0.0, 0.0, 0.0), *rules)
+        return grid.with_patch(patch.occupancy, x, y, patch.cost, patch.obstacles)
 
     def _take_directions(self, message: OccupancyGrid) -> None:
         with self._report.taking(DIRECTIONS):
@@ -190,10 +211,7 @@ class MapSource:
                 raise ValueError(f"an update came before a map; {REMEDY}")
             values = updated_values(newest.message, update)
             if newest is self._used:
-                rules = map(self._node.value, MAP_PARAMETERS)
-                patch = grid_from_values(values, 1.0, (0.0, 0.0, 0.0), *rules)
-                cells = patch.occupancy, update.x, update.y, patch.cost, patch.obstacles
-                self._grid = self._grid.with_patch(*cells)
+                self._grid = self._patched(self._grid, values, update.x, update.y)
         except (ValueError, MemoryError) as error:
             self._refused_updates = count = self._refused_updates + 1
             self._report.refuse("map_updates", str(error), log=False)
@@ -209,6 +227,11 @@ class MapSource:
         self._updates += 1
         if newest is self._used:
             self._changed()
+
+
+def _place(message: OccupancyGrid) -> tuple[Any, ...]:
+    info, size = message.info, len(message.data)
+    return message.header.frame_id, info.width, info.height, info.resolution, info.origin, size
 
 
 def updated_values(message: OccupancyGrid, update: Any) -> NDArray[np.int8]:

@@ -60,7 +60,7 @@ PLANNER_PARAMETERS: Final = {
         (0, 1000),
     ),
     "field_cache_bytes": Declared(
-        CACHE_BYTES, "Bytes for kept Q fields; the last always stays", (0, 2**40)
+        CACHE_BYTES, "Bytes for kept Q fields; the last two always stay", (0, 2**40)
     ),
     "planner_id": Declared("GridBased", "What Nav2's requests may name, or leave empty"),
     "follow_trainer": Declared(False, "Load what the trainer saves", read_only=True),

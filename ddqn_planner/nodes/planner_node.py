@@ -62,11 +62,17 @@ class PlannerNode(ManagedNode):
 
     def _forget(self) -> None:
         """Have no map and no goal, and refuse requests."""
-        self._is_configured = self._waits_for_pose = self._lacks_map = False
+        self._is_configured = self._waits_for_pose = False
         # What requests are answered, also those under way; None while the node is active.
         self._refusal: Outcome | None = NOT_ACTIVE
         self._logged: tuple[object, ...] = ()
         self.deactivate()
+
+    def start(self) -> None:
+        """Configure the node; what is asked before the model is loaded waits for it."""
+        super().start()
+        self._refusal = None
+        self._replan.trigger()
 
     def configure(self) -> None:
         """Listen to the map and to where the robot is, and create what answers requests."""
@@ -127,7 +133,7 @@ class PlannerNode(ManagedNode):
             self._model.load()
             await self._model.first()
             return self._model.planner is not None
-        if transition in ("deactivate", "shutdown"):
+        if transition != "activate":
             self._refusal = NOT_ACTIVE
             while self._answering:
                 await self._requests.next_look
@@ -199,6 +205,8 @@ class PlannerNode(ManagedNode):
 
     async def _plan_for_active_goal(self) -> None:
         await self._model.first()
+        if self._refusal is None and self.state == "inactive":
+            self.trigger_activate()
         active, goals = self._active, self._active.poses
         if not goals:
             return
@@ -288,9 +296,8 @@ class PlannerNode(ManagedNode):
     def _look_for_news(self) -> None:
         self._requests.look_again()
         self._start.transform()
-        lacked, self._lacks_map = self._lacks_map, bool(self._map.missing)
-        is_due = self._active.is_look_due(self._settings.replan_period)
-        is_due |= self._lacks_map and not lacked  # a costmap stopped: its path is taken back
+        period, lacks_map = self._settings.replan_period, bool(self._map.missing)
+        is_due = self._active.is_look_due(period, lacks_map)
         if self._waits_for_pose and self._active.poses:
             with suppress(RequestError):
                 for pose in (self._start.pose(), *self._active.poses):

@@ -31,6 +31,7 @@ from ddqn_planner.planning import Plan, PlanMethod, Planner, PlanRequest, PlanSt
 from ddqn_planner.planning.field import shift_between
 from ddqn_planner.planning.paths import is_path_valid, rest_of_path
 from ddqn_planner.planning.plan import joined
+from ddqn_planner.warm_up import warm_up
 
 UNCHANGED = Outcome("UNCHANGED", "the active goal needs no new plan")
 
@@ -74,9 +75,10 @@ class ActiveGoal:
         self._shown: tuple[str, str] | None = None
         self._looks, self._next_look = False, 0.0
 
-    def is_look_due(self, replan_period: float) -> bool:
+    def is_look_due(self, replan_period: float, lacks_map: bool) -> bool:
         """Return whether it is time to look if something changed; the next plan does then."""
-        is_due = bool(self.poses) and time.monotonic() >= self._next_look
+        stopped = lacks_map and self._planned is not None  # a costmap: its path is taken back
+        is_due = bool(self.poses) and (stopped or time.monotonic() >= self._next_look)
         if is_due:
             self._looks, self._next_look = True, time.monotonic() + replan_period
         return is_due
@@ -123,21 +125,23 @@ class ModelSource:
         self.loading: Future | None = None
 
     @staticmethod
-    def read(model: str, warms_up: bool = False) -> tuple[Planner, str]:
-        """Return a model's planner and file; warm up the libraries and functions of plans."""
+    def read(model: str) -> tuple[Planner, str]:
+        """Return a model's planner and file."""
         path = find_model(model)
-        planner = Planner.load(path)
-        if warms_up:
-            sizes = planner.metadata.sizes
-            shape = sizes.get("height", 3), sizes.get("width", 3)
-            corner = shape[1] - 1, shape[0] - 1
-            planner.plan(GridMap(np.zeros(shape, dtype=np.bool_)), (0, 0), corner)
-            gc.freeze()  # a collection of all that would stop the node for 45 ms
-        return planner, str(path)
+        return Planner.load(path), str(path)
 
     def load(self) -> None:
-        """Begin to load the first model."""
-        self.loading = self._worker.call(self.read, self._node.value("model"), True)
+        """Begin to load the first model, and to compile what many requests need."""
+
+        def read() -> tuple[Planner, str]:
+            planner, file = self.read(self._node.value("model"))
+            compiling = warm_up(planner, self._node.value("follow_trainer"))
+            next(compiling)
+            gc.freeze()  # a collection of all that would stop the node for 45 ms
+            Worker(self._node).call(next, compiling)  # the rest
+            return planner, file
+
+        self.loading = self._worker.call(read)
 
     async def first(self) -> None:
         """Wait for the first model, and use it unless another one was set since."""

@@ -190,7 +190,7 @@ class DistanceField(QField):
         return Plan(PlanStatus.SUCCEEDED, path, move_rule=self.move_rule, rollout_ms=ms)
 
     def take_over(self, old: DistanceField, shift: Cell, start: Cell | None = None) -> bool:
-        """Repair and take what an older field of the place knows, unless to begin is quicker."""
+        """Repair and take what an older field knows, or begin if quicker; False for other maps."""
         changed = changed_cells(old.grid, self.grid, shift)
         if changed is None:
             return False
@@ -212,7 +212,7 @@ class DistanceField(QField):
                 quicker = start is None or limit > most or self._reach(start, VISITS * limit)
                 if quicker or self.is_whole:
                     old.known = taken
-                    return False
+                    return True
 
     def _whole(self) -> NDArray[np.float64]:
         """Return the distance of every cell of the padded map, 0 where there is none: (C,)."""

@@ -12,6 +12,7 @@ from ddqn_planner.model.move_costs import MoveCosts
 from ddqn_planner.planning.field import DistanceField, Goals, QField, network_field, shift_between
 
 CACHE_BYTES = 2**29  # for a planner's Q fields: 14 of 2000 x 2000 cells, at 9 bytes per cell
+ALWAYS_KEPT = 2  # fields, whatever their size: on a large map, too, a robot drives to and fro
 
 
 @dataclass(eq=False)
@@ -35,7 +36,7 @@ class FieldCache:
 
     def __init__(self, network: QNetwork) -> None:
         self.network = network
-        self.nbytes = CACHE_BYTES  # the field used last is always kept
+        self.nbytes = CACHE_BYTES
         self._maps: list[_KnownMap] = []  # used last at the end
         self._lock = threading.Lock()
 
@@ -68,11 +69,8 @@ class FieldCache:
 
     def _known_map(self, grid: GridMap, rule: MoveRule) -> _KnownMap | None:
         """Return what is known of an equal map."""
-        maps = [known for known in reversed(self._maps) if known.move_rule is rule]
-        # To compare a map with those that it is a patch of is quick, and enough.
-        earlier = [known for known in maps if grid.patches_since(known.grid) is not None]
-        for known in earlier or maps:
-            if grid.same_cells(known.grid):
+        for known in reversed(self._maps):
+            if known.move_rule is rule and grid.same_cells(known.grid):
                 known.grid = grid  # which may lie elsewhere
                 return known
         return None
@@ -113,7 +111,7 @@ class FieldCache:
             old = older.fields.get(old_goals)
             if isinstance(old, DistanceField):
                 if new.take_over(old, shift, start):
-                    with self._lock:
+                    with self._lock:  # the place will hardly be again what it was
                         older.fields.pop(old_goals, None)
                 return
 
@@ -122,7 +120,8 @@ class FieldCache:
         with self._lock:
             self._use(known, used)
             size = sum(other.nbytes for other in self._maps)
-            while size > self.nbytes and (len(self._maps) > 1 or len(known.fields) > 1):
+            count = sum(len(other.fields) for other in self._maps)
+            while size > self.nbytes and (count := count - 1) >= ALWAYS_KEPT:
                 _, forgotten = self._maps[0].fields.popitem(last=False)
                 size -= forgotten.nbytes
                 if not self._maps[0].fields:

@@ -1,14 +1,16 @@
 """How values spread from the goal over a map, how they are repaired and read: in compiled code."""
 
+# To compile takes time at the first start of an installation, most of all memory that a kernel
+# allocates, slices, and `min`, `max` and `int`. So arrays are passed in, empty ones for none.
+
 from __future__ import annotations
 
-import heapq
 from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ddqn_planner.compiled import compiled
+from ddqn_planner.compiled import in_place, inlined
 from ddqn_planner.grid import MOVES
 from ddqn_planner.model.move_costs import MAX_MULTIPLIER, MoveCosts
 
@@ -25,38 +27,47 @@ Bounds = tuple[float, float]
 UNREACHED, OPEN, CLOSED, MARKED = 0, 1, 2, 4
 
 AT_GOAL: Final = 5e-324  # the goal's distance: not 0, and as good as 0 in every sum
+CAPACITY = 1000  # cells of a bucket, at first; not a power of 2, as those share lines of caches
 BUCKETS: Final = 2  # per unit of cost; more mean fewer visits of cells that a start does not need
 SAME: Final = 1 + 1e-12  # paths cost the same up to this factor: sums of floats are rounded
 
 MOVE_X, MOVE_Y = MOVES.T.copy()
 
 # The lowest bit of a byte that is set.
-FIRST = np.array([0] + [(bits & -bits).bit_length() - 1 for bits in range(1, 256)], np.int8)
+FIRST = np.array([0] + [(bits & -bits).bit_length() - 1 for bits in range(1, 256)], np.uint64)
+ONE: Final = np.uint64(1)  # unsigned, as numba then looks for no index that counts from the end
 
 
-@compiled
+# What it takes of `MoveCosts`, their first fields, kernels take last: `*costs`.
+@inlined
 def cost_of(
-    patch: Any, table: Any, value: Any, terms: Any, width: int, cell: int, action: int
+    cell: int,
+    action: int,
+    patch: Any,
+    table: Any,
+    value: Any,
+    terms: Any,
+    multiplier: Any,
+    width: int,
 ) -> Any:
     """Return the cost of a move, infinite if it is not possible. See `MoveCosts`."""
     cost = table[patch[cell], action]
-    if terms is None:
-        if value is None:
-            return cost
+    if multiplier.size > 0:
         after = cell + MOVE_Y[action] * width + MOVE_X[action]
-        return cost * (np.float64(value[cell]) + value[after]) / 2
-    if cost == np.inf:
-        return cost
+        return cost * (np.float64(multiplier[cell]) + multiplier[after]) / 2
+    if terms.size == 0 or cost == np.inf:
+        return np.float64(cost)
     total = np.float32(0)
+    middle = np.uint64(cell) - np.uint64(width)
     for row in range(3):
-        middle = cell + (row - 1) * width
         total += (
-            terms[3 * row, value[middle - 1], action]
+            terms[3 * row, value[middle - ONE], action]
             + terms[3 * row + 1, value[middle], action]
-            + terms[3 * row + 2, value[middle + 1], action]
+            + terms[3 * row + 2, value[middle + ONE], action]
         )
-    multiplier = np.float32(1) + max(total, np.float32(0))
-    return cost * min(multiplier, np.float32(MAX_MULTIPLIER))
+        middle += np.uint64(width)
+    factor = np.float32(1) + total if total > 0 else np.float32(1)
+    return np.float64(cost * (factor if factor < MAX_MULTIPLIER else np.float32(MAX_MULTIPLIER)))
 
 
 # The wavefront
@@ -73,273 +84,292 @@ def grow(
         # is enough: no move costs less than 1.
         bounds, buckets = (0.0, 0.0), 1
     else:  # lower bounds, whatever the rounding
-        bounds = costs.straight * (1 - 1e-7), costs.diagonal * (1 - 1e-7)
-        buckets = BUCKETS
-    order = _orders(distance, opened, costs.width, start, bounds, buckets)
-    first = np.argsort(order)
-    order, opened = order[first], opened[first]
-    return _grow(distance, state, opened, order, costs, start, bounds, buckets, limit)
+        least = costs.least * (1 - 1e-7)
+        bounds, buckets = (costs.straight * least, costs.diagonal * least), BUCKETS
+    # A power of 2, so that a slot takes no division.
+    ring, capacity = 1 << int((costs.highest + bounds[1]) * buckets + 2).bit_length(), CAPACITY
+    offsets = (MOVE_Y * costs.width + MOVE_X).astype(np.uint64)
+    how = start, bounds, buckets
+    while True:
+        order = np.empty(opened.size, np.int64)
+        _orders(distance, opened, costs.width, *how, order)
+        first = np.argsort(order)
+        order, opened = order[first], opened[first]
+        bucket, count = np.empty((ring, capacity), np.int32), np.zeros(ring, np.int64)
+        places = opened, order, bucket, count, costs.into, costs.low, offsets
+        taken, visited, is_full = _grow(distance, state, *places, *how, limit, *costs[:6])
+        limit, capacity = limit - visited, 4 * capacity
+        found = np.empty(opened.size - taken + int(count.sum()), np.int32)
+        opened = found[: _still_open(state, opened, taken, bucket, count, found)]
+        if not is_full:
+            return opened, limit >= 0
 
 
-@compiled
+@in_place
 def _orders(
-    distance: Distances, opened: Cells, width: int, start: int, bounds: Bounds, buckets: int
-) -> NDArray[np.int64]:
-    """Return the bucket of each open cell, in the order of A*."""
-    order = np.empty(opened.size, np.int64)
+    distance: Distances,
+    opened: Cells,
+    width: int,
+    start: int,
+    bounds: Bounds,
+    buckets: int,
+    order: NDArray[np.int64],
+) -> None:
+    """Write the bucket of each open cell, in the order of A*."""
     for number in range(opened.size):
-        cell = opened[number]
+        cell = np.int64(opened[number])
         x, y = cell % width - start % width, cell // width - start // width
-        order[number] = (distance[cell] + _remaining(x, y, bounds)) * buckets
-    return order
+        remaining = _remaining(x, y, bounds)
+        order[number] = np.int64((distance[cell] + remaining) * buckets)
 
 
-@compiled
+@inlined
 def _remaining(x: int, y: int, bounds: Bounds) -> float:
     """Return the least cost of moves over (x, y), given a straight and a diagonal one's."""
     x, y = abs(x), abs(y)
-    both = min(x, y)
-    return bounds[0] * (max(x, y) - both) + bounds[1] * both
+    both = x if x < y else y
+    return bounds[0] * (x + y - 2 * both) + bounds[1] * both
 
 
-@compiled
+@in_place
 def _grow(
     distance: Distances,
     state: States,
     opened: Cells,
     order: NDArray[np.int64],
-    costs: MoveCosts,
+    bucket: NDArray[np.int32],
+    count: NDArray[np.int64],
+    into: NDArray[np.uint8],
+    low: NDArray[np.float32],
+    offsets: NDArray[np.uint64],
     start: int,
     bounds: Bounds,
     buckets: int,
     limit: int,
-) -> tuple[Cells, bool]:
-    """Do the work of `grow`, with the open cells in their order."""
-    patch, table, value, terms, width = costs[:5]
-    offsets = MOVE_Y * width + MOVE_X
+    *costs: Any,
+) -> tuple[int, int, bool]:
+    """Do the work of `grow`, with the open cells in their order, until a bucket may be full."""
+    patch, table, value, _, _, width = costs
     start_y, start_x = start // width, start % width
-    ring = int((costs.highest + bounds[1]) * buckets) + 3
-    capacity = 256
-    bucket = np.empty((ring, capacity), np.int32)
-    count = np.zeros(ring, np.int64)
-    through = np.empty(8)
-    taken, waiting, front, visited = 0, 0, 0, 0
-    while visited <= limit:
+    ring, most = bucket.shape[0], bucket.shape[1] - 8
+    taken, waiting, front, visited, is_full = 0, 0, 0, 0, False
+    while visited <= limit and not is_full:
         if waiting == 0:
             if taken == opened.size:
                 break
-            front = max(front, order[taken])
+            front = order[taken] if order[taken] > front else front
         # Ties are closed too: so a rollout does not depend on what was asked before.
         if state[start] == CLOSED and distance[start] * (1 + 1e-6) * buckets < front:
             break
-        slot = front % ring
+        slot = np.uint64(front & (ring - 1))
         used = 0
-        while True:
+        while not is_full:
             if taken < opened.size and order[taken] <= front:
-                cell = opened[taken]
+                cell = np.uint64(opened[taken])
                 taken += 1
             elif used < count[slot]:
-                cell = bucket[slot, used]
+                cell = np.uint64(bucket[slot, np.uint64(used)])
                 used += 1
                 waiting -= 1
             else:
+                count[slot] = 0
                 break
             if state[cell] != OPEN:
                 continue
             state[cell] = CLOSED
             visited += 1
             here = distance[cell]
-            # With values, the table has lower bounds: few moves need more than that.
-            better = 0
-            for action in range(8):
+            # With values, these are lower bounds: few moves need more than that.
+            better, legal = np.uint64(0), np.uint64(into[patch[cell]])
+            while legal:
+                action = FIRST[legal]
+                legal &= legal - ONE
                 previous = cell - offsets[action]
-                through[action] = here + table[patch[previous], action]
-                known = distance[previous]
-                is_better = (through[action] < known) | ((known == 0) & (through[action] < np.inf))
-                better |= int(is_better) << action
-            y = cell // width
-            x = cell - y * width
+                cost = table[patch[previous], action]
+                if low.size > 0:
+                    cost *= low[value[previous]] + low[value[cell]]
+                known = distance[previous] if distance[previous] > 0 else np.inf
+                better |= np.uint64(here + cost < known) << action
+            x, y = np.int64(cell) % width - start_x, np.int64(cell) // width - start_y
             while better:
                 action = FIRST[better]
-                better &= better - 1
+                better &= better - ONE
                 previous = cell - offsets[action]
-                known, cost = distance[previous], through[action]
-                if value is not None:
-                    cost = here + cost_of(patch, table, value, terms, width, previous, action)
-                    if cost >= known > 0:
-                        continue
-                remaining = _remaining(
-                    x - MOVE_X[action] - start_x, y - MOVE_Y[action] - start_y, bounds
-                )
-                new = max(int((cost + remaining) * buckets), front)
-                old = max(int((known + remaining) * buckets), front)
-                distance[previous] = cost
-                if state[previous] == OPEN and old == new:
+                known = distance[previous] if distance[previous] > 0 else np.inf
+                cost = here + cost_of(np.int64(previous), np.int64(action), *costs)
+                if cost >= known:
                     continue
-                state[previous] = OPEN
-                slot_of_new = new % ring
-                if count[slot_of_new] == capacity:
-                    bucket, capacity = _wider(bucket), 2 * capacity
-                bucket[slot_of_new, count[slot_of_new]] = previous
-                count[slot_of_new] += 1
+                distance[previous], state[previous] = cost, OPEN
+                remaining = _remaining(x - MOVE_X[action], y - MOVE_Y[action], bounds)
+                new = np.int64((cost + remaining) * buckets)
+                new = np.uint64((new if new > front else front) & (ring - 1))
+                bucket[new, np.uint64(count[new])] = previous
+                count[new] += 1
+                is_full |= count[new] > most
                 waiting += 1
-        count[slot] = 0
         front += 1
-    return _still_open(state, opened[taken:], bucket, count), visited <= limit
+    return taken, visited, is_full
 
 
-@compiled
-def _wider(bucket: NDArray[np.int32]) -> NDArray[np.int32]:
-    """Return buckets of twice the capacity with the same cells."""
-    wider = np.empty((bucket.shape[0], 2 * bucket.shape[1]), np.int32)
-    for slot in range(bucket.shape[0]):  # numba compiles it in a third of the time of a slice
-        for number in range(bucket.shape[1]):
-            wider[slot, number] = bucket[slot, number]
-    return wider
-
-
-@compiled
+@in_place
 def _still_open(
-    state: States, opened: Cells, bucket: NDArray[np.int32], count: NDArray[np.int64]
-) -> Cells:
-    """Return each open cell of those given and of the buckets once."""
-    found: Cells = np.empty(opened.size + count.sum(), np.int32)
+    state: States,
+    opened: Cells,
+    taken: int,
+    bucket: NDArray[np.int32],
+    count: NDArray[np.int64],
+    found: Cells,
+) -> int:
+    """Find each open cell once, of those not yet taken and those in buckets; return how many."""
     number = 0
     for slot in range(-1, count.size):
-        cells = opened if slot < 0 else bucket[slot, : count[slot]]
-        for cell in cells:
+        for index in range(opened.size - taken if slot < 0 else count[slot]):
+            cell = opened[taken + index] if slot < 0 else bucket[slot, index]
             if state[cell] == OPEN:
                 state[cell] = OPEN | MARKED
                 found[number] = cell
                 number += 1
-    for cell in found[:number]:
-        state[cell] = OPEN
-    still_open: Cells = found[:number].copy()
-    return still_open
+    for index in range(number):
+        state[found[index]] = OPEN
+    return number
 
 
 # What changes of the map take back
 
 
-@compiled
-def _least(
-    distance: Any, state: Any, patch: Any, table: Any, value: Any, terms: Any, width: int, cell: int
-) -> float:
-    """Return the least cost of a path from a cell through neighbours that are not marked."""
-    least = np.inf
+@inlined
+def _best(distance: Any, cell: int, enough: float, *costs: Any) -> tuple[float, int]:
+    """Return the least cost of a path from a cell and its action, or the first that is enough."""
+    least, best = np.inf, -1
     for action in range(8):
-        after = cell + MOVE_Y[action] * width + MOVE_X[action]
-        if distance[after] > 0 and not state[after] & MARKED:
-            cost = cost_of(patch, table, value, terms, width, cell, action)
-            least = min(least, distance[after] + cost)
-    return least
+        after = distance[cell + MOVE_Y[action] * costs[-1] + MOVE_X[action]]
+        if after > 0:
+            cost = cost_of(cell, action, *costs)
+            if after + cost < least:
+                least, best = after + cost, action
+                if least <= enough:
+                    break
+    return least, best
 
 
-@compiled
 def take_back(
     distance: Distances, state: States, costs: MoveCosts, changed: Cells, limit: int
 ) -> tuple[Cells, bool]:
     """Take back what changed moves no longer support; return what it opened, and if it could."""
     # `changed` has all cells whose own moves changed (Ramalingam and Reps 1996; LPA*, Koenig and
     # Likhachev 2002, is the same for one start). Beyond the limit, the field is as it was.
-    patch, table, value, terms, width = costs[:5]
-    offsets = MOVE_Y * width + MOVE_X
-    # In the order of the old distances: what supports a cell is judged before it.
-    waiting = [(np.float64(0), np.int64(0)) for _ in range(0)]
-    for cell in changed:
-        if distance[cell] > AT_GOAL:
-            heapq.heappush(waiting, (distance[cell], np.int64(cell)))
-    lost = [np.int64(0) for _ in range(0)]
-    while len(waiting) > 0:
-        known, cell = heapq.heappop(waiting)
-        if state[cell] & MARKED:
+    lost, waiting = np.empty(limit, np.int32), np.empty(changed.size + 8 * limit, np.int32)
+    waiting[: changed.size] = changed
+    number = _take_back(distance, state, changed, lost, waiting, *costs[:6])
+    return waiting[: max(number, 0)].copy(), number >= 0
+
+
+@in_place
+def _take_back(
+    distance: Distances,
+    state: States,
+    changed: Cells,
+    lost: Cells,
+    waiting: Cells,
+    *costs: Any,
+) -> int:
+    """Do the work of `take_back`; return how many cells it opened, the first ones of `waiting`."""
+    first, end, count = 0, changed.size, 0
+    while first < end:
+        cell = np.int64(waiting[first])
+        first += 1
+        known = distance[cell]
+        if known <= AT_GOAL:
             continue
-        if _least(distance, state, patch, table, value, terms, width, cell) <= known:
+        least, _ = _best(distance, cell, known, *costs)
+        if least <= known:
             continue
-        state[cell] |= MARKED
-        lost.append(cell)
-        if len(lost) > limit:
-            for lost_cell in lost:
-                state[lost_cell] ^= MARKED
-            return changed[:0], False
+        if count == lost.size:
+            for number in range(count):
+                distance[lost[number]] = -distance[lost[number]]
+            return -1
+        # Below 0 it supports no other cell. Those that it may have supported are judged again.
+        distance[cell] = -known
+        lost[count] = cell
+        count += 1
         for action in range(8):
-            before = cell - offsets[action]
-            cost = cost_of(patch, table, value, terms, width, before, action)
-            if distance[before] >= known + cost and not state[before] & MARKED:
-                heapq.heappush(waiting, (distance[before], np.int64(before)))
-    for cell in lost:
-        distance[cell], state[cell] = 0.0, UNREACHED
-    for cell in changed:
-        lost.append(np.int64(cell))
-    opened = np.empty(len(lost), np.int32)
-    number = 0
-    for cell in lost:
-        best = _least(distance, state, patch, table, value, terms, width, cell)
-        if best < np.inf and (distance[cell] == 0 or best < distance[cell]):
-            distance[cell], state[cell] = best, OPEN
-            opened[number] = cell
-            number += 1
-    return opened[:number].copy(), True
+            before = cell - MOVE_Y[action] * costs[-1] - MOVE_X[action]
+            cost = cost_of(before, action, *costs)
+            if distance[before] >= known + cost:
+                waiting[end] = before
+                end += 1
+    for number in range(count):
+        distance[lost[number]], state[lost[number]] = 0.0, UNREACHED
+    opened = 0
+    for number in range(count + changed.size):
+        cell = np.int64(lost[number] if number < count else changed[number - count])
+        least, _ = _best(distance, cell, 0.0, *costs)
+        if least < np.inf and (distance[cell] == 0 or least < distance[cell]):
+            distance[cell], state[cell] = least, OPEN
+            waiting[opened] = cell
+            opened += 1
+    return opened
 
 
 # What distances say
 
 
-@compiled
-def _next_action(
-    distance: Any, patch: Any, table: Any, value: Any, terms: Any, width: int, cell: int
-) -> int:
-    """Return the greedy action of a closed cell, the lowest of those that tie; -1 without one."""
-    for action in range(8):
-        after = distance[cell + MOVE_Y[action] * width + MOVE_X[action]]
-        if after > 0:
-            cost = cost_of(patch, table, value, terms, width, cell, action)
-            if after + cost <= distance[cell] * SAME:
-                return action
-    return -1
-
-
-@compiled
 def roll_out(distance: Distances, costs: MoveCosts, start: int) -> Cells:
     """Return the (x, y) of greedy steps from a closed start to the goal, both too: (N, 2)."""
-    patch, table, value, terms, width = costs[:5]
-    cells: Cells = np.empty(64, np.int32)
-    cell, number = start, 0
-    while True:
-        if number == cells.size:
-            cells = np.concatenate((cells, np.empty(number, np.int32)))
-        cells[number] = cell
+    path: Cells = np.empty((128, 2), np.int32)
+    cell, number = _roll_out(distance, start, path, 0, *costs[:6])
+    while cell > 0:
+        path = np.concatenate([path, np.empty_like(path)])
+        cell, number = _roll_out(distance, cell, path, number, *costs[:6])
+    return path[:number]
+
+
+@in_place
+def _roll_out(
+    distance: Distances, cell: int, path: Cells, number: int, *costs: Any
+) -> tuple[int, int]:
+    """Fill a path from a cell on; return the next cell, or 0 at the end, and its length so far."""
+    while cell > 0 and number < path.shape[0]:
+        path[number, 0] = cell % costs[-1] - 1
+        path[number, 1] = cell // costs[-1] - 1
         number += 1
-        action = _next_action(distance, patch, table, value, terms, width, cell)
-        if distance[cell] == AT_GOAL or action < 0:
-            break
-        cell += MOVE_Y[action] * width + MOVE_X[action]
-    path: Cells = np.empty((number, 2), np.int32)
-    for step in range(number):
-        path[step, 0] = cells[step] % width - 1
-        path[step, 1] = cells[step] // width - 1
-    return path
+        enough = distance[cell] * SAME
+        least, action = _best(distance, cell, enough, *costs)
+        if distance[cell] == AT_GOAL or least > enough:
+            cell = 0
+        else:
+            cell += MOVE_Y[action] * costs[-1] + MOVE_X[action]
+    return cell, number
 
 
-@compiled
 def policy_of(distance: Distances, costs: MoveCosts) -> NDArray[np.int8]:
     """Return the greedy action of each cell of a whole field, -1 without one: (C,) int8."""
-    patch, table, value, terms, width = costs[:5]
     policy = np.full(distance.size, -1, np.int8)
-    for cell in range(width + 1, distance.size - width - 1):
-        policy[cell] = _next_action(distance, patch, table, value, terms, width, cell)
+    _policy_of(distance, policy, *costs[:6])
     return policy
 
 
-@compiled
+@in_place
+def _policy_of(distance: Distances, policy: NDArray[np.int8], *costs: Any) -> None:
+    for cell in range(costs[-1] + 1, distance.size - costs[-1] - 1):
+        enough = distance[cell] * SAME
+        least, action = _best(distance, cell, enough, *costs)
+        if least <= enough:
+            policy[cell] = action
+
+
 def q_of(distance: Distances, costs: MoveCosts) -> NDArray[np.float32]:
     """Return minus the cost of the best path through each action: (8, C) float32."""
-    patch, table, value, terms, width = costs[:5]
     q = np.full((8, distance.size), -np.inf, np.float32)
-    for action in range(8):
-        for cell in range(width + 1, distance.size - width - 1):
-            after = distance[cell + MOVE_Y[action] * width + MOVE_X[action]]
-            if after > 0:
-                cost = cost_of(patch, table, value, terms, width, cell, action)
-                q[action, cell] = -(cost + after)
+    _q_of(distance, q, *costs[:6])
     return q
+
+
+@in_place
+def _q_of(distance: Distances, q: NDArray[np.float32], *costs: Any) -> None:
+    for action in range(8):
+        for cell in range(costs[-1] + 1, distance.size - costs[-1] - 1):
+            after = distance[cell + MOVE_Y[action] * costs[-1] + MOVE_X[action]]
+            if after > 0:
+                cost = cost_of(cell, action, *costs)
+                q[action, cell] = -(cost + after)

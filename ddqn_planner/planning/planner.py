@@ -60,7 +60,7 @@ class Planner:
 
     @property
     def cache_bytes(self) -> int:
-        """Memory for the fields that it keeps, those used last; the last one is always kept."""
+        """Memory for the fields that it keeps, those used last; the last two are always kept."""
         return self.fields.nbytes
 
     @cache_bytes.setter

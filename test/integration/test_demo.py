@@ -106,4 +106,4 @@ def test_a_signal_while_a_node_is_started_ends_it(monkeypatch: pytest.MonkeyPatc
     monkeypatch.setattr(subprocess, "Popen", start)
     with pytest.raises(KeyboardInterrupt), running("sleep", "60"):
         pass
-    assert children[0].returncode == -signal.SIGINT
+    assert children[0].returncode == -signal.SIGTERM

@@ -5,12 +5,13 @@ from __future__ import annotations
 import array
 import itertools
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
 import pytest
 from builtin_interfaces.msg import Time
-from client import cells_of
+from client import cells_of, wait_for
 from diagnostic_msgs.msg import DiagnosticStatus
 from geometry_msgs.msg import PoseStamped, TransformStamped
 from integration.robot import Robot, values_of
@@ -41,7 +42,7 @@ def robot(run_robot: Any, costmap: np.ndarray) -> Iterator[Robot]:
     parameters = {"map_type": "costmap", "map_timeout": 0.0}
     with run_robot("/live", parameters, costmap, remaps=["map:=global_costmap/costmap"]) as robot:
         robot.grid = GridMap(costmap >= 99, 0.5, (-1.0, 2.0, 0.0))
-        robot.client.publish("global_costmap/costmap", robot.stamped_map(), LATCHED)
+        publish_costmap(robot)
         robot.send_start(robot.pose((5, 5)))
         yield robot
 
@@ -65,20 +66,38 @@ def stamp(path: Any) -> tuple[int, int]:
     return path.header.stamp.sec, path.header.stamp.nanosec
 
 
+def publish_costmap(robot: Robot) -> None:
+    robot.client.publish("global_costmap/costmap", robot.stamped_map(), LATCHED)
+
+
+@contextmanager
+def repeating(client: Any, publish: Callable[[], None]) -> Iterator[None]:
+    """Publish something 50 times a second."""
+    timer = client.node.create_timer(0.02, publish)
+    try:
+        yield
+    finally:
+        client.node.destroy_timer(timer)
+
+
 def test_a_costmap_that_stops_takes_its_path_back_until_it_comes_again(robot: Robot) -> None:
     # Nobody sets a parameter or asks while it is away, and it is not time to plan again.
-    robot.set(map_timeout=1.5, replan_period=3600.0)
+    robot.set(map_timeout=0.05, replan_period=3600.0)
+    robot.clear()
     robot.send_goal(robot.pose((35, 5)))
+    last = (0, 0)
     for _ in range(2):
-        robot.clear()
-        robot.client.publish("global_costmap/costmap", robot.stamped_map(), LATCHED)
-        shown = stamp(robot.wait_for_path((5, 5), (35, 5)))
-        empty = robot.plans.wait(lambda path, at=shown: not path.poses and stamp(path) > at)
+        # As a costmap does: on a loaded machine the first may time out before it is planned on.
+        with repeating(robot.client, lambda: publish_costmap(robot)):
+            path = robot.plans.wait(lambda path, at=last: path.poses and stamp(path) > at)
+        last = stamp(path)
+        empty = robot.plans.wait(lambda path, at=last: not path.poses and stamp(path) > at)
+        last = stamp(empty)
         assert empty.header.frame_id == "map"
-    assert robot.get_plan(robot.pose((5, 5)), robot.pose((9, 9))).poses == []
-    status = robot.wait_for_reason("nothing came on /live/global_costmap/costmap for longer than")
+    wait_for("refusal", lambda: not robot.get_plan(robot.pose((5, 5)), robot.pose((9, 9))).poses)
+    silent = "nothing came on /live/global_costmap/costmap for longer than"
+    status = robot.wait_for_reason(silent, {"status": "MAP_TIMEOUT"})
     assert status.level == DiagnosticStatus.WARN
-    assert values_of(status)["status"] == "MAP_TIMEOUT"
     robot.set(map_timeout=0.0, replan_period=1.0)
 
 
@@ -135,15 +154,12 @@ def test_poses_in_other_frames_are_transformed(robot: Robot) -> None:
         client.publish("/tf", message, listeners=0)
 
     robot.set(transform_tolerance=60.0)
-    timer = client.node.create_timer(0.02, send_transforms)
-    try:
+    with repeating(client, send_transforms):
         path = robot.get_plan(in_frame("odom", 0.1, 0.1), in_frame("base", 3.1, 2.1))
-        cells = cells_of(robot.grid, path)
-        expected = [robot.grid.world_to_cell(*point) for point in ((5.1, 4.1), (8.1, 6.1))]
-        assert path.header.frame_id == "map"
-        assert [cells[0], cells[-1]] == expected
-    finally:
-        client.node.destroy_timer(timer)
+    cells = cells_of(robot.grid, path)
+    expected = [robot.grid.world_to_cell(*point) for point in ((5.1, 4.1), (8.1, 6.1))]
+    assert path.header.frame_id == "map"
+    assert [cells[0], cells[-1]] == expected
     assert robot.get_plan(robot.pose((3, 3)), in_frame("moon", 0.0, 0.0)).poses == []
     status = robot.wait_for_reason("the goal's frame is 'moon', and no transform leads from it")
     assert values_of(status)["status"] == "TF_ERROR"

@@ -29,8 +29,14 @@ from std_msgs.msg import Header, String
 
 from ddqn_planner import Experience, GridMap, MoveRule, Planner
 from ddqn_planner.experience import ExperienceFileError
-from ddqn_planner.nodes.conversions import directions_message, occupancy_message
-from ddqn_planner.nodes.map_source import MapSource, updated_values
+from ddqn_planner.grid import inflate
+from ddqn_planner.nodes.conversions import directions_message, grid_from_message, occupancy_message
+from ddqn_planner.nodes.map_source import (
+    BODY_PARAMETERS,
+    MAP_PARAMETERS,
+    MapSource,
+    updated_values,
+)
 from ddqn_planner.nodes.parameters import PLANNER_PARAMETERS
 from ddqn_planner.nodes.planner_node import ExpectedTimes
 from ddqn_planner.nodes.report import Outcome, Report, RequestError
@@ -178,11 +184,16 @@ def test_after_updates_the_map_is_as_if_it_came_whole(
         header, data = map_of(stamp).header, array.array("b", patch.tobytes())
         box = {"x": int(x), "y": int(y), "width": width, "height": height}
         source._take_update(update(header=header, data=data, **box))
-        whole._take(occupancy_message(values, *place, header))
-        found, expected = source.grid(), whole.grid()
-        assert found.same_cells(expected)
-        assert found.origin == expected.origin
-        np.testing.assert_array_equal(found.obstacles, expected.obstacles)
+        message = occupancy_message(values, *place, header)
+        before = whole.grid() if stamp > 2 else None
+        whole._take(message)
+        new = grid_from_message(message, *map(node.value, MAP_PARAMETERS))
+        expected = inflate(new, *map(node.value, BODY_PARAMETERS))
+        for found in (source.grid(), whole.grid()):
+            assert found.fingerprint == expected.fingerprint
+            assert found.origin == expected.origin
+            np.testing.assert_array_equal(found.obstacles, expected.obstacles)
+        assert before is None or found.patches_since(before)  # only where cells changed
         assert source.check() == header
         set_parameters(allow_unknown=parameters.get("allow_unknown", False))  # it reads anew
         assert source.grid().same_cells(expected)

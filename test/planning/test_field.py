@@ -48,8 +48,10 @@ def test_the_path_is_the_same_whatever_was_asked_before(
     exact = shortest_distances(grid, goal, rule)
     for start in data.draw(st.lists(st.sampled_from(grid.free_cells()), min_size=1, max_size=5)):
         limit = data.draw(st.integers(0, 30))
-        while (plan := grown.rollout(start, limit)).status is PlanStatus.ROLLOUT_TRAPPED:
-            pass  # each call visits more cells
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(kernels, "CAPACITY", data.draw(st.sampled_from((9, kernels.CAPACITY))))
+            while (plan := grown.rollout(start, limit)).status is PlanStatus.ROLLOUT_TRAPPED:
+                pass  # each call visits more cells
         assert plan == whole.rollout(start) == fresh_field(grid, goal, rule).rollout(start)
         assert (plan.status is PlanStatus.NO_PATH) == np.isinf(exact[start[::-1]])
     assert_same(grown, whole)
@@ -243,6 +245,20 @@ def test_a_changed_map_uses_what_is_known_of_the_one_before() -> None:
     assert older.rollout(start).cells == before.cells  # and begins anew
 
 
+@pytest.mark.parametrize("slowness", [None, np.full((31, 31), 3)])
+def test_the_least_cost_on_a_map_is_that_of_its_patches_too(slowness: np.ndarray | None) -> None:
+    # Straight ahead each cell costs as much; around, three patches cost nothing.
+    grid = GridMap(np.zeros((31, 31)), cost=np.full((31, 31), 33), slowness=slowness)
+    planner, ends = new_planner(), ((0, 15), (30, 15))
+    assert len(planner.plan(grid, *ends).cells) == 31
+    for x, y, shape in ((0, 0, (31, 1)), (0, 0, (1, 31)), (30, 0, (31, 1))):
+        grid = grid.with_patch(np.zeros(shape), x, y, np.zeros(shape))
+    around = new_planner().plan(grid, *ends)
+    exact = shortest_distances(grid, ends[1], MoveRule.ROBOT_SAFE)[15, 0]
+    assert around.cost == pytest.approx(exact, rel=1e-3)
+    assert planner.plan(grid, *ends) == around
+
+
 def test_a_repair_that_takes_too_long_leaves_the_older_field_as_it_was() -> None:
     fields.REPAIRED = 5
     grid, goal = GridMap(np.zeros((60, 60))), (30, 30)
@@ -252,11 +268,12 @@ def test_a_repair_that_takes_too_long_leaves_the_older_field_as_it_was() -> None
     changed = grid.with_patch(np.ones((1, 12)), 20, 29)  # a wall beside the goal
     start = (30, 32)
     assert planner.plan(changed, start, goal) == new_planner().plan(changed, start, goal)
-    assert planner.fields.find(grid, (goal,), MoveRule.ROBOT_SAFE) is older
+    assert planner.fields.find(grid, (goal,), MoveRule.ROBOT_SAFE) is None  # the place has changed
     assert older.rollout_if_known((0, 0)) == before
     assert_same(older, fresh_field(grid, goal, MoveRule.ROBOT_SAFE))
 
 
+@pytest.mark.filterwarnings("ignore:overflow encountered in scalar subtract")  # not where compiled
 @settings(max_examples=150)
 @given(GRIDS, RULES, st.booleans(), st.integers(0, 2), st.integers(1, 1500), st.data())
 def test_a_field_that_is_interrupted_anywhere_is_as_a_new_one(
@@ -305,7 +322,7 @@ def run_until(line: int, step: Callable[[], object]) -> None:
 
     before = sys.gettrace()
     with pytest.MonkeyPatch.context() as patch, suppress(MemoryError):
-        for name in ("_grow", "_wider", "take_back"):
+        for name in ("_grow", "_still_open", "_take_back"):
             patch.setattr(kernels, name, getattr(kernels, name).__wrapped__)
         sys.settrace(trace)
         try:

@@ -235,8 +235,13 @@ def test_the_memory_for_fields_is_bounded_and_those_used_last_are_kept() -> None
     planner.cache_bytes = 1
     last = GridMap(np.zeros((3, 3)), cost=np.ones((3, 3), np.int8))
     planner.q_field(last, (0, 0))
-    assert known_field(planner, last, (0, 0), rule) is not None  # whatever its size
+    for goal in ((0, 0), (2, 2), (0, 0)):  # two goals in turn, whatever the size of their fields
+        found = known_field(planner, last, goal, rule)
+        assert planner.q_field(last, goal) is known_field(planner, last, goal, rule)
+    assert found is not None
     assert not any(known_field(planner, grid, goal, rule) for goal in grid.free_cells())
+    planner.q_field(last, (1, 1))
+    assert known_field(planner, last, (2, 2), rule) is None
 
 
 def test_maps_on_which_there_was_no_path_are_not_kept() -> None:

@@ -1,0 +1,39 @@
+"""All that is compiled for a planner: by a node before it is active, or at an installation."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from ddqn_planner.planning import Planner
+
+
+def warm_up(planner: Planner, learns: bool = False) -> Iterator[None]:
+    """Plan on small maps in all ways; yield between what many requests need and the rest."""
+    import numpy as np
+
+    from ddqn_planner.experience import Experience
+    from ddqn_planner.grid import GridMap
+    from ddqn_planner.planning.paths import is_path_valid
+
+    sizes = planner.metadata.sizes
+    free = np.zeros((sizes.get("height", 8), sizes.get("width", 8)), np.bool_)
+    start, goal = (0, 0), (free.shape[1] - 1, free.shape[0] - 1)
+    # Unit costs and expected times have the same code as costs.
+    grid = GridMap(free, cost=free.astype(np.int8))
+    planner.plan(grid, start, goal, simplified=True)
+    planner.plan(grid.with_patch([[True]], 1, 1), start, goal)
+    if learns:
+        experience = Experience(nominal_speed=1.0)
+        experience.record(np.arange(9.0), np.full((9, 2), 4.5) + np.arange(9.0)[:, None] / 3)
+        experience.apply(grid)
+    yield
+    is_path_valid([start, goal], start, grid, planner.metadata.move_rule)
+    # From an obstacle there is a way out, to where a path begins, perhaps in one direction only.
+    obstacle = free.copy()
+    obstacle[0, 0] = True
+    for forbidden in (None, 16 + free.astype(np.uint8)):
+        blocked = GridMap(obstacle, forbidden=forbidden)
+        planner.plan(blocked, start, goal, start_clearing_radius=1.0)
+    yield
