@@ -20,9 +20,7 @@ Floats = NDArray[np.floating[Any]]
 Integers = NDArray[np.int64]
 
 # Sums in any order, so that eight are added at once; NaN and infinity as ever.
-compiled = partial(
-    compiling.compiled, fastmath={"reassoc", "contract", "arcp", "nsz"}, error_model="numpy"
-)
+compiled = partial(compiling.compiled, fastmath={"reassoc", "contract", "arcp", "nsz"})
 
 
 class Windows(NamedTuple):
