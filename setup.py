@@ -46,7 +46,14 @@ setup(
         "bags": ["mcap-ros2-support>=0.5"],
         "watch": ["rerun-sdk>=0.39"],
         "docs": ["furo", "myst-parser>=3.0", "sphinx>=7.3"],
-        "bench": ["nano-astar>=0.1.2", "psutil>=5.9", "pyastar2d>=1.1", "stable-baselines3>=2.6"],
+        "bench": [
+            "dijkstra3d>=1.15",
+            "nano-astar>=0.1.2",
+            "psutil>=5.9",
+            "pyastar2d>=1.1",
+            "stable-baselines3>=2.6",
+            "tcod>=21",
+        ],
         "test": [
             "colcon-core>=0.15",
             "colcon-package-selection",

@@ -24,12 +24,12 @@ def warm_up(planner: Planner, learns: bool = False) -> Iterator[None]:
     grid = GridMap(free, cost=free.astype(np.int8))
     planner.plan(grid, start, goal, simplified=True)
     planner.plan(grid.with_patch([[True]], 1, 1), start, goal)
+    is_path_valid([start, goal], start, grid, planner.metadata.move_rule)
     if learns:
         experience = Experience(nominal_speed=1.0)
         experience.record(np.arange(9.0), np.full((9, 2), 4.5) + np.arange(9.0)[:, None] / 3)
         experience.apply(grid)
     yield
-    is_path_valid([start, goal], start, grid, planner.metadata.move_rule)
     # From an obstacle there is a way out, to where a path begins, perhaps in one direction only.
     obstacle = free.copy()
     obstacle[0, 0] = True

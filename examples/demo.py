@@ -57,7 +57,7 @@ def main(_: Sequence[str]) -> int:
         for case in CASES:
             with (
                 running_node("map_server_node", yaml_filename=f"{case[0]}.yaml") as server,
-                running_node("planner_node", model=case[1]) as planner,
+                running_node("planner_node", model=case[1], path_simplification="none") as planner,
                 Client() as client,
             ):
                 show_path(client, case, [server, planner])

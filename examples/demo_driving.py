@@ -127,7 +127,9 @@ def main(arguments: Sequence[str]) -> int:
     """Drive the missions, and save what they show."""
     count = int(arguments[0]) if arguments else MISSIONS
     world, random = generated_world(WORLD, SEED), np.random.default_rng(SEED)
+    # Its route is compared with others cell by cell.
     planning = {"start_source": "odometry", "move_rule": RULE.value, "follow_trainer": True}
+    planning["path_simplification"] = "none"
     with tempfile.TemporaryDirectory() as folder, claim_ros_domain():
         map_file = FilePath(folder) / "world.yaml"
         save_map(world.grid, map_file)

@@ -1,6 +1,8 @@
 """Counts how often the path of a robot flips on noisy costmaps, and what it costs to keep it."""
 
+import itertools
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -12,6 +14,7 @@ from tables import table
 from ddqn_planner import GridMap, MoveRule, Planner
 from ddqn_planner.grid import Cell, clearance, path_cost
 from ddqn_planner.grid.arguments import Occupancy
+from ddqn_planner.grid.moves import cells_along
 from ddqn_planner.grid.noise import random_requests
 from ddqn_planner.planning import PlanRequest
 from ddqn_planner.planning.paths import rest_of_path
@@ -40,19 +43,22 @@ def main(_: Sequence[str]) -> int:
     """Print the flips per 100 replans; cost beside that of the first threshold."""
     rows, planner = [], Planner.load("any_map")
     planner.cache_bytes = 0  # each map comes once
-    for kind in KINDS:
+    for kind, path in itertools.product(KINDS, ("cells", "straight")):
         first = None
         for threshold in THRESHOLDS:
-            runs = [drive(planner, kind, seed, threshold) for seed in range(RUNS)]
+            how = threshold, path == "straight"
+            runs = [drive(planner, kind, seed, *how) for seed in range(RUNS)]
             replans, flips, cost = np.sum(runs, axis=0)
             first = first or cost
             more = f"{cost / first - 1:+.2%}"
-            rows.append([kind, threshold, int(replans), f"{100 * flips / replans:.1f}", more])
-    print(table("map | switch_threshold | replans | flips per 100 | cost driven", rows))
+            rows.append([kind, path, threshold, int(replans), f"{100 * flips / replans:.1f}", more])
+    print(table("map | path | switch_threshold | replans | flips per 100 | cost driven", rows))
     return 0
 
 
-def drive(planner: Planner, kind: str, seed: int, threshold: float, side: int = SIDE) -> Driven:
+def drive(
+    planner: Planner, kind: str, seed: int, threshold: float, straight: bool, side: int = SIDE
+) -> Driven:
     """Drive from a start to a goal; the seed and the kind fix the map and its noise."""
     random = np.random.default_rng([seed, KINDS.index(kind)])
     occupancy, robot, goal = scenario(kind, side, random)
@@ -65,14 +71,14 @@ def drive(planner: Planner, kind: str, seed: int, threshold: float, side: int = 
         seen = occupancy | (noise & (np.hypot(x - robot[0], y - robot[1]) <= SIGHT))
         seen[robot[::-1]] = seen[goal[::-1]] = False
         grid = GridMap(seen, cost=inflated_costs(seen, INFLATION))
-        request = PlanRequest(grid, robot, goal, RULE, under_way=path, switch_threshold=threshold)
-        plan = last_step(planner.steps(request))
+        request = PlanRequest(grid, robot, goal, RULE, simplified=straight, under_way=path)
+        plan = last_step(planner.steps(replace(request, switch_threshold=threshold)))
         if not plan.cells:  # it waits
             continue
         rest, path = rest_of_path(path, robot, grid, RULE), plan.path
         replans += 1
         flips += is_flip(rest, path)
-        way += plan.cells[1 : 1 + STRIDE]
+        way += [(x, y) for x, y in cells_along(path)[0][1 : 1 + STRIDE].tolist()]
         robot = way[-1]
         if robot == goal:
             break
@@ -99,7 +105,8 @@ def is_flip(rest: NDArray[np.int32], path: NDArray[np.int32]) -> bool:
     """Return whether the next 3 m of a path lead away from what is left of the last one."""
     if not len(rest):
         return False
-    apart = np.hypot(*(path[:AHEAD, None] - rest[None]).transpose(2, 0, 1)).min(axis=1)
+    ahead, _ = cells_along(path)
+    apart = np.hypot(*(ahead[:AHEAD, None] - cells_along(rest)[0]).transpose(2, 0, 1)).min(axis=1)
     return bool((apart > APART).any())
 
 

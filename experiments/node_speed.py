@@ -214,7 +214,7 @@ def measure_changing_map(client: ros.Client) -> Iterator[bool]:
             time.sleep(1 / RATE)
         seconds, computed = time.monotonic() - began, processes.cpu_seconds(planner.pid) - computed
     name = f"{CHANGING}x{CHANGING}: a few cells change, {RATE} Hz: share of a core"
-    yield report(name, 100 * computed / seconds, "%", 10)
+    yield report(name, 100 * computed / seconds, "%", 8)
 
 
 def measure_trainer(client: ros.Client) -> Iterator[bool]:

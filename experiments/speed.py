@@ -8,19 +8,23 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
+import dijkstra3d
 import gymnasium
 import nano_astar
 import numpy as np
 import pyastar2d
+import tcod.path
 import torch
+from numpy.typing import NDArray
 from random_maps import KINDS, Random, generate_map
 from stable_baselines3 import DQN
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
+from straight_paths import measure_straight_paths
 from tables import report
 from torch import nn
 
 from ddqn_planner import GridMap, MoveRule, Plan, Planner, QField
-from ddqn_planner.grid import Cell, shortest_distances
+from ddqn_planner.grid import Cell, inflate, shortest_distances
 from ddqn_planner.grid.arguments import Occupancy
 from ddqn_planner.grid.noise import random_costs, random_requests
 from ddqn_planner.training.environment import GridEnvironment, paper_scenario
@@ -44,6 +48,10 @@ CHANGE_KINDS = {
     "a wall closes": 0,
     "a wall beside the goal": -3,
 }
+# They cut corners, and cost what the entered cell costs; a diagonal as much as a straight move, or
+# with tcod 1.4 times as much.
+# pyastar2d is not among them: where cells cost differently, it may read memory that it never set.
+PEERS = "tcod", "dijkstra3d A*", "dijkstra3d from both ends"
 Change = tuple[Occupancy, Occupancy, int, int]  # a map, and a patch of it with its x and y
 LOADED = Planner.load("any_map")
 
@@ -97,6 +105,53 @@ def measure_requests(side: int) -> Iterator[bool]:
         yield report(f"{name}, pyastar2d* {pyastar_ms:.2f}; ratio", ms / pyastar_ms, "x", 1.3)
         yield report(f"{side}x{side} {kind}: known goal, {moves:.0f} cells", known_ms, "ms", 0.1)
     print("* cuts corners, and a diagonal counts 1: its paths are no paths under our rule")
+
+
+def search_with_tcod(cost: NDArray[np.int32], start: Cell, goal: Cell) -> Any:
+    """Return the path of libtcod's A*, given whole costs, 0 where occupied."""
+    graph = tcod.path.SimpleGraph(
+        cost=cost, cardinal=5, diagonal=7, greed=int(cost[cost > 0].min())
+    )
+    search = tcod.path.Pathfinder(graph)
+    search.add_root(start[::-1])
+    return search.path_to(goal[::-1])
+
+
+def farthest_cells(occupancy: Occupancy) -> tuple[Cell, Cell]:
+    """Return two cells near opposite corners, of the most connected ones."""
+    labels = GridMap(occupancy).labels(RULE)
+    cells = np.argwhere(labels == np.bincount(labels[~occupancy]).argmax())[:, ::-1]
+    first, last = cells.sum(axis=1).argmin(), cells.sum(axis=1).argmax()
+    return tuple(cells[first].tolist()), tuple(cells[last].tolist())
+
+
+def measure_requests_with_costs(side: int) -> Iterator[bool]:
+    """Compare requests across new maps with costs with searches in C and C++."""
+    ratios = []
+    for kind in MAP_KINDS:
+        random = np.random.default_rng(0)
+        occupancy = generate_map(kind, (side, side), random)
+        start, goal = farthest_cells(occupancy)
+        inflated = inflate(GridMap(occupancy, 0.05), 0, 1).cost
+        for name, cost in (("inflated", inflated), ("random", random_costs(occupancy, random))):
+            multiplier, times = GridMap(occupancy, cost=cost).cost_multiplier, []
+            weights = np.where(occupancy, np.inf, multiplier).astype(np.float32)
+            whole = np.where(occupancy, 0, np.rint(25 * multiplier)).astype(np.int32)
+            ends = weights, start[::-1], goal[::-1]
+            for _ in range(ROUNDS):
+                ms, _ = timed(new_planner().plan, GridMap(occupancy, cost=cost), start, goal, RULE)
+                tcod_ms, _ = timed(search_with_tcod, whole, start, goal)
+                astar_ms, _ = timed(dijkstra3d.dijkstra, *ends, connectivity=8, compass=True)
+                both_ms, _ = timed(dijkstra3d.dijkstra, *ends, connectivity=8, bidirectional=True)
+                times.append((ms, tcod_ms, astar_ms, both_ms))
+            ms, *peers = medians(times)
+            ratios.append([ms / peer for peer in peers])
+            beside = ", ".join(f"{peer:.1f}" for peer in peers)
+            print(f"{side}x{side} {kind}, {name} costs: {ms:.1f} ms; peers {beside}", flush=True)
+    for peer, of_peer in zip(PEERS, zip(*ratios, strict=True), strict=True):
+        typical = statistics.median(of_peer)
+        figure = f"{side}x{side}: long request with costs / {peer}, median {typical:.2f}; worst"
+        yield report(figure, max(of_peer), "x", 1.0)
 
 
 def draw_change(kind: str, occupancy: Occupancy, path: Sequence[Cell], random: Random) -> Change:
@@ -159,6 +214,44 @@ def measure_replans(side: int) -> Iterator[bool]:
         typical = statistics.median(ratios)
         figure = f"{side}x{side}, {kind}: replan / new, median {typical:.3f}; worst"
         yield report(figure, max(ratios), "x", 2.0)
+
+
+def measure_short_requests(side: int) -> Iterator[bool]:
+    """Compare a request of 15 cells on a new map of random costs with one on a map without."""
+    random, times = np.random.default_rng(0), []
+    occupancy = random.random((side, side)) < 0.2
+    occupancy[3:30, 3:30] = False
+    costs = None, random_costs(occupancy, random)
+    for _ in range(CHANGES):
+        maps = [GridMap(occupancy, cost=cost) for cost in costs]
+        times.append([timed(new_planner().plan, it, (5, 5), (20, 20), RULE)[0] for it in maps])
+    without, with_costs = medians(times)
+    name = f"{side}x{side}, 15 cells: {without:.2f} ms; with costs {with_costs:.2f}; ratio"
+    yield report(name, with_costs / without, "x", 2.0)
+
+
+def measure_repairs(sides: tuple[int, int], with_costs: bool) -> Iterator[bool]:
+    """Compare replans near the robot, patches included, on a large map with those on a small."""
+    known: list[list[Any]] = []
+    for side in sides:
+        random = np.random.default_rng(0)
+        occupancy = random.random((side, side)) < 0.2
+        occupancy[100:140, 100:140] = occupancy[500:503, 500:503] = False
+        grid = GridMap(occupancy, cost=random_costs(occupancy, random) if with_costs else None)
+        known.append([random, new_planner(), grid])
+        known[-1][1].plan(grid, (110, 110), (501, 501), RULE)
+
+    def repair(of_side: list[Any]) -> None:
+        random, planner, grid = of_side
+        (x, y), flipped = random.integers(112, 130, 2), random.choice(25, FLIPPED, replace=False)
+        patch = grid.occupancy[y : y + 5, x : x + 5].copy()
+        patch.flat[flipped] ^= True
+        of_side[2] = grid.with_patch(patch, x, y)
+        assert planner.plan(of_side[2], (110, 110), (501, 501), RULE).cells
+
+    small, large = medians([[timed(repair, it)[0] for it in known] for _ in range(CHANGES)])
+    name = f"{FLIPPED} cells near the robot{', costs' if with_costs else ''}: {small:.2f} ms"
+    yield report(f"{name} at {sides[0]}, {large:.2f} at {sides[1]}; ratio", large / small, "x", 1.5)
 
 
 def all_values(grid: GridMap, goal: Cell) -> QField:
@@ -247,8 +340,13 @@ def main() -> int:
     gc.freeze()  # else this process pauses to look for garbage among what it has imported
     missed = [*measure_paper_map(), *measure_training()]
     for side in (256, 1024):
-        missed += measure_requests(side)
-    missed += measure_replans(1024)
+        missed += [*measure_requests(side), *measure_requests_with_costs(side)]
+    missed += [*measure_short_requests(1024), *measure_replans(1024)]
+    for with_costs in (False, True):
+        missed += measure_repairs((1024, 4096), with_costs)
+    missed += measure_whole_fields(64, True, 30)
+    for side in (256, 1024, 2048):
+        missed += measure_straight_paths(side, MAP_KINDS)
     for side in (256, 1024, 2000):
         missed += [*measure_whole_fields(side, False, 20), *measure_whole_fields(side, True, 25)]
     return int(any(missed))

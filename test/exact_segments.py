@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from fractions import Fraction
-from itertools import pairwise
 
 import numpy as np
 
@@ -45,20 +44,30 @@ def exact_cost(first: Cell, last: Cell, grid: GridMap, rule: MoveRule) -> float:
     return float(length * float(mean))
 
 
-def is_legal(first: Cell, last: Cell, grid: GridMap, rule: MoveRule) -> bool:
-    """Say whether a segment is legal, from the whole map's moves or from all cells it touches."""
-    if not (grid.is_free(first) and grid.is_free(last)):
+def is_legal(
+    first: Cell, last: Cell, grid: GridMap, rule: MoveRule, begin: Fraction = Fraction(0)
+) -> bool:
+    """Say whether a segment is legal from a share of it on, by all cells that it touches there."""
+    if not (grid.contains(first) and grid.contains(last)):
         return False
     step = [last[0] - first[0], last[1] - first[1]]
-    if step in MOVES.tolist():
-        return bool(grid.legal_moves(rule)[MOVES.tolist().index(step), first[1], first[0]])
-    passed = [*shares(first, last)]
-    touched = {*passed}
-    if not rule.cuts_corners:
-        touched |= {cell for (x, y), (u, v) in pairwise(passed) for cell in ((x, v), (u, y))}
-    if not all(map(grid.is_free, touched)):
-        return False
     angle = np.arctan2(step[1], step[0]) / (np.pi / 4)
     actions = {int(np.floor(angle + 1e-9)) % 8, int(np.ceil(angle - 1e-9)) % 8}
     forbidden = np.zeros(grid.occupancy.shape, int) if grid.forbidden is None else grid.forbidden
-    return not any(forbidden[y, x] >> a & 1 for x, y in passed if (x, y) != last for a in actions)
+    passed, until = [*shares(first, last).items()], Fraction(0)
+    for number, ((x, y), share) in enumerate(passed):
+        until += share
+        if until <= begin:
+            continue
+        touched = {(x, y)}
+        if (x, y) != last:
+            u, v = passed[number + 1][0]
+            touched |= set() if rule.cuts_corners else {(x, v), (u, y)}
+            if any(forbidden[y, x] >> action & 1 for action in actions):
+                return False
+        if not all(map(grid.is_free, touched)):
+            return False
+    if begin == 0 and step in MOVES.tolist():
+        index = MOVES.tolist().index(step), first[1], first[0]
+        assert grid.legal_moves(rule)[index]
+    return True

@@ -151,9 +151,3 @@ def test_cells_outside_the_map_and_fractions_are_refused(cell: Any) -> None:
             call()
     with pytest.raises(ValueError, match=r"holds 0\.5"):
         Plan(PlanStatus.SUCCEEDED, [(0.5, 0)])  # type: ignore[arg-type]
-
-
-def test_cells_that_are_no_neighbours_have_no_expected_time() -> None:
-    for cells in ([(0, 0), (2, 0)], [(0, 0), (0, 0)], [(0, 0), (1, 0), (1, 2)]):
-        with pytest.raises(ValueError, match="neighbouring"):
-            EXPERIENCE.expected_time(GRID, cells)

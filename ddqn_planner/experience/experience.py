@@ -16,6 +16,7 @@ from ddqn_planner.experience.evidence import FARTHEST, Evidence, Visits
 from ddqn_planner.files import as_path, write_atomically
 from ddqn_planner.grid import GridMap
 from ddqn_planner.grid.arguments import POSITIVE, Cells, as_number, cells_inside, numbers
+from ddqn_planner.grid.moves import cells_along
 
 Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
@@ -154,7 +155,7 @@ class Experience:
         return deviation
 
     def expected_time(self, grid: GridMap, cells: Cells) -> ExpectedTime:
-        """Return the time that a path of neighbouring cells takes, with an interval of 90 %.
+        """Return the time that a path takes, with an interval of 90 %.
 
         The interval follows from how sure the times of its places are, and is widened until it held
         for 90 % of the last drives.
@@ -162,16 +163,16 @@ class Experience:
         Raises
         ------
         ValueError
-            If the cells are no path in the map.
+            If a cell is no cell of the map.
         """
         spread = self.evidence.over(grid)
-        path = cells_inside(cells, grid.occupancy.shape)
-        if len(path) < 2:
+        corners = cells_inside(cells, grid.occupancy.shape)
+        if len(corners) < 2:
             return ExpectedTime(0.0, 0.0, 0.0)
-        if (np.abs(np.diff(path, axis=0)).max(axis=1) != 1).any():
-            raise ValueError("the cells are no path; give neighbouring cells, as Plan.every_cell")
+        path, position = cells_along(corners)
         x, y = path.T
-        metres = np.hypot(np.diff(x), np.diff(y)) * grid.resolution
+        of_segments = np.hypot(*np.diff(corners, axis=0).T) * grid.resolution
+        metres = np.diff(position) * of_segments[position[:-1].astype(np.int64)]
         slowness = spread.slowness[y, x].astype(np.float64)
         variance = spread.variance(x, y)
         seconds = metres / self.nominal_speed * (slowness[1:] + slowness[:-1]) / 2

@@ -105,6 +105,26 @@ def segment_lengths(
     return lengths
 
 
+def positions(parts: NDArray[np.int64]) -> NDArray[np.float64]:
+    """Return positions on a path, given in how many parts they divide each of its N segments.
+
+    2.5 is the middle of the third segment, and N the end.
+    """
+    number = np.repeat(np.arange(len(parts)), parts)
+    within = np.arange(len(number)) - np.repeat(np.cumsum(parts) - parts, parts)
+    return np.append(number + within / parts[number], float(len(parts)))
+
+
+def cells_along(path: NDArray[Any]) -> tuple[NDArray[np.int32], NDArray[np.float64]]:
+    """Return cells side by side that a path of segments passes, and their positions on it."""
+    vectors = np.append(np.diff(path, axis=0), [[0, 0]], axis=0)
+    position = positions(np.abs(vectors[:-1]).max(axis=1))
+    share, number = np.modf(position)
+    segment = number.astype(np.int64)
+    cells = path[segment] + np.floor(share[:, None] * vectors[segment] + 0.5)
+    return cells.astype(np.int32), position
+
+
 def shortest_distances(grid: GridMap, goal: Cell, move_rule: MoveRule | str) -> NDArray[np.float64]:
     """Return (H, W) float64: the exact least cost of a path to the goal, inf without one."""
     distances: NDArray[np.float64] = _dijkstra(grid, goal, move_rule)[0]

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import array
 import math
+from collections.abc import Sequence
+from itertools import compress
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -17,6 +19,7 @@ from ddqn_planner.grid import Cell, GridMap
 from ddqn_planner.grid.arguments import Cells
 from ddqn_planner.grid.body import grid_from_costmap
 from ddqn_planner.grid.map_file import MAX_CELLS
+from ddqn_planner.grid.moves import positions
 
 if TYPE_CHECKING:
     from ddqn_planner.planning import QField
@@ -26,6 +29,7 @@ Float64 = NDArray[np.float64]
 
 TOLERANCE = 1e-4  # how far the norm of a quaternion may be from 1
 MIN_RESOLUTION = 1e-6  # metres per cell
+SAME_DIRECTION = 1e-6  # radians: poses along a segment are rounded
 
 
 def grid_from_message(message: OccupancyGrid, *rules: Any) -> GridMap:
@@ -108,14 +112,13 @@ def value_message(field: QField | None, grid: GridMap, header: Header) -> Occupa
     return occupancy_message(percent, grid.resolution, grid.origin, header)
 
 
-def path_message(cells: Cells, grid: GridMap, header: Header, goal_orientation: Quaternion) -> Path:
-    """Make a path message; each pose faces the next, and the last has the goal's orientation."""
+def path_message(centres: Float64, yaws: Float64, header: Header, last: Quaternion) -> Path:
+    """Make a path message of what `along` returns; the last pose has an orientation of its own."""
     path, blank = Path(header=header), PoseStamped(header=header)
-    positions, yaws = _along(cells, grid)
     # Poses in the same direction share a quaternion: most of an answer's time is making messages.
     towards = {yaw: quaternion(yaw) for yaw in {*yaws.tolist()}}
-    orientations = [*map(towards.get, yaws.tolist()), goal_orientation]
-    for (x, y), orientation in zip(positions.tolist(), orientations, strict=False):
+    orientations = [*map(towards.get, yaws.tolist()), last]
+    for (x, y), orientation in zip(centres.tolist(), orientations, strict=False):
         stamped = _copy(blank)
         stamped.pose = pose = _copy(blank.pose)
         pose.position = point = _copy(blank.pose.position)
@@ -125,16 +128,24 @@ def path_message(cells: Cells, grid: GridMap, header: Header, goal_orientation: 
     return path
 
 
-def serialized_path(cells: Cells, grid: GridMap, header: Header, goal: Quaternion) -> bytes:
-    """Return what `path_message` does, as it is sent, in a fiftieth of the time."""
-    return path_bytes(*_along(cells, grid), header, goal)
-
-
-def _along(cells: Cells, grid: GridMap) -> tuple[Float64, Float64]:
-    """Return the centres of cells (N, 2), and the directions from each to the next (N - 1)."""
+def along(cells: Cells, grid: GridMap, is_dense: bool = False) -> tuple[Float64, Float64]:
+    """Return positions on a path (N, 2), at most a cell apart if dense, and headings (N - 1)."""
     x, y = np.asarray(cells, dtype=np.float64).reshape(-1, 2).T
     yaws = grid.origin[2] + np.arctan2(np.diff(y), np.diff(x))
+    if is_dense and x.size:
+        at = positions(np.ceil(np.hypot(np.diff(x), np.diff(y))).astype(np.int64))
+        yaws = yaws[at[:-1].astype(np.int64)]
+        x, y = (np.interp(at, np.arange(x.size), axis) for axis in (x, y))
     return np.column_stack(grid.centres(x, y)), yaws
+
+
+def turns(poses: Sequence[PoseStamped]) -> list[PoseStamped]:
+    """Return the first and last of some poses, and those where their path turns."""
+    points = np.array([complex(p.pose.position.x, p.pose.position.y) for p in poses])
+    with np.errstate(invalid="ignore"):  # two poses at one place, or NaN
+        directions = np.diff(points) / np.abs(np.diff(points))
+        is_turn = ~(np.abs(np.diff(directions)) < SAME_DIRECTION)
+    return [*compress(poses, [True, *is_turn, True])] if len(poses) > 2 else [*poses]
 
 
 def path_bytes(

@@ -12,7 +12,7 @@ from rclpy.duration import Duration
 from rclpy.lifecycle import LifecycleNodeMixin, LifecycleState, TransitionCallbackReturn
 from rclpy.node import Node
 
-from ddqn_planner.nodes.runtime import BaseNode, Parameters
+from ddqn_planner.nodes.runtime import Aside, BaseNode, Parameters
 
 SUCCESS = TransitionCallbackReturn.SUCCESS
 
@@ -82,9 +82,7 @@ class ManagedNode(LifecycleNodeMixin, BaseNode):
             # Else a publisher that ends at once takes its last message with it.
             self._bond.pub.wait_for_all_acked(Duration(seconds=0.2))
             self._bond.shutdown()
-            # It has destroyed these, and the node still has them in its lists.
-            self.destroy_subscription(self._bond.sub)
-            self.destroy_publisher(self._bond.pub)
+            self._aside.close()
             self._bond = None
 
     def cleanup(self) -> None:
@@ -149,7 +147,8 @@ class ManagedNode(LifecycleNodeMixin, BaseNode):
             remedy = "apt install ros-jazzy-bondpy, or set bond_timeout to 0.0 in its manager"
             self.get_logger().info(f"no bond: bondpy is not installed; {remedy}")
             return
-        self._bond = Bond(self, "bond", self.get_name())
+        self._aside = Aside(self, "bond")  # it hears the bonds of all nodes, ten times a second
+        self._bond = Bond(self._aside.node, "bond", self.get_name())
         # Seconds, as Nav2's nodes and lifecycle manager have them.
         self._bond.heartbeat_period, self._bond.heartbeat_timeout = 0.1, 4.0
         self._bond.start()

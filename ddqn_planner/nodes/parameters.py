@@ -45,7 +45,9 @@ PLANNER_PARAMETERS: Final = {
     "switch_threshold": Declared(0.05, "Share by which a kept path may cost more", (0, 10)),
     "mode": Declared("greedy", "astar_fallback: search where greedy steps get stuck", METHODS),
     "path_simplification": Declared(
-        "none", "line_of_sight: poses only where a path turns", ["none", "line_of_sight"]
+        "straight",
+        "straight: lines, a pose at least each cell; line_of_sight: only at turns; none: cells",
+        ["none", "line_of_sight", "straight"],
     ),
     "start_source": Declared(
         "initialpose",

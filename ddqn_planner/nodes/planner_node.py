@@ -20,7 +20,7 @@ from std_msgs.msg import Header, String
 from ddqn_planner.experience import Experience
 from ddqn_planner.grid import GridMap
 from ddqn_planner.grid.copies import WHOLE
-from ddqn_planner.nodes.conversions import path_message, serialized_path
+from ddqn_planner.nodes.conversions import along, path_bytes, path_message
 from ddqn_planner.nodes.display import FieldDisplay
 from ddqn_planner.nodes.lifecycle import ManagedNode
 from ddqn_planner.nodes.map_source import MapSource
@@ -122,6 +122,8 @@ class PlannerNode(ManagedNode):
         self._forget()
         self._report.refused.clear()
         self._report.note(NO_REQUEST)
+        if "_frames" in vars(self):
+            self._frames.close()
         self.after_jump_back.clear()
         for name in ("_start", "_frames", "_display", "_map", "_times", "_requests"):
             vars(self).pop(name, None)  # not all are there, if `configure` failed
@@ -160,6 +162,8 @@ class PlannerNode(ManagedNode):
         self._start.listen()
         self._requests.settings = settings
         self._map.apply_parameters(changed)
+        if "path_simplification" in changed:
+            self._followed = PathUnderWay()
         self._plan_for(ActiveGoal(self._active.poses, PathUnderWay()))
 
     # Map, start and goal
@@ -214,7 +218,7 @@ class PlannerNode(ManagedNode):
         if outcome in (UNCHANGED, NOT_ACTIVE):
             return
         if active.is_news(outcome, header.frame_id):
-            self._plan_publisher.publish(_path(serialized_path, outcome, header))
+            self._plan_publisher.publish(_path(path_bytes, outcome, header))
         self._waits_for_pose = outcome.status in ("NO_START", "TF_ERROR")
         path, request = outcome.plan.path, outcome.request
         leaves = request is not None and len(path) > 0 and request.grid.is_obstacle(path[0])
@@ -230,8 +234,8 @@ class PlannerNode(ManagedNode):
     ) -> tuple[Path, Outcome]:
         header, outcome = await self._answer(given_up, start, goals, None, name, self._followed)
         if outcome.request is not None and len(outcome.plan.path):
-            self._followed.keep(outcome.plan.every_cell, outcome.request.grid, header.frame_id)
-            self._plan_publisher.publish(_path(serialized_path, outcome, header))
+            self._followed.keep(outcome.plan.path, outcome.request.grid, header.frame_id)
+            self._plan_publisher.publish(_path(path_bytes, outcome, header))
         self._report.log(outcome)
         return _path(path_message, outcome, header), outcome
 
@@ -372,7 +376,7 @@ class ExpectedTimes:
 
     def describe(self, outcome: Outcome) -> dict[str, str]:
         """Return how long a plan takes, unless its map is old or untimed, or no memory is left."""
-        now, request, path = self._spread_on, outcome.request, outcome.plan.every_cell
+        now, request, path = self._spread_on, outcome.request, outcome.plan.path
         told: dict[str, str] = {}
         is_timed = request is not None and request.grid.slowness is not None and len(path) > 0
         if self._experience and now and request and is_timed and _is_like(request.grid, now):
@@ -397,7 +401,8 @@ def _path(make: Callable[..., Any], outcome: Outcome, header: Header) -> Any:
     """Return the path of an outcome, or an empty one, made by a function of `conversions`."""
     if outcome.request is None or outcome.goal is None:
         return Path(header=header)
-    return make(outcome.plan.path, outcome.request.grid, header, outcome.goal.pose.orientation)
+    poses = along(outcome.plan.path, outcome.request.grid, outcome.is_dense)
+    return make(*poses, header, outcome.goal.pose.orientation)
 
 
 def main() -> int:

@@ -17,7 +17,7 @@ from rclpy.time import Time
 
 from ddqn_planner.nodes.conversions import check_pose, quaternion
 from ddqn_planner.nodes.report import Refusals, RequestError
-from ddqn_planner.nodes.runtime import BaseNode
+from ddqn_planner.nodes.runtime import Aside, BaseNode
 
 # A pose that was stamped before may be transformed by a transform that is later by so much.
 PATIENCE = 1.0  # seconds within which a new listener hears the first message of `odom` or TF
@@ -113,7 +113,8 @@ class Frames:
             import tf2_ros  # it takes a while
 
             self._tf2_ros, self._buffer = tf2_ros, tf2_ros.Buffer()
-            self._listener = tf2_ros.TransformListener(self._buffer, self._node)
+            self._aside = Aside(self._node, "tf")
+            self._listener = tf2_ros.TransformListener(self._buffer, self._aside.node)
             self._began = time.monotonic()
             self._node.after_jump_back.add(self._forget)
 
@@ -126,6 +127,7 @@ class Frames:
         if self._listener is not None:
             self._node.after_jump_back.discard(self._forget)
             self._listener.unregister()
+            self._aside.close()
             self._buffer = self._listener = None
 
 

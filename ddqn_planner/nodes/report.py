@@ -51,6 +51,7 @@ class Outcome:
     plan: Plan = field(default_factory=lambda: Plan(PlanStatus.NO_PATH))
     goal: PoseStamped | None = None  # in the map's frame
     map_stamp: str = ""  # seconds
+    is_dense: bool = False  # whether its path has a pose at least every cell
 
 
 NO_REQUEST = Outcome("NO_REQUEST", "no plan was asked for yet")

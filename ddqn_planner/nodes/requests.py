@@ -22,7 +22,7 @@ from ddqn_planner.grid import Cell, GridMap, MoveRule
 from ddqn_planner.grid.arguments import Cells
 from ddqn_planner.model import find_model
 from ddqn_planner.model.certificate import NO_CERTIFICATE
-from ddqn_planner.nodes.conversions import cell_from_pose
+from ddqn_planner.nodes.conversions import cell_from_pose, turns
 from ddqn_planner.nodes.map_source import MapSource
 from ddqn_planner.nodes.poses import Frames, StartSource
 from ddqn_planner.nodes.report import Outcome, Report, RequestError, reason_of, seconds
@@ -99,7 +99,7 @@ class ActiveGoal:
 
     def is_news(self, outcome: Outcome, frame: str) -> bool:
         """Return whether to publish the path of an outcome, which may be empty."""
-        path, request, shown = outcome.plan.every_cell, outcome.request, (frame, outcome.status)
+        path, request, shown = outcome.plan.path, outcome.request, (frame, outcome.status)
         is_new_path = len(path) > 0 and outcome.plan.extra_cost is None
         is_news, self._shown = is_new_path or shown != self._shown, shown
         if request is None:
@@ -255,7 +255,7 @@ class Requests:
             move_rule=move_rule(settings.move_rule, planner),
             method=PlanMethod(settings.mode),
             tolerance=metres / grid.resolution,
-            simplified=settings.path_simplification == "line_of_sight",
+            simplified=settings.path_simplification != "none",
             start_clearing_radius=_clearing_radius(settings, grid),
         )
         if isinstance(followed, ActiveGoal):
@@ -286,14 +286,16 @@ class Requests:
         if more and not len(plan.path):
             reason = f"goal {number} of {len(goals)}: {reason}"
         stamp = seconds(header.stamp)
-        return Outcome(plan.status.name, reason, planner, request, plan, goal, stamp)
+        is_dense = settings.path_simplification == "straight"
+        return Outcome(plan.status.name, reason, planner, request, plan, goal, stamp, is_dense)
 
     async def is_path_valid(self, path: Path) -> bool:
         """Return whether a path is free now, from the robot on, or all of it if that is unknown."""
         header, grid, planner = await self._inputs()
         frame, settings = header.frame_id, self.settings
         poses = [PoseStamped(header=path.header, pose=stamped.pose) for stamped in path.poses]
-        cells = [_checked("the path", cell_from_pose, pose, grid, frame) for pose in poses]
+        # What a straight path passes between its turns is known exactly, between its poses not.
+        cells = [_checked("the path", cell_from_pose, pose, grid, frame) for pose in turns(poses)]
         robot = cells[0] if cells else (0, 0)
         with suppress(RequestError):
             start = await self._wait_for(self.start.pose)

@@ -15,7 +15,13 @@ from rclpy.exceptions import InvalidParameterValueException
 from std_msgs.msg import Float32, Header, String
 
 from ddqn_planner.grid import Cell, MoveRule, read_map_file
-from ddqn_planner.nodes.conversions import cell_from_pose, check_pose, path_message, serialized_path
+from ddqn_planner.nodes.conversions import (
+    along,
+    cell_from_pose,
+    check_pose,
+    path_bytes,
+    path_message,
+)
 from ddqn_planner.nodes.driving import NO_MAP, Driving, LearningNode, MapInFrame, explained
 from ddqn_planner.nodes.parameters import HYPER_PARAMETERS, OF_MAPS, TRAINER_PARAMETERS
 from ddqn_planner.nodes.poses import check_source
@@ -78,7 +84,7 @@ class TrainerNode(LearningNode):
         self.map = MapInFrame(grid, "map")
         for which, cell in (("start", map_file.start), ("goal", map_file.goal)):
             if cell is not None:
-                path = path_message([cell], grid, Header(frame_id="map"), Quaternion())
+                path = path_message(*along([cell], grid), Header(frame_id="map"), Quaternion())
                 self._poses[which] = path.poses[0]
 
     def _on_pose(self, which: str, message: PoseStamped | PoseWithCovarianceStamped) -> None:
@@ -187,7 +193,7 @@ class TrainerNode(LearningNode):
         self.get_logger().info(f"the training {ends}")
 
     def _publish_cells(self, cells: tuple[Cell, ...], place: MapInFrame) -> None:
-        path = serialized_path(cells, place.grid, self.header(place.frame), Quaternion())
+        path = path_bytes(*along(cells, place.grid), self.header(place.frame), Quaternion())
         self.episodes.publish(path)
 
     def _publish_diagnostics(self) -> None:

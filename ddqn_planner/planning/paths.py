@@ -1,21 +1,27 @@
-"""Parts of paths: searches, the way out of a start, what is left of a path, straight segments."""
+"""Parts of paths: searches, the way out of a start, what is left of a path under way."""
 
 from __future__ import annotations
 
 import heapq
-from typing import Any, TypeAlias
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ddqn_planner.compiled import compiled
-from ddqn_planner.grid import MOVES, Cell, GridMap, MoveRule, legal_moves, path_cost, path_length
+from ddqn_planner.grid import MOVES, Cell, GridMap, MoveRule, legal_moves
 from ddqn_planner.grid.arguments import Cells, Occupancy
+from ddqn_planner.grid.moves import cells_along
 from ddqn_planner.planning.field import Goals
 from ddqn_planner.planning.plan import ROUNDING, PlanRequest
-from ddqn_planner.planning.segments import SAME_COST, segment_cost
+from ddqn_planner.planning.segments import (
+    SAME_COST,
+    Path,
+    cost_along,
+    legal_segments,
+    straightened,
+)
 
-Path: TypeAlias = NDArray[np.int32]  # (N, 2): the cells of a path
 REACH = 5  # cells along an axis that a robot may be beside its path, and still come back to it
 # Of ways out of one length, the one that ends nearer to the goal: so little its distance counts.
 NEARER_TO_GOAL = 1e-9
@@ -141,28 +147,6 @@ def _near(cells: NDArray[np.bool_], centre: Cell, distance: float) -> NDArray[np
 # The path under way
 
 
-def legal_segments(path: Cells, grid: GridMap, move_rule: MoveRule | str) -> NDArray[np.bool_]:
-    """Return which moves or segments of a path are legal, see `simplify`: (N - 1,) bool."""
-    rule, cells = MoveRule(move_rule), _array(path)
-    inside = ((cells >= 0) & (cells < (grid.width, grid.height))).all(axis=1)
-    free = inside.copy()
-    free[inside] = ~grid.occupancy[cells[inside, 1], cells[inside, 0]]
-    legal: NDArray[np.bool_] = free[:-1] & free[1:]
-    sides = np.abs(np.diff(cells, axis=0))
-    if not rule.cuts_corners:
-        diagonal = np.flatnonzero(legal & (sides == 1).all(axis=1))
-        (x, y), (next_x, next_y) = cells[diagonal].T, cells[diagonal + 1].T
-        legal[diagonal] = ~(grid.occupancy[y, next_x] | grid.occupancy[next_y, x])
-    if grid.forbidden is not None:
-        moves = np.flatnonzero(legal & (sides.max(axis=1) == 1))
-        (x, y), (dx, dy) = cells[moves].T, (cells[moves + 1] - cells[moves]).T
-        actions = np.rint(np.arctan2(dy, dx) / (np.pi / 4)).astype(np.int64) % len(MOVES)
-        legal[moves] = (grid.forbidden[y, x] >> actions & 1) == 0
-    for index in np.flatnonzero(legal & (sides.max(axis=1) > 1)).tolist():
-        legal[index] = segment_cost(cells[index], cells[index + 1], grid, rule) < np.inf
-    return legal
-
-
 def is_path_valid(
     path: Cells, robot: Cell, grid: GridMap, move_rule: MoveRule | str, radius: float = 0.0
 ) -> bool:
@@ -170,15 +154,20 @@ def is_path_valid(
     cells = _array(path)
     if not len(cells):
         return False
-    rest = cells[np.hypot(*(cells - np.array(robot, dtype=np.float64)).T).argmin() :]
+    passed, position = cells_along(cells)
+    at = np.hypot(*(passed - np.array(robot, dtype=np.float64)).T).argmin()
     if grid.contains(robot) and not grid.is_free(robot):
-        out = next((index for index, (x, y) in enumerate(rest) if grid.is_free((x, y))), len(rest))
+        free = (index for index in range(at, len(passed)) if grid.is_free((*passed[index],)))
+        out = next(free, len(passed))
         obstacles = obstacles_in_the_way(grid, robot, radius)
         leaving = GridMap(obstacles, forbidden=grid.forbidden)
-        if not legal_segments(rest[: out + 1], leaving, move_rule).all():
+        if not legal_segments(passed[at : out + 1], leaving, move_rule).all():
             return False
-        rest = rest[out:]
-    return len(rest) > 0 and _legal_from(rest, grid, move_rule) == 0
+        at = out
+    if at == len(passed):
+        return False
+    begin, segment = np.modf(position[at])
+    return _legal_from(cells[int(segment) :], grid, move_rule, begin) == 0
 
 
 def rest_of_path(path: Cells, robot: Cell, grid: GridMap, move_rule: MoveRule | str) -> Path:
@@ -186,16 +175,25 @@ def rest_of_path(path: Cells, robot: Cell, grid: GridMap, move_rule: MoveRule | 
     cells = _array(path)
     if not len(cells) or not grid.is_free(robot):
         return cells[:0]
-    first = _legal_from(cells, grid, move_rule)
-    distances = np.abs(cells - robot).max(axis=1)
-    near = first + np.flatnonzero(distances[first:] <= REACH)
+    passed, position = cells_along(cells)
+    following = position.astype(np.int64) + 1
+    distances = np.abs(passed - robot).max(axis=1)
+    is_near = (distances <= REACH) & (following >= _legal_from(cells, grid, move_rule))
+    near = np.flatnonzero(is_near)
     # The nearest first, and of those the farthest along the path.
     for index in near[np.lexsort((-near, distances[near]))].tolist():
-        vector = cells[index] - robot
-        steps = np.arange(distances[index] + 1, dtype=np.int32)[:, None]
-        way = robot + np.sign(vector) * np.minimum(steps, np.abs(vector))  # diagonal moves first
-        if legal_segments(way, grid, move_rule).all():
-            return np.concatenate([way[:-1], cells[index:]], dtype=np.int32)
+        vector = passed[index] - robot
+        dx, dy = np.abs(vector)
+        steps = np.arange(dx + dy + 1)
+        ways = [np.minimum(steps[: max(dx, dy) + 1, None], (dx, dy))]  # diagonal moves first
+        if dx + dy <= REACH:  # past a corner that the path's segment grazes
+            ways.append(np.stack([np.minimum(steps, dx), np.maximum(steps - dx, 0)], axis=1))
+            ways.append(np.stack([np.maximum(steps - dy, 0), np.minimum(steps, dy)], axis=1))
+        for way in ways:
+            leaving = robot + np.sign(vector) * way, cells[following[index] :]
+            rest = np.concatenate(leaving, dtype=np.int32)
+            if legal_segments(rest[: len(way) + 1], grid, move_rule).all():
+                return rest
     return cells[:0]
 
 
@@ -206,21 +204,20 @@ def keep_or_switch(request: PlanRequest, new: Path) -> tuple[Path, float | None]
     rest = rest_of_path(request.under_way, (x, y), grid, rule)
     if not len(rest) or rest[-1].tolist() not in [new[-1].tolist(), *map(list, request.goals)]:
         return new, None
+    if request.simplified:
+        rest = straightened(rest, grid, rule)
     if np.array_equal(rest, new):
         return new, 0.0
-    if grid.has_costs:
-        cost, new_cost = (path_cost(path, grid.multipliers(path), rule) for path in (rest, new))
-    else:  # multipliers that are all 1 would take memory
-        cost, new_cost = path_length(rest, rule), path_length(new, rule)
+    cost, new_cost = (cost_along(path, grid, rule) for path in (rest, new))
     if cost > (1 + request.switch_threshold) * new_cost * SAME_COST:
         return new, None
     return rest, cost / new_cost - 1
 
 
-def _legal_from(cells: Path, grid: GridMap, move_rule: MoveRule | str) -> int:
+def _legal_from(cells: Path, grid: GridMap, move_rule: MoveRule | str, begin: float = 0.0) -> int:
     """Return the first cell of a path from which on all of it is legal; N if its end is not."""
     # As a segment of no length the last cell has to be free too.
-    legal = legal_segments(np.concatenate([cells, cells[-1:]]), grid, move_rule)
+    legal = legal_segments(np.concatenate([cells, cells[-1:]]), grid, move_rule, begin)
     return int(np.flatnonzero(~legal).max(initial=-1)) + 1
 
 

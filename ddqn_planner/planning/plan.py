@@ -48,7 +48,7 @@ class PlanRequest:
     method: PlanMethod = PlanMethod.GREEDY
     tolerance: float = 0.0
     simplified: bool = False
-    under_way: Cells = field(default=(), compare=False)  # what the robot follows, move by move
+    under_way: Cells = field(default=(), compare=False)  # what the robot follows
     switch_threshold: float = 0.0  # the share by which the rest of it may cost more than a new path
     others: tuple[Cell, ...] = ()  # goals that do as well: the nearest one counts; no tolerance
     start_clearing_radius: float = 0.0
@@ -79,13 +79,11 @@ class Plan:
     move_rule : MoveRule
         The rule under which the moves are legal.
     cost : float, optional
-        What the path costs before it is simplified, see `path_cost`: on a map with costs, if a
-        planner made the plan. On a map of expected times it is in seconds.
+        What the path costs, see `path_cost`: on a map with costs, if a planner made the plan. On a
+        map of expected times it is in seconds.
     goal : (x, y), optional
         Where the path ends, or would end: the goal asked for, the nearest of several, or the cell
         to which it moved. None for a rollout, or if no Q field was needed.
-    every_cell : (N, 2) int32
-        The path move by move, before it was simplified, if a planner made the plan.
     extra_cost : float, optional
         The share by which the rest of the path under way costs more than a new one, if it is kept.
     field_ms, rollout_ms : float
@@ -98,7 +96,6 @@ class Plan:
     move_rule: MoveRule = MoveRule.ROBOT_SAFE
     cost: float | None = None
     goal: Cell | None = None
-    every_cell: Cells = ()
     extra_cost: float | None = None
     field_ms: float = 0.0
     rollout_ms: float = 0.0
@@ -145,14 +142,9 @@ def joined(plans: Sequence[Plan]) -> Plan:
     searched = any(plan.method is PlanMethod.ASTAR_FALLBACK for plan in plans)
     return replace(
         last,
-        path=_joined([plan.path for plan in plans]),
-        every_cell=_joined([plan.every_cell for plan in plans]),
+        path=np.concatenate([first.path[:1], *(plan.path[1:] for plan in plans)]),
         method=PlanMethod.ASTAR_FALLBACK if searched else PlanMethod.GREEDY,
         cost=None if first.cost is None else sum(plan.cost or 0.0 for plan in plans),
         field_ms=sum(plan.field_ms for plan in plans),
         rollout_ms=sum(plan.rollout_ms for plan in plans),
     )
-
-
-def _joined(paths: Sequence[Cells]) -> NDArray[np.int32]:
-    return np.concatenate([paths[0][:1], *(path[1:] for path in paths)], dtype=np.int32)

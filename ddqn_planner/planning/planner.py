@@ -12,7 +12,7 @@ from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 
-from ddqn_planner.grid import Cell, GridMap, MoveRule, path_cost
+from ddqn_planner.grid import Cell, GridMap, MoveRule
 from ddqn_planner.grid.arguments import as_cell, as_flag, as_number, listed
 from ddqn_planner.grid.grid_map import check_grid
 from ddqn_planner.model import ModelMetadata, QNetwork, load_model
@@ -20,7 +20,7 @@ from ddqn_planner.planning.field import DistanceField, Goals, QField
 from ddqn_planner.planning.field_cache import FieldCache
 from ddqn_planner.planning.paths import find_way_out, keep_or_switch, search, way_and_ends
 from ddqn_planner.planning.plan import Plan, PlanMethod, PlanRequest, PlanStatus, joined
-from ddqn_planner.planning.segments import simplify
+from ddqn_planner.planning.segments import cost_along, straightened
 
 T = TypeVar("T")
 
@@ -306,6 +306,8 @@ def _roll_out(request: PlanRequest, found: _Found) -> Generator[None, None, Call
         plan = Plan(PlanStatus.SUCCEEDED, np.array(cells), PlanMethod.ASTAR_FALLBACK)
     path, cost, extra_cost, goal = plan.path, None, None, field.goal
     if path.size:
+        if request.simplified:
+            path = straightened(path, grid, rule)
         if len(request.under_way):
             path, extra_cost = keep_or_switch(request, path)
         goal = (int(path[-1, 0]), int(path[-1, 1]))
@@ -314,11 +316,8 @@ def _roll_out(request: PlanRequest, found: _Found) -> Generator[None, None, Call
             if not np.array_equal(path, np.asarray(request.under_way)[-len(path) :]):
                 extra_cost = None  # only from the first free cell on it is the one kept
         if grid.has_costs:
-            cost = path_cost(path, grid.multipliers(path), rule) * (grid.seconds_per_cell or 1.0)
-    every_cell = path
-    if request.simplified:
-        path = np.array(simplify(path, grid, rule), dtype=np.int32)
-    return partial(Plan, plan.status, path, plan.method, rule, cost, goal, every_cell, extra_cost)
+            cost = cost_along(path, grid, rule) * (grid.seconds_per_cell or 1.0)
+    return partial(Plan, plan.status, path, plan.method, rule, cost, goal, extra_cost)
 
 
 def _timed(steps: Generator[None, None, T]) -> Generator[None, None, tuple[T, float]]:

@@ -1,6 +1,7 @@
 """The script of docs/benchmarks.md that counts flips, at a small scale."""
 
 import numpy as np
+import pytest
 from flips import APART, drive, is_flip
 
 from ddqn_planner import Planner
@@ -20,10 +21,12 @@ def test_a_flip_leads_away_from_what_was_left_within_the_next_metres() -> None:
     assert not is_flip(straight[:0], away)  # the last one was not legal any more
 
 
-def test_a_drive_is_the_same_each_time_and_flips_less_with_a_threshold() -> None:
+@pytest.mark.parametrize("is_straight", [False, True])
+def test_a_drive_is_the_same_each_time_and_flips_less_with_a_threshold(is_straight: bool) -> None:
     planner = Planner.load("any_map")
     without, again, with_threshold = (
-        drive(planner, "two ways", 2, threshold, side=80) for threshold in (0.0, 0.0, 0.3)
+        drive(planner, "two ways", 0, threshold, is_straight, side=80)
+        for threshold in (0.0, 0.0, 0.3)
     )
     assert without == again
     assert with_threshold.flips < without.flips

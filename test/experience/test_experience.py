@@ -125,8 +125,11 @@ def test_the_cost_of_a_plan_is_its_expected_time_and_no_path_is_faster(seed: int
         if plan.cells:
             assert plan.cost == pytest.approx(seconds[start[1], start[0]], rel=1e-6, abs=1e-6)
             if grid.cost is None:
-                told = experience.expected_time(grid, plan.every_cell)
+                told = experience.expected_time(grid, plan.path)
                 assert told.seconds == pytest.approx(plan.cost, rel=1e-4)
+                straight_plan = planner.plan(applied, start, goal, simplified=True)
+                told = experience.expected_time(grid, straight_plan.path)
+                assert told.seconds == pytest.approx(straight_plan.cost, rel=0.05)
         else:
             assert np.isinf(seconds[start[1], start[0]])
 

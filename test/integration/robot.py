@@ -18,6 +18,7 @@ from client import TIMEOUT as TIMEOUT  # this and values_of are used by the test
 from client import Client, initial_pose, map_message, pose, wait_for_map
 from client import values_of as values_of
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from exact_segments import is_legal
 from geometry_msgs.msg import PoseStamped, Quaternion
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState, GetState
@@ -29,7 +30,7 @@ from rclpy.parameter import parameter_value_to_python
 from rclpy.qos import DurabilityPolicy, QoSProfile
 from std_msgs.msg import Header
 
-from ddqn_planner.grid import Cell, GridMap, MoveRule, legal_moves
+from ddqn_planner.grid import Cell, GridMap, MoveRule
 from ddqn_planner.model import ModelMetadata, save_model
 from ddqn_planner.nodes.parameters import PLANNER_PARAMETERS
 from ddqn_planner.nodes.report import seconds
@@ -234,20 +235,23 @@ def yaw_of(rotation: Quaternion) -> float:
 
 
 def check_path(path: Path, grid: GridMap, move_rule: MoveRule = MoveRule.ROBOT_SAFE) -> None:
-    """Check that a path makes legal moves from cell centre to cell centre and looks ahead."""
+    """Check that a path leads along legal segments between cell centres, densely, looking ahead."""
     assert path.header.frame_id == "map"
     assert all(pose.header == path.header for pose in path.poses)
     points = points_of(path)
-    cells = [grid.world_to_cell(x, y) for x, y in points]
-    assert np.allclose([grid.cell_to_world(cell) for cell in cells], points, atol=1e-6)
-    legal = legal_moves(grid.occupancy, move_rule)
-    for index, (cell, next_cell) in enumerate(pairwise(cells)):
-        step = (next_cell[0] - cell[0], next_cell[1] - cell[1])
-        assert max(abs(step[0]), abs(step[1])) == 1
-        action = round(math.atan2(step[1], step[0]) / (math.pi / 4)) % 8
-        assert legal[action, cell[1], cell[0]]
-        turned = yaw_of(path.poses[index].pose.orientation) - grid.origin[2]
-        assert math.cos(turned - action * math.pi / 4) == pytest.approx(1.0)
+    yaws = [math.atan2(y - v, x - u) for (u, v), (x, y) in pairwise(points)]
+    for stamped, yaw, step in zip(path.poses, yaws, pairwise(points), strict=False):
+        assert math.dist(*step) <= grid.resolution * (1 + 1e-6)
+        assert math.cos(yaw_of(stamped.pose.orientation) - yaw) == pytest.approx(1.0)
+    turns = [point for point, step in zip(points[1:], pairwise(yaws), strict=False) if turned(step)]
+    corners = [*points[:1], *turns, *points[-1:]] if len(points) > 1 else points
+    cells = [grid.world_to_cell(x, y) for x, y in corners]
+    assert np.allclose([grid.cell_to_world(cell) for cell in cells], corners, atol=1e-6)
+    assert all(is_legal(*segment, grid, move_rule) for segment in pairwise(cells))
+
+
+def turned(yaws: tuple[float, float]) -> bool:
+    return math.cos(yaws[0] - yaws[1]) < 1 - 1e-9
 
 
 def changed(message: Any, field: str, value: Any) -> Any:

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import math
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
 import pytest
 from client import cell_of, cells_of, map_message
+from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseArray
-from integration.robot import NUMBERS, Robot, check_path, odometry
+from integration.robot import NUMBERS, Robot, check_path, odometry, points_of, values_of
 from nav_msgs.msg import OccupancyGrid, Odometry
 from std_msgs.msg import Header
 
@@ -153,12 +156,17 @@ def test_the_path_of_a_moving_robot_is_published_only_where_it_leaves_it(robot: 
     robot.client.publisher(Odometry, "odom")
     robot.client.wait_for_discovery("planner")
     robot.client.publish("odom", odometry(robot, START))
-    path = cells_of(robot.grid, robot.wait_for_path(START, GOAL))
+    message = robot.wait_for_path(START, GOAL)
+    path, points = cells_of(robot.grid, message), points_of(message)
     first = robot.last_plan()
     for index in (1, 4, 10):
         robot.client.publish("odom", odometry(robot, path[index]))
-        length = np.hypot(*np.diff(path[index:], axis=0).T).sum()
-        robot.wait_for_reason("^a path of ", {"path length (cells)": f"{length:.3f}"})
+        rest = sum(math.dist(*step) for step in pairwise(points[index:])) / robot.grid.resolution
+
+        def follows(message: DiagnosticArray, rest: float = rest) -> bool:
+            return abs(float(values_of(message.status[0])["path length (cells)"]) - rest) < 1.2
+
+        robot.diagnostics.wait(follows)
         assert robot.last_plan().header.stamp == first.header.stamp
     x, y = path[10]
     robot.client.publish("odom", odometry(robot, (x, y - 8)))

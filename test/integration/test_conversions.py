@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import array
 import math
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -16,13 +17,15 @@ from std_msgs.msg import Header
 
 from ddqn_planner.grid import GridMap
 from ddqn_planner.nodes.conversions import (
+    along,
     cell_from_pose,
     check_pose,
     grid_from_message,
     occupancy_message,
+    path_bytes,
     path_message,
     quaternion,
-    serialized_path,
+    turns,
     value_message,
 )
 from ddqn_planner.planning import QField
@@ -123,28 +126,42 @@ def test_values_are_percent_or_unknown(values: list[float], percent: list[int]) 
     assert message.header.frame_id == "map"
 
 
+def is_turn(before: tuple[int, int], at: tuple[int, int], after: tuple[int, int]) -> bool:
+    (dx, dy), (u, v) = np.subtract(at, before).tolist(), np.subtract(after, at).tolist()
+    return bool(dx * v != dy * u or dx * u + dy * v < 0)
+
+
 @given(
     st.lists(st.tuples(st.integers(0, 300), st.integers(0, 300)), max_size=8),
     st.text(st.characters(min_codepoint=1, codec="utf-8"), max_size=12),
     st.floats(-4, 4),
+    st.booleans(),
 )
 def test_a_path_looks_ahead_and_ends_as_the_goal_and_is_the_same_serialized(
-    cells: list[tuple[int, int]], frame: str, yaw: float
+    cells: list[tuple[int, int]], frame: str, yaw: float, is_dense: bool
 ) -> None:
     grid = GridMap(np.zeros((2, 2)), 0.05, (1.5, -20.25, yaw))
     header = Header(frame_id=frame, stamp=Time(sec=5, nanosec=77))
-    path = path_message(cells, grid, header, quaternion(0.7))
+    path = path_message(*along(cells, grid, is_dense), header, quaternion(0.7))
     assert all(each.header is header for each in [path, *path.poses])
     points = points_of(path)
-    expected = [grid.cell_to_world(cell) for cell in cells]
-    np.testing.assert_allclose(points, expected, atol=1e-9)
+    if is_dense:
+        assert all(math.dist(*step) <= 0.05 * (1 + 1e-9) for step in pairwise(points))
+        cells = [cell for cell, after in pairwise([*cells, None]) if cell != after]
+        corners = [grid.world_to_cell(*point) for point in points_of(Path(poses=turns(path.poses)))]
+        through = zip(cells, cells[1:], cells[2:], strict=False)
+        assert corners == [*cells[:1], *(at[1] for at in through if is_turn(*at)), *cells[1:][-1:]]
+    else:
+        expected = [grid.cell_to_world(cell) for cell in cells]
+        np.testing.assert_allclose(points, expected, atol=1e-9)
     for pose, here, there in zip(path.poses, points, points[1:], strict=False):
         ahead = math.atan2(there[1] - here[1], there[0] - here[0])
         looks = yaw_of(pose.pose.orientation)
         assert math.cos(looks - ahead) == pytest.approx(1.0) or here == there
     assert all(pose.pose.orientation == quaternion(0.7) for pose in path.poses[-1:])
-    sent = deserialize_message(serialized_path(cells, grid, header, quaternion(0.7)), Path)
-    assert [sent.header, *(pose.header for pose in sent.poses)] == [header] * (1 + len(cells))
+    sent = path_bytes(*along(cells, grid, is_dense), header, quaternion(0.7))
+    sent = deserialize_message(sent, Path)
+    assert [sent.header, *(pose.header for pose in sent.poses)] == [header] * (1 + len(points))
     for name, axes in (("position", "xyz"), ("orientation", "xyzw")):
         values, expected = (
             [[getattr(getattr(p.pose, name), axis) for axis in axes] for p in message.poses]

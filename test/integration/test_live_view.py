@@ -17,7 +17,7 @@ pytest.importorskip("rerun", reason="rerun is missing")
 import live_view
 from rerun.chunk import RrdReader
 
-from ddqn_planner.nodes.conversions import grid_from_message, occupancy_message, path_message
+from ddqn_planner.nodes.conversions import along, grid_from_message, occupancy_message, path_message
 from ddqn_planner.nodes.runtime import LATCHED
 
 TIMEOUT = 120.0
@@ -61,7 +61,9 @@ def test_a_recording_holds_what_the_nodes_published(
         client.publish("planner/value", occupancy_message(field, 0.5, ORIGIN, HEADER), LATCHED)
         client.publish("map", message, LATCHED)
         for topic, cells in (("plan", CELLS["plan"]), ("trainer/episode", CELLS["episode"])):
-            client.publish(topic, path_message(cells, grid, HEADER, Quaternion(w=1.0)), LATCHED)
+            client.publish(
+                topic, path_message(*along(cells, grid), HEADER, Quaternion(w=1.0)), LATCHED
+            )
         client.publish("trainer/average_reward", Float32(data=-0.5))
         deadline = time.monotonic() + TIMEOUT
         wanted = {*(f"map/{layer}" for layer in live_view.LAYERS), "reward"}

@@ -18,9 +18,9 @@ def test_the_check_of_an_answer_finds_each_error() -> None:
         ((0, 0), (9, 9), [], ""),
         ((0, 0), (1, 1), [], "where there is one"),
         ((0, 0), (1, 1), [(0, 0), (0, 1)], "asked was"),
-        ((0, 0), (1, 1), [(0, 0), (1, 1)], "illegal move"),
-        ((0, 0), (0, 2), [(0, 0), (0, 2)], "illegal move"),
-        ((0, 0), (0, 1), [(0, 0), (-1, 0), (0, 1)], "illegal move"),
+        ((0, 0), (1, 1), [(0, 0), (1, 1)], "illegal segment"),
+        ((0, 0), (2, 0), [(0, 0), (2, 0)], "illegal segment"),
+        ((0, 0), (0, 1), [(0, 0), (-1, 0), (0, 1)], "illegal segment"),
     ]
     for start, goal, path, error in cases:
         plan = Path(poses=[pose(fixture.grid, cell) for cell in path])

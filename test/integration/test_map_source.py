@@ -197,6 +197,16 @@ def test_after_updates_the_map_is_as_if_it_came_whole(
         assert source.check() == header
         set_parameters(allow_unknown=parameters.get("allow_unknown", False))  # it reads anew
         assert source.grid().same_cells(expected)
+    for frame, moved in (
+        ("map", (0.5, (1.0, 2.0, 0.3))),
+        ("map", (1.0, place[1])),
+        ("odom", place),
+    ):
+        whole._take(occupancy_message(values, *moved, Header(frame_id=frame)))
+        assert (whole.frame, whole.grid().resolution) == (frame, moved[0])
+        assert whole.grid().origin == pytest.approx(moved[1])
+    whole._take(occupancy_message(values, *place, Header()))
+    assert "frame is ''" in whole.report.refused["map"]
     said = source.describe()
     assert said["map stamp (s)"] == "11.000000000"
     assert said["map updates applied"] == "10"

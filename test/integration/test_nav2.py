@@ -223,6 +223,11 @@ def test_a_path_to_one_goal_is_kept_while_it_is_nearly_as_good_as_a_new_one() ->
         grid = GridMap(values > 0)
         ends = pose(grid, (0, 5)), pose(grid, (29, 5))
 
+        def run(task: Any) -> Any:
+            future = executor.create_task(task)
+            executor.spin_until_future_complete(future, 60)
+            return future.result()
+
         def plan(dear: slice, threshold: float) -> tuple[bool, str]:
             """Return whether the path leads above the block, where one way costs a little more."""
             node.set_parameters([Parameter("switch_threshold", value=threshold)])
@@ -230,9 +235,9 @@ def test_a_path_to_one_goal_is_kept_while_it_is_nearly_as_good_as_a_new_one() ->
             costs[dear, 10:20] = 2
             node._map._take(map_message(costs, grid, next(NUMBERS)))
             asked = ends[0], [ends[1]], "", lambda: None
-            answer = executor.create_task(node._plan_for_action(*asked))
-            executor.spin_until_future_complete(answer, 60)
-            path, outcome = answer.result()
+            path, outcome = run(node._plan_for_action(*asked))
+            request, validity = SimpleNamespace(path=path), SimpleNamespace()
+            assert run(node._on_is_path_valid(request, validity)).is_valid
             return max(stamped.pose.position.y for stamped in path.poses) > 8, outcome.reason
 
         below, above = slice(0, 3), slice(8, 11)

@@ -19,6 +19,7 @@ from rclpy.time import Time
 from scipy.spatial.transform import Rotation
 from std_msgs.msg import Header
 
+from ddqn_planner.nodes import poses
 from ddqn_planner.nodes.poses import Frames, StartSource, transformed
 from ddqn_planner.nodes.report import Refusals, RequestError
 
@@ -110,6 +111,8 @@ def listening(monkeypatch: pytest.MonkeyPatch) -> Callable[..., Frames]:
         fields["__spec__"] = object  # it is installed
         tf2_ros = SimpleNamespace(Buffer=lambda: Buffer(*seconds), **fields)
         monkeypatch.setitem(sys.modules, "tf2_ros", tf2_ros)
+        aside = SimpleNamespace(node=None, close=lambda: None)
+        monkeypatch.setattr(poses, "Aside", lambda *_: aside)
         return Frames(Node(), lambda: tolerance)
 
     return make

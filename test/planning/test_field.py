@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import copy
 import sys
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
@@ -18,7 +19,8 @@ from random_maps import generate_map
 from strategies import GRIDS, RULES, cells_of
 
 from ddqn_planner import GridMap, MoveRule, PlanStatus
-from ddqn_planner.grid import MOVES, Cell, legal_moves, shortest_distances
+from ddqn_planner.grid import MOVES, Cell, copies, grid_map, legal_moves, shortest_distances
+from ddqn_planner.grid.grid_map import LAYERS
 from ddqn_planner.grid.noise import random_requests
 from ddqn_planner.model.move_costs import MoveCosts
 from ddqn_planner.planning import field as fields
@@ -162,6 +164,9 @@ def any_share(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(fields, "CHANGED_SHARE", 1.0)
     monkeypatch.setattr(fields, "REPAIRED_SHARE", 1.0)
     monkeypatch.setattr(fields, "REPAIRED", fields.REPAIRED)  # tests change it
+    for name, value in {"SMALL": 0, "BOX": 1, "LARGE": 1}.items():  # copies share memory
+        monkeypatch.setattr(copies, name, value)
+    monkeypatch.setattr(grid_map, "MAX_PATCHES", 3)
 
 
 @st.composite
@@ -225,6 +230,41 @@ def test_a_repaired_field_is_a_fresh_one_bit_for_bit(
         assert plans[0] == plans[1]
         if data.draw(st.booleans(), label="compare"):
             assert_same(planner.q_field(grid, goal, rule), fresh_field(grid, goal, rule))
+
+
+@settings(max_examples=150)
+@given(GRIDS, RULES, st.data())
+def test_a_map_made_of_any_earlier_one_is_planned_on_as_a_new_one(
+    grid_and_goal: tuple[GridMap, Cell], rule: MoveRule, data: st.DataObject
+) -> None:
+    maps, planner = [grid_and_goal[0]], new_planner()
+    for seed in range(data.draw(st.integers(1, 8))):
+        grid = data.draw(st.sampled_from(maps))
+        random = np.random.default_rng(seed)
+        if data.draw(st.booleans()):
+            x, y = data.draw(cells_of(grid))
+            cost = None if grid.cost is None else [[data.draw(st.integers(-1, 99))]]
+            grid = grid.with_patch([[not grid.occupancy[y, x]]], x, y, cost)
+        elif data.draw(st.booleans()):
+            slowness = (1 + random.random(grid.occupancy.shape)).astype(np.float32)
+            grid = grid.with_slowness(slowness, 1.0)
+        else:
+            grid = data.draw(changed_maps(grid))
+        maps.append(grid)
+        if not grid.free_cells():
+            continue
+        copied = {name: copy.copy(getattr(grid, name)) for name in LAYERS}
+        fresh = GridMap(resolution=grid.resolution, origin=grid.origin, **copied)
+        fresh = replace(fresh, seconds_per_cell=grid.seconds_per_cell)
+        start, goal = (data.draw(st.sampled_from(grid.free_cells()[::7])) for _ in range(2))
+        assert planner.plan(grid, start, goal, rule) == new_planner().plan(fresh, start, goal, rule)
+        costs, new = (one.fields._map(grid, rule).costs for one in (planner, new_planner()))
+        assert costs is not None
+        assert new is not None
+        for ours, expected in ((costs.patch, new.patch), (costs.value, new.value)):
+            np.testing.assert_array_equal(ours, expected)
+        if data.draw(st.booleans(), label="compare"):
+            assert_same(planner.q_field(grid, goal, rule), fresh_field(fresh, goal, rule))
 
 
 def test_a_changed_map_uses_what_is_known_of_the_one_before() -> None:

@@ -83,7 +83,7 @@ def test_a_robot_between_two_docks_keeps_to_one_of_them(has_costs: bool) -> None
     request = PlanRequest(grid, (9, 10), left, MoveRule.ROBOT_SAFE, PlanMethod.ASTAR_FALLBACK)
     first = last_step(planner.steps(replace(request, others=(right,))))
     assert first.goal == left
-    request = replace(request, start=(11, 10), others=(right,), under_way=first.every_cell)
+    request = replace(request, start=(11, 10), others=(right,), under_way=first.path)
     kept = last_step(planner.steps(replace(request, switch_threshold=0.5)))
     assert (kept.goal, kept.length) == (left, 11)
     assert kept.extra_cost == pytest.approx(11 / 9 - 1)

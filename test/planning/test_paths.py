@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from fractions import Fraction
 from itertools import pairwise
 from typing import Any
 
@@ -23,6 +24,7 @@ from ddqn_planner.grid import (
     shortest_distances,
     shortest_path,
 )
+from ddqn_planner.grid.moves import cells_along
 from ddqn_planner.planning import PlanRequest
 from ddqn_planner.planning.paths import (
     REACH,
@@ -50,6 +52,21 @@ def changed(draw: st.DrawFn, grid: GridMap) -> GridMap:
 
 
 # The path under way
+
+
+def cells_with_positions(path: list[Cell]) -> list[tuple[Cell, Fraction]]:
+    """Cells side by side on a path of segments: each that lies nearest to a point of it."""
+    passed = []
+    for number, (first, last) in enumerate(pairwise(path)):
+        vector = [b - a for a, b in zip(first, last, strict=True)]
+        steps = max(map(abs, vector))
+        for step in range(steps):
+            x, y = (
+                math.floor(a + Fraction(step * by, steps) + Fraction(1, 2))
+                for a, by in zip(first, vector, strict=True)
+            )
+            passed.append(((x, y), number + Fraction(step, steps)))
+    return [*passed, (path[-1], Fraction(len(path) - 1))]
 
 
 def drawn_path(data: st.DataObject, grid: GridMap, goal: Cell, rule: MoveRule) -> list[Cell]:
@@ -81,11 +98,22 @@ def test_a_path_is_valid_if_all_of_it_from_the_cell_nearest_to_the_robot_on_is_l
     path = data.draw(st.sampled_from([path, [*simplify(path, grid, rule)]]))
     robot = data.draw(st.tuples(st.integers(-99, 99), st.integers(-99, 99)))
     after = data.draw(changed(grid))
-    nearest = min(range(len(path)), key=lambda index: math.dist(path[index], robot))
-    rest = path[nearest:]
-    expected = after.is_free(rest[-1]) and all(is_legal(*s, after, rule) for s in pairwise(rest))
+    passed = cells_with_positions(path)
+    assert cells_along(np.array(path))[0].tolist() == [[*cell] for cell, _ in passed]
+    _, position = min(passed, key=lambda entry: math.dist(entry[0], robot))
+    segments = [*pairwise([*path, path[-1]])][int(position) :]
+    expected = is_legal(*segments[0], after, rule, position % 1)
+    expected &= all(is_legal(*segment, after, rule) for segment in segments[1:])
     assert is_path_valid(path, robot, after, rule) == expected
     assert is_path_valid(path, robot, grid, rule)
+
+
+def test_what_lies_behind_a_robot_on_a_segment_does_not_count() -> None:
+    grid, path, rule = GridMap(np.zeros((9, 31))), [(0, 2), (15, 5), (30, 7)], "robot_safe"
+    for blocked, is_free in (((2, 2), True), ((12, 4), False), ((24, 6), False)):
+        after = grid.with_patch([[True]], *blocked)
+        assert is_path_valid(path, (5, 3), after, rule) == is_free
+        assert (len(rest_of_path(path, (5, 3), after, rule)) > 0) == is_free
 
 
 def test_a_path_of_which_only_an_occupied_end_or_nothing_is_left_is_not_valid() -> None:
@@ -97,6 +125,23 @@ def test_a_path_of_which_only_an_occupied_end_or_nothing_is_left_is_not_valid() 
     assert not len(rest_of_path([], (0, 0), grid, "robot_safe"))
 
 
+def check_rest_of_straight_path(
+    path: list[Cell], robot: Cell, grid: GridMap, rule: MoveRule
+) -> None:
+    """Check that it leads from the robot onto the path, and is found on it while it is legal."""
+    rest = list(map(tuple, rest_of_path(path, robot, grid, rule).tolist()))
+    if not rest:
+        assert robot not in path or not is_path_valid(path[path.index(robot) :], robot, grid, rule)
+        return
+    assert (rest[0], rest[-1]) == (robot, path[-1])
+    assert legal_segments(rest, grid, rule).all()
+    passed = [cell for cell, _ in cells_with_positions(path)]
+    joins = next(number for number, cell in enumerate(rest) if cell in passed)
+    assert joins <= REACH
+    assert all(max(abs(x - a), abs(y - b)) == 1 for (x, y), (a, b) in pairwise(rest[: joins + 1]))
+    assert {*rest[joins + 1 :]} <= {*path}
+
+
 @given(GRIDS, RULES, st.data())
 def test_what_is_left_of_a_path_leads_from_the_robot_onto_it_by_legal_moves(
     grid_and_cell: tuple[GridMap, Cell], rule: MoveRule, data: st.DataObject
@@ -105,6 +150,7 @@ def test_what_is_left_of_a_path_leads_from_the_robot_onto_it_by_legal_moves(
     path = drawn_path(data, grid, goal, rule)
     after = data.draw(changed(grid))
     robot = data.draw(st.tuples(st.integers(-1, 9), st.integers(-1, 9)) | st.sampled_from(path))
+    check_rest_of_straight_path([*simplify(path, grid, rule)], robot, after, rule)
     rest = list(map(tuple, rest_of_path(path, robot, after, rule).tolist()))
     if not rest:
         if robot in path:

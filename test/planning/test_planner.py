@@ -81,11 +81,13 @@ def test_a_plan_of_the_shipped_model_is_a_cheapest_path(
         check_legal(plan.cells, grid, rule)
         cost = path_cost(plan.cells, grid.multipliers(plan.cells), rule)
         assert cost == pytest.approx(exact[start[::-1]], rel=2e-2)
-        assert plan.cost in (None, cost)
+        assert plan.cost is None or plan.cost == pytest.approx(cost)
         assert plan.length == path_length(plan.cells, rule)
         simple = planner.plan(grid, start, goal, rule, method, simplified=True)
         assert simple.cells == simplified(plan.cells, grid, rule)
-        assert simple.cost == plan.cost
+        if plan.cost is not None:
+            assert simple.cost is not None
+            assert simple.cost <= plan.cost * (1 + 1e-8)
         unmasked = planner.q_field(grid, goal, rule).unmasked().rollout(start)
         assert path_cost(unmasked.cells, grid.multipliers(unmasked.cells), rule) == pytest.approx(
             cost

@@ -1,6 +1,6 @@
 from __future__ import annotations
 
-import math
+from fractions import Fraction
 from itertools import pairwise
 
 import numpy as np
@@ -12,33 +12,39 @@ from strategies import GRIDS, RULES, cells_of
 
 from ddqn_planner import GridMap, MoveRule, simplify
 from ddqn_planner.grid import Cell, path_cost, path_length, shortest_path
-from ddqn_planner.planning.segments import segment_cost
+from ddqn_planner.planning.segments import cost_along, legal_segments
 
 
 @settings(max_examples=300)
 @given(GRIDS, RULES, st.data())
-def test_a_segment_costs_what_its_share_of_each_cell_does_if_it_is_legal(
+def test_a_segment_is_legal_and_costs_what_the_cells_are_in_which_it_lies(
     grid_and_cell: tuple[GridMap, Cell], rule: MoveRule, data: st.DataObject
 ) -> None:
     grid, first = grid_and_cell
-    last = data.draw(cells_of(grid), label="last")
-    legal = is_legal(first, last, grid, rule)
-    exact = exact_cost(first, last, grid, rule) if legal else math.inf
-    assert segment_cost(first, last, grid, rule) == pytest.approx(exact)
-    if legal and max(abs(last[0] - first[0]), abs(last[1] - first[1])) == 1:
+    far = min(grid.width - first[0], grid.height - first[1]) - 1
+    diagonal = st.integers(0, far).map(lambda by: (first[0] + by, first[1] + by))
+    last = data.draw(cells_of(grid) | diagonal, label="last")
+    begin = data.draw(st.sampled_from([0.0, 0.0, 0.25, 0.625]), label="begin")
+    (legal,) = legal_segments(np.array([first, last]), grid, rule, begin)
+    assert legal == is_legal(first, last, grid, rule, Fraction(begin))
+    exact = exact_cost(first, last, grid, rule)
+    assert cost_along(np.array([first, last]), grid, rule) == pytest.approx(exact)
+    if max(abs(last[0] - first[0]), abs(last[1] - first[1])) == 1:
         cells = [first, last]
         assert path_cost(cells, grid.multipliers(cells), rule) == pytest.approx(exact)
 
 
 def check_simplified(path: list[Cell], grid: GridMap, rule: MoveRule) -> tuple[Cell, ...]:
-    """Check that each segment is legal, and costs no more than what it replaces."""
+    """Check that all segments are legal, and cost no more than what they replace."""
     simple = simplify(path, grid, rule)
     assert simple[:1] + simple[-1:] == (*path[:1], *path[-1:])
-    for first, last in pairwise(simple):
-        part = path[path.index(first) : path.index(last) + 1]
-        replaced = sum(exact_cost(a, b, grid, rule) for a, b in pairwise(part))
-        assert exact_cost(first, last, grid, rule) <= replaced * (1 + 1e-8)
-        assert len(part) == 2 or is_legal(first, last, grid, rule)
+    assert len(simple) <= len(path)
+    assert all(is_legal(*segment, grid, rule) for segment in pairwise(simple))
+    replaced, cost = (
+        sum(exact_cost(*segment, grid, rule) for segment in pairwise(cells))
+        for cells in (path, simple)
+    )
+    assert cost <= replaced * (1 + 1e-8)
     return simple
 
 
@@ -49,9 +55,20 @@ def test_a_simplified_path_is_legal_and_costs_no_more(
 ) -> None:
     grid, goal = grid_and_goal
     path = shortest_path(grid, data.draw(st.sampled_from(grid.free_cells())), goal, rule)
-    simple = check_simplified(path, grid, rule)
-    assert path_length(simple) <= path_length(path) + 1e-9
-    assert path_length(simple, MoveRule.UNIT) <= path_length(path, MoveRule.UNIT)
+    simple = check_simplified([*check_simplified(path, grid, rule)], grid, rule)
+    if not grid.has_costs:
+        assert path_length(simple, rule) <= path_length(path, rule) + 1e-9
+
+
+def test_a_path_turns_at_the_corner_and_not_behind_it() -> None:
+    grid, rule = GridMap(np.zeros((30, 30))).with_patch(np.ones((20, 20)), 0, 0), "robot_safe"
+    path = [(0, 20), *((x, 20) for x in range(1, 21)), *((20, y) for y in range(19, -1, -1))]
+    for cells in (path, path[::-1]):
+        assert simplify(cells, grid, rule) == (cells[0], (20, 20), cells[-1])
+    wide = [*((x, 25) for x in range(26)), *((25, y) for y in range(24, -1, -1))]
+    least = path_length([(0, 25), (20, 20), (25, 0)])
+    for cells in (wide, wide[::-1]):
+        assert path_length(simplify(cells, grid, rule)) < 1.03 * least
 
 
 def test_segments_are_as_long_as_can_be() -> None:
