@@ -98,5 +98,5 @@ model: setup
 	cp runs/any_map/model.safetensors models/any_map.safetensors
 
 model-dilemma: setup
-	$(BIN)/ddqn-planner train dilemma --learning-rate 0.001 --seed 0 --out runs/dilemma
+	$(BIN)/ddqn-planner train dilemma --learning-rate 0.001 --seed 1 --out runs/dilemma
 	cp runs/dilemma/model.safetensors models/dilemma.safetensors
