@@ -102,6 +102,17 @@ def test_compiling_is_announced_once_and_a_load_from_the_cache_is_not(tmp_path: 
         assert done.stderr.count("\n") == bool(words)
 
 
+def test_each_process_finds_the_code_that_another_has_kept() -> None:
+    code = "from ddqn_planner.model.shared_background import evaluate as function;"
+    code += "print(function.dispatcher().py_func.__qualname__)"
+    command, names = [sys.executable, "-c", code], set()
+    for seed in "12345":
+        environment = {**os.environ, "PYTHONHASHSEED": seed}
+        done = subprocess.run(command, env=environment, check=True, capture_output=True, text=True)
+        names.add(done.stdout)
+    assert len(names) == 1
+
+
 def test_where_no_folder_may_be_written_code_is_compiled_all_the_same(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:

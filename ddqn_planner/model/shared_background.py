@@ -20,7 +20,8 @@ Floats = NDArray[np.floating[Any]]
 Integers = NDArray[np.int64]
 
 # Sums in any order, so that eight are added at once; NaN and infinity as ever.
-compiled = partial(compiling.compiled, fastmath={"reassoc", "contract", "arcp", "nsz"})
+FLAGS = {"reassoc": True, "contract": True, "arcp": True, "nsz": True}  # a set has no fixed order
+compiled = partial(compiling.compiled, fastmath=FLAGS)
 
 
 class Windows(NamedTuple):
