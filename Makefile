@@ -1,4 +1,4 @@
-# make setup | demo | demo-driving | test | test-fast | experiments-test | docs | lint | format | types | bench | body | faults | fuzz | load | soak | model | model-dilemma
+# make setup | demo | demo-driving | demo-training | test | test-fast | experiments-test | docs | lint | format | types | bench | body | faults | fuzz | load | soak | model | model-dilemma
 PYTHON ?= python3
 TORCH ?= torch==2.13.0
 VENV := .venv
@@ -12,7 +12,7 @@ else
 EXTRAS := bags,experiments,figures,ros,test,train,watch
 endif
 
-.PHONY: setup demo demo-driving test test-fast experiments-test docs lint format types bench body faults fuzz load soak model model-dilemma
+.PHONY: setup demo demo-driving demo-training test test-fast experiments-test docs lint format types bench body faults fuzz load soak model model-dilemma
 .DEFAULT_GOAL := help
 
 .PHONY: help
@@ -34,6 +34,10 @@ demo: setup
 # A robot learns by driving where it is slow: a film, a picture and a curve.
 demo-driving: setup
 	$(BIN)/python examples/demo_driving.py $(MISSIONS)
+
+# A robot learns to leave the dead end of the paper's map: a film.
+demo-training: setup
+	$(BIN)/python examples/demo_training.py $(STEPS)
 
 # One process per core; each has its nodes in a ROS domain of its own.
 PYTEST := $(BIN)/python -m pytest --numprocesses auto --maxprocesses 4 --dist loadfile --no-loadscope-reorder
@@ -94,5 +98,5 @@ model: setup
 	cp runs/any_map/model.safetensors models/any_map.safetensors
 
 model-dilemma: setup
-	$(BIN)/ddqn-planner train dilemma --learning-rate 0.001 --seed 0 --out runs/dilemma
+	$(BIN)/ddqn-planner train dilemma --learning-rate 0.001 --seed 1 --out runs/dilemma
 	cp runs/dilemma/model.safetensors models/dilemma.safetensors

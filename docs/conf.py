@@ -37,9 +37,14 @@ def write_command_line() -> None:
     folder = DOCS / "_build" / "help"
     folder.mkdir(parents=True, exist_ok=True)
     environment = {**os.environ, "COLUMNS": "88", "PYTHONPATH": str(DOCS.parent)}
-    for name in ("plan", "train", "train-any-map", "certify", "learn"):
-        command = [sys.executable, "-m", "ddqn_planner.cli", name, "--help"]
-        text = subprocess.run(command, env=environment, stdout=subprocess.PIPE, check=True).stdout
+    from ddqn_planner.cli import COMMANDS
+
+    command = [sys.executable, "-c", "from ddqn_planner.cli import main; main()"]
+    for name in COMMANDS:
+        asked = [*command, name, "--help"]
+        text = subprocess.run(asked, env=environment, stdout=subprocess.PIPE, check=True).stdout
+        if not text:
+            raise RuntimeError(f"{asked} prints nothing")
         (folder / f"{name}.txt").write_bytes(text)
 
 

@@ -10,12 +10,10 @@ from pathlib import Path as FilePath
 from subprocess import Popen
 from typing import Any
 
-import matplotlib.pyplot as plt
 import numpy as np
 import simulated_robot
 from geometry_msgs.msg import PoseStamped
 from nav_msgs.msg import OccupancyGrid, Odometry, Path
-from PIL import Image
 
 from ddqn_planner.experience.drives import ARRIVAL_DISTANCE
 from ddqn_planner.grid import Cell, save_map
@@ -26,7 +24,7 @@ from ddqn_planner.planning import Planner
 sys.path.insert(0, str(FilePath(__file__).resolve().parents[1] / "experiments"))
 from client import Client, Recorder, cells_of, pose, wait_for
 from driving_worlds import RULE, Float64, Routes, World, generated_world, path_seconds
-from figures import ROUTE_STYLES, draw_slowness, draw_times
+from figures import ROUTE_STYLES, draw_slowness, draw_times, frame_of, save_film
 from processes import claim_ros_domain, run_script, running, running_node
 from simulated_robot import SEED, WORLD
 
@@ -116,15 +114,10 @@ def save_pictures(world: World, missions: Sequence[Mission]) -> None:
         figure: Any = draw_slowness(world.grid, world.stations, panels, (8.4, 4.7))
         title = f"mission {number}: {mission.ratio('learned'):.2f} of the best possible time"
         figure.suptitle(title, fontsize=11)
-        figure.canvas.draw()
-        image = Image.fromarray(np.asarray(figure.canvas.buffer_rgba())).convert("RGB")
-        frames.append(image.quantize(64))
+        frames.append(frame_of(figure))
         if mission is best:
-            image.save("demo_driving.png")
-        plt.close(figure)
-    frames[0].save(
-        "demo_driving.gif", save_all=True, append_images=frames[1:], duration=450, loop=0
-    )
+            frames[-1].save("demo_driving.png")
+    save_film("demo_driving.gif", frames, 450)
     seconds = {name: [np.array([each.seconds[name] for each in missions])] for name in ROUTE_STYLES}
     curve, _ = draw_times(seconds, seconds.pop("best possible"), width, banded="learned")
     curve.savefig("demo_driving_curve.png", dpi=110)

@@ -27,7 +27,7 @@ VARIANTS: Final[dict[str, dict[str, Any]]] = {
     "the paper's reward": PAPERS_REWARD,
     "plain reward (α = β = 0)": {**PAPERS_REWARD, "alpha": 0.0, "beta": 0.0},
 }
-STEPS: Final = 256_000  # of the environment, for each training of the ablation
+STEPS: Final = 128_000  # of the environment, for each training of the ablation
 HELD_OUT: Final = ("maze", "rooms", "corridors", "dead_ends", "office")
 SIDE: Final = 48
 ABLATION = (

@@ -12,6 +12,7 @@ import numpy as np
 from matplotlib.colors import LogNorm
 from matplotlib.patheffects import withStroke
 from numpy.typing import NDArray
+from PIL import Image
 
 from ddqn_planner.grid import Cell, GridMap
 from ddqn_planner.pictures import draw_obstacles
@@ -35,6 +36,20 @@ def save_figure(figure: Any, path: Path, caption: str) -> str:
     figure.savefig(path, dpi=120)
     plt.close(figure)
     return f"![{caption}]({path.name})"
+
+
+def frame_of(figure: Any) -> Image.Image:
+    """Draw a figure as a frame of a film, and close it."""
+    figure.canvas.draw()
+    image = Image.fromarray(np.asarray(figure.canvas.buffer_rgba())).convert("RGB")
+    plt.close(figure)
+    return image
+
+
+def save_film(path: str, frames: Sequence[Image.Image], milliseconds: int) -> None:
+    """Save a GIF that shows each frame for so long, and repeats."""
+    first, *others = (frame.quantize(64) for frame in frames)
+    first.save(path, save_all=True, append_images=others, duration=milliseconds, loop=0)
 
 
 def draw_curves(

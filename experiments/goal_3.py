@@ -10,6 +10,7 @@ import torch
 from figures import draw_map, draw_path, save_figure
 from matplotlib.patches import Rectangle
 from numpy.typing import NDArray
+from scipy.special import softmax
 from tables import mean_and_worst, median_and_range, table
 from trainings import MOVE_RULE, PROFILES, SCENARIO, Settings, Training, in_parallel, rollouts
 
@@ -24,10 +25,12 @@ from ddqn_planner.grid import (
     shortest_distances,
     shortest_path,
 )
+from ddqn_planner.model.shared_background import evaluate, look
 from ddqn_planner.planning import Planner
 from ddqn_planner.planning.paths import search
 from ddqn_planner.training.environment import Scenario
 from ddqn_planner.training.hyper_parameters import HyperParameters
+from ddqn_planner.training.shared_background import adam, differentiate, networks_of
 from ddqn_planner.training.trainer import Trainer
 
 TRAINING_MAPS, TEST_MAPS, NOISE_SEED = 100, 200, 0
@@ -88,21 +91,23 @@ def train_supervised(training: Training) -> None:
     best_SCA = np.stack([best_moves(scenario) for scenario in training.scenarios])
     scenario, cell = np.nonzero(best_SCA.any(axis=2))
     random = np.random.default_rng(training.seed)
-    optimiser = torch.optim.Adam(trainer.network.parameters(), SUPERVISED_LEARNING_RATE)
+    weights: list[torch.Tensor] = [*trainer.network.parameters()]
+    parts = [weights, *([torch.zeros_like(weight) for weight in weights] for _ in range(3))]
+    network, gradient, mean, square = networks_of(trainer.environment, parts, SUPERVISED_BATCH)
     steps = training.parameters.steps
-    decay = torch.optim.lr_scheduler.LinearLR(optimiser, 1.0, 0.05, steps)
-    trainer.network.settle(trainer.environment)
-    for _ in range(steps):
+    for number in range(steps):
         drawn = random.integers(len(cell), size=SUPERVISED_BATCH)
-        q_BA = trainer.network(trainer.network.states(scenario[drawn], cell[drawn]))
-        best_BA = torch.from_numpy(best_SCA[scenario[drawn], cell[drawn]])
-        # -log of the probability that softmax(Q) gives to the best moves
-        best_B = q_BA.masked_fill(~best_BA, -torch.inf).logsumexp(dim=1)
-        loss = (q_BA.logsumexp(dim=1) - best_B).mean()
-        optimiser.zero_grad()
-        torch.autograd.backward(loss)
-        optimiser.step()
-        decay.step()
+        look(network)
+        evaluate(network, scenario[drawn], cell[drawn])
+        # -log of the probability that softmax(Q) gives to the best moves, and its gradient by Q
+        best_BA = best_SCA[scenario[drawn], cell[drawn]]
+        gradient.q[:] = softmax(network.q, axis=1)
+        gradient.q[:] -= softmax(np.where(best_BA, network.q, -np.inf), axis=1)
+        gradient.q[:] /= SUPERVISED_BATCH
+        differentiate(network, gradient, SUPERVISED_BATCH)
+        rate = SUPERVISED_LEARNING_RATE * (1 - 0.95 * number / steps)
+        moments = mean.weights, square.weights
+        adam(network.weights, gradient.weights, *moments, rate, number + 1)
     trainer.save_model(path)
 
 

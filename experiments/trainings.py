@@ -37,7 +37,7 @@ PROFILES: Final[dict[str, HyperParameters]] = {
         learning_rate=0.001,
         batch_size=128,
         target_interval=100,
-        steps=15_000,
+        steps=10_000,
     ),
 }
 
@@ -152,7 +152,7 @@ def train(training: Training) -> None:
         before = before[before["step"] <= trainer.steps]
         rows = [dict(zip(before.dtype.names or (), row, strict=True)) for row in before.tolist()]
         optimum = optimal_value(trainer.environment)
-        for _ in run.steps():
+        for _ in run.steps(training.evaluation_interval):
             if trainer.steps // training.evaluation_interval > len(rows):
                 best = max((row["solved"] for row in rows), default=-1)
                 rows.append(evaluate_training(trainer, optimum))

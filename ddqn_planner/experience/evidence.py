@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ddqn_planner.compiled import compiled
+from ddqn_planner.compiled import in_place
 from ddqn_planner.grid import GridMap
 from ddqn_planner.grid.arguments import MAX_SLOWNESS
 from ddqn_planner.grid.grid_map import check_grid, equal
@@ -286,7 +286,6 @@ def nearest_free(position: Float64, grid: GridMap, metres: float) -> NDArray[np.
     return result
 
 
-@compiled
 def spread_evidence(
     occupancy: NDArray[np.bool_],
     cells: NDArray[np.int64],
@@ -297,25 +296,32 @@ def spread_evidence(
 ) -> None:
     """Add amounts (B, 3) of cells (B, 2) to sums (H, W, 3) around them; mark touched (H, W)."""
     # An amount becomes less with the length d of a path, not through walls: (1 - (d / reach)^2)^3.
-    height, width = occupancy.shape
-    middle = int(reach) + 1  # no path within reach leads to the border
-    size = 2 * middle + 1
-    furthest = int(STRAIGHT * reach)
-    share = np.empty(furthest + 1, np.float32)
-    for distance in range(furthest + 1):
-        share[distance] = (1 - (distance / (STRAIGHT * reach)) ** 2) ** 3
-    best = np.empty((size, size), np.int32)
+    lengths = np.arange(int(STRAIGHT * reach) + 1)
+    share = ((1 - (lengths / (STRAIGHT * reach)) ** 2) ** 3).astype(np.float32)
+    size = 2 * int(reach) + 3  # no path within reach leads to the border
+    best, queue = np.empty((size, size), np.int32), np.empty((size * size, 2), np.int32)
     waits = np.zeros((size, size), np.bool_)
-    queue = np.empty((size * size, 2), np.int32)
+    _spread(occupancy, cells, amounts, share, best, queue, waits, sums, touched)
+
+
+@in_place
+def _spread(
+    occupancy: Any, cells: Any, amounts: Any, share: Any, best: Any, queue: Any, *arrays: Any
+) -> None:
+    """Do the work of `spread_evidence`, given shares by the length, and memory."""
+    (height, width), (waits, sums, touched) = occupancy.shape, arrays
+    size, furthest, middle = best.shape[0], share.size - 1, best.shape[0] // 2
     for number in range(cells.shape[0]):
         left, bottom = cells[number, 0] - middle, cells[number, 1] - middle
-        best[:] = furthest + 1
+        for y in range(size):
+            for x in range(size):
+                best[y, x] = furthest + 1
         best[middle, middle] = 0
-        queue[0] = middle
+        queue[0, 0] = queue[0, 1] = middle
         first, end = 0, 1
         while first != end:
             x, y = queue[first, 0], queue[first, 1]
-            first = first + 1 if first + 1 < len(queue) else 0
+            first = first + 1 if first + 1 < queue.shape[0] else 0
             waits[y, x] = False
             row, column, way = bottom + y, left + x, best[y, x]
             for dy in range(-1, 2):
@@ -333,7 +339,7 @@ def spread_evidence(
                     if not waits[y + dy, x + dx]:
                         waits[y + dy, x + dx] = True
                         queue[end, 0], queue[end, 1] = x + dx, y + dy
-                        end = end + 1 if end + 1 < len(queue) else 0
+                        end = end + 1 if end + 1 < queue.shape[0] else 0
         for y in range(size):
             for x in range(size):
                 if best[y, x] <= furthest:

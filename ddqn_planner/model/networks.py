@@ -21,7 +21,7 @@ from ddqn_planner.model.move_costs import (
     patch_numbers,
     unique_patches,
 )
-from ddqn_planner.model.shared_background import network_of, q_of_cells, windows_of
+from ddqn_planner.model.shared_background import evaluate, look, network_of, windows_of
 
 Array: TypeAlias = NDArray[np.float32]
 
@@ -31,7 +31,7 @@ Array: TypeAlias = NDArray[np.float32]
 # A move of at least this probability counts as one that always succeeds: the sigmoid function never
 # reaches 1, and its rest must not decide between paths.
 CERTAIN = 0.99
-BATCH = 2**12  # patches per evaluation: the layers' outputs then fit into a cache
+BATCH = 2**12  # patches or cells per evaluation: the layers' outputs then fit into a cache
 
 # The paper (section 4) uses four values and does not give them. With ours the robot stands out.
 # With a smaller value for the robot, the many obstacles outweigh it and training is less stable.
@@ -118,14 +118,18 @@ class PaperQNetwork(QNetwork):
     def q_values(self, grid: GridMap, goal: Cell, move_rule: MoveRule) -> Array:
         """Evaluate a robot in each cell: Q(s, a) toward one goal, (8, H, W), whatever the rule."""
         # In double precision: differences of large sums stay exact enough, and do not overflow.
-        arrays = [self.tensors[name].astype(np.float64) for name in self.shapes(self.sizes)]
-        arrays[2] = np.asfortranarray(arrays[2])
         background = observation_background(grid.occupancy, goal).astype(np.float64)
         windows = windows_of(background[None], grid.occupancy.shape, ROBOT)
-        q = np.empty((len(MOVES), grid.occupancy.size))
-        q_of_cells(network_of(arrays, len(windows.common)), windows, 0, q)
-        with np.errstate(over="ignore"):
-            return q.reshape(-1, *grid.occupancy.shape).astype(np.float32)
+        tensors = [self.tensors[name] for name in self.shapes(self.sizes)]
+        cells = np.arange(grid.occupancy.size)
+        network = network_of(tensors, windows, min(len(cells), BATCH))
+        look(network)
+        q_AC: Array = np.empty((len(MOVES), len(cells)), dtype=np.float32)
+        for some in np.split(cells, range(BATCH, len(cells), BATCH)):
+            evaluate(network, np.zeros_like(some), some)
+            with np.errstate(over="ignore"):
+                q_AC[:, some] = network.q[: len(some)].T
+        return q_AC.reshape(-1, *grid.occupancy.shape)
 
 
 class PropagationQNetwork(QNetwork):

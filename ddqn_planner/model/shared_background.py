@@ -2,7 +2,7 @@
 
 A robot changes at most four windows of the convolution; S maps of one kind differ from what most of
 them show in a few windows more. C = cells of a map, L = windows, F = filters, U = outputs of the
-layer after the convolution.
+layer after the convolution, D = windows that may differ.
 """
 
 from __future__ import annotations
@@ -20,9 +20,7 @@ Floats = NDArray[np.floating[Any]]
 Integers = NDArray[np.int64]
 
 # Sums in any order, so that eight are added at once; NaN and infinity as ever.
-compiled = partial(
-    compiling.compiled, fastmath={"reassoc", "contract", "arcp", "nsz"}, error_model="numpy"
-)
+compiled = partial(compiling.compiled, fastmath={"reassoc", "contract", "arcp", "nsz"})
 
 
 class Windows(NamedTuple):
@@ -32,24 +30,30 @@ class Windows(NamedTuple):
     own: Floats  # (S, L, 9): as each map has it
     differing: Integers  # the windows of map 0 that are not the common ones, those of map 1, ...
     ends: Integers  # (S + 1,): those of map s are from ends[s] to before ends[s + 1]
-    seeing: Integers  # (C, 4): the windows in which a cell lies, -1 for none
-    place: Integers  # (C, 4): where in them it lies, 0 to 8
+    shape: tuple[int, int]  # (H, W)
     robot: float  # what a cell with the robot shows
 
 
 class Network(NamedTuple):
-    """A module's tensors in its own memory, and what it makes of the common windows."""
+    """A module's weights, and what it makes of the common windows and of B states."""
 
-    kernel: Floats  # (F, 9)
+    weights: Floats  # all that follow, up to `last_bias`
+    kernel: Floats  # (9, F)
     kernel_bias: Floats  # (F,)
     layer: Floats  # (F * L, U)
     layer_bias: Floats  # (U,)
-    last: Floats  # (8, U), empty without a hidden layer: then U is 8
+    last: Floats  # (U, 8), empty without a hidden layer: then U is 8
     last_bias: Floats
-    turned: Floats  # (9, F): the kernel, in the order of its use
     before: Floats  # (L, F): the convolution before ReLU
     after: Floats  # (L, F): after it
     output: Floats  # (U,): of the layer after the convolution
+    patch: Floats  # (B * D, 9): each state's windows that are not the common ones
+    changed: Integers  # (B * D,): which they are
+    first: Integers  # (B + 1,): those of state n are from first[n] to before first[n + 1]
+    own_before: Floats  # (B * D, F): their convolution before ReLU
+    own_output: Floats  # (B, U): of the layer after it
+    q: Floats  # (B, 8)
+    windows: Windows
     eight: tuple[int, ...]  # of 8 zeros where U is 8: a known number of turns is twice as fast
 
 
@@ -63,118 +67,99 @@ def windows_of(background_SC: Floats, shape: tuple[int, int], robot: float) -> W
     common = np.sort(background_SC, axis=0)[len(own) // 2][cut_L9]
     scenario, differing = np.nonzero((own != common).any(axis=2))
     ends = np.searchsorted(scenario, np.arange(len(own) + 1))
-    seeing, place = np.full((2, cells, 4), -1)
-    for window, at in np.ndindex(cut_L9.shape):
-        if (cell := cut_L9[window, at]) < cells:
-            free = np.argmin(seeing[cell])
-            seeing[cell, free], place[cell, free] = window, at
-    return Windows(common, own, differing, ends, seeing, place, robot)
+    return Windows(common, own, differing, ends, shape, robot)
 
 
-def network_of(arrays: Sequence[Floats], windows: int) -> Network:
-    """Return the network of a model's tensors, in their order; they share its memory."""
-    kernel, kernel_bias, layer, layer_bias, *last = arrays
-    last = last or [np.zeros((0, 0), kernel.dtype), np.zeros(0, kernel.dtype)]
-    filters, units = len(kernel), len(layer_bias)
-    shapes = (9, filters), (windows, filters), (windows, filters), units
-    features: Any = (np.zeros(shape, kernel.dtype) for shape in shapes)
-    eight = (0,) * 8 if not last[0].size else ()
-    own = kernel.reshape(-1, 9), kernel_bias, layer.T, layer_bias, *last, *features
-    return Network._make([*own, eight])
-
-
-@compiled
-def q_of_cells(network: Any, windows: Any, scenario: int, q: Any) -> None:
-    """Compute Q (8, C) of a robot in each cell of a map."""
-    look(network, windows)
-    most = 4 + windows.differing.size
-    changed, patch = np.empty(most, np.int64), np.empty((most, 9), windows.own.dtype)
-    before = np.empty((most, network.after.shape[1]), network.after.dtype)
-    output, q_of_cell = np.empty_like(network.output), np.empty(8, network.output.dtype)
-    for cell in range(q.shape[1]):
-        found = changes(windows, scenario, cell, changed, patch)
-        evaluate(network, changed, patch, found, before, output, q_of_cell)
-        for action in range(8):
-            q[action, cell] = q_of_cell[action]
+def network_of(tensors: Sequence[Floats], windows: Windows, batch: int) -> Network:
+    """Return a network for B states with a copy of a model's tensors, as exact as the windows."""
+    turned = [t.T if t.ndim < 3 else t.reshape(-1, 9).T for t in tensors]
+    turned += [np.zeros((0, 8)), np.zeros(0)][: 6 - len(turned)]
+    zeros: Any = partial(np.zeros, dtype=windows.own.dtype)
+    weights = np.concatenate([array.ravel() for array in turned], dtype=windows.own.dtype)
+    ends = np.cumsum([array.size for array in turned])[:-1]
+    parts = (p.reshape(t.shape) for p, t in zip(np.split(weights, ends), turned, strict=True))
+    of_all = len(windows.common), len(tensors[0])
+    units, rows = len(tensors[3]), batch * (4 + int(np.diff(windows.ends).max()))
+    common = zeros(of_all), zeros(of_all), zeros(units), zeros((rows, 9))
+    numbers = np.zeros(rows, np.int64), np.zeros(batch + 1, np.int64)
+    own = zeros((rows, of_all[1])), zeros((batch, units))
+    q, eight = (zeros((batch, 8)), ()) if len(tensors) > 4 else (own[1], (0,) * 8)
+    return Network._make([weights, *parts, *common, *numbers, *own, q, windows, eight])
 
 
 @compiled
-def look(network: Any, windows: Any) -> None:
+def look(network: Any) -> None:
     """Compute what a network makes of the common windows."""
-    before, after, output = network.before, network.after, network.output
-    count, filters = before.shape
-    for f in range(filters):
-        for at in range(9):
-            network.turned[at, f] = network.kernel[f, at]
-    for window in range(count):
-        convolve(network, windows.common, window, before, window)
-        for f in range(filters):
-            after[window, f] = max(before[window, f], np.float32(0))
-    for u in range(output.size):
-        output[u] = network.layer_bias[u]
+    layer, after, output = network.layer, network.after, network.output
+    count, filters = after.shape
+    convolve(network.kernel, network.kernel_bias, network.windows.common, count, network.before)
+    output[:] = network.layer_bias
     for f in range(filters):
         for window in range(count):
-            feature = after[window, f]
+            feature = max(network.before[window, f], np.float32(0))
+            after[window, f] = feature
             if feature != 0:
                 for u in range(len(network.eight) or output.size):
-                    output[u] += feature * network.layer[f * count + window, u]
+                    output[u] += feature * layer[f * count + window, u]
 
 
 @compiled
-def convolve(network: Any, patch: Any, number: int, before: Any, row: int) -> None:
-    """Compute the convolution of a window, a row of `patch`, into a row of `before`."""
-    filters = network.kernel_bias.size
-    for f in range(filters):
-        before[row, f] = network.kernel_bias[f]
-    for at in range(9):
-        seen = patch[number, at]
-        if seen != 0:
-            for f in range(filters):
-                before[row, f] += seen * network.turned[at, f]
-
-
-@compiled
-def changes(windows: Any, scenario: int, cell: int, changed: Any, patch: Any) -> int:
-    """Cut the windows that are not the common ones on a map with a robot; return how many."""
-    count = 0
-    while count < 4 and windows.seeing[cell, count] >= 0:
-        changed[count] = windows.seeing[cell, count]
+def convolve(kernel: Any, bias: Any, patch: Any, count: int, before: Any) -> None:
+    """Compute the convolution of so many windows."""
+    for row in range(count):
+        for f in range(bias.size):
+            before[row, f] = bias[f]
         for at in range(9):
-            patch[count, at] = windows.own[scenario, changed[count], at]
-        patch[count, windows.place[cell, count]] = windows.robot
-        count += 1
-    with_robot = count
-    for number in range(windows.ends[scenario], windows.ends[scenario + 1]):
-        window = windows.differing[number]
-        is_new = True
-        for other in range(with_robot):
-            is_new &= changed[other] != window
-        if is_new:
-            changed[count] = window
-            for at in range(9):
-                patch[count, at] = windows.own[scenario, window, at]
-            count += 1
-    return count
+            seen = patch[row, at]
+            if seen != 0:
+                for f in range(bias.size):
+                    before[row, f] += seen * kernel[at, f]
 
 
 @compiled
-def evaluate(
-    network: Any, changed: Any, patch: Any, count: int, before: Any, output: Any, q: Any
-) -> None:
-    """Compute Q (8,) of a state, the output (U,), and the convolution of its changed windows."""
-    windows, filters = network.after.shape
-    for u in range(len(network.eight) or output.size):
-        output[u] = network.output[u]
-    for number in range(count):
-        convolve(network, patch, number, before, number)
-        window = changed[number]
-        for f in range(filters):
-            change = max(before[number, f], np.float32(0)) - network.after[window, f]
-            if change != 0:
-                for u in range(len(network.eight) or output.size):
-                    output[u] += change * network.layer[f * windows + window, u]
-    for action in range(8):
-        q[action] = output[action] if len(network.eight) else network.last_bias[action]
+def evaluate(network: Any, scenario: Any, cell: Any) -> None:
+    """Compute Q of robots in cells (B,) of maps (B,)."""
+    see(network, scenario, cell)
+    layer, last, output, q = network.layer, network.last, network.own_output, network.q
+    first, after, before = network.first, network.after, network.own_before
+    (count, filters), units = after.shape, network.output.size
+    convolve(network.kernel, network.kernel_bias, network.patch, first[cell.size], before)
+    for n in range(cell.size):
+        output[n] = network.output
+        for row in range(first[n], first[n + 1]):
+            window = network.changed[row]
+            for f in range(filters):
+                change = max(before[row, f], np.float32(0)) - after[window, f]
+                if change != 0:
+                    for u in range(len(network.eight) or units):
+                        output[n, u] += change * layer[f * count + window, u]
         if not len(network.eight):
-            for u in range(output.size):
-                q[action] += max(output[u], np.float32(0)) * network.last[action, u]
+            q[n] = network.last_bias
+            for u in range(units):
+                for action in range(8):
+                    q[n, action] += max(output[n, u], np.float32(0)) * last[u, action]
+
+
+@compiled
+def see(network: Any, scenario: Any, cell: Any) -> None:
+    """Cut the windows that are not the common ones of maps (B,) with robots in cells (B,)."""
+    windows, changed, patch, first = network.windows, network.changed, network.patch, network.first
+    own, (height, width), end = windows.own, windows.shape, 0
+    for n in range(cell.size):
+        y, x = divmod(cell[n], width)
+        for row in range(y // 2, min((y + 1) // 2, (height - 1) // 2) + 1):
+            for column in range(x // 2, min((x + 1) // 2, (width - 1) // 2) + 1):
+                changed[end] = row * ((width + 1) // 2) + column
+                patch[end] = own[scenario[n], changed[end]]
+                patch[end, 3 * (y + 1 - 2 * row) + x + 1 - 2 * column] = windows.robot
+                end += 1
+        with_robot = end
+        for number in range(windows.ends[scenario[n]], windows.ends[scenario[n] + 1]):
+            window, is_new = windows.differing[number], True
+            for other in range(first[n], with_robot):
+                is_new &= changed[other] != window
+            if is_new:
+                changed[end] = window
+                patch[end] = own[scenario[n], window]
+                end += 1
+        first[n + 1] = end

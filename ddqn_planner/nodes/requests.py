@@ -51,10 +51,10 @@ class PathUnderWay:
         """Take the place of the path before."""
         self.path, self.grid, self.frame = path, grid, frame
 
-    def next_request(self, request: PlanRequest, frame: str, settings: Any) -> PlanRequest:
+    def next_request(self, request: PlanRequest, header: Header, settings: Any) -> PlanRequest:
         """Return the request for a plan that may keep the path, in cells of the request's map."""
         path: Cells = ()
-        if len(self.path) and self.grid is not None and frame == self.frame:
+        if len(self.path) and self.grid is not None and header.frame_id == self.frame:
             shift, (x, y) = shift_between(self.grid, request.grid), self.path[-1]
             if shift is not None and request.grid.contains((int(x) + shift[0], int(y) + shift[1])):
                 path = np.asarray(self.path, dtype=np.int32) + np.array(shift, dtype=np.int32)
@@ -70,7 +70,7 @@ class ActiveGoal:
         # Of the paths that were published for this goal, the last one.
         self.path = path
         # What was planned last; None to plan whatever is asked.
-        self._planned: tuple[GridMap, Cell] | None = None
+        self._planned: tuple[GridMap, Cell, Header] | None = None
         # The frame and the status of what was published last; None to publish whatever comes.
         self._shown: tuple[str, str] | None = None
         self._looks, self._next_look = False, 0.0
@@ -83,18 +83,21 @@ class ActiveGoal:
             self._looks, self._next_look = True, time.monotonic() + replan_period
         return is_due
 
-    def next_request(self, request: PlanRequest, frame: str, settings: Any) -> PlanRequest | None:
+    def next_request(
+        self, request: PlanRequest, header: Header, settings: Any
+    ) -> PlanRequest | None:
         """Return the request for the next plan; None while there is no reason to plan."""
         grid, start, period = request.grid, request.start, settings.replan_period
         looks, self._looks = self._looks or period == 0, False
-        if self._planned == (grid, start):
+        # A map that came again as it was is planned on, so that the diagnostics name the last one.
+        if self._planned == (grid, start, header):
             return None
-        request = self.path.next_request(request, frame, settings)
+        request, frame = self.path.next_request(request, header, settings), header.frame_id
         is_followed = self._shown == (frame, PlanStatus.SUCCEEDED.name) and not looks
         if is_followed and len(rest_of_path(request.under_way, start, grid, request.move_rule)):
             return None
         self.path.keep(request.under_way, grid, frame)
-        self._planned, self._next_look = (grid, start), time.monotonic() + period
+        self._planned, self._next_look = (grid, start, header), time.monotonic() + period
         return request
 
     def is_news(self, outcome: Outcome, frame: str) -> bool:
@@ -263,7 +266,7 @@ class Requests:
             if several:
                 request, more = replace(request, tolerance=0.0, others=tuple(more)), []
         if followed is not None and not more:
-            next_request = followed.next_request(request, frame, settings)
+            next_request = followed.next_request(request, header, settings)
             if next_request is None:
                 return UNCHANGED
             request = next_request

@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
-from typing import Any, TypeAlias
+import math
+from typing import Any, Final, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ddqn_planner.compiled import compiled
-from ddqn_planner.grid import Cell, GridMap, MoveRule
+from ddqn_planner.compiled import in_place, inlined
+from ddqn_planner.grid import MOVES, Cell, GridMap, MoveRule
 from ddqn_planner.grid.arguments import Cells, cells_inside
 from ddqn_planner.grid.grid_map import MULTIPLIERS, check_grid
 
 Path: TypeAlias = NDArray[np.int32]  # (N, 2): cells, joined by moves or by segments
-SAME_COST = 1 + 1e-9  # a path may cost so much more, and still as much: sums are rounded
+SAME_COST: Final = 1 + 1e-9  # a path may cost so much more, and still as much: sums are rounded
+BITS = np.zeros((3, 3), np.uint8)  # the action by which a step is taken, in a set of them
+BITS[MOVES[:, 1] + 1, MOVES[:, 0] + 1] = 1 << np.arange(8)
 
 
 def simplify(cells: Cells, grid: GridMap, move_rule: MoveRule | str) -> tuple[Cell, ...]:
@@ -45,19 +48,31 @@ def simplify(cells: Cells, grid: GridMap, move_rule: MoveRule | str) -> tuple[Ce
 def straightened(path: Cells, grid: GridMap, move_rule: MoveRule | str) -> Path:
     """Do the work of `simplify` for a path of one cell or more."""
     # With 64 bits, whatever is computed with a cell has its type, and numba compiles once for it.
-    return _straightened(np.array(path, np.int64), _layers(grid, move_rule)).astype(np.int32)
+    cells = np.array(path, np.int64)
+    count = _straighten(cells, np.empty(len(cells)), *_layers(grid, move_rule))
+    return cells[:count].astype(np.int32)
 
 
 def cost_along(path: Cells, grid: GridMap, move_rule: MoveRule | str) -> float:
     """Return what a path of segments costs, legal or not: each cell counts by its share of it."""
-    return float(_cost_until(np.array(path, np.int64), _layers(grid, move_rule))[-1])
+    return float(_segment_costs(path, grid, move_rule, 1.0, 1.0).sum())
 
 
 def legal_segments(
     path: Cells, grid: GridMap, move_rule: MoveRule | str, begin: float = 0.0
 ) -> NDArray[np.bool_]:
     """Return which segments are legal, see `simplify`, the first one from a share of it on."""
-    return _legal(np.array(path, np.int64), begin, _layers(grid, move_rule))
+    return _segment_costs(path, grid, move_rule, begin, 0.0) < np.inf
+
+
+def _segment_costs(
+    path: Cells, grid: GridMap, move_rule: MoveRule | str, begin: float, others: float
+) -> NDArray[np.float64]:
+    """Return the cost of each segment, see `_cost`, the first and the others from a share on."""
+    cells = np.array(path, np.int64)
+    costs = np.empty(len(cells))
+    _costs(cells, begin, others, costs, *_layers(grid, move_rule))
+    return costs[1:]
 
 
 def _layers(grid: GridMap, move_rule: MoveRule | str) -> tuple[Any, ...]:
@@ -71,23 +86,27 @@ def _layers(grid: GridMap, move_rule: MoveRule | str) -> tuple[Any, ...]:
     return grid.occupancy, *layers, rule.cuts_corners, rule is MoveRule.UNIT
 
 
-@compiled
-def _cost(x: int, y: int, last_x: int, last_y: int, begin: float, layers: Any) -> float:
+@inlined
+def _cost(x: int, y: int, last_x: int, last_y: int, begin: float, *layers: Any) -> float:
     """Return the cost of a segment, infinity if it is not legal from a share of it on."""
     occupancy, forbidden, cost, slowness, cuts_corners, is_unit = layers
     dx, dy = last_x - x, last_y - y
-    step_x, step_y = np.sign(dx), np.sign(dy)
-    angle = np.arctan2(dy, dx) * 4 / np.pi if forbidden.size else 0.0
-    takes = 1 << int(np.floor(angle + 1e-6)) % 8 | 1 << int(np.ceil(angle - 1e-6)) % 8
+    step_x, step_y = (dx > 0) - (dx < 0), (dy > 0) - (dy < 0)
+    width, height = abs(dx), abs(dy)
+    # It lies between a diagonal move and one along its longer axis.
+    takes = BITS[step_y + 1, step_x + 1]
+    takes |= BITS[step_y * (height >= width) + 1, step_x * (width >= height) + 1]
+    longer = width if width > height else height
+    length = float(longer) if is_unit else math.sqrt(width * width + height * height)
     # Positions on the segment count from 0 at its first point to `whole` at its last one: then all
     # crossings of edges of cells are whole numbers.
-    width, height = max(abs(dx), 1), max(abs(dy), 1)
+    width, height = width + (width == 0), height + (height == 0)
     whole = 2 * width * height
     at_column, at_row = height if dx else whole + 1, width if dy else whole + 1
-    at, total, ignored, legal = 0, 0.0, int(begin * whole), True
-    # One exit alone: with more, numba counts references to the layers, in two thirds of the time.
+    at, total, ignored, legal = 0, 0.0, begin * whole, True
     while at < whole and legal:
-        until = min(at_column, at_row, whole)
+        until = at_column if at_column < at_row else at_row
+        until = until if until < whole else whole
         blocked = occupancy[y, x]
         if forbidden.size and until < whole:
             blocked |= (forbidden[y, x] & takes) != 0
@@ -101,91 +120,77 @@ def _cost(x: int, y: int, last_x: int, last_y: int, begin: float, layers: Any) -
             x, at_column = x + step_x, at_column + 2 * height
         if at_row == until:
             y, at_row = y + step_y, at_row + 2 * width
-    length = max(abs(dx), abs(dy)) if is_unit else np.hypot(dx, dy)
     return length * total / whole if legal else np.inf
 
 
-@compiled
-def _legal(path: Path, begin: float, layers: Any) -> NDArray[np.bool_]:
-    """Do the work of `legal_segments`; cells may lie outside the map."""
-    (height, width), legal = layers[0].shape, np.zeros(len(path) - 1, np.bool_)
-    for index in range(len(path) - 1):
-        x, y, next_x, next_y = (
-            path[index, 0],
-            path[index, 1],
-            path[index + 1, 0],
-            path[index + 1, 1],
-        )
-        is_inside = min(x, next_x, y, next_y) >= 0 and max(x, next_x) < width
-        if is_inside and max(y, next_y) < height:
-            share = 0.0 if index else begin
-            legal[index] = _cost(x, y, next_x, next_y, share, layers) < np.inf
-    return legal
+@in_place
+def _costs(path: Any, begin: float, others: float, costs: Any, *layers: Any) -> None:
+    """Do the work of `_segment_costs`; cells may lie outside the map, where none is legal."""
+    height, width = layers[0].shape
+    costs[0] = 0.0
+    for index in range(1, path.shape[0]):
+        x, y, to_x, to_y = path[index - 1, 0], path[index - 1, 1], path[index, 0], path[index, 1]
+        costs[index] = np.inf
+        if 0 <= x < width and 0 <= y < height and 0 <= to_x < width and 0 <= to_y < height:
+            costs[index] = _cost(x, y, to_x, to_y, others if index > 1 else begin, *layers)
 
 
-@compiled
-def _cost_until(path: Path, layers: Any) -> NDArray[np.float64]:
-    """Return what a path costs up to each of its cells."""
-    until, (x, y) = np.zeros(len(path)), path[0]
-    for cell in range(1, len(path)):
-        next_x, next_y = path[cell, 0], path[cell, 1]
-        until[cell] = until[cell - 1] + _cost(x, y, next_x, next_y, 1.0, layers)
-        x, y = next_x, next_y
-    return until
-
-
-@compiled
-def _straightened(path: Path, layers: Any) -> Path:
-    """Do the work of `straightened`."""
-    kept: Path = path.copy()
-    until, number, first, last = _cost_until(path, layers), 0, 0, len(path) - 1
+@in_place
+def _straighten(path: Any, until: Any, *layers: Any) -> int:
+    """Do the work of `straightened` in a path's own cells; return how many are left."""
+    first, number, last = 0, 0, path.shape[0] - 1
+    _costs(path, 1.0, 1.0, until, *layers)
+    for cell in range(1, last + 1):
+        until[cell] += until[cell - 1]
     while first < last:
         # The length of each segment is found by doubling and halving.
         x, y, reached, step, doubling = path[first, 0], path[first, 1], first + 1, 1, True
         while step > 0 and reached < last:
-            following = min(reached + step, last) if doubling else reached + step
-            joins = False
+            following, joins = reached + step, False
+            if doubling and following > last:
+                following = last
             if following <= last:
-                cost = _cost(x, y, path[following, 0], path[following, 1], 0.0, layers)
+                cost = _cost(x, y, path[following, 0], path[following, 1], 0.0, *layers)
                 joins = cost <= SAME_COST * (until[following] - until[first])
             if joins:
                 reached = following
             doubling = doubling and joins
             step = 2 * step if doubling else step // 2
         first, number = reached, number + 1
-        kept[number] = path[reached]
+        path[number, 0], path[number, 1] = path[reached, 0], path[reached, 1]
     # Each cell is now the last that is seen from the one before, mostly well behind a corner: it
     # moves back as far as the next one is seen, and is left out if it meets the one before.
     before = 0
     for corner in range(1, number):
-        x, y = _moved_back(kept, before, corner, layers)
-        if kept[before, 0] != x or kept[before, 1] != y:
+        x, y = _moved_back(path, before, corner, *layers)
+        if path[before, 0] != x or path[before, 1] != y:
             before += 1
-            kept[before, 0], kept[before, 1] = x, y
+            path[before, 0], path[before, 1] = x, y
     before += number > 0
-    kept[before] = kept[number]
-    return kept[: before + 1]
+    path[before, 0], path[before, 1] = path[number, 0], path[number, 1]
+    return before + 1
 
 
-@compiled
-def _moved_back(kept: Path, before: int, corner: int, layers: Any) -> tuple[int, int]:
+@inlined
+def _moved_back(path: Any, before: int, corner: int, *layers: Any) -> tuple[int, int]:
     """Return the cell toward the one before through which a path to the next one costs least."""
-    x, y, last_x, last_y = kept[before, 0], kept[before, 1], kept[corner, 0], kept[corner, 1]
-    next_x, next_y = kept[corner + 1, 0], kept[corner + 1, 1]
-    least = _cost(x, y, last_x, last_y, 1.0, layers)
-    least += _cost(last_x, last_y, next_x, next_y, 1.0, layers)
-    steps, best_x, best_y = max(abs(x - last_x), abs(y - last_y)), last_x, last_y
-    seen, unseen = 0, steps + 1
-    while unseen - seen > 1:
-        middle = (seen + unseen) // 2
+    x, y, last_x, last_y = path[before, 0], path[before, 1], path[corner, 0], path[corner, 1]
+    next_x, next_y = path[corner + 1, 0], path[corner + 1, 1]
+    across, up = abs(x - last_x), abs(y - last_y)
+    steps = across if across > up else up
+    least, best_x, best_y = np.inf, last_x, last_y
+    # First the cell itself, legal or not.
+    seen, middle, unseen, share = -1, 0, steps + 1, 1.0
+    while middle > seen:
         back_x = last_x + (2 * middle * (x - last_x) + steps) // (2 * steps)
         back_y = last_y + (2 * middle * (y - last_y) + steps) // (2 * steps)
-        cost = _cost(back_x, back_y, next_x, next_y, 0.0, layers)
+        cost = _cost(back_x, back_y, next_x, next_y, share, *layers)
         if cost == np.inf:
             unseen = middle
         else:
             seen = middle
-            cost += _cost(x, y, back_x, back_y, 0.0, layers)
+            cost += _cost(x, y, back_x, back_y, share, *layers)
             if cost * SAME_COST < least:
                 least, best_x, best_y = cost, back_x, back_y
+        middle, share = (seen + unseen) // 2, 0.0
     return best_x, best_y

@@ -66,9 +66,6 @@ class PaperModule(TrainableNetwork):
         features = filters * ((height + 1) // 2) * ((width + 1) // 2)
         self.hidden = nn.Linear(features, hidden_units) if hidden_units else None
         self.fully_connected = nn.Linear(hidden_units or features, len(MOVES))
-        # Compiled code reads the weights of one feature after the other.
-        layer = self.hidden or self.fully_connected
-        layer.weight.data = layer.weight.data.T.contiguous().T
 
     @staticmethod
     def windows(observation_BHW: Tensor) -> Tensor:

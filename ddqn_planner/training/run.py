@@ -56,11 +56,11 @@ class TrainingRun(WorkFolder):
         first = self.saved_at = self.trainer.steps
         self.description = f"training in {self.folder} from step {first} to {parameters.steps}"
 
-    def steps(self) -> Iterator[list[Episode]]:
-        """Train to the end, and save there too; yield after each step the episodes that ended."""
+    def steps(self, every: int = SAVE_INTERVAL) -> Iterator[list[Episode]]:
+        """Train to the end, and save there too; yield as `Trainer.run` does."""
         rules, until = self.trainer.environment.move_rules, self.trainer.parameters.steps
         with _memory_with_remedy():
-            for finished in self.trainer.run(until):
+            for finished in self.trainer.run(until, every):
                 for episode in finished:
                     self._record.append(record(episode, rules[episode.scenario]))
                 due = self.trainer.steps // SAVE_INTERVAL != self.saved_at // SAVE_INTERVAL

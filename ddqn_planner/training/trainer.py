@@ -73,12 +73,10 @@ class Trainer:
         self.environment.reset()
         self._visited: list[list[int]] = [[int(cell)] for cell in self.environment.cell]
         self._total_reward = np.zeros(parameters.environments)
-        self._player: Any = None  # without it the paper's network is trained by torch, as others
-        if isinstance(self.network, PaperModule) and isinstance(self._target, PaperModule):
+        self._player: Any = None  # without it torch trains the paper's network, as it does others
+        if isinstance(self.network, PaperModule):
             networks = self.network, self._target, self._optimiser.state
-            self._player = player(
-                *networks, self.environment, self._replay, self._total_reward, parameters
-            )
+            self._player = player(*networks, self.environment, self._replay, self._total_reward)
 
     @property
     def epsilon(self) -> float:
@@ -87,10 +85,11 @@ class Trainer:
         fraction = min(self.steps / p.epsilon_steps, 1.0)
         return p.epsilon_start + fraction * (p.epsilon_end - p.epsilon_start)
 
-    def run(self, until: int) -> Iterator[list[Episode]]:
-        """Train until step `until`; yield, often, the episodes that ended since."""
+    def run(self, until: int, every: int = 10**9) -> Iterator[list[Episode]]:
+        """Train until step `until`; yield what ended, often and at each multiple of `every`."""
         while self.steps < until:
-            cells, terminated, truncated = self._play(until) if self._player else self._step()
+            pause = min(until, (self.steps // every + 1) * every)
+            cells, terminated, truncated = self._play(pause) if self._player else self._step()
             for visited, entered in zip(self._visited, cells.T.tolist(), strict=True):
                 visited += entered
             ended = terminated | truncated
@@ -98,11 +97,11 @@ class Trainer:
 
     def _play(self, until: int) -> tuple[NDArray[np.int64], NDArray[np.bool_], NDArray[np.bool_]]:
         """Make some steps in compiled code; return what `_step` returns."""
-        robots, play = self._player
+        (*_, terminated, truncated, trail), play = self._player
         counters = np.array([self.steps, self.updates, self._replay.added])
-        made = play(self._exploration, self._sampling, counters, until)
+        made = play((self._exploration, self._sampling), counters, until)
         self.steps, self.updates, self._replay.added = counters.tolist()
-        return robots.trail[:made], robots.terminated, robots.truncated
+        return trail[:made], terminated, truncated
 
     def _step(self) -> tuple[NDArray[np.int64], NDArray[np.bool_], NDArray[np.bool_]]:
         """Make a step, with torch; return the entered cells (1, N), and which episodes ended."""

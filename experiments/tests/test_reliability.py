@@ -79,3 +79,11 @@ def test_a_robot_learns_by_driving_and_what_it_learned_is_drawn(tmp_path: Path) 
         with Image.open(tmp_path / name) as picture:
             assert min(picture.size) >= 300
             assert len(picture.convert("RGB").getcolors(10**7) or []) > 50
+
+
+def test_a_robot_that_is_trained_is_filmed(tmp_path: Path) -> None:
+    printed = run(ROOT / "examples" / "demo_training.py", "30", tmp_path)
+    shares = re.findall(r"step +(\d+): +\d+% of the starts", printed)
+    assert shares == [str(step) for step in range(1, 31)]
+    with Image.open(tmp_path / "demo_training.gif") as film:
+        assert 1 < film.n_frames <= 30

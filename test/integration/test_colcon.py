@@ -126,7 +126,7 @@ def test_nodes_of_the_workspace_plan_with_its_model_on_its_map(
     plans = client.subscribe(PathMessage, "plan", LATCHED)
     with (
         node("map_server_node", "--ros-args", "-p", "yaml_filename:=dilemma.yaml") as map_server,
-        node("planner_node") as planner,
+        node("planner_node", "--ros-args", "-p", "path_simplification:=none") as planner,
     ):
         grid = grid_from_message(maps.wait())
         diagnosis = diagnostics.wait(names_model).status[0]

@@ -145,7 +145,7 @@ def test_learning_starts_and_targets_are_copied_when_the_parameters_say(small: S
     trainer = make(small, replace(QUICK, learning_starts=5, target_interval=3))
     train(trainer, 5)
     assert trainer.updates == 0
-    for _ in trainer.run(13):
+    for _ in trainer.run(13, every=1):
         target = trainer._target.state_dict().values()
         same = all(torch.equal(x, y) for x, y in zip(weights(trainer), target, strict=True))
         assert same == (trainer.updates % 3 == 0)
