@@ -427,7 +427,7 @@ def test_goals_that_wait_are_canceled_preempted_and_stopped(
         assert (answer.status, answer.result.error_code) == (ABORTED, 200)
         assert answer.result.error_msg == "a newer goal of the same action came"
 
-        assert robot.transition("cleanup")
+        assert robot.transition("deactivate")
         answer = done(waiting.ask(second.get_result_async))
         assert (answer.status, answer.result.error_code) == (ABORTED, 200)
         assert not waiting.send(goal, **fields).accepted
@@ -437,5 +437,5 @@ def test_goals_that_wait_are_canceled_preempted_and_stopped(
         answer = waiting.plan(goal, **fields)
         assert answer.status == SUCCEEDED
         check_path(answer.result.path, robot.grid)
-        assert robot.transition("cleanup")
+        assert robot.transition("deactivate")
         assert robot.transition("cleanup")
