@@ -49,7 +49,7 @@ def usage(child: AbstractContextManager[Any], wait: Callable[[], Any]) -> Usage:
 # A client per start: one that has seen other nodes end is discovered more slowly.
 
 
-def start_planner() -> Usage:
+def start_planner(*environment: str) -> Usage:
     """Start the planner node; return what it takes until its first plan."""
     fixture = ros.shipped_maps()["dilemma"]
     (request,) = fixture.requests(1, np.random.default_rng(0))
@@ -61,7 +61,14 @@ def start_planner() -> Usage:
             client.publish_ends(request)
             plans.wait(lambda plan: plan.poses)
 
-        return usage(processes.running_node("planner_node", "--log-level", "error"), first_plan)
+        command = processes.executable("planner_node"), "--ros-args", "--log-level", "error"
+        return usage(processes.running("env", *environment, *command), first_plan)
+
+
+def start_cold_planner() -> Usage:
+    """Do the same with nothing compiled."""
+    with tempfile.TemporaryDirectory() as folder:
+        return start_planner(f"NUMBA_CACHE_DIR={folder}")
 
 
 def start_map_server() -> Usage:
@@ -101,6 +108,7 @@ def measure_starts() -> Iterator[bool]:
         "a bare rclpy node, discovered": (start_bare_node, (FREE, FREE, FREE)),
         "map_server_node to its first map": (start_map_server, (0.8, FREE, 90)),
         "planner_node to its first plan": (start_planner, (1.5, 0.9, 210)),
+        "planner_node with nothing compiled": (start_cold_planner, (FREE, 4, FREE)),
         "import ddqn_planner": (imported, (FREE, 0.3, FREE)),
         "ddqn-planner plan dilemma": (planned, (1.2, FREE, FREE)),
     }

@@ -69,8 +69,7 @@ def _segment_costs(
     path: Cells, grid: GridMap, move_rule: MoveRule | str, begin: float, others: float
 ) -> NDArray[np.float64]:
     """Return the cost of each segment, see `_cost`, the first and the others from a share on."""
-    cells = np.array(path, np.int64)
-    costs = np.empty(len(cells))
+    cells, costs = np.array(path, np.int64), np.empty(len(path))
     _costs(cells, begin, others, costs, *_layers(grid, move_rule))
     return costs[1:]
 
@@ -147,8 +146,7 @@ def _straighten(path: Any, until: Any, *layers: Any) -> int:
         x, y, reached, step, doubling = path[first, 0], path[first, 1], first + 1, 1, True
         while step > 0 and reached < last:
             following, joins = reached + step, False
-            if doubling and following > last:
-                following = last
+            following = last if doubling and following > last else following
             if following <= last:
                 cost = _cost(x, y, path[following, 0], path[following, 1], 0.0, *layers)
                 joins = cost <= SAME_COST * (until[following] - until[first])
