@@ -7,6 +7,7 @@ import math
 import time
 from collections.abc import Callable
 from contextlib import suppress
+from functools import partial
 from typing import Any
 
 from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped, Quaternion, TransformStamped
@@ -17,7 +18,7 @@ from rclpy.time import Time
 
 from ddqn_planner.nodes.conversions import check_pose, quaternion
 from ddqn_planner.nodes.report import Refusals, RequestError
-from ddqn_planner.nodes.runtime import STEADY, BaseNode, take_all
+from ddqn_planner.nodes.runtime import STEADY, BaseNode
 
 # A pose that was stamped before may be transformed by a transform that is later by so much.
 PATIENCE = 1.0  # seconds within which a new listener hears the first message of `odom` or TF
@@ -122,8 +123,11 @@ class Frames:
             self._node.after_jump_back.add(self._forget)
 
     def _read(self) -> None:
-        take_all(self._listener.tf_sub)
-        take_all(self._listener.tf_static_sub)
+        for subscription in (self._listener.tf_sub, self._listener.tf_static_sub):
+            with subscription.handle:
+                take = partial(subscription.handle.take_message, subscription.msg_type, False)
+                for message, _ in iter(take, None):
+                    subscription.callback(message)
 
     def _forget(self) -> None:
         self._read()

@@ -12,7 +12,6 @@ import weakref
 from collections.abc import Callable, Coroutine, Generator, Iterator, Mapping
 from contextlib import suppress
 from copy import copy
-from functools import partial
 from inspect import isawaitable
 from itertools import product
 from pathlib import Path
@@ -254,14 +253,6 @@ class BaseNode(Node):
                         f"{wanted} is asked for; let it publish so, or start this node with the "
                         f"parameter qos_overrides.{topic}.subscription.{policy}:={has}"
                     )
-
-
-def take_all(subscription: Subscription) -> None:
-    """Call a subscription back with all messages that came, without an executor."""
-    with subscription.handle:
-        take = partial(subscription.handle.take_message, subscription.msg_type, False)
-        for message, _ in iter(take, None):
-            subscription.callback(message)
 
 
 class Worker:

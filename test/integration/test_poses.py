@@ -19,7 +19,6 @@ from rclpy.time import Time
 from scipy.spatial.transform import Rotation
 from std_msgs.msg import Header
 
-from ddqn_planner.nodes import poses
 from ddqn_planner.nodes.poses import Frames, StartSource, transformed
 from ddqn_planner.nodes.report import Refusals, RequestError
 
@@ -112,13 +111,12 @@ def listening(monkeypatch: pytest.MonkeyPatch) -> Callable[..., Frames]:
     """Return what makes frames that know the transforms of some seconds."""
 
     def make(*seconds: int, tolerance: float = 20.0) -> Frames:
-        empty = dict.fromkeys(("tf_sub", "tf_static_sub"))
-        listener = SimpleNamespace(unregister=lambda: None, group=SimpleNamespace(), **empty)
+        listener = SimpleNamespace(unregister=lambda: None, group=SimpleNamespace())
         fields = {"TransformListener": lambda *_, **__: listener, "TransformException": KeyError}
         fields["__spec__"] = object  # it is installed
         tf2_ros = SimpleNamespace(Buffer=lambda: Buffer(*seconds), **fields)
         monkeypatch.setitem(sys.modules, "tf2_ros", tf2_ros)
-        monkeypatch.setattr(poses, "take_all", lambda _: None)
+        monkeypatch.setattr(Frames, "_read", lambda _: None)
         return Frames(Node(), lambda: tolerance)
 
     return make
