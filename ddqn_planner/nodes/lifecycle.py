@@ -5,16 +5,19 @@ from __future__ import annotations
 from collections.abc import Callable
 from functools import partialmethod
 from typing import Any
+from uuid import uuid4
 
 from lifecycle_msgs.srv import ChangeState
 from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.duration import Duration
 from rclpy.lifecycle import LifecycleNodeMixin, LifecycleState, TransitionCallbackReturn
 from rclpy.node import Node
+from rclpy.timer import Timer
 
-from ddqn_planner.nodes.runtime import Aside, BaseNode, Parameters
+from ddqn_planner.nodes.runtime import STEADY, BaseNode, Parameters
 
 SUCCESS = TransitionCallbackReturn.SUCCESS
+BEAT_PERIOD, BEAT_TIMEOUT = 0.5, 4.0  # seconds; the timeout as Nav2's lifecycle manager has it
 
 ENTITIES: dict[str, Callable[[Node, Any], object]] = {
     "publishers": Node.destroy_publisher,
@@ -41,7 +44,7 @@ class ManagedNode(LifecycleNodeMixin, BaseNode):
         self.answer_with(ChangeState, self._on_change_state)
         self._is_changing = False
         self._error: Exception | None = None
-        self._bond: Any = None
+        self._beats: Timer | None = None
 
     @property
     def state(self) -> str:
@@ -77,13 +80,13 @@ class ManagedNode(LifecycleNodeMixin, BaseNode):
 
     def deactivate(self) -> None:
         """Stop, and end the bond."""
-        if self._bond is not None:
-            self._bond.break_bond()
+        if self._beats is not None:
+            self.destroy_timer(self._beats)
+            self._beats, self._bond.active = None, False
+            self._beat()
             # Else a publisher that ends at once takes its last message with it.
-            self._bond.pub.wait_for_all_acked(Duration(seconds=0.2))
-            self._bond.shutdown()
-            self._aside.close()
-            self._bond = None
+            self._heart.wait_for_all_acked(Duration(seconds=0.2))
+            self.destroy_publisher(self._heart)
 
     def cleanup(self) -> None:
         """Destroy what was created since `configure`, also if that failed."""
@@ -142,13 +145,18 @@ class ManagedNode(LifecycleNodeMixin, BaseNode):
     def _form_bond(self) -> None:
         """Let a lifecycle manager see that the process lives."""
         try:
-            from bondpy.bondpy import Bond
+            from bond.msg import Status
         except ImportError:
-            remedy = "apt install ros-jazzy-bondpy, or set bond_timeout to 0.0 in its manager"
-            self.get_logger().info(f"no bond: bondpy is not installed; {remedy}")
+            remedy = "apt install ros-jazzy-bond, or set bond_timeout to 0.0 in its manager"
+            self.get_logger().info(f"no bond: bond is not installed; {remedy}")
             return
-        self._aside = Aside(self, "bond")  # it hears the bonds of all nodes, ten times a second
-        self._bond = Bond(self._aside.node, "bond", self.get_name())
-        # Seconds, as Nav2's nodes and lifecycle manager have them.
-        self._bond.heartbeat_period, self._bond.heartbeat_timeout = 0.1, 4.0
-        self._bond.start()
+        # As bondpy does, but deaf: the topic has the bonds of all nodes, each ten times a second.
+        self._bond = Status(id=self.get_name(), instance_id=str(uuid4()), active=True)
+        self._bond.heartbeat_period, self._bond.heartbeat_timeout = BEAT_PERIOD, BEAT_TIMEOUT
+        self._heart = self.create_publisher(Status, "bond", 1)
+        self._beat()
+        self._beats = self.create_timer(BEAT_PERIOD, self._beat, clock=STEADY)
+
+    def _beat(self) -> None:
+        self._bond.header = self.header()
+        self._heart.publish(self._bond)

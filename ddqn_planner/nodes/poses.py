@@ -7,6 +7,7 @@ import math
 import time
 from collections.abc import Callable
 from contextlib import suppress
+from functools import partial
 from typing import Any
 
 from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped, Quaternion, TransformStamped
@@ -17,10 +18,11 @@ from rclpy.time import Time
 
 from ddqn_planner.nodes.conversions import check_pose, quaternion
 from ddqn_planner.nodes.report import Refusals, RequestError
-from ddqn_planner.nodes.runtime import Aside, BaseNode
+from ddqn_planner.nodes.runtime import STEADY, BaseNode
 
 # A pose that was stamped before may be transformed by a transform that is later by so much.
 PATIENCE = 1.0  # seconds within which a new listener hears the first message of `odom` or TF
+READ_PERIOD, TF_DEPTH = 0.5, 1000  # seconds between two reads, and messages that come meanwhile
 SILENCE = 2.0  # seconds after which odometry that comes no more does not tell where the robot is
 REMEDY = "; or install tf2_ros (apt install ros-jazzy-tf2-ros-py), which transforms it"
 
@@ -97,6 +99,7 @@ class Frames:
         if not self.available:
             raise ValueError("tf2_ros is not installed")
         self.listen()
+        self._read()
         try:
             return self._buffer.lookup_transform(target, source, stamp or Time())
         except self._tf2_ros.TransformException as error:
@@ -112,13 +115,22 @@ class Frames:
         if self._listener is None:
             import tf2_ros  # it takes a while
 
-            self._tf2_ros, self._buffer = tf2_ros, tf2_ros.Buffer()
-            self._aside = Aside(self._node, "tf")
-            self._listener = tf2_ros.TransformListener(self._buffer, self._aside.node)
-            self._began = time.monotonic()
+            self._tf2_ros, self._buffer, self._began = tf2_ros, tf2_ros.Buffer(), time.monotonic()
+            self._listener = tf2_ros.TransformListener(self._buffer, self._node, qos=TF_DEPTH)
+            # No executor wakes for them, a hundred a second: they are read when they are needed.
+            self._listener.group.can_execute = lambda _: False
+            self._reads = self._node.create_timer(READ_PERIOD, self._read, clock=STEADY)
             self._node.after_jump_back.add(self._forget)
 
+    def _read(self) -> None:
+        for subscription in (self._listener.tf_sub, self._listener.tf_static_sub):
+            with subscription.handle:
+                take = partial(subscription.handle.take_message, subscription.msg_type, False)
+                for message, _ in iter(take, None):
+                    subscription.callback(message)
+
     def _forget(self) -> None:
+        self._read()
         self._buffer.clear()  # tf2 takes no transform that is older than those it has
         self._began = time.monotonic()
 
@@ -126,8 +138,8 @@ class Frames:
         """Stop listening, until a transform is needed again."""
         if self._listener is not None:
             self._node.after_jump_back.discard(self._forget)
+            self._node.destroy_timer(self._reads)
             self._listener.unregister()
-            self._aside.close()
             self._buffer = self._listener = None
 
 

@@ -33,7 +33,7 @@ from rclpy.clock_type import ClockType
 from rclpy.duration import Duration
 from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.exceptions import InvalidHandle, NameValidationException, ParameterException
-from rclpy.executors import ExternalShutdownException, ShutdownException, SingleThreadedExecutor
+from rclpy.executors import SingleThreadedExecutor
 from rclpy.logging import get_logger
 from rclpy.node import Node
 from rclpy.parameter import Parameter
@@ -253,33 +253,6 @@ class BaseNode(Node):
                         f"{wanted} is asked for; let it publish so, or start this node with the "
                         f"parameter qos_overrides.{topic}.subscription.{policy}:={has}"
                     )
-
-
-class Aside:
-    """A node in a thread of its own, for what comes often: it wakes fast, with few to listen to."""
-
-    def __init__(self, of: Node, name: str) -> None:
-        self.node = Node(
-            f"{of.get_name()}_{name}",
-            namespace=of.get_namespace(),
-            use_global_arguments=False,
-            enable_rosout=False,
-            start_parameter_services=False,
-        )
-        self._executor = SingleThreadedExecutor()
-        self._executor.add_node(self.node)
-        self._thread = threading.Thread(target=self._spin, daemon=True)
-        self._thread.start()
-
-    def _spin(self) -> None:
-        with suppress(ExternalShutdownException, ShutdownException, InvalidHandle):
-            self._executor.spin()
-
-    def close(self) -> None:
-        """End the thread, and destroy the node."""
-        self._executor.shutdown()
-        self._thread.join()
-        self.node.destroy_node()
 
 
 class Worker:

@@ -174,8 +174,7 @@ def test_a_stop_answers_what_waits(run_waiting: Any, load_gate: Path) -> None:
 
 
 def test_a_stop_breaks_the_bond(run_robot: Any, model: Path) -> None:
-    pytest.importorskip("bondpy", reason="bondpy is not on PyPI")
-    status = pytest.importorskip("bond.msg").Status
+    status = pytest.importorskip("bond.msg", reason="bond is not on PyPI").Status
     with run_robot("/bonded", {"autostart": False, "model": str(model)}) as robot:
         bond = robot.client.subscribe(status, "bond")
         robot.start()

@@ -170,6 +170,7 @@ def test_without_tf2_it_says_so_and_the_other_sources_work(robot: Robot) -> None
 
 TF2_ROS = """
 from geometry_msgs.msg import TransformStamped
+from rclpy.callback_groups import ReentrantCallbackGroup
 
 class TransformException(Exception):
     pass
@@ -184,15 +185,19 @@ class Buffer:
         return self.transforms[target_frame, source_frame]
 
 class TransformListener:
-    def __init__(self, buffer, node):
+    def __init__(self, buffer, node, qos):
         def hear(transform):
             buffer.transforms[transform.header.frame_id, transform.child_frame_id] = transform
 
-        self.node = node
-        self.subscription = node.create_subscription(TransformStamped, "tf", hear, 10)
+        self.node, self.group = node, ReentrantCallbackGroup()
+        self.tf_sub, self.tf_static_sub = (
+            node.create_subscription(TransformStamped, topic, hear, qos, callback_group=self.group)
+            for topic in ("tf", "tf_static")
+        )
 
     def unregister(self):
-        self.node.destroy_subscription(self.subscription)
+        self.node.destroy_subscription(self.tf_sub)
+        self.node.destroy_subscription(self.tf_static_sub)
 """
 """As much of tf2_ros as the node uses, which is no package of PyPI: one transform, no tree."""
 

@@ -19,7 +19,6 @@ from rclpy.time import Time
 from scipy.spatial.transform import Rotation
 from std_msgs.msg import Header
 
-from ddqn_planner.nodes import poses
 from ddqn_planner.nodes.poses import Frames, StartSource, transformed
 from ddqn_planner.nodes.report import Refusals, RequestError
 
@@ -97,6 +96,12 @@ class Node:
         self.after_jump_back: set[object] = set()
         self.value = {"start_source": "tf", "robot_frame": "odom"}.__getitem__
 
+    def create_timer(self, *_: object, clock: object) -> None:
+        """Do not call back."""
+
+    def destroy_timer(self, _: object) -> None:
+        """Have nothing to destroy."""
+
     def get_clock(self) -> SimpleNamespace:
         return SimpleNamespace(now=lambda: Time(seconds=NOW, clock_type=ClockType.ROS_TIME))
 
@@ -106,13 +111,12 @@ def listening(monkeypatch: pytest.MonkeyPatch) -> Callable[..., Frames]:
     """Return what makes frames that know the transforms of some seconds."""
 
     def make(*seconds: int, tolerance: float = 20.0) -> Frames:
-        listener = SimpleNamespace(unregister=lambda: None)
-        fields = {"TransformListener": lambda *_: listener, "TransformException": KeyError}
+        listener = SimpleNamespace(unregister=lambda: None, group=SimpleNamespace())
+        fields = {"TransformListener": lambda *_, **__: listener, "TransformException": KeyError}
         fields["__spec__"] = object  # it is installed
         tf2_ros = SimpleNamespace(Buffer=lambda: Buffer(*seconds), **fields)
         monkeypatch.setitem(sys.modules, "tf2_ros", tf2_ros)
-        aside = SimpleNamespace(node=None, close=lambda: None)
-        monkeypatch.setattr(poses, "Aside", lambda *_: aside)
+        monkeypatch.setattr(Frames, "_read", lambda _: None)
         return Frames(Node(), lambda: tolerance)
 
     return make
