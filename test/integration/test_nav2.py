@@ -427,15 +427,16 @@ def test_goals_that_wait_are_canceled_preempted_and_stopped(
         assert (answer.status, answer.result.error_code) == (ABORTED, 200)
         assert answer.result.error_msg == "a newer goal of the same action came"
 
-        assert robot.transition("deactivate")
-        answer = done(waiting.ask(second.get_result_async))
+        result = waiting.ask(second.get_result_async)
+        assert robot.transition("cleanup")  # it is inactive until the model is loaded
+        answer = done(result)
         assert (answer.status, answer.result.error_code) == (ABORTED, 200)
-        assert not waiting.send(goal, **fields).accepted
 
         load_gate.touch()
-        assert robot.transition("activate")
+        robot.start()
         answer = waiting.plan(goal, **fields)
         assert answer.status == SUCCEEDED
         check_path(answer.result.path, robot.grid)
         assert robot.transition("deactivate")
+        assert not waiting.send(goal, **fields).accepted
         assert robot.transition("cleanup")
