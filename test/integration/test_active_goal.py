@@ -218,7 +218,7 @@ def test_the_nearest_free_dock_is_taken_and_kept_up_to_the_threshold(docks: Robo
     docks.send_map(docks.stamped_map())
     wait_for_dock(docks, LEFT, "to goal 2 of 4")
     # Between two docks it keeps to one, up to the threshold.
-    docks.set(switch_threshold=0.3)
+    docks.change(switch_threshold=0.3)
     docks.clear()
     docks.send_start(docks.pose((16, 5)))  # 15 cells from the left dock, 13 from the right one
     docks.wait_for_path((16, 5), LEFT, yaw=YAWS[LEFT])
