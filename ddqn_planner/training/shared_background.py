@@ -47,7 +47,7 @@ def player(
     """Return `play` for a `PaperModule`, its target and Adam's moments, and the robots' arrays."""
     e, p, weights = environment, environment.parameters, [*online.parameters()]
     mean, square = ([moments[w][name] for w in weights] for name in ("exp_avg", "exp_avg_sq"))
-    parts = weights, target.parameters(), [weight.clone() for weight in weights], mean, square
+    parts = weights, target.parameters(), [*map(torch.zeros_like, weights)], mean, square
     networks = networks_of(environment, parts, max(p.batch_size, p.environments))
     kind = ("double_dqn", "dqn", "printed").index(p.target)
     numbers = Numbers(*(as_number(getattr(p, name)) for name, as_number in NUMBERS.items()))
@@ -160,8 +160,7 @@ def greedy(q: Any, n: int) -> int:
 
 @compiled
 def differentiate(network: Any, gradient: Any, count: int) -> None:
-    """Set the gradient of a loss by each array, given that by Q of the states that it has seen."""
-    gradient.weights[:] = 0
+    """Add to a loss's gradients, given that by Q of the states that a network has seen."""
     gradient.output[:] = 0
     gradient.before[:] = 0
     layer, layer_gradient, error = network.layer, gradient.layer, gradient.own_output
@@ -180,16 +179,14 @@ def differentiate(network: Any, gradient: Any, count: int) -> None:
         for row in range(network.first[n], network.first[n + 1]):
             window = network.changed[row]
             for f in range(filters):
-                feature, number = (
-                    max(network.own_before[row, f], np.float32(0)),
-                    f * windows + window,
-                )
-                change, through = feature - after[window, f], np.float32(0)
-                for u in range(len(network.eight) or units):
-                    layer_gradient[number, u] += change * error[n, u]
-                    through += layer[number, u] * error[n, u]
-                if after[window, f] > 0:
-                    before[window, f] -= through
+                feature, through = max(network.own_before[row, f], np.float32(0)), np.float32(0)
+                change, number = feature - after[window, f], f * windows + window
+                if feature != 0 or change != 0:  # most features are 0, with the robot and without
+                    for u in range(len(network.eight) or units):
+                        layer_gradient[number, u] += change * error[n, u]
+                        through += layer[number, u] * error[n, u]
+                    if after[window, f] > 0:
+                        before[window, f] -= through
                 own_before[row, f] = through if feature > 0 else np.float32(0)
     for window in range(windows):
         for f in range(filters):
@@ -198,7 +195,7 @@ def differentiate(network: Any, gradient: Any, count: int) -> None:
                 for u in range(len(network.eight) or units):
                     layer_gradient[number, u] += feature * gradient.output[u]
                     before[window, f] += layer[number, u] * gradient.output[u]
-    gradient.layer_bias[:] = gradient.output
+    gradient.layer_bias[:] += gradient.output
     add_kernel(gradient.kernel, gradient.kernel_bias, network.windows.common, windows, before)
     rows = network.first[count]
     add_kernel(gradient.kernel, gradient.kernel_bias, network.patch, rows, own_before)
@@ -223,8 +220,12 @@ def adam(weight: Any, gradient: Any, mean: Any, square: Any, rate: float, update
     step = np.float32(rate / (1 - BETA_1**updates))
     root = np.float32(1 / np.sqrt(1 - BETA_2**updates))
     one, two, epsilon = np.float32(1 - BETA_1), np.float32(1 - BETA_2), np.float32(EPSILON)
+    least = np.float32(1e-30)
     for number in range(weight.size):
         slope = gradient[number]
         mean[number] += one * (slope - mean[number])
+        # Most fade away, as few features are alive: a processor is slow where they are denormal.
+        mean[number] = mean[number] if abs(mean[number]) > least else np.float32(0)
         square[number] += two * (slope * slope - square[number])
         weight[number] -= step * mean[number] / (np.sqrt(square[number]) * root + epsilon)
+        gradient[number] = 0
