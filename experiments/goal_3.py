@@ -116,9 +116,7 @@ def best_moves(scenario: Scenario) -> NDArray[np.bool_]:
     distance = shortest_distances(scenario.grid, scenario.goal, MOVE_RULE).ravel()
     onward_AC = np.append(distance, np.inf)[neighbours(occupancy.shape)] + LENGTHS[:, None]
     legal_AC = legal_moves(occupancy, MOVE_RULE).reshape(len(LENGTHS), -1)
-    best: NDArray[np.bool_]
-    best = (legal_AC & np.isfinite(onward_AC) & (onward_AC <= distance + 1e-9)).T
-    return best
+    return np.array((legal_AC & np.isfinite(onward_AC) & (onward_AC <= distance + 1e-9)).T)
 
 
 def fixed_path(maps: Sequence[Scenario]) -> tuple[Cell, ...]:
@@ -133,8 +131,7 @@ def report(settings: Settings) -> str:
     rows = []
     for noise in settings.noise:
         training, test = drawn_maps(settings, noise)
-        maps = GridVectorEnvironment([*training, *test], MOVE_RULE, PAPER)
-        lengths = dict[str, NDArray[np.float64]]()  # (seeds, maps), NaN without a path
+        maps, lengths = GridVectorEnvironment([*training, *test], MOVE_RULE, PAPER), {}
         for label, (folder, parameters) in networks(settings).items():
             name = f"{noise.value}/{folder}"
             lengths[label] = np.array([rollouts(p, maps)[0] for p in settings.planners(name, KEPT)])

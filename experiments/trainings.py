@@ -189,10 +189,7 @@ def evaluate_training(trainer: Trainer, optimum: NDArray[np.float32]) -> dict[st
 
 
 def rollouts(planner: Planner, environment: GridVectorEnvironment) -> NDArray[np.float64]:
-    """Return the length of the rollout from each start, NaN if it is trapped: (2, S).
-
-    The second ones are those without action masking.
-    """
+    """Return each start's length, NaN if trapped, with and without action masking: (2, S)."""
     if not isinstance(planner.network, PaperQNetwork):
         fields = [(planner.q_field(s.grid, s.goal), s.start) for s in environment.scenarios]
         plans = [[f.rollout(start) for f, start in fields]]
@@ -215,18 +212,10 @@ def rollouts(planner: Planner, environment: GridVectorEnvironment) -> NDArray[np
 
 def optimal_value(environment: GridVectorEnvironment) -> NDArray[np.float32]:
     """Return V* of the first scenario, exact by value iteration: (C,) float32."""
-    legal, parameters = environment.legal[:1], environment.parameters
-    (return_AC,) = value_iteration(
-        legal.astype(np.float32),
-        environment.free_reward[:1],
-        environment.goal[:1],
-        neighbours(environment.shape),
-        parameters.gamma,
-        parameters.obstacle_reward,
-    )
-    value_C: NDArray[np.float32]
-    value_C = np.where(legal[0], return_AC, np.float32(parameters.obstacle_reward)).max(axis=0)
-    return value_C
+    e, p = environment, environment.parameters
+    given = e.legal[:1].astype(np.float32), e.free_reward[:1], e.goal[:1], neighbours(e.shape)
+    (return_AC,) = value_iteration(*given, p.gamma, p.obstacle_reward)
+    return np.array(np.where(e.legal[0], return_AC, np.float32(p.obstacle_reward)).max(axis=0))
 
 
 def read_csv(path: Path) -> NDArray[Any]:

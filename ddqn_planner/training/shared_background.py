@@ -25,7 +25,8 @@ from ddqn_planner.training.double_dqn import ReplayBuffer
 from ddqn_planner.training.environment import GridVectorEnvironment
 from ddqn_planner.training.hyper_parameters import HyperParameters
 
-BETA_1, BETA_2, EPSILON = 0.9, 0.999, 1e-8  # Adam's, as torch has them
+BETA_1, BETA_2, EPSILON = 0.9, 0.999, np.float32(1e-8)  # Adam's, as torch has them
+LEAST = np.float32(1e-30)  # mean of a gradient: less moves no weight
 
 DQN, PRINTED = 1, 2  # other targets than Double DQN's
 
@@ -95,7 +96,7 @@ def play(game: Any, learning: Any, robots: Any, random: Any, counters: Any, unti
         evaluate(online, scenario, cell)
         for n in range(count):
             if exploration.random() >= epsilon:
-                actions[n] = greedy(online.q, n)
+                actions[n] = online.q[n].argmax()
         for n in range(count):
             at = scenario[n], actions[n], cell[n]
             after = cell[n] + offset[actions[n]] if legal[at] else cell[n]
@@ -130,7 +131,7 @@ def update(learning: Any, sampling: Any, counters: Any) -> None:
     evaluate(target, scenario, next_cell)
     y = replay.reward[slots]
     for n in range(slots.size):
-        best = greedy(target.q if kind == DQN else online.q, n)
+        best = (target.q if kind == DQN else online.q)[n].argmax()
         next_q = (online.q if kind == PRINTED else target.q)[n, best]
         y[n] += replay.discount[slots[n]] * next_q
     evaluate(online, scenario, replay.cell[slots])
@@ -146,16 +147,6 @@ def update(learning: Any, sampling: Any, counters: Any) -> None:
     if counters[1] % numbers.target_interval == 0:
         target.weights[:] = online.weights
         look(target)
-
-
-@compiled
-def greedy(q: Any, n: int) -> int:
-    """Return the first action of the greatest Q (B, 8) of a state."""
-    best = 0
-    for action in range(1, 8):
-        if q[n, action] > q[n, best]:
-            best = action
-    return best
 
 
 @compiled
@@ -219,13 +210,12 @@ def adam(weight: Any, gradient: Any, mean: Any, square: Any, rate: float, update
     """Take Adam's step number `updates` (Kingma and Ba 2015, with torch's place of epsilon)."""
     step = np.float32(rate / (1 - BETA_1**updates))
     root = np.float32(1 / np.sqrt(1 - BETA_2**updates))
-    one, two, epsilon = np.float32(1 - BETA_1), np.float32(1 - BETA_2), np.float32(EPSILON)
-    least = np.float32(1e-30)
+    one, two = np.float32(1 - BETA_1), np.float32(1 - BETA_2)
     for number in range(weight.size):
         slope = gradient[number]
         mean[number] += one * (slope - mean[number])
         # Most fade away, as few features are alive: a processor is slow where they are denormal.
-        mean[number] = mean[number] if abs(mean[number]) > least else np.float32(0)
+        mean[number] = mean[number] if abs(mean[number]) > LEAST else np.float32(0)
         square[number] += two * (slope * slope - square[number])
-        weight[number] -= step * mean[number] / (np.sqrt(square[number]) * root + epsilon)
+        weight[number] -= step * mean[number] / (np.sqrt(square[number]) * root + EPSILON)
         gradient[number] = 0
