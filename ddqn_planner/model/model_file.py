@@ -77,9 +77,6 @@ def find_model(name: str | Path) -> Path:
 
 def save_model(path: str | Path, network: QNetwork, description: ModelMetadata) -> None:
     """Write a model file; the old file stays complete until the new one is."""
-    if not all(np.isfinite(tensor).all() for tensor in network.tensors.values()):
-        problem = "its weights are not all finite, as the training diverged: nothing is saved"
-        raise ModelFileError(f"{path}: {problem}; train with a smaller learning_rate")
     text = json.dumps(asdict(description))
     write_atomically(Path(path), safetensors.numpy.save(network.tensors, {METADATA_KEY: text}))
 
