@@ -49,7 +49,9 @@ def straightened(path: Cells, grid: GridMap, move_rule: MoveRule | str) -> Path:
     """Do the work of `simplify` for a path of one cell or more."""
     # With 64 bits, whatever is computed with a cell has its type, and numba compiles once for it.
     cells = np.array(path, np.int64)
-    count = _straighten(cells, np.empty(len(cells)), *_layers(grid, move_rule))
+    layers, until = _layers(grid, move_rule), np.empty(len(cells))
+    _costs(cells, 1.0, 1.0, until, layers)
+    count = _straighten(cells, until, layers)
     return cells[:count].astype(np.int32)
 
 
@@ -70,7 +72,7 @@ def _segment_costs(
 ) -> NDArray[np.float64]:
     """Return the cost of each segment, see `_cost`, the first and the others from a share on."""
     cells, costs = np.array(path, np.int64), np.empty(len(path))
-    _costs(cells, begin, others, costs, *_layers(grid, move_rule))
+    _costs(cells, begin, others, costs, _layers(grid, move_rule))
     return costs[1:]
 
 
@@ -86,7 +88,7 @@ def _layers(grid: GridMap, move_rule: MoveRule | str) -> tuple[Any, ...]:
 
 
 @inlined
-def _cost(x: int, y: int, last_x: int, last_y: int, begin: float, *layers: Any) -> float:
+def _cost(x: int, y: int, last_x: int, last_y: int, begin: float, layers: Any) -> float:
     """Return the cost of a segment, infinity if it is not legal from a share of it on."""
     occupancy, forbidden, cost, slowness, cuts_corners, is_unit = layers
     dx, dy = last_x - x, last_y - y
@@ -123,7 +125,7 @@ def _cost(x: int, y: int, last_x: int, last_y: int, begin: float, *layers: Any) 
 
 
 @in_place
-def _costs(path: Any, begin: float, others: float, costs: Any, *layers: Any) -> None:
+def _costs(path: Any, begin: float, others: float, costs: Any, layers: Any) -> None:
     """Do the work of `_segment_costs`; cells may lie outside the map, where none is legal."""
     height, width = layers[0].shape
     costs[0] = 0.0
@@ -131,14 +133,13 @@ def _costs(path: Any, begin: float, others: float, costs: Any, *layers: Any) -> 
         x, y, to_x, to_y = path[index - 1, 0], path[index - 1, 1], path[index, 0], path[index, 1]
         costs[index] = np.inf
         if 0 <= x < width and 0 <= y < height and 0 <= to_x < width and 0 <= to_y < height:
-            costs[index] = _cost(x, y, to_x, to_y, others if index > 1 else begin, *layers)
+            costs[index] = _cost(x, y, to_x, to_y, others if index > 1 else begin, layers)
 
 
 @in_place
-def _straighten(path: Any, until: Any, *layers: Any) -> int:
+def _straighten(path: Any, until: Any, layers: Any) -> int:
     """Do the work of `straightened` in a path's own cells; return how many are left."""
     first, number, last = 0, 0, path.shape[0] - 1
-    _costs(path, 1.0, 1.0, until, *layers)
     for cell in range(1, last + 1):
         until[cell] += until[cell - 1]
     while first < last:
@@ -148,7 +149,7 @@ def _straighten(path: Any, until: Any, *layers: Any) -> int:
             following, joins = reached + step, False
             following = last if doubling and following > last else following
             if following <= last:
-                cost = _cost(x, y, path[following, 0], path[following, 1], 0.0, *layers)
+                cost = _cost(x, y, path[following, 0], path[following, 1], 0.0, layers)
                 joins = cost <= SAME_COST * (until[following] - until[first])
             if joins:
                 reached = following
@@ -160,35 +161,28 @@ def _straighten(path: Any, until: Any, *layers: Any) -> int:
     # moves back as far as the next one is seen, and is left out if it meets the one before.
     before = 0
     for corner in range(1, number):
-        x, y = _moved_back(path, before, corner, *layers)
-        if path[before, 0] != x or path[before, 1] != y:
+        # To the cell toward the one before through which a path to the next one costs least.
+        x, y, last_x, last_y = path[before, 0], path[before, 1], path[corner, 0], path[corner, 1]
+        across, up = abs(x - last_x), abs(y - last_y)
+        steps = across if across > up else up
+        least, best_x, best_y = np.inf, last_x, last_y
+        # First the cell itself, legal or not.
+        seen, middle, unseen, share = -1, 0, steps + 1, 1.0
+        while middle > seen:
+            back_x = last_x + (2 * middle * (x - last_x) + steps) // (2 * steps)
+            back_y = last_y + (2 * middle * (y - last_y) + steps) // (2 * steps)
+            cost = _cost(back_x, back_y, path[corner + 1, 0], path[corner + 1, 1], share, layers)
+            if cost == np.inf:
+                unseen = middle
+            else:
+                seen = middle
+                cost += _cost(x, y, back_x, back_y, share, layers)
+                if cost * SAME_COST < least:
+                    least, best_x, best_y = cost, back_x, back_y
+            middle, share = (seen + unseen) // 2, 0.0
+        if x != best_x or y != best_y:
             before += 1
-            path[before, 0], path[before, 1] = x, y
+            path[before, 0], path[before, 1] = best_x, best_y
     before += number > 0
     path[before, 0], path[before, 1] = path[number, 0], path[number, 1]
     return before + 1
-
-
-@inlined
-def _moved_back(path: Any, before: int, corner: int, *layers: Any) -> tuple[int, int]:
-    """Return the cell toward the one before through which a path to the next one costs least."""
-    x, y, last_x, last_y = path[before, 0], path[before, 1], path[corner, 0], path[corner, 1]
-    next_x, next_y = path[corner + 1, 0], path[corner + 1, 1]
-    across, up = abs(x - last_x), abs(y - last_y)
-    steps = across if across > up else up
-    least, best_x, best_y = np.inf, last_x, last_y
-    # First the cell itself, legal or not.
-    seen, middle, unseen, share = -1, 0, steps + 1, 1.0
-    while middle > seen:
-        back_x = last_x + (2 * middle * (x - last_x) + steps) // (2 * steps)
-        back_y = last_y + (2 * middle * (y - last_y) + steps) // (2 * steps)
-        cost = _cost(back_x, back_y, next_x, next_y, share, *layers)
-        if cost == np.inf:
-            unseen = middle
-        else:
-            seen = middle
-            cost += _cost(x, y, back_x, back_y, share, *layers)
-            if cost * SAME_COST < least:
-                least, best_x, best_y = cost, back_x, back_y
-        middle, share = (seen + unseen) // 2, 0.0
-    return best_x, best_y
