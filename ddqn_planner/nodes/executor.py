@@ -17,14 +17,9 @@ from rclpy.waitable import NumberOfEntities
 
 EVENTS_PERIOD = 0.5  # seconds: how late a busy node may hear that publishers or subscribers came
 
-KINDS = {
-    "subscription": "subscriptions",
-    "guard_condition": "guards",
-    "timer": "timers",
-    "client": "clients",
-    "service": "services",
-}
-"""What a wait set waits for, and what a node calls all that it has of it."""
+# What a wait set waits for, as it calls them, and where a node has them.
+KINDS = "subscription", "guard_condition", "timer", "client", "service"
+LISTS = "subscriptions", "guards", "timers", "clients", "services"
 
 
 class NodeExecutor(SingleThreadedExecutor):
@@ -47,19 +42,15 @@ class NodeExecutor(SingleThreadedExecutor):
         if threading.get_ident() != self._thread:  # which may wait
             return super().create_task(callback, *arguments, **options)
         task = Task(callback, arguments, options, executor=self)
-        with self._tasks_lock:
-            self._tasks.append((task, None, None))
+        self._tasks.append((task, None, None))
         return task
 
     def spin_until(self, stopping: threading.Event) -> None:
         """Run what is ready, wait for more, and so on until an event is set."""
-        while True:
-            self._run_tasks()
-            if stopping.is_set():
-                return
-            if self._has_changed:
-                self._look_at_node()
+        self._run_tasks()
+        while not stopping.is_set():
             self._wait()
+            self._run_tasks()
 
     def _run_tasks(self) -> None:
         """Run all tasks until they are done or await something."""
@@ -78,21 +69,21 @@ class NodeExecutor(SingleThreadedExecutor):
         self._waitables = [*node.waitables]
         self._entities = {
             (kind, entity.handle.pointer): entity
-            for kind, name in KINDS.items()
+            for kind, name in zip(KINDS, LISTS, strict=True)
             for entity in getattr(node, name)
         }
-        kinds = [kind for kind, _ in self._entities]
-        count = NumberOfEntities(*map(kinds.count, KINDS))
-        count.num_guard_conditions += 1  # what wakes the executor
-        for waitable in self._waitables:
-            count += waitable.get_num_entities()
-        counts = (getattr(count, name) for name in count.__slots__)
-        self._wait_set = rclpy_implementation.WaitSet(*counts, self.context.handle)
+        kinds = ["guard_condition", *(kind for kind, _ in self._entities)]  # one is the executor's
+        counts = [it.get_num_entities() for it in self._waitables]
+        count = sum(counts, NumberOfEntities(*map(kinds.count, KINDS)))
+        sizes = (getattr(count, name) for name in count.__slots__)
+        self._wait_set = rclpy_implementation.WaitSet(*sizes, self.context.handle)
 
     def _wait(self) -> None:
         """Wait until something is ready, and create tasks for it."""
-        wait_set, timeout = self._wait_set, -1
+        if self._has_changed:
+            self._look_at_node()
         waitables = [it for it in self._waitables if it.callback_group.can_execute(it)]
+        wait_set, timeout = self._wait_set, -1
         if (seconds := self._events_due - time.monotonic()) > 0:  # they are half of what it has
             waitables = [it for it in waitables if not isinstance(it, EventHandler)]
             timeout = int(1e9 * seconds)
