@@ -20,7 +20,7 @@ BITS[MOVES[:, 1] + 1, MOVES[:, 0] + 1] = 1 << np.arange(8)
 
 
 def simplify(cells: Cells, grid: GridMap, move_rule: MoveRule | str) -> tuple[Cell, ...]:
-    """Return a path of few legal segments beside a given path, with the same ends.
+    """Return a path of few legal segments beside a given path, with the same ends: string pulling.
 
     A segment is legal if all cells that it passes through are free; under `MoveRule.ROBOT_SAFE`
     also those that it touches at a corner. None of them except the last may forbid one of the two
@@ -49,7 +49,7 @@ def straightened(path: Cells, grid: GridMap, move_rule: MoveRule | str) -> Path:
     """Do the work of `simplify` for a path of one cell or more."""
     # With 64 bits, whatever is computed with a cell has its type, and numba compiles once for it.
     cells = np.array(path, np.int64)
-    count = _straighten(cells, np.empty(len(cells)), *_layers(grid, move_rule))
+    count = _straighten(cells, cells.copy(), np.empty(len(cells)), *_layers(grid, move_rule))
     return cells[:count].astype(np.int32)
 
 
@@ -86,6 +86,14 @@ def _layers(grid: GridMap, move_rule: MoveRule | str) -> tuple[Any, ...]:
 
 
 @inlined
+def _length(width: int, height: int, is_unit: bool) -> float:
+    """Return the length of a segment over some columns and rows: what it costs at least."""
+    if is_unit:
+        return float(width if width > height else height)
+    return math.sqrt(width * width + height * height)
+
+
+@inlined
 def _cost(x: int, y: int, last_x: int, last_y: int, begin: float, *layers: Any) -> float:
     """Return the cost of a segment, infinity if it is not legal from a share of it on."""
     occupancy, forbidden, cost, slowness, cuts_corners, is_unit = layers
@@ -95,8 +103,7 @@ def _cost(x: int, y: int, last_x: int, last_y: int, begin: float, *layers: Any) 
     # It lies between a diagonal move and one along its longer axis.
     takes = BITS[step_y + 1, step_x + 1]
     takes |= BITS[step_y * (height >= width) + 1, step_x * (width >= height) + 1]
-    longer = width if width > height else height
-    length = float(longer) if is_unit else math.sqrt(width * width + height * height)
+    length = _length(width, height, is_unit)
     # Positions on the segment count from 0 at its first point to `whole` at its last one: then all
     # crossings of edges of cells are whole numbers.
     width, height = width + (width == 0), height + (height == 0)
@@ -135,60 +142,92 @@ def _costs(path: Any, begin: float, others: float, costs: Any, *layers: Any) -> 
 
 
 @in_place
-def _straighten(path: Any, until: Any, *layers: Any) -> int:
+def _straighten(path: Any, other: Any, until: Any, *layers: Any) -> int:
     """Do the work of `straightened` in a path's own cells; return how many are left."""
-    first, number, last = 0, 0, path.shape[0] - 1
     _costs(path, 1.0, 1.0, until, *layers)
-    for cell in range(1, last + 1):
-        until[cell] += until[cell - 1]
+    for cell in range(path.shape[0]):
+        until[cell] += until[cell - 1] if cell else 0.0
+    count, is_better = _move_corners(path, _pull(path, until, False, *layers), *layers)
+    if is_better:
+        # From the end, other obstacles come first: the path may pass them on the better side.
+        of_other, _ = _move_corners(other, _pull(other, until, True, *layers), *layers)
+        if _total(other, of_other, *layers) * SAME_COST < _total(path, count, *layers):
+            count = of_other
+            for cell in range(count):
+                path[cell, 0], path[cell, 1] = other[cell, 0], other[cell, 1]
+    return count
+
+
+@in_place
+def _total(path: Any, count: int, *layers: Any) -> float:
+    """Return what a path of so many cells costs, legal or not."""
+    total = 0.0
+    for cell in range(1, count):
+        x, y = path[cell - 1, 0], path[cell - 1, 1]
+        total += _cost(x, y, path[cell, 0], path[cell, 1], 1.0, *layers)
+    return total
+
+
+@in_place
+def _pull(path: Any, until: Any, backward: bool, *layers: Any) -> int:
+    """Keep the cells that are the last ones seen from the one before; return how many."""
+    first, number, last = 0, 0, path.shape[0] - 1
     while first < last:
         # The length of each segment is found by doubling and halving.
-        x, y, reached, step, doubling = path[first, 0], path[first, 1], first + 1, 1, True
+        reached, step, doubling = first + 1, 1, True
         while step > 0 and reached < last:
             following, joins = reached + step, False
             following = last if doubling and following > last else following
             if following <= last:
-                cost = _cost(x, y, path[following, 0], path[following, 1], 0.0, *layers)
-                joins = cost <= SAME_COST * (until[following] - until[first])
+                begin, end = (last - following, last - first) if backward else (first, following)
+                x, y, to_x, to_y = path[begin, 0], path[begin, 1], path[end, 0], path[end, 1]
+                cost = _cost(x, y, to_x, to_y, 0.0, *layers)
+                joins = cost <= SAME_COST * (until[end] - until[begin])
             if joins:
                 reached = following
             doubling = doubling and joins
             step = 2 * step if doubling else step // 2
         first, number = reached, number + 1
-        path[number, 0], path[number, 1] = path[reached, 0], path[reached, 1]
-    # Each cell is now the last that is seen from the one before, mostly well behind a corner: it
-    # moves back as far as the next one is seen, and is left out if it meets the one before.
-    before = 0
-    for corner in range(1, number):
-        x, y = _moved_back(path, before, corner, *layers)
-        if path[before, 0] != x or path[before, 1] != y:
-            before += 1
-            path[before, 0], path[before, 1] = x, y
-    before += number > 0
-    path[before, 0], path[before, 1] = path[number, 0], path[number, 1]
-    return before + 1
+        kept, at = (last - number, last - reached) if backward else (number, reached)
+        path[kept, 0], path[kept, 1] = path[at, 0], path[at, 1]
+    for cell in range(number + 1 if backward else 0):
+        at = last - number + cell
+        path[cell, 0], path[cell, 1] = path[at, 0], path[at, 1]
+    return number + 1
 
 
-@inlined
-def _moved_back(path: Any, before: int, corner: int, *layers: Any) -> tuple[int, int]:
-    """Return the cell toward the one before through which a path to the next one costs least."""
-    x, y, last_x, last_y = path[before, 0], path[before, 1], path[corner, 0], path[corner, 1]
-    next_x, next_y = path[corner + 1, 0], path[corner + 1, 1]
-    across, up = abs(x - last_x), abs(y - last_y)
-    steps = across if across > up else up
-    least, best_x, best_y = np.inf, last_x, last_y
-    # First the cell itself, legal or not.
-    seen, middle, unseen, share = -1, 0, steps + 1, 1.0
-    while middle > seen:
-        back_x = last_x + (2 * middle * (x - last_x) + steps) // (2 * steps)
-        back_y = last_y + (2 * middle * (y - last_y) + steps) // (2 * steps)
-        cost = _cost(back_x, back_y, next_x, next_y, share, *layers)
-        if cost == np.inf:
-            unseen = middle
+@in_place
+def _move_corners(path: Any, count: int, *layers: Any) -> tuple[int, bool]:
+    """Leave out corners, or move them, as long as the path costs less; return how many, if any."""
+    height, width = layers[0].shape
+    is_better, corner = False, 1
+    while corner < count - 1:
+        x, y = path[corner - 1, 0], path[corner - 1, 1]
+        at_x, at_y = path[corner, 0], path[corner, 1]
+        next_x, next_y = path[corner + 1, 0], path[corner + 1, 1]
+        # Legal or not, as a path may begin on an obstacle.
+        before = _cost(x, y, at_x, at_y, 1.0, *layers)
+        before += _cost(at_x, at_y, next_x, next_y, 1.0, *layers)
+        if _cost(x, y, next_x, next_y, 0.0, *layers) <= SAME_COST * before:
+            count -= 1
+            for cell in range(corner, count):
+                path[cell, 0], path[cell, 1] = path[cell + 1, 0], path[cell + 1, 1]
+            is_better, corner = True, corner - 1 if corner > 1 else 1
+            continue
+        least = before
+        for candidate in range(16):  # by one cell, or by two, past an obstacle of one cell
+            action, step = candidate % 8, 1 + candidate // 8
+            to_x, to_y = at_x + step * MOVES[action, 0], at_y + step * MOVES[action, 1]
+            cost = _length(abs(to_x - x), abs(to_y - y), layers[-1])
+            cost += _length(abs(next_x - to_x), abs(next_y - to_y), layers[-1])
+            if 0 <= to_x < width and 0 <= to_y < height and cost < least:
+                cost = _cost(to_x, to_y, next_x, next_y, 0.0, *layers)
+                if cost < least:
+                    cost += _cost(x, y, to_x, to_y, 0.0, *layers)
+                if cost * SAME_COST < least:
+                    least, path[corner, 0], path[corner, 1] = cost, to_x, to_y
+        if least < before:
+            is_better, corner = True, corner - 1 if corner > 1 else 1
         else:
-            seen = middle
-            cost += _cost(x, y, back_x, back_y, share, *layers)
-            if cost * SAME_COST < least:
-                least, best_x, best_y = cost, back_x, back_y
-        middle, share = (seen + unseen) // 2, 0.0
-    return best_x, best_y
+            corner += 1
+    return count, is_better
