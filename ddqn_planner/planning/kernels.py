@@ -51,7 +51,7 @@ def cost_of(
     width: int,
 ) -> Any:
     """Return the cost of a move, infinite if it is not possible. See `MoveCosts`."""
-    cost = table[patch[cell], action]
+    cost = table[patch[np.uint64(cell)], np.uint64(action)]
     if multiplier.size > 0:
         after = cell + MOVE_Y[action] * width + MOVE_X[action]
         return cost * (np.float64(multiplier[cell]) + multiplier[after]) / 2
@@ -242,7 +242,7 @@ def _best(distance: Any, cell: int, enough: float, *costs: Any) -> tuple[float, 
     """Return the least cost of a path from a cell and its action, or the first that is enough."""
     least, best = np.inf, -1
     for action in range(8):
-        after = distance[cell + MOVE_Y[action] * costs[-1] + MOVE_X[action]]
+        after = distance[np.uint64(cell + MOVE_Y[action] * costs[-1] + MOVE_X[action])]
         if after > 0:
             cost = cost_of(cell, action, *costs)
             if after + cost < least:
@@ -274,15 +274,28 @@ def _take_back(
     *costs: Any,
 ) -> int:
     """Do the work of `take_back`; return how many cells it opened, the first ones of `waiting`."""
-    first, end, count = 0, changed.size, 0
-    while first < end:
-        cell = np.int64(waiting[first])
-        first += 1
+    first, end, count, judged, opened = 0, changed.size, 0, 0, 0
+    while first < end or judged < count + changed.size:
+        # First all lose what has no support; then they and the changed cells take what is left. In
+        # one loop, as `_best` takes long to compile.
+        loses = first < end
+        if loses:
+            cell = np.int64(waiting[first])
+            first += 1
+        else:
+            cell = np.int64(lost[judged] if judged < count else changed[judged - count])
+            judged += 1
         known = distance[cell]
-        if known <= AT_GOAL:
+        if loses and known <= AT_GOAL:
             continue
-        least, _ = _best(distance, cell, known, *costs)
-        if least <= known:
+        if known <= 0:
+            distance[cell], state[cell], known = 0.0, UNREACHED, np.inf
+        least, _ = _best(distance, cell, known if loses else 0.0, *costs)
+        if not loses and least < known:
+            distance[cell], state[cell] = least, OPEN
+            waiting[opened] = cell
+            opened += 1
+        if not loses or least <= known:
             continue
         if count == lost.size:
             for number in range(count):
@@ -295,19 +308,9 @@ def _take_back(
         for action in range(8):
             before = cell - MOVE_Y[action] * costs[-1] - MOVE_X[action]
             cost = cost_of(before, action, *costs)
-            if distance[before] >= known + cost:
+            if distance[np.uint64(before)] >= known + cost:
                 waiting[end] = before
                 end += 1
-    for number in range(count):
-        distance[lost[number]], state[lost[number]] = 0.0, UNREACHED
-    opened = 0
-    for number in range(count + changed.size):
-        cell = np.int64(lost[number] if number < count else changed[number - count])
-        least, _ = _best(distance, cell, 0.0, *costs)
-        if least < np.inf and (distance[cell] == 0 or least < distance[cell]):
-            distance[cell], state[cell] = least, OPEN
-            waiting[opened] = cell
-            opened += 1
     return opened
 
 

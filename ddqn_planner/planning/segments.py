@@ -47,31 +47,42 @@ def simplify(cells: Cells, grid: GridMap, move_rule: MoveRule | str) -> tuple[Ce
 
 def straightened(path: Cells, grid: GridMap, move_rule: MoveRule | str) -> Path:
     """Do the work of `simplify` for a path of one cell or more."""
-    # With 64 bits, whatever is computed with a cell has its type, and numba compiles once for it.
-    cells = np.array(path, np.int64)
-    count = _straighten(cells, cells.copy(), np.empty(len(cells)), *_layers(grid, move_rule))
-    return cells[:count].astype(np.int32)
+    layers, least, best = _layers(grid, move_rule), np.inf, np.array(path, np.int64)
+    until = np.cumsum(_segment_costs(best, layers, 1.0, 1.0))
+    # From the end, other obstacles come first: the path may pass them on the better side.
+    for backward in (False, True):
+        cells, costs = np.array(path, np.int64), np.empty(len(path))
+        count = _pull(cells, until, backward, layers)
+        _costs(cells, count, 1.0, 1.0, costs, layers)
+        count, is_better = _move_corners(cells, count, costs, layers)
+        cost = costs[:count].sum()
+        if cost * SAME_COST < least:
+            least, best = cost, cells[:count]
+        if not is_better:
+            break
+    return best.astype(np.int32)
 
 
 def cost_along(path: Cells, grid: GridMap, move_rule: MoveRule | str) -> float:
     """Return what a path of segments costs, legal or not: each cell counts by its share of it."""
-    return float(_segment_costs(path, grid, move_rule, 1.0, 1.0).sum())
+    return float(_segment_costs(path, _layers(grid, move_rule), 1.0, 1.0).sum())
 
 
 def legal_segments(
     path: Cells, grid: GridMap, move_rule: MoveRule | str, begin: float = 0.0
 ) -> NDArray[np.bool_]:
     """Return which segments are legal, see `simplify`, the first one from a share of it on."""
-    return _segment_costs(path, grid, move_rule, begin, 0.0) < np.inf
+    return _segment_costs(path, _layers(grid, move_rule), begin, 0.0)[1:] < np.inf
 
 
 def _segment_costs(
-    path: Cells, grid: GridMap, move_rule: MoveRule | str, begin: float, others: float
+    path: Cells, layers: tuple[Any, ...], begin: float, others: float
 ) -> NDArray[np.float64]:
-    """Return the cost of each segment, see `_cost`, the first and the others from a share on."""
+    """Return 0 and the cost of each segment, see `_cost`, the first and the others from a share."""
+    # With 64 bits, whatever is computed with a cell has its type, and numba compiles once for it.
     cells, costs = np.array(path, np.int64), np.empty(len(path))
-    _costs(cells, begin, others, costs, *_layers(grid, move_rule))
-    return costs[1:]
+    _costs(cells, len(cells), begin, others, costs, layers)
+    return costs
 
 
 def _layers(grid: GridMap, move_rule: MoveRule | str) -> tuple[Any, ...]:
@@ -94,7 +105,7 @@ def _length(width: int, height: int, is_unit: bool) -> float:
 
 
 @inlined
-def _cost(x: int, y: int, last_x: int, last_y: int, begin: float, *layers: Any) -> float:
+def _cost(x: int, y: int, last_x: int, last_y: int, begin: float, layers: Any) -> float:
     """Return the cost of a segment, infinity if it is not legal from a share of it on."""
     occupancy, forbidden, cost, slowness, cuts_corners, is_unit = layers
     dx, dy = last_x - x, last_y - y
@@ -130,46 +141,19 @@ def _cost(x: int, y: int, last_x: int, last_y: int, begin: float, *layers: Any) 
 
 
 @in_place
-def _costs(path: Any, begin: float, others: float, costs: Any, *layers: Any) -> None:
+def _costs(path: Any, count: int, begin: float, others: float, costs: Any, layers: Any) -> None:
     """Do the work of `_segment_costs`; cells may lie outside the map, where none is legal."""
     height, width = layers[0].shape
     costs[0] = 0.0
-    for index in range(1, path.shape[0]):
+    for index in range(1, count):
         x, y, to_x, to_y = path[index - 1, 0], path[index - 1, 1], path[index, 0], path[index, 1]
         costs[index] = np.inf
         if 0 <= x < width and 0 <= y < height and 0 <= to_x < width and 0 <= to_y < height:
-            costs[index] = _cost(x, y, to_x, to_y, others if index > 1 else begin, *layers)
+            costs[index] = _cost(x, y, to_x, to_y, others if index > 1 else begin, layers)
 
 
 @in_place
-def _straighten(path: Any, other: Any, until: Any, *layers: Any) -> int:
-    """Do the work of `straightened` in a path's own cells; return how many are left."""
-    _costs(path, 1.0, 1.0, until, *layers)
-    for cell in range(path.shape[0]):
-        until[cell] += until[cell - 1] if cell else 0.0
-    count, is_better = _move_corners(path, _pull(path, until, False, *layers), *layers)
-    if is_better:
-        # From the end, other obstacles come first: the path may pass them on the better side.
-        of_other, _ = _move_corners(other, _pull(other, until, True, *layers), *layers)
-        if _total(other, of_other, *layers) * SAME_COST < _total(path, count, *layers):
-            count = of_other
-            for cell in range(count):
-                path[cell, 0], path[cell, 1] = other[cell, 0], other[cell, 1]
-    return count
-
-
-@in_place
-def _total(path: Any, count: int, *layers: Any) -> float:
-    """Return what a path of so many cells costs, legal or not."""
-    total = 0.0
-    for cell in range(1, count):
-        x, y = path[cell - 1, 0], path[cell - 1, 1]
-        total += _cost(x, y, path[cell, 0], path[cell, 1], 1.0, *layers)
-    return total
-
-
-@in_place
-def _pull(path: Any, until: Any, backward: bool, *layers: Any) -> int:
+def _pull(path: Any, until: Any, backward: bool, layers: Any) -> int:
     """Keep the cells that are the last ones seen from the one before; return how many."""
     first, number, last = 0, 0, path.shape[0] - 1
     while first < last:
@@ -181,7 +165,7 @@ def _pull(path: Any, until: Any, backward: bool, *layers: Any) -> int:
             if following <= last:
                 begin, end = (last - following, last - first) if backward else (first, following)
                 x, y, to_x, to_y = path[begin, 0], path[begin, 1], path[end, 0], path[end, 1]
-                cost = _cost(x, y, to_x, to_y, 0.0, *layers)
+                cost = _cost(x, y, to_x, to_y, 0.0, layers)
                 joins = cost <= SAME_COST * (until[end] - until[begin])
             if joins:
                 reached = following
@@ -197,37 +181,41 @@ def _pull(path: Any, until: Any, backward: bool, *layers: Any) -> int:
 
 
 @in_place
-def _move_corners(path: Any, count: int, *layers: Any) -> tuple[int, bool]:
-    """Leave out corners, or move them, as long as the path costs less; return how many, if any."""
+def _move_corners(path: Any, count: int, costs: Any, layers: Any) -> tuple[int, bool]:
+    """Move each corner, or leave it out, as long as the path costs less; return count, if any."""
     height, width = layers[0].shape
     is_better, corner = False, 1
     while corner < count - 1:
         x, y = path[corner - 1, 0], path[corner - 1, 1]
         at_x, at_y = path[corner, 0], path[corner, 1]
         next_x, next_y = path[corner + 1, 0], path[corner + 1, 1]
-        # Legal or not, as a path may begin on an obstacle.
-        before = _cost(x, y, at_x, at_y, 1.0, *layers)
-        before += _cost(at_x, at_y, next_x, next_y, 1.0, *layers)
-        if _cost(x, y, next_x, next_y, 0.0, *layers) <= SAME_COST * before:
-            count -= 1
-            for cell in range(corner, count):
-                path[cell, 0], path[cell, 1] = path[cell + 1, 0], path[cell + 1, 1]
-            is_better, corner = True, corner - 1 if corner > 1 else 1
-            continue
-        least = before
-        for candidate in range(16):  # by one cell, or by two, past an obstacle of one cell
+        before = costs[corner] + costs[corner + 1]
+        # To the next one, which leaves it out; by a cell; by two, past an obstacle of one cell.
+        least, is_moved = before * SAME_COST, False
+        for candidate in range(-1, 16):
             action, step = candidate % 8, 1 + candidate // 8
             to_x, to_y = at_x + step * MOVES[action, 0], at_y + step * MOVES[action, 1]
-            cost = _length(abs(to_x - x), abs(to_y - y), layers[-1])
-            cost += _length(abs(next_x - to_x), abs(next_y - to_y), layers[-1])
-            if 0 <= to_x < width and 0 <= to_y < height and cost < least:
-                cost = _cost(to_x, to_y, next_x, next_y, 0.0, *layers)
-                if cost < least:
-                    cost += _cost(x, y, to_x, to_y, 0.0, *layers)
-                if cost * SAME_COST < least:
-                    least, path[corner, 0], path[corner, 1] = cost, to_x, to_y
-        if least < before:
-            is_better, corner = True, corner - 1 if corner > 1 else 1
-        else:
-            corner += 1
+            if candidate < 0:
+                to_x, to_y = next_x, next_y
+            first = _length(abs(to_x - x), abs(to_y - y), layers[-1])
+            second = _length(abs(next_x - to_x), abs(next_y - to_y), layers[-1])
+            if 0 <= to_x < width and 0 <= to_y < height and first + second < least:
+                second = _cost(to_x, to_y, next_x, next_y, 0.0, layers)
+                if first + second < least:
+                    first = _cost(x, y, to_x, to_y, 0.0, layers)
+                if first + second < least:
+                    least, is_moved = first + second, True
+                    path[corner, 0], path[corner, 1] = to_x, to_y
+                    costs[corner], costs[corner + 1] = first, second
+            if candidate < 0:
+                if is_moved:
+                    break
+                least = before / SAME_COST
+        if is_moved and path[corner, 0] == next_x and path[corner, 1] == next_y:
+            count -= 1
+            for cell in range(corner + 1, count):
+                path[cell, 0], path[cell, 1] = path[cell + 1, 0], path[cell + 1, 1]
+                costs[cell] = costs[cell + 1]
+        is_better |= is_moved
+        corner = corner + 1 if not is_moved else corner - 1 if corner > 1 else 1
     return count, is_better
