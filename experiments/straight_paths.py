@@ -49,8 +49,8 @@ def main(_: Sequence[str]) -> int:
     for kind in KINDS:
         planner, figures = Planner.load("any_map"), []
         for grid, start, goal in drawn_requests(kind, SMALL_SIDE):
-            all_paths = *both_paths(planner, grid, start, goal), theta_star(grid, start, goal)
-            lengths = [cost_along(each, grid, RULE) for each in all_paths]
+            paths = [*both_paths(planner, grid, start, goal), theta_star(grid, start, goal)]
+            lengths = [cost_along(each, grid, RULE) for each in paths]
             best = optimum(grid.occupancy, start, goal, 1), optimum(grid.occupancy, start, goal)
             figures.append((*[length / best[0] for length in lengths], best[0] / best[1]))
         rows.append([kind, *(f"{mean:.4f}" for mean in np.mean(figures, axis=0))])
@@ -60,7 +60,7 @@ def main(_: Sequence[str]) -> int:
     return 0
 
 
-def both_paths(planner: Planner, grid: GridMap, start: Cell, goal: Cell) -> list[NDArray[np.int32]]:
+def both_paths(planner: Planner, grid: GridMap, start: Cell, goal: Cell) -> list[NDArray[Any]]:
     """Return the path in moves, and the straight one."""
     return [planner.plan(grid, start, goal, RULE, simplified=way).path for way in (False, True)]
 

@@ -24,35 +24,30 @@ OCCUPIED_PATCH = 512  # of occupied cells, and those outside the map: no move le
 class MoveCosts(NamedTuple):
     """The cost of each move of each cell, on a map with a border of one cell."""
 
-    # It is table[patch[cell], action]. With terms, that is a length, times 1 + max(0, sum of them),
-    # at most MAX_MULTIPLIER; with multipliers, it is multiplied by the mean of its two cells'.
+    # It is table[8 patch[cell] + action]. With terms, that is a length, times 1 + max(0, sum of
+    # them), at most MAX_MULTIPLIER; with multipliers, it is multiplied by the mean of its cells'.
     patch: NDArray[Any]  # (C,) uint16 or int32: the number of each cell's patch
-    table: Array  # (P, 8) float32: at least 1; infinite where a move is not possible
+    table: Array  # (8 P,) float32: at least 1; infinite where a move is not possible
     value: NDArray[np.uint8]  # (C,), for the terms, or empty
-    terms: Array  # (9, L, 8) float32: what each value of each cell of a patch adds, or empty
+    terms: Array  # (9 * L * 8,) float32: what each value of each cell of a patch adds, or empty
     multiplier: Array  # (C,) float32: 1 or more, or empty
     width: int  # columns of the padded map
     highest: float  # no possible move costs more
     straight: float  # no straight move costs less
     diagonal: float  # no diagonal move costs less
-    into: NDArray[np.uint8]  # (P,): as bits, the actions by which moves may lead into a cell
     low: Array  # (L,): with terms, half of a move's multiplier is no less, for each cell; or empty
     least: float = 1.0  # no multiplier on the map is less
 
     @classmethod
-    def of_table(cls, table_PA: Array, legal_PA: NDArray[np.bool_] | None = None) -> MoveCosts:
+    def of_table(cls, table_PA: Array) -> MoveCosts:
         """Return the costs that a table gives, and one more patch without moves; for no map yet."""
-        into = np.full(len(table_PA) + 1, 255, np.uint8)
-        if legal_PA is not None:  # where a move is legal, so is the one back
-            into[:-1] = np.packbits(np.roll(legal_PA, 4, axis=1), axis=1, bitorder="little")[:, 0]
-        table_PA = np.pad(table_PA, ((0, 1), (0, 0)), constant_values=np.inf)
         highest = float(table_PA.max(where=np.isfinite(table_PA), initial=1))
         straight = float(table_PA[:, 0::2].min(initial=highest))
         diagonal = float(table_PA[:, 1::2].min(initial=2 * straight))
-        table_PA = np.ascontiguousarray(table_PA)  # numba compiles again for another layout
-        nowhere, none = np.empty(0, np.uint16), np.empty(0, np.float32)
-        empty = nowhere, table_PA, np.empty(0, np.uint8), none.reshape(0, 0, 0), none
-        return cls(*empty, 0, highest, straight, diagonal, into, none)
+        table = np.append(table_PA, np.full(table_PA.shape[1], np.inf, np.float32))
+        none = np.empty(0, np.float32)
+        empty = np.empty(0, np.uint16), table, np.empty(0, np.uint8), none, none
+        return cls(*empty, 0, highest, straight, diagonal, none)
 
     def after(self, grid: GridMap, boxes: Sequence[Box]) -> MoveCosts | None:
         """Return the costs on a map that differs from theirs in boxes; None to look at it all."""
@@ -79,7 +74,7 @@ class MoveCosts(NamedTuple):
                 least = min(least, self._least(values.astype(np.uint8)))
                 value = replaced(value.reshape(shape), inner, values)
         cells = patch.ravel(), self.table, value.ravel(), self.terms, multiplier.ravel()
-        return MoveCosts(*cells, self.width, highest, *self[-5:-1], least)
+        return MoveCosts(*cells, self.width, highest, *self[-4:-1], least)
 
     def _least(self, value: NDArray[np.uint8]) -> float:
         """Return a multiplier that none on free cells is less than, given cells' values."""
@@ -88,25 +83,26 @@ class MoveCosts(NamedTuple):
 
     def on(self, grid: GridMap, patch: NDArray[Any]) -> MoveCosts:
         """Return the costs on a map, given its patches, with its directions and expected times."""
-        costs = self._replace(patch=patch, width=grid.width + 2)
+        value, least, table, multiplier = self.value, self.least, self.table, self.multiplier
+        highest = self.highest
         if self.terms.size and grid.cost is not None:
             value = cell_values(grid.occupancy, grid.cost)
-            costs = costs._replace(value=value, least=self._least(value))
+            least = self._least(value)
         if grid.forbidden is not None:
-            patch, table = _with_directions(patch, self.table, np.pad(grid.forbidden, 1).ravel())
-            into = np.tile(self.into, len(table) // len(self.into))
-            costs = costs._replace(patch=patch, table=table, into=into)
-        if grid.slowness is None:
-            return costs
-        multiplier = np.pad(grid.cost_multiplier, 1, constant_values=1).ravel()
-        highest, least = costs.highest * float(multiplier.max()), float(grid.cost_multiplier.min())
-        return costs._replace(multiplier=multiplier, highest=highest, least=least)
+            patch, table = _with_directions(patch, table, np.pad(grid.forbidden, 1).ravel())
+        if grid.slowness is not None:
+            multiplier = np.pad(grid.cost_multiplier, 1, constant_values=1).ravel()
+            highest *= float(multiplier.max())
+            least = float(grid.cost_multiplier.min())
+        cells = patch, table, value, self.terms, multiplier
+        return MoveCosts(*cells, grid.width + 2, highest, *self[-4:-1], least)
 
 
 def _with_directions(
-    patch_C: NDArray[Any], table_PA: Array, forbidden_C: NDArray[np.uint8]
+    patch_C: NDArray[Any], table: Array, forbidden_C: NDArray[np.uint8]
 ) -> tuple[NDArray[Any], Array]:
     """Return patches and costs without forbidden moves: a copy of the table per set that occurs."""
+    table_PA = table.reshape(-1, 8)
     occurs = np.zeros(256, np.bool_)
     _occurring(forbidden_C, occurs)
     sets = np.flatnonzero(occurs)
@@ -116,7 +112,7 @@ def _with_directions(
     first_row = ((np.cumsum(occurs) - 1) * len(table_PA)).astype(np.uint16 if small else np.int32)
     rows_C = first_row.take(forbidden_C)
     rows_C += patch_C.astype(rows_C.dtype, copy=False)
-    return rows_C, tables_SPA.reshape(-1, table_PA.shape[1])
+    return rows_C, tables_SPA.ravel()
 
 
 @in_place

@@ -204,7 +204,7 @@ class PropagationQNetwork(QNetwork):
         legal_PA = legal_in_patches(patch_P9, move_rule)
         if not np.array_equal(np.isfinite(table_PA), legal_PA):
             return None
-        return MoveCosts.of_table(table_PA, legal_PA)
+        return MoveCosts.of_table(table_PA)
 
     def believed_costs(self, grid: GridMap, move_rule: MoveRule) -> MoveCosts:
         """Return the costs of a map's moves, right or not: Q is minus the cheapest path's cost."""
@@ -263,7 +263,7 @@ class AnyMapQNetwork(PropagationQNetwork):
             return None
         legal_PA = legal_in_patches(every_patch(), move_rule)
         lengths_PA = np.where(legal_PA, move_rule.lengths, np.inf).astype(np.float32)
-        costs = MoveCosts.of_table(lengths_PA, legal_PA)
+        costs = MoveCosts.of_table(lengths_PA)
         # The layer is linear, so that its output is a sum over the patch's cells.
         weight_AI, bias_A = self.tensors["prices.weight"], self.tensors["prices.bias"]
         occupied_9A, cost_9A, unknown_9A = weight_AI[:, :27].T.reshape(3, 9, -1)
@@ -276,7 +276,9 @@ class AnyMapQNetwork(PropagationQNetwork):
         # What is proved of the sums bounds them from below by two values; they need no more often.
         share = 1 - certificate.multiplier_error - 1e-5  # the sums are rounded
         low_L = MULTIPLIERS.take(np.arange(UNKNOWN, OCCUPIED + 1), mode="wrap") * np.float32(share)
-        return costs._replace(terms=terms_9LA, highest=highest, low=np.maximum(low_L, 1) / 2)
+        return costs._replace(
+            terms=terms_9LA.ravel(), highest=highest, low=np.maximum(low_L, 1) / 2
+        )
 
 
 def _with_biases(weights: Mapping[str, tuple[int, ...]]) -> dict[str, tuple[int, ...]]:

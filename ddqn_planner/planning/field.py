@@ -246,10 +246,10 @@ class DistanceField(QField):
         with self._lock:
             distance = self._whole().reshape(-1, self.costs.width)[1:-1, 1:-1]
             value = np.negative(distance, dtype=np.float32, casting="same_kind")
-            value[value == 0] = -np.inf
-        x, y = np.transpose(self.goals)
-        value[y, x] = -np.inf
-        value[y, x] = value.max()
+        np.copyto(value, -np.inf, where=value == 0)  # sooner than by an index; goals are 0 too
+        greatest = value.max()
+        for x, y in self.goals:
+            value[y, x] = greatest
         return value
 
     @cached_property

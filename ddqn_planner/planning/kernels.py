@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from ddqn_planner.compiled import in_place, inlined
 from ddqn_planner.grid import MOVES, Cell
-from ddqn_planner.model.move_costs import MAX_MULTIPLIER, MoveCosts
+from ddqn_planner.model.move_costs import MAX_MULTIPLIER, VALUES, MoveCosts
 
 Distances = NDArray[np.float64]
 States = NDArray[np.uint8]
@@ -35,7 +35,8 @@ MOVE_X, MOVE_Y = MOVES.T.copy()
 
 # The lowest bit of a byte that is set.
 FIRST = np.array([0] + [(bits & -bits).bit_length() - 1 for bits in range(1, 256)], np.uint64)
-ONE: Final = np.uint64(1)  # unsigned, as numba then looks for no index that counts from the end
+# Unsigned, as numba then looks for no index that counts from the end.
+ONE, ACTIONS, OF_CELL = np.uint64(1), np.uint64(8), np.uint64(8 * VALUES)
 
 
 # What it takes of `MoveCosts`, their first fields, kernels take last: `*costs`.
@@ -51,7 +52,8 @@ def cost_of(
     width: int,
 ) -> Any:
     """Return the cost of a move, infinite if it is not possible. See `MoveCosts`."""
-    cost = table[patch[np.uint64(cell)], np.uint64(action)]
+    place = np.uint64(action)
+    cost = table[ACTIONS * np.uint64(patch[np.uint64(cell)]) + place]
     if multiplier.size > 0:
         after = cell + MOVE_Y[action] * width + MOVE_X[action]
         return cost * (np.float64(multiplier[cell]) + multiplier[after]) / 2
@@ -59,13 +61,14 @@ def cost_of(
         return np.float64(cost)
     total = np.float32(0)
     middle = np.uint64(cell) - np.uint64(width)
-    for row in range(3):
+    for _ in range(3):
         total += (
-            terms[3 * row, value[middle - ONE], action]
-            + terms[3 * row + 1, value[middle], action]
-            + terms[3 * row + 2, value[middle + ONE], action]
+            terms[ACTIONS * value[middle - ONE] + place]
+            + terms[ACTIONS * value[middle] + place + OF_CELL]
+            + terms[ACTIONS * value[middle + ONE] + place + OF_CELL + OF_CELL]
         )
         middle += np.uint64(width)
+        place += OF_CELL + OF_CELL + OF_CELL
     factor = np.float32(1) + total if total > 0 else np.float32(1)
     return np.float64(cost * (factor if factor < MAX_MULTIPLIER else np.float32(MAX_MULTIPLIER)))
 
@@ -93,10 +96,11 @@ def grow(
     while True:
         order = np.empty(opened.size, np.int64)
         _orders(distance, opened, costs.width, *how, order)
-        first = np.argsort(order)
-        order, opened = order[first], opened[first]
+        if opened.size > 1:
+            first = np.argsort(order)
+            order, opened = order[first], opened[first]
         bucket, count = np.empty((ring, capacity), np.int32), np.zeros(ring, np.int64)
-        places = opened, order, bucket, count, costs.into, costs.low, offsets
+        places = opened, order, bucket, count, costs.low, offsets
         taken, visited, is_full = _grow(distance, state, *places, *how, limit, *costs[:6])
         limit, capacity = limit - visited, 4 * capacity
         found = np.empty(opened.size - taken + int(count.sum()), np.int32)
@@ -139,7 +143,6 @@ def _grow(
     order: NDArray[np.int64],
     bucket: NDArray[np.int32],
     count: NDArray[np.int64],
-    into: NDArray[np.uint8],
     low: NDArray[np.float32],
     offsets: NDArray[np.uint64],
     start: int,
@@ -179,13 +182,13 @@ def _grow(
             state[cell] = CLOSED
             visited += 1
             here = distance[cell]
-            # With values, these are lower bounds: few moves need more than that.
-            better, legal = np.uint64(0), np.uint64(into[patch[cell]])
-            while legal:
-                action = FIRST[legal]
-                legal &= legal - ONE
+            # With values, these are lower bounds: few moves need more than that. Illegal ones take
+            # no branch, which would often be predicted wrong.
+            better = np.uint64(0)
+            for number in range(8):
+                action = np.uint64(number)
                 previous = cell - offsets[action]
-                cost = table[patch[previous], action]
+                cost = table[ACTIONS * np.uint64(patch[previous]) + action]
                 if low.size > 0:
                     cost *= low[value[previous]] + low[value[cell]]
                 known = distance[previous] if distance[previous] > 0 else np.inf

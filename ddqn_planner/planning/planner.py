@@ -26,8 +26,8 @@ T = TypeVar("T")
 
 VISITS = 2**18  # about how many cells a field visits in one step of a plan: some 30 ms
 # Share of the map's cells that a request may visit before the connected cells are looked at. One
-# without a path would visit all that its goal is connected to.
-UNLABELLED_SHARE = 1 / 2
+# without a path would visit all that its goal is connected to. With more occupied, few are left.
+UNLABELLED_SHARE, OCCUPIED_SHARE = 1 / 2, 1 / 8
 
 
 class Planner:
@@ -282,12 +282,13 @@ def _in_parts(field: DistanceField, request: PlanRequest) -> Generator[None, Non
     """Return the rollout from the start; after each part that the field grows for it, yield."""
     grid, start = request.grid, request.start
     until_labels = int(UNLABELLED_SHARE * grid.occupancy.size)
+    few_occupied = OCCUPIED_SHARE * grid.occupancy.size
     while True:
         visits = min(VISITS, until_labels) or VISITS
         plan = field.rollout(start, request.simplified, visits)
         if plan.status is not PlanStatus.ROLLOUT_TRAPPED:
             return plan
-        if until_labels == visits:
+        if until_labels == visits and np.count_nonzero(grid.occupancy) < few_occupied:
             labels = grid.labels(request.move_rule)
             if all(labels[y, x] != labels[start[::-1]] for x, y in field.goals):
                 return Plan(PlanStatus.NO_PATH)
