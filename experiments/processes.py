@@ -11,6 +11,8 @@ from contextlib import AbstractContextManager, contextmanager, suppress
 from pathlib import Path
 from typing import NoReturn
 
+# A command after this hears SIGTERM when its parent ends, even if by SIGKILL, which tidies nothing.
+TIED = "setpriv", "--pdeathsig", "TERM"
 STOP_TIMEOUT = 120.0  # seconds that a process may take to end on a loaded machine
 
 
@@ -61,7 +63,7 @@ def running(*command: str) -> Iterator[subprocess.Popen[bytes]]:
         # A signal inside Popen would lose the child that it has just begun.
         with _signals_held_back():
             # In a session of its own, it does not hear Ctrl-C: the parent does, and tidies up.
-            child = subprocess.Popen(command, start_new_session=True)
+            child = subprocess.Popen([*TIED, *command], start_new_session=True)
         yield child
     finally:
         if child is not None:

@@ -114,16 +114,16 @@ def value_message(field: QField | None, grid: GridMap, header: Header) -> Occupa
 
 def path_message(centres: Float64, yaws: Float64, header: Header, last: Quaternion) -> Path:
     """Make a path message of what `along` returns; the last pose has an orientation of its own."""
-    path, blank = Path(header=header), PoseStamped(header=header)
-    # Poses in the same direction share a quaternion: most of an answer's time is making messages.
+    path, new, checked = Path(header=header), object.__new__, header._check_fields
+    # Poses in the same direction share a quaternion, and all are made without their constructors,
+    # which take fifteen times as long: most of an answer's time is making messages.
     towards = {yaw: quaternion(yaw) for yaw in {*yaws.tolist()}}
     orientations = [*map(towards.get, yaws.tolist()), last]
     for (x, y), orientation in zip(centres.tolist(), orientations, strict=False):
-        stamped = _copy(blank)
-        stamped.pose = pose = _copy(blank.pose)
-        pose.position = point = _copy(blank.pose.position)
-        point.x, point.y = x, y
-        pose.orientation = orientation
+        stamped, pose, point = new(PoseStamped), new(Pose), new(Point)
+        stamped._header, stamped._pose, stamped._check_fields = header, pose, checked
+        pose._position, pose._orientation, pose._check_fields = point, orientation, checked
+        point._x, point._y, point._z, point._check_fields = x, y, 0.0, checked
         path.poses.append(stamped)
     return path
 
@@ -169,14 +169,6 @@ def path_bytes(
         if last is not None:
             numbers[-1, 3:] = last.x, last.y, last.z, last.w
     return b"\0\1\0\0" + start + (first + poses.tobytes()[len(others) :] if count else b"")
-
-
-def _copy(message: Any) -> Any:
-    """Return a message with the same parts, in a third of the time of `copy.copy`."""
-    copied = object.__new__(type(message))
-    for slot in message.__slots__:
-        setattr(copied, slot, getattr(message, slot))
-    return copied
 
 
 def check_pose(name: str, stamped: PoseStamped, frame: str = "", other_remedy: str = "") -> None:

@@ -21,8 +21,8 @@ QUEUES: dict[str, Any] = {
 }
 """Those of an action's services: without them, goals are lost like requests."""
 
-RESULT_TIMEOUT = 5
-"""Seconds for which a result is kept: each status message names all goals whose results are."""
+RESULT_TIMEOUT = 2
+"""Seconds for which a result is kept: each request goes over all goals whose results are."""
 
 CANCELED = Outcome("CANCELED", "the goal was canceled")
 PREEMPTED = Outcome("PREEMPTED", "a newer goal of the same action came")

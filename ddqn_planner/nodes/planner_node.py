@@ -414,4 +414,5 @@ def main() -> int:
     with suppress(AttributeError):  # another C library
         for option in (-1, -3):  # M_TRIM_THRESHOLD, M_MMAP_THRESHOLD
             ctypes.CDLL(None).mallopt(option, 2**24)
+        ctypes.CDLL(None).mallopt(-8, 1)  # M_ARENA_MAX: most threads only wait
     return spin_until_shutdown(PlannerNode, PLANNER_PARAMETERS)

@@ -169,8 +169,8 @@ class Report(Refusals):
 
     def log_paths(self) -> None:
         """Log the paths that were found since the last call."""
-        for reason in self._to_be_logged:
-            self.node.get_logger().info(reason)
+        if self._to_be_logged:
+            self.node.get_logger().info("\n".join(self._to_be_logged))
         self._to_be_logged.clear()
 
     def publish(self, fatal: bool, missing: str, more: Mapping[str, str]) -> None:

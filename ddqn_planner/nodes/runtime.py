@@ -33,7 +33,6 @@ from rclpy.clock_type import ClockType
 from rclpy.duration import Duration
 from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.exceptions import InvalidHandle, NameValidationException, ParameterException
-from rclpy.executors import SingleThreadedExecutor
 from rclpy.logging import get_logger
 from rclpy.node import Node
 from rclpy.parameter import Parameter
@@ -45,6 +44,8 @@ from rclpy.subscription import Subscription
 from rclpy.task import Future
 from std_msgs.msg import Header
 from std_srvs.srv import Trigger
+
+from ddqn_planner.nodes.executor import NodeExecutor
 
 # Late subscribers receive the last message too: for maps, plans, saved models.
 LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
@@ -344,7 +345,7 @@ def spin_until_shutdown(make_node: Callable[[], Node], parameters: Parameters | 
     try:
         # With rclpy's handlers, nothing could be published any more when the node ends.
         rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
-        executor = SingleThreadedExecutor()
+        executor = NodeExecutor()
         # A task, not a flag: the executor wakes and returns.
         _at_signals(lambda: executor.create_task(stopping.set))
         node = make_node()
@@ -354,8 +355,7 @@ def spin_until_shutdown(make_node: Callable[[], Node], parameters: Parameters | 
         return 1
     try:
         executor.add_node(node)
-        while not stopping.is_set():
-            executor.spin_once()
+        executor.spin_until(stopping)
     finally:
         node.destroy_node()
         executor.shutdown()

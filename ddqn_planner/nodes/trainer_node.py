@@ -23,9 +23,10 @@ from ddqn_planner.nodes.conversions import (
     path_message,
 )
 from ddqn_planner.nodes.driving import NO_MAP, Driving, LearningNode, MapInFrame, explained
-from ddqn_planner.nodes.parameters import HYPER_PARAMETERS, OF_MAPS, TRAINER_PARAMETERS
+from ddqn_planner.nodes.parameters import OF_MAPS
 from ddqn_planner.nodes.poses import check_source
 from ddqn_planner.nodes.runtime import LATCHED, STEADY, Worker, spin_until_shutdown
+from ddqn_planner.nodes.trainer_parameters import HYPER_PARAMETERS, TRAINER_PARAMETERS
 from ddqn_planner.resources import find_map
 from ddqn_planner.training.hyper_parameters import HyperParameters
 

@@ -11,7 +11,7 @@ from ddqn_planner.model import QNetwork
 from ddqn_planner.model.move_costs import MoveCosts
 from ddqn_planner.planning.field import DistanceField, Goals, QField, network_field, shift_between
 
-CACHE_BYTES = 2**26  # for a planner's Q fields: 7 of 1000 x 1000 cells, at 9 bytes per cell
+CACHE_BYTES = 2**23  # for a planner's Q fields: 3 of 500 x 500 cells, at 9 bytes per cell
 ALWAYS_KEPT = 2  # fields, whatever their size: on a large map, too, a robot drives to and fro
 
 

@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 import pytest
 import yaml
-from processes import claim_ros_domain, executable
+from processes import TIED, claim_ros_domain, executable
 
 from ddqn_planner.model import find_model
 
@@ -45,7 +45,7 @@ class NodeProcess:
         path = filter(None, [str(folder), os.environ.get("PYTHONPATH")])
         with self.log_path.open("ab") as file:
             self.process = subprocess.Popen(
-                [executable(name), *arguments],
+                [*TIED, executable(name), *arguments],
                 env={**os.environ, "PYTHONPATH": os.pathsep.join(path)},
                 stdout=file,
                 stderr=subprocess.STDOUT,

@@ -85,12 +85,16 @@ def test_demo_finds_the_shortest_paths_and_draws_them(demo: Demo, tmp_path: Path
         assert counts.max() < 0.8 * counts.sum()
 
 
-@pytest.mark.parametrize(("signal_number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+@pytest.mark.parametrize(
+    ("signal_number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143), (signal.SIGKILL, -9)]
+)
 def test_no_process_outlives_the_demo(demo: Demo, signal_number: int, code: int) -> None:
     for node in ("map_server_node", "planner_node"):
         wait_for(node, partial(demo.runs, node), [demo.process])
     demo.process.send_signal(signal_number)
     assert demo.process.wait(TIMEOUT) == code, demo.output
+    if signal_number == signal.SIGKILL:  # else the demo has waited for them
+        wait_for("their end", lambda: not demo.commands(), [])
     assert demo.commands() == {}
 
 

@@ -151,6 +151,15 @@ def test_q_meets_bellmans_equation_whatever_the_costs(
         np.testing.assert_allclose(q[action], after - cost[patch_id, action], rtol=1e-5)
 
 
+def test_no_cell_is_lost_where_many_are_at_one_distance(monkeypatch: pytest.MonkeyPatch) -> None:
+    grid = GridMap(np.zeros((60, 60)), cost=np.zeros((60, 60)))
+    whole = fresh_field(grid, (30, 30), MoveRule.ROBOT_SAFE)
+    _ = whole.value
+    for capacity in range(9, 25):
+        monkeypatch.setattr(kernels, "CAPACITY", capacity)
+        assert_same(fresh_field(grid, (30, 30), MoveRule.ROBOT_SAFE), whole)
+
+
 def test_values_keep_their_sense_at_any_distance() -> None:
     # One corridor that winds through the whole map, over 100,000 moves long.
     occupancy = np.zeros((501, 401), dtype=bool)
