@@ -19,7 +19,15 @@ from random_maps import generate_map
 from strategies import GRIDS, RULES, cells_of
 
 from ddqn_planner import GridMap, MoveRule, PlanStatus
-from ddqn_planner.grid import MOVES, Cell, copies, grid_map, legal_moves, shortest_distances
+from ddqn_planner.grid import (
+    MOVES,
+    Cell,
+    copies,
+    grid_map,
+    legal_moves,
+    path_cost,
+    shortest_distances,
+)
 from ddqn_planner.grid.grid_map import LAYERS
 from ddqn_planner.grid.noise import random_requests
 from ddqn_planner.model.move_costs import MoveCosts
@@ -40,6 +48,17 @@ def assert_same(field: Any, fresh: Any) -> None:
     np.testing.assert_array_equal(field.known.distance, fresh.known.distance)  # bit for bit
 
 
+@given(st.integers(2, 40), st.integers(2, 40), st.data())
+def test_a_straight_rollout_keeps_to_the_line_through_free_space(
+    width: int, height: int, data: st.DataObject
+) -> None:
+    grid = GridMap(np.zeros((height, width), np.bool_))
+    start, goal = data.draw(cells_of(grid)), data.draw(cells_of(grid))
+    path = fresh_field(grid, goal, MoveRule.ROBOT_SAFE).rollout(start, straight=True).path
+    (x, y), (dx, dy) = (path - start).T, np.subtract(goal, start)
+    assert np.abs(x * dy - y * dx).max() <= np.hypot(dx, dy)
+
+
 @given(GRIDS, RULES, st.data())
 def test_the_path_is_the_same_whatever_was_asked_before(
     grid_and_goal: tuple[GridMap, Cell], rule: MoveRule, data: st.DataObject
@@ -49,13 +68,19 @@ def test_the_path_is_the_same_whatever_was_asked_before(
     _ = whole.value
     exact = shortest_distances(grid, goal, rule)
     for start in data.draw(st.lists(st.sampled_from(grid.free_cells()), min_size=1, max_size=5)):
-        limit = data.draw(st.integers(0, 30))
+        limit, straight = data.draw(st.integers(0, 30)), data.draw(st.booleans())
         with pytest.MonkeyPatch.context() as patch:
             patch.setattr(kernels, "CAPACITY", data.draw(st.sampled_from((9, kernels.CAPACITY))))
-            while (plan := grown.rollout(start, limit)).status is PlanStatus.ROLLOUT_TRAPPED:
+            while (
+                plan := grown.rollout(start, straight, limit)
+            ).status is PlanStatus.ROLLOUT_TRAPPED:
                 pass  # each call visits more cells
-        assert plan == whole.rollout(start) == fresh_field(grid, goal, rule).rollout(start)
+        for field in (whole, fresh_field(grid, goal, rule)):
+            assert plan == field.rollout(start, straight)
         assert (plan.status is PlanStatus.NO_PATH) == np.isinf(exact[start[::-1]])
+        if plan.cells:
+            cost = path_cost(plan.cells, grid.multipliers(plan.cells), rule)
+            assert cost == pytest.approx(exact[start[::-1]], rel=2e-2)
     assert_same(grown, whole)
 
 
@@ -64,9 +89,10 @@ def test_the_whole_field_is_that_of_the_network(
     grid_and_goal: tuple[GridMap, Cell], rule: MoveRule
 ) -> None:
     grid, goal = grid_and_goal
-    field, q = fresh_field(grid, goal, rule), network_field(ANY_MAP.network, grid, goal, rule).q
+    field, of_q = fresh_field(grid, goal, rule), network_field(ANY_MAP.network, grid, goal, rule)
     np.testing.assert_array_equal(field.legal, grid.legal_moves(rule))
-    np.testing.assert_allclose(field.q, np.where(field.legal, q, -np.inf), rtol=1e-5)
+    np.testing.assert_allclose(field.q, np.where(field.legal, of_q.q, -np.inf), rtol=1e-5)
+    np.testing.assert_allclose(field.value, of_q.value, rtol=1e-5)
 
 
 def test_a_request_visits_few_cells_of_a_large_map() -> None:
