@@ -34,8 +34,7 @@ def main(_: Sequence[str]) -> int:
         for kind in KINDS:
             planner, figures = Planner.load("any_map"), []
             for grid, start, goal in drawn_requests(kind, SIDE, inflation):
-                path = planner.plan(grid, start, goal, RULE).path
-                paths = path, straightened(path, grid, RULE)
+                paths = both_paths(planner, grid, start, goal)
                 theta = cost_along(theta_star(grid, start, goal), grid, RULE)
                 distance = clearance(grid.occupancy)
                 near = [distance[tuple(cells_along(each)[0].T[::-1])] for each in paths]
@@ -50,9 +49,8 @@ def main(_: Sequence[str]) -> int:
     for kind in KINDS:
         planner, figures = Planner.load("any_map"), []
         for grid, start, goal in drawn_requests(kind, SMALL_SIDE):
-            path = planner.plan(grid, start, goal, RULE).path
-            all_paths = path, straightened(path, grid, RULE), theta_star(grid, start, goal)
-            lengths = [cost_along(each, grid, RULE) for each in all_paths]
+            paths = [*both_paths(planner, grid, start, goal), theta_star(grid, start, goal)]
+            lengths = [cost_along(each, grid, RULE) for each in paths]
             best = optimum(grid.occupancy, start, goal, 1), optimum(grid.occupancy, start, goal)
             figures.append((*[length / best[0] for length in lengths], best[0] / best[1]))
         rows.append([kind, *(f"{mean:.4f}" for mean in np.mean(figures, axis=0))])
@@ -60,6 +58,11 @@ def main(_: Sequence[str]) -> int:
     print(f"\n{SMALL_SIDE}x{SMALL_SIDE}: lengths over the best through cell centres")
     print(table(header, rows))
     return 0
+
+
+def both_paths(planner: Planner, grid: GridMap, start: Cell, goal: Cell) -> list[NDArray[Any]]:
+    """Return the path in moves, and the straight one."""
+    return [planner.plan(grid, start, goal, RULE, simplified=way).path for way in (False, True)]
 
 
 def drawn_requests(
@@ -75,13 +78,14 @@ def drawn_requests(
 
 def measure_straight_paths(side: int, kinds: Sequence[str]) -> Iterator[bool]:
     """Time straight paths, after the plan, and compare their lengths with Theta*'s."""
+    planner = Planner.load("any_map")
     for kind in kinds:
         times, ratios = [], []
         for grid, start, goal in drawn_requests(kind, side, count=15):
-            path, of_path = Planner.load("any_map").plan(grid, start, goal, RULE).path, []
+            (path, simple), of_path = both_paths(planner, grid, start, goal), []
             for _ in range(ROUNDS):
                 began = time.process_time()
-                simple = straightened(path, grid, RULE)
+                straightened(path, grid, RULE)
                 of_path.append(1e3 * (time.process_time() - began))
             times.append(statistics.median(of_path))
             if side <= SIDE:
@@ -120,10 +124,10 @@ def _theta_star(
             number = to_y * width + to_x
             if not (0 <= to_x < width and 0 <= to_y < height) or closed[number]:
                 continue
-            through = cost[cell] + _cost(x, y, to_x, to_y, 0.0, *layers)
+            through = cost[cell] + _cost(x, y, to_x, to_y, 0.0, layers)
             if through == np.inf:
                 continue
-            direct = cost[parent[cell]] + _cost(from_x, from_y, to_x, to_y, 0.0, *layers)
+            direct = cost[parent[cell]] + _cost(from_x, from_y, to_x, to_y, 0.0, layers)
             least = min(through, direct)
             if least < cost[number] * (1 - 1e-12):
                 cost[number], parent[number] = least, parent[cell] if direct <= through else cell
@@ -167,7 +171,7 @@ def _optimum(points: NDArray[np.int64], layers: Any) -> float:
         for other in range(len(points)):
             to_x, to_y = points[other]
             if cost[number] + np.hypot(to_x - x, to_y - y) < cost[other] - 1e-9:
-                length = cost[number] + _cost(x, y, to_x, to_y, 0.0, *layers)
+                length = cost[number] + _cost(x, y, to_x, to_y, 0.0, layers)
                 if length < cost[other] - 1e-9:
                     cost[other] = length
                     order = length + np.hypot(points[1, 0] - to_x, points[1, 1] - to_y)

@@ -197,7 +197,8 @@ class GridMap:
         )
         occupied = self._occupied + int(patch.sum()) - int(self.occupancy[box].sum())
         patches = *self._patches[1 - MAX_PATCHES :], (self._version, box)
-        patched._set(_occupied=occupied, _patches=patches)
+        has_same_layers = (costs is None) == (self.cost is None)
+        patched._set(_occupied=occupied, _patches=patches if has_same_layers else ())
         return patched
 
     def with_boxes_of(self, other: GridMap, boxes: Sequence[Box]) -> GridMap:

@@ -142,7 +142,7 @@ class Refusals:
 class Report(Refusals):
     """Logs what the planner node does, and publishes the last outcome with what was refused."""
 
-    def __init__(self, node: BaseNode, on_change: Callable[[], None] = lambda: None) -> None:
+    def __init__(self, node: BaseNode, on_change: Callable[[], None]) -> None:
         super().__init__(node)
         self.outcome, self._on_change = NO_REQUEST, on_change
         self._publisher = node.create_publisher(DiagnosticArray, "/diagnostics", 10)

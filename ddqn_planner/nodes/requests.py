@@ -141,8 +141,10 @@ class ModelSource:
             compiling = warm_up(planner, self._node.value("follow_trainer"))
             often = gc.get_threshold()
             gc.set_threshold(20_000)  # to compile makes objects that stay, not garbage
-            next(compiling)
-            gc.set_threshold(*often)
+            try:
+                next(compiling)
+            finally:
+                gc.set_threshold(*often)
             gc.freeze()  # a collection of all that would stop the node for 45 ms
             Worker(self._node).call(next, compiling)  # the rest
             return planner, file

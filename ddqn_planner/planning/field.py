@@ -87,15 +87,16 @@ class QField:
         legal = self.legal & (actions_A11 == greedy_1HW)
         return QField(self.goal, self.q, legal, self.move_rule)
 
-    def rollout_if_known(self, start: Cell) -> Plan | None:
+    def rollout_if_known(self, start: Cell, straight: bool = False) -> Plan | None:
         """Return the rollout from a start if no more of the field is needed, else None."""
-        return self.rollout(start)
+        return self.rollout(start, straight)
 
-    def rollout(self, start: Cell) -> Plan:
+    def rollout(self, start: Cell, straight: bool = False) -> Plan:
         """Take greedy steps from a free cell until the goal, and return the path.
 
         The plan is ROLLOUT_TRAPPED as soon as a cell is entered again: the steps would repeat. A
-        start that is no cell of the map is a ValueError.
+        start that is no cell of the map is a ValueError. A straight rollout takes, of steps
+        as good as each other, those along the line to the goal: a `DistanceField` has many.
         """
         began, policy, steps = time.perf_counter(), self.policy, MOVES.tolist()
         cell = cell_inside(start, policy.shape, "the start")
@@ -168,16 +169,16 @@ class DistanceField(QField):
         closed = self.known.state[number] == kernels.CLOSED
         return self.is_whole or bool(self.known.closed_is_final and closed)
 
-    def rollout_if_known(self, start: Cell) -> Plan | None:
+    def rollout_if_known(self, start: Cell, straight: bool = False) -> Plan | None:
         """Return the rollout from a start if no more of the field is needed, else None."""
         if not self._lock.acquire(blocking=False):
             return None  # another thread computes it
         try:
-            return self.rollout(start) if self._is_final(self._number(start)) else None
+            return self.rollout(start, straight) if self._is_final(self._number(start)) else None
         finally:
             self._lock.release()
 
-    def rollout(self, start: Cell, limit: int | None = None) -> Plan:
+    def rollout(self, start: Cell, straight: bool = False, limit: int | None = None) -> Plan:
         """Return the path; ROLLOUT_TRAPPED if more cells than the limit must be visited for it."""
         start = cell_inside(start, self.grid.occupancy.shape, "the start")
         with self._lock:
@@ -185,7 +186,12 @@ class DistanceField(QField):
                 status = PlanStatus.NO_PATH if self.is_whole else PlanStatus.ROLLOUT_TRAPPED
                 return Plan(status, move_rule=self.move_rule)
             began = time.perf_counter()
-            path = kernels.roll_out(self.known.distance, self.costs, self._number(start))
+            path = kernels.roll_out(
+                self.known.distance,
+                self.costs,
+                self._number(start),
+                self.goal if straight else start,
+            )
         ms = 1e3 * (time.perf_counter() - began)
         return Plan(PlanStatus.SUCCEEDED, path, move_rule=self.move_rule, rollout_ms=ms)
 

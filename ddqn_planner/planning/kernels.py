@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ddqn_planner.compiled import in_place, inlined
-from ddqn_planner.grid import MOVES
+from ddqn_planner.grid import MOVES, Cell
 from ddqn_planner.model.move_costs import MAX_MULTIPLIER, VALUES, MoveCosts
 
 Distances = NDArray[np.float64]
@@ -320,31 +320,36 @@ def _take_back(
 # What distances say
 
 
-def roll_out(distance: Distances, costs: MoveCosts, start: int) -> Cells:
+def roll_out(distance: Distances, costs: MoveCosts, start: int, toward: Cell) -> Cells:
     """Return the (x, y) of greedy steps from a closed start to the goal, both too: (N, 2)."""
     path: Cells = np.empty((128, 2), np.int32)
-    cell, number = _roll_out(distance, start, path, 0, *costs[:6])
+    cell, number = _roll_out(distance, start, path, 0, *toward, *costs[:6])
     while cell > 0:
         path = np.concatenate([path, np.empty_like(path)])
-        cell, number = _roll_out(distance, cell, path, number, *costs[:6])
+        cell, number = _roll_out(distance, cell, path, number, *toward, *costs[:6])
     return path[:number]
 
 
 @in_place
 def _roll_out(
-    distance: Distances, cell: int, path: Cells, number: int, *costs: Any
+    distance: Distances, cell: int, path: Cells, number: int, to_x: int, to_y: int, *costs: Any
 ) -> tuple[int, int]:
     """Fill a path from a cell on; return the next cell, or 0 at the end, and its length so far."""
+    width = costs[-1]
     while cell > 0 and number < path.shape[0]:
-        path[number, 0] = cell % costs[-1] - 1
-        path[number, 1] = cell // costs[-1] - 1
+        path[number, 0], path[number, 1] = cell % width - 1, cell // width - 1
+        x, y = path[number, 0] - path[0, 0], path[number, 1] - path[0, 1]
         number += 1
-        enough = distance[cell] * SAME
-        least, action = _best(distance, cell, enough, *costs)
-        if distance[cell] == AT_GOAL or least > enough:
-            cell = 0
-        else:
-            cell += MOVE_Y[action] * costs[-1] + MOVE_X[action]
+        # Of steps as good as each other, the nearest to the straight line from the start.
+        enough, least, best = distance[cell] * SAME, np.inf, 0
+        for action in range(8):
+            after = distance[cell + MOVE_Y[action] * width + MOVE_X[action]]
+            if 0 < after < enough:
+                ahead_x, ahead_y = x + MOVE_X[action], y + MOVE_Y[action]
+                aside = abs(ahead_x * (to_y - path[0, 1]) - ahead_y * (to_x - path[0, 0]))
+                if aside < least and after + cost_of(cell, action, *costs) <= enough:
+                    least, best = aside, MOVE_Y[action] * width + MOVE_X[action]
+        cell = cell + best if best else 0
     return cell, number
 
 

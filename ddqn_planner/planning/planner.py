@@ -242,7 +242,7 @@ class Planner:
         plan: Plan | None = None
         if grid.is_free(start):
             field = self.fields.find(grid, goals, rule)
-            plan = field.rollout_if_known(start) if field else None
+            plan = field.rollout_if_known(start, request.simplified) if field else None
         if plan is None or (not plan.path.size and request.reach >= 1):
             yield
         if plan is None and goals and grid.is_free(start) and self.fields.has_costs(grid, rule):
@@ -285,7 +285,7 @@ def _in_parts(field: DistanceField, request: PlanRequest) -> Generator[None, Non
     few_occupied = OCCUPIED_SHARE * grid.occupancy.size
     while True:
         visits = min(VISITS, until_labels) or VISITS
-        plan = field.rollout(start, visits)
+        plan = field.rollout(start, request.simplified, visits)
         if plan.status is not PlanStatus.ROLLOUT_TRAPPED:
             return plan
         if until_labels == visits and np.count_nonzero(grid.occupancy) < few_occupied:
@@ -300,7 +300,7 @@ def _roll_out(request: PlanRequest, found: _Found) -> Generator[None, None, Call
     """Return the plan that is asked for, but for its times: a rollout, or perhaps a search."""
     grid, rule, way_out, field = request.grid, request.move_rule, found.way_out, found.field
     start = way_out[-1]
-    plan = found.plan or field.rollout(start)
+    plan = found.plan or field.rollout(start, request.simplified)
     if not plan.path.size and request.method is PlanMethod.ASTAR_FALLBACK:
         yield
         cells = search(start, field.goal, field.legal, grid.cost_multiplier, rule, field.value)

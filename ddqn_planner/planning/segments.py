@@ -20,7 +20,7 @@ BITS[MOVES[:, 1] + 1, MOVES[:, 0] + 1] = 1 << np.arange(8)
 
 
 def simplify(cells: Cells, grid: GridMap, move_rule: MoveRule | str) -> tuple[Cell, ...]:
-    """Return a path of few legal segments beside a given path, with the same ends.
+    """Return a path of few legal segments beside a given path, with the same ends: string pulling.
 
     A segment is legal if all cells that it passes through are free; under `MoveRule.ROBOT_SAFE`
     also those that it touches at a corner. None of them except the last may forbid one of the two
@@ -47,33 +47,42 @@ def simplify(cells: Cells, grid: GridMap, move_rule: MoveRule | str) -> tuple[Ce
 
 def straightened(path: Cells, grid: GridMap, move_rule: MoveRule | str) -> Path:
     """Do the work of `simplify` for a path of one cell or more."""
-    # With 64 bits, whatever is computed with a cell has its type, and numba compiles once for it.
-    cells = np.array(path, np.int64)
-    layers, until = _layers(grid, move_rule), np.empty(len(cells))
-    _costs(cells, 1.0, 1.0, until, layers)
-    count = _straighten(cells, until, layers)
-    return cells[:count].astype(np.int32)
+    layers, least, best = _layers(grid, move_rule), np.inf, np.array(path, np.int64)
+    until = np.cumsum(_segment_costs(best, layers, 1.0, 1.0))
+    # From the end, other obstacles come first: the path may pass them on the better side.
+    for backward in (False, True):
+        cells, costs = np.array(path, np.int64), np.empty(len(path))
+        count = _pull(cells, until, backward, layers)
+        _costs(cells, count, 1.0, 1.0, costs, layers)
+        count, is_better = _move_corners(cells, count, costs, layers)
+        cost = costs[:count].sum()
+        if cost * SAME_COST < least:
+            least, best = cost, cells[:count]
+        if not is_better:
+            break
+    return best.astype(np.int32)
 
 
 def cost_along(path: Cells, grid: GridMap, move_rule: MoveRule | str) -> float:
     """Return what a path of segments costs, legal or not: each cell counts by its share of it."""
-    return float(_segment_costs(path, grid, move_rule, 1.0, 1.0).sum())
+    return float(_segment_costs(path, _layers(grid, move_rule), 1.0, 1.0).sum())
 
 
 def legal_segments(
     path: Cells, grid: GridMap, move_rule: MoveRule | str, begin: float = 0.0
 ) -> NDArray[np.bool_]:
     """Return which segments are legal, see `simplify`, the first one from a share of it on."""
-    return _segment_costs(path, grid, move_rule, begin, 0.0) < np.inf
+    return _segment_costs(path, _layers(grid, move_rule), begin, 0.0)[1:] < np.inf
 
 
 def _segment_costs(
-    path: Cells, grid: GridMap, move_rule: MoveRule | str, begin: float, others: float
+    path: Cells, layers: tuple[Any, ...], begin: float, others: float
 ) -> NDArray[np.float64]:
-    """Return the cost of each segment, see `_cost`, the first and the others from a share on."""
+    """Return 0 and the cost of each segment, see `_cost`, the first and the others from a share."""
+    # With 64 bits, whatever is computed with a cell has its type, and numba compiles once for it.
     cells, costs = np.array(path, np.int64), np.empty(len(path))
-    _costs(cells, begin, others, costs, _layers(grid, move_rule))
-    return costs[1:]
+    _costs(cells, len(cells), begin, others, costs, layers)
+    return costs
 
 
 def _layers(grid: GridMap, move_rule: MoveRule | str) -> tuple[Any, ...]:
@@ -88,6 +97,14 @@ def _layers(grid: GridMap, move_rule: MoveRule | str) -> tuple[Any, ...]:
 
 
 @inlined
+def _length(width: int, height: int, is_unit: bool) -> float:
+    """Return the length of a segment over some columns and rows: what it costs at least."""
+    if is_unit:
+        return float(width if width > height else height)
+    return math.sqrt(width * width + height * height)
+
+
+@inlined
 def _cost(x: int, y: int, last_x: int, last_y: int, begin: float, layers: Any) -> float:
     """Return the cost of a segment, infinity if it is not legal from a share of it on."""
     occupancy, forbidden, cost, slowness, cuts_corners, is_unit = layers
@@ -97,8 +114,7 @@ def _cost(x: int, y: int, last_x: int, last_y: int, begin: float, layers: Any) -
     # It lies between a diagonal move and one along its longer axis.
     takes = BITS[step_y + 1, step_x + 1]
     takes |= BITS[step_y * (height >= width) + 1, step_x * (width >= height) + 1]
-    longer = width if width > height else height
-    length = float(longer) if is_unit else math.sqrt(width * width + height * height)
+    length = _length(width, height, is_unit)
     # Positions on the segment count from 0 at its first point to `whole` at its last one: then all
     # crossings of edges of cells are whole numbers.
     width, height = width + (width == 0), height + (height == 0)
@@ -125,11 +141,11 @@ def _cost(x: int, y: int, last_x: int, last_y: int, begin: float, layers: Any) -
 
 
 @in_place
-def _costs(path: Any, begin: float, others: float, costs: Any, layers: Any) -> None:
+def _costs(path: Any, count: int, begin: float, others: float, costs: Any, layers: Any) -> None:
     """Do the work of `_segment_costs`; cells may lie outside the map, where none is legal."""
     height, width = layers[0].shape
     costs[0] = 0.0
-    for index in range(1, path.shape[0]):
+    for index in range(1, count):
         x, y, to_x, to_y = path[index - 1, 0], path[index - 1, 1], path[index, 0], path[index, 1]
         costs[index] = np.inf
         if 0 <= x < width and 0 <= y < height and 0 <= to_x < width and 0 <= to_y < height:
@@ -137,52 +153,69 @@ def _costs(path: Any, begin: float, others: float, costs: Any, layers: Any) -> N
 
 
 @in_place
-def _straighten(path: Any, until: Any, layers: Any) -> int:
-    """Do the work of `straightened` in a path's own cells; return how many are left."""
+def _pull(path: Any, until: Any, backward: bool, layers: Any) -> int:
+    """Keep the cells that are the last ones seen from the one before; return how many."""
     first, number, last = 0, 0, path.shape[0] - 1
-    for cell in range(1, last + 1):
-        until[cell] += until[cell - 1]
     while first < last:
         # The length of each segment is found by doubling and halving.
-        x, y, reached, step, doubling = path[first, 0], path[first, 1], first + 1, 1, True
+        reached, step, doubling = first + 1, 1, True
         while step > 0 and reached < last:
             following, joins = reached + step, False
             following = last if doubling and following > last else following
             if following <= last:
-                cost = _cost(x, y, path[following, 0], path[following, 1], 0.0, layers)
-                joins = cost <= SAME_COST * (until[following] - until[first])
+                begin, end = (last - following, last - first) if backward else (first, following)
+                x, y, to_x, to_y = path[begin, 0], path[begin, 1], path[end, 0], path[end, 1]
+                cost = _cost(x, y, to_x, to_y, 0.0, layers)
+                joins = cost <= SAME_COST * (until[end] - until[begin])
             if joins:
                 reached = following
             doubling = doubling and joins
             step = 2 * step if doubling else step // 2
         first, number = reached, number + 1
-        path[number, 0], path[number, 1] = path[reached, 0], path[reached, 1]
-    # Each cell is now the last that is seen from the one before, mostly well behind a corner: it
-    # moves back as far as the next one is seen, and is left out if it meets the one before.
-    before = 0
-    for corner in range(1, number):
-        # To the cell toward the one before through which a path to the next one costs least.
-        x, y, last_x, last_y = path[before, 0], path[before, 1], path[corner, 0], path[corner, 1]
-        across, up = abs(x - last_x), abs(y - last_y)
-        steps = across if across > up else up
-        least, best_x, best_y = np.inf, last_x, last_y
-        # First the cell itself, legal or not.
-        seen, middle, unseen, share = -1, 0, steps + 1, 1.0
-        while middle > seen:
-            back_x = last_x + (2 * middle * (x - last_x) + steps) // (2 * steps)
-            back_y = last_y + (2 * middle * (y - last_y) + steps) // (2 * steps)
-            cost = _cost(back_x, back_y, path[corner + 1, 0], path[corner + 1, 1], share, layers)
-            if cost == np.inf:
-                unseen = middle
-            else:
-                seen = middle
-                cost += _cost(x, y, back_x, back_y, share, layers)
-                if cost * SAME_COST < least:
-                    least, best_x, best_y = cost, back_x, back_y
-            middle, share = (seen + unseen) // 2, 0.0
-        if x != best_x or y != best_y:
-            before += 1
-            path[before, 0], path[before, 1] = best_x, best_y
-    before += number > 0
-    path[before, 0], path[before, 1] = path[number, 0], path[number, 1]
-    return before + 1
+        kept, at = (last - number, last - reached) if backward else (number, reached)
+        path[kept, 0], path[kept, 1] = path[at, 0], path[at, 1]
+    for cell in range(number + 1 if backward else 0):
+        at = last - number + cell
+        path[cell, 0], path[cell, 1] = path[at, 0], path[at, 1]
+    return number + 1
+
+
+@in_place
+def _move_corners(path: Any, count: int, costs: Any, layers: Any) -> tuple[int, bool]:
+    """Move each corner, or leave it out, as long as the path costs less; return count, if any."""
+    height, width = layers[0].shape
+    is_better, corner = False, 1
+    while corner < count - 1:
+        x, y = path[corner - 1, 0], path[corner - 1, 1]
+        at_x, at_y = path[corner, 0], path[corner, 1]
+        next_x, next_y = path[corner + 1, 0], path[corner + 1, 1]
+        before = costs[corner] + costs[corner + 1]
+        # To the next one, which leaves it out; by a cell; by two, past an obstacle of one cell.
+        least, is_moved = before * SAME_COST, False
+        for candidate in range(-1, 16):
+            action, step = candidate % 8, 1 + candidate // 8
+            to_x, to_y = at_x + step * MOVES[action, 0], at_y + step * MOVES[action, 1]
+            if candidate < 0:
+                to_x, to_y = next_x, next_y
+            first = _length(abs(to_x - x), abs(to_y - y), layers[-1])
+            second = _length(abs(next_x - to_x), abs(next_y - to_y), layers[-1])
+            if 0 <= to_x < width and 0 <= to_y < height and first + second < least:
+                second = _cost(to_x, to_y, next_x, next_y, 0.0, layers)
+                if first + second < least:
+                    first = _cost(x, y, to_x, to_y, 0.0, layers)
+                if first + second < least:
+                    least, is_moved = first + second, True
+                    path[corner, 0], path[corner, 1] = to_x, to_y
+                    costs[corner], costs[corner + 1] = first, second
+            if candidate < 0:
+                if is_moved:
+                    break
+                least = before / SAME_COST
+        if is_moved and path[corner, 0] == next_x and path[corner, 1] == next_y:
+            count -= 1
+            for cell in range(corner + 1, count):
+                path[cell, 0], path[cell, 1] = path[cell + 1, 0], path[cell + 1, 1]
+                costs[cell] = costs[cell + 1]
+        is_better |= is_moved
+        corner = corner + 1 if not is_moved else corner - 1 if corner > 1 else 1
+    return count, is_better

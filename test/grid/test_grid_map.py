@@ -185,6 +185,7 @@ def test_a_patched_map_is_the_map_of_the_patched_arrays(
     for field in fields(grid):
         np.testing.assert_array_equal(getattr(patched, field.name), getattr(expected, field.name))
     assert patched.same_cells(expected)
+    assert patched.same_cells(grid) == expected.same_cells(grid)
     assert derived(grid) == before
 
 

@@ -63,7 +63,7 @@ class Source(MapSource):
 
     def __init__(self, node: BaseNode) -> None:
         self.heard: list[bool] = []
-        self.report = Report(node)
+        self.report = Report(node, lambda: None)
         self.worker = Worker(node)
         super().__init__(node, self.report, self.worker, self.heard.append)
 

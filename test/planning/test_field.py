@@ -19,7 +19,15 @@ from random_maps import generate_map
 from strategies import GRIDS, RULES, cells_of
 
 from ddqn_planner import GridMap, MoveRule, PlanStatus
-from ddqn_planner.grid import MOVES, Cell, copies, grid_map, legal_moves, shortest_distances
+from ddqn_planner.grid import (
+    MOVES,
+    Cell,
+    copies,
+    grid_map,
+    legal_moves,
+    path_cost,
+    shortest_distances,
+)
 from ddqn_planner.grid.grid_map import LAYERS
 from ddqn_planner.grid.noise import random_requests
 from ddqn_planner.model.move_costs import MoveCosts
@@ -40,6 +48,17 @@ def assert_same(field: Any, fresh: Any) -> None:
     np.testing.assert_array_equal(field.known.distance, fresh.known.distance)  # bit for bit
 
 
+@given(st.integers(2, 40), st.integers(2, 40), st.data())
+def test_a_straight_rollout_keeps_to_the_line_through_free_space(
+    width: int, height: int, data: st.DataObject
+) -> None:
+    grid = GridMap(np.zeros((height, width), np.bool_))
+    start, goal = data.draw(cells_of(grid)), data.draw(cells_of(grid))
+    path = fresh_field(grid, goal, MoveRule.ROBOT_SAFE).rollout(start, straight=True).path
+    (x, y), (dx, dy) = (path - start).T, np.subtract(goal, start)
+    assert np.abs(x * dy - y * dx).max() <= np.hypot(dx, dy)
+
+
 @given(GRIDS, RULES, st.data())
 def test_the_path_is_the_same_whatever_was_asked_before(
     grid_and_goal: tuple[GridMap, Cell], rule: MoveRule, data: st.DataObject
@@ -49,13 +68,19 @@ def test_the_path_is_the_same_whatever_was_asked_before(
     _ = whole.value
     exact = shortest_distances(grid, goal, rule)
     for start in data.draw(st.lists(st.sampled_from(grid.free_cells()), min_size=1, max_size=5)):
-        limit = data.draw(st.integers(0, 30))
+        limit, straight = data.draw(st.integers(0, 30)), data.draw(st.booleans())
         with pytest.MonkeyPatch.context() as patch:
             patch.setattr(kernels, "CAPACITY", data.draw(st.sampled_from((9, kernels.CAPACITY))))
-            while (plan := grown.rollout(start, limit)).status is PlanStatus.ROLLOUT_TRAPPED:
+            while (
+                plan := grown.rollout(start, straight, limit)
+            ).status is PlanStatus.ROLLOUT_TRAPPED:
                 pass  # each call visits more cells
-        assert plan == whole.rollout(start) == fresh_field(grid, goal, rule).rollout(start)
+        for field in (whole, fresh_field(grid, goal, rule)):
+            assert plan == field.rollout(start, straight)
         assert (plan.status is PlanStatus.NO_PATH) == np.isinf(exact[start[::-1]])
+        if plan.cells:
+            cost = path_cost(plan.cells, grid.multipliers(plan.cells), rule)
+            assert cost == pytest.approx(exact[start[::-1]], rel=1e-5)
     assert_same(grown, whole)
 
 
@@ -124,6 +149,15 @@ def test_q_meets_bellmans_equation_whatever_the_costs(
     for action, (dx, dy) in enumerate(MOVES.tolist()):
         after = beyond[1 + dy : 1 + dy + height, 1 + dx : 1 + dx + width]
         np.testing.assert_allclose(q[action], after - cost[patch_id, action], rtol=1e-5)
+
+
+def test_no_cell_is_lost_where_many_are_at_one_distance(monkeypatch: pytest.MonkeyPatch) -> None:
+    grid = GridMap(np.zeros((60, 60)), cost=np.zeros((60, 60)))
+    whole = fresh_field(grid, (30, 30), MoveRule.ROBOT_SAFE)
+    _ = whole.value
+    for capacity in range(9, 25):
+        monkeypatch.setattr(kernels, "CAPACITY", capacity)
+        assert_same(fresh_field(grid, (30, 30), MoveRule.ROBOT_SAFE), whole)
 
 
 def test_values_keep_their_sense_at_any_distance() -> None:

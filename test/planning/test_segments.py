@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+from collections.abc import Sequence
 from fractions import Fraction
 from itertools import pairwise
 
@@ -11,7 +12,7 @@ from hypothesis import strategies as st
 from strategies import GRIDS, RULES, cells_of
 
 from ddqn_planner import GridMap, MoveRule, simplify
-from ddqn_planner.grid import Cell, path_cost, path_length, shortest_path
+from ddqn_planner.grid import MOVES, Cell, path_cost, path_length, shortest_path
 from ddqn_planner.planning.segments import cost_along, legal_segments
 
 
@@ -48,6 +49,17 @@ def check_simplified(path: list[Cell], grid: GridMap, rule: MoveRule) -> tuple[C
     return simple
 
 
+def check_corners(path: Sequence[Cell], grid: GridMap, rule: MoveRule) -> None:
+    """Check that no corner can be left out, or moved by a cell at less cost."""
+    for before, (x, y), after in zip(path, path[1:], path[2:], strict=False):
+        cost = sum(exact_cost(*pair, grid, rule) for pair in ((before, (x, y)), ((x, y), after)))
+        others = [(before, (x + dx, y + dy), after) for dx, dy in MOVES.tolist()]
+        for cells in [(before, after), *(cells for cells in others if grid.contains(cells[1]))]:
+            if all(is_legal(*segment, grid, rule) for segment in pairwise(cells)):
+                new_cost = sum(exact_cost(*segment, grid, rule) for segment in pairwise(cells))
+                assert new_cost > cost * (1 + 1e-10 if len(cells) == 2 else 1 - 1e-8)
+
+
 @settings(max_examples=300)
 @given(GRIDS, RULES, st.data())
 def test_a_simplified_path_is_legal_and_costs_no_more(
@@ -56,6 +68,7 @@ def test_a_simplified_path_is_legal_and_costs_no_more(
     grid, goal = grid_and_goal
     path = shortest_path(grid, data.draw(st.sampled_from(grid.free_cells())), goal, rule)
     simple = check_simplified([*check_simplified(path, grid, rule)], grid, rule)
+    check_corners(simple, grid, rule)
     if not grid.has_costs:
         assert path_length(simple, rule) <= path_length(path, rule) + 1e-9
 
@@ -69,6 +82,17 @@ def test_a_path_turns_at_the_corner_and_not_behind_it() -> None:
     least = path_length([(0, 25), (20, 20), (25, 0)])
     for cells in (wide, wide[::-1]):
         assert path_length(simplify(cells, grid, rule)) < 1.03 * least
+
+
+def test_the_better_one_is_taken_of_the_path_pulled_from_its_start_and_from_its_end() -> None:
+    rule, lengths = MoveRule.ROBOT_SAFE, {}
+    for seed in (2, 5, 10):
+        grid = GridMap(np.random.default_rng(seed).random((30, 30)) < 0.15)
+        for y in (5, 25):
+            simple = simplify(shortest_path(grid, (0, y), (29, 29 - y), rule), grid, rule)
+            check_corners(simple, grid, rule)
+            lengths[seed, y] = path_length(simple)
+    assert lengths[5, 5] < 36.7  # from the start alone, 37.1
 
 
 def test_segments_are_as_long_as_can_be() -> None:
