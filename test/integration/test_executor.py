@@ -1,0 +1,48 @@
+"""In what order the nodes' executor calls what is ready."""
+
+from __future__ import annotations
+
+import threading
+
+import pytest
+import rclpy
+from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
+from rclpy.task import Future
+
+from ddqn_planner.nodes import executor as of_nodes
+
+
+def test_a_callback_goes_on_as_soon_as_it_can_then_the_next_of_its_group_but_none_destroyed(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(of_nodes, "EVENTS_PERIOD", 1000.0)  # else it looks again after that
+    called, awaited, stopping = [], Future(), threading.Event()
+
+    async def begin() -> None:
+        called.append("begin")
+        node.destroy_guard_condition(destroyed)
+        another.trigger()
+        await awaited
+        called.append("go on")
+
+    def end() -> None:
+        called.append("end")
+        executor.create_task(stopping.set)
+
+    rclpy.init()
+    node, group = rclpy.create_node("calls"), MutuallyExclusiveCallbackGroup()
+    executor = of_nodes.NodeExecutor()
+    executor.add_node(node)
+    for callback in (begin, end):
+        node.create_guard_condition(callback, group).trigger()
+    destroyed = node.create_guard_condition(lambda: called.append("destroyed"))
+    destroyed.trigger()
+    another = node.create_guard_condition(lambda: awaited.set_result(None))
+    late = threading.Timer(60.0, executor.create_task, [stopping.set])
+    late.start()
+    executor.spin_until(stopping)
+    late.cancel()
+    node.destroy_node()
+    executor.shutdown()
+    rclpy.shutdown()
+    assert called == ["begin", "go on", "end"]
