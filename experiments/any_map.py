@@ -15,6 +15,7 @@ from ddqn_planner.grid import OCCUPIED, UNKNOWN, legal_moves, move_costs
 from ddqn_planner.grid.noise import random_costs
 from ddqn_planner.model import AnyMapQNetwork
 from ddqn_planner.training.any_map import ANY_MAP, RULES, random_scenarios
+from ddqn_planner.training.environment import GridVectorEnvironment
 from ddqn_planner.training.evaluation import evaluate
 
 PAPERS_REWARD: Final = {"reward": "paper", "goal_reward": 10.0}
@@ -77,9 +78,9 @@ def _zero_shot(settings: Settings) -> list[list[str]]:
     ]
     for noise in settings.noise:
         training, test = goal_3.drawn_maps(settings, noise)
-        both = rollouts(planner, [*training, *test])
-        solved, unmasked = (sum(bool(plan.cells) for plan in plans) for plans in both)
-        counts = f"{solved} ({unmasked}) of {len(both[0])}"
+        maps = GridVectorEnvironment([*training, *test], MOVE_RULE, ANY_MAP)
+        solved, unmasked = np.isfinite(rollouts(planner, maps)).sum(axis=1)
+        counts = f"{solved} ({unmasked}) of {len(maps.start)}"
         rows.append([f"goal iii, {noise.value} (without action masking)", counts])
     return rows
 

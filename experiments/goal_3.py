@@ -26,9 +26,8 @@ from ddqn_planner.grid import (
     shortest_path,
 )
 from ddqn_planner.model.shared_background import evaluate, look
-from ddqn_planner.planning import Planner
 from ddqn_planner.planning.paths import search
-from ddqn_planner.training.environment import Scenario
+from ddqn_planner.training.environment import GridVectorEnvironment, Scenario
 from ddqn_planner.training.hyper_parameters import HyperParameters
 from ddqn_planner.training.shared_background import adam, differentiate, networks_of
 from ddqn_planner.training.trainer import Trainer
@@ -117,9 +116,7 @@ def best_moves(scenario: Scenario) -> NDArray[np.bool_]:
     distance = shortest_distances(scenario.grid, scenario.goal, MOVE_RULE).ravel()
     onward_AC = np.append(distance, np.inf)[neighbours(occupancy.shape)] + LENGTHS[:, None]
     legal_AC = legal_moves(occupancy, MOVE_RULE).reshape(len(LENGTHS), -1)
-    best: NDArray[np.bool_]
-    best = (legal_AC & np.isfinite(onward_AC) & (onward_AC <= distance + 1e-9)).T
-    return best
+    return np.array((legal_AC & np.isfinite(onward_AC) & (onward_AC <= distance + 1e-9)).T)
 
 
 def fixed_path(maps: Sequence[Scenario]) -> tuple[Cell, ...]:
@@ -134,18 +131,19 @@ def report(settings: Settings) -> str:
     rows = []
     for noise in settings.noise:
         training, test = drawn_maps(settings, noise)
-        maps, lengths = [*training, *test], {}
+        maps, lengths = GridVectorEnvironment([*training, *test], MOVE_RULE, PAPER), {}
         for label, (folder, parameters) in networks(settings).items():
             name = f"{noise.value}/{folder}"
-            lengths[label] = _lengths(settings.planners(name, KEPT), maps)
+            lengths[label] = np.array([rollouts(p, maps)[0] for p in settings.planners(name, KEPT)])
             # Obstacles on the path alone can be avoided by one fixed path.
             if parameters.network == "paper" and noise is Noise.NEAR_PATH:
                 taught = {f"{name}/supervised": replace(parameters, steps=SUPERVISED_UPDATES)}
                 jobs = settings.trainings(taught, training)
                 in_parallel(train_supervised, jobs, settings.backend)
-                lengths[f"{label}, supervised"] = _lengths(settings.planners(*taught), maps)
+                planners = settings.planners(*taught)
+                lengths[f"{label}, supervised"] = np.array([rollouts(p, maps)[0] for p in planners])
         path = fixed_path(training)
-        is_free = [all(map(scenario.grid.is_free, path)) for scenario in maps]
+        is_free = [all(map(scenario.grid.is_free, path)) for scenario in maps.scenarios]
         lengths["one fixed path"] = np.where([is_free], path_length(path, MOVE_RULE), np.nan)
         distances = (shortest_distances(s.grid, s.goal, MOVE_RULE) for s in test)
         optimum = np.array([d[SCENARIO.start[::-1]] for d in distances])
@@ -156,12 +154,6 @@ def report(settings: Settings) -> str:
             rows.append([noise.value, label, *counts, mean_and_worst(ratios)[0]])
     drawn = table(COLUMNS, rows), _draw(settings)
     return "\n\n".join(drawn)
-
-
-def _lengths(planners: Sequence[Planner], maps: Sequence[Scenario]) -> NDArray[np.float64]:
-    """Return the length of each planner's path on each map, (P, M), NaN without one."""
-    plans = [rollouts(planner, maps)[0] for planner in planners]
-    return np.array([[p.length if p.cells else np.nan for p in of_planner] for of_planner in plans])
 
 
 def _draw(settings: Settings) -> str:

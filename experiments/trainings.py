@@ -15,8 +15,10 @@ from tqdm import tqdm
 
 from ddqn_planner.cli import HelpFormatter
 from ddqn_planner.files import write_csv
-from ddqn_planner.grid import MoveRule, Noise, neighbours
-from ddqn_planner.planning import Plan, Planner
+from ddqn_planner.grid import LENGTHS, MoveRule, Noise, neighbours
+from ddqn_planner.model import PaperQNetwork
+from ddqn_planner.model.shared_background import evaluate
+from ddqn_planner.planning import Planner
 from ddqn_planner.training.environment import GridVectorEnvironment, Scenario, paper_scenario
 from ddqn_planner.training.hyper_parameters import HyperParameters
 from ddqn_planner.training.networks import value_iteration
@@ -166,8 +168,7 @@ def train(training: Training) -> None:
 def evaluate_training(trainer: Trainer, optimum: NDArray[np.float32]) -> dict[str, float]:
     """Return figures of the current network's rollouts from the start of each scenario."""
     planner = trainer.planner()
-    plans, unmasked = rollouts(planner, trainer.scenarios)
-    lengths = [plan.length for plan in plans if plan.cells]
+    lengths, unmasked = rollouts(planner, trainer.environment)
     # The mean of max_a Q(s, a) - V*(s) over the free cells, where Q is the return.
     overestimation = np.nan
     if trainer.parameters.network == "paper":
@@ -180,36 +181,41 @@ def evaluate_training(trainer: Trainer, optimum: NDArray[np.float32]) -> dict[st
         "step": trainer.steps,
         "updates": trainer.updates,
         "episodes": trainer.episodes,
-        "solved": len(lengths),
-        "solved_unmasked": sum(bool(plan.cells) for plan in unmasked),
-        "length": float(np.mean(lengths)) if lengths else np.nan,
+        "solved": int(np.isfinite(lengths).sum()),
+        "solved_unmasked": int(np.isfinite(unmasked).sum()),
+        "length": float(np.nanmean(lengths)) if np.isfinite(lengths).any() else np.nan,
         "overestimation": overestimation,
     }
 
 
-def rollouts(planner: Planner, scenarios: Sequence[Scenario]) -> tuple[list[Plan], list[Plan]]:
-    """Return the rollout from the start of each scenario, with and without action masking."""
-    fields = [(planner.q_field(s.grid, s.goal), s.start) for s in scenarios]
-    return (
-        [field.rollout(start) for field, start in fields],
-        [field.unmasked().rollout(start) for field, start in fields],
-    )
+def rollouts(planner: Planner, environment: GridVectorEnvironment) -> NDArray[np.float64]:
+    """Return each start's length, NaN if trapped, with and without action masking: (2, S)."""
+    if not isinstance(planner.network, PaperQNetwork):
+        fields = [(planner.q_field(s.grid, s.goal), s.start) for s in environment.scenarios]
+        plans = [[f.rollout(start) for f, start in fields]]
+        plans += [[f.unmasked().rollout(start) for f, start in fields]]
+        return np.array([[p.length if p.cells else np.nan for p in each] for each in plans])
+    # All maps at once, and the paths' cells alone: whole fields take 10 to 20 times as long.
+    maps, background = np.arange(len(environment.start)), environment.background
+    network, lengths = planner.network.on_maps(background, len(maps)), np.zeros((2, len(maps)))
+    for length, is_masked in zip(lengths, (True, False), strict=True):
+        cell, visited = environment.start.copy(), np.zeros(background.shape, np.bool_)
+        while (on_way := np.isfinite(length) & (cell != environment.goal)).any():
+            visited[maps, cell] = True
+            evaluate(network, maps, cell)
+            q, legal = network.q.astype(np.float32), environment.legal[maps, :, cell]
+            action = np.where(legal | (not is_masked), q, -np.inf).argmax(axis=1)
+            cell = np.where(on_way & legal[maps, action], cell + environment.offset[action], cell)
+            length += np.where(on_way, np.where(visited[maps, cell], np.nan, LENGTHS[action]), 0)
+    return lengths
 
 
 def optimal_value(environment: GridVectorEnvironment) -> NDArray[np.float32]:
     """Return V* of the first scenario, exact by value iteration: (C,) float32."""
-    legal, parameters = environment.legal[:1], environment.parameters
-    (return_AC,) = value_iteration(
-        legal.astype(np.float32),
-        environment.free_reward[:1],
-        environment.goal[:1],
-        neighbours(environment.shape),
-        parameters.gamma,
-        parameters.obstacle_reward,
-    )
-    value_C: NDArray[np.float32]
-    value_C = np.where(legal[0], return_AC, np.float32(parameters.obstacle_reward)).max(axis=0)
-    return value_C
+    e, p = environment, environment.parameters
+    given = e.legal[:1].astype(np.float32), e.free_reward[:1], e.goal[:1], neighbours(e.shape)
+    (return_AC,) = value_iteration(*given, p.gamma, p.obstacle_reward)
+    return np.array(np.where(e.legal[0], return_AC, np.float32(p.obstacle_reward)).max(axis=0))
 
 
 def read_csv(path: Path) -> NDArray[Any]:

@@ -21,7 +21,7 @@ from ddqn_planner.model.move_costs import (
     patch_numbers,
     unique_patches,
 )
-from ddqn_planner.model.shared_background import evaluate, look, network_of, windows_of
+from ddqn_planner.model.shared_background import Network, evaluate, look, network_of, windows_of
 
 Array: TypeAlias = NDArray[np.float32]
 
@@ -117,19 +117,25 @@ class PaperQNetwork(QNetwork):
 
     def q_values(self, grid: GridMap, goal: Cell, move_rule: MoveRule) -> Array:
         """Evaluate a robot in each cell: Q(s, a) toward one goal, (8, H, W), whatever the rule."""
-        # In double precision: differences of large sums stay exact enough, and do not overflow.
-        background = observation_background(grid.occupancy, goal).astype(np.float64)
-        windows = windows_of(background[None], grid.occupancy.shape, ROBOT)
-        tensors = [self.tensors[name] for name in self.shapes(self.sizes)]
         cells = np.arange(grid.occupancy.size)
-        network = network_of(tensors, windows, min(len(cells), BATCH))
-        look(network)
+        background = observation_background(grid.occupancy, goal)
+        network = self.on_maps(background[None], min(len(cells), BATCH))
         q_AC: Array = np.empty((len(MOVES), len(cells)), dtype=np.float32)
         for some in np.split(cells, range(BATCH, len(cells), BATCH)):
             evaluate(network, np.zeros_like(some), some)
             with np.errstate(over="ignore"):
                 q_AC[:, some] = network.q[: len(some)].T
         return q_AC.reshape(-1, *grid.occupancy.shape)
+
+    def on_maps(self, background: Array, batch: int) -> Network:
+        """Return what evaluates so many robots on maps with these backgrounds (S, C)."""
+        # In double precision: differences of large sums stay exact enough, and do not overflow.
+        shape = self.sizes["height"], self.sizes["width"]
+        windows = windows_of(background.astype(np.float64), shape, ROBOT)
+        tensors = [self.tensors[name] for name in self.shapes(self.sizes)]
+        network = network_of(tensors, windows, batch)
+        look(network)
+        return network
 
 
 class PropagationQNetwork(QNetwork):

@@ -217,7 +217,8 @@ class TrainerNode(LearningNode):
         super().destroy_node()
         self._worker.close()  # torch, half imported, may fail when the process ends
         if self._run is not None and self.state == "training":
-            self._run.try_to_save()
+            with suppress(ValueError):  # it diverged: older files stay
+                self._run.try_to_save()
             self._run.close()
             self.note_saving("the training is", self._run.save_error)
 

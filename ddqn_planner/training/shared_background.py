@@ -25,7 +25,8 @@ from ddqn_planner.training.double_dqn import ReplayBuffer
 from ddqn_planner.training.environment import GridVectorEnvironment
 from ddqn_planner.training.hyper_parameters import HyperParameters
 
-BETA_1, BETA_2, EPSILON = 0.9, 0.999, 1e-8  # Adam's, as torch has them
+BETA_1, BETA_2, EPSILON = 0.9, 0.999, np.float32(1e-8)  # Adam's, as torch has them
+LEAST = np.float32(1e-30)  # mean of a gradient: less moves no weight
 
 DQN, PRINTED = 1, 2  # other targets than Double DQN's
 
@@ -47,7 +48,7 @@ def player(
     """Return `play` for a `PaperModule`, its target and Adam's moments, and the robots' arrays."""
     e, p, weights = environment, environment.parameters, [*online.parameters()]
     mean, square = ([moments[w][name] for w in weights] for name in ("exp_avg", "exp_avg_sq"))
-    parts = weights, target.parameters(), [weight.clone() for weight in weights], mean, square
+    parts = weights, target.parameters(), [*map(torch.zeros_like, weights)], mean, square
     networks = networks_of(environment, parts, max(p.batch_size, p.environments))
     kind = ("double_dqn", "dqn", "printed").index(p.target)
     numbers = Numbers(*(as_number(getattr(p, name)) for name, as_number in NUMBERS.items()))
@@ -95,7 +96,7 @@ def play(game: Any, learning: Any, robots: Any, random: Any, counters: Any, unti
         evaluate(online, scenario, cell)
         for n in range(count):
             if exploration.random() >= epsilon:
-                actions[n] = greedy(online.q, n)
+                actions[n] = online.q[n].argmax()
         for n in range(count):
             at = scenario[n], actions[n], cell[n]
             after = cell[n] + offset[actions[n]] if legal[at] else cell[n]
@@ -130,7 +131,7 @@ def update(learning: Any, sampling: Any, counters: Any) -> None:
     evaluate(target, scenario, next_cell)
     y = replay.reward[slots]
     for n in range(slots.size):
-        best = greedy(target.q if kind == DQN else online.q, n)
+        best = (target.q if kind == DQN else online.q)[n].argmax()
         next_q = (online.q if kind == PRINTED else target.q)[n, best]
         y[n] += replay.discount[slots[n]] * next_q
     evaluate(online, scenario, replay.cell[slots])
@@ -149,19 +150,8 @@ def update(learning: Any, sampling: Any, counters: Any) -> None:
 
 
 @compiled
-def greedy(q: Any, n: int) -> int:
-    """Return the first action of the greatest Q (B, 8) of a state."""
-    best = 0
-    for action in range(1, 8):
-        if q[n, action] > q[n, best]:
-            best = action
-    return best
-
-
-@compiled
 def differentiate(network: Any, gradient: Any, count: int) -> None:
-    """Set the gradient of a loss by each array, given that by Q of the states that it has seen."""
-    gradient.weights[:] = 0
+    """Add to a loss's gradients, given that by Q of the states that a network has seen."""
     gradient.output[:] = 0
     gradient.before[:] = 0
     layer, layer_gradient, error = network.layer, gradient.layer, gradient.own_output
@@ -180,16 +170,14 @@ def differentiate(network: Any, gradient: Any, count: int) -> None:
         for row in range(network.first[n], network.first[n + 1]):
             window = network.changed[row]
             for f in range(filters):
-                feature, number = (
-                    max(network.own_before[row, f], np.float32(0)),
-                    f * windows + window,
-                )
-                change, through = feature - after[window, f], np.float32(0)
-                for u in range(len(network.eight) or units):
-                    layer_gradient[number, u] += change * error[n, u]
-                    through += layer[number, u] * error[n, u]
-                if after[window, f] > 0:
-                    before[window, f] -= through
+                feature, through = max(network.own_before[row, f], np.float32(0)), np.float32(0)
+                change, number = feature - after[window, f], f * windows + window
+                if feature != 0 or change != 0:  # most features are 0, with the robot and without
+                    for u in range(len(network.eight) or units):
+                        layer_gradient[number, u] += change * error[n, u]
+                        through += layer[number, u] * error[n, u]
+                    if after[window, f] > 0:
+                        before[window, f] -= through
                 own_before[row, f] = through if feature > 0 else np.float32(0)
     for window in range(windows):
         for f in range(filters):
@@ -198,7 +186,7 @@ def differentiate(network: Any, gradient: Any, count: int) -> None:
                 for u in range(len(network.eight) or units):
                     layer_gradient[number, u] += feature * gradient.output[u]
                     before[window, f] += layer[number, u] * gradient.output[u]
-    gradient.layer_bias[:] = gradient.output
+    gradient.layer_bias[:] += gradient.output
     add_kernel(gradient.kernel, gradient.kernel_bias, network.windows.common, windows, before)
     rows = network.first[count]
     add_kernel(gradient.kernel, gradient.kernel_bias, network.patch, rows, own_before)
@@ -222,9 +210,12 @@ def adam(weight: Any, gradient: Any, mean: Any, square: Any, rate: float, update
     """Take Adam's step number `updates` (Kingma and Ba 2015, with torch's place of epsilon)."""
     step = np.float32(rate / (1 - BETA_1**updates))
     root = np.float32(1 / np.sqrt(1 - BETA_2**updates))
-    one, two, epsilon = np.float32(1 - BETA_1), np.float32(1 - BETA_2), np.float32(EPSILON)
+    one, two = np.float32(1 - BETA_1), np.float32(1 - BETA_2)
     for number in range(weight.size):
         slope = gradient[number]
         mean[number] += one * (slope - mean[number])
+        # Most fade away, as few features are alive: a processor is slow where they are denormal.
+        mean[number] = mean[number] if abs(mean[number]) > LEAST else np.float32(0)
         square[number] += two * (slope * slope - square[number])
-        weight[number] -= step * mean[number] / (np.sqrt(square[number]) * root + epsilon)
+        weight[number] -= step * mean[number] / (np.sqrt(square[number]) * root + EPSILON)
+        gradient[number] = 0

@@ -185,7 +185,10 @@ class Trainer:
         return Planner(self.network.to_numpy(), metadata)
 
     def save_model(self, path: str | Path) -> None:
-        """Write the network as it is now to a model file; see `save_model` for errors."""
+        """Write the network as it is now to a model file; a ValueError if the training diverged."""
+        if not all(weight.isfinite().all() for weight in self._weights):
+            remedy = "train into another folder with a smaller learning_rate"
+            raise ValueError(f"the training diverged, and nothing more is saved; {remedy}")
         planner = self.planner()
         save_model(path, planner.network, planner.metadata)
 

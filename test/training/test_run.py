@@ -152,6 +152,20 @@ def test_a_save_that_failed_is_tried_again_at_the_next_interval_and_not_before(
     run.close()
 
 
+def test_a_training_that_diverged_is_not_saved(small: Scenario, tmp_path: Path) -> None:
+    run = open_run(tmp_path, small)
+    next(run.steps())
+    run.try_to_save()
+    before = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
+    next(run.trainer.network.parameters()).data.fill_(np.nan)
+    with pytest.raises(ValueError, match=r"diverged.*smaller learning_rate"):
+        finish(run)
+    run.close()
+    after = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
+    assert before.pop("episodes.csv") in after.pop("episodes.csv")
+    assert after == before
+
+
 def test_a_training_that_cannot_fit_is_refused_with_the_remedy(tmp_path: Path) -> None:
     grid = GridMap(np.zeros((300, 300), dtype=bool))
     greedy = replace(PARAMETERS, filters=1024, hidden_units=4096)  # 400 GB of weights

@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 from collections.abc import Callable
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -121,7 +122,9 @@ def test_an_update_of_the_papers_network_is_that_of_the_equations(
 
 @pytest.mark.parametrize("units", [0, 6])
 @pytest.mark.parametrize("target", ["double_dqn", "dqn", "printed"])
-def test_a_compiled_training_is_that_of_torch(small: Scenario, target: str, units: int) -> None:
+def test_a_compiled_training_is_that_of_torch_and_continues_it(
+    small: Scenario, tmp_path: Path, target: str, units: int
+) -> None:
     walls = small.grid.occupancy
     scenarios = [replace(small, grid=GridMap(other)) for other in (walls, walls[::-1], walls & 0)]
     parameters = HyperParameters(
@@ -142,6 +145,15 @@ def test_a_compiled_training_is_that_of_torch(small: Scenario, target: str, unit
     one, other = ([e for ended in t.run(90) for e in ended] for t in (compiled, in_torch))
     assert one == other
     assert compiled.updates == in_torch.updates > 60
+    check_same(compiled, in_torch)
+    in_torch.save_checkpoint(tmp_path / "checkpoint")
+    compiled = Trainer.load_checkpoint(tmp_path / "checkpoint", scenarios)
+    one, other = ([e for ended in t.run(180) for e in ended] for t in (compiled, in_torch))
+    assert one == other
+    check_same(compiled, in_torch)
+
+
+def check_same(compiled: Trainer, in_torch: Trainer) -> None:
     expected = in_torch._tensors()
     for name, tensor in compiled._tensors().items():
         # The mean: Adam makes much of the rounding of a gradient that is nearly 0.
