@@ -41,8 +41,7 @@ class NodeExecutor(SingleThreadedExecutor):
         """Call a function soon, in the thread of the executor."""
         if threading.get_ident() != self._thread:  # which may wait
             return super().create_task(callback, *arguments, **options)
-        task = Task(callback, arguments, options, executor=self)
-        self._tasks.append((task, None, None))
+        self._tasks.append((task := Task(callback, arguments, options, executor=self), None, None))
         return task
 
     def spin_until(self, stopping: threading.Event) -> None:

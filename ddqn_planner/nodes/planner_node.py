@@ -412,7 +412,6 @@ def main() -> int:
     # glibc reuses the memory of arrays up to 16 MB, because new pages would cost small fields a
     # third of their time. It returns larger arrays at once, so that the memory does not grow.
     with suppress(AttributeError):  # another C library
-        for option in (-1, -3):  # M_TRIM_THRESHOLD, M_MMAP_THRESHOLD
-            ctypes.CDLL(None).mallopt(option, 2**24)
-        ctypes.CDLL(None).mallopt(-8, 1)  # M_ARENA_MAX: most threads only wait
+        for option, value in ((-1, 2**24), (-3, 2**24), (-8, 1)):
+            ctypes.CDLL(None).mallopt(option, value)  # TRIM_THRESHOLD, MMAP_THRESHOLD, ARENA_MAX
     return spin_until_shutdown(PlannerNode, PLANNER_PARAMETERS)
