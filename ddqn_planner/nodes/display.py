@@ -70,8 +70,7 @@ class FieldDisplay:
         self._worker = Worker(node)
         self._shown: Shown | None = None
         self._shows_again = False
-        group = MutuallyExclusiveCallbackGroup()
-        self._look = node.create_guard_condition(self._on_look, group)
+        self._look = node.create_guard_condition(self._on_look, MutuallyExclusiveCallbackGroup())
         matched = PublisherEventCallbacks(matched=lambda _: self._look.trigger())
         value, policy = (
             node.create_publisher(kind, topic, LATCHED, event_callbacks=matched)
@@ -114,8 +113,7 @@ class FieldDisplay:
             except InvalidHandle:  # cleaned up meanwhile
                 return
             except Exception as error:  # as when no memory is left: the node must survive
-                reason = f"({error!r}); give a smaller map"
-                self._logger.error(f"the {layer.name} cannot be shown {reason}")
+                self._logger.error(f"no {layer.name} is shown ({error!r}); give a smaller map")
 
 
 def policy_message(field: QField | None, grid: GridMap, header: Header) -> MarkerArray:
@@ -135,8 +133,7 @@ def policy_message(field: QField | None, grid: GridMap, header: Header) -> Marke
 
     marker = Marker(header=header, ns="policy", type=Marker.LINE_LIST, color=COLOUR)
     marker.action = Marker.ADD if rows.size else Marker.DELETE
-    marker.pose.position.z = HEIGHT
-    marker.pose.orientation.w = 1.0
+    marker.pose.position.z, marker.pose.orientation.w = HEIGHT, 1.0
     marker.scale.x = LINE_WIDTH * step * grid.resolution
     corners = map(_point, arrows.real.ravel().tolist(), arrows.imag.ravel().tolist())
     # The lines share their points, because most of the time goes into making messages.

@@ -282,9 +282,8 @@ class PlannerNode(ManagedNode):
     def _on_look(self) -> None:
         self._is_look_near, self._looks.timer_period_ns = False, 1e9 * IDLE_PERIOD
         self._looks.reset()
-        if self._waits_for_pose or (
-            self._active.poses and self._settings.replan_period < IDLE_PERIOD
-        ):
+        is_frequent = self._active.poses and self._settings.replan_period < IDLE_PERIOD
+        if self._waits_for_pose or is_frequent:
             self._look_soon()
         self._report.log_paths()
         if self._is_configured:

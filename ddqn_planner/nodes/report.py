@@ -181,8 +181,7 @@ class Report(Refusals):
             problems.append(missing)
         good = not problems and (plan.path.size or outcome.status == "NO_REQUEST")
         level = DiagnosticStatus.OK if good else DiagnosticStatus.WARN
-        if fatal:
-            level = DiagnosticStatus.ERROR
+        level = DiagnosticStatus.ERROR if fatal else level
         values = {
             "status": outcome.status,
             "reason": outcome.reason,

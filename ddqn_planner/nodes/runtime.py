@@ -45,7 +45,7 @@ from rclpy.task import Future
 from std_msgs.msg import Header
 from std_srvs.srv import Trigger
 
-from ddqn_planner.nodes.executor import NodeExecutor
+from ddqn_planner.nodes.executor import new_executor
 
 # Late subscribers receive the last message too: for maps, plans, saved models.
 LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
@@ -345,7 +345,7 @@ def spin_until_shutdown(make_node: Callable[[], Node], parameters: Parameters | 
     try:
         # With rclpy's handlers, nothing could be published any more when the node ends.
         rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
-        executor = NodeExecutor()
+        executor = new_executor()
         # A task, not a flag: the executor wakes and returns.
         _at_signals(lambda: executor.create_task(stopping.set))
         node = make_node()
@@ -355,7 +355,8 @@ def spin_until_shutdown(make_node: Callable[[], Node], parameters: Parameters | 
         return 1
     try:
         executor.add_node(node)
-        executor.spin_until(stopping)
+        while not stopping.is_set():
+            executor.spin_once()
     finally:
         node.destroy_node()
         executor.shutdown()

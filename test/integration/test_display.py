@@ -170,11 +170,11 @@ def test_what_nobody_asks_for_is_not_computed_and_what_somebody_sees_is_of_the_g
         robot.send_map(robot.stamped_map(changed))
         policies.wait(lambda message: arrows(message) == free - 3)
 
-        # What cannot be shown does not end the node.
+        # A field that is not shown does not end the node.
         gap.touch()
         robot.send_goal(robot.pose((4, 4)))
         for name in ("value", "policy"):
-            node.wait_for_log(f"the {name} cannot be shown .AssertionError.*give a smaller map")
+            node.wait_for_log(f"no {name} is shown .AssertionError.*give a smaller map")
         gap.unlink()
         robot.send_goal(robot.pose((3, 3)))
         wait_for((3, 3))

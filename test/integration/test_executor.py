@@ -7,9 +7,18 @@ import threading
 import pytest
 import rclpy
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
+from rclpy.executors import SingleThreadedExecutor
 from rclpy.task import Future
 
 from ddqn_planner.nodes import executor as of_nodes
+
+
+def test_with_another_rclpy_its_own_executor_runs_the_node(monkeypatch: pytest.MonkeyPatch) -> None:
+    rclpy.init()
+    assert type(of_nodes.new_executor()) is of_nodes.NodeExecutor
+    monkeypatch.setattr(of_nodes, "PARTS", (*of_nodes.PARTS, "_of_another_version"))
+    assert type(of_nodes.new_executor()) is SingleThreadedExecutor
+    rclpy.shutdown()
 
 
 def test_a_callback_goes_on_as_soon_as_it_can_then_the_next_of_its_group_but_none_destroyed(
@@ -40,7 +49,8 @@ def test_a_callback_goes_on_as_soon_as_it_can_then_the_next_of_its_group_but_non
     another = node.create_guard_condition(lambda: awaited.set_result(None))
     late = threading.Timer(60.0, executor.create_task, [stopping.set])
     late.start()
-    executor.spin_until(stopping)
+    while not stopping.is_set():
+        executor.spin_once()
     late.cancel()
     node.destroy_node()
     executor.shutdown()
