@@ -32,6 +32,7 @@ from ddqn_planner.resources import find_map
 BARE = [sys.executable, str(Path(__file__).with_name("bare_service.py"))]
 STARTS, CALLS, GOALS, LARGE, CHANGING = 10, 200, 7, 2000, 1024
 RATE = 5  # maps per second
+IDLE = 30  # seconds
 SETTLED = 0.6  # seconds after which a client is known to DDS
 FREE = float("inf")
 Usage = tuple[float, float, float]  # wall time and CPU time, seconds; resident memory, MB
@@ -200,7 +201,7 @@ def measure_large_map(client: ros.Client) -> Iterator[bool]:
 
 
 def measure_changing_map(client: ros.Client) -> Iterator[bool]:
-    """Measure the planner's share of a core while a few cells of its map change."""
+    """Measure the planner's share of a core with no goal, and while a few cells change."""
     random = np.random.default_rng(0)
     fixture = ros.generated_map("office", CHANGING, seed=random)
     grid = fixture.grid
@@ -214,6 +215,14 @@ def measure_changing_map(client: ros.Client) -> Iterator[bool]:
             values = OCCUPIED * changed.occupancy.astype(np.int8)
             messages.append(ros.map_message(values, changed))
     with processes.running_node("planner_node") as planner:
+        client.publish("map", messages[0], LATCHED)
+        time.sleep(IDLE / 2)  # until all is compiled
+        computed = processes.cpu_seconds(planner.pid)
+        time.sleep(IDLE)
+        idle = processes.cpu_seconds(planner.pid) - computed
+        yield report(
+            f"{CHANGING}x{CHANGING}: no goal: share of a core", 100 * idle / IDLE, "%", 0.2
+        )
         client.publish_ends(ros.plan_request(grid, start, goal))
         for number, message in enumerate(messages):
             if number == 2 * RATE:  # the node is warm
