@@ -86,7 +86,7 @@ class NodeExecutor(SingleThreadedExecutor):
             self._look_at_node()
         waitables = [it for it in self._waitables if it.callback_group.can_execute(it)]
         wait_set, timeout = self._wait_set, -1
-        if (seconds := self._events_due - time.monotonic()) > 0:  # they are half of what it has
+        if (seconds := self._events_due - time.monotonic()) > 0:  # events are half of them
             waitables = [it for it in waitables if not isinstance(it, EventHandler)]
             timeout = int(1e9 * seconds)
         else:

@@ -48,8 +48,8 @@ def simplify(cells: Cells, grid: GridMap, move_rule: MoveRule | str) -> tuple[Ce
 
 def straightened(path: Cells, grid: GridMap, move_rule: MoveRule | str) -> Path:
     """Do the work of `simplify` for a path of one cell or more."""
-    layers, least, best = _layers(grid, move_rule), np.inf, np.array(path, np.int64)
-    until = np.cumsum(_segment_costs(best, layers, 1.0, 1.0))
+    layers, least, best = _layers(grid, move_rule), np.inf, np.asarray(path)
+    until = np.cumsum(_segment_costs(path, layers, 1.0, 1.0))
     # From the end, other obstacles come first: the path may pass them on the better side.
     for backward in (False, True):
         cells, costs = np.array(path, np.int64), np.empty(len(path))
@@ -183,7 +183,7 @@ def _pull(path: Any, until: Any, backward: bool, layers: Any) -> int:
 
 @in_place
 def _move_corners(path: Any, count: int, costs: Any, layers: Any) -> tuple[int, bool]:
-    """Move each corner, or leave it out, as long as the path costs less; return count, if any."""
+    """Move or leave out corners while it costs less; return the cells left, and if any moved."""
     height, width = layers[0].shape
     is_better, corner = False, 1
     while corner < count - 1:
