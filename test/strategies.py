@@ -1,7 +1,5 @@
 """Random maps for the property tests."""
 
-from __future__ import annotations
-
 import numpy as np
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as numpy_st

@@ -1,7 +1,5 @@
 """Which libraries a program loads: a planner must start fast, and on robots without torch."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys

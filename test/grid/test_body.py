@@ -1,7 +1,5 @@
 """Inflation, and costmaps as Nav2 makes and publishes them, written here after its formulas."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

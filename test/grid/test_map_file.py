@@ -1,7 +1,5 @@
 """Map files are read as map_server reads them; broken and hostile ones are refused by name."""
 
-from __future__ import annotations
-
 import itertools
 import json
 import math

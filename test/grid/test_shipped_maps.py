@@ -1,7 +1,5 @@
 """The shipped maps. The dilemma has each property of the paper's text; see docs/reproduction.md."""
 
-from __future__ import annotations
-
 import itertools
 import math
 import re

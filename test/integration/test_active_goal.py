@@ -1,7 +1,5 @@
 """When the planner plans for the active goal again, and which of several goals it leads to."""
 
-from __future__ import annotations
-
 import math
 from itertools import pairwise
 from typing import Any

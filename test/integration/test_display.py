@@ -1,7 +1,5 @@
 """What RViz shows of a field, and that nothing is computed for nobody."""
 
-from __future__ import annotations
-
 import time
 from pathlib import Path as FilePath
 from typing import Any

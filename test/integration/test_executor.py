@@ -1,7 +1,5 @@
 """In what order the nodes' executor calls what is ready."""
 
-from __future__ import annotations
-
 import threading
 
 import pytest

@@ -1,7 +1,5 @@
 """The planner's lifecycle: configure creates, activate enables, deactivate stops, cleanup frees."""
 
-from __future__ import annotations
-
 import gc
 import re
 import shutil

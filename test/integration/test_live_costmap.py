@@ -1,7 +1,5 @@
 """A costmap, its updates, and poses in other frames over DDS."""
 
-from __future__ import annotations
-
 import array
 import itertools
 from collections.abc import Callable, Iterator

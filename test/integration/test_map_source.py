@@ -3,8 +3,6 @@
 Here a message of map_msgs is a stand-in with the same fields; PyPI does not have map_msgs.
 """
 
-from __future__ import annotations
-
 import array
 import re
 import threading

@@ -1,7 +1,5 @@
 """Nav2's actions: what decides in them without Nav2's types, and the real ones where installed."""
 
-from __future__ import annotations
-
 import sys
 import threading
 from collections.abc import Callable, Coroutine, Iterator

@@ -1,7 +1,5 @@
 """The nodes and RViz as docs/nodes.md tells of them; no request for parameters ends a node."""
 
-from __future__ import annotations
-
 import importlib.util
 import re
 import sys

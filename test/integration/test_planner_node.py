@@ -1,7 +1,5 @@
 """The planner as its user sees it: plans, models, parameters, bad input, and what it waits for."""
 
-from __future__ import annotations
-
 import math
 import shutil
 import signal

@@ -1,7 +1,5 @@
 """Poses in other frames than the map's, given the transforms, and where the robot is by TF."""
 
-from __future__ import annotations
-
 import re
 import sys
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """What a planner loads, and what it answers before it has its model and its first map."""
 
-from __future__ import annotations
-
 import signal
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """Paths through several goals, and to the nearest of several."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from itertools import pairwise
 from typing import Any

@@ -1,7 +1,5 @@
 """Parts of paths: what is left of a path, and what is kept of it."""
 
-from __future__ import annotations
-
 import math
 from fractions import Fraction
 from itertools import pairwise

@@ -1,7 +1,5 @@
 """Plans against exact oracles: on maps with costs, one-way zones and walls, by any network."""
 
-from __future__ import annotations
-
 import gc
 import time
 import weakref

@@ -1,7 +1,5 @@
 """A start that is not free: the way out of it, against an oracle that shares no code with it."""
 
-from __future__ import annotations
-
 import heapq
 import math
 from itertools import pairwise

@@ -1,7 +1,5 @@
 """The replay buffer, and one update of each network beside the same written down from equations."""
 
-from __future__ import annotations
-
 import copy
 from collections.abc import Callable
 from dataclasses import replace
