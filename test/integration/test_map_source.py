@@ -29,12 +29,7 @@ from ddqn_planner import Experience, GridMap, MoveRule, Planner
 from ddqn_planner.experience import ExperienceFileError
 from ddqn_planner.grid import inflate
 from ddqn_planner.nodes.conversions import directions_message, grid_from_message, occupancy_message
-from ddqn_planner.nodes.map_source import (
-    BODY_PARAMETERS,
-    MAP_PARAMETERS,
-    MapSource,
-    updated_values,
-)
+from ddqn_planner.nodes.map_source import BODY_PARAMETERS, MAP_PARAMETERS, MapSource, updated_values
 from ddqn_planner.nodes.parameters import PLANNER_PARAMETERS
 from ddqn_planner.nodes.planner_node import ExpectedTimes
 from ddqn_planner.nodes.report import Outcome, Report, RequestError
@@ -299,9 +294,7 @@ def test_without_a_publisher_of_directions_a_map_needs_none(source: Source) -> N
     assert source.forbidden() == [[EAST] * 5] * 4
 
 
-def test_the_first_map_waits_for_directions_where_a_node_publishes_them(
-    source: Source, published: None
-) -> None:
+def test_the_first_map_waits_for_directions_of_a_publisher(source: Source, published: None) -> None:
     source._take(map_of(1))
     assert "directions were not received on /map_directions yet; let a map server" in source.missing
     assert not source.heard
@@ -365,9 +358,7 @@ def test_directions_hold_for_the_region_of_maps_of_another_node(
     assert source.heard == [False] * 4
 
 
-def test_required_directions_are_waited_for_once(
-    source: Source, set_parameters: SetParameters
-) -> None:
+def test_required_directions_are_awaited(source: Source, set_parameters: SetParameters) -> None:
     set_parameters(require_directions=True)
     source._take(map_of(1))
     assert "or set require_directions to false" in source.missing
@@ -385,9 +376,7 @@ def test_required_directions_are_waited_for_once(
 @pytest.mark.parametrize(
     "changes", [{"frame": "odom"}, {"x": 0.2}, {"x": 1e308}, {"x": 1e30}, {"resolution": 0.25}]
 )
-def test_no_map_is_planned_on_with_directions_of_another_frame_or_other_cells(
-    source: Source, changes: dict[str, Any]
-) -> None:
+def test_directions_of_other_cells_are_not_used(source: Source, changes: dict[str, Any]) -> None:
     other = map_of(2, **changes)
     source._take(other)
     assert not source.missing
@@ -409,9 +398,7 @@ def test_no_map_is_planned_on_with_directions_of_another_frame_or_other_cells(
     assert source.check() == other.header
 
 
-def test_malformed_directions_are_refused_and_those_before_them_stay(
-    source: Source, published: None
-) -> None:
+def test_malformed_directions_leave_those_before_them(source: Source, published: None) -> None:
     source._take_directions(directions_of(1))
     broken = directions_of(2)
     broken.data = broken.data[:-1]
@@ -508,9 +495,7 @@ def finished(coroutine: Coroutine[None, None, Any]) -> Any:
         time.sleep(0.001)
 
 
-def test_a_map_with_a_person_has_the_same_times_and_one_that_grows_those_of_its_places(
-    times: ExpectedTimes,
-) -> None:
+def test_a_map_with_a_person_or_that_grows_keeps_its_times(times: ExpectedTimes) -> None:
     before = times.apply(GRID).slowness
     assert before is not None
     person = GRID.with_patch(np.ones((3, 3), dtype=np.bool_), 60, 19)

@@ -115,9 +115,7 @@ def whole_model(robot: Robot) -> Iterator[FilePath]:
     robot.set(model=str(robot.model))
 
 
-def test_reload_plans_again_with_what_the_file_holds_now(
-    robot: Robot, whole_model: FilePath
-) -> None:
+def test_reload_plans_again_with_what_the_file_holds(robot: Robot, whole_model: FilePath) -> None:
     constant_model(whole_model, 6, 7)
     response = robot.client.call(Trigger, "planner/reload_model")
     assert response.success, response.message
@@ -181,9 +179,7 @@ def test_a_model_of_another_size_says_so_and_a_trapped_one_may_search(
 # Parameters
 
 
-def test_a_bad_parameter_is_refused_with_a_reason_and_a_good_one_holds(
-    robot: Robot, tmp_path: FilePath
-) -> None:
+def test_a_bad_parameter_is_refused_and_a_good_one_holds(robot: Robot, tmp_path: FilePath) -> None:
     broken, missing = tmp_path / "broken.safetensors", tmp_path / "missing.safetensors"
     broken.write_bytes(b"a model")
     for name, bad, reason in (
@@ -209,9 +205,7 @@ def test_a_bad_parameter_is_refused_with_a_reason_and_a_good_one_holds(
 # Bad input. After each, a good request has its plan.
 
 
-def test_a_malformed_map_or_start_leaves_the_old_one_and_a_goal_has_an_empty_plan(
-    robot: Robot,
-) -> None:
+def test_a_malformed_map_or_start_is_refused_and_a_goal_has_an_empty_plan(robot: Robot) -> None:
     robot.send_map(changed(robot.map_message(), "info.width", 0))
     robot.send_start(changed(robot.pose((3, 3)), "pose.orientation", Quaternion(w=0.0)))
     for reason in (
