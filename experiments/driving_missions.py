@@ -1,16 +1,16 @@
 """Missions of a robot in a world of `driving_worlds`, and what they took."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cache
 from typing import Any, Final
 
 import driving_worlds as worlds
 import numpy as np
-from driving_learners import LEARNERS, Learner
-from driving_worlds import RULE, STATIONS, Bool, Float64, World, drive, path_seconds
+from driving_learners import LEARNERS
+from driving_worlds import RULE, Bool, Float64, World, drive, path_seconds
 
-from ddqn_planner import Experience, GridMap, Planner, inflate, load_map
+from ddqn_planner import Experience, Planner, inflate, load_map
 from ddqn_planner.grid import Cell
 
 MOVED_AT: Final = 100  # the mission before which all that is slow moves, where it does
@@ -26,7 +26,7 @@ class Job:
     seed: int
     learner: str
     missions: int
-    exploration: float = 0.0
+    exploration: float | None = None
     is_faulty: bool = False
     is_moved: bool = False
 
@@ -67,15 +67,16 @@ def world_of(job: Job) -> World:
 
 def run(job: Job) -> Result:
     """Drive the missions of a job."""
-    return run_in(job, world_of(job), LEARNERS[job.learner])
+    world = world_of(job)
+    return run_in(job, world, LEARNERS[job.learner](world.grid))
 
 
-def run_in(job: Job, world: World, make: Callable[[GridMap], Learner]) -> Result:
-    """Drive the missions of a job in a world."""
+def run_in(job: Job, world: World, learner: Any) -> Result:
+    """Drive the missions of a job in a world, with a learner that may know something."""
     grid = world.grid
     missions, noise, faults, moved = (np.random.default_rng([job.seed, n]) for n in range(4))
-    learner: Any = make(grid)
-    given = {"exploration": job.exploration} if job.exploration else {}
+    is_exploring = isinstance(learner, Experience) and job.exploration is not None
+    given = {"exploration": job.exploration} if is_exploring else {}
     shortest: dict[tuple[int, int], Sequence[Cell]] = {}
     new = np.ones(grid.occupancy.shape, dtype=np.bool_)
     times, forecast = [], []
@@ -83,7 +84,7 @@ def run_in(job: Job, world: World, make: Callable[[GridMap], Learner]) -> Result
     for mission in range(job.missions):
         if job.is_moved and mission == MOVED_AT:
             world.change(job.kind.rsplit("-", 1)[1], moved)
-        pair = tuple(missions.choice(STATIONS, 2, replace=False).tolist())
+        pair = tuple(missions.choice(len(world.stations), 2, replace=False).tolist())
         start, goal = (world.stations[number] for number in pair)
         if pair not in shortest:
             shortest[pair] = planner().plan(grid, start, goal, RULE).cells

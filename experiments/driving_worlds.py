@@ -44,8 +44,8 @@ TUNING: Final = (
     *("maze-waits", "warehouse-crowds", "warehouse-gradient", "blobs-clearance", "rooms-waits"),
 )
 HELD_OUT: Final = (
-    *("corridors-waits", "rooms-clearance", "rooms-ramps", "halls-noise", "halls-crowds"),
-    *("halls-gradient", "maze-sills", "maze-noise", "maze-checkerboard", "warehouse-discs"),
+    *("warehouse-discs", "corridors-waits", "rooms-clearance", "rooms-ramps", "halls-noise"),
+    *("halls-crowds", "halls-gradient", "maze-sills", "maze-noise", "maze-checkerboard"),
     *("warehouse-waits", "warehouse-clearance", "blobs-noise", "blobs-discs", "blobs-ramps"),
     *("small_rooms-sills", "office-checkerboard", "office-crowds"),
 )
