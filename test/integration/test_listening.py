@@ -1,7 +1,5 @@
 """What a node can hear, and what it forgets when the clock jumps back: real nodes over DDS."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 
