@@ -16,6 +16,7 @@ Bool = NDArray[np.bool_]
 SIDE, RESOLUTION = 96, 0.25
 NARROW: Final = 1.25  # metres: the widest door
 APART: Final = 1.5  # metres from one door to the next
+GATES, GATE_AREA = 6, 25.0  # where doors are few: so many narrow places, or one per so many m²
 
 
 def _halls(random: Random) -> Bool:
@@ -91,8 +92,8 @@ def draw_map(name: str, random: Random) -> GridMap:
     return GridMap(occupancy, RESOLUTION)
 
 
-def gates(grid: GridMap, most: int, random: Random) -> list[tuple[Any, Any]]:
-    """Draw doors, or else narrow places: the rows and the columns of each one's cells."""
+def gates(grid: GridMap, random: Random) -> list[tuple[Any, Any]]:
+    """Draw half of all doors, or some narrow places: the rows and columns of each one's cells."""
     found = []  # whether it is no door, a random number, and its cells
     beside = max(round(0.5 / grid.resolution), 1)
     for occupancy in (grid.occupancy, grid.occupancy.T):
@@ -118,4 +119,5 @@ def gates(grid: GridMap, most: int, random: Random) -> list[tuple[Any, Any]]:
             doors += not no_door
             kept.append(cells)
             centres = np.append(centres, [centre], axis=0)
-    return kept[: max(doors // 2, most)]
+    free = np.count_nonzero(~grid.occupancy) * grid.resolution**2
+    return kept[: max(doors // 2, min(GATES, round(free / GATE_AREA)))]

@@ -32,7 +32,6 @@ HOUR: Final = 3600.0
 # drive; and of a pose, metres.
 NOISE, DRIVE_NOISE, POSE_NOISE = 0.3, 0.03, 0.02
 RATE: Final = 10.0  # poses per second
-GATES: Final = 6  # doors, or places like them, are slow: so many, or half of the doors
 
 # Each kind of world is a map and what is slow on it.
 TUNING: Final = (
@@ -171,14 +170,14 @@ def _crowds(world: World, random: Random) -> None:
 
 def _sills(world: World, random: Random) -> None:
     """Let the cells of doors be 5 to 20 times as slow."""
-    for cells in gates(world.grid, GATES, random):
+    for cells in gates(world.grid, random):
         world.always[cells] = random.uniform(5, 20)
 
 
 def _waits(world: World, random: Random) -> None:
     """Let the robot wait for 5 to 30 s at each passage of some doors."""
     world.waits = np.zeros(world.grid.occupancy.shape)
-    for cells in gates(world.grid, GATES, random):
+    for cells in gates(world.grid, random):
         world.waits[cells] = random.uniform(5, 30)
 
 
@@ -199,13 +198,13 @@ def _checkerboard(world: World, random: Random) -> None:
 
 
 def _noise(world: World, random: Random) -> None:
-    """Let the log slowness have the spectrum 1/f, and a standard deviation of 0.8."""
+    """Let the log slowness have the spectrum 1/f, and a standard deviation of 0.65."""
     height, width = world.grid.occupancy.shape
     frequency = np.hypot(np.fft.fftfreq(height)[:, None], np.fft.fftfreq(width))
     frequency[0, 0] = np.inf
     of_white = np.fft.fft2(random.normal(size=(height, width)))
     log = np.fft.ifft2(of_white / frequency).real
-    world.always = np.exp(np.maximum(0.4 + 0.8 * log / log.std(), 0))
+    world.always = np.exp(np.maximum(0.4 + 0.65 * log / log.std(), 0))
 
 
 def _ramps(world: World, random: Random) -> None:
