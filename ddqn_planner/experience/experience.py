@@ -181,8 +181,8 @@ class Experience:
         total = float(seconds.sum())
         return ExpectedTime(total * middle, total * low, total * high)
 
-    def save(self, path: str | Path) -> None:
-        """Save to a file, atomically; an OSError leaves an old file unchanged."""
+    def to_bytes(self) -> bytes:
+        """Return what a file of it holds."""
         content, evidence = io.BytesIO(), self.evidence
         np.savez(
             content,
@@ -194,7 +194,32 @@ class Experience:
             noise=evidence.noise_sums,
             errors=evidence.errors,
         )
-        write_atomically(as_path(path), content.getvalue())
+        return content.getvalue()
+
+    def save(self, path: str | Path) -> None:
+        """Save to a file, atomically; an OSError leaves an old file unchanged."""
+        write_atomically(as_path(path), self.to_bytes())
+
+    @classmethod
+    def from_bytes(cls, data: bytes) -> Experience:
+        """Return the experience of which `to_bytes` made the bytes.
+
+        Raises
+        ------
+        ExperienceFileError
+            If the bytes are broken, or no experience.
+        """
+        try:
+            with np.load(io.BytesIO(data), allow_pickle=False) as file:
+                arrays = dict(file)  # whose checksums are checked
+            if int(arrays["version"]) != VERSION:
+                raise ValueError(f"it has version {arrays['version']}, not {VERSION}")
+            options = dict(zip(OPTIONS, arrays["options"].tolist(), strict=True))
+            experience = cls(**options)
+            experience.evidence.restore(arrays)
+        except Exception as error:  # broken bytes make zipfile and NumPy raise many kinds of errors
+            raise ExperienceFileError(f"no experience: {error}") from error
+        return experience
 
     @classmethod
     def load(cls, path: str | Path) -> Experience:
@@ -207,19 +232,12 @@ class Experience:
         """
         path = as_path(path)
         try:
-            with np.load(path, allow_pickle=False) as file:
-                arrays = dict(file)  # whose checksums are checked
-            if int(arrays["version"]) != VERSION:
-                raise ValueError(f"it has version {arrays['version']}, not {VERSION}")
-            options = dict(zip(OPTIONS, arrays["options"].tolist(), strict=True))
-            experience = cls(**options)
-            experience.evidence.restore(arrays)
-        except Exception as error:  # broken bytes make zipfile and NumPy raise many kinds of errors
+            return cls.from_bytes(path.read_bytes())
+        except (OSError, ExperienceFileError) as error:
             raise ExperienceFileError(
                 f"{path}: cannot be read ({error}); give a file that `Experience.save` wrote, or "
                 "delete it to begin anew"
             ) from error
-        return experience
 
 
 def _believed_parts(
