@@ -8,7 +8,8 @@ from typing import Any, Final
 import driving_worlds as worlds
 import numpy as np
 from driving_learners import LEARNERS
-from driving_worlds import RULE, Bool, Float64, World, drive, path_seconds
+from driving_maps import Bool
+from driving_worlds import RULE, Float64, World, drive, path_seconds
 
 from ddqn_planner import Experience, Planner, inflate, load_map
 from ddqn_planner.grid import Cell

@@ -5,28 +5,26 @@ programs'. They are other pairings of a map and of what is slow, with other seed
 for maps from files.
 """
 
-import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Final
 
 import numpy as np
 import scipy.ndimage
+from driving_maps import draw_map, gates
 from numpy.typing import NDArray
-from random_maps import Random, generate_map
+from random_maps import Random
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import dijkstra
 
 from ddqn_planner.grid import Cell, GridMap, MoveRule
 from ddqn_planner.planning import Planner
 
-Bool = NDArray[np.bool_]
 Float64 = NDArray[np.float64]
 Range = tuple[float, float]
 Routes = dict[str, Sequence[Cell]]
 RULE: Final = MoveRule.ROBOT_SAFE
 
-SIDE, RESOLUTION = 96, 0.25
 SPEED: Final = 0.5  # metres per second in the open
 STATIONS: Final = 6  # missions lead from one of so many cells to another
 HOUR: Final = 3600.0
@@ -34,8 +32,6 @@ HOUR: Final = 3600.0
 # drive; and of a pose, metres.
 NOISE, DRIVE_NOISE, POSE_NOISE = 0.3, 0.03, 0.02
 RATE: Final = 10.0  # poses per second
-NARROW: Final = 1.25  # metres: the widest door
-GATES: Final = 6  # doors, or places like them, are slow: so many, or half of the doors
 
 # Each kind of world is a map and what is slow on it.
 TUNING: Final = (
@@ -172,46 +168,16 @@ def _crowds(world: World, random: Random) -> None:
     world.crowds = [_discs(world.grid, 5, (1, 2.5), (2, 5), random) for _ in range(2)]
 
 
-def _gates(grid: GridMap, random: Random) -> list[tuple[Any, Any]]:
-    """Draw doors, or else narrow places: the rows and the columns of each one's cells."""
-    found = []  # not a door, random, row, columns, whether transposed
-    beside = max(round(0.5 / grid.resolution), 1)
-    for occupancy in (grid.occupancy, grid.occupancy.T):
-        step = np.diff(np.pad(occupancy, ((0, 0), (1, 1)), constant_values=True).astype(np.int8))
-        rows, begins = np.nonzero(step == -1)
-        ends = np.nonzero(step == 1)[1]
-        widths = np.zeros(occupancy.shape, np.int64)
-        for row, first, end in zip(rows, begins, ends, strict=True):
-            widths[row, first:end] = end - first
-        widths = np.pad(widths, ((beside, beside), (0, 0)))
-        middle, width = (begins + ends) // 2, ends - begins
-        wider = np.minimum(widths[rows, middle], widths[rows + 2 * beside, middle]) > 1.5 * width
-        for index in np.flatnonzero(width * grid.resolution <= NARROW):
-            columns = np.arange(begins[index], ends[index])
-            cells: tuple[Any, Any] = rows[index], columns
-            cells = cells if occupancy is grid.occupancy else cells[::-1]
-            found.append((not wider[index], random.random(), cells))
-    kept: list[tuple[Any, Any]] = []
-    centres, doors = np.full((1, 2), np.inf), 0
-    for no_door, _, cells in sorted(found, key=lambda each: each[:2]):
-        centre = np.array([cells[0].mean(), cells[1].mean()])
-        if np.hypot(*(centres - centre).T).min() * grid.resolution > 1.5:
-            doors += not no_door
-            kept.append(cells)
-            centres = np.append(centres, [centre], axis=0)
-    return kept[: max(doors // 2, GATES)]
-
-
 def _sills(world: World, random: Random) -> None:
     """Let the cells of doors be 5 to 20 times as slow."""
-    for cells in _gates(world.grid, random):
+    for cells in gates(world.grid, random):
         world.always[cells] = random.uniform(5, 20)
 
 
 def _waits(world: World, random: Random) -> None:
     """Let the robot wait for 5 to 30 s at each passage of some doors."""
     world.waits = np.zeros(world.grid.occupancy.shape)
-    for cells in _gates(world.grid, random):
+    for cells in gates(world.grid, random):
         world.waits[cells] = random.uniform(5, 30)
 
 
@@ -232,13 +198,13 @@ def _checkerboard(world: World, random: Random) -> None:
 
 
 def _noise(world: World, random: Random) -> None:
-    """Let the log slowness have the spectrum 1/f, and a standard deviation of 0.8."""
+    """Let the log slowness have the spectrum 1/f, and a standard deviation of 0.65."""
     height, width = world.grid.occupancy.shape
     frequency = np.hypot(np.fft.fftfreq(height)[:, None], np.fft.fftfreq(width))
     frequency[0, 0] = np.inf
     of_white = np.fft.fft2(random.normal(size=(height, width)))
     log = np.fft.ifft2(of_white / frequency).real
-    world.always = np.exp(np.maximum(0.4 + 0.8 * log / log.std(), 0))
+    world.always = np.exp(np.maximum(0.4 + 0.65 * log / log.std(), 0))
 
 
 def _ramps(world: World, random: Random) -> None:
@@ -276,71 +242,6 @@ HIDDEN: Final[dict[str, Callable[[World, Random], None]]] = {
 }
 
 
-def _halls(random: Random) -> Bool:
-    """Draw two to four halls with openings of 3 m, and pillars of 0.5 to 1 m."""
-    occupancy = np.zeros((SIDE, SIDE), dtype=np.bool_)
-    for lines in (occupancy, occupancy.T)[: random.integers(1, 3)]:
-        at, gaps = random.integers(30, 66), random.integers([4, 52], [36, 84])
-        lines[at] = True
-        for gap in gaps:
-            lines[at, gap : gap + 12] = False
-    for y, x, side in random.integers([2, 2, 2], [90, 90, 5], (30, 3)):
-        occupancy[y : y + side, x : x + side] = True
-    return occupancy
-
-
-def _maze(random: Random) -> Bool:
-    """Draw a maze with corridors of two cells, and loops."""
-    occupancy = generate_map("maze", (SIDE // 4 * 2 + 1,) * 2, random)
-    inner = np.argwhere(occupancy[1:-1, 1:-1]) + 1
-    inner = inner[inner.sum(axis=1) % 2 == 1]  # walls between two cells of the maze
-    y, x = random.permutation(inner)[: len(inner) // 6].T
-    occupancy[y, x] = False
-    return np.kron(occupancy, np.ones((2, 2), dtype=np.bool_))[:SIDE, :SIDE]
-
-
-def _warehouse(random: Random) -> Bool:
-    """Draw racks of 3 to 6 m, with aisles of 1 to 1.5 m between them."""
-    occupancy, y = np.zeros((SIDE, SIDE), dtype=np.bool_), int(random.integers(5, 8))
-    aisle = int(random.integers(4, 7))
-    while y < SIDE - 6:
-        x = int(random.integers(4, 8))
-        while x < SIDE - 8:
-            length = int(random.integers(12, 25))
-            occupancy[y : y + 3, x : min(x + length, SIDE - 5)] = True
-            x += length + int(random.integers(4, 7))
-        y += 3 + aisle
-    return occupancy
-
-
-def _blobs(random: Random) -> Bool:
-    """Draw smooth obstacles on a quarter of the map."""
-    smooth = scipy.ndimage.gaussian_filter(random.normal(size=(SIDE, SIDE)), 4, mode="nearest")
-    return np.asarray(smooth > np.quantile(smooth, 0.75))
-
-
-def _rooms(random: Random) -> Bool:
-    """Draw rooms of 3 to 5 m, with doors of 1 m in most walls between two of them."""
-    occupancy = np.zeros((SIDE, SIDE), dtype=np.bool_)
-    across, along = (np.cumsum(random.integers(12, 21, SIDE // 12)) for _ in range(2))
-    for lines, at, cuts in ((occupancy, across, along), (occupancy.T, along, across)):
-        for line in at[at < SIDE - 8]:
-            lines[line] = True
-            for first, end in itertools.pairwise([0, *cuts[cuts < SIDE - 8], SIDE]):
-                door = random.integers(first + 2, end - 5)
-                lines[line, door : door + 4] = random.random() > 0.8
-    return occupancy
-
-
-MAPS: Final[dict[str, Callable[[Random], Bool]]] = {
-    "halls": _halls,
-    "maze": _maze,
-    "warehouse": _warehouse,
-    "blobs": _blobs,
-    "rooms": _rooms,
-}
-
-
 def make_world(grid: GridMap, hidden: str, random: Random) -> World:
     """Draw what is slow on a map, and stations; all in its largest part that is connected."""
     labels = scipy.ndimage.label(~grid.occupancy)[0]
@@ -356,12 +257,8 @@ def make_world(grid: GridMap, hidden: str, random: Random) -> World:
 def generated_world(kind: str, seed: int) -> World:
     """Make a world on a generated map, of a kind as "office-mixture"."""
     name, hidden = kind.split("-")
-    random = np.random.default_rng([seed, *name.replace("small_", "").encode()])
-    if name in MAPS:
-        occupancy = MAPS[name](random)
-    else:
-        occupancy = generate_map(name.replace("small_", ""), (SIDE, SIDE), random)
-    return make_world(GridMap(occupancy, RESOLUTION), hidden, random)
+    random = np.random.default_rng([seed, *name.removeprefix("small_").encode()])
+    return make_world(draw_map(name, random), hidden, random)
 
 
 @dataclass(frozen=True)
