@@ -21,7 +21,7 @@ FARTHEST = 1e7  # metres from the origin of the map: a place beyond is not belie
 
 NOISE, NOISY_VISITS = 0.1, 50.0  # variance of the log slowness of one visit, as if of so many
 OLD_VISITS = 500.0  # the noise of visits is that of about the last so many
-VARIANCE, VARIED_PLACES = 1.0, 4.0  # of the log slowness of places, as if of so many
+VARIANCE, VARIED_PLACES = 0.5, 4.0  # of the log slowness of places, as if of so many
 LEAST_VARIANCE, MOST_VARIANCE = 0.05, 2.0
 ALIKE = 8.0  # so many places of a path tell as much of other places as one alone
 NOMINAL = 2.0  # inverse variance of the log slowness of all places, before the first drive
@@ -38,6 +38,7 @@ CHANGED, CHANGED_AROUND = 0.2, 1.5  # share of evidence that is left within so m
 CHANGED_FAR = 0.7  # and elsewhere: where one place changed, others did
 
 WAIT_PASSAGES = 0.5  # passages without a wait that are assumed
+NEAREST_WAITS = 4.0  # the place of a wait is the mean of about the last so many
 MOST_PASSAGES = 20.0  # a wait is the mean of about the last so many
 
 FADING_STEPS = 4  # so often per half-life all evidence fades: few changes of a map come at once
@@ -151,10 +152,11 @@ class Evidence:
         for x, y, seconds in waits.tolist():
             distance = np.hypot(self.waits[:, 2] - x, self.waits[:, 3] - y)
             nearest = int(distance.argmin()) if len(distance) else -1
-            if nearest < 0 or distance[nearest] > self.wait_radius:
+            if nearest < 0 or distance[nearest] > 1.25 * self.wait_radius:
                 self.waits = np.vstack([self.waits, [seconds, 1.0, x, y]])
-            else:
+            else:  # robots from both sides wait before one door: it is between them
                 self.waits[nearest, 0] += seconds
+                self.waits[nearest, 2:] += (np.array([x, y]) - self.waits[nearest, 2:]) / NEAREST_WAITS
 
     def add_failure(self, x: float, y: float, seconds: float) -> None:
         """Add a failure, which costs as much as a wait of so many seconds."""

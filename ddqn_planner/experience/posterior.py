@@ -135,7 +135,7 @@ class Posterior:
                 metres = np.hypot(*(self.middle[places] - (x, y)).T) * self.grid.resolution
                 front = places[metres <= radius].tolist()
                 found.update(front)
-            width = max(2 * radius, self.spacing)
+            width = max(math.pi / 2 * radius, self.spacing)  # the mean way through a disc
             self.waits[list(found)] += seconds * evidence.nominal_speed / width
 
     def paint(self, exploration: float, fastest: float) -> NDArray[np.float32]:
