@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from strategies import grids_with_free_cell
 
 from ddqn_planner.grid import Cell, GridMap, MoveRule, legal_moves, neighbours, shortest_distances
-from ddqn_planner.training.networks import value_iteration
+from ddqn_planner.planning.value_iteration import value_iteration
 
 
 def settled(
@@ -20,9 +20,9 @@ def settled(
 ) -> np.ndarray:
     """The return of each move on one map: (8, C)."""
     goals, near = np.array([goal]), neighbours(shape)
-    tables = success.astype(np.float32)[None], reward.astype(np.float32)[None]
-    (return_AC,) = value_iteration(*tables, goals, near, gamma, collision)
-    return return_AC
+    tables = success.astype(np.float32).T[None], reward.astype(np.float32).T[None]
+    (return_CA,) = value_iteration(*tables, goals, near, gamma, collision)
+    return return_CA.T
 
 
 @given(grids_with_free_cell(), st.sampled_from(MoveRule))
