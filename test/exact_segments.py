@@ -1,7 +1,5 @@
 """Which cells a segment passes, in exact numbers: what is legal, and what it costs."""
 
-from __future__ import annotations
-
 import math
 from fractions import Fraction
 

@@ -1,7 +1,5 @@
 """Limits to the files and the memory of a test."""
 
-from __future__ import annotations
-
 import os
 import resource
 from collections.abc import Iterator

@@ -1,7 +1,5 @@
 """Networks with chosen weights, without a training."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from ddqn_planner.grid import MoveRule

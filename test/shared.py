@@ -1,7 +1,5 @@
 """What the tests of the library and those of the experiments have in common."""
 
-from __future__ import annotations
-
 import signal
 
 import hypothesis

@@ -1,13 +1,12 @@
 """Random maps for the property tests."""
 
-from __future__ import annotations
-
 import numpy as np
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as numpy_st
 
-from ddqn_planner.grid import GridMap, MoveRule
+from ddqn_planner.grid import Cell, GridMap, MoveRule
 
+Place = tuple[GridMap, Cell]
 RULES = st.sampled_from(list(MoveRule))
 occupancies = numpy_st.arrays(
     np.bool_,
@@ -17,7 +16,7 @@ occupancies = numpy_st.arrays(
 
 
 @st.composite
-def grids_with_free_cell(draw: st.DrawFn) -> tuple[GridMap, tuple[int, int]]:
+def grids_with_free_cell(draw: st.DrawFn) -> Place:
     """A map and one of its free cells."""
     occupancy = draw(occupancies)
     y = draw(st.integers(0, occupancy.shape[0] - 1))
@@ -27,7 +26,7 @@ def grids_with_free_cell(draw: st.DrawFn) -> tuple[GridMap, tuple[int, int]]:
 
 
 @st.composite
-def grids_in_parts(draw: st.DrawFn) -> tuple[GridMap, tuple[int, int]]:
+def grids_in_parts(draw: st.DrawFn) -> Place:
     """A map that walls and obstacles cut into parts, and one of its free cells."""
     grid, (x, y) = draw(grids_with_free_cell())
     occupancy = grid.occupancy.copy()
@@ -40,7 +39,7 @@ def grids_in_parts(draw: st.DrawFn) -> tuple[GridMap, tuple[int, int]]:
 
 
 @st.composite
-def grids_with_costs(draw: st.DrawFn) -> tuple[GridMap, tuple[int, int]]:
+def grids_with_costs(draw: st.DrawFn) -> Place:
     """A map whose free cells have costs or are unknown, and one of its free cells."""
     grid, cell = draw(grids_with_free_cell())
     costs = numpy_st.arrays(np.int8, grid.occupancy.shape, elements=st.integers(-1, 99))
@@ -48,7 +47,7 @@ def grids_with_costs(draw: st.DrawFn) -> tuple[GridMap, tuple[int, int]]:
 
 
 @st.composite
-def grids_with_directions(draw: st.DrawFn) -> tuple[GridMap, tuple[int, int]]:
+def grids_with_directions(draw: st.DrawFn) -> Place:
     """A map with forbidden directions, with or without costs, and one of its free cells."""
     grid, cell = draw(grids_with_free_cell() | grids_with_costs())
     # Few or many different sets of forbidden actions, and cells without any.
@@ -58,7 +57,7 @@ def grids_with_directions(draw: st.DrawFn) -> tuple[GridMap, tuple[int, int]]:
     return GridMap(grid.occupancy, cost=grid.cost, forbidden=forbidden), cell
 
 
-def cells_of(grid: GridMap) -> st.SearchStrategy[tuple[int, int]]:
+def cells_of(grid: GridMap) -> st.SearchStrategy[Cell]:
     """Any cells of a map."""
     return st.tuples(st.integers(0, grid.width - 1), st.integers(0, grid.height - 1))
 

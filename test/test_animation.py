@@ -11,9 +11,7 @@ from ddqn_planner import GridMap, Planner
 from ddqn_planner.pictures import PATH_COLOUR
 
 
-def test_cells_appear_from_the_goal_on_and_then_the_path_grows(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_cells_appear_then_the_path_grows(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(animation, "LAST_FRAMES", 2)
     planner, grid = Planner.load("any_map"), GridMap(np.zeros((8, 12), dtype=bool))
     plan = planner.plan(grid, (1, 4), (10, 4))

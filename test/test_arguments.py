@@ -1,7 +1,5 @@
 """Every public call of docs/python_api.md, with arguments of all kinds."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from contextlib import suppress
 from fractions import Fraction

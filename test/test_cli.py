@@ -1,5 +1,3 @@
-from __future__ import annotations
-
 import json
 import os
 import re
@@ -39,9 +37,7 @@ def small_map(small: Scenario, tmp_path: Path) -> str:
     return str(path)
 
 
-def test_plan_prints_the_papers_path_and_counts_by_its_rule(
-    capsys: pytest.CaptureFixture[str],
-) -> None:
+def test_plan_prints_the_papers_path_by_its_rule(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["plan", "dilemma", "--model", "dilemma"]) == 0
     printed = capsys.readouterr().out
     assert "length 22.97 cells, optimum 22.97 under corner_cutting" in printed
@@ -73,9 +69,7 @@ CLEARED = {"start": (5, 0), "start_clearing_radius": 2}
 ASKED["--start 5 0 --start-clearing-radius 0.1"] = {}, (0, 0), CLEARED
 
 
-def test_plan_gives_what_the_library_gives_with_the_same_options(
-    capsys: pytest.CaptureFixture[str], tmp_path: Path
-) -> None:
+def test_plan_gives_as_the_library(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     random, planner, seen = np.random.default_rng(12), Planner.load("any_map"), set()
     values = random.choice([0, 60, -1, 100], (30, 30), p=[0.8, 0.08, 0.06, 0.06])
     values[0, 0], values[-1, -1], values[0, 5], values[-1, -4] = 0, 0, 100, 100
@@ -109,9 +103,7 @@ def test_plan_draws_a_wide_map_for_a_terminal(
     assert re.search(r"cost \d{4}\.\d\d, greedy", length)
 
 
-def test_plan_gives_every_cell_that_is_asked_for_and_prints_no_wide_map(
-    capsys: pytest.CaptureFixture[str], tmp_path: Path
-) -> None:
+def test_plan_gives_every_cell(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     file = tmp_path / "path.csv"
     assert main(["plan", "office", "--cells", "--csv", str(file)]) == 0
     *cells, start, length = capsys.readouterr().out.splitlines()
@@ -191,9 +183,7 @@ def without(tmp_path: Path) -> Callable[..., subprocess.CompletedProcess[str]]:
 
 
 @pytest.mark.parametrize("library", ["torch", "gymnasium"])
-def test_training_says_in_one_line_what_it_needs(
-    without: Any, tmp_path: Path, library: str
-) -> None:
+def test_training_says_what_it_needs(without: Any, tmp_path: Path, library: str) -> None:
     for command in (["train", "dilemma"], ["train-any-map"])[: 1 + (library == "torch")]:
         done = without([library], "ddqn-planner", *command, "--out", str(tmp_path / "run"))
         expected = f"ddqn-planner: No module named '{library}'; pip install torch gymnasium\n"
@@ -242,9 +232,7 @@ def test_a_trained_model_plans(
     assert "length" in capsys.readouterr().out
 
 
-def test_every_hyper_parameter_and_the_seed_can_be_given(
-    small: Scenario, small_map: str, tmp_path: Path
-) -> None:
+def test_each_hyper_parameter_can_be_given(small: Scenario, small_map: str, tmp_path: Path) -> None:
     given: dict[str, Any] = {}
     for entry in fields(HyperParameters):
         if "choices" in entry.metadata:

@@ -1,7 +1,5 @@
 """Which libraries a program loads: a planner must start fast, and on robots without torch."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys
@@ -113,9 +111,7 @@ def test_each_process_finds_the_code_that_another_has_kept() -> None:
     assert len(names) == 1
 
 
-def test_where_no_folder_may_be_written_code_is_compiled_all_the_same(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_without_a_cache_code_is_compiled_all_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
     def nowhere(*_: object) -> None:
         raise RuntimeError("cannot cache function: no locator available")
 

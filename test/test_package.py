@@ -1,5 +1,3 @@
-from __future__ import annotations
-
 import ast
 import os
 import re
@@ -72,9 +70,7 @@ print(ddqn_planner.__file__, find_map("dilemma"), find_model("dilemma"))
 # last two do.
 @pytest.mark.slow
 @pytest.mark.parametrize("option", [None, "--target", "--prefix"])
-def test_maps_and_models_come_along_wherever_pip_installs(
-    wheel: Path, tmp_path: Path, option: str | None
-) -> None:
+def test_maps_and_models_come_everywhere(wheel: Path, tmp_path: Path, option: str | None) -> None:
     environment = tmp_path / "environment"
     subprocess.run([sys.executable, "-m", "venv", "--without-pip", environment], check=True)
     python, folder = environment / "bin" / "python", environment
@@ -104,9 +100,7 @@ def test_maps_and_models_come_along_wherever_pip_installs(
             assert {path.name: path.read_bytes() for path in copy.iterdir()} == shipped
 
 
-def test_a_map_is_a_shipped_one_or_a_path_or_a_file_of_a_package(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_map_is_shipped_or_of_a_package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     shipped = ROOT / "maps" / "dilemma.yaml"
     for name in ("dilemma", "dilemma.yaml", "package://ddqn_planner/maps/dilemma.yaml"):
         assert find_map(name).resolve() == shipped
@@ -122,9 +116,7 @@ def test_a_map_is_a_shipped_one_or_a_path_or_a_file_of_a_package(
             find_map(f"package://{name}/map.yaml")
 
 
-def test_a_file_hides_a_shipped_map_but_a_folder_does_not(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_file_alone_hides_a_shipped_map(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     shipped = find_map("dilemma")
     (tmp_path / "dilemma").mkdir()

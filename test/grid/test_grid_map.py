@@ -1,5 +1,3 @@
-from __future__ import annotations
-
 import json
 import math
 from dataclasses import fields
@@ -13,15 +11,11 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as numpy_st
 from strategies import grids_with_directions, occupancies
 
-from ddqn_planner import Planner
 from ddqn_planner.grid import UNKNOWN, GridMap, MoveRule
-from ddqn_planner.grid.arguments import MAX_SLOWNESS, as_cell
+from ddqn_planner.grid.arguments import as_cell
 
 ZEROS = np.zeros((2, 3))
 origins = st.tuples(*3 * [st.floats(-100, 100)])
-
-
-# Where it lies
 
 
 @given(occupancies, st.floats(0.01, 10), origins, st.data())
@@ -57,9 +51,6 @@ def test_a_cell_is_any_pair_of_whole_numbers(cell: Any) -> None:
         assert (grid.is_free(cell), grid.is_obstacle(cell)) == (not occupied, occupied)
     with pytest.raises(ValueError, match=r"the cell is \(0, None\); give two whole numbers"):
         grid.contains((0, None))
-
-
-# What it holds
 
 
 MALFORMED: list[tuple[str, list[Any], str]] = [
@@ -190,9 +181,7 @@ def test_a_patched_map_is_the_map_of_the_patched_arrays(
 
 
 @given(full_grids(), full_grids())
-def test_maps_have_the_same_cells_and_fingerprint_exactly_if_their_layers_are_equal(
-    a: GridMap, b: GridMap
-) -> None:
+def test_maps_of_the_same_fingerprint_have_the_same_layers(a: GridMap, b: GridMap) -> None:
     names = "occupancy", "cost", "forbidden", "slowness"
     for changed in (None, *names):
         layers = {name: getattr(a, name) for name in names}
@@ -209,10 +198,7 @@ def test_maps_have_the_same_cells_and_fingerprint_exactly_if_their_layers_are_eq
 def test_a_wrong_patch_is_named_and_the_remedy_too() -> None:
     one = np.zeros((1, 1))
     for arguments, named in (
-        (
-            (np.zeros((2, 2)), 2, 0),
-            r"2 x 2 cells from \(2, 0\) is not inside .* 3 x 2; cut",
-        ),
+        ((np.zeros((2, 2)), 2, 0), r"2 x 2 cells from \(2, 0\) is not inside .* 3 x 2; cut"),
         *(((one, *cell), "is not inside") for cell in ((-1, 0), (0, -1), (3, 0), (0, 2))),
         ((one, 0.5, 0), "first cell of the patch is .*; give two whole numbers"),
         ((one, 0, 0, [[1, 2]]), r"cost has shape \(1, 2\); give \(1, 1\)"),
@@ -221,13 +207,3 @@ def test_a_wrong_patch_is_named_and_the_remedy_too() -> None:
         for cost in (None, ZEROS):
             with pytest.raises(ValueError, match=named):
                 GridMap(ZEROS, cost=cost).with_patch(*arguments)
-
-
-def test_the_memory_of_a_field_on_the_slowest_map_is_bounded() -> None:
-    slowness = np.full((300, 300), MAX_SLOWNESS)
-    slowness[::2] = 1
-    grid = GridMap(np.zeros((300, 300)), cost=np.full((300, 300), UNKNOWN), slowness=slowness)
-    # The least memory for the lists of cells of about the same order.
-    costs = Planner.load("any_map").network.move_costs(grid, MoveRule.ROBOT_SAFE)
-    assert costs is not None
-    assert 4 * 256 * 2 ** np.ceil(np.log2(2 * costs.highest + 20)) < 3e6

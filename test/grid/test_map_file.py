@@ -1,7 +1,5 @@
 """Map files are read as map_server reads them; broken and hostile ones are refused by name."""
 
-from __future__ import annotations
-
 import itertools
 import json
 import math
@@ -20,9 +18,9 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as numpy_st
 from limits import memory_grows_less_than
 from PIL import Image
-from strategies import grids_with_directions
+from strategies import Place, grids_with_directions
 
-from ddqn_planner.grid import UNKNOWN, Cell, GridMap, MapFile, load_map, read_map_file, save_map
+from ddqn_planner.grid import UNKNOWN, GridMap, MapFile, load_map, read_map_file, save_map
 from ddqn_planner.grid.map_file import (
     MapDataError,
     MapFileError,
@@ -57,9 +55,6 @@ def write(folder: Path, image: np.ndarray | Image.Image | bytes, /, **changes: A
 
 def values(path: Path) -> list[list[int]]:
     return read_map_file(path).values.tolist()  # type: ignore[no-any-return]
-
-
-# What map_server reads
 
 
 def occupancy_of(grey: int, mode: str, negate: bool, occupied: float, free: float) -> int:
@@ -111,8 +106,8 @@ def test_each_mode_follows_map_servers_rule_and_row_0_is_the_bottom_one(
 
 def test_what_is_not_opaque_is_unknown_but_in_mode_raw(tmp_path: Path) -> None:
     pixels = np.array([[[0, 0, 0, 255], [0, 0, 0, 254], [254, 254, 254, 0]]], dtype=np.uint8)
-    assert values(write(tmp_path, Image.fromarray(pixels))) == [[100, -1, -1]]
-    assert values(write(tmp_path, Image.fromarray(pixels), mode="raw")) == [[0, 0, -1]]
+    assert values(write(tmp_path, pixels)) == [[100, -1, -1]]
+    assert values(write(tmp_path, pixels, mode="raw")) == [[0, 0, -1]]
     image = Image.fromarray(np.array([[0, 1, 2]], dtype=np.uint8), "P")
     image.putpalette([0, 0, 0, 0, 0, 0, 254, 254, 254])
     image.save(tmp_path / "map.png", transparency=bytes([255, 254, 255]))
@@ -152,33 +147,26 @@ def test_an_image_that_map_server_reads_differently_is_refused(tmp_path: Path) -
         return (tmp_path / "pixels.png").read_bytes()
 
     wide = np.array([[256, 257, 511]], dtype=np.uint16)
-    refused = {
-        "stored as raw": [bitmap_of_32_bits(0), bitmap_of_32_bits(3)],
-        "stored as ppm": [
-            *(after(b"P5 3 1 100\n", ">u1"), after(b"P5 3 1 1000\n", ">u2")),
-            *(after(b"P6 1 1 65535\n", ">u2"), b"P2 3 1 100\n1 2 3"),
-        ],
-        "transparent": [
-            *(png(wide, transparency=257), png(wide.astype(np.uint8), transparency=1)),
-        ],
-    }
-    for reason, contents in refused.items():
-        for content in contents:
-            with pytest.raises(MapDataError, match=reason):
-                read_map_file(write(tmp_path, content))
-    accepted = [
+    for reason, content in (
+        *(("stored as raw", bitmap_of_32_bits(compression)) for compression in (0, 3)),
+        ("stored as ppm", after(b"P5 3 1 100\n", ">u1")),
+        ("stored as ppm", after(b"P5 3 1 1000\n", ">u2")),
+        ("stored as ppm", after(b"P6 1 1 65535\n", ">u2")),
+        ("stored as ppm", b"P2 3 1 100\n1 2 3"),
+        ("transparent", png(wide, transparency=257)),
+        ("transparent", png(wide.astype(np.uint8), transparency=1)),
+    ):
+        with pytest.raises(MapDataError, match=reason):
+            read_map_file(write(tmp_path, content))
+    for content in (
         *(after(b"P5 3 1 255\n", ">u1"), after(b"P5 3 1 65535\n", ">u2"), png(wide)),
         *(after(b"P6 1 1 255\n", ">u1"), b"P2 3 1 255\n1 2 3", b"P2 3 1 65535\n1 2 3"),
         b"P1 3 1\n1 1 1",
-    ]
-    for content in accepted:
+    ):
         assert {*map(max, values(write(tmp_path, content)))} == {100}
-
-
-def test_a_wide_grey_value_counts_by_its_upper_byte(tmp_path: Path) -> None:
+    # A wide grey value counts by its upper byte.
     wide = np.array([[0, 256, 257, 513, 100 * 257, 100 * 257 + 256, 65535]], dtype=np.uint16)
-    path = write(tmp_path, Image.fromarray(wide), mode="raw")
-    assert values(path) == [[0, 0, 1, 1, 100, 100, -1]]
+    assert values(write(tmp_path, wide, mode="raw")) == [[0, 0, 1, 1, 100, 100, -1]]
 
 
 def test_a_moving_ai_map_keeps_the_benchmarks_rows_and_columns(tmp_path: Path) -> None:
@@ -187,9 +175,6 @@ def test_a_moving_ai_map_keeps_the_benchmarks_rows_and_columns(tmp_path: Path) -
     grid = load_map(path)
     assert grid.free_cells() == [(0, 0), (1, 0), (2, 0), (3, 1)]
     assert grid.resolution == 1.0
-
-
-# What is saved
 
 
 percent = st.sampled_from([st.integers(-1, 100), st.sampled_from([-1, 0, 100])]).flatmap(
@@ -215,10 +200,8 @@ def test_a_saved_map_file_comes_back_the_same(
 
 @same_folder
 @given(grids_with_directions())
-def test_a_saved_grid_comes_back_with_its_directions_and_on_request_its_costs(
-    tmp_path: Path, grid_and_cell: tuple[GridMap, Cell]
-) -> None:
-    grid, path = grid_and_cell[0], tmp_path / "saved.yaml"
+def test_a_saved_grid_comes_back_with_directions_and_costs(tmp_path: Path, place: Place) -> None:
+    grid, path = place[0], tmp_path / "saved.yaml"
     save_map(grid, path)
     options = {"occupied_threshold": 100, "allow_unknown": True}
     read = load_map(path, use_map_costs=grid.cost is not None, **options)
@@ -249,9 +232,6 @@ def test_an_impossible_map_file_cannot_be_made() -> None:
     for wrong in IMPOSSIBLE:
         with pytest.raises(ValueError, match="give"):
             MapFile(**{"values": np.zeros((2, 2)), **wrong})
-
-
-# What is refused, by name
 
 
 @pytest.mark.parametrize(
@@ -315,22 +295,19 @@ def test_an_unreadable_file_is_refused(plain_folder: Path) -> None:
 
 
 def test_a_broken_moving_ai_map_is_refused(tmp_path: Path) -> None:
-    header, path = "type octile\nheight {}\nwidth {}\nmap\n", tmp_path / "broken.map"
-    broken = {
-        MapMetadataError: ["", "type quad\nheight 1\nwidth 2\nmap\n..\n"],
-        MapDataError: [header.format(2, 2) + "..\n", header.format(1, 2) + "..\n..\n"],
-    }
-    broken[MapMetadataError] += [header.format(height, 2) + "..\n" for height in "x0"]
-    broken[MapMetadataError] += ["type octile\nwidth 1\nheight 2\nmap\n.@\n"]
-    broken[MapDataError] += [header.format(1, 2) + "...\n"]
-    for error, contents in broken.items():
-        for content in contents:
-            path.write_text(content)
-            with pytest.raises(error, match=r"broken\.map"):
-                read_map_file(path)
+    path, octile = tmp_path / "broken.map", "type octile\nheight {}\nwidth 2\nmap\n{}"
+    for error, content in (
+        (MapMetadataError, ""),
+        (MapMetadataError, "type quad\nheight 1\nwidth 2\nmap\n..\n"),
+        (MapMetadataError, "type octile\nwidth 1\nheight 2\nmap\n.@\n"),
+        *((MapMetadataError, octile.format(height, "..\n")) for height in "x0"),
+        (MapDataError, octile.format(2, "..\n")),
+        *((MapDataError, octile.format(1, rows)) for rows in ("..\n..\n", "...\n")),
+    ):
+        path.write_text(content)
+        with pytest.raises(error, match=r"broken\.map"):
+            read_map_file(path)
 
-
-# Directions
 
 GREY = Image.fromarray(np.array([[1, 2, 3], [4, 5, 255]], dtype=np.uint8))
 
@@ -364,9 +341,6 @@ def test_an_image_that_holds_no_directions_is_refused(tmp_path: Path) -> None:
             read_map_file(with_directions(tmp_path, image, name))
 
 
-# Where the images are
-
-
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
     """A folder with a good map, and beside it a file that no map file may reach."""
@@ -391,9 +365,7 @@ def test_an_image_lies_in_the_yamls_folder_named_in_any_way(folder: Path) -> Non
             read_map_file(path)
 
 
-def test_a_yaml_that_is_a_link_reads_the_image_beside_it_or_beside_what_it_links_to(
-    folder: Path,
-) -> None:
+def test_a_yaml_that_is_a_link_reads_the_image_beside_it_or_its_target(folder: Path) -> None:
     linked, target = folder / "linked", folder / "below"
     linked.mkdir()
     (linked / "good.yaml").symlink_to(target / "good.yaml")
@@ -424,9 +396,6 @@ def test_any_name_of_a_map_is_a_path_or_refused(prefix: str, name: str) -> None:
     with suppress(FileNotFoundError, MapFileError):
         read_map_file(find_map(prefix + name))
         assert name in ("dilemma.yaml", "office")
-
-
-# Anything else
 
 
 def png_of(width: int, height: int) -> bytes:
@@ -476,9 +445,7 @@ def test_a_small_file_of_gigabytes_is_refused_before_it_is_read(tmp_path: Path) 
             assert len(str(caught.value)) < 2000
 
 
-def test_nothing_in_a_yaml_grows_or_runs_when_it_is_read(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_nothing_in_a_yaml_grows_or_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     path = write(tmp_path, PIXELS)
     merges = ["a0: &a0 {k: 1}"]

@@ -1,5 +1,3 @@
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from itertools import product
@@ -9,23 +7,12 @@ import pytest
 import scipy.ndimage
 from hypothesis import given
 from hypothesis import strategies as st
-from strategies import RULES, grids_with_costs, grids_with_directions
+from strategies import RULES, Place, grids_with_costs, grids_with_directions
 
-from ddqn_planner.grid import (
-    LENGTHS,
-    MAX_COST_MULTIPLIER,
-    MOVES,
-    Cell,
-    GridMap,
-    MoveRule,
-    legal_moves,
-    move_costs,
-    neighbours,
-    path_cost,
-    path_length,
-    shortest_distances,
-    shortest_path,
-)
+from ddqn_planner import GridMap, MoveRule
+from ddqn_planner.grid import LENGTHS, MAX_COST_MULTIPLIER, MOVES, neighbours, shortest_path
+from ddqn_planner.grid.moves import move_costs, path_cost, path_length, shortest_distances
+from ddqn_planner.planning import PlanMethod
 
 
 def test_a_rule_is_a_member_or_its_value() -> None:
@@ -35,6 +22,8 @@ def test_a_rule_is_a_member_or_its_value() -> None:
         message = f"{wrong!r} is unknown; give one of robot_safe, corner_c.*, unit"
         with pytest.raises(ValueError, match=message):
             GridMap([[0]]).legal_moves(wrong)
+    with pytest.raises(ValueError, match="'nope' is unknown; give one of greedy, astar_fallback"):
+        PlanMethod("nope")
 
 
 def test_action_k_points_at_k_times_45_degrees() -> None:
@@ -44,10 +33,8 @@ def test_action_k_points_at_k_times_45_degrees() -> None:
 
 
 @given(grids_with_directions(), RULES)
-def test_legal_moves_follow_the_rule_in_each_cell(
-    grid_and_cell: tuple[GridMap, Cell], rule: MoveRule
-) -> None:
-    grid, _ = grid_and_cell
+def test_legal_moves_follow_the_rule_in_each_cell(place: Place, rule: MoveRule) -> None:
+    grid, _ = place
     legal = grid.legal_moves(rule)
     for (y, x), (action, (dx, dy)) in product(
         np.ndindex(grid.occupancy.shape), enumerate(MOVES.tolist())
@@ -62,22 +49,18 @@ def test_legal_moves_follow_the_rule_in_each_cell(
 
 @pytest.mark.parametrize("shape", [(1, 1), (1, 4), (3, 5)])
 def test_neighbours_are_numbered_row_by_row_and_outside_comes_last(shape: tuple[int, int]) -> None:
-    found, (height, width) = neighbours(shape), shape
-    assert (found.shape, found.dtype) == ((8, height * width), np.int64)
-    for (y, x), (action, (dx, dy)) in product(np.ndindex(shape), enumerate(MOVES.tolist())):
-        inside = 0 <= x + dx < width and 0 <= y + dy < height
-        expected = (y + dy) * width + x + dx if inside else height * width
-        assert found[action, y * width + x] == expected
+    (height, width), size = shape, math.prod(shape)
+    numbers = np.pad(np.arange(size).reshape(shape), 1, constant_values=size)
+    expected = [numbers[1 + y : 1 + y + height, 1 + x : 1 + x + width].ravel() for x, y in MOVES]
+    np.testing.assert_array_equal(neighbours(shape), expected, strict=True)
 
 
 @given(grids_with_costs(), RULES)
-def test_a_legal_move_costs_its_length_times_the_mean_cost_and_the_same_in_return(
-    grid_and_cell: tuple[GridMap, Cell], rule: MoveRule
-) -> None:
-    grid, _ = grid_and_cell
+def test_a_move_costs_its_length_times_the_mean_multiplier(place: Place, rule: MoveRule) -> None:
+    grid, _ = place
     assert ((grid.cost_multiplier >= 1) & (grid.cost_multiplier <= MAX_COST_MULTIPLIER)).all()
     cost = move_costs(grid.cost_multiplier, rule)
-    for action, y, x in np.argwhere(legal_moves(grid.occupancy, rule)).tolist():
+    for action, y, x in np.argwhere(grid.legal_moves(rule)).tolist():
         next_x, next_y = np.array([x, y]) + MOVES[action]
         mean_multiplier = (grid.cost_multiplier[y, x] + grid.cost_multiplier[next_y, next_x]) / 2
         assert cost[action, y, x] == pytest.approx(rule.lengths[action] * mean_multiplier)
@@ -107,9 +90,9 @@ def test_the_labels_are_those_of_scipy(seed: int, share: float, rule: MoveRule) 
 
 @given(grids_with_directions(), RULES, st.booleans(), st.data())
 def test_reachable_cells_are_those_that_a_path_joins_to_some_cells(
-    grid_and_cell: tuple[GridMap, Cell], rule: MoveRule, has_directions: bool, data: st.DataObject
+    place: Place, rule: MoveRule, has_directions: bool, data: st.DataObject
 ) -> None:
-    grid = grid_and_cell[0] if has_directions else replace(grid_and_cell[0], forbidden=None)
+    grid = place[0] if has_directions else replace(place[0], forbidden=None)
     cells = data.draw(st.lists(st.sampled_from(grid.free_cells()), min_size=1, max_size=3))
     distances = [shortest_distances(grid, cell, rule) for cell in cells]
     backward = grid.reachable(cells, rule, backward=True)
@@ -122,10 +105,8 @@ def test_reachable_cells_are_those_that_a_path_joins_to_some_cells(
 
 
 @given(grids_with_directions(), RULES, st.data())
-def test_distances_meet_bellmans_equation_and_the_path_is_as_long_as_they_say(
-    grid_and_goal: tuple[GridMap, Cell], rule: MoveRule, data: st.DataObject
-) -> None:
-    grid, goal = grid_and_goal
+def test_distances_and_paths_are_exact(place: Place, rule: MoveRule, data: st.DataObject) -> None:
+    grid, goal = place
     distance = shortest_distances(grid, goal, rule)
     legal, cost = grid.legal_moves(rule), move_costs(grid.cost_multiplier, rule)
     assert distance[goal[1], goal[0]] == 0

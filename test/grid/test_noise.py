@@ -1,5 +1,3 @@
-from __future__ import annotations
-
 from collections import Counter
 
 import numpy as np
@@ -8,23 +6,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 from strategies import RULES, occupancies
 
-from ddqn_planner.grid import (
-    UNKNOWN,
-    GridMap,
-    MoveRule,
-    Noise,
-    legal_moves,
-    scatter_obstacles,
-    shortest_path,
-)
+from ddqn_planner import GridMap, MoveRule
+from ddqn_planner.grid import UNKNOWN, Noise, legal_moves, scatter_obstacles, shortest_path
 from ddqn_planner.grid.noise import random_costs, random_requests, unknown_costs
 from ddqn_planner.training.environment import Scenario
 
 
 @pytest.mark.parametrize("noise", Noise)
-def test_one_to_five_new_obstacles_lie_where_the_noise_says_and_leave_a_path(
-    paper: Scenario, noise: Noise
-) -> None:
+def test_new_obstacles_lie_as_the_noise_says_off_a_path(paper: Scenario, noise: Noise) -> None:
     grid, rule = paper.grid, MoveRule.CORNER_CUTTING
     path = shortest_path(grid, paper.start, paper.goal, rule)
     counts, distances = set(), set()
@@ -49,10 +38,8 @@ def test_a_path_that_leaves_no_obstacle_a_place_is_refused() -> None:
     east, west = [0b00111000] * 5, [0b10000011] * 5
     ring = GridMap([[0] * 5, [0, 1, 1, 1, 0], [0] * 5], forbidden=[east, [0] * 5, west])
     for grid, noise, named in (
-        (corridor, Noise.NEAR_PATH, "left a path"),
-        (ring, Noise.ON_PATH, "left a path"),
-        (short, Noise.ON_PATH, "lies on the path"),
-        (short, Noise.NEAR_PATH, "lies on or next to the path"),
+        *((corridor, Noise.NEAR_PATH, "left a path"), (ring, Noise.ON_PATH, "left a path")),
+        *((short, Noise.ON_PATH, "on the path"), (short, Noise.NEAR_PATH, "on or next to the")),
     ):
         path = [(x, 0) for x in range(grid.width)]
         with pytest.raises(ValueError, match=named):
@@ -60,9 +47,7 @@ def test_a_path_that_leaves_no_obstacle_a_place_is_refused() -> None:
 
 
 @given(occupancies, RULES, st.integers(0, 2**32 - 1))
-def test_a_path_joins_start_and_goal_of_each_request(
-    occupancy: np.ndarray, rule: MoveRule, seed: int
-) -> None:
+def test_a_path_joins_ends_of_requests(occupancy: np.ndarray, rule: MoveRule, seed: int) -> None:
     random = np.random.default_rng(seed)
     if not legal_moves(occupancy, rule).any():
         with pytest.raises(ValueError, match="no two free cells"):

@@ -1,7 +1,5 @@
 """Real processes of the installed executables, and clients that talk to them over DDS."""
 
-from __future__ import annotations
-
 import importlib.util
 import os
 import re

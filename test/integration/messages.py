@@ -1,7 +1,5 @@
 """Messages of every kind for the property tests of the nodes: whole ones, and malformed ones."""
 
-from __future__ import annotations
-
 import array
 import math
 

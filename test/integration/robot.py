@@ -1,7 +1,5 @@
 """A planner node as its user sees it, and what is to be said of its paths."""
 
-from __future__ import annotations
-
 import itertools
 import math
 import re

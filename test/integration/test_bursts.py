@@ -1,7 +1,5 @@
 """Requests that come at once: each is answered."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any
 

@@ -1,7 +1,5 @@
 """The package as a colcon workspace builds and runs it, without `ros2`, which is not on PyPI."""
 
-from __future__ import annotations
-
 import os
 import shutil
 import subprocess

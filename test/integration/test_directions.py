@@ -1,7 +1,5 @@
 """One-way zones, from map server to planner: no path goes the wrong way, whatever is late."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from itertools import pairwise
 from pathlib import Path

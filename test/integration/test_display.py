@@ -1,7 +1,7 @@
 """What RViz shows of a field, and that nothing is computed for nobody."""
 
-from __future__ import annotations
-
+import cmath
+import math
 import time
 from pathlib import Path as FilePath
 from typing import Any
@@ -23,16 +23,11 @@ HEADER = Header(frame_id="map")
 
 def exact_field(grid: GridMap, goal: Cell) -> QField:
     """Return a field whose policy goes down the exact distances."""
-    distances = np.pad(
-        shortest_distances(grid, goal, MoveRule.ROBOT_SAFE), 1, constant_values=np.inf
-    )
+    exact = shortest_distances(grid, goal, MoveRule.ROBOT_SAFE)
+    distances = np.pad(exact, 1, constant_values=np.inf)
     beside = [np.roll(distances, (-dy, -dx), (0, 1))[1:-1, 1:-1] for dx, dy in MOVES]
-    lengths = np.hypot(*MOVES.T).reshape(-1, 1, 1)
-    return QField(
-        goal,
-        -(np.array(beside) + lengths).astype(np.float32),
-        legal_moves(grid.occupancy, MoveRule.ROBOT_SAFE),
-    )
+    q = -(np.array(beside) + np.hypot(*MOVES.T).reshape(-1, 1, 1)).astype(np.float32)
+    return QField(goal, q, legal_moves(grid.occupancy, MoveRule.ROBOT_SAFE))
 
 
 def arrows_of(marker: Marker) -> np.ndarray:
@@ -50,26 +45,21 @@ def test_each_free_cell_except_the_goal_has_its_greedy_arrow(
     assert (marker.type, marker.action) == (Marker.LINE_LIST, Marker.ADD)
     assert marker.header.frame_id == "map"
     assert marker.pose.orientation.w == 1.0
-    assert marker.scale.x > 0
-    assert marker.color.a > 0
-    found = {}
-    for shaft_tail, tip, *barbs in arrows_of(marker):
-        cell = grid.world_to_cell(*(shaft_tail + tip) / 2)
-        assert (shaft_tail + tip) / 2 == pytest.approx(grid.cell_to_world(cell))
-        found[cell] = np.subtract(tip, shaft_tail)
-        assert barbs[0] == pytest.approx(tip)
-        assert barbs[2] == pytest.approx(tip)
+    assert min(marker.scale.x, marker.color.a) > 0
+    found = set()
+    for tail, tip, tip_1, barb_1, tip_2, barb_2 in (arrows_of(marker) @ [1, 1j]).tolist():
+        assert [tip_1, tip_2] == pytest.approx([tip, tip])
+        middle = (tail + tip) / 2
+        x, y = cell = grid.world_to_cell(middle.real, middle.imag)
+        assert middle == pytest.approx(complex(*grid.cell_to_world(cell)))
+        found.add(cell)
         # A barb lies behind the tip, and the two are mirrored.
-        sides = np.cross(
-            np.append(found[cell], 0), np.append([barbs[1] - tip, barbs[3] - tip], [[0], [0]], 1)
-        )
-        assert sides[0, 2] == pytest.approx(-sides[1, 2])
-        assert max((barbs[1] - tip) @ found[cell], (barbs[3] - tip) @ found[cell]) < 0
-    assert set(found) == set(grid.free_cells()) - {(5, 5)}
-    for (x, y), direction in found.items():
-        dx, dy = MOVES[field.policy[y, x]]
-        ahead = np.subtract(grid.cell_to_world((x + dx, y + dy)), grid.cell_to_world((x, y)))
-        assert direction / np.linalg.norm(direction) == pytest.approx(ahead / np.linalg.norm(ahead))
+        ahead = cmath.rect(1.0, origin[2] + field.policy[y, x] * math.pi / 4)
+        along, *barbs = ((point / ahead) for point in (tip - tail, barb_1 - tip, barb_2 - tip))
+        assert along == pytest.approx(abs(along))
+        assert barbs[0] == pytest.approx(barbs[1].conjugate())
+        assert barbs[0].real < 0 != barbs[0].imag
+    assert found == set(grid.free_cells()) - {(5, 5)}
 
 
 def test_a_new_message_replaces_the_old_one_and_none_deletes_it() -> None:
@@ -121,9 +111,9 @@ def test_what_nobody_asks_for_is_not_computed_and_what_somebody_sees_is_of_the_g
     gap = tmp_path / "gap"
     with run_robot("/seen", {}, hall, sitecustomize=TOLD.format(gap=str(gap))) as robot:
         client, node = robot.client, robot.node
-        client.node.destroy_subscription(
-            next(it for it in client.node.subscriptions if it.topic_name == "/seen/planner/value")
-        )
+        value = "/seen/planner/value"
+        (seen,) = (each for each in client.node.subscriptions if each.topic_name == value)
+        client.node.destroy_subscription(seen)
         for _ in range(2):
             robot.set_map(robot.stamped_map())
         assert "a map is inflated" not in node.log

@@ -1,7 +1,5 @@
 """In what order the nodes' executor calls what is ready."""
 
-from __future__ import annotations
-
 import threading
 
 import pytest
@@ -21,7 +19,7 @@ def test_with_another_rclpy_its_own_executor_runs_the_node(monkeypatch: pytest.M
     rclpy.shutdown()
 
 
-def test_a_callback_goes_on_as_soon_as_it_can_then_the_next_of_its_group_but_none_destroyed(
+def test_callbacks_resume_in_order_unless_destroyed(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(of_nodes, "EVENTS_PERIOD", 1000.0)  # else it looks again after that

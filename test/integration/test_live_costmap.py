@@ -1,7 +1,5 @@
 """A costmap, its updates, and poses in other frames over DDS."""
 
-from __future__ import annotations
-
 import array
 import itertools
 from collections.abc import Callable, Iterator
@@ -47,9 +45,7 @@ def robot(run_robot: Any, costmap: np.ndarray) -> Iterator[Robot]:
         yield robot
 
 
-def test_a_costmap_is_planned_on_where_the_same_values_as_a_map_leave_no_path(
-    robot: Robot,
-) -> None:
+def test_a_costmap_is_planned_on_where_the_same_values_as_a_map_leave_no_path(robot: Robot) -> None:
     robot.send_goal(robot.pose((35, 5)))
     robot.wait_for_path((5, 5), (35, 5))
     robot.set(map_type="map")

@@ -61,9 +61,8 @@ def test_a_recording_holds_what_the_nodes_published(
         client.publish("planner/value", occupancy_message(field, 0.5, ORIGIN, HEADER), LATCHED)
         client.publish("map", message, LATCHED)
         for topic, cells in (("plan", CELLS["plan"]), ("trainer/episode", CELLS["episode"])):
-            client.publish(
-                topic, path_message(*along(cells, grid), HEADER, Quaternion(w=1.0)), LATCHED
-            )
+            path = path_message(*along(cells, grid), HEADER, Quaternion(w=1.0))
+            client.publish(topic, path, LATCHED)
         client.publish("trainer/average_reward", Float32(data=-0.5))
         deadline = time.monotonic() + TIMEOUT
         wanted = {*(f"map/{layer}" for layer in live_view.LAYERS), "reward"}

@@ -1,5 +1,3 @@
-from __future__ import annotations
-
 import os
 import re
 import signal
@@ -35,8 +33,8 @@ def map_file(tmp_path_factory: pytest.TempPathFactory, small_values: np.ndarray)
 
 @pytest.fixture(scope="module")
 def server(run_node: Any, map_file: Path) -> Iterator[Any]:
-    parameters = {"frame_id": "site", "topic_name": "plant", "seed": 3}
-    parameters["yaml_filename"] = str(map_file)
+    file = {"yaml_filename": str(map_file)}
+    parameters = {"frame_id": "site", "topic_name": "plant", "seed": 3, **file}
     with run_node("map_server_node", parameters, namespace=NAMESPACE) as node:
         yield node
         assert "Traceback" not in node.log

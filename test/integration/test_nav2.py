@@ -1,7 +1,5 @@
 """Nav2's actions: what decides in them without Nav2's types, and the real ones where installed."""
 
-from __future__ import annotations
-
 import sys
 import threading
 from collections.abc import Callable, Coroutine, Iterator
@@ -147,9 +145,7 @@ def end(execution: Coroutine[Any, Any, Any]) -> Any:
 @pytest.mark.parametrize(
     ("outcome", "state", "code"), [(FOUND, "succeeded", 0), (NO_PATH, "aborted", 308)]
 )
-def test_a_goal_is_planned_as_asked_and_ends_with_its_outcome(
-    outcome: Outcome, state: str, code: int
-) -> None:
+def test_a_goal_ends_with_the_outcome_of_its_plan(outcome: Outcome, state: str, code: int) -> None:
     server, first, second = Server(), Handle(use_start=False), Handle(goals=3)
     server.begin(first).close()
     execution = server.begin(second)
@@ -195,9 +191,7 @@ def test_goals_are_rejected_while_the_node_is_not_active_and_aborted_when_it_sto
     assert server.action.accept(handle.request) is GoalResponse.REJECT
 
 
-def test_the_services_of_actions_have_the_queues_of_the_others(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_the_services_of_actions_have_queues_as_others(monkeypatch: pytest.MonkeyPatch) -> None:
     kind = SimpleNamespace(Result=Result)
     types = {"ComputePathThroughPoses": kind, "ComputePathToPose": kind, "IsPathValid": None}
     for module in ("nav2_msgs", "nav2_msgs.action", "nav2_msgs.srv"):
@@ -406,9 +400,7 @@ def test_a_path_is_valid_while_it_is_free(navigator: Navigator) -> None:
     assert not is_valid(path)
 
 
-def test_goals_that_wait_are_canceled_preempted_and_stopped(
-    run_waiting: Any, load_gate: Path
-) -> None:
+def test_waiting_goals_are_canceled_preempted_stopped(run_waiting: Any, load_gate: Path) -> None:
     pytest.importorskip("nav2_msgs.action", reason=REASON)
     # Plans wait for the planner's model, as they wait for a field.
     with run_waiting("/waiting") as robot:

@@ -1,7 +1,5 @@
 """The nodes and RViz as docs/nodes.md tells of them; no request for parameters ends a node."""
 
-from __future__ import annotations
-
 import importlib.util
 import re
 import sys
@@ -17,7 +15,7 @@ import pytest
 import yaml
 from client import Client, wait_for
 from rcl_interfaces import srv
-from rcl_interfaces.msg import Parameter, ParameterDescriptor, ParameterType, ParameterValue
+from rcl_interfaces.msg import Parameter, ParameterDescriptor, ParameterValue
 
 from ddqn_planner.nodes.driving import NAVIGATION
 from ddqn_planner.nodes.poses import has_tf
@@ -26,12 +24,7 @@ ROOT = Path(__file__).resolve().parents[2]
 DOCS = (ROOT / "docs" / "nodes.md").read_text(encoding="utf-8")
 NODES = ["map_server", "planner", "trainer"]
 NAMES = ["", "no_such", "a.b", "/", "ü" * 300]
-TYPES = {
-    ParameterType.PARAMETER_BOOL: "bool",
-    ParameterType.PARAMETER_INTEGER: "integer",
-    ParameterType.PARAMETER_DOUBLE: "double",
-    ParameterType.PARAMETER_STRING: "string",
-}
+TYPES = ["not set", "bool", "integer", "double", "string"]  # as rcl_interfaces numbers them
 OF_EVERY_NODE = {"/rosout", "/parameter_events", "use_sim_time", "start_type_description_service"}
 OF_DRIVING = {"~/experience_saved", "~/slowness", "~/forget", "odom", NAVIGATION}
 """What the trainer has only where it learns from driving."""
@@ -112,9 +105,8 @@ def test_each_parameter_is_documented_as_it_is(running: Running) -> None:
     for entry in described.descriptors:
         assert entry.description
         value = running.client.get_parameter(running.name, entry.name)
-        text = str(value).lower() if isinstance(value, bool) else repr(value)
-        default = f"`{text}`".replace("''", "")
-        found[entry.name] = [TYPES[entry.type], default, range_of(entry)]
+        text = str(value).lower() if isinstance(value, bool) else repr(value).replace("''", "")
+        found[entry.name] = [TYPES[entry.type], f"`{text}`", range_of(entry)]
     if running.name == "planner":
         found["follow_trainer"][1] = "`false`"
     assert found == documented_parameters(running.name)
@@ -233,13 +225,11 @@ def test_what_a_node_cannot_start_with_is_said_and_ends_with_1(
 
 # RViz
 
-MESSAGES = {
-    "rviz_default_plugins/Map": "nav_msgs/OccupancyGrid",
-    "rviz_default_plugins/MarkerArray": "visualization_msgs/MarkerArray",
-    "rviz_default_plugins/Path": "nav_msgs/Path",
-    "rviz_default_plugins/SetGoal": "geometry_msgs/PoseStamped",
-    "rviz_default_plugins/SetInitialPose": "geometry_msgs/PoseWithCovarianceStamped",
-}
+MESSAGES = {"Map": "nav_msgs/OccupancyGrid", "Path": "nav_msgs/Path"}
+MESSAGES |= {"MarkerArray": "visualization_msgs/MarkerArray"}
+MESSAGES |= {"SetGoal": "geometry_msgs/PoseStamped"}
+MESSAGES |= {"SetInitialPose": "geometry_msgs/PoseWithCovarianceStamped"}
+"""By the class of a display or a tool of rviz_default_plugins."""
 SHOWN = {"/map", "/plan", "/planner/value", "/planner/policy", "/trainer/episode"}
 SET = {"/initialpose", "/goal_pose"}
 
@@ -255,13 +245,14 @@ def test_each_display_and_tool_has_a_topic_of_the_nodes() -> None:
     displays = {display["Topic"]["Value"]: display for display in manager["Displays"]}
     tools = {tool["Topic"]["Value"]: tool for tool in manager["Tools"] if "Topic" in tool}
     assert (set(displays), set(tools)) == (SHOWN, SET)
-    for way, entries in (("publishes", displays), ("subscribes", tools)):
-        for name, entry in entries.items():
-            message_type, _, latched = documented[way, name].partition(", ")
-            assert MESSAGES[entry["Class"]] == message_type
-            durability = "Transient Local" if latched == "latched" else "Volatile"
-            assert entry["Topic"]["Durability Policy"] == durability
-            assert entry["Topic"]["Reliability Policy"] == "Reliable"
+    for name, entry in (displays | tools).items():
+        way = "publishes" if name in displays else "subscribes"
+        message_type, _, latched = documented[way, name].partition(", ")
+        assert entry["Class"] in {f"rviz_default_plugins/{k}" for k in MESSAGES}
+        assert MESSAGES[entry["Class"].removeprefix("rviz_default_plugins/")] == message_type
+        durability = "Transient Local" if latched == "latched" else "Volatile"
+        assert entry["Topic"]["Durability Policy"] == durability
+        assert entry["Topic"]["Reliability Policy"] == "Reliable"
     assert all(display["Enabled"] for display in displays.values())
     assert displays["/map"]["Draw Behind"]
     value = displays["/planner/value"]

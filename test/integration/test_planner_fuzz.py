@@ -1,7 +1,5 @@
 """Whatever comes in, the planner node answers, says why, and goes on with what it had."""
 
-from __future__ import annotations
-
 import math
 from typing import Any
 

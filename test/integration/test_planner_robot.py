@@ -1,7 +1,5 @@
 """A robot with a body, that is somewhere, and goals that it can nearly reach."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator
 from typing import Any

@@ -1,7 +1,5 @@
 """Poses in other frames than the map's, given the transforms, and where the robot is by TF."""
 
-from __future__ import annotations
-
 import re
 import sys
 from collections.abc import Callable
@@ -137,10 +135,9 @@ def refusal(status: str, get: Callable[[], object]) -> str:
 
 
 def test_a_pose_is_transformed_by_the_transform_of_its_time_or_refused(listening: Any) -> None:
+    asked_found = (100, 100), (105, 105), (0, 110)  # the last one has no time
     for asked, known, found in (
-        (100, (100, 110), 100),
-        (105, (100, 110), 105),
-        (0, (100, 110), 110),  # a pose without a time
+        *((asked, (100, 110), found) for asked, found in asked_found),
         (99.5, (100,), 100),  # from just before the node listened
     ):
         in_map = listening(*known).to_map("the goal", pose_at(asked), "map")
@@ -152,19 +149,13 @@ def test_a_pose_is_transformed_by_the_transform_of_its_time_or_refused(listening
         (pose_at(110.5), r"the goal's frame is 'odom'.*extrapol.*; publish"),
         (pose_at(100, "moon"), r"the map's, 'map' .*moon does not exist"),
     ):
-        assert re.search(
-            reason, refusal("TF_ERROR", partial(frames.to_map, "the goal", pose, "map"))
-        )
+        refused = refusal("TF_ERROR", partial(frames.to_map, "the goal", pose, "map"))
+        assert re.search(reason, refused)
 
 
 def test_a_newest_transform_beyond_the_tolerance_is_not_used(listening: Any) -> None:
-    for stamp, words in (
-        (NOW - 6, "6 s old"),
-        (NOW + 6, "6 s in the future"),
-        (NOW - 2, ""),
-        (NOW + 2, ""),
-        (0, ""),
-    ):
+    late = {NOW - 6: "6 s old", NOW + 6: "6 s in the future"}
+    for stamp, words in (late | dict.fromkeys((NOW - 2, NOW + 2, 0), "")).items():
         frames = listening(stamp, tolerance=5.0)
         start = StartSource(Node(), frames, Refusals(None), lambda: "map", lambda: None)
         goal_in_map = partial(frames.to_map, "the goal", pose_at(0), "map")

@@ -1,7 +1,5 @@
 """What a planner loads, and what it answers before it has its model and its first map."""
 
-from __future__ import annotations
-
 import signal
 from pathlib import Path
 from typing import Any
@@ -11,9 +9,7 @@ from diagnostic_msgs.msg import DiagnosticStatus
 from integration.robot import GOAL, START, TIMEOUT, ask_for_plan, values_of
 
 
-def test_requests_wait_for_the_first_map_and_need_no_torch(
-    run_waiting: Any, load_gate: Path, model: Path
-) -> None:
+def test_requests_wait_for_the_first_map(run_waiting: Any, load_gate: Path, model: Path) -> None:
     load_gate.touch()
     with run_waiting("/early") as robot:
         plan, answered = ask_for_plan(robot)
@@ -54,9 +50,7 @@ def test_requests_wait_for_the_first_model_and_another_one_that_is_set_meanwhile
         assert "refused" not in robot.node.log
 
 
-def test_a_first_model_that_cannot_be_loaded_answers_the_requests_that_waited(
-    run_waiting: Any, tmp_path: Path, load_gate: Path
-) -> None:
+def test_a_broken_model_answers_requests(run_waiting: Any, tmp_path: Path, load_gate: Path) -> None:
     broken = tmp_path / "any_map.safetensors"
     broken.write_text("a model")
     with run_waiting("/broken", {"model": str(broken)}) as robot:

@@ -1,29 +1,19 @@
-from __future__ import annotations
-
 import math
 from functools import cache
 from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as numpy_st
 from networks import random_network
-from strategies import grids_with_costs, grids_with_free_cell
+from strategies import Place, grids_with_costs, grids_with_free_cell
 
+from ddqn_planner import MoveRule
 from ddqn_planner.cli import main
-from ddqn_planner.grid import (
-    MAX_COST_MULTIPLIER,
-    MOVES,
-    OCCUPIED,
-    UNKNOWN,
-    Cell,
-    GridMap,
-    MoveRule,
-    path_cost,
-    shortest_distances,
-)
+from ddqn_planner.grid import MAX_COST_MULTIPLIER, OCCUPIED, UNKNOWN
+from ddqn_planner.grid.moves import MOVES, path_cost, shortest_distances
 from ddqn_planner.model import ModelMetadata, PropagationQNetwork, load_model
 from ddqn_planner.model.certificate import MAX_FILTERS, MOVE_RULES, Certificate, _margins, certify
 from ddqn_planner.model.move_costs import every_patch, legal_in_patches
@@ -92,13 +82,8 @@ def true_multipliers(patch_B9: np.ndarray) -> np.ndarray:
 CERTIFICATE = certify(any_map())
 
 
-# What is proved holds
-
-
 @given(patches(), st.sampled_from(MoveRule))
-def test_decisions_and_costs_of_any_patch_are_as_certified(
-    patch_B9: np.ndarray, rule: MoveRule
-) -> None:
+def test_decisions_and_costs_are_as_certified(patch_B9: np.ndarray, rule: MoveRule) -> None:
     network, certificate = any_map(), CERTIFICATE
     feature_BI, legal_BA = network.features(patch_B9, rule), legal_in_patches(patch_B9, rule)
     np.testing.assert_array_equal(network.success(feature_BI) > 0.5, legal_BA)
@@ -128,25 +113,6 @@ def test_no_margin_of_any_network_is_above_a_sampled_one(
     assert (margin_BA <= sampled_BA).all()
 
 
-@settings(max_examples=12)
-@given(patches(), st.integers(0, 99))
-def test_decisions_that_are_wrong_for_some_costs_are_open_or_wrong(
-    patch_B9: np.ndarray, seed: int
-) -> None:
-    network = any_map()
-    random = np.random.default_rng(seed)
-    for name in ("convolution.weight", "hidden.weight"):
-        network.tensors[name] *= random.normal(1, 0.5, network.tensors[name].shape)
-    wrong = set()
-    for rule in MOVE_RULES:
-        possible_BA = network.success(network.features(patch_B9, rule)) > 0.5
-        for row, action in np.argwhere(possible_BA != legal_in_patches(patch_B9, rule)).tolist():
-            wrong.add((rule, tuple(patch_B9[row] == OCCUPIED), action))
-    certificate = certify(network)
-    assert len(wrong) <= certificate.wrong + certificate.undecided
-    assert not (wrong and certificate.proved)
-
-
 @cache
 def unsure_and_noisy(share: float, noise: float) -> tuple[PropagationQNetwork, Certificate]:
     network = any_map()
@@ -164,9 +130,9 @@ def unsure_and_noisy(share: float, noise: float) -> tuple[PropagationQNetwork, C
     st.booleans(),
 )
 def test_no_path_costs_more_than_certified(
-    grid_and_goal: tuple[GridMap, Cell], rule: MoveRule, noise: float, share: float, timed: bool
+    place: Place, rule: MoveRule, noise: float, share: float, timed: bool
 ) -> None:
-    grid, goal = grid_and_goal
+    grid, goal = place
     if timed:
         slowness = np.linspace(1, 9, grid.occupancy.size, dtype=np.float32)
         grid = grid.with_slowness(slowness.reshape(grid.occupancy.shape), 1.0)
@@ -183,9 +149,6 @@ def test_no_path_costs_more_than_certified(
             cost = path_cost(plan.cells, grid.multipliers(plan.cells), rule)
             bound = (1 + certificate.path_error) * optimum[start[1], start[0]]
             assert cost <= bound * (1 + 1e-6)
-
-
-# What is not right is not proved
 
 
 def test_a_decision_that_only_costs_make_wrong_is_found() -> None:
@@ -229,9 +192,6 @@ def test_the_proof_of_a_large_network_is_not_tried() -> None:
     assert certify(network) == Certificate(4096, 4096, 0, 0.0, math.inf)
 
 
-# How good the bounds are
-
-
 def test_a_network_without_costs_is_certified_exactly_under_its_rule() -> None:
     rule = MoveRule.ROBOT_SAFE
     network = right_network("propagation", rule)
@@ -261,12 +221,7 @@ def test_the_error_of_the_costs_is_the_greatest_one() -> None:
     assert certificate.path_error == pytest.approx(1.3 / 0.7 - 1, abs=1e-3)
 
 
-# What a user reads
-
-
-def test_certify_prints_the_proof_of_the_documentation_or_why_there_is_none(
-    capsys: pytest.CaptureFixture[str],
-) -> None:
+def test_certify_prints_the_proof_of_the_documentation(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["certify", "any_map"]) == 0
     printed = capsys.readouterr().out
     assert printed.startswith("proved: all 4,096 decisions, ")

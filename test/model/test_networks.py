@@ -1,12 +1,10 @@
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
 from networks import random_network
-from strategies import grids_with_costs, grids_with_free_cell
+from strategies import Place, grids_with_costs, grids_with_free_cell
 
 from ddqn_planner.grid import OCCUPIED, Cell, GridMap, MoveRule
 from ddqn_planner.model import NETWORKS, networks
@@ -31,9 +29,6 @@ SIZES = {
 }
 
 
-# The same as the torch modules
-
-
 @pytest.mark.parametrize("name", NETWORKS)
 def test_a_module_has_the_tensors_of_its_network(name: str) -> None:
     module, shapes = MODULES[name](**SIZES[name]), NETWORKS[name].shapes(SIZES[name])
@@ -48,10 +43,8 @@ def test_a_module_has_the_tensors_of_its_network(name: str) -> None:
 
 
 @given(grids_with_free_cell(), st.sampled_from([0, 1, 6]), st.integers(0, 99))
-def test_the_papers_network_answers_in_each_cell_as_its_module(
-    grid_and_goal: tuple[GridMap, Cell], hidden_units: int, seed: int
-) -> None:
-    grid, goal = grid_and_goal
+def test_the_papers_network_is_its_layers(place: Place, hidden_units: int, seed: int) -> None:
+    grid, goal = place
     sizes = {"height": grid.height, "width": grid.width, "filters": 3, "hidden_units": hidden_units}
     network = random_network("paper", seed, **sizes)
     q = network.q_values(grid, goal, MoveRule.ROBOT_SAFE)
@@ -60,17 +53,19 @@ def test_the_papers_network_answers_in_each_cell_as_its_module(
     background = observation_background(grid.occupancy, goal)
     cells = np.arange(grid.occupancy.size)
     observations = torch.from_numpy(observe(background, cells, grid.occupancy.shape))
+    module = PaperModule.from_numpy(network)
     with torch.inference_mode():
-        states = PaperModule.windows(observations)
-        expected = PaperModule.from_numpy(network)(states).T.reshape(q.shape)
-    np.testing.assert_allclose(q, expected.numpy(), rtol=1e-5, atol=1e-5)
+        answer = module(PaperModule.windows(observations))
+        features = module.convolution(observations.unsqueeze(1)).relu().flatten(1)
+        if module.hidden is not None:
+            features = module.hidden(features).relu()
+        torch.testing.assert_close(answer, module.fully_connected(features))
+    np.testing.assert_allclose(q, answer.T.reshape(q.shape).numpy(), rtol=1e-5, atol=1e-5)
 
 
 @given(grids_with_costs(), st.sampled_from(MoveRule), st.integers(0, 99))
-def test_the_propagation_networks_answer_on_each_patch_as_their_modules(
-    grid_and_goal: tuple[GridMap, Cell], rule: MoveRule, seed: int
-) -> None:
-    grid, _ = grid_and_goal
+def test_propagation_networks_answer_as_modules(place: Place, rule: MoveRule, seed: int) -> None:
+    grid, _ = place
     features = AnyMapQNetwork.features(patches(grid.occupancy, grid.cost), rule)
     for name, inputs in (("any_map", features), ("propagation", features[:, :9])):
         network = random_network(name, seed, filters=5)
@@ -87,8 +82,8 @@ def test_the_propagation_networks_answer_on_each_patch_as_their_modules(
 
 
 @given(grids_with_free_cell())
-def test_the_observation_shows_four_kinds_of_cell(grid_and_goal: tuple[GridMap, Cell]) -> None:
-    grid, goal = grid_and_goal
+def test_the_observation_shows_four_kinds_of_cell(place: Place) -> None:
+    grid, goal = place
     background = observation_background(grid.occupancy, goal)
     shape = grid.occupancy.shape
     observations = observe(background, np.arange(grid.occupancy.size), shape)
@@ -101,10 +96,8 @@ def test_the_observation_shows_four_kinds_of_cell(grid_and_goal: tuple[GridMap, 
 
 
 @given(grids_with_costs())
-def test_a_patch_is_the_3x3_cells_and_outside_is_occupied(
-    grid_and_goal: tuple[GridMap, Cell],
-) -> None:
-    grid, _ = grid_and_goal
+def test_a_patch_is_the_3x3_cells_and_outside_is_occupied(place: Place) -> None:
+    grid, _ = place
     for cost in (None, grid.cost):
         cells = np.where(grid.occupancy, OCCUPIED, 0 if cost is None else cost)
         padded = np.pad(cells, 1, constant_values=OCCUPIED)
@@ -125,22 +118,6 @@ def test_the_features_tell_obstacles_costs_unknown_cells_and_the_rule_apart() ->
     assert features[18:27].tolist() == [1, 0, 0, 0, 0, 0, 0, 0, 0]
     assert features[27] == 0
     assert AnyMapQNetwork.features(patch, MoveRule.CORNER_CUTTING)[0, 27] == 1
-
-
-# The paper's network
-
-
-@pytest.mark.parametrize("hidden_units", [0, 6])
-def test_the_network_is_the_papers_convolution_relu_and_fully_connected_layers(
-    hidden_units: int,
-) -> None:
-    module = PaperModule(7, 10, filters=5, hidden_units=hidden_units)
-    observations = torch.randn(6, 7, 10)
-    features = module.convolution(observations.unsqueeze(1)).relu().flatten(1)
-    if module.hidden is not None:
-        features = module.hidden(features).relu()
-    answer = module(module.windows(observations))
-    torch.testing.assert_close(answer, module.fully_connected(features))
 
 
 # The networks for maps of any size
@@ -182,12 +159,8 @@ def test_a_move_is_tried_until_it_succeeds_if_it_does_more_often_than_not(name: 
         ):
             q = q_values(network, grid, (1, 0))
             assert q[0, 0, 0] == pytest.approx(-cost * multiplier)
-
-
-def test_a_cost_above_the_upper_bound_counts_as_the_bound() -> None:
-    grid = GridMap(np.zeros((1, 2)))
-    for multiplier, used in ((99.0, 99.0), (1e4, 100.0)):
-        q = q_values(answering("any_map", 0.9, multiplier), grid, (1, 0))
+    for multiplier, used in ((99.0, 99.0), (1e4, 100.0)):  # no more than the upper bound
+        q = q_values(answering("any_map", 0.9, multiplier), GridMap(np.zeros((1, 2))), (1, 0))
         assert q[0, 0, 0] == pytest.approx(-used / 0.9)
 
 

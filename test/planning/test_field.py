@@ -1,5 +1,3 @@
-from __future__ import annotations
-
 import copy
 import sys
 from collections.abc import Callable
@@ -16,19 +14,12 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as numpy_st
 from networks import ANY_MAP, new_planner
 from random_maps import generate_map
-from strategies import GRIDS, RULES, cells_of
+from strategies import GRIDS, RULES, Place, cells_of
 
 from ddqn_planner import GridMap, MoveRule, PlanStatus
-from ddqn_planner.grid import (
-    MOVES,
-    Cell,
-    copies,
-    grid_map,
-    legal_moves,
-    path_cost,
-    shortest_distances,
-)
+from ddqn_planner.grid import Cell, copies, grid_map
 from ddqn_planner.grid.grid_map import LAYERS
+from ddqn_planner.grid.moves import MOVES, legal_moves, path_cost, shortest_distances
 from ddqn_planner.grid.noise import random_requests
 from ddqn_planner.model.move_costs import MoveCosts
 from ddqn_planner.planning import field as fields
@@ -49,9 +40,7 @@ def assert_same(field: Any, fresh: Any) -> None:
 
 
 @given(st.integers(2, 40), st.integers(2, 40), st.data())
-def test_a_straight_rollout_keeps_to_the_line_through_free_space(
-    width: int, height: int, data: st.DataObject
-) -> None:
+def test_a_straight_rollout_keeps_to_the_line(width: int, height: int, data: st.DataObject) -> None:
     grid = GridMap(np.zeros((height, width), np.bool_))
     start, goal = data.draw(cells_of(grid)), data.draw(cells_of(grid))
     path = fresh_field(grid, goal, MoveRule.ROBOT_SAFE).rollout(start, straight=True).path
@@ -60,10 +49,8 @@ def test_a_straight_rollout_keeps_to_the_line_through_free_space(
 
 
 @given(GRIDS, RULES, st.data())
-def test_the_path_is_the_same_whatever_was_asked_before(
-    grid_and_goal: tuple[GridMap, Cell], rule: MoveRule, data: st.DataObject
-) -> None:
-    grid, goal = grid_and_goal
+def test_no_path_depends_on_the_past(place: Place, rule: MoveRule, data: st.DataObject) -> None:
+    grid, goal = place
     grown, whole = fresh_field(grid, goal, rule), fresh_field(grid, goal, rule)
     _ = whole.value
     exact = shortest_distances(grid, goal, rule)
@@ -71,10 +58,9 @@ def test_the_path_is_the_same_whatever_was_asked_before(
         limit, straight = data.draw(st.integers(0, 30)), data.draw(st.booleans())
         with pytest.MonkeyPatch.context() as patch:
             patch.setattr(kernels, "CAPACITY", data.draw(st.sampled_from((9, kernels.CAPACITY))))
-            while (
-                plan := grown.rollout(start, straight, limit)
-            ).status is PlanStatus.ROLLOUT_TRAPPED:
-                pass  # each call visits more cells
+            plan = grown.rollout(start, straight, limit)
+            while plan.status is PlanStatus.ROLLOUT_TRAPPED:  # each call visits more cells
+                plan = grown.rollout(start, straight, limit)
         for field in (whole, fresh_field(grid, goal, rule)):
             assert plan == field.rollout(start, straight)
         assert (plan.status is PlanStatus.NO_PATH) == np.isinf(exact[start[::-1]])
@@ -85,10 +71,8 @@ def test_the_path_is_the_same_whatever_was_asked_before(
 
 
 @given(GRIDS, RULES)
-def test_the_whole_field_is_that_of_the_network(
-    grid_and_goal: tuple[GridMap, Cell], rule: MoveRule
-) -> None:
-    grid, goal = grid_and_goal
+def test_the_whole_field_is_that_of_the_network(place: Place, rule: MoveRule) -> None:
+    grid, goal = place
     field, of_q = fresh_field(grid, goal, rule), network_field(ANY_MAP.network, grid, goal, rule)
     np.testing.assert_array_equal(field.legal, grid.legal_moves(rule))
     np.testing.assert_allclose(field.q, np.where(field.legal, of_q.q, -np.inf), rtol=1e-5)
@@ -104,8 +88,7 @@ def test_a_request_visits_few_cells_of_a_large_map() -> None:
     assert field.rollout_if_known((300, 300)) is None
     assert field.nbytes <= 10 * grid.occupancy.size
 
-
-def test_a_request_without_a_path_does_not_visit_the_whole_map() -> None:
+    # Nor does one without a path visit all.
     occupancy = np.zeros((200, 200))
     occupancy[:, 10] = 1
     grid, planner = GridMap(occupancy), new_planner()
@@ -114,9 +97,6 @@ def test_a_request_without_a_path_does_not_visit_the_whole_map() -> None:
     assert isinstance(field, DistanceField)
     assert not field.is_whole
     assert np.count_nonzero(field.known.distance) < 0.6 * occupancy.size
-
-
-# Values, against oracles
 
 
 PATCH_IDS = numpy_st.arrays(
@@ -239,13 +219,9 @@ def changed_maps(draw: st.DrawFn, grid: GridMap) -> GridMap:
 @settings(max_examples=400)
 @given(GRIDS, RULES, st.floats(0, 6), st.integers(1, 4), st.data())
 def test_a_repaired_field_is_a_fresh_one_bit_for_bit(
-    grid_and_goal: tuple[GridMap, Cell],
-    rule: MoveRule,
-    yaw: float,
-    changes: int,
-    data: st.DataObject,
+    place: Place, rule: MoveRule, yaw: float, changes: int, data: st.DataObject
 ) -> None:
-    plain, goal = grid_and_goal
+    plain, goal = place
     goals = [goal, *data.draw(st.lists(st.sampled_from(plain.free_cells()), max_size=2))]
     grid = replace(plain, resolution=0.05, origin=(1.25, -3.0, yaw))
     fields.REPAIRED = data.draw(st.sampled_from([1, 3, 300]), label="limit of a repair")
@@ -269,10 +245,8 @@ def test_a_repaired_field_is_a_fresh_one_bit_for_bit(
 
 @settings(max_examples=150)
 @given(GRIDS, RULES, st.data())
-def test_a_map_made_of_any_earlier_one_is_planned_on_as_a_new_one(
-    grid_and_goal: tuple[GridMap, Cell], rule: MoveRule, data: st.DataObject
-) -> None:
-    maps, planner = [grid_and_goal[0]], new_planner()
+def test_a_map_made_of_others_is_as_new(place: Place, rule: MoveRule, data: st.DataObject) -> None:
+    maps, planner = [place[0]], new_planner()
     for seed in range(data.draw(st.integers(1, 8))):
         grid = data.draw(st.sampled_from(maps))
         random = np.random.default_rng(seed)
@@ -352,14 +326,9 @@ def test_a_repair_that_takes_too_long_leaves_the_older_field_as_it_was() -> None
 @settings(max_examples=150)
 @given(GRIDS, RULES, st.booleans(), st.integers(0, 2), st.integers(1, 1500), st.data())
 def test_a_field_that_is_interrupted_anywhere_is_as_a_new_one(
-    grid_and_goal: tuple[GridMap, Cell],
-    rule: MoveRule,
-    whole: bool,
-    interrupted_step: int,
-    line: int,
-    data: st.DataObject,
+    place: Place, rule: MoveRule, whole: bool, interrupted_step: int, line: int, data: st.DataObject
 ) -> None:
-    grid, goal = grid_and_goal
+    grid, goal = place
     planner, start = new_planner(), data.draw(st.sampled_from(grid.free_cells()))
     x, y = data.draw(st.sampled_from(grid.free_cells()))
     changed = grid.with_patch([[(x, y) != goal]], x, y)
@@ -416,25 +385,18 @@ def test_after_too_many_changes_both_fields_are_kept(monkeypatch: pytest.MonkeyP
     assert kept[:2] == kept[2:]
 
 
-@pytest.mark.parametrize(
-    ("resolution", "origin", "shift"),
-    [
-        (0.05, (0.0, 0.0, 0.0), (0, 0)),
-        (float(np.float32(0.05)), (-1.0, 0.5, 0.0), (20, -10)),
-        (0.05, (0.02, 0.0, 0.0), None),
-        (0.1, (0.0, 0.0, 0.0), None),
-        (0.05, (0.0, 0.0, 0.1), None),
-        (0.05, (0.0, 0.0, 0.005), None),
-    ],
-)
-def test_maps_are_compared_where_one_is_the_other_shifted_by_whole_cells(
-    resolution: float, origin: tuple[float, float, float], shift: Cell | None
-) -> None:
+def test_maps_are_compared_where_one_is_the_other_shifted_by_whole_cells() -> None:
     cells = np.zeros((9, 9))
     old = GridMap(cells, 0.05)
-    assert fields.shift_between(old, GridMap(cells, resolution, origin)) == shift
-    with_costs = GridMap(cells, resolution, origin, np.ones((9, 9), dtype=np.int8))
-    assert fields.shift_between(old, with_costs) is None
+    for resolution, origin, shift in (
+        (0.05, (0.0, 0.0, 0.0), (0, 0)),
+        (float(np.float32(0.05)), (-1.0, 0.5, 0.0), (20, -10)),
+        *((0.05, (0.0, 0.0, yaw), None) for yaw in (0.1, 0.005)),
+        *((0.05, (0.02, 0.0, 0.0), None), (0.1, (0.0, 0.0, 0.0), None)),
+    ):
+        assert fields.shift_between(old, GridMap(cells, resolution, origin)) == shift
+        with_costs = GridMap(cells, resolution, origin, np.ones((9, 9), dtype=np.int8))
+        assert fields.shift_between(old, with_costs) is None
 
 
 def test_threads_share_a_planner_while_the_map_changes() -> None:

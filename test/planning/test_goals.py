@@ -1,7 +1,5 @@
 """Paths through several goals, and to the nearest of several."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from itertools import pairwise
 from typing import Any
@@ -11,10 +9,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from networks import ANY_MAP, new_planner, turning_planner
-from strategies import GRIDS, RULES, cells_of
+from strategies import GRIDS, RULES, Place, cells_of
 
 from ddqn_planner import GridMap, MoveRule, PlanMethod, PlanStatus
-from ddqn_planner.grid import Cell, shortest_distances
+from ddqn_planner.grid import shortest_distances
 from ddqn_planner.planning.field import DistanceField
 from ddqn_planner.planning.plan import PlanRequest
 from ddqn_planner.planning.planner import last_step
@@ -22,10 +20,8 @@ from ddqn_planner.planning.planner import last_step
 
 @settings(max_examples=300)
 @given(GRIDS, RULES, st.data())
-def test_the_nearest_goal_is_that_of_the_cheapest_plan(
-    grid_and_start: tuple[GridMap, Cell], rule: MoveRule, data: st.DataObject
-) -> None:
-    grid, start = grid_and_start
+def test_the_nearest_goal_is_cheapest(place: Place, rule: MoveRule, data: st.DataObject) -> None:
+    grid, start = place
     cells = cells_of(grid) | st.sampled_from([(-1, 0), (0, 99)])
     goals = data.draw(st.lists(cells, min_size=1, max_size=4))
     plan = new_planner().plan_nearest(grid, start, goals, rule)
@@ -48,10 +44,8 @@ def test_the_nearest_goal_is_that_of_the_cheapest_plan(
 
 @settings(max_examples=300)
 @given(GRIDS, RULES, st.data())
-def test_a_field_toward_several_goals_is_the_best_of_their_fields(
-    grid_and_goal: tuple[GridMap, Cell], rule: MoveRule, data: st.DataObject
-) -> None:
-    grid, goal = grid_and_goal
+def test_a_field_of_goals_is_the_best(place: Place, rule: MoveRule, data: st.DataObject) -> None:
+    grid, goal = place
     more = data.draw(st.lists(st.sampled_from(grid.free_cells()), max_size=3))
     goals = tuple(sorted({goal, *more}))
     costs = ANY_MAP.network.move_costs(grid, rule)
@@ -94,13 +88,9 @@ def test_a_robot_between_two_docks_keeps_to_one_of_them(has_costs: bool) -> None
 
 @given(GRIDS, RULES, st.booleans(), st.sampled_from([0.0, 2.0]), st.data())
 def test_a_path_through_goals_is_the_sum_of_its_pieces(
-    grid_and_start: tuple[GridMap, Cell],
-    rule: MoveRule,
-    simplified: bool,
-    tolerance: float,
-    data: st.DataObject,
+    place: Place, rule: MoveRule, simplified: bool, tolerance: float, data: st.DataObject
 ) -> None:
-    grid, start = grid_and_start
+    grid, start = place
     goals = data.draw(st.lists(cells_of(grid), min_size=1, max_size=4))
     options: dict[str, Any] = {"tolerance": tolerance, "simplified": simplified}
     plan = ANY_MAP.plan_through(grid, start, goals, rule, **options)

@@ -1,7 +1,5 @@
 """Parts of paths: what is left of a path, and what is kept of it."""
 
-from __future__ import annotations
-
 import math
 from fractions import Fraction
 from itertools import pairwise
@@ -13,17 +11,10 @@ from exact_segments import is_legal
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as numpy_st
-from strategies import GRIDS, RULES, cells_of, grids_with_costs
+from strategies import GRIDS, RULES, Place, cells_of, grids_with_costs
 
 from ddqn_planner import GridMap, MoveRule, simplify
-from ddqn_planner.grid import (
-    MOVES,
-    Cell,
-    legal_moves,
-    path_cost,
-    shortest_distances,
-    shortest_path,
-)
+from ddqn_planner.grid import MOVES, Cell, legal_moves, path_cost, shortest_distances, shortest_path
 from ddqn_planner.grid.moves import cells_along
 from ddqn_planner.planning import PlanRequest
 from ddqn_planner.planning.paths import (
@@ -51,9 +42,6 @@ def changed(draw: st.DrawFn, grid: GridMap) -> GridMap:
     return GridMap(occupancy, cost=cost, forbidden=forbidden)
 
 
-# The path under way
-
-
 def cells_with_positions(path: list[Cell]) -> list[tuple[Cell, Fraction]]:
     """Cells side by side on a path of segments: each that lies nearest to a point of it."""
     passed = []
@@ -77,10 +65,8 @@ def drawn_path(data: st.DataObject, grid: GridMap, goal: Cell, rule: MoveRule) -
 
 
 @given(GRIDS, RULES, st.data())
-def test_legal_segments_are_those_of_legal_moves_or_through_free_cells(
-    grid_and_cell: tuple[GridMap, Cell], rule: MoveRule, data: st.DataObject
-) -> None:
-    grid, _ = grid_and_cell
+def test_legal_segments_touch_free_cells(place: Place, rule: MoveRule, data: st.DataObject) -> None:
+    grid, _ = place
     cell = st.tuples(st.integers(-1, grid.width), st.integers(-1, grid.height))
     path = data.draw(st.lists(cell, min_size=1, max_size=6))
     for move in data.draw(st.lists(st.sampled_from(MOVES.tolist()), max_size=6)):
@@ -90,10 +76,8 @@ def test_legal_segments_are_those_of_legal_moves_or_through_free_cells(
 
 
 @given(GRIDS, RULES, st.data())
-def test_a_path_is_valid_if_all_of_it_from_the_cell_nearest_to_the_robot_on_is_legal(
-    grid_and_cell: tuple[GridMap, Cell], rule: MoveRule, data: st.DataObject
-) -> None:
-    grid, goal = grid_and_cell
+def test_a_path_is_valid_by_its_rest(place: Place, rule: MoveRule, data: st.DataObject) -> None:
+    grid, goal = place
     path = drawn_path(data, grid, goal, rule)
     path = data.draw(st.sampled_from([path, [*simplify(path, grid, rule)]]))
     robot = data.draw(st.tuples(st.integers(-99, 99), st.integers(-99, 99)))
@@ -108,14 +92,6 @@ def test_a_path_is_valid_if_all_of_it_from_the_cell_nearest_to_the_robot_on_is_l
     assert is_path_valid(path, robot, grid, rule)
 
 
-def test_what_lies_behind_a_robot_on_a_segment_does_not_count() -> None:
-    grid, path, rule = GridMap(np.zeros((9, 31))), [(0, 2), (15, 5), (30, 7)], "robot_safe"
-    for blocked, is_free in (((2, 2), True), ((12, 4), False), ((24, 6), False)):
-        after = grid.with_patch([[True]], *blocked)
-        assert is_path_valid(path, (5, 3), after, rule) == is_free
-        assert (len(rest_of_path(path, (5, 3), after, rule)) > 0) == is_free
-
-
 def test_a_path_of_which_only_an_occupied_end_or_nothing_is_left_is_not_valid() -> None:
     grid, path = GridMap(np.zeros((1, 9))), [(0, 0), (1, 0), (2, 0)]
     for robot in ((9, 0), (2, 5)):  # off the map, so that its own cell does not count
@@ -125,46 +101,34 @@ def test_a_path_of_which_only_an_occupied_end_or_nothing_is_left_is_not_valid() 
     assert not len(rest_of_path([], (0, 0), grid, "robot_safe"))
 
 
-def check_rest_of_straight_path(
-    path: list[Cell], robot: Cell, grid: GridMap, rule: MoveRule
-) -> None:
-    """Check that it leads from the robot onto the path, and is found on it while it is legal."""
-    rest = list(map(tuple, rest_of_path(path, robot, grid, rule).tolist()))
-    if not rest:
-        assert robot not in path or not is_path_valid(path[path.index(robot) :], robot, grid, rule)
-        return
-    assert (rest[0], rest[-1]) == (robot, path[-1])
-    assert legal_segments(rest, grid, rule).all()
-    passed = [cell for cell, _ in cells_with_positions(path)]
-    # It may leave a path that is no longer legal, and join it again.
-    follows = [{*rest[number + 1 :]} <= {*path} for number in range(len(rest))]
-    joins = next(n for n, cell in enumerate(rest) if cell in passed and follows[n])
-    assert joins <= REACH
-    assert all(max(abs(x - a), abs(y - b)) == 1 for (x, y), (a, b) in pairwise(rest[: joins + 1]))
-
-
 @given(GRIDS, RULES, st.data())
-def test_what_is_left_of_a_path_leads_from_the_robot_onto_it_by_legal_moves(
-    grid_and_cell: tuple[GridMap, Cell], rule: MoveRule, data: st.DataObject
-) -> None:
-    grid, goal = grid_and_cell
+def test_the_rest_of_a_path_leads_to_it(place: Place, rule: MoveRule, data: st.DataObject) -> None:
+    grid, goal = place
     path = drawn_path(data, grid, goal, rule)
     after = data.draw(changed(grid))
     robot = data.draw(st.tuples(st.integers(-1, 9), st.integers(-1, 9)) | st.sampled_from(path))
-    check_rest_of_straight_path([*simplify(path, grid, rule)], robot, after, rule)
-    rest = list(map(tuple, rest_of_path(path, robot, after, rule).tolist()))
-    if not rest:
-        if robot in path:
-            assert not is_path_valid(path[path.index(robot) :], robot, after, rule)
-        return
-    assert (rest[0], rest[-1]) == (robot, goal)
-    assert after.is_free(robot)
-    assert legal_segments(rest, after, rule).all()
-    assert all(max(abs(x - a), abs(y - b)) == 1 for (x, y), (a, b) in pairwise(rest))
-    joins = next(index for index in range(len(rest)) if rest[index:] == path[index - len(rest) :])
-    assert joins <= REACH
-    if robot in path and is_path_valid(path[path.index(robot) :], robot, after, rule):
-        assert rest == path[path.index(robot) :]
+    for followed in (path, [*simplify(path, grid, rule)]):
+        rest = list(map(tuple, rest_of_path(followed, robot, after, rule).tolist()))
+        left = followed[followed.index(robot) :] if robot in followed else []
+        if not rest:
+            assert not left or not is_path_valid(left, robot, after, rule)
+            continue
+        assert (rest[0], rest[-1]) == (robot, goal)
+        assert after.is_free(robot)
+        assert legal_segments(rest, after, rule).all()
+        # It may leave a path that is no longer legal, and join it again.
+        passed = [cell for cell, _ in cells_with_positions(followed)]
+        follows = [
+            cell in passed and {*rest[n + 1 :]} <= {*followed} for n, cell in enumerate(rest)
+        ]
+        joins = follows.index(True)
+        assert joins <= REACH
+        beside = pairwise(rest if followed is path else rest[: joins + 1])
+        assert all(max(abs(x - a), abs(y - b)) == 1 for (x, y), (a, b) in beside)
+        if followed is path:
+            assert any(rest[n:] == path[n - len(rest) :] for n in range(len(rest))[: REACH + 1])
+            if left and is_path_valid(left, robot, after, rule):
+                assert rest == left
 
 
 def test_a_robot_beside_its_path_comes_back_to_it_and_a_far_one_has_lost_it() -> None:
@@ -192,9 +156,9 @@ def cost_of(path: Any, grid: GridMap, rule: MoveRule) -> float:
 @settings(max_examples=300)
 @given(GRIDS, RULES, st.sampled_from([0.0, 0.03, 0.3, 10.0]), st.data())
 def test_what_is_kept_is_legal_and_costs_at_most_the_threshold_more(
-    grid_and_cell: tuple[GridMap, Cell], rule: MoveRule, threshold: float, data: st.DataObject
+    place: Place, rule: MoveRule, threshold: float, data: st.DataObject
 ) -> None:
-    grid, goal = grid_and_cell
+    grid, goal = place
     start = data.draw(st.sampled_from(grid.free_cells()))
     under_way = shortest_path(grid, start, goal, rule)
     after = data.draw(changed(grid))
@@ -219,14 +183,9 @@ def test_what_is_kept_is_legal_and_costs_at_most_the_threshold_more(
         assert cost == pytest.approx((1 + extra_cost) * best)
 
 
-# Searches
-
-
 @given(grids_with_costs(), RULES, st.data())
-def test_a_search_finds_a_legal_path_wherever_there_is_one_whatever_the_values(
-    grid_and_goal: tuple[GridMap, Cell], rule: MoveRule, data: st.DataObject
-) -> None:
-    grid, goal = grid_and_goal
+def test_a_search_finds_any_legal_path(place: Place, rule: MoveRule, data: st.DataObject) -> None:
+    grid, goal = place
     start = data.draw(st.sampled_from(grid.free_cells()))
     value = data.draw(
         numpy_st.arrays(np.float32, grid.occupancy.shape, elements=st.floats(width=32))

@@ -1,5 +1,3 @@
-from __future__ import annotations
-
 from collections.abc import Sequence
 from fractions import Fraction
 from itertools import pairwise
@@ -9,7 +7,7 @@ import pytest
 from exact_segments import exact_cost, is_legal
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from strategies import GRIDS, RULES, cells_of
+from strategies import GRIDS, RULES, Place, cells_of
 
 from ddqn_planner import GridMap, MoveRule, simplify
 from ddqn_planner.grid import MOVES, Cell, path_cost, path_length, shortest_path
@@ -18,10 +16,8 @@ from ddqn_planner.planning.segments import cost_along, legal_segments
 
 @settings(max_examples=300)
 @given(GRIDS, RULES, st.data())
-def test_a_segment_is_legal_and_costs_what_the_cells_are_in_which_it_lies(
-    grid_and_cell: tuple[GridMap, Cell], rule: MoveRule, data: st.DataObject
-) -> None:
-    grid, first = grid_and_cell
+def test_segments_are_as_their_cells_are(place: Place, rule: MoveRule, data: st.DataObject) -> None:
+    grid, first = place
     far = min(grid.width - first[0], grid.height - first[1]) - 1
     diagonal = st.integers(0, far).map(lambda by: (first[0] + by, first[1] + by))
     last = data.draw(cells_of(grid) | diagonal, label="last")
@@ -62,10 +58,8 @@ def check_corners(path: Sequence[Cell], grid: GridMap, rule: MoveRule) -> None:
 
 @settings(max_examples=300)
 @given(GRIDS, RULES, st.data())
-def test_a_simplified_path_is_legal_and_costs_no_more(
-    grid_and_goal: tuple[GridMap, Cell], rule: MoveRule, data: st.DataObject
-) -> None:
-    grid, goal = grid_and_goal
+def test_a_simplified_path_costs_no_more(place: Place, rule: MoveRule, data: st.DataObject) -> None:
+    grid, goal = place
     path = shortest_path(grid, data.draw(st.sampled_from(grid.free_cells())), goal, rule)
     simple = check_simplified([*check_simplified(path, grid, rule)], grid, rule)
     check_corners(simple, grid, rule)

@@ -1,40 +1,34 @@
-from __future__ import annotations
+from typing import Any
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from strategies import grids_with_free_cell
+from strategies import Place, grids_with_free_cell
 
-from ddqn_planner.grid import Cell, GridMap, MoveRule, legal_moves, neighbours, shortest_distances
+from ddqn_planner.grid import MoveRule, legal_moves, neighbours, shortest_distances
 from ddqn_planner.planning.value_iteration import value_iteration
 
 
 def settled(
-    success: np.ndarray,
-    reward: np.ndarray,
-    shape: tuple[int, int],
-    goal: int,
-    gamma: float = 1.0,
-    collision: float = -10_000.0,
+    tables: Any, shape: tuple[int, int], goal: int, gamma: float = 1.0, collision: float = -10_000.0
 ) -> np.ndarray:
-    """The return of each move on one map: (8, C)."""
+    """The return of each move on one map, (8, C), given success and reward of each."""
+    success, reward = np.asarray(tables, np.float32)[:, None]
     goals, near = np.array([goal]), neighbours(shape)
-    tables = success.astype(np.float32).T[None], reward.astype(np.float32).T[None]
+    tables = success.swapaxes(1, 2), reward.swapaxes(1, 2)
     (return_CA,) = value_iteration(*tables, goals, near, gamma, collision)
     return return_CA.T
 
 
 @given(grids_with_free_cell(), st.sampled_from(MoveRule))
-def test_without_discount_a_perfect_success_gives_the_length_of_the_shortest_path(
-    grid_and_goal: tuple[GridMap, Cell], rule: MoveRule
-) -> None:
-    grid, goal = grid_and_goal
+def test_without_discount_values_are_shortest_lengths(place: Place, rule: MoveRule) -> None:
+    grid, goal = place
     shape = grid.occupancy.shape
     legal = legal_moves(grid.occupancy, rule).reshape(8, -1)
     length = np.repeat(-rule.lengths[:, None], grid.occupancy.size, axis=1)
     number = goal[1] * grid.width + goal[0]
-    return_AC = settled(legal, length, (grid.height, grid.width), number, collision=-1000.0)
+    return_AC = settled((legal, length), shape, number, collision=-1000.0)
     best = np.where(legal, return_AC, -np.inf).max(axis=0).reshape(shape)
     optimum = shortest_distances(grid, goal, rule)
     for x, y in set(grid.free_cells()) - {goal}:
@@ -46,9 +40,9 @@ def test_without_discount_a_perfect_success_gives_the_length_of_the_shortest_pat
 
 def test_with_discount_a_value_is_what_the_rewards_on_the_way_add_up_to() -> None:
     # A corridor of four cells, the goal at its right end; each move right succeeds half the time.
-    success, reward = np.zeros((2, 8, 4))
-    success[0], reward[0] = 0.5, (1.0, 1.0, 10.0, 0.0)
-    return_AC = settled(success, reward, (1, 4), 3, gamma=0.9, collision=-2.0)
+    tables = np.zeros((2, 8, 4))
+    tables[:, 0] = [0.5] * 4, (1.0, 1.0, 10.0, 0.0)
+    return_AC = settled(tables, (1, 4), 3, gamma=0.9, collision=-2.0)
     value_2 = 0.5 * 10.0 + 0.5 * -2.0
     value_1 = 0.5 * (1.0 + 0.9 * value_2) + 0.5 * -2.0
     assert return_AC[0, :3] == pytest.approx([1.0 + 0.9 * value_1, 1.0 + 0.9 * value_2, 10.0])
@@ -57,5 +51,5 @@ def test_with_discount_a_value_is_what_the_rewards_on_the_way_add_up_to() -> Non
 def test_values_propagate_as_far_as_a_map_reaches_and_those_that_never_settle_end_anyway() -> None:
     success, reward = np.zeros((8, 2500)), np.full((8, 2500), -1.0)
     success[0] = 1.0
-    assert settled(success, reward, (1, 2500), 2499)[0, 0] == 1 - 2500
-    assert settled(np.full((8, 4), np.nan), np.ones((8, 4)), (2, 2), 3).shape == (8, 4)
+    assert settled((success, reward), (1, 2500), 2499)[0, 0] == 1 - 2500
+    assert settled((np.full((8, 4), np.nan), np.ones((8, 4))), (2, 2), 3).shape == (8, 4)

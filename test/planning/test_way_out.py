@@ -1,7 +1,5 @@
 """A start that is not free: the way out of it, against an oracle that shares no code with it."""
 
-from __future__ import annotations
-
 import heapq
 import math
 from itertools import pairwise
@@ -11,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from networks import ANY_MAP
-from strategies import RULES, grids_with_directions, grids_with_free_cell
+from strategies import RULES, Place, grids_with_directions, grids_with_free_cell
 
 from ddqn_planner import GridMap, MoveRule, PlanStatus, inflate
 from ddqn_planner.grid import Cell, path_length
@@ -20,7 +18,8 @@ from ddqn_planner.planning.paths import is_path_valid
 from ddqn_planner.planning.planner import last_step
 
 ACTIONS = [(1, 0), (1, 1), (0, 1), (-1, 1), (-1, 0), (-1, -1), (0, -1), (1, -1)]
-RADII = [0, 0.5, 1, 1.5, 2, 3, math.inf]
+BODIES = st.sampled_from([0, 1.1, 1.5, 2.1])
+RADII = st.sampled_from([0, 0.5, 1, 1.5, 2, 3, math.inf])
 Cells = set[Cell]
 
 
@@ -56,21 +55,11 @@ def lengths_from(
 
 
 @settings(max_examples=300)
-@given(
-    grids_with_free_cell() | grids_with_directions(),
-    RULES,
-    st.sampled_from([0, 1.1, 1.5, 2.1]),
-    st.sampled_from(RADII),
-    st.data(),
-)
+@given(grids_with_free_cell() | grids_with_directions(), RULES, BODIES, RADII, st.data())
 def test_a_start_that_is_not_free_is_left_by_the_shortest_way(
-    grid_and_cell: tuple[GridMap, Cell],
-    rule: MoveRule,
-    robot_radius: float,
-    clearing_radius: float,
-    data: st.DataObject,
+    place: Place, rule: MoveRule, robot_radius: float, clearing_radius: float, data: st.DataObject
 ) -> None:
-    plain, some_cell = grid_and_cell
+    plain, some_cell = place
     grid = inflate(plain, robot_radius)
     cells = [(x, y) for y in range(grid.height) for x in range(grid.width)]
     free = {cell for cell in cells if not grid.occupancy[cell[::-1]]}
@@ -150,15 +139,9 @@ def test_a_path_under_way_is_kept_if_the_way_out_lies_on_it(
         occupancy[y, x] = True
     occupancy[2, 3] = is_kept  # so that there the way out leads north
     under_way = [(0, 2), (1, 2), (2, 2), (2, 3), *((x, 4) for x in range(3, 12))]
-    request = PlanRequest(
-        GridMap(occupancy),
-        (2, 2),
-        (11, 4),
-        MoveRule.ROBOT_SAFE,
-        under_way=under_way,
-        switch_threshold=1.0,
-        start_clearing_radius=0.5,
-    )
+    options = {"under_way": under_way, "switch_threshold": 1.0, "start_clearing_radius": 0.5}
+    ends = (2, 2), (11, 4)
+    request = PlanRequest(GridMap(occupancy), *ends, MoveRule.ROBOT_SAFE, **options)
     plan = last_step(ANY_MAP.steps(request))
     assert plan.cells == (*begin, *under_way[6:])
     assert (plan.extra_cost is not None) == is_kept

@@ -1,5 +1,3 @@
-from __future__ import annotations
-
 import numpy as np
 import pytest
 
@@ -30,9 +28,7 @@ def evaluation_of(planner: Planner, grid: GridMap, rule: MoveRule) -> Evaluation
 
 @pytest.mark.slow(seconds=20)
 @pytest.mark.parametrize("rule", RULES)
-def test_training_on_small_random_maps_learns_the_moves_on_other_maps_and_their_costs(
-    planner: Planner, rule: MoveRule
-) -> None:
+def test_training_on_random_maps_learns_moves_and_costs(planner: Planner, rule: MoveRule) -> None:
     random = np.random.default_rng(2)
     rooms = np.zeros((40, 50), dtype=bool)
     rooms[::8] = rooms[:, ::10] = True

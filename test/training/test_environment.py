@@ -1,5 +1,3 @@
-from __future__ import annotations
-
 import warnings
 from dataclasses import replace
 from math import dist, hypot
@@ -97,9 +95,7 @@ def test_the_scalar_environment_is_a_batch_of_one(paper: Scenario) -> None:
 
 
 @pytest.mark.parametrize("p_r", [0.0, 0.5, 1.0])
-def test_an_episode_starts_with_probability_p_r_in_any_free_cell_of_its_map_but_the_goal(
-    paper: Scenario, p_r: float
-) -> None:
+def test_an_episode_starts_with_probability_p_r_in_any_cell(paper: Scenario, p_r: float) -> None:
     scenarios = [paper, Scenario(GridMap(np.zeros((20, 20))), (0, 0), (4, 3))]
     parameters = HyperParameters(environments=4000, p_r=p_r)
     random = np.random.default_rng(2)
@@ -128,15 +124,12 @@ def test_gymnasium_accepts_the_environment() -> None:
         check_env(environment.unwrapped, skip_render_check=True)
 
 
-@pytest.mark.parametrize(
-    ("start", "goal", "named"),
-    [((2, 0), (4, 0), "start"), ((0, 0), (5, 0), "goal"), ((0, 0), (0, 0), "different")],
-)
-def test_a_scenario_needs_two_free_cells(
-    small: Scenario, start: tuple[int, int], goal: tuple[int, int], named: str
-) -> None:
-    with pytest.raises(ValueError, match=named):
-        Scenario(small.grid, start, goal)
+def test_a_scenario_needs_two_free_cells(small: Scenario) -> None:
+    for *ends, named in (
+        *(((2, 0), (4, 0), "start"), ((0, 0), (5, 0), "goal"), ((0, 0), (0, 0), "different")),
+    ):
+        with pytest.raises(ValueError, match=named):
+            Scenario(small.grid, *ends)
     other = Scenario(GridMap(np.zeros((2, 2))), (0, 0), (1, 1))
     with pytest.raises(ValueError, match="one size"):
         GridVectorEnvironment([small, other], MoveRule.ROBOT_SAFE, PARAMETERS)

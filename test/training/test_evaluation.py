@@ -1,5 +1,3 @@
-from __future__ import annotations
-
 import numpy as np
 import pytest
 
@@ -23,10 +21,8 @@ def test_a_detour_counts_with_its_length_and_a_trapped_rollout_is_left_out() -> 
     # (0, 1) goes by (0, 0), (1, 1) and (2, 1) go to each other; nothing joins (4, 0) to the goal.
     field = field_of([[0, 0, 0, 0, 0], [6, 0, 4, 0, 0]])
     detour = 3 / (1 + 2**0.5)
-    np.testing.assert_allclose(
-        length_ratios(field, GRID, RULE),
-        [[1, 1, np.nan, np.nan, np.nan], [detour, np.inf, np.inf, np.nan, np.nan]],
-    )
+    ratios = [[1, 1, np.nan, np.nan, np.nan], [detour, np.inf, np.inf, np.nan, np.nan]]
+    np.testing.assert_allclose(length_ratios(field, GRID, RULE), ratios)
     evaluation = evaluate(field, GRID, RULE)
     assert (evaluation.starts, evaluation.solved) == (5, 3)
     assert evaluation.mean_ratio == pytest.approx((2 + detour) / 3)

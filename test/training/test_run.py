@@ -1,5 +1,3 @@
-from __future__ import annotations
-
 import csv
 from dataclasses import replace
 from itertools import pairwise
@@ -25,6 +23,10 @@ from ddqn_planner.training.trainer import CheckpointError
 PARAMETERS = HyperParameters(steps=400, filters=4, learning_starts=50)
 
 
+def contents(folder: Path) -> dict[str, bytes]:
+    return {path.name: path.read_bytes() for path in folder.iterdir()}
+
+
 def open_run(folder: Path, scenario: Scenario, **changes: object) -> TrainingRun:
     parameters = replace(PARAMETERS, **changes)  # type: ignore[arg-type]
     return TrainingRun(folder, [scenario], MoveRule.ROBOT_SAFE, parameters, seed=0)
@@ -42,25 +44,18 @@ def rows(folder: Path) -> list[dict[str, str]]:
 
 
 @pytest.mark.parametrize("rule", MoveRule)
-def test_each_episode_is_a_row_of_the_curves(
-    small: Scenario, tmp_path: Path, rule: MoveRule
-) -> None:
+def test_an_episode_is_a_row_of_the_curves(small: Scenario, tmp_path: Path, rule: MoveRule) -> None:
     episodes = finish(open_run(tmp_path, replace(small, move_rule=rule), steps=150))
-    assert [int(row["episode"]) for row in rows(tmp_path)] == [e.number for e in episodes]
-    assert [float(row["average_reward"]) for row in rows(tmp_path)] == pytest.approx(
-        [episode.average_reward for episode in episodes], abs=1e-6
-    )
     assert any(x != u and y != v for e in episodes for (x, y), (u, v) in pairwise(e.cells))
-    assert [float(row["length"]) for row in rows(tmp_path)] == pytest.approx(
-        [path_length(episode.cells, rule) for episode in episodes], abs=1e-4
-    )
+    for row, episode in zip(rows(tmp_path), episodes, strict=True):
+        assert int(row["episode"]) == episode.number
+        assert float(row["average_reward"]) == pytest.approx(episode.average_reward, abs=1e-6)
+        assert float(row["length"]) == pytest.approx(path_length(episode.cells, rule), abs=1e-4)
     recorded = list(read_cells(tmp_path / "episodes.csv", every=3))
     assert recorded == [episode.cells for episode in episodes if episode.number % 3 == 0]
 
 
-def test_a_run_continues_from_its_checkpoint_and_loses_no_row(
-    small: Scenario, tmp_path: Path
-) -> None:
+def test_a_run_continues_from_its_checkpoint_and_rows(small: Scenario, tmp_path: Path) -> None:
     uninterrupted = open_run(tmp_path / "uninterrupted", small)
     finish(uninterrupted)
     first = open_run(tmp_path / "cut", small)
@@ -77,18 +72,16 @@ def test_a_run_continues_from_its_checkpoint_and_loses_no_row(
     finish(second)
     assert load_model(second.model_path)[1].steps == 400
     assert rows(tmp_path / "cut") == rows(tmp_path / "uninterrupted")
-    for a, b in zip(
-        uninterrupted.trainer.network.parameters(), second.trainer.network.parameters(), strict=True
-    ):
-        assert torch.equal(a, b)
+    weights = [list(run.trainer.network.parameters()) for run in (uninterrupted, second)]
+    assert all(map(torch.equal, *weights))
 
 
 def test_a_finished_run_can_be_made_longer_but_not_changed(small: Scenario, tmp_path: Path) -> None:
     finish(open_run(tmp_path, small, steps=100))
-    before = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
+    before = contents(tmp_path)
     with pytest.raises(CheckpointError, match=r"gamma 0\.95 \(now 0\.9\), p_r") as refused:
         open_run(tmp_path, small, gamma=0.9, p_r=0.0)
-    assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == before
+    assert contents(tmp_path) == before
     assert refused  # its frames keep the failed run alive: the folder is unlocked all the same
     (tmp_path / "training.lock").unlink()  # a version without locks made it
     longer = open_run(tmp_path, small, steps=150)
@@ -96,13 +89,11 @@ def test_a_finished_run_can_be_made_longer_but_not_changed(small: Scenario, tmp_
     assert longer.trainer.steps == 150
 
 
-@pytest.mark.parametrize(
-    "name",
-    ["episodes.csv", "model.safetensors", ".episodes.csv.swp", "sub/thesis.tex"],
-)
-def test_a_folder_of_something_else_is_refused_and_left_as_it_is(
-    small: Scenario, tmp_path: Path, name: str
-) -> None:
+NAMES = ["episodes.csv", "model.safetensors", ".episodes.csv.swp", "sub/thesis.tex"]
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_a_folder_of_something_else_is_left(small: Scenario, tmp_path: Path, name: str) -> None:
     path = tmp_path / name
     path.parent.mkdir(exist_ok=True)
     path.write_text("mine")
@@ -113,17 +104,15 @@ def test_a_folder_of_something_else_is_refused_and_left_as_it_is(
     assert path.read_text() == "mine"
 
 
-def test_no_other_run_gets_into_a_folder_until_the_first_one_ends_even_without_a_checkpoint(
-    small: Scenario, tmp_path: Path
-) -> None:
+def test_a_folder_is_of_one_run_at_a_time(small: Scenario, tmp_path: Path) -> None:
     first = open_run(tmp_path, small)
     steps = first.steps()
     for _ in range(100):
         next(steps)
-    before = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
+    before = contents(tmp_path)
     with pytest.raises(FolderError, match=f"another process trains in {tmp_path}"):
         open_run(tmp_path, small)
-    assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == before
+    assert contents(tmp_path) == before
     first.close()
     assert not first.checkpoint_path.exists()
     assert len(finish(open_run(tmp_path, small))) == len(rows(tmp_path)) > 0
@@ -156,12 +145,12 @@ def test_a_training_that_diverged_is_not_saved(small: Scenario, tmp_path: Path) 
     run = open_run(tmp_path, small)
     next(run.steps())
     run.try_to_save()
-    before = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
+    before = contents(tmp_path)
     next(run.trainer.network.parameters()).data.fill_(np.nan)
     with pytest.raises(ValueError, match=r"diverged.*smaller learning_rate"):
         finish(run)
     run.close()
-    after = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
+    after = contents(tmp_path)
     assert before.pop("episodes.csv") in after.pop("episodes.csv")
     assert after == before
 

@@ -1,11 +1,10 @@
 """The replay buffer, and one update of each network beside the same written down from equations."""
 
-from __future__ import annotations
-
 import copy
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -92,9 +91,7 @@ def check_update(trainer: Trainer, loss: Tensor, before: list[Tensor], tolerance
 
 
 @pytest.mark.parametrize("target", ["double_dqn", "dqn", "printed"])
-def test_an_update_of_the_papers_network_is_that_of_the_equations(
-    small: Scenario, target: str
-) -> None:
+def test_an_update_of_the_papers_network_is_the_equations(small: Scenario, target: str) -> None:
     scenarios = [small, replace(small, grid=GridMap(small.grid.occupancy[::-1]))]
     trainer = about_to_update(scenarios, HyperParameters(target=target, filters=4))
     network = copy.deepcopy(trainer.network)
@@ -127,20 +124,11 @@ def test_a_compiled_training_is_that_of_torch_and_continues_it(
 ) -> None:
     walls = small.grid.occupancy
     scenarios = [replace(small, grid=GridMap(other)) for other in (walls, walls[::-1], walls & 0)]
-    parameters = HyperParameters(
-        target=target,
-        filters=4,
-        hidden_units=units,
-        learning_rate=0.001,
-        learning_starts=20,
-        target_interval=10,
-        epsilon_steps=60,
-        environments=3,
-        max_episode_steps=7,
-    )
-    compiled, in_torch = (
-        Trainer(scenarios, MoveRule.ROBOT_SAFE, parameters, seed=2) for _ in range(2)
-    )
+    brief = {"learning_rate": 0.001, "learning_starts": 20, "target_interval": 10}
+    brief |= {"epsilon_steps": 60, "environments": 3, "max_episode_steps": 7, "filters": 4}
+    parameters = HyperParameters(target=target, hidden_units=units, **brief)
+    trainers = [Trainer(scenarios, MoveRule.ROBOT_SAFE, parameters, seed=2) for _ in range(2)]
+    compiled, in_torch = trainers
     in_torch._player = None
     one, other = ([e for ended in t.run(90) for e in ended] for t in (compiled, in_torch))
     assert one == other
@@ -169,17 +157,13 @@ def test_an_update_of_the_network_for_any_map_counts_each_reward_once(small: Sce
         replace(small, grid=GridMap(walls, cost=cost)),
         Scenario(GridMap(walls[::-1]), (4, 3), (0, 1), MoveRule.ROBOT_SAFE),
     ]
-    parameters = HyperParameters(
-        network="any_map", reward="path_cost", gamma=0.5, obstacle_reward=-20.0, filters=4
-    )
-    trainer = about_to_update(scenarios, parameters)
+    settings = {"reward": "path_cost", "gamma": 0.5, "obstacle_reward": -20.0, "filters": 4}
+    trainer = about_to_update(scenarios, HyperParameters(network="any_map", **settings))
     network, target_network = copy.deepcopy(trainer.network), copy.deepcopy(trainer._target)
     assert isinstance(network, AnyMapModule)
     lengths = torch.from_numpy(LENGTHS.astype(np.float32))
 
-    def q_of(
-        network: AnyMapModule, scenario: Scenario, value: dict[Cell, float]
-    ) -> dict[Cell, Tensor]:
+    def q_of(network: AnyMapModule, scenario: Scenario, value: Any) -> dict[Cell, Tensor]:
         seen = patches(scenario.grid.occupancy, scenario.grid.cost)
         rule = scenario.move_rule or MoveRule.CORNER_CUTTING
         features = torch.from_numpy(AnyMapQNetwork.features(seen, rule))
@@ -204,11 +188,9 @@ def test_an_update_of_the_network_for_any_map_counts_each_reward_once(small: Sce
         online[scenario] = q_of(network, scenario, value)
     batch = next_batch(trainer)
     assert {0, 1} == set(batch.scenario)
-    loss = mean_squared_error(
-        trainer,
-        batch,
-        online=lambda s, cell: online[s][cell],
-        selection=lambda s, cell: online[s][cell],
-        evaluation=lambda s, cell: evaluation[s][cell],
-    )
+
+    def first(s: Scenario, cell: Cell) -> Tensor:
+        return online[s][cell]
+
+    loss = mean_squared_error(trainer, batch, first, first, lambda s, cell: evaluation[s][cell])
     check_update(trainer, loss, list(network.parameters()), tolerance=2e-3)
