@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from strategies import Place, grids_with_free_cell
 
 from ddqn_planner.grid import MoveRule, legal_moves, neighbours, shortest_distances
-from ddqn_planner.training.networks import value_iteration
+from ddqn_planner.planning.value_iteration import value_iteration
 
 
 def settled(
@@ -16,8 +16,9 @@ def settled(
     """The return of each move on one map, (8, C), given success and reward of each."""
     success, reward = np.asarray(tables, np.float32)[:, None]
     goals, near = np.array([goal]), neighbours(shape)
-    (return_AC,) = value_iteration(success, reward, goals, near, gamma, collision)
-    return return_AC
+    tables = success.swapaxes(1, 2), reward.swapaxes(1, 2)
+    (return_CA,) = value_iteration(*tables, goals, near, gamma, collision)
+    return return_CA.T
 
 
 @given(grids_with_free_cell(), st.sampled_from(MoveRule))
