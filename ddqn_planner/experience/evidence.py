@@ -21,12 +21,14 @@ FARTHEST = 1e7  # metres from the origin of the map: a place beyond is not belie
 
 NOISE, NOISY_VISITS = 0.1, 50.0  # variance of the log slowness of one visit, as if of so many
 OLD_VISITS = 500.0  # the noise of visits is that of about the last so many
-VARIANCE, VARIED_PLACES = 0.5, 4.0  # of the log slowness of places, as if of so many
+VARIANCE, VARIED_PLACES = 1.0, 4.0  # of the log slowness of places, as if of so many
 LEAST_VARIANCE, MOST_VARIANCE = 0.05, 2.0
 ALIKE = 8.0  # so many places of a path tell as much of other places as one alone
 NOMINAL = 2.0  # inverse variance of the log slowness of all places, before the first drive
 TRUST, TRUSTED = 1.0, 4.0  # in the prior: at first, and the inverse variance of that
+SURE_PLACES = 20  # fewer say nothing about the robot's speed in the open
 OUTLIER = 2.5  # a visit is moved to so many standard deviations from what was expected
+KNOWN = 0.7  # weight of visits from which a place is known
 MOST = 6.0  # weight of visits that a place keeps
 
 PART, SURPRISE = (
@@ -34,7 +36,7 @@ PART, SURPRISE = (
     3.0,
 )  # places of a drive: these are off by more standard deviations if they changed
 DRIVE_NOISE = 0.05  # standard deviation of what the log slowness of so many places has in common
-CHANGED, CHANGED_AROUND = 0.2, 1.5  # share of evidence that is left within so many metres
+CHANGED, CHANGED_AROUND = 0.1, 1.5  # share of evidence that is left within so many metres
 CHANGED_FAR = 0.7  # and elsewhere: where one place changed, others did
 
 WAIT_PASSAGES = 0.5  # passages without a wait that are assumed
@@ -82,7 +84,6 @@ class Evidence:
         self.noise_sums = NOISY_VISITS * NOISE, NOISY_VISITS
         self.errors: list[float] = []  # of the last drives' log times, in standard deviations
         self.posterior: Posterior | None = None  # over the last map
-        self.place_variance = VARIANCE  # of the log slowness
         self._fit()
 
     @property
@@ -118,7 +119,8 @@ class Evidence:
         count += int(known.sum())
         surplus = max(count / OLD_VISITS, 1)
         self.noise_sums = total / surplus, count / surplus
-        self._look_for_changes(visits.position, surprise, weight)
+        changed = self._changed(visits.position, surprise, weight)
+        believed[changed] = surprise[changed]
         places = np.unique(rows)
         self.table[places, :2] = self.faded()[places]
         self.table[places, 5] = self.driven
@@ -127,18 +129,19 @@ class Evidence:
         np.add.at(self.table[:, 1], rows, weight * (expected + believed))
         self.table[places, :2] /= np.maximum(self.table[places, :1] / MOST, 1)
 
-    def _look_for_changes(self, position: Float64, surprise: Float64, weight: Float64) -> None:
-        """Forget most where a part of a drive was other than all before, and some elsewhere."""
-        known = np.flatnonzero(weight >= 0.7)
+    def _changed(self, position: Float64, surprise: Float64, weight: Float64) -> NDArray[np.int64]:
+        """Return the visits that were other than all before; most of that is forgotten."""
+        changed, known = [np.zeros(0, np.int64)], np.flatnonzero(weight >= KNOWN)
         for part in np.array_split(known, max(1, len(known) // PART)):
             if len(part) < PART / 2:
                 continue
             variance = self.noise * (1 + 1 / weight[part]).mean() / len(part) + DRIVE_NOISE**2
             if abs(surprise[part].mean()) > SURPRISE * math.sqrt(variance):
+                changed.append(part)
                 away = self.table[:, 3:5] - position[part].mean(axis=0)
-                reach = CHANGED_AROUND + len(part) * self.side / 2
-                near = np.hypot(*away.T) <= reach
+                near = np.hypot(*away.T) <= CHANGED_AROUND + len(part) * self.side / 2
                 self.table[:, :2] *= np.where(near, CHANGED, CHANGED_FAR)[:, None]
+        return np.concatenate(changed)
 
     def _add_waits(self, visits: Visits, waits: Float64) -> None:
         """Count the passages of places where robots wait, and the seconds of this drive."""
@@ -156,7 +159,9 @@ class Evidence:
                 self.waits = np.vstack([self.waits, [seconds, 1.0, x, y]])
             else:  # robots from both sides wait before one door: it is between them
                 self.waits[nearest, 0] += seconds
-                self.waits[nearest, 2:] += (np.array([x, y]) - self.waits[nearest, 2:]) / NEAREST_WAITS
+                self.waits[nearest, 2:] += (
+                    np.array([x, y]) - self.waits[nearest, 2:]
+                ) / NEAREST_WAITS
 
     def add_failure(self, x: float, y: float, seconds: float) -> None:
         """Add a failure, which costs as much as a wait of so many seconds."""
@@ -191,28 +196,31 @@ class Evidence:
         return weights
 
     def _fit(self) -> None:
-        """Learn what all places have in common, how much they differ, and what the prior is worth."""
+        """Learn what all places have in common, how they differ, and what the prior is worth."""
         weight, sum_of_log = self.faded().T
         seen = weight >= 0.2
         weight, foretold = weight[seen], self.table[seen, 2]
         log = sum_of_log[seen] / weight
-        share = 1 / (self.place_variance + self.noise / weight) / ALIKE
-        # Bayesian regression of the log slowness on 1 and on what the prior foretold.
         columns = np.column_stack([np.ones(len(log)), foretold])
-        precision = np.diag([NOMINAL, TRUSTED]) + (columns * share[:, None]).T @ columns
-        self.trust_variance = np.linalg.inv(precision)
-        right = np.array([0, TRUSTED * TRUST]) + columns.T @ (share * log)
-        fitted = self.trust_variance @ right
-        self.trust = float(fitted[0]), float(max(fitted[1], 0))
-        squares = (log - columns @ self.trust) ** 2 - self.noise / weight
-        total = VARIED_PLACES * VARIANCE + float(squares.sum()) / ALIKE
-        variance = total / (VARIED_PLACES + len(log) / ALIKE)
-        self.place_variance = min(max(variance, LEAST_VARIANCE), MOST_VARIANCE)
-        sure = log[weight >= 0.7]
+        self.place_variance = VARIANCE  # of the log slowness
+        for _ in range(3):  # either tells of the other
+            # Bayesian regression of the log slowness on 1 and on what the prior foretold.
+            share = 1 / (self.place_variance + self.noise / weight) / ALIKE
+            precision = np.diag([NOMINAL, TRUSTED]) + (columns * share[:, None]).T @ columns
+            self.trust_variance = np.linalg.inv(precision)
+            right = np.array([0, TRUSTED * TRUST]) + columns.T @ (share * log)
+            fitted = self.trust_variance @ right
+            self.trust = float(fitted[0]), float(max(fitted[1], 0))
+            squares = (log - columns @ self.trust) ** 2 - self.noise / weight
+            total = VARIED_PLACES * VARIANCE + float(squares.sum()) / ALIKE
+            variance = total / (VARIED_PLACES + len(log) / ALIKE)
+            self.place_variance = min(max(variance, LEAST_VARIANCE), MOST_VARIANCE)
+        # The mean of an exponential is more than 1, as far as drives have shown that places differ.
+        self.surplus = self.place_variance / 2 * len(log) / (VARIED_PLACES * ALIKE + len(log))
+        sure = log[weight >= KNOWN]
         # Logarithms of how slow the robot is in the open, and where it is fastest.
-        self.open, self.fastest = (
-            np.quantile(sure, (0.25, 0.05)).tolist() if len(sure) >= 20 else (0.0, 0.0)
-        )
+        quantiles = np.quantile(sure, (0.25, 0.05)) if len(sure) >= SURE_PLACES else np.zeros(2)
+        self.open, self.fastest = map(float, quantiles)
 
     def _compare(self, visits: Visits, waits: Float64, posterior: Posterior) -> None:
         """Compare the time of a drive with the one expected on the last map."""

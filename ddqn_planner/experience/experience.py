@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from itertools import pairwise
 from pathlib import Path
-from typing import NamedTuple, TypeAlias
+from typing import Any, NamedTuple, TypeAlias
 from zlib import crc32
 
 import numpy as np
@@ -120,15 +120,17 @@ class Experience:
         possible = (np.abs(time) < LATEST) & (np.abs(position) < FARTHEST).all(axis=1)
         time, position = time[possible], position[possible]
         fresh = np.diff(time, prepend=np.nan) != 0  # a repeated time adds nothing
-        drive = self._measured(time[fresh], position[fresh])
-        if drive is not None:
+        if fresh.any() and (drive := self._measured(time[fresh], position[fresh])) is not None:
             self._learn(partial(Evidence.add, visits=drive[0], waits=drive[1]))
 
     def _measured(self, time: Float64, position: Float64) -> tuple[Visits, Float64] | None:
         """Return the visits and the waits of a drive, if there are any."""
         side = self.evidence.side
         window = WINDOW / self.nominal_speed
-        limits = 3 * max(self.nominal_speed, self.learned_speed), self.max_pause
+        seconds, at = _averaged(time, position, window)
+        speeds = np.hypot(*np.diff(at, axis=0).T) / np.abs(np.diff(seconds))
+        usual = float(np.median(speeds)) if len(speeds) else 0.0
+        limits = 3 * max(self.nominal_speed, self.learned_speed, usual), self.max_pause
         steps: list[tuple[float, float, float, float]] = []
         waits: list[Float64] = []
         for part in _believed_parts(time, position, *limits):
@@ -177,7 +179,7 @@ class Experience:
 
     @property
     def learned_speed(self) -> float:
-        """Metres per second in the open, as the drives show; `nominal_speed` before there are some."""
+        """Metres per second in the open, as drives show; at first the nominal speed."""
         return self.nominal_speed / math.exp(self.evidence.open)
 
     @property
@@ -246,7 +248,7 @@ class Experience:
         path, position = cells_along(corners)
         of_segments = np.hypot(*np.diff(corners, axis=0).T) * grid.resolution
         metres = np.diff(position) * of_segments[position[:-1].astype(np.int64)]
-        places = posterior.place[path[:, 1], path[:, 0]]
+        places = posterior.place[path[:, 1], path[:, 0]].astype(np.int64)
         slowness = posterior.slowness[places]
         seconds = metres / self.nominal_speed * (slowness[1:] + slowness[:-1]) / 2
         deviation = self.evidence.deviation(seconds, metres, posterior, places[1:])
@@ -287,13 +289,9 @@ class Experience:
         """Return all as bytes, for a file or a message."""
         content = io.BytesIO()
         prior = self.prior.arrays() if self.prior is not None else {}
-        np.savez(
-            content,
-            version=VERSION,
-            options=[getattr(self, name) for name in OPTIONS],
-            **self.evidence.arrays(),
-            **{PRIOR + name: array for name, array in prior.items()},
-        )
+        arrays: dict[str, Any] = {PRIOR + name: array for name, array in prior.items()}
+        options = [getattr(self, name) for name in OPTIONS]
+        np.savez(content, version=VERSION, options=options, **self.evidence.arrays(), **arrays)
         return content.getvalue()
 
     @classmethod
@@ -308,10 +306,14 @@ class Experience:
         try:
             with np.load(io.BytesIO(data), allow_pickle=False) as file:
                 arrays = dict(file)  # whose checksums are checked
-            if int(arrays["version"]) != VERSION:
-                raise ValueError(f"it has version {arrays['version']}, not {VERSION}")
+            version = int(arrays["version"])
+            if version not in (1, VERSION):
+                raise ValueError(f"it has version {version}, not {VERSION}")
             options = dict(zip(OPTIONS, arrays["options"].tolist(), strict=True))
             experience = cls(**options)
+            if version == 1:  # before 0.4.0 failures stood where now is what the prior foretold
+                arrays["waits"] = np.zeros((0, 4))
+                arrays["evidence"][:, 2] = 0
             experience.evidence.restore(arrays)
             prior = {n.removeprefix(PRIOR): a for n, a in arrays.items() if n.startswith(PRIOR)}
             experience.prior = Prior.from_arrays(prior) if prior else None
@@ -364,7 +366,7 @@ def _believed_parts(
 
 def _averaged(time: Float64, position: Float64, window: float) -> tuple[Float64, Float64]:
     """Return the means of poses over windows of time: noise of poses is no way that is driven."""
-    begins = np.flatnonzero(np.diff(np.floor((time - time[0]) / window), prepend=-1) != 0)
+    begins = np.flatnonzero(np.diff(np.floor((time - time[:1]) / window), prepend=np.nan) != 0)
     count = np.diff(begins, append=len(time))
     sums = np.add.reduceat(np.column_stack([time, position]), begins)
     means = sums / count[:, None]
@@ -392,7 +394,7 @@ def _steps(
     """Yield x and y of the middle of each step, its seconds and its metres."""
     # How long the robot stands before it drives off says nothing about the place.
     away = (index for index, at in enumerate(position) if math.dist(at, position[0]) >= step / 4)
-    start = max(next(away, len(time)) - 1, 0)
+    start = next(away, len(time) - 1)
     began, (from_x, from_y) = time[start], position[start]
     for now, (x, y) in zip(time[start:], position[start:], strict=True):
         seconds, metres = now - began, math.hypot(x - from_x, y - from_y)

@@ -1,4 +1,4 @@
-"""What driving tells of all free places of a map: a Gaussian Markov random field of log slowness."""
+"""What drives tell of all free places of a map: a Gaussian Markov random field."""
 
 from __future__ import annotations
 
@@ -23,7 +23,9 @@ CORRELATION = 1.0  # metres: how far the slowness of a place tells of that of ot
 STEP = 0.02  # slowness is told in steps of this share: fields need no repair for less
 ACCURACY = 1e-3  # of the log slowness: places whose neighbours changed less stay as they are
 OVER_RELAXATION = 1.4  # of the solver: neighbours agree sooner
-NEWS = 0.1  # share by which a common value must change before all places are told
+# By how much what all places have in common must change before they are told: noise and variance
+# by a share, logarithms as they are.
+NEWS, NEWS_OF_LOG = 0.1, 0.02
 
 
 class Posterior:
@@ -42,13 +44,14 @@ class Posterior:
         count = len(self.middle)
         self.links = _links_of(self.place, self.size, count)
         self.degree = np.asarray(self.links.sum(axis=1), dtype=np.float64)
-        self.seen = np.zeros((count, 2))  # of each place: precision, and that times what was seen
-        # What was seen beyond what was expected, and the share that is known: the solution.
-        self.solution = np.zeros((count, 2))
+        # What was seen beyond what was expected, and the share that is known: a solution of linear
+        # equations, and their right side.
+        self.solution, self.right = np.zeros((2, count, 2))
         self.prior: Prior | None = None
         self.foretold = np.zeros(count, dtype=np.float32)  # by the prior
         self.expected, self.waits = np.zeros(count), np.zeros(count)
-        self.common = (0.0, 0.0, 0.0, 0.0)  # noise, variance, and what the prior is worth
+        # Noise, variance, what the prior is worth (two), surplus of the mean.
+        self.common = (0.0,) * 5
         self.rows = np.zeros((0, 2)), np.zeros(0, dtype=np.int64)  # positions, and their places
         self.painted: tuple[float, float, NDArray[np.float32]] | None = None
         self.steps = np.zeros(0)
@@ -56,8 +59,7 @@ class Posterior:
     @property
     def mean(self) -> Float64:
         """The expected log slowness of driving at each place."""
-        mean: Float64 = self.expected + self.solution[:, 0] + self.variance / 2
-        return mean
+        return self.expected + self.solution[:, 0] + self.common[4] * (1 - self.known)
 
     @property
     def known(self) -> Float64:
@@ -67,8 +69,7 @@ class Posterior:
     @property
     def variance(self) -> Float64:
         """The variance of each place's log slowness."""
-        variance: Float64 = self.common[1] * (1 - self.known)
-        return variance
+        return self.common[1] * (1 - self.known)
 
     @property
     def slowness(self) -> Float64:
@@ -89,36 +90,41 @@ class Posterior:
         first = len(position) if same else 0
         places = np.concatenate([places[:first], self.places_at(now[first:])])
         self.rows = now.copy(), places
-        common = evidence.noise, evidence.place_variance, *evidence.trust
+        common = evidence.noise, evidence.place_variance, *evidence.trust, evidence.surplus
         change = np.abs(np.array(common) - self.common)
+        least = [NEWS * common[0], NEWS * common[1], *[NEWS_OF_LOG] * 3]
         is_new = evidence.prior is not self.prior
         if is_new and evidence.prior is not None:
             x, y = self.middle.T
             self.foretold = evidence.prior.log_slowness(map_features(self.grid)[y, x])
-        if is_new or (change > NEWS * np.array([*common[:2], 1, 1])).any():
+        if is_new or (change > least).any():
             self.prior, self.common = evidence.prior, common
-            self.expected = common[2] + common[3] * self.foretold
+            self.expected = common[2] + common[3] * self.foretold.astype(np.float64)
         noise, variance = self.common[:2]
         inside = places >= 0
         weight, log = evidence.faded()[inside].T
         # Half of the noise is added, as the mean of its exponential is more than 1.
         sums = np.column_stack([weight, log + weight * noise / 2]) / noise
-        seen = np.zeros_like(self.seen)
+        seen = np.zeros_like(self.right)
         np.add.at(seen, places[inside], sums)
         # A lattice whose neighbours pull with strength 1 has the variance ln(32 / kappa) / 4 pi.
         kappa = (self.spacing / CORRELATION) ** 2
         seen *= variance / (math.log(32 / kappa) / (4 * math.pi))
         right = np.column_stack([seen[:, 1] - seen[:, 0] * self.expected, seen[:, 0]])
         diagonal = kappa + self.degree + seen[:, 0]
+        if not np.array_equal(right, self.right):
+            self._solve(diagonal, right)
+        self._wait(evidence)
+
+    def _solve(self, diagonal: Float64, right: Float64) -> None:
+        self.right = right
         residual = right + self.links @ self.solution - diagonal[:, None] * self.solution
         wrong = np.abs(residual).max(axis=1) > ACCURACY * diagonal
-        self.seen = seen
         queue = np.zeros(len(diagonal), dtype=np.int64)
         begins = np.flatnonzero(wrong)
         queue[: len(begins)] = begins
         links = self.links.indptr, self.links.indices, self.links.data
         _relax(*links, diagonal, right, self.solution, queue, len(begins), wrong)
-        self._wait(evidence)
 
     def _wait(self, evidence: Evidence) -> None:
         """Spread the expected waits over the places around, so that a crossing costs each once."""
@@ -195,7 +201,7 @@ def _links_of(place: NDArray[np.int32], size: int, count: int) -> Any:
 
 @in_place
 def _label(occupancy: Any, size: int, place: Any, stack: Any) -> int:
-    """Number the connected parts of the free cells in each block of cells."""
+    """Give a number to each connected part of the free cells in each block of cells."""
     height, width = occupancy.shape
     count = 0
     for block in range(((height - 1) // size + 1) * ((width - 1) // size + 1)):
