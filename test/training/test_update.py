@@ -159,6 +159,8 @@ def test_an_update_of_the_network_for_any_map_counts_each_reward_once(small: Sce
     ]
     settings = {"reward": "path_cost", "gamma": 0.5, "obstacle_reward": -20.0, "filters": 4}
     trainer = about_to_update(scenarios, HyperParameters(network="any_map", **settings))
+    with torch.no_grad():  # a multiplier below 1 is clipped
+        trainer.network.get_submodule("prices").bias[::2] = -1.0
     network, target_network = copy.deepcopy(trainer.network), copy.deepcopy(trainer._target)
     assert isinstance(network, AnyMapModule)
     lengths = torch.from_numpy(LENGTHS.astype(np.float32))
