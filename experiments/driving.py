@@ -41,7 +41,7 @@ NEW_MAPS: Final = ("warehouse", "blobs", "halls")
 EXPERIENCE, SHORTEST, HELD_OUT_SET = "experience", "shortest path", "Held-out worlds"
 DRAWN: Final = (EXPERIENCE, SHORTEST, "Gaussian process", "Markov field")
 SMOOTHED: Final = 10  # missions that a point of the curve averages
-DOOR_WAITS, DOOR_DRIVES, DOOR_SEEDS = (10, 30, 60), 40, 5
+DOOR_WAITS, DOOR_DRIVES = (10, 30, 60), 40
 ZONE_NOISES, ZONE_RATES, ZONE_WIDTHS = (0.02, 0.035, 0.05), (10, 50), (0.2, 0.35, 0.5)
 VISITED: Final = 0.95  # uncertainty of a cell below which the robot was near
 
@@ -94,7 +94,7 @@ def moved(options: Options) -> Sections:
 def priors(options: Options) -> Sections:
     """Measure missions on a map never driven, without a prior and with one from another map."""
     rows = []
-    for source, hidden in PRIORS:
+    for source, hidden in PRIORS[: 1 if options.quick else None]:
         kinds = [f"{name}-{hidden}" for name in (*NEW_MAPS, *options.maps_found)]
         for name, prior_from in (("without", ""), ("with", f"rooms-{source}")):
             own = _runs(kinds, (EXPERIENCE,), options, missions=20, prior_from=prior_from)
@@ -114,7 +114,7 @@ def doors(options: Options) -> Sections:
         waits[20, 10:13] = seconds
         world = World(GridMap(occupancy, 0.25), np.ones(waits.shape), [], ends, waits)
         through = []
-        for seed in range(DOOR_SEEDS):
+        for seed in range(options.seeds):
             job = Job("doors", seed, EXPERIENCE, DOOR_DRIVES, options.exploration)
             result = run_in(job, world, Experience(SPEED))
             # The shortest path leads through it, and the detour takes less time.
