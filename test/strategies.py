@@ -57,6 +57,13 @@ def grids_with_directions(draw: st.DrawFn) -> Place:
     return GridMap(grid.occupancy, cost=grid.cost, forbidden=forbidden), cell
 
 
+def json_values(scalars: st.SearchStrategy[object]) -> st.SearchStrategy[object]:
+    """Scalars, and lists and mappings of them."""
+    return st.recursive(
+        scalars, lambda it: st.lists(it) | st.dictionaries(st.text(), it), max_leaves=8
+    )
+
+
 def cells_of(grid: GridMap) -> st.SearchStrategy[Cell]:
     """Any cells of a map."""
     return st.tuples(st.integers(0, grid.width - 1), st.integers(0, grid.height - 1))

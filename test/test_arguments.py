@@ -71,11 +71,7 @@ CALLS: dict[Callable[..., Any], dict[str, Any]] = {
     PLANNER.q_field(GRID, (3, 3)).rollout: {"start": (0, 0)},
     simplify: {"cells": CELLS, "grid": GRID, "move_rule": "unit"},
 }
-ARGUMENTS = [
-    pytest.param(call, name, id=f"{call.__qualname__}-{name}")
-    for call, arguments in CALLS.items()
-    for name in arguments
-]
+ARGUMENTS = [(call, name) for call, arguments in CALLS.items() for name in arguments]
 
 WRONG = [
     *(object(), 1j, len, b"x", "no such", [object()], [[1], [1, 2]], (None, None), np.ones(3, "U")),

@@ -85,8 +85,6 @@ def test_maps_that_come_one_after_another_are_inflated_as_if_each_were_the_first
             np.testing.assert_array_equal(found.obstacles, grid.occupancy)  # type: ignore[arg-type]
 
 
-# Costmaps
-
 values_of_any_kind = numpy_st.arrays(
     np.int8, numpy_st.array_shapes(min_dims=2, max_dims=2, min_side=1, max_side=9)
 )

@@ -1,5 +1,6 @@
 import json
 import math
+from copy import copy
 from dataclasses import fields
 from fractions import Fraction
 from typing import Any
@@ -124,9 +125,6 @@ def test_a_wrong_occupancy_value_is_named() -> None:
             GridMap.from_occupancy_values(values, occupied_threshold=threshold)
 
 
-# Maps that are made of others
-
-
 @st.composite
 def full_grids(draw: st.DrawFn) -> GridMap:
     """A map with any layers."""
@@ -161,15 +159,12 @@ def test_a_patched_map_is_the_map_of_the_patched_arrays(
         patch, x, y, costs if with_costs else None, obstacles if with_obstacles else None
     )
     box = slice(y, y + shape[0]), slice(x, x + shape[1])
-    layers = {field.name: getattr(grid, field.name) for field in fields(grid)}
-    layers["occupancy"] = grid.occupancy.copy()
+    layers = {field.name: copy(getattr(grid, field.name)) for field in fields(grid)}
     layers["occupancy"][box] = patch
-    if with_costs or grid.cost is not None:
-        layers["cost"] = np.zeros(grid.occupancy.shape) if grid.cost is None else grid.cost.copy()
-        if with_costs:
-            layers["cost"][box] = costs
+    if with_costs:
+        layers["cost"] = np.zeros(grid.occupancy.shape) if grid.cost is None else layers["cost"]
+        layers["cost"][box] = costs
     if grid.obstacles is not None:
-        layers["obstacles"] = grid.obstacles.copy()
         layers["obstacles"][box] = patch & obstacles if with_obstacles else patch
     expected = GridMap(**layers)
     assert derived(patched) == derived(expected)

@@ -4,7 +4,8 @@ import itertools
 import math
 import re
 import threading
-from collections.abc import Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from itertools import pairwise
 from pathlib import Path as FilePath
 from typing import Any
@@ -35,11 +36,9 @@ from ddqn_planner.nodes.report import seconds
 from ddqn_planner.nodes.runtime import LATCHED
 
 START, GOAL = (0, 0), (5, 5)
-RESOLUTION, ORIGIN = 0.5, (-1.0, 2.0, 0.5)
-GOAL_YAW = 1.2
+RESOLUTION, ORIGIN, GOAL_YAW = 0.5, (-1.0, 2.0, 0.5), 1.2
 
-NUMBERS = itertools.count(1)
-"""Stamps of maps and yaws of goals, to tell one from another."""
+NUMBERS = itertools.count(1)  # stamps of maps and yaws of goals, to tell one from another
 
 ALL = QoSProfile(depth=1000, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 """The last message of a latched topic, and every one after it."""
@@ -121,11 +120,10 @@ class Robot:
         ends = [grid.cell_to_world(start), grid.cell_to_world(goal)]
 
         def is_asked_for(path: Path) -> bool:
-            if not path.poses:
-                return False
-            last = yaw_of(path.poses[-1].pose.orientation)
-            found = [points_of(path)[0], points_of(path)[-1]]
-            return np.allclose(found, ends, atol=1e-6) and (yaw is None or abs(last - yaw) < 1e-6)
+            found = points_of(path)[:1] + points_of(path)[-1:]
+            last = [yaw_of(stamped.pose.orientation) for stamped in path.poses[-1:]]
+            expected = last if yaw is None else [yaw]
+            return bool(found) and np.allclose(found, ends) and np.allclose(last, expected)
 
         path: Path = self.plans.wait(is_asked_for)
         check_path(path, grid)
@@ -138,12 +136,9 @@ class Robot:
         expected = (values or {}).items()
 
         def says(message: DiagnosticArray) -> bool:
-            status = message.status[0]
-            return (
-                status.name == f"{self.name}: plan"
-                and bool(re.search(pattern, status.message))
-                and expected <= values_of(status).items()
-            )
+            (status,), name = message.status, f"{self.name}: plan"
+            is_said = status.name == name and bool(re.search(pattern, status.message))
+            return is_said and expected <= values_of(status).items()
 
         return self.diagnostics.wait(says).status[0]
 
@@ -211,6 +206,16 @@ def ask_for_plan(robot: Robot) -> tuple[Any, threading.Event]:
     plan.add_done_callback(lambda _: answered.set())
     robot.wait_until_received()
     return plan, answered
+
+
+@contextmanager
+def repeating(client: Client, publish: Callable[[], None]) -> Iterator[None]:
+    """Publish something 50 times a second."""
+    timer = client.node.create_timer(0.02, publish)
+    try:
+        yield
+    finally:
+        client.node.destroy_timer(timer)
 
 
 def points_of(path: Path) -> list[tuple[float, float]]:

@@ -60,8 +60,7 @@ def with_values(robot: Robot, box: tuple[Any, Any], value: int) -> OccupancyGrid
     return robot.stamped_map(values)
 
 
-UPPER, LOWER = (slice(8, 11), 15), (slice(0, 3), 15)
-"""Walls across the ways."""
+UPPER, LOWER = (slice(8, 11), 15), (slice(0, 3), 15)  # walls across the ways
 
 
 @pytest.mark.parametrize("period", [SOON, 0.0])

@@ -34,16 +34,11 @@ pytestmark = [
 
 def build(workspace: Path, *options: str) -> Path:
     command = [str(COLCON), "build", "--base-paths", "src", "--event-handlers", "console_direct+"]
-    built = subprocess.run(
-        [*command, *options],
-        cwd=workspace,
-        # A home of its own: the user's defaults may ask for another layout.
-        env={**os.environ, "COLCON_HOME": str(workspace / "home")},
-        stdout=subprocess.PIPE,
-        stderr=subprocess.STDOUT,
-        text=True,
-    )
-    assert built.returncode == 0, built.stdout
+    # A home of its own: the user's defaults may ask for another layout.
+    environment = {**os.environ, "COLCON_HOME": str(workspace / "home")}
+    command += options
+    built = subprocess.run(command, cwd=workspace, env=environment, capture_output=True, text=True)
+    assert built.returncode == 0, built.stdout + built.stderr
     return workspace / "install"
 
 

@@ -5,7 +5,8 @@ from itertools import pairwise
 import numpy as np
 import pytest
 from builtin_interfaces.msg import Time
-from geometry_msgs.msg import Pose, PoseStamped, Quaternion
+from client import MapFixture, plan_request, pose
+from geometry_msgs.msg import PoseStamped, Quaternion
 from hypothesis import given
 from hypothesis import strategies as st
 from integration.robot import changed, points_of, yaw_of
@@ -13,11 +14,10 @@ from nav_msgs.msg import OccupancyGrid, Path
 from rclpy.serialization import deserialize_message, serialize_message
 from std_msgs.msg import Header
 
-from ddqn_planner.grid import GridMap
+from ddqn_planner.grid import Cell, GridMap, MapFile
 from ddqn_planner.nodes.conversions import (
     along,
     cell_from_pose,
-    check_pose,
     grid_from_message,
     occupancy_message,
     path_bytes,
@@ -52,27 +52,21 @@ def test_a_map_survives_the_way_to_a_message_and_back(yaw: float, sign: int) -> 
     assert grid.occupancy.tolist() == [[False, True, False], [True, True, False]]
 
 
-@pytest.mark.parametrize(
-    ("field", "value", "reason"),
-    [
+def test_a_malformed_map_is_refused() -> None:
+    rolled, at = Quaternion(x=math.sin(0.1), w=math.cos(0.1)), "info.origin.orientation"
+    for field, value, reason in (
         ("header.frame_id", "", "frame is ''"),
-        ("info.resolution", 0.0, "resolution is 0.0"),
-        ("info.resolution", math.nan, "resolution is nan"),
-        ("info.resolution", math.inf, "resolution is inf"),
-        ("info.width", 0, "0 x 2 cells"),
-        ("info.height", 0, "3 x 0 cells"),
+        *(("info.resolution", n, f"resolution is {n}") for n in (0.0, math.nan, math.inf)),
+        *(("info.width", 0, "0 x 2 cells"), ("info.height", 0, "3 x 0 cells")),
         ("info.width", 2**31, "give at most"),
         ("info.width", 4, "data has 6 values; its 4 x 2 cells need 8"),
         ("info.origin.position.x", math.nan, "position is .x = nan"),
         ("info.origin.position.z", math.inf, "z = inf"),
-        ("info.origin.orientation", Quaternion(w=1.001), "quaternion of norm 1.001"),
-        ("info.origin.orientation", Quaternion(x=math.nan), "quaternion of norm nan"),
-        ("info.origin.orientation", Quaternion(x=math.sin(0.1), w=math.cos(0.1)), "rolled or pitc"),
-    ],
-)
-def test_a_malformed_map_is_refused(field: str, value: object, reason: str) -> None:
-    with pytest.raises(ValueError, match=reason):
-        grid_from_message(changed(map_message(), field, value))
+        *((at, Quaternion(w=1.001), "norm 1.001"), (at, Quaternion(x=math.nan), "norm nan")),
+        (at, rolled, "rolled or pitched"),
+    ):
+        with pytest.raises(ValueError, match=reason):
+            grid_from_message(changed(map_message(), field, value))
 
 
 def test_a_pose_has_a_cell_also_off_the_map_or_is_refused_by_the_name_of_its_value() -> None:
@@ -88,17 +82,6 @@ def test_a_pose_has_a_cell_also_off_the_map_or_is_refused_by_the_name_of_its_val
         bad = changed(PoseStamped(header=HEADER), f"pose.{field}", value)
         with pytest.raises(ValueError, match=reason):
             cell_from_pose("the goal", bad, grid, "map")
-
-
-def test_a_pose_needs_the_frame_of_the_map_if_there_is_one() -> None:
-    stamped = PoseStamped(pose=Pose(orientation=Quaternion(w=1.00009)))
-    with pytest.raises(ValueError, match="frame is ''"):
-        check_pose("the start", stamped)
-    for stamped.header.frame_id in ("", "odom"):
-        its = f"the start's frame is '{stamped.header.frame_id}', the map's is 'map'"
-        with pytest.raises(ValueError, match=its):
-            check_pose("the start", stamped, "map")
-    check_pose("the start", stamped)
 
 
 SHOWN = [([0.0, 1.004, 1.996, 3.0], [0, 33, 67, 100]), ([0.0, 0.0], [100, 100])]
@@ -147,9 +130,9 @@ def test_a_path_looks_ahead_and_ends_as_the_goal_and_is_the_same_serialized(
     else:
         expected = [grid.cell_to_world(cell) for cell in cells]
         np.testing.assert_allclose(points, expected, atol=1e-9)
-    for pose, here, there in zip(path.poses, points, points[1:], strict=False):
+    for stamped, here, there in zip(path.poses, points, points[1:], strict=False):
         ahead = math.atan2(there[1] - here[1], there[0] - here[0])
-        looks = yaw_of(pose.pose.orientation)
+        looks = yaw_of(stamped.pose.orientation)
         assert math.cos(looks - ahead) == pytest.approx(1.0) or here == there
     assert all(pose.pose.orientation == quaternion(0.7) for pose in path.poses[-1:])
     content = path_bytes(*along(cells, grid, is_dense), header, quaternion(0.7))
@@ -162,3 +145,22 @@ def test_a_path_looks_ahead_and_ends_as_the_goal_and_is_the_same_serialized(
         )
         np.testing.assert_allclose(values, expected, atol=1e-12)
     assert len(serialize_message(sent)) == len(serialize_message(path))
+
+
+def test_the_check_of_an_answer_finds_each_error() -> None:
+    values = np.array([[0, 100, 0], [0, 0, 100], [0, 100, 0]], dtype=np.int8)
+    fixture = MapFixture(MapFile(values, 0.1, (1.0, 2.0, 0.3)))
+    cases: list[tuple[Cell, Cell, list[Cell], str]] = [
+        ((0, 0), (1, 1), [(0, 0), (0, 1), (1, 1)], ""),
+        ((0, 0), (0, 0), [(0, 0)], ""),
+        *((start, goal, [], "") for start in ((0, 0), (1, 0)) for goal in ((2, 0), (9, 9))),
+        ((0, 0), (1, 1), [], "where there is one"),
+        ((0, 0), (1, 1), [(0, 0), (0, 1)], "asked was"),
+        ((0, 0), (1, 1), [(0, 0), (1, 1)], "illegal segment"),
+        ((0, 0), (2, 0), [(0, 0), (2, 0)], "illegal segment"),
+        ((0, 0), (0, 1), [(0, 0), (-1, 0), (0, 1)], "illegal segment"),
+    ]
+    for start, goal, path, error in cases:
+        plan = Path(poses=[pose(fixture.grid, cell) for cell in path])
+        found = fixture.error(plan_request(fixture.grid, start, goal), plan)
+        assert (error in found) if error else not found

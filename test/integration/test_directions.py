@@ -1,28 +1,22 @@
 """One-way zones, from map server to planner: no path goes the wrong way, whatever is late."""
 
 from collections.abc import Callable, Iterator
-from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from client import cells_of, pose, wait_for, wait_for_map
+from client import pose, wait_for, wait_for_map
 from diagnostic_msgs.msg import DiagnosticArray
-from exact_segments import is_legal
 from nav_msgs.msg import OccupancyGrid
-from nav_msgs.msg import Path as PathMessage
 from nav_msgs.srv import GetMap, LoadMap
 from std_srvs.srv import Trigger
 
-from ddqn_planner import Planner
-from ddqn_planner.grid import GridMap, MapFile, MoveRule, read_map_file, save_map
-from ddqn_planner.nodes.conversions import turns
+from ddqn_planner.grid import GridMap, MapFile, read_map_file, save_map
 from ddqn_planner.nodes.runtime import LATCHED
 from ddqn_planner.resources import find_map
 
-EAST, WEST = 0b00111000, 0b10000011
-"""What lanes to the east and to the west forbid."""
+EAST, WEST = 0b00111000, 0b10000011  # what lanes to the east and to the west forbid
 
 
 @pytest.fixture(scope="module")
@@ -35,26 +29,9 @@ def client(run_node: Any, make_client: Callable[[str], Any]) -> Iterator[Any]:
         yield make_client("/hall")
 
 
-def wait_until_planned(client: Any, ends: tuple[Any, Any]) -> PathMessage:
-    """Return the first path that is not empty: before it, map or model may be missing."""
-
-    def path() -> PathMessage | None:
-        answer = client.get_plan(*ends)
-        return answer if answer.poses else None
-
-    return wait_for("path", path)
-
-
-def test_paths_there_and_back_obey_the_served_directions(client: Any) -> None:
-    map_file = read_map_file(find_map("warehouse"))
-    grid, planner = map_file.grid(), Planner.load("any_map")
-    there = map_file.start, map_file.goal
-    for ends in (there, there[::-1]):
-        path = wait_until_planned(client, tuple(pose(grid, cell) for cell in ends))
-        path.poses = turns(path.poses)
-        cells = cells_of(grid, path)
-        assert cells == [*planner.plan(grid, *ends, simplified=True).cells]
-        assert all(is_legal(*segment, grid, MoveRule.ROBOT_SAFE) for segment in pairwise(cells))
+def wait_until_planned(client: Any, ends: tuple[Any, Any]) -> None:
+    """Wait for a path that is not empty: before it, map or model may be missing."""
+    wait_for("path", lambda: client.get_plan(*ends).poses)
 
 
 def test_the_directions_come_with_the_stamp_and_the_place_of_the_map(client: Any) -> None:

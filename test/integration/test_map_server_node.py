@@ -80,8 +80,7 @@ def test_topic_and_service_give_the_map_of_a_path_a_url_and_a_shipped_name(
     assert (grid.resolution, *grid.origin) == pytest.approx((0.25, -1.0, 2.0, 0.5))
     shipped = read_map_file(SHIPPED).values
     for url, values in (
-        ("dilemma.yaml", shipped),
-        (map_file, small_values),
+        *(("dilemma.yaml", shipped), (map_file, small_values)),
         ("package://ddqn_planner/maps/dilemma.yaml", shipped),
         (f"file://{map_file}", small_values),
     ):
@@ -132,13 +131,10 @@ def test_a_failed_load_has_its_code_and_keeps_the_served_map(
     no_files = "unknown.yaml", "", "x" * 5000, "package://no/x.yaml", tmp_path, pipe
     for url, pattern, replacement, code in (
         *((url, "", "", NO_FILE) for url in no_files),
-        (image, "", "", BAD_YAML),
-        (bad, "good.pgm", "missing.pgm", BAD_DATA),
-        (bad, "good.pgm", "cut.pgm", BAD_DATA),
-        (bad, "(?s).*", "[1, 2", BAD_YAML),
+        *((image, "", "", BAD_YAML), (bad, "(?s).*", "[1, 2", BAD_YAML)),
+        *((bad, "good.pgm", name, BAD_DATA) for name in ("missing.pgm", "cut.pgm")),
         # Files may have these, messages may not.
-        (bad, "resolution: .*", "resolution: 1e-300", BAD_YAML),
-        (bad, "resolution: .*", "resolution: 1e300", BAD_YAML),
+        *((bad, "resolution: .*", f"resolution: 1e{n}", BAD_YAML) for n in (-300, 300)),
     ):
         bad.write_text(re.sub(pattern, replacement, text, count=1))
         response = load_map(client, url)

@@ -4,7 +4,6 @@ Here a message of map_msgs is a stand-in with the same fields; PyPI does not hav
 """
 
 import array
-import re
 import threading
 import time
 from collections.abc import Callable, Coroutine, Iterator
@@ -36,11 +35,9 @@ from ddqn_planner.nodes.report import Outcome, Report, RequestError
 from ddqn_planner.nodes.runtime import LATCHED, BaseNode, Worker
 from ddqn_planner.planning import PlanRequest
 
-EAST, WEST = 0b00111000, 0b10000011
-"""What lanes to the east and to the west forbid."""
+EAST, WEST = 0b00111000, 0b10000011  # what lanes to the east and to the west forbid
 
-NOTHING = 0, None
-"""What is used without a map to plan on."""
+NOTHING = 0, None  # what is used without a map to plan on
 
 SetParameters = Callable[..., None]
 
@@ -261,23 +258,21 @@ def test_a_costmap_is_planned_on_for_map_timeout_after_its_last_message(
 
     def after(seconds: float) -> str:
         now[0] += seconds
-        if not source.missing:
-            return ""
-        with pytest.raises(RequestError, match=re.escape(source.missing)) as error:
+        try:
             source.check()
-        return error.value.status
+        except RequestError as error:
+            return error.status if source.missing == str(error) else "another reason"
+        return source.missing
 
     source._take(map_of(5))
     assert after(1e6) == ""  # a map
     set_parameters(map_type="costmap")
     assert after(0) == "MAP_TIMEOUT"
     assert "nothing came on /map for longer than map_timeout, 5 s; start" in source.missing
-    source._take(map_of(5))
-    assert [after(4.9), after(0.2)] == ["", "MAP_TIMEOUT"]
-    source._take_update(update())
-    assert [after(0), after(4.9), after(0.2)] == ["", "", "MAP_TIMEOUT"]
+    for take, message in ((source._take, map_of(5)), (source._take_update, update())):
+        take(message)
+        assert [after(0), after(4.9), after(0.2)] == ["", "", "MAP_TIMEOUT"]
     source._take_update(update(x=40))  # what is refused is no news
-    assert after(0) == "MAP_TIMEOUT"
     set_parameters(robot_radius=0.4)  # nor is a parameter
     assert after(0) == "MAP_TIMEOUT"
     set_parameters(map_timeout=20.0)

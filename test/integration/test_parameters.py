@@ -223,8 +223,6 @@ def test_what_a_node_cannot_start_with_is_said_and_ends_with_1(
     assert "Traceback" not in log
 
 
-# RViz
-
 MESSAGES = {"Map": "nav_msgs/OccupancyGrid", "Path": "nav_msgs/Path"}
 MESSAGES |= {"MarkerArray": "visualization_msgs/MarkerArray"}
 MESSAGES |= {"SetGoal": "geometry_msgs/PoseStamped"}

@@ -17,6 +17,7 @@ from rclpy.time import Time
 from scipy.spatial.transform import Rotation
 from std_msgs.msg import Header
 
+from ddqn_planner.nodes.conversions import check_pose
 from ddqn_planner.nodes.poses import Frames, StartSource, transformed
 from ddqn_planner.nodes.report import Refusals, RequestError
 
@@ -185,8 +186,11 @@ def test_transforms_from_before_the_clock_jumped_back_are_forgotten(listening: A
 def test_other_frames_are_refused_without_tf_and_the_remedy_names_it(listening: Any) -> None:
     stamped, frames = pose_at(1), listening()
     frames.check("the goal", stamped, "map")
+    check_pose("the start", stamped)  # in any frame
     with pytest.raises(ValueError, match=r"frame is ''; name one in header\.frame_id$"):
         frames.check("the goal", PoseStamped(), "map")
+    with pytest.raises(ValueError, match="the start's frame is '', the map's is 'map'"):
+        check_pose("the start", PoseStamped(), "map")
     frames.available = False
     with pytest.raises(ValueError, match=r"'odom', the map's is 'map'; transform .* tf2_ros"):
         frames.check("the goal", stamped, "map")

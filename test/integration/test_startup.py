@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 from diagnostic_msgs.msg import DiagnosticStatus
-from integration.robot import GOAL, START, TIMEOUT, ask_for_plan, values_of
+from integration.robot import GOAL, START, TIMEOUT, ask_for_plan
 
 
 def test_requests_wait_for_the_first_map(run_waiting: Any, load_gate: Path, model: Path) -> None:
@@ -26,43 +26,37 @@ def test_requests_wait_for_the_first_map(run_waiting: Any, load_gate: Path, mode
         assert robot.node.heavy_libraries <= {"numba", "scipy"}
 
 
-@pytest.mark.parametrize("other", [False, True])
+@pytest.mark.parametrize("case", ["good", "broken", "replaced"])
 def test_requests_wait_for_the_first_model_and_another_one_that_is_set_meanwhile_stays(
-    run_waiting: Any, model: Path, load_gate: Path, other: bool
+    run_waiting: Any, model: Path, load_gate: Path, tmp_path: Path, case: str
 ) -> None:
-    with run_waiting(f"/waiting_{other}") as robot:
+    broken = tmp_path / "any_map.safetensors"
+    broken.write_text("a model")
+    first = str(broken) if case == "broken" else "any_map"
+    with run_waiting(f"/waiting_{case}", {"model": first}) as robot:
         robot.set_map(robot.map_message())
         plan, answered = ask_for_plan(robot)
-        status = robot.wait_for_reason("the model is being loaded")
-        assert (status.level, values_of(status)["model"]) == (DiagnosticStatus.WARN, "any_map")
+        status = robot.wait_for_reason("the model is being loaded", {"model": first})
+        assert status.level == DiagnosticStatus.WARN
         assert robot.client.get_parameter("planner", "mode") == "greedy"
         assert not plan.done()
         assert robot.plans.messages() == []
-        if other:
+        if case == "replaced":
             robot.set(model=str(model))
         load_gate.touch()
         assert answered.wait(TIMEOUT)
-        assert plan.result().plan.poses
+        assert bool(plan.result().plan.poses) == (case != "broken")
+        if case == "broken":
+            reason = "cannot be read as safetensors"
+            status = robot.wait_for_reason(f"no model is loaded: .*{reason}")
+            assert status.level == DiagnosticStatus.ERROR
+            robot.node.wait_for_log(f"model refused: .*{reason}.*set the parameter")
+            return
         robot.wait_for_path(START, GOAL)
-        if other:
+        if case == "replaced":
             robot.assert_works()
-            assert values_of(robot.wait_for_reason("^a path of "))["model file"] == str(model)
+            robot.wait_for_reason("^a path of ", {"model file": str(model)})
         assert "refused" not in robot.node.log
-
-
-def test_a_broken_model_answers_requests(run_waiting: Any, tmp_path: Path, load_gate: Path) -> None:
-    broken = tmp_path / "any_map.safetensors"
-    broken.write_text("a model")
-    with run_waiting("/broken", {"model": str(broken)}) as robot:
-        robot.set_map(robot.map_message())
-        plan, answered = ask_for_plan(robot)
-        robot.wait_for_reason("the model is being loaded")
-        load_gate.touch()
-        assert answered.wait(TIMEOUT)
-        assert plan.result().plan.poses == []
-        status = robot.wait_for_reason("no model is loaded: .*cannot be read as safetensors")
-        assert status.level == DiagnosticStatus.ERROR
-        robot.node.wait_for_log("model refused: .*cannot be read as safetensors.*set the parameter")
 
 
 def test_a_planner_that_is_stopped_waits_for_no_model(run_waiting: Any) -> None:

@@ -94,13 +94,10 @@ def test_decisions_and_costs_are_as_certified(patch_B9: np.ndarray, rule: MoveRu
     assert error_BA[legal_BA].max(initial=0) <= certificate.multiplier_error
 
 
-@given(
-    patches(),
-    st.sampled_from(MOVE_RULES),
-    st.sampled_from(["propagation", "any_map"]),
-    st.integers(0, 99),
-    st.sampled_from([0.1, 0.5, 3.0]),
-)
+NAMES, SCALES = st.sampled_from(["propagation", "any_map"]), st.sampled_from([0.1, 0.5, 3.0])
+
+
+@given(patches(), st.sampled_from(MOVE_RULES), NAMES, st.integers(0, 99), SCALES)
 def test_no_margin_of_any_network_is_above_a_sampled_one(
     patch_B9: np.ndarray, rule: MoveRule, name: str, seed: int, scale: float
 ) -> None:
@@ -122,13 +119,11 @@ def unsure_and_noisy(share: float, noise: float) -> tuple[PropagationQNetwork, C
     return network, certify(network)
 
 
-@given(
-    grids_with_costs() | grids_with_free_cell(),
-    st.sampled_from(MOVE_RULES),
-    st.sampled_from([0.0, 0.02]),
-    st.sampled_from([1.0, 0.3, 0.1, 0.01]),
-    st.booleans(),
-)
+GRIDS, NOISES = grids_with_costs() | grids_with_free_cell(), st.sampled_from([0.0, 0.02])
+SHARES = st.sampled_from([1.0, 0.3, 0.1, 0.01])
+
+
+@given(GRIDS, st.sampled_from(MOVE_RULES), NOISES, SHARES, st.booleans())
 def test_no_path_costs_more_than_certified(
     place: Place, rule: MoveRule, noise: float, share: float, timed: bool
 ) -> None:

@@ -99,14 +99,10 @@ def test_a_request_visits_few_cells_of_a_large_map() -> None:
     assert np.count_nonzero(field.known.distance) < 0.6 * occupancy.size
 
 
-PATCH_IDS = numpy_st.arrays(
-    np.int32,
-    numpy_st.array_shapes(min_dims=2, max_dims=2, min_side=1, max_side=9),
-    elements=st.integers(0, 3),
-)
-COSTS = numpy_st.arrays(
-    np.float32, (4, 8), elements=st.floats(1, 20, width=32) | st.just(float("inf"))
-)
+SHAPES = numpy_st.array_shapes(min_dims=2, max_dims=2, min_side=1, max_side=9)
+PATCH_IDS = numpy_st.arrays(np.int32, SHAPES, elements=st.integers(0, 3))
+LENGTHS = st.floats(1, 20, width=32) | st.just(float("inf"))
+COSTS = numpy_st.arrays(np.float32, (4, 8), elements=LENGTHS)
 
 
 def propagate_values(patch_id: np.ndarray, cost_PA: np.ndarray, goal: Cell) -> np.ndarray:
@@ -170,9 +166,6 @@ def test_a_map_may_hold_all_sets_of_directions(classes: int) -> None:
     np.testing.assert_allclose(-value, exact, rtol=1e-2)
 
 
-# Repair
-
-
 @pytest.fixture(autouse=True)
 def any_share(monkeypatch: pytest.MonkeyPatch) -> None:
     """Repair the small maps of these tests, however much of them changes."""
@@ -204,16 +197,13 @@ def changed_maps(draw: st.DrawFn, grid: GridMap) -> GridMap:
     if grid.width + left + right < 1 or grid.height + below + above < 1:
         left = right = below = above = 1
 
-    def cut(array: np.ndarray | None) -> Any:
-        if array is None:
-            return None
-        height, width = array.shape
-        return np.pad(array, 3)[3 - below : 3 + height + above, 3 - left : 3 + width + right]
-
+    rows = slice(3 - below, 3 + grid.height + above)
+    columns = slice(3 - left, 3 + grid.width + right)
+    layers = (grid.occupancy, grid.cost, grid.forbidden)
+    cut = [None if array is None else np.pad(array, 3)[rows, columns] for array in layers]
     moved = np.subtract(grid.cell_to_world((-left, -below)), grid.cell_to_world((0, 0)))
     origin = (*(grid.origin[:2] + moved).tolist(), grid.origin[2])
-    layers = cut(grid.cost), None, cut(grid.forbidden)
-    return GridMap(cut(grid.occupancy), grid.resolution, origin, *layers)
+    return GridMap(cut[0], grid.resolution, origin, cut[1], None, cut[2])
 
 
 @settings(max_examples=400)
@@ -333,12 +323,13 @@ def test_a_field_that_is_interrupted_anywhere_is_as_a_new_one(
     x, y = data.draw(st.sampled_from(grid.free_cells()))
     changed = grid.with_patch([[(x, y) != goal]], x, y)
     older = planner.q_field(grid, goal, rule)
-    steps = [
-        lambda: older.value if whole else older.rollout(start),
-        lambda: planner.q_field(changed, goal, rule),
-        lambda: planner.plan(changed, start, goal, rule),
-    ]
-    for number, step in enumerate(steps):
+    for number, step in enumerate(
+        (
+            lambda: older.value if whole else older.rollout(start),
+            lambda: planner.q_field(changed, goal, rule),
+            lambda: planner.plan(changed, start, goal, rule),
+        )
+    ):
         if number == interrupted_step:
             run_until(line, step)
         step()
@@ -407,20 +398,12 @@ def test_threads_share_a_planner_while_the_map_changes() -> None:
     for _ in range(5):
         x, y = random.integers(0, 58, 2).tolist()
         maps.append(maps[-1].with_patch(random.random((2, 2)) < 0.5, x, y))
-    expected = {
-        (number, request): new_planner().plan(changed, *request)
-        for number, changed in enumerate(maps)
-        for request in requests
-    }
-    planner = new_planner()
+    asked = [(changed, *request) for changed in maps for request in requests]
+    expected, planner = [new_planner().plan(*request) for request in asked], new_planner()
 
     def count_wrong(seed: int) -> int:
-        order, wrong = np.random.default_rng(seed), 0
-        for _ in range(100):
-            number = int(order.integers(len(maps)))
-            request = requests[int(order.integers(len(requests)))]
-            wrong += planner.plan(maps[number], *request) != expected[number, request]
-        return wrong
+        order = np.random.default_rng(seed).integers(len(asked), size=100).tolist()
+        return sum(planner.plan(*asked[number]) != expected[number] for number in order)
 
     with ThreadPoolExecutor(4) as threads:
         assert list(threads.map(count_wrong, range(4))) == [0, 0, 0, 0]

@@ -17,14 +17,8 @@ from ddqn_planner import GridMap, MoveRule, simplify
 from ddqn_planner.grid import MOVES, Cell, legal_moves, path_cost, shortest_distances, shortest_path
 from ddqn_planner.grid.moves import cells_along
 from ddqn_planner.planning import PlanRequest
-from ddqn_planner.planning.paths import (
-    REACH,
-    is_path_valid,
-    keep_or_switch,
-    legal_segments,
-    rest_of_path,
-    search,
-)
+from ddqn_planner.planning.paths import REACH, is_path_valid, keep_or_switch, rest_of_path, search
+from ddqn_planner.planning.segments import legal_segments
 
 
 @st.composite
@@ -49,10 +43,8 @@ def cells_with_positions(path: list[Cell]) -> list[tuple[Cell, Fraction]]:
         vector = [b - a for a, b in zip(first, last, strict=True)]
         steps = max(map(abs, vector))
         for step in range(steps):
-            x, y = (
-                math.floor(a + Fraction(step * by, steps) + Fraction(1, 2))
-                for a, by in zip(first, vector, strict=True)
-            )
+            at = (a + Fraction(step * by, steps) for a, by in zip(first, vector, strict=True))
+            x, y = (math.floor(each + Fraction(1, 2)) for each in at)
             passed.append(((x, y), number + Fraction(step, steps)))
     return [*passed, (path[-1], Fraction(len(path) - 1))]
 
@@ -187,9 +179,8 @@ def test_what_is_kept_is_legal_and_costs_at_most_the_threshold_more(
 def test_a_search_finds_any_legal_path(place: Place, rule: MoveRule, data: st.DataObject) -> None:
     grid, goal = place
     start = data.draw(st.sampled_from(grid.free_cells()))
-    value = data.draw(
-        numpy_st.arrays(np.float32, grid.occupancy.shape, elements=st.floats(width=32))
-    )
+    shape, values = grid.occupancy.shape, st.floats(width=32)
+    value = data.draw(numpy_st.arrays(np.float32, shape, elements=values))
     legal = legal_moves(grid.occupancy, rule)
     distances = shortest_distances(grid, goal, rule)
 

@@ -1,8 +1,11 @@
 """Plans against exact oracles: on maps with costs, one-way zones and walls, by any network."""
 
 import gc
+import json
+import pickle
 import time
 import weakref
+from dataclasses import FrozenInstanceError, replace
 from itertools import pairwise
 from typing import Any
 
@@ -13,7 +16,7 @@ from hypothesis import strategies as st
 from networks import ANY_MAP, new_planner, random_network
 from strategies import GRIDS, RULES, Place, cells_of
 
-from ddqn_planner import GridMap, MoveRule, inflate
+from ddqn_planner import GridMap, MoveRule, Plan, inflate
 from ddqn_planner.grid import MOVES, Cell, legal_moves, path_cost, path_length, shortest_distances
 from ddqn_planner.model import AnyMapQNetwork, ModelMetadata
 from ddqn_planner.planning import PlanMethod, Planner, PlanRequest, PlanStatus, QField, simplify
@@ -107,7 +110,7 @@ def test_whatever_the_network_says_moves_are_legal_and_a_search_finds_a_path(
         assert searched == greedy
 
 
-def test_a_request_off_the_free_cells_is_told_apart() -> None:
+def test_a_request_off_the_free_cells_or_on_a_map_of_another_size_is_told_apart() -> None:
     planner, grid = random_planner(3, 3, 0), GridMap(np.array([[0, 0, 0], [0, 1, 0], [0, 0, 0]]))
     for start, goal, status in (
         ((-1, 0), (2, 2), PlanStatus.START_OUTSIDE_MAP),
@@ -117,13 +120,10 @@ def test_a_request_off_the_free_cells_is_told_apart() -> None:
     ):
         plan = planner.plan(grid, start, goal, "unit")
         assert (plan.status, plan.goal, plan.move_rule) == (status, None, MoveRule.UNIT)
-
-
-def test_a_map_of_another_size_is_refused() -> None:
-    grid, planner = GridMap(np.zeros((4, 5))), random_planner(5, 4, 0)
-    assert planner.plan(grid, (0, 0), (1, 1)).status is PlanStatus.MAP_SIZE_UNSUPPORTED
-    with pytest.raises(ValueError, match="5 x 4"):
-        planner.q_field(grid, (1, 1))
+    larger = GridMap(np.zeros((4, 5)))
+    assert planner.plan(larger, (0, 0), (1, 1)).status is PlanStatus.MAP_SIZE_UNSUPPORTED
+    with pytest.raises(ValueError, match="3 x 3"):
+        planner.q_field(larger, (1, 1))
 
 
 def test_a_plan_tells_how_long_field_and_rollout_took(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -283,3 +283,36 @@ def test_a_start_too_near_to_an_obstacle_finds_a_goal_that_is_cut_off() -> None:
             ANY_MAP.plan(grid, (1, 2), (11, 2), tolerance=tolerance)
     with pytest.raises(ValueError, match="start_clearing_radius is nan"):
         ANY_MAP.plan(grid, (1, 2), (11, 2), start_clearing_radius=np.nan)
+
+
+CELLS = ((0, 0), (1, 0), (2, 1))
+PLAN = Plan(PlanStatus.SUCCEEDED, np.array(CELLS), cost=2.5, goal=(2, 1), field_ms=1.0)
+
+
+def test_the_cells_of_a_plan_are_pairs_of_python_ints() -> None:
+    assert PLAN.cells == CELLS
+    assert json.loads(json.dumps(PLAN.cells)) == [[0, 0], [1, 0], [2, 1]]
+    assert PLAN.path.dtype == np.int32
+    assert PLAN.length == pytest.approx(1 + 2**0.5)
+    nothing = Plan(PlanStatus.NO_PATH)
+    assert (nothing.cells, nothing.path.shape, nothing.length) == ((), (0, 2), 0)
+    with pytest.raises(ValueError, match="read-only"):
+        PLAN.path[0, 0] = 5
+    with pytest.raises(FrozenInstanceError):
+        PLAN.cost = 1.0  # type: ignore[misc]
+    cells = np.array(CELLS, dtype=np.int32)
+    assert Plan(PlanStatus.SUCCEEDED, cells).cells == CELLS
+    cells[0, 0] = 5  # the array that was given stays writable
+
+
+def test_plans_are_equal_whatever_time_they_took() -> None:
+    assert Plan(PlanStatus.SUCCEEDED, np.array(CELLS), cost=2.5) != PLAN
+    for same in (replace(PLAN, field_ms=7.0, rollout_ms=2.0), pickle.loads(pickle.dumps(PLAN))):
+        assert same == PLAN
+        assert hash(same) == hash(PLAN)
+        assert same.cells == CELLS
+    shorter = replace(PLAN, path=np.array(CELLS[:2]))
+    assert shorter.cells == CELLS[:2]
+    others = replace(PLAN, cost=2.6), replace(PLAN, goal=(0, 0)), replace(PLAN, move_rule="unit")
+    for other in (shorter, replace(PLAN, status=PlanStatus.NO_PATH), *others, CELLS):
+        assert other != PLAN

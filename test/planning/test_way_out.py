@@ -110,27 +110,27 @@ def test_a_path_that_leaves_is_valid_until_another_obstacle_lies_on_it() -> None
     occupancy[2, 2:5] = True
     grid = GridMap(occupancy)
     path = [(x, 2) for x in range(2, 12)]
-    assert is_path_valid(path, (4, 2), grid, "robot_safe", 1)
-    assert is_path_valid(path, (2, 2), grid, "robot_safe", 2)
-    assert not is_path_valid(path, (2, 2), grid, "robot_safe", 1)  # its third cell is beyond
-    assert not is_path_valid(path[:3], (2, 2), grid, "robot_safe", 2)  # it leads nowhere
-    assert not is_path_valid(path, (2, 2), grid.with_patch([[True]], 8, 2), "robot_safe", 2)
+    blocked = grid.with_patch([[True]], 8, 2)
+    for part, robot, each, radius, is_valid in (
+        *((path, (4, 2), grid, 1, True), (path, (2, 2), grid, 2, True)),
+        (path, (2, 2), grid, 1, False),  # its third cell is beyond
+        (path[:3], (2, 2), grid, 2, False),  # it leads nowhere
+        (path, (2, 2), blocked, 2, False),
+        (path, (1, 2), grid, 2, False),  # a robot beside the obstacle has to go round it
+    ):
+        assert is_path_valid(part, robot, each, "robot_safe", radius) == is_valid
     only_west = np.full(occupancy.shape, 0b10000011, dtype=np.uint8)
     only_west[:, 5:] = 0
     one_way = GridMap(occupancy, forbidden=only_west)
     assert not is_path_valid(path, (4, 2), one_way, "robot_safe", 1)
     assert is_path_valid([(2, 2), (1, 2)], (2, 2), one_way, "robot_safe", 1)
-    # A robot beside the obstacle has to go round it.
-    assert not is_path_valid(path, (1, 2), grid, "robot_safe", 2)
 
 
-@pytest.mark.parametrize(
-    ("blocked", "is_kept", "begin"),
-    [
-        ([(2, 2)], True, [(2, 2), (2, 3), (3, 4), (4, 4)]),  # the robot's cell alone: straight on
-        ([(2, 2), (2, 3)], False, [(2, 2), (3, 2), (4, 3)]),  # round the next cell
-    ],
-)
+KEPT = [(2, 2)], True, [(2, 2), (2, 3), (3, 4), (4, 4)]  # the robot's cell alone: straight on
+LEFT = [(2, 2), (2, 3)], False, [(2, 2), (3, 2), (4, 3)]  # round the next cell
+
+
+@pytest.mark.parametrize(("blocked", "is_kept", "begin"), [KEPT, LEFT])
 def test_a_path_under_way_is_kept_if_the_way_out_lies_on_it(
     blocked: list[Cell], is_kept: bool, begin: list[Cell]
 ) -> None:

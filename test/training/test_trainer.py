@@ -10,11 +10,13 @@ from limits import memory_grows_less_than
 from safetensors import safe_open
 
 from ddqn_planner import GridMap, MoveRule, PlanStatus
+from ddqn_planner.grid import legal_moves
 from ddqn_planner.model import load_model
+from ddqn_planner.planning import QField
 from ddqn_planner.training.double_dqn import Transitions
 from ddqn_planner.training.environment import Scenario
 from ddqn_planner.training.episodes import Episode, EpisodeEnd
-from ddqn_planner.training.evaluation import evaluate
+from ddqn_planner.training.evaluation import evaluate, length_ratios
 from ddqn_planner.training.hyper_parameters import HyperParameters
 from ddqn_planner.training.trainer import CheckpointError, Trainer
 
@@ -98,8 +100,7 @@ def test_an_interrupted_training_continues_bit_for_bit_and_another_seed_gives_an
 ) -> None:
     changes = {"replay_capacity": 200, "update_interval": 2, "target_interval": 30}
     parameters = replace(QUICK, environments=environments, network=network, **changes)
-    trainers = [make(small, parameters, seed) for seed in (0, 0, 1)]
-    uninterrupted, interrupted, other = trainers
+    uninterrupted, interrupted, other = (make(small, parameters, seed) for seed in (0, 0, 1))
     episodes = train(uninterrupted, 400)
     before = train(interrupted, first)
     interrupted.save_checkpoint(tmp_path / "checkpoint")
@@ -135,16 +136,12 @@ def test_epsilon_falls_linearly_and_then_stays(small: Scenario) -> None:
     trainer = make(small, HyperParameters(epsilon_start=0.8, epsilon_end=0.2, epsilon_steps=100))
     for trainer.steps, epsilon in ((0, 0.8), (25, 0.65), (100, 0.2), (101, 0.2), (1000, 0.2)):
         assert trainer.epsilon == pytest.approx(epsilon)
-
-
-def test_without_epsilon_the_robot_follows_the_network_alone(small: Scenario) -> None:
-    parameters = replace(QUICK, learning_starts=10**6, max_episode_steps=9, p_r=0.0)
-    rollouts = []
+    # Without it the robot follows the network, which does not change, alone.
+    still = replace(QUICK, learning_starts=10**6, max_episode_steps=9, p_r=0.0)
     for epsilon in (0.0, 1.0):
-        parameters = replace(parameters, epsilon_start=epsilon, epsilon_end=epsilon)
-        rollouts.append({episode.cells for episode in train(make(small, parameters), 200)})
-    assert len(rollouts[0]) == 1  # the network does not change
-    assert len(rollouts[1]) > 5
+        parameters = replace(still, epsilon_start=epsilon, epsilon_end=epsilon)
+        rollouts = {episode.cells for episode in train(make(small, parameters), 200)}
+        assert len(rollouts) == 1 if epsilon == 0 else len(rollouts) > 5
 
 
 def test_an_episode_adds_up_its_own_rewards_alone(small: Scenario) -> None:
@@ -177,21 +174,12 @@ def test_after_a_truncated_move_the_target_still_bootstraps(small: Scenario) -> 
     assert stored.tolist() == pytest.approx(expected)
 
 
-# Checkpoints
-
-
 @pytest.fixture
 def checkpoint(small: Scenario, tmp_path: Path) -> Path:
     trainer = make(small, replace(QUICK, replay_capacity=100))
     train(trainer, 60)
     trainer.save_checkpoint(tmp_path / "checkpoint")
     return tmp_path / "checkpoint"
-
-
-def test_a_checkpoint_is_of_its_maps(small: Scenario, paper: Scenario, checkpoint: Path) -> None:
-    for other in (paper, replace(small, start=(0, 1)), replace(small, goal=(4, 1))):
-        with pytest.raises(CheckpointError, match="another map, start or goal"):
-            Trainer.load_checkpoint(checkpoint, [other])
 
 
 def test_the_format_of_a_checkpoint_stays(checkpoint: Path) -> None:
@@ -213,7 +201,12 @@ def test_the_format_of_a_checkpoint_stays(checkpoint: Path) -> None:
     assert shapes == expected
 
 
-def test_a_checkpoint_with_another_bit_or_cut_is_refused(small: Scenario, checkpoint: Path) -> None:
+def test_a_checkpoint_of_another_map_or_bit_or_cut_is_refused(
+    small: Scenario, paper: Scenario, checkpoint: Path
+) -> None:
+    for other in (paper, replace(small, start=(0, 1)), replace(small, goal=(4, 1))):
+        with pytest.raises(CheckpointError, match="another map, start or goal"):
+            Trainer.load_checkpoint(checkpoint, [other])
     content = checkpoint.read_bytes()
     random = np.random.default_rng(0)
     header = 8 + int.from_bytes(content[:8], "little")
@@ -249,3 +242,30 @@ def test_a_parameter_out_of_range_is_named() -> None:
     for name, value in wrong.items():
         with pytest.raises(ValueError, match=f"{name} is {value!r}"):
             HyperParameters(**{name: value})
+
+
+RULE = MoveRule.ROBOT_SAFE
+GRID = GridMap(np.array([[0, 0, 0, 1, 0], [0, 0, 0, 1, 0]]))
+
+
+def field_of(actions: list[list[int]]) -> QField:
+    """The field toward (2, 0) that prefers one action in each cell."""
+    q = np.zeros((8, *GRID.occupancy.shape), dtype=np.float32)
+    for y, x in np.ndindex(GRID.occupancy.shape):
+        q[actions[y][x], y, x] = 1
+    return QField((2, 0), q, legal_moves(GRID.occupancy, RULE))
+
+
+def test_a_detour_counts_with_its_length_and_a_trapped_rollout_is_left_out() -> None:
+    # (0, 1) goes by (0, 0), (1, 1) and (2, 1) go to each other; nothing joins (4, 0) to the goal.
+    field = field_of([[0, 0, 0, 0, 0], [6, 0, 4, 0, 0]])
+    detour = 3 / (1 + 2**0.5)
+    ratios = [[1, 1, np.nan, np.nan, np.nan], [detour, np.inf, np.inf, np.nan, np.nan]]
+    np.testing.assert_allclose(length_ratios(field, GRID, RULE), ratios)
+    evaluation = evaluate(field, GRID, RULE)
+    assert (evaluation.starts, evaluation.solved) == (5, 3)
+    assert evaluation.mean_ratio == pytest.approx((2 + detour) / 3)
+    assert evaluation.worst_ratio == pytest.approx(detour)
+    # Nobody reaches the goal.
+    evaluation = evaluate(field_of([[2, 2, 0, 0, 0], [6, 6, 4, 0, 0]]), GRID, RULE)
+    assert evaluation == pytest.approx((5, 0, np.nan, np.nan), nan_ok=True)
