@@ -7,6 +7,7 @@ from hypothesis.extra import numpy as numpy_st
 from ddqn_planner.grid import Cell, GridMap, MoveRule
 
 Place = tuple[GridMap, Cell]
+Data = st.DataObject
 RULES = st.sampled_from(list(MoveRule))
 occupancies = numpy_st.arrays(
     np.bool_,

@@ -37,7 +37,7 @@ def small_map(small: Scenario, tmp_path: Path) -> str:
     return str(path)
 
 
-def test_plan_prints_the_papers_path_by_its_rule(capsys: pytest.CaptureFixture[str]) -> None:
+def test_plan_prints_the_papers_path_by_its_rule(capsys: Any) -> None:
     assert main(["plan", "dilemma", "--model", "dilemma"]) == 0
     printed = capsys.readouterr().out
     assert "length 22.97 cells, optimum 22.97 under corner_cutting" in printed
@@ -72,7 +72,7 @@ ASKED: dict[str, tuple[dict[str, Any], tuple[float, float], dict[str, Any]]] = {
 }
 
 
-def test_plan_gives_as_the_library(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+def test_plan_gives_as_the_library(capsys: Any, tmp_path: Path) -> None:
     random, planner, seen = np.random.default_rng(12), Planner.load("any_map"), set()
     values = random.choice([0, 60, -1, 100], (30, 30), p=[0.8, 0.08, 0.06, 0.06])
     values[0, 0], values[-1, -1], values[0, 5], values[-1, -4] = 0, 0, 100, 100
@@ -93,9 +93,7 @@ def test_plan_gives_as_the_library(capsys: pytest.CaptureFixture[str], tmp_path:
     assert len(seen) == len(ASKED)  # each option counts
 
 
-def test_plan_draws_a_wide_map_for_a_terminal(
-    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_plan_draws_a_wide_map_for_a_terminal(capsys: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sys.stdout, "isatty", lambda: True)
     monkeypatch.setenv("COLUMNS", "100")
     monkeypatch.setenv("LINES", "40")
@@ -106,7 +104,7 @@ def test_plan_draws_a_wide_map_for_a_terminal(
     assert re.search(r"cost \d{4}\.\d\d, greedy", length)
 
 
-def test_plan_gives_every_cell(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+def test_plan_gives_every_cell(capsys: Any, tmp_path: Path) -> None:
     file = tmp_path / "path.csv"
     assert main(["plan", "office", "--cells", "--csv", str(file)]) == 0
     *cells, start, length = capsys.readouterr().out.splitlines()
@@ -120,7 +118,7 @@ def test_plan_gives_every_cell(capsys: pytest.CaptureFixture[str], tmp_path: Pat
     assert file.read_text().splitlines() == [header]  # of no other plan
 
 
-def test_plan_writes_json_and_a_picture(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+def test_plan_writes_json_and_a_picture(capsys: Any, tmp_path: Path) -> None:
     def plan(picture: str, *goal: Any) -> Any:
         command = ["plan", "dilemma", "--json", "--picture", str(tmp_path / picture)]
         assert main([*command, *map(str, goal)]) == 0
@@ -137,8 +135,8 @@ def test_plan_writes_json_and_a_picture(capsys: pytest.CaptureFixture[str], tmp_
     assert (tmp_path / "moved.png").read_bytes() == (tmp_path / "there.png").read_bytes()
 
 
-def test_a_missing_library_is_named_with_how_to_get_it(
-    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+def test_a_missing_library_is_named(
+    capsys: Any, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     monkeypatch.setitem(sys.modules, "matplotlib", None)
     assert main(["plan", "dilemma", "--picture", str(tmp_path / "plan.png")]) == 2
@@ -189,8 +187,8 @@ def test_a_node_without_ros_says_in_one_line_how_to_get_it(without: Any, node: s
     assert done.returncode == 1
 
 
-def test_bad_input_ends_with_2_and_its_name(
-    capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+def test_bad_input_ends_with_2(
+    capsys: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
     save_map(GridMap(np.zeros((2, 2))), "bare.yaml")
@@ -211,9 +209,7 @@ def test_bad_input_ends_with_2_and_its_name(
         assert "Traceback" not in error
 
 
-def test_a_trained_model_plans(
-    capsys: pytest.CaptureFixture[str], small_map: str, tmp_path: Path
-) -> None:
+def test_a_trained_model_plans(capsys: Any, small_map: str, tmp_path: Path) -> None:
     train = ["train", small_map, "--out", str(tmp_path / "run"), "--network", "propagation"]
     train += ["--steps", "1000", "--learning-rate", "0.003", "--target-interval", "50"]
     assert main(train) == 0
@@ -225,10 +221,11 @@ def test_a_trained_model_plans(
 
 def test_each_hyper_parameter_can_be_given(small: Scenario, small_map: str, tmp_path: Path) -> None:
     given: dict[str, Any] = {}
-    for name, metadata, default in ((it.name, it.metadata, it.default) for it in PARAMETERS):
-        low, second = metadata.get("range", [0])[0], metadata.get("choices", (0, 0))[1]
-        other = second or (default + 1 if default == low else (low + default) / 2)
-        given[name] = type(default)(other)
+    for each in PARAMETERS:
+        low, default = each.metadata.get("range", [0])[0], each.default
+        other = each.metadata.get("choices", (0, 0))[1]
+        other = other or (default + 1 if default == low else (low + default) / 2)
+        given[each.name] = type(default)(other)
     given["steps"] = 4
     arguments = [f"--{name.replace('_', '-')}={value}" for name, value in given.items()]
     out = str(tmp_path / "run")

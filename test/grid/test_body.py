@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as numpy_st
 from scipy.spatial.distance import cdist
-from strategies import occupancies
+from strategies import Data, occupancies
 
 from ddqn_planner.grid import UNKNOWN, GridMap, clearance, inflate
 from ddqn_planner.grid.body import Inflation, grid_from_costmap
@@ -26,7 +26,7 @@ RADII, WEIGHTS = st.sampled_from([0.0, 0.03, 0.05, 0.1, 0.12, 0.2, 1.0]), st.flo
 
 
 @given(occupancies, RADII, WEIGHTS, st.sampled_from([None, UNKNOWN, 0, 40]))
-def test_an_inflated_map_is_the_one_of_the_definition(
+def test_inflation_is_as_defined(
     occupancy: np.ndarray, radius: float, weight: float, cost: int | None
 ) -> None:
     distance = distances_by_definition(occupancy)
@@ -60,7 +60,7 @@ BODIES = st.tuples(st.sampled_from([0.0, 0.4, 1.0, 2.3]), st.sampled_from([0.0, 
 
 @given(st.integers(0, 2**32), st.lists(BODIES, min_size=1, max_size=2), st.booleans(), st.data())
 def test_maps_that_come_one_after_another_are_inflated_as_if_each_were_the_first(
-    seed: int, bodies: list[tuple[float, float]], with_costs: bool, data: st.DataObject
+    seed: int, bodies: list[tuple[float, float]], with_costs: bool, data: Data
 ) -> None:
     random, inflation = np.random.default_rng(seed), Inflation()
     occupancy = random.random((30, 45)) < random.choice([0.0, 0.02, 0.3])

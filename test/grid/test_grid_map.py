@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as numpy_st
-from strategies import grids_with_directions, occupancies
+from strategies import Data, grids_with_directions, occupancies
 
 from ddqn_planner.grid import UNKNOWN, GridMap, MoveRule
 from ddqn_planner.grid.arguments import as_cell
@@ -20,8 +20,8 @@ origins = st.tuples(*3 * [st.floats(-100, 100)])
 
 
 @given(occupancies, st.floats(0.01, 10), origins, st.data())
-def test_the_centre_of_a_cell_lies_in_that_cell(
-    occupancy: np.ndarray, resolution: float, origin: Any, data: st.DataObject
+def test_a_cells_centre_lies_in_it(
+    occupancy: np.ndarray, resolution: float, origin: Any, data: Data
 ) -> None:
     grid = GridMap(occupancy, resolution, origin)
     x, y = (data.draw(st.integers(0, side - 1)) for side in (grid.width, grid.height))
@@ -99,7 +99,7 @@ def test_the_map_keeps_read_only_copies_of_arrays_and_lists() -> None:
 
 
 @given(numpy_st.arrays(np.int8, (2, 5)), st.integers(1, 100), st.booleans(), st.booleans())
-def test_each_occupancy_value_has_a_meaning(
+def test_each_value_has_a_meaning(
     values: np.ndarray, threshold: int, allow_unknown: bool, use_map_costs: bool
 ) -> None:
     options = (threshold, allow_unknown, use_map_costs)
@@ -146,8 +146,8 @@ def derived(grid: GridMap) -> list[Any]:
 
 
 @given(full_grids(), st.booleans(), st.booleans(), st.data())
-def test_a_patched_map_is_the_map_of_the_patched_arrays(
-    grid: GridMap, with_costs: bool, with_obstacles: bool, data: st.DataObject
+def test_a_patched_map_is_a_new_one(
+    grid: GridMap, with_costs: bool, with_obstacles: bool, data: Data
 ) -> None:
     before = derived(grid)
     x, y = (data.draw(st.integers(0, side - 1)) for side in (grid.width, grid.height))

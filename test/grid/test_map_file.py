@@ -18,7 +18,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as numpy_st
 from limits import memory_grows_less_than
 from PIL import Image
-from strategies import Place, grids_with_directions, json_values
+from strategies import Data, Place, grids_with_directions, json_values
 
 from ddqn_planner import GridMap, load_map
 from ddqn_planner.grid import UNKNOWN, MapFile, MapFileError, read_map_file, save_map
@@ -161,8 +161,8 @@ origins = st.tuples(*3 * [st.floats(-100, 100)])
 
 @same_folder
 @given(percent, st.floats(0.01, 10), origins, st.data())
-def test_a_saved_map_file_comes_back_the_same(
-    tmp_path: Path, values: np.ndarray, resolution: float, origin: Any, data: st.DataObject
+def test_a_saved_file_comes_back(
+    tmp_path: Path, values: np.ndarray, resolution: float, origin: Any, data: Data
 ) -> None:
     cells = [st.integers(0, side - 1) for side in values.shape[::-1]]
     start, goal = (data.draw(st.none() | st.tuples(*cells)) for _ in range(2))
@@ -188,7 +188,7 @@ def test_a_saved_grid_comes_back_with_directions_and_costs(tmp_path: Path, place
     np.testing.assert_array_equal(load_map(path).occupancy, closed)
 
 
-def test_an_impossible_map_file_is_not_made_and_one_that_is_no_yaml_not_saved(
+def test_an_impossible_map_file_is_not_made_and_no_other_file_saved(
     tmp_path: Path,
 ) -> None:
     for name in ("saved.pgm", "saved.map", "saved"):
@@ -222,9 +222,7 @@ def test_an_impossible_map_file_is_not_made_and_one_that_is_no_yaml_not_saved(
         *(({"ddqn_planner": wrong}, "ddqn_planner is") for wrong in ({"gaol": [0, 0]}, 5)),
     ],
 )
-def test_a_wrong_value_of_the_yaml_is_named(
-    tmp_path: Path, changes: dict[str, Any], named: str
-) -> None:
+def test_a_wrong_yaml_value_is_named(tmp_path: Path, changes: dict[str, Any], named: str) -> None:
     with pytest.raises(MapMetadataError, match=named):
         read_map_file(write(tmp_path, PIXELS, **changes))
 

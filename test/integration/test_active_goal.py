@@ -166,8 +166,6 @@ def test_the_path_of_a_moving_robot_is_published_only_where_it_leaves_it(robot: 
     robot.wait_for_path((x, y - 8), GOAL)
 
 
-# The nearest of several goals, as docks are
-
 LEFT, RIGHT, DOCKED, OUTSIDE, WALL = (1, 5), (29, 5), (14, 5), (99, 5), (15, 10)
 YAWS = {LEFT: 1.0, RIGHT: -2.0, OUTSIDE: 0.1, WALL: 0.2}
 

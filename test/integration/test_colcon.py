@@ -99,7 +99,7 @@ def test_nodes_of_the_workspace_plan_with_its_model_on_its_map(
     install: Path,
     make_client: Callable[[], Any],
     paper: Scenario,
-    capfd: pytest.CaptureFixture[str],
+    capfd: Any,
 ) -> None:
     (package,) = (install / "ddqn_planner" / "lib").glob("python*/site-packages/ddqn_planner")
     take_compiled(ROOT / "ddqn_planner", package)

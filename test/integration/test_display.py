@@ -36,7 +36,7 @@ def arrows_of(marker: Marker) -> np.ndarray:
 
 
 @pytest.mark.parametrize("origin", [(0.0, 0.0, 0.0), (-1.0, 2.0, 0.7), (3.0, 0.0, -2.5)])
-def test_each_free_cell_except_the_goal_has_its_greedy_arrow(
+def test_each_free_cell_has_its_greedy_arrow(
     small_values: np.ndarray, origin: tuple[float, float, float]
 ) -> None:
     grid = GridMap.from_occupancy_values(small_values, 0.5, origin)

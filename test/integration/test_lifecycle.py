@@ -98,8 +98,7 @@ def test_each_transition_creates_enables_stops_and_frees(robot: Robot) -> None:
         robot.set_map(robot.stamped_map())
         assert_not_active()
         assert_works_without_a_goal()  # it was dropped
-        assert robot.transition("deactivate")
-        assert robot.transition("cleanup")
+        assert all(map(robot.transition, ("deactivate", "cleanup")))
         node.forget_log()
 
 

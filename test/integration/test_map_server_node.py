@@ -73,7 +73,7 @@ def draws(seed: int, map_file: Path) -> Iterator[np.ndarray]:
         yield scatter_obstacles(read.grid(), path, move_rule, random)[0].occupancy
 
 
-def test_topic_and_service_give_the_map_of_a_path_a_url_and_a_shipped_name(
+def test_topic_and_service_give_any_map(
     client: Any, maps: Any, map_file: Path, small_values: np.ndarray
 ) -> None:
     grid = grid_from_message(served_map(client, maps))
@@ -101,7 +101,7 @@ def test_nav2s_service_loads_a_map_too(client: Any, map_file: Path) -> None:
         assert answer.map == (served_map(client) if result == 0 else OccupancyGrid())
 
 
-def test_scatter_draws_on_the_loaded_map_by_the_seed_and_restore_undoes_it(
+def test_scatter_draws_by_the_seed(
     client: Any, maps: Any, small_values: np.ndarray, map_file: Path
 ) -> None:
     for expected, _ in zip(draws(3, map_file), range(3), strict=False):
@@ -120,7 +120,7 @@ def test_scatter_draws_on_the_loaded_map_by_the_seed_and_restore_undoes_it(
     assert (values_of(served_map(client, maps)) == small_values).all()
 
 
-def test_a_failed_load_has_its_code_and_keeps_the_served_map(
+def test_a_failed_load_keeps_the_map(
     client: Any, server: Any, small_values: np.ndarray, tmp_path: Path
 ) -> None:
     good, bad, pipe = (tmp_path / f"{name}.yaml" for name in ("good", "bad", "pipe"))
@@ -157,7 +157,7 @@ def test_no_noise_without_a_path(client: Any, map_file: Path, tmp_path: Path) ->
     assert load_map(client, map_file).result == LoadMap.Response.RESULT_SUCCESS
 
 
-def test_without_a_map_at_the_start_the_node_lives_on(
+def test_without_a_map_the_node_lives(
     run_node: Any, make_client: Any, map_file: Path, small_values: np.ndarray
 ) -> None:
     parameters = {"yaml_filename": "no_such.yaml"}

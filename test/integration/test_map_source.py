@@ -125,9 +125,6 @@ def directions_of(stamp: int, value: int | None = EAST) -> Any:
     return directions_message(forbidden, 0.5, (0.0, 0.0, 0.0), map_of(stamp).header)
 
 
-# Updates
-
-
 def update(**fields: Any) -> SimpleNamespace:
     """Return an update of 2 x 3 cells from (1, 0), or with other fields."""
     usual = {
@@ -141,7 +138,7 @@ PLACES, SIZES = st.integers(-8, 8), st.integers(0, 7) | st.just(2**32 - 1)
 
 
 @given(PLACES, PLACES, SIZES, SIZES, st.integers(-1, 1))
-def test_an_update_is_taken_if_all_its_cells_are_inside_and_have_values(
+def test_an_update_is_taken_if_it_fits(
     x: int, y: int, width: int, height: int, surplus: int
 ) -> None:
     data = array.array("b", range(max(min(width * height, 20) + surplus, 0)))
@@ -161,8 +158,7 @@ def test_an_update_has_the_maps_frame_and_its_stamp_or_a_later_one_or_none() -> 
         sent = update(header=Header(frame_id="map", stamp=stamp))
         assert updated_values(map_of(5), sent).shape == (3, 2)
     for frame, stamp, reason in (
-        ("odom", Time(sec=6), "'odom', the map's is 'map'"),
-        ("", Time(sec=6), "frame is ''"),
+        *(("odom", Time(sec=6), "'odom', the map's is 'map'"), ("", Time(sec=6), "frame is ''")),
         ("map", Time(sec=4, nanosec=999), "later than the update"),
     ):
         with pytest.raises(ValueError, match=reason):
@@ -301,7 +297,7 @@ def test_the_first_map_waits_for_directions_of_a_publisher(source: Source) -> No
 
 
 @pytest.mark.usefixtures("published")
-def test_a_map_servers_map_waits_for_its_own_directions_and_the_one_before_stays(
+def test_a_map_servers_map_waits_for_its_directions(
     source: Source, set_parameters: SetParameters
 ) -> None:
     source.on_directions(1)
@@ -325,7 +321,7 @@ def test_a_map_servers_map_waits_for_its_own_directions_and_the_one_before_stays
 
 @pytest.mark.usefixtures("published")
 @pytest.mark.parametrize("map_type", ["map", "costmap"])
-def test_directions_hold_for_the_region_of_maps_of_another_node(
+def test_directions_hold_for_their_region(
     source: Source, set_parameters: SetParameters, map_type: str
 ) -> None:
     set_parameters(map_type=map_type)
@@ -416,9 +412,7 @@ def times(source: Source, tmp_path: Path) -> ExpectedTimes:
     return times
 
 
-def test_a_map_has_expected_times_once_there_are_drives(
-    source: Source, times: ExpectedTimes, tmp_path: Path
-) -> None:
+def test_a_map_has_times_after_drives(source: Source, times: ExpectedTimes, tmp_path: Path) -> None:
     assert new_times(source).apply(GRID) is GRID
     slowness = times.apply(GRID).slowness
     assert slowness is not None
@@ -434,7 +428,7 @@ def test_a_map_has_expected_times_once_there_are_drives(
     assert times.apply(GRID) is GRID
 
 
-def test_what_a_drive_taught_is_planned_with_at_once(
+def test_drives_are_planned_with_at_once(
     source: Source, times: ExpectedTimes, tmp_path: Path
 ) -> None:
     changes: list[int] = []

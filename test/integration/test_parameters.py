@@ -112,7 +112,7 @@ def test_each_parameter_is_documented_as_it_is(running: Running) -> None:
     assert found == documented_parameters(running.name)
 
 
-def test_each_topic_and_service_is_documented_as_it_is(
+def test_topics_are_as_documented(
     running: Running, run_node: Any, make_client: Callable[[str], Client], tmp_path: Path
 ) -> None:
     documented, more = documented_topics(running.name), set()

@@ -98,7 +98,7 @@ NAMES = [*PLANNER_PARAMETERS, "use_sim_time"]
 
 @fuzz
 @given(parameters=some_parameters(NAMES), together=st.booleans())
-def test_any_parameters_are_set_or_refused_with_a_reason(
+def test_any_parameters_are_set_or_refused(
     unharmed: Robot, parameters: list[Any], together: bool
 ) -> None:
     robot = unharmed

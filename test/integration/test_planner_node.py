@@ -30,7 +30,7 @@ from integration.robot import (
 )
 from nav_msgs.msg import OccupancyGrid, Path
 from nav_msgs.srv import GetPlan
-from rcl_interfaces.srv import DescribeParameters, ListParameters
+from rcl_interfaces.srv import ListParameters
 from rclpy.qos import QoSProfile
 from std_msgs.msg import String
 from std_srvs.srv import Trigger
@@ -132,7 +132,7 @@ def test_follows_the_trainer(robot: Robot, whole_model: FilePath, tmp_path: File
     robot.wait_for_reason(refused, {"model training steps": "11"})
 
 
-def test_a_model_of_another_size_says_so_and_a_trapped_one_may_search(
+def test_a_trapped_or_unfit_model_says_so(
     robot: Robot, whole_model: FilePath, tmp_path: FilePath
 ) -> None:
     for size, reason in (
@@ -317,9 +317,7 @@ def test_all_else_is_answered_while_a_plan_takes_long(slow_robot: Any) -> None:
     outside = changed(robot.pose(START), "pose.position.x", 50.0)
     assert robot.get_plan(outside, robot.pose((0, 5))).poses == []
     assert client.get_parameter("planner", "model") == str(robot.model)
-    names = client.call(ListParameters, "planner/list_parameters").result.names
-    request = DescribeParameters.Request(names=names)
-    assert client.call(DescribeParameters, "planner/describe_parameters", request).descriptors
+    assert client.call(ListParameters, "planner/list_parameters").result.names
     assert robot.refuse(model="no_model")
     assert client.call(Trigger, "planner/reload_model").success
     # The map grows by the robot's body, in another thread than that of the plan.
@@ -355,9 +353,7 @@ def test_a_signal_ends_the_node_while_a_plan_takes_long(slow_robot: Any) -> None
     assert slow_robot.node.stop(signal.SIGTERM) == 0
 
 
-def test_says_what_it_waits_for_and_plans_once_it_is_there(
-    run_robot: Any, model: FilePath, tmp_path: FilePath
-) -> None:
+def test_says_what_it_waits_for(run_robot: Any, model: FilePath, tmp_path: FilePath) -> None:
     path, remaps = tmp_path / "model.safetensors", ["map:=plant", "plan:=route", "__node:=router"]
     with run_robot("", {"model": str(path)}, remaps=remaps) as robot:
         client, node, robot.name = robot.client, robot.node, "/router"

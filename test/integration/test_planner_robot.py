@@ -126,8 +126,7 @@ def test_a_goal_moves_within_the_tolerance_of_the_request(robot: Robot, hall: np
 
 def test_the_start_comes_from_odometry(robot: Robot) -> None:
     def wait_until_unknown(refused: str, remedy: str) -> None:
-        """What was refused of one source is forgotten with it."""
-        other = rf"((?!{refused} refused).)*"
+        other = rf"((?!{refused} refused).)*"  # what was refused of one source is forgotten with it
         robot.wait_for_reason(f"^{other}start is unknown; {remedy}{other}$")
 
     robot.send_goal(robot.pose((19, 14)))
@@ -144,8 +143,8 @@ def test_the_start_comes_from_odometry(robot: Robot) -> None:
     # It goes on moving; the next plan begins where it is then.
     robot.client.publish("odom", odometry(robot, (3, 2)))
     robot.client.publish("odom", odometry(robot, (4, 2), frame=""))
-    status = robot.wait_for_reason("odom refused: the start's frame is ''")
-    assert status.level == DiagnosticStatus.WARN
+    refused = "odom refused: the start's frame is ''"
+    assert robot.wait_for_reason(refused).level == DiagnosticStatus.WARN
     assert robot.plans.messages() == []
     robot.send_goal(robot.pose((0, 14)))
     robot.wait_for_path((3, 2), (0, 14))
@@ -213,9 +212,9 @@ def transformed(run_robot: Any, hall: np.ndarray) -> Iterator[Robot]:
         yield robot
 
 
-def transform(robot: Robot, cell: Cell, age: float | None = None) -> TransformStamped:
+def transform(robot: Robot, cell: Cell, age: float | None = None, child: str = "base_link") -> Any:
     """Return where the robot was so many seconds ago; None for a static transform."""
-    message = TransformStamped(header=Header(frame_id="map"), child_frame_id="base_link")
+    message = TransformStamped(header=Header(frame_id="map"), child_frame_id=child)
     if age is not None:
         then = robot.client.node.get_clock().now() - Duration(seconds=age)
         message.header.stamp = then.to_msg()
@@ -241,8 +240,7 @@ def test_a_goal_waits_for_the_first_transform_that_is_not_too_old(transformed: R
 
 def test_docks_in_another_frame_stay_where_they_are_when_it_moves(transformed: Robot) -> None:
     robot, client = transformed, transformed.client
-    odom = transform(robot, (3, 2))
-    odom.child_frame_id = "odom"
+    odom = transform(robot, (3, 2), child="odom")
     x, y = robot.grid.cell_to_world((3, 2))
     docks = [robot.pose((1, 7), 0.5).pose, robot.pose((18, 3), 1.5).pose]
     for dock in docks:

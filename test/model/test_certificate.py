@@ -124,7 +124,7 @@ SHARES = st.sampled_from([1.0, 0.3, 0.1, 0.01])
 
 
 @given(GRIDS, st.sampled_from(MOVE_RULES), NOISES, SHARES, st.booleans())
-def test_no_path_costs_more_than_certified(
+def test_no_path_exceeds_the_certificate(
     place: Place, rule: MoveRule, noise: float, share: float, timed: bool
 ) -> None:
     grid, goal = place
@@ -216,7 +216,7 @@ def test_the_error_of_the_costs_is_the_greatest_one() -> None:
     assert certificate.path_error == pytest.approx(1.3 / 0.7 - 1, abs=1e-3)
 
 
-def test_certify_prints_the_proof_of_the_documentation(capsys: pytest.CaptureFixture[str]) -> None:
+def test_certify_prints_the_documented_proof(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["certify", "any_map"]) == 0
     printed = capsys.readouterr().out
     assert printed.startswith("proved: all 4,096 decisions, ")

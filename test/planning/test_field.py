@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as numpy_st
 from networks import ANY_MAP, new_planner
 from random_maps import generate_map
-from strategies import GRIDS, RULES, Place, cells_of
+from strategies import GRIDS, RULES, Data, Place, cells_of
 
 from ddqn_planner import GridMap, MoveRule, PlanStatus
 from ddqn_planner.grid import Cell, copies, grid_map
@@ -40,7 +40,7 @@ def assert_same(field: Any, fresh: Any) -> None:
 
 
 @given(st.integers(2, 40), st.integers(2, 40), st.data())
-def test_a_straight_rollout_keeps_to_the_line(width: int, height: int, data: st.DataObject) -> None:
+def test_a_straight_rollout_keeps_to_the_line(width: int, height: int, data: Data) -> None:
     grid = GridMap(np.zeros((height, width), np.bool_))
     start, goal = data.draw(cells_of(grid)), data.draw(cells_of(grid))
     path = fresh_field(grid, goal, MoveRule.ROBOT_SAFE).rollout(start, straight=True).path
@@ -49,7 +49,7 @@ def test_a_straight_rollout_keeps_to_the_line(width: int, height: int, data: st.
 
 
 @given(GRIDS, RULES, st.data())
-def test_no_path_depends_on_the_past(place: Place, rule: MoveRule, data: st.DataObject) -> None:
+def test_no_path_depends_on_the_past(place: Place, rule: MoveRule, data: Data) -> None:
     grid, goal = place
     grown, whole = fresh_field(grid, goal, rule), fresh_field(grid, goal, rule)
     _ = whole.value
@@ -114,9 +114,7 @@ def propagate_values(patch_id: np.ndarray, cost_PA: np.ndarray, goal: Cell) -> n
 
 
 @given(PATCH_IDS, COSTS, st.data())
-def test_q_meets_bellmans_equation_whatever_the_costs(
-    patch_id: np.ndarray, cost: np.ndarray, data: st.DataObject
-) -> None:
+def test_q_meets_bellmans_equation(patch_id: np.ndarray, cost: np.ndarray, data: Data) -> None:
     height, width = patch_id.shape
     goal = data.draw(cells_of(GridMap(np.zeros(patch_id.shape))))
     q = propagate_values(patch_id, cost, goal)
@@ -208,8 +206,8 @@ def changed_maps(draw: st.DrawFn, grid: GridMap) -> GridMap:
 
 @settings(max_examples=400)
 @given(GRIDS, RULES, st.floats(0, 6), st.integers(1, 4), st.data())
-def test_a_repaired_field_is_a_fresh_one_bit_for_bit(
-    place: Place, rule: MoveRule, yaw: float, changes: int, data: st.DataObject
+def test_a_repaired_field_is_a_fresh_one(
+    place: Place, rule: MoveRule, yaw: float, changes: int, data: Data
 ) -> None:
     plain, goal = place
     goals = [goal, *data.draw(st.lists(st.sampled_from(plain.free_cells()), max_size=2))]
@@ -235,7 +233,7 @@ def test_a_repaired_field_is_a_fresh_one_bit_for_bit(
 
 @settings(max_examples=150)
 @given(GRIDS, RULES, st.data())
-def test_a_map_made_of_others_is_as_new(place: Place, rule: MoveRule, data: st.DataObject) -> None:
+def test_a_map_made_of_others_is_as_new(place: Place, rule: MoveRule, data: Data) -> None:
     maps, planner = [place[0]], new_planner()
     for seed in range(data.draw(st.integers(1, 8))):
         grid = data.draw(st.sampled_from(maps))
@@ -316,7 +314,7 @@ def test_a_repair_that_takes_too_long_leaves_the_older_field_as_it_was() -> None
 @settings(max_examples=150)
 @given(GRIDS, RULES, st.booleans(), st.integers(0, 2), st.integers(1, 1500), st.data())
 def test_a_field_that_is_interrupted_anywhere_is_as_a_new_one(
-    place: Place, rule: MoveRule, whole: bool, interrupted_step: int, line: int, data: st.DataObject
+    place: Place, rule: MoveRule, whole: bool, interrupted_step: int, line: int, data: Data
 ) -> None:
     grid, goal = place
     planner, start = new_planner(), data.draw(st.sampled_from(grid.free_cells()))

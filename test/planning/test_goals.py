@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from networks import ANY_MAP, new_planner, turning_planner
-from strategies import GRIDS, RULES, Place, cells_of
+from strategies import GRIDS, RULES, Data, Place, cells_of
 
 from ddqn_planner import GridMap, MoveRule, PlanMethod, PlanStatus
 from ddqn_planner.grid import shortest_distances
@@ -20,7 +20,7 @@ from ddqn_planner.planning.planner import last_step
 
 @settings(max_examples=300)
 @given(GRIDS, RULES, st.data())
-def test_the_nearest_goal_is_cheapest(place: Place, rule: MoveRule, data: st.DataObject) -> None:
+def test_the_nearest_goal_is_cheapest(place: Place, rule: MoveRule, data: Data) -> None:
     grid, start = place
     cells = cells_of(grid) | st.sampled_from([(-1, 0), (0, 99)])
     goals = data.draw(st.lists(cells, min_size=1, max_size=4))
@@ -44,7 +44,7 @@ def test_the_nearest_goal_is_cheapest(place: Place, rule: MoveRule, data: st.Dat
 
 @settings(max_examples=300)
 @given(GRIDS, RULES, st.data())
-def test_a_field_of_goals_is_the_best(place: Place, rule: MoveRule, data: st.DataObject) -> None:
+def test_a_field_of_goals_is_the_best(place: Place, rule: MoveRule, data: Data) -> None:
     grid, goal = place
     more = data.draw(st.lists(st.sampled_from(grid.free_cells()), max_size=3))
     goals = tuple(sorted({goal, *more}))
@@ -88,7 +88,7 @@ def test_a_robot_between_two_docks_keeps_to_one_of_them(has_costs: bool) -> None
 
 @given(GRIDS, RULES, st.booleans(), st.sampled_from([0.0, 2.0]), st.data())
 def test_a_path_through_goals_is_the_sum_of_its_pieces(
-    place: Place, rule: MoveRule, simplified: bool, tolerance: float, data: st.DataObject
+    place: Place, rule: MoveRule, simplified: bool, tolerance: float, data: Data
 ) -> None:
     grid, start = place
     goals = data.draw(st.lists(cells_of(grid), min_size=1, max_size=4))

@@ -14,7 +14,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from networks import ANY_MAP, new_planner, random_network
-from strategies import GRIDS, RULES, Place, cells_of
+from strategies import GRIDS, RULES, Data, Place, cells_of
 
 from ddqn_planner import GridMap, MoveRule, Plan, inflate
 from ddqn_planner.grid import MOVES, Cell, legal_moves, path_cost, path_length, shortest_distances
@@ -57,8 +57,8 @@ def test_the_unmasked_rollout_is_trapped_by_the_first_illegal_move_that_it_prefe
 
 @settings(max_examples=200)
 @given(GRIDS, RULES, st.sampled_from(list(PlanMethod)), st.data())
-def test_a_plan_of_the_shipped_model_is_a_cheapest_path(
-    place: Place, rule: MoveRule, method: PlanMethod, data: st.DataObject
+def test_a_plan_is_a_cheapest_path(
+    place: Place, rule: MoveRule, method: PlanMethod, data: Data
 ) -> None:
     grid, goal = place
     exact, planner = shortest_distances(grid, goal, rule), new_planner()
@@ -87,9 +87,7 @@ def test_a_plan_of_the_shipped_model_is_a_cheapest_path(
 
 @settings(max_examples=200)
 @given(GRIDS, RULES, st.integers(0, 5), st.data())
-def test_whatever_the_network_says_moves_are_legal_and_a_search_finds_a_path(
-    place: Place, rule: MoveRule, seed: int, data: st.DataObject
-) -> None:
+def test_any_networks_moves_are_legal(place: Place, rule: MoveRule, seed: int, data: Data) -> None:
     grid, goal = place
     start = data.draw(st.sampled_from(grid.free_cells()))
     planner = random_planner(grid.height, grid.width, seed)
@@ -234,7 +232,7 @@ TOLERANCES = st.floats(0, 6) | st.integers(0, 36).map(np.sqrt)
 @settings(max_examples=400)
 @given(GRIDS, RULES, TOLERANCES, st.booleans(), st.data())
 def test_a_goal_moves_to_the_nearest_reachable_free_cell_within_the_tolerance(
-    place: Place, rule: MoveRule, tolerance: float, field_is_known: bool, data: st.DataObject
+    place: Place, rule: MoveRule, tolerance: float, field_is_known: bool, data: Data
 ) -> None:
     grid, start = place
     goal = data.draw(cells_of(grid), label="goal")

@@ -7,7 +7,7 @@ import pytest
 from exact_segments import exact_cost, is_legal
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from strategies import GRIDS, RULES, Place, cells_of
+from strategies import GRIDS, RULES, Data, Place, cells_of
 
 from ddqn_planner import GridMap, MoveRule, simplify
 from ddqn_planner.grid import MOVES, Cell, path_cost, path_length, shortest_path
@@ -16,7 +16,7 @@ from ddqn_planner.planning.segments import cost_along, legal_segments
 
 @settings(max_examples=300)
 @given(GRIDS, RULES, st.data())
-def test_segments_are_as_their_cells_are(place: Place, rule: MoveRule, data: st.DataObject) -> None:
+def test_segments_are_as_their_cells_are(place: Place, rule: MoveRule, data: Data) -> None:
     grid, first = place
     far = min(grid.width - first[0], grid.height - first[1]) - 1
     diagonal = st.integers(0, far).map(lambda by: (first[0] + by, first[1] + by))
@@ -58,7 +58,7 @@ def check_corners(path: Sequence[Cell], grid: GridMap, rule: MoveRule) -> None:
 
 @settings(max_examples=300)
 @given(GRIDS, RULES, st.data())
-def test_a_simplified_path_costs_no_more(place: Place, rule: MoveRule, data: st.DataObject) -> None:
+def test_a_simplified_path_costs_no_more(place: Place, rule: MoveRule, data: Data) -> None:
     grid, goal = place
     path = shortest_path(grid, data.draw(st.sampled_from(grid.free_cells())), goal, rule)
     simple = check_simplified([*check_simplified(path, grid, rule)], grid, rule)
@@ -91,12 +91,6 @@ def test_the_better_one_is_taken_of_the_path_pulled_from_its_start_and_from_its_
 
 def test_segments_are_as_long_as_can_be() -> None:
     rule = MoveRule.ROBOT_SAFE
-    for length in range(2, 20):
-        occupancy = np.ones((4, length + 1), dtype=bool)
-        occupancy[0] = occupancy[:, length] = False
-        path = [(x, 0) for x in range(length + 1)] + [(length, y) for y in range(1, 4)]
-        expected = ((0, 0), (length, 0), (length, 3))
-        assert simplify(path, GridMap(occupancy), rule) == expected
     grid = GridMap(np.zeros((40, 90)))
     assert simplify(shortest_path(grid, (2, 5), (80, 31), rule), grid, rule) == ((2, 5), (80, 31))
     assert simplify([], grid, rule) == ()

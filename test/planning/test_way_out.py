@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from networks import ANY_MAP
-from strategies import RULES, Place, grids_with_directions, grids_with_free_cell
+from strategies import RULES, Data, Place, grids_with_directions, grids_with_free_cell
 
 from ddqn_planner import GridMap, MoveRule, PlanStatus, inflate
 from ddqn_planner.grid import Cell, path_length
@@ -57,7 +57,7 @@ def lengths_from(
 @settings(max_examples=300)
 @given(grids_with_free_cell() | grids_with_directions(), RULES, BODIES, RADII, st.data())
 def test_a_start_that_is_not_free_is_left_by_the_shortest_way(
-    place: Place, rule: MoveRule, robot_radius: float, clearing_radius: float, data: st.DataObject
+    place: Place, rule: MoveRule, robot_radius: float, clearing_radius: float, data: Data
 ) -> None:
     plain, some_cell = place
     grid = inflate(plain, robot_radius)
@@ -131,7 +131,7 @@ LEFT = [(2, 2), (2, 3)], False, [(2, 2), (3, 2), (4, 3)]  # round the next cell
 
 
 @pytest.mark.parametrize(("blocked", "is_kept", "begin"), [KEPT, LEFT])
-def test_a_path_under_way_is_kept_if_the_way_out_lies_on_it(
+def test_a_path_is_kept_on_the_way_out(
     blocked: list[Cell], is_kept: bool, begin: list[Cell]
 ) -> None:
     occupancy = np.zeros((6, 12), dtype=bool)

@@ -42,9 +42,7 @@ def step_by_hand(
 @pytest.mark.parametrize("rule", MoveRule)
 @pytest.mark.parametrize("count", [1, 3])
 @pytest.mark.parametrize("reward", ["paper", "path_cost"])
-def test_the_batch_agrees_with_one_robot_moved_by_hand(
-    paper: Scenario, rule: MoveRule, count: int, reward: str
-) -> None:
+def test_a_batch_moves_as_by_hand(paper: Scenario, rule: MoveRule, count: int, reward: str) -> None:
     changes = {"reward": reward, "environments": count, "alpha": 0.7, "beta": 0.2}
     parameters = replace(PARAMETERS, **changes)
     cost = np.random.default_rng(0).integers(0, 99, (20, 20))

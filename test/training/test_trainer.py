@@ -48,9 +48,7 @@ def trained(small: Scenario) -> tuple[Trainer, list[Episode]]:
     return trainer, train(trainer, 3000)
 
 
-def test_training_learns_the_path_around_a_wall(
-    trained: tuple[Trainer, list[Episode]], small: Scenario
-) -> None:
+def test_training_learns_a_path(trained: tuple[Trainer, list[Episode]], small: Scenario) -> None:
     field = trained[0].planner().q_field(small.grid, small.goal)
     evaluation = evaluate(field, small.grid, MoveRule.ROBOT_SAFE)
     assert evaluation.solved == evaluation.starts
@@ -201,9 +199,7 @@ def test_the_format_of_a_checkpoint_stays(checkpoint: Path) -> None:
     assert shapes == expected
 
 
-def test_a_checkpoint_of_another_map_or_bit_or_cut_is_refused(
-    small: Scenario, paper: Scenario, checkpoint: Path
-) -> None:
+def test_a_wrong_checkpoint_is_refused(small: Scenario, paper: Scenario, checkpoint: Path) -> None:
     for other in (paper, replace(small, start=(0, 1)), replace(small, goal=(4, 1))):
         with pytest.raises(CheckpointError, match="another map, start or goal"):
             Trainer.load_checkpoint(checkpoint, [other])

@@ -129,7 +129,7 @@ def test_an_update_of_the_papers_network_is_the_equations(small: Scenario, targe
 
 @pytest.mark.parametrize("units", [0, 6])
 @pytest.mark.parametrize("target", ["double_dqn", "dqn", "printed"])
-def test_a_compiled_training_is_that_of_torch_and_continues_it(
+def test_compiled_training_is_that_of_torch(
     small: Scenario, tmp_path: Path, target: str, units: int
 ) -> None:
     walls = small.grid.occupancy
