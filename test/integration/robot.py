@@ -36,6 +36,7 @@ from ddqn_planner.nodes.report import seconds
 from ddqn_planner.nodes.runtime import LATCHED
 
 START, GOAL = (0, 0), (5, 5)
+OK, WARN, ERROR = DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.ERROR
 RESOLUTION, ORIGIN, GOAL_YAW = 0.5, (-1.0, 2.0, 0.5), 1.2
 
 NUMBERS = itertools.count(1)  # stamps of maps and yaws of goals, to tell one from another

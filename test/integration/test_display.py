@@ -95,7 +95,6 @@ def told(words, function):
         print(words, flush=True)
         assert not os.path.exists({gap!r})
         return function(*arguments)
-
     return say_and_call
 
 Inflation.__call__ = told("a map is inflated", Inflation.__call__)

@@ -9,9 +9,8 @@ import numpy as np
 import pytest
 from builtin_interfaces.msg import Time
 from client import cells_of, wait_for
-from diagnostic_msgs.msg import DiagnosticStatus
 from geometry_msgs.msg import PoseStamped, TransformStamped
-from integration.robot import Robot, repeating, values_of
+from integration.robot import WARN, Robot, repeating, values_of
 from std_msgs.msg import Header
 
 from ddqn_planner.grid import GridMap
@@ -78,8 +77,7 @@ def test_a_costmap_that_stops_takes_its_path_back_until_it_comes_again(robot: Ro
         assert empty.header.frame_id == "map"
     wait_for("refusal", lambda: not robot.get_plan(robot.pose((5, 5)), robot.pose((9, 9))).poses)
     silent = "nothing came on /live/global_costmap/costmap for longer than"
-    status = robot.wait_for_reason(silent, {"status": "MAP_TIMEOUT"})
-    assert status.level == DiagnosticStatus.WARN
+    assert robot.wait_for_reason(silent, {"status": "MAP_TIMEOUT"}).level == WARN
     robot.set(map_timeout=0.0, replan_period=1.0)
 
 

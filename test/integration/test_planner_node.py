@@ -11,13 +11,15 @@ from typing import Any
 import numpy as np
 import pytest
 from client import TIMEOUT
-from diagnostic_msgs.msg import DiagnosticStatus
 from geometry_msgs.msg import PoseStamped, Quaternion
 from integration.robot import (
+    ERROR,
     GOAL,
     GOAL_YAW,
+    OK,
     RESOLUTION,
     START,
+    WARN,
     Robot,
     ask_for_plan,
     changed,
@@ -59,7 +61,7 @@ def test_goal_pose_is_answered_by_a_plan_a_value_and_diagnostics(robot: Robot) -
 
     length = {"path length (cells)": f"{length_of(path) / RESOLUTION:.3f}"}
     status = robot.wait_for_reason("^a path of ", length)
-    assert status.level == DiagnosticStatus.OK
+    assert status.level == OK
     said = values_of(status)
     expected = dict.fromkeys(("model", "model file"), str(robot.model))
     expected |= dict.fromkeys(("move rule", "model move rule"), "robot_safe")
@@ -106,7 +108,7 @@ def test_reload_plans_again_with_what_the_file_holds(robot: Robot, whole_model: 
     robot.plans.wait(lambda path: not path.poses)
     said = {"status": "ROLLOUT_TRAPPED", "model training steps": "7"}
     reason = "greedy steps do not find it.*cell \\(0, 0\\).*train the model"
-    assert robot.wait_for_reason(reason, said).level == DiagnosticStatus.WARN
+    assert robot.wait_for_reason(reason, said).level == WARN
     # What cannot be loaded is refused, and the model before it stays.
     whole_model.write_bytes(whole_model.read_bytes()[:-9])
     response = robot.client.call(Trigger, "planner/reload_model")
@@ -147,8 +149,7 @@ def test_a_trapped_or_unfit_model_says_so(
     robot.set(mode="astar_fallback")
     robot.wait_for_path(START, GOAL)
     said = "a path of .* searched for in the order of the Q field"
-    status = robot.wait_for_reason(said, {"method": "astar_fallback"})
-    assert status.level == DiagnosticStatus.OK
+    assert robot.wait_for_reason(said, {"method": "astar_fallback"}).level == OK
     robot.node.wait_for_log(said)
     # Of the two moves that the model knows one leads there.
     robot.get_plan(robot.pose((2, 0)), robot.pose((0, 0)))
@@ -159,12 +160,10 @@ def test_a_bad_parameter_is_refused_and_a_good_one_holds(robot: Robot, tmp_path:
     broken, missing = tmp_path / "broken.safetensors", tmp_path / "missing.safetensors"
     broken.write_bytes(b"a model")
     for name, bad, reason in (
-        ("clearance_weight", 1.5, "out of range"),
-        ("tolerance", math.nan, "out of range"),
+        *(("clearance_weight", 1.5, "out of range"), ("tolerance", math.nan, "out of range")),
         ("mode", "best", "mode is 'best'; give one of greedy, astar_fallback"),
         ("start_source", "gps", "start_source is 'gps'; give one of"),
-        ("robot_frame", "", "robot_frame is ''; name"),
-        ("follow_trainer", False, "read-only"),
+        *(("robot_frame", "", "robot_frame is ''; name"), ("follow_trainer", False, "read-only")),
         ("model", "no_such_model", "there is no shipped model 'no_such_model'"),
         ("model", str(missing), "there is no model file"),
         ("model", str(broken), "cannot be read as safetensors"),
@@ -184,7 +183,7 @@ def test_a_malformed_map_or_start_is_refused_and_a_goal_has_an_empty_plan(robot:
         "map refused: the map has 0 x 6 cells",
         "initialpose refused: the start's orientation is .* a quaternion of norm 0",
     ):
-        assert robot.wait_for_reason(reason).level == DiagnosticStatus.WARN
+        assert robot.wait_for_reason(reason).level == WARN
         robot.node.wait_for_log(reason)
     robot.assert_works()
     robot.clear()
@@ -195,8 +194,7 @@ def test_a_malformed_map_or_start_is_refused_and_a_goal_has_an_empty_plan(robot:
     reason = "the goal's position is .*x = nan"
     robot.send_goal(changed(robot.pose(GOAL), "pose.position.x", math.nan))
     assert robot.plans.wait(lambda path: not path.poses).header.frame_id == "map"
-    status = robot.wait_for_reason(reason, {"status": "INVALID_GOAL"})
-    assert status.level == DiagnosticStatus.WARN
+    assert robot.wait_for_reason(reason, {"status": "INVALID_GOAL"}).level == WARN
     robot.node.wait_for_log(f"no plan: {reason}")
     robot.clear()
     robot.send_start(robot.pose((3, 3)))
@@ -361,12 +359,10 @@ def test_says_what_it_waits_for(run_robot: Any, model: FilePath, tmp_path: FileP
         node.wait_for_log("waiting for a map on /plant")
         unheard = client.node.create_publisher(OccupancyGrid, "plant", QoSProfile(depth=1))
         name = client.node.get_fully_qualified_name()
-        reason = (
-            f"no map was received .*; nothing of {name} is received on /plant: its durability is "
-            "volatile, and transient_local is asked for; let it publish so, or start this node "
-            "with the parameter qos_overrides./plant.subscription.durability:=volatile"
-        )
-        robot.wait_for_reason(reason)
+        unfit = "its durability is volatile, and transient_local is asked for; let it publish so"
+        remedy = "start .* the parameter qos_overrides./plant.subscription.durability:=volatile"
+        heard = f"nothing of {name} is received on /plant"
+        robot.wait_for_reason(f"no map was received .*; {heard}: {unfit}, or {remedy}")
         # A publisher may be discovered before its node, and named as unknown until then.
         assert node.log.count(f"nothing of {name} ") == 1
         assert "New publisher discovered" not in node.log  # rclpy's words, without the remedy
@@ -380,8 +376,7 @@ def test_says_what_it_waits_for(run_robot: Any, model: FilePath, tmp_path: FileP
 
         client.publish("plant", robot.map_message(), LATCHED)
         no_model = "there is no model file"
-        status = robot.wait_for_reason(f"no model is loaded: .*{no_model}")
-        assert status.level == DiagnosticStatus.ERROR
+        assert robot.wait_for_reason(f"no model is loaded: .*{no_model}").level == ERROR
         node.wait_for_log(f"model refused: .*{no_model}")
         shutil.copy(model, path)
         assert client.call(Trigger, "router/reload_model").success

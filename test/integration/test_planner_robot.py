@@ -9,9 +9,18 @@ import numpy as np
 import pytest
 from builtin_interfaces.msg import Time
 from client import cells_of, wait_for
-from diagnostic_msgs.msg import DiagnosticStatus
 from geometry_msgs.msg import PoseArray, PoseStamped, PoseWithCovarianceStamped, TransformStamped
-from integration.robot import GOAL, GOAL_YAW, RESOLUTION, START, Robot, odometry, repeating, yaw_of
+from integration.robot import (
+    GOAL,
+    GOAL_YAW,
+    RESOLUTION,
+    START,
+    WARN,
+    Robot,
+    odometry,
+    repeating,
+    yaw_of,
+)
 from nav_msgs.msg import OccupancyGrid, Odometry
 from nav_msgs.srv import GetPlan
 from rclpy.duration import Duration
@@ -144,7 +153,7 @@ def test_the_start_comes_from_odometry(robot: Robot) -> None:
     robot.client.publish("odom", odometry(robot, (3, 2)))
     robot.client.publish("odom", odometry(robot, (4, 2), frame=""))
     refused = "odom refused: the start's frame is ''"
-    assert robot.wait_for_reason(refused).level == DiagnosticStatus.WARN
+    assert robot.wait_for_reason(refused).level == WARN
     assert robot.plans.messages() == []
     robot.send_goal(robot.pose((0, 14)))
     robot.wait_for_path((3, 2), (0, 14))
@@ -313,7 +322,7 @@ def test_odometry_counts_while_it_comes(run_robot: Any, model: Path) -> None:
         second = client.node.create_publisher(Odometry, "odom", 10)
         name = client.node.get_fully_qualified_name()
         expected = rf"/odom has 2 publishers \({name}, {name}\), so the robot's place may jump"
-        assert robot.wait_for_reason(expected).level == DiagnosticStatus.WARN
+        assert robot.wait_for_reason(expected).level == WARN
         assert node.log.count("has 2 publishers") == 1
         client.node.destroy_publisher(second)
         robot.clear()
