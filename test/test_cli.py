@@ -30,7 +30,6 @@ PATIENCE = 300  # seconds to wait for what should come at once: a loaded machine
 
 @pytest.fixture
 def small_map(small: Scenario, tmp_path: Path) -> str:
-    """A map file of the small scenario."""
     path = tmp_path / "small.yaml"
     percent = small.grid.occupancy.astype("int8") * 100
     save_map(MapFile(percent, start=small.start, goal=small.goal), path)

@@ -36,7 +36,6 @@ move_costs(grid.cost_multiplier, "robot_safe")
 
 
 def run(code: str, **environment: str) -> subprocess.CompletedProcess[str]:
-    """Run some code in a new process."""
     command, environ = [sys.executable, "-c", code], {**os.environ, **environment}
     return subprocess.run(command, env=environ, check=True, capture_output=True, text=True)
 

@@ -36,7 +36,6 @@ def test_imports_run_downwards(room: str) -> None:
 
 @pytest.fixture(scope="module")
 def wheel(source_copy: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """What pip builds of the source."""
     folder = tmp_path_factory.mktemp("wheel")
     build = ["wheel", "--no-deps", "--no-build-isolation", "--wheel-dir", folder, source_copy]
     subprocess.run([*PIP, *build], check=True)

@@ -16,12 +16,6 @@ from ddqn_planner.grid.body import Inflation, grid_from_costmap
 RESOLUTION = 0.05
 
 
-def distances_by_definition(obstacles: np.ndarray) -> np.ndarray:
-    """Look at every pair of a cell and an obstacle."""
-    pairs = cdist(np.argwhere(np.ones_like(obstacles)), np.argwhere(obstacles))
-    return pairs.min(axis=1, initial=math.inf).reshape(obstacles.shape)
-
-
 RADII, WEIGHTS = st.sampled_from([0.0, 0.03, 0.05, 0.1, 0.12, 0.2, 1.0]), st.floats(0, 1)
 
 
@@ -29,7 +23,8 @@ RADII, WEIGHTS = st.sampled_from([0.0, 0.03, 0.05, 0.1, 0.12, 0.2, 1.0]), st.flo
 def test_inflation_is_as_defined(
     occupancy: np.ndarray, radius: float, weight: float, cost: int | None
 ) -> None:
-    distance = distances_by_definition(occupancy)
+    pairs = cdist(np.argwhere(np.ones_like(occupancy)), np.argwhere(occupancy))
+    distance = pairs.min(axis=1, initial=math.inf).reshape(occupancy.shape)
     assert clearance(occupancy) == pytest.approx(distance)
     costs = None if cost is None else np.full(occupancy.shape, cost)
     # A message has the resolution in single precision: two cells of 0.05 m may be 0.099999999 m.

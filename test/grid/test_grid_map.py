@@ -127,7 +127,6 @@ def test_a_wrong_occupancy_value_is_named() -> None:
 
 @st.composite
 def full_grids(draw: st.DrawFn) -> GridMap:
-    """A map with any layers."""
     grid, _ = draw(grids_with_directions())
     shape = grid.occupancy.shape
     slowness = draw(st.none() | numpy_st.arrays(np.float32, shape, elements=st.integers(1, 100)))

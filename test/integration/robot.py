@@ -96,7 +96,6 @@ class Robot:
         self.client.publish("map", message or self.map_message(), LATCHED)
 
     def pose(self, cell: Cell, yaw: float = 0.0, grid: GridMap | None = None) -> PoseStamped:
-        """Return a pose in a cell, a little beside its centre."""
         return pose(grid or self.grid, cell, yaw, offset=0.05)
 
     def send_start(self, stamped: PoseStamped) -> None:
@@ -211,7 +210,6 @@ def ask_for_plan(robot: Robot) -> tuple[Any, threading.Event]:
 
 @contextmanager
 def repeating(client: Client, publish: Callable[[], None]) -> Iterator[None]:
-    """Publish something 50 times a second."""
     timer = client.node.create_timer(0.02, publish)
     try:
         yield
@@ -228,10 +226,6 @@ def odometry(robot: Robot, cell: Cell, frame: str = "map") -> Odometry:
     message.child_frame_id = "base_link"
     message.pose.pose = robot.pose(cell).pose
     return message
-
-
-def length_of(path: Path) -> float:
-    return sum(math.dist(*step) for step in pairwise(points_of(path)))
 
 
 def yaw_of(rotation: Quaternion) -> float:

@@ -48,7 +48,6 @@ def way(robot: Robot) -> list[Cell]:
 
 
 def plan_on(robot: Robot, message: OccupancyGrid, reason: str = "^a path of ") -> None:
-    """Send a map, and wait until the planner has planned on it."""
     robot.send_map(message)
     stamp = seconds(message.header.stamp)
     robot.wait_for_reason(reason, {"planned on the map of (s)": stamp})

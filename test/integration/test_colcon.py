@@ -44,7 +44,6 @@ def build(workspace: Path, *options: str) -> Path:
 
 @pytest.fixture(scope="module")
 def install(source_copy: Path) -> Path:
-    """The install folder of a workspace with a copy of the source."""
     return build(source_copy.parents[1])
 
 

@@ -178,14 +178,12 @@ def test_the_check_of_an_answer_finds_each_error() -> None:
         assert (error in found) if error else not found
 
 
-def unit_quaternion(values: list[float]) -> Quaternion:
-    x, y, z, w = (np.array(values) / np.linalg.norm(values)).tolist()
-    return Quaternion(x=x, y=y, z=z, w=w)
-
-
 POINTS = st.tuples(*3 * [st.floats(-100, 100)])
 NUMBERS = st.lists(st.floats(-1, 1), min_size=4, max_size=4)
-QUATERNIONS = NUMBERS.filter(lambda values: np.linalg.norm(values) > 0.1).map(unit_quaternion)
+UNITS = NUMBERS.filter(lambda four: math.hypot(*four) > 0.1).map(
+    lambda four: [number / math.hypot(*four) for number in four]
+)
+QUATERNIONS = UNITS.map(lambda four: Quaternion(**dict(zip("xyzw", four, strict=True))))
 
 
 def stamped_pose(point: tuple[float, ...], rotation: Quaternion) -> PoseStamped:
@@ -284,7 +282,6 @@ def pose_at(seconds: float, frame: str = "odom") -> PoseStamped:
 
 
 def refusal(status: str, get: Callable[[], object]) -> str:
-    """Return why there is no pose."""
     with pytest.raises(RequestError) as error:
         get()
     assert error.value.status == status

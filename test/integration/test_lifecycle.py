@@ -28,7 +28,6 @@ OF_CONFIGURED = {"planner/get_plan", "planner/reload_model", "plan", "map", "goa
 
 
 def start(robot: Robot) -> None:
-    """Configure and activate the planner, which works then."""
     robot.start()
     robot.set_map(robot.stamped_map())
     robot.assert_works()

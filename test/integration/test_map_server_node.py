@@ -69,7 +69,6 @@ def values_of(message: OccupancyGrid) -> np.ndarray:
 
 
 def draws(seed: int, map_file: Path) -> Iterator[np.ndarray]:
-    """Yield what the draws of a seed occupy."""
     read, random = read_map_file(map_file), np.random.default_rng(seed)
     move_rule, path = known_path(read.grid(), read)
     while True:

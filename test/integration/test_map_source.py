@@ -115,7 +115,6 @@ def published(node: BaseNode) -> Iterator[None]:
 
 
 def map_of(stamp: int, frame: str = "map", x: float = 0.0, resolution: float = 0.5) -> Any:
-    """Return a free map of 5 x 4 cells."""
     header = Header(frame_id=frame, stamp=Time(sec=stamp))
     return occupancy_message(np.zeros((4, 5), np.int8), resolution, (x, 0.0, 0.0), header)
 

@@ -136,7 +136,6 @@ class Server:
 
 
 def end(execution: Coroutine[Any, Any, Any]) -> Any:
-    """Resume an execution once, and return its result."""
     with pytest.raises(StopIteration) as ended:
         execution.send(None)
     return ended.value.value
@@ -273,7 +272,6 @@ class Navigator:
         return done(self.robot.client._executor.create_task(function, *arguments))
 
     def send(self, goal: PoseStamped | list[PoseStamped], **fields: Any) -> Any:
-        """Send a goal, and return its handle."""
         if isinstance(goal, list):
             request = self.actions.ComputePathThroughPoses.Goal(goals=goal, **fields)
             return done(self.ask(self.poses.send_goal_async, request))

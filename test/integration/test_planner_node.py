@@ -5,6 +5,7 @@ import shutil
 import signal
 import time
 from collections.abc import Iterator
+from itertools import pairwise
 from pathlib import Path as FilePath
 from typing import Any
 
@@ -25,7 +26,6 @@ from integration.robot import (
     changed,
     check_path,
     constant_model,
-    length_of,
     points_of,
     values_of,
     yaw_of,
@@ -59,7 +59,8 @@ def test_goal_pose_is_answered_by_a_plan_a_value_and_diagnostics(robot: Robot) -
     assert percent[GOAL[1], GOAL[0]] == percent.max() == 100
     assert percent[robot.values == 0].min() == 0
 
-    length = {"path length (cells)": f"{length_of(path) / RESOLUTION:.3f}"}
+    metres = sum(math.dist(*step) for step in pairwise(points_of(path)))
+    length = {"path length (cells)": f"{metres / RESOLUTION:.3f}"}
     status = robot.wait_for_reason("^a path of ", length)
     assert status.level == OK
     said = values_of(status)

@@ -103,7 +103,6 @@ def test_a_start_on_an_obstacle_or_deep_in_one_is_told(robot: Robot, hall: np.nd
 
 def test_a_goal_moves_within_the_tolerance_of_the_request(robot: Robot, hall: np.ndarray) -> None:
     def get_cells(tolerance: float, goal: Cell = (10, 2)) -> list[Cell]:
-        """Return the last cell of a path, if there is one."""
         request = GetPlan.Request(start=robot.pose((0, 2)), tolerance=tolerance)
         request.goal = robot.pose(goal, GOAL_YAW)
         robot.clear()

@@ -66,17 +66,9 @@ def right_network(name: str, move_rule: MoveRule | None = None) -> PropagationQN
 
 
 def logits(network: PropagationQNetwork, feature_BI: np.ndarray) -> np.ndarray:
-    """Return the logits of p(s, a) in float32."""
     hidden_BF = np.maximum(network._layer("convolution", feature_BI), 0)
     hidden_BF = np.maximum(network._layer("hidden", hidden_BF), 0)
     return network._layer("moves", hidden_BF)
-
-
-def true_multipliers(patch_B9: np.ndarray) -> np.ndarray:
-    """Return the mean cost multiplier of the two cells of each move: (B, 8)."""
-    share = np.where(patch_B9 == UNKNOWN, 1, patch_B9 / 100)
-    multiplier = 1 + (MAX_COST_MULTIPLIER - 1) * share
-    return (multiplier[:, [4]] + multiplier[:, CELLS]) / 2
 
 
 CERTIFICATE = certify(any_map())
@@ -89,7 +81,9 @@ def test_decisions_and_costs_are_as_certified(patch_B9: np.ndarray, rule: MoveRu
     np.testing.assert_array_equal(network.success(feature_BI) > 0.5, legal_BA)
     distance_BA = np.where(legal_BA, 1, -1) * logits(network, feature_BI)
     assert distance_BA.min() >= certificate.margin
-    true_BA = true_multipliers(patch_B9)
+    share_B9 = np.where(patch_B9 == UNKNOWN, 1, patch_B9 / 100)
+    multiplier_B9 = 1 + (MAX_COST_MULTIPLIER - 1) * share_B9
+    true_BA = (multiplier_B9[:, [4]] + multiplier_B9[:, CELLS]) / 2  # the mean of both cells
     error_BA = np.abs(network.multiplier(feature_BI) - true_BA) / true_BA
     assert error_BA[legal_BA].max(initial=0) <= certificate.multiplier_error
 

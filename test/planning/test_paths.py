@@ -59,7 +59,6 @@ def cells_with_positions(path: list[Cell]) -> list[tuple[Cell, Fraction]]:
 
 
 def drawn_path(data: Data, grid: GridMap, goal: Cell, rule: MoveRule) -> list[Cell]:
-    """A shortest path from one of the cells that have one."""
     path = list(shortest_path(grid, data.draw(st.sampled_from(grid.free_cells())), goal, rule))
     assume(path)
     return path

@@ -65,7 +65,6 @@ def about_to_update(scenarios: list[Scenario], parameters: HyperParameters) -> T
 
 
 def next_batch(trainer: Trainer) -> Transitions:
-    """The transitions that the next update will draw."""
     random = copy.deepcopy(trainer._sampling)
     return trainer._replay.sample(trainer.parameters.batch_size, random)
 
