@@ -1,5 +1,4 @@
 import json
-from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -33,12 +32,8 @@ def train(trainer: Trainer, until: int) -> list[Episode]:
     return [episode for finished in trainer.run(until) for episode in finished]
 
 
-def weights(trainer: Trainer) -> Iterator[torch.Tensor]:
-    return iter(trainer.network.state_dict().values())
-
-
-def same_weights(a: Trainer, b: Trainer) -> bool:
-    return all(torch.equal(x, y) for x, y in zip(weights(a), weights(b), strict=True))
+def same_weights(a: torch.nn.Module, b: torch.nn.Module) -> bool:
+    return all(map(torch.equal, a.state_dict().values(), b.state_dict().values()))
 
 
 @pytest.fixture(scope="module")
@@ -104,11 +99,11 @@ def test_an_interrupted_training_continues_bit_for_bit_and_another_seed_gives_an
     interrupted.save_checkpoint(tmp_path / "checkpoint")
     resumed = Trainer.load_checkpoint(tmp_path / "checkpoint", [small])
     assert before + train(resumed, 400) == episodes
-    assert same_weights(uninterrupted, resumed)
+    assert same_weights(uninterrupted.network, resumed.network)
     for name in ("steps", "updates", "episodes", "epsilon"):
         assert getattr(uninterrupted, name) == getattr(resumed, name)
     train(other, 100)
-    assert not same_weights(uninterrupted, other)
+    assert not same_weights(uninterrupted.network, other.network)
 
 
 @pytest.mark.parametrize(("environments", "interval"), [(1, 1), (3, 2), (3, 5), (4, 3)])
@@ -124,9 +119,7 @@ def test_learning_starts_and_targets_are_copied_when_the_parameters_say(small: S
     train(trainer, 5)
     assert trainer.updates == 0
     for _ in trainer.run(13, every=1):
-        target = trainer._target.state_dict().values()
-        same = all(torch.equal(x, y) for x, y in zip(weights(trainer), target, strict=True))
-        assert same == (trainer.updates % 3 == 0)
+        assert same_weights(trainer.network, trainer._target) == (trainer.updates % 3 == 0)
     assert trainer.updates == 8
 
 
