@@ -91,7 +91,7 @@ class Driver:
         learned, truth = cells_of(grid, path), self.world.slowness(began)
         shortest, best = self.world.routes(self.planner, learned[0], goal, began).values()
         routes = {"shortest": shortest, "learned": learned, "best possible": best}
-        seconds = {name: path_seconds(of, truth, grid) for name, of in routes.items()}
+        seconds = {name: path_seconds(of, self.world, began) for name, of in routes.items()}
         return Mission(routes, seconds, measured, truth, slowness)
 
 

@@ -19,7 +19,7 @@ sys.path.insert(0, str(FilePath(__file__).resolve().parents[1] / "experiments"))
 from client import RobotPoses
 from driving_worlds import NOISE, SPEED, World, generated_world
 
-WORLD, SEED, SPEED_UP = "office", 9, 40.0
+WORLD, SEED, SPEED_UP = "office-mixture", 9, 40.0
 STEP = 0.2  # simulated seconds from one pose to the next
 MORNING = 3000.0  # when the simulated time begins, seconds: ten minutes later the first crowd goes
 JOIN_DISTANCE = 2.0  # metres from which the robot drives to the nearest point of a new path

@@ -5,240 +5,192 @@ import itertools
 import os
 import sys
 import time
-from collections import defaultdict
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 # Before NumPy is imported. On a busy machine, several threads are ten times as slow as one.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import driving_worlds as worlds
 import numpy as np
-from driving_worlds import KINDS, RULE, SPEED, STATIONS, Float64, World, drive, path_seconds
+from driving_learners import LEARNERS
+from driving_missions import Job, Result, planner, run, run_in, world_of
+from driving_worlds import HELD_OUT, HELD_OUT_SEED, ON_FILES, RULE, SPEED, TUNING, World, drive
 from figures import draw_slowness, draw_times, save_figure
 from random_maps import generate_map
-from tables import median_and_range, table, write_report
+from tables import table, write_report
 from trainings import in_parallel, make_folder, parser_of
 
-from ddqn_planner import Experience, GridMap, Planner, inflate, load_map
+from ddqn_planner import Experience, GridMap
 from ddqn_planner.cli import exit_code
 from ddqn_planner.grid import Cell
-from ddqn_planner.grid.arguments import MAX_SLOWNESS
 from ddqn_planner.grid.noise import random_requests
 
-MISSIONS: Final = 150
-MOVED_AT: Final = 100  # the mission before which all slow zones move
-QUICK_MISSIONS: Final = 60
-FAULT_EVERY: Final = 900.0  # seconds of driving: four faults per hour, one of each kind on average
-ROBOT_RADIUS: Final = 0.2  # metres, on maps from files
-STAGES: Final = ((0, 20), (20, 50), (50, 100), (100, 110), (120, 140))
-BARS: Final = ("1.08", "1.04", "1.02")  # what the learning planner should stay below at first
+Options = argparse.Namespace
+Sections = dict[str, str]
+Stages = Sequence[tuple[int, int]]
+
+STAGES: Final = ((0, 20), (20, 50), (50, 100))
+LONG_STAGES: Final = ((0, 200), (200, 600), (600, 1000))
+MOVED_STAGES: Final = ((50, 100), (100, 110), (110, 150))
+EXPERIENCE, SHORTEST, HELD_OUT_SET = "experience", "shortest path", "Held-out worlds"
+DRAWN: Final = (EXPERIENCE, SHORTEST, "Gaussian process", "Markov field")
 SMOOTHED: Final = 10  # missions that a point of the curve averages
+DOOR_WAITS, DOOR_DRIVES, DOOR_SEEDS = (10, 30, 60), 40, 5
+ZONE_NOISES, ZONE_RATES, ZONE_WIDTHS = (0.02, 0.035, 0.05), (10, 50), (0.2, 0.35, 0.5)
 VISITED: Final = 0.95  # uncertainty of a cell below which the robot was near
-BEST, LEARNED, SHORTEST = "best possible", "learned", "shortest path"
-LAST, MEAN = "last time per cell", "mean per cell"
-PLANNERS: Final = (LEARNED, SHORTEST, LAST, MEAN)
 
 
-@dataclass(frozen=True)
-class Job:
-    """A world (a kind of generated map, or a map file) and how the robot drives in it."""
-
-    kind: str
-    seed: int
-    missions: int
-    faults: bool = False  # then without the baselines
-
-
-@dataclass(frozen=True)
-class Result:
-    """The missions of a job: the expected seconds of each planner's route, and what was learned."""
-
-    seconds: dict[str, Float64]
-    forecast: Float64  # (M, 4): measured seconds, the expected time, and its bounds
-    world: World
-    experience: Experience
-    clock: float  # at the end
-
-    def ratio(self, planner: str, first: int, end: int, over: str = BEST) -> float:
-        """Return the total time over that of another planner, over some missions."""
-        return float(self.seconds[planner][first:end].sum() / self.seconds[over][first:end].sum())
-
-
-class CellTimes:
-    """What the baselines remember: the last or the mean slowness of each cell."""
-
-    def __init__(self, grid: GridMap, is_mean: bool) -> None:
-        self.grid, self.is_mean = grid, is_mean
-        self.slowness, self.count = np.ones(grid.occupancy.shape), np.zeros(grid.occupancy.shape)
-
-    def record(self, cells: Sequence[Cell], slowness: Float64) -> None:
-        """Learn from a drive."""
-        x, y = np.asarray(cells).T
-        self.count[y, x] = self.count[y, x] * self.is_mean + 1
-        self.slowness[y, x] += (slowness - self.slowness[y, x]) / self.count[y, x]
-
-    def apply(self) -> GridMap:
-        """Return a map whose moves cost what was seen."""
-        slowness = np.clip(self.slowness, 1, MAX_SLOWNESS).astype(np.float32)
-        return self.grid.with_slowness(slowness, self.grid.resolution / SPEED)
+def compared(options: Options) -> Sections:
+    """Compare all learners on each set of worlds."""
+    sections = {}
+    for title, kinds in options.sets.items():
+        results = _runs(kinds, tuple(LEARNERS), options)
+        rows, of_kinds = [], {kind: [_short(kind)] for kind in kinds}
+        of_learners = _by(results, "learner")
+        for learner, own in of_learners.items():
+            over = {}
+            for kind, of_kind in _by(own, "kind").items():
+                over[kind] = np.mean([result.over_shortest(0, 20) for result in of_kind])
+                of_kinds[kind].append(", ".join(f"{value:.1f}" for value in _above(of_kind)))
+            worst = max(over, key=lambda kind: over[kind])
+            beyond = f"{100 * over[worst] - 100:+.1f} % ({_short(worst)})"
+            rows.append([learner, *_percent(_above(own)), beyond])
+        header = f"missions | {_names(STAGES)} | worst kind over the shortest path, 1 to 20"
+        sections[title] = table(header, rows)
+        sections[f"{title}, by kind"] = table(
+            f"kind | {' | '.join(LEARNERS)}", [*of_kinds.values()]
+        )
+        if title == HELD_OUT_SET:
+            drawn = {name: of_learners[name] for name in DRAWN}
+            sections["From mission to mission"] = _curve(options.out / "curve.png", drawn)
+            sections["Expected times"] = _forecasts(of_learners[EXPERIENCE])
+    return sections
 
 
-def run(job: Job) -> Result:
-    """Drive the missions of a job."""
-    if job.kind in KINDS:
-        world = worlds.generated_world(job.kind, job.seed)
-    else:
-        of_file = inflate(load_map(job.kind), ROBOT_RADIUS)
-        world = worlds.make_world(of_file, np.random.default_rng([job.seed, 1]))
-    grid, planner = world.grid, Planner.load("any_map")
-    missions, noise, faults, moved = (np.random.default_rng([job.seed, n]) for n in range(4))
-    experience = Experience(SPEED)
-    memories = {LAST: CellTimes(grid, False), MEAN: CellTimes(grid, True)}
-    seconds = defaultdict[str, list[float]](list)
-    forecast: list[tuple[float, ...]] = []
-    clock, next_fault = 0.0, FAULT_EVERY / 2
-    for mission in range(job.missions):
-        if mission == MOVED_AT:
-            world.always = worlds.slow_zones(grid, moved)
-        start, goal = (world.stations[i] for i in missions.choice(STATIONS, 2, replace=False))
-        maps = {BEST: world.known(clock), LEARNED: experience.apply(grid)}
-        if not job.faults:
-            maps |= {SHORTEST: grid} | {name: memory.apply() for name, memory in memories.items()}
-        routes = {name: planner.plan(on, start, goal, RULE).cells for name, on in maps.items()}
-        for name, cells in routes.items():
-            seconds[name].append(path_seconds(cells, world.slowness(clock), grid))
-        seen = measured = drive(routes[LEARNED], world, clock, noise)
-        forecast.append((measured.duration, *experience.expected_time(grid, routes[LEARNED])))
-        if job.faults and clock >= next_fault:
-            seen, next_fault = worlds.with_faults(measured, faults), next_fault + FAULT_EVERY
-        experience.record(seen.seconds, seen.positions)
-        for name, memory in memories.items():
-            if name in routes:
-                memory.record(routes[name], drive(routes[name], world, clock, noise).slowness)
-        clock += measured.duration
-    arrays = {name: np.array(values) for name, values in seconds.items()}
-    return Result(arrays, np.array(forecast), world, experience, clock)
+def faulty(options: Options) -> Sections:
+    """Measure the held-out worlds with faults."""
+    results = _runs(options.sets[HELD_OUT_SET], (EXPERIENCE,), options, is_faulty=True)
+    text = table(f"missions | {_names(STAGES)}", [["with faults", *_percent(_above(results))]])
+    return {"Faults": text, "Expected times with faults": _forecasts(results)}
 
 
-def measured_worlds(kinds: Sequence[str], options: argparse.Namespace) -> list[list[Result]]:
-    """Run each world as it is, and with faults; return the results of both."""
-    missions = QUICK_MISSIONS if options.quick else MISSIONS
-    drawn = itertools.product((False, True), kinds, range(options.seeds))
-    jobs = [Job(kind, seed, missions, faults) for faults, kind, seed in drawn]
-    results = in_parallel(run, jobs, options.backend, "world")
-    return [results[: len(jobs) // 2], results[len(jobs) // 2 :]]
-
-
-def measure(options: argparse.Namespace) -> int:
-    """Run the experiment, write its tables, figures and ``report.md``, and print it."""
-    maps = sorted(map(str, options.maps.rglob("*.yaml"))) if options.maps else []
-    if options.maps and not maps:
-        raise ValueError(f"{options.maps}: found no ROS map (.yaml); check the path")
-    out = make_folder(options)
-    plain, faulty = measured_worlds(KINDS, options)
-    sections = {
-        "Time over the best possible": _stages(plain, faulty),
-        "From mission to mission": _curve(out / "curve.png", plain),
-        "Expected times": _forecasts({"as it is": plain, "with faults": faulty}),
-        "Speed": _times(),
-        "True and learned slowness": _picture(out / "map.png"),
-    }
-    if maps:
-        of_maps, faulty = measured_worlds(maps, options)
-        sections["Maps from files"] = _stages(of_maps, faulty)
-        plain += of_maps
-    over = [result.ratio(LEARNED, 0, MOVED_AT, SHORTEST) for result in plain]
-    sections["Learned over the shortest path, missions 1 to 100"] = (
-        f"{median_and_range(over, 3)}; above 1 in {sum(r > 1 for r in over)} of {len(over)} worlds"
-    )
-    print(write_report(out, sections, options.page))
-    print(f"saved {out / 'report.md'}")
-    return 0
-
-
-def _stages(plain: Sequence[Result], faulty: Sequence[Result]) -> str:
-    """Return the time over the best possible: the median, and of what is learned the range."""
-    of_rows = {name: (plain, name) for name in PLANNERS}
-    of_rows["learned, with faults"] = (faulty, LEARNED)
-    rows: list[list[str]] = []
-    for row, (results, planner) in of_rows.items():
-        reached = [stage for stage in STAGES if stage[0] < len(results[0].forecast)]
-        ratios = ([result.ratio(planner, *stage) for result in results] for stage in reached)
-        cells = (median_and_range(of_stage, 3) for of_stage in ratios)
-        rows.append([row, *(cell if row == LEARNED else cell.split()[0] for cell in cells)])
-    header = " | ".join(["missions", *(f"{first + 1} to {end}" for first, end in STAGES)])
-    return table(header, [*rows, ["bar", *BARS]])
-
-
-def _forecasts(both: Mapping[str, Sequence[Result]]) -> str:
-    """Return how far the expected time of a mission was from the measured one, after 50."""
+def long(options: Options) -> Sections:
+    """Measure a thousand missions: the time above the best, and the regret per mission."""
     rows = []
-    for label, results in both.items():
-        forecasts = [result.forecast[50:MOVED_AT] for result in results]
-        measured, expected, low, high = np.concatenate(forecasts).T
-        error = np.abs(expected / measured - 1).mean()
-        inside = ((low <= measured) & (measured <= high)).mean()
-        width = np.median((high - low) / expected)
-        rows.append([label, len(measured), f"{error:.1%}", f"{inside:.1%}", f"{width:.1%}"])
-    return table("drives | missions | MAPE | within the 90 % interval | width of it, median", rows)
+    for title, kinds in options.sets.items():
+        results = _runs(kinds, (EXPERIENCE,), options, missions=1000)
+        for name, own in {**_by(results, "kind"), f"all: {title.lower()}": results}.items():
+            regret = [
+                np.mean([(result.seconds - result.best)[slice(*stage)].mean() for result in own])
+                for stage in _reached(own, LONG_STAGES)
+            ]
+            pairs = zip(_above(own, LONG_STAGES), regret, strict=True)
+            rows.append([_short(name), *(f"{above:.1f} %, {more:.2f} s" for above, more in pairs)])
+    return {"A thousand missions": table(f"missions | {_names(LONG_STAGES)}", rows)}
 
 
-def _times() -> str:
-    """Return the CPU time to learn from 1,000 poses on 1000 x 1000 cells, and to plan again."""
+def moved(options: Options) -> Sections:
+    """Measure what happens when all slow zones move."""
+    rows = []
+    for title, kinds in options.sets.items():
+        with_zones = [kind for kind in kinds if kind.endswith(("discs", "mixture"))]
+        results = _runs(with_zones, (EXPERIENCE,), options, missions=150, is_moved=True)
+        for name, own in {**_by(results, "kind"), f"all: {title.lower()}": results}.items():
+            rows.append([_short(name), *_percent(_above(own, MOVED_STAGES))])
+    return {"All slow zones move": table(f"missions | {_names(MOVED_STAGES)}", rows)}
+
+
+def doors(options: Options) -> Sections:
+    """Count the drives through a door where the robot waits, beside one that is 6 s farther."""
+    occupancy = np.zeros((40, 40), dtype=np.bool_)
+    occupancy[20] = True
+    occupancy[20, 10:13] = occupancy[20, 24:27] = False
+    ends, rows = [(11, 8), (11, 32)], []
+    for seconds in DOOR_WAITS:
+        waits = np.zeros(occupancy.shape)
+        waits[20, 10:13] = seconds
+        world = World(GridMap(occupancy, 0.25), np.ones(waits.shape), [], ends, waits)
+        through = []
+        for seed in range(DOOR_SEEDS):
+            experience, random, clock = Experience(SPEED), np.random.default_rng(seed), 0.0
+            routes = []
+            for number in range(DOOR_DRIVES):
+                grid = _applied(experience, world.grid, options)
+                routes.append(
+                    planner().plan(grid, ends[number % 2], ends[1 - number % 2], RULE).cells
+                )
+                measured = drive(routes[-1], world, clock, random)
+                experience.record(measured.seconds, measured.positions)
+                clock += measured.duration
+            through.append(sum(any(y == 20 and x < 13 for x, y in route) for route in routes))
+        rows.append([f"{seconds} s", f"{np.mean(through):.1f}", max(through)])
+    return {"Doors": table(f"wait | drives through it, of {DOOR_DRIVES} | most", rows)}
+
+
+def zones(options: Options) -> Sections:
+    """Measure the slowness that is learned of a zone of 4.0, with poses of several kinds."""
+    grid, always = GridMap(np.zeros((20, 80), dtype=np.bool_), 0.25), np.ones((20, 80))
+    always[:, 32:48] = 4
+    path = [(x, 10) for x in range(2, 78)]
+    world, rows = World(grid, always, [], [path[0], path[-1]]), []
+    for noise, rate in itertools.product(ZONE_NOISES, ZONE_RATES):
+        learned = []
+        for width in ZONE_WIDTHS:
+            experience, random, clock = Experience(SPEED, width), np.random.default_rng(0), 0.0
+            for number in range(10):
+                measured = drive(path[:: 1 - 2 * (number % 2)], world, clock, random, noise, rate)
+                experience.record(measured.seconds, measured.positions)
+                clock += measured.duration
+            learned.append(experience.slowness(grid)[10, 36:44].mean())
+        rows.append([f"{100 * noise:g} cm", f"{rate} Hz", *(f"{value:.2f}" for value in learned)])
+    widths = " | ".join(f"robot_width {width}" for width in ZONE_WIDTHS)
+    return {"A zone of slowness 4.0": table(f"noise of poses | rate | {widths}", rows)}
+
+
+def speed(options: Options) -> Sections:
+    """Measure the CPU time to learn from 1,000 poses on 1000 x 1000 cells, and to plan again."""
     random = np.random.default_rng(0)
-    occupancy = generate_map("office", (1000, 1000), random)
-    grid, planner = GridMap(occupancy, 0.05), Planner.load("any_map")
-    world = worlds.make_world(grid, random)
+    grid = GridMap(generate_map("office", (1000, 1000), random), 0.05)
+    world = worlds.make_world(grid, "mixture", random)
     requests = random_requests(world.grid.occupancy, RULE, 6, random)
     goal, experience, clock = requests[0][1], Experience(SPEED), 0.0
     times = []
     for number in range(25):
-        cells = planner.plan(experience.apply(grid), requests[number % 6][0], goal).cells
+        cells = planner().plan(experience.apply(grid), requests[number % 6][0], goal).cells
         measured = drive(cells[:1001], world, clock, random)
         some = np.linspace(0, len(measured.seconds) - 1, 1000).astype(np.int64)
         clock += measured.duration
         began = [time.thread_time()]
         experience.record(measured.seconds[some], measured.positions[some])
         began.append(time.thread_time())
-        applied = experience.apply(grid)
+        applied = _applied(experience, grid, options)
         began.append(time.thread_time())
-        planner.plan(applied, cells[: len(cells) // 2 + 1][-1], goal)
+        planner().plan(applied, cells[: len(cells) // 2 + 1][-1], goal)
         began.append(time.thread_time())
         steps = 1e3 * np.diff(began)
         times.append([*steps, steps.sum()])
     columns = zip(("record", "apply", "plan again", "all"), np.array(times[5:]).T, strict=True)
     rows = [[name, f"{np.median(ms):.1f}", f"{ms.max():.1f}"] for name, ms in columns]
-    return table("1,000 poses on 1000 x 1000 cells | median [ms] | worst [ms]", rows)
+    return {"Speed": table("1,000 poses on 1000 x 1000 cells | median [ms] | worst [ms]", rows)}
 
 
-def _curve(path: Path, plain: Sequence[Result]) -> str:
-    seconds = {name: [result.seconds[name] for result in plain] for name in PLANNERS}
-    best = [result.seconds[BEST] for result in plain]
-    figure, axes = draw_times(seconds, best, SMOOTHED, banded=LEARNED)
-    if len(best[0]) > MOVED_AT:
-        axes.axvline(MOVED_AT, color="black", linewidth=1, linestyle=":")
-        axes.text(MOVED_AT + 1, axes.get_ylim()[1], "all slow zones move", va="top", fontsize=9)
-    return save_figure(figure, path, "Time over the best possible, from mission to mission")
-
-
-def _picture(path: Path, missions: int = 50) -> str:
+def pictures(options: Options, missions: int = 50) -> Sections:
     """Draw the true and the learned slowness of a world, with the routes of a mission."""
-    result, planner = run(Job("office", 1, missions)), Planner.load("any_map")
-    world, experience, clock = result.world, result.experience, result.clock
-    grid = world.grid
-    truth = world.slowness(clock)
+    job = Job("office-mixture", 1, EXPERIENCE, missions)
+    world, experience = world_of(job), Experience(SPEED)
+    run_in(job, world, experience)
+    grid, truth = world.grid, world.slowness(0)
 
     def saved(ends: tuple[Cell, Cell]) -> float:
-        of_routes = world.routes(planner, *ends, clock).values()
-        shortest, best = (path_seconds(cells, truth, grid) for cells in of_routes)
+        of_routes = world.routes(planner(), *ends, 0).values()
+        shortest, best = (worlds.path_seconds(cells, world, 0) for cells in of_routes)
         return shortest - best
 
     start, goal = max(itertools.combinations(world.stations, 2), key=saved)
-    shortest, best = world.routes(planner, start, goal, clock).values()
-    learned = planner.plan(experience.apply(grid), start, goal, RULE).cells
+    shortest, best = world.routes(planner(), start, goal, 0).values()
+    learned = planner().plan(experience.apply(grid), start, goal, RULE).cells
     routes = {"shortest": shortest, "learned": learned, "best possible": best}
     visited = experience.uncertainty(grid) < VISITED
     known = np.where(visited, experience.slowness(grid), np.nan)
@@ -246,15 +198,149 @@ def _picture(path: Path, missions: int = 50) -> str:
         "what nobody told the robot: true slowness": (truth, routes),
         f"what it learned from {missions} missions (grey: never there)": (known, routes),
     }
-    figure = draw_slowness(grid, world.stations, panels, (11, 5.6))
-    return save_figure(figure, path, "True and learned slowness, and the routes")
+    figure, title = (
+        draw_slowness(grid, world.stations, panels, (11, 5.6)),
+        "True and learned slowness",
+    )
+    return {title: save_figure(figure, options.out / "map.png", f"{title}, and the routes")}
+
+
+def tuning(options: Options) -> Sections:
+    """Print a line for each kind of world for tuning, and the mean, for some learners."""
+    for learner in options.learner or [EXPERIENCE]:
+        own = _runs(TUNING, [learner], options)
+        names = "  ".join(f"{first + 1:3}-{end:3}" for first, end in STAGES)
+        print(f"{learner:24} {names}  1-20 over the shortest path")
+        for name, results in {**_by(own, "kind"), "mean": own}.items():
+            over = 100 * np.mean([result.over_shortest(0, 20) for result in results]) - 100
+            line = "  ".join(f"{value:7.1f}" for value in _above(results))
+            print(f"{name:24} {line}  {over:7.1f}", flush=True)
+    return {}
+
+
+FIGURES: Final[dict[str, Callable[[Options], Sections]]] = {
+    "compared": compared,
+    "faulty": faulty,
+    "long": long,
+    "moved": moved,
+    "doors": doors,
+    "zones": zones,
+    "speed": speed,
+    "pictures": pictures,
+}
+
+
+def _runs(
+    kinds: Sequence[str], learners: Sequence[str], options: Options, **more: Any
+) -> list[Result]:
+    """Run each kind of a set with each learner and seed."""
+    first = 0 if kinds[0] in TUNING else HELD_OUT_SEED
+    given = {"missions": 100, "exploration": options.exploration, **more}
+    given |= {"missions": 10} if options.quick else {}
+    drawn = itertools.product(kinds, range(first, first + options.seeds), learners)
+    jobs = [Job(kind, seed, learner, **given) for kind, seed, learner in drawn]
+    return in_parallel(run, jobs, options.backend, "world")
+
+
+def _by(results: Sequence[Result], name: str) -> dict[str, list[Result]]:
+    """Return the results by their kind or learner, in the same order."""
+    groups: dict[str, list[Result]] = {}
+    for result in results:
+        groups.setdefault(getattr(result.job, name), []).append(result)
+    return groups
+
+
+def _reached(results: Sequence[Result], stages: Stages) -> Stages:
+    """Return the stages that the missions reached."""
+    return [stage for stage in stages if stage[0] < len(results[0].seconds)]
+
+
+def _above(results: Sequence[Result], stages: Stages = STAGES) -> list[float]:
+    """Return the mean time above the best possible in each stage, in percent."""
+    reached = _reached(results, stages)
+    return [100 * float(np.mean([each.ratio(*stage) for each in results]) - 1) for stage in reached]
+
+
+def _percent(values: Sequence[float]) -> list[str]:
+    return [f"{value:.1f} %" for value in values]
+
+
+def _names(stages: Stages) -> str:
+    """Return the names of columns."""
+    return " | ".join(f"{first + 1} to {end}" for first, end in stages)
+
+
+def _short(kind: str) -> str:
+    """Return the name of a kind, without the folder and the ending of a file."""
+    return Path(kind).name.replace(".yaml", "")
+
+
+def _forecasts(results: Sequence[Result]) -> str:
+    """Return how far the expected times of missions were from the measured ones."""
+    rows = []
+    for first, end in ((0, 5), (50, 100)):
+        chosen = np.concatenate([result.forecast[first:end] for result in results])
+        rows.append([f"{first + 1} to {end}", *_errors(chosen)])
+    every = np.concatenate([result.forecast for result in results])
+    rows.append(["all whose path is half new", *_errors(every[every[:, 4] >= 0.5])])
+    header = "missions | drives | MAPE | within the 90 % interval | width of it, median"
+    return table(f"{header} | measured over expected", [row for row in rows if row[1]])
+
+
+def _errors(forecast: Any) -> list[Any]:
+    measured, expected, low, high, _ = forecast.T
+    if not len(measured):
+        return [0]
+    error = np.abs(expected / measured - 1).mean()
+    inside = ((low <= measured) & (measured <= high)).mean()
+    width, ratio = np.median((high - low) / expected), measured.sum() / expected.sum()
+    return [len(measured), f"{error:.1%}", f"{inside:.1%}", f"{width:.1%}", f"{ratio:.2f}"]
+
+
+def _curve(path: Path, results: Mapping[str, Sequence[Result]]) -> str:
+    seconds = {name: [result.seconds for result in own] for name, own in results.items()}
+    best = [result.best for result in results[EXPERIENCE]]
+    figure, _ = draw_times(seconds, best, min(SMOOTHED, len(best[0])), banded=EXPERIENCE)
+    return save_figure(figure, path, "Time over the best possible, from mission to mission")
+
+
+def _applied(experience: Experience, grid: GridMap, options: Options) -> GridMap:
+    given = {} if options.exploration is None else {"exploration": options.exploration}
+    return experience.apply(grid, **given)
+
+
+def measure(options: Options) -> int:
+    """Run the experiment, write its tables, figures and ``report.md``, and print it."""
+    maps = sorted(map(str, options.maps.rglob("*.yaml"))) if options.maps else []
+    if options.maps and not maps:
+        raise ValueError(f"{options.maps}: found no ROS map (.yaml); check the path")
+    options.out = make_folder(options)
+    options.sets = {HELD_OUT_SET: HELD_OUT, "Worlds for tuning": TUNING}
+    if maps:
+        on_maps = tuple(f"{path}-{hidden}" for path in maps for hidden in ON_FILES)
+        options.sets["Maps from files"] = on_maps
+    if options.quick:
+        options.sets = {title: kinds[:2] for title, kinds in options.sets.items()}
+    if options.tuning:
+        return len(tuning(options))
+    sections = Sections()
+    for name in options.figure or FIGURES:
+        sections |= FIGURES[name](options)
+    print(write_report(options.out, sections, options.page))
+    print(f"saved {options.out / 'report.md'}")
+    return 0
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the program; return the exit code."""
     parser = parser_of("driving.py", __doc__, "runs/driving")
-    words = "measure on the ROS maps of a folder too"
-    parser.add_argument("--maps", type=Path, metavar="FOLDER", help=words)
+    add = parser.add_argument
+    add("--maps", type=Path, metavar="FOLDER", help="measure on the ROS maps of a folder too")
+    add("--figure", action="append", choices=FIGURES, help="measure some of the figures alone")
+    words = "what `Experience.apply` is given, rather than its default"
+    add("--exploration", type=float, metavar="SHARE", help=words)
+    add("--tuning", action="store_true", help="print the results of worlds for tuning, no report")
+    add("--learner", action="append", choices=LEARNERS, help="those of --tuning")
     options = parser.parse_args(arguments)
     return exit_code(parser.prog, lambda: measure(options))
 

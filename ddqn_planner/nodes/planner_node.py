@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import ctypes
-import time
 from collections.abc import Callable
 from contextlib import suppress
 from typing import Any
@@ -273,22 +272,20 @@ class PlannerNode(ManagedNode):
 
     # Diagnostics
 
-    def _look_soon(self) -> None:
-        """Look at what changed, or may have come, in `LOOK_PERIOD`."""
-        if not self._is_look_near:
-            self._is_look_near, self._looks.timer_period_ns = True, 1e9 * LOOK_PERIOD
+    def _look_soon(self, is_near: bool = True) -> None:
+        """Look at what changed, or may have come, in `LOOK_PERIOD`, or else in `IDLE_PERIOD`."""
+        if is_near != self._is_look_near:  # a timer that is reset wakes the node
+            period, self._is_look_near = LOOK_PERIOD if is_near else IDLE_PERIOD, is_near
+            self._looks.timer_period_ns = 1e9 * period
             self._looks.reset()
 
     def _on_look(self) -> None:
-        self._is_look_near, self._looks.timer_period_ns = False, 1e9 * IDLE_PERIOD
-        self._looks.reset()
-        is_frequent = self._active.poses and self._settings.replan_period < IDLE_PERIOD
-        if self._waits_for_pose or is_frequent:
-            self._look_soon()
+        is_frequent = bool(self._active.poses) and self._settings.replan_period < IDLE_PERIOD
+        self._look_soon(self._waits_for_pose or is_frequent)
         self._report.log_paths()
         if self._is_configured:
             self._look_for_news()
-        if time.monotonic() >= self._report.due:
+        if self._report.is_due():
             missing = [self._refusal.reason] if self._refusal is not None else []
             missing += [self._map.missing] if self._is_configured else []
             missing += ["the model is being loaded"] if self._model.loading else []
@@ -301,8 +298,7 @@ class PlannerNode(ManagedNode):
     def _look_for_news(self) -> None:
         self._requests.look_again()
         self._start.transform()
-        period, lacks_map = self._settings.replan_period, bool(self._map.missing)
-        is_due = self._active.is_look_due(period, lacks_map)
+        is_due = self._active.is_look_due(self._settings.replan_period, bool(self._map.missing))
         if self._waits_for_pose and self._active.poses:
             with suppress(RequestError):
                 for pose in (self._start.pose(), *self._active.poses):

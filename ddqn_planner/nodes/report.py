@@ -16,7 +16,7 @@ from ddqn_planner.grid import Cell
 from ddqn_planner.nodes.runtime import BaseNode
 from ddqn_planner.planning import Plan, PlanMethod, Planner, PlanRequest, PlanStatus
 
-PERIOD = 1.0  # seconds between two diagnostics when nothing changes
+PERIOD = 0.9  # seconds until diagnostics are due when nothing changes: at the next look
 
 TOLERANCE = ", or a greater tolerance"
 """The part of a remedy that does not help with several goals: none of them moves."""
@@ -147,12 +147,19 @@ class Report(Refusals):
         self.outcome, self._on_change = NO_REQUEST, on_change
         self._publisher = node.create_publisher(DiagnosticArray, "/diagnostics", 10)
         self._to_be_logged: list[str] = []
-        self.due = 0.0  # when to publish: something changed, or `PERIOD` has passed
+        self._due = 0.0
 
     def change(self) -> None:
         """Publish soon: something about the node changed."""
-        self.due = 0.0
+        self._due = 0.0
         self._on_change()
+
+    def is_due(self) -> bool:
+        """Return whether somebody listens, and something changed or `PERIOD` has passed."""
+        if is_due := time.monotonic() >= self._due:
+            self._due = time.monotonic() + PERIOD
+            self.node.topic_problems()  # which are logged, whoever listens
+        return is_due and self._publisher.get_subscription_count() > 0
 
     def note(self, outcome: Outcome) -> None:
         """Keep the last outcome for the diagnostics."""
@@ -175,7 +182,6 @@ class Report(Refusals):
 
     def publish(self, fatal: bool, missing: str, more: Mapping[str, str]) -> None:
         """Publish the diagnostics; `fatal` if the node cannot plan until its user helps."""
-        self.due = time.monotonic() + PERIOD
         outcome, plan, problems = self.outcome, self.outcome.plan, self.problems()
         if missing and missing != outcome.reason:
             problems.append(missing)

@@ -139,12 +139,8 @@ class ModelSource:
         def read() -> tuple[Planner, str]:
             planner, file = self.read(self._node.value("model"))
             compiling = warm_up(planner, self._node.value("follow_trainer"))
-            often = gc.get_threshold()
-            gc.set_threshold(20_000)  # to compile makes objects that stay, not garbage
-            try:
-                next(compiling)
-            finally:
-                gc.set_threshold(*often)
+            gc.set_threshold(20_000)  # to compile and to plan makes hardly any garbage
+            next(compiling)
             gc.freeze()  # a collection of all that would stop the node for 45 ms
             Worker(self._node).call(next, compiling)  # the rest
             return planner, file
@@ -175,8 +171,7 @@ class ModelSource:
 
     def set(self, name: str) -> str:
         """Set the node's parameter, which loads the model; return why it was refused."""
-        (result,) = self._node.set_parameters([Parameter("model", value=name)])
-        return str(result.reason)
+        return str(self._node.set_parameters([Parameter("model", value=name)])[0].reason)
 
     def on_saved(self, message: String) -> None:
         """Use a model that the trainer saved."""
@@ -194,15 +189,14 @@ class ModelSource:
         description = {"model": self._node.value("model")}
         if self.planner is None:
             return description
-        metadata = self.planner.metadata
-        certificate = self.planner.network.certificate(metadata.move_rule)
+        metadata, network = self.planner.metadata, self.planner.network
         return description | {
             "model file": self.file,
             "move rule": move_rule(rule, self.planner).value,
             "model move rule": metadata.move_rule.value,
             "model sizes": ", ".join(f"{key} {size}" for key, size in metadata.sizes.items()),
             "model training steps": str(metadata.steps),
-            "model certificate": str(certificate or NO_CERTIFICATE),
+            "model certificate": str(network.certificate(metadata.move_rule) or NO_CERTIFICATE),
         }
 
     def forget(self) -> None:

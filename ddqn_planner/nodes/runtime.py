@@ -216,17 +216,19 @@ class BaseNode(Node):
         self, what: str, level: bytes, message: str, values: Mapping[str, str]
     ) -> DiagnosticArray:
         """Return a message for `/diagnostics`; topics' problems are in it, and logged once."""
-        problems = [*self._topic_problems()]
-        for problem in problems:
-            if problem not in self._logged_problems:
-                self.get_logger().warning(problem)
-        self._logged_problems = problems
-        if problems:
+        if problems := self.topic_problems():
             level, message = max(level, DiagnosticStatus.WARN), "; ".join([message, *problems])
         status = DiagnosticStatus(name=f"{self.get_fully_qualified_name()}: {what}")
         status.level, status.message = level, message
         status.values = [KeyValue(key=key, value=value) for key, value in values.items()]
         return DiagnosticArray(header=self.header(), status=[status])
+
+    def topic_problems(self) -> list[str]:
+        """Return what it cannot hear, and why; each is logged once."""
+        before, self._logged_problems = self._logged_problems, [*self._topic_problems()]
+        for problem in {*self._logged_problems}.difference(before):
+            self.get_logger().warning(problem)
+        return self._logged_problems
 
     def _topic_problems(self) -> Iterator[str]:
         for subscription in self.subscriptions:

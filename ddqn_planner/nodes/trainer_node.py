@@ -217,8 +217,10 @@ class TrainerNode(LearningNode):
         super().destroy_node()
         self._worker.close()  # torch, half imported, may fail when the process ends
         if self._run is not None and self.state == "training":
-            with suppress(ValueError):  # it diverged: older files stay
+            try:
                 self._run.try_to_save()
+            except ValueError as error:  # it diverged: older files stay
+                self.fail(str(error))
             self._run.close()
             self.note_saving("the training is", self._run.save_error)
 

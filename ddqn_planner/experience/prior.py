@@ -1,0 +1,97 @@
+"""What a map says of how slow its places are likely to be: also where nobody has driven."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from functools import partial
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ddqn_planner.grid import GridMap
+from ddqn_planner.grid.arguments import Occupancy
+from ddqn_planner.grid.body import clearance
+
+Float32 = NDArray[np.float32]
+
+FEATURES = 10
+REACH = 3.0  # metres: what is farther away says nothing
+SQUARES = 0.5, 1.0, 2.0  # metres: half the sides of squares whose share of free space counts
+UNUSUAL = 3.0  # standard deviations: features are no farther off than those of training
+
+
+def map_features(grid: GridMap) -> Float32:
+    """Return what the map says around each cell, in metres: (H, W, FEATURES). Off it is free."""
+    occupied = grid.occupancy if grid.obstacles is None else grid.obstacles
+    metres = np.minimum((clearance(occupied) - 0.5) * grid.resolution, REACH).astype(np.float32)
+    widths = _widths(occupied, grid.resolution), _widths(occupied.T, grid.resolution).T
+    narrow, wide = np.minimum(*widths), np.maximum(*widths)
+    near, middle, far = (_free_share(occupied, side / grid.resolution) for side in SQUARES)
+    door = np.exp(-narrow / 0.5)
+    width = [door, np.exp(-narrow / 1.5), np.log(np.maximum(wide, 0.1)), door * (far - near)]
+    distance = [np.exp(-metres / 0.25), np.exp(-metres / 0.75), metres]
+    return np.stack([*distance, *width, near, middle, far], axis=-1)
+
+
+def _widths(occupied: Occupancy, resolution: float) -> Float32:
+    """Return how many metres of its row are free around each cell: (H, W)."""
+    at, reach = np.arange(occupied.shape[1], dtype=np.int32), int(2 * REACH / resolution) + 1
+    left = np.maximum.accumulate(np.where(occupied, at, -reach), axis=1)
+    right = np.where(occupied, at, len(at) + reach)[:, ::-1]
+    cells = np.minimum.accumulate(right, axis=1)[:, ::-1] - left - 1
+    return np.clip(cells * resolution, 0, 2 * REACH).astype(np.float32)
+
+
+def _free_share(occupied: Occupancy, reach: float) -> Float32:
+    """Return the free share of the square around each cell that reaches so many cells: (H, W)."""
+    from scipy.ndimage import uniform_filter1d
+
+    whole, rest = divmod(max(2 * reach - 1, 0) / 2, 1)
+    share = (~occupied).astype(np.float32)
+    for axis in (0, 1):
+        # A side of 3.5 cells lies between those of 3 and 5 cells.
+        sizes = 2 * int(whole) + 1, 2 * int(whole) + 3
+        mean = partial(uniform_filter1d, share, axis=axis, mode="constant", cval=1)
+        small, large = (size * mean(size) for size in sizes)
+        share = (small + np.float32(rest) * (large - small)) / np.float32(2 * (whole + rest) + 1)
+    return share
+
+
+class Prior(NamedTuple):
+    """A network with two layers of H units that foretells log slowness from F features."""
+
+    mean: Float32  # (F,) of the features in training
+    scale: Float32  # (F,): their standard deviations
+    level: Float32  # (): the mean log slowness in training
+    direct: Float32  # (F,): what each feature adds beside the layers
+    weights_1: Float32  # (F, H)
+    bias_1: Float32
+    weights_2: Float32  # (H, H)
+    bias_2: Float32
+    weights_3: Float32  # (H,)
+    replay: Float32  # (N, F + 2): features, log slowness and weight of places, to learn on from
+
+    def log_slowness(self, features: Float32) -> Float32:
+        """Return the expected log slowness of places: (..., F) to (...,)."""
+        x = np.clip((features - self.mean) / self.scale, -UNUSUAL, UNUSUAL)
+        hidden = np.tanh(np.tanh(x @ self.weights_1 + self.bias_1) @ self.weights_2 + self.bias_2)
+        return np.asarray(self.level + x @ self.direct + hidden @ self.weights_3)
+
+    def arrays(self) -> dict[str, Float32]:
+        """Return its arrays by name, to save them."""
+        return self._asdict()
+
+    @classmethod
+    def from_arrays(cls, arrays: Mapping[str, NDArray[Any]]) -> Prior:
+        """Return the prior that `arrays` gave; a ValueError if they are no prior's."""
+        prior = cls(*(np.asarray(arrays.get(name)) for name in cls._fields))
+        size, (units, *_) = (FEATURES,), (*prior.bias_1.shape, 0)
+        layers = (FEATURES, units), (units,), (units, units), (units,), (units,)
+        shapes = size, size, (), size, *layers, (len(np.atleast_1d(prior.replay)), FEATURES + 2)
+        for name, array, shape in zip(cls._fields, prior, shapes, strict=True):
+            if array.dtype.kind != "f" or array.shape != shape or not np.isfinite(array).all():
+                raise ValueError(f"the prior's {name} is not made of finite numbers {shape}")
+        if (prior.scale <= 0).any() or (prior.replay[:, -1] < 0).any():
+            raise ValueError("the prior's scale or weights cannot be true")
+        return cls(*(array.astype(np.float32) for array in prior))

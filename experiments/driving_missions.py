@@ -1,0 +1,115 @@
+"""Missions of a robot in a world of `driving_worlds`, and what they took."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cache
+from typing import Any, Final
+
+import driving_worlds as worlds
+import numpy as np
+from driving_learners import LEARNERS
+from driving_maps import Bool
+from driving_worlds import RULE, Float64, World, drive, path_seconds
+
+from ddqn_planner import Experience, Planner, inflate, load_map
+from ddqn_planner.grid import Cell
+
+MOVED_AT: Final = 100  # the mission before which all that is slow moves, where it does
+FAULT_EVERY: Final = 900.0  # seconds of driving: four faults per hour, one of each kind on average
+ROBOT_RADIUS: Final = 0.2  # metres, on maps from files
+
+
+@dataclass(frozen=True)
+class Job:
+    """A world (of a kind, or a map file and what is slow), and who drives in it, and how."""
+
+    kind: str
+    seed: int
+    learner: str
+    missions: int
+    exploration: float | None = None
+    is_faulty: bool = False
+    is_moved: bool = False
+
+
+@dataclass(frozen=True)
+class Result:
+    """The missions of a job: the seconds of the routes, and of the best and the shortest ones."""
+
+    job: Job
+    seconds: Float64
+    best: Float64
+    shortest: Float64
+    forecast: Float64  # (M, 5): measured, the expected time, its bounds, and the new share
+
+    def ratio(self, first: int, end: int) -> float:
+        """Return the total time over the best possible, over some missions."""
+        return float(self.seconds[first:end].sum() / self.best[first:end].sum())
+
+    def over_shortest(self, first: int, end: int) -> float:
+        """Return the total time over that of the shortest paths."""
+        return float(self.seconds[first:end].sum() / self.shortest[first:end].sum())
+
+
+@cache
+def planner() -> Planner:
+    """Load the planner, once in a process."""
+    return Planner.load("any_map")
+
+
+def world_of(job: Job) -> World:
+    """Make the world of a job."""
+    if ".yaml" not in job.kind:
+        return worlds.generated_world(job.kind, job.seed)
+    path, hidden = job.kind.rsplit("-", 1)
+    random = np.random.default_rng([job.seed, 1])
+    return worlds.make_world(inflate(load_map(path), ROBOT_RADIUS), hidden, random)
+
+
+def run(job: Job) -> Result:
+    """Drive the missions of a job."""
+    world = world_of(job)
+    return run_in(job, world, LEARNERS[job.learner](world.grid))
+
+
+def run_in(job: Job, world: World, learner: Any) -> Result:
+    """Drive the missions of a job in a world, with a learner that may know something."""
+    grid = world.grid
+    missions, noise, faults, moved = (np.random.default_rng([job.seed, n]) for n in range(4))
+    is_exploring = isinstance(learner, Experience) and job.exploration is not None
+    given = {"exploration": job.exploration} if is_exploring else {}
+    shortest: dict[tuple[int, int], Sequence[Cell]] = {}
+    new = np.ones(grid.occupancy.shape, dtype=np.bool_)
+    times, forecast = [], []
+    clock, own, next_fault = 0.0, 0.0, FAULT_EVERY / 2
+    for mission in range(job.missions):
+        if job.is_moved and mission == MOVED_AT:
+            world.change(job.kind.rsplit("-", 1)[1], moved)
+        pair = tuple(missions.choice(len(world.stations), 2, replace=False).tolist())
+        start, goal = (world.stations[number] for number in pair)
+        if pair not in shortest:
+            shortest[pair] = planner().plan(grid, start, goal, RULE).cells
+        cells = planner().plan(learner.apply(grid, **given), start, goal, RULE).cells
+        of_routes = [path_seconds(route, world, clock) for route in (cells, shortest[pair])]
+        best = world.best_seconds(start, goal, clock)
+        times.append([*of_routes, best])
+        measured = drive(cells, world, clock, noise)
+        if isinstance(learner, Experience):
+            x, y = np.transpose(cells)
+            expected = learner.expected_time(grid, cells)
+            forecast.append([measured.duration, *expected, new[y, x].mean()])
+            _mark(new, cells, round(0.25 / grid.resolution))
+        seen = replace(measured, seconds=measured.seconds + own - clock)
+        if job.is_faulty and own >= next_fault:
+            seen, next_fault = worlds.with_faults(seen, faults), next_fault + FAULT_EVERY
+        learner.record(seen.seconds, seen.positions)
+        # Crowds come for all learners at the same mission, however long their drives take.
+        clock, own = clock + best, own + measured.duration
+    seconds, of_shortest, of_best = np.array(times).T
+    return Result(job, seconds, of_best, of_shortest, np.array(forecast))
+
+
+def _mark(new: Bool, cells: Sequence[Cell], reach: int) -> None:
+    """Mark what is near a path as driven."""
+    for x, y in cells:
+        new[max(y - reach, 0) : y + reach + 1, max(x - reach, 0) : x + reach + 1] = False

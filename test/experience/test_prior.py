@@ -1,0 +1,85 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from strategies import occupancies
+
+from ddqn_planner import GridMap, inflate
+from ddqn_planner.experience.prior import FEATURES, Prior, map_features
+
+
+@given(occupancies)
+def test_a_turn_of_the_map_turns_its_features(occupancy: np.ndarray) -> None:
+    features = map_features(GridMap(occupancy, 0.25))
+    turned = map_features(GridMap(np.rot90(occupancy), 0.25))
+    assert np.abs(np.rot90(features) - turned).max() < 1e-5
+    mirrored = map_features(GridMap(occupancy.T, 0.25))
+    assert np.abs(features.swapaxes(0, 1) - mirrored).max() < 1e-5
+
+
+@given(occupancies)
+def test_another_resolution_of_the_same_walls_has_nearly_the_same_features(
+    occupancy: np.ndarray,
+) -> None:
+    coarse = map_features(GridMap(occupancy, 0.25))
+    fine = map_features(GridMap(occupancy.repeat(5, 0).repeat(5, 1), 0.05))[2::5, 2::5]
+    difference = np.abs(fine - coarse)[~occupancy]
+    assert difference[:, 3:].max(initial=0) < 1e-5
+    assert difference[:, :3].max(initial=0) < 0.25 / 3  # a corner's distance depends on its cell
+
+
+def test_features_tell_a_wall_a_door_and_a_hall_apart_and_end_nowhere_at_the_map() -> None:
+    occupancy = np.zeros((40, 40), dtype=bool)
+    occupancy[20] = True
+    occupancy[20, 10] = False
+    features = map_features(GridMap(occupancy, 0.25))
+    metres, door = features[..., 2], features[..., 6] * ~occupancy
+    assert metres[19, 30] == pytest.approx(0.125)
+    assert metres[16, 30] == pytest.approx(0.875)
+    assert metres[0, 0] == metres.max() == 3
+    assert np.unravel_index(door.argmax(), door.shape) == (20, 10)
+    assert door[20, 10] > 4 * np.delete(door[:, 10], 20).max()
+
+
+def test_a_robots_body_moves_no_wall() -> None:
+    grid = GridMap(np.arange(400).reshape(20, 20) % 37 == 0, 0.25)
+    assert (map_features(inflate(grid, 0.5)) == map_features(grid)).all()
+
+
+def some_prior() -> Prior:
+    random, units = np.random.default_rng(0), 3
+    layers = (FEATURES, units), units, (units, units), units, units
+    shapes = FEATURES, FEATURES, (), FEATURES, *layers, (7, FEATURES + 2)
+    return Prior(*(np.abs(random.normal(size=shape)).astype(np.float32) for shape in shapes))
+
+
+def test_a_prior_survives_as_arrays() -> None:
+    prior, features = some_prior(), np.ones((2, 3, FEATURES), dtype=np.float32)
+    again = Prior.from_arrays(prior.arrays())
+    assert again.log_slowness(features).dtype == np.float32
+    assert (again.log_slowness(features) == prior.log_slowness(features)).all()
+    assert all(np.array_equal(one, other) for one, other in zip(prior, again, strict=True))
+
+
+@pytest.mark.parametrize("name", Prior._fields)
+def test_what_is_no_prior_is_refused(name: str) -> None:
+    arrays = some_prior().arrays()
+    bad = {
+        "shape": np.concatenate([np.atleast_1d(arrays[name])] * 2, axis=-1),
+        "numbers": np.full_like(arrays[name], np.nan),
+        "type": arrays[name].astype(complex),
+        "array": np.array("prior"),
+    }
+    for value in bad.values():
+        with pytest.raises(ValueError, match="is not made of"):
+            Prior.from_arrays({**arrays, name: value})
+    with pytest.raises(ValueError, match="is not made of"):
+        Prior.from_arrays({key: arrays[key] for key in arrays if key != name})
+
+
+@pytest.mark.parametrize("name", ["scale", "replay"])
+def test_a_prior_with_negative_scales_or_weights_is_refused(name: str) -> None:
+    arrays = some_prior().arrays()
+    with pytest.raises(ValueError, match="cannot be true"):
+        Prior.from_arrays({**arrays, name: -arrays[name]})

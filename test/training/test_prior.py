@@ -1,0 +1,81 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from random_maps import generate_map
+
+from ddqn_planner import GridMap
+from ddqn_planner.experience.prior import Prior, map_features
+from ddqn_planner.training.prior import train_prior
+
+Places = tuple[np.ndarray, np.ndarray, np.ndarray]
+"""Features (N, F), log slowness (N,) and weights (N,)."""
+
+rng = np.random.default_rng
+
+
+def rooms(seed: int, count: int = 600) -> np.ndarray:
+    """The features of free cells of rooms, row by row."""
+    occupancy = generate_map("rooms", (40, 40), rng(seed)).repeat(2, 0).repeat(2, 1)
+    features = map_features(GridMap(occupancy, 0.25))[~occupancy]
+    return features[np.sort(rng(seed).choice(len(features), count, replace=False))]
+
+
+def by_clearance(features: np.ndarray) -> np.ndarray:
+    """Log slowness that a map's walls govern alone."""
+    return np.log(1 + 3 * np.exp(-features[:, 2] / 0.5))
+
+
+def measured(seed: int, count: int = 600) -> Places:
+    """Places of rooms that are slow near walls, with noise."""
+    features = rooms(seed, count)
+    slowness = by_clearance(features) + rng(seed).normal(0, 0.3, count)
+    return features, slowness, rng(seed).uniform(1, 4, count)
+
+
+def share_foretold(prior: Prior, features: np.ndarray) -> float:
+    """R² of the log slowness by clearance."""
+    truth = by_clearance(features)
+    return float(1 - ((prior.log_slowness(features) - truth) ** 2).mean() / truth.var())
+
+
+def test_what_walls_govern_is_foretold_on_another_map() -> None:
+    assert share_foretold(train_prior(*measured(0)), rooms(1)) > 0.85
+
+
+def test_few_places_and_those_that_no_map_explains_are_foretold_by_their_mean() -> None:
+    features, slowness, weights = measured(0)
+    few = train_prior(features[:30], slowness[:30], weights[:30])
+    mean = np.average(slowness[:30], weights=weights[:30])
+    assert few.log_slowness(rooms(1)) == pytest.approx(mean, abs=0.15)
+    slow = np.where(np.arange(600) // 60 % 3 == 0, 1.0, 0.0) + rng(1).normal(0, 0.3, 600)
+    unrelated = train_prior(features, slow, weights).log_slowness(rooms(1))
+    assert unrelated == pytest.approx(np.average(slow, weights=weights), abs=0.3)
+
+
+def test_weights_count() -> None:
+    features, slowness, weights = measured(0)
+    twice = [np.concatenate([array, array]) for array in (features, slowness)]
+    twice[1][600:] = 5.0
+    ignored = train_prior(*twice, np.concatenate([weights, np.full(600, 1e-6)]))
+    assert ignored.level == pytest.approx(np.average(slowness, weights=weights), abs=1e-3)
+    assert share_foretold(ignored, rooms(1)) > 0.7
+
+
+def test_the_same_seed_gives_the_same_prior() -> None:
+    one, same, other = (train_prior(*measured(0), seed=seed) for seed in (3, 3, 4))
+    assert all(np.array_equal(*pair) for pair in zip(one, same, strict=True))
+    assert not np.array_equal(one.weights_1, other.weights_1)
+
+
+def test_an_older_map_is_not_forgotten_and_only_new_places_take_their_place() -> None:
+    older = train_prior(*measured(0))
+    features, _, weights = measured(1)
+    hall = np.repeat(features[features[:, 2].argmax()][None], 600, axis=0)
+    prior = older
+    for _ in range(3):
+        prior = train_prior(hall, rng(2).normal(1, 0.3, 600), weights, prior)
+    moved = prior._replace(level=np.float32(by_clearance(rooms(2)).mean()))
+    assert share_foretold(moved, rooms(2)) > 0.7
+    elsewhere = {row.tobytes() for row in older.replay}
+    assert elsewhere <= {row.tobytes() for row in prior.replay}
