@@ -134,7 +134,7 @@ def test_plan_writes_json_and_a_picture(capsys: Any, tmp_path: Path) -> None:
     assert (tmp_path / "moved.png").read_bytes() == (tmp_path / "there.png").read_bytes()
 
 
-def test_a_missing_library_is_named(
+def test_missing_matplotlib_is_named(
     capsys: Any, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     monkeypatch.setitem(sys.modules, "matplotlib", None)
@@ -186,9 +186,7 @@ def test_a_node_without_ros_says_in_one_line_how_to_get_it(without: Any, node: s
     assert done.returncode == 1
 
 
-def test_bad_input_ends_with_2(
-    capsys: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_bad_input_ends_in_2(capsys: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     save_map(GridMap(np.zeros((2, 2))), "bare.yaml")
     for command, named in (

@@ -1,6 +1,9 @@
+import copy
+import gc
 import json
 import math
-from copy import copy
+import os
+import pickle
 from dataclasses import fields
 from fractions import Fraction
 from typing import Any
@@ -13,16 +16,17 @@ from hypothesis.extra import numpy as numpy_st
 from scipy.spatial.distance import cdist
 from strategies import Data, grids_with_directions, occupancies
 
-from ddqn_planner.grid import UNKNOWN, GridMap, MoveRule, clearance, inflate
+from ddqn_planner.grid import UNKNOWN, GridMap, MoveRule, clearance, copies, inflate
 from ddqn_planner.grid.arguments import as_cell
 from ddqn_planner.grid.body import Inflation, grid_from_costmap
+from ddqn_planner.grid.copies import boxes_of, cells_in, replaced
 
 ZEROS = np.zeros((2, 3))
 origins = st.tuples(*3 * [st.floats(-100, 100)])
 
 
 @given(occupancies, st.floats(0.01, 10), origins, st.data())
-def test_a_cells_centre_lies_in_it(
+def test_cells_hold_centres(
     occupancy: np.ndarray, resolution: float, origin: Any, data: Data
 ) -> None:
     grid = GridMap(occupancy, resolution, origin)
@@ -147,7 +151,7 @@ def derived(grid: GridMap) -> list[Any]:
 
 
 @given(full_grids(), st.booleans(), st.booleans(), st.data())
-def test_a_patched_map_is_a_new_one(
+def test_patches_are_exact(
     grid: GridMap, with_costs: bool, with_obstacles: bool, data: Data
 ) -> None:
     before = derived(grid)
@@ -160,7 +164,7 @@ def test_a_patched_map_is_a_new_one(
         patch, x, y, costs if with_costs else None, obstacles if with_obstacles else None
     )
     box = slice(y, y + shape[0]), slice(x, x + shape[1])
-    layers = {field.name: copy(getattr(grid, field.name)) for field in fields(grid)}
+    layers = {field.name: copy.copy(getattr(grid, field.name)) for field in fields(grid)}
     layers["occupancy"][box] = patch
     if with_costs:
         layers["cost"] = np.zeros(grid.occupancy.shape) if grid.cost is None else layers["cost"]
@@ -212,7 +216,7 @@ RADII, WEIGHTS = st.sampled_from([0.0, 0.03, 0.05, 0.1, 0.12, 0.2, 1.0]), st.flo
 
 
 @given(occupancies, RADII, WEIGHTS, st.sampled_from([None, UNKNOWN, 0, 40]))
-def test_inflation_is_as_defined(
+def test_inflation_is_exact(
     occupancy: np.ndarray, radius: float, weight: float, cost: int | None
 ) -> None:
     pairs = cdist(np.argwhere(np.ones_like(occupancy)), np.argwhere(occupancy))
@@ -309,3 +313,90 @@ def test_unknown_inscribed_lethal_cells_are_closed(values: np.ndarray, allow_unk
         assert (grid.cost_multiplier[unknown] == 5).all()
     free = ~grid.occupancy & ~unknown
     assert ((grid.cost_multiplier[free] == 1) == (values[free] <= 1)).all()
+
+
+@pytest.fixture(autouse=True)
+def shared(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let small arrays share their memory, too."""
+    monkeypatch.setattr(copies, "SMALL", 0)
+    monkeypatch.setattr(copies, "LARGE", 1)
+    monkeypatch.setattr(copies, "BOX", 1)
+
+
+BOXES = st.tuples(st.integers(0, 9), st.integers(1, 10), st.integers(0, 9), st.integers(1, 10))
+SHAPES = st.sampled_from([(10, 20), (20, 10)])
+FATES = st.sampled_from(["kept", "dropped", "viewed"])
+CHANGES = st.lists(st.tuples(st.integers(0, 100), BOXES, SHAPES, FATES), max_size=80)
+
+
+@given(CHANGES)
+def test_each_copy_keeps_what_it_was_given_whatever_comes_after(changes: list[Any]) -> None:
+    copied = [np.arange(200, dtype=np.int16).reshape(10, 20)]
+    expected, views = [copied[0].copy()], []
+    for origin, (y, height, x, width), shape, fate in changes:
+        before = origin % len(copied)  # any of the copies may be changed again
+        box = slice(y, y + height), slice(x, x + width)
+        changed = expected[before].reshape(shape).copy()
+        changed[box] = len(copied)
+        copied.append(replaced(copied[before].reshape(shape), box, changed[box]))
+        expected.append(changed)
+        if fate == "viewed":
+            views.append((copied[before].T[1:], expected[before].T[1:]))
+        if fate != "kept":  # others may use its memory, unless there is a view
+            del copied[before], expected[before]
+        for ours, right in [*zip(copied, expected, strict=True), *views]:
+            np.testing.assert_array_equal(ours, right)
+
+
+def open_files() -> int:
+    gc.collect()
+    return len(os.listdir("/proc/self/fd"))
+
+
+def test_maps_that_are_patched_or_kept_leave_files_for_others() -> None:
+    before, grid = open_files(), GridMap(np.zeros((20, 20)), cost=np.zeros((20, 20), np.int8))
+    kept = [grid]
+    for step in range(2000):
+        grid = grid.with_patch([[step % 2]], step % 20, step // 20 % 20)
+        if step % 5 == 0:
+            kept.append(grid)
+    assert open_files() - before <= 2 * copies.MOST_ALIVE
+    kept.clear()
+    assert open_files() - before <= 4  # of this map: its occupancy and its costs
+    del grid
+    assert open_files() == before
+
+
+def test_a_patched_map_is_copied_whole_and_shares_nothing_with_what_it_was_made_of() -> None:
+    given, patch = np.zeros((20, 20), dtype=np.bool_), np.ones((2, 2), dtype=np.bool_)
+    grid = GridMap(given)
+    patched = grid.with_patch(patch, 3, 3)
+    given[:], patch[:] = True, False
+    assert (grid._occupied, patched._occupied) == (0, 4)
+    for copied in (pickle.loads(pickle.dumps(patched)), copy.deepcopy(patched), copy.copy(patched)):
+        assert copied.same_cells(patched)
+        assert copied.fingerprint == patched.fingerprint
+        assert copied.with_patch([[0, 0], [0, 0]], 3, 3).same_cells(grid)
+    with pytest.raises(ValueError, match="read-only"):
+        patched.occupancy[0, 0] = True
+
+
+@given(st.lists(st.tuples(st.integers(0, 69), st.integers(0, 69)), max_size=30))
+def test_a_few_boxes_hold_all_changes(cells: list[tuple[int, int]]) -> None:
+    is_set = np.zeros((70, 70), dtype=np.bool_)
+    for cell in cells:
+        is_set[cell] = True
+    boxes, covered = boxes_of(is_set), np.zeros_like(is_set)
+    for box in boxes:
+        assert is_set[box].any()
+        covered[box] = True
+    assert len(boxes) <= copies.FEW
+    assert not (is_set & ~covered).any()
+
+
+def test_changes_that_lie_apart_have_small_boxes() -> None:
+    is_set = np.zeros((200, 300), dtype=np.bool_)
+    is_set[5:8, 5:9] = is_set[[100, 101], [7, 8]] = is_set[101, 250] = True
+    assert sum(cells_in(box) for box in boxes_of(is_set)) == 12 + 4 + 2
+    is_set[::50, ::50] = True
+    assert boxes_of(is_set) == [(slice(0, 151), slice(0, 251))]

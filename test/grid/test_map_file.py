@@ -188,9 +188,7 @@ def test_a_saved_grid_comes_back_with_directions_and_costs(tmp_path: Path, place
     np.testing.assert_array_equal(load_map(path).occupancy, closed)
 
 
-def test_an_impossible_map_file_is_not_made_and_no_other_file_saved(
-    tmp_path: Path,
-) -> None:
+def test_an_impossible_map_file_is_not_made_and_no_other_file_saved(tmp_path: Path) -> None:
     for name in ("saved.pgm", "saved.map", "saved"):
         with pytest.raises(MapFileError, match=r"\.yaml"):
             save_map(GridMap(PIXELS), tmp_path / name)

@@ -89,9 +89,7 @@ def test_the_labels_are_those_of_scipy(seed: int, share: float, rule: MoveRule) 
 
 
 @given(grids_with_directions(), RULES, st.booleans(), st.data())
-def test_reachable_cells_have_a_path(
-    place: Place, rule: MoveRule, has_directions: bool, data: Data
-) -> None:
+def test_reachable_is_exact(place: Place, rule: MoveRule, has_directions: bool, data: Data) -> None:
     grid = place[0] if has_directions else replace(place[0], forbidden=None)
     cells = data.draw(st.lists(st.sampled_from(grid.free_cells()), min_size=1, max_size=3))
     distances = [shortest_distances(grid, cell, rule) for cell in cells]

@@ -4,7 +4,7 @@ import itertools
 import math
 import re
 import threading
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from itertools import pairwise
 from pathlib import Path as FilePath
@@ -48,9 +48,7 @@ ALL = QoSProfile(depth=1000, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 class Robot:
     """A planner node and what its user sees and does."""
 
-    def __init__(
-        self, client: Client, values: np.ndarray, model: FilePath, node: Any = None
-    ) -> None:
+    def __init__(self, client: Client, values: np.ndarray, model: Any, node: Any = None) -> None:
         self.client, self.values, self.model, self.node = client, values, model, node
         self.name = f"{client.node.get_namespace().rstrip('/')}/planner"
         self.plans = client.subscribe(Path, "plan", ALL)
@@ -129,9 +127,7 @@ class Robot:
         check_path(path, grid)
         return path
 
-    def wait_for_reason(
-        self, pattern: str, values: Mapping[str, str] | None = None
-    ) -> DiagnosticStatus:
+    def wait_for_reason(self, pattern: str, values: Any = None) -> DiagnosticStatus:
         """Wait until the diagnostics of this node say something, and have such values."""
         expected = (values or {}).items()
 

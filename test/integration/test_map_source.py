@@ -137,9 +137,7 @@ PLACES, SIZES = st.integers(-8, 8), st.integers(0, 7) | st.just(2**32 - 1)
 
 
 @given(PLACES, PLACES, SIZES, SIZES, st.integers(-1, 1))
-def test_an_update_is_taken_if_it_fits(
-    x: int, y: int, width: int, height: int, surplus: int
-) -> None:
+def test_an_update_is_taken_if_fit(x: int, y: int, width: int, height: int, surplus: int) -> None:
     data = array.array("b", range(max(min(width * height, 20) + surplus, 0)))
     fits = width * height > 0 and 0 <= x <= 5 - width and 0 <= y <= 4 - height
     sent = update(x=x, y=y, width=width, height=height, data=data)
@@ -296,9 +294,7 @@ def test_the_first_map_waits_for_directions_of_a_publisher(source: Source) -> No
 
 
 @pytest.mark.usefixtures("published")
-def test_a_map_servers_map_waits_for_its_directions(
-    source: Source, set_parameters: SetParameters
-) -> None:
+def test_a_servers_map_waits_for_directions(source: Source, set_parameters: SetParameters) -> None:
     source.on_directions(1)
     assert source.on_map(1) == (1, EAST)
     # A map comes before its directions, or without them: its map server was killed.

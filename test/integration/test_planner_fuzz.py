@@ -100,7 +100,7 @@ NAMES = [*PLANNER_PARAMETERS, "use_sim_time"]
 
 @fuzz
 @given(parameters=some_parameters(NAMES), together=st.booleans())
-def test_any_parameters_are_set_or_refused(
+def test_any_parameters_are_answered(
     unharmed: Robot, parameters: list[Any], together: bool
 ) -> None:
     robot = unharmed

@@ -104,11 +104,21 @@ def test_a_path_is_valid_by_its_rest(place: Place, rule: MoveRule, data: Data) -
     assert is_path_valid(path, robot, grid, rule)
 
 
+def test_what_lies_behind_a_robot_on_a_segment_does_not_count() -> None:
+    grid, path, rule = GridMap(np.zeros((9, 31))), [(0, 2), (15, 5), (30, 7)], "robot_safe"
+    for blocked, is_free in (((2, 2), True), ((12, 4), False), ((24, 6), False)):
+        after = grid.with_patch([[True]], *blocked)
+        assert is_path_valid(path, (5, 3), after, rule) == is_free
+        assert (len(rest_of_path(path, (5, 3), after, rule)) > 0) == is_free
+
+
 def test_a_path_of_which_only_an_occupied_end_or_nothing_is_left_is_not_valid() -> None:
     grid, path = GridMap(np.zeros((1, 9))), [(0, 0), (1, 0), (2, 0)]
+    closed = grid.with_patch([[True]], 2, 0)
+    assert not len(rest_of_path(path, (2, 0), closed, "robot_safe"))
     for robot in ((9, 0), (2, 5)):  # off the map, so that its own cell does not count
         assert is_path_valid(path, robot, grid, "robot_safe")
-        assert not is_path_valid(path, robot, grid.with_patch([[True]], 2, 0), "robot_safe")
+        assert not is_path_valid(path, robot, closed, "robot_safe")
     assert not is_path_valid([], (0, 0), grid, "robot_safe")
     assert not len(rest_of_path([], (0, 0), grid, "robot_safe"))
 
@@ -167,9 +177,7 @@ def cost_of(path: Any, grid: GridMap, rule: MoveRule) -> float:
 
 @settings(max_examples=300)
 @given(GRIDS, RULES, st.sampled_from([0.0, 0.03, 0.3, 10.0]), st.data())
-def test_what_is_kept_costs_little_more(
-    place: Place, rule: MoveRule, threshold: float, data: Data
-) -> None:
+def test_what_is_kept_is_cheap(place: Place, rule: MoveRule, threshold: float, data: Data) -> None:
     grid, goal = place
     start = data.draw(st.sampled_from(grid.free_cells()))
     under_way = shortest_path(grid, start, goal, rule)
@@ -429,9 +437,7 @@ LEFT = [(2, 2), (2, 3)], False, [(2, 2), (3, 2), (4, 3)]  # round the next cell
 
 
 @pytest.mark.parametrize(("blocked", "is_kept", "begin"), [KEPT, LEFT])
-def test_a_path_is_kept_on_the_way_out(
-    blocked: list[Cell], is_kept: bool, begin: list[Cell]
-) -> None:
+def test_a_path_is_kept_on_a_way_out(blocked: list[Cell], is_kept: bool, begin: list[Cell]) -> None:
     occupancy = np.zeros((6, 12), dtype=bool)
     for x, y in blocked:
         occupancy[y, x] = True

@@ -58,7 +58,7 @@ def test_the_unmasked_rollout_is_trapped_by_the_first_illegal_move_that_it_prefe
 
 @settings(max_examples=200)
 @given(GRIDS, RULES, st.sampled_from(list(PlanMethod)), st.data())
-def test_a_plan_is_a_cheapest_path(
+def test_a_plan_is_the_cheapest(
     place: Place, rule: MoveRule, method: PlanMethod, data: Data
 ) -> None:
     grid, goal = place
