@@ -204,42 +204,64 @@ def changed_maps(draw: st.DrawFn, grid: GridMap) -> GridMap:
     return GridMap(cut[0], grid.resolution, origin, cut[1], None, cut[2])
 
 
-@settings(max_examples=300)
-@given(GRIDS, RULES, st.floats(0, 6), st.data())
-def test_a_map_made_of_others_is_planned_on_as_a_new_one_bit_for_bit(
-    place: Place, rule: MoveRule, yaw: float, data: Data
+@settings(max_examples=400)
+@given(GRIDS, RULES, st.floats(0, 6), st.integers(1, 4), st.data())
+def test_a_repaired_field_is_a_fresh_one(
+    place: Place, rule: MoveRule, yaw: float, changes: int, data: Data
 ) -> None:
     plain, goal = place
     goals = [goal, *data.draw(st.lists(st.sampled_from(plain.free_cells()), max_size=2))]
-    maps = [(replace(plain, resolution=0.05, origin=(1.25, -3.0, yaw)), goals)]
+    grid = replace(plain, resolution=0.05, origin=(1.25, -3.0, yaw))
     fields.REPAIRED = data.draw(st.sampled_from([1, 3, 300]), label="limit of a repair")
     planner = new_planner()
     if data.draw(st.booleans(), label="whole"):
-        _ = planner.q_field(maps[0][0], goal, rule).value
-    for seed in range(data.draw(st.integers(1, 6))):
-        before, goals = maps[-1] if data.draw(st.booleans()) else data.draw(st.sampled_from(maps))
-        planner.plan_nearest(before, data.draw(st.sampled_from(before.free_cells())), goals, rule)
-        grid = data.draw(changed_maps(before))
-        if data.draw(st.integers(0, 3)) == 0:
-            slowness = 1 + np.random.default_rng(seed).random(before.occupancy.shape)
-            grid = before.with_slowness(slowness.astype(np.float32), 1.0)
-        goals = [grid.world_to_cell(*before.cell_to_world(cell)) for cell in goals]
-        if not grid.is_free(goals[0]):
+        _ = planner.q_field(grid, goal, rule).value
+    for _ in range(changes):
+        start = data.draw(st.sampled_from(grid.free_cells()))
+        planner.plan_nearest(grid, start, goals, rule)
+        changed = data.draw(changed_maps(grid))
+        goals = [changed.world_to_cell(*grid.cell_to_world(cell)) for cell in goals]
+        grid, goal = changed, goals[0]
+        if not grid.is_free(goal):
+            return
+        start = data.draw(st.sampled_from(grid.free_cells()))
+        plans = [one.plan_nearest(grid, start, goals, rule) for one in (planner, new_planner())]
+        assert plans[0] == plans[1]
+        if data.draw(st.booleans(), label="compare"):
+            assert_same(planner.q_field(grid, goal, rule), fresh_field(grid, goal, rule))
+
+
+@settings(max_examples=150)
+@given(GRIDS, RULES, st.data())
+def test_a_map_made_of_others_is_as_new(place: Place, rule: MoveRule, data: Data) -> None:
+    maps, planner = [place[0]], new_planner()
+    for seed in range(data.draw(st.integers(1, 8))):
+        grid = data.draw(st.sampled_from(maps))
+        random = np.random.default_rng(seed)
+        if data.draw(st.booleans()):
+            x, y = data.draw(cells_of(grid))
+            cost = None if grid.cost is None else [[data.draw(st.integers(-1, 99))]]
+            grid = grid.with_patch([[not grid.occupancy[y, x]]], x, y, cost)
+        elif data.draw(st.booleans()):
+            slowness = (1 + random.random(grid.occupancy.shape)).astype(np.float32)
+            grid = grid.with_slowness(slowness, 1.0)
+        else:
+            grid = data.draw(changed_maps(grid))
+        maps.append(grid)
+        if not grid.free_cells():
             continue
-        maps.append((grid, goals))
         copied = {name: copy.copy(getattr(grid, name)) for name in LAYERS}
         fresh = GridMap(resolution=grid.resolution, origin=grid.origin, **copied)
         fresh = replace(fresh, seconds_per_cell=grid.seconds_per_cell)
-        start = data.draw(st.sampled_from(grid.free_cells()))
-        found = planner.plan_nearest(grid, start, goals, rule)
-        assert found == new_planner().plan_nearest(fresh, start, goals, rule)
+        start, goal = (data.draw(st.sampled_from(grid.free_cells()[::7])) for _ in range(2))
+        assert planner.plan(grid, start, goal, rule) == new_planner().plan(fresh, start, goal, rule)
         costs, new = (one.fields._map(grid, rule).costs for one in (planner, new_planner()))
         assert costs is not None
         assert new is not None
-        np.testing.assert_array_equal(costs.patch, new.patch)
-        np.testing.assert_array_equal(costs.value, new.value)
+        for ours, expected in ((costs.patch, new.patch), (costs.value, new.value)):
+            np.testing.assert_array_equal(ours, expected)
         if data.draw(st.booleans(), label="compare"):
-            assert_same(planner.q_field(grid, goals[0], rule), fresh_field(fresh, goals[0], rule))
+            assert_same(planner.q_field(grid, goal, rule), fresh_field(fresh, goal, rule))
 
 
 def test_a_changed_map_uses_what_is_known_of_the_one_before() -> None:
