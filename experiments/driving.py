@@ -34,6 +34,14 @@ Stages = Sequence[tuple[int, int]]
 STAGES: Final = ((0, 20), (20, 50), (50, 100))
 LONG_STAGES: Final = ((0, 200), (200, 600), (600, 1000))
 MOVED_STAGES: Final = ((50, 100), (100, 110), (110, 150))
+NEW_STAGES: Final = ((0, 5), (0, 20))
+# What the robot learned before, and what is slow on the maps that are new to it.
+PRIORS: Final = (
+    ("rooms-clearance", "clearance"),
+    ("rooms-discs", "discs"),
+    ("rooms-clearance", "discs"),
+)
+NEW_MAPS: Final = ("warehouse", "blobs", "halls")
 EXPERIENCE, SHORTEST, HELD_OUT_SET = "experience", "shortest path", "Held-out worlds"
 DRAWN: Final = (EXPERIENCE, SHORTEST, "Gaussian process", "Markov field")
 SMOOTHED: Final = 10  # missions that a point of the curve averages
@@ -100,6 +108,21 @@ def moved(options: Options) -> Sections:
         for name, own in {**_by(results, "kind"), f"all: {title.lower()}": results}.items():
             rows.append([_short(name), *_percent(_above(own, MOVED_STAGES))])
     return {"All slow zones move": table(f"missions | {_names(MOVED_STAGES)}", rows)}
+
+
+def priors(options: Options) -> Sections:
+    """Measure missions on a map never driven, without a prior and with one from another map."""
+    rows = []
+    for source, hidden in PRIORS:
+        kinds = [f"{name}-{hidden}" for name in (*NEW_MAPS, *options.maps_found)]
+        without, taught = (
+            _runs(kinds, (EXPERIENCE,), options, missions=20, prior_from=prior_from)
+            for prior_from in ("", source)
+        )
+        for name, own in (("without", without), ("with", taught)):
+            above = _percent(_above(own, NEW_STAGES))
+            rows.append([f"{source}, then {hidden}", name, *above])
+    return {"A map never driven": table(f"worlds | prior | {_names(NEW_STAGES)}", rows)}
 
 
 def doors(options: Options) -> Sections:
@@ -223,6 +246,7 @@ FIGURES: Final[dict[str, Callable[[Options], Sections]]] = {
     "faulty": faulty,
     "long": long,
     "moved": moved,
+    "priors": priors,
     "doors": doors,
     "zones": zones,
     "speed": speed,
@@ -312,6 +336,7 @@ def _applied(experience: Experience, grid: GridMap, options: Options) -> GridMap
 def measure(options: Options) -> int:
     """Run the experiment, write its tables, figures and ``report.md``, and print it."""
     maps = sorted(map(str, options.maps.rglob("*.yaml"))) if options.maps else []
+    options.maps_found = maps
     if options.maps and not maps:
         raise ValueError(f"{options.maps}: found no ROS map (.yaml); check the path")
     options.out = make_folder(options)
