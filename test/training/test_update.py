@@ -13,7 +13,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 from torch import Tensor, nn
 
-from ddqn_planner.grid import LENGTHS, MOVES, Cell, GridMap, MoveRule
+from ddqn_planner.grid import (
+    LENGTHS,
+    MOVES,
+    Cell,
+    GridMap,
+    MoveRule,
+)
 from ddqn_planner.model import AnyMapQNetwork
 from ddqn_planner.model.move_costs import patches
 from ddqn_planner.training.double_dqn import ReplayBuffer, Transitions
@@ -55,7 +61,6 @@ def about_to_update(scenarios: list[Scenario], parameters: HyperParameters) -> T
 
 
 def next_batch(trainer: Trainer) -> Transitions:
-    """The transitions that the next update will draw."""
     random = copy.deepcopy(trainer._sampling)
     return trainer._replay.sample(trainer.parameters.batch_size, random)
 
@@ -119,7 +124,7 @@ def test_an_update_of_the_papers_network_is_the_equations(small: Scenario, targe
 
 @pytest.mark.parametrize("units", [0, 6])
 @pytest.mark.parametrize("target", ["double_dqn", "dqn", "printed"])
-def test_a_compiled_training_is_that_of_torch_and_continues_it(
+def test_compiled_training_is_that_of_torch(
     small: Scenario, tmp_path: Path, target: str, units: int
 ) -> None:
     walls = small.grid.occupancy
