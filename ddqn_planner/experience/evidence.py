@@ -39,7 +39,7 @@ DRIVE_NOISE = 0.05  # standard deviation of what the log slowness of so many pla
 CHANGED, CHANGED_AROUND = 0.1, 1.5  # share of evidence that is left within so many metres
 CHANGED_FAR = 0.7  # and elsewhere: where one place changed, others did
 
-WAIT_PASSAGES = 0.5  # passages without a wait that are assumed
+WAIT_PASSAGES = 0.2  # passages without a wait that are assumed
 NEAREST_WAITS = 4.0  # the place of a wait is the mean of about the last so many
 MOST_PASSAGES = 20.0  # a wait is the mean of about the last so many
 
