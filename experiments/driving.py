@@ -33,11 +33,15 @@ Stages = Sequence[tuple[int, int]]
 
 STAGES: Final = ((0, 20), (20, 50), (50, 100))
 LONG_STAGES: Final = ((0, 200), (200, 600), (600, 1000))
-MOVED_STAGES: Final = ((50, 100), (100, 110), (110, 150))
+MOVED_STAGES: Final = ((0, 100), (100, 110), (110, 150))
+NEW_STAGES: Final = ((0, 5), (0, 20))
+# What is slow on the map where the robot learned, and on those that are new to it.
+PRIORS: Final = (("clearance", "clearance"), ("discs", "discs"), ("clearance", "discs"))
+NEW_MAPS: Final = ("warehouse", "blobs", "halls")
 EXPERIENCE, SHORTEST, HELD_OUT_SET = "experience", "shortest path", "Held-out worlds"
 DRAWN: Final = (EXPERIENCE, SHORTEST, "Gaussian process", "Markov field")
 SMOOTHED: Final = 10  # missions that a point of the curve averages
-DOOR_WAITS, DOOR_DRIVES, DOOR_SEEDS = (10, 30, 60), 40, 5
+DOOR_WAITS, DOOR_DRIVES = (10, 30, 60), 40
 ZONE_NOISES, ZONE_RATES, ZONE_WIDTHS = (0.02, 0.035, 0.05), (10, 50), (0.2, 0.35, 0.5)
 VISITED: Final = 0.95  # uncertainty of a cell below which the robot was near
 
@@ -59,9 +63,8 @@ def compared(options: Options) -> Sections:
             rows.append([learner, *_percent(_above(own)), beyond])
         header = f"missions | {_names(STAGES)} | worst kind over the shortest path, 1 to 20"
         sections[title] = table(header, rows)
-        sections[f"{title}, by kind"] = table(
-            f"kind | {' | '.join(LEARNERS)}", [*of_kinds.values()]
-        )
+        header = " | ".join(["kind", *LEARNERS])
+        sections[f"{title}, by kind"] = table(header, [*of_kinds.values()])
         if title == HELD_OUT_SET:
             drawn = {name: of_learners[name] for name in DRAWN}
             sections["From mission to mission"] = _curve(options.out / "curve.png", drawn)
@@ -77,29 +80,26 @@ def faulty(options: Options) -> Sections:
 
 
 def long(options: Options) -> Sections:
-    """Measure a thousand missions: the time above the best, and the regret per mission."""
-    rows = []
-    for title, kinds in options.sets.items():
-        results = _runs(kinds, (EXPERIENCE,), options, missions=1000)
-        for name, own in {**_by(results, "kind"), f"all: {title.lower()}": results}.items():
-            regret = [
-                np.mean([(result.seconds - result.best)[slice(*stage)].mean() for result in own])
-                for stage in _reached(own, LONG_STAGES)
-            ]
-            pairs = zip(_above(own, LONG_STAGES), regret, strict=True)
-            rows.append([_short(name), *(f"{above:.1f} %, {more:.2f} s" for above, more in pairs)])
-    return {"A thousand missions": table(f"missions | {_names(LONG_STAGES)}", rows)}
+    """Measure a thousand missions."""
+    return _every_kind("A thousand missions", LONG_STAGES, options, missions=1000)
 
 
 def moved(options: Options) -> Sections:
     """Measure what happens when all slow zones move."""
+    title, hidden = "All slow zones move", ("discs", "mixture")
+    return _every_kind(title, MOVED_STAGES, options, hidden, missions=150, is_moved=True)
+
+
+def priors(options: Options) -> Sections:
+    """Measure missions on a map never driven, without a prior and with one from another map."""
     rows = []
-    for title, kinds in options.sets.items():
-        with_zones = [kind for kind in kinds if kind.endswith(("discs", "mixture"))]
-        results = _runs(with_zones, (EXPERIENCE,), options, missions=150, is_moved=True)
-        for name, own in {**_by(results, "kind"), f"all: {title.lower()}": results}.items():
-            rows.append([_short(name), *_percent(_above(own, MOVED_STAGES))])
-    return {"All slow zones move": table(f"missions | {_names(MOVED_STAGES)}", rows)}
+    for source, hidden in PRIORS[: 1 if options.quick else None]:
+        kinds = [f"{name}-{hidden}" for name in (*NEW_MAPS, *options.maps_found)]
+        for name, prior_from in (("without", ""), ("with", f"rooms-{source}")):
+            own = _runs(kinds, (EXPERIENCE,), options, missions=20, prior_from=prior_from)
+            above = _percent(_above(own, NEW_STAGES))
+            rows.append([f"{source}, then {hidden}", name, *above])
+    return {"A map never driven": table(f"worlds | prior | {_names(NEW_STAGES)}", rows)}
 
 
 def doors(options: Options) -> Sections:
@@ -113,23 +113,16 @@ def doors(options: Options) -> Sections:
         waits[20, 10:13] = seconds
         world = World(GridMap(occupancy, 0.25), np.ones(waits.shape), [], ends, waits)
         through = []
-        for seed in range(DOOR_SEEDS):
-            experience, random, clock = Experience(SPEED), np.random.default_rng(seed), 0.0
-            routes = []
-            for number in range(DOOR_DRIVES):
-                grid = _applied(experience, world.grid, options)
-                routes.append(
-                    planner().plan(grid, ends[number % 2], ends[1 - number % 2], RULE).cells
-                )
-                measured = drive(routes[-1], world, clock, random)
-                experience.record(measured.seconds, measured.positions)
-                clock += measured.duration
-            through.append(sum(any(y == 20 and x < 13 for x, y in route) for route in routes))
+        for seed in range(options.seeds):
+            job = Job("doors", seed, EXPERIENCE, DOOR_DRIVES, options.exploration)
+            result = run_in(job, world, Experience(SPEED))
+            # The shortest path leads through it, and the detour takes less time.
+            through.append(np.count_nonzero(result.seconds > result.shortest - 1e-6))
         rows.append([f"{seconds} s", f"{np.mean(through):.1f}", max(through)])
     return {"Doors": table(f"wait | drives through it, of {DOOR_DRIVES} | most", rows)}
 
 
-def zones(options: Options) -> Sections:
+def zones(_: Options) -> Sections:
     """Measure the slowness that is learned of a zone of 4.0, with poses of several kinds."""
     grid, always = GridMap(np.zeros((20, 80), dtype=np.bool_), 0.25), np.ones((20, 80))
     always[:, 32:48] = 4
@@ -149,7 +142,7 @@ def zones(options: Options) -> Sections:
     return {"A zone of slowness 4.0": table(f"noise of poses | rate | {widths}", rows)}
 
 
-def speed(options: Options) -> Sections:
+def speed(_: Options) -> Sections:
     """Measure the CPU time to learn from 1,000 poses on 1000 x 1000 cells, and to plan again."""
     random = np.random.default_rng(0)
     grid = GridMap(generate_map("office", (1000, 1000), random), 0.05)
@@ -165,7 +158,7 @@ def speed(options: Options) -> Sections:
         began = [time.thread_time()]
         experience.record(measured.seconds[some], measured.positions[some])
         began.append(time.thread_time())
-        applied = _applied(experience, grid, options)
+        applied = experience.apply(grid)
         began.append(time.thread_time())
         planner().plan(applied, cells[: len(cells) // 2 + 1][-1], goal)
         began.append(time.thread_time())
@@ -223,6 +216,7 @@ FIGURES: Final[dict[str, Callable[[Options], Sections]]] = {
     "faulty": faulty,
     "long": long,
     "moved": moved,
+    "priors": priors,
     "doors": doors,
     "zones": zones,
     "speed": speed,
@@ -250,15 +244,32 @@ def _by(results: Sequence[Result], name: str) -> dict[str, list[Result]]:
     return groups
 
 
-def _reached(results: Sequence[Result], stages: Stages) -> Stages:
-    """Return the stages that the missions reached."""
-    return [stage for stage in stages if stage[0] < len(results[0].seconds)]
+def _every_kind(
+    title: str, stages: Stages, options: Options, hidden: tuple[str, ...] = ("",), **more: Any
+) -> Sections:
+    """Return what `Experience` reaches in each set of worlds, and in each kind."""
+    rows, of_kinds = [], []
+    for name, kinds in options.sets.items():
+        chosen = [kind for kind in kinds if kind.endswith(hidden)]
+        results = _runs(chosen, (EXPERIENCE,), options, **more)
+        last = {}
+        for kind, own in _by(results, "kind").items():
+            last[_short(kind)] = _above(own, stages)[-1]
+            of_kinds.append([_short(kind), *_percent(_above(own, stages))])
+        worst = max(last, key=lambda kind: last[kind])
+        rows.append([name, *_percent(_above(results, stages)), f"{last[worst]:.1f} % ({worst})"])
+    header = f"missions | {_names(stages)}"
+    tables = table(f"{header} | worst kind at last", rows), table(header, of_kinds)
+    return {title: tables[0], f"{title}, by kind": tables[1]}
 
 
 def _above(results: Sequence[Result], stages: Stages = STAGES) -> list[float]:
-    """Return the mean time above the best possible in each stage, in percent."""
-    reached = _reached(results, stages)
-    return [100 * float(np.mean([each.ratio(*stage) for each in results]) - 1) for stage in reached]
+    """Return the mean time above the best possible in each stage reached, in percent."""
+    return [
+        100 * float(np.mean([result.ratio(first, end) for result in results]) - 1)
+        for first, end in stages
+        if first < len(results[0].seconds)
+    ]
 
 
 def _percent(values: Sequence[float]) -> list[str]:
@@ -277,24 +288,22 @@ def _short(kind: str) -> str:
 
 def _forecasts(results: Sequence[Result]) -> str:
     """Return how far the expected times of missions were from the measured ones."""
-    rows = []
-    for first, end in ((0, 5), (50, 100)):
-        chosen = np.concatenate([result.forecast[first:end] for result in results])
-        rows.append([f"{first + 1} to {end}", *_errors(chosen)])
     every = np.concatenate([result.forecast for result in results])
-    rows.append(["all whose path is half new", *_errors(every[every[:, 4] >= 0.5])])
+    groups = {"all whose path is half new": every[every[:, 4] >= 0.5]}
+    for first, end in ((0, 5), (50, 100)):
+        some = np.concatenate([result.forecast[first:end] for result in results])
+        groups[f"{first + 1} to {end}"] = some
+    rows: list[list[object]] = []
+    for name, forecast in sorted(groups.items()):
+        measured, expected, low, high, _ = forecast.T
+        if len(measured):
+            error = np.abs(expected / measured - 1).mean()
+            inside = ((low <= measured) & (measured <= high)).mean()
+            width, ratio = np.median((high - low) / expected), measured.sum() / expected.sum()
+            shares = [f"{share:.1%}" for share in (error, inside, width)]
+            rows.append([name, len(measured), *shares, f"{ratio:.2f}"])
     header = "missions | drives | MAPE | within the 90 % interval | width of it, median"
-    return table(f"{header} | measured over expected", [row for row in rows if row[1]])
-
-
-def _errors(forecast: Any) -> list[Any]:
-    measured, expected, low, high, _ = forecast.T
-    if not len(measured):
-        return [0]
-    error = np.abs(expected / measured - 1).mean()
-    inside = ((low <= measured) & (measured <= high)).mean()
-    width, ratio = np.median((high - low) / expected), measured.sum() / expected.sum()
-    return [len(measured), f"{error:.1%}", f"{inside:.1%}", f"{width:.1%}", f"{ratio:.2f}"]
+    return table(f"{header} | measured over expected", rows)
 
 
 def _curve(path: Path, results: Mapping[str, Sequence[Result]]) -> str:
@@ -304,21 +313,15 @@ def _curve(path: Path, results: Mapping[str, Sequence[Result]]) -> str:
     return save_figure(figure, path, "Time over the best possible, from mission to mission")
 
 
-def _applied(experience: Experience, grid: GridMap, options: Options) -> GridMap:
-    given = {} if options.exploration is None else {"exploration": options.exploration}
-    return experience.apply(grid, **given)
-
-
 def measure(options: Options) -> int:
     """Run the experiment, write its tables, figures and ``report.md``, and print it."""
-    maps = sorted(map(str, options.maps.rglob("*.yaml"))) if options.maps else []
-    if options.maps and not maps:
+    options.maps_found = sorted(map(str, options.maps.rglob("*.yaml"))) if options.maps else []
+    if options.maps and not options.maps_found:
         raise ValueError(f"{options.maps}: found no ROS map (.yaml); check the path")
     options.out = make_folder(options)
     options.sets = {HELD_OUT_SET: HELD_OUT, "Worlds for tuning": TUNING}
-    if maps:
-        on_maps = tuple(f"{path}-{hidden}" for path in maps for hidden in ON_FILES)
-        options.sets["Maps from files"] = on_maps
+    if found := [f"{path}-{hidden}" for path in options.maps_found for hidden in ON_FILES]:
+        options.sets["Maps from files"] = found
     if options.quick:
         options.sets = {title: kinds[:2] for title, kinds in options.sets.items()}
     if options.tuning:

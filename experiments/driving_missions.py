@@ -12,10 +12,13 @@ from driving_maps import Bool
 from driving_worlds import RULE, Float64, World, drive, path_seconds
 
 from ddqn_planner import Experience, Planner, inflate, load_map
+from ddqn_planner.experience.prior import Prior, map_features
 from ddqn_planner.grid import Cell
+from ddqn_planner.training.prior import train_prior
 
 MOVED_AT: Final = 100  # the mission before which all that is slow moves, where it does
 FAULT_EVERY: Final = 900.0  # seconds of driving: four faults per hour, one of each kind on average
+TEACHING: Final = 50  # missions on one map, before the robot comes to another
 ROBOT_RADIUS: Final = 0.2  # metres, on maps from files
 
 
@@ -30,6 +33,7 @@ class Job:
     exploration: float | None = None
     is_faulty: bool = False
     is_moved: bool = False
+    prior_from: str | None = None  # the kind that another world teaches; "" for an untaught robot
 
 
 @dataclass(frozen=True)
@@ -59,17 +63,34 @@ def planner() -> Planner:
 
 def world_of(job: Job) -> World:
     """Make the world of a job."""
-    if ".yaml" not in job.kind:
-        return worlds.generated_world(job.kind, job.seed)
-    path, hidden = job.kind.rsplit("-", 1)
-    random = np.random.default_rng([job.seed, 1])
-    return worlds.make_world(inflate(load_map(path), ROBOT_RADIUS), hidden, random)
+    name, hidden = job.kind.rsplit("-", 1)
+    if name.endswith(".yaml"):
+        random = np.random.default_rng([job.seed, 1])
+        world = worlds.make_world(inflate(load_map(name), ROBOT_RADIUS), hidden, random)
+    else:
+        world = worlds.generated_world(job.kind, job.seed)
+    if job.prior_from is not None:  # the same law holds on both maps
+        world.change(hidden, np.random.default_rng(job.seed))
+    return world
 
 
 def run(job: Job) -> Result:
     """Drive the missions of a job."""
     world = world_of(job)
-    return run_in(job, world, LEARNERS[job.learner](world.grid))
+    learner = LEARNERS[job.learner](world.grid)
+    if job.prior_from:
+        source = Job(job.prior_from, job.seed, job.learner, TEACHING, prior_from="")
+        learner.prior = taught(world_of(source), source)
+    return run_in(job, world, learner)
+
+
+def taught(world: World, job: Job) -> Prior:
+    """Return the prior that the missions of a job teach."""
+    experience = Experience(worlds.SPEED)
+    run_in(job, world, experience)
+    weight, log, _, *position, _ = experience.evidence.table[experience.evidence.table[:, 0] > 0].T
+    x, y = np.transpose([world.grid.world_to_cell(*at) for at in np.transpose(position)])
+    return train_prior(map_features(world.grid)[y, x], log / weight, weight)
 
 
 def run_in(job: Job, world: World, learner: Any) -> Result:

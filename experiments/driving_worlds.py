@@ -102,10 +102,10 @@ class World:
 
     def best_seconds(self, start: Cell, goal: Cell, seconds: float) -> float:
         """Return how long one who knows all takes from a station to another: exact."""
-        key = int(seconds // HOUR) % 2
-        if key not in self.best:
-            self.best[key] = self._all_pairs(seconds)
-        return float(self.best[key][self.stations.index(start), self.stations.index(goal)])
+        hour = int(seconds // HOUR) % 2
+        if hour not in self.best:
+            self.best[hour] = self._all_pairs(seconds)
+        return float(self.best[hour][self.stations.index(start), self.stations.index(goal)])
 
     def _all_pairs(self, seconds: float) -> Float64:
         """Return the least seconds between all stations."""

@@ -19,9 +19,9 @@ from ddqn_planner.grid import LENGTHS, MoveRule, Noise, neighbours
 from ddqn_planner.model import PaperQNetwork
 from ddqn_planner.model.shared_background import evaluate
 from ddqn_planner.planning import Planner
+from ddqn_planner.planning.value_iteration import value_iteration
 from ddqn_planner.training.environment import GridVectorEnvironment, Scenario, paper_scenario
 from ddqn_planner.training.hyper_parameters import HyperParameters
-from ddqn_planner.training.networks import value_iteration
 from ddqn_planner.training.run import TrainingRun
 from ddqn_planner.training.trainer import Trainer
 
@@ -212,10 +212,10 @@ def rollouts(planner: Planner, environment: GridVectorEnvironment) -> NDArray[np
 
 def optimal_value(environment: GridVectorEnvironment) -> NDArray[np.float32]:
     """Return V* of the first scenario, exact by value iteration: (C,) float32."""
-    e, p = environment, environment.parameters
-    given = e.legal[:1].astype(np.float32), e.free_reward[:1], e.goal[:1], neighbours(e.shape)
-    (return_AC,) = value_iteration(*given, p.gamma, p.obstacle_reward)
-    return np.array(np.where(e.legal[0], return_AC, np.float32(p.obstacle_reward)).max(axis=0))
+    e, p, near_AC = environment, environment.parameters, neighbours(environment.shape)
+    given = e.legal[:1].astype(np.float32).swapaxes(1, 2), e.free_reward[:1].swapaxes(1, 2)
+    (return_CA,) = value_iteration(*given, e.goal[:1], near_AC, p.gamma, p.obstacle_reward)
+    return np.array(np.where(e.legal[0].T, return_CA, np.float32(p.obstacle_reward)).max(axis=1))
 
 
 def read_csv(path: Path) -> NDArray[Any]:

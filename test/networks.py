@@ -8,7 +8,6 @@ from ddqn_planner.planning import Planner
 
 
 def random_network(name: str, seed: int = 0, scale: float = 0.5, **sizes: int) -> QNetwork:
-    """A network with weights from a normal distribution."""
     random = np.random.default_rng(seed)
     shapes = NETWORKS[name].shapes(sizes)
     tensors = {key: random.normal(0, scale, shape) for key, shape in shapes.items()}

@@ -7,6 +7,7 @@ from hypothesis.extra import numpy as numpy_st
 from ddqn_planner.grid import Cell, GridMap, MoveRule
 
 Place = tuple[GridMap, Cell]
+Data = st.DataObject
 RULES = st.sampled_from(list(MoveRule))
 occupancies = numpy_st.arrays(
     np.bool_,
@@ -17,7 +18,6 @@ occupancies = numpy_st.arrays(
 
 @st.composite
 def grids_with_free_cell(draw: st.DrawFn) -> Place:
-    """A map and one of its free cells."""
     occupancy = draw(occupancies)
     y = draw(st.integers(0, occupancy.shape[0] - 1))
     x = draw(st.integers(0, occupancy.shape[1] - 1))
@@ -27,7 +27,6 @@ def grids_with_free_cell(draw: st.DrawFn) -> Place:
 
 @st.composite
 def grids_in_parts(draw: st.DrawFn) -> Place:
-    """A map that walls and obstacles cut into parts, and one of its free cells."""
     grid, (x, y) = draw(grids_with_free_cell())
     occupancy = grid.occupancy.copy()
     for column in draw(st.lists(st.integers(0, grid.width - 1), max_size=2)):
@@ -40,7 +39,6 @@ def grids_in_parts(draw: st.DrawFn) -> Place:
 
 @st.composite
 def grids_with_costs(draw: st.DrawFn) -> Place:
-    """A map whose free cells have costs or are unknown, and one of its free cells."""
     grid, cell = draw(grids_with_free_cell())
     costs = numpy_st.arrays(np.int8, grid.occupancy.shape, elements=st.integers(-1, 99))
     return GridMap(grid.occupancy, cost=draw(costs)), cell
@@ -48,7 +46,6 @@ def grids_with_costs(draw: st.DrawFn) -> Place:
 
 @st.composite
 def grids_with_directions(draw: st.DrawFn) -> Place:
-    """A map with forbidden directions, with or without costs, and one of its free cells."""
     grid, cell = draw(grids_with_free_cell() | grids_with_costs())
     # Few or many different sets of forbidden actions, and cells without any.
     masks = [*draw(st.lists(st.integers(0, 255), min_size=1, max_size=4)), 0]
@@ -57,8 +54,13 @@ def grids_with_directions(draw: st.DrawFn) -> Place:
     return GridMap(grid.occupancy, cost=grid.cost, forbidden=forbidden), cell
 
 
+def json_values(scalars: st.SearchStrategy[object]) -> st.SearchStrategy[object]:
+    return st.recursive(
+        scalars, lambda it: st.lists(it) | st.dictionaries(st.text(), it), max_leaves=8
+    )
+
+
 def cells_of(grid: GridMap) -> st.SearchStrategy[Cell]:
-    """Any cells of a map."""
     return st.tuples(st.integers(0, grid.width - 1), st.integers(0, grid.height - 1))
 
 

@@ -24,20 +24,19 @@ from ddqn_planner.training.environment import Scenario
 from ddqn_planner.training.hyper_parameters import HyperParameters
 from ddqn_planner.training.trainer import Trainer
 
-PATIENCE = 300
-"""Seconds to wait for what should come at once: a loaded machine is slow, not wrong."""
+PARAMETERS: Any = fields(HyperParameters)
+PATIENCE = 300  # seconds to wait for what should come at once: a loaded machine is slow, not wrong
 
 
 @pytest.fixture
 def small_map(small: Scenario, tmp_path: Path) -> str:
-    """A map file of the small scenario."""
     path = tmp_path / "small.yaml"
     percent = small.grid.occupancy.astype("int8") * 100
     save_map(MapFile(percent, start=small.start, goal=small.goal), path)
     return str(path)
 
 
-def test_plan_prints_the_papers_path_by_its_rule(capsys: pytest.CaptureFixture[str]) -> None:
+def test_plan_prints_the_papers_path_by_its_rule(capsys: Any) -> None:
     assert main(["plan", "dilemma", "--model", "dilemma"]) == 0
     printed = capsys.readouterr().out
     assert "length 22.97 cells, optimum 22.97 under corner_cutting" in printed
@@ -48,8 +47,14 @@ def test_plan_prints_the_papers_path_by_its_rule(capsys: pytest.CaptureFixture[s
     assert "11.49 m" in printed  # as the robot drives, whatever the rule counts
     assert main(["plan", "dilemma", "--start", "1", "19"]) == 1
     assert "the start is occupied" in capsys.readouterr().err
+    request = ["plan", "dilemma", "--model", "dilemma", "--goal", "0", "0"]
+    assert main(request) == 1
+    assert "greedy steps do not find it" in capsys.readouterr().err
+    assert main([*request, "--mode", "astar_fallback"]) == 0
+    assert re.search("cells, optimum.*, astar_fallback, planned in", capsys.readouterr().out)
 
 
+CLEARED = {"start": (5, 0), "start_clearing_radius": 2}
 # Options, and what they are for the library: of the map's values, of the body, of the plan.
 ASKED: dict[str, tuple[dict[str, Any], tuple[float, float], dict[str, Any]]] = {
     "": ({}, (0, 0), {}),
@@ -62,14 +67,11 @@ ASKED: dict[str, tuple[dict[str, Any], tuple[float, float], dict[str, Any]]] = {
     "--move-rule unit": ({}, (0, 0), {"move_rule": "unit"}),
     "--goal 26 29 --tolerance 0.1": ({}, (0, 0), {"goal": (26, 29), "tolerance": 2}),
     "--start 5 0": ({}, (0, 0), {"start": (5, 0)}),
+    "--start 5 0 --start-clearing-radius 0.1": ({}, (0, 0), CLEARED),
 }
 
 
-CLEARED = {"start": (5, 0), "start_clearing_radius": 2}
-ASKED["--start 5 0 --start-clearing-radius 0.1"] = {}, (0, 0), CLEARED
-
-
-def test_plan_gives_as_the_library(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+def test_plan_gives_as_the_library(capsys: Any, tmp_path: Path) -> None:
     random, planner, seen = np.random.default_rng(12), Planner.load("any_map"), set()
     values = random.choice([0, 60, -1, 100], (30, 30), p=[0.8, 0.08, 0.06, 0.06])
     values[0, 0], values[-1, -1], values[0, 5], values[-1, -4] = 0, 0, 100, 100
@@ -90,9 +92,7 @@ def test_plan_gives_as_the_library(capsys: pytest.CaptureFixture[str], tmp_path:
     assert len(seen) == len(ASKED)  # each option counts
 
 
-def test_plan_draws_a_wide_map_for_a_terminal(
-    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_plan_draws_a_wide_map_for_a_terminal(capsys: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sys.stdout, "isatty", lambda: True)
     monkeypatch.setenv("COLUMNS", "100")
     monkeypatch.setenv("LINES", "40")
@@ -103,7 +103,7 @@ def test_plan_draws_a_wide_map_for_a_terminal(
     assert re.search(r"cost \d{4}\.\d\d, greedy", length)
 
 
-def test_plan_gives_every_cell(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+def test_plan_gives_every_cell(capsys: Any, tmp_path: Path) -> None:
     file = tmp_path / "path.csv"
     assert main(["plan", "office", "--cells", "--csv", str(file)]) == 0
     *cells, start, length = capsys.readouterr().out.splitlines()
@@ -117,7 +117,7 @@ def test_plan_gives_every_cell(capsys: pytest.CaptureFixture[str], tmp_path: Pat
     assert file.read_text().splitlines() == [header]  # of no other plan
 
 
-def test_plan_writes_json_and_a_picture(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+def test_plan_writes_json_and_a_picture(capsys: Any, tmp_path: Path) -> None:
     def plan(picture: str, *goal: Any) -> Any:
         command = ["plan", "dilemma", "--json", "--picture", str(tmp_path / picture)]
         assert main([*command, *map(str, goal)]) == 0
@@ -134,17 +134,8 @@ def test_plan_writes_json_and_a_picture(capsys: pytest.CaptureFixture[str], tmp_
     assert (tmp_path / "moved.png").read_bytes() == (tmp_path / "there.png").read_bytes()
 
 
-def test_plan_searches_in_fallback_mode(capsys: pytest.CaptureFixture[str]) -> None:
-    request = ["plan", "dilemma", "--model", "dilemma", "--goal", "0", "0"]
-    assert main(request) == 1
-    assert "greedy steps do not find it" in capsys.readouterr().err
-    assert main([*request, "--mode", "astar_fallback"]) == 0
-    assert "cells, optimum" in (printed := capsys.readouterr().out)
-    assert ", astar_fallback, planned in" in printed
-
-
-def test_a_missing_library_is_named_with_how_to_get_it(
-    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+def test_missing_matplotlib_is_named(
+    capsys: Any, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     monkeypatch.setitem(sys.modules, "matplotlib", None)
     assert main(["plan", "dilemma", "--picture", str(tmp_path / "plan.png")]) == 2
@@ -172,12 +163,9 @@ def without(tmp_path: Path) -> Callable[..., subprocess.CompletedProcess[str]]:
     def run(libraries: Sequence[str], *command: str) -> subprocess.CompletedProcess[str]:
         (tmp_path / "sitecustomize.py").write_text(ABSENT.format(libraries=libraries))
         path = os.pathsep.join([str(tmp_path), os.environ.get("PYTHONPATH", "")])
-        return subprocess.run(
-            [executable(command[0]), *command[1:]],
-            env={**os.environ, "PYTHONPATH": path},
-            capture_output=True,
-            text=True,
-        )
+        environment, program = {**os.environ, "PYTHONPATH": path}, executable(command[0])
+        arguments = [program, *command[1:]]
+        return subprocess.run(arguments, env=environment, capture_output=True, text=True)
 
     return run
 
@@ -198,9 +186,7 @@ def test_a_node_without_ros_says_in_one_line_how_to_get_it(without: Any, node: s
     assert done.returncode == 1
 
 
-def test_bad_input_ends_with_2_and_its_name(
-    capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_bad_input_ends_in_2(capsys: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     save_map(GridMap(np.zeros((2, 2))), "bare.yaml")
     for command, named in (
@@ -220,9 +206,7 @@ def test_bad_input_ends_with_2_and_its_name(
         assert "Traceback" not in error
 
 
-def test_a_trained_model_plans(
-    capsys: pytest.CaptureFixture[str], small_map: str, tmp_path: Path
-) -> None:
+def test_a_trained_model_plans(capsys: Any, small_map: str, tmp_path: Path) -> None:
     train = ["train", small_map, "--out", str(tmp_path / "run"), "--network", "propagation"]
     train += ["--steps", "1000", "--learning-rate", "0.003", "--target-interval", "50"]
     assert main(train) == 0
@@ -234,21 +218,18 @@ def test_a_trained_model_plans(
 
 def test_each_hyper_parameter_can_be_given(small: Scenario, small_map: str, tmp_path: Path) -> None:
     given: dict[str, Any] = {}
-    for entry in fields(HyperParameters):
-        if "choices" in entry.metadata:
-            given[entry.name] = entry.metadata["choices"][1]
-        else:
-            low, default = entry.metadata["range"][0], entry.default
-            other = default + 1 if default == low else (low + default) / 2
-            given[entry.name] = type(default)(other)
+    for each in PARAMETERS:
+        low, default = each.metadata.get("range", [0])[0], each.default
+        other = each.metadata.get("choices", (0, 0))[1]
+        other = other or (default + 1 if default == low else (low + default) / 2)
+        given[each.name] = type(default)(other)
     given["steps"] = 4
     arguments = [f"--{name.replace('_', '-')}={value}" for name, value in given.items()]
     out = str(tmp_path / "run")
     assert main(["train", small_map, "--out", out, "--seed", "5", *arguments]) == 0
     trainer = Trainer.load_checkpoint(tmp_path / "run" / "checkpoint.safetensors", [small])
     assert trainer.parameters == HyperParameters(**given)
-    defaults = {entry.name: entry.default for entry in fields(HyperParameters)}
-    assert not given.items() & defaults.items()
+    assert not given.items() & {entry.name: entry.default for entry in PARAMETERS}.items()
     assert trainer.seed == load_model(tmp_path / "run" / "model.safetensors")[1].seed == 5
 
 
@@ -263,12 +244,11 @@ def test_the_model_for_any_map_is_trained_with_parameters_of_its_own(tmp_path: P
 @pytest.mark.slow
 def test_an_interrupted_training_is_saved_and_resumed(small_map: str, tmp_path: Path) -> None:
     command = [executable("ddqn-planner"), "train", small_map, "--out", str(tmp_path / "run")]
+    command += ["--filters", "4", "--steps", "1000000"]
     curves, steps = tmp_path / "run" / "episodes.csv", 0
     for number in (signal.SIGINT, signal.SIGTERM):
         rows = curves.read_text().count("\n") if curves.exists() else 0
-        child = subprocess.Popen(
-            [*command, "--filters", "4", "--steps", "1000000"], stdout=subprocess.PIPE, text=True
-        )
+        child = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
         deadline = time.monotonic() + PATIENCE
         while not curves.exists() or curves.read_text().count("\n") < rows + 5:
             assert time.monotonic() < deadline

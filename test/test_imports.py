@@ -35,12 +35,15 @@ move_costs(grid.cost_multiplier, "robot_safe")
 """
 
 
+def run(code: str, **environment: str) -> subprocess.CompletedProcess[str]:
+    command, environ = [sys.executable, "-c", code], {**os.environ, **environment}
+    return subprocess.run(command, env=environ, check=True, capture_output=True, text=True)
+
+
 def loaded(code: str) -> set[str]:
     """Return the top-level packages that a new process has loaded after some code."""
     code += "\nimport sys; print(*{name.partition('.')[0] for name in sys.modules})"
-    command = [sys.executable, "-c", code]
-    printed = subprocess.run(command, check=True, capture_output=True, text=True).stdout
-    return set(printed.split())
+    return set(run(code).stdout.split())
 
 
 COMMAND = """
@@ -92,23 +95,16 @@ def test_compiling_is_announced_once_and_a_load_from_the_cache_is_not(tmp_path: 
         for kind in (bool, np.uint8):
             component_labels(np.zeros((2, 2), kind), 1)
     """
-    environment = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path)}
-    command = [sys.executable, "-c", code]
     for words in (f"ddqn_planner compiles its functions, once, and keeps them in {tmp_path}/", ""):
-        done = subprocess.run(command, env=environment, check=True, capture_output=True, text=True)
-        assert done.stderr.startswith(words)
-        assert done.stderr.count("\n") == bool(words)
+        said = run(code, NUMBA_CACHE_DIR=str(tmp_path)).stderr
+        assert said.startswith(words)
+        assert said.count("\n") == bool(words)
 
 
 def test_each_process_finds_the_code_that_another_has_kept() -> None:
     code = "from ddqn_planner.model.shared_background import evaluate as function;"
     code += "print(function.dispatcher().py_func.__qualname__)"
-    command, names = [sys.executable, "-c", code], set()
-    for seed in "12345":
-        environment = {**os.environ, "PYTHONHASHSEED": seed}
-        done = subprocess.run(command, env=environment, check=True, capture_output=True, text=True)
-        names.add(done.stdout)
-    assert len(names) == 1
+    assert len({run(code, PYTHONHASHSEED=seed).stdout for seed in "12345"}) == 1
 
 
 def test_without_a_cache_code_is_compiled_all_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -117,3 +113,51 @@ def test_without_a_cache_code_is_compiled_all_the_same(monkeypatch: pytest.Monke
 
     monkeypatch.setattr("numba.core.dispatcher.Dispatcher.enable_caching", nowhere)
     assert compiled(lambda x: x + 1)(1) == 2
+
+
+CODE = """
+import sys
+import numpy as np
+from ddqn_planner import Experience, GridMap, Planner
+from ddqn_planner.planning.paths import is_path_valid
+from ddqn_planner.warm_up import warm_up
+
+
+def signatures():
+    modules = [module for name, module in sys.modules.items() if name.startswith("ddqn_planner.")]
+    values = [value for module in modules for value in vars(module).values()]
+    compiled = {value.dispatcher() for value in values if hasattr(value, "dispatcher")}
+    return {(each.__qualname__, str(kinds)) for each in compiled for kinds in each.signatures}
+
+
+def ask(planner):
+    occupancy = np.random.default_rng(0).random((40, 50)) < 0.1
+    occupancy[:5] = occupancy[-5:] = False
+    occupancy[20] = True
+    costs, slowness = np.ones((40, 50), np.int8), np.full((40, 50), 1.5, np.float32)
+    experience = Experience(0.5)
+    experience.record(np.arange(20.0), np.column_stack([np.arange(20.0), np.full(20, 1.5)]))
+    forbidden = np.full((40, 50), 1, np.uint8)
+    for layers in ({}, {"cost": costs}, {"slowness": slowness}, {"forbidden": forbidden}):
+        grid = GridMap(occupancy, **layers)
+        for simplified in (False, True):
+            planner.plan(grid, (2, 2), (40, 4), simplified=simplified)
+        planner.plan(grid, (2, 2), (40, 38), tolerance=40)
+        patched = grid.with_patch([[True]], 20, 2)
+        planner.plan(patched, (2, 2), (40, 4))
+        planner.plan(patched, (20, 2), (40, 4), start_clearing_radius=1)
+        planner.plan(experience.apply(grid), (2, 2), (40, 4))
+        is_path_valid([(2, 2), (9, 4), (30, 4)], (2, 2), grid, "robot_safe")
+
+
+planner = Planner.load("any_map")
+for _ in warm_up(planner, learns=True):
+    pass
+before = signatures()
+ask(planner)
+print(sorted(signatures() - before))
+"""
+
+
+def test_no_request_compiles_what_the_warm_up_left_out() -> None:
+    assert run(CODE).stdout == "[]\n"

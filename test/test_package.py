@@ -1,6 +1,7 @@
 import ast
 import os
 import re
+import signal
 import subprocess
 import sys
 import sysconfig
@@ -9,7 +10,9 @@ from xml.etree import ElementTree
 from zipfile import ZipFile
 
 import pytest
+from limits import files_no_longer_than
 
+from ddqn_planner.files import WorkFolder, write_atomically
 from ddqn_planner.resources import find_map
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -33,7 +36,6 @@ def test_imports_run_downwards(room: str) -> None:
 
 @pytest.fixture(scope="module")
 def wheel(source_copy: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """What pip builds of the source."""
     folder = tmp_path_factory.mktemp("wheel")
     build = ["wheel", "--no-deps", "--no-build-isolation", "--wheel-dir", folder, source_copy]
     subprocess.run([*PIP, *build], check=True)
@@ -73,11 +75,9 @@ print(ddqn_planner.__file__, find_map("dilemma"), find_model("dilemma"))
 def test_maps_and_models_come_everywhere(wheel: Path, tmp_path: Path, option: str | None) -> None:
     environment = tmp_path / "environment"
     subprocess.run([sys.executable, "-m", "venv", "--without-pip", environment], check=True)
-    python, folder = environment / "bin" / "python", environment
-    into: list[str | Path] = []
-    if option:
-        folder = tmp_path / "elsewhere"
-        into = [option, folder]
+    python, folder = environment / "bin" / "python", tmp_path / "elsewhere"
+    into = [option, folder] if option else []
+    folder = folder if option else environment
     subprocess.run([*PIP, "--python", python, "install", "--no-deps", *into, wheel], check=True)
     (package,) = folder.glob("**/ddqn_planner/__init__.py")
     # The libraries of this environment; its editable install of the package is not among them.
@@ -114,14 +114,52 @@ def test_a_map_is_shipped_or_of_a_package(tmp_path: Path, monkeypatch: pytest.Mo
     for name in ("", "no_such", "nul\0", "\ud800", "..", "x" * 5000):
         with pytest.raises(FileNotFoundError, match="no such package"):
             find_map(f"package://{name}/map.yaml")
-
-
-def test_a_file_alone_hides_a_shipped_map(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    # A file hides a shipped map, but a folder does not.
     monkeypatch.chdir(tmp_path)
-    shipped = find_map("dilemma")
-    (tmp_path / "dilemma").mkdir()
-    (tmp_path / "dilemma.yaml").mkdir()
-    assert find_map("dilemma") == find_map("dilemma.yaml") == shipped
+    for name in ("dilemma", "dilemma.yaml"):
+        (tmp_path / name).mkdir()
+        assert find_map(name).resolve() == shipped
     (tmp_path / "office.yaml").touch()
     assert find_map("office.yaml") == Path("office.yaml")
-    assert find_map("office").is_relative_to(shipped.parent)
+    assert find_map("office").resolve().parent == shipped.parent
+
+
+def test_a_write_that_fails_leaves_the_old_file_and_nothing_else(tmp_path: Path) -> None:
+    path = tmp_path / "file"
+    write_atomically(path, b"old")
+    (tmp_path / "other").touch()
+    assert path.stat().st_mode == (tmp_path / "other").stat().st_mode
+    with files_no_longer_than(1000), pytest.raises(OSError, match="too large"):
+        write_atomically(path, b"n" * 2000)
+    assert path.read_bytes() == b"old"
+    assert sorted(tmp_path.iterdir()) == [path, tmp_path / "other"]
+
+
+WRITE_FOR_EVER = """
+import sys
+from pathlib import Path
+from ddqn_planner.files import write_atomically
+
+while True:
+    write_atomically(Path(sys.argv[1]), b"whole" * 100_000)
+    print(flush=True)
+"""
+
+
+def test_a_kill_leaves_a_complete_file_and_a_temporary_that_can_be_removed(tmp_path: Path) -> None:
+    path = tmp_path / "file"
+    left = 0
+    while not left:
+        command = [sys.executable, "-c", WRITE_FOR_EVER, str(path)]
+        with subprocess.Popen(command, stdout=subprocess.PIPE) as writer:
+            assert writer.stdout is not None
+            for _ in range(5):
+                writer.stdout.readline()
+            writer.send_signal(signal.SIGKILL)
+        assert path.read_bytes() == b"whole" * 100_000
+        left = len(list(tmp_path.iterdir())) - 1
+    others = [tmp_path / name for name in (".another", ".file.swp", "file.0123456789abcdef")]
+    for other in others:
+        other.touch()
+    WorkFolder(tmp_path, ["file"], "files", "writes").close()
+    assert sorted(tmp_path.iterdir()) == sorted([*others, path])

@@ -14,13 +14,9 @@ def test_a_map_as_text_has_its_first_row_below() -> None:
     assert draw_text(grid, []) == ". # .\n. . #"
     assert draw_text(grid, [(1, 0), (0, 0), (0, 1)]) == "G # .\n* S #"
     assert draw_text(grid, [(2, 1)]) == ". # G\n. . #"
-
-
-def test_one_way_zones_are_arrows() -> None:
-    # All moves to the east, north, west and south, and no zone.
+    # All moves to the east, north, west and south are arrows; no zone is none.
     forbidden = [[0b10000011, 0b00111000, 0], [0b00001110, 0b11100000, 255]]
-    grid = GridMap(np.array([[0, 0, 0], [0, 0, 1]]), forbidden=np.array(forbidden))
-    assert draw_text(grid, []) == "v ^ #\n< > ."
+    assert draw_text(GridMap([[0, 0, 0], [0, 0, 1]], forbidden=forbidden), []) == "v ^ #\n< > ."
 
 
 def test_a_wide_map_fits_into_its_terminal() -> None:

@@ -1,4 +1,4 @@
-"""Double DQN: experience replay, and the loss of the online network θ; θ⁻ is the target network."""
+"""Double DQN: replay memory, and the gradient of the online network θ; θ⁻ is the target network."""
 
 from __future__ import annotations
 
@@ -7,8 +7,7 @@ from typing import NamedTuple
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch import Tensor, nn
-from torch.nn import functional
+from torch import Tensor
 
 # Dimensions: B = a batch, A = 8 actions.
 
@@ -51,24 +50,19 @@ class ReplayBuffer:
         return Transitions._make(stored[indices] for stored in self.transitions)
 
 
-def double_dqn_loss(
-    online: nn.Module,
-    target: nn.Module,
-    kind: str,
-    batch: Transitions,
-    state_B: Tensor,
-    next_state_B: Tensor,
+def double_dqn_gradient(
+    kind: str, batch: Transitions, target_BA: Tensor, online_2BA: Tensor
 ) -> Tensor:
-    """Return the mean squared temporal-difference error of a batch, a scalar."""
-    numbers = batch.action, batch.reward, batch.discount
-    action_B, reward_B, discount_B = map(torch.from_numpy, numbers)
+    """Return the gradient of the mean squared temporal-difference error by Q of states: (B, 8)."""
+    # Given is Q of the next states by θ⁻, and Q of the states and then the next ones by θ.
+    q_BA, online_BA = online_2BA.chunk(2)
+    numbers = batch.action[:, None], batch.reward[:, None], batch.discount[:, None]
+    action_B1, reward_B1, discount_B1 = map(torch.from_numpy, numbers)
     # Double DQN (van Hasselt et al. 2016, equation 4) selects the next action with θ and evaluates
     # it with θ⁻. DQN (Mnih et al. 2015) does both with θ⁻, the paper's target as printed with θ.
-    selection = target if kind == "dqn" else online
-    evaluation = online if kind == "printed" else target
-    with torch.no_grad():
-        greedy_B1 = selection(next_state_B).argmax(dim=1, keepdim=True)
-        next_q_B = evaluation(next_state_B).gather(1, greedy_B1).squeeze(1)
-        y_B = reward_B + discount_B * next_q_B
-    q_B = online(state_B).gather(1, action_B.unsqueeze(1)).squeeze(1)
-    return functional.mse_loss(q_B, y_B)
+    selection_BA = target_BA if kind == "dqn" else online_BA
+    evaluation_BA = online_BA if kind == "printed" else target_BA
+    greedy_B1 = selection_BA.argmax(dim=1, keepdim=True)
+    y_B1 = reward_B1 + discount_B1 * evaluation_BA.gather(1, greedy_B1)
+    error_B1 = q_BA.gather(1, action_B1) - y_B1
+    return torch.zeros_like(q_BA).scatter_(1, action_B1, 2 / len(q_BA) * error_B1)

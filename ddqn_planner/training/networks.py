@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any, ClassVar, Final, cast
 
 import numpy as np
@@ -14,10 +15,11 @@ from ddqn_planner.grid import LENGTHS, MOVES, neighbours
 from ddqn_planner.model import AnyMapQNetwork, PaperQNetwork, PropagationQNetwork, QNetwork
 from ddqn_planner.model.move_costs import patches
 from ddqn_planner.model.networks import observe
+from ddqn_planner.planning.value_iteration import value_iteration
 from ddqn_planner.training.environment import GridVectorEnvironment
 
 # Dimensions: B = a batch, A = 8 actions, F = filters, I = inputs of the first layer, L = windows,
-# S maps, C = H * W cells (cell y * W + x).
+# S maps, C = H * W cells (cell y * W + x), U = different features.
 
 LENGTHS_A: Final = torch.tensor(LENGTHS, dtype=torch.float32)
 
@@ -39,6 +41,17 @@ class TrainableNetwork(nn.Module):
     def states(self, scenario: NDArray[np.int64], cell: NDArray[np.int64]) -> Tensor:
         """Return the states of robots in `cell` (B,) on the maps `scenario` (B,): (B, ...)."""
         raise NotImplementedError
+
+    def target_q(self, scenario: NDArray[np.int64], cell: NDArray[np.int64]) -> Tensor:
+        """As the target network, return Q(s, a) of these robots: (B, 8)."""
+        return cast(Tensor, self(self.states(scenario, cell)))
+
+    def differentiate(self, state_B: Tensor, gradient_of: Callable[[Tensor], Tensor]) -> None:
+        """Set the gradients of a loss, given that by Q of the first states as a function of Q."""
+        q_BA = self(state_B)
+        gradient_BA = gradient_of(q_BA.detach())
+        self.zero_grad()
+        torch.autograd.backward(q_BA[: len(gradient_BA)], gradient_BA)
 
     def to_numpy(self) -> QNetwork:
         """Return the network for planning, with a copy of the weights as they are now."""
@@ -92,6 +105,7 @@ class PropagationModule(TrainableNetwork):
     """The propagation network, see `PropagationQNetwork`."""
 
     numpy_class: ClassVar[type[PropagationQNetwork]] = PropagationQNetwork
+    prices: nn.Linear  # where costs are learned
 
     def __init__(self, filters: int) -> None:
         super().__init__(filters=filters)
@@ -104,41 +118,77 @@ class PropagationModule(TrainableNetwork):
 
     def settle(self, environment: GridVectorEnvironment) -> None:
         """Settle V on every map."""
-        with_rules = zip(environment.scenarios, environment.move_rules, strict=True)
-        seen = [(patches(s.grid.occupancy, s.grid.cost), rule) for s, rule in with_rules]
-        features = np.stack([self.numpy_class.features(*of_map) for of_map in seen])
-        feature_SCI = torch.from_numpy(features)
-        gamma, collision = environment.parameters.gamma, environment.parameters.obstacle_reward
+        e, collision = environment, np.float32(environment.parameters.obstacle_reward)
+        if getattr(self, "environment", None) is not e:
+            self.environment = e
+            with_rules = zip(e.scenarios, e.move_rules, strict=True)
+            seen = [(patches(s.grid.occupancy, s.grid.cost), rule) for s, rule in with_rules]
+            features = np.concatenate([self.numpy_class.features(*of_map) for of_map in seen])
+            self._feature_UI, places = np.unique(features, axis=0, return_inverse=True)
+            self._place_SC = places.reshape(len(seen), -1)
+        feature_UI = torch.from_numpy(self._feature_UI)
         with torch.inference_mode():
-            p_SAC = self.success(feature_SCI).numpy().transpose(0, 2, 1)
-            cost_SAC = self.cost(feature_SCI).numpy().transpose(0, 2, 1)
-        reward_SAC = -cost_SAC if self.numpy_class.uses_costs else environment.free_reward
-        near_AC, goal_S = neighbours(environment.shape), environment.goal
-        return_SAC = value_iteration(p_SAC, reward_SAC, goal_S, near_AC, gamma, collision)
-        return_SCA = (return_SAC + cost_SAC).transpose(0, 2, 1)
+            p_UA, cost_UA = self.success(feature_UI).numpy(), self.cost(feature_UI).numpy()
+        p_SCA, cost_SCA = p_UA[self._place_SC], cost_UA[self._place_SC]
+        reward_SCA = -cost_SCA if self.numpy_class.uses_costs else e.free_reward.swapaxes(1, 2)
+        near_AC, gamma = neighbours(e.shape), e.parameters.gamma
+        return_SCA = value_iteration(p_SCA, reward_SCA, e.goal, near_AC, gamma, float(collision))
+        self._q_SCA = collision + p_SCA * (return_SCA - collision)
+        parts = self._feature_UI[self._place_SC], return_SCA + cost_SCA
         collision_SC1 = np.full_like(return_SCA[..., :1], collision)
-        self._state_SCX = np.concatenate([features, return_SCA, collision_SC1], axis=2)
+        self._state_SCX = np.concatenate([*parts, collision_SC1], axis=2)
 
     def states(self, scenario: NDArray[np.int64], cell: NDArray[np.int64]) -> Tensor:
         """Return the states of robots in `cell` (B,) on the maps `scenario` (B,): (B, I + 9)."""
         return torch.from_numpy(self._state_SCX[scenario, cell])
 
+    def target_q(self, scenario: NDArray[np.int64], cell: NDArray[np.int64]) -> Tensor:
+        """As the target network, return Q(s, a) of these robots: (B, 8)."""
+        return torch.from_numpy(self._q_SCA[scenario, cell])
+
     def forward(self, state_BX: Tensor) -> Tensor:
         """Return Q(s, a) = p (r + γ V(s')) + (1 - p) r_o: (B, 8)."""
-        inputs = self.numpy_class.inputs
-        # Contiguous as in `settle`, since how a layer rounds depends on the layout.
-        feature_BI, collision_B1 = state_BX[:, :inputs].contiguous(), state_BX[:, -1:]
-        gain_BA = state_BX[:, inputs:-1] - self.cost(feature_BI) - collision_B1
+        feature_BI, gain_BA, collision_B1 = self._parts(state_BX)
         return collision_B1 + self.success(feature_BI) * gain_BA
+
+    def _parts(self, state_BX: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Return features, what success gains over a collision, and r_o: (B, ...)."""
+        inputs = self.numpy_class.inputs
+        feature_BI, collision_B1 = state_BX[:, :inputs], state_BX[:, -1:]
+        gain_BA = state_BX[:, inputs:-1] - self.cost(feature_BI) - collision_B1
+        return feature_BI, gain_BA, collision_B1
 
     def success(self, feature_BI: Tensor) -> Tensor:
         """Return p(s, a) in 0..1: (B, 8), for the features of patches (B, I)."""
-        hidden_BF = self.hidden(self.convolution(feature_BI).relu()).relu()
-        return cast(Tensor, self.moves(hidden_BF).sigmoid())
+        return self._activations(feature_BI)[-1]
+
+    def _activations(self, feature_BI: Tensor) -> list[Tensor]:
+        """Return the features, and what each layer makes of what is before it: (B, ...)."""
+        first_BF = self.convolution(feature_BI).relu()
+        second_BF = self.hidden(first_BF).relu()
+        return [feature_BI, first_BF, second_BF, self.moves(second_BF).sigmoid()]
 
     def cost(self, feature_BI: Tensor) -> Tensor:
         """Return the learned cost of each move: (B, 8); 0 where the reward is given."""
         return torch.zeros(1).expand(*feature_BI.shape[:-1], len(MOVES))
+
+    @torch.no_grad()
+    def differentiate(self, state_BX: Tensor, gradient_of: Callable[[Tensor], Tensor]) -> None:
+        """Do the same by hand, in half of autograd's time."""
+        feature_BI, gain_BA, collision_B1 = self._parts(state_BX)
+        *inputs, p_BA = self._activations(feature_BI)
+        gradient_BA = gradient_of(collision_B1 + p_BA * gain_BA)
+        *inputs, p_BA, gain_BA = (t[: len(gradient_BA)] for t in (*inputs, p_BA, gain_BA))
+        by_gain_BA = gradient_BA * p_BA
+        if self.numpy_class.uses_costs:
+            by_price_BA = by_gain_BA * -LENGTHS_A * (self.cost(inputs[0]) > LENGTHS_A)
+            self.prices.weight.grad = by_price_BA.T @ inputs[0]
+            self.prices.bias.grad = by_price_BA.sum(0)
+        by_output = by_gain_BA * (1 - p_BA) * gain_BA
+        for layer in (self.moves, self.hidden, self.convolution):
+            input_BF = inputs.pop()
+            layer.weight.grad, layer.bias.grad = by_output.T @ input_BF, by_output.sum(0)
+            by_output = torch.ops.aten.threshold_backward(by_output @ layer.weight, input_BF, 0)
 
 
 class AnyMapModule(PropagationModule):
@@ -164,35 +214,3 @@ class AnyMapModule(PropagationModule):
 MODULES: Final[dict[str, type[TrainableNetwork]]] = {
     module.numpy_class.name: module for module in (PaperModule, PropagationModule, AnyMapModule)
 }
-
-
-def value_iteration(
-    success_SAC: NDArray[np.float32],
-    reward_SAC: NDArray[np.float32],
-    goal_S: NDArray[np.int64],
-    neighbours_AC: NDArray[np.int64],
-    gamma: float,
-    collision: float,
-) -> NDArray[np.float32]:
-    """Iterate V until it settles; return r + γ V(s') of each successful move: (S, 8, C) float32."""
-    # V(s) = max_a Q(s, a), Q(s, a) = p (r + γ V(s')) + (1 - p) r_o, V(goal) = 0. Off the map V is
-    # r_o, which with γ = 1 must be less than any path's return. Into occupied cells p is 0.
-    maps, _, cells = success_SAC.shape
-    gain_SAC = np.float32(gamma) * success_SAC
-    base_SAC = success_SAC * reward_SAC + (1 - success_SAC) * np.float32(collision)
-    # The goal is worth 0, whatever its moves lead to.
-    gain_SAC[np.arange(maps), :, goal_S] = 0.0
-    base_SAC[np.arange(maps), :, goal_S] = 0.0
-    # From below, as if every move collided: values then rise outwards from the goal.
-    value_SC = np.full((maps, cells + 1), collision, dtype=np.float32)
-    for _ in range(cells + 1000):  # values that are not finite never settle
-        q_SAC = value_SC.take(neighbours_AC, axis=1)
-        q_SAC *= gain_SAC
-        q_SAC += base_SAC
-        new_SC = q_SAC.max(axis=1)
-        change = np.abs(new_SC - value_SC[:, :-1]).max()
-        value_SC[:, :-1] = new_SC
-        if change < 1e-3:
-            break
-    return_SAC: NDArray[np.float32] = reward_SAC + np.float32(gamma) * value_SC[:, neighbours_AC]
-    return return_SAC

@@ -121,7 +121,7 @@ def play(game: Any, learning: Any, robots: Any, random: Any, counters: Any, unti
 
 @compiled
 def update(learning: Any, sampling: Any, counters: Any) -> None:
-    """Make one Double DQN update with a batch from the replay buffer, see `double_dqn_loss`."""
+    """Make one Double DQN update with a batch from the replay buffer, see `double_dqn_gradient`."""
     numbers, kind, (online, target, gradient, mean, square), replay = learning
     slots = np.empty(numbers.batch_size, np.int64)
     for n in range(slots.size):

@@ -7,6 +7,7 @@ import hashlib
 import json
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +22,7 @@ from ddqn_planner.files import write_atomically
 from ddqn_planner.grid import MOVES, MoveRule
 from ddqn_planner.model import ModelMetadata, package_version, save_model
 from ddqn_planner.planning import Planner
-from ddqn_planner.training.double_dqn import ReplayBuffer, Transitions, double_dqn_loss
+from ddqn_planner.training.double_dqn import ReplayBuffer, Transitions, double_dqn_gradient
 from ddqn_planner.training.environment import GridVectorEnvironment, Scenario
 from ddqn_planner.training.episodes import Episode, EpisodeEnd
 from ddqn_planner.training.hyper_parameters import HyperParameters
@@ -136,10 +137,10 @@ class Trainer:
         p = self.parameters
         batch = self._replay.sample(p.batch_size, self._sampling)
         cells = np.concatenate([batch.cell, batch.next_cell])
-        state, next_state = self._target.states(np.tile(batch.scenario, 2), cells).chunk(2)
-        loss = double_dqn_loss(self.network, self._target, p.target, batch, state, next_state)
-        self._optimiser.zero_grad()
-        torch.autograd.backward(loss)
+        states = self._target.states(np.tile(batch.scenario, 2), cells)
+        target_BA = self._target.target_q(batch.scenario, batch.next_cell)
+        gradient_of = partial(double_dqn_gradient, p.target, batch, target_BA)
+        self.network.differentiate(states, gradient_of)
         self._optimiser.step()
         self.updates += 1
         if self.updates % p.target_interval == 0:

@@ -1,5 +1,9 @@
+import copy
+import gc
 import json
 import math
+import os
+import pickle
 from dataclasses import fields
 from fractions import Fraction
 from typing import Any
@@ -9,18 +13,21 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as numpy_st
-from strategies import grids_with_directions, occupancies
+from scipy.spatial.distance import cdist
+from strategies import Data, grids_with_directions, occupancies
 
-from ddqn_planner.grid import UNKNOWN, GridMap, MoveRule
+from ddqn_planner.grid import UNKNOWN, GridMap, MoveRule, clearance, copies, inflate
 from ddqn_planner.grid.arguments import as_cell
+from ddqn_planner.grid.body import Inflation, grid_from_costmap
+from ddqn_planner.grid.copies import boxes_of, cells_in, replaced
 
 ZEROS = np.zeros((2, 3))
 origins = st.tuples(*3 * [st.floats(-100, 100)])
 
 
 @given(occupancies, st.floats(0.01, 10), origins, st.data())
-def test_the_centre_of_a_cell_lies_in_that_cell(
-    occupancy: np.ndarray, resolution: float, origin: Any, data: st.DataObject
+def test_cells_hold_centres(
+    occupancy: np.ndarray, resolution: float, origin: Any, data: Data
 ) -> None:
     grid = GridMap(occupancy, resolution, origin)
     x, y = (data.draw(st.integers(0, side - 1)) for side in (grid.width, grid.height))
@@ -98,7 +105,7 @@ def test_the_map_keeps_read_only_copies_of_arrays_and_lists() -> None:
 
 
 @given(numpy_st.arrays(np.int8, (2, 5)), st.integers(1, 100), st.booleans(), st.booleans())
-def test_each_occupancy_value_has_a_meaning(
+def test_each_value_has_a_meaning(
     values: np.ndarray, threshold: int, allow_unknown: bool, use_map_costs: bool
 ) -> None:
     options = (threshold, allow_unknown, use_map_costs)
@@ -124,12 +131,8 @@ def test_a_wrong_occupancy_value_is_named() -> None:
             GridMap.from_occupancy_values(values, occupied_threshold=threshold)
 
 
-# Maps that are made of others
-
-
 @st.composite
 def full_grids(draw: st.DrawFn) -> GridMap:
-    """A map with any layers."""
     grid, _ = draw(grids_with_directions())
     shape = grid.occupancy.shape
     slowness = draw(st.none() | numpy_st.arrays(np.float32, shape, elements=st.integers(1, 100)))
@@ -148,8 +151,8 @@ def derived(grid: GridMap) -> list[Any]:
 
 
 @given(full_grids(), st.booleans(), st.booleans(), st.data())
-def test_a_patched_map_is_the_map_of_the_patched_arrays(
-    grid: GridMap, with_costs: bool, with_obstacles: bool, data: st.DataObject
+def test_patches_are_exact(
+    grid: GridMap, with_costs: bool, with_obstacles: bool, data: Data
 ) -> None:
     before = derived(grid)
     x, y = (data.draw(st.integers(0, side - 1)) for side in (grid.width, grid.height))
@@ -161,15 +164,12 @@ def test_a_patched_map_is_the_map_of_the_patched_arrays(
         patch, x, y, costs if with_costs else None, obstacles if with_obstacles else None
     )
     box = slice(y, y + shape[0]), slice(x, x + shape[1])
-    layers = {field.name: getattr(grid, field.name) for field in fields(grid)}
-    layers["occupancy"] = grid.occupancy.copy()
+    layers = {field.name: copy.copy(getattr(grid, field.name)) for field in fields(grid)}
     layers["occupancy"][box] = patch
-    if with_costs or grid.cost is not None:
-        layers["cost"] = np.zeros(grid.occupancy.shape) if grid.cost is None else grid.cost.copy()
-        if with_costs:
-            layers["cost"][box] = costs
+    if with_costs:
+        layers["cost"] = np.zeros(grid.occupancy.shape) if grid.cost is None else layers["cost"]
+        layers["cost"][box] = costs
     if grid.obstacles is not None:
-        layers["obstacles"] = grid.obstacles.copy()
         layers["obstacles"][box] = patch & obstacles if with_obstacles else patch
     expected = GridMap(**layers)
     assert derived(patched) == derived(expected)
@@ -207,3 +207,196 @@ def test_a_wrong_patch_is_named_and_the_remedy_too() -> None:
         for cost in (None, ZEROS):
             with pytest.raises(ValueError, match=named):
                 GridMap(ZEROS, cost=cost).with_patch(*arguments)
+
+
+RESOLUTION = 0.05
+
+
+RADII, WEIGHTS = st.sampled_from([0.0, 0.03, 0.05, 0.1, 0.12, 0.2, 1.0]), st.floats(0, 1)
+
+
+@given(occupancies, RADII, WEIGHTS, st.sampled_from([None, UNKNOWN, 0, 40]))
+def test_inflation_is_exact(
+    occupancy: np.ndarray, radius: float, weight: float, cost: int | None
+) -> None:
+    pairs = cdist(np.argwhere(np.ones_like(occupancy)), np.argwhere(occupancy))
+    distance = pairs.min(axis=1, initial=math.inf).reshape(occupancy.shape)
+    assert clearance(occupancy) == pytest.approx(distance)
+    costs = None if cost is None else np.full(occupancy.shape, cost)
+    # A message has the resolution in single precision: two cells of 0.05 m may be 0.099999999 m.
+    grid = inflate(GridMap(occupancy, float(np.float32(RESOLUTION)), cost=costs), radius, weight)
+    closed = occupancy | (np.round(distance * RESOLUTION, 6) < radius)
+    np.testing.assert_array_equal(grid.occupancy, closed)
+    for y, x in np.ndindex(occupancy.shape):
+        assert grid.is_obstacle((x, y)) == occupancy[y, x]
+    # One metre beyond the body, the cost is an eighth of that beside it.
+    added = 99 * weight / (1 + np.maximum(distance * RESOLUTION - radius, 0)) ** 3
+    expected = cost if cost == UNKNOWN else np.maximum(np.rint(added), cost or 0)
+    found = np.zeros(occupancy.shape) if grid.cost is None else grid.cost
+    np.testing.assert_allclose(found, np.where(closed, 0, expected), atol=float(weight > 0))
+
+
+def test_a_value_out_of_range_is_named() -> None:
+    grid = GridMap(np.zeros((2, 2)))
+    for wrong in (-0.1, math.nan, math.inf, 1.1):
+        with pytest.raises(ValueError, match=f"clearance_weight is {wrong}; give 0 to 1"):
+            inflate(grid, 0.0, wrong)
+        if wrong != 1.1:
+            with pytest.raises(ValueError, match=f"robot_radius is {wrong}; give metres"):
+                inflate(grid, wrong)
+
+
+BODIES = st.tuples(st.sampled_from([0.0, 0.4, 1.0, 2.3]), st.sampled_from([0.0, 0.3, 1.0]))
+
+
+@given(st.integers(0, 2**32), st.lists(BODIES, min_size=1, max_size=2), st.booleans(), st.data())
+def test_maps_that_come_one_after_another_are_inflated_as_if_each_were_the_first(
+    seed: int, bodies: list[tuple[float, float]], with_costs: bool, data: Data
+) -> None:
+    random, inflation = np.random.default_rng(seed), Inflation()
+    occupancy = random.random((30, 45)) < random.choice([0.0, 0.02, 0.3])
+    cost = random.integers(-1, 100, occupancy.shape) if with_costs else None
+    grid = GridMap(occupancy, 0.5, cost=cost)
+    for _ in range(4):
+        change = data.draw(st.sampled_from(["none", "cells", "costs", "resolution", "size"]))
+        x, y = random.integers(0, 20, 2).tolist()
+        if change == "cells":
+            grid = grid.with_patch(random.random((2, 2)) < 0.5, x, y)
+        elif change == "costs":
+            grid = grid.with_patch([[0]], x, y, cost=[[7]])
+        elif change == "resolution":
+            grid = GridMap(grid.occupancy, 0.75 - grid.resolution, cost=grid.cost)
+        elif change == "size":
+            grid = GridMap(grid.occupancy[:-1], grid.resolution)
+        body = data.draw(st.sampled_from(bodies))
+        found, expected = inflation(grid, *body), inflate(grid, *body)
+        assert found.same_cells(expected)
+        assert found.resolution == grid.resolution
+        if body != (0.0, 0.0):
+            np.testing.assert_array_equal(found.obstacles, grid.occupancy)  # type: ignore[arg-type]
+
+
+values_of_any_kind = numpy_st.arrays(
+    np.int8, numpy_st.array_shapes(min_dims=2, max_dims=2, min_side=1, max_side=9)
+)
+
+FREE, INSCRIBED, LETHAL, NO_INFORMATION = 0, 253, 254, 255
+
+
+def published(costs: np.ndarray) -> np.ndarray:
+    """Return what Nav2's costmap publisher sends for the costs of a costmap, 0 to 255."""
+    values = 1 + 97 * (costs.astype(int) - 1) // 251
+    for cost, value in ((FREE, 0), (INSCRIBED, 99), (LETHAL, 100), (NO_INFORMATION, -1)):
+        values[costs == cost] = value
+    return values.astype(np.int8)
+
+
+def test_costs_are_those_of_navfn() -> None:
+    costs = np.arange(253).reshape(1, -1)
+    grid = grid_from_costmap(published(costs))
+    assert not grid.occupancy.any()
+    navfn = np.minimum(50 + 0.8 * costs, 253).astype(int) / 50
+    # A value stands for two or three costs, and steps of 0.04 are what a map holds.
+    assert np.abs(grid.cost_multiplier - navfn).max() <= 0.0701
+    assert (np.diff(grid.cost_multiplier) >= 0).all()
+    assert grid.cost_multiplier[0, [0, -1]] == pytest.approx([1, 4.96])
+
+
+@given(values_of_any_kind, st.booleans())
+def test_unknown_inscribed_lethal_cells_are_closed(values: np.ndarray, allow_unknown: bool) -> None:
+    grid = grid_from_costmap(values, allow_unknown=allow_unknown)
+    unknown = values < 0
+    assert grid.occupancy.tolist() == ((values >= 99) | (unknown & (not allow_unknown))).tolist()
+    assert grid.obstacles is not None
+    assert grid.obstacles.tolist() == (grid.occupancy & (values != 99)).tolist()
+    if allow_unknown:
+        assert (grid.cost_multiplier[unknown] == 5).all()
+    free = ~grid.occupancy & ~unknown
+    assert ((grid.cost_multiplier[free] == 1) == (values[free] <= 1)).all()
+
+
+@pytest.fixture(autouse=True)
+def shared(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let small arrays share their memory, too."""
+    monkeypatch.setattr(copies, "SMALL", 0)
+    monkeypatch.setattr(copies, "LARGE", 1)
+    monkeypatch.setattr(copies, "BOX", 1)
+
+
+BOXES = st.tuples(st.integers(0, 9), st.integers(1, 10), st.integers(0, 9), st.integers(1, 10))
+SHAPES = st.sampled_from([(10, 20), (20, 10)])
+FATES = st.sampled_from(["kept", "dropped", "viewed"])
+CHANGES = st.lists(st.tuples(st.integers(0, 100), BOXES, SHAPES, FATES), max_size=80)
+
+
+@given(CHANGES)
+def test_each_copy_keeps_what_it_was_given_whatever_comes_after(changes: list[Any]) -> None:
+    copied = [np.arange(200, dtype=np.int16).reshape(10, 20)]
+    expected, views = [copied[0].copy()], []
+    for origin, (y, height, x, width), shape, fate in changes:
+        before = origin % len(copied)  # any of the copies may be changed again
+        box = slice(y, y + height), slice(x, x + width)
+        changed = expected[before].reshape(shape).copy()
+        changed[box] = len(copied)
+        copied.append(replaced(copied[before].reshape(shape), box, changed[box]))
+        expected.append(changed)
+        if fate == "viewed":
+            views.append((copied[before].T[1:], expected[before].T[1:]))
+        if fate != "kept":  # others may use its memory, unless there is a view
+            del copied[before], expected[before]
+        for ours, right in [*zip(copied, expected, strict=True), *views]:
+            np.testing.assert_array_equal(ours, right)
+
+
+def open_files() -> int:
+    gc.collect()
+    return len(os.listdir("/proc/self/fd"))
+
+
+def test_maps_that_are_patched_or_kept_leave_files_for_others() -> None:
+    before, grid = open_files(), GridMap(np.zeros((20, 20)), cost=np.zeros((20, 20), np.int8))
+    kept = [grid]
+    for step in range(2000):
+        grid = grid.with_patch([[step % 2]], step % 20, step // 20 % 20)
+        if step % 5 == 0:
+            kept.append(grid)
+    assert open_files() - before <= 2 * copies.MOST_ALIVE
+    kept.clear()
+    assert open_files() - before <= 4  # of this map: its occupancy and its costs
+    del grid
+    assert open_files() == before
+
+
+def test_a_patched_map_is_copied_whole_and_shares_nothing_with_what_it_was_made_of() -> None:
+    given, patch = np.zeros((20, 20), dtype=np.bool_), np.ones((2, 2), dtype=np.bool_)
+    grid = GridMap(given)
+    patched = grid.with_patch(patch, 3, 3)
+    given[:], patch[:] = True, False
+    assert (grid._occupied, patched._occupied) == (0, 4)
+    for copied in (pickle.loads(pickle.dumps(patched)), copy.deepcopy(patched), copy.copy(patched)):
+        assert copied.same_cells(patched)
+        assert copied.fingerprint == patched.fingerprint
+        assert copied.with_patch([[0, 0], [0, 0]], 3, 3).same_cells(grid)
+    with pytest.raises(ValueError, match="read-only"):
+        patched.occupancy[0, 0] = True
+
+
+@given(st.lists(st.tuples(st.integers(0, 69), st.integers(0, 69)), max_size=30))
+def test_a_few_boxes_hold_all_changes(cells: list[tuple[int, int]]) -> None:
+    is_set = np.zeros((70, 70), dtype=np.bool_)
+    for cell in cells:
+        is_set[cell] = True
+    boxes, covered = boxes_of(is_set), np.zeros_like(is_set)
+    for box in boxes:
+        assert is_set[box].any()
+        covered[box] = True
+    assert len(boxes) <= copies.FEW
+    assert not (is_set & ~covered).any()
+
+
+def test_changes_that_lie_apart_have_small_boxes() -> None:
+    is_set = np.zeros((200, 300), dtype=np.bool_)
+    is_set[5:8, 5:9] = is_set[[100, 101], [7, 8]] = is_set[101, 250] = True
+    assert sum(cells_in(box) for box in boxes_of(is_set)) == 12 + 4 + 2
+    is_set[::50, ::50] = True
+    assert boxes_of(is_set) == [(slice(0, 151), slice(0, 251))]

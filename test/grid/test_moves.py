@@ -7,7 +7,7 @@ import pytest
 import scipy.ndimage
 from hypothesis import given
 from hypothesis import strategies as st
-from strategies import RULES, Place, grids_with_costs, grids_with_directions
+from strategies import RULES, Data, Place, grids_with_costs, grids_with_directions
 
 from ddqn_planner import GridMap, MoveRule
 from ddqn_planner.grid import LENGTHS, MAX_COST_MULTIPLIER, MOVES, neighbours, shortest_path
@@ -89,9 +89,7 @@ def test_the_labels_are_those_of_scipy(seed: int, share: float, rule: MoveRule) 
 
 
 @given(grids_with_directions(), RULES, st.booleans(), st.data())
-def test_reachable_cells_are_those_that_a_path_joins_to_some_cells(
-    place: Place, rule: MoveRule, has_directions: bool, data: st.DataObject
-) -> None:
+def test_reachable_is_exact(place: Place, rule: MoveRule, has_directions: bool, data: Data) -> None:
     grid = place[0] if has_directions else replace(place[0], forbidden=None)
     cells = data.draw(st.lists(st.sampled_from(grid.free_cells()), min_size=1, max_size=3))
     distances = [shortest_distances(grid, cell, rule) for cell in cells]
@@ -105,7 +103,7 @@ def test_reachable_cells_are_those_that_a_path_joins_to_some_cells(
 
 
 @given(grids_with_directions(), RULES, st.data())
-def test_distances_and_paths_are_exact(place: Place, rule: MoveRule, data: st.DataObject) -> None:
+def test_distances_and_paths_are_exact(place: Place, rule: MoveRule, data: Data) -> None:
     grid, goal = place
     distance = shortest_distances(grid, goal, rule)
     legal, cost = grid.legal_moves(rule), move_costs(grid.cost_multiplier, rule)

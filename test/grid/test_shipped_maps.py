@@ -58,6 +58,13 @@ def test_the_start_lies_in_a_dead_end_that_opens_away_from_the_end(paper: Scenar
     assert {(int(x), int(y)) for y, x in np.argwhere(inside)} == START_DEAD_END
     for rule in MoveRule:
         assert greedy_neighbour_walk(paper, paper.start, rule) <= START_DEAD_END
+    # The shortest path has the paper's length, and each cell has one.
+    lengths = {MoveRule.CORNER_CUTTING: (6, 12), MoveRule.ROBOT_SAFE: (14, 8)}
+    for rule, (straight, diagonal) in lengths.items():
+        distances = shortest_distances(paper.grid, paper.goal, rule)
+        np.testing.assert_array_equal(np.isfinite(distances), ~paper.grid.occupancy)
+        length = straight + diagonal * math.sqrt(2)
+        assert distances[paper.start[1], paper.start[0]] == pytest.approx(length, abs=1e-9)
 
 
 @pytest.mark.parametrize("dead_end", DEAD_ENDS_ON_THE_WAY)
@@ -68,15 +75,6 @@ def test_two_dead_ends_catch_a_robot_on_its_way(paper: Scenario, dead_end: set[C
     outside = set(paper.grid.free_cells()) - dead_end
     walks = [greedy_neighbour_walk(paper, cell, MoveRule.CORNER_CUTTING) for cell in outside]
     assert sum(paper.goal not in walk and bool(walk & dead_end) for walk in walks) > 20
-
-
-def test_the_shortest_path_has_the_papers_length_and_each_cell_has_one(paper: Scenario) -> None:
-    lengths = {MoveRule.CORNER_CUTTING: (6, 12), MoveRule.ROBOT_SAFE: (14, 8)}
-    for rule, (straight, diagonal) in lengths.items():
-        distances = shortest_distances(paper.grid, paper.goal, rule)
-        np.testing.assert_array_equal(np.isfinite(distances), ~paper.grid.occupancy)
-        length = straight + diagonal * math.sqrt(2)
-        assert distances[paper.start[1], paper.start[0]] == pytest.approx(length, abs=1e-9)
 
 
 def test_the_shipped_office_is_a_generated_one_of_six_times_the_cells() -> None:

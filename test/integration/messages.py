@@ -42,7 +42,6 @@ PARAMETER_VALUES = st.builds(
 
 
 def some_parameters(names: list[str]) -> st.SearchStrategy[list[Parameter]]:
-    """Some parameters, of the given names and of others."""
     name = st.sampled_from(names) | TEXTS
     return st.lists(st.builds(Parameter, name=name, value=PARAMETER_VALUES), max_size=4)
 

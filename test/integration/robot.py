@@ -4,7 +4,8 @@ import itertools
 import math
 import re
 import threading
-from collections.abc import Mapping
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from itertools import pairwise
 from pathlib import Path as FilePath
 from typing import Any
@@ -35,11 +36,10 @@ from ddqn_planner.nodes.report import seconds
 from ddqn_planner.nodes.runtime import LATCHED
 
 START, GOAL = (0, 0), (5, 5)
-RESOLUTION, ORIGIN = 0.5, (-1.0, 2.0, 0.5)
-GOAL_YAW = 1.2
+OK, WARN, ERROR = DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.ERROR
+RESOLUTION, ORIGIN, GOAL_YAW = 0.5, (-1.0, 2.0, 0.5), 1.2
 
-NUMBERS = itertools.count(1)
-"""Stamps of maps and yaws of goals, to tell one from another."""
+NUMBERS = itertools.count(1)  # stamps of maps and yaws of goals, to tell one from another
 
 ALL = QoSProfile(depth=1000, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 """The last message of a latched topic, and every one after it."""
@@ -48,9 +48,7 @@ ALL = QoSProfile(depth=1000, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 class Robot:
     """A planner node and what its user sees and does."""
 
-    def __init__(
-        self, client: Client, values: np.ndarray, model: FilePath, node: Any = None
-    ) -> None:
+    def __init__(self, client: Client, values: np.ndarray, model: Any, node: Any = None) -> None:
         self.client, self.values, self.model, self.node = client, values, model, node
         self.name = f"{client.node.get_namespace().rstrip('/')}/planner"
         self.plans = client.subscribe(Path, "plan", ALL)
@@ -96,7 +94,6 @@ class Robot:
         self.client.publish("map", message or self.map_message(), LATCHED)
 
     def pose(self, cell: Cell, yaw: float = 0.0, grid: GridMap | None = None) -> PoseStamped:
-        """Return a pose in a cell, a little beside its centre."""
         return pose(grid or self.grid, cell, yaw, offset=0.05)
 
     def send_start(self, stamped: PoseStamped) -> None:
@@ -121,29 +118,23 @@ class Robot:
         ends = [grid.cell_to_world(start), grid.cell_to_world(goal)]
 
         def is_asked_for(path: Path) -> bool:
-            if not path.poses:
-                return False
-            last = yaw_of(path.poses[-1].pose.orientation)
-            found = [points_of(path)[0], points_of(path)[-1]]
-            return np.allclose(found, ends, atol=1e-6) and (yaw is None or abs(last - yaw) < 1e-6)
+            found = points_of(path)[:1] + points_of(path)[-1:]
+            last = [yaw_of(stamped.pose.orientation) for stamped in path.poses[-1:]]
+            expected = last if yaw is None else [yaw]
+            return bool(found) and np.allclose(found, ends) and np.allclose(last, expected)
 
         path: Path = self.plans.wait(is_asked_for)
         check_path(path, grid)
         return path
 
-    def wait_for_reason(
-        self, pattern: str, values: Mapping[str, str] | None = None
-    ) -> DiagnosticStatus:
+    def wait_for_reason(self, pattern: str, values: Any = None) -> DiagnosticStatus:
         """Wait until the diagnostics of this node say something, and have such values."""
         expected = (values or {}).items()
 
         def says(message: DiagnosticArray) -> bool:
-            status = message.status[0]
-            return (
-                status.name == f"{self.name}: plan"
-                and bool(re.search(pattern, status.message))
-                and expected <= values_of(status).items()
-            )
+            (status,), name = message.status, f"{self.name}: plan"
+            is_said = status.name == name and bool(re.search(pattern, status.message))
+            return is_said and expected <= values_of(status).items()
 
         return self.diagnostics.wait(says).status[0]
 
@@ -213,6 +204,15 @@ def ask_for_plan(robot: Robot) -> tuple[Any, threading.Event]:
     return plan, answered
 
 
+@contextmanager
+def repeating(client: Client, publish: Callable[[], None]) -> Iterator[None]:
+    timer = client.node.create_timer(0.02, publish)
+    try:
+        yield
+    finally:
+        client.node.destroy_timer(timer)
+
+
 def points_of(path: Path) -> list[tuple[float, float]]:
     return [(pose.pose.position.x, pose.pose.position.y) for pose in path.poses]
 
@@ -222,10 +222,6 @@ def odometry(robot: Robot, cell: Cell, frame: str = "map") -> Odometry:
     message.child_frame_id = "base_link"
     message.pose.pose = robot.pose(cell).pose
     return message
-
-
-def length_of(path: Path) -> float:
-    return sum(math.dist(*step) for step in pairwise(points_of(path)))
 
 
 def yaw_of(rotation: Quaternion) -> float:

@@ -48,7 +48,6 @@ def way(robot: Robot) -> list[Cell]:
 
 
 def plan_on(robot: Robot, message: OccupancyGrid, reason: str = "^a path of ") -> None:
-    """Send a map, and wait until the planner has planned on it."""
     robot.send_map(message)
     stamp = seconds(message.header.stamp)
     robot.wait_for_reason(reason, {"planned on the map of (s)": stamp})
@@ -60,8 +59,7 @@ def with_values(robot: Robot, box: tuple[Any, Any], value: int) -> OccupancyGrid
     return robot.stamped_map(values)
 
 
-UPPER, LOWER = (slice(8, 11), 15), (slice(0, 3), 15)
-"""Walls across the ways."""
+UPPER, LOWER = (slice(8, 11), 15), (slice(0, 3), 15)  # walls across the ways
 
 
 @pytest.mark.parametrize("period", [SOON, 0.0])
@@ -166,8 +164,6 @@ def test_the_path_of_a_moving_robot_is_published_only_where_it_leaves_it(robot: 
     robot.client.publish("odom", odometry(robot, (x, y - 8)))
     robot.wait_for_path((x, y - 8), GOAL)
 
-
-# The nearest of several goals, as docks are
 
 LEFT, RIGHT, DOCKED, OUTSIDE, WALL = (1, 5), (29, 5), (14, 5), (99, 5), (15, 10)
 YAWS = {LEFT: 1.0, RIGHT: -2.0, OUTSIDE: 0.1, WALL: 0.2}

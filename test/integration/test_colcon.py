@@ -34,22 +34,16 @@ pytestmark = [
 
 def build(workspace: Path, *options: str) -> Path:
     command = [str(COLCON), "build", "--base-paths", "src", "--event-handlers", "console_direct+"]
-    built = subprocess.run(
-        [*command, *options],
-        cwd=workspace,
-        # A home of its own: the user's defaults may ask for another layout.
-        env={**os.environ, "COLCON_HOME": str(workspace / "home")},
-        stdout=subprocess.PIPE,
-        stderr=subprocess.STDOUT,
-        text=True,
-    )
-    assert built.returncode == 0, built.stdout
+    # A home of its own: the user's defaults may ask for another layout.
+    environment = {**os.environ, "COLCON_HOME": str(workspace / "home")}
+    command += options
+    built = subprocess.run(command, cwd=workspace, env=environment, capture_output=True, text=True)
+    assert built.returncode == 0, built.stdout + built.stderr
     return workspace / "install"
 
 
 @pytest.fixture(scope="module")
 def install(source_copy: Path) -> Path:
-    """The install folder of a workspace with a copy of the source."""
     return build(source_copy.parents[1])
 
 
@@ -104,7 +98,7 @@ def test_nodes_of_the_workspace_plan_with_its_model_on_its_map(
     install: Path,
     make_client: Callable[[], Any],
     paper: Scenario,
-    capfd: pytest.CaptureFixture[str],
+    capfd: Any,
 ) -> None:
     (package,) = (install / "ddqn_planner" / "lib").glob("python*/site-packages/ddqn_planner")
     take_compiled(ROOT / "ddqn_planner", package)

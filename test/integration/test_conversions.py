@@ -1,19 +1,29 @@
 import array
 import math
+import re
+import sys
+from collections.abc import Callable
+from functools import partial
 from itertools import pairwise
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
-from builtin_interfaces.msg import Time
-from geometry_msgs.msg import Pose, PoseStamped, Quaternion
+from builtin_interfaces.msg import Time as Stamp
+from client import MapFixture, plan_request, pose
+from geometry_msgs.msg import PoseStamped, Quaternion, TransformStamped
 from hypothesis import given
 from hypothesis import strategies as st
 from integration.robot import changed, points_of, yaw_of
 from nav_msgs.msg import OccupancyGrid, Path
+from rclpy.clock_type import ClockType
 from rclpy.serialization import deserialize_message, serialize_message
+from rclpy.time import Time
+from scipy.spatial.transform import Rotation
 from std_msgs.msg import Header
 
-from ddqn_planner.grid import GridMap
+from ddqn_planner.grid import Cell, GridMap, MapFile
 from ddqn_planner.nodes.conversions import (
     along,
     cell_from_pose,
@@ -26,6 +36,8 @@ from ddqn_planner.nodes.conversions import (
     turns,
     value_message,
 )
+from ddqn_planner.nodes.poses import Frames, StartSource, transformed
+from ddqn_planner.nodes.report import Refusals, RequestError
 from ddqn_planner.planning import QField
 
 HEADER = Header(frame_id="map")
@@ -52,27 +64,21 @@ def test_a_map_survives_the_way_to_a_message_and_back(yaw: float, sign: int) -> 
     assert grid.occupancy.tolist() == [[False, True, False], [True, True, False]]
 
 
-@pytest.mark.parametrize(
-    ("field", "value", "reason"),
-    [
+def test_a_malformed_map_is_refused() -> None:
+    rolled, at = Quaternion(x=math.sin(0.1), w=math.cos(0.1)), "info.origin.orientation"
+    for field, value, reason in (
         ("header.frame_id", "", "frame is ''"),
-        ("info.resolution", 0.0, "resolution is 0.0"),
-        ("info.resolution", math.nan, "resolution is nan"),
-        ("info.resolution", math.inf, "resolution is inf"),
-        ("info.width", 0, "0 x 2 cells"),
-        ("info.height", 0, "3 x 0 cells"),
+        *(("info.resolution", n, f"resolution is {n}") for n in (0.0, math.nan, math.inf)),
+        *(("info.width", 0, "0 x 2 cells"), ("info.height", 0, "3 x 0 cells")),
         ("info.width", 2**31, "give at most"),
         ("info.width", 4, "data has 6 values; its 4 x 2 cells need 8"),
         ("info.origin.position.x", math.nan, "position is .x = nan"),
         ("info.origin.position.z", math.inf, "z = inf"),
-        ("info.origin.orientation", Quaternion(w=1.001), "quaternion of norm 1.001"),
-        ("info.origin.orientation", Quaternion(x=math.nan), "quaternion of norm nan"),
-        ("info.origin.orientation", Quaternion(x=math.sin(0.1), w=math.cos(0.1)), "rolled or pitc"),
-    ],
-)
-def test_a_malformed_map_is_refused(field: str, value: object, reason: str) -> None:
-    with pytest.raises(ValueError, match=reason):
-        grid_from_message(changed(map_message(), field, value))
+        *((at, Quaternion(w=1.001), "norm 1.001"), (at, Quaternion(x=math.nan), "norm nan")),
+        (at, rolled, "rolled or pitched"),
+    ):
+        with pytest.raises(ValueError, match=reason):
+            grid_from_message(changed(map_message(), field, value))
 
 
 def test_a_pose_has_a_cell_also_off_the_map_or_is_refused_by_the_name_of_its_value() -> None:
@@ -88,17 +94,6 @@ def test_a_pose_has_a_cell_also_off_the_map_or_is_refused_by_the_name_of_its_val
         bad = changed(PoseStamped(header=HEADER), f"pose.{field}", value)
         with pytest.raises(ValueError, match=reason):
             cell_from_pose("the goal", bad, grid, "map")
-
-
-def test_a_pose_needs_the_frame_of_the_map_if_there_is_one() -> None:
-    stamped = PoseStamped(pose=Pose(orientation=Quaternion(w=1.00009)))
-    with pytest.raises(ValueError, match="frame is ''"):
-        check_pose("the start", stamped)
-    for stamped.header.frame_id in ("", "odom"):
-        its = f"the start's frame is '{stamped.header.frame_id}', the map's is 'map'"
-        with pytest.raises(ValueError, match=its):
-            check_pose("the start", stamped, "map")
-    check_pose("the start", stamped)
 
 
 SHOWN = [([0.0, 1.004, 1.996, 3.0], [0, 33, 67, 100]), ([0.0, 0.0], [100, 100])]
@@ -134,7 +129,7 @@ def test_a_path_looks_ahead_and_ends_as_the_goal_and_is_the_same_serialized(
     cells: list[tuple[int, int]], frame: str, yaw: float, is_dense: bool
 ) -> None:
     grid = GridMap(np.zeros((2, 2)), 0.05, (1.5, -20.25, yaw))
-    header = Header(frame_id=frame, stamp=Time(sec=5, nanosec=77))
+    header = Header(frame_id=frame, stamp=Stamp(sec=5, nanosec=77))
     path = path_message(*along(cells, grid, is_dense), header, quaternion(0.7))
     assert all(each.header is header for each in [path, *path.poses])
     points = points_of(path)
@@ -147,9 +142,9 @@ def test_a_path_looks_ahead_and_ends_as_the_goal_and_is_the_same_serialized(
     else:
         expected = [grid.cell_to_world(cell) for cell in cells]
         np.testing.assert_allclose(points, expected, atol=1e-9)
-    for pose, here, there in zip(path.poses, points, points[1:], strict=False):
+    for stamped, here, there in zip(path.poses, points, points[1:], strict=False):
         ahead = math.atan2(there[1] - here[1], there[0] - here[0])
-        looks = yaw_of(pose.pose.orientation)
+        looks = yaw_of(stamped.pose.orientation)
         assert math.cos(looks - ahead) == pytest.approx(1.0) or here == there
     assert all(pose.pose.orientation == quaternion(0.7) for pose in path.poses[-1:])
     content = path_bytes(*along(cells, grid, is_dense), header, quaternion(0.7))
@@ -162,3 +157,197 @@ def test_a_path_looks_ahead_and_ends_as_the_goal_and_is_the_same_serialized(
         )
         np.testing.assert_allclose(values, expected, atol=1e-12)
     assert len(serialize_message(sent)) == len(serialize_message(path))
+
+
+def test_the_check_of_an_answer_finds_each_error() -> None:
+    values = np.array([[0, 100, 0], [0, 0, 100], [0, 100, 0]], dtype=np.int8)
+    fixture = MapFixture(MapFile(values, 0.1, (1.0, 2.0, 0.3)))
+    cases: list[tuple[Cell, Cell, list[Cell], str]] = [
+        ((0, 0), (1, 1), [(0, 0), (0, 1), (1, 1)], ""),
+        ((0, 0), (0, 0), [(0, 0)], ""),
+        *((start, goal, [], "") for start in ((0, 0), (1, 0)) for goal in ((2, 0), (9, 9))),
+        ((0, 0), (1, 1), [], "where there is one"),
+        ((0, 0), (1, 1), [(0, 0), (0, 1)], "asked was"),
+        ((0, 0), (1, 1), [(0, 0), (1, 1)], "illegal segment"),
+        ((0, 0), (2, 0), [(0, 0), (2, 0)], "illegal segment"),
+        ((0, 0), (0, 1), [(0, 0), (-1, 0), (0, 1)], "illegal segment"),
+    ]
+    for start, goal, path, error in cases:
+        plan = Path(poses=[pose(fixture.grid, cell) for cell in path])
+        found = fixture.error(plan_request(fixture.grid, start, goal), plan)
+        assert (error in found) if error else not found
+
+
+POINTS = st.tuples(*3 * [st.floats(-100, 100)])
+NUMBERS = st.lists(st.floats(-1, 1), min_size=4, max_size=4)
+UNITS = NUMBERS.filter(lambda four: math.hypot(*four) > 0.1).map(
+    lambda four: [number / math.hypot(*four) for number in four]
+)
+QUATERNIONS = UNITS.map(lambda four: Quaternion(**dict(zip("xyzw", four, strict=True))))
+
+
+def stamped_pose(point: tuple[float, ...], rotation: Quaternion) -> PoseStamped:
+    stamped = PoseStamped(header=Header(frame_id="odom"))
+    position = stamped.pose.position
+    position.x, position.y, position.z = point
+    stamped.pose.orientation = rotation
+    return stamped
+
+
+def transform(shift: tuple[float, ...], rotation: Quaternion) -> TransformStamped:
+    message = TransformStamped(header=Header(frame_id="map"), child_frame_id="odom")
+    translation = message.transform.translation
+    translation.x, translation.y, translation.z = shift
+    message.transform.rotation = rotation
+    return message
+
+
+@given(POINTS, QUATERNIONS, POINTS, QUATERNIONS)
+def test_a_pose_is_turned_and_moved_in_space_and_projected_to_the_plane(
+    point: tuple[float, ...], facing: Quaternion, shift: tuple[float, ...], turn: Quaternion
+) -> None:
+    found = transformed(stamped_pose(point, facing), transform(shift, turn))
+    position, rotation = found.pose.position, found.pose.orientation
+    in_map = Rotation.from_quat([turn.x, turn.y, turn.z, turn.w])
+    expected = (in_map.apply(point) + shift)[:2]
+    assert (position.x, position.y) == pytest.approx(tuple(expected), abs=1e-9)
+    assert (position.z, rotation.x, rotation.y) == (0, 0, 0)
+    assert found.header.frame_id == "map"
+    looks = in_map * Rotation.from_quat([facing.x, facing.y, facing.z, facing.w])
+    ahead = complex(*looks.apply((1, 0, 0))[:2])
+    if abs(ahead) > 1e-3:  # else it looks up or down
+        assert complex(rotation.w, rotation.z) ** 2 == pytest.approx(ahead / abs(ahead), abs=1e-6)
+
+
+class Buffer:
+    """What `Frames` asks of tf2_ros.Buffer: transforms from odom to map at some seconds."""
+
+    def __init__(self, *seconds: int) -> None:
+        self.seconds = seconds
+
+    def clear(self) -> None:
+        self.seconds = ()
+
+    def lookup_transform(self, target: str, source: str, stamp: Time) -> TransformStamped:
+        if (target, source) != ("map", "odom") or not self.seconds:
+            raise KeyError(f"{source} does not exist")
+        nanoseconds = stamp.nanoseconds or max(self.seconds) * 10**9
+        if not min(self.seconds) * 10**9 <= nanoseconds <= max(self.seconds) * 10**9:
+            raise KeyError("extrapolation")
+        found = transform((1.0, 0.0, 0.0), Quaternion())
+        found.header.stamp = Time(nanoseconds=nanoseconds).to_msg()
+        return found
+
+
+NOW = 111  # seconds of the node's clock
+
+
+class Node:
+    """What `Frames` and `StartSource` ask of a node."""
+
+    def __init__(self) -> None:
+        self.after_jump_back: set[object] = set()
+        self.value = {"start_source": "tf", "robot_frame": "odom"}.__getitem__
+
+    def create_timer(self, *_: object, clock: object) -> None:
+        """Do not call back."""
+
+    def destroy_timer(self, _: object) -> None:
+        """Have nothing to destroy."""
+
+    def get_clock(self) -> SimpleNamespace:
+        return SimpleNamespace(now=lambda: Time(seconds=NOW, clock_type=ClockType.ROS_TIME))
+
+
+@pytest.fixture
+def listening(monkeypatch: pytest.MonkeyPatch) -> Callable[..., Frames]:
+    """Return what makes frames that know the transforms of some seconds."""
+
+    def make(*seconds: int, tolerance: float = 20.0) -> Frames:
+        listener = SimpleNamespace(unregister=lambda: None, group=SimpleNamespace())
+        fields = {"TransformListener": lambda *_, **__: listener, "TransformException": KeyError}
+        fields["__spec__"] = object  # it is installed
+        tf2_ros = SimpleNamespace(Buffer=lambda: Buffer(*seconds), **fields)
+        monkeypatch.setitem(sys.modules, "tf2_ros", tf2_ros)
+        monkeypatch.setattr(Frames, "_read", lambda _: None)
+        return Frames(Node(), lambda: tolerance)
+
+    return make
+
+
+def pose_at(seconds: float, frame: str = "odom") -> PoseStamped:
+    stamped = stamped_pose((2.0, 0.0, 0.0), Quaternion())
+    stamped.header = Header(stamp=Time(nanoseconds=int(seconds * 1e9)).to_msg(), frame_id=frame)
+    return stamped
+
+
+def refusal(status: str, get: Callable[[], object]) -> str:
+    with pytest.raises(RequestError) as error:
+        get()
+    assert error.value.status == status
+    return str(error.value)
+
+
+def test_a_pose_is_transformed_by_the_transform_of_its_time_or_refused(listening: Any) -> None:
+    asked_found = (100, 100), (105, 105), (0, 110)  # the last one has no time
+    for asked, known, found in (
+        *((asked, (100, 110), found) for asked, found in asked_found),
+        (99.5, (100,), 100),  # from just before the node listened
+    ):
+        in_map = listening(*known).to_map("the goal", pose_at(asked), "map")
+        assert in_map.header.stamp.sec == found
+        assert in_map.pose.position.x == 3.0
+    frames = listening(100, 110)
+    for stamped, reason in (
+        (pose_at(98.9), r"the goal's frame is 'odom'.*extrapol.*; publish"),
+        (pose_at(110.5), r"the goal's frame is 'odom'.*extrapol.*; publish"),
+        (pose_at(100, "moon"), r"the map's, 'map' .*moon does not exist"),
+    ):
+        refused = refusal("TF_ERROR", partial(frames.to_map, "the goal", stamped, "map"))
+        assert re.search(reason, refused)
+
+
+def test_a_newest_transform_beyond_the_tolerance_is_not_used(listening: Any) -> None:
+    late = {NOW - 6: "6 s old", NOW + 6: "6 s in the future"}
+    for stamp, words in (late | dict.fromkeys((NOW - 2, NOW + 2, 0), "")).items():
+        frames = listening(stamp, tolerance=5.0)
+        start = StartSource(Node(), frames, Refusals(None), lambda: "map", lambda: None)
+        goal_in_map = partial(frames.to_map, "the goal", pose_at(0), "map")
+        if words:
+            why = f"(the newest is {words}, more than transform_tolerance, 5 s)"
+            assert f"'odom' to 'map' {why}" in refusal("NO_START", start.pose)
+            assert why in refusal("TF_ERROR", goal_in_map)
+        else:
+            assert start.pose().pose.position.x == 1.0
+            assert goal_in_map().header.stamp.sec == stamp
+
+
+def test_transforms_from_before_the_clock_jumped_back_are_forgotten(listening: Any) -> None:
+    frames = listening(100)
+    assert not frames.may_come
+    assert frames.origin_of("odom", "map").pose.position.x == 1.0
+    forgets = frames._node.after_jump_back
+    for forget in forgets:  # as the node does
+        forget()
+    with pytest.raises(ValueError, match="does not exist"):
+        frames.origin_of("odom", "map")
+    assert frames.may_come
+    frames.close()
+    assert not forgets
+
+
+def test_other_frames_are_refused_without_tf_and_the_remedy_names_it(listening: Any) -> None:
+    stamped, frames = pose_at(1), listening()
+    frames.check("the goal", stamped, "map")
+    check_pose("the start", stamped)  # in any frame
+    with pytest.raises(ValueError, match=r"frame is ''; name one in header\.frame_id$"):
+        frames.check("the goal", PoseStamped(), "map")
+    with pytest.raises(ValueError, match="the start's frame is '', the map's is 'map'"):
+        check_pose("the start", PoseStamped(), "map")
+    frames.available = False
+    with pytest.raises(ValueError, match=r"'odom', the map's is 'map'; transform .* tf2_ros"):
+        frames.check("the goal", stamped, "map")
+    with pytest.raises(RequestError, match="tf2_ros is not installed"):
+        frames.to_map("the goal", stamped, "map")
+    in_map = pose_at(1, "map")
+    assert frames.to_map("the goal", in_map, "map") is in_map

@@ -21,8 +21,7 @@ pytestmark = pytest.mark.slow
 
 DEMO = Path(__file__).resolve().parents[2] / "examples" / "demo.py"
 MARK = "DDQN_PLANNER_TEST_DEMO"
-TIMEOUT = 600.0
-"""Seconds that the whole demo may take on a loaded machine."""
+TIMEOUT = 600.0  # seconds that the whole demo may take on a loaded machine
 
 
 class Demo:
@@ -34,14 +33,9 @@ class Demo:
         self._entry = f"{MARK}={mark}".encode()
         self._output = folder / "output.txt"
         with self._output.open("wb") as file:
-            self.process = subprocess.Popen(
-                [sys.executable, str(DEMO)],
-                cwd=folder,
-                env={**os.environ, MARK: mark},
-                stdout=file,
-                stderr=subprocess.STDOUT,
-                start_new_session=True,
-            )
+            options: Any = {"env": {**os.environ, MARK: mark}, "start_new_session": True}
+            options |= {"cwd": folder, "stdout": file, "stderr": subprocess.STDOUT}
+            self.process = subprocess.Popen([sys.executable, DEMO], **options)
 
     @property
     def output(self) -> str:

@@ -13,19 +13,21 @@ from typing import Any
 import pytest
 import rclpy
 from client import generated_map, initial_pose, plan_request, wait_for
-from diagnostic_msgs.msg import DiagnosticStatus
-from integration.robot import GOAL, NUMBERS, START, Robot, ask_for_plan
+from integration.robot import ERROR, GOAL, NUMBERS, START, TIMEOUT, WARN, Robot, ask_for_plan
 from lifecycle_msgs.msg import Transition
 from nav_msgs.srv import GetPlan
 from processes import cpu_seconds
+from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.task import Future
 
+from ddqn_planner.nodes import executor as of_nodes
 from ddqn_planner.nodes.planner_node import PlannerNode
 
 OF_CONFIGURED = {"planner/get_plan", "planner/reload_model", "plan", "map", "goal_pose"}
 
 
 def start(robot: Robot) -> None:
-    """Configure and activate the planner, which works then."""
     robot.start()
     robot.set_map(robot.stamped_map())
     robot.assert_works()
@@ -74,8 +76,8 @@ def test_each_transition_creates_enables_stops_and_frees(robot: Robot) -> None:
 
     for _ in range(2):
         wait_for_created(robot, set())
-        status = robot.wait_for_reason("the node is not active; configure and activate it")
-        assert status.level == DiagnosticStatus.WARN
+        remedy = "the node is not active; configure and activate it"
+        assert robot.wait_for_reason(remedy).level == WARN
         assert robot.transition("configure")
         assert robot.state == "inactive"
         wait_for_created(robot, OF_CONFIGURED)
@@ -94,8 +96,7 @@ def test_each_transition_creates_enables_stops_and_frees(robot: Robot) -> None:
         robot.set_map(robot.stamped_map())
         assert_not_active()
         assert_works_without_a_goal()  # it was dropped
-        assert robot.transition("deactivate")
-        assert robot.transition("cleanup")
+        assert all(map(robot.transition, ("deactivate", "cleanup")))
         node.forget_log()
 
 
@@ -122,8 +123,7 @@ def test_an_unconfigured_planner_checks_parameters(robot: Robot, tmp_path: Path)
         assert not robot.transition("configure")
         assert robot.state == "unconfigured"
         robot.node.wait_for_log(f"model refused: .*{reason}.*; or set the parameter 'model'")
-        status = robot.wait_for_reason(f"model refused: .*{reason}")
-        assert status.level == DiagnosticStatus.ERROR
+        assert robot.wait_for_reason(f"model refused: .*{reason}").level == ERROR
         wait_for_created(robot, set())
         model.write_text("a model")
     shutil.copy(robot.model, model)
@@ -219,3 +219,125 @@ def test_a_planner_that_plans_leaves_the_graph_at_once(robot: Robot) -> None:
     name, graph = ("planner", "/managed"), robot.client.node
     wait_for("farewell", lambda: name not in graph.get_node_names_and_namespaces(), timeout=10)
     assert not all(answer.done() for answer in answers)
+
+
+def test_with_another_rclpy_its_own_executor_runs_the_node(monkeypatch: pytest.MonkeyPatch) -> None:
+    rclpy.init()
+    assert type(of_nodes.new_executor()) is of_nodes.NodeExecutor
+    monkeypatch.setattr(of_nodes, "PARTS", (*of_nodes.PARTS, "_of_another_version"))
+    assert type(of_nodes.new_executor()) is SingleThreadedExecutor
+    rclpy.shutdown()
+
+
+def test_callbacks_resume_in_order_unless_destroyed(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(of_nodes, "EVENTS_PERIOD", 1000.0)  # else it looks again after that
+    called, awaited, stopping = [], Future(), threading.Event()
+
+    async def begin() -> None:
+        called.append("begin")
+        node.destroy_guard_condition(destroyed)
+        another.trigger()
+        await awaited
+        called.append("go on")
+
+    def end() -> None:
+        called.append("end")
+        executor.create_task(stopping.set)
+
+    rclpy.init()
+    node, group = rclpy.create_node("calls"), MutuallyExclusiveCallbackGroup()
+    executor = of_nodes.NodeExecutor()
+    executor.add_node(node)
+    for callback in (begin, end):
+        node.create_guard_condition(callback, group).trigger()
+    destroyed = node.create_guard_condition(lambda: called.append("destroyed"))
+    destroyed.trigger()
+    another = node.create_guard_condition(lambda: awaited.set_result(None))
+    late = threading.Timer(60.0, executor.create_task, [stopping.set])
+    late.start()
+    while not stopping.is_set():
+        executor.spin_once()
+    late.cancel()
+    node.destroy_node()
+    executor.shutdown()
+    rclpy.shutdown()
+    assert called == ["begin", "go on", "end"]
+
+
+def test_requests_wait_for_the_first_map(run_waiting: Any, load_gate: Path, model: Path) -> None:
+    load_gate.touch()
+    with run_waiting("/early") as robot:
+        plan, answered = ask_for_plan(robot)
+        robot.node.wait_for_log("planning with the model")
+        assert not plan.done()
+        robot.send_map()
+        assert answered.wait(TIMEOUT)
+        assert plan.result().plan.poses
+        robot.wait_for_path(START, GOAL)
+        assert all(path.poses for path in robot.plans.messages())
+        robot.set(model=str(model))
+        robot.assert_works()
+        # Numba itself loads scipy.
+        assert robot.node.heavy_libraries <= {"numba", "scipy"}
+
+
+@pytest.mark.parametrize("case", ["good", "broken", "replaced"])
+def test_requests_wait_for_the_first_model_and_another_one_that_is_set_meanwhile_stays(
+    run_waiting: Any, model: Path, load_gate: Path, tmp_path: Path, case: str
+) -> None:
+    broken = tmp_path / "any_map.safetensors"
+    broken.write_text("a model")
+    first = str(broken) if case == "broken" else "any_map"
+    with run_waiting(f"/waiting_{case}", {"model": first}) as robot:
+        robot.set_map(robot.map_message())
+        plan, answered = ask_for_plan(robot)
+        assert robot.wait_for_reason("the model is being loaded", {"model": first}).level == WARN
+        assert robot.client.get_parameter("planner", "mode") == "greedy"
+        assert not plan.done()
+        assert robot.plans.messages() == []
+        if case == "replaced":
+            robot.set(model=str(model))
+        load_gate.touch()
+        assert answered.wait(TIMEOUT)
+        assert bool(plan.result().plan.poses) == (case != "broken")
+        if case == "broken":
+            reason = "cannot be read as safetensors"
+            assert robot.wait_for_reason(f"no model is loaded: .*{reason}").level == ERROR
+            robot.node.wait_for_log(f"model refused: .*{reason}.*set the parameter")
+            return
+        robot.wait_for_path(START, GOAL)
+        if case == "replaced":
+            robot.assert_works()
+            robot.wait_for_reason("^a path of ", {"model file": str(model)})
+        assert "refused" not in robot.node.log
+
+
+def test_a_planner_that_is_stopped_waits_for_no_model(run_waiting: Any) -> None:
+    with run_waiting("/loads_for_ever") as robot:
+        robot.node.wait_for_log("a model waits")
+
+
+INTERRUPTED = """
+import os, signal, sys, weakref
+
+class Place: pass
+
+def interrupt(_):
+    os.kill(os.getpid(), signal.SIGINT)
+    for _ in range(100): pass  # here Python would raise KeyboardInterrupt, and drop it
+
+class Finder:
+    def find_spec(name, path, target=None):
+        if name == {module!r}:
+            weakref.ref(Place(), interrupt)
+
+sys.meta_path.insert(0, Finder)
+"""
+
+
+@pytest.mark.parametrize("module", ["nodes.planner_node", "grid", "planning", "nodes.nav2"])
+def test_a_signal_ends_a_planner_that_still_imports_its_modules(run_node: Any, module: str) -> None:
+    interrupted = INTERRUPTED.format(module=f"ddqn_planner.{module}")
+    code = -signal.SIGINT
+    with run_node("planner_node", exit_code=code, sitecustomize=interrupted) as node:
+        assert node.process.wait(TIMEOUT) == code

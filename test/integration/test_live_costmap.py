@@ -3,25 +3,20 @@
 import array
 import itertools
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
 import pytest
 from builtin_interfaces.msg import Time
 from client import cells_of, wait_for
-from diagnostic_msgs.msg import DiagnosticStatus
 from geometry_msgs.msg import PoseStamped, TransformStamped
-from integration.robot import Robot, values_of
+from integration.robot import WARN, Robot, repeating, values_of
 from std_msgs.msg import Header
 
 from ddqn_planner.grid import GridMap
 from ddqn_planner.nodes.runtime import LATCHED
 
-DOORS = [(4, 30), (12, 30)]
-"""(x, y) of the cells in which a wall is open."""
-
-NEEDS_MAP_MSGS = "PyPI does not have map_msgs; apt install ros-jazzy-map-msgs"
+DOORS = [(4, 30), (12, 30)]  # (x, y) of the cells in which a wall is open
 
 
 @pytest.fixture(scope="module")
@@ -66,16 +61,6 @@ def publish_costmap(robot: Robot) -> None:
     robot.client.publish("global_costmap/costmap", robot.stamped_map(), LATCHED)
 
 
-@contextmanager
-def repeating(client: Any, publish: Callable[[], None]) -> Iterator[None]:
-    """Publish something 50 times a second."""
-    timer = client.node.create_timer(0.02, publish)
-    try:
-        yield
-    finally:
-        client.node.destroy_timer(timer)
-
-
 def test_a_costmap_that_stops_takes_its_path_back_until_it_comes_again(robot: Robot) -> None:
     # Nobody sets a parameter or asks while it is away, and it is not time to plan again.
     robot.set(map_timeout=0.05, replan_period=3600.0)
@@ -92,13 +77,12 @@ def test_a_costmap_that_stops_takes_its_path_back_until_it_comes_again(robot: Ro
         assert empty.header.frame_id == "map"
     wait_for("refusal", lambda: not robot.get_plan(robot.pose((5, 5)), robot.pose((9, 9))).poses)
     silent = "nothing came on /live/global_costmap/costmap for longer than"
-    status = robot.wait_for_reason(silent, {"status": "MAP_TIMEOUT"})
-    assert status.level == DiagnosticStatus.WARN
+    assert robot.wait_for_reason(silent, {"status": "MAP_TIMEOUT"}).level == WARN
     robot.set(map_timeout=0.0, replan_period=1.0)
 
 
 def test_updates_close_and_open_doors(robot: Robot) -> None:
-    map_msgs = pytest.importorskip("map_msgs.msg", reason=NEEDS_MAP_MSGS)
+    map_msgs = pytest.importorskip("map_msgs.msg", reason="map_msgs is not on PyPI")
     stamps = itertools.count(10_000)
 
     def send(x: int, y: int, values: list[list[int]]) -> None:
@@ -130,7 +114,7 @@ def test_updates_close_and_open_doors(robot: Robot) -> None:
 
 
 def test_poses_in_other_frames_are_transformed(robot: Robot) -> None:
-    pytest.importorskip("tf2_ros", reason="PyPI does not have tf2_ros; see docs/install.md")
+    pytest.importorskip("tf2_ros", reason="tf2_ros is not on PyPI")
     from tf2_msgs.msg import TFMessage
 
     client, clock = robot.client, robot.client.node.get_clock()

@@ -46,7 +46,7 @@ def drawn(image: dict[str, list[Any]]) -> np.ndarray:
 
 
 @pytest.mark.filterwarnings("ignore:RRD file has no footer")  # while it is written
-def test_a_recording_holds_what_the_nodes_published(
+def test_a_recording_holds_all(
     make_client: Callable[[str], Any], small_values: np.ndarray, tmp_path: FilePath
 ) -> None:
     client, file = make_client("/watched"), tmp_path / "watched.rrd"

@@ -1,21 +1,24 @@
 import os
 import re
 import signal
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from client import pose, wait_for, wait_for_map
+from diagnostic_msgs.msg import DiagnosticArray
 from integration.user import trigger
 from nav_msgs.msg import OccupancyGrid
 from nav_msgs.srv import GetMap, LoadMap
+from std_srvs.srv import Trigger
 
-from ddqn_planner.grid import MapFile, read_map_file, save_map, scatter_obstacles
+from ddqn_planner.grid import GridMap, MapFile, read_map_file, save_map, scatter_obstacles
 from ddqn_planner.nodes.conversions import grid_from_message
 from ddqn_planner.nodes.map_server_node import known_path
 from ddqn_planner.nodes.runtime import LATCHED
-from ddqn_planner.resources import find_resource
+from ddqn_planner.resources import find_map, find_resource
 
 NAMESPACE = "/maps"
 SHIPPED = find_resource("maps", "dilemma.yaml")
@@ -66,22 +69,20 @@ def values_of(message: OccupancyGrid) -> np.ndarray:
 
 
 def draws(seed: int, map_file: Path) -> Iterator[np.ndarray]:
-    """Yield what the draws of a seed occupy."""
     read, random = read_map_file(map_file), np.random.default_rng(seed)
     move_rule, path = known_path(read.grid(), read)
     while True:
         yield scatter_obstacles(read.grid(), path, move_rule, random)[0].occupancy
 
 
-def test_topic_and_service_give_the_map_of_a_path_a_url_and_a_shipped_name(
+def test_topic_and_service_give_any_map(
     client: Any, maps: Any, map_file: Path, small_values: np.ndarray
 ) -> None:
     grid = grid_from_message(served_map(client, maps))
     assert (grid.resolution, *grid.origin) == pytest.approx((0.25, -1.0, 2.0, 0.5))
     shipped = read_map_file(SHIPPED).values
     for url, values in (
-        ("dilemma.yaml", shipped),
-        (map_file, small_values),
+        *(("dilemma.yaml", shipped), (map_file, small_values)),
         ("package://ddqn_planner/maps/dilemma.yaml", shipped),
         (f"file://{map_file}", small_values),
     ):
@@ -102,7 +103,7 @@ def test_nav2s_service_loads_a_map_too(client: Any, map_file: Path) -> None:
         assert answer.map == (served_map(client) if result == 0 else OccupancyGrid())
 
 
-def test_scatter_draws_on_the_loaded_map_by_the_seed_and_restore_undoes_it(
+def test_scatter_draws_by_the_seed(
     client: Any, maps: Any, small_values: np.ndarray, map_file: Path
 ) -> None:
     for expected, _ in zip(draws(3, map_file), range(3), strict=False):
@@ -121,7 +122,7 @@ def test_scatter_draws_on_the_loaded_map_by_the_seed_and_restore_undoes_it(
     assert (values_of(served_map(client, maps)) == small_values).all()
 
 
-def test_a_failed_load_has_its_code_and_keeps_the_served_map(
+def test_a_failed_load_keeps_the_map(
     client: Any, server: Any, small_values: np.ndarray, tmp_path: Path
 ) -> None:
     good, bad, pipe = (tmp_path / f"{name}.yaml" for name in ("good", "bad", "pipe"))
@@ -132,13 +133,10 @@ def test_a_failed_load_has_its_code_and_keeps_the_served_map(
     no_files = "unknown.yaml", "", "x" * 5000, "package://no/x.yaml", tmp_path, pipe
     for url, pattern, replacement, code in (
         *((url, "", "", NO_FILE) for url in no_files),
-        (image, "", "", BAD_YAML),
-        (bad, "good.pgm", "missing.pgm", BAD_DATA),
-        (bad, "good.pgm", "cut.pgm", BAD_DATA),
-        (bad, "(?s).*", "[1, 2", BAD_YAML),
+        *((image, "", "", BAD_YAML), (bad, "(?s).*", "[1, 2", BAD_YAML)),
+        *((bad, "good.pgm", name, BAD_DATA) for name in ("missing.pgm", "cut.pgm")),
         # Files may have these, messages may not.
-        (bad, "resolution: .*", "resolution: 1e-300", BAD_YAML),
-        (bad, "resolution: .*", "resolution: 1e300", BAD_YAML),
+        *((bad, "resolution: .*", f"resolution: 1e{n}", BAD_YAML) for n in (-300, 300)),
     ):
         bad.write_text(re.sub(pattern, replacement, text, count=1))
         response = load_map(client, url)
@@ -161,7 +159,7 @@ def test_no_noise_without_a_path(client: Any, map_file: Path, tmp_path: Path) ->
     assert load_map(client, map_file).result == LoadMap.Response.RESULT_SUCCESS
 
 
-def test_without_a_map_at_the_start_the_node_lives_on(
+def test_without_a_map_the_node_lives(
     run_node: Any, make_client: Any, map_file: Path, small_values: np.ndarray
 ) -> None:
     parameters = {"yaml_filename": "no_such.yaml"}
@@ -185,3 +183,55 @@ def test_by_default_numpy_alone_serves_a_map(run_node: Any, make_client: Any) ->
         assert ((values_of(served_map(client)) == 100) == next(draws(0, SHIPPED))).all()
         assert node.heavy_libraries <= {"numba", "scipy"}
         assert node.stop(signal.SIGTERM) == 0
+
+
+EAST, WEST = 0b00111000, 0b10000011  # what lanes to the east and to the west forbid
+
+
+@pytest.fixture(scope="module")
+def hall_client(run_node: Any, make_client: Callable[[str], Any]) -> Iterator[Any]:
+    parameters = {"yaml_filename": "warehouse.yaml"}
+    with (
+        run_node("planner_node", namespace="/hall"),
+        run_node("map_server_node", parameters, namespace="/hall"),
+    ):
+        yield make_client("/hall")
+
+
+def wait_until_planned(hall_client: Any, ends: tuple[Any, Any]) -> None:
+    """Wait for a path that is not empty: before it, map or model may be missing."""
+    wait_for("path", lambda: hall_client.get_plan(*ends).poses)
+
+
+def test_the_directions_come_with_the_stamp_and_the_place_of_the_map(hall_client: Any) -> None:
+    topics = "map_directions", "map"
+    directions, maps = (hall_client.subscribe(OccupancyGrid, topic, LATCHED) for topic in topics)
+    for _ in range(2):
+        served = hall_client.call(GetMap, "map_server/map").map
+        maps.wait(lambda message, served=served: message == served)
+        of_map = directions.wait(lambda message, served=served: message.header == served.header)
+        assert of_map.info == served.info
+        forbidden = np.frombuffer(of_map.data, np.uint8).reshape(36, 48)
+        np.testing.assert_array_equal(forbidden, read_map_file(find_map("warehouse")).forbidden)
+        assert hall_client.call(Trigger, "map_server/scatter_obstacles").success
+
+
+def test_each_map_is_planned_on_with_its_own_directions(hall_client: Any, tmp_path: Path) -> None:
+    values, grid = np.zeros((3, 9), dtype=np.int8), GridMap(np.zeros((3, 9)), 0.5)
+    for name, forbidden in (("east", EAST), ("west", WEST), ("free", None)):
+        full = None if forbidden is None else np.full(values.shape, forbidden, dtype=np.uint8)
+        save_map(MapFile(values, 0.5, forbidden=full), tmp_path / f"{name}.yaml")
+    diagnostics = hall_client.subscribe(DiagnosticArray, "/diagnostics")
+    ends = pose(grid, (0, 1)), pose(grid, (8, 1))
+    for name in ["east", "west", "free", "west"] * 2:
+        diagnostics.clear()
+        request = LoadMap.Request(map_url=str(tmp_path / f"{name}.yaml"))
+        response = hall_client.call(LoadMap, "map_server/load_map", request)
+        wait_for_map(diagnostics, response.map.header.stamp, "/hall/planner")
+        if name == "west":
+            for _ in range(2):
+                assert not hall_client.get_plan(*ends).poses
+            # That the planner has the directions: the way back is open.
+            wait_until_planned(hall_client, ends[::-1])
+        else:
+            wait_until_planned(hall_client, ends)

@@ -112,7 +112,7 @@ def test_each_parameter_is_documented_as_it_is(running: Running) -> None:
     assert found == documented_parameters(running.name)
 
 
-def test_each_topic_and_service_is_documented_as_it_is(
+def test_topics_are_as_documented(
     running: Running, run_node: Any, make_client: Callable[[str], Client], tmp_path: Path
 ) -> None:
     documented, more = documented_topics(running.name), set()
@@ -223,13 +223,11 @@ def test_what_a_node_cannot_start_with_is_said_and_ends_with_1(
     assert "Traceback" not in log
 
 
-# RViz
-
-MESSAGES = {"Map": "nav_msgs/OccupancyGrid", "Path": "nav_msgs/Path"}
-MESSAGES |= {"MarkerArray": "visualization_msgs/MarkerArray"}
-MESSAGES |= {"SetGoal": "geometry_msgs/PoseStamped"}
-MESSAGES |= {"SetInitialPose": "geometry_msgs/PoseWithCovarianceStamped"}
-"""By the class of a display or a tool of rviz_default_plugins."""
+CLASSES = {  # of rviz_default_plugins
+    "nav_msgs/OccupancyGrid": "Map",
+    "geometry_msgs/PoseStamped": "SetGoal",
+    "geometry_msgs/PoseWithCovarianceStamped": "SetInitialPose",
+}
 SHOWN = {"/map", "/plan", "/planner/value", "/planner/policy", "/trainer/episode"}
 SET = {"/initialpose", "/goal_pose"}
 
@@ -248,15 +246,14 @@ def test_each_display_and_tool_has_a_topic_of_the_nodes() -> None:
     for name, entry in (displays | tools).items():
         way = "publishes" if name in displays else "subscribes"
         message_type, _, latched = documented[way, name].partition(", ")
-        assert entry["Class"] in {f"rviz_default_plugins/{k}" for k in MESSAGES}
-        assert MESSAGES[entry["Class"].removeprefix("rviz_default_plugins/")] == message_type
+        name = CLASSES.get(message_type, message_type.rpartition("/")[2])
+        assert entry["Class"] == f"rviz_default_plugins/{name}"
         durability = "Transient Local" if latched == "latched" else "Volatile"
         assert entry["Topic"]["Durability Policy"] == durability
         assert entry["Topic"]["Reliability Policy"] == "Reliable"
     assert all(display["Enabled"] for display in displays.values())
     assert displays["/map"]["Draw Behind"]
     value = displays["/planner/value"]
-    assert (value["Color Scheme"], value["Draw Behind"]) == ("costmap", False)
-    assert 0 < value["Alpha"] < 1
+    assert (value["Color Scheme"], value["Draw Behind"], value["Alpha"] < 1) == ("costmap", 0, True)
     assert manager["Global Options"]["Fixed Frame"] == "map"
     assert manager["Views"]["Current"]["Class"] == "rviz_default_plugins/TopDownOrtho"

@@ -1,6 +1,7 @@
 """Whatever comes in, the planner node answers, says why, and goes on with what it had."""
 
 import math
+from collections.abc import Callable
 from typing import Any
 
 import pytest
@@ -9,8 +10,9 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from integration.messages import NUMBERS_32, STAMPED_POSES, maps, some_parameters
 from integration.robot import GOAL, NUMBERS, Robot, check_path
+from load import BurstClients, GoalBursts, burst_requests
 from nav_msgs.msg import OccupancyGrid, Odometry
-from nav_msgs.srv import GetPlan
+from nav_msgs.srv import GetMap, GetPlan
 from rcl_interfaces.srv import GetParameters, SetParameters, SetParametersAtomically
 from rclpy.parameter import Parameter
 from std_msgs.msg import String
@@ -98,7 +100,7 @@ NAMES = [*PLANNER_PARAMETERS, "use_sim_time"]
 
 @fuzz
 @given(parameters=some_parameters(NAMES), together=st.booleans())
-def test_any_parameters_are_set_or_refused_with_a_reason(
+def test_any_parameters_are_answered(
     unharmed: Robot, parameters: list[Any], together: bool
 ) -> None:
     robot = unharmed
@@ -127,3 +129,30 @@ def test_any_parameters_are_set_or_refused_with_a_reason(
     robot.set(use_sim_time=False)
     robot.reset()
     robot.assert_works()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("clients", [1, 20])
+def test_each_request_of_a_burst_has_its_plan(robot: Any, clients: int) -> None:
+    with BurstClients(clients, service="/robot/planner/get_plan") as asking:
+        requests = burst_requests(robot.grid, [(5, 5)], 200)
+        answers = asking.burst(requests)
+    assert len(answers) == 200
+    assert all(answer is not None and answer.plan.poses for answer in answers)
+
+
+@pytest.mark.slow
+def test_each_request_of_a_burst_has_its_map(run_node: Callable[..., Any]) -> None:
+    with (
+        run_node("map_server_node", {}, namespace="/burst"),
+        BurstClients(1, GetMap, "/burst/map_server/map") as asking,
+    ):
+        answers = asking.burst([GetMap.Request()] * 200)
+    assert all(answer is not None and answer.map.info.width == 20 for answer in answers)
+
+
+@pytest.mark.slow
+def test_each_goal_of_a_burst_has_a_result(robot: Any) -> None:
+    pytest.importorskip("nav2_msgs.action", reason="nav2_msgs is not on PyPI")
+    with GoalBursts("/robot/compute_path_to_pose", "/robot/planner") as asking:
+        assert asking.burst(burst_requests(robot.grid, [(5, 5)], 200)) == 200

@@ -2,17 +2,31 @@
 
 import math
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from client import cells_of
-from diagnostic_msgs.msg import DiagnosticStatus
+from builtin_interfaces.msg import Time
+from client import cells_of, wait_for
+from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseArray, PoseStamped, PoseWithCovarianceStamped, TransformStamped
-from integration.robot import GOAL_YAW, RESOLUTION, Robot, odometry, values_of, yaw_of
-from nav_msgs.msg import Odometry
+from integration.robot import (
+    GOAL,
+    GOAL_YAW,
+    RESOLUTION,
+    START,
+    WARN,
+    Robot,
+    odometry,
+    repeating,
+    yaw_of,
+)
+from nav_msgs.msg import OccupancyGrid, Odometry
 from nav_msgs.srv import GetPlan
 from rclpy.duration import Duration
+from rclpy.qos import QoSProfile, qos_profile_sensor_data
+from rosgraph_msgs.msg import Clock
 from std_msgs.msg import Header
 
 from ddqn_planner import Planner
@@ -32,8 +46,6 @@ def robot(hall_robot: Robot) -> Robot:
     hall_robot.begin((0, 0), (19, 0))
     return hall_robot
 
-
-# A body
 
 RADIUS = {"robot_radius": 0.6}
 FROM_OBSTACLE = {"start": (5, 0), "start_clearing_radius": 1}
@@ -92,7 +104,6 @@ def test_a_start_on_an_obstacle_or_deep_in_one_is_told(robot: Robot, hall: np.nd
 
 def test_a_goal_moves_within_the_tolerance_of_the_request(robot: Robot, hall: np.ndarray) -> None:
     def get_cells(tolerance: float, goal: Cell = (10, 2)) -> list[Cell]:
-        """Return the last cell of a path, if there is one."""
         request = GetPlan.Request(start=robot.pose((0, 2)), tolerance=tolerance)
         request.goal = robot.pose(goal, GOAL_YAW)
         robot.clear()
@@ -122,13 +133,9 @@ def test_a_goal_moves_within_the_tolerance_of_the_request(robot: Robot, hall: np
     robot.wait_for_reason("a path of .*; the goal is cut off and moved 1.5 m")
 
 
-# Where the robot is
-
-
 def test_the_start_comes_from_odometry(robot: Robot) -> None:
     def wait_until_unknown(refused: str, remedy: str) -> None:
-        """What was refused of one source is forgotten with it."""
-        other = rf"((?!{refused} refused).)*"
+        other = rf"((?!{refused} refused).)*"  # what was refused of one source is forgotten with it
         robot.wait_for_reason(f"^{other}start is unknown; {remedy}{other}$")
 
     robot.send_goal(robot.pose((19, 14)))
@@ -145,8 +152,8 @@ def test_the_start_comes_from_odometry(robot: Robot) -> None:
     # It goes on moving; the next plan begins where it is then.
     robot.client.publish("odom", odometry(robot, (3, 2)))
     robot.client.publish("odom", odometry(robot, (4, 2), frame=""))
-    status = robot.wait_for_reason("odom refused: the start's frame is ''")
-    assert status.level == DiagnosticStatus.WARN
+    refused = "odom refused: the start's frame is ''"
+    assert robot.wait_for_reason(refused).level == WARN
     assert robot.plans.messages() == []
     robot.send_goal(robot.pose((0, 14)))
     robot.wait_for_path((3, 2), (0, 14))
@@ -214,13 +221,12 @@ def transformed(run_robot: Any, hall: np.ndarray) -> Iterator[Robot]:
         yield robot
 
 
-def transform(robot: Robot, cell: Cell, age: float | None = None) -> TransformStamped:
+def transform(robot: Robot, cell: Cell, age: float | None = None, child: str = "base_link") -> Any:
     """Return where the robot was so many seconds ago; None for a static transform."""
-    message = TransformStamped(header=Header(frame_id="map"), child_frame_id="base_link")
+    message = TransformStamped(header=Header(frame_id="map"), child_frame_id=child)
     if age is not None:
-        message.header.stamp = (
-            robot.client.node.get_clock().now() - Duration(seconds=age)
-        ).to_msg()
+        then = robot.client.node.get_clock().now() - Duration(seconds=age)
+        message.header.stamp = then.to_msg()
     position = message.transform.translation
     position.x, position.y = robot.grid.cell_to_world(cell)
     return message
@@ -229,14 +235,12 @@ def transform(robot: Robot, cell: Cell, age: float | None = None) -> TransformSt
 def test_a_goal_waits_for_the_first_transform_that_is_not_too_old(transformed: Robot) -> None:
     robot, client = transformed, transformed.client
     robot.send_goal(robot.pose((19, 14)))
-    robot.wait_for_reason("no transform leads from 'base_link' to 'map' .*publish one, or set")
+    none = "no transform leads from 'base_link' to 'map' "
+    robot.wait_for_reason(none + ".*publish one, or set")
     assert all(plan.poses == [] for plan in [robot.plans.wait(), *robot.plans.messages()])
     client.publish("tf", transform(robot, (4, 7), age=6.0))
-    status = robot.wait_for_reason(
-        r"no transform leads from 'base_link' to 'map' \(the newest is ([6-9]|\d\d)[.\d]* s old, "
-        r"more than transform_tolerance, 0.3 s\); publish"
-    )
-    assert values_of(status)["status"] == "NO_START"
+    late = r"\(the newest is ([6-9]|\d\d)[.\d]* s old, more than transform_tolerance, 0.3 s\); publ"
+    robot.wait_for_reason(none + late, {"status": "NO_START"})
     assert all(not plan.poses for plan in robot.plans.messages())
     client.publish("tf", transform(robot, (4, 7)))
     robot.wait_for_path((4, 7), (19, 14))
@@ -245,8 +249,7 @@ def test_a_goal_waits_for_the_first_transform_that_is_not_too_old(transformed: R
 
 def test_docks_in_another_frame_stay_where_they_are_when_it_moves(transformed: Robot) -> None:
     robot, client = transformed, transformed.client
-    odom = transform(robot, (3, 2))
-    odom.child_frame_id = "odom"
+    odom = transform(robot, (3, 2), child="odom")
     x, y = robot.grid.cell_to_world((3, 2))
     docks = [robot.pose((1, 7), 0.5).pose, robot.pose((18, 3), 1.5).pose]
     for dock in docks:
@@ -267,19 +270,63 @@ def test_docks_in_another_frame_stay_where_they_are_when_it_moves(transformed: R
 
 def test_a_new_listener_to_transforms_has_no_empty_plan(transformed: Robot) -> None:
     robot, client = transformed, transformed.client
-    values = {"start_source": "initialpose", "transform_tolerance": 100.0}
-    robot.set(**values)
+    robot.set(start_source="initialpose", transform_tolerance=100.0)
     robot.send_map(robot.stamped_map())
     robot.send_start(robot.pose((5, 5)))
     robot.send_goal(robot.pose((19, 14)))
     robot.wait_for_path((5, 5), (19, 14))
     robot.plans.clear()
-    timer = client.node.create_timer(
-        0.05, lambda: client.publish("tf", transform(robot, (4, 7), age=0.0), listeners=0)
-    )
-    try:
+
+    def publish() -> None:
+        client.publish("tf", transform(robot, (4, 7), age=0.0), listeners=0)
+
+    with repeating(client, publish):
         robot.set(start_source="tf")
         robot.wait_for_path((4, 7), (19, 14))
-    finally:
-        client.node.destroy_timer(timer)
     assert all(plan.poses for plan in robot.plans.messages())
+
+
+def test_odometry_counts_while_it_comes(run_robot: Any, model: Path) -> None:
+    def set_clock(seconds: int) -> None:
+        robot.clear()
+        client.publish("/clock", Clock(clock=Time(sec=seconds)))
+        robot.diagnostics.wait(lambda message: message.header.stamp.sec == seconds)
+
+    def plans() -> bool:
+        return bool(robot.get_plan(PoseStamped(), robot.pose(GOAL)).poses)
+
+    parameters = {"model": str(model), "start_source": "odometry", "use_sim_time": True}
+    parameters["qos_overrides./listening/map.subscription.durability"] = "volatile"
+    with run_robot("/listening", parameters) as robot:
+        client, node = robot.client, robot.node
+        client.publisher(OccupancyGrid, "map", QoSProfile(depth=1))
+        robot.set_map(robot.stamped_map())
+        client.publisher(Odometry, "odom", qos_profile_sensor_data)  # as many drivers publish it
+        client.publisher(Clock, "/clock")
+        client.wait_for_discovery("planner")
+        for began in (1000, 500):
+            set_clock(began)
+            assert not plans()
+            client.publish("odom", odometry(robot, START))
+            wait_for("plan", plans)
+            set_clock(began + 2)
+            assert plans()
+            set_clock(began + 3)
+            assert not plans()
+            robot.wait_for_reason(r"nothing came on /\w+/odom for 3 s; publish it more often")
+            client.publish("odom", odometry(robot, START))
+            wait_for("plan", plans)
+        assert node.log.count("the clock jumped by -503 s") == 1
+
+        (heard,) = (it for it in client.node.subscriptions if it.topic_name == "/diagnostics")
+        client.run(client.node.destroy_subscription, heard)  # its thread may hold it
+        second = client.node.create_publisher(Odometry, "odom", 10)
+        name = client.node.get_fully_qualified_name()
+        expected = rf"/odom has 2 publishers \({name}, {name}\), so the robot's place may jump"
+        node.wait_for_log("odom has 2 publishers")  # though nobody reads the diagnostics
+        robot.diagnostics = client.subscribe(DiagnosticArray, "/diagnostics")
+        assert robot.wait_for_reason(expected).level == WARN
+        assert node.log.count("has 2 publishers") == 1
+        client.node.destroy_publisher(second)
+        robot.clear()
+        robot.wait_for_reason("^((?!publishers).)*$")

@@ -66,17 +66,9 @@ def right_network(name: str, move_rule: MoveRule | None = None) -> PropagationQN
 
 
 def logits(network: PropagationQNetwork, feature_BI: np.ndarray) -> np.ndarray:
-    """Return the logits of p(s, a) in float32."""
     hidden_BF = np.maximum(network._layer("convolution", feature_BI), 0)
     hidden_BF = np.maximum(network._layer("hidden", hidden_BF), 0)
     return network._layer("moves", hidden_BF)
-
-
-def true_multipliers(patch_B9: np.ndarray) -> np.ndarray:
-    """Return the mean cost multiplier of the two cells of each move: (B, 8)."""
-    share = np.where(patch_B9 == UNKNOWN, 1, patch_B9 / 100)
-    multiplier = 1 + (MAX_COST_MULTIPLIER - 1) * share
-    return (multiplier[:, [4]] + multiplier[:, CELLS]) / 2
 
 
 CERTIFICATE = certify(any_map())
@@ -89,18 +81,17 @@ def test_decisions_and_costs_are_as_certified(patch_B9: np.ndarray, rule: MoveRu
     np.testing.assert_array_equal(network.success(feature_BI) > 0.5, legal_BA)
     distance_BA = np.where(legal_BA, 1, -1) * logits(network, feature_BI)
     assert distance_BA.min() >= certificate.margin
-    true_BA = true_multipliers(patch_B9)
+    share_B9 = np.where(patch_B9 == UNKNOWN, 1, patch_B9 / 100)
+    multiplier_B9 = 1 + (MAX_COST_MULTIPLIER - 1) * share_B9
+    true_BA = (multiplier_B9[:, [4]] + multiplier_B9[:, CELLS]) / 2  # the mean of both cells
     error_BA = np.abs(network.multiplier(feature_BI) - true_BA) / true_BA
     assert error_BA[legal_BA].max(initial=0) <= certificate.multiplier_error
 
 
-@given(
-    patches(),
-    st.sampled_from(MOVE_RULES),
-    st.sampled_from(["propagation", "any_map"]),
-    st.integers(0, 99),
-    st.sampled_from([0.1, 0.5, 3.0]),
-)
+NAMES, SCALES = st.sampled_from(["propagation", "any_map"]), st.sampled_from([0.1, 0.5, 3.0])
+
+
+@given(patches(), st.sampled_from(MOVE_RULES), NAMES, st.integers(0, 99), SCALES)
 def test_no_margin_of_any_network_is_above_a_sampled_one(
     patch_B9: np.ndarray, rule: MoveRule, name: str, seed: int, scale: float
 ) -> None:
@@ -122,14 +113,12 @@ def unsure_and_noisy(share: float, noise: float) -> tuple[PropagationQNetwork, C
     return network, certify(network)
 
 
-@given(
-    grids_with_costs() | grids_with_free_cell(),
-    st.sampled_from(MOVE_RULES),
-    st.sampled_from([0.0, 0.02]),
-    st.sampled_from([1.0, 0.3, 0.1, 0.01]),
-    st.booleans(),
-)
-def test_no_path_costs_more_than_certified(
+GRIDS, NOISES = grids_with_costs() | grids_with_free_cell(), st.sampled_from([0.0, 0.02])
+SHARES = st.sampled_from([1.0, 0.3, 0.1, 0.01])
+
+
+@given(GRIDS, st.sampled_from(MOVE_RULES), NOISES, SHARES, st.booleans())
+def test_no_path_exceeds_the_certificate(
     place: Place, rule: MoveRule, noise: float, share: float, timed: bool
 ) -> None:
     grid, goal = place
@@ -221,7 +210,7 @@ def test_the_error_of_the_costs_is_the_greatest_one() -> None:
     assert certificate.path_error == pytest.approx(1.3 / 0.7 - 1, abs=1e-3)
 
 
-def test_certify_prints_the_proof_of_the_documentation(capsys: pytest.CaptureFixture[str]) -> None:
+def test_certify_prints_the_documented_proof(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["certify", "any_map"]) == 0
     printed = capsys.readouterr().out
     assert printed.startswith("proved: all 4,096 decisions, ")

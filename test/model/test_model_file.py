@@ -14,23 +14,15 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from limits import memory_grows_less_than
 from networks import random_network
-from strategies import Place, grids_with_costs
+from strategies import RULES, Place, grids_with_costs, json_values
 
 from ddqn_planner.grid import MoveRule
 from ddqn_planner.model import ModelFileError, ModelMetadata, QNetwork, load_model, save_model
 from ddqn_planner.model.move_costs import MAX_MULTIPLIER
 from ddqn_planner.planning.field import network_field
 
-METADATA = ModelMetadata(
-    network="paper",
-    sizes={"height": 4, "width": 5, "filters": 2, "hidden_units": 0},
-    move_rule=MoveRule.ROBOT_SAFE,
-    gamma=0.95,
-    map_fingerprint="0123456789abcdef",
-    steps=7,
-    seed=3,
-    package_version="0.1.0",
-)
+SIZED = {"height": 4, "width": 5, "filters": 2, "hidden_units": 0}
+METADATA = ModelMetadata("paper", SIZED, MoveRule.ROBOT_SAFE, 0.95, "0123456789", 7, 3, "0.1.0")
 
 # Every example writes the same file anew.
 same_folder = settings(suppress_health_check=[HealthCheck.function_scoped_fixture])
@@ -48,16 +40,12 @@ def model_path(tmp_path: Path, network: QNetwork) -> Path:
     return path
 
 
-@pytest.mark.parametrize(
-    ("kind", "sizes"),
-    [
-        ("paper", METADATA.sizes),
-        ("paper", {**METADATA.sizes, "hidden_units": 3}),
-        ("propagation", {"filters": 3}),
-        ("any_map", {"filters": 3}),
-        ("paper", {"height": 4, "width": 5, "filters": 2}),  # of an old file
-    ],
-)
+OLD = {"height": 4, "width": 5, "filters": 2}  # a file of an old version
+KINDS = [("paper", SIZED), ("paper", {**SIZED, "hidden_units": 3}), ("paper", OLD)]
+KINDS += [(kind, {"filters": 3}) for kind in ("propagation", "any_map")]
+
+
+@pytest.mark.parametrize(("kind", "sizes"), KINDS)
 def test_a_saved_model_comes_back(tmp_path: Path, kind: str, sizes: dict[str, int]) -> None:
     path, units = tmp_path / "model.safetensors", {"hidden_units": 0} if kind == "paper" else {}
     network = random_network(kind, **(units | sizes))
@@ -71,16 +59,12 @@ def test_a_saved_model_comes_back(tmp_path: Path, kind: str, sizes: dict[str, in
         np.testing.assert_array_equal(loaded.tensors[key], tensor)
 
 
-def test_a_file_that_is_truncated_anywhere_is_refused(model_path: Path) -> None:
+def test_a_file_with_a_wrong_byte_or_cut_off_is_a_model_or_refused(model_path: Path) -> None:
     content = model_path.read_bytes()
     for length in np.linspace(0, len(content) - 1, 50).astype(int):
         model_path.write_bytes(content[:length])
         with pytest.raises(ModelFileError, match="truncated"):
             load_model(model_path)
-
-
-def test_a_file_with_one_wrong_byte_is_a_model_or_refused(model_path: Path) -> None:
-    content = model_path.read_bytes()
     chance = random.Random(0)
     header = 8 + int.from_bytes(content[:8], "little")
     refused = 0
@@ -108,48 +92,31 @@ def save_as(path: Path, weights: QNetwork, /, **changes: object) -> None:
     path.write_bytes(content)
 
 
-@pytest.mark.parametrize(
-    ("changes", "named"),
-    [
-        ({"network": "resnet"}, "resnet"),
-        ({"move_rule": "flying"}, "flying"),
-        ({"sizes": {"height": 4, "width": 5, "filters": 10**9}}, "filters is 1000000000"),
-        ({"sizes": {"height": 4, "width": 5, "filters": 0}}, "filters is 0"),
-        ({"sizes": {**METADATA.sizes, "hidden_units": -1}}, "hidden_units is -1"),
-        ({"sizes": {**METADATA.sizes, "hidden_units": 3}}, "holds tensors"),
-        ({"sizes": {"height": 6, "width": 5, "filters": 2}}, "holds tensors"),
-        ({"extra": 1}, "extra"),
-        ({"sizes": {"height": 4, "width": 5, "filters": 2, "depth": 1}}, "depth"),
-        ({"sizes": []}, r"sizes is \[\]; it must be dict"),
-        ({"gamma": "high"}, "gamma is 'high'; it must be float or int"),
-        ({"gamma": float("nan")}, "gamma is nan"),
-        ({"steps": 1.5}, r"steps is 1\.5"),
-        ({"seed": MISSING}, r"metadata is wrong .*\['seed'\]"),
-    ],
-)
-def test_wrong_metadata_is_refused_by_name(
-    tmp_path: Path, network: QNetwork, changes: dict[str, object], named: str
-) -> None:
+def test_wrong_metadata_is_refused_by_name(tmp_path: Path, network: QNetwork) -> None:
     path = tmp_path / "model.safetensors"
-    save_as(path, network, **changes)
-    with pytest.raises(ModelFileError, match=named):
-        load_model(path)
+    for name, value, named in (
+        *(("network", "resnet", "resnet"), ("move_rule", "flying", "flying")),
+        *(("extra", 1, "extra"), ("sizes", {**OLD, "depth": 1}, "depth")),
+        *(("sizes", {**OLD, "filters": n}, f"filters is {n}") for n in (10**9, 0)),
+        ("sizes", {**OLD, "hidden_units": -1}, "hidden_units is -1"),
+        *(("sizes", {**OLD, key: 6}, "holds tensors") for key in ("hidden_units", "height")),
+        ("sizes", [], r"sizes is \[\]; it must be dict"),
+        ("gamma", "high", "gamma is 'high'; it must be float or int"),
+        *(("gamma", float("nan"), "gamma is nan"), ("steps", 1.5, r"steps is 1\.5")),
+        ("seed", MISSING, r"metadata is wrong .*\['seed'\]"),
+    ):
+        save_as(path, network, **{name: value})
+        with pytest.raises(ModelFileError, match=named):
+            load_model(path)
 
 
-JSON_VALUES = st.recursive(
-    st.none() | st.booleans() | st.integers() | st.floats() | st.text(),
-    lambda values: st.lists(values) | st.dictionaries(st.text(), values),
-    max_leaves=8,
-)
+JSON = json_values(st.none() | st.booleans() | st.integers() | st.floats() | st.text())
+SIZES = st.dictionaries(st.sampled_from(["height", "width", "filters"]), JSON)
+CHANGES = st.dictionaries(st.sampled_from([*asdict(METADATA)]) | st.text(), JSON, min_size=1)
 
 
 @same_folder
-@given(
-    st.dictionaries(st.sampled_from([*asdict(METADATA)]) | st.text(), JSON_VALUES, min_size=1)
-    | st.fixed_dictionaries(
-        {"sizes": st.dictionaries(st.sampled_from(["height", "width", "filters"]), JSON_VALUES)}
-    )
-)
+@given(CHANGES | st.fixed_dictionaries({"sizes": SIZES}))
 def test_any_metadata_is_a_models_or_refused(tmp_path: Path, changes: dict[str, Any]) -> None:
     path = tmp_path / "model.safetensors"
     save_as(path, random_network("paper", **METADATA.sizes), **changes)
@@ -165,10 +132,8 @@ def test_a_file_of_something_else_is_refused(tmp_path: Path) -> None:
     texts = ("", "null", "[1, 2", "[" * 10**5, "7", "{}", "1" * 5000)
     contents = [safetensors.numpy.save(tensors, {"ddqn_planner": text}) for text in texts]
     for content, refusal in (
-        *(
-            (pickle.dumps(tensors), "another kind"),
-            (safetensors.numpy.save(tensors), "no model of"),
-        ),
+        (pickle.dumps(tensors), "another kind"),
+        (safetensors.numpy.save(tensors), "no model of"),
         *((content, "metadata is wrong") for content in contents),
     ):
         path.write_bytes(content)
@@ -190,14 +155,11 @@ def test_wrong_tensors_and_weights_are_refused(model_path: Path, network: QNetwo
                 load_model(model_path)
 
 
+NAMES, SEEDS = st.sampled_from(["any_map", "propagation"]), st.integers(0, 2**32 - 1)
+
+
 @same_folder
-@given(
-    grids_with_costs(),
-    st.sampled_from(["any_map", "propagation"]),
-    st.sampled_from(MoveRule),
-    st.integers(0, 2**32 - 1),
-    st.floats(-30, 38),
-)
+@given(grids_with_costs(), NAMES, RULES, SEEDS, st.floats(-30, 38))
 def test_whatever_finite_weights_say_each_q_is_a_length_or_no_way(
     tmp_path: Path, place: Place, kind: str, rule: MoveRule, seed: int, exponent: float
 ) -> None:

@@ -7,26 +7,14 @@ from networks import random_network
 from strategies import Place, grids_with_costs, grids_with_free_cell
 
 from ddqn_planner.grid import OCCUPIED, Cell, GridMap, MoveRule
-from ddqn_planner.model import NETWORKS, networks
+from ddqn_planner.model import NETWORKS, AnyMapQNetwork, PropagationQNetwork, networks
 from ddqn_planner.model.move_costs import patches, unique_patches
-from ddqn_planner.model.networks import (
-    FREE,
-    GOAL,
-    OBSTACLE,
-    ROBOT,
-    AnyMapQNetwork,
-    PropagationQNetwork,
-    observation_background,
-    observe,
-)
+from ddqn_planner.model.networks import FREE, GOAL, OBSTACLE, ROBOT, observation_background, observe
 from ddqn_planner.planning.field import network_field
 from ddqn_planner.training.networks import MODULES, AnyMapModule, PaperModule
 
-SIZES = {
-    "paper": {"height": 5, "width": 8, "filters": 3, "hidden_units": 6},
-    "propagation": {"filters": 3},
-    "any_map": {"filters": 3},
-}
+SIZES = {name: {"filters": 3} for name in ("propagation", "any_map")}
+SIZES["paper"] = {"height": 5, "width": 8, "filters": 3, "hidden_units": 6}
 
 
 @pytest.mark.parametrize("name", NETWORKS)
@@ -78,9 +66,6 @@ def test_propagation_networks_answer_as_modules(place: Place, rule: MoveRule, se
             np.testing.assert_allclose(answer, expected, rtol=1e-5, atol=1e-5)
 
 
-# What they observe
-
-
 @given(grids_with_free_cell())
 def test_the_observation_shows_four_kinds_of_cell(place: Place) -> None:
     grid, goal = place
@@ -118,9 +103,6 @@ def test_the_features_tell_obstacles_costs_unknown_cells_and_the_rule_apart() ->
     assert features[18:27].tolist() == [1, 0, 0, 0, 0, 0, 0, 0, 0]
     assert features[27] == 0
     assert AnyMapQNetwork.features(patch, MoveRule.CORNER_CUTTING)[0, 27] == 1
-
-
-# The networks for maps of any size
 
 
 def answering(name: str, success: float, multiplier: float = 1.0) -> PropagationQNetwork:

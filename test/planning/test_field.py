@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as numpy_st
 from networks import ANY_MAP, new_planner
 from random_maps import generate_map
-from strategies import GRIDS, RULES, Place, cells_of
+from strategies import GRIDS, RULES, Data, Place, cells_of
 
 from ddqn_planner import GridMap, MoveRule, PlanStatus
 from ddqn_planner.grid import Cell, copies, grid_map
@@ -40,7 +40,7 @@ def assert_same(field: Any, fresh: Any) -> None:
 
 
 @given(st.integers(2, 40), st.integers(2, 40), st.data())
-def test_a_straight_rollout_keeps_to_the_line(width: int, height: int, data: st.DataObject) -> None:
+def test_a_straight_rollout_keeps_to_the_line(width: int, height: int, data: Data) -> None:
     grid = GridMap(np.zeros((height, width), np.bool_))
     start, goal = data.draw(cells_of(grid)), data.draw(cells_of(grid))
     path = fresh_field(grid, goal, MoveRule.ROBOT_SAFE).rollout(start, straight=True).path
@@ -49,7 +49,7 @@ def test_a_straight_rollout_keeps_to_the_line(width: int, height: int, data: st.
 
 
 @given(GRIDS, RULES, st.data())
-def test_no_path_depends_on_the_past(place: Place, rule: MoveRule, data: st.DataObject) -> None:
+def test_no_path_depends_on_the_past(place: Place, rule: MoveRule, data: Data) -> None:
     grid, goal = place
     grown, whole = fresh_field(grid, goal, rule), fresh_field(grid, goal, rule)
     _ = whole.value
@@ -99,14 +99,10 @@ def test_a_request_visits_few_cells_of_a_large_map() -> None:
     assert np.count_nonzero(field.known.distance) < 0.6 * occupancy.size
 
 
-PATCH_IDS = numpy_st.arrays(
-    np.int32,
-    numpy_st.array_shapes(min_dims=2, max_dims=2, min_side=1, max_side=9),
-    elements=st.integers(0, 3),
-)
-COSTS = numpy_st.arrays(
-    np.float32, (4, 8), elements=st.floats(1, 20, width=32) | st.just(float("inf"))
-)
+SHAPES = numpy_st.array_shapes(min_dims=2, max_dims=2, min_side=1, max_side=9)
+PATCH_IDS = numpy_st.arrays(np.int32, SHAPES, elements=st.integers(0, 3))
+LENGTHS = st.floats(1, 20, width=32) | st.just(float("inf"))
+COSTS = numpy_st.arrays(np.float32, (4, 8), elements=LENGTHS)
 
 
 def propagate_values(patch_id: np.ndarray, cost_PA: np.ndarray, goal: Cell) -> np.ndarray:
@@ -118,9 +114,7 @@ def propagate_values(patch_id: np.ndarray, cost_PA: np.ndarray, goal: Cell) -> n
 
 
 @given(PATCH_IDS, COSTS, st.data())
-def test_q_meets_bellmans_equation_whatever_the_costs(
-    patch_id: np.ndarray, cost: np.ndarray, data: st.DataObject
-) -> None:
+def test_q_meets_bellmans_equation(patch_id: np.ndarray, cost: np.ndarray, data: Data) -> None:
     height, width = patch_id.shape
     goal = data.draw(cells_of(GridMap(np.zeros(patch_id.shape))))
     q = propagate_values(patch_id, cost, goal)
@@ -170,9 +164,6 @@ def test_a_map_may_hold_all_sets_of_directions(classes: int) -> None:
     np.testing.assert_allclose(-value, exact, rtol=1e-2)
 
 
-# Repair
-
-
 @pytest.fixture(autouse=True)
 def any_share(monkeypatch: pytest.MonkeyPatch) -> None:
     """Repair the small maps of these tests, however much of them changes."""
@@ -204,22 +195,19 @@ def changed_maps(draw: st.DrawFn, grid: GridMap) -> GridMap:
     if grid.width + left + right < 1 or grid.height + below + above < 1:
         left = right = below = above = 1
 
-    def cut(array: np.ndarray | None) -> Any:
-        if array is None:
-            return None
-        height, width = array.shape
-        return np.pad(array, 3)[3 - below : 3 + height + above, 3 - left : 3 + width + right]
-
+    rows = slice(3 - below, 3 + grid.height + above)
+    columns = slice(3 - left, 3 + grid.width + right)
+    layers = (grid.occupancy, grid.cost, grid.forbidden)
+    cut = [None if array is None else np.pad(array, 3)[rows, columns] for array in layers]
     moved = np.subtract(grid.cell_to_world((-left, -below)), grid.cell_to_world((0, 0)))
     origin = (*(grid.origin[:2] + moved).tolist(), grid.origin[2])
-    layers = cut(grid.cost), None, cut(grid.forbidden)
-    return GridMap(cut(grid.occupancy), grid.resolution, origin, *layers)
+    return GridMap(cut[0], grid.resolution, origin, cut[1], None, cut[2])
 
 
 @settings(max_examples=400)
 @given(GRIDS, RULES, st.floats(0, 6), st.integers(1, 4), st.data())
-def test_a_repaired_field_is_a_fresh_one_bit_for_bit(
-    place: Place, rule: MoveRule, yaw: float, changes: int, data: st.DataObject
+def test_a_repaired_field_is_a_fresh_one(
+    place: Place, rule: MoveRule, yaw: float, changes: int, data: Data
 ) -> None:
     plain, goal = place
     goals = [goal, *data.draw(st.lists(st.sampled_from(plain.free_cells()), max_size=2))]
@@ -245,7 +233,7 @@ def test_a_repaired_field_is_a_fresh_one_bit_for_bit(
 
 @settings(max_examples=150)
 @given(GRIDS, RULES, st.data())
-def test_a_map_made_of_others_is_as_new(place: Place, rule: MoveRule, data: st.DataObject) -> None:
+def test_a_map_made_of_others_is_as_new(place: Place, rule: MoveRule, data: Data) -> None:
     maps, planner = [place[0]], new_planner()
     for seed in range(data.draw(st.integers(1, 8))):
         grid = data.draw(st.sampled_from(maps))
@@ -326,19 +314,20 @@ def test_a_repair_that_takes_too_long_leaves_the_older_field_as_it_was() -> None
 @settings(max_examples=150)
 @given(GRIDS, RULES, st.booleans(), st.integers(0, 2), st.integers(1, 1500), st.data())
 def test_a_field_that_is_interrupted_anywhere_is_as_a_new_one(
-    place: Place, rule: MoveRule, whole: bool, interrupted_step: int, line: int, data: st.DataObject
+    place: Place, rule: MoveRule, whole: bool, interrupted_step: int, line: int, data: Data
 ) -> None:
     grid, goal = place
     planner, start = new_planner(), data.draw(st.sampled_from(grid.free_cells()))
     x, y = data.draw(st.sampled_from(grid.free_cells()))
     changed = grid.with_patch([[(x, y) != goal]], x, y)
     older = planner.q_field(grid, goal, rule)
-    steps = [
-        lambda: older.value if whole else older.rollout(start),
-        lambda: planner.q_field(changed, goal, rule),
-        lambda: planner.plan(changed, start, goal, rule),
-    ]
-    for number, step in enumerate(steps):
+    for number, step in enumerate(
+        (
+            lambda: older.value if whole else older.rollout(start),
+            lambda: planner.q_field(changed, goal, rule),
+            lambda: planner.plan(changed, start, goal, rule),
+        )
+    ):
         if number == interrupted_step:
             run_until(line, step)
         step()
@@ -407,20 +396,12 @@ def test_threads_share_a_planner_while_the_map_changes() -> None:
     for _ in range(5):
         x, y = random.integers(0, 58, 2).tolist()
         maps.append(maps[-1].with_patch(random.random((2, 2)) < 0.5, x, y))
-    expected = {
-        (number, request): new_planner().plan(changed, *request)
-        for number, changed in enumerate(maps)
-        for request in requests
-    }
-    planner = new_planner()
+    asked = [(changed, *request) for changed in maps for request in requests]
+    expected, planner = [new_planner().plan(*request) for request in asked], new_planner()
 
     def count_wrong(seed: int) -> int:
-        order, wrong = np.random.default_rng(seed), 0
-        for _ in range(100):
-            number = int(order.integers(len(maps)))
-            request = requests[int(order.integers(len(requests)))]
-            wrong += planner.plan(maps[number], *request) != expected[number, request]
-        return wrong
+        order = np.random.default_rng(seed).integers(len(asked), size=100).tolist()
+        return sum(planner.plan(*asked[number]) != expected[number] for number in order)
 
     with ThreadPoolExecutor(4) as threads:
         assert list(threads.map(count_wrong, range(4))) == [0, 0, 0, 0]

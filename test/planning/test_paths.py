@@ -1,30 +1,45 @@
 """Parts of paths: what is left of a path, and what is kept of it."""
 
+import heapq
 import math
+from collections.abc import Sequence
 from fractions import Fraction
 from itertools import pairwise
 from typing import Any
 
 import numpy as np
 import pytest
-from exact_segments import is_legal
+from exact_segments import exact_cost, is_legal
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as numpy_st
-from strategies import GRIDS, RULES, Place, cells_of, grids_with_costs
+from networks import ANY_MAP
+from strategies import (
+    GRIDS,
+    RULES,
+    Data,
+    Place,
+    cells_of,
+    grids_with_costs,
+    grids_with_directions,
+    grids_with_free_cell,
+)
 
-from ddqn_planner import GridMap, MoveRule, simplify
-from ddqn_planner.grid import MOVES, Cell, legal_moves, path_cost, shortest_distances, shortest_path
+from ddqn_planner import GridMap, MoveRule, PlanStatus, inflate, simplify
+from ddqn_planner.grid import (
+    MOVES,
+    Cell,
+    legal_moves,
+    path_cost,
+    path_length,
+    shortest_distances,
+    shortest_path,
+)
 from ddqn_planner.grid.moves import cells_along
 from ddqn_planner.planning import PlanRequest
-from ddqn_planner.planning.paths import (
-    REACH,
-    is_path_valid,
-    keep_or_switch,
-    legal_segments,
-    rest_of_path,
-    search,
-)
+from ddqn_planner.planning.paths import REACH, is_path_valid, keep_or_switch, rest_of_path, search
+from ddqn_planner.planning.planner import last_step
+from ddqn_planner.planning.segments import cost_along, legal_segments
 
 
 @st.composite
@@ -49,23 +64,20 @@ def cells_with_positions(path: list[Cell]) -> list[tuple[Cell, Fraction]]:
         vector = [b - a for a, b in zip(first, last, strict=True)]
         steps = max(map(abs, vector))
         for step in range(steps):
-            x, y = (
-                math.floor(a + Fraction(step * by, steps) + Fraction(1, 2))
-                for a, by in zip(first, vector, strict=True)
-            )
+            at = (a + Fraction(step * by, steps) for a, by in zip(first, vector, strict=True))
+            x, y = (math.floor(each + Fraction(1, 2)) for each in at)
             passed.append(((x, y), number + Fraction(step, steps)))
     return [*passed, (path[-1], Fraction(len(path) - 1))]
 
 
-def drawn_path(data: st.DataObject, grid: GridMap, goal: Cell, rule: MoveRule) -> list[Cell]:
-    """A shortest path from one of the cells that have one."""
+def drawn_path(data: Data, grid: GridMap, goal: Cell, rule: MoveRule) -> list[Cell]:
     path = list(shortest_path(grid, data.draw(st.sampled_from(grid.free_cells())), goal, rule))
     assume(path)
     return path
 
 
 @given(GRIDS, RULES, st.data())
-def test_legal_segments_touch_free_cells(place: Place, rule: MoveRule, data: st.DataObject) -> None:
+def test_legal_segments_touch_free_cells(place: Place, rule: MoveRule, data: Data) -> None:
     grid, _ = place
     cell = st.tuples(st.integers(-1, grid.width), st.integers(-1, grid.height))
     path = data.draw(st.lists(cell, min_size=1, max_size=6))
@@ -76,7 +88,7 @@ def test_legal_segments_touch_free_cells(place: Place, rule: MoveRule, data: st.
 
 
 @given(GRIDS, RULES, st.data())
-def test_a_path_is_valid_by_its_rest(place: Place, rule: MoveRule, data: st.DataObject) -> None:
+def test_a_path_is_valid_by_its_rest(place: Place, rule: MoveRule, data: Data) -> None:
     grid, goal = place
     path = drawn_path(data, grid, goal, rule)
     path = data.draw(st.sampled_from([path, [*simplify(path, grid, rule)]]))
@@ -92,17 +104,27 @@ def test_a_path_is_valid_by_its_rest(place: Place, rule: MoveRule, data: st.Data
     assert is_path_valid(path, robot, grid, rule)
 
 
+def test_what_lies_behind_a_robot_on_a_segment_does_not_count() -> None:
+    grid, path, rule = GridMap(np.zeros((9, 31))), [(0, 2), (15, 5), (30, 7)], "robot_safe"
+    for blocked, is_free in (((2, 2), True), ((12, 4), False), ((24, 6), False)):
+        after = grid.with_patch([[True]], *blocked)
+        assert is_path_valid(path, (5, 3), after, rule) == is_free
+        assert (len(rest_of_path(path, (5, 3), after, rule)) > 0) == is_free
+
+
 def test_a_path_of_which_only_an_occupied_end_or_nothing_is_left_is_not_valid() -> None:
     grid, path = GridMap(np.zeros((1, 9))), [(0, 0), (1, 0), (2, 0)]
+    closed = grid.with_patch([[True]], 2, 0)
+    assert not len(rest_of_path(path, (2, 0), closed, "robot_safe"))
     for robot in ((9, 0), (2, 5)):  # off the map, so that its own cell does not count
         assert is_path_valid(path, robot, grid, "robot_safe")
-        assert not is_path_valid(path, robot, grid.with_patch([[True]], 2, 0), "robot_safe")
+        assert not is_path_valid(path, robot, closed, "robot_safe")
     assert not is_path_valid([], (0, 0), grid, "robot_safe")
     assert not len(rest_of_path([], (0, 0), grid, "robot_safe"))
 
 
 @given(GRIDS, RULES, st.data())
-def test_the_rest_of_a_path_leads_to_it(place: Place, rule: MoveRule, data: st.DataObject) -> None:
+def test_the_rest_of_a_path_leads_to_it(place: Place, rule: MoveRule, data: Data) -> None:
     grid, goal = place
     path = drawn_path(data, grid, goal, rule)
     after = data.draw(changed(grid))
@@ -155,9 +177,7 @@ def cost_of(path: Any, grid: GridMap, rule: MoveRule) -> float:
 
 @settings(max_examples=300)
 @given(GRIDS, RULES, st.sampled_from([0.0, 0.03, 0.3, 10.0]), st.data())
-def test_what_is_kept_is_legal_and_costs_at_most_the_threshold_more(
-    place: Place, rule: MoveRule, threshold: float, data: st.DataObject
-) -> None:
+def test_what_is_kept_is_cheap(place: Place, rule: MoveRule, threshold: float, data: Data) -> None:
     grid, goal = place
     start = data.draw(st.sampled_from(grid.free_cells()))
     under_way = shortest_path(grid, start, goal, rule)
@@ -184,12 +204,11 @@ def test_what_is_kept_is_legal_and_costs_at_most_the_threshold_more(
 
 
 @given(grids_with_costs(), RULES, st.data())
-def test_a_search_finds_any_legal_path(place: Place, rule: MoveRule, data: st.DataObject) -> None:
+def test_a_search_finds_any_legal_path(place: Place, rule: MoveRule, data: Data) -> None:
     grid, goal = place
     start = data.draw(st.sampled_from(grid.free_cells()))
-    value = data.draw(
-        numpy_st.arrays(np.float32, grid.occupancy.shape, elements=st.floats(width=32))
-    )
+    shape, values = grid.occupancy.shape, st.floats(width=32)
+    value = data.draw(numpy_st.arrays(np.float32, shape, elements=values))
     legal = legal_moves(grid.occupancy, rule)
     distances = shortest_distances(grid, goal, rule)
 
@@ -217,3 +236,222 @@ def test_a_search_follows_the_values_even_on_a_detour() -> None:
     legal = legal_moves(grid.occupancy, rule)
     assert set(search((0, 0), (4, 0), legal, grid.cost_multiplier, rule, value)) <= set(detour)
     assert len(search((0, 0), (4, 0), legal, grid.cost_multiplier, rule)) == 5
+
+
+@settings(max_examples=300)
+@given(GRIDS, RULES, st.data())
+def test_segments_are_as_their_cells_are(place: Place, rule: MoveRule, data: Data) -> None:
+    grid, first = place
+    far = min(grid.width - first[0], grid.height - first[1]) - 1
+    diagonal = st.integers(0, far).map(lambda by: (first[0] + by, first[1] + by))
+    last = data.draw(cells_of(grid) | diagonal, label="last")
+    begin = data.draw(st.sampled_from([0.0, 0.0, 0.25, 0.625]), label="begin")
+    (legal,) = legal_segments(np.array([first, last]), grid, rule, begin)
+    assert legal == is_legal(first, last, grid, rule, Fraction(begin))
+    exact = exact_cost(first, last, grid, rule)
+    assert cost_along(np.array([first, last]), grid, rule) == pytest.approx(exact)
+    if max(abs(last[0] - first[0]), abs(last[1] - first[1])) == 1:
+        cells = [first, last]
+        assert path_cost(cells, grid.multipliers(cells), rule) == pytest.approx(exact)
+
+
+def check_simplified(path: list[Cell], grid: GridMap, rule: MoveRule) -> tuple[Cell, ...]:
+    """Check that all segments are legal, and cost no more than what they replace."""
+    simple = simplify(path, grid, rule)
+    assert simple[:1] + simple[-1:] == (*path[:1], *path[-1:])
+    assert len(simple) <= len(path)
+    assert all(is_legal(*segment, grid, rule) for segment in pairwise(simple))
+    replaced, cost = (
+        sum(exact_cost(*segment, grid, rule) for segment in pairwise(cells))
+        for cells in (path, simple)
+    )
+    assert cost <= replaced * (1 + 1e-8)
+    return simple
+
+
+def check_corners(path: Sequence[Cell], grid: GridMap, rule: MoveRule) -> None:
+    """Check that no corner can be left out, or moved by a cell at less cost."""
+    for before, (x, y), after in zip(path, path[1:], path[2:], strict=False):
+        cost = sum(exact_cost(*pair, grid, rule) for pair in ((before, (x, y)), ((x, y), after)))
+        others = [(before, (x + dx, y + dy), after) for dx, dy in MOVES.tolist()]
+        for cells in [(before, after), *(cells for cells in others if grid.contains(cells[1]))]:
+            if all(is_legal(*segment, grid, rule) for segment in pairwise(cells)):
+                new_cost = sum(exact_cost(*segment, grid, rule) for segment in pairwise(cells))
+                assert new_cost > cost * (1 + 1e-10 if len(cells) == 2 else 1 - 1e-8)
+
+
+@settings(max_examples=300)
+@given(GRIDS, RULES, st.data())
+def test_a_simplified_path_costs_no_more(place: Place, rule: MoveRule, data: Data) -> None:
+    grid, goal = place
+    path = shortest_path(grid, data.draw(st.sampled_from(grid.free_cells())), goal, rule)
+    simple = check_simplified([*check_simplified(path, grid, rule)], grid, rule)
+    check_corners(simple, grid, rule)
+    if not grid.has_costs:
+        assert path_length(simple, rule) <= path_length(path, rule) + 1e-9
+
+
+def test_a_path_turns_at_the_corner_and_not_behind_it() -> None:
+    grid, rule = GridMap(np.zeros((30, 30))).with_patch(np.ones((20, 20)), 0, 0), "robot_safe"
+    path = [(0, 20), *((x, 20) for x in range(1, 21)), *((20, y) for y in range(19, -1, -1))]
+    for cells in (path, path[::-1]):
+        assert simplify(cells, grid, rule) == (cells[0], (20, 20), cells[-1])
+    wide = [*((x, 25) for x in range(26)), *((25, y) for y in range(24, -1, -1))]
+    least = path_length([(0, 25), (20, 20), (25, 0)])
+    for cells in (wide, wide[::-1]):
+        assert path_length(simplify(cells, grid, rule)) < 1.03 * least
+
+
+def test_the_better_one_is_taken_of_the_path_pulled_from_its_start_and_from_its_end() -> None:
+    rule, lengths = MoveRule.ROBOT_SAFE, {}
+    for seed in (2, 5, 10):
+        grid = GridMap(np.random.default_rng(seed).random((30, 30)) < 0.15)
+        for y in (5, 25):
+            simple = simplify(shortest_path(grid, (0, y), (29, 29 - y), rule), grid, rule)
+            check_corners(simple, grid, rule)
+            lengths[seed, y] = path_length(simple)
+    assert lengths[5, 5] < 36.7  # from the start alone, 37.1
+
+
+def test_segments_are_as_long_as_can_be() -> None:
+    rule = MoveRule.ROBOT_SAFE
+    grid = GridMap(np.zeros((40, 90)))
+    assert simplify(shortest_path(grid, (2, 5), (80, 31), rule), grid, rule) == ((2, 5), (80, 31))
+    assert simplify([], grid, rule) == ()
+    assert simplify([(1, 1)], grid, rule) == ((1, 1),)
+    diagonal = [(x, x) for x in range(9)]
+    assert simplify(diagonal, grid, MoveRule.UNIT) == ((0, 0), (8, 8))
+
+
+ACTIONS = [(1, 0), (1, 1), (0, 1), (-1, 1), (-1, 0), (-1, -1), (0, -1), (1, -1)]
+BODIES = st.sampled_from([0, 1.1, 1.5, 2.1])
+RADII = st.sampled_from([0, 0.5, 1, 1.5, 2, 3, math.inf])
+Cells = set[Cell]
+
+
+def moves(cell: Cell, allowed: Cells, grid: GridMap, rule: MoveRule) -> list[tuple[Cell, float]]:
+    """The cells that one move leads to, within some, and the length of each."""
+    (x, y), found = cell, []
+    for action, (dx, dy) in enumerate(ACTIONS):
+        past_corner = dx and dy and not {(x + dx, y), (x, y + dy)} <= allowed
+        is_forbidden = grid.forbidden is not None and int(grid.forbidden[y, x]) >> action & 1
+        if is_forbidden or (rule is MoveRule.ROBOT_SAFE and past_corner):
+            continue
+        if (x + dx, y + dy) in allowed:
+            length = 1.0 if rule is MoveRule.UNIT else math.hypot(dx, dy)
+            found.append(((x + dx, y + dy), length))
+    return found
+
+
+def lengths_from(
+    start: Cell, allowed: Cells, grid: GridMap, rule: MoveRule, ends: Cells
+) -> dict[Cell, float]:
+    """The lengths of the shortest ways to the ends, each of which stops a way."""
+    lengths: dict[Cell, float] = {}
+    waiting = [(0.0, start)]
+    while waiting:
+        length, cell = heapq.heappop(waiting)
+        if cell in lengths:
+            continue
+        lengths[cell] = length
+        if cell not in ends:
+            for after, more in moves(cell, allowed, grid, rule):
+                heapq.heappush(waiting, (length + more, after))
+    return {cell: length for cell, length in lengths.items() if cell in ends}
+
+
+@settings(max_examples=300)
+@given(grids_with_free_cell() | grids_with_directions(), RULES, BODIES, RADII, st.data())
+def test_a_start_that_is_not_free_is_left_by_the_shortest_way(
+    place: Place, rule: MoveRule, robot_radius: float, clearing_radius: float, data: Data
+) -> None:
+    plain, some_cell = place
+    grid = inflate(plain, robot_radius)
+    cells = [(x, y) for y in range(grid.height) for x in range(grid.width)]
+    free = {cell for cell in cells if not grid.occupancy[cell[::-1]]}
+    obstacles = {cell for cell in cells if plain.occupancy[cell[::-1]]}
+    blocked = sorted({*cells} - free) or cells
+    start = data.draw(st.sampled_from(blocked) | st.sampled_from(cells), label="start")
+    goal = data.draw(st.sampled_from(sorted(free) or [some_cell]), label="goal")
+    plan = ANY_MAP.plan(grid, start, goal, rule, start_clearing_radius=clearing_radius)
+    if start in obstacles and clearing_radius == 0:
+        assert plan.status is PlanStatus.START_OCCUPIED
+        return
+    if start in free:
+        assert plan == ANY_MAP.plan(grid, start, goal, rule)
+        return
+    if goal not in free:
+        assert plan.status is PlanStatus.GOAL_OCCUPIED
+        return
+    near = {cell for cell in obstacles if math.dist(cell, start) <= clearing_radius}
+    closed = obstacles - near if start in obstacles else obstacles
+    joined = {cell for cell in free if lengths_from(cell, free, grid, rule, {goal})}
+    allowed = {cell for cell in cells if cell in joined or cell not in free | closed}
+    ways = lengths_from(start, allowed, grid, rule, joined)
+    if not ways:
+        leaves = lengths_from(start, {*cells} - closed, grid, rule, free)
+        stuck = start in obstacles and not leaves
+        assert plan.status is (PlanStatus.START_OCCUPIED if stuck else PlanStatus.NO_PATH)
+        return
+    number = next(index for index, cell in enumerate(plan.cells) if cell in free)
+    way, rest = plan.cells[: number + 1], plan.cells[number:]
+    assert (way[0], rest[-1]) == (start, goal)
+    assert not closed & {*plan.cells}
+    for cell, after in pairwise(way):
+        assert after in dict(moves(cell, allowed, grid, rule))
+    shortest = min(ways.values())
+    assert path_length(way, rule) == pytest.approx(shortest)
+    tied = [end for end, length in ways.items() if length < shortest + 1e-6]
+    assert math.dist(way[-1], goal) == pytest.approx(min(math.dist(end, goal) for end in tied))
+    assert rest == ANY_MAP.plan(grid, way[-1], goal, rule).cells
+    assert is_path_valid(plan.cells, start, grid, rule, clearing_radius)
+    if start in obstacles:
+        assert not is_path_valid(plan.cells, start, grid, rule)
+        several = ANY_MAP.plan_nearest(grid, start, [goal], rule, "greedy", False, clearing_radius)
+        assert several.cells == plan.cells
+
+
+def test_a_path_that_leaves_is_valid_until_another_obstacle_lies_on_it() -> None:
+    occupancy = np.zeros((5, 12), dtype=bool)
+    occupancy[2, 2:5] = True
+    grid = GridMap(occupancy)
+    path = [(x, 2) for x in range(2, 12)]
+    blocked = grid.with_patch([[True]], 8, 2)
+    for part, robot, each, radius, is_valid in (
+        *((path, (4, 2), grid, 1, True), (path, (2, 2), grid, 2, True)),
+        (path, (2, 2), grid, 1, False),  # its third cell is beyond
+        (path[:3], (2, 2), grid, 2, False),  # it leads nowhere
+        (path, (2, 2), blocked, 2, False),
+        (path, (1, 2), grid, 2, False),  # a robot beside the obstacle has to go round it
+    ):
+        assert is_path_valid(part, robot, each, "robot_safe", radius) == is_valid
+    only_west = np.full(occupancy.shape, 0b10000011, dtype=np.uint8)
+    only_west[:, 5:] = 0
+    one_way = GridMap(occupancy, forbidden=only_west)
+    assert not is_path_valid(path, (4, 2), one_way, "robot_safe", 1)
+    assert is_path_valid([(2, 2), (1, 2)], (2, 2), one_way, "robot_safe", 1)
+
+
+KEPT = [(2, 2)], True, [(2, 2), (2, 3), (3, 4), (4, 4)]  # the robot's cell alone: straight on
+LEFT = [(2, 2), (2, 3)], False, [(2, 2), (3, 2), (4, 3)]  # round the next cell
+
+
+@pytest.mark.parametrize(("blocked", "is_kept", "begin"), [KEPT, LEFT])
+def test_a_path_is_kept_on_a_way_out(blocked: list[Cell], is_kept: bool, begin: list[Cell]) -> None:
+    occupancy = np.zeros((6, 12), dtype=bool)
+    for x, y in blocked:
+        occupancy[y, x] = True
+    occupancy[2, 3] = is_kept  # so that there the way out leads north
+    under_way = [(0, 2), (1, 2), (2, 2), (2, 3), *((x, 4) for x in range(3, 12))]
+    options = {"under_way": under_way, "switch_threshold": 1.0, "start_clearing_radius": 0.5}
+    ends = (2, 2), (11, 4)
+    request = PlanRequest(GridMap(occupancy), *ends, MoveRule.ROBOT_SAFE, **options)
+    plan = last_step(ANY_MAP.steps(request))
+    assert plan.cells == (*begin, *under_way[6:])
+    assert (plan.extra_cost is not None) == is_kept
+
+
+def test_a_way_out_does_not_cross_free_cells_from_which_no_path_leads_on() -> None:
+    grid = GridMap(np.array([[0, 1, 0, 1]]), obstacles=np.zeros((1, 4), dtype=bool))
+    assert ANY_MAP.plan(grid, (3, 0), (0, 0)).status is PlanStatus.NO_PATH
+    assert ANY_MAP.plan(grid, (3, 0), (2, 0)).cells == ((3, 0), (2, 0))

@@ -1,22 +1,26 @@
 """Plans against exact oracles: on maps with costs, one-way zones and walls, by any network."""
 
 import gc
+import json
+import pickle
 import time
 import weakref
-from itertools import pairwise
+from dataclasses import FrozenInstanceError, replace
+from itertools import pairwise, product
 from typing import Any
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from networks import ANY_MAP, new_planner, random_network
-from strategies import GRIDS, RULES, Place, cells_of
+from networks import ANY_MAP, new_planner, random_network, turning_planner
+from strategies import GRIDS, RULES, Data, Place, cells_of
 
-from ddqn_planner import GridMap, MoveRule, inflate
+from ddqn_planner import GridMap, MoveRule, Plan, inflate
 from ddqn_planner.grid import MOVES, Cell, legal_moves, path_cost, path_length, shortest_distances
 from ddqn_planner.model import AnyMapQNetwork, ModelMetadata
 from ddqn_planner.planning import PlanMethod, Planner, PlanRequest, PlanStatus, QField, simplify
+from ddqn_planner.planning.field import DistanceField
 from ddqn_planner.planning.planner import last_step
 
 
@@ -54,8 +58,8 @@ def test_the_unmasked_rollout_is_trapped_by_the_first_illegal_move_that_it_prefe
 
 @settings(max_examples=200)
 @given(GRIDS, RULES, st.sampled_from(list(PlanMethod)), st.data())
-def test_a_plan_of_the_shipped_model_is_a_cheapest_path(
-    place: Place, rule: MoveRule, method: PlanMethod, data: st.DataObject
+def test_a_plan_is_the_cheapest(
+    place: Place, rule: MoveRule, method: PlanMethod, data: Data
 ) -> None:
     grid, goal = place
     exact, planner = shortest_distances(grid, goal, rule), new_planner()
@@ -84,9 +88,7 @@ def test_a_plan_of_the_shipped_model_is_a_cheapest_path(
 
 @settings(max_examples=200)
 @given(GRIDS, RULES, st.integers(0, 5), st.data())
-def test_whatever_the_network_says_moves_are_legal_and_a_search_finds_a_path(
-    place: Place, rule: MoveRule, seed: int, data: st.DataObject
-) -> None:
+def test_any_networks_moves_are_legal(place: Place, rule: MoveRule, seed: int, data: Data) -> None:
     grid, goal = place
     start = data.draw(st.sampled_from(grid.free_cells()))
     planner = random_planner(grid.height, grid.width, seed)
@@ -107,7 +109,7 @@ def test_whatever_the_network_says_moves_are_legal_and_a_search_finds_a_path(
         assert searched == greedy
 
 
-def test_a_request_off_the_free_cells_is_told_apart() -> None:
+def test_a_request_off_the_free_cells_or_on_a_map_of_another_size_is_told_apart() -> None:
     planner, grid = random_planner(3, 3, 0), GridMap(np.array([[0, 0, 0], [0, 1, 0], [0, 0, 0]]))
     for start, goal, status in (
         ((-1, 0), (2, 2), PlanStatus.START_OUTSIDE_MAP),
@@ -117,13 +119,10 @@ def test_a_request_off_the_free_cells_is_told_apart() -> None:
     ):
         plan = planner.plan(grid, start, goal, "unit")
         assert (plan.status, plan.goal, plan.move_rule) == (status, None, MoveRule.UNIT)
-
-
-def test_a_map_of_another_size_is_refused() -> None:
-    grid, planner = GridMap(np.zeros((4, 5))), random_planner(5, 4, 0)
-    assert planner.plan(grid, (0, 0), (1, 1)).status is PlanStatus.MAP_SIZE_UNSUPPORTED
+    larger = GridMap(np.zeros((4, 5)))
+    assert planner.plan(larger, (0, 0), (1, 1)).status is PlanStatus.MAP_SIZE_UNSUPPORTED
     with pytest.raises(ValueError, match="5 x 4"):
-        planner.q_field(grid, (1, 1))
+        planner.q_field(larger, (1, 1))
 
 
 def test_a_plan_tells_how_long_field_and_rollout_took(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -234,7 +233,7 @@ TOLERANCES = st.floats(0, 6) | st.integers(0, 36).map(np.sqrt)
 @settings(max_examples=400)
 @given(GRIDS, RULES, TOLERANCES, st.booleans(), st.data())
 def test_a_goal_moves_to_the_nearest_reachable_free_cell_within_the_tolerance(
-    place: Place, rule: MoveRule, tolerance: float, field_is_known: bool, data: st.DataObject
+    place: Place, rule: MoveRule, tolerance: float, field_is_known: bool, data: Data
 ) -> None:
     grid, start = place
     goal = data.draw(cells_of(grid), label="goal")
@@ -258,12 +257,10 @@ def test_a_goal_moves_to_the_nearest_reachable_free_cell_within_the_tolerance(
         assert quick == (tolerance < 1)
 
 
-@pytest.mark.parametrize(
-    ("tolerance", "cells"),
-    [(0.15 / 0.05, 3), (float(np.float32(0.7)) / float(np.float32(0.35)), 2), (2.99, 2), (1.0, 1)],
-)
-def test_a_tolerance_reaches_the_cells_that_its_metres_name(tolerance: float, cells: int) -> None:
-    for distance in range(1, 5):
+def test_a_tolerance_reaches_the_cells_that_its_metres_name() -> None:
+    single = float(np.float32(0.7)) / float(np.float32(0.35))
+    tolerances = {0.15 / 0.05: 3, single: 2, 2.99: 2, 1.0: 1}
+    for (tolerance, cells), distance in product(tolerances.items(), range(1, 5)):
         occupancy = np.zeros((1, 9), dtype=bool)
         occupancy[0, 9 - distance :] = True
         plan = ANY_MAP.plan(GridMap(occupancy), (0, 0), (8, 0), tolerance=tolerance)
@@ -283,3 +280,137 @@ def test_a_start_too_near_to_an_obstacle_finds_a_goal_that_is_cut_off() -> None:
             ANY_MAP.plan(grid, (1, 2), (11, 2), tolerance=tolerance)
     with pytest.raises(ValueError, match="start_clearing_radius is nan"):
         ANY_MAP.plan(grid, (1, 2), (11, 2), start_clearing_radius=np.nan)
+
+
+CELLS = ((0, 0), (1, 0), (2, 1))
+PLAN = Plan(PlanStatus.SUCCEEDED, np.array(CELLS), cost=2.5, goal=(2, 1), field_ms=1.0)
+
+
+def test_the_cells_of_a_plan_are_pairs_of_python_ints() -> None:
+    assert PLAN.cells == CELLS
+    assert json.loads(json.dumps(PLAN.cells)) == [[0, 0], [1, 0], [2, 1]]
+    assert PLAN.path.dtype == np.int32
+    assert PLAN.length == pytest.approx(1 + 2**0.5)
+    nothing = Plan(PlanStatus.NO_PATH)
+    assert (nothing.cells, nothing.path.shape, nothing.length) == ((), (0, 2), 0)
+    with pytest.raises(ValueError, match="read-only"):
+        PLAN.path[0, 0] = 5
+    with pytest.raises(FrozenInstanceError):
+        PLAN.cost = 1.0  # type: ignore[misc]
+    cells = np.array(CELLS, dtype=np.int32)
+    assert Plan(PlanStatus.SUCCEEDED, cells).cells == CELLS
+    cells[0, 0] = 5  # the array that was given stays writable
+
+
+def test_plans_are_equal_whatever_time_they_took() -> None:
+    assert Plan(PlanStatus.SUCCEEDED, np.array(CELLS), cost=2.5) != PLAN
+    for same in (replace(PLAN, field_ms=7.0, rollout_ms=2.0), pickle.loads(pickle.dumps(PLAN))):
+        assert same == PLAN
+        assert hash(same) == hash(PLAN)
+        assert same.cells == CELLS
+    shorter = replace(PLAN, path=np.array(CELLS[:2]))
+    assert shorter.cells == CELLS[:2]
+    others = replace(PLAN, cost=2.6), replace(PLAN, goal=(0, 0)), replace(PLAN, move_rule="unit")
+    for other in (shorter, replace(PLAN, status=PlanStatus.NO_PATH), *others, CELLS):
+        assert other != PLAN
+
+
+@settings(max_examples=300)
+@given(GRIDS, RULES, st.data())
+def test_the_nearest_goal_is_cheapest(place: Place, rule: MoveRule, data: Data) -> None:
+    grid, start = place
+    cells = cells_of(grid) | st.sampled_from([(-1, 0), (0, 99)])
+    goals = data.draw(st.lists(cells, min_size=1, max_size=4))
+    plan = new_planner().plan_nearest(grid, start, goals, rule)
+    free = [goal for goal in goals if grid.is_free(goal)]
+    optimum = [shortest_distances(grid, goal, rule)[start[::-1]] for goal in free]
+    if not any(map(grid.contains, goals)):
+        assert plan.status is PlanStatus.GOAL_OUTSIDE_MAP
+    elif not free:
+        assert plan.status is PlanStatus.GOAL_OCCUPIED
+    elif np.isinf(min(optimum)):
+        assert plan.status is PlanStatus.NO_PATH
+    else:
+        assert plan.goal == plan.cells[-1]
+        assert plan.goal in free
+        cost = plan.length if plan.cost is None else plan.cost
+        assert min(optimum) - 1e-9 <= cost <= 1.02 * min(optimum)
+        singles = [new_planner().plan(grid, start, goal, rule) for goal in free]
+        assert cost <= 1.02 * min(p.cost or p.length for p in singles if p.cells)
+
+
+@settings(max_examples=300)
+@given(GRIDS, RULES, st.data())
+def test_a_field_of_goals_is_the_best(place: Place, rule: MoveRule, data: Data) -> None:
+    grid, goal = place
+    more = data.draw(st.lists(st.sampled_from(grid.free_cells()), max_size=3))
+    goals = tuple(sorted({goal, *more}))
+    costs = ANY_MAP.network.move_costs(grid, rule)
+    assert costs is not None
+    field = DistanceField(goals, grid, costs, rule)
+    value = np.max([new_planner().q_field(grid, goal, rule).q for goal in goals], axis=0)
+    np.testing.assert_array_equal(field.q, value)
+    for x, y in goals:
+        assert field.value[y, x] == field.value.max()
+        assert field.policy[y, x] == -1
+    start = data.draw(st.sampled_from(grid.free_cells()))
+    whole = field.rollout(start)
+    assert DistanceField(goals, grid, costs, rule).rollout(start) == whole
+    if whole.cells:
+        assert set(whole.cells) & set(goals) == {whole.cells[-1]}
+
+
+def test_a_network_without_costs_plans_to_each_goal() -> None:
+    grid, planner, goals = GridMap(np.zeros((6, 6))), turning_planner(), [(5, 5), (0, 3)]
+    found = planner.plan_nearest(grid, (0, 0), goals, method=PlanMethod.ASTAR_FALLBACK)
+    assert found == planner.plan(grid, (0, 0), (0, 3), method=PlanMethod.ASTAR_FALLBACK)
+    assert planner.plan_nearest(grid, (0, 0), goals).status is PlanStatus.ROLLOUT_TRAPPED
+
+
+@pytest.mark.parametrize("has_costs", [True, False])
+def test_a_robot_between_two_docks_keeps_to_one_of_them(has_costs: bool) -> None:
+    planner = ANY_MAP if has_costs else turning_planner(21)
+    grid, left, right = GridMap(np.zeros((21, 21))), (0, 10), (20, 10)
+    request = PlanRequest(grid, (9, 10), left, MoveRule.ROBOT_SAFE, PlanMethod.ASTAR_FALLBACK)
+    first = last_step(planner.steps(replace(request, others=(right,))))
+    assert first.goal == left
+    request = replace(request, start=(11, 10), others=(right,), under_way=first.path)
+    kept = last_step(planner.steps(replace(request, switch_threshold=0.5)))
+    assert (kept.goal, kept.length) == (left, 11)
+    assert kept.extra_cost == pytest.approx(11 / 9 - 1)
+    assert last_step(planner.steps(replace(request, switch_threshold=0.2))).goal == right
+    taken = replace(request, grid=grid.with_patch([[True]], *left), switch_threshold=10.0)
+    assert last_step(planner.steps(taken)).goal == right
+
+
+@given(GRIDS, RULES, st.booleans(), st.sampled_from([0.0, 2.0]), st.data())
+def test_a_path_through_goals_is_the_sum_of_its_pieces(
+    place: Place, rule: MoveRule, simplified: bool, tolerance: float, data: Data
+) -> None:
+    grid, start = place
+    goals = data.draw(st.lists(cells_of(grid), min_size=1, max_size=4))
+    options: dict[str, Any] = {"tolerance": tolerance, "simplified": simplified}
+    plan = ANY_MAP.plan_through(grid, start, goals, rule, **options)
+    pieces, here = [], start
+    for goal in goals:
+        pieces.append(ANY_MAP.plan(grid, here, goal, rule, **options))
+        if pieces[-1].status is not PlanStatus.SUCCEEDED:
+            assert (plan.status, plan.goal, plan.cells) == (pieces[-1].status, goal, ())
+            return
+        here = pieces[-1].cells[-1]
+    cells = [cell for piece in pieces for cell in piece.cells]
+    assert list(plan.cells) == cells[:1] + [cell for last, cell in pairwise(cells) if last != cell]
+    assert plan.goal == here
+    assert plan.length == pytest.approx(sum(piece.length for piece in pieces))
+    assert (plan.cost is None) == (grid.cost is None)
+    if plan.cost is not None:
+        assert plan.cost == pytest.approx(sum(piece.cost or 0 for piece in pieces))
+
+
+def test_wrong_goals_are_named() -> None:
+    grid = GridMap(np.zeros((3, 3)))
+    for plan in (ANY_MAP.plan_nearest, ANY_MAP.plan_through):
+        with pytest.raises(ValueError, match="there is no goal; give at least one cell"):
+            plan(grid, (0, 0), [])
+        with pytest.raises(ValueError, match=r"goal 2 is .*; give two whole numbers"):
+            plan(grid, (0, 0), [(1, 1), (0.5, 1)])  # type: ignore[list-item]

@@ -42,11 +42,9 @@ def step_by_hand(
 @pytest.mark.parametrize("rule", MoveRule)
 @pytest.mark.parametrize("count", [1, 3])
 @pytest.mark.parametrize("reward", ["paper", "path_cost"])
-def test_the_batch_agrees_with_one_robot_moved_by_hand(
-    paper: Scenario, rule: MoveRule, count: int, reward: str
-) -> None:
-    weights = {"alpha": 0.7, "beta": 0.2}
-    parameters = replace(PARAMETERS, reward=reward, environments=count, **weights)
+def test_a_batch_moves_as_by_hand(paper: Scenario, rule: MoveRule, count: int, reward: str) -> None:
+    changes = {"reward": reward, "environments": count, "alpha": 0.7, "beta": 0.2}
+    parameters = replace(PARAMETERS, **changes)
     cost = np.random.default_rng(0).integers(0, 99, (20, 20))
     paper = replace(paper, grid=replace(paper.grid, cost=cost.astype(np.int8)), move_rule=rule)
     batch = GridVectorEnvironment([paper], MoveRule.ROBOT_SAFE, parameters)
@@ -125,9 +123,8 @@ def test_gymnasium_accepts_the_environment() -> None:
 
 
 def test_a_scenario_needs_two_free_cells(small: Scenario) -> None:
-    for *ends, named in (
-        *(((2, 0), (4, 0), "start"), ((0, 0), (5, 0), "goal"), ((0, 0), (0, 0), "different")),
-    ):
+    wrong = {"start": ((2, 0), (4, 0)), "goal": ((0, 0), (5, 0)), "different": ((0, 0), (0, 0))}
+    for named, ends in wrong.items():
         with pytest.raises(ValueError, match=named):
             Scenario(small.grid, *ends)
     other = Scenario(GridMap(np.zeros((2, 2))), (0, 0), (1, 1))

@@ -118,7 +118,7 @@ def test_a_folder_is_of_one_run_at_a_time(small: Scenario, tmp_path: Path) -> No
     assert len(finish(open_run(tmp_path, small))) == len(rows(tmp_path)) > 0
 
 
-def test_a_save_that_failed_is_tried_again_at_the_next_interval_and_not_before(
+def test_a_failed_save_is_tried_again_later(
     small: Scenario, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(run_module, "SAVE_INTERVAL", 100)
@@ -167,7 +167,7 @@ GOOD = b"1,9,0,reached_goal,2,2.0,1.5,0.75,0:0 1:0 2:0\r\n"
 
 
 @given(st.lists(st.binary() | st.sampled_from([GOOD, GOOD[:-9], GOOD.replace(b"1:0", b"1:")])))
-def test_only_the_complete_rows_of_a_broken_file_are_read(
+def test_complete_rows_of_a_broken_file_are_read(
     tmp_path_factory: pytest.TempPathFactory, lines: list[bytes]
 ) -> None:
     path = tmp_path_factory.mktemp("broken") / "episodes.csv"

@@ -1,7 +1,7 @@
 import json
-from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -10,11 +10,13 @@ from limits import memory_grows_less_than
 from safetensors import safe_open
 
 from ddqn_planner import GridMap, MoveRule, PlanStatus
+from ddqn_planner.grid import legal_moves
 from ddqn_planner.model import load_model
+from ddqn_planner.planning import QField
 from ddqn_planner.training.double_dqn import Transitions
 from ddqn_planner.training.environment import Scenario
 from ddqn_planner.training.episodes import Episode, EpisodeEnd
-from ddqn_planner.training.evaluation import evaluate
+from ddqn_planner.training.evaluation import evaluate, length_ratios
 from ddqn_planner.training.hyper_parameters import HyperParameters
 from ddqn_planner.training.trainer import CheckpointError, Trainer
 
@@ -31,12 +33,8 @@ def train(trainer: Trainer, until: int) -> list[Episode]:
     return [episode for finished in trainer.run(until) for episode in finished]
 
 
-def weights(trainer: Trainer) -> Iterator[torch.Tensor]:
-    return iter(trainer.network.state_dict().values())
-
-
-def same_weights(a: Trainer, b: Trainer) -> bool:
-    return all(torch.equal(x, y) for x, y in zip(weights(a), weights(b), strict=True))
+def same_weights(a: torch.nn.Module, b: torch.nn.Module) -> bool:
+    return all(map(torch.equal, a.state_dict().values(), b.state_dict().values()))
 
 
 @pytest.fixture(scope="module")
@@ -46,9 +44,7 @@ def trained(small: Scenario) -> tuple[Trainer, list[Episode]]:
     return trainer, train(trainer, 3000)
 
 
-def test_training_learns_the_path_around_a_wall(
-    trained: tuple[Trainer, list[Episode]], small: Scenario
-) -> None:
+def test_training_learns_a_path(trained: Any, small: Scenario) -> None:
     field = trained[0].planner().q_field(small.grid, small.goal)
     evaluation = evaluate(field, small.grid, MoveRule.ROBOT_SAFE)
     assert evaluation.solved == evaluation.starts
@@ -58,9 +54,7 @@ def test_training_learns_the_path_around_a_wall(
     assert field.q[0, 1, 4] == pytest.approx(-10.0, abs=0.6)  # off the map
 
 
-def test_episodes_say_how_they_ended(
-    trained: tuple[Trainer, list[Episode]], small: Scenario
-) -> None:
+def test_episodes_say_how_they_ended(trained: Any, small: Scenario) -> None:
     _, episodes = trained
     assert [episode.number for episode in episodes] == list(range(1, len(episodes) + 1))
     assert {episode.outcome for episode in episodes} == set(EpisodeEnd)
@@ -98,18 +92,17 @@ def test_an_interrupted_training_continues_bit_for_bit_and_another_seed_gives_an
 ) -> None:
     changes = {"replay_capacity": 200, "update_interval": 2, "target_interval": 30}
     parameters = replace(QUICK, environments=environments, network=network, **changes)
-    trainers = [make(small, parameters, seed) for seed in (0, 0, 1)]
-    uninterrupted, interrupted, other = trainers
+    uninterrupted, interrupted, other = (make(small, parameters, seed) for seed in (0, 0, 1))
     episodes = train(uninterrupted, 400)
     before = train(interrupted, first)
     interrupted.save_checkpoint(tmp_path / "checkpoint")
     resumed = Trainer.load_checkpoint(tmp_path / "checkpoint", [small])
     assert before + train(resumed, 400) == episodes
-    assert same_weights(uninterrupted, resumed)
+    assert same_weights(uninterrupted.network, resumed.network)
     for name in ("steps", "updates", "episodes", "epsilon"):
         assert getattr(uninterrupted, name) == getattr(resumed, name)
     train(other, 100)
-    assert not same_weights(uninterrupted, other)
+    assert not same_weights(uninterrupted.network, other.network)
 
 
 @pytest.mark.parametrize(("environments", "interval"), [(1, 1), (3, 2), (3, 5), (4, 3)])
@@ -125,9 +118,7 @@ def test_learning_starts_and_targets_are_copied_when_the_parameters_say(small: S
     train(trainer, 5)
     assert trainer.updates == 0
     for _ in trainer.run(13, every=1):
-        target = trainer._target.state_dict().values()
-        same = all(torch.equal(x, y) for x, y in zip(weights(trainer), target, strict=True))
-        assert same == (trainer.updates % 3 == 0)
+        assert same_weights(trainer.network, trainer._target) == (trainer.updates % 3 == 0)
     assert trainer.updates == 8
 
 
@@ -135,16 +126,12 @@ def test_epsilon_falls_linearly_and_then_stays(small: Scenario) -> None:
     trainer = make(small, HyperParameters(epsilon_start=0.8, epsilon_end=0.2, epsilon_steps=100))
     for trainer.steps, epsilon in ((0, 0.8), (25, 0.65), (100, 0.2), (101, 0.2), (1000, 0.2)):
         assert trainer.epsilon == pytest.approx(epsilon)
-
-
-def test_without_epsilon_the_robot_follows_the_network_alone(small: Scenario) -> None:
-    parameters = replace(QUICK, learning_starts=10**6, max_episode_steps=9, p_r=0.0)
-    rollouts = []
+    # Without it the robot follows the network, which does not change, alone.
+    still = replace(QUICK, learning_starts=10**6, max_episode_steps=9, p_r=0.0)
     for epsilon in (0.0, 1.0):
-        parameters = replace(parameters, epsilon_start=epsilon, epsilon_end=epsilon)
-        rollouts.append({episode.cells for episode in train(make(small, parameters), 200)})
-    assert len(rollouts[0]) == 1  # the network does not change
-    assert len(rollouts[1]) > 5
+        parameters = replace(still, epsilon_start=epsilon, epsilon_end=epsilon)
+        rollouts = {episode.cells for episode in train(make(small, parameters), 200)}
+        assert len(rollouts) == 1 if epsilon == 0 else len(rollouts) > 5
 
 
 def test_an_episode_adds_up_its_own_rewards_alone(small: Scenario) -> None:
@@ -177,21 +164,12 @@ def test_after_a_truncated_move_the_target_still_bootstraps(small: Scenario) -> 
     assert stored.tolist() == pytest.approx(expected)
 
 
-# Checkpoints
-
-
 @pytest.fixture
 def checkpoint(small: Scenario, tmp_path: Path) -> Path:
     trainer = make(small, replace(QUICK, replay_capacity=100))
     train(trainer, 60)
     trainer.save_checkpoint(tmp_path / "checkpoint")
     return tmp_path / "checkpoint"
-
-
-def test_a_checkpoint_is_of_its_maps(small: Scenario, paper: Scenario, checkpoint: Path) -> None:
-    for other in (paper, replace(small, start=(0, 1)), replace(small, goal=(4, 1))):
-        with pytest.raises(CheckpointError, match="another map, start or goal"):
-            Trainer.load_checkpoint(checkpoint, [other])
 
 
 def test_the_format_of_a_checkpoint_stays(checkpoint: Path) -> None:
@@ -213,7 +191,10 @@ def test_the_format_of_a_checkpoint_stays(checkpoint: Path) -> None:
     assert shapes == expected
 
 
-def test_a_checkpoint_with_another_bit_or_cut_is_refused(small: Scenario, checkpoint: Path) -> None:
+def test_a_wrong_checkpoint_is_refused(small: Scenario, paper: Scenario, checkpoint: Path) -> None:
+    for other in (paper, replace(small, start=(0, 1)), replace(small, goal=(4, 1))):
+        with pytest.raises(CheckpointError, match="another map, start or goal"):
+            Trainer.load_checkpoint(checkpoint, [other])
     content = checkpoint.read_bytes()
     random = np.random.default_rng(0)
     header = 8 + int.from_bytes(content[:8], "little")
@@ -249,3 +230,30 @@ def test_a_parameter_out_of_range_is_named() -> None:
     for name, value in wrong.items():
         with pytest.raises(ValueError, match=f"{name} is {value!r}"):
             HyperParameters(**{name: value})
+
+
+RULE = MoveRule.ROBOT_SAFE
+GRID = GridMap(np.array([[0, 0, 0, 1, 0], [0, 0, 0, 1, 0]]))
+
+
+def field_of(actions: list[list[int]]) -> QField:
+    """The field toward (2, 0) that prefers one action in each cell."""
+    q = np.zeros((8, *GRID.occupancy.shape), dtype=np.float32)
+    for y, x in np.ndindex(GRID.occupancy.shape):
+        q[actions[y][x], y, x] = 1
+    return QField((2, 0), q, legal_moves(GRID.occupancy, RULE))
+
+
+def test_a_detour_counts_with_its_length_and_a_trapped_rollout_is_left_out() -> None:
+    # (0, 1) goes by (0, 0), (1, 1) and (2, 1) go to each other; nothing joins (4, 0) to the goal.
+    field = field_of([[0, 0, 0, 0, 0], [6, 0, 4, 0, 0]])
+    detour = 3 / (1 + 2**0.5)
+    ratios = [[1, 1, np.nan, np.nan, np.nan], [detour, np.inf, np.inf, np.nan, np.nan]]
+    np.testing.assert_allclose(length_ratios(field, GRID, RULE), ratios)
+    evaluation = evaluate(field, GRID, RULE)
+    assert (evaluation.starts, evaluation.solved) == (5, 3)
+    assert evaluation.mean_ratio == pytest.approx((2 + detour) / 3)
+    assert evaluation.worst_ratio == pytest.approx(detour)
+    # Nobody reaches the goal.
+    evaluation = evaluate(field_of([[2, 2, 0, 0, 0], [6, 6, 4, 0, 0]]), GRID, RULE)
+    assert evaluation == pytest.approx((5, 0, np.nan, np.nan), nan_ok=True)

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from strategies import Place, grids_with_free_cell
 
 from ddqn_planner.grid import MoveRule, legal_moves, neighbours, shortest_distances
-from ddqn_planner.training.networks import value_iteration
+from ddqn_planner.planning.value_iteration import value_iteration
 
 
 def settled(
@@ -16,8 +16,9 @@ def settled(
     """The return of each move on one map, (8, C), given success and reward of each."""
     success, reward = np.asarray(tables, np.float32)[:, None]
     goals, near = np.array([goal]), neighbours(shape)
-    (return_AC,) = value_iteration(success, reward, goals, near, gamma, collision)
-    return return_AC
+    tables = success.swapaxes(1, 2), reward.swapaxes(1, 2)
+    (return_CA,) = value_iteration(*tables, goals, near, gamma, collision)
+    return return_CA.T
 
 
 @given(grids_with_free_cell(), st.sampled_from(MoveRule))
@@ -45,9 +46,7 @@ def test_with_discount_a_value_is_what_the_rewards_on_the_way_add_up_to() -> Non
     value_2 = 0.5 * 10.0 + 0.5 * -2.0
     value_1 = 0.5 * (1.0 + 0.9 * value_2) + 0.5 * -2.0
     assert return_AC[0, :3] == pytest.approx([1.0 + 0.9 * value_1, 1.0 + 0.9 * value_2, 10.0])
-
-
-def test_values_propagate_as_far_as_a_map_reaches_and_those_that_never_settle_end_anyway() -> None:
+    # Values propagate as far as a map reaches, and those that never settle end anyway.
     success, reward = np.zeros((8, 2500)), np.full((8, 2500), -1.0)
     success[0] = 1.0
     assert settled((success, reward), (1, 2500), 2499)[0, 0] == 1 - 2500
