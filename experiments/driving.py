@@ -33,7 +33,7 @@ Stages = Sequence[tuple[int, int]]
 
 STAGES: Final = ((0, 20), (20, 50), (50, 100))
 LONG_STAGES: Final = ((0, 200), (200, 600), (600, 1000))
-MOVED_STAGES: Final = ((50, 100), (100, 110), (110, 150))
+MOVED_STAGES: Final = ((0, 100), (100, 110), (110, 150))
 NEW_STAGES: Final = ((0, 5), (0, 20))
 # What is slow on the map where the robot learned, and on those that are new to it.
 PRIORS: Final = (("clearance", "clearance"), ("discs", "discs"), ("clearance", "discs"))
@@ -81,14 +81,13 @@ def faulty(options: Options) -> Sections:
 
 def long(options: Options) -> Sections:
     """Measure a thousand missions."""
-    return {"A thousand missions": _every_kind(options, LONG_STAGES, missions=1000)}
+    return _every_kind("A thousand missions", LONG_STAGES, options, missions=1000)
 
 
 def moved(options: Options) -> Sections:
     """Measure what happens when all slow zones move."""
-    how = {"missions": 150, "is_moved": True}
-    text = _every_kind(options, MOVED_STAGES, ("discs", "mixture"), **how)
-    return {"All slow zones move": text}
+    title, hidden = "All slow zones move", ("discs", "mixture")
+    return _every_kind(title, MOVED_STAGES, options, hidden, missions=150, is_moved=True)
 
 
 def priors(options: Options) -> Sections:
@@ -246,16 +245,22 @@ def _by(results: Sequence[Result], name: str) -> dict[str, list[Result]]:
 
 
 def _every_kind(
-    options: Options, stages: Stages, hidden: tuple[str, ...] = ("",), **more: Any
-) -> str:
-    """Return a table of what `Experience` reaches in each kind of world, and in each set."""
-    rows = []
-    for title, kinds in options.sets.items():
+    title: str, stages: Stages, options: Options, hidden: tuple[str, ...] = ("",), **more: Any
+) -> Sections:
+    """Return what `Experience` reaches in each set of worlds, and in each kind."""
+    rows, of_kinds = [], []
+    for name, kinds in options.sets.items():
         chosen = [kind for kind in kinds if kind.endswith(hidden)]
         results = _runs(chosen, (EXPERIENCE,), options, **more)
-        for name, own in {**_by(results, "kind"), f"all: {title.lower()}": results}.items():
-            rows.append([_short(name), *_percent(_above(own, stages))])
-    return table(f"missions | {_names(stages)}", rows)
+        last = {}
+        for kind, own in _by(results, "kind").items():
+            last[_short(kind)] = _above(own, stages)[-1]
+            of_kinds.append([_short(kind), *_percent(_above(own, stages))])
+        worst = max(last, key=lambda kind: last[kind])
+        rows.append([name, *_percent(_above(results, stages)), f"{last[worst]:.1f} % ({worst})"])
+    header = f"missions | {_names(stages)}"
+    tables = table(f"{header} | worst kind at last", rows), table(header, of_kinds)
+    return {title: tables[0], f"{title}, by kind": tables[1]}
 
 
 def _above(results: Sequence[Result], stages: Stages = STAGES) -> list[float]:
