@@ -304,21 +304,3 @@ def drive(
     positions += random.normal(0, pose_noise, positions.shape)
     positions += world.grid.origin[:2]
     return Drive(times + clock, positions, float(at[-1]))
-
-
-def with_faults(measured: Drive, random: Random) -> Drive:
-    """Return the drive with a fault: a pause, a teleport, a clock jump or an odometry reset."""
-    seconds, positions = measured.seconds.copy(), measured.positions.copy()
-    at = int(random.integers(len(seconds) // 4, 3 * len(seconds) // 4 + 1))
-    fault = int(random.integers(4))
-    if fault == 0:  # a pause of 10 minutes
-        standing = seconds[at] + np.arange(0, 600, 1 / RATE)
-        seconds = np.concatenate([seconds[:at], standing, seconds[at:] + 600])
-        positions = np.insert(positions, [at] * len(standing), positions[at], axis=0)
-    elif fault == 1:  # a teleport for 3 s
-        positions[at : at + int(3 * RATE)] += random.uniform(-10, 10, 2)
-    elif fault == 2:  # the clock jumps, back or ahead
-        seconds[at:] += random.choice([-1, 1]) * random.uniform(5, 3600)
-    else:  # odometry begins anew
-        positions[at:] -= positions[at]
-    return Drive(seconds, positions, measured.duration)
