@@ -198,13 +198,15 @@ def _checkerboard(world: World, random: Random) -> None:
 
 
 def _noise(world: World, random: Random) -> None:
-    """Let the log slowness have the spectrum 1/f, and a standard deviation of 0.65."""
-    height, width = world.grid.occupancy.shape
+    """Let the log slowness of squares of 25 cm have the spectrum 1/f, and a deviation of 0.65."""
+    size = world.grid.resolution
+    squares = [(np.arange(n) + 0.5) * size // 0.25 for n in world.grid.occupancy.shape]
+    height, width = (int(of_axis[-1]) + 1 for of_axis in squares)
     frequency = np.hypot(np.fft.fftfreq(height)[:, None], np.fft.fftfreq(width))
     frequency[0, 0] = np.inf
-    of_white = np.fft.fft2(random.normal(size=(height, width)))
-    log = np.fft.ifft2(of_white / frequency).real
-    world.always = np.exp(np.maximum(0.4 + 0.65 * log / log.std(), 0))
+    log = np.fft.ifft2(np.fft.fft2(random.normal(size=(height, width))) / frequency).real
+    of_squares = np.exp(np.maximum(0.4 + 0.65 * log / log.std(), 0))
+    world.always = of_squares[np.ix_(*(of_axis.astype(np.int64) for of_axis in squares))]
 
 
 def _ramps(world: World, random: Random) -> None:
