@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -15,8 +14,9 @@ from ddqn_planner.grid.body import clearance
 
 Float32 = NDArray[np.float32]
 
-FEATURES = 10
+FEATURES = 11
 REACH = 3.0  # metres: what is farther away says nothing
+NARROW = 0.7, 1.2, 2.0  # metres: free widths up to which a way counts as narrow
 SQUARES = 0.5, 1.0, 2.0  # metres: half the sides of squares whose share of free space counts
 UNUSUAL = 3.0  # standard deviations: features are no farther off than those of training
 
@@ -28,10 +28,11 @@ def map_features(grid: GridMap) -> Float32:
     widths = _widths(occupied, grid.resolution), _widths(occupied.T, grid.resolution).T
     narrow, wide = np.minimum(*widths), np.maximum(*widths)
     near, middle, far = (_free_share(occupied, side / grid.resolution) for side in SQUARES)
-    door = np.exp(-narrow / 0.5)
-    width = [door, np.exp(-narrow / 1.5), np.log(np.maximum(wide, 0.1)), door * (far - near)]
+    steps = [1 / (1 + np.exp(7 * (narrow / width - 1))) for width in NARROW]
+    door, open_ahead = steps[1] * (far - near), np.log(np.maximum(wide, 0.1))
     distance = [np.exp(-metres / 0.25), np.exp(-metres / 0.75), metres]
-    return np.stack([*distance, *width, near, middle, far], axis=-1)
+    features = [*distance, *steps, open_ahead, door, near, middle, far]
+    return np.moveaxis(np.stack(features), 0, -1)
 
 
 def _widths(occupied: Occupancy, resolution: float) -> Float32:
@@ -52,8 +53,7 @@ def _free_share(occupied: Occupancy, reach: float) -> Float32:
     for axis in (0, 1):
         # A side of 3.5 cells lies between those of 3 and 5 cells.
         sizes = 2 * int(whole) + 1, 2 * int(whole) + 3
-        mean = partial(uniform_filter1d, share, axis=axis, mode="constant", cval=1)
-        small, large = (size * mean(size) for size in sizes)
+        small, large = (n * uniform_filter1d(share, n, axis, None, "constant", 1) for n in sizes)
         share = (small + np.float32(rest) * (large - small)) / np.float32(2 * (whole + rest) + 1)
     return share
 

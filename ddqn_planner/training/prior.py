@@ -11,23 +11,21 @@ from torch import nn
 
 from ddqn_planner.experience.prior import FEATURES, UNUSUAL, Prior
 
-Floats = NDArray[np.floating[Any]]
+Float32 = NDArray[np.float32]
 
 UNITS = 16
+RIDGE = 10.0  # the weight of so many places speaks against each linear prediction
 LEARNING_RATE, WEIGHT_DECAY = 0.01, 0.3
 STEPS, CHECKED = 200, 5  # at most so many; the held-out error is seen every so many
 SMALLEST_SCALE = 0.1  # a feature that hardly varies tells nothing of maps where it does
 FOLDS = 6  # networks that each leave out a part of the places; one more learns from all
-BLOCK = 32  # places driven one after the other, left out together: near ones are alike
+BLOCKS, PLACES = 12, (8, 32)  # near places are alike: so many in a row are left out together
+DOUBT = 2.0  # what is foretold must be so many standard errors from nothing to be believed
 REPLAYED = 512  # places of older maps, and as many of this one, are kept to learn from again
 
 
 def train_prior(
-    features: Floats,
-    log_slowness: Floats,
-    weights: Floats,
-    older: Prior | None = None,
-    seed: int = 0,
+    features: Any, log_slowness: Any, weights: Any, older: Prior | None = None, seed: int = 0
 ) -> Prior:
     """Train a prior on N places: features (N, F), mean log slowness (N,) and its weight (N,).
 
@@ -42,38 +40,44 @@ def train_prior(
     old = old[[row.tobytes() not in known for row in old[:, :FEATURES]]]
     rows = np.concatenate([old, new])
     x, target, weight = rows[:, :FEATURES], rows[:, FEATURES], rows[:, -1] / rows[:, -1].mean()
-    mean = np.average(x, axis=0, weights=weight)
-    variance = np.average((x - mean) ** 2, axis=0, weights=weight)
-    scale = np.maximum(np.sqrt(variance), SMALLEST_SCALE)
+    mean, scale = x.mean(axis=0), np.maximum(x.std(axis=0), SMALLEST_SCALE)
     level = np.average(new[:, FEATURES], weights=new[:, -1])
     # Other maps may be slower as a whole: theirs is a level of its own.
     is_old = (np.arange(len(rows)) < len(old)).astype(np.float32)
     x = np.column_stack([np.clip((x - mean) / scale, -UNUSUAL, UNUSUAL), is_old])
-    block = np.arange(len(rows)) // BLOCK
+    target, block = target - level, np.arange(len(rows)) // np.clip(len(rows) // BLOCKS, *PLACES)
     left_out = random.permutation(block[-1] + 1)[block] % FOLDS == np.arange(FOLDS + 1)[:, None]
-    share, trained = _train(x, target - level, weight, left_out.astype(np.float32), seed=seed)
+    foretold, trained = _train(x, target, weight, left_out.astype(np.float32), seed=seed)
+    fit, size = (np.bincount(block, weight * foretold * one) for one in (target, foretold))
+    share = fit.sum() / max(size.sum(), 1e-9)
+    error = np.linalg.norm(fit - share * size) / max(size.sum(), 1e-9)
+    doubt = DOUBT * error / max(share * (1 - 2 / len(fit)), 1e-9)  # fewer blocks, greater errors
+    share = min(share, 1) * (1 - min(doubt, 1) ** 2)
     direct, *layers, last = (array[-1].squeeze() for array in trained)
     kept = [part[np.sort(random.permutation(len(part))[:REPLAYED])] for part in (old, new)]
     network = share * direct[:FEATURES], *layers, share * last, np.concatenate(kept)
     return Prior(*(np.asarray(array, np.float32) for array in (mean, scale, level, *network)))
 
 
-def _train(*arrays: NDArray[np.float32], seed: int) -> tuple[float, list[NDArray[np.float32]]]:
-    """Return what share of the last network's output to believe, and all networks' weights."""
+def _train(*arrays: Float32, seed: int) -> tuple[Float32, list[Float32]]:
+    """Return what places left out are foretold, (N,), and the weights of all networks."""
     x, target, weight, left_out = map(torch.from_numpy, arrays)
     generator, networks = torch.Generator().manual_seed(seed), len(left_out)
-    first, second, third = (FEATURES, UNITS), (UNITS, UNITS), (UNITS, 1)
-    sizes = (FEATURES + 1, 1), first, (1, UNITS), second, (1, UNITS), third
-    parameters = [torch.zeros(networks, *size, requires_grad=True) for size in sizes]
-    with torch.no_grad():
-        for layer in parameters[1], parameters[3]:
-            layer += torch.randn(layer.shape[1:], generator=generator) / layer.shape[1] ** 0.5
+    layers = (FEATURES, UNITS), (1, UNITS), (UNITS, UNITS), (1, UNITS), (UNITS, 1)
+    sizes = (FEATURES + 1, 1), *layers
+    parameters = [torch.zeros(networks, *size) for size in sizes]
     direct, weights_1, bias_1, weights_2, bias_2, weights_3 = parameters
-    optimiser = torch.optim.AdamW(parameters, LEARNING_RATE, weight_decay=WEIGHT_DECAY)
-    share_learned = (1 - left_out) * weight
-    share_learned = share_learned / share_learned.sum(dim=1, keepdim=True).clamp(min=1e-9)
-    x = x.expand(networks, -1, -1)
-    least = float("inf")
+    for layer in weights_1, weights_2:
+        layer += torch.randn(layer.shape[1:], generator=generator) / layer.shape[1] ** 0.5
+    # The best linear prediction is where they begin; few steps then bend it.
+    learned = (1 - left_out) * weight
+    moments = torch.einsum("kn,ni,nj->kij", learned, x, torch.column_stack([x, target]))
+    penalty = RIDGE * torch.eye(FEATURES + 1)
+    direct += torch.linalg.solve(moments[..., :-1] + penalty, moments[..., -1:])
+    trained = [array.requires_grad_() for array in parameters]
+    optimiser = torch.optim.AdamW(trained, LEARNING_RATE, weight_decay=WEIGHT_DECAY)
+    learned = learned / learned.sum(dim=1, keepdim=True).clamp(min=1e-9)
+    x, least = x.expand(networks, -1, -1), float("inf")
     for step in range(STEPS + 1):
         hidden = torch.baddbmm(bias_1, x[..., :FEATURES], weights_1).tanh()
         hidden = torch.baddbmm(bias_2, hidden, weights_2).tanh()
@@ -81,11 +85,9 @@ def _train(*arrays: NDArray[np.float32], seed: int) -> tuple[float, list[NDArray
         loss = nn.functional.huber_loss(output, target.expand_as(output), reduction="none")
         error = (loss * left_out * weight).sum().item()
         if step % CHECKED == 0 and error < least:
-            foretold = (output * left_out).sum(dim=0).detach()
-            fit = (weight * foretold * target).sum() / ((weight * foretold**2).sum() + 1e-9)
-            least, share = error, fit.clamp(0, 1).item()
+            least, foretold = error, (output * left_out).sum(dim=0).detach().numpy()
             best = [array.detach().numpy().copy() for array in parameters]
         optimiser.zero_grad()
-        (share_learned * loss).sum().backward()  # type: ignore[no-untyped-call]
+        (learned * loss).sum().backward()  # type: ignore[no-untyped-call]
         optimiser.step()
-    return share, best
+    return foretold, best

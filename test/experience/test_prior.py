@@ -34,7 +34,7 @@ def test_features_tell_a_wall_a_door_and_a_hall_apart_and_end_nowhere_at_the_map
     occupancy[20] = True
     occupancy[20, 10] = False
     features = map_features(GridMap(occupancy, 0.25))
-    metres, door = features[..., 2], features[..., 6] * ~occupancy
+    metres, door = features[..., 2], features[..., 7] * ~occupancy
     assert metres[19, 30] == pytest.approx(0.125)
     assert metres[16, 30] == pytest.approx(0.875)
     assert metres[0, 0] == metres.max() == 3

@@ -34,23 +34,22 @@ def measured(seed: int, count: int = 600) -> Places:
 
 
 def share_foretold(prior: Prior, features: np.ndarray) -> float:
-    """R² of the log slowness by clearance."""
+    """R² of the log slowness by clearance, up to its mean."""
     truth = by_clearance(features)
-    return float(1 - ((prior.log_slowness(features) - truth) ** 2).mean() / truth.var())
+    return float(1 - (prior.log_slowness(features) - truth).var() / truth.var())
 
 
 def test_what_walls_govern_is_foretold_on_another_map() -> None:
     assert share_foretold(train_prior(*measured(0)), rooms(1)) > 0.85
 
 
-def test_few_places_and_those_that_no_map_explains_are_foretold_by_their_mean() -> None:
-    features, slowness, weights = measured(0)
-    few = train_prior(features[:30], slowness[:30], weights[:30])
-    mean = np.average(slowness[:30], weights=weights[:30])
-    assert few.log_slowness(rooms(1)) == pytest.approx(mean, abs=0.15)
-    slow = np.where(np.arange(600) // 60 % 3 == 0, 1.0, 0.0) + rng(1).normal(0, 0.3, 600)
-    unrelated = train_prior(features, slow, weights).log_slowness(rooms(1))
-    assert unrelated == pytest.approx(np.average(slow, weights=weights), abs=0.3)
+def test_few_places_tell_little_and_what_no_map_explains_tells_nothing() -> None:
+    features, _, weights = measured(0)
+    for count in (1, 30, 600):
+        slow = np.where(np.arange(count) // 10 % 2, 1.0, 0.0) + rng(1).normal(0, 0.3, count)
+        prior = train_prior(features[:count], slow, weights[:count])
+        mean = np.average(slow, weights=weights[:count])
+        assert prior.log_slowness(rooms(1)) == pytest.approx(mean, abs=0.1)
 
 
 def test_weights_count() -> None:
@@ -68,14 +67,13 @@ def test_the_same_seed_gives_the_same_prior() -> None:
     assert not np.array_equal(one.weights_1, other.weights_1)
 
 
-def test_an_older_map_is_not_forgotten_and_only_new_places_take_their_place() -> None:
+def test_an_older_map_is_not_forgotten_and_known_places_are_not_kept_twice() -> None:
     older = train_prior(*measured(0))
     features, _, weights = measured(1)
-    hall = np.repeat(features[features[:, 2].argmax()][None], 600, axis=0)
-    prior = older
-    for _ in range(3):
-        prior = train_prior(hall, rng(2).normal(1, 0.3, 600), weights, prior)
-    moved = prior._replace(level=np.float32(by_clearance(rooms(2)).mean()))
-    assert share_foretold(moved, rooms(2)) > 0.7
-    elsewhere = {row.tobytes() for row in older.replay}
-    assert elsewhere <= {row.tobytes() for row in prior.replay}
+    is_hall = features[:, 2] > np.quantile(features[:, 2], 0.7)
+    hall = features[is_hall], rng(2).normal(1, 0.3, is_hall.sum()), weights[is_hall]
+    assert share_foretold(train_prior(*hall), rooms(2)) < 0.1
+    once = train_prior(*hall, older)
+    assert share_foretold(once, rooms(2)) > 0.7
+    again = train_prior(*hall, once)
+    assert all(np.array_equal(*pair) for pair in zip(once, again, strict=True))
