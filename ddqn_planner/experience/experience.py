@@ -141,7 +141,7 @@ class Experience:
                     waits.append(np.array([*at[first : last + 1].mean(axis=0), stood]))
                 seconds[last:] -= stood
                 seconds[first:last] = seconds[first]
-            steps += _steps(seconds.tolist(), at.tolist(), side / 2, *limits)
+            steps += _steps(seconds.tolist(), at.tolist(), max(side, WINDOW) / 2, *limits)
         if not steps:
             return None
         rows = np.array(steps)
