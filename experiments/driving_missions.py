@@ -9,7 +9,8 @@ import driving_worlds as worlds
 import numpy as np
 from driving_learners import LEARNERS
 from driving_maps import Bool
-from driving_worlds import RULE, Float64, World, drive, path_seconds
+from driving_worlds import RATE, RULE, Drive, Float64, World, drive, path_seconds
+from random_maps import Random
 
 from ddqn_planner import Experience, Planner, inflate, load_map
 from ddqn_planner.experience.prior import Prior, map_features
@@ -122,7 +123,7 @@ def run_in(job: Job, world: World, learner: Any) -> Result:
             _mark(new, cells, round(0.25 / grid.resolution))
         seen = replace(measured, seconds=measured.seconds + own - clock)
         if job.is_faulty and own >= next_fault:
-            seen, next_fault = worlds.with_faults(seen, faults), next_fault + FAULT_EVERY
+            seen, next_fault = with_faults(seen, faults), next_fault + FAULT_EVERY
         learner.record(seen.seconds, seen.positions)
         # Crowds come for all learners at the same mission, however long their drives take.
         clock, own = clock + best, own + measured.duration
@@ -134,3 +135,21 @@ def _mark(new: Bool, cells: Sequence[Cell], reach: int) -> None:
     """Mark what is near a path as driven."""
     for x, y in cells:
         new[max(y - reach, 0) : y + reach + 1, max(x - reach, 0) : x + reach + 1] = False
+
+
+def with_faults(measured: Drive, random: Random) -> Drive:
+    """Return the drive with a fault: a pause, a teleport, a clock jump or an odometry reset."""
+    seconds, positions = measured.seconds.copy(), measured.positions.copy()
+    at = int(random.integers(len(seconds) // 4, 3 * len(seconds) // 4 + 1))
+    fault = int(random.integers(4))
+    if fault == 0:  # a pause of 10 minutes
+        standing = seconds[at] + np.arange(0, 600, 1 / RATE)
+        seconds = np.concatenate([seconds[:at], standing, seconds[at:] + 600])
+        positions = np.insert(positions, [at] * len(standing), positions[at], axis=0)
+    elif fault == 1:  # a teleport for 3 s
+        positions[at : at + int(3 * RATE)] += random.uniform(-10, 10, 2)
+    elif fault == 2:  # the clock jumps, back or ahead
+        seconds[at:] += random.choice([-1, 1]) * random.uniform(5, 3600)
+    else:  # odometry begins anew
+        positions[at:] -= positions[at]
+    return Drive(seconds, positions, measured.duration)

@@ -198,13 +198,15 @@ def _checkerboard(world: World, random: Random) -> None:
 
 
 def _noise(world: World, random: Random) -> None:
-    """Let the log slowness have the spectrum 1/f, and a standard deviation of 0.65."""
-    height, width = world.grid.occupancy.shape
+    """Let the log slowness of squares of 25 cm have the spectrum 1/f, and a deviation of 0.65."""
+    size = world.grid.resolution
+    squares = [(np.arange(n) + 0.5) * size // 0.25 for n in world.grid.occupancy.shape]
+    height, width = (int(of_axis[-1]) + 1 for of_axis in squares)
     frequency = np.hypot(np.fft.fftfreq(height)[:, None], np.fft.fftfreq(width))
     frequency[0, 0] = np.inf
-    of_white = np.fft.fft2(random.normal(size=(height, width)))
-    log = np.fft.ifft2(of_white / frequency).real
-    world.always = np.exp(np.maximum(0.4 + 0.65 * log / log.std(), 0))
+    log = np.fft.ifft2(np.fft.fft2(random.normal(size=(height, width))) / frequency).real
+    of_squares = np.exp(np.maximum(0.4 + 0.65 * log / log.std(), 0))
+    world.always = of_squares[np.ix_(*(of_axis.astype(np.int64) for of_axis in squares))]
 
 
 def _ramps(world: World, random: Random) -> None:
@@ -304,21 +306,3 @@ def drive(
     positions += random.normal(0, pose_noise, positions.shape)
     positions += world.grid.origin[:2]
     return Drive(times + clock, positions, float(at[-1]))
-
-
-def with_faults(measured: Drive, random: Random) -> Drive:
-    """Return the drive with a fault: a pause, a teleport, a clock jump or an odometry reset."""
-    seconds, positions = measured.seconds.copy(), measured.positions.copy()
-    at = int(random.integers(len(seconds) // 4, 3 * len(seconds) // 4 + 1))
-    fault = int(random.integers(4))
-    if fault == 0:  # a pause of 10 minutes
-        standing = seconds[at] + np.arange(0, 600, 1 / RATE)
-        seconds = np.concatenate([seconds[:at], standing, seconds[at:] + 600])
-        positions = np.insert(positions, [at] * len(standing), positions[at], axis=0)
-    elif fault == 1:  # a teleport for 3 s
-        positions[at : at + int(3 * RATE)] += random.uniform(-10, 10, 2)
-    elif fault == 2:  # the clock jumps, back or ahead
-        seconds[at:] += random.choice([-1, 1]) * random.uniform(5, 3600)
-    else:  # odometry begins anew
-        positions[at:] -= positions[at]
-    return Drive(seconds, positions, measured.duration)

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from driving import main
 from driving_learners import LEARNERS, LastTime, MeanTime
-from driving_missions import Job, run
+from driving_missions import Job, run, with_faults
 
 from ddqn_planner.grid import GridMap, MoveRule
 from ddqn_planner.planning import Planner
@@ -78,7 +78,7 @@ def test_every_fault_occurs() -> None:
     measured = worlds.Drive(seconds, positions, 60.0)
     seen = set()
     for seed in range(30):
-        faulty = worlds.with_faults(measured, np.random.default_rng(seed))
+        faulty = with_faults(measured, np.random.default_rng(seed))
         pause = len(faulty.seconds) > len(seconds)
         clock_jumps = bool((np.abs(np.diff(faulty.seconds)) > 1).any())
         jumps = int((np.hypot(*np.diff(faulty.positions, axis=0).T) > 0.5).sum())
