@@ -31,10 +31,8 @@ OUTLIER = 2.5  # a visit is moved to so many standard deviations from what was e
 KNOWN = 0.7  # weight of visits from which a place is known
 MOST = 6.0  # weight of visits that a place keeps
 
-PART, SURPRISE = (
-    8,
-    3.0,
-)  # places of a drive: these are off by more standard deviations if they changed
+PART, SURPRISE = 8, 3.5  # so many places have changed if they are off by more deviations
+PART_NOISE = 0.12  # of their mean log slowness, as each way through a place is another
 DRIVE_NOISE = 0.05  # standard deviation of what the log slowness of so many places has in common
 CHANGED, CHANGED_AROUND = 0.1, 1.5  # share of evidence that is left within so many metres
 CHANGED_FAR = 0.7  # and elsewhere: where one place changed, others did
@@ -135,7 +133,7 @@ class Evidence:
         for part in np.array_split(known, max(1, len(known) // PART)):
             if len(part) < PART / 2:
                 continue
-            variance = self.noise * (1 + 1 / weight[part]).mean() / len(part) + DRIVE_NOISE**2
+            variance = self.noise * (1 + 1 / weight[part]).mean() / len(part) + PART_NOISE**2
             if abs(surprise[part].mean()) > SURPRISE * math.sqrt(variance):
                 changed.append(part)
                 away = self.table[:, 3:5] - position[part].mean(axis=0)
