@@ -35,7 +35,7 @@ PART, SURPRISE = 8, 3.5  # so many places have changed if they are off by more d
 PART_NOISE = 0.12  # of their mean log slowness, as each way through a place is another
 DRIVE_NOISE = 0.05  # standard deviation of what the log slowness of so many places has in common
 CHANGED, CHANGED_AROUND = 0.1, 1.5  # share of evidence that is left within so many metres
-CHANGED_FAR = 0.7  # and elsewhere: where one place changed, others did
+CHANGED_FAR = 0.4  # and elsewhere: where one place changed, others did
 
 WAIT_PASSAGES = 0.2  # passages without a wait that are assumed
 NEAREST_WAITS = 4.0  # the place of a wait is the mean of about the last so many
