@@ -29,9 +29,9 @@ def map_features(grid: GridMap) -> Float32:
     narrow, wide = np.minimum(*widths), np.maximum(*widths)
     near, middle, far = (_free_share(occupied, side / grid.resolution) for side in SQUARES)
     steps = [1 / (1 + np.exp(7 * (narrow / width - 1))) for width in NARROW]
-    door, open_ahead = steps[1] * (far - near), np.log(np.maximum(wide, 0.1))
-    distance = [np.exp(-metres / 0.25), np.exp(-metres / 0.75), metres]
-    features = [*distance, *steps, open_ahead, door, near, middle, far]
+    door = steps[1] * (far - near)
+    features = [np.exp(-metres / 0.25), np.exp(-metres / 0.75), metres, *steps]
+    features += [np.log(np.maximum(wide, 0.1)), door, near, middle, far]
     return np.moveaxis(np.stack(features), 0, -1)
 
 

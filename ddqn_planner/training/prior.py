@@ -6,12 +6,9 @@ from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import nn
 
-from ddqn_planner.experience.prior import FEATURES, UNUSUAL, Prior
-
-Float32 = NDArray[np.float32]
+from ddqn_planner.experience.prior import FEATURES, UNUSUAL, Float32, Prior
 
 UNITS = 16
 RIDGE = 10.0  # the weight of so many places speaks against each linear prediction
