@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from random_maps import generate_map
 
-from ddqn_planner import GridMap
+from ddqn_planner import Experience, GridMap
 from ddqn_planner.experience.prior import Prior, map_features
-from ddqn_planner.training.prior import REPLAYED, train_prior
+from ddqn_planner.training.prior import REPLAYED, teach_prior, train_prior
 
 Places = tuple[np.ndarray, np.ndarray, np.ndarray]
 """Features (N, F), log slowness (N,) and weights (N,)."""
@@ -86,3 +86,25 @@ def test_an_older_map_is_not_forgotten_and_known_places_are_not_kept_twice() -> 
     assert share_foretold(once, rooms(2)) > 0.7
     again = train_prior(*hall, once)
     assert all(np.array_equal(*pair) for pair in zip(once, again, strict=True))
+
+
+def test_the_places_of_experience_teach_its_prior_where_they_lie_on_a_map() -> None:
+    occupancy = np.zeros((60, 120), dtype=np.bool_)
+    occupancy[30] = True
+    grid = GridMap(occupancy, 0.25, (10.0, 0.0, 0.0))
+    experience = Experience(0.5)
+    for y, slowness in ((3.0, 1.0), (7.0, 4.0), (11.0, 1.0), (900.0, 9.0)):  # the last lies off it
+        seconds = np.arange(0, 50 * slowness, 0.5)
+        experience.record(seconds, np.column_stack([10 + seconds / 2 / slowness, 0 * seconds + y]))
+    teach_prior(experience, GridMap(np.zeros((4, 4), dtype=np.bool_), 0.25))
+    assert experience.prior is None
+    teach_prior(experience, grid)
+    assert experience.prior is not None
+    foretold = experience.prior.log_slowness(map_features(grid))
+    assert foretold[28, 60] > foretold[12, 60] + 0.5
+    assert foretold[44, 60] < 0.5
+    first = experience.prior
+    other = GridMap(np.roll(occupancy, 9, axis=0), 0.25, grid.origin)
+    for place, more in ((grid, False), (other, True)):  # no place is kept twice, none is forgotten
+        teach_prior(experience, place)
+        assert (len(experience.prior.replay) > len(first.replay)) == more
