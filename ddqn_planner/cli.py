@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 import ddqn_planner as api
-from ddqn_planner.files import WorkFolder, write_csv
+from ddqn_planner.files import WorkFolder, write_atomically, write_csv
 from ddqn_planner.resources import find_map, with_remedy
 
 # A command imports what it needs, and no other command's libraries: the names of `api` do so, too.
@@ -290,7 +290,7 @@ def learn(parser: argparse.ArgumentParser, arguments: Sequence[str]) -> int:
         if not drives:
             raise ValueError(f"{source} holds no drive; drive on")
         out = options.out or (source if source.is_dir() else source.parent) / EXPERIENCE
-        experience.save(out)
+        write_atomically(out, experience.to_bytes())  # anew, whatever an older file holds
     slowness, known = experience.slowness(grid), experience.uncertainty(grid) < 0.9
     seconds = sum(float(np.ptp(drive.seconds)) for drive in drives)
     print(f"{len(drives)} drives, {sum(d.metres for d in drives):.0f} m, {seconds / 60:.1f} min")

@@ -1,15 +1,16 @@
-"""What visits tell of places of the world: log slowness, how sure it is, and both on a map."""
+"""What drives showed at places of the world: how slow driving is, and where robots wait."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ddqn_planner.compiled import in_place
+from ddqn_planner.experience.posterior import Posterior
+from ddqn_planner.experience.prior import Prior
 from ddqn_planner.grid import GridMap
 from ddqn_planner.grid.arguments import MAX_SLOWNESS
 from ddqn_planner.grid.grid_map import check_grid, equal
@@ -18,18 +19,31 @@ Float64 = NDArray[np.float64]
 
 FARTHEST = 1e7  # metres from the origin of the map: a place beyond is not believed
 
-REACH = 2.5  # how far a visit tells of the places around, in widths of the robot
-PRIOR = 1.0  # variance of the log slowness of a place before it is visited; its mean is 0
-PRIOR_SUCCESSES = 2.0  # so many are assumed where nothing was driven
 NOISE, NOISY_VISITS = 0.1, 50.0  # variance of the log slowness of one visit, as if of so many
 OLD_VISITS = 500.0  # the noise of visits is that of about the last so many
+VARIANCE, VARIED_PLACES = 1.0, 4.0  # of the log slowness of places, as if of so many
+LEAST_VARIANCE, MOST_VARIANCE = 0.05, 2.0
+ALIKE = 8.0  # so many places of a path tell as much of other places as one alone
+NOMINAL = 2.0  # inverse variance of the log slowness of all places, before the first drive
+TRUST, TRUSTED = 1.0, 4.0  # in the prior: at first, and the inverse variance of that
+SURE_PLACES = 20  # fewer say nothing about the robot's speed in the open
 OUTLIER = 2.5  # a visit is moved to so many standard deviations from what was expected
-MOST = 4.0  # weight of visits that a place keeps: a new visit then counts a fifth
+KNOWN = 0.7  # weight of visits from which a place is known
+MOST = 6.0  # weight of visits that a place keeps
 
-STEP = 0.02  # slowness is told in steps of this share: fields need no repair for less
+PART, SURPRISE = (
+    8,
+    3.0,
+)  # places of a drive: these are off by more standard deviations if they changed
+DRIVE_NOISE = 0.05  # standard deviation of what the log slowness of so many places has in common
+CHANGED, CHANGED_AROUND = 0.1, 1.5  # share of evidence that is left within so many metres
+CHANGED_FAR = 0.7  # and elsewhere: where one place changed, others did
+
+WAIT_PASSAGES = 0.2  # passages without a wait that are assumed
+NEAREST_WAITS = 4.0  # the place of a wait is the mean of about the last so many
+MOST_PASSAGES = 20.0  # a wait is the mean of about the last so many
+
 FADING_STEPS = 4  # so often per half-life all evidence fades: few changes of a map come at once
-MOST_AT_ONCE = 2**13  # cells whose slowness is computed at once
-REBASE = 2.0**16  # evidence is spread anew when weights have grown so much against the oldest
 
 SHORTEST = 8  # a drive through fewer places says little about how sure expected times are
 KEPT, ASSUMED = 64, 8  # drives whose errors count, and drives assumed before, with normal errors
@@ -38,11 +52,10 @@ TAIL = 0.04  # share of errors beyond each bound: not 5 %, as successive drives 
 PARTS = 256  # of a path, between which it is computed what they have in common
 CORRELATED = 5.0  # places so many sides apart have a third of their error in common
 
-STRAIGHT, DIAGONAL = 5, 7  # lengths of moves in whole numbers: within 4 % of the true ones
-
-# Of each place: the weight of its visits, that times their log slowness, the weight of failures,
-# where it was visited first, and the driven time when the weights were last faded.
-COLUMNS = "weight", "log", "failures", "x", "y", "time"
+# Of each place: the weight of its visits, that times their log slowness, what the prior foretold of
+# it before, where it was visited first, and the driven time when the weights were last faded.
+COLUMNS = "weight", "log", "foretold", "x", "y", "time"
+WAIT_COLUMNS = "seconds", "passages", "x", "y"
 
 
 class Visits(NamedTuple):
@@ -58,13 +71,20 @@ class Evidence:
 
     def __init__(self, nominal_speed: float, robot_width: float, half_life: float) -> None:
         self.nominal_speed, self.half_life = nominal_speed, half_life
-        self.side, self.reach = robot_width / 2, REACH * robot_width
+        self.side, self.wait_radius = robot_width / 2, robot_width
+        self.forget()
+
+    def forget(self) -> None:
+        """Forget all."""
+        self.prior: Prior | None = None
         self.driven = 0.0
         self.places: dict[tuple[int, int], int] = {}  # the row of each in the table
         self.table = np.zeros((0, len(COLUMNS)))
+        self.waits = np.zeros((0, len(WAIT_COLUMNS)))
         self.noise_sums = NOISY_VISITS * NOISE, NOISY_VISITS
         self.errors: list[float] = []  # of the last drives' log times, in standard deviations
-        self.spread: Spread | None = None  # over the last map
+        self.posterior: Posterior | None = None  # over the last map
+        self._fit()
 
     @property
     def noise(self) -> float:
@@ -72,14 +92,25 @@ class Evidence:
         total, visits = self.noise_sums
         return max(total / visits, 1e-4)
 
-    def add(self, visits: Visits) -> None:
-        """Learn from the visits of a drive, and from how far its time was from the expected one."""
+    def add(self, visits: Visits, waits: Float64) -> None:
+        """Learn from the visits of a drive, its waits (W, 3): x, y, seconds; and its whole time."""
+        if self.posterior is not None:
+            self._compare(visits, waits, self.posterior)
+        if len(visits.position):
+            self._add_visits(visits)
+        self._add_waits(visits, waits)
+        self.driven += float(visits.seconds.sum() + waits[:, 2].sum())
+        self._fit()
+
+    def _add_visits(self, visits: Visits) -> None:
         rows, noise = self._rows(visits.position), self.noise
         slowness = visits.seconds * self.nominal_speed / visits.metres
-        log = np.log(np.clip(slowness, 1 / 3, MAX_SLOWNESS))
-        weight, sum_of_log, *_ = self.faded(self.table[rows], self.driven).T
-        variance = 1 / (weight / noise + 1 / PRIOR)
-        surprise = log - sum_of_log / noise * variance
+        log = np.log(np.clip(slowness, 1 / MAX_SLOWNESS, MAX_SLOWNESS))
+        weight, sum_of_log = self.faded()[rows].T
+        variance = 1 / (weight / noise + 1 / self.place_variance)
+        expected = self.trust[0] * np.ones(len(rows))
+        expected += (sum_of_log - weight * expected) / noise * variance
+        surprise = log - expected
         most = OUTLIER * np.sqrt(noise + variance)
         believed = np.clip(surprise, -most, most)
         known = weight >= 1
@@ -88,20 +119,58 @@ class Evidence:
         count += int(known.sum())
         surplus = max(count / OLD_VISITS, 1)
         self.noise_sums = total / surplus, count / surplus
-        if self.spread is not None:
-            self._compare(visits, self.spread)
-        self.driven += float(visits.seconds.sum())
-        places = self._fade(rows)
+        changed = self._changed(visits.position, surprise, weight)
+        believed[changed] = surprise[changed]
+        places = np.unique(rows)
+        self.table[places, :2] = self.faded()[places]
+        self.table[places, 5] = self.driven
         weight = visits.metres / self.side
         np.add.at(self.table[:, 0], rows, weight)
-        np.add.at(self.table[:, 1], rows, weight * (log - surprise + believed))
-        self.table[places, :3] /= np.maximum(self.table[places, :1] / MOST, 1)
+        np.add.at(self.table[:, 1], rows, weight * (expected + believed))
+        self.table[places, :2] /= np.maximum(self.table[places, :1] / MOST, 1)
 
-    def add_failure(self, x: float, y: float) -> None:
-        """Add a failure."""
-        rows = self._rows(np.array([[x, y]]))
-        self._fade(rows)
-        self.table[rows, 2] += 1
+    def _changed(self, position: Float64, surprise: Float64, weight: Float64) -> NDArray[np.int64]:
+        """Return the visits that were other than all before; most of that is forgotten."""
+        changed, known = [np.zeros(0, np.int64)], np.flatnonzero(weight >= KNOWN)
+        for part in np.array_split(known, max(1, len(known) // PART)):
+            if len(part) < PART / 2:
+                continue
+            variance = self.noise * (1 + 1 / weight[part]).mean() / len(part) + DRIVE_NOISE**2
+            if abs(surprise[part].mean()) > SURPRISE * math.sqrt(variance):
+                changed.append(part)
+                away = self.table[:, 3:5] - position[part].mean(axis=0)
+                near = np.hypot(*away.T) <= CHANGED_AROUND + len(part) * self.side / 2
+                self.table[:, :2] *= np.where(near, CHANGED, CHANGED_FAR)[:, None]
+        return np.concatenate(changed)
+
+    def _add_waits(self, visits: Visits, waits: Float64) -> None:
+        """Count the passages of places where robots wait, and the seconds of this drive."""
+        if len(self.waits) and len(visits.position):
+            away = visits.position[None] - self.waits[:, None, 2:4]
+            inside = np.hypot(*np.moveaxis(away, 2, 0)) <= self.wait_radius
+            passages = (np.diff(inside, axis=1, prepend=False) & inside).sum(axis=1)
+            self.waits[:, 1] += passages
+            surplus = np.maximum(self.waits[:, 1:2] / MOST_PASSAGES, 1)
+            self.waits[:, :2] /= surplus
+        for x, y, seconds in waits.tolist():
+            distance = np.hypot(self.waits[:, 2] - x, self.waits[:, 3] - y)
+            nearest = int(distance.argmin()) if len(distance) else -1
+            if nearest < 0 or distance[nearest] > 1.25 * self.wait_radius:
+                self.waits = np.vstack([self.waits, [seconds, 1.0, x, y]])
+            else:  # robots from both sides wait before one door: it is between them
+                self.waits[nearest, 0] += seconds
+                self.waits[nearest, 2:] += (
+                    np.array([x, y]) - self.waits[nearest, 2:]
+                ) / NEAREST_WAITS
+
+    def add_failure(self, x: float, y: float, seconds: float) -> None:
+        """Add a failure, which costs as much as a wait of so many seconds."""
+        self._add_waits(NO_VISITS, np.array([[x, y, seconds]]))
+
+    def expected_waits(self) -> Iterator[tuple[Float64, float]]:
+        """Yield where robots wait, and the mean seconds of a passage."""
+        for seconds, passages, x, y in self.waits.tolist():
+            yield np.array([x, y]), seconds / (passages + WAIT_PASSAGES)
 
     def _rows(self, position: Float64) -> NDArray[np.int64]:
         """Return the row of each position; new places get one."""
@@ -111,48 +180,74 @@ class Evidence:
         visited, first = np.unique(rows, return_index=True)
         first = first[visited >= before]
         fresh = np.zeros((len(first), len(COLUMNS)))
-        fresh[:, 3:5] = position[first]
+        fresh[:, 3:5], fresh[:, 5] = position[first], self.driven
+        if self.posterior is not None:
+            fresh[:, 2] = np.append(self.posterior.foretold, 0)[
+                self.posterior.places_at(fresh[:, 3:5])
+            ]
         self.table = np.concatenate([self.table, fresh])
         return rows
 
-    def share_left(self, seconds: Any) -> Any:
-        """Return what share of evidence is left after so many driven seconds."""
-        return 0.5 ** (seconds / self.half_life)
-
-    def faded(self, table: Float64, driven: float) -> Float64:
-        """Return the weights of rows of the table, faded to a driven time: (N, 3)."""
-        weights: Float64 = table[:, :3] * self.share_left(driven - table[:, 5:])
+    def faded(self) -> Float64:
+        """Return the weight of each row, and that times the log slowness, of now: (N, 2)."""
+        period = self.half_life / FADING_STEPS
+        elapsed = np.maximum(math.floor(self.driven / period) * period - self.table[:, 5:], 0)
+        weights: Float64 = self.table[:, :2] * 0.5 ** (elapsed / self.half_life)
         return weights
 
-    def _fade(self, rows: NDArray[np.int64]) -> NDArray[np.int64]:
-        """Fade places to the driven time; return each of them once."""
-        places = np.unique(rows)
-        self.table[places, :3] = self.faded(self.table[places], self.driven)
-        self.table[places, 5] = self.driven
-        return places
+    def _fit(self) -> None:
+        """Learn what all places have in common, how they differ, and what the prior is worth."""
+        weight, sum_of_log = self.faded().T
+        seen = weight >= 0.2
+        weight, foretold = weight[seen], self.table[seen, 2]
+        log = sum_of_log[seen] / weight
+        columns = np.column_stack([np.ones(len(log)), foretold])
+        self.place_variance = VARIANCE  # of the log slowness
+        for _ in range(3):  # either tells of the other
+            # Bayesian regression of the log slowness on 1 and on what the prior foretold.
+            share = 1 / (self.place_variance + self.noise / weight) / ALIKE
+            precision = np.diag([NOMINAL, TRUSTED]) + (columns * share[:, None]).T @ columns
+            self.trust_variance = np.linalg.inv(precision)
+            right = np.array([0, TRUSTED * TRUST]) + columns.T @ (share * log)
+            fitted = self.trust_variance @ right
+            self.trust = float(fitted[0]), float(max(fitted[1], 0))
+            squares = (log - columns @ self.trust) ** 2 - self.noise / weight
+            total = VARIED_PLACES * VARIANCE + float(squares.sum()) / ALIKE
+            variance = total / (VARIED_PLACES + len(log) / ALIKE)
+            self.place_variance = min(max(variance, LEAST_VARIANCE), MOST_VARIANCE)
+        # The mean of an exponential is more than 1, as far as drives have shown that places differ.
+        self.surplus = self.place_variance / 2 * len(log) / (VARIED_PLACES * ALIKE + len(log))
+        sure = log[weight >= KNOWN]
+        # Logarithms of how slow the robot is in the open, and where it is fastest.
+        quantiles = np.quantile(sure, (0.25, 0.05)) if len(sure) >= SURE_PLACES else np.zeros(2)
+        self.open, self.fastest = map(float, quantiles)
 
-    def _compare(self, visits: Visits, spread: Spread) -> None:
+    def _compare(self, visits: Visits, waits: Float64, posterior: Posterior) -> None:
         """Compare the time of a drive with the one expected on the last map."""
-        cells, free = cells_of(visits.position, spread.grid)
-        x, y = cells[free].T
-        if len(x) < SHORTEST:
+        places = posterior.places_at(visits.position)
+        free = places >= 0
+        places, metres = places[free], visits.metres[free]
+        if len(places) < SHORTEST:
             return
-        metres = visits.metres[free]
-        expected = metres / self.nominal_speed * spread.slowness[y, x]
-        deviation = self.deviation(expected, metres, spread.variance(x, y))
-        error = math.log(visits.seconds[free].sum() / expected.sum()) / deviation
+        expected = metres / self.nominal_speed * posterior.slowness[places]
+        deviation = self.deviation(expected, metres, posterior, places)
+        seconds = visits.seconds[free].sum() + waits[:, 2].sum()
+        error = math.log(seconds / expected.sum()) / deviation
         self.errors = [*self.errors, error][-KEPT:]
 
-    def deviation(self, seconds: Float64, metres: Float64, variance: Float64) -> float:
+    def deviation(
+        self, seconds: Float64, metres: Float64, posterior: Posterior, places: NDArray[np.int64]
+    ) -> float:
         """Return the standard deviation of the log time of a drive, from those of its parts."""
         # Each place has a noise of its own; the log slowness of near ones is wrong in the same way.
-        share = seconds / seconds.sum()
+        share, known = seconds / seconds.sum(), posterior.known[places]
         of_visits = self.noise * (share**2 * np.maximum(self.side / metres, 1)).sum()
-        weighted, at = share * np.sqrt(variance), np.cumsum(metres)
+        of_all = self.trust_variance[0, 0] * float(share @ (1 - known)) ** 2 + DRIVE_NOISE**2
+        weighted, at = share * np.sqrt(posterior.variance[places]), np.cumsum(metres)
         begins = np.unique(np.linspace(0, len(at) - 1, PARTS).astype(np.int64))
         weighted, at = np.add.reduceat(weighted, begins), at[begins]
         same = np.exp(-np.abs(at[:, None] - at) / (CORRELATED * self.side))
-        return float(np.sqrt(weighted @ same @ weighted + of_visits))
+        return float(np.sqrt(weighted @ same @ weighted + of_visits + of_all))
 
     def quantiles(self) -> Float64:
         """Return the lower bound, the mean, and the upper bound of 90 % of the errors of drives."""
@@ -162,188 +257,75 @@ class Evidence:
         low, high = np.quantile(errors, (max(tail, 0), min(1 - tail, 1)))
         return np.array([low, errors.mean(), high])
 
-    def over(self, grid: GridMap) -> Spread:
-        """Return the evidence spread over a map, computed only where it changed."""
+    def over(self, grid: GridMap) -> Posterior:
+        """Return the posterior over a map, solved only where it changed."""
         check_grid(grid)
-        period = self.half_life / FADING_STEPS
-        driven = math.floor(self.driven / period) * period
-        spread, self.spread = self.spread, None  # an exception must not leave a part of it
+        posterior, self.posterior = self.posterior, None  # an exception must not leave a part of it
         if (
-            spread is None
-            or self.share_left(driven - spread.since) <= 1 / REBASE
-            or (spread.grid.resolution, spread.grid.origin) != (grid.resolution, grid.origin)
-            or not equal(spread.grid.occupancy, grid.occupancy)
+            posterior is None
+            or (posterior.grid.resolution, posterior.grid.origin) != (grid.resolution, grid.origin)
+            or not equal(posterior.grid.occupancy, grid.occupancy)
         ):
-            spread = Spread(grid, driven)
-        spread.grid = grid
-        spread.update(self, driven)
-        self.spread = spread
-        return spread
+            posterior = Posterior(grid, self.side)
+        posterior.grid = grid
+        posterior.update(self)
+        self.posterior = posterior
+        return posterior
+
+    def merge(self, other: Evidence) -> None:
+        """Add what other evidence has."""
+        if len(other.table):
+            rows = self._rows(other.table[:, 3:5])
+            places = np.unique(rows)
+            self.table[places, :2], self.table[places, 5] = self.faded()[places], self.driven
+            np.add.at(self.table[:, :2], rows, other.faded())
+            self.table[places, :2] /= np.maximum(self.table[places, :1] / MOST, 1)
+        for seconds, passages, x, y in other.waits.tolist():
+            self._add_waits(NO_VISITS, np.array([[x, y, seconds]]))
+            nearest = np.hypot(self.waits[:, 2] - x, self.waits[:, 3] - y).argmin()
+            self.waits[nearest, 1] += passages - 1.0
+        self.noise_sums = tuple(np.add(self.noise_sums, other.noise_sums).tolist())
+        self.errors = [*self.errors, *other.errors][-KEPT:]
+        self.driven += other.driven
+        self.prior = other.prior if self.prior is None else self.prior
+        self._fit()
+
+    def arrays(self) -> dict[str, Any]:
+        """Return what a file keeps."""
+        return {
+            "evidence": self.table,
+            "waits": self.waits,
+            "driven": self.driven,
+            "noise": self.noise_sums,
+            "errors": self.errors,
+        }
 
     def restore(self, arrays: Mapping[str, NDArray[Any]]) -> None:
         """Take what a file keeps; a ValueError if it cannot be true."""
-        names = ("places", "evidence", "driven", "noise", "errors")
-        places, table, driven, noise, errors = given = [arrays[name] for name in names]
+        names = "evidence", "waits", "driven", "noise", "errors"
+        table, waits, driven, noise, errors = given = [arrays[name] for name in names]
         if not all(array.dtype.kind in "if" and np.isfinite(array).all() for array in given):
             raise ValueError("it holds what is no finite number")
-        number = {(x, y): row for row, (x, y) in enumerate(places.tolist())}
-        shapes = places.shape, table.shape, driven.shape, noise.shape, errors.shape
-        fitting = (len(number), 2), (len(number), len(COLUMNS)), (), (2,), (errors.size,)
-        if shapes != fitting or places.dtype.kind != "i":
+        shapes = table.shape, waits.shape, driven.shape, noise.shape, errors.shape
+        fitting = (
+            (len(table), len(COLUMNS)),
+            (len(waits), len(WAIT_COLUMNS)),
+            (),
+            (2,),
+            (errors.size,),
+        )
+        if shapes != fitting:
             raise ValueError(f"its arrays do not fit: they have the shapes {shapes}")
+        squares = np.floor(table[:, 3:5] / self.side).tolist()
+        places = {(int(x), int(y)): row for row, (x, y) in enumerate(squares)}
         total, visits = noise.tolist()
-        wrong = (table[:, [0, 2]] < 0).any() or (np.abs(table[:, 3:5]) > FARTHEST).any()
+        wrong = (table[:, 0] < 0).any() or (np.abs(table[:, 3:5]) > FARTHEST).any()
+        wrong = wrong or (waits[:, :2] < 0).any() or len(places) != len(table)
         if wrong or (table[:, 5] > driven).any() or total < 0 or visits <= 0:
             raise ValueError("its evidence cannot be true")
-        self.places, self.table, self.driven = number, table, float(driven)
-        self.noise_sums, self.errors = (total, visits), errors.tolist()
+        self.places, self.table, self.waits = places, table, waits
+        self.driven, self.noise_sums, self.errors = float(driven), (total, visits), errors.tolist()
+        self._fit()
 
 
-class Spread:
-    """Evidence spread over the cells of a map."""
-
-    # The sums are those at the driven time `since`: they all fade further by one factor, `faded`.
-
-    def __init__(self, grid: GridMap, since: float) -> None:
-        shape = grid.occupancy.shape
-        self.grid, self.since, self.driven = grid, since, since
-        self.faded, self.noise = 1.0, NOISE
-        # Of weights of visits, of these times log slowness, and of failures.
-        self.sums = np.zeros((*shape, 3), dtype=np.float32)
-        self.slowness: NDArray[np.float32] = np.ones(shape, dtype=np.float32)
-        self.touched = np.zeros(shape, dtype=np.bool_)
-        self.table = np.zeros((0, len(COLUMNS)))  # what was spread of `Evidence.table`
-
-    def update(self, evidence: Evidence, driven: float) -> None:
-        """Spread what changed, less what was spread of the same places before."""
-        before = np.zeros_like(evidence.table)
-        before[: len(self.table)] = self.table
-        changed = (evidence.table != before).any(axis=1)
-        if changed.any():
-            before, now = before[changed], evidence.table[changed]
-            before, after = (evidence.faded(table, self.since) for table in (before, now))
-            more = after.astype(np.float32) - before.astype(np.float32)
-            cells = nearest_free(now[:, 3:5], self.grid, evidence.side)
-            inside = cells[:, 0] >= 0
-            reach = max(evidence.reach / self.grid.resolution, 0.5)
-            occupancy, cells, more = self.grid.occupancy, cells[inside], more[inside]
-            spread_evidence(occupancy, cells, more, reach, self.sums, self.touched)
-            self.table = evidence.table.copy()
-        if driven != self.driven:
-            self.driven, self.noise = driven, evidence.noise
-            self.faded = evidence.share_left(driven - self.since)
-            self.touched |= self.sums[..., 0] > 0
-        touched, scale = np.flatnonzero(self.touched), np.log(1 + STEP)
-        if not len(touched):
-            return
-        self.slowness = self.slowness.copy()  # maps have the old one
-        for cells in np.array_split(touched, 1 + len(touched) // MOST_AT_ONCE):
-            sums = self.sums.reshape(-1, 3).take(cells, axis=0).T
-            weight, sum_of_log, failures = np.ascontiguousarray(sums, dtype=np.float64) * self.faded
-            # Differences of sums may leave a rest below 0.
-            weight, failures = np.maximum(weight, 0), np.maximum(failures, 0)
-            # Half of the noise is added, as the mean of its exponential is more than 1.
-            mean = (sum_of_log / self.noise + weight / 2) / (weight / self.noise + 1 / PRIOR)
-            tries = (PRIOR_SUCCESSES + weight + failures) / (PRIOR_SUCCESSES + weight)
-            steps = np.rint((np.maximum(mean, 0) + np.log(tries)) / scale)
-            np.put(self.slowness, cells, np.minimum(np.exp(steps * scale), MAX_SLOWNESS))
-        np.put(self.touched, touched, False)
-
-    def variance(self, x: Any, y: Any) -> Float64:
-        """Return the variance of the log slowness of some cells."""
-        weight = np.maximum(self.sums[y, x, 0].astype(np.float64), 0) * self.faded
-        variance: Float64 = 1 / (weight / self.noise + 1 / PRIOR)
-        return variance
-
-
-def cells_of(position: Float64, grid: GridMap) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
-    """Return the cells of positions, (N, 2) as (x, y), and which of them are free: (N,)."""
-    origin_x, origin_y, yaw = grid.origin
-    x, y = position[:, 0] - origin_x, position[:, 1] - origin_y
-    cos, sin = math.cos(yaw), math.sin(yaw)
-    along = np.column_stack([cos * x + sin * y, cos * y - sin * x])
-    cells = np.floor(along / grid.resolution).astype(np.int64)
-    last = np.array([grid.width - 1, grid.height - 1])
-    x, y = np.clip(cells, 0, last).T
-    inside = ((cells >= 0) & (cells <= last)).all(axis=1)
-    free: NDArray[np.bool_] = inside & ~grid.occupancy[y, x]
-    return cells, free
-
-
-def nearest_free(position: Float64, grid: GridMap, metres: float) -> NDArray[np.int64]:
-    """Return the free cells of positions, or the nearest within some metres, or (-1, -1)."""
-    cells, free = cells_of(position, grid)
-    reach = int(metres / grid.resolution)
-    result = np.where(free[:, None], cells, -1)
-    for index in np.flatnonzero(~free):
-        x, y = cells[index].tolist()
-        left, bottom = max(x - reach, 0), max(y - reach, 0)
-        box = grid.occupancy[bottom : max(y + reach + 1, 0), left : max(x + reach + 1, 0)]
-        free_y, free_x = np.nonzero(~box)
-        if len(free_x):
-            best = np.hypot(free_x + left - x, free_y + bottom - y).argmin()
-            result[index] = free_x[best] + left, free_y[best] + bottom
-    return result
-
-
-def spread_evidence(
-    occupancy: NDArray[np.bool_],
-    cells: NDArray[np.int64],
-    amounts: NDArray[np.float32],
-    reach: float,
-    sums: NDArray[np.float32],
-    touched: NDArray[np.bool_],
-) -> None:
-    """Add amounts (B, 3) of cells (B, 2) to sums (H, W, 3) around them; mark touched (H, W)."""
-    # An amount becomes less with the length d of a path, not through walls: (1 - (d / reach)^2)^3.
-    lengths = np.arange(int(STRAIGHT * reach) + 1)
-    share = ((1 - (lengths / (STRAIGHT * reach)) ** 2) ** 3).astype(np.float32)
-    size = 2 * int(reach) + 3  # no path within reach leads to the border
-    best, queue = np.empty((size, size), np.int32), np.empty((size * size, 2), np.int32)
-    waits = np.zeros((size, size), np.bool_)
-    _spread(occupancy, cells, amounts, share, best, queue, waits, sums, touched)
-
-
-@in_place
-def _spread(
-    occupancy: Any, cells: Any, amounts: Any, share: Any, best: Any, queue: Any, *arrays: Any
-) -> None:
-    """Do the work of `spread_evidence`, given shares by the length, and memory."""
-    (height, width), (waits, sums, touched) = occupancy.shape, arrays
-    size, furthest, middle = best.shape[0], share.size - 1, best.shape[0] // 2
-    for number in range(cells.shape[0]):
-        left, bottom = cells[number, 0] - middle, cells[number, 1] - middle
-        for y in range(size):
-            for x in range(size):
-                best[y, x] = furthest + 1
-        best[middle, middle] = 0
-        queue[0, 0] = queue[0, 1] = middle
-        first, end = 0, 1
-        while first != end:
-            x, y = queue[first, 0], queue[first, 1]
-            first = first + 1 if first + 1 < queue.shape[0] else 0
-            waits[y, x] = False
-            row, column, way = bottom + y, left + x, best[y, x]
-            for dy in range(-1, 2):
-                for dx in range(-1, 2):
-                    length = way + (DIAGONAL if dx != 0 and dy != 0 else STRAIGHT)
-                    if length >= best[y + dy, x + dx]:
-                        continue
-                    to_row, to_column = row + dy, column + dx
-                    if not (0 <= to_row < height and 0 <= to_column < width):
-                        continue
-                    corner = occupancy[row, to_column] or occupancy[to_row, column]
-                    if corner or occupancy[to_row, to_column]:
-                        continue
-                    best[y + dy, x + dx] = length
-                    if not waits[y + dy, x + dx]:
-                        waits[y + dy, x + dx] = True
-                        queue[end, 0], queue[end, 1] = x + dx, y + dy
-                        end = end + 1 if end + 1 < queue.shape[0] else 0
-        for y in range(size):
-            for x in range(size):
-                if best[y, x] <= furthest:
-                    touched[bottom + y, left + x] = True
-                    for kind in range(3):
-                        part = share[best[y, x]] * amounts[number, kind]
-                        sums[bottom + y, left + x, kind] += part
+NO_VISITS = Visits(np.zeros((0, 2)), np.zeros(0), np.zeros(0))

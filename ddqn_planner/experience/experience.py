@@ -2,29 +2,39 @@
 
 from __future__ import annotations
 
+import copy
 import io
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from functools import partial
 from itertools import pairwise
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple, TypeAlias
+from zlib import crc32
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ddqn_planner.experience.evidence import FARTHEST, Evidence, Visits
-from ddqn_planner.files import as_path, write_atomically
+from ddqn_planner.experience.prior import Prior
+from ddqn_planner.files import as_path, differences, locked, write_atomically
 from ddqn_planner.grid import GridMap
 from ddqn_planner.grid.arguments import POSITIVE, Cells, as_number, cells_inside, numbers
 from ddqn_planner.grid.moves import cells_along
 
 Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
+Step: TypeAlias = Callable[[Evidence], None]
 
-VERSION = 1
+VERSION = 2
+PRIOR = "prior_"  # before the names of its arrays in a file
 OPTIONS = ("nominal_speed", "robot_width", "half_life", "max_pause")
 
 LATEST = 1e12  # seconds of a clock: a pose of a later time is not believed
+WINDOW = 0.25  # metres at nominal speed, in whose time poses are averaged
+STAND_DISTANCE = 0.1  # metres within which a robot stands
+STAND = 1.5  # metres at nominal speed: a robot that drives needs less time to leave a place
+FAST_STEP = 0.3  # of the log speed, by which the fastest move that a map knows of becomes faster
 CORRECTION = 0.25  # metres by which a localisation may move a pose at once: the drive goes on
 RELOCATION = 1.0  # a jump by this many metres more puts the robot at a place not believed
 MEMORY = 60.0  # seconds over which a robot whose pose is not believed counts as driving on
@@ -45,30 +55,31 @@ class ExpectedTime(NamedTuple):
 class Experience:
     """How long driving takes at places of the world, learned from poses of a robot.
 
-    The logarithm of the slowness, that is seconds over seconds at nominal speed, has a normal
-    posterior at each place, whose prior is a nominal place. A visit tells of the places around it
-    too, as far as `REACH`, along paths and not through walls. All is kept by places of the world:
+    A place has a slowness, that is seconds over those at nominal speed, and perhaps a wait, in
+    seconds a passage. The log slowness is a Gaussian Markov random field over the free places of a
+    map: near places are alike, but not through walls. What nobody drove is expected to be as slow
+    as what was driven, or as `prior` foretells from the map. All is kept by places of the world:
     maps may grow, shift or come in another resolution. Memory grows with the driven area.
 
-    Evidence fades with the time that the robot drives: what it learned does not fade overnight.
+    Evidence fades with the time that the robot drives, and at once where places have changed.
 
     Parameters
     ----------
     nominal_speed : float
-        Metres per second in the open.
+        Metres per second in the open: a first guess, see `learned_speed`.
     robot_width : float
         Metres: the size of a place is half of it.
     half_life : float
         Seconds of driving after which evidence counts half.
     max_pause : float
-        Seconds: a place that takes longer shows something else than driving, and is left out.
+        Seconds: a robot that stands for longer waits for nothing, which is left out.
     """
 
     def __init__(
         self,
         nominal_speed: float,
         robot_width: float = 0.5,
-        half_life: float = 900.0,
+        half_life: float = 36_000.0,
         max_pause: float = 90.0,
     ) -> None:
         given = nominal_speed, robot_width, half_life, max_pause
@@ -76,11 +87,14 @@ class Experience:
             as_number(name, value, *POSITIVE, "more than 0, and finite")
             for name, value in zip(OPTIONS, given, strict=True)
         )
-        self.forget()
+        self.evidence = Evidence(self.nominal_speed, self.robot_width, self.half_life)
+        # The file that holds this experience, less what is new.
+        self._synchronised: tuple[Path | None, int] = None, 0
+        self._news: list[Step] = []
 
     def forget(self) -> None:
         """Forget all."""
-        self.evidence = Evidence(self.nominal_speed, self.robot_width, self.half_life)
+        self._learn(Evidence.forget)
 
     def record(self, seconds: ArrayLike, positions: ArrayLike) -> None:
         """Learn from a drive, or a part of one.
@@ -106,53 +120,115 @@ class Experience:
         possible = (np.abs(time) < LATEST) & (np.abs(position) < FARTHEST).all(axis=1)
         time, position = time[possible], position[possible]
         fresh = np.diff(time, prepend=np.nan) != 0  # a repeated time adds nothing
-        time, position = time[fresh], position[fresh]
-        side, limits = self.evidence.side, (3 * self.nominal_speed, self.max_pause)
+        if fresh.any() and (drive := self._measured(time[fresh], position[fresh])) is not None:
+            self._learn(partial(Evidence.add, visits=drive[0], waits=drive[1]))
+
+    def _measured(self, time: Float64, position: Float64) -> tuple[Visits, Float64] | None:
+        """Return the visits and the waits of a drive, if there are any."""
+        side = self.evidence.side
+        window = WINDOW / self.nominal_speed
+        seconds, at = _averaged(time, position, window)
+        speeds = np.hypot(*np.diff(at, axis=0).T) / np.abs(np.diff(seconds))
+        usual = float(np.median(speeds)) if len(speeds) else 0.0
+        limits = 3 * max(self.nominal_speed, self.learned_speed, usual), self.max_pause
         steps: list[tuple[float, float, float, float]] = []
+        waits: list[Float64] = []
         for part in _believed_parts(time, position, *limits):
-            steps += _steps(time[part].tolist(), position[part].tolist(), side / 2, *limits)
+            seconds, at = _averaged(time[part], position[part], window)
+            stands = _stands(seconds, at, STAND / self.nominal_speed)
+            for first, last in stands:
+                if (stood := seconds[last] - seconds[first]) <= self.max_pause:
+                    waits.append(np.array([*at[first : last + 1].mean(axis=0), stood]))
+                seconds[last:] -= stood
+                seconds[first:last] = seconds[first]
+            steps += _steps(seconds.tolist(), at.tolist(), side / 2, *limits)
         if not steps:
-            return
+            return None
         rows = np.array(steps)
         square = np.floor(rows[:, :2] / side)
         begins = np.flatnonzero(np.append(True, (np.diff(square, axis=0) != 0).any(axis=1)))
         rows[:, :2] *= rows[:, 3:]
         sums = np.add.reduceat(rows, begins)
-        self.evidence.add(Visits(sums[:, :2] / sums[:, 3:], sums[:, 2], sums[:, 3]))
+        visits = Visits(sums[:, :2] / sums[:, 3:], sums[:, 2], sums[:, 3])
+        return visits, np.array(waits).reshape(-1, 3)
 
     def record_failure(self, position: Sequence[float]) -> None:
-        """Learn that the robot failed at a place: it got stuck, was sent back, or gave up."""
+        """Learn that the robot failed at a place: it costs as much as a wait of `max_pause`."""
         point = numbers("the position", position, (2,))
         if not (np.abs(point) < FARTHEST).all():
             raise ValueError(f"the position is {position!r}; give metres, at most {FARTHEST:g}")
-        self.evidence.add_failure(float(point[0]), float(point[1]))
+        x, y = point.tolist()
+        self._learn(partial(Evidence.add_failure, x=x, y=y, seconds=self.max_pause))
+
+    def _learn(self, step: Step) -> None:
+        step(self.evidence)
+        self._news.append(step)
+
+    def merge(self, other: Experience) -> None:
+        """Learn all that another experience of a robot of this kind learned; merge each once.
+
+        Raises
+        ------
+        ValueError
+            If the two have other parameters.
+        """
+        mine, its = ({name: getattr(each, name) for name in OPTIONS} for each in (self, other))
+        if changed := differences(its, mine):
+            raise ValueError(f"the other experience has {changed}; give those of one kind of robot")
+        self._learn(partial(Evidence.merge, other=copy.deepcopy(other.evidence)))
+
+    @property
+    def learned_speed(self) -> float:
+        """Metres per second in the open, as drives show; at first the nominal speed."""
+        return self.nominal_speed / math.exp(self.evidence.open)
+
+    @property
+    def prior(self) -> Prior | None:
+        """What foretells the slowness of places from the map; None if nothing does."""
+        return self.evidence.prior
+
+    @prior.setter
+    def prior(self, prior: Prior | None) -> None:
+        self.evidence.prior = prior
 
     def take_over(self, older: Experience) -> None:
-        """Use what older experience of the same robot computed for its map, which forgets it."""
+        """Use what older experience solved for its map, which forgets it."""
         mine, its = self.evidence, older.evidence
-        of_one_robot = all(getattr(self, name) == getattr(older, name) for name in OPTIONS)
-        if of_one_robot and list(mine.places)[: len(its.places)] == list(its.places):
-            mine.spread, its.spread = its.spread, None
+        if mine.side == its.side:
+            mine.posterior, its.posterior = its.posterior, None
 
-    def apply(self, grid: GridMap) -> GridMap:
+    def apply(self, grid: GridMap, exploration: float = 0.0) -> GridMap:
         """Return a map whose moves cost expected time, so that `Plan.cost` is in seconds.
 
-        Costs of the map itself multiply it. Where moves fail, a move is tried until it succeeds:
-        its time is that of one try over the probability of success.
+        Costs of the map itself multiply it.
+
+        Parameters
+        ----------
+        grid : GridMap
+            The map.
+        exploration : float
+            0 or more. Places count as faster the less of them is known, at most by this share. So
+            plans lead where it may be faster, but no plan is expected to take longer than the best
+            one by more than this share.
         """
-        slowness = self.evidence.over(grid).slowness
-        seconds_per_cell = grid.resolution / self.nominal_speed
+        limits = 0.0, 10.0, "0 to 10"
+        exploration = as_number("exploration", exploration, *limits)
+        evidence = self.evidence
+        fastest = FAST_STEP * min(0, math.floor(evidence.fastest / FAST_STEP + 0.5))
+        fastest -= math.log(1 + exploration)
+        slowness = evidence.over(grid).paint(exploration, fastest)
+        seconds_per_cell = grid.resolution / self.nominal_speed * math.exp(fastest)
         return grid.with_layers(slowness=slowness, seconds_per_cell=seconds_per_cell)
 
     def slowness(self, grid: GridMap) -> Float32:
-        """Return (H, W) float32: expected seconds over those at nominal speed, 1 or more."""
-        return np.array(self.evidence.over(grid).slowness)
+        """Return (H, W) float32: expected seconds, with waits, over those at nominal speed."""
+        posterior = self.evidence.over(grid)
+        return posterior.over(posterior.slowness, 1.0)
 
     def uncertainty(self, grid: GridMap) -> Float32:
         """Return (H, W) float32: the standard deviation of the log slowness."""
-        variance = self.evidence.over(grid).variance(slice(None), slice(None))
-        deviation: Float32 = np.sqrt(variance).astype(np.float32)
-        return deviation
+        posterior = self.evidence.over(grid)
+        return posterior.over(np.sqrt(posterior.variance), 0.0)
 
     def expected_time(self, grid: GridMap, cells: Cells) -> ExpectedTime:
         """Return the time that a path takes, with an interval of 90 %.
@@ -165,40 +241,58 @@ class Experience:
         ValueError
             If a cell is no cell of the map.
         """
-        spread = self.evidence.over(grid)
+        posterior = self.evidence.over(grid)
         corners = cells_inside(cells, grid.occupancy.shape)
         if len(corners) < 2:
             return ExpectedTime(0.0, 0.0, 0.0)
         path, position = cells_along(corners)
-        x, y = path.T
         of_segments = np.hypot(*np.diff(corners, axis=0).T) * grid.resolution
         metres = np.diff(position) * of_segments[position[:-1].astype(np.int64)]
-        slowness = spread.slowness[y, x].astype(np.float64)
-        variance = spread.variance(x, y)
+        places = posterior.place[path[:, 1], path[:, 0]].astype(np.int64)
+        slowness = posterior.slowness[places]
         seconds = metres / self.nominal_speed * (slowness[1:] + slowness[:-1]) / 2
-        deviation = self.evidence.deviation(seconds, metres, (variance[1:] + variance[:-1]) / 2)
+        deviation = self.evidence.deviation(seconds, metres, posterior, places[1:])
         low, middle, high = np.exp(self.evidence.quantiles() * deviation)
         total = float(seconds.sum())
         return ExpectedTime(total * middle, total * low, total * high)
 
-    def to_bytes(self) -> bytes:
-        """Return what a file of it holds."""
-        content, evidence = io.BytesIO(), self.evidence
-        np.savez(
-            content,
-            version=VERSION,
-            options=[getattr(self, name) for name in OPTIONS],
-            places=np.array(list(evidence.places), dtype=np.int64).reshape(-1, 2),
-            evidence=evidence.table,
-            driven=evidence.driven,
-            noise=evidence.noise_sums,
-            errors=evidence.errors,
-        )
-        return content.getvalue()
-
     def save(self, path: str | Path) -> None:
-        """Save to a file, atomically; an OSError leaves an old file unchanged."""
-        write_atomically(as_path(path), self.to_bytes())
+        """Save to a file, atomically; an OSError leaves an old file unchanged.
+
+        What the file holds from others is kept: two processes may save to one file. Delete it to
+        begin anew.
+
+        Raises
+        ------
+        ValueError
+            If the file holds no experience, or that of another kind of robot.
+        """
+        path = as_path(path).absolute()
+        with locked(path):
+            old = path.read_bytes() if path.exists() else None
+            if old is not None and self._synchronised != (path, crc32(old)):
+                saved = Experience.load(path)
+                if self._synchronised[0] == path:
+                    for step in self._news:
+                        step(saved.evidence)
+                    saved.prior = self.prior
+                else:
+                    saved.merge(self)
+                saved.take_over(self)
+                self.evidence = saved.evidence
+            content = self.to_bytes()
+            write_atomically(path, content)
+        self._synchronised = path, crc32(content)
+        self._news = []
+
+    def to_bytes(self) -> bytes:
+        """Return all as bytes, for a file or a message."""
+        content = io.BytesIO()
+        prior = self.prior.arrays() if self.prior is not None else {}
+        arrays: dict[str, Any] = {PRIOR + name: array for name, array in prior.items()}
+        options = [getattr(self, name) for name in OPTIONS]
+        np.savez(content, version=VERSION, options=options, **self.evidence.arrays(), **arrays)
+        return content.getvalue()
 
     @classmethod
     def from_bytes(cls, data: bytes) -> Experience:
@@ -212,11 +306,17 @@ class Experience:
         try:
             with np.load(io.BytesIO(data), allow_pickle=False) as file:
                 arrays = dict(file)  # whose checksums are checked
-            if int(arrays["version"]) != VERSION:
-                raise ValueError(f"it has version {arrays['version']}, not {VERSION}")
+            version = int(arrays["version"])
+            if version not in (1, VERSION):
+                raise ValueError(f"it has version {version}, not {VERSION}")
             options = dict(zip(OPTIONS, arrays["options"].tolist(), strict=True))
             experience = cls(**options)
+            if version == 1:  # before 0.4.0 failures stood where now is what the prior foretold
+                arrays["waits"] = np.zeros((0, 4))
+                arrays["evidence"][:, 2] = 0
             experience.evidence.restore(arrays)
+            prior = {n.removeprefix(PRIOR): a for n, a in arrays.items() if n.startswith(PRIOR)}
+            experience.prior = Prior.from_arrays(prior) if prior else None
         except Exception as error:  # broken bytes make zipfile and NumPy raise many kinds of errors
             raise ExperienceFileError(f"no experience: {error}") from error
         return experience
@@ -232,12 +332,15 @@ class Experience:
         """
         path = as_path(path)
         try:
-            return cls.from_bytes(path.read_bytes())
+            content = path.read_bytes()
+            experience = cls.from_bytes(content)
         except (OSError, ExperienceFileError) as error:
             raise ExperienceFileError(
                 f"{path}: cannot be read ({error}); give a file that `Experience.save` wrote, or "
                 "delete it to begin anew"
             ) from error
+        experience._synchronised = path.absolute(), crc32(content)
+        return experience
 
 
 def _believed_parts(
@@ -261,13 +364,37 @@ def _believed_parts(
             yield slice(first, end)
 
 
+def _averaged(time: Float64, position: Float64, window: float) -> tuple[Float64, Float64]:
+    """Return the means of poses over windows of time: noise of poses is no way that is driven."""
+    begins = np.flatnonzero(np.diff(np.floor((time - time[:1]) / window), prepend=np.nan) != 0)
+    count = np.diff(begins, append=len(time))
+    sums = np.add.reduceat(np.column_stack([time, position]), begins)
+    means = sums / count[:, None]
+    return means[:, 0].copy(), means[:, 1:]
+
+
+def _stands(time: Float64, position: Float64, shortest: float) -> list[tuple[int, int]]:
+    """Return the first and the last index of each stand on the way, not at its ends."""
+    stands, first = [], 0
+    while first < len(time):
+        away = np.hypot(*(position[first:] - position[first]).T) > STAND_DISTANCE
+        last = first + (int(away.argmax()) if away.any() else len(away)) - 1
+        if time[last] - time[first] < shortest:
+            first += 1
+            continue
+        if first > 0 and last < len(time) - 1:
+            stands.append((first, last))
+        first = last + 1
+    return stands
+
+
 def _steps(
     time: list[float], position: list[list[float]], step: float, max_speed: float, max_pause: float
 ) -> Iterator[tuple[float, float, float, float]]:
     """Yield x and y of the middle of each step, its seconds and its metres."""
     # How long the robot stands before it drives off says nothing about the place.
     away = (index for index, at in enumerate(position) if math.dist(at, position[0]) >= step / 4)
-    start = max(next(away, len(time)) - 1, 0)
+    start = next(away, len(time) - 1)
     began, (from_x, from_y) = time[start], position[start]
     for now, (x, y) in zip(time[start:], position[start:], strict=True):
         seconds, metres = now - began, math.hypot(x - from_x, y - from_y)

@@ -63,5 +63,8 @@ PLANNER_PARAMETERS: Final = {
         CACHE_BYTES, "Bytes for kept Q fields; the last two always stay", (0, 2**40)
     ),
     "planner_id": Declared("GridBased", "What Nav2's requests may name, or leave empty"),
+    "exploration": Declared(
+        0.1, "Share by which a path may be expected to take longer, to learn from it", (0, 10)
+    ),
     "follow_trainer": Declared(False, "Load what the trainer saves", read_only=True),
 }

@@ -86,7 +86,7 @@ class PlannerNode(ManagedNode):
         self._start = StartSource(
             self, self._frames, self._report, lambda: self._map.frame, self._on_start
         )
-        self._times = ExpectedTimes(self._report, self._map_worker, self._replan.trigger)
+        self._times = ExpectedTimes(self, self._report, self._map_worker, self._replan.trigger)
         inputs = self._map, self._times.on, self._start, self._frames, self._model
         self._requests = Requests(self._settings, *inputs, self._worker, self._look_soon)
         self.create_subscription(PoseStamped, "goal_pose", lambda goal: self._on_goals([goal]), 10)
@@ -311,8 +311,10 @@ class PlannerNode(ManagedNode):
 class ExpectedTimes:
     """Puts on maps what the trainer has learned of the robot's drives."""
 
-    def __init__(self, report: Report, worker: Worker, on_change: Callable[[], None]) -> None:
-        self._report, self._worker, self._on_change = report, worker, on_change
+    def __init__(
+        self, node: ManagedNode, report: Report, worker: Worker, on_change: Callable[[], None]
+    ) -> None:
+        self._node, self._report, self._worker, self._on_change = node, report, worker, on_change
         self._experience: Experience | None = None
         self._spread_on: GridMap | None = None
         self._applied = (NO_MAP, NO_MAP)  # the last map, without times and with them
@@ -361,7 +363,8 @@ class ExpectedTimes:
             return grid
         if self._spread_on is None or not _is_like(grid, self._spread_on):
             self._spread_on = grid
-        of_places, (before, timed) = self._experience.apply(self._spread_on), self._applied
+        (before, timed), share = self._applied, self._node.value("exploration")
+        of_places = self._experience.apply(self._spread_on, share)
         boxes = grid.patches_since(before)
         if boxes is None or timed.slowness is not of_places.slowness:
             seconds = of_places.seconds_per_cell

@@ -22,7 +22,7 @@ def test_without_drives_every_place_takes_its_nominal_time() -> None:
     forgotten.forget()
     for experience in (Experience(SPEED), forgotten):
         assert (experience.slowness(HALL) == 1).all()
-        assert (experience.uncertainty(HALL) == 1).all()
+        assert (experience.uncertainty(HALL) == experience.uncertainty(HALL)[0, 0]).all()
         assert experience.expected_time(HALL, [(0, 0)]).seconds == 0
 
 
@@ -32,9 +32,9 @@ def test_a_place_is_as_slow_as_its_drives_at_any_rate_of_samples_and_time_of_the
 ) -> None:
     experience = driven(*[straight((2, 5), (12, 5), slowness, rate, began)] * 4)
     assert at(HALL, experience.slowness(HALL), 7, 5) == pytest.approx(slowness, rel=0.15)
-    assert at(HALL, experience.uncertainty(HALL), 7, 5) < 0.2
-    assert at(HALL, experience.slowness(HALL), 7, 8) == 1
-    assert at(HALL, experience.uncertainty(HALL), 7, 8) == 1
+    uncertainty = experience.uncertainty(HALL)
+    assert at(HALL, uncertainty, 7, 5) < 0.3 * uncertainty.max()
+    assert at(HALL, uncertainty, 7, 9) > 0.95 * uncertainty.max()
 
 
 @given(st.integers(0, 2**32 - 1))
@@ -46,6 +46,33 @@ def test_noise_of_the_pose_hardly_matters(seed: int) -> None:
     assert np.mean([at(HALL, slowness, x, 5) for x in range(4, 11)]) == pytest.approx(3, rel=0.1)
 
 
+@given(st.floats(0.2, 5), st.floats(1, 4))
+def test_the_speed_in_the_open_is_learned(guess: float, slowness: float) -> None:
+    experience = Experience(SPEED * guess)
+    for y in (3.0, 5.0, 7.0):
+        experience.record(*straight((2, y), (12, y)))
+    experience.record(*straight((2, 8), (12, 8), slowness))
+    assert experience.learned_speed == pytest.approx(SPEED, rel=0.1)
+    grid = experience.apply(HALL)
+    plan = Planner.load("any_map").plan(grid, (8, 20), (48, 20))
+    assert plan.cost == pytest.approx(10 / SPEED, rel=0.15)
+
+
+@given(st.floats(0.01, 0.5), st.integers(0, 2**32 - 1))
+def test_what_is_explored_is_expected_to_take_no_longer_than_the_share(
+    share: float, seed: int
+) -> None:
+    random = np.random.default_rng(seed)
+    grid = GridMap(random.random((40, 60)) < 0.2, 0.25)
+    ends = [grid.free_cells()[i] for i in random.integers(0, 1500, 2)]
+    drives = (straight(*random.uniform(0.5, 9.5, (2, 2)), random.uniform(1, 4)) for _ in range(4))
+    experience, planner = driven(*drives), Planner.load("any_map")
+    best, tried = (planner.plan(experience.apply(grid, e), *ends) for e in (0.0, share))
+    if best.cells:
+        expected = experience.expected_time(grid, tried.path).seconds
+        assert expected <= experience.expected_time(grid, best.path).seconds * (1 + share) * 1.04
+
+
 def test_waiting_counts_as_time_and_standing_before_a_drive_does_not() -> None:
     before, after = straight((2, 5), (7, 5)), straight((7, 5), (12, 5))
     seconds = np.concatenate([before[0] + 30, after[0] + before[0][-1] + 60])
@@ -55,7 +82,7 @@ def test_waiting_counts_as_time_and_standing_before_a_drive_does_not() -> None:
     positions = np.concatenate([np.tile([2.0, 5.0], (len(stood), 1)), positions])
     slowness = driven((seconds, positions)).slowness(HALL)
     assert at(HALL, slowness, 7, 5) > 2
-    assert at(HALL, slowness, 2, 5) == at(HALL, slowness, 10, 5) < 1.06
+    assert max(at(HALL, slowness, 2, 5), at(HALL, slowness, 10, 5)) < 1.1
 
 
 def faulty(fault: str) -> Poses:
@@ -93,7 +120,7 @@ def test_what_cannot_be_true_is_not_believed(fault: str) -> None:
     experience = driven(faulty(fault))
     slowness = experience.slowness(HALL)
     assert slowness.max() < 1.5
-    visited = experience.uncertainty(HALL) < 1
+    visited = experience.uncertainty(HALL) < 0.7 * experience.uncertainty(HALL).max()
     assert not visited[:15].any()
     assert not visited[26:].any()
     assert visited[20, 10:22].all()
@@ -106,7 +133,7 @@ def test_no_drive_breaks_it(poses: list[tuple[float, float, float]]) -> None:
     experience.record(array[:, 0], array[:, 1:])
     slowness = experience.slowness(HALL)
     assert np.isfinite(slowness).all()
-    assert (slowness >= 1).all()
+    assert (slowness > 0).all()
 
 
 @given(st.integers(0, 2**32 - 1))
@@ -126,7 +153,7 @@ def test_the_cost_of_a_plan_is_its_expected_time_and_no_path_is_faster(seed: int
             assert plan.cost == pytest.approx(seconds[start[1], start[0]], rel=1e-6, abs=1e-6)
             if grid.cost is None:
                 told = experience.expected_time(grid, plan.path)
-                assert told.seconds == pytest.approx(plan.cost, rel=1e-4)
+                assert told.seconds == pytest.approx(plan.cost, rel=0.03)  # in steps of 2 %
                 straight_plan = planner.plan(applied, start, goal, simplified=True)
                 told = experience.expected_time(grid, straight_plan.path)
                 # It looks at one cell of each column or row that a segment passes.
@@ -199,17 +226,17 @@ def test_every_broken_file_is_named(path: Path) -> None:
 @pytest.mark.parametrize(
     ("name", "value"),
     [
-        ("version", 2),
+        ("version", 3),
         ("options", [0.5, -1.0, 900.0, 45.0]),
-        ("places", np.zeros((3, 2), dtype=np.int64)),
+        ("waits", np.zeros((3, 2))),
         ("evidence", np.full((39, 6), np.nan)),
         ("driven", np.zeros(2)),
         ("noise", np.array(["a", "b"])),
         ("noise", [1.0, 0.0]),
         ("noise", [-1.0, 1.0]),
         ("driven", -1.0),
-        ("places", np.zeros((39, 2), dtype=np.int64)),
-        ("places", np.arange(78.0).reshape(39, 2)),
+        ("waits", -np.ones((1, 4))),
+        ("evidence", np.zeros((39, 6))),
         ("evidence", np.full((39, 6), 1e9)),
         ("errors", np.array([print], dtype=object)),  # nothing is unpickled
     ],
@@ -220,3 +247,38 @@ def test_a_wrong_value_is_refused(path: Path, name: str, value: object) -> None:
     np.savez(path, **{**values, name: value}, allow_pickle=True)
     with pytest.raises(ExperienceFileError):
         Experience.load(path)
+
+
+def test_two_processes_that_save_one_file_lose_nothing(tmp_path: Path) -> None:
+    file, lines = tmp_path / "experience.npz", {y: straight((2, y), (12, y), 3) for y in (2, 5, 8)}
+    driven(lines[2]).save(file)
+    one, other = Experience.load(file), Experience.load(file)
+    for experience, y in ((one, 5), (other, 8)):
+        experience.record(*lines[y])
+        experience.save(file)
+    one.save(file)
+    together = driven(*lines.values())
+    for experience in (one, Experience.load(file)):
+        np.testing.assert_allclose(
+            experience.uncertainty(HALL), together.uncertainty(HALL), rtol=0.05
+        )
+    one.forget()
+    one.save(file)
+    assert (Experience.load(file).slowness(HALL) == 1).all()
+    with pytest.raises(ValueError, match=r"robot_width 0.4 \(now 0.5\)"):
+        driven(robot_width=0.4).save(file)
+
+
+def test_what_was_merged_is_as_if_one_robot_had_driven_all() -> None:
+    drives = [straight((2, y), (12, y), slowness) for y, slowness in ((2, 2), (5, 4), (8, 3))]
+    one = driven(drives[0], drives[1])
+    one.merge(driven(drives[1], drives[2]))
+    together = driven(drives[0], drives[1], drives[1], drives[2])
+    np.testing.assert_allclose(one.slowness(HALL), together.slowness(HALL), rtol=0.1)
+
+
+def test_a_file_of_an_older_version_is_read(path: Path) -> None:
+    with np.load(path) as arrays:
+        old = {name: array for name, array in arrays.items() if name != "waits"}
+    np.savez(path, **{**old, "version": 1})
+    assert at(HALL, Experience.load(path).slowness(HALL), 7, 5) == pytest.approx(3, rel=0.15)

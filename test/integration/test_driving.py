@@ -35,6 +35,7 @@ GRID = GridMap(VALUES > 0, resolution=0.25)
 """A block with a way around it on each side; the lower one is shorter."""
 
 START, GOAL = (3, 18), (96, 18)
+UPPER = [(0.875, 4.625), (3.0, 7.5), (22.0, 7.5), (24.125, 4.625)]
 LOWER = [(0.875, 4.625), (3.0, 3.5), (22.0, 3.5), (24.125, 4.625)]
 """Metres: from the start to the goal below the block."""
 
@@ -170,23 +171,25 @@ def test_the_robot_goes_round_what_was_slow_until_it_forgets(planner: Any, site:
     ends = pose(GRID, START), pose(GRID, GOAL)
     wait_for("first way", lambda: is_below(site.client.get_plan(*ends)))
 
+    site.drive(UPPER, speed=0.5)
+    site.drive(UPPER[::-1], speed=0.5)
     episode = site.drive(LOWER, speed=0.1)
     assert episode.header.frame_id == "map"
     first, last = episode.poses[0].pose.position, episode.poses[-1].pose.position
     assert (first.x, first.y) == pytest.approx(LOWER[0], abs=0.2)
     assert (last.x, last.y) == pytest.approx(LOWER[-1], abs=0.1)
-    (drive,) = read_drives(site.folder / "episodes.csv")
+    *_, drive = read_drives(site.folder / "episodes.csv")
     assert drive.metres == pytest.approx(23.8, abs=0.5)
     assert drive.seconds[-1] - drive.seconds[0] == pytest.approx(238, abs=10)
 
     assert site.saved.wait().data == str(site.folder / "experience.npz")
     slowness = site.learned()
     assert slowness[14, 50] > 2
-    shown = site.slowness.wait(lambda message: max(message.data) > 0)
+    shown = site.slowness.wait(lambda message: max(message.data) > 40)
     values = np.array(shown.data).reshape(VALUES.shape)
     assert (values[VALUES > 0] == -1).all()
     assert values[14, 50] == pytest.approx(100 * math.log10(slowness[14, 50]), abs=1)
-    assert values[35, 50] == 0
+    assert values[30, 50] < 10
 
     wait_for("other way", lambda: not is_below(site.client.get_plan(*ends)))
     site.client.publish("initialpose", initial_pose(ends[0]))

@@ -1,0 +1,287 @@
+"""What drives tell of all free places of a map: a Gaussian Markov random field."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ddqn_planner.compiled import in_place
+from ddqn_planner.experience.prior import Prior, map_features
+from ddqn_planner.grid import GridMap
+from ddqn_planner.grid.arguments import MAX_SLOWNESS
+
+if TYPE_CHECKING:
+    from ddqn_planner.experience.evidence import Evidence
+
+Float64 = NDArray[np.float64]
+Int64 = NDArray[np.int64]
+
+CORRELATION = 1.0  # metres: how far the slowness of a place tells of that of others
+STEP = 0.02  # slowness is told in steps of this share: fields need no repair for less
+ACCURACY = 1e-3  # of the log slowness: places whose neighbours changed less stay as they are
+OVER_RELAXATION = 1.4  # of the solver: neighbours agree sooner
+# By how much what all places have in common must change before they are told: noise and variance
+# by a share, logarithms as they are.
+NEWS, NEWS_OF_LOG = 0.1, 0.02
+
+
+class Posterior:
+    """The posterior of each place of a map: a connected part of a block of free cells.
+
+    The log slowness of a place is normal around what the map lets expect. Neighbours are alike,
+    but not through walls. `mean` (P,) and `known` (P,) belong to the places: the log slowness, and
+    the share of it that was seen rather than expected.
+    """
+
+    def __init__(self, grid: GridMap, side: float) -> None:
+        self.grid = grid
+        self.size = max(1, round(side / grid.resolution))
+        self.spacing = self.size * grid.resolution
+        self.place, self.middle = _places_of(grid, self.size)  # (H, W), -1 where occupied
+        count = len(self.middle)
+        self.links = _links_of(self.place, self.size, count)
+        self.degree = np.asarray(self.links.sum(axis=1), dtype=np.float64)
+        # What was seen beyond what was expected, and the share that is known: a solution of linear
+        # equations, and their right side.
+        self.solution, self.right = np.zeros((2, count, 2))
+        self.prior: Prior | None = None
+        self.foretold = np.zeros(count, dtype=np.float32)  # by the prior
+        self.expected, self.waits = np.zeros(count), np.zeros(count)
+        # Noise, variance, what the prior is worth (two), surplus of the mean.
+        self.common = (0.0,) * 5
+        self.rows = np.zeros((0, 2)), np.zeros(0, dtype=np.int64)  # positions, and their places
+        self.painted: tuple[float, float, NDArray[np.float32]] | None = None
+        self.steps = np.zeros(0)
+
+    @property
+    def mean(self) -> Float64:
+        """The expected log slowness of driving at each place."""
+        return self.expected + self.solution[:, 0] + self.common[4] * (1 - self.known)
+
+    @property
+    def known(self) -> Float64:
+        """The share of each place's log slowness that was seen: 0 to 1."""
+        return np.clip(self.solution[:, 1], 0, 1)
+
+    @property
+    def variance(self) -> Float64:
+        """The variance of each place's log slowness."""
+        return self.common[1] * (1 - self.known)
+
+    @property
+    def slowness(self) -> Float64:
+        """Expected seconds of each place over those at nominal speed, with waits."""
+        return np.exp(self.mean) + self.waits
+
+    def places_at(self, position: Float64) -> Int64:
+        """Return the place of each position (N, 2), the nearest within a place's side, or -1."""
+        cells = nearest_free(position, self.grid, self.spacing)
+        places: Int64 = np.where(cells[:, 0] >= 0, self.place[cells[:, 1], cells[:, 0]], -1)
+        return places
+
+    def update(self, evidence: Evidence) -> None:
+        """Take what changed in the evidence, and solve again around it."""
+        position, places = self.rows
+        now = evidence.table[:, 3:5]
+        same = len(position) <= len(now) and bool((position == now[: len(position)]).all())
+        first = len(position) if same else 0
+        places = np.concatenate([places[:first], self.places_at(now[first:])])
+        self.rows = now.copy(), places
+        common = evidence.noise, evidence.place_variance, *evidence.trust, evidence.surplus
+        change = np.abs(np.array(common) - self.common)
+        least = [NEWS * common[0], NEWS * common[1], *[NEWS_OF_LOG] * 3]
+        is_new = evidence.prior is not self.prior
+        if is_new and evidence.prior is not None:
+            x, y = self.middle.T
+            self.foretold = evidence.prior.log_slowness(map_features(self.grid)[y, x])
+        if is_new or (change > least).any():
+            self.prior, self.common = evidence.prior, common
+            self.expected = common[2] + common[3] * self.foretold.astype(np.float64)
+        noise, variance = self.common[:2]
+        inside = places >= 0
+        weight, log = evidence.faded()[inside].T
+        # Half of the noise is added, as the mean of its exponential is more than 1.
+        sums = np.column_stack([weight, log + weight * noise / 2]) / noise
+        seen = np.zeros_like(self.right)
+        np.add.at(seen, places[inside], sums)
+        # A lattice whose neighbours pull with strength 1 has the variance ln(32 / kappa) / 4 pi.
+        kappa = (self.spacing / CORRELATION) ** 2
+        seen *= variance / (math.log(32 / kappa) / (4 * math.pi))
+        right = np.column_stack([seen[:, 1] - seen[:, 0] * self.expected, seen[:, 0]])
+        diagonal = kappa + self.degree + seen[:, 0]
+        if not np.array_equal(right, self.right):
+            self._solve(diagonal, right)
+        self._wait(evidence)
+
+    def _solve(self, diagonal: Float64, right: Float64) -> None:
+        self.right = right
+        residual = right + self.links @ self.solution - diagonal[:, None] * self.solution
+        wrong = np.abs(residual).max(axis=1) > ACCURACY * diagonal
+        queue = np.zeros(len(diagonal), dtype=np.int64)
+        begins = np.flatnonzero(wrong)
+        queue[: len(begins)] = begins
+        links = self.links.indptr, self.links.indices, self.links.data
+        _relax(*links, diagonal, right, self.solution, queue, len(begins), wrong)
+
+    def _wait(self, evidence: Evidence) -> None:
+        """Spread the expected waits over the places around, so that a crossing costs each once."""
+        self.waits[:] = 0
+        radius = evidence.wait_radius
+        for position, seconds in evidence.expected_waits():
+            first = int(self.places_at(position[None])[0])
+            if first < 0:
+                continue
+            (x, y), found, front = self.middle[first], {first}, [first]
+            while front:
+                nearby = set(self.links[front].indices.tolist()) - found
+                places = np.array(sorted(nearby), dtype=np.int64)
+                metres = np.hypot(*(self.middle[places] - (x, y)).T) * self.grid.resolution
+                front = places[metres <= radius].tolist()
+                found.update(front)
+            width = max(math.pi / 2 * radius, self.spacing)  # the mean way through a disc
+            self.waits[list(found)] += seconds * evidence.nominal_speed / width
+
+    def paint(self, exploration: float, fastest: float) -> NDArray[np.float32]:
+        """Return (H, W) float32: the slowness over that of the fastest place, which has this log.
+
+        A place that is not known counts as faster, at most by the share `exploration`.
+        """
+        hope = np.minimum(np.sqrt(self.variance), math.log(1 + exploration))
+        log = np.log(np.exp(self.mean - hope) + self.waits) - fastest
+        steps = np.rint(np.clip(log, 0, math.log(MAX_SLOWNESS)) / math.log(1 + STEP))
+        if self.painted is None or self.painted[:2] != (exploration, fastest):
+            box: tuple[slice, ...] = (slice(None), slice(None))
+            slowness = np.ones(self.place.shape, dtype=np.float32)
+        else:
+            x, y = self.middle[steps != self.steps].T
+            if not len(x):
+                return self.painted[2]
+            box = tuple(slice(max(v.min() - self.size, 0), v.max() + self.size + 1) for v in (y, x))
+            slowness = self.painted[2].copy()  # maps have the old one
+        values = np.append(np.exp(steps * math.log(1 + STEP)), 1.0).astype(np.float32)
+        np.minimum(values, MAX_SLOWNESS, out=values)
+        slowness[box] = values.take(self.place[box], mode="wrap")
+        self.steps, self.painted = steps, (exploration, fastest, slowness)
+        return slowness
+
+    def over(self, values: Float64, occupied: float) -> NDArray[np.float32]:
+        """Return (H, W) float32: of each cell the value of its place."""
+        return np.append(values, occupied).astype(np.float32).take(self.place, mode="wrap")
+
+
+def _places_of(grid: GridMap, size: int) -> tuple[NDArray[np.int32], Int64]:
+    """Return the place of each cell, and a cell (x, y) of each place, near its middle."""
+    place = np.full(grid.occupancy.shape, -1, dtype=np.int32)
+    count = _label(grid.occupancy, size, place, np.zeros(size * size + 1, dtype=np.int64))
+    y, x = np.nonzero(place >= 0)
+    of = place[y, x]
+    number = np.maximum(np.bincount(of, minlength=count), 1)
+    middle = [np.bincount(of, at, minlength=count) / number for at in (x, y)]
+    away = np.hypot(x - middle[0][of], y - middle[1][of])
+    order = np.lexsort((away, of))
+    first = order[np.searchsorted(of[order], np.arange(count))]
+    return place, np.column_stack([x[first], y[first]])
+
+
+def _links_of(place: NDArray[np.int32], size: int, count: int) -> Any:
+    """Return how strongly places are linked, by the share of a block's side that they have."""
+    from scipy.sparse import csr_array
+
+    pairs = []
+    for one, other in ((place[:, :-1], place[:, 1:]), (place[:-1], place[1:])):
+        linked = (one != other) & (one >= 0) & (other >= 0)
+        pairs += [(one[linked], other[linked]), (other[linked], one[linked])]
+    first, second = (np.concatenate(part) for part in zip(*pairs, strict=True))
+    weights = np.full(len(first), 1 / size)
+    return csr_array((weights, (first, second)), shape=(count, count))
+
+
+@in_place
+def _label(occupancy: Any, size: int, place: Any, stack: Any) -> int:
+    """Give a number to each connected part of the free cells in each block of cells."""
+    height, width = occupancy.shape
+    count = 0
+    for block in range(((height - 1) // size + 1) * ((width - 1) // size + 1)):
+        bottom = block // ((width - 1) // size + 1) * size
+        left = block % ((width - 1) // size + 1) * size
+        top, right = min(bottom + size, height), min(left + size, width)
+        for first in range((top - bottom) * (right - left)):
+            y, x = bottom + first // (right - left), left + first % (right - left)
+            if occupancy[y, x] or place[y, x] >= 0:
+                continue
+            place[y, x], stack[0], waiting = count, y * width + x, 1
+            while waiting > 0:
+                waiting -= 1
+                cell = stack[waiting]
+                for side in range(4):
+                    to_y = cell // width + (side == 0) - (side == 1)
+                    to_x = cell % width + (side == 2) - (side == 3)
+                    if to_y < bottom or to_y >= top or to_x < left or to_x >= right:
+                        continue
+                    if not occupancy[to_y, to_x] and place[to_y, to_x] < 0:
+                        place[to_y, to_x] = count
+                        stack[waiting] = to_y * width + to_x
+                        waiting += 1
+            count += 1
+    return count
+
+
+@in_place
+def _relax(*arrays: Any) -> None:
+    """Solve (diagonal - links) x = right for both columns, from where it is wrong, by its queue."""
+    begins, to, weights, diagonal, right, x, queue, waiting, waits = arrays
+    first = 0
+    while waiting > 0:
+        place = queue[first]
+        first = first + 1 if first + 1 < queue.size else 0
+        waiting -= 1
+        waits[place] = False
+        one, other = right[place, 0], right[place, 1]
+        for link in range(begins[place], begins[place + 1]):
+            one += weights[link] * x[to[link], 0]
+            other += weights[link] * x[to[link], 1]
+        one = OVER_RELAXATION * (one / diagonal[place] - x[place, 0])
+        other = OVER_RELAXATION * (other / diagonal[place] - x[place, 1])
+        x[place, 0] += one
+        x[place, 1] += other
+        if max(abs(one), abs(other)) <= ACCURACY:
+            continue
+        for link in range(begins[place], begins[place + 1]):
+            if not waits[to[link]]:
+                waits[to[link]] = True
+                end = first + waiting
+                queue[end if end < queue.size else end - queue.size] = to[link]
+                waiting += 1
+
+
+def cells_of(position: Float64, grid: GridMap) -> tuple[Int64, NDArray[np.bool_]]:
+    """Return the cells of positions, (N, 2) as (x, y), and which of them are free: (N,)."""
+    origin_x, origin_y, yaw = grid.origin
+    x, y = position[:, 0] - origin_x, position[:, 1] - origin_y
+    cos, sin = math.cos(yaw), math.sin(yaw)
+    along = np.column_stack([cos * x + sin * y, cos * y - sin * x])
+    cells = np.floor(along / grid.resolution).astype(np.int64)
+    last = np.array([grid.width - 1, grid.height - 1])
+    x, y = np.clip(cells, 0, last).T
+    inside = ((cells >= 0) & (cells <= last)).all(axis=1)
+    free: NDArray[np.bool_] = inside & ~grid.occupancy[y, x]
+    return cells, free
+
+
+def nearest_free(position: Float64, grid: GridMap, metres: float) -> Int64:
+    """Return the free cells of positions, or the nearest within some metres, or (-1, -1)."""
+    cells, free = cells_of(position, grid)
+    reach = int(metres / grid.resolution)
+    result = np.where(free[:, None], cells, -1)
+    for index in np.flatnonzero(~free):
+        x, y = cells[index].tolist()
+        left, bottom = max(x - reach, 0), max(y - reach, 0)
+        box = grid.occupancy[bottom : max(y + reach + 1, 0), left : max(x + reach + 1, 0)]
+        free_y, free_x = np.nonzero(~box)
+        if len(free_x):
+            best = np.hypot(free_x + left - x, free_y + bottom - y).argmin()
+            result[index] = free_x[best] + left, free_y[best] + bottom
+    return result
