@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import nn
 
-from ddqn_planner.experience.prior import FEATURES, UNUSUAL, Prior
+from ddqn_planner.experience.posterior import nearest_free
+from ddqn_planner.experience.prior import FEATURES, UNUSUAL, Float32, Prior, map_features
+from ddqn_planner.grid import GridMap
 
-Float32 = NDArray[np.float32]
+if TYPE_CHECKING:
+    from ddqn_planner.experience import Experience
 
 UNITS = 16
 RIDGE = 10.0  # the weight of so many places speaks against each linear prediction
@@ -22,6 +24,17 @@ FOLDS = 6  # networks that each leave out a part of the places; one more learns 
 BLOCKS, PLACES = 12, (8, 32)  # near places are alike: so many in a row are left out together
 DOUBT = 2.0  # what is foretold must be so many standard errors from nothing to be believed
 REPLAYED = 512  # places of older maps, and as many of this one, are kept to learn from again
+
+
+def teach_prior(experience: Experience, grid: GridMap, seed: int = 0) -> None:
+    """Let the places of experience that lie on a map teach its prior, unless there are none."""
+    evidence = experience.evidence
+    weight, log, _, *position, _ = evidence.table[evidence.table[:, 0] > 0].T
+    x, y = nearest_free(np.transpose(position), grid, evidence.side).T
+    on = x >= 0
+    if on.any():
+        places = map_features(grid)[y[on], x[on]], (log / weight)[on], weight[on]
+        experience.prior = train_prior(*places, older=experience.prior, seed=seed)
 
 
 def train_prior(
