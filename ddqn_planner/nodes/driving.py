@@ -16,11 +16,16 @@ from numpy.typing import NDArray
 from rclpy.qos import DurabilityPolicy, QoSProfile
 from rclpy.time import Time
 from rclpy.timer import Timer
-from std_msgs.msg import String
+from std_msgs.msg import String, UInt8MultiArray
 
 from ddqn_planner.experience.drives import RECORD, DriveEnd, DriveFolder, DriveRecorder, read_drives
 from ddqn_planner.grid import GridMap
-from ddqn_planner.nodes.conversions import grid_from_message, occupancy_message, path_bytes
+from ddqn_planner.nodes.conversions import (
+    bytes_message,
+    grid_from_message,
+    occupancy_message,
+    path_bytes,
+)
 from ddqn_planner.nodes.parameters import OF_MAPS
 from ddqn_planner.nodes.poses import Frames, listen
 from ddqn_planner.nodes.report import Refusals
@@ -136,6 +141,7 @@ class Driving:
         self._aborted: set[bytes] | None = None
         self._shown: GridMap | None = None
         self._saved = node.create_publisher(String, "~/experience_saved", LATCHED)
+        self._published = node.create_publisher(UInt8MultiArray, "~/experience", LATCHED)
         self._slowness = node.create_publisher(OccupancyGrid, "~/slowness", LATCHED)
         node.create_subscription(PoseStamped, "goal_pose", self._on_goal, 10)
         latched = QoSProfile(depth=10, durability=DurabilityPolicy.TRANSIENT_LOCAL)
@@ -226,6 +232,7 @@ class Driving:
 
     def _tell_saved(self, folder: DriveFolder) -> None:
         self._shown = None
+        self._published.publish(bytes_message("experience", folder.experience.to_bytes()))
         self._node.note_saving("the drives are", folder.save_error)
         if not folder.save_error:
             self._saved.publish(String(data=str(folder.experience_path)))

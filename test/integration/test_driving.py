@@ -21,11 +21,11 @@ from integration.robot import changed
 from integration.user import SOON, User, limited
 from nav_msgs.msg import OccupancyGrid, Odometry, Path
 from rclpy.qos import QoSProfile, ReliabilityPolicy
-from std_msgs.msg import Header, String
+from std_msgs.msg import Header
 
 from ddqn_planner import Experience, GridMap
 from ddqn_planner.experience.drives import read_drives
-from ddqn_planner.nodes.conversions import quaternion
+from ddqn_planner.nodes.conversions import bytes_message, quaternion
 from ddqn_planner.nodes.driving import NAVIGATION
 from ddqn_planner.nodes.runtime import LATCHED
 
@@ -199,10 +199,9 @@ def test_the_robot_goes_round_what_was_slow_until_it_forgets(planner: Any, site:
     forecast = site.diagnostics.wait(lambda array: key in values_of(array.status[0]))
     assert float(values_of(forecast.status[0])[key]) > length / 0.5 * 0.8
 
-    broken = site.folder / "broken.npz"
-    broken.write_bytes((site.folder / "experience.npz").read_bytes()[:-20])
-    site.client.publish("trainer/experience_saved", String(data=str(broken)), LATCHED)
-    planner.wait_for_log(r"experience refused: .*broken.npz: cannot be read")
+    broken = bytes_message("experience", (site.folder / "experience.npz").read_bytes()[:-20])
+    site.client.publish("trainer/experience", broken, LATCHED)
+    planner.wait_for_log("experience refused: no experience")
     assert not is_below(site.client.get_plan(*ends))
 
     site.episodes.clear()
