@@ -291,7 +291,8 @@ def learn(parser: argparse.ArgumentParser, arguments: Sequence[str]) -> int:
             raise ValueError(f"{source} holds no drive; drive on")
         out = options.out or (source if source.is_dir() else source.parent) / EXPERIENCE
         write_atomically(out, experience.to_bytes())  # anew, whatever an older file holds
-    slowness, known = experience.slowness(grid), experience.uncertainty(grid) < 0.9
+    slowness, unsure = experience.slowness(grid), experience.uncertainty(grid)
+    known = unsure < 0.9 * unsure.max()
     seconds = sum(float(np.ptp(drive.seconds)) for drive in drives)
     print(f"{len(drives)} drives, {sum(d.metres for d in drives):.0f} m, {seconds / 60:.1f} min")
     free = known & ~grid.occupancy
