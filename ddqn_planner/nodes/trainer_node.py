@@ -50,7 +50,7 @@ class TrainerNode(LearningNode):
         self._worker = Worker(self)
         self._driving: Driving | None = None
         if self.value("learn_from") == "driving":
-            self._driving = Driving(self)
+            self._driving = Driving(self, self._worker)
             return
         self.create_timer(1.0, self._publish_diagnostics, clock=STEADY)
         self._reward_publisher = self.create_publisher(Float32, "~/average_reward", 100)
