@@ -340,8 +340,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     add = parser.add_argument
     add("--maps", type=Path, metavar="FOLDER", help="measure on the ROS maps of a folder too")
     add("--figure", action="append", choices=FIGURES, help="measure some of the figures alone")
-    words = "what `Experience.apply` is given, rather than its default"
-    add("--exploration", type=float, metavar="SHARE", help=words)
+    words = "what `Experience.apply` is given (default: %(default)s)"
+    add("--exploration", type=float, default=0.1, metavar="SHARE", help=words)
     add("--tuning", action="store_true", help="print the results of worlds for tuning, no report")
     add("--learner", action="append", choices=LEARNERS, help="those of --tuning")
     options = parser.parse_args(arguments)

@@ -13,9 +13,8 @@ from driving_worlds import RATE, RULE, Drive, Float64, World, drive, path_second
 from random_maps import Random
 
 from ddqn_planner import Experience, Planner, inflate, load_map
-from ddqn_planner.experience.prior import Prior, map_features
 from ddqn_planner.grid import Cell
-from ddqn_planner.training.prior import train_prior
+from ddqn_planner.training.prior import teach_prior
 
 MOVED_AT: Final = 100  # the mission before which all that is slow moves, where it does
 FAULT_EVERY: Final = 900.0  # seconds of driving: four faults per hour, one of each kind on average
@@ -80,18 +79,12 @@ def run(job: Job) -> Result:
     world = world_of(job)
     learner = LEARNERS[job.learner](world.grid)
     if job.prior_from:
-        source = Job(job.prior_from, job.seed, job.learner, TEACHING, prior_from="")
-        learner.prior = taught(world_of(source), source)
+        source, teacher = replace(job, kind=job.prior_from, prior_from=""), Experience(worlds.SPEED)
+        taught = world_of(source)
+        run_in(replace(source, missions=TEACHING), taught, teacher)
+        teach_prior(teacher, taught.grid)
+        learner.prior = teacher.prior
     return run_in(job, world, learner)
-
-
-def taught(world: World, job: Job) -> Prior:
-    """Return the prior that the missions of a job teach."""
-    experience = Experience(worlds.SPEED)
-    run_in(job, world, experience)
-    weight, log, _, *position, _ = experience.evidence.table[experience.evidence.table[:, 0] > 0].T
-    x, y = np.transpose([world.grid.world_to_cell(*at) for at in np.transpose(position)])
-    return train_prior(map_features(world.grid)[y, x], log / weight, weight)
 
 
 def run_in(job: Job, world: World, learner: Any) -> Result:

@@ -25,19 +25,17 @@ VARIANCE, VARIED_PLACES = 1.0, 4.0  # of the log slowness of places, as if of so
 LEAST_VARIANCE, MOST_VARIANCE = 0.05, 2.0
 ALIKE = 8.0  # so many places of a path tell as much of other places as one alone
 NOMINAL = 2.0  # inverse variance of the log slowness of all places, before the first drive
-TRUST, TRUSTED = 1.0, 4.0  # in the prior: at first, and the inverse variance of that
+TRUST, TRUSTED = 1.0, 0.5  # in the prior: at first, and the inverse variance of that
 SURE_PLACES = 20  # fewer say nothing about the robot's speed in the open
 OUTLIER = 2.5  # a visit is moved to so many standard deviations from what was expected
 KNOWN = 0.7  # weight of visits from which a place is known
 MOST = 6.0  # weight of visits that a place keeps
 
-PART, SURPRISE = (
-    8,
-    3.0,
-)  # places of a drive: these are off by more standard deviations if they changed
+PART, SURPRISE = 8, 3.5  # so many places have changed if they are off by more deviations
+PART_NOISE = 0.12  # of their mean log slowness, as each way through a place is another
 DRIVE_NOISE = 0.05  # standard deviation of what the log slowness of so many places has in common
 CHANGED, CHANGED_AROUND = 0.1, 1.5  # share of evidence that is left within so many metres
-CHANGED_FAR = 0.7  # and elsewhere: where one place changed, others did
+CHANGED_FAR = 0.4  # and elsewhere: where one place changed, others did
 
 WAIT_PASSAGES = 0.2  # passages without a wait that are assumed
 NEAREST_WAITS = 4.0  # the place of a wait is the mean of about the last so many
@@ -135,7 +133,7 @@ class Evidence:
         for part in np.array_split(known, max(1, len(known) // PART)):
             if len(part) < PART / 2:
                 continue
-            variance = self.noise * (1 + 1 / weight[part]).mean() / len(part) + DRIVE_NOISE**2
+            variance = self.noise * (1 + 1 / weight[part]).mean() / len(part) + PART_NOISE**2
             if abs(surprise[part].mean()) > SURPRISE * math.sqrt(variance):
                 changed.append(part)
                 away = self.table[:, 3:5] - position[part].mean(axis=0)

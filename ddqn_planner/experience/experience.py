@@ -126,22 +126,22 @@ class Experience:
     def _measured(self, time: Float64, position: Float64) -> tuple[Visits, Float64] | None:
         """Return the visits and the waits of a drive, if there are any."""
         side = self.evidence.side
-        window = WINDOW / self.nominal_speed
+        speed, window = self.learned_speed, WINDOW / self.learned_speed
         seconds, at = _averaged(time, position, window)
         speeds = np.hypot(*np.diff(at, axis=0).T) / np.abs(np.diff(seconds))
         usual = float(np.median(speeds)) if len(speeds) else 0.0
-        limits = 3 * max(self.nominal_speed, self.learned_speed, usual), self.max_pause
+        limits = 3 * max(self.nominal_speed, speed, usual), self.max_pause
         steps: list[tuple[float, float, float, float]] = []
         waits: list[Float64] = []
         for part in _believed_parts(time, position, *limits):
             seconds, at = _averaged(time[part], position[part], window)
-            stands = _stands(seconds, at, STAND / self.nominal_speed)
+            stands = _stands(seconds, at, STAND / speed)
             for first, last in stands:
                 if (stood := seconds[last] - seconds[first]) <= self.max_pause:
                     waits.append(np.array([*at[first : last + 1].mean(axis=0), stood]))
                 seconds[last:] -= stood
                 seconds[first:last] = seconds[first]
-            steps += _steps(seconds.tolist(), at.tolist(), side / 2, *limits)
+            steps += _steps(seconds.tolist(), at.tolist(), max(side, WINDOW) / 2, *limits)
         if not steps:
             return None
         rows = np.array(steps)

@@ -22,26 +22,27 @@ UNUSUAL = 3.0  # standard deviations: features are no farther off than those of 
 
 
 def map_features(grid: GridMap) -> Float32:
-    """Return what the map says around each cell, in metres: (H, W, FEATURES). Off it is free."""
+    """Return what the map says around each cell: (H, W, FEATURES). A wall stands around it."""
     occupied = grid.occupancy if grid.obstacles is None else grid.obstacles
-    metres = np.minimum((clearance(occupied) - 0.5) * grid.resolution, REACH).astype(np.float32)
+    cells = clearance(np.pad(occupied, 1, constant_values=True))[1:-1, 1:-1].astype(np.float32)
+    metres = np.minimum((cells - 0.5) * np.float32(grid.resolution), REACH)
     widths = _widths(occupied, grid.resolution), _widths(occupied.T, grid.resolution).T
     narrow, wide = np.minimum(*widths), np.maximum(*widths)
     near, middle, far = (_free_share(occupied, side / grid.resolution) for side in SQUARES)
     steps = [1 / (1 + np.exp(7 * (narrow / width - 1))) for width in NARROW]
-    door, open_ahead = steps[1] * (far - near), np.log(np.maximum(wide, 0.1))
-    distance = [np.exp(-metres / 0.25), np.exp(-metres / 0.75), metres]
-    features = [*distance, *steps, open_ahead, door, near, middle, far]
+    door = steps[1] * (far - near)
+    features = [np.exp(-metres / 0.25), np.exp(-metres / 0.75), metres, *steps]
+    features += [np.log(np.maximum(wide, 0.1)), door, near, middle, far]
     return np.moveaxis(np.stack(features), 0, -1)
 
 
 def _widths(occupied: Occupancy, resolution: float) -> Float32:
     """Return how many metres of its row are free around each cell: (H, W)."""
-    at, reach = np.arange(occupied.shape[1], dtype=np.int32), int(2 * REACH / resolution) + 1
-    left = np.maximum.accumulate(np.where(occupied, at, -reach), axis=1)
-    right = np.where(occupied, at, len(at) + reach)[:, ::-1]
-    cells = np.minimum.accumulate(right, axis=1)[:, ::-1] - left - 1
-    return np.clip(cells * resolution, 0, 2 * REACH).astype(np.float32)
+    at = np.arange(occupied.shape[1], dtype=np.int32)
+    left = np.maximum.accumulate(np.where(occupied, at, -1), axis=1)
+    right = np.minimum.accumulate(np.where(occupied, at, len(at))[:, ::-1], axis=1)[:, ::-1]
+    cells = np.maximum(right - left - 1, 0).astype(np.float32)
+    return np.asarray(np.minimum(cells * np.float32(resolution), 2 * REACH))
 
 
 def _free_share(occupied: Occupancy, reach: float) -> Float32:
@@ -53,7 +54,7 @@ def _free_share(occupied: Occupancy, reach: float) -> Float32:
     for axis in (0, 1):
         # A side of 3.5 cells lies between those of 3 and 5 cells.
         sizes = 2 * int(whole) + 1, 2 * int(whole) + 3
-        small, large = (n * uniform_filter1d(share, n, axis, None, "constant", 1) for n in sizes)
+        small, large = (n * uniform_filter1d(share, n, axis, None, "constant") for n in sizes)
         share = (small + np.float32(rest) * (large - small)) / np.float32(2 * (whole + rest) + 1)
     return share
 

@@ -6,6 +6,8 @@ from ddqn_planner.model.model_file import (
     ModelMetadata,
     find_model,
     load_model,
+    model_bytes,
+    model_of,
     package_version,
     save_model,
 )

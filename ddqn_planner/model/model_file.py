@@ -11,7 +11,7 @@ from typing import Final
 
 import numpy as np
 import safetensors.numpy
-from safetensors import SafetensorError, safe_open
+from safetensors import SafetensorError, deserialize
 
 from ddqn_planner.files import as_path, write_atomically
 from ddqn_planner.grid import MoveRule
@@ -77,49 +77,56 @@ def find_model(name: str | Path) -> Path:
 
 def save_model(path: str | Path, network: QNetwork, description: ModelMetadata) -> None:
     """Write a model file; the old file stays complete until the new one is."""
+    write_atomically(Path(path), model_bytes(network, description))
+
+
+def model_bytes(network: QNetwork, description: ModelMetadata) -> bytes:
+    """Return what a model file holds."""
     text = json.dumps(asdict(description))
-    write_atomically(Path(path), safetensors.numpy.save(network.tensors, {METADATA_KEY: text}))
+    return bytes(safetensors.numpy.save(network.tensors, {METADATA_KEY: text}))
 
 
 def load_model(name: str | Path) -> tuple[QNetwork, ModelMetadata]:
     """Read a model file, given by path or a shipped model's name; else raise ModelFileError."""
     path = find_model(name)
     try:
-        with path.open("rb"):  # safetensors reports an unreadable file as missing
-            return _load(path)
+        size = os.path.getsize(path)
+        if size > MAX_FILE_BYTES:
+            raise ValueError(f"has {size} bytes; give a model of at most {MAX_FILE_BYTES}")
+        return model_of(path.read_bytes())
     except OSError as error:
         problem = f"cannot be read ({error}); check its rights"
-    except SafetensorError as error:
-        problem = f"cannot be read as safetensors ({error}); it is truncated or of another kind: "
-        problem += "save or copy it again"
     except ValueError as error:
         problem = str(error)
     raise ModelFileError(f"{path}: {problem}")
 
 
-def _load(path: Path) -> tuple[QNetwork, ModelMetadata]:
-    size = os.path.getsize(path)
-    if size > MAX_FILE_BYTES:
-        raise ValueError(f"has {size} bytes; give a model of at most {MAX_FILE_BYTES}")
-    with safe_open(path, framework="np") as file:
-        text = (file.metadata() or {}).get(METADATA_KEY)
-        if text is None:
-            found = (
-                f"is safetensors, but no model of {PACKAGE} (it has no metadata {METADATA_KEY!r})"
-            )
-            raise ValueError(f"{found}; give a file that ddqn-planner or trainer_node saved")
-        try:
-            description = _parse(json.loads(text))
-        except (ValueError, RecursionError) as error:
-            raise ValueError(f"its metadata is wrong ({error}); train the model again") from None
-        network_class, sizes = NETWORKS[description.network], description.sizes
-        shapes = network_class.shapes(sizes)
-        expected = {key: ("F32", [*shape]) for key, shape in shapes.items()}
-        slices = {key: file.get_slice(key) for key in file.keys()}  # noqa: SIM118
-        held = {key: (part.get_dtype(), part.get_shape()) for key, part in slices.items()}
-        if expected != held:
-            raise ValueError(f"holds tensors {reprlib.repr(held)}, not {expected}; train it again")
-        tensors = {key: file.get_tensor(key) for key in held}
+def model_of(data: bytes) -> tuple[QNetwork, ModelMetadata]:
+    """Return the model of which `model_bytes` made the bytes; a ValueError if they are none."""
+    try:
+        parts = dict(deserialize(data))  # type: ignore[no-untyped-call]
+    except SafetensorError as error:
+        problem = f"cannot be read as safetensors ({error}); it is truncated or of another kind"
+        raise ValueError(f"{problem}: save or copy it again") from None
+    header = json.loads(data[8 : 8 + int.from_bytes(data[:8], "little")])
+    text = (header.get("__metadata__") or {}).get(METADATA_KEY)
+    if text is None:
+        found = f"is safetensors, but no model of {PACKAGE} (it has no metadata {METADATA_KEY!r})"
+        raise ValueError(f"{found}; give a file that ddqn-planner or trainer_node saved")
+    try:
+        description = _parse(json.loads(text))
+    except (ValueError, RecursionError) as error:
+        raise ValueError(f"its metadata is wrong ({error}); train the model again") from None
+    network_class, sizes = NETWORKS[description.network], description.sizes
+    shapes = network_class.shapes(sizes)
+    expected = {key: ("F32", [*shape]) for key, shape in shapes.items()}
+    held = {key: (part["dtype"], part["shape"]) for key, part in parts.items()}
+    if expected != held:
+        raise ValueError(f"holds tensors {reprlib.repr(held)}, not {expected}; train it again")
+    tensors = {
+        key: np.frombuffer(parts[key]["data"], "<f4").reshape(shape)
+        for key, (_, shape) in held.items()
+    }
     if not all(np.isfinite(tensor).all() for tensor in tensors.values()):
         raise ValueError("its weights are not all finite; train it again")
     return network_class(sizes, tensors), description

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import array
+import hashlib
 import math
 from collections.abc import Sequence
 from itertools import compress
@@ -13,7 +14,7 @@ from geometry_msgs.msg import Point, Pose, PoseStamped, Quaternion
 from nav_msgs.msg import OccupancyGrid, Path
 from numpy.typing import NDArray
 from rclpy.serialization import serialize_message
-from std_msgs.msg import Header
+from std_msgs.msg import Header, MultiArrayDimension, MultiArrayLayout, UInt8MultiArray
 
 from ddqn_planner.grid import Cell, GridMap
 from ddqn_planner.grid.arguments import Cells
@@ -29,6 +30,7 @@ Float64 = NDArray[np.float64]
 
 TOLERANCE = 1e-4  # how far the norm of a quaternion may be from 1
 MIN_RESOLUTION = 1e-6  # metres per cell
+LABEL = "ddqn_planner {} 1 sha256:{}"  # of bytes: their kind, its version and their digest
 SAME_DIRECTION = 1e-6  # radians: poses along a segment are rounded
 
 
@@ -169,6 +171,28 @@ def path_bytes(
         if last is not None:
             numbers[-1, 3:] = last.x, last.y, last.z, last.w
     return b"\0\1\0\0" + start + (first + poses.tobytes()[len(others) :] if count else b"")
+
+
+def bytes_message(kind: str, data: bytes) -> UInt8MultiArray:
+    """Make the message that carries bytes of a kind, a model or an experience."""
+    label = LABEL.format(kind, hashlib.sha256(data).hexdigest())
+    dimension = MultiArrayDimension(label=label, size=len(data), stride=len(data))
+    layout = MultiArrayLayout(dim=[dimension])
+    return UInt8MultiArray(layout=layout, data=array.array("B", data))
+
+
+def label_of(message: UInt8MultiArray) -> str:
+    """Return what a message says of its bytes."""
+    return message.layout.dim[0].label if message.layout.dim else ""
+
+
+def bytes_of(kind: str, message: UInt8MultiArray) -> bytes:
+    """Return the bytes of a kind that a message carries; a ValueError if it has others."""
+    data, label = bytes(message.data), label_of(message)
+    if label != (right := LABEL.format(kind, hashlib.sha256(data).hexdigest())):
+        wrong = f"{len(data)} bytes with the label {label!r}, not {right!r}"
+        raise ValueError(f"the trainer sent {wrong}; let trainer and planner have one version")
+    return data
 
 
 def check_pose(name: str, stamped: PoseStamped, frame: str = "", other_remedy: str = "") -> None:

@@ -13,24 +13,34 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import PoseStamped
 from nav_msgs.msg import OccupancyGrid, Path
 from numpy.typing import NDArray
+from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
 from rclpy.qos import DurabilityPolicy, QoSProfile
 from rclpy.time import Time
 from rclpy.timer import Timer
-from std_msgs.msg import String
+from std_msgs.msg import String, UInt8MultiArray
 
 from ddqn_planner.experience.drives import RECORD, DriveEnd, DriveFolder, DriveRecorder, read_drives
+from ddqn_planner.experience.posterior import cells_of
+from ddqn_planner.experience.prior import Prior, map_features
 from ddqn_planner.grid import GridMap
-from ddqn_planner.nodes.conversions import grid_from_message, occupancy_message, path_bytes
+from ddqn_planner.nodes.conversions import (
+    bytes_message,
+    grid_from_message,
+    occupancy_message,
+    path_bytes,
+)
 from ddqn_planner.nodes.parameters import OF_MAPS
 from ddqn_planner.nodes.poses import Frames, listen
 from ddqn_planner.nodes.report import Refusals
-from ddqn_planner.nodes.runtime import LATCHED, STEADY, BaseNode, Parameters
+from ddqn_planner.nodes.runtime import LATCHED, STEADY, BaseNode, Parameters, Worker
 from ddqn_planner.resources import with_remedy
 
 Float64 = NDArray[np.float64]
 NAVIGATION = "navigate_to_pose/_action/status"
 RETRY_PERIOD = 5.0  # seconds after which what failed for a full disk is tried again
 SLOWEST = 10.0  # the slowness that ``~/slowness`` shows as 100
+WRONG = np.log(1.5)  # of the nominal speed, compared with the learned one
+FEWEST_PLACES, MORE_PLACES = 32, 1.1  # from so many on; then times as many as the last time
 NOT_RECORDING = "no drives are being recorded; call ~/start first"
 NO_MAP = "no map was received yet; start a map server"
 
@@ -128,14 +138,15 @@ class LearningNode(BaseNode):
 class Driving:
     """Records the drives of a node's robot in its ``output_folder``, and learns from them."""
 
-    def __init__(self, node: LearningNode) -> None:
-        self._node, self._frames = node, Frames(node)
+    def __init__(self, node: LearningNode, worker: Worker) -> None:
+        self._node, self._worker, self._frames = node, worker, Frames(node)
         self._recorder = DriveRecorder(self._on_drive)
         self._folder: DriveFolder | None = None
         self._last_drive, self._is_disk_full = "", False
         self._aborted: set[bytes] | None = None
         self._shown: GridMap | None = None
         self._saved = node.create_publisher(String, "~/experience_saved", LATCHED)
+        self._published = node.create_publisher(UInt8MultiArray, "~/experience", LATCHED)
         self._slowness = node.create_publisher(OccupancyGrid, "~/slowness", LATCHED)
         node.create_subscription(PoseStamped, "goal_pose", self._on_goal, 10)
         latched = QoSProfile(depth=10, durability=DurabilityPolicy.TRANSIENT_LOCAL)
@@ -148,6 +159,9 @@ class Driving:
         node.create_timer(1.0, self._publish_diagnostics, clock=STEADY)
         node.create_timer(0.1, self._show_slowness, clock=STEADY)
         node.create_timer(RETRY_PERIOD, self._retry, clock=STEADY)
+        self._places_of_prior, self._is_speed_wrong = 0, False
+        group = MutuallyExclusiveCallbackGroup()  # it awaits the worker
+        self._learning = node.create_timer(1.0, self._learn_prior, group, clock=STEADY)
         for name in ("start", "stop", "save", "replay", "forget"):
             node.create_trigger(f"~/{name}", getattr(self, f"_on_{name}"))
         self._on_start()
@@ -226,9 +240,38 @@ class Driving:
 
     def _tell_saved(self, folder: DriveFolder) -> None:
         self._shown = None
+        speed, given = folder.experience.learned_speed, folder.experience.nominal_speed
+        was_wrong, self._is_speed_wrong = self._is_speed_wrong, abs(np.log(speed / given)) > WRONG
+        if self._is_speed_wrong and not was_wrong:
+            wrong = f"the robot drives {speed:.3g} m/s in the open, nominal_speed is {given:g}"
+            self._node.get_logger().warning(f"{wrong}; set it before you learn anew")
+        self._published.publish(bytes_message("experience", folder.experience.to_bytes()))
         self._node.note_saving("the drives are", folder.save_error)
         if not folder.save_error:
             self._saved.publish(String(data=str(folder.experience_path)))
+
+    async def _learn_prior(self) -> None:
+        """Train the prior, and again once drives have shown a tenth more places."""
+        place, folder = self._node.map, self._recording()
+        if place is None or folder is None:
+            return
+        evidence, before = folder.experience.evidence, self._places_of_prior
+        known = len(evidence.places)
+        if known < FEWEST_PLACES or before <= known < MORE_PLACES * before:
+            return
+        self._places_of_prior = known
+        given = place.grid, evidence.table.copy(), evidence.prior, self._node.value("seed")
+        try:
+            prior = await self._worker.call(prior_of, *given)
+        except Exception as error:  # the node must survive
+            if isinstance(error, ImportError):
+                self._node.destroy_timer(self._learning)
+            self._node.get_logger().warning(f"the map foretells nothing: {explained(error)}")
+            return
+        evidence = folder.experience.evidence
+        if folder is self._recording() and len(evidence.places) >= known:  # else it was forgotten
+            folder.experience.prior = prior
+            self._save(folder)
 
     def _retry(self) -> None:
         folder = self._recording()
@@ -322,6 +365,7 @@ class Driving:
         if self._folder is not None:
             values |= {
                 "drives": str(self._folder.drives),
+                "learned speed (m/s)": f"{self._folder.experience.learned_speed:.3f}",
                 "places": str(len(self._folder.experience.evidence.places)),
                 "folder": str(self._folder.folder),
             }
@@ -331,6 +375,22 @@ class Driving:
     def close(self) -> None:
         """Record the drive that is under way, and save."""
         self._on_stop()
+
+
+def prior_of(grid: GridMap, table: Float64, older: Prior | None, seed: int) -> Prior | None:
+    """Train a prior on the places of `Evidence.table` that are on the map; None if few are."""
+    import torch
+
+    from ddqn_planner.training.prior import train_prior
+
+    torch.set_num_threads(1)  # as in `import_training`
+    cells, free = cells_of(table[:, 3:5], grid)
+    seen = free & (table[:, 0] > 0)
+    if seen.sum() < FEWEST_PLACES:
+        return older
+    x, y = cells[seen].T
+    weight, log = table[seen, :2].T
+    return train_prior(map_features(grid)[y, x], log / weight, weight, older, seed)
 
 
 def _place_of(position: tuple[float, float] | None) -> str:

@@ -14,12 +14,12 @@ from nav_msgs.srv import GetPlan
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup, ReentrantCallbackGroup
 from rclpy.parameter import Parameter
 from rclpy.task import Future
-from std_msgs.msg import Header, String
+from std_msgs.msg import Header, UInt8MultiArray
 
 from ddqn_planner.experience import Experience
 from ddqn_planner.grid import GridMap
 from ddqn_planner.grid.copies import WHOLE
-from ddqn_planner.nodes.conversions import along, path_bytes, path_message
+from ddqn_planner.nodes.conversions import along, bytes_of, label_of, path_bytes, path_message
 from ddqn_planner.nodes.display import FieldDisplay
 from ddqn_planner.nodes.lifecycle import ManagedNode
 from ddqn_planner.nodes.map_source import MapSource
@@ -92,10 +92,10 @@ class PlannerNode(ManagedNode):
         self.create_subscription(PoseStamped, "goal_pose", lambda goal: self._on_goals([goal]), 10)
         self.create_subscription(PoseArray, "goal_poses", self._on_goal_poses, 10)
         if self._settings.follow_trainer:
-            self.create_subscription(String, "trainer/model_saved", self._model.on_saved, LATCHED)
-            on_saved, topic = self._times.on_saved, "trainer/experience_saved"
-            group = MutuallyExclusiveCallbackGroup()  # it waits for a worker
-            self.create_subscription(String, topic, on_saved, LATCHED, callback_group=group)
+            sent, group = UInt8MultiArray, MutuallyExclusiveCallbackGroup()  # it awaits a worker
+            self.create_subscription(sent, "trainer/model", self._on_model, LATCHED)
+            topic, on_sent = "trainer/experience", self._times.on_sent
+            self.create_subscription(sent, topic, on_sent, LATCHED, callback_group=group)
         # Reentrant: a request that waits for its field does not keep out the others.
         reentrant = ReentrantCallbackGroup()
         self.create_service(GetPlan, "~/get_plan", self._on_get_plan, callback_group=reentrant)
@@ -164,6 +164,10 @@ class PlannerNode(ManagedNode):
         if "path_simplification" in changed:
             self._followed = PathUnderWay()
         self._plan_for(ActiveGoal(self._active.poses, PathUnderWay()))
+
+    def _on_model(self, message: UInt8MultiArray) -> None:
+        if self._model.take(message):
+            self._plan_for(ActiveGoal(self._active.poses, PathUnderWay()))
 
     # Map, start and goal
 
@@ -321,18 +325,20 @@ class ExpectedTimes:
         # What the worker was asked last, and its answers.
         self._grid: GridMap | None = None
         self._timed = Future()  # of the last grid, as the forecast is of the last outcome
+        self._label = ""  # of the message that was taken last
         self._outcome, self._forecast = NO_REQUEST, Future()
 
-    async def on_saved(self, message: String) -> None:
-        """Plan by what the trainer has learned from drives, or refuse its file."""
+    async def on_sent(self, message: UInt8MultiArray) -> None:
+        """Plan by what the trainer has learned from drives, or refuse its message."""
         try:
-            await self._worker.call(self.load, message.data)
+            is_new = await self._worker.call(self.load, message)
         except Exception as error:
             self._report.refuse("experience", str(error) or repr(error))
             return
         self._report.accept("experience")
-        self._grid = None
-        self._on_change()
+        if is_new:
+            self._grid = None
+            self._on_change()
 
     async def on(self, grid: GridMap) -> GridMap:
         """Return what `apply` returns; the worker computes it once for a map."""
@@ -350,12 +356,15 @@ class ExpectedTimes:
             self._forecast.add_done_callback(lambda _: self._report.change())
         return self._forecast.result() or {}
 
-    def load(self, path: str) -> None:
-        """Use a file of the trainer from now on; an error leaves what was used before."""
-        newer = Experience.load(path)
+    def load(self, message: UInt8MultiArray) -> bool:
+        """Use what the trainer sent, and say if it is new; an error leaves what was used before."""
+        if (label := label_of(message)) == self._label:
+            return False
+        newer = Experience.from_bytes(bytes_of("experience", message))
         if self._experience is not None:
             newer.take_over(self._experience)
-        self._experience = newer
+        self._experience, self._label = newer, label
+        return True
 
     def apply(self, grid: GridMap) -> GridMap:
         """Return a map whose moves cost expected time, or the same map before a drive."""

@@ -14,15 +14,14 @@ from typing import Any, TypeVar
 import numpy as np
 from geometry_msgs.msg import PoseStamped
 from nav_msgs.msg import Path
-from rclpy.parameter import Parameter
 from rclpy.task import Future
-from std_msgs.msg import Header, String
+from std_msgs.msg import Header, UInt8MultiArray
 
 from ddqn_planner.grid import Cell, GridMap, MoveRule
 from ddqn_planner.grid.arguments import Cells
-from ddqn_planner.model import find_model
+from ddqn_planner.model import find_model, model_of
 from ddqn_planner.model.certificate import NO_CERTIFICATE
-from ddqn_planner.nodes.conversions import cell_from_pose, turns
+from ddqn_planner.nodes.conversions import bytes_of, cell_from_pose, label_of, turns
 from ddqn_planner.nodes.map_source import MapSource
 from ddqn_planner.nodes.poses import Frames, StartSource
 from ddqn_planner.nodes.report import Outcome, Report, RequestError, reason_of, seconds
@@ -126,6 +125,7 @@ class ModelSource:
         self._node, self.report, self._worker = node, report, worker
         # The first model, while it is being loaded.
         self.loading: Future | None = None
+        self._label = ""  # of the trainer's message that was taken last
 
     @staticmethod
     def read(model: str) -> tuple[Planner, str]:
@@ -169,18 +169,25 @@ class ModelSource:
         self.report.change()
         self._node.get_logger().info(f"planning with the model {file}")
 
-    def set(self, name: str) -> str:
-        """Set the node's parameter, which loads the model; return why it was refused."""
-        return str(self._node.set_parameters([Parameter("model", value=name)])[0].reason)
-
-    def on_saved(self, message: String) -> None:
-        """Use a model that the trainer saved."""
-        if reason := self.set(message.data):
+    def take(self, message: UInt8MultiArray) -> bool:
+        """Use a model that the trainer sent; return whether it is a new one."""
+        label = label_of(message)
+        is_new = label != self._label
+        try:
+            if is_new:
+                self.use(Planner(*model_of(bytes_of("model", message))), "trainer/model")
+                self._label = label
+        except Exception as error:
+            reason = str(error) or repr(error)
             self.report.refuse("model", f"the trainer's model was refused: {reason}")
+            return False
+        self.report.accept("model")
+        return is_new
 
     def on_reload(self) -> tuple[bool, str]:
         """Load the file of the model again."""
-        if reason := self.set(self._node.value("model")):
+        parameter = self._node.get_parameter("model")  # to set it loads the model
+        if reason := str(self._node.set_parameters([parameter])[0].reason):
             self._node.get_logger().error(f"the model was not loaded again: {reason}")
         return not reason, reason or f"loaded {self.file}"
 
@@ -201,7 +208,7 @@ class ModelSource:
 
     def forget(self) -> None:
         """Free the model and its fields, with what `read` kept from collection."""
-        self.planner, self.file, self.loading = None, "", None
+        self.planner, self.file, self.loading, self._label = None, "", None, ""
         gc.unfreeze()
         gc.collect()
 

@@ -12,11 +12,12 @@ from typing import TYPE_CHECKING, Any
 from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped, Quaternion
 from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.exceptions import InvalidParameterValueException
-from std_msgs.msg import Float32, Header, String
+from std_msgs.msg import Float32, Header, String, UInt8MultiArray
 
 from ddqn_planner.grid import Cell, MoveRule, read_map_file
 from ddqn_planner.nodes.conversions import (
     along,
+    bytes_message,
     cell_from_pose,
     check_pose,
     path_bytes,
@@ -49,11 +50,12 @@ class TrainerNode(LearningNode):
         self._worker = Worker(self)
         self._driving: Driving | None = None
         if self.value("learn_from") == "driving":
-            self._driving = Driving(self)
+            self._driving = Driving(self, self._worker)
             return
         self.create_timer(1.0, self._publish_diagnostics, clock=STEADY)
         self._reward_publisher = self.create_publisher(Float32, "~/average_reward", 100)
         self._saved_publisher = self.create_publisher(String, "~/model_saved", LATCHED)
+        self._model_publisher = self.create_publisher(UInt8MultiArray, "~/model", LATCHED)
         on_start, on_goal = (partial(self._on_pose, which) for which in ("start", "goal"))
         self.create_subscription(PoseWithCovarianceStamped, "initialpose", on_start, 10)
         self.create_subscription(PoseStamped, "goal_pose", on_goal, 10)
@@ -184,6 +186,7 @@ class TrainerNode(LearningNode):
                 if not run.save_error and (ends == "finished" or run.saved_at != announced):
                     self.get_logger().info(f"step {run.saved_at} is saved in {run.checkpoint_path}")
                     self._saved_publisher.publish(String(data=str(run.model_path)))
+                    self._model_publisher.publish(bytes_message("model", run.model))
                 announced = run.saved_at
         except Exception as error:  # the node must survive any error
             ends = "failed"

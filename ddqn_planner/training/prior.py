@@ -6,17 +6,14 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import nn
 
 from ddqn_planner.experience.posterior import nearest_free
-from ddqn_planner.experience.prior import FEATURES, UNUSUAL, Prior, map_features
+from ddqn_planner.experience.prior import FEATURES, UNUSUAL, Float32, Prior, map_features
 from ddqn_planner.grid import GridMap
 
 if TYPE_CHECKING:
     from ddqn_planner.experience import Experience
-
-Float32 = NDArray[np.float32]
 
 UNITS = 16
 RIDGE = 10.0  # the weight of so many places speaks against each linear prediction

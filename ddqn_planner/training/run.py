@@ -7,7 +7,7 @@ from contextlib import closing, contextmanager
 from dataclasses import asdict
 from pathlib import Path
 
-from ddqn_planner.files import WorkFolder, differences
+from ddqn_planner.files import WorkFolder, differences, write_atomically
 from ddqn_planner.grid import MoveRule
 from ddqn_planner.training.environment import Scenario
 from ddqn_planner.training.episodes import Episode, open_record, record
@@ -71,10 +71,10 @@ class TrainingRun(WorkFolder):
 
     def try_to_save(self) -> None:
         """Write the model, the checkpoint and the episodes; if that fails, old files stay."""
-        self.saved_at = self.trainer.steps
+        self.saved_at, self.model = self.trainer.steps, self.trainer.model_bytes()
         with self.saving():
             # A kill between the two leaves a model that is newer than the checkpoint: no harm.
-            self.trainer.save_model(self.model_path)
+            write_atomically(self.model_path, self.model)
             self.trainer.save_checkpoint(self.checkpoint_path)
             self._record.flush()
 

@@ -20,7 +20,7 @@ from torch import Tensor
 
 from ddqn_planner.files import write_atomically
 from ddqn_planner.grid import MOVES, MoveRule
-from ddqn_planner.model import ModelMetadata, package_version, save_model
+from ddqn_planner.model import ModelMetadata, model_bytes, package_version
 from ddqn_planner.planning import Planner
 from ddqn_planner.training.double_dqn import ReplayBuffer, Transitions, double_dqn_gradient
 from ddqn_planner.training.environment import GridVectorEnvironment, Scenario
@@ -185,13 +185,17 @@ class Trainer:
         )
         return Planner(self.network.to_numpy(), metadata)
 
-    def save_model(self, path: str | Path) -> None:
-        """Write the network as it is now to a model file; a ValueError if the training diverged."""
+    def model_bytes(self) -> bytes:
+        """Return what a model file of now holds; a ValueError if the training diverged."""
         if not all(weight.isfinite().all() for weight in self._weights):
             remedy = "train into another folder with a smaller learning_rate"
             raise ValueError(f"the training diverged, and nothing more is saved; {remedy}")
         planner = self.planner()
-        save_model(path, planner.network, planner.metadata)
+        return model_bytes(planner.network, planner.metadata)
+
+    def save_model(self, path: str | Path) -> None:
+        """Write what `model_bytes` returns to a file."""
+        write_atomically(Path(path), self.model_bytes())
 
     def save_checkpoint(self, path: str | Path) -> None:
         """Write all that `load_checkpoint` needs; after an OSError, an old file is unchanged."""

@@ -44,6 +44,7 @@ class NodeProcess:
         with self.log_path.open("ab") as file:
             self.process = subprocess.Popen(
                 [*TIED, executable(name), *arguments],
+                cwd=folder,  # no node depends on another's
                 env={**os.environ, "PYTHONPATH": os.pathsep.join(path)},
                 stdout=file,
                 stderr=subprocess.STDOUT,

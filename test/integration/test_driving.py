@@ -21,11 +21,11 @@ from integration.robot import changed
 from integration.user import SOON, User, limited
 from nav_msgs.msg import OccupancyGrid, Odometry, Path
 from rclpy.qos import QoSProfile, ReliabilityPolicy
-from std_msgs.msg import Header, String
+from std_msgs.msg import Header, UInt8MultiArray
 
 from ddqn_planner import Experience, GridMap
 from ddqn_planner.experience.drives import read_drives
-from ddqn_planner.nodes.conversions import quaternion
+from ddqn_planner.nodes.conversions import bytes_message, bytes_of, quaternion
 from ddqn_planner.nodes.driving import NAVIGATION
 from ddqn_planner.nodes.runtime import LATCHED
 
@@ -53,6 +53,7 @@ class Site(User):
     def __init__(self, client: Client, folder: FilePath) -> None:
         super().__init__(client, "driving", "trainer/experience_saved")
         self.folder, self.now, self.at = folder, time.monotonic(), LOWER[0]
+        self.experience = client.subscribe(UInt8MultiArray, "trainer/experience", LATCHED)
         self.slowness = client.subscribe(OccupancyGrid, "trainer/slowness", LATCHED)
 
     def begin(self, listeners: int = 1) -> None:
@@ -108,6 +109,14 @@ class Site(User):
         episode = wait_for("episode", ends)
         self.saved.wait()
         return episode
+
+    def wait_for_prior(self) -> None:
+        """Wait until what the trainer sends foretells from the map."""
+
+        def has_prior(message: UInt8MultiArray) -> bool:
+            return Experience.from_bytes(bytes_of("experience", message)).prior is not None
+
+        self.experience.wait(has_prior)
 
     def record_in(self, folder: FilePath) -> None:
         self.client.set_parameters("trainer", output_folder=str(folder))
@@ -183,6 +192,7 @@ def test_the_robot_goes_round_what_was_slow_until_it_forgets(planner: Any, site:
     assert drive.seconds[-1] - drive.seconds[0] == pytest.approx(238, abs=10)
 
     assert site.saved.wait().data == str(site.folder / "experience.npz")
+    site.wait_for_prior()
     slowness = site.learned()
     assert slowness[14, 50] > 2
     shown = site.slowness.wait(lambda message: max(message.data) > 40)
@@ -199,10 +209,9 @@ def test_the_robot_goes_round_what_was_slow_until_it_forgets(planner: Any, site:
     forecast = site.diagnostics.wait(lambda array: key in values_of(array.status[0]))
     assert float(values_of(forecast.status[0])[key]) > length / 0.5 * 0.8
 
-    broken = site.folder / "broken.npz"
-    broken.write_bytes((site.folder / "experience.npz").read_bytes()[:-20])
-    site.client.publish("trainer/experience_saved", String(data=str(broken)), LATCHED)
-    planner.wait_for_log(r"experience refused: .*broken.npz: cannot be read")
+    broken = bytes_message("experience", (site.folder / "experience.npz").read_bytes()[:-20])
+    site.client.publish("trainer/experience", broken, LATCHED)
+    planner.wait_for_log("experience refused: no experience")
     assert not is_below(site.client.get_plan(*ends))
 
     site.episodes.clear()
@@ -276,6 +285,7 @@ def test_malformed_odometry_is_refused_and_the_next_is_taken(site: Site, trainer
 def test_nothing_is_lost_while_the_disk_is_full(site: Site, trainer: Any) -> None:
     site.drive(LOWER[:2], 0.1)
     size = (site.folder / "episodes.csv").stat().st_size + 10
+    trainer.forget_log()  # it is limited, too
     with limited(trainer.process, resource.RLIMIT_FSIZE, size):
         site.move(LOWER[2:], 0.1)
         site.send_goal(9.0, 9.0)
@@ -284,6 +294,9 @@ def test_nothing_is_lost_while_the_disk_is_full(site: Site, trainer: Any) -> Non
         site.call("stop", succeeds=False)  # it would lose the drive
     trainer.wait_for_log("the drives are saved again")
     assert trainer.log.count("make room") == 1
+    warning = r"drives 0\.1\d* m/s in the open, nominal_speed is 0\.5"
+    assert len(re.findall(warning, trainer.log)) == 1
+    assert float(site.state()["learned speed (m/s)"]) == pytest.approx(0.1, abs=0.03)
     assert site.outcomes == ["arrived", "new_goal"]
 
 

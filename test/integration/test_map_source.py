@@ -8,7 +8,6 @@ import threading
 import time
 from collections.abc import Callable, Coroutine, Iterator
 from dataclasses import replace
-from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -22,12 +21,16 @@ from hypothesis import strategies as st
 from nav_msgs.msg import OccupancyGrid
 from rclpy.parameter import Parameter
 from rclpy.utilities import try_shutdown
-from std_msgs.msg import Header, String
+from std_msgs.msg import Header, UInt8MultiArray
 
 from ddqn_planner import Experience, GridMap, MoveRule, Planner
-from ddqn_planner.experience import ExperienceFileError
 from ddqn_planner.grid import inflate
-from ddqn_planner.nodes.conversions import directions_message, grid_from_message, occupancy_message
+from ddqn_planner.nodes.conversions import (
+    bytes_message,
+    directions_message,
+    grid_from_message,
+    occupancy_message,
+)
 from ddqn_planner.nodes.map_source import BODY_PARAMETERS, MAP_PARAMETERS, MapSource, updated_values
 from ddqn_planner.nodes.parameters import PLANNER_PARAMETERS
 from ddqn_planner.nodes.planner_node import ExpectedTimes
@@ -57,7 +60,7 @@ class Source(MapSource):
     def __init__(self, node: BaseNode) -> None:
         self.heard: list[bool] = []
         self.report = Report(node, lambda: None)
-        self.worker = Worker(node)
+        self.node, self.worker = node, Worker(node)
         super().__init__(node, self.report, self.worker, self.heard.append)
 
     def grid(self) -> GridMap:
@@ -392,59 +395,73 @@ GRID = GridMap(np.zeros((40, 120), dtype=np.bool_), resolution=0.25)
 
 
 def new_times(source: Source) -> ExpectedTimes:
-    return ExpectedTimes(source.report, source.worker, lambda: None)
+    return ExpectedTimes(source.node, source.report, source.worker, lambda: None)
+
+
+def message_of(experience: Experience) -> UInt8MultiArray:
+    return bytes_message("experience", experience.to_bytes())
 
 
 @pytest.fixture
-def times(source: Source, tmp_path: Path) -> ExpectedTimes:
-    """Times after a drive of 20 m along x, at a fifth of the nominal speed."""
-    experience, speed = Experience(0.5), 0.1
-    time = np.linspace(0, 20 / speed, 201)
-    experience.record(time, np.column_stack([5 + speed * time, np.full(201, 5.0)]))
-    experience.save(tmp_path / "experience.npz")
+def driven() -> UInt8MultiArray:
+    """What is learned of two drives of 20 m, one at a fifth of the nominal speed."""
+    experience, x = Experience(0.5), np.linspace(5, 25, 201)
+    for y, speed in ((5.1, 0.1), (7.6, 0.5)):
+        experience.record((x - 5) / speed, np.column_stack([x, np.full(201, y)]))
+    return message_of(experience)
+
+
+@pytest.fixture
+def times(source: Source, driven: UInt8MultiArray) -> ExpectedTimes:
     times = new_times(source)
-    times.load(str(tmp_path / "experience.npz"))
+    assert times.load(driven)
     return times
 
 
-def test_a_map_has_times_after_drives(source: Source, times: ExpectedTimes, tmp_path: Path) -> None:
+def test_a_map_has_times_after_drives(
+    source: Source, times: ExpectedTimes, driven: UInt8MultiArray
+) -> None:
     assert new_times(source).apply(GRID) is GRID
     slowness = times.apply(GRID).slowness
     assert slowness is not None
     assert slowness[20, 60] > 2
-    broken = tmp_path / "broken.npz"
-    broken.write_bytes((tmp_path / "experience.npz").read_bytes()[:-9])
-    for path in (broken, tmp_path / "missing.npz"):
-        with pytest.raises(ExperienceFileError):
-            times.load(str(path))
+    layout, data = driven.layout, bytes(driven.data)
+    for bad, reason in (
+        (bytes_message("experience", data[:-9]), "no experience"),
+        (bytes_message("model", data), "label 'ddqn_planner model 1"),
+        (UInt8MultiArray(layout=message_of(Experience(0.5)).layout, data=data), "sha256"),
+        (UInt8MultiArray(data=data), "label ''"),
+    ):
+        with pytest.raises(ValueError, match=reason):
+            times.load(bad)
     np.testing.assert_array_equal(times.apply(GRID).slowness, slowness)
-    Experience(0.5).save(tmp_path / "empty.npz")
-    times.load(str(tmp_path / "empty.npz"))  # it was forgotten
+    assert not times.load(UInt8MultiArray(layout=layout))  # by its digest it is known already
+    times.load(message_of(Experience(0.5)))  # it was forgotten
     assert times.apply(GRID) is GRID
 
 
 def test_drives_are_planned_with_at_once(
-    source: Source, times: ExpectedTimes, tmp_path: Path
+    source: Source, times: ExpectedTimes, driven: UInt8MultiArray
 ) -> None:
     changes: list[int] = []
-    learned = ExpectedTimes(source.report, source.worker, lambda: changes.append(1))
+    on_change = source.node, source.report, source.worker, lambda: changes.append(1)
+    learned = ExpectedTimes(*on_change)
     assert finished(learned.on(GRID)) is GRID
-    path = str(tmp_path / "experience.npz")
-    finished(learned.on_saved(String(data=path)))
-    assert len(changes) == 1
+    for _ in range(2):
+        finished(learned.on_sent(driven))
+        assert len(changes) == 1
     closed = GRID.with_patch(np.ones((3, 3), dtype=np.bool_), 60, 19)
     for grid in (GRID, closed, GRID):
         timed = finished(learned.on(grid))
         assert finished(learned.on(grid)) is timed
         np.testing.assert_array_equal(timed.occupancy, grid.occupancy)
     np.testing.assert_array_equal(timed.slowness, times.apply(GRID).slowness)
-    Experience(0.5).save(path)
-    finished(learned.on_saved(String(data=path)))
+    finished(learned.on_sent(message_of(Experience(0.5))))
     assert len(changes) == 2
     assert finished(learned.on(GRID)) is GRID  # it was forgotten
-    finished(learned.on_saved(String(data="missing")))
+    finished(learned.on_sent(UInt8MultiArray(data=driven.data)))
     assert len(changes) == 2
-    assert "missing" in source.report.refused["experience"]
+    assert "label ''" in source.report.refused["experience"]
 
 
 def finished(coroutine: Coroutine[None, None, Any]) -> Any:
@@ -467,7 +484,8 @@ def test_a_map_with_a_person_or_that_grows_keeps_its_times(times: ExpectedTimes)
     grown = GridMap(np.zeros((60, 150), dtype=np.bool_), 0.25, (-2.5, -1.25, 0.0))
     after = times.apply(grown).slowness
     assert after is not None
-    np.testing.assert_allclose(after[5:45, 10:130], before, rtol=0.021)
+    # Near the old edge more places tell of others.
+    np.testing.assert_allclose(after[5:35, 10:130], before[:30], rtol=0.021)
 
 
 def test_the_plan_goes_round_and_its_time_is_told(times: ExpectedTimes) -> None:
@@ -480,7 +498,7 @@ def test_the_plan_goes_round_and_its_time_is_told(times: ExpectedTimes) -> None:
     low, high = map(float, told["expected time, 90 % interval (s)"].split(" to "))
     assert plan.cost is not None
     assert low < seconds < high
-    assert seconds == pytest.approx(plan.cost, rel=0.05)
+    assert 0.95 < seconds / plan.cost < 1.05 * 1.1  # by the exploration
     assert 19 / 0.5 < plan.cost < 19 / 0.2  # not straight on
     other = GridMap(np.zeros((10, 10), dtype=np.bool_)).with_slowness(
         np.ones((10, 10), dtype=np.float32), 1.0

@@ -26,7 +26,7 @@ NODES = ["map_server", "planner", "trainer"]
 NAMES = ["", "no_such", "a.b", "/", "ü" * 300]
 TYPES = ["not set", "bool", "integer", "double", "string"]  # as rcl_interfaces numbers them
 OF_EVERY_NODE = {"/rosout", "/parameter_events", "use_sim_time", "start_type_description_service"}
-OF_DRIVING = {"~/experience_saved", "~/slowness", "~/forget", "odom", NAVIGATION}
+OF_DRIVING = {"~/experience", "~/experience_saved", "~/slowness", "~/forget", "odom", NAVIGATION}
 """What the trainer has only where it learns from driving."""
 
 

@@ -15,7 +15,7 @@ from nav_msgs.msg import OccupancyGrid, Odometry
 from nav_msgs.srv import GetMap, GetPlan
 from rcl_interfaces.srv import GetParameters, SetParameters, SetParametersAtomically
 from rclpy.parameter import Parameter
-from std_msgs.msg import String
+from std_msgs.msg import UInt8MultiArray
 
 from ddqn_planner.nodes.conversions import grid_from_message
 from ddqn_planner.nodes.parameters import PLANNER_PARAMETERS
@@ -28,7 +28,7 @@ fuzz = settings(suppress_health_check=[HealthCheck.function_scoped_fixture])
 def unharmed(robot: Robot) -> Any:
     """See afterwards that nothing was raised out of a callback."""
     # Else a message may come after the answer to a later request.
-    robot.client.publisher(String, "trainer/model_saved", LATCHED)
+    robot.client.publisher(UInt8MultiArray, "trainer/model", LATCHED)
     robot.client.wait_for_discovery("planner")
     yield robot
     robot.reset()

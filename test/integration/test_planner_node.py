@@ -34,10 +34,11 @@ from nav_msgs.msg import OccupancyGrid, Path
 from nav_msgs.srv import GetPlan
 from rcl_interfaces.srv import ListParameters
 from rclpy.qos import QoSProfile
-from std_msgs.msg import String
+from std_msgs.msg import UInt8MultiArray
 from std_srvs.srv import Trigger
 
 from ddqn_planner.model import find_model
+from ddqn_planner.nodes.conversions import bytes_message
 from ddqn_planner.nodes.report import seconds
 from ddqn_planner.nodes.runtime import LATCHED
 
@@ -126,13 +127,28 @@ def test_reload_plans_again_with_what_the_file_holds(robot: Robot, whole_model: 
 def test_follows_the_trainer(robot: Robot, whole_model: FilePath, tmp_path: FilePath) -> None:
     path = tmp_path / "saved.safetensors"
     constant_model(path, 6, 11)
-    robot.client.publish("trainer/model_saved", String(data=str(path)), LATCHED)
-    robot.wait_for_reason("greedy steps do not find it", {"model training steps": "11"})
-    assert robot.client.get_parameter("planner", "model") == str(path)
+    sent = bytes_message("model", path.read_bytes())
+    robot.client.publish("trainer/model", sent, LATCHED)
+    its = {"model training steps": "11", "model file": "trainer/model"}
+    robot.wait_for_reason("greedy steps do not find it", its)
+    broken = bytes_message("model", path.read_bytes()[:-9])
+    other = UInt8MultiArray(layout=broken.layout, data=sent.data)
+    unnamed = UInt8MultiArray(data=sent.data)
+    for bad, reason in (
+        (broken, "cannot be read as safetensors"),
+        (other, f"{len(sent.data)} bytes with the label 'ddqn_planner model 1 sha256:.*, not"),
+        (bytes_message("experience", path.read_bytes()), "label 'ddqn_planner experience 1 "),
+        (unnamed, "label ''"),
+    ):
+        robot.clear()
+        robot.client.publish("trainer/model", bad, LATCHED)
+        robot.wait_for_reason(f"trainer's model was refused: .*{reason}", its)
+    # Of the same model again nothing is told but that it is right.
+    robot.node.forget_log()
     robot.clear()
-    robot.client.publish("trainer/model_saved", String(data="/no/such.safetensors"), LATCHED)
-    refused = "trainer's model was refused: .*'/no/such.safetensors'"
-    robot.wait_for_reason(refused, {"model training steps": "11"})
+    robot.client.publish("trainer/model", sent, LATCHED)
+    robot.diagnostics.wait(lambda array: "refused" not in array.status[0].message)
+    assert "planning with the model" not in robot.node.log
 
 
 def test_a_trapped_or_unfit_model_says_so(
