@@ -19,12 +19,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 import ddqn_planner as api
-from ddqn_planner.files import WorkFolder, write_atomically, write_csv
+from ddqn_planner.files import WorkFolder, differences, write_atomically, write_csv
 from ddqn_planner.resources import find_map, with_remedy
 
 # A command imports what it needs, and no other command's libraries: the names of `api` do so, too.
 if TYPE_CHECKING:
-    from ddqn_planner.experience.drives import Drive
     from ddqn_planner.grid import Cell, MapFile
     from ddqn_planner.training.environment import Scenario
     from ddqn_planner.training.hyper_parameters import HyperParameters
@@ -256,41 +255,59 @@ def certify(parser: argparse.ArgumentParser, arguments: Sequence[str]) -> int:
 
 
 def learn(parser: argparse.ArgumentParser, arguments: Sequence[str]) -> int:
-    """Learn from a robot's recorded drives how long places take."""
+    """Learn from a robot's recorded drives how long places take, and what of it the map tells."""
     import numpy as np
 
-    from ddqn_planner.experience.drives import EXPERIENCE, LOCK, RECORD
+    from ddqn_planner.experience.drives import EXPERIENCE, LOCK, RECORD, Drive
+    from ddqn_planner.experience.recordings import read_recording
 
     add = parser.add_argument
-    words = "a trainer's folder, a CSV file with the columns seconds, x, y, or an MCAP file"
-    add("drives", type=Path, help=words)
+    words = "trainers' folders, bags, MCAP files, or CSV files with the columns seconds, x, y"
+    add("drives", type=Path, nargs="+", help=words)
     add("--map", required=True, help="ROS map YAML, or name of a shipped map")
-    words = "by default experience.npz in the folder, or beside the file"
+    words = "by default experience.npz in the first folder, or beside the first file"
     add("--out", type=Path, metavar="FILE", help=words)
-    words = "the robot's speed where nothing slows it down, metres per second"
-    add("--nominal-speed", type=float, default=0.5, metavar="X", help=words)
-    add("--robot-width", type=float, default=0.5, metavar="X", help="metres")
-    words = "MCAP: the topic of the poses, by default the one with most poses; or /tf"
+    words = "older experience that the drives add to; else all is learned anew"
+    add("--experience", type=Path, metavar="FILE", help=words)
+    words = "metres per second in the open, a first guess; by default 0.5, or that of --experience"
+    add("--nominal-speed", type=float, metavar="X", help=words)
+    words = "metres; by default 0.5, or that of --experience"
+    add("--robot-width", type=float, metavar="X", help=words)
+    words = "MCAP: the topic of the poses or transforms, by default the one with most of them"
     add("--topic", default="", help=words)
     add("--frame", default="map", help="MCAP: the map's frame")
-    add("--robot-frame", default="base_link", help="MCAP: the robot's frame, for /tf")
+    words = "MCAP: the robot's frame in transforms, by default any that ends in base_link"
+    add("--robot-frame", default="", help=words)
     options = parser.parse_args(arguments)
-    source: Path = options.drives
     grid = api.load_map(find_map(options.map))
-    experience = api.Experience(options.nominal_speed, options.robot_width)
+    names = "nominal_speed", "robot_width"
+    given = {name: value for name in names if (value := getattr(options, name)) is not None}
+    if options.experience:
+        experience = api.Experience.load(options.experience)
+        if changed := differences({name: getattr(experience, name) for name in given}, given):
+            raise ValueError(f"{options.experience} has {changed}; leave those options out")
+    else:
+        experience = api.Experience(**{"nominal_speed": 0.5, **given})
+    drives: list[Drive] = []
     with ExitStack() as stack:
-        if source.is_dir():
-            if not (source / RECORD).is_file():
-                remedy = "give a trainer's folder, or the .mcap file in a bag's"
-                raise ValueError(f"{source} holds no {RECORD}; {remedy}")
-            stack.callback(WorkFolder(source, [LOCK, RECORD], "drives", "records").close)
-        drives = _read_drives(source, options)
+        for source in options.drives:
+            if (source / RECORD).is_file():
+                stack.callback(WorkFolder(source, [LOCK, RECORD], "drives", "records").close)
+            how = options.topic, options.frame, options.robot_frame
+            name, found = read_recording(source, grid, *how)
+            print(f"{source}: {name}")
+            drives += found
         for drive in drives:
             drive.teach(experience, grid)
-        if not drives:
-            raise ValueError(f"{source} holds no drive; drive on")
-        out = options.out or (source if source.is_dir() else source.parent) / EXPERIENCE
-        write_atomically(out, experience.to_bytes())  # anew, whatever an older file holds
+        try:
+            from ddqn_planner.training.prior import teach_prior
+
+            teach_prior(experience, grid)
+        except ImportError as error:
+            print(f"the map's prior is not trained: {with_remedy(error)}")
+        first = options.drives[0]
+        out = options.out or (first if first.is_dir() else first.parent) / EXPERIENCE
+        write_atomically(out, experience.to_bytes())  # not `save`, which adds to an older file
     slowness, known = experience.slowness(grid), experience.uncertainty(grid) < 0.9
     seconds = sum(float(np.ptp(drive.seconds)) for drive in drives)
     print(f"{len(drives)} drives, {sum(d.metres for d in drives):.0f} m, {seconds / 60:.1f} min")
@@ -299,24 +316,9 @@ def learn(parser: argparse.ArgumentParser, arguments: Sequence[str]) -> int:
     if free.any():
         middle, slow = np.quantile(slowness[free], (0.5, 0.95))
         print(f"seconds over nominal ones there: median {middle:.2f}, slowest 5 % from {slow:.2f}")
+    print(f"speed in the open: {experience.learned_speed:.2f} m/s")
     print(f"saved {out}")
     return 0
-
-
-def _read_drives(source: Path, options: Any) -> list[Drive]:
-    """Return the drives of a folder or a file."""
-    from ddqn_planner.experience.drives import RECORD, drives_of, read_csv, read_drives, read_mcap
-
-    if source.is_dir():
-        return list(read_drives(source / RECORD))
-    ending = source.suffix.lower()
-    if ending == ".mcap":
-        topic, samples = read_mcap(source, options.topic, options.frame, options.robot_frame)
-        print(f"{len(samples)} poses of {topic}")
-        return drives_of(samples)
-    if ending == ".csv":
-        return list(read_drives(source)) if source.name == RECORD else drives_of(read_csv(source))
-    raise ValueError(f"{source} is no folder, and ends in neither .csv nor .mcap; give one of them")
 
 
 def warm_up(parser: argparse.ArgumentParser, arguments: Sequence[str]) -> int:

@@ -1,18 +1,15 @@
-"""A robot's drives: from its poses, live or recorded, and in a folder that learns from them."""
+"""A robot's drives: from its poses, and in a folder that learns from them."""
 
 from __future__ import annotations
 
-import cmath
-import csv
 import math
 import os
 import re
-from collections import defaultdict
 from collections.abc import Callable, Iterator
 from contextlib import closing
 from enum import Enum
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -42,16 +39,6 @@ SHORTEST = 0.5  # metres: a robot that went no farther away has not driven
 MOST_SAMPLES = 2000  # a drive is cut there, so that the robot learns while it drives for hours
 JUMP = 1.0  # seconds back by which a clock begins anew: a bag loops, a simulator is reset
 WINDOW, STEP = 0.5, 0.25  # a drive's length joins means of so many seconds, so many metres apart
-
-POSES = (
-    "geometry_msgs/msg/PoseStamped",
-    "geometry_msgs/msg/PoseWithCovarianceStamped",
-    "nav_msgs/msg/Odometry",
-)
-TF = "/tf"  # what the poses of transforms count as: they come from more than one topic
-
-# Of each frame: its parent, and where it is there, shifted and turned in the complex plane.
-Transforms = dict[str, tuple[str, complex, complex]]
 
 
 class DriveEnd(str, Enum):
@@ -257,96 +244,3 @@ def _cut_incomplete_row(path: Path) -> int:
         os.truncate(path, len(complete + end))
     rows = map(ROW.fullmatch, (complete + end).splitlines(keepends=True))
     return max((int(row[1]) for row in rows if row), default=0)
-
-
-def drives_of(samples: list[Sample]) -> list[Drive]:
-    """Divide recorded poses into drives. Those without finite numbers are left out."""
-    drives: list[Drive] = []
-    recorder = DriveRecorder(lambda *drive: drives.append(Drive(len(drives) + 1, *drive)))
-    for sample in samples:
-        if all(map(math.isfinite, sample)):
-            recorder.add(*sample)
-    recorder.end(DriveEnd.STOPPED)
-    return drives
-
-
-def read_csv(path: Path) -> list[Sample]:
-    """Read the columns seconds, x and y; a ValueError if one is missing or has no numbers."""
-    samples = []
-    with path.open(newline="", encoding="utf-8", errors="replace") as file:
-        reader = csv.DictReader(file)
-        missing = sorted({"seconds", "x", "y"} - set(reader.fieldnames or ()))
-        if missing:
-            raise ValueError(
-                f"{path}: the columns {', '.join(missing)} are missing; give seconds, and x and y "
-                "in metres in the frame of the map"
-            )
-        for row in reader:
-            try:
-                samples.append((float(row["seconds"]), float(row["x"]), float(row["y"])))
-            except (TypeError, ValueError):
-                raise ValueError(
-                    f"{path}, line {reader.line_num}: {row} has no numbers; give seconds, x and y"
-                ) from None
-    return samples
-
-
-def read_mcap(path: Path, topic: str, frame: str, robot_frame: str) -> tuple[str, list[Sample]]:
-    """Read a topic's poses in the map's frame; return the topic too, by default the longest."""
-    from mcap.reader import make_reader
-    from mcap_ros2.decoder import DecoderFactory
-
-    found: dict[str, list[Sample]] = defaultdict(list)
-    frames: dict[str, set[str]] = defaultdict(set)
-    transforms: Transforms = {}
-    with path.open("rb") as file:
-        try:
-            reader = make_reader(file, decoder_factories=[DecoderFactory()])
-            for schema, channel, _, message in reader.iter_decoded_messages():
-                name = schema.name if schema else ""
-                if name in POSES:
-                    frames[channel.topic].add(message.header.frame_id)
-                    if message.header.frame_id == frame:
-                        at = getattr(message.pose, "pose", message.pose).position
-                        found[channel.topic].append((_seconds(message), at.x, at.y))
-                elif name == "tf2_msgs/msg/TFMessage":
-                    found[TF] += _samples_of_tf(message, transforms, frame, robot_frame)
-        except Exception as error:  # broken bytes make the reader raise many kinds of errors
-            raise ValueError(
-                f"{path}: cannot be read as MCAP ({error!r}); `mcap recover` repairs a recording "
-                "that a crash cut"
-            ) from error
-    if not topic:
-        topic = max(found.keys() - {TF}, key=lambda name: len(found[name]), default=TF)
-    if not found[topic]:
-        seen = ", ".join(f"{name} in {sorted(frames[name])}" for name in sorted(frames)) or "none"
-        raise ValueError(
-            f"{path}: {topic} has no poses in the frame {frame!r} (topics of poses: {seen}); give "
-            "--topic, --frame or --robot-frame"
-        )
-    return topic, found[topic]
-
-
-def _seconds(stamped: Any) -> float:
-    return float(stamped.header.stamp.sec + stamped.header.stamp.nanosec / 1e9)
-
-
-def _samples_of_tf(
-    message: Any, transforms: Transforms, frame: str, robot_frame: str
-) -> Iterator[Sample]:
-    """Take transforms, and yield where the robot is after each that moves it."""
-    for stamped in message.transforms:
-        moved, turn = stamped.transform.translation, stamped.transform.rotation
-        child, parent = stamped.child_frame_id.lstrip("/"), stamped.header.frame_id.lstrip("/")
-        turned = cmath.rect(1, 2 * math.atan2(turn.z, turn.w))
-        transforms[child] = parent, complex(moved.x, moved.y), turned
-        if child != robot_frame:
-            continue
-        position, at = 0j, robot_frame
-        for _ in transforms:  # their frames may form a circle
-            if at == frame or at not in transforms:
-                break
-            at, shift, turned = transforms[at]
-            position = shift + turned * position
-        if at == frame:
-            yield _seconds(stamped), position.real, position.imag

@@ -285,7 +285,13 @@ class Evidence:
         self.noise_sums = tuple(np.add(self.noise_sums, other.noise_sums).tolist())
         self.errors = [*self.errors, *other.errors][-KEPT:]
         self.driven += other.driven
-        self.prior = other.prior if self.prior is None else self.prior
+        self.use_prior(other.prior if self.prior is None else self.prior)
+
+    def use_prior(self, prior: Prior | None) -> None:
+        """Let another prior foretell; its level, learned from these places, counts but once."""
+        old, new = (0.0 if each is None else float(each.level) for each in (self.prior, prior))
+        self.table[:, 2] += new - old
+        self.prior = prior
         self._fit()
 
     def arrays(self) -> dict[str, Any]:

@@ -189,7 +189,7 @@ class Experience:
 
     @prior.setter
     def prior(self, prior: Prior | None) -> None:
-        self.evidence.prior = prior
+        self.evidence.use_prior(prior)
 
     def take_over(self, older: Experience) -> None:
         """Use what older experience solved for its map, which forgets it."""
@@ -316,7 +316,7 @@ class Experience:
                 arrays["evidence"][:, 2] = 0
             experience.evidence.restore(arrays)
             prior = {n.removeprefix(PRIOR): a for n, a in arrays.items() if n.startswith(PRIOR)}
-            experience.prior = Prior.from_arrays(prior) if prior else None
+            experience.evidence.prior = Prior.from_arrays(prior) if prior else None
         except Exception as error:  # broken bytes make zipfile and NumPy raise many kinds of errors
             raise ExperienceFileError(f"no experience: {error}") from error
         return experience

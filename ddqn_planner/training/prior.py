@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 UNITS = 16
 RIDGE = 10.0  # the weight of so many places speaks against each linear prediction
 LEARNING_RATE, WEIGHT_DECAY = 0.01, 0.3
-STEPS, CHECKED = 200, 5  # at most so many; the held-out error is seen every so many
+STEPS, CHECKED = 60, 5  # at most so many; the held-out error is seen every so many
 SMALLEST_SCALE = 0.1  # a feature that hardly varies tells nothing of maps where it does
 FOLDS = 6  # networks that each leave out a part of the places; one more learns from all
 BLOCKS, PLACES = 12, (8, 32)  # near places are alike: so many in a row are left out together

@@ -10,7 +10,8 @@ import pytest
 
 from ddqn_planner import Experience, GridMap
 from ddqn_planner.cli import main
-from ddqn_planner.experience.drives import DriveEnd, DriveFolder, drives_of, read_mcap
+from ddqn_planner.experience.drives import DriveEnd, DriveFolder
+from ddqn_planner.experience.recordings import drives_of, read_csv, read_mcap
 from ddqn_planner.grid import save_map
 
 GRID = GridMap(np.zeros((40, 120), dtype=np.bool_), resolution=0.25)
@@ -126,6 +127,37 @@ def test_a_csv_file_is_learned(tmp_path: Path, map_file: Path, capsys: Any) -> N
     assert Experience.load(out).nominal_speed == 1
 
 
+def test_a_csv_file_may_have_a_mark_of_its_encoding_and_blanks(tmp_path: Path) -> None:
+    file = tmp_path / "drive.csv"
+    text = "\ufeff\r\n seconds , x,y \r\n\r\n 1 , 2, 3 ,more\r\n ,, \r\n  \r\n4,5,6\r\n"
+    file.write_text(text, encoding="utf-8", newline="")
+    assert read_csv(file) == [(1, 2, 3), (4, 5, 6)]
+
+
+def test_recordings_add_to_older_experience(tmp_path: Path, map_file: Path, capsys: Any) -> None:
+    files = [tmp_path / f"{name}.csv" for name in "ab"]
+    for file, y in zip(files, (5.0, 8.0), strict=True):
+        file.write_text("seconds,x,y\n" + "".join(f"{t},{x},{y}\n" for t, x, _ in slow_drive()))
+    learn = ["learn", "--map", str(map_file), "--out"]
+    both, first, after = (tmp_path / f"{name}.npz" for name in ("both", "first", "after"))
+    speed = ["--nominal-speed", "0.8"]
+    assert main([*learn, str(both), *map(str, files), *speed]) == 0
+    assert main([*learn, str(first), str(files[0]), *speed]) == 0
+    going_on = [*learn, str(after), str(files[1]), "--experience", str(first)]
+    assert main(going_on) == 0
+    one, two, old = map(Experience.load, (both, after, first))
+    driven = np.ix_((20, 32), (40, 60, 80))
+    np.testing.assert_allclose(one.slowness(GRID)[driven], two.slowness(GRID)[driven], rtol=0.3)
+    assert one.evidence.driven == pytest.approx(two.evidence.driven, rel=0.02)
+    assert two.evidence.driven == pytest.approx(2 * old.evidence.driven, rel=0.02)
+    assert one.prior is not None
+    assert two.nominal_speed == 0.8
+    before = after.read_bytes()
+    assert main([*going_on, "--nominal-speed", "0.5"]) == 2
+    assert "nominal_speed 0.8 (now 0.5); leave those options out" in capsys.readouterr().err
+    assert after.read_bytes() == before
+
+
 @pytest.mark.parametrize(
     ("name", "text", "reason"),
     [
@@ -134,9 +166,13 @@ def test_a_csv_file_is_learned(tmp_path: Path, map_file: Path, capsys: Any) -> N
         ("drive.csv", "seconds,x,y\n1,2\n", "line 2: .* no numbers"),
         ("drive.csv", "seconds,x,y\n1,2,nan\n", "holds no drive"),
         ("drive.csv", "", "columns seconds, x, y are missing"),
+        ("drive.csv", "seconds,x,y\n99,1,1\n98,2,1\n97,3,1\n", "time .* runs backwards"),
+        ("drive.csv", "seconds,x,y\n" + 9 * "7,1,1\n7,2,1\n", "time .* stands still"),
+        ("drive.csv", "seconds,x,y\n1,-50,1\n2,-51,1\n3,-52,1\n", "x is -52.0 .* map has 30.0 x"),
         ("drive.bag", "", r"ends in neither .csv nor .mcap"),
+        ("drive.db3", "", r"convert the bag: ros2 bag convert -i .*drive\.db3 -o"),
         ("missing.csv", None, "No such file"),
-        (".", None, r"holds no episodes\.csv; give .* the \.mcap file in a bag's"),
+        (".", None, r"holds no episodes\.csv and no \.mcap file; give a .* folder, a bag's"),
     ],
 )
 def test_what_cannot_be_learned_is_refused(
@@ -163,25 +199,100 @@ def test_poses_of_an_mcap_file_are_learned(
     assert "1200 poses of /where" in capsys.readouterr().out
 
 
-def test_transforms_of_an_mcap_file_lead_to_the_map(tmp_path: Path) -> None:
-    kind = "tf2_msgs/msg/TFMessage"
-    turned = transform(0, "map", "odom", 10.0, 20.0, math.pi / 2)
-    messages = [("/tf", kind, {"transforms": [turned]})]
-    for t in range(5):
-        own = transform(100.0 + t, "odom", "base_link", float(t), 1.0)
-        messages.append(("/tf", kind, {"transforms": [transform(t, "map", "door", 0, 0), own]}))
-    file = write_mcap(tmp_path / "tf.mcap", messages)
-    topic, samples = read_mcap(file, "", "map", "base_link")
-    assert topic == "/tf"
-    expected = [(100.0 + t, 9.0, 20.0 + t) for t in range(5)]
-    np.testing.assert_allclose(samples, expected, atol=1e-9)
+def tree(robot: str, y: float, topic: str = "/tf") -> list[Message]:
+    """What a robot sends that drives 10 m along x: few corrections, dated into the future."""
+    kind, map_frame = "tf2_msgs/msg/TFMessage", "map"
+    odom, footprint, base = (f"{robot}{name}" for name in ("odom", "base_footprint", "base_link"))
+    upwards = transform(0, footprint, base, 1.0, 0.0)
+    messages: list[Message] = [(f"{topic}_static", kind, {"transforms": [upwards]})]
+    for step in range(200):
+        sent = [transform(100 + step / 20, odom, footprint, 2.0, 5 - step / 20)]
+        if step % 10 == 0:
+            turned = transform(101 + step / 20, map_frame, odom, 10.0, y, math.pi / 2)
+            sent = [turned, transform(100 + step / 20, footprint, "door", 0, 0), *sent]
+        messages.append((topic, kind, {"transforms": sent}))
+    return messages
+
+
+def driven(y: float) -> np.ndarray:
+    """What the transforms of `tree` tell of."""
+    return np.array([(100 + s / 20, 10 - 5 + s / 20, y + 2 + 1) for s in range(200)])
+
+
+def test_transforms_of_a_bag_lead_from_a_frame_below_the_one_that_moves_to_the_map(
+    tmp_path: Path, map_file: Path, capsys: Any
+) -> None:
+    messages = [*tree("", 5.0), message("/goal_pose", ODOMETRY, (100.0, 20.0, 1.0))]
+    parts = [
+        write_mcap(tmp_path / name, part)
+        for name, part in (("b.mcap", messages[:101]), ("a.mcap", messages[101:]))
+    ]
+    source, samples = read_mcap(parts)
+    assert source == "/tf of base_link"
+    np.testing.assert_allclose(samples, driven(5.0), atol=1e-9)
+    for remedy, text in (("bag reindex", "none: {}"), ("bag reindex", "{"), ("", "")):
+        names = text or "rosbag2_bagfile_information: {relative_file_paths: [b.mcap, a.mcap]}"
+        (tmp_path / "metadata.yaml").write_text(names)
+        assert main(["learn", str(tmp_path), "--map", str(map_file)]) == (2 if remedy else 0)
+        output = capsys.readouterr()
+        assert remedy in output.err
+    assert "200 poses of /tf of base_link" in output.out
+
+
+def test_files_of_a_bag_without_metadata_come_in_the_order_of_their_numbers(
+    tmp_path: Path, map_file: Path
+) -> None:
+    for number in range(11):
+        part = [message("/where", ODOMETRY, s) for s in slow_drive()[100 * number :][:100]]
+        write_mcap(tmp_path / f"bag_{number}.mcap", part)
+    assert main(["learn", str(tmp_path), "--map", str(map_file)]) == 0
+    assert Experience.load(tmp_path / "experience.npz").evidence.driven == pytest.approx(110, abs=2)
+
+
+@pytest.mark.parametrize(
+    ("messages", "names", "choice"),
+    [
+        (
+            [*tree("robot1/", 1.0), *tree("robot2/", 9.0)],
+            "/tf of robot1/base_link, /tf of robot2/base_link",
+            {"robot_frame": "robot2/base_link"},
+        ),
+        (
+            [*tree("", 1.0, "/robot1/tf"), *tree("", 9.0, "/robot2/tf")],
+            "/robot1/tf of base_link, /robot2/tf of base_link",
+            {"topic": "/robot2/tf"},
+        ),
+        (
+            [message("/a", ODOMETRY, s) for s in driven(6.0).tolist()] + tree("", 9.0),
+            "/a, /tf of base_link",
+            {"robot_frame": "base_link"},
+        ),
+        (
+            [
+                message(name, ODOMETRY, s)
+                for s in driven(9.0).tolist()
+                for name in ("/a/at", "/b/at")
+            ],
+            "/a/at, /b/at",
+            {"topic": "/b/at"},
+        ),
+    ],
+)
+def test_of_several_robots_one_is_chosen(
+    tmp_path: Path, messages: list[Message], names: str, choice: dict[str, str]
+) -> None:
+    file = write_mcap(tmp_path / "two.mcap", messages)
+    with pytest.raises(ValueError, match=f"poses of several robots: {names}; give --topic"):
+        read_mcap([file])
+    _, samples = read_mcap([file], **choice)
+    np.testing.assert_allclose(samples, driven(9.0), atol=1e-9)
 
 
 def test_an_mcap_file_without_poses_on_the_map_names_what_it_has(tmp_path: Path) -> None:
     file = write_mcap(tmp_path / "odom.mcap", [message("/odom", ODOMETRY, (1, 2, 3), "odom")])
     with pytest.raises(ValueError, match=r"no poses in the frame 'map' .*/odom in \['odom'\]"):
-        read_mcap(file, "", "map", "base_link")
-    assert read_mcap(file, "/odom", "odom", "base_link")[1] == [(1, 2, 3)]
+        read_mcap([file])
+    assert read_mcap([file], "/odom", "odom")[1] == [(1, 2, 3)]
 
 
 @pytest.mark.parametrize("cut", [0, 20, 400])
@@ -190,12 +301,12 @@ def test_a_broken_mcap_file_is_refused(tmp_path: Path, cut: int) -> None:
     file = write_mcap(tmp_path / "drive.mcap", messages)
     file.write_bytes(file.read_bytes()[:cut])
     with pytest.raises(ValueError, match="cannot be read as MCAP"):
-        read_mcap(file, "", "map", "base_link")
+        read_mcap([file])
 
 
 def test_a_recording_of_hours_has_a_drive_for_each_way() -> None:
     way = [(t, min(t / 2, 10.0), 0.0) for t in np.arange(0, 200, 0.1).tolist()]
     back = [(200 + t, 10 - x, y) for t, x, y in way]
-    drives = drives_of([*way, *back, (math.nan, 0.0, 0.0)])
+    drives = drives_of([*way, *back])
     assert [drive.outcome.value for drive in drives] == ["paused", "paused"]
     assert [round(drive.metres) for drive in drives] == [10, 10]

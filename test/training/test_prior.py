@@ -108,3 +108,19 @@ def test_the_places_of_experience_teach_its_prior_where_they_lie_on_a_map() -> N
     for place, more in ((grid, False), (other, True)):  # no place is kept twice, none is forgotten
         teach_prior(experience, place)
         assert (len(experience.prior.replay) > len(first.replay)) == more
+
+
+def test_what_all_places_have_in_common_is_not_learned_twice() -> None:
+    experience, grid = Experience(0.5), GridMap(np.zeros((40, 120), dtype=np.bool_), 0.25)
+    for y in (2.0, 4.0, 6.0):
+        seconds = np.arange(0, 200, 0.5)
+        experience.record(seconds, np.column_stack([1 + seconds / 8, 0 * seconds + y]))
+    before = experience.slowness(grid)
+    assert before[36, 60] == pytest.approx(4, rel=0.4)
+    teach_prior(experience, grid)
+    np.testing.assert_allclose(experience.slowness(grid), before, rtol=0.1)
+    again = Experience.from_bytes(experience.to_bytes())
+    np.testing.assert_allclose(again.slowness(grid), experience.slowness(grid), rtol=0.01)
+    merged = Experience(0.5)
+    merged.merge(experience)
+    np.testing.assert_allclose(merged.slowness(grid), before, rtol=0.1)
