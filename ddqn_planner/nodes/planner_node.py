@@ -330,13 +330,8 @@ class ExpectedTimes:
 
     async def on_sent(self, message: UInt8MultiArray) -> None:
         """Plan by what the trainer has learned from drives, or refuse its message."""
-        try:
-            is_new = await self._worker.call(self.load, message)
-        except Exception as error:
-            self._report.refuse("experience", str(error) or repr(error))
-            return
-        self._report.accept("experience")
-        if is_new:
+        with self._report.taking("experience"):
+            await self._worker.call(self.load, message)
             self._grid = None
             self._on_change()
 
@@ -356,15 +351,14 @@ class ExpectedTimes:
             self._forecast.add_done_callback(lambda _: self._report.change())
         return self._forecast.result() or {}
 
-    def load(self, message: UInt8MultiArray) -> bool:
-        """Use what the trainer sent, and say if it is new; an error leaves what was used before."""
+    def load(self, message: UInt8MultiArray) -> None:
+        """Use what the trainer sent, if it is new; an error leaves what was used before."""
         if (label := label_of(message)) == self._label:
-            return False
+            return
         newer = Experience.from_bytes(bytes_of("experience", message))
         if self._experience is not None:
             newer.take_over(self._experience)
         self._experience, self._label = newer, label
-        return True
 
     def apply(self, grid: GridMap) -> GridMap:
         """Return a map whose moves cost expected time, or the same map before a drive."""
