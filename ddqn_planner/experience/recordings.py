@@ -231,7 +231,7 @@ def _moves(
         turned = cmath.rect(1, 2 * math.atan2(turn.z, turn.w))
         tree[child] = parent, complex(moved.x, moved.y), turned
         for robot in tree:
-            if robot != robot_frame and (robot_frame or PurePosixPath(robot).name != BASE):
+            if robot != robot_frame and (robot_frame or robot.rpartition("/")[2] != BASE):
                 continue
             position, at, chain = 0j, robot, set[str]()
             while at != frame and at in tree and at not in chain:  # they may form a circle
