@@ -87,12 +87,15 @@ class PlannerNode(ManagedNode):
             self, self._frames, self._report, lambda: self._map.frame, self._on_start
         )
         self._times = ExpectedTimes(self, self._report, self._map_worker, self._replan.trigger)
+        group = MutuallyExclusiveCallbackGroup()  # it waits for a worker
+        self._read_experience = self.create_guard_condition(self._times.on_sent, group)
+        self._read_experience.trigger()
         inputs = self._map, self._times.on, self._start, self._frames, self._model
         self._requests = Requests(self._settings, *inputs, self._worker, self._look_soon)
         self.create_subscription(PoseStamped, "goal_pose", lambda goal: self._on_goals([goal]), 10)
         self.create_subscription(PoseArray, "goal_poses", self._on_goal_poses, 10)
         if self._settings.follow_trainer:
-            sent, group = UInt8MultiArray, MutuallyExclusiveCallbackGroup()  # it awaits a worker
+            sent = UInt8MultiArray
             self.create_subscription(sent, "trainer/model", self._on_model, LATCHED)
             topic, on_sent = "trainer/experience", self._times.on_sent
             self.create_subscription(sent, topic, on_sent, LATCHED, callback_group=group)
@@ -154,6 +157,8 @@ class PlannerNode(ManagedNode):
         changed = {parameter.name for parameter in parameters} & self._declared.keys()
         if not (changed and self._is_configured):  # subscriptions declare parameters, too
             return
+        if "experience" in changed:
+            self._read_experience.trigger()
         if "model" in changed:
             self._model.use(*self._candidate)
         if self._model.planner is not None:
@@ -328,8 +333,8 @@ class ExpectedTimes:
         self._label = ""  # of the message that was taken last
         self._outcome, self._forecast = NO_REQUEST, Future()
 
-    async def on_sent(self, message: UInt8MultiArray) -> None:
-        """Plan by what the trainer has learned from drives, or refuse its message."""
+    async def on_sent(self, message: UInt8MultiArray | None = None) -> None:
+        """Plan by what drives taught, or refuse the trainer's message, or the file that is set."""
         try:
             is_new = await self._worker.call(self.load, message)
         except Exception as error:
@@ -356,11 +361,13 @@ class ExpectedTimes:
             self._forecast.add_done_callback(lambda _: self._report.change())
         return self._forecast.result() or {}
 
-    def load(self, message: UInt8MultiArray) -> bool:
-        """Use what the trainer sent, and say if it is new; an error leaves what was used before."""
-        if (label := label_of(message)) == self._label:
+    def load(self, message: UInt8MultiArray | None = None) -> bool:
+        """Use a message or the file that is set; say if it is new; an error changes nothing."""
+        file, label = self._node.value("experience"), label_of(message) if message else ""
+        if label == self._label if message else not file:
             return False
-        newer = Experience.from_bytes(bytes_of("experience", message))
+        data = bytes_of("experience", message) if message else b""
+        newer = Experience.from_bytes(data) if message else Experience.load(file)
         if self._experience is not None:
             newer.take_over(self._experience)
         self._experience, self._label = newer, label
