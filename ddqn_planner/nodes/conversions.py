@@ -177,8 +177,7 @@ def bytes_message(kind: str, data: bytes) -> UInt8MultiArray:
     """Make the message that carries bytes of a kind, a model or an experience."""
     label = LABEL.format(kind, hashlib.sha256(data).hexdigest())
     dimension = MultiArrayDimension(label=label, size=len(data), stride=len(data))
-    layout = MultiArrayLayout(dim=[dimension])
-    return UInt8MultiArray(layout=layout, data=array.array("B", data))
+    return UInt8MultiArray(layout=MultiArrayLayout(dim=[dimension]), data=array.array("B", data))
 
 
 def label_of(message: UInt8MultiArray) -> str:

@@ -8,18 +8,14 @@ from pathlib import Path as FilePath
 from typing import Any, NamedTuple
 
 import numpy as np
-from action_msgs.msg import GoalStatus, GoalStatusArray
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
-from geometry_msgs.msg import PoseStamped
 from nav_msgs.msg import OccupancyGrid, Path
 from numpy.typing import NDArray
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
-from rclpy.qos import DurabilityPolicy, QoSProfile
-from rclpy.time import Time
 from rclpy.timer import Timer
 from std_msgs.msg import String, UInt8MultiArray
 
-from ddqn_planner.experience.drives import RECORD, DriveEnd, DriveFolder, DriveRecorder, read_drives
+from ddqn_planner.experience.drives import RECORD, DriveEnd, DriveFolder, read_drives
 from ddqn_planner.experience.posterior import cells_of
 from ddqn_planner.experience.prior import Prior, map_features
 from ddqn_planner.grid import GridMap
@@ -29,14 +25,14 @@ from ddqn_planner.nodes.conversions import (
     occupancy_message,
     path_bytes,
 )
+from ddqn_planner.nodes.driving_robot import DrivingRobot
 from ddqn_planner.nodes.parameters import OF_MAPS
-from ddqn_planner.nodes.poses import Frames, listen
+from ddqn_planner.nodes.poses import Frames
 from ddqn_planner.nodes.report import Refusals
 from ddqn_planner.nodes.runtime import LATCHED, STEADY, BaseNode, Parameters, Worker
 from ddqn_planner.resources import with_remedy
 
 Float64 = NDArray[np.float64]
-NAVIGATION = "navigate_to_pose/_action/status"
 RETRY_PERIOD = 5.0  # seconds after which what failed for a full disk is tried again
 SLOWEST = 10.0  # the slowness that ``~/slowness`` shows as 100
 WRONG = np.log(1.5)  # of the nominal speed, compared with the learned one
@@ -139,23 +135,15 @@ class Driving:
     """Records the drives of a node's robot in its ``output_folder``, and learns from them."""
 
     def __init__(self, node: LearningNode, worker: Worker) -> None:
-        self._node, self._worker, self._frames = node, worker, Frames(node)
-        self._recorder = DriveRecorder(self._on_drive)
+        self._node, self._worker = node, worker
         self._folder: DriveFolder | None = None
         self._last_drive, self._is_disk_full = "", False
-        self._aborted: set[bytes] | None = None
         self._shown: GridMap | None = None
         self._saved = node.create_publisher(String, "~/experience_saved", LATCHED)
         self._published = node.create_publisher(UInt8MultiArray, "~/experience", LATCHED)
         self._slowness = node.create_publisher(OccupancyGrid, "~/slowness", LATCHED)
-        node.create_subscription(PoseStamped, "goal_pose", self._on_goal, 10)
-        latched = QoSProfile(depth=10, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-        node.create_subscription(GoalStatusArray, NAVIGATION, self._on_status, latched)
-        if node.value("pose_source") == "tf":
-            self._frames.listen()
-            node.create_timer(0.05, self._look_up, clock=STEADY)  # every pose counts
-        else:
-            listen(node, "odom", 1000, node.refusals, self._on_pose)
+        frames, names = Frames(node), node.value("robots") or [""]
+        self._robots = [DrivingRobot(node, frames, name, self._on_drive) for name in names]
         node.create_timer(1.0, self._publish_diagnostics, clock=STEADY)
         node.create_timer(0.1, self._show_slowness, clock=STEADY)
         node.create_timer(RETRY_PERIOD, self._retry, clock=STEADY)
@@ -169,57 +157,9 @@ class Driving:
     def _recording(self) -> DriveFolder | None:
         return self._folder if self._node.state == "recording" else None
 
-    def _on_pose(self, pose: PoseStamped) -> None:
-        """Record a pose; a ValueError refuses it."""
-        seconds = Time.from_msg(pose.header.stamp).nanoseconds / 1e9
-        position = self._position("the robot's pose", pose)
-        if position is None:
-            return
-        if not seconds:
-            raise ValueError("the robot's pose has no stamp; give it the time")
-        if self._recording():
-            self._recorder.add(seconds, *position)
-
-    def _look_up(self) -> None:
-        place = self._node.map
-        if place is None:
-            return
-        with self._node.refusals.taking("tf", often=True):
-            try:
-                pose = self._frames.origin_of(self._node.value("robot_frame"), place.frame)
-            except ValueError as error:
-                raise ValueError(f"{error}; publish a transform, or set robot_frame") from None
-            self._on_pose(pose)
-
-    def _on_goal(self, goal: PoseStamped) -> None:
-        with self._node.refusals.taking("goal_pose"):
-            position = self._position("the goal", goal)
-            if position is not None:
-                self._recorder.set_goal(*position)
-
-    def _position(self, name: str, pose: PoseStamped) -> tuple[float, float] | None:
-        """Return a pose's position in the frame of the map, if there is one, or a ValueError."""
-        if self._node.map is None:
-            return None
-        frame = self._node.map.frame
-        self._frames.check(name, pose, frame)
-        position = self._frames.to_map(name, pose, frame).pose.position
-        return position.x, position.y
-
-    def _on_status(self, message: GoalStatusArray) -> None:
-        """End the drive where the robot's navigation gives up."""
-        aborted = {
-            bytes(status.goal_info.goal_id.uuid)
-            for status in message.status_list
-            if status.status == GoalStatus.STATUS_ABORTED
-        }
-        # What failed before the node listened failed elsewhere.
-        before = aborted if self._aborted is None else self._aborted
-        self._aborted = before | aborted
-        if self._recording() and aborted - before:
-            self._recorder.abort()
-
-    def _on_drive(self, outcome: DriveEnd, seconds: Float64, positions: Float64) -> None:
+    def _on_drive(
+        self, by_robot: str, outcome: DriveEnd, seconds: Float64, positions: Float64
+    ) -> None:
         place, folder = self._node.map, self._recording()
         if place is None or folder is None:
             return
@@ -228,7 +168,7 @@ class Driving:
         except Exception as error:  # the node must survive
             self._node.refusals.refuse("output_folder", explained(error))
             return
-        self._last_drive = f"{drive.number}: {drive.metres:.1f} m, {outcome.value}"
+        self._last_drive = f"{drive.number}{by_robot}: {drive.metres:.1f} m, {outcome.value}"
         self._node.get_logger().info(f"drive {self._last_drive}")
         if self._node.replaying is None:
             self._draw(place, positions)
@@ -310,7 +250,8 @@ class Driving:
             self._node.refusals.refuse("output_folder", explained(error))
             return False, explained(error)
         self._folder, self._node.state = folder, "recording"
-        self._recorder.forget()
+        for robot in self._robots:
+            robot.recorder.forget()
         self._node.refusals.accept("output_folder")
         self._node.get_logger().info(f"recording drives in {folder.folder}")
         self._save(folder)
@@ -322,7 +263,8 @@ class Driving:
         if folder is None:
             self._node.state = "stopped"
             return True, f"no drives were being recorded{replay}"
-        self._recorder.end(DriveEnd.STOPPED)
+        for robot in self._robots:
+            robot.recorder.end(DriveEnd.STOPPED)
         self._save(folder)
         if folder.save_error:
             return False, folder.save_error
@@ -360,8 +302,9 @@ class Driving:
         return self._node.replay(file, drives, partial(self._draw, place), "drive on")
 
     def _publish_diagnostics(self) -> None:
-        robot, goal = map(_place_of, (self._recorder.position, self._recorder.goal))
-        values = {"robot": robot, "goal": goal, "last drive": self._last_drive}
+        values = {"last drive": self._last_drive}
+        for robot in self._robots:
+            values |= robot.told()
         if self._folder is not None:
             values |= {
                 "drives": str(self._folder.drives),
@@ -391,10 +334,6 @@ def prior_of(grid: GridMap, table: Float64, older: Prior | None, seed: int) -> P
     x, y = cells[seen].T
     weight, log = table[seen, :2].T
     return train_prior(map_features(grid)[y, x], log / weight, weight, older, seed)
-
-
-def _place_of(position: tuple[float, float] | None) -> str:
-    return "unknown" if position is None else f"({position[0]:.6g}, {position[1]:.6g})"
 
 
 def explained(error: Exception) -> str:

@@ -18,11 +18,10 @@ from std_msgs.msg import Header, UInt8MultiArray
 
 from ddqn_planner.experience import Experience
 from ddqn_planner.grid import GridMap
-from ddqn_planner.grid.copies import WHOLE
 from ddqn_planner.nodes.conversions import along, bytes_of, label_of, path_bytes, path_message
 from ddqn_planner.nodes.display import FieldDisplay
 from ddqn_planner.nodes.lifecycle import ManagedNode
-from ddqn_planner.nodes.map_source import MapSource
+from ddqn_planner.nodes.map_source import MapSource, is_like
 from ddqn_planner.nodes.nav2 import GivenUp, serve_nav2
 from ddqn_planner.nodes.parameters import PLANNER_PARAMETERS
 from ddqn_planner.nodes.poses import Frames, StartSource, check_source
@@ -32,7 +31,6 @@ from ddqn_planner.nodes.runtime import LATCHED, STEADY, Worker, spin_until_shutd
 
 LOOK_PERIOD, IDLE_PERIOD = 0.1, 1.0  # seconds until the next look: after a change, and else
 NO_MAP = GridMap(np.zeros((1, 1), dtype=np.bool_))
-CHANGED_SHARE = 0.02  # of cells: with more, experience is spread anew over the map, slowly
 
 
 # The executor's one thread holds all state. What takes long runs in workers: to load the model,
@@ -89,7 +87,8 @@ class PlannerNode(ManagedNode):
         self._times = ExpectedTimes(self, self._report, self._map_worker, self._replan.trigger)
         group = MutuallyExclusiveCallbackGroup()  # it waits for a worker
         self._read_experience = self.create_guard_condition(self._times.on_sent, group)
-        self._read_experience.trigger()
+        if self._settings.experience:
+            self._read_experience.trigger()
         inputs = self._map, self._times.on, self._start, self._frames, self._model
         self._requests = Requests(self._settings, *inputs, self._worker, self._look_soon)
         self.create_subscription(PoseStamped, "goal_pose", lambda goal: self._on_goals([goal]), 10)
@@ -157,7 +156,7 @@ class PlannerNode(ManagedNode):
         changed = {parameter.name for parameter in parameters} & self._declared.keys()
         if not (changed and self._is_configured):  # subscriptions declare parameters, too
             return
-        if "experience" in changed:
+        if "experience" in changed and settings.experience:
             self._read_experience.trigger()
         if "model" in changed:
             self._model.use(*self._candidate)
@@ -335,13 +334,8 @@ class ExpectedTimes:
 
     async def on_sent(self, message: UInt8MultiArray | None = None) -> None:
         """Plan by what drives taught, or refuse the trainer's message, or the file that is set."""
-        try:
-            is_new = await self._worker.call(self.load, message)
-        except Exception as error:
-            self._report.refuse("experience", str(error) or repr(error))
-            return
-        self._report.accept("experience")
-        if is_new:
+        with self._report.taking("experience"):
+            await self._worker.call(self.load, message)
             self._grid = None
             self._on_change()
 
@@ -361,23 +355,23 @@ class ExpectedTimes:
             self._forecast.add_done_callback(lambda _: self._report.change())
         return self._forecast.result() or {}
 
-    def load(self, message: UInt8MultiArray | None = None) -> bool:
-        """Use a message or the file that is set; say if it is new; an error changes nothing."""
-        file, label = self._node.value("experience"), label_of(message) if message else ""
-        if label == self._label if message else not file:
-            return False
+    def load(self, message: UInt8MultiArray | None = None) -> None:
+        """Use a message, if it is new, or the file that is set; an error changes nothing."""
+        label = label_of(message) if message else ""
+        if message and label == self._label:
+            return
         data = bytes_of("experience", message) if message else b""
+        file = self._node.value("experience")
         newer = Experience.from_bytes(data) if message else Experience.load(file)
         if self._experience is not None:
             newer.take_over(self._experience)
         self._experience, self._label = newer, label
-        return True
 
     def apply(self, grid: GridMap) -> GridMap:
         """Return a map whose moves cost expected time, or the same map before a drive."""
         if self._experience is None or not self._experience.evidence.places:
             return grid
-        if self._spread_on is None or not _is_like(grid, self._spread_on):
+        if self._spread_on is None or not is_like(grid, self._spread_on):
             self._spread_on = grid
         (before, timed), share = self._applied, self._node.value("exploration")
         of_places = self._experience.apply(self._spread_on, share)
@@ -395,22 +389,12 @@ class ExpectedTimes:
         now, request, path = self._spread_on, outcome.request, outcome.plan.path
         told: dict[str, str] = {}
         is_timed = request is not None and request.grid.slowness is not None and len(path) > 0
-        if self._experience and now and request and is_timed and _is_like(request.grid, now):
+        if self._experience and now and request and is_timed and is_like(request.grid, now):
             with suppress(MemoryError):
                 seconds, low, high = self._experience.expected_time(now, path)
                 told["expected time (s)"] = f"{seconds:.1f}"
                 told["expected time, 90 % interval (s)"] = f"{low:.1f} to {high:.1f}"
         return told
-
-
-def _is_like(grid: GridMap, other: GridMap) -> bool:
-    mine, its = ((each.occupancy.shape, each.resolution, each.origin) for each in (grid, other))
-    if mine != its:
-        return False
-    boxes = grid.patches_since(other)
-    boxes = [WHOLE] if boxes is None else boxes
-    changed = sum(np.count_nonzero(grid.occupancy[box] != other.occupancy[box]) for box in boxes)
-    return bool(changed <= CHANGED_SHARE * grid.occupancy.size)
 
 
 def _path(make: Callable[..., Any], outcome: Outcome, header: Header) -> Any:

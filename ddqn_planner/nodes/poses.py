@@ -167,7 +167,7 @@ def listen(
     node: BaseNode, topic: str, depth: int, refusals: Refusals, take: Callable[[PoseStamped], None]
 ) -> Subscription:
     """Hand each pose of `odom` or `initialpose` to a function, whose ValueError refuses it."""
-    is_odometry = topic == "odom"
+    is_odometry = topic.endswith("odom")
     kind = Odometry if is_odometry else PoseWithCovarianceStamped
 
     def on_message(message: Odometry | PoseWithCovarianceStamped) -> None:

@@ -171,18 +171,12 @@ class ModelSource:
 
     def take(self, message: UInt8MultiArray) -> bool:
         """Use a model that the trainer sent; return whether it is a new one."""
-        label = label_of(message)
-        is_new = label != self._label
-        try:
-            if is_new:
+        label, before = label_of(message), self._label
+        with self.report.taking("trainer/model"):
+            if label != before:
                 self.use(Planner(*model_of(bytes_of("model", message))), "trainer/model")
                 self._label = label
-        except Exception as error:
-            reason = str(error) or repr(error)
-            self.report.refuse("model", f"the trainer's model was refused: {reason}")
-            return False
-        self.report.accept("model")
-        return is_new
+        return self._label != before
 
     def on_reload(self) -> tuple[bool, str]:
         """Load the file of the model again."""

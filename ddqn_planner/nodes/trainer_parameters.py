@@ -45,6 +45,9 @@ TRAINER_PARAMETERS: Final = {
     "robot_frame": Declared(
         "base_link", "Driving: the robot's frame, for the pose_source tf", "not empty"
     ),
+    "robots": Declared(
+        [""], "Driving: namespaces of robots it learns from; '': its own", read_only=True
+    ),
     "nominal_speed": Declared(
         0.5, "Driving: m/s where nothing slows the robot down", (0.01, 100.0)
     ),

@@ -26,7 +26,7 @@ from std_msgs.msg import Header, UInt8MultiArray
 from ddqn_planner import Experience, GridMap
 from ddqn_planner.experience.drives import read_drives
 from ddqn_planner.nodes.conversions import bytes_message, bytes_of, quaternion
-from ddqn_planner.nodes.driving import NAVIGATION
+from ddqn_planner.nodes.driving_robot import NAVIGATION
 from ddqn_planner.nodes.runtime import LATCHED
 
 VALUES = np.zeros((40, 100), dtype=np.int8)
@@ -50,15 +50,16 @@ def pose_at(x: float, y: float) -> Pose:
 class Site(User):
     """The user of a trainer that learns from driving: it says where the robot is."""
 
-    def __init__(self, client: Client, folder: FilePath) -> None:
+    def __init__(self, client: Client, folder: FilePath, robot: str = "") -> None:
         super().__init__(client, "driving", "trainer/experience_saved")
         self.folder, self.now, self.at = folder, time.monotonic(), LOWER[0]
+        self.robot, self.space = f" {robot}".rstrip(), f"{robot}/".lstrip("/")
         self.experience = client.subscribe(UInt8MultiArray, "trainer/experience", LATCHED)
         self.slowness = client.subscribe(OccupancyGrid, "trainer/slowness", LATCHED)
 
     def begin(self, listeners: int = 1) -> None:
         """Send the map, and wait until the trainer has it and records."""
-        self.client.publisher(Odometry, "odom", BEST_EFFORT)
+        self.client.publisher(Odometry, f"{self.space}odom", BEST_EFFORT)
         self.client.wait_for_discovery("trainer")
         self.client.publish("map", map_message(VALUES, GRID), LATCHED, listeners)
         self.state(state="recording", message="^recording$")
@@ -70,13 +71,13 @@ class Site(User):
         return message
 
     def send(self, message: Odometry) -> None:
-        self.client.publish("odom", message, BEST_EFFORT)
+        self.client.publish(f"{self.space}odom", message, BEST_EFFORT)
 
     def send_goal(self, x: float, y: float) -> None:
         """Send a goal, and wait until the trainer has it: poses may overtake it."""
         goal = PoseStamped(header=Header(frame_id="map"), pose=pose_at(x, y))
-        self.client.publish("goal_pose", goal)
-        self.state(goal=re.escape(f"({x:.6g}, {y:.6g})"))
+        self.client.publish(f"{self.space}goal_pose", goal)
+        self.state(**{f"goal{self.robot}": re.escape(f"({x:.6g}, {y:.6g})")})
 
     def move(self, points: list[tuple[float, float]], speed: float) -> None:
         """Drive along a line in steps of 0.1 m."""
@@ -88,7 +89,7 @@ class Site(User):
                 self.now += distance / steps / speed
                 self.send(self.odometry(*there))
             self.at = point
-        self.state(robot=re.escape("({:.6g}, {:.6g})".format(*self.at)))
+        self.state(**{f"robot{self.robot}": re.escape("({:.6g}, {:.6g})".format(*self.at))})
 
     def drive(
         self, points: list[tuple[float, float]], speed: float, then: Any = lambda: None
@@ -132,9 +133,13 @@ class Site(User):
 
 @pytest.fixture(scope="module")
 def run_trainer(run_node: Any) -> Callable[..., Any]:
-    def run(folder: FilePath, namespace: str, exit_code: int = 0) -> Any:
+    def run(
+        folder: FilePath, namespace: str, exit_code: int = 0, robots: Any = ("",), **modules: str
+    ) -> Any:
         given = {"learn_from": "driving", "output_folder": str(folder), "replay_period": 0.002}
-        return run_node("trainer_node", given, (), namespace, exit_code, sitecustomize=SOON)
+        modules |= {"sitecustomize": SOON}
+        parameters = {**given, "robots": [*robots]}
+        return run_node("trainer_node", parameters, (), namespace, exit_code, **modules)
 
     return run
 
@@ -172,6 +177,10 @@ def site(trainer: Any, client: Client, tmp_path: FilePath) -> Iterator[Site]:
 
 def is_below(path: Path) -> bool:
     return len(path.poses) > 0 and all(it.pose.position.y < 5 for it in path.poses)
+
+
+def is_above(path: Path) -> bool:
+    return len(path.poses) > 0 and all(it.pose.position.y > 4 for it in path.poses)
 
 
 def test_the_robot_goes_round_what_was_slow_until_it_forgets(planner: Any, site: Site) -> None:
@@ -301,6 +310,43 @@ def test_nothing_is_lost_while_the_disk_is_full(site: Site, trainer: Any) -> Non
     assert len(re.findall(warning, trainer.log)) == 1
     assert float(site.state()["learned speed (m/s)"]) == pytest.approx(0.1, abs=0.03)
     assert site.outcomes == ["arrived", "new_goal"]
+
+
+def test_a_fleet_teaches_one_trainer_and_each_robot_plans_by_all(
+    run_trainer: Any, run_node: Any, make_client: Any, tmp_path: FilePath
+) -> None:
+    """On a computer without torch; the planners are on others, which do not have its folder."""
+    names, folder = ["one", "two", "three"], tmp_path / "drives"
+    missing = "No module named 'torch'"
+    torch = f'raise ModuleNotFoundError("{missing}", name="torch")'
+    sites = [Site(make_client("/fleet"), folder, name) for name in names]
+    with run_trainer(
+        folder, "/fleet", exit_code=-signal.SIGKILL, robots=names, torch=torch
+    ) as node:
+        ways = [*zip(sites, (UPPER, UPPER[::-1], LOWER), (0.5, 0.5, 0.1), strict=True)]
+        for site, way, speed in ways:
+            site.at = way[0]
+            site.begin()
+            site.send_goal(*way[-1])
+            site.move(way[1:2], speed)  # all are under way at once
+        for site, way, speed in ways:
+            site.drive(way[2:], speed)
+        sites[0].send_goal(9.0, 9.0)
+        sites[0].move([UPPER[2]], 0.5)  # it is under way when the trainer is killed
+        node.wait_for_log("drive 3 by three: 23")
+        node.wait_for_log("the map foretells nothing: training needs another library")
+        folder.rename(tmp_path / "moved")
+        remaps = [f"{topic}:=/fleet/{topic}" for topic in ("map", "trainer/experience")]
+        parameters = {"follow_trainer": True, "move_rule": "robot_safe"}
+        with run_node("planner_node", parameters, remaps, "/fleet/one"):
+            robot = make_client("/fleet/one")
+            ends = pose(GRID, START), pose(GRID, GOAL)
+            wait_for("the other way", lambda: is_above(robot.get_plan(*ends)))
+            node.stop(signal.SIGKILL)
+            assert is_above(robot.get_plan(*ends))
+    sites[0].folder = tmp_path / "moved"
+    assert sites[0].outcomes == ["arrived"] * 3
+    assert node.log.count("the map foretells nothing") == 1
 
 
 def test_a_kill_loses_nothing_but_the_drive_under_way_and_an_end_not_even_that(

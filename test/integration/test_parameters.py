@@ -1,6 +1,7 @@
 """The nodes and RViz as docs/nodes.md tells of them; no request for parameters ends a node."""
 
 import importlib.util
+import json
 import re
 import sys
 from collections.abc import Callable, Iterator
@@ -17,14 +18,14 @@ from client import Client, wait_for
 from rcl_interfaces import srv
 from rcl_interfaces.msg import Parameter, ParameterDescriptor, ParameterValue
 
-from ddqn_planner.nodes.driving import NAVIGATION
+from ddqn_planner.nodes.driving_robot import NAVIGATION
 from ddqn_planner.nodes.poses import has_tf
 
 ROOT = Path(__file__).resolve().parents[2]
 DOCS = (ROOT / "docs" / "nodes.md").read_text(encoding="utf-8")
 NODES = ["map_server", "planner", "trainer"]
 NAMES = ["", "no_such", "a.b", "/", "ü" * 300]
-TYPES = ["not set", "bool", "integer", "double", "string"]  # as rcl_interfaces numbers them
+TYPES = {1: "bool", 2: "integer", 3: "double", 4: "string", 9: "string_array"}
 OF_EVERY_NODE = {"/rosout", "/parameter_events", "use_sim_time", "start_type_description_service"}
 OF_DRIVING = {"~/experience", "~/experience_saved", "~/slowness", "~/forget", "odom", NAVIGATION}
 """What the trainer has only where it learns from driving."""
@@ -105,7 +106,7 @@ def test_each_parameter_is_documented_as_it_is(running: Running) -> None:
     for entry in described.descriptors:
         assert entry.description
         value = running.client.get_parameter(running.name, entry.name)
-        text = str(value).lower() if isinstance(value, bool) else repr(value).replace("''", "")
+        text = repr(value).replace("''", "") if isinstance(value, str) else json.dumps(value)
         found[entry.name] = [TYPES[entry.type], f"`{text}`", range_of(entry)]
     if running.name == "planner":
         found["follow_trainer"][1] = "`false`"

@@ -142,7 +142,7 @@ def test_follows_the_trainer(robot: Robot, whole_model: FilePath, tmp_path: File
     ):
         robot.clear()
         robot.client.publish("trainer/model", bad, LATCHED)
-        robot.wait_for_reason(f"trainer's model was refused: .*{reason}", its)
+        robot.wait_for_reason(f"trainer/model refused: .*{reason}", its)
     # Of the same model again nothing is told but that it is right.
     robot.node.forget_log()
     robot.clear()
