@@ -308,7 +308,8 @@ def learn(parser: argparse.ArgumentParser, arguments: Sequence[str]) -> int:
         first = options.drives[0]
         out = options.out or (first if first.is_dir() else first.parent) / EXPERIENCE
         write_atomically(out, experience.to_bytes())  # not `save`, which adds to an older file
-    slowness, known = experience.slowness(grid), experience.uncertainty(grid) < 0.9
+    slowness, unsure = experience.slowness(grid), experience.uncertainty(grid)
+    known = unsure < 0.9 * unsure.max()
     seconds = sum(float(np.ptp(drive.seconds)) for drive in drives)
     print(f"{len(drives)} drives, {sum(d.metres for d in drives):.0f} m, {seconds / 60:.1f} min")
     free = known & ~grid.occupancy

@@ -43,7 +43,7 @@ DRAWN: Final = (EXPERIENCE, SHORTEST, "Gaussian process", "Markov field")
 SMOOTHED: Final = 10  # missions that a point of the curve averages
 DOOR_WAITS, DOOR_DRIVES = (10, 30, 60), 40
 ZONE_NOISES, ZONE_RATES, ZONE_WIDTHS = (0.02, 0.035, 0.05), (10, 50), (0.2, 0.35, 0.5)
-VISITED: Final = 0.95  # uncertainty of a cell below which the robot was near
+VISITED: Final = 0.8  # share of the uncertainty of unknown cells below which the robot was near
 
 
 def compared(options: Options) -> Sections:
@@ -185,7 +185,8 @@ def pictures(options: Options, missions: int = 50) -> Sections:
     shortest, best = world.routes(planner(), start, goal, 0).values()
     learned = planner().plan(experience.apply(grid), start, goal, RULE).cells
     routes = {"shortest": shortest, "learned": learned, "best possible": best}
-    visited = experience.uncertainty(grid) < VISITED
+    unsure = experience.uncertainty(grid)
+    visited = unsure < VISITED * unsure.max()
     known = np.where(visited, experience.slowness(grid), np.nan)
     panels = {
         "what nobody told the robot: true slowness": (truth, routes),

@@ -35,10 +35,12 @@ PART, SURPRISE = 8, 3.5  # so many places have changed if they are off by more d
 PART_NOISE = 0.12  # of their mean log slowness, as each way through a place is another
 DRIVE_NOISE = 0.05  # standard deviation of what the log slowness of so many places has in common
 CHANGED, CHANGED_AROUND = 0.1, 1.5  # share of evidence that is left within so many metres
-CHANGED_FAR = 0.4  # and elsewhere: where one place changed, others did
+CHANGED_FAR = 0.25  # and elsewhere: where one place changed, others did
 
 WAIT_PASSAGES = 0.2  # passages without a wait that are assumed
-NEAREST_WAITS = 4.0  # the place of a wait is the mean of about the last so many
+# Robots that wait on both sides of a door wait at one place, between them: waits within so many
+# widths of the robot are of one place, which is the mean of about the last so many.
+SAME_WAIT, NEAREST_WAITS = 1.25, 4.0
 MOST_PASSAGES = 20.0  # a wait is the mean of about the last so many
 
 FADING_STEPS = 4  # so often per half-life all evidence fades: few changes of a map come at once
@@ -130,6 +132,7 @@ class Evidence:
     def _changed(self, position: Float64, surprise: Float64, weight: Float64) -> NDArray[np.int64]:
         """Return the visits that were other than all before; most of that is forgotten."""
         changed, known = [np.zeros(0, np.int64)], np.flatnonzero(weight >= KNOWN)
+        near = np.zeros(len(self.table), dtype=np.bool_)
         for part in np.array_split(known, max(1, len(known) // PART)):
             if len(part) < PART / 2:
                 continue
@@ -137,8 +140,9 @@ class Evidence:
             if abs(surprise[part].mean()) > SURPRISE * math.sqrt(variance):
                 changed.append(part)
                 away = self.table[:, 3:5] - position[part].mean(axis=0)
-                near = np.hypot(*away.T) <= CHANGED_AROUND + len(part) * self.side / 2
-                self.table[:, :2] *= np.where(near, CHANGED, CHANGED_FAR)[:, None]
+                near |= np.hypot(*away.T) <= CHANGED_AROUND + len(part) * self.side / 2
+        if near.any():
+            self.table[:, :2] *= np.where(near, CHANGED, CHANGED_FAR)[:, None]
         return np.concatenate(changed)
 
     def _add_waits(self, visits: Visits, waits: Float64) -> None:
@@ -151,15 +155,20 @@ class Evidence:
             surplus = np.maximum(self.waits[:, 1:2] / MOST_PASSAGES, 1)
             self.waits[:, :2] /= surplus
         for x, y, seconds in waits.tolist():
-            distance = np.hypot(self.waits[:, 2] - x, self.waits[:, 3] - y)
-            nearest = int(distance.argmin()) if len(distance) else -1
-            if nearest < 0 or distance[nearest] > 1.25 * self.wait_radius:
-                self.waits = np.vstack([self.waits, [seconds, 1.0, x, y]])
-            else:  # robots from both sides wait before one door: it is between them
-                self.waits[nearest, 0] += seconds
-                self.waits[nearest, 2:] += (
-                    np.array([x, y]) - self.waits[nearest, 2:]
-                ) / NEAREST_WAITS
+            row = self._wait_at(x, y)
+            self.waits[row, 0] += seconds
+            self.waits[row, 1] = max(self.waits[row, 1], 1)
+
+    def _wait_at(self, x: float, y: float) -> int:
+        """Return the row of a place where robots wait; a new place gets one."""
+        away = np.array([x, y]) - self.waits[:, 2:]
+        distance = np.hypot(*away.T)
+        if not (distance <= SAME_WAIT * self.wait_radius).any():
+            self.waits = np.vstack([self.waits, [0.0, 0.0, x, y]])
+            return len(self.waits) - 1
+        row = int(distance.argmin())
+        self.waits[row, 2:] += away[row] / NEAREST_WAITS
+        return row
 
     def add_failure(self, x: float, y: float, seconds: float) -> None:
         """Add a failure, which costs as much as a wait of so many seconds."""
@@ -279,9 +288,7 @@ class Evidence:
             np.add.at(self.table[:, :2], rows, other.faded())
             self.table[places, :2] /= np.maximum(self.table[places, :1] / MOST, 1)
         for seconds, passages, x, y in other.waits.tolist():
-            self._add_waits(NO_VISITS, np.array([[x, y, seconds]]))
-            nearest = np.hypot(self.waits[:, 2] - x, self.waits[:, 3] - y).argmin()
-            self.waits[nearest, 1] += passages - 1.0
+            self.waits[self._wait_at(x, y), :2] += seconds, passages
         self.noise_sums = tuple(np.add(self.noise_sums, other.noise_sums).tolist())
         self.errors = [*self.errors, *other.errors][-KEPT:]
         self.driven += other.driven
@@ -311,14 +318,8 @@ class Evidence:
         if not all(array.dtype.kind in "if" and np.isfinite(array).all() for array in given):
             raise ValueError("it holds what is no finite number")
         shapes = table.shape, waits.shape, driven.shape, noise.shape, errors.shape
-        fitting = (
-            (len(table), len(COLUMNS)),
-            (len(waits), len(WAIT_COLUMNS)),
-            (),
-            (2,),
-            (errors.size,),
-        )
-        if shapes != fitting:
+        rows = (len(table), len(COLUMNS)), (len(waits), len(WAIT_COLUMNS))
+        if shapes != (*rows, (), (2,), (errors.size,)):
             raise ValueError(f"its arrays do not fit: they have the shapes {shapes}")
         squares = np.floor(table[:, 3:5] / self.side).tolist()
         places = {(int(x), int(y)): row for row, (x, y) in enumerate(squares)}

@@ -226,9 +226,9 @@ class Experience:
         return posterior.over(posterior.slowness, 1.0)
 
     def uncertainty(self, grid: GridMap) -> Float32:
-        """Return (H, W) float32: the standard deviation of the log slowness."""
+        """Return (H, W) float32: the standard deviation of the log slowness, most if unknown."""
         posterior = self.evidence.over(grid)
-        return posterior.over(np.sqrt(posterior.variance), 0.0)
+        return posterior.over(np.sqrt(posterior.variance), math.sqrt(posterior.common[1]))
 
     def expected_time(self, grid: GridMap, cells: Cells) -> ExpectedTime:
         """Return the time that a path takes, with an interval of 90 %.
