@@ -14,14 +14,14 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ddqn_planner.experience.experience import Experience
+from ddqn_planner.experience.experience import EXPERIENCE, Experience
 from ddqn_planner.files import Appender, WorkFolder, differences
 from ddqn_planner.grid import GridMap
 
 Float64 = NDArray[np.float64]
 Sample = tuple[float, float, float]  # seconds, and x and y in metres in the frame of the map
 
-RECORD, EXPERIENCE = "episodes.csv", "experience.npz"
+RECORD = "episodes.csv"
 LOCK = "driving.lock"  # a folder with this file belongs to a robot's drives
 
 HEADER = b"episode,outcome,start_time,seconds,metres,samples\r\n"
@@ -184,25 +184,29 @@ class DriveRecorder:
 class DriveFolder(WorkFolder):
     """Records a robot's drives in a folder, and keeps there what they teach."""
 
-    def __init__(self, folder: str | Path, nominal_speed: float, robot_width: float) -> None:
+    # A new folder begins with the older experience, if there is one.
+    def __init__(
+        self, folder: str | Path, nominal_speed: float, robot_width: float, older: str = ""
+    ) -> None:
         after = "the recording continues, and saving is tried again"
         super().__init__(Path(folder), [LOCK], "drives", "records", after)
         self.record_path, self.experience_path = self.folder / RECORD, self.folder / EXPERIENCE
         self.experience = Experience(nominal_speed, robot_width)
         with self.opening() as files:
             self.drives = _cut_incomplete_row(self.record_path)
-            if self.experience_path.exists():
-                saved, now = Experience.load(self.experience_path), self.experience
+            is_new = not self.experience_path.exists()
+            if source := older if is_new else self.experience_path:
+                saved, now = Experience.load(source), self.experience
                 names = "nominal_speed", "robot_width"
                 values = ({name: getattr(one, name) for name in names} for one in (saved, now))
                 if changed := differences(*values):
                     raise ValueError(
-                        f"{folder} holds experience with {changed}; give those values, another "
+                        f"{source} holds experience with {changed}; give those values, another "
                         f"folder, or learn anew: ddqn-planner learn {folder} --map MAP"
                     )
                 self.experience = saved
-            elif self.drives:  # learn anew
-                for drive in read_drives(self.record_path):
+            if is_new:  # learn anew from the drives that it holds
+                for drive in read_drives(self.record_path) if self.drives else ():
                     drive.teach(self.experience)
             self._record = files.enter_context(closing(Appender(self.record_path)))
             if self.record_path.stat().st_size == 0:

@@ -28,6 +28,7 @@ Step: TypeAlias = Callable[[Evidence], None]
 
 VERSION = 2
 PRIOR = "prior_"  # before the names of its arrays in a file
+EXPERIENCE = "experience.npz"  # the name of the file in a folder
 OPTIONS = ("nominal_speed", "robot_width", "half_life", "max_pause")
 
 LATEST = 1e12  # seconds of a clock: a pose of a later time is not believed
@@ -323,7 +324,7 @@ class Experience:
 
     @classmethod
     def load(cls, path: str | Path) -> Experience:
-        """Load from a file.
+        """Load from a file, or from ``experience.npz`` in a folder.
 
         Raises
         ------
@@ -331,6 +332,7 @@ class Experience:
             If the file is missing, broken, or no experience.
         """
         path = as_path(path)
+        path = path / EXPERIENCE if path.is_dir() else path
         try:
             content = path.read_bytes()
             experience = cls.from_bytes(content)

@@ -242,7 +242,7 @@ class Driving:
     def _on_start(self) -> tuple[bool, str]:
         if self._recording():
             return False, "drives are being recorded already; call ~/stop first"
-        names = "nominal_speed", "robot_width"
+        names = "nominal_speed", "robot_width", "experience"
         try:
             folder = DriveFolder(self._node.folder, *map(self._node.value, names))
         except Exception as error:  # the node must survive

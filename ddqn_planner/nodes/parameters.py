@@ -63,6 +63,7 @@ PLANNER_PARAMETERS: Final = {
         CACHE_BYTES, "Bytes for kept Q fields; the last two always stay", (0, 2**40)
     ),
     "planner_id": Declared("GridBased", "What Nav2's requests may name, or leave empty"),
+    "experience": Declared("", "What drives taught: a file or folder; '': none"),
     "exploration": Declared(
         0.1, "Share by which a path may be expected to take longer, to learn from it", (0, 10)
     ),

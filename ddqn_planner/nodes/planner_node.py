@@ -18,11 +18,10 @@ from std_msgs.msg import Header, UInt8MultiArray
 
 from ddqn_planner.experience import Experience
 from ddqn_planner.grid import GridMap
-from ddqn_planner.grid.copies import WHOLE
 from ddqn_planner.nodes.conversions import along, bytes_of, label_of, path_bytes, path_message
 from ddqn_planner.nodes.display import FieldDisplay
 from ddqn_planner.nodes.lifecycle import ManagedNode
-from ddqn_planner.nodes.map_source import MapSource
+from ddqn_planner.nodes.map_source import MapSource, is_like
 from ddqn_planner.nodes.nav2 import GivenUp, serve_nav2
 from ddqn_planner.nodes.parameters import PLANNER_PARAMETERS
 from ddqn_planner.nodes.poses import Frames, StartSource, check_source
@@ -32,7 +31,6 @@ from ddqn_planner.nodes.runtime import LATCHED, STEADY, Worker, spin_until_shutd
 
 LOOK_PERIOD, IDLE_PERIOD = 0.1, 1.0  # seconds until the next look: after a change, and else
 NO_MAP = GridMap(np.zeros((1, 1), dtype=np.bool_))
-CHANGED_SHARE = 0.02  # of cells: with more, experience is spread anew over the map, slowly
 
 
 # The executor's one thread holds all state. What takes long runs in workers: to load the model,
@@ -87,12 +85,16 @@ class PlannerNode(ManagedNode):
             self, self._frames, self._report, lambda: self._map.frame, self._on_start
         )
         self._times = ExpectedTimes(self, self._report, self._map_worker, self._replan.trigger)
+        group = MutuallyExclusiveCallbackGroup()  # it waits for a worker
+        self._read_experience = self.create_guard_condition(self._times.on_sent, group)
+        if self._settings.experience:
+            self._read_experience.trigger()
         inputs = self._map, self._times.on, self._start, self._frames, self._model
         self._requests = Requests(self._settings, *inputs, self._worker, self._look_soon)
         self.create_subscription(PoseStamped, "goal_pose", lambda goal: self._on_goals([goal]), 10)
         self.create_subscription(PoseArray, "goal_poses", self._on_goal_poses, 10)
         if self._settings.follow_trainer:
-            sent, group = UInt8MultiArray, MutuallyExclusiveCallbackGroup()  # it awaits a worker
+            sent = UInt8MultiArray
             self.create_subscription(sent, "trainer/model", self._on_model, LATCHED)
             topic, on_sent = "trainer/experience", self._times.on_sent
             self.create_subscription(sent, topic, on_sent, LATCHED, callback_group=group)
@@ -154,6 +156,8 @@ class PlannerNode(ManagedNode):
         changed = {parameter.name for parameter in parameters} & self._declared.keys()
         if not (changed and self._is_configured):  # subscriptions declare parameters, too
             return
+        if "experience" in changed and settings.experience:
+            self._read_experience.trigger()
         if "model" in changed:
             self._model.use(*self._candidate)
         if self._model.planner is not None:
@@ -328,8 +332,8 @@ class ExpectedTimes:
         self._label = ""  # of the message that was taken last
         self._outcome, self._forecast = NO_REQUEST, Future()
 
-    async def on_sent(self, message: UInt8MultiArray) -> None:
-        """Plan by what the trainer has learned from drives, or refuse its message."""
+    async def on_sent(self, message: UInt8MultiArray | None = None) -> None:
+        """Plan by what drives taught, or refuse the trainer's message, or the file that is set."""
         with self._report.taking("experience"):
             await self._worker.call(self.load, message)
             self._grid = None
@@ -351,11 +355,14 @@ class ExpectedTimes:
             self._forecast.add_done_callback(lambda _: self._report.change())
         return self._forecast.result() or {}
 
-    def load(self, message: UInt8MultiArray) -> None:
-        """Use what the trainer sent, if it is new; an error leaves what was used before."""
-        if (label := label_of(message)) == self._label:
+    def load(self, message: UInt8MultiArray | None = None) -> None:
+        """Use a message, if it is new, or the file that is set; an error changes nothing."""
+        label = label_of(message) if message else ""
+        if message and label == self._label:
             return
-        newer = Experience.from_bytes(bytes_of("experience", message))
+        data = bytes_of("experience", message) if message else b""
+        file = self._node.value("experience")
+        newer = Experience.from_bytes(data) if message else Experience.load(file)
         if self._experience is not None:
             newer.take_over(self._experience)
         self._experience, self._label = newer, label
@@ -364,7 +371,7 @@ class ExpectedTimes:
         """Return a map whose moves cost expected time, or the same map before a drive."""
         if self._experience is None or not self._experience.evidence.places:
             return grid
-        if self._spread_on is None or not _is_like(grid, self._spread_on):
+        if self._spread_on is None or not is_like(grid, self._spread_on):
             self._spread_on = grid
         (before, timed), share = self._applied, self._node.value("exploration")
         of_places = self._experience.apply(self._spread_on, share)
@@ -382,22 +389,12 @@ class ExpectedTimes:
         now, request, path = self._spread_on, outcome.request, outcome.plan.path
         told: dict[str, str] = {}
         is_timed = request is not None and request.grid.slowness is not None and len(path) > 0
-        if self._experience and now and request and is_timed and _is_like(request.grid, now):
+        if self._experience and now and request and is_timed and is_like(request.grid, now):
             with suppress(MemoryError):
                 seconds, low, high = self._experience.expected_time(now, path)
                 told["expected time (s)"] = f"{seconds:.1f}"
                 told["expected time, 90 % interval (s)"] = f"{low:.1f} to {high:.1f}"
         return told
-
-
-def _is_like(grid: GridMap, other: GridMap) -> bool:
-    mine, its = ((each.occupancy.shape, each.resolution, each.origin) for each in (grid, other))
-    if mine != its:
-        return False
-    boxes = grid.patches_since(other)
-    boxes = [WHOLE] if boxes is None else boxes
-    changed = sum(np.count_nonzero(grid.occupancy[box] != other.occupancy[box]) for box in boxes)
-    return bool(changed <= CHANGED_SHARE * grid.occupancy.size)
 
 
 def _path(make: Callable[..., Any], outcome: Outcome, header: Header) -> Any:

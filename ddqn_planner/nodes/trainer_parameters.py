@@ -52,6 +52,7 @@ TRAINER_PARAMETERS: Final = {
         0.5, "Driving: m/s where nothing slows the robot down", (0.01, 100.0)
     ),
     "robot_width": Declared(0.5, "Driving: metres; places are squares of half of it", (0.05, 10.0)),
+    "experience": Declared("", "Driving: older experience with which a new folder begins"),
     **HYPER_PARAMETERS,
 }
 """The next ``~/start`` uses those that changed."""

@@ -250,6 +250,20 @@ def test_experience_that_is_broken_or_of_another_robot_is_refused(tmp_path: Path
     assert path.read_bytes() == before
 
 
+def test_a_new_folder_begins_with_older_experience_which_stays(tmp_path: Path) -> None:
+    older = record(tmp_path / "older", 3).folder
+    before = (older / "experience.npz").read_bytes()
+    for drives in (1, 2):
+        folder = DriveFolder(tmp_path / "new", 0.5, 0.5, str(older))
+        folder.add(DriveEnd.ARRIVED, *SLOW, GRID)
+        folder.close()
+        driven = Experience.load(tmp_path / "new").evidence.driven
+        assert driven == pytest.approx((3 + drives) * np.ptp(SLOW[0]), rel=0.05)
+    assert (older / "experience.npz").read_bytes() == before
+    with pytest.raises(ValueError, match=r"older holds experience with nominal_speed 0.5 \(now 2"):
+        DriveFolder(tmp_path / "other", 2.0, 0.5, str(older))
+
+
 def test_a_folder_is_locked_and_keeps_forgotten_experience(tmp_path: Path) -> None:
     folder = opened(tmp_path)
     with pytest.raises(FolderError, match="another process records in"):

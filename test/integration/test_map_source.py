@@ -8,6 +8,7 @@ import threading
 import time
 from collections.abc import Callable, Coroutine, Iterator
 from dataclasses import replace
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -461,6 +462,19 @@ def test_drives_are_planned_with_at_once(
     finished(learned.on_sent(UInt8MultiArray(data=driven.data)))
     assert len(changes) == 2
     assert "label ''" in source.report.refused["experience"]
+
+
+def test_a_file_is_planned_with_or_refused(
+    source: Source, driven: UInt8MultiArray, tmp_path: Path
+) -> None:
+    learned, file = new_times(source), tmp_path / "experience.npz"
+    file.write_bytes(bytes(driven.data))
+    source.node.set_parameters([Parameter("experience", value=str(tmp_path))])
+    for problem in ("", "cannot be read"):
+        finished(learned.on_sent())
+        assert problem in source.report.refused.get("experience", "")
+        assert finished(learned.on(GRID)).slowness[20, 60] > 2
+        file.write_bytes(bytes(driven.data)[:-9])
 
 
 def finished(coroutine: Coroutine[None, None, Any]) -> Any:
