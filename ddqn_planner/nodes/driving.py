@@ -16,8 +16,7 @@ from rclpy.timer import Timer
 from std_msgs.msg import String, UInt8MultiArray
 
 from ddqn_planner.experience.drives import RECORD, DriveEnd, DriveFolder, read_drives
-from ddqn_planner.experience.posterior import cells_of
-from ddqn_planner.experience.prior import Prior, map_features
+from ddqn_planner.experience.prior import Prior
 from ddqn_planner.grid import GridMap
 from ddqn_planner.nodes.conversions import (
     bytes_message,
@@ -36,7 +35,7 @@ Float64 = NDArray[np.float64]
 RETRY_PERIOD = 5.0  # seconds after which what failed for a full disk is tried again
 SLOWEST = 10.0  # the slowness that ``~/slowness`` shows as 100
 WRONG = np.log(1.5)  # of the nominal speed, compared with the learned one
-FEWEST_PLACES, MORE_PLACES = 32, 1.1  # from so many on; then times as many as the last time
+MORE_PLACES = 1.1  # times as many as the last time
 NOT_RECORDING = "no drives are being recorded; call ~/start first"
 NO_MAP = "no map was received yet; start a map server"
 
@@ -197,7 +196,7 @@ class Driving:
             return
         evidence, before = folder.experience.evidence, self._places_of_prior
         known = len(evidence.places)
-        if known < FEWEST_PLACES or before <= known < MORE_PLACES * before:
+        if not known or before <= known < MORE_PLACES * before:
             return
         self._places_of_prior = known
         given = place.grid, evidence.table.copy(), evidence.prior, self._node.value("seed")
@@ -320,20 +319,14 @@ class Driving:
         self._on_stop()
 
 
-def prior_of(grid: GridMap, table: Float64, older: Prior | None, seed: int) -> Prior | None:
-    """Train a prior on the places of `Evidence.table` that are on the map; None if few are."""
+def prior_of(*given: Any) -> Prior | None:
+    """Import torch in the worker, and train the prior."""
     import torch
 
-    from ddqn_planner.training.prior import train_prior
+    from ddqn_planner.training import prior
 
     torch.set_num_threads(1)  # as in `import_training`
-    cells, free = cells_of(table[:, 3:5], grid)
-    seen = free & (table[:, 0] > 0)
-    if seen.sum() < FEWEST_PLACES:
-        return older
-    x, y = cells[seen].T
-    weight, log = table[seen, :2].T
-    return train_prior(map_features(grid)[y, x], log / weight, weight, older, seed)
+    return prior.prior_of(*given)
 
 
 def explained(error: Exception) -> str:

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from torch import nn
 
-from ddqn_planner.experience.posterior import nearest_free
+from ddqn_planner.experience.posterior import cells_of
 from ddqn_planner.experience.prior import FEATURES, UNUSUAL, Float32, Prior, map_features
 from ddqn_planner.grid import GridMap
 
@@ -26,15 +26,23 @@ DOUBT = 2.0  # what is foretold must be so many standard errors from nothing to 
 REPLAYED = 512  # places of older maps, and as many of this one, are kept to learn from again
 
 
+FEWEST_PLACES = 32  # from which a prior is learned
+
+
+def prior_of(grid: GridMap, table: Any, older: Prior | None, seed: int = 0) -> Prior | None:
+    """Train a prior on places of `Evidence.table` that are free on a map; few change nothing."""
+    cells, free = cells_of(table[:, 3:5], grid)
+    seen = free & (table[:, 0] > 0)
+    if seen.sum() < FEWEST_PLACES:
+        return older
+    x, y = cells[seen].T
+    weight, log = table[seen, :2].T
+    return train_prior(map_features(grid)[y, x], log / weight, weight, older, seed)
+
+
 def teach_prior(experience: Experience, grid: GridMap, seed: int = 0) -> None:
-    """Let the places of experience that lie on a map teach its prior, unless there are none."""
-    evidence = experience.evidence
-    weight, log, _, *position, _ = evidence.table[evidence.table[:, 0] > 0].T
-    x, y = nearest_free(np.transpose(position), grid, evidence.side).T
-    on = x >= 0
-    if on.any():
-        places = map_features(grid)[y[on], x[on]], (log / weight)[on], weight[on]
-        experience.prior = train_prior(*places, older=experience.prior, seed=seed)
+    """Let the places of experience that lie on a map teach its prior."""
+    experience.prior = prior_of(grid, experience.evidence.table, experience.prior, seed)
 
 
 def train_prior(
