@@ -258,7 +258,13 @@ def test_files_of_a_bag_without_metadata_come_in_the_order_of_their_numbers(
             {"robot_frame": "robot2/base_link"},
         ),
         (
-            [*tree("", 1.0, "/robot1/tf"), *tree("", 9.0, "/robot2/tf")],
+            [
+                sent
+                for both in zip(
+                    tree("", 9.0, "/robot2/tf"), tree("", 1.0, "/robot1/tf"), strict=True
+                )
+                for sent in both
+            ],
             "/robot1/tf of base_link, /robot2/tf of base_link",
             {"topic": "/robot2/tf"},
         ),
