@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 from client import RULE, Client, generated_map, plan_request, wait_for
+from diagnostic_msgs.msg import DiagnosticArray
 from nav_msgs.msg import OccupancyGrid
 from nav_msgs.msg import Path as PathMessage
 from nav_msgs.srv import GetPlan, LoadMap
@@ -43,6 +44,7 @@ class Faults(Client):
     def __init__(self, folder: Path) -> None:
         super().__init__()
         self.maps = self.subscribe(OccupancyGrid, "map", LATCHED, keep=1)
+        self.diagnostics = self.subscribe(DiagnosticArray, "/diagnostics", keep=20)
         self.plans = self.subscribe(PathMessage, "plan", LATCHED, keep=1)
         self.random = np.random.default_rng(0)
         self.map_path, self.training_folder = folder / "map.yaml", folder / "training"
@@ -177,10 +179,15 @@ class Faults(Client):
         message = self.trigger("start")
         # The planner that follows the trainer loads a model of its.
         self.set_parameters("/training/planner", model="any_map")
+        self.diagnostics.clear()
         self.trigger("save")
-        wait_for("model", lambda: self.get_parameter("/training/planner", "model") == str(model))
+        wait_for("model", lambda: self.diagnostics.find(_has_model_of_trainer))
         tally["temporaries"] = len([*temporaries()])
         tally["restarts"] += f"from step {steps} " in message
+
+
+def _has_model_of_trainer(array: DiagnosticArray) -> bool:
+    return any(value.value == "trainer/model" for value in array.status[0].values)
 
 
 def main(arguments: Sequence[str]) -> int:
