@@ -21,7 +21,7 @@ Int64 = NDArray[np.int64]
 
 CORRELATION = 1.0  # metres: how far the slowness of a place tells of that of others
 STEP = 0.02  # slowness is told in steps of this share: fields need no repair for less
-ACCURACY = 1e-3  # of the log slowness: places whose neighbours changed less stay as they are
+ACCURACY = 5e-4  # of the log slowness: places whose neighbours changed less stay as they are
 OVER_RELAXATION = 1.4  # of the solver: neighbours agree sooner
 # By how much what all places have in common must change before they are told: noise and variance
 # by a share, logarithms as they are.
