@@ -37,7 +37,7 @@ DRIVE_NOISE = 0.05  # standard deviation of what the log slowness of so many pla
 CHANGED, CHANGED_AROUND = 0.1, 1.5  # share of evidence that is left within so many metres
 CHANGED_FAR = 0.25  # and elsewhere: where one place changed, others did
 
-WAIT_PASSAGES = 0.2  # passages without a wait that are assumed
+WAIT_PASSAGES = 0.1  # passages without a wait that are assumed
 # Robots that wait on both sides of a door wait at one place, between them: waits within so many
 # widths of the robot are of one place, which is the mean of about the last so many.
 SAME_WAIT, NEAREST_WAITS = 1.25, 4.0
