@@ -107,9 +107,10 @@ class Posterior:
         sums = np.column_stack([weight, log + weight * noise / 2]) / noise
         seen = np.zeros_like(self.right)
         np.add.at(seen, places[inside], sums)
-        # A lattice whose neighbours pull with strength 1 has the variance ln(32 / kappa) / 4 pi.
+        # A lattice whose links have strength 1 has about the variance ln(32 / kappa) / 4 pi;
+        # 1 is added for cells of many metres, where that would be negative.
         kappa = (self.spacing / CORRELATION) ** 2
-        seen *= variance / (math.log(32 / kappa) / (4 * math.pi))
+        seen *= variance / (math.log1p(32 / kappa) / (4 * math.pi))
         right = np.column_stack([seen[:, 1] - seen[:, 0] * self.expected, seen[:, 0]])
         diagonal = kappa + self.degree + seen[:, 0]
         if not np.array_equal(right, self.right):

@@ -79,7 +79,7 @@ def test_the_posterior_is_that_of_a_gaussian_markov_random_field(seed: int) -> N
             precision[[i, j], [i, j]] += 1
             precision[[i, j], [j, i]] -= 1
     precision += np.eye(len(precision)) * 0.25**2
-    precision *= np.log(32 / 0.25**2) / (4 * np.pi) / variance
+    precision *= np.log1p(32 / 0.25**2) / (4 * np.pi) / variance
     table, seen = experience.evidence.table, np.zeros(len(precision))
     cells = np.floor(table[:, 3:5] / 0.25).astype(int)
     for (x, y), (weight, log, *_) in zip(cells, table, strict=True):
@@ -154,6 +154,14 @@ def test_a_map_in_another_resolution_and_frame_keeps_it(resolution: float, yaw: 
     for share in (0.2, 0.5, 0.8):
         x, y = 4 + 7 * share, 4 + 2 * share
         assert at(grid, experience.slowness(grid), x, y) == pytest.approx(3, rel=0.1)
+
+
+@pytest.mark.parametrize("resolution", [5.0, 6.0, 20.0])
+def test_cells_of_many_metres_learn_too(resolution: float) -> None:
+    grid = GridMap(np.zeros((4, 4), dtype=bool), resolution)
+    slowness = driven(*[straight((1, 1), (4, 1), 4)] * 3).slowness(grid)
+    assert np.isfinite(slowness).all()
+    assert slowness[0, 0] == pytest.approx(4, rel=0.1)
 
 
 def test_evidence_fades_with_driven_time() -> None:
