@@ -21,7 +21,7 @@ Int64 = NDArray[np.int64]
 
 CORRELATION = 1.0  # metres: how far the slowness of a place tells of that of others
 STEP = 0.02  # slowness is told in steps of this share: fields need no repair for less
-ACCURACY = 5e-4  # of the log slowness: places whose neighbours changed less stay as they are
+ACCURACY = 0.01  # of the log slowness: no place is farther from the solution of its equations
 OVER_RELAXATION = 1.4  # of the solver: neighbours agree sooner
 # By how much what all places have in common must change before they are told: noise and variance
 # by a share, logarithms as they are.
@@ -120,12 +120,15 @@ class Posterior:
     def _solve(self, diagonal: Float64, right: Float64) -> None:
         self.right = right
         residual = right + self.links @ self.solution - diagonal[:, None] * self.solution
-        wrong = np.abs(residual).max(axis=1) > ACCURACY * diagonal
+        # The equations map the same error everywhere to its product with these, and greater errors
+        # to greater residuals: residuals up to that product prove that no error is greater.
+        most = ACCURACY * (diagonal - self.degree)
+        wrong = np.abs(residual).max(axis=1) > most
         queue = np.zeros(len(diagonal), dtype=np.int64)
         begins = np.flatnonzero(wrong)
         queue[: len(begins)] = begins
         links = self.links.indptr, self.links.indices, self.links.data
-        _relax(*links, diagonal, right, self.solution, queue, len(begins), wrong)
+        _relax(*links, diagonal, most, residual, self.solution, queue, len(begins), wrong)
 
     def _wait(self, evidence: Evidence) -> None:
         """Spread the expected waits over the places around, so that a crossing costs each once."""
@@ -232,30 +235,33 @@ def _label(occupancy: Any, size: int, place: Any, stack: Any) -> int:
 
 @in_place
 def _relax(*arrays: Any) -> None:
-    """Solve (diagonal - links) x = right for both columns, from where it is wrong, by its queue."""
-    begins, to, weights, diagonal, right, x, queue, waiting, waits = arrays
+    """Solve (diagonal - links) x = right for both columns, from where residuals are too great."""
+    begins, to, weights, diagonal, most, residual, x, queue, waiting, waits = arrays
     first = 0
     while waiting > 0:
         place = queue[first]
         first = first + 1 if first + 1 < queue.size else 0
         waiting -= 1
         waits[place] = False
-        one, other = right[place, 0], right[place, 1]
-        for link in range(begins[place], begins[place + 1]):
-            one += weights[link] * x[to[link], 0]
-            other += weights[link] * x[to[link], 1]
-        one = OVER_RELAXATION * (one / diagonal[place] - x[place, 0])
-        other = OVER_RELAXATION * (other / diagonal[place] - x[place, 1])
+        if max(abs(residual[place, 0]), abs(residual[place, 1])) <= most[place]:
+            continue
+        one = OVER_RELAXATION * residual[place, 0] / diagonal[place]
+        other = OVER_RELAXATION * residual[place, 1] / diagonal[place]
         x[place, 0] += one
         x[place, 1] += other
-        if max(abs(one), abs(other)) <= ACCURACY:
-            continue
-        for link in range(begins[place], begins[place + 1]):
-            if not waits[to[link]]:
-                waits[to[link]] = True
-                end = first + waiting
-                queue[end if end < queue.size else end - queue.size] = to[link]
-                waiting += 1
+        residual[place, 0] -= one * diagonal[place]
+        residual[place, 1] -= other * diagonal[place]
+        for link in range(begins[place], begins[place + 1] + 1):
+            near = to[link] if link < begins[place + 1] else place
+            if near != place:
+                residual[near, 0] += weights[link] * one
+                residual[near, 1] += weights[link] * other
+            if waits[near] or max(abs(residual[near, 0]), abs(residual[near, 1])) <= most[near]:
+                continue
+            waits[near] = True
+            end = first + waiting
+            queue[end if end < queue.size else end - queue.size] = near
+            waiting += 1
 
 
 def cells_of(position: Float64, grid: GridMap) -> tuple[Int64, NDArray[np.bool_]]:
