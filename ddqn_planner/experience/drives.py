@@ -14,7 +14,13 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ddqn_planner.experience.experience import EXPERIENCE, Experience
+from ddqn_planner.experience.experience import (
+    EXPERIENCE,
+    LATEST,
+    STAND_DISTANCE,
+    Experience,
+    averaged,
+)
 from ddqn_planner.files import Appender, WorkFolder, differences
 from ddqn_planner.grid import GridMap
 
@@ -28,10 +34,7 @@ HEADER = b"episode,outcome,start_time,seconds,metres,samples\r\n"
 NUMBER = rb"-?\d{1,18}(?:\.\d{1,9})?"
 ROW = re.compile(rb"(\d{1,18}),([a-z_]{1,20}),(%b),%b,%b,((?:%b:%b:%b ?)+)\r\n" % ((NUMBER,) * 6))
 
-FARTHEST = 1e12  # metres, and seconds: a pose beyond is none
-
 SAMPLE_DISTANCE, SAMPLE_PERIOD = 0.05, 0.5  # from the last kept pose, metres or seconds
-STAND_DISTANCE = 0.1  # metres: a robot that stays within stands, as localisation is not exact
 STAND_PERIOD = 2.0  # seconds after which a robot that stands at its goal has arrived
 ARRIVAL_DISTANCE = 0.5  # metres from the goal
 PAUSE = 120.0  # seconds: a robot that stands for longer waits for no door and no crowd
@@ -63,12 +66,8 @@ class Drive(NamedTuple):
     @property
     def metres(self) -> float:
         """How far the robot drove; noise of its poses counts as little as standing does."""
-        window = np.floor((self.seconds - self.seconds[0]) / WINDOW)
-        begins = np.flatnonzero(np.append(True, np.diff(window) != 0))
-        counts = np.diff(begins, append=len(window))[:, None]
-        means = (np.add.reduceat(self.positions, begins) / counts).tolist()
         total, at = 0.0, self.positions[0].tolist()
-        for mean in means:
+        for mean in averaged(self.seconds, self.positions, WINDOW)[1].tolist():
             if math.dist(at, mean) >= STEP:
                 total, at = total + math.dist(at, mean), mean
         return total + math.dist(at, self.positions[-1].tolist())
@@ -98,7 +97,7 @@ def read_drives(path: str | Path) -> Iterator[Drive]:
             if row and row[2] in ends:
                 text = [sample.split(b":") for sample in row[4].split()]
                 samples = np.array(text, dtype=np.float64)
-                if np.abs(samples).max() <= FARTHEST:
+                if np.abs(samples).max() <= LATEST:
                     seconds = samples[:, 0] + float(row[3])
                     yield Drive(int(row[1]), ends[row[2]], seconds, samples[:, 1:])
 
@@ -125,26 +124,24 @@ class DriveRecorder:
     def add(self, seconds: float, x: float, y: float) -> None:
         """Take a pose of the robot, in order; a ValueError if its numbers name no place."""
         sample = seconds, x, y
-        if not all(abs(value) <= FARTHEST for value in sample):  # NaN fails too
+        if not all(abs(value) < LATEST for value in sample):  # NaN fails too
             raise ValueError(
-                f"the robot is at {(x, y)} at {seconds} s; give finite numbers up to {FARTHEST:g}"
+                f"the robot is at {(x, y)} at {seconds} s; give finite numbers up to {LATEST:g}"
             )
         if self._last is not None and seconds < self._last[0] - JUMP:
             self.end(DriveEnd.STOPPED)
             self.forget()
-        stands = self._stands
-        if stands is None or math.dist(stands[1:], sample[1:]) > STAND_DISTANCE:
+        if self._stands is None or math.dist(self._stands[1:], sample[1:]) > STAND_DISTANCE:
             if self._last is not None and not self._samples:
                 self._samples.append(self._last)
-            stands = self._stands = sample
+            self._stands = sample
         self._last = sample
         if not self._samples:
             return
-        before = self._samples[-1]
-        moved = math.dist(before[1:], sample[1:]) >= SAMPLE_DISTANCE
-        if moved or abs(seconds - before[0]) >= SAMPLE_PERIOD:
+        time, *at = self._samples[-1]
+        if math.dist(at, (x, y)) >= SAMPLE_DISTANCE or abs(seconds - time) >= SAMPLE_PERIOD:
             self._samples.append(sample)
-        stood = abs(seconds - stands[0])
+        stood = abs(seconds - self._stands[0])
         if stood >= STAND_PERIOD and self._is_at_goal:
             self.end(DriveEnd.ARRIVED)
         elif stood >= PAUSE:
@@ -172,12 +169,10 @@ class DriveRecorder:
 
     def end(self, outcome: DriveEnd) -> None:
         """End the drive, if there is one; the robot has to drive off again."""
-        samples, self._samples = np.array(self._samples), []
+        samples, self._samples = np.array(self._samples).reshape(-1, 3), []
         self._stands = self._last
-        if len(samples) == 0:
-            return
-        extent = np.hypot(*(samples[:, 1:] - samples[0, 1:]).T).max()
-        if extent >= SHORTEST or outcome is DriveEnd.ABORTED:
+        extent = np.hypot(*(samples[:, 1:] - samples[:1, 1:]).T).max(initial=0)
+        if extent >= SHORTEST or (outcome is DriveEnd.ABORTED and len(samples)):
             self._on_drive(outcome, samples[:, 0], samples[:, 1:])
 
 
@@ -196,17 +191,16 @@ class DriveFolder(WorkFolder):
             self.drives = _cut_incomplete_row(self.record_path)
             is_new = not self.experience_path.exists()
             if source := older if is_new else self.experience_path:
-                saved, now = Experience.load(source), self.experience
-                names = "nominal_speed", "robot_width"
-                values = ({name: getattr(one, name) for name in names} for one in (saved, now))
-                if changed := differences(*values):
+                saved = Experience.load(source)
+                now = {"nominal_speed": nominal_speed, "robot_width": robot_width}
+                if changed := differences({name: saved.options[name] for name in now}, now):
                     raise ValueError(
                         f"{source} holds experience with {changed}; give those values, another "
                         f"folder, or learn anew: ddqn-planner learn {folder} --map MAP"
                     )
                 self.experience = saved
-            if is_new:  # learn anew from the drives that it holds
-                for drive in read_drives(self.record_path) if self.drives else ():
+            if is_new and self.drives:  # learn anew from the drives that it holds
+                for drive in read_drives(self.record_path):
                     drive.teach(self.experience)
             self._record = files.enter_context(closing(Appender(self.record_path)))
             if self.record_path.stat().st_size == 0:
@@ -241,10 +235,9 @@ class DriveFolder(WorkFolder):
 
 def _cut_incomplete_row(path: Path) -> int:
     """Cut what a crash left of a row at the end; return the number of the last drive, or 0."""
-    if not path.exists():
-        return 0
-    complete, end, rest = path.read_bytes().rpartition(b"\r\n")
-    if rest:
-        os.truncate(path, len(complete + end))
-    rows = map(ROW.fullmatch, (complete + end).splitlines(keepends=True))
+    content = path.read_bytes() if path.exists() else b""
+    complete = content[: content.rfind(b"\n") + 1]
+    if complete != content:
+        os.truncate(path, len(complete))
+    rows = map(ROW.fullmatch, complete.splitlines(keepends=True))
     return max((int(row[1]) for row in rows if row), default=0)

@@ -10,6 +10,7 @@ from functools import partial
 from itertools import pairwise
 from pathlib import Path
 from typing import Any, NamedTuple, TypeAlias
+from zipfile import is_zipfile
 from zlib import crc32
 
 import numpy as np
@@ -93,6 +94,11 @@ class Experience:
         self._synchronised: tuple[Path | None, int] = None, 0
         self._news: list[Step] = []
 
+    @property
+    def options(self) -> dict[str, float]:
+        """The parameters by their names."""
+        return {name: getattr(self, name) for name in OPTIONS}
+
     def forget(self) -> None:
         """Forget all."""
         self._learn(Evidence.forget)
@@ -126,26 +132,24 @@ class Experience:
 
     def _measured(self, time: Float64, position: Float64) -> tuple[Visits, Float64] | None:
         """Return the visits and the waits of a drive, if there are any."""
-        side = self.evidence.side
-        speed, window = self.learned_speed, WINDOW / self.learned_speed
-        seconds, at = _averaged(time, position, window)
+        speed, side = self.learned_speed, self.evidence.side
+        seconds, at = averaged(time, position, WINDOW / speed)
         speeds = np.hypot(*np.diff(at, axis=0).T) / np.abs(np.diff(seconds))
         usual = float(np.median(speeds)) if len(speeds) else 0.0
-        limits = 3 * max(self.nominal_speed, speed, usual), self.max_pause
-        steps: list[tuple[float, float, float, float]] = []
-        waits: list[Float64] = []
-        for part in _believed_parts(time, position, *limits):
-            seconds, at = _averaged(time[part], position[part], window)
-            stands = _stands(seconds, at, STAND / speed)
-            for first, last in stands:
-                if (stood := seconds[last] - seconds[first]) <= self.max_pause:
-                    waits.append(np.array([*at[first : last + 1].mean(axis=0), stood]))
-                seconds[last:] -= stood
-                seconds[first:last] = seconds[first]
-            steps += _steps(seconds.tolist(), at.tolist(), max(side, WINDOW) / 2, *limits)
-        if not steps:
+        max_speed, steps, waits = 3 * max(self.nominal_speed, speed, usual), [], []
+        for part in _believed_parts(time, position, max_speed, self.max_pause):
+            seconds, at = averaged(time[part], position[part], WINDOW / speed)
+            # Standing at the ends of a drive is no waiting on the way.
+            for first, end in list(pairwise(_ways(at, STAND_DISTANCE)))[1:]:
+                if (stood := seconds[end - 1] - seconds[first]) >= STAND / speed:
+                    if stood <= self.max_pause:
+                        waits.append([*at[first:end].mean(axis=0), stood])
+                    seconds[end - 1 :] -= stood
+                    seconds[first : end - 1] = seconds[first]
+            steps.append(_steps(seconds, at, max(side, WINDOW) / 2, max_speed))
+        rows = np.concatenate([np.zeros((0, 4)), *steps])
+        if not len(rows):
             return None
-        rows = np.array(steps)
         square = np.floor(rows[:, :2] / side)
         begins = np.flatnonzero(np.append(True, (np.diff(square, axis=0) != 0).any(axis=1)))
         rows[:, :2] *= rows[:, 3:]
@@ -163,7 +167,8 @@ class Experience:
 
     def _learn(self, step: Step) -> None:
         step(self.evidence)
-        self._news.append(step)
+        if self._synchronised[0] is not None:
+            self._news.append(step)
 
     def merge(self, other: Experience) -> None:
         """Learn all that another experience of a robot of this kind learned; merge each once.
@@ -173,8 +178,7 @@ class Experience:
         ValueError
             If the two have other parameters.
         """
-        mine, its = ({name: getattr(each, name) for name in OPTIONS} for each in (self, other))
-        if changed := differences(its, mine):
+        if changed := differences(other.options, self.options):
             raise ValueError(f"the other experience has {changed}; give those of one kind of robot")
         self._learn(partial(Evidence.merge, other=copy.deepcopy(other.evidence)))
 
@@ -291,7 +295,7 @@ class Experience:
         content = io.BytesIO()
         prior = self.prior.arrays() if self.prior is not None else {}
         arrays: dict[str, Any] = {PRIOR + name: array for name, array in prior.items()}
-        options = [getattr(self, name) for name in OPTIONS]
+        options = list(self.options.values())
         np.savez(content, version=VERSION, options=options, **self.evidence.arrays(), **arrays)
         return content.getvalue()
 
@@ -305,6 +309,8 @@ class Experience:
             If the bytes are broken, or no experience.
         """
         try:
+            if not is_zipfile(io.BytesIO(data)):
+                raise ValueError("it is no .npz file")
             with np.load(io.BytesIO(data), allow_pickle=False) as file:
                 arrays = dict(file)  # whose checksums are checked
             version = int(arrays["version"])
@@ -349,64 +355,49 @@ def _believed_parts(
     time: Float64, position: Float64, max_speed: float, max_pause: float
 ) -> Iterator[slice]:
     """Yield the parts of a drive without jumps; after a far one, none until the pose is back."""
-    elapsed = np.diff(time)
-    distance = np.hypot(*np.diff(position, axis=0).T)
-    reach = max_speed * np.maximum(elapsed, 0) + CORRECTION
-    broken = (elapsed <= 0) | (elapsed > max_pause) | (distance > reach)
-    is_far = distance > np.minimum(reach, MEMORY * max_speed) + RELOCATION
-    lost_at: int | None = None
-    for first, end in pairwise([0, *(np.flatnonzero(broken) + 1).tolist(), len(time)]):
-        if first and is_far[first - 1]:
-            if lost_at is None:
-                lost_at = first - 1
-            else:
-                way = max_speed * np.clip(time[first] - time[lost_at], 0, MEMORY) + RELOCATION
-                lost_at = lost_at if math.dist(position[first], position[lost_at]) > way else None
-        if lost_at is None and end - first > 1:
-            yield slice(first, end)
+    elapsed, last = np.diff(time), 0
+    reach = max_speed * elapsed + CORRECTION
+    far = np.hypot(*np.diff(position, axis=0).T) > reach
+    breaks = np.flatnonzero((elapsed <= 0) | (elapsed > max_pause) | far) + 1
+    for first, end in pairwise([0, *breaks.tolist(), len(time)]):
+        way = max_speed * min(max(time[first] - time[last], 0), MEMORY) + RELOCATION
+        if math.dist(position[first], position[last]) <= way:
+            last = end - 1
+            if end - first > 1:
+                yield slice(first, end)
 
 
-def _averaged(time: Float64, position: Float64, window: float) -> tuple[Float64, Float64]:
+def averaged(time: Float64, position: Float64, window: float) -> tuple[Float64, Float64]:
     """Return the means of poses over windows of time: noise of poses is no way that is driven."""
     begins = np.flatnonzero(np.diff(np.floor((time - time[:1]) / window), prepend=np.nan) != 0)
-    count = np.diff(begins, append=len(time))
-    sums = np.add.reduceat(np.column_stack([time, position]), begins)
-    means = sums / count[:, None]
-    return means[:, 0].copy(), means[:, 1:]
+    count = np.diff(begins, append=len(time))[:, None]
+    means = np.add.reduceat(np.column_stack([time, position]), begins) / count
+    return means[:, 0], means[:, 1:]
 
 
-def _stands(time: Float64, position: Float64, shortest: float) -> list[tuple[int, int]]:
-    """Return the first and the last index of each stand on the way, not at its ends."""
-    stands, first = [], 0
-    while first < len(time):
-        away = np.hypot(*(position[first:] - position[first]).T) > STAND_DISTANCE
-        last = first + (int(away.argmax()) if away.any() else len(away)) - 1
-        if time[last] - time[first] < shortest:
-            first += 1
-            continue
-        if first > 0 and last < len(time) - 1:
-            stands.append((first, last))
-        first = last + 1
-    return stands
+def _ways(position: Float64, metres: float) -> list[int]:
+    """Return the indices of the first position, and of each that is so far from the one before."""
+    kept, points = [0], position.tolist()
+    for index, at in enumerate(points):
+        if math.dist(at, points[kept[-1]]) >= metres:
+            kept.append(index)
+    return kept
 
 
-def _steps(
-    time: list[float], position: list[list[float]], step: float, max_speed: float, max_pause: float
-) -> Iterator[tuple[float, float, float, float]]:
-    """Yield x and y of the middle of each step, its seconds and its metres."""
+def _steps(time: Float64, position: Float64, step: float, max_speed: float) -> Float64:
+    """Return the middle of each step, its seconds and its metres: (N, 4)."""
     # How long the robot stands before it drives off says nothing about the place.
-    away = (index for index, at in enumerate(position) if math.dist(at, position[0]) >= step / 4)
-    start = next(away, len(time) - 1)
-    began, (from_x, from_y) = time[start], position[start]
-    for now, (x, y) in zip(time[start:], position[start:], strict=True):
-        seconds, metres = now - began, math.hypot(x - from_x, y - from_y)
-        if metres < step:
-            continue
-        if seconds <= max_pause and metres <= max_speed * seconds:
-            count = round(metres / step)  # where samples are rare, a step passes several places
-            for number in range(count):
-                share = (number + 0.5) / count
-                middle_x = from_x * (1 - share) + x * share
-                middle_y = from_y * (1 - share) + y * share
-                yield middle_x, middle_y, seconds / count, metres / count
-        began, from_x, from_y = now, x, y
+    first = (_ways(position, step / 4)[1:] or [0])[0]
+    kept = [first + index for index in _ways(position[first:], step)]
+    seconds, moved, begin = (
+        np.diff(time[kept]),
+        np.diff(position[kept], axis=0),
+        position[kept[:-1]],
+    )
+    metres = np.hypot(*moved.T)
+    # Where samples are rare, a step passes several places.
+    count = np.rint(metres / step).astype(np.int64) * (metres <= max_speed * seconds)
+    of = np.repeat(np.arange(len(count)), count)
+    share = (np.arange(len(of)) - (np.cumsum(count) - count)[of] + 0.5) / count[of]
+    middle = begin[of] + share[:, None] * moved[of]
+    return np.column_stack([middle, seconds[of] / count[of], metres[of] / count[of]])

@@ -21,7 +21,7 @@ Int64 = NDArray[np.int64]
 
 CORRELATION = 1.0  # metres: how far the slowness of a place tells of that of others
 STEP = 0.02  # slowness is told in steps of this share: fields need no repair for less
-ACCURACY = 5e-4  # of the log slowness: places whose neighbours changed less stay as they are
+ACCURACY = 0.01  # of the log slowness: no place is farther from the solution of its equations
 OVER_RELAXATION = 1.4  # of the solver: neighbours agree sooner
 # By how much what all places have in common must change before they are told: noise and variance
 # by a share, logarithms as they are.
@@ -44,9 +44,9 @@ class Posterior:
         count = len(self.middle)
         self.links = _links_of(self.place, self.size, count)
         self.degree = np.asarray(self.links.sum(axis=1), dtype=np.float64)
-        # What was seen beyond what was expected, and the share that is known: a solution of linear
-        # equations, and their right side.
-        self.solution, self.right = np.zeros((2, count, 2))
+        # The solution of linear equations, and their right side: real, what was seen beyond what is
+        # expected; imaginary, the share that is known.
+        self.solution, self.right = np.zeros((2, count), dtype=np.complex128)
         self.prior: Prior | None = None
         self.foretold = np.zeros(count, dtype=np.float32)  # by the prior
         self.expected, self.waits = np.zeros(count), np.zeros(count)
@@ -59,12 +59,12 @@ class Posterior:
     @property
     def mean(self) -> Float64:
         """The expected log slowness of driving at each place."""
-        return self.expected + self.solution[:, 0] + self.common[4] * (1 - self.known)
+        return self.expected + self.solution.real + self.common[4] * (1 - self.known)
 
     @property
     def known(self) -> Float64:
         """The share of each place's log slowness that was seen: 0 to 1."""
-        return np.clip(self.solution[:, 1], 0, 1)
+        return np.clip(self.solution.imag, 0, 1)
 
     @property
     def variance(self) -> Float64:
@@ -78,8 +78,18 @@ class Posterior:
 
     def places_at(self, position: Float64) -> Int64:
         """Return the place of each position (N, 2), the nearest within a place's side, or -1."""
-        cells = nearest_free(position, self.grid, self.spacing)
-        places: Int64 = np.where(cells[:, 0] >= 0, self.place[cells[:, 1], cells[:, 0]], -1)
+        cells, free = cells_of(position, self.grid)
+        reach, last = self.size, np.array(self.place.shape)[::-1] - 1
+        x, y = np.clip(cells, 0, last).T
+        places = np.where(free, self.place[y, x], -1).astype(np.int64)
+        for index in np.flatnonzero(~free):
+            x, y = cells[index].tolist()
+            left, bottom = max(x - reach, 0), max(y - reach, 0)
+            box = self.place[bottom : max(y + reach + 1, 0), left : max(x + reach + 1, 0)]
+            free_y, free_x = np.nonzero(box >= 0)
+            if len(free_x):
+                best = np.hypot(free_x + left - x, free_y + bottom - y).argmin()
+                places[index] = box[free_y[best], free_x[best]]
         return places
 
     def update(self, evidence: Evidence) -> None:
@@ -104,46 +114,51 @@ class Posterior:
         inside = places >= 0
         weight, log = evidence.faded()[inside].T
         # Half of the noise is added, as the mean of its exponential is more than 1.
-        sums = np.column_stack([weight, log + weight * noise / 2]) / noise
-        seen = np.zeros_like(self.right)
-        np.add.at(seen, places[inside], sums)
         # A lattice whose links have strength 1 has about the variance ln(32 / kappa) / 4 pi;
         # 1 is added for cells of many metres, where that would be negative.
         kappa = (self.spacing / CORRELATION) ** 2
-        seen *= variance / (math.log1p(32 / kappa) / (4 * math.pi))
-        right = np.column_stack([seen[:, 1] - seen[:, 0] * self.expected, seen[:, 0]])
-        diagonal = kappa + self.degree + seen[:, 0]
+        scale = variance / (math.log1p(32 / kappa) / (4 * math.pi)) / noise
+        known = scale * np.bincount(places[inside], weight, len(self.waits))
+        # Half of the noise is added, as the mean of its exponential is more than 1.
+        seen = scale * np.bincount(places[inside], log + weight * noise / 2, len(self.waits))
+        right = seen - known * self.expected + 1j * known
+        diagonal = kappa + self.degree + known
         if not np.array_equal(right, self.right):
             self._solve(diagonal, right)
         self._wait(evidence)
 
-    def _solve(self, diagonal: Float64, right: Float64) -> None:
+    def _solve(self, diagonal: Float64, right: NDArray[np.complex128]) -> None:
         self.right = right
-        residual = right + self.links @ self.solution - diagonal[:, None] * self.solution
-        wrong = np.abs(residual).max(axis=1) > ACCURACY * diagonal
-        queue = np.zeros(len(diagonal), dtype=np.int64)
-        begins = np.flatnonzero(wrong)
-        queue[: len(begins)] = begins
+        residual = right + self.links @ self.solution - diagonal * self.solution
+        # The equations map the same error everywhere to its product with these, and greater errors
+        # to greater residuals: residuals up to that product prove that no error is greater.
+        most = ACCURACY * (diagonal - self.degree)
+        wrong = np.abs(residual) > most
+        queue = np.append(np.flatnonzero(wrong), np.zeros(np.count_nonzero(~wrong), dtype=np.int64))
         links = self.links.indptr, self.links.indices, self.links.data
-        _relax(*links, diagonal, right, self.solution, queue, len(begins), wrong)
+        waiting = np.count_nonzero(wrong)
+        _relax(*links, diagonal, most, residual, self.solution, queue, waiting, wrong)
 
     def _wait(self, evidence: Evidence) -> None:
         """Spread the expected waits over the places around, so that a crossing costs each once."""
+        from scipy.ndimage import label
+
         self.waits[:] = 0
         radius = evidence.wait_radius
+        width = max(math.pi / 2 * radius, self.spacing)  # the mean way through a disc
+        reach = int(radius / self.grid.resolution)
         for position, seconds in evidence.expected_waits():
-            first = int(self.places_at(position[None])[0])
-            if first < 0:
+            at = int(self.places_at(position[None])[0])
+            if at < 0:
                 continue
-            (x, y), found, front = self.middle[first], {first}, [first]
-            while front:
-                nearby = set(self.links[front].indices.tolist()) - found
-                places = np.array(sorted(nearby), dtype=np.int64)
-                metres = np.hypot(*(self.middle[places] - (x, y)).T) * self.grid.resolution
-                front = places[metres <= radius].tolist()
-                found.update(front)
-            width = max(math.pi / 2 * radius, self.spacing)  # the mean way through a disc
-            self.waits[list(found)] += seconds * evidence.nominal_speed / width
+            x, y = self.middle[at].tolist()
+            left, bottom = max(x - reach, 0), max(y - reach, 0)
+            box = self.place[bottom : y + reach + 1, left : x + reach + 1]
+            from_y, from_x = np.ogrid[: box.shape[0], : box.shape[1]]
+            away = np.hypot(from_y + bottom - y, from_x + left - x)
+            parts = label((box >= 0) & (away <= reach))[0]
+            near = np.unique(box[parts == parts[y - bottom, x - left]])
+            self.waits[near] += seconds * evidence.nominal_speed / width
 
     def paint(self, exploration: float, fastest: float) -> NDArray[np.float32]:
         """Return (H, W) float32: the slowness over that of the fastest place, which has this log.
@@ -174,87 +189,54 @@ class Posterior:
 
 
 def _places_of(grid: GridMap, size: int) -> tuple[NDArray[np.int32], Int64]:
-    """Return the place of each cell, and a cell (x, y) of each place, near its middle."""
-    place = np.full(grid.occupancy.shape, -1, dtype=np.int32)
-    count = _label(grid.occupancy, size, place, np.zeros(size * size + 1, dtype=np.int64))
+    """Return the place of each cell, and a cell (x, y) of each place, near its block's middle."""
+    from scipy.ndimage import label
+
+    # Between the blocks are rows and columns that connect nothing.
+    rows, columns = (np.arange(cells) + np.arange(cells) // size for cells in grid.occupancy.shape)
+    apart = np.zeros((rows[-1] + 1, columns[-1] + 1), dtype=np.bool_)
+    apart[np.ix_(rows, columns)] = ~grid.occupancy
+    place = label(apart, output=np.int32)[0][np.ix_(rows, columns)] - 1
     y, x = np.nonzero(place >= 0)
-    of = place[y, x]
-    number = np.maximum(np.bincount(of, minlength=count), 1)
-    middle = [np.bincount(of, at, minlength=count) / number for at in (x, y)]
-    away = np.hypot(x - middle[0][of], y - middle[1][of])
-    order = np.lexsort((away, of))
-    first = order[np.searchsorted(of[order], np.arange(count))]
-    return place, np.column_stack([x[first], y[first]])
+    middle = (size - 1) / 2
+    order = np.argsort(np.hypot(x % size - middle, y % size - middle), kind="stable")
+    cells = np.column_stack([x, y])[order]
+    return place, cells[np.unique(place[y, x][order], return_index=True)[1]]
 
 
 def _links_of(place: NDArray[np.int32], size: int, count: int) -> Any:
     """Return how strongly places are linked, by the share of a block's side that they have."""
     from scipy.sparse import csr_array
 
-    pairs = []
+    links = csr_array((count, count))
     for one, other in ((place[:, :-1], place[:, 1:]), (place[:-1], place[1:])):
         linked = (one != other) & (one >= 0) & (other >= 0)
-        pairs += [(one[linked], other[linked]), (other[linked], one[linked])]
-    first, second = (np.concatenate(part) for part in zip(*pairs, strict=True))
-    weights = np.full(len(first), 1 / size)
-    return csr_array((weights, (first, second)), shape=(count, count))
-
-
-@in_place
-def _label(occupancy: Any, size: int, place: Any, stack: Any) -> int:
-    """Give a number to each connected part of the free cells in each block of cells."""
-    height, width = occupancy.shape
-    count = 0
-    for block in range(((height - 1) // size + 1) * ((width - 1) // size + 1)):
-        bottom = block // ((width - 1) // size + 1) * size
-        left = block % ((width - 1) // size + 1) * size
-        top, right = min(bottom + size, height), min(left + size, width)
-        for first in range((top - bottom) * (right - left)):
-            y, x = bottom + first // (right - left), left + first % (right - left)
-            if occupancy[y, x] or place[y, x] >= 0:
-                continue
-            place[y, x], stack[0], waiting = count, y * width + x, 1
-            while waiting > 0:
-                waiting -= 1
-                cell = stack[waiting]
-                for side in range(4):
-                    to_y = cell // width + (side == 0) - (side == 1)
-                    to_x = cell % width + (side == 2) - (side == 3)
-                    if to_y < bottom or to_y >= top or to_x < left or to_x >= right:
-                        continue
-                    if not occupancy[to_y, to_x] and place[to_y, to_x] < 0:
-                        place[to_y, to_x] = count
-                        stack[waiting] = to_y * width + to_x
-                        waiting += 1
-            count += 1
-    return count
+        weights = np.full(np.count_nonzero(linked), 1 / size)
+        links += csr_array((weights, (one[linked], other[linked])), shape=(count, count))
+    return (links + links.T).tocsr()
 
 
 @in_place
 def _relax(*arrays: Any) -> None:
-    """Solve (diagonal - links) x = right for both columns, from where it is wrong, by its queue."""
-    begins, to, weights, diagonal, right, x, queue, waiting, waits = arrays
+    """Solve (diagonal - links) x = right from where residuals are too great."""
+    begins, to, weights, diagonal, most, residual, x, queue, waiting, waits = arrays
     first = 0
     while waiting > 0:
         place = queue[first]
         first = first + 1 if first + 1 < queue.size else 0
         waiting -= 1
         waits[place] = False
-        one, other = right[place, 0], right[place, 1]
-        for link in range(begins[place], begins[place + 1]):
-            one += weights[link] * x[to[link], 0]
-            other += weights[link] * x[to[link], 1]
-        one = OVER_RELAXATION * (one / diagonal[place] - x[place, 0])
-        other = OVER_RELAXATION * (other / diagonal[place] - x[place, 1])
-        x[place, 0] += one
-        x[place, 1] += other
-        if max(abs(one), abs(other)) <= ACCURACY:
-            continue
-        for link in range(begins[place], begins[place + 1]):
-            if not waits[to[link]]:
-                waits[to[link]] = True
+        change = OVER_RELAXATION * residual[place] / diagonal[place]
+        x[place] += change
+        residual[place] -= change * diagonal[place]
+        for link in range(begins[place], begins[place + 1] + 1):
+            near = to[link] if link < begins[place + 1] else place
+            if near != place:
+                residual[near] += weights[link] * change
+            if not waits[near] and abs(residual[near]) > most[near]:
+                waits[near] = True
                 end = first + waiting
-                queue[end if end < queue.size else end - queue.size] = to[link]
+                queue[end if end < queue.size else end - queue.size] = near
                 waiting += 1
 
 
@@ -270,19 +252,3 @@ def cells_of(position: Float64, grid: GridMap) -> tuple[Int64, NDArray[np.bool_]
     inside = ((cells >= 0) & (cells <= last)).all(axis=1)
     free: NDArray[np.bool_] = inside & ~grid.occupancy[y, x]
     return cells, free
-
-
-def nearest_free(position: Float64, grid: GridMap, metres: float) -> Int64:
-    """Return the free cells of positions, or the nearest within some metres, or (-1, -1)."""
-    cells, free = cells_of(position, grid)
-    reach = int(metres / grid.resolution)
-    result = np.where(free[:, None], cells, -1)
-    for index in np.flatnonzero(~free):
-        x, y = cells[index].tolist()
-        left, bottom = max(x - reach, 0), max(y - reach, 0)
-        box = grid.occupancy[bottom : max(y + reach + 1, 0), left : max(x + reach + 1, 0)]
-        free_y, free_x = np.nonzero(~box)
-        if len(free_x):
-            best = np.hypot(free_x + left - x, free_y + bottom - y).argmin()
-            result[index] = free_x[best] + left, free_y[best] + bottom
-    return result

@@ -7,7 +7,7 @@ from unittest.mock import Mock
 import numpy as np
 import pytest
 from experience.straight_drives import HALL, SPEED, Poses, at, driven, straight
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 from ddqn_planner import Experience, GridMap, Planner
@@ -57,6 +57,7 @@ def test_experience_that_was_forgotten_is_not_taken_over() -> None:
 
 
 @given(st.integers(0, 2**32 - 1))
+@example(seed=8894)  # a place has no neighbours
 def test_the_posterior_is_that_of_a_gaussian_markov_random_field(seed: int) -> None:
     random, drives = np.random.default_rng(seed), []
     for _ in range(3):
@@ -86,7 +87,7 @@ def test_the_posterior_is_that_of_a_gaussian_markov_random_field(seed: int) -> N
         precision[number[y, x], number[y, x]] += weight / noise
         seen[number[y, x]] += (log + weight * (noise / 2 - common)) / noise
     mean = common + np.linalg.solve(precision, seen) + surplus * (1 - posterior.known)
-    np.testing.assert_allclose(posterior.mean, mean, atol=0.03)
+    np.testing.assert_allclose(posterior.mean, mean, atol=0.02)
 
 
 def test_a_map_is_the_same_while_nothing_was_learned() -> None:

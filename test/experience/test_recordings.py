@@ -162,17 +162,20 @@ def test_recordings_add_to_older_experience(tmp_path: Path, map_file: Path, caps
     ("name", "text", "reason"),
     [
         ("drive.csv", "time,x,y\n1,2,3\n", "the columns seconds are missing"),
-        ("drive.csv", "seconds,x,y\n1,2,three\n", "line 2: .* no numbers"),
-        ("drive.csv", "seconds,x,y\n1,2\n", "line 2: .* no numbers"),
+        ("drive.csv", "seconds,x,y\n1,2,three\n", "'three'.* has no numbers"),
+        ("drive.csv", "seconds,x,y\n1,2\n", "'2'.* has no numbers"),
         ("drive.csv", "seconds,x,y\n1,2,nan\n", "holds no drive"),
         ("drive.csv", "", "columns seconds, x, y are missing"),
         ("drive.csv", "seconds,x,y\n99,1,1\n98,2,1\n97,3,1\n", "time .* runs backwards"),
         ("drive.csv", "seconds,x,y\n" + 9 * "7,1,1\n7,2,1\n", "time .* stands still"),
-        ("drive.csv", "seconds,x,y\n1,-50,1\n2,-51,1\n3,-52,1\n", "x is -52.0 .* map has 30.0 x"),
-        ("drive.bag", "", r"ends in neither .csv nor .mcap"),
-        ("drive.db3", "", r"convert the bag: ros2 bag convert -i .*drive\.db3 -o"),
+        (
+            "drive.csv",
+            "seconds,x,y\n1,-50,1\n2,-51,1\n3,-52,1\n",
+            r"\[-52.0, 1.0\] to .* map has 30.0 x",
+        ),
+        ("drive.db3", "", r"no \.csv and no \.mcap file.* `ros2 bag convert`"),
         ("missing.csv", None, "No such file"),
-        (".", None, r"holds no episodes\.csv and no \.mcap file; give a .* folder, a bag's"),
+        (".", None, r"no folder with episodes\.csv or \.mcap files"),
     ],
 )
 def test_what_cannot_be_learned_is_refused(
@@ -225,28 +228,13 @@ def test_transforms_of_a_bag_lead_from_a_frame_below_the_one_that_moves_to_the_m
     messages = [*tree("", 5.0), message("/goal_pose", ODOMETRY, (100.0, 20.0, 1.0))]
     parts = [
         write_mcap(tmp_path / name, part)
-        for name, part in (("b.mcap", messages[:101]), ("a.mcap", messages[101:]))
+        for name, part in (("bag_9.mcap", messages[:101]), ("bag_10.mcap", messages[101:]))
     ]
     source, samples = read_mcap(parts)
     assert source == "/tf of base_link"
     np.testing.assert_allclose(samples, driven(5.0), atol=1e-9)
-    for remedy, text in (("bag reindex", "none: {}"), ("bag reindex", "{"), ("", "")):
-        names = text or "rosbag2_bagfile_information: {relative_file_paths: [b.mcap, a.mcap]}"
-        (tmp_path / "metadata.yaml").write_text(names)
-        assert main(["learn", str(tmp_path), "--map", str(map_file)]) == (2 if remedy else 0)
-        output = capsys.readouterr()
-        assert remedy in output.err
-    assert "200 poses of /tf of base_link" in output.out
-
-
-def test_files_of_a_bag_without_metadata_come_in_the_order_of_their_numbers(
-    tmp_path: Path, map_file: Path
-) -> None:
-    for number in range(11):
-        part = [message("/where", ODOMETRY, s) for s in slow_drive()[100 * number :][:100]]
-        write_mcap(tmp_path / f"bag_{number}.mcap", part)
     assert main(["learn", str(tmp_path), "--map", str(map_file)]) == 0
-    assert Experience.load(tmp_path / "experience.npz").evidence.driven == pytest.approx(110, abs=2)
+    assert "200 poses of /tf of base_link" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(
@@ -272,15 +260,6 @@ def test_files_of_a_bag_without_metadata_come_in_the_order_of_their_numbers(
             [message("/a", ODOMETRY, s) for s in driven(6.0).tolist()] + tree("", 9.0),
             "/a, /tf of base_link",
             {"robot_frame": "base_link"},
-        ),
-        (
-            [
-                message(name, ODOMETRY, s)
-                for s in driven(9.0).tolist()
-                for name in ("/a/at", "/b/at")
-            ],
-            "/a/at, /b/at",
-            {"topic": "/b/at"},
         ),
     ],
 )

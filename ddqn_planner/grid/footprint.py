@@ -1,0 +1,131 @@
+"""A robot's footprint, and the cells that it sweeps."""
+
+from __future__ import annotations
+
+import ast
+import math
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ddqn_planner.grid.arguments import as_number, numbers
+from ddqn_planner.grid.motions import Motions, closer
+
+CORNERS: Final = 24  # of the polygon around a circle
+MARGIN: Final = 0.1  # cells by which the swept cells are those of a larger body
+MAX_REACH: Final = 120  # cells that a primitive may sweep to each side
+
+
+def read_footprint(text: Any) -> NDArray[np.float64]:
+    """Return a polygon's corners, (K, 2) metres, given as in Nav2: a string of points or a radius.
+
+    A ValueError names what is wrong: fewer than three points, sides that cross, a centre of
+    rotation outside.
+    """
+    remedy = "give a radius, or a string of points '[[x, y], ...]', metres from the robot's origin"
+    try:
+        value = ast.literal_eval(text.strip()) if isinstance(text, str) else text
+        if isinstance(value, (int, float)):
+            radius = as_number("the radius", value, 1e-3, 100, "metres")
+            turn = 2 * math.pi * (np.arange(CORNERS) + 0.5) / CORNERS
+            around = np.column_stack([np.cos(turn), np.sin(turn)])
+            return around * (radius / math.cos(math.pi / CORNERS))
+        corners = numbers("the footprint", value).astype(np.float64)
+    except (ValueError, SyntaxError, MemoryError, RecursionError) as error:
+        raise ValueError(f"the footprint is {text!r} ({error}); {remedy}") from None
+    if corners.ndim != 2 or corners.shape[1] != 2 or len(corners) < 3:
+        raise ValueError(f"the footprint {text!r} is no list of three or more points; {remedy}")
+    if not np.isfinite(corners).all() or _crosses_itself(corners):
+        raise ValueError(f"the sides of the footprint {text!r} cross or are no numbers; {remedy}")
+    if not _inside(np.zeros((1, 2)), corners)[0]:
+        problem = f"the footprint {text!r} does not contain the robot's origin (0, 0)"
+        raise ValueError(f"{problem}; give points relative to it")
+    return corners
+
+
+def _crosses_itself(corners: NDArray[np.float64]) -> bool:
+    """Return whether two sides touch that do not meet in a corner, or one has no length."""
+    ends = np.roll(corners, -1, axis=0)
+
+    def side_of(p: Any, q: Any, r: Any) -> Any:
+        return (q[0] - p[0]) * (r[1] - p[1]) - (q[1] - p[1]) * (r[0] - p[0])
+
+    count = len(corners)
+    for i in range(count):
+        if np.array_equal(corners[i], ends[i]):
+            return True
+        for j in range(i + 2, count - (i == 0)):
+            a, b, c, d = corners[i], ends[i], corners[j], ends[j]
+            if (
+                side_of(a, b, c) * side_of(a, b, d) <= 0
+                and side_of(c, d, a) * side_of(c, d, b) <= 0
+            ):
+                return True
+    return False
+
+
+def _inside(points: NDArray[np.float64], corners: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Return which points (N, 2) lie inside a polygon: those from which a ray crosses it oddly."""
+    inside = np.zeros(len(points), dtype=np.bool_)
+    x, y = points.T
+    for (x0, y0), (x1, y1) in zip(corners, np.roll(corners, -1, axis=0), strict=True):
+        if y0 != y1:
+            inside ^= ((y0 > y) != (y1 > y)) & (x < x0 + (y - y0) / (y1 - y0) * (x1 - x0))
+    return inside
+
+
+def inner_radius(corners: NDArray[np.float64]) -> float:
+    """Return the radius of the circle around the origin that fits into a polygon, metres."""
+    sides = np.roll(corners, -1, axis=0) - corners
+    share = np.clip(-(corners * sides).sum(axis=1) / (sides**2).sum(axis=1), 0, 1)
+    return float(np.hypot(*(corners + share[:, None] * sides).T).min())
+
+
+def swept_cells(corners: NDArray[np.float64], motions: Motions) -> NDArray[np.bool_]:
+    """Return (P, S, S) bool: the cells that the body touches on each primitive, S // 2 the first's.
+
+    All that lies within `MARGIN` of the body counts, so that what lies between two poses does.
+    """
+    body = corners / motions.resolution
+    far = float(np.hypot(*body.T).max())
+    ways = [float(np.hypot(*poses[:, :2].T).max()) for poses in motions.poses]
+    reach = math.ceil(far + max(ways)) + 1
+    if reach > MAX_REACH:
+        problem = f"the body sweeps {reach} cells to a side; at most {MAX_REACH} can be learned"
+        raise ValueError(f"{problem}: give a coarser resolution than {motions.resolution} m")
+    edge = np.concatenate(
+        [
+            np.linspace(a, b, math.ceil(math.hypot(*(b - a)) / MARGIN), endpoint=False)
+            for a, b in zip(body, np.roll(body, -1, axis=0), strict=True)
+        ]
+    )
+    square = MARGIN * np.array([(-1, -1), (-1, 1), (1, -1), (1, 1)])
+    cells = np.arange(-reach, reach + 1.0)
+    centres = np.column_stack([axis.ravel() for axis in np.meshgrid(cells, cells)])
+    swept = np.zeros((len(motions.poses), len(cells), len(cells)), dtype=np.bool_)
+    for mask, poses in zip(swept, motions.poses, strict=True):
+        for x, y, yaw in closer(poses, MARGIN, far):
+            turn = np.array([[math.cos(yaw), math.sin(yaw)], [-math.sin(yaw), math.cos(yaw)]])
+            around = (edge @ turn + (x, y))[:, None] + square
+            column, row = np.rint(around).astype(np.int64).reshape(-1, 2).T + reach
+            mask[row, column] = True
+        for x, y, yaw in poses:
+            turn = np.array([[math.cos(yaw), -math.sin(yaw)], [math.sin(yaw), math.cos(yaw)]])
+            mask |= _inside((centres - (x, y)) @ turn, body).reshape(mask.shape)
+    return swept
+
+
+def rows_of(swept: NDArray[np.bool_]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Return the rows of cells (P, S, S): y, first x, count <= 64 of each, and where they begin."""
+    reach = swept.shape[-1] // 2
+    steps = np.diff(np.pad(swept, ((0, 0), (0, 0), (1, 1))).astype(np.int8), axis=-1)
+    number, y, begin = np.nonzero(steps == 1)
+    _, _, end = np.nonzero(steps == -1)
+    pieces = (end - begin + 63) // 64
+    part = np.arange(pieces.sum()) - np.repeat(np.cumsum(pieces) - pieces, pieces)
+    number, y, begin, end = (np.repeat(array, pieces) for array in (number, y, begin, end))
+    begin = begin + 64 * part
+    count = np.minimum(end - begin, 64)
+    first = np.searchsorted(number, np.arange(len(swept) + 1))
+    return np.column_stack([y - reach, begin - reach, count]), first

@@ -1,0 +1,190 @@
+"""Motion primitives: what a robot with a heading can do next, made here or read from a lattice."""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import dataclass
+from itertools import pairwise, product
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ddqn_planner.grid.arguments import POSITIVE, Choice, as_number
+
+Array = NDArray[np.float64]
+
+# As in Nav2's lattices (Pivtoraiko and Kelly 2005), a robot that drives straight ahead passes
+# through the centres of cells: the headings are not evenly spaced.
+QUARTER: Final = ((1, 0), (2, 1), (1, 1), (1, 2))
+DIRECTIONS: Final = (
+    np.array([[(x, y), (-y, x), (-x, -y), (y, -x)] for x, y in QUARTER], dtype=np.int64)
+    .swapaxes(0, 1)
+    .reshape(-1, 2)
+)
+HEADINGS: Final = len(DIRECTIONS)
+
+STRIDE = 0.4  # metres of a long step straight ahead
+BEHIND = 2.0  # what a metre counts that is not driven ahead; Nav2's reverse_penalty
+TURN = 0.5  # metres that a turn on the spot by one radian counts
+SPACING, ANGLE = 0.5, math.radians(5)  # between the poses of a primitive: at most so many cells
+
+
+class Motion(Choice):
+    """How a robot moves."""
+
+    DIFFERENTIAL = "differential"
+    ACKERMANN = "ackermann"
+    OMNIDIRECTIONAL = "omnidirectional"
+
+
+@dataclass(frozen=True, eq=False)
+class Motions:
+    """P motion primitives: from a heading, so many cells further, to a heading."""
+
+    resolution: float  # metres per cell
+    angles: Array  # (16,) the yaw of each heading, radians
+    start: NDArray[np.int64]  # (P,) the heading before
+    end: NDArray[np.int64]  # (P,) and after
+    offset: NDArray[np.int64]  # (P, 2) cells, x and y
+    cost: NDArray[np.float32]  # (P,) what it counts, in cells of its length
+    poses: tuple[Array, ...]  # P times (n, 3): x, y in cells from where it begins, and the yaw
+
+    def nearest_heading(self, yaw: float) -> int:
+        """Return the heading that is nearest to a yaw in radians."""
+        return int(np.abs(turn_between(self.angles, yaw)).argmin())
+
+
+def turn_between(before: Any, after: Any) -> Any:
+    """Return by how many radians to turn, from -pi to pi, counter-clockwise positive."""
+    return (np.asarray(after) - before + math.pi) % (2 * math.pi) - math.pi
+
+
+def make_motions(motion: Motion | str, turning_radius: float, resolution: float) -> Motions:
+    """Make primitives: ahead, bends, behind; turns on the spot, or sideways, where it can."""
+    motion = Motion(motion)
+    cell = as_number("the resolution", resolution, *POSITIVE, "metres per cell, > 0")
+    limits = 0, math.inf, "metres, 0 or more"
+    radius = as_number("the turning radius", turning_radius, *limits) / cell
+    if motion is Motion.ACKERMANN and radius < 1:
+        problem = f"the turning radius is {turning_radius} m; a car cannot turn on the spot"
+        raise ValueError(f"{problem}: give at least the resolution, {cell} m")
+    if radius > 100:
+        raise ValueError(
+            f"the turning radius is {radius:.0f} cells; give at most 100, or a lattice"
+        )
+    angles = np.arctan2(DIRECTIONS[:, 1], DIRECTIONS[:, 0]) % (2 * math.pi)
+    found: list[tuple[int, int, Array, float]] = []
+    for heading, angle in enumerate(angles):
+        for towards in (0, 4, 12, 2, 14) if motion is Motion.OMNIDIRECTIONAL else (0,):
+            step = DIRECTIONS[(heading + towards) % HEADINGS]
+            long = max(round(STRIDE / cell / math.hypot(*step)), 2)
+            for count in (1, long) if towards in (0, 4, 12) else (1,):
+                poses = _straight(np.zeros(2), step * count, angle)
+                found += _both_ways(heading, heading, poses, 1.0 if towards == 0 else BEHIND)
+        for side in (-1, 1):
+            end = (heading + side) % HEADINGS
+            found += _both_ways(heading, end, _bend(heading, end, angles, radius), 1.0)
+            if motion is not Motion.ACKERMANN:
+                turn = turn_between(angle, angles[end])
+                yaw = angle + turn * np.linspace(0, 1, math.ceil(abs(turn) / ANGLE) + 1)
+                spin = np.column_stack([np.zeros((len(yaw), 2)), yaw])
+                found.append((heading, end, spin, abs(turn) * TURN / cell))
+    return _motions(cell, angles, found)
+
+
+def read_lattice(file: str | Path) -> Motions:
+    """Read the motion primitives of a state lattice in Nav2's JSON format; else a ValueError."""
+    try:
+        lattice = json.loads(Path(file).read_text())
+        about = lattice["lattice_metadata"]
+        cell, angles = float(about["grid_resolution"]), np.array(about["heading_angles"], float)
+        found = []
+        for primitive in lattice["primitives"]:
+            start, end = (int(primitive[f"{name}_angle_index"]) for name in ("start", "end"))
+            length = float(primitive["trajectory_length"]) / cell
+            poses = np.array(primitive["poses"], dtype=np.float64).reshape(-1, 3)
+            poses = poses / (cell, cell, 1)
+            poses[-1, 2] = angles[end]
+            first = np.array([0, 0, angles[start]])
+            if np.abs(poses[0] - first).max() > 1e-6:  # only old files begin with it
+                poses = np.vstack([first, poses])
+            poses[:, 2] = np.unwrap(poses[:, 2])
+            turn = float(np.abs(np.diff(poses[:, 2])).sum())
+            found.append(
+                (start, end, closer(poses, SPACING, SPACING / ANGLE), length or turn * TURN / cell)
+            )
+        motions = _motions(cell, angles, found)
+        misses = max(np.abs(one[-1, :2] - np.rint(one[-1, :2])).max() for one in motions.poses)
+    except (OSError, LookupError, TypeError, ValueError) as error:
+        problem = f"{file}: cannot be read as a lattice ({error!r})"
+        raise ValueError(f"{problem}; give a file of Nav2's lattice generator") from None
+    if angles.shape != (HEADINGS,) or misses > 0.01:
+        found_there = f"{angles.size} headings, ends {misses:.2g} cells off the cells' centres"
+        raise ValueError(f"{file}: has {found_there}; give {HEADINGS} headings and whole cells")
+    return motions
+
+
+def closer(poses: Array, spacing: float, lever: float) -> Array:
+    """Return poses with others between them: what is so far from the origin moves by `spacing`."""
+    parts = [poses[:1]]
+    for before, after in pairwise(poses):
+        moves = math.hypot(*(after - before)[:2]) + lever * abs(after[2] - before[2])
+        share = np.linspace(0, 1, max(math.ceil(moves / spacing - 1e-9), 1) + 1)[1:, None]
+        parts.append(before + share * (after - before))
+    return np.concatenate(parts)
+
+
+def _both_ways(start: int, end: int, poses: Array, factor: float) -> list[Any]:
+    """Return a primitive, and, unless it leads sideways, the same in reverse."""
+    length = factor * float(np.hypot(*np.diff(poses[:, :2], axis=0).T).sum())
+    primitives = [(start, end, poses, length)]
+    if factor == 1:
+        back = poses[::-1] - [*poses[-1, :2], 0]
+        primitives.append((end, start, back, BEHIND * length))
+    return primitives
+
+
+def _straight(begin: Any, end: Any, yaw: float) -> Array:
+    """Return poses on a line, from its begin to its end."""
+    count = math.ceil(math.hypot(*np.subtract(end, begin)) / SPACING - 1e-9) + 1
+    return np.column_stack([np.linspace(begin, end, count), np.full(count, yaw)])
+
+
+def _bend(start: int, end: int, angles: Array, radius: float) -> Array:
+    """Return the shortest way to a neighbouring heading that ends in the centre of a cell."""
+    # A line, an arc, a line, one line of length 0. With tangents of equal length, so many cells
+    # ahead and so many in the new heading, an arc of the least radius leads from one to the other.
+    turn = float(turn_between(angles[start], angles[end]))
+    ahead = np.array([np.cos(angles[[start, end]]), np.sin(angles[[start, end]])])
+    tangent = max(radius, 1.0) * math.tan(abs(turn) / 2)
+    far = math.ceil(4 * tangent) + 6
+    cells = np.array(list(product(range(-far, far + 1), repeat=2)))
+    lengths = np.linalg.solve(ahead, cells.T).T
+    possible = (lengths >= tangent - 1e-9).all(axis=1)
+    best = np.where(possible, lengths.sum(axis=1), np.inf).argmin()
+    (first, last), whole = lengths[best], cells[best]
+    arc = min(first, last)
+    arc_radius = arc / math.tan(abs(turn) / 2)
+    count = max(math.ceil(abs(turn) / ANGLE), math.ceil(abs(turn) * arc_radius / SPACING)) + 1
+    yaw = angles[start] + turn * np.linspace(0, 1, count)
+    side = np.array([-math.sin(angles[start]), math.cos(angles[start])]) * math.copysign(1, turn)
+    centre = (first - arc) * ahead[:, 0] + arc_radius * side
+    outward = np.column_stack([np.sin(yaw), -np.cos(yaw)]) * math.copysign(1, turn)
+    on_arc = np.column_stack([centre + arc_radius * outward, yaw])
+    parts = [
+        _straight((0, 0), on_arc[0, :2], yaw[0])[:-1],
+        on_arc,
+        _straight(on_arc[-1, :2], whole, yaw[-1])[1:],
+    ]
+    return np.concatenate(parts)
+
+
+def _motions(cell: float, angles: Array, found: list[Any]) -> Motions:
+    start, end, poses, cost = zip(*sorted(found, key=lambda it: it[:2]), strict=True)
+    offset = np.array([np.rint(one[-1, :2]) for one in poses], dtype=np.int64)
+    return Motions(
+        cell, angles, np.array(start), np.array(end), offset, np.array(cost, np.float32), poses
+    )
