@@ -29,7 +29,7 @@ from ddqn_planner.model.shared_background import evaluate, look
 from ddqn_planner.planning.paths import search
 from ddqn_planner.training.environment import GridVectorEnvironment, Scenario
 from ddqn_planner.training.hyper_parameters import HyperParameters
-from ddqn_planner.training.shared_background import descend, differentiate, networks_of
+from ddqn_planner.training.shared_background import adam, differentiate, networks_of
 from ddqn_planner.training.trainer import Trainer
 
 TRAINING_MAPS, TEST_MAPS, NOISE_SEED = 100, 200, 0
@@ -105,7 +105,7 @@ def train_supervised(training: Training) -> None:
         gradient.q[:] /= SUPERVISED_BATCH
         differentiate(network, gradient, SUPERVISED_BATCH)
         rate = SUPERVISED_LEARNING_RATE * (1 - 0.95 * number / steps)
-        descend(network, gradient, mean, square, rate, number + 1)
+        adam(network, gradient, mean, square, rate, number + 1)
     trainer.save_model(path)
 
 

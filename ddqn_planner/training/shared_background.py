@@ -141,7 +141,7 @@ def update(learning: Any, sampling: Any, counters: Any) -> None:
         gradient.q[n, action] = 2 * (online.q[n, action] - y[n]) / slots.size
     differentiate(online, gradient, slots.size)
     counters[1] += 1
-    descend(online, gradient, mean, square, numbers.learning_rate, counters[1])
+    adam(online, gradient, mean, square, numbers.learning_rate, counters[1])
     look(online)
     if counters[1] % numbers.target_interval == 0:
         target.weights[:] = online.weights
@@ -207,41 +207,33 @@ def add_kernel(kernel: Any, bias: Any, patch: Any, count: int, before: Any) -> N
 
 
 @compiled
-def descend(online: Any, gradient: Any, mean: Any, square: Any, rate: float, updates: int) -> None:
-    """Take Adam's step number `updates` (Kingma and Ba 2015), and forget the gradient."""
-    first = online.kernel.size + online.kernel_bias.size
-    for part in (slice(0, first), slice(first + online.layer.size, online.weights.size)):
-        weight, slope = online.weights[part].reshape(1, -1), gradient.weights[part].reshape(1, -1)
-        moments = mean.weights[part].reshape(1, -1), square.weights[part].reshape(1, -1)
-        adam(weight, slope, *moments, np.ones(1, np.bool_), rate, updates)
-    rows = len(gradient.awake)
-    weight, slope = online.layer.reshape(rows, -1), gradient.layer.reshape(rows, -1)
-    moments = mean.layer.reshape(rows, -1), square.layer.reshape(rows, -1)
-    adam(weight, slope, *moments, gradient.awake, rate, updates)
-
-
-@compiled
-def adam(
-    weight: Any, gradient: Any, mean: Any, square: Any, awake: Any, rate: float, updates: int
-) -> None:
-    """Take the step for rows of weights, with torch's place of epsilon; most of them may sleep."""
+def adam(online: Any, gradient: Any, mean: Any, square: Any, rate: float, updates: int) -> None:
+    """Take Adam's step number `updates` (Kingma and Ba 2015, with torch's place of epsilon)."""
     step = np.float32(rate / (1 - BETA_1**updates))
     root = np.float32(1 / np.sqrt(1 - BETA_2**updates))
-    one, two = np.float32(1 - BETA_1), np.float32(1 - BETA_2)
-    for row in range(len(weight)):
-        if not awake[row]:  # it has neither a gradient nor a mean of the last ones
-            for number in range(weight.shape[1]):
-                square[row, number] -= two * square[row, number]
-            continue
-        momentum = np.float32(0)
-        for number in range(weight.shape[1]):
-            slope, average = gradient[row, number], mean[row, number]
-            average += one * (slope - average)
-            # Most fade away, as few features live: a processor is slow where they are denormal.
-            average = average if abs(average) > LEAST else np.float32(0)
-            mean[row, number], momentum = average, momentum + abs(average)
-            square[row, number] += two * (slope * slope - square[row, number])
-            to = np.sqrt(square[row, number]) * root + EPSILON
-            weight[row, number] -= step * average / to
-            gradient[row, number] = 0
-        awake[row] = momentum != 0
+    one, two, always = np.float32(1 - BETA_1), np.float32(1 - BETA_2), np.ones((2, 1), np.bool_)
+    first = online.kernel.size + online.kernel_bias.size
+    ends = 0, first, first + online.layer.size, online.weights.size
+    for part, awake in enumerate((always[0], gradient.awake, always[1])):
+        start, end, shape = ends[part], ends[part + 1], (len(awake), -1)
+        weights = online.weights[start:end].reshape(shape)
+        slopes = gradient.weights[start:end].reshape(shape)
+        means = mean.weights[start:end].reshape(shape)
+        squares = square.weights[start:end].reshape(shape)
+        for row in range(len(awake)):
+            if not awake[row]:  # it has neither a gradient nor a mean of earlier ones
+                for number in range(weights.shape[1]):
+                    squares[row, number] -= two * squares[row, number]
+                continue
+            momentum = np.float32(0)
+            for number in range(weights.shape[1]):
+                slope, average = slopes[row, number], means[row, number]
+                average += one * (slope - average)
+                # Most fade away, as few features live: a processor is slow where it is denormal.
+                average = average if abs(average) > LEAST else np.float32(0)
+                means[row, number], momentum = average, momentum + abs(average)
+                squares[row, number] += two * (slope * slope - squares[row, number])
+                divisor = np.sqrt(squares[row, number]) * root + EPSILON
+                weights[row, number] -= step * average / divisor
+                slopes[row, number] = 0
+            awake[row] = momentum != 0

@@ -27,7 +27,7 @@ from ddqn_planner.training.double_dqn import ReplayBuffer, Transitions
 from ddqn_planner.training.environment import Scenario
 from ddqn_planner.training.hyper_parameters import HyperParameters
 from ddqn_planner.training.networks import AnyMapModule, PaperModule
-from ddqn_planner.training.shared_background import descend, differentiate
+from ddqn_planner.training.shared_background import adam, differentiate
 from ddqn_planner.training.trainer import Trainer
 
 Q = Callable[[Scenario, Cell], Tensor]
@@ -161,7 +161,7 @@ def test_weights_that_slept_wake_as_if_they_had_moved_all_the_time(small: Scenar
     trainer = Trainer([small], MoveRule.ROBOT_SAFE, parameters, seed=2)
     online, _, gradient, *moments = trainer._player[1].args[1][2]
     weight = torch.tensor(online.weights)
-    adam = torch.optim.Adam([weight], 0.01)
+    optimiser = torch.optim.Adam([weight], 0.01)
     for update in range(1, 701):
         if update in (1, 700):  # until the last one, Adam's mean of the first fades to 0
             look(online)
@@ -170,8 +170,8 @@ def test_weights_that_slept_wake_as_if_they_had_moved_all_the_time(small: Scenar
             differentiate(online, gradient, 1)
             assert gradient.layer.any(axis=1).sum() > gradient.awake.size // 4
         weight.grad = torch.tensor(gradient.weights)
-        adam.step()
-        descend(online, gradient, *moments, 0.01, update)
+        optimiser.step()
+        adam(online, gradient, *moments, 0.01, update)
         assert not gradient.weights.any()
     torch.testing.assert_close(torch.tensor(online.weights), weight)
 
