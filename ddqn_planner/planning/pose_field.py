@@ -37,10 +37,10 @@ def _untouched(count: int, dtype: DTypeLike) -> NDArray[Any]:
 class PoseField:
     """The least costs that are known from poses to the nearest of some goals."""
 
-    # Grown from the goals in the order of weighted A* toward a start (Pohl 1970), with states that
-    # open again. No open state's cost plus `weight` times the straight way is less than the start's
-    # cost when it ends; on a cheapest path lies an open state, or the cost is the least: so the
-    # start's cost is at most `weight` times the least.
+    # Grown from the goals toward a start, in rounds of weighted A* that close a state once (ARA*,
+    # Likhachev et al. 2003). On a cheapest path to the start lies a state that is open or waits,
+    # and whose cost is the least; else the start's is. So the least cost of one of these, plus what
+    # is left from there at least, is a lower bound, which proves how good the start's cost is.
 
     def __init__(self, goals: tuple[State, ...], grid: GridMap, world: World, body: Body) -> None:
         self.goals, self.grid, self.world, self.body = goals, grid, world, body
@@ -89,8 +89,7 @@ class PoseField:
                 return False
             elif visits < most:
                 self._reserve(2 * len(self._keys))
-            elif not self._guide():
-                self._size = self._waiting = 0
+            elif not self._can_leave(number) or not self._guide():
                 return True
 
     def _grow(self, limit: int) -> tuple[int, bool]:
@@ -119,18 +118,23 @@ class PoseField:
         self.least = min(kernels.least_order(self.known, self._open(), self._aim, self.world), cost)
         return cost / self.least if self.least else 1.0
 
+    def _can_leave(self, number: int) -> bool:
+        """Return whether primitives lead from the start to more than a few states."""
+        mark, queue = _untouched(self.known.mark.size, np.uint8), np.empty(UNGUIDED, np.int64)
+        return bool(kernels.leads_to(number, mark, queue, self.world, self.body) == len(queue))
+
     def _guide(self) -> bool:
         """Look at the map for what is left to the start; return whether a way may exist."""
         columns, rows = (self.world.width + 7) // TILE, (self.world.height + 7) // TILE
         left = np.empty((columns + 1) * (rows + 1), np.float32)
         keys, numbers = np.empty(4 * left.size, np.float32), np.empty(4 * left.size, np.int64)
-        x, y, _ = self.goals[0]
-        goal = (y // TILE) * (columns + 1) + x // TILE
+        x, y, _ = np.array(self.goals).T // TILE
+        goals = np.unique(y * (columns + 1) + x)
         heap = left, keys, numbers
-        found = kernels.spread(*heap, self._aim, goal, FURTHER, self.world, self.body)
+        kernels.spread(*heap, self._aim, goals, FURTHER, self.world, self.body)
         self._aim = self._aim._replace(left=left)
         self._order()
-        return bool(found)
+        return bool(np.isfinite(left[goals]).any())
 
     def _reserve(self, entries: int) -> None:
         """Make the heap so large; what waits stays at its end."""

@@ -110,18 +110,31 @@ STRAIGHT, DIAGONAL = 5, 7
 LONGER: Final = math.sqrt(1 + (DIAGONAL / STRAIGHT - 1) ** 2)
 
 
+@inlined
+def is_way(x: int, y: int, step_x: int, step_y: int, world: Any, body: Any) -> bool:
+    """Return whether a step from a corner leads through a tile with room, or along its side."""
+    columns, rows = (world.width + 7) >> 3, (world.height + 7) >> 3
+    for side in range(2):
+        tile_x = x + (step_x - 1) // 2 if step_x != 0 else x - side
+        tile_y = y + (step_y - 1) // 2 if step_y != 0 else y - side
+        is_inside = 0 <= tile_x < columns and 0 <= tile_y < rows
+        if is_inside and has_room(tile_x, tile_y, world, body):
+            return True
+    return False
+
+
 @in_place
 def spread(
     left: NDArray[np.float32],
     keys: Any,
     numbers: Any,
     aim: Aim,
-    goal: int,
+    goals: NDArray[np.int64],
     further: float,
     world: World,
     body: Body,
-) -> bool:
-    """Write what is left from corners of tiles to a start; return whether a goal's is reached."""
+) -> None:
+    """Write what is left from corners of tiles to a start, infinite where no way leads."""
     columns, rows = (world.width + 7) >> 3, (world.height + 7) >> 3
     size, end, limit = 0, 0.0, np.inf
     left[:] = np.inf
@@ -137,8 +150,9 @@ def spread(
             sink(keys[size], numbers[size], 0, keys, numbers, size)
         if here > left[number]:
             continue
-        if number == goal:
-            limit = further * here
+        for goal in goals:
+            if number == goal and limit == np.inf:
+                limit = further * here
         y = number // (columns + 1)
         x = number - y * (columns + 1)
         for step_y in range(-1, 2):
@@ -152,21 +166,13 @@ def spread(
                 cost = here + (STRAIGHT if step_x == 0 or step_y == 0 else DIAGONAL)
                 if cost >= left[after] or size == keys.size:
                     continue
-                # Through a tile, or along a side between two of them.
-                is_open = False
-                for side in range(2):
-                    tile_x = x + (step_x - 1) // 2 if step_x != 0 else x - side
-                    tile_y = y + (step_y - 1) // 2 if step_y != 0 else y - side
-                    if 0 <= tile_x < columns and 0 <= tile_y < rows:
-                        is_open = is_open or has_room(tile_x, tile_y, world, body)
-                if is_open:
+                if is_way(x, y, step_x, step_y, world, body):
                     left[after] = cost
                     size = push(np.float32(cost), after, keys, numbers, size)
     for number in range(left.size):
         # What was not reached is no nearer than where it ended.
         value = left[number] if left[number] < end or size == 0 else end
         left[number] = value * (TILE / STRAIGHT / LONGER) - math.sqrt(2.0) * TILE
-    return bool(left[goal] < np.inf)
 
 
 @in_place
@@ -299,6 +305,28 @@ def follow(
         primitives[count], costs[count] = chosen, spent
         count += 1
         number = after
+    return count
+
+
+@in_place
+def leads_to(
+    number: int, mark: NDArray[np.uint8], queue: NDArray[np.int64], world: World, body: Body
+) -> int:
+    """Return to how many states primitives lead from one, at most so many as the queue holds."""
+    queue[0], mark[number], read, count = number, 1, 0, 1
+    while read < count:
+        x, y, heading = place_of(queue[read], world.width)
+        read += 1
+        for primitive in range(body.out[heading], body.out[heading + 1]):
+            column, line = x + body.offset[primitive, 0], y + body.offset[primitive, 1]
+            if column < 0 or line < 0 or column >= world.width or line >= world.height:
+                continue
+            after = number_of(column, line, body.end[primitive], world.width)
+            if mark[after] == 0 and is_possible(x, y, primitive, world, body):
+                if count == queue.size:
+                    return count
+                queue[count], mark[after] = after, 1
+                count += 1
     return count
 
 
