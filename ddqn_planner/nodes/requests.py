@@ -202,8 +202,6 @@ class ModelSource:
         """Plan with it from now on."""
         self.planner, self.file, self.loading = planner, file, None
         planner.cache_bytes = self._node.value("field_cache_bytes")
-        certificate = planner.network.certificate(planner.metadata.move_rule)
-        self._certificate = str(certificate or NO_CERTIFICATE)
         self.report.accept("model")
         self.report.change()
         self._node.get_logger().info(f"planning with the model {file}")
@@ -229,8 +227,8 @@ class ModelSource:
         description = {"model": self._node.value("model")}
         if self.planner is None:
             return description
-        metadata, body = self.planner.metadata, self.planner.pose_planner
-        if body is not None:
+        metadata, network = self.planner.metadata, self.planner.network
+        if body := self.planner.pose_planner:
             description["model footprint (m)"] = str(body.footprint.tolist())
         return description | {
             "model file": self.file,
@@ -238,7 +236,7 @@ class ModelSource:
             "model move rule": metadata.move_rule.value,
             "model sizes": ", ".join(f"{key} {size}" for key, size in metadata.sizes.items()),
             "model training steps": str(metadata.steps),
-            "model certificate": self._certificate,
+            "model certificate": str(network.certificate(metadata.move_rule) or NO_CERTIFICATE),
         }
 
     def forget(self) -> None:
