@@ -49,13 +49,13 @@ SHORTEST = 8  # a drive through fewer places says little about how sure expected
 KEPT, ASSUMED = 64, 8  # drives whose errors count, and drives assumed before, with normal errors
 NORMAL = 1.645  # 90 % of a normal distribution lie within so many standard deviations
 TAIL = 0.04  # share of errors beyond each bound: not 5 %, as successive drives are alike
-PARTS = 256  # of a path, between which it is computed what they have in common
-CORRELATED = 5.0  # places so many sides apart have a third of their error in common
+CORRELATED = 10.0  # so many places in a row have their error in common
 
 # Of each place: the weight of its visits, that times their log slowness, what the prior foretold of
 # it before, where it was visited first, and the driven time when the weights were last faded.
 COLUMNS = "weight", "log", "foretold", "x", "y", "time"
 WAIT_COLUMNS = "seconds", "passages", "x", "y"
+IN_FILES = "evidence", "waits", "driven", "noise", "errors"  # what they keep
 
 
 class Visits(NamedTuple):
@@ -64,6 +64,9 @@ class Visits(NamedTuple):
     position: Float64
     seconds: Float64
     metres: Float64
+
+
+NO_VISITS = Visits(np.zeros((0, 2)), np.zeros(0), np.zeros(0))
 
 
 class Evidence:
@@ -170,28 +173,26 @@ class Evidence:
         self.waits[row, 2:] += away[row] / NEAREST_WAITS
         return row
 
-    def add_failure(self, x: float, y: float, seconds: float) -> None:
-        """Add a failure, which costs as much as a wait of so many seconds."""
-        self._add_waits(NO_VISITS, np.array([[x, y, seconds]]))
-
     def expected_waits(self) -> Iterator[tuple[Float64, float]]:
         """Yield where robots wait, and the mean seconds of a passage."""
         for seconds, passages, x, y in self.waits.tolist():
             yield np.array([x, y]), seconds / (passages + WAIT_PASSAGES)
 
+    def _squares(self, position: Float64) -> list[tuple[int, int]]:
+        """Return the square of the world of each position."""
+        return list(map(tuple, np.floor(position / self.side).astype(np.int64).tolist()))
+
     def _rows(self, position: Float64) -> NDArray[np.int64]:
         """Return the row of each position; new places get one."""
-        before = len(self.places)
-        keys = map(tuple, np.floor(position / self.side).astype(np.int64).tolist())
-        rows = np.array([self.places.setdefault(key, len(self.places)) for key in keys])
+        before, squares = len(self.places), self._squares(position)
+        rows = np.array([self.places.setdefault(at, len(self.places)) for at in squares])
         visited, first = np.unique(rows, return_index=True)
         first = first[visited >= before]
         fresh = np.zeros((len(first), len(COLUMNS)))
         fresh[:, 3:5], fresh[:, 5] = position[first], self.driven
         if self.posterior is not None:
-            fresh[:, 2] = np.append(self.posterior.foretold, 0)[
-                self.posterior.places_at(fresh[:, 3:5])
-            ]
+            places = self.posterior.places_at(fresh[:, 3:5])
+            fresh[:, 2] = np.append(self.posterior.foretold, 0)[places]
         self.table = np.concatenate([self.table, fresh])
         return rows
 
@@ -250,11 +251,10 @@ class Evidence:
         share, known = seconds / seconds.sum(), posterior.known[places]
         of_visits = self.noise * (share**2 * np.maximum(self.side / metres, 1)).sum()
         of_all = self.trust_variance[0, 0] * float(share @ (1 - known)) ** 2 + DRIVE_NOISE**2
-        weighted, at = share * np.sqrt(posterior.variance[places]), np.cumsum(metres)
-        begins = np.unique(np.linspace(0, len(at) - 1, PARTS).astype(np.int64))
-        weighted, at = np.add.reduceat(weighted, begins), at[begins]
-        same = np.exp(-np.abs(at[:, None] - at) / (CORRELATED * self.side))
-        return float(np.sqrt(weighted @ same @ weighted + of_visits + of_all))
+        errors = share * np.sqrt(posterior.variance[places])
+        alike = np.maximum(CORRELATED * self.side / metres, 1)
+        of_places = min(float((errors**2 * alike).sum()), float(errors.sum()) ** 2)
+        return math.sqrt(of_places + of_visits + of_all)
 
     def quantiles(self) -> Float64:
         """Return the lower bound, the mean, and the upper bound of 90 % of the errors of drives."""
@@ -303,34 +303,22 @@ class Evidence:
 
     def arrays(self) -> dict[str, Any]:
         """Return what a file keeps."""
-        return {
-            "evidence": self.table,
-            "waits": self.waits,
-            "driven": self.driven,
-            "noise": self.noise_sums,
-            "errors": self.errors,
-        }
+        kept = self.table, self.waits, self.driven, self.noise_sums, self.errors
+        return dict(zip(IN_FILES, kept, strict=True))
 
     def restore(self, arrays: Mapping[str, NDArray[Any]]) -> None:
         """Take what a file keeps; a ValueError if it cannot be true."""
-        names = "evidence", "waits", "driven", "noise", "errors"
-        table, waits, driven, noise, errors = given = [arrays[name] for name in names]
-        if not all(array.dtype.kind in "if" and np.isfinite(array).all() for array in given):
+        given = [arrays[name].astype(np.float64) for name in IN_FILES]
+        if not all(np.isfinite(array).all() for array in given):
             raise ValueError("it holds what is no finite number")
-        shapes = table.shape, waits.shape, driven.shape, noise.shape, errors.shape
-        rows = (len(table), len(COLUMNS)), (len(waits), len(WAIT_COLUMNS))
-        if shapes != (*rows, (), (2,), (errors.size,)):
-            raise ValueError(f"its arrays do not fit: they have the shapes {shapes}")
-        squares = np.floor(table[:, 3:5] / self.side).tolist()
-        places = {(int(x), int(y)): row for row, (x, y) in enumerate(squares)}
-        total, visits = noise.tolist()
-        wrong = (table[:, 0] < 0).any() or (np.abs(table[:, 3:5]) > FARTHEST).any()
-        wrong = wrong or (waits[:, :2] < 0).any() or len(places) != len(table)
-        if wrong or (table[:, 5] > driven).any() or total < 0 or visits <= 0:
+        (table, waits, _, _, errors), driven = given, float(given[2])
+        places = {at: row for row, at in enumerate(self._squares(table[:, 3:5]))}
+        total, visits = given[3].tolist()
+        right = table.shape == (len(places), len(COLUMNS)) and (table[:, 5] <= driven).all()
+        right = right and (table[:, 0] >= 0).all() and (np.abs(table[:, 3:5]) <= FARTHEST).all()
+        right = right and waits.shape[1:] == (len(WAIT_COLUMNS),) and (waits[:, :2] >= 0).all()
+        if not right or total < 0 or visits <= 0 or errors.ndim != 1:
             raise ValueError("its evidence cannot be true")
         self.places, self.table, self.waits = places, table, waits
-        self.driven, self.noise_sums, self.errors = float(driven), (total, visits), errors.tolist()
+        self.driven, self.noise_sums, self.errors = driven, (total, visits), errors.tolist()
         self._fit()
-
-
-NO_VISITS = Visits(np.zeros((0, 2)), np.zeros(0), np.zeros(0))
