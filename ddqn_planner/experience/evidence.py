@@ -25,7 +25,7 @@ VARIANCE, VARIED_PLACES = 1.0, 4.0  # of the log slowness of places, as if of so
 LEAST_VARIANCE, MOST_VARIANCE = 0.05, 2.0
 ALIKE = 8.0  # so many places of a path tell as much of other places as one alone
 NOMINAL = 2.0  # inverse variance of the log slowness of all places, before the first drive
-TRUST, TRUSTED = 1.0, 0.5  # in the prior: at first, and the inverse variance of that
+TRUST, TRUSTED = 0.4, 0.25  # in the prior: at first, and the inverse variance of that
 SURE_PLACES = 20  # fewer say nothing about the robot's speed in the open
 OUTLIER = 2.5  # a visit is moved to so many standard deviations from what was expected
 KNOWN = 0.7  # weight of visits from which a place is known
@@ -34,7 +34,7 @@ MOST = 6.0  # weight of visits that a place keeps
 PART, SURPRISE = 8, 3.5  # so many places have changed if they are off by more deviations
 PART_NOISE = 0.12  # of their mean log slowness, as each way through a place is another
 DRIVE_NOISE = 0.05  # standard deviation of what the log slowness of so many places has in common
-CHANGED, CHANGED_AROUND = 0.1, 1.5  # share of evidence that is left within so many metres
+CHANGED, CHANGED_AROUND = 0.01, 1.5  # share of evidence that is left within so many metres
 CHANGED_FAR = 0.25  # and elsewhere: where one place changed, others did
 
 WAIT_PASSAGES = 0.1  # passages without a wait that are assumed
@@ -52,8 +52,8 @@ TAIL = 0.04  # share of errors beyond each bound: not 5 %, as successive drives 
 CORRELATED = 10.0  # so many places in a row have their error in common
 
 # Of each place: the weight of its visits, that times their log slowness, what the prior foretold of
-# it before, where it was visited first, and the driven time when the weights were last faded.
-COLUMNS = "weight", "log", "foretold", "x", "y", "time"
+# it before, and where it was visited first.
+COLUMNS = "weight", "log", "foretold", "x", "y"
 WAIT_COLUMNS = "seconds", "passages", "x", "y"
 IN_FILES = "evidence", "waits", "driven", "noise", "errors"  # what they keep
 
@@ -102,17 +102,19 @@ class Evidence:
         if len(visits.position):
             self._add_visits(visits)
         self._add_waits(visits, waits)
+        period = self.half_life / FADING_STEPS
+        before = self.driven // period
         self.driven += float(visits.seconds.sum() + waits[:, 2].sum())
+        self.table[:, :2] *= 0.5 ** ((self.driven // period - before) / FADING_STEPS)
         self._fit()
 
     def _add_visits(self, visits: Visits) -> None:
         rows, noise = self._rows(visits.position), self.noise
         slowness = visits.seconds * self.nominal_speed / visits.metres
         log = np.log(np.clip(slowness, 1 / MAX_SLOWNESS, MAX_SLOWNESS))
-        weight, sum_of_log = self.faded()[rows].T
+        weight, sum_of_log = self.table[rows, :2].T
         variance = 1 / (weight / noise + 1 / self.place_variance)
-        expected = self.trust[0] * np.ones(len(rows))
-        expected += (sum_of_log - weight * expected) / noise * variance
+        expected = self.trust[0] + (sum_of_log - weight * self.trust[0]) / noise * variance
         surprise = log - expected
         most = OUTLIER * np.sqrt(noise + variance)
         believed = np.clip(surprise, -most, most)
@@ -124,13 +126,14 @@ class Evidence:
         self.noise_sums = total / surplus, count / surplus
         changed = self._changed(visits.position, surprise, weight)
         believed[changed] = surprise[changed]
-        places = np.unique(rows)
-        self.table[places, :2] = self.faded()[places]
-        self.table[places, 5] = self.driven
         weight = visits.metres / self.side
         np.add.at(self.table[:, 0], rows, weight)
         np.add.at(self.table[:, 1], rows, weight * (expected + believed))
-        self.table[places, :2] /= np.maximum(self.table[places, :1] / MOST, 1)
+        self._bound()
+
+    def _bound(self) -> None:
+        """Bound the weights of places, so that what is new counts."""
+        self.table[:, :2] /= np.maximum(self.table[:, :1] / MOST, 1)
 
     def _changed(self, position: Float64, surprise: Float64, weight: Float64) -> NDArray[np.int64]:
         """Return the visits that were other than all before; most of that is forgotten."""
@@ -189,23 +192,16 @@ class Evidence:
         visited, first = np.unique(rows, return_index=True)
         first = first[visited >= before]
         fresh = np.zeros((len(first), len(COLUMNS)))
-        fresh[:, 3:5], fresh[:, 5] = position[first], self.driven
+        fresh[:, 3:5] = position[first]
         if self.posterior is not None:
             places = self.posterior.places_at(fresh[:, 3:5])
             fresh[:, 2] = np.append(self.posterior.foretold, 0)[places]
         self.table = np.concatenate([self.table, fresh])
         return rows
 
-    def faded(self) -> Float64:
-        """Return the weight of each row, and that times the log slowness, of now: (N, 2)."""
-        period = self.half_life / FADING_STEPS
-        elapsed = np.maximum(math.floor(self.driven / period) * period - self.table[:, 5:], 0)
-        weights: Float64 = self.table[:, :2] * 0.5 ** (elapsed / self.half_life)
-        return weights
-
     def _fit(self) -> None:
         """Learn what all places have in common, how they differ, and what the prior is worth."""
-        weight, sum_of_log = self.faded().T
+        weight, sum_of_log = self.table[:, :2].T
         seen = weight >= 0.2
         weight, foretold = weight[seen], self.table[seen, 2]
         log = sum_of_log[seen] / weight
@@ -283,10 +279,8 @@ class Evidence:
         """Add what other evidence has."""
         if len(other.table):
             rows = self._rows(other.table[:, 3:5])
-            places = np.unique(rows)
-            self.table[places, :2], self.table[places, 5] = self.faded()[places], self.driven
-            np.add.at(self.table[:, :2], rows, other.faded())
-            self.table[places, :2] /= np.maximum(self.table[places, :1] / MOST, 1)
+            np.add.at(self.table[:, :2], rows, other.table[:, :2])
+            self._bound()
         for seconds, passages, x, y in other.waits.tolist():
             self.waits[self._wait_at(x, y), :2] += seconds, passages
         self.noise_sums = tuple(np.add(self.noise_sums, other.noise_sums).tolist())
@@ -311,14 +305,15 @@ class Evidence:
         given = [arrays[name].astype(np.float64) for name in IN_FILES]
         if not all(np.isfinite(array).all() for array in given):
             raise ValueError("it holds what is no finite number")
-        (table, waits, _, _, errors), driven = given, float(given[2])
+        table, waits, driven, noise, errors = given
         places = {at: row for row, at in enumerate(self._squares(table[:, 3:5]))}
-        total, visits = given[3].tolist()
-        right = table.shape == (len(places), len(COLUMNS)) and (table[:, 5] <= driven).all()
-        right = right and (table[:, 0] >= 0).all() and (np.abs(table[:, 3:5]) <= FARTHEST).all()
-        right = right and waits.shape[1:] == (len(WAIT_COLUMNS),) and (waits[:, :2] >= 0).all()
-        if not right or total < 0 or visits <= 0 or errors.ndim != 1:
+        total, visits = noise.tolist()
+        shapes = table.shape, waits.shape, errors.shape
+        if shapes != ((len(places), len(COLUMNS)), (len(waits), len(WAIT_COLUMNS)), (errors.size,)):
+            raise ValueError(f"its arrays do not fit: they have the shapes {shapes}")
+        least = min(table[:, 0].min(initial=0), waits[:, :2].min(initial=0), float(driven), total)
+        if least < 0 or visits <= 0 or np.abs(table[:, 3:5]).max(initial=0) > FARTHEST:
             raise ValueError("its evidence cannot be true")
         self.places, self.table, self.waits = places, table, waits
-        self.driven, self.noise_sums, self.errors = driven, (total, visits), errors.tolist()
+        self.driven, self.noise_sums, self.errors = float(driven), (total, visits), errors.tolist()
         self._fit()

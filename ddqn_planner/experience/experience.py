@@ -317,8 +317,10 @@ class Experience:
             options = dict(zip(OPTIONS, arrays["options"].tolist(), strict=True))
             experience = cls(**options)
             if version == 1:  # before 0.4.0 failures stood where now is what the prior foretold
-                arrays["waits"] = np.zeros((0, 4))
-                arrays["evidence"][:, 2] = 0
+                arrays["waits"], table = np.zeros((0, 4)), arrays["evidence"]
+                age = (arrays["driven"] - table[:, 5:]) / experience.half_life
+                faded = table[:, :2] * 0.5**age
+                arrays["evidence"] = np.hstack([faded, 0 * table[:, 2:3], table[:, 3:5]])
             experience.evidence.restore(arrays)
             prior = {n.removeprefix(PRIOR): a for n, a in arrays.items() if n.startswith(PRIOR)}
             experience.evidence.prior = Prior.from_arrays(prior) if prior else None

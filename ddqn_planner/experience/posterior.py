@@ -106,7 +106,7 @@ class Posterior:
         noise, variance = self.common[:2]
         places = self.places_at(evidence.table[:, 3:5])
         inside = places >= 0
-        weight, log = evidence.faded()[inside].T
+        weight, log = evidence.table[inside, :2].T
         # Half of the noise is added, as the mean of its exponential is more than 1.
         # A lattice whose links have strength 1 has about the variance ln(32 / kappa) / 4 pi;
         # 1 is added for cells of many metres, where that would be negative.
