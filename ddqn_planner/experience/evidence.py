@@ -34,8 +34,7 @@ MOST = 6.0  # weight of visits that a place keeps
 PART, SURPRISE = 8, 3.5  # so many places have changed if they are off by more deviations
 PART_NOISE = 0.12  # of their mean log slowness, as each way through a place is another
 DRIVE_NOISE = 0.05  # standard deviation of what the log slowness of so many places has in common
-CHANGED, CHANGED_AROUND = 0.01, 1.5  # share of evidence that is left within so many metres
-CHANGED_FAR = 0.25  # and elsewhere: where one place changed, others did
+CHANGED = 0.01  # share of all evidence that is left then: where one place changed, others did
 
 WAIT_PASSAGES = 0.1  # passages without a wait that are assumed
 # Robots that wait on both sides of a door wait at one place, between them: waits within so many
@@ -124,7 +123,7 @@ class Evidence:
         count += int(known.sum())
         surplus = max(count / OLD_VISITS, 1)
         self.noise_sums = total / surplus, count / surplus
-        changed = self._changed(visits.position, surprise, weight)
+        changed = self._changed(surprise, weight)
         believed[changed] = surprise[changed]
         weight = visits.metres / self.side
         np.add.at(self.table[:, 0], rows, weight)
@@ -135,20 +134,17 @@ class Evidence:
         """Bound the weights of places, so that what is new counts."""
         self.table[:, :2] /= np.maximum(self.table[:, :1] / MOST, 1)
 
-    def _changed(self, position: Float64, surprise: Float64, weight: Float64) -> NDArray[np.int64]:
-        """Return the visits that were other than all before; most of that is forgotten."""
+    def _changed(self, surprise: Float64, weight: Float64) -> NDArray[np.int64]:
+        """Return the visits that were other than all before; then hardly anything is known."""
         changed, known = [np.zeros(0, np.int64)], np.flatnonzero(weight >= KNOWN)
-        near = np.zeros(len(self.table), dtype=np.bool_)
         for part in np.array_split(known, max(1, len(known) // PART)):
             if len(part) < PART / 2:
                 continue
             variance = self.noise * (1 + 1 / weight[part]).mean() / len(part) + PART_NOISE**2
             if abs(surprise[part].mean()) > SURPRISE * math.sqrt(variance):
                 changed.append(part)
-                away = self.table[:, 3:5] - position[part].mean(axis=0)
-                near |= np.hypot(*away.T) <= CHANGED_AROUND + len(part) * self.side / 2
-        if near.any():
-            self.table[:, :2] *= np.where(near, CHANGED, CHANGED_FAR)[:, None]
+        if len(changed) > 1:
+            self.table[:, :2] *= CHANGED
         return np.concatenate(changed)
 
     def _add_waits(self, visits: Visits, waits: Float64) -> None:
