@@ -117,11 +117,15 @@ def swept_cells(corners: NDArray[np.float64], motions: Motions) -> NDArray[np.bo
 
 
 def rows_of(swept: NDArray[np.bool_]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Return the rows of swept cells (P, S, S) as (R, 3), y, first x, last x + 1; and (P + 1,)."""
-    # Row numbers first[p] to first[p + 1] are those of primitive p.
+    """Return the rows of cells (P, S, S): y, first x, count <= 64 of each, and where they begin."""
     reach = swept.shape[-1] // 2
     steps = np.diff(np.pad(swept, ((0, 0), (0, 0), (1, 1))).astype(np.int8), axis=-1)
     number, y, begin = np.nonzero(steps == 1)
     _, _, end = np.nonzero(steps == -1)
+    pieces = (end - begin + 63) // 64
+    part = np.arange(pieces.sum()) - np.repeat(np.cumsum(pieces) - pieces, pieces)
+    number, y, begin, end = (np.repeat(array, pieces) for array in (number, y, begin, end))
+    begin = begin + 64 * part
+    count = np.minimum(end - begin, 64)
     first = np.searchsorted(number, np.arange(len(swept) + 1))
-    return np.column_stack([y - reach, begin - reach, end - reach]), first
+    return np.column_stack([y - reach, begin - reach, count]), first

@@ -134,6 +134,34 @@ class Plan:
         return path_length(self.path, self.move_rule)
 
 
+@dataclass(frozen=True, eq=False)
+class PosePlan(Plan):
+    """A path for a robot with a body and a heading; its `path` has the cells of the origin.
+
+    Parameters
+    ----------
+    poses : (N, 3) float64
+        x, y in metres and yaw in radians, -pi to pi, in the map frame, from start to goal: at most
+        half a cell apart. Empty unless the status is SUCCEEDED.
+    driven : float
+        The length of the origin's way, in cells, whatever the direction.
+    bound : float
+        The proved ratio of the cost to the least one, 1.0 when it is the least.
+    """
+
+    poses: NDArray[np.float64] = field(default_factory=lambda: np.empty((0, 3)))
+    driven: float = 0.0
+    bound: float = 1.0
+
+    @property
+    def length(self) -> float:
+        """Length of the origin's way in cells."""
+        return self.driven
+
+    def _identity(self) -> tuple[object, ...]:
+        return *super()._identity(), self.poses.tobytes(), self.bound
+
+
 def joined(plans: Sequence[Plan]) -> Plan:
     """Return the plan through several goals: each but the last succeeded, and ends at the next."""
     first, last = plans[0], plans[-1]
