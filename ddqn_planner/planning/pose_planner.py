@@ -218,7 +218,8 @@ class PosePlanner:
                 continue
             x, y, yaw = (way.poses - request.start).T
             far, turn = np.hypot(x, y) / grid.resolution, np.abs(turn_between(0, yaw))
-            apart = np.where((far <= ON_PATH[0]) & (turn <= ON_PATH[1]), far, np.inf)
+            is_near = (far <= ON_PATH[0]) & (turn <= ON_PATH[1])
+            apart = np.where(is_near, far + turn, np.inf)
             first = int(apart.argmin())
             plan = way.plan(first, grid)
             if apart[first] < np.inf and plan.bound <= request.bound * SAME:

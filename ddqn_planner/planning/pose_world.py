@@ -17,7 +17,7 @@ from ddqn_planner.grid.motions import HEADINGS, Motions, closer
 TILE: Final = 8  # cells of a side
 BORDER: Final = 128  # occupied cells around the map, so that a body sweeps none beyond the bits
 CHANGED_SHARE = 1 / 50  # of the map's cells: if more changed, fields begin anew
-FINE = 0.05  # cells between two points of the origin's way, which tell the cells that it passes
+FINE = 0.01  # cells between two points of the origin's way, which tell the cells that it passes
 WORD, LAST_BIT, ONE, FULL = np.uint64(64), np.uint64(63), np.uint64(1), np.uint64(2**64 - 1)
 
 
