@@ -210,7 +210,7 @@ class PlannerNode(ManagedNode):
     async def _on_get_plan(self, request: Any, response: Any) -> Any:
         start = request.start if request.start.header.frame_id else None
         header, outcome = await self._answer(lambda: None, start, [request.goal], request.tolerance)
-        response.plan = _path(path_message, outcome, header)
+        (response.plan,) = _paths(outcome, header, path_message)
         self._report.log(outcome)
         return response
 
@@ -225,7 +225,7 @@ class PlannerNode(ManagedNode):
         if outcome in (UNCHANGED, NOT_ACTIVE):
             return
         if active.is_news(outcome, header.frame_id):
-            self._plan_publisher.publish(_path(path_bytes, outcome, header))
+            self._plan_publisher.publish(*_paths(outcome, header, path_bytes))
         self._waits_for_pose = outcome.status in ("NO_START", "TF_ERROR")
         path, request = outcome.plan.path, outcome.request
         leaves = request is not None and len(path) > 0 and request.grid.is_obstacle(path[0])
@@ -240,11 +240,12 @@ class PlannerNode(ManagedNode):
         self, start: PoseStamped | None, goals: list[PoseStamped], name: str, given_up: GivenUp
     ) -> tuple[Path, Outcome]:
         header, outcome = await self._answer(given_up, start, goals, None, name, self._followed)
+        to_publish, path = _paths(outcome, header, path_bytes, path_message)
         if outcome.request is not None and len(outcome.plan.path):
             self._followed.keep(outcome.plan.path, outcome.request.grid, header.frame_id)
-            self._plan_publisher.publish(_path(path_bytes, outcome, header))
+            self._plan_publisher.publish(to_publish)
         self._report.log(outcome)
-        return _path(path_message, outcome, header), outcome
+        return path, outcome
 
     async def _on_is_path_valid(self, request: Any, response: Any) -> Any:
         """Answer Nav2's IsPathValid: whether the robot can drive the rest of a path."""
@@ -397,12 +398,12 @@ class ExpectedTimes:
         return told
 
 
-def _path(make: Callable[..., Any], outcome: Outcome, header: Header) -> Any:
-    """Return the path of an outcome, or an empty one, made by a function of `conversions`."""
+def _paths(outcome: Outcome, header: Header, *makers: Callable[..., Any]) -> list[Any]:
+    """Return the path of an outcome, or an empty one, as functions of `conversions` make it."""
     if outcome.request is None or outcome.goal is None:
-        return Path(header=header)
+        return [Path(header=header) for _ in makers]
     poses = along(outcome.plan.path, outcome.request.grid, outcome.is_dense)
-    return make(*poses, header, outcome.goal.pose.orientation)
+    return [make(*poses, header, outcome.goal.pose.orientation) for make in makers]
 
 
 def main() -> int:
