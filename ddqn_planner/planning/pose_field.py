@@ -182,8 +182,8 @@ class PoseField:
         for x, y in low:
             near[x : x + high, y : y + high] = True
         tiles = np.flatnonzero(near.T)
-        raised = np.empty(self.visits // TAKEN_BACK + HEAP, np.int64)
-        scratch = np.empty(4 * raised.size, np.float32), np.empty(4 * raised.size, np.int64), raised
+        raised = np.empty(self.visits // TAKEN_BACK + 2**10, np.int64)
+        scratch = np.empty(8 * raised.size, np.float32), np.empty(8 * raised.size, np.int64), raised
         count = kernels.take_back(self.known, tiles, *scratch, world, self.body)
         if count < 0:
             return False
