@@ -52,7 +52,6 @@ class Posterior:
         self.expected, self.waits = np.zeros(count), np.zeros(count)
         # Noise, variance, what the prior is worth (two), surplus of the mean.
         self.common = (0.0,) * 5
-        self.rows = np.zeros((0, 2)), np.zeros(0, dtype=np.int64)  # positions, and their places
         self.painted: tuple[float, float, NDArray[np.float32]] | None = None
         self.steps = np.zeros(0)
 
@@ -94,12 +93,6 @@ class Posterior:
 
     def update(self, evidence: Evidence) -> None:
         """Take what changed in the evidence, and solve again around it."""
-        position, places = self.rows
-        now = evidence.table[:, 3:5]
-        same = len(position) <= len(now) and bool((position == now[: len(position)]).all())
-        first = len(position) if same else 0
-        places = np.concatenate([places[:first], self.places_at(now[first:])])
-        self.rows = now.copy(), places
         common = evidence.noise, evidence.place_variance, *evidence.trust, evidence.surplus
         change = np.abs(np.array(common) - self.common)
         least = [NEWS * common[0], NEWS * common[1], *[NEWS_OF_LOG] * 3]
@@ -111,8 +104,9 @@ class Posterior:
             self.prior, self.common = evidence.prior, common
             self.expected = common[2] + common[3] * self.foretold.astype(np.float64)
         noise, variance = self.common[:2]
+        places = self.places_at(evidence.table[:, 3:5])
         inside = places >= 0
-        weight, log = evidence.faded()[inside].T
+        weight, log = evidence.table[inside, :2].T
         # Half of the noise is added, as the mean of its exponential is more than 1.
         # A lattice whose links have strength 1 has about the variance ln(32 / kappa) / 4 pi;
         # 1 is added for cells of many metres, where that would be negative.

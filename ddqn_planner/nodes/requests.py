@@ -125,7 +125,7 @@ class ModelSource:
         self._node, self.report, self._worker = node, report, worker
         # The first model, while it is being loaded.
         self.loading: Future | None = None
-        self._label = ""  # of the trainer's message that was taken last
+        self._label = ""  # of the trainer's message, if the model came by it
 
     @staticmethod
     def read(model: str) -> tuple[Planner, str]:
@@ -163,7 +163,7 @@ class ModelSource:
 
     def use(self, planner: Planner, file: str) -> None:
         """Plan with it from now on."""
-        self.planner, self.file, self.loading = planner, file, None
+        self.planner, self.file, self.loading, self._label = planner, file, None, ""
         planner.cache_bytes = self._node.value("field_cache_bytes")
         self.report.accept("model")
         self.report.change()
