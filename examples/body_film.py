@@ -39,15 +39,15 @@ def door() -> tuple[GridMap, Pose, Pose]:
 def lane() -> tuple[GridMap, Pose, Pose]:
     """Return a lane that is too narrow for a car's turning circle; it must turn round."""
     occupancy = np.zeros((70, 110), np.bool_)
-    occupancy[:18] = occupancy[52:] = True
+    occupancy[:12] = occupancy[58:] = True
     occupancy[:, [0, -1]] = True
-    return GridMap(occupancy, 0.05), (1.0, 1.4, 0.0), (1.0, 2.2, math.pi)
+    return GridMap(occupancy, 0.05), (1.5, 1.2, 0.0), (1.5, 2.4, math.pi)
 
 
 def main(arguments: Sequence[str]) -> int:
     """Save the film; return 1 if there is no path."""
     scenes = ("differential_robot", door()), ("car", lane())
-    figure, both = plt.subplots(2, 1, figsize=(5.5, 7.2), layout="constrained")
+    figure, both = plt.subplots(2, 1, figsize=(4.4, 5.8), layout="constrained")
     bodies: list[tuple[NDArray[Any], Any, Any]] = []
     for axes, (model, (grid, start, goal)) in zip(both, scenes, strict=True):
         planner = Planner.load(model)
