@@ -224,7 +224,7 @@ class PlannerNode(ManagedNode):
         goals = [request.goal]
         planning = self._requests.plan(start, goals, request.tolerance)
         header, outcome = await self._answer(lambda: None, goals, planning)
-        response.plan = _path(path_message, outcome, header)
+        (response.plan,) = _paths(outcome, header, path_message)
         self._report.log(outcome)
         return response
 
@@ -241,7 +241,7 @@ class PlannerNode(ManagedNode):
             return
         self._improve_later(outcome, active)
         if active.is_news(outcome, header.frame_id):
-            self._plan_publisher.publish(_path(path_bytes, outcome, header))
+            self._plan_publisher.publish(*_paths(outcome, header, path_bytes))
         self._waits_for_pose = outcome.status in ("NO_START", "TF_ERROR")
         path, request = outcome.plan.path, outcome.request
         leaves = request is not None and len(path) > 0 and request.grid.is_obstacle(path[0])
@@ -257,12 +257,13 @@ class PlannerNode(ManagedNode):
     ) -> tuple[Path, Outcome]:
         planning = self._requests.plan(start, goals, None, name, self._followed)
         header, outcome = await self._answer(given_up, goals, planning)
+        to_publish, path = _paths(outcome, header, path_bytes, path_message)
         if outcome.request is not None and len(outcome.plan.path):
             self._followed.keep(way_of(outcome.plan), outcome.request.grid, header.frame_id)
             self._improve_later(outcome, self._followed)
-            self._plan_publisher.publish(_path(path_bytes, outcome, header))
+            self._plan_publisher.publish(to_publish)
         self._report.log(outcome)
-        return _path(path_message, outcome, header), outcome
+        return path, outcome
 
     def _improve_later(self, outcome: Outcome, followed: ActiveGoal | PathUnderWay) -> None:
         """Find the least path for a body when the worker is idle, instead of any before."""
@@ -283,7 +284,7 @@ class PlannerNode(ManagedNode):
         )
         if better.request is not None and followed is self._active:
             if self._active.is_news(better, header.frame_id):
-                self._plan_publisher.publish(_path(path_bytes, better, header))
+                self._plan_publisher.publish(*_paths(better, header, path_bytes))
             self._display.show(better, header)
 
     async def _on_is_path_valid(self, request: Any, response: Any) -> Any:
@@ -436,14 +437,15 @@ class ExpectedTimes:
         return told
 
 
-def _path(make: Callable[..., Any], outcome: Outcome, header: Header) -> Any:
-    """Return the path of an outcome, or an empty one, made by a function of `conversions`."""
+def _paths(outcome: Outcome, header: Header, *makers: Callable[..., Any]) -> list[Any]:
+    """Return the path of an outcome, or an empty one, as functions of `conversions` make it."""
     if outcome.request is None or outcome.goal is None:
-        return Path(header=header)
+        return [Path(header=header) for _ in makers]
     if isinstance(outcome.plan, PosePlan):
-        return make(outcome.plan.poses[:, :2], outcome.plan.poses[:, 2], header)
-    poses = along(outcome.plan.path, outcome.request.grid, outcome.is_dense)
-    return make(*poses, header, outcome.goal.pose.orientation)
+        poses = outcome.plan.poses
+        return [make(poses[:, :2], poses[:, 2], header) for make in makers]
+    along_path = along(outcome.plan.path, outcome.request.grid, outcome.is_dense)
+    return [make(*along_path, header, outcome.goal.pose.orientation) for make in makers]
 
 
 def main() -> int:
