@@ -119,17 +119,17 @@ class PosePlanner:
     def steps(self, request: PoseRequest) -> Iterator[PosePlan | None]:
         """Yield None before each slow step, and last the plan."""
         began, grid = time.perf_counter(), request.grid
+        with self._lock:
+            rest = self._rest_of_path(request)
+        if rest is not None:
+            yield self._keep_or_switch(request, rest)
+            return
         self._check(grid)
         starts, *goals = ([*self._states(grid, p)] for p in (request.start, *request.goals))
         goals = [near for near in goals if grid.contains(near[0][:2])]
         if not goals or not grid.contains(starts[0][:2]):
             outside = PlanStatus.GOAL_OUTSIDE_MAP if goals == [] else PlanStatus.START_OUTSIDE_MAP
             yield PosePlan(outside)
-            return
-        with self._lock:
-            rest = self._rest_of_path(request)
-        if rest is not None:
-            yield self._keep_or_switch(request, rest)
             return
         yield None
         with self._lock:
