@@ -42,7 +42,8 @@ def robot(motion: str) -> tuple[Motions, NDArray[np.bool_]]:
 
 def planner(motion: str) -> PosePlanner:
     motions, swept = robot(motion)
-    return PosePlanner(SimpleNamespace(motions=motions, swept=lambda: swept))
+    body = read_footprint(BODIES[motion])
+    return PosePlanner(SimpleNamespace(motions=motions, swept=lambda: swept, footprint=body))
 
 
 def plan(planner: PosePlanner, grid: GridMap, start: Pose, *goals: Pose, **how: Any) -> PosePlan:
