@@ -249,6 +249,8 @@ class Planner:
         """Check what a user asks for, and plan."""
         move_rule, method, tolerance, simplified, radius = how
         check_grid(grid)
+        if self.pose_planner is not None:
+            raise ValueError("the model plans poses of a body; use plan_poses, or a planner_node")
         limits = 0, math.inf, "0 cells or more"
         request = PlanRequest(
             grid,

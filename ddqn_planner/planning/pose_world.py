@@ -37,7 +37,7 @@ class Body(NamedTuple):
     share: NDArray[np.float32]  # (C,): which part of the cost counts in this cell
     first_passed: NDArray[np.int64]  # (P + 1,)
     reach: int  # cells that a primitive sweeps to any side, at most
-    core: int  # the rows from here on are of cells that the body covers whatever its heading
+    core: int  # the rows from here on: what it sweeps around any cell that its origin passes
 
 
 class World(NamedTuple):
@@ -57,14 +57,19 @@ class World(NamedTuple):
 def body_of(motions: Motions, swept: NDArray[np.bool_]) -> Body:
     """Return what kernels need of primitives and the cells (P, S, S) that they sweep."""
     start, end, headings = motions.start, motions.end, np.arange(HEADINGS + 1)
-    # Where the body stands is what all primitives from there and to there sweep.
+    passed = [_passed(poses) for poses in motions.poses]
+    # Where the body stands is what all primitives from there and to there sweep; its core is what
+    # each sweeps around every cell that its origin passes.
     standing = np.ones((HEADINGS, *swept.shape[1:]), dtype=np.bool_)
-    for mask, before, after, (x, y) in zip(swept, start, end, motions.offset, strict=True):
+    core = np.ones((1, *swept.shape[1:]), dtype=np.bool_)
+    for mask, before, after, (x, y), (cells, _) in zip(
+        swept, start, end, motions.offset, passed, strict=True
+    ):
         standing[before] &= mask
         standing[after] &= np.roll(mask, (-y, -x), axis=(0, 1))
-    core = np.all(standing, axis=0, keepdims=True)
+        for over, up, _ in cells:
+            core &= np.roll(mask, (-up, -over), axis=(0, 1))
     row, first = rows_of(np.concatenate([swept, standing, core]))
-    passed = [_passed(poses) for poses in motions.poses]
     ending = np.argsort(end, kind="stable")
     return Body(
         into=np.searchsorted(end[ending], headings),
