@@ -129,3 +129,11 @@ def rows_of(swept: NDArray[np.bool_]) -> tuple[NDArray[np.int64], NDArray[np.int
     count = np.minimum(end - begin, 64)
     first = np.searchsorted(number, np.arange(len(swept) + 1))
     return np.column_stack([y - reach, begin - reach, count]), first
+
+
+def placed(corners: NDArray[np.float64], poses: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the corners (K, 2) of a body at poses (N, 3), in metres: (N, K, 2)."""
+    x, y, yaw = poses.T[..., None]
+    u, v = corners.T
+    turned = np.cos(yaw) * u - np.sin(yaw) * v, np.sin(yaw) * u + np.cos(yaw) * v
+    return np.stack([turned[0] + x, turned[1] + y], axis=-1)

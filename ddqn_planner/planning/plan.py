@@ -63,6 +63,19 @@ class PlanRequest:
         """The goal and the others, in their order."""
         return self.goal, *self.others
 
+    @property
+    def cells(self) -> tuple[Cell, ...]:
+        """Those of the start and the goals."""
+        return self.start, *self.goals
+
+    def to_nearest(self, others: Sequence[Cell]) -> PlanRequest:
+        """Return the request for a path to the nearest of several goals, none of which moves."""
+        return replace(self, tolerance=0.0, others=tuple(others))
+
+    def after(self, leg: Plan, goal: Cell) -> PlanRequest:
+        """Return the request for the next leg."""
+        return replace(self, start=leg.cells[-1], goal=goal)
+
 
 @dataclass(frozen=True, eq=False)
 class Plan:
@@ -168,8 +181,17 @@ def joined(plans: Sequence[Plan]) -> Plan:
     if not last.path.size:
         return last
     searched = any(plan.method is PlanMethod.ASTAR_FALLBACK for plan in plans)
+    whole: Plan = last
+    if isinstance(last, PosePlan):
+        legs = [plan for plan in plans if isinstance(plan, PosePlan)]
+        whole = replace(
+            last,
+            poses=np.concatenate([legs[0].poses[:1], *(leg.poses[1:] for leg in legs)]),
+            driven=sum(leg.driven for leg in legs),
+            bound=max(leg.bound for leg in legs),
+        )
     return replace(
-        last,
+        whole,
         path=np.concatenate([first.path[:1], *(plan.path[1:] for plan in plans)]),
         method=PlanMethod.ASTAR_FALLBACK if searched else PlanMethod.GREEDY,
         cost=None if first.cost is None else sum(plan.cost or 0.0 for plan in plans),

@@ -58,7 +58,7 @@ class Planner:
         self.network = network
         self.metadata = metadata
         self.fields = FieldCache(network)
-        self._poses = PosePlanner(network) if hasattr(network, "motions") else None
+        self.pose_planner = PosePlanner(network) if hasattr(network, "motions") else None
 
     @classmethod
     def load(cls, model: str | Path) -> Planner:
@@ -241,14 +241,16 @@ class Planner:
 
     def pose_steps(self, request: PoseRequest) -> Iterator[PosePlan | None]:
         """Yield None before each slow step, and last the plan of `plan_poses`."""
-        if self._poses is None:
+        if self.pose_planner is None:
             raise ValueError("the model knows no body; give one of ddqn-planner train-robot")
-        return self._poses.steps(request)
+        return self.pose_planner.steps(request)
 
     def _answer(self, grid: GridMap, start: Cell, goals: list[Cell], how: tuple[Any, ...]) -> Plan:
         """Check what a user asks for, and plan."""
         move_rule, method, tolerance, simplified, radius = how
         check_grid(grid)
+        if self.pose_planner is not None:
+            raise ValueError("the model plans poses of a body; use plan_poses, or a planner_node")
         limits = 0, math.inf, "0 cells or more"
         request = PlanRequest(
             grid,

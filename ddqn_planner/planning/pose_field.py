@@ -127,7 +127,8 @@ class PoseField:
         """Look at the map for what is left to the start; return whether a way may exist."""
         columns, rows = (self.world.width + 7) // TILE, (self.world.height + 7) // TILE
         left = np.empty((columns + 1) * (rows + 1), np.float32)
-        keys, numbers = np.empty(4 * left.size, np.float32), np.empty(4 * left.size, np.int64)
+        most = 8 * left.size + 4  # each corner opens its neighbours once
+        keys, numbers = np.empty(most, np.float32), np.empty(most, np.int64)
         x, y, _ = np.array(self.goals).T // TILE
         goals = np.unique(y * (columns + 1) + x)
         heap = left, keys, numbers
@@ -153,7 +154,9 @@ class PoseField:
         self._size = kernels.order(self.known, *heap, self._aim, self._weight, self.world)
         self._waiting, self._round = 0, self._round + 1
         if self._round == kernels.ROUNDS:
-            np.minimum(self.known.mark, kernels.CLOSED, out=self.known.mark)
+            for part in np.split(self.known.mark, range(2**20, self.known.mark.size, 2**20)):
+                if part.max() > kernels.CLOSED:  # so that memory is not used where nothing is
+                    np.minimum(part, kernels.CLOSED, out=part)
             self._round = 1
 
     def _open(self) -> NDArray[np.int64]:
@@ -166,8 +169,7 @@ class PoseField:
         number = self.number(start)
         if self.known.mark[number] == kernels.UNREACHED:
             return None
-        # No primitive but a turn costs less than a cell.
-        most = 4 * int(self.known.distance[number]) + HEADINGS
+        most = int(self.known.distance[number] / self.body.cost.min()) + 1
         primitives, costs = np.empty(most, np.int64), np.empty(most)
         inputs = self.known, number, primitives, costs, self.world, self.body
         count = kernels.follow(*inputs)
@@ -182,8 +184,8 @@ class PoseField:
         for x, y in low:
             near[x : x + high, y : y + high] = True
         tiles = np.flatnonzero(near.T)
-        raised = np.empty(self.visits // TAKEN_BACK + HEAP, np.int64)
-        scratch = np.empty(4 * raised.size, np.float32), np.empty(4 * raised.size, np.int64), raised
+        raised = np.empty(self.visits // TAKEN_BACK + 2**10, np.int64)
+        scratch = np.empty(8 * raised.size, np.float32), np.empty(8 * raised.size, np.int64), raised
         count = kernels.take_back(self.known, tiles, *scratch, world, self.body)
         if count < 0:
             return False

@@ -101,10 +101,10 @@ def sink(key: Any, number: int, place: int, keys: Any, numbers: Any, size: int) 
     keys[place], numbers[place] = key, number
 
 
-# A lower bound from the map. What the body covers whatever its heading, its core, must have room:
-# the robot's origin stays in tiles where it has. A shortest way in them bends at corners only, and
-# each straight part has a way over corners and diagonals of the same tiles that is longer by
-# `LONGER` at most, if a diagonal counts 7/5.
+# A lower bound from the map. Around each cell that the robot's origin passes, its core has room: so
+# the origin stays in tiles where it has. A shortest way in them bends at corners only, and each
+# straight part has a way over corners and diagonals of the same tiles that is longer by `LONGER` at
+# most, if a diagonal counts 7/5.
 
 STRAIGHT, DIAGONAL = 5, 7
 LONGER: Final = math.sqrt(1 + (DIAGONAL / STRAIGHT - 1) ** 2)
@@ -164,7 +164,7 @@ def spread(
                     continue
                 after = after_y * (columns + 1) + after_x
                 cost = here + (STRAIGHT if step_x == 0 or step_y == 0 else DIAGONAL)
-                if cost >= left[after] or size == keys.size:
+                if cost >= left[after]:
                     continue
                 if is_way(x, y, step_x, step_y, world, body):
                     left[after] = cost

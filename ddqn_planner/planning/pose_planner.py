@@ -5,26 +5,36 @@ from __future__ import annotations
 import math
 import threading
 import time
-from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field, replace
 from itertools import product
 from typing import Any, Final, NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ddqn_planner.grid import GridMap
+from ddqn_planner.grid import Cell, GridMap
 from ddqn_planner.grid.motions import HEADINGS, turn_between
 from ddqn_planner.planning.field import offset_between
 from ddqn_planner.planning.plan import ROUNDING, PlanStatus, PosePlan
 from ddqn_planner.planning.pose_field import PoseField, State
 from ddqn_planner.planning.pose_kernels import SAME
+from ddqn_planner.planning.pose_paths import (
+    REACH,
+    cells_of,
+    cost_of_poses,
+    in_cells,
+    outline_of,
+    rest_of_poses,
+)
 from ddqn_planner.planning.pose_world import World, body_of, differences, world_of
+from ddqn_planner.planning.segments import SAME_COST
 
 Pose: TypeAlias = tuple[float, float, float]  # metres, metres, radians; in the map frame
 
 VISITS = 2**16  # states that a field visits in one step of a plan: some 30 ms
 KEPT: Final = 3  # fields, those used last
+TWO_NEAREST = 0.5  # radians: no yaw is farther from the two headings nearest to it
 ON_PATH = 0.5, math.pi / HEADINGS  # a start so near to a pose, in cells and radians, lies on it
 
 
@@ -37,6 +47,22 @@ class PoseRequest:
     goals: tuple[Pose, ...]  # the nearest one counts
     tolerance: tuple[float, float] = (0.0, 0.0)
     bound: float = 1.2
+    under_way: Any = field(default=(), compare=False)  # (N, 3) what the robot follows
+    switch_threshold: float = 0.0  # the share by which the rest of it may cost more than a new path
+
+    @property
+    def cells(self) -> tuple[Cell, ...]:
+        """Those of the start and the goals."""
+        return tuple(self.grid.world_to_cell(x, y) for x, y, _ in (self.start, *self.goals))
+
+    def to_nearest(self, others: Sequence[Pose]) -> PoseRequest:
+        """Return the request for a path to the nearest of several goals, none of which moves."""
+        return replace(self, tolerance=(0.0, 0.0), goals=(*self.goals, *others))
+
+    def after(self, leg: PosePlan, goal: Pose) -> PoseRequest:
+        """Return the request for the next leg."""
+        x, y, yaw = leg.poses[-1].tolist()
+        return replace(self, start=(x, y, yaw), goals=(goal,))
 
 
 @dataclass(eq=False)
@@ -78,8 +104,9 @@ class PosePlanner:
     """Keeps the fields of the goals used last. Several threads may use it."""
 
     def __init__(self, network: Any) -> None:
-        self.motions = network.motions
+        self.motions, self.footprint = network.motions, network.footprint
         self.body = body_of(network.motions, network.swept())
+        self.outline = outline_of(self.footprint, self.motions.resolution)
         # Of each primitive, in all poses: the first one, and how many follow it.
         self._poses = np.concatenate(self.motions.poses)
         self._count = np.array([len(poses) - 1 for poses in self.motions.poses])
@@ -92,17 +119,17 @@ class PosePlanner:
     def steps(self, request: PoseRequest) -> Iterator[PosePlan | None]:
         """Yield None before each slow step, and last the plan."""
         began, grid = time.perf_counter(), request.grid
+        with self._lock:
+            rest = self._rest_of_path(request)
+        if rest is not None:
+            yield self._keep_or_switch(request, rest)
+            return
         self._check(grid)
         starts, *goals = ([*self._states(grid, p)] for p in (request.start, *request.goals))
         goals = [near for near in goals if grid.contains(near[0][:2])]
         if not goals or not grid.contains(starts[0][:2]):
             outside = PlanStatus.GOAL_OUTSIDE_MAP if goals == [] else PlanStatus.START_OUTSIDE_MAP
             yield PosePlan(outside)
-            return
-        with self._lock:
-            rest = self._rest_of_path(request)
-        if rest is not None:
-            yield rest
             return
         yield None
         with self._lock:
@@ -114,14 +141,43 @@ class PosePlanner:
         exact = [state for near in goals for state in [*filter(empty.has_room, near)][:1]]
         around = filter(empty.has_room, self._around(request)) if any(request.tolerance) else ()
         plan = PosePlan(PlanStatus.GOAL_OCCUPIED)
-        for states in filter(None, (tuple(exact), tuple(around))):
+        for states in filter(None, map(tuple, (exact, around))):
             while not self._grow(request, states, start):
                 yield None
             with self._lock:
                 plan = self._follow(request, states, start, began)
             if plan.poses.size:
                 break
-        yield plan
+        yield self._keep_or_switch(request, plan)
+
+    def rest_of(
+        self, poses: Any, robot: Pose, grid: GridMap, reach: tuple[float, float] = REACH
+    ) -> NDArray[np.float64]:
+        """Return a path from the pose nearest to a robot on; empty if it is far, or has no room."""
+        return rest_of_poses(poses, robot, grid, self.outline, reach)
+
+    def _keep_or_switch(self, request: PoseRequest, plan: PosePlan) -> PosePlan:
+        """Return the rest of the path under way if it hardly costs more than a plan, or that."""
+        if not plan.poses.size or not len(request.under_way):
+            return plan
+        rest, grid = self.rest_of(request.under_way, request.start, request.grid), request.grid
+        if not any(_meets(rest[-1:], end, grid) for end in (plan.poses[-1], *request.goals)):
+            return plan
+        (driven, cost), (_, least) = (cost_of_poses(way, grid) for way in (rest, plan.poses))
+        if cost > (1 + request.switch_threshold) * least * SAME_COST:
+            return plan
+        cells = cells_of(in_cells(rest, grid))
+        share = cost / least if least else 1.0
+        return replace(
+            plan,
+            path=cells[np.append(True, (cells[1:] != cells[:-1]).any(axis=1))],
+            poses=rest,
+            cost=(plan.cost or 0.0) * share,
+            goal=(int(cells[-1, 0]), int(cells[-1, 1])),
+            extra_cost=share - 1,
+            driven=driven,
+            bound=max(plan.bound * share, 1.0),
+        )
 
     def _check(self, grid: GridMap) -> None:
         """Raise a ValueError if the map's cells are not of the size that the robot learned."""
@@ -145,9 +201,10 @@ class PosePlanner:
             turn = np.abs(turn_between(self.motions.angles, yaw - grid.origin[2]))
             headings = np.flatnonzero(turn <= max(radians * ROUNDING, turn.min())).tolist()
             far = math.floor(metres * ROUNDING / grid.resolution)
-            for over, up in product(range(-far, far + 1), repeat=2):
-                cell = column + over, line + up
-                if math.hypot(over, up) <= far and grid.contains(cell):
+            places = (column, grid.width), (line, grid.height)
+            on_map = (range(max(at - far, 0), min(at + far + 1, size)) for at, size in places)
+            for cell in product(*on_map):
+                if math.dist(cell, (column, line)) <= far:
                     yield from ((*cell, heading) for heading in headings)
 
     def _rest_of_path(self, request: PoseRequest) -> PosePlan | None:
@@ -245,6 +302,13 @@ class PosePlanner:
         rollout_ms = 1e3 * (time.perf_counter() - grown)
         plan = known.way.plan(0, grid)
         return replace(plan, field_ms=1e3 * (grown - began), rollout_ms=rollout_ms)
+
+
+def _meets(ends: NDArray[np.float64], pose: Any, grid: GridMap) -> bool:
+    """Return whether a path ends at a pose, as far as states do."""
+    x, y, yaw = np.abs(ends - pose).T
+    near = np.hypot(x, y) <= grid.resolution, np.abs(turn_between(0, yaw)) <= TWO_NEAREST
+    return bool(np.all(near)) and len(ends) > 0
 
 
 def _asked(request: PoseRequest) -> tuple[object, ...]:

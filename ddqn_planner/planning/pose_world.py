@@ -5,10 +5,11 @@ from __future__ import annotations
 from typing import Any, Final, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import DTypeLike, NDArray
 
 from ddqn_planner.compiled import inlined
 from ddqn_planner.grid import MOVES, GridMap
+from ddqn_planner.grid.arguments import OCCUPIED
 from ddqn_planner.grid.footprint import rows_of
 from ddqn_planner.grid.grid_map import MULTIPLIERS
 from ddqn_planner.grid.motions import HEADINGS, Motions, closer
@@ -36,7 +37,7 @@ class Body(NamedTuple):
     share: NDArray[np.float32]  # (C,): which part of the cost counts in this cell
     first_passed: NDArray[np.int64]  # (P + 1,)
     reach: int  # cells that a primitive sweeps to any side, at most
-    core: int  # the rows from here on are of cells that the body covers whatever its heading
+    core: int  # the rows from here on: what it sweeps around any cell that its origin passes
 
 
 class World(NamedTuple):
@@ -56,14 +57,19 @@ class World(NamedTuple):
 def body_of(motions: Motions, swept: NDArray[np.bool_]) -> Body:
     """Return what kernels need of primitives and the cells (P, S, S) that they sweep."""
     start, end, headings = motions.start, motions.end, np.arange(HEADINGS + 1)
-    # Where the body stands is what all primitives from there and to there sweep.
+    passed = [_passed(poses) for poses in motions.poses]
+    # Where the body stands is what all primitives from there and to there sweep; its core is what
+    # each sweeps around every cell that its origin passes.
     standing = np.ones((HEADINGS, *swept.shape[1:]), dtype=np.bool_)
-    for mask, before, after, (x, y) in zip(swept, start, end, motions.offset, strict=True):
+    core = np.ones((1, *swept.shape[1:]), dtype=np.bool_)
+    for mask, before, after, (x, y), (cells, _) in zip(
+        swept, start, end, motions.offset, passed, strict=True
+    ):
         standing[before] &= mask
         standing[after] &= np.roll(mask, (-y, -x), axis=(0, 1))
-    core = np.all(standing, axis=0, keepdims=True)
+        for over, up, _ in cells:
+            core &= np.roll(mask, (-up, -over), axis=(0, 1))
     row, first = rows_of(np.concatenate([swept, standing, core]))
-    passed = [_passed(poses) for poses in motions.poses]
     ending = np.argsort(end, kind="stable")
     return Body(
         into=np.searchsorted(end[ending], headings),
@@ -97,19 +103,32 @@ def _passed(poses: NDArray[np.float64]) -> tuple[NDArray[np.int64], NDArray[np.f
     return np.column_stack([cells, [*leaves, 0]]), share
 
 
-def _occupied(grid: GridMap) -> NDArray[np.bool_]:
+def occupied_for_body(grid: GridMap) -> NDArray[np.bool_]:
     """Return the cells that no body may touch: what is only too near for a disc's body is free."""
     return grid.occupancy if grid.obstacles is None else grid.obstacles
+
+
+def body_costs(grid: GridMap) -> NDArray[np.int8] | None:
+    """Return what cells cost, if they do: the most where only a disc's body is too near."""
+    if grid.cost is None or grid.obstacles is None:
+        return grid.cost
+    return np.where(grid.occupancy, np.int8(OCCUPIED), grid.cost)
+
+
+def _layer(layer: NDArray[Any] | None, dtype: DTypeLike) -> NDArray[Any]:
+    """Return a layer, or an empty one, read-only: for others numba compiles the kernels again."""
+    array = np.empty((0, 0), dtype) if layer is None else layer.view()
+    array.flags.writeable = False
+    return array
 
 
 def world_of(
     grid: GridMap, older: World | None = None, cells: NDArray[np.int64] | None = None
 ) -> World:
     """Return a map for kernels: from scratch, or from an older one that differs in cells (N, 2)."""
-    occupied = _occupied(grid)
+    occupied = occupied_for_body(grid)
     height, width = occupied.shape
     words = (width + 2 * BORDER + 63) // 64 + 1
-    none = np.empty((0, 0), dtype=np.int8)
     bits = np.full((height + 2 * BORDER, words), -1, np.int64) if older is None else older.bits
     bits = bits.view(np.uint64).copy()
     tile = np.zeros(((height + TILE - 1) // TILE, (width + TILE - 1) // TILE), dtype=np.uint8)
@@ -130,10 +149,10 @@ def world_of(
     tile[near] = room[near] = 0
     return World(
         bits,
-        none if grid.cost is None else grid.cost,
+        _layer(body_costs(grid), np.int8),
         MULTIPLIERS if grid.cost is None else np.append(MULTIPLIERS, MULTIPLIERS[-1:]),
-        none.astype(np.float32) if grid.slowness is None else grid.slowness,
-        none.astype(np.uint8) if grid.forbidden is None else grid.forbidden,
+        _layer(grid.slowness, np.float32),
+        _layer(grid.forbidden, np.uint8),
         tile.ravel(),
         room.ravel(),
         height,
@@ -146,7 +165,7 @@ def differences(old: GridMap, new: GridMap) -> tuple[NDArray[np.int64], bool] | 
 
     None if the maps cannot be compared, or differ in too much.
     """
-    layers = ("cost", "slowness", "forbidden", "obstacles")
+    layers = ("cost", "slowness", "forbidden", "occupancy", "obstacles")
     pairs = [(getattr(old, name), getattr(new, name)) for name in layers]
     has_same = all((before is None) == (after is None) for before, after in pairs)
     if not has_same or old.occupancy.shape != new.occupancy.shape:
@@ -154,13 +173,13 @@ def differences(old: GridMap, new: GridMap) -> tuple[NDArray[np.int64], bool] | 
     boxes = new.patches_since(old)
     if boxes is None:
         boxes = [(slice(0, new.height), slice(0, new.width))]
-    before, after = _occupied(old), _occupied(new)
+    before, after = occupied_for_body(old), occupied_for_body(new)
     found, opens = [np.empty((0, 2), np.int64)], False
     for rows, columns in boxes:
         box = rows, columns
         differs = before[box] != after[box]
         opens = opens or bool((differs & before[box]).any())
-        for one, other in pairs[:3]:
+        for one, other in pairs[:4]:
             if one is not None and one is not other:
                 changed = (one[box] != other[box]) & ~after[box]
                 opens = opens or bool(changed.any())
