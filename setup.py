@@ -63,6 +63,7 @@ setup(
             "pytest>=7.4",
             "pytest-xdist>=3.5",
             "ruff>=0.9",
+            "shapely>=2.0",
             "types-PyYAML",
             "types-tqdm",
         ],

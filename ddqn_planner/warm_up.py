@@ -22,13 +22,17 @@ def warm_up(planner: Planner, learns: bool = False) -> Iterator[None]:
     start, goal = (0, 0), (free.shape[1] - 1, free.shape[0] - 1)
     # Unit costs and expected times have the same code as costs.
     grid = GridMap(free, cost=free.astype(np.int8))
-    planner.plan(grid, start, goal, simplified=True)
-    planner.plan(grid.with_patch([[True]], 1, 1), start, goal)
-    is_path_valid([start, goal], start, grid, planner.metadata.move_rule)
     if learns:
         experience = Experience(nominal_speed=1.0)
         experience.record(np.arange(9.0), np.full((9, 2), 4.5) + np.arange(9.0)[:, None] / 3)
         experience.apply(grid)
+    if planner.pose_planner is not None:
+        _plan_poses(planner)
+        yield
+        return
+    planner.plan(grid, start, goal, simplified=True)
+    planner.plan(grid.with_patch([[True]], 1, 1), start, goal)
+    is_path_valid([start, goal], start, grid, planner.metadata.move_rule)
     yield
     # From an obstacle there is a way out, to where a path begins, perhaps in one direction only.
     obstacle = free.copy()
@@ -37,3 +41,21 @@ def warm_up(planner: Planner, learns: bool = False) -> Iterator[None]:
         blocked = GridMap(obstacle, forbidden=forbidden)
         planner.plan(blocked, start, goal, start_clearing_radius=1.0)
     yield
+
+
+def _plan_poses(planner: Planner) -> None:
+    """Plan where a wall divides a map, then through it, and look what is left of the path."""
+    import numpy as np
+
+    from ddqn_planner.grid import GridMap
+
+    assert planner.pose_planner is not None
+    reach, cell = planner.pose_planner.body.reach, planner.pose_planner.motions.resolution
+    room = 2 * reach + 48  # cells; a field visits more of its states before it looks at the map
+    walled = np.zeros((room, 2 * room), np.bool_)
+    walled[:, room] = True
+    grid, ends = GridMap(walled, cell), np.array([[room / 2, room / 2], [1.5 * room, room / 2]])
+    start, goal = ((*end, 0.0) for end in (ends * cell).tolist())
+    planner.plan_poses(grid, start, goal)
+    plan = planner.plan_poses(grid.with_patch(np.zeros((room, 1), np.bool_), room, 0), start, goal)
+    planner.pose_planner.rest_of(plan.poses, start, grid)

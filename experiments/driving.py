@@ -15,16 +15,15 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 import driving_worlds as worlds
 import numpy as np
 from driving_learners import LEARNERS
-from driving_missions import Job, Result, planner, run, run_in, world_of
+from driving_missions import Job, Result, planner, run, run_in
 from driving_worlds import HELD_OUT, HELD_OUT_SEED, ON_FILES, RULE, SPEED, TUNING, World, drive
-from figures import draw_slowness, draw_times, save_figure
+from figures import draw_times, save_figure
 from random_maps import generate_map
 from tables import table, write_report
 from trainings import in_parallel, make_folder, parser_of
 
 from ddqn_planner import Experience, GridMap
 from ddqn_planner.cli import exit_code
-from ddqn_planner.grid import Cell
 from ddqn_planner.grid.noise import random_requests
 
 Options = argparse.Namespace
@@ -43,7 +42,6 @@ DRAWN: Final = (EXPERIENCE, SHORTEST, "Gaussian process", "Markov field")
 SMOOTHED: Final = 10  # missions that a point of the curve averages
 DOOR_WAITS, DOOR_DRIVES = (10, 30, 60), 40
 ZONE_NOISES, ZONE_RATES, ZONE_WIDTHS = (0.02, 0.035, 0.05), (10, 50), (0.2, 0.35, 0.5)
-VISITED: Final = 0.8  # share of the uncertainty of unknown cells below which the robot was near
 
 
 def compared(options: Options) -> Sections:
@@ -169,49 +167,6 @@ def speed(_: Options) -> Sections:
     return {"Speed": table("1,000 poses on 1000 x 1000 cells | median [ms] | worst [ms]", rows)}
 
 
-def pictures(options: Options, missions: int = 50) -> Sections:
-    """Draw the true and the learned slowness of a world, with the routes of a mission."""
-    job = Job("office-mixture", 1, EXPERIENCE, missions)
-    world, experience = world_of(job), Experience(SPEED)
-    run_in(job, world, experience)
-    grid, truth = world.grid, world.slowness(0)
-
-    def saved(ends: tuple[Cell, Cell]) -> float:
-        of_routes = world.routes(planner(), *ends, 0).values()
-        shortest, best = (worlds.path_seconds(cells, world, 0) for cells in of_routes)
-        return shortest - best
-
-    start, goal = max(itertools.combinations(world.stations, 2), key=saved)
-    shortest, best = world.routes(planner(), start, goal, 0).values()
-    learned = planner().plan(experience.apply(grid), start, goal, RULE).cells
-    routes = {"shortest": shortest, "learned": learned, "best possible": best}
-    unsure = experience.uncertainty(grid)
-    visited = unsure < VISITED * unsure.max()
-    known = np.where(visited, experience.slowness(grid), np.nan)
-    panels = {
-        "what nobody told the robot: true slowness": (truth, routes),
-        f"what it learned from {missions} missions (grey: never there)": (known, routes),
-    }
-    figure, title = (
-        draw_slowness(grid, world.stations, panels, (11, 5.6)),
-        "True and learned slowness",
-    )
-    return {title: save_figure(figure, options.out / "map.png", f"{title}, and the routes")}
-
-
-def tuning(options: Options) -> Sections:
-    """Print a line for each kind of world for tuning, and the mean, for some learners."""
-    for learner in options.learner or [EXPERIENCE]:
-        own = _runs(TUNING, [learner], options)
-        names = "  ".join(f"{first + 1:3}-{end:3}" for first, end in STAGES)
-        print(f"{learner:24} {names}  1-20 over the shortest path")
-        for name, results in {**_by(own, "kind"), "mean": own}.items():
-            over = 100 * np.mean([result.over_shortest(0, 20) for result in results]) - 100
-            line = "  ".join(f"{value:7.1f}" for value in _above(results))
-            print(f"{name:24} {line}  {over:7.1f}", flush=True)
-    return {}
-
-
 FIGURES: Final[dict[str, Callable[[Options], Sections]]] = {
     "compared": compared,
     "faulty": faulty,
@@ -221,7 +176,6 @@ FIGURES: Final[dict[str, Callable[[Options], Sections]]] = {
     "doors": doors,
     "zones": zones,
     "speed": speed,
-    "pictures": pictures,
 }
 
 
@@ -325,8 +279,6 @@ def measure(options: Options) -> int:
         options.sets["Maps from files"] = found
     if options.quick:
         options.sets = {title: kinds[:2] for title, kinds in options.sets.items()}
-    if options.tuning:
-        return len(tuning(options))
     sections = Sections()
     for name in options.figure or FIGURES:
         sections |= FIGURES[name](options)
@@ -343,8 +295,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
     add("--figure", action="append", choices=FIGURES, help="measure some of the figures alone")
     words = "what `Experience.apply` is given (default: %(default)s)"
     add("--exploration", type=float, default=0.1, metavar="SHARE", help=words)
-    add("--tuning", action="store_true", help="print the results of worlds for tuning, no report")
-    add("--learner", action="append", choices=LEARNERS, help="those of --tuning")
     options = parser.parse_args(arguments)
     return exit_code(parser.prog, lambda: measure(options))
 

@@ -105,8 +105,7 @@ def train_supervised(training: Training) -> None:
         gradient.q[:] /= SUPERVISED_BATCH
         differentiate(network, gradient, SUPERVISED_BATCH)
         rate = SUPERVISED_LEARNING_RATE * (1 - 0.95 * number / steps)
-        moments = mean.weights, square.weights
-        adam(network.weights, gradient.weights, *moments, rate, number + 1)
+        adam(network, gradient, mean, square, rate, number + 1)
     trainer.save_model(path)
 
 

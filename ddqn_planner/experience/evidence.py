@@ -25,7 +25,7 @@ VARIANCE, VARIED_PLACES = 1.0, 4.0  # of the log slowness of places, as if of so
 LEAST_VARIANCE, MOST_VARIANCE = 0.05, 2.0
 ALIKE = 8.0  # so many places of a path tell as much of other places as one alone
 NOMINAL = 2.0  # inverse variance of the log slowness of all places, before the first drive
-TRUST, TRUSTED = 1.0, 0.5  # in the prior: at first, and the inverse variance of that
+TRUST, TRUSTED = 0.4, 0.25  # in the prior: at first, and the inverse variance of that
 SURE_PLACES = 20  # fewer say nothing about the robot's speed in the open
 OUTLIER = 2.5  # a visit is moved to so many standard deviations from what was expected
 KNOWN = 0.7  # weight of visits from which a place is known
@@ -34,8 +34,7 @@ MOST = 6.0  # weight of visits that a place keeps
 PART, SURPRISE = 8, 3.5  # so many places have changed if they are off by more deviations
 PART_NOISE = 0.12  # of their mean log slowness, as each way through a place is another
 DRIVE_NOISE = 0.05  # standard deviation of what the log slowness of so many places has in common
-CHANGED, CHANGED_AROUND = 0.1, 1.5  # share of evidence that is left within so many metres
-CHANGED_FAR = 0.25  # and elsewhere: where one place changed, others did
+CHANGED = 0.01  # share of all evidence that is left then: where one place changed, others did
 
 WAIT_PASSAGES = 0.1  # passages without a wait that are assumed
 # Robots that wait on both sides of a door wait at one place, between them: waits within so many
@@ -49,13 +48,13 @@ SHORTEST = 8  # a drive through fewer places says little about how sure expected
 KEPT, ASSUMED = 64, 8  # drives whose errors count, and drives assumed before, with normal errors
 NORMAL = 1.645  # 90 % of a normal distribution lie within so many standard deviations
 TAIL = 0.04  # share of errors beyond each bound: not 5 %, as successive drives are alike
-PARTS = 256  # of a path, between which it is computed what they have in common
-CORRELATED = 5.0  # places so many sides apart have a third of their error in common
+CORRELATED = 10.0  # so many places in a row have their error in common
 
 # Of each place: the weight of its visits, that times their log slowness, what the prior foretold of
-# it before, where it was visited first, and the driven time when the weights were last faded.
-COLUMNS = "weight", "log", "foretold", "x", "y", "time"
+# it before, and where it was visited first.
+COLUMNS = "weight", "log", "foretold", "x", "y"
 WAIT_COLUMNS = "seconds", "passages", "x", "y"
+IN_FILES = "evidence", "waits", "driven", "noise", "errors"  # what they keep
 
 
 class Visits(NamedTuple):
@@ -64,6 +63,9 @@ class Visits(NamedTuple):
     position: Float64
     seconds: Float64
     metres: Float64
+
+
+NO_VISITS = Visits(np.zeros((0, 2)), np.zeros(0), np.zeros(0))
 
 
 class Evidence:
@@ -99,17 +101,19 @@ class Evidence:
         if len(visits.position):
             self._add_visits(visits)
         self._add_waits(visits, waits)
+        period = self.half_life / FADING_STEPS
+        before = self.driven // period
         self.driven += float(visits.seconds.sum() + waits[:, 2].sum())
+        self.table[:, :2] *= 0.5 ** ((self.driven // period - before) / FADING_STEPS)
         self._fit()
 
     def _add_visits(self, visits: Visits) -> None:
         rows, noise = self._rows(visits.position), self.noise
         slowness = visits.seconds * self.nominal_speed / visits.metres
         log = np.log(np.clip(slowness, 1 / MAX_SLOWNESS, MAX_SLOWNESS))
-        weight, sum_of_log = self.faded()[rows].T
+        weight, sum_of_log = self.table[rows, :2].T
         variance = 1 / (weight / noise + 1 / self.place_variance)
-        expected = self.trust[0] * np.ones(len(rows))
-        expected += (sum_of_log - weight * expected) / noise * variance
+        expected = self.trust[0] + (sum_of_log - weight * self.trust[0]) / noise * variance
         surprise = log - expected
         most = OUTLIER * np.sqrt(noise + variance)
         believed = np.clip(surprise, -most, most)
@@ -119,30 +123,28 @@ class Evidence:
         count += int(known.sum())
         surplus = max(count / OLD_VISITS, 1)
         self.noise_sums = total / surplus, count / surplus
-        changed = self._changed(visits.position, surprise, weight)
+        changed = self._changed(surprise, weight)
         believed[changed] = surprise[changed]
-        places = np.unique(rows)
-        self.table[places, :2] = self.faded()[places]
-        self.table[places, 5] = self.driven
         weight = visits.metres / self.side
         np.add.at(self.table[:, 0], rows, weight)
         np.add.at(self.table[:, 1], rows, weight * (expected + believed))
-        self.table[places, :2] /= np.maximum(self.table[places, :1] / MOST, 1)
+        self._bound()
 
-    def _changed(self, position: Float64, surprise: Float64, weight: Float64) -> NDArray[np.int64]:
-        """Return the visits that were other than all before; most of that is forgotten."""
+    def _bound(self) -> None:
+        """Bound the weights of places, so that what is new counts."""
+        self.table[:, :2] /= np.maximum(self.table[:, :1] / MOST, 1)
+
+    def _changed(self, surprise: Float64, weight: Float64) -> NDArray[np.int64]:
+        """Return the visits that were other than all before; then hardly anything is known."""
         changed, known = [np.zeros(0, np.int64)], np.flatnonzero(weight >= KNOWN)
-        near = np.zeros(len(self.table), dtype=np.bool_)
         for part in np.array_split(known, max(1, len(known) // PART)):
             if len(part) < PART / 2:
                 continue
             variance = self.noise * (1 + 1 / weight[part]).mean() / len(part) + PART_NOISE**2
             if abs(surprise[part].mean()) > SURPRISE * math.sqrt(variance):
                 changed.append(part)
-                away = self.table[:, 3:5] - position[part].mean(axis=0)
-                near |= np.hypot(*away.T) <= CHANGED_AROUND + len(part) * self.side / 2
-        if near.any():
-            self.table[:, :2] *= np.where(near, CHANGED, CHANGED_FAR)[:, None]
+        if len(changed) > 1:
+            self.table[:, :2] *= CHANGED
         return np.concatenate(changed)
 
     def _add_waits(self, visits: Visits, waits: Float64) -> None:
@@ -170,41 +172,32 @@ class Evidence:
         self.waits[row, 2:] += away[row] / NEAREST_WAITS
         return row
 
-    def add_failure(self, x: float, y: float, seconds: float) -> None:
-        """Add a failure, which costs as much as a wait of so many seconds."""
-        self._add_waits(NO_VISITS, np.array([[x, y, seconds]]))
-
     def expected_waits(self) -> Iterator[tuple[Float64, float]]:
         """Yield where robots wait, and the mean seconds of a passage."""
         for seconds, passages, x, y in self.waits.tolist():
             yield np.array([x, y]), seconds / (passages + WAIT_PASSAGES)
 
+    def _squares(self, position: Float64) -> list[tuple[int, int]]:
+        """Return the square of the world of each position."""
+        return list(map(tuple, np.floor(position / self.side).astype(np.int64).tolist()))
+
     def _rows(self, position: Float64) -> NDArray[np.int64]:
         """Return the row of each position; new places get one."""
-        before = len(self.places)
-        keys = map(tuple, np.floor(position / self.side).astype(np.int64).tolist())
-        rows = np.array([self.places.setdefault(key, len(self.places)) for key in keys])
+        before, squares = len(self.places), self._squares(position)
+        rows = np.array([self.places.setdefault(at, len(self.places)) for at in squares])
         visited, first = np.unique(rows, return_index=True)
         first = first[visited >= before]
         fresh = np.zeros((len(first), len(COLUMNS)))
-        fresh[:, 3:5], fresh[:, 5] = position[first], self.driven
+        fresh[:, 3:5] = position[first]
         if self.posterior is not None:
-            fresh[:, 2] = np.append(self.posterior.foretold, 0)[
-                self.posterior.places_at(fresh[:, 3:5])
-            ]
+            places = self.posterior.places_at(fresh[:, 3:5])
+            fresh[:, 2] = np.append(self.posterior.foretold, 0)[places]
         self.table = np.concatenate([self.table, fresh])
         return rows
 
-    def faded(self) -> Float64:
-        """Return the weight of each row, and that times the log slowness, of now: (N, 2)."""
-        period = self.half_life / FADING_STEPS
-        elapsed = np.maximum(math.floor(self.driven / period) * period - self.table[:, 5:], 0)
-        weights: Float64 = self.table[:, :2] * 0.5 ** (elapsed / self.half_life)
-        return weights
-
     def _fit(self) -> None:
         """Learn what all places have in common, how they differ, and what the prior is worth."""
-        weight, sum_of_log = self.faded().T
+        weight, sum_of_log = self.table[:, :2].T
         seen = weight >= 0.2
         weight, foretold = weight[seen], self.table[seen, 2]
         log = sum_of_log[seen] / weight
@@ -250,11 +243,10 @@ class Evidence:
         share, known = seconds / seconds.sum(), posterior.known[places]
         of_visits = self.noise * (share**2 * np.maximum(self.side / metres, 1)).sum()
         of_all = self.trust_variance[0, 0] * float(share @ (1 - known)) ** 2 + DRIVE_NOISE**2
-        weighted, at = share * np.sqrt(posterior.variance[places]), np.cumsum(metres)
-        begins = np.unique(np.linspace(0, len(at) - 1, PARTS).astype(np.int64))
-        weighted, at = np.add.reduceat(weighted, begins), at[begins]
-        same = np.exp(-np.abs(at[:, None] - at) / (CORRELATED * self.side))
-        return float(np.sqrt(weighted @ same @ weighted + of_visits + of_all))
+        errors = share * np.sqrt(posterior.variance[places])
+        alike = np.maximum(CORRELATED * self.side / metres, 1)
+        of_places = min(float((errors**2 * alike).sum()), float(errors.sum()) ** 2)
+        return math.sqrt(of_places + of_visits + of_all)
 
     def quantiles(self) -> Float64:
         """Return the lower bound, the mean, and the upper bound of 90 % of the errors of drives."""
@@ -283,10 +275,8 @@ class Evidence:
         """Add what other evidence has."""
         if len(other.table):
             rows = self._rows(other.table[:, 3:5])
-            places = np.unique(rows)
-            self.table[places, :2], self.table[places, 5] = self.faded()[places], self.driven
-            np.add.at(self.table[:, :2], rows, other.faded())
-            self.table[places, :2] /= np.maximum(self.table[places, :1] / MOST, 1)
+            np.add.at(self.table[:, :2], rows, other.table[:, :2])
+            self._bound()
         for seconds, passages, x, y in other.waits.tolist():
             self.waits[self._wait_at(x, y), :2] += seconds, passages
         self.noise_sums = tuple(np.add(self.noise_sums, other.noise_sums).tolist())
@@ -303,34 +293,23 @@ class Evidence:
 
     def arrays(self) -> dict[str, Any]:
         """Return what a file keeps."""
-        return {
-            "evidence": self.table,
-            "waits": self.waits,
-            "driven": self.driven,
-            "noise": self.noise_sums,
-            "errors": self.errors,
-        }
+        kept = self.table, self.waits, self.driven, self.noise_sums, self.errors
+        return dict(zip(IN_FILES, kept, strict=True))
 
     def restore(self, arrays: Mapping[str, NDArray[Any]]) -> None:
         """Take what a file keeps; a ValueError if it cannot be true."""
-        names = "evidence", "waits", "driven", "noise", "errors"
-        table, waits, driven, noise, errors = given = [arrays[name] for name in names]
-        if not all(array.dtype.kind in "if" and np.isfinite(array).all() for array in given):
+        given = [arrays[name].astype(np.float64) for name in IN_FILES]
+        if not all(np.isfinite(array).all() for array in given):
             raise ValueError("it holds what is no finite number")
-        shapes = table.shape, waits.shape, driven.shape, noise.shape, errors.shape
-        rows = (len(table), len(COLUMNS)), (len(waits), len(WAIT_COLUMNS))
-        if shapes != (*rows, (), (2,), (errors.size,)):
-            raise ValueError(f"its arrays do not fit: they have the shapes {shapes}")
-        squares = np.floor(table[:, 3:5] / self.side).tolist()
-        places = {(int(x), int(y)): row for row, (x, y) in enumerate(squares)}
+        table, waits, driven, noise, errors = given
+        places = {at: row for row, at in enumerate(self._squares(table[:, 3:5]))}
         total, visits = noise.tolist()
-        wrong = (table[:, 0] < 0).any() or (np.abs(table[:, 3:5]) > FARTHEST).any()
-        wrong = wrong or (waits[:, :2] < 0).any() or len(places) != len(table)
-        if wrong or (table[:, 5] > driven).any() or total < 0 or visits <= 0:
+        shapes = table.shape, waits.shape, errors.shape
+        if shapes != ((len(places), len(COLUMNS)), (len(waits), len(WAIT_COLUMNS)), (errors.size,)):
+            raise ValueError(f"its arrays do not fit: they have the shapes {shapes}")
+        least = min(table[:, 0].min(initial=0), waits[:, :2].min(initial=0), float(driven), total)
+        if least < 0 or visits <= 0 or np.abs(table[:, 3:5]).max(initial=0) > FARTHEST:
             raise ValueError("its evidence cannot be true")
         self.places, self.table, self.waits = places, table, waits
         self.driven, self.noise_sums, self.errors = float(driven), (total, visits), errors.tolist()
         self._fit()
-
-
-NO_VISITS = Visits(np.zeros((0, 2)), np.zeros(0), np.zeros(0))

@@ -16,7 +16,7 @@ from zlib import crc32
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ddqn_planner.experience.evidence import FARTHEST, Evidence, Visits
+from ddqn_planner.experience.evidence import FARTHEST, NO_VISITS, Evidence, Visits
 from ddqn_planner.experience.prior import Prior
 from ddqn_planner.files import as_path, differences, locked, write_atomically
 from ddqn_planner.grid import GridMap
@@ -118,11 +118,9 @@ class Experience:
         ValueError
             If the shapes or types are wrong. Values that cannot be true are left out.
         """
-        time = numbers("seconds", seconds).astype(np.float64)
-        position = numbers("positions", positions).astype(np.float64)
-        if time.ndim != 1 or position.shape != (len(time), 2):
-            shapes = f"seconds have shape {time.shape} and positions {position.shape}"
-            raise ValueError(f"{shapes}; give (N,) and (N, 2)")
+        count = np.size(seconds)
+        time = numbers("seconds", seconds, (count,)).astype(np.float64)
+        position = numbers("positions", positions, (count, 2)).astype(np.float64)
         # Comparisons with NaN are false.
         possible = (np.abs(time) < LATEST) & (np.abs(position) < FARTHEST).all(axis=1)
         time, position = time[possible], position[possible]
@@ -162,8 +160,8 @@ class Experience:
         point = numbers("the position", position, (2,))
         if not (np.abs(point) < FARTHEST).all():
             raise ValueError(f"the position is {position!r}; give metres, at most {FARTHEST:g}")
-        x, y = point.tolist()
-        self._learn(partial(Evidence.add_failure, x=x, y=y, seconds=self.max_pause))
+        waits = np.array([[*point, self.max_pause]])
+        self._learn(partial(Evidence.add, visits=NO_VISITS, waits=waits))
 
     def _learn(self, step: Step) -> None:
         step(self.evidence)
@@ -293,7 +291,7 @@ class Experience:
     def to_bytes(self) -> bytes:
         """Return all as bytes, for a file or a message."""
         content = io.BytesIO()
-        prior = self.prior.arrays() if self.prior is not None else {}
+        prior = self.prior._asdict() if self.prior is not None else {}
         arrays: dict[str, Any] = {PRIOR + name: array for name, array in prior.items()}
         options = list(self.options.values())
         np.savez(content, version=VERSION, options=options, **self.evidence.arrays(), **arrays)
@@ -319,8 +317,10 @@ class Experience:
             options = dict(zip(OPTIONS, arrays["options"].tolist(), strict=True))
             experience = cls(**options)
             if version == 1:  # before 0.4.0 failures stood where now is what the prior foretold
-                arrays["waits"] = np.zeros((0, 4))
-                arrays["evidence"][:, 2] = 0
+                arrays["waits"], table = np.zeros((0, 4)), arrays["evidence"]
+                age = (arrays["driven"] - table[:, 5:]) / experience.half_life
+                faded = table[:, :2] * 0.5**age
+                arrays["evidence"] = np.hstack([faded, 0 * table[:, 2:3], table[:, 3:5]])
             experience.evidence.restore(arrays)
             prior = {n.removeprefix(PRIOR): a for n, a in arrays.items() if n.startswith(PRIOR)}
             experience.evidence.prior = Prior.from_arrays(prior) if prior else None

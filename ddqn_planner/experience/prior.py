@@ -79,20 +79,19 @@ class Prior(NamedTuple):
         hidden = np.tanh(np.tanh(x @ self.weights_1 + self.bias_1) @ self.weights_2 + self.bias_2)
         return np.asarray(self.level + x @ self.direct + hidden @ self.weights_3)
 
-    def arrays(self) -> dict[str, Float32]:
-        """Return its arrays by name, to save them."""
-        return self._asdict()
-
     @classmethod
     def from_arrays(cls, arrays: Mapping[str, NDArray[Any]]) -> Prior:
-        """Return the prior that `arrays` gave; a ValueError if they are no prior's."""
-        prior = cls(*(np.asarray(arrays.get(name)) for name in cls._fields))
-        size, (units, *_) = (FEATURES,), (*prior.bias_1.shape, 0)
-        layers = (FEATURES, units), (units,), (units, units), (units,), (units,)
-        shapes = size, size, (), size, *layers, (len(np.atleast_1d(prior.replay)), FEATURES + 2)
-        for name, array, shape in zip(cls._fields, prior, shapes, strict=True):
-            if array.dtype.kind != "f" or array.shape != shape or not np.isfinite(array).all():
-                raise ValueError(f"the prior's {name} is not made of finite numbers {shape}")
-        if (prior.scale <= 0).any() or (prior.replay[:, -1] < 0).any():
-            raise ValueError("the prior's scale or weights cannot be true")
-        return cls(*(array.astype(np.float32) for array in prior))
+        """Return the prior of these arrays by name; a ValueError if they are no prior's."""
+        try:
+            prior = cls(
+                *(arrays[name].astype(np.float32, casting="same_kind") for name in cls._fields)
+            )
+            possible = prior.log_slowness(np.zeros(FEATURES, dtype=np.float32)).shape == ()
+            possible &= bool(np.isfinite(np.concatenate([array.ravel() for array in prior])).all())
+            possible &= prior.replay.shape[1:] == (FEATURES + 2,)
+            possible &= bool((prior.scale > 0).all() and (prior.replay[:, -1] >= 0).all())
+        except (KeyError, TypeError, ValueError):
+            possible = False
+        if not possible:
+            raise ValueError("its prior cannot be true")
+        return prior

@@ -38,7 +38,7 @@ def read_footprint(text: Any) -> NDArray[np.float64]:
         raise ValueError(f"the footprint {text!r} is no list of three or more points; {remedy}")
     if not np.isfinite(corners).all() or _crosses_itself(corners):
         raise ValueError(f"the sides of the footprint {text!r} cross or are no numbers; {remedy}")
-    if not _inside(np.zeros((1, 2)), corners)[0]:
+    if not inside(np.zeros((1, 2)), corners)[0]:
         problem = f"the footprint {text!r} does not contain the robot's origin (0, 0)"
         raise ValueError(f"{problem}; give points relative to it")
     return corners
@@ -65,14 +65,14 @@ def _crosses_itself(corners: NDArray[np.float64]) -> bool:
     return False
 
 
-def _inside(points: NDArray[np.float64], corners: NDArray[np.float64]) -> NDArray[np.bool_]:
+def inside(points: NDArray[np.float64], corners: NDArray[np.float64]) -> NDArray[np.bool_]:
     """Return which points (N, 2) lie inside a polygon: those from which a ray crosses it oddly."""
-    inside = np.zeros(len(points), dtype=np.bool_)
+    found = np.zeros(len(points), dtype=np.bool_)
     x, y = points.T
     for (x0, y0), (x1, y1) in zip(corners, np.roll(corners, -1, axis=0), strict=True):
         if y0 != y1:
-            inside ^= ((y0 > y) != (y1 > y)) & (x < x0 + (y - y0) / (y1 - y0) * (x1 - x0))
-    return inside
+            found ^= ((y0 > y) != (y1 > y)) & (x < x0 + (y - y0) / (y1 - y0) * (x1 - x0))
+    return found
 
 
 def inner_radius(corners: NDArray[np.float64]) -> float:
@@ -112,16 +112,28 @@ def swept_cells(corners: NDArray[np.float64], motions: Motions) -> NDArray[np.bo
             mask[row, column] = True
         for x, y, yaw in poses:
             turn = np.array([[math.cos(yaw), -math.sin(yaw)], [math.sin(yaw), math.cos(yaw)]])
-            mask |= _inside((centres - (x, y)) @ turn, body).reshape(mask.shape)
+            mask |= inside((centres - (x, y)) @ turn, body).reshape(mask.shape)
     return swept
 
 
 def rows_of(swept: NDArray[np.bool_]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Return the rows of swept cells (P, S, S) as (R, 3), y, first x, last x + 1; and (P + 1,)."""
-    # Row numbers first[p] to first[p + 1] are those of primitive p.
+    """Return the rows of cells (P, S, S): y, first x, count <= 64 of each, and where they begin."""
     reach = swept.shape[-1] // 2
     steps = np.diff(np.pad(swept, ((0, 0), (0, 0), (1, 1))).astype(np.int8), axis=-1)
     number, y, begin = np.nonzero(steps == 1)
     _, _, end = np.nonzero(steps == -1)
+    pieces = (end - begin + 63) // 64
+    part = np.arange(pieces.sum()) - np.repeat(np.cumsum(pieces) - pieces, pieces)
+    number, y, begin, end = (np.repeat(array, pieces) for array in (number, y, begin, end))
+    begin = begin + 64 * part
+    count = np.minimum(end - begin, 64)
     first = np.searchsorted(number, np.arange(len(swept) + 1))
-    return np.column_stack([y - reach, begin - reach, end - reach]), first
+    return np.column_stack([y - reach, begin - reach, count]), first
+
+
+def placed(corners: NDArray[np.float64], poses: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the corners (K, 2) of a body at poses (N, 3), in metres: (N, K, 2)."""
+    x, y, yaw = poses.T[..., None]
+    u, v = corners.T
+    turned = np.cos(yaw) * u - np.sin(yaw) * v, np.sin(yaw) * u + np.cos(yaw) * v
+    return np.stack([turned[0] + x, turned[1] + y], axis=-1)

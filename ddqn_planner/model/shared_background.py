@@ -54,6 +54,7 @@ class Network(NamedTuple):
     own_before: Floats  # (B * D, F): their convolution before ReLU
     own_output: Floats  # (B, U): of the layer after it
     q: Floats  # (B, 8)
+    awake: NDArray[np.bool_]  # (F * L,): where a step moves the layer; (1,) without a hidden one
     windows: Windows
     eight: tuple[int, ...]  # of 8 zeros where U is 8: a known number of turns is twice as fast
 
@@ -78,14 +79,15 @@ def network_of(tensors: Sequence[Floats], windows: Windows, batch: int) -> Netwo
     zeros: Any = partial(np.zeros, dtype=windows.own.dtype)
     weights = np.concatenate([array.ravel() for array in turned], dtype=windows.own.dtype)
     ends = np.cumsum([array.size for array in turned])[:-1]
-    parts = (p.reshape(t.shape) for p, t in zip(np.split(weights, ends), turned, strict=True))
+    parts = [p.reshape(t.shape) for p, t in zip(np.split(weights, ends), turned, strict=True)]
     of_all = len(windows.common), len(tensors[0])
     units, rows = len(tensors[3]), batch * (4 + int(np.diff(windows.ends).max()))
     common = zeros(of_all), zeros(of_all), zeros(units), zeros((rows, 9))
     numbers = np.zeros(rows, np.int64), np.zeros(batch + 1, np.int64)
     own = zeros((rows, of_all[1])), zeros((batch, units))
     q, eight = (zeros((batch, 8)), ()) if len(tensors) > 4 else (own[1], (0,) * 8)
-    return Network._make([weights, *parts, *common, *numbers, *own, q, windows, eight])
+    awake = np.ones(1 if eight else len(parts[2]), np.bool_)
+    return Network._make([weights, *parts, *common, *numbers, *own, q, awake, windows, eight])
 
 
 @compiled
@@ -128,8 +130,10 @@ def evaluate(network: Any, scenario: Any, cell: Any) -> None:
     for n in range(cell.size):
         output[n] = network.output
         for row in range(first[n], first[n + 1]):
-            window = network.changed[row]
+            window, seen = network.changed[row], np.float32(0)
             for f in range(filters):
+                seen += abs(max(before[row, f], np.float32(0)) - after[window, f])
+            for f in range(filters if seen != 0 else 0):
                 change = max(before[row, f], np.float32(0)) - after[window, f]
                 if change != 0:
                     for u in range(len(network.eight) or units):
@@ -137,8 +141,8 @@ def evaluate(network: Any, scenario: Any, cell: Any) -> None:
         if not len(network.eight):
             q[n] = network.last_bias
             for u in range(units):
-                for action in range(8):
-                    q[n, action] += max(output[n, u], np.float32(0)) * last[u, action]
+                for action in range(8 if output[n, u] > 0 else 0):  # most are not
+                    q[n, action] += output[n, u] * last[u, action]
 
 
 @compiled
@@ -151,7 +155,8 @@ def see(network: Any, scenario: Any, cell: Any) -> None:
         for row in range(y // 2, min((y + 1) // 2, (height - 1) // 2) + 1):
             for column in range(x // 2, min((x + 1) // 2, (width - 1) // 2) + 1):
                 changed[end] = row * ((width + 1) // 2) + column
-                patch[end] = own[scenario[n], changed[end]]
+                for at in range(9):  # a copy of a slice takes three times as long
+                    patch[end, at] = own[scenario[n], changed[end], at]
                 patch[end, 3 * (y + 1 - 2 * row) + x + 1 - 2 * column] = windows.robot
                 end += 1
         with_robot = end
@@ -161,6 +166,7 @@ def see(network: Any, scenario: Any, cell: Any) -> None:
                 is_new &= changed[other] != window
             if is_new:
                 changed[end] = window
-                patch[end] = own[scenario[n], window]
+                for at in range(9):
+                    patch[end, at] = own[scenario[n], window, at]
                 end += 1
         first[n + 1] = end

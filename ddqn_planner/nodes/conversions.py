@@ -114,8 +114,10 @@ def value_message(field: QField | None, grid: GridMap, header: Header) -> Occupa
     return occupancy_message(percent, grid.resolution, grid.origin, header)
 
 
-def path_message(centres: Float64, yaws: Float64, header: Header, last: Quaternion) -> Path:
-    """Make a path message of what `along` returns; the last pose has an orientation of its own."""
+def path_message(
+    centres: Float64, yaws: Float64, header: Header, last: Quaternion | None = None
+) -> Path:
+    """Make a path message of positions and directions, see `path_bytes`."""
     path, new, checked = Path(header=header), object.__new__, header._check_fields
     # Poses in the same direction share a quaternion, and all are made without their constructors,
     # which take fifteen times as long: most of an answer's time is making messages.
@@ -190,7 +192,9 @@ def bytes_of(kind: str, message: UInt8MultiArray) -> bytes:
     data, label = bytes(message.data), label_of(message)
     if label != (right := LABEL.format(kind, hashlib.sha256(data).hexdigest())):
         wrong = f"{len(data)} bytes with the label {label!r}, not {right!r}"
-        raise ValueError(f"the trainer sent {wrong}; let trainer and planner have one version")
+        is_cut = label.partition(":")[0] == right.partition(":")[0]
+        remedy = "save there again" if is_cut else "let trainer and planner have one version"
+        raise ValueError(f"the trainer sent {wrong}; {remedy}")
     return data
 
 
@@ -215,6 +219,14 @@ def cell_from_pose(name: str, stamped: PoseStamped, grid: GridMap, frame: str) -
     except (OverflowError, ValueError):  # the floor of infinity, and of NaN
         where = f"({_numbers(position)}) is too far from the map to have a cell"
         raise ValueError(f"{name}'s position {where}; give one on the map, in metres") from None
+
+
+def pose_of(stamped: PoseStamped) -> Origin:
+    """Return x, y and yaw of a pose, about z alone."""
+    position, turned = stamped.pose.position, stamped.pose.orientation
+    ahead = 1 - 2 * (turned.y**2 + turned.z**2)
+    yaw = math.atan2(2 * (turned.x * turned.y + turned.w * turned.z), ahead)
+    return position.x, position.y, yaw
 
 
 def quaternion(yaw: float) -> Quaternion:

@@ -1,4 +1,4 @@
-"""What RViz shows of a Q field: its value as a map, its policy as arrows."""
+"""What RViz shows: a Q field's value as a map, its policy as arrows, a body along its path."""
 
 from __future__ import annotations
 
@@ -18,13 +18,15 @@ from std_msgs.msg import ColorRGBA, Header
 from visualization_msgs.msg import Marker, MarkerArray
 
 from ddqn_planner.grid import MOVES, Cell, GridMap, MoveRule
+from ddqn_planner.grid.motions import turn_between
 from ddqn_planner.nodes.conversions import value_message
 from ddqn_planner.nodes.report import Outcome
 from ddqn_planner.nodes.runtime import LATCHED, Worker
-from ddqn_planner.planning import Planner, QField
+from ddqn_planner.planning import Planner, PosePlan, QField
 
 MAX_ARROWS = 10_000  # more take longer to make than a plan, and are too small to see
 LINE_WIDTH = 0.06  # in cells; larger arrows have wider lines
+APART, TURN, BODY_LINE = 0.25, 0.5, 0.01  # metres: between two bodies, a radian's, a line's width
 HEIGHT = 0.01  # metres above the map, so that the map does not hide the arrows
 COLOUR = ColorRGBA(r=0.13, g=0.13, b=0.23, a=0.9)
 
@@ -35,34 +37,39 @@ DIRECTIONS = np.exp(1j * np.arctan2(MOVES[:, 1], MOVES[:, 0]))
 
 
 class Shown(NamedTuple):
-    """A Q field, perhaps not computed yet, or none without a planner; and its messages' header."""
+    """A Q field, perhaps not computed yet, or the path of a body; none without a planner."""
 
     planner: Planner | None
     grid: GridMap
     goal: Cell
-    move_rule: MoveRule
+    move_rule: MoveRule | None
+    plan: PosePlan | None
     header: Header
+
+    def field(self) -> QField | None:
+        """Return the field, which is computed."""
+        planner, grid, goal, move_rule, *_ = self
+        return planner.q_field(grid, goal, move_rule) if planner is not None else None
 
 
 @dataclass
 class Layer:
-    """A topic, the function that makes its messages, and whether the last one shows a field."""
+    """A topic, the function that makes its messages, and whether the last one shows anything."""
 
     name: str
     publisher: Publisher
-    message: Callable[..., Any]
+    message: Callable[[Shown], Any]
+    is_of_body: bool = False
     is_due: bool = False
-    has_field: bool = False
+    shows: bool = False
 
-    def make(self, shown: Shown) -> Any:
-        """Make a message, for which the field is computed."""
-        planner, grid, goal, move_rule, header = shown
-        field = planner and planner.q_field(grid, goal, move_rule)
-        return self.message(field, grid, header)
+    def has(self, shown: Shown) -> bool:
+        """Return whether there is anything to show."""
+        return shown.planner is not None and self.is_of_body == (shown.plan is not None)
 
 
 class FieldDisplay:
-    """Publishes ``~/value`` and ``~/policy``, and computes nothing for one without subscribers."""
+    """Publishes what subscribers ask for: ``~/value``, ``~/policy``, ``~/footprints``."""
 
     def __init__(self, node: Node) -> None:
         self._logger = node.get_logger()
@@ -72,11 +79,16 @@ class FieldDisplay:
         self._shows_again = False
         self._look = node.create_guard_condition(self._on_look, MutuallyExclusiveCallbackGroup())
         matched = PublisherEventCallbacks(matched=lambda _: self._look.trigger())
-        value, policy = (
-            node.create_publisher(kind, topic, LATCHED, event_callbacks=matched)
-            for kind, topic in ((OccupancyGrid, "~/value"), (MarkerArray, "~/policy"))
+
+        def layer(name: str, kind: Any, message: Callable[[Shown], Any], *of: bool) -> Layer:
+            publisher = node.create_publisher(kind, f"~/{name}", LATCHED, event_callbacks=matched)
+            return Layer(name, publisher, message, *of)
+
+        self._layers = (
+            layer("value", OccupancyGrid, lambda it: value_message(it.field(), it.grid, it.header)),
+            layer("policy", MarkerArray, lambda it: policy_message(it.field(), it.grid, it.header)),
+            layer("footprints", MarkerArray, footprint_message, True),
         )
-        self._layers = Layer("value", value, value_message), Layer("policy", policy, policy_message)
 
     def show_again(self) -> None:
         """Publish the next field even if it is shown already."""
@@ -86,7 +98,9 @@ class FieldDisplay:
         """Show the field of an outcome from now on; none if it has none, as of another goal."""
         request, goal, shown = outcome.request, outcome.plan.goal, self._shown
         if request is not None and goal is not None:
-            shown = Shown(outcome.planner, request.grid, goal, request.move_rule, header)
+            rule, plan = getattr(request, "move_rule", None), outcome.plan
+            path = plan if isinstance(plan, PosePlan) else None
+            shown = Shown(outcome.planner, request.grid, goal, rule, path, header)
         elif shown is not None:
             header = Header(stamp=header.stamp, frame_id=shown.header.frame_id)
             shown = shown._replace(planner=None, header=header)
@@ -103,13 +117,13 @@ class FieldDisplay:
             shown = self._shown
             if shown is None or not layer.is_due:
                 continue
-            has_field = shown.planner is not None
-            # A field that is latched is cleared even if nobody subscribes now.
-            if not (layer.publisher.get_subscription_count() if has_field else layer.has_field):
+            has_any = layer.has(shown)
+            # What is latched is cleared even if nobody subscribes now.
+            if not (layer.publisher.get_subscription_count() if has_any else layer.shows):
                 continue
-            layer.is_due, layer.has_field = False, has_field
+            layer.is_due, layer.shows = False, has_any
             try:
-                layer.publisher.publish(await self._worker.call(layer.make, shown))
+                layer.publisher.publish(await self._worker.call(layer.message, shown))
             except InvalidHandle:  # cleaned up meanwhile
                 return
             except Exception as error:  # as when no memory is left: the node must survive
@@ -131,15 +145,39 @@ def policy_message(field: QField | None, grid: GridMap, header: Header) -> Marke
     origin_x, origin_y, yaw = grid.origin
     arrows = complex(origin_x, origin_y) + grid.resolution * np.exp(1j * yaw) * arrows
 
-    marker = Marker(header=header, ns="policy", type=Marker.LINE_LIST, color=COLOUR)
-    marker.action = Marker.ADD if rows.size else Marker.DELETE
-    marker.pose.position.z, marker.pose.orientation.w = HEIGHT, 1.0
-    marker.scale.x = LINE_WIDTH * step * grid.resolution
+    marker = _lines("policy", rows.size, LINE_WIDTH * step * grid.resolution, header)
     corners = map(_point, arrows.real.ravel().tolist(), arrows.imag.ravel().tolist())
     # The lines share their points, because most of the time goes into making messages.
     for tail, tip, left, right in zip(corners, corners, corners, corners, strict=True):
         marker.points.extend((tail, tip, tip, left, tip, right))
     return MarkerArray(markers=[marker])
+
+
+def footprint_message(shown: Shown) -> MarkerArray:
+    """Make a message with a body's outlines along its path; without one, it deletes the last."""
+    outlines = np.empty((0, 0), dtype=np.complex128)
+    body = shown.planner.pose_planner if shown.planner is not None else None
+    if body is not None and shown.plan is not None:
+        x, y, yaw = shown.plan.poses.T
+        turn = np.abs(turn_between(yaw[:-1], yaw[1:]))
+        passed = np.cumsum(np.hypot(np.diff(x), np.diff(y)) + turn * TURN) // APART
+        at = np.append(True, np.diff(passed, prepend=0) > 0)
+        corners = body.footprint @ [1, 1j]
+        outlines = (x + 1j * y)[at, None] + np.exp(1j * yaw)[at, None] * corners
+    marker = _lines("footprints", len(outlines), BODY_LINE, shown.header)
+    for outline in outlines:
+        points = [*map(_point, outline.real.tolist(), outline.imag.tolist())]
+        for side in zip(points, points[1:] + points[:1], strict=True):
+            marker.points.extend(side)
+    return MarkerArray(markers=[marker])
+
+
+def _lines(name: str, count: int, width: float, header: Header) -> Marker:
+    """Return a marker for lines; without any, it deletes the last one."""
+    marker = Marker(header=header, ns=name, type=Marker.LINE_LIST, color=COLOUR)
+    marker.action = Marker.ADD if count else Marker.DELETE
+    marker.pose.position.z, marker.pose.orientation.w, marker.scale.x = HEIGHT, 1.0, width
+    return marker
 
 
 def _point(x: float, y: float) -> Point:

@@ -34,7 +34,7 @@ from ddqn_planner.resources import with_remedy
 Float64 = NDArray[np.float64]
 RETRY_PERIOD = 5.0  # seconds after which what failed for a full disk is tried again
 SLOWEST = 10.0  # the slowness that ``~/slowness`` shows as 100
-WRONG = np.log(1.5)  # of the nominal speed, compared with the learned one
+WRONG = np.log(1.5)  # of the nominal speed, compared with that of drives
 MORE_PLACES = 1.1  # times as many as the last time
 NOT_RECORDING = "no drives are being recorded; call ~/start first"
 NO_MAP = "no map was received yet; start a map server"
@@ -180,7 +180,9 @@ class Driving:
     def _tell_saved(self, folder: DriveFolder) -> None:
         self._shown = None
         speed, given = folder.experience.learned_speed, folder.experience.nominal_speed
-        was_wrong, self._is_speed_wrong = self._is_speed_wrong, abs(np.log(speed / given)) > WRONG
+        slow, was_wrong = folder.experience.evidence, self._is_speed_wrong
+        # Where most places are slow, the fastest ones must be, too, to tell of a slow robot.
+        self._is_speed_wrong = slow.open < -WRONG or slow.fastest > WRONG
         if self._is_speed_wrong and not was_wrong:
             wrong = f"the robot drives {speed:.3g} m/s in the open, nominal_speed is {given:g}"
             self._node.get_logger().warning(f"{wrong}; set it before you learn anew")

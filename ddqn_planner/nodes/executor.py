@@ -6,6 +6,7 @@ import threading
 import time
 from collections.abc import Callable
 from contextlib import suppress
+from functools import partial
 from typing import Any
 
 from rclpy.event_handler import EventHandler
@@ -78,7 +79,12 @@ class NodeExecutor(SingleThreadedExecutor):
         counts = [it.get_num_entities() for it in self._waitables]
         count = sum(counts, NumberOfEntities(*map(kinds.count, KINDS)))
         sizes = (getattr(count, name) for name in count.__slots__)
-        self._wait_set = rclpy_implementation.WaitSet(*sizes, self.context.handle)
+        wait_set = self._wait_set = rclpy_implementation.WaitSet(*sizes, self.context.handle)
+        # Of each callback group an entity, and what adds all of them: a node waits often.
+        self._groups: dict[Any, tuple[Any, list[Callable[[], None]]]] = {}
+        for (kind, _), entity in self._entities.items():
+            _, adding = self._groups.setdefault(entity.callback_group, (entity, []))
+            adding.append(partial(getattr(wait_set, f"add_{kind}"), entity.handle))
 
     def _wait(self) -> None:
         """Wait until something is ready, and create tasks for it."""
@@ -93,9 +99,9 @@ class NodeExecutor(SingleThreadedExecutor):
             self._events_due = time.monotonic() + EVENTS_PERIOD
         wait_set.clear_entities()
         wait_set.add_guard_condition(self._guard.handle)
-        for (kind, _), entity in self._entities.items():
-            if entity.callback_group.can_execute(entity):
-                getattr(wait_set, f"add_{kind}")(entity.handle)
+        for group, (entity, adding) in self._groups.items():
+            for add in adding if group.can_execute(entity) else ():
+                add()
         for waitable in waitables:
             waitable.add_to_wait_set(wait_set)
         wait_set.wait(timeout)

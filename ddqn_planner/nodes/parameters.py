@@ -39,6 +39,10 @@ PLANNER_PARAMETERS: Final = {
     ),
     "clearance_weight": Declared(0.0, "For any_map: how strongly to avoid obstacles", (0, 1)),
     "tolerance": Declared(0.0, "Metres: how far an occupied or cut off goal may move", (0, 1000)),
+    "yaw_tolerance": Declared(0.0, "Radians: the same for a robot's heading", (0, 4)),
+    "path_bound": Declared(
+        1.2, "For a robot's model: how many times the least cost a first path may have", (1, 10)
+    ),
     "replan_period": Declared(1.0, "Seconds between plans on a free path; 0: each map", (0, 3600)),
     "switch_threshold": Declared(0.05, "Share by which a kept path may cost more", (0, 10)),
     "mode": Declared("greedy", "astar_fallback: search where greedy steps get stuck", METHODS),

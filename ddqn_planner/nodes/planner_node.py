@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import ctypes
-from collections.abc import Callable
+from collections.abc import Callable, Coroutine
 from contextlib import suppress
 from typing import Any
 
@@ -26,8 +26,17 @@ from ddqn_planner.nodes.nav2 import GivenUp, serve_nav2
 from ddqn_planner.nodes.parameters import PLANNER_PARAMETERS
 from ddqn_planner.nodes.poses import Frames, StartSource, check_source
 from ddqn_planner.nodes.report import NO_REQUEST, NOT_ACTIVE, Outcome, Report, RequestError
-from ddqn_planner.nodes.requests import UNCHANGED, ActiveGoal, ModelSource, PathUnderWay, Requests
+from ddqn_planner.nodes.requests import (
+    UNCHANGED,
+    ActiveGoal,
+    ModelSource,
+    PathUnderWay,
+    Requests,
+    way_of,
+)
 from ddqn_planner.nodes.runtime import LATCHED, STEADY, Worker, spin_until_shutdown, unless
+from ddqn_planner.planning import PosePlan
+from ddqn_planner.planning.segments import SAME_COST
 
 LOOK_PERIOD, IDLE_PERIOD = 0.1, 1.0  # seconds until the next look: after a change, and else
 NO_MAP = GridMap(np.zeros((1, 1), dtype=np.bool_))
@@ -85,6 +94,8 @@ class PlannerNode(ManagedNode):
             self, self._frames, self._report, lambda: self._map.frame, self._on_start
         )
         self._times = ExpectedTimes(self, self._report, self._map_worker, self._replan.trigger)
+        group = MutuallyExclusiveCallbackGroup()  # this one ends when a newer path is there
+        self._improve = self.create_guard_condition(self._improve_path, group)
         group = MutuallyExclusiveCallbackGroup()  # it waits for a worker
         self._read_experience = self.create_guard_condition(self._times.on_sent, group)
         if self._settings.experience:
@@ -115,6 +126,7 @@ class PlannerNode(ManagedNode):
         """Forget the active goal."""
         super().deactivate()
         self._active, self._followed = ActiveGoal([], PathUnderWay()), PathUnderWay()
+        self._improvable: tuple[Outcome, ActiveGoal | PathUnderWay] | None = None
         self._report.change()
 
     def cleanup(self) -> None:
@@ -209,8 +221,10 @@ class PlannerNode(ManagedNode):
 
     async def _on_get_plan(self, request: Any, response: Any) -> Any:
         start = request.start if request.start.header.frame_id else None
-        header, outcome = await self._answer(lambda: None, start, [request.goal], request.tolerance)
-        response.plan = _path(path_message, outcome, header)
+        goals = [request.goal]
+        planning = self._requests.plan(start, goals, request.tolerance)
+        header, outcome = await self._answer(lambda: None, goals, planning)
+        (response.plan,) = _paths(outcome, header, path_message)
         self._report.log(outcome)
         return response
 
@@ -221,11 +235,13 @@ class PlannerNode(ManagedNode):
         active, goals = self._active, self._active.poses
         if not goals:
             return
-        header, outcome = await self._answer(lambda: None, None, goals, None, "", active)
+        planning = self._requests.plan(None, goals, None, "", active)
+        header, outcome = await self._answer(lambda: None, goals, planning)
         if outcome in (UNCHANGED, NOT_ACTIVE):
             return
+        self._improve_later(outcome, active)
         if active.is_news(outcome, header.frame_id):
-            self._plan_publisher.publish(_path(path_bytes, outcome, header))
+            self._plan_publisher.publish(*_paths(outcome, header, path_bytes))
         self._waits_for_pose = outcome.status in ("NO_START", "TF_ERROR")
         path, request = outcome.plan.path, outcome.request
         leaves = request is not None and len(path) > 0 and request.grid.is_obstacle(path[0])
@@ -239,12 +255,37 @@ class PlannerNode(ManagedNode):
     async def _plan_for_action(
         self, start: PoseStamped | None, goals: list[PoseStamped], name: str, given_up: GivenUp
     ) -> tuple[Path, Outcome]:
-        header, outcome = await self._answer(given_up, start, goals, None, name, self._followed)
+        planning = self._requests.plan(start, goals, None, name, self._followed)
+        header, outcome = await self._answer(given_up, goals, planning)
+        to_publish, path = _paths(outcome, header, path_bytes, path_message)
         if outcome.request is not None and len(outcome.plan.path):
-            self._followed.keep(outcome.plan.path, outcome.request.grid, header.frame_id)
-            self._plan_publisher.publish(_path(path_bytes, outcome, header))
+            self._followed.keep(way_of(outcome.plan), outcome.request.grid, header.frame_id)
+            self._improve_later(outcome, self._followed)
+            self._plan_publisher.publish(to_publish)
         self._report.log(outcome)
-        return _path(path_message, outcome, header), outcome
+        return path, outcome
+
+    def _improve_later(self, outcome: Outcome, followed: ActiveGoal | PathUnderWay) -> None:
+        """Find the least path for a body when the worker is idle, instead of any before."""
+        plan, self._improvable = outcome.plan, None
+        if isinstance(plan, PosePlan) and plan.bound > (1 + (plan.extra_cost or 0.0)) * SAME_COST:
+            self._improvable = outcome, followed
+            self._improve.trigger()
+
+    async def _improve_path(self) -> None:
+        if (last := self._improvable) is None:
+            return
+        outcome, followed = last
+        # What an action follows gets the better path with its next request.
+        path = followed.path if isinstance(followed, ActiveGoal) else followed
+        improving = self._requests.improve(outcome, path.path)
+        header, better = await self._answer(
+            lambda: None if last is self._improvable else UNCHANGED, [], improving
+        )
+        if better.request is not None and followed is self._active:
+            if self._active.is_news(better, header.frame_id):
+                self._plan_publisher.publish(*_paths(better, header, path_bytes))
+            self._display.show(better, header)
 
     async def _on_is_path_valid(self, request: Any, response: Any) -> Any:
         """Answer Nav2's IsPathValid: whether the robot can drive the rest of a path."""
@@ -257,12 +298,11 @@ class PlannerNode(ManagedNode):
         return response
 
     async def _answer(
-        self, given_up: GivenUp, start: PoseStamped | None, goals: list[PoseStamped], *how: Any
+        self, given_up: GivenUp, goals: list[PoseStamped], planning: Coroutine[None, None, Outcome]
     ) -> tuple[Header, Outcome]:
         """Plan, unless the node stops or the request is given up; return the path's header, too."""
         self._answering += 1
         try:
-            planning = self._requests.plan(start, goals, *how)
             outcome = await unless(planning, lambda: self._refusal or given_up())
         except RequestError as error:
             outcome = Outcome(error.status, str(error))
@@ -397,12 +437,15 @@ class ExpectedTimes:
         return told
 
 
-def _path(make: Callable[..., Any], outcome: Outcome, header: Header) -> Any:
-    """Return the path of an outcome, or an empty one, made by a function of `conversions`."""
+def _paths(outcome: Outcome, header: Header, *makers: Callable[..., Any]) -> list[Any]:
+    """Return the path of an outcome, or an empty one, as functions of `conversions` make it."""
     if outcome.request is None or outcome.goal is None:
-        return Path(header=header)
-    poses = along(outcome.plan.path, outcome.request.grid, outcome.is_dense)
-    return make(*poses, header, outcome.goal.pose.orientation)
+        return [Path(header=header) for _ in makers]
+    if isinstance(outcome.plan, PosePlan):
+        poses = outcome.plan.poses
+        return [make(poses[:, :2], poses[:, 2], header) for make in makers]
+    along_path = along(outcome.plan.path, outcome.request.grid, outcome.is_dense)
+    return [make(*along_path, header, outcome.goal.pose.orientation) for make in makers]
 
 
 def main() -> int:

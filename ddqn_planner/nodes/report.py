@@ -14,7 +14,17 @@ from geometry_msgs.msg import PoseStamped
 
 from ddqn_planner.grid import Cell
 from ddqn_planner.nodes.runtime import BaseNode
-from ddqn_planner.planning import Plan, PlanMethod, Planner, PlanRequest, PlanStatus
+from ddqn_planner.planning import (
+    Plan,
+    PlanMethod,
+    Planner,
+    PlanRequest,
+    PlanStatus,
+    PosePlan,
+    PoseRequest,
+)
+
+Request = PlanRequest | PoseRequest
 
 PERIOD = 0.9  # seconds until diagnostics are due when nothing changes: at the next look
 
@@ -47,7 +57,7 @@ class Outcome:
     status: str  # the name of a `PlanStatus`, or that of a `RequestError`
     reason: str
     planner: Planner | None = None
-    request: PlanRequest | None = None
+    request: Request | None = None
     plan: Plan = field(default_factory=lambda: Plan(PlanStatus.NO_PATH))
     goal: PoseStamped | None = None  # in the map's frame
     map_stamp: str = ""  # seconds
@@ -60,37 +70,45 @@ NOT_ACTIVE = Outcome("NOT_ACTIVE", f"the node is not active; configure and activ
 
 
 def reason_of(
-    request: PlanRequest, plan: Plan, start: PoseStamped, goal: PoseStamped, robot_radius: float
+    request: Request, plan: Plan, start: PoseStamped, goal: PoseStamped, robot_radius: float
 ) -> str:
     """Say how a path between two poses was found, or why there is none and what to do."""
-    grid, goals = request.grid, request.goals
-    cleared = f"{request.start_clearing_radius * grid.resolution:.3g} m"
+    grid, has_body = request.grid, isinstance(plan, PosePlan)
+    begin, goals = request.cells[0], request.cells[1:]
+    clearing: float = getattr(request, "start_clearing_radius", 0.0)
+    cleared = f"{clearing * grid.resolution:.3g} m"
     if plan.status is not PlanStatus.SUCCEEDED:
         status, remedy = plan.status.value, REMEDIES[plan.status]
-        to = f"goal: {_place(goal, request.goal)}"
-        if request.others:
+        if has_body:
+            remedy = remedy.removesuffix(", or a greater start_clearing_radius")
+            remedy = remedy.replace("on a free cell", "where the robot's body has room")
+        to = f"goal: {_place(goal, goals[0])}"
+        if len(goals) > 1:
             status = f"no path to any of {len(goals)} goals: {status}"
             remedy = remedy.removesuffix(TOLERANCE)
             to = f"goals: cells {', '.join(map(str, goals[:5]))}{', ...' * (len(goals) > 5)}"
         of_map = f"map: {grid.width} x {grid.height} cells"
-        reason = f"{status} (start: {_place(start, request.start)}; {to}; {of_map})"
+        reason = f"{status} (start: {_place(start, begin)}; {to}; {of_map})"
         on_map = filter(grid.contains, goals)
         if plan.status is PlanStatus.GOAL_OCCUPIED and not all(map(grid.is_obstacle, on_map)):
             near = f"robot_radius, {robot_radius:g} m" if robot_radius else "the costmap allows"
+            near = "the robot's body allows" if has_body else near
             reason += f", nearer to an obstacle than {near}"
-        if plan.status is PlanStatus.START_OCCUPIED and request.start_clearing_radius:
+        if plan.status is PlanStatus.START_OCCUPIED and clearing:
             reason += f", deeper than the start_clearing_radius, {cleared}"
         return f"{reason}; {remedy}"
-    number = f" to goal {goals.index(plan.goal) + 1} of {len(goals)}" if request.others else ""
+    number = f" to goal {goals.index(plan.goal) + 1} of {len(goals)}" if len(goals) > 1 else ""
     how = "by greedy steps"
-    if plan.method is not PlanMethod.GREEDY:
+    if isinstance(plan, PosePlan):
+        how = f"by greedy steps, of at most {plan.bound:.3g} times the least cost"
+    elif plan.method is not PlanMethod.GREEDY:
         how = "searched for in the order of the Q field: the greedy steps were trapped"
     reason = f"a path of {plan.length:.2f} cells{number}, {how}"
     if plan.extra_cost:
         reason += f", kept: its cost is {plan.extra_cost:+.1%} beside that of a new one"
     if plan.goal is not None and plan.goal not in goals:
-        metres = math.dist(plan.goal, request.goal) * grid.resolution
-        why = "is cut off" if grid.is_free(request.goal) else "is occupied"
+        metres = math.dist(plan.goal, goals[0]) * grid.resolution
+        why = "is cut off" if grid.is_free(goals[0]) else "is occupied"
         reason += f"; the goal {why} and moved {metres:.3g} m"
     if grid.is_obstacle(plan.path[0]):
         reason += f"; the start is occupied: obstacles within {cleared} of it were ignored"

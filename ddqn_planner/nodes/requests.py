@@ -18,20 +18,36 @@ from rclpy.task import Future
 from std_msgs.msg import Header, UInt8MultiArray
 
 from ddqn_planner.grid import Cell, GridMap, MoveRule
-from ddqn_planner.grid.arguments import Cells
+from ddqn_planner.grid.motions import HEADINGS
 from ddqn_planner.model import find_model, model_of
 from ddqn_planner.model.certificate import NO_CERTIFICATE
-from ddqn_planner.nodes.conversions import bytes_of, cell_from_pose, label_of, turns
+from ddqn_planner.nodes.conversions import bytes_of, cell_from_pose, label_of, pose_of, turns
 from ddqn_planner.nodes.map_source import MapSource
 from ddqn_planner.nodes.poses import Frames, StartSource
-from ddqn_planner.nodes.report import Outcome, Report, RequestError, reason_of, seconds
+from ddqn_planner.nodes.report import (
+    Outcome,
+    Report,
+    Request,
+    RequestError,
+    reason_of,
+    seconds,
+)
 from ddqn_planner.nodes.runtime import BaseNode, Worker
-from ddqn_planner.planning import Plan, PlanMethod, Planner, PlanRequest, PlanStatus
+from ddqn_planner.planning import (
+    Plan,
+    PlanMethod,
+    Planner,
+    PlanRequest,
+    PlanStatus,
+    PosePlan,
+    PoseRequest,
+)
 from ddqn_planner.planning.field import shift_between
 from ddqn_planner.planning.paths import is_path_valid, rest_of_path
 from ddqn_planner.planning.plan import joined
 from ddqn_planner.warm_up import warm_up
 
+HEADING = 2 * math.pi / HEADINGS  # radians that a robot turns until that is a reason to plan
 UNCHANGED = Outcome("UNCHANGED", "the active goal needs no new plan")
 
 T = TypeVar("T")
@@ -40,23 +56,29 @@ Place = tuple[PoseStamped, Cell]
 
 @dataclass
 class PathUnderWay:
-    """The last path to a goal, in cells of the map that it was planned on."""
+    """The last path to a goal: poses, or cells of the map that it was planned on."""
 
-    path: Cells = ()
+    path: Any = ()
     grid: GridMap | None = None
     frame: str = ""
 
-    def keep(self, path: Cells, grid: GridMap, frame: str) -> None:
+    def keep(self, path: Any, grid: GridMap, frame: str) -> None:
         """Take the place of the path before."""
         self.path, self.grid, self.frame = path, grid, frame
 
-    def next_request(self, request: PlanRequest, header: Header, settings: Any) -> PlanRequest:
+    def next_request(self, request: Request, header: Header, settings: Any) -> Any:
         """Return the request for a plan that may keep the path, in cells of the request's map."""
-        path: Cells = ()
-        if len(self.path) and self.grid is not None and header.frame_id == self.frame:
-            shift, (x, y) = shift_between(self.grid, request.grid), self.path[-1]
-            if shift is not None and request.grid.contains((int(x) + shift[0], int(y) + shift[1])):
-                path = np.asarray(self.path, dtype=np.int32) + np.array(shift, dtype=np.int32)
+        path: Any = ()
+        # A path of cells is none of poses: the model may be another one.
+        fits = len(self.path) > 0 and len(self.path[0]) == len(request.start)
+        if fits and self.grid is not None and header.frame_id == self.frame:
+            path = self.path
+            if isinstance(request, PlanRequest):
+                path, shift = (), shift_between(self.grid, request.grid)
+                if shift is not None and request.grid.contains(
+                    tuple(np.add(self.path[-1], shift).tolist())
+                ):
+                    path = np.asarray(self.path, np.int32) + np.array(shift, np.int32)
         return replace(request, under_way=path, switch_threshold=settings.switch_threshold)
 
 
@@ -69,7 +91,7 @@ class ActiveGoal:
         # Of the paths that were published for this goal, the last one.
         self.path = path
         # What was planned last; None to plan whatever is asked.
-        self._planned: tuple[GridMap, Cell, Header] | None = None
+        self._planned: tuple[Any, ...] | None = None
         # The frame and the status of what was published last; None to publish whatever comes.
         self._shown: tuple[str, str] | None = None
         self._looks, self._next_look = False, 0.0
@@ -83,17 +105,18 @@ class ActiveGoal:
         return is_due
 
     def next_request(
-        self, request: PlanRequest, header: Header, settings: Any
-    ) -> PlanRequest | None:
+        self, planner: Planner, request: Request, header: Header, settings: Any
+    ) -> Any:
         """Return the request for the next plan; None while there is no reason to plan."""
-        grid, start, period = request.grid, request.start, settings.replan_period
+        grid, period = request.grid, settings.replan_period
+        start = request.cells[0], *(round(yaw / HEADING) for yaw in request.start[2:])
         looks, self._looks = self._looks or period == 0, False
         # A map that came again as it was is planned on, so that the diagnostics name the last one.
         if self._planned == (grid, start, header):
             return None
         request, frame = self.path.next_request(request, header, settings), header.frame_id
         is_followed = self._shown == (frame, PlanStatus.SUCCEEDED.name) and not looks
-        if is_followed and len(rest_of_path(request.under_way, start, grid, request.move_rule)):
+        if is_followed and len(_rest(planner, request)):
             return None
         self.path.keep(request.under_way, grid, frame)
         self._planned, self._next_look = (grid, start, header), time.monotonic() + period
@@ -101,7 +124,7 @@ class ActiveGoal:
 
     def is_news(self, outcome: Outcome, frame: str) -> bool:
         """Return whether to publish the path of an outcome, which may be empty."""
-        path, request, shown = outcome.plan.path, outcome.request, (frame, outcome.status)
+        path, request, shown = way_of(outcome.plan), outcome.request, (frame, outcome.status)
         is_new_path = len(path) > 0 and outcome.plan.extra_cost is None
         is_news, self._shown = is_new_path or shown != self._shown, shown
         if request is None:
@@ -109,6 +132,20 @@ class ActiveGoal:
         elif is_news and len(path):
             self.path.keep(path, request.grid, frame)
         return is_news
+
+
+def way_of(plan: Plan) -> Any:
+    """Return a path as the next request knows it: its poses, or its cells."""
+    return plan.poses if isinstance(plan, PosePlan) else plan.path
+
+
+def _rest(planner: Planner, request: Request) -> Any:
+    """Return what is left of the path under way, if it is free and the robot near it."""
+    way, grid = request.under_way, request.grid
+    if isinstance(request, PlanRequest):
+        return rest_of_path(way, request.start, grid, request.move_rule)
+    assert planner.pose_planner is not None
+    return planner.pose_planner.rest_of(way, request.start, grid)
 
 
 def move_rule(rule: str, planner: Planner) -> MoveRule:
@@ -125,7 +162,7 @@ class ModelSource:
         self._node, self.report, self._worker = node, report, worker
         # The first model, while it is being loaded.
         self.loading: Future | None = None
-        self._label = ""  # of the trainer's message that was taken last
+        self._label = ""  # of the trainer's message, if the model came by it
 
     @staticmethod
     def read(model: str) -> tuple[Planner, str]:
@@ -163,7 +200,7 @@ class ModelSource:
 
     def use(self, planner: Planner, file: str) -> None:
         """Plan with it from now on."""
-        self.planner, self.file, self.loading = planner, file, None
+        self.planner, self.file, self.loading, self._label = planner, file, None, ""
         planner.cache_bytes = self._node.value("field_cache_bytes")
         self.report.accept("model")
         self.report.change()
@@ -191,6 +228,8 @@ class ModelSource:
         if self.planner is None:
             return description
         metadata, network = self.planner.metadata, self.planner.network
+        if body := self.planner.pose_planner:
+            description["model footprint (m)"] = str(body.footprint.tolist())
         return description | {
             "model file": self.file,
             "move rule": move_rule(rule, self.planner).value,
@@ -251,7 +290,7 @@ class Requests:
         if not 0 <= metres < math.inf:
             wrong = f"the tolerance is {metres}; give metres, finite and 0 or more"
             raise RequestError("INVALID_TOLERANCE", wrong)
-        request = PlanRequest(
+        request: Any = PlanRequest(
             grid,
             start=first,
             goal=second,
@@ -261,30 +300,29 @@ class Requests:
             simplified=settings.path_simplification != "none",
             start_clearing_radius=_clearing_radius(settings, grid),
         )
+        if planner.pose_planner is not None:
+            first, second, *more = map(pose_of, poses)
+            limits = metres, settings.yaw_tolerance
+            request = PoseRequest(grid, first, (second,), limits, settings.path_bound)
         if isinstance(followed, ActiveGoal):
             followed.poses[:] = poses[1:]  # there they stay, though their own frame moves
             if several:
-                request, more = replace(request, tolerance=0.0, others=tuple(more)), []
-        if followed is not None and not more:
-            next_request = followed.next_request(request, header, settings)
-            if next_request is None:
-                return UNCHANGED
-            request = next_request
-        plans: list[Plan] = []
-        for cell in (request.goal, *more):
-            if plans:
-                request = replace(request, start=plans[-1].cells[-1], goal=cell)
-            steps = planner.steps(request)
-            plan = next(steps)
-            while plan is None:  # a slow step follows; between two of them others have a turn
-                plan = await self.worker.run(next, steps)
-            plans.append(plan)
-            if not len(plan.path):
+                request, more = request.to_nearest(more), []
+            request = followed.next_request(planner, request, header, settings)
+        elif followed is not None and not more:
+            request = followed.next_request(request, header, settings)
+        if request is None:
+            return UNCHANGED
+        plans = [await self._plan(planner, request)]
+        for goal in more:
+            if not len(plans[-1].path):
                 break
+            request = request.after(plans[-1], goal)
+            plans.append(await self._plan(planner, request))
         plan, number = joined(plans), len(plans)
         before, goal = poses[number - 1 : number + 1]
-        if request.others and plan.goal in request.goals:
-            goal = poses[1 + request.goals.index(plan.goal)]
+        if len(request.goals) > 1 and plan.goal in request.cells[1:]:
+            goal = poses[1 + request.cells[1:].index(plan.goal)]
         reason = reason_of(request, plan, before, goal, settings.robot_radius)
         if more and not len(plan.path):
             reason = f"goal {number} of {len(goals)}: {reason}"
@@ -292,19 +330,48 @@ class Requests:
         is_dense = settings.path_simplification == "straight"
         return Outcome(plan.status.name, reason, planner, request, plan, goal, stamp, is_dense)
 
+    async def improve(self, outcome: Outcome, under_way: Any) -> Outcome:
+        """Return the outcome of a request for poses with a path of the least cost."""
+        planner, goal = outcome.planner, outcome.goal
+        assert isinstance(outcome.request, PoseRequest)
+        assert planner is not None
+        assert goal is not None
+        request = replace(outcome.request, bound=1.0, under_way=under_way)
+        plan = await self._plan(planner, request)
+        reason = reason_of(request, plan, goal, goal, 0.0)
+        return replace(outcome, request=request, plan=plan, reason=reason)
+
+    async def _plan(self, planner: Planner, request: Any) -> Plan:
+        is_of_poses = isinstance(request, PoseRequest)
+        steps: Any = planner.pose_steps(request) if is_of_poses else planner.steps(request)
+        try:
+            plan: Plan | None = next(steps)
+        except ValueError as error:
+            raise RequestError("MAP_RESOLUTION_UNSUPPORTED", str(error)) from None
+        while plan is None:  # a slow step follows; between two of them others have a turn
+            plan = await self.worker.run(next, steps)
+        return plan
+
     async def is_path_valid(self, path: Path) -> bool:
         """Return whether a path is free now, from the robot on, or all of it if that is unknown."""
         header, grid, planner = await self._inputs()
         frame, settings = header.frame_id, self.settings
         poses = [PoseStamped(header=path.header, pose=stamped.pose) for stamped in path.poses]
-        # What a straight path passes between its turns is known exactly, between its poses not.
-        cells = [_checked("the path", cell_from_pose, pose, grid, frame) for pose in turns(poses)]
-        robot = cells[0] if cells else (0, 0)
+        if planner.pose_planner is None:
+            # What a straight path passes between its turns is known, between its poses not.
+            poses = turns(poses)
+        cells = [_checked("the path", cell_from_pose, pose, grid, frame) for pose in poses]
+        if not cells:
+            return False
+        robot, cell = poses[0], cells[0]
         with suppress(RequestError):
             start = await self._wait_for(self.start.pose)
-            _, robot = await self._in_map("the start", start, grid, frame)
+            robot, cell = await self._in_map("the start", start, grid, frame)
+        if planner.pose_planner is not None:
+            way, anywhere = np.array([*map(pose_of, poses)]), (np.inf, np.inf)
+            return len(planner.pose_planner.rest_of(way, pose_of(robot), grid, anywhere)) > 0
         rule = move_rule(settings.move_rule, planner)
-        return is_path_valid(cells, robot, grid, rule, _clearing_radius(settings, grid))
+        return is_path_valid(cells, cell, grid, rule, _clearing_radius(settings, grid))
 
     async def _inputs(self) -> tuple[Header, GridMap, Planner]:
         """Return the header of the map of now, this map for the robot's body, and the planner."""

@@ -63,6 +63,19 @@ class PlanRequest:
         """The goal and the others, in their order."""
         return self.goal, *self.others
 
+    @property
+    def cells(self) -> tuple[Cell, ...]:
+        """Those of the start and the goals."""
+        return self.start, *self.goals
+
+    def to_nearest(self, others: Sequence[Cell]) -> PlanRequest:
+        """Return the request for a path to the nearest of several goals, none of which moves."""
+        return replace(self, tolerance=0.0, others=tuple(others))
+
+    def after(self, leg: Plan, goal: Cell) -> PlanRequest:
+        """Return the request for the next leg."""
+        return replace(self, start=leg.cells[-1], goal=goal)
+
 
 @dataclass(frozen=True, eq=False)
 class Plan:
@@ -134,14 +147,51 @@ class Plan:
         return path_length(self.path, self.move_rule)
 
 
+@dataclass(frozen=True, eq=False)
+class PosePlan(Plan):
+    """A path for a robot with a body and a heading; its `path` has the cells of the origin.
+
+    Parameters
+    ----------
+    poses : (N, 3) float64
+        x, y in metres and yaw in radians, -pi to pi, in the map frame, from start to goal: at most
+        half a cell apart. Empty unless the status is SUCCEEDED.
+    driven : float
+        The length of the origin's way, in cells, whatever the direction.
+    bound : float
+        The proved ratio of the cost to the least one, 1.0 when it is the least.
+    """
+
+    poses: NDArray[np.float64] = field(default_factory=lambda: np.empty((0, 3)))
+    driven: float = 0.0
+    bound: float = 1.0
+
+    @property
+    def length(self) -> float:
+        """Length of the origin's way in cells."""
+        return self.driven
+
+    def _identity(self) -> tuple[object, ...]:
+        return *super()._identity(), self.poses.tobytes(), self.bound
+
+
 def joined(plans: Sequence[Plan]) -> Plan:
     """Return the plan through several goals: each but the last succeeded, and ends at the next."""
     first, last = plans[0], plans[-1]
     if not last.path.size:
         return last
     searched = any(plan.method is PlanMethod.ASTAR_FALLBACK for plan in plans)
+    whole: Plan = last
+    if isinstance(last, PosePlan):
+        legs = [plan for plan in plans if isinstance(plan, PosePlan)]
+        whole = replace(
+            last,
+            poses=np.concatenate([legs[0].poses[:1], *(leg.poses[1:] for leg in legs)]),
+            driven=sum(leg.driven for leg in legs),
+            bound=max(leg.bound for leg in legs),
+        )
     return replace(
-        last,
+        whole,
         path=np.concatenate([first.path[:1], *(plan.path[1:] for plan in plans)]),
         method=PlanMethod.ASTAR_FALLBACK if searched else PlanMethod.GREEDY,
         cost=None if first.cost is None else sum(plan.cost or 0.0 for plan in plans),

@@ -13,16 +13,25 @@ from typing import Any, NamedTuple, TypeVar
 import numpy as np
 
 from ddqn_planner.grid import Cell, GridMap, MoveRule
-from ddqn_planner.grid.arguments import as_cell, as_flag, as_number, listed
+from ddqn_planner.grid.arguments import as_cell, as_flag, as_number, listed, numbers
 from ddqn_planner.grid.grid_map import check_grid
 from ddqn_planner.model import ModelMetadata, QNetwork, load_model
 from ddqn_planner.planning.field import DistanceField, Goals, QField
 from ddqn_planner.planning.field_cache import FieldCache
 from ddqn_planner.planning.paths import find_way_out, keep_or_switch, search, way_and_ends
-from ddqn_planner.planning.plan import Plan, PlanMethod, PlanRequest, PlanStatus, joined
+from ddqn_planner.planning.plan import (
+    Plan,
+    PlanMethod,
+    PlanRequest,
+    PlanStatus,
+    PosePlan,
+    joined,
+)
+from ddqn_planner.planning.pose_planner import Pose, PosePlanner, PoseRequest
 from ddqn_planner.planning.segments import cost_along, straightened
 
 T = TypeVar("T")
+AnyPlan = TypeVar("AnyPlan", bound=Plan)
 
 VISITS = 2**18  # about how many cells a field visits in one step of a plan: some 30 ms
 # Share of the map's cells that a request may visit before the connected cells are looked at. One
@@ -49,6 +58,7 @@ class Planner:
         self.network = network
         self.metadata = metadata
         self.fields = FieldCache(network)
+        self.pose_planner = PosePlanner(network) if hasattr(network, "motions") else None
 
     @classmethod
     def load(cls, model: str | Path) -> Planner:
@@ -185,10 +195,62 @@ class Planner:
             start = plans[-1].goal
         return joined(plans)
 
+    def plan_poses(
+        self,
+        grid: GridMap,
+        start: Pose,
+        goal: Pose | Sequence[Pose],
+        tolerance: tuple[float, float] = (0.0, 0.0),
+        bound: float = 1.2,
+    ) -> PosePlan:
+        """Plan a path for a robot with a body and a heading, with a model that learned it.
+
+        Parameters
+        ----------
+        grid : GridMap
+            With cells of the size that the robot learned.
+        start : (x, y, yaw)
+            Metres and radians in the map frame. The path begins in the middle of its cell, with one
+            of 16 headings: the nearest one, or else the next, where the body has room.
+        goal : (x, y, yaw), or several
+            Likewise; of several, the one that the cheapest path reaches.
+        tolerance : (float, float)
+            Metres and radians by which a goal without room or without a way may move.
+        bound : float
+            How many times the least cost a path may have at most, 1 or more: with 1 it is the
+            least, and takes longer. `PosePlan.bound` tells what is proved of the path.
+
+        Returns
+        -------
+        PosePlan
+            No pose of its path touches an occupied cell.
+
+        Raises
+        ------
+        ValueError
+            If the model knows no body, the map's resolution is another, or an argument is wrong.
+        """
+        check_grid(grid)
+        several = [goal] if np.ndim(goal) == 1 else goal
+        goals = tuple(_as_pose("the goal", one) for one in several)
+        limits = 0, math.inf, "two numbers, metres and radians, 0 or more"
+        metres, radians = (as_number("the tolerance", one, *limits) for one in tolerance)
+        least = as_number("the bound", bound, 1, math.inf, "1 or more")
+        request = PoseRequest(grid, _as_pose("the start", start), goals, (metres, radians), least)
+        return last_step(self.pose_steps(request))
+
+    def pose_steps(self, request: PoseRequest) -> Iterator[PosePlan | None]:
+        """Yield None before each slow step, and last the plan of `plan_poses`."""
+        if self.pose_planner is None:
+            raise ValueError("the model knows no body; give one of ddqn-planner train-robot")
+        return self.pose_planner.steps(request)
+
     def _answer(self, grid: GridMap, start: Cell, goals: list[Cell], how: tuple[Any, ...]) -> Plan:
         """Check what a user asks for, and plan."""
         move_rule, method, tolerance, simplified, radius = how
         check_grid(grid)
+        if self.pose_planner is not None:
+            raise ValueError("the model plans poses of a body; use plan_poses, or a planner_node")
         limits = 0, math.inf, "0 cells or more"
         request = PlanRequest(
             grid,
@@ -278,6 +340,14 @@ class _Found(NamedTuple):
     plan: Plan | None
 
 
+def _as_pose(name: str, pose: Any) -> Pose:
+    """Return three finite numbers as floats; else a ValueError."""
+    x, y, yaw = numbers(name, pose, (3,)).astype(np.float64).tolist()
+    if not all(map(math.isfinite, (x, y, yaw))):
+        raise ValueError(f"{name} is {pose!r}; give three finite numbers x, y, yaw")
+    return x, y, yaw
+
+
 def _in_parts(field: DistanceField, request: PlanRequest) -> Generator[None, None, Plan]:
     """Return the rollout from the start; after each part that the field grows for it, yield."""
     grid, start = request.grid, request.start
@@ -334,7 +404,7 @@ def _timed(steps: Generator[None, None, T]) -> Generator[None, None, tuple[T, fl
         yield
 
 
-def last_step(steps: Iterator[Plan | None]) -> Plan:
+def last_step(steps: Iterator[AnyPlan | None]) -> AnyPlan:
     """Take all steps that are left of `Planner.steps`, and return the plan."""
     *_, plan = steps
     assert plan is not None

@@ -141,8 +141,7 @@ def update(learning: Any, sampling: Any, counters: Any) -> None:
         gradient.q[n, action] = 2 * (online.q[n, action] - y[n]) / slots.size
     differentiate(online, gradient, slots.size)
     counters[1] += 1
-    moments = mean.weights, square.weights
-    adam(online.weights, gradient.weights, *moments, numbers.learning_rate, counters[1])
+    adam(online, gradient, mean, square, numbers.learning_rate, counters[1])
     look(online)
     if counters[1] % numbers.target_interval == 0:
         target.weights[:] = online.weights
@@ -173,6 +172,7 @@ def differentiate(network: Any, gradient: Any, count: int) -> None:
                 feature, through = max(network.own_before[row, f], np.float32(0)), np.float32(0)
                 change, number = feature - after[window, f], f * windows + window
                 if feature != 0 or change != 0:  # most features are 0, with the robot and without
+                    gradient.awake[min(number, gradient.awake.size - 1)] = True
                     for u in range(len(network.eight) or units):
                         layer_gradient[number, u] += change * error[n, u]
                         through += layer[number, u] * error[n, u]
@@ -183,6 +183,7 @@ def differentiate(network: Any, gradient: Any, count: int) -> None:
         for f in range(filters):
             feature, number = after[window, f], f * windows + window
             if feature > 0:
+                gradient.awake[min(number, gradient.awake.size - 1)] = True
                 for u in range(len(network.eight) or units):
                     layer_gradient[number, u] += feature * gradient.output[u]
                     before[window, f] += layer[number, u] * gradient.output[u]
@@ -206,16 +207,33 @@ def add_kernel(kernel: Any, bias: Any, patch: Any, count: int, before: Any) -> N
 
 
 @compiled
-def adam(weight: Any, gradient: Any, mean: Any, square: Any, rate: float, updates: int) -> None:
+def adam(online: Any, gradient: Any, mean: Any, square: Any, rate: float, updates: int) -> None:
     """Take Adam's step number `updates` (Kingma and Ba 2015, with torch's place of epsilon)."""
     step = np.float32(rate / (1 - BETA_1**updates))
     root = np.float32(1 / np.sqrt(1 - BETA_2**updates))
-    one, two = np.float32(1 - BETA_1), np.float32(1 - BETA_2)
-    for number in range(weight.size):
-        slope = gradient[number]
-        mean[number] += one * (slope - mean[number])
-        # Most fade away, as few features are alive: a processor is slow where they are denormal.
-        mean[number] = mean[number] if abs(mean[number]) > LEAST else np.float32(0)
-        square[number] += two * (slope * slope - square[number])
-        weight[number] -= step * mean[number] / (np.sqrt(square[number]) * root + EPSILON)
-        gradient[number] = 0
+    one, two, always = np.float32(1 - BETA_1), np.float32(1 - BETA_2), np.ones((2, 1), np.bool_)
+    first = online.kernel.size + online.kernel_bias.size
+    ends = 0, first, first + online.layer.size, online.weights.size
+    for part, awake in enumerate((always[0], gradient.awake, always[1])):
+        start, end, shape = ends[part], ends[part + 1], (len(awake), -1)
+        weights = online.weights[start:end].reshape(shape)
+        slopes = gradient.weights[start:end].reshape(shape)
+        means = mean.weights[start:end].reshape(shape)
+        squares = square.weights[start:end].reshape(shape)
+        for row in range(len(awake)):
+            if not awake[row]:  # it has neither a gradient nor a mean of earlier ones
+                for number in range(weights.shape[1]):
+                    squares[row, number] -= two * squares[row, number]
+                continue
+            momentum = np.float32(0)
+            for number in range(weights.shape[1]):
+                slope, average = slopes[row, number], means[row, number]
+                average += one * (slope - average)
+                # Most fade away, as few features live: a processor is slow where it is denormal.
+                average = average if abs(average) > LEAST else np.float32(0)
+                means[row, number], momentum = average, momentum + abs(average)
+                squares[row, number] += two * (slope * slope - squares[row, number])
+                divisor = np.sqrt(squares[row, number]) * root + EPSILON
+                weights[row, number] -= step * average / divisor
+                slopes[row, number] = 0
+            awake[row] = momentum != 0

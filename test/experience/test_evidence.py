@@ -182,6 +182,8 @@ def test_a_place_that_changes_is_learned_anew_at_once() -> None:
     experience.record(*straight((2, 5), (12, 5)))
     experience.record(*straight((2, 5), (12, 5)))
     assert at(HALL, experience.slowness(HALL), 7, 5) < 1.5
+    assert at(HALL, experience.slowness(HALL), 7, 2) > 1.3  # others are likely to have changed, too
+    experience.record(*straight((2, 2), (12, 2), 3))
     assert at(HALL, experience.slowness(HALL), 7, 2) == pytest.approx(3, rel=0.15)
 
 

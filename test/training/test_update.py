@@ -22,10 +22,12 @@ from ddqn_planner.grid import (
 )
 from ddqn_planner.model import AnyMapQNetwork
 from ddqn_planner.model.move_costs import patches
+from ddqn_planner.model.shared_background import evaluate, look
 from ddqn_planner.training.double_dqn import ReplayBuffer, Transitions
 from ddqn_planner.training.environment import Scenario
 from ddqn_planner.training.hyper_parameters import HyperParameters
 from ddqn_planner.training.networks import AnyMapModule, PaperModule
+from ddqn_planner.training.shared_background import adam, differentiate
 from ddqn_planner.training.trainer import Trainer
 
 Q = Callable[[Scenario, Cell], Tensor]
@@ -152,6 +154,26 @@ def check_same(compiled: Trainer, in_torch: Trainer) -> None:
         # The mean: Adam makes much of the rounding of a gradient that is nearly 0.
         error = (tensor.double() - expected[name].double()).abs().mean()
         assert error <= 1e-3 * expected[name].double().abs().mean(), name
+
+
+def test_weights_that_slept_wake_as_if_they_had_moved_all_the_time(small: Scenario) -> None:
+    parameters = HyperParameters(hidden_units=6, filters=4)
+    trainer = Trainer([small], MoveRule.ROBOT_SAFE, parameters, seed=2)
+    online, _, gradient, *moments = trainer._player[1].args[1][2]
+    weight = torch.tensor(online.weights)
+    optimiser = torch.optim.Adam([weight], 0.01)
+    for update in range(1, 701):
+        if update in (1, 700):  # until the last one, Adam's mean of the first fades to 0
+            look(online)
+            evaluate(online, np.array([0]), np.array([0]))
+            gradient.q[0] = 1
+            differentiate(online, gradient, 1)
+            assert gradient.layer.any(axis=1).sum() > gradient.awake.size // 4
+        weight.grad = torch.tensor(gradient.weights)
+        optimiser.step()
+        adam(online, gradient, *moments, 0.01, update)
+        assert not gradient.weights.any()
+    torch.testing.assert_close(torch.tensor(online.weights), weight)
 
 
 def test_an_update_of_the_network_for_any_map_counts_each_reward_once(small: Scenario) -> None:

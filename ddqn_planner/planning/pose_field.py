@@ -1,0 +1,205 @@
+"""The least costs of poses toward a goal: grown as far as a start needs, with a proved bound."""
+
+from __future__ import annotations
+
+import mmap
+from typing import Any, TypeAlias
+
+import numpy as np
+from numpy.typing import DTypeLike, NDArray
+
+from ddqn_planner.grid import GridMap
+from ddqn_planner.grid.motions import HEADINGS
+from ddqn_planner.planning import pose_kernels as kernels
+from ddqn_planner.planning.pose_kernels import Aim, Known
+from ddqn_planner.planning.pose_world import TILE, Body, World, touches
+
+State: TypeAlias = tuple[int, int, int]  # x, y, heading
+
+NO_RESERVE = getattr(mmap, "MAP_NORESERVE", 0x4000)  # not in all versions of Python
+HEAP = 2**14  # entries of a heap, at first
+TAKEN_BACK = 4  # of so many visited states a repair takes one back; else a new field is quicker
+UNGUIDED = 2**14  # states that are visited before a look at the map pays
+GREEDY = 1.5  # the first round's weight is the bound to the power of this: mostly that will do
+FURTHER = 1.5  # times the way to the goal that the look at the map goes
+
+
+def _untouched(count: int, dtype: DTypeLike) -> NDArray[Any]:
+    """Return zeros, in memory that is used where it is touched."""
+    # Pages of 4 KiB: NumPy would ask for larger ones.
+    size = count * np.dtype(dtype).itemsize
+    flags = mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS | NO_RESERVE
+    memory = mmap.mmap(-1, size, flags=flags)
+    memory.madvise(mmap.MADV_NOHUGEPAGE)
+    return np.frombuffer(memory, dtype)
+
+
+class PoseField:
+    """The least costs that are known from poses to the nearest of some goals."""
+
+    # Grown from the goals toward a start, in rounds of weighted A* that close a state once (ARA*,
+    # Likhachev et al. 2003). On a cheapest path to the start lies a state that is open or waits,
+    # and whose cost is the least; else the start's is. So the least cost of one of these, plus what
+    # is left from there at least, is a lower bound, which proves how good the start's cost is.
+
+    def __init__(self, goals: tuple[State, ...], grid: GridMap, world: World, body: Body) -> None:
+        self.goals, self.grid, self.world, self.body = goals, grid, world, body
+        states = world.tile.size * TILE * TILE * HEADINGS
+        self.known = Known(_untouched(states, np.float32), _untouched(states, np.uint8))
+        self._keys, self._numbers = np.empty(HEAP, np.float32), np.empty(HEAP, np.int64)
+        self._size = self._waiting = self._round = 0
+        self._aim, self._weight = Aim(0, 0, -1, np.empty(0, np.float32)), 0.0
+        self.visits = 0
+        for goal in goals:
+            number = self.number(goal)
+            self.known.mark[number] = kernels.OPEN
+            self._numbers[self._size] = number
+            self._size += 1
+
+    def number(self, state: State) -> int:
+        """Return the number of a state inside the map."""
+        return int(kernels.number_of(*state, self.world.width))
+
+    def has_room(self, state: State) -> bool:
+        """Return whether the body has room to stand."""
+        x, y, heading = state
+        row = len(self.body.start) + heading
+        first, last = self.body.first[row : row + 2]
+        return not touches(self.world.bits, x, y, self.body.row, first, last)
+
+    def reach(self, start: State, bound: float, limit: int) -> bool:
+        """Grow until the cost from a start is known within a bound, or known not to exist."""
+        number = self.number(start)
+        if number != self._aim.number:
+            self._aim = Aim(*start[:2], number, np.empty(0, np.float32))
+            self._weight, self._tried = 0.0, 0
+        if not bound <= self._weight <= bound**GREEDY:
+            self._weight = bound**GREEDY
+            self._order()
+        while True:
+            most = limit if self._aim.left.size else min(limit, UNGUIDED - self._tried)
+            visits, done = self._grow(most)
+            limit, self._tried = limit - visits, self._tried + visits
+            if done:
+                if self.bound(number) <= bound * kernels.SAME or not len(self._open()):
+                    return True
+                self._weight = bound
+                self._order()
+            elif limit == 0:
+                return False
+            elif visits < most:
+                self._reserve(2 * len(self._keys))
+            elif not self._can_leave(number) or not self._guide():
+                return True
+
+    def _grow(self, limit: int) -> tuple[int, bool]:
+        """Visit so many states, or fewer; return how many, and whether the round is over."""
+        self._size, self._waiting, visits, done = kernels.grow(
+            self.known,
+            self._keys,
+            self._numbers,
+            self._size,
+            self._waiting,
+            self._aim,
+            self._weight,
+            kernels.CLOSED + self._round,
+            limit,
+            self.world,
+            self.body,
+        )
+        self.visits += visits
+        return visits, done
+
+    def bound(self, number: int) -> float:
+        """Return how many times the least cost that of the last aim may be."""
+        if self.known.mark[number] == kernels.UNREACHED:
+            return np.inf
+        cost = float(self.known.distance[number])
+        self.least = min(kernels.least_order(self.known, self._open(), self._aim, self.world), cost)
+        return cost / self.least if self.least else 1.0
+
+    def _can_leave(self, number: int) -> bool:
+        """Return whether primitives lead from the start to more than a few states."""
+        mark, queue = _untouched(self.known.mark.size, np.uint8), np.empty(UNGUIDED, np.int64)
+        return bool(kernels.leads_to(number, mark, queue, self.world, self.body) == len(queue))
+
+    def _guide(self) -> bool:
+        """Look at the map for what is left to the start; return whether a way may exist."""
+        columns, rows = (self.world.width + 7) // TILE, (self.world.height + 7) // TILE
+        left = np.empty((columns + 1) * (rows + 1), np.float32)
+        most = 8 * left.size + 4  # each corner opens its neighbours once
+        keys, numbers = np.empty(most, np.float32), np.empty(most, np.int64)
+        x, y, _ = np.array(self.goals).T // TILE
+        goals = np.unique(y * (columns + 1) + x)
+        heap = left, keys, numbers
+        kernels.spread(*heap, self._aim, goals, FURTHER, self.world, self.body)
+        self._aim = self._aim._replace(left=left)
+        self._order()
+        return bool(np.isfinite(left[goals]).any())
+
+    def _reserve(self, entries: int) -> None:
+        """Make the heap so large; what waits stays at its end."""
+        before = self._numbers
+        self._keys = np.append(self._keys, np.empty(entries - len(self._keys), np.float32))
+        self._numbers = np.empty(entries, np.int64)
+        self._numbers[: self._size] = before[: self._size]
+        last = len(before) - self._waiting
+        self._numbers[entries - self._waiting :] = before[last:]
+
+    def _order(self) -> None:
+        """Begin a round: what is open or waits is ordered toward the start."""
+        opened = self._open()
+        self._numbers[: len(opened)] = opened
+        heap = self._keys, self._numbers, len(opened)
+        self._size = kernels.order(self.known, *heap, self._aim, self._weight, self.world)
+        self._waiting, self._round = 0, self._round + 1
+        if self._round == kernels.ROUNDS:
+            for part in np.split(self.known.mark, range(2**20, self.known.mark.size, 2**20)):
+                if part.max() > kernels.CLOSED:  # so that memory is not used where nothing is
+                    np.minimum(part, kernels.CLOSED, out=part)
+            self._round = 1
+
+    def _open(self) -> NDArray[np.int64]:
+        """Return the states that may be open or waiting."""
+        last = len(self._numbers) - self._waiting
+        return np.concatenate([self._numbers[: self._size], self._numbers[last:]])
+
+    def rollout(self, start: State) -> tuple[NDArray[np.int64], NDArray[np.float64]] | None:
+        """Return the primitives from a start to a goal, and their costs; None without a way."""
+        number = self.number(start)
+        if self.known.mark[number] == kernels.UNREACHED:
+            return None
+        most = int(self.known.distance[number] / self.body.cost.min()) + 1
+        primitives, costs = np.empty(most, np.int64), np.empty(most)
+        inputs = self.known, number, primitives, costs, self.world, self.body
+        count = kernels.follow(*inputs)
+        return primitives[:count], costs[:count]
+
+    def repair(self, grid: GridMap, world: World, cells: NDArray[np.int64], opens: bool) -> bool:
+        """Hold for a map that differs in some cells (N, 2); False if a new field is quicker."""
+        # `opens` tells whether a way may have got cheaper.
+        reach, columns = self.body.reach + TILE, (world.width + TILE - 1) // TILE
+        near = np.zeros((columns, (world.height + TILE - 1) // TILE), dtype=np.bool_)
+        low, high = np.unique(np.maximum(cells - reach, 0) // TILE, axis=0), 2 * reach // TILE + 1
+        for x, y in low:
+            near[x : x + high, y : y + high] = True
+        tiles = np.flatnonzero(near.T)
+        raised = np.empty(self.visits // TAKEN_BACK + 2**10, np.int64)
+        scratch = np.empty(8 * raised.size, np.float32), np.empty(8 * raised.size, np.int64), raised
+        count = kernels.take_back(self.known, tiles, *scratch, world, self.body)
+        if count < 0:
+            return False
+        self.grid, self.world, found = grid, world, raised[:count]
+        if opens:
+            states = np.arange(TILE * TILE * HEADINGS)
+            found = np.concatenate([found, (tiles[:, None] * len(states) + states).ravel()])
+        self._reserve(max(self._size + self._waiting + len(found), len(self._keys)))
+        heap = self._numbers, self._size
+        self._size = kernels.look_again(self.known, found, *heap, world, self.body)
+        self._aim = self._aim._replace(number=-1)  # what is ordered, and left, is another
+        return True
+
+    @property
+    def nbytes(self) -> int:
+        """Memory that was touched, at least, bytes."""
+        return 5 * self.visits + self._keys.nbytes + self._numbers.nbytes

@@ -1,0 +1,423 @@
+"""How values spread over poses from the goal, and how they are repaired: in compiled code."""
+
+from __future__ import annotations
+
+import math
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ddqn_planner.compiled import in_place, inlined
+from ddqn_planner.planning.pose_world import TILE, Body, World, cost_of, has_room, is_possible
+
+# A state is a cell and one of 16 headings. Its number counts headings, then the cells of a tile of
+# 8 x 8, then tiles: so what a request visits lies on few pages of memory, 4 bytes a distance.
+# Marks. Before a state is reached, its distance has no meaning. One that got cheaper after it was
+# closed waits for the next round. From CLOSED on, a mark tells the round in which it was closed.
+UNREACHED, OPEN, WAITING, CLOSED, ROUNDS = 0, 1, 2, 3, 250
+SAME: Final = 1 + 1e-6  # what is rounded in sums of float32 is less
+
+
+class Aim(NamedTuple):
+    """Where a field grows to: a start, and what is left to it at least, from corners of tiles."""
+
+    x: int
+    y: int
+    number: int
+    left: NDArray[np.float32]  # (corners,) in cells, row by row; empty for the straight way alone
+
+
+class Known(NamedTuple):
+    """What a field knows, in memory that is not used before it is touched."""
+
+    distance: NDArray[np.float32]  # (N,): the least cost that was found, in cells
+    mark: NDArray[np.uint8]  # (N,)
+
+
+@inlined
+def number_of(x: int, y: int, heading: int, width: int) -> int:
+    """Return the number of a state."""
+    tile = (y >> 3) * ((width + 7) >> 3) + (x >> 3)
+    return (tile << 10) | ((y & 7) << 7) | ((x & 7) << 4) | heading
+
+
+@inlined
+def place_of(number: int, width: int) -> tuple[int, int, int]:
+    """Return x, y and heading of a state."""
+    tile, columns = number >> 10, (width + 7) >> 3
+    row = tile // columns
+    x = ((tile - row * columns) << 3) | ((number >> 4) & 7)
+    return x, (row << 3) | ((number >> 7) & 7), number & 15
+
+
+@inlined
+def way_left(x: int, y: int, aim: Any, columns: int) -> float:
+    """Return a lower bound of the cost from a cell to the start, in cells."""
+    best = math.sqrt((x - aim.x) * (x - aim.x) + (y - aim.y) * (y - aim.y))
+    if aim.left.size > 0:
+        tile_x, tile_y = x >> 3, y >> 3
+        for row in range(2):
+            for column in range(2):
+                there = aim.left[(tile_y + row) * (columns + 1) + tile_x + column]
+                if there > best:
+                    over, up = x + 0.5 - 8 * (tile_x + column), y + 0.5 - 8 * (tile_y + row)
+                    there -= math.sqrt(over * over + up * up)
+                    if there > best:
+                        best = there
+    return best
+
+
+# The heap: the first `size` of an array of keys and one of states, the least key first.
+
+
+@inlined
+def push(key: Any, number: int, keys: Any, numbers: Any, size: int) -> int:
+    """Add an entry; return the new size."""
+    place = size
+    while place > 0:
+        parent = (place - 1) >> 2
+        if keys[parent] <= key:
+            break
+        keys[place], numbers[place] = keys[parent], numbers[parent]
+        place = parent
+    keys[place], numbers[place] = key, number
+    return size + 1
+
+
+@inlined
+def sink(key: Any, number: int, place: int, keys: Any, numbers: Any, size: int) -> None:
+    """Put an entry where it belongs, at a place or below it."""
+    while True:
+        least, first = place, 4 * place + 1
+        best = key
+        for child in range(first, first + 4 if first + 4 < size else size):
+            if keys[child] < best:
+                least, best = child, keys[child]
+        if least == place:
+            break
+        keys[place], numbers[place] = best, numbers[least]
+        place = least
+    keys[place], numbers[place] = key, number
+
+
+# A lower bound from the map. Around each cell that the robot's origin passes, its core has room: so
+# the origin stays in tiles where it has. A shortest way in them bends at corners only, and each
+# straight part has a way over corners and diagonals of the same tiles that is longer by `LONGER` at
+# most, if a diagonal counts 7/5.
+
+STRAIGHT, DIAGONAL = 5, 7
+LONGER: Final = math.sqrt(1 + (DIAGONAL / STRAIGHT - 1) ** 2)
+
+
+@inlined
+def is_way(x: int, y: int, step_x: int, step_y: int, world: Any, body: Any) -> bool:
+    """Return whether a step from a corner leads through a tile with room, or along its side."""
+    columns, rows = (world.width + 7) >> 3, (world.height + 7) >> 3
+    for side in range(2):
+        tile_x = x + (step_x - 1) // 2 if step_x != 0 else x - side
+        tile_y = y + (step_y - 1) // 2 if step_y != 0 else y - side
+        is_inside = 0 <= tile_x < columns and 0 <= tile_y < rows
+        if is_inside and has_room(tile_x, tile_y, world, body):
+            return True
+    return False
+
+
+@in_place
+def spread(
+    left: NDArray[np.float32],
+    keys: Any,
+    numbers: Any,
+    aim: Aim,
+    goals: NDArray[np.int64],
+    further: float,
+    world: World,
+    body: Body,
+) -> None:
+    """Write what is left from corners of tiles to a start, infinite where no way leads."""
+    columns, rows = (world.width + 7) >> 3, (world.height + 7) >> 3
+    size, end, limit = 0, 0.0, np.inf
+    left[:] = np.inf
+    for corner in range(4):
+        number = ((aim.y >> 3) + (corner >> 1)) * (columns + 1) + (aim.x >> 3) + (corner & 1)
+        left[number] = 0
+        size = push(np.float32(0), number, keys, numbers, size)
+    while size > 0 and keys[0] <= limit:
+        here, number = keys[0], numbers[0]
+        end = here
+        size -= 1
+        if size > 0:
+            sink(keys[size], numbers[size], 0, keys, numbers, size)
+        if here > left[number]:
+            continue
+        for goal in goals:
+            if number == goal and limit == np.inf:
+                limit = further * here
+        y = number // (columns + 1)
+        x = number - y * (columns + 1)
+        for step_y in range(-1, 2):
+            for step_x in range(-1, 2):
+                if step_x == 0 and step_y == 0:
+                    continue
+                after_x, after_y = x + step_x, y + step_y
+                if after_x < 0 or after_y < 0 or after_x > columns or after_y > rows:
+                    continue
+                after = after_y * (columns + 1) + after_x
+                cost = here + (STRAIGHT if step_x == 0 or step_y == 0 else DIAGONAL)
+                if cost >= left[after]:
+                    continue
+                if is_way(x, y, step_x, step_y, world, body):
+                    left[after] = cost
+                    size = push(np.float32(cost), after, keys, numbers, size)
+    for number in range(left.size):
+        # What was not reached is no nearer than where it ended.
+        value = left[number] if left[number] < end or size == 0 else end
+        left[number] = value * (TILE / STRAIGHT / LONGER) - math.sqrt(2.0) * TILE
+
+
+@in_place
+def order(
+    known: Known, keys: Any, numbers: Any, size: int, aim: Aim, weight: float, world: World
+) -> int:
+    """Order the open and waiting states toward a start, each once; return how many there are."""
+    kept = 0
+    for place in range(size):
+        number = numbers[place]
+        if known.mark[number] == 1 or known.mark[number] == 2:
+            known.mark[number] = 255  # so that it is taken once
+            numbers[kept] = number
+            kept += 1
+    for place in range(kept):
+        number = numbers[place]
+        known.mark[number] = 1
+        x, y, _ = place_of(number, world.width)
+        far = way_left(x, y, aim, (world.width + 7) >> 3)
+        keys[place] = known.distance[number] + weight * far
+    for place in range((kept - 2) >> 2, -1, -1):
+        sink(keys[place], numbers[place], place, keys, numbers, kept)
+    return kept
+
+
+@in_place
+def grow(
+    known: Known,
+    keys: Any,
+    numbers: Any,
+    size: int,
+    waiting: int,
+    aim: Aim,
+    weight: float,
+    closed: int,
+    limit: int,
+    world: World,
+    body: Body,
+) -> tuple[int, int, int, bool]:
+    """Close states in their order until that of a start is known; see `PoseField`."""
+    # Returns the heap's size, how many wait, the visits, and whether it is done: the order of the
+    # next state is not below the start's distance. Those that wait lie at the end of the arrays.
+    distance, mark = known.distance, known.mark
+    width, height = world.width, world.height
+    target, most, visits = aim.number, keys.size - 2 * body.start.size, 0
+    while size > 0:
+        key = keys[0]
+        if mark[target] != 0 and key >= distance[target]:
+            return size, waiting, visits, True
+        if visits == limit or size + waiting > most:
+            return size, waiting, visits, False
+        number = numbers[0]
+        size -= 1
+        if size > 0:
+            sink(keys[size], numbers[size], 0, keys, numbers, size)
+        if mark[number] != 1:
+            continue
+        mark[number] = closed
+        visits += 1
+        x, y, heading = place_of(number, width)
+        here = distance[number]
+        for place in range(body.into[heading], body.into[heading + 1]):
+            primitive = body.ending[place]
+            column, line = x - body.offset[primitive, 0], y - body.offset[primitive, 1]
+            if column < 0 or line < 0 or column >= width or line >= height:
+                continue
+            before = number_of(column, line, body.start[primitive], width)
+            if mark[before] != 0 and here + body.cost[primitive] >= distance[before]:
+                continue
+            if not is_possible(column, line, primitive, world, body):
+                continue
+            found = here + cost_of(column, line, primitive, world, body)
+            if found == np.inf or (mark[before] != 0 and found >= distance[before]):
+                continue
+            distance[before] = found
+            if mark[before] == closed:
+                mark[before] = 2
+                waiting += 1
+                numbers[numbers.size - waiting] = before
+            if mark[before] == 2:
+                continue
+            mark[before] = 1
+            far = way_left(column, line, aim, (width + 7) >> 3)
+            size = push(np.float32(found + weight * far), before, keys, numbers, size)
+    return size, waiting, visits, True
+
+
+@in_place
+def least_order(known: Known, numbers: Any, aim: Aim, world: World) -> float:
+    """Return a lower bound of what may still be found for a start, from states that may change."""
+    least = np.inf
+    for number in numbers:
+        if 1 <= known.mark[number] <= 2 and known.distance[number] < least:
+            x, y, _ = place_of(number, world.width)
+            far = way_left(x, y, aim, (world.width + 7) >> 3)
+            if known.distance[number] + far < least:
+                least = known.distance[number] + far
+    return least
+
+
+@in_place
+def follow(
+    known: Known,
+    number: int,
+    primitives: NDArray[np.int64],
+    costs: NDArray[np.float64],
+    world: World,
+    body: Body,
+) -> int:
+    """Write the greedy primitives from a state to the goal, and their costs; return their count."""
+    count = 0
+    while known.distance[number] > 0 and count < primitives.size:
+        x, y, heading = place_of(number, world.width)
+        best, chosen, after, spent = np.float32(np.inf), 0, number, np.float32(0)
+        for primitive in range(body.out[heading], body.out[heading + 1]):
+            column, line = x + body.offset[primitive, 0], y + body.offset[primitive, 1]
+            if column < 0 or line < 0 or column >= world.width or line >= world.height:
+                continue
+            next_one = number_of(column, line, body.end[primitive], world.width)
+            if known.mark[next_one] == 0:
+                continue
+            beyond = known.distance[next_one]
+            if beyond + body.cost[primitive] >= best:
+                continue
+            if not is_possible(x, y, primitive, world, body):
+                continue
+            cost = cost_of(x, y, primitive, world, body)
+            if beyond + cost < best:
+                best, chosen, after, spent = beyond + cost, primitive, next_one, cost
+        primitives[count], costs[count] = chosen, spent
+        count += 1
+        number = after
+    return count
+
+
+@in_place
+def leads_to(
+    number: int, mark: NDArray[np.uint8], queue: NDArray[np.int64], world: World, body: Body
+) -> int:
+    """Return to how many states primitives lead from one, at most so many as the queue holds."""
+    queue[0], mark[number], read, count = number, 1, 0, 1
+    while read < count:
+        x, y, heading = place_of(queue[read], world.width)
+        read += 1
+        for primitive in range(body.out[heading], body.out[heading + 1]):
+            column, line = x + body.offset[primitive, 0], y + body.offset[primitive, 1]
+            if column < 0 or line < 0 or column >= world.width or line >= world.height:
+                continue
+            after = number_of(column, line, body.end[primitive], world.width)
+            if mark[after] == 0 and is_possible(x, y, primitive, world, body):
+                if count == queue.size:
+                    return count
+                queue[count], mark[after] = after, 1
+                count += 1
+    return count
+
+
+# The repair
+
+
+@inlined
+def best_after(number: int, limit: Any, marked: int, known: Known, world: World, body: Body) -> Any:
+    """Return the least cost by way of a state with such a mark, or more; infinite above a limit."""
+    x, y, heading = place_of(number, world.width)
+    best = np.float32(np.inf)
+    for primitive in range(body.out[heading], body.out[heading + 1]):
+        column, line = x + body.offset[primitive, 0], y + body.offset[primitive, 1]
+        if column < 0 or line < 0 or column >= world.width or line >= world.height:
+            continue
+        after = number_of(column, line, body.end[primitive], world.width)
+        if known.mark[after] < marked:
+            continue
+        least = known.distance[after] + body.cost[primitive]
+        if least > limit or least >= best or not is_possible(x, y, primitive, world, body):
+            continue
+        found = known.distance[after] + cost_of(x, y, primitive, world, body)
+        if found <= limit and found < best:
+            best = found
+    return best
+
+
+@in_place
+def take_back(
+    known: Known,
+    tiles: NDArray[np.int64],
+    keys: Any,
+    numbers: Any,
+    raised: NDArray[np.int64],
+    world: World,
+    body: Body,
+) -> int:
+    """Take back what no possible primitive supports since the tiles changed; return how many."""
+    # -1 if those are too many for `raised`, or for the heap.
+    distance, mark = known.distance, known.mark
+    size, count, most = 0, 0, keys.size - body.start.size
+    for tile in tiles:
+        for number in range(tile << 10, (tile + 1) << 10):
+            if mark[number] == 0 or distance[number] == 0:
+                continue
+            if best_after(number, distance[number], 1, known, world, body) == np.inf:
+                size = push(distance[number], number, keys, numbers, size)
+                if size > most:
+                    return -1
+    while size > 0:
+        number, key = numbers[0], keys[0]
+        size -= 1
+        if size > 0:
+            sink(keys[size], numbers[size], 0, keys, numbers, size)
+        if mark[number] == 0 or distance[number] != key:
+            continue
+        # What is nearer to the goal is settled: only that can support this one.
+        if best_after(number, key, 1, known, world, body) < np.inf:
+            continue
+        if count == raised.size or size > most:
+            return -1
+        mark[number] = 0
+        raised[count] = number
+        count += 1
+        x, y, heading = place_of(number, world.width)
+        for place in range(body.into[heading], body.into[heading + 1]):
+            primitive = body.ending[place]
+            column, line = x - body.offset[primitive, 0], y - body.offset[primitive, 1]
+            if column < 0 or line < 0 or column >= world.width or line >= world.height:
+                continue
+            before = number_of(column, line, body.start[primitive], world.width)
+            if mark[before] != 0 and distance[before] >= key + body.cost[primitive]:
+                size = push(distance[before], before, keys, numbers, size)
+    return count
+
+
+@in_place
+def look_again(
+    known: Known,
+    found: NDArray[np.int64],
+    numbers: Any,
+    size: int,
+    world: World,
+    body: Body,
+) -> int:
+    """Open the states among some to which a cheaper way leads now; return how many are open."""
+    for number in found:
+        limit = known.distance[number] if known.mark[number] != 0 else np.float32(np.inf)
+        best = best_after(number, limit, 2, known, world, body)
+        if best < np.inf and (known.mark[number] == 0 or best < limit):
+            known.distance[number], known.mark[number] = best, 1
+            numbers[size] = number
+            size += 1
+    return size

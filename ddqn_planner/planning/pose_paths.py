@@ -1,0 +1,107 @@
+"""Paths of poses: what is left of one, whether a body has room along it, what it costs."""
+
+from __future__ import annotations
+
+import math
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ddqn_planner.compiled import in_place
+from ddqn_planner.grid import MOVES, GridMap
+from ddqn_planner.grid.footprint import inside
+from ddqn_planner.grid.grid_map import MULTIPLIERS
+from ddqn_planner.grid.motions import BEHIND, TURN, turn_between
+from ddqn_planner.planning.pose_world import body_costs, occupied_for_body
+
+Float64 = NDArray[np.float64]
+Body = tuple[Float64, Float64]
+
+REACH: Final = 5.0, math.pi / 4  # cells and radians that a robot may be beside its path
+BETWEEN: Final = 0.25  # cells between two points of a body's outline
+WITHIN: Final = 0.7  # and inside: so each cell there, turned as it may be, has a point
+AHEAD: Final = 0.9  # the cosine above which a robot drives ahead, not behind or sideways
+
+
+def points_of(corners: Float64, resolution: float) -> tuple[Float64, Float64]:
+    """Return points along the sides of a footprint, (M, 2), and inside it, in cells."""
+    body = corners / resolution
+    columns, rows = (np.arange(axis.min(), axis.max(), WITHIN) for axis in body.T)
+    filled = np.column_stack([axis.ravel() for axis in np.meshgrid(columns, rows)])
+    sides = zip(body, np.roll(body, -1, axis=0), strict=True)
+    counts = [(a, b, math.ceil(math.dist(a, b) / BETWEEN)) for a, b in sides]
+    outline = [np.linspace(a, b, count, endpoint=False) for a, b, count in counts]
+    return np.concatenate(outline), filled[inside(filled, body)]
+
+
+def in_cells(poses: Float64, grid: GridMap) -> Float64:
+    """Return poses (N, 3) with x and y in cells from the centre of cell (0, 0), turned with it."""
+    x, y, yaw = (np.reshape(poses, (-1, 3)) - grid.origin).T
+    along, across = math.cos(grid.origin[2]), math.sin(grid.origin[2])
+    turned = np.column_stack([along * x + across * y, along * y - across * x])
+    return np.column_stack([turned / grid.resolution - 0.5, yaw])
+
+
+def rest_of_poses(
+    way: Any, robot: Any, grid: GridMap, body: Body, reach: tuple[float, float] = REACH
+) -> Float64:
+    """Return a path from the pose nearest to a robot on; empty if it is far, or has no room."""
+    poses: Float64 = np.asarray(way, dtype=np.float64).reshape(-1, 3)
+    path, (x, y, yaw) = in_cells(poses, grid), in_cells(robot, grid)[0]
+    apart = np.hypot(path[:, 0] - x, path[:, 1] - y)
+    turn = np.abs(turn_between(path[:, 2], yaw))
+    near = np.flatnonzero((apart <= reach[0]) & (turn <= reach[1]))
+    if not len(near):
+        return poses[:0]
+    first = int(near[(apart / REACH[0] + turn / REACH[1])[near].argmin()])
+    cells = cells_of(path[first:])
+    occupied, (outline, within) = occupied_for_body(grid).view(np.uint8), body
+    # What is inside the body at a later pose has come through its outline.
+    if touches(path[first:], outline, occupied) or touches(path[first:][:1], within, occupied):
+        return poses[:0]
+    if grid.forbidden is not None:
+        actions = {tuple(move): 1 << action for action, move in enumerate(MOVES.tolist())}
+        leaves = [actions.get(tuple(step), 0) for step in np.diff(cells, axis=0).tolist()]
+        if (grid.forbidden[cells[:-1, 1], cells[:-1, 0]] & np.array(leaves, np.uint8)).any():
+            return poses[:0]
+    return poses[first:]
+
+
+def cells_of(path: Float64) -> NDArray[np.int32]:
+    """Return the cells in which poses `in_cells` lie, (N, 2)."""
+    return np.floor(path[:, :2] + 0.5).astype(np.int32)
+
+
+def cost_of_poses(poses: Float64, grid: GridMap) -> tuple[float, float]:
+    """Return the length of a free path in cells, and nearly what its primitives cost."""
+    path = in_cells(poses, grid)
+    steps = np.diff(path[:, :2], axis=0)
+    length, turn = np.hypot(*steps.T), np.abs(turn_between(path[:-1, 2], path[1:, 2]))
+    yaw = path[:-1, 2] + turn_between(path[:-1, 2], path[1:, 2]) / 2
+    ahead = steps[:, 0] * np.cos(yaw) + steps[:, 1] * np.sin(yaw) > AHEAD * length
+    spent = np.where(ahead, 1.0, BEHIND) * length
+    spent[length < 1e-6] = (turn * TURN / grid.resolution)[length < 1e-6]
+    x, y = cells_of(path[:-1]).T
+    if (cost := body_costs(grid)) is not None:
+        spent *= MULTIPLIERS.take(cost[y, x], mode="wrap")
+    if grid.slowness is not None:
+        spent *= grid.slowness[y, x]
+    return float(length.sum()), float(spent.sum())
+
+
+@in_place
+def touches(path: Float64, points: Float64, occupied: NDArray[np.uint8]) -> bool:
+    """Return whether points of a body touch an occupied cell at a pose, or leave the map."""
+    for number in range(len(path)):
+        x, y, yaw = path[number, 0] + 0.5, path[number, 1] + 0.5, path[number, 2]
+        cos, sin = math.cos(yaw), math.sin(yaw)
+        for point in range(len(points)):
+            over, up = points[point, 0], points[point, 1]
+            column = math.floor(x + cos * over - sin * up)
+            line = math.floor(y + sin * over + cos * up)
+            if column < 0 or line < 0 or line >= occupied.shape[0] or column >= occupied.shape[1]:
+                return True
+            if occupied[line, column] != 0:
+                return True
+    return False

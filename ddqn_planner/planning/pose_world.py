@@ -1,0 +1,279 @@
+"""A body on a map, as kernels see them: where it has room, and what its primitives cost."""
+
+from __future__ import annotations
+
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+from numpy.typing import DTypeLike, NDArray
+
+from ddqn_planner.compiled import inlined
+from ddqn_planner.grid import MOVES, GridMap
+from ddqn_planner.grid.arguments import OCCUPIED
+from ddqn_planner.grid.footprint import rows_of
+from ddqn_planner.grid.grid_map import MULTIPLIERS
+from ddqn_planner.grid.motions import HEADINGS, Motions, closer
+
+TILE: Final = 8  # cells of a side
+BORDER: Final = 128  # occupied cells around the map, so that a body sweeps none beyond the bits
+CHANGED_SHARE = 1 / 50  # of the map's cells: if more changed, fields begin anew
+FINE = 0.01  # cells between two points of the origin's way, which tell the cells that it passes
+WORD, LAST_BIT, ONE, FULL = np.uint64(64), np.uint64(63), np.uint64(1), np.uint64(2**64 - 1)
+
+
+class Body(NamedTuple):
+    """P primitives as kernels use them; 16 more say of each heading where the body stands."""
+
+    into: NDArray[np.int64]  # (17,): into[h] to into[h + 1] are the places in `ending` of those
+    ending: NDArray[np.int64]  # (P,): the primitives, by the heading in which they end
+    out: NDArray[np.int64]  # (17,): likewise, by the heading in which they start
+    start: NDArray[np.int64]  # (P,)
+    end: NDArray[np.int64]  # (P,)
+    offset: NDArray[np.int64]  # (P, 2)
+    cost: NDArray[np.float32]  # (P,)
+    row: NDArray[np.int64]  # (R, 3): y, first x, cells: the swept cells, at most 64 in one row
+    first: NDArray[np.int64]  # (P + 17,): where the rows of a primitive begin
+    passed: NDArray[np.int64]  # (C, 3): x, y, bit of the action by which the origin leaves the cell
+    share: NDArray[np.float32]  # (C,): which part of the cost counts in this cell
+    first_passed: NDArray[np.int64]  # (P + 1,)
+    reach: int  # cells that a primitive sweeps to any side, at most
+    core: int  # the rows from here on: what it sweeps around any cell that its origin passes
+
+
+class World(NamedTuple):
+    """A map as kernels use it; empty arrays for layers that it does not have."""
+
+    bits: NDArray[np.uint64]  # (rows, words): a bit for each occupied cell, with the border
+    cost: NDArray[np.int8]  # (H, W)
+    multipliers: NDArray[np.float32]  # (102,): of costs 0 to 100 and, last, unknown
+    slowness: NDArray[np.float32]  # (H, W)
+    forbidden: NDArray[np.uint8]  # (H, W)
+    tile: NDArray[np.uint8]  # (T,): whether the body can reach an occupied cell, once it is known
+    room: NDArray[np.uint8]  # (T,): whether the body's core has room in one of its cells, likewise
+    height: int
+    width: int
+
+
+def body_of(motions: Motions, swept: NDArray[np.bool_]) -> Body:
+    """Return what kernels need of primitives and the cells (P, S, S) that they sweep."""
+    start, end, headings = motions.start, motions.end, np.arange(HEADINGS + 1)
+    passed = [_passed(poses) for poses in motions.poses]
+    # Where the body stands is what all primitives from there and to there sweep; its core is what
+    # each sweeps around every cell that its origin passes.
+    standing = np.ones((HEADINGS, *swept.shape[1:]), dtype=np.bool_)
+    core = np.ones((1, *swept.shape[1:]), dtype=np.bool_)
+    for mask, before, after, (x, y), (cells, _) in zip(
+        swept, start, end, motions.offset, passed, strict=True
+    ):
+        standing[before] &= mask
+        standing[after] &= np.roll(mask, (-y, -x), axis=(0, 1))
+        for over, up, _ in cells:
+            core &= np.roll(mask, (-up, -over), axis=(0, 1))
+    row, first = rows_of(np.concatenate([swept, standing, core]))
+    ending = np.argsort(end, kind="stable")
+    return Body(
+        into=np.searchsorted(end[ending], headings),
+        ending=ending,
+        out=np.searchsorted(start, headings),
+        start=start,
+        end=end,
+        offset=motions.offset,
+        cost=motions.cost,
+        row=row,
+        first=first[:-1],
+        passed=np.concatenate([cells for cells, _ in passed]),
+        share=np.concatenate([share for _, share in passed]).astype(np.float32),
+        first_passed=np.cumsum([0, *(len(share) for _, share in passed)]),
+        reach=int(np.abs(np.vstack([row[:, :2], [(0, sum(r) - 1) for r in row[:, 1:]]])).max()),
+        core=int(first[-2]),
+    )
+
+
+def _passed(poses: NDArray[np.float64]) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    """Return the cells that the origin passes, with the action that leaves each; and its shares."""
+    way = closer(poses, FINE, 0.0)[:, :2]
+    middle, length = (way[1:] + way[:-1]) / 2, np.hypot(*np.diff(way, axis=0).T)
+    if not length.any():
+        middle, length = way[:1], np.ones(1)
+    cells = np.floor(middle + 0.5).astype(np.int64)
+    begins = np.flatnonzero(np.r_[True, (cells[1:] != cells[:-1]).any(axis=1)])
+    share = np.add.reduceat(length, begins) / length.sum()
+    cells = cells[begins]
+    leaves = [1 << MOVES.tolist().index(step) for step in np.diff(cells, axis=0).tolist()]
+    return np.column_stack([cells, [*leaves, 0]]), share
+
+
+def occupied_for_body(grid: GridMap) -> NDArray[np.bool_]:
+    """Return the cells that no body may touch: what is only too near for a disc's body is free."""
+    return grid.occupancy if grid.obstacles is None else grid.obstacles
+
+
+def body_costs(grid: GridMap) -> NDArray[np.int8] | None:
+    """Return what cells cost, if they do: the most where only a disc's body is too near."""
+    if grid.cost is None or grid.obstacles is None:
+        return grid.cost
+    return np.where(grid.occupancy, np.int8(OCCUPIED), grid.cost)
+
+
+def _layer(layer: NDArray[Any] | None, dtype: DTypeLike) -> NDArray[Any]:
+    """Return a layer, or an empty one, read-only: for others numba compiles the kernels again."""
+    array = np.empty((0, 0), dtype) if layer is None else layer.view()
+    array.flags.writeable = False
+    return array
+
+
+def world_of(
+    grid: GridMap, older: World | None = None, cells: NDArray[np.int64] | None = None
+) -> World:
+    """Return a map for kernels: from scratch, or from an older one that differs in cells (N, 2)."""
+    occupied = occupied_for_body(grid)
+    height, width = occupied.shape
+    words = (width + 2 * BORDER + 63) // 64 + 1
+    bits = np.full((height + 2 * BORDER, words), -1, np.int64) if older is None else older.bits
+    bits = bits.view(np.uint64).copy()
+    tile = np.zeros(((height + TILE - 1) // TILE, (width + TILE - 1) // TILE), dtype=np.uint8)
+    room = tile.copy()
+    (left, bottom), (right, top) = (0, 0), (width, height)
+    if older is not None and cells is not None:
+        (left, bottom), (right, top) = cells.min(axis=0), cells.max(axis=0) + 1
+        tile[:] = older.tile.reshape(tile.shape)
+        room[:] = older.room.reshape(tile.shape)
+    line = np.ones((top - bottom, 64 * words), dtype=np.bool_)
+    line[:, BORDER : BORDER + width] = occupied[bottom:top]
+    packed = np.packbits(line, axis=1, bitorder="little").view("<u8")
+    bits[BORDER + bottom : BORDER + top] = packed
+    near = tuple(
+        slice(max(first - BORDER, 0) // TILE, (last + BORDER) // TILE + 1)
+        for first, last in ((bottom, top), (left, right))
+    )
+    tile[near] = room[near] = 0
+    return World(
+        bits,
+        _layer(body_costs(grid), np.int8),
+        MULTIPLIERS if grid.cost is None else np.append(MULTIPLIERS, MULTIPLIERS[-1:]),
+        _layer(grid.slowness, np.float32),
+        _layer(grid.forbidden, np.uint8),
+        tile.ravel(),
+        room.ravel(),
+        height,
+        width,
+    )
+
+
+def differences(old: GridMap, new: GridMap) -> tuple[NDArray[np.int64], bool] | None:
+    """Return the cells (N, 2) in which maps of one place differ, and whether a way may be cheaper.
+
+    None if the maps cannot be compared, or differ in too much.
+    """
+    layers = ("cost", "slowness", "forbidden", "occupancy", "obstacles")
+    pairs = [(getattr(old, name), getattr(new, name)) for name in layers]
+    has_same = all((before is None) == (after is None) for before, after in pairs)
+    if not has_same or old.occupancy.shape != new.occupancy.shape:
+        return None
+    boxes = new.patches_since(old)
+    if boxes is None:
+        boxes = [(slice(0, new.height), slice(0, new.width))]
+    before, after = occupied_for_body(old), occupied_for_body(new)
+    found, opens = [np.empty((0, 2), np.int64)], False
+    for rows, columns in boxes:
+        box = rows, columns
+        differs = before[box] != after[box]
+        opens = opens or bool((differs & before[box]).any())
+        for one, other in pairs[:4]:
+            if one is not None and one is not other:
+                changed = (one[box] != other[box]) & ~after[box]
+                opens = opens or bool(changed.any())
+                differs |= changed
+        y, x = np.nonzero(differs)
+        found.append(np.column_stack([x + columns.start, y + rows.start]))
+    cells = np.concatenate(found)
+    return None if len(cells) > CHANGED_SHARE * new.occupancy.size else (cells, opens)
+
+
+@inlined
+def touches(bits: Any, x: int, y: int, row: Any, first: int, last: int) -> bool:
+    """Return whether an occupied cell lies in some rows of swept cells."""
+    for number in range(first, last):
+        column = np.uint64(x + row[number, 1] + BORDER)
+        line, word, place = y + row[number, 0] + BORDER, column // WORD, column & LAST_BIT
+        seen = bits[line, word] >> place
+        # Two shifts, as one by 64 has no meaning.
+        seen |= (bits[line, word + ONE] << ONE) << (LAST_BIT - place)
+        if seen & (FULL >> np.uint64(64 - row[number, 2])):
+            return True
+    return False
+
+
+@inlined
+def is_far(x: int, y: int, world: Any, body: Any) -> bool:
+    """Return whether no occupied cell is within reach of a tile; looks at most once."""
+    tile = (y >> 3) * ((world.width + 7) >> 3) + (x >> 3)
+    if world.tile[tile] == 0:
+        left, bottom, wide = (x & -8) - body.reach, (y & -8) - body.reach, TILE + 2 * body.reach
+        found = 1
+        first = np.uint64(left + BORDER)
+        last = np.uint64(left + wide - 1 + BORDER)
+        for line in range(bottom + BORDER, bottom + wide + BORDER):
+            for word in range(first // WORD, last // WORD + ONE):
+                seen = world.bits[line, word]
+                if word == first // WORD:
+                    seen &= FULL << (first & LAST_BIT)
+                if word == last // WORD:
+                    seen &= FULL >> (LAST_BIT - (last & LAST_BIT))
+                if seen:
+                    found = 2
+                    break
+            if found == 2:
+                break
+        world.tile[tile] = found
+    return bool(world.tile[tile] == 1)
+
+
+@inlined
+def multiplier_in(x: int, y: int, world: Any) -> Any:
+    """Return what a cell of the origin's way costs per cell of its length."""
+    factor = np.float32(1)
+    if world.cost.size > 0:
+        factor = world.multipliers[world.cost[y, x]]
+    if world.slowness.size > 0:
+        factor *= world.slowness[y, x]
+    return factor
+
+
+@inlined
+def cost_of(x: int, y: int, number: int, world: Any, body: Any) -> Any:
+    """Return the cost of a primitive that the body has room for, infinite if it is forbidden."""
+    cost = body.cost[number]
+    if world.cost.size + world.slowness.size + world.forbidden.size == 0:
+        return cost
+    total = np.float32(0)
+    for place in range(body.first_passed[number], body.first_passed[number + 1]):
+        column, line = x + body.passed[place, 0], y + body.passed[place, 1]
+        total += body.share[place] * multiplier_in(column, line, world)
+        if world.forbidden.size > 0 and world.forbidden[line, column] & body.passed[place, 2]:
+            return np.float32(np.inf)
+    return cost * total
+
+
+@inlined
+def is_possible(x: int, y: int, number: int, world: Any, body: Any) -> bool:
+    """Return whether the body can take a primitive from a cell."""
+    first, last = body.first[number], body.first[number + 1]
+    return is_far(x, y, world, body) or not touches(world.bits, x, y, body.row, first, last)
+
+
+@inlined
+def has_room(tile_x: int, tile_y: int, world: Any, body: Any) -> bool:
+    """Return whether the body's core has room in a tile; looks at most once."""
+    tile = tile_y * ((world.width + 7) >> 3) + tile_x
+    if world.room[tile] == 0:
+        found = 2
+        for cell in range(64):
+            # From the middle on: most tiles have room there.
+            x, y = 8 * tile_x + ((cell & 7) ^ 4), 8 * tile_y + ((cell >> 3) ^ 4)
+            inside = x < world.width and y < world.height
+            if inside and not touches(world.bits, x, y, body.row, body.core, body.row.shape[0]):
+                found = 1
+                break
+        world.room[tile] = found
+    return bool(world.room[tile] == 1)

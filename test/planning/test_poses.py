@@ -1,0 +1,320 @@
+"""Plans for bodies with a heading, against Dijkstra over the same poses and against polygons."""
+
+import math
+from functools import cache
+from itertools import pairwise
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+import shapely
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import dijkstra
+
+from ddqn_planner import GridMap
+from ddqn_planner.grid import MOVES
+from ddqn_planner.grid.body import INSCRIBED, grid_from_costmap
+from ddqn_planner.grid.footprint import read_footprint, swept_cells
+from ddqn_planner.grid.motions import Motions, make_motions, turn_between
+from ddqn_planner.planning import pose_field
+from ddqn_planner.planning.plan import PlanStatus, PosePlan
+from ddqn_planner.planning.planner import last_step
+from ddqn_planner.planning.pose_field import State
+from ddqn_planner.planning.pose_paths import cost_of_poses
+from ddqn_planner.planning.pose_planner import Pose, PosePlanner, PoseRequest
+
+CELL = 0.1
+SQUARE = (0, 0), (0, 2), (2, 2), (2, 0)
+BODIES = {
+    "differential": "[[0.25, 0.15], [-0.25, 0.15], [-0.25, -0.15], [0.25, -0.15]]",
+    "ackermann": "[[0.35, 0.15], [-0.1, 0.15], [-0.1, -0.15], [0.35, -0.15]]",
+    "omnidirectional": "[[0.25, 0.15], [-0.25, 0.15], [-0.1, -0.15], [0.25, -0.15]]",
+}
+
+
+@cache
+def robot(motion: str) -> tuple[Motions, NDArray[np.bool_]]:
+    """Return motions and swept cells of a small robot."""
+    motions = make_motions(motion, 0.2, CELL)
+    return motions, swept_cells(read_footprint(BODIES[motion]), motions)
+
+
+def planner(motion: str) -> PosePlanner:
+    motions, swept = robot(motion)
+    body = read_footprint(BODIES[motion])
+    return PosePlanner(SimpleNamespace(motions=motions, swept=lambda: swept, footprint=body))
+
+
+def plan(planner: PosePlanner, grid: GridMap, start: Pose, *goals: Pose, **how: Any) -> PosePlan:
+    return last_step(planner.steps(PoseRequest(grid, start, goals, **how)))
+
+
+def pose_of(grid: GridMap, motions: Motions, state: State) -> Pose:
+    x, y, heading = state
+    return (*grid.cell_to_world((x, y)), float(motions.angles[heading]) + grid.origin[2])
+
+
+@cache
+def way_of(motion: str, number: int) -> dict[tuple[int, int], float]:
+    """Return the cells that the origin passes, and its shares, from a thousand points."""
+    poses = robot(motion)[0].poses[number]
+    at = np.linspace(0, len(poses) - 1, 1001)
+    way = np.column_stack([np.interp(at, range(len(poses)), poses[:, i]) for i in (0, 1)])
+    length = np.hypot(*np.diff(way, axis=0).T) + 1e-12
+    shares: dict[tuple[int, int], float] = {}
+    for cell, part in zip(np.floor((way[1:] + way[:-1]) / 2 + 0.5), length, strict=True):
+        key = int(cell[0]), int(cell[1])
+        shares[key] = shares.get(key, 0) + part / length.sum()
+    return shares
+
+
+def least_costs(grid: GridMap, motion: str, goal: State) -> NDArray[np.float64]:
+    """Return (H, W, 16): the least cost from every pose to a goal, in cells."""
+    motions, swept = robot(motion)
+    height, width = grid.occupancy.shape
+    reach, multiplier = swept.shape[-1] // 2, grid.cost_multiplier
+    occupied = np.pad(grid.occupancy, reach, constant_values=True)
+    edges = []
+    for number in range(len(motions.start)):
+        hit = np.zeros((height, width), np.bool_)
+        for y, x in np.argwhere(swept[number]):
+            hit |= occupied[y : y + height, x : x + width]
+        y, x = np.nonzero(~hit)
+        way = way_of(motion, number)
+        factor = sum(part * multiplier[y + up, x + over] for (over, up), part in way.items())
+        allowed = np.ones(len(x), np.bool_)
+        for here, after in pairwise(way):
+            if grid.forbidden is not None:
+                action = MOVES.tolist().index([after[0] - here[0], after[1] - here[1]])
+                allowed &= (grid.forbidden[y + here[1], x + here[0]] >> action & 1) == 0
+        over, up = motions.offset[number]
+        before = (y * width + x) * 16 + motions.start[number]
+        after = ((y + up) * width + x + over) * 16 + motions.end[number]
+        edges.append(np.column_stack([before, after, motions.cost[number] * factor])[allowed])
+    before, after, cost = np.concatenate(edges).T
+    size = grid.occupancy.size * 16
+    graph = coo_matrix((cost, (after.astype(int), before.astype(int))), (size, size)).tocsr()
+    x, y, heading = goal
+    return dijkstra(graph, indices=(y * width + x) * 16 + heading).reshape(height, width, 16)
+
+
+@settings(max_examples=12)
+@given(
+    motion=st.sampled_from(sorted(BODIES)),
+    seed=st.integers(0, 2**32 - 1),
+    layers=st.sampled_from([(), ("cost",), ("forbidden",), ("cost", "slowness")]),
+    guided=st.booleans(),
+)
+def test_plans_cost_the_least_within_their_bound_also_after_repairs(
+    motion: str, seed: int, layers: tuple[str, ...], guided: bool
+) -> None:
+    random = np.random.default_rng(seed)
+    shape = height, width = tuple(random.integers(14, 22, 2))
+    occupancy = random.random(shape) < random.choice([0, 0.01, 0.03])
+    occupancy[random.integers(height), : random.integers(width)] = True
+    given_layers = {
+        "cost": random.integers(-1, 100, shape),
+        "forbidden": np.where(random.random(shape) < 0.1, random.integers(0, 256, shape), 0),
+        "slowness": random.uniform(1, 4, shape).astype(np.float32),
+    }
+    origin = (*random.uniform(-3, 3, 2), random.choice([0, 0.5]))
+    grid = GridMap(occupancy, CELL, origin, **{name: given_layers[name] for name in layers})
+    motions, _ = robot(motion)
+    states = [(*random.integers((width, height)).tolist(), h) for h in random.integers(16, size=7)]
+    goal, *starts = ((x, y, int(heading)) for x, y, heading in states)
+    body = planner(motion)
+    with pytest.MonkeyPatch.context() as patch:
+        if guided:
+            patch.setattr(pose_field, "UNGUIDED", 16)
+        for _ in range(3):
+            best = least_costs(grid, motion, goal)
+            for x, y, heading in starts:
+                bound = float(random.choice([1.0, 1.2, 2.0]))
+                start, end = (pose_of(grid, motions, s) for s in ((x, y, heading), goal))
+                found = plan(body, grid, start, end, bound=bound)
+                if found.status in (PlanStatus.START_OCCUPIED, PlanStatus.GOAL_OCCUPIED):
+                    continue
+                least = best[y, x, heading]
+                # Where the body has no room, the next heading counts.
+                if found.poses.size and abs(turn_between(found.poses[0, 2], start[2])) < 1e-6:
+                    assert 1 <= found.bound <= bound + 1e-5
+                    same = 1.003 if layers else 1.0001  # the parts of the way are rounded
+                    assert least / same <= found.cost <= least * found.bound * same
+                elif not found.poses.size:
+                    assert found.status is PlanStatus.NO_PATH
+                    assert least == math.inf
+            x, y = random.integers(0, (width - 3, height - 3)).tolist()
+            patch_of = random.random((3, 3)) < random.choice([0, 0.5, 1])
+            grid = grid.with_patch(patch_of, x, y)
+
+
+def placed(body: shapely.Polygon, pose: NDArray[np.float64]) -> shapely.Polygon:
+    x, y, yaw = pose
+    turned = shapely.affinity.rotate(body, yaw, origin=(0, 0), use_radians=True)
+    return shapely.affinity.translate(turned, x, y)
+
+
+@settings(max_examples=25)
+@given(motion=st.sampled_from(sorted(BODIES)), seed=st.integers(0, 2**32 - 1))
+def test_no_body_touches_an_occupied_cell(motion: str, seed: int) -> None:
+    random = np.random.default_rng(seed)
+    # So wide that the body's bits lie in several words of the map's.
+    occupancy = random.random((25, 110)) < 0.03
+    grid = GridMap(occupancy, CELL, (*random.uniform(-3, 3, 2), 0))
+    start, goal = (
+        (grid.origin[0] + x, grid.origin[1] + random.uniform(0, 2.5), random.uniform(-4, 4))
+        for x in random.uniform(0, 11, 2)
+    )
+    poses = plan(planner(motion), grid, start, goal).poses
+    y, x = np.nonzero(np.pad(occupancy, 1, constant_values=True))
+    low = (np.column_stack([x, y]) - 1) * CELL + grid.origin[:2]
+    cells = shapely.STRtree(shapely.box(*low.T, *(low + CELL).T))
+    body = shapely.Polygon(read_footprint(BODIES[motion])).buffer(-1e-6, join_style="mitre")
+    # Every 2 cm and 2 degrees between poses that are half a cell apart at most.
+    for before, after in pairwise(poses):
+        move = after - before
+        assert math.hypot(*move[:2]) <= CELL / 2 + 1e-9
+        move[2] = (move[2] + math.pi) % (2 * math.pi) - math.pi
+        for share in np.linspace(0, 1, 1 + math.ceil(max(abs(move[2]) / math.radians(2), 3))):
+            assert not len(cells.query(placed(body, before + share * move), "intersects"))
+
+
+def test_a_plan_begins_and_ends_as_asked_and_the_rest_of_it_is_known() -> None:
+    motions, _ = robot("differential")
+    grid = GridMap(np.zeros((40, 60), np.bool_), CELL, (1, 2, 0.5))
+    start, goal = (pose_of(grid, motions, state) for state in ((10, 10, 2), (50, 20, 7)))
+    body = planner("differential")
+    whole = plan(body, grid, start, goal)
+    assert np.abs((whole.poses[[0, -1]] - [start, goal])[:, :2]).max() < 1e-9
+    assert np.abs(turn_between(whole.poses[[0, -1], 2], [start[2], goal[2]])).max() < 1e-9
+    assert whole.length * CELL == pytest.approx(np.hypot(*np.diff(whole.poses[:, :2].T)).sum())
+    assert whole.cells[0] == (10, 10)
+    assert whole.cells[-1] == (50, 20) == whole.goal
+    rest = plan(body, grid, tuple(whole.poses[7]), goal)
+    assert np.array_equal(rest.poses, whole.poses[7:])
+    assert rest.cost < whole.cost
+    assert plan(body, grid, goal, goal).poses.shape == (1, 3)
+
+
+def test_the_nearest_goal_counts_and_one_without_room_moves_within_the_tolerance() -> None:
+    motions, _ = robot("differential")
+    occupancy = np.zeros((30, 60), np.bool_)
+    occupancy[10, 40] = True
+    grid = GridMap(occupancy, CELL)
+    start, near, far, occupied = (
+        pose_of(grid, motions, state)
+        for state in ((10, 10, 0), (20, 10, 0), (50, 10, 0), (40, 10, 0))
+    )
+    body = planner("differential")
+    assert plan(body, grid, start, far, near).goal == (20, 10)
+    assert plan(body, grid, start, occupied).status is PlanStatus.GOAL_OCCUPIED
+    moved = plan(body, grid, start, occupied, tolerance=(0.5, 0.3))
+    assert 0 < math.dist(moved.poses[-1, :2], occupied[:2]) <= 0.5
+    assert plan(body, grid, occupied, near).status is PlanStatus.START_OCCUPIED
+    assert plan(body, grid, (-1, 0, 0), near).status is PlanStatus.START_OUTSIDE_MAP
+    assert plan(body, grid, near, (99, 0, 0)).status is PlanStatus.GOAL_OUTSIDE_MAP
+    with pytest.raises(ValueError, match=r"learned cells of 0.1 m, and the map's have 0.05 m"):
+        plan(body, GridMap(occupancy, 0.05), start, near)
+
+
+def test_a_body_that_cannot_leave_its_place_has_no_path() -> None:
+    motions, _ = robot("differential")
+    occupancy = np.zeros((60, 60), np.bool_)
+    occupancy[[20, 30], 20:31] = occupancy[20:31, [20, 30]] = True  # a closed room
+    grid = GridMap(occupancy, CELL)
+    start, goal = (pose_of(grid, motions, state) for state in ((25, 25, 0), (50, 50, 0)))
+    body = planner("differential")
+    for pair in ((start, goal), (goal, start)):
+        assert plan(body, grid, *pair).status is PlanStatus.NO_PATH
+    assert plan(body, grid, pose_of(grid, motions, (50, 10, 4)), goal).poses.size
+
+
+@settings(max_examples=12)
+@given(motion=st.sampled_from(sorted(BODIES)), seed=st.integers(0, 2**32 - 1))
+def test_the_rest_of_a_path_is_free_unless_a_box_stands_ahead(motion: str, seed: int) -> None:
+    random = np.random.default_rng(seed)
+    grid = GridMap(np.zeros((40, 60), np.bool_), CELL, (1, 2, float(random.choice([0, 0.5]))))
+    states = [(*random.integers((8, 8), (52, 32)).tolist(), h) for h in random.integers(16, size=2)]
+    start, goal = (pose_of(grid, robot(motion)[0], (x, y, int(h))) for x, y, h in states)
+    body = planner(motion)
+    poses = plan(body, grid, start, goal).poses
+    at, beside = random.integers(len(poses)), (*random.uniform(-0.02, 0.02, 2), 0.05)
+    rest = body.rest_of(poses, tuple(poses[at] + beside), grid)
+    assert np.array_equal(rest, poses[len(poses) - len(rest) :])
+    assert math.dist(rest[0, :2], poses[at, :2]) < 0.1
+    x, y = grid.world_to_cell(*poses[at, :2])
+    blocked = grid.with_patch(np.ones((2, 2), np.bool_), x, y)
+    box = shapely.Polygon([blocked.centres(x + a - 0.5, y + b - 0.5) for a, b in SQUARE])
+    shape = shapely.Polygon(read_footprint(BODIES[motion]))
+    for robot_at in (0, at, len(poses) - 1):
+        ahead = body.rest_of(poses, tuple(poses[robot_at]), grid)
+        # In between, the outline's points may miss a corner.
+        surely, perhaps = (
+            any(placed(shape.buffer(by), pose).intersects(box) for pose in ahead)
+            for by in (-0.02, 0.001)
+        )
+        is_free = len(body.rest_of(poses, tuple(poses[robot_at]), blocked)) > 0
+        assert not (is_free and surely)
+        assert is_free or perhaps
+    here = grid.with_patch([[True]], *grid.world_to_cell(*poses[-1, :2]))
+    assert not len(body.rest_of(poses, tuple(poses[-1]), here))
+    forbidden = np.zeros((40, 60), np.uint8)
+    forbidden[y, x] = 255
+    cells = [grid.world_to_cell(*pose[:2]) for pose in poses]
+    leaves = any(a == (x, y) != b for a, b in pairwise(cells))
+    closed = grid.with_layers(forbidden=forbidden)
+    assert bool(len(body.rest_of(poses, tuple(poses[0]), closed))) != leaves
+    far = tuple(poses[0] + (3.0, 3.0, 0.0)), tuple(poses[0] + (0, 0, math.pi))
+    assert not len(body.rest_of(poses[:1], far[0], grid)) + len(
+        body.rest_of(poses[:1], far[1], grid)
+    )
+
+
+def test_a_path_is_kept_while_it_costs_hardly_more_and_leads_to_a_goal() -> None:
+    motions, _ = robot("differential")
+    occupancy = np.zeros((41, 60), np.bool_)
+    occupancy[10:31, 20:40] = True
+    start, goal, other = (
+        pose_of(GridMap(occupancy, CELL), motions, (x, 20, 0)) for x in (8, 52, 50)
+    )
+    body = planner("differential")
+
+    def costs(expensive: slice) -> GridMap:
+        cost = np.zeros(occupancy.shape, np.int8)
+        cost[expensive, 20:40] = 3
+        return GridMap(occupancy, CELL, cost=cost)
+
+    below, above = costs(slice(0, 20)), costs(slice(21, 41))
+    first = plan(body, below, start, goal, bound=1.0)
+    assert first.poses[:, 1].max() > 3
+    how = {"under_way": first.poses, "bound": 1.0}
+    kept = plan(body, above, start, goal, switch_threshold=0.2, **how)
+    new = plan(body, above, start, goal, switch_threshold=0.01, **how)
+    assert np.array_equal(kept.poses, first.poses)
+    assert new.poses[:, 1].max() < 3
+    assert (new.extra_cost, new.bound) == (None, 1.0)
+    assert kept.extra_cost == pytest.approx(kept.cost / new.cost - 1)
+    assert kept.bound == pytest.approx(kept.cost / new.cost)
+    assert kept.cost == pytest.approx(cost_of_poses(first.poses, above)[1], rel=0.02)
+    assert plan(body, above, start, other, switch_threshold=0.2, **how).extra_cost is None
+
+
+def test_cells_that_are_only_too_near_for_a_disc_are_free_at_the_highest_cost() -> None:
+    motions, _ = robot("differential")
+    values = np.zeros((20, 60), np.int8)
+    values[:, 30] = INSCRIBED
+    grid, body = grid_from_costmap(values, CELL), planner("differential")
+    start, goal = (pose_of(grid, motions, (x, 10, 0)) for x in (8, 52))
+    assert plan(body, grid, start, goal, bound=1.0).cost == pytest.approx(44 + 4)
+    free = grid.with_patch(
+        np.zeros((20, 1), np.bool_), 30, 0, obstacles=np.zeros((20, 1), np.bool_)
+    )
+    assert plan(body, free, start, goal, bound=1.0).cost == pytest.approx(44)
+    assert plan(body, grid, start, goal, bound=1.0).cost == pytest.approx(44 + 4)
+    values[:, 30] = 100
+    walled = grid_from_costmap(values, CELL)
+    assert plan(body, walled, start, goal).status is PlanStatus.NO_PATH
