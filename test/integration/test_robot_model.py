@@ -144,9 +144,8 @@ def test_the_nearest_pose_counts_and_services_are_answered(robot: Robot) -> None
     answer = robot.get_plan(at(robot, BEYOND, 0.0), at(robot, START, 3.0))
     check(answer, robot.grid, START, 3.0)
     assert not robot.get_plan(at(robot, (29, 3), 0.0), at(robot, START, 3.0)).poses
-    robot.wait_for_reason(
-        "the start is occupied .*; set the start where the robot's body has room$"
-    )
+    why = r"the start is occupied \(start: .* in cell \(29, 3\); goal: .* in cell \(10, 10\); .*"
+    robot.wait_for_reason(f"{why}; set the start where the robot's body has room$")
 
 
 def test_a_car_turns_by_driving_back(robot: Robot, models: Any) -> None:
@@ -209,6 +208,7 @@ def test_bodies_along_the_path_are_shown_to_who_asks(robot: Robot) -> None:
     assert shown.wait(is_of_a_plan).markers[0].header.frame_id == "map"
     robot.send_goal(at(robot, (30, 2), 0.5))
     shown.wait(lambda message: message.markers[0].action == Marker.DELETE)
+    assert "is shown" not in robot.node.log  # of fields, which a body does not have
 
 
 def test_actions_lead_through_poses_and_paths_are_checked(models: Any, rooms: np.ndarray) -> None:
