@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -44,9 +45,9 @@ class Posterior:
         count = len(self.middle)
         self.links = _links_of(self.place, self.size, count)
         self.degree = np.asarray(self.links.sum(axis=1), dtype=np.float64)
-        # The solution of linear equations, and their right side: real, what was seen beyond what is
-        # expected; imaginary, the share that is known.
-        self.solution, self.right = np.zeros((2, count), dtype=np.complex128)
+        # The solution of linear equations: real, what was seen beyond what is expected; imaginary,
+        # the share that is known.
+        self.solution = np.zeros(count, dtype=np.complex128)
         self.prior: Prior | None = None
         self.foretold = np.zeros(count, dtype=np.float32)  # by the prior
         self.expected, self.waits = np.zeros(count), np.zeros(count)
@@ -54,6 +55,13 @@ class Posterior:
         self.common = (0.0,) * 5
         self.painted: tuple[float, float, NDArray[np.float32]] | None = None
         self.steps = np.zeros(0)
+
+    @cached_property
+    def tree(self) -> Any:
+        """Finds places by their middle cells."""
+        from scipy.spatial import KDTree
+
+        return KDTree(self.middle)
 
     @property
     def mean(self) -> Float64:
@@ -78,17 +86,12 @@ class Posterior:
     def places_at(self, position: Float64) -> Int64:
         """Return the place of each position (N, 2), the nearest within a place's side, or -1."""
         cells, free = cells_of(position, self.grid)
-        reach, last = self.size, np.array(self.place.shape)[::-1] - 1
-        x, y = np.clip(cells, 0, last).T
-        places = np.where(free, self.place[y, x], -1).astype(np.int64)
-        for index in np.flatnonzero(~free):
-            x, y = cells[index].tolist()
-            left, bottom = max(x - reach, 0), max(y - reach, 0)
-            box = self.place[bottom : max(y + reach + 1, 0), left : max(x + reach + 1, 0)]
-            free_y, free_x = np.nonzero(box >= 0)
-            if len(free_x):
-                best = np.hypot(free_x + left - x, free_y + bottom - y).argmin()
-                places[index] = box[free_y[best], free_x[best]]
+        x, y = cells[free].T
+        places = np.full(len(cells), -1)
+        places[free] = self.place[y, x]
+        if not free.all():
+            away, near = self.tree.query(cells[~free], distance_upper_bound=1.5 * self.size)
+            places[~free] = np.where(np.isfinite(away), near, -1)
         return places
 
     def update(self, evidence: Evidence) -> None:
@@ -107,7 +110,6 @@ class Posterior:
         places = self.places_at(evidence.table[:, 3:5])
         inside = places >= 0
         weight, log = evidence.table[inside, :2].T
-        # Half of the noise is added, as the mean of its exponential is more than 1.
         # A lattice whose links have strength 1 has about the variance ln(32 / kappa) / 4 pi;
         # 1 is added for cells of many metres, where that would be negative.
         kappa = (self.spacing / CORRELATION) ** 2
@@ -117,42 +119,31 @@ class Posterior:
         seen = scale * np.bincount(places[inside], log + weight * noise / 2, len(self.waits))
         right = seen - known * self.expected + 1j * known
         diagonal = kappa + self.degree + known
-        if not np.array_equal(right, self.right):
-            self._solve(diagonal, right)
-        self._wait(evidence)
-
-    def _solve(self, diagonal: Float64, right: NDArray[np.complex128]) -> None:
-        self.right = right
         residual = right + self.links @ self.solution - diagonal * self.solution
         # The equations map the same error everywhere to its product with these, and greater errors
         # to greater residuals: residuals up to that product prove that no error is greater.
         most = ACCURACY * (diagonal - self.degree)
         wrong = np.abs(residual) > most
-        queue = np.append(np.flatnonzero(wrong), np.zeros(np.count_nonzero(~wrong), dtype=np.int64))
+        queue, waiting = np.argsort(~wrong, kind="stable"), np.count_nonzero(wrong)
         links = self.links.indptr, self.links.indices, self.links.data
-        waiting = np.count_nonzero(wrong)
         _relax(*links, diagonal, most, residual, self.solution, queue, waiting, wrong)
+        self._wait(evidence)
 
     def _wait(self, evidence: Evidence) -> None:
         """Spread the expected waits over the places around, so that a crossing costs each once."""
-        from scipy.ndimage import label
+        from scipy.sparse.csgraph import connected_components
 
         self.waits[:] = 0
         radius = evidence.wait_radius
         width = max(math.pi / 2 * radius, self.spacing)  # the mean way through a disc
-        reach = int(radius / self.grid.resolution)
         for position, seconds in evidence.expected_waits():
-            at = int(self.places_at(position[None])[0])
-            if at < 0:
-                continue
-            x, y = self.middle[at].tolist()
-            left, bottom = max(x - reach, 0), max(y - reach, 0)
-            box = self.place[bottom : y + reach + 1, left : x + reach + 1]
-            from_y, from_x = np.ogrid[: box.shape[0], : box.shape[1]]
-            away = np.hypot(from_y + bottom - y, from_x + left - x)
-            parts = label((box >= 0) & (away <= reach))[0]
-            near = np.unique(box[parts == parts[y - bottom, x - left]])
-            self.waits[near] += seconds * evidence.nominal_speed / width
+            at = self.places_at(position[None])[0]
+            if at >= 0:
+                cells = radius / self.grid.resolution
+                near = np.array(self.tree.query_ball_point(self.middle[at], cells))
+                parts = connected_components(self.links[near][:, near])[1]
+                near = near[parts == parts[near == at]]
+                self.waits[near] += seconds * evidence.nominal_speed / width
 
     def paint(self, exploration: float, fastest: float) -> NDArray[np.float32]:
         """Return (H, W) float32: the slowness over that of the fastest place, which has this log.

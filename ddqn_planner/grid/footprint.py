@@ -38,7 +38,7 @@ def read_footprint(text: Any) -> NDArray[np.float64]:
         raise ValueError(f"the footprint {text!r} is no list of three or more points; {remedy}")
     if not np.isfinite(corners).all() or _crosses_itself(corners):
         raise ValueError(f"the sides of the footprint {text!r} cross or are no numbers; {remedy}")
-    if not _inside(np.zeros((1, 2)), corners)[0]:
+    if not inside(np.zeros((1, 2)), corners)[0]:
         problem = f"the footprint {text!r} does not contain the robot's origin (0, 0)"
         raise ValueError(f"{problem}; give points relative to it")
     return corners
@@ -65,14 +65,14 @@ def _crosses_itself(corners: NDArray[np.float64]) -> bool:
     return False
 
 
-def _inside(points: NDArray[np.float64], corners: NDArray[np.float64]) -> NDArray[np.bool_]:
+def inside(points: NDArray[np.float64], corners: NDArray[np.float64]) -> NDArray[np.bool_]:
     """Return which points (N, 2) lie inside a polygon: those from which a ray crosses it oddly."""
-    inside = np.zeros(len(points), dtype=np.bool_)
+    found = np.zeros(len(points), dtype=np.bool_)
     x, y = points.T
     for (x0, y0), (x1, y1) in zip(corners, np.roll(corners, -1, axis=0), strict=True):
         if y0 != y1:
-            inside ^= ((y0 > y) != (y1 > y)) & (x < x0 + (y - y0) / (y1 - y0) * (x1 - x0))
-    return inside
+            found ^= ((y0 > y) != (y1 > y)) & (x < x0 + (y - y0) / (y1 - y0) * (x1 - x0))
+    return found
 
 
 def inner_radius(corners: NDArray[np.float64]) -> float:
@@ -112,7 +112,7 @@ def swept_cells(corners: NDArray[np.float64], motions: Motions) -> NDArray[np.bo
             mask[row, column] = True
         for x, y, yaw in poses:
             turn = np.array([[math.cos(yaw), -math.sin(yaw)], [math.sin(yaw), math.cos(yaw)]])
-            mask |= _inside((centres - (x, y)) @ turn, body).reshape(mask.shape)
+            mask |= inside((centres - (x, y)) @ turn, body).reshape(mask.shape)
     return swept
 
 

@@ -10,23 +10,29 @@ from numpy.typing import NDArray
 
 from ddqn_planner.compiled import in_place
 from ddqn_planner.grid import MOVES, GridMap
+from ddqn_planner.grid.footprint import inside
 from ddqn_planner.grid.grid_map import MULTIPLIERS
 from ddqn_planner.grid.motions import BEHIND, TURN, turn_between
 from ddqn_planner.planning.pose_world import body_costs, occupied_for_body
 
 Float64 = NDArray[np.float64]
+Body = tuple[Float64, Float64]
 
 REACH: Final = 5.0, math.pi / 4  # cells and radians that a robot may be beside its path
 BETWEEN: Final = 0.25  # cells between two points of a body's outline
+WITHIN: Final = 0.7  # and inside: so each cell there, turned as it may be, has a point
 AHEAD: Final = 0.9  # the cosine above which a robot drives ahead, not behind or sideways
 
 
-def outline_of(corners: Float64, resolution: float) -> Float64:
-    """Return points along the sides of a footprint, (M, 2), in cells."""
+def points_of(corners: Float64, resolution: float) -> tuple[Float64, Float64]:
+    """Return points along the sides of a footprint, (M, 2), and inside it, in cells."""
     body = corners / resolution
+    columns, rows = (np.arange(axis.min(), axis.max(), WITHIN) for axis in body.T)
+    filled = np.column_stack([axis.ravel() for axis in np.meshgrid(columns, rows)])
     sides = zip(body, np.roll(body, -1, axis=0), strict=True)
     counts = [(a, b, math.ceil(math.dist(a, b) / BETWEEN)) for a, b in sides]
-    return np.concatenate([np.linspace(a, b, count, endpoint=False) for a, b, count in counts])
+    outline = [np.linspace(a, b, count, endpoint=False) for a, b, count in counts]
+    return np.concatenate(outline), filled[inside(filled, body)]
 
 
 def in_cells(poses: Float64, grid: GridMap) -> Float64:
@@ -38,7 +44,7 @@ def in_cells(poses: Float64, grid: GridMap) -> Float64:
 
 
 def rest_of_poses(
-    way: Any, robot: Any, grid: GridMap, outline: Float64, reach: tuple[float, float] = REACH
+    way: Any, robot: Any, grid: GridMap, body: Body, reach: tuple[float, float] = REACH
 ) -> Float64:
     """Return a path from the pose nearest to a robot on; empty if it is far, or has no room."""
     poses: Float64 = np.asarray(way, dtype=np.float64).reshape(-1, 3)
@@ -50,7 +56,9 @@ def rest_of_poses(
         return poses[:0]
     first = int(near[(apart / REACH[0] + turn / REACH[1])[near].argmin()])
     cells = cells_of(path[first:])
-    if touches_at(path[first:], outline, occupied_for_body(grid).view(np.uint8)):
+    occupied, (outline, within) = occupied_for_body(grid).view(np.uint8), body
+    # What is inside the body at a later pose has come through its outline.
+    if touches(path[first:], outline, occupied) or touches(path[first:][:1], within, occupied):
         return poses[:0]
     if grid.forbidden is not None:
         actions = {tuple(move): 1 << action for action, move in enumerate(MOVES.tolist())}
@@ -83,13 +91,13 @@ def cost_of_poses(poses: Float64, grid: GridMap) -> tuple[float, float]:
 
 
 @in_place
-def touches_at(path: Float64, outline: Float64, occupied: NDArray[np.uint8]) -> bool:
-    """Return whether a body's outline touches an occupied cell at a pose, or leaves the map."""
+def touches(path: Float64, points: Float64, occupied: NDArray[np.uint8]) -> bool:
+    """Return whether points of a body touch an occupied cell at a pose, or leave the map."""
     for number in range(len(path)):
         x, y, yaw = path[number, 0] + 0.5, path[number, 1] + 0.5, path[number, 2]
         cos, sin = math.cos(yaw), math.sin(yaw)
-        for point in range(len(outline)):
-            over, up = outline[point, 0], outline[point, 1]
+        for point in range(len(points)):
+            over, up = points[point, 0], points[point, 1]
             column = math.floor(x + cos * over - sin * up)
             line = math.floor(y + sin * over + cos * up)
             if column < 0 or line < 0 or line >= occupied.shape[0] or column >= occupied.shape[1]:

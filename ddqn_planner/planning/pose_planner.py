@@ -24,7 +24,7 @@ from ddqn_planner.planning.pose_paths import (
     cells_of,
     cost_of_poses,
     in_cells,
-    outline_of,
+    points_of,
     rest_of_poses,
 )
 from ddqn_planner.planning.pose_world import World, body_of, differences, world_of
@@ -106,7 +106,7 @@ class PosePlanner:
     def __init__(self, network: Any) -> None:
         self.motions, self.footprint = network.motions, network.footprint
         self.body = body_of(network.motions, network.swept())
-        self.outline = outline_of(self.footprint, self.motions.resolution)
+        self.points = points_of(self.footprint, self.motions.resolution)
         # Of each primitive, in all poses: the first one, and how many follow it.
         self._poses = np.concatenate(self.motions.poses)
         self._count = np.array([len(poses) - 1 for poses in self.motions.poses])
@@ -154,7 +154,7 @@ class PosePlanner:
         self, poses: Any, robot: Pose, grid: GridMap, reach: tuple[float, float] = REACH
     ) -> NDArray[np.float64]:
         """Return a path from the pose nearest to a robot on; empty if it is far, or has no room."""
-        return rest_of_poses(poses, robot, grid, self.outline, reach)
+        return rest_of_poses(poses, robot, grid, self.points, reach)
 
     def _keep_or_switch(self, request: PoseRequest, plan: PosePlan) -> PosePlan:
         """Return the rest of the path under way if it hardly costs more than a plan, or that."""

@@ -115,11 +115,7 @@ def test_the_experiment_writes_its_report(
     command = ["--backend", "sequential", "--quick", "--seeds", "1", "--out", str(tmp_path)]
     assert main(command) == 0
     assert "| experience | " in capsys.readouterr().out
-    assert {path.name for path in (tmp_path / "quick").iterdir()} == {
-        "report.md",
-        "curve.png",
-        "map.png",
-    }
+    assert {path.name for path in (tmp_path / "quick").iterdir()} == {"report.md", "curve.png"}
 
 
 def test_wrong_options_are_refused(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:

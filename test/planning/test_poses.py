@@ -17,15 +17,18 @@ from scipy.sparse.csgraph import dijkstra
 
 from ddqn_planner import GridMap
 from ddqn_planner.grid import MOVES
+from ddqn_planner.grid.body import INSCRIBED, grid_from_costmap
 from ddqn_planner.grid.footprint import read_footprint, swept_cells
 from ddqn_planner.grid.motions import Motions, make_motions, turn_between
 from ddqn_planner.planning import pose_field
 from ddqn_planner.planning.plan import PlanStatus, PosePlan
 from ddqn_planner.planning.planner import last_step
 from ddqn_planner.planning.pose_field import State
+from ddqn_planner.planning.pose_paths import cost_of_poses
 from ddqn_planner.planning.pose_planner import Pose, PosePlanner, PoseRequest
 
 CELL = 0.1
+SQUARE = (0, 0), (0, 2), (2, 2), (2, 0)
 BODIES = {
     "differential": "[[0.25, 0.15], [-0.25, 0.15], [-0.25, -0.15], [0.25, -0.15]]",
     "ackermann": "[[0.35, 0.15], [-0.1, 0.15], [-0.1, -0.15], [0.35, -0.15]]",
@@ -149,6 +152,12 @@ def test_plans_cost_the_least_within_their_bound_also_after_repairs(
             grid = grid.with_patch(patch_of, x, y)
 
 
+def placed(body: shapely.Polygon, pose: NDArray[np.float64]) -> shapely.Polygon:
+    x, y, yaw = pose
+    turned = shapely.affinity.rotate(body, yaw, origin=(0, 0), use_radians=True)
+    return shapely.affinity.translate(turned, x, y)
+
+
 @settings(max_examples=25)
 @given(motion=st.sampled_from(sorted(BODIES)), seed=st.integers(0, 2**32 - 1))
 def test_no_body_touches_an_occupied_cell(motion: str, seed: int) -> None:
@@ -171,9 +180,7 @@ def test_no_body_touches_an_occupied_cell(motion: str, seed: int) -> None:
         assert math.hypot(*move[:2]) <= CELL / 2 + 1e-9
         move[2] = (move[2] + math.pi) % (2 * math.pi) - math.pi
         for share in np.linspace(0, 1, 1 + math.ceil(max(abs(move[2]) / math.radians(2), 3))):
-            x, y, yaw = before + share * move
-            placed = shapely.affinity.rotate(body, yaw, origin=(0, 0), use_radians=True)
-            assert not len(cells.query(shapely.affinity.translate(placed, x, y), "intersects"))
+            assert not len(cells.query(placed(body, before + share * move), "intersects"))
 
 
 def test_a_plan_begins_and_ends_as_asked_and_the_rest_of_it_is_known() -> None:
@@ -224,3 +231,90 @@ def test_a_body_that_cannot_leave_its_place_has_no_path() -> None:
     for pair in ((start, goal), (goal, start)):
         assert plan(body, grid, *pair).status is PlanStatus.NO_PATH
     assert plan(body, grid, pose_of(grid, motions, (50, 10, 4)), goal).poses.size
+
+
+@settings(max_examples=12)
+@given(motion=st.sampled_from(sorted(BODIES)), seed=st.integers(0, 2**32 - 1))
+def test_the_rest_of_a_path_is_free_unless_a_box_stands_ahead(motion: str, seed: int) -> None:
+    random = np.random.default_rng(seed)
+    grid = GridMap(np.zeros((40, 60), np.bool_), CELL, (1, 2, float(random.choice([0, 0.5]))))
+    states = [(*random.integers((8, 8), (52, 32)).tolist(), h) for h in random.integers(16, size=2)]
+    start, goal = (pose_of(grid, robot(motion)[0], (x, y, int(h))) for x, y, h in states)
+    body = planner(motion)
+    poses = plan(body, grid, start, goal).poses
+    at, beside = random.integers(len(poses)), (*random.uniform(-0.02, 0.02, 2), 0.05)
+    rest = body.rest_of(poses, tuple(poses[at] + beside), grid)
+    assert np.array_equal(rest, poses[len(poses) - len(rest) :])
+    assert math.dist(rest[0, :2], poses[at, :2]) < 0.1
+    x, y = grid.world_to_cell(*poses[at, :2])
+    blocked = grid.with_patch(np.ones((2, 2), np.bool_), x, y)
+    box = shapely.Polygon([blocked.centres(x + a - 0.5, y + b - 0.5) for a, b in SQUARE])
+    shape = shapely.Polygon(read_footprint(BODIES[motion]))
+    for robot_at in (0, at, len(poses) - 1):
+        ahead = body.rest_of(poses, tuple(poses[robot_at]), grid)
+        # In between, the outline's points may miss a corner.
+        surely, perhaps = (
+            any(placed(shape.buffer(by), pose).intersects(box) for pose in ahead)
+            for by in (-0.02, 0.001)
+        )
+        is_free = len(body.rest_of(poses, tuple(poses[robot_at]), blocked)) > 0
+        assert not (is_free and surely)
+        assert is_free or perhaps
+    here = grid.with_patch([[True]], *grid.world_to_cell(*poses[-1, :2]))
+    assert not len(body.rest_of(poses, tuple(poses[-1]), here))
+    forbidden = np.zeros((40, 60), np.uint8)
+    forbidden[y, x] = 255
+    cells = [grid.world_to_cell(*pose[:2]) for pose in poses]
+    leaves = any(a == (x, y) != b for a, b in pairwise(cells))
+    closed = grid.with_layers(forbidden=forbidden)
+    assert bool(len(body.rest_of(poses, tuple(poses[0]), closed))) != leaves
+    far = tuple(poses[0] + (3.0, 3.0, 0.0)), tuple(poses[0] + (0, 0, math.pi))
+    assert not len(body.rest_of(poses[:1], far[0], grid)) + len(
+        body.rest_of(poses[:1], far[1], grid)
+    )
+
+
+def test_a_path_is_kept_while_it_costs_hardly_more_and_leads_to_a_goal() -> None:
+    motions, _ = robot("differential")
+    occupancy = np.zeros((41, 60), np.bool_)
+    occupancy[10:31, 20:40] = True
+    start, goal, other = (
+        pose_of(GridMap(occupancy, CELL), motions, (x, 20, 0)) for x in (8, 52, 50)
+    )
+    body = planner("differential")
+
+    def costs(expensive: slice) -> GridMap:
+        cost = np.zeros(occupancy.shape, np.int8)
+        cost[expensive, 20:40] = 3
+        return GridMap(occupancy, CELL, cost=cost)
+
+    below, above = costs(slice(0, 20)), costs(slice(21, 41))
+    first = plan(body, below, start, goal, bound=1.0)
+    assert first.poses[:, 1].max() > 3
+    how = {"under_way": first.poses, "bound": 1.0}
+    kept = plan(body, above, start, goal, switch_threshold=0.2, **how)
+    new = plan(body, above, start, goal, switch_threshold=0.01, **how)
+    assert np.array_equal(kept.poses, first.poses)
+    assert new.poses[:, 1].max() < 3
+    assert (new.extra_cost, new.bound) == (None, 1.0)
+    assert kept.extra_cost == pytest.approx(kept.cost / new.cost - 1)
+    assert kept.bound == pytest.approx(kept.cost / new.cost)
+    assert kept.cost == pytest.approx(cost_of_poses(first.poses, above)[1], rel=0.02)
+    assert plan(body, above, start, other, switch_threshold=0.2, **how).extra_cost is None
+
+
+def test_cells_that_are_only_too_near_for_a_disc_are_free_at_the_highest_cost() -> None:
+    motions, _ = robot("differential")
+    values = np.zeros((20, 60), np.int8)
+    values[:, 30] = INSCRIBED
+    grid, body = grid_from_costmap(values, CELL), planner("differential")
+    start, goal = (pose_of(grid, motions, (x, 10, 0)) for x in (8, 52))
+    assert plan(body, grid, start, goal, bound=1.0).cost == pytest.approx(44 + 4)
+    free = grid.with_patch(
+        np.zeros((20, 1), np.bool_), 30, 0, obstacles=np.zeros((20, 1), np.bool_)
+    )
+    assert plan(body, free, start, goal, bound=1.0).cost == pytest.approx(44)
+    assert plan(body, grid, start, goal, bound=1.0).cost == pytest.approx(44 + 4)
+    values[:, 30] = 100
+    walled = grid_from_costmap(values, CELL)
+    assert plan(body, walled, start, goal).status is PlanStatus.NO_PATH
