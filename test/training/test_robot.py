@@ -12,7 +12,13 @@ from ddqn_planner.grid.footprint import swept_cells
 from ddqn_planner.model import RobotNetwork, load_model, model_bytes
 from ddqn_planner.training.robot import RobotTrainer
 
-TINY: Any = ("[[0.34, 0.09], [-0.09, 0.09], [-0.09, -0.09], [0.34, -0.09]]", "ackermann", 0.6, 0.25, None)
+TINY: Any = (
+    "[[0.34, 0.09], [-0.09, 0.09], [-0.09, -0.09], [0.34, -0.09]]",
+    "ackermann",
+    0.6,
+    0.25,
+    None,
+)
 
 
 def test_the_command_trains_a_robot_that_is_proved(capsys: Any, tmp_path: Path) -> None:
