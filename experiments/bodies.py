@@ -136,8 +136,7 @@ def speed(options: argparse.Namespace) -> Iterator[list[Any]]:
         random = np.random.default_rng(options.seed)
         figures: list[list[float]] = []
         asked = requests(grid, 0.55, random)
-        planner = robot(FOOTPRINTS["rectangle"], Motion.DIFFERENTIAL)
-        next(asked)
+        planner = Planner.load(options.model)
         while len(figures) < options.requests:
             start, goal = next(asked)
             if FAR[0] < math.dist(start[:2], goal[:2]) < FAR[1]:
@@ -154,7 +153,7 @@ def speed(options: argparse.Namespace) -> Iterator[list[Any]]:
 
 def drive(planner: Planner, grid: GridMap, start: Pose, goal: Pose, bound: float) -> list[float]:
     """Return milliseconds: first plan, next, repair, new; then the bound, and the memory in MB."""
-    other = robot(FOOTPRINTS["rectangle"], Motion.DIFFERENTIAL)
+    other = Planner(planner.network, planner.metadata)
     for one in (planner, other):  # what holds for the map
         one.plan_poses(grid, start, start)
     before = resident()
@@ -214,6 +213,7 @@ def main() -> None:
     parser.add_argument("--maps", type=Path, metavar="FOLDER", help="ROS maps of 0.05 m")
     parser.add_argument("--requests", type=int, default=30, metavar="N", help="of each map")
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--model", default="differential_robot", help="whose times count")
     parser.add_argument("--bound", type=float, default=1.2, help="of the paths whose times count")
     options = parser.parse_args()
     header, rows = FIGURES[options.figure]
