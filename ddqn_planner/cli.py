@@ -203,8 +203,8 @@ def train_robot(parser: argparse.ArgumentParser, arguments: Sequence[str]) -> in
     ):
         parser.add_argument(f"--{name}", type=kind, default=default, metavar="X", help=words)
     options = parser.parse_args(arguments)
-    made = options.motion, options.turning_radius, options.resolution
-    trainer = RobotTrainer.of(options.footprint, *made, options.lattice, options.seed)
+    how = options.turning_radius, options.resolution, options.lattice, options.seed
+    trainer = RobotTrainer.of(options.footprint, options.motion, *how)
     with tqdm(total=options.steps, disable=None) as bar:
         for certificate in trainer.run(options.steps):
             bar.update(trainer.steps - bar.n)
@@ -274,8 +274,7 @@ def _run_training(
 def certify(parser: argparse.ArgumentParser, arguments: Sequence[str]) -> int:
     """Prove which moves a model takes for possible, for all costs and unknown cells.
 
-    The proof bounds the error of the learned costs too, and so the cost of planned paths. The exit
-    code is 1 if there is no proof.
+    It bounds the costs of planned paths, too. The exit code is 1 if there is no proof.
     """
     from ddqn_planner.model import load_model
     from ddqn_planner.model.certificate import NO_CERTIFICATE
