@@ -191,21 +191,20 @@ def train_robot(parser: argparse.ArgumentParser, arguments: Sequence[str]) -> in
     from ddqn_planner.model import save_model
     from ddqn_planner.training.robot import ROBOT, RobotTrainer
 
-    for name, default, words in (
-        ("footprint", None, "'[[x, y], ...]', metres, or a radius, as in Nav2's costmaps"),
-        ("motion", None, "differential, ackermann or omnidirectional"),
-        ("turning-radius", 0.0, "of its bends, metres; ackermann needs it"),
-        ("resolution", 0.05, "of the maps, metres per cell"),
-        ("lattice", None, "a file of Nav2's lattice generator, instead of these three options"),
-        ("out", "my_robot.safetensors", "the model's file"),
-        ("seed", 0, "seed of the training"),
-        ("steps", ROBOT.steps, "transitions after which to give up"),
+    for name, kind, default, words in (
+        ("footprint", str, None, "'[[x, y], ...]', metres, or a radius, as in Nav2's costmaps"),
+        ("motion", str, None, "differential, ackermann or omnidirectional"),
+        ("turning-radius", float, 0.0, "of its bends, metres; ackermann needs it"),
+        ("resolution", float, 0.05, "of the maps, metres per cell"),
+        ("lattice", str, None, "a file of Nav2's lattice generator, instead of these three"),
+        ("out", str, "my_robot.safetensors", "the model's file"),
+        ("seed", int, 0, "seed of the training"),
+        ("steps", int, ROBOT.steps, "transitions after which to give up"),
     ):
-        kind: Any = {"type": type(default)} if default is not None else {}
-        parser.add_argument(f"--{name}", default=default, metavar="X", help=words, **kind)
+        parser.add_argument(f"--{name}", type=kind, default=default, metavar="X", help=words)
     options = parser.parse_args(arguments)
-    made = options.motion, options.turning_radius, options.resolution
-    trainer = RobotTrainer.of(options.footprint, *made, options.lattice, options.seed)
+    how = options.turning_radius, options.resolution, options.lattice, options.seed
+    trainer = RobotTrainer.of(options.footprint, options.motion, *how)
     with tqdm(total=options.steps, disable=None) as bar:
         for certificate in trainer.run(options.steps):
             bar.update(trainer.steps - bar.n)
@@ -275,8 +274,7 @@ def _run_training(
 def certify(parser: argparse.ArgumentParser, arguments: Sequence[str]) -> int:
     """Prove which moves a model takes for possible, for all costs and unknown cells.
 
-    The proof bounds the error of the learned costs too, and so the cost of planned paths. The exit
-    code is 1 if there is no proof.
+    It bounds the costs of planned paths, too. The exit code is 1 if there is no proof.
     """
     from ddqn_planner.model import load_model
     from ddqn_planner.model.certificate import NO_CERTIFICATE
