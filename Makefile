@@ -1,4 +1,4 @@
-# make setup | demo | demo-driving | demo-training | test | test-fast | experiments-test | docs | lint | format | types | bench | body | faults | fuzz | load | soak | model | model-dilemma
+# make setup | demo | demo-driving | demo-training | test | test-fast | experiments-test | docs | lint | format | types | bench | body | faults | fuzz | load | soak | model | model-dilemma | robots
 PYTHON ?= python3
 TORCH ?= torch==2.13.0
 VENV := .venv
@@ -12,7 +12,7 @@ else
 EXTRAS := bags,experiments,figures,ros,test,train,watch
 endif
 
-.PHONY: setup demo demo-driving demo-training test test-fast experiments-test docs lint format types bench body faults fuzz load soak model model-dilemma
+.PHONY: setup demo demo-driving demo-training test test-fast experiments-test docs lint format types bench body faults fuzz load soak model model-dilemma robots
 .DEFAULT_GOAL := help
 
 .PHONY: help
@@ -100,3 +100,11 @@ model: setup
 model-dilemma: setup
 	$(BIN)/ddqn-planner train dilemma --learning-rate 0.001 --seed 1 --out runs/dilemma
 	cp runs/dilemma/model.safetensors models/dilemma.safetensors
+
+ROBOT := $(BIN)/ddqn-planner train-robot --resolution 0.05 --seed 0
+
+robots: setup
+	$(ROBOT) --motion differential --out models/differential_robot.safetensors \
+		--footprint '[[0.45, 0.3], [-0.45, 0.3], [-0.45, -0.3], [0.45, -0.3]]'
+	$(ROBOT) --motion ackermann --turning-radius 0.8 --out models/car.safetensors \
+		--footprint '[[0.7, 0.3], [-0.2, 0.3], [-0.2, -0.3], [0.7, -0.3]]'

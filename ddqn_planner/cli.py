@@ -184,6 +184,39 @@ def train_any_map(parser: argparse.ArgumentParser, arguments: Sequence[str]) -> 
     return 0
 
 
+def train_robot(parser: argparse.ArgumentParser, arguments: Sequence[str]) -> int:
+    """Train a model of a robot with a body and a heading; exit code 1 if it cannot be proved."""
+    from tqdm import tqdm
+
+    from ddqn_planner.model import save_model
+    from ddqn_planner.training.robot import ROBOT, RobotTrainer
+
+    for name, kind, default, words in (
+        ("footprint", str, None, "'[[x, y], ...]', metres, or a radius, as in Nav2's costmaps"),
+        ("motion", str, None, "differential, ackermann or omnidirectional"),
+        ("turning-radius", float, 0.0, "of its bends, metres; ackermann needs it"),
+        ("resolution", float, 0.05, "of the maps, metres per cell"),
+        ("lattice", str, None, "a file of Nav2's lattice generator, instead of these three"),
+        ("out", str, "my_robot.safetensors", "the model's file"),
+        ("seed", int, 0, "seed of the training"),
+        ("steps", int, ROBOT.steps, "transitions after which to give up"),
+    ):
+        parser.add_argument(f"--{name}", type=kind, default=default, metavar="X", help=words)
+    options = parser.parse_args(arguments)
+    how = options.turning_radius, options.resolution, options.lattice, options.seed
+    trainer = RobotTrainer.of(options.footprint, options.motion, *how)
+    with tqdm(total=options.steps, disable=None) as bar:
+        for certificate in trainer.run(options.steps):
+            bar.update(trainer.steps - bar.n)
+            bar.set_postfix(weak=certificate.weak, forbidden=certificate.forbidden, refresh=False)
+    print(f"{trainer.steps:,} transitions: {certificate}")
+    if certificate.proved:
+        save_model(options.out, trainer.network, trainer.metadata())
+    else:
+        print("not saved; give more --steps, or another --seed or --resolution", file=sys.stderr)
+    return int(not certificate.proved)
+
+
 def _add_training_options(
     parser: argparse.ArgumentParser, out: str, parameters: HyperParameters
 ) -> None:
@@ -241,8 +274,7 @@ def _run_training(
 def certify(parser: argparse.ArgumentParser, arguments: Sequence[str]) -> int:
     """Prove which moves a model takes for possible, for all costs and unknown cells.
 
-    The proof bounds the error of the learned costs too, and so the cost of planned paths. The exit
-    code is 1 if there is no proof.
+    It bounds the costs of planned paths, too. The exit code is 1 if there is no proof.
     """
     from ddqn_planner.model import load_model
     from ddqn_planner.model.certificate import NO_CERTIFICATE
@@ -360,6 +392,7 @@ COMMANDS: Final = {
     "plan": ("plan a path on a map file", plan),
     "train": ("train a model on a map file", train),
     "train-any-map": ("train a model for any map on random maps", train_any_map),
+    "train-robot": ("train a model of a robot with a body and a heading", train_robot),
     "certify": ("prove which moves a model takes for possible", certify),
     "warm-up": ("compile what plans need, once after an installation", warm_up),
     "learn": ("learn from recorded drives how long places take", learn),

@@ -205,7 +205,7 @@ def rollouts(planner: Planner, environment: GridVectorEnvironment) -> NDArray[np
             evaluate(network, maps, cell)
             q, legal = network.q.astype(np.float32), environment.legal[maps, :, cell]
             action = np.where(legal | (not is_masked), q, -np.inf).argmax(axis=1)
-            cell = np.where(on_way & legal[maps, action], cell + environment.offset[action], cell)
+            cell = np.where(on_way & legal[maps, action], environment.next_cell[action, cell], cell)
             length += np.where(on_way, np.where(visited[maps, cell], np.nan, LENGTHS[action]), 0)
     return lengths
 

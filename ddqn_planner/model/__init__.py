@@ -12,3 +12,4 @@ from ddqn_planner.model.model_file import (
     save_model,
 )
 from ddqn_planner.model.networks import AnyMapQNetwork, PaperQNetwork, PropagationQNetwork, QNetwork
+from ddqn_planner.model.robot import RobotNetwork

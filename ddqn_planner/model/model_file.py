@@ -15,26 +15,29 @@ from safetensors import SafetensorError, deserialize
 
 from ddqn_planner.files import as_path, write_atomically
 from ddqn_planner.grid import MoveRule
-from ddqn_planner.model.networks import AnyMapQNetwork, PaperQNetwork, PropagationQNetwork, QNetwork
+from ddqn_planner.model.networks import (
+    AnyMapQNetwork,
+    ModelFileError,
+    PaperQNetwork,
+    PropagationQNetwork,
+    QNetwork,
+)
+from ddqn_planner.model.robot import RobotNetwork
 from ddqn_planner.resources import PACKAGE, find_resource
 
 METADATA_KEY = "ddqn_planner"
 MODEL_SUFFIX = ".safetensors"
-MAX_SIZE = 4096  # of a network (height, width, filters, hidden units)
 MAX_FILE_BYTES = 2**28  # a larger file is refused before it is read
 
 NETWORKS: Final[dict[str, type[QNetwork]]] = {
-    network.name: network for network in (PaperQNetwork, PropagationQNetwork, AnyMapQNetwork)
+    network.name: network
+    for network in (PaperQNetwork, PropagationQNetwork, AnyMapQNetwork, RobotNetwork)
 }
 TYPES: Final[dict[str, tuple[type, ...]]] = {
     **dict.fromkeys(("network", "move_rule", "map_fingerprint", "package_version"), (str,)),
     **{"sizes": (dict,), "gamma": (float, int), "steps": (int,), "seed": (int,)},
 }
 """The types of each entry of `ModelMetadata` in JSON."""
-
-
-class ModelFileError(ValueError):
-    """A model file cannot be used; the message says why and what to do."""
 
 
 @dataclass(frozen=True)
@@ -119,13 +122,16 @@ def model_of(data: bytes) -> tuple[QNetwork, ModelMetadata]:
         raise ValueError(f"its metadata is wrong ({error}); train the model again") from None
     network_class, sizes = NETWORKS[description.network], description.sizes
     shapes = network_class.shapes(sizes)
-    expected = {key: ("F32", [*shape]) for key, shape in shapes.items()}
+    doubles = network_class.doubles
+    expected = {
+        key: ("F64" if key in doubles else "F32", [*shape]) for key, shape in shapes.items()
+    }
     held = {key: (part["dtype"], part["shape"]) for key, part in parts.items()}
     if expected != held:
         raise ValueError(f"holds tensors {reprlib.repr(held)}, not {expected}; train it again")
     tensors = {
-        key: np.frombuffer(parts[key]["data"], "<f4").reshape(shape)
-        for key, (_, shape) in held.items()
+        key: np.frombuffer(parts[key]["data"], "<f8" if kind == "F64" else "<f4").reshape(shape)
+        for key, (kind, shape) in held.items()
     }
     if not all(np.isfinite(tensor).all() for tensor in tensors.values()):
         raise ValueError("its weights are not all finite; train it again")
@@ -151,9 +157,9 @@ def _parse(values: object) -> ModelMetadata:
     if sizes.keys() != set(size_names):
         raise ValueError(f"sizes is {reprlib.repr(sizes)}; it must have {[*size_names]}")
     for name, size in sizes.items():
-        least = 0 if name == "hidden_units" else 1
-        if type(size) is not int or not least <= size <= MAX_SIZE:
-            limits = f"{least} to {MAX_SIZE}"
+        least, most = 0 if name == "hidden_units" else 1, NETWORKS[network].max_size
+        if type(size) is not int or not least <= size <= most:
+            limits = f"{least} to {most}"
             raise ValueError(f"size {name} is {reprlib.repr(size)}; it must lie in {limits}")
     if not 0 <= values["gamma"] <= 1:
         raise ValueError(f"gamma is {values['gamma']}; it must lie in 0 to 1")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
-from typing import ClassVar, TypeAlias
+from typing import TYPE_CHECKING, ClassVar, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,6 +23,9 @@ from ddqn_planner.model.move_costs import (
 )
 from ddqn_planner.model.shared_background import Network, evaluate, look, network_of, windows_of
 
+if TYPE_CHECKING:
+    from ddqn_planner.model.robot import BodyCertificate
+
 Array: TypeAlias = NDArray[np.float32]
 
 # Shapes: A = 8 actions, B = a batch, I and O = inputs and outputs of a layer, P = patches, F =
@@ -38,11 +41,17 @@ BATCH = 2**12  # patches or cells per evaluation: the layers' outputs then fit i
 FREE, OBSTACLE, GOAL, ROBOT = 0.0, -0.1, 1.0, 3.0
 
 
+class ModelFileError(ValueError):
+    """A model file cannot be used; the message says why and what to do."""
+
+
 class QNetwork(ABC):
-    """A trained Q-network, of `sizes` and float32 `tensors`: what it says of a map's moves."""
+    """A trained Q-network, of `sizes` and `tensors`: what it says of a map's moves."""
 
     name: ClassVar[str]  # in model files and hyper-parameters
     size_names: ClassVar[tuple[str, ...]]
+    max_size: ClassVar[int] = 4096
+    doubles: ClassVar[frozenset[str]] = frozenset()  # tensors that are float64
 
     def __init__(self, sizes: Mapping[str, int], tensors: Mapping[str, Array]) -> None:
         self.sizes = dict(sizes)
@@ -57,7 +66,7 @@ class QNetwork(ABC):
         """Say whether the network can plan on maps of shape (H, W)."""
         return True
 
-    def certificate(self, move_rule: MoveRule) -> Certificate | None:
+    def certificate(self, move_rule: MoveRule) -> Certificate | BodyCertificate | None:
         """Return what is proved of its moves; None if they depend on the whole map."""
         return None
 

@@ -22,7 +22,8 @@ from ddqn_planner.grid.motions import turn_between
 from ddqn_planner.nodes.conversions import value_message
 from ddqn_planner.nodes.report import Outcome
 from ddqn_planner.nodes.runtime import LATCHED, Worker
-from ddqn_planner.planning import Planner, PosePlan, QField
+from ddqn_planner.planning import Planner, QField
+from ddqn_planner.planning.plan import PosePlan
 
 MAX_ARROWS = 10_000  # more take longer to make than a plan, and are too small to see
 LINE_WIDTH = 0.06  # in cells; larger arrows have wider lines

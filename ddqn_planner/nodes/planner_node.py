@@ -7,21 +7,18 @@ from collections.abc import Callable, Coroutine
 from contextlib import suppress
 from typing import Any
 
-import numpy as np
 from geometry_msgs.msg import PoseArray, PoseStamped
 from nav_msgs.msg import Path
 from nav_msgs.srv import GetPlan
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup, ReentrantCallbackGroup
 from rclpy.parameter import Parameter
-from rclpy.task import Future
 from std_msgs.msg import Header, UInt8MultiArray
 
-from ddqn_planner.experience import Experience
-from ddqn_planner.grid import GridMap
-from ddqn_planner.nodes.conversions import along, bytes_of, label_of, path_bytes, path_message
+from ddqn_planner.nodes.conversions import along, path_bytes, path_message
 from ddqn_planner.nodes.display import FieldDisplay
+from ddqn_planner.nodes.expected_times import ExpectedTimes
 from ddqn_planner.nodes.lifecycle import ManagedNode
-from ddqn_planner.nodes.map_source import MapSource, is_like
+from ddqn_planner.nodes.map_source import MapSource
 from ddqn_planner.nodes.nav2 import GivenUp, serve_nav2
 from ddqn_planner.nodes.parameters import PLANNER_PARAMETERS
 from ddqn_planner.nodes.poses import Frames, StartSource, check_source
@@ -35,11 +32,10 @@ from ddqn_planner.nodes.requests import (
     way_of,
 )
 from ddqn_planner.nodes.runtime import LATCHED, STEADY, Worker, spin_until_shutdown, unless
-from ddqn_planner.planning import PosePlan
+from ddqn_planner.planning.plan import PosePlan
 from ddqn_planner.planning.segments import SAME_COST
 
 LOOK_PERIOD, IDLE_PERIOD = 0.1, 1.0  # seconds until the next look: after a change, and else
-NO_MAP = GridMap(np.zeros((1, 1), dtype=np.bool_))
 
 
 # The executor's one thread holds all state. What takes long runs in workers: to load the model,
@@ -266,9 +262,10 @@ class PlannerNode(ManagedNode):
         return path, outcome
 
     def _improve_later(self, outcome: Outcome, followed: ActiveGoal | PathUnderWay) -> None:
-        """Find the least path for a body when the worker is idle, instead of any before."""
+        """Look for the least path of a body, unless it would not be worth a switch."""
         plan, self._improvable = outcome.plan, None
-        if isinstance(plan, PosePlan) and plan.bound > (1 + (plan.extra_cost or 0.0)) * SAME_COST:
+        worth = (1 + self._settings.switch_threshold) * SAME_COST
+        if isinstance(plan, PosePlan) and plan.bound > worth:
             self._improvable = outcome, followed
             self._improve.trigger()
 
@@ -354,87 +351,6 @@ class PlannerNode(ManagedNode):
                 self._waits_for_pose, is_due = False, True
         if is_due:
             self._replan.trigger()
-
-
-class ExpectedTimes:
-    """Puts on maps what the trainer has learned of the robot's drives."""
-
-    def __init__(
-        self, node: ManagedNode, report: Report, worker: Worker, on_change: Callable[[], None]
-    ) -> None:
-        self._node, self._report, self._worker, self._on_change = node, report, worker, on_change
-        self._experience: Experience | None = None
-        self._spread_on: GridMap | None = None
-        self._applied = (NO_MAP, NO_MAP)  # the last map, without times and with them
-        # What the worker was asked last, and its answers.
-        self._grid: GridMap | None = None
-        self._timed = Future()  # of the last grid, as the forecast is of the last outcome
-        self._label = ""  # of the message that was taken last
-        self._outcome, self._forecast = NO_REQUEST, Future()
-
-    async def on_sent(self, message: UInt8MultiArray | None = None) -> None:
-        """Plan by what drives taught, or refuse the trainer's message, or the file that is set."""
-        with self._report.taking("experience"):
-            await self._worker.call(self.load, message)
-            self._grid = None
-            self._on_change()
-
-    async def on(self, grid: GridMap) -> GridMap:
-        """Return what `apply` returns; the worker computes it once for a map."""
-        if self._experience is None:
-            return grid
-        if grid is not self._grid:
-            self._grid, self._timed = grid, self._worker.call(self.apply, grid)
-        timed: GridMap = await self._timed
-        return timed
-
-    def told(self, outcome: Outcome) -> dict[str, str]:
-        """Return what `describe` returns, once the worker has computed it."""
-        if self._experience is not None and outcome is not self._outcome:
-            self._outcome, self._forecast = outcome, self._worker.call(self.describe, outcome)
-            self._forecast.add_done_callback(lambda _: self._report.change())
-        return self._forecast.result() or {}
-
-    def load(self, message: UInt8MultiArray | None = None) -> None:
-        """Use a message, if it is new, or the file that is set; an error changes nothing."""
-        label = label_of(message) if message else ""
-        if message and label == self._label:
-            return
-        data = bytes_of("experience", message) if message else b""
-        file = self._node.value("experience")
-        newer = Experience.from_bytes(data) if message else Experience.load(file)
-        if self._experience is not None:
-            newer.take_over(self._experience)
-        self._experience, self._label = newer, label
-
-    def apply(self, grid: GridMap) -> GridMap:
-        """Return a map whose moves cost expected time, or the same map before a drive."""
-        if self._experience is None or not self._experience.evidence.places:
-            return grid
-        if self._spread_on is None or not is_like(grid, self._spread_on):
-            self._spread_on = grid
-        (before, timed), share = self._applied, self._node.value("exploration")
-        of_places = self._experience.apply(self._spread_on, share)
-        boxes = grid.patches_since(before)
-        if boxes is None or timed.slowness is not of_places.slowness:
-            seconds = of_places.seconds_per_cell
-            timed = grid.with_layers(slowness=of_places.slowness, seconds_per_cell=seconds)
-        else:
-            timed = timed.with_boxes_of(grid, boxes)
-        self._applied = grid, timed
-        return timed
-
-    def describe(self, outcome: Outcome) -> dict[str, str]:
-        """Return how long a plan takes, unless its map is old or untimed, or no memory is left."""
-        now, request, path = self._spread_on, outcome.request, outcome.plan.path
-        told: dict[str, str] = {}
-        is_timed = request is not None and request.grid.slowness is not None and len(path) > 0
-        if self._experience and now and request and is_timed and is_like(request.grid, now):
-            with suppress(MemoryError):
-                seconds, low, high = self._experience.expected_time(now, path)
-                told["expected time (s)"] = f"{seconds:.1f}"
-                told["expected time, 90 % interval (s)"] = f"{low:.1f} to {high:.1f}"
-        return told
 
 
 def _paths(outcome: Outcome, header: Header, *makers: Callable[..., Any]) -> list[Any]:

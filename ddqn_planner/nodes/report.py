@@ -14,15 +14,9 @@ from geometry_msgs.msg import PoseStamped
 
 from ddqn_planner.grid import Cell
 from ddqn_planner.nodes.runtime import BaseNode
-from ddqn_planner.planning import (
-    Plan,
-    PlanMethod,
-    Planner,
-    PlanRequest,
-    PlanStatus,
-    PosePlan,
-    PoseRequest,
-)
+from ddqn_planner.planning import Plan, PlanMethod, Planner, PlanRequest, PlanStatus
+from ddqn_planner.planning.plan import PosePlan
+from ddqn_planner.planning.pose_planner import PoseRequest
 
 Request = PlanRequest | PoseRequest
 

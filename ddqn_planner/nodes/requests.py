@@ -33,18 +33,11 @@ from ddqn_planner.nodes.report import (
     seconds,
 )
 from ddqn_planner.nodes.runtime import BaseNode, Worker
-from ddqn_planner.planning import (
-    Plan,
-    PlanMethod,
-    Planner,
-    PlanRequest,
-    PlanStatus,
-    PosePlan,
-    PoseRequest,
-)
+from ddqn_planner.planning import Plan, PlanMethod, Planner, PlanRequest, PlanStatus
 from ddqn_planner.planning.field import shift_between
 from ddqn_planner.planning.paths import is_path_valid, rest_of_path
-from ddqn_planner.planning.plan import joined
+from ddqn_planner.planning.plan import PosePlan, joined
+from ddqn_planner.planning.pose_planner import PoseRequest
 from ddqn_planner.warm_up import warm_up
 
 HEADING = 2 * math.pi / HEADINGS  # radians that a robot turns until that is a reason to plan
@@ -330,16 +323,13 @@ class Requests:
         is_dense = settings.path_simplification == "straight"
         return Outcome(plan.status.name, reason, planner, request, plan, goal, stamp, is_dense)
 
-    async def improve(self, outcome: Outcome, under_way: Any) -> Outcome:
+    async def improve(self, outcome: Any, under_way: Any) -> Outcome:
         """Return the outcome of a request for poses with a path of the least cost."""
-        planner, goal = outcome.planner, outcome.goal
-        assert isinstance(outcome.request, PoseRequest)
-        assert planner is not None
-        assert goal is not None
-        request = replace(outcome.request, bound=1.0, under_way=under_way)
-        plan = await self._plan(planner, request)
+        request, goal = replace(outcome.request, bound=1.0, under_way=under_way), outcome.goal
+        plan = await self._plan(outcome.planner, request)
         reason = reason_of(request, plan, goal, goal, 0.0)
-        return replace(outcome, request=request, plan=plan, reason=reason)
+        improved: Outcome = replace(outcome, request=request, plan=plan, reason=reason)
+        return improved
 
     async def _plan(self, planner: Planner, request: Any) -> Plan:
         is_of_poses = isinstance(request, PoseRequest)

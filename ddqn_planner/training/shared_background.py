@@ -55,7 +55,7 @@ def player(
     trail = np.zeros((max(1, WINDOWS // len(networks[0].after)), p.environments), np.int64)
     terminated, truncated = np.zeros((2, p.environments), np.bool_)
     robots = e.scenario, e.cell, e.steps, total_reward, terminated, truncated, trail
-    game = e.legal, e.rewards, e.offset, e.goal
+    game = e.legal, e.rewards, e.next_cell, e.goal
     return robots, partial(play, game, (numbers, kind, networks, replay.transitions), robots)
 
 
@@ -79,7 +79,7 @@ def play(game: Any, learning: Any, robots: Any, random: Any, counters: Any, unti
 
     The counters are steps, updates and replayed transitions.
     """
-    legal, rewards, offset, goal = game
+    legal, rewards, next_cell, goal = game
     numbers, _, networks, replay = learning
     scenario, cell, episode_steps, total_reward, terminated, truncated, trail = robots
     exploration, sampling = random
@@ -99,7 +99,7 @@ def play(game: Any, learning: Any, robots: Any, random: Any, counters: Any, unti
                 actions[n] = online.q[n].argmax()
         for n in range(count):
             at = scenario[n], actions[n], cell[n]
-            after = cell[n] + offset[actions[n]] if legal[at] else cell[n]
+            after = next_cell[actions[n], cell[n]] if legal[at] else cell[n]
             episode_steps[n] += 1
             terminated[n] = not legal[at] or after == goal[scenario[n]]
             truncated[n] = not terminated[n] and episode_steps[n] >= numbers.max_episode_steps

@@ -32,9 +32,9 @@ from ddqn_planner.nodes.conversions import (
     grid_from_message,
     occupancy_message,
 )
+from ddqn_planner.nodes.expected_times import ExpectedTimes
 from ddqn_planner.nodes.map_source import BODY_PARAMETERS, MAP_PARAMETERS, MapSource, updated_values
 from ddqn_planner.nodes.parameters import PLANNER_PARAMETERS
-from ddqn_planner.nodes.planner_node import ExpectedTimes
 from ddqn_planner.nodes.report import Outcome, Report, RequestError
 from ddqn_planner.nodes.runtime import LATCHED, BaseNode, Worker
 from ddqn_planner.planning import PlanRequest

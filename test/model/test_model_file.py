@@ -215,4 +215,4 @@ def test_an_unreadable_file_is_refused(plain_folder: Path, network: QNetwork) ->
 def test_a_model_of_any_name_is_shipped_or_refused(name: str) -> None:
     with suppress(ModelFileError):
         load_model(name)
-        assert name in ("any_map", "dilemma")
+        assert name in ("any_map", "dilemma", "differential_robot", "car")

@@ -17,7 +17,7 @@ SIZES = {name: {"filters": 3} for name in ("propagation", "any_map")}
 SIZES["paper"] = {"height": 5, "width": 8, "filters": 3, "hidden_units": 6}
 
 
-@pytest.mark.parametrize("name", NETWORKS)
+@pytest.mark.parametrize("name", MODULES)
 def test_a_module_has_the_tensors_of_its_network(name: str) -> None:
     module, shapes = MODULES[name](**SIZES[name]), NETWORKS[name].shapes(SIZES[name])
     assert {key: tuple(t.shape) for key, t in module.state_dict().items()} == shapes

@@ -1,0 +1,190 @@
+"""The network that knows a robot's body: which primitives succeed among which occupied cells."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ddqn_planner.grid import MoveRule
+from ddqn_planner.grid.footprint import read_footprint, swept_cells
+from ddqn_planner.grid.motions import HEADINGS, Motions, turn_between
+from ddqn_planner.model.certificate import ROUNDING
+from ddqn_planner.model.networks import ModelFileError, QNetwork
+
+Float64: TypeAlias = NDArray[np.float64]
+
+# Shapes: P = primitives, U = units of the network, S x S cells with the robot in the middle.
+
+QUARTER = HEADINGS // 4  # headings in a quarter turn
+SAME = 1e-6  # cells or radians: primitives differ by more, and are not written so exactly
+
+
+@dataclass(frozen=True)
+class BodyCertificate:
+    """What is proved about a robot's network, for all patterns of occupied cells at once."""
+
+    primitives: int
+    cells: int  # that they sweep, all together
+    weak: int  # of these, which do not forbid their primitive by themselves
+    forbidden: int  # primitives that cells forbid which they do not sweep
+    margin: float  # least distance of a logit from 0, over its threshold; not above 0 if wrong
+
+    @property
+    def proved(self) -> bool:
+        """Whether a primitive is possible just where no cell that it sweeps is occupied."""
+        return self.weak == self.forbidden == 0
+
+    def __str__(self) -> str:
+        if self.proved:
+            what = f"all {self.cells:,} cells that {self.primitives:,} primitives sweep forbid them"
+            return f"proved: {what}, and no others do, margin {self.margin:.2f}"
+        weak = f"{self.weak:,} of {self.cells:,} swept cells do not forbid their primitive"
+        others = f"{self.forbidden:,} of {self.primitives:,} are forbidden by other cells"
+        return f"not proved: {weak}, {others}"
+
+
+class RobotNetwork(QNetwork):
+    """Whether a primitive succeeds: p(s, a) = sigmoid(b - sum of the weights of occupied cells)."""
+
+    # Weights are at least 0: what is below counts as 0. One unit serves all primitives that are
+    # quarter turns of each other. What else the tensors hold is given, not learned.
+    name = "robot"
+    size_names = ("units", "side", "primitives", "poses", "corners")
+    max_size = 2**16
+    doubles = frozenset({"primitive", "pose", "angle", "footprint", "resolution"})
+
+    @classmethod
+    def shapes(cls, sizes: Mapping[str, int]) -> dict[str, tuple[int, ...]]:
+        """Return the shape of each tensor."""
+        units, side, primitives, poses, corners = (sizes[name] for name in cls.size_names)
+        learned = {"weight": (units, side, side), "threshold": (units,)}
+        given = {"primitive": (primitives, 6), "pose": (poses, 3), "footprint": (corners, 2)}
+        return {**learned, **given, "angle": (HEADINGS,), "resolution": (1,)}
+
+    @classmethod
+    def untrained(cls, footprint: Float64, motions: Motions) -> RobotNetwork:
+        """Return the network of a robot that knows nothing yet; a ValueError for no robot."""
+        *_, units = units_of(motions)
+        count = len(units)
+        side = swept_cells(footprint, replace(motions, poses=tuple(units))).shape[1]
+        poses = [len(one) for one in motions.poses]
+        columns = motions.start, motions.end, *motions.offset.T, motions.cost, poses
+        tensors: dict[str, Any] = {
+            "weight": np.zeros((count, side, side), np.float32),
+            "threshold": np.zeros(count, np.float32),
+            "primitive": np.column_stack(columns).astype(np.float64),
+            "pose": np.concatenate(motions.poses),
+            "footprint": footprint,
+            "angle": motions.angles,
+            "resolution": np.array([motions.resolution]),
+        }
+        sizes = count, side, len(poses), sum(poses), len(footprint)
+        return cls(dict(zip(cls.size_names, sizes, strict=True)), tensors)
+
+    def __init__(self, sizes: Mapping[str, int], tensors: Mapping[str, Any]) -> None:
+        super().__init__(sizes, tensors)
+        self.footprint = read_footprint(tensors["footprint"].tolist())
+        self.motions = _motions_of(self.tensors)
+        self.unit, self.turns, self.unit_poses = units_of(self.motions)
+        found = {"units": len(self.unit_poses), "side": self.swept_by_unit.shape[1]}
+        if wrong := {name: size for name, size in found.items() if size != sizes[name]}:
+            raise ValueError(
+                f"its body and motions need {wrong}, not {dict(sizes)}; train it again"
+            )
+
+    def supports(self, shape: tuple[int, int]) -> bool:
+        """Say whether the network can plan cells on maps of shape (H, W): it plans poses."""
+        return False
+
+    @cached_property
+    def swept_by_unit(self) -> NDArray[np.bool_]:
+        """The cells that the body sweeps on one primitive of each unit: (U, S, S)."""
+        return swept_cells(self.footprint, replace(self.motions, poses=tuple(self.unit_poses)))
+
+    def of_primitives(self, array_USS: NDArray[Any]) -> NDArray[Any]:
+        """Return what each primitive has of its unit, in the directions of the map: (P, S, S)."""
+        turned = [np.rot90(array_USS, -turns, axes=(1, 2)) for turns in range(4)]
+        return np.stack(turned)[self.turns, self.unit]
+
+    def certificate(self, move_rule: MoveRule | None = None) -> BodyCertificate:
+        """Return what is proved of its primitives, for all patterns of occupied cells."""
+        # Weights are at least 0, so more occupied cells never make a primitive possible: what each
+        # swept cell does by itself, and what all others do together, decides every pattern. A sum
+        # is not less than its terms in float32 either, and its relative error is bounded.
+        weight_USS = np.maximum(self.tensors["weight"].astype(np.float64), 0)
+        threshold_U = self.tensors["threshold"].astype(np.float64)
+        swept_USS, count_U = self.swept_by_unit, np.bincount(self.unit)
+        lack_USS = weight_USS - threshold_U[:, None, None]
+        weak_U = (swept_USS & (lack_USS <= 0)).sum(axis=(1, 2))
+        others_U = weight_USS.sum(axis=(1, 2), where=~swept_USS)
+        rest_U = threshold_U - others_U * (1 + weight_USS[0].size * ROUNDING)
+        least_U = np.minimum(rest_U, lack_USS.min(axis=(1, 2), where=swept_USS, initial=np.inf))
+        return BodyCertificate(
+            primitives=len(self.unit),
+            cells=int(count_U @ swept_USS.sum(axis=(1, 2))),
+            weak=int(count_U @ weak_U),
+            forbidden=int(count_U @ (rest_U <= 0)),
+            margin=float((least_U / np.maximum(np.abs(threshold_U), 1e-30)).min()),
+        )
+
+    def swept(self) -> NDArray[np.bool_]:
+        """Return the cells that forbid each primitive, (P, S, S), as learned and proved."""
+        certificate = self.certificate()
+        if not certificate.proved:
+            remedy = "give a model that ddqn-planner train-robot has proved"
+            raise ModelFileError(f"the robot's body is {certificate}; {remedy}")
+        learned_USS = self.tensors["weight"] > self.tensors["threshold"][:, None, None]
+        return self.of_primitives(learned_USS)
+
+
+def units_of(motions: Motions) -> tuple[NDArray[np.int64], NDArray[np.int64], list[Float64]]:
+    """Return the unit of each primitive, its quarter turns, (P,), and the poses of each unit."""
+    turns_P, numbers = motions.start // QUARTER, []
+    units: list[Float64] = []
+    known: dict[tuple[int, int, int], list[int]] = {}
+    for start, end, turns, poses in zip(
+        motions.start.tolist(), motions.end.tolist(), turns_P.tolist(), motions.poses, strict=True
+    ):
+        x, y, yaw = poses.T
+        for _ in range(turns):
+            x, y = y, -x
+        back = np.column_stack([x, y, yaw - turns * math.pi / 2])
+        ends = (start - QUARTER * turns, (end - QUARTER * turns) % HEADINGS)
+        alike = known.setdefault((*ends, len(back)), [])
+        for unit in alike:
+            off = units[unit] - back
+            if max(np.abs(off[:, :2]).max(), np.abs(turn_between(0, off[:, 2])).max()) < SAME:
+                break
+        else:
+            unit = len(units)
+            alike.append(unit)
+            units.append(back)
+        numbers.append(unit)
+    return np.array(numbers), turns_P, units
+
+
+def _motions_of(tensors: Mapping[str, Any]) -> Motions:
+    """Return the motions that tensors hold; a ValueError if they are none."""
+    *whole, cost, count = tensors["primitive"].T
+    start, end, dx, dy, count = (column.astype(np.int64) for column in (*whole, count))
+    angle, pose = tensors["angle"], tensors["pose"]
+    inside = ((start >= 0) & (start < HEADINGS) & (end >= 0) & (end < HEADINGS)).all()
+    is_whole = np.array_equal(np.column_stack([*whole, count]), np.c_[start, end, dx, dy, count])
+    poses_fit = (count >= 1).all() and count.sum() == len(pose)
+    if not (inside and is_whole and poses_fit and (cost > 0).all() and tensors["resolution"] > 0):
+        raise ValueError("its primitives are damaged; train the robot again")
+    offset, last = np.column_stack([dx, dy]), np.cumsum(count)
+    for places, cells, heading in ((last - count, 0 * offset, start), (last - 1, offset, end)):
+        off = np.abs(pose[places, :2] - cells).max()
+        turned = np.abs(turn_between(pose[places, 2], angle[heading])).max()
+        if off > 0.01 or turned > 0.01 or len(np.unique(heading)) < HEADINGS:
+            raise ValueError("its primitives do not begin and end where they say; train it again")
+    poses = tuple(np.split(pose, last[:-1]))
+    cost = cost.astype(np.float32)
+    return Motions(float(tensors["resolution"][0]), angle, start, end, offset, cost, poses)

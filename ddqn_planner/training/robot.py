@@ -1,0 +1,209 @@
+"""The training of a robot's model: it bumps into obstacles until its body is proved."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+from typing import Final
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from ddqn_planner.grid import GridMap, MoveRule
+from ddqn_planner.grid.footprint import read_footprint
+from ddqn_planner.grid.motions import HEADINGS, Motions, make_motions, read_lattice
+from ddqn_planner.model import ModelMetadata, RobotNetwork, package_version
+from ddqn_planner.model.robot import BodyCertificate
+from ddqn_planner.planning.value_iteration import value_iteration
+from ddqn_planner.training.double_dqn import ReplayBuffer, Transitions, double_dqn_gradient
+from ddqn_planner.training.environment import PoseVectorEnvironment, Scenario, around
+from ddqn_planner.training.hyper_parameters import HyperParameters
+
+# Shapes: B = a batch, U units, S x S cells around the robot, K = primitives of a heading, L =
+# obstacles of a map, C = poses.
+
+# Every episode starts at any pose, and all actions are random. The batch and the environments are
+# per unit. A collision costs much more than a primitive, so that all successes teach about as much.
+ROBOT: Final = HyperParameters(
+    network="robot",
+    reward="path_cost",
+    learning_rate=3e-5,
+    batch_size=16,
+    gamma=0.2,
+    obstacle_reward=-1000.0,
+    goal_reward=0.0,
+    p_r=1.0,
+    steps=10_000_000,
+    replay_capacity=200_000,
+    learning_starts=250,
+    target_interval=2000,
+    epsilon_end=1.0,
+    max_episode_steps=1,
+    environments=4,
+)
+OBSTACLES: Final = (1, 2, 4)  # occupied cells of a map
+FIRST: Final = 0.3, 1.0  # the weights and the thresholds of a network that knows nothing
+PER_UNIT: Final = ("batch_size", "learning_starts", "environments")
+SHRINKS: Final = 1e-4  # what each weight loses per update: an obstacle is harmless unless seen
+HALVED: Final = 1000  # updates after which the learning rate is half, a third after twice as many
+CHECKED: Final = 100  # updates between two proofs
+
+
+def random_scenarios(side: int, random: np.random.Generator) -> list[Scenario]:
+    """Draw maps with few occupied cells, wider than what the robot sees."""
+    width, scenarios = side + 5, []
+    for _ in range(max(4, min(16, 60_000 // width**2))):  # fewer, if they are large
+        count = random.choice(OBSTACLES)
+        start, goal, *occupied = random.permutation(width**2)[: count + 2].tolist()
+        occupancy = np.zeros((width, width), dtype=np.bool_)
+        occupancy.flat[occupied] = True
+        ends = (start % width, start // width), (goal % width, goal // width)
+        scenarios.append(Scenario(GridMap(occupancy), *ends))
+    return scenarios
+
+
+class RobotTrainer:
+    """Trains a `RobotNetwork` by Double DQN; the same arguments give the same network."""
+
+    def __init__(self, footprint: NDArray[np.float64], motions: Motions, seed: int) -> None:
+        self.network, self.seed = RobotNetwork.untrained(footprint, motions), seed
+        tensors, units = self.network.tensors, self.network.sizes["units"]
+        counts = {name: min(4096, units * getattr(ROBOT, name)) for name in PER_UNIT}
+        self.parameters = replace(ROBOT, **counts)
+        draws = np.random.SeedSequence(seed).spawn(4)
+        maps, initial, self._exploration, self._sampling = map(np.random.default_rng, draws)
+        swept = self.network.swept_by_unit
+        scenarios = random_scenarios(swept.shape[1], maps)
+        body = self.network.motions, self.network.of_primitives(swept)
+        self.environment = PoseVectorEnvironment(scenarios, *body, self.parameters, initial)
+        self._replay = ReplayBuffer(self.parameters.replay_capacity)
+        self.steps = self.updates = 0
+
+        tensors["weight"][:], tensors["threshold"][:] = FIRST
+        # A unit's weights in a row, and one more of 0 for what it does not see.
+        self._weight = np.pad(tensors["weight"].reshape(units, -1), ((0, 0), (0, 1)))
+        self._threshold = tensors["threshold"]
+        places = [np.argwhere(s.grid.occupancy)[:, ::-1] for s in scenarios]
+        self._obstacle = np.full((len(places), max(map(len, places)), 2), -1)
+        for of_map, found in zip(self._obstacle, places, strict=True):
+            of_map[: len(found)] = found
+
+    @classmethod
+    def of(
+        cls,
+        footprint: str | None,
+        motion: str | None,
+        turning_radius: float,
+        resolution: float,
+        lattice: str | None,
+        seed: int,
+    ) -> RobotTrainer:
+        """Return the trainer of a robot as a user describes it; a ValueError says what is wrong."""
+        if motion is not None and lattice is None:
+            motions = make_motions(motion, turning_radius, resolution)
+        elif lattice is not None and motion is None:
+            motions = read_lattice(lattice)
+        else:
+            raise ValueError(f"motion is {motion}, lattice is {lattice}; give one of the two")
+        return cls(read_footprint(footprint), motions, seed)
+
+    def run(self, until: int) -> Iterator[BodyCertificate]:
+        """Train until all is proved, or so many steps are done; yield what is proved so far."""
+        self.environment.reset()
+        self._settle()
+        certificate = self.network.certificate()
+        yield certificate
+        while not certificate.proved and self.steps < until:
+            for _ in range(CHECKED):
+                self._step()
+                if self.steps >= self.parameters.learning_starts:
+                    self._update()
+            weight = self.network.tensors["weight"]
+            weight[:] = self._weight[:, :-1].reshape(weight.shape)
+            certificate = self.network.certificate()
+            yield certificate
+
+    def metadata(self) -> ModelMetadata:
+        """Return what the model file says of the network as it is now."""
+        first = self.environment.scenarios[0].grid.fingerprint
+        p, sizes = self.parameters, self.network.sizes
+        of_training = first, self.steps, self.seed, package_version()
+        return ModelMetadata(p.network, sizes, MoveRule.ROBOT_SAFE, p.gamma, *of_training)
+
+    def _step(self) -> None:
+        """Let each robot try a random primitive, and remember what came of it."""
+        e, p = self.environment, self.parameters
+        scenario, cell = e.scenario.copy(), e.cell
+        actions = self._exploration.integers(len(e.primitive), size=p.environments)
+        reward, terminated, truncated = e.move(actions)
+        discount = np.where(terminated, 0.0, p.gamma).astype(np.float32)
+        self._replay.add(Transitions(scenario, cell, actions, reward, e.cell, discount))
+        e.reset(terminated | truncated)
+        self.steps += p.environments
+
+    def _update(self) -> None:
+        """Make one Double DQN update with a batch from the replay buffer."""
+        p, units = self.parameters, len(self._weight)
+        batch = self._replay.sample(p.batch_size, self._sampling)
+        states = np.tile(batch.scenario, 2), np.concatenate([batch.cell, batch.next_cell])
+        unit_2BK, place_2BL = self._observed(*states)
+        logit_2BK = self._threshold[unit_2BK] - self._weight[
+            unit_2BK[:, :, None], place_2BL[:, None]
+        ].sum(axis=2)
+        p_2BK = 0.5 + 0.5 * np.tanh(0.5 * logit_2BK)
+        collision = np.float32(p.obstacle_reward)
+        gain_2BK = self._return_SCK[states] - collision
+        q = self._q_SCK[batch.scenario, batch.next_cell], collision + p_2BK * gain_2BK
+        q_gradient = double_dqn_gradient(p.target, batch, *map(torch.from_numpy, q)).numpy()
+        taken = np.arange(p.batch_size), batch.action
+        by_logit_B = (q_gradient * gain_2BK[: p.batch_size])[taken]
+        by_logit_B *= p_2BK[taken] * (1 - p_2BK[taken])
+        step_B = p.learning_rate * units / (1 + self.updates / HALVED) * by_logit_B
+        unit_B, place_BL = unit_2BK[taken], place_2BL[: p.batch_size]
+        np.subtract.at(self._threshold, unit_B, step_B)
+        np.add.at(self._weight, (unit_B[:, None], place_BL), step_B[:, None])
+        self._weight -= np.float32(SHRINKS)
+        np.maximum(self._weight, 0, out=self._weight)
+        self._weight[:, -1] = 0
+        self.updates += 1
+        if self.updates % p.target_interval == 0:
+            self._settle()
+
+    def _observed(
+        self, scenario: NDArray[np.int64], cell: NDArray[np.int64]
+    ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Return the unit of each action, (B, K), and the places of the obstacles, (B, L)."""
+        (height, width), side = self.environment.shape, self.network.sizes["side"]
+        reach, heading, cell = side // 2, cell % HEADINGS, cell // HEADINGS
+        x, y = self._obstacle[scenario].T
+        is_none = x < 0
+        x = (x - cell % width + reach) % width - reach
+        y = (y - cell // width + reach) % height - reach
+        for quarter in range(1, 4):
+            turned = heading // (HEADINGS // 4) >= quarter
+            x, y = np.where(turned, (y, -x), (x, y))
+        far = is_none | (np.maximum(np.abs(x), np.abs(y)) > reach)
+        place_LB = np.where(far, side * side, (y + reach) * side + x + reach)
+        return self.network.unit[self.environment.primitive[:, heading]].T, place_LB.T
+
+    def _settle(self) -> None:
+        """As the target network, settle V on every map."""
+        e, p = self.environment, self.parameters
+        weight_PSS = self.network.of_primitives(
+            self._weight[:, :-1].reshape(self.network.tensors["weight"].shape)
+        )
+        threshold_P11 = self._threshold[self.network.unit][:, None, None]
+        self._return_SCK = np.empty(e.free_reward.swapaxes(1, 2).shape, np.float32)
+        self._q_SCK = np.empty_like(self._return_SCK)
+        for number, scenario in enumerate(e.scenarios):
+            logit_PC = (threshold_P11 - around(scenario.grid.occupancy, weight_PSS)).reshape(
+                len(weight_PSS), -1
+            )
+            p_CK = (0.5 + 0.5 * np.tanh(0.5 * logit_PC[e.primitive])).transpose(2, 1, 0)
+            p_1CK = p_CK.reshape(1, -1, len(e.primitive))
+            given = e.free_reward[[number]].swapaxes(1, 2), e.goal[[number]], e.next_cell, p.gamma
+            (return_CK,) = value_iteration(p_1CK, *given, p.obstacle_reward)
+            self._return_SCK[number] = return_CK
+            collision = np.float32(p.obstacle_reward)
+            self._q_SCK[number] = collision + p_1CK[0] * (return_CK - collision)

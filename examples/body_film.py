@@ -1,0 +1,83 @@
+"""Films how bodies drive: a long robot through a narrow door, a car that turns in three points.
+
+python examples/body_film.py robots.gif
+"""
+
+import math
+import sys
+from collections.abc import Sequence
+from typing import Any
+
+import matplotlib
+
+matplotlib.use("Agg")
+import matplotlib.pyplot as plt
+import numpy as np
+from matplotlib.animation import FuncAnimation, PillowWriter
+from numpy.typing import NDArray
+
+from ddqn_planner import GridMap, Planner
+from ddqn_planner.grid.footprint import placed
+from ddqn_planner.model import RobotNetwork
+from ddqn_planner.pictures import PATH_COLOUR, VALUE_COLOURS, draw_obstacles
+
+FRAMES_PER_SECOND, LAST_FRAMES = 20, 30
+TRACE = 6  # poses from one outline that stays to the next
+
+Pose = tuple[float, float, float]
+
+
+def door() -> tuple[GridMap, Pose, Pose]:
+    """Return a wall with a door 10 cm wider than the robot; it starts and ends across."""
+    occupancy = np.zeros((70, 110), np.bool_)
+    occupancy[[0, -1]] = occupancy[:, [0, -1]] = True
+    occupancy[:, 53:57] = True
+    occupancy[28:42, 53:57] = False
+    return GridMap(occupancy, 0.05), (1.0, 0.9, math.pi / 2), (4.5, 2.6, math.pi / 2)
+
+
+def lane() -> tuple[GridMap, Pose, Pose]:
+    """Return a lane that is too narrow for a car's turning circle; it must turn round."""
+    occupancy = np.zeros((70, 110), np.bool_)
+    occupancy[:12] = occupancy[58:] = True
+    occupancy[:, [0, -1]] = True
+    return GridMap(occupancy, 0.05), (1.5, 1.2, 0.0), (1.5, 2.4, math.pi)
+
+
+def main(arguments: Sequence[str]) -> int:
+    """Save the film; return 1 if there is no path."""
+    scenes = ("differential_robot", door()), ("car", lane())
+    figure, both = plt.subplots(2, 1, figsize=(4.4, 5.8), layout="constrained")
+    bodies: list[tuple[NDArray[Any], Any, Any]] = []
+    for axes, (model, (grid, start, goal)) in zip(both, scenes, strict=True):
+        planner = Planner.load(model)
+        assert isinstance(planner.network, RobotNetwork)
+        plan = planner.plan_poses(grid, start, goal, bound=1.0)
+        if not plan.poses.size:
+            print(f"no path: {plan.status.value}")
+            return 1
+        print(f"{model}: {plan.length * grid.resolution:.2f} m in {plan.field_ms:.0f} ms")
+        axes.axis("off")
+        draw_obstacles(axes, grid)
+        outlines = placed(planner.network.footprint, plan.poses) / grid.resolution - 0.5
+        x, y = plan.poses.T[:2] / grid.resolution - 0.5
+        axes.plot(x, y, color=PATH_COLOUR, linewidth=1)
+        (body,) = axes.fill([], [], color=PATH_COLOUR, alpha=0.9)
+        bodies.append((outlines, axes, body))
+    longest = max(len(outlines) for outlines, *_ in bodies)
+
+    def draw(frame: int) -> Sequence[Any]:
+        for outlines, axes, body in bodies:
+            number = min(frame, len(outlines) - 1)
+            body.set_xy(outlines[number])
+            if frame == number and frame % TRACE == 0:
+                axes.fill(*outlines[number].T, color=VALUE_COLOURS[2], alpha=0.25, zorder=0)
+        return [body for *_, body in bodies]
+
+    frames = [*range(0, longest, 2), *[longest] * LAST_FRAMES]
+    FuncAnimation(figure, draw, frames).save(arguments[0], PillowWriter(FRAMES_PER_SECOND))
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:] or ["robots.gif"]))

@@ -1,0 +1,104 @@
+"""A simulated robot bumps into obstacles, and learns its body until it is proved."""
+
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from ddqn_planner.cli import main
+from ddqn_planner.grid.footprint import swept_cells
+from ddqn_planner.model import RobotNetwork, load_model, model_bytes
+from ddqn_planner.training.robot import RobotTrainer
+
+TINY: Any = (
+    "[[0.34, 0.09], [-0.09, 0.09], [-0.09, -0.09], [0.34, -0.09]]",
+    "ackermann",
+    0.6,
+    0.25,
+    None,
+)
+
+
+def test_the_command_trains_a_robot_that_is_proved(capsys: Any, tmp_path: Path) -> None:
+    path, (footprint, motion, radius, resolution, _) = tmp_path / "tiny.safetensors", TINY
+    command = ["train-robot", "--footprint", footprint, "--motion", motion, "--out", str(path)]
+    command += ["--turning-radius", str(radius), "--resolution", str(resolution)]
+    assert main([*command, "--steps", "20000"]) == 1
+    assert re.search(r"steps|seed", capsys.readouterr().err)
+    assert not path.exists()
+    assert main(command) == 0
+    assert re.search(r"transitions: proved: all [\d,]+ cells", capsys.readouterr().out)
+    network, metadata = load_model(path)
+    assert isinstance(network, RobotNetwork)
+    expected = swept_cells(network.footprint, network.motions)
+    np.testing.assert_array_equal(network.swept(), expected)
+    assert 20_000 < metadata.steps < 2_000_000
+    assert main(["certify", str(path)]) == 0
+    assert "no others do" in capsys.readouterr().out
+
+
+def test_the_same_seed_trains_the_same_model() -> None:
+    contents = []
+    for seed in (1, 1, 2):
+        trainer = RobotTrainer.of(*TINY, seed)
+        for _ in trainer.run(30_000):
+            pass
+        contents.append(model_bytes(trainer.network, trainer.metadata()))
+    assert contents[0] == contents[1] != contents[2]
+
+
+def test_a_robot_bumps_where_its_body_touches_an_obstacle() -> None:
+    environment = RobotTrainer.of(*TINY, 0).environment
+    motions, swept = environment.motions, environment.swept
+    height, width = environment.shape
+    reach, random = swept.shape[1] // 2, np.random.default_rng(0)
+    environment.reset()
+    collisions = 0
+    for _ in range(20):
+        cells, number = environment.cell, environment.scenario.copy()
+        actions = random.integers(len(environment.primitive), size=len(cells))
+        reward, terminated, _ = environment.move(actions)
+        for i, (cell, action) in enumerate(zip(cells, actions, strict=True)):
+            (y, x), heading = divmod(cell // 16, width), cell % 16
+            primitive = environment.primitive[action, heading]
+            assert motions.start[primitive] == heading
+            # The maps repeat in all directions.
+            rows, columns = (np.arange(-reach, reach + 1) + at for at in (y, x))
+            occupancy = environment.scenarios[number[i]].grid.occupancy
+            seen = occupancy[np.ix_(rows % height, columns % width)]
+            bumps = bool((seen & swept[primitive]).any())
+            dx, dy = motions.offset[primitive]
+            after = (y + dy) % height * width + (x + dx) % width
+            after = cell if bumps else 16 * after + motions.end[primitive]
+            assert environment.cell[i] == after
+            assert terminated[i] == (bumps or after == environment.goal[number[i]])
+            assert reward[i] == (-1000 if bumps else -motions.cost[primitive])
+            collisions += bumps
+        environment.reset(terminated)
+    assert 30 < collisions < 2000
+
+
+WRONG = {
+    "--motion flying": "flying",
+    "--motion ackermann --turning-radius 0": "turning radius is 0.0",
+    "--motion differential --resolution nan": "resolution is nan",
+    "--motion differential --resolution 0.001": "coarser resolution",
+    "--motion differential --lattice x.json": "one of the two",
+    "": "one of the two",
+    "--lattice none.json": "none.json",
+    "--motion differential --footprint 0": "radius is 0",
+    "--motion differential --footprint [[0,0],[1,0]]": "three or more points",
+    "--motion differential --footprint [[-1,-1],[1,1],[1,-1],[-1,1]]": "cross",
+    "--motion differential --footprint [[1,1],[2,1],[2,2]]": "does not contain",
+    "--motion differential --steps 0": "give more --steps",
+}
+
+
+@pytest.mark.parametrize("options", WRONG)
+def test_what_is_no_robot_is_refused(capsys: Any, tmp_path: Path, options: str) -> None:
+    command = ["train-robot", "--footprint", "0.2", "--out", str(tmp_path / "robot.safetensors")]
+    assert main([*command, *options.split()]) == (1 if "steps" in options else 2)
+    assert WRONG[options] in capsys.readouterr().err
+    assert not any(tmp_path.iterdir())
