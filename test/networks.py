@@ -1,9 +1,13 @@
 """Networks with chosen weights, without a training."""
 
+from pathlib import Path
+
 import numpy as np
 
 from ddqn_planner.grid import MoveRule
-from ddqn_planner.model import NETWORKS, ModelMetadata, QNetwork
+from ddqn_planner.grid.footprint import read_footprint
+from ddqn_planner.grid.motions import make_motions
+from ddqn_planner.model import NETWORKS, ModelMetadata, QNetwork, RobotNetwork, save_model
 from ddqn_planner.planning import Planner
 
 
@@ -35,3 +39,18 @@ ANY_MAP = Planner.load("any_map")
 def new_planner() -> Planner:
     """The shipped planner for any map, which knows no field."""
     return Planner(ANY_MAP.network, ANY_MAP.metadata)
+
+
+BODY = 0.3, 0.2, 0.2  # metres that `robot_model` reaches ahead, behind and to each side
+
+
+def robot_model(path: Path, motion: str, cell: float) -> None:
+    """Write the model of a small robot that has learned its body exactly."""
+    front, back, side = BODY
+    corners = [(front, side), (-back, side), (-back, -side), (front, -side)]
+    untrained = RobotNetwork.untrained(read_footprint(corners), make_motions(motion, 0.4, cell))
+    swept = untrained.swept_by_unit.astype(np.float32)
+    learned = {"weight": 2 * swept, "threshold": np.ones(len(swept), np.float32)}
+    network = RobotNetwork(untrained.sizes, {**untrained.tensors, **learned})
+    rule = MoveRule.ROBOT_SAFE
+    save_model(path, network, ModelMetadata("robot", network.sizes, rule, 1.0, "", 0, 0, ""))

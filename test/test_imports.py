@@ -35,8 +35,8 @@ move_costs(grid.cost_multiplier, "robot_safe")
 """
 
 
-def run(code: str, **environment: str) -> subprocess.CompletedProcess[str]:
-    command, environ = [sys.executable, "-c", code], {**os.environ, **environment}
+def run(code: str, *given: str, **environment: str) -> subprocess.CompletedProcess[str]:
+    command, environ = [sys.executable, "-c", code, *given], {**os.environ, **environment}
     return subprocess.run(command, env=environ, check=True, capture_output=True, text=True)
 
 
@@ -127,7 +127,24 @@ def signatures():
     modules = [module for name, module in sys.modules.items() if name.startswith("ddqn_planner.")]
     values = [value for module in modules for value in vars(module).values()]
     compiled = {value.dispatcher() for value in values if hasattr(value, "dispatcher")}
-    return {(each.__qualname__, str(kinds)) for each in compiled for kinds in each.signatures}
+    return {(each.py_func.__module__, each.__qualname__, str(kinds))
+            for each in compiled for kinds in each.signatures}
+
+
+def ask_for_poses(planner):
+    occupancy = np.zeros((100, 120), bool)
+    occupancy[:, 60] = True
+    occupancy[40:60, 60] = False
+    costs, slowness = np.ones((100, 120), np.int8), np.full((100, 120), 1.5, np.float32)
+    forbidden, near = np.full((100, 120), 1, np.uint8), np.zeros((100, 120), bool)
+    layers = {"cost": costs}, {"slowness": slowness}, {"forbidden": forbidden}
+    for layer in ({}, *layers, {"cost": costs, "obstacles": near}):
+        grid = GridMap(occupancy, 0.05, **layer)
+        for bound in (1.2, 1.0):
+            plan = planner.plan_poses(grid, (1, 1, 0), (5, 4, 1), bound=bound)
+        patched = grid.with_patch([[True]], *plan.cells[50])
+        planner.plan_poses(patched, (1, 1, 0), [(5, 4, 1), (5, 1, 1)], (0.3, 0.2))
+        planner.pose_planner.rest_of(plan.poses, (1, 1, 0), patched)
 
 
 def ask(planner):
@@ -150,14 +167,17 @@ def ask(planner):
         is_path_valid([(2, 2), (9, 4), (30, 4)], (2, 2), grid, "robot_safe")
 
 
-planner = Planner.load("any_map")
+planner = Planner.load(sys.argv[1])
 for _ in warm_up(planner, learns=True):
     pass
 before = signatures()
-ask(planner)
-print(sorted(signatures() - before))
+ask_for_poses(planner) if planner.pose_planner else ask(planner)
+print(sorted(signatures() - before), f"planning.{sys.argv[2]}" in str(before))
 """
 
 
-def test_no_request_compiles_what_the_warm_up_left_out() -> None:
-    assert run(CODE).stdout == "[]\n"
+@pytest.mark.parametrize(
+    ("model", "other"), [("any_map", "pose_kernels"), ("differential_robot", "kernels")]
+)
+def test_a_warm_up_compiles_what_requests_need_and_no_more(model: str, other: str) -> None:
+    assert run(CODE, model, other).stdout == "[] False\n"

@@ -1,0 +1,251 @@
+"""Paths for robots with a body and a heading over DDS."""
+
+import math
+from collections.abc import Iterator
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+import rclpy
+from client import map_message, pose
+from geometry_msgs.msg import PoseArray, PoseStamped
+from integration.robot import NUMBERS, Robot, values_of, yaw_of
+from nav_msgs.msg import Path
+from networks import BODY, robot_model
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.utilities import try_shutdown
+from std_msgs.msg import Header
+from visualization_msgs.msg import Marker, MarkerArray
+
+from ddqn_planner.grid import Cell, GridMap
+from ddqn_planner.nodes.planner_node import PlannerNode
+from ddqn_planner.nodes.runtime import LATCHED
+
+CELL, ORIGIN = 0.1, (-1.0, 2.0, 0.5)
+START, BESIDE, BEYOND = (10, 10), (20, 30), (50, 30)  # cells: before the wall, and behind its door
+DOOR = slice(22, 30)
+
+
+@pytest.fixture(scope="session")
+def models(tmp_path_factory: pytest.TempPathFactory) -> SimpleNamespace:
+    """The files of two robots with one body."""
+    folder = tmp_path_factory.mktemp("robots")
+    files = {kind: folder / f"{kind}.safetensors" for kind in ("differential", "ackermann")}
+    for kind, file in files.items():
+        robot_model(file, kind, CELL)
+    return SimpleNamespace(**{kind: str(file) for kind, file in files.items()})
+
+
+@pytest.fixture(scope="module")
+def rooms() -> np.ndarray:
+    """(40, 60) int8: two rooms, and a door between them that is twice as wide as the body."""
+    values = np.zeros((40, 60), dtype=np.int8)
+    values[:, 30] = 100
+    values[DOOR, 30] = 0
+    return values
+
+
+@pytest.fixture(scope="module")
+def running(run_robot: Any, models: Any, rooms: np.ndarray) -> Iterator[Robot]:
+    with run_robot("/body", {"model": models.differential}, rooms) as robot:
+        robot.model = models.differential
+        robot.grid = GridMap(rooms > 0, CELL, ORIGIN)
+        yield robot
+
+
+@pytest.fixture
+def robot(running: Robot) -> Robot:
+    running.reset()
+    running.clear()
+    running.set_map(running.stamped_map())
+    running.send_start(at(running, START, 0.5))
+    running.wait_until_received()
+    return running
+
+
+def at(robot: Robot, cell: Cell, yaw: float) -> PoseStamped:
+    return pose(robot.grid, cell, yaw, offset=0.01)
+
+
+def array_of(path: Path) -> np.ndarray:
+    """Return the poses of a path, (N, 3)."""
+    places = ((it.pose.position, it.pose.orientation) for it in path.poses)
+    return np.array([(at.x, at.y, yaw_of(turned)) for at, turned in places])
+
+
+def check(path: Path, grid: GridMap, goal: Cell, yaw: float) -> np.ndarray:
+    """Check that no part of the body touches an obstacle, and where the path begins and ends."""
+    poses, (front, back, side) = array_of(path), BODY
+    assert grid.world_to_cell(*poses[-1, :2]) == goal
+    assert math.cos(poses[-1, 2] - yaw) > math.cos(0.25)
+    assert np.hypot(*np.diff(poses[:, :2], axis=0).T).max() <= CELL / 2 + 1e-6
+    over, up = np.meshgrid(np.arange(-back, front, 0.02), np.arange(-side, side, 0.02))
+    body = (over + 1j * up).ravel()
+    for x, y, towards in poses.tolist():
+        for point in x + 1j * y + body * np.exp(1j * towards):
+            assert grid.is_free(grid.world_to_cell(point.real, point.imag))
+    return poses
+
+
+def ends_at(path: Path, grid: GridMap, goal: Cell, yaw: float) -> bool:
+    poses = array_of(path)
+    if not len(poses):
+        return False
+    is_there = grid.world_to_cell(*poses[-1, :2]) == goal
+    return is_there and math.cos(poses[-1, 2] - yaw) > math.cos(0.25)
+
+
+def path_to(robot: Robot, goal: Cell, yaw: float, grid: GridMap | None = None) -> np.ndarray:
+    """Wait for a plan to a pose, and check it."""
+    grid = grid or robot.grid
+    return check(robot.plans.wait(lambda path: ends_at(path, grid, goal, yaw)), grid, goal, yaw)
+
+
+def drives_back(poses: np.ndarray) -> np.ndarray:
+    """Return of which steps the robot drives backward."""
+    x, y = np.diff(poses[:, :2], axis=0).T
+    return x * np.cos(poses[:-1, 2]) + y * np.sin(poses[:-1, 2]) < -1e-9
+
+
+def test_a_path_through_a_door_has_the_goals_heading_and_gets_better(robot: Robot) -> None:
+    robot.set(path_bound=4.0, switch_threshold=0.0)
+    robot.send_goal(at(robot, BEYOND, 2.1))
+    first = path_to(robot, BEYOND, 2.1)
+    assert robot.grid.world_to_cell(*first[0, :2]) == START
+    # Nobody asks for this one.
+    best = robot.plans.wait(lambda path: 0 < len(path.poses) < len(first))
+    check(best, robot.grid, BEYOND, 2.1)
+    status = robot.wait_for_reason("^a path of .* of at most 1 times the least cost")
+    assert (
+        values_of(status)["model footprint (m)"]
+        == "[[0.3, 0.2], [-0.2, 0.2], [-0.2, -0.2], [0.3, -0.2]]"
+    )
+
+
+def test_the_rest_of_a_path_is_kept_from_where_the_robot_is(robot: Robot) -> None:
+    robot.set(path_bound=1.0)
+    robot.send_goal(at(robot, BEYOND, 0.5))
+    poses = path_to(robot, BEYOND, 0.5)
+    robot.clear()
+    start = at(robot, START, poses[30, 2] + 0.1)
+    start.pose.position.x, start.pose.position.y = poses[30, :2] + 0.03
+    robot.send_start(start)
+    rest = array_of(robot.plans.wait())
+    assert 25 < len(poses) - len(rest) < 35
+    assert np.array_equal(rest, poses[-len(rest) :])
+
+
+def test_the_nearest_pose_counts_and_services_are_answered(robot: Robot) -> None:
+    goals = [at(robot, *goal).pose for goal in ((BEYOND, 0.5), (BESIDE, 0.5))]
+    robot.client.publish("goal_poses", PoseArray(header=Header(frame_id="map"), poses=goals))
+    path_to(robot, BESIDE, 0.5)
+    robot.wait_for_reason("to goal 2 of 2")
+    answer = robot.get_plan(at(robot, BEYOND, 0.0), at(robot, START, 3.0))
+    check(answer, robot.grid, START, 3.0)
+    assert not robot.get_plan(at(robot, (29, 3), 0.0), at(robot, START, 3.0)).poses
+    why = r"the start is occupied \(start: .* in cell \(29, 3\); goal: .* in cell \(10, 10\); .*"
+    robot.wait_for_reason(f"{why}; set the start where the robot's body has room$")
+
+
+def test_a_car_turns_by_driving_back(robot: Robot, models: Any) -> None:
+    robot.set(model=models.ackermann)
+    behind = START[0] + 2, START[1]
+    robot.send_goal(at(robot, behind, 0.5 + math.pi))
+    poses = path_to(robot, behind, 0.5 + math.pi)
+    back = drives_back(poses)
+    print(back.sum(), len(back))
+    assert 0 < back.sum() < len(back)
+
+
+def test_a_map_of_another_resolution_is_refused_with_the_remedy(robot: Robot) -> None:
+    robot.send_goal(at(robot, BESIDE, 0.0))
+    path_to(robot, BESIDE, 0.0)
+    other = GridMap(robot.values > 0, 2 * CELL, ORIGIN)
+    robot.set_map(map_message(robot.values, other, next(NUMBERS)))
+    robot.plans.wait(lambda path: not path.poses)
+    status = robot.wait_for_reason(
+        "learned cells of 0.1 m, and the map's have 0.2 m; give a map of 0.1 m"
+    )
+    assert values_of(status)["status"] == "MAP_RESOLUTION_UNSUPPORTED"
+    robot.plans.clear()
+    robot.set_map(robot.stamped_map())
+    path_to(robot, BESIDE, 0.0)
+
+
+def test_a_path_leads_round_a_box_that_stands_on_it(robot: Robot) -> None:
+    robot.send_goal(at(robot, BESIDE, 0.5))
+    poses = path_to(robot, BESIDE, 0.5)
+    x, y = robot.grid.world_to_cell(*poses[len(poses) // 2, :2])
+    values = robot.values.copy()
+    values[y - 1 : y + 2, x - 1 : x + 2] = 100
+    robot.plans.clear()
+    robot.set_map(robot.stamped_map(values))
+    grid = GridMap(values > 0, CELL, ORIGIN)
+    path_to(robot, BESIDE, 0.5, grid)
+
+
+def test_bodies_along_the_path_are_shown_to_who_asks(robot: Robot) -> None:
+    shown = robot.client.subscribe(MarkerArray, "planner/footprints", LATCHED)
+    robot.send_goal(at(robot, BESIDE, 0.5))
+    path_to(robot, BESIDE, 0.5)
+    front, back, side = BODY
+    corners = np.array([complex(x, y) for x in (front, -back) for y in (side, -side)])
+
+    def is_of_a_plan(message: MarkerArray) -> bool:
+        (marker,) = message.markers
+        points = np.array([(point.x, point.y) for point in marker.points]).reshape(-1, 8, 2)
+        is_of = []
+        for path in robot.plans.messages():
+            x, y, yaw = array_of(path).T.reshape(3, -1)
+            bodies = np.sort((x + 1j * y)[:, None] + np.exp(1j * yaw)[:, None] * corners)
+            outlines = np.sort(points @ [1, 1j])[:, ::2]
+            is_of += [
+                all(np.abs(bodies - outline).max(axis=1).min() < 1e-6 for outline in outlines)
+            ]
+        return len(points) > 3 and marker.type == Marker.LINE_LIST and any(is_of)
+
+    assert shown.wait(is_of_a_plan).markers[0].header.frame_id == "map"
+    robot.send_goal(at(robot, (30, 2), 0.5))
+    shown.wait(lambda message: message.markers[0].action == Marker.DELETE)
+    assert "is shown" not in robot.node.log  # of fields, which a body does not have
+
+
+def test_actions_lead_through_poses_and_paths_are_checked(models: Any, rooms: np.ndarray) -> None:
+    """The node is asked as its actions ask it, which need nav2_msgs."""
+    rclpy.init(args=["--ros-args", "-p", f"model:={models.differential}"])
+    node, executor, grid = PlannerNode(), SingleThreadedExecutor(), GridMap(rooms > 0, CELL, ORIGIN)
+    start, middle, goal = (
+        pose(grid, cell, yaw, 0.01) for cell, yaw in ((START, 0.5), (BESIDE, 2.0), (BEYOND, 1.0))
+    )
+
+    def run(task: Any) -> Any:
+        future = executor.create_task(task)
+        executor.spin_until_future_complete(future, 60)
+        return future.result()
+
+    def is_valid(path: Path) -> bool:
+        answer = run(node._on_is_path_valid(SimpleNamespace(path=path), SimpleNamespace()))
+        return bool(answer.is_valid)
+
+    try:
+        executor.add_node(node)
+        node._map._take(map_message(rooms, grid, next(NUMBERS)))
+        path, outcome = run(node._plan_for_action(start, [middle, goal], "", lambda: None))
+        poses = check(path, grid, BEYOND, 1.0)
+        assert outcome.status == "SUCCEEDED"
+        assert np.abs(np.diff(poses, axis=0)).max(axis=1).min() > 1e-6
+        assert any(ends_at(Path(poses=[it]), grid, BESIDE, 2.0) for it in path.poses)
+        first, _ = run(node._plan_for_action(start, [goal], "", lambda: None))
+        again, outcome = run(node._plan_for_action(first.poses[9], [goal], "", lambda: None))
+        assert outcome.plan.extra_cost is not None  # kept
+        assert np.array_equal(array_of(again), array_of(first)[9:])
+        assert is_valid(path)
+        blocked = rooms.copy()
+        x, y = grid.world_to_cell(*poses[len(poses) // 2, :2])
+        blocked[y, x] = 100
+        node._map._take(map_message(blocked, grid, next(NUMBERS)))
+        assert not is_valid(path)
+    finally:
+        node.destroy_node()
+        try_shutdown()
