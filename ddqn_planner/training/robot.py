@@ -47,6 +47,7 @@ FIRST: Final = 0.3, 1.0  # the weights and the thresholds of a network that know
 PER_UNIT: Final = ("batch_size", "learning_starts", "environments")
 SHRINKS: Final = 1e-4  # what each weight loses per update: an obstacle is harmless unless seen
 HALVED: Final = 1000  # updates after which the learning rate is half, a third after twice as many
+CAREFUL: Final = 0.1  # of a step is what a threshold moves
 CHECKED: Final = 100  # updates between two proofs
 MARGIN: Final = 0.02  # of the proof, with which the training ends
 
@@ -162,7 +163,8 @@ class RobotTrainer:
         by_logit_B *= p_2BK[taken] * (1 - p_2BK[taken])
         step_B = p.learning_rate * units / (1 + self.updates / HALVED) * by_logit_B
         unit_B, place_BL = unit_2BK[taken], place_2BL[: p.batch_size]
-        np.subtract.at(self._threshold, unit_B, step_B)
+        # All transitions of a unit move its threshold, and few move a weight: it must not jump.
+        np.subtract.at(self._threshold, unit_B, CAREFUL * step_B)
         np.add.at(self._weight, (unit_B[:, None], place_BL), step_B[:, None])
         self._weight -= np.float32(SHRINKS)
         np.maximum(self._weight, 0, out=self._weight)
