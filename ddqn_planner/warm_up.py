@@ -28,7 +28,7 @@ def warm_up(planner: Planner, learns: bool = False) -> Iterator[None]:
         experience.apply(grid)
     if planner.pose_planner is not None:
         _plan_poses(planner)
-        yield
+        yield from (None, None)  # there is no rest
         return
     planner.plan(grid, start, goal, simplified=True)
     planner.plan(grid.with_patch([[True]], 1, 1), start, goal)

@@ -1,4 +1,4 @@
-"""Measures plans for robots with a body and a heading: collisions, times and memory.
+"""Measures plans for robots with a body and a heading: collisions, costs, times and memory.
 
 ``--figure collisions`` has each plan checked by an oracle of its own: the body's polygon, every
 2 cm and 2 degrees, against each occupied cell (Shapely). ``--maps`` adds ROS maps from a folder.
@@ -10,7 +10,8 @@ import math
 import os
 import time
 from collections.abc import Iterator
-from itertools import product
+from functools import cache
+from itertools import pairwise, product
 from pathlib import Path
 from typing import Any, Final
 
@@ -18,12 +19,14 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 from random_maps import KINDS, generate_map
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import dijkstra
 from tables import table
 
 from ddqn_planner import GridMap, Planner, load_map
-from ddqn_planner.grid import MoveRule
+from ddqn_planner.grid import MOVES, Cell, MoveRule
 from ddqn_planner.grid.footprint import inner_radius, read_footprint
-from ddqn_planner.grid.motions import Motion, make_motions
+from ddqn_planner.grid.motions import HEADINGS, Motion, Motions, make_motions
 from ddqn_planner.model import ModelMetadata, RobotNetwork, package_version
 from ddqn_planner.planning.plan import PosePlan
 
@@ -108,6 +111,95 @@ def worlds(maps: Path | None, random: np.random.Generator) -> dict[str, GridMap]
     for path in sorted(maps.glob("*.yaml")) if maps else ():
         found[path.stem] = load_map(path)
     return found
+
+
+@cache
+def ways(motions: Motions) -> list[dict[Cell, float]]:
+    """Return the cells that the origin passes on each primitive, and its shares, from points."""
+    found = []
+    for poses in motions.poses:
+        at = np.linspace(0, len(poses) - 1, 1001)
+        way = np.column_stack([np.interp(at, range(len(poses)), poses[:, i]) for i in (0, 1)])
+        length = np.hypot(*np.diff(way, axis=0).T) + 1e-12
+        shares: dict[Cell, float] = {}
+        for cell, part in zip(np.floor((way[1:] + way[:-1]) / 2 + 0.5), length, strict=True):
+            key = int(cell[0]), int(cell[1])
+            shares[key] = shares.get(key, 0) + part / length.sum()
+        found.append(shares)
+    return found
+
+
+def least_costs(
+    grid: GridMap, motions: Motions, swept: NDArray[np.bool_], goal: tuple[int, int, int]
+) -> NDArray[np.float64]:
+    """Return (H, W, 16): the least cost from every pose to a goal, in cells, by Dijkstra."""
+    height, width = grid.occupancy.shape
+    reach, multiplier = swept.shape[-1] // 2, grid.cost_multiplier
+    occupied = np.pad(grid.occupancy, reach, constant_values=True)
+    edges = []
+    for number, way in enumerate(ways(motions)):
+        hit = np.zeros((height, width), np.bool_)
+        for y, x in np.argwhere(swept[number]):
+            hit |= occupied[y : y + height, x : x + width]
+        y, x = np.nonzero(~hit)
+        factor = sum(part * multiplier[y + up, x + over] for (over, up), part in way.items())
+        allowed = np.ones(len(x), np.bool_)
+        for here, after in pairwise(way):
+            if grid.forbidden is not None:
+                action = MOVES.tolist().index([after[0] - here[0], after[1] - here[1]])
+                allowed &= (grid.forbidden[y + here[1], x + here[0]] >> action & 1) == 0
+        over, up = motions.offset[number]
+        before = (y * width + x) * 16 + motions.start[number]
+        after = ((y + up) * width + x + over) * 16 + motions.end[number]
+        edges.append(np.column_stack([before, after, motions.cost[number] * factor])[allowed])
+    before, after, cost = np.concatenate(edges).T
+    size = grid.occupancy.size * 16
+    graph = coo_matrix((cost, (after.astype(int), before.astype(int))), (size, size)).tocsr()
+    x, y, heading = goal
+    costs: NDArray[np.float64] = dijkstra(graph, indices=(y * width + x) * 16 + heading)
+    return costs.reshape(height, width, 16)
+
+
+def narrow(random: np.random.Generator) -> Iterator[tuple[str, NDArray[np.bool_]]]:
+    """Yield doors 10 cm wider than a body of 0.6 m, corridors with a turn, and mazes."""
+    for _ in range(3):
+        occupancy = np.zeros((100, 110), np.bool_)
+        wall, door = random.integers(35, 75), random.integers(5, 81)
+        occupancy[:, wall : wall + random.integers(1, 9)] = True
+        occupancy[door : door + 14] = False
+        yield "door", occupancy
+        occupancy = np.ones((100, 110), np.bool_)
+        wide, corner = random.integers(14, 24), random.integers(45, 80)
+        occupancy[5 : 5 + wide, 5:corner] = occupancy[5:95, corner - wide : corner] = False
+        yield "corridor with a turn", occupancy
+        maze = generate_map("maze", (5, 5), random)
+        yield "maze", np.kron(maze, np.ones((24, 24), np.bool_))
+
+
+def optimality(options: argparse.Namespace) -> Iterator[list[Any]]:
+    """Yield a row for each kind of narrow place: what is solved, and costs over the least."""
+    random, planner = np.random.default_rng(options.seed), Planner.load(options.model)
+    assert isinstance(planner.network, RobotNetwork)
+    motions, swept = planner.network.motions, planner.network.swept()
+    rows: dict[str, list[Any]] = {}
+    for name, occupancy in narrow(random):
+        grid, row = GridMap(occupancy, CELL), rows.setdefault(name, [0, 0, 0, 1.0, 1.0, 1.0])
+        best = np.full(1, np.inf)
+        while np.isfinite(best).sum() < 1000:
+            y, x = random.choice(np.argwhere(~occupancy)).tolist()
+            heading = int(random.integers(HEADINGS))
+            best = least_costs(grid, motions, swept, (x, y, heading))
+        end = *grid.cell_to_world((x, y)), float(motions.angles[heading])
+        reached = np.argwhere(np.isfinite(best) & (best > 0))
+        for y, x, heading in random.choice(reached, options.requests).tolist():
+            start = *grid.cell_to_world((x, y)), float(motions.angles[heading])
+            first, last = (planner.plan_poses(grid, start, end, bound=b) for b in (1.2, 1.0))
+            ratios = [(plan.cost or np.nan) / best[y, x, heading] for plan in (first, last)]
+            row[:2] = row[0] + 1, row[1] + bool(first.poses.size and last.poses.size)
+            row[2] += ratios[0] > first.bound * 1.0001
+            row[3:] = np.maximum(row[3:], [*ratios, first.bound]).tolist()
+    for name, row in rows.items():
+        yield [name, *row[:3], *(f"{ratio:.4f}" for ratio in row[3:])]
 
 
 def collisions(options: argparse.Namespace) -> Iterator[list[Any]]:
@@ -199,6 +291,10 @@ def blocks(share: float, seed: int) -> GridMap:
 
 FIGURES: Final = {
     "collisions": ("body | motion | requests | plans | with a collision | poses", collisions),
+    "optimality": (
+        "place | requests with a way | solved | above the bound | worst cost | at last | bound",
+        optimality,
+    ),
     "speed": (
         "map | first, mean ms | worst | next | repair | new | ratio | worst | bound | MB",
         speed,

@@ -262,9 +262,10 @@ class PlannerNode(ManagedNode):
         return path, outcome
 
     def _improve_later(self, outcome: Outcome, followed: ActiveGoal | PathUnderWay) -> None:
-        """Find the least path for a body when the worker is idle, instead of any before."""
+        """Look for the least path of a body, unless it would not be worth a switch."""
         plan, self._improvable = outcome.plan, None
-        if isinstance(plan, PosePlan) and plan.bound > (1 + (plan.extra_cost or 0.0)) * SAME_COST:
+        worth = (1 + self._settings.switch_threshold) * SAME_COST
+        if isinstance(plan, PosePlan) and plan.bound > worth:
             self._improvable = outcome, followed
             self._improve.trigger()
 

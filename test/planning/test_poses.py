@@ -9,14 +9,12 @@ from typing import Any
 import numpy as np
 import pytest
 import shapely
+from bodies import least_costs
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
-from scipy.sparse import coo_matrix
-from scipy.sparse.csgraph import dijkstra
 
 from ddqn_planner import GridMap
-from ddqn_planner.grid import MOVES
 from ddqn_planner.grid.body import INSCRIBED, grid_from_costmap
 from ddqn_planner.grid.footprint import read_footprint, swept_cells
 from ddqn_planner.grid.motions import Motions, make_motions, turn_between
@@ -58,50 +56,6 @@ def pose_of(grid: GridMap, motions: Motions, state: State) -> Pose:
     return (*grid.cell_to_world((x, y)), float(motions.angles[heading]) + grid.origin[2])
 
 
-@cache
-def way_of(motion: str, number: int) -> dict[tuple[int, int], float]:
-    """Return the cells that the origin passes, and its shares, from a thousand points."""
-    poses = robot(motion)[0].poses[number]
-    at = np.linspace(0, len(poses) - 1, 1001)
-    way = np.column_stack([np.interp(at, range(len(poses)), poses[:, i]) for i in (0, 1)])
-    length = np.hypot(*np.diff(way, axis=0).T) + 1e-12
-    shares: dict[tuple[int, int], float] = {}
-    for cell, part in zip(np.floor((way[1:] + way[:-1]) / 2 + 0.5), length, strict=True):
-        key = int(cell[0]), int(cell[1])
-        shares[key] = shares.get(key, 0) + part / length.sum()
-    return shares
-
-
-def least_costs(grid: GridMap, motion: str, goal: State) -> NDArray[np.float64]:
-    """Return (H, W, 16): the least cost from every pose to a goal, in cells."""
-    motions, swept = robot(motion)
-    height, width = grid.occupancy.shape
-    reach, multiplier = swept.shape[-1] // 2, grid.cost_multiplier
-    occupied = np.pad(grid.occupancy, reach, constant_values=True)
-    edges = []
-    for number in range(len(motions.start)):
-        hit = np.zeros((height, width), np.bool_)
-        for y, x in np.argwhere(swept[number]):
-            hit |= occupied[y : y + height, x : x + width]
-        y, x = np.nonzero(~hit)
-        way = way_of(motion, number)
-        factor = sum(part * multiplier[y + up, x + over] for (over, up), part in way.items())
-        allowed = np.ones(len(x), np.bool_)
-        for here, after in pairwise(way):
-            if grid.forbidden is not None:
-                action = MOVES.tolist().index([after[0] - here[0], after[1] - here[1]])
-                allowed &= (grid.forbidden[y + here[1], x + here[0]] >> action & 1) == 0
-        over, up = motions.offset[number]
-        before = (y * width + x) * 16 + motions.start[number]
-        after = ((y + up) * width + x + over) * 16 + motions.end[number]
-        edges.append(np.column_stack([before, after, motions.cost[number] * factor])[allowed])
-    before, after, cost = np.concatenate(edges).T
-    size = grid.occupancy.size * 16
-    graph = coo_matrix((cost, (after.astype(int), before.astype(int))), (size, size)).tocsr()
-    x, y, heading = goal
-    return dijkstra(graph, indices=(y * width + x) * 16 + heading).reshape(height, width, 16)
-
-
 @settings(max_examples=12)
 @given(
     motion=st.sampled_from(sorted(BODIES)),
@@ -131,7 +85,7 @@ def test_plans_cost_the_least_within_their_bound_also_after_repairs(
         if guided:
             patch.setattr(pose_field, "UNGUIDED", 16)
         for _ in range(3):
-            best = least_costs(grid, motion, goal)
+            best = least_costs(grid, *robot(motion), goal)
             for x, y, heading in starts:
                 bound = float(random.choice([1.0, 1.2, 2.0]))
                 start, end = (pose_of(grid, motions, s) for s in ((x, y, heading), goal))
