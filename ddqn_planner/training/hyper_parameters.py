@@ -5,8 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass, field, fields
 from typing import Any
 
-from ddqn_planner.model import NETWORKS
-
 
 def _number(default: Any, source: str, low: float, high: float) -> Any:
     return field(default=default, metadata={"source": source, "range": (low, high)})
@@ -21,7 +19,9 @@ class HyperParameters:
     """The paper's Table 1, and our values where it gives none; a ValueError names a wrong one."""
 
     # p_r = 0 switches off improvement 1 (initialisation), alpha = beta = 0 improvement 2 (reward).
-    network: str = _choice(*NETWORKS, source="ours: the Q-network, see model/")
+    network: str = _choice(
+        "paper", "propagation", "any_map", source="ours: the Q-network, see model/"
+    )
     target: str = _choice(
         "double_dqn", "dqn", "printed", source="ours: the target, see training/double_dqn.py"
     )

@@ -26,10 +26,10 @@ from ddqn_planner.training.hyper_parameters import HyperParameters
 # Every episode starts at any pose, and all actions are random. The batch and the environments are
 # per unit. A collision costs much more than a primitive, so that all successes teach about as much.
 ROBOT: Final = HyperParameters(
-    network="robot",
+    network="propagation",
     reward="path_cost",
-    learning_rate=3e-5,
-    batch_size=16,
+    learning_rate=4.5e-5,
+    batch_size=24,
     gamma=0.2,
     obstacle_reward=-1000.0,
     goal_reward=0.0,
@@ -40,14 +40,16 @@ ROBOT: Final = HyperParameters(
     target_interval=2000,
     epsilon_end=1.0,
     max_episode_steps=1,
-    environments=4,
+    environments=12,
 )
 OBSTACLES: Final = (1, 2, 4)  # occupied cells of a map
 FIRST: Final = 0.3, 1.0  # the weights and the thresholds of a network that knows nothing
 PER_UNIT: Final = ("batch_size", "learning_starts", "environments")
 SHRINKS: Final = 1e-4  # what each weight loses per update: an obstacle is harmless unless seen
 HALVED: Final = 1000  # updates after which the learning rate is half, a third after twice as many
+CAREFUL: Final = 0.1  # of a step is what a threshold moves
 CHECKED: Final = 100  # updates between two proofs
+MARGIN: Final = 0.02  # of the proof, with which the training ends
 
 
 def random_scenarios(side: int, random: np.random.Generator) -> list[Scenario]:
@@ -114,7 +116,7 @@ class RobotTrainer:
         self._settle()
         certificate = self.network.certificate()
         yield certificate
-        while not certificate.proved and self.steps < until:
+        while certificate.margin < MARGIN and self.steps < until:
             for _ in range(CHECKED):
                 self._step()
                 if self.steps >= self.parameters.learning_starts:
@@ -129,7 +131,7 @@ class RobotTrainer:
         first = self.environment.scenarios[0].grid.fingerprint
         p, sizes = self.parameters, self.network.sizes
         of_training = first, self.steps, self.seed, package_version()
-        return ModelMetadata(p.network, sizes, MoveRule.ROBOT_SAFE, p.gamma, *of_training)
+        return ModelMetadata(self.network.name, sizes, MoveRule.ROBOT_SAFE, p.gamma, *of_training)
 
     def _step(self) -> None:
         """Let each robot try a random primitive, and remember what came of it."""
@@ -161,7 +163,8 @@ class RobotTrainer:
         by_logit_B *= p_2BK[taken] * (1 - p_2BK[taken])
         step_B = p.learning_rate * units / (1 + self.updates / HALVED) * by_logit_B
         unit_B, place_BL = unit_2BK[taken], place_2BL[: p.batch_size]
-        np.subtract.at(self._threshold, unit_B, step_B)
+        # All transitions of a unit move its threshold, and few move a weight: it must not jump.
+        np.subtract.at(self._threshold, unit_B, CAREFUL * step_B)
         np.add.at(self._weight, (unit_B[:, None], place_BL), step_B[:, None])
         self._weight -= np.float32(SHRINKS)
         np.maximum(self._weight, 0, out=self._weight)

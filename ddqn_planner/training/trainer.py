@@ -47,8 +47,6 @@ class Trainer:
         parameters: HyperParameters,
         seed: int,
     ) -> None:
-        if parameters.network not in MODULES:
-            raise ValueError(f"a {parameters.network} is trained by ddqn-planner train-robot")
         self.scenarios = tuple(scenarios)
         self.move_rule = move_rule
         self.parameters = parameters

@@ -98,6 +98,14 @@ def test_a_damaged_robot_is_refused_or_right(seed: int, exponent: float, name: s
             network.swept()
 
 
+def test_a_weight_below_0_makes_up_for_no_other() -> None:
+    network = exact()
+    cells = np.flatnonzero(~network.swept_by_unit[0])[:2]
+    network.tensors["weight"][0].flat[cells] = 1.5, -1.0
+    certificate = network.certificate()
+    assert (certificate.weak, certificate.forbidden) == (0, 4)
+
+
 def test_the_proof_is_that_of_all_patterns_of_a_small_body() -> None:
     network, random = exact(), np.random.default_rng(3)
     seen = set()
