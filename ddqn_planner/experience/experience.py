@@ -118,7 +118,7 @@ class Experience:
         ValueError
             If the shapes or types are wrong. Values that cannot be true are left out.
         """
-        count = np.size(seconds)
+        count = numbers("seconds", seconds).size
         time = numbers("seconds", seconds, (count,)).astype(np.float64)
         position = numbers("positions", positions, (count, 2)).astype(np.float64)
         # Comparisons with NaN are false.
