@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ddqn_planner.compiled import in_place, inlined
-from ddqn_planner.planning.pose_world import TILE, Body, World, cost_of, has_room, is_possible
+from ddqn_planner.planning.pose_world import TILE, Body, World, cost_of, is_possible, is_way
 
 # A state is a cell and one of 16 headings. Its number counts headings, then the cells of a tile of
 # 8 x 8, then tiles: so what a request visits lies on few pages of memory, 4 bytes a distance.
@@ -110,19 +110,6 @@ STRAIGHT, DIAGONAL = 5, 7
 LONGER: Final = math.sqrt(1 + (DIAGONAL / STRAIGHT - 1) ** 2)
 
 
-@inlined
-def is_way(x: int, y: int, step_x: int, step_y: int, world: Any, body: Any) -> bool:
-    """Return whether a step from a corner leads through a tile with room, or along its side."""
-    columns, rows = (world.width + 7) >> 3, (world.height + 7) >> 3
-    for side in range(2):
-        tile_x = x + (step_x - 1) // 2 if step_x != 0 else x - side
-        tile_y = y + (step_y - 1) // 2 if step_y != 0 else y - side
-        is_inside = 0 <= tile_x < columns and 0 <= tile_y < rows
-        if is_inside and has_room(tile_x, tile_y, world, body):
-            return True
-    return False
-
-
 @in_place
 def spread(
     left: NDArray[np.float32],
@@ -183,13 +170,13 @@ def order(
     kept = 0
     for place in range(size):
         number = numbers[place]
-        if known.mark[number] == 1 or known.mark[number] == 2:
+        if OPEN <= known.mark[number] <= WAITING:
             known.mark[number] = 255  # so that it is taken once
             numbers[kept] = number
             kept += 1
     for place in range(kept):
         number = numbers[place]
-        known.mark[number] = 1
+        known.mark[number] = OPEN
         x, y, _ = place_of(number, world.width)
         far = way_left(x, y, aim, (world.width + 7) >> 3)
         keys[place] = known.distance[number] + weight * far
@@ -220,7 +207,7 @@ def grow(
     target, most, visits = aim.number, keys.size - 2 * body.start.size, 0
     while size > 0:
         key = keys[0]
-        if mark[target] != 0 and key >= distance[target]:
+        if mark[target] != UNREACHED and key >= distance[target]:
             return size, waiting, visits, True
         if visits == limit or size + waiting > most:
             return size, waiting, visits, False
@@ -228,7 +215,7 @@ def grow(
         size -= 1
         if size > 0:
             sink(keys[size], numbers[size], 0, keys, numbers, size)
-        if mark[number] != 1:
+        if mark[number] != OPEN:
             continue
         mark[number] = closed
         visits += 1
@@ -240,21 +227,21 @@ def grow(
             if column < 0 or line < 0 or column >= width or line >= height:
                 continue
             before = number_of(column, line, body.start[primitive], width)
-            if mark[before] != 0 and here + body.cost[primitive] >= distance[before]:
+            if mark[before] != UNREACHED and here + body.cost[primitive] >= distance[before]:
                 continue
             if not is_possible(column, line, primitive, world, body):
                 continue
             found = here + cost_of(column, line, primitive, world, body)
-            if found == np.inf or (mark[before] != 0 and found >= distance[before]):
+            if found == np.inf or (mark[before] != UNREACHED and found >= distance[before]):
                 continue
             distance[before] = found
             if mark[before] == closed:
-                mark[before] = 2
+                mark[before] = WAITING
                 waiting += 1
                 numbers[numbers.size - waiting] = before
-            if mark[before] == 2:
+            if mark[before] == WAITING:
                 continue
-            mark[before] = 1
+            mark[before] = OPEN
             far = way_left(column, line, aim, (width + 7) >> 3)
             size = push(np.float32(found + weight * far), before, keys, numbers, size)
     return size, waiting, visits, True
@@ -265,7 +252,7 @@ def least_order(known: Known, numbers: Any, aim: Aim, world: World) -> float:
     """Return a lower bound of what may still be found for a start, from states that may change."""
     least = np.inf
     for number in numbers:
-        if 1 <= known.mark[number] <= 2 and known.distance[number] < least:
+        if OPEN <= known.mark[number] <= WAITING and known.distance[number] < least:
             x, y, _ = place_of(number, world.width)
             far = way_left(x, y, aim, (world.width + 7) >> 3)
             if known.distance[number] + far < least:
@@ -292,7 +279,7 @@ def follow(
             if column < 0 or line < 0 or column >= world.width or line >= world.height:
                 continue
             next_one = number_of(column, line, body.end[primitive], world.width)
-            if known.mark[next_one] == 0:
+            if known.mark[next_one] == UNREACHED:
                 continue
             beyond = known.distance[next_one]
             if beyond + body.cost[primitive] >= best:
@@ -313,7 +300,7 @@ def leads_to(
     number: int, mark: NDArray[np.uint8], queue: NDArray[np.int64], world: World, body: Body
 ) -> int:
     """Return to how many states primitives lead from one, at most so many as the queue holds."""
-    queue[0], mark[number], read, count = number, 1, 0, 1
+    queue[0], mark[number], read, count = number, OPEN, 0, 1
     while read < count:
         x, y, heading = place_of(queue[read], world.width)
         read += 1
@@ -322,10 +309,10 @@ def leads_to(
             if column < 0 or line < 0 or column >= world.width or line >= world.height:
                 continue
             after = number_of(column, line, body.end[primitive], world.width)
-            if mark[after] == 0 and is_possible(x, y, primitive, world, body):
+            if mark[after] == UNREACHED and is_possible(x, y, primitive, world, body):
                 if count == queue.size:
                     return count
-                queue[count], mark[after] = after, 1
+                queue[count], mark[after] = after, OPEN
                 count += 1
     return count
 
@@ -370,9 +357,9 @@ def take_back(
     size, count, most = 0, 0, keys.size - body.start.size
     for tile in tiles:
         for number in range(tile << 10, (tile + 1) << 10):
-            if mark[number] == 0 or distance[number] == 0:
+            if mark[number] == UNREACHED or distance[number] == 0:
                 continue
-            if best_after(number, distance[number], 1, known, world, body) == np.inf:
+            if best_after(number, distance[number], OPEN, known, world, body) == np.inf:
                 size = push(distance[number], number, keys, numbers, size)
                 if size > most:
                     return -1
@@ -381,14 +368,14 @@ def take_back(
         size -= 1
         if size > 0:
             sink(keys[size], numbers[size], 0, keys, numbers, size)
-        if mark[number] == 0 or distance[number] != key:
+        if mark[number] == UNREACHED or distance[number] != key:
             continue
         # What is nearer to the goal is settled: only that can support this one.
-        if best_after(number, key, 1, known, world, body) < np.inf:
+        if best_after(number, key, OPEN, known, world, body) < np.inf:
             continue
         if count == raised.size or size > most:
             return -1
-        mark[number] = 0
+        mark[number] = UNREACHED
         raised[count] = number
         count += 1
         x, y, heading = place_of(number, world.width)
@@ -398,7 +385,7 @@ def take_back(
             if column < 0 or line < 0 or column >= world.width or line >= world.height:
                 continue
             before = number_of(column, line, body.start[primitive], world.width)
-            if mark[before] != 0 and distance[before] >= key + body.cost[primitive]:
+            if mark[before] != UNREACHED and distance[before] >= key + body.cost[primitive]:
                 size = push(distance[before], before, keys, numbers, size)
     return count
 
@@ -414,10 +401,10 @@ def look_again(
 ) -> int:
     """Open the states among some to which a cheaper way leads now; return how many are open."""
     for number in found:
-        limit = known.distance[number] if known.mark[number] != 0 else np.float32(np.inf)
-        best = best_after(number, limit, 2, known, world, body)
-        if best < np.inf and (known.mark[number] == 0 or best < limit):
-            known.distance[number], known.mark[number] = best, 1
+        limit = known.distance[number] if known.mark[number] != UNREACHED else np.float32(np.inf)
+        best = best_after(number, limit, WAITING, known, world, body)
+        if best < np.inf and (known.mark[number] == UNREACHED or best < limit):
+            known.distance[number], known.mark[number] = best, OPEN
             numbers[size] = number
             size += 1
     return size

@@ -277,3 +277,16 @@ def has_room(tile_x: int, tile_y: int, world: Any, body: Any) -> bool:
                 break
         world.room[tile] = found
     return bool(world.room[tile] == 1)
+
+
+@inlined
+def is_way(x: int, y: int, step_x: int, step_y: int, world: Any, body: Any) -> bool:
+    """Return whether a step from a corner leads through a tile with room, or along its side."""
+    columns, rows = (world.width + 7) >> 3, (world.height + 7) >> 3
+    for side in range(2):
+        tile_x = x + (step_x - 1) // 2 if step_x != 0 else x - side
+        tile_y = y + (step_y - 1) // 2 if step_y != 0 else y - side
+        is_inside = 0 <= tile_x < columns and 0 <= tile_y < rows
+        if is_inside and has_room(tile_x, tile_y, world, body):
+            return True
+    return False
