@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import mmap
-from typing import Any, TypeAlias
+from typing import Any
 
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
@@ -12,9 +12,7 @@ from ddqn_planner.grid import GridMap
 from ddqn_planner.grid.motions import HEADINGS
 from ddqn_planner.planning import pose_kernels as kernels
 from ddqn_planner.planning.pose_kernels import Aim, Known
-from ddqn_planner.planning.pose_world import TILE, Body, World, touches
-
-State: TypeAlias = tuple[int, int, int]  # x, y, heading
+from ddqn_planner.planning.pose_world import TILE, Body, State, World
 
 NO_RESERVE = getattr(mmap, "MAP_NORESERVE", 0x4000)  # not in all versions of Python
 HEAP = 2**14  # entries of a heap, at first
@@ -59,13 +57,6 @@ class PoseField:
     def number(self, state: State) -> int:
         """Return the number of a state inside the map."""
         return int(kernels.number_of(*state, self.world.width))
-
-    def has_room(self, state: State) -> bool:
-        """Return whether the body has room to stand."""
-        x, y, heading = state
-        row = len(self.body.start) + heading
-        first, last = self.body.first[row : row + 2]
-        return not touches(self.world.bits, x, y, self.body.row, first, last)
 
     def reach(self, start: State, bound: float, limit: int) -> bool:
         """Grow until the cost from a start is known within a bound, or known not to exist."""

@@ -7,6 +7,7 @@ import threading
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from itertools import product
 from typing import Any, Final, NamedTuple, TypeAlias
 
@@ -17,7 +18,7 @@ from ddqn_planner.grid import Cell, GridMap
 from ddqn_planner.grid.motions import HEADINGS, turn_between
 from ddqn_planner.planning.field import offset_between
 from ddqn_planner.planning.plan import ROUNDING, PlanStatus, PosePlan
-from ddqn_planner.planning.pose_field import PoseField, State
+from ddqn_planner.planning.pose_field import PoseField
 from ddqn_planner.planning.pose_kernels import SAME
 from ddqn_planner.planning.pose_paths import (
     REACH,
@@ -27,7 +28,7 @@ from ddqn_planner.planning.pose_paths import (
     points_of,
     rest_of_poses,
 )
-from ddqn_planner.planning.pose_world import World, body_of, differences, world_of
+from ddqn_planner.planning.pose_world import State, World, body_of, differences, stands, world_of
 from ddqn_planner.planning.segments import SAME_COST
 
 Pose: TypeAlias = tuple[float, float, float]  # metres, metres, radians; in the map frame
@@ -133,13 +134,13 @@ class PosePlanner:
             return
         yield None
         with self._lock:
-            empty = PoseField((), grid, self._world(grid), self.body)
-        start = next(filter(empty.has_room, starts), None)
+            has_room = partial(stands, world=self._world(grid), body=self.body)
+        start = next(filter(has_room, starts), None)
         if start is None:
             yield PosePlan(PlanStatus.START_OCCUPIED)
             return
-        exact = [state for near in goals for state in [*filter(empty.has_room, near)][:1]]
-        around = filter(empty.has_room, self._around(request)) if any(request.tolerance) else ()
+        exact = [state for near in goals for state in [*filter(has_room, near)][:1]]
+        around = filter(has_room, self._around(request)) if any(request.tolerance) else ()
         plan = PosePlan(PlanStatus.GOAL_OCCUPIED)
         for states in filter(None, map(tuple, (exact, around))):
             while not self._grow(request, states, start):

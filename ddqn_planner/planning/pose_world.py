@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, Final, NamedTuple
+from typing import Any, Final, NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
@@ -16,6 +16,7 @@ from ddqn_planner.grid.motions import HEADINGS, Motions, closer
 
 TILE: Final = 8  # cells of a side
 BORDER: Final = 128  # occupied cells around the map, so that a body sweeps none beyond the bits
+State: TypeAlias = tuple[int, int, int]  # x, y, heading
 CHANGED_SHARE = 1 / 50  # of the map's cells: if more changed, fields begin anew
 FINE = 0.01  # cells between two points of the origin's way, which tell the cells that it passes
 WORD, LAST_BIT, ONE, FULL = np.uint64(64), np.uint64(63), np.uint64(1), np.uint64(2**64 - 1)
@@ -202,6 +203,13 @@ def touches(bits: Any, x: int, y: int, row: Any, first: int, last: int) -> bool:
         if seen & (FULL >> np.uint64(64 - row[number, 2])):
             return True
     return False
+
+
+def stands(state: State, world: World, body: Body) -> bool:
+    """Return whether the body has room at a state inside the map."""
+    x, y, heading = state
+    row = len(body.start) + heading
+    return not touches(world.bits, x, y, body.row, body.first[row], body.first[row + 1])
 
 
 @inlined

@@ -21,7 +21,7 @@ from ddqn_planner.grid.motions import Motions, make_motions, turn_between
 from ddqn_planner.planning import pose_field
 from ddqn_planner.planning.plan import PlanStatus, PosePlan
 from ddqn_planner.planning.planner import last_step
-from ddqn_planner.planning.pose_field import State
+from ddqn_planner.planning.pose_world import State
 from ddqn_planner.planning.pose_paths import cost_of_poses
 from ddqn_planner.planning.pose_planner import Pose, PosePlanner, PoseRequest
 
