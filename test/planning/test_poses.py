@@ -21,9 +21,9 @@ from ddqn_planner.grid.motions import Motions, make_motions, turn_between
 from ddqn_planner.planning import pose_field
 from ddqn_planner.planning.plan import PlanStatus, PosePlan
 from ddqn_planner.planning.planner import last_step
-from ddqn_planner.planning.pose_world import State
 from ddqn_planner.planning.pose_paths import cost_of_poses
 from ddqn_planner.planning.pose_planner import Pose, PosePlanner, PoseRequest
+from ddqn_planner.planning.pose_world import State
 
 CELL = 0.1
 SQUARE = (0, 0), (0, 2), (2, 2), (2, 0)
