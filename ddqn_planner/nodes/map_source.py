@@ -52,18 +52,25 @@ class Received:
 class MapSource:
     """The map to plan on; `on_map` is called, with whether the frame is new, when anything is."""
 
+    # `timed` returns a map with expected times; the worker calls it.
     def __init__(
-        self, node: BaseNode, report: Report, worker: Worker, on_map: Callable[[bool], None]
+        self,
+        node: BaseNode,
+        report: Report,
+        worker: Worker,
+        timed: Callable[[GridMap], GridMap],
+        on_map: Callable[[bool], None],
     ) -> None:
-        self._node, self._report, self._worker, self._on_map = node, report, worker, on_map
+        self._node, self._report, self._worker = node, report, worker
+        self._timed, self._on_map = timed, on_map
         # The map in use and the last one. If that is another one, it waits for its directions.
         self._used: Received | None = None
         self._newest: Received | None = None
         self._began = time.monotonic()
         self._described = ""
         self._updates = self._refused_updates = 0
-        self._inflated: Future | None = None
         self._inflate = Inflation()
+        self._ready: Future | None = None
         # Before the subscription of the map: directions that come with a map are taken first.
         node.create_subscription(OccupancyGrid, DIRECTIONS, self._take_directions, LATCHED)
         self._directions = Directions(node)
@@ -115,18 +122,22 @@ class MapSource:
             description["map updates refused"] = str(self._refused_updates)
         return description
 
-    def inflated(self) -> Future:
-        """Return the `GridMap` for the robot's body, which is computed for the first request."""
-        if self._inflated is None:
+    def ready(self) -> Future:
+        """Return the `GridMap` to plan on, with body and times: computed for the first request."""
+        ready = self._ready
+        if ready is None or (ready.done() and ready.exception()):  # as when no memory was left
             radius, weight = map(self._node.value, BODY_PARAMETERS)
             # ROS accepts a value that is above the range by a millionth.
             of = self._grid, radius, min(weight, 1.0)
-            self._inflated = self._worker.call(self._inflate, *of)
-        return self._inflated
+            ready = self._ready = self._worker.call(self._prepare, *of)
+        return ready
+
+    def _prepare(self, *of_body: Any) -> GridMap:
+        return self._timed(self._inflate(*of_body))
 
     def apply_parameters(self, changed: set[str]) -> None:
-        """Read and inflate the map anew if one of the parameters that changed says so."""
-        if changed & {*MAP_PARAMETERS, *BODY_PARAMETERS, "require_directions"}:
+        """Read and prepare the map anew if one of the parameters that changed says so."""
+        if changed & {*MAP_PARAMETERS, *BODY_PARAMETERS, "require_directions", "exploration"}:
             self._read_again()
 
     def _take(self, message: OccupancyGrid) -> None:
@@ -195,12 +206,12 @@ class MapSource:
             missing = "is not read: map_msgs is not installed; apt install ros-jazzy-map-msgs, or"
             warning = f"{self._updates_topic} {missing} {REMEDY}"
             self._node.get_logger().warning(warning, once=True)
-        self._changed(frame_changed)
+        self.change(frame_changed)
         return True
 
-    def _changed(self, frame_changed: bool = False) -> None:
+    def change(self, frame_changed: bool = False) -> None:
         """Plan on what is new."""
-        self._inflated = None
+        self._ready = None
         self._report.change()
         self._on_map(frame_changed)
 
@@ -227,7 +238,7 @@ class MapSource:
         newest.header, newest.came = update.header, time.monotonic()
         self._updates += 1
         if newest is self._used:
-            self._changed()
+            self.change()
 
 
 def _place(message: OccupancyGrid) -> tuple[Any, ...]:

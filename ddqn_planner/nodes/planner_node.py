@@ -85,18 +85,19 @@ class PlannerNode(ManagedNode):
         group = MutuallyExclusiveCallbackGroup()
         self._replan = self.create_guard_condition(self._plan_for_active_goal, group)
         self._frames = Frames(self, lambda: float(self._settings.transform_tolerance))
-        self._map = MapSource(self, self._report, self._map_worker, self._on_map)
+        worker = self._map_worker
+        self._times = ExpectedTimes(self, self._report, worker, lambda: self._map.change())
+        self._map = MapSource(self, self._report, worker, self._times.apply, self._on_map)
         self._start = StartSource(
             self, self._frames, self._report, lambda: self._map.frame, self._on_start
         )
-        self._times = ExpectedTimes(self, self._report, self._map_worker, self._replan.trigger)
         group = MutuallyExclusiveCallbackGroup()  # this one ends when a newer path is there
         self._improve = self.create_guard_condition(self._improve_path, group)
         group = MutuallyExclusiveCallbackGroup()  # it waits for a worker
         self._read_experience = self.create_guard_condition(self._times.on_sent, group)
         if self._settings.experience:
             self._read_experience.trigger()
-        inputs = self._map, self._times.on, self._start, self._frames, self._model
+        inputs = self._map, self._start, self._frames, self._model
         self._requests = Requests(self._settings, *inputs, self._worker, self._look_soon)
         self.create_subscription(PoseStamped, "goal_pose", lambda goal: self._on_goals([goal]), 10)
         self.create_subscription(PoseArray, "goal_poses", self._on_goal_poses, 10)
@@ -164,7 +165,7 @@ class PlannerNode(ManagedNode):
         changed = {parameter.name for parameter in parameters} & self._declared.keys()
         if not (changed and self._is_configured):  # subscriptions declare parameters, too
             return
-        if "experience" in changed and settings.experience:
+        if "experience" in changed:
             self._read_experience.trigger()
         if "model" in changed:
             self._model.use(*self._candidate)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import gc
 import math
 import time
-from collections.abc import Awaitable, Callable
+from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from types import SimpleNamespace
@@ -245,7 +245,6 @@ class Requests:
 
     settings: SimpleNamespace
     map: MapSource
-    timed: Callable[[GridMap], Awaitable[GridMap]]
     start: StartSource
     frames: Frames
     model: ModelSource
@@ -364,15 +363,15 @@ class Requests:
         return is_path_valid(cells, cell, grid, rule, _clearing_radius(settings, grid))
 
     async def _inputs(self) -> tuple[Header, GridMap, Planner]:
-        """Return the header of the map of now, this map for the robot's body, and the planner."""
+        """Return the header of the map of now, this map ready to plan on, and the planner."""
         header = await self._wait_for(self.map.check)
-        inflated = self.map.inflated()
+        ready = self.map.ready()
         await self.model.first()
         planner = self.model.planner
         if planner is None:
             refused = self.model.report.refused["model"]
             raise RequestError("NO_MODEL", f"no model is loaded: {refused}")
-        return header, await self.timed(await inflated), planner
+        return header, await ready, planner
 
     async def _in_map(self, name: str, stamped: PoseStamped, grid: GridMap, frame: str) -> Place:
         """Return a pose in the map's frame, whose transform is waited for, and its cell."""
