@@ -77,7 +77,6 @@ class FieldDisplay:
         # Its own thread: neither requests nor maps wait for a field that is only shown.
         self._worker = Worker(node)
         self._shown: Shown | None = None
-        self._shows_again = False
         self._look = node.create_guard_condition(self._on_look, MutuallyExclusiveCallbackGroup())
         matched = PublisherEventCallbacks(matched=lambda _: self._look.trigger())
 
@@ -91,10 +90,6 @@ class FieldDisplay:
             layer("footprints", MarkerArray, footprint_message, True),
         )
 
-    def show_again(self) -> None:
-        """Publish the next field even if it is shown already."""
-        self._shows_again = True
-
     def show(self, outcome: Outcome, header: Header) -> None:
         """Show the field of an outcome from now on; none if it has none, as of another goal."""
         request, goal, shown = outcome.request, outcome.plan.goal, self._shown
@@ -107,8 +102,8 @@ class FieldDisplay:
             shown = shown._replace(planner=None, header=header)
         if shown is None:
             return
-        if self._shows_again or self._shown is None or self._shown[:-1] != shown[:-1]:
-            self._shown, self._shows_again = shown, False
+        if self._shown is None or self._shown[:-1] != shown[:-1]:
+            self._shown = shown
             for layer in self._layers:
                 layer.is_due = True
             self._look.trigger()
