@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
-from geometry_msgs.msg import Point
+from geometry_msgs.msg import Point, PoseStamped
 from nav_msgs.msg import OccupancyGrid
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
 from rclpy.event_handler import PublisherEventCallbacks
@@ -45,6 +45,7 @@ class Shown(NamedTuple):
     goal: Cell
     move_rule: MoveRule | None
     plan: PosePlan | None
+    asked: PoseStamped | None  # the goal: a new one is shown, though its field may be shown already
     header: Header
 
     def field(self) -> QField | None:
@@ -96,7 +97,7 @@ class FieldDisplay:
         if request is not None and goal is not None:
             rule, plan = getattr(request, "move_rule", None), outcome.plan
             path = plan if isinstance(plan, PosePlan) else None
-            shown = Shown(outcome.planner, request.grid, goal, rule, path, header)
+            shown = Shown(outcome.planner, request.grid, goal, rule, path, outcome.goal, header)
         elif shown is not None:
             header = Header(stamp=header.stamp, frame_id=shown.header.frame_id)
             shown = shown._replace(planner=None, header=header)

@@ -87,7 +87,7 @@ class DrivingRobot:
         }
         # What failed before the node listened failed elsewhere.
         before = aborted if self._aborted is None else self._aborted
-        self._aborted = aborted
+        self._aborted = before | aborted
         if self._node.state == "recording" and aborted - before:
             self.recorder.abort()
 

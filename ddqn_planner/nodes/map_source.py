@@ -20,7 +20,7 @@ from ddqn_planner.grid.copies import WHOLE, boxes_of
 from ddqn_planner.nodes.conversions import grid_from_message, grid_from_values
 from ddqn_planner.nodes.report import Report, RequestError, seconds
 from ddqn_planner.nodes.runtime import LATCHED, BaseNode, Worker
-from ddqn_planner.planning.field import offset_between
+from ddqn_planner.planning.field import offset_between, overlap
 
 try:
     from map_msgs.msg import OccupancyGridUpdate
@@ -316,11 +316,9 @@ class Directions:
                     f"{header.frame_id!r} and {grid.resolution:.6g} m; give both one frame, and "
                     "cells that lie on each other"
                 )
-            forbidden, (x, y) = np.zeros(grid.occupancy.shape, dtype=np.uint8), offset
-            part = directions.forbidden[max(-y, 0) :, max(-x, 0) :]
-            target = forbidden[max(y, 0) :, max(x, 0) :]
-            height, width = (min(sides) for sides in zip(part.shape, target.shape, strict=True))
-            target[:height, :width] = part[:height, :width]
+            theirs, ours = overlap(directions, grid, offset)
+            forbidden = np.zeros(grid.occupancy.shape, dtype=np.uint8)
+            forbidden[ours] = directions.forbidden[theirs]
             grid = replace(grid, forbidden=forbidden)
         self.used, self._are_paired = found, bool(own)
         return grid
