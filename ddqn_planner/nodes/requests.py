@@ -45,7 +45,6 @@ HEADING = 2 * math.pi / HEADINGS  # radians that a robot turns until that is a r
 UNCHANGED = Outcome("UNCHANGED", "the active goal needs no new plan")
 
 T = TypeVar("T")
-Place = tuple[PoseStamped, Cell]
 
 
 @dataclass
@@ -375,7 +374,9 @@ class Requests:
             raise RequestError("NO_MODEL", f"no model is loaded: {refused}")
         return header, await ready, planner
 
-    async def _in_map(self, name: str, stamped: PoseStamped, grid: GridMap, frame: str) -> Place:
+    async def _in_map(
+        self, name: str, stamped: PoseStamped, grid: GridMap, frame: str
+    ) -> tuple[PoseStamped, Cell]:
         """Return a pose in the map's frame, whose transform is waited for, and its cell."""
         _checked(name, self.frames.check, stamped, frame)
         deadline = time.monotonic() + self.settings.transform_tolerance
