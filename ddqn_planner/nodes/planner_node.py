@@ -273,11 +273,12 @@ class PlannerNode(ManagedNode):
     async def _improve_path(self) -> None:
         if (last := self._improvable) is None:
             return
-        (outcome, active), is_newest = last, lambda: last is self._improvable
-        improving = self._requests.improve(outcome)
-        header, better = await self._answer(
-            [], improving, lambda: None if is_newest() else UNCHANGED
-        )
+        outcome, active = last
+
+        def given_up() -> Outcome | None:
+            return None if last is self._improvable else UNCHANGED
+
+        header, better = await self._answer([], self._requests.improve(outcome), given_up)
         if better.request is not None and active is self._active:
             if active.is_news(better, header.frame_id):
                 self._plan_publisher.publish(*_paths(better, header, path_bytes))
