@@ -199,7 +199,7 @@ def test_plan_tells_how_a_body_drives_or_why_it_cannot(rooms: Any, capsys: Any) 
         ("--goal 112 -1", "the goal lies outside the map"),
     ):
         assert main([*command, *options.split()]) == 1
-        assert capsys.readouterr().err == f"no path: {reason}\n"
+        assert capsys.readouterr().err == f"no path: {reason}; --picture shows the body\n"
 
 
 @pytest.mark.parametrize(
