@@ -165,7 +165,8 @@ def _print_plan(
             print(draw_blocks(grid, plan.cells, *shutil.get_terminal_size()))
         print(*lines, sep="\n")
     else:
-        print(f"no path: {plan.status.value}", file=sys.stderr)
+        hint = "" if options.picture or "poses" not in answer else "; --picture shows the body"
+        print(f"no path: {plan.status.value}{hint}", file=sys.stderr)
 
 
 def add_map_options(parser: argparse.ArgumentParser, move_rule: str | None) -> None:

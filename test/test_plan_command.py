@@ -12,9 +12,10 @@ import pytest
 from bodies import Oracle
 from PIL import Image, ImageColor
 
-from ddqn_planner import Planner, inflate
+from ddqn_planner import Planner, inflate, pictures
 from ddqn_planner.cli import main
 from ddqn_planner.grid import MapFile, save_map
+from ddqn_planner.grid.footprint import placed
 from ddqn_planner.pictures import PATH_COLOUR, VALUE_COLOURS
 
 
@@ -198,7 +199,7 @@ def test_plan_tells_how_a_body_drives_or_why_it_cannot(rooms: Any, capsys: Any) 
         ("--goal 112 -1", "the goal lies outside the map"),
     ):
         assert main([*command, *options.split()]) == 1
-        assert capsys.readouterr().err == f"no path: {reason}\n"
+        assert capsys.readouterr().err == f"no path: {reason}; --picture shows the body\n"
 
 
 @pytest.mark.parametrize(
@@ -239,17 +240,32 @@ def test_plan_names_the_resolution_that_a_body_needs(capsys: Any) -> None:
 
 
 def test_a_picture_shows_what_a_body_sweeps_and_where_it_has_no_room(
-    rooms: Any, tmp_path: Path
+    rooms: Any, capsys: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     pytest.importorskip("matplotlib")
-    shown = []
-    for goal in ("40", "12"):
-        command = ["plan", rooms[1], "--model", "car", "--goal", "102", goal]
-        assert main([*command, "--picture", str(tmp_path / "plan.png")]) == int(goal == "12")
+    shown, drawn, draw_body = [], [], pictures.draw_body
+    planner: Any = Planner.load("car").pose_planner
+
+    def draw(*body: Any) -> None:
+        drawn.append(body)
+        draw_body(*body)
+
+    monkeypatch.setattr(pictures, "draw_body", draw)
+    for goal, tolerance in (("40", "0"), ("12", "0"), ("12", "0.6")):
+        command = ["plan", rooms[1], "--model", "car", "--goal", "102", goal, "--json"]
+        command += ["--tolerance", tolerance, "--picture", str(tmp_path / "plan.png")]
+        has_path = main(command) == 0
         with Image.open(tmp_path / "plan.png") as picture:
             pixels = np.asarray(picture.convert("RGB"))
         colours = map(ImageColor.getrgb, (VALUE_COLOURS[1], PATH_COLOUR))
         shown.append([int((pixels == colour).all(axis=2).sum()) for colour in colours])
-    (swept, driven), (none, ends) = shown
-    assert none == 0 < min(swept, ends)
-    assert ends < driven
+        # Cells, counted from the centre of the first one, are the metres of the plan.
+        _, footprint, *poses = drawn[-1]
+        swept, ends = ((placed(footprint, each) + 0.5) * 0.05 + (1, -2) for each in poses)
+        driven = np.reshape(json.loads(capsys.readouterr().out)["poses"], (-1, 3))
+        asked = driven[[0, -1]] if has_path else np.array([[1.775, -0.725, 0], [6.125, -1.375, 0]])
+        np.testing.assert_allclose(swept, placed(planner.footprint, driven), atol=1e-9)
+        np.testing.assert_allclose(ends, placed(planner.footprint, asked), atol=1e-9)
+    (swept, path), (none, no_path), _ = shown
+    assert none == 0 < min(swept, no_path)
+    assert no_path < path

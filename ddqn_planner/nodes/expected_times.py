@@ -11,12 +11,13 @@ from std_msgs.msg import UInt8MultiArray
 
 from ddqn_planner.experience import Experience
 from ddqn_planner.grid import GridMap
+from ddqn_planner.grid.copies import WHOLE
 from ddqn_planner.nodes.conversions import bytes_of, label_of
 from ddqn_planner.nodes.lifecycle import ManagedNode
-from ddqn_planner.nodes.map_source import is_like
 from ddqn_planner.nodes.report import NO_REQUEST, Outcome, Report
 from ddqn_planner.nodes.runtime import Worker
 
+CHANGED_SHARE = 0.02  # of cells: with more, experience is spread anew over the map, slowly
 NO_MAP = GridMap(np.zeros((1, 1), dtype=np.bool_))
 
 
@@ -91,3 +92,14 @@ class ExpectedTimes:
                 told["expected time (s)"] = f"{seconds:.1f}"
                 told["expected time, 90 % interval (s)"] = f"{low:.1f} to {high:.1f}"
         return told
+
+
+def is_like(grid: GridMap, other: GridMap) -> bool:
+    """Return whether two maps have the same place, and nearly the same obstacles."""
+    mine, its = ((each.occupancy.shape, each.resolution, each.origin) for each in (grid, other))
+    if mine != its:
+        return False
+    boxes = grid.patches_since(other)
+    boxes = [WHOLE] if boxes is None else boxes
+    changed = sum(np.count_nonzero(grid.occupancy[box] != other.occupancy[box]) for box in boxes)
+    return bool(changed <= CHANGED_SHARE * grid.occupancy.size)

@@ -16,11 +16,11 @@ from std_msgs.msg import Header
 
 from ddqn_planner.grid import GridMap
 from ddqn_planner.grid.body import Inflation
-from ddqn_planner.grid.copies import WHOLE, boxes_of
+from ddqn_planner.grid.copies import boxes_of
 from ddqn_planner.nodes.conversions import grid_from_message, grid_from_values
 from ddqn_planner.nodes.report import Report, RequestError, seconds
 from ddqn_planner.nodes.runtime import LATCHED, BaseNode, Worker
-from ddqn_planner.planning.field import offset_between
+from ddqn_planner.planning.field import offset_between, overlap
 
 try:
     from map_msgs.msg import OccupancyGridUpdate
@@ -37,7 +37,6 @@ UPDATES_QUALITY = QoSProfile(depth=100)
 REMEDY = "let the map's publisher send the full map"
 
 PATIENCE = 1.0  # seconds within which the first map is expected after the node subscribes
-CHANGED_SHARE = 0.02  # of cells: with more, experience is spread anew over the map, slowly
 
 
 @dataclass
@@ -144,8 +143,8 @@ class MapSource:
         try:
             grid = self._changed_map(message)
             grid = grid or grid_from_message(message, *map(self._node.value, MAP_PARAMETERS))
-        except ValueError as error:
-            self._report.refuse("map", str(error))
+        except (ValueError, MemoryError) as error:
+            self._report.refuse("map", str(error) or repr(error))
             return
         self._newest = Received(message, message.header, time.monotonic())
         self._report.accept("map_updates")
@@ -316,22 +315,9 @@ class Directions:
                     f"{header.frame_id!r} and {grid.resolution:.6g} m; give both one frame, and "
                     "cells that lie on each other"
                 )
-            forbidden, (x, y) = np.zeros(grid.occupancy.shape, dtype=np.uint8), offset
-            part = directions.forbidden[max(-y, 0) :, max(-x, 0) :]
-            target = forbidden[max(y, 0) :, max(x, 0) :]
-            height, width = (min(sides) for sides in zip(part.shape, target.shape, strict=True))
-            target[:height, :width] = part[:height, :width]
+            theirs, ours = overlap(directions, grid, offset)
+            forbidden = np.zeros(grid.occupancy.shape, dtype=np.uint8)
+            forbidden[ours] = directions.forbidden[theirs]
             grid = replace(grid, forbidden=forbidden)
         self.used, self._are_paired = found, bool(own)
         return grid
-
-
-def is_like(grid: GridMap, other: GridMap) -> bool:
-    """Return whether two maps have the same place, and nearly the same obstacles."""
-    mine, its = ((each.occupancy.shape, each.resolution, each.origin) for each in (grid, other))
-    if mine != its:
-        return False
-    boxes = grid.patches_since(other)
-    boxes = [WHOLE] if boxes is None else boxes
-    changed = sum(np.count_nonzero(grid.occupancy[box] != other.occupancy[box]) for box in boxes)
-    return bool(changed <= CHANGED_SHARE * grid.occupancy.size)

@@ -122,8 +122,8 @@ class PlannerNode(ManagedNode):
     def deactivate(self) -> None:
         """Forget the active goal."""
         super().deactivate()
-        self._active, self._followed = ActiveGoal([], PathUnderWay()), PathUnderWay()
-        self._improvable: tuple[Outcome, ActiveGoal | PathUnderWay] | None = None
+        self._active, self._followed = ActiveGoal([]), PathUnderWay()
+        self._improvable: tuple[Outcome, ActiveGoal | None] | None = None
         self._report.change()
 
     def cleanup(self) -> None:
@@ -176,11 +176,11 @@ class PlannerNode(ManagedNode):
         self._map.apply_parameters(changed)
         if "path_simplification" in changed:
             self._followed = PathUnderWay()
-        self._plan_for(ActiveGoal(self._active.poses, PathUnderWay()))
+        self._plan_for(ActiveGoal(self._active.poses))
 
     def _on_model(self, message: UInt8MultiArray) -> None:
         if self._model.take(message):
-            self._plan_for(ActiveGoal(self._active.poses, PathUnderWay()))
+            self._plan_for(ActiveGoal(self._active.poses))
 
     # Map, start and goal
 
@@ -211,8 +211,7 @@ class PlannerNode(ManagedNode):
             self._report.log(self._refusal)
             return
         self._report.accept("goal_poses")
-        self._display.show_again()
-        self._plan_for(ActiveGoal(goals, PathUnderWay()))
+        self._plan_for(ActiveGoal(goals))
 
     # Planning
 
@@ -220,7 +219,7 @@ class PlannerNode(ManagedNode):
         start = request.start if request.start.header.frame_id else None
         goals = [request.goal]
         planning = self._requests.plan(start, goals, request.tolerance)
-        header, outcome = await self._answer(lambda: None, goals, planning)
+        header, outcome = await self._answer(goals, planning)
         (response.plan,) = _paths(outcome, header, path_message)
         self._report.log(outcome)
         return response
@@ -232,8 +231,8 @@ class PlannerNode(ManagedNode):
         active, goals = self._active, self._active.poses
         if not goals:
             return
-        planning = self._requests.plan(None, goals, None, "", active)
-        header, outcome = await self._answer(lambda: None, goals, planning)
+        planning = self._requests.plan(None, goals, followed=active)
+        header, outcome = await self._answer(goals, planning)
         if outcome in (UNCHANGED, NOT_ACTIVE):
             return
         self._improve_later(outcome, active)
@@ -253,35 +252,35 @@ class PlannerNode(ManagedNode):
         self, start: PoseStamped | None, goals: list[PoseStamped], name: str, given_up: GivenUp
     ) -> tuple[Path, Outcome]:
         planning = self._requests.plan(start, goals, None, name, self._followed)
-        header, outcome = await self._answer(given_up, goals, planning)
+        header, outcome = await self._answer(goals, planning, given_up)
         to_publish, path = _paths(outcome, header, path_bytes, path_message)
         if outcome.request is not None and len(outcome.plan.path):
             self._followed.keep(way_of(outcome.plan), outcome.request.grid, header.frame_id)
-            self._improve_later(outcome, self._followed)
+            # It gets the better path with its next request.
+            self._improve_later(outcome, None)
             self._plan_publisher.publish(to_publish)
         self._report.log(outcome)
         return path, outcome
 
-    def _improve_later(self, outcome: Outcome, followed: ActiveGoal | PathUnderWay) -> None:
+    def _improve_later(self, outcome: Outcome, active: ActiveGoal | None) -> None:
         """Look for the least path of a body, unless it would not be worth a switch."""
         plan, self._improvable = outcome.plan, None
         worth = (1 + self._settings.switch_threshold) * SAME_COST
         if isinstance(plan, PosePlan) and plan.bound > worth:
-            self._improvable = outcome, followed
+            self._improvable = outcome, active
             self._improve.trigger()
 
     async def _improve_path(self) -> None:
         if (last := self._improvable) is None:
             return
-        outcome, followed = last
-        # What an action follows gets the better path with its next request.
-        path = followed.path if isinstance(followed, ActiveGoal) else followed
-        improving = self._requests.improve(outcome, path.path)
-        header, better = await self._answer(
-            lambda: None if last is self._improvable else UNCHANGED, [], improving
-        )
-        if better.request is not None and followed is self._active:
-            if self._active.is_news(better, header.frame_id):
+        outcome, active = last
+
+        def given_up() -> Outcome | None:
+            return None if last is self._improvable else UNCHANGED
+
+        header, better = await self._answer([], self._requests.improve(outcome), given_up)
+        if better.request is not None and active is self._active:
+            if active.is_news(better, header.frame_id):
                 self._plan_publisher.publish(*_paths(better, header, path_bytes))
             self._display.show(better, header)
 
@@ -296,7 +295,10 @@ class PlannerNode(ManagedNode):
         return response
 
     async def _answer(
-        self, given_up: GivenUp, goals: list[PoseStamped], planning: Coroutine[None, None, Outcome]
+        self,
+        goals: list[PoseStamped],
+        planning: Coroutine[None, None, Outcome],
+        given_up: GivenUp = lambda: None,
     ) -> tuple[Header, Outcome]:
         """Plan, unless the node stops or the request is given up; return the path's header, too."""
         self._answering += 1

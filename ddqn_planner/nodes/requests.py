@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gc
 import math
+import threading
 import time
 from collections.abc import Callable
 from contextlib import suppress
@@ -44,7 +45,6 @@ HEADING = 2 * math.pi / HEADINGS  # radians that a robot turns until that is a r
 UNCHANGED = Outcome("UNCHANGED", "the active goal needs no new plan")
 
 T = TypeVar("T")
-Place = tuple[PoseStamped, Cell]
 
 
 @dataclass
@@ -78,11 +78,11 @@ class PathUnderWay:
 class ActiveGoal:
     """Decides when to plan again, and what to publish; the table in docs/nodes.md has the rules."""
 
-    def __init__(self, poses: list[PoseStamped], path: PathUnderWay) -> None:
+    def __init__(self, poses: list[PoseStamped], path: PathUnderWay | None = None) -> None:
         # The last ``goal_pose``, or the last ``goal_poses``, of which the nearest one counts.
         self.poses = poses
         # Of the paths that were published for this goal, the last one.
-        self.path = path
+        self.path = path or PathUnderWay()
         # What was planned last; None to plan whatever is asked.
         self._planned: tuple[Any, ...] | None = None
         # The frame and the status of what was published last; None to publish whatever comes.
@@ -172,7 +172,7 @@ class ModelSource:
             gc.set_threshold(20_000)  # to compile and to plan makes hardly any garbage
             next(compiling)
             gc.freeze()  # a collection of all that would stop the node for 45 ms
-            Worker(self._node).call(next, compiling)  # the rest
+            threading.Thread(target=next, args=[compiling], daemon=True).start()  # the rest
             return planner, file
 
         self.loading = self._worker.call(read)
@@ -322,9 +322,10 @@ class Requests:
         is_dense = settings.path_simplification == "straight"
         return Outcome(plan.status.name, reason, planner, request, plan, goal, stamp, is_dense)
 
-    async def improve(self, outcome: Any, under_way: Any) -> Outcome:
+    async def improve(self, outcome: Any) -> Outcome:
         """Return the outcome of a request for poses with a path of the least cost."""
-        request, goal = replace(outcome.request, bound=1.0, under_way=under_way), outcome.goal
+        under_way, goal = way_of(outcome.plan), outcome.goal
+        request = replace(outcome.request, bound=1.0, under_way=under_way)
         plan = await self._plan(outcome.planner, request)
         reason = reason_of(request, plan, goal, goal, 0.0)
         improved: Outcome = replace(outcome, request=request, plan=plan, reason=reason)
@@ -373,7 +374,9 @@ class Requests:
             raise RequestError("NO_MODEL", f"no model is loaded: {refused}")
         return header, await ready, planner
 
-    async def _in_map(self, name: str, stamped: PoseStamped, grid: GridMap, frame: str) -> Place:
+    async def _in_map(
+        self, name: str, stamped: PoseStamped, grid: GridMap, frame: str
+    ) -> tuple[PoseStamped, Cell]:
         """Return a pose in the map's frame, whose transform is waited for, and its cell."""
         _checked(name, self.frames.check, stamped, frame)
         deadline = time.monotonic() + self.settings.transform_tolerance

@@ -503,18 +503,25 @@ def test_the_exploration_that_is_set_counts_at_once(
         np.testing.assert_allclose(source.slowness(), expected.slowness, rtol=1e-4)
 
 
-def test_a_map_that_could_not_be_made_ready_is_tried_again(
+def test_a_map_for_which_no_memory_was_left_is_refused_or_tried_again(
     source: Source, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def fail(*_: Any) -> GridMap:
         raise MemoryError
 
+    changed = map_of(2)
+    changed.data[0] = 100
     source._take(map_of(1))
     with monkeypatch.context() as patch:
         patch.setattr(source, "_inflate", fail)
         with pytest.raises(MemoryError):
             source.grid()
-    assert source.grid().occupancy.shape == (4, 5)
+        patch.setattr(source, "_patched", fail)
+        source._take(changed)
+        assert "MemoryError" in source.report.refused["map"]
+    assert source.used() == (1, None)
+    source._take(changed)
+    assert source.used() == (2, None)
 
 
 def finished(coroutine: Coroutine[None, None, Any]) -> Any:
@@ -539,6 +546,26 @@ def test_a_map_with_a_person_or_that_grows_keeps_its_times(times: ExpectedTimes)
     assert after is not None
     # Near the old edge more places tell of others.
     np.testing.assert_allclose(after[5:35, 10:130], before[:30], rtol=0.021)
+
+
+def test_the_executors_thread_alone_tells_what_the_worker_computes(
+    source: Source, driven: UInt8MultiArray, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    threads, told = set[int](), {"expected time (s)": "1.0"}
+
+    def describe(_: Outcome) -> dict[str, str]:
+        time.sleep(0.1)
+        return told
+
+    monkeypatch.setattr(source.report, "_on_change", lambda: threads.add(threading.get_ident()))
+    monkeypatch.setattr(source.times, "describe", describe)
+    outcome = Outcome("SUCCEEDED", "a path")
+    assert source.times.told(outcome) == {}  # without drives
+    finished(source.times.on_sent(driven))
+    assert source.times.told(outcome) == {}
+    assert wait_for("expected time", lambda: source.times.told(outcome)) == told
+    time.sleep(0.1)
+    assert threads == {threading.get_ident()}
 
 
 def test_the_plan_goes_round_and_its_time_is_told(times: ExpectedTimes) -> None:
