@@ -290,8 +290,8 @@ class PlannerNode(ManagedNode):
         try:
             checking = self._requests.is_path_valid(request.path)
             response.is_valid = await unless(checking, lambda: self._refusal) is True
-        except RequestError as error:
-            self.get_logger().warning(f"no path to check: {error}")
+        except Exception as error:  # as when no memory is left: the node must survive
+            self.get_logger().warning(f"no path to check: {str(error) or repr(error)}")
         return response
 
     async def _answer(

@@ -238,6 +238,15 @@ def test_a_path_to_one_goal_is_kept_while_it_is_nearly_as_good_as_a_new_one() ->
         assert "kept: its cost is +" in above_kept[1][1]
         assert node._model.planner is not None
         assert node._model.planner.cache_bytes == 0  # what the node was started with holds
+
+        def fail(*_: Any) -> GridMap:
+            raise MemoryError
+
+        # A path that cannot be checked is not valid, and the node lives.
+        request, validity = SimpleNamespace(path=PathMessage()), SimpleNamespace()
+        node._map._inflate = fail
+        node._map.change()
+        assert not run(node._on_is_path_valid(request, validity)).is_valid
     finally:
         node.destroy_node()
         try_shutdown()
