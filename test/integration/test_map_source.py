@@ -568,6 +568,8 @@ def test_the_executors_thread_alone_tells_what_the_worker_computes(
     assert wait_for("expected time", lambda: source.times.told(outcome)) == told
     time.sleep(0.1)
     assert threads == {threading.get_ident()}
+    finished(source.times.on_sent())  # the file that is set: none
+    assert source.times.told(outcome) == {}
 
 
 def test_the_plan_goes_round_and_its_time_is_told(times: ExpectedTimes) -> None:
