@@ -251,11 +251,12 @@ class PlannerNode(ManagedNode):
     async def _plan_for_action(
         self, start: PoseStamped | None, goals: list[PoseStamped], name: str, given_up: GivenUp
     ) -> tuple[Path, Outcome]:
-        planning = self._requests.plan(start, goals, None, name, self._followed)
+        followed = self._followed
+        planning = self._requests.plan(start, goals, None, name, followed)
         header, outcome = await self._answer(goals, planning, given_up)
         to_publish, path = _paths(outcome, header, path_bytes, path_message)
         if outcome.request is not None and len(outcome.plan.path):
-            self._followed.keep(way_of(outcome.plan), outcome.request.grid, header.frame_id)
+            followed.keep(way_of(outcome.plan), outcome.request.grid, header.frame_id)
             # It gets the better path with its next request.
             self._improve_later(outcome, None)
             self._plan_publisher.publish(to_publish)
