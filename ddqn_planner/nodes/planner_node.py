@@ -251,11 +251,12 @@ class PlannerNode(ManagedNode):
     async def _plan_for_action(
         self, start: PoseStamped | None, goals: list[PoseStamped], name: str, given_up: GivenUp
     ) -> tuple[Path, Outcome]:
-        planning = self._requests.plan(start, goals, None, name, self._followed)
+        followed = self._followed
+        planning = self._requests.plan(start, goals, None, name, followed)
         header, outcome = await self._answer(goals, planning, given_up)
         to_publish, path = _paths(outcome, header, path_bytes, path_message)
         if outcome.request is not None and len(outcome.plan.path):
-            self._followed.keep(way_of(outcome.plan), outcome.request.grid, header.frame_id)
+            followed.keep(way_of(outcome.plan), outcome.request.grid, header.frame_id)
             # It gets the better path with its next request.
             self._improve_later(outcome, None)
             self._plan_publisher.publish(to_publish)
@@ -290,8 +291,8 @@ class PlannerNode(ManagedNode):
         try:
             checking = self._requests.is_path_valid(request.path)
             response.is_valid = await unless(checking, lambda: self._refusal) is True
-        except RequestError as error:
-            self.get_logger().warning(f"no path to check: {error}")
+        except Exception as error:  # as when no memory is left: the node must survive
+            self.get_logger().warning(f"no path to check: {str(error) or repr(error)}")
         return response
 
     async def _answer(

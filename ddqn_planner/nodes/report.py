@@ -124,11 +124,12 @@ class Refusals:
 
     @contextmanager
     def taking(self, what: str, often: bool = False) -> Iterator[None]:
-        """Accept something, or refuse it by a ValueError; of what comes often, log the first."""
+        """Accept something, or refuse it by its error; of what comes often, log the first."""
         try:
             yield
-        except ValueError as error:
-            self.refuse(what, str(error), log=not often or what not in self.refused)
+        except (ValueError, MemoryError) as error:
+            is_logged = not often or what not in self.refused
+            self.refuse(what, str(error) or repr(error), is_logged)
         else:
             self.accept(what)
 

@@ -25,14 +25,7 @@ from ddqn_planner.model.certificate import NO_CERTIFICATE
 from ddqn_planner.nodes.conversions import bytes_of, cell_from_pose, label_of, pose_of, turns
 from ddqn_planner.nodes.map_source import MapSource
 from ddqn_planner.nodes.poses import Frames, StartSource
-from ddqn_planner.nodes.report import (
-    Outcome,
-    Report,
-    Request,
-    RequestError,
-    reason_of,
-    seconds,
-)
+from ddqn_planner.nodes.report import Outcome, Report, Request, RequestError, reason_of, seconds
 from ddqn_planner.nodes.runtime import BaseNode, Worker
 from ddqn_planner.planning import Plan, PlanMethod, Planner, PlanRequest, PlanStatus
 from ddqn_planner.planning.field import shift_between

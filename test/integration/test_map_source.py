@@ -503,7 +503,7 @@ def test_the_exploration_that_is_set_counts_at_once(
         np.testing.assert_allclose(source.slowness(), expected.slowness, rtol=1e-4)
 
 
-def test_a_map_for_which_no_memory_was_left_is_refused_or_tried_again(
+def test_what_no_memory_was_left_for_is_refused_or_tried_again(
     source: Source, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def fail(*_: Any) -> GridMap:
@@ -518,7 +518,9 @@ def test_a_map_for_which_no_memory_was_left_is_refused_or_tried_again(
             source.grid()
         patch.setattr(source, "_patched", fail)
         source._take(changed)
-        assert "MemoryError" in source.report.refused["map"]
+        patch.setattr(source.times, "load", fail)
+        finished(source.times.on_sent())
+        assert source.report.refused == dict.fromkeys(("map", "experience"), "MemoryError()")
     assert source.used() == (1, None)
     source._take(changed)
     assert source.used() == (2, None)
@@ -566,6 +568,8 @@ def test_the_executors_thread_alone_tells_what_the_worker_computes(
     assert wait_for("expected time", lambda: source.times.told(outcome)) == told
     time.sleep(0.1)
     assert threads == {threading.get_ident()}
+    finished(source.times.on_sent())  # the file that is set: none
+    assert source.times.told(outcome) == {}
 
 
 def test_the_plan_goes_round_and_its_time_is_told(times: ExpectedTimes) -> None:
