@@ -3,10 +3,7 @@
 from __future__ import annotations
 
 import argparse
-import json
-import math
 import os
-import shutil
 import signal
 import sys
 import threading
@@ -19,12 +16,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 import ddqn_planner as api
-from ddqn_planner.files import WorkFolder, differences, write_atomically, write_csv
+from ddqn_planner.files import WorkFolder, differences, write_atomically
+from ddqn_planner.plan_command import add_map_options, plan, read_map
 from ddqn_planner.resources import find_map, with_remedy
 
 # A command imports what it needs, and no other command's libraries: the names of `api` do so, too.
 if TYPE_CHECKING:
-    from ddqn_planner.grid import Cell, MapFile
     from ddqn_planner.training.environment import Scenario
     from ddqn_planner.training.hyper_parameters import HyperParameters
     from ddqn_planner.training.run import TrainingRun
@@ -47,117 +44,16 @@ def exit_code(program: str, run: Callable[[], int]) -> int:
         return 2
 
 
-def plan(parser: argparse.ArgumentParser, arguments: Sequence[str]) -> int:
-    """Plan a path on a map file, and print it."""
-    import numpy as np
-
-    from ddqn_planner.grid.arguments import as_number
-    from ddqn_planner.pictures import save_picture
-
-    _add_plan_options(parser)
-    options = parser.parse_args(arguments)
-    map_file, start, goal = _read_map(options)
-    grid = map_file.grid(options.occupied_threshold, options.allow_unknown, options.use_map_costs)
-    grid = api.inflate(grid, options.robot_radius, options.clearance_weight)
-    metres = 0, math.inf, "metres, 0 or more"
-    tolerance = as_number("--tolerance", options.tolerance, *metres)
-    radius = as_number("--start-clearing-radius", options.start_clearing_radius, *metres)
-    planner = api.Planner.load(options.model)
-    # A first plan loads compiled code, which the time of the second one leaves out.
-    shape = tuple(planner.metadata.sizes.get(side, 3) for side in ("height", "width"))
-    planner.plan(api.GridMap(np.zeros(shape, dtype=np.bool_)), (0, 0), (1, 1))
-    asked = options.move_rule, options.mode, tolerance / grid.resolution
-    radius /= grid.resolution
-    began = time.perf_counter()
-    plan = planner.plan(grid, start, goal, *asked, start_clearing_radius=radius)
-    _print_plan(options, grid, plan, time.perf_counter() - began)
-    if options.csv:
-        rows = ((*cell, *np.round(grid.cell_to_world(cell), 6)) for cell in plan.cells)
-        write_csv(options.csv, ("x", "y", "x_metres", "y_metres"), rows)
-    if options.picture:
-        value = None
-        if plan.cells and planner.network.supports((grid.height, grid.width)):
-            value = planner.q_field(grid, plan.cells[-1], plan.move_rule).value
-        title = f"{plan.length:.2f} cells" if plan.cells else plan.status.value
-        save_picture(options.picture, grid, plan.cells, value, title)
-    return 0 if plan.cells else 1
-
-
-def _add_plan_options(parser: argparse.ArgumentParser) -> None:
-    add = parser.add_argument
-    _add_map_options(parser, None)
-    add("--model", default="any_map", help="name or file")
-    modes = [method.value for method in api.PlanMethod]
-    add("--mode", choices=modes, default="greedy", help="astar_fallback: search if steps get stuck")
-    occupied = "a cell of this value or more is occupied, percent"
-    add("--occupied-threshold", type=int, default=65, metavar="N", help=occupied)
-    add("--allow-unknown", action="store_true", help="treat unknown cells as free")
-    costs = "a free cell costs more, the greater its value; an unknown one costs most"
-    add("--use-map-costs", action="store_true", help=costs)
-    for name, words in (
-        ("robot-radius", "distance that the path keeps from obstacles, metres"),
-        ("clearance-weight", "how strongly to avoid cells near obstacles, 0 to 1"),
-        ("tolerance", "how far a goal that is occupied or cut off may move, metres"),
-        ("start-clearing-radius", "obstacles so near to an occupied start do not count, metres"),
-    ):
-        add(f"--{name}", type=float, default=0.0, metavar="X", help=words)
-    add("--cells", action="store_true", help="print each cell of the path, as X Y")
-    add("--csv", type=Path, metavar="FILE", help="write the path's cells and their metres")
-    add("--json", action="store_true", help="print JSON instead of text")
-    add("--picture", type=Path, metavar="FILE", help="draw map, value and path")
-
-
-def _print_plan(options: Any, grid: api.GridMap, plan: api.Plan, seconds: float) -> None:
-    import numpy as np
-
-    from ddqn_planner.grid import path_length
-    from ddqn_planner.pictures import MAX_TEXT_WIDTH, draw_blocks, draw_text
-    from ddqn_planner.planning.paths import search
-
-    optimum = None
-    if plan.cells and grid.is_free(plan.cells[0]):
-        legal, no_costs = grid.legal_moves(plan.move_rule), np.ones(grid.occupancy.shape, "f4")
-        shortest = search(plan.cells[0], plan.cells[-1], legal, no_costs, plan.move_rule)
-        optimum = path_length(shortest, plan.move_rule)
-    if options.json:
-        answer = {
-            "status": plan.status.name,
-            "reason": plan.status.value,
-            "cells": plan.cells,
-            "method": plan.method.value,
-            "length": plan.length,
-            "optimum": optimum,
-            "move_rule": plan.move_rule.value,
-            "planning_seconds": seconds,
-        }
-        print(json.dumps(answer))
-    elif plan.cells:
-        if grid.width <= MAX_TEXT_WIDTH:
-            print(draw_text(grid, plan.cells))
-        elif sys.stdout.isatty() and sys.stdout.encoding.lower() == "utf-8":
-            print(draw_blocks(grid, plan.cells, *shutil.get_terminal_size()))
-        if options.cells:
-            print(*(f"{x} {y}" for x, y in plan.cells), sep="\n")
-        metres = path_length(plan.path) * grid.resolution
-        print(f"start {plan.cells[0]}, goal {plan.cells[-1]}, {metres:.2f} m")
-        known = "" if optimum is None else f"optimum {optimum:.2f} under {plan.move_rule.value}, "
-        known += "" if plan.cost is None else f"cost {plan.cost:.2f}, "
-        known += f"{plan.method.value}, planned in {seconds * 1e3:.1f} ms"
-        print(f"length {plan.length:.2f} cells, {known}")
-    else:
-        print(f"no path: {plan.status.value}", file=sys.stderr)
-
-
 def train(parser: argparse.ArgumentParser, arguments: Sequence[str]) -> int:
     """Train a model on a map file, into a folder. Run the same command again to resume."""
     from ddqn_planner.training.environment import Scenario
     from ddqn_planner.training.evaluation import evaluate
     from ddqn_planner.training.hyper_parameters import HyperParameters
 
-    _add_map_options(parser, "corner_cutting")
+    add_map_options(parser, "corner_cutting")
     _add_training_options(parser, "runs/train", HyperParameters())
     options = parser.parse_args(arguments)
-    map_file, start, goal = _read_map(options)
+    map_file, start, goal = read_map(options)
     scenario, rule = Scenario(map_file.grid(), start, goal), api.MoveRule(options.move_rule)
     run = _run_training(options, lambda: [scenario], rule)
     field = run.trainer.planner().q_field(scenario.grid, goal)
@@ -364,28 +260,6 @@ def warm_up(parser: argparse.ArgumentParser, arguments: Sequence[str]) -> int:
         pass
     print(f"compiled, or loaded, in {time.perf_counter() - began:.1f} s")
     return 0
-
-
-def _add_map_options(parser: argparse.ArgumentParser, move_rule: str | None) -> None:
-    parser.add_argument("map", help="ROS map YAML, MovingAI .map, or name of a shipped map")
-    for name in ("start", "goal"):
-        words = f"the {name}'s cell, by default the map file's"
-        parser.add_argument(f"--{name}", type=int, nargs=2, metavar=("X", "Y"), help=words)
-    words = "which diagonal moves are legal" + ("" if move_rule else ", by default as in training")
-    rules = [rule.value for rule in api.MoveRule]
-    parser.add_argument("--move-rule", choices=rules, default=move_rule, help=words)
-
-
-def _read_map(options: Any) -> tuple[MapFile, Cell, Cell]:
-    """Return the map file, the start and the goal that the options give."""
-    from ddqn_planner.grid import read_map_file
-
-    map_file = read_map_file(find_map(options.map))
-    start = tuple(options.start) if options.start else map_file.start
-    goal = tuple(options.goal) if options.goal else map_file.goal
-    if start is None or goal is None:
-        raise ValueError(f"{options.map} names no start and goal; give --start X Y and --goal X Y")
-    return map_file, start, goal
 
 
 COMMANDS: Final = {

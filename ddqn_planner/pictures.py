@@ -10,6 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ddqn_planner.grid import LENGTHS, MOVES, Cell, GridMap
+from ddqn_planner.grid.footprint import placed
+
+Array = NDArray[np.float64]
 
 OBSTACLE_COLOUR, PATH_COLOUR, DIRECTION_COLOUR = "#22223b", "#d1495b", "#6c757d"
 
@@ -22,6 +25,7 @@ TERMINAL = ("9", "8;5;255", "8;5;236", "8;5;167", "8;5;33")
 MAX_TEXT_WIDTH = 64  # cells of the widest map that is worth printing: two characters for each
 MAX_SIDE_WITH_LINES = 64  # cells of the longest side of a map with lines between its cells
 MAX_ARROWS = 48  # arrows of one-way zones along the longest side of a map
+OUTLINES = 30  # of a body along its path
 ONE_WAY = 1e-9  # the mean direction of a cell that is not one-way is shorter
 
 
@@ -64,8 +68,9 @@ def save_picture(
     value: NDArray[np.float32] | None,
     title: str,
     value_label: str = "value: max Q(s, a)",
+    body: tuple[Array, Array, Array] | None = None,  # see `draw_body`
 ) -> None:
-    """Draw the map, the value where it is finite, and the path if there is one into a file."""
+    """Draw the map, the value where it is finite, and the path or the body along it into a file."""
     from matplotlib.colors import LinearSegmentedColormap
     from matplotlib.figure import Figure
     from matplotlib.patheffects import withStroke
@@ -85,15 +90,35 @@ def save_picture(
         bar = axes.inset_axes((1.02, 0, 0.035, 1))  # as high as the map
         figure.colorbar(image, bar, label=value_label)
     draw_obstacles(axes, grid)
-    if cells:
+    if body is not None:
+        draw_body(axes, *body)
+    elif cells:
         x, y = np.transpose(cells)
         outline = [withStroke(linewidth=5.5, foreground="white")]
         axes.plot(x, y, color=PATH_COLOUR, linewidth=3, path_effects=outline, label="path")
         style: Any = {"color": PATH_COLOUR, "edgecolors": "white", "linewidths": 1.5, "zorder": 3}
         for label, end, marker, size in (("start", 0, "o", 110), ("goal", -1, "*", 300)):
             axes.scatter(x[end], y[end], size, label=label, marker=marker, **style)
-        figure.legend(loc="outside lower center", ncols=3, frameon=False)
+    if cells or body is not None:
+        figure.legend(loc="outside lower center", ncols=4, frameon=False)
     figure.savefig(path)
+
+
+def draw_body(axes: Any, footprint: Array, poses: Array, ends: Array) -> None:
+    """Draw what a body sweeps along poses (N, 3), in cells, and where it starts and ends."""
+    from matplotlib.collections import PolyCollection
+
+    if len(poses):
+        swept: Any = placed(footprint, poses)
+        axes.add_collection(PolyCollection(swept, facecolor=VALUE_COLOURS[1], label="swept"))
+        style: Any = {"facecolor": VALUE_COLOURS[2], "edgecolor": VALUE_COLOURS[3], "alpha": 0.3}
+        axes.add_collection(PolyCollection(swept[:: len(swept) // OUTLINES + 1], **style))
+        axes.plot(*poses.T[:2], color=PATH_COLOUR, linewidth=2, label="path")
+    nose = np.array([[1, 0], [0, 0.5], [0, -0.5]]) * footprint.max(axis=0)
+    for pose, label, colour in zip(ends, ("start", "goal"), ("white", PATH_COLOUR), strict=True):
+        style = {"edgecolor": PATH_COLOUR, "zorder": 3}
+        axes.fill(*placed(footprint, pose).T, label=label, facecolor=colour, **style)
+        axes.fill(*placed(nose, pose).T, facecolor=OBSTACLE_COLOUR, zorder=3)
 
 
 def draw_obstacles(axes: Any, grid: GridMap) -> None:

@@ -20,7 +20,8 @@ from shared import small as small
 ROOT = Path(__file__).resolve().parent.parent
 NOBODY = 65534
 NOT_SOURCE = (".*", "__pycache__", "*.egg-info", "build", "dist", "install", "log", "runs")
-ANY_WORKER = {"test_cli.py", "test_demo.py"}  # their tests take long, and share nothing
+# Their tests take long, and share nothing.
+ANY_WORKER = {"test_cli.py", "test_demo.py", "test_plan_command.py"}
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

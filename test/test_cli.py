@@ -1,9 +1,7 @@
-import json
 import os
 import re
 import signal
 import subprocess
-import sys
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import fields, replace
@@ -12,10 +10,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from PIL import Image
 from processes import executable
 
-from ddqn_planner import Planner, inflate
 from ddqn_planner.cli import main
 from ddqn_planner.grid import GridMap, MapFile, save_map
 from ddqn_planner.model import load_model
@@ -34,112 +30,6 @@ def small_map(small: Scenario, tmp_path: Path) -> str:
     percent = small.grid.occupancy.astype("int8") * 100
     save_map(MapFile(percent, start=small.start, goal=small.goal), path)
     return str(path)
-
-
-def test_plan_prints_the_papers_path_by_its_rule(capsys: Any) -> None:
-    assert main(["plan", "dilemma", "--model", "dilemma"]) == 0
-    printed = capsys.readouterr().out
-    assert "length 22.97 cells, optimum 22.97 under corner_cutting" in printed
-    assert [printed.count(letter) for letter in "*SG"] == [17, 1, 1]
-    assert main(["plan", "dilemma", "--move-rule", "unit"]) == 0
-    printed = capsys.readouterr().out
-    assert "length 18.00 cells, optimum 18.00 under unit" in printed
-    assert "11.49 m" in printed  # as the robot drives, whatever the rule counts
-    assert main(["plan", "dilemma", "--start", "1", "19"]) == 1
-    assert "the start is occupied" in capsys.readouterr().err
-    request = ["plan", "dilemma", "--model", "dilemma", "--goal", "0", "0"]
-    assert main(request) == 1
-    assert "greedy steps do not find it" in capsys.readouterr().err
-    assert main([*request, "--mode", "astar_fallback"]) == 0
-    assert re.search("cells, optimum.*, astar_fallback, planned in", capsys.readouterr().out)
-
-
-CLEARED = {"start": (5, 0), "start_clearing_radius": 2}
-# Options, and what they are for the library: of the map's values, of the body, of the plan.
-ASKED: dict[str, tuple[dict[str, Any], tuple[float, float], dict[str, Any]]] = {
-    "": ({}, (0, 0), {}),
-    "--occupied-threshold 60": ({"occupied_threshold": 60}, (0, 0), {}),
-    "--allow-unknown": ({"allow_unknown": True}, (0, 0), {}),
-    "--use-map-costs": ({"use_map_costs": True}, (0, 0), {}),
-    "--allow-unknown --use-map-costs": ({"allow_unknown": True, "use_map_costs": True}, (0, 0), {}),
-    "--robot-radius 0.1": ({}, (0.1, 0), {}),
-    "--clearance-weight 1": ({}, (0, 1), {}),
-    "--move-rule unit": ({}, (0, 0), {"move_rule": "unit"}),
-    "--goal 26 29 --tolerance 0.1": ({}, (0, 0), {"goal": (26, 29), "tolerance": 2}),
-    "--start 5 0": ({}, (0, 0), {"start": (5, 0)}),
-    "--start 5 0 --start-clearing-radius 0.1": ({}, (0, 0), CLEARED),
-}
-
-
-def test_plan_gives_as_the_library(capsys: Any, tmp_path: Path) -> None:
-    random, planner, seen = np.random.default_rng(12), Planner.load("any_map"), set()
-    values = random.choice([0, 60, -1, 100], (30, 30), p=[0.8, 0.08, 0.06, 0.06])
-    values[0, 0], values[-1, -1], values[0, 5], values[-1, -4] = 0, 0, 100, 100
-    map_file = MapFile(values, 0.05, start=(0, 0), goal=(29, 29))
-    save_map(map_file, tmp_path / "map.yaml")
-    for options, (rules, body, asked) in ASKED.items():
-        grid = inflate(map_file.grid(**rules), *body)
-        plan = planner.plan(grid, **{"start": (0, 0), "goal": (29, 29), **asked})
-        command = ["plan", str(tmp_path / "map.yaml"), "--json", *options.split()]
-        assert main(command) == (0 if plan.cells else 1)
-        answer = json.loads(capsys.readouterr().out)
-        assert answer["cells"] == [list(cell) for cell in plan.cells]
-        assert (answer["status"], answer["length"]) == (plan.status.name, plan.length)
-        if plan.cells:
-            assert (answer["optimum"] is None) == (not grid.is_free(plan.cells[0]))
-            assert (answer["optimum"] or 0) <= plan.length + 1e-9
-        seen.add(plan.cells)
-    assert len(seen) == len(ASKED)  # each option counts
-
-
-def test_plan_draws_a_wide_map_for_a_terminal(capsys: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(sys.stdout, "isatty", lambda: True)
-    monkeypatch.setenv("COLUMNS", "100")
-    monkeypatch.setenv("LINES", "40")
-    assert main(["plan", "office", "--clearance-weight", "1"]) == 0
-    *blocks, start, length = capsys.readouterr().out.splitlines()
-    assert [line.count("▀") for line in blocks] == [96] * 32  # 6 cells per square
-    assert "goal (550, 330)" in start
-    assert re.search(r"cost \d{4}\.\d\d, greedy", length)
-
-
-def test_plan_gives_every_cell(capsys: Any, tmp_path: Path) -> None:
-    file = tmp_path / "path.csv"
-    assert main(["plan", "office", "--cells", "--csv", str(file)]) == 0
-    *cells, start, length = capsys.readouterr().out.splitlines()
-    assert start == "start (15, 15), goal (550, 330), 39.50 m"
-    assert length.startswith("length 789.95 cells, optimum 789.95 under robot_safe, greedy, ")
-    assert (cells[0], cells[-1]) == ("15 15", "550 330")
-    header, *rows = file.read_text().splitlines()
-    assert (header, rows[0]) == ("x,y,x_metres,y_metres", "15,15,0.775,0.775")
-    assert cells == [" ".join(row.split(",")[:2]) for row in rows]
-    assert main(["plan", "dilemma", "--start", "1", "19", "--csv", str(file)]) == 1
-    assert file.read_text().splitlines() == [header]  # of no other plan
-
-
-def test_plan_writes_json_and_a_picture(capsys: Any, tmp_path: Path) -> None:
-    def plan(picture: str, *goal: Any) -> Any:
-        command = ["plan", "dilemma", "--json", "--picture", str(tmp_path / picture)]
-        assert main([*command, *map(str, goal)]) == 0
-        return json.loads(capsys.readouterr().out)
-
-    answer = plan("plan.png")
-    assert (answer["cells"][0], answer["cells"][-1]) == ([6, 6], [17, 19])
-    assert (answer["status"], answer["length"]) == ("SUCCEEDED", pytest.approx(answer["optimum"]))
-    with Image.open(tmp_path / "plan.png") as picture:
-        assert len(np.unique(np.asarray(picture.convert("RGB")).reshape(-1, 3), axis=0)) > 100
-    moved = plan("moved.png", "--goal", 1, 19, "--tolerance", 9)
-    assert moved["cells"][-1] != [1, 19]
-    plan("there.png", "--goal", *moved["cells"][-1])  # the value is that of the end
-    assert (tmp_path / "moved.png").read_bytes() == (tmp_path / "there.png").read_bytes()
-
-
-def test_missing_matplotlib_is_named(
-    capsys: Any, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    monkeypatch.setitem(sys.modules, "matplotlib", None)
-    assert main(["plan", "dilemma", "--picture", str(tmp_path / "plan.png")]) == 2
-    assert capsys.readouterr().err.endswith("; pip install matplotlib\n")
 
 
 ABSENT = """

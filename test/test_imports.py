@@ -63,6 +63,7 @@ UNUSED = {
     COMMAND.format("--help"): {"numpy"},
     COMMAND.format("plan --help"): {"rclpy", "matplotlib"},
     COMMAND.format("plan dilemma"): {"torch", "matplotlib", "gymnasium", "tqdm"},
+    COMMAND.format("plan office --model car"): {"torch", "matplotlib", "gymnasium", "tqdm"},
     COMMAND.format("certify"): {"torch", "numba", "scipy"},
 }
 

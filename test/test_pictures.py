@@ -1,12 +1,21 @@
+import math
 import re
 from pathlib import Path
 
 import numpy as np
 import pytest
-from PIL import Image
+from PIL import Image, ImageColor
 
 from ddqn_planner.grid import GridMap
-from ddqn_planner.pictures import TERMINAL, draw_blocks, draw_text, save_picture
+from ddqn_planner.pictures import (
+    OBSTACLE_COLOUR,
+    PATH_COLOUR,
+    TERMINAL,
+    draw_blocks,
+    draw_body,
+    draw_text,
+    save_picture,
+)
 
 
 def test_a_map_as_text_has_its_first_row_below() -> None:
@@ -47,3 +56,35 @@ def test_a_picture_shows_the_value_the_path_and_one_way_zones(tmp_path: Path) ->
     assert len(np.unique(plain)) > 20
     for other in (with_path, one_way):
         assert (plain != other).mean() > 0.01
+
+
+@pytest.mark.parametrize("yaw", [0.0, 0.7, math.pi / 2, 4.0])
+def test_a_body_stands_where_it_is_with_its_nose_ahead(yaw: float) -> None:
+    pytest.importorskip("matplotlib")
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    canvas = FigureCanvasAgg(Figure(figsize=(4, 4), dpi=100))  # 4 pixels per cell
+    axes = canvas.figure.add_axes((0, 0, 1, 1))
+    axes.set_axis_off()
+    body, along = np.array([[10, 5], [-4, 5], [-4, -5], [10, -5]]), np.linspace(-25, 25, 100)
+    x, y = 50 + math.cos(yaw) * along, 50 + math.sin(yaw) * along
+    poses = np.column_stack([x, y, np.full(100, yaw)])
+    draw_body(axes, body, poses, poses[[0, -1]])
+    axes.set(xlim=(0, 100), ylim=(0, 100))
+    canvas.draw()
+    pixels = np.asarray(canvas.buffer_rgba())[::-1]
+
+    def shows(colour: str, ahead: float, left: float) -> bool:
+        x = 50 + math.cos(yaw) * ahead - math.sin(yaw) * left
+        y = 50 + math.sin(yaw) * ahead + math.cos(yaw) * left
+        pixel = pixels[round(4 * y), round(4 * x), :3].astype(int)
+        return bool(np.abs(pixel - ImageColor.getrgb(colour)).max() < 25)
+
+    assert shows(OBSTACLE_COLOUR, -25 + 3, 0)
+    assert shows("white", -25 - 2, 3)  # beside the nose of the start
+    assert shows(OBSTACLE_COLOUR, 25 + 3, 0)
+    assert shows(PATH_COLOUR, 25 - 2, 3)
+    assert shows(PATH_COLOUR, 0, 0)
+    assert not any(shows("white", *place) for place in ((0, 3), (0, -3), (-12, 3)))
+    assert all(shows("white", *place) for place in ((0, 7), (0, -7), (-31, 0), (37, 0)))

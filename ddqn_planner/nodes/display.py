@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
-from geometry_msgs.msg import Point
+from geometry_msgs.msg import Point, PoseStamped
 from nav_msgs.msg import OccupancyGrid
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
 from rclpy.event_handler import PublisherEventCallbacks
@@ -45,6 +45,7 @@ class Shown(NamedTuple):
     goal: Cell
     move_rule: MoveRule | None
     plan: PosePlan | None
+    asked: PoseStamped | None  # the goal: a new one is shown, though its field may be shown already
     header: Header
 
     def field(self) -> QField | None:
@@ -77,7 +78,6 @@ class FieldDisplay:
         # Its own thread: neither requests nor maps wait for a field that is only shown.
         self._worker = Worker(node)
         self._shown: Shown | None = None
-        self._shows_again = False
         self._look = node.create_guard_condition(self._on_look, MutuallyExclusiveCallbackGroup())
         matched = PublisherEventCallbacks(matched=lambda _: self._look.trigger())
 
@@ -91,24 +91,20 @@ class FieldDisplay:
             layer("footprints", MarkerArray, footprint_message, True),
         )
 
-    def show_again(self) -> None:
-        """Publish the next field even if it is shown already."""
-        self._shows_again = True
-
     def show(self, outcome: Outcome, header: Header) -> None:
         """Show the field of an outcome from now on; none if it has none, as of another goal."""
         request, goal, shown = outcome.request, outcome.plan.goal, self._shown
         if request is not None and goal is not None:
             rule, plan = getattr(request, "move_rule", None), outcome.plan
             path = plan if isinstance(plan, PosePlan) else None
-            shown = Shown(outcome.planner, request.grid, goal, rule, path, header)
+            shown = Shown(outcome.planner, request.grid, goal, rule, path, outcome.goal, header)
         elif shown is not None:
             header = Header(stamp=header.stamp, frame_id=shown.header.frame_id)
             shown = shown._replace(planner=None, header=header)
         if shown is None:
             return
-        if self._shows_again or self._shown is None or self._shown[:-1] != shown[:-1]:
-            self._shown, self._shows_again = shown, False
+        if self._shown is None or self._shown[:-1] != shown[:-1]:
+            self._shown = shown
             for layer in self._layers:
                 layer.is_due = True
             self._look.trigger()

@@ -8,7 +8,7 @@ from pathlib import Path as FilePath
 from typing import Any, NamedTuple
 
 import numpy as np
-from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from diagnostic_msgs.msg import DiagnosticStatus
 from nav_msgs.msg import OccupancyGrid, Path
 from numpy.typing import NDArray
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
@@ -57,7 +57,6 @@ class LearningNode(BaseNode):
         self.state = self.error = self.save_error = ""
         self.replaying: Timer | None = None
         self.episodes = self.create_publisher(Path, "~/episode", 10)
-        self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
         self.create_subscription(OccupancyGrid, "map", self._on_map, LATCHED)
 
     @property
@@ -92,8 +91,7 @@ class LearningNode(BaseNode):
         good = DiagnosticStatus.WARN if missing else DiagnosticStatus.OK
         level = DiagnosticStatus.ERROR if problems else good
         message = "; ".join(filter(None, [*problems, missing])) or self.state
-        values = {"state": self.state, **values}
-        self._diagnostics.publish(self.diagnostics(what, level, message, values))
+        self.refusals.tell(what, level, message, {"state": self.state, **values})
 
     def replay(
         self, file: FilePath, episodes: Iterator[Any], draw: Callable[[Any], None], remedy: str
@@ -101,13 +99,12 @@ class LearningNode(BaseNode):
         """Draw the first place of each episode, its first two, and so on; see `create_trigger`."""
         frames = (places[: n + 1] for places in episodes for n in range(len(places)))
         try:
-            first = next(frames, None)
+            draw(next(frames))
+        except StopIteration:
+            return False, f"{file} holds no episode to replay yet; {remedy}"
         except OSError as error:
             return False, f"no recorded episodes ({error}); call ~/start first"
-        if first is None:
-            return False, f"{file} holds no episode to replay yet; {remedy}"
         self.stop_replay()
-        draw(first)
 
         def step() -> None:
             try:

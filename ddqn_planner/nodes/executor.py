@@ -19,8 +19,13 @@ from rclpy.waitable import NumberOfEntities
 EVENTS_PERIOD = 0.5  # seconds: how late a busy node may hear that publishers or subscribers came
 
 # What a wait set waits for, as it calls them, and where a node has them.
-KINDS = "subscription", "guard_condition", "timer", "client", "service"
-LISTS = "subscriptions", "guards", "timers", "clients", "services"
+KINDS = {
+    "subscription": "subscriptions",
+    "guard_condition": "guards",
+    "timer": "timers",
+    "client": "clients",
+    "service": "services",
+}
 PARTS = "_tasks", "_tasks_lock", "_guard", "_take_waitable", *(f"_take_{kind}" for kind in KINDS)
 
 
@@ -72,8 +77,8 @@ class NodeExecutor(SingleThreadedExecutor):
         self._waitables = [*node.waitables]
         self._entities = {
             (kind, entity.handle.pointer): entity
-            for kind, name in zip(KINDS, LISTS, strict=True)
-            for entity in getattr(node, name)
+            for kind, entities in KINDS.items()
+            for entity in getattr(node, entities)
         }
         kinds = ["guard_condition", *(kind for kind, _ in self._entities)]  # one is the executor's
         counts = [it.get_num_entities() for it in self._waitables]

@@ -11,12 +11,13 @@ from std_msgs.msg import UInt8MultiArray
 
 from ddqn_planner.experience import Experience
 from ddqn_planner.grid import GridMap
+from ddqn_planner.grid.copies import WHOLE
 from ddqn_planner.nodes.conversions import bytes_of, label_of
 from ddqn_planner.nodes.lifecycle import ManagedNode
-from ddqn_planner.nodes.map_source import is_like
 from ddqn_planner.nodes.report import NO_REQUEST, Outcome, Report
 from ddqn_planner.nodes.runtime import Worker
 
+CHANGED_SHARE = 0.02  # of cells: with more, experience is spread anew over the map, slowly
 NO_MAP = GridMap(np.zeros((1, 1), dtype=np.bool_))
 
 
@@ -30,44 +31,36 @@ class ExpectedTimes:
         self._experience: Experience | None = None
         self._spread_on: GridMap | None = None
         self._applied = (NO_MAP, NO_MAP)  # the last map, without times and with them
-        # What the worker was asked last, and its answers.
-        self._grid: GridMap | None = None
-        self._timed = Future()  # of the last grid, as the forecast is of the last outcome
         self._label = ""  # of the message that was taken last
+        # What the worker was asked last, and its answer.
         self._outcome, self._forecast = NO_REQUEST, Future()
 
     async def on_sent(self, message: UInt8MultiArray | None = None) -> None:
         """Plan by what drives taught, or refuse the trainer's message, or the file that is set."""
         with self._report.taking("experience"):
             await self._worker.call(self.load, message)
-            self._grid = None
             self._on_change()
-
-    async def on(self, grid: GridMap) -> GridMap:
-        """Return what `apply` returns; the worker computes it once for a map."""
-        if self._experience is None:
-            return grid
-        if grid is not self._grid:
-            self._grid, self._timed = grid, self._worker.call(self.apply, grid)
-        timed: GridMap = await self._timed
-        return timed
 
     def told(self, outcome: Outcome) -> dict[str, str]:
         """Return what `describe` returns, once the worker has computed it."""
-        if self._experience is not None and outcome is not self._outcome:
+        if self._experience is None:
+            return {}
+        if outcome is not self._outcome:
             self._outcome, self._forecast = outcome, self._worker.call(self.describe, outcome)
-            self._forecast.add_done_callback(lambda _: self._report.change())
+        if not self._forecast.done():
+            self._report.change()  # to look again soon
         return self._forecast.result() or {}
 
     def load(self, message: UInt8MultiArray | None = None) -> None:
-        """Use a message, if it is new, or the file that is set; an error changes nothing."""
-        label = label_of(message) if message else ""
+        """Use a message, if it is new, or the file that is set, or none; errors change nothing."""
+        label, newer = label_of(message) if message else "", None
         if message and label == self._label:
             return
-        data = bytes_of("experience", message) if message else b""
-        file = self._node.value("experience")
-        newer = Experience.from_bytes(data) if message else Experience.load(file)
-        if self._experience is not None:
+        if message:
+            newer = Experience.from_bytes(bytes_of("experience", message))
+        elif file := self._node.value("experience"):
+            newer = Experience.load(file)
+        if newer is not None and self._experience is not None:
             newer.take_over(self._experience)
         self._experience, self._label = newer, label
 
@@ -99,3 +92,14 @@ class ExpectedTimes:
                 told["expected time (s)"] = f"{seconds:.1f}"
                 told["expected time, 90 % interval (s)"] = f"{low:.1f} to {high:.1f}"
         return told
+
+
+def is_like(grid: GridMap, other: GridMap) -> bool:
+    """Return whether two maps have the same place, and nearly the same obstacles."""
+    mine, its = ((each.occupancy.shape, each.resolution, each.origin) for each in (grid, other))
+    if mine != its:
+        return False
+    boxes = grid.patches_since(other)
+    boxes = [WHOLE] if boxes is None else boxes
+    changed = sum(np.count_nonzero(grid.occupancy[box] != other.occupancy[box]) for box in boxes)
+    return bool(changed <= CHANGED_SHARE * grid.occupancy.size)

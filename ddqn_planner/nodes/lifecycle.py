@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from functools import partialmethod
 from typing import Any
 from uuid import uuid4
@@ -11,25 +10,16 @@ from lifecycle_msgs.srv import ChangeState
 from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.duration import Duration
 from rclpy.lifecycle import LifecycleNodeMixin, LifecycleState, TransitionCallbackReturn
-from rclpy.node import Node
 from rclpy.timer import Timer
 
+from ddqn_planner.nodes.executor import KINDS
 from ddqn_planner.nodes.runtime import STEADY, BaseNode, Parameters
 
 SUCCESS = TransitionCallbackReturn.SUCCESS
 BEAT_PERIOD, BEAT_TIMEOUT = 0.5, 4.0  # seconds; the timeout as Nav2's lifecycle manager has it
 
-ENTITIES: dict[str, Callable[[Node, Any], object]] = {
-    "publishers": Node.destroy_publisher,
-    "subscriptions": Node.destroy_subscription,
-    "clients": Node.destroy_client,
-    "services": Node.destroy_service,
-    "timers": Node.destroy_timer,
-    "guards": Node.destroy_guard_condition,
-    # Last: handlers of events end with their publisher or subscription, and action servers stay.
-    "waitables": lambda _, server: server.destroy(),
-}
-"""What a node can create, and what destroys it."""
+ENTITIES = {"publisher": "publishers", **KINDS}
+"""What a node can create, and where it has them; beside waitables."""
 
 
 class ManagedNode(LifecycleNodeMixin, BaseNode):
@@ -73,7 +63,8 @@ class ManagedNode(LifecycleNodeMixin, BaseNode):
 
     def configure(self) -> None:
         """Create what the node needs, after this."""
-        self._kept = {entity for kind in ENTITIES for entity in getattr(self, kind)}
+        self._kept = {it for name in ENTITIES.values() for it in getattr(self, name)}
+        self._kept |= {*self.waitables}
 
     def activate(self) -> None:
         """Begin to answer requests."""
@@ -90,9 +81,13 @@ class ManagedNode(LifecycleNodeMixin, BaseNode):
 
     def cleanup(self) -> None:
         """Destroy what was created since `configure`, also if that failed."""
-        for kind, destroy in ENTITIES.items():
-            for entity in {*getattr(self, kind)} - self._kept:
-                destroy(self, entity)
+        for kind, name in ENTITIES.items():
+            for entity in {*getattr(self, name)} - self._kept:
+                getattr(self, f"destroy_{kind}")(entity)
+        # Handlers of events have ended with their publisher or subscription: action servers stay.
+        servers: set[Any] = {*self.waitables} - self._kept
+        for server in servers:
+            server.destroy()
 
     def _attempt(self, what: str, state: LifecycleState) -> TransitionCallbackReturn:
         try:

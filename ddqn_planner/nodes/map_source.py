@@ -16,11 +16,11 @@ from std_msgs.msg import Header
 
 from ddqn_planner.grid import GridMap
 from ddqn_planner.grid.body import Inflation
-from ddqn_planner.grid.copies import WHOLE, boxes_of
+from ddqn_planner.grid.copies import boxes_of
 from ddqn_planner.nodes.conversions import grid_from_message, grid_from_values
 from ddqn_planner.nodes.report import Report, RequestError, seconds
 from ddqn_planner.nodes.runtime import LATCHED, BaseNode, Worker
-from ddqn_planner.planning.field import offset_between
+from ddqn_planner.planning.field import offset_between, overlap
 
 try:
     from map_msgs.msg import OccupancyGridUpdate
@@ -37,7 +37,6 @@ UPDATES_QUALITY = QoSProfile(depth=100)
 REMEDY = "let the map's publisher send the full map"
 
 PATIENCE = 1.0  # seconds within which the first map is expected after the node subscribes
-CHANGED_SHARE = 0.02  # of cells: with more, experience is spread anew over the map, slowly
 
 
 @dataclass
@@ -52,18 +51,25 @@ class Received:
 class MapSource:
     """The map to plan on; `on_map` is called, with whether the frame is new, when anything is."""
 
+    # `timed` returns a map with expected times; the worker calls it.
     def __init__(
-        self, node: BaseNode, report: Report, worker: Worker, on_map: Callable[[bool], None]
+        self,
+        node: BaseNode,
+        report: Report,
+        worker: Worker,
+        timed: Callable[[GridMap], GridMap],
+        on_map: Callable[[bool], None],
     ) -> None:
-        self._node, self._report, self._worker, self._on_map = node, report, worker, on_map
+        self._node, self._report, self._worker = node, report, worker
+        self._timed, self._on_map = timed, on_map
         # The map in use and the last one. If that is another one, it waits for its directions.
         self._used: Received | None = None
         self._newest: Received | None = None
         self._began = time.monotonic()
         self._described = ""
         self._updates = self._refused_updates = 0
-        self._inflated: Future | None = None
         self._inflate = Inflation()
+        self._ready: Future | None = None
         # Before the subscription of the map: directions that come with a map are taken first.
         node.create_subscription(OccupancyGrid, DIRECTIONS, self._take_directions, LATCHED)
         self._directions = Directions(node)
@@ -115,26 +121,30 @@ class MapSource:
             description["map updates refused"] = str(self._refused_updates)
         return description
 
-    def inflated(self) -> Future:
-        """Return the `GridMap` for the robot's body, which is computed for the first request."""
-        if self._inflated is None:
+    def ready(self) -> Future:
+        """Return the `GridMap` to plan on, with body and times: computed for the first request."""
+        ready = self._ready
+        if ready is None or (ready.done() and ready.exception()):  # as when no memory was left
             radius, weight = map(self._node.value, BODY_PARAMETERS)
             # ROS accepts a value that is above the range by a millionth.
             of = self._grid, radius, min(weight, 1.0)
-            self._inflated = self._worker.call(self._inflate, *of)
-        return self._inflated
+            ready = self._ready = self._worker.call(self._prepare, *of)
+        return ready
+
+    def _prepare(self, *of_body: Any) -> GridMap:
+        return self._timed(self._inflate(*of_body))
 
     def apply_parameters(self, changed: set[str]) -> None:
-        """Read and inflate the map anew if one of the parameters that changed says so."""
-        if changed & {*MAP_PARAMETERS, *BODY_PARAMETERS, "require_directions"}:
+        """Read and prepare the map anew if one of the parameters that changed says so."""
+        if changed & {*MAP_PARAMETERS, *BODY_PARAMETERS, "require_directions", "exploration"}:
             self._read_again()
 
     def _take(self, message: OccupancyGrid) -> None:
         try:
             grid = self._changed_map(message)
             grid = grid or grid_from_message(message, *map(self._node.value, MAP_PARAMETERS))
-        except ValueError as error:
-            self._report.refuse("map", str(error))
+        except (ValueError, MemoryError) as error:
+            self._report.refuse("map", str(error) or repr(error))
             return
         self._newest = Received(message, message.header, time.monotonic())
         self._report.accept("map_updates")
@@ -195,12 +205,12 @@ class MapSource:
             missing = "is not read: map_msgs is not installed; apt install ros-jazzy-map-msgs, or"
             warning = f"{self._updates_topic} {missing} {REMEDY}"
             self._node.get_logger().warning(warning, once=True)
-        self._changed(frame_changed)
+        self.change(frame_changed)
         return True
 
-    def _changed(self, frame_changed: bool = False) -> None:
+    def change(self, frame_changed: bool = False) -> None:
         """Plan on what is new."""
-        self._inflated = None
+        self._ready = None
         self._report.change()
         self._on_map(frame_changed)
 
@@ -227,7 +237,7 @@ class MapSource:
         newest.header, newest.came = update.header, time.monotonic()
         self._updates += 1
         if newest is self._used:
-            self._changed()
+            self.change()
 
 
 def _place(message: OccupancyGrid) -> tuple[Any, ...]:
@@ -305,22 +315,9 @@ class Directions:
                     f"{header.frame_id!r} and {grid.resolution:.6g} m; give both one frame, and "
                     "cells that lie on each other"
                 )
-            forbidden, (x, y) = np.zeros(grid.occupancy.shape, dtype=np.uint8), offset
-            part = directions.forbidden[max(-y, 0) :, max(-x, 0) :]
-            target = forbidden[max(y, 0) :, max(x, 0) :]
-            height, width = (min(sides) for sides in zip(part.shape, target.shape, strict=True))
-            target[:height, :width] = part[:height, :width]
+            theirs, ours = overlap(directions, grid, offset)
+            forbidden = np.zeros(grid.occupancy.shape, dtype=np.uint8)
+            forbidden[ours] = directions.forbidden[theirs]
             grid = replace(grid, forbidden=forbidden)
         self.used, self._are_paired = found, bool(own)
         return grid
-
-
-def is_like(grid: GridMap, other: GridMap) -> bool:
-    """Return whether two maps have the same place, and nearly the same obstacles."""
-    mine, its = ((each.occupancy.shape, each.resolution, each.origin) for each in (grid, other))
-    if mine != its:
-        return False
-    boxes = grid.patches_since(other)
-    boxes = [WHOLE] if boxes is None else boxes
-    changed = sum(np.count_nonzero(grid.occupancy[box] != other.occupancy[box]) for box in boxes)
-    return bool(changed <= CHANGED_SHARE * grid.occupancy.size)

@@ -85,18 +85,19 @@ class PlannerNode(ManagedNode):
         group = MutuallyExclusiveCallbackGroup()
         self._replan = self.create_guard_condition(self._plan_for_active_goal, group)
         self._frames = Frames(self, lambda: float(self._settings.transform_tolerance))
-        self._map = MapSource(self, self._report, self._map_worker, self._on_map)
+        worker = self._map_worker
+        self._times = ExpectedTimes(self, self._report, worker, lambda: self._map.change())
+        self._map = MapSource(self, self._report, worker, self._times.apply, self._on_map)
         self._start = StartSource(
             self, self._frames, self._report, lambda: self._map.frame, self._on_start
         )
-        self._times = ExpectedTimes(self, self._report, self._map_worker, self._replan.trigger)
         group = MutuallyExclusiveCallbackGroup()  # this one ends when a newer path is there
         self._improve = self.create_guard_condition(self._improve_path, group)
         group = MutuallyExclusiveCallbackGroup()  # it waits for a worker
         self._read_experience = self.create_guard_condition(self._times.on_sent, group)
         if self._settings.experience:
             self._read_experience.trigger()
-        inputs = self._map, self._times.on, self._start, self._frames, self._model
+        inputs = self._map, self._start, self._frames, self._model
         self._requests = Requests(self._settings, *inputs, self._worker, self._look_soon)
         self.create_subscription(PoseStamped, "goal_pose", lambda goal: self._on_goals([goal]), 10)
         self.create_subscription(PoseArray, "goal_poses", self._on_goal_poses, 10)
@@ -121,8 +122,8 @@ class PlannerNode(ManagedNode):
     def deactivate(self) -> None:
         """Forget the active goal."""
         super().deactivate()
-        self._active, self._followed = ActiveGoal([], PathUnderWay()), PathUnderWay()
-        self._improvable: tuple[Outcome, ActiveGoal | PathUnderWay] | None = None
+        self._active, self._followed = ActiveGoal([]), PathUnderWay()
+        self._improvable: tuple[Outcome, ActiveGoal | None] | None = None
         self._report.change()
 
     def cleanup(self) -> None:
@@ -164,7 +165,7 @@ class PlannerNode(ManagedNode):
         changed = {parameter.name for parameter in parameters} & self._declared.keys()
         if not (changed and self._is_configured):  # subscriptions declare parameters, too
             return
-        if "experience" in changed and settings.experience:
+        if "experience" in changed:
             self._read_experience.trigger()
         if "model" in changed:
             self._model.use(*self._candidate)
@@ -175,11 +176,11 @@ class PlannerNode(ManagedNode):
         self._map.apply_parameters(changed)
         if "path_simplification" in changed:
             self._followed = PathUnderWay()
-        self._plan_for(ActiveGoal(self._active.poses, PathUnderWay()))
+        self._plan_for(ActiveGoal(self._active.poses))
 
     def _on_model(self, message: UInt8MultiArray) -> None:
         if self._model.take(message):
-            self._plan_for(ActiveGoal(self._active.poses, PathUnderWay()))
+            self._plan_for(ActiveGoal(self._active.poses))
 
     # Map, start and goal
 
@@ -210,8 +211,7 @@ class PlannerNode(ManagedNode):
             self._report.log(self._refusal)
             return
         self._report.accept("goal_poses")
-        self._display.show_again()
-        self._plan_for(ActiveGoal(goals, PathUnderWay()))
+        self._plan_for(ActiveGoal(goals))
 
     # Planning
 
@@ -219,7 +219,7 @@ class PlannerNode(ManagedNode):
         start = request.start if request.start.header.frame_id else None
         goals = [request.goal]
         planning = self._requests.plan(start, goals, request.tolerance)
-        header, outcome = await self._answer(lambda: None, goals, planning)
+        header, outcome = await self._answer(goals, planning)
         (response.plan,) = _paths(outcome, header, path_message)
         self._report.log(outcome)
         return response
@@ -231,8 +231,8 @@ class PlannerNode(ManagedNode):
         active, goals = self._active, self._active.poses
         if not goals:
             return
-        planning = self._requests.plan(None, goals, None, "", active)
-        header, outcome = await self._answer(lambda: None, goals, planning)
+        planning = self._requests.plan(None, goals, followed=active)
+        header, outcome = await self._answer(goals, planning)
         if outcome in (UNCHANGED, NOT_ACTIVE):
             return
         self._improve_later(outcome, active)
@@ -251,36 +251,37 @@ class PlannerNode(ManagedNode):
     async def _plan_for_action(
         self, start: PoseStamped | None, goals: list[PoseStamped], name: str, given_up: GivenUp
     ) -> tuple[Path, Outcome]:
-        planning = self._requests.plan(start, goals, None, name, self._followed)
-        header, outcome = await self._answer(given_up, goals, planning)
+        followed = self._followed
+        planning = self._requests.plan(start, goals, None, name, followed)
+        header, outcome = await self._answer(goals, planning, given_up)
         to_publish, path = _paths(outcome, header, path_bytes, path_message)
         if outcome.request is not None and len(outcome.plan.path):
-            self._followed.keep(way_of(outcome.plan), outcome.request.grid, header.frame_id)
-            self._improve_later(outcome, self._followed)
+            followed.keep(way_of(outcome.plan), outcome.request.grid, header.frame_id)
+            # It gets the better path with its next request.
+            self._improve_later(outcome, None)
             self._plan_publisher.publish(to_publish)
         self._report.log(outcome)
         return path, outcome
 
-    def _improve_later(self, outcome: Outcome, followed: ActiveGoal | PathUnderWay) -> None:
+    def _improve_later(self, outcome: Outcome, active: ActiveGoal | None) -> None:
         """Look for the least path of a body, unless it would not be worth a switch."""
         plan, self._improvable = outcome.plan, None
         worth = (1 + self._settings.switch_threshold) * SAME_COST
         if isinstance(plan, PosePlan) and plan.bound > worth:
-            self._improvable = outcome, followed
+            self._improvable = outcome, active
             self._improve.trigger()
 
     async def _improve_path(self) -> None:
         if (last := self._improvable) is None:
             return
-        outcome, followed = last
-        # What an action follows gets the better path with its next request.
-        path = followed.path if isinstance(followed, ActiveGoal) else followed
-        improving = self._requests.improve(outcome, path.path)
-        header, better = await self._answer(
-            lambda: None if last is self._improvable else UNCHANGED, [], improving
-        )
-        if better.request is not None and followed is self._active:
-            if self._active.is_news(better, header.frame_id):
+        outcome, active = last
+
+        def given_up() -> Outcome | None:
+            return None if last is self._improvable else UNCHANGED
+
+        header, better = await self._answer([], self._requests.improve(outcome), given_up)
+        if better.request is not None and active is self._active:
+            if active.is_news(better, header.frame_id):
                 self._plan_publisher.publish(*_paths(better, header, path_bytes))
             self._display.show(better, header)
 
@@ -290,12 +291,15 @@ class PlannerNode(ManagedNode):
         try:
             checking = self._requests.is_path_valid(request.path)
             response.is_valid = await unless(checking, lambda: self._refusal) is True
-        except RequestError as error:
-            self.get_logger().warning(f"no path to check: {error}")
+        except Exception as error:  # as when no memory is left: the node must survive
+            self.get_logger().warning(f"no path to check: {str(error) or repr(error)}")
         return response
 
     async def _answer(
-        self, given_up: GivenUp, goals: list[PoseStamped], planning: Coroutine[None, None, Outcome]
+        self,
+        goals: list[PoseStamped],
+        planning: Coroutine[None, None, Outcome],
+        given_up: GivenUp = lambda: None,
     ) -> tuple[Header, Outcome]:
         """Plan, unless the node stops or the request is given up; return the path's header, too."""
         self._answering += 1

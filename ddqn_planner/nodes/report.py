@@ -9,7 +9,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 
 from builtin_interfaces.msg import Time
-from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from geometry_msgs.msg import PoseStamped
 
 from ddqn_planner.grid import Cell
@@ -120,14 +120,16 @@ class Refusals:
     def __init__(self, node: BaseNode) -> None:
         self.node = node
         self.refused: dict[str, str] = {}
+        self.publisher = node.create_publisher(DiagnosticArray, "/diagnostics", 10)
 
     @contextmanager
     def taking(self, what: str, often: bool = False) -> Iterator[None]:
-        """Accept something, or refuse it by a ValueError; of what comes often, log the first."""
+        """Accept something, or refuse it by its error; of what comes often, log the first."""
         try:
             yield
-        except ValueError as error:
-            self.refuse(what, str(error), log=not often or what not in self.refused)
+        except (ValueError, MemoryError) as error:
+            is_logged = not often or what not in self.refused
+            self.refuse(what, str(error) or repr(error), is_logged)
         else:
             self.accept(what)
 
@@ -150,6 +152,15 @@ class Refusals:
         """Return what a user reads of all that is refused."""
         return [f"{what} refused: {reason}" for what, reason in self.refused.items()]
 
+    def tell(self, what: str, level: bytes, message: str, values: Mapping[str, str]) -> None:
+        """Publish diagnostics; topics' problems are in them, and logged once."""
+        if problems := self.node.topic_problems():
+            level, message = max(level, DiagnosticStatus.WARN), "; ".join([message, *problems])
+        status = DiagnosticStatus(name=f"{self.node.get_fully_qualified_name()}: {what}")
+        status.level, status.message = level, message
+        status.values = [KeyValue(key=key, value=value) for key, value in values.items()]
+        self.publisher.publish(DiagnosticArray(header=self.node.header(), status=[status]))
+
 
 class Report(Refusals):
     """Logs what the planner node does, and publishes the last outcome with what was refused."""
@@ -157,7 +168,6 @@ class Report(Refusals):
     def __init__(self, node: BaseNode, on_change: Callable[[], None]) -> None:
         super().__init__(node)
         self.outcome, self._on_change = NO_REQUEST, on_change
-        self._publisher = node.create_publisher(DiagnosticArray, "/diagnostics", 10)
         self._to_be_logged: list[str] = []
         self._due = 0.0
 
@@ -171,7 +181,7 @@ class Report(Refusals):
         if is_due := time.monotonic() >= self._due:
             self._due = time.monotonic() + PERIOD
             self.node.topic_problems()  # which are logged, whoever listens
-        return is_due and self._publisher.get_subscription_count() > 0
+        return is_due and self.publisher.get_subscription_count() > 0
 
     def note(self, outcome: Outcome) -> None:
         """Keep the last outcome for the diagnostics."""
@@ -211,8 +221,7 @@ class Report(Refusals):
             **more,
             **{f"refused {what}": reason for what, reason in self.refused.items()},
         }
-        message = "; ".join([outcome.reason, *problems])
-        self._publisher.publish(self.node.diagnostics("plan", level, message, values))
+        self.tell("plan", level, "; ".join([outcome.reason, *problems]), values)
 
 
 def seconds(stamp: Time) -> str:

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import gc
 import math
+import threading
 import time
-from collections.abc import Awaitable, Callable
+from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from types import SimpleNamespace
@@ -24,14 +25,7 @@ from ddqn_planner.model.certificate import NO_CERTIFICATE
 from ddqn_planner.nodes.conversions import bytes_of, cell_from_pose, label_of, pose_of, turns
 from ddqn_planner.nodes.map_source import MapSource
 from ddqn_planner.nodes.poses import Frames, StartSource
-from ddqn_planner.nodes.report import (
-    Outcome,
-    Report,
-    Request,
-    RequestError,
-    reason_of,
-    seconds,
-)
+from ddqn_planner.nodes.report import Outcome, Report, Request, RequestError, reason_of, seconds
 from ddqn_planner.nodes.runtime import BaseNode, Worker
 from ddqn_planner.planning import Plan, PlanMethod, Planner, PlanRequest, PlanStatus
 from ddqn_planner.planning.field import shift_between
@@ -44,7 +38,6 @@ HEADING = 2 * math.pi / HEADINGS  # radians that a robot turns until that is a r
 UNCHANGED = Outcome("UNCHANGED", "the active goal needs no new plan")
 
 T = TypeVar("T")
-Place = tuple[PoseStamped, Cell]
 
 
 @dataclass
@@ -78,11 +71,11 @@ class PathUnderWay:
 class ActiveGoal:
     """Decides when to plan again, and what to publish; the table in docs/nodes.md has the rules."""
 
-    def __init__(self, poses: list[PoseStamped], path: PathUnderWay) -> None:
+    def __init__(self, poses: list[PoseStamped], path: PathUnderWay | None = None) -> None:
         # The last ``goal_pose``, or the last ``goal_poses``, of which the nearest one counts.
         self.poses = poses
         # Of the paths that were published for this goal, the last one.
-        self.path = path
+        self.path = path or PathUnderWay()
         # What was planned last; None to plan whatever is asked.
         self._planned: tuple[Any, ...] | None = None
         # The frame and the status of what was published last; None to publish whatever comes.
@@ -172,7 +165,7 @@ class ModelSource:
             gc.set_threshold(20_000)  # to compile and to plan makes hardly any garbage
             next(compiling)
             gc.freeze()  # a collection of all that would stop the node for 45 ms
-            Worker(self._node).call(next, compiling)  # the rest
+            threading.Thread(target=next, args=[compiling], daemon=True).start()  # the rest
             return planner, file
 
         self.loading = self._worker.call(read)
@@ -245,7 +238,6 @@ class Requests:
 
     settings: SimpleNamespace
     map: MapSource
-    timed: Callable[[GridMap], Awaitable[GridMap]]
     start: StartSource
     frames: Frames
     model: ModelSource
@@ -323,9 +315,10 @@ class Requests:
         is_dense = settings.path_simplification == "straight"
         return Outcome(plan.status.name, reason, planner, request, plan, goal, stamp, is_dense)
 
-    async def improve(self, outcome: Any, under_way: Any) -> Outcome:
+    async def improve(self, outcome: Any) -> Outcome:
         """Return the outcome of a request for poses with a path of the least cost."""
-        request, goal = replace(outcome.request, bound=1.0, under_way=under_way), outcome.goal
+        under_way, goal = way_of(outcome.plan), outcome.goal
+        request = replace(outcome.request, bound=1.0, under_way=under_way)
         plan = await self._plan(outcome.planner, request)
         reason = reason_of(request, plan, goal, goal, 0.0)
         improved: Outcome = replace(outcome, request=request, plan=plan, reason=reason)
@@ -364,17 +357,19 @@ class Requests:
         return is_path_valid(cells, cell, grid, rule, _clearing_radius(settings, grid))
 
     async def _inputs(self) -> tuple[Header, GridMap, Planner]:
-        """Return the header of the map of now, this map for the robot's body, and the planner."""
+        """Return the header of the map of now, this map ready to plan on, and the planner."""
         header = await self._wait_for(self.map.check)
-        inflated = self.map.inflated()
+        ready = self.map.ready()
         await self.model.first()
         planner = self.model.planner
         if planner is None:
             refused = self.model.report.refused["model"]
             raise RequestError("NO_MODEL", f"no model is loaded: {refused}")
-        return header, await self.timed(await inflated), planner
+        return header, await ready, planner
 
-    async def _in_map(self, name: str, stamped: PoseStamped, grid: GridMap, frame: str) -> Place:
+    async def _in_map(
+        self, name: str, stamped: PoseStamped, grid: GridMap, frame: str
+    ) -> tuple[PoseStamped, Cell]:
         """Return a pose in the map's frame, whose transform is waited for, and its cell."""
         _checked(name, self.frames.check, stamped, frame)
         deadline = time.monotonic() + self.settings.transform_tolerance

@@ -19,7 +19,6 @@ from types import SimpleNamespace, coroutine
 from typing import Any, NamedTuple
 
 import rclpy
-from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from nav_msgs.msg import Odometry
 from rcl_interfaces.msg import (
     FloatingPointRange,
@@ -211,17 +210,6 @@ class BaseNode(Node):
     def header(self, frame: str = "") -> Header:
         """Return the header of a message about now."""
         return Header(stamp=self.get_clock().now().to_msg(), frame_id=frame)
-
-    def diagnostics(
-        self, what: str, level: bytes, message: str, values: Mapping[str, str]
-    ) -> DiagnosticArray:
-        """Return a message for `/diagnostics`; topics' problems are in it, and logged once."""
-        if problems := self.topic_problems():
-            level, message = max(level, DiagnosticStatus.WARN), "; ".join([message, *problems])
-        status = DiagnosticStatus(name=f"{self.get_fully_qualified_name()}: {what}")
-        status.level, status.message = level, message
-        status.values = [KeyValue(key=key, value=value) for key, value in values.items()]
-        return DiagnosticArray(header=self.header(), status=[status])
 
     def topic_problems(self) -> list[str]:
         """Return what it cannot hear, and why; each is logged once."""

@@ -6,8 +6,9 @@ import importlib
 import time
 from collections.abc import Iterator
 from contextlib import suppress
+from dataclasses import fields
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Final
 
 from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped, Quaternion
 from rclpy.callback_groups import ReentrantCallbackGroup
@@ -24,10 +25,9 @@ from ddqn_planner.nodes.conversions import (
     path_message,
 )
 from ddqn_planner.nodes.driving import NO_MAP, Driving, LearningNode, MapInFrame, explained
-from ddqn_planner.nodes.parameters import OF_MAPS
+from ddqn_planner.nodes.parameters import MOVE_RULES, OF_MAPS
 from ddqn_planner.nodes.poses import check_source
-from ddqn_planner.nodes.runtime import LATCHED, STEADY, Worker, spin_until_shutdown
-from ddqn_planner.nodes.trainer_parameters import HYPER_PARAMETERS, TRAINER_PARAMETERS
+from ddqn_planner.nodes.runtime import LATCHED, STEADY, Declared, Worker, spin_until_shutdown
 from ddqn_planner.resources import find_map
 from ddqn_planner.training.hyper_parameters import HyperParameters
 
@@ -37,12 +37,60 @@ if TYPE_CHECKING:
 
 SLICE = 0.1  # seconds for which the worker trains before the node publishes what became of it
 
+HYPER_PARAMETERS: Final = {
+    entry.name: Declared(
+        entry.default,
+        entry.metadata["source"],
+        entry.metadata.get("range") or [*entry.metadata["choices"]],
+    )
+    for entry in fields(HyperParameters)
+}
+
+PARAMETERS: Final = {
+    "learn_from": Declared(
+        "simulation", "Episodes, or the robot's drives", ["simulation", "driving"], read_only=True
+    ),
+    "output_folder": Declared(
+        "runs/trainer",
+        "A folder for the checkpoint, model and curves, or for drives and experience; used by the "
+        "next ~/start",
+        "not empty",
+    ),
+    "map_file": Declared(
+        "", "Map file or shipped map with start and goal; '': topics", read_only=True
+    ),
+    "move_rule": Declared("corner_cutting", "Which diagonal moves are legal", MOVE_RULES),
+    "seed": Declared(0, "Seed of the training", (0, 2**31 - 1)),
+    **OF_MAPS,
+    "episode_interval": Declared(10, "Publish each n-th episode", (1, 10**6)),
+    "replay_period": Declared(0.05, "Seconds per step of ~/replay", (1e-3, 10.0)),
+    "pose_source": Declared(
+        "odometry",
+        "Driving: odom, or the transform to robot_frame",
+        ["odometry", "tf"],
+        read_only=True,
+    ),
+    "robot_frame": Declared(
+        "base_link", "Driving: the robot's frame, for the pose_source tf", "not empty"
+    ),
+    "robots": Declared(
+        [""], "Driving: namespaces of robots it learns from; '': its own", read_only=True
+    ),
+    "nominal_speed": Declared(
+        0.5, "Driving: m/s where nothing slows the robot down", (0.01, 100.0)
+    ),
+    "robot_width": Declared(0.5, "Driving: metres; places are squares of half of it", (0.05, 10.0)),
+    "experience": Declared("", "Driving: older experience with which a new folder begins"),
+    **HYPER_PARAMETERS,
+}
+"""The next ``~/start`` uses those that changed."""
+
 
 class TrainerNode(LearningNode):
     """Trains on the last ``map`` from the last ``initialpose`` to the last ``goal_pose``."""
 
     def __init__(self) -> None:
-        super().__init__("trainer", TRAINER_PARAMETERS)
+        super().__init__("trainer", PARAMETERS)
         self._poses: dict[str, PoseStamped] = {}
         self._run: TrainingRun | None = None
         self.state = "idle"
@@ -248,4 +296,4 @@ def import_training() -> None:
         torch.optim.Adam([torch.zeros(1)])  # the first optimiser imports for a second
 
 
-main = partial(spin_until_shutdown, TrainerNode, TRAINER_PARAMETERS)
+main = partial(spin_until_shutdown, TrainerNode, PARAMETERS)

@@ -297,7 +297,7 @@ def offset_between(old: GridMap, new: GridMap) -> Cell | None:
     return shift if apart < SAME_PLACE * new.resolution else None
 
 
-def _overlap(old: GridMap, new: GridMap, shift: Cell) -> tuple[Box, Box]:
+def overlap(old: GridMap, new: GridMap, shift: Cell) -> tuple[Box, Box]:
     """Return the rows and columns that both maps show, in the old map and in the new one."""
     before, after = [], []
     for axis, by in enumerate(reversed(shift)):
@@ -312,7 +312,7 @@ def _overlap(old: GridMap, new: GridMap, shift: Cell) -> tuple[Box, Box]:
 def changed_cells(old: GridMap, new: GridMap, shift: Cell) -> NDArray[np.int32] | None:
     """Return the cells whose moves may differ, as numbers of the padded new map; None for many."""
     width, patches = new.width + 2, new.patches_since(old)
-    boxes = [_overlap(old, new, shift)] if patches is None else [(box, box) for box in patches]
+    boxes = [overlap(old, new, shift)] if patches is None else [(box, box) for box in patches]
     found = [np.empty(0, np.int64)]
     for before, (rows, columns) in boxes:
         y, x = np.nonzero(new.differs(old, (rows, columns), before))
@@ -335,7 +335,7 @@ def _moved(known: Known, old: GridMap, new: GridMap, shift: Cell) -> tuple[NDArr
     """Return a field's distance, state and open cells with each cell where the new map has it."""
     if shift == (0, 0) and old.occupancy.shape == new.occupancy.shape:
         return known[:3]
-    before, after = _overlap(old, new, shift)
+    before, after = overlap(old, new, shift)
     shape = new.height + 2, new.width + 2
     distance, state = np.zeros(shape), np.zeros(shape, dtype=np.uint8)
     for layer, source in ((distance, known.distance), (state, known.state)):

@@ -44,15 +44,13 @@ class PoseField:
         self.goals, self.grid, self.world, self.body = goals, grid, world, body
         states = world.tile.size * TILE * TILE * HEADINGS
         self.known = Known(_untouched(states, np.float32), _untouched(states, np.uint8))
-        self._keys, self._numbers = np.empty(HEAP, np.float32), np.empty(HEAP, np.int64)
-        self._size = self._waiting = self._round = 0
+        self._size, self._waiting, self._round = len(goals), 0, 0
+        entries = max(HEAP, len(goals))
+        self._keys, self._numbers = np.empty(entries, np.float32), np.empty(entries, np.int64)
+        self._numbers[: len(goals)] = [self.number(goal) for goal in goals]
+        self.known.mark[self._numbers[: len(goals)]] = kernels.OPEN
         self._aim, self._weight = Aim(0, 0, -1, np.empty(0, np.float32)), 0.0
         self.visits = 0
-        for goal in goals:
-            number = self.number(goal)
-            self.known.mark[number] = kernels.OPEN
-            self._numbers[self._size] = number
-            self._size += 1
 
     def number(self, state: State) -> int:
         """Return the number of a state inside the map."""

@@ -243,7 +243,7 @@ NOW = 111  # seconds of the node's clock
 
 
 class Node:
-    """What `Frames` and `StartSource` ask of a node."""
+    """What `Frames`, `StartSource` and `Refusals` ask of a node."""
 
     def __init__(self) -> None:
         self.after_jump_back: set[object] = set()
@@ -251,6 +251,9 @@ class Node:
 
     def create_timer(self, *_: object, clock: object) -> None:
         """Do not call back."""
+
+    def create_publisher(self, *_: object) -> None:
+        """Have nobody to publish to."""
 
     def destroy_timer(self, _: object) -> None:
         """Have nothing to destroy."""
@@ -311,7 +314,8 @@ def test_a_newest_transform_beyond_the_tolerance_is_not_used(listening: Any) -> 
     late = {NOW - 6: "6 s old", NOW + 6: "6 s in the future"}
     for stamp, words in (late | dict.fromkeys((NOW - 2, NOW + 2, 0), "")).items():
         frames = listening(stamp, tolerance=5.0)
-        start = StartSource(Node(), frames, Refusals(None), lambda: "map", lambda: None)
+        node = Node()
+        start = StartSource(node, frames, Refusals(node), lambda: "map", lambda: None)
         goal_in_map = partial(frames.to_map, "the goal", pose_at(0), "map")
         if words:
             why = f"(the newest is {words}, more than transform_tolerance, 5 s)"

@@ -235,6 +235,8 @@ def test_the_robot_goes_round_what_was_slow_until_it_forgets(planner: Any, site:
     kept = str(site.folder / "experience_forgotten.npz")
     assert site.client.set_parameters("planner", experience=kept)
     wait_for("other way", lambda: not is_below(site.client.get_plan(*ends)))
+    assert site.client.set_parameters("planner", experience="")
+    wait_for("first way", lambda: is_below(site.client.get_plan(*ends)))
     assert site.outcomes == ["arrived"] * 3
 
 

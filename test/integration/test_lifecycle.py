@@ -197,6 +197,9 @@ def test_cleanup_frees_map_model_and_fields(make_robot: Any, model: Path) -> Non
         assert all(reference() for reference in freed)
         assert robot.transition("cleanup")
         wait_for("free memory", lambda: gc.collect() >= 0 and not any(it() for it in freed))
+        before = len([*node.guards])
+        assert all(map(robot.transition, ("configure", "cleanup")))
+        assert len([*node.guards]) == before
     finally:
         rclpy.shutdown()
         spinning.join()

@@ -62,14 +62,18 @@ class Source(MapSource):
         self.heard: list[bool] = []
         self.report = Report(node, lambda: None)
         self.node, self.worker = node, Worker(node)
-        super().__init__(node, self.report, self.worker, self.heard.append)
+        self.times = ExpectedTimes(node, self.report, self.worker, self.change)
+        super().__init__(node, self.report, self.worker, self.times.apply, self.heard.append)
 
     def grid(self) -> GridMap:
-        future, deadline = self.inflated(), time.monotonic() + TIMEOUT
+        future, deadline = self.ready(), time.monotonic() + TIMEOUT
         while not future.done():
             assert time.monotonic() < deadline
             time.sleep(0.001)
         return future.result()
+
+    def slowness(self) -> Any:
+        return self.grid().slowness
 
     def used(self) -> tuple[int, Any]:
         """The stamp of the map to plan on, and what it forbids: everywhere, or in each column."""
@@ -393,6 +397,8 @@ def test_a_worker_leaves_out_what_was_given_up_before_its_turn(node: BaseNode) -
 # Expected times
 
 GRID = GridMap(np.zeros((40, 120), dtype=np.bool_), resolution=0.25)
+PLACE = GRID.resolution, GRID.origin
+MESSAGE = occupancy_message(np.zeros((40, 120), np.int8), *PLACE, Header(frame_id="map"))
 
 
 def new_times(source: Source) -> ExpectedTimes:
@@ -444,37 +450,80 @@ def test_a_map_has_times_after_drives(
 def test_drives_are_planned_with_at_once(
     source: Source, times: ExpectedTimes, driven: UInt8MultiArray
 ) -> None:
-    changes: list[int] = []
-    on_change = source.node, source.report, source.worker, lambda: changes.append(1)
-    learned = ExpectedTimes(*on_change)
-    assert finished(learned.on(GRID)) is GRID
-    finished(learned.on_sent(driven))
-    assert len(changes) == 1
-    closed = GRID.with_patch(np.ones((3, 3), dtype=np.bool_), 60, 19)
-    for grid in (GRID, closed, GRID):
-        timed = finished(learned.on(grid))
-        assert finished(learned.on(grid)) is timed
-        np.testing.assert_array_equal(timed.occupancy, grid.occupancy)
+    source._take(MESSAGE)
+    assert source.slowness() is None
+    source.heard.clear()
+    finished(source.times.on_sent(driven))
+    assert source.heard == [False]
+    free, closed = np.zeros((2, 40, 120), np.int8)
+    closed[19:22, 60:63] = 100
+    for values in (free, closed, free):
+        source._take(occupancy_message(values, *PLACE, MESSAGE.header))
+        timed = source.grid()
+        assert source.grid() is timed
+        np.testing.assert_array_equal(timed.occupancy, values > 0)
     np.testing.assert_array_equal(timed.slowness, times.apply(GRID).slowness)
-    finished(learned.on_sent(message_of(Experience(0.5))))
-    assert len(changes) == 2
-    assert finished(learned.on(GRID)) is GRID  # it was forgotten
-    finished(learned.on_sent(UInt8MultiArray(data=driven.data)))
-    assert len(changes) == 2
+    source.heard.clear()
+    finished(source.times.on_sent(message_of(Experience(0.5))))
+    assert source.heard == [False]
+    assert source.slowness() is None  # it was forgotten
+    finished(source.times.on_sent(UInt8MultiArray(data=driven.data)))
+    assert source.heard == [False]
     assert "label ''" in source.report.refused["experience"]
 
 
-def test_a_file_is_planned_with_or_refused(
-    source: Source, driven: UInt8MultiArray, tmp_path: Path
+def test_a_file_is_planned_with_or_refused_or_none_is_set(
+    source: Source, driven: UInt8MultiArray, set_parameters: SetParameters, tmp_path: Path
 ) -> None:
-    learned, file = new_times(source), tmp_path / "experience.npz"
+    file = tmp_path / "experience.npz"
     file.write_bytes(bytes(driven.data))
-    source.node.set_parameters([Parameter("experience", value=str(tmp_path))])
+    source._take(MESSAGE)
+    set_parameters(experience=str(tmp_path))
     for problem in ("", "cannot be read"):
-        finished(learned.on_sent())
+        finished(source.times.on_sent())
         assert problem in source.report.refused.get("experience", "")
-        assert finished(learned.on(GRID)).slowness[20, 60] > 2
+        assert source.slowness()[20, 60] > 2
         file.write_bytes(bytes(driven.data)[:-9])
+    set_parameters(experience="")
+    finished(source.times.on_sent())
+    assert source.slowness() is None
+    assert "experience" not in source.report.refused
+    finished(source.times.on_sent(driven))
+    assert source.slowness()[20, 60] > 2
+
+
+def test_the_exploration_that_is_set_counts_at_once(
+    source: Source, driven: UInt8MultiArray, set_parameters: SetParameters
+) -> None:
+    source._take(MESSAGE)
+    finished(source.times.on_sent(driven))
+    for share in (0.1, 0.5):
+        set_parameters(exploration=share)
+        expected = Experience.from_bytes(bytes(driven.data)).apply(GRID, share)
+        np.testing.assert_allclose(source.slowness(), expected.slowness, rtol=1e-4)
+
+
+def test_what_no_memory_was_left_for_is_refused_or_tried_again(
+    source: Source, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(*_: Any) -> GridMap:
+        raise MemoryError
+
+    changed = map_of(2)
+    changed.data[0] = 100
+    source._take(map_of(1))
+    with monkeypatch.context() as patch:
+        patch.setattr(source, "_inflate", fail)
+        with pytest.raises(MemoryError):
+            source.grid()
+        patch.setattr(source, "_patched", fail)
+        source._take(changed)
+        patch.setattr(source.times, "load", fail)
+        finished(source.times.on_sent())
+        assert source.report.refused == dict.fromkeys(("map", "experience"), "MemoryError()")
+    assert source.used() == (1, None)
+    source._take(changed)
+    assert source.used() == (2, None)
 
 
 def finished(coroutine: Coroutine[None, None, Any]) -> Any:
@@ -499,6 +548,28 @@ def test_a_map_with_a_person_or_that_grows_keeps_its_times(times: ExpectedTimes)
     assert after is not None
     # Near the old edge more places tell of others.
     np.testing.assert_allclose(after[5:35, 10:130], before[:30], rtol=0.021)
+
+
+def test_the_executors_thread_alone_tells_what_the_worker_computes(
+    source: Source, driven: UInt8MultiArray, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    threads, told = set[int](), {"expected time (s)": "1.0"}
+
+    def describe(_: Outcome) -> dict[str, str]:
+        time.sleep(0.1)
+        return told
+
+    monkeypatch.setattr(source.report, "_on_change", lambda: threads.add(threading.get_ident()))
+    monkeypatch.setattr(source.times, "describe", describe)
+    outcome = Outcome("SUCCEEDED", "a path")
+    assert source.times.told(outcome) == {}  # without drives
+    finished(source.times.on_sent(driven))
+    assert source.times.told(outcome) == {}
+    assert wait_for("expected time", lambda: source.times.told(outcome)) == told
+    time.sleep(0.1)
+    assert threads == {threading.get_ident()}
+    finished(source.times.on_sent())  # the file that is set: none
+    assert source.times.told(outcome) == {}
 
 
 def test_the_plan_goes_round_and_its_time_is_told(times: ExpectedTimes) -> None:

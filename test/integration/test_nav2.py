@@ -238,6 +238,27 @@ def test_a_path_to_one_goal_is_kept_while_it_is_nearly_as_good_as_a_new_one() ->
         assert "kept: its cost is +" in above_kept[1][1]
         assert node._model.planner is not None
         assert node._model.planner.cache_bytes == 0  # what the node was started with holds
+
+        def fail(*_: Any) -> GridMap:
+            raise MemoryError
+
+        # A path that is planned while its form is set is not kept.
+        planned = node._requests.plan
+
+        async def plan_and_set(*asked: Any) -> Outcome:
+            outcome = await planned(*asked)
+            node.set_parameters([Parameter("path_simplification", value="none")])
+            return outcome
+
+        node._requests.plan = plan_and_set
+        run(node._plan_for_action(ends[0], [ends[1]], "", lambda: None))
+        assert len(node._followed.path) == 0
+
+        # A path that cannot be checked is not valid, and the node lives.
+        request, validity = SimpleNamespace(path=PathMessage()), SimpleNamespace()
+        node._map._inflate = fail
+        node._map.change()
+        assert not run(node._on_is_path_valid(request, validity)).is_valid
     finally:
         node.destroy_node()
         try_shutdown()

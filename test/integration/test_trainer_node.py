@@ -27,12 +27,12 @@ from std_srvs.srv import Trigger
 from ddqn_planner.grid import MOVES, GridMap, MapFile, MoveRule, legal_moves, save_map
 from ddqn_planner.model import load_model
 from ddqn_planner.nodes.runtime import LATCHED
-from ddqn_planner.nodes.trainer_parameters import TRAINER_PARAMETERS
+from ddqn_planner.nodes.trainer_node import PARAMETERS
 
 ENDLESS = {"steps": 10**9, "filters": 4, "learning_starts": 100}
 START, GOAL = (0, 0), (5, 5)
 NAMESPACE = "/training"  # of the trainer that most tests share
-DEFAULTS = {name: it.default for name, it in TRAINER_PARAMETERS.items() if not it.read_only}
+DEFAULTS = {name: it.default for name, it in PARAMETERS.items() if not it.read_only}
 
 
 class Trainee(User):

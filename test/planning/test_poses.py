@@ -175,6 +175,17 @@ def test_the_nearest_goal_counts_and_one_without_room_moves_within_the_tolerance
         plan(body, GridMap(occupancy, 0.05), start, near)
 
 
+def test_a_goal_may_move_as_far_as_one_likes() -> None:
+    motions, _ = robot("differential")
+    occupancy = np.zeros((60, 80), np.bool_)
+    occupancy[30, 40] = True
+    grid = GridMap(occupancy, CELL)
+    start, occupied = (pose_of(grid, motions, (x, 30, 0)) for x in (10, 40))
+    far = 2.2, math.pi  # more states than a field has room for at first
+    moved = plan(planner("differential"), grid, start, occupied, tolerance=far, bound=1.0)
+    assert (moved.goal, moved.length) == ((18, 30), pytest.approx(8))
+
+
 def test_a_body_that_cannot_leave_its_place_has_no_path() -> None:
     motions, _ = robot("differential")
     occupancy = np.zeros((60, 60), np.bool_)

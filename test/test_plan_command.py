@@ -1,0 +1,271 @@
+"""``ddqn-planner plan``, for models without and with a body."""
+
+import csv
+import json
+import re
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from bodies import Oracle
+from PIL import Image, ImageColor
+
+from ddqn_planner import Planner, inflate, pictures
+from ddqn_planner.cli import main
+from ddqn_planner.grid import MapFile, save_map
+from ddqn_planner.grid.footprint import placed
+from ddqn_planner.pictures import PATH_COLOUR, VALUE_COLOURS
+
+
+def test_plan_prints_the_papers_path_by_its_rule(capsys: Any) -> None:
+    assert main(["plan", "dilemma", "--model", "dilemma"]) == 0
+    printed = capsys.readouterr().out
+    assert "length 22.97 cells, optimum 22.97 under corner_cutting" in printed
+    assert [printed.count(letter) for letter in "*SG"] == [17, 1, 1]
+    assert main(["plan", "dilemma", "--move-rule", "unit"]) == 0
+    printed = capsys.readouterr().out
+    assert "length 18.00 cells, optimum 18.00 under unit" in printed
+    assert "11.49 m" in printed  # as the robot drives, whatever the rule counts
+    assert main(["plan", "dilemma", "--start", "1", "19"]) == 1
+    assert "the start is occupied" in capsys.readouterr().err
+    request = ["plan", "dilemma", "--model", "dilemma", "--goal", "0", "0"]
+    assert main(request) == 1
+    assert "greedy steps do not find it" in capsys.readouterr().err
+    assert main([*request, "--mode", "astar_fallback"]) == 0
+    assert re.search("cells, optimum.*, astar_fallback, planned in", capsys.readouterr().out)
+
+
+CLEARED = {"start": (5, 0), "start_clearing_radius": 2}
+# Options, and what they are for the library: of the map's values, of the body, of the plan.
+ASKED: dict[str, tuple[dict[str, Any], tuple[float, float], dict[str, Any]]] = {
+    "": ({}, (0, 0), {}),
+    "--occupied-threshold 60": ({"occupied_threshold": 60}, (0, 0), {}),
+    "--allow-unknown": ({"allow_unknown": True}, (0, 0), {}),
+    "--use-map-costs": ({"use_map_costs": True}, (0, 0), {}),
+    "--allow-unknown --use-map-costs": ({"allow_unknown": True, "use_map_costs": True}, (0, 0), {}),
+    "--robot-radius 0.1": ({}, (0.1, 0), {}),
+    "--clearance-weight 1": ({}, (0, 1), {}),
+    "--move-rule unit": ({}, (0, 0), {"move_rule": "unit"}),
+    "--goal 26 29 --tolerance 0.1": ({}, (0, 0), {"goal": (26, 29), "tolerance": 2}),
+    "--start 5 0": ({}, (0, 0), {"start": (5, 0)}),
+    "--start 5 0 --start-clearing-radius 0.1": ({}, (0, 0), CLEARED),
+}
+
+
+def test_plan_gives_as_the_library(capsys: Any, tmp_path: Path) -> None:
+    random, planner, seen = np.random.default_rng(12), Planner.load("any_map"), set()
+    values = random.choice([0, 60, -1, 100], (30, 30), p=[0.8, 0.08, 0.06, 0.06])
+    values[0, 0], values[-1, -1], values[0, 5], values[-1, -4] = 0, 0, 100, 100
+    map_file = MapFile(values, 0.05, start=(0, 0), goal=(29, 29))
+    save_map(map_file, tmp_path / "map.yaml")
+    for options, (rules, body, asked) in ASKED.items():
+        grid = inflate(map_file.grid(**rules), *body)
+        plan = planner.plan(grid, **{"start": (0, 0), "goal": (29, 29), **asked})
+        command = ["plan", str(tmp_path / "map.yaml"), "--json", *options.split()]
+        assert main(command) == (0 if plan.cells else 1)
+        answer = json.loads(capsys.readouterr().out)
+        assert answer["cells"] == [list(cell) for cell in plan.cells]
+        assert (answer["status"], answer["length"]) == (plan.status.name, plan.length)
+        if plan.cells:
+            assert (answer["optimum"] is None) == (not grid.is_free(plan.cells[0]))
+            assert (answer["optimum"] or 0) <= plan.length + 1e-9
+        seen.add(plan.cells)
+    assert len(seen) == len(ASKED)  # each option counts
+
+
+def test_plan_draws_a_wide_map_for_a_terminal(capsys: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sys.stdout, "isatty", lambda: True)
+    monkeypatch.setenv("COLUMNS", "100")
+    monkeypatch.setenv("LINES", "40")
+    assert main(["plan", "office", "--clearance-weight", "1"]) == 0
+    *blocks, start, length = capsys.readouterr().out.splitlines()
+    assert [line.count("▀") for line in blocks] == [96] * 32  # 6 cells per square
+    assert "goal (550, 330)" in start
+    assert re.search(r"cost \d{4}\.\d\d, greedy", length)
+
+
+def test_plan_gives_every_cell(capsys: Any, tmp_path: Path) -> None:
+    file = tmp_path / "path.csv"
+    assert main(["plan", "office", "--cells", "--csv", str(file)]) == 0
+    *cells, start, length = capsys.readouterr().out.splitlines()
+    assert start == "start (15, 15), goal (550, 330), 39.50 m"
+    assert length.startswith("length 789.95 cells, optimum 789.95 under robot_safe, greedy, ")
+    assert (cells[0], cells[-1]) == ("15 15", "550 330")
+    header, *rows = file.read_text().splitlines()
+    assert (header, rows[0]) == ("x,y,x_metres,y_metres", "15,15,0.775,0.775")
+    assert cells == [" ".join(row.split(",")[:2]) for row in rows]
+    assert main(["plan", "dilemma", "--start", "1", "19", "--csv", str(file)]) == 1
+    assert file.read_text().splitlines() == [header]  # of no other plan
+
+
+def test_plan_writes_json_and_a_picture(capsys: Any, tmp_path: Path) -> None:
+    def plan(picture: str, *goal: Any) -> Any:
+        command = ["plan", "dilemma", "--json", "--picture", str(tmp_path / picture)]
+        assert main([*command, *map(str, goal)]) == 0
+        return json.loads(capsys.readouterr().out)
+
+    answer = plan("plan.png")
+    assert (answer["cells"][0], answer["cells"][-1]) == ([6, 6], [17, 19])
+    assert (answer["status"], answer["length"]) == ("SUCCEEDED", pytest.approx(answer["optimum"]))
+    with Image.open(tmp_path / "plan.png") as picture:
+        assert len(np.unique(np.asarray(picture.convert("RGB")).reshape(-1, 3), axis=0)) > 100
+    moved = plan("moved.png", "--goal", 1, 19, "--tolerance", 9)
+    assert moved["cells"][-1] != [1, 19]
+    plan("there.png", "--goal", *moved["cells"][-1])  # the value is that of the end
+    assert (tmp_path / "moved.png").read_bytes() == (tmp_path / "there.png").read_bytes()
+
+
+def test_missing_matplotlib_is_named(
+    capsys: Any, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setitem(sys.modules, "matplotlib", None)
+    assert main(["plan", "dilemma", "--picture", str(tmp_path / "plan.png")]) == 2
+    assert capsys.readouterr().err.endswith("; pip install matplotlib\n")
+
+
+@pytest.fixture
+def rooms(tmp_path: Path) -> tuple[MapFile, str]:
+    """Two rooms of 3 x 3.5 m and a door of 1 m between them, and the map's file."""
+    values = np.zeros((70, 130), np.int8)
+    values[[0, -1]] = values[:, [0, -1]] = values[:25, 64] = values[45:, 64] = 100
+    values[20:30, 30], values[30:45, 90], values[10:15, 110] = -1, 60, 100
+    map_file = MapFile(values, 0.05, (1, -2, 0), start=(15, 25), goal=(112, 40))
+    save_map(map_file, tmp_path / "rooms.yaml")
+    return map_file, str(tmp_path / "rooms.yaml")
+
+
+# Options, and what they are for the library: of the map's values, of costs, of ends and of plans.
+TURNED, MOVED = {"yaws": (0, 3)}, {"goal": (102, 12)}
+BODY_ASKED: dict[str, tuple[dict[str, Any], float, dict[str, Any], dict[str, Any]]] = {
+    "": ({}, 0, {}, {}),
+    "--occupied-threshold 60": ({"occupied_threshold": 60}, 0, {}, {}),
+    "--allow-unknown": ({"allow_unknown": True}, 0, {}, {}),
+    "--use-map-costs": ({"use_map_costs": True}, 0, {}, {}),
+    "--clearance-weight 1": ({}, 1, {}, {}),
+    "--yaws 0 3": ({}, 0, TURNED, {}),
+    "--start 15 50": ({}, 0, {"start": (15, 50)}, {}),
+    "--bound 3": ({}, 0, {}, {"bound": 3.0}),
+    "--goal 102 12": ({}, 0, MOVED, {}),
+    "--goal 102 12 --tolerance 0.6": ({}, 0, MOVED, {"tolerance": (0.6, 0)}),
+    "--goal 102 12 --yaw-tolerance 2": ({}, 0, MOVED, {"tolerance": (0, 2)}),
+}
+
+
+def test_plan_drives_a_body_as_the_library_and_without_a_collision(
+    rooms: Any, capsys: Any, tmp_path: Path
+) -> None:
+    map_file, path = rooms
+    file, seen = tmp_path / "poses.csv", set()
+    for options, (rules, weight, ends, asked) in BODY_ASKED.items():
+        grid = inflate(map_file.grid(**rules), 0, weight)
+        cells = ends.get("start", (15, 25)), ends.get("goal", (112, 40))
+        start, goal = (
+            (*grid.cell_to_world(cell), yaw)
+            for cell, yaw in zip(cells, ends.get("yaws", (0, 0)), strict=True)
+        )
+        planner = Planner.load("car")
+        assert planner.pose_planner is not None
+        body = str(planner.pose_planner.footprint.tolist())
+        plan = planner.plan_poses(grid, start, goal, **asked)
+        command = ["plan", path, "--model", "car", "--json", "--csv", str(file), *options.split()]
+        assert main(command) == (0 if plan.cells else 1)
+        answer = json.loads(capsys.readouterr().out)
+        assert answer["poses"] == plan.poses.tolist()
+        assert (answer["status"], answer["reason"]) == (plan.status.name, plan.status.value)
+        assert (answer["bound"], answer["cost"]) == (plan.bound, plan.cost)
+        assert answer["metres"] == pytest.approx(plan.length * 0.05)
+        header, *rows = csv.reader(file.read_text().splitlines())
+        assert header == ["x", "y", "yaw"]
+        assert len(rows) == len(plan.poses)
+        if rows:
+            poses = np.array(rows, dtype=float)
+            np.testing.assert_allclose(poses, plan.poses, atol=1e-6)
+            assert Oracle(grid, body).collisions(poses) == 0
+        seen.add(plan.poses.tobytes())
+    assert len(seen) == len(BODY_ASKED)  # each option counts
+
+
+def test_plan_tells_how_a_body_drives_or_why_it_cannot(rooms: Any, capsys: Any) -> None:
+    command = ["plan", rooms[1], "--model", "car"]
+    assert main(command) == 0
+    words = r"\d\.\d\d m, \d+ poses, at most 1\.\d{3} times the least cost, planned in \d+\.\d ms\n"
+    assert re.fullmatch(words, capsys.readouterr().out)
+    for options, reason in (
+        ("--start 64 10", "the start is occupied"),
+        ("--start 3 25", "the start is occupied"),  # not by its cell
+        ("--goal 200 40", "the goal lies outside the map"),
+        ("--goal 112 -1", "the goal lies outside the map"),
+    ):
+        assert main([*command, *options.split()]) == 1
+        assert capsys.readouterr().err == f"no path: {reason}; --picture shows the body\n"
+
+
+@pytest.mark.parametrize(
+    ("options", "named"),
+    [
+        (
+            "--model car --robot-radius 0",
+            "--robot-radius is for models without a body, unlike car;",
+        ),
+        ("--model car --move-rule unit", "--move-rule is for models without"),
+        ("--model car --mode greedy", "--mode is for models without"),
+        ("--model car --start-clearing-radius 1", "--start-clearing-radius is for models without"),
+        ("--model car --cells", "--cells is for models without"),
+        (
+            "--yaws 0 0",
+            "--yaws is for models with a body, unlike any_map; leave it out, or give an",
+        ),
+        ("--yaw-tolerance 0", "--yaw-tolerance is for models with a"),
+        ("--bound 1.2", "--bound is for models with a"),
+        ("--model car --yaws nan 0", "nan); give three finite numbers x, y, yaw"),
+        ("--model car --bound nan", "the bound is nan; give 1 or more"),
+        ("--model car --bound 0.9", "the bound is 0.9; give 1 or more"),
+        ("--model car --tolerance -1", "the tolerance is -1.0; give two numbers"),
+        ("--model car --yaw-tolerance nan", "the tolerance is nan; give two numbers"),
+        ("--model cart", "no 'cart.safetensors'"),
+    ],
+)
+def test_plan_refuses_what_a_model_cannot_follow(
+    rooms: Any, capsys: Any, options: str, named: str
+) -> None:
+    assert main(["plan", rooms[1], *options.split()]) == 2
+    assert named in capsys.readouterr().err
+
+
+def test_plan_names_the_resolution_that_a_body_needs(capsys: Any) -> None:
+    assert main(["plan", "dilemma", "--model", "car"]) == 2
+    assert "0.05 m, and the map's have 0.5 m; give a map" in capsys.readouterr().err
+
+
+def test_a_picture_shows_what_a_body_sweeps_and_where_it_has_no_room(
+    rooms: Any, capsys: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pytest.importorskip("matplotlib")
+    shown, drawn, draw_body = [], [], pictures.draw_body
+    planner: Any = Planner.load("car").pose_planner
+
+    def draw(*body: Any) -> None:
+        drawn.append(body)
+        draw_body(*body)
+
+    monkeypatch.setattr(pictures, "draw_body", draw)
+    for goal, tolerance in (("40", "0"), ("12", "0"), ("12", "0.6")):
+        command = ["plan", rooms[1], "--model", "car", "--goal", "102", goal, "--json"]
+        command += ["--tolerance", tolerance, "--picture", str(tmp_path / "plan.png")]
+        has_path = main(command) == 0
+        with Image.open(tmp_path / "plan.png") as picture:
+            pixels = np.asarray(picture.convert("RGB"))
+        colours = map(ImageColor.getrgb, (VALUE_COLOURS[1], PATH_COLOUR))
+        shown.append([int((pixels == colour).all(axis=2).sum()) for colour in colours])
+        # Cells, counted from the centre of the first one, are the metres of the plan.
+        _, footprint, *poses = drawn[-1]
+        swept, ends = ((placed(footprint, each) + 0.5) * 0.05 + (1, -2) for each in poses)
+        driven = np.reshape(json.loads(capsys.readouterr().out)["poses"], (-1, 3))
+        asked = driven[[0, -1]] if has_path else np.array([[1.775, -0.725, 0], [6.125, -1.375, 0]])
+        np.testing.assert_allclose(swept, placed(planner.footprint, driven), atol=1e-9)
+        np.testing.assert_allclose(ends, placed(planner.footprint, asked), atol=1e-9)
+    (swept, path), (none, no_path), _ = shown
+    assert none == 0 < min(swept, no_path)
+    assert no_path < path
