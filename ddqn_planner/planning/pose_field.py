@@ -18,6 +18,7 @@ NO_RESERVE = getattr(mmap, "MAP_NORESERVE", 0x4000)  # not in all versions of Py
 HEAP = 2**14  # entries of a heap, at first
 TAKEN_BACK = 4  # of so many visited states a repair takes one back; else a new field is quicker
 UNGUIDED = 2**14  # states that are visited before a look at the map pays
+FIRST = 1.2
 GREEDY = 1.5  # the first round's weight is the bound to the power of this: mostly that will do
 FURTHER = 1.5  # times the way to the goal that the look at the map goes
 
@@ -61,18 +62,16 @@ class PoseField:
         number = self.number(start)
         if number != self._aim.number:
             self._aim = Aim(*start[:2], number, np.empty(0, np.float32))
-            self._weight, self._tried = 0.0, 0
-        if not bound <= self._weight <= bound**GREEDY:
-            self._weight = bound**GREEDY
+            self._weight, self._tried = max(bound, FIRST) ** GREEDY, 0
             self._order()
         while True:
             most = limit if self._aim.left.size else min(limit, UNGUIDED - self._tried)
-            visits, done = self._grow(most)
+            visits, done = self._grow(most, 1 / bound)
             limit, self._tried = limit - visits, self._tried + visits
             if done:
                 if self.bound(number) <= bound * kernels.SAME or not len(self._open()):
                     return True
-                self._weight = bound
+                self._weight = 0.0
                 self._order()
             elif limit == 0:
                 return False
@@ -81,7 +80,7 @@ class PoseField:
             elif not self._can_leave(number) or not self._guide():
                 return True
 
-    def _grow(self, limit: int) -> tuple[int, bool]:
+    def _grow(self, limit: int, share: float) -> tuple[int, bool]:
         """Visit so many states, or fewer; return how many, and whether the round is over."""
         self._size, self._waiting, visits, done = kernels.grow(
             self.known,
@@ -91,6 +90,7 @@ class PoseField:
             self._waiting,
             self._aim,
             self._weight,
+            share,
             kernels.CLOSED + self._round,
             limit,
             self.world,

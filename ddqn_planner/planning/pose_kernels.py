@@ -194,6 +194,7 @@ def grow(
     waiting: int,
     aim: Aim,
     weight: float,
+    share: float,
     closed: int,
     limit: int,
     world: World,
@@ -205,6 +206,7 @@ def grow(
     distance, mark = known.distance, known.mark
     width, height = world.width, world.height
     target, most, visits = aim.number, keys.size - 2 * body.start.size, 0
+    columns, enough = (width + 7) >> 3, np.inf
     while size > 0:
         key = keys[0]
         if mark[target] != UNREACHED and key >= distance[target]:
@@ -217,10 +219,17 @@ def grow(
             sink(keys[size], numbers[size], 0, keys, numbers, size)
         if mark[number] != OPEN:
             continue
-        mark[number] = closed
-        visits += 1
         x, y, heading = place_of(number, width)
         here = distance[number]
+        if weight == 0 and mark[target] != UNREACHED:
+            enough = share * distance[target]
+            if here + way_left(x, y, aim, columns) >= enough:
+                mark[number] = WAITING
+                waiting += 1
+                numbers[numbers.size - waiting] = number
+                continue
+        mark[number] = closed
+        visits += 1
         for place in range(body.into[heading], body.into[heading + 1]):
             primitive = body.ending[place]
             column, line = x - body.offset[primitive, 0], y - body.offset[primitive, 1]
@@ -235,15 +244,15 @@ def grow(
             if found == np.inf or (mark[before] != UNREACHED and found >= distance[before]):
                 continue
             distance[before] = found
-            if mark[before] == closed:
-                mark[before] = WAITING
-                waiting += 1
-                numbers[numbers.size - waiting] = before
-            if mark[before] == WAITING:
-                continue
-            mark[before] = OPEN
-            far = way_left(column, line, aim, (width + 7) >> 3)
-            size = push(np.float32(found + weight * far), before, keys, numbers, size)
+            far = way_left(column, line, aim, columns)
+            if mark[before] == closed or found + far >= enough:
+                if mark[before] != WAITING and mark[before] != OPEN:
+                    mark[before] = WAITING
+                    waiting += 1
+                    numbers[numbers.size - waiting] = before
+            elif mark[before] != WAITING or weight == 0:
+                mark[before] = OPEN
+                size = push(np.float32(found + weight * far), before, keys, numbers, size)
     return size, waiting, visits, True
 
 
