@@ -49,12 +49,13 @@ def simplify(cells: Cells, grid: GridMap, move_rule: MoveRule | str) -> tuple[Ce
 def straightened(path: Cells, grid: GridMap, move_rule: MoveRule | str) -> Path:
     """Do the work of `simplify` for a path of one cell or more."""
     layers, least, best = _layers(grid, move_rule), np.inf, np.asarray(path)
-    until = np.cumsum(_segment_costs(path, layers, 1.0, 1.0))
+    # Without costs, nothing between two cells costs less than a segment.
+    until = np.cumsum(_segment_costs(path, layers, 1.0, 1.0)) if grid.has_costs else np.empty(0)
     # From the end, other obstacles come first: the path may pass them on the better side.
-    for backward in (False, True):
-        cells, costs = np.array(path, np.int64), np.empty(len(path))
-        count = _pull(cells, until, backward, layers)
-        _costs(cells, count, 1.0, 1.0, costs, layers)
+    for order in (1, -1):
+        cells, costs = np.array(path[::order], np.int64), np.zeros(len(path))
+        count = _pull(cells, costs, order * until[::order], order < 0, layers)
+        cells[:count], costs[1:count] = cells[:count][::order], costs[1:count][::order]
         count, is_better = _move_corners(cells, count, costs, layers)
         cost = costs[:count].sum()
         if cost * SAME_COST < least:
@@ -106,6 +107,12 @@ def _length(width: int, height: int, is_unit: bool) -> float:
 
 
 @inlined
+def _is_free(x: int, y: int, occupancy: Any) -> bool:
+    """Return whether a cell lies on the map and is free."""
+    return 0 <= x < occupancy.shape[1] and 0 <= y < occupancy.shape[0] and not occupancy[y, x]
+
+
+@inlined
 def _cost(x: int, y: int, last_x: int, last_y: int, begin: float, layers: Any) -> float:
     """Return the cost of a segment, infinity if it is not legal from a share of it on."""
     occupancy, forbidden, cost, slowness, cuts_corners, is_unit = layers
@@ -154,53 +161,65 @@ def _costs(path: Any, count: int, begin: float, others: float, costs: Any, layer
 
 
 @in_place
-def _pull(path: Any, until: Any, backward: bool, layers: Any) -> int:
-    """Keep the cells that are the last ones seen from the one before; return how many."""
+def _pull(path: Any, costs: Any, until: Any, backward: bool, layers: Any) -> int:
+    """Keep cells far along the path that are seen from the one before; return how many."""
     first, number, last = 0, 0, path.shape[0] - 1
     while first < last:
-        # The length of each segment is found by doubling and halving.
-        reached, step, doubling = first + 1, 1, True
+        x, y, reached, is_equal = path[first, 0], path[first, 1], first, True
+        dx, dy = path[first + 1, 0] - x, path[first + 1, 1] - y
+        while is_equal and reached < last:  # equal moves are a segment
+            to_x, to_y = path[reached, 0] + dx, path[reached, 1] + dy
+            is_equal = path[reached + 1, 0] == to_x and path[reached + 1, 1] == to_y
+            reached += is_equal
+        least = (reached - first) * _length(abs(dx), abs(dy), layers[-1])
+        least = until[reached] - until[first] if until.size else least
+        # How much longer it can be is found by doubling and halving. Half of 3 is 1, so that some
+        # cells are passed over: with corners at the very last ones seen, a path is longer.
+        step, doubling = 3, True
         while step > 0 and reached < last:
-            following, joins = reached + step, False
-            following = last if doubling and following > last else following
-            if following <= last:
-                begin, end = (last - following, last - first) if backward else (first, following)
-                x, y, to_x, to_y = path[begin, 0], path[begin, 1], path[end, 0], path[end, 1]
-                cost = _cost(x, y, to_x, to_y, 0.0, layers)
-                joins = cost <= SAME_COST * (until[end] - until[begin])
+            following = min(reached + step, last)
+            from_x, from_y, to_x, to_y = x, y, path[following, 0], path[following, 1]
+            if backward:
+                from_x, from_y, to_x, to_y = to_x, to_y, x, y
+            cost = _cost(from_x, from_y, to_x, to_y, 0.0, layers)
+            joins = cost < np.inf
+            if until.size:
+                joins = cost <= SAME_COST * (until[following] - until[first])
             if joins:
-                reached = following
+                reached, least = following, cost
             doubling = doubling and joins
             step = 2 * step if doubling else step // 2
         first, number = reached, number + 1
-        kept, at = (last - number, last - reached) if backward else (number, reached)
-        path[kept, 0], path[kept, 1] = path[at, 0], path[at, 1]
-    for cell in range(number + 1 if backward else 0):
-        at = last - number + cell
-        path[cell, 0], path[cell, 1] = path[at, 0], path[at, 1]
+        path[number, 0], path[number, 1], costs[number] = path[reached, 0], path[reached, 1], least
     return number + 1
 
 
 @in_place
 def _move_corners(path: Any, count: int, costs: Any, layers: Any) -> tuple[int, bool]:
     """Move or leave out corners while it costs less; return the cells left, and if any moved."""
-    height, width = layers[0].shape
-    is_better, corner = False, 1
+    occupancy, _, cost, slowness, cuts_corners, is_unit = layers
+    has_costs, is_better, corner = cost.size + slowness.size > 0, False, 1
     while corner < count - 1:
         x, y = path[corner - 1, 0], path[corner - 1, 1]
         at_x, at_y = path[corner, 0], path[corner, 1]
         next_x, next_y = path[corner + 1, 0], path[corner + 1, 1]
         before = costs[corner] + costs[corner + 1]
+        # Around an occupied cell, as in a maze, nothing is shorter than a right angle.
+        dx, dy = x + next_x - 2 * at_x, y + next_y - 2 * at_y
+        inner_x, inner_y = at_x + (dx > 0) - (dx < 0), at_y + (dy > 0) - (dy < 0)
+        is_right = (x == at_x or next_x == at_x) and (y == at_y or next_y == at_y)
+        is_least = is_right and occupancy[inner_y, inner_x] and not (has_costs or cuts_corners)
         # To the next one, which leaves it out; by a cell; by two, past an obstacle of one cell.
         least, is_moved = before * SAME_COST, False
-        for candidate in range(-1, 16):
-            action, step = candidate % 8, 1 + candidate // 8
-            to_x, to_y = at_x + step * MOVES[action, 0], at_y + step * MOVES[action, 1]
-            if candidate < 0:
+        for action in range(-1, 0 if is_least else 8):
+            to_x, to_y = at_x + MOVES[action, 0], at_y + MOVES[action, 1]
+            if action < 0:
                 to_x, to_y = next_x, next_y
-            first = _length(abs(to_x - x), abs(to_y - y), layers[-1])
-            second = _length(abs(next_x - to_x), abs(next_y - to_y), layers[-1])
-            if 0 <= to_x < width and 0 <= to_y < height and first + second < least:
+            elif not _is_free(to_x, to_y, occupancy):
+                to_x, to_y = to_x + MOVES[action, 0], to_y + MOVES[action, 1]
+            first = _length(abs(to_x - x), abs(to_y - y), is_unit)
+            second = _length(abs(next_x - to_x), abs(next_y - to_y), is_unit)
+            if first + second < least and _is_free(to_x, to_y, occupancy):
                 second = _cost(to_x, to_y, next_x, next_y, 0.0, layers)
                 if first + second < least:
                     first = _cost(x, y, to_x, to_y, 0.0, layers)
@@ -208,7 +227,7 @@ def _move_corners(path: Any, count: int, costs: Any, layers: Any) -> tuple[int, 
                     least, is_moved = first + second, True
                     path[corner, 0], path[corner, 1] = to_x, to_y
                     costs[corner], costs[corner + 1] = first, second
-            if candidate < 0:
+            if action < 0:
                 if is_moved:
                     break
                 least = before / SAME_COST

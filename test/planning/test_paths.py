@@ -298,8 +298,43 @@ def test_a_path_turns_at_the_corner_and_not_behind_it() -> None:
         assert simplify(cells, grid, rule) == (cells[0], (20, 20), cells[-1])
     wide = [*((x, 25) for x in range(26)), *((25, y) for y in range(24, -1, -1))]
     least = path_length([(0, 25), (20, 20), (25, 0)])
-    for cells in (wide, wide[::-1]):
+    for cells in (wide, wide[::-1], [wide[0], wide[25], wide[-1]]):
         assert path_length(simplify(cells, grid, rule)) < 1.03 * least
+
+
+@pytest.mark.parametrize("layer", ["cost", "slowness"])
+def test_a_bend_around_an_obstacle_moves_away_from_a_costly_cell(layer: str) -> None:
+    costs = np.zeros((9, 9), np.int8) if layer == "cost" else np.ones((9, 9), np.float32)
+    costs[5, 5] = 99
+    grid = GridMap(np.pad(np.ones((5, 5)), (0, 4)), **{layer: costs})
+    bend = [(0, 5), (5, 5), (5, 0)]
+    check_corners(check_simplified(bend, grid, MoveRule.ROBOT_SAFE), grid, MoveRule.ROBOT_SAFE)
+
+
+def test_a_bend_is_cut_where_corners_may_be() -> None:
+    grid = GridMap(np.pad(np.ones((5, 5)), (0, 4)))
+    bend = [(0, 5), (5, 5), (5, 4)]
+    assert simplify(bend, grid, "robot_safe") == (*bend,)
+    assert simplify(bend, grid, "corner_cutting") == ((0, 5), (4, 5), (5, 4))
+
+
+@settings(max_examples=40)
+@given(st.integers(0, 999), st.sampled_from(["cost", "slowness", "neither"]), RULES)
+def test_a_simplified_path_across_a_larger_map_costs_no_more(
+    seed: int, layer: str, rule: MoveRule
+) -> None:
+    random, shape = np.random.default_rng(seed), (16, 16)
+    costs = random.integers(0, 99, shape, np.int8)
+    slowness = random.uniform(1, 9, shape).astype(np.float32)
+    grid = GridMap(
+        random.random(shape) < 0.1,
+        cost=costs if layer == "cost" else None,
+        slowness=slowness if layer == "slowness" else None,
+        forbidden=random.choice([0, 0, 0, 1, 2, 4, 16, 64], shape).astype(np.uint8),
+    )
+    free = grid.free_cells()
+    path = shortest_path(grid, free[0], free[-1], rule)
+    check_corners(check_simplified(path, grid, rule), grid, rule)
 
 
 def test_the_better_one_is_taken_of_the_path_pulled_from_its_start_and_from_its_end() -> None:
