@@ -204,14 +204,15 @@ def keep_or_switch(request: PlanRequest, new: Path) -> tuple[Path, float | None]
     rest = rest_of_path(request.under_way, (x, y), grid, rule)
     if not len(rest) or rest[-1].tolist() not in [new[-1].tolist(), *map(list, request.goals)]:
         return new, None
+    # As it stands: pulled straight, it may be the new path through what has opened.
+    cost, new_cost = (cost_along(path, grid, rule) for path in (rest, new))
+    if cost > (1 + request.switch_threshold) * new_cost * SAME_COST:
+        return new, None
     if request.simplified:
         rest = straightened(rest, grid, rule)
     if np.array_equal(rest, new):
         return new, 0.0
-    cost, new_cost = (cost_along(path, grid, rule) for path in (rest, new))
-    if cost > (1 + request.switch_threshold) * new_cost * SAME_COST:
-        return new, None
-    return rest, cost / new_cost - 1
+    return rest, cost_along(rest, grid, rule) / new_cost - 1
 
 
 def _legal_from(cells: Path, grid: GridMap, move_rule: MoveRule | str, begin: float = 0.0) -> int:
