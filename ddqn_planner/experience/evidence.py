@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ddqn_planner.experience.posterior import Posterior
+from ddqn_planner.experience.posterior import FEW_PLACES, Posterior
 from ddqn_planner.experience.prior import Prior
 from ddqn_planner.grid import GridMap
 from ddqn_planner.grid.arguments import MAX_SLOWNESS
@@ -25,13 +25,14 @@ VARIANCE, VARIED_PLACES = 1.0, 4.0  # of the log slowness of places, as if of so
 LEAST_VARIANCE, MOST_VARIANCE = 0.05, 2.0
 ALIKE = 8.0  # so many places of a path tell as much of other places as one alone
 NOMINAL = 2.0  # inverse variance of the log slowness of all places, before the first drive
-TRUST, TRUSTED = 0.4, 0.25  # in the prior: at first, and the inverse variance of that
+TRUST, TRUSTED = 0.2, 0.25  # in the prior: at first, and the inverse variance of that
 SURE_PLACES = 20  # fewer say nothing about the robot's speed in the open
 OUTLIER = 2.5  # a visit is moved to so many standard deviations from what was expected
 KNOWN = 0.7  # weight of visits from which a place is known
 MOST = 6.0  # weight of visits that a place keeps
 
 PART, SURPRISE = 8, 3.5  # so many places have changed if they are off by more deviations
+USUAL = 4.0  # from bound to bound of drives' errors; where it is more, so is a surprise
 PART_NOISE = 0.12  # of their mean log slowness, as each way through a place is another
 DRIVE_NOISE = 0.05  # standard deviation of what the log slowness of so many places has in common
 CHANGED = 0.01  # share of all evidence that is left then: where one place changed, others did
@@ -137,11 +138,14 @@ class Evidence:
     def _changed(self, surprise: Float64, weight: Float64) -> NDArray[np.int64]:
         """Return the visits that were other than all before; then hardly anything is known."""
         changed, known = [np.zeros(0, np.int64)], np.flatnonzero(weight >= KNOWN)
+        # Up a ramp a drive takes longer than down, and nothing has changed.
+        low, _, high = self.quantiles()
+        most = SURPRISE * max((high - low) / USUAL, 1)
         for part in np.array_split(known, max(1, len(known) // PART)):
             if len(part) < PART / 2:
                 continue
             variance = self.noise * (1 + 1 / weight[part]).mean() / len(part) + PART_NOISE**2
-            if abs(surprise[part].mean()) > SURPRISE * math.sqrt(variance):
+            if abs(surprise[part].mean()) > most * math.sqrt(variance):
                 changed.append(part)
         if len(changed) > 1:
             self.table[:, :2] *= CHANGED
@@ -215,8 +219,8 @@ class Evidence:
             total = VARIED_PLACES * VARIANCE + float(squares.sum()) / ALIKE
             variance = total / (VARIED_PLACES + len(log) / ALIKE)
             self.place_variance = min(max(variance, LEAST_VARIANCE), MOST_VARIANCE)
-        # The mean of an exponential is more than 1, as far as drives have shown that places differ.
-        self.surplus = self.place_variance / 2 * len(log) / (VARIED_PLACES * ALIKE + len(log))
+        # The mean of an exponential is more than 1, as far as drives have shown that times differ.
+        self.surplus = (self.place_variance + self.noise) / 2 * len(log) / (FEW_PLACES + len(log))
         sure = log[weight >= KNOWN]
         # Logarithms of how slow the robot is in the open, and where it is fastest.
         quantiles = np.quantile(sure, (0.25, 0.05)) if len(sure) >= SURE_PLACES else np.zeros(2)

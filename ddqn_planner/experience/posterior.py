@@ -24,6 +24,7 @@ CORRELATION = 1.0  # metres: how far the slowness of a place tells of that of ot
 STEP = 0.02  # slowness is told in steps of this share: fields need no repair for less
 ACCURACY = 0.01  # of the log slowness: no place is farther from the solution of its equations
 OVER_RELAXATION = 1.4  # of the solver: neighbours agree sooner
+FEW_PLACES = 8.0  # it is assumed that so many were driven where nothing was slow
 # By how much what all places have in common must change before they are told: noise and variance
 # by a share, logarithms as they are.
 NEWS, NEWS_OF_LOG = 0.1, 0.02
@@ -134,6 +135,7 @@ class Posterior:
         from scipy.sparse.csgraph import connected_components
 
         self.waits[:] = 0
+        known, of_each = self.known, [0.0]
         radius = evidence.wait_radius
         width = max(math.pi / 2 * radius, self.spacing)  # the mean way through a disc
         for position, seconds in evidence.expected_waits():
@@ -143,7 +145,11 @@ class Posterior:
                 near = np.array(self.tree.query_ball_point(self.middle[at], cells))
                 parts = connected_components(self.links[near][:, near])[1]
                 near = near[parts == parts[near == at]]
-                self.waits[near] += seconds * evidence.nominal_speed / width
+                wait = seconds * evidence.nominal_speed / width
+                self.waits[near] += wait
+                of_each.append(wait * known[near].sum())
+        # Robots wait where nobody drove, too; but one place of waits says nothing of others.
+        self.waits += (sum(of_each) - max(of_each)) / (FEW_PLACES + known.sum()) * (1 - known)
 
     def paint(self, exploration: float, fastest: float) -> NDArray[np.float32]:
         """Return (H, W) float32: the slowness over that of the fastest place, which has this log.

@@ -187,6 +187,16 @@ def test_a_place_that_changes_is_learned_anew_at_once() -> None:
     assert at(HALL, experience.slowness(HALL), 7, 2) == pytest.approx(3, rel=0.15)
 
 
+def test_what_is_slow_in_one_direction_alone_is_no_change() -> None:
+    experience = driven(*[straight((2, 2), (12, 2), 3)] * 3)
+    elsewhere = experience.evidence.table[:, 0].copy()
+    for number in range(40):
+        experience.apply(HALL)  # so that it learns how sure expected times are
+        up, down = straight((2, 8), (12, 8), 4), straight((12, 8), (2, 8))
+        experience.record(*(up if number % 4 else down))
+    assert (experience.evidence.table[: len(elsewhere), 0] > 0.9 * elsewhere).all()
+
+
 def test_one_outlier_is_bounded() -> None:
     usual = straight((2, 5), (12, 5))
     seconds = usual[0].copy()
@@ -228,6 +238,17 @@ def test_a_wait_is_not_spread_along_the_way_or_to_other_ways() -> None:
     assert at(HALL, slowness, 7, 5) > 5
     for x, y in ((5.5, 5), (8.5, 5), (7, 6.5)):
         assert at(HALL, slowness, x, y) < 1.3
+
+
+def test_where_robots_wait_at_several_places_they_are_expected_to_wait_elsewhere_too() -> None:
+    open_way, one, other = (
+        driven(*[drive] * 4).slowness(HALL)[:10].mean()
+        for drive in (waited(0.0), waited(20.0), waited(20.0, 4.0))
+    )
+    several = driven(*[waited(20.0), waited(20.0, 4.0)] * 2).slowness(HALL)[:10].mean()
+    assert one == pytest.approx(open_way, rel=0.02)
+    assert other == pytest.approx(open_way, rel=0.02)
+    assert several > 1.1 * open_way
 
 
 def test_a_failure_costs_as_a_wait_and_is_forgotten_where_the_robot_succeeds() -> None:

@@ -9,7 +9,7 @@ from typing import cast
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 from ddqn_planner.grid import MoveRule
@@ -86,13 +86,16 @@ def test_one_unit_serves_the_quarter_turns_of_a_primitive(motion: str) -> None:
 
 
 @given(st.integers(0, 2**32 - 1), st.floats(-3, 1), st.sampled_from(["weight", "threshold"]))
+@example(0, -6e-8, "weight")
 def test_a_damaged_robot_is_refused_or_right(seed: int, exponent: float, name: str) -> None:
     network, random = exact(), np.random.default_rng(seed)
     network.tensors[name].flat[random.integers(network.tensors[name].size)] += (
         random.choice([-1, 1]) * 10**exponent
     )
     certificate = network.certificate()
-    assert certificate.proved == is_right(network) == (certificate.margin > 0)
+    assert certificate.proved == (certificate.margin > 0)
+    # A margin that float32 sums may make up for proves nothing, even if they happen to be right.
+    assert certificate.proved == is_right(network) or -1e-4 < certificate.margin <= 0
     if not certificate.proved:
         with pytest.raises(ModelFileError, match=r"not proved: .*train-robot"):
             network.swept()
