@@ -39,7 +39,7 @@ def exit_code(program: str, run: Callable[[], int]) -> int:
     """Return what a program returns, or 2 after a line that names its error."""
     try:
         return run()
-    except (OSError, ValueError, ImportError, MemoryError) as error:
+    except (OSError, ValueError, ImportError, MemoryError, OverflowError) as error:
         print(f"{program}: {with_remedy(error)}", file=sys.stderr)
         return 2
 

@@ -42,7 +42,7 @@ def plan(parser: argparse.ArgumentParser, arguments: Sequence[str]) -> int:
         ("tolerance", 0.0, "how far a goal that is occupied or cut off may move, metres"),
         ("start-clearing-radius", 0.0, "obstacles so near an occupied start do not count, metres"),
         ("yaw-tolerance", 0.0, "body: how far such a goal may turn, radians"),
-        ("bound", 1.2, "body: how many times the least cost a path may have, 1 or more"),
+        ("bound", 1.0, "body: how many times the least cost a path may have: more is sooner found"),
     ):
         add(f"--{name}", type=float, default=default, metavar="X", help=words)
     yaws = "body: headings in the map frame, radians"
@@ -165,7 +165,7 @@ def _print_plan(
             print(draw_blocks(grid, plan.cells, *shutil.get_terminal_size()))
         print(*lines, sep="\n")
     else:
-        hint = "" if options.picture or "poses" not in answer else "; --picture shows the body"
+        hint = " for the body; --picture shows it" if "poses" in answer else ""
         print(f"no path: {plan.status.value}{hint}", file=sys.stderr)
 
 

@@ -168,7 +168,7 @@ def test_plan_drives_a_body_as_the_library_and_without_a_collision(
         planner = Planner.load("car")
         assert planner.pose_planner is not None
         body = str(planner.pose_planner.footprint.tolist())
-        plan = planner.plan_poses(grid, start, goal, **asked)
+        plan = planner.plan_poses(grid, start, goal, **{"bound": 1.0, **asked})
         command = ["plan", path, "--model", "car", "--json", "--csv", str(file), *options.split()]
         assert main(command) == (0 if plan.cells else 1)
         answer = json.loads(capsys.readouterr().out)
@@ -190,7 +190,7 @@ def test_plan_drives_a_body_as_the_library_and_without_a_collision(
 def test_plan_tells_how_a_body_drives_or_why_it_cannot(rooms: Any, capsys: Any) -> None:
     command = ["plan", rooms[1], "--model", "car"]
     assert main(command) == 0
-    words = r"\d\.\d\d m, \d+ poses, at most 1\.\d{3} times the least cost, planned in \d+\.\d ms\n"
+    words = r"\d\.\d\d m, \d+ poses, at most 1\.000 times the least cost, planned in \d+\.\d ms\n"
     assert re.fullmatch(words, capsys.readouterr().out)
     for options, reason in (
         ("--start 64 10", "the start is occupied"),
@@ -199,7 +199,7 @@ def test_plan_tells_how_a_body_drives_or_why_it_cannot(rooms: Any, capsys: Any) 
         ("--goal 112 -1", "the goal lies outside the map"),
     ):
         assert main([*command, *options.split()]) == 1
-        assert capsys.readouterr().err == f"no path: {reason}; --picture shows the body\n"
+        assert capsys.readouterr().err == f"no path: {reason} for the body; --picture shows it\n"
 
 
 @pytest.mark.parametrize(

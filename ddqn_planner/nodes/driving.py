@@ -139,7 +139,8 @@ class Driving:
         self._published = node.create_publisher(UInt8MultiArray, "~/experience", LATCHED)
         self._slowness = node.create_publisher(OccupancyGrid, "~/slowness", LATCHED)
         frames, names = Frames(node), node.value("robots") or [""]
-        self._robots = [DrivingRobot(node, frames, name, self._on_drive) for name in names]
+        robots = dict.fromkeys(names)  # one that is named twice drives once
+        self._robots = [DrivingRobot(node, frames, name, self._on_drive) for name in robots]
         node.create_timer(1.0, self._publish_diagnostics, clock=STEADY)
         node.create_timer(0.1, self._show_slowness, clock=STEADY)
         node.create_timer(RETRY_PERIOD, self._retry, clock=STEADY)

@@ -47,7 +47,6 @@ class PlannerNode(ManagedNode):
         super().__init__("planner", PLANNER_PARAMETERS)
         self._settings = self.settings()
         self._looks = self.create_timer(LOOK_PERIOD, self._on_look, clock=STEADY)
-        self._is_look_near = True
         self._report = Report(self, self._look_soon)
         self._worker, self._map_worker = Worker(self), Worker(self)
         self._model = ModelSource(self, self._report, self._worker)
@@ -323,9 +322,9 @@ class PlannerNode(ManagedNode):
 
     def _look_soon(self, is_near: bool = True) -> None:
         """Look at what changed, or may have come, in `LOOK_PERIOD`, or else in `IDLE_PERIOD`."""
-        if is_near != self._is_look_near:  # a timer that is reset wakes the node
-            period, self._is_look_near = LOOK_PERIOD if is_near else IDLE_PERIOD, is_near
-            self._looks.timer_period_ns = 1e9 * period
+        nanoseconds = int(1e9 * (LOOK_PERIOD if is_near else IDLE_PERIOD))
+        if self._looks.timer_period_ns != nanoseconds:  # a timer that is reset wakes the node
+            self._looks.timer_period_ns = nanoseconds
             self._looks.reset()
 
     def _on_look(self) -> None:

@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 
+import numpy as np
 from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from geometry_msgs.msg import PoseStamped
@@ -91,7 +92,8 @@ def reason_of(
         if plan.status is PlanStatus.START_OCCUPIED and clearing:
             reason += f", deeper than the start_clearing_radius, {cleared}"
         return f"{reason}; {remedy}"
-    number = f" to goal {goals.index(plan.goal) + 1} of {len(goals)}" if len(goals) > 1 else ""
+    several = len(goals) > 1
+    number = f" to goal {reached(request, plan) + 1} of {len(goals)}" if several else ""
     how = "by greedy steps"
     if isinstance(plan, PosePlan):
         how = f"by greedy steps, of at most {plan.bound:.3g} times the least cost"
@@ -100,13 +102,20 @@ def reason_of(
     reason = f"a path of {plan.length:.2f} cells{number}, {how}"
     if plan.extra_cost:
         reason += f", kept: its cost is {plan.extra_cost:+.1%} beside that of a new one"
-    if plan.goal is not None and plan.goal not in goals:
+    if plan.goal is not None and plan.goal not in goals and not several:
         metres = math.dist(plan.goal, goals[0]) * grid.resolution
         why = "is cut off" if grid.is_free(goals[0]) else "is occupied"
         reason += f"; the goal {why} and moved {metres:.3g} m"
     if grid.is_obstacle(plan.path[0]):
         reason += f"; the start is occupied: obstacles within {cleared} of it were ignored"
     return reason
+
+
+def reached(request: Request, plan: Plan) -> int:
+    """Return which of several goals a plan leads to, from 0: a path that is kept ends beside it."""
+    if plan.goal is None:
+        return 0
+    return int(np.argmin([math.dist(cell, plan.goal) for cell in request.cells[1:]]))
 
 
 def _place(stamped: PoseStamped, cell: Cell) -> str:

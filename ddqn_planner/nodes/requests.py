@@ -25,7 +25,15 @@ from ddqn_planner.model.certificate import NO_CERTIFICATE
 from ddqn_planner.nodes.conversions import bytes_of, cell_from_pose, label_of, pose_of, turns
 from ddqn_planner.nodes.map_source import MapSource
 from ddqn_planner.nodes.poses import Frames, StartSource
-from ddqn_planner.nodes.report import Outcome, Report, Request, RequestError, reason_of, seconds
+from ddqn_planner.nodes.report import (
+    Outcome,
+    Report,
+    Request,
+    RequestError,
+    reached,
+    reason_of,
+    seconds,
+)
 from ddqn_planner.nodes.runtime import BaseNode, Worker
 from ddqn_planner.planning import Plan, PlanMethod, Planner, PlanRequest, PlanStatus
 from ddqn_planner.planning.field import shift_between
@@ -305,9 +313,7 @@ class Requests:
             request = request.after(plans[-1], goal)
             plans.append(await self._plan(planner, request))
         plan, number = joined(plans), len(plans)
-        before, goal = poses[number - 1 : number + 1]
-        if len(request.goals) > 1 and plan.goal in request.cells[1:]:
-            goal = poses[1 + request.cells[1:].index(plan.goal)]
+        before, goal = poses[number - 1], poses[number + reached(request, plan)]
         reason = reason_of(request, plan, before, goal, settings.robot_radius)
         if more and not len(plan.path):
             reason = f"goal {number} of {len(goals)}: {reason}"

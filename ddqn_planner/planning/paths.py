@@ -204,14 +204,14 @@ def keep_or_switch(request: PlanRequest, new: Path) -> tuple[Path, float | None]
     rest = rest_of_path(request.under_way, (x, y), grid, rule)
     if not len(rest) or rest[-1].tolist() not in [new[-1].tolist(), *map(list, request.goals)]:
         return new, None
-    if request.simplified:
-        rest = straightened(rest, grid, rule)
-    if np.array_equal(rest, new):
-        return new, 0.0
-    cost, new_cost = (cost_along(path, grid, rule) for path in (rest, new))
-    if cost > (1 + request.switch_threshold) * new_cost * SAME_COST:
+    way = straightened(rest, grid, rule) if request.simplified else rest
+    stands, cost, new_cost = (cost_along(path, grid, rule) for path in (rest, way, new))
+    most = (1 + request.switch_threshold) * new_cost * SAME_COST
+    if cost > most:
         return new, None
-    return rest, cost / new_cost - 1
+    if stands > most:  # it was pulled straight through what has opened: that is a new path
+        return way, None
+    return way, cost / new_cost - 1 if new_cost else 0.0
 
 
 def _legal_from(cells: Path, grid: GridMap, move_rule: MoveRule | str, begin: float = 0.0) -> int:

@@ -11,13 +11,18 @@ from numpy.typing import DTypeLike, NDArray
 from ddqn_planner.grid import GridMap
 from ddqn_planner.grid.motions import HEADINGS
 from ddqn_planner.planning import pose_kernels as kernels
-from ddqn_planner.planning.pose_kernels import Aim, Known
+from ddqn_planner.planning.pose_guide import Aim, spread
+from ddqn_planner.planning.pose_kernels import Known
 from ddqn_planner.planning.pose_world import TILE, Body, State, World
 
 NO_RESERVE = getattr(mmap, "MAP_NORESERVE", 0x4000)  # not in all versions of Python
 HEAP = 2**14  # entries of a heap, at first
 TAKEN_BACK = 4  # of so many visited states a repair takes one back; else a new field is quicker
 UNGUIDED = 2**14  # states that are visited before a look at the map pays
+GUIDED = 2**16  # and before one at where the body can turn: elsewhere a way is often a dead end
+NARROW = 5  # times as much counts what is left there
+FIRST = 1.2  # a first path is looked for as if with this bound, if a smaller one is asked for
+NOTHING = np.empty(0, np.float32)
 GREEDY = 1.5  # the first round's weight is the bound to the power of this: mostly that will do
 FURTHER = 1.5  # times the way to the goal that the look at the map goes
 
@@ -35,10 +40,12 @@ def _untouched(count: int, dtype: DTypeLike) -> NDArray[Any]:
 class PoseField:
     """The least costs that are known from poses to the nearest of some goals."""
 
-    # Grown from the goals toward a start, in rounds of weighted A* that close a state once (ARA*,
-    # Likhachev et al. 2003). On a cheapest path to the start lies a state that is open or waits,
-    # and whose cost is the least; else the start's is. So the least cost of one of these, plus what
-    # is left from there at least, is a lower bound, which proves how good the start's cost is.
+    # Grown from the goals toward a start: first by weighted A* that closes a state once, as the
+    # rounds of ARA* do (Likhachev et al. 2003). If the bound is not proved then, by Dijkstra's
+    # order, without what is too far from the start to lead to a path that would disprove it. On a
+    # cheapest path to the start lies a state that is open or waits, and whose cost is the least;
+    # else the start's is. So the least cost of one of these, plus what is left from there at least,
+    # is a lower bound, which proves how good the start's cost is.
 
     def __init__(self, goals: tuple[State, ...], grid: GridMap, world: World, body: Body) -> None:
         self.goals, self.grid, self.world, self.body = goals, grid, world, body
@@ -49,7 +56,7 @@ class PoseField:
         self._keys, self._numbers = np.empty(entries, np.float32), np.empty(entries, np.int64)
         self._numbers[: len(goals)] = [self.number(goal) for goal in goals]
         self.known.mark[self._numbers[: len(goals)]] = kernels.OPEN
-        self._aim, self._weight = Aim(0, 0, -1, np.empty(0, np.float32)), 0.0
+        self._aim, self._weight = Aim(0, 0, -1, NOTHING, NOTHING), 0.0
         self.visits = 0
 
     def number(self, state: State) -> int:
@@ -60,28 +67,30 @@ class PoseField:
         """Grow until the cost from a start is known within a bound, or known not to exist."""
         number = self.number(start)
         if number != self._aim.number:
-            self._aim = Aim(*start[:2], number, np.empty(0, np.float32))
-            self._weight, self._tried = 0.0, 0
-        if not bound <= self._weight <= bound**GREEDY:
-            self._weight = bound**GREEDY
+            self._aim = Aim(*start[:2], number, NOTHING, NOTHING)
+            self._weight, self._tried = max(bound, FIRST) ** GREEDY, 0
             self._order()
         while True:
-            most = limit if self._aim.left.size else min(limit, UNGUIDED - self._tried)
-            visits, done = self._grow(most)
+            looks = (self._aim.left.size > 0) + (self._aim.guide is not self._aim.left)
+            until = (UNGUIDED, GUIDED if self._weight else np.inf, np.inf)[looks]
+            most = int(min(limit, until - self._tried))
+            visits, done = self._grow(most, 1 / bound)
             limit, self._tried = limit - visits, self._tried + visits
             if done:
                 if self.bound(number) <= bound * kernels.SAME or not len(self._open()):
                     return True
-                self._weight = bound
+                self._weight = 0.0
                 self._order()
             elif limit == 0:
                 return False
             elif visits < most:
                 self._reserve(2 * len(self._keys))
-            elif not self._can_leave(number) or not self._guide():
+            elif looks == 1:
+                self._guide(NARROW)
+            elif not self._can_leave(number) or not self._guide(1):
                 return True
 
-    def _grow(self, limit: int) -> tuple[int, bool]:
+    def _grow(self, limit: int, share: float) -> tuple[int, bool]:
         """Visit so many states, or fewer; return how many, and whether the round is over."""
         self._size, self._waiting, visits, done = kernels.grow(
             self.known,
@@ -91,6 +100,7 @@ class PoseField:
             self._waiting,
             self._aim,
             self._weight,
+            share,
             kernels.CLOSED + self._round,
             limit,
             self.world,
@@ -112,7 +122,7 @@ class PoseField:
         mark, queue = _untouched(self.known.mark.size, np.uint8), np.empty(UNGUIDED, np.int64)
         return bool(kernels.leads_to(number, mark, queue, self.world, self.body) == len(queue))
 
-    def _guide(self) -> bool:
+    def _guide(self, narrow: int) -> bool:
         """Look at the map for what is left to the start; return whether a way may exist."""
         columns, rows = (self.world.width + 7) // TILE, (self.world.height + 7) // TILE
         left = np.empty((columns + 1) * (rows + 1), np.float32)
@@ -121,8 +131,8 @@ class PoseField:
         x, y, _ = np.array(self.goals).T // TILE
         goals = np.unique(y * (columns + 1) + x)
         heap = left, keys, numbers
-        kernels.spread(*heap, self._aim, goals, FURTHER, self.world, self.body)
-        self._aim = self._aim._replace(left=left)
+        spread(*heap, self._aim, goals, FURTHER, narrow, self.world, self.body)
+        self._aim = self._aim._replace(guide=left, left=left if narrow == 1 else self._aim.left)
         self._order()
         return bool(np.isfinite(left[goals]).any())
 

@@ -2,30 +2,22 @@
 
 from __future__ import annotations
 
-import math
 from typing import Any, Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ddqn_planner.compiled import in_place, inlined
-from ddqn_planner.planning.pose_world import TILE, Body, World, cost_of, is_possible, is_way
+from ddqn_planner.planning.pose_guide import Aim, push, sink, way_left
+from ddqn_planner.planning.pose_world import Body, World, cost_of, is_possible
 
 # A state is a cell and one of 16 headings. Its number counts headings, then the cells of a tile of
 # 8 x 8, then tiles: so what a request visits lies on few pages of memory, 4 bytes a distance.
 # Marks. Before a state is reached, its distance has no meaning. One that got cheaper after it was
-# closed waits for the next round. From CLOSED on, a mark tells the round in which it was closed.
+# closed, or that is too far from the start, waits for the next round. From CLOSED on, a mark tells
+# the round in which it was closed.
 UNREACHED, OPEN, WAITING, CLOSED, ROUNDS = 0, 1, 2, 3, 250
 SAME: Final = 1 + 1e-6  # what is rounded in sums of float32 is less
-
-
-class Aim(NamedTuple):
-    """Where a field grows to: a start, and what is left to it at least, from corners of tiles."""
-
-    x: int
-    y: int
-    number: int
-    left: NDArray[np.float32]  # (corners,) in cells, row by row; empty for the straight way alone
 
 
 class Known(NamedTuple):
@@ -51,117 +43,6 @@ def place_of(number: int, width: int) -> tuple[int, int, int]:
     return x, (row << 3) | ((number >> 7) & 7), number & 15
 
 
-@inlined
-def way_left(x: int, y: int, aim: Any, columns: int) -> float:
-    """Return a lower bound of the cost from a cell to the start, in cells."""
-    best = math.sqrt((x - aim.x) * (x - aim.x) + (y - aim.y) * (y - aim.y))
-    if aim.left.size > 0:
-        tile_x, tile_y = x >> 3, y >> 3
-        for row in range(2):
-            for column in range(2):
-                there = aim.left[(tile_y + row) * (columns + 1) + tile_x + column]
-                if there > best:
-                    over, up = x + 0.5 - 8 * (tile_x + column), y + 0.5 - 8 * (tile_y + row)
-                    there -= math.sqrt(over * over + up * up)
-                    if there > best:
-                        best = there
-    return best
-
-
-# The heap: the first `size` of an array of keys and one of states, the least key first.
-
-
-@inlined
-def push(key: Any, number: int, keys: Any, numbers: Any, size: int) -> int:
-    """Add an entry; return the new size."""
-    place = size
-    while place > 0:
-        parent = (place - 1) >> 2
-        if keys[parent] <= key:
-            break
-        keys[place], numbers[place] = keys[parent], numbers[parent]
-        place = parent
-    keys[place], numbers[place] = key, number
-    return size + 1
-
-
-@inlined
-def sink(key: Any, number: int, place: int, keys: Any, numbers: Any, size: int) -> None:
-    """Put an entry where it belongs, at a place or below it."""
-    while True:
-        least, first = place, 4 * place + 1
-        best = key
-        for child in range(first, first + 4 if first + 4 < size else size):
-            if keys[child] < best:
-                least, best = child, keys[child]
-        if least == place:
-            break
-        keys[place], numbers[place] = best, numbers[least]
-        place = least
-    keys[place], numbers[place] = key, number
-
-
-# A lower bound from the map. Around each cell that the robot's origin passes, its core has room: so
-# the origin stays in tiles where it has. A shortest way in them bends at corners only, and each
-# straight part has a way over corners and diagonals of the same tiles that is longer by `LONGER` at
-# most, if a diagonal counts 7/5.
-
-STRAIGHT, DIAGONAL = 5, 7
-LONGER: Final = math.sqrt(1 + (DIAGONAL / STRAIGHT - 1) ** 2)
-
-
-@in_place
-def spread(
-    left: NDArray[np.float32],
-    keys: Any,
-    numbers: Any,
-    aim: Aim,
-    goals: NDArray[np.int64],
-    further: float,
-    world: World,
-    body: Body,
-) -> None:
-    """Write what is left from corners of tiles to a start, infinite where no way leads."""
-    columns, rows = (world.width + 7) >> 3, (world.height + 7) >> 3
-    size, end, limit = 0, 0.0, np.inf
-    left[:] = np.inf
-    for corner in range(4):
-        number = ((aim.y >> 3) + (corner >> 1)) * (columns + 1) + (aim.x >> 3) + (corner & 1)
-        left[number] = 0
-        size = push(np.float32(0), number, keys, numbers, size)
-    while size > 0 and keys[0] <= limit:
-        here, number = keys[0], numbers[0]
-        end = here
-        size -= 1
-        if size > 0:
-            sink(keys[size], numbers[size], 0, keys, numbers, size)
-        if here > left[number]:
-            continue
-        for goal in goals:
-            if number == goal and limit == np.inf:
-                limit = further * here
-        y = number // (columns + 1)
-        x = number - y * (columns + 1)
-        for step_y in range(-1, 2):
-            for step_x in range(-1, 2):
-                if step_x == 0 and step_y == 0:
-                    continue
-                after_x, after_y = x + step_x, y + step_y
-                if after_x < 0 or after_y < 0 or after_x > columns or after_y > rows:
-                    continue
-                after = after_y * (columns + 1) + after_x
-                cost = here + (STRAIGHT if step_x == 0 or step_y == 0 else DIAGONAL)
-                if cost >= left[after]:
-                    continue
-                if is_way(x, y, step_x, step_y, world, body):
-                    left[after] = cost
-                    size = push(np.float32(cost), after, keys, numbers, size)
-    for number in range(left.size):
-        # What was not reached is no nearer than where it ended.
-        value = left[number] if left[number] < end or size == 0 else end
-        left[number] = value * (TILE / STRAIGHT / LONGER) - math.sqrt(2.0) * TILE
-
-
 @in_place
 def order(
     known: Known, keys: Any, numbers: Any, size: int, aim: Aim, weight: float, world: World
@@ -178,11 +59,19 @@ def order(
         number = numbers[place]
         known.mark[number] = OPEN
         x, y, _ = place_of(number, world.width)
-        far = way_left(x, y, aim, (world.width + 7) >> 3)
+        far = way_left(x, y, aim, aim.guide, (world.width + 7) >> 3)
         keys[place] = known.distance[number] + weight * far
     for place in range((kept - 2) >> 2, -1, -1):
         sink(keys[place], numbers[place], place, keys, numbers, kept)
     return kept
+
+
+@inlined
+def let_wait(number: int, mark: Any, numbers: Any, waiting: int) -> int:
+    """Let a state wait for the next round; return how many do."""
+    mark[number] = WAITING
+    numbers[numbers.size - waiting - 1] = number
+    return waiting + 1
 
 
 @in_place
@@ -194,6 +83,7 @@ def grow(
     waiting: int,
     aim: Aim,
     weight: float,
+    share: float,
     closed: int,
     limit: int,
     world: World,
@@ -202,9 +92,11 @@ def grow(
     """Close states in their order until that of a start is known; see `PoseField`."""
     # Returns the heap's size, how many wait, the visits, and whether it is done: the order of the
     # next state is not below the start's distance. Those that wait lie at the end of the arrays.
+    # Without a weight, no state can lead to a path of less than a share of the known one's cost.
     distance, mark = known.distance, known.mark
     width, height = world.width, world.height
     target, most, visits = aim.number, keys.size - 2 * body.start.size, 0
+    columns = (width + 7) >> 3
     while size > 0:
         key = keys[0]
         if mark[target] != UNREACHED and key >= distance[target]:
@@ -217,10 +109,14 @@ def grow(
             sink(keys[size], numbers[size], 0, keys, numbers, size)
         if mark[number] != OPEN:
             continue
-        mark[number] = closed
-        visits += 1
         x, y, heading = place_of(number, width)
         here = distance[number]
+        enough = share * distance[target] if weight == 0 and mark[target] != UNREACHED else np.inf
+        if enough < np.inf and here + way_left(x, y, aim, aim.left, columns) >= enough:
+            waiting = let_wait(number, mark, numbers, waiting)
+            continue
+        mark[number] = closed
+        visits += 1
         for place in range(body.into[heading], body.into[heading + 1]):
             primitive = body.ending[place]
             column, line = x - body.offset[primitive, 0], y - body.offset[primitive, 1]
@@ -235,15 +131,13 @@ def grow(
             if found == np.inf or (mark[before] != UNREACHED and found >= distance[before]):
                 continue
             distance[before] = found
-            if mark[before] == closed:
-                mark[before] = WAITING
-                waiting += 1
-                numbers[numbers.size - waiting] = before
-            if mark[before] == WAITING:
-                continue
-            mark[before] = OPEN
-            far = way_left(column, line, aim, (width + 7) >> 3)
-            size = push(np.float32(found + weight * far), before, keys, numbers, size)
+            far = way_left(column, line, aim, aim.guide if weight > 0 else aim.left, columns)
+            if mark[before] == closed or found + far >= enough:
+                if not OPEN <= mark[before] <= WAITING:
+                    waiting = let_wait(before, mark, numbers, waiting)
+            elif mark[before] != WAITING or weight == 0:
+                mark[before] = OPEN
+                size = push(np.float32(found + weight * far), before, keys, numbers, size)
     return size, waiting, visits, True
 
 
@@ -254,7 +148,7 @@ def least_order(known: Known, numbers: Any, aim: Aim, world: World) -> float:
     for number in numbers:
         if OPEN <= known.mark[number] <= WAITING and known.distance[number] < least:
             x, y, _ = place_of(number, world.width)
-            far = way_left(x, y, aim, (world.width + 7) >> 3)
+            far = way_left(x, y, aim, aim.left, (world.width + 7) >> 3)
             if known.distance[number] + far < least:
                 least = known.distance[number] + far
     return least

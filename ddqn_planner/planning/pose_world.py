@@ -39,6 +39,7 @@ class Body(NamedTuple):
     first_passed: NDArray[np.int64]  # (P + 1,)
     reach: int  # cells that a primitive sweeps to any side, at most
     core: int  # the rows from here on: what it sweeps around any cell that its origin passes
+    turn: int  # and from here on: where it stands with any heading
 
 
 class World(NamedTuple):
@@ -51,6 +52,7 @@ class World(NamedTuple):
     forbidden: NDArray[np.uint8]  # (H, W)
     tile: NDArray[np.uint8]  # (T,): whether the body can reach an occupied cell, once it is known
     room: NDArray[np.uint8]  # (T,): whether the body's core has room in one of its cells, likewise
+    turns: NDArray[np.uint8]  # (T,): whether the body has room there with any heading, likewise
     height: int
     width: int
 
@@ -70,7 +72,8 @@ def body_of(motions: Motions, swept: NDArray[np.bool_]) -> Body:
         standing[after] &= np.roll(mask, (-y, -x), axis=(0, 1))
         for over, up, _ in cells:
             core &= np.roll(mask, (-up, -over), axis=(0, 1))
-    row, first = rows_of(np.concatenate([swept, standing, core]))
+    turn = standing.any(axis=0, keepdims=True)
+    row, first = rows_of(np.concatenate([swept, standing, core, turn]))
     ending = np.argsort(end, kind="stable")
     return Body(
         into=np.searchsorted(end[ending], headings),
@@ -81,12 +84,13 @@ def body_of(motions: Motions, swept: NDArray[np.bool_]) -> Body:
         offset=motions.offset,
         cost=motions.cost,
         row=row,
-        first=first[:-1],
+        first=first[:-2],
         passed=np.concatenate([cells for cells, _ in passed]),
         share=np.concatenate([share for _, share in passed]).astype(np.float32),
         first_passed=np.cumsum([0, *(len(share) for _, share in passed)]),
         reach=int(np.abs(np.vstack([row[:, :2], [(0, sum(r) - 1) for r in row[:, 1:]]])).max()),
-        core=int(first[-2]),
+        core=int(first[-3]),
+        turn=int(first[-2]),
     )
 
 
@@ -132,30 +136,30 @@ def world_of(
     words = (width + 2 * BORDER + 63) // 64 + 1
     bits = np.full((height + 2 * BORDER, words), -1, np.int64) if older is None else older.bits
     bits = bits.view(np.uint64).copy()
-    tile = np.zeros(((height + TILE - 1) // TILE, (width + TILE - 1) // TILE), dtype=np.uint8)
-    room = tile.copy()
+    looks = np.zeros((3, (height + TILE - 1) // TILE, (width + TILE - 1) // TILE), dtype=np.uint8)
     (left, bottom), (right, top) = (0, 0), (width, height)
     if older is not None and cells is not None:
         (left, bottom), (right, top) = cells.min(axis=0), cells.max(axis=0) + 1
-        tile[:] = older.tile.reshape(tile.shape)
-        room[:] = older.room.reshape(tile.shape)
+        looks[:] = np.reshape((older.tile, older.room, older.turns), looks.shape)
     line = np.ones((top - bottom, 64 * words), dtype=np.bool_)
     line[:, BORDER : BORDER + width] = occupied[bottom:top]
     packed = np.packbits(line, axis=1, bitorder="little").view("<u8")
     bits[BORDER + bottom : BORDER + top] = packed
-    near = tuple(
+    rows, columns = (
         slice(max(first - BORDER, 0) // TILE, (last + BORDER) // TILE + 1)
         for first, last in ((bottom, top), (left, right))
     )
-    tile[near] = room[near] = 0
+    looks[:, rows, columns] = 0
+    tile, room, turns = looks.reshape(3, -1)
     return World(
         bits,
         _layer(body_costs(grid), np.int8),
         MULTIPLIERS if grid.cost is None else np.append(MULTIPLIERS, MULTIPLIERS[-1:]),
         _layer(grid.slowness, np.float32),
         _layer(grid.forbidden, np.uint8),
-        tile.ravel(),
-        room.ravel(),
+        tile,
+        room,
+        turns,
         height,
         width,
     )
@@ -268,33 +272,3 @@ def is_possible(x: int, y: int, number: int, world: Any, body: Any) -> bool:
     """Return whether the body can take a primitive from a cell."""
     first, last = body.first[number], body.first[number + 1]
     return is_far(x, y, world, body) or not touches(world.bits, x, y, body.row, first, last)
-
-
-@inlined
-def has_room(tile_x: int, tile_y: int, world: Any, body: Any) -> bool:
-    """Return whether the body's core has room in a tile; looks at most once."""
-    tile = tile_y * ((world.width + 7) >> 3) + tile_x
-    if world.room[tile] == 0:
-        found = 2
-        for cell in range(64):
-            # From the middle on: most tiles have room there.
-            x, y = 8 * tile_x + ((cell & 7) ^ 4), 8 * tile_y + ((cell >> 3) ^ 4)
-            inside = x < world.width and y < world.height
-            if inside and not touches(world.bits, x, y, body.row, body.core, body.row.shape[0]):
-                found = 1
-                break
-        world.room[tile] = found
-    return bool(world.room[tile] == 1)
-
-
-@inlined
-def is_way(x: int, y: int, step_x: int, step_y: int, world: Any, body: Any) -> bool:
-    """Return whether a step from a corner leads through a tile with room, or along its side."""
-    columns, rows = (world.width + 7) >> 3, (world.height + 7) >> 3
-    for side in range(2):
-        tile_x = x + (step_x - 1) // 2 if step_x != 0 else x - side
-        tile_y = y + (step_y - 1) // 2 if step_y != 0 else y - side
-        is_inside = 0 <= tile_x < columns and 0 <= tile_y < rows
-        if is_inside and has_room(tile_x, tile_y, world, body):
-            return True
-    return False

@@ -323,7 +323,7 @@ def test_a_fleet_teaches_one_trainer_and_each_robot_plans_by_all(
     torch = f'raise ModuleNotFoundError("{missing}", name="torch")'
     sites = [Site(make_client("/fleet"), folder, name) for name in names]
     with run_trainer(
-        folder, "/fleet", exit_code=-signal.SIGKILL, robots=names, torch=torch
+        folder, "/fleet", exit_code=-signal.SIGKILL, robots=[*names, "one"], torch=torch
     ) as node:
         ways = [*zip(sites, (UPPER, UPPER[::-1], LOWER), (0.5, 0.5, 0.1), strict=True)]
         for site, way, speed in ways:

@@ -20,6 +20,7 @@ from visualization_msgs.msg import Marker, MarkerArray
 
 from ddqn_planner.grid import Cell, GridMap
 from ddqn_planner.nodes.planner_node import PlannerNode
+from ddqn_planner.nodes.report import seconds
 from ddqn_planner.nodes.runtime import LATCHED
 
 CELL, ORIGIN = 0.1, (-1.0, 2.0, 0.5)
@@ -148,13 +149,27 @@ def test_the_nearest_pose_counts_and_services_are_answered(robot: Robot) -> None
     robot.wait_for_reason(f"{why}; set the start where the robot's body has room$")
 
 
+def test_a_path_to_one_of_several_goals_is_kept_on_a_map_with_other_cells(robot: Robot) -> None:
+    robot.set(switch_threshold=1.0)
+    goals = [pose(robot.grid, cell, 0.5, offset=0.04).pose for cell in (BEYOND, BESIDE)]
+    robot.client.publish("goal_poses", PoseArray(header=Header(frame_id="map"), poses=goals))
+    robot.wait_for_reason("to goal 2 of 2")
+    x, y, yaw = ORIGIN
+    for share in (0.2, 0.4, 0.6, 0.8):
+        moved = GridMap(robot.values > 0, CELL, (x - share * CELL, y - share * CELL, yaw))
+        message = map_message(robot.values, moved, next(NUMBERS))
+        robot.send_map(message)
+        stamp = {"planned on the map of (s)": seconds(message.header.stamp)}
+        assert "to goal 2 of 2" in robot.wait_for_reason("", stamp).message
+    robot.send_map()
+
+
 def test_a_car_turns_by_driving_back(robot: Robot, models: Any) -> None:
     robot.set(model=models.ackermann)
     behind = START[0] + 2, START[1]
     robot.send_goal(at(robot, behind, 0.5 + math.pi))
     poses = path_to(robot, behind, 0.5 + math.pi)
     back = drives_back(poses)
-    print(back.sum(), len(back))
     assert 0 < back.sum() < len(back)
 
 
