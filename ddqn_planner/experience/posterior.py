@@ -24,7 +24,7 @@ CORRELATION = 1.0  # metres: how far the slowness of a place tells of that of ot
 STEP = 0.02  # slowness is told in steps of this share: fields need no repair for less
 ACCURACY = 0.01  # of the log slowness: no place is farther from the solution of its equations
 OVER_RELAXATION = 1.4  # of the solver: neighbours agree sooner
-FEW_PLACES = 8.0  # it is assumed that so many were driven where nothing was slow
+FEW_PLACES = 16.0  # it is assumed that so many were driven where nothing was slow
 # By how much what all places have in common must change before they are told: noise and variance
 # by a share, logarithms as they are.
 NEWS, NEWS_OF_LOG = 0.1, 0.02
