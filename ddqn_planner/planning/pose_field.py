@@ -114,8 +114,8 @@ class PoseField:
         if self.known.mark[number] == kernels.UNREACHED:
             return np.inf
         cost = float(self.known.distance[number])
-        self.least = min(kernels.least_order(self.known, self._open(), self._aim, self.world), cost)
-        return cost / self.least if self.least else 1.0
+        least = min(kernels.least_order(self.known, self._open(), self._aim, self.world), cost)
+        return cost / least if least else 1.0
 
     def _can_leave(self, number: int) -> bool:
         """Return whether primitives lead from the start to more than a few states."""
@@ -197,8 +197,3 @@ class PoseField:
         self._size = kernels.look_again(self.known, found, *heap, world, self.body)
         self._aim = self._aim._replace(number=-1)  # what is ordered, and left, is another
         return True
-
-    @property
-    def nbytes(self) -> int:
-        """Memory that was touched, at least, bytes."""
-        return 5 * self.visits + self._keys.nbytes + self._numbers.nbytes
