@@ -132,6 +132,22 @@ def test_what_the_map_tells_changes_no_least_path(seed: int, monkeypatch: Any) -
     assert few == pytest.approx(many, rel=1e-5)
 
 
+def test_what_was_far_from_obstacles_is_looked_at_again_when_one_comes() -> None:
+    motions, _ = robot("differential")
+    grid = GridMap(np.zeros((100, 160), np.bool_), CELL)
+    start, goal = (pose_of(grid, motions, state) for state in ((40, 50, 0), (120, 50, 0)))
+    body = planner("differential")
+    free = plan(body, grid, start, goal, bound=1.0)
+    box = grid.with_patch(np.ones((12, 4), np.bool_), 78, 44)
+    for changed in (box, grid):
+        found = plan(body, changed, start, goal, bound=1.0)
+        fresh = plan(planner("differential"), changed, start, goal, bound=1.0)
+        assert found.cost == pytest.approx(fresh.cost, rel=1e-5)
+    assert found.cost == pytest.approx(free.cost, rel=1e-5)
+    around = plan(body, box, start, goal, bound=1.0)
+    assert (around.cost or 0) > (free.cost or 0) + 1
+
+
 def placed(body: shapely.Polygon, pose: NDArray[np.float64]) -> shapely.Polygon:
     x, y, yaw = pose
     turned = shapely.affinity.rotate(body, yaw, origin=(0, 0), use_radians=True)
