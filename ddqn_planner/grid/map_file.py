@@ -14,7 +14,6 @@ from typing import Any
 import numpy as np
 import yaml
 from numpy.typing import NDArray
-from PIL import Image
 
 from ddqn_planner.files import as_path, write_atomically
 from ddqn_planner.grid.arguments import OCCUPIED, UNKNOWN, Cell, cell_inside, numbers
@@ -254,6 +253,8 @@ def _read_image(
     path: Path, document: dict[str, Any], key: str, formats: tuple[str, ...]
 ) -> tuple[NDArray[np.uint8], NDArray[np.bool_], str]:
     """Return an image's grey values, which pixels are not opaque, and the layout of the pixels."""
+    from PIL import Image  # 17 ms, and a planner that is sent its maps reads no image
+
     name = document.get(key)
     if not isinstance(name, str) or not name:
         raise ValueError(f"{key} is {_short(name)}; give the path of an image")
