@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
+from importlib import import_module
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -23,7 +24,6 @@ from ddqn_planner.experience.drives import (
     DriveRecorder,
     read_drives,
 )
-from ddqn_planner.experience.prior import Prior
 from ddqn_planner.grid import GridMap
 from ddqn_planner.nodes.conversions import bytes_message, occupancy_message, path_bytes
 from ddqn_planner.nodes.poses import Frames, listen
@@ -202,8 +202,9 @@ class Driving:
             return
         self._places_of_prior = known
         given = place.grid, evidence.table.copy(), evidence.prior, self._node.value("seed")
+        training = "ddqn_planner.training.prior"  # it imports torch
         try:
-            prior = await self._node.worker.call(prior_of, *given)
+            prior = await self._node.worker.call(lambda: import_module(training).prior_of(*given))
         except Exception as error:  # the node must survive
             if isinstance(error, ImportError):
                 self._node.destroy_timer(self._learning)
@@ -319,16 +320,6 @@ class Driving:
             }
         missing = f"{NO_MAP}, or set map_file" if self._node.map is None else ""
         self._node.publish_diagnostics("driving", values, missing=missing)
-
-
-def prior_of(*given: Any) -> Prior | None:
-    """Import torch in the worker, and train the prior."""
-    import torch
-
-    from ddqn_planner.training import prior
-
-    torch.set_num_threads(1)  # as in `import_training`
-    return prior.prior_of(*given)
 
 
 def explained(error: Exception) -> str:

@@ -123,8 +123,6 @@ class PlannerNode(ManagedNode):
         self._forget()
         self._report.refused.clear()
         self._report.note(NO_REQUEST)
-        if "_frames" in vars(self):
-            self._frames.close()
         self.after_jump_back.clear()
         for name in ("_start", "_frames", "_display", "_map", "_requests"):
             vars(self).pop(name, None)  # not all are there, if `configure` failed

@@ -363,11 +363,10 @@ class TrainerNode(BaseNode):
 
 
 def import_training() -> None:
-    """Import torch and the trainer, and let torch use one thread."""
+    """Import torch and the trainer."""
     with suppress(ImportError):  # without torch, ~/start says what is missing
         torch = importlib.import_module("torch")
         importlib.import_module("ddqn_planner.training.run")
-        torch.set_num_threads(1)  # as fast as two for these networks, and leaves ROS a core
         torch.optim.Adam([torch.zeros(1)])  # the first optimiser imports for a second
 
 
