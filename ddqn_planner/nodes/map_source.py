@@ -242,8 +242,7 @@ def updated_values(message: OccupancyGrid, update: Any) -> NDArray[np.int8]:
     """Return the values that an update puts into the last map, (h, w); ValueError if none fit."""
     frame, map_frame = update.header.frame_id, message.header.frame_id
     if frame != map_frame:
-        both = f"the update's frame is {frame!r}, the map's is {map_frame!r}"
-        raise ValueError(f"{both}; publish both in one frame")
+        raise ValueError(f"the update's frame is {frame!r}, the map's is {map_frame!r}; use one")
     stamp, map_stamp = update.header.stamp, message.header.stamp
     if (0, 0) < (stamp.sec, stamp.nanosec) < (map_stamp.sec, map_stamp.nanosec):
         stamps = f"{seconds(map_stamp)}, is later than the update's, {seconds(stamp)}"
@@ -254,8 +253,7 @@ def updated_values(message: OccupancyGrid, update: Any) -> NDArray[np.int8]:
         place = f"is not inside the map of {info.width} x {info.height}"
         raise ValueError(f"an update of {box} from {(x, y)} {place}; {REMEDY}")
     if len(update.data) != width * height:
-        wrong = f"the update's data has {len(update.data)} values"
-        raise ValueError(f"{wrong}; its {box} need {width * height}")
+        raise ValueError(f"the update has {len(update.data)} values; {box} need {width * height}")
     return np.frombuffer(update.data, np.int8).reshape(height, width)
 
 
