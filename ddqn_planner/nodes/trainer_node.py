@@ -307,7 +307,7 @@ class TrainerNode(BaseNode):
             return False, f"{NO_MAP} first"
         frames = (places[: n + 1] for places in episodes for n in range(len(places)))
 
-        def problem() -> str:
+        def draw_next() -> str:  # it returns why it cannot
             try:
                 draw(place, next(frames))
             except StopIteration:
@@ -316,13 +316,14 @@ class TrainerNode(BaseNode):
                 return f"no recorded episodes ({error}); call ~/start first"
             return ""
 
-        if reason := problem():
+        def step() -> None:
+            if draw_next():
+                self.stop_replay()
+
+        if reason := draw_next():
             return False, reason
         self.stop_replay()
-        period = self.value("replay_period")
-        self.replaying = self.create_timer(
-            period, lambda: problem() and self.stop_replay(), clock=STEADY
-        )
+        self.replaying = self.create_timer(self.value("replay_period"), step, clock=STEADY)
         return True, "replaying the recorded episodes on ~/episode"
 
     def stop_replay(self) -> str:
