@@ -182,14 +182,10 @@ def bytes_message(kind: str, data: bytes) -> UInt8MultiArray:
     return UInt8MultiArray(layout=MultiArrayLayout(dim=[dimension]), data=array.array("B", data))
 
 
-def label_of(message: UInt8MultiArray) -> str:
-    """Return what a message says of its bytes."""
-    return message.layout.dim[0].label if message.layout.dim else ""
-
-
 def bytes_of(kind: str, message: UInt8MultiArray) -> bytes:
     """Return the bytes of a kind that a message carries; a ValueError if it has others."""
-    data, label = bytes(message.data), label_of(message)
+    data = bytes(message.data)
+    label = message.layout.dim[0].label if message.layout.dim else ""
     if label != (right := LABEL.format(kind, hashlib.sha256(data).hexdigest())):
         wrong = f"{len(data)} bytes with the label {label!r}, not {right!r}"
         is_cut = label.partition(":")[0] == right.partition(":")[0]

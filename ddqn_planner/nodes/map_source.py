@@ -1,24 +1,27 @@
-"""The map that the planner plans on: the last one received, with its updates and its directions."""
+"""The map that the planner plans on: the last one, with updates, directions and expected times."""
 
 from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from nav_msgs.msg import OccupancyGrid
 from numpy.typing import NDArray
+from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
 from rclpy.qos import QoSProfile
 from rclpy.task import Future
-from std_msgs.msg import Header
+from std_msgs.msg import Header, UInt8MultiArray
 
+from ddqn_planner.experience import Experience
 from ddqn_planner.grid import GridMap
 from ddqn_planner.grid.body import Inflation
-from ddqn_planner.grid.copies import boxes_of
-from ddqn_planner.nodes.conversions import grid_from_message, grid_from_values
-from ddqn_planner.nodes.report import Report, RequestError, seconds
+from ddqn_planner.grid.copies import WHOLE, boxes_of
+from ddqn_planner.nodes.conversions import bytes_of, grid_from_message, grid_from_values
+from ddqn_planner.nodes.report import NO_REQUEST, Outcome, Report, RequestError, seconds
 from ddqn_planner.nodes.runtime import LATCHED, BaseNode, Worker
 from ddqn_planner.planning.field import offset_between, overlap
 
@@ -37,6 +40,8 @@ UPDATES_QUALITY = QoSProfile(depth=100)
 REMEDY = "let the map's publisher send the full map"
 
 PATIENCE = 1.0  # seconds within which the first map is expected after the node subscribes
+CHANGED_SHARE = 0.02  # of cells: with more, experience is spread anew over the map, slowly
+NO_MAP = GridMap(np.zeros((1, 1), dtype=np.bool_))
 
 
 @dataclass
@@ -51,17 +56,11 @@ class Received:
 class MapSource:
     """The map to plan on; `on_map` is called, with whether the frame is new, when anything is."""
 
-    # `timed` returns a map with expected times; the worker calls it.
     def __init__(
-        self,
-        node: BaseNode,
-        report: Report,
-        worker: Worker,
-        timed: Callable[[GridMap], GridMap],
-        on_map: Callable[[bool], None],
+        self, node: BaseNode, report: Report, worker: Worker, on_map: Callable[[bool], None]
     ) -> None:
-        self._node, self._report, self._worker = node, report, worker
-        self._timed, self._on_map = timed, on_map
+        self._node, self._report, self._worker, self._on_map = node, report, worker, on_map
+        self.times = ExpectedTimes(node, report, worker, self.change)
         # The map in use and the last one. If that is another one, it waits for its directions.
         self._used: Received | None = None
         self._newest: Received | None = None
@@ -119,7 +118,7 @@ class MapSource:
         if self._updates or self._refused_updates:
             description["map updates applied"] = str(self._updates)
             description["map updates refused"] = str(self._refused_updates)
-        return description
+        return description | self.times.told(self._report.outcome)
 
     def ready(self) -> Future:
         """Return the `GridMap` to plan on, with body and times: computed for the first request."""
@@ -132,12 +131,14 @@ class MapSource:
         return ready
 
     def _prepare(self, *of_body: Any) -> GridMap:
-        return self._timed(self._inflate(*of_body))
+        return self.times.apply(self._inflate(*of_body))
 
     def apply_parameters(self, changed: set[str]) -> None:
         """Read and prepare the map anew if one of the parameters that changed says so."""
         if changed & {*MAP_PARAMETERS, *BODY_PARAMETERS, "require_directions", "exploration"}:
             self._read_again()
+        if "experience" in changed:
+            self.times.read()
 
     def _take(self, message: OccupancyGrid) -> None:
         try:
@@ -321,3 +322,91 @@ class Directions:
             grid = replace(grid, forbidden=forbidden)
         self.used, self._are_paired = found, bool(own)
         return grid
+
+
+class ExpectedTimes:
+    """Puts on maps what the trainer has learned of the robot's drives."""
+
+    def __init__(
+        self, node: BaseNode, report: Report, worker: Worker, on_change: Callable[[], None]
+    ) -> None:
+        self._node, self._report, self._worker, self._on_change = node, report, worker, on_change
+        self._experience: Experience | None = None
+        self._spread_on: GridMap | None = None
+        self._applied = (NO_MAP, NO_MAP)  # the last map, without times and with them
+        # What the worker was asked last, and its answer.
+        self._outcome, self._forecast = NO_REQUEST, Future()
+        group = MutuallyExclusiveCallbackGroup()  # it waits for the worker
+        self.read = node.create_guard_condition(self.on_sent, group).trigger
+        if node.value("experience"):
+            self.read()
+        if node.value("follow_trainer"):
+            sent = UInt8MultiArray, "trainer/experience", self.on_sent, LATCHED
+            node.create_subscription(*sent, callback_group=group)
+
+    async def on_sent(self, message: UInt8MultiArray | None = None) -> None:
+        """Plan by what drives taught, or refuse the trainer's message, or the file that is set."""
+        with self._report.taking("experience"):
+            await self._worker.call(self.load, message)
+            self._on_change()
+
+    def told(self, outcome: Outcome) -> dict[str, str]:
+        """Return what `describe` returns, once the worker has computed it."""
+        if self._experience is None:
+            return {}
+        if outcome is not self._outcome:
+            self._outcome, self._forecast = outcome, self._worker.call(self.describe, outcome)
+        if not self._forecast.done():
+            self._report.change()  # to look again soon
+        return self._forecast.result() or {}
+
+    def load(self, message: UInt8MultiArray | None = None) -> None:
+        """Use a message, or the file that is set, or none; errors change nothing."""
+        newer = None
+        if message:
+            newer = Experience.from_bytes(bytes_of("experience", message))
+        elif file := self._node.value("experience"):
+            newer = Experience.load(file)
+        if newer is not None and self._experience is not None:
+            newer.take_over(self._experience)
+        self._experience = newer
+
+    def apply(self, grid: GridMap) -> GridMap:
+        """Return a map whose moves cost expected time, or the same map before a drive."""
+        if self._experience is None or not self._experience.evidence.places:
+            return grid
+        if self._spread_on is None or not is_like(grid, self._spread_on):
+            self._spread_on = grid
+        (before, timed), share = self._applied, self._node.value("exploration")
+        of_places = self._experience.apply(self._spread_on, share)
+        boxes = grid.patches_since(before)
+        if boxes is None or timed.slowness is not of_places.slowness:
+            seconds = of_places.seconds_per_cell
+            timed = grid.with_layers(slowness=of_places.slowness, seconds_per_cell=seconds)
+        else:
+            timed = timed.with_boxes_of(grid, boxes)
+        self._applied = grid, timed
+        return timed
+
+    def describe(self, outcome: Outcome) -> dict[str, str]:
+        """Return how long a plan takes, unless its map is old or untimed, or no memory is left."""
+        now, request, path = self._spread_on, outcome.request, outcome.plan.path
+        told: dict[str, str] = {}
+        is_timed = request is not None and request.grid.slowness is not None and len(path) > 0
+        if self._experience and now and request and is_timed and is_like(request.grid, now):
+            with suppress(MemoryError):
+                seconds, low, high = self._experience.expected_time(now, path)
+                told["expected time (s)"] = f"{seconds:.1f}"
+                told["expected time, 90 % interval (s)"] = f"{low:.1f} to {high:.1f}"
+        return told
+
+
+def is_like(grid: GridMap, other: GridMap) -> bool:
+    """Return whether two maps have the same place, and nearly the same obstacles."""
+    mine, its = ((each.occupancy.shape, each.resolution, each.origin) for each in (grid, other))
+    if mine != its:
+        return False
+    boxes = grid.patches_since(other)
+    boxes = [WHOLE] if boxes is None else boxes
+    changed = sum(np.count_nonzero(grid.occupancy[box] != other.occupancy[box]) for box in boxes)
+    return bool(changed <= CHANGED_SHARE * grid.occupancy.size)

@@ -119,8 +119,8 @@ class Frames:
             self._listener = tf2_ros.TransformListener(self._buffer, self._node, qos=TF_DEPTH)
             # No executor wakes for them, a hundred a second: they are read when they are needed.
             self._listener.group.can_execute = lambda _: False
-            self._reads = self._node.create_timer(READ_PERIOD, self._read, clock=STEADY)
-            self._node.after_jump_back.add(self._forget)
+            self._node.create_timer(READ_PERIOD, self._read, clock=STEADY)
+            self._node.after_jump_back.append(self._forget)
 
     def _read(self) -> None:
         for subscription in (self._listener.tf_sub, self._listener.tf_static_sub):
@@ -133,14 +133,6 @@ class Frames:
         self._read()
         self._buffer.clear()  # tf2 takes no transform that is older than those it has
         self._began = time.monotonic()
-
-    def close(self) -> None:
-        """Stop listening, until a transform is needed again."""
-        if self._listener is not None:
-            self._node.after_jump_back.discard(self._forget)
-            self._node.destroy_timer(self._reads)
-            self._listener.unregister()
-            self._buffer = self._listener = None
 
 
 def transformed(stamped: PoseStamped, transform: TransformStamped) -> PoseStamped:
@@ -195,35 +187,28 @@ class StartSource:
         # What to call when there is a start from which to plan at once.
         self._map_frame, self._on_start = map_frame, on_start
         self._pose: PoseStamped | None = None
+        self._subscription: Any = None
         self.source = self.topic = ""
         self.listen()
+        node.after_jump_back.append(self._forget_odometry)
 
     def listen(self) -> None:
         """Listen to what the parameter names, if it is another source."""
         source = self._node.value("start_source")
         if source == self.source:
             return
-        self.close()
+        self._node.destroy_subscription(self._subscription)
+        self._refusals.accept(self.topic)
         self.source, self.topic = source, "odom" if source == "odometry" else source
-        self._forget()
+        self._pose, self._began = None, time.monotonic()
         if source == "tf":
             self._frames.listen()
-            return
-        self._subscription = listen(self._node, self.topic, 10, self._refusals, self._take)
-        if source == "odometry":
-            self._node.after_jump_back.add(self._forget)
+        else:
+            self._subscription = listen(self._node, self.topic, 10, self._refusals, self._take)
 
-    def close(self) -> None:
-        """Stop listening; what was refused no longer counts."""
-        self._refusals.accept(self.topic)
-        if self.source == "tf":
-            self._frames.close()
-        elif self.source:
-            self._node.after_jump_back.discard(self._forget)
-            self._node.destroy_subscription(self._subscription)
-
-    def _forget(self) -> None:
-        self._pose, self._began = None, time.monotonic()
+    def _forget_odometry(self) -> None:
+        if self.source == "odometry":
+            self._pose, self._began = None, time.monotonic()
 
     def _take(self, pose: PoseStamped) -> None:
         self._frames.check("the start", pose, self._map_frame())

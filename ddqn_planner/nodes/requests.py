@@ -16,13 +16,13 @@ import numpy as np
 from geometry_msgs.msg import PoseStamped
 from nav_msgs.msg import Path
 from rclpy.task import Future
-from std_msgs.msg import Header, UInt8MultiArray
+from std_msgs.msg import Header
 
 from ddqn_planner.grid import Cell, GridMap, MoveRule
 from ddqn_planner.grid.motions import HEADINGS
-from ddqn_planner.model import find_model, model_of
+from ddqn_planner.model import find_model
 from ddqn_planner.model.certificate import NO_CERTIFICATE
-from ddqn_planner.nodes.conversions import bytes_of, cell_from_pose, label_of, pose_of, turns
+from ddqn_planner.nodes.conversions import cell_from_pose, pose_of, turns
 from ddqn_planner.nodes.map_source import MapSource
 from ddqn_planner.nodes.poses import Frames, StartSource
 from ddqn_planner.nodes.report import (
@@ -156,7 +156,6 @@ class ModelSource:
         self._node, self.report, self._worker = node, report, worker
         # The first model, while it is being loaded.
         self.loading: Future | None = None
-        self._label = ""  # of the trainer's message, if the model came by it
 
     @staticmethod
     def read(model: str) -> tuple[Planner, str]:
@@ -194,20 +193,11 @@ class ModelSource:
 
     def use(self, planner: Planner, file: str) -> None:
         """Plan with it from now on."""
-        self.planner, self.file, self.loading, self._label = planner, file, None, ""
+        self.planner, self.file, self.loading = planner, file, None
         planner.cache_bytes = self._node.value("field_cache_bytes")
         self.report.accept("model")
         self.report.change()
         self._node.get_logger().info(f"planning with the model {file}")
-
-    def take(self, message: UInt8MultiArray) -> bool:
-        """Use a model that the trainer sent; return whether it is a new one."""
-        label, before = label_of(message), self._label
-        with self.report.taking("trainer/model"):
-            if label != before:
-                self.use(Planner(*model_of(bytes_of("model", message))), "trainer/model")
-                self._label = label
-        return self._label != before
 
     def on_reload(self) -> tuple[bool, str]:
         """Load the file of the model again."""
@@ -235,7 +225,7 @@ class ModelSource:
 
     def forget(self) -> None:
         """Free the model and its fields, with what `read` kept from collection."""
-        self.planner, self.file, self.loading, self._label = None, "", None, ""
+        self.planner, self.file, self.loading = None, "", None
         gc.unfreeze()
         gc.collect()
 

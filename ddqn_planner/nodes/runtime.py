@@ -108,7 +108,7 @@ class BaseNode(Node):
     def __init__(self, name: str, parameters: Parameters) -> None:
         self._incompatible: set[str] = set()
         self._logged_problems: list[str] = []
-        self.after_jump_back: set[Callable[[], None]] = set()
+        self.after_jump_back: list[Callable[[], None]] = []
         """Called when a bag loops or a simulator is reset."""
         super().__init__(name)
         # As tf2 has it. Another clock, by use_sim_time, counts as a jump, too.

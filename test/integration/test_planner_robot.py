@@ -194,15 +194,11 @@ class TransformListener:
         def hear(transform):
             buffer.transforms[transform.header.frame_id, transform.child_frame_id] = transform
 
-        self.node, self.group = node, ReentrantCallbackGroup()
+        self.group = ReentrantCallbackGroup()
         self.tf_sub, self.tf_static_sub = (
             node.create_subscription(TransformStamped, topic, hear, qos, callback_group=self.group)
             for topic in ("tf", "tf_static")
         )
-
-    def unregister(self):
-        self.node.destroy_subscription(self.tf_sub)
-        self.node.destroy_subscription(self.tf_static_sub)
 """
 """As much of tf2_ros as the node uses, which is no package of PyPI: one transform, no tree."""
 
