@@ -60,7 +60,7 @@ class DrivingRobot:
         self._space = f"{name}/" if name else ""  # before its topics and its frame
         self.recorder = DriveRecorder(partial(on_drive, f" by {name}" if name else ""))
         self._aborted: set[bytes] | None = None
-        node.create_subscription(PoseStamped, f"{self._space}goal_pose", self._on_goal, 10)
+        listen(node, f"{self._space}goal_pose", 10, node.refusals, self._on_goal)
         latched = QoSProfile(depth=10, durability=DurabilityPolicy.TRANSIENT_LOCAL)
         topic = f"{self._space}{NAVIGATION}"
         node.create_subscription(GoalStatusArray, topic, self._on_status, latched)
@@ -93,10 +93,9 @@ class DrivingRobot:
             self._on_pose(pose)
 
     def _on_goal(self, goal: PoseStamped) -> None:
-        with self._node.refusals.taking(f"{self._space}goal_pose"):
-            position = self._position("the goal", goal)
-            if position is not None:
-                self.recorder.set_goal(*position)
+        position = self._position("the goal", goal)
+        if position is not None:
+            self.recorder.set_goal(*position)
 
     def _position(self, name: str, pose: PoseStamped) -> tuple[float, float] | None:
         """Return a pose's position in the frame of the map, if there is one, or a ValueError."""

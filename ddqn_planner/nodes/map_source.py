@@ -66,7 +66,7 @@ class MapSource:
         self._newest: Received | None = None
         self._began = time.monotonic()
         self._described = ""
-        self._updates = self._refused_updates = 0
+        self._updates = self._applied_updates = 0
         self._inflate = Inflation()
         self._ready: Future | None = None
         # Before the subscription of the map: directions that come with a map are taken first.
@@ -115,9 +115,9 @@ class MapSource:
         if self._used is not None:
             description["map"] = self._described
             description["map stamp (s)"] = seconds(self._used.header.stamp)
-        if self._updates or self._refused_updates:
-            description["map updates applied"] = str(self._updates)
-            description["map updates refused"] = str(self._refused_updates)
+        if self._updates:
+            description["map updates applied"] = str(self._applied_updates)
+            description["map updates refused"] = str(self._updates - self._applied_updates)
         return description | self.times.told(self._report.outcome)
 
     def ready(self) -> Future:
@@ -126,12 +126,11 @@ class MapSource:
         if ready is None or (ready.done() and ready.exception()):  # as when no memory was left
             radius, weight = map(self._node.value, BODY_PARAMETERS)
             # ROS accepts a value that is above the range by a millionth.
-            of = self._grid, radius, min(weight, 1.0)
-            ready = self._ready = self._worker.call(self._prepare, *of)
+            of_body = self._grid, radius, min(weight, 1.0)
+            ready = self._ready = self._worker.call(
+                lambda: self.times.apply(self._inflate(*of_body))
+            )
         return ready
-
-    def _prepare(self, *of_body: Any) -> GridMap:
-        return self.times.apply(self._inflate(*of_body))
 
     def apply_parameters(self, changed: set[str]) -> None:
         """Read and prepare the map anew if one of the parameters that changed says so."""
@@ -217,28 +216,21 @@ class MapSource:
 
     def _take_update(self, update: Any) -> None:
         """Plan on the map with other values in a box from now on, or refuse the update."""
-        newest = self._newest
-        try:
+        newest, self._updates = self._newest, self._updates + 1
+        with self._report.taking("map_updates", often=True):
             if newest is None:
                 raise ValueError(f"an update came before a map; {REMEDY}")
             values = updated_values(newest.message, update)
             if newest is self._used:
                 self._grid = self._patched(self._grid, values, update.x, update.y)
-        except (ValueError, MemoryError) as error:
-            self._refused_updates = count = self._refused_updates + 1
-            self._report.refuse("map_updates", str(error), log=False)
-            if count & (count - 1) == 0:  # 1, 2, 4, ...: updates come often
-                self._node.get_logger().error(f"update {count} of the map refused: {error}")
-            return
-        # In place, for the day when a parameter changes and the map is read anew.
-        info, (height, width) = newest.message.info, values.shape
-        whole = np.frombuffer(newest.message.data, np.int8).reshape(info.height, info.width)
-        whole[update.y : update.y + height, update.x : update.x + width] = values
-        self._report.accept("map_updates")
-        newest.header, newest.came = update.header, time.monotonic()
-        self._updates += 1
-        if newest is self._used:
-            self.change()
+            # In place, for the day when a parameter changes and the map is read anew.
+            info, (height, width) = newest.message.info, values.shape
+            whole = np.frombuffer(newest.message.data, np.int8).reshape(info.height, info.width)
+            whole[update.y : update.y + height, update.x : update.x + width] = values
+            newest.header, newest.came = update.header, time.monotonic()
+            self._applied_updates += 1
+            if newest is self._used:
+                self.change()
 
 
 def _place(message: OccupancyGrid) -> tuple[Any, ...]:

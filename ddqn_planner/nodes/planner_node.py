@@ -29,6 +29,7 @@ from ddqn_planner.nodes.requests import (
     ModelSource,
     PathUnderWay,
     Requests,
+    read_model,
     way_of,
 )
 from ddqn_planner.nodes.runtime import LATCHED, STEADY, Worker, spin_until_shutdown, unless
@@ -89,8 +90,6 @@ class PlannerNode(ManagedNode):
         self._start = StartSource(
             self, self._frames, self._report, lambda: self._map.frame, self._on_start
         )
-        group = MutuallyExclusiveCallbackGroup()  # this one ends when a newer path is there
-        self._improve = self.create_guard_condition(self._improve_path, group)
         inputs = self._map, self._start, self._frames, self._model
         self._requests = Requests(self._settings, *inputs, self._worker, self._look_soon)
         self.create_subscription(PoseStamped, "goal_pose", lambda goal: self._on_goals([goal]), 10)
@@ -114,7 +113,7 @@ class PlannerNode(ManagedNode):
         """Forget the active goal."""
         super().deactivate()
         self._active, self._followed = ActiveGoal([]), PathUnderWay()
-        self._improvable: tuple[Outcome, ActiveGoal | None] | None = None
+        self._newest: Outcome | None = None
         self._report.change()
 
     def cleanup(self) -> None:
@@ -147,19 +146,17 @@ class PlannerNode(ManagedNode):
         super().check_parameters(new)
         check_source("start_source", new.get("start_source", ""), "'initialpose' or 'odometry'")
         if "model" in new and hasattr(self, "_settings"):  # a worker loads the first one
-            self._candidate = ModelSource.read(new["model"])
+            self._candidate = read_model(new["model"])
 
     def _apply_parameters(self, parameters: list[Parameter]) -> None:
-        settings = self._settings = self.settings()
+        self._settings = self.settings()
         changed = {parameter.name for parameter in parameters} & self._declared.keys()
         if not (changed and self._is_configured):  # subscriptions declare parameters, too
             return
         if "model" in changed:
             self._model.use(*self._candidate)
-        if self._model.planner is not None:
-            self._model.planner.cache_bytes = settings.field_cache_bytes
         self._start.listen()
-        self._requests.settings = settings
+        self._requests.settings = self._settings
         self._map.apply_parameters(changed)
         if "path_simplification" in changed:
             self._followed = PathUnderWay()
@@ -228,10 +225,8 @@ class PlannerNode(ManagedNode):
         if active.is_news(outcome, header.frame_id):
             self._plan_publisher.publish(*_paths(outcome, header, path_bytes))
         self._waits_for_pose = outcome.status in ("NO_START", "TF_ERROR")
-        path, request = outcome.plan.path, outcome.request
-        leaves = request is not None and len(path) > 0 and request.grid.is_obstacle(path[0])
         # Not the reason: its places and lengths may differ.
-        logged = goals, outcome.goal, outcome.status, outcome.plan.method, leaves
+        logged = goals, outcome.goal, outcome.status, outcome.plan.method
         if self._logged != logged:
             self._logged = logged
             self._report.log(outcome)
@@ -254,19 +249,15 @@ class PlannerNode(ManagedNode):
 
     def _improve_later(self, outcome: Outcome, active: ActiveGoal | None) -> None:
         """Look for the least path of a body, unless it would not be worth a switch."""
-        plan, self._improvable = outcome.plan, None
+        plan, self._newest = outcome.plan, outcome
         worth = (1 + self._settings.switch_threshold) * SAME_COST
         if isinstance(plan, PosePlan) and plan.bound > worth:
-            self._improvable = outcome, active
-            self._improve.trigger()
+            executor: Any = self.executor
+            executor.create_task(self._improve_path, outcome, active)
 
-    async def _improve_path(self) -> None:
-        if (last := self._improvable) is None:
-            return
-        outcome, active = last
-
+    async def _improve_path(self, outcome: Outcome, active: ActiveGoal | None) -> None:
         def given_up() -> Outcome | None:
-            return None if last is self._improvable else UNCHANGED
+            return None if outcome is self._newest else UNCHANGED
 
         header, better = await self._answer([], self._requests.improve(outcome), given_up)
         if better.request is not None and active is self._active:

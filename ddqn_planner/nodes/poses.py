@@ -25,6 +25,7 @@ PATIENCE = 1.0  # seconds within which a new listener hears the first message of
 READ_PERIOD, TF_DEPTH = 0.5, 1000  # seconds between two reads, and messages that come meanwhile
 SILENCE = 2.0  # seconds after which odometry that comes no more does not tell where the robot is
 REMEDY = "; or install tf2_ros (apt install ros-jazzy-tf2-ros-py), which transforms it"
+TYPES = {"odom": Odometry, "initialpose": PoseWithCovarianceStamped, "goal_pose": PoseStamped}
 
 
 def has_tf() -> bool:
@@ -158,18 +159,19 @@ def _turned(rotation: Quaternion, point: tuple[float, ...]) -> tuple[float, ...]
 def listen(
     node: BaseNode, topic: str, depth: int, refusals: Refusals, take: Callable[[PoseStamped], None]
 ) -> Subscription:
-    """Hand each pose of `odom` or `initialpose` to a function, whose ValueError refuses it."""
-    is_odometry = topic.endswith("odom")
-    kind = Odometry if is_odometry else PoseWithCovarianceStamped
+    """Hand each pose of a topic of `TYPES` to a function, whose ValueError refuses it."""
+    message_type = TYPES[topic.rpartition("/")[2]]
+    is_odometry = message_type is Odometry
 
-    def on_message(message: Odometry | PoseWithCovarianceStamped) -> None:
+    def on_message(message: Any) -> None:
+        pose = getattr(message.pose, "pose", message.pose)
         with refusals.taking(topic, often=is_odometry):
-            take(PoseStamped(header=message.header, pose=message.pose.pose))
+            take(PoseStamped(header=message.header, pose=pose))
 
     quality = QoSProfile(depth=depth)
     if is_odometry:  # reliable publishers and others are received
         quality.reliability = ReliabilityPolicy.BEST_EFFORT
-    return node.create_subscription(kind, topic, on_message, quality)
+    return node.create_subscription(message_type, topic, on_message, quality)
 
 
 class StartSource:

@@ -147,6 +147,12 @@ def move_rule(rule: str, planner: Planner) -> MoveRule:
     return MoveRule(rule or planner.metadata.move_rule)
 
 
+def read_model(model: str) -> tuple[Planner, str]:
+    """Return a model's planner and file."""
+    path = find_model(model)
+    return Planner.load(path), str(path)
+
+
 class ModelSource:
     """Has the planner with the last model that could be loaded, and its file."""
 
@@ -157,17 +163,11 @@ class ModelSource:
         # The first model, while it is being loaded.
         self.loading: Future | None = None
 
-    @staticmethod
-    def read(model: str) -> tuple[Planner, str]:
-        """Return a model's planner and file."""
-        path = find_model(model)
-        return Planner.load(path), str(path)
-
     def load(self) -> None:
         """Begin to load the first model, and to compile what many requests need."""
 
         def read() -> tuple[Planner, str]:
-            planner, file = self.read(self._node.value("model"))
+            planner, file = read_model(self._node.value("model"))
             compiling = warm_up(planner, self._node.value("follow_trainer"))
             gc.set_threshold(20_000)  # to compile and to plan makes hardly any garbage
             next(compiling)
@@ -194,7 +194,6 @@ class ModelSource:
     def use(self, planner: Planner, file: str) -> None:
         """Plan with it from now on."""
         self.planner, self.file, self.loading = planner, file, None
-        planner.cache_bytes = self._node.value("field_cache_bytes")
         self.report.accept("model")
         self.report.change()
         self._node.get_logger().info(f"planning with the model {file}")
@@ -361,6 +360,7 @@ class Requests:
         if planner is None:
             refused = self.model.report.refused["model"]
             raise RequestError("NO_MODEL", f"no model is loaded: {refused}")
+        planner.cache_bytes = self.settings.field_cache_bytes
         return header, await ready, planner
 
     async def _in_map(

@@ -11,7 +11,7 @@ from pathlib import Path as FilePath
 from typing import TYPE_CHECKING, Any, Final
 
 from diagnostic_msgs.msg import DiagnosticStatus
-from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped, Quaternion
+from geometry_msgs.msg import PoseStamped, Quaternion
 from nav_msgs.msg import OccupancyGrid, Path
 from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.exceptions import InvalidParameterValueException
@@ -30,7 +30,7 @@ from ddqn_planner.nodes.conversions import (
 )
 from ddqn_planner.nodes.driving import NO_MAP, Driving, MapInFrame, explained
 from ddqn_planner.nodes.parameters import MOVE_RULES, OF_MAPS
-from ddqn_planner.nodes.poses import check_source
+from ddqn_planner.nodes.poses import check_source, listen
 from ddqn_planner.nodes.report import Refusals
 from ddqn_planner.nodes.runtime import (
     LATCHED,
@@ -119,9 +119,8 @@ class TrainerNode(BaseNode):
         self._reward_publisher = self.create_publisher(Float32, "~/average_reward", 100)
         self._saved_publisher = self.create_publisher(String, "~/model_saved", LATCHED)
         self._model_publisher = self.create_publisher(UInt8MultiArray, "~/model", LATCHED)
-        on_start, on_goal = (partial(self._on_pose, which) for which in ("start", "goal"))
-        self.create_subscription(PoseWithCovarianceStamped, "initialpose", on_start, 10)
-        self.create_subscription(PoseStamped, "goal_pose", on_goal, 10)
+        for which, topic in (("start", "initialpose"), ("goal", "goal_pose")):
+            listen(self, topic, 10, self.refusals, partial(self._on_pose, which))
         group = ReentrantCallbackGroup()  # the others are answered while ~/start waits
         for name in ("start", "stop", "save", "replay"):
             self.create_trigger(f"~/{name}", getattr(self, f"_on_{name}"), callback_group=group)
@@ -164,16 +163,13 @@ class TrainerNode(BaseNode):
             self.map = MapInFrame(grid, message.header.frame_id)
             self.get_logger().info(f"map of {grid.width} x {grid.height} cells")
 
-    def _on_pose(self, which: str, message: PoseStamped | PoseWithCovarianceStamped) -> None:
-        pose = getattr(message.pose, "pose", message.pose)
-        stamped = PoseStamped(header=message.header, pose=pose)
-        with self.refusals.taking(which):
-            # A pose may come before the map: ~/start then checks its cell.
-            check_pose(f"the {which}", stamped)
-            if self.map is not None:
-                cell = self._cell(which, stamped, self.map)
-                self.get_logger().info(f"the {which} is cell {cell}")
-            self._poses[which] = stamped
+    def _on_pose(self, which: str, stamped: PoseStamped) -> None:
+        # A pose may come before the map: ~/start then checks its cell.
+        check_pose(f"the {which}", stamped)
+        if self.map is not None:
+            cell = self._cell(which, stamped, self.map)
+            self.get_logger().info(f"the {which} is cell {cell}")
+        self._poses[which] = stamped
 
     def _cell(self, which: str, pose: PoseStamped, place: MapInFrame) -> Cell:
         """Return the cell of a pose; ValueError if it is not a free cell of the map."""
