@@ -39,7 +39,6 @@ UPDATES_QUALITY = QoSProfile(depth=100)
 
 REMEDY = "let the map's publisher send the full map"
 
-PATIENCE = 1.0  # seconds within which the first map is expected after the node subscribes
 CHANGED_SHARE = 0.02  # of cells: with more, experience is spread anew over the map, slowly
 NO_MAP = GridMap(np.zeros((1, 1), dtype=np.bool_))
 
@@ -90,8 +89,8 @@ class MapSource:
         because = f" ({refused})" if refused else ""
         if self._used is None:
             missing = f"no map was received on {self._topic} yet{because}; start a map server"
-            may_come = time.monotonic() - self._began < PATIENCE
-            raise RequestError("NO_MAP", refused if refused and self._newest else missing, may_come)
+            missing = refused if refused and self._newest else missing
+            raise RequestError("NO_MAP", missing, self._began)
         timeout = self._node.value("map_timeout")
         is_costmap = self._node.value("map_type") == "costmap"
         if is_costmap and 0 < timeout < time.monotonic() - self._used.came:

@@ -332,13 +332,15 @@ def test_a_newest_transform_beyond_the_tolerance_is_not_used(listening: Any) -> 
 
 def test_transforms_from_before_the_clock_jumped_back_are_forgotten(listening: Any) -> None:
     frames = listening(100)
-    assert not frames.may_come
     assert frames.origin_of("odom", "map").pose.position.x == 1.0
+    frames.began -= 60
     for forget in frames._node.after_jump_back:  # as the node does
         forget()
     with pytest.raises(ValueError, match="does not exist"):
         frames.origin_of("odom", "map")
-    assert frames.may_come
+    with pytest.raises(RequestError) as error:
+        frames.to_map("the goal", pose_at(100), "map")
+    assert error.value.may_come
 
 
 @pytest.mark.parametrize(("source", "stays"), [("initialpose", True), ("odometry", False)])
