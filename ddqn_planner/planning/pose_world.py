@@ -10,6 +10,7 @@ from numpy.typing import DTypeLike, NDArray
 from ddqn_planner.compiled import inlined
 from ddqn_planner.grid import MOVES, GridMap
 from ddqn_planner.grid.arguments import OCCUPIED
+from ddqn_planner.grid.copies import few_of
 from ddqn_planner.grid.footprint import rows_of
 from ddqn_planner.grid.grid_map import MULTIPLIERS
 from ddqn_planner.grid.motions import HEADINGS, Motions, closer
@@ -182,7 +183,7 @@ def differences(old: GridMap, new: GridMap) -> tuple[NDArray[np.int64], bool] | 
                 changed = (one[box] != other[box]) & ~after[box]
                 opens = opens or bool(changed.any())
                 differs |= changed
-        y, x = np.nonzero(differs)
+        y, x = few_of(differs)
         found.append(np.column_stack([x + columns.start, y + rows.start]))
     cells = np.concatenate(found)
     return None if len(cells) > CHANGED_SHARE * new.occupancy.size else (cells, opens)
