@@ -46,7 +46,12 @@ class PoseField:
     # is a lower bound, which proves how good the start's cost is.
 
     def __init__(self, goals: tuple[State, ...], grid: GridMap, world: World, body: Body) -> None:
-        self.goals, self.grid, self.world, self.body = goals, grid, world, body
+        self.goals, self.body, self._aim = goals, body, Aim(0, 0, -1, NOTHING)
+        self._begin(grid, world)
+
+    def _begin(self, grid: GridMap, world: World) -> None:
+        """Know nothing but the goals."""
+        self.grid, self.world, goals = grid, world, self.goals
         states = world.tile.size * TILE * TILE * HEADINGS
         self.known = Known(_untouched(states, np.float32), _untouched(states, np.uint8))
         self._size, self._waiting, self._round = len(goals), 0, 0
@@ -54,8 +59,7 @@ class PoseField:
         self._keys, self._numbers = np.empty(entries, np.float32), np.empty(entries, np.int64)
         self._numbers[: len(goals)] = [self.number(goal) for goal in goals]
         self.known.mark[self._numbers[: len(goals)]] = kernels.OPEN
-        self._aim, self._weight = Aim(0, 0, -1, NOTHING), 0.0
-        self.visits = 0
+        self._weight, self.visits = 0.0, 0
 
     def number(self, state: State) -> int:
         """Return the number of a state inside the map."""
@@ -65,7 +69,8 @@ class PoseField:
         """Grow until the cost from a start is known within a bound, or known not to exist."""
         number = self.number(start)
         if number != self._aim.number:
-            self._aim = Aim(*start[:2], number, NOTHING)
+            left = self._aim.left if start[:2] == self._aim[:2] else NOTHING
+            self._aim = Aim(*start[:2], number, left)
             self._weight, self._tried = max(bound, FIRST) ** GREEDY, 0
             self._order()
         while True:
@@ -168,20 +173,22 @@ class PoseField:
         count = kernels.follow(*inputs)
         return primitives[:count], costs[:count]
 
-    def repair(self, grid: GridMap, world: World, cells: NDArray[np.int64], opens: bool) -> bool:
-        """Hold for a map that differs in some cells (N, 2); False if a new field is quicker."""
-        # `opens` tells whether a way may have got cheaper.
+    def repair(self, grid: GridMap, world: World, cells: NDArray[np.int64], opens: bool) -> None:
+        """Hold for a map that differs in some cells (N, 2); begin anew where that is quicker."""
+        # `opens` tells whether a way may have got cheaper: what is left to the start, too.
+        self._aim = self._aim._replace(number=-1, left=NOTHING if opens else self._aim.left)
         reach, columns = self.body.reach + TILE, (world.width + TILE - 1) // TILE
         near = np.zeros((columns, (world.height + TILE - 1) // TILE), dtype=np.bool_)
         low, high = np.unique(np.maximum(cells - reach, 0) // TILE, axis=0), 2 * reach // TILE + 1
         for x, y in low:
             near[x : x + high, y : y + high] = True
         tiles = np.flatnonzero(near.T)
-        raised = np.empty(self.visits // TAKEN_BACK + 2**10, np.int64)
+        raised = np.empty(self.visits // TAKEN_BACK + 2**8, np.int64)
         scratch = np.empty(8 * raised.size, np.float32), np.empty(8 * raised.size, np.int64), raised
         count = kernels.take_back(self.known, tiles, *scratch, world, self.body)
         if count < 0:
-            return False
+            self._begin(grid, world)
+            return
         self.grid, self.world, found = grid, world, raised[:count]
         if opens:
             states = np.arange(TILE * TILE * HEADINGS)
@@ -189,5 +196,3 @@ class PoseField:
         self._reserve(max(self._size + self._waiting + len(found), len(self._keys)))
         heap = self._numbers, self._size
         self._size = kernels.look_again(self.known, found, *heap, world, self.body)
-        self._aim = self._aim._replace(number=-1)  # what is ordered, and left, is another
-        return True
