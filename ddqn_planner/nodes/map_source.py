@@ -39,7 +39,6 @@ UPDATES_QUALITY = QoSProfile(depth=100)
 
 REMEDY = "let the map's publisher send the full map"
 
-PATIENCE = 1.0  # seconds within which the first map is expected after the node subscribes
 CHANGED_SHARE = 0.02  # of cells: with more, experience is spread anew over the map, slowly
 NO_MAP = GridMap(np.zeros((1, 1), dtype=np.bool_))
 
@@ -90,8 +89,8 @@ class MapSource:
         because = f" ({refused})" if refused else ""
         if self._used is None:
             missing = f"no map was received on {self._topic} yet{because}; start a map server"
-            may_come = time.monotonic() - self._began < PATIENCE
-            raise RequestError("NO_MAP", refused if refused and self._newest else missing, may_come)
+            missing = refused if refused and self._newest else missing
+            raise RequestError("NO_MAP", missing, self._began)
         timeout = self._node.value("map_timeout")
         is_costmap = self._node.value("map_type") == "costmap"
         if is_costmap and 0 < timeout < time.monotonic() - self._used.came:
@@ -242,8 +241,7 @@ def updated_values(message: OccupancyGrid, update: Any) -> NDArray[np.int8]:
     """Return the values that an update puts into the last map, (h, w); ValueError if none fit."""
     frame, map_frame = update.header.frame_id, message.header.frame_id
     if frame != map_frame:
-        both = f"the update's frame is {frame!r}, the map's is {map_frame!r}"
-        raise ValueError(f"{both}; publish both in one frame")
+        raise ValueError(f"the update's frame is {frame!r}, the map's is {map_frame!r}; use one")
     stamp, map_stamp = update.header.stamp, message.header.stamp
     if (0, 0) < (stamp.sec, stamp.nanosec) < (map_stamp.sec, map_stamp.nanosec):
         stamps = f"{seconds(map_stamp)}, is later than the update's, {seconds(stamp)}"
@@ -254,8 +252,7 @@ def updated_values(message: OccupancyGrid, update: Any) -> NDArray[np.int8]:
         place = f"is not inside the map of {info.width} x {info.height}"
         raise ValueError(f"an update of {box} from {(x, y)} {place}; {REMEDY}")
     if len(update.data) != width * height:
-        wrong = f"the update's data has {len(update.data)} values"
-        raise ValueError(f"{wrong}; its {box} need {width * height}")
+        raise ValueError(f"the update has {len(update.data)} values; {box} need {width * height}")
     return np.frombuffer(update.data, np.int8).reshape(height, width)
 
 

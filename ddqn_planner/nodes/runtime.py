@@ -128,8 +128,7 @@ class BaseNode(Node):
     def _on_jump(self, jump: TimeJump) -> None:
         seconds = jump.delta.nanoseconds / 1e9
         what = f"jumped by {seconds:.6g} s" if seconds else "changed"
-        forgotten = "transforms and odometry from before are forgotten"
-        self.get_logger().warning(f"the clock {what}: {forgotten}")
+        self.get_logger().warning(f"the clock {what}: transforms and odometry are forgotten")
         for forget in self.after_jump_back:
             forget()
 

@@ -59,35 +59,19 @@ PARAMETERS: Final = {
     "learn_from": Declared(
         "simulation", "Episodes, or the robot's drives", ["simulation", "driving"], read_only=True
     ),
-    "output_folder": Declared(
-        "runs/trainer",
-        "A folder for the checkpoint, model and curves, or for drives and experience; used by the "
-        "next ~/start",
-        "not empty",
-    ),
-    "map_file": Declared(
-        "", "Map file or shipped map with start and goal; '': topics", read_only=True
-    ),
+    "output_folder": Declared("runs/trainer", "A folder for the training or drives", "not empty"),
+    "map_file": Declared("", "Map with start and goal, as a file; '': topics", read_only=True),
     "move_rule": Declared("corner_cutting", "Which diagonal moves are legal", MOVE_RULES),
     "seed": Declared(0, "Seed of the training", (0, 2**31 - 1)),
     **OF_MAPS,
     "episode_interval": Declared(10, "Publish each n-th episode", (1, 10**6)),
     "replay_period": Declared(0.05, "Seconds per step of ~/replay", (1e-3, 10.0)),
     "pose_source": Declared(
-        "odometry",
-        "Driving: odom, or the transform to robot_frame",
-        ["odometry", "tf"],
-        read_only=True,
+        "odometry", "Driving: odom, or a transform", ["odometry", "tf"], read_only=True
     ),
-    "robot_frame": Declared(
-        "base_link", "Driving: the robot's frame, for the pose_source tf", "not empty"
-    ),
-    "robots": Declared(
-        [""], "Driving: namespaces of robots it learns from; '': its own", read_only=True
-    ),
-    "nominal_speed": Declared(
-        0.5, "Driving: m/s where nothing slows the robot down", (0.01, 100.0)
-    ),
+    "robot_frame": Declared("base_link", "Driving: the robot's frame, for tf", "not empty"),
+    "robots": Declared([""], "Driving: namespaces of robots; '': its own", read_only=True),
+    "nominal_speed": Declared(0.5, "Driving: m/s where nothing slows it down", (0.01, 100.0)),
     "robot_width": Declared(0.5, "Driving: metres; places are squares of half of it", (0.05, 10.0)),
     "experience": Declared("", "Driving: older experience with which a new folder begins"),
     **HYPER_PARAMETERS,
@@ -323,7 +307,7 @@ class TrainerNode(BaseNode):
             return False, f"{NO_MAP} first"
         frames = (places[: n + 1] for places in episodes for n in range(len(places)))
 
-        def problem() -> str:
+        def draw_next() -> str:  # it returns why it cannot
             try:
                 draw(place, next(frames))
             except StopIteration:
@@ -332,13 +316,14 @@ class TrainerNode(BaseNode):
                 return f"no recorded episodes ({error}); call ~/start first"
             return ""
 
-        if reason := problem():
+        def step() -> None:
+            if draw_next():
+                self.stop_replay()
+
+        if reason := draw_next():
             return False, reason
         self.stop_replay()
-        period = self.value("replay_period")
-        self.replaying = self.create_timer(
-            period, lambda: problem() and self.stop_replay(), clock=STEADY
-        )
+        self.replaying = self.create_timer(self.value("replay_period"), step, clock=STEADY)
         return True, "replaying the recorded episodes on ~/episode"
 
     def stop_replay(self) -> str:

@@ -19,12 +19,10 @@ NO_RESERVE = getattr(mmap, "MAP_NORESERVE", 0x4000)  # not in all versions of Py
 HEAP = 2**14  # entries of a heap, at first
 TAKEN_BACK = 4  # of so many visited states a repair takes one back; else a new field is quicker
 UNGUIDED = 2**14  # states that are visited before a look at the map pays
-GUIDED = 2**16  # and before one at where the body can turn: elsewhere a way is often a dead end
-NARROW = 5  # times as much counts what is left there
 FIRST = 1.2  # a first path is looked for as if with this bound, if a smaller one is asked for
 NOTHING = np.empty(0, np.float32)
 GREEDY = 1.5  # the first round's weight is the bound to the power of this: mostly that will do
-FURTHER = 1.5  # times the way to the goal that the look at the map goes
+FURTHER = 1.2  # times the way to the goal that the look at the map goes
 
 
 def _untouched(count: int, dtype: DTypeLike) -> NDArray[Any]:
@@ -56,7 +54,7 @@ class PoseField:
         self._keys, self._numbers = np.empty(entries, np.float32), np.empty(entries, np.int64)
         self._numbers[: len(goals)] = [self.number(goal) for goal in goals]
         self.known.mark[self._numbers[: len(goals)]] = kernels.OPEN
-        self._aim, self._weight = Aim(0, 0, -1, NOTHING, NOTHING), 0.0
+        self._aim, self._weight = Aim(0, 0, -1, NOTHING), 0.0
         self.visits = 0
 
     def number(self, state: State) -> int:
@@ -67,13 +65,11 @@ class PoseField:
         """Grow until the cost from a start is known within a bound, or known not to exist."""
         number = self.number(start)
         if number != self._aim.number:
-            self._aim = Aim(*start[:2], number, NOTHING, NOTHING)
+            self._aim = Aim(*start[:2], number, NOTHING)
             self._weight, self._tried = max(bound, FIRST) ** GREEDY, 0
             self._order()
         while True:
-            looks = (self._aim.left.size > 0) + (self._aim.guide is not self._aim.left)
-            until = (UNGUIDED, GUIDED if self._weight else np.inf, np.inf)[looks]
-            most = int(min(limit, until - self._tried))
+            most = limit if self._aim.left.size else min(limit, UNGUIDED - self._tried)
             visits, done = self._grow(most, 1 / bound)
             limit, self._tried = limit - visits, self._tried + visits
             if done:
@@ -85,9 +81,7 @@ class PoseField:
                 return False
             elif visits < most:
                 self._reserve(2 * len(self._keys))
-            elif looks == 1:
-                self._guide(NARROW)
-            elif not self._can_leave(number) or not self._guide(1):
+            elif not self._can_leave(number) or not self._guide():
                 return True
 
     def _grow(self, limit: int, share: float) -> tuple[int, bool]:
@@ -122,17 +116,17 @@ class PoseField:
         mark, queue = _untouched(self.known.mark.size, np.uint8), np.empty(UNGUIDED, np.int64)
         return bool(kernels.leads_to(number, mark, queue, self.world, self.body) == len(queue))
 
-    def _guide(self, narrow: int) -> bool:
+    def _guide(self) -> bool:
         """Look at the map for what is left to the start; return whether a way may exist."""
-        columns, rows = (self.world.width + 7) // TILE, (self.world.height + 7) // TILE
+        columns, rows = (self.world.width + 3) // TILE, (self.world.height + 3) // TILE
         left = np.empty((columns + 1) * (rows + 1), np.float32)
         most = 8 * left.size + 4  # each corner opens its neighbours once
         keys, numbers = np.empty(most, np.float32), np.empty(most, np.int64)
         x, y, _ = np.array(self.goals).T // TILE
-        goals = np.unique(y * (columns + 1) + x)
-        heap = left, keys, numbers
-        spread(*heap, self._aim, goals, FURTHER, narrow, self.world, self.body)
-        self._aim = self._aim._replace(guide=left, left=left if narrow == 1 else self._aim.left)
+        goals, box = np.unique(y * (columns + 1) + x), (x.min(), y.min(), x.max(), y.max())
+        towards = self._aim, goals, np.array(box), FURTHER
+        spread(left, keys, numbers, *towards, self.world, self.body)
+        self._aim = self._aim._replace(left=left)
         self._order()
         return bool(np.isfinite(left[goals]).any())
 

@@ -203,7 +203,7 @@ class TransformListener:
 """As much of tf2_ros as the node uses, which is no package of PyPI: one transform, no tree."""
 
 
-PATIENT = "import ddqn_planner.nodes.poses as poses; poses.PATIENCE = 3.0  # on a loaded machine"
+PATIENT = "from ddqn_planner.nodes import report; report.PATIENCE = 3.0  # on a loaded machine"
 
 
 @pytest.fixture(scope="module")

@@ -84,7 +84,6 @@ def test_plans_cost_the_least_within_their_bound_also_after_repairs(
     with pytest.MonkeyPatch.context() as patch:
         if guided:
             patch.setattr(pose_field, "UNGUIDED", 16)
-            patch.setattr(pose_field, "GUIDED", 64)
         for _ in range(3):
             best = least_costs(grid, *robot(motion), goal)
             for x, y, heading in starts:
@@ -119,7 +118,6 @@ def test_what_the_map_tells_changes_no_least_path(seed: int, monkeypatch: Any) -
     costs: dict[int, list[float]] = {}
     for looks in (2**8, 2**30):
         monkeypatch.setattr(pose_field, "UNGUIDED", looks)
-        monkeypatch.setattr(pose_field, "GUIDED", 4 * looks)
         body, places = planner("differential"), np.random.default_rng(seed)
         for heading in range(6):
             cells = places.permutation(np.argwhere(~occupancy))[:2].tolist()
