@@ -138,7 +138,7 @@ def measure_requests_with_costs(side: int) -> Iterator[bool]:
             weights = np.where(occupancy, np.inf, multiplier).astype(np.float32)
             whole = np.where(occupancy, 0, np.rint(25 * multiplier)).astype(np.int32)
             ends = weights, start[::-1], goal[::-1]
-            for _ in range(2 + ROUNDS):
+            for _ in range(2 + ROUNDS * 1024 // side):
                 ms, _ = timed(new_planner().plan, GridMap(occupancy, cost=cost), start, goal, RULE)
                 tcod_ms, _ = timed(search_with_tcod, whole, start, goal)
                 astar_ms, _ = timed(dijkstra3d.dijkstra, *ends, connectivity=8, compass=True)
