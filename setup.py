@@ -63,6 +63,7 @@ setup(
             "pytest>=7.4",
             "pytest-xdist>=3.5",
             "ruff>=0.9",
+            "setuptools<80",  # with a newer one, colcon's --symlink-install makes copies
             "shapely>=2.0",
             "types-PyYAML",
             "types-tqdm",

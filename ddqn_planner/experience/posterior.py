@@ -156,8 +156,8 @@ class Posterior:
 
         A place that is not known counts as faster, at most by the share `exploration`.
         """
-        hope = np.minimum(np.sqrt(self.variance), math.log(1 + exploration))
-        log = np.log(np.exp(self.mean - hope) + self.waits) - fastest
+        hope = math.log(1 + exploration) * np.sqrt(1 - self.known)
+        log = np.log(self.slowness) - hope - fastest
         steps = np.rint(np.clip(log, 0, math.log(MAX_SLOWNESS)) / math.log(1 + STEP))
         if self.painted is None or self.painted[:2] != (exploration, fastest):
             box: tuple[slice, ...] = (slice(None), slice(None))

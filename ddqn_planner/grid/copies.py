@@ -102,6 +102,12 @@ def boxes_of(is_set: NDArray[np.bool_], apart: int = APART) -> list[Box]:
     return boxes if len(boxes) <= FEW else boxes_of(is_set, is_set.size)
 
 
+def few_of(is_set: NDArray[np.bool_]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Return the rows and columns of what is True: with few of many, sooner than `np.nonzero`."""
+    y, x = np.divmod(np.flatnonzero(is_set), is_set.shape[1])
+    return y, x
+
+
 def _runs(is_set: NDArray[np.bool_], apart: int) -> list[slice]:
     """Return where something is True, with gaps of so many others at most."""
     places = np.flatnonzero(is_set)

@@ -195,7 +195,7 @@ class GridMap:
             cost=costs,
             obstacles=replaced(self.obstacles, box, closed),
         )
-        occupied = self._occupied + int(patch.sum()) - int(self.occupancy[box].sum())
+        occupied = self._occupied + np.count_nonzero(patch) - np.count_nonzero(self.occupancy[box])
         patches = *self._patches[1 - MAX_PATCHES :], (self._version, box)
         has_same_layers = (costs is None) == (self.cost is None)
         patched._set(_occupied=occupied, _patches=patches if has_same_layers else ())

@@ -8,9 +8,9 @@ from importlib import import_module
 
 from ddqn_planner.resources import with_remedy
 
-# NumPy is imported after this. The networks' products are small: more threads than one only wait
-# for each other, ten times as long on a busy machine.
-os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+# NumPy and torch are imported after this. The networks' products are small: more threads than one
+# only wait for each other, ten times as long on a busy machine.
+os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 
 def run(name: str) -> int:

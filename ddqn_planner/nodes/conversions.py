@@ -52,8 +52,7 @@ def grid_from_message(message: OccupancyGrid, *rules: Any) -> GridMap:
         raise ValueError(f"the map's data has {has} values; its {size} need {needs}")
     _check_pose("the map's origin", info.origin)
     if math.hypot(turned.x, turned.y) > TOLERANCE:
-        how = f"rolled or pitched ({_numbers(turned)})"
-        raise ValueError(f"the map's origin is {how}; give a rotation about z alone")
+        raise ValueError(f"the map's origin is rolled or pitched ({_numbers(turned)}); give a yaw")
     values = np.frombuffer(message.data, np.int8).reshape(info.height, info.width)
     origin = (info.origin.position.x, info.origin.position.y, 2 * math.atan2(turned.z, turned.w))
     try:
@@ -182,14 +181,10 @@ def bytes_message(kind: str, data: bytes) -> UInt8MultiArray:
     return UInt8MultiArray(layout=MultiArrayLayout(dim=[dimension]), data=array.array("B", data))
 
 
-def label_of(message: UInt8MultiArray) -> str:
-    """Return what a message says of its bytes."""
-    return message.layout.dim[0].label if message.layout.dim else ""
-
-
 def bytes_of(kind: str, message: UInt8MultiArray) -> bytes:
     """Return the bytes of a kind that a message carries; a ValueError if it has others."""
-    data, label = bytes(message.data), label_of(message)
+    data = bytes(message.data)
+    label = message.layout.dim[0].label if message.layout.dim else ""
     if label != (right := LABEL.format(kind, hashlib.sha256(data).hexdigest())):
         wrong = f"{len(data)} bytes with the label {label!r}, not {right!r}"
         is_cut = label.partition(":")[0] == right.partition(":")[0]
@@ -243,9 +238,8 @@ def _check_pose(name: str, pose: Pose) -> None:
     # A comparison that NaN fails.
     norm = math.hypot(rotation.x, rotation.y, rotation.z, rotation.w)
     if not abs(norm - 1) <= TOLERANCE:
-        wrong = f"orientation is ({_numbers(rotation)}), a quaternion of norm {norm:.6g}"
-        remedy = "give one of norm 1 (w = 1 and the rest 0 means no rotation)"
-        raise ValueError(f"{name}'s {wrong}; {remedy}")
+        wrong = f"{name}'s orientation is ({_numbers(rotation)}), a quaternion of norm {norm:.6g}"
+        raise ValueError(f"{wrong}; give one of norm 1 (w = 1 and the rest 0 means no rotation)")
 
 
 def _numbers(message: Point | Quaternion) -> str:

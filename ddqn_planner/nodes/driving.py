@@ -1,36 +1,39 @@
-"""Learning from drives, and what it shares with training: the map, the folder, the replay."""
+"""What a trainer node learns from drives: those of its robot, or of a fleet."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable
 from functools import partial
-from pathlib import Path as FilePath
-from typing import Any, NamedTuple
+from importlib import import_module
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
-from diagnostic_msgs.msg import DiagnosticStatus
-from nav_msgs.msg import OccupancyGrid, Path
+from action_msgs.msg import GoalStatus, GoalStatusArray
+from geometry_msgs.msg import PoseStamped
+from nav_msgs.msg import OccupancyGrid
 from numpy.typing import NDArray
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
-from rclpy.timer import Timer
+from rclpy.qos import DurabilityPolicy, QoSProfile
+from rclpy.time import Time
 from std_msgs.msg import String, UInt8MultiArray
 
-from ddqn_planner.experience.drives import RECORD, DriveEnd, DriveFolder, read_drives
-from ddqn_planner.experience.prior import Prior
-from ddqn_planner.grid import GridMap
-from ddqn_planner.nodes.conversions import (
-    bytes_message,
-    grid_from_message,
-    occupancy_message,
-    path_bytes,
+from ddqn_planner.experience.drives import (
+    RECORD,
+    DriveEnd,
+    DriveFolder,
+    DriveRecorder,
+    read_drives,
 )
-from ddqn_planner.nodes.driving_robot import DrivingRobot
-from ddqn_planner.nodes.parameters import OF_MAPS
-from ddqn_planner.nodes.poses import Frames
-from ddqn_planner.nodes.report import Refusals
-from ddqn_planner.nodes.runtime import LATCHED, STEADY, BaseNode, Parameters, Worker
+from ddqn_planner.grid import GridMap
+from ddqn_planner.nodes.conversions import bytes_message, occupancy_message, path_bytes
+from ddqn_planner.nodes.poses import Frames, listen
+from ddqn_planner.nodes.runtime import LATCHED, STEADY
 from ddqn_planner.resources import with_remedy
 
+if TYPE_CHECKING:
+    from ddqn_planner.nodes.trainer_node import TrainerNode
+
+NAVIGATION = "navigate_to_pose/_action/status"
 Float64 = NDArray[np.float64]
 RETRY_PERIOD = 5.0  # seconds after which what failed for a full disk is tried again
 SLOWEST = 10.0  # the slowness that ``~/slowness`` shows as 100
@@ -47,91 +50,89 @@ class MapInFrame(NamedTuple):
     frame: str
 
 
-class LearningNode(BaseNode):
-    """Node that learns on the last map, keeps what it learns in a folder, and replays episodes."""
+class DrivingRobot:
+    """Divides what it hears of the robot of a namespace into drives, while the node records."""
 
-    def __init__(self, name: str, parameters: Parameters) -> None:
-        super().__init__(name, parameters)
-        self.map: MapInFrame | None = None
-        self.refusals = Refusals(self)
-        self.state = self.error = self.save_error = ""
-        self.replaying: Timer | None = None
-        self.episodes = self.create_publisher(Path, "~/episode", 10)
-        self.create_subscription(OccupancyGrid, "map", self._on_map, LATCHED)
-
-    @property
-    def folder(self) -> FilePath:
-        """The parameter ``output_folder``."""
-        return FilePath(self.value("output_folder")).absolute()
-
-    def _on_map(self, message: OccupancyGrid) -> None:
-        with self.refusals.taking("map"):
-            grid = grid_from_message(message, *map(self.value, OF_MAPS))
-            self.map = MapInFrame(grid, message.header.frame_id)
-            self.get_logger().info(f"map of {grid.width} x {grid.height} cells")
-
-    def fail(self, reason: str) -> None:
-        """Log an error, and keep it for the diagnostics."""
-        self.error = reason
-        self.get_logger().error(reason)
-
-    def note_saving(self, what: str, error: str) -> None:
-        """Log when saving begins to fail, and when it works again (no error), not at each try."""
-        before, self.save_error = self.save_error, error
-        if error and not before:
-            self.get_logger().error(error)
-        if before and not error:
-            self.get_logger().info(f"{what} saved again")
-
-    def publish_diagnostics(
-        self, what: str, values: Mapping[str, str], error: str = "", missing: str = ""
+    def __init__(
+        self, node: TrainerNode, frames: Frames, name: str, on_drive: Callable[..., Any]
     ) -> None:
-        """Publish the state, what was refused and failed, and what is still missing."""
-        problems = [*self.refusals.problems(), *filter(None, [self.save_error, error])]
-        good = DiagnosticStatus.WARN if missing else DiagnosticStatus.OK
-        level = DiagnosticStatus.ERROR if problems else good
-        message = "; ".join(filter(None, [*problems, missing])) or self.state
-        self.refusals.tell(what, level, message, {"state": self.state, **values})
+        self._node, self._frames, self._name = node, frames, name
+        self._space = f"{name}/" if name else ""  # before its topics and its frame
+        self.recorder = DriveRecorder(partial(on_drive, f" by {name}" if name else ""))
+        self._aborted: set[bytes] | None = None
+        listen(node, f"{self._space}goal_pose", 10, node.refusals, self._on_goal)
+        latched = QoSProfile(depth=10, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+        topic = f"{self._space}{NAVIGATION}"
+        node.create_subscription(GoalStatusArray, topic, self._on_status, latched)
+        if node.value("pose_source") == "tf":
+            frames.listen()
+            node.create_timer(0.05, self._look_up, clock=STEADY)  # every pose counts
+        else:
+            listen(node, f"{self._space}odom", 1000, node.refusals, self._on_pose)
 
-    def replay(
-        self, file: FilePath, episodes: Iterator[Any], draw: Callable[[Any], None], remedy: str
-    ) -> tuple[bool, str]:
-        """Draw the first place of each episode, its first two, and so on; see `create_trigger`."""
-        frames = (places[: n + 1] for places in episodes for n in range(len(places)))
-        try:
-            draw(next(frames))
-        except StopIteration:
-            return False, f"{file} holds no episode to replay yet; {remedy}"
-        except OSError as error:
-            return False, f"no recorded episodes ({error}); call ~/start first"
-        self.stop_replay()
+    def _on_pose(self, pose: PoseStamped) -> None:
+        """Record a pose; a ValueError refuses it."""
+        seconds = Time.from_msg(pose.header.stamp).nanoseconds / 1e9
+        position = self._position("the robot's pose", pose)
+        if position is None:
+            return
+        if not seconds:
+            raise ValueError("the robot's pose has no stamp; give it the time")
+        if self._node.state == "recording":
+            self.recorder.add(seconds, *position)
 
-        def step() -> None:
+    def _look_up(self) -> None:
+        if (place := self._node.map) is None:
+            return
+        with self._node.refusals.taking(f"{self._space}tf", often=True):
+            frame = f"{self._space}{self._node.value('robot_frame')}".lstrip("/")
             try:
-                draw(next(frames))
-            except StopIteration:
-                self.stop_replay()
-            except OSError as error:
-                self.stop_replay()
-                self.fail(f"the replay ends: {file.name} can no longer be read ({error})")
+                pose = self._frames.origin_of(frame, place.frame)
+            except ValueError as error:
+                raise ValueError(f"{error}; publish a transform, or set robot_frame") from None
+            self._on_pose(pose)
 
-        self.replaying = self.create_timer(self.value("replay_period"), step, clock=STEADY)
-        return True, "replaying the recorded episodes on ~/episode"
+    def _on_goal(self, goal: PoseStamped) -> None:
+        position = self._position("the goal", goal)
+        if position is not None:
+            self.recorder.set_goal(*position)
 
-    def stop_replay(self) -> str:
-        """Stop a replay, and say so; return nothing if there was none."""
-        timer, self.replaying = self.replaying, None
-        if timer is None:
-            return ""
-        self.destroy_timer(timer)
-        return "; the replay was stopped"
+    def _position(self, name: str, pose: PoseStamped) -> tuple[float, float] | None:
+        """Return a pose's position in the frame of the map, if there is one, or a ValueError."""
+        if self._node.map is None:
+            return None
+        frame = self._node.map.frame
+        self._frames.check(name, pose, frame)
+        position = self._frames.to_map(name, pose, frame).pose.position
+        return position.x, position.y
+
+    def _on_status(self, message: GoalStatusArray) -> None:
+        """End the drive where the robot's navigation gives up."""
+        aborted = {
+            bytes(status.goal_info.goal_id.uuid)
+            for status in message.status_list
+            if status.status == GoalStatus.STATUS_ABORTED
+        }
+        # What failed before the node listened failed elsewhere.
+        before = aborted if self._aborted is None else self._aborted
+        self._aborted = before | aborted
+        if self._node.state == "recording" and aborted - before:
+            self.recorder.abort()
+
+    def told(self) -> dict[str, str]:
+        """Return what the diagnostics say of it."""
+        places = {"robot": self.recorder.position, "goal": self.recorder.goal}
+        return {
+            f"{what} {self._name}".rstrip(): f"({at[0]:.6g}, {at[1]:.6g})" if at else "unknown"
+            for what, at in places.items()
+        }
 
 
 class Driving:
     """Records the drives of a node's robot in its ``output_folder``, and learns from them."""
 
-    def __init__(self, node: LearningNode, worker: Worker) -> None:
-        self._node, self._worker = node, worker
+    def __init__(self, node: TrainerNode) -> None:
+        self._node = node
         self._folder: DriveFolder | None = None
         self._last_drive, self._is_disk_full = "", False
         self._shown: GridMap | None = None
@@ -148,8 +149,8 @@ class Driving:
         group = MutuallyExclusiveCallbackGroup()  # it awaits the worker
         self._learning = node.create_timer(1.0, self._learn_prior, group, clock=STEADY)
         for name in ("start", "stop", "save", "replay", "forget"):
-            node.create_trigger(f"~/{name}", getattr(self, f"_on_{name}"))
-        self._on_start()
+            node.create_trigger(f"~/{name}", getattr(self, name))
+        self.start()
 
     def _recording(self) -> DriveFolder | None:
         return self._folder if self._node.state == "recording" else None
@@ -200,8 +201,9 @@ class Driving:
             return
         self._places_of_prior = known
         given = place.grid, evidence.table.copy(), evidence.prior, self._node.value("seed")
+        training = "ddqn_planner.training.prior"  # it imports torch
         try:
-            prior = await self._worker.call(prior_of, *given)
+            prior = await self._node.worker.call(lambda: import_module(training).prior_of(*given))
         except Exception as error:  # the node must survive
             if isinstance(error, ImportError):
                 self._node.destroy_timer(self._learning)
@@ -217,7 +219,7 @@ class Driving:
         if folder is not None and folder.save_error:
             self._save(folder)
         elif self._node.state == "failed" and self._is_disk_full:
-            self._on_start()
+            self.start()
 
     def _draw(self, place: MapInFrame, positions: Float64) -> None:
         yaw = np.arctan2(*np.diff(positions, axis=0).T[::-1])
@@ -238,7 +240,10 @@ class Driving:
         header = self._node.header(place.frame)
         self._slowness.publish(occupancy_message(percent, grid.resolution, grid.origin, header))
 
-    def _on_start(self) -> tuple[bool, str]:
+    # Services
+
+    def start(self) -> tuple[bool, str]:
+        """Record drives, which begin anew."""
         if self._recording():
             return False, "drives are being recorded already; call ~/stop first"
         names = "nominal_speed", "robot_width", "experience"
@@ -256,7 +261,8 @@ class Driving:
         self._save(folder)
         return True, f"recording in {folder.folder} after drive {folder.drives}"
 
-    def _on_stop(self) -> tuple[bool, str]:
+    def stop(self) -> tuple[bool, str]:
+        """Record the drive that is under way, save, and record no more."""
         replay = self._node.stop_replay()
         folder = self._recording()
         if folder is None:
@@ -271,14 +277,16 @@ class Driving:
         self._node.state = "stopped"
         return True, f"stopped after drive {folder.drives}; ~/start continues{replay}"
 
-    def _on_save(self) -> tuple[bool, str]:
+    def save(self) -> tuple[bool, str]:
+        """Save now."""
         folder = self._recording()
         if folder is None:
             return False, NOT_RECORDING
         self._save(folder)
         return not folder.save_error, folder.save_error or f"saved in {folder.folder}"
 
-    def _on_forget(self) -> tuple[bool, str]:
+    def forget(self) -> tuple[bool, str]:
+        """Forget what was learned."""
         folder = self._recording()
         if folder is None:
             return False, NOT_RECORDING
@@ -292,13 +300,11 @@ class Driving:
         done = f"forgot all but the drives. {kept} has what was known: {undo}"
         return not folder.save_error, folder.save_error or done
 
-    def _on_replay(self) -> tuple[bool, str]:
-        place = self._node.map
-        if place is None:
-            return False, f"{NO_MAP} first"
+    def replay(self) -> tuple[bool, str]:
+        """Draw the recorded drives."""
         file = self._node.folder / RECORD
         drives = (drive.positions[::5] for drive in read_drives(file))  # else it takes long
-        return self._node.replay(file, drives, partial(self._draw, place), "drive on")
+        return self._node.replay(self._node.map, file, drives, self._draw, "drive on")
 
     def _publish_diagnostics(self) -> None:
         values = {"last drive": self._last_drive}
@@ -313,20 +319,6 @@ class Driving:
             }
         missing = f"{NO_MAP}, or set map_file" if self._node.map is None else ""
         self._node.publish_diagnostics("driving", values, missing=missing)
-
-    def close(self) -> None:
-        """Record the drive that is under way, and save."""
-        self._on_stop()
-
-
-def prior_of(*given: Any) -> Prior | None:
-    """Import torch in the worker, and train the prior."""
-    import torch
-
-    from ddqn_planner.training import prior
-
-    torch.set_num_threads(1)  # as in `import_training`
-    return prior.prior_of(*given)
 
 
 def explained(error: Exception) -> str:

@@ -1,24 +1,27 @@
-"""The map that the planner plans on: the last one received, with its updates and its directions."""
+"""The map that the planner plans on: the last one, with updates, directions and expected times."""
 
 from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from nav_msgs.msg import OccupancyGrid
 from numpy.typing import NDArray
+from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
 from rclpy.qos import QoSProfile
 from rclpy.task import Future
-from std_msgs.msg import Header
+from std_msgs.msg import Header, UInt8MultiArray
 
+from ddqn_planner.experience import Experience
 from ddqn_planner.grid import GridMap
 from ddqn_planner.grid.body import Inflation
-from ddqn_planner.grid.copies import boxes_of
-from ddqn_planner.nodes.conversions import grid_from_message, grid_from_values
-from ddqn_planner.nodes.report import Report, RequestError, seconds
+from ddqn_planner.grid.copies import WHOLE, boxes_of
+from ddqn_planner.nodes.conversions import bytes_of, grid_from_message, grid_from_values
+from ddqn_planner.nodes.report import NO_REQUEST, Outcome, Report, RequestError, seconds
 from ddqn_planner.nodes.runtime import LATCHED, BaseNode, Worker
 from ddqn_planner.planning.field import offset_between, overlap
 
@@ -36,7 +39,8 @@ UPDATES_QUALITY = QoSProfile(depth=100)
 
 REMEDY = "let the map's publisher send the full map"
 
-PATIENCE = 1.0  # seconds within which the first map is expected after the node subscribes
+CHANGED_SHARE = 0.02  # of cells: with more, experience is spread anew over the map, slowly
+NO_MAP = GridMap(np.zeros((1, 1), dtype=np.bool_))
 
 
 @dataclass
@@ -51,23 +55,17 @@ class Received:
 class MapSource:
     """The map to plan on; `on_map` is called, with whether the frame is new, when anything is."""
 
-    # `timed` returns a map with expected times; the worker calls it.
     def __init__(
-        self,
-        node: BaseNode,
-        report: Report,
-        worker: Worker,
-        timed: Callable[[GridMap], GridMap],
-        on_map: Callable[[bool], None],
+        self, node: BaseNode, report: Report, worker: Worker, on_map: Callable[[bool], None]
     ) -> None:
-        self._node, self._report, self._worker = node, report, worker
-        self._timed, self._on_map = timed, on_map
+        self._node, self._report, self._worker, self._on_map = node, report, worker, on_map
+        self.times = ExpectedTimes(node, report, worker, self.change)
         # The map in use and the last one. If that is another one, it waits for its directions.
         self._used: Received | None = None
         self._newest: Received | None = None
         self._began = time.monotonic()
         self._described = ""
-        self._updates = self._refused_updates = 0
+        self._updates = self._applied_updates = 0
         self._inflate = Inflation()
         self._ready: Future | None = None
         # Before the subscription of the map: directions that come with a map are taken first.
@@ -91,8 +89,8 @@ class MapSource:
         because = f" ({refused})" if refused else ""
         if self._used is None:
             missing = f"no map was received on {self._topic} yet{because}; start a map server"
-            may_come = time.monotonic() - self._began < PATIENCE
-            raise RequestError("NO_MAP", refused if refused and self._newest else missing, may_come)
+            missing = refused if refused and self._newest else missing
+            raise RequestError("NO_MAP", missing, self._began)
         timeout = self._node.value("map_timeout")
         is_costmap = self._node.value("map_type") == "costmap"
         if is_costmap and 0 < timeout < time.monotonic() - self._used.came:
@@ -116,10 +114,10 @@ class MapSource:
         if self._used is not None:
             description["map"] = self._described
             description["map stamp (s)"] = seconds(self._used.header.stamp)
-        if self._updates or self._refused_updates:
-            description["map updates applied"] = str(self._updates)
-            description["map updates refused"] = str(self._refused_updates)
-        return description
+        if self._updates:
+            description["map updates applied"] = str(self._applied_updates)
+            description["map updates refused"] = str(self._updates - self._applied_updates)
+        return description | self.times.told(self._report.outcome)
 
     def ready(self) -> Future:
         """Return the `GridMap` to plan on, with body and times: computed for the first request."""
@@ -127,17 +125,18 @@ class MapSource:
         if ready is None or (ready.done() and ready.exception()):  # as when no memory was left
             radius, weight = map(self._node.value, BODY_PARAMETERS)
             # ROS accepts a value that is above the range by a millionth.
-            of = self._grid, radius, min(weight, 1.0)
-            ready = self._ready = self._worker.call(self._prepare, *of)
+            of_body = self._grid, radius, min(weight, 1.0)
+            ready = self._ready = self._worker.call(
+                lambda: self.times.apply(self._inflate(*of_body))
+            )
         return ready
-
-    def _prepare(self, *of_body: Any) -> GridMap:
-        return self._timed(self._inflate(*of_body))
 
     def apply_parameters(self, changed: set[str]) -> None:
         """Read and prepare the map anew if one of the parameters that changed says so."""
         if changed & {*MAP_PARAMETERS, *BODY_PARAMETERS, "require_directions", "exploration"}:
             self._read_again()
+        if "experience" in changed:
+            self.times.read()
 
     def _take(self, message: OccupancyGrid) -> None:
         try:
@@ -216,28 +215,21 @@ class MapSource:
 
     def _take_update(self, update: Any) -> None:
         """Plan on the map with other values in a box from now on, or refuse the update."""
-        newest = self._newest
-        try:
+        newest, self._updates = self._newest, self._updates + 1
+        with self._report.taking("map_updates", often=True):
             if newest is None:
                 raise ValueError(f"an update came before a map; {REMEDY}")
             values = updated_values(newest.message, update)
             if newest is self._used:
                 self._grid = self._patched(self._grid, values, update.x, update.y)
-        except (ValueError, MemoryError) as error:
-            self._refused_updates = count = self._refused_updates + 1
-            self._report.refuse("map_updates", str(error), log=False)
-            if count & (count - 1) == 0:  # 1, 2, 4, ...: updates come often
-                self._node.get_logger().error(f"update {count} of the map refused: {error}")
-            return
-        # In place, for the day when a parameter changes and the map is read anew.
-        info, (height, width) = newest.message.info, values.shape
-        whole = np.frombuffer(newest.message.data, np.int8).reshape(info.height, info.width)
-        whole[update.y : update.y + height, update.x : update.x + width] = values
-        self._report.accept("map_updates")
-        newest.header, newest.came = update.header, time.monotonic()
-        self._updates += 1
-        if newest is self._used:
-            self.change()
+            # In place, for the day when a parameter changes and the map is read anew.
+            info, (height, width) = newest.message.info, values.shape
+            whole = np.frombuffer(newest.message.data, np.int8).reshape(info.height, info.width)
+            whole[update.y : update.y + height, update.x : update.x + width] = values
+            newest.header, newest.came = update.header, time.monotonic()
+            self._applied_updates += 1
+            if newest is self._used:
+                self.change()
 
 
 def _place(message: OccupancyGrid) -> tuple[Any, ...]:
@@ -249,8 +241,7 @@ def updated_values(message: OccupancyGrid, update: Any) -> NDArray[np.int8]:
     """Return the values that an update puts into the last map, (h, w); ValueError if none fit."""
     frame, map_frame = update.header.frame_id, message.header.frame_id
     if frame != map_frame:
-        both = f"the update's frame is {frame!r}, the map's is {map_frame!r}"
-        raise ValueError(f"{both}; publish both in one frame")
+        raise ValueError(f"the update's frame is {frame!r}, the map's is {map_frame!r}; use one")
     stamp, map_stamp = update.header.stamp, message.header.stamp
     if (0, 0) < (stamp.sec, stamp.nanosec) < (map_stamp.sec, map_stamp.nanosec):
         stamps = f"{seconds(map_stamp)}, is later than the update's, {seconds(stamp)}"
@@ -261,8 +252,7 @@ def updated_values(message: OccupancyGrid, update: Any) -> NDArray[np.int8]:
         place = f"is not inside the map of {info.width} x {info.height}"
         raise ValueError(f"an update of {box} from {(x, y)} {place}; {REMEDY}")
     if len(update.data) != width * height:
-        wrong = f"the update's data has {len(update.data)} values"
-        raise ValueError(f"{wrong}; its {box} need {width * height}")
+        raise ValueError(f"the update has {len(update.data)} values; {box} need {width * height}")
     return np.frombuffer(update.data, np.int8).reshape(height, width)
 
 
@@ -321,3 +311,91 @@ class Directions:
             grid = replace(grid, forbidden=forbidden)
         self.used, self._are_paired = found, bool(own)
         return grid
+
+
+class ExpectedTimes:
+    """Puts on maps what the trainer has learned of the robot's drives."""
+
+    def __init__(
+        self, node: BaseNode, report: Report, worker: Worker, on_change: Callable[[], None]
+    ) -> None:
+        self._node, self._report, self._worker, self._on_change = node, report, worker, on_change
+        self._experience: Experience | None = None
+        self._spread_on: GridMap | None = None
+        self._applied = (NO_MAP, NO_MAP)  # the last map, without times and with them
+        # What the worker was asked last, and its answer.
+        self._outcome, self._forecast = NO_REQUEST, Future()
+        group = MutuallyExclusiveCallbackGroup()  # it waits for the worker
+        self.read = node.create_guard_condition(self.on_sent, group).trigger
+        if node.value("experience"):
+            self.read()
+        if node.value("follow_trainer"):
+            sent = UInt8MultiArray, "trainer/experience", self.on_sent, LATCHED
+            node.create_subscription(*sent, callback_group=group)
+
+    async def on_sent(self, message: UInt8MultiArray | None = None) -> None:
+        """Plan by what drives taught, or refuse the trainer's message, or the file that is set."""
+        with self._report.taking("experience"):
+            await self._worker.call(self.load, message)
+            self._on_change()
+
+    def told(self, outcome: Outcome) -> dict[str, str]:
+        """Return what `describe` returns, once the worker has computed it."""
+        if self._experience is None:
+            return {}
+        if outcome is not self._outcome:
+            self._outcome, self._forecast = outcome, self._worker.call(self.describe, outcome)
+        if not self._forecast.done():
+            self._report.change()  # to look again soon
+        return self._forecast.result() or {}
+
+    def load(self, message: UInt8MultiArray | None = None) -> None:
+        """Use a message, or the file that is set, or none; errors change nothing."""
+        newer = None
+        if message:
+            newer = Experience.from_bytes(bytes_of("experience", message))
+        elif file := self._node.value("experience"):
+            newer = Experience.load(file)
+        if newer is not None and self._experience is not None:
+            newer.take_over(self._experience)
+        self._experience = newer
+
+    def apply(self, grid: GridMap) -> GridMap:
+        """Return a map whose moves cost expected time, or the same map before a drive."""
+        if self._experience is None or not self._experience.evidence.places:
+            return grid
+        if self._spread_on is None or not is_like(grid, self._spread_on):
+            self._spread_on = grid
+        (before, timed), share = self._applied, self._node.value("exploration")
+        of_places = self._experience.apply(self._spread_on, share)
+        boxes = grid.patches_since(before)
+        if boxes is None or timed.slowness is not of_places.slowness:
+            seconds = of_places.seconds_per_cell
+            timed = grid.with_layers(slowness=of_places.slowness, seconds_per_cell=seconds)
+        else:
+            timed = timed.with_boxes_of(grid, boxes)
+        self._applied = grid, timed
+        return timed
+
+    def describe(self, outcome: Outcome) -> dict[str, str]:
+        """Return how long a plan takes, unless its map is old or untimed, or no memory is left."""
+        now, request, path = self._spread_on, outcome.request, outcome.plan.path
+        told: dict[str, str] = {}
+        is_timed = request is not None and request.grid.slowness is not None and len(path) > 0
+        if self._experience and now and request and is_timed and is_like(request.grid, now):
+            with suppress(MemoryError):
+                seconds, low, high = self._experience.expected_time(now, path)
+                told["expected time (s)"] = f"{seconds:.1f}"
+                told["expected time, 90 % interval (s)"] = f"{low:.1f} to {high:.1f}"
+        return told
+
+
+def is_like(grid: GridMap, other: GridMap) -> bool:
+    """Return whether two maps have the same place, and nearly the same obstacles."""
+    mine, its = ((each.occupancy.shape, each.resolution, each.origin) for each in (grid, other))
+    if mine != its:
+        return False
+    boxes = grid.patches_since(other)
+    boxes = [WHOLE] if boxes is None else boxes
+    changed = sum(np.count_nonzero(grid.occupancy[box] != other.occupancy[box]) for box in boxes)
+    return bool(changed <= CHANGED_SHARE * grid.occupancy.size)

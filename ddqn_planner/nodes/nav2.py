@@ -107,8 +107,7 @@ def serve_nav2(
         from nav2_msgs.action import ComputePathThroughPoses, ComputePathToPose
         from nav2_msgs.srv import IsPathValid
     except ImportError as error:
-        remedy = "to have them: apt install ros-jazzy-nav2-msgs"
-        node.get_logger().info(f"no actions for Nav2 ({error}); {remedy}")
+        node.get_logger().info(f"no actions for Nav2 ({error}); apt install ros-jazzy-nav2-msgs")
         return
     # Reentrant: the newest goal must be able to preempt another one.
     group = ReentrantCallbackGroup()

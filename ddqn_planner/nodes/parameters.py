@@ -27,22 +27,18 @@ PLANNER_PARAMETERS: Final = {
     "map_timeout": Declared(5.0, "Seconds to plan on the last costmap; 0: always", (0, 3600)),
     "require_directions": Declared(False, "Wait for map_directions, even from a later node"),
     **OF_MAPS,
-    "use_map_costs": Declared(
-        False, "For any_map: a free cell's value is its cost; unknown has the highest"
-    ),
+    "use_map_costs": Declared(False, "For any_map: a free cell costs by its value, unknown most"),
     "robot_radius": Declared(0.0, "Metres: cells nearer to an obstacle are occupied", (0, 100)),
     "start_clearing_radius": Declared(
         -1.0,
-        "Metres: obstacles this near to a start on an obstacle do not count; -1: robot_radius, at "
-        "least one cell; 0: such a start is refused",
+        "Metres: obstacles so near to an occupied start do not count; -1: robot_radius, at least "
+        "one cell; 0: such a start is refused",
         (-1, 100),
     ),
     "clearance_weight": Declared(0.0, "For any_map: how strongly to avoid obstacles", (0, 1)),
     "tolerance": Declared(0.0, "Metres: how far an occupied or cut off goal may move", (0, 1000)),
     "yaw_tolerance": Declared(0.0, "Radians: the same for a robot's heading", (0, 4)),
-    "path_bound": Declared(
-        1.2, "For a robot's model: how many times the least cost a first path may have", (1, 10)
-    ),
+    "path_bound": Declared(1.2, "A robot's first path: how many times the least cost", (1, 10)),
     "replan_period": Declared(1.0, "Seconds between plans on a free path; 0: each map", (0, 3600)),
     "switch_threshold": Declared(0.05, "Share by which a kept path may cost more", (0, 10)),
     "mode": Declared("greedy", "astar_fallback: search where greedy steps get stuck", METHODS),
@@ -52,24 +48,17 @@ PLANNER_PARAMETERS: Final = {
         ["none", "line_of_sight", "straight"],
     ),
     "start_source": Declared(
-        "initialpose",
-        "Where the robot is: a topic, odom, or a transform",
-        ["initialpose", "odometry", "tf"],
+        "initialpose", "What says where the robot is", ["initialpose", "odometry", "tf"]
     ),
     "robot_frame": Declared("base_link", "The robot's frame, for the start_source tf", "not empty"),
     "transform_tolerance": Declared(
-        0.3,
-        "Seconds: greatest age of a transform, how long a request waits for one, and how long "
-        "odometry may be silent (at least 2)",
-        (0, 1000),
+        0.3, "Seconds: greatest age of a transform, wait for one, silence of odometry", (0, 1000)
     ),
     "field_cache_bytes": Declared(
         CACHE_BYTES, "Bytes for kept Q fields; the last two always stay", (0, 2**40)
     ),
     "planner_id": Declared("GridBased", "What Nav2's requests may name, or leave empty"),
     "experience": Declared("", "What drives taught: a file or folder; '': none"),
-    "exploration": Declared(
-        0.1, "Share by which a path may be expected to take longer, to learn from it", (0, 10)
-    ),
+    "exploration": Declared(0.1, "Share by which a path may take longer, to learn", (0, 10)),
     "follow_trainer": Declared(False, "Load what the trainer saves", read_only=True),
 }

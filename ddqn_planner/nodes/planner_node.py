@@ -14,9 +14,9 @@ from rclpy.callback_groups import MutuallyExclusiveCallbackGroup, ReentrantCallb
 from rclpy.parameter import Parameter
 from std_msgs.msg import Header, UInt8MultiArray
 
-from ddqn_planner.nodes.conversions import along, path_bytes, path_message
+from ddqn_planner.model import model_of
+from ddqn_planner.nodes.conversions import along, bytes_of, path_bytes, path_message
 from ddqn_planner.nodes.display import FieldDisplay
-from ddqn_planner.nodes.expected_times import ExpectedTimes
 from ddqn_planner.nodes.lifecycle import ManagedNode
 from ddqn_planner.nodes.map_source import MapSource
 from ddqn_planner.nodes.nav2 import GivenUp, serve_nav2
@@ -29,9 +29,11 @@ from ddqn_planner.nodes.requests import (
     ModelSource,
     PathUnderWay,
     Requests,
+    read_model,
     way_of,
 )
 from ddqn_planner.nodes.runtime import LATCHED, STEADY, Worker, spin_until_shutdown, unless
+from ddqn_planner.planning import Planner
 from ddqn_planner.planning.plan import PosePlan
 from ddqn_planner.planning.segments import SAME_COST
 
@@ -84,27 +86,16 @@ class PlannerNode(ManagedNode):
         group = MutuallyExclusiveCallbackGroup()
         self._replan = self.create_guard_condition(self._plan_for_active_goal, group)
         self._frames = Frames(self, lambda: float(self._settings.transform_tolerance))
-        worker = self._map_worker
-        self._times = ExpectedTimes(self, self._report, worker, lambda: self._map.change())
-        self._map = MapSource(self, self._report, worker, self._times.apply, self._on_map)
+        self._map = MapSource(self, self._report, self._map_worker, self._on_map)
         self._start = StartSource(
             self, self._frames, self._report, lambda: self._map.frame, self._on_start
         )
-        group = MutuallyExclusiveCallbackGroup()  # this one ends when a newer path is there
-        self._improve = self.create_guard_condition(self._improve_path, group)
-        group = MutuallyExclusiveCallbackGroup()  # it waits for a worker
-        self._read_experience = self.create_guard_condition(self._times.on_sent, group)
-        if self._settings.experience:
-            self._read_experience.trigger()
         inputs = self._map, self._start, self._frames, self._model
         self._requests = Requests(self._settings, *inputs, self._worker, self._look_soon)
         self.create_subscription(PoseStamped, "goal_pose", lambda goal: self._on_goals([goal]), 10)
         self.create_subscription(PoseArray, "goal_poses", self._on_goal_poses, 10)
         if self._settings.follow_trainer:
-            sent = UInt8MultiArray
-            self.create_subscription(sent, "trainer/model", self._on_model, LATCHED)
-            topic, on_sent = "trainer/experience", self._times.on_sent
-            self.create_subscription(sent, topic, on_sent, LATCHED, callback_group=group)
+            self.create_subscription(UInt8MultiArray, "trainer/model", self._on_model, LATCHED)
         # Reentrant: a request that waits for its field does not keep out the others.
         reentrant = ReentrantCallbackGroup()
         self.create_service(GetPlan, "~/get_plan", self._on_get_plan, callback_group=reentrant)
@@ -122,7 +113,7 @@ class PlannerNode(ManagedNode):
         """Forget the active goal."""
         super().deactivate()
         self._active, self._followed = ActiveGoal([]), PathUnderWay()
-        self._improvable: tuple[Outcome, ActiveGoal | None] | None = None
+        self._newest: Outcome | None = None
         self._report.change()
 
     def cleanup(self) -> None:
@@ -131,10 +122,8 @@ class PlannerNode(ManagedNode):
         self._forget()
         self._report.refused.clear()
         self._report.note(NO_REQUEST)
-        if "_frames" in vars(self):
-            self._frames.close()
         self.after_jump_back.clear()
-        for name in ("_start", "_frames", "_display", "_map", "_times", "_requests"):
+        for name in ("_start", "_frames", "_display", "_map", "_requests"):
             vars(self).pop(name, None)  # not all are there, if `configure` failed
         self._model.forget()
 
@@ -157,28 +146,26 @@ class PlannerNode(ManagedNode):
         super().check_parameters(new)
         check_source("start_source", new.get("start_source", ""), "'initialpose' or 'odometry'")
         if "model" in new and hasattr(self, "_settings"):  # a worker loads the first one
-            self._candidate = ModelSource.read(new["model"])
+            self._candidate = read_model(new["model"])
 
     def _apply_parameters(self, parameters: list[Parameter]) -> None:
-        settings = self._settings = self.settings()
+        self._settings = self.settings()
         changed = {parameter.name for parameter in parameters} & self._declared.keys()
         if not (changed and self._is_configured):  # subscriptions declare parameters, too
             return
-        if "experience" in changed:
-            self._read_experience.trigger()
         if "model" in changed:
             self._model.use(*self._candidate)
-        if self._model.planner is not None:
-            self._model.planner.cache_bytes = settings.field_cache_bytes
         self._start.listen()
-        self._requests.settings = settings
+        self._requests.settings = self._settings
         self._map.apply_parameters(changed)
         if "path_simplification" in changed:
             self._followed = PathUnderWay()
         self._plan_for(ActiveGoal(self._active.poses))
 
     def _on_model(self, message: UInt8MultiArray) -> None:
-        if self._model.take(message):
+        with self._report.taking("trainer/model"):
+            planner = Planner(*model_of(bytes_of("model", message)))
+            self._model.use(planner, "trainer/model")
             self._plan_for(ActiveGoal(self._active.poses))
 
     # Map, start and goal
@@ -238,10 +225,8 @@ class PlannerNode(ManagedNode):
         if active.is_news(outcome, header.frame_id):
             self._plan_publisher.publish(*_paths(outcome, header, path_bytes))
         self._waits_for_pose = outcome.status in ("NO_START", "TF_ERROR")
-        path, request = outcome.plan.path, outcome.request
-        leaves = request is not None and len(path) > 0 and request.grid.is_obstacle(path[0])
         # Not the reason: its places and lengths may differ.
-        logged = goals, outcome.goal, outcome.status, outcome.plan.method, leaves
+        logged = goals, outcome.goal, outcome.status, outcome.plan.method
         if self._logged != logged:
             self._logged = logged
             self._report.log(outcome)
@@ -264,19 +249,15 @@ class PlannerNode(ManagedNode):
 
     def _improve_later(self, outcome: Outcome, active: ActiveGoal | None) -> None:
         """Look for the least path of a body, unless it would not be worth a switch."""
-        plan, self._improvable = outcome.plan, None
+        plan, self._newest = outcome.plan, outcome
         worth = (1 + self._settings.switch_threshold) * SAME_COST
         if isinstance(plan, PosePlan) and plan.bound > worth:
-            self._improvable = outcome, active
-            self._improve.trigger()
+            executor: Any = self.executor
+            executor.create_task(self._improve_path, outcome, active)
 
-    async def _improve_path(self) -> None:
-        if (last := self._improvable) is None:
-            return
-        outcome, active = last
-
+    async def _improve_path(self, outcome: Outcome, active: ActiveGoal | None) -> None:
         def given_up() -> Outcome | None:
-            return None if last is self._improvable else UNCHANGED
+            return None if outcome is self._newest else UNCHANGED
 
         header, better = await self._answer([], self._requests.improve(outcome), given_up)
         if better.request is not None and active is self._active:
@@ -340,7 +321,7 @@ class PlannerNode(ManagedNode):
             fatal = self._model.planner is None and "model" in self._report.refused
             values = {"state": self.state, **self._model.describe(self._settings.move_rule)}
             if self._is_configured:
-                values |= self._map.describe() | self._times.told(self._report.outcome)
+                values |= self._map.describe()
             self._report.publish(fatal, "; ".join(filter(None, missing)), values)
 
     def _look_for_news(self) -> None:

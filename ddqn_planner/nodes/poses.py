@@ -17,14 +17,13 @@ from rclpy.subscription import Subscription
 from rclpy.time import Time
 
 from ddqn_planner.nodes.conversions import check_pose, quaternion
-from ddqn_planner.nodes.report import Refusals, RequestError
+from ddqn_planner.nodes.report import PATIENCE, Refusals, RequestError
 from ddqn_planner.nodes.runtime import STEADY, BaseNode
 
-# A pose that was stamped before may be transformed by a transform that is later by so much.
-PATIENCE = 1.0  # seconds within which a new listener hears the first message of `odom` or TF
 READ_PERIOD, TF_DEPTH = 0.5, 1000  # seconds between two reads, and messages that come meanwhile
 SILENCE = 2.0  # seconds after which odometry that comes no more does not tell where the robot is
 REMEDY = "; or install tf2_ros (apt install ros-jazzy-tf2-ros-py), which transforms it"
+TYPES = {"odom": Odometry, "initialpose": PoseWithCovarianceStamped, "goal_pose": PoseStamped}
 
 
 def has_tf() -> bool:
@@ -46,9 +45,8 @@ class Frames:
     def __init__(self, node: BaseNode, tolerance: Callable[[], float] = lambda: math.inf) -> None:
         self.available = has_tf()
         self._node, self._tolerance = node, tolerance
-        self._buffer: Any = None
         self._listener: Any = None
-        self._began = -math.inf
+        self.began = -math.inf  # to listen
 
     def check(self, name: str, stamped: PoseStamped, map_frame: str) -> None:
         """Check a pose as `check_pose` does; its frame may be any with TF."""
@@ -65,7 +63,7 @@ class Frames:
             what = f"frame is {frame!r}, and no transform leads from it to the map's, {map_frame!r}"
             remedy = "publish one, or give the pose in the map's frame"
             reason = f"{name}'s {what} ({error}); {remedy}"
-            raise RequestError("TF_ERROR", reason, self.may_come) from None
+            raise RequestError("TF_ERROR", reason, self.began) from None
 
     def _transform_at(self, stamped: PoseStamped, map_frame: str) -> TransformStamped:
         stamp, frames = Time.from_msg(stamped.header.stamp), (map_frame, stamped.header.frame_id)
@@ -76,7 +74,7 @@ class Frames:
         except ValueError:
             newest = self._lookup(*frames)
             later = (Time.from_msg(newest.header.stamp) - stamp).nanoseconds / 1e9
-            if not 0 < later <= PATIENCE:
+            if not 0 < later <= PATIENCE:  # the pose is from before the node listened
                 raise
             return newest
 
@@ -105,22 +103,17 @@ class Frames:
         except self._tf2_ros.TransformException as error:
             raise ValueError(str(error)) from None
 
-    @property
-    def may_come(self) -> bool:
-        """Whether the first transforms are still expected, as the node has subscribed just now."""
-        return time.monotonic() - self._began < PATIENCE
-
     def listen(self) -> None:
         """Listen to TF from now on: most robots do not need it, and each message costs time."""
         if self._listener is None:
             import tf2_ros  # it takes a while
 
-            self._tf2_ros, self._buffer, self._began = tf2_ros, tf2_ros.Buffer(), time.monotonic()
+            self._tf2_ros, self._buffer, self.began = tf2_ros, tf2_ros.Buffer(), time.monotonic()
             self._listener = tf2_ros.TransformListener(self._buffer, self._node, qos=TF_DEPTH)
             # No executor wakes for them, a hundred a second: they are read when they are needed.
             self._listener.group.can_execute = lambda _: False
-            self._reads = self._node.create_timer(READ_PERIOD, self._read, clock=STEADY)
-            self._node.after_jump_back.add(self._forget)
+            self._node.create_timer(READ_PERIOD, self._read, clock=STEADY)
+            self._node.after_jump_back.append(self._forget)
 
     def _read(self) -> None:
         for subscription in (self._listener.tf_sub, self._listener.tf_static_sub):
@@ -132,15 +125,7 @@ class Frames:
     def _forget(self) -> None:
         self._read()
         self._buffer.clear()  # tf2 takes no transform that is older than those it has
-        self._began = time.monotonic()
-
-    def close(self) -> None:
-        """Stop listening, until a transform is needed again."""
-        if self._listener is not None:
-            self._node.after_jump_back.discard(self._forget)
-            self._node.destroy_timer(self._reads)
-            self._listener.unregister()
-            self._buffer = self._listener = None
+        self.began = time.monotonic()
 
 
 def transformed(stamped: PoseStamped, transform: TransformStamped) -> PoseStamped:
@@ -166,18 +151,19 @@ def _turned(rotation: Quaternion, point: tuple[float, ...]) -> tuple[float, ...]
 def listen(
     node: BaseNode, topic: str, depth: int, refusals: Refusals, take: Callable[[PoseStamped], None]
 ) -> Subscription:
-    """Hand each pose of `odom` or `initialpose` to a function, whose ValueError refuses it."""
-    is_odometry = topic.endswith("odom")
-    kind = Odometry if is_odometry else PoseWithCovarianceStamped
+    """Hand each pose of a topic of `TYPES` to a function, whose ValueError refuses it."""
+    message_type = TYPES[topic.rpartition("/")[2]]
+    is_odometry = message_type is Odometry
 
-    def on_message(message: Odometry | PoseWithCovarianceStamped) -> None:
+    def on_message(message: Any) -> None:
+        pose = getattr(message.pose, "pose", message.pose)
         with refusals.taking(topic, often=is_odometry):
-            take(PoseStamped(header=message.header, pose=message.pose.pose))
+            take(PoseStamped(header=message.header, pose=pose))
 
     quality = QoSProfile(depth=depth)
     if is_odometry:  # reliable publishers and others are received
         quality.reliability = ReliabilityPolicy.BEST_EFFORT
-    return node.create_subscription(kind, topic, on_message, quality)
+    return node.create_subscription(message_type, topic, on_message, quality)
 
 
 class StartSource:
@@ -195,35 +181,28 @@ class StartSource:
         # What to call when there is a start from which to plan at once.
         self._map_frame, self._on_start = map_frame, on_start
         self._pose: PoseStamped | None = None
+        self._subscription: Any = None
         self.source = self.topic = ""
         self.listen()
+        node.after_jump_back.append(self._forget_odometry)
 
     def listen(self) -> None:
         """Listen to what the parameter names, if it is another source."""
         source = self._node.value("start_source")
         if source == self.source:
             return
-        self.close()
+        self._node.destroy_subscription(self._subscription)
+        self._refusals.accept(self.topic)
         self.source, self.topic = source, "odom" if source == "odometry" else source
-        self._forget()
+        self._pose, self._began = None, time.monotonic()
         if source == "tf":
             self._frames.listen()
-            return
-        self._subscription = listen(self._node, self.topic, 10, self._refusals, self._take)
-        if source == "odometry":
-            self._node.after_jump_back.add(self._forget)
+        else:
+            self._subscription = listen(self._node, self.topic, 10, self._refusals, self._take)
 
-    def close(self) -> None:
-        """Stop listening; what was refused no longer counts."""
-        self._refusals.accept(self.topic)
-        if self.source == "tf":
-            self._frames.close()
-        elif self.source:
-            self._node.after_jump_back.discard(self._forget)
-            self._node.destroy_subscription(self._subscription)
-
-    def _forget(self) -> None:
-        self._pose, self._began = None, time.monotonic()
+    def _forget_odometry(self) -> None:
+        if self.source == "odometry":
+            self._pose, self._began = None, time.monotonic()
 
     def _take(self, pose: PoseStamped) -> None:
         self._frames.check("the start", pose, self._map_frame())
@@ -250,7 +229,7 @@ class StartSource:
                 problem = "no transform leads from {!r} to {!r}".format(*frames)
                 remedy = "publish one, or set robot_frame or start_source"
                 reason = f"the start is unknown: {problem} ({error}); {remedy}"
-                raise RequestError("NO_START", reason, self._frames.may_come) from None
+                raise RequestError("NO_START", reason, self._frames.began) from None
         topic, is_odometry = self._subscription.topic_name, self.source == "odometry"
         problem = f"nothing came on {topic} in the map's frame"
         if not is_odometry:
@@ -262,5 +241,5 @@ class StartSource:
             often = "publish it more often, set transform_tolerance"
             problem = f"nothing came on {topic} for {silent:.3g} s; {often}"
         remedy = "or set start_source, or give the request's start its frame"
-        may_come = is_odometry and time.monotonic() - self._began < PATIENCE
-        raise RequestError("NO_START", f"the start is unknown; {problem}; {remedy}", may_come)
+        since = self._began if is_odometry else -math.inf
+        raise RequestError("NO_START", f"the start is unknown; {problem}; {remedy}", since)

@@ -21,6 +21,7 @@ from ddqn_planner.planning.pose_planner import PoseRequest
 
 Request = PlanRequest | PoseRequest
 
+PATIENCE = 1.0  # seconds within which a new listener hears a first map, odometry or TF
 PERIOD = 0.9  # seconds until diagnostics are due when nothing changes: at the next look
 
 TOLERANCE = ", or a greater tolerance"
@@ -38,11 +39,11 @@ REMEDIES = {
 
 
 class RequestError(ValueError):
-    """There is no request for the planner; what is missing `may_come` soon in a new node."""
+    """There is no request for the planner; what the node listens to since just now `may_come`."""
 
-    def __init__(self, status: str, reason: str, may_come: bool = False) -> None:
+    def __init__(self, status: str, reason: str, since: float = -math.inf) -> None:
         super().__init__(reason)
-        self.status, self.may_come = status, may_come
+        self.status, self.may_come = status, time.monotonic() - since < PATIENCE
 
 
 @dataclass(frozen=True)

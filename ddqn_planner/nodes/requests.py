@@ -16,13 +16,13 @@ import numpy as np
 from geometry_msgs.msg import PoseStamped
 from nav_msgs.msg import Path
 from rclpy.task import Future
-from std_msgs.msg import Header, UInt8MultiArray
+from std_msgs.msg import Header
 
 from ddqn_planner.grid import Cell, GridMap, MoveRule
 from ddqn_planner.grid.motions import HEADINGS
-from ddqn_planner.model import find_model, model_of
+from ddqn_planner.model import find_model
 from ddqn_planner.model.certificate import NO_CERTIFICATE
-from ddqn_planner.nodes.conversions import bytes_of, cell_from_pose, label_of, pose_of, turns
+from ddqn_planner.nodes.conversions import cell_from_pose, pose_of, turns
 from ddqn_planner.nodes.map_source import MapSource
 from ddqn_planner.nodes.poses import Frames, StartSource
 from ddqn_planner.nodes.report import (
@@ -147,6 +147,12 @@ def move_rule(rule: str, planner: Planner) -> MoveRule:
     return MoveRule(rule or planner.metadata.move_rule)
 
 
+def read_model(model: str) -> tuple[Planner, str]:
+    """Return a model's planner and file."""
+    path = find_model(model)
+    return Planner.load(path), str(path)
+
+
 class ModelSource:
     """Has the planner with the last model that could be loaded, and its file."""
 
@@ -156,19 +162,12 @@ class ModelSource:
         self._node, self.report, self._worker = node, report, worker
         # The first model, while it is being loaded.
         self.loading: Future | None = None
-        self._label = ""  # of the trainer's message, if the model came by it
-
-    @staticmethod
-    def read(model: str) -> tuple[Planner, str]:
-        """Return a model's planner and file."""
-        path = find_model(model)
-        return Planner.load(path), str(path)
 
     def load(self) -> None:
         """Begin to load the first model, and to compile what many requests need."""
 
         def read() -> tuple[Planner, str]:
-            planner, file = self.read(self._node.value("model"))
+            planner, file = read_model(self._node.value("model"))
             compiling = warm_up(planner, self._node.value("follow_trainer"))
             gc.set_threshold(20_000)  # to compile and to plan makes hardly any garbage
             next(compiling)
@@ -194,20 +193,10 @@ class ModelSource:
 
     def use(self, planner: Planner, file: str) -> None:
         """Plan with it from now on."""
-        self.planner, self.file, self.loading, self._label = planner, file, None, ""
-        planner.cache_bytes = self._node.value("field_cache_bytes")
+        self.planner, self.file, self.loading = planner, file, None
         self.report.accept("model")
         self.report.change()
         self._node.get_logger().info(f"planning with the model {file}")
-
-    def take(self, message: UInt8MultiArray) -> bool:
-        """Use a model that the trainer sent; return whether it is a new one."""
-        label, before = label_of(message), self._label
-        with self.report.taking("trainer/model"):
-            if label != before:
-                self.use(Planner(*model_of(bytes_of("model", message))), "trainer/model")
-                self._label = label
-        return self._label != before
 
     def on_reload(self) -> tuple[bool, str]:
         """Load the file of the model again."""
@@ -235,7 +224,7 @@ class ModelSource:
 
     def forget(self) -> None:
         """Free the model and its fields, with what `read` kept from collection."""
-        self.planner, self.file, self.loading, self._label = None, "", None, ""
+        self.planner, self.file, self.loading = None, "", None
         gc.unfreeze()
         gc.collect()
 
@@ -371,6 +360,7 @@ class Requests:
         if planner is None:
             refused = self.model.report.refused["model"]
             raise RequestError("NO_MODEL", f"no model is loaded: {refused}")
+        planner.cache_bytes = self.settings.field_cache_bytes
         return header, await ready, planner
 
     async def _in_map(

@@ -108,7 +108,7 @@ class BaseNode(Node):
     def __init__(self, name: str, parameters: Parameters) -> None:
         self._incompatible: set[str] = set()
         self._logged_problems: list[str] = []
-        self.after_jump_back: set[Callable[[], None]] = set()
+        self.after_jump_back: list[Callable[[], None]] = []
         """Called when a bag loops or a simulator is reset."""
         super().__init__(name)
         # As tf2 has it. Another clock, by use_sim_time, counts as a jump, too.
@@ -128,8 +128,7 @@ class BaseNode(Node):
     def _on_jump(self, jump: TimeJump) -> None:
         seconds = jump.delta.nanoseconds / 1e9
         what = f"jumped by {seconds:.6g} s" if seconds else "changed"
-        forgotten = "transforms and odometry from before are forgotten"
-        self.get_logger().warning(f"the clock {what}: {forgotten}")
+        self.get_logger().warning(f"the clock {what}: transforms and odometry are forgotten")
         for forget in self.after_jump_back:
             forget()
 

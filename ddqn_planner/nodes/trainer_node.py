@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 import importlib
-import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import fields
 from functools import partial
+from pathlib import Path as FilePath
 from typing import TYPE_CHECKING, Any, Final
 
-from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped, Quaternion
+from diagnostic_msgs.msg import DiagnosticStatus
+from geometry_msgs.msg import PoseStamped, Quaternion
+from nav_msgs.msg import OccupancyGrid, Path
 from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.exceptions import InvalidParameterValueException
+from rclpy.timer import Timer
 from std_msgs.msg import Float32, Header, String, UInt8MultiArray
 
 from ddqn_planner.grid import Cell, MoveRule, read_map_file
@@ -21,21 +24,27 @@ from ddqn_planner.nodes.conversions import (
     bytes_message,
     cell_from_pose,
     check_pose,
+    grid_from_message,
     path_bytes,
     path_message,
 )
-from ddqn_planner.nodes.driving import NO_MAP, Driving, LearningNode, MapInFrame, explained
+from ddqn_planner.nodes.driving import NO_MAP, Driving, MapInFrame, explained
 from ddqn_planner.nodes.parameters import MOVE_RULES, OF_MAPS
-from ddqn_planner.nodes.poses import check_source
-from ddqn_planner.nodes.runtime import LATCHED, STEADY, Declared, Worker, spin_until_shutdown
+from ddqn_planner.nodes.poses import check_source, listen
+from ddqn_planner.nodes.report import Refusals
+from ddqn_planner.nodes.runtime import (
+    LATCHED,
+    STEADY,
+    BaseNode,
+    Declared,
+    Worker,
+    spin_until_shutdown,
+)
 from ddqn_planner.resources import find_map
 from ddqn_planner.training.hyper_parameters import HyperParameters
 
 if TYPE_CHECKING:
-    from ddqn_planner.training.episodes import Episode
     from ddqn_planner.training.run import TrainingRun
-
-SLICE = 0.1  # seconds for which the worker trains before the node publishes what became of it
 
 HYPER_PARAMETERS: Final = {
     entry.name: Declared(
@@ -50,35 +59,19 @@ PARAMETERS: Final = {
     "learn_from": Declared(
         "simulation", "Episodes, or the robot's drives", ["simulation", "driving"], read_only=True
     ),
-    "output_folder": Declared(
-        "runs/trainer",
-        "A folder for the checkpoint, model and curves, or for drives and experience; used by the "
-        "next ~/start",
-        "not empty",
-    ),
-    "map_file": Declared(
-        "", "Map file or shipped map with start and goal; '': topics", read_only=True
-    ),
+    "output_folder": Declared("runs/trainer", "A folder for the training or drives", "not empty"),
+    "map_file": Declared("", "Map with start and goal, as a file; '': topics", read_only=True),
     "move_rule": Declared("corner_cutting", "Which diagonal moves are legal", MOVE_RULES),
     "seed": Declared(0, "Seed of the training", (0, 2**31 - 1)),
     **OF_MAPS,
     "episode_interval": Declared(10, "Publish each n-th episode", (1, 10**6)),
     "replay_period": Declared(0.05, "Seconds per step of ~/replay", (1e-3, 10.0)),
     "pose_source": Declared(
-        "odometry",
-        "Driving: odom, or the transform to robot_frame",
-        ["odometry", "tf"],
-        read_only=True,
+        "odometry", "Driving: odom, or a transform", ["odometry", "tf"], read_only=True
     ),
-    "robot_frame": Declared(
-        "base_link", "Driving: the robot's frame, for the pose_source tf", "not empty"
-    ),
-    "robots": Declared(
-        [""], "Driving: namespaces of robots it learns from; '': its own", read_only=True
-    ),
-    "nominal_speed": Declared(
-        0.5, "Driving: m/s where nothing slows the robot down", (0.01, 100.0)
-    ),
+    "robot_frame": Declared("base_link", "Driving: the robot's frame, for tf", "not empty"),
+    "robots": Declared([""], "Driving: namespaces of robots; '': its own", read_only=True),
+    "nominal_speed": Declared(0.5, "Driving: m/s where nothing slows it down", (0.01, 100.0)),
     "robot_width": Declared(0.5, "Driving: metres; places are squares of half of it", (0.05, 10.0)),
     "experience": Declared("", "Driving: older experience with which a new folder begins"),
     **HYPER_PARAMETERS,
@@ -86,32 +79,42 @@ PARAMETERS: Final = {
 """The next ``~/start`` uses those that changed."""
 
 
-class TrainerNode(LearningNode):
+class TrainerNode(BaseNode):
     """Trains on the last ``map`` from the last ``initialpose`` to the last ``goal_pose``."""
 
     def __init__(self) -> None:
         super().__init__("trainer", PARAMETERS)
+        self.map: MapInFrame | None = None
+        self.refusals = Refusals(self)
+        self.worker = Worker(self)
+        self.state, self.error, self.save_error = "idle", "", ""
+        self.replaying: Timer | None = None
+        self.episodes = self.create_publisher(Path, "~/episode", 10)
         self._poses: dict[str, PoseStamped] = {}
         self._run: TrainingRun | None = None
-        self.state = "idle"
+        self._is_stopping = self._is_saving = False
         self._read_map_file()
-        self._worker = Worker(self)
+        self.create_subscription(OccupancyGrid, "map", self._on_map, LATCHED)
         self._driving: Driving | None = None
         if self.value("learn_from") == "driving":
-            self._driving = Driving(self, self._worker)
+            self._driving = Driving(self)
             return
         self.create_timer(1.0, self._publish_diagnostics, clock=STEADY)
         self._reward_publisher = self.create_publisher(Float32, "~/average_reward", 100)
         self._saved_publisher = self.create_publisher(String, "~/model_saved", LATCHED)
         self._model_publisher = self.create_publisher(UInt8MultiArray, "~/model", LATCHED)
-        on_start, on_goal = (partial(self._on_pose, which) for which in ("start", "goal"))
-        self.create_subscription(PoseWithCovarianceStamped, "initialpose", on_start, 10)
-        self.create_subscription(PoseStamped, "goal_pose", on_goal, 10)
+        for which, topic in (("start", "initialpose"), ("goal", "goal_pose")):
+            listen(self, topic, 10, self.refusals, partial(self._on_pose, which))
         group = ReentrantCallbackGroup()  # the others are answered while ~/start waits
         for name in ("start", "stop", "save", "replay"):
             self.create_trigger(f"~/{name}", getattr(self, f"_on_{name}"), callback_group=group)
         # While the node answers already; only ~/start waits for it.
-        self._imported = self._worker.call(import_training)
+        self._imported = self.worker.call(import_training)
+
+    @property
+    def folder(self) -> FilePath:
+        """The parameter ``output_folder``."""
+        return FilePath(self.value("output_folder")).absolute()
 
     def check_parameters(self, new: dict[str, Any]) -> None:
         """Check new values as `BaseNode` does, and hyper-parameters together: some limit others."""
@@ -138,16 +141,19 @@ class TrainerNode(LearningNode):
                 path = path_message(*along([cell], grid), Header(frame_id="map"), Quaternion())
                 self._poses[which] = path.poses[0]
 
-    def _on_pose(self, which: str, message: PoseStamped | PoseWithCovarianceStamped) -> None:
-        pose = getattr(message.pose, "pose", message.pose)
-        stamped = PoseStamped(header=message.header, pose=pose)
-        with self.refusals.taking(which):
-            # A pose may come before the map: ~/start then checks its cell.
-            check_pose(f"the {which}", stamped)
-            if self.map is not None:
-                cell = self._cell(which, stamped, self.map)
-                self.get_logger().info(f"the {which} is cell {cell}")
-            self._poses[which] = stamped
+    def _on_map(self, message: OccupancyGrid) -> None:
+        with self.refusals.taking("map"):
+            grid = grid_from_message(message, *map(self.value, OF_MAPS))
+            self.map = MapInFrame(grid, message.header.frame_id)
+            self.get_logger().info(f"map of {grid.width} x {grid.height} cells")
+
+    def _on_pose(self, which: str, stamped: PoseStamped) -> None:
+        # A pose may come before the map: ~/start then checks its cell.
+        check_pose(f"the {which}", stamped)
+        if self.map is not None:
+            cell = self._cell(which, stamped, self.map)
+            self.get_logger().info(f"the {which} is cell {cell}")
+        self._poses[which] = stamped
 
     def _cell(self, which: str, pose: PoseStamped, place: MapInFrame) -> Cell:
         """Return the cell of a pose; ValueError if it is not a free cell of the map."""
@@ -173,8 +179,7 @@ class TrainerNode(LearningNode):
         self.refusals.refused.clear()
         self._run, self._run_map = run, place
         self.get_logger().info(run.description)
-        executor: Any = self.executor
-        executor.create_task(self._train(run, place))
+        self.worker.call(self._train, run, place)
         return True, run.description
 
     def _open_run(self) -> tuple[MapInFrame, TrainingRun]:
@@ -211,31 +216,29 @@ class TrainerNode(LearningNode):
         file = self.folder / "episodes.csv"
         is_of_run = self._run is not None and self._run.folder == self.folder
         place = self._run_map if is_of_run else self.map
-        if place is None:
-            return False, f"{NO_MAP} first"
         episodes = read_cells(file, self.value("episode_interval"))
-        return self.replay(file, episodes, partial(self._publish_cells, place=place), "train on")
+        return self.replay(place, file, episodes, self._draw, "train on")
 
-    async def _train(self, run: TrainingRun, place: MapInFrame) -> None:
-        steps, announced, ends = run.steps(), run.saved_at, ""
+    def _train(self, run: TrainingRun, place: MapInFrame) -> None:
+        """Train, in the worker, until the training has finished or is stopped."""
+        told = run.saved_at
         try:
-            while not ends:
-                episodes, is_finished = await self._worker.call(train_for_a_slice, steps)
+            for episodes in run.steps():
                 for episode in episodes:
                     self._reward_publisher.publish(Float32(data=episode.average_reward))
                     is_due = episode.number % self.value("episode_interval") == 0
                     if is_due and self.replaying is None:
-                        self._publish_cells(episode.cells, place)
-                ends = "stopped" if self._is_stopping else "finished" if is_finished else ""
+                        self._draw(place, episode.cells)
                 if self._is_stopping or self._is_saving:
                     self._is_saving = False
-                    await self._worker.call(run.try_to_save)
-                self.note_saving("the training is", run.save_error)
-                if not run.save_error and (ends == "finished" or run.saved_at != announced):
-                    self.get_logger().info(f"step {run.saved_at} is saved in {run.checkpoint_path}")
-                    self._saved_publisher.publish(String(data=str(run.model_path)))
-                    self._model_publisher.publish(bytes_message("model", run.model))
-                announced = run.saved_at
+                    run.try_to_save()
+                if self._is_stopping:
+                    break
+                if run.saved_at != told:
+                    told = run.saved_at
+                    self._tell_saved(run)
+            self._tell_saved(run)
+            ends = "stopped" if self._is_stopping else "finished"
         except Exception as error:  # the node must survive any error
             ends = "failed"
             self.fail(f"the training failed: {error!r}; ~/start continues from its checkpoint")
@@ -244,7 +247,14 @@ class TrainerNode(LearningNode):
         self.state = ends
         self.get_logger().info(f"the training {ends}")
 
-    def _publish_cells(self, cells: tuple[Cell, ...], place: MapInFrame) -> None:
+    def _tell_saved(self, run: TrainingRun) -> None:
+        self.note_saving("the training is", run.save_error)
+        if not run.save_error:
+            self.get_logger().info(f"step {run.saved_at} is saved in {run.checkpoint_path}")
+            self._saved_publisher.publish(String(data=str(run.model_path)))
+            self._model_publisher.publish(bytes_message("model", run.model))
+
+    def _draw(self, place: MapInFrame, cells: tuple[Cell, ...]) -> None:
         path = path_bytes(*along(cells, place.grid), self.header(place.frame), Quaternion())
         self.episodes.publish(path)
 
@@ -259,40 +269,85 @@ class TrainerNode(LearningNode):
                 "epsilon": f"{trainer.epsilon:.3f}",
                 "folder": str(self._run.folder),
             }
-        self.publish_diagnostics("training", values, error=self.error)
+        self.publish_diagnostics("training", values)
+
+    # What learning from driving shares
+
+    def fail(self, reason: str) -> None:
+        """Log an error, and keep it for the diagnostics."""
+        self.error = reason
+        self.get_logger().error(reason)
+
+    def note_saving(self, what: str, error: str) -> None:
+        """Log when saving begins to fail, and when it works again (no error), not at each try."""
+        before, self.save_error = self.save_error, error
+        if error and not before:
+            self.get_logger().error(error)
+        if before and not error:
+            self.get_logger().info(f"{what} saved again")
+
+    def publish_diagnostics(self, what: str, values: Mapping[str, str], missing: str = "") -> None:
+        """Publish the state, what was refused and failed, and what is still missing."""
+        problems = [*self.refusals.problems(), *filter(None, [self.save_error, self.error])]
+        good = DiagnosticStatus.WARN if missing else DiagnosticStatus.OK
+        level = DiagnosticStatus.ERROR if problems else good
+        message = "; ".join(filter(None, [*problems, missing])) or self.state
+        self.refusals.tell(what, level, message, {"state": self.state, **values})
+
+    def replay(
+        self,
+        place: MapInFrame | None,
+        file: FilePath,
+        episodes: Iterator[Any],
+        draw: Callable[[MapInFrame, Any], None],
+        remedy: str,
+    ) -> tuple[bool, str]:
+        """Draw the first place of each episode, its first two, and so on; see `create_trigger`."""
+        if place is None:
+            return False, f"{NO_MAP} first"
+        frames = (places[: n + 1] for places in episodes for n in range(len(places)))
+
+        def draw_next() -> str:  # it returns why it cannot
+            try:
+                draw(place, next(frames))
+            except StopIteration:
+                return f"{file} holds no episode to replay yet; {remedy}"
+            except OSError as error:
+                return f"no recorded episodes ({error}); call ~/start first"
+            return ""
+
+        def step() -> None:
+            if draw_next():
+                self.stop_replay()
+
+        if reason := draw_next():
+            return False, reason
+        self.stop_replay()
+        self.replaying = self.create_timer(self.value("replay_period"), step, clock=STEADY)
+        return True, "replaying the recorded episodes on ~/episode"
+
+    def stop_replay(self) -> str:
+        """Stop a replay, and say so; return nothing if there was none."""
+        timer, self.replaying = self.replaying, None
+        if timer is None:
+            return ""
+        self.destroy_timer(timer)
+        return "; the replay was stopped"
 
     def destroy_node(self) -> None:
-        """Destroy the node at once, then wait for the worker and save what it trained."""
+        """Save what was learned, and destroy the node."""
         if self._driving is not None:
-            self._driving.close()
+            self._driving.stop()
+        self._is_stopping = True
+        self.worker.close()  # torch, half imported, may fail when the process ends
         super().destroy_node()
-        self._worker.close()  # torch, half imported, may fail when the process ends
-        if self._run is not None and self.state == "training":
-            try:
-                self._run.try_to_save()
-            except ValueError as error:  # it diverged: older files stay
-                self.fail(str(error))
-            self._run.close()
-            self.note_saving("the training is", self._run.save_error)
-
-
-def train_for_a_slice(steps: Iterator[list[Episode]]) -> tuple[list[Episode], bool]:
-    """Train; return the episodes that ended, and whether the training has finished."""
-    episodes: list[Episode] = []
-    until = time.monotonic() + SLICE
-    for ended in steps:
-        episodes += ended
-        if time.monotonic() >= until:
-            return episodes, False
-    return episodes, True
 
 
 def import_training() -> None:
-    """Import torch and the trainer, and let torch use one thread."""
+    """Import torch and the trainer."""
     with suppress(ImportError):  # without torch, ~/start says what is missing
         torch = importlib.import_module("torch")
         importlib.import_module("ddqn_planner.training.run")
-        torch.set_num_threads(1)  # as fast as two for these networks, and leaves ROS a core
         torch.optim.Adam([torch.zeros(1)])  # the first optimiser imports for a second
 
 

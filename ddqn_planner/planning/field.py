@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from ddqn_planner.grid import MOVES, Cell, GridMap, MoveRule
 from ddqn_planner.grid.arguments import cell_inside, numbers
+from ddqn_planner.grid.copies import few_of
 from ddqn_planner.grid.grid_map import LAYERS
 from ddqn_planner.model import PropagationQNetwork, QNetwork
 from ddqn_planner.model.move_costs import MoveCosts
@@ -315,7 +316,7 @@ def changed_cells(old: GridMap, new: GridMap, shift: Cell) -> NDArray[np.int32] 
     boxes = [overlap(old, new, shift)] if patches is None else [(box, box) for box in patches]
     found = [np.empty(0, np.int64)]
     for before, (rows, columns) in boxes:
-        y, x = np.nonzero(new.differs(old, (rows, columns), before))
+        y, x = few_of(new.differs(old, (rows, columns), before))
         found.append((y + rows.start + 1) * width + x + columns.start + 1)
     if sum(map(len, found)) > CHANGED_SHARE * new.occupancy.size:
         return None

@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any, Final
 
 import numpy as np
@@ -27,7 +28,7 @@ Bounds = tuple[float, float]
 UNREACHED, OPEN, CLOSED, MARKED = 0, 1, 2, 4
 
 AT_GOAL: Final = 5e-324  # the goal's distance: not 0, and as good as 0 in every sum
-CAPACITY = 1000  # cells of a bucket, at first; not a power of 2, as those share lines of caches
+CAPACITY = 4.0  # cells of a bucket, at first, per cell of a square map's side
 BUCKETS: Final = 2  # per unit of cost; more mean fewer visits of cells that a start does not need
 SAME: Final = 1 + 1e-12  # paths cost the same up to this factor: sums of floats are rounded
 
@@ -90,7 +91,8 @@ def grow(
         least = costs.least * (1 - 1e-7)
         bounds, buckets = (costs.straight * least, costs.diagonal * least), BUCKETS
     # A power of 2, so that a slot takes no division.
-    ring, capacity = 1 << int((costs.highest + bounds[1]) * buckets + 2).bit_length(), CAPACITY
+    ring = 1 << int((costs.highest + bounds[1]) * buckets + 2).bit_length()
+    capacity = 9 + int(CAPACITY * math.sqrt(distance.size))
     offsets = (MOVE_Y * costs.width + MOVE_X).astype(np.uint64)
     how = start, bounds, buckets
     while True:

@@ -19,12 +19,10 @@ NO_RESERVE = getattr(mmap, "MAP_NORESERVE", 0x4000)  # not in all versions of Py
 HEAP = 2**14  # entries of a heap, at first
 TAKEN_BACK = 4  # of so many visited states a repair takes one back; else a new field is quicker
 UNGUIDED = 2**14  # states that are visited before a look at the map pays
-GUIDED = 2**16  # and before one at where the body can turn: elsewhere a way is often a dead end
-NARROW = 5  # times as much counts what is left there
 FIRST = 1.2  # a first path is looked for as if with this bound, if a smaller one is asked for
 NOTHING = np.empty(0, np.float32)
 GREEDY = 1.5  # the first round's weight is the bound to the power of this: mostly that will do
-FURTHER = 1.5  # times the way to the goal that the look at the map goes
+FURTHER = 1.2  # times the way to the goal that the look at the map goes
 
 
 def _untouched(count: int, dtype: DTypeLike) -> NDArray[Any]:
@@ -48,7 +46,12 @@ class PoseField:
     # is a lower bound, which proves how good the start's cost is.
 
     def __init__(self, goals: tuple[State, ...], grid: GridMap, world: World, body: Body) -> None:
-        self.goals, self.grid, self.world, self.body = goals, grid, world, body
+        self.goals, self.body, self._aim = goals, body, Aim(0, 0, -1, NOTHING)
+        self._begin(grid, world)
+
+    def _begin(self, grid: GridMap, world: World) -> None:
+        """Know nothing but the goals."""
+        self.grid, self.world, goals = grid, world, self.goals
         states = world.tile.size * TILE * TILE * HEADINGS
         self.known = Known(_untouched(states, np.float32), _untouched(states, np.uint8))
         self._size, self._waiting, self._round = len(goals), 0, 0
@@ -56,8 +59,7 @@ class PoseField:
         self._keys, self._numbers = np.empty(entries, np.float32), np.empty(entries, np.int64)
         self._numbers[: len(goals)] = [self.number(goal) for goal in goals]
         self.known.mark[self._numbers[: len(goals)]] = kernels.OPEN
-        self._aim, self._weight = Aim(0, 0, -1, NOTHING, NOTHING), 0.0
-        self.visits = 0
+        self._weight, self.visits = 0.0, 0
 
     def number(self, state: State) -> int:
         """Return the number of a state inside the map."""
@@ -67,13 +69,12 @@ class PoseField:
         """Grow until the cost from a start is known within a bound, or known not to exist."""
         number = self.number(start)
         if number != self._aim.number:
-            self._aim = Aim(*start[:2], number, NOTHING, NOTHING)
+            left = self._aim.left if start[:2] == self._aim[:2] else NOTHING
+            self._aim = Aim(*start[:2], number, left)
             self._weight, self._tried = max(bound, FIRST) ** GREEDY, 0
             self._order()
         while True:
-            looks = (self._aim.left.size > 0) + (self._aim.guide is not self._aim.left)
-            until = (UNGUIDED, GUIDED if self._weight else np.inf, np.inf)[looks]
-            most = int(min(limit, until - self._tried))
+            most = limit if self._aim.left.size else min(limit, UNGUIDED - self._tried)
             visits, done = self._grow(most, 1 / bound)
             limit, self._tried = limit - visits, self._tried + visits
             if done:
@@ -85,9 +86,7 @@ class PoseField:
                 return False
             elif visits < most:
                 self._reserve(2 * len(self._keys))
-            elif looks == 1:
-                self._guide(NARROW)
-            elif not self._can_leave(number) or not self._guide(1):
+            elif not self._can_leave(number) or not self._guide():
                 return True
 
     def _grow(self, limit: int, share: float) -> tuple[int, bool]:
@@ -122,17 +121,17 @@ class PoseField:
         mark, queue = _untouched(self.known.mark.size, np.uint8), np.empty(UNGUIDED, np.int64)
         return bool(kernels.leads_to(number, mark, queue, self.world, self.body) == len(queue))
 
-    def _guide(self, narrow: int) -> bool:
+    def _guide(self) -> bool:
         """Look at the map for what is left to the start; return whether a way may exist."""
-        columns, rows = (self.world.width + 7) // TILE, (self.world.height + 7) // TILE
+        columns, rows = (self.world.width + 3) // TILE, (self.world.height + 3) // TILE
         left = np.empty((columns + 1) * (rows + 1), np.float32)
         most = 8 * left.size + 4  # each corner opens its neighbours once
         keys, numbers = np.empty(most, np.float32), np.empty(most, np.int64)
         x, y, _ = np.array(self.goals).T // TILE
-        goals = np.unique(y * (columns + 1) + x)
-        heap = left, keys, numbers
-        spread(*heap, self._aim, goals, FURTHER, narrow, self.world, self.body)
-        self._aim = self._aim._replace(guide=left, left=left if narrow == 1 else self._aim.left)
+        goals, box = np.unique(y * (columns + 1) + x), (x.min(), y.min(), x.max(), y.max())
+        towards = self._aim, goals, np.array(box), FURTHER
+        spread(left, keys, numbers, *towards, self.world, self.body)
+        self._aim = self._aim._replace(left=left)
         self._order()
         return bool(np.isfinite(left[goals]).any())
 
@@ -174,20 +173,22 @@ class PoseField:
         count = kernels.follow(*inputs)
         return primitives[:count], costs[:count]
 
-    def repair(self, grid: GridMap, world: World, cells: NDArray[np.int64], opens: bool) -> bool:
-        """Hold for a map that differs in some cells (N, 2); False if a new field is quicker."""
-        # `opens` tells whether a way may have got cheaper.
+    def repair(self, grid: GridMap, world: World, cells: NDArray[np.int64], opens: bool) -> None:
+        """Hold for a map that differs in some cells (N, 2); begin anew where that is quicker."""
+        # `opens` tells whether a way may have got cheaper: what is left to the start, too.
+        self._aim = self._aim._replace(number=-1, left=NOTHING if opens else self._aim.left)
         reach, columns = self.body.reach + TILE, (world.width + TILE - 1) // TILE
         near = np.zeros((columns, (world.height + TILE - 1) // TILE), dtype=np.bool_)
         low, high = np.unique(np.maximum(cells - reach, 0) // TILE, axis=0), 2 * reach // TILE + 1
         for x, y in low:
             near[x : x + high, y : y + high] = True
         tiles = np.flatnonzero(near.T)
-        raised = np.empty(self.visits // TAKEN_BACK + 2**10, np.int64)
+        raised = np.empty(self.visits // TAKEN_BACK + 2**8, np.int64)
         scratch = np.empty(8 * raised.size, np.float32), np.empty(8 * raised.size, np.int64), raised
         count = kernels.take_back(self.known, tiles, *scratch, world, self.body)
         if count < 0:
-            return False
+            self._begin(grid, world)
+            return
         self.grid, self.world, found = grid, world, raised[:count]
         if opens:
             states = np.arange(TILE * TILE * HEADINGS)
@@ -195,5 +196,3 @@ class PoseField:
         self._reserve(max(self._size + self._waiting + len(found), len(self._keys)))
         heap = self._numbers, self._size
         self._size = kernels.look_again(self.known, found, *heap, world, self.body)
-        self._aim = self._aim._replace(number=-1)  # what is ordered, and left, is another
-        return True

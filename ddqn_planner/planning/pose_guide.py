@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ddqn_planner.compiled import in_place, inlined
-from ddqn_planner.planning.pose_world import TILE, Body, World, touches
+from ddqn_planner.planning.pose_world import TILE, Body, World, is_possible, touches
 
 
 class Aim(NamedTuple):
@@ -19,20 +19,19 @@ class Aim(NamedTuple):
     y: int
     number: int
     left: NDArray[np.float32]  # (corners,) in cells, row by row; empty for the straight way alone
-    guide: NDArray[np.float32]  # likewise, or more: what orders the states before a path is known
 
 
 @inlined
-def way_left(x: int, y: int, aim: Any, left: Any, columns: int) -> float:
-    """Return what is left from a cell to the start at least, in cells, by that from corners."""
+def way_left(x: int, y: int, aim: Any, columns: int) -> float:
+    """Return what is left from a cell to the start at least, in cells."""
     best = math.sqrt((x - aim.x) * (x - aim.x) + (y - aim.y) * (y - aim.y))
-    if left.size > 0:
-        tile_x, tile_y = x >> 3, y >> 3
+    if aim.left.size > 0:
+        tile_x, tile_y = x >> 2, y >> 2
         for row in range(2):
             for column in range(2):
-                there = left[(tile_y + row) * (columns + 1) + tile_x + column]
+                there = aim.left[(tile_y + row) * (columns + 1) + tile_x + column]
                 if there > best:
-                    over, up = x + 0.5 - 8 * (tile_x + column), y + 0.5 - 8 * (tile_y + row)
+                    over, up = x + 0.5 - 4 * (tile_x + column), y + 0.5 - 4 * (tile_y + row)
                     there -= math.sqrt(over * over + up * up)
                     if there > best:
                         best = there
@@ -73,44 +72,69 @@ def sink(key: Any, number: int, place: int, keys: Any, numbers: Any, size: int) 
 
 
 @inlined
-def has_room(x: int, y: int, seen: Any, first: int, last: int, world: Any, body: Any) -> bool:
-    """Return whether some rows of swept cells have room around a cell of a tile; looks once."""
-    tile = y * ((world.width + 7) >> 3) + x
-    if seen[tile] == 0:
-        seen[tile] = 2
-        for cell in range(64):
+def has_room(x: int, y: int, world: Any, body: Any) -> bool:
+    """Return whether the origin may pass a tile; looks once."""
+    tile = y * ((world.width + 3) >> 2) + x
+    if world.room[tile] == 0:
+        world.room[tile] = 2
+        for number in range(32):
             # From the middle on: most tiles have room there.
-            column, line = 8 * x + ((cell & 7) ^ 4), 8 * y + ((cell >> 3) ^ 4)
+            column, line = 4 * x + ((number & 3) ^ 2), 4 * y + (((number >> 2) & 3) ^ 2)
             inside = column < world.width and line < world.height
-            if inside and not touches(world.bits, column, line, body.row, first, last):
-                seen[tile] = 1
+            if inside and may_pass(column, line, number >= 16, world, body):
+                world.room[tile] = 1
                 break
-    return bool(seen[tile] == 1)
+    return bool(world.room[tile] == 1)
 
 
 @inlined
-def room_on(x: int, y: int, step_x: int, step_y: int, turns: bool, world: Any, body: Any) -> int:
-    """Return the room of a step from a corner: 0 for none, 2 where the body can turn, else 1."""
-    columns, rows, best = (world.width + 7) >> 3, (world.height + 7) >> 3, 0
-    for side in range(2):  # through a tile, or along its side
+def may_pass(x: int, y: int, moves: bool, world: Any, body: Any) -> bool:
+    """Return whether the body stands in a cell, or moves its origin through it."""
+    count, cores, bits, row = body.start.size, body.start.size + 16, world.bits, body.row
+    if touches(bits, x, y, row, body.first[cores + 16], body.first[cores + 17]):
+        return False
+    for heading in range(16):
+        mask = cores + heading if moves else count + heading
+        if touches(bits, x, y, row, body.first[mask], body.first[mask + 1]):
+            continue
+        if not moves:
+            return True
+        for primitive in range(body.out[heading], body.out[heading + 1]):
+            for place in range(body.first_passed[primitive], body.first_passed[primitive + 1]):
+                column, line = x - body.passed[place, 0], y - body.passed[place, 1]
+                inside = 0 <= column < world.width and 0 <= line < world.height
+                if inside and is_possible(column, line, primitive, world, body):
+                    return True
+    return False
+
+
+@inlined
+def leads(x: int, y: int, step_x: int, step_y: int, world: Any, body: Any) -> bool:
+    """Return whether a step from a corner leads through a tile that has room, or along its side."""
+    columns, rows = (world.width + 3) >> 2, (world.height + 3) >> 2
+    for side in range(2):
         tile_x = x + (step_x - 1) // 2 if step_x != 0 else x - side
         tile_y = y + (step_y - 1) // 2 if step_y != 0 else y - side
-        if not (0 <= tile_x < columns and 0 <= tile_y < rows):
-            continue
-        if has_room(tile_x, tile_y, world.room, body.core, body.turn, world, body):
-            last = body.row.shape[0]
-            wide = turns and has_room(tile_x, tile_y, world.turns, body.turn, last, world, body)
-            best = 2 if wide or best == 2 else 1
-    return best
+        inside = 0 <= tile_x < columns and 0 <= tile_y < rows
+        if inside and has_room(tile_x, tile_y, world, body):
+            return True
+    return False
 
 
-# A lower bound from the map. Around each cell that the robot's origin passes, its core has room: so
-# the origin stays in tiles where it has. A shortest way in them bends at corners only, and each
-# straight part has a way over corners and diagonals of the same tiles that is longer by `LONGER` at
-# most, if a diagonal counts 7/5.
+# A lower bound from the map. The robot's origin stays in tiles that it may pass. A shortest way in
+# them bends at corners only, and each straight part has a way over corners and diagonals of the
+# same tiles that is longer by `LONGER` at most, if a diagonal counts 7/5.
 
 STRAIGHT, DIAGONAL = 5, 7
 LONGER: Final = math.sqrt(1 + (DIAGONAL / STRAIGHT - 1) ** 2)
+
+
+@inlined
+def way_to_box(x: int, y: int, box: NDArray[np.int64]) -> Any:
+    """Return what is left from a corner to a box of corners at least, as steps count."""
+    over = max(box[0] - x, x - box[2], 0)
+    up = max(box[1] - y, y - box[3], 0)
+    return STRAIGHT * max(over, up) + (DIAGONAL - STRAIGHT) * min(over, up)
 
 
 @in_place
@@ -120,33 +144,36 @@ def spread(
     numbers: Any,
     aim: Aim,
     goals: NDArray[np.int64],
+    box: NDArray[np.int64],
     further: float,
-    narrow: int,
     world: World,
     body: Body,
 ) -> None:
     """Write what is left from corners of tiles to a start, infinite where no way leads."""
-    # Where the body cannot turn, a way counts so many times.
-    columns, rows = (world.width + 7) >> 3, (world.height + 7) >> 3
+    # By A*, to the nearest goal and as much further: what is not on the way there is left out.
+    columns, rows = (world.width + 3) >> 2, (world.height + 3) >> 2
     size, end, limit = 0, 0.0, np.inf
     left[:] = np.inf
     for corner in range(4):
-        number = ((aim.y >> 3) + (corner >> 1)) * (columns + 1) + (aim.x >> 3) + (corner & 1)
+        x, y = (aim.x >> 2) + (corner & 1), (aim.y >> 2) + (corner >> 1)
+        number = y * (columns + 1) + x
         left[number] = 0
-        size = push(np.float32(0), number, keys, numbers, size)
+        size = push(np.float32(way_to_box(x, y, box)), number, keys, numbers, size)
     while size > 0 and keys[0] <= limit:
-        here, number = keys[0], numbers[0]
-        end = here
+        key, number = keys[0], numbers[0]
+        end = key
         size -= 1
         if size > 0:
             sink(keys[size], numbers[size], 0, keys, numbers, size)
-        if here > left[number]:
-            continue
-        for goal in goals:
-            if number == goal and limit == np.inf:
-                limit = further * here
         y = number // (columns + 1)
         x = number - y * (columns + 1)
+        here, ahead = left[number], way_to_box(x, y, box)
+        if key > here + ahead:
+            continue
+        if ahead == 0 and limit == np.inf:
+            for goal in goals:
+                if number == goal:
+                    limit = further * here
         for step_y in range(-1, 2):
             for step_x in range(-1, 2):
                 if step_x == 0 and step_y == 0:
@@ -156,15 +183,13 @@ def spread(
                     continue
                 after = after_y * (columns + 1) + after_x
                 cost = here + (STRAIGHT if step_x == 0 or step_y == 0 else DIAGONAL)
-                if cost >= left[after]:
-                    continue
-                room = room_on(x, y, step_x, step_y, narrow > 1, world, body)
-                if room == 1:
-                    cost += (narrow - 1) * (cost - here)
-                if room > 0 and cost < left[after]:
+                if cost < left[after] and leads(x, y, step_x, step_y, world, body):
                     left[after] = cost
-                    size = push(np.float32(cost), after, keys, numbers, size)
+                    key = np.float32(cost + way_to_box(after_x, after_y, box))
+                    size = push(key, after, keys, numbers, size)
     for number in range(left.size):
+        y = number // (columns + 1)
         # What was not reached is no nearer than where it ended.
-        value = left[number] if left[number] < end or size == 0 else end
+        least = end - way_to_box(number - y * (columns + 1), y, box) if size > 0 else np.inf
+        value = left[number] if left[number] < least else least
         left[number] = value * (TILE / STRAIGHT / LONGER) - math.sqrt(2.0) * TILE

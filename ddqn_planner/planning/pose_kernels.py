@@ -12,7 +12,7 @@ from ddqn_planner.planning.pose_guide import Aim, push, sink, way_left
 from ddqn_planner.planning.pose_world import Body, World, cost_of, is_possible
 
 # A state is a cell and one of 16 headings. Its number counts headings, then the cells of a tile of
-# 8 x 8, then tiles: so what a request visits lies on few pages of memory, 4 bytes a distance.
+# 4 x 4, then tiles: so what a request visits lies on few pages of memory, 4 bytes a distance.
 # Marks. Before a state is reached, its distance has no meaning. One that got cheaper after it was
 # closed, or that is too far from the start, waits for the next round. From CLOSED on, a mark tells
 # the round in which it was closed.
@@ -30,17 +30,17 @@ class Known(NamedTuple):
 @inlined
 def number_of(x: int, y: int, heading: int, width: int) -> int:
     """Return the number of a state."""
-    tile = (y >> 3) * ((width + 7) >> 3) + (x >> 3)
-    return (tile << 10) | ((y & 7) << 7) | ((x & 7) << 4) | heading
+    tile = (y >> 2) * ((width + 3) >> 2) + (x >> 2)
+    return (tile << 8) | ((y & 3) << 6) | ((x & 3) << 4) | heading
 
 
 @inlined
 def place_of(number: int, width: int) -> tuple[int, int, int]:
     """Return x, y and heading of a state."""
-    tile, columns = number >> 10, (width + 7) >> 3
+    tile, columns = number >> 8, (width + 3) >> 2
     row = tile // columns
-    x = ((tile - row * columns) << 3) | ((number >> 4) & 7)
-    return x, (row << 3) | ((number >> 7) & 7), number & 15
+    x = ((tile - row * columns) << 2) | ((number >> 4) & 3)
+    return x, (row << 2) | ((number >> 6) & 3), number & 15
 
 
 @in_place
@@ -59,7 +59,7 @@ def order(
         number = numbers[place]
         known.mark[number] = OPEN
         x, y, _ = place_of(number, world.width)
-        far = way_left(x, y, aim, aim.guide, (world.width + 7) >> 3)
+        far = way_left(x, y, aim, (world.width + 3) >> 2)
         keys[place] = known.distance[number] + weight * far
     for place in range((kept - 2) >> 2, -1, -1):
         sink(keys[place], numbers[place], place, keys, numbers, kept)
@@ -96,7 +96,7 @@ def grow(
     distance, mark = known.distance, known.mark
     width, height = world.width, world.height
     target, most, visits = aim.number, keys.size - 2 * body.start.size, 0
-    columns = (width + 7) >> 3
+    columns = (width + 3) >> 2
     while size > 0:
         key = keys[0]
         if mark[target] != UNREACHED and key >= distance[target]:
@@ -112,7 +112,7 @@ def grow(
         x, y, heading = place_of(number, width)
         here = distance[number]
         enough = share * distance[target] if weight == 0 and mark[target] != UNREACHED else np.inf
-        if enough < np.inf and here + way_left(x, y, aim, aim.left, columns) >= enough:
+        if enough < np.inf and here + way_left(x, y, aim, columns) >= enough:
             waiting = let_wait(number, mark, numbers, waiting)
             continue
         mark[number] = closed
@@ -131,7 +131,7 @@ def grow(
             if found == np.inf or (mark[before] != UNREACHED and found >= distance[before]):
                 continue
             distance[before] = found
-            far = way_left(column, line, aim, aim.guide if weight > 0 else aim.left, columns)
+            far = way_left(column, line, aim, columns)
             if mark[before] == closed or found + far >= enough:
                 if not OPEN <= mark[before] <= WAITING:
                     waiting = let_wait(before, mark, numbers, waiting)
@@ -148,7 +148,7 @@ def least_order(known: Known, numbers: Any, aim: Aim, world: World) -> float:
     for number in numbers:
         if OPEN <= known.mark[number] <= WAITING and known.distance[number] < least:
             x, y, _ = place_of(number, world.width)
-            far = way_left(x, y, aim, aim.left, (world.width + 7) >> 3)
+            far = way_left(x, y, aim, (world.width + 3) >> 2)
             if known.distance[number] + far < least:
                 least = known.distance[number] + far
     return least
@@ -250,7 +250,7 @@ def take_back(
     distance, mark = known.distance, known.mark
     size, count, most = 0, 0, keys.size - body.start.size
     for tile in tiles:
-        for number in range(tile << 10, (tile + 1) << 10):
+        for number in range(tile << 8, (tile + 1) << 8):
             if mark[number] == UNREACHED or distance[number] == 0:
                 continue
             if best_after(number, distance[number], OPEN, known, world, body) == np.inf:

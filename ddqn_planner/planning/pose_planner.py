@@ -247,20 +247,14 @@ class PosePlanner:
                 known = one
         if known is not None and known.field.grid is not grid:
             self._known.remove(known)
-            known = self._repaired(known, grid)
+            field, known = known.field, None
+            if (found := self._differences(field.grid, grid)) is not None:
+                field.repair(grid, self._world(grid), *found)
+                self._known.append(known := _Known(asked, field))
         if known is None:
             field = PoseField(states, grid, self._world(grid), self.body)
             self._known = [*self._known, known := _Known(asked, field)][-KEPT:]
         return known
-
-    def _repaired(self, known: _Known, grid: GridMap) -> _Known | None:
-        """Return the field for a map that may have changed, or None if a new one is quicker."""
-        field = known.field
-        found = self._differences(field.grid, grid)
-        if found is None or not field.repair(grid, self._world(grid), *found):
-            return None
-        self._known.append(new := _Known(known.asked, field))
-        return new
 
     def _differences(self, old: GridMap, new: GridMap) -> tuple[NDArray[np.int64], bool] | None:
         """Return what `differences` does, of maps of one place; the last answer is kept."""

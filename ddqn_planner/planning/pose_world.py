@@ -10,11 +10,12 @@ from numpy.typing import DTypeLike, NDArray
 from ddqn_planner.compiled import inlined
 from ddqn_planner.grid import MOVES, GridMap
 from ddqn_planner.grid.arguments import OCCUPIED
+from ddqn_planner.grid.copies import few_of
 from ddqn_planner.grid.footprint import rows_of
 from ddqn_planner.grid.grid_map import MULTIPLIERS
 from ddqn_planner.grid.motions import HEADINGS, Motions, closer
 
-TILE: Final = 8  # cells of a side
+TILE: Final = 4  # cells of a side
 BORDER: Final = 128  # occupied cells around the map, so that a body sweeps none beyond the bits
 State: TypeAlias = tuple[int, int, int]  # x, y, heading
 CHANGED_SHARE = 1 / 50  # of the map's cells: if more changed, fields begin anew
@@ -23,7 +24,10 @@ WORD, LAST_BIT, ONE, FULL = np.uint64(64), np.uint64(63), np.uint64(1), np.uint6
 
 
 class Body(NamedTuple):
-    """P primitives as kernels use them; 16 more say of each heading where the body stands."""
+    """P primitives as kernels use them, and the rows of 33 more masks."""
+
+    # 16 say for each heading where the body stands. Then come the cores, of each heading and of
+    # all: what each primitive that starts with it sweeps around any cell that its origin passes.
 
     into: NDArray[np.int64]  # (17,): into[h] to into[h + 1] are the places in `ending` of those
     ending: NDArray[np.int64]  # (P,): the primitives, by the heading in which they end
@@ -33,13 +37,11 @@ class Body(NamedTuple):
     offset: NDArray[np.int64]  # (P, 2)
     cost: NDArray[np.float32]  # (P,)
     row: NDArray[np.int64]  # (R, 3): y, first x, cells: the swept cells, at most 64 in one row
-    first: NDArray[np.int64]  # (P + 17,): where the rows of a primitive begin
+    first: NDArray[np.int64]  # (P + 34,): where the rows of each begin
     passed: NDArray[np.int64]  # (C, 3): x, y, bit of the action by which the origin leaves the cell
     share: NDArray[np.float32]  # (C,): which part of the cost counts in this cell
     first_passed: NDArray[np.int64]  # (P + 1,)
     reach: int  # cells that a primitive sweeps to any side, at most
-    core: int  # the rows from here on: what it sweeps around any cell that its origin passes
-    turn: int  # and from here on: where it stands with any heading
 
 
 class World(NamedTuple):
@@ -51,8 +53,7 @@ class World(NamedTuple):
     slowness: NDArray[np.float32]  # (H, W)
     forbidden: NDArray[np.uint8]  # (H, W)
     tile: NDArray[np.uint8]  # (T,): whether the body can reach an occupied cell, once it is known
-    room: NDArray[np.uint8]  # (T,): whether the body's core has room in one of its cells, likewise
-    turns: NDArray[np.uint8]  # (T,): whether the body has room there with any heading, likewise
+    room: NDArray[np.uint8]  # (T,): whether the body may pass one of its cells, likewise
     height: int
     width: int
 
@@ -61,19 +62,15 @@ def body_of(motions: Motions, swept: NDArray[np.bool_]) -> Body:
     """Return what kernels need of primitives and the cells (P, S, S) that they sweep."""
     start, end, headings = motions.start, motions.end, np.arange(HEADINGS + 1)
     passed = [_passed(poses) for poses in motions.poses]
-    # Where the body stands is what all primitives from there and to there sweep; its core is what
-    # each sweeps around every cell that its origin passes.
-    standing = np.ones((HEADINGS, *swept.shape[1:]), dtype=np.bool_)
-    core = np.ones((1, *swept.shape[1:]), dtype=np.bool_)
+    standing, core = np.ones((2, HEADINGS, *swept.shape[1:]), dtype=np.bool_)
     for mask, before, after, (x, y), (cells, _) in zip(
         swept, start, end, motions.offset, passed, strict=True
     ):
         standing[before] &= mask
         standing[after] &= np.roll(mask, (-y, -x), axis=(0, 1))
         for over, up, _ in cells:
-            core &= np.roll(mask, (-up, -over), axis=(0, 1))
-    turn = standing.any(axis=0, keepdims=True)
-    row, first = rows_of(np.concatenate([swept, standing, core, turn]))
+            core[before] &= np.roll(mask, (-up, -over), axis=(0, 1))
+    row, first = rows_of(np.concatenate([swept, standing, core, core.all(axis=0, keepdims=True)]))
     ending = np.argsort(end, kind="stable")
     return Body(
         into=np.searchsorted(end[ending], headings),
@@ -84,13 +81,11 @@ def body_of(motions: Motions, swept: NDArray[np.bool_]) -> Body:
         offset=motions.offset,
         cost=motions.cost,
         row=row,
-        first=first[:-2],
+        first=first,
         passed=np.concatenate([cells for cells, _ in passed]),
         share=np.concatenate([share for _, share in passed]).astype(np.float32),
         first_passed=np.cumsum([0, *(len(share) for _, share in passed)]),
         reach=int(np.abs(np.vstack([row[:, :2], [(0, sum(r) - 1) for r in row[:, 1:]]])).max()),
-        core=int(first[-3]),
-        turn=int(first[-2]),
     )
 
 
@@ -136,11 +131,11 @@ def world_of(
     words = (width + 2 * BORDER + 63) // 64 + 1
     bits = np.full((height + 2 * BORDER, words), -1, np.int64) if older is None else older.bits
     bits = bits.view(np.uint64).copy()
-    looks = np.zeros((3, (height + TILE - 1) // TILE, (width + TILE - 1) // TILE), dtype=np.uint8)
+    looks = np.zeros((2, (height + TILE - 1) // TILE, (width + TILE - 1) // TILE), dtype=np.uint8)
     (left, bottom), (right, top) = (0, 0), (width, height)
     if older is not None and cells is not None:
         (left, bottom), (right, top) = cells.min(axis=0), cells.max(axis=0) + 1
-        looks[:] = np.reshape((older.tile, older.room, older.turns), looks.shape)
+        looks[:] = np.reshape((older.tile, older.room), looks.shape)
     line = np.ones((top - bottom, 64 * words), dtype=np.bool_)
     line[:, BORDER : BORDER + width] = occupied[bottom:top]
     packed = np.packbits(line, axis=1, bitorder="little").view("<u8")
@@ -150,7 +145,7 @@ def world_of(
         for first, last in ((bottom, top), (left, right))
     )
     looks[:, rows, columns] = 0
-    tile, room, turns = looks.reshape(3, -1)
+    tile, room = looks.reshape(2, -1)
     return World(
         bits,
         _layer(body_costs(grid), np.int8),
@@ -159,7 +154,6 @@ def world_of(
         _layer(grid.forbidden, np.uint8),
         tile,
         room,
-        turns,
         height,
         width,
     )
@@ -189,7 +183,7 @@ def differences(old: GridMap, new: GridMap) -> tuple[NDArray[np.int64], bool] | 
                 changed = (one[box] != other[box]) & ~after[box]
                 opens = opens or bool(changed.any())
                 differs |= changed
-        y, x = np.nonzero(differs)
+        y, x = few_of(differs)
         found.append(np.column_stack([x + columns.start, y + rows.start]))
     cells = np.concatenate(found)
     return None if len(cells) > CHANGED_SHARE * new.occupancy.size else (cells, opens)
@@ -219,9 +213,9 @@ def stands(state: State, world: World, body: Body) -> bool:
 @inlined
 def is_far(x: int, y: int, world: Any, body: Any) -> bool:
     """Return whether no occupied cell is within reach of a tile; looks at most once."""
-    tile = (y >> 3) * ((world.width + 7) >> 3) + (x >> 3)
+    tile = (y >> 2) * ((world.width + 3) >> 2) + (x >> 2)
     if world.tile[tile] == 0:
-        left, bottom, wide = (x & -8) - body.reach, (y & -8) - body.reach, TILE + 2 * body.reach
+        left, bottom, wide = (x & -4) - body.reach, (y & -4) - body.reach, TILE + 2 * body.reach
         found = 1
         first = np.uint64(left + BORDER)
         last = np.uint64(left + wide - 1 + BORDER)
@@ -264,7 +258,8 @@ def cost_of(x: int, y: int, number: int, world: Any, body: Any) -> Any:
         total += body.share[place] * multiplier_in(column, line, world)
         if world.forbidden.size > 0 and world.forbidden[line, column] & body.passed[place, 2]:
             return np.float32(np.inf)
-    return cost * total
+    # Rounded, the shares may be less than 1 together; what counts on the least cost relies on it.
+    return cost * max(total, np.float32(1))
 
 
 @inlined

@@ -73,6 +73,21 @@ def test_what_is_explored_is_expected_to_take_no_longer_than_the_share(
         assert expected <= experience.expected_time(grid, best.path).seconds * (1 + share) * 1.04
 
 
+@given(st.floats(0.1, 1), st.floats(0.5, 4), st.floats(0, 60))
+def test_places_with_and_without_waits_count_as_faster_the_less_of_them_is_known(
+    share: float, slowness: float, waited: float
+) -> None:
+    seconds, positions = straight((2, 5), (12, 5), slowness)
+    seconds[len(seconds) // 2 :] += waited
+    experience = driven((seconds, positions), straight((2, 6), (12, 5)))
+    maps = [experience.apply(HALL, explored) for explored in (0.0, share)]
+    expected, hoped = (np.log(grid.slowness * grid.seconds_per_cell) for grid in maps)
+    uncertainty = experience.uncertainty(HALL)
+    unknown = uncertainty / uncertainty.max()
+    np.testing.assert_allclose(expected - hoped, math.log(1 + share) * unknown, atol=0.021)
+    assert at(HALL, unknown, 7, 5) < 0.7
+
+
 def test_waiting_counts_as_time_and_standing_before_a_drive_does_not() -> None:
     before, after = straight((2, 5), (7, 5)), straight((7, 5), (12, 5))
     seconds = np.concatenate([before[0] + 30, after[0] + before[0][-1] + 60])

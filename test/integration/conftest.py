@@ -182,10 +182,10 @@ def run_robot(run_node: RunNode, make_robot: Any, small_values: np.ndarray) -> C
 
 WAITING = """
 import os, time
-from ddqn_planner.nodes import map_source
+from ddqn_planner.nodes import report
 from ddqn_planner.planning import Planner
 
-load, map_source.PATIENCE = Planner.load, {patience}
+load, report.PATIENCE = Planner.load, {patience}
 
 def wait_and_load(path):
     while os.path.basename(path) == "any_map.safetensors" and not os.path.exists({gate!r}):

@@ -245,9 +245,10 @@ NOW = 111  # seconds of the node's clock
 class Node:
     """What `Frames`, `StartSource` and `Refusals` ask of a node."""
 
-    def __init__(self) -> None:
-        self.after_jump_back: set[object] = set()
-        self.value = {"start_source": "tf", "robot_frame": "odom"}.__getitem__
+    def __init__(self, source: str = "tf") -> None:
+        self.after_jump_back: list[Callable[[], None]] = []
+        values = {"start_source": source, "robot_frame": "odom", "transform_tolerance": 5.0}
+        self.value = values.__getitem__
 
     def create_timer(self, *_: object, clock: object) -> None:
         """Do not call back."""
@@ -255,7 +256,10 @@ class Node:
     def create_publisher(self, *_: object) -> None:
         """Have nobody to publish to."""
 
-    def destroy_timer(self, _: object) -> None:
+    def create_subscription(self, _: object, topic: str, *__: object) -> SimpleNamespace:
+        return SimpleNamespace(topic_name=topic)
+
+    def destroy_subscription(self, _: object) -> None:
         """Have nothing to destroy."""
 
     def get_clock(self) -> SimpleNamespace:
@@ -267,7 +271,7 @@ def listening(monkeypatch: pytest.MonkeyPatch) -> Callable[..., Frames]:
     """Return what makes frames that know the transforms of some seconds."""
 
     def make(*seconds: int, tolerance: float = 20.0) -> Frames:
-        listener = SimpleNamespace(unregister=lambda: None, group=SimpleNamespace())
+        listener = SimpleNamespace(group=SimpleNamespace())
         fields = {"TransformListener": lambda *_, **__: listener, "TransformException": KeyError}
         fields["__spec__"] = object  # it is installed
         tf2_ros = SimpleNamespace(Buffer=lambda: Buffer(*seconds), **fields)
@@ -328,16 +332,31 @@ def test_a_newest_transform_beyond_the_tolerance_is_not_used(listening: Any) -> 
 
 def test_transforms_from_before_the_clock_jumped_back_are_forgotten(listening: Any) -> None:
     frames = listening(100)
-    assert not frames.may_come
     assert frames.origin_of("odom", "map").pose.position.x == 1.0
-    forgets = frames._node.after_jump_back
-    for forget in forgets:  # as the node does
+    frames.began -= 60
+    for forget in frames._node.after_jump_back:  # as the node does
         forget()
     with pytest.raises(ValueError, match="does not exist"):
         frames.origin_of("odom", "map")
-    assert frames.may_come
-    frames.close()
-    assert not forgets
+    with pytest.raises(RequestError) as error:
+        frames.to_map("the goal", pose_at(100), "map")
+    assert error.value.may_come
+
+
+@pytest.mark.parametrize(("source", "stays"), [("initialpose", True), ("odometry", False)])
+def test_a_set_start_outlives_a_jump_of_the_clock_and_odometry_does_not(
+    listening: Any, source: str, stays: bool
+) -> None:
+    node, pose = Node(source), pose_at(NOW, "map")
+    start = StartSource(node, listening(), Refusals(node), lambda: "map", lambda: None)
+    start._take(pose)
+    assert start.pose() is pose
+    for forget in node.after_jump_back:
+        forget()
+    if stays:
+        assert start.pose() is pose
+    else:
+        assert "nothing came on odom" in refusal("NO_START", start.pose)
 
 
 def test_other_frames_are_refused_without_tf_and_the_remedy_names_it(listening: Any) -> None:

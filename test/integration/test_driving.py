@@ -26,7 +26,7 @@ from std_msgs.msg import Header, UInt8MultiArray
 from ddqn_planner import Experience, GridMap
 from ddqn_planner.experience.drives import read_drives
 from ddqn_planner.nodes.conversions import bytes_message, bytes_of, quaternion
-from ddqn_planner.nodes.driving_robot import NAVIGATION
+from ddqn_planner.nodes.driving import NAVIGATION
 from ddqn_planner.nodes.runtime import LATCHED
 
 VALUES = np.zeros((40, 100), dtype=np.int8)

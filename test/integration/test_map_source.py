@@ -32,8 +32,13 @@ from ddqn_planner.nodes.conversions import (
     grid_from_message,
     occupancy_message,
 )
-from ddqn_planner.nodes.expected_times import ExpectedTimes
-from ddqn_planner.nodes.map_source import BODY_PARAMETERS, MAP_PARAMETERS, MapSource, updated_values
+from ddqn_planner.nodes.map_source import (
+    BODY_PARAMETERS,
+    MAP_PARAMETERS,
+    ExpectedTimes,
+    MapSource,
+    updated_values,
+)
 from ddqn_planner.nodes.parameters import PLANNER_PARAMETERS
 from ddqn_planner.nodes.report import Outcome, Report, RequestError
 from ddqn_planner.nodes.runtime import LATCHED, BaseNode, Worker
@@ -62,8 +67,7 @@ class Source(MapSource):
         self.heard: list[bool] = []
         self.report = Report(node, lambda: None)
         self.node, self.worker = node, Worker(node)
-        self.times = ExpectedTimes(node, self.report, self.worker, self.change)
-        super().__init__(node, self.report, self.worker, self.times.apply, self.heard.append)
+        super().__init__(node, self.report, self.worker, self.heard.append)
 
     def grid(self) -> GridMap:
         future, deadline = self.ready(), time.monotonic() + TIMEOUT
@@ -432,7 +436,7 @@ def test_a_map_has_times_after_drives(
     slowness = times.apply(GRID).slowness
     assert slowness is not None
     assert slowness[20, 60] > 2
-    layout, data = driven.layout, bytes(driven.data)
+    data = bytes(driven.data)
     for bad, reason in (
         (bytes_message("experience", data[:-9]), "no experience"),
         (bytes_message("model", data), "label 'ddqn_planner model 1"),
@@ -442,7 +446,6 @@ def test_a_map_has_times_after_drives(
         with pytest.raises(ValueError, match=reason):
             times.load(bad)
     np.testing.assert_array_equal(times.apply(GRID).slowness, slowness)
-    times.load(UInt8MultiArray(layout=layout))  # by its digest it is known already
     times.load(message_of(Experience(0.5)))  # it was forgotten
     assert times.apply(GRID) is GRID
 

@@ -18,7 +18,7 @@ from client import Client, wait_for
 from rcl_interfaces import srv
 from rcl_interfaces.msg import Parameter, ParameterDescriptor, ParameterValue
 
-from ddqn_planner.nodes.driving_robot import NAVIGATION
+from ddqn_planner.nodes.driving import NAVIGATION
 from ddqn_planner.nodes.poses import has_tf
 
 ROOT = Path(__file__).resolve().parents[2]

@@ -194,20 +194,16 @@ class TransformListener:
         def hear(transform):
             buffer.transforms[transform.header.frame_id, transform.child_frame_id] = transform
 
-        self.node, self.group = node, ReentrantCallbackGroup()
+        self.group = ReentrantCallbackGroup()
         self.tf_sub, self.tf_static_sub = (
             node.create_subscription(TransformStamped, topic, hear, qos, callback_group=self.group)
             for topic in ("tf", "tf_static")
         )
-
-    def unregister(self):
-        self.node.destroy_subscription(self.tf_sub)
-        self.node.destroy_subscription(self.tf_static_sub)
 """
 """As much of tf2_ros as the node uses, which is no package of PyPI: one transform, no tree."""
 
 
-PATIENT = "import ddqn_planner.nodes.poses as poses; poses.PATIENCE = 3.0  # on a loaded machine"
+PATIENT = "from ddqn_planner.nodes import report; report.PATIENCE = 3.0  # on a loaded machine"
 
 
 @pytest.fixture(scope="module")

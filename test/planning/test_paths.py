@@ -203,6 +203,19 @@ def test_what_is_kept_is_cheap(place: Place, rule: MoveRule, threshold: float, d
         assert cost == pytest.approx((1 + extra_cost) * best)
 
 
+def test_a_path_pulled_straight_through_an_opening_is_a_new_one() -> None:
+    walled, rule, start, goal = np.zeros((9, 9), dtype=bool), MoveRule.ROBOT_SAFE, (0, 4), (8, 4)
+    walled[:8, 4] = True
+    under_way = simplify(shortest_path(GridMap(walled), start, goal, rule), GridMap(walled), rule)
+    walled[4, 4] = False
+    opened, new = GridMap(walled), np.array([start, goal], dtype=np.int32)
+    for simplified in (True, False):
+        request = PlanRequest(opened, start, goal, rule, simplified=simplified, under_way=under_way)
+        path, extra_cost = keep_or_switch(request, new)
+        assert path.tolist() == new.tolist()
+        assert extra_cost is None
+
+
 @given(grids_with_costs(), RULES, st.data())
 def test_a_search_finds_any_legal_path(place: Place, rule: MoveRule, data: Data) -> None:
     grid, goal = place

@@ -84,7 +84,6 @@ def test_plans_cost_the_least_within_their_bound_also_after_repairs(
     with pytest.MonkeyPatch.context() as patch:
         if guided:
             patch.setattr(pose_field, "UNGUIDED", 16)
-            patch.setattr(pose_field, "GUIDED", 64)
         for _ in range(3):
             best = least_costs(grid, *robot(motion), goal)
             for x, y, heading in starts:
@@ -119,7 +118,6 @@ def test_what_the_map_tells_changes_no_least_path(seed: int, monkeypatch: Any) -
     costs: dict[int, list[float]] = {}
     for looks in (2**8, 2**30):
         monkeypatch.setattr(pose_field, "UNGUIDED", looks)
-        monkeypatch.setattr(pose_field, "GUIDED", 4 * looks)
         body, places = planner("differential"), np.random.default_rng(seed)
         for heading in range(6):
             cells = places.permutation(np.argwhere(~occupancy))[:2].tolist()
@@ -132,20 +130,27 @@ def test_what_the_map_tells_changes_no_least_path(seed: int, monkeypatch: Any) -
     assert few == pytest.approx(many, rel=1e-5)
 
 
-def test_what_was_far_from_obstacles_is_looked_at_again_when_one_comes() -> None:
+@pytest.mark.parametrize("unguided", [2**4, 2**30])
+def test_what_was_far_from_obstacles_is_looked_at_again_when_one_comes(
+    unguided: int, monkeypatch: Any
+) -> None:
+    monkeypatch.setattr(pose_field, "UNGUIDED", unguided)
     motions, _ = robot("differential")
-    grid = GridMap(np.zeros((100, 160), np.bool_), CELL)
-    start, goal = (pose_of(grid, motions, state) for state in ((40, 50, 0), (120, 50, 0)))
-    body = planner("differential")
-    free = plan(body, grid, start, goal, bound=1.0)
-    box = grid.with_patch(np.ones((12, 4), np.bool_), 78, 44)
-    for changed in (box, grid):
-        found = plan(body, changed, start, goal, bound=1.0)
-        fresh = plan(planner("differential"), changed, start, goal, bound=1.0)
+    occupancy = np.zeros((160, 260), np.bool_)
+    occupancy[[50, 90], 60:160] = True  # a lane, which a block closes on its left
+    grid = GridMap(occupancy, CELL)
+    inside, start, goal = (
+        pose_of(grid, motions, state) for state in ((95, 65, 3), (20, 75, 1), (120, 70, 0))
+    )
+    block = grid.with_patch(np.ones((40, 20), np.bool_), 60, 50)
+    body, costs = planner("differential"), []
+    for changed, begin in (grid, start), (block, inside), (block, start), (grid, start):
+        found = plan(body, changed, begin, goal, bound=1.0)
+        fresh = plan(planner("differential"), changed, begin, goal, bound=1.0)
         assert found.cost == pytest.approx(fresh.cost, rel=1e-5)
-    assert found.cost == pytest.approx(free.cost, rel=1e-5)
-    around = plan(body, box, start, goal, bound=1.0)
-    assert (around.cost or 0) > (free.cost or 0) + 1
+        costs.append(found.cost or 0)
+    assert costs[3] == pytest.approx(costs[0], rel=1e-5)
+    assert costs[2] > costs[0] + 1
 
 
 def placed(body: shapely.Polygon, pose: NDArray[np.float64]) -> shapely.Polygon:
