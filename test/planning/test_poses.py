@@ -21,9 +21,10 @@ from ddqn_planner.grid.motions import Motions, make_motions, turn_between
 from ddqn_planner.planning import pose_field
 from ddqn_planner.planning.plan import PlanStatus, PosePlan
 from ddqn_planner.planning.planner import last_step
+from ddqn_planner.planning.pose_guide import way_left
 from ddqn_planner.planning.pose_paths import cost_of_poses
 from ddqn_planner.planning.pose_planner import Pose, PosePlanner, PoseRequest
-from ddqn_planner.planning.pose_world import State
+from ddqn_planner.planning.pose_world import State, world_of
 
 CELL = 0.1
 SQUARE = (0, 0), (0, 2), (2, 2), (2, 0)
@@ -128,6 +129,27 @@ def test_what_the_map_tells_changes_no_least_path(seed: int, monkeypatch: Any) -
                 assert body._known[-1].field._round <= 4
     few, many = costs.values()
     assert few == pytest.approx(many, rel=1e-5)
+
+
+@settings(max_examples=10)
+@given(motion=st.sampled_from(sorted(BODIES)), seed=st.integers(0, 2**32 - 1))
+def test_what_the_map_tells_is_left_at_least(motion: str, seed: int) -> None:
+    random = np.random.default_rng(seed)
+    occupancy = random.random((30, 44)) < 0.01
+    for wall in (14, 28):  # with gaps that the body just passes, or does not
+        begin, gap = random.integers(2, 20), random.integers(3, 9)
+        occupancy[:, wall] = True
+        occupancy[begin : begin + gap, wall] = False
+    grid, (motions, swept) = GridMap(occupancy, CELL), robot(motion)
+    x, y, heading = (int(random.integers(n)) for n in (44, 30, 16))
+    body, world = planner(motion).body, world_of(grid)
+    field = pose_field.PoseField(((43, 29, 0),), grid, world, body)
+    field._aim = field._aim._replace(x=x, y=y)
+    field._guide()
+    best = least_costs(grid, motions, swept, (x, y, heading))
+    for row, column, _ in np.argwhere(np.isfinite(best)):
+        left = way_left(column, row, field._aim, (world.width + 3) >> 2)
+        assert left <= best[row, column].min() + 1e-3
 
 
 @pytest.mark.parametrize("unguided", [2**4, 2**30])
