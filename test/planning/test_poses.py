@@ -133,6 +133,21 @@ def test_what_the_map_tells_changes_no_least_path(seed: int, goals: int, monkeyp
     assert few == pytest.approx(many, rel=1e-5)
 
 
+@pytest.mark.parametrize("motion", sorted(BODIES))
+def test_a_core_is_what_all_motions_sweep_around_each_cell_of_the_origin(motion: str) -> None:
+    body, cells = planner(motion).body, []
+    for begin, end in pairwise(body.first.tolist()):
+        rows = body.row[begin:end].tolist()
+        cells.append({(x + i, y) for y, x, length in rows for i in range(length)})
+    for heading in range(16):
+        swept_around = [
+            {(x - over, y - up) for x, y in cells[primitive]}
+            for primitive in range(body.out[heading], body.out[heading + 1])
+            for over, up, _ in body.passed[slice(*body.first_passed[primitive : primitive + 2])]
+        ]
+        assert cells[body.start.size + 16 + heading] == set.intersection(*swept_around)
+
+
 @settings(max_examples=10)
 @given(motion=st.sampled_from(sorted(BODIES)), seed=st.integers(0, 2**32 - 1))
 def test_what_the_map_tells_is_left_at_least(motion: str, seed: int) -> None:
