@@ -9,7 +9,6 @@ import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
 from ddqn_planner.grid import GridMap
-from ddqn_planner.grid.motions import HEADINGS
 from ddqn_planner.planning import pose_kernels as kernels
 from ddqn_planner.planning.pose_guide import Aim, spread
 from ddqn_planner.planning.pose_kernels import Known
@@ -52,7 +51,7 @@ class PoseField:
     def _begin(self, grid: GridMap, world: World) -> None:
         """Know nothing but the goals."""
         self.grid, self.world, goals = grid, world, self.goals
-        states = world.tile.size * TILE * TILE * HEADINGS
+        states = world.tile.size << kernels.TILE_BITS
         self.known = Known(_untouched(states, np.float32), _untouched(states, np.uint8))
         self._size, self._waiting, self._round = len(goals), 0, 0
         entries = max(HEAP, len(goals))
@@ -63,7 +62,7 @@ class PoseField:
 
     def number(self, state: State) -> int:
         """Return the number of a state inside the map."""
-        return int(kernels.number_of(*state, self.world.width))
+        return int(kernels.number_of(*state, self.world.columns))
 
     def reach(self, start: State, bound: float, limit: int) -> bool:
         """Grow until the cost from a start is known within a bound, or known not to exist."""
@@ -123,7 +122,7 @@ class PoseField:
 
     def _guide(self) -> bool:
         """Look at the map for what is left to the start; return whether a way may exist."""
-        columns, rows = (self.world.width + 3) // TILE, (self.world.height + 3) // TILE
+        columns, rows = self.world.columns, self.world.rows
         left = np.empty((columns + 1) * (rows + 1), np.float32)
         most = 8 * left.size + 4  # each corner opens its neighbours once
         keys, numbers = np.empty(most, np.float32), np.empty(most, np.int64)
@@ -177,8 +176,8 @@ class PoseField:
         """Hold for a map that differs in some cells (N, 2); begin anew where that is quicker."""
         # `opens` tells whether a way may have got cheaper: what is left to the start, too.
         self._aim = self._aim._replace(number=-1, left=NOTHING if opens else self._aim.left)
-        reach, columns = self.body.reach + TILE, (world.width + TILE - 1) // TILE
-        near = np.zeros((columns, (world.height + TILE - 1) // TILE), dtype=np.bool_)
+        reach = self.body.reach + TILE
+        near = np.zeros((world.columns, world.rows), dtype=np.bool_)
         low, high = np.unique(np.maximum(cells - reach, 0) // TILE, axis=0), 2 * reach // TILE + 1
         for x, y in low:
             near[x : x + high, y : y + high] = True
@@ -191,7 +190,7 @@ class PoseField:
             return
         self.grid, self.world, found = grid, world, raised[:count]
         if opens:
-            states = np.arange(TILE * TILE * HEADINGS)
+            states = np.arange(1 << kernels.TILE_BITS)
             found = np.concatenate([found, (tiles[:, None] * len(states) + states).ravel()])
         self._reserve(max(self._size + self._waiting + len(found), len(self._keys)))
         heap = self._numbers, self._size

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ddqn_planner.compiled import in_place, inlined
-from ddqn_planner.planning.pose_world import TILE, Body, World, is_possible, touches
+from ddqn_planner.planning.pose_world import SHIFT, TILE, Body, World, is_possible, touches
 
 
 class Aim(NamedTuple):
@@ -26,12 +26,12 @@ def way_left(x: int, y: int, aim: Any, columns: int) -> float:
     """Return what is left from a cell to the start at least, in cells."""
     best = math.sqrt((x - aim.x) * (x - aim.x) + (y - aim.y) * (y - aim.y))
     if aim.left.size > 0:
-        tile_x, tile_y = x >> 2, y >> 2
+        tile_x, tile_y = x >> SHIFT, y >> SHIFT
         for row in range(2):
             for column in range(2):
                 there = aim.left[(tile_y + row) * (columns + 1) + tile_x + column]
                 if there > best:
-                    over, up = x + 0.5 - 4 * (tile_x + column), y + 0.5 - 4 * (tile_y + row)
+                    over, up = x + 0.5 - TILE * (tile_x + column), y + 0.5 - TILE * (tile_y + row)
                     there -= math.sqrt(over * over + up * up)
                     if there > best:
                         best = there
@@ -74,14 +74,15 @@ def sink(key: Any, number: int, place: int, keys: Any, numbers: Any, size: int) 
 @inlined
 def has_room(x: int, y: int, world: Any, body: Any) -> bool:
     """Return whether the origin may pass a tile; looks once."""
-    tile = y * ((world.width + 3) >> 2) + x
+    tile = y * world.columns + x
     if world.room[tile] == 0:
         world.room[tile] = 2
-        for number in range(32):
+        for number in range(2 * TILE * TILE):
             # From the middle on: most tiles have room there.
-            column, line = 4 * x + ((number & 3) ^ 2), 4 * y + (((number >> 2) & 3) ^ 2)
+            column = TILE * x + ((number % TILE) ^ (TILE // 2))
+            line = TILE * y + ((number // TILE % TILE) ^ (TILE // 2))
             inside = column < world.width and line < world.height
-            if inside and may_pass(column, line, number >= 16, world, body):
+            if inside and may_pass(column, line, number >= TILE * TILE, world, body):
                 world.room[tile] = 1
                 break
     return bool(world.room[tile] == 1)
@@ -111,11 +112,10 @@ def may_pass(x: int, y: int, moves: bool, world: Any, body: Any) -> bool:
 @inlined
 def leads(x: int, y: int, step_x: int, step_y: int, world: Any, body: Any) -> bool:
     """Return whether a step from a corner leads through a tile that has room, or along its side."""
-    columns, rows = (world.width + 3) >> 2, (world.height + 3) >> 2
     for side in range(2):
         tile_x = x + (step_x - 1) // 2 if step_x != 0 else x - side
         tile_y = y + (step_y - 1) // 2 if step_y != 0 else y - side
-        inside = 0 <= tile_x < columns and 0 <= tile_y < rows
+        inside = 0 <= tile_x < world.columns and 0 <= tile_y < world.rows
         if inside and has_room(tile_x, tile_y, world, body):
             return True
     return False
@@ -151,11 +151,11 @@ def spread(
 ) -> None:
     """Write what is left from corners of tiles to a start, infinite where no way leads."""
     # By A*, to the nearest goal and as much further: what is not on the way there is left out.
-    columns, rows = (world.width + 3) >> 2, (world.height + 3) >> 2
+    columns, rows = world.columns, world.rows
     size, end, limit = 0, 0.0, np.inf
     left[:] = np.inf
     for corner in range(4):
-        x, y = (aim.x >> 2) + (corner & 1), (aim.y >> 2) + (corner >> 1)
+        x, y = (aim.x >> SHIFT) + (corner & 1), (aim.y >> SHIFT) + (corner >> 1)
         number = y * (columns + 1) + x
         left[number] = 0
         size = push(np.float32(way_to_box(x, y, box)), number, keys, numbers, size)

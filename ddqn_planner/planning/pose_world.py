@@ -15,7 +15,8 @@ from ddqn_planner.grid.footprint import rows_of
 from ddqn_planner.grid.grid_map import MULTIPLIERS
 from ddqn_planner.grid.motions import HEADINGS, Motions, closer
 
-TILE: Final = 4  # cells of a side
+SHIFT: Final = 2  # so many bits tell where in its tile a cell lies, along a side
+TILE: Final = 1 << SHIFT  # cells of a side
 BORDER: Final = 128  # occupied cells around the map, so that a body sweeps none beyond the bits
 State: TypeAlias = tuple[int, int, int]  # x, y, heading
 CHANGED_SHARE = 1 / 50  # of the map's cells: if more changed, fields begin anew
@@ -56,6 +57,8 @@ class World(NamedTuple):
     room: NDArray[np.uint8]  # (T,): whether the body may pass one of its cells, likewise
     height: int
     width: int
+    rows: int  # of tiles
+    columns: int
 
 
 def body_of(motions: Motions, swept: NDArray[np.bool_]) -> Body:
@@ -131,7 +134,7 @@ def world_of(
     words = (width + 2 * BORDER + 63) // 64 + 1
     bits = np.full((height + 2 * BORDER, words), -1, np.int64) if older is None else older.bits
     bits = bits.view(np.uint64).copy()
-    looks = np.zeros((2, (height + TILE - 1) // TILE, (width + TILE - 1) // TILE), dtype=np.uint8)
+    looks = np.zeros((2, -(-height // TILE), -(-width // TILE)), dtype=np.uint8)
     (left, bottom), (right, top) = (0, 0), (width, height)
     if older is not None and cells is not None:
         (left, bottom), (right, top) = cells.min(axis=0), cells.max(axis=0) + 1
@@ -156,6 +159,7 @@ def world_of(
         room,
         height,
         width,
+        *looks.shape[1:],
     )
 
 
@@ -211,11 +215,18 @@ def stands(state: State, world: World, body: Body) -> bool:
 
 
 @inlined
+def tile_of(x: int, y: int, columns: int) -> int:
+    """Return the number of the tile in which a cell lies."""
+    return (y >> SHIFT) * columns + (x >> SHIFT)
+
+
+@inlined
 def is_far(x: int, y: int, world: Any, body: Any) -> bool:
     """Return whether no occupied cell is within reach of a tile; looks at most once."""
-    tile = (y >> 2) * ((world.width + 3) >> 2) + (x >> 2)
+    tile = tile_of(x, y, world.columns)
     if world.tile[tile] == 0:
-        left, bottom, wide = (x & -4) - body.reach, (y & -4) - body.reach, TILE + 2 * body.reach
+        left, bottom = (x & -TILE) - body.reach, (y & -TILE) - body.reach
+        wide = TILE + 2 * body.reach
         found = 1
         first = np.uint64(left + BORDER)
         last = np.uint64(left + wide - 1 + BORDER)

@@ -165,7 +165,7 @@ def test_what_the_map_tells_is_left_at_least(motion: str, seed: int) -> None:
     field._guide()
     best = least_costs(grid, motions, swept, (x, y, heading))
     for row, column, _ in np.argwhere(np.isfinite(best)):
-        left = way_left(column, row, field._aim, (world.width + 3) >> 2)
+        left = way_left(column, row, field._aim, world.columns)
         assert left <= best[row, column].min() + 1e-3
 
 
