@@ -44,8 +44,9 @@ class PoseField:
     # else the start's is. So the least cost of one of these, plus what is left from there at least,
     # is a lower bound, which proves how good the start's cost is.
 
-    def __init__(self, goals: tuple[State, ...], grid: GridMap, world: World, body: Body) -> None:
-        self.goals, self.body, self._aim = goals, body, Aim(0, 0, -1, NOTHING)
+    def __init__(self, goals: NDArray[np.int64], grid: GridMap, world: World, body: Body) -> None:
+        self.goals = goals  # (N, 3): x, y, heading
+        self.body, self._aim = body, Aim(0, 0, -1, NOTHING)
         self._begin(grid, world)
 
     def _begin(self, grid: GridMap, world: World) -> None:
@@ -56,7 +57,8 @@ class PoseField:
         self._size, self._waiting, self._round = len(goals), 0, 0
         entries = max(HEAP, len(goals))
         self._keys, self._numbers = np.empty(entries, np.float32), np.empty(entries, np.int64)
-        self._numbers[: len(goals)] = [self.number(goal) for goal in goals]
+        x, y, heading = goals.T
+        self._numbers[: len(goals)] = kernels.number_of(x, y, heading, world.columns)
         self.known.mark[self._numbers[: len(goals)]] = kernels.OPEN
         self._weight, self.visits = 0.0, 0
 
@@ -126,13 +128,15 @@ class PoseField:
         left = np.empty((columns + 1) * (rows + 1), np.float32)
         most = 8 * left.size + 4  # each corner opens its neighbours once
         keys, numbers = np.empty(most, np.float32), np.empty(most, np.int64)
-        x, y, _ = np.array(self.goals).T // TILE
-        goals, box = np.unique(y * (columns + 1) + x), (x.min(), y.min(), x.max(), y.max())
-        towards = self._aim, goals, np.array(box), FURTHER
+        x, y, _ = self.goals.T // TILE
+        is_goal = np.zeros(left.size, np.bool_)
+        is_goal[y * (columns + 1) + x] = True
+        box = np.array([x.min(), y.min(), x.max(), y.max()])
+        towards = self._aim, is_goal, box, FURTHER
         spread(left, keys, numbers, *towards, self.world, self.body)
         self._aim = self._aim._replace(left=left)
         self._order()
-        return bool(np.isfinite(left[goals]).any())
+        return bool(np.isfinite(left[is_goal]).any())
 
     def _reserve(self, entries: int) -> None:
         """Make the heap so large; what waits stays at its end."""

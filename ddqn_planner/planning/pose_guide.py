@@ -143,7 +143,7 @@ def spread(
     keys: Any,
     numbers: Any,
     aim: Aim,
-    goals: NDArray[np.int64],
+    is_goal: NDArray[np.bool_],
     box: NDArray[np.int64],
     further: float,
     world: World,
@@ -170,10 +170,8 @@ def spread(
         here, ahead = left[number], way_to_box(x, y, box)
         if key > here + ahead:
             continue
-        if ahead == 0 and limit == np.inf:
-            for goal in goals:
-                if number == goal:
-                    limit = further * here
+        if is_goal[number] and limit == np.inf:
+            limit = further * here
         for step_y in range(-1, 2):
             for step_x in range(-1, 2):
                 if step_x == 0 and step_y == 0:

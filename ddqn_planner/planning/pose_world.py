@@ -7,7 +7,7 @@ from typing import Any, Final, NamedTuple, TypeAlias
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
-from ddqn_planner.compiled import inlined
+from ddqn_planner.compiled import in_place, inlined
 from ddqn_planner.grid import MOVES, GridMap
 from ddqn_planner.grid.arguments import OCCUPIED
 from ddqn_planner.grid.copies import few_of
@@ -207,13 +207,6 @@ def touches(bits: Any, x: int, y: int, row: Any, first: int, last: int) -> bool:
     return False
 
 
-def stands(state: State, world: World, body: Body) -> bool:
-    """Return whether the body has room at a state inside the map."""
-    x, y, heading = state
-    row = len(body.start) + heading
-    return not touches(world.bits, x, y, body.row, body.first[row], body.first[row + 1])
-
-
 @inlined
 def tile_of(x: int, y: int, columns: int) -> int:
     """Return the number of the tile in which a cell lies."""
@@ -278,3 +271,17 @@ def is_possible(x: int, y: int, number: int, world: Any, body: Any) -> bool:
     """Return whether the body can take a primitive from a cell."""
     first, last = body.first[number], body.first[number + 1]
     return is_far(x, y, world, body) or not touches(world.bits, x, y, body.row, first, last)
+
+
+@in_place
+def standing(states: NDArray[np.int64], world: World, body: Body) -> int:
+    """Move the states (N, 3) at which the body has room to the front; return how many."""
+    count = 0
+    for place in range(len(states)):
+        x, y, heading = states[place, 0], states[place, 1], states[place, 2]
+        row = body.start.size + heading
+        first, last = body.first[row], body.first[row + 1]
+        if is_far(x, y, world, body) or not touches(world.bits, x, y, body.row, first, last):
+            states[count, 0], states[count, 1], states[count, 2] = x, y, heading
+            count += 1
+    return count
