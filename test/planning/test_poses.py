@@ -289,7 +289,8 @@ def test_an_occupied_goal_moves_to_where_the_way_costs_the_least(
     grid, (motions, swept) = GridMap(occupancy, CELL), robot(motion)
     turn = np.abs(turn_between(motions.angles, motions.angles[heading]))
     headings = np.flatnonzero(turn <= radians)
-    cells = [(i, j) for j, i in np.ndindex(24, 30) if math.dist((i, j), (x, y)) * CELL <= metres]
+    far = metres / CELL + 1e-4
+    cells = [(i, j) for j, i in np.ndindex(24, 30) if math.dist((i, j), (x, y)) <= far]
     ends = [(*cell, int(turned)) for cell in cells for turned in headings]
     best = least_costs(grid, motions, swept, *ends)
     body, goal = planner(motion), pose_of(grid, motions, (x, y, heading))
