@@ -50,13 +50,21 @@ def place_of(number: int, columns: int) -> tuple[int, int, int]:
 
 @in_place
 def order(
-    known: Known, keys: Any, numbers: Any, size: int, aim: Aim, weight: float, world: World
+    known: Known,
+    keys: Any,
+    numbers: Any,
+    size: int,
+    aim: Aim,
+    weight: float,
+    last: int,
+    world: World,
 ) -> int:
-    """Order the open and waiting states toward a start, each once; return how many there are."""
+    """Order states toward a start, each once: open ones, and those with marks up to a last one."""
+    # Returns how many there are.
     kept = 0
     for place in range(size):
         number = numbers[place]
-        if OPEN <= known.mark[number] <= WAITING:
+        if OPEN <= known.mark[number] <= last:
             known.mark[number] = 255  # so that it is taken once
             numbers[kept] = number
             kept += 1
@@ -64,7 +72,7 @@ def order(
         number = numbers[place]
         known.mark[number] = OPEN
         x, y, _ = place_of(number, world.columns)
-        far = way_left(x, y, aim, world.columns)
+        far = way_left(x, y, aim)
         keys[place] = known.distance[number] + weight * far
     for place in range((kept - 2) >> 2, -1, -1):
         sink(keys[place], numbers[place], place, keys, numbers, kept)
@@ -116,7 +124,7 @@ def grow(
         x, y, heading = place_of(number, columns)
         here = distance[number]
         enough = share * distance[target] if weight == 0 and mark[target] != UNREACHED else np.inf
-        if enough < np.inf and here + way_left(x, y, aim, columns) >= enough:
+        if enough < np.inf and here + way_left(x, y, aim) >= enough:
             waiting = let_wait(number, mark, numbers, waiting)
             continue
         mark[number] = closed
@@ -135,7 +143,7 @@ def grow(
             if found == np.inf or (mark[before] != UNREACHED and found >= distance[before]):
                 continue
             distance[before] = found
-            far = way_left(column, line, aim, columns)
+            far = way_left(column, line, aim)
             if mark[before] == closed or found + far >= enough:
                 if not OPEN <= mark[before] <= WAITING:
                     waiting = let_wait(before, mark, numbers, waiting)
@@ -152,7 +160,7 @@ def least_order(known: Known, numbers: Any, aim: Aim, world: World) -> float:
     for number in numbers:
         if OPEN <= known.mark[number] <= WAITING and known.distance[number] < least:
             x, y, _ = place_of(number, world.columns)
-            far = way_left(x, y, aim, world.columns)
+            far = way_left(x, y, aim)
             if known.distance[number] + far < least:
                 least = known.distance[number] + far
     return least
