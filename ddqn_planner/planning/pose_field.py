@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import mmap
 from typing import Any
 
@@ -67,8 +68,11 @@ class PoseField:
         """Return the number of a state inside the map."""
         return int(kernels.number_of(*state, self.world.columns))
 
-    def reach(self, start: State, bound: float, limit: int) -> bool:
-        """Grow until the cost from a start is known within a bound, or known not to exist."""
+    def reach(self, start: State, bound: float, limit: int) -> float | None:
+        """Grow until the cost from a start is known within a bound, or known not to exist.
+
+        Return the bound that is proved, or None if more states than the limit must be visited.
+        """
         number = self.number(start)
         if number != self._aim.number:
             known = self._aim if start[:2] == self._aim[:2] else NOWHERE
@@ -81,16 +85,17 @@ class PoseField:
             visits, done = self._grow(most, 1 / bound)
             limit, self._tried = limit - visits, self._tried + visits
             if done:
-                if self.bound(number) <= bound * kernels.SAME or not len(self._open()):
-                    return True
+                proved = self._bound(number)
+                if proved <= bound * kernels.SAME or not len(self._open()):
+                    return proved
                 self._weight = 0.0
                 self._order()
             elif limit == 0:
-                return False
+                return None
             elif visits < most:
                 self._reserve(2 * len(self._keys))
             elif not self._can_leave(number) or not self._guide():
-                return True
+                return math.inf
 
     def _until_look(self, number: int) -> int:
         """Return how many states are visited before the next look at the map pays, or -1."""
@@ -120,8 +125,8 @@ class PoseField:
         self.visits += visits
         return visits, done
 
-    def bound(self, number: int) -> float:
-        """Return how many times the least cost that of the last aim may be."""
+    def _bound(self, number: int) -> float:
+        """Return how many times the least cost that of the aim may be."""
         if self.known.mark[number] == kernels.UNREACHED:
             return np.inf
         cost = float(self.known.distance[number])

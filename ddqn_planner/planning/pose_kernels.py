@@ -244,6 +244,8 @@ def best_after(number: int, limit: Any, marked: int, known: Known, world: World,
         found = known.distance[after] + cost_of(x, y, primitive, world, body)
         if found <= limit and found < best:
             best = found
+            if marked == OPEN:  # whether there is one is asked, not which is the best
+                break
     return best
 
 

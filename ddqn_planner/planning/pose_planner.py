@@ -146,10 +146,9 @@ class PosePlanner:
             states = self._around(request, start, world) if may_move else exact
             if not len(states):
                 continue
-            while not self._grow(request, states, start):
+            while (found := self._grow(request, states, start, began)) is None:
                 yield None
-            with self._lock:
-                plan = self._follow(request, states, start, began)
+            plan = found
             if plan.poses.size:
                 break
         yield self._keep_or_switch(request, plan)
@@ -277,17 +276,20 @@ class PosePlanner:
         found: tuple[NDArray[np.int64], bool] | None = self._compared[2]
         return found
 
-    def _grow(self, request: PoseRequest, states: NDArray[np.int64], start: State) -> bool:
-        """Grow the field by a step; return whether it knows the start."""
+    def _grow(
+        self, request: PoseRequest, states: NDArray[np.int64], start: State, began: float
+    ) -> PosePlan | None:
+        """Grow the field by a step; return the path from the start if it is known then."""
         with self._lock:  # between two steps another request may use the field
-            return self._field(request, states).field.reach(start, request.bound, VISITS)
+            known = self._field(request, states)
+            bound = known.field.reach(start, request.bound, VISITS)
+            return None if bound is None else self._follow(known, request.grid, start, bound, began)
 
     def _follow(
-        self, request: PoseRequest, states: NDArray[np.int64], start: State, began: float
+        self, known: _Known, grid: GridMap, start: State, bound: float, began: float
     ) -> PosePlan:
-        """Return the path from a start that its field knows."""
-        known, grid, grown = self._field(request, states), request.grid, time.perf_counter()
-        found, field = known.field.rollout(start), known.field
+        """Return the path from a start that its field knows within a bound."""
+        grown, found = time.perf_counter(), known.field.rollout(start)
         if found is None:
             return PosePlan(PlanStatus.NO_PATH, field_ms=1e3 * (grown - began))
         numbers, costs = found
@@ -305,7 +307,7 @@ class PosePlanner:
             np.floor(np.column_stack([x, y]) + 0.5).astype(np.int32),
             np.append(0.0, np.cumsum(np.hypot(np.diff(x), np.diff(y)))),
             spent,
-            float(spent[-1]) / field.bound(field.number(start)),
+            float(spent[-1]) / bound,
         )
         rollout_ms = 1e3 * (time.perf_counter() - grown)
         plan = known.way.plan(0, grid)
