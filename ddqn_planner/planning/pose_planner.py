@@ -35,6 +35,9 @@ Pose: TypeAlias = tuple[float, float, float]  # metres, metres, radians; in the 
 VISITS = 2**16  # states that a field visits in one step of a plan: some 30 ms
 KEPT: Final = 3  # fields, those used last
 TWO_NEAREST = 0.5  # radians: no yaw is farther from the two headings nearest to it
+# So near to its path, a robot keeps it even if there is none from the state nearest to its pose:
+# a controller has driven it a little aside, where the body of that state has no room.
+BESIDE_PATH = 1.0, 2 * math.pi / HEADINGS
 ON_PATH = 0.5, math.pi / HEADINGS  # a start so near to a pose, in cells and radians, lies on it
 
 
@@ -135,7 +138,7 @@ class PosePlanner:
             world = self._world(grid)
         starts = self._at(grid, request.start, world)
         if not len(starts):
-            yield PosePlan(PlanStatus.START_OCCUPIED)
+            yield self._keep_or_switch(request, PosePlan(PlanStatus.START_OCCUPIED))
             return
         ((x, y, heading),) = starts.tolist()
         start = x, y, heading
@@ -161,14 +164,19 @@ class PosePlanner:
 
     def _keep_or_switch(self, request: PoseRequest, plan: PosePlan) -> PosePlan:
         """Return the rest of the path under way if it hardly costs more than a plan, or that."""
-        if not plan.poses.size or not len(request.under_way):
+        if not len(request.under_way):
             return plan
-        rest, grid = self.rest_of(request.under_way, request.start, request.grid), request.grid
-        if not any(_meets(rest[-1:], end, grid) for end in (plan.poses[-1], *request.goals)):
+        has_plan, grid = plan.poses.size > 0, request.grid
+        reach = REACH if has_plan else BESIDE_PATH
+        rest = self.rest_of(request.under_way, request.start, grid, reach)
+        if not any(_meets(rest[-1:], end, grid) for end in (*plan.poses[-1:], *request.goals)):
             return plan
         (driven, cost), (_, least) = (cost_of_poses(way, grid) for way in (rest, plan.poses))
-        if cost > (1 + request.switch_threshold) * least * SAME_COST:
+        if has_plan and cost > (1 + request.switch_threshold) * least * SAME_COST:
             return plan
+        if not has_plan:  # nothing is proved
+            cost *= grid.seconds_per_cell or 1.0
+            plan = PosePlan(PlanStatus.SUCCEEDED, cost=cost, bound=math.inf)
         cells = cells_of(in_cells(rest, grid))
         share = cost / least if least else 1.0
         return replace(
