@@ -130,7 +130,7 @@ def ways(motions: Motions) -> list[dict[Cell, float]]:
 
 
 def least_costs(
-    grid: GridMap, motions: Motions, swept: NDArray[np.bool_], goal: tuple[int, int, int]
+    grid: GridMap, motions: Motions, swept: NDArray[np.bool_], *goals: tuple[int, int, int]
 ) -> NDArray[np.float64]:
     """Return (H, W, 16): the least cost from every pose to a goal, in cells, by Dijkstra."""
     height, width = grid.occupancy.shape
@@ -155,8 +155,8 @@ def least_costs(
     before, after, cost = np.concatenate(edges).T
     size = grid.occupancy.size * 16
     graph = coo_matrix((cost, (after.astype(int), before.astype(int))), (size, size)).tocsr()
-    x, y, heading = goal
-    costs: NDArray[np.float64] = dijkstra(graph, indices=(y * width + x) * 16 + heading)
+    numbers = [(y * width + x) * 16 + heading for x, y, heading in goals]
+    costs: NDArray[np.float64] = dijkstra(graph, indices=numbers, min_only=True)
     return costs.reshape(height, width, 16)
 
 

@@ -321,6 +321,7 @@ class ExpectedTimes:
     ) -> None:
         self._node, self._report, self._worker, self._on_change = node, report, worker, on_change
         self._experience: Experience | None = None
+        self._layout: Any = None  # of the message that it came in
         self._spread_on: GridMap | None = None
         self._applied = (NO_MAP, NO_MAP)  # the last map, without times and with them
         # What the worker was asked last, and its answer.
@@ -336,8 +337,8 @@ class ExpectedTimes:
     async def on_sent(self, message: UInt8MultiArray | None = None) -> None:
         """Plan by what drives taught, or refuse the trainer's message, or the file that is set."""
         with self._report.taking("experience"):
-            await self._worker.call(self.load, message)
-            self._on_change()
+            if await self._worker.call(self.load, message):
+                self._on_change()
 
     def told(self, outcome: Outcome) -> dict[str, str]:
         """Return what `describe` returns, once the worker has computed it."""
@@ -349,16 +350,20 @@ class ExpectedTimes:
             self._report.change()  # to look again soon
         return self._forecast.result() or {}
 
-    def load(self, message: UInt8MultiArray | None = None) -> None:
-        """Use a message, or the file that is set, or none; errors change nothing."""
-        newer = None
+    def load(self, message: UInt8MultiArray | None = None) -> bool:
+        """Use a message, or the file that is set, or none; return whether it is another one."""
+        newer, layout = None, message.layout if message else None
         if message:
-            newer = Experience.from_bytes(bytes_of("experience", message))
+            data = bytes_of("experience", message)
+            if layout == self._layout:  # its digest is the same
+                return False
+            newer = Experience.from_bytes(data)
         elif file := self._node.value("experience"):
             newer = Experience.load(file)
         if newer is not None and self._experience is not None:
             newer.take_over(self._experience)
-        self._experience = newer
+        self._experience, self._layout = newer, layout
+        return True
 
     def apply(self, grid: GridMap) -> GridMap:
         """Return a map whose moves cost expected time, or the same map before a drive."""

@@ -164,9 +164,10 @@ class PlannerNode(ManagedNode):
 
     def _on_model(self, message: UInt8MultiArray) -> None:
         with self._report.taking("trainer/model"):
-            planner = Planner(*model_of(bytes_of("model", message)))
-            self._model.use(planner, "trainer/model")
-            self._plan_for(ActiveGoal(self._active.poses))
+            data = bytes_of("model", message)
+            if message.layout != self._model.layout:  # its digest says whether it is in use
+                self._model.use(Planner(*model_of(data)), "trainer/model", message.layout)
+                self._plan_for(ActiveGoal(self._active.poses))
 
     # Map, start and goal
 

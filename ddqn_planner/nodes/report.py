@@ -98,6 +98,8 @@ def reason_of(
     how = "by greedy steps"
     if isinstance(plan, PosePlan):
         how = f"by greedy steps, of at most {plan.bound:.3g} times the least cost"
+        if math.isinf(plan.bound):
+            how = "kept, as there is none from the cell and heading nearest to the start"
     elif plan.method is not PlanMethod.GREEDY:
         how = "searched for in the order of the Q field: the greedy steps were trapped"
     reason = f"a path of {plan.length:.2f} cells{number}, {how}"

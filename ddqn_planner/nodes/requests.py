@@ -159,6 +159,7 @@ class ModelSource:
     def __init__(self, node: BaseNode, report: Report, worker: Worker) -> None:
         self.planner: Planner | None = None
         self.file = ""
+        self.layout: Any = None  # of the message that the model came in
         self._node, self.report, self._worker = node, report, worker
         # The first model, while it is being loaded.
         self.loading: Future | None = None
@@ -191,9 +192,9 @@ class ModelSource:
         if loaded is not None and self.loading is loading:
             self.use(*loaded)
 
-    def use(self, planner: Planner, file: str) -> None:
+    def use(self, planner: Planner, file: str, layout: Any = None) -> None:
         """Plan with it from now on."""
-        self.planner, self.file, self.loading = planner, file, None
+        self.planner, self.file, self.layout, self.loading = planner, file, layout, None
         self.report.accept("model")
         self.report.change()
         self._node.get_logger().info(f"planning with the model {file}")

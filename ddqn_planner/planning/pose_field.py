@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import mmap
 from typing import Any
 
@@ -9,18 +10,18 @@ import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
 from ddqn_planner.grid import GridMap
-from ddqn_planner.grid.motions import HEADINGS
 from ddqn_planner.planning import pose_kernels as kernels
 from ddqn_planner.planning.pose_guide import Aim, spread
 from ddqn_planner.planning.pose_kernels import Known
-from ddqn_planner.planning.pose_world import TILE, Body, State, World
+from ddqn_planner.planning.pose_world import SHIFT, TILE, Body, State, World
 
 NO_RESERVE = getattr(mmap, "MAP_NORESERVE", 0x4000)  # not in all versions of Python
 HEAP = 2**14  # entries of a heap, at first
 TAKEN_BACK = 4  # of so many visited states a repair takes one back; else a new field is quicker
 UNGUIDED = 2**14  # states that are visited before a look at the map pays
+FINEST = 1  # the shift of the smallest tiles that it looks at
 FIRST = 1.2  # a first path is looked for as if with this bound, if a smaller one is asked for
-NOTHING = np.empty(0, np.float32)
+NOWHERE = Aim(0, 0, -1, np.empty(0, np.float32), SHIFT + 1, 0)
 GREEDY = 1.5  # the first round's weight is the bound to the power of this: mostly that will do
 FURTHER = 1.2  # times the way to the goal that the look at the map goes
 
@@ -45,49 +46,65 @@ class PoseField:
     # else the start's is. So the least cost of one of these, plus what is left from there at least,
     # is a lower bound, which proves how good the start's cost is.
 
-    def __init__(self, goals: tuple[State, ...], grid: GridMap, world: World, body: Body) -> None:
-        self.goals, self.body, self._aim = goals, body, Aim(0, 0, -1, NOTHING)
+    def __init__(self, goals: NDArray[np.int64], grid: GridMap, world: World, body: Body) -> None:
+        self.goals = goals  # (N, 3): x, y, heading
+        self.body, self._aim = body, NOWHERE
         self._begin(grid, world)
 
     def _begin(self, grid: GridMap, world: World) -> None:
         """Know nothing but the goals."""
         self.grid, self.world, goals = grid, world, self.goals
-        states = world.tile.size * TILE * TILE * HEADINGS
+        states = world.tile.size << kernels.TILE_BITS
         self.known = Known(_untouched(states, np.float32), _untouched(states, np.uint8))
         self._size, self._waiting, self._round = len(goals), 0, 0
         entries = max(HEAP, len(goals))
         self._keys, self._numbers = np.empty(entries, np.float32), np.empty(entries, np.int64)
-        self._numbers[: len(goals)] = [self.number(goal) for goal in goals]
+        x, y, heading = goals.T
+        self._numbers[: len(goals)] = kernels.number_of(x, y, heading, world.columns)
         self.known.mark[self._numbers[: len(goals)]] = kernels.OPEN
         self._weight, self.visits = 0.0, 0
 
     def number(self, state: State) -> int:
         """Return the number of a state inside the map."""
-        return int(kernels.number_of(*state, self.world.width))
+        return int(kernels.number_of(*state, self.world.columns))
 
-    def reach(self, start: State, bound: float, limit: int) -> bool:
-        """Grow until the cost from a start is known within a bound, or known not to exist."""
+    def reach(self, start: State, bound: float, limit: int) -> float | None:
+        """Grow until the cost from a start is known within a bound, or known not to exist.
+
+        Return the bound that is proved, or None if more states than the limit must be visited.
+        """
         number = self.number(start)
         if number != self._aim.number:
-            left = self._aim.left if start[:2] == self._aim[:2] else NOTHING
-            self._aim = Aim(*start[:2], number, left)
+            known = self._aim if start[:2] == self._aim[:2] else NOWHERE
+            self._aim = known._replace(x=start[0], y=start[1], number=number)
             self._weight, self._tried = max(bound, FIRST) ** GREEDY, 0
             self._order()
         while True:
-            most = limit if self._aim.left.size else min(limit, UNGUIDED - self._tried)
+            most = self._until_look(number)
+            most = limit if most < 0 else min(limit, most)
             visits, done = self._grow(most, 1 / bound)
             limit, self._tried = limit - visits, self._tried + visits
             if done:
-                if self.bound(number) <= bound * kernels.SAME or not len(self._open()):
-                    return True
+                proved = self._bound(number)
+                if proved <= bound * kernels.SAME or not len(self._open()):
+                    return proved
                 self._weight = 0.0
                 self._order()
             elif limit == 0:
-                return False
+                return None
             elif visits < most:
                 self._reserve(2 * len(self._keys))
             elif not self._can_leave(number) or not self._guide():
-                return True
+                return math.inf
+
+    def _until_look(self, number: int) -> int:
+        """Return how many states are visited before the next look at the map pays, or -1."""
+        shift, is_found = self._aim.shift, self.known.mark[number] != kernels.UNREACHED
+        # Tiles of half the size take 4 times as long, and show that narrower gaps are closed. Once
+        # a path is known, they hardly prove more.
+        if shift == FINEST or (shift == SHIFT and is_found):
+            return -1
+        return max((UNGUIDED << 3 * (SHIFT + 1 - shift)) - self._tried, 0)
 
     def _grow(self, limit: int, share: float) -> tuple[int, bool]:
         """Visit so many states, or fewer; return how many, and whether the round is over."""
@@ -108,8 +125,8 @@ class PoseField:
         self.visits += visits
         return visits, done
 
-    def bound(self, number: int) -> float:
-        """Return how many times the least cost that of the last aim may be."""
+    def _bound(self, number: int) -> float:
+        """Return how many times the least cost that of the aim may be."""
         if self.known.mark[number] == kernels.UNREACHED:
             return np.inf
         cost = float(self.known.distance[number])
@@ -123,17 +140,21 @@ class PoseField:
 
     def _guide(self) -> bool:
         """Look at the map for what is left to the start; return whether a way may exist."""
-        columns, rows = (self.world.width + 3) // TILE, (self.world.height + 3) // TILE
+        shift, world = self._aim.shift - 1, self.world
+        side = 1 << shift
+        columns, rows = -(-world.width // side), -(-world.height // side)
+        room = world.room if shift == SHIFT else np.zeros(columns * rows, np.uint8)
         left = np.empty((columns + 1) * (rows + 1), np.float32)
+        self._aim = self._aim._replace(left=left, shift=shift, columns=columns)
         most = 8 * left.size + 4  # each corner opens its neighbours once
         keys, numbers = np.empty(most, np.float32), np.empty(most, np.int64)
-        x, y, _ = np.array(self.goals).T // TILE
-        goals, box = np.unique(y * (columns + 1) + x), (x.min(), y.min(), x.max(), y.max())
-        towards = self._aim, goals, np.array(box), FURTHER
-        spread(left, keys, numbers, *towards, self.world, self.body)
-        self._aim = self._aim._replace(left=left)
-        self._order()
-        return bool(np.isfinite(left[goals]).any())
+        x, y, _ = self.goals.T >> shift
+        is_goal = np.zeros(left.size, np.bool_)
+        is_goal[y * (columns + 1) + x] = True
+        box = np.array([x.min(), y.min(), x.max(), y.max()])
+        spread(self._aim, room, keys, numbers, is_goal, box, FURTHER, world, self.body)
+        self._sort(self._size, kernels.OPEN)
+        return bool(np.isfinite(left[is_goal]).any())
 
     def _reserve(self, entries: int) -> None:
         """Make the heap so large; what waits stays at its end."""
@@ -148,14 +169,18 @@ class PoseField:
         """Begin a round: what is open or waits is ordered toward the start."""
         opened = self._open()
         self._numbers[: len(opened)] = opened
-        heap = self._keys, self._numbers, len(opened)
-        self._size = kernels.order(self.known, *heap, self._aim, self._weight, self.world)
+        self._sort(len(opened), kernels.WAITING)
         self._waiting, self._round = 0, self._round + 1
         if self._round == kernels.ROUNDS:
             for part in np.split(self.known.mark, range(2**20, self.known.mark.size, 2**20)):
                 if part.max() > kernels.CLOSED:  # so that memory is not used where nothing is
                     np.minimum(part, kernels.CLOSED, out=part)
             self._round = 1
+
+    def _sort(self, size: int, last: int) -> None:
+        """Make a heap of the first states whose marks are open to a last one."""
+        heap = self._keys, self._numbers, size
+        self._size = kernels.order(self.known, *heap, self._aim, self._weight, last, self.world)
 
     def _open(self) -> NDArray[np.int64]:
         """Return the states that may be open or waiting."""
@@ -176,9 +201,9 @@ class PoseField:
     def repair(self, grid: GridMap, world: World, cells: NDArray[np.int64], opens: bool) -> None:
         """Hold for a map that differs in some cells (N, 2); begin anew where that is quicker."""
         # `opens` tells whether a way may have got cheaper: what is left to the start, too.
-        self._aim = self._aim._replace(number=-1, left=NOTHING if opens else self._aim.left)
-        reach, columns = self.body.reach + TILE, (world.width + TILE - 1) // TILE
-        near = np.zeros((columns, (world.height + TILE - 1) // TILE), dtype=np.bool_)
+        self._aim = NOWHERE if opens else self._aim._replace(number=-1)
+        reach = self.body.reach + TILE
+        near = np.zeros((world.columns, world.rows), dtype=np.bool_)
         low, high = np.unique(np.maximum(cells - reach, 0) // TILE, axis=0), 2 * reach // TILE + 1
         for x, y in low:
             near[x : x + high, y : y + high] = True
@@ -191,7 +216,7 @@ class PoseField:
             return
         self.grid, self.world, found = grid, world, raised[:count]
         if opens:
-            states = np.arange(TILE * TILE * HEADINGS)
+            states = np.arange(1 << kernels.TILE_BITS)
             found = np.concatenate([found, (tiles[:, None] * len(states) + states).ravel()])
         self._reserve(max(self._size + self._waiting + len(found), len(self._keys)))
         heap = self._numbers, self._size

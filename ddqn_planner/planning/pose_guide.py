@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ddqn_planner.compiled import in_place, inlined
-from ddqn_planner.planning.pose_world import TILE, Body, World, is_possible, touches
+from ddqn_planner.planning.pose_world import Body, World, is_far, is_possible, touches
 
 
 class Aim(NamedTuple):
@@ -19,19 +19,22 @@ class Aim(NamedTuple):
     y: int
     number: int
     left: NDArray[np.float32]  # (corners,) in cells, row by row; empty for the straight way alone
+    shift: int  # those of tiles with 2**shift cells of a side
+    columns: int  # of such tiles
 
 
 @inlined
-def way_left(x: int, y: int, aim: Any, columns: int) -> float:
+def way_left(x: int, y: int, aim: Any) -> float:
     """Return what is left from a cell to the start at least, in cells."""
     best = math.sqrt((x - aim.x) * (x - aim.x) + (y - aim.y) * (y - aim.y))
     if aim.left.size > 0:
-        tile_x, tile_y = x >> 2, y >> 2
+        tile_x, tile_y = x >> aim.shift, y >> aim.shift
         for row in range(2):
             for column in range(2):
-                there = aim.left[(tile_y + row) * (columns + 1) + tile_x + column]
+                there = aim.left[(tile_y + row) * (aim.columns + 1) + tile_x + column]
                 if there > best:
-                    over, up = x + 0.5 - 4 * (tile_x + column), y + 0.5 - 4 * (tile_y + row)
+                    over = x + 0.5 - ((tile_x + column) << aim.shift)
+                    up = y + 0.5 - ((tile_y + row) << aim.shift)
                     there -= math.sqrt(over * over + up * up)
                     if there > best:
                         best = there
@@ -72,19 +75,20 @@ def sink(key: Any, number: int, place: int, keys: Any, numbers: Any, size: int) 
 
 
 @inlined
-def has_room(x: int, y: int, world: Any, body: Any) -> bool:
+def has_room(x: int, y: int, aim: Any, room: Any, world: Any, body: Any) -> bool:
     """Return whether the origin may pass a tile; looks once."""
-    tile = y * ((world.width + 3) >> 2) + x
-    if world.room[tile] == 0:
-        world.room[tile] = 2
-        for number in range(32):
+    tile, side = y * aim.columns + x, 1 << aim.shift
+    if room[tile] == 0:
+        room[tile] = 1 if is_far(x << aim.shift, y << aim.shift, world, body) else 2
+        for number in range(0 if room[tile] == 1 else 2 * side * side):
             # From the middle on: most tiles have room there.
-            column, line = 4 * x + ((number & 3) ^ 2), 4 * y + (((number >> 2) & 3) ^ 2)
+            column = (x << aim.shift) + ((number & (side - 1)) ^ (side >> 1))
+            line = (y << aim.shift) + (((number >> aim.shift) & (side - 1)) ^ (side >> 1))
             inside = column < world.width and line < world.height
-            if inside and may_pass(column, line, number >= 16, world, body):
-                world.room[tile] = 1
+            if inside and may_pass(column, line, number >= side * side, world, body):
+                room[tile] = 1
                 break
-    return bool(world.room[tile] == 1)
+    return bool(room[tile] == 1)
 
 
 @inlined
@@ -109,14 +113,16 @@ def may_pass(x: int, y: int, moves: bool, world: Any, body: Any) -> bool:
 
 
 @inlined
-def leads(x: int, y: int, step_x: int, step_y: int, world: Any, body: Any) -> bool:
+def leads(
+    x: int, y: int, step_x: int, step_y: int, aim: Any, room: Any, world: Any, body: Any
+) -> bool:
     """Return whether a step from a corner leads through a tile that has room, or along its side."""
-    columns, rows = (world.width + 3) >> 2, (world.height + 3) >> 2
+    rows = room.size // aim.columns
     for side in range(2):
         tile_x = x + (step_x - 1) // 2 if step_x != 0 else x - side
         tile_y = y + (step_y - 1) // 2 if step_y != 0 else y - side
-        inside = 0 <= tile_x < columns and 0 <= tile_y < rows
-        if inside and has_room(tile_x, tile_y, world, body):
+        inside = 0 <= tile_x < aim.columns and 0 <= tile_y < rows
+        if inside and has_room(tile_x, tile_y, aim, room, world, body):
             return True
     return False
 
@@ -139,23 +145,23 @@ def way_to_box(x: int, y: int, box: NDArray[np.int64]) -> Any:
 
 @in_place
 def spread(
-    left: NDArray[np.float32],
+    aim: Aim,
+    room: NDArray[np.uint8],
     keys: Any,
     numbers: Any,
-    aim: Aim,
-    goals: NDArray[np.int64],
+    is_goal: NDArray[np.bool_],
     box: NDArray[np.int64],
     further: float,
     world: World,
     body: Body,
 ) -> None:
-    """Write what is left from corners of tiles to a start, infinite where no way leads."""
+    """Write to an aim what is left from corners of tiles, infinite where no way leads."""
     # By A*, to the nearest goal and as much further: what is not on the way there is left out.
-    columns, rows = (world.width + 3) >> 2, (world.height + 3) >> 2
+    left, columns, rows = aim.left, aim.columns, room.size // aim.columns
     size, end, limit = 0, 0.0, np.inf
     left[:] = np.inf
     for corner in range(4):
-        x, y = (aim.x >> 2) + (corner & 1), (aim.y >> 2) + (corner >> 1)
+        x, y = (aim.x >> aim.shift) + (corner & 1), (aim.y >> aim.shift) + (corner >> 1)
         number = y * (columns + 1) + x
         left[number] = 0
         size = push(np.float32(way_to_box(x, y, box)), number, keys, numbers, size)
@@ -170,10 +176,8 @@ def spread(
         here, ahead = left[number], way_to_box(x, y, box)
         if key > here + ahead:
             continue
-        if ahead == 0 and limit == np.inf:
-            for goal in goals:
-                if number == goal:
-                    limit = further * here
+        if is_goal[number] and limit == np.inf:
+            limit = further * here
         for step_y in range(-1, 2):
             for step_x in range(-1, 2):
                 if step_x == 0 and step_y == 0:
@@ -183,7 +187,7 @@ def spread(
                     continue
                 after = after_y * (columns + 1) + after_x
                 cost = here + (STRAIGHT if step_x == 0 or step_y == 0 else DIAGONAL)
-                if cost < left[after] and leads(x, y, step_x, step_y, world, body):
+                if cost < left[after] and leads(x, y, step_x, step_y, aim, room, world, body):
                     left[after] = cost
                     key = np.float32(cost + way_to_box(after_x, after_y, box))
                     size = push(key, after, keys, numbers, size)
@@ -192,4 +196,4 @@ def spread(
         # What was not reached is no nearer than where it ended.
         least = end - way_to_box(number - y * (columns + 1), y, box) if size > 0 else np.inf
         value = left[number] if left[number] < least else least
-        left[number] = value * (TILE / STRAIGHT / LONGER) - math.sqrt(2.0) * TILE
+        left[number] = (value / (STRAIGHT * LONGER) - math.sqrt(2.0)) * (1 << aim.shift)

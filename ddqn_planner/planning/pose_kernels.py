@@ -8,11 +8,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ddqn_planner.compiled import in_place, inlined
+from ddqn_planner.grid.motions import HEADINGS
 from ddqn_planner.planning.pose_guide import Aim, push, sink, way_left
-from ddqn_planner.planning.pose_world import Body, World, cost_of, is_possible
+from ddqn_planner.planning.pose_world import SHIFT, TILE, Body, World, cost_of, is_possible, tile_of
 
 # A state is a cell and one of 16 headings. Its number counts headings, then the cells of a tile of
 # 4 x 4, then tiles: so what a request visits lies on few pages of memory, 4 bytes a distance.
+HEADING_BITS: Final = 4
+TILE_BITS: Final = HEADING_BITS + 2 * SHIFT
+
 # Marks. Before a state is reached, its distance has no meaning. One that got cheaper after it was
 # closed, or that is too far from the start, waits for the next round. From CLOSED on, a mark tells
 # the round in which it was closed.
@@ -28,38 +32,47 @@ class Known(NamedTuple):
 
 
 @inlined
-def number_of(x: int, y: int, heading: int, width: int) -> int:
+def number_of(x: int, y: int, heading: int, columns: int) -> int:
     """Return the number of a state."""
-    tile = (y >> 2) * ((width + 3) >> 2) + (x >> 2)
-    return (tile << 8) | ((y & 3) << 6) | ((x & 3) << 4) | heading
+    cell = (y & (TILE - 1)) << SHIFT | (x & (TILE - 1))
+    return tile_of(x, y, columns) << TILE_BITS | cell << HEADING_BITS | heading
 
 
 @inlined
-def place_of(number: int, width: int) -> tuple[int, int, int]:
+def place_of(number: int, columns: int) -> tuple[int, int, int]:
     """Return x, y and heading of a state."""
-    tile, columns = number >> 8, (width + 3) >> 2
+    tile, cell = number >> TILE_BITS, number >> HEADING_BITS
     row = tile // columns
-    x = ((tile - row * columns) << 2) | ((number >> 4) & 3)
-    return x, (row << 2) | ((number >> 6) & 3), number & 15
+    x = (tile - row * columns) << SHIFT | (cell & (TILE - 1))
+    y = row << SHIFT | (cell >> SHIFT & (TILE - 1))
+    return x, y, number & (HEADINGS - 1)
 
 
 @in_place
 def order(
-    known: Known, keys: Any, numbers: Any, size: int, aim: Aim, weight: float, world: World
+    known: Known,
+    keys: Any,
+    numbers: Any,
+    size: int,
+    aim: Aim,
+    weight: float,
+    last: int,
+    world: World,
 ) -> int:
-    """Order the open and waiting states toward a start, each once; return how many there are."""
+    """Order states toward a start, each once: open ones, and those with marks up to a last one."""
+    # Returns how many there are.
     kept = 0
     for place in range(size):
         number = numbers[place]
-        if OPEN <= known.mark[number] <= WAITING:
+        if OPEN <= known.mark[number] <= last:
             known.mark[number] = 255  # so that it is taken once
             numbers[kept] = number
             kept += 1
     for place in range(kept):
         number = numbers[place]
         known.mark[number] = OPEN
-        x, y, _ = place_of(number, world.width)
-        far = way_left(x, y, aim, (world.width + 3) >> 2)
+        x, y, _ = place_of(number, world.columns)
+        far = way_left(x, y, aim)
         keys[place] = known.distance[number] + weight * far
     for place in range((kept - 2) >> 2, -1, -1):
         sink(keys[place], numbers[place], place, keys, numbers, kept)
@@ -94,9 +107,8 @@ def grow(
     # next state is not below the start's distance. Those that wait lie at the end of the arrays.
     # Without a weight, no state can lead to a path of less than a share of the known one's cost.
     distance, mark = known.distance, known.mark
-    width, height = world.width, world.height
+    width, height, columns = world.width, world.height, world.columns
     target, most, visits = aim.number, keys.size - 2 * body.start.size, 0
-    columns = (width + 3) >> 2
     while size > 0:
         key = keys[0]
         if mark[target] != UNREACHED and key >= distance[target]:
@@ -109,10 +121,10 @@ def grow(
             sink(keys[size], numbers[size], 0, keys, numbers, size)
         if mark[number] != OPEN:
             continue
-        x, y, heading = place_of(number, width)
+        x, y, heading = place_of(number, columns)
         here = distance[number]
         enough = share * distance[target] if weight == 0 and mark[target] != UNREACHED else np.inf
-        if enough < np.inf and here + way_left(x, y, aim, columns) >= enough:
+        if enough < np.inf and here + way_left(x, y, aim) >= enough:
             waiting = let_wait(number, mark, numbers, waiting)
             continue
         mark[number] = closed
@@ -122,7 +134,7 @@ def grow(
             column, line = x - body.offset[primitive, 0], y - body.offset[primitive, 1]
             if column < 0 or line < 0 or column >= width or line >= height:
                 continue
-            before = number_of(column, line, body.start[primitive], width)
+            before = number_of(column, line, body.start[primitive], columns)
             if mark[before] != UNREACHED and here + body.cost[primitive] >= distance[before]:
                 continue
             if not is_possible(column, line, primitive, world, body):
@@ -131,7 +143,7 @@ def grow(
             if found == np.inf or (mark[before] != UNREACHED and found >= distance[before]):
                 continue
             distance[before] = found
-            far = way_left(column, line, aim, columns)
+            far = way_left(column, line, aim)
             if mark[before] == closed or found + far >= enough:
                 if not OPEN <= mark[before] <= WAITING:
                     waiting = let_wait(before, mark, numbers, waiting)
@@ -147,8 +159,8 @@ def least_order(known: Known, numbers: Any, aim: Aim, world: World) -> float:
     least = np.inf
     for number in numbers:
         if OPEN <= known.mark[number] <= WAITING and known.distance[number] < least:
-            x, y, _ = place_of(number, world.width)
-            far = way_left(x, y, aim, (world.width + 3) >> 2)
+            x, y, _ = place_of(number, world.columns)
+            far = way_left(x, y, aim)
             if known.distance[number] + far < least:
                 least = known.distance[number] + far
     return least
@@ -166,13 +178,13 @@ def follow(
     """Write the greedy primitives from a state to the goal, and their costs; return their count."""
     count = 0
     while known.distance[number] > 0 and count < primitives.size:
-        x, y, heading = place_of(number, world.width)
+        x, y, heading = place_of(number, world.columns)
         best, chosen, after, spent = np.float32(np.inf), 0, number, np.float32(0)
         for primitive in range(body.out[heading], body.out[heading + 1]):
             column, line = x + body.offset[primitive, 0], y + body.offset[primitive, 1]
             if column < 0 or line < 0 or column >= world.width or line >= world.height:
                 continue
-            next_one = number_of(column, line, body.end[primitive], world.width)
+            next_one = number_of(column, line, body.end[primitive], world.columns)
             if known.mark[next_one] == UNREACHED:
                 continue
             beyond = known.distance[next_one]
@@ -196,13 +208,13 @@ def leads_to(
     """Return to how many states primitives lead from one, at most so many as the queue holds."""
     queue[0], mark[number], read, count = number, OPEN, 0, 1
     while read < count:
-        x, y, heading = place_of(queue[read], world.width)
+        x, y, heading = place_of(queue[read], world.columns)
         read += 1
         for primitive in range(body.out[heading], body.out[heading + 1]):
             column, line = x + body.offset[primitive, 0], y + body.offset[primitive, 1]
             if column < 0 or line < 0 or column >= world.width or line >= world.height:
                 continue
-            after = number_of(column, line, body.end[primitive], world.width)
+            after = number_of(column, line, body.end[primitive], world.columns)
             if mark[after] == UNREACHED and is_possible(x, y, primitive, world, body):
                 if count == queue.size:
                     return count
@@ -217,13 +229,13 @@ def leads_to(
 @inlined
 def best_after(number: int, limit: Any, marked: int, known: Known, world: World, body: Body) -> Any:
     """Return the least cost by way of a state with such a mark, or more; infinite above a limit."""
-    x, y, heading = place_of(number, world.width)
+    x, y, heading = place_of(number, world.columns)
     best = np.float32(np.inf)
     for primitive in range(body.out[heading], body.out[heading + 1]):
         column, line = x + body.offset[primitive, 0], y + body.offset[primitive, 1]
         if column < 0 or line < 0 or column >= world.width or line >= world.height:
             continue
-        after = number_of(column, line, body.end[primitive], world.width)
+        after = number_of(column, line, body.end[primitive], world.columns)
         if known.mark[after] < marked:
             continue
         least = known.distance[after] + body.cost[primitive]
@@ -232,6 +244,8 @@ def best_after(number: int, limit: Any, marked: int, known: Known, world: World,
         found = known.distance[after] + cost_of(x, y, primitive, world, body)
         if found <= limit and found < best:
             best = found
+            if marked == OPEN:  # whether there is one is asked, not which is the best
+                break
     return best
 
 
@@ -250,7 +264,7 @@ def take_back(
     distance, mark = known.distance, known.mark
     size, count, most = 0, 0, keys.size - body.start.size
     for tile in tiles:
-        for number in range(tile << 8, (tile + 1) << 8):
+        for number in range(tile << TILE_BITS, (tile + 1) << TILE_BITS):
             if mark[number] == UNREACHED or distance[number] == 0:
                 continue
             if best_after(number, distance[number], OPEN, known, world, body) == np.inf:
@@ -272,13 +286,13 @@ def take_back(
         mark[number] = UNREACHED
         raised[count] = number
         count += 1
-        x, y, heading = place_of(number, world.width)
+        x, y, heading = place_of(number, world.columns)
         for place in range(body.into[heading], body.into[heading + 1]):
             primitive = body.ending[place]
             column, line = x - body.offset[primitive, 0], y - body.offset[primitive, 1]
             if column < 0 or line < 0 or column >= world.width or line >= world.height:
                 continue
-            before = number_of(column, line, body.start[primitive], world.width)
+            before = number_of(column, line, body.start[primitive], world.columns)
             if mark[before] != UNREACHED and distance[before] >= key + body.cost[primitive]:
                 size = push(distance[before], before, keys, numbers, size)
     return count

@@ -7,8 +7,7 @@ import threading
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
-from functools import partial
-from itertools import product
+from itertools import compress
 from typing import Any, Final, NamedTuple, TypeAlias
 
 import numpy as np
@@ -28,7 +27,7 @@ from ddqn_planner.planning.pose_paths import (
     points_of,
     rest_of_poses,
 )
-from ddqn_planner.planning.pose_world import State, World, body_of, differences, stands, world_of
+from ddqn_planner.planning.pose_world import State, World, body_of, differences, standing, world_of
 from ddqn_planner.planning.segments import SAME_COST
 
 Pose: TypeAlias = tuple[float, float, float]  # metres, metres, radians; in the map frame
@@ -36,6 +35,9 @@ Pose: TypeAlias = tuple[float, float, float]  # metres, metres, radians; in the 
 VISITS = 2**16  # states that a field visits in one step of a plan: some 30 ms
 KEPT: Final = 3  # fields, those used last
 TWO_NEAREST = 0.5  # radians: no yaw is farther from the two headings nearest to it
+# So near to its path, a robot keeps it even if there is none from the state nearest to its pose:
+# a controller has driven it a little aside, where the body of that state has no room.
+BESIDE_PATH = 1.0, 2 * math.pi / HEADINGS
 ON_PATH = 0.5, math.pi / HEADINGS  # a start so near to a pose, in cells and radians, lies on it
 
 
@@ -126,27 +128,30 @@ class PosePlanner:
             yield self._keep_or_switch(request, rest)
             return
         self._check(grid)
-        starts, *goals = ([*self._states(grid, p)] for p in (request.start, *request.goals))
-        goals = [near for near in goals if grid.contains(near[0][:2])]
-        if not goals or not grid.contains(starts[0][:2]):
-            outside = PlanStatus.GOAL_OUTSIDE_MAP if goals == [] else PlanStatus.START_OUTSIDE_MAP
+        is_start_inside, *inside = (grid.contains(cell) for cell in request.cells)
+        if not is_start_inside or not any(inside):
+            outside = PlanStatus.START_OUTSIDE_MAP if any(inside) else PlanStatus.GOAL_OUTSIDE_MAP
             yield PosePlan(outside)
             return
         yield None
         with self._lock:
-            has_room = partial(stands, world=self._world(grid), body=self.body)
-        start = next(filter(has_room, starts), None)
-        if start is None:
-            yield PosePlan(PlanStatus.START_OCCUPIED)
+            world = self._world(grid)
+        starts = self._at(grid, request.start, world)
+        if not len(starts):
+            yield self._keep_or_switch(request, PosePlan(PlanStatus.START_OCCUPIED))
             return
-        exact = [state for near in goals for state in [*filter(has_room, near)][:1]]
-        around = filter(has_room, self._around(request)) if any(request.tolerance) else ()
+        ((x, y, heading),) = starts.tolist()
+        start = x, y, heading
+        goals = compress(request.goals, inside)
+        exact = np.concatenate([self._at(grid, goal, world) for goal in goals])
         plan = PosePlan(PlanStatus.GOAL_OCCUPIED)
-        for states in filter(None, map(tuple, (exact, around))):
-            while not self._grow(request, states, start):
+        for may_move in (False, True) if any(request.tolerance) else (False,):
+            states = self._around(request, start, world) if may_move else exact
+            if not len(states):
+                continue
+            while (found := self._grow(request, states, start, began)) is None:
                 yield None
-            with self._lock:
-                plan = self._follow(request, states, start, began)
+            plan = found
             if plan.poses.size:
                 break
         yield self._keep_or_switch(request, plan)
@@ -159,14 +164,19 @@ class PosePlanner:
 
     def _keep_or_switch(self, request: PoseRequest, plan: PosePlan) -> PosePlan:
         """Return the rest of the path under way if it hardly costs more than a plan, or that."""
-        if not plan.poses.size or not len(request.under_way):
+        if not len(request.under_way):
             return plan
-        rest, grid = self.rest_of(request.under_way, request.start, request.grid), request.grid
-        if not any(_meets(rest[-1:], end, grid) for end in (plan.poses[-1], *request.goals)):
+        has_plan, grid = plan.poses.size > 0, request.grid
+        reach = REACH if has_plan else BESIDE_PATH
+        rest = self.rest_of(request.under_way, request.start, grid, reach)
+        if not any(_meets(rest[-1:], end, grid) for end in (*plan.poses[-1:], *request.goals)):
             return plan
         (driven, cost), (_, least) = (cost_of_poses(way, grid) for way in (rest, plan.poses))
-        if cost > (1 + request.switch_threshold) * least * SAME_COST:
+        if has_plan and cost > (1 + request.switch_threshold) * least * SAME_COST:
             return plan
+        if not has_plan:  # nothing is proved
+            cost *= grid.seconds_per_cell or 1.0
+            plan = PosePlan(PlanStatus.SUCCEEDED, cost=cost, bound=math.inf)
         cells = cells_of(in_cells(rest, grid))
         share = cost / least if least else 1.0
         return replace(
@@ -188,25 +198,35 @@ class PosePlanner:
             remedy = f"give a map of {known:g} m, or run ddqn-planner train-robot with --resolution"
             raise ValueError(f"{problem}; {remedy} {given:g}")
 
-    def _states(self, grid: GridMap, pose: Pose) -> Iterator[State]:
-        """Yield the states at a pose, in the cell where it lies: of its two nearest headings."""
+    def _at(self, grid: GridMap, pose: Pose, world: World) -> NDArray[np.int64]:
+        """Return the state (1, 3) of a pose, of the nearer of two headings with room, or none."""
         apart = np.abs(turn_between(self.motions.angles, pose[2] - grid.origin[2]))
-        for heading in np.argsort(apart, kind="stable")[:2].tolist():
-            yield *grid.world_to_cell(*pose[:2]), heading
+        cell = grid.world_to_cell(*pose[:2])
+        states = np.array([(*cell, heading) for heading in np.argsort(apart, kind="stable")[:2]])
+        return states[: min(standing(states, world, self.body), 1)]
 
-    def _around(self, request: PoseRequest) -> Iterator[State]:
-        """Yield the states within the tolerance of a goal."""
-        grid, (metres, radians) = request.grid, request.tolerance
-        for x, y, yaw in request.goals:
-            column, line = grid.world_to_cell(x, y)
-            turn = np.abs(turn_between(self.motions.angles, yaw - grid.origin[2]))
-            headings = np.flatnonzero(turn <= max(radians * ROUNDING, turn.min())).tolist()
-            far = math.floor(metres * ROUNDING / grid.resolution)
-            places = (column, grid.width), (line, grid.height)
-            on_map = (range(max(at - far, 0), min(at + far + 1, size)) for at, size in places)
-            for cell in product(*on_map):
-                if math.dist(cell, (column, line)) <= far:
-                    yield from ((*cell, heading) for heading in headings)
+    def _around(self, request: PoseRequest, start: State, world: World) -> NDArray[np.int64]:
+        """Return the states (N, 3) within the tolerance of the goal at which a path may end."""
+        grid, (metres, radians), (x, y, yaw) = request.grid, request.tolerance, request.goals[0]
+        column, line = grid.world_to_cell(x, y)
+        turn = np.abs(turn_between(self.motions.angles, yaw - grid.origin[2]))
+        is_meant = turn <= max(radians * ROUNDING, turn.min())
+        far = metres * ROUNDING / grid.resolution
+        if is_meant[start[2]] and math.dist(start[:2], (column, line)) <= far:
+            return np.array([start])
+        columns, rows = np.arange(grid.width) - column, np.arange(grid.height) - line
+        columns, rows = columns[abs(columns) <= far], rows[abs(rows) <= far]
+        apart, found = np.hypot(columns, rows[:, None]), []
+        for heading in np.flatnonzero(is_meant):
+            into = self.motions.end == heading
+            is_end = apart <= far
+            if is_meant[self.motions.start[into]].all():
+                # A path ends where it first may: it comes to what is further inside from such.
+                is_end &= apart > far - np.hypot(*self.motions.offset[into].T).max()
+            row, place = np.nonzero(is_end)
+            found.append(np.column_stack([columns[place], rows[row], np.full(len(row), heading)]))
+        states: NDArray[np.int64] = np.concatenate(found) + np.array([column, line, 0])
+        return states[: standing(states, world, self.body)]
 
     def _rest_of_path(self, request: PoseRequest) -> PosePlan | None:
         """Return the rest of the path that was planned last, if the start lies on it."""
@@ -239,11 +259,11 @@ class PosePlanner:
         self._worlds = [(grid, world)]
         return world
 
-    def _field(self, request: PoseRequest, states: tuple[State, ...]) -> _Known:
+    def _field(self, request: PoseRequest, states: NDArray[np.int64]) -> _Known:
         """Return a field toward some states: as it is, repaired, or new."""
         grid, asked, known = request.grid, _asked(request), None
         for one in self._known:
-            if one.asked == asked and one.field.goals == states:
+            if one.asked == asked and np.array_equal(one.field.goals, states):
                 known = one
         if known is not None and known.field.grid is not grid:
             self._known.remove(known)
@@ -264,17 +284,20 @@ class PosePlanner:
         found: tuple[NDArray[np.int64], bool] | None = self._compared[2]
         return found
 
-    def _grow(self, request: PoseRequest, states: tuple[State, ...], start: State) -> bool:
-        """Grow the field by a step; return whether it knows the start."""
+    def _grow(
+        self, request: PoseRequest, states: NDArray[np.int64], start: State, began: float
+    ) -> PosePlan | None:
+        """Grow the field by a step; return the path from the start if it is known then."""
         with self._lock:  # between two steps another request may use the field
-            return self._field(request, states).field.reach(start, request.bound, VISITS)
+            known = self._field(request, states)
+            bound = known.field.reach(start, request.bound, VISITS)
+            return None if bound is None else self._follow(known, request.grid, start, bound, began)
 
     def _follow(
-        self, request: PoseRequest, states: tuple[State, ...], start: State, began: float
+        self, known: _Known, grid: GridMap, start: State, bound: float, began: float
     ) -> PosePlan:
-        """Return the path from a start that its field knows."""
-        known, grid, grown = self._field(request, states), request.grid, time.perf_counter()
-        found, field = known.field.rollout(start), known.field
+        """Return the path from a start that its field knows within a bound."""
+        grown, found = time.perf_counter(), known.field.rollout(start)
         if found is None:
             return PosePlan(PlanStatus.NO_PATH, field_ms=1e3 * (grown - began))
         numbers, costs = found
@@ -292,7 +315,7 @@ class PosePlanner:
             np.floor(np.column_stack([x, y]) + 0.5).astype(np.int32),
             np.append(0.0, np.cumsum(np.hypot(np.diff(x), np.diff(y)))),
             spent,
-            float(spent[-1]) / field.bound(field.number(start)),
+            float(spent[-1]) / bound,
         )
         rollout_ms = 1e3 * (time.perf_counter() - grown)
         plan = known.way.plan(0, grid)

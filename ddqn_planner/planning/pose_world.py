@@ -7,7 +7,7 @@ from typing import Any, Final, NamedTuple, TypeAlias
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
-from ddqn_planner.compiled import inlined
+from ddqn_planner.compiled import in_place, inlined
 from ddqn_planner.grid import MOVES, GridMap
 from ddqn_planner.grid.arguments import OCCUPIED
 from ddqn_planner.grid.copies import few_of
@@ -15,7 +15,8 @@ from ddqn_planner.grid.footprint import rows_of
 from ddqn_planner.grid.grid_map import MULTIPLIERS
 from ddqn_planner.grid.motions import HEADINGS, Motions, closer
 
-TILE: Final = 4  # cells of a side
+SHIFT: Final = 2  # so many bits tell where in its tile a cell lies, along a side
+TILE: Final = 1 << SHIFT  # cells of a side
 BORDER: Final = 128  # occupied cells around the map, so that a body sweeps none beyond the bits
 State: TypeAlias = tuple[int, int, int]  # x, y, heading
 CHANGED_SHARE = 1 / 50  # of the map's cells: if more changed, fields begin anew
@@ -56,6 +57,8 @@ class World(NamedTuple):
     room: NDArray[np.uint8]  # (T,): whether the body may pass one of its cells, likewise
     height: int
     width: int
+    rows: int  # of tiles
+    columns: int
 
 
 def body_of(motions: Motions, swept: NDArray[np.bool_]) -> Body:
@@ -131,7 +134,7 @@ def world_of(
     words = (width + 2 * BORDER + 63) // 64 + 1
     bits = np.full((height + 2 * BORDER, words), -1, np.int64) if older is None else older.bits
     bits = bits.view(np.uint64).copy()
-    looks = np.zeros((2, (height + TILE - 1) // TILE, (width + TILE - 1) // TILE), dtype=np.uint8)
+    looks = np.zeros((2, -(-height // TILE), -(-width // TILE)), dtype=np.uint8)
     (left, bottom), (right, top) = (0, 0), (width, height)
     if older is not None and cells is not None:
         (left, bottom), (right, top) = cells.min(axis=0), cells.max(axis=0) + 1
@@ -156,6 +159,7 @@ def world_of(
         room,
         height,
         width,
+        *looks.shape[1:],
     )
 
 
@@ -203,19 +207,19 @@ def touches(bits: Any, x: int, y: int, row: Any, first: int, last: int) -> bool:
     return False
 
 
-def stands(state: State, world: World, body: Body) -> bool:
-    """Return whether the body has room at a state inside the map."""
-    x, y, heading = state
-    row = len(body.start) + heading
-    return not touches(world.bits, x, y, body.row, body.first[row], body.first[row + 1])
+@inlined
+def tile_of(x: int, y: int, columns: int) -> int:
+    """Return the number of the tile in which a cell lies."""
+    return (y >> SHIFT) * columns + (x >> SHIFT)
 
 
 @inlined
 def is_far(x: int, y: int, world: Any, body: Any) -> bool:
     """Return whether no occupied cell is within reach of a tile; looks at most once."""
-    tile = (y >> 2) * ((world.width + 3) >> 2) + (x >> 2)
+    tile = tile_of(x, y, world.columns)
     if world.tile[tile] == 0:
-        left, bottom, wide = (x & -4) - body.reach, (y & -4) - body.reach, TILE + 2 * body.reach
+        left, bottom = (x & -TILE) - body.reach, (y & -TILE) - body.reach
+        wide = TILE + 2 * body.reach
         found = 1
         first = np.uint64(left + BORDER)
         last = np.uint64(left + wide - 1 + BORDER)
@@ -267,3 +271,17 @@ def is_possible(x: int, y: int, number: int, world: Any, body: Any) -> bool:
     """Return whether the body can take a primitive from a cell."""
     first, last = body.first[number], body.first[number + 1]
     return is_far(x, y, world, body) or not touches(world.bits, x, y, body.row, first, last)
+
+
+@in_place
+def standing(states: NDArray[np.int64], world: World, body: Body) -> int:
+    """Move the states (N, 3) at which the body has room to the front; return how many."""
+    count = 0
+    for place in range(len(states)):
+        x, y, heading = states[place, 0], states[place, 1], states[place, 2]
+        row = body.start.size + heading
+        first, last = body.first[row], body.first[row + 1]
+        if is_far(x, y, world, body) or not touches(world.bits, x, y, body.row, first, last):
+            states[count, 0], states[count, 1], states[count, 2] = x, y, heading
+            count += 1
+    return count

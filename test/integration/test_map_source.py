@@ -458,6 +458,8 @@ def test_drives_are_planned_with_at_once(
     source.heard.clear()
     finished(source.times.on_sent(driven))
     assert source.heard == [False]
+    finished(source.times.on_sent(driven))  # the same again is no news
+    assert source.heard == [False]
     free, closed = np.zeros((2, 40, 120), np.int8)
     closed[19:22, 60:63] = 100
     for values in (free, closed, free):

@@ -143,7 +143,13 @@ def test_follows_the_trainer(robot: Robot, whole_model: FilePath, tmp_path: File
         robot.clear()
         robot.client.publish("trainer/model", bad, LATCHED)
         robot.wait_for_reason(f"trainer/model refused: .*{reason}", its)
-    robot.set(model=str(whole_model))
+    # Of the same model again nothing is told but that it is right.
+    robot.node.forget_log()
+    robot.clear()
+    robot.client.publish("trainer/model", sent, LATCHED)
+    robot.diagnostics.wait(lambda array: "refused" not in array.status[0].message)
+    assert "planning with the model" not in robot.node.log
+    robot.set(model=str(whole_model))  # but it is taken again after another one
     robot.clear()
     robot.client.publish("trainer/model", sent, LATCHED)
     robot.wait_for_reason("greedy steps do not find it", its)

@@ -1,0 +1,76 @@
+"""The path that a body follows, where the robot's own cell and heading have none."""
+
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+from networks import robot_model
+
+from ddqn_planner import GridMap, Planner
+from ddqn_planner.planning import PlanStatus
+from ddqn_planner.planning.planner import last_step
+from ddqn_planner.planning.pose_planner import PoseRequest
+
+CELL = 0.1
+START, GOAL = (0.55, 1.05, 0.0), (3.45, 1.05, 0.0)  # in a corridor as wide as the body is at most
+
+
+@pytest.fixture(scope="module")
+def planner(tmp_path_factory: pytest.TempPathFactory) -> Planner:
+    file = tmp_path_factory.mktemp("robot") / "robot.safetensors"
+    robot_model(file, "differential", CELL)
+    return Planner.load(file)
+
+
+def plan(planner: Planner, grid: GridMap, start: Any, **how: Any) -> Any:
+    return last_step(planner.pose_steps(PoseRequest(grid, tuple(start), (GOAL,), **how)))
+
+
+@pytest.fixture
+def corridor() -> GridMap:
+    occupancy = np.ones((20, 40), np.bool_)
+    occupancy[8:13] = False
+    return GridMap(occupancy, CELL)
+
+
+@pytest.mark.parametrize("seconds_per_cell", [None, 0.2])
+def test_a_robot_a_little_beside_its_path_keeps_it(
+    planner: Planner, corridor: GridMap, seconds_per_cell: float | None
+) -> None:
+    grid = corridor.with_layers(seconds_per_cell=seconds_per_cell)
+    path = plan(planner, grid, START, bound=1.0)
+    aside, under_way = path.poses[20] + (0, 0.06, 0.1), {"under_way": path.poses}
+    assert plan(planner, grid, aside).status is PlanStatus.START_OCCUPIED
+    kept = plan(planner, grid, aside, **under_way)
+    assert kept.status is PlanStatus.SUCCEEDED
+    assert np.array_equal(kept.poses, path.poses[20:])
+    assert kept.cost == pytest.approx(path.cost * kept.driven / path.driven)
+    assert (kept.extra_cost, kept.bound) == (0.0, math.inf)
+    for farther in ((0, 0.11, 0), (0, 0.06, 0.5)):
+        start = path.poses[20] + farther
+        assert plan(planner, grid, start, **under_way).status is PlanStatus.START_OCCUPIED
+
+
+def test_it_keeps_no_path_that_is_blocked_or_leads_elsewhere(
+    planner: Planner, corridor: GridMap
+) -> None:
+    poses = plan(planner, corridor, START, bound=1.0).poses
+    aside = poses[20] + (0, 0.06, 0)
+    box = corridor.with_patch(np.ones((1, 1), np.bool_), 30, 10)
+    assert plan(planner, box, aside, under_way=poses).status is PlanStatus.START_OCCUPIED
+    elsewhere = plan(planner, corridor, aside, under_way=poses[:-10])
+    assert elsewhere.status is PlanStatus.START_OCCUPIED
+
+
+def test_a_robot_that_cannot_leave_its_own_cell_keeps_its_path(
+    planner: Planner, corridor: GridMap
+) -> None:
+    path = plan(planner, corridor, START, bound=1.0)
+    column, line = corridor.world_to_cell(*path.poses[20, :2])
+    occupancy = corridor.occupancy.copy()
+    occupancy[line + 3, column - 2 : column + 4] = False  # a niche beside the corridor
+    grid, aside = corridor.with_layers(occupancy=occupancy), path.poses[20] + (0, 0.06, 0)
+    assert plan(planner, grid, aside).status is PlanStatus.NO_PATH
+    kept = plan(planner, grid, aside, under_way=path.poses)
+    assert np.array_equal(kept.poses, path.poses[20:])
