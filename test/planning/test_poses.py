@@ -83,6 +83,7 @@ def test_plans_cost_the_least_within_their_bound_also_after_repairs(
     goal, *starts = ((x, y, int(heading)) for x, y, heading in states)
     body = planner(motion)
     with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(pose_field, "NEAR", math.inf)  # all that is known of a small map is near
         if guided:
             patch.setattr(pose_field, "UNGUIDED", 16)
         for _ in range(3):
@@ -186,6 +187,7 @@ def test_what_was_far_from_obstacles_is_looked_at_again_when_one_comes(
     unguided: int, monkeypatch: Any
 ) -> None:
     monkeypatch.setattr(pose_field, "UNGUIDED", unguided)
+    monkeypatch.setattr(pose_field, "NEAR", math.inf)
     motions, _ = robot("differential")
     occupancy = np.zeros((160, 260), np.bool_)
     occupancy[[50, 90], 60:160] = True  # a lane, which a block closes on its left
@@ -202,6 +204,23 @@ def test_what_was_far_from_obstacles_is_looked_at_again_when_one_comes(
         costs.append(found.cost or 0)
     assert costs[3] == pytest.approx(costs[0], rel=1e-5)
     assert costs[2] > costs[0] + 1
+
+
+@pytest.mark.parametrize("motion", sorted(BODIES))
+def test_a_box_on_the_path_is_driven_around_at_the_least_cost(motion: str) -> None:
+    motions, _ = robot(motion)
+    grid, random = GridMap(np.zeros((70, 140), np.bool_), CELL), np.random.default_rng(3)
+    start, goal = (pose_of(grid, motions, state) for state in ((15, 20, 0), (125, 50, 0)))
+    body = planner(motion)
+    way = plan(body, grid, start, goal, bound=1.0)
+    for ahead in random.integers(30, 80, 3):
+        known = body._known[-1].field.visits
+        x, y = grid.world_to_cell(*way.poses[ahead, :2])
+        grid = grid.with_patch(np.ones((3, 3), np.bool_), x - 1, y - 1)
+        way = plan(body, grid, start, goal, bound=1.0)
+        assert body._known[-1].field.visits >= known  # it is repaired, not begun anew
+        fresh = plan(planner(motion), grid, start, goal, bound=1.0)
+        assert way.cost == pytest.approx(fresh.cost, rel=1e-5)
 
 
 def placed(body: shapely.Polygon, pose: NDArray[np.float64]) -> shapely.Polygon:
