@@ -48,6 +48,8 @@ FADING_STEPS = 4  # so often per half-life all evidence fades: few changes of a 
 SHORTEST = 8  # a drive through fewer places says little about how sure expected times are
 KEPT, ASSUMED = 64, 8  # drives whose errors count, and drives assumed before, with normal errors
 NORMAL = 1.645  # 90 % of a normal distribution lie within so many standard deviations
+BOLDEST = 6  # times the share of exploration, to which places count as faster that are unknown
+WARY = 0.99  # a way through the unknown counts less with each drive
 TAIL = 0.04  # share of errors beyond each bound: not 5 %, as successive drives are alike
 CORRELATED = 10.0  # so many places in a row have their error in common
 
@@ -55,7 +57,7 @@ CORRELATED = 10.0  # so many places in a row have their error in common
 # it before, and where it was visited first.
 COLUMNS = "weight", "log", "foretold", "x", "y"
 WAIT_COLUMNS = "seconds", "passages", "x", "y"
-IN_FILES = "evidence", "waits", "driven", "noise", "errors"  # what they keep
+IN_FILES = "evidence", "waits", "driven", "noise", "errors", "unknown"  # what they keep
 
 
 class Visits(NamedTuple):
@@ -86,6 +88,7 @@ class Evidence:
         self.waits = np.zeros((0, len(WAIT_COLUMNS)))
         self.noise_sums = NOISY_VISITS * NOISE, NOISY_VISITS
         self.errors: list[float] = []  # of the last drives' log times, in standard deviations
+        self.unknown = 1.0  # the greatest share of a drive's way, the last ones before older ones
         self.posterior: Posterior | None = None  # over the last map
         self._fit()
 
@@ -238,6 +241,16 @@ class Evidence:
         seconds = visits.seconds[free].sum() + waits[:, 2].sum()
         error = math.log(seconds / expected.sum()) / deviation
         self.errors = [*self.errors, error][-KEPT:]
+        unknown = float(expected @ posterior.unknown[places] / expected.sum())
+        self.unknown = max(unknown, WARY * self.unknown)
+
+    @property
+    def boldness(self) -> int:
+        """By how many times the share of exploration unknown places may count as faster.
+
+        The last drives were then not expected to take longer than the best ones by more than it.
+        """
+        return max(1, int(1 / max(self.unknown, 1 / BOLDEST)))
 
     def deviation(
         self, seconds: Float64, metres: Float64, posterior: Posterior, places: NDArray[np.int64]
@@ -247,7 +260,7 @@ class Evidence:
         share, known = seconds / seconds.sum(), posterior.known[places]
         of_visits = self.noise * (share**2 * np.maximum(self.side / metres, 1)).sum()
         of_all = self.trust_variance[0, 0] * float(share @ (1 - known)) ** 2 + DRIVE_NOISE**2
-        errors = share * np.sqrt(posterior.variance[places])
+        errors = share * math.sqrt(posterior.common[1]) * posterior.unknown[places]
         alike = np.maximum(CORRELATED * self.side / metres, 1)
         of_places = min(float((errors**2 * alike).sum()), float(errors.sum()) ** 2)
         return math.sqrt(of_places + of_visits + of_all)
@@ -285,6 +298,7 @@ class Evidence:
             self.waits[self._wait_at(x, y), :2] += seconds, passages
         self.noise_sums = tuple(np.add(self.noise_sums, other.noise_sums).tolist())
         self.errors = [*self.errors, *other.errors][-KEPT:]
+        self.unknown = max(self.unknown, other.unknown)
         self.driven += other.driven
         self.use_prior(other.prior if self.prior is None else self.prior)
 
@@ -297,7 +311,7 @@ class Evidence:
 
     def arrays(self) -> dict[str, Any]:
         """Return what a file keeps."""
-        kept = self.table, self.waits, self.driven, self.noise_sums, self.errors
+        kept = self.table, self.waits, self.driven, self.noise_sums, self.errors, self.unknown
         return dict(zip(IN_FILES, kept, strict=True))
 
     def restore(self, arrays: Mapping[str, NDArray[Any]]) -> None:
@@ -305,7 +319,7 @@ class Evidence:
         given = [arrays[name].astype(np.float64) for name in IN_FILES]
         if not all(np.isfinite(array).all() for array in given):
             raise ValueError("it holds what is no finite number")
-        table, waits, driven, noise, errors = given
+        table, waits, driven, noise, errors, unknown = given
         places = {at: row for row, at in enumerate(self._squares(table[:, 3:5]))}
         total, visits = noise.tolist()
         shapes = table.shape, waits.shape, errors.shape
@@ -315,5 +329,6 @@ class Evidence:
         if least < 0 or visits <= 0 or np.abs(table[:, 3:5]).max(initial=0) > FARTHEST:
             raise ValueError("its evidence cannot be true")
         self.places, self.table, self.waits = places, table, waits
-        self.driven, self.noise_sums, self.errors = float(driven), (total, visits), errors.tolist()
+        self.driven, self.unknown = float(driven), float(unknown)
+        self.noise_sums, self.errors = (total, visits), errors.tolist()
         self._fit()

@@ -37,6 +37,7 @@ WINDOW = 0.25  # metres at nominal speed, in whose time poses are averaged
 STAND_DISTANCE = 0.1  # metres within which a robot stands
 STAND = 1.5  # metres at nominal speed: a robot that drives needs less time to leave a place
 FAST_STEP = 0.1  # of the log speed, by which the fastest move that a map knows of becomes faster
+MOST_SHARES = 2  # times the share of exploration: no place counts as faster by more
 CORRECTION = 0.25  # metres by which a localisation may move a pose at once: the drive goes on
 RELOCATION = 1.0  # a jump by this many metres more puts the robot at a place not believed
 MEMORY = 60.0  # seconds over which a robot whose pose is not believed counts as driving on
@@ -210,16 +211,18 @@ class Experience:
         grid : GridMap
             The map.
         exploration : float
-            0 or more. Places count as faster the less of them is known, at most by this share. So
-            plans lead where it may be faster, but no plan is expected to take longer than the best
-            one by more than this share.
+            0 or more. Places count as faster the less of them is known, so plans lead where it may
+            be faster. No plan is expected to take longer than the best one by more than this share,
+            or hardly one by more, and none by twice, while drives know nearly all of their ways.
         """
         limits = 0.0, 10.0, "0 to 10"
         exploration = as_number("exploration", exploration, *limits)
-        evidence = self.evidence
+        evidence, share = self.evidence, math.log(1 + exploration)
+        posterior, boldness = evidence.over(grid), evidence.boldness
         fastest = FAST_STEP * min(0, math.floor(evidence.fastest / FAST_STEP + 0.5))
-        fastest -= math.log(1 + exploration)
-        slowness = evidence.over(grid).paint(exploration, fastest)
+        fastest -= share * min(boldness, MOST_SHARES)
+        hope = share * np.minimum(boldness * posterior.unknown, MOST_SHARES)
+        slowness = posterior.paint(hope, fastest)
         seconds_per_cell = grid.resolution / self.nominal_speed * math.exp(fastest)
         return grid.with_layers(slowness=slowness, seconds_per_cell=seconds_per_cell)
 
@@ -231,7 +234,7 @@ class Experience:
     def uncertainty(self, grid: GridMap) -> Float32:
         """Return (H, W) float32: the standard deviation of the log slowness, most if unknown."""
         posterior = self.evidence.over(grid)
-        return posterior.over(np.sqrt(posterior.variance), math.sqrt(posterior.common[1]))
+        return math.sqrt(posterior.common[1]) * posterior.over(posterior.unknown, 1.0)
 
     def expected_time(self, grid: GridMap, cells: Cells) -> ExpectedTime:
         """Return the time that a path takes, with an interval of 90 %.
@@ -321,6 +324,7 @@ class Experience:
                 age = (arrays["driven"] - table[:, 5:]) / experience.half_life
                 faded = table[:, :2] * 0.5**age
                 arrays["evidence"] = np.hstack([faded, 0 * table[:, 2:3], table[:, 3:5]])
+            arrays.setdefault("unknown", np.ones(()))  # not in older files
             experience.evidence.restore(arrays)
             prior = {n.removeprefix(PRIOR): a for n, a in arrays.items() if n.startswith(PRIOR)}
             experience.evidence.prior = Prior.from_arrays(prior) if prior else None

@@ -54,7 +54,7 @@ class Posterior:
         self.expected, self.waits = np.zeros(count), np.zeros(count)
         # Noise, variance, what the prior is worth (two), surplus of the mean.
         self.common = (0.0,) * 5
-        self.painted: tuple[float, float, NDArray[np.float32]] | None = None
+        self.painted: tuple[float, NDArray[np.float32]] | None = None
         self.steps = np.zeros(0)
 
     @cached_property
@@ -75,9 +75,9 @@ class Posterior:
         return np.clip(self.solution.imag, 0, 1)
 
     @property
-    def variance(self) -> Float64:
-        """The variance of each place's log slowness."""
-        return self.common[1] * (1 - self.known)
+    def unknown(self) -> Float64:
+        """The share of the standard deviation of each place's log slowness that is left."""
+        return np.sqrt(1 - self.known)
 
     @property
     def slowness(self) -> Float64:
@@ -151,27 +151,26 @@ class Posterior:
         # Robots wait where nobody drove, too; but one place of waits says nothing of others.
         self.waits += (sum(of_each) - max(of_each)) / (FEW_PLACES + known.sum()) * (1 - known)
 
-    def paint(self, exploration: float, fastest: float) -> NDArray[np.float32]:
+    def paint(self, hope: Float64, fastest: float) -> NDArray[np.float32]:
         """Return (H, W) float32: the slowness over that of the fastest place, which has this log.
 
-        A place that is not known counts as faster, at most by the share `exploration`.
+        Each place counts as faster by its hope (P,), a logarithm, too.
         """
-        hope = math.log(1 + exploration) * np.sqrt(1 - self.known)
         log = np.log(self.slowness) - hope - fastest
         steps = np.rint(np.clip(log, 0, math.log(MAX_SLOWNESS)) / math.log(1 + STEP))
-        if self.painted is None or self.painted[:2] != (exploration, fastest):
+        if self.painted is None or self.painted[0] != fastest:
             box: tuple[slice, ...] = (slice(None), slice(None))
             slowness = np.ones(self.place.shape, dtype=np.float32)
         else:
             x, y = self.middle[steps != self.steps].T
             if not len(x):
-                return self.painted[2]
+                return self.painted[1]
             box = tuple(slice(max(v.min() - self.size, 0), v.max() + self.size + 1) for v in (y, x))
-            slowness = self.painted[2].copy()  # maps have the old one
+            slowness = self.painted[1].copy()  # maps have the old one
         values = np.append(np.exp(steps * math.log(1 + STEP)), 1.0).astype(np.float32)
         np.minimum(values, MAX_SLOWNESS, out=values)
         slowness[box] = values.take(self.place[box], mode="wrap")
-        self.steps, self.painted = steps, (exploration, fastest, slowness)
+        self.steps, self.painted = steps, (fastest, slowness)
         return slowness
 
     def over(self, values: Float64, occupied: float) -> NDArray[np.float32]:

@@ -256,6 +256,23 @@ def test_actions_lead_through_poses_and_paths_are_checked(models: Any, rooms: np
         assert outcome.plan.extra_cost is not None  # kept
         assert np.array_equal(array_of(again), array_of(first)[9:])
         assert is_valid(path)
+        # In a door as wide as the body is at most, half a cell aside is too much for a new path.
+        narrow = rooms.copy()
+        narrow[:, 28:33] = 100
+        narrow[24:29, 28:33] = 0
+        node._map._take(map_message(narrow, grid, next(NUMBERS)))
+        through, _ = run(node._plan_for_action(start, [goal], "", lambda: None))
+        poses_through = array_of(through)
+        number = int(
+            np.abs(poses_through[:, :2] - grid.cell_to_world((30, 26))).sum(axis=1).argmin()
+        )
+        aside = through.poses[number]
+        aside.pose.position.x -= 0.06 * math.sin(ORIGIN[2])
+        aside.pose.position.y += 0.06 * math.cos(ORIGIN[2])
+        rest, outcome = run(node._plan_for_action(aside, [goal], "", lambda: None))
+        assert np.array_equal(array_of(rest), poses_through[number:])
+        assert "cells, kept, as there is none from the cell and heading nearest" in outcome.reason
+        node._map._take(map_message(rooms, grid, next(NUMBERS)))
         blocked = rooms.copy()
         x, y = grid.world_to_cell(*poses[len(poses) // 2, :2])
         blocked[y, x] = 100
