@@ -44,7 +44,7 @@ def warm_up(planner: Planner, learns: bool = False) -> Iterator[None]:
 
 
 def _plan_poses(planner: Planner) -> None:
-    """Plan where a wall divides a map, then through it, and look what is left of the path."""
+    """Plan where a wall divides a map, through it, and past a far box, and look what is left."""
     import numpy as np
 
     from ddqn_planner.grid import GridMap
@@ -57,5 +57,7 @@ def _plan_poses(planner: Planner) -> None:
     grid, ends = GridMap(walled, cell), np.array([[room / 2, room / 2], [1.5 * room, room / 2]])
     start, goal = ((*end, 0.0) for end in (ends * cell).tolist())
     planner.plan_poses(grid, start, goal)
-    plan = planner.plan_poses(grid.with_patch(np.zeros((room, 1), np.bool_), room, 0), start, goal)
+    opened = grid.with_patch(np.zeros((room, 1), np.bool_), room, 0)
+    planner.plan_poses(opened, start, goal)
+    plan = planner.plan_poses(opened.with_patch([[True]], room, 0), start, goal)
     planner.pose_planner.rest_of(plan.poses, start, grid)

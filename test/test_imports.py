@@ -145,6 +145,7 @@ def ask_for_poses(planner):
             plan = planner.plan_poses(grid, (1, 1, 0), (5, 4, 1), bound=bound)
         patched = grid.with_patch([[True]], *plan.cells[50])
         planner.plan_poses(patched, (1, 1, 0), [(5, 4, 1), (5, 1, 1)], (0.3, 0.2))
+        planner.plan_poses(grid.with_patch([[True]], 119, 0), (1, 1, 0), (5, 4, 1))
         planner.pose_planner.rest_of(plan.poses, (1, 1, 0), patched)
 
 

@@ -18,6 +18,7 @@ from ddqn_planner.planning.pose_world import SHIFT, TILE, Body, State, World
 NO_RESERVE = getattr(mmap, "MAP_NORESERVE", 0x4000)  # not in all versions of Python
 HEAP = 2**14  # entries of a heap, at first
 TAKEN_BACK = 4  # of so many visited states a repair takes one back; else a new field is quicker
+FEW = 2**8  # states that are taken back in no time
 NEAR = 1 / 2  # the share of them around a change from which on it would take back too many
 UNGUIDED = 2**14  # states that are visited before a look at the map pays
 FINEST = 1  # the shift of the smallest tiles that it looks at
@@ -210,10 +211,10 @@ class PoseField:
             near[x : x + high, y : y + high] = True
         tiles = np.flatnonzero(near.T)
         marks = self.known.mark.reshape(-1, 1 << kernels.TILE_BITS)[tiles]
-        if np.count_nonzero(marks) > NEAR * self.visits:
+        if np.count_nonzero(marks) > NEAR * self.visits + FEW:
             self._begin(grid, world)
             return
-        raised = np.empty(self.visits // TAKEN_BACK + 2**8, np.int64)
+        raised = np.empty(self.visits // TAKEN_BACK + FEW, np.int64)
         scratch = np.empty(8 * raised.size, np.float32), np.empty(8 * raised.size, np.int64), raised
         count = kernels.take_back(self.known, tiles, *scratch, world, self.body)
         if count < 0:
