@@ -32,7 +32,7 @@ Stages = Sequence[tuple[int, int]]
 
 STAGES: Final = ((0, 20), (20, 50), (50, 100))
 LONG_STAGES: Final = ((0, 200), (200, 600), (600, 1000))
-MOVED_STAGES: Final = ((0, 100), (100, 110), (110, 150))
+MOVED_STAGES: Final = ((0, 10), (10, 50), (100, 110), (110, 150))  # new to the world, and moved
 NEW_STAGES: Final = ((0, 5), (0, 20))
 # What is slow on the map where the robot learned, and on those that are new to it.
 PRIORS: Final = (("clearance", "clearance"), ("discs", "discs"), ("clearance", "discs"))

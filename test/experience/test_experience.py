@@ -108,6 +108,10 @@ def test_places_count_as_faster_by_more_while_drives_know_their_ways() -> None:
     assert hope() == pytest.approx(2, abs=0.2)
     experience = Experience.from_bytes(experience.to_bytes())
     assert hope() == pytest.approx(2, abs=0.2)
+    experience.merge(Experience(SPEED))  # another robot's ways
+    assert hope() == pytest.approx(1, abs=0.2)
+    drive(80, 5.0)
+    assert hope() == pytest.approx(2, abs=0.2)
     drive(1, 1.0)
     assert hope() == pytest.approx(1, abs=0.2)
 
