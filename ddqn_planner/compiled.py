@@ -10,6 +10,8 @@ from threading import Lock
 from types import FunctionType
 from typing import Any, TypeVar, cast
 
+import numpy as np
+
 Function = TypeVar("Function", bound=Callable[..., Any])
 
 _importing = Lock()
@@ -26,8 +28,10 @@ def compiled(function: Function, **options: Any) -> Function:
         scope |= {name: scope[name].dispatcher() for name in calls}
         to_compile = FunctionType(function.__code__, scope)
         # numba looks at the file of a function alone to see whether the code it has kept is old.
-        called = "".join(scope[name].py_func.__qualname__ for name in calls)
-        digest = zlib.crc32(function.__code__.co_code + f"{called} {options}".encode())
+        code, called = function.__code__, [scope[name].py_func.__qualname__ for name in calls]
+        values = *code.co_consts, *map(scope.get, names)
+        constants = [it for it in values if isinstance(it, (int, float, tuple, np.ndarray))]
+        digest = zlib.crc32(code.co_code + f"{called} {constants} {options}".encode())
         to_compile.__qualname__ = f"{function.__name__}_{digest:08x}"
         with _importing:
             numba = _import_numba()

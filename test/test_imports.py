@@ -4,7 +4,9 @@ import os
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pytest
 
 from ddqn_planner.compiled import compiled
@@ -106,6 +108,18 @@ def test_each_process_finds_the_code_that_another_has_kept() -> None:
     code = "from ddqn_planner.model.shared_background import evaluate as function;"
     code += "print(function.dispatcher().py_func.__qualname__)"
     assert len({run(code, PYTHONHASHSEED=seed).stdout for seed in "12345"}) == 1
+
+
+def test_code_that_was_kept_for_other_constants_is_old() -> None:
+    def name_of(line: str, constant: object) -> str:
+        scope: dict[str, Any] = {"CONSTANT": constant}
+        exec(f"def function(x):\n    return x + {line}", scope)
+        name: str = compiled(scope["function"]).dispatcher().py_func.__qualname__
+        return name
+
+    constants = 1, 2, 2.0, np.array([1, 2]), np.array([1, 3])
+    assert len({name_of("CONSTANT", constant) for constant in constants}) == len(constants)
+    assert name_of("1000", 1) != name_of("1001", 1) == name_of("1001", 1)
 
 
 def test_without_a_cache_code_is_compiled_all_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
