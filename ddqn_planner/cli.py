@@ -89,6 +89,7 @@ def train_robot(parser: argparse.ArgumentParser, arguments: Sequence[str]) -> in
 
     for name, kind, default, words in (
         ("footprint", str, None, "'[[x, y], ...]', metres, or a radius, as in Nav2's costmaps"),
+        ("padding", float, 0.0, "metres by which the body counts as larger: room for a controller"),
         ("motion", str, None, "differential, ackermann or omnidirectional"),
         ("turning-radius", float, 0.0, "of its bends, metres; ackermann needs it"),
         ("resolution", float, 0.05, "of the maps, metres per cell"),
@@ -99,7 +100,7 @@ def train_robot(parser: argparse.ArgumentParser, arguments: Sequence[str]) -> in
     ):
         parser.add_argument(f"--{name}", type=kind, default=default, metavar="X", help=words)
     options = parser.parse_args(arguments)
-    how = options.turning_radius, options.resolution, options.lattice, options.seed
+    how = options.turning_radius, options.resolution, options.lattice, options.seed, options.padding
     trainer = RobotTrainer.of(options.footprint, options.motion, *how)
     with tqdm(total=options.steps, disable=None) as bar:
         for certificate in trainer.run(options.steps):

@@ -17,12 +17,14 @@ MARGIN: Final = 0.1  # cells by which the swept cells are those of a larger body
 MAX_REACH: Final = 120  # cells that a primitive may sweep to each side
 
 
-def read_footprint(text: Any) -> NDArray[np.float64]:
+def read_footprint(text: Any, padding: float = 0.0) -> NDArray[np.float64]:
     """Return a polygon's corners, (K, 2) metres, given as in Nav2: a string of points or a radius.
 
-    A ValueError names what is wrong: fewer than three points, sides that cross, a centre of
-    rotation outside.
+    The padding moves each corner away from both axes, as Nav2's footprint_padding does. A
+    ValueError names what is wrong: fewer than three points, sides that cross, a centre of rotation
+    outside.
     """
+    padding = as_number("padding", padding, 0, 10, "0 to 10 metres")
     remedy = "give a radius, or a string of points '[[x, y], ...]', metres from the robot's origin"
     try:
         value = ast.literal_eval(text.strip()) if isinstance(text, str) else text
@@ -30,10 +32,12 @@ def read_footprint(text: Any) -> NDArray[np.float64]:
             radius = as_number("the radius", value, 1e-3, 100, "metres")
             turn = 2 * math.pi * (np.arange(CORNERS) + 0.5) / CORNERS
             around = np.column_stack([np.cos(turn), np.sin(turn)])
-            return around * (radius / math.cos(math.pi / CORNERS))
-        corners = numbers("the footprint", value).astype(np.float64)
+            corners = around * (radius / math.cos(math.pi / CORNERS))
+        else:
+            corners = numbers("the footprint", value).astype(np.float64)
     except (ValueError, SyntaxError, MemoryError, RecursionError) as error:
         raise ValueError(f"the footprint is {text!r} ({error}); {remedy}") from None
+    corners += padding * np.sign(corners)
     if corners.ndim != 2 or corners.shape[1] != 2 or len(corners) < 3:
         raise ValueError(f"the footprint {text!r} is no list of three or more points; {remedy}")
     if not np.isfinite(corners).all() or _crosses_itself(corners):

@@ -94,6 +94,7 @@ class RobotTrainer:
         resolution: float,
         lattice: str | None,
         seed: int,
+        padding: float = 0.0,
     ) -> RobotTrainer:
         """Return the trainer of a robot as a user describes it; a ValueError says what is wrong."""
         if motion is not None and lattice is None:
@@ -102,7 +103,7 @@ class RobotTrainer:
             motions = read_lattice(lattice)
         else:
             raise ValueError(f"motion is {motion}, lattice is {lattice}; give one of the two")
-        return cls(read_footprint(footprint), motions, seed)
+        return cls(read_footprint(footprint, padding), motions, seed)
 
     def run(self, until: int) -> Iterator[BodyCertificate]:
         """Train until all is proved, or so many steps are done; yield what is proved so far."""

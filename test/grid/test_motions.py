@@ -41,6 +41,14 @@ def test_primitives_lead_from_heading_to_heading_and_turn_no_sharper_than_allowe
             assert (turns <= steps / (radius / 0.05) * 1.02 + 1e-9).all()
 
 
+@given(padding=st.floats(1e-3, 0.5))
+def test_padding_makes_a_body_larger_on_each_side(padding: float) -> None:
+    for footprint in (LONG, "0.2"):
+        body, padded = (shapely.Polygon(read_footprint(footprint, by)) for by in (0.0, padding))
+        assert padded.buffer(1e-6).contains(body.buffer(padding))
+        assert padded.hausdorff_distance(body) <= 1.5 * padding + 1e-6
+
+
 def test_only_a_car_cannot_turn_on_the_spot_and_all_can_reverse() -> None:
     for motion in Motion:
         motions = make_motions(motion, 0.5, 0.05)

@@ -25,6 +25,7 @@ def test_the_command_trains_a_robot_that_is_proved(capsys: Any, tmp_path: Path) 
     path, (footprint, motion, radius, resolution, _) = tmp_path / "tiny.safetensors", TINY
     command = ["train-robot", "--footprint", footprint, "--motion", motion, "--out", str(path)]
     command += ["--turning-radius", str(radius), "--resolution", str(resolution)]
+    command += ["--padding", "0.02"]
     assert main([*command, "--steps", "20000"]) == 1
     assert re.search(r"steps|seed", capsys.readouterr().err)
     assert not path.exists()
@@ -32,6 +33,7 @@ def test_the_command_trains_a_robot_that_is_proved(capsys: Any, tmp_path: Path) 
     assert re.search(r"transitions: proved: all [\d,]+ cells", capsys.readouterr().out)
     network, metadata = load_model(path)
     assert isinstance(network, RobotNetwork)
+    assert network.footprint.max() == pytest.approx(0.36)
     expected = swept_cells(network.footprint, network.motions)
     np.testing.assert_array_equal(network.swept(), expected)
     assert 20_000 < metadata.steps < 2_000_000
@@ -89,6 +91,7 @@ WRONG = {
     "": "one of the two",
     "--lattice none.json": "none.json",
     "--motion differential --footprint 0": "radius is 0",
+    "--motion differential --padding -0.1": "padding is -0.1",
     "--motion differential --footprint [[0,0],[1,0]]": "three or more points",
     "--motion differential --footprint [[-1,-1],[1,1],[1,-1],[-1,1]]": "cross",
     "--motion differential --footprint [[1,1],[2,1],[2,2]]": "does not contain",
