@@ -48,7 +48,7 @@ FADING_STEPS = 4  # so often per half-life all evidence fades: few changes of a 
 SHORTEST = 8  # a drive through fewer places says little about how sure expected times are
 KEPT, ASSUMED = 64, 8  # drives whose errors count, and drives assumed before, with normal errors
 NORMAL = 1.645  # 90 % of a normal distribution lie within so many standard deviations
-BOLDEST = 6  # times the share of exploration, to which places count as faster that are unknown
+BOLDEST = 6  # times, at most, that places count as less known than they are
 WARY = 0.99  # a way through the unknown counts less with each drive
 TAIL = 0.04  # share of errors beyond each bound: not 5 %, as successive drives are alike
 CORRELATED = 10.0  # so many places in a row have their error in common
@@ -246,10 +246,7 @@ class Evidence:
 
     @property
     def boldness(self) -> int:
-        """By how many times the share of exploration unknown places may count as faster.
-
-        The last drives were then not expected to take longer than the best ones by more than it.
-        """
+        """How many times places count as less known: so what is nearly known is tried, too."""
         return max(1, int(1 / max(self.unknown, 1 / BOLDEST)))
 
     def deviation(

@@ -37,7 +37,6 @@ WINDOW = 0.25  # metres at nominal speed, in whose time poses are averaged
 STAND_DISTANCE = 0.1  # metres within which a robot stands
 STAND = 1.5  # metres at nominal speed: a robot that drives needs less time to leave a place
 FAST_STEP = 0.1  # of the log speed, by which the fastest move that a map knows of becomes faster
-MOST_SHARES = 2  # times the share of exploration: no place counts as faster by more
 CORRECTION = 0.25  # metres by which a localisation may move a pose at once: the drive goes on
 RELOCATION = 1.0  # a jump by this many metres more puts the robot at a place not believed
 MEMORY = 60.0  # seconds over which a robot whose pose is not believed counts as driving on
@@ -211,17 +210,17 @@ class Experience:
         grid : GridMap
             The map.
         exploration : float
-            0 or more. Places count as faster the less of them is known, so plans lead where it may
-            be faster. No plan is expected to take longer than the best one by more than this share,
-            or hardly one by more, and none by twice, while drives know nearly all of their ways.
+            0 or more. Places count as faster the less of them is known, at most by this share, and
+            sooner by all of it while drives know their ways. So plans lead where it may be faster,
+            but no plan is expected to take longer than the best one by more than this share.
         """
         limits = 0.0, 10.0, "0 to 10"
         exploration = as_number("exploration", exploration, *limits)
         evidence, share = self.evidence, math.log(1 + exploration)
-        posterior, boldness = evidence.over(grid), evidence.boldness
+        posterior = evidence.over(grid)
         fastest = FAST_STEP * min(0, math.floor(evidence.fastest / FAST_STEP + 0.5))
-        fastest -= share * min(boldness, MOST_SHARES)
-        hope = share * np.minimum(boldness * posterior.unknown, MOST_SHARES)
+        fastest -= share
+        hope = share * np.minimum(evidence.boldness * posterior.unknown, 1)
         slowness = posterior.paint(hope, fastest)
         seconds_per_cell = grid.resolution / self.nominal_speed * math.exp(fastest)
         return grid.with_layers(slowness=slowness, seconds_per_cell=seconds_per_cell)

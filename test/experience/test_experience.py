@@ -88,13 +88,13 @@ def test_places_with_and_without_waits_count_as_faster_the_less_of_them_is_known
     assert at(HALL, unknown, 7, 5) < 0.7
 
 
-def test_places_count_as_faster_by_more_while_drives_know_their_ways() -> None:
+def test_what_is_little_known_is_tried_while_drives_know_their_ways() -> None:
     experience, share = Experience(SPEED), 0.1
 
     def hope() -> float:
-        """By how much more than it takes a place counts that nobody drove, in the share."""
+        """By how much a place beside the way counts as faster than it is, in the share."""
         maps = [experience.apply(HALL, explored) for explored in (0.0, share)]
-        expected, hoped = (at(HALL, grid.slowness, 7, 9) * grid.seconds_per_cell for grid in maps)
+        expected, hoped = (at(HALL, grid.slowness, 7, 6) * grid.seconds_per_cell for grid in maps)
         return math.log(expected / hoped) / math.log(1 + share)
 
     def drive(times: int, y: float) -> None:
@@ -103,17 +103,17 @@ def test_places_count_as_faster_by_more_while_drives_know_their_ways() -> None:
             experience.record(*straight((2, y), (12, y)))
 
     drive(60, 5.0)
-    assert hope() == pytest.approx(1, abs=0.2)  # the first ways were not known
+    assert 0.5 < hope() < 0.9  # the first ways were not known
     drive(90, 5.0)
-    assert hope() == pytest.approx(2, abs=0.2)
+    assert hope() == pytest.approx(1, abs=0.1)
     experience = Experience.from_bytes(experience.to_bytes())
-    assert hope() == pytest.approx(2, abs=0.2)
+    assert hope() == pytest.approx(1, abs=0.1)
     experience.merge(Experience(SPEED))  # another robot's ways
-    assert hope() == pytest.approx(1, abs=0.2)
+    assert 0.5 < hope() < 0.9
     drive(80, 5.0)
-    assert hope() == pytest.approx(2, abs=0.2)
+    assert hope() == pytest.approx(1, abs=0.1)
     drive(1, 1.0)
-    assert hope() == pytest.approx(1, abs=0.2)
+    assert 0.5 < hope() < 0.9
 
 
 def test_waiting_counts_as_time_and_standing_before_a_drive_does_not() -> None:
