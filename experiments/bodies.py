@@ -9,6 +9,7 @@ import gc
 import math
 import os
 import time
+from collections import deque
 from collections.abc import Iterator
 from functools import cache
 from itertools import pairwise, product
@@ -29,6 +30,7 @@ from ddqn_planner.grid.footprint import inner_radius, read_footprint
 from ddqn_planner.grid.motions import HEADINGS, Motion, Motions, make_motions
 from ddqn_planner.model import ModelMetadata, RobotNetwork, package_version
 from ddqn_planner.planning.plan import PosePlan
+from ddqn_planner.warm_up import warm_up
 
 CELL: Final = 0.05  # metres
 FOOTPRINTS: Final = {
@@ -229,6 +231,7 @@ def speed(options: argparse.Namespace) -> Iterator[list[Any]]:
         figures: list[list[float]] = []
         asked = requests(grid, 0.55, random)
         planner = Planner.load(options.model)
+        deque(warm_up(planner), maxlen=0)  # what is compiled first takes long
         while len(figures) < options.requests:
             start, goal = next(asked)
             if FAR[0] < math.dist(start[:2], goal[:2]) < FAR[1]:
