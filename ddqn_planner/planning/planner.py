@@ -211,7 +211,9 @@ class Planner:
             With cells of the size that the robot learned.
         start : (x, y, yaw)
             Metres and radians in the map frame. The path begins in the middle of its cell, with one
-            of 16 headings: the nearest one, or else the next, where the body has room.
+            of 16 headings: the nearest one, or else the next, where the body has room. Where at
+            most half a cell and 11.25 degrees part it from the path planned last, the plan is the
+            rest of that path.
         goal : (x, y, yaw), or several
             Likewise; of several, the one that the cheapest path reaches.
         tolerance : (float, float)

@@ -95,10 +95,12 @@ def test_plans_cost_the_least_within_their_bound_also_after_repairs(
                 if found.status in (PlanStatus.START_OCCUPIED, PlanStatus.GOAL_OCCUPIED):
                     continue
                 least = best[y, x, heading]
-                # Where the body has no room, the next heading counts.
-                yaws = found.poses[[0, -1], 2] if found.poses.size else math.pi + np.zeros(2)
-                turned = np.abs(turn_between(yaws, (start[2], end[2]))).max()
-                if found.poses.size and turned < 1e-6:
+                if found.poses.size:
+                    x_off, y_off, turned = np.abs(found.poses[[0, -1]] - (start, end)).T
+                    turned = np.abs(turn_between(0, turned))
+                    assert np.hypot(x_off, y_off).max() <= 0.5001 * CELL
+                # Where the body has no room, the next heading counts; on the last path, that one.
+                if found.poses.size and max(x_off.max(), y_off.max(), turned.max()) < 1e-6:
                     assert 1 <= found.bound <= bound + 1e-5
                     same = 1.003 if layers else 1.0001  # the parts of the way are rounded
                     assert least / same <= found.cost <= least * found.bound * same
