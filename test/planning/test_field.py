@@ -355,7 +355,7 @@ def run_until(line: int, step: Callable[[], object]) -> None:
 
     before = sys.gettrace()
     with pytest.MonkeyPatch.context() as patch, suppress(MemoryError):
-        for name in ("_grow", "_still_open", "_take_back"):
+        for name in ("_grow", "_take_back"):
             patch.setattr(kernels, name, getattr(kernels, name).__wrapped__)
         sys.settrace(trace)
         try:
