@@ -44,7 +44,7 @@ class Layer:
 
     name: str
     publisher: Publisher
-    message: Callable[[Outcome, Header], Any]
+    message: Callable[[Outcome], Any]
     is_due: bool = False
     shows: bool = False
 
@@ -57,34 +57,31 @@ class Layer:
 class FieldDisplay:
     """Publishes what subscribers ask for: ``~/value``, ``~/policy``, ``~/footprints``."""
 
-    def __init__(self, node: Node) -> None:
-        self._logger = node.get_logger()
-        # Its own thread: neither requests nor maps wait for a field that is only shown.
-        self._worker = Worker(node)
-        self._shown: tuple[Outcome, Header] | None = None
+    # Its worker has no other calls: neither requests nor maps wait for a field that is only shown.
+    def __init__(self, node: Node, worker: Worker) -> None:
+        self._logger, self._worker = node.get_logger(), worker
+        self._shown: Outcome | None = None
         self._look = node.create_guard_condition(self._on_look, MutuallyExclusiveCallbackGroup())
         matched = PublisherEventCallbacks(matched=lambda _: self._look.trigger())
 
-        def layer(name: str, kind: Any, message: Callable[[Outcome, Header], Any]) -> Layer:
+        def layer(name: str, kind: Any, message: Callable[[Outcome], Any]) -> Layer:
             publisher = node.create_publisher(kind, f"~/{name}", LATCHED, event_callbacks=matched)
             return Layer(name, publisher, message)
 
         self._layers = (
-            layer("value", OccupancyGrid, lambda *it: value_message(*_field_of(*it))),
-            layer("policy", MarkerArray, lambda *it: policy_message(*_field_of(*it))),
+            layer("value", OccupancyGrid, lambda it: value_message(*_field_of(it))),
+            layer("policy", MarkerArray, lambda it: policy_message(*_field_of(it))),
             layer("footprints", MarkerArray, footprint_message),
         )
 
-    def show(self, outcome: Outcome, header: Header) -> None:
+    def show(self, outcome: Outcome) -> None:
         """Show the field of an outcome from now on; none if it has none, as of another goal."""
-        if outcome.plan.goal is None:
-            if self._shown is None:
-                return
-            last, last_header = self._shown
-            outcome = replace(last, planner=None)
-            header = Header(stamp=header.stamp, frame_id=last_header.frame_id)
-        if self._shown is None or _visible(outcome) != _visible(self._shown[0]):
-            self._shown = outcome, header
+        last = self._shown
+        if outcome.plan.goal is None and last is not None:
+            header = Header(stamp=outcome.header.stamp, frame_id=last.header.frame_id)
+            outcome = replace(last, planner=None, header=header)
+        if outcome.plan.goal and (last is None or _visible(outcome) != _visible(last)):
+            self._shown = outcome
             for layer in self._layers:
                 layer.is_due = True
             self._look.trigger()
@@ -93,13 +90,13 @@ class FieldDisplay:
         for layer in self._layers:
             if self._shown is None or not layer.is_due:
                 continue
-            has_any = layer.has(self._shown[0])
+            has_any = layer.has(self._shown)
             # What is latched is cleared even if nobody subscribes now.
             if not (layer.publisher.get_subscription_count() if has_any else layer.shows):
                 continue
             layer.is_due, layer.shows = False, has_any
             try:
-                layer.publisher.publish(await self._worker.call(layer.message, *self._shown))
+                layer.publisher.publish(await self._worker.call(layer.message, self._shown))
             except InvalidHandle:  # cleaned up meanwhile
                 return
             except Exception as error:  # as when no memory is left: the node must survive
@@ -113,12 +110,12 @@ def _visible(outcome: Outcome) -> tuple[object, ...]:
     return outcome.planner, request and request.grid, plan.goal, outcome.goal, way
 
 
-def _field_of(outcome: Any, header: Header) -> tuple[QField | None, GridMap, Header]:
-    """Return the field of an outcome, which is computed, its map, and a header."""
+def _field_of(outcome: Any) -> tuple[QField | None, GridMap, Header]:
+    """Return the field of an outcome, which is computed, its map, and the header."""
     request, planner, goal = outcome.request, outcome.planner, outcome.plan.goal
     is_shown = planner is not None and not isinstance(outcome.plan, PosePlan)
     field = planner.q_field(request.grid, goal, request.move_rule) if is_shown else None
-    return field, request.grid, header
+    return field, request.grid, outcome.header
 
 
 def policy_message(field: QField | None, grid: GridMap, header: Header) -> MarkerArray:
@@ -140,11 +137,11 @@ def policy_message(field: QField | None, grid: GridMap, header: Header) -> Marke
     return _lines("policy", arrows, (0, 1, 1, 2, 1, 3), width, header)
 
 
-def footprint_message(outcome: Outcome, header: Header) -> MarkerArray:
+def footprint_message(outcome: Outcome) -> MarkerArray:
     """Make a message with a body's outlines along its path; without one, it deletes the last."""
     body = outcome.planner.pose_planner if outcome.planner is not None else None
     if body is None or not isinstance(outcome.plan, PosePlan):
-        return _lines("footprints", np.empty((0, 0), np.complex128), (), BODY_LINE, header)
+        return _lines("footprints", np.empty((0, 0)), (), BODY_LINE, outcome.header)
     x, y, yaw = outcome.plan.poses.T
     turn = np.abs(turn_between(yaw[:-1], yaw[1:]))
     passed = np.cumsum(np.hypot(np.diff(x), np.diff(y)) + turn * TURN) // APART
@@ -152,11 +149,11 @@ def footprint_message(outcome: Outcome, header: Header) -> MarkerArray:
     corners = body.footprint @ [1, 1j]
     outlines = (x + 1j * y)[at, None] + np.exp(1j * yaw)[at, None] * corners
     sides = [corner % len(corners) for n in range(len(corners)) for corner in (n, n + 1)]
-    return _lines("footprints", outlines, sides, BODY_LINE, header)
+    return _lines("footprints", outlines, sides, BODY_LINE, outcome.header)
 
 
 def _lines(
-    name: str, shapes: NDArray[np.complex128], ends: Sequence[int], width: float, header: Header
+    name: str, shapes: NDArray[Any], ends: Sequence[int], width: float, header: Header
 ) -> MarkerArray:
     """Return a marker with lines between the corners of each shape; none deletes the last one."""
     marker = Marker(header=header, ns=name, type=Marker.LINE_LIST, color=COLOUR)
