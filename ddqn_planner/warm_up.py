@@ -1,7 +1,5 @@
 """All that is compiled for a planner: by a node before it is active, or at an installation."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 
 import numpy as np

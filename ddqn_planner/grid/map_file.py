@@ -1,7 +1,5 @@
 """Map files: ROS maps (YAML and an image) are read and written, MovingAI maps are read."""
 
-from __future__ import annotations
-
 import os
 import re
 import reprlib
