@@ -228,7 +228,12 @@ def learn(parser: argparse.ArgumentParser, arguments: Sequence[str]) -> int:
             drives += found
         for drive in drives:
             drive.teach(experience, grid)
-        experience.learn_prior(grid)
+        try:
+            from ddqn_planner.training.prior import teach_prior
+
+            teach_prior(experience, grid)
+        except ImportError as error:
+            print(f"the map's prior is not trained: {with_remedy(error)}")
         first = options.drives[0]
         out = options.out or (first if first.is_dir() else first.parent) / EXPERIENCE
         write_atomically(out, experience.to_bytes())  # not `save`, which adds to an older file

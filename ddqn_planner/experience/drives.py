@@ -41,7 +41,6 @@ PAUSE = 120.0  # seconds: a robot that stands for longer waits for no door and n
 SHORTEST = 0.5  # metres: a robot that went no farther away has not driven
 MOST_SAMPLES = 2000  # a drive is cut there, so that the robot learns while it drives for hours
 JUMP = 1.0  # seconds back by which a clock begins anew: a bag loops, a simulator is reset
-MORE_PLACES = 1.1  # times as many as the last time teach the prior anew
 WINDOW, STEP = 0.5, 0.25  # a drive's length joins means of so many seconds, so many metres apart
 
 
@@ -188,7 +187,6 @@ class DriveFolder(WorkFolder):
         super().__init__(Path(folder), [LOCK], "drives", "records", after)
         self.record_path, self.experience_path = self.folder / RECORD, self.folder / EXPERIENCE
         self.experience = Experience(nominal_speed, robot_width)
-        self._places_of_prior = 0
         with self.opening() as files:
             self.drives = _cut_incomplete_row(self.record_path)
             is_new = not self.experience_path.exists()
@@ -216,10 +214,6 @@ class DriveFolder(WorkFolder):
         drive = Drive(self.drives, outcome, seconds, positions)
         self._record.append(drive.row())
         drive.teach(self.experience, grid)
-        known = len(self.experience.evidence.places)
-        if grid is not None and known >= MORE_PLACES * self._places_of_prior:
-            self.experience.learn_prior(grid)
-            self._places_of_prior = known
         self.try_to_save()
         return drive
 
@@ -229,7 +223,6 @@ class DriveFolder(WorkFolder):
         if self.experience_path.exists():
             kept = self.experience_path.replace(self.folder / "experience_forgotten.npz")
         self.experience.forget()
-        self._places_of_prior = 0
         self.try_to_save()
         return kept
 

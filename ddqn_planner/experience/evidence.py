@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ddqn_planner.experience.posterior import FEW_PLACES, Posterior
-from ddqn_planner.experience.prior import FEWEST_PLACES, Prior, train_prior
+from ddqn_planner.experience.prior import Prior
 from ddqn_planner.grid import GridMap
 from ddqn_planner.grid.arguments import MAX_SLOWNESS
 from ddqn_planner.grid.grid_map import check_grid, equal
@@ -298,16 +298,6 @@ class Evidence:
         self.unknown = max(self.unknown, other.unknown)
         self.driven += other.driven
         self.use_prior(other.prior if self.prior is None else self.prior)
-
-    def learn_prior(self, grid: GridMap) -> Prior | None:
-        """Return the prior that the places on a map teach; few places change nothing."""
-        posterior = self.over(grid)
-        places = posterior.places_at(self.table[:, 3:5])
-        seen = (places >= 0) & (self.table[:, 0] > 0)
-        if seen.sum() < FEWEST_PLACES:
-            return self.prior
-        weight, log = self.table[seen, :2].T
-        return train_prior(posterior.features[places[seen]], log / weight, weight, self.prior)
 
     def use_prior(self, prior: Prior | None) -> None:
         """Let another prior foretell; its level, learned from these places, counts but once."""

@@ -28,7 +28,7 @@ Float64 = NDArray[np.float64]
 Step: TypeAlias = Callable[[Evidence], None]
 
 VERSION = 2
-PRIOR = "map_"  # before the names of its arrays in a file
+PRIOR = "prior_"  # before the names of its arrays in a file
 EXPERIENCE = "experience.npz"  # the name of the file in a folder
 OPTIONS = ("nominal_speed", "robot_width", "half_life", "max_pause")
 
@@ -192,11 +192,7 @@ class Experience:
 
     @prior.setter
     def prior(self, prior: Prior | None) -> None:
-        self._learn(partial(Evidence.use_prior, prior=prior))
-
-    def learn_prior(self, grid: GridMap) -> None:
-        """Learn from the driven places on a map what of their slowness the map tells."""
-        self.prior = self.evidence.learn_prior(grid)
+        self.evidence.use_prior(prior)
 
     def take_over(self, older: Experience) -> None:
         """Use what older experience solved for its map, which forgets it."""
@@ -284,6 +280,7 @@ class Experience:
                 if self._synchronised[0] == path:
                     for step in self._news:
                         step(saved.evidence)
+                    saved.prior = self.prior
                 else:
                     saved.merge(self)
                 saved.take_over(self)

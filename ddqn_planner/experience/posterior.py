@@ -64,13 +64,6 @@ class Posterior:
 
         return KDTree(self.middle)
 
-    @cached_property
-    def features(self) -> NDArray[np.float32]:
-        """What the map says around each place: (P, FEATURES)."""
-        x, y = self.middle.T
-        features: NDArray[np.float32] = map_features(self.grid)[y, x]
-        return features
-
     @property
     def mean(self) -> Float64:
         """The expected log slowness of driving at each place."""
@@ -109,7 +102,8 @@ class Posterior:
         least = [NEWS * common[0], NEWS * common[1], *[NEWS_OF_LOG] * 3]
         is_new = evidence.prior is not self.prior
         if is_new and evidence.prior is not None:
-            self.foretold = evidence.prior.log_slowness(self.features)
+            x, y = self.middle.T
+            self.foretold = evidence.prior.log_slowness(map_features(self.grid)[y, x])
         if is_new or (change > least).any():
             self.prior, self.common = evidence.prior, common
             self.expected = common[2] + common[3] * self.foretold.astype(np.float64)

@@ -20,14 +20,6 @@ NARROW = 0.7, 1.2, 2.0  # metres: free widths up to which a way counts as narrow
 SQUARES = 0.5, 1.0, 2.0  # metres: half the sides of squares whose share of free space counts
 UNUSUAL = 3.0  # standard deviations: features are no farther off than those of training
 
-FEWEST_PLACES = 32  # from which a prior is learned
-RIDGE = 10.0  # the weight of so many places speaks against each weight of the prior
-SMALLEST_SCALE = 0.1  # a feature that hardly varies tells nothing of maps where it does
-PARTS = 6  # each is foretold by the others
-BLOCKS, PLACES = 12, (8, 32)  # near places are alike: so many in a row are left out together
-DOUBT = 2.0  # what is foretold must be so many standard errors from nothing to be believed
-REPLAYED = 512  # places of older maps, and as many of this one, are kept to learn from again
-
 
 def map_features(grid: GridMap) -> Float32:
     """Return what the map says around each cell: (H, W, FEATURES). A wall stands around it."""
@@ -68,18 +60,24 @@ def _free_share(occupied: Occupancy, reach: float) -> Float32:
 
 
 class Prior(NamedTuple):
-    """Foretells log slowness from F features, linearly."""
+    """A network with two layers of H units that foretells log slowness from F features."""
 
     mean: Float32  # (F,) of the features in training
     scale: Float32  # (F,): their standard deviations
     level: Float32  # (): the mean log slowness in training
-    weights: Float32  # (F,)
+    direct: Float32  # (F,): what each feature adds beside the layers
+    weights_1: Float32  # (F, H)
+    bias_1: Float32
+    weights_2: Float32  # (H, H)
+    bias_2: Float32
+    weights_3: Float32  # (H,)
     replay: Float32  # (N, F + 2): features, log slowness and weight of places, to learn on from
 
     def log_slowness(self, features: Float32) -> Float32:
         """Return the expected log slowness of places: (..., F) to (...,)."""
         x = np.clip((features - self.mean) / self.scale, -UNUSUAL, UNUSUAL)
-        return np.asarray(self.level + x @ self.weights)
+        hidden = np.tanh(np.tanh(x @ self.weights_1 + self.bias_1) @ self.weights_2 + self.bias_2)
+        return np.asarray(self.level + x @ self.direct + hidden @ self.weights_3)
 
     @classmethod
     def from_arrays(cls, arrays: Mapping[str, NDArray[Any]]) -> Prior:
@@ -88,54 +86,12 @@ class Prior(NamedTuple):
             prior = cls(
                 *(arrays[name].astype(np.float32, casting="same_kind") for name in cls._fields)
             )
-            shapes = (FEATURES,), (FEATURES,), (), (FEATURES,), (len(prior.replay), FEATURES + 2)
-            possible = shapes == tuple(array.shape for array in prior)
+            possible = prior.log_slowness(np.zeros(FEATURES, dtype=np.float32)).shape == ()
             possible &= bool(np.isfinite(np.concatenate([array.ravel() for array in prior])).all())
+            possible &= prior.replay.shape[1:] == (FEATURES + 2,)
             possible &= bool((prior.scale > 0).all() and (prior.replay[:, -1] >= 0).all())
-        except (KeyError, TypeError):
+        except (KeyError, TypeError, ValueError):
             possible = False
         if not possible:
             raise ValueError("its prior cannot be true")
         return prior
-
-
-def train_prior(
-    features: Any, log_slowness: Any, weights: Any, older: Prior | None = None
-) -> Prior:
-    """Train a prior on N places: features (N, F), mean log slowness (N,) and its weight (N,).
-
-    The places come in the order in which they were first driven. How much to believe the result is
-    what foretells places best that were left out: not at all, if it foretells none. The places of
-    an older prior are replayed, so that what it knew of other maps is not forgotten.
-    """
-    random = np.random.default_rng(0)
-    new = np.column_stack([features, log_slowness, weights]).astype(np.float32)
-    old = new[:0] if older is None else older.replay
-    known = {row.tobytes() for row in new[:, :FEATURES]}  # a later drive tells of them anew
-    old = old[[row.tobytes() not in known for row in old[:, :FEATURES]]]
-    rows = np.concatenate([old, new]).astype(np.float64)
-    x, target, weight = rows[:, :FEATURES], rows[:, FEATURES], rows[:, -1] / rows[:, -1].mean()
-    mean, scale = x.mean(axis=0), np.maximum(x.std(axis=0), SMALLEST_SCALE)
-    level = np.average(new[:, FEATURES], weights=new[:, -1])
-    # Other maps may be slower as a whole: theirs is a level of its own.
-    is_old = np.arange(len(rows)) < len(old)
-    x = np.column_stack([np.clip((x - mean) / scale, -UNUSUAL, UNUSUAL), is_old])
-    target, block = target - level, np.arange(len(rows)) // np.clip(len(rows) // BLOCKS, *PLACES)
-
-    def fitted(learned: NDArray[np.bool_]) -> NDArray[np.float64]:
-        moments = (x * (learned * weight)[:, None]).T
-        return np.linalg.solve(moments @ x + RIDGE * np.eye(FEATURES + 1), moments @ target)
-
-    foretold = np.zeros(len(x))
-    for part in range(PARTS):
-        left_out = block % PARTS == part
-        foretold[left_out] = x[left_out] @ fitted(~left_out)
-    fit, size = (np.bincount(block, weight * foretold * one) for one in (target, foretold))
-    share = fit.sum() / max(size.sum(), 1e-9)
-    error = np.linalg.norm(fit - share * size) / max(size.sum(), 1e-9)
-    doubt = DOUBT * error / max(share * (1 - 2 / len(fit)), 1e-9)  # fewer blocks, greater errors
-    share = min(share, 1) * (1 - min(doubt, 1) ** 2)
-    kept = [part[np.sort(random.permutation(len(part))[:REPLAYED])] for part in (old, new)]
-    believed = share * fitted(np.ones(len(x), dtype=np.bool_))[:FEATURES]
-    arrays = mean, scale, level, believed, np.concatenate(kept)
-    return Prior(*(np.asarray(array, dtype=np.float32) for array in arrays))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
+from importlib import import_module
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -11,6 +12,7 @@ from action_msgs.msg import GoalStatus, GoalStatusArray
 from geometry_msgs.msg import PoseStamped
 from nav_msgs.msg import OccupancyGrid
 from numpy.typing import NDArray
+from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
 from rclpy.qos import DurabilityPolicy, QoSProfile
 from rclpy.time import Time
 from std_msgs.msg import String, UInt8MultiArray
@@ -36,6 +38,7 @@ Float64 = NDArray[np.float64]
 RETRY_PERIOD = 5.0  # seconds after which what failed for a full disk is tried again
 SLOWEST = 10.0  # the slowness that ``~/slowness`` shows as 100
 WRONG = np.log(1.5)  # of the nominal speed, compared with that of drives
+MORE_PLACES = 1.1  # times as many as the last time
 NOT_RECORDING = "no drives are being recorded; call ~/start first"
 NO_MAP = "no map was received yet; start a map server"
 
@@ -142,7 +145,9 @@ class Driving:
         node.create_timer(1.0, self._publish_diagnostics, clock=STEADY)
         node.create_timer(0.1, self._show_slowness, clock=STEADY)
         node.create_timer(RETRY_PERIOD, self._retry, clock=STEADY)
-        self._is_speed_wrong = False
+        self._places_of_prior, self._is_speed_wrong = 0, False
+        group = MutuallyExclusiveCallbackGroup()  # it awaits the worker
+        self._learning = node.create_timer(1.0, self._learn_prior, group, clock=STEADY)
         for name in ("start", "stop", "save", "replay", "forget"):
             node.create_trigger(f"~/{name}", getattr(self, name))
         self.start()
@@ -184,6 +189,30 @@ class Driving:
         self._node.note_saving("the drives are", folder.save_error)
         if not folder.save_error:
             self._saved.publish(String(data=str(folder.experience_path)))
+
+    async def _learn_prior(self) -> None:
+        """Train the prior, and again once drives have shown a tenth more places."""
+        place, folder = self._node.map, self._recording()
+        if place is None or folder is None:
+            return
+        evidence, before = folder.experience.evidence, self._places_of_prior
+        known = len(evidence.places)
+        if not known or before <= known < MORE_PLACES * before:
+            return
+        self._places_of_prior = known
+        given = place.grid, evidence.table.copy(), evidence.prior, self._node.value("seed")
+        training = "ddqn_planner.training.prior"  # it imports torch
+        try:
+            prior = await self._node.worker.call(lambda: import_module(training).prior_of(*given))
+        except Exception as error:  # the node must survive
+            if isinstance(error, ImportError):
+                self._node.destroy_timer(self._learning)
+            self._node.get_logger().warning(f"the map foretells nothing: {explained(error)}")
+            return
+        evidence = folder.experience.evidence
+        if folder is self._recording() and len(evidence.places) >= known:  # else it was forgotten
+            folder.experience.prior = prior
+            self._save(folder)
 
     def _retry(self) -> None:
         folder = self._recording()

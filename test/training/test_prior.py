@@ -5,7 +5,8 @@ import pytest
 from random_maps import generate_map
 
 from ddqn_planner import Experience, GridMap
-from ddqn_planner.experience.prior import REPLAYED, Prior, map_features, train_prior
+from ddqn_planner.experience.prior import Prior, map_features
+from ddqn_planner.training.prior import REPLAYED, teach_prior, train_prior
 
 Places = tuple[np.ndarray, np.ndarray, np.ndarray]
 """Features (N, F), log slowness (N,) and weights (N,)."""
@@ -68,6 +69,12 @@ def test_weights_count() -> None:
     assert share_foretold(ignored, rooms(1)) > 0.7
 
 
+def test_the_same_seed_gives_the_same_prior() -> None:
+    one, same, other = (train_prior(*measured(0), seed=seed) for seed in (3, 3, 4))
+    assert all(np.array_equal(*pair) for pair in zip(one, same, strict=True))
+    assert not np.array_equal(one.weights_1, other.weights_1)
+
+
 def test_an_older_map_is_not_forgotten_and_known_places_are_not_kept_twice() -> None:
     older = train_prior(*measured(0))
     assert len(older.replay) == REPLAYED < len(measured(0)[0])
@@ -89,9 +96,9 @@ def test_the_places_of_experience_teach_its_prior_where_they_lie_on_a_map() -> N
     for y, slowness in ((3.0, 1.0), (7.0, 4.0), (11.0, 1.0), (900.0, 9.0)):  # the last lies off it
         seconds = np.arange(0, 50 * slowness, 0.5)
         experience.record(seconds, np.column_stack([10 + seconds / 2 / slowness, 0 * seconds + y]))
-    experience.learn_prior(GridMap(np.zeros((4, 4), dtype=np.bool_), 0.25))
+    teach_prior(experience, GridMap(np.zeros((4, 4), dtype=np.bool_), 0.25))
     assert experience.prior is None
-    experience.learn_prior(grid)
+    teach_prior(experience, grid)
     assert experience.prior is not None
     foretold = experience.prior.log_slowness(map_features(grid))
     assert foretold[28, 60] > foretold[12, 60] + 0.5
@@ -99,7 +106,7 @@ def test_the_places_of_experience_teach_its_prior_where_they_lie_on_a_map() -> N
     first = experience.prior
     other = GridMap(np.roll(occupancy, 9, axis=0), 0.25, grid.origin)
     for place, more in ((grid, False), (other, True)):  # no place is kept twice, none is forgotten
-        experience.learn_prior(place)
+        teach_prior(experience, place)
         assert (len(experience.prior.replay) > len(first.replay)) == more
 
 
@@ -110,7 +117,7 @@ def test_what_all_places_have_in_common_is_not_learned_twice() -> None:
         experience.record(seconds, np.column_stack([1 + seconds / 8, 0 * seconds + y]))
     before = experience.slowness(grid)
     assert before[36, 60] == pytest.approx(4, rel=0.4)
-    experience.learn_prior(grid)
+    teach_prior(experience, grid)
     np.testing.assert_allclose(experience.slowness(grid), before, rtol=0.1)
     again = Experience.from_bytes(experience.to_bytes())
     np.testing.assert_allclose(again.slowness(grid), experience.slowness(grid), rtol=0.01)
