@@ -292,7 +292,8 @@ class Evidence:
             np.add.at(self.table[:, :2], rows, other.table[:, :2])
             self._bound()
         for seconds, passages, x, y in other.waits.tolist():
-            self.waits[self._wait_at(x, y), :2] += seconds, passages
+            row = self._wait_at(x, y)  # first: it may make the table anew
+            self.waits[row, :2] += seconds, passages
         self.noise_sums = tuple(np.add(self.noise_sums, other.noise_sums).tolist())
         self.errors = [*self.errors, *other.errors][-KEPT:]
         self.unknown = max(self.unknown, other.unknown)
