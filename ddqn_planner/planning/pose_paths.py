@@ -30,6 +30,7 @@ class Way(NamedTuple):
     """A path of N poses that follows a field."""
 
     poses: Float64  # (N, 3), in metres and radians
+    cells: NDArray[np.int32]  # (N, 2)
     spent: Float64  # (N,) before each pose
     least: float  # a lower bound of what must be spent
 
@@ -37,12 +38,14 @@ class Way(NamedTuple):
         """Return the plan along the poses from one on."""
         cost, least = float(self.spent[-1] - self.spent[first]), self.least - self.spent[first]
         bound = max(cost / least, 1.0) if cost > least * SAME else 1.0
-        return plan_along(self.poses[first:], grid, cost * (grid.seconds_per_cell or 1.0), bound)
+        way = self.poses[first:], self.cells[first:]
+        return plan_along(*way, grid, cost * (grid.seconds_per_cell or 1.0), bound)
 
 
-def plan_along(poses: Float64, grid: GridMap, cost: float, bound: float) -> PosePlan:
-    """Return the plan of a path that has these poses."""
-    cells = cells_of(in_cells(poses, grid))
+def plan_along(
+    poses: Float64, cells: NDArray[np.int32], grid: GridMap, cost: float, bound: float
+) -> PosePlan:
+    """Return the plan of a path of poses that lie in cells."""
     poses.flags.writeable = False
     return PosePlan(
         PlanStatus.SUCCEEDED,

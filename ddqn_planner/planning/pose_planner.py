@@ -136,7 +136,8 @@ class PosePlanner:
         new_cost, bound = plan.cost or 0.0, plan.bound
         if not has_plan:  # nothing is proved
             new_cost, bound = cost * (grid.seconds_per_cell or 1.0), math.inf
-        kept = paths.plan_along(rest, grid, new_cost * share, max(bound * share, 1.0))
+        way = rest, paths.cells_of(paths.in_cells(rest, grid)), grid
+        kept = paths.plan_along(*way, new_cost * share, max(bound * share, 1.0))
         ms = plan.field_ms, plan.rollout_ms
         return replace(kept, extra_cost=share - 1, field_ms=ms[0], rollout_ms=ms[1])
 
@@ -253,9 +254,10 @@ class PosePlanner:
         over, up, before, cost = np.repeat(
             np.vstack([np.zeros((1, 4)), begins]), [1, *map(len, after)], axis=0
         ).T
-        centres = grid.centres(x + over + start[0], y + up + start[1])
-        poses = np.column_stack([*centres, turn_between(0, yaw + grid.origin[2])])
-        return paths.Way(poses, before + share * cost, float(costs.sum()) / bound)
+        x, y, yaw = x + over + start[0], y + up + start[1], turn_between(0, yaw + grid.origin[2])
+        poses, cells = np.column_stack([*grid.centres(x, y), yaw]), np.column_stack([x, y])
+        least = float(costs.sum()) / bound
+        return paths.Way(poses, paths.cells_of(cells), before + share * cost, least)
 
 
 def _meets(ends: NDArray[np.float64], pose: Any, grid: GridMap) -> bool:
