@@ -2,6 +2,7 @@
 
 import argparse
 import itertools
+import math
 import os
 import sys
 import time
@@ -93,10 +94,19 @@ def priors(options: Options) -> Sections:
     rows = []
     for source, hidden in PRIORS[: 1 if options.quick else None]:
         kinds = [f"{name}-{hidden}" for name in (*NEW_MAPS, *options.maps_found)]
-        for name, prior_from in (("without", ""), ("with", f"rooms-{source}")):
-            own = _runs(kinds, (EXPERIENCE,), options, missions=20, prior_from=prior_from)
-            above = _percent(_above(own, NEW_STAGES))
-            rows.append([f"{source}, then {hidden}", name, *above])
+        without, own = (
+            _runs(kinds, (EXPERIENCE,), options, missions=20, prior_from=prior_from)
+            for prior_from in ("", f"rooms-{source}")
+        )
+        cells = _percent(_above(own, NEW_STAGES))
+        for number, (first, end) in enumerate(NEW_STAGES[: len(cells)]):
+            pairs = zip(own, without, strict=True)
+            more = [100 * (a.ratio(first, end) - b.ratio(first, end)) for a, b in pairs]
+            error = np.std(more) / math.sqrt(len(more))
+            cells[number] += f" ({np.mean(more):+.1f} ± {error:.1f})"
+        title = f"{source}, then {hidden}"
+        rows.append([title, "without", *_percent(_above(without, NEW_STAGES))])
+        rows.append([title, "with", *cells])
     return {"A map never driven": table(f"worlds | prior | {_names(NEW_STAGES)}", rows)}
 
 

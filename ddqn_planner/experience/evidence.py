@@ -13,7 +13,7 @@ from ddqn_planner.experience.posterior import FEW_PLACES, Posterior
 from ddqn_planner.experience.prior import Prior
 from ddqn_planner.grid import GridMap
 from ddqn_planner.grid.arguments import MAX_SLOWNESS
-from ddqn_planner.grid.grid_map import check_grid, equal
+from ddqn_planner.grid.grid_map import check_grid
 
 Float64 = NDArray[np.float64]
 
@@ -277,7 +277,7 @@ class Evidence:
         if (
             posterior is None
             or (posterior.grid.resolution, posterior.grid.origin) != (grid.resolution, grid.origin)
-            or not equal(posterior.grid.occupancy, grid.occupancy)
+            or not np.array_equal(posterior.grid.occupancy, grid.occupancy)
         ):
             posterior = Posterior(grid, self.side)
         posterior.grid = grid
@@ -292,7 +292,8 @@ class Evidence:
             np.add.at(self.table[:, :2], rows, other.table[:, :2])
             self._bound()
         for seconds, passages, x, y in other.waits.tolist():
-            self.waits[self._wait_at(x, y), :2] += seconds, passages
+            row = self._wait_at(x, y)  # first: it may make the table anew
+            self.waits[row, :2] += seconds, passages
         self.noise_sums = tuple(np.add(self.noise_sums, other.noise_sums).tolist())
         self.errors = [*self.errors, *other.errors][-KEPT:]
         self.unknown = max(self.unknown, other.unknown)

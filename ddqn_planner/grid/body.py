@@ -1,7 +1,5 @@
 """The robot's body: which cells are too near to an obstacle, and which are better avoided."""
 
-from __future__ import annotations
-
 import sys
 from typing import Any
 
@@ -9,7 +7,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ddqn_planner.grid.arguments import OCCUPIED, UNKNOWN, Occupancy, as_number
-from ddqn_planner.grid.copies import WHOLE, boxes_of, cells_in, hull, wider, within
+from ddqn_planner.grid.copies import Box, cells_in, hull, wider, within
 from ddqn_planner.grid.grid_map import MAX_COST_MULTIPLIER, GridMap, check_grid
 
 # Linear and exponential costs, with paths as long, kept no clearly greater distances.
@@ -82,29 +80,24 @@ class Inflation:
     """Inflates maps as they come: of a map like the last one, only what is near changed cells."""
 
     def __init__(self) -> None:
-        self._last: tuple[Any, GridMap, GridMap] | None = None
+        self._last: tuple[Any, ...] = (None, None, None)  # body, map, inflated map
 
     def __call__(self, grid: GridMap, robot_radius: float, clearance_weight: float) -> GridMap:
         """Return what `inflate` returns."""
-        body = robot_radius, clearance_weight
-        key = body, grid.occupancy.shape, grid.resolution, grid.cost is None
-        if any(body) and self._last is not None and self._last[0] == key:
-            inflated = _inflate_changed(grid, *self._last[1:], body)
-        else:
+        body, (last_body, before, inflated) = (robot_radius, clearance_weight), self._last
+        boxes = grid.patches_since(before) if any(body) and body == last_body else None
+        if boxes is None:
             inflated = inflate(grid, *body)
-        self._last = key, grid, inflated
+        else:
+            inflated = _inflate_near(boxes, grid, inflated, body)
+        self._last = body, grid, inflated
         return inflated
 
 
-def _inflate_changed(
-    grid: GridMap, before: GridMap, inflated: GridMap, body: tuple[float, float]
+def _inflate_near(
+    boxes: list[Box], grid: GridMap, inflated: GridMap, body: tuple[float, float]
 ) -> GridMap:
-    """Return what `inflate` returns, given what it returned for a map that has other cells."""
-    boxes = grid.patches_since(before)
-    if boxes is None:
-        boxes = boxes_of(grid.differs(before, WHOLE, WHOLE))
-        layers = {"occupancy": inflated.occupancy, "cost": inflated.cost}
-        inflated = grid.with_layers(**layers, obstacles=inflated.obstacles)
+    """Return what `inflate` returns, given what it returned before boxes of the map changed."""
     # Farther away than this, an obstacle has no effect: the cost that it adds is rounded to 0.
     reach = body[0] + max(np.cbrt(2 * (OCCUPIED - 1) * body[1]) - 1, 0) * CLEARANCE_SCALE
     cells, shape = int(reach / grid.resolution) + 2, grid.occupancy.shape

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
@@ -12,23 +11,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ddqn_planner.grid.arguments import (
-    MAX_SLOWNESS,
-    OCCUPIED,
-    POSITIVE,
-    UNKNOWN,
-    Cell,
-    Cells,
-    Occupancy,
-    as_cell,
-    as_flag,
-    as_mask,
-    as_number,
-    cell_inside,
-    cells_inside,
-    numbers,
-    real,
-)
+from ddqn_planner.grid import arguments
+from ddqn_planner.grid.arguments import OCCUPIED, UNKNOWN, Cell, Occupancy
 from ddqn_planner.grid.copies import Box, replaced
 from ddqn_planner.grid.moves import MoveRule, component_labels, flood, legal_moves
 
@@ -36,6 +20,7 @@ MAX_COST_MULTIPLIER = 5.0
 """That of a cell of value 100 or unknown; as in Nav2's NavFn planner: 50 if free, at most 253."""
 
 LAYERS = "occupancy", "cost", "forbidden", "slowness"  # what its moves depend on
+PATCHED = {"occupancy", "cost", "obstacles"}  # layers of which patches change some cells
 MAX_PATCHES = 512  # so many are known of a map, one after the other
 
 # (101,): the multiplier of each cost, 0 to 100
@@ -84,28 +69,34 @@ class GridMap:
     seconds_per_cell: float | None = None
 
     def __post_init__(self) -> None:
-        occupancy = as_mask("occupancy", self.occupancy)
-        metres = as_number("resolution", self.resolution, *POSITIVE, "metres per cell, > 0")
-        origin = tuple(numbers("origin", self.origin, (3,)).astype(np.float64).tolist())
+        occupancy = arguments.as_mask("occupancy", self.occupancy)
+        metres = arguments.as_number(
+            "resolution", self.resolution, *arguments.POSITIVE, "metres per cell, > 0"
+        )
+        origin = tuple(arguments.numbers("origin", self.origin, (3,)).astype(np.float64).tolist())
         if not all(map(math.isfinite, origin)):
             raise ValueError(f"origin is {origin}; give three finite numbers x, y, yaw")
         self._set(occupancy=occupancy, resolution=metres, origin=origin)
         if self.cost is not None:
             self._set(cost=_costs(self.cost, occupancy))
         if self.obstacles is not None:
-            obstacles = as_mask("obstacles", self.obstacles, occupancy.shape)
+            obstacles = arguments.as_mask("obstacles", self.obstacles, occupancy.shape)
             if (obstacles & ~occupancy).any():
                 raise ValueError("obstacles lie on free cells; give some within the occupied cells")
             self._set(obstacles=obstacles)
         if self.forbidden is not None:
-            bits = numbers("forbidden", self.forbidden, occupancy.shape, between=(0, 255))
+            bits = arguments.numbers("forbidden", self.forbidden, occupancy.shape, between=(0, 255))
             self._set(forbidden=bits.astype(np.uint8, order="C") if bits.any() else None)
         if self.slowness is not None:
-            slowest = 1, MAX_SLOWNESS
-            slowness = numbers("slowness", self.slowness, occupancy.shape, "iuf", slowest, False)
+            slowest = 1, arguments.MAX_SLOWNESS
+            slowness = arguments.numbers(
+                "slowness", self.slowness, occupancy.shape, "iuf", slowest, False
+            )
             self._set(slowness=slowness.astype(np.float32, order="C"))
         if self.seconds_per_cell is not None:
-            seconds = as_number("seconds_per_cell", self.seconds_per_cell, *POSITIVE, "more than 0")
+            seconds = arguments.as_number(
+                "seconds_per_cell", self.seconds_per_cell, *arguments.POSITIVE, "more than 0"
+            )
             self._set(seconds_per_cell=seconds)
 
     def _set(self, **layers: Any) -> None:
@@ -140,15 +131,15 @@ class GridMap:
         use_map_costs : bool
             Whether free cells keep their values as costs; otherwise all cost the same.
         """
-        as_number("occupied_threshold", occupied_threshold, 1, OCCUPIED)
-        array = numbers("the array of values", values, between=(-128, 127))
+        arguments.as_number("occupied_threshold", occupied_threshold, 1, OCCUPIED)
+        array = arguments.numbers("the array of values", values, between=(-128, 127))
         if array.dtype.kind == "f":  # these may be probabilities, 1.0 for occupied
             raise ValueError(f"the values are of type {array.dtype}; give integers, percent")
         array = array.astype(np.int8, copy=False)
         occupied = array >= occupied_threshold
-        if not as_flag("allow_unknown", allow_unknown):
+        if not arguments.as_flag("allow_unknown", allow_unknown):
             occupied |= array < 0
-        with_costs = as_flag("use_map_costs", use_map_costs)
+        with_costs = arguments.as_flag("use_map_costs", use_map_costs)
         cost = np.maximum(array, UNKNOWN) if with_costs else None
         return cls(occupied, resolution, origin, cost, forbidden=forbidden)  # type: ignore[arg-type]
 
@@ -175,8 +166,8 @@ class GridMap:
             Which of the new occupied cells are obstacles, as for `GridMap`; by default all. On a
             map without obstacles of its own they are ignored.
         """
-        patch = as_mask("occupancy", occupancy)
-        left, bottom = as_cell((x, y), "the first cell of the patch")
+        patch = arguments.as_mask("occupancy", occupancy)
+        left, bottom = arguments.as_cell((x, y), "the first cell of the patch")
         height, width = patch.shape
         if not (0 <= left <= self.width - width and 0 <= bottom <= self.height - height):
             size = f"{self.width} x {self.height}"
@@ -189,36 +180,22 @@ class GridMap:
             costs = replaced(costs, box, _costs(costs[box] if cost is None else cost, patch))
         closed = patch
         if obstacles is not None:
-            closed = patch & as_mask("obstacles", obstacles, patch.shape)
+            closed = patch & arguments.as_mask("obstacles", obstacles, patch.shape)
         patched = self.with_layers(
             occupancy=replaced(self.occupancy, box, patch),
             cost=costs,
             obstacles=replaced(self.obstacles, box, closed),
         )
-        occupied = self._occupied + np.count_nonzero(patch) - np.count_nonzero(self.occupancy[box])
-        patches = *self._patches[1 - MAX_PATCHES :], (self._version, box)
-        has_same_layers = (costs is None) == (self.cost is None)
-        patched._set(_occupied=occupied, _patches=patches if has_same_layers else ())
+        if (costs is None) == (self.cost is None):
+            patched._set(_patches=(*self._patches[1 - MAX_PATCHES :], (self._version, box)))
         return patched
-
-    def with_boxes_of(self, other: GridMap, boxes: Sequence[Box]) -> GridMap:
-        """Return this map with the cells that another one of its size has in some boxes."""
-        result = self
-        for box in boxes:
-            cost, obstacles = (
-                None if layer is None else layer[box] for layer in (other.cost, other.obstacles)
-            )
-            corner = box[1].start, box[0].start
-            result = result.with_patch(other.occupancy[box], *corner, cost, obstacles)
-        return result
 
     def patches_since(self, older: GridMap) -> list[Box] | None:
         """Return the boxes, rows and columns, that `with_patch` replaced since an older map."""
-        # None if it is no such map, or there were more than `MAX_PATCHES`.
-        if older._version is self._version:
-            return []
-        versions = [version for version, _ in self._patches]
-        if older._version not in versions:
+        # None if it is no such map, or has other layers, or there were more than `MAX_PATCHES`.
+        versions = [*(version for version, _ in self._patches), self._version]
+        has_same = self.forbidden is older.forbidden and self.slowness is older.slowness
+        if not has_same or older._version not in versions:
             return None
         return [box for _, box in self._patches[versions.index(older._version) :]]
 
@@ -228,9 +205,11 @@ class GridMap:
 
     def with_layers(self, **layers: Any) -> GridMap:
         """Return the same map with other layers, which are neither checked nor copied."""
-        stale = {"cost_multiplier", "fingerprint", "_version", "_patches"}
-        if "occupancy" in layers:
-            stale |= {"_labels", "_occupied"}
+        stale = {"cost_multiplier", "fingerprint"}
+        if layers.keys() & PATCHED:
+            stale |= {"_version", "_patches", "_labels", "_occupied"}
+        else:
+            layers["_version"] = self._version  # which may not be there yet
         kept = {name: value for name, value in vars(self).items() if name not in stale}
         changed = object.__new__(GridMap)
         changed._set(**{**kept, **layers})
@@ -256,21 +235,12 @@ class GridMap:
         """(H, W) float32: what a path costs per cell of its length: 1 to 5, times the slowness."""
         return self.multipliers_in(...)
 
-    def multipliers(self, cells: Cells) -> NDArray[np.float32]:
-        """Return (N,) float32: the cost multiplier of some cells (N, 2) of the map."""
-        x, y = np.asarray(cells, dtype=np.int64).reshape(-1, 2).T
-        return self.multipliers_in((y, x))
-
     def multipliers_in(self, where: Any) -> NDArray[np.float32]:
         """Return the cost multipliers that an index of NumPy names."""
-        slowness: NDArray[np.float32] | None
-        slowness = None if self.slowness is None else self.slowness[where]
-        if self.cost is None:
-            ones = np.ones(self.occupancy[where].shape, dtype=np.float32)
-            return ones if slowness is None else slowness
-        multiplier: NDArray[np.float32]
-        multiplier = MULTIPLIERS.take(self.cost[where], mode="wrap")  # -1 finds the last one
-        return multiplier if slowness is None else multiplier * slowness
+        multiplier = np.ones(self.occupancy[where].shape, dtype=np.float32)
+        if self.cost is not None:
+            multiplier = MULTIPLIERS.take(self.cost[where], mode="wrap")  # -1 finds the last one
+        return multiplier if self.slowness is None else multiplier * self.slowness[where]
 
     def labels(self, move_rule: MoveRule | str) -> NDArray[np.int32]:
         """Return (H, W) int32: each free cell's component, from 1 on, whatever is forbidden."""
@@ -288,7 +258,10 @@ class GridMap:
         self, cells: ArrayLike, move_rule: MoveRule | str, backward: bool = False
     ) -> NDArray[np.bool_]:
         """Return (H, W) bool: where paths from some free cells (N, 2) lead, or backward, begin."""
-        array, backward = cells_inside(cells, self.occupancy.shape), as_flag("backward", backward)
+        array, backward = (
+            arguments.cells_inside(cells, self.occupancy.shape),
+            arguments.as_flag("backward", backward),
+        )
         if self.forbidden is None:
             labels = self.labels(move_rule)
             return np.isin(labels, labels[array[:, 1], array[:, 0]])
@@ -331,12 +304,12 @@ class GridMap:
     def same_cells(self, other: GridMap) -> bool:
         """Return whether all cells of two maps are equal, wherever the maps lie."""
         check_grid(other, "other")
-        if self._occupied != other._occupied:
-            return False
         boxes = self.patches_since(other)
         if boxes is not None:
             return not any(self.differs(other, box, box).any() for box in reversed(boxes))
-        return all(equal(getattr(self, name), getattr(other, name)) for name in LAYERS)
+        layers = ((getattr(self, name), getattr(other, name)) for name in LAYERS)
+        same = (mine is its or np.array_equal(mine, its) for mine, its in layers)
+        return self._occupied == other._occupied and all(same)
 
     def differs(self, other: GridMap, box: Box, others_box: Box) -> NDArray[np.bool_]:
         """Return which cells of boxes of two maps with the same layers differ."""
@@ -349,31 +322,29 @@ class GridMap:
 
     def contains(self, cell: Cell) -> bool:
         """Return whether a cell lies inside the map."""
-        x, y = as_cell(cell)
+        x, y = arguments.as_cell(cell)
         height, width = self.occupancy.shape
         return bool(0 <= x < width and 0 <= y < height)
 
     def is_free(self, cell: Cell) -> bool:
         """Return whether a cell lies inside the map and is not occupied."""
-        x, y = as_cell(cell)
-        height, width = self.occupancy.shape
-        return bool(0 <= x < width and 0 <= y < height and not self.occupancy[y, x])
+        x, y = arguments.as_cell(cell)
+        return self.contains((x, y)) and not self.occupancy[y, x]
 
     def is_obstacle(self, cell: Cell) -> bool:
         """Return whether a cell is an obstacle, not just too near to one; ValueError if outside."""
-        x, y = cell_inside(cell, self.occupancy.shape)
+        x, y = arguments.cell_inside(cell, self.occupancy.shape)
         obstacles = self.occupancy if self.obstacles is None else self.obstacles
         return bool(obstacles[y, x])
 
     def free_cells(self) -> list[Cell]:
         """Return the free cells as (x, y), row by row from y = 0."""
-        rows, columns = np.nonzero(~self.occupancy)
-        return list(zip(columns.tolist(), rows.tolist(), strict=True))
+        return [(x, y) for y, x in np.argwhere(~self.occupancy).tolist()]
 
     def world_to_cell(self, x: float, y: float) -> Cell:
         """Return the cell of a point, in metres; it owns its lower edges, and may lie outside."""
         origin_x, origin_y, yaw = self.origin
-        dx, dy = real(x) - origin_x, real(y) - origin_y
+        dx, dy = arguments.real(x) - origin_x, arguments.real(y) - origin_y
         column = (math.cos(yaw) * dx + math.sin(yaw) * dy) / self.resolution
         row = (-math.sin(yaw) * dx + math.cos(yaw) * dy) / self.resolution
         if not (math.isfinite(column) and math.isfinite(row)):
@@ -382,7 +353,7 @@ class GridMap:
 
     def cell_to_world(self, cell: Cell) -> tuple[float, float]:
         """Return the centre of a cell in the map frame, in metres."""
-        return self.centres(*as_cell(cell))
+        return self.centres(*arguments.as_cell(cell))
 
     def centres(self, x: Any, y: Any) -> tuple[Any, Any]:
         """Return the centre of a cell, or of each of many (arrays), in the map frame, in metres."""
@@ -402,19 +373,10 @@ def check_grid(grid: object, name: str = "grid") -> None:
 
 def _costs(cost: ArrayLike, occupancy: Occupancy) -> NDArray[np.int8]:
     """Return a copy with 0 in occupied cells."""
-    of_free = np.array(numbers("cost", cost, occupancy.shape), order="C")
+    of_free = np.array(arguments.numbers("cost", cost, occupancy.shape), order="C")
     if of_free.dtype.kind in "iu":
         of_free *= ~occupancy  # fifty times as fast as the assignment below
     else:  # NaN times 0 is NaN
         of_free[occupancy] = 0
-    numbers("cost", of_free, between=(UNKNOWN, OCCUPIED - 1))
+    arguments.numbers("cost", of_free, between=(UNKNOWN, OCCUPIED - 1))
     return of_free.astype(np.int8, copy=False)
-
-
-def equal(some: NDArray[Any] | None, others: NDArray[Any] | None) -> bool:
-    """Return whether two layers are equal, soon where they are the same or very different."""
-    if some is None or others is None or some is others:
-        return some is others
-    # A planner compares a map with each one that it knows; a look at some cells often suffices.
-    some_of = slice(None, None, 32), slice(None, None, 32)
-    return np.array_equal(some[some_of], others[some_of]) and np.array_equal(some, others)

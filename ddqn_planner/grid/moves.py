@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ddqn_planner.compiled import in_place
+from ddqn_planner.compiled import in_place, inlined
 from ddqn_planner.grid.arguments import Cell, Cells, Choice, Occupancy, cell_inside
 
 if TYPE_CHECKING:
@@ -83,25 +83,22 @@ def move_costs(multiplier: NDArray[np.float32], move_rule: MoveRule | str) -> ND
 
 def path_length(cells: Cells, move_rule: MoveRule | str = MoveRule.ROBOT_SAFE) -> float:
     """Return the length in cells of a path of straight segments between the given cells."""
+    return float(_segment_lengths(cells, move_rule).sum())
+
+
+def path_cost(grid: GridMap, cells: Cells, move_rule: MoveRule | str) -> float:
+    """Return the cost of a path of moves: see `move_costs`."""
     x, y = np.asarray(cells, dtype=np.int64).reshape(-1, 2).T
-    return float(segment_lengths(np.diff(x), np.diff(y), move_rule).sum())
+    multiplier = grid.multipliers_in((y, x)).astype(np.float64)
+    of_moves = _segment_lengths(cells, move_rule) * (multiplier[1:] + multiplier[:-1]) / 2
+    return float(of_moves.sum())
 
 
-def path_cost(cells: Cells, multipliers: NDArray[np.float32], move_rule: MoveRule | str) -> float:
-    """Return the cost of a path, given the multipliers of its N cells: see `move_costs`."""
-    x, y = np.asarray(cells, dtype=np.int64).reshape(-1, 2).T
-    lengths = segment_lengths(np.diff(x), np.diff(y), move_rule)
-    multipliers = multipliers.astype(np.float64)
-    return float((lengths * (multipliers[1:] + multipliers[:-1]) / 2).sum())
-
-
-def segment_lengths(
-    dx: NDArray[np.int64], dy: NDArray[np.int64], move_rule: MoveRule | str
-) -> NDArray[np.float64]:
-    """Return the length of each straight segment (dx, dy); under `MoveRule.UNIT`, its moves."""
-    if MoveRule(move_rule) is MoveRule.UNIT:
-        return np.maximum(np.abs(dx), np.abs(dy)).astype(np.float64)
-    lengths: NDArray[np.float64] = np.hypot(dx, dy)
+def _segment_lengths(cells: Cells, move_rule: MoveRule | str) -> NDArray[np.float64]:
+    """Return the length of each straight segment of a path; under `MoveRule.UNIT`, its moves."""
+    steps = np.diff(np.asarray(cells, dtype=np.int64).reshape(-1, 2).T)
+    is_unit = MoveRule(move_rule) is MoveRule.UNIT
+    lengths: NDArray[np.float64] = np.abs(steps * 1.0).max(axis=0) if is_unit else np.hypot(*steps)
     return lengths
 
 
@@ -166,65 +163,52 @@ def _dijkstra(grid: GridMap, goal: Cell, move_rule: MoveRule | str) -> Any:
 def component_labels(occupancy: Any, reach: int) -> Any:
     """Return (H, W) int32 labels, see `GridMap.labels`."""
     height, width = occupancy.shape
-    labels, edges = (
-        np.zeros((height, width), np.int32),
-        np.empty(height * (width + 1) + 1, np.int32),
-    )
-    parent, label_of_run = np.empty((2, edges.size // 2), np.int32)
-    ends = np.empty(height, np.int32)
-    _label(np.ascontiguousarray(occupancy), reach, labels, edges, parent, label_of_run, ends)
-    return labels
+    labels = np.zeros((height + 1, width + 2), np.int32)
+    _label(np.ascontiguousarray(occupancy), reach, labels, np.zeros(labels.size // 2, np.int32))
+    return labels[1:, 1:-1]
 
 
 @in_place
-def _label(
-    occupancy: Any, reach: int, labels: Any, edges: Any, parent: Any, label_of_run: Any, ends: Any
-) -> None:  # pragma: no cover
-    """Label free cells by union-find over runs of them."""
-    # Run r of a row is from edges[2 * r] to before edges[2 * r + 1]. Runs of neighbouring rows are
-    # connected if they overlap when one of them is `reach` cells longer at both ends. `parent` is
-    # in a run's component, never after the run; `ends` has the first run after each row.
-    height, width = occupancy.shape
-    edge_count = above = first = 0
+def _label(occupancy: Any, reach: int, labels: Any, parent: Any) -> None:  # pragma: no cover
+    """Label free cells by union-find, given a border of 0 on three sides of the labels."""
+    count, (height, width) = 0, occupancy.shape
     for y in range(height):
-        previous = True
-        for x in range(width):  # without a branch: on a random map, most would be mispredicted
-            edges[edge_count] = x
-            edge_count += occupancy[y, x] != previous
-            previous = occupancy[y, x]
-        if not previous:
-            edges[edge_count] = width
-            edge_count += 1
-        ends[y] = edge_count // 2
-        for run in range(first, ends[y]):
-            left, right = edges[2 * run] - reach, edges[2 * run + 1] + reach
-            while above < first and edges[2 * above + 1] <= left:
-                above += 1
-            root = parent[run] = run
-            while above < first and edges[2 * above] < right:
-                other = above
-                while parent[other] != other:
-                    parent[other] = parent[parent[other]]
-                    other = parent[other]
-                if other < root:
-                    parent[root] = root = other
-                else:
-                    parent[other] = root
-                if edges[2 * above + 1] >= right:  # it may be connected to the next run too
-                    break
-                above += 1
-        above, first = first, ends[y]
-    count = first = 0
-    for y in range(height):
-        for run in range(first, ends[y]):
-            if parent[run] == run:
+        for x in range(width):
+            if occupancy[y, x]:
+                continue
+            label = labels[y + 1, x]
+            sides = 0 if labels[y, x + 1] else reach  # a free cell above joins those beside it
+            for column in range(x + 1 - sides, x + 2 + sides):
+                above = labels[y, column]
+                if label == 0:
+                    label = above
+                elif above != 0 and above != label:
+                    label, above = _root(label, parent), _root(above, parent)
+                    parent[max(label, above)] = label = min(label, above)
+            if label == 0:
                 count += 1
-                label_of_run[run] = count
-            else:
-                label_of_run[run] = label_of_run[parent[run]]
-            for x in range(edges[2 * run], edges[2 * run + 1]):
-                labels[y, x] = label_of_run[run]
-        first = ends[y]
+                parent[count] = label = count
+            labels[y + 1, x + 1] = label
+    # A parent is less than its children: numbers are in the order of the components' first cells.
+    components = 0
+    for label in range(1, count + 1):
+        if parent[label] == label:
+            components += 1
+            parent[label] = components
+        else:
+            parent[label] = parent[parent[label]]
+    for y in range(height):
+        for x in range(width):
+            labels[y + 1, x + 1] = parent[labels[y + 1, x + 1]]
+
+
+@inlined
+def _root(label: int, parent: Any) -> int:
+    """Return the least label of those that are joined so far, and shorten the way to it."""
+    while parent[label] != label:
+        parent[label] = parent[parent[label]]
+        label = parent[label]
+    return label
 
 
 @in_place

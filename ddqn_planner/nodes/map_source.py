@@ -40,7 +40,6 @@ UPDATES_QUALITY = QoSProfile(depth=100)
 REMEDY = "let the map's publisher send the full map"
 
 CHANGED_SHARE = 0.02  # of cells: with more, experience is spread anew over the map, slowly
-NO_MAP = GridMap(np.zeros((1, 1), dtype=np.bool_))
 
 
 @dataclass
@@ -323,7 +322,6 @@ class ExpectedTimes:
         self._experience: Experience | None = None
         self._layout: Any = None  # of the message that it came in
         self._spread_on: GridMap | None = None
-        self._applied = (NO_MAP, NO_MAP)  # the last map, without times and with them
         # What the worker was asked last, and its answer.
         self._outcome, self._forecast = NO_REQUEST, Future()
         group = MutuallyExclusiveCallbackGroup()  # it waits for the worker
@@ -371,16 +369,9 @@ class ExpectedTimes:
             return grid
         if self._spread_on is None or not is_like(grid, self._spread_on):
             self._spread_on = grid
-        (before, timed), share = self._applied, self._node.value("exploration")
-        of_places = self._experience.apply(self._spread_on, share)
-        boxes = grid.patches_since(before)
-        if boxes is None or timed.slowness is not of_places.slowness:
-            seconds = of_places.seconds_per_cell
-            timed = grid.with_layers(slowness=of_places.slowness, seconds_per_cell=seconds)
-        else:
-            timed = timed.with_boxes_of(grid, boxes)
-        self._applied = grid, timed
-        return timed
+        of_places = self._experience.apply(self._spread_on, self._node.value("exploration"))
+        slowness, seconds = of_places.slowness, of_places.seconds_per_cell
+        return grid.with_layers(slowness=slowness, seconds_per_cell=seconds)
 
     def describe(self, outcome: Outcome) -> dict[str, str]:
         """Return how long a plan takes, unless its map is old or untimed, or no memory is left."""

@@ -5,8 +5,9 @@ from __future__ import annotations
 import math
 import threading
 import time
+from collections.abc import Callable
 from functools import cached_property
-from typing import Any, NamedTuple, TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,6 +19,7 @@ from ddqn_planner.grid.grid_map import LAYERS
 from ddqn_planner.model import PropagationQNetwork, QNetwork
 from ddqn_planner.model.move_costs import MoveCosts
 from ddqn_planner.planning import kernels
+from ddqn_planner.planning.kernels import Known
 from ddqn_planner.planning.plan import Plan, PlanStatus
 
 Box: TypeAlias = tuple[slice, ...]  # rows and columns
@@ -113,16 +115,6 @@ class QField:
         return Plan(PlanStatus.SUCCEEDED, np.array(cells), move_rule=self.move_rule, rollout_ms=ms)
 
 
-class Known(NamedTuple):
-    """What is known of a field, see `kernels`."""
-
-    distance: NDArray[np.float64]
-    state: NDArray[np.uint8]
-    opened: NDArray[np.int32]  # the open cells
-    # Whether closed cells have the least distances: those of a repair may be too great.
-    closed_is_final: bool = True
-
-
 class DistanceField(QField):
     """The Q field that costs of moves give; it grows from its goals as far as a request needs."""
 
@@ -154,16 +146,12 @@ class DistanceField(QField):
         """Whether the distances of all cells are known."""
         return not self.known.opened.size
 
-    def _reach(self, start: Cell, limit: int | None = None) -> bool:
-        """Compute the field as far as a start needs it; return whether its distance is known."""
-        number, done = self._number(start), True
-        if not self._is_final(number):
-            distance, state, opened, closed_is_final = self._take()
-            limit = distance.size if limit is None else limit
-            opened, done = kernels.grow(distance, state, opened, self.costs, number, limit)
-            self.known = Known(distance, state, opened, closed_is_final)
-        closed = self.known.state[number] == kernels.CLOSED
-        return bool((done or self.is_whole) and closed)
+    def _grow(self, number: int = 0, limit: int = 2**62) -> bool:
+        """Compute all of the field, or as far as a cell needs it; return if that was enough."""
+        done = self._is_final(number)
+        if not done:
+            self.known, done = kernels.grow(self._take(), self.costs, number, limit)
+        return done
 
     def _is_final(self, number: int) -> bool:
         """Return whether no more of the field is needed to know the distance of a cell."""
@@ -179,20 +167,17 @@ class DistanceField(QField):
         finally:
             self._lock.release()
 
-    def rollout(self, start: Cell, straight: bool = False, limit: int | None = None) -> Plan:
+    def rollout(self, start: Cell, straight: bool = False, limit: int = 2**62) -> Plan:
         """Return the path; ROLLOUT_TRAPPED if more cells than the limit must be visited for it."""
         start = cell_inside(start, self.grid.occupancy.shape, "the start")
+        number, toward = self._number(start), self.goal if straight else start
         with self._lock:
-            if not self._reach(start, limit):
-                status = PlanStatus.NO_PATH if self.is_whole else PlanStatus.ROLLOUT_TRAPPED
-                return Plan(status, move_rule=self.move_rule)
+            if not self._grow(number, limit):
+                return Plan(PlanStatus.ROLLOUT_TRAPPED, move_rule=self.move_rule)
+            if self.known.state[number] != kernels.CLOSED:
+                return Plan(PlanStatus.NO_PATH, move_rule=self.move_rule)
             began = time.perf_counter()
-            path = kernels.roll_out(
-                self.known.distance,
-                self.costs,
-                self._number(start),
-                self.goal if straight else start,
-            )
+            path = kernels.roll_out(self.known.distance, self.costs, number, toward)
         ms = 1e3 * (time.perf_counter() - began)
         return Plan(PlanStatus.SUCCEEDED, path, move_rule=self.move_rule, rollout_ms=ms)
 
@@ -204,37 +189,30 @@ class DistanceField(QField):
         # For one start, repair and new field take turns, each time with four times the limit: the
         # quicker one wins. The older field then begins anew, or else stays as it is.
         most = max(REPAIRED, int(REPAIRED_SHARE * self.grid.occupancy.size))
-        has_values_of_all = not vars(old).keys().isdisjoint(("q", "value", "policy"))
-        limit = most if start is None or has_values_of_all else REPAIRED
+        limit = most if start is None else REPAIRED
         with old._lock:
             taken = old._take()
-            distance, state, opened = _moved(taken, old.grid, self.grid, shift)
-            while True:
-                reopened, kept = kernels.take_back(distance, state, self.costs, changed, limit)
-                if kept:
-                    opened = np.concatenate([opened, reopened])
-                    self.known = Known(distance, state, opened, closed_is_final=False)
-                    return True
+            moved = _moved(taken, old.grid, self.grid, shift)
+            while (repaired := kernels.take_back(moved, self.costs, changed, limit)) is None:
                 limit *= 4
-                quicker = start is None or limit > most or self._reach(start, VISITS * limit)
-                if quicker or self.is_whole:
-                    old.known = taken
-                    return True
+                if start and limit <= most and not self._grow(self._number(start), VISITS * limit):
+                    continue
+                old.known = taken
+                return True
+            self.known = repaired
+        return True
 
-    def _whole(self) -> NDArray[np.float64]:
-        """Return the distance of every cell of the padded map, 0 where there is none: (C,)."""
-        if not self.is_whole:
-            distance, state, opened, _ = self._take()
-            opened, _ = kernels.grow(distance, state, opened, self.costs, 0, 2**62)
-            self.known = Known(distance, state, opened)
-        return self.known.distance
+    def _layer(self, layer_of: Callable[..., NDArray[Any]]) -> NDArray[Any]:
+        """Return what a kernel computes for each cell of the whole field: (..., H, W)."""
+        with self._lock:
+            self._grow()
+            layer = layer_of(self.known.distance, self.costs)
+        return layer.reshape(*layer.shape[:-1], -1, self.costs.width)[..., 1:-1, 1:-1]
 
     @cached_property
     def q(self) -> NDArray[np.float32]:  # type: ignore[override]
         """(8, H, W) float32: Q(s, a); -inf where no path to the goal begins with the action."""
-        with self._lock:
-            q = kernels.q_of(self._whole(), self.costs)
-        return q.reshape(8, -1, self.costs.width)[:, 1:-1, 1:-1]
+        return self._layer(kernels.q_of)
 
     @cached_property
     def legal(self) -> NDArray[np.bool_]:  # type: ignore[override]
@@ -244,10 +222,7 @@ class DistanceField(QField):
     @cached_property
     def value(self) -> NDArray[np.float32]:
         """(H, W) float32: the greatest Q of a legal move, and at the goal the greatest of all."""
-        with self._lock:
-            distance = self._whole().reshape(-1, self.costs.width)[1:-1, 1:-1]
-            value = np.negative(distance, dtype=np.float32, casting="same_kind")
-        np.copyto(value, -np.inf, where=value == 0)  # sooner than by an index; goals are 0 too
+        value = self._layer(kernels.value_of)
         greatest = value.max()
         for x, y in self.goals:
             value[y, x] = greatest
@@ -256,9 +231,7 @@ class DistanceField(QField):
     @cached_property
     def policy(self) -> NDArray[np.int8]:
         """(H, W) int8: the action of a rollout in each cell; -1 without one."""
-        with self._lock:
-            policy = kernels.policy_of(self._whole(), self.costs)
-        return policy.reshape(-1, self.costs.width)[1:-1, 1:-1]
+        return self._layer(kernels.policy_of)
 
     @property
     def nbytes(self) -> int:
@@ -332,14 +305,14 @@ def changed_cells(old: GridMap, new: GridMap, shift: Cell) -> NDArray[np.int32] 
     return numbers[(numbers > width) & (numbers < last)].astype(np.int32)
 
 
-def _moved(known: Known, old: GridMap, new: GridMap, shift: Cell) -> tuple[NDArray[Any], ...]:
-    """Return a field's distance, state and open cells with each cell where the new map has it."""
+def _moved(known: Known, old: GridMap, new: GridMap, shift: Cell) -> Known:
+    """Return what is known of a field with each cell where the new map has it."""
     if shift == (0, 0) and old.occupancy.shape == new.occupancy.shape:
-        return known[:3]
+        return known
     before, after = overlap(old, new, shift)
     shape = new.height + 2, new.width + 2
     distance, state = np.zeros(shape), np.zeros(shape, dtype=np.uint8)
     for layer, source in ((distance, known.distance), (state, known.state)):
         layer[1:-1, 1:-1][after] = source.reshape(-1, old.width + 2)[1:-1, 1:-1][before]
     opened = np.flatnonzero(state == kernels.OPEN).astype(np.int32)
-    return distance.ravel(), state.ravel(), opened
+    return Known(distance.ravel(), state.ravel(), opened)

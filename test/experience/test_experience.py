@@ -316,8 +316,11 @@ def test_two_processes_that_save_one_file_lose_nothing(tmp_path: Path) -> None:
 def test_what_was_merged_is_as_if_one_robot_had_driven_all() -> None:
     drives = [straight((2, y), (12, y), slowness) for y, slowness in ((2, 2), (5, 4), (8, 3))]
     one = driven(drives[0], drives[1])
-    one.merge(driven(drives[1], drives[2]))
+    other = driven(drives[1], drives[2])
+    other.record_failure((7, 7))
+    one.merge(other)
     together = driven(drives[0], drives[1], drives[1], drives[2])
+    together.record_failure((7, 7))
     np.testing.assert_allclose(one.slowness(HALL), together.slowness(HALL), rtol=0.1)
 
 

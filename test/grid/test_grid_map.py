@@ -209,6 +209,21 @@ def test_a_wrong_patch_is_named_and_the_remedy_too() -> None:
                 GridMap(ZEROS, cost=cost).with_patch(*arguments)
 
 
+@pytest.mark.parametrize(
+    ("name", "value"), [("slowness", np.float32(2)), ("forbidden", np.uint8(2))]
+)
+def test_maps_tell_their_patches_where_all_else_is_the_same(name: str, value: Any) -> None:
+    grid = GridMap(ZEROS, cost=ZEROS)
+    patched, layer = grid.with_patch([[1]], 2, 1), np.full((2, 3), value)
+    before, after = (each.with_layers(**{name: layer}) for each in (grid, patched))
+    assert after.patches_since(before) == [(slice(1, 2), slice(2, 3))]
+    assert after.patches_since(after) == []
+    for other in (grid, patched, grid.with_layers(**{name: layer.copy()})):
+        assert after.patches_since(other) is None
+    for name in ("occupancy", "cost"):
+        assert after.with_layers(**{name: getattr(after, name)}).patches_since(before) is None
+
+
 RESOLUTION = 0.05
 
 

@@ -65,7 +65,7 @@ def test_no_path_depends_on_the_past(place: Place, rule: MoveRule, data: Data) -
             assert plan == field.rollout(start, straight)
         assert (plan.status is PlanStatus.NO_PATH) == np.isinf(exact[start[::-1]])
         if plan.cells:
-            cost = path_cost(plan.cells, grid.multipliers(plan.cells), rule)
+            cost = path_cost(grid, plan.cells, rule)
             assert cost == pytest.approx(exact[start[::-1]], rel=2e-2)
     assert_same(grown, whole)
 
@@ -255,7 +255,7 @@ def test_a_map_made_of_others_is_as_new(place: Place, rule: MoveRule, data: Data
         fresh = replace(fresh, seconds_per_cell=grid.seconds_per_cell)
         start, goal = (data.draw(st.sampled_from(grid.free_cells()[::7])) for _ in range(2))
         assert planner.plan(grid, start, goal, rule) == new_planner().plan(fresh, start, goal, rule)
-        costs, new = (one.fields._map(grid, rule).costs for one in (planner, new_planner()))
+        costs, new = (one.fields._costs(grid, rule) for one in (planner, new_planner()))
         assert costs is not None
         assert new is not None
         for ours, expected in ((costs.patch, new.patch), (costs.value, new.value)):
@@ -355,7 +355,7 @@ def run_until(line: int, step: Callable[[], object]) -> None:
 
     before = sys.gettrace()
     with pytest.MonkeyPatch.context() as patch, suppress(MemoryError):
-        for name in ("_grow", "_still_open", "_take_back"):
+        for name in ("_grow", "_take_back"):
             patch.setattr(kernels, name, getattr(kernels, name).__wrapped__)
         sys.settrace(trace)
         try:

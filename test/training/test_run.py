@@ -9,7 +9,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ddqn_planner import GridMap, MoveRule
-from ddqn_planner.files import FolderError
 from ddqn_planner.grid import path_length
 from ddqn_planner.model import load_model
 from ddqn_planner.training import run as run_module
@@ -96,7 +95,7 @@ def test_a_folder_of_something_else_is_left(small: Scenario, tmp_path: Path, nam
     path = tmp_path / name
     path.parent.mkdir(exist_ok=True)
     path.write_text("mine")
-    with pytest.raises(FolderError, match="no training; give a new or empty folder") as error:
+    with pytest.raises(ValueError, match="no training; give a new or empty folder") as error:
         open_run(tmp_path, small)
     assert name.split("/")[0] in str(error.value)
     assert [entry for entry in tmp_path.rglob("*") if entry.is_file()] == [path]
@@ -109,7 +108,7 @@ def test_a_folder_is_of_one_run_at_a_time(small: Scenario, tmp_path: Path) -> No
     for _ in range(100):
         next(steps)
     before = contents(tmp_path)
-    with pytest.raises(FolderError, match=f"another process trains in {tmp_path}"):
+    with pytest.raises(ValueError, match=f"another process trains in {tmp_path}"):
         open_run(tmp_path, small)
     assert contents(tmp_path) == before
     first.close()
