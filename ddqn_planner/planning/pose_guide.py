@@ -75,6 +75,15 @@ def sink(key: Any, number: int, place: int, keys: Any, numbers: Any, size: int) 
 
 
 @inlined
+def pop(keys: Any, numbers: Any, size: int) -> int:
+    """Take the first entry away; return the new size."""
+    size -= 1
+    if size > 0:
+        sink(keys[size], numbers[size], 0, keys, numbers, size)
+    return size
+
+
+@inlined
 def has_room(x: int, y: int, aim: Any, room: Any, world: Any, body: Any) -> bool:
     """Return whether the origin may pass a tile; looks once."""
     tile, side = y * aim.columns + x, 1 << aim.shift
@@ -168,9 +177,7 @@ def spread(
     while size > 0 and keys[0] <= limit:
         key, number = keys[0], numbers[0]
         end = key
-        size -= 1
-        if size > 0:
-            sink(keys[size], numbers[size], 0, keys, numbers, size)
+        size = pop(keys, numbers, size)
         y = number // (columns + 1)
         x = number - y * (columns + 1)
         here, ahead = left[number], way_to_box(x, y, box)

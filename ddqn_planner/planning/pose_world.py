@@ -214,6 +214,12 @@ def tile_of(x: int, y: int, columns: int) -> int:
 
 
 @inlined
+def is_inside(x: int, y: int, world: Any) -> bool:
+    """Return whether a cell lies inside the map."""
+    return bool(0 <= x < world.width and 0 <= y < world.height)
+
+
+@inlined
 def is_far(x: int, y: int, world: Any, body: Any) -> bool:
     """Return whether no occupied cell is within reach of a tile; looks at most once."""
     tile = tile_of(x, y, world.columns)

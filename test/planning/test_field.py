@@ -65,7 +65,7 @@ def test_no_path_depends_on_the_past(place: Place, rule: MoveRule, data: Data) -
             assert plan == field.rollout(start, straight)
         assert (plan.status is PlanStatus.NO_PATH) == np.isinf(exact[start[::-1]])
         if plan.cells:
-            cost = path_cost(plan.cells, grid.multipliers(plan.cells), rule)
+            cost = path_cost(grid, plan.cells, rule)
             assert cost == pytest.approx(exact[start[::-1]], rel=2e-2)
     assert_same(grown, whole)
 
