@@ -1,7 +1,5 @@
 """Functions that numba compiles. Nothing is imported or compiled before the first call."""
 
-from __future__ import annotations
-
 import logging
 import zlib
 from collections.abc import Callable
