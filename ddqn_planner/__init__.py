@@ -1,7 +1,5 @@
 """Plans robot paths on grid maps with a Double DQN."""
 
-from __future__ import annotations
-
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 

@@ -31,7 +31,7 @@ class HelpFormatter(argparse.HelpFormatter):
     """Shows the default of each option that has one."""
 
     def _get_help_string(self, action: argparse.Action) -> str:
-        has_default = action.default not in (None, argparse.SUPPRESS) and action.nargs != 0
+        has_default = action.default not in (None, "", argparse.SUPPRESS) and action.nargs != 0
         return f"{action.help} (default: %(default)s)" if has_default else str(action.help)
 
 
@@ -81,7 +81,7 @@ def train_any_map(parser: argparse.ArgumentParser, arguments: Sequence[str]) -> 
 
 
 def train_robot(parser: argparse.ArgumentParser, arguments: Sequence[str]) -> int:
-    """Train a model of a robot with a body and a heading; exit code 1 if it cannot be proved."""
+    """Train a model of a robot with a body and a heading. Exit code 1 if it cannot be proved."""
     from tqdm import tqdm
 
     from ddqn_planner.model import save_model
@@ -190,27 +190,23 @@ def learn(parser: argparse.ArgumentParser, arguments: Sequence[str]) -> int:
     from ddqn_planner.experience.drives import EXPERIENCE, LOCK, RECORD, Drive
     from ddqn_planner.experience.recordings import read_recording
 
-    add = parser.add_argument
     words = "trainers' folders, bags, MCAP files, or CSV files with the columns seconds, x, y"
-    add("drives", type=Path, nargs="+", help=words)
-    add("--map", required=True, help="ROS map YAML, or name of a shipped map")
-    words = "by default experience.npz in the first folder, or beside the first file"
-    add("--out", type=Path, metavar="FILE", help=words)
-    words = "older experience that the drives add to; else all is learned anew"
-    add("--experience", type=Path, metavar="FILE", help=words)
-    words = "metres per second in the open, a first guess; by default 0.5, or that of --experience"
-    add("--nominal-speed", type=float, metavar="X", help=words)
-    words = "metres; by default 0.5, or that of --experience"
-    add("--robot-width", type=float, metavar="X", help=words)
-    words = "MCAP: the topic of the poses or transforms, by default the one with most of them"
-    add("--topic", default="", help=words)
-    add("--frame", default="map", help="MCAP: the map's frame")
-    words = "MCAP: the robot's frame in transforms, by default any that ends in base_link"
-    add("--robot-frame", default="", help=words)
+    parser.add_argument("drives", type=Path, nargs="+", help=words)
+    parser.add_argument("--map", required=True, help="ROS map YAML, or name of a shipped map")
+    for name, kind, default, words in (
+        ("out", Path, None, "by default experience.npz in the first folder, or beside the file"),
+        ("experience", Path, None, "older file that the drives add to; else all is learned anew"),
+        ("nominal-speed", float, None, "a first guess, m/s; by default 0.5, or --experience's"),
+        ("robot-width", float, None, "metres; by default 0.5, or --experience's"),
+        ("topic", str, "", "MCAP: of poses or transforms, by default that with most of them"),
+        ("frame", str, "map", "MCAP: the map's frame"),
+        ("robot-frame", str, "", "MCAP: by default any that ends in base_link"),
+    ):
+        parser.add_argument(f"--{name}", type=kind, default=default, metavar="X", help=words)
     options = parser.parse_args(arguments)
     grid = api.load_map(find_map(options.map))
-    names = "nominal_speed", "robot_width"
-    given = {name: value for name in names if (value := getattr(options, name)) is not None}
+    of_robot = {"nominal_speed": options.nominal_speed, "robot_width": options.robot_width}
+    given = {name: value for name, value in of_robot.items() if value is not None}
     if options.experience:
         experience = api.Experience.load(options.experience)
         if changed := differences({name: getattr(experience, name) for name in given}, given):
@@ -263,15 +259,8 @@ def warm_up(parser: argparse.ArgumentParser, arguments: Sequence[str]) -> int:
     return 0
 
 
-COMMANDS: Final = {
-    "plan": ("plan a path on a map file", plan),
-    "train": ("train a model on a map file", train),
-    "train-any-map": ("train a model for any map on random maps", train_any_map),
-    "train-robot": ("train a model of a robot with a body and a heading", train_robot),
-    "certify": ("prove which moves a model takes for possible", certify),
-    "warm-up": ("compile what plans need, once after an installation", warm_up),
-    "learn": ("learn from recorded drives how long places take", learn),
-}
+FUNCTIONS: Final = plan, train, train_any_map, train_robot, certify, warm_up, learn
+COMMANDS: Final = {function.__name__.replace("_", "-"): function for function in FUNCTIONS}
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -282,13 +271,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
     arguments = sys.argv[1:] if arguments is None else arguments
     parser = argparse.ArgumentParser(prog="ddqn-planner", description=str(__doc__).replace("`", ""))
     names = parser.add_subparsers(required=True, metavar="|".join(COMMANDS))
-    parsers = {
-        name: names.add_parser(
+    parsers = {}
+    for name, command in COMMANDS.items():
+        words, _, _ = str(command.__doc__).partition(".")
+        parsers[name] = names.add_parser(
             name, help=words, description=command.__doc__, formatter_class=HelpFormatter
         )
-        for name, (words, command) in COMMANDS.items()
-    }
     if not arguments or arguments[0] not in COMMANDS:
         parser.parse_args(arguments)  # ends with the help, or an error
     name, *others = arguments
-    return exit_code(parser.prog, lambda: COMMANDS[name][1](parsers[name], others))
+    return exit_code(parser.prog, lambda: COMMANDS[name](parsers[name], others))

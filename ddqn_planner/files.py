@@ -1,7 +1,5 @@
 """Writes files so that a crash or a full disk never leaves half a file or half a record."""
 
-from __future__ import annotations
-
 import csv
 import fcntl
 import io
@@ -64,10 +62,6 @@ def differences(saved: Mapping[str, object], now: Mapping[str, object]) -> str:
     return ", ".join(f"{name} {value} (now {new})" for name, value, new in pairs if value != new)
 
 
-class FolderError(ValueError):
-    """A folder belongs to something else, or another process works in it."""
-
-
 class WorkFolder:
     """A folder in which one process works until `close` or its end; a missing folder is made."""
 
@@ -80,7 +74,7 @@ class WorkFolder:
         names = sorted(path.name for path in folder.iterdir())
         if names and not any((folder / name).is_file() for name in marks):
             held = f"{folder} holds {reprlib.repr(names)} but no {content}"
-            raise FolderError(f"{held}; give a new or empty folder")
+            raise ValueError(f"{held}; give a new or empty folder")
         self.folder, self._after = folder, after
         self.save_error = ""  # why the last save failed; empty if it did not
         self._open_files = ExitStack()
@@ -91,7 +85,7 @@ class WorkFolder:
                 fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
             except BlockingIOError:
                 remedy = "wait for its end, stop it, or give another folder"
-                raise FolderError(f"another process {works} in {folder}; {remedy}") from None
+                raise ValueError(f"another process {works} in {folder}; {remedy}") from None
             for path in folder.iterdir():
                 if TEMPORARY.fullmatch(path.name):  # of a process that was killed
                     path.unlink()

@@ -1,7 +1,5 @@
 """Plans to look at: as text, in a terminal's colours, and as a picture file. No ROS is needed."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any

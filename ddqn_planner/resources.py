@@ -1,7 +1,5 @@
 """Finds the shipped maps and models, and says what to install where a library is missing."""
 
-from __future__ import annotations
-
 import os
 from pathlib import Path
 from typing import Final

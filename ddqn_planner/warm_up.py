@@ -1,22 +1,17 @@
 """All that is compiled for a planner: by a node before it is active, or at an installation."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
-from typing import TYPE_CHECKING
 
-if TYPE_CHECKING:
-    from ddqn_planner.planning import Planner
+import numpy as np
+
+from ddqn_planner.experience import Experience
+from ddqn_planner.grid import GridMap
+from ddqn_planner.planning import Planner
+from ddqn_planner.planning.paths import is_path_valid
 
 
 def warm_up(planner: Planner, learns: bool = False) -> Iterator[None]:
     """Plan on small maps in all ways; yield between what many requests need and the rest."""
-    import numpy as np
-
-    from ddqn_planner.experience import Experience
-    from ddqn_planner.grid import GridMap
-    from ddqn_planner.planning.paths import is_path_valid
-
     sizes = planner.metadata.sizes
     free = np.zeros((sizes.get("height", 8), sizes.get("width", 8)), np.bool_)
     start, goal = (0, 0), (free.shape[1] - 1, free.shape[0] - 1)
@@ -45,10 +40,6 @@ def warm_up(planner: Planner, learns: bool = False) -> Iterator[None]:
 
 def _plan_poses(planner: Planner) -> None:
     """Plan where a wall divides a map, through it, and past a far box, and look what is left."""
-    import numpy as np
-
-    from ddqn_planner.grid import GridMap
-
     assert planner.pose_planner is not None
     reach, cell = planner.pose_planner.body.reach, planner.pose_planner.motions.resolution
     room = 2 * reach + 48  # cells; a field visits more of its states before it looks at the map

@@ -13,7 +13,7 @@ from ddqn_planner.experience.posterior import FEW_PLACES, NOISE, Posterior
 from ddqn_planner.experience.prior import Prior
 from ddqn_planner.grid import GridMap
 from ddqn_planner.grid.arguments import MAX_SLOWNESS
-from ddqn_planner.grid.grid_map import check_grid, equal
+from ddqn_planner.grid.grid_map import check_grid
 
 Float64 = NDArray[np.float64]
 
@@ -211,7 +211,7 @@ class Evidence:
         if (
             posterior is None
             or (posterior.grid.resolution, posterior.grid.origin) != (grid.resolution, grid.origin)
-            or not equal(posterior.grid.occupancy, grid.occupancy)
+            or not np.array_equal(posterior.grid.occupancy, grid.occupancy)
         ):
             posterior = Posterior(grid, self.side)
         posterior.grid = grid

@@ -1,7 +1,5 @@
 """The robot's body: which cells are too near to an obstacle, and which are better avoided."""
 
-from __future__ import annotations
-
 import sys
 from typing import Any
 

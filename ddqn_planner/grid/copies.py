@@ -1,7 +1,5 @@
 """Copies of large arrays that differ in few cells, and share the memory of the others."""
 
-from __future__ import annotations
-
 import math
 import mmap
 import os

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ddqn_planner.grid import arguments
-from ddqn_planner.grid.arguments import OCCUPIED, UNKNOWN, Cell, Cells, Occupancy
+from ddqn_planner.grid.arguments import OCCUPIED, UNKNOWN, Cell, Occupancy
 from ddqn_planner.grid.copies import Box, replaced
 from ddqn_planner.grid.moves import MoveRule, component_labels, flood, legal_moves
 
@@ -235,11 +235,6 @@ class GridMap:
         """(H, W) float32: what a path costs per cell of its length: 1 to 5, times the slowness."""
         return self.multipliers_in(...)
 
-    def multipliers(self, cells: Cells) -> NDArray[np.float32]:
-        """Return (N,) float32: the cost multiplier of some cells (N, 2) of the map."""
-        x, y = np.asarray(cells, dtype=np.int64).reshape(-1, 2).T
-        return self.multipliers_in((y, x))
-
     def multipliers_in(self, where: Any) -> NDArray[np.float32]:
         """Return the cost multipliers that an index of NumPy names."""
         multiplier = np.ones(self.occupancy[where].shape, dtype=np.float32)
@@ -312,9 +307,9 @@ class GridMap:
         boxes = self.patches_since(other)
         if boxes is not None:
             return not any(self.differs(other, box, box).any() for box in reversed(boxes))
-        return self._occupied == other._occupied and all(
-            equal(getattr(self, name), getattr(other, name)) for name in LAYERS
-        )
+        layers = ((getattr(self, name), getattr(other, name)) for name in LAYERS)
+        same = (mine is its or np.array_equal(mine, its) for mine, its in layers)
+        return self._occupied == other._occupied and all(same)
 
     def differs(self, other: GridMap, box: Box, others_box: Box) -> NDArray[np.bool_]:
         """Return which cells of boxes of two maps with the same layers differ."""
@@ -385,12 +380,3 @@ def _costs(cost: ArrayLike, occupancy: Occupancy) -> NDArray[np.int8]:
         of_free[occupancy] = 0
     arguments.numbers("cost", of_free, between=(UNKNOWN, OCCUPIED - 1))
     return of_free.astype(np.int8, copy=False)
-
-
-def equal(some: NDArray[Any] | None, others: NDArray[Any] | None) -> bool:
-    """Return whether two layers are equal, soon where they are the same or very different."""
-    if some is None or others is None or some is others:
-        return some is others
-    # A planner compares a map with each one that it knows; a look at some cells often suffices.
-    some_of = slice(None, None, 32), slice(None, None, 32)
-    return np.array_equal(some[some_of], others[some_of]) and np.array_equal(some, others)

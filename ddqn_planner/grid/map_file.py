@@ -1,7 +1,5 @@
 """Map files: ROS maps (YAML and an image) are read and written, MovingAI maps are read."""
 
-from __future__ import annotations
-
 import os
 import re
 import reprlib
@@ -65,15 +63,13 @@ class MapFile:
     def __post_init__(self) -> None:
         values = numbers("the array of values", self.values, between=(UNKNOWN, OCCUPIED))
         values = values.astype(np.int8)
-        occupancy = values == OCCUPIED
-        grid = GridMap(occupancy, self.resolution, self.origin, forbidden=self.forbidden)
         values.flags.writeable = False
-        names = "resolution", "origin", "forbidden"
-        checked = {"values": values, **{name: getattr(grid, name) for name in names}}
+        grid = GridMap(values == OCCUPIED, self.resolution, self.origin, forbidden=self.forbidden)
+        checked = {name: getattr(grid, name) for name in ("resolution", "origin", "forbidden")}
         for name in ("start", "goal"):
             if (cell := getattr(self, name)) is not None:
                 checked[name] = cell_inside(cell, values.shape, name)
-        vars(self).update(checked)  # the dataclass is frozen
+        vars(self).update(checked, values=values)  # the dataclass is frozen
 
     def grid(
         self, occupied_threshold: int = 65, allow_unknown: bool = False, use_map_costs: bool = False
@@ -163,8 +159,8 @@ def save_map(grid: GridMap | MapFile, path: str | Path) -> None:
         "occupied_thresh": 0.65,
         "free_thresh": 0.196,  # grey 205 would be free at 0.25
     }
-    scenario = (("start", grid.start), ("goal", grid.goal))
-    ours: dict[str, Any] = {name: list(cell) for name, cell in scenario if cell is not None}
+    cells = {"start": grid.start, "goal": grid.goal}
+    ours: dict[str, Any] = {name: list(cell) for name, cell in cells.items() if cell is not None}
     if grid.forbidden is not None:
         ours["directions"] = f"{path.stem}_directions.pgm"
         write_atomically(path.with_name(ours["directions"]), _pgm(grid.forbidden))
@@ -202,16 +198,13 @@ def _read_moving_ai(path: Path) -> MapFile:
     if not 1 <= height * width <= MAX_CELLS:
         raise ValueError(f"height is {height}, width is {width}; give 1 to {MAX_CELLS} cells")
     rows = content[header.end() :].replace(b"\r\n", b"\n").rstrip(b"\n") + b"\n"
-    count = rows.count(b"\n")
-    if count != height:
-        raise MapDataError(f"{path}: has {count} rows; its header says {height}")
-    cells = np.frombuffer(rows, dtype=np.uint8)
-    lengths = np.diff(np.flatnonzero(cells == ord("\n")), prepend=-1) - 1
-    if (lengths != width).any():
-        row = int(np.argmax(lengths != width))
-        raise MapDataError(f"{path}: row {row} has {lengths[row]} characters; give {width}")
+    count, cells = rows.count(b"\n"), np.frombuffer(rows, dtype=np.uint8)
+    ends = cells[width :: width + 1]
+    if cells.size != height * (width + 1) or count != height or (ends != ord("\n")).any():
+        right = f"{height} rows of {width}, as its header says"
+        raise MapDataError(f"{path}: has {count} rows, {cells.size - count} cells; give {right}")
     free = np.isin(cells.reshape(height, width + 1)[:, :-1], list(b".GS"))
-    return MapFile(np.where(free, np.int8(0), np.int8(100)))
+    return MapFile(np.where(free, np.int8(0), np.int8(OCCUPIED)))
 
 
 def _read_ros(path: Path) -> MapFile:
@@ -281,9 +274,8 @@ def _layout(image: Any) -> str:
     codec, *_, arguments = image.tile[0]
     layout, *rest = [arguments] if isinstance(arguments, str) else arguments
     # The last argument of a PPM is its greatest value, unless that is the greatest of its bytes.
-    scaled = codec.startswith("ppm") and rest not in ([], [255])
-    if image.mode == "I" and rest == [65535]:
-        scaled = False
+    greatest = 65535 if image.mode == "I" else 255
+    scaled = codec.startswith("ppm") and rest not in ([], [greatest])
     if scaled or layout not in LAYOUTS or codec == "bmp_rle":
         raise ValueError(f"its pixels are stored as {codec} {arguments}; save an 8-bit PNG")
     if "transparency" in image.info and image.mode != "P":

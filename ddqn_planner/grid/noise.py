@@ -2,8 +2,6 @@
 
 # The trained models and the documented figures depend on it: a seed must always give the same.
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
-from typing import Any, NamedTuple
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
-from geometry_msgs.msg import Point, PoseStamped
+from geometry_msgs.msg import Point
 from nav_msgs.msg import OccupancyGrid
+from numpy.typing import NDArray
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
 from rclpy.event_handler import PublisherEventCallbacks
 from rclpy.exceptions import InvalidHandle
@@ -17,12 +18,12 @@ from rclpy.publisher import Publisher
 from std_msgs.msg import ColorRGBA, Header
 from visualization_msgs.msg import Marker, MarkerArray
 
-from ddqn_planner.grid import MOVES, Cell, GridMap, MoveRule
+from ddqn_planner.grid import MOVES, GridMap
 from ddqn_planner.grid.motions import turn_between
 from ddqn_planner.nodes.conversions import value_message
 from ddqn_planner.nodes.report import Outcome
 from ddqn_planner.nodes.runtime import LATCHED, Worker
-from ddqn_planner.planning import Planner, QField
+from ddqn_planner.planning import QField
 from ddqn_planner.planning.plan import PosePlan
 
 MAX_ARROWS = 10_000  # more take longer to make than a plan, and are too small to see
@@ -37,94 +38,84 @@ ARROW = np.array([-0.35, 0.35, 0.1 + 0.175j, 0.1 - 0.175j])
 DIRECTIONS = np.exp(1j * np.arctan2(MOVES[:, 1], MOVES[:, 0]))
 
 
-class Shown(NamedTuple):
-    """A Q field, perhaps not computed yet, or the path of a body; none without a planner."""
-
-    planner: Planner | None
-    grid: GridMap
-    goal: Cell
-    move_rule: MoveRule | None
-    plan: PosePlan | None
-    asked: PoseStamped | None  # the goal: a new one is shown, though its field may be shown already
-    header: Header
-
-    def field(self) -> QField | None:
-        """Return the field, which is computed."""
-        planner, grid, goal, move_rule, *_ = self
-        return planner.q_field(grid, goal, move_rule) if planner is not None else None
-
-
 @dataclass
 class Layer:
     """A topic, the function that makes its messages, and whether the last one shows anything."""
 
     name: str
     publisher: Publisher
-    message: Callable[[Shown], Any]
-    is_of_body: bool = False
+    message: Callable[[Outcome], Any]
     is_due: bool = False
     shows: bool = False
 
-    def has(self, shown: Shown) -> bool:
+    def has(self, outcome: Outcome) -> bool:
         """Return whether there is anything to show."""
-        return shown.planner is not None and self.is_of_body == (shown.plan is not None)
+        has_body = isinstance(outcome.plan, PosePlan)
+        return outcome.planner is not None and has_body == (self.name == "footprints")
 
 
 class FieldDisplay:
     """Publishes what subscribers ask for: ``~/value``, ``~/policy``, ``~/footprints``."""
 
-    def __init__(self, node: Node) -> None:
-        self._logger = node.get_logger()
-        # Its own thread: neither requests nor maps wait for a field that is only shown.
-        self._worker = Worker(node)
-        self._shown: Shown | None = None
+    # Its worker has no other calls: neither requests nor maps wait for a field that is only shown.
+    def __init__(self, node: Node, worker: Worker) -> None:
+        self._logger, self._worker = node.get_logger(), worker
+        self._shown: Outcome | None = None
         self._look = node.create_guard_condition(self._on_look, MutuallyExclusiveCallbackGroup())
         matched = PublisherEventCallbacks(matched=lambda _: self._look.trigger())
 
-        def layer(name: str, kind: Any, message: Callable[[Shown], Any], *of: bool) -> Layer:
+        def layer(name: str, kind: Any, message: Callable[[Outcome], Any]) -> Layer:
             publisher = node.create_publisher(kind, f"~/{name}", LATCHED, event_callbacks=matched)
-            return Layer(name, publisher, message, *of)
+            return Layer(name, publisher, message)
 
         self._layers = (
-            layer("value", OccupancyGrid, lambda it: value_message(it.field(), it.grid, it.header)),
-            layer("policy", MarkerArray, lambda it: policy_message(it.field(), it.grid, it.header)),
-            layer("footprints", MarkerArray, footprint_message, True),
+            layer("value", OccupancyGrid, lambda it: value_message(*_field_of(it))),
+            layer("policy", MarkerArray, lambda it: policy_message(*_field_of(it))),
+            layer("footprints", MarkerArray, footprint_message),
         )
 
-    def show(self, outcome: Outcome, header: Header) -> None:
+    def show(self, outcome: Outcome) -> None:
         """Show the field of an outcome from now on; none if it has none, as of another goal."""
-        request, goal, shown = outcome.request, outcome.plan.goal, self._shown
-        if request is not None and goal is not None:
-            rule, plan = getattr(request, "move_rule", None), outcome.plan
-            path = plan if isinstance(plan, PosePlan) else None
-            shown = Shown(outcome.planner, request.grid, goal, rule, path, outcome.goal, header)
-        elif shown is not None:
-            header = Header(stamp=header.stamp, frame_id=shown.header.frame_id)
-            shown = shown._replace(planner=None, header=header)
-        if shown is None:
-            return
-        if self._shown is None or self._shown[:-1] != shown[:-1]:
-            self._shown = shown
+        last = self._shown
+        if outcome.plan.goal is None and last is not None:
+            header = Header(stamp=outcome.header.stamp, frame_id=last.header.frame_id)
+            outcome = replace(last, planner=None, header=header)
+        if outcome.plan.goal and (last is None or _visible(outcome) != _visible(last)):
+            self._shown = outcome
             for layer in self._layers:
                 layer.is_due = True
             self._look.trigger()
 
     async def _on_look(self) -> None:
         for layer in self._layers:
-            shown = self._shown
-            if shown is None or not layer.is_due:
+            if self._shown is None or not layer.is_due:
                 continue
-            has_any = layer.has(shown)
+            has_any = layer.has(self._shown)
             # What is latched is cleared even if nobody subscribes now.
             if not (layer.publisher.get_subscription_count() if has_any else layer.shows):
                 continue
             layer.is_due, layer.shows = False, has_any
             try:
-                layer.publisher.publish(await self._worker.call(layer.message, shown))
+                layer.publisher.publish(await self._worker.call(layer.message, self._shown))
             except InvalidHandle:  # cleaned up meanwhile
                 return
             except Exception as error:  # as when no memory is left: the node must survive
                 self._logger.error(f"no {layer.name} is shown ({error!r}); give a smaller map")
+
+
+def _visible(outcome: Outcome) -> tuple[object, ...]:
+    """Return what is shown of an outcome: another goal is, though its field may be the same."""
+    request, plan = outcome.request, outcome.plan
+    way = plan if isinstance(plan, PosePlan) else getattr(request, "move_rule", None)
+    return outcome.planner, request and request.grid, plan.goal, outcome.goal, way
+
+
+def _field_of(outcome: Any) -> tuple[QField | None, GridMap, Header]:
+    """Return the field of an outcome, which is computed, its map, and the header."""
+    request, planner, goal = outcome.request, outcome.planner, outcome.plan.goal
+    is_shown = planner is not None and not isinstance(outcome.plan, PosePlan)
+    field = planner.q_field(request.grid, goal, request.move_rule) if is_shown else None
+    return field, request.grid, outcome.header
 
 
 def policy_message(field: QField | None, grid: GridMap, header: Header) -> MarkerArray:
@@ -141,40 +132,38 @@ def policy_message(field: QField | None, grid: GridMap, header: Header) -> Marke
     arrows = centres[:, None] + step * ARROW * DIRECTIONS[policy[rows, columns], None]
     origin_x, origin_y, yaw = grid.origin
     arrows = complex(origin_x, origin_y) + grid.resolution * np.exp(1j * yaw) * arrows
-
-    marker = _lines("policy", rows.size, LINE_WIDTH * step * grid.resolution, header)
-    corners = map(_point, arrows.real.ravel().tolist(), arrows.imag.ravel().tolist())
-    # The lines share their points, because most of the time goes into making messages.
-    for tail, tip, left, right in zip(corners, corners, corners, corners, strict=True):
-        marker.points.extend((tail, tip, tip, left, tip, right))
-    return MarkerArray(markers=[marker])
+    width = LINE_WIDTH * step * grid.resolution
+    # From tail to tip, and from there along both barbs.
+    return _lines("policy", arrows, (0, 1, 1, 2, 1, 3), width, header)
 
 
-def footprint_message(shown: Shown) -> MarkerArray:
+def footprint_message(outcome: Outcome) -> MarkerArray:
     """Make a message with a body's outlines along its path; without one, it deletes the last."""
-    outlines = np.empty((0, 0), dtype=np.complex128)
-    body = shown.planner.pose_planner if shown.planner is not None else None
-    if body is not None and shown.plan is not None:
-        x, y, yaw = shown.plan.poses.T
-        turn = np.abs(turn_between(yaw[:-1], yaw[1:]))
-        passed = np.cumsum(np.hypot(np.diff(x), np.diff(y)) + turn * TURN) // APART
-        at = np.append(True, np.diff(passed, prepend=0) > 0)
-        corners = body.footprint @ [1, 1j]
-        outlines = (x + 1j * y)[at, None] + np.exp(1j * yaw)[at, None] * corners
-    marker = _lines("footprints", len(outlines), BODY_LINE, shown.header)
-    for outline in outlines:
-        points = [*map(_point, outline.real.tolist(), outline.imag.tolist())]
-        for side in zip(points, points[1:] + points[:1], strict=True):
-            marker.points.extend(side)
-    return MarkerArray(markers=[marker])
+    body = outcome.planner.pose_planner if outcome.planner is not None else None
+    if body is None or not isinstance(outcome.plan, PosePlan):
+        return _lines("footprints", np.empty((0, 0)), (), BODY_LINE, outcome.header)
+    x, y, yaw = outcome.plan.poses.T
+    turn = np.abs(turn_between(yaw[:-1], yaw[1:]))
+    passed = np.cumsum(np.hypot(np.diff(x), np.diff(y)) + turn * TURN) // APART
+    at = np.append(True, np.diff(passed, prepend=0) > 0)
+    corners = body.footprint @ [1, 1j]
+    outlines = (x + 1j * y)[at, None] + np.exp(1j * yaw)[at, None] * corners
+    sides = [corner % len(corners) for n in range(len(corners)) for corner in (n, n + 1)]
+    return _lines("footprints", outlines, sides, BODY_LINE, outcome.header)
 
 
-def _lines(name: str, count: int, width: float, header: Header) -> Marker:
-    """Return a marker for lines; without any, it deletes the last one."""
+def _lines(
+    name: str, shapes: NDArray[Any], ends: Sequence[int], width: float, header: Header
+) -> MarkerArray:
+    """Return a marker with lines between the corners of each shape; none deletes the last one."""
     marker = Marker(header=header, ns=name, type=Marker.LINE_LIST, color=COLOUR)
-    marker.action = Marker.ADD if count else Marker.DELETE
+    marker.action = Marker.ADD if len(shapes) else Marker.DELETE
     marker.pose.position.z, marker.pose.orientation.w, marker.scale.x = HEIGHT, 1.0, width
-    return marker
+    for shape in shapes:
+        # The lines share their points, because most of the time goes into making messages.
+        corners = [*map(_point, shape.real.tolist(), shape.imag.tolist())]
+        marker.points.extend([corners[end] for end in ends])
+    return MarkerArray(markers=[marker])
 
 
 def _point(x: float, y: float) -> Point:

@@ -2,21 +2,15 @@
 
 from __future__ import annotations
 
-import threading
-import time
 from collections.abc import Callable
 from contextlib import suppress
-from functools import partial
 from typing import Any
 
-from rclpy.event_handler import EventHandler
 from rclpy.exceptions import InvalidHandle
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.task import Task
 from rclpy.waitable import NumberOfEntities
-
-EVENTS_PERIOD = 0.5  # seconds: how late a busy node may hear that publishers or subscribers came
 
 # What a wait set waits for, as it calls them, and where a node has them.
 KINDS = {
@@ -39,38 +33,24 @@ class NodeExecutor(SingleThreadedExecutor):
     """Runs one node as rclpy's executor does, and waits for it at a fraction of the cost."""
 
     # rclpy's makes a wait set each time that it waits, and wakes itself after each callback.
-    def __init__(self) -> None:
-        super().__init__()
-        self._thread, self._events_due = threading.get_ident(), 0.0
-        self._has_changed = True  # the node has other entities than the wait set
+    _has_changed = True  # the node has other entities than the wait set
 
     def wake(self) -> None:
         """Wait for what the node has now."""
         self._has_changed = True
         super().wake()
 
-    def create_task(self, callback: Any, *arguments: Any, **options: Any) -> Task:
-        """Call a function soon, in the thread of the executor."""
-        if threading.get_ident() != self._thread:  # which may wait
-            return super().create_task(callback, *arguments, **options)
-        self._tasks.append((task := Task(callback, arguments, options, executor=self), None, None))
-        return task
-
     def spin_once(self, timeout_sec: float | None = None) -> None:
         """Wait until something is ready, and run it."""
         self._wait()
-        self._run_tasks()
-
-    def _run_tasks(self) -> None:
-        """Run all tasks until they are done or await something."""
-        before = -1
-        while before < 0 or len(self._tasks) < before:  # others may have awaited what is done now
+        has_ended = True
+        while has_ended:  # others may have awaited what is done now
             for task, *_ in self._tasks:  # also those that begin meanwhile
                 task()
                 task.result()  # or the exception of its callback
             with self._tasks_lock:
-                before = len(self._tasks)
-                self._tasks = [it for it in self._tasks if not (it[0].done() or it[0].cancelled())]
+                left = [it for it in self._tasks if not (it[0].done() or it[0].cancelled())]
+                has_ended, self._tasks = len(left) < len(self._tasks), left
 
     def _look_at_node(self) -> None:
         self._has_changed, (node,) = False, self.get_nodes()
@@ -84,39 +64,33 @@ class NodeExecutor(SingleThreadedExecutor):
         counts = [it.get_num_entities() for it in self._waitables]
         count = sum(counts, NumberOfEntities(*map(kinds.count, KINDS)))
         sizes = (getattr(count, name) for name in count.__slots__)
-        wait_set = self._wait_set = rclpy_implementation.WaitSet(*sizes, self.context.handle)
-        # Of each callback group an entity, and what adds all of them: a node waits often.
-        self._groups: dict[Any, tuple[Any, list[Callable[[], None]]]] = {}
-        for (kind, _), entity in self._entities.items():
-            _, adding = self._groups.setdefault(entity.callback_group, (entity, []))
-            adding.append(partial(getattr(wait_set, f"add_{kind}"), entity.handle))
+        self._wait_set = rclpy_implementation.WaitSet(*sizes, self.context.handle)
 
     def _wait(self) -> None:
-        """Wait until something is ready, and create tasks for it."""
+        """Wait until something is ready, and begin to call it."""
         if self._has_changed:
             self._look_at_node()
-        waitables = [it for it in self._waitables if it.callback_group.can_execute(it)]
-        wait_set, timeout = self._wait_set, -1
-        if (seconds := self._events_due - time.monotonic()) > 0:  # events are half of them
-            waitables = [it for it in waitables if not isinstance(it, EventHandler)]
-            timeout = int(1e9 * seconds)
-        else:
-            self._events_due = time.monotonic() + EVENTS_PERIOD
+        wait_set = self._wait_set
         wait_set.clear_entities()
         wait_set.add_guard_condition(self._guard.handle)
-        for group, (entity, adding) in self._groups.items():
-            for add in adding if group.can_execute(entity) else ():
-                add()
+        for (kind, _), entity in self._entities.items():
+            if entity.callback_group.can_execute(entity):
+                getattr(wait_set, f"add_{kind}")(entity.handle)
+        waitables = [it for it in self._waitables if it.callback_group.can_execute(it)]
         for waitable in waitables:
             waitable.add_to_wait_set(wait_set)
-        wait_set.wait(timeout)
+        wait_set.wait(-1)
         for waitable in waitables:
             if waitable.is_ready(wait_set):
-                self.create_task(self._execute, waitable, self._take_waitable)
+                self._begin(waitable, self._take_waitable)
         for kind in KINDS:
             for pointer in wait_set.get_ready_entities(kind):
                 if entity := self._entities.get((kind, pointer)):
-                    self.create_task(self._execute, entity, getattr(self, f"_take_{kind}"))
+                    self._begin(entity, getattr(self, f"_take_{kind}"))
+
+    def _begin(self, entity: Any, take: Callable[[Any], Any]) -> None:
+        # Not by `create_task`, which would wake the executor.
+        self._tasks.append((Task(self._execute, (entity, take), executor=self), None, None))
 
     async def _execute(self, entity: Any, take: Callable[[Any], Any]) -> None:
         """Call an entity's callback, unless another of its group runs, or the node has changed."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import ctypes
 from collections.abc import Callable, Coroutine
 from contextlib import suppress
+from dataclasses import replace
 from typing import Any
 
 from geometry_msgs.msg import PoseArray, PoseStamped
@@ -12,7 +13,7 @@ from nav_msgs.msg import Path
 from nav_msgs.srv import GetPlan
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup, ReentrantCallbackGroup
 from rclpy.parameter import Parameter
-from std_msgs.msg import Header, UInt8MultiArray
+from std_msgs.msg import UInt8MultiArray
 
 from ddqn_planner.model import model_of
 from ddqn_planner.nodes.conversions import along, bytes_of, path_bytes, path_message
@@ -50,7 +51,7 @@ class PlannerNode(ManagedNode):
         self._settings = self.settings()
         self._looks = self.create_timer(LOOK_PERIOD, self._on_look, clock=STEADY)
         self._report = Report(self, self._look_soon)
-        self._worker, self._map_worker = Worker(self), Worker(self)
+        self._worker, self._map_worker, self._display_worker = (Worker(self) for _ in range(3))
         self._model = ModelSource(self, self._report, self._worker)
         if self._settings.autostart:
             # While it loads, DDS discovers, and the node says what else is missing.
@@ -80,7 +81,7 @@ class PlannerNode(ManagedNode):
     def configure(self) -> None:
         """Listen to the map and to where the robot is, and create what answers requests."""
         super().configure()
-        self._display = FieldDisplay(self)
+        self._display = FieldDisplay(self, self._display_worker)
         self._plan_publisher = self.create_publisher(Path, "plan", LATCHED)
         # In a group of its own: triggers that come while it plans make it plan once more after.
         group = MutuallyExclusiveCallbackGroup()
@@ -205,9 +206,8 @@ class PlannerNode(ManagedNode):
     async def _on_get_plan(self, request: Any, response: Any) -> Any:
         start = request.start if request.start.header.frame_id else None
         goals = [request.goal]
-        planning = self._requests.plan(start, goals, request.tolerance)
-        header, outcome = await self._answer(goals, planning)
-        (response.plan,) = _paths(outcome, header, path_message)
+        outcome = await self._answer(goals, self._requests.plan(start, goals, request.tolerance))
+        (response.plan,) = _paths(outcome, path_message)
         self._report.log(outcome)
         return response
 
@@ -218,30 +218,34 @@ class PlannerNode(ManagedNode):
         active, goals = self._active, self._active.poses
         if not goals:
             return
-        planning = self._requests.plan(None, goals, followed=active)
-        header, outcome = await self._answer(goals, planning)
-        if outcome in (UNCHANGED, NOT_ACTIVE):
+        planning = self._requests.plan(None, goals, followed=active.path, active=active)
+        outcome = await self._answer(goals, planning)
+        if outcome.status in (UNCHANGED.status, NOT_ACTIVE.status):
             return
+        self._publish(outcome, active)
         self._improve_later(outcome, active)
-        if active.is_news(outcome, header.frame_id):
-            self._plan_publisher.publish(*_paths(outcome, header, path_bytes))
         self._waits_for_pose = outcome.status in ("NO_START", "TF_ERROR")
         # Not the reason: its places and lengths may differ.
         logged = goals, outcome.goal, outcome.status, outcome.plan.method
         if self._logged != logged:
             self._logged = logged
             self._report.log(outcome)
-        self._display.show(outcome, header)
+
+    def _publish(self, outcome: Outcome, active: ActiveGoal) -> None:
+        if active.is_news(outcome):
+            self._plan_publisher.publish(*_paths(outcome, path_bytes))
+        self._display.show(outcome)
 
     async def _plan_for_action(
         self, start: PoseStamped | None, goals: list[PoseStamped], name: str, given_up: GivenUp
     ) -> tuple[Path, Outcome]:
-        followed = self._followed
-        planning = self._requests.plan(start, goals, None, name, followed)
-        header, outcome = await self._answer(goals, planning, given_up)
-        to_publish, path = _paths(outcome, header, path_bytes, path_message)
-        if outcome.request is not None and len(outcome.plan.path):
-            followed.keep(way_of(outcome.plan), outcome.request.grid, header.frame_id)
+        form = self._settings.path_simplification
+        planning = self._requests.plan(start, goals, None, name, self._followed)
+        outcome = await self._answer(goals, planning, given_up)
+        to_publish, path = _paths(outcome, path_bytes, path_message)
+        if len(outcome.plan.path):
+            if form == self._settings.path_simplification:  # else the next path is a new one
+                self._followed = way_of(outcome)
             # It gets the better path with its next request.
             self._improve_later(outcome, None)
             self._plan_publisher.publish(to_publish)
@@ -260,11 +264,9 @@ class PlannerNode(ManagedNode):
         def given_up() -> Outcome | None:
             return None if outcome is self._newest else UNCHANGED
 
-        header, better = await self._answer([], self._requests.improve(outcome), given_up)
-        if better.request is not None and active is self._active:
-            if active.is_news(better, header.frame_id):
-                self._plan_publisher.publish(*_paths(better, header, path_bytes))
-            self._display.show(better, header)
+        better = await self._answer([], self._requests.improve(outcome), given_up)
+        if active is self._active and better.request is not None:
+            self._publish(better, active)
 
     async def _on_is_path_valid(self, request: Any, response: Any) -> Any:
         """Answer Nav2's IsPathValid: whether the robot can drive the rest of a path."""
@@ -281,11 +283,11 @@ class PlannerNode(ManagedNode):
         goals: list[PoseStamped],
         planning: Coroutine[None, None, Outcome],
         given_up: GivenUp = lambda: None,
-    ) -> tuple[Header, Outcome]:
-        """Plan, unless the node stops or the request is given up; return the path's header, too."""
+    ) -> Outcome:
+        """Plan, unless the node stops or the request is given up."""
         self._answering += 1
         try:
-            outcome = await unless(planning, lambda: self._refusal or given_up())
+            outcome: Outcome = await unless(planning, lambda: self._refusal or given_up())
         except RequestError as error:
             outcome = Outcome(error.status, str(error))
         except Exception as error:  # as when no memory is left: the node must survive
@@ -298,7 +300,7 @@ class PlannerNode(ManagedNode):
         frame = self._map.frame or (goals[0].header.frame_id if goals else "")
         if outcome.goal is not None:  # the map may be another one by now
             frame = outcome.goal.header.frame_id
-        return self.header(frame), outcome
+        return replace(outcome, header=self.header(frame))
 
     # Diagnostics
 
@@ -338,14 +340,14 @@ class PlannerNode(ManagedNode):
             self._replan.trigger()
 
 
-def _paths(outcome: Outcome, header: Header, *makers: Callable[..., Any]) -> list[Any]:
+def _paths(outcome: Outcome, *makers: Callable[..., Any]) -> list[Any]:
     """Return the path of an outcome, or an empty one, as functions of `conversions` make it."""
+    plan, header = outcome.plan, outcome.header
     if outcome.request is None or outcome.goal is None:
         return [Path(header=header) for _ in makers]
-    if isinstance(outcome.plan, PosePlan):
-        poses = outcome.plan.poses
-        return [make(poses[:, :2], poses[:, 2], header) for make in makers]
-    along_path = along(outcome.plan.path, outcome.request.grid, outcome.is_dense)
+    if isinstance(plan, PosePlan):
+        return [make(plan.poses[:, :2], plan.poses[:, 2], header) for make in makers]
+    along_path = along(plan.path, outcome.request.grid, outcome.is_dense)
     return [make(*along_path, header, outcome.goal.pose.orientation) for make in makers]
 
 

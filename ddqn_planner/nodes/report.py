@@ -12,6 +12,7 @@ import numpy as np
 from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from geometry_msgs.msg import PoseStamped
+from std_msgs.msg import Header
 
 from ddqn_planner.grid import Cell
 from ddqn_planner.nodes.runtime import BaseNode
@@ -58,6 +59,7 @@ class Outcome:
     goal: PoseStamped | None = None  # in the map's frame
     map_stamp: str = ""  # seconds
     is_dense: bool = False  # whether its path has a pose at least every cell
+    header: Header = field(default_factory=Header)  # of its path
 
 
 NO_REQUEST = Outcome("NO_REQUEST", "no plan was asked for yet")

@@ -10,7 +10,7 @@ from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from types import SimpleNamespace
-from typing import Any, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 from geometry_msgs.msg import PoseStamped
@@ -48,32 +48,24 @@ UNCHANGED = Outcome("UNCHANGED", "the active goal needs no new plan")
 T = TypeVar("T")
 
 
-@dataclass
-class PathUnderWay:
+class PathUnderWay(NamedTuple):
     """The last path to a goal: poses, or cells of the map that it was planned on."""
 
     path: Any = ()
     grid: GridMap | None = None
     frame: str = ""
 
-    def keep(self, path: Any, grid: GridMap, frame: str) -> None:
-        """Take the place of the path before."""
-        self.path, self.grid, self.frame = path, grid, frame
-
-    def next_request(self, request: Request, header: Header, settings: Any) -> Any:
-        """Return the request for a plan that may keep the path, in cells of the request's map."""
-        path: Any = ()
+    def on(self, request: Request, frame: str) -> Any:
+        """Return the path in cells of a request's map, or none if that has another place."""
         # A path of cells is none of poses: the model may be another one.
         fits = len(self.path) > 0 and len(self.path[0]) == len(request.start)
-        if fits and self.grid is not None and header.frame_id == self.frame:
-            path = self.path
-            if isinstance(request, PlanRequest):
-                path, shift = (), shift_between(self.grid, request.grid)
-                if shift is not None and request.grid.contains(
-                    tuple(np.add(self.path[-1], shift).tolist())
-                ):
-                    path = np.asarray(self.path, np.int32) + np.array(shift, np.int32)
-        return replace(request, under_way=path, switch_threshold=settings.switch_threshold)
+        if not fits or self.grid is None or frame != self.frame:
+            return ()
+        if isinstance(request, PoseRequest):
+            return self.path
+        shift = shift_between(self.grid, request.grid)
+        cells = None if shift is None else np.asarray(self.path) + np.array(shift, np.int32)
+        return () if cells is None or not request.grid.contains((*cells[-1].tolist(),)) else cells
 
 
 class ActiveGoal:
@@ -98,39 +90,36 @@ class ActiveGoal:
             self._looks, self._next_look = True, time.monotonic() + replan_period
         return is_due
 
-    def next_request(
-        self, planner: Planner, request: Request, header: Header, settings: Any
-    ) -> Any:
-        """Return the request for the next plan; None while there is no reason to plan."""
-        grid, period = request.grid, settings.replan_period
+    def is_due(self, planner: Planner, request: Request, header: Header, period: float) -> bool:
+        """Return whether there is a reason to plan."""
         start = request.cells[0], *(round(yaw / HEADING) for yaw in request.start[2:])
+        planned, frame = (request.grid, start, header), header.frame_id
         looks, self._looks = self._looks or period == 0, False
-        # A map that came again as it was is planned on, so that the diagnostics name the last one.
-        if self._planned == (grid, start, header):
-            return None
-        request, frame = self.path.next_request(request, header, settings), header.frame_id
         is_followed = self._shown == (frame, PlanStatus.SUCCEEDED.name) and not looks
-        if is_followed and len(_rest(planner, request)):
-            return None
-        self.path.keep(request.under_way, grid, frame)
-        self._planned, self._next_look = (grid, start, header), time.monotonic() + period
-        return request
+        # A map that came again as it was is planned on, so that the diagnostics name the last one.
+        if self._planned == planned or (is_followed and len(_rest(planner, request))):
+            return False
+        self.path = PathUnderWay(request.under_way, request.grid, frame)
+        self._planned, self._next_look = planned, time.monotonic() + period
+        return True
 
-    def is_news(self, outcome: Outcome, frame: str) -> bool:
+    def is_news(self, outcome: Outcome) -> bool:
         """Return whether to publish the path of an outcome, which may be empty."""
-        path, request, shown = way_of(outcome.plan), outcome.request, (frame, outcome.status)
-        is_new_path = len(path) > 0 and outcome.plan.extra_cost is None
+        way, shown = way_of(outcome), (outcome.header.frame_id, outcome.status)
+        is_new_path = len(way.path) > 0 and outcome.plan.extra_cost is None
         is_news, self._shown = is_new_path or shown != self._shown, shown
-        if request is None:
+        if outcome.request is None:
             self._planned = None
-        elif is_news and len(path):
-            self.path.keep(path, request.grid, frame)
+        elif is_news and len(way.path):
+            self.path = way
         return is_news
 
 
-def way_of(plan: Plan) -> Any:
-    """Return a path as the next request knows it: its poses, or its cells."""
-    return plan.poses if isinstance(plan, PosePlan) else plan.path
+def way_of(outcome: Outcome) -> PathUnderWay:
+    """Return the path of an outcome as the next request knows it: its poses, or its cells."""
+    plan, grid = outcome.plan, outcome.request.grid if outcome.request else None
+    path = plan.poses if isinstance(plan, PosePlan) else plan.path
+    return PathUnderWay(path, grid, outcome.header.frame_id)
 
 
 def _rest(planner: Planner, request: Request) -> Any:
@@ -254,7 +243,8 @@ class Requests:
         goals: list[PoseStamped],
         tolerance: float | None = None,
         planner_id: str = "",
-        followed: ActiveGoal | PathUnderWay | None = None,
+        followed: PathUnderWay | None = None,
+        active: ActiveGoal | None = None,
     ) -> Outcome:
         """Plan from a start or where the robot is, through all goals; to one if they are active."""
         # As they are now, like the map and the model, whatever changes while it waits.
@@ -287,14 +277,14 @@ class Requests:
             first, second, *more = map(pose_of, poses)
             limits = metres, settings.yaw_tolerance
             request = PoseRequest(grid, first, (second,), limits, settings.path_bound)
-        if isinstance(followed, ActiveGoal):
-            followed.poses[:] = poses[1:]  # there they stay, though their own frame moves
+        if active is not None:
+            active.poses[:] = poses[1:]  # there they stay, though their own frame moves
             if several:
                 request, more = request.to_nearest(more), []
-            request = followed.next_request(planner, request, header, settings)
-        elif followed is not None and not more:
-            request = followed.next_request(request, header, settings)
-        if request is None:
+        if followed is not None and not more:
+            way, threshold = followed.on(request, frame), settings.switch_threshold
+            request = replace(request, under_way=way, switch_threshold=threshold)
+        if active and not active.is_due(planner, request, header, settings.replan_period):
             return UNCHANGED
         plans = [await self._plan(planner, request)]
         for goal in more:
@@ -313,8 +303,8 @@ class Requests:
 
     async def improve(self, outcome: Any) -> Outcome:
         """Return the outcome of a request for poses with a path of the least cost."""
-        under_way, goal = way_of(outcome.plan), outcome.goal
-        request = replace(outcome.request, bound=1.0, under_way=under_way)
+        goal = outcome.goal
+        request = replace(outcome.request, bound=1.0, under_way=outcome.plan.poses)
         plan = await self._plan(outcome.planner, request)
         reason = reason_of(request, plan, goal, goal, 0.0)
         improved: Outcome = replace(outcome, request=request, plan=plan, reason=reason)

@@ -8,7 +8,6 @@ import queue
 import signal
 import sys
 import threading
-import weakref
 from collections.abc import Callable, Coroutine, Generator, Iterator, Mapping
 from contextlib import suppress
 from copy import copy
@@ -251,26 +250,24 @@ class Worker:
     def __init__(self, node: Node) -> None:
         # A future alone does not wake an executor in another thread.
         self._wake = node.create_guard_condition(lambda: None)
-        self._calls: queue.SimpleQueue[Callable[[], None] | None] = queue.SimpleQueue()
-        self._thread = threading.Thread(target=_make_calls, args=[self._calls], daemon=True)
+        self._calls: queue.SimpleQueue[Any] = queue.SimpleQueue()
+        self._thread = threading.Thread(target=self._work, daemon=True)
         self._thread.start()
-        weakref.finalize(self, self._calls.put, None)
+
+    def _work(self) -> None:
+        for future, function, arguments in iter(self._calls.get, None):
+            if not future.cancelled():
+                try:
+                    future.set_result(function(*arguments))
+                except Exception as error:
+                    future.set_exception(error)
+                with suppress(InvalidHandle):  # the node was destroyed meanwhile
+                    self._wake.trigger()
+            del future, function, arguments  # they hold a map
 
     def call(self, function: Callable[..., Any], *arguments: object) -> Future:
         """Return the future of a call; it has the exception if the function raises one."""
-        future, wake = Future(), self._wake
-
-        def work() -> None:
-            if future.cancelled():
-                return
-            try:
-                future.set_result(function(*arguments))
-            except Exception as error:
-                future.set_exception(error)
-            with suppress(InvalidHandle):  # the node was destroyed meanwhile
-                wake.trigger()
-
-        self._calls.put(work)
+        self._calls.put((future := Future(), function, arguments))
         return future
 
     async def run(self, function: Callable[..., Any], *arguments: object) -> Any:
@@ -285,12 +282,6 @@ class Worker:
         """Wait until all calls have ended; take no more."""
         self._calls.put(None)
         self._thread.join()
-
-
-def _make_calls(calls: queue.SimpleQueue[Callable[[], None] | None]) -> None:
-    while call := calls.get():
-        call()
-        del call  # it holds a map
 
 
 @coroutine

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import threading
-from collections import OrderedDict
-from dataclasses import dataclass, field
+from functools import cache
+from typing import NamedTuple
 
 from ddqn_planner.grid import Cell, GridMap, MoveRule
 from ddqn_planner.model import QNetwork
@@ -15,20 +15,13 @@ CACHE_BYTES = 2**23  # for a planner's Q fields: 3 of 500 x 500 cells, at 9 byte
 ALWAYS_KEPT = 2  # fields, whatever their size: on a large map, too, a robot drives to and fro
 
 
-@dataclass(eq=False)
-class _KnownMap:
-    """What is known of a map under a move rule: `QNetwork.move_costs`, and fields."""
+class _Kept(NamedTuple):
+    """What is known of a map under a move rule: `QNetwork.move_costs`, and perhaps a field."""
 
     grid: GridMap
-    move_rule: MoveRule
+    rule: MoveRule
     costs: MoveCosts | None
-    fields: OrderedDict[Goals, QField] = field(default_factory=OrderedDict)
-
-    @property
-    def nbytes(self) -> int:
-        """Memory of the fields and the costs, bytes."""
-        of_costs = self.costs.patch.nbytes if self.costs else 0
-        return of_costs + sum(field.nbytes for field in self.fields.values())
+    field: QField | None = None
 
 
 class FieldCache:
@@ -37,99 +30,80 @@ class FieldCache:
     def __init__(self, network: QNetwork) -> None:
         self.network = network
         self.nbytes = CACHE_BYTES
-        self._maps: list[_KnownMap] = []  # used last at the end
+        self._kept: list[_Kept] = []  # used last at the end
         self._lock = threading.Lock()
 
     def has_costs(self, grid: GridMap, rule: MoveRule) -> bool:
         """Return whether the network gives the costs of a map's moves, see `DistanceField`."""
-        return self._map(grid, rule).costs is not None
+        return self._costs(grid, rule) is not None
 
     def find(self, grid: GridMap, goals: Goals, rule: MoveRule) -> QField | None:
         """Return the field of a map toward the nearest of some goals if it is kept, else None."""
-        with self._lock:
-            known = self._known_map(grid, rule)
-            found = known.fields.get(goals) if known else None
-            if known and found:
-                self._use(known, found)
-            return found
+        for kept in self._of_rule(rule):
+            if kept.field and kept.field.goals == goals and grid.same_cells(kept.grid):
+                self._use(_Kept(grid, rule, kept.costs, kept.field))  # the map may lie elsewhere
+                return kept.field
+        return None
 
     def get(self, grid: GridMap, goals: Goals, rule: MoveRule, start: Cell | None = None) -> QField:
         """Return the field of a map toward the nearest of some goals: several, if it has costs."""
-        known = self._map(grid, rule)
-        with self._lock:
-            found = known.fields.get(goals)
-        if found is None:
-            if known.costs is None:
-                found = network_field(self.network, grid, goals[0], rule)
+        field = self.find(grid, goals, rule)
+        if field is None:
+            costs = self._costs(grid, rule)
+            if costs is None:
+                field = network_field(self.network, grid, goals[0], rule)
             else:
-                found = DistanceField(goals, grid, known.costs, rule)
-                self._repair(known, found, start)
-        self._remember(known, found)
-        return found
+                field = DistanceField(goals, grid, costs, rule)
+                self._repair(field, start)
+            self._use(_Kept(grid, rule, costs, field))
+            self._forget()
+        return field
 
-    def _known_map(self, grid: GridMap, rule: MoveRule) -> _KnownMap | None:
-        """Return what is known of an equal map."""
-        for known in reversed(self._maps):
-            if known.move_rule is rule and grid.same_cells(known.grid):
-                known.grid = grid  # which may lie elsewhere
-                return known
-        return None
-
-    def _map(self, grid: GridMap, rule: MoveRule) -> _KnownMap:
-        """Return what is known of an equal map, or what the network says of a new one."""
-        with self._lock:
-            known = self._known_map(grid, rule)
-        if known is not None:
-            return known
-        new = _KnownMap(grid, rule, self._costs(grid, rule))
-        with self._lock:
-            known = self._known_map(grid, rule)  # another thread may have been faster
-            if known is None:
-                # A map on which no goal got a field is not kept.
-                self._maps = [*(other for other in self._maps if other.fields), new]
-        return known or new
+    def _of_rule(self, rule: MoveRule) -> list[_Kept]:
+        """Return what is kept for a move rule, used last first."""
+        return [kept for kept in reversed(self._kept) if kept.rule is rule]
 
     def _costs(self, grid: GridMap, rule: MoveRule) -> MoveCosts | None:
-        """Return the costs of a map's moves, from those of the map that it is a patch of."""
-        for known in reversed(self._maps):
-            boxes = grid.patches_since(known.grid)
-            if boxes is not None and known.move_rule is rule and known.costs is not None:
-                after = known.costs.after(grid, boxes)
-                if after is not None:
-                    return after
-        return self.network.move_costs(grid, rule)
+        """Return the costs of a map's moves: known, from those of the map it patches, or new."""
+        known = self._of_rule(rule)
+        for kept in known:
+            if grid.same_cells(kept.grid):
+                return kept.costs
+        costs = None
+        for kept in known:
+            boxes = grid.patches_since(kept.grid)
+            if boxes is not None and kept.costs is not None and costs is None:
+                costs = kept.costs.after(grid, boxes)
+        costs = costs or self.network.move_costs(grid, rule)
+        self._use(_Kept(grid, rule, costs))
+        return costs
 
-    def _repair(self, known: _KnownMap, new: DistanceField, start: Cell | None) -> None:
+    def _repair(self, new: DistanceField, start: Cell | None) -> None:
         """Give a new field what a field of an older map knows, if there is one."""
-        with self._lock:
-            olders = [other for other in reversed(self._maps) if other is not known]
-        for older in olders:
-            shift = shift_between(older.grid, known.grid)
-            if shift is None or older.move_rule is not known.move_rule:
+        shift_from = cache(lambda older: shift_between(older, new.grid))  # many are of one map
+        for kept in self._of_rule(new.move_rule):
+            old, shift = kept.field, shift_from(kept.grid)
+            if shift is None or not isinstance(old, DistanceField):
                 continue
-            old_goals = tuple((x - shift[0], y - shift[1]) for x, y in new.goals)
-            old = older.fields.get(old_goals)
-            if isinstance(old, DistanceField):
-                if new.take_over(old, shift, start):
-                    with self._lock:  # the place will hardly be again what it was
-                        older.fields.pop(old_goals, None)
+            moved_goals = tuple((x + shift[0], y + shift[1]) for x, y in old.goals)
+            if moved_goals == new.goals and new.take_over(old, shift, start):
+                with self._lock:  # the place will hardly be again what it was
+                    self._kept = [other for other in self._kept if other.field is not old]
                 return
 
-    def _remember(self, known: _KnownMap, used: QField) -> None:
-        """Keep a field, and forget the oldest ones beyond the bound."""
+    def _use(self, used: _Kept) -> None:
+        """Put what is used at the end; of maps without a field, only the last stays."""
         with self._lock:
-            self._use(known, used)
-            size = sum(other.nbytes for other in self._maps)
-            count = sum(len(other.fields) for other in self._maps)
-            while size > self.nbytes and (count := count - 1) >= ALWAYS_KEPT:
-                _, forgotten = self._maps[0].fields.popitem(last=False)
-                size -= forgotten.nbytes
-                if not self._maps[0].fields:
-                    size -= self._maps.pop(0).nbytes
+            others = [kept for kept in self._kept if kept.field and kept.field is not used.field]
+            self._kept = [*others, used]
 
-    def _use(self, known: _KnownMap, used: QField) -> None:
-        """Put a map and its field where those lie that were used last."""
-        known.fields[used.goals] = used
-        known.fields.move_to_end(used.goals)
-        others = (other for other in self._maps if other is not known and other.fields)
-        self._maps = [*others, known]
+    def _forget(self) -> None:
+        """Forget the oldest fields beyond the bound; those of one map share its costs."""
+        size, of_costs = 0, dict[int, int]()
+        with self._lock:
+            for number, kept in enumerate(reversed(self._kept)):
+                size += kept.field.nbytes if kept.field else 0
+                of_costs[id(kept.costs)] = kept.costs.patch.nbytes if kept.costs else 0
+                if number >= ALWAYS_KEPT and size + sum(of_costs.values()) > self.nbytes:
+                    self._kept = self._kept[-number:]
+                    break

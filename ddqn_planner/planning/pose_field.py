@@ -13,13 +13,12 @@ from ddqn_planner.grid import GridMap
 from ddqn_planner.planning import pose_kernels as kernels
 from ddqn_planner.planning.pose_guide import Aim, spread
 from ddqn_planner.planning.pose_kernels import Known
+from ddqn_planner.planning.pose_paths import SAME, Way
 from ddqn_planner.planning.pose_world import SHIFT, TILE, Body, State, World
 
 NO_RESERVE = getattr(mmap, "MAP_NORESERVE", 0x4000)  # not in all versions of Python
-HEAP = 2**14  # entries of a heap, at first
-TAKEN_BACK = 4  # of so many visited states a repair takes one back; else a new field is quicker
-FEW = 2**8  # states that are taken back in no time
-NEAR = 1 / 2  # the share of them around a change from which on it would take back too many
+HEAP = 2**16  # entries that a heap has room for, at least
+LOST = 1 / 2  # of the cost of the last start; if a repair takes more back, a new field is quicker
 UNGUIDED = 2**14  # states that are visited before a look at the map pays
 FINEST = 1  # the shift of the smallest tiles that it looks at
 FIRST = 1.2  # a first path is looked for as if with this bound, if a smaller one is asked for
@@ -42,29 +41,27 @@ class PoseField:
     """The least costs that are known from poses to the nearest of some goals."""
 
     # Grown from the goals toward a start: first by weighted A* that closes a state once, as the
-    # rounds of ARA* do (Likhachev et al. 2003). If the bound is not proved then, by Dijkstra's
-    # order, without what is too far from the start to lead to a path that would disprove it. On a
+    # rounds of ARA* do (Likhachev et al. 2003), then, if the bound is not proved, by A*. On a
     # cheapest path to the start lies a state that is open or waits, and whose cost is the least;
     # else the start's is. So the least cost of one of these, plus what is left from there at least,
     # is a lower bound, which proves how good the start's cost is.
 
     def __init__(self, goals: NDArray[np.int64], grid: GridMap, world: World, body: Body) -> None:
         self.goals = goals  # (N, 3): x, y, heading
-        self.body, self._aim = body, NOWHERE
+        self.body, self._aim, self.visits = body, NOWHERE, 0
+        self.way: Way | None = None  # the last path that followed it
         self._begin(grid, world)
 
     def _begin(self, grid: GridMap, world: World) -> None:
         """Know nothing but the goals."""
-        self.grid, self.world, goals = grid, world, self.goals
-        states = world.tile.size << kernels.TILE_BITS
-        self.known = Known(_untouched(states, np.float32), _untouched(states, np.uint8))
-        self._size, self._waiting, self._round = len(goals), 0, 0
-        entries = max(HEAP, len(goals))
-        self._keys, self._numbers = np.empty(entries, np.float32), np.empty(entries, np.int64)
-        x, y, heading = goals.T
-        self._numbers[: len(goals)] = kernels.number_of(x, y, heading, world.columns)
-        self.known.mark[self._numbers[: len(goals)]] = kernels.OPEN
-        self._weight, self.visits = 0.0, 0
+        self.grid, self.world, tiles = grid, world, world.tile.size
+        states, touched = tiles << kernels.TILE_BITS, np.zeros(tiles, np.bool_)
+        self.known = Known(_untouched(states, np.float32), _untouched(states, np.uint8), touched)
+        x, y, heading = self.goals.T
+        numbers = kernels.number_of(x, y, heading, world.columns)
+        self.known.mark[numbers] = kernels.OPEN
+        touched[numbers >> kernels.TILE_BITS] = True
+        self._size, self._least = 0, math.inf
 
     def number(self, state: State) -> int:
         """Return the number of a state inside the map."""
@@ -79,69 +76,71 @@ class PoseField:
         if number != self._aim.number:
             known = self._aim if start[:2] == self._aim[:2] else NOWHERE
             self._aim = known._replace(x=start[0], y=start[1], number=number)
-            self._weight, self._tried = max(bound, FIRST) ** GREEDY, 0
-            self._order()
+            self.visits = 0  # for this start
+            self._order(max(bound, FIRST) ** GREEDY)
         while True:
-            most = self._until_look(number)
-            most = limit if most < 0 else min(limit, most)
-            visits, done = self._grow(most, 1 / bound)
-            limit, self._tried = limit - visits, self._tried + visits
+            proved = self._bound(number)
+            if proved <= bound * SAME or self._least == math.inf:
+                return proved
+            most = self._until_look(number, limit)
+            self._size, visits, done = kernels.grow(
+                self.known,
+                self._keys,
+                self._numbers,
+                self._size,
+                self._aim,
+                self._weight,
+                1.0 if self._weight > 1 else 1 / bound,
+                most,
+                self.world,
+                self.body,
+            )
+            limit, self.visits = limit - visits, self.visits + visits
             if done:
-                proved = self._bound(number)
-                if proved <= bound * kernels.SAME or not len(self._open()):
-                    return proved
-                self._weight = 0.0
-                self._order()
+                self._order(1.0)
             elif limit == 0:
                 return None
-            elif visits < most:
-                self._reserve(2 * len(self._keys))
-            elif not self._can_leave(number) or not self._guide():
+            elif visits < most:  # the heap is full
+                self._order(self._weight)
+            elif self._can_leave(number):
+                self._look_at_map()
+                self._order(self._weight)
+            else:
                 return math.inf
-
-    def _until_look(self, number: int) -> int:
-        """Return how many states are visited before the next look at the map pays, or -1."""
-        shift, is_found = self._aim.shift, self.known.mark[number] != kernels.UNREACHED
-        # Tiles of half the size take 4 times as long, and show that narrower gaps are closed. Once
-        # a path is known, they hardly prove more.
-        if shift == FINEST or (shift == SHIFT and is_found):
-            return -1
-        return max((UNGUIDED << 3 * (SHIFT + 1 - shift)) - self._tried, 0)
-
-    def _grow(self, limit: int, share: float) -> tuple[int, bool]:
-        """Visit so many states, or fewer; return how many, and whether the round is over."""
-        self._size, self._waiting, visits, done = kernels.grow(
-            self.known,
-            self._keys,
-            self._numbers,
-            self._size,
-            self._waiting,
-            self._aim,
-            self._weight,
-            share,
-            kernels.CLOSED + self._round,
-            limit,
-            self.world,
-            self.body,
-        )
-        self.visits += visits
-        return visits, done
 
     def _bound(self, number: int) -> float:
         """Return how many times the least cost that of the aim may be."""
         if self.known.mark[number] == kernels.UNREACHED:
-            return np.inf
+            return math.inf
         cost = float(self.known.distance[number])
-        least = min(kernels.least_order(self.known, self._open(), self._aim, self.world), cost)
-        return cost / least if least else 1.0
+        return cost / least if (least := min(self._least, cost)) else 1.0
+
+    def _until_look(self, number: int, limit: int) -> int:
+        """Return how many states are visited before the next look at the map pays, or a limit."""
+        shift, is_found = self._aim.shift, self.known.mark[number] != kernels.UNREACHED
+        # Tiles of half the size take 4 times as long, and show that narrower gaps are closed. Once
+        # a path is known, they hardly prove more.
+        if shift == FINEST or (shift == SHIFT and is_found):
+            return limit
+        return min(max((UNGUIDED << 3 * (SHIFT + 1 - shift)) - self.visits, 0), limit)
+
+    def _order(self, weight: float) -> None:
+        """Begin a round: what is open or waits is ordered toward the start."""
+        tiles = np.flatnonzero(self.known.touched)
+        entries = (len(tiles) << kernels.TILE_BITS) + HEAP
+        self._keys, self._numbers = np.empty(entries, np.float32), np.empty(entries, np.int64)
+        heap, self._weight = (self._keys, self._numbers), weight
+        self._size, self._least = kernels.order(
+            self.known, tiles, *heap, self._aim, weight, self.world
+        )
 
     def _can_leave(self, number: int) -> bool:
         """Return whether primitives lead from the start to more than a few states."""
         mark, queue = _untouched(self.known.mark.size, np.uint8), np.empty(UNGUIDED, np.int64)
         return bool(kernels.leads_to(number, mark, queue, self.world, self.body) == len(queue))
 
-    def _guide(self) -> bool:
-        """Look at the map for what is left to the start; return whether a way may exist."""
+    def _look_at_map(self) -> None:
+        """Look at the map for what is left to the start."""
         shift, world = self._aim.shift - 1, self.world
         side = 1 << shift
         columns, rows = -(-world.width // side), -(-world.height // side)
@@ -155,39 +154,6 @@ class PoseField:
         is_goal[y * (columns + 1) + x] = True
         box = np.array([x.min(), y.min(), x.max(), y.max()])
         spread(self._aim, room, keys, numbers, is_goal, box, FURTHER, world, self.body)
-        self._sort(self._size, kernels.OPEN)
-        return bool(np.isfinite(left[is_goal]).any())
-
-    def _reserve(self, entries: int) -> None:
-        """Make the heap so large; what waits stays at its end."""
-        before = self._numbers
-        self._keys = np.append(self._keys, np.empty(entries - len(self._keys), np.float32))
-        self._numbers = np.empty(entries, np.int64)
-        self._numbers[: self._size] = before[: self._size]
-        last = len(before) - self._waiting
-        self._numbers[entries - self._waiting :] = before[last:]
-
-    def _order(self) -> None:
-        """Begin a round: what is open or waits is ordered toward the start."""
-        opened = self._open()
-        self._numbers[: len(opened)] = opened
-        self._sort(len(opened), kernels.WAITING)
-        self._waiting, self._round = 0, self._round + 1
-        if self._round == kernels.ROUNDS:
-            for part in np.split(self.known.mark, range(2**20, self.known.mark.size, 2**20)):
-                if part.max() > kernels.CLOSED:  # so that memory is not used where nothing is
-                    np.minimum(part, kernels.CLOSED, out=part)
-            self._round = 1
-
-    def _sort(self, size: int, last: int) -> None:
-        """Make a heap of the first states whose marks are open to a last one."""
-        heap = self._keys, self._numbers, size
-        self._size = kernels.order(self.known, *heap, self._aim, self._weight, last, self.world)
-
-    def _open(self) -> NDArray[np.int64]:
-        """Return the states that may be open or waiting."""
-        last = len(self._numbers) - self._waiting
-        return np.concatenate([self._numbers[: self._size], self._numbers[last:]])
 
     def rollout(self, start: State) -> tuple[NDArray[np.int64], NDArray[np.float64]] | None:
         """Return the primitives from a start to a goal, and their costs; None without a way."""
@@ -202,28 +168,22 @@ class PoseField:
 
     def repair(self, grid: GridMap, world: World, cells: NDArray[np.int64], opens: bool) -> None:
         """Hold for a map that differs in some cells (N, 2); begin anew where that is quicker."""
-        # `opens` tells whether a way may have got cheaper: what is left to the start, too.
+        # What costs less than all that lost its support is supported still. `opens` tells whether
+        # a way may have got cheaper: what is left to the start, too.
+        reached = float(self.known.distance[self._aim.number])
         self._aim = NOWHERE if opens else self._aim._replace(number=-1)
+        self.grid, self.world, self.way, touched = grid, world, None, self.known.touched
         reach = self.body.reach + TILE
         near = np.zeros((world.columns, world.rows), dtype=np.bool_)
         low, high = np.unique(np.maximum(cells - reach, 0) // TILE, axis=0), 2 * reach // TILE + 1
         for x, y in low:
             near[x : x + high, y : y + high] = True
-        tiles = np.flatnonzero(near.T)
-        marks = self.known.mark.reshape(-1, 1 << kernels.TILE_BITS)[tiles]
-        if np.count_nonzero(marks) > NEAR * self.visits + FEW:
+        around, on_map = near.T.ravel(), (world, self.body)
+        least = kernels.least_unsupported(self.known, np.flatnonzero(around & touched), *on_map)
+        if least < LOST * reached:
             self._begin(grid, world)
             return
-        raised = np.empty(self.visits // TAKEN_BACK + FEW, np.int64)
-        scratch = np.empty(8 * raised.size, np.float32), np.empty(8 * raised.size, np.int64), raised
-        count = kernels.take_back(self.known, tiles, *scratch, world, self.body)
-        if count < 0:
-            self._begin(grid, world)
-            return
-        self.grid, self.world, found = grid, world, raised[:count]
+        if least < math.inf:
+            kernels.look_again(self.known, np.flatnonzero(touched), least, False, *on_map)
         if opens:
-            states = np.arange(1 << kernels.TILE_BITS)
-            found = np.concatenate([found, (tiles[:, None] * len(states) + states).ravel()])
-        self._reserve(max(self._size + self._waiting + len(found), len(self._keys)))
-        heap = self._numbers, self._size
-        self._size = kernels.look_again(self.known, found, *heap, world, self.body)
+            kernels.look_again(self.known, np.flatnonzero(around), math.inf, True, *on_map)

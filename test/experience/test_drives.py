@@ -21,7 +21,6 @@ from ddqn_planner.experience.drives import (
     DriveRecorder,
     read_drives,
 )
-from ddqn_planner.files import FolderError
 
 RATE = 20.0
 
@@ -266,10 +265,10 @@ def test_a_new_folder_begins_with_older_experience_which_stays(tmp_path: Path) -
 
 def test_a_folder_is_locked_and_keeps_forgotten_experience(tmp_path: Path) -> None:
     folder = opened(tmp_path)
-    with pytest.raises(FolderError, match="another process records in"):
+    with pytest.raises(ValueError, match="another process records in"):
         opened(tmp_path)
     (tmp_path / "of" / "a_training").mkdir(parents=True)
-    with pytest.raises(FolderError, match=r"a_training.* no drives; give a new or empty"):
+    with pytest.raises(ValueError, match=r"a_training.* no drives; give a new or empty"):
         opened(tmp_path / "of")
     assert folder.forget() is None
     folder.add(DriveEnd.ARRIVED, *SLOW)

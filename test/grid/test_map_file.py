@@ -273,7 +273,7 @@ def test_a_moving_ai_map_keeps_its_rows_and_columns_or_is_refused(tmp_path: Path
         (MapMetadataError, "type quad\nheight 1\nwidth 2\nmap\n..\n"),
         (MapMetadataError, "type octile\nwidth 1\nheight 2\nmap\n.@\n"),
         *((MapMetadataError, octile.format(height, "..\n")) for height in "x0"),
-        (MapDataError, octile.format(2, "..\n")),
+        *((MapDataError, octile.format(2, rows)) for rows in ("..\n", "...\n.\n")),
         *((MapDataError, octile.format(1, rows)) for rows in ("..\n..\n", "...\n")),
     ):
         path.write_text(content)
