@@ -293,10 +293,7 @@ class Directions:
             return grid
         of_map, directions = found = (own or known)[0]
         if directions is not None and directions.forbidden is not None:
-            try:
-                offset = offset_between(directions, grid)
-            except (OverflowError, ValueError):  # too far away to have a number of cells
-                offset = None
+            offset = offset_between(directions, grid)
             if of_map.frame_id != header.frame_id or offset is None:
                 raise ValueError(
                     f"the directions on {self._topic} are not for this map: they have the frame "
