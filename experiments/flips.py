@@ -85,7 +85,7 @@ def drive(
     true_map = GridMap(occupancy, cost=inflated_costs(occupancy, INFLATION))
     if robot != goal:  # the best path from there, so that all drives end at the goal
         way += planner.plan(true_map, robot, goal, RULE).cells[1:]
-    return Driven(replans, flips, path_cost(way, true_map.multipliers(way), RULE))
+    return Driven(replans, flips, path_cost(true_map, way, RULE))
 
 
 def scenario(kind: str, side: int, random: Random) -> tuple[Occupancy, Cell, Cell]:

@@ -195,7 +195,7 @@ def measure(
             for _, start, told in of_goal:
                 cells = field.rollout(start).cells
                 arrived = cells[:1] == (start,) and cells[-1:] == (goal,)
-                cost = path_cost(cells, grid.multipliers(cells), move_rule) if arrived else math.inf
+                cost = path_cost(grid, cells, move_rule) if arrived else math.inf
                 optimum = float(optima[start[::-1]])
                 agrees = math.isclose(told, optimum, rel_tol=AGREES)
                 yield Rollout(

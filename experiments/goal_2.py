@@ -7,7 +7,6 @@ from typing import Any, Final
 import goal_1
 import matplotlib.pyplot as plt
 import numpy as np
-import torch
 from figures import draw_curves, draw_map, save_figure
 from matplotlib.colors import BoundaryNorm, ListedColormap
 from numpy.typing import NDArray
@@ -16,9 +15,10 @@ from trainings import MOVE_RULE, PROFILES, SCENARIO, Settings, Training
 
 from ddqn_planner import Planner, QField
 from ddqn_planner.grid import MOVES, Cell, legal_moves
+from ddqn_planner.model import PropagationQNetwork
 from ddqn_planner.training.environment import GridVectorEnvironment
 from ddqn_planner.training.evaluation import length_ratios
-from ddqn_planner.training.networks import PropagationModule
+from ddqn_planner.training.propagation import PropagationLearner
 
 # The paper's dilemma on its rebuilt map: the start and ten more cells.
 START_DEAD_END: Final[frozenset[Cell]] = frozenset(
@@ -51,10 +51,11 @@ def trained_field(planner: Planner) -> QField:
     """Return the Q field of a propagation network as the loss trained it: with reward and γ."""
     occupancy = SCENARIO.grid.occupancy
     environment = GridVectorEnvironment([SCENARIO], MOVE_RULE, PROFILES["propagation"])
-    module, cells = PropagationModule.from_numpy(planner.network), np.arange(occupancy.size)
-    module.settle(environment)
-    with torch.inference_mode():
-        q_CA = module(module.states(np.zeros_like(cells), cells))
+    network, cells = planner.network, np.arange(occupancy.size)
+    assert isinstance(network, PropagationQNetwork)
+    parts = [{name: tensor.copy() for name, tensor in network.tensors.items()} for _ in range(4)]
+    learner = PropagationLearner(network, tuple(parts), environment)
+    q_CA = learner.q_values(np.zeros_like(cells), cells)
     q_AHW = q_CA.T.reshape(len(MOVES), *occupancy.shape).numpy()
     return QField(SCENARIO.goal, q_AHW, legal_moves(occupancy, MOVE_RULE))
 

@@ -6,7 +6,6 @@ from typing import Any, Final
 
 import matplotlib.pyplot as plt
 import numpy as np
-import torch
 from figures import draw_map, draw_path, save_figure
 from matplotlib.patches import Rectangle
 from numpy.typing import NDArray
@@ -90,8 +89,9 @@ def train_supervised(training: Training) -> None:
     best_SCA = np.stack([best_moves(scenario) for scenario in training.scenarios])
     scenario, cell = np.nonzero(best_SCA.any(axis=2))
     random = np.random.default_rng(training.seed)
-    weights: list[torch.Tensor] = [*trainer.network.parameters()]
-    parts = [weights, *([torch.zeros_like(weight) for weight in weights] for _ in range(3))]
+    tensors = trainer.network.tensors
+    zeros = ({name: np.zeros_like(t) for name, t in tensors.items()} for _ in range(3))
+    parts = [tensors, *zeros]
     network, gradient, mean, square = networks_of(trainer.environment, parts, SUPERVISED_BATCH)
     steps = training.parameters.steps
     for number in range(steps):

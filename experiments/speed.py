@@ -22,6 +22,7 @@ from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from straight_paths import measure_straight_paths
 from tables import report
 from torch import nn
+from torch_learner import TorchLearner
 
 from ddqn_planner import GridMap, MoveRule, Plan, Planner, QField
 from ddqn_planner.grid import Cell, inflate, shortest_distances
@@ -302,7 +303,7 @@ def measure_training() -> Iterator[bool]:
     p = HyperParameters(epsilon_start=HyperParameters().epsilon_end)
     scenario, rule = paper_scenario(), MoveRule.CORNER_CUTTING
     ours, in_torch = (Trainer([scenario], rule, p, seed=0) for _ in range(2))
-    in_torch._player = None
+    TorchLearner(in_torch)
     theirs = DQN(
         "MlpPolicy",
         GridEnvironment(scenario, rule, p),
@@ -323,8 +324,8 @@ def measure_training() -> Iterator[bool]:
         seed=0,
         device="cpu",
     )
-    weights = [sum(w.numel() for w in net.parameters()) for net in (ours.network, theirs.q_net)]
-    assert weights[0] == weights[1]
+    weights = sum(tensor.size for tensor in ours.network.tensors.values())
+    assert weights == sum(weight.numel() for weight in theirs.q_net.parameters())
     times = []
     for _ in range(1 + TRAINING_ROUNDS):
         until = ours.steps + STEPS

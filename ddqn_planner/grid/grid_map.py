@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ddqn_planner.grid import arguments
-from ddqn_planner.grid.arguments import OCCUPIED, UNKNOWN, Cell, Cells, Occupancy
+from ddqn_planner.grid.arguments import OCCUPIED, UNKNOWN, Cell, Occupancy
 from ddqn_planner.grid.copies import Box, replaced
 from ddqn_planner.grid.moves import MoveRule, component_labels, flood, legal_moves
 
@@ -234,11 +234,6 @@ class GridMap:
     def cost_multiplier(self) -> NDArray[np.float32]:
         """(H, W) float32: what a path costs per cell of its length: 1 to 5, times the slowness."""
         return self.multipliers_in(...)
-
-    def multipliers(self, cells: Cells) -> NDArray[np.float32]:
-        """Return (N,) float32: the cost multiplier of some cells (N, 2) of the map."""
-        x, y = np.asarray(cells, dtype=np.int64).reshape(-1, 2).T
-        return self.multipliers_in((y, x))
 
     def multipliers_in(self, where: Any) -> NDArray[np.float32]:
         """Return the cost multipliers that an index of NumPy names."""

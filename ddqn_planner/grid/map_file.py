@@ -274,9 +274,8 @@ def _layout(image: Any) -> str:
     codec, *_, arguments = image.tile[0]
     layout, *rest = [arguments] if isinstance(arguments, str) else arguments
     # The last argument of a PPM is its greatest value, unless that is the greatest of its bytes.
-    scaled = codec.startswith("ppm") and rest not in ([], [255])
-    if image.mode == "I" and rest == [65535]:
-        scaled = False
+    greatest = 65535 if image.mode == "I" else 255
+    scaled = codec.startswith("ppm") and rest not in ([], [greatest])
     if scaled or layout not in LAYOUTS or codec == "bmp_rle":
         raise ValueError(f"its pixels are stored as {codec} {arguments}; save an 8-bit PNG")
     if "transparency" in image.info and image.mode != "P":

@@ -86,10 +86,12 @@ def path_length(cells: Cells, move_rule: MoveRule | str = MoveRule.ROBOT_SAFE) -
     return float(_segment_lengths(cells, move_rule).sum())
 
 
-def path_cost(cells: Cells, multipliers: NDArray[np.float32], move_rule: MoveRule | str) -> float:
-    """Return the cost of a path, given the multipliers of its N cells: see `move_costs`."""
-    lengths, multipliers = _segment_lengths(cells, move_rule), multipliers.astype(np.float64)
-    return float((lengths * (multipliers[1:] + multipliers[:-1]) / 2).sum())
+def path_cost(grid: GridMap, cells: Cells, move_rule: MoveRule | str) -> float:
+    """Return the cost of a path of moves: see `move_costs`."""
+    x, y = np.asarray(cells, dtype=np.int64).reshape(-1, 2).T
+    multiplier = grid.multipliers_in((y, x)).astype(np.float64)
+    of_moves = _segment_lengths(cells, move_rule) * (multiplier[1:] + multiplier[:-1]) / 2
+    return float(of_moves.sum())
 
 
 def _segment_lengths(cells: Cells, move_rule: MoveRule | str) -> NDArray[np.float64]:

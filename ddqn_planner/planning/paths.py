@@ -13,7 +13,7 @@ from ddqn_planner.grid import MOVES, Cell, GridMap, MoveRule, legal_moves
 from ddqn_planner.grid.arguments import Cells, Occupancy
 from ddqn_planner.grid.moves import cells_along
 from ddqn_planner.planning.field import Goals
-from ddqn_planner.planning.plan import ROUNDING, PlanRequest
+from ddqn_planner.planning.plan import ROUNDING, PlanRequest, PlanStatus
 from ddqn_planner.planning.segments import (
     SAME_COST,
     Path,
@@ -95,8 +95,8 @@ def _search(
 # The way out, and the goals that are left
 
 
-def way_and_ends(request: PlanRequest, goals: Goals) -> tuple[tuple[Cell, ...], Goals]:
-    """Return the way to the first free cell, empty if no path leads on, and where it can end."""
+def way_and_ends(request: PlanRequest, goals: Goals) -> tuple[tuple[Cell, ...], Goals] | PlanStatus:
+    """Return the way to the first free cell and where a path can end, or why there is none."""
     grid, start, rule = request.grid, request.start, request.move_rule
     candidates = [(np.array(goals), len(goals))] if goals else []
     if request.reach >= 1:
@@ -108,7 +108,9 @@ def way_and_ends(request: PlanRequest, goals: Goals) -> tuple[tuple[Cell, ...], 
             reached = grid.reachable([way_out[-1]], rule)
             reached_ends = ends[reached[ends[:, 1], ends[:, 0]]]
             return way_out, tuple((x, y) for x, y in reached_ends[:number].tolist())
-    return (), goals
+    if grid.is_obstacle(start) and not find_way_out(request, ~grid.occupancy):
+        return PlanStatus.START_OCCUPIED
+    return PlanStatus.NO_PATH if goals else PlanStatus.GOAL_OCCUPIED
 
 
 def obstacles_in_the_way(grid: GridMap, start: Cell, clearing_radius: float) -> Occupancy:

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Generator, Iterator, Sequence
+from collections.abc import Generator, Iterator, Sequence
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -18,7 +17,7 @@ from ddqn_planner.grid.grid_map import check_grid
 from ddqn_planner.model import ModelMetadata, QNetwork, load_model
 from ddqn_planner.planning.field import DistanceField, Goals, QField
 from ddqn_planner.planning.field_cache import FieldCache
-from ddqn_planner.planning.paths import find_way_out, keep_or_switch, search, way_and_ends
+from ddqn_planner.planning.paths import keep_or_switch, search, way_and_ends
 from ddqn_planner.planning.plan import (
     Plan,
     PlanMethod,
@@ -30,13 +29,9 @@ from ddqn_planner.planning.plan import (
 from ddqn_planner.planning.pose_planner import Pose, PosePlanner, PoseRequest
 from ddqn_planner.planning.segments import cost_along, straightened
 
-T = TypeVar("T")
 AnyPlan = TypeVar("AnyPlan", bound=Plan)
 
 VISITS = 2**18  # about how many cells a field visits in one step of a plan: some 30 ms
-# Share of the map's cells that a request may visit before the connected cells are looked at. One
-# without a path would visit all that its goal is connected to. With more occupied, few are left.
-UNLABELLED_SHARE, OCCUPIED_SHARE = 1 / 2, 1 / 8
 
 
 class Planner:
@@ -269,16 +264,13 @@ class Planner:
 
     def steps(self, request: PlanRequest) -> Iterator[Plan | None]:
         """Yield None before each slow step (a part of a field, a search), and last the plan."""
-        found: PlanStatus | _Found | None = self._refusal(request)
-        field_ms = 0.0
-        if found is None:
-            found, field_ms = yield from _timed(self._find_field(request))
-        if isinstance(found, PlanStatus):
-            yield Plan(found, move_rule=request.move_rule, field_ms=field_ms)
-            return
-        plan, rollout_ms = yield from _timed(_roll_out(request, found))
-        known_ms = found.plan.rollout_ms if found.plan else 0.0  # it was found with the field
-        yield plan(field_ms=field_ms - known_ms, rollout_ms=rollout_ms + known_ms)
+        ms, began = 0.0, time.perf_counter()
+        for plan in self._find(request):
+            ms += 1e3 * (time.perf_counter() - began)
+            if plan is not None:
+                vars(plan)["field_ms"] = ms - plan.rollout_ms  # frozen, but nobody else has it yet
+            yield plan
+            began = time.perf_counter()
 
     def _refusal(self, request: PlanRequest) -> PlanStatus | None:
         """Return why there is no path, where one look at start and goals says so."""
@@ -295,36 +287,54 @@ class Planner:
             return PlanStatus.MAP_SIZE_UNSUPPORTED
         return None
 
-    def _find_field(self, request: PlanRequest) -> Generator[None, None, _Found | PlanStatus]:
-        """Return the field that leads to a goal, or why there is no path."""
+    def _find(self, request: PlanRequest) -> Iterator[Plan | None]:
+        """Do the work of `steps`, without the time that the field takes."""
         grid, start, rule = request.grid, request.start, request.move_rule
+        status = self._refusal(request)
+        if status is not None:
+            yield Plan(status, move_rule=rule)
+            return
         goals = tuple(sorted({goal for goal in request.goals if grid.is_free(goal)}))
         if len(goals) > 1 and not self.fields.has_costs(grid, rule):
-            yield
+            yield None
             goals = self._nearest_alone(request, goals)
-        field: QField | None = None
-        plan: Plan | None = None
-        if grid.is_free(start):
-            field = self.fields.find(grid, goals, rule)
-            plan = field.rollout_if_known(start, request.simplified) if field else None
-        if plan is None or (not plan.path.size and request.reach >= 1):
-            yield
-        if plan is None and goals and grid.is_free(start) and self.fields.has_costs(grid, rule):
-            field = self.fields.get(grid, goals, rule, start)
-            assert isinstance(field, DistanceField)
-            plan = yield from _in_parts(field, request)
-        if field and plan and plan.path.size:
-            return _Found(field, (start,), plan)
+        plan = yield from self._roll_out(request, goals)
+        if plan and plan.path.size:
+            yield _dressed(request, plan, (start,))
+            return
         if plan and plan.status is PlanStatus.NO_PATH and request.reach < 1:
-            return PlanStatus.NO_PATH
-        way_out, ends = way_and_ends(request, goals)
-        if not way_out and grid.is_obstacle(start) and not find_way_out(request, ~grid.occupancy):
-            return PlanStatus.START_OCCUPIED
-        if not way_out:
-            return PlanStatus.NO_PATH if goals else PlanStatus.GOAL_OCCUPIED
-        if field is None or field.goals != ends:
-            field, plan = self.fields.get(grid, ends, rule, way_out[-1]), None
-        return _Found(field, way_out, plan)
+            yield plan
+            return
+        found = way_and_ends(request, goals)
+        if isinstance(found, PlanStatus):
+            yield Plan(found, move_rule=rule)
+            return
+        way_out, goals = found
+        field = self.fields.get(grid, goals, rule, way_out[-1])
+        plan = field.rollout(way_out[-1], request.simplified)
+        if not plan.path.size and request.method is PlanMethod.ASTAR_FALLBACK:
+            yield None
+            plan = _searched(field, way_out[-1], grid)
+        yield _dressed(request, plan, way_out) if plan.path.size else replace(plan, goal=goals[0])
+
+    def _roll_out(self, request: PlanRequest, goals: Goals) -> Generator[None, None, Plan | None]:
+        """Return the rollout from a free start if its field is known, or follows from costs."""
+        grid, start, straight = request.grid, request.start, request.simplified
+        if not grid.is_free(start):
+            yield None
+            return None
+        known = self.fields.find(grid, goals, request.move_rule)
+        plan = known.rollout_if_known(start, straight) if known else None
+        if plan is None or (not plan.path.size and request.reach >= 1):
+            yield None
+        if plan is None and goals and self.fields.has_costs(grid, request.move_rule):
+            field = self.fields.get(grid, goals, request.move_rule, start)
+            assert isinstance(field, DistanceField)
+            plan = field.rollout(start, straight, VISITS)
+            while plan.status is PlanStatus.ROLLOUT_TRAPPED:  # more of the field is needed
+                yield None
+                plan = field.rollout(start, straight, VISITS)
+        return plan
 
     def _nearest_alone(self, request: PlanRequest, goals: Goals) -> Goals:
         """Return the nearest of several goals, by a field toward each."""
@@ -332,14 +342,6 @@ class Planner:
         plans = [plan for one in each if (plan := last_step(self.steps(one))).path.size]
         nearest = min(plans, key=lambda plan: plan.cost or plan.length, default=None)
         return nearest.cells[-1:] if nearest else goals[:1]
-
-
-class _Found(NamedTuple):
-    """The field that leads to a goal, the way out to a free cell, and the rollout where known."""
-
-    field: QField
-    way_out: tuple[Cell, ...]
-    plan: Plan | None
 
 
 def _as_pose(name: str, pose: Any) -> Pose:
@@ -350,60 +352,32 @@ def _as_pose(name: str, pose: Any) -> Pose:
     return x, y, yaw
 
 
-def _in_parts(field: DistanceField, request: PlanRequest) -> Generator[None, None, Plan]:
-    """Return the rollout from the start; after each part that the field grows for it, yield."""
-    grid, start = request.grid, request.start
-    until_labels = int(UNLABELLED_SHARE * grid.occupancy.size)
-    few_occupied = OCCUPIED_SHARE * grid.occupancy.size
-    while True:
-        visits = min(VISITS, until_labels) or VISITS
-        plan = field.rollout(start, request.simplified, visits)
-        if plan.status is not PlanStatus.ROLLOUT_TRAPPED:
-            return plan
-        if until_labels == visits and np.count_nonzero(grid.occupancy) < few_occupied:
-            labels = grid.labels(request.move_rule)
-            if all(labels[y, x] != labels[start[::-1]] for x, y in field.goals):
-                return Plan(PlanStatus.NO_PATH)
-        until_labels = max(until_labels - visits, 0)
-        yield
+def _searched(field: QField, start: Cell, grid: GridMap) -> Plan:
+    """Return the path that a search in the order of a field finds: one exists."""
+    began = time.perf_counter()
+    of_grid = field.legal, grid.cost_multiplier, field.move_rule
+    cells = np.array(search(start, field.goal, *of_grid, field.value))
+    ms = 1e3 * (time.perf_counter() - began)
+    return Plan(PlanStatus.SUCCEEDED, cells, PlanMethod.ASTAR_FALLBACK, rollout_ms=ms)
 
 
-def _roll_out(request: PlanRequest, found: _Found) -> Generator[None, None, Callable[..., Plan]]:
-    """Return the plan that is asked for, but for its times: a rollout, or perhaps a search."""
-    grid, rule, way_out, field = request.grid, request.move_rule, found.way_out, found.field
-    start = way_out[-1]
-    plan = found.plan or field.rollout(start, request.simplified)
-    if not plan.path.size and request.method is PlanMethod.ASTAR_FALLBACK:
-        yield
-        cells = search(start, field.goal, field.legal, grid.cost_multiplier, rule, field.value)
-        plan = Plan(PlanStatus.SUCCEEDED, np.array(cells), PlanMethod.ASTAR_FALLBACK)
-    path, cost, extra_cost, goal = plan.path, None, None, field.goal
-    if path.size:
-        if request.simplified:
-            path = straightened(path, grid, rule)
-        if len(request.under_way):
-            path, extra_cost = keep_or_switch(request, path)
-        goal = (int(path[-1, 0]), int(path[-1, 1]))
-        if len(way_out) > 1:
-            path = np.concatenate([way_out[:-1], path], dtype=np.int32)
-            if not np.array_equal(path, np.asarray(request.under_way)[-len(path) :]):
-                extra_cost = None  # only from the first free cell on it is the one kept
-        if grid.has_costs:
-            cost = cost_along(path, grid, rule) * (grid.seconds_per_cell or 1.0)
-    return partial(Plan, plan.status, path, plan.method, rule, cost, goal, extra_cost)
-
-
-def _timed(steps: Generator[None, None, T]) -> Generator[None, None, tuple[T, float]]:
-    """Take some steps, and return what they return, and the milliseconds that they took."""
-    ms = 0.0
-    while True:
-        began = time.perf_counter()
-        try:
-            next(steps)
-        except StopIteration as done:
-            return done.value, ms + 1e3 * (time.perf_counter() - began)
-        ms += 1e3 * (time.perf_counter() - began)
-        yield
+def _dressed(request: PlanRequest, found: Plan, way_out: tuple[Cell, ...]) -> Plan:
+    """Return the plan by a path that was found: straight, or by the one under way."""
+    began, grid, rule = time.perf_counter(), request.grid, request.move_rule
+    path, cost, extra_cost = found.path, None, None
+    if request.simplified:
+        path = straightened(path, grid, rule)
+    if len(request.under_way):
+        path, extra_cost = keep_or_switch(request, path)
+    goal = (int(path[-1, 0]), int(path[-1, 1]))
+    if len(way_out) > 1:
+        path = np.concatenate([way_out[:-1], path], dtype=np.int32)
+        if not np.array_equal(path, np.asarray(request.under_way)[-len(path) :]):
+            extra_cost = None  # only from the first free cell on it is the one kept
+    if grid.has_costs:
+        cost = cost_along(path, grid, rule) * (grid.seconds_per_cell or 1.0)
+    ms = found.rollout_ms + 1e3 * (time.perf_counter() - began)
+    return Plan(found.status, path, found.method, rule, cost, goal, extra_cost, 0.0, ms)
 
 
 def last_step(steps: Iterator[AnyPlan | None]) -> AnyPlan:

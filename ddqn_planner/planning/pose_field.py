@@ -13,6 +13,7 @@ from ddqn_planner.grid import GridMap
 from ddqn_planner.planning import pose_kernels as kernels
 from ddqn_planner.planning.pose_guide import Aim, spread
 from ddqn_planner.planning.pose_kernels import Known
+from ddqn_planner.planning.pose_paths import SAME, Way
 from ddqn_planner.planning.pose_world import SHIFT, TILE, Body, State, World
 
 NO_RESERVE = getattr(mmap, "MAP_NORESERVE", 0x4000)  # not in all versions of Python
@@ -48,6 +49,7 @@ class PoseField:
     def __init__(self, goals: NDArray[np.int64], grid: GridMap, world: World, body: Body) -> None:
         self.goals = goals  # (N, 3): x, y, heading
         self.body, self._aim, self.visits = body, NOWHERE, 0
+        self.way: Way | None = None  # the last path that followed it
         self._begin(grid, world)
 
     def _begin(self, grid: GridMap, world: World) -> None:
@@ -78,7 +80,7 @@ class PoseField:
             self._order(max(bound, FIRST) ** GREEDY)
         while True:
             proved = self._bound(number)
-            if proved <= bound * kernels.SAME or self._least == math.inf:
+            if proved <= bound * SAME or self._least == math.inf:
                 return proved
             most = self._until_look(number, limit)
             self._size, visits, done = kernels.grow(
@@ -170,7 +172,7 @@ class PoseField:
         # a way may have got cheaper: what is left to the start, too.
         reached = float(self.known.distance[self._aim.number])
         self._aim = NOWHERE if opens else self._aim._replace(number=-1)
-        self.grid, self.world, touched = grid, world, self.known.touched
+        self.grid, self.world, self.way, touched = grid, world, None, self.known.touched
         reach = self.body.reach + TILE
         near = np.zeros((world.columns, world.rows), dtype=np.bool_)
         low, high = np.unique(np.maximum(cells - reach, 0) // TILE, axis=0), 2 * reach // TILE + 1

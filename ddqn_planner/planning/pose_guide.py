@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ddqn_planner.compiled import in_place, inlined
-from ddqn_planner.planning.pose_world import Body, World, is_far, is_possible, touches
+from ddqn_planner.planning.pose_world import Body, World, is_far, is_inside, is_possible, touches
 
 
 class Aim(NamedTuple):
@@ -89,33 +89,32 @@ def has_room(x: int, y: int, aim: Any, room: Any, world: Any, body: Any) -> bool
     tile, side = y * aim.columns + x, 1 << aim.shift
     if room[tile] == 0:
         room[tile] = 1 if is_far(x << aim.shift, y << aim.shift, world, body) else 2
-        for number in range(0 if room[tile] == 1 else 2 * side * side):
+        for number in range(0 if room[tile] == 1 else side * side):
             # From the middle on: most tiles have room there.
             column = (x << aim.shift) + ((number & (side - 1)) ^ (side >> 1))
-            line = (y << aim.shift) + (((number >> aim.shift) & (side - 1)) ^ (side >> 1))
-            inside = column < world.width and line < world.height
-            if inside and may_pass(column, line, number >= side * side, world, body):
+            line = (y << aim.shift) + ((number >> aim.shift) ^ (side >> 1))
+            if is_inside(column, line, world) and may_pass(column, line, world, body):
                 room[tile] = 1
                 break
     return bool(room[tile] == 1)
 
 
 @inlined
-def may_pass(x: int, y: int, moves: bool, world: Any, body: Any) -> bool:
+def may_pass(x: int, y: int, world: Any, body: Any) -> bool:
     """Return whether the body stands in a cell, or moves its origin through it."""
-    count, cores, bits, row = body.start.size, body.start.size + 16, world.bits, body.row
-    if touches(bits, x, y, row, body.first[cores + 16], body.first[cores + 17]):
+    standing, core = body.start.size, body.start.size + 16
+    if touches(x, y, core + 16, world, body):
         return False
     for heading in range(16):
-        mask = cores + heading if moves else count + heading
-        if touches(bits, x, y, row, body.first[mask], body.first[mask + 1]):
-            continue
-        if not moves:
+        if not touches(x, y, standing + heading, world, body):
             return True
+    for heading in range(16):
+        if touches(x, y, core + heading, world, body):
+            continue
         for primitive in range(body.out[heading], body.out[heading + 1]):
             for place in range(body.first_passed[primitive], body.first_passed[primitive + 1]):
                 column, line = x - body.passed[place, 0], y - body.passed[place, 1]
-                inside = 0 <= column < world.width and 0 <= line < world.height
+                inside = is_inside(column, line, world)
                 if inside and is_possible(column, line, primitive, world, body):
                     return True
     return False

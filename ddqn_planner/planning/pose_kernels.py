@@ -29,7 +29,6 @@ TILE_BITS: Final = HEADING_BITS + 2 * SHIFT
 # Marks. Before a state is reached, its distance has no meaning. One that got cheaper after it was
 # closed waits for the next round.
 UNREACHED, OPEN, WAITING, CLOSED = 0, 1, 2, 3
-SAME: Final = 1 + 1e-6  # what is rounded in sums of float32 is less
 
 
 class Known(NamedTuple):

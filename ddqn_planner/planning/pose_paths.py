@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,6 +13,7 @@ from ddqn_planner.grid import MOVES, GridMap
 from ddqn_planner.grid.footprint import inside
 from ddqn_planner.grid.grid_map import MULTIPLIERS
 from ddqn_planner.grid.motions import BEHIND, TURN, turn_between
+from ddqn_planner.planning.plan import PlanStatus, PosePlan
 from ddqn_planner.planning.pose_world import body_costs, occupied_for_body
 
 Float64 = NDArray[np.float64]
@@ -21,7 +22,40 @@ Body = tuple[Float64, Float64]
 REACH: Final = 5.0, math.pi / 4  # cells and radians that a robot may be beside its path
 BETWEEN: Final = 0.25  # cells between two points of a body's outline
 WITHIN: Final = 0.7  # and inside: so each cell there, turned as it may be, has a point
+SAME: Final = 1 + 1e-6  # what is rounded in sums of float32 is less
 AHEAD: Final = 0.9  # the cosine above which a robot drives ahead, not behind or sideways
+
+
+class Way(NamedTuple):
+    """A path of N poses that follows a field."""
+
+    poses: Float64  # (N, 3), in metres and radians
+    cells: NDArray[np.int32]  # (N, 2)
+    spent: Float64  # (N,) before each pose
+    least: float  # a lower bound of what must be spent
+
+    def plan(self, first: int, grid: GridMap) -> PosePlan:
+        """Return the plan along the poses from one on."""
+        cost, least = float(self.spent[-1] - self.spent[first]), self.least - self.spent[first]
+        bound = max(cost / least, 1.0) if cost > least * SAME else 1.0
+        way = self.poses[first:], self.cells[first:]
+        return plan_along(*way, grid, cost * (grid.seconds_per_cell or 1.0), bound)
+
+
+def plan_along(
+    poses: Float64, cells: NDArray[np.int32], grid: GridMap, cost: float, bound: float
+) -> PosePlan:
+    """Return the plan of a path of poses that lie in cells."""
+    poses.flags.writeable = False
+    return PosePlan(
+        PlanStatus.SUCCEEDED,
+        cells[np.append(True, (cells[1:] != cells[:-1]).any(axis=1))],
+        cost=cost,
+        goal=(int(cells[-1, 0]), int(cells[-1, 1])),
+        poses=poses,
+        driven=float(np.hypot(*np.diff(poses[:, :2], axis=0).T).sum()) / grid.resolution,
+        bound=bound,
+    )
 
 
 def points_of(corners: Float64, resolution: float) -> tuple[Float64, Float64]:
@@ -73,8 +107,8 @@ def cells_of(path: Float64) -> NDArray[np.int32]:
     return np.floor(path[:, :2] + 0.5).astype(np.int32)
 
 
-def cost_of_poses(poses: Float64, grid: GridMap) -> tuple[float, float]:
-    """Return the length of a free path in cells, and nearly what its primitives cost."""
+def cost_of_poses(poses: Float64, grid: GridMap) -> float:
+    """Return nearly what the primitives of a free path cost."""
     path = in_cells(poses, grid)
     steps = np.diff(path[:, :2], axis=0)
     length, turn = np.hypot(*steps.T), np.abs(turn_between(path[:-1, 2], path[1:, 2]))
@@ -87,7 +121,7 @@ def cost_of_poses(poses: Float64, grid: GridMap) -> tuple[float, float]:
         spent *= MULTIPLIERS.take(cost[y, x], mode="wrap")
     if grid.slowness is not None:
         spent *= grid.slowness[y, x]
-    return float(length.sum()), float(spent.sum())
+    return float(spent.sum())
 
 
 @in_place

@@ -7,26 +7,18 @@ import threading
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
+from functools import lru_cache
 from itertools import compress
-from typing import Any, Final, NamedTuple, TypeAlias
+from typing import Any, Final, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ddqn_planner.grid import Cell, GridMap
 from ddqn_planner.grid.motions import HEADINGS, turn_between
-from ddqn_planner.planning.field import offset_between
+from ddqn_planner.planning import pose_paths as paths
 from ddqn_planner.planning.plan import ROUNDING, PlanStatus, PosePlan
 from ddqn_planner.planning.pose_field import PoseField
-from ddqn_planner.planning.pose_kernels import SAME
-from ddqn_planner.planning.pose_paths import (
-    REACH,
-    cells_of,
-    cost_of_poses,
-    in_cells,
-    points_of,
-    rest_of_poses,
-)
 from ddqn_planner.planning.pose_world import State, World, body_of, differences, standing, world_of
 from ddqn_planner.planning.segments import SAME_COST
 
@@ -68,55 +60,21 @@ class PoseRequest:
         return replace(self, start=(x, y, yaw), goals=(goal,))
 
 
-@dataclass(eq=False)
-class _Known:
-    """A field, what it was asked for, and the last path that followed it."""
-
-    asked: tuple[object, ...]
-    field: PoseField
-    way: _Way | None = None
-
-
-class _Way(NamedTuple):
-    """A path of N poses, in cells, with what was passed and spent before each of them."""
-
-    poses: NDArray[np.float64]  # (N, 3), in metres and radians
-    cells: NDArray[np.int32]  # (N, 2)
-    driven: NDArray[np.float64]  # (N,)
-    spent: NDArray[np.float64]  # (N,)
-    least: float  # a lower bound of what must be spent
-
-    def plan(self, first: int, grid: GridMap) -> PosePlan:
-        """Return the plan along the poses from one on."""
-        cells, cost = self.cells[first:], float(self.spent[-1] - self.spent[first])
-        least = self.least - self.spent[first]
-        poses = self.poses[first:]
-        poses.flags.writeable = False
-        return PosePlan(
-            PlanStatus.SUCCEEDED,
-            cells[np.append(True, (cells[1:] != cells[:-1]).any(axis=1))],
-            cost=cost * (grid.seconds_per_cell or 1.0),
-            goal=(int(cells[-1, 0]), int(cells[-1, 1])),
-            poses=poses,
-            driven=float(self.driven[-1] - self.driven[first]),
-            bound=max(cost / least, 1.0) if cost > least * SAME else 1.0,
-        )
-
-
 class PosePlanner:
     """Keeps the fields of the goals used last. Several threads may use it."""
 
     def __init__(self, network: Any) -> None:
         self.motions, self.footprint = network.motions, network.footprint
         self.body = body_of(network.motions, network.swept())
-        self.points = points_of(self.footprint, self.motions.resolution)
-        # Of each primitive, in all poses: the first one, and how many follow it.
-        self._poses = np.concatenate(self.motions.poses)
-        self._count = np.array([len(poses) - 1 for poses in self.motions.poses])
-        self._first = np.cumsum(self._count + 1) - self._count - 1
-        self._known: list[_Known] = []  # used last at the end
-        self._compared: tuple[Any, ...] = (None, None, None)
-        self._worlds: list[tuple[GridMap, World]] = []  # the last one
+        self.points = paths.points_of(self.footprint, self.motions.resolution)
+        # After its first pose, those of each primitive, and the share of its cost until there.
+        self._after = [
+            np.column_stack([poses, np.linspace(0, 1, len(poses))])[1:]
+            for poses in self.motions.poses
+        ]
+        self._fields: dict[tuple[Any, ...], PoseField] = {}  # used last at the end
+        self._map: tuple[GridMap, World] | None = None  # the last one
+        self._differences = lru_cache(maxsize=1)(differences)
         self._lock = threading.Lock()
 
     def steps(self, request: PoseRequest) -> Iterator[PosePlan | None]:
@@ -157,38 +115,31 @@ class PosePlanner:
         yield self._keep_or_switch(request, plan)
 
     def rest_of(
-        self, poses: Any, robot: Pose, grid: GridMap, reach: tuple[float, float] = REACH
+        self, poses: Any, robot: Pose, grid: GridMap, reach: tuple[float, float] = paths.REACH
     ) -> NDArray[np.float64]:
         """Return a path from the pose nearest to a robot on; empty if it is far, or has no room."""
-        return rest_of_poses(poses, robot, grid, self.points, reach)
+        return paths.rest_of_poses(poses, robot, grid, self.points, reach)
 
     def _keep_or_switch(self, request: PoseRequest, plan: PosePlan) -> PosePlan:
         """Return the rest of the path under way if it hardly costs more than a plan, or that."""
         if not len(request.under_way):
             return plan
         has_plan, grid = plan.poses.size > 0, request.grid
-        reach = REACH if has_plan else BESIDE_PATH
+        reach = paths.REACH if has_plan else BESIDE_PATH
         rest = self.rest_of(request.under_way, request.start, grid, reach)
         if not any(_meets(rest[-1:], end, grid) for end in (*plan.poses[-1:], *request.goals)):
             return plan
-        (driven, cost), (_, least) = (cost_of_poses(way, grid) for way in (rest, plan.poses))
+        cost, least = (paths.cost_of_poses(way, grid) for way in (rest, plan.poses))
         if has_plan and cost > (1 + request.switch_threshold) * least * SAME_COST:
             return plan
-        if not has_plan:  # nothing is proved
-            cost *= grid.seconds_per_cell or 1.0
-            plan = PosePlan(PlanStatus.SUCCEEDED, cost=cost, bound=math.inf)
-        cells = cells_of(in_cells(rest, grid))
         share = cost / least if least else 1.0
-        return replace(
-            plan,
-            path=cells[np.append(True, (cells[1:] != cells[:-1]).any(axis=1))],
-            poses=rest,
-            cost=(plan.cost or 0.0) * share,
-            goal=(int(cells[-1, 0]), int(cells[-1, 1])),
-            extra_cost=share - 1,
-            driven=driven,
-            bound=max(plan.bound * share, 1.0),
-        )
+        new_cost, bound = plan.cost or 0.0, plan.bound
+        if not has_plan:  # nothing is proved
+            new_cost, bound = cost * (grid.seconds_per_cell or 1.0), math.inf
+        way = rest, paths.cells_of(paths.in_cells(rest, grid)), grid
+        kept = paths.plan_along(*way, new_cost * share, max(bound * share, 1.0))
+        ms = plan.field_ms, plan.rollout_ms
+        return replace(kept, extra_cost=share - 1, field_ms=ms[0], rollout_ms=ms[1])
 
     def _check(self, grid: GridMap) -> None:
         """Raise a ValueError if the map's cells are not of the size that the robot learned."""
@@ -230,96 +181,83 @@ class PosePlanner:
 
     def _rest_of_path(self, request: PoseRequest) -> PosePlan | None:
         """Return the rest of the path that was planned last, if the start lies on it."""
-        for known in self._known:
-            way, grid = known.way, request.grid
-            if known.asked != _asked(request) or way is None:
+        for asked, known in self._fields.items():
+            if asked[:2] != (request.goals, request.tolerance) or (way := known.way) is None:
                 continue
-            found = self._differences(known.field.grid, grid)
+            found = self._differences(known.grid, request.grid)
             if found is None or len(found[0]):
                 continue
             x, y, yaw = (way.poses - request.start).T
-            far, turn = np.hypot(x, y) / grid.resolution, np.abs(turn_between(0, yaw))
+            far, turn = np.hypot(x, y) / request.grid.resolution, np.abs(turn_between(0, yaw))
             is_near = (far <= ON_PATH[0]) & (turn <= ON_PATH[1])
             apart = np.where(is_near, far + turn, np.inf)
-            first = int(apart.argmin())
-            plan = way.plan(first, grid)
-            if apart[first] < np.inf and plan.bound <= request.bound * SAME:
+            plan = way.plan(int(apart.argmin()), request.grid)
+            if is_near.any() and plan.bound <= request.bound * paths.SAME:
                 return plan
         return None
 
     def _world(self, grid: GridMap) -> World:
         """Return a map for kernels, from the last one where that is quicker."""
-        for before, world in self._worlds:
-            found = self._differences(before, grid)
-            if found is not None:
-                world = world_of(grid, world, found[0]) if len(found[0]) else world
-                break
-        else:
+        found = None if self._map is None else self._differences(self._map[0], grid)
+        if self._map is None or found is None:
             world = world_of(grid)
-        self._worlds = [(grid, world)]
+        else:
+            world = world_of(grid, self._map[1], found[0]) if len(found[0]) else self._map[1]
+        self._map = grid, world
         return world
 
-    def _field(self, request: PoseRequest, states: NDArray[np.int64]) -> _Known:
+    def _field(self, request: PoseRequest, states: NDArray[np.int64]) -> PoseField:
         """Return a field toward some states: as it is, repaired, or new."""
-        grid, asked, known = request.grid, _asked(request), None
-        for one in self._known:
-            if one.asked == asked and np.array_equal(one.field.goals, states):
-                known = one
-        if known is not None and known.field.grid is not grid:
-            self._known.remove(known)
-            field, known = known.field, None
-            if (found := self._differences(field.grid, grid)) is not None:
+        grid, asked = request.grid, (request.goals, request.tolerance, states.tobytes())
+        field = self._fields.pop(asked, None)
+        if field is not None and field.grid is not grid:
+            found = self._differences(field.grid, grid)
+            if found is None:
+                field = None
+            else:
                 field.repair(grid, self._world(grid), *found)
-                self._known.append(known := _Known(asked, field))
-        if known is None:
-            field = PoseField(states, grid, self._world(grid), self.body)
-            self._known = [*self._known, known := _Known(asked, field)][-KEPT:]
-        return known
-
-    def _differences(self, old: GridMap, new: GridMap) -> tuple[NDArray[np.int64], bool] | None:
-        """Return what `differences` does, of maps of one place; the last answer is kept."""
-        if self._compared[:2] != (old, new):
-            is_there = offset_between(old, new) == (0, 0)
-            self._compared = old, new, differences(old, new) if is_there else None
-        found: tuple[NDArray[np.int64], bool] | None = self._compared[2]
-        return found
+        field = field or PoseField(states, grid, self._world(grid), self.body)
+        self._fields = dict([*self._fields.items(), (asked, field)][-KEPT:])
+        return field
 
     def _grow(
         self, request: PoseRequest, states: NDArray[np.int64], start: State, began: float
     ) -> PosePlan | None:
         """Grow the field by a step; return the path from the start if it is known then."""
         with self._lock:  # between two steps another request may use the field
-            known = self._field(request, states)
-            bound = known.field.reach(start, request.bound, VISITS)
-            return None if bound is None else self._follow(known, request.grid, start, bound, began)
+            field = self._field(request, states)
+            bound = field.reach(start, request.bound, VISITS)
+            if bound is None:
+                return None
+            grown = time.perf_counter()
+            field_ms, found = 1e3 * (grown - began), field.rollout(start)
+            if found is None:
+                return PosePlan(PlanStatus.NO_PATH, field_ms=field_ms)
+            field.way = self._way(request.grid, start, bound, *found)
+            plan = field.way.plan(0, request.grid)
+        return replace(plan, field_ms=field_ms, rollout_ms=1e3 * (time.perf_counter() - grown))
 
-    def _follow(
-        self, known: _Known, grid: GridMap, start: State, bound: float, began: float
-    ) -> PosePlan:
-        """Return the path from a start that its field knows within a bound."""
-        grown, found = time.perf_counter(), known.field.rollout(start)
-        if found is None:
-            return PosePlan(PlanStatus.NO_PATH, field_ms=1e3 * (grown - began))
-        numbers, costs = found
-        # The poses of each primitive but its first one, moved to where the primitive begins.
-        count, (offset, motions) = self._count[numbers], (self.motions.offset[numbers], self._poses)
-        each = np.repeat(np.arange(len(numbers)), count)
-        nth = np.arange(len(each)) - np.repeat(np.cumsum(count) - count, count) + 1
-        way = motions[self._first[numbers][each] + nth]
-        way[:, :2] += (np.cumsum(offset, axis=0) - offset)[each]
-        spent = np.append(0.0, (np.cumsum(costs) - costs)[each] + costs[each] * nth / count[each])
-        x, y, yaw = np.vstack([[0, 0, self.motions.angles[start[2]]], way]).T
-        x, y = x + start[0], y + start[1]
-        known.way = _Way(
-            np.column_stack([*grid.centres(x, y), turn_between(0, yaw + grid.origin[2])]),
-            np.floor(np.column_stack([x, y]) + 0.5).astype(np.int32),
-            np.append(0.0, np.cumsum(np.hypot(np.diff(x), np.diff(y)))),
-            spent,
-            float(spent[-1]) / bound,
-        )
-        rollout_ms = 1e3 * (time.perf_counter() - grown)
-        plan = known.way.plan(0, grid)
-        return replace(plan, field_ms=1e3 * (grown - began), rollout_ms=rollout_ms)
+    def _way(
+        self,
+        grid: GridMap,
+        start: State,
+        bound: float,
+        primitives: NDArray[np.int64],
+        costs: NDArray[np.float64],
+    ) -> paths.Way:
+        """Return the poses of primitives from a start, and what is spent before each."""
+        after = [self._after[primitive] for primitive in primitives]
+        offset, spent = self.motions.offset[primitives], np.cumsum(costs)
+        begins = np.column_stack([np.cumsum(offset, axis=0) - offset, spent - costs, costs])
+        first = [0.0, 0.0, self.motions.angles[start[2]], 0.0]
+        x, y, yaw, share = np.vstack([[first], *after]).T
+        over, up, before, cost = np.repeat(
+            np.vstack([np.zeros((1, 4)), begins]), [1, *map(len, after)], axis=0
+        ).T
+        x, y, yaw = x + over + start[0], y + up + start[1], turn_between(0, yaw + grid.origin[2])
+        poses, cells = np.column_stack([*grid.centres(x, y), yaw]), np.column_stack([x, y])
+        least = float(costs.sum()) / bound
+        return paths.Way(poses, paths.cells_of(cells), before + share * cost, least)
 
 
 def _meets(ends: NDArray[np.float64], pose: Any, grid: GridMap) -> bool:
@@ -327,8 +265,3 @@ def _meets(ends: NDArray[np.float64], pose: Any, grid: GridMap) -> bool:
     x, y, yaw = np.abs(ends - pose).T
     near = np.hypot(x, y) <= grid.resolution, np.abs(turn_between(0, yaw)) <= TWO_NEAREST
     return bool(np.all(near)) and len(ends) > 0
-
-
-def _asked(request: PoseRequest) -> tuple[object, ...]:
-    """Return what a field is for."""
-    return request.goals, request.tolerance

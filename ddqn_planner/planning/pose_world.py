@@ -14,6 +14,7 @@ from ddqn_planner.grid.copies import few_of
 from ddqn_planner.grid.footprint import rows_of
 from ddqn_planner.grid.grid_map import MULTIPLIERS
 from ddqn_planner.grid.motions import HEADINGS, Motions, closer
+from ddqn_planner.planning.field import offset_between
 
 SHIFT: Final = 2  # so many bits tell where in its tile a cell lies, along a side
 TILE: Final = 1 << SHIFT  # cells of a side
@@ -171,7 +172,8 @@ def differences(old: GridMap, new: GridMap) -> tuple[NDArray[np.int64], bool] | 
     layers = ("cost", "slowness", "forbidden", "occupancy", "obstacles")
     pairs = [(getattr(old, name), getattr(new, name)) for name in layers]
     has_same = all((before is None) == (after is None) for before, after in pairs)
-    if not has_same or old.occupancy.shape != new.occupancy.shape:
+    is_there = offset_between(old, new) == (0, 0) and old.occupancy.shape == new.occupancy.shape
+    if not (has_same and is_there):
         return None
     boxes = new.patches_since(old)
     if boxes is None:
@@ -194,15 +196,15 @@ def differences(old: GridMap, new: GridMap) -> tuple[NDArray[np.int64], bool] | 
 
 
 @inlined
-def touches(bits: Any, x: int, y: int, row: Any, first: int, last: int) -> bool:
-    """Return whether an occupied cell lies in some rows of swept cells."""
-    for number in range(first, last):
-        column = np.uint64(x + row[number, 1] + BORDER)
-        line, word, place = y + row[number, 0] + BORDER, column // WORD, column & LAST_BIT
-        seen = bits[line, word] >> place
+def touches(x: int, y: int, mask: int, world: Any, body: Any) -> bool:
+    """Return whether an occupied cell lies in a mask around a cell."""
+    for number in range(body.first[mask], body.first[mask + 1]):
+        column = np.uint64(x + body.row[number, 1] + BORDER)
+        line, word, place = y + body.row[number, 0] + BORDER, column // WORD, column & LAST_BIT
+        seen = world.bits[line, word] >> place
         # Two shifts, as one by 64 has no meaning.
-        seen |= (bits[line, word + ONE] << ONE) << (LAST_BIT - place)
-        if seen & (FULL >> np.uint64(64 - row[number, 2])):
+        seen |= (world.bits[line, word + ONE] << ONE) << (LAST_BIT - place)
+        if seen & (FULL >> np.uint64(64 - body.row[number, 2])):
             return True
     return False
 
@@ -273,10 +275,9 @@ def cost_of(x: int, y: int, number: int, world: Any, body: Any) -> Any:
 
 
 @inlined
-def is_possible(x: int, y: int, number: int, world: Any, body: Any) -> bool:
-    """Return whether the body can take a primitive from a cell."""
-    first, last = body.first[number], body.first[number + 1]
-    return is_far(x, y, world, body) or not touches(world.bits, x, y, body.row, first, last)
+def is_possible(x: int, y: int, mask: int, world: Any, body: Any) -> bool:
+    """Return whether the body can take a primitive from a cell, or has room for another mask."""
+    return is_far(x, y, world, body) or not touches(x, y, mask, world, body)
 
 
 @in_place
@@ -285,9 +286,7 @@ def standing(states: NDArray[np.int64], world: World, body: Body) -> int:
     count = 0
     for place in range(len(states)):
         x, y, heading = states[place, 0], states[place, 1], states[place, 2]
-        row = body.start.size + heading
-        first, last = body.first[row], body.first[row + 1]
-        if is_far(x, y, world, body) or not touches(world.bits, x, y, body.row, first, last):
+        if is_possible(x, y, body.start.size + heading, world, body):
             states[count, 0], states[count, 1], states[count, 2] = x, y, heading
             count += 1
     return count

@@ -28,11 +28,7 @@ def length_ratios(field: QField, grid: GridMap, move_rule: MoveRule) -> NDArray[
     for x, y in grid.free_cells():
         if np.isfinite(optimum[y, x]) and (x, y) != field.goal:
             plan = field.rollout((x, y))
-            cost = (
-                path_cost(plan.cells, grid.multipliers(plan.cells), move_rule)
-                if plan.cells
-                else np.inf
-            )
+            cost = path_cost(grid, plan.cells, move_rule) if plan.cells else np.inf
             ratios[y, x] = cost / optimum[y, x]
     return ratios
 

@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 from collections import namedtuple
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable
 from dataclasses import fields
-from functools import partial
 from typing import Any
 
 import numpy as np
-import torch
-from torch import Tensor, nn
+from numpy.typing import NDArray
 
 from ddqn_planner.model.networks import ROBOT
 from ddqn_planner.model.shared_background import (
@@ -32,43 +30,50 @@ DQN, PRINTED = 1, 2  # other targets than Double DQN's
 
 WINDOWS = 5_000  # that all steps of one call look at: so it returns within milliseconds
 
+Tensors = dict[str, NDArray[np.float32]]
+
 # The hyper-parameters that are numbers, for compiled code.
 NUMBERS: Any = {f.name: type(f.default) for f in fields(HyperParameters) if f.type != "str"}
 Numbers: Any = namedtuple("Numbers", [*NUMBERS])  # type: ignore[misc]
 
 
 def player(
-    online: nn.Module,
-    target: nn.Module,
-    moments: Mapping[Any, Mapping[str, Tensor]],
+    parts: tuple[Tensors, ...],
     environment: GridVectorEnvironment,
     replay: ReplayBuffer,
-    total_reward: Any,
-) -> tuple[Any, Callable[..., int]]:
-    """Return `play` for a `PaperModule`, its target and Adam's moments, and the robots' arrays."""
-    e, p, weights = environment, environment.parameters, [*online.parameters()]
-    mean, square = ([moments[w][name] for w in weights] for name in ("exp_avg", "exp_avg_sq"))
-    parts = weights, target.parameters(), [*map(torch.zeros_like, weights)], mean, square
-    networks = networks_of(environment, parts, max(p.batch_size, p.environments))
+    total_reward: NDArray[np.float64],
+) -> Callable[..., tuple[NDArray[Any], ...]]:
+    """Return what plays on: it takes generators, counters and the last step, see `play`."""
+    e, p = environment, environment.parameters
+    online, target, mean, square = parts
+    gradient = {name: np.zeros_like(tensor) for name, tensor in online.items()}
+    all_parts = online, target, gradient, mean, square
+    networks = networks_of(environment, all_parts, max(p.batch_size, p.environments))
     kind = ("double_dqn", "dqn", "printed").index(p.target)
     numbers = Numbers(*(as_number(getattr(p, name)) for name, as_number in NUMBERS.items()))
     trail = np.zeros((max(1, WINDOWS // len(networks[0].after)), p.environments), np.int64)
     terminated, truncated = np.zeros((2, p.environments), np.bool_)
     robots = e.scenario, e.cell, e.steps, total_reward, terminated, truncated, trail
     game = e.legal, e.rewards, e.next_cell, e.goal
-    return robots, partial(play, game, (numbers, kind, networks, replay.transitions), robots)
+    learning = numbers, kind, networks, replay.transitions
+
+    def play_on(random: Any, counters: Any, until: int) -> tuple[NDArray[Any], ...]:
+        made = play(game, learning, robots, random, counters, until)
+        return trail[:made], terminated, truncated
+
+    return play_on
 
 
 def networks_of(
-    environment: GridVectorEnvironment, parts: Iterable[Iterable[Tensor]], batch: int
+    environment: GridVectorEnvironment, parts: Iterable[Tensors], batch: int
 ) -> tuple[Network, ...]:
-    """Return networks of `PaperModule`s' parameters, which from now on are parts of them."""
+    """Return networks of the paper's tensors, which from now on are parts of them."""
     windows = windows_of(environment.background, environment.shape, ROBOT)
     networks = []
-    for tensors in map(list, parts):
-        network: Any = network_of([t.detach().numpy() for t in tensors], windows, batch)
-        for tensor, array in zip(tensors, network[1:], strict=False):
-            tensor.data = torch.from_numpy(array.T).view(tensor.shape)
+    for tensors in parts:
+        network: Any = network_of([*tensors.values()], windows, batch)
+        for (name, tensor), array in zip(tensors.items(), network[1:], strict=False):
+            tensors[name] = array.T.reshape(tensor.shape)
         networks.append(network)
     return tuple(networks)
 

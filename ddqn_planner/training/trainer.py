@@ -2,35 +2,38 @@
 
 from __future__ import annotations
 
-import copy
 import hashlib
 import json
-from collections.abc import Iterator, Sequence
+import math
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict
-from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import safetensors.torch
+import safetensors.numpy
 import torch
 from numpy.typing import NDArray
 from safetensors import safe_open
-from torch import Tensor
 
 from ddqn_planner.files import write_atomically
 from ddqn_planner.grid import MOVES, MoveRule
-from ddqn_planner.model import ModelMetadata, model_bytes, package_version
+from ddqn_planner.model import (
+    NETWORKS,
+    ModelMetadata,
+    PropagationQNetwork,
+    model_bytes,
+    package_version,
+)
 from ddqn_planner.planning import Planner
-from ddqn_planner.training.double_dqn import ReplayBuffer, Transitions, double_dqn_gradient
+from ddqn_planner.training.double_dqn import ReplayBuffer, Transitions
 from ddqn_planner.training.environment import GridVectorEnvironment, Scenario
 from ddqn_planner.training.episodes import Episode, EpisodeEnd
 from ddqn_planner.training.hyper_parameters import HyperParameters
-from ddqn_planner.training.networks import MODULES, PaperModule
+from ddqn_planner.training.propagation import PropagationLearner
 from ddqn_planner.training.shared_background import player
 
 CHECKPOINT_KEY, DIGEST_KEY = "ddqn_planner_checkpoint", "sha256"
-FUSED = tuple(map(int, torch.__version__.split(".")[:2])) >= (2, 4)  # Adam, on the CPU too
 
 
 class CheckpointError(ValueError):
@@ -57,27 +60,30 @@ class Trainer:
         self._generators = [np.random.default_rng(sequence) for sequence in others]
         initial, self._exploration, self._sampling = self._generators
         self.environment = GridVectorEnvironment(self.scenarios, move_rule, parameters, initial)
-        with torch.random.fork_rng(devices=[]):
-            torch.manual_seed(int(weights.generate_state(1)[0]))
-            module, (height, width) = MODULES[parameters.network], self.environment.shape
-            known = {**asdict(parameters), "height": height, "width": width}
-            self.network = module(**{name: known[name] for name in module.numpy_class.size_names})
-        self._target = copy.deepcopy(self.network).requires_grad_(False)
-        self._target.settle(self.environment)
-        self._weights = tuple(self.network.parameters())
-        self._optimiser = torch.optim.Adam(self._weights, parameters.learning_rate, fused=FUSED)
-        for weight in self._weights:  # as Adam does at its first step; a checkpoint restores it
-            moments = {name: torch.zeros_like(weight) for name in ("exp_avg", "exp_avg_sq")}
-            self._optimiser.state[weight] = {"step": torch.zeros(()), **moments}
+        network_class, (height, width) = NETWORKS[parameters.network], self.environment.shape
+        known = {**asdict(parameters), "height": height, "width": width}
+        sizes = {name: known[name] for name in network_class.size_names}
+        first = _initial_tensors(network_class.shapes(sizes), int(weights.generate_state(1)[0]))
+        self.network = network_class(sizes, {name: t.numpy() for name, t in first.items()})
+        target = {name: tensor.clone().numpy() for name, tensor in first.items()}
+        mean, square = (
+            {name: torch.zeros_like(tensor).numpy() for name, tensor in first.items()}
+            for _ in range(2)
+        )
+        # The networks θ and θ⁻, and Adam's moments of the gradient: all that an update changes.
+        self._parts = self.network.tensors, target, mean, square
         self._replay = ReplayBuffer(parameters.replay_capacity)
 
         self.environment.reset()
         self._visited: list[list[int]] = [[int(cell)] for cell in self.environment.cell]
         self._total_reward = np.zeros(parameters.environments)
-        self._player: Any = None  # without it torch trains the paper's network, as it does others
-        if isinstance(self.network, PaperModule):
-            networks = self.network, self._target, self._optimiser.state
-            self._player = player(*networks, self.environment, self._replay, self._total_reward)
+        self._player: Any = None  # of the paper's network, else there is a learner
+        self._learner: Any = None
+        if isinstance(self.network, PropagationQNetwork):
+            self._learner = PropagationLearner(self.network, self._parts, self.environment)
+        else:
+            robots = self.environment, self._replay, self._total_reward
+            self._player = player(self._parts, *robots)
 
     @property
     def epsilon(self) -> float:
@@ -98,11 +104,10 @@ class Trainer:
 
     def _play(self, until: int) -> tuple[NDArray[np.int64], NDArray[np.bool_], NDArray[np.bool_]]:
         """Make some steps in compiled code; return what `_step` returns."""
-        (*_, terminated, truncated, trail), play = self._player
         counters = np.array([self.steps, self.updates, self._replay.added])
-        made = play((self._exploration, self._sampling), counters, until)
+        played = self._player((self._exploration, self._sampling), counters, until)
         self.steps, self.updates, self._replay.added = counters.tolist()
-        return trail[:made], terminated, truncated
+        return played  # type: ignore[no-any-return]
 
     def _step(self) -> tuple[NDArray[np.int64], NDArray[np.bool_], NDArray[np.bool_]]:
         """Make a step, with torch; return the entered cells (1, N), and which episodes ended."""
@@ -126,9 +131,7 @@ class Trainer:
         actions = self._exploration.integers(len(MOVES), size=count)
         greedy = self._exploration.random(count) >= self.epsilon
         if greedy.any():
-            states = self._target.states(self.environment.scenario, self.environment.cell)
-            with torch.inference_mode():
-                q_NA = self.network(states)
+            q_NA = self._learner.q_values(self.environment.scenario, self.environment.cell)
             actions[greedy] = q_NA.argmax(dim=1).numpy()[greedy]
         return actions
 
@@ -136,16 +139,13 @@ class Trainer:
         """Make one Double DQN update with a batch from the replay buffer."""
         p = self.parameters
         batch = self._replay.sample(p.batch_size, self._sampling)
-        cells = np.concatenate([batch.cell, batch.next_cell])
-        states = self._target.states(np.tile(batch.scenario, 2), cells)
-        target_BA = self._target.target_q(batch.scenario, batch.next_cell)
-        gradient_of = partial(double_dqn_gradient, p.target, batch, target_BA)
-        self.network.differentiate(states, gradient_of)
-        self._optimiser.step()
         self.updates += 1
+        self._learner.update(batch, self.updates)
         if self.updates % p.target_interval == 0:
-            self._target.load_state_dict(self.network.state_dict())
-            self._target.settle(self.environment)
+            online, target, *_ = self._parts
+            for name, tensor in target.items():
+                tensor[:] = online[name]
+            self._learner.settle()
 
     def _end_episodes(
         self, ended: NDArray[np.bool_], terminated: NDArray[np.bool_]
@@ -183,11 +183,12 @@ class Trainer:
             seed=self.seed,
             package_version=package_version(),
         )
-        return Planner(self.network.to_numpy(), metadata)
+        tensors = {name: tensor.copy() for name, tensor in self.network.tensors.items()}
+        return Planner(type(self.network)(self.network.sizes, tensors), metadata)
 
     def model_bytes(self) -> bytes:
         """Return what a model file of now holds; a ValueError if the training diverged."""
-        if not all(weight.isfinite().all() for weight in self._weights):
+        if not all(np.isfinite(tensor).all() for tensor in self.network.tensors.values()):
             remedy = "train into another folder with a smaller learning_rate"
             raise ValueError(f"the training diverged, and nothing more is saved; {remedy}")
         planner = self.planner()
@@ -208,16 +209,16 @@ class Trainer:
             "walked": self._visited,
             "generators": [generator.bit_generator.state for generator in self._generators],
         }
-        tensors = {name: tensor.contiguous() for name, tensor in self._tensors().items()}
+        tensors = {name: np.asarray(t, order="C") for name, t in self._tensors().items()}
         text = json.dumps(description)
         metadata = {CHECKPOINT_KEY: text, DIGEST_KEY: _digest(text, tensors)}
-        write_atomically(Path(path), safetensors.torch.save(tensors, metadata))
+        write_atomically(Path(path), safetensors.numpy.save(tensors, metadata))
 
     @classmethod
     def load_checkpoint(cls, path: str | Path, scenarios: Sequence[Scenario]) -> Trainer:
         """Return the trainer of a checkpoint, made with these scenarios, or a CheckpointError."""
         try:
-            with safe_open(path, framework="pt") as file:
+            with safe_open(path, framework="np") as file:
                 metadata = file.metadata()
                 text = metadata[CHECKPOINT_KEY]
                 description = json.loads(text)
@@ -250,40 +251,49 @@ class Trainer:
         if {name: file.get_slice(name).get_shape() for name in file.keys()} != shapes:  # noqa: SIM118
             raise ValueError("its tensors have other names or shapes")
         for name, tensor in tensors.items():
-            tensor.copy_(file.get_tensor(name))
-        self._target.settle(self.environment)
+            tensor[...] = file.get_tensor(name)
+        if not self._player:
+            self._learner.settle()
         self._visited = description["walked"]
         for generator, state in zip(self._generators, description["generators"], strict=True):
             generator.bit_generator.state = state
 
-    def _tensors(self) -> dict[str, Tensor]:
-        """Return the tensors of a checkpoint, which share the trainer's memory."""
-        environment, replay = self.environment, self._replay.transitions._asdict()
-        names = ("scenario", "cell", "steps")
-        groups: dict[str, dict[str, Any]] = {
-            "network": self.network.state_dict(),
-            "target": self._target.state_dict(),
+    def _tensors(self) -> dict[str, NDArray[Any]]:
+        """Return the arrays of a checkpoint, which share the trainer's memory."""
+        online, target, mean, square = self._parts
+        replay = self._replay.transitions._asdict()
+        groups: dict[str, dict[str, NDArray[Any]]] = {
+            "network": online,
+            "target": target,
             "replay": {name: values[: len(self._replay)] for name, values in replay.items()},
-            "environment": {name: getattr(environment, name) for name in names},
+            "environment": {n: getattr(self.environment, n) for n in ("scenario", "cell", "steps")},
         }
-        for index, weight in enumerate(self._weights if self.updates else ()):
-            groups[f"optimiser.{index}"] = self._optimiser.state[weight]
-            self._optimiser.state[weight]["step"].fill_(self.updates)
-        tensors = {
-            f"{group}.{name}": torch.as_tensor(part)
-            for group, parts in groups.items()
-            for name, part in parts.items()
-        }
-        return tensors | {"total_reward": torch.from_numpy(self._total_reward)}
+        for index, name in enumerate(online if self.updates else ()):
+            moments = {"exp_avg": mean[name], "exp_avg_sq": square[name]}
+            groups[f"optimiser.{index}"] = {"step": np.array(self.updates, np.float32), **moments}
+        tensors = {f"{g}.{n}": array for g, arrays in groups.items() for n, array in arrays.items()}
+        return tensors | {"total_reward": self._total_reward}
+
+
+def _initial_tensors(shapes: Mapping[str, tuple[int, ...]], seed: int) -> dict[str, torch.Tensor]:
+    """Draw weights and biases as torch does for its layers."""
+    generator, tensors = torch.Generator().manual_seed(seed), {}
+    for name, shape in shapes.items():
+        layer, _, _ = name.partition(".")
+        most = math.prod(shapes[f"{layer}.weight"][1:]) ** -0.5
+        tensors[name] = torch.empty(shape).uniform_(-most, most, generator=generator)
+        if name == "prices.bias":  # a cost multiplier below 1 has no gradient: it must begin above
+            tensors[name].fill_(1)
+    return tensors
 
 
 def _fingerprints(scenarios: Sequence[Scenario]) -> list[list[object]]:
     return [[s.grid.fingerprint, list(s.start), list(s.goal)] for s in scenarios]
 
 
-def _digest(text: str, tensors: dict[str, Tensor]) -> str:
+def _digest(text: str, tensors: dict[str, NDArray[Any]]) -> str:
     digest = hashlib.sha256(text.encode())
     for name in sorted(tensors):
         digest.update(name.encode())
-        digest.update(tensors[name].numpy().ravel().data)
+        digest.update(tensors[name].ravel().data)
     return digest.hexdigest()

@@ -66,7 +66,7 @@ def test_a_move_costs_its_length_times_the_mean_multiplier(place: Place, rule: M
         assert cost[action, y, x] == pytest.approx(rule.lengths[action] * mean_multiplier)
         assert cost[(action + 4) % 8, next_y, next_x] == cost[action, y, x]
         move = [(x, y), (next_x, next_y)]
-        assert path_cost(move, grid.multipliers(move), rule) == pytest.approx(cost[action, y, x])
+        assert path_cost(grid, move, rule) == pytest.approx(cost[action, y, x])
 
 
 def test_a_length_counts_moves_under_the_unit_rule_and_along_straight_segments() -> None:
@@ -121,5 +121,5 @@ def test_distances_and_paths_are_exact(place: Place, rule: MoveRule, data: Data)
         assert path == []
     else:
         assert (path[0], path[-1]) == (start, goal)
-        length = path_cost(path, grid.multipliers(path), rule)
+        length = path_cost(grid, path, rule)
         assert length == pytest.approx(distance[start[1], start[0]])

@@ -135,7 +135,7 @@ def test_no_path_exceeds_the_certificate(
         plan = field.rollout(start)
         assert bool(plan.cells) == math.isfinite(optimum[start[1], start[0]])
         if plan.cells:
-            cost = path_cost(plan.cells, grid.multipliers(plan.cells), rule)
+            cost = path_cost(grid, plan.cells, rule)
             bound = (1 + certificate.path_error) * optimum[start[1], start[0]]
             assert cost <= bound * (1 + 1e-6)
 

@@ -5,29 +5,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 from networks import random_network
 from strategies import Place, grids_with_costs, grids_with_free_cell
+from torch_layers import in_torch, papers_layers, propagation_layers
 
 from ddqn_planner.grid import OCCUPIED, Cell, GridMap, MoveRule
-from ddqn_planner.model import NETWORKS, AnyMapQNetwork, PropagationQNetwork, networks
+from ddqn_planner.model import AnyMapQNetwork, PropagationQNetwork, networks
 from ddqn_planner.model.move_costs import patches, unique_patches
 from ddqn_planner.model.networks import FREE, GOAL, OBSTACLE, ROBOT, observation_background, observe
 from ddqn_planner.planning.field import network_field
-from ddqn_planner.training.networks import MODULES, AnyMapModule, PaperModule
-
-SIZES = {name: {"filters": 3} for name in ("propagation", "any_map")}
-SIZES["paper"] = {"height": 5, "width": 8, "filters": 3, "hidden_units": 6}
-
-
-@pytest.mark.parametrize("name", MODULES)
-def test_a_module_has_the_tensors_of_its_network(name: str) -> None:
-    module, shapes = MODULES[name](**SIZES[name]), NETWORKS[name].shapes(SIZES[name])
-    assert {key: tuple(t.shape) for key, t in module.state_dict().items()} == shapes
-    network = module.to_numpy()
-    assert type(network) is NETWORKS[name]
-    again = type(module).from_numpy(network)
-    assert all(map(torch.equal, again.state_dict().values(), module.state_dict().values()))
-    for tensor in module.parameters():
-        tensor.data.zero_()
-    assert any(tensor.any() for tensor in network.tensors.values())
 
 
 @given(grids_with_free_cell(), st.sampled_from([0, 1, 6]), st.integers(0, 99))
@@ -41,27 +25,19 @@ def test_the_papers_network_is_its_layers(place: Place, hidden_units: int, seed:
     background = observation_background(grid.occupancy, goal)
     cells = np.arange(grid.occupancy.size)
     observations = torch.from_numpy(observe(background, cells, grid.occupancy.shape))
-    module = PaperModule.from_numpy(network)
-    with torch.inference_mode():
-        answer = module(PaperModule.windows(observations))
-        features = module.convolution(observations.unsqueeze(1)).relu().flatten(1)
-        if module.hidden is not None:
-            features = module.hidden(features).relu()
-        torch.testing.assert_close(answer, module.fully_connected(features))
+    answer = papers_layers(in_torch(network.tensors), observations)
     np.testing.assert_allclose(q, answer.T.reshape(q.shape).numpy(), rtol=1e-5, atol=1e-5)
 
 
 @given(grids_with_costs(), st.sampled_from(MoveRule), st.integers(0, 99))
-def test_propagation_networks_answer_as_modules(place: Place, rule: MoveRule, seed: int) -> None:
+def test_propagation_networks_are_their_layers(place: Place, rule: MoveRule, seed: int) -> None:
     grid, _ = place
     features = AnyMapQNetwork.features(patches(grid.occupancy, grid.cost), rule)
     for name, inputs in (("any_map", features), ("propagation", features[:, :9])):
         network = random_network(name, seed, filters=5)
         assert isinstance(network, PropagationQNetwork)
-        module = MODULES[name].from_numpy(network)
-        for method in ("success", "multiplier")[: 2 if name == "any_map" else 1]:
-            with torch.inference_mode():
-                expected = getattr(module, method)(torch.from_numpy(inputs)).numpy()
+        answers = propagation_layers(in_torch(network.tensors), torch.from_numpy(inputs))
+        for method, expected in zip(("success", "multiplier"), answers, strict=False):
             answer = getattr(network, method)(inputs)
             np.testing.assert_allclose(answer, expected, rtol=1e-5, atol=1e-5)
 
@@ -156,11 +132,3 @@ def test_a_move_whose_cost_or_p_is_nan_is_not_possible(tensor: str) -> None:
     q = q_values(network, grid, (1, 0))
     assert q[0, 0, 0] == -np.inf
     assert q[2, 0, 0] == pytest.approx(-(1 + 2**0.5) / 0.9)  # up, and then down to the right
-
-
-def test_every_cost_begins_where_it_has_a_gradient() -> None:
-    torch.manual_seed(0)
-    module = AnyMapModule(filters=4)
-    module.multiplier(torch.zeros(1, 28)).sum().backward()
-    assert module.prices.bias.grad is not None
-    assert module.prices.bias.grad.tolist() == [1.0] * 8

@@ -172,7 +172,7 @@ def test_a_robot_beside_its_path_comes_back_to_it_and_a_far_one_has_lost_it() ->
 
 
 def cost_of(path: Any, grid: GridMap, rule: MoveRule) -> float:
-    return path_cost(path, grid.multipliers(path), rule)
+    return path_cost(grid, path, rule)
 
 
 @settings(max_examples=300)
@@ -237,7 +237,7 @@ def test_a_search_finds_any_legal_path(place: Place, rule: MoveRule, data: Data)
     for known in (None, -distances.astype(np.float32)):  # nothing is known, or all is
         cells = search(start, goal, legal, grid.cost_multiplier, rule, known)
         if cells:
-            assert path_cost(cells, grid.multipliers(cells), rule) == pytest.approx(cheapest)
+            assert path_cost(grid, cells, rule) == pytest.approx(cheapest)
 
 
 def test_a_search_follows_the_values_even_on_a_detour() -> None:
@@ -265,7 +265,7 @@ def test_segments_are_as_their_cells_are(place: Place, rule: MoveRule, data: Dat
     assert cost_along(np.array([first, last]), grid, rule) == pytest.approx(exact)
     if max(abs(last[0] - first[0]), abs(last[1] - first[1])) == 1:
         cells = [first, last]
-        assert path_cost(cells, grid.multipliers(cells), rule) == pytest.approx(exact)
+        assert path_cost(grid, cells, rule) == pytest.approx(exact)
 
 
 def check_simplified(path: list[Cell], grid: GridMap, rule: MoveRule) -> tuple[Cell, ...]:

@@ -33,8 +33,8 @@ def train(trainer: Trainer, until: int) -> list[Episode]:
     return [episode for finished in trainer.run(until) for episode in finished]
 
 
-def same_weights(a: torch.nn.Module, b: torch.nn.Module) -> bool:
-    return all(map(torch.equal, a.state_dict().values(), b.state_dict().values()))
+def same_weights(a: dict[str, Any], b: dict[str, Any]) -> bool:
+    return all(map(np.array_equal, a.values(), b.values()))
 
 
 @pytest.fixture(scope="module")
@@ -71,6 +71,22 @@ def test_episodes_say_how_they_ended(trained: Any, small: Scenario) -> None:
             assert episode.moves == 20
 
 
+@pytest.mark.parametrize("network", ["paper", "propagation", "any_map"])
+def test_weights_begin_as_those_of_torch(small: Scenario, network: str) -> None:
+    tensors = make(small, HyperParameters(network=network, hidden_units=3)).network.tensors
+    prices = tensors.pop("prices.bias", np.ones(8))
+    assert (prices == 1).all()  # a multiplier below 1 has no gradient
+    seed, *_ = np.random.SeedSequence(0).spawn(4)
+    torch.manual_seed(int(seed.generate_state(1)[0]))
+    for name in [name for name in tensors if name.endswith("weight")]:
+        outputs, *inputs = tensors[name].shape
+        is_dense = len(inputs) == 1
+        layer = torch.nn.Linear(*inputs, outputs) if is_dense else torch.nn.Conv2d(1, outputs, 3)
+        for part, expected in layer.state_dict().items():
+            found = tensors.get(name.replace("weight", part), expected)
+            np.testing.assert_array_equal(found, expected)
+
+
 @pytest.mark.parametrize("rule", MoveRule)
 def test_a_propagation_network_learns(small: Scenario, paper: Scenario, rule: MoveRule) -> None:
     quick = {"learning_rate": 0.003, "batch_size": 256, "filters": 32, "environments": 8}
@@ -98,11 +114,11 @@ def test_an_interrupted_training_continues_bit_for_bit_and_another_seed_gives_an
     interrupted.save_checkpoint(tmp_path / "checkpoint")
     resumed = Trainer.load_checkpoint(tmp_path / "checkpoint", [small])
     assert before + train(resumed, 400) == episodes
-    assert same_weights(uninterrupted.network, resumed.network)
+    assert same_weights(uninterrupted.network.tensors, resumed.network.tensors)
     for name in ("steps", "updates", "episodes", "epsilon"):
         assert getattr(uninterrupted, name) == getattr(resumed, name)
     train(other, 100)
-    assert not same_weights(uninterrupted.network, other.network)
+    assert not same_weights(uninterrupted.network.tensors, other.network.tensors)
 
 
 @pytest.mark.parametrize(("environments", "interval"), [(1, 1), (3, 2), (3, 5), (4, 3)])
@@ -118,7 +134,8 @@ def test_learning_starts_and_targets_are_copied_when_the_parameters_say(small: S
     train(trainer, 5)
     assert trainer.updates == 0
     for _ in trainer.run(13, every=1):
-        assert same_weights(trainer.network, trainer._target) == (trainer.updates % 3 == 0)
+        online, target, *_ = trainer._parts
+        assert same_weights(online, target) == (trainer.updates % 3 == 0)
     assert trainer.updates == 8
 
 

@@ -11,7 +11,9 @@ import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
-from torch import Tensor, nn
+from torch import Tensor
+from torch_layers import in_torch, papers_layers, propagation_layers
+from torch_learner import TorchLearner
 
 from ddqn_planner.grid import (
     LENGTHS,
@@ -26,8 +28,7 @@ from ddqn_planner.model.shared_background import evaluate, look
 from ddqn_planner.training.double_dqn import ReplayBuffer, Transitions
 from ddqn_planner.training.environment import Scenario
 from ddqn_planner.training.hyper_parameters import HyperParameters
-from ddqn_planner.training.networks import AnyMapModule, PaperModule
-from ddqn_planner.training.shared_background import adam, differentiate
+from ddqn_planner.training.shared_background import adam, differentiate, networks_of
 from ddqn_planner.training.trainer import Trainer
 
 Q = Callable[[Scenario, Cell], Tensor]
@@ -50,20 +51,27 @@ def test_the_buffer_holds_the_last_transitions_whole(capacity: int, batches: lis
 
 
 def about_to_update(scenarios: list[Scenario], parameters: HyperParameters) -> Trainer:
-    """A trainer that has seen some steps; its two networks differ, it made no update yet."""
-    parameters = replace(parameters, learning_starts=10**6, environments=5, max_episode_steps=7)
+    """A trainer that makes its first update after the next step; its two networks differ."""
+    settings = {"learning_starts": 60, "environments": 5, "update_interval": 5}
+    parameters = replace(parameters, **settings, max_episode_steps=7)
     trainer = Trainer(scenarios, MoveRule.CORNER_CUTTING, parameters, seed=1)
     for _ in trainer.run(60):
         pass
-    torch.manual_seed(0)
-    for weight in trainer._target.parameters():
-        weight.add_(0.3 * torch.randn_like(weight))
-    trainer._target.settle(trainer.environment)
+    random = np.random.default_rng(0)
+    _, target, *_ = trainer._parts
+    for tensor in target.values():
+        tensor += random.normal(0, 0.3, tensor.shape).astype(np.float32)
+    if trainer._learner:
+        trainer._learner.settle()
     return trainer
 
 
-def next_batch(trainer: Trainer) -> Transitions:
+def update(trainer: Trainer) -> Transitions:
+    """Let a trainer make its first update; return its batch."""
     random = copy.deepcopy(trainer._sampling)
+    for _ in trainer.run(65):
+        pass
+    assert trainer.updates == 1
     return trainer._replay.sample(trainer.parameters.batch_size, random)
 
 
@@ -83,45 +91,57 @@ def mean_squared_error(
     return torch.stack(errors).mean()
 
 
-def check_update(trainer: Trainer, loss: Tensor, before: list[Tensor], tolerance: float) -> None:
-    """Check gradients, and weights after Adam's first step: w - rate * g / (|g| + ε)."""
-    expected = torch.autograd.grad(loss, before)
-    trainer._update()
-    assert trainer.updates == 1
+def check_update(
+    trainer: Trainer, loss: Tensor, before: dict[str, Tensor], tolerance: float
+) -> None:
+    """Check Adam's moments, and weights after its first step: w - rate * g / (|g| + ε)."""
+    expected = torch.autograd.grad(loss, list(before.values()))
     rate = trainer.parameters.learning_rate
     scale = max(float(gradient.abs().max()) for gradient in expected)
-    for weight, gradient, old in zip(trainer.network.parameters(), expected, before, strict=True):
-        assert weight.grad is not None
-        torch.testing.assert_close(weight.grad, gradient, rtol=tolerance, atol=tolerance * scale)
-        step = rate * weight.grad / (weight.grad.abs() + 1e-8)
-        torch.testing.assert_close(weight.detach(), (old - step).detach())
+    parts = map(in_torch, trainer._parts)
+    weights, _, mean, square = (tensors.values() for tensors in parts)
+    for *found, gradient, old in zip(weights, mean, square, expected, before.values(), strict=True):
+        weight, moment, square_of = found
+        slope = moment / (1 - 0.9)
+        torch.testing.assert_close(slope, gradient, rtol=tolerance, atol=tolerance * scale)
+        torch.testing.assert_close(square_of, (1 - 0.999) * slope**2)
+        step = rate * slope / (slope.abs() + 1e-8)
+        torch.testing.assert_close(weight, (old - step).detach())
 
 
+def weights_of(trainer: Trainer) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
+    """The weights of both networks, to be differentiated by the first one's."""
+    online, target = map(in_torch, trainer._parts[:2])
+    return {name: weight.requires_grad_() for name, weight in online.items()}, target
+
+
+@pytest.mark.parametrize("units", [0, 6])
 @pytest.mark.parametrize("target", ["double_dqn", "dqn", "printed"])
-def test_an_update_of_the_papers_network_is_the_equations(small: Scenario, target: str) -> None:
+def test_an_update_of_the_papers_network_is_the_equations(
+    small: Scenario, target: str, units: int
+) -> None:
     scenarios = [small, replace(small, grid=GridMap(small.grid.occupancy[::-1]))]
-    trainer = about_to_update(scenarios, HyperParameters(target=target, filters=4))
-    network = copy.deepcopy(trainer.network)
-    assert isinstance(network, PaperModule)
+    parameters = HyperParameters(target=target, filters=4, hidden_units=units)
+    trainer = about_to_update(scenarios, parameters)
 
-    def q_of(network: nn.Module) -> Q:
+    def q_of(weights: dict[str, Tensor]) -> Q:
         def q(scenario: Scenario, cell: Cell) -> Tensor:
             observation = torch.where(torch.tensor(scenario.grid.occupancy), -0.1, 0.0)
             observation[scenario.goal[::-1]] = 1.0
             observation[cell[::-1]] = 3.0
-            answer: Tensor = network(PaperModule.windows(observation[None]))[0]
-            return answer
+            return papers_layers(weights, observation[None])[0]
 
         return q
 
-    online, target_q = q_of(network), q_of(copy.deepcopy(trainer._target))
+    before, target_weights = weights_of(trainer)
+    online, target_q = q_of(before), q_of(target_weights)
     selection = target_q if target == "dqn" else online
     evaluation = online if target == "printed" else target_q
-    batch = next_batch(trainer)
+    batch = update(trainer)
     assert {0, 1} == set(batch.scenario)
     assert {0.0, np.float32(0.95)} == set(batch.discount)
     loss = mean_squared_error(trainer, batch, online, selection, evaluation)
-    check_update(trainer, loss, list(network.parameters()), tolerance=1e-4)
+    check_update(trainer, loss, before, tolerance=1e-4)
 
 
 @pytest.mark.parametrize("units", [0, 6])
@@ -135,31 +155,33 @@ def test_compiled_training_is_that_of_torch(
     brief |= {"epsilon_steps": 60, "environments": 3, "max_episode_steps": 7, "filters": 4}
     parameters = HyperParameters(target=target, hidden_units=units, **brief)
     trainers = [Trainer(scenarios, MoveRule.ROBOT_SAFE, parameters, seed=2) for _ in range(2)]
-    compiled, in_torch = trainers
-    in_torch._player = None
-    one, other = ([e for ended in t.run(90) for e in ended] for t in (compiled, in_torch))
+    compiled, of_torch = trainers
+    TorchLearner(of_torch)
+    one, other = ([e for ended in t.run(90) for e in ended] for t in (compiled, of_torch))
     assert one == other
-    assert compiled.updates == in_torch.updates > 60
-    check_same(compiled, in_torch)
-    in_torch.save_checkpoint(tmp_path / "checkpoint")
+    assert compiled.updates == of_torch.updates > 60
+    check_same(compiled, of_torch)
+    of_torch.save_checkpoint(tmp_path / "checkpoint")
     compiled = Trainer.load_checkpoint(tmp_path / "checkpoint", scenarios)
-    one, other = ([e for ended in t.run(180) for e in ended] for t in (compiled, in_torch))
+    one, other = ([e for ended in t.run(180) for e in ended] for t in (compiled, of_torch))
     assert one == other
-    check_same(compiled, in_torch)
+    check_same(compiled, of_torch)
 
 
-def check_same(compiled: Trainer, in_torch: Trainer) -> None:
-    expected = in_torch._tensors()
+def check_same(compiled: Trainer, of_torch: Trainer) -> None:
+    expected = of_torch._tensors()
     for name, tensor in compiled._tensors().items():
         # The mean: Adam makes much of the rounding of a gradient that is nearly 0.
-        error = (tensor.double() - expected[name].double()).abs().mean()
-        assert error <= 1e-3 * expected[name].double().abs().mean(), name
+        error = np.abs(tensor - expected[name]).mean(dtype=np.float64)
+        assert error <= 1e-3 * np.abs(expected[name]).mean(dtype=np.float64), name
 
 
 def test_weights_that_slept_wake_as_if_they_had_moved_all_the_time(small: Scenario) -> None:
     parameters = HyperParameters(hidden_units=6, filters=4)
     trainer = Trainer([small], MoveRule.ROBOT_SAFE, parameters, seed=2)
-    online, _, gradient, *moments = trainer._player[1].args[1][2]
+    zeros = ({name: 0 * t for name, t in trainer.network.tensors.items()} for _ in range(3))
+    parts = trainer.network.tensors, *zeros
+    online, gradient, *moments = networks_of(trainer.environment, parts, batch=1)
     weight = torch.tensor(online.weights)
     optimiser = torch.optim.Adam([weight], 0.01)
     for update in range(1, 701):
@@ -186,17 +208,15 @@ def test_an_update_of_the_network_for_any_map_counts_each_reward_once(small: Sce
     ]
     settings = {"reward": "path_cost", "gamma": 0.5, "obstacle_reward": -20.0, "filters": 4}
     trainer = about_to_update(scenarios, HyperParameters(network="any_map", **settings))
-    with torch.no_grad():  # a multiplier below 1 is clipped
-        trainer.network.get_submodule("prices").bias[::2] = -1.0
-    network, target_network = copy.deepcopy(trainer.network), copy.deepcopy(trainer._target)
-    assert isinstance(network, AnyMapModule)
+    trainer.network.tensors["prices.bias"][::2] = -1.0  # a multiplier below 1 is clipped
+    before, target_weights = weights_of(trainer)
     lengths = torch.from_numpy(LENGTHS.astype(np.float32))
 
-    def q_of(network: AnyMapModule, scenario: Scenario, value: Any) -> dict[Cell, Tensor]:
+    def q_of(weights: dict[str, Tensor], scenario: Scenario, value: Any) -> dict[Cell, Tensor]:
         seen = patches(scenario.grid.occupancy, scenario.grid.cost)
         rule = scenario.move_rule or MoveRule.CORNER_CUTTING
         features = torch.from_numpy(AnyMapQNetwork.features(seen, rule))
-        p, multiplier = network.success(features), network.multiplier(features)
+        p, multiplier = propagation_layers(weights, features)
         answers = {}
         for number in range(20):
             x, y = number % 5, number // 5
@@ -210,16 +230,16 @@ def test_an_update_of_the_network_for_any_map_counts_each_reward_once(small: Sce
         value = {(x, y): -20.0 for x in range(5) for y in range(4)}
         with torch.no_grad():
             for _ in range(40):  # γ^40 is 1e-12
-                q = q_of(target_network, scenario, value)
+                q = q_of(target_weights, scenario, value)
                 value = {cell: float(q_A.max()) for cell, q_A in q.items()}
                 value[scenario.goal] = 0.0
-            evaluation[scenario] = q_of(target_network, scenario, value)
-        online[scenario] = q_of(network, scenario, value)
-    batch = next_batch(trainer)
+            evaluation[scenario] = q_of(target_weights, scenario, value)
+        online[scenario] = q_of(before, scenario, value)
+    batch = update(trainer)
     assert {0, 1} == set(batch.scenario)
 
     def first(s: Scenario, cell: Cell) -> Tensor:
         return online[s][cell]
 
     loss = mean_squared_error(trainer, batch, first, first, lambda s, cell: evaluation[s][cell])
-    check_update(trainer, loss, list(network.parameters()), tolerance=2e-3)
+    check_update(trainer, loss, before, tolerance=2e-3)

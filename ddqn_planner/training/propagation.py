@@ -1,0 +1,138 @@
+"""Double DQN of the propagation networks, in torch: their states on given maps, and updates."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Final, TypeAlias
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+from torch.nn import functional
+
+from ddqn_planner.grid import LENGTHS, MOVES, neighbours
+from ddqn_planner.model import PropagationQNetwork
+from ddqn_planner.model.move_costs import patches
+from ddqn_planner.planning.value_iteration import value_iteration
+from ddqn_planner.training.double_dqn import Transitions, double_dqn_gradient
+from ddqn_planner.training.environment import GridVectorEnvironment
+
+# Dimensions: B = a batch, A = 8 actions, F = filters, I = features of a 3x3 patch, X = I + 9 of a
+# state, S maps, C = H * W cells (cell y * W + x), U = different features.
+
+Tensors: TypeAlias = Mapping[str, Tensor]
+
+LENGTHS_A: Final = torch.tensor(LENGTHS, dtype=torch.float32)
+FUSED: Final = tuple(map(int, torch.__version__.split(".")[:2])) >= (2, 4)  # Adam, on the CPU too
+
+
+class PropagationLearner:
+    """Trains a propagation network in place; `parts` are θ, θ⁻ and Adam's two moments."""
+
+    def __init__(
+        self,
+        network: PropagationQNetwork,
+        parts: tuple[Mapping[str, NDArray[np.float32]], ...],
+        environment: GridVectorEnvironment,
+    ) -> None:
+        e = self.environment = environment
+        self.uses_costs = network.uses_costs
+        self._online, self._target, *moments = (
+            {name: torch.from_numpy(array) for name, array in part.items()} for part in parts
+        )
+        self._adam = adam_of(self._online, moments, e.parameters.learning_rate)
+        with_rules = zip(e.scenarios, e.move_rules, strict=True)
+        seen = [(patches(s.grid.occupancy, s.grid.cost), rule) for s, rule in with_rules]
+        features = np.concatenate([network.features(*of_map) for of_map in seen])
+        self._feature_UI, places = np.unique(features, axis=0, return_inverse=True)
+        self._place_SC = places.reshape(len(seen), -1)
+        self.settle()
+
+    def settle(self) -> None:
+        """Settle V on every map, by the target network."""
+        e, feature_UI = self.environment, torch.from_numpy(self._feature_UI)
+        p_SCA = _activations(self._target, feature_UI)[-1].numpy()[self._place_SC]
+        cost_SCA = self._cost(self._target, feature_UI).numpy()[self._place_SC]
+        reward_SCA = -cost_SCA if self.uses_costs else e.free_reward.swapaxes(1, 2)
+        collision, gamma = np.float32(e.parameters.obstacle_reward), e.parameters.gamma
+        near_AC = neighbours(e.shape)
+        return_SCA = value_iteration(p_SCA, reward_SCA, e.goal, near_AC, gamma, float(collision))
+        self._q_SCA = collision + p_SCA * (return_SCA - collision)
+        # A state: the features, the return r + γ V(s') of each move (γ V(s') where r is learned),
+        # r_o. A gradient through V would diverge: none flows.
+        returns = return_SCA + cost_SCA, np.full_like(return_SCA[..., :1], collision)
+        self._state_SCX = np.concatenate([self._feature_UI[self._place_SC], *returns], axis=2)
+
+    def q_values(self, scenario: NDArray[np.int64], cell: NDArray[np.int64]) -> Tensor:
+        """Return Q(s, a) of robots in `cell` (B,) on the maps `scenario` (B,): (B, 8)."""
+        return self._evaluate(scenario, cell)[0]
+
+    def _evaluate(
+        self, scenario: NDArray[np.int64], cell: NDArray[np.int64]
+    ) -> tuple[Tensor, Tensor, list[Tensor]]:
+        """Return Q(s, a), what success gains over a collision, (B, 8), and all activations."""
+        # Q(s, a) = p (r + γ V(s')) + (1 - p) r_o
+        state_BX = torch.from_numpy(self._state_SCX[scenario, cell])
+        widths = [self._feature_UI.shape[1], len(MOVES), 1]
+        feature_BI, return_BA, collision_B1 = torch.split(state_BX, widths, dim=1)
+        gain_BA = return_BA - self._cost(self._online, feature_BI) - collision_B1
+        activations = _activations(self._online, feature_BI)
+        return collision_B1 + activations[-1] * gain_BA, gain_BA, activations
+
+    def _cost(self, weights: Tensors, feature_BI: Tensor) -> Tensor:
+        """Return length times cost multiplier of each move: (B, 8); 0 where the reward is given."""
+        if not self.uses_costs:
+            return torch.zeros(len(feature_BI), len(MOVES))
+        return LENGTHS_A * (1 + _layer(weights, "prices", feature_BI).relu())
+
+    def update(self, batch: Transitions, number: int) -> None:
+        """Make an update, of this number, with a gradient by hand: in half of autograd's time."""
+        count, target = len(batch.cell), self.environment.parameters.target
+        states = np.tile(batch.scenario, 2), np.concatenate([batch.cell, batch.next_cell])
+        q_2BA, gain_2BA, activations = self._evaluate(*states)
+        target_BA = torch.from_numpy(self._q_SCA[batch.scenario, batch.next_cell])
+        gradient_BA = double_dqn_gradient(target, batch, target_BA, q_2BA)
+        *inputs, p_BA = (activation[:count] for activation in activations)
+        by_gain_BA = gradient_BA * p_BA
+        if self.uses_costs:
+            is_above_1_BA = self._cost(self._online, inputs[0]) > LENGTHS_A
+            self._set_gradient("prices", by_gain_BA * -LENGTHS_A * is_above_1_BA, inputs[0])
+        by_output = by_gain_BA * (1 - p_BA) * gain_2BA[:count]
+        for layer in ("moves", "hidden", "convolution"):
+            input_BF = inputs.pop()
+            self._set_gradient(layer, by_output, input_BF)
+            by_input_BF = by_output @ self._online[f"{layer}.weight"]
+            by_output = torch.ops.aten.threshold_backward(by_input_BF, input_BF, 0)
+        self._adam(number)
+
+    def _set_gradient(self, layer: str, by_output: Tensor, input_BF: Tensor) -> None:
+        """Set the gradients of a layer, given that by its output."""
+        self._online[f"{layer}.weight"].grad = by_output.T @ input_BF
+        self._online[f"{layer}.bias"].grad = by_output.sum(0)
+
+
+def adam_of(online: Tensors, moments: Sequence[Tensors], rate: float) -> Callable[[int], None]:
+    """Return what makes torch's step of Adam with a number, given the moments of the gradients."""
+    adam = torch.optim.Adam([*online.values()], rate, fused=FUSED)
+    (mean, square), updates = moments, torch.zeros(len(online))
+    for number, (name, weight) in enumerate(online.items()):
+        state = {"step": updates[number], "exp_avg": mean[name], "exp_avg_sq": square[name]}
+        adam.state[weight] = state
+
+    def step(number: int) -> None:
+        updates.fill_(number - 1)
+        adam.step()
+
+    return step
+
+
+def _layer(weights: Tensors, name: str, input_BF: Tensor) -> Tensor:
+    return functional.linear(input_BF, weights[f"{name}.weight"], weights[f"{name}.bias"])
+
+
+def _activations(weights: Tensors, feature_BI: Tensor) -> list[Tensor]:
+    """Return the features, and what each layer makes of what is before it; p(s, a) at the end."""
+    first_BF = _layer(weights, "convolution", feature_BI).relu()
+    second_BF = _layer(weights, "hidden", first_BF).relu()
+    return [feature_BI, first_BF, second_BF, _layer(weights, "moves", second_BF).sigmoid()]

@@ -1,0 +1,78 @@
+"""The paper's network, trained by torch: what the compiled training is compared with."""
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor, nn
+from torch.nn import functional
+
+from ddqn_planner.model.networks import observe
+from ddqn_planner.training.double_dqn import Transitions, double_dqn_gradient
+from ddqn_planner.training.propagation import adam_of
+from ddqn_planner.training.trainer import Trainer
+
+
+class PaperModule(nn.Module):
+    """The paper's network, see `PaperQNetwork`."""
+
+    def __init__(self, height: int, width: int, filters: int, hidden_units: int) -> None:
+        super().__init__()
+        self.convolution = nn.Conv2d(1, filters, kernel_size=3, stride=2, padding=1)
+        features = filters * ((height + 1) // 2) * ((width + 1) // 2)
+        self.hidden = nn.Linear(features, hidden_units) if hidden_units else None
+        self.fully_connected = nn.Linear(hidden_units or features, 8)
+
+    def forward(self, observation_BHW: Tensor) -> Tensor:
+        """Return Q(s, a): (B, 8)."""
+        # On windows the convolution is a matrix product, which is faster on small maps.
+        window_BKL = functional.unfold(observation_BHW.unsqueeze(1), 3, padding=1, stride=2)
+        weight_BFK = self.convolution.weight.flatten(1).expand(len(window_BKL), -1, -1)
+        bias_F1 = self.convolution.get_parameter("bias").unsqueeze(1)
+        feature_BF = torch.baddbmm(bias_F1, weight_BFK, window_BKL).relu_().flatten(1)
+        if self.hidden is not None:
+            feature_BF = self.hidden(feature_BF).relu_()
+        answer: Tensor = self.fully_connected(feature_BF)
+        return answer
+
+
+class TorchLearner:
+    """Takes over the training of the paper's network, with autograd and torch's Adam."""
+
+    def __init__(self, trainer: Trainer) -> None:
+        self.environment, p = trainer.environment, trainer.parameters
+        self._online, self._target = (PaperModule(**trainer.network.sizes) for _ in range(2))
+        online, target, *moments = trainer._parts
+        for module, part in ((self._online, online), (self._target, target)):
+            for name, weight in module.named_parameters():
+                weight.data.copy_(torch.from_numpy(part[name]))
+                part[name] = weight.data.numpy()
+        for part in moments:
+            part.update({name: tensor.copy() for name, tensor in part.items()})
+        states = [{name: torch.from_numpy(t) for name, t in part.items()} for part in moments]
+        self._adam = adam_of(dict(self._online.named_parameters()), states, p.learning_rate)
+        trainer._player, trainer._learner = None, self
+
+    def settle(self) -> None:
+        """Do nothing: this network knows no values of maps."""
+
+    def _observe(self, scenario: NDArray[np.int64], cell: NDArray[np.int64]) -> Tensor:
+        background, shape = self.environment.background[scenario], self.environment.shape
+        return torch.from_numpy(observe(background, cell, shape))
+
+    def q_values(self, scenario: NDArray[np.int64], cell: NDArray[np.int64]) -> Tensor:
+        """Return Q(s, a) of robots in `cell` (B,) on the maps `scenario` (B,): (B, 8)."""
+        with torch.inference_mode():
+            answer: Tensor = self._online(self._observe(scenario, cell))
+        return answer
+
+    def update(self, batch: Transitions, number: int) -> None:
+        """Make an update, of this number."""
+        with torch.no_grad():
+            target_BA = self._target(self._observe(batch.scenario, batch.next_cell))
+        cells = np.concatenate([batch.cell, batch.next_cell])
+        q_2BA = self._online(self._observe(np.tile(batch.scenario, 2), cells))
+        kind = self.environment.parameters.target
+        gradient_BA = double_dqn_gradient(kind, batch, target_BA, q_2BA.detach())
+        self._online.zero_grad()
+        torch.autograd.backward(q_2BA[: len(gradient_BA)], gradient_BA)
+        self._adam(number)
