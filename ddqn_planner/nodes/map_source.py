@@ -19,7 +19,7 @@ from std_msgs.msg import Header, UInt8MultiArray
 from ddqn_planner.experience import Experience
 from ddqn_planner.grid import GridMap
 from ddqn_planner.grid.body import Inflation
-from ddqn_planner.grid.copies import WHOLE, boxes_of
+from ddqn_planner.grid.copies import boxes_of
 from ddqn_planner.nodes.conversions import bytes_of, grid_from_message, grid_from_values
 from ddqn_planner.nodes.report import NO_REQUEST, Outcome, Report, RequestError, seconds
 from ddqn_planner.nodes.runtime import LATCHED, BaseNode, Worker
@@ -388,7 +388,5 @@ def is_like(grid: GridMap, other: GridMap) -> bool:
     mine, its = ((each.occupancy.shape, each.resolution, each.origin) for each in (grid, other))
     if mine != its:
         return False
-    boxes = grid.patches_since(other)
-    boxes = [WHOLE] if boxes is None else boxes
-    changed = sum(np.count_nonzero(grid.occupancy[box] != other.occupancy[box]) for box in boxes)
+    changed = np.count_nonzero(grid.occupancy != other.occupancy)
     return bool(changed <= CHANGED_SHARE * grid.occupancy.size)
