@@ -14,13 +14,12 @@ from ddqn_planner.grid.copies import few_of
 from ddqn_planner.grid.footprint import rows_of
 from ddqn_planner.grid.grid_map import MULTIPLIERS
 from ddqn_planner.grid.motions import HEADINGS, Motions, closer
-from ddqn_planner.planning.field import offset_between
+from ddqn_planner.planning.field import CHANGED_SHARE, overlap, shift_between
 
 SHIFT: Final = 2  # so many bits tell where in its tile a cell lies, along a side
 TILE: Final = 1 << SHIFT  # cells of a side
 BORDER: Final = 128  # occupied cells around the map, so that a body sweeps none beyond the bits
 State: TypeAlias = tuple[int, int, int]  # x, y, heading
-CHANGED_SHARE = 1 / 50  # of the map's cells: if more changed, fields begin anew
 FINE = 0.01  # cells between two points of the origin's way, which tell the cells that it passes
 WORD, LAST_BIT, ONE, FULL = np.uint64(64), np.uint64(63), np.uint64(1), np.uint64(2**64 - 1)
 
@@ -169,26 +168,16 @@ def differences(old: GridMap, new: GridMap) -> tuple[NDArray[np.int64], bool] | 
 
     None if the maps cannot be compared, or differ in too much.
     """
-    layers = ("cost", "slowness", "forbidden", "occupancy", "obstacles")
-    pairs = [(getattr(old, name), getattr(new, name)) for name in layers]
-    has_same = all((before is None) == (after is None) for before, after in pairs)
-    is_there = offset_between(old, new) == (0, 0) and old.occupancy.shape == new.occupancy.shape
-    if not (has_same and is_there):
-        return None
-    boxes = new.patches_since(old)
-    if boxes is None:
-        boxes = [(slice(0, new.height), slice(0, new.width))]
     before, after = occupied_for_body(old), occupied_for_body(new)
+    if shift_between(old, new) != (0, 0) or before.shape != after.shape:
+        return None
+    patches = new.patches_since(old)
+    boxes = [overlap(old, new, (0, 0))[1]] if patches is None else patches
     found, opens = [np.empty((0, 2), np.int64)], False
     for rows, columns in boxes:
         box = rows, columns
-        differs = before[box] != after[box]
-        opens = opens or bool((differs & before[box]).any())
-        for one, other in pairs[:4]:
-            if one is not None and one is not other:
-                changed = (one[box] != other[box]) & ~after[box]
-                opens = opens or bool(changed.any())
-                differs |= changed
+        differs = (before[box] != after[box]) | (new.differs(old, box, box) & ~after[box])
+        opens = opens or bool((differs & ~after[box]).any())
         y, x = few_of(differs)
         found.append(np.column_stack([x + columns.start, y + rows.start]))
     cells = np.concatenate(found)
