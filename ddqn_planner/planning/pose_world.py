@@ -25,10 +25,11 @@ WORD, LAST_BIT, ONE, FULL = np.uint64(64), np.uint64(63), np.uint64(1), np.uint6
 
 
 class Body(NamedTuple):
-    """P primitives as kernels use them, and the rows of 33 more masks."""
+    """P primitives as kernels use them, and the rows of 34 more masks."""
 
     # 16 say for each heading where the body stands. Then come the cores, of each heading and of
     # all: what each primitive that starts with it sweeps around any cell that its origin passes.
+    # The last one is all within reach of a tile, around its middle.
 
     into: NDArray[np.int64]  # (17,): into[h] to into[h + 1] are the places in `ending` of those
     ending: NDArray[np.int64]  # (P,): the primitives, by the heading in which they end
@@ -38,7 +39,7 @@ class Body(NamedTuple):
     offset: NDArray[np.int64]  # (P, 2)
     cost: NDArray[np.float32]  # (P,)
     row: NDArray[np.int64]  # (R, 3): y, first x, cells: the swept cells, at most 64 in one row
-    first: NDArray[np.int64]  # (P + 34,): where the rows of each begin
+    first: NDArray[np.int64]  # (P + 35,): where the rows of each begin
     passed: NDArray[np.int64]  # (C, 3): x, y, bit of the action by which the origin leaves the cell
     share: NDArray[np.float32]  # (C,): which part of the cost counts in this cell
     first_passed: NDArray[np.int64]  # (P + 1,)
@@ -74,6 +75,8 @@ def body_of(motions: Motions, swept: NDArray[np.bool_]) -> Body:
         for over, up, _ in cells:
             core[before] &= np.roll(mask, (-up, -over), axis=(0, 1))
     row, first = rows_of(np.concatenate([swept, standing, core, core.all(axis=0, keepdims=True)]))
+    reach = int(np.abs(np.argwhere(swept.any(axis=0)) - len(swept[0]) // 2).max())
+    around, _ = rows_of(np.ones((1, 2 * reach + TILE + 1, 2 * reach + TILE + 1), dtype=np.bool_))
     ending = np.argsort(end, kind="stable")
     return Body(
         into=np.searchsorted(end[ending], headings),
@@ -83,12 +86,12 @@ def body_of(motions: Motions, swept: NDArray[np.bool_]) -> Body:
         end=end,
         offset=motions.offset,
         cost=motions.cost,
-        row=row,
-        first=first,
+        row=np.concatenate([row, around]),
+        first=np.append(first, len(row) + len(around)),
         passed=np.concatenate([cells for cells, _ in passed]),
         share=np.concatenate([share for _, share in passed]).astype(np.float32),
         first_passed=np.cumsum([0, *(len(share) for _, share in passed)]),
-        reach=int(np.abs(np.vstack([row[:, :2], [(0, sum(r) - 1) for r in row[:, 1:]]])).max()),
+        reach=reach,
     )
 
 
@@ -215,24 +218,8 @@ def is_far(x: int, y: int, world: Any, body: Any) -> bool:
     """Return whether no occupied cell is within reach of a tile; looks at most once."""
     tile = tile_of(x, y, world.columns)
     if world.tile[tile] == 0:
-        left, bottom = (x & -TILE) - body.reach, (y & -TILE) - body.reach
-        wide = TILE + 2 * body.reach
-        found = 1
-        first = np.uint64(left + BORDER)
-        last = np.uint64(left + wide - 1 + BORDER)
-        for line in range(bottom + BORDER, bottom + wide + BORDER):
-            for word in range(first // WORD, last // WORD + ONE):
-                seen = world.bits[line, word]
-                if word == first // WORD:
-                    seen &= FULL << (first & LAST_BIT)
-                if word == last // WORD:
-                    seen &= FULL >> (LAST_BIT - (last & LAST_BIT))
-                if seen:
-                    found = 2
-                    break
-            if found == 2:
-                break
-        world.tile[tile] = found
+        x, y = (x & -TILE) + TILE // 2, (y & -TILE) + TILE // 2
+        world.tile[tile] = 2 if touches(x, y, body.first.size - 2, world, body) else 1
     return bool(world.tile[tile] == 1)
 
 
