@@ -35,8 +35,6 @@ def compiled(function: Function, **options: Any) -> Function:
             numba = _import_numba()
         # Without checks of divisors and entries for C, which none needs, they compile sooner.
         settings = {"nogil": True, "error_model": "numpy", "no_cfunc_wrapper": True, **options}
-        if "_nrt" in options:
-            settings["pipeline_class"] = _short_pipeline()
         try:
             return numba.njit(cache=True, **settings)(to_compile)
         except RuntimeError:  # no folder is writable: each process compiles again
@@ -98,34 +96,3 @@ def _import_numba() -> Any:
 
     event.register("numba:compile", Announcement())  # type: ignore[no-untyped-call]
     return numba
-
-
-@cache
-def _short_pipeline() -> Any:
-    """Return numba's passes that plain loops over arrays need: a third of its own, and sooner."""
-    from numba.core import typed_passes, untyped_passes
-    from numba.core.compiler import CompilerBase, PassManager
-
-    passes = (
-        untyped_passes.TranslateByteCode,
-        untyped_passes.FixupArgs,
-        untyped_passes.IRProcessing,
-        untyped_passes.GenericRewrites,
-        untyped_passes.ReconstructSSA,
-        typed_passes.NopythonTypeInference,
-        typed_passes.PreLowerStripPhis,
-        typed_passes.NativeLowering,
-        typed_passes.NoPythonBackend,
-    )
-
-    class ShortPipeline(CompilerBase):
-        """Compiles without what closures, exceptions, array expressions and threads need."""
-
-        def define_pipelines(self) -> list[Any]:
-            manager = PassManager("short")  # type: ignore[no-untyped-call]
-            for each in passes:
-                manager.add_pass(each)  # type: ignore[no-untyped-call]
-            manager.finalize()  # type: ignore[no-untyped-call]
-            return [manager]
-
-    return ShortPipeline

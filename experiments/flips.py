@@ -42,7 +42,7 @@ class Driven(NamedTuple):
 def main(_: Sequence[str]) -> int:
     """Print the flips per 100 replans; cost beside that of the first threshold."""
     rows, planner = [], Planner.load("any_map")
-    planner.cache_bytes = 0  # each map comes once
+    planner.fields.nbytes = 0  # each map comes once
     for kind, path in itertools.product(KINDS, ("cells", "straight")):
         first = None
         for threshold in THRESHOLDS:

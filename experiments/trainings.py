@@ -19,9 +19,9 @@ from ddqn_planner.grid import LENGTHS, MoveRule, Noise, neighbours
 from ddqn_planner.model import PaperQNetwork
 from ddqn_planner.model.shared_background import evaluate
 from ddqn_planner.planning import Planner
-from ddqn_planner.planning.value_iteration import value_iteration
 from ddqn_planner.training.environment import GridVectorEnvironment, Scenario, paper_scenario
 from ddqn_planner.training.hyper_parameters import HyperParameters
+from ddqn_planner.training.propagation import value_iteration
 from ddqn_planner.training.run import TrainingRun
 from ddqn_planner.training.trainer import Trainer
 

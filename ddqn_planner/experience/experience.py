@@ -125,35 +125,36 @@ class Experience:
         possible = (np.abs(time) < LATEST) & (np.abs(position) < FARTHEST).all(axis=1)
         time, position = time[possible], position[possible]
         fresh = np.diff(time, prepend=np.nan) != 0  # a repeated time adds nothing
-        if fresh.any() and (drive := self._measured(time[fresh], position[fresh])) is not None:
-            self._learn(partial(Evidence.add, visits=drive[0], waits=drive[1]))
+        if fresh.any():
+            visits, waits = self._measured(time[fresh], position[fresh])
+            self._learn(partial(Evidence.add, visits=visits, waits=waits))
 
-    def _measured(self, time: Float64, position: Float64) -> tuple[Visits, Float64] | None:
-        """Return the visits and the waits of a drive, if there are any."""
+    def _measured(self, time: Float64, position: Float64) -> tuple[Visits, Float64]:
+        """Return the visits and the waits of a drive."""
         speed, side = self.learned_speed, self.evidence.side
         seconds, at = averaged(time, position, WINDOW / speed)
         speeds = np.hypot(*np.diff(at, axis=0).T) / np.abs(np.diff(seconds))
         usual = float(np.median(speeds)) if len(speeds) else 0.0
-        max_speed, steps, waits = 3 * max(self.nominal_speed, speed, usual), [], []
+        max_speed, step = 3 * max(self.nominal_speed, speed, usual), max(side, WINDOW) / 2
+        steps, waits = [np.zeros((0, 3))], [np.zeros((0, 3))]
         for part in _believed_parts(time, position, max_speed, self.max_pause):
             seconds, at = averaged(time[part], position[part], WINDOW / speed)
             # Standing at the ends of a drive is no waiting on the way.
-            for first, end in list(pairwise(_ways(at, STAND_DISTANCE)))[1:]:
-                if (stood := seconds[end - 1] - seconds[first]) >= STAND / speed:
-                    if stood <= self.max_pause:
-                        waits.append([*at[first:end].mean(axis=0), stood])
-                    seconds[end - 1 :] -= stood
-                    seconds[first : end - 1] = seconds[first]
-            steps.append(_steps(seconds, at, max(side, WINDOW) / 2, max_speed))
-        rows = np.concatenate([np.zeros((0, 4)), *steps])
-        if not len(rows):
-            return None
-        square = np.floor(rows[:, :2] / side)
-        begins = np.flatnonzero(np.append(True, (np.diff(square, axis=0) != 0).any(axis=1)))
-        rows[:, :2] *= rows[:, 3:]
-        sums = np.add.reduceat(rows, begins)
-        visits = Visits(sums[:, :2] / sums[:, 3:], sums[:, 2], sums[:, 3])
-        return visits, np.array(waits).reshape(-1, 3)
+            way = np.array(_ways(at, STAND_DISTANCE)[1:], dtype=np.int64)
+            if not len(way):
+                continue
+            stood = seconds[way[1:] - 1] - seconds[way[:-1]]
+            stood[stood < STAND / speed] = 0
+            waited = np.column_stack([at[way[:-1]], stood])
+            waits.append(waited[(stood > 0) & (stood <= self.max_pause)])
+            steps.append(_steps(np.diff(seconds[way]) - stood, at[way], step))
+        rows = np.concatenate(steps)
+        rows = rows[step <= max_speed * rows[:, 2]]
+        squares = np.floor(rows[:, :2] / side)
+        entered = np.flatnonzero((np.diff(squares, axis=0, prepend=np.nan) != 0).any(axis=1))
+        count, sums = np.diff(entered, append=len(rows)), np.add.reduceat(rows, entered)
+        visits = Visits(sums[:, :2] / count[:, None], sums[:, 2], step * count)
+        return visits, np.concatenate(waits)
 
     def record_failure(self, position: Sequence[float]) -> None:
         """Learn that the robot failed at a place: it costs as much as a wait of `max_pause`."""
@@ -210,9 +211,9 @@ class Experience:
         grid : GridMap
             The map.
         exploration : float
-            0 or more. Places count as faster the less of them is known, at most by this share, and
-            sooner by all of it while drives know their ways. So plans lead where it may be faster,
-            but no plan is expected to take longer than the best one by more than this share.
+            0 or more. Places count as faster the less of them is known, at most by this share. So
+            plans lead where it may be faster, but no plan is expected to take longer than the best
+            one by more than this share.
         """
         limits = 0.0, 10.0, "0 to 10"
         exploration = as_number("exploration", exploration, *limits)
@@ -220,8 +221,7 @@ class Experience:
         posterior = evidence.over(grid)
         fastest = FAST_STEP * min(0, math.floor(evidence.fastest / FAST_STEP + 0.5))
         fastest -= share
-        hope = share * np.minimum(evidence.boldness * posterior.unknown, 1)
-        slowness = posterior.paint(hope, fastest)
+        slowness = posterior.paint(share * posterior.unknown, fastest)
         seconds_per_cell = grid.resolution / self.nominal_speed * math.exp(fastest)
         return grid.with_layers(slowness=slowness, seconds_per_cell=seconds_per_cell)
 
@@ -233,7 +233,7 @@ class Experience:
     def uncertainty(self, grid: GridMap) -> Float32:
         """Return (H, W) float32: the standard deviation of the log slowness, most if unknown."""
         posterior = self.evidence.over(grid)
-        return math.sqrt(posterior.common[1]) * posterior.over(posterior.unknown, 1.0)
+        return math.sqrt(posterior.variance) * posterior.over(posterior.unknown, 1.0)
 
     def expected_time(self, grid: GridMap, cells: Cells) -> ExpectedTime:
         """Return the time that a path takes, with an interval of 90 %.
@@ -253,10 +253,10 @@ class Experience:
         path, position = cells_along(corners)
         of_segments = np.hypot(*np.diff(corners, axis=0).T) * grid.resolution
         metres = np.diff(position) * of_segments[position[:-1].astype(np.int64)]
-        places = posterior.place[path[:, 1], path[:, 0]].astype(np.int64)
+        places = posterior.place[path[:, 1], path[:, 0]]
         slowness = posterior.slowness[places]
         seconds = metres / self.nominal_speed * (slowness[1:] + slowness[:-1]) / 2
-        deviation = self.evidence.deviation(seconds, metres, posterior, places[1:])
+        deviation = posterior.deviation(seconds, places[1:])
         low, middle, high = np.exp(self.evidence.quantiles() * deviation)
         total = float(seconds.sum())
         return ExpectedTime(total * middle, total * low, total * high)
@@ -323,7 +323,6 @@ class Experience:
                 age = (arrays["driven"] - table[:, 5:]) / experience.half_life
                 faded = table[:, :2] * 0.5**age
                 arrays["evidence"] = np.hstack([faded, 0 * table[:, 2:3], table[:, 3:5]])
-            arrays.setdefault("unknown", np.ones(()))  # not in older files
             experience.evidence.restore(arrays)
             prior = {n.removeprefix(PRIOR): a for n, a in arrays.items() if n.startswith(PRIOR)}
             experience.evidence.prior = Prior.from_arrays(prior) if prior else None
@@ -364,10 +363,9 @@ def _believed_parts(
     breaks = np.flatnonzero((elapsed <= 0) | (elapsed > max_pause) | far) + 1
     for first, end in pairwise([0, *breaks.tolist(), len(time)]):
         way = max_speed * min(max(time[first] - time[last], 0), MEMORY) + RELOCATION
-        if math.dist(position[first], position[last]) <= way:
+        if end - first > 1 and math.dist(position[first], position[last]) <= way:
             last = end - 1
-            if end - first > 1:
-                yield slice(first, end)
+            yield slice(first, end)
 
 
 def averaged(time: Float64, position: Float64, window: float) -> tuple[Float64, Float64]:
@@ -387,20 +385,10 @@ def _ways(position: Float64, metres: float) -> list[int]:
     return kept
 
 
-def _steps(time: Float64, position: Float64, step: float, max_speed: float) -> Float64:
-    """Return the middle of each step, its seconds and its metres: (N, 4)."""
-    # How long the robot stands before it drives off says nothing about the place.
-    first = (_ways(position, step / 4)[1:] or [0])[0]
-    kept = [first + index for index in _ways(position[first:], step)]
-    seconds, moved, begin = (
-        np.diff(time[kept]),
-        np.diff(position[kept], axis=0),
-        position[kept[:-1]],
-    )
-    metres = np.hypot(*moved.T)
-    # Where samples are rare, a step passes several places.
-    count = np.rint(metres / step).astype(np.int64) * (metres <= max_speed * seconds)
-    of = np.repeat(np.arange(len(count)), count)
-    share = (np.arange(len(of)) - (np.cumsum(count) - count)[of] + 0.5) / count[of]
-    middle = begin[of] + share[:, None] * moved[of]
-    return np.column_stack([middle, seconds[of] / count[of], metres[of] / count[of]])
+def _steps(seconds: Float64, position: Float64, step: float) -> Float64:
+    """Return the middle of each step of a way, and its seconds: (N, 3)."""
+    metres = np.hypot(*np.diff(position, axis=0).T)
+    along, clock = (np.cumsum(np.append(0, values)) for values in (metres, seconds))
+    ends = np.arange(0, along[-1], step)
+    x, y, at = (np.interp(ends, along, values) for values in (*position.T, clock))
+    return np.column_stack([(x[1:] + x[:-1]) / 2, (y[1:] + y[:-1]) / 2, np.diff(at)])

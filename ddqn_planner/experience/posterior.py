@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -24,132 +23,101 @@ CORRELATION = 1.0  # metres: how far the slowness of a place tells of that of ot
 STEP = 0.02  # slowness is told in steps of this share: fields need no repair for less
 ACCURACY = 0.01  # of the log slowness: no place is farther from the solution of its equations
 OVER_RELAXATION = 1.4  # of the solver: neighbours agree sooner
+WAIT_PASSAGES = 0.1  # passages without a wait that are assumed
 FEW_PLACES = 16.0  # it is assumed that so many were driven where nothing was slow
-# By how much what all places have in common must change before they are told: noise and variance
-# by a share, logarithms as they are.
-NEWS, NEWS_OF_LOG = 0.1, 0.02
+NOISE = 0.1  # variance of the log slowness of one visit
+# Standard deviations of the log time of a drive: on ways that are known, and that are not.
+DRIVE_NOISE, UNSURE = 0.05, 0.5
 
 
 class Posterior:
     """The posterior of each place of a map: a connected part of a block of free cells.
 
     The log slowness of a place is normal around what the map lets expect. Neighbours are alike,
-    but not through walls. `mean` (P,) and `known` (P,) belong to the places: the log slowness, and
-    the share of it that was seen rather than expected.
+    but not through walls.
     """
 
     def __init__(self, grid: GridMap, side: float) -> None:
+        from scipy.ndimage import distance_transform_edt
+
         self.grid = grid
         self.size = max(1, round(side / grid.resolution))
         self.spacing = self.size * grid.resolution
         self.place, self.middle = _places_of(grid, self.size)  # (H, W), -1 where occupied
+        away, (y, x) = distance_transform_edt(self.place < 0, return_indices=True)
+        self.nearest = np.where(away <= 1.5 * self.size, self.place[y, x], -1)
         count = len(self.middle)
         self.links = _links_of(self.place, self.size, count)
-        self.degree = np.asarray(self.links.sum(axis=1), dtype=np.float64)
         # The solution of linear equations: real, what was seen beyond what is expected; imaginary,
         # the share that is known.
         self.solution = np.zeros(count, dtype=np.complex128)
         self.prior: Prior | None = None
-        self.foretold = np.zeros(count, dtype=np.float32)  # by the prior
-        self.expected, self.waits = np.zeros(count), np.zeros(count)
-        # Noise, variance, what the prior is worth (two), surplus of the mean.
-        self.common = (0.0,) * 5
-        self.painted: tuple[float, NDArray[np.float32]] | None = None
-        self.steps = np.zeros(0)
+        self.foretold = np.zeros(count)  # by the prior
+        self.steps: Float64 | None = None
 
-    @cached_property
-    def tree(self) -> Any:
-        """Finds places by their middle cells."""
-        from scipy.spatial import KDTree
+    def deviation(self, seconds: Float64, places: NDArray[np.int32]) -> float:
+        """Return the standard deviation of the log time of a way, by its seconds in places."""
+        unknown = float(seconds @ self.unknown[places] / seconds.sum())
+        return math.hypot(DRIVE_NOISE, UNSURE * unknown)
 
-        return KDTree(self.middle)
-
-    @property
-    def mean(self) -> Float64:
-        """The expected log slowness of driving at each place."""
-        return self.expected + self.solution.real + self.common[4] * (1 - self.known)
-
-    @property
-    def known(self) -> Float64:
-        """The share of each place's log slowness that was seen: 0 to 1."""
-        return np.clip(self.solution.imag, 0, 1)
-
-    @property
-    def unknown(self) -> Float64:
-        """The share of the standard deviation of each place's log slowness that is left."""
-        return np.sqrt(1 - self.known)
-
-    @property
-    def slowness(self) -> Float64:
-        """Expected seconds of each place over those at nominal speed, with waits."""
-        return np.exp(self.mean) + self.waits
-
-    def places_at(self, position: Float64) -> Int64:
+    def places_at(self, position: Float64) -> NDArray[np.int32]:
         """Return the place of each position (N, 2), the nearest within a place's side, or -1."""
-        cells, free = cells_of(position, self.grid)
-        x, y = cells[free].T
-        places = np.full(len(cells), -1)
-        places[free] = self.place[y, x]
-        if not free.all():
-            away, near = self.tree.query(cells[~free], distance_upper_bound=1.5 * self.size)
-            places[~free] = np.where(np.isfinite(away), near, -1)
-        return places
+        cells, inside = cells_of(position, self.grid)
+        x, y = cells.T
+        return np.where(inside, self.nearest[y, x], -1)
 
     def update(self, evidence: Evidence) -> None:
-        """Take what changed in the evidence, and solve again around it."""
-        common = evidence.noise, evidence.place_variance, *evidence.trust, evidence.surplus
-        change = np.abs(np.array(common) - self.common)
-        least = [NEWS * common[0], NEWS * common[1], *[NEWS_OF_LOG] * 3]
-        is_new = evidence.prior is not self.prior
-        if is_new and evidence.prior is not None:
+        """Take what changed in the evidence, and solve again."""
+        if evidence.prior is not self.prior:
+            self.prior = evidence.prior
             x, y = self.middle.T
-            self.foretold = evidence.prior.log_slowness(map_features(self.grid)[y, x])
-        if is_new or (change > least).any():
-            self.prior, self.common = evidence.prior, common
-            self.expected = common[2] + common[3] * self.foretold.astype(np.float64)
-        noise, variance = self.common[:2]
+            features = map_features(self.grid)[y, x]
+            self.foretold[:] = self.prior.log_slowness(features) if self.prior else 0
+        self.variance = evidence.variance  # of the log slowness of places
+        self.expected = evidence.trust[0] + evidence.trust[1] * self.foretold
         places = self.places_at(evidence.table[:, 3:5])
         inside = places >= 0
         weight, log = evidence.table[inside, :2].T
         # A lattice whose links have strength 1 has about the variance ln(32 / kappa) / 4 pi;
         # 1 is added for cells of many metres, where that would be negative.
         kappa = (self.spacing / CORRELATION) ** 2
-        scale = variance / (math.log1p(32 / kappa) / (4 * math.pi)) / noise
-        known = scale * np.bincount(places[inside], weight, len(self.waits))
+        scale = self.variance / (math.log1p(32 / kappa) / (4 * math.pi)) / NOISE
+        visits = scale * np.bincount(places[inside], weight, len(self.middle))
         # Half of the noise is added, as the mean of its exponential is more than 1.
-        seen = scale * np.bincount(places[inside], log + weight * noise / 2, len(self.waits))
-        right = seen - known * self.expected + 1j * known
-        diagonal = kappa + self.degree + known
-        residual = right + self.links @ self.solution - diagonal * self.solution
+        seen = scale * np.bincount(places[inside], log + weight * NOISE / 2, len(self.middle))
+        right = seen - visits * self.expected + 1j * visits
         # The equations map the same error everywhere to its product with these, and greater errors
         # to greater residuals: residuals up to that product prove that no error is greater.
-        most = ACCURACY * (diagonal - self.degree)
-        wrong = np.abs(residual) > most
-        queue, waiting = np.argsort(~wrong, kind="stable"), np.count_nonzero(wrong)
+        most = (ACCURACY * (kappa + visits)) ** 2
+        diagonal = kappa + self.links.sum(axis=1) + visits
+        residual = right + self.links @ self.solution - diagonal * self.solution
         links = self.links.indptr, self.links.indices, self.links.data
-        _relax(*links, diagonal, most, residual, self.solution, queue, waiting, wrong)
-        self._wait(evidence)
+        _relax(*links, diagonal, most, residual, self.solution)
+        # Of each place: the share of its log slowness that was seen, that of its standard deviation
+        # which is left, and expected seconds over those at nominal speed, with waits.
+        self.known = np.clip(self.solution.imag, 0, 1)
+        self.unknown = np.sqrt(1 - self.known)
+        self.mean = self.expected + self.solution.real + evidence.surplus * (1 - self.known)
+        self.slowness = np.exp(self.mean) + self._waits(evidence)
 
-    def _wait(self, evidence: Evidence) -> None:
+    def _waits(self, evidence: Evidence) -> Float64:
         """Spread the expected waits over the places around, so that a crossing costs each once."""
-        from scipy.sparse.csgraph import connected_components
-
-        self.waits[:] = 0
-        known, of_each = self.known, [0.0]
+        waits, of_each = np.zeros(len(self.middle)), [0.0]
         radius = evidence.wait_radius
         width = max(math.pi / 2 * radius, self.spacing)  # the mean way through a disc
-        for position, seconds in evidence.expected_waits():
-            at = self.places_at(position[None])[0]
+        means = evidence.waits[:, 0] / (evidence.waits[:, 1] + WAIT_PASSAGES)
+        for at, seconds in zip(self.places_at(evidence.waits[:, 2:]), means, strict=True):
             if at >= 0:
-                cells = radius / self.grid.resolution
-                near = np.array(self.tree.query_ball_point(self.middle[at], cells))
-                parts = connected_components(self.links[near][:, near])[1]
-                near = near[parts == parts[near == at]]
+                near = np.array([at])
+                for _ in range(round(radius / self.spacing)):
+                    near = np.union1d(near, self.links[near].indices)
                 wait = seconds * evidence.nominal_speed / width
-                self.waits[near] += wait
-                of_each.append(wait * known[near].sum())
+                waits[near] += wait
+                of_each.append(wait * self.known[near].sum())
         # Robots wait where nobody drove, too; but one place of waits says nothing of others.
-        self.waits += (sum(of_each) - max(of_each)) / (FEW_PLACES + known.sum()) * (1 - known)
+        elsewhere = (sum(of_each) - max(of_each)) / (FEW_PLACES + self.known.sum())
+        waits += elsewhere * (1 - self.known)
+        return waits
 
     def paint(self, hope: Float64, fastest: float) -> NDArray[np.float32]:
         """Return (H, W) float32: the slowness over that of the fastest place, which has this log.
@@ -158,20 +126,10 @@ class Posterior:
         """
         log = np.log(self.slowness) - hope - fastest
         steps = np.rint(np.clip(log, 0, math.log(MAX_SLOWNESS)) / math.log(1 + STEP))
-        if self.painted is None or self.painted[0] != fastest:
-            box: tuple[slice, ...] = (slice(None), slice(None))
-            slowness = np.ones(self.place.shape, dtype=np.float32)
-        else:
-            x, y = self.middle[steps != self.steps].T
-            if not len(x):
-                return self.painted[1]
-            box = tuple(slice(max(v.min() - self.size, 0), v.max() + self.size + 1) for v in (y, x))
-            slowness = self.painted[1].copy()  # maps have the old one
-        values = np.append(np.exp(steps * math.log(1 + STEP)), 1.0).astype(np.float32)
-        np.minimum(values, MAX_SLOWNESS, out=values)
-        slowness[box] = values.take(self.place[box], mode="wrap")
-        self.steps, self.painted = steps, (fastest, slowness)
-        return slowness
+        if self.steps is None or not np.array_equal(steps, self.steps):
+            of_places = np.exp(steps * math.log(1 + STEP))
+            self.steps, self.painted = steps, self.over(np.minimum(of_places, MAX_SLOWNESS), 1.0)
+        return self.painted
 
     def over(self, values: Float64, occupied: float) -> NDArray[np.float32]:
         """Return (H, W) float32: of each cell the value of its place."""
@@ -208,37 +166,28 @@ def _links_of(place: NDArray[np.int32], size: int, count: int) -> Any:
 
 @in_place
 def _relax(*arrays: Any) -> None:
-    """Solve (diagonal - links) x = right from where residuals are too great."""
-    begins, to, weights, diagonal, most, residual, x, queue, waiting, waits = arrays
-    first = 0
-    while waiting > 0:
-        place = queue[first]
-        first = first + 1 if first + 1 < queue.size else 0
-        waiting -= 1
-        waits[place] = False
-        change = OVER_RELAXATION * residual[place] / diagonal[place]
-        x[place] += change
-        residual[place] -= change * diagonal[place]
-        for link in range(begins[place], begins[place + 1] + 1):
-            near = to[link] if link < begins[place + 1] else place
-            if near != place:
-                residual[near] += weights[link] * change
-            if not waits[near] and abs(residual[near]) > most[near]:
-                waits[near] = True
-                end = first + waiting
-                queue[end if end < queue.size else end - queue.size] = near
-                waiting += 1
+    """Solve (diagonal - links) x = right by residuals, until the square of none is too great."""
+    begins, to, weights, diagonal, most, residual, x = arrays
+    is_solved = False
+    while not is_solved:
+        is_solved = True
+        for place in range(x.size):
+            left = residual[place]
+            if left.real * left.real + left.imag * left.imag > most[place]:
+                is_solved = False
+                change = OVER_RELAXATION * left / diagonal[place]
+                x[place] += change
+                residual[place] -= change * diagonal[place]
+                for link in range(begins[place], begins[place + 1]):
+                    residual[to[link]] += weights[link] * change
 
 
 def cells_of(position: Float64, grid: GridMap) -> tuple[Int64, NDArray[np.bool_]]:
-    """Return the cells of positions, (N, 2) as (x, y), and which of them are free: (N,)."""
+    """Return the nearest cells of positions, (N, 2) as (x, y), and which are on the map: (N,)."""
     origin_x, origin_y, yaw = grid.origin
     x, y = position[:, 0] - origin_x, position[:, 1] - origin_y
     cos, sin = math.cos(yaw), math.sin(yaw)
     along = np.column_stack([cos * x + sin * y, cos * y - sin * x])
     cells = np.floor(along / grid.resolution).astype(np.int64)
-    last = np.array([grid.width - 1, grid.height - 1])
-    x, y = np.clip(cells, 0, last).T
-    inside = ((cells >= 0) & (cells <= last)).all(axis=1)
-    free: NDArray[np.bool_] = inside & ~grid.occupancy[y, x]
-    return cells, free
+    nearest = np.clip(cells, 0, [grid.width - 1, grid.height - 1])
+    return nearest, (cells == nearest).all(axis=1)

@@ -62,7 +62,9 @@ def read_recording(
     if not drives:
         raise ValueError(f"{path} holds no drive; drive on")
     at = np.concatenate([drive.positions for drive in drives])
-    if not cells_of(at, grid)[1].any():
+    cells, inside = cells_of(at, grid)
+    x, y = cells.T
+    if not (inside & ~grid.occupancy[y, x]).any():
         least, most = at.min(axis=0).round(1).tolist(), at.max(axis=0).round(1).tolist()
         size = f"{grid.width * grid.resolution:.1f} x {grid.height * grid.resolution:.1f} m"
         raise ValueError(

@@ -351,7 +351,7 @@ class Requests:
         if planner is None:
             refused = self.model.report.refused["model"]
             raise RequestError("NO_MODEL", f"no model is loaded: {refused}")
-        planner.cache_bytes = self.settings.field_cache_bytes
+        planner.fields.nbytes = self.settings.field_cache_bytes
         return header, await ready, planner
 
     async def _in_map(

@@ -1,4 +1,4 @@
-"""The Q field: Q(s, a) of every cell toward one goal, its repair, and greedy rollouts in it."""
+"""The Q field: Q(s, a) of every cell toward one goal, its repair, rollouts, and those kept."""
 
 from __future__ import annotations
 
@@ -6,15 +6,15 @@ import math
 import threading
 import time
 from collections.abc import Callable
-from functools import cached_property
-from typing import Any, TypeAlias
+from functools import cache, cached_property
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ddqn_planner.grid import MOVES, Cell, GridMap, MoveRule
 from ddqn_planner.grid.arguments import cell_inside, numbers
-from ddqn_planner.grid.copies import few_of
+from ddqn_planner.grid.copies import Box, few_of
 from ddqn_planner.grid.grid_map import LAYERS
 from ddqn_planner.model import PropagationQNetwork, QNetwork
 from ddqn_planner.model.move_costs import MoveCosts
@@ -22,7 +22,6 @@ from ddqn_planner.planning import kernels
 from ddqn_planner.planning.kernels import Known
 from ddqn_planner.planning.plan import Plan, PlanStatus
 
-Box: TypeAlias = tuple[slice, ...]  # rows and columns
 Goals: TypeAlias = tuple[Cell, ...]  # different free cells, sorted: a path may end in any of them
 REPAIRED = 100  # cells that a repair may take back before a new field is begun
 # Visits of a new field per cell that a repair may take back, while both take turns: to take a cell
@@ -30,6 +29,8 @@ REPAIRED = 100  # cells that a repair may take back before a new field is begun
 VISITS = 8
 REPAIRED_SHARE = 0.02  # of the map's cells that a repair may take back
 CHANGED_SHARE = 0.02  # of the map's cells may have changed: with more, a new field is cheaper
+CACHE_BYTES = 2**23  # for a planner's Q fields: 3 of 500 x 500 cells, at 9 bytes per cell
+ALWAYS_KEPT = 2  # fields, whatever their size: on a large map, too, a robot drives to and fro
 SAME_PLACE = 0.01  # cells that a shift may be off whole ones: messages' resolution is float32
 
 
@@ -141,11 +142,6 @@ class DistanceField(QField):
         del self.known
         return known
 
-    @property
-    def is_whole(self) -> bool:
-        """Whether the distances of all cells are known."""
-        return not self.known.opened.size
-
     def _grow(self, number: int = 0, limit: int = 2**62) -> bool:
         """Compute all of the field, or as far as a cell needs it; return if that was enough."""
         done = self._is_final(number)
@@ -156,7 +152,7 @@ class DistanceField(QField):
     def _is_final(self, number: int) -> bool:
         """Return whether no more of the field is needed to know the distance of a cell."""
         closed = self.known.state[number] == kernels.CLOSED
-        return self.is_whole or bool(self.known.closed_is_final and closed)
+        return bool(not self.known.opened.size or (self.known.closed_is_final and closed))
 
     def rollout_if_known(self, start: Cell, straight: bool = False) -> Plan | None:
         """Return the rollout from a start if no more of the field is needed, else None."""
@@ -316,3 +312,100 @@ def _moved(known: Known, old: GridMap, new: GridMap, shift: Cell) -> Known:
         layer[1:-1, 1:-1][after] = source.reshape(-1, old.width + 2)[1:-1, 1:-1][before]
     opened = np.flatnonzero(state == kernels.OPEN).astype(np.int32)
     return Known(distance.ravel(), state.ravel(), opened)
+
+
+# The fields that a planner keeps
+
+
+class _Kept(NamedTuple):
+    """What is known of a map under a move rule: `QNetwork.move_costs`, and perhaps a field."""
+
+    grid: GridMap
+    rule: MoveRule
+    costs: MoveCosts | None
+    field: QField | None = None
+
+
+class FieldCache:
+    """Gives the Q fields of a network, computed, repaired or kept. Several threads may use it."""
+
+    def __init__(self, network: QNetwork) -> None:
+        self.network = network
+        self.nbytes = CACHE_BYTES  # the bound; the fields used last are kept
+        self._kept: list[_Kept] = []  # used last at the end
+        self._lock = threading.Lock()
+
+    def has_costs(self, grid: GridMap, rule: MoveRule) -> bool:
+        """Return whether the network gives the costs of a map's moves, see `DistanceField`."""
+        return self._costs(grid, rule) is not None
+
+    def find(self, grid: GridMap, goals: Goals, rule: MoveRule) -> QField | None:
+        """Return the field of a map toward the nearest of some goals if it is kept, else None."""
+        for kept in self._of_rule(rule):
+            if kept.field and kept.field.goals == goals and grid.same_cells(kept.grid):
+                self._use(_Kept(grid, rule, kept.costs, kept.field))  # the map may lie elsewhere
+                return kept.field
+        return None
+
+    def get(self, grid: GridMap, goals: Goals, rule: MoveRule, start: Cell | None = None) -> QField:
+        """Return the field of a map toward the nearest of some goals: several, if it has costs."""
+        field = self.find(grid, goals, rule)
+        if field is None:
+            costs = self._costs(grid, rule)
+            if costs is None:
+                field = network_field(self.network, grid, goals[0], rule)
+            else:
+                field = DistanceField(goals, grid, costs, rule)
+                self._repair(field, start)
+            self._use(_Kept(grid, rule, costs, field))
+            self._forget()
+        return field
+
+    def _of_rule(self, rule: MoveRule) -> list[_Kept]:
+        """Return what is kept for a move rule, used last first."""
+        return [kept for kept in reversed(self._kept) if kept.rule is rule]
+
+    def _costs(self, grid: GridMap, rule: MoveRule) -> MoveCosts | None:
+        """Return the costs of a map's moves: known, from those of the map it patches, or new."""
+        known = self._of_rule(rule)
+        for kept in known:
+            if grid.same_cells(kept.grid):
+                return kept.costs
+        costs = None
+        for kept in known:
+            boxes = grid.patches_since(kept.grid)
+            if boxes is not None and kept.costs is not None and costs is None:
+                costs = kept.costs.after(grid, boxes)
+        costs = costs or self.network.move_costs(grid, rule)
+        self._use(_Kept(grid, rule, costs))
+        return costs
+
+    def _repair(self, new: DistanceField, start: Cell | None) -> None:
+        """Give a new field what a field of an older map knows, if there is one."""
+        shift_from = cache(lambda older: shift_between(older, new.grid))  # many are of one map
+        for kept in self._of_rule(new.move_rule):
+            old, shift = kept.field, shift_from(kept.grid)
+            if shift is None or not isinstance(old, DistanceField):
+                continue
+            moved_goals = tuple((x + shift[0], y + shift[1]) for x, y in old.goals)
+            if moved_goals == new.goals and new.take_over(old, shift, start):
+                with self._lock:  # the place will hardly be again what it was
+                    self._kept = [other for other in self._kept if other.field is not old]
+                return
+
+    def _use(self, used: _Kept) -> None:
+        """Put what is used at the end; of maps without a field, only the last stays."""
+        with self._lock:
+            others = [kept for kept in self._kept if kept.field and kept.field is not used.field]
+            self._kept = [*others, used]
+
+    def _forget(self) -> None:
+        """Forget the oldest fields beyond the bound; those of one map share its costs."""
+        size, of_costs = 0, dict[int, int]()
+        with self._lock:
+            for number, kept in enumerate(reversed(self._kept)):
+                size += kept.field.nbytes if kept.field else 0
+                of_costs[id(kept.costs)] = kept.costs.patch.nbytes if kept.costs else 0
+                if number >= ALWAYS_KEPT and size + sum(of_costs.values()) > self.nbytes:
+                    self._kept = self._kept[-number:]
+                    break

@@ -186,15 +186,13 @@ def rest_of_path(path: Cells, robot: Cell, grid: GridMap, move_rule: MoveRule | 
     for index in near[np.lexsort((-near, distances[near]))].tolist():
         vector = passed[index] - robot
         dx, dy = np.abs(vector)
-        steps = np.arange(dx + dy + 1)
-        ways = [np.minimum(steps[: max(dx, dy) + 1, None], (dx, dy))]  # diagonal moves first
-        if dx + dy <= REACH:  # past a corner that the path's segment grazes
-            ways.append(np.stack([np.minimum(steps, dx), np.maximum(steps - dx, 0)], axis=1))
-            ways.append(np.stack([np.maximum(steps - dy, 0), np.minimum(steps, dy)], axis=1))
-        for way in ways:
-            leaving = robot + np.sign(vector) * way, cells[following[index] :]
-            rest = np.concatenate(leaving, dtype=np.int32)
-            if legal_segments(rest[: len(way) + 1], grid, move_rule).all():
+        # Diagonal moves first, or one axis after the other: past a corner that a segment grazes.
+        for waits in ((0, 0), (0, dx), (dy, 0)):
+            steps = np.arange(1 + max(dx + waits[0], dy + waits[1]))[:, None]
+            way = robot + np.sign(vector) * np.clip(steps - waits, 0, (dx, dy))
+            rest = np.concatenate([way, cells[following[index] :]], dtype=np.int32)
+            is_legal = legal_segments(rest[: len(way) + 1], grid, move_rule).all()
+            if is_legal and len(way) <= REACH + 1:
                 return rest
     return cells[:0]
 

@@ -15,8 +15,7 @@ from ddqn_planner.grid import Cell, GridMap, MoveRule
 from ddqn_planner.grid.arguments import as_cell, as_flag, as_number, listed, numbers
 from ddqn_planner.grid.grid_map import check_grid
 from ddqn_planner.model import ModelMetadata, QNetwork, load_model
-from ddqn_planner.planning.field import DistanceField, Goals, QField
-from ddqn_planner.planning.field_cache import FieldCache
+from ddqn_planner.planning.field import DistanceField, FieldCache, Goals, QField
 from ddqn_planner.planning.paths import keep_or_switch, search, way_and_ends
 from ddqn_planner.planning.plan import (
     Plan,
@@ -62,15 +61,6 @@ class Planner:
         A ModelFileError says that there is none, or why it cannot be used.
         """
         return cls(*load_model(model))
-
-    @property
-    def cache_bytes(self) -> int:
-        """Memory for the fields that it keeps, those used last; the last two are always kept."""
-        return self.fields.nbytes
-
-    @cache_bytes.setter
-    def cache_bytes(self, nbytes: int) -> None:
-        self.fields.nbytes = nbytes
 
     def q_field(self, grid: GridMap, goal: Cell, move_rule: MoveRule | str | None = None) -> QField:
         """Return the Q field of a map toward a goal, a free cell, computed or from the cache.

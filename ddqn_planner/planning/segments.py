@@ -16,6 +16,8 @@ from ddqn_planner.grid.grid_map import MULTIPLIERS, check_grid
 Path: TypeAlias = NDArray[np.int32]  # (N, 2): cells, joined by moves or by segments
 LONG: Final = 400  # cells: a longer path is pulled once, as twice saves less than 0.1 %
 SAME_COST: Final = 1 + 1e-9  # a path may cost so much more, and still as much: sums are rounded
+# Not to be written to, as those of maps.
+NO_LAYERS = [np.frombuffer(b"", kind).reshape(0, 0) for kind in (np.uint8, np.int8, np.float32)]
 BITS = np.zeros((3, 3), np.uint8)  # the action by which a step is taken, in a set of them
 BITS[MOVES[:, 1] + 1, MOVES[:, 0] + 1] = 1 << np.arange(8)
 
@@ -89,13 +91,9 @@ def _segment_costs(
 
 def _layers(grid: GridMap, move_rule: MoveRule | str) -> tuple[Any, ...]:
     """Return what decides of a segment; empty arrays for missing layers, so that one code does."""
-    rule = MoveRule(move_rule)
-    layers: list[Any] = [grid.forbidden, grid.cost, grid.slowness]
-    for index, kind in enumerate((np.uint8, np.int8, np.float32)):
-        if layers[index] is None:
-            layers[index] = np.empty((0, 0), kind)
-            layers[index].flags.writeable = False  # as those of maps
-    return grid.occupancy, *layers, rule.cuts_corners, rule is MoveRule.UNIT
+    rule, layers = MoveRule(move_rule), (grid.forbidden, grid.cost, grid.slowness)
+    known = [none if it is None else it for it, none in zip(layers, NO_LAYERS, strict=True)]
+    return grid.occupancy, *known, rule.cuts_corners, rule is MoveRule.UNIT
 
 
 @inlined

@@ -31,13 +31,13 @@ FEWEST_PLACES = 32  # from which a prior is learned
 
 def prior_of(grid: GridMap, table: Any, older: Prior | None, seed: int = 0) -> Prior | None:
     """Train a prior on places of `Evidence.table` that are free on a map; few change nothing."""
-    cells, free = cells_of(table[:, 3:5], grid)
-    seen = free & (table[:, 0] > 0)
+    cells, inside = cells_of(table[:, 3:5], grid)
+    x, y = cells.T
+    seen = inside & ~grid.occupancy[y, x] & (table[:, 0] > 0)
     if seen.sum() < FEWEST_PLACES:
         return older
-    x, y = cells[seen].T
     weight, log = table[seen, :2].T
-    return train_prior(map_features(grid)[y, x], log / weight, weight, older, seed)
+    return train_prior(map_features(grid)[y[seen], x[seen]], log / weight, weight, older, seed)
 
 
 def teach_prior(experience: Experience, grid: GridMap, seed: int = 0) -> None:

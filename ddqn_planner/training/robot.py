@@ -15,10 +15,10 @@ from ddqn_planner.grid.footprint import read_footprint
 from ddqn_planner.grid.motions import HEADINGS, Motions, make_motions, read_lattice
 from ddqn_planner.model import ModelMetadata, RobotNetwork, package_version
 from ddqn_planner.model.robot import BodyCertificate
-from ddqn_planner.planning.value_iteration import value_iteration
 from ddqn_planner.training.double_dqn import ReplayBuffer, Transitions, double_dqn_gradient
 from ddqn_planner.training.environment import PoseVectorEnvironment, Scenario, around
 from ddqn_planner.training.hyper_parameters import HyperParameters
+from ddqn_planner.training.propagation import value_iteration
 
 # Shapes: B = a batch, U units, S x S cells around the robot, K = primitives of a heading, C = cells
 # by heading.

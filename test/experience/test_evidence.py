@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 
 from ddqn_planner import Experience, GridMap, Planner
 from ddqn_planner.experience import posterior as posterior_module
+from ddqn_planner.experience.posterior import NOISE
 
 WALL = np.zeros((40, 60), dtype=bool)
 WALL[21, 10:30] = True
@@ -69,7 +70,8 @@ def test_the_posterior_is_that_of_a_gaussian_markov_random_field(seed: int) -> N
     for drive in drives:  # solved again where evidence changed
         experience.record(*drive)
         posterior = experience.evidence.over(grid)
-    noise, variance, common, _, surplus = posterior.common
+    variance, common = posterior.variance, posterior.expected[0]
+    surplus = experience.evidence.surplus
     # The same from its definition, with one equation per free cell.
     free = ~grid.occupancy
     number = np.where(free, np.cumsum(free).reshape(free.shape) - 1, -1)
@@ -84,8 +86,8 @@ def test_the_posterior_is_that_of_a_gaussian_markov_random_field(seed: int) -> N
     table, seen = experience.evidence.table, np.zeros(len(precision))
     cells = np.floor(table[:, 3:5] / 0.25).astype(int)
     for (x, y), (weight, log, *_) in zip(cells, table, strict=True):
-        precision[number[y, x], number[y, x]] += weight / noise
-        seen[number[y, x]] += (log + weight * (noise / 2 - common)) / noise
+        precision[number[y, x], number[y, x]] += weight / NOISE
+        seen[number[y, x]] += (log + weight * (NOISE / 2 - common)) / NOISE
     mean = common + np.linalg.solve(precision, seen) + surplus * (1 - posterior.known)
     np.testing.assert_allclose(posterior.mean, mean, atol=0.02)
 
@@ -155,6 +157,12 @@ def test_a_map_in_another_resolution_and_frame_keeps_it(resolution: float, yaw: 
     for share in (0.2, 0.5, 0.8):
         x, y = 4 + 7 * share, 4 + 2 * share
         assert at(grid, experience.slowness(grid), x, y) == pytest.approx(3, rel=0.1)
+
+
+def test_a_map_without_a_free_cell_has_nowhere_to_be_slow() -> None:
+    grid = GridMap(np.ones((4, 5), dtype=bool), 0.25)
+    slowness = driven(straight((0.1, 0.5), (1, 0.5), 4)).apply(grid).slowness
+    np.testing.assert_array_equal(slowness, np.ones((4, 5)))
 
 
 @pytest.mark.parametrize("resolution", [5.0, 6.0, 20.0])

@@ -237,7 +237,7 @@ def test_a_path_to_one_goal_is_kept_while_it_is_nearly_as_good_as_a_new_one() ->
         assert [leads_above for leads_above, _ in above_kept] == [True, True, False, False]
         assert "kept: its cost is +" in above_kept[1][1]
         assert node._model.planner is not None
-        assert node._model.planner.cache_bytes == 0  # what the node was started with holds
+        assert node._model.planner.fields.nbytes == 0  # what the node was started with holds
 
         def fail(*_: Any) -> GridMap:
             raise MemoryError

@@ -197,14 +197,14 @@ def test_the_memory_for_fields_is_bounded_and_those_used_last_are_kept() -> None
     field = planner.q_field(grid, first)
     arrays = field.q, field.legal, field.value, field.policy
     assert field.nbytes == sum(array.nbytes for array in arrays)
-    planner.cache_bytes = 4 * field.nbytes
+    planner.fields.nbytes = 4 * field.nbytes
     for goal in goals:
         planner.q_field(grid, goal)
         planner.q_field(grid, first)
     rule = planner.metadata.move_rule
     known = [goal for goal in grid.free_cells() if known_field(planner, grid, goal, rule)]
     assert known == [first, *goals[-3:]]
-    planner.cache_bytes = 1
+    planner.fields.nbytes = 1
     last = GridMap(np.zeros((3, 3)), cost=np.ones((3, 3), np.int8))
     planner.q_field(last, (0, 0))
     for goal in ((0, 0), (2, 2), (0, 0)):  # two goals in turn, whatever the size of their fields

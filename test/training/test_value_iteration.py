@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from strategies import Place, grids_with_free_cell
 
 from ddqn_planner.grid import MoveRule, legal_moves, neighbours, shortest_distances
-from ddqn_planner.planning.value_iteration import value_iteration
+from ddqn_planner.training.propagation import value_iteration
 
 
 def settled(
