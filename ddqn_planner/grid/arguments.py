@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import reprlib
 import sys
 from collections.abc import Sequence
 from enum import Enum
@@ -41,7 +42,7 @@ def as_cell(cell: Any, name: str = "the cell") -> Cell:
                 return x, y
     except (TypeError, ValueError, OverflowError, LookupError):
         pass
-    raise ValueError(f"{name} is {cell!r}; give two whole numbers (x, y)")
+    raise ValueError(f"{name} is {reprlib.repr(cell)}; give two whole numbers (x, y)")
 
 
 def cell_inside(cell: Any, shape: tuple[int, ...], name: str = "the cell") -> Cell:
@@ -72,8 +73,6 @@ def listed(values: Any, name: str) -> list[Any]:
 
 def real(value: Any) -> float:
     """Return a number of any type as a float; NaN, which no range contains, for anything else."""
-    if type(value) is float:  # a look at the kind of number takes longer
-        return value
     try:
         return float(value) if isinstance(value, Real) else math.nan
     except OverflowError:
@@ -112,12 +111,13 @@ def numbers(
         raise ValueError(f"{name} has shape {array.shape}; give {shape}")
     if array.dtype.kind not in kinds:
         raise ValueError(f"{name}: the elements are of type {array.dtype}; give numbers")
-    if between is None or array.dtype.kind == "b" or array.size == 0:
+    if between is None or array.dtype.kind == "b":
         return array
     lowest, highest = between
-    fractions = whole and array.dtype.kind == "f" and not (array == np.floor(array)).all()
-    if fractions or not lowest <= array.min() <= array.max() <= highest:  # or NaN
-        right = (array >= lowest) & (array <= highest) & (not whole or array == np.floor(array))
+    right = (array >= lowest) & (array <= highest)  # not NaN
+    if whole and array.dtype.kind == "f":
+        right &= array == np.floor(array)
+    if not right.all():
         remedy = remedy or f"{'whole numbers ' if whole else ''}{lowest:g} to {highest:g}"
         raise ValueError(f"{name} holds {array[~right].flat[0]}; give {remedy}")
     return array
