@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from ddqn_planner.grid import GridMap, MoveRule
 from ddqn_planner.grid.footprint import read_footprint
-from ddqn_planner.grid.motions import HEADINGS, Motions, make_motions, read_lattice
+from ddqn_planner.grid.motions import HEADINGS, make_motions, read_lattice
 from ddqn_planner.model import ModelMetadata, RobotNetwork, package_version
 from ddqn_planner.model.robot import BodyCertificate
 from ddqn_planner.training.double_dqn import ReplayBuffer, Transitions, double_dqn_gradient
@@ -65,8 +65,24 @@ def random_scenarios(side: int, random: np.random.Generator) -> list[Scenario]:
 class RobotTrainer:
     """Trains a `RobotNetwork` by Double DQN; the same arguments give the same network."""
 
-    def __init__(self, footprint: NDArray[np.float64], motions: Motions, seed: int) -> None:
-        self.network, self.seed = RobotNetwork.untrained(footprint, motions), seed
+    def __init__(
+        self,
+        footprint: str | None,
+        motion: str | None,
+        turning_radius: float,
+        resolution: float,
+        lattice: str | None,
+        seed: int,
+        padding: float = 0.0,
+    ) -> None:
+        if motion is not None and lattice is None:
+            motions = make_motions(motion, turning_radius, resolution)
+        elif lattice is not None and motion is None:
+            motions = read_lattice(lattice)
+        else:
+            raise ValueError(f"motion is {motion}, lattice is {lattice}; give one of the two")
+        self.network = RobotNetwork.untrained(read_footprint(footprint, padding), motions)
+        self.seed = seed
         tensors, units = self.network.tensors, self.network.sizes["units"]
         counts = {name: min(4096, units * getattr(ROBOT, name)) for name in PER_UNIT}
         self.parameters = replace(ROBOT, **counts)
@@ -83,27 +99,13 @@ class RobotTrainer:
         # A unit's weights in a row, and one more of 0 for what it does not see.
         self._weight = np.pad(tensors["weight"].reshape(units, -1), ((0, 0), (0, 1)))
         self._threshold = tensors["threshold"]
-        self._obstacle = np.array([np.argwhere(s.grid.occupancy)[0, ::-1] for s in scenarios])
-
-    @classmethod
-    def of(
-        cls,
-        footprint: str | None,
-        motion: str | None,
-        turning_radius: float,
-        resolution: float,
-        lattice: str | None,
-        seed: int,
-        padding: float = 0.0,
-    ) -> RobotTrainer:
-        """Return the trainer of a robot as a user describes it; a ValueError says what is wrong."""
-        if motion is not None and lattice is None:
-            motions = make_motions(motion, turning_radius, resolution)
-        elif lattice is not None and motion is None:
-            motions = read_lattice(lattice)
-        else:
-            raise ValueError(f"motion is {motion}, lattice is {lattice}; give one of the two")
-        return cls(read_footprint(footprint, padding), motions, seed)
+        self._obstacle = np.array([np.argwhere(s.grid.occupancy)[0] for s in scenarios])
+        # Where a robot that has turned by quarters sees an obstacle, so many rows and columns away.
+        side = swept.shape[1]
+        near, seen = np.arange(side) - side // 2, np.arange(side * side).reshape(side, side)
+        self._place = np.full((4, *self.environment.shape), side * side)
+        for quarter in range(4):
+            self._place[quarter][np.ix_(near, near)] = np.rot90(seen, -quarter)
 
     def run(self, until: int) -> Iterator[BodyCertificate]:
         """Train until all is proved, or so many steps are done; yield what is proved so far."""
@@ -170,35 +172,25 @@ class RobotTrainer:
         self, scenario: NDArray[np.int64], cell: NDArray[np.int64]
     ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         """Return the unit of each action, (B, K), and the place of the obstacle, (B,)."""
-        (height, width), side = self.environment.shape, self.network.sizes["side"]
-        reach, heading, cell = side // 2, cell % HEADINGS, cell // HEADINGS
-        x, y = self._obstacle[scenario].T
-        x = (x - cell % width + reach) % width - reach
-        y = (y - cell // width + reach) % height - reach
-        for quarter in range(1, 4):
-            turned = heading // (HEADINGS // 4) >= quarter
-            x, y = np.where(turned, (y, -x), (x, y))
-        far = np.maximum(np.abs(x), np.abs(y)) > reach
-        place_B = np.where(far, side * side, (y + reach) * side + x + reach)
-        return self.network.unit[self.environment.primitive[:, heading]].T, place_B
+        (height, width), heading, cell = self.environment.shape, cell % HEADINGS, cell // HEADINGS
+        y, x = self._obstacle[scenario].T
+        seen = heading // (HEADINGS // 4), (y - cell // width) % height, (x - cell % width) % width
+        return self.network.unit[self.environment.primitive[:, heading]].T, self._place[seen]
 
     def _settle(self) -> None:
         """As the target network, settle V on every map."""
-        e, p = self.environment, self.parameters
-        weight_PSS = self.network.of_primitives(
-            self._weight[:, :-1].reshape(self.network.tensors["weight"].shape)
-        )
-        threshold_P11 = self._threshold[self.network.unit][:, None, None]
+        e, p, actions = self.environment, self.parameters, len(self.environment.primitive)
+        learned = self._weight[:, :-1].reshape(self.network.tensors["weight"].shape)
+        weight_PSS = self.network.of_primitives(learned)
+        threshold_P1 = self._threshold[self.network.unit][:, None]
         self._return_SCK = np.empty(e.free_reward.swapaxes(1, 2).shape, np.float32)
         self._q_SCK = np.empty_like(self._return_SCK)
+        collision = np.float32(p.obstacle_reward)
         for number, scenario in enumerate(e.scenarios):
-            logit_PC = (threshold_P11 - around(scenario.grid.occupancy, weight_PSS)).reshape(
-                len(weight_PSS), -1
-            )
-            p_CK = (0.5 + 0.5 * np.tanh(0.5 * logit_PC[e.primitive])).transpose(2, 1, 0)
-            p_1CK = p_CK.reshape(1, -1, len(e.primitive))
+            blocked_PC = around(scenario.grid.occupancy, weight_PSS).reshape(len(weight_PSS), -1)
+            p_KHC = 0.5 + 0.5 * np.tanh(0.5 * (threshold_P1 - blocked_PC)[e.primitive])
+            p_1CK = p_KHC.transpose(2, 1, 0).reshape(1, -1, actions)
             given = e.free_reward[[number]].swapaxes(1, 2), e.goal[[number]], e.next_cell, p.gamma
-            (return_CK,) = value_iteration(p_1CK, *given, p.obstacle_reward)
-            self._return_SCK[number] = return_CK
-            collision = np.float32(p.obstacle_reward)
-            self._q_SCK[number] = collision + p_1CK[0] * (return_CK - collision)
+            return_1CK = value_iteration(p_1CK, *given, p.obstacle_reward)
+            self._return_SCK[number] = return_1CK[0]
+            self._q_SCK[number] = collision + p_1CK[0] * (return_1CK[0] - collision)

@@ -44,7 +44,7 @@ def test_the_command_trains_a_robot_that_is_proved(capsys: Any, tmp_path: Path) 
 def test_the_same_seed_trains_the_same_model() -> None:
     contents = []
     for seed in (1, 1, 2):
-        trainer = RobotTrainer.of(*TINY, seed)
+        trainer = RobotTrainer(*TINY, seed)
         for _ in trainer.run(30_000):
             pass
         contents.append(model_bytes(trainer.network, trainer.metadata()))
@@ -52,7 +52,7 @@ def test_the_same_seed_trains_the_same_model() -> None:
 
 
 def test_a_robot_bumps_where_its_body_touches_an_obstacle() -> None:
-    environment = RobotTrainer.of(*TINY, 0).environment
+    environment = RobotTrainer(*TINY, 0).environment
     motions, swept = environment.motions, environment.swept
     height, width = environment.shape
     reach, random = swept.shape[1] // 2, np.random.default_rng(0)
