@@ -193,7 +193,7 @@ class Experience:
 
     @prior.setter
     def prior(self, prior: Prior | None) -> None:
-        self.evidence.use_prior(prior)
+        self._learn(partial(Evidence.use_prior, prior=prior))
 
     def take_over(self, older: Experience) -> None:
         """Use what older experience solved for its map, which forgets it."""
@@ -280,7 +280,6 @@ class Experience:
                 if self._synchronised[0] == path:
                     for step in self._news:
                         step(saved.evidence)
-                    saved.prior = self.prior
                 else:
                     saved.merge(self)
                 saved.take_over(self)
