@@ -143,9 +143,10 @@ class Experience:
             way = np.array(_ways(at, STAND_DISTANCE)[1:], dtype=np.int64)
             if not len(way):
                 continue
-            stood = seconds[way[1:] - 1] - seconds[way[:-1]]
+            leaves = way[1:] - 1
+            stood = seconds[leaves] - seconds[way[:-1]]
             stood[stood < STAND / speed] = 0
-            waited = np.column_stack([at[way[:-1]], stood])
+            waited = np.column_stack([at[leaves], stood])
             waits.append(waited[(stood > 0) & (stood <= self.max_pause)])
             steps.append(_steps(np.diff(seconds[way]) - stood, at[way], step))
         rows = np.concatenate(steps)
