@@ -26,7 +26,7 @@ from tables import table
 
 from ddqn_planner import GridMap, Planner, load_map
 from ddqn_planner.grid import MOVES, Cell, MoveRule
-from ddqn_planner.grid.footprint import inner_radius, read_footprint
+from ddqn_planner.grid.footprint import read_footprint
 from ddqn_planner.grid.motions import HEADINGS, Motion, Motions, make_motions
 from ddqn_planner.model import ModelMetadata, RobotNetwork, package_version
 from ddqn_planner.planning.plan import PosePlan
@@ -85,6 +85,13 @@ class Oracle:
         outline = np.stack([cos * u - sin * v + x[:, None], sin * u + cos * v + y[:, None]], -1)
         touched, _ = self.cells.query(shapely.polygons(outline), predicate="intersects")
         return len(np.unique(touched))
+
+
+def inner_radius(corners: NDArray[np.float64]) -> float:
+    """Return the radius of the circle around the origin that fits into a polygon, metres."""
+    sides = np.roll(corners, -1, axis=0) - corners
+    share = np.clip(-(corners * sides).sum(axis=1) / (sides**2).sum(axis=1), 0, 1)
+    return float(np.hypot(*(corners + share[:, None] * sides).T).min())
 
 
 def requests(

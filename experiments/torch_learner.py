@@ -8,7 +8,7 @@ from torch.nn import functional
 
 from ddqn_planner.model.networks import observe
 from ddqn_planner.training.double_dqn import Transitions, double_dqn_gradient
-from ddqn_planner.training.propagation import adam_of
+from ddqn_planner.training.propagation import take_step
 from ddqn_planner.training.trainer import Trainer
 
 
@@ -39,7 +39,7 @@ class TorchLearner:
     """Takes over the training of the paper's network, with autograd and torch's Adam."""
 
     def __init__(self, trainer: Trainer) -> None:
-        self.environment, p = trainer.environment, trainer.parameters
+        self.environment = trainer.environment
         self._online, self._target = (PaperModule(**trainer.network.sizes) for _ in range(2))
         online, target, *moments = trainer._parts
         for module, part in ((self._online, online), (self._target, target)):
@@ -48,8 +48,7 @@ class TorchLearner:
                 part[name] = weight.data.numpy()
         for part in moments:
             part.update({name: tensor.copy() for name, tensor in part.items()})
-        states = [{name: torch.from_numpy(t) for name, t in part.items()} for part in moments]
-        self._adam = adam_of(dict(self._online.named_parameters()), states, p.learning_rate)
+        self._parts = [{n: torch.from_numpy(t) for n, t in part.items()} for part in trainer._parts]
         trainer._player, trainer._learner = None, self
 
     def settle(self) -> None:
@@ -75,4 +74,6 @@ class TorchLearner:
         gradient_BA = double_dqn_gradient(kind, batch, target_BA, q_2BA.detach())
         self._online.zero_grad()
         torch.autograd.backward(q_2BA[: len(gradient_BA)], gradient_BA)
-        self._adam(number)
+        weights = self._online.named_parameters()
+        gradients = {name: weight.grad for name, weight in weights if weight.grad is not None}
+        take_step(self._parts, gradients, number, self.environment.parameters.learning_rate)

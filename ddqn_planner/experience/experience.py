@@ -135,27 +135,26 @@ class Experience:
         seconds, at = averaged(time, position, WINDOW / speed)
         speeds = np.hypot(*np.diff(at, axis=0).T) / np.abs(np.diff(seconds))
         usual = float(np.median(speeds)) if len(speeds) else 0.0
-        max_speed, waits = 3 * max(self.nominal_speed, speed, usual), []
-        step, steps = max(side, WINDOW) / 2, [np.zeros((0, 3))]
+        max_speed, step = 3 * max(self.nominal_speed, speed, usual), max(side, WINDOW) / 2
+        steps, waits = [np.zeros((0, 3))], [np.zeros((0, 3))]
         for part in _believed_parts(time, position, max_speed, self.max_pause):
             seconds, at = averaged(time[part], position[part], WINDOW / speed)
             # Standing at the ends of a drive is no waiting on the way.
-            _, *begins = _ways(at, STAND_DISTANCE)
-            for first, end in pairwise(begins):
-                if (stood := seconds[end - 1] - seconds[first]) >= STAND / speed:
-                    if stood <= self.max_pause:
-                        waits.append([*at[first:end].mean(axis=0), stood])
-                    seconds[end - 1 :] -= stood
-                    seconds[first : end - 1] = seconds[first]
-            if begins:
-                way = slice(begins[0], None)
-                steps.append(_steps(seconds[way], at[way], step, max_speed))
+            way = np.array(_ways(at, STAND_DISTANCE)[1:], dtype=np.int64)
+            if not len(way):
+                continue
+            stood = seconds[way[1:] - 1] - seconds[way[:-1]]
+            stood[stood < STAND / speed] = 0
+            waited = np.column_stack([at[way[:-1]], stood])
+            waits.append(waited[(stood > 0) & (stood <= self.max_pause)])
+            steps.append(_steps(np.diff(seconds[way]) - stood, at[way], step))
         rows = np.concatenate(steps)
+        rows = rows[step <= max_speed * rows[:, 2]]
         squares = np.floor(rows[:, :2] / side)
         entered = np.flatnonzero((np.diff(squares, axis=0, prepend=np.nan) != 0).any(axis=1))
         count, sums = np.diff(entered, append=len(rows)), np.add.reduceat(rows, entered)
         visits = Visits(sums[:, :2] / count[:, None], sums[:, 2], step * count)
-        return visits, np.array(waits).reshape(-1, 3)
+        return visits, np.concatenate(waits)
 
     def record_failure(self, position: Sequence[float]) -> None:
         """Learn that the robot failed at a place: it costs as much as a wait of `max_pause`."""
@@ -386,11 +385,10 @@ def _ways(position: Float64, metres: float) -> list[int]:
     return kept
 
 
-def _steps(time: Float64, position: Float64, step: float, max_speed: float) -> Float64:
+def _steps(seconds: Float64, position: Float64, step: float) -> Float64:
     """Return the middle of each step of a way, and its seconds: (N, 3)."""
-    kept = _ways(position, step)
-    metres = np.append(0, np.cumsum(np.hypot(*np.diff(position[kept], axis=0).T)))
-    ends = np.arange(0, metres[-1], step)
-    x, y, seconds = (np.interp(ends, metres, values[kept]) for values in (*position.T, time))
-    rows = np.column_stack([(x[1:] + x[:-1]) / 2, (y[1:] + y[:-1]) / 2, np.diff(seconds)])
-    return rows[step <= max_speed * rows[:, 2]]
+    metres = np.hypot(*np.diff(position, axis=0).T)
+    along, clock = (np.cumsum(np.append(0, values)) for values in (metres, seconds))
+    ends = np.arange(0, along[-1], step)
+    x, y, at = (np.interp(ends, along, values) for values in (*position.T, clock))
+    return np.column_stack([(x[1:] + x[:-1]) / 2, (y[1:] + y[:-1]) / 2, np.diff(at)])

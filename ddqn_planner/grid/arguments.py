@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import reprlib
 import sys
 from collections.abc import Sequence
 from enum import Enum
@@ -41,7 +42,7 @@ def as_cell(cell: Any, name: str = "the cell") -> Cell:
                 return x, y
     except (TypeError, ValueError, OverflowError, LookupError):
         pass
-    raise ValueError(f"{name} is {cell!r}; give two whole numbers (x, y)")
+    raise ValueError(f"{name} is {reprlib.repr(cell)}; give two whole numbers (x, y)")
 
 
 def cell_inside(cell: Any, shape: tuple[int, ...], name: str = "the cell") -> Cell:
@@ -72,8 +73,6 @@ def listed(values: Any, name: str) -> list[Any]:
 
 def real(value: Any) -> float:
     """Return a number of any type as a float; NaN, which no range contains, for anything else."""
-    if type(value) is float:  # a look at the kind of number takes longer
-        return value
     try:
         return float(value) if isinstance(value, Real) else math.nan
     except OverflowError:

@@ -50,23 +50,16 @@ def read_footprint(text: Any, padding: float = 0.0) -> NDArray[np.float64]:
 
 def _crosses_itself(corners: NDArray[np.float64]) -> bool:
     """Return whether two sides touch that do not meet in a corner, or one has no length."""
-    ends = np.roll(corners, -1, axis=0)
+    begin, count = corners @ (1, 1j), len(corners)
+    end = np.roll(begin, -1)
+    a, b, c, d = begin[:, None], end[:, None], begin, end
 
     def side_of(p: Any, q: Any, r: Any) -> Any:
-        return (q[0] - p[0]) * (r[1] - p[1]) - (q[1] - p[1]) * (r[0] - p[0])
+        return ((q - p).conj() * (r - p)).imag
 
-    count = len(corners)
-    for i in range(count):
-        if np.array_equal(corners[i], ends[i]):
-            return True
-        for j in range(i + 2, count - (i == 0)):
-            a, b, c, d = corners[i], ends[i], corners[j], ends[j]
-            if (
-                side_of(a, b, c) * side_of(a, b, d) <= 0
-                and side_of(c, d, a) * side_of(c, d, b) <= 0
-            ):
-                return True
-    return False
+    touch = (side_of(a, b, c) * side_of(a, b, d) <= 0) & (side_of(c, d, a) * side_of(c, d, b) <= 0)
+    between = np.abs(np.subtract.outer(np.arange(count), np.arange(count)))
+    return bool((begin == end).any() or (touch & (between > 1) & (between < count - 1)).any())
 
 
 def inside(points: NDArray[np.float64], corners: NDArray[np.float64]) -> NDArray[np.bool_]:
@@ -77,13 +70,6 @@ def inside(points: NDArray[np.float64], corners: NDArray[np.float64]) -> NDArray
         if y0 != y1:
             found ^= ((y0 > y) != (y1 > y)) & (x < x0 + (y - y0) / (y1 - y0) * (x1 - x0))
     return found
-
-
-def inner_radius(corners: NDArray[np.float64]) -> float:
-    """Return the radius of the circle around the origin that fits into a polygon, metres."""
-    sides = np.roll(corners, -1, axis=0) - corners
-    share = np.clip(-(corners * sides).sum(axis=1) / (sides**2).sum(axis=1), 0, 1)
-    return float(np.hypot(*(corners + share[:, None] * sides).T).min())
 
 
 def swept_cells(corners: NDArray[np.float64], motions: Motions) -> NDArray[np.bool_]:

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ddqn_planner.grid import arguments
 from ddqn_planner.grid.arguments import OCCUPIED, UNKNOWN, Cell, Occupancy
-from ddqn_planner.grid.copies import Box, replaced
+from ddqn_planner.grid.copies import ORIGIN, Box, replaced
 from ddqn_planner.grid.moves import MoveRule, component_labels, flood, legal_moves
 
 MAX_COST_MULTIPLIER = 5.0
@@ -186,18 +186,20 @@ class GridMap:
             cost=costs,
             obstacles=replaced(self.obstacles, box, closed),
         )
+        change = np.count_nonzero(patch) - np.count_nonzero(self.occupancy[box])
+        patched._set(_occupied=self._occupied + change)
         if (costs is None) == (self.cost is None):
-            patched._set(_patches=(*self._patches[1 - MAX_PATCHES :], (self._version, box)))
+            patched._set(_history=(*self._history[-MAX_PATCHES:], (object(), box)))
         return patched
 
     def patches_since(self, older: GridMap) -> list[Box] | None:
         """Return the boxes, rows and columns, that `with_patch` replaced since an older map."""
         # None if it is no such map, or has other layers, or there were more than `MAX_PATCHES`.
-        versions = [*(version for version, _ in self._patches), self._version]
+        versions, (older_version, _) = [version for version, _ in self._history], older._history[-1]
         has_same = self.forbidden is older.forbidden and self.slowness is older.slowness
-        if not has_same or older._version not in versions:
+        if not has_same or older_version not in versions:
             return None
-        return [box for _, box in self._patches[versions.index(older._version) :]]
+        return [box for _, box in self._history[versions.index(older_version) + 1 :]]
 
     def with_slowness(self, slowness: NDArray[np.float32], seconds_per_cell: float) -> GridMap:
         """Return the same map with other expected times."""
@@ -207,9 +209,9 @@ class GridMap:
         """Return the same map with other layers, which are neither checked nor copied."""
         stale = {"cost_multiplier", "fingerprint"}
         if layers.keys() & PATCHED:
-            stale |= {"_version", "_patches", "_labels", "_occupied"}
+            stale |= {"_history", "_labels", "_occupied"}
         else:
-            layers["_version"] = self._version  # which may not be there yet
+            layers["_history"] = self._history  # which may not be there yet
         kept = {name: value for name, value in vars(self).items() if name not in stale}
         changed = object.__new__(GridMap)
         changed._set(**{**kept, **layers})
@@ -237,10 +239,12 @@ class GridMap:
 
     def multipliers_in(self, where: Any) -> NDArray[np.float32]:
         """Return the cost multipliers that an index of NumPy names."""
-        multiplier = np.ones(self.occupancy[where].shape, dtype=np.float32)
-        if self.cost is not None:
-            multiplier = MULTIPLIERS.take(self.cost[where], mode="wrap")  # -1 finds the last one
-        return multiplier if self.slowness is None else multiplier * self.slowness[where]
+        slowness = None if self.slowness is None else self.slowness[where]
+        if self.cost is None:
+            return np.ones(self.occupancy[where].shape, "f4") if slowness is None else slowness
+        multiplier: NDArray[np.float32]
+        multiplier = MULTIPLIERS.take(self.cost[where], mode="wrap")  # -1 finds the last one
+        return multiplier if slowness is None else multiplier * slowness
 
     def labels(self, move_rule: MoveRule | str) -> NDArray[np.int32]:
         """Return (H, W) int32: each free cell's component, from 1 on, whatever is forbidden."""
@@ -258,10 +262,8 @@ class GridMap:
         self, cells: ArrayLike, move_rule: MoveRule | str, backward: bool = False
     ) -> NDArray[np.bool_]:
         """Return (H, W) bool: where paths from some free cells (N, 2) lead, or backward, begin."""
-        array, backward = (
-            arguments.cells_inside(cells, self.occupancy.shape),
-            arguments.as_flag("backward", backward),
-        )
+        array = arguments.cells_inside(cells, self.occupancy.shape)
+        backward = arguments.as_flag("backward", backward)
         if self.forbidden is None:
             labels = self.labels(move_rule)
             return np.isin(labels, labels[array[:, 1], array[:, 0]])
@@ -273,13 +275,9 @@ class GridMap:
         return reached
 
     @cached_property
-    def _version(self) -> object:
-        return object()
-
-    @cached_property
-    def _patches(self) -> tuple[tuple[object, Box], ...]:
-        """The last patches: the version of the map before each, and its rows and columns."""
-        return ()
+    def _history(self) -> tuple[tuple[object, Box], ...]:
+        """The last versions, its own at the end, and the box that differs from the one before."""
+        return ((object(), ORIGIN),)
 
     @cached_property
     def _labels(self) -> dict[int, NDArray[np.int32]]:
@@ -304,12 +302,13 @@ class GridMap:
     def same_cells(self, other: GridMap) -> bool:
         """Return whether all cells of two maps are equal, wherever the maps lie."""
         check_grid(other, "other")
+        if self._occupied != other._occupied:
+            return False
         boxes = self.patches_since(other)
         if boxes is not None:
             return not any(self.differs(other, box, box).any() for box in reversed(boxes))
         layers = ((getattr(self, name), getattr(other, name)) for name in LAYERS)
-        same = (mine is its or np.array_equal(mine, its) for mine, its in layers)
-        return self._occupied == other._occupied and all(same)
+        return all(mine is its or np.array_equal(mine, its) for mine, its in layers)
 
     def differs(self, other: GridMap, box: Box, others_box: Box) -> NDArray[np.bool_]:
         """Return which cells of boxes of two maps with the same layers differ."""

@@ -14,7 +14,7 @@ import yaml
 from numpy.typing import NDArray
 
 from ddqn_planner.files import as_path, write_atomically
-from ddqn_planner.grid.arguments import OCCUPIED, UNKNOWN, Cell, cell_inside, numbers
+from ddqn_planner.grid.arguments import OCCUPIED, UNKNOWN, Cell, as_number, cell_inside, numbers
 from ddqn_planner.grid.grid_map import GridMap
 
 MAX_CELLS = 2**26  # a larger map is refused before its cells are read
@@ -218,12 +218,11 @@ def _read_ros(path: Path) -> MapFile:
     if not isinstance(document, dict):
         raise ValueError("not a YAML mapping; give 'key: value' lines: image, resolution, ...")
     grey, clear, _ = _read_image(path, document, "image", ("PPM", "PNG", "BMP", "JPEG"))
-    mode = _choice(document, "mode", ("trinary", "scale", "raw"), "trinary")
+    mode = _choice({"mode": "trinary", **document}, "mode", ("trinary", "scale", "raw"))
     values = _percent_of_grey(document, mode)[grey]
     if mode != "raw":
         values[clear] = UNKNOWN
-    resolution = _number(document.get("resolution"), "resolution")
-    x, y, yaw = _numbers(document.get("origin"), "origin", "[x, y, yaw]")
+    resolution, origin = _numbers(document, "resolution"), _numbers(document, "origin")
     ours = document.get("ddqn_planner", {})
     if not isinstance(ours, dict) or not ours.keys() <= {"start", "goal", "directions"}:
         keys = "{start: , goal: , directions: }"
@@ -238,8 +237,8 @@ def _read_ros(path: Path) -> MapFile:
             has, right = (f"{w} x {h}" for h, w in (forbidden.shape, values.shape))
             raise MapDataError(f"{name!r}: has {has} pixels; give {right}, as the map's image")
         forbidden = forbidden[::-1]
-    cells: Any = {name: _numbers(cell, name, "[x, y]") for name, cell in ours.items()}
-    return MapFile(values[::-1], resolution, (x, y, yaw), **cells, forbidden=forbidden)
+    cells = {name: _numbers(ours, name) for name in ours}
+    return MapFile(values[::-1], resolution, origin, **cells, forbidden=forbidden)
 
 
 def _read_image(
@@ -300,37 +299,28 @@ def _grey(image: Any) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
     return grey.astype(np.uint8, copy=False), clear
 
 
-def _choice(
-    document: dict[str, Any], key: str, choices: Sequence[str], default: str | None = None
-) -> str:
-    value = document.get(key, default)
+def _choice(document: dict[str, Any], key: str, choices: Sequence[str]) -> str:
+    value = document.get(key)
     if not isinstance(value, str) or value.lower() not in choices:
         raise ValueError(f"{key} is {_short(value)}; give one of {', '.join(choices)}")
     return value.lower()
 
 
-def _number(value: Any, key: str) -> float:
+def _numbers(document: dict[str, Any], key: str) -> Any:
+    """Return a number, or a list of them; whoever takes them checks how many there are."""
+    value: Any = document.get(key)
     try:
-        return float(value)
+        return [float(each) for each in value] if isinstance(value, list) else float(value)
     except (TypeError, ValueError):
-        raise ValueError(f"{key} is {_short(value)}; give a number") from None
-
-
-def _numbers(value: Any, key: str, names: str) -> list[float]:
-    if not isinstance(value, list) or len(value) != names.count(",") + 1:
-        raise ValueError(f"{key} is {_short(value)}; give numbers {names}")
-    return [_number(number, key) for number in value]
+        raise ValueError(f"{key} is {_short(value)}; give numbers") from None
 
 
 def _percent_of_grey(document: dict[str, Any], mode: str) -> NDArray[np.int8]:
     """Return (256,) int8: the occupancy of each grey value, by map_server's rules."""
     keys = "free_thresh", "occupied_thresh"
-    free_thresh, occupied_thresh = (_number(document.get(key), key) for key in keys)
-    if not 0 <= free_thresh <= occupied_thresh <= 1:
-        raise ValueError(
-            f"free_thresh is {free_thresh}, occupied_thresh is {occupied_thresh}; give"
-            " 0 <= free_thresh <= occupied_thresh <= 1"
-        )
+    free_thresh, occupied_thresh = (as_number(key, _numbers(document, key), 0, 1) for key in keys)
+    if free_thresh > occupied_thresh:
+        raise ValueError(f"free_thresh is {free_thresh}; give at most {occupied_thresh}")
     negate = _choice(document, "negate", YES + NO)
     grey = np.arange(256)
     if mode == "raw":

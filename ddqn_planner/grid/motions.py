@@ -52,10 +52,6 @@ class Motions:
     cost: NDArray[np.float32]  # (P,) what it counts, in cells of its length
     poses: tuple[Array, ...]  # P times (n, 3): x, y in cells from where it begins, and the yaw
 
-    def nearest_heading(self, yaw: float) -> int:
-        """Return the heading that is nearest to a yaw in radians."""
-        return int(np.abs(turn_between(self.angles, yaw)).argmin())
-
 
 def turn_between(before: Any, after: Any) -> Any:
     """Return by how many radians to turn, from -pi to pi, counter-clockwise positive."""

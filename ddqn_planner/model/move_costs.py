@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from ddqn_planner.compiled import in_place
 from ddqn_planner.grid import MAX_COST_MULTIPLIER, OCCUPIED, UNKNOWN, GridMap, MoveRule, legal_moves
 from ddqn_planner.grid.copies import ORIGIN, Box, replaced, wider, within
+from ddqn_planner.grid.grid_map import LAYERS
 
 # Shapes: C = cells of the padded map, P = patches, S = sets of actions, A = 8 actions, L = the 102
 # values of a cell: 0 for unknown, 1 to 100 for the costs 0 to 99, 101 for occupied.
@@ -18,7 +19,7 @@ Array = NDArray[np.float32]
 VALUES = OCCUPIED - UNKNOWN + 1
 # Above all true ones. Time and memory of a field grow with it, and a broken model predicts any.
 MAX_MULTIPLIER = 20 * MAX_COST_MULTIPLIER
-OCCUPIED_PATCH = 512  # of occupied cells, and those outside the map: no move leads out of them
+OUTSIDE = 512  # the patch of cells outside the map: no move leads out of them
 
 
 class MoveCosts(NamedTuple):
@@ -53,28 +54,24 @@ class MoveCosts(NamedTuple):
         """Return the costs on a map that differs from theirs in boxes; None to look at it all."""
         if grid.forbidden is not None:  # its patches are others
             return None
-        shape = grid.height + 2, grid.width + 2
-        patch, value, multiplier = self.patch.reshape(shape), self.value, self.multiplier
-        highest, least = self.highest, self.least
+        after, shape = self, grid.occupancy.shape
         for box in boxes:
             # The patches of the cells around see the box, too.
-            around, seen = (wider(box, by, grid.occupancy.shape) for by in (1, 2))
-            window = grid.occupancy[seen]
-            numbers = patch_numbers(window).reshape(window.shape[0] + 2, -1)
-            patch = replaced(patch, within(around, ORIGIN, 1), numbers[within(around, seen, 1)])
-            inner = within(box, ORIGIN, 1)
-            if multiplier.size:
-                multipliers = grid.multipliers_in(box)
-                greatest = self.table.max(where=np.isfinite(self.table), initial=1)
-                highest = max(highest, float(greatest * multipliers.max()))
-                least = min(least, float(multipliers.min()))
-                multiplier = replaced(multiplier.reshape(shape), inner, multipliers)
-            if value.size and grid.cost is not None:
-                values = np.where(grid.occupancy[box], VALUES - 1, grid.cost[box] - UNKNOWN)
-                least = min(least, self._least(values.astype(np.uint8)))
-                value = replaced(value.reshape(shape), inner, values)
-        cells = patch.ravel(), self.table, value.ravel(), self.terms, multiplier.ravel()
-        return MoveCosts(*cells, self.width, highest, *self[-4:-1], least)
+            around, seen = (wider(box, by, shape) for by in (1, 2))
+            layers = [(name, getattr(grid, name)) for name in LAYERS]
+            parts = {name: layer[seen].copy() for name, layer in layers if layer is not None}
+            part = grid.with_layers(**parts)
+            of_part = self.on(part, patch_numbers(part.occupancy))
+            highest, least = max(after.highest, of_part.highest), min(after.least, of_part.least)
+            after = after._replace(highest=highest, least=least)
+            for name in ("patch", "value", "multiplier"):
+                layer, new = getattr(after, name), getattr(of_part, name)
+                if new.size:
+                    layer, new = layer.reshape(-1, shape[1] + 2), new.reshape(-1, part.width + 2)
+                    new = new[within(around, seen, 1)]
+                    layer = replaced(layer, within(around, ORIGIN, 1), new)
+                    after = after._replace(**{name: layer.ravel()})
+        return after
 
     def _least(self, value: NDArray[np.uint8]) -> float:
         """Return a multiplier that none on free cells is less than, given cells' values."""
@@ -83,19 +80,20 @@ class MoveCosts(NamedTuple):
 
     def on(self, grid: GridMap, patch: NDArray[Any]) -> MoveCosts:
         """Return the costs on a map, given its patches, with its directions and expected times."""
-        value, least, table, multiplier = self.value, self.least, self.table, self.multiplier
-        highest = self.highest
+        costs = self._replace(patch=patch, width=grid.width + 2)
         if self.terms.size and grid.cost is not None:
             value = cell_values(grid.occupancy, grid.cost)
-            least = self._least(value)
+            costs = costs._replace(value=value, least=self._least(value))
         if grid.forbidden is not None:
-            patch, table = _with_directions(patch, table, np.pad(grid.forbidden, 1).ravel())
+            forbidden = np.pad(grid.forbidden, 1).ravel()
+            patch, table = _with_directions(patch, self.table, forbidden)
+            costs = costs._replace(patch=patch, table=table)
         if grid.slowness is not None:
             multiplier = np.pad(grid.cost_multiplier, 1, constant_values=1).ravel()
-            highest *= float(multiplier.max())
-            least = float(grid.cost_multiplier.min())
-        cells = patch, table, value, self.terms, multiplier
-        return MoveCosts(*cells, grid.width + 2, highest, *self[-4:-1], least)
+            greatest = self.table.max(where=np.isfinite(self.table), initial=1)
+            highest, least = float(greatest * multiplier.max()), float(grid.cost_multiplier.min())
+            costs = costs._replace(multiplier=multiplier, highest=highest, least=least)
+        return costs
 
 
 def _with_directions(
@@ -141,10 +139,8 @@ def _cell_values(
 
 def patch_numbers(occupancy: NDArray[np.bool_]) -> NDArray[np.uint16]:
     """Return each cell's patch: (C,) uint16, with bit 3 y + x where its cell (x, y) is occupied."""
-    numbers = _with_border(occupancy, np.uint16, OCCUPIED_PATCH)
+    numbers = _with_border(occupancy, np.uint16, OUTSIDE)
     rows = np.ones((3, numbers.shape[1]), np.uint8)  # all rows would be memory to fetch
-    occupancy = np.ascontiguousarray(occupancy).view()
-    occupancy.flags.writeable = False  # numba compiles again for one that can be written to
     _patch_numbers(occupancy, rows, numbers)
     return numbers.ravel()
 
@@ -170,9 +166,9 @@ def _patch_numbers(
             continue
         for x in range(width):
             bits = rows[below, x] + 2 * rows[below, x + 1] + 4 * rows[below, x + 2]
-            bits += 8 * rows[here, x] + 32 * rows[here, x + 2]
+            bits += 8 * rows[here, x] + 16 * rows[here, x + 1] + 32 * rows[here, x + 2]
             bits += 64 * rows[above, x] + 128 * rows[above, x + 1] + 256 * rows[above, x + 2]
-            numbers[y, x + 1] = OCCUPIED_PATCH if rows[here, x + 1] else bits
+            numbers[y, x + 1] = bits
 
 
 def patches(occupancy: NDArray[np.bool_], cost: NDArray[np.int8] | None) -> NDArray[np.int8]:
@@ -185,29 +181,19 @@ def patches(occupancy: NDArray[np.bool_], cost: NDArray[np.int8] | None) -> NDAr
 
 
 def unique_patches(
-    occupancy: NDArray[np.bool_], cost: NDArray[np.int8] | None
-) -> tuple[NDArray[np.int32], NDArray[np.int8]]:
-    """Return each cell's patch number, (H, W), and the different patches, (P, 9); 512 costless."""
-    base, digits, outside = 2, occupancy.astype(np.int32), 1
-    if cost is not None:
-        base, outside = 128, OCCUPIED - UNKNOWN
-        digits = np.where(occupancy, outside, cost.astype(np.int64) - UNKNOWN)
-    padded = np.pad(digits, 1, constant_values=outside)
-    height, width = occupancy.shape
-    code = np.zeros(occupancy.shape, dtype=padded.dtype)
-    for place in range(9):
-        y, x = divmod(place, 3)
-        code += padded[y : y + height, x : x + width] * base**place
-    if cost is None:
-        return code, every_patch()
-    codes, patch_id = np.unique(code, return_inverse=True)
-    patch_P9 = codes[:, None] // base ** np.arange(9) % base + UNKNOWN
-    return patch_id.reshape(code.shape).astype(np.int32), patch_P9.astype(np.int8)
+    occupancy: NDArray[np.bool_], cost: NDArray[np.int8]
+) -> tuple[NDArray[Any], NDArray[np.int8]]:
+    """Return each cell's patch, (C,), and the different patches, (P, 9); P for outside the map."""
+    patch_C9 = patches(occupancy, cost)
+    code_C = (patch_C9 - UNKNOWN) @ 128 ** np.arange(9)
+    _, first, patch_id = np.unique(code_C, return_index=True, return_inverse=True)
+    patch_HW = patch_id.reshape(occupancy.shape).astype(np.int32)
+    return np.pad(patch_HW, 1, constant_values=len(first)).ravel(), patch_C9[first]
 
 
 def every_patch() -> NDArray[np.int8]:
     """Return all 512 patches without costs, in the order of their numbers: (512, 9) int8."""
-    return ((np.arange(OCCUPIED_PATCH)[:, None] >> np.arange(9) & 1) * OCCUPIED).astype(np.int8)
+    return ((np.arange(2**9)[:, None] >> np.arange(9) & 1) * OCCUPIED).astype(np.int8)
 
 
 def legal_in_patches(patch_P9: NDArray[np.int8], move_rule: MoveRule) -> NDArray[np.bool_]:

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
+from functools import cache, partial
 from typing import TYPE_CHECKING, ClassVar, TypeAlias
 
 import numpy as np
@@ -160,8 +161,7 @@ class PropagationQNetwork(QNetwork):
     def __init__(self, sizes: Mapping[str, int], tensors: Mapping[str, Array]) -> None:
         super().__init__(sizes, tensors)
         # What holds for all maps, so that it is computed once.
-        self._proved: dict[tuple[MoveRule, bool, bool], MoveCosts | None] = {}
-        self._certificates: dict[Sequence[MoveRule], Certificate] = {}
+        self._certify, self._proved = cache(partial(certify, self)), cache(self._proved_costs)
 
     @classmethod
     def shapes(cls, sizes: Mapping[str, int]) -> dict[str, tuple[int, ...]]:
@@ -197,18 +197,13 @@ class PropagationQNetwork(QNetwork):
 
     def certificate(self, move_rule: MoveRule) -> Certificate:
         """Return what is proved of its moves: under all rules, or the one it was trained for."""
-        rules = MOVE_RULES if self.uses_costs else (move_rule,)
-        if rules not in self._certificates:
-            self._certificates[rules] = certify(self, rules)
-        return self._certificates[rules]
+        return self._certify(MOVE_RULES if self.uses_costs else (move_rule,))
 
     def move_costs(self, grid: GridMap, move_rule: MoveRule) -> MoveCosts | None:
         """Return the costs of a map's moves if the possible ones are exactly the legal ones."""
         timed = grid.slowness is not None
-        key = move_rule, self.uses_costs and grid.cost is not None and not timed, timed
-        if key not in self._proved:
-            self._proved[key] = self._proved_costs(*key)
-        costs = self._proved[key]
+        with_costs = self.uses_costs and grid.cost is not None and not timed
+        costs = self._proved(move_rule, with_costs, timed)
         return costs and costs.on(grid, patch_numbers(grid.occupancy))
 
     def _proved_costs(self, move_rule: MoveRule, with_costs: bool, timed: bool) -> MoveCosts | None:
@@ -226,9 +221,10 @@ class PropagationQNetwork(QNetwork):
         # A move counts as possible where p > 1/2, and is tried until it succeeds. The progress and
         # detour terms of the paper's reward (section 4.2) add up to a constant along a path.
         timed = grid.slowness is not None
-        cost = grid.cost if self.uses_costs and not timed else None
-        patch_id, patch_P9 = unique_patches(grid.occupancy, cost)
-        patch_C = np.pad(patch_id, 1, constant_values=len(patch_P9)).ravel()
+        if self.uses_costs and grid.cost is not None and not timed:
+            patch_C, patch_P9 = unique_patches(grid.occupancy, grid.cost)
+        else:
+            patch_C, patch_P9 = patch_numbers(grid.occupancy), every_patch()
         return MoveCosts.of_table(self._costs_of(patch_P9, move_rule, timed)).on(grid, patch_C)
 
     def _costs_of(self, patch_P9: NDArray[np.int8], move_rule: MoveRule, timed: bool) -> Array:

@@ -262,7 +262,10 @@ def offset_between(old: GridMap, new: GridMap) -> Cell | None:
     if not same or old.origin[2] != new.origin[2]:
         return None
     corner = old.cell_to_world((0, 0))
-    shift = new.world_to_cell(*corner)
+    try:
+        shift = new.world_to_cell(*corner)
+    except (OverflowError, ValueError):  # too far away to have a number of cells
+        return None
     apart = math.dist(corner, new.cell_to_world(shift))
     return shift if apart < SAME_PLACE * new.resolution else None
 

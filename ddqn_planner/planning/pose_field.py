@@ -11,7 +11,7 @@ from numpy.typing import DTypeLike, NDArray
 
 from ddqn_planner.grid import GridMap
 from ddqn_planner.planning import pose_kernels as kernels
-from ddqn_planner.planning.pose_guide import Aim, spread
+from ddqn_planner.planning.pose_guide import Aim, heap_of, spread
 from ddqn_planner.planning.pose_kernels import Known
 from ddqn_planner.planning.pose_paths import SAME, Way
 from ddqn_planner.planning.pose_world import SHIFT, TILE, Body, State, World
@@ -22,9 +22,8 @@ LOST = 1 / 2  # of the cost of the last start; if a repair takes more back, a ne
 UNGUIDED = 2**14  # states that are visited before a look at the map pays
 FINEST = 1  # the shift of the smallest tiles that it looks at
 FIRST = 1.2  # a first path is looked for as if with this bound, if a smaller one is asked for
-NOWHERE = Aim(0, 0, -1, np.empty(0, np.float32), SHIFT + 1, 0)
+NOWHERE = Aim(0, 0, -1, 1.0, np.empty(0, np.float32), SHIFT + 1, 0)
 GREEDY = 1.5  # the first round's weight is the bound to the power of this: mostly that will do
-FURTHER = 1.2  # times the way to the goal that the look at the map goes
 
 
 def _untouched(count: int, dtype: DTypeLike) -> NDArray[Any]:
@@ -83,28 +82,18 @@ class PoseField:
             if proved <= bound * SAME or self._least == math.inf:
                 return proved
             most = self._until_look(number, limit)
-            self._size, visits, done = kernels.grow(
-                self.known,
-                self._keys,
-                self._numbers,
-                self._size,
-                self._aim,
-                self._weight,
-                1.0 if self._weight > 1 else 1 / bound,
-                most,
-                self.world,
-                self.body,
-            )
+            how = self._aim, 1.0 if self._aim.weight > 1 else 1 / bound, most, self.world, self.body
+            self._size, visits, done = kernels.grow(self.known, self._heap, self._size, *how)
             limit, self.visits = limit - visits, self.visits + visits
             if done:
                 self._order(1.0)
             elif limit == 0:
                 return None
             elif visits < most:  # the heap is full
-                self._order(self._weight)
+                self._order(self._aim.weight)
             elif self._can_leave(number):
                 self._look_at_map()
-                self._order(self._weight)
+                self._order(self._aim.weight)
             else:
                 return math.inf
 
@@ -127,12 +116,10 @@ class PoseField:
     def _order(self, weight: float) -> None:
         """Begin a round: what is open or waits is ordered toward the start."""
         tiles = np.flatnonzero(self.known.touched)
-        entries = (len(tiles) << kernels.TILE_BITS) + HEAP
-        self._keys, self._numbers = np.empty(entries, np.float32), np.empty(entries, np.int64)
-        heap, self._weight = (self._keys, self._numbers), weight
-        self._size, self._least = kernels.order(
-            self.known, tiles, *heap, self._aim, weight, self.world
-        )
+        self._heap = heap_of((len(tiles) << kernels.TILE_BITS) + HEAP)
+        self._aim = self._aim._replace(weight=weight)
+        given = self.known, tiles, self._heap, self._aim, self.world
+        self._size, self._least = kernels.order(*given)
 
     def _can_leave(self, number: int) -> bool:
         """Return whether primitives lead from the start to more than a few states."""
@@ -147,13 +134,12 @@ class PoseField:
         room = world.room if shift == SHIFT else np.zeros(columns * rows, np.uint8)
         left = np.empty((columns + 1) * (rows + 1), np.float32)
         self._aim = self._aim._replace(left=left, shift=shift, columns=columns)
-        most = 8 * left.size + 4  # each corner opens its neighbours once
-        keys, numbers = np.empty(most, np.float32), np.empty(most, np.int64)
+        heap = heap_of(8 * left.size + 4)  # each corner opens its neighbours once
         x, y, _ = self.goals.T >> shift
         is_goal = np.zeros(left.size, np.bool_)
         is_goal[y * (columns + 1) + x] = True
         box = np.array([x.min(), y.min(), x.max(), y.max()])
-        spread(self._aim, room, keys, numbers, is_goal, box, FURTHER, world, self.body)
+        spread(self._aim, room, heap, is_goal, box, world, self.body)
 
     def rollout(self, start: State) -> tuple[NDArray[np.int64], NDArray[np.float64]] | None:
         """Return the primitives from a start to a goal, and their costs; None without a way."""

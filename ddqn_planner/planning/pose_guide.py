@@ -18,6 +18,7 @@ class Aim(NamedTuple):
     x: int
     y: int
     number: int
+    weight: float  # times what is left, in the order in which states are visited
     left: NDArray[np.float32]  # (corners,) in cells, row by row; empty for the straight way alone
     shift: int  # those of tiles with 2**shift cells of a side
     columns: int  # of such tiles
@@ -41,45 +42,53 @@ def way_left(x: int, y: int, aim: Any) -> float:
     return best
 
 
-# The heap: the first `size` of an array of keys and one of states, the least key first.
+class Heap(NamedTuple):
+    """Entries, of which the first ones are ordered: the least key first."""
+
+    keys: NDArray[np.float32]
+    numbers: NDArray[np.int64]
+
+
+def heap_of(entries: int) -> Heap:
+    """Return a heap with room for so many entries."""
+    return Heap(np.empty(entries, np.float32), np.empty(entries, np.int64))
 
 
 @inlined
-def push(key: Any, number: int, keys: Any, numbers: Any, size: int) -> int:
+def push(key: Any, number: int, heap: Heap, size: int) -> int:
     """Add an entry; return the new size."""
     place = size
     while place > 0:
         parent = (place - 1) >> 2
-        if keys[parent] <= key:
+        if heap.keys[parent] <= key:
             break
-        keys[place], numbers[place] = keys[parent], numbers[parent]
+        heap.keys[place], heap.numbers[place] = heap.keys[parent], heap.numbers[parent]
         place = parent
-    keys[place], numbers[place] = key, number
+    heap.keys[place], heap.numbers[place] = key, number
     return size + 1
 
 
 @inlined
-def sink(key: Any, number: int, place: int, keys: Any, numbers: Any, size: int) -> None:
+def sink(key: Any, number: int, place: int, heap: Heap, size: int) -> None:
     """Put an entry where it belongs, at a place or below it."""
     while True:
-        least, first = place, 4 * place + 1
-        best = key
+        least, first, best = place, 4 * place + 1, key
         for child in range(first, first + 4 if first + 4 < size else size):
-            if keys[child] < best:
-                least, best = child, keys[child]
+            if heap.keys[child] < best:
+                least, best = child, heap.keys[child]
         if least == place:
             break
-        keys[place], numbers[place] = best, numbers[least]
+        heap.keys[place], heap.numbers[place] = best, heap.numbers[least]
         place = least
-    keys[place], numbers[place] = key, number
+    heap.keys[place], heap.numbers[place] = key, number
 
 
 @inlined
-def pop(keys: Any, numbers: Any, size: int) -> int:
+def pop(heap: Heap, size: int) -> int:
     """Take the first entry away; return the new size."""
     size -= 1
     if size > 0:
-        sink(keys[size], numbers[size], 0, keys, numbers, size)
+        sink(heap.keys[size], heap.numbers[size], 0, heap, size)
     return size
 
 
@@ -140,6 +149,7 @@ def leads(
 # same tiles that is longer by `LONGER` at most, if a diagonal counts 7/5.
 
 STRAIGHT, DIAGONAL = 5, 7
+FURTHER: Final = 1.2  # times the way to the nearest goal that the look at the map goes
 LONGER: Final = math.sqrt(1 + (DIAGONAL / STRAIGHT - 1) ** 2)
 
 
@@ -155,11 +165,9 @@ def way_to_box(x: int, y: int, box: NDArray[np.int64]) -> Any:
 def spread(
     aim: Aim,
     room: NDArray[np.uint8],
-    keys: Any,
-    numbers: Any,
+    heap: Heap,
     is_goal: NDArray[np.bool_],
     box: NDArray[np.int64],
-    further: float,
     world: World,
     body: Body,
 ) -> None:
@@ -172,18 +180,18 @@ def spread(
         x, y = (aim.x >> aim.shift) + (corner & 1), (aim.y >> aim.shift) + (corner >> 1)
         number = y * (columns + 1) + x
         left[number] = 0
-        size = push(np.float32(way_to_box(x, y, box)), number, keys, numbers, size)
-    while size > 0 and keys[0] <= limit:
-        key, number = keys[0], numbers[0]
+        size = push(np.float32(way_to_box(x, y, box)), number, heap, size)
+    while size > 0 and heap.keys[0] <= limit:
+        key, number = heap.keys[0], heap.numbers[0]
         end = key
-        size = pop(keys, numbers, size)
+        size = pop(heap, size)
         y = number // (columns + 1)
         x = number - y * (columns + 1)
         here, ahead = left[number], way_to_box(x, y, box)
         if key > here + ahead:
             continue
         if is_goal[number] and limit == np.inf:
-            limit = further * here
+            limit = FURTHER * here
         for step_y in range(-1, 2):
             for step_x in range(-1, 2):
                 if step_x == 0 and step_y == 0:
@@ -196,7 +204,7 @@ def spread(
                 if cost < left[after] and leads(x, y, step_x, step_y, aim, room, world, body):
                     left[after] = cost
                     key = np.float32(cost + way_to_box(after_x, after_y, box))
-                    size = push(key, after, keys, numbers, size)
+                    size = push(key, after, heap, size)
     for number in range(left.size):
         y = number // (columns + 1)
         # What was not reached is no nearer than where it ended.

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from ddqn_planner.compiled import in_place, inlined
 from ddqn_planner.grid.motions import HEADINGS
-from ddqn_planner.planning.pose_guide import Aim, pop, push, sink, way_left
+from ddqn_planner.planning.pose_guide import Aim, Heap, pop, push, sink, way_left
 from ddqn_planner.planning.pose_world import (
     SHIFT,
     TILE,
@@ -58,13 +58,7 @@ def place_of(number: int, columns: int) -> tuple[int, int, int]:
 
 @in_place
 def order(
-    known: Known,
-    tiles: NDArray[np.int64],
-    keys: Any,
-    numbers: Any,
-    aim: Aim,
-    weight: float,
-    world: World,
+    known: Known, tiles: NDArray[np.int64], heap: Heap, aim: Aim, world: World
 ) -> tuple[int, float]:
     """Make a heap of all states in some tiles that are open or wait, ordered toward a start."""
     # Returns how many there are, and a lower bound of what may still be found for the start.
@@ -75,22 +69,20 @@ def order(
                 known.mark[number] = OPEN
                 x, y, _ = place_of(number, world.columns)
                 here, far = known.distance[number], way_left(x, y, aim)
-                keys[size], numbers[size] = here + weight * far, number
+                heap.keys[size], heap.numbers[size] = here + aim.weight * far, number
                 size += 1
                 least = min(least, here + far)
     for place in range((size - 2) >> 2, -1, -1):
-        sink(keys[place], numbers[place], place, keys, numbers, size)
+        sink(heap.keys[place], heap.numbers[place], place, heap, size)
     return size, least
 
 
 @in_place
 def grow(
     known: Known,
-    keys: Any,
-    numbers: Any,
+    heap: Heap,
     size: int,
     aim: Aim,
-    weight: float,
     share: float,
     limit: int,
     world: World,
@@ -99,12 +91,12 @@ def grow(
     """Close states in their order until it reaches a share of a start's cost; see `PoseField`."""
     # Returns the heap's size, the visits, and whether it is done.
     distance, mark, columns, target = known.distance, known.mark, world.columns, aim.number
-    most, visits = keys.size - body.start.size, 0
+    keys, most, visits = heap.keys, heap.keys.size - body.start.size, 0
     while size > 0 and (mark[target] == UNREACHED or keys[0] < share * distance[target]):
         if visits == limit or size > most:
             return size, visits, False
-        number = numbers[0]
-        size = pop(keys, numbers, size)
+        number = heap.numbers[0]
+        size = pop(heap, size)
         if mark[number] != OPEN:
             continue
         mark[number] = CLOSED
@@ -125,13 +117,13 @@ def grow(
             if found == np.inf or (mark[before] != UNREACHED and found >= distance[before]):
                 continue
             distance[before] = found
-            if mark[before] >= WAITING and weight > 1:
+            if mark[before] >= WAITING and aim.weight > 1:
                 mark[before] = WAITING
                 continue
             mark[before] = OPEN
             known.touched[before >> TILE_BITS] = True
-            key = np.float32(found + weight * way_left(column, line, aim))
-            size = push(key, before, keys, numbers, size)
+            key = np.float32(found + aim.weight * way_left(column, line, aim))
+            size = push(key, before, heap, size)
     return size, visits, True
 
 

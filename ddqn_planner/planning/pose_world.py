@@ -14,22 +14,22 @@ from ddqn_planner.grid.copies import few_of
 from ddqn_planner.grid.footprint import rows_of
 from ddqn_planner.grid.grid_map import MULTIPLIERS
 from ddqn_planner.grid.motions import HEADINGS, Motions, closer
-from ddqn_planner.planning.field import offset_between
+from ddqn_planner.planning.field import CHANGED_SHARE, overlap, shift_between
 
 SHIFT: Final = 2  # so many bits tell where in its tile a cell lies, along a side
 TILE: Final = 1 << SHIFT  # cells of a side
 BORDER: Final = 128  # occupied cells around the map, so that a body sweeps none beyond the bits
 State: TypeAlias = tuple[int, int, int]  # x, y, heading
-CHANGED_SHARE = 1 / 50  # of the map's cells: if more changed, fields begin anew
 FINE = 0.01  # cells between two points of the origin's way, which tell the cells that it passes
 WORD, LAST_BIT, ONE, FULL = np.uint64(64), np.uint64(63), np.uint64(1), np.uint64(2**64 - 1)
 
 
 class Body(NamedTuple):
-    """P primitives as kernels use them, and the rows of 33 more masks."""
+    """P primitives as kernels use them, and the rows of 34 more masks."""
 
     # 16 say for each heading where the body stands. Then come the cores, of each heading and of
     # all: what each primitive that starts with it sweeps around any cell that its origin passes.
+    # The last one is all within reach of a tile, around its middle.
 
     into: NDArray[np.int64]  # (17,): into[h] to into[h + 1] are the places in `ending` of those
     ending: NDArray[np.int64]  # (P,): the primitives, by the heading in which they end
@@ -39,7 +39,7 @@ class Body(NamedTuple):
     offset: NDArray[np.int64]  # (P, 2)
     cost: NDArray[np.float32]  # (P,)
     row: NDArray[np.int64]  # (R, 3): y, first x, cells: the swept cells, at most 64 in one row
-    first: NDArray[np.int64]  # (P + 34,): where the rows of each begin
+    first: NDArray[np.int64]  # (P + 35,): where the rows of each begin
     passed: NDArray[np.int64]  # (C, 3): x, y, bit of the action by which the origin leaves the cell
     share: NDArray[np.float32]  # (C,): which part of the cost counts in this cell
     first_passed: NDArray[np.int64]  # (P + 1,)
@@ -75,6 +75,8 @@ def body_of(motions: Motions, swept: NDArray[np.bool_]) -> Body:
         for over, up, _ in cells:
             core[before] &= np.roll(mask, (-up, -over), axis=(0, 1))
     row, first = rows_of(np.concatenate([swept, standing, core, core.all(axis=0, keepdims=True)]))
+    reach = int(np.abs(np.argwhere(swept.any(axis=0)) - len(swept[0]) // 2).max())
+    around, _ = rows_of(np.ones((1, 2 * reach + TILE + 1, 2 * reach + TILE + 1), dtype=np.bool_))
     ending = np.argsort(end, kind="stable")
     return Body(
         into=np.searchsorted(end[ending], headings),
@@ -84,12 +86,12 @@ def body_of(motions: Motions, swept: NDArray[np.bool_]) -> Body:
         end=end,
         offset=motions.offset,
         cost=motions.cost,
-        row=row,
-        first=first,
+        row=np.concatenate([row, around]),
+        first=np.append(first, len(row) + len(around)),
         passed=np.concatenate([cells for cells, _ in passed]),
         share=np.concatenate([share for _, share in passed]).astype(np.float32),
         first_passed=np.cumsum([0, *(len(share) for _, share in passed)]),
-        reach=int(np.abs(np.vstack([row[:, :2], [(0, sum(r) - 1) for r in row[:, 1:]]])).max()),
+        reach=reach,
     )
 
 
@@ -169,26 +171,16 @@ def differences(old: GridMap, new: GridMap) -> tuple[NDArray[np.int64], bool] | 
 
     None if the maps cannot be compared, or differ in too much.
     """
-    layers = ("cost", "slowness", "forbidden", "occupancy", "obstacles")
-    pairs = [(getattr(old, name), getattr(new, name)) for name in layers]
-    has_same = all((before is None) == (after is None) for before, after in pairs)
-    is_there = offset_between(old, new) == (0, 0) and old.occupancy.shape == new.occupancy.shape
-    if not (has_same and is_there):
-        return None
-    boxes = new.patches_since(old)
-    if boxes is None:
-        boxes = [(slice(0, new.height), slice(0, new.width))]
     before, after = occupied_for_body(old), occupied_for_body(new)
+    if shift_between(old, new) != (0, 0) or before.shape != after.shape:
+        return None
+    patches = new.patches_since(old)
+    boxes = [overlap(old, new, (0, 0))[1]] if patches is None else patches
     found, opens = [np.empty((0, 2), np.int64)], False
     for rows, columns in boxes:
         box = rows, columns
-        differs = before[box] != after[box]
-        opens = opens or bool((differs & before[box]).any())
-        for one, other in pairs[:4]:
-            if one is not None and one is not other:
-                changed = (one[box] != other[box]) & ~after[box]
-                opens = opens or bool(changed.any())
-                differs |= changed
+        differs = (before[box] != after[box]) | (new.differs(old, box, box) & ~after[box])
+        opens = opens or bool((differs & ~after[box]).any())
         y, x = few_of(differs)
         found.append(np.column_stack([x + columns.start, y + rows.start]))
     cells = np.concatenate(found)
@@ -226,24 +218,8 @@ def is_far(x: int, y: int, world: Any, body: Any) -> bool:
     """Return whether no occupied cell is within reach of a tile; looks at most once."""
     tile = tile_of(x, y, world.columns)
     if world.tile[tile] == 0:
-        left, bottom = (x & -TILE) - body.reach, (y & -TILE) - body.reach
-        wide = TILE + 2 * body.reach
-        found = 1
-        first = np.uint64(left + BORDER)
-        last = np.uint64(left + wide - 1 + BORDER)
-        for line in range(bottom + BORDER, bottom + wide + BORDER):
-            for word in range(first // WORD, last // WORD + ONE):
-                seen = world.bits[line, word]
-                if word == first // WORD:
-                    seen &= FULL << (first & LAST_BIT)
-                if word == last // WORD:
-                    seen &= FULL >> (LAST_BIT - (last & LAST_BIT))
-                if seen:
-                    found = 2
-                    break
-            if found == 2:
-                break
-        world.tile[tile] = found
+        x, y = (x & -TILE) + TILE // 2, (y & -TILE) + TILE // 2
+        world.tile[tile] = 2 if touches(x, y, body.first.size - 2, world, body) else 1
     return bool(world.tile[tile] == 1)
 
 

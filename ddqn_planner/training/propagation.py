@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, Final, TypeAlias
 
 import numpy as np
@@ -10,6 +10,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn import functional
+from torch.optim.adam import adam
 
 from ddqn_planner.compiled import compiled
 from ddqn_planner.grid import LENGTHS, MOVES, neighbours
@@ -38,10 +39,8 @@ class PropagationLearner:
     ) -> None:
         e = self.environment = environment
         self.uses_costs = network.uses_costs
-        self._online, self._target, *moments = (
-            {name: torch.from_numpy(array) for name, array in part.items()} for part in parts
-        )
-        self._adam = adam_of(self._online, moments, e.parameters.learning_rate)
+        self._parts = [{name: torch.from_numpy(t) for name, t in part.items()} for part in parts]
+        self._online, self._target, *_ = self._parts
         with_rules = zip(e.scenarios, e.move_rules, strict=True)
         seen = [(patches(s.grid.occupancy, s.grid.cost), rule) for s, rule in with_rules]
         features = np.concatenate([network.features(*of_map) for of_map in seen])
@@ -95,36 +94,33 @@ class PropagationLearner:
         gradient_BA = double_dqn_gradient(target, batch, target_BA, q_2BA)
         *inputs, p_BA = (activation[:count] for activation in activations)
         by_gain_BA = gradient_BA * p_BA
+        by_output = by_gain_BA * (1 - p_BA) * gain_2BA[:count]
+        gradients: dict[str, Tensor] = {}
         if self.uses_costs:
             is_above_1_BA = self._cost(self._online, inputs[0]) > LENGTHS_A
-            self._set_gradient("prices", by_gain_BA * -LENGTHS_A * is_above_1_BA, inputs[0])
-        by_output = by_gain_BA * (1 - p_BA) * gain_2BA[:count]
+            by_price_BA = by_gain_BA * -LENGTHS_A * is_above_1_BA
+            gradients |= _gradients("prices", by_price_BA, inputs[0])
         for layer in ("moves", "hidden", "convolution"):
             input_BF = inputs.pop()
-            self._set_gradient(layer, by_output, input_BF)
+            gradients |= _gradients(layer, by_output, input_BF)
             by_input_BF = by_output @ self._online[f"{layer}.weight"]
             by_output = torch.ops.aten.threshold_backward(by_input_BF, input_BF, 0)
-        self._adam(number)
-
-    def _set_gradient(self, layer: str, by_output: Tensor, input_BF: Tensor) -> None:
-        """Set the gradients of a layer, given that by its output."""
-        self._online[f"{layer}.weight"].grad = by_output.T @ input_BF
-        self._online[f"{layer}.bias"].grad = by_output.sum(0)
+        take_step(self._parts, gradients, number, self.environment.parameters.learning_rate)
 
 
-def adam_of(online: Tensors, moments: Sequence[Tensors], rate: float) -> Callable[[int], None]:
-    """Return what makes torch's step of Adam with a number, given the moments of the gradients."""
-    adam = torch.optim.Adam([*online.values()], rate, fused=FUSED)
-    (mean, square), updates = moments, torch.zeros(len(online))
-    for number, (name, weight) in enumerate(online.items()):
-        state = {"step": updates[number], "exp_avg": mean[name], "exp_avg_sq": square[name]}
-        adam.state[weight] = state
+def take_step(parts: Sequence[Tensors], gradients: Tensors, number: int, rate: float) -> None:
+    """Take Adam's step of this number, given θ, θ⁻, Adam's moments and the gradients."""
+    of_each = parts[0], gradients, *parts[2:]
+    weights, slopes, mean, square = ([of[name] for name in parts[0]] for of in of_each)
+    updates = [torch.tensor(number - 1.0) for _ in weights]
+    settings: Any = {"lr": rate, "beta1": 0.9, "beta2": 0.999, "eps": 1e-8, "weight_decay": 0.0}
+    settings |= {"fused": FUSED, "amsgrad": False, "maximize": False}
+    adam(weights, slopes, mean, square, [], updates, **settings)
 
-    def step(number: int) -> None:
-        updates.fill_(number - 1)
-        adam.step()
 
-    return step
+def _gradients(layer: str, by_output: Tensor, input_BF: Tensor) -> dict[str, Tensor]:
+    """Return the gradients of a layer, given that by its output."""
+    return {f"{layer}.weight": by_output.T @ input_BF, f"{layer}.bias": by_output.sum(0)}
 
 
 def _layer(weights: Tensors, name: str, input_BF: Tensor) -> Tensor:

@@ -11,12 +11,7 @@ import shapely
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ddqn_planner.grid.footprint import (
-    inner_radius,
-    read_footprint,
-    rows_of,
-    swept_cells,
-)
+from ddqn_planner.grid.footprint import read_footprint, rows_of, swept_cells
 from ddqn_planner.grid.motions import Motion, make_motions, read_lattice, turn_between
 
 ARROW = "[[0.4, 0], [-0.3, 0.3], [-0.1, 0], [-0.3, -0.3]]"
@@ -154,8 +149,3 @@ def test_wrong_footprints_are_named(text: Any, problem: str) -> None:
 def test_a_body_that_is_too_large_for_its_cells_is_refused() -> None:
     with pytest.raises(ValueError, match="give a coarser resolution"):
         swept_cells(read_footprint("8.0"), make_motions("differential", 0.5, 0.05))
-
-
-def test_a_circle_fits_into_a_footprint() -> None:
-    assert inner_radius(read_footprint(LONG)) == pytest.approx(0.2)
-    assert inner_radius(read_footprint("0.3")) == pytest.approx(0.3)

@@ -9,7 +9,7 @@ from torch_layers import in_torch, papers_layers, propagation_layers
 
 from ddqn_planner.grid import OCCUPIED, Cell, GridMap, MoveRule
 from ddqn_planner.model import AnyMapQNetwork, PropagationQNetwork, networks
-from ddqn_planner.model.move_costs import patches, unique_patches
+from ddqn_planner.model.move_costs import every_patch, patch_numbers, patches, unique_patches
 from ddqn_planner.model.networks import FREE, GOAL, OBSTACLE, ROBOT, observation_background, observe
 from ddqn_planner.planning.field import network_field
 
@@ -65,8 +65,12 @@ def test_a_patch_is_the_3x3_cells_and_outside_is_occupied(place: Place) -> None:
         found = patches(grid.occupancy, cost)
         for (y, x), patch in zip(np.ndindex(cells.shape), found, strict=True):
             np.testing.assert_array_equal(patch.reshape(3, 3), padded[y : y + 3, x : x + 3])
-        patch_id, unique = unique_patches(grid.occupancy, cost)
-        np.testing.assert_array_equal(unique[patch_id.ravel()], found)
+        patch_C, unique = patch_numbers(grid.occupancy), every_patch()
+        if cost is not None:
+            patch_C, unique = unique_patches(grid.occupancy, cost)
+        inside = np.pad(np.ones(cells.shape, bool), 1).ravel()
+        np.testing.assert_array_equal(unique[patch_C[inside]], found)
+        assert (patch_C[~inside] == len(unique)).all()
         assert len(np.unique(unique, axis=0)) == len(unique)
 
 
