@@ -388,8 +388,8 @@ class FieldCache:
         """Give a new field what a field of an older map knows, if there is one."""
         shift_from = cache(lambda older: shift_between(older, new.grid))  # many are of one map
         for kept in self._of_rule(new.move_rule):
-            old, shift = kept.field, shift_from(kept.grid)
-            if shift is None or not isinstance(old, DistanceField):
+            old = kept.field
+            if not isinstance(old, DistanceField) or (shift := shift_from(kept.grid)) is None:
                 continue
             moved_goals = tuple((x + shift[0], y + shift[1]) for x, y in old.goals)
             if moved_goals == new.goals and new.take_over(old, shift, start):
