@@ -223,9 +223,9 @@ def learn(parser: argparse.ArgumentParser, arguments: Sequence[str]) -> int:
         for drive in drives:
             drive.teach(experience, grid)
         try:
-            from ddqn_planner.training.prior import teach_prior
+            from ddqn_planner.training.prior import prior_of
 
-            teach_prior(experience, grid)
+            experience.prior = prior_of(grid, experience.evidence.table, experience.prior)
         except ImportError as error:
             print(f"the map's prior is not trained: {with_remedy(error)}")
         first = options.drives[0]
